@@ -1,0 +1,69 @@
+# Everything is made inside .venv; what it needs from outside is Python 3.11 or later with venv, and make.
+
+VENV   := .venv
+BIN    := $(VENV)/bin
+READY  := $(VENV)/.phibench-ready
+RECIPE ?= datasets/recipes/paper.toml
+OUT    ?= out/paper
+# Which Python makes the environment: `make setup PYTHON=python3.13`. Without it the first that is new enough.
+PYTHON ?=
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help setup dataset test test-slow test-all bench lint clean
+
+help:
+	@echo "make setup      make .venv with everything in it, and make sure of LLVM"
+	@echo "make dataset    render $(RECIPE) into $(OUT)"
+	@echo "make test       the tests, without the slow ones"
+	@echo "make test-slow  the slow tests"
+	@echo "make test-all   both"
+	@echo "make bench      the benchmarks"
+	@echo "make lint       ruff and mypy"
+	@echo "make clean      remove caches and builds; .venv and out/ stay"
+
+setup: $(READY)
+
+# The stamp comes last, so that an interrupted set-up is taken up again; every step may be repeated.
+$(READY): pyproject.toml constraints.txt
+	@$(BIN)/python -c 'import sys, pip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || ( \
+	    python=; \
+	    for name in $(or $(PYTHON),python3 python3.13 python3.12 python3.11 python3.14); do \
+	        if "$$name" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then python=$$name; break; fi; \
+	    done; \
+	    if [ -z "$$python" ]; then \
+	        echo "phibench: $(or $(PYTHON),no Python here) is not Python 3.11 or later: install one and name it with 'make setup PYTHON=...'." >&2; exit 1; \
+	    fi; \
+	    if ! "$$python" -c 'import ensurepip, venv' 2>/dev/null; then \
+	        echo "phibench: $$python has no venv: install it (Debian, Ubuntu: apt-get install python3-venv)." >&2; exit 1; \
+	    fi; \
+	    echo "Making $(VENV) with $$python"; \
+	    "$$python" -m venv --clear $(VENV) )
+	@echo "Installing phibench and what it needs (some minutes the first time)"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[render,test,check]'
+	@$(BIN)/python -m phibench.render.llvm
+	@touch $@
+
+dataset: $(READY)
+	$(BIN)/phibench dataset make $(RECIPE) --out $(OUT)
+
+test: $(READY)
+	$(BIN)/python -m pytest -m "not slow"
+
+test-slow: $(READY)
+	$(BIN)/python -m pytest -m slow
+
+test-all: $(READY)
+	$(BIN)/python -m pytest
+
+bench: $(READY)
+	$(BIN)/python -m pytest --benchmark-enable --benchmark-only
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy -p phibench
+
+clean:
+	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks
+	find scenes render datasets estimator tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,85 @@
+"""Files that are either complete under their final name or not there at all."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+TEMPORARY_PREFIX = ".phibench-tmp-"
+
+
+def write_atomic(path: Path, write: Callable[[Path], None]) -> Path:
+    """Let `write` fill a temporary file in the folder of `path`, flush it to the disk, then rename it to `path`.
+
+    On any exception, a full disk and Ctrl-C included, the temporary file is removed and `path` is as before.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = _temporary(path)
+    try:
+        write(temporary)
+        _flush(temporary)
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    _flush_folder(path.parent)
+    return path
+
+
+def write_bytes(path: Path, data: bytes) -> Path:
+    """Write `data` to `path` atomically."""
+
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(data)
+
+    return write_atomic(path, write)
+
+
+def write_text(path: Path, text: str) -> Path:
+    """Write `text` to `path` atomically, UTF-8, line ends as they are."""
+    return write_bytes(path, text.encode())
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file, hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def remove_temporary(folder: Path) -> None:
+    """Remove what a killed run left under temporary names, in `folder` and below."""
+    for path in folder.rglob(TEMPORARY_PREFIX + "*"):
+        path.unlink(missing_ok=True)
+
+
+def _temporary(path: Path) -> Path:
+    """Name of a new empty file beside `path`, with its suffix and the permissions of an ordinary file."""
+    handle, name = tempfile.mkstemp(prefix=TEMPORARY_PREFIX, suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    umask = os.umask(0)
+    os.umask(umask)
+    Path(name).chmod(0o666 & ~umask)
+    return Path(name)
+
+
+def _flush(path: Path) -> None:
+    """Wait until the file is on the disk; here a full disk shows at the latest."""
+    handle = os.open(path, os.O_RDWR)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _flush_folder(folder: Path) -> None:
+    """Wait until the new name is on the disk (nothing to do on Windows, where folders cannot be opened)."""
+    if os.name == "nt":
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

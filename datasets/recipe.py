@@ -1,0 +1,151 @@
+"""Recipes: what a data set is made of, as strict tables that TOML files fill.
+
+Lengths in metres, angles in radians unless the key says degrees. Every key says its unit. `load_recipe` reports all
+faults of a file in one go (`recipe_faults`, `recipe_checks`).
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+MAX_STROKE_M = 10.0
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.]*$", max_length=48)]
+DatasetName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
+StrokeM = Annotated[float, Field(gt=0.0, le=MAX_STROKE_M)]
+Tilt = Annotated[float, Field(ge=-0.5, le=0.5)]
+Decentre = Annotated[float, Field(ge=-0.1, le=0.1)]
+Distortion = Annotated[float, Field(ge=-1000.0, le=1000.0)]
+FocalPx = Annotated[float, Field(ge=50.0, le=50000.0)]
+Unit = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+class Table(BaseModel):
+    """A table of a recipe: no unknown keys, no silent conversions, no NaN or infinity, immutable."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class DatasetTable(Table):
+    """`[dataset]`."""
+
+    name: DatasetName = Field(description="name of the data set")
+    seed: int = Field(default=0, ge=0, le=2**63 - 1, description="root of all random streams; 0 is legal")
+
+
+class RigTable(Table):
+    """`[rig]`: a preset, and what differs from it."""
+
+    preset: Literal["default", "c310"] = Field(default="default", description="rig to start from")
+    z_c_m: float | None = Field(
+        default=None, gt=0.0, le=5.0, description="camera centre to sphere centre, along the camera's axis"
+    )
+    camera_height_m: float | None = Field(
+        default=None, ge=0.34, le=10.0, description="height of the lens centre above the floor at the down position"
+    )
+    radius_m: float | None = Field(default=None, gt=0.0, le=1.0, description="radius of the spherical mirror")
+    roughness_alpha: float | None = Field(
+        default=None, ge=0.0, le=0.05, description="Beckmann roughness of the mirror; 0 is ideal"
+    )
+    width_px: int | None = Field(default=None, ge=16, le=8192, description="image width")
+    height_px: int | None = Field(default=None, ge=16, le=8192, description="image height")
+    pixel_pitch_um: float | None = Field(default=None, gt=0.0, le=100.0, description="pixel pitch")
+    fx_px: FocalPx | None = Field(default=None, description="focal length along u")
+    fy_px: FocalPx | None = Field(default=None, description="focal length along v")
+    cx_px: float | None = Field(
+        default=None, ge=-8192.0, le=16384.0, description="principal point u; the image centre if width_px is given"
+    )
+    cy_px: float | None = Field(
+        default=None, ge=-8192.0, le=16384.0, description="principal point v; the image centre if height_px is given"
+    )
+    k1: Distortion | None = Field(default=None, description="radial distortion (Brown, as OpenCV)")
+    k2: Distortion | None = Field(default=None, description="radial distortion (Brown, as OpenCV)")
+    k3: Distortion | None = Field(default=None, description="radial distortion (Brown, as OpenCV)")
+    p1: Distortion | None = Field(default=None, description="tangential distortion (Brown, as OpenCV)")
+    p2: Distortion | None = Field(default=None, description="tangential distortion (Brown, as OpenCV)")
+    f_number: float | None = Field(default=None, ge=0.5, le=256.0, description="focal length over aperture diameter")
+    focus_distance_m: float | None = Field(
+        default=None, ge=0.01, le=1000.0, description="plane of focus from the lens; z_c - R/2 where not given"
+    )
+    blur_sigma_px: float | None = Field(
+        default=None, ge=0.05, le=20.0, description="Gaussian optical blur besides defocus"
+    )
+    decentre_x_m: Decentre = Field(default=0.0, description="sphere centre off the camera's vertical, world x")
+    decentre_y_m: Decentre = Field(default=0.0, description="sphere centre off the camera's vertical, world y")
+    tilt_x_rad: Tilt = Field(default=0.0, description="camera turned about world x, the mirror stays")
+    tilt_y_rad: Tilt = Field(default=0.0, description="camera turned about world y, the mirror stays")
+    stroke_tilt_x_rad: Tilt = Field(default=0.0, description="stroke axis turned about world x")
+    stroke_tilt_y_rad: Tilt = Field(default=0.0, description="stroke axis turned about world y")
+
+
+class RoomTable(Table):
+    """`[room]`."""
+
+    name: Literal["lab", "dark"] = Field(default="lab", description="'dark' is the lab with every lamp off")
+
+
+class LaserTable(Table):
+    """`[laser]`: one laser for all targets."""
+
+    power_w: float = Field(default=1e-3, gt=0.0, le=10.0, description="laser power on the wall")
+    wavelength_nm: float = Field(default=650.0, ge=400.0, le=700.0, description="vacuum wavelength")
+    profile: Literal["gaussian", "uniform"] = Field(default="gaussian", description="shape of the spot")
+    albedo: Unit = Field(default=0.7, description="diffuse albedo of the boards at the laser's wavelength")
+    diameter_m: float | None = Field(
+        default=None, gt=0.0, le=1.0, description="one diameter for every spot, instead of base and growth"
+    )
+    diameter_base_m: float = Field(default=3e-3, ge=0.0, le=1.0, description="spot diameter at distance 0")
+    diameter_growth_m_per_m: float = Field(
+        default=1e-3, ge=0.0, le=0.1, description="growth of the spot diameter per metre of depth_m"
+    )
+
+
+class AmbientTable(Table):
+    """`[ambient]`: how well the room is rendered."""
+
+    samples_per_pixel: int = Field(default=64, ge=1, le=1 << 20, description="paths per pixel")
+    max_depth: int = Field(default=8, ge=1, le=256, description="longest path, in segments")
+
+
+class TargetTable(Table):
+    """`[[targets]]`: a board with a laser spot at its centre."""
+
+    name: Name = Field(description="name of the target")
+    depth_m: float = Field(gt=0.0, le=100.0, description="horizontal distance of the board's face from the world's z axis")
+    azimuth_deg: float = Field(ge=-360.0, le=360.0, description="direction from world x towards world y")
+    height_m: float = Field(ge=0.0, le=100.0, description="height of the spot above the floor")
+
+
+class ExperimentTable(Table):
+    """`[[experiments]]`: every target with every stroke."""
+
+    name: Name = Field(description="name of the experiment")
+    targets: Annotated[tuple[Name, ...], Field(strict=False, min_length=1)] = Field(
+        description="names from [[targets]]"
+    )
+    strokes_m: Annotated[tuple[StrokeM, ...], Field(strict=False, min_length=1)] = Field(
+        description="strokes (baselines); 0 has no parallax and gives no depth"
+    )
+
+
+class Recipe(Table):
+    """A whole recipe."""
+
+    dataset: DatasetTable = Field(description="name and seed")
+    rig: RigTable = Field(default=RigTable(), description="camera, mirror and stroke axis")
+    room: RoomTable = Field(default=RoomTable(), description="the room")
+    laser: LaserTable = Field(default=LaserTable(), description="the laser")
+    ambient: AmbientTable = Field(default=AmbientTable(), description="quality of the ambient layer")
+    targets: Annotated[tuple[TargetTable, ...], Field(strict=False, min_length=1)] = Field(
+        description="boards with a laser spot"
+    )
+    experiments: Annotated[tuple[ExperimentTable, ...], Field(strict=False, min_length=1)] = Field(
+        description="which targets with which strokes"
+    )
+
+
+def recipe_schema() -> dict[str, Any]:
+    """JSON schema of a recipe, for editors that complete and check TOML."""
+    schema = Recipe.model_json_schema()
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "phibench recipe"}

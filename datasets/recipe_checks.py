@@ -1,0 +1,176 @@
+"""What is wrong with a recipe although every key has a legal value.
+
+Works on the raw document, table by table, so that these faults are reported together with the structural ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, TypeVar, cast
+
+from pydantic import ValidationError
+
+from phibench.datasets.recipe import MAX_STROKE_M, LaserTable, Recipe, RigTable, RoomTable, Table, TargetTable
+from phibench.datasets.recipe_faults import Fault, nearest
+from phibench.datasets.recipe_scene import build_rig, build_room, build_spot, build_target
+from phibench.scenes.checks import SceneError
+from phibench.scenes.rig import Rig
+from phibench.scenes.room import Room
+from phibench.scenes.solids import Rectangle
+
+T = TypeVar("T", bound=Table)
+Raw = dict[str, Any]
+
+
+def semantic_faults(raw: Raw) -> list[Fault]:
+    """Faults between keys: names, places, strokes, the rig as a whole. Faulty keys are passed over."""
+    experiments = _tables(raw, "experiments")
+    targets = [(i, table) for i, entry in _tables(raw, "targets") if (table := _sound(entry, TargetTable)) is not None]
+    return [
+        *_twice("targets", _tables(raw, "targets")),
+        *_twice("experiments", experiments),
+        *_unknown_targets(experiments, [entry["name"] for _, entry in _named(_tables(raw, "targets"))]),
+        *_repeats(experiments),
+        *_laser(_sound(raw.get("laser", {}), LaserTable)),
+        *_places(_sound(raw.get("room", {}), RoomTable), targets),
+        *_rig(raw, experiments),
+    ]
+
+
+def warnings(recipe: Recipe) -> list[str]:
+    """What is legal but probably not meant."""
+    result = []
+    if not build_rig(recipe.rig).fits_image():
+        result.append("rig: the mirror's outline does not fit the image; spots near its rim may fall outside")
+    used = {name for experiment in recipe.experiments for name in experiment.targets}
+    unused = [target.name for target in recipe.targets if target.name not in used]
+    if unused:
+        result.append(f"targets: {', '.join(unused)} stand in the room but no experiment uses their spots")
+    return result
+
+
+def _sound(raw: object, model: type[T]) -> T | None:
+    """Table of `raw` without its faulty keys; None where that leaves out a key that must be there."""
+    try:
+        return model.model_validate(raw)
+    except ValidationError as error:
+        faulty = {details["loc"][0] for details in error.errors() if details["loc"]}
+    rest = {key: value for key, value in raw.items() if key not in faulty} if isinstance(raw, dict) else None
+    return None if rest is None or len(rest) == len(cast(Raw, raw)) else _sound(rest, model)
+
+
+def _tables(raw: Raw, key: str) -> list[tuple[int, Raw]]:
+    """Entries of an array of tables that are tables, with their index."""
+    entries = raw.get(key)
+    return [(i, e) for i, e in enumerate(entries) if isinstance(e, dict)] if isinstance(entries, list) else []
+
+
+def _named(tables: list[tuple[int, Raw]]) -> list[tuple[int, Raw]]:
+    return [(i, entry) for i, entry in tables if isinstance(entry.get("name"), str)]
+
+
+def _items(entry: Raw, key: str) -> list[tuple[int, Any]]:
+    """Entries of a list in a table, with their index."""
+    values = entry.get(key)
+    return list(enumerate(values)) if isinstance(values, list) else []
+
+
+def _twice(key: str, tables: list[tuple[int, Raw]]) -> Iterator[Fault]:
+    """Names that differ by case only are refused too: they become file names."""
+    first: dict[str, int] = {}
+    for i, entry in _named(tables):
+        name = entry["name"]
+        if (earlier := first.setdefault(name.casefold(), i)) != i:
+            yield Fault(f"{key}[{i}].name", f"'{name}' is also the name of {key}[{earlier}]; rename one of them")
+
+
+def _unknown_targets(experiments: list[tuple[int, Raw]], names: list[str]) -> Iterator[Fault]:
+    for i, experiment in experiments:
+        for j, name in _items(experiment, "targets"):
+            if isinstance(name, str) and name not in names:
+                yield Fault(f"experiments[{i}].targets[{j}]", f"no target is called '{name}'; {nearest(name, names)}")
+
+
+def _repeats(experiments: list[tuple[int, Raw]]) -> Iterator[Fault]:
+    for i, experiment in experiments:
+        for key in ("targets", "strokes_m"):
+            values = [value for _, value in _items(experiment, key)]
+            for j, value in enumerate(values):
+                if value in values[:j]:
+                    yield Fault(f"experiments[{i}].{key}[{j}]", f"{value!r} is listed twice; remove one")
+
+
+def _laser(laser: LaserTable | None) -> Iterator[Fault]:
+    if laser is None:
+        return
+    growing = laser.model_fields_set & {"diameter_base_m", "diameter_growth_m_per_m"}
+    if laser.diameter_m is not None and growing:
+        yield Fault("laser.diameter_m", f"given together with {', '.join(sorted(growing))}; give one or the other")
+    if laser.diameter_m is None and laser.diameter_base_m + laser.diameter_growth_m_per_m == 0.0:
+        yield Fault("laser.diameter_base_m", "0.0 with no growth makes spots of diameter 0; give a number above 0")
+
+
+def _places(table: RoomTable | None, targets: list[tuple[int, TargetTable]]) -> Iterator[Fault]:
+    """Boards may not share a name with the room's furniture, nor spots lie in solids or outside the room."""
+    if table is None:
+        return
+    bare = build_room(table, ())
+    for i, target in targets:
+        spot = build_spot(LaserTable(), target).position_world_m
+        others = build_room(table, _others(targets, target))
+        inside = others.solid_around(spot)
+        where = f"depth_m {target.depth_m}, azimuth_deg {target.azimuth_deg}, height_m {target.height_m}"
+        if inside is not None:
+            yield Fault(f"targets[{i}]", f"the spot ({where}) lies inside '{inside}'; move it into the open")
+        elif not _within(bare, spot):
+            yield Fault(f"targets[{i}]", f"the spot ({where}) lies outside the room {_extent(bare)}; move it inside")
+
+
+def _others(targets: list[tuple[int, TargetTable]], target: TargetTable) -> list[TargetTable]:
+    unique = {other.name: other for _, other in targets if other.name != target.name}
+    return [other for other in unique.values() if build_target(other) != build_target(target)]
+
+
+def _bounds(room: Room) -> list[tuple[float, float]]:
+    """Extent of the room along x, y, z: of the centres of its surfaces (walls, floor, ceiling)."""
+    places = [surface.T_world_shape.translation_m for surface in room.surfaces]
+    return [(min(place[axis] for place in places), max(place[axis] for place in places)) for axis in range(3)]
+
+
+def _within(room: Room, point: tuple[float, ...]) -> bool:
+    return all(low <= x <= high for x, (low, high) in zip(point, _bounds(room), strict=True))
+
+
+def _extent(room: Room) -> str:
+    return ", ".join(f"{name} {low:g} to {high:g} m" for name, (low, high) in zip("xyz", _bounds(room), strict=True))
+
+
+def _rig(raw: Raw, experiments: list[tuple[int, Raw]]) -> Iterator[Fault]:
+    table, room_table = _sound(raw.get("rig", {}), RigTable), _sound(raw.get("room", {}), RoomTable)
+    if table is None:
+        return
+    try:
+        rig = build_rig(table)
+    except SceneError as error:
+        yield Fault("rig", str(error))
+        return
+    if room_table is not None:
+        yield from _strokes(rig, build_room(room_table, ()), experiments)
+
+
+def _strokes(rig: Rig, room: Room, experiments: list[tuple[int, Raw]]) -> Iterator[Fault]:
+    """The mirror must stay below the lowest thing that hangs from the ceiling."""
+    ceiling_m = min(s.T_world_shape.translation_m[2] for s in room.surfaces if _faces_down(s))
+    for i, experiment in experiments:
+        for j, stroke_m in _items(experiment, "strokes_m"):
+            if type(stroke_m) not in (int, float) or not 0.0 < stroke_m <= MAX_STROKE_M:
+                continue  # a structural fault
+            top_m = rig.at(stroke_m).sphere_centre_m[2] + rig.mirror.radius_m
+            if top_m >= ceiling_m:
+                longest_m = stroke_m - (top_m - ceiling_m)
+                text = f"{stroke_m} lifts the mirror's top to {top_m:.3f} m, through the ceiling at {ceiling_m:.2f} m"
+                yield Fault(f"experiments[{i}].strokes_m[{j}]", f"{text}; give less than {longest_m:.3f}")
+
+
+def _faces_down(surface: Rectangle) -> bool:
+    return bool(surface.T_world_shape.R[2, 2] < -0.5)

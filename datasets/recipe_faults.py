@@ -1,0 +1,115 @@
+"""Faults of a recipe: one line each, with path, value, allowed range, what to do and the nearest known name."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+Schema = dict[str, Any]
+Location = tuple[str | int, ...]
+_LIMITS = {"exclusiveMinimum": "above {}", "minimum": "from {}", "exclusiveMaximum": "below {}", "maximum": "up to {}"}
+_KINDS = {"number": "a number", "integer": "an integer", "string": "a string", "array": "a list", "object": "a table"}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault: where it is and what to do about it."""
+
+    path: str
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.path}: {self.text}"
+
+
+def structural_faults(model: type[BaseModel], raw: object) -> list[Fault]:
+    """All keys of `raw` that are wrong, missing or unknown for `model`."""
+    try:
+        model.model_validate(raw)
+    except ValidationError as error:
+        schema = model.model_json_schema()
+        return [_fault(schema, details["type"], details["loc"], details["input"]) for details in error.errors()]
+    return []
+
+
+def path_text(location: Sequence[str | int]) -> str:
+    """Path of a key as people write it, such as ``targets[2].depth_m``."""
+    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
+    return "".join(parts).removeprefix(".") or "recipe"
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Advice for an unknown name: the nearest known one, and what is known."""
+    names = list(known)
+    close = difflib.get_close_matches(name, names, 1, 0.5)
+    guess = f"did you mean '{close[0]}'? " if close else ""
+    return f"{guess}known: {', '.join(names)}"
+
+
+def _fault(schema: Schema, kind: str, location: Location, given: object) -> Fault:
+    path = path_text(location)
+    if kind == "extra_forbidden":
+        known = _node(schema, location[:-1]).get("properties", {})
+        return Fault(path, f"unknown key; {nearest(str(location[-1]), known)}")
+    node = _node(schema, location)
+    hint = f" ({node['description']})" if "description" in node else ""
+    if kind == "missing":
+        return Fault(path, f"missing; add {allowed(node)}{hint}")
+    return Fault(path, f"{_shown(given)} is not allowed; give {allowed(node)}{hint}")
+
+
+def _node(schema: Schema, location: Location) -> Schema:
+    """Part of a JSON schema that describes one key, references and optional values resolved."""
+    node = _resolve(schema, schema)
+    for part in location:
+        inner = node.get("items", {}) if isinstance(part, int) else node.get("properties", {}).get(part, {})
+        description = inner.get("description")
+        node = _resolve(schema, inner)
+        node = {**node, "description": description} if description else node
+    return node
+
+
+def _resolve(schema: Schema, node: Schema) -> Schema:
+    options = [option for option in node.get("anyOf", ()) if option.get("type") != "null"]
+    if options:
+        return _resolve(schema, {**node, **options[0], "anyOf": ()})
+    if "$ref" in node:
+        return _resolve(schema, schema["$defs"][node["$ref"].rsplit("/", 1)[-1]])
+    return node
+
+
+def allowed(node: Schema) -> str:
+    """Say in words what a JSON schema node allows."""
+    if "enum" in node or "const" in node:
+        return "one of " + ", ".join(repr(value) for value in node.get("enum", [node.get("const")]))
+    words = [_KINDS.get(node.get("type", ""), "a value"), *_limits(node)]
+    if "pattern" in node:
+        words.append(f"of at most {node['maxLength']} letters, digits and signs like {_signs(node['pattern'])}")
+    if "minItems" in node:
+        words.append(f"of at least {node['minItems']} ({allowed(node['items'])})" if _plain(node) else "with entries")
+    return " ".join(words)
+
+
+def _limits(node: Schema) -> list[str]:
+    return [text.format(_number(node[key])) for key, text in _LIMITS.items() if key in node]
+
+
+def _plain(node: Schema) -> bool:
+    return "$ref" not in node["items"]
+
+
+def _number(value: float) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _signs(pattern: str) -> str:
+    return "_ . -" if "-]" in pattern else "_ ."
+
+
+def _shown(given: object) -> str:
+    text = repr(given)
+    return text if len(text) <= 60 else text[:57] + "..."

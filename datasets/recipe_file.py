@@ -1,0 +1,62 @@
+"""Reading recipe files."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from phibench.datasets.errors import RecipeError
+from phibench.datasets.recipe import Recipe
+from phibench.datasets.recipe_checks import semantic_faults
+from phibench.datasets.recipe_faults import nearest, structural_faults
+
+RECIPES = Path(__file__).with_name("recipes")
+
+
+def find_recipe(name: str | Path) -> Path:
+    """Path of a recipe: a file, or the name of one that is shipped (``paper``, ``smoke``)."""
+    path, shipped = Path(name), RECIPES / f"{name}.toml"
+    if path.is_file() or not shipped.is_file():
+        return path
+    return shipped
+
+
+def load_recipe(path: str | Path) -> Recipe:
+    """Read and check a recipe.
+
+    Raises
+    ------
+    RecipeError
+        With one line per fault, all of them.
+    """
+    path = find_recipe(path)
+    return parse_recipe(_text(path), str(path))
+
+
+def parse_recipe(text: str, source: str = "recipe") -> Recipe:
+    """Check the TOML text of a recipe; `source` is what the error calls it."""
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise RecipeError(f"{source} is not valid TOML: {error}") from error
+    return check_recipe(raw, source)
+
+
+def check_recipe(raw: dict[str, Any], source: str = "recipe") -> Recipe:
+    """Check a recipe that is a dict already."""
+    faults = [*structural_faults(Recipe, raw), *semantic_faults(raw)]
+    if faults:
+        count = f"{len(faults)} fault" + "s" * (len(faults) > 1)
+        raise RecipeError("\n".join([f"{source} has {count}:", *(f"  {fault}" for fault in faults)]))
+    return Recipe.model_validate(raw)
+
+
+def _text(path: Path) -> str:
+    if not path.is_file():
+        shipped = nearest(path.name, sorted(file.stem for file in RECIPES.glob("*.toml")))
+        raise RecipeError(f"there is no recipe {path}; give a TOML file or the name of a shipped recipe ({shipped})")
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecipeError(f"{path} cannot be read: {error}") from error

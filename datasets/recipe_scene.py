@@ -1,0 +1,79 @@
+"""From the tables of a recipe to the descriptions of `scenes`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from phibench.datasets.recipe import LaserTable, RigTable, RoomTable, TargetTable
+from phibench.scenes.camera import Camera
+from phibench.scenes.catalog import RIGS, ROOMS, Target
+from phibench.scenes.frames import Pose, as_vector, rotation_xyz
+from phibench.scenes.laser import LaserSpot
+from phibench.scenes.mirror import SphereMirror
+from phibench.scenes.rig import Rig
+from phibench.scenes.room import Room
+
+_CAMERA_KEYS = (
+    *("width_px", "height_px", "pixel_pitch_um", "fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "p1", "p2"),
+    *("f_number", "focus_distance_m", "blur_sigma_px"),
+)
+
+
+def build_rig(table: RigTable) -> Rig:
+    """Rig of a recipe; raises `SceneError` where the numbers do not go together."""
+    base = RIGS[table.preset]()
+    mirror = replace(base.mirror, **_given(table, ("radius_m", "roughness_alpha")))
+    z_c_m = base.sphere_in_camera_m[2] if table.z_c_m is None else table.z_c_m
+    height_m = base.T_world_camera.t[2] if table.camera_height_m is None else table.camera_height_m
+    T_world_camera = Pose("world", "camera", (0.0, 0.0, height_m), rotation_xyz(table.tilt_x_rad, table.tilt_y_rad))
+    sphere_from_camera = np.array([table.decentre_x_m, table.decentre_y_m, z_c_m])  # world axes
+    T_camera_sphere = Pose("camera", "sphere", as_vector(T_world_camera.R.T @ sphere_from_camera))
+    stroke = np.array(rotation_xyz(table.stroke_tilt_x_rad, table.stroke_tilt_y_rad)) @ np.array([0.0, 0.0, 1.0])
+    camera = _camera(base.camera, table, z_c_m, mirror)
+    return Rig(camera, mirror, T_world_camera, T_camera_sphere, as_vector(stroke))
+
+
+def build_target(table: TargetTable) -> Target:
+    """Target board of a recipe."""
+    return Target(table.name, table.depth_m, float(np.radians(table.azimuth_deg)), table.height_m)
+
+
+def build_room(table: RoomTable, targets: Iterable[TargetTable]) -> Room:
+    """Room of a recipe with its target boards."""
+    return ROOMS[table.name]([build_target(target) for target in targets])
+
+
+def build_spot(laser: LaserTable, target: TargetTable) -> LaserSpot:
+    """Laser spot at the centre of a target board."""
+    board = build_target(target)
+    growing = laser.diameter_base_m + laser.diameter_growth_m_per_m * target.depth_m
+    return LaserSpot(
+        position_world_m=board.position_world_m,
+        normal_world=board.normal_world,
+        diameter_m=growing if laser.diameter_m is None else laser.diameter_m,
+        albedo=laser.albedo,
+        power_w=laser.power_w,
+        wavelength_nm=laser.wavelength_nm,
+        profile=laser.profile,
+    )
+
+
+def _given(table: RigTable, keys: Iterable[str]) -> dict[str, Any]:
+    """Those keys of the rig's table that the recipe sets."""
+    return {key: value for key in keys if (value := getattr(table, key)) is not None}
+
+
+def _camera(base: Camera, table: RigTable, z_c_m: float, mirror: SphereMirror) -> Camera:
+    """Camera with the recipe's numbers; focus and principal point follow what they depend on unless they are set."""
+    implied: dict[str, Any] = {}
+    if table.z_c_m is not None or table.radius_m is not None:
+        implied["focus_distance_m"] = z_c_m - mirror.radius_m / 2.0  # on the virtual image
+    if table.width_px is not None:
+        implied["cx_px"] = (table.width_px - 1) / 2.0
+    if table.height_px is not None:
+        implied["cy_px"] = (table.height_px - 1) / 2.0
+    return replace(base, **{**implied, **_given(table, _CAMERA_KEYS)})

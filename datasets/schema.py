@@ -1,0 +1,173 @@
+"""The on-disk documents: one row of the manifest, and `dataset.json`. FORMAT.md describes them; a test compares.
+
+A number is NaN in Python and null in JSON where it does not exist (a spot without a reflection point).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, model_validator
+
+SCHEMA_VERSION = 1
+Position = Literal["down", "up"]
+
+
+def _nan_from_null(value: object) -> object:
+    return math.nan if value is None else value
+
+
+def _null_from_nan(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+Number = Annotated[float, BeforeValidator(_nan_from_null), PlainSerializer(_null_from_nan, when_used="json")]
+"""A double that may be NaN: null in JSON."""
+
+Vector2 = Annotated[tuple[Number, Number], Field(strict=False)]
+Vector3 = Annotated[tuple[Number, Number, Number], Field(strict=False)]
+
+
+class Document(BaseModel):
+    """A frozen document without unknown keys; values outside float range or of the wrong type are refused."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+
+
+def _field(unit: str, text: str) -> Any:
+    return Field(description=text, json_schema_extra={"unit": unit})
+
+
+class CertificateRow(Document):
+    """Differences of two independent answers for one spot in one view, and the tolerances they were held to."""
+
+    chief_difference_px: float = _field("px", "chief ray: closed form against ray tracer")
+    chief_tolerance_px: float = _field("px", "largest allowed chief_difference_px")
+    centroid_difference_px: float = _field("px", "centroid of the spot layer against rays over aperture and spot")
+    centroid_tolerance_px: float = _field("px", "largest allowed centroid_difference_px")
+    flux_difference: float = _field("1", "relative difference of the spot's electrons per second, same two")
+    flux_tolerance: float = _field("1", "largest allowed flux_difference")
+    passed: bool = _field("-", "all three differences are within their tolerances; false is never shipped")
+
+
+class SpotRow(Document):
+    """The exact answer for one spot in one view, and where its layers are."""
+
+    pose: str = _field("-", "id of the mirror pose")
+    offset_m: float = _field("m", "carriage offset along the stroke axis")
+    u_px: Number = _field("px", "image of the spot's centre through the lens centre, to the right")
+    v_px: Number = _field("px", "image of the spot's centre through the lens centre, downwards")
+    phi_ray_rad: Number = _field("rad", "half the angle between the mirror-to-spot ray and straight down")
+    phi_normal_rad: Number = _field("rad", "angle between the mirror's normal and straight down")
+    phi_incidence_rad: Number = _field("rad", "angle between the mirror's normal and the ray")
+    azimuth_rad: Number = _field("rad", "direction of the mirror-to-spot ray in the horizontal plane, from world x")
+    reflection_point_world_m: Vector3 = _field("m", "where the chief ray meets the mirror")
+    camera_centre_world_m: Vector3 = _field("m", "lens centre")
+    sphere_centre_world_m: Vector3 = _field("m", "sphere centre")
+    path_spot_mirror_m: Number = _field("m", "spot centre to reflection point")
+    path_mirror_camera_m: Number = _field("m", "reflection point to lens centre")
+    visible: bool = _field("-", "whether the chief ray reaches the sensor")
+    cause: str = _field("-", "why not; 'none' if visible")
+    coma_shift_px: Vector2 = _field("px", "energy centroid of the spot minus (u_px, v_px)")
+    electrons_per_s: Vector3 = _field("1/s", "electrons per second of the whole spot behind R, G, B")
+    view_ambient_file: str = _field("-", "ambient layer of the view")
+    view_truth_file: str = _field("-", "truth layer of the view")
+    spot_file: str | None = _field("-", "spot layer; null where no light of the spot reaches the image")
+    certificate: CertificateRow | None = _field("-", "null where the spot is not visible")
+
+    @model_validator(mode="after")
+    def _complete_if_visible(self) -> SpotRow:
+        """A visible spot has every number, a layer and a passed certificate."""
+        if not self.visible:
+            return self
+        if missing := [name for name, value in self if not _is_finite(value)]:
+            raise ValueError(f"the spot is visible but has no {', '.join(missing)}")
+        if self.certificate is None or not self.certificate.passed:
+            raise ValueError("the spot is visible but its certificate is missing or not passed")
+        return self
+
+
+class ManifestRow(Document):
+    """One stroke pair: one line of `manifest.jsonl`."""
+
+    sample_id: str = _field("-", "<experiment>-<target>-h<stroke>")
+    experiment: str = _field("-", "name of the experiment in the recipe")
+    target: str = _field("-", "name of the target in the recipe")
+    depth_m: float = _field("m", "D: horizontal distance of the spot from the vertical through the sphere centre, down")
+    stroke_m: float = _field("m", "stroke (baseline) h")
+    spot_world_m: Vector3 = _field("m", "centre of the laser spot")
+    spot_normal_world: Vector3 = _field("1", "unit normal of the wall at the spot")
+    spot_diameter_m: float = _field("m", "diameter of the spot: 4 sigma if gaussian, of the disc if uniform")
+    down: SpotRow = _field("-", "stroke position 1, offset 0")
+    up: SpotRow = _field("-", "stroke position 2, offset stroke_m")
+
+    def position(self, name: str) -> SpotRow:
+        """Truth of the stroke position "down" or "up"."""
+        return {"down": self.down, "up": self.up}[name]
+
+
+class PoseInfo(Document):
+    """One mirror pose in `dataset.json`."""
+
+    pose: str = _field("-", "id")
+    offset_m: float = _field("m", "carriage offset along the stroke axis")
+    ambient_seed: int = _field("-", "32-bit seed of the ambient layer")
+    files: dict[str, str] = _field("-", "ambient, truth, preview")
+
+
+class DatasetInfo(Document):
+    """`dataset.json`."""
+
+    schema_version: int = _field("-", "version of this format")
+    name: str = _field("-", "name of the data set")
+    recipe: dict[str, Any] = _field("-", "the recipe, defaults filled in")
+    recipe_sha256: str = _field("-", "SHA-256 of the recipe as canonical JSON; two folders with equal values hold the same")
+    rig: dict[str, Any] = _field("-", "resolved rig")
+    room: dict[str, Any] = _field("-", "resolved room, all shapes")
+    object_names: Annotated[tuple[str, ...], Field(strict=False)] = _field("-", "name by object_id of the truth layers")
+    poses: Annotated[tuple[PoseInfo, ...], Field(strict=False)] = _field("-", "all mirror poses")
+    samples: int = _field("-", "number of rows of the manifest")
+    conventions: dict[str, str] = _field("-", "frames, pixels, phi, units in one sentence each")
+    provenance: dict[str, Any] = _field("-", "versions, commit, code hash, variant, LLVM, threads")
+
+
+def row_line(row: ManifestRow) -> str:
+    """One line of `manifest.jsonl`; doubles are written so that reading gives the same bits."""
+    return json.dumps(row.model_dump(mode="json"), allow_nan=False)
+
+
+def flat(document: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Key and value of every leaf of a row, keys joined by dots: the columns of `manifest.parquet`."""
+    for key, value in document.items():
+        if isinstance(value, dict):
+            yield from flat(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
+
+
+def columns(model: type[BaseModel] = ManifestRow, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted name and field of every leaf of a document, in order."""
+    for name, field in model.model_fields.items():
+        inner = next((kind for kind in _kinds(field.annotation) if _is_document(kind)), None)
+        if inner is None:
+            yield prefix + name, field
+        else:
+            yield from columns(inner, f"{prefix}{name}.")
+
+
+def _kinds(annotation: Any) -> tuple[Any, ...]:
+    """An annotation or the options of a union."""
+    return (annotation, *getattr(annotation, "__args__", ()))
+
+
+def _is_document(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, Document)
+
+
+def _is_finite(value: object) -> bool:
+    if isinstance(value, tuple):
+        return all(_is_finite(item) for item in value)
+    return value is not None and not (isinstance(value, float) and not math.isfinite(value))

@@ -1,0 +1,155 @@
+"""Camera rays reflected at the sphere, in closed form.
+
+Symbols: d unit camera ray, s sphere centre in the camera frame, P reflection point relative to the sphere centre,
+n outward normal, i angle of incidence, r unit ray that leaves the mirror. Frames, poses and pixels as in
+`phibench.scenes.frames`. Every kernel takes leading axes and never raises for one bad ray: NaN and a `Status`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from phibench.estimator.status import Status, StatusArray, flag, keep
+from phibench.scenes.camera import Camera
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import View
+
+# cos i = 1e-3 is 2e-4 px inside the outline of the default rig; the error of theta per pixel grows as 1 / cos i.
+GRAZING_COSINE = 1e-3
+# Sine of the angle of incidence below which a ray has no azimuth: 1e-9 is less than 1e-6 px from the axis.
+ON_AXIS_SINE = 1e-9
+
+
+@dataclass(frozen=True)
+class Reflection:
+    """Rays that leave the mirror.
+
+    Parameters
+    ----------
+    origin_world_m : shape (..., 3), reflection points, metres
+    direction_world : shape (..., 3), unit vectors, away from the mirror
+    normal_world : shape (..., 3), unit vectors, outward
+    incidence_rad : shape (...)
+    status : shape (...), values of `Status`
+    """
+
+    origin_world_m: Array
+    direction_world: Array
+    normal_world: Array
+    incidence_rad: Array
+    status: StatusArray
+
+
+@dataclass(frozen=True)
+class ReflectionJacobian:
+    """Derivatives of a `Reflection` by the pixel (u, v): the last axis is (u, v), shapes (..., 3, 2) and (..., 2)."""
+
+    origin_m_per_px: Array
+    direction_per_px: Array
+    normal_per_px: Array
+    incidence_rad_per_px: Array
+
+
+@dataclass(frozen=True)
+class _Hit:
+    """First hit in the camera frame; vectors (..., 3), scalars (..., 1)."""
+
+    d: Array
+    t: Array
+    P: Array
+    n: Array
+    cos_i: Array
+    sin_i: Array
+
+
+def reflect(view: View, uv_px: Array) -> Reflection:
+    """Reflect the chief rays of pixels at the mirror.
+
+    Parameters
+    ----------
+    view : View
+    uv_px : shape (..., 2), pixels
+
+    Returns
+    -------
+    Reflection
+        In the world frame.
+    """
+    with np.errstate(all="ignore"):
+        hit = _first_hit(view, uv_px)
+        status = _status(hit)
+        r = hit.d + 2.0 * hit.cos_i * hit.n  # d - 2 (d.n) n with d.n = -cos i
+    T = view.T_world_camera
+    return Reflection(
+        keep(view.sphere_centre_m + T.directions(hit.P), status),
+        keep(T.directions(r), status),
+        keep(T.directions(hit.n), status),
+        keep(np.arctan2(hit.sin_i, hit.cos_i)[..., 0], status),
+        status,
+    )
+
+
+def reflect_jacobian(view: View, uv_px: Array) -> ReflectionJacobian:
+    """Differentiate `reflect` by the pixel, analytically; NaN where `reflect` gives NaN.
+
+    Parameters
+    ----------
+    view : View
+    uv_px : shape (..., 2), pixels
+    """
+    with np.errstate(all="ignore"):
+        hit = _first_hit(view, uv_px)
+        status = _status(hit)
+        d, P, n, cos_i, t = (x[..., None] for x in (hit.d, hit.P, hit.n, hit.cos_i, hit.t))
+        dd = _ray_jacobian(view.rig.camera, uv_px)
+        dt = -t * _dot(P, dd) / _dot(P, d)  # P stays on the sphere: P . dP = 0
+        dP = t * dd + d * dt
+        dn = dP / view.rig.mirror.radius_m
+        dcos = -(_dot(dd, n) + _dot(d, dn))
+        dr = dd + 2.0 * (dcos * n + cos_i * dn)
+        di = -dcos / hit.sin_i[..., None]
+    R = view.T_world_camera.R
+    return ReflectionJacobian(keep(R @ dP, status), keep(R @ dr, status), keep(R @ dn, status), keep(di[..., 0, :], status))
+
+
+def _first_hit(view: View, uv_px: Array) -> _Hit:
+    s, radius = view.rig.sphere_in_camera_m, view.rig.mirror.radius_m
+    d = view.rig.camera.rays(uv_px)
+    b = np.sum(d * s, axis=-1, keepdims=True)
+    miss2 = np.sum(np.cross(d, s) ** 2, axis=-1, keepdims=True)  # squared distance of the ray from the sphere centre
+    root = np.sqrt(np.where(b > 0.0, radius**2 - miss2, -1.0))
+    # t^2 - 2 b t + c = 0; the near root b - root loses digits, c / (b + root) does not
+    t = (s @ s - radius**2) / (b + root)
+    P = t * d - s
+    return _Hit(d, t, P, P / radius, root / radius, np.sqrt(miss2) / radius)
+
+
+def _status(hit: _Hit) -> StatusArray:
+    return flag(
+        (~np.isfinite(hit.d).all(axis=-1), Status.NOT_FINITE),
+        (np.isnan(hit.cos_i[..., 0]), Status.MISSES_MIRROR),
+        (hit.cos_i[..., 0] < GRAZING_COSINE, Status.GRAZING),
+        (hit.sin_i[..., 0] < ON_AXIS_SINE, Status.ON_AXIS),
+    )
+
+
+def _ray_jacobian(camera: Camera, uv_px: Array) -> Array:
+    """Derivative of the unit camera ray by the pixel, shape (..., 3, 2)."""
+    xy = camera.normalised(uv_px)
+    J = camera.distort_jacobian(xy)
+    (a, b), (c, e) = ((J[..., i, 0], J[..., i, 1]) for i in (0, 1))
+    det = a * e - b * c
+    inverse = np.stack([np.stack([e, -b], -1), np.stack([-c, a], -1)], -2) / det[..., None, None]
+    dq = np.zeros((*xy.shape[:-1], 3, 2))
+    dq[..., :2, :] = inverse / np.array([camera.fx_px, camera.fy_px])
+    q = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)[..., None]
+    length = np.sqrt(np.sum(q * q, axis=-2, keepdims=True))
+    d = q / length
+    return (dq - d * _dot(d, dq)) / length
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Dot product over the second last axis, kept with length 1."""
+    return np.sum(a * b, axis=-2, keepdims=True)

@@ -1,0 +1,140 @@
+"""The C310 as one Mitsuba sensor: thin lens, focus, Brown distortion, principal point, Gaussian blur, electrons.
+
+Mitsuba's film coordinate is u + 0.5 (pixel centres at half integers); the scene is in millimetres with the origin at the
+sphere centre. Each ray's weight is its etendue times electrons per joule, so that an image of radiance in W/(m^2 sr) comes
+out in expected photo-electrons per second per pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from types import ModuleType
+from typing import Any
+
+from phibench.scenes.rig import View
+
+PLUGIN = "c310"
+MM_PER_M = 1000.0
+_NEWTON_STEPS = 8  # from the distorted position; the C310's polynomial needs 4 for 1e-14
+
+
+def sensor_dict(mi: ModuleType, view: View, crop: tuple[int, int, int, int] | None = None) -> dict[str, Any]:
+    """Mitsuba dictionary of the sensor for one view.
+
+    Parameters
+    ----------
+    mi : module
+        Mitsuba with its variant set.
+    view : View
+    crop : (u0, v0, width, height), or None
+        Image window in pixels; None is the whole image.
+    """
+    _register(mi)
+    camera = view.rig.camera
+    film = {"type": "hdrfilm", "width": camera.width_px, "height": camera.height_px, "component_format": "float32"}
+    film |= {"pixel_format": "rgb", "rfilter": {"type": "box"}, "sample_border": False}
+    if crop is not None:
+        keys = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
+        film |= dict(zip(keys, crop, strict=True))
+    numbers = {name: float(getattr(camera, name)) for name in _CAMERA_NUMBERS}
+    axes = view.T_world_camera.R
+    for column, axis in enumerate("xyz"):
+        numbers |= {f"{axis}_{row}": float(axes[i, column]) for i, row in enumerate("xyz")}
+    position = MM_PER_M * view.T_world_camera.directions(-view.rig.T_camera_sphere.t)
+    numbers |= {f"origin_{row}": float(position[i]) for i, row in enumerate("xyz")}
+    numbers["aperture_radius_m"] = camera.aperture_radius_m
+    for name, value in zip("RGB", camera.detector.band_electrons_per_joule(), strict=True):
+        numbers[f"electrons_per_joule_{name}"] = value
+    return {"type": PLUGIN, "film": film, "sampler": {"type": "multijitter"}, **numbers}
+
+
+_CAMERA_NUMBERS = (
+    *("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "p1", "p2"),
+    *("focus_distance_m", "blur_sigma_px"),
+)
+
+
+def _register(mi: ModuleType) -> None:
+    """Define and register the plugin class; Mitsuba's classes exist only once a variant is set."""
+    import drjit as dr
+
+    class C310(mi.Sensor):  # type: ignore[misc, name-defined]
+        """See the module's docstring."""
+
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            self.number = {name: mi.Float64(props[name]) for name in props.keys() if name not in _NOT_NUMBERS}
+            dr.make_opaque(self.number)  # same kernel for every camera
+            self.distorted = any(props[name] != 0.0 for name in ("k1", "k2", "k3", "p1", "p2"))
+            self.m_needs_sample_2 = True
+            self.m_needs_sample_3 = True
+
+        def sample_ray(self, time, wavelength_sample, position_sample, aperture_sample, active=True):  # type: ignore[no-untyped-def]
+            ray, weight = self.sample_ray_differential(
+                time, wavelength_sample, position_sample, aperture_sample, active
+            )
+            return mi.Ray3f(ray), weight
+
+        def sample_ray_differential(  # type: ignore[no-untyped-def]
+            self, time, wavelength_sample, position_sample, aperture_sample, active=True
+        ):
+            film = self.film()
+            size, offset = mi.ScalarVector2f(film.crop_size()), mi.ScalarVector2f(film.crop_offset())
+            n, F64 = self.number, mi.Float64
+            # optical blur: the film point moves by a Gaussian; its deviates are hashed from the two samples
+            blur = mi.warp.square_to_std_normal(_hashed_pair(mi, dr, position_sample, aperture_sample))
+            u = F64(position_sample.x) * size.x + offset.x - 0.5 + F64(blur.x) * n["blur_sigma_px"]
+            v = F64(position_sample.y) * size.y + offset.y - 0.5 + F64(blur.y) * n["blur_sigma_px"]
+            xd, yd = (u - n["cx_px"]) / n["fx_px"], (v - n["cy_px"]) / n["fy_px"]
+            x, y, jacobian = _undistort(n, xd, yd) if self.distorted else (xd, yd, F64(1.0))
+            lens = mi.warp.square_to_uniform_disk_concentric(aperture_sample)
+            a, b = F64(lens.x) * n["aperture_radius_m"], F64(lens.y) * n["aperture_radius_m"]
+            dx, dy = x - a / n["focus_distance_m"], y - b / n["focus_distance_m"]
+            cos2 = 1.0 / (1.0 + dx * dx + dy * dy)
+            cos = dr.sqrt(cos2)
+            origin = [n[f"origin_{i}"] + MM_PER_M * (a * n[f"x_{i}"] + b * n[f"y_{i}"]) for i in "xyz"]
+            direction = [cos * (dx * n[f"x_{i}"] + dy * n[f"y_{i}"] + n[f"z_{i}"]) for i in "xyz"]
+            etendue = math.pi * n["aperture_radius_m"] ** 2 * cos2 * cos2 / (n["fx_px"] * n["fy_px"] * jacobian)
+            weight = mi.Color3f(*(mi.Float(etendue * n[f"electrons_per_joule_{c}"]) for c in "RGB"))
+            ray = mi.RayDifferential3f(
+                mi.Point3f(*map(mi.Float, origin)), mi.Vector3f(*map(mi.Float, direction)), time, mi.Color0f()
+            )
+            return ray, weight
+
+        def bbox(self):  # type: ignore[no-untyped-def]
+            return mi.ScalarBoundingBox3f()
+
+        def to_string(self) -> str:
+            return "C310[]"
+
+    mi.register_sensor(PLUGIN, C310)
+
+
+_NOT_NUMBERS = ("film", "sampler", "id")
+
+
+def _hashed_pair(mi: ModuleType, dr: ModuleType, position: Any, aperture: Any) -> Any:
+    """Two uniform deviates from the bits of four others (Tiny Encryption Algorithm)."""
+    bits = [dr.reinterpret_array(mi.UInt32, value) for value in (position.x, position.y, aperture.x, aperture.y)]
+    first = mi.sample_tea_32(bits[0], bits[1])
+    second = mi.sample_tea_32(bits[2] ^ first[0], bits[3] ^ first[1])
+    return mi.Point2f(*(mi.Float(word >> 8) * (1.0 / 16777216.0) for word in second))
+
+
+def _undistort(n: dict[str, Any], xd: Any, yd: Any) -> tuple[Any, Any, Any]:
+    """Invert Brown's distortion by Newton's method; also the determinant of its Jacobian at the solution."""
+    x, y = xd, yd
+    for step in range(_NEWTON_STEPS + 1):
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (n["k1"] + r2 * (n["k2"] + r2 * n["k3"]))
+        slope = 2.0 * (n["k1"] + r2 * (2.0 * n["k2"] + r2 * 3.0 * n["k3"]))
+        xx = radial + x * x * slope + 2.0 * n["p1"] * y + 6.0 * n["p2"] * x
+        yy = radial + y * y * slope + 6.0 * n["p1"] * y + 2.0 * n["p2"] * x
+        xy = x * y * slope + 2.0 * (n["p1"] * x + n["p2"] * y)
+        det = xx * yy - xy * xy
+        if step == _NEWTON_STEPS:
+            break
+        ex = x * radial + 2.0 * n["p1"] * x * y + n["p2"] * (r2 + 2.0 * x * x) - xd
+        ey = y * radial + n["p1"] * (r2 + 2.0 * y * y) + 2.0 * n["p2"] * x * y - yd
+        x, y = x - (yy * ex - xy * ey) / det, y - (xx * ey - xy * ex) / det
+    return x, y, det

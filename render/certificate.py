@@ -1,0 +1,239 @@
+"""The certificate of a spot in one view: the world-side closed form against a camera-side ray tracer.
+
+`spot_truth` and `spot_cloud` go from the spot to the lens (Alhazen's problem, Coddington's equations). Here rays go from the
+film through the aperture to the mirror and on to the wall, and the film position that meets a given wall point is found
+by Newton's method. Power is radiance times etendue. A rough mirror reflects each ray at a facet with a drawn slope, where
+`rough_cloud` evaluates the BRDF at given pairs. Only the scene's numbers are shared.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtri
+from scipy.stats import qmc
+
+from phibench.render.raycast import blocked_by
+from phibench.render.spot import SpotLayer
+from phibench.render.spot_truth import SpotTruth
+from phibench.render.trace import MirrorRays, lens_rays, reflect
+from phibench.scenes.frames import Array
+from phibench.scenes.laser import LaserSpot
+from phibench.scenes.rig import View
+from phibench.scenes.solids import Shape
+
+CHIEF_TOLERANCE_PX = 1e-6
+CENTROID_TOLERANCE_PX = 2e-3
+FLUX_TOLERANCE = 3e-3
+_LOG2_RAYS = 14
+_SEED = 0  # the scramble is part of the quadrature rule, not a noise draw
+_STEP_PX = 1e-3
+_NEWTON_STEPS = 8
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Differences between two independent answers, and the tolerances they were held to.
+
+    Attributes
+    ----------
+    chief_difference_px, chief_tolerance_px : float
+        Closed form against ray tracer, chief ray.
+    centroid_difference_px, centroid_tolerance_px : float
+        Centroid of the spot layer's pixels against the centroid predicted by rays over aperture and spot.
+    flux_difference, flux_tolerance : float
+        Relative difference of the electrons per second of the same two.
+    passed : bool
+    """
+
+    chief_difference_px: float
+    chief_tolerance_px: float
+    centroid_difference_px: float
+    centroid_tolerance_px: float
+    flux_difference: float
+    flux_tolerance: float
+    passed: bool
+
+
+def certify(view: View, spot: LaserSpot, shapes: Sequence[Shape], truth: SpotTruth, layer: SpotLayer) -> Certificate:
+    """Check one visible spot. Raises nothing: look at `passed`."""
+    chief = np.array([truth.u_px, truth.v_px])
+    traced = aim(view, spot, _Bundle.chief(), np.zeros((1, 2)), chief)[0]
+    centroid, electrons = trace_spot(view, spot, shapes, chief)
+    differences = (
+        float(np.linalg.norm(traced - chief)),
+        float(np.linalg.norm(pixel_centroid(layer) - centroid)),
+        float(abs(layer.electrons_per_s[0].sum() / electrons - 1.0)),
+    )
+    tolerances = (CHIEF_TOLERANCE_PX, CENTROID_TOLERANCE_PX, FLUX_TOLERANCE)
+    passed = all(d <= t for d, t in zip(differences, tolerances, strict=True))  # a NaN does not pass
+    pairs = [x for pair in zip(differences, tolerances, strict=True) for x in pair]
+    return Certificate(*pairs, passed)
+
+
+def pixel_centroid(layer: SpotLayer) -> Array:
+    """Centroid (u, v), shape (2,), of the red plane's pixels."""
+    image = layer.electrons_per_s[0]
+    v, u = np.indices(image.shape)
+    with np.errstate(invalid="ignore"):
+        total = image.sum()
+        return np.array([(image * u).sum() / total + layer.u0_px, (image * v).sum() / total + layer.v0_px])
+
+
+@dataclass(frozen=True)
+class _Bundle:
+    """Rays that differ in aperture point (metres, camera x and y) and facet slope, both of shape (N, 2)."""
+
+    lens_m: Array
+    slopes: Array
+
+    @staticmethod
+    def chief() -> _Bundle:
+        return _Bundle(np.zeros((1, 2)), np.zeros((1, 2)))
+
+
+def aim(view: View, spot: LaserSpot, bundle: _Bundle, wall_m: Array, start_px: Array) -> Array:
+    """Film positions, shape (N, 2), whose rays meet wall points.
+
+    Parameters
+    ----------
+    bundle
+        Aperture points and facet slopes of the N rays.
+    wall_m : array, shape (N, 2)
+        Points in the spot's plane, metres from the spot's centre along its tangents.
+    start_px : array, shape (2,)
+    """
+    uv = np.tile(start_px, (len(wall_m), 1))
+    for _ in range(_NEWTON_STEPS):
+        error = _on_wall(view, spot, uv, bundle) - wall_m
+        step = np.linalg.solve(_wall_jacobian(view, spot, uv, bundle), error[..., None])[..., 0]
+        uv = uv - step
+        if not np.any(np.abs(step) > 1e-11):
+            break
+    return uv
+
+
+def trace_spot(view: View, spot: LaserSpot, shapes: Sequence[Shape], chief_px: Array) -> tuple[Array, float]:
+    """Centroid (2,) of the pixel-sampled image of the spot, and its electrons per second behind the red filter."""
+    x = np.clip(qmc.Sobol(6, scramble=True, rng=_SEED).random_base2(_LOG2_RAYS), 1e-12, 1.0 - 1e-12)
+    bundle = _Bundle(view.rig.camera.aperture_radius_m * _disc(x[:, :2]), _facets(view, x[:, 4:]))
+    wall, density = _wall_samples(spot, x[:, 2:4])
+    uv, jacobian = _linear_aim(view, spot, bundle, wall, chief_px)
+    watts = _watts(view, spot, shapes, uv, bundle) / (density * np.abs(np.linalg.det(jacobian))) / len(x)
+    watts = np.where(np.isfinite(watts), watts, 0.0)
+    electrons = watts.sum() * view.rig.camera.detector.laser_electrons_per_joule(spot.wavelength_nm)[0]
+    return watts @ _expected_pixel(uv, view.rig.camera.blur_sigma_px) / watts.sum(), float(electrons)
+
+
+def _linear_aim(
+    view: View, spot: LaserSpot, bundle: _Bundle, wall: Array, chief_px: Array
+) -> tuple[Array, Array]:
+    """Film samples: the exact image of the spot's centre for each ray of the bundle, plus a linear map of the wall sample.
+
+    Sampling only: where on the wall such a ray really lands, and with what weight, is traced afterwards.
+    """
+    centres = aim(view, spot, bundle, np.zeros_like(wall), chief_px)
+    jacobian = _wall_jacobian(view, spot, centres, bundle)
+    return centres + np.linalg.solve(jacobian, wall[..., None])[..., 0], jacobian
+
+
+def _facets(view: View, x: Array) -> Array:
+    """Beckmann slopes, shape (N, 2): variance alpha^2 / 2 each way; 0 for an ideal mirror."""
+    return view.rig.mirror.roughness_alpha / math.sqrt(2.0) * ndtri(x)
+
+
+def _wall_samples(spot: LaserSpot, x: Array) -> tuple[Array, Array]:
+    """Points in the spot's plane (N, 2) that cover the spot generously, and their density, 1/m^2."""
+    if spot.profile == "gaussian":
+        z, sigma = ndtri(x), 1.2 * spot.sigma_m
+        return sigma * z, np.exp(-0.5 * (z**2).sum(axis=1)) / (2.0 * math.pi * sigma**2)
+    radius = 1.05 * spot.diameter_m / 2.0
+    return radius * _disc(x), np.full(len(x), 1.0 / (math.pi * radius**2))
+
+
+def _disc(x: Array) -> Array:
+    radius, turn = np.sqrt(x[:, 0]), 2.0 * np.pi * x[:, 1]
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=-1)
+
+
+@dataclass(frozen=True)
+class _Reflected:
+    """Rays of film positions after the mirror."""
+
+    lens_points_m: Array
+    mirror_points_m: Array
+    directions: Array
+    cos_facet: Array
+    cos_lens: Array
+    facet_weight: Array
+
+
+def _reflect(view: View, spot: LaserSpot, uv: Array, bundle: _Bundle) -> _Reflected:
+    """Reflect each ray at its facet. The weight (o.m) / (o.n n.m) turns drawn facets into f_r cos_i (shadowing is 1)."""
+    origins, directions = lens_rays(view, uv, bundle.lens_m)
+    rays = reflect(view, origins, directions)
+    facet = rays.normals + np.einsum("nk,nki->ni", bundle.slopes, _tangents(view, spot, rays))
+    facet /= np.linalg.norm(facet, axis=-1, keepdims=True)
+    cos_facet = -np.einsum("ni,ni->n", facet, directions)
+    out = directions + 2.0 * cos_facet[:, None] * facet
+    weight = cos_facet / (rays.cos_incidence * np.einsum("ni,ni->n", facet, rays.normals))
+    return _Reflected(origins, rays.points_m, out, cos_facet, directions @ view.T_world_camera.R[:, 2], weight)
+
+
+def _tangents(view: View, spot: LaserSpot, rays: MirrorRays) -> Array:
+    """Two tangents per ray, shape (N, 2, 3), smooth over the film: the first along the plane of incidence's normal."""
+    to_spot = np.array(spot.position_world_m) - view.sphere_centre_m
+    across = np.cross(to_spot, view.camera_centre_m - view.sphere_centre_m)
+    if np.linalg.norm(across) < 1e-12:  # spot, sphere and camera in one line: any direction across will do
+        across = view.T_world_camera.R[:, 0]
+    first = across - np.einsum("ni,i->n", rays.normals, across)[:, None] * rays.normals
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    return np.stack([first, np.cross(rays.normals, first)], axis=1)
+
+
+def _on_wall(view: View, spot: LaserSpot, uv: Array, bundle: _Bundle) -> Array:
+    """Where rays of film positions land in the spot's plane, metres along its tangents, shape (N, 2)."""
+    rays = _reflect(view, spot, uv, bundle)
+    return _meet(spot, rays.mirror_points_m, rays.directions)[0]
+
+
+def _meet(spot: LaserSpot, origins: Array, directions: Array) -> tuple[Array, Array]:
+    normal, centre = np.array(spot.normal_world), np.array(spot.position_world_m)
+    distance = (centre - origins) @ normal / (directions @ normal)
+    points = origins + distance[:, None] * directions
+    return (points - centre) @ np.stack(spot.tangents()).T, points
+
+
+def _wall_jacobian(view: View, spot: LaserSpot, uv: Array, bundle: _Bundle) -> Array:
+    """d(wall) / d(u, v), shape (N, 2, 2), by central differences."""
+    sides = [[_on_wall(view, spot, uv + sign * step, bundle) for sign in (1, -1)] for step in _STEP_PX * np.eye(2)]
+    return np.stack([(plus - minus) / (2.0 * _STEP_PX) for plus, minus in sides], axis=-1)
+
+
+def _watts(view: View, spot: LaserSpot, shapes: Sequence[Shape], uv: Array, bundle: _Bundle) -> Array:
+    """Radiance x etendue, watts per square pixel for the whole aperture, shape (N,)."""
+    camera = view.rig.camera
+    rays = _reflect(view, spot, uv, bundle)
+    wall, points = _meet(spot, rays.mirror_points_m, rays.directions)
+    facing = rays.directions @ np.array(spot.normal_world) < 0.0
+    radiance = spot.radiance_w_m2_sr(np.linalg.norm(wall, axis=-1)) * facing * rays.facet_weight
+    radiance *= view.rig.mirror.reflectance(rays.cos_facet, spot.wavelength_nm)
+    density = camera.solid_angle_density(camera.normalised(uv))
+    watts = radiance * density * rays.cos_lens**4 * math.pi * camera.aperture_radius_m**2
+    hit = np.isfinite(watts)
+    legs = ((rays.mirror_points_m[hit], points[hit]), (rays.lens_points_m[hit], rays.mirror_points_m[hit]))
+    watts[hit] *= np.all([blocked_by(shapes, start, end) < 0 for start, end in legs], axis=0)
+    return watts
+
+
+def _expected_pixel(uv: Array, sigma: float) -> Array:
+    """Mean pixel index of a point blurred by a Gaussian: the centroid that pixels can show (Fourier series).
+
+    round(x) = x - sum_m (-1)^(m+1) sin(2 pi m x) / (pi m); the Gaussian damps term m by exp(-2 pi^2 m^2 sigma^2).
+    """
+    m = np.arange(1, 2 + math.ceil(1.4 / sigma))  # the first left out is below 1e-16
+    damping = (-1.0) ** (m + 1) / (np.pi * m) * np.exp(-2.0 * (np.pi * m * sigma) ** 2)
+    return uv - np.sin(2.0 * np.pi * uv[..., None] * m) @ damping

@@ -1,0 +1,153 @@
+"""The laser spot's light on the film, as weighted points: specular connections spot -> mirror -> lens.
+
+Pairs of a point on the spot and a point on the aperture are joined by the reflection law (`alhazen`); each pair's power
+follows from the geometry of the reflected bundle. With s the distance spot to mirror, l mirror to lens and i the
+angle of incidence, Coddington's equations for a convex sphere give the distances of the virtual image behind the mirror
+
+    1/s_t = 1/s + 2 / (R cos i)      1/s_s = 1/s + 2 cos(i) / R
+
+and dPhi = L rho(i) cos(theta_spot) cos(theta_lens) / (s^2 (1 + l/s_t) (1 + l/s_s)) dA_spot dA_lens (DESIGN section 5).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from phibench.render.alhazen import reflection_points
+from phibench.render.quadrature import disc_nodes
+from phibench.render.raycast import blocked_by
+from phibench.scenes.frames import Array
+from phibench.scenes.laser import LaserSpot
+from phibench.scenes.rig import View
+from phibench.scenes.solids import Shape
+
+_PAIRS_AT_ONCE = 65536
+
+
+@dataclass(frozen=True)
+class FilmCloud:
+    """Light that reaches the film before optical blur.
+
+    Attributes
+    ----------
+    uv_px : array, shape (N, 2)
+    watts : array, shape (N,)
+    """
+
+    uv_px: Array
+    watts: Array
+
+    def centroid_px(self) -> Array:
+        """Energy centroid (u, v), shape (2,); NaN when there is no light."""
+        with np.errstate(invalid="ignore"):
+            return self.watts @ self.uv_px / self.watts.sum()
+
+
+def specular_cloud(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> FilmCloud:
+    """Quadrature over spot and aperture; occluded pairs keep their place with power 0."""
+    spot_nodes, spot_weights, lens_nodes, lens_weights = _nodes(view, spot)
+    lens_steps = max(1, _PAIRS_AT_ONCE // len(spot_nodes))
+    parts = []
+    for start in range(0, len(lens_nodes), lens_steps):
+        lens = lens_nodes[start : start + lens_steps]
+        points, eyes = _pairs(spot_nodes, lens)
+        weight = np.outer(lens_weights[start : start + lens_steps], spot_weights).ravel()
+        parts.append(_connect(view, spot, shapes, points, eyes, weight))
+    return FilmCloud(np.concatenate([p.uv_px for p in parts]), np.concatenate([p.watts for p in parts]))
+
+
+def film_position(view: View, lens_m: Array, mirror_m: Array) -> Array:
+    """Film position (u, v), shape (N, 2), of rays from mirror points to aperture points, both in the camera frame."""
+    focus = view.rig.camera.focus_distance_m
+    ray = mirror_m - lens_m
+    at_focus = lens_m + ray * (focus / ray[:, 2:])
+    return view.rig.camera.to_pixel(at_focus[:, :2] / focus)
+
+
+def image_radii_px(view: View, spot: LaserSpot) -> tuple[float, float]:
+    """Extent of the image, before blur, of the spot's rim (or sigma) and of the aperture's rim, pixels."""
+    rim = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
+    spot_uv = _film(view, _spot_points(spot, rim), _lens_points(view, np.zeros_like(rim)))
+    lens_uv = _film(view, np.broadcast_to(spot.position_world_m, (len(rim), 3)), _lens_points(view, rim))
+    return _reach(spot_uv), _reach(lens_uv)
+
+
+_TURN = 2.0 * np.pi * np.arange(8) / 8.0
+
+
+def _reach(uv: Array) -> float:
+    return float(np.nanmax(np.linalg.norm(uv - uv.mean(axis=0), axis=-1), initial=0.0))
+
+
+def _film(view: View, points: Array, eyes: Array) -> Array:
+    centre, pose = view.sphere_centre_m, view.T_world_camera.inverse()
+    mirror, _ = reflection_points(points - centre, eyes - centre, view.rig.mirror.radius_m)
+    return film_position(view, pose.points(eyes), pose.points(mirror + centre))
+
+
+def _nodes(view: View, spot: LaserSpot) -> tuple[Array, Array, Array, Array]:
+    """World points on the spot, their weights (W / sr if unobstructed), world points on the aperture, weights (m^2)."""
+    blur = view.rig.camera.blur_sigma_px
+    spot_px, lens_px = image_radii_px(view, spot)
+    disc, share = disc_nodes(spot.profile, spot_px / blur)
+    aperture, area = disc_nodes("uniform", lens_px / blur)
+    intensity = share * spot.albedo * spot.power_w / math.pi
+    area = area * math.pi * view.rig.camera.aperture_radius_m**2
+    return _spot_points(spot, disc), intensity, _lens_points(view, aperture), area
+
+
+def _spot_points(spot: LaserSpot, disc: Array) -> Array:
+    scale = spot.sigma_m if spot.profile == "gaussian" else spot.diameter_m / 2.0
+    return np.array(spot.position_world_m) + scale * disc @ np.stack(spot.tangents())
+
+
+def _lens_points(view: View, disc: Array) -> Array:
+    flat = np.concatenate([view.rig.camera.aperture_radius_m * disc, np.zeros((len(disc), 1))], axis=-1)
+    return view.T_world_camera.points(flat)
+
+
+def _pairs(points: Array, eyes: Array) -> tuple[Array, Array]:
+    """Every eye with every point, shapes (len(eyes) * len(points), 3)."""
+    return np.tile(points, (len(eyes), 1)), np.repeat(eyes, len(points), axis=0)
+
+
+def _connect(
+    view: View, spot: LaserSpot, shapes: Sequence[Shape], points: Array, eyes: Array, weight: Array
+) -> FilmCloud:
+    """Film positions and powers of pairs (spot point, aperture point), shapes (N, 3), with quadrature weights (N,)."""
+    centre, radius = view.sphere_centre_m, view.rig.mirror.radius_m
+    mirror, lit = reflection_points(points - centre, eyes - centre, radius)
+    mirror = np.where(lit[:, None], mirror + centre, np.nan)
+    normal = (mirror - centre) / radius
+    s, from_spot = _split(mirror - points)
+    to_lens_length, to_lens = _split(eyes - mirror)
+    cos_i = np.einsum("ni,ni->n", to_lens, normal)
+    cos_spot = from_spot @ np.array(spot.normal_world)
+    cos_lens = -to_lens @ view.T_world_camera.R[:, 2]
+    spread = s**2 * (1.0 + to_lens_length * (1.0 / s + 2.0 / (radius * cos_i)))
+    spread *= 1.0 + to_lens_length * (1.0 / s + 2.0 * cos_i / radius)
+    rho = view.rig.mirror.reflectance(cos_i, spot.wavelength_nm)
+    watts = weight * rho * np.maximum(cos_spot, 0.0) * np.maximum(cos_lens, 0.0) / spread
+    free = lit & _unobstructed(shapes, points, mirror, eyes, lit)
+    pose = view.T_world_camera.inverse()
+    uv = film_position(view, pose.points(eyes), pose.points(mirror))
+    return FilmCloud(uv[lit], np.where(free, watts, 0.0)[lit])
+
+
+def _unobstructed(shapes: Sequence[Shape], points: Array, mirror: Array, eyes: Array, lit: Array) -> Array:
+    free = np.zeros(len(points), dtype=bool)
+    legs = ((mirror[lit], points[lit]), (eyes[lit], mirror[lit]))
+    free[lit] = np.all([blocked_by(shapes, start, end) < 0 for start, end in legs], axis=0)
+    return free
+
+
+def _split(vectors: Array) -> tuple[Array, Array]:
+    """Lengths (N,) and unit vectors (N, 3)."""
+    length = np.linalg.norm(vectors, axis=-1)
+    return length, vectors / length[:, None]
+
+

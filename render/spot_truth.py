@@ -1,0 +1,103 @@
+"""Exact answers for one laser spot in one view: the chief ray, by closed form in float64."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from phibench.render.alhazen import reflection_points
+from phibench.render.angles import mirror_angles
+from phibench.render.raycast import blocked_by
+from phibench.scenes.frames import Array
+from phibench.scenes.laser import LaserSpot
+from phibench.scenes.rig import View
+from phibench.scenes.solids import Shape
+
+VISIBLE, NO_REFLECTION, FACES_AWAY, OUTSIDE = "none", "no_reflection", "faces_away", "outside_image"
+OCCLUDED = "occluded:"  # followed by the name of the object in the way
+
+
+@dataclass(frozen=True)
+class SpotTruth:
+    """Where the spot's chief ray goes. All numbers are NaN where no reflection point exists.
+
+    Attributes
+    ----------
+    u_px, v_px : float
+        Image of the spot centre through the lens centre.
+    phi_ray_rad, phi_normal_rad, phi_incidence_rad, azimuth_rad : float
+        See `angles`.
+    reflection_point_world_m, camera_centre_world_m, sphere_centre_world_m : 3 floats
+    path_spot_mirror_m, path_mirror_camera_m : float
+    visible : bool
+    cause : str
+        "none", "no_reflection", "faces_away", "outside_image" or "occluded:<object>".
+    """
+
+    u_px: float
+    v_px: float
+    phi_ray_rad: float
+    phi_normal_rad: float
+    phi_incidence_rad: float
+    azimuth_rad: float
+    reflection_point_world_m: tuple[float, ...]
+    camera_centre_world_m: tuple[float, ...]
+    sphere_centre_world_m: tuple[float, ...]
+    path_spot_mirror_m: float
+    path_mirror_camera_m: float
+    visible: bool
+    cause: str
+
+
+def spot_truth(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> SpotTruth:
+    """Trace the chief ray of a spot: position, angles, lengths, and why it is not seen where it is not."""
+    point, eye, centre = np.array([spot.position_world_m]), view.camera_centre_m[None], view.sphere_centre_m
+    mirror, _ = reflection_points(point - centre, eye - centre, view.rig.mirror.radius_m)
+    mirror = mirror + centre
+    normals, leaving = (mirror - centre) / view.rig.mirror.radius_m, point - mirror
+    path = np.linalg.norm(leaving, axis=-1)
+    uv = view.rig.camera.project(view.T_world_camera.inverse().points(mirror))[0]
+    angles = mirror_angles(normals, leaving / path[:, None])
+    cause = _cause(view, spot, shapes, mirror, uv)
+    return SpotTruth(
+        u_px=float(uv[0]),
+        v_px=float(uv[1]),
+        phi_ray_rad=float(angles.phi_ray_rad[0]),
+        phi_normal_rad=float(angles.phi_normal_rad[0]),
+        phi_incidence_rad=float(angles.phi_incidence_rad[0]),
+        azimuth_rad=float(angles.azimuth_rad[0]),
+        reflection_point_world_m=_floats(mirror[0]),
+        camera_centre_world_m=_floats(eye[0]),
+        sphere_centre_world_m=_floats(centre),
+        path_spot_mirror_m=float(path[0]),
+        path_mirror_camera_m=float(np.linalg.norm(mirror - eye)),
+        visible=cause == VISIBLE,
+        cause=cause,
+    )
+
+
+def depth_m(point_world_m: Array, sphere_centre_down_m: Array) -> Array:
+    """D: horizontal distance of points, shape (..., 3), from the vertical line through the sphere centre when down."""
+    offset = np.asarray(point_world_m, float)[..., :2] - sphere_centre_down_m[:2]
+    return np.hypot(offset[..., 0], offset[..., 1])
+
+
+def _cause(view: View, spot: LaserSpot, shapes: Sequence[Shape], mirror: Array, uv: Array) -> str:
+    point, eye = np.array([spot.position_world_m]), view.camera_centre_m[None]
+    if not np.isfinite(mirror).all():
+        return NO_REFLECTION
+    if np.dot(mirror[0] - point[0], spot.normal_world) <= 0.0:
+        return FACES_AWAY
+    if not view.rig.camera.contains(uv):
+        return OUTSIDE
+    for start, end in ((mirror, point), (eye, mirror)):
+        blocker = int(blocked_by(shapes, start, end)[0])
+        if blocker >= 0:
+            return OCCLUDED + shapes[blocker].name
+    return VISIBLE
+
+
+def _floats(values: Array) -> tuple[float, ...]:
+    return tuple(float(x) for x in values)

@@ -1,0 +1,82 @@
+"""Mitsuba, switched on once per process: LLVM first, then the variant, then one Dr.Jit thread.
+
+Dr.Jit adds floating-point numbers with atomics, in whatever order its threads come, so two runs agree to the last bit
+only with one thread. Work is spread over processes instead, and the variant, global to the process, is never changed.
+"""
+
+import os
+import sys
+from types import ModuleType
+
+from phibench.render.llvm import ENVIRONMENT as LLVM_ENVIRONMENT
+from phibench.render.llvm import use_llvm
+
+DEFAULT = "llvm_ad_rgb"
+ENVIRONMENT = "PHIBENCH_VARIANT"
+"""Names a variant for everything, over what the code asks for (`scalar_rgb` where there is no LLVM)."""
+
+THREADS = 1
+"""Dr.Jit counts the calling thread: 1 means that it works alone, without a pool."""
+
+
+class VariantError(RuntimeError):
+    """Mitsuba cannot be used as asked. The message is one sentence."""
+
+
+def activate(variant: str = DEFAULT) -> ModuleType:
+    """Import Mitsuba, set the variant and one thread, and return the module.
+
+    Parameters
+    ----------
+    variant : str
+        Mitsuba's name of a variant; PHIBENCH_VARIANT overrules it.
+
+    Raises
+    ------
+    VariantError
+        If Mitsuba is not installed, does not have the variant, runs another one in this process, or was imported with
+        an LLVM that nobody chose.
+    LlvmError
+        If the variant needs an LLVM and there is none.
+    """
+    wanted = os.environ.get(ENVIRONMENT) or variant
+    mitsuba = _import_mitsuba(needs_llvm=wanted.startswith("llvm"))
+    active = mitsuba.variant()
+    if active == wanted:
+        _settle()
+        return mitsuba
+    if active is not None:
+        raise VariantError(
+            f"this process renders with {active} and cannot change to {wanted}: start another process for that."
+        )
+    if wanted not in mitsuba.variants():
+        raise VariantError(f"Mitsuba has no variant {wanted}: choose one of {', '.join(mitsuba.variants())}.")
+    mitsuba.set_variant(wanted)
+    _settle()
+    return mitsuba
+
+
+def _import_mitsuba(*, needs_llvm: bool) -> ModuleType:
+    if needs_llvm and "drjit" not in sys.modules:
+        use_llvm()
+    elif needs_llvm and not os.environ.get(LLVM_ENVIRONMENT):
+        # Dr.Jit reads the variable when it is imported; without it, it has taken the first LLVM that it met.
+        raise VariantError(
+            "Dr.Jit was imported before its LLVM was chosen: call `phibench.render.variant.activate` before any import "
+            "of mitsuba or drjit."
+        )
+    try:
+        import mitsuba
+    except ModuleNotFoundError as error:
+        raise VariantError("Mitsuba is not installed: run `pip install 'phibench[render]'`.") from error
+    return mitsuba
+
+
+def _settle() -> None:
+    """Set what Mitsuba and Dr.Jit keep for the whole process."""
+    import drjit
+    import mitsuba
+
+    drjit.set_thread_count(THREADS)
+    drjit.set_log_level(drjit.LogLevel.Error)
+    mitsuba.set_log_level(mitsuba.LogLevel.Error)

@@ -1,0 +1,150 @@
+"""The camera: a thin lens with OpenCV intrinsics and Brown distortion.
+
+A point of the plane of focus has one image for the whole aperture, at the pixel that `Camera.project` gives for it.
+The chief ray goes through the lens centre undeviated. The natural (cos^4) fall-off follows from this geometry and is
+part of every layer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from phibench.scenes.checks import finite, positive, within
+from phibench.scenes.detector import Detector
+from phibench.scenes.frames import Array
+
+_NEWTON_STEPS = 30
+_NEWTON_TOLERANCE = 1e-14  # normalised image coordinates; 1.4e-11 px
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics, lens and detector of one camera.
+
+    Parameters
+    ----------
+    width_px, height_px : int
+        Image size; pixel centres are integers, the image spans [-0.5, W - 0.5].
+    pixel_pitch_um : float
+    fx_px, fy_px, cx_px, cy_px : float
+        OpenCV camera matrix, pixels.
+    k1, k2, k3, p1, p2 : float
+        Brown distortion in OpenCV's definition.
+    f_number : float
+        Aperture diameter = fx_px * pixel_pitch / f_number.
+    focus_distance_m : float
+        Distance of the plane of focus from the lens centre, along the optical axis.
+    blur_sigma_px : float
+        Gaussian optical blur besides defocus, pixels.
+    """
+
+    width_px: int = 1280
+    height_px: int = 720
+    pixel_pitch_um: float = 2.8
+    fx_px: float = 1430.0
+    fy_px: float = 1430.0
+    cx_px: float = 639.5
+    cy_px: float = 359.5
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    f_number: float = 2.4
+    focus_distance_m: float = 0.23
+    blur_sigma_px: float = 0.7
+    detector: Detector = field(default_factory=Detector)
+
+    def __post_init__(self) -> None:
+        for name in ("width_px", "height_px", "pixel_pitch_um", "fx_px", "fy_px", "f_number", "focus_distance_m"):
+            positive("Camera", name, getattr(self, name))
+        for name in ("cx_px", "cy_px", "k1", "k2", "k3", "p1", "p2"):
+            finite("Camera", name, getattr(self, name))
+        within("Camera", "blur_sigma_px", self.blur_sigma_px, 0.05, 20.0)
+
+    @property
+    def aperture_radius_m(self) -> float:
+        """Radius of the lens aperture, metres."""
+        return self.fx_px * self.pixel_pitch_um * 1e-6 / (2.0 * self.f_number)
+
+    def distort(self, xy: Array) -> Array:
+        """Apply Brown distortion to normalised coordinates, shape (..., 2)."""
+        x, y = xy[..., 0], xy[..., 1]
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        xd = x * radial + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x)
+        yd = y * radial + self.p1 * (r2 + 2.0 * y * y) + 2.0 * self.p2 * x * y
+        return np.stack([xd, yd], axis=-1)
+
+    def distort_jacobian(self, xy: Array) -> Array:
+        """Derivative of `distort`, shape (..., 2, 2): rows (xd, yd), columns (x, y)."""
+        x, y = xy[..., 0], xy[..., 1]
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        slope = 2.0 * (self.k1 + r2 * (2.0 * self.k2 + r2 * 3.0 * self.k3))  # (d radial / d r2) * 2
+        cross = x * y * slope + 2.0 * (self.p1 * x + self.p2 * y)
+        xx = radial + x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x
+        yy = radial + y * y * slope + 6.0 * self.p1 * y + 2.0 * self.p2 * x
+        return np.stack([np.stack([xx, cross], -1), np.stack([cross, yy], -1)], -2)
+
+    def to_pixel(self, xy: Array) -> Array:
+        """Pixel coordinates (u, v), shape (..., 2), of undistorted normalised coordinates (x/z, y/z)."""
+        xyd = self.distort(xy)
+        return xyd * np.array([self.fx_px, self.fy_px]) + np.array([self.cx_px, self.cy_px])
+
+    def project(self, points_camera_m: Array) -> Array:
+        """Pixel (u, v), shape (..., 2), of points in the camera frame, shape (..., 3); NaN behind the camera."""
+        points = np.asarray(points_camera_m, float)
+        z = np.where(points[..., 2:] > 0.0, points[..., 2:], np.nan)
+        return self.to_pixel(points[..., :2] / z)
+
+    def normalised(self, uv_px: Array) -> Array:
+        """Undistorted normalised coordinates (x/z, y/z), shape (..., 2), of pixels (u, v), by Newton's method.
+
+        NaN where the iteration does not converge (outside the monotonic range of the distortion polynomial).
+        """
+        uv = np.asarray(uv_px, float)
+        target = (uv - np.array([self.cx_px, self.cy_px])) / np.array([self.fx_px, self.fy_px])
+        if not any((self.k1, self.k2, self.k3, self.p1, self.p2)):
+            return target
+        xy = target.copy()
+        with np.errstate(all="ignore"):
+            for _ in range(_NEWTON_STEPS):
+                step = _solve_2x2(self.distort_jacobian(xy), target - self.distort(xy))
+                xy = xy + step
+                if not np.any(np.abs(step) > _NEWTON_TOLERANCE):
+                    break
+            bad = ~np.all(np.abs(self.distort(xy) - target) < 1e-12, axis=-1)
+        xy[bad] = np.nan
+        return xy
+
+    def rays(self, uv_px: Array) -> Array:
+        """Unit chief-ray directions in the camera frame, shape (..., 3), of pixels (u, v), shape (..., 2)."""
+        xy = self.normalised(uv_px)
+        directions = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
+        return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+
+    def solid_angle_density(self, xy: Array) -> Array:
+        """|d(x, y) / d(u, v)|, shape (...): area of normalised coordinates per square pixel."""
+        J = self.distort_jacobian(xy)
+        return 1.0 / np.abs((J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]) * self.fx_px * self.fy_px)
+
+    def contains(self, uv_px: Array) -> NDArrayBool:
+        """Whether pixels (u, v), shape (..., 2), lie inside the image [-0.5, W - 0.5] x [-0.5, H - 0.5]."""
+        uv = np.asarray(uv_px, float)
+        inside_u = (uv[..., 0] >= -0.5) & (uv[..., 0] <= self.width_px - 0.5)
+        return inside_u & (uv[..., 1] >= -0.5) & (uv[..., 1] <= self.height_px - 0.5)
+
+
+NDArrayBool = np.typing.NDArray[np.bool_]
+
+
+def _solve_2x2(matrix: Array, rhs: Array) -> Array:
+    """Solve 2 x 2 systems, matrix (..., 2, 2), rhs (..., 2), by Cramer's rule; no raise when singular."""
+    (a, b), (c, d) = (matrix[..., i, :].transpose(-1, *range(matrix.ndim - 2)) for i in (0, 1))
+    det = a * d - b * c
+    x = (d * rhs[..., 0] - b * rhs[..., 1]) / det
+    y = (a * rhs[..., 1] - c * rhs[..., 0]) / det
+    return np.stack([x, y], axis=-1)

@@ -1,0 +1,120 @@
+"""The rig: camera and mirror on one carriage that moves along the stroke axis."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from phibench.scenes.camera import Camera
+from phibench.scenes.checks import SceneError, finite, positive, unit_vector
+from phibench.scenes.frames import Array, Pose, Vector, as_vector
+from phibench.scenes.mirror import SphereMirror
+
+POSITIONS = ("down", "up")  # stroke positions 1 and 2 of the paper
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """A stroke (baseline) of `stroke_m` metres: position 1 is down at 0, position 2 is up at h."""
+
+    stroke_m: float
+
+    def __post_init__(self) -> None:
+        positive("Stroke", "stroke_m", self.stroke_m)
+
+    def offset_m(self, position: str) -> float:
+        """Carriage offset along the stroke axis, metres, for "down" or "up"."""
+        return {"down": 0.0, "up": self.stroke_m}[position]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Camera, mirror and how they are mounted; the carriage is at the down position.
+
+    Parameters
+    ----------
+    camera, mirror
+    T_world_camera : Pose
+        Camera pose at the down position.
+    T_camera_sphere : Pose
+        Mirror pose in the camera frame; aligned optics have the translation (0, 0, z_c).
+    stroke_axis_world : 3 floats
+        Direction of the stroke, made a unit vector.
+    """
+
+    camera: Camera = field(default_factory=Camera)
+    mirror: SphereMirror = field(default_factory=SphereMirror)
+    T_world_camera: Pose = Pose("world", "camera", (0.0, 0.0, 0.45))
+    T_camera_sphere: Pose = Pose("camera", "sphere", (0.0, 0.0, 0.26))
+    stroke_axis_world: Vector = (0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        axis = unit_vector("Rig", "stroke_axis_world", self.stroke_axis_world)
+        object.__setattr__(self, "stroke_axis_world", axis)
+        for name, frames in (("T_world_camera", ("world", "camera")), ("T_camera_sphere", ("camera", "sphere"))):
+            pose = getattr(self, name)
+            if (pose.target, pose.source) != frames:
+                raise SceneError(f"Rig.{name} joins frames {pose.target}, {pose.source}: must be {frames}")
+        distance, radius = math.hypot(*self.T_camera_sphere.translation_m), self.mirror.radius_m
+        if self.T_camera_sphere.translation_m[2] <= radius or distance <= radius:
+            raise SceneError(
+                f"Rig.T_camera_sphere: the sphere centre is {self.T_camera_sphere.translation_m[2]:.4f} m in front of "
+                f"the camera; it must be more than the mirror radius {radius:.4f} m"
+            )
+
+    @property
+    def sphere_in_camera_m(self) -> Array:
+        """Sphere centre in the camera frame, shape (3,), metres."""
+        return self.T_camera_sphere.t
+
+    def at(self, offset_m: float) -> View:
+        """Return the rig with its carriage moved by `offset_m` along the stroke axis."""
+        finite("Rig", "offset_m", offset_m)
+        return View(self, float(offset_m))
+
+    def outline_px(self, count: int = 720) -> Array:
+        """Image of the mirror's outline (its occluding contour), shape (count, 2), pixels."""
+        s = self.sphere_in_camera_m
+        distance = float(np.linalg.norm(s))
+        axis = s / distance
+        side = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])
+        side /= np.linalg.norm(side)
+        turn = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)[:, None]
+        rim = np.cos(turn) * side + np.sin(turn) * np.cross(axis, side)
+        sine = self.mirror.radius_m / distance
+        return self.camera.project(math.sqrt(1.0 - sine * sine) * axis + sine * rim)
+
+    def fits_image(self) -> bool:
+        """Whether the whole outline of the mirror lies inside the image."""
+        return bool(np.all(self.camera.contains(self.outline_px())))
+
+
+@dataclass(frozen=True)
+class View:
+    """A rig with its carriage at one offset: what one image is taken from."""
+
+    rig: Rig
+    offset_m: float
+
+    @property
+    def T_world_camera(self) -> Pose:
+        """Camera pose in the world."""
+        shift = self.offset_m * np.array(self.rig.stroke_axis_world)
+        return replace(self.rig.T_world_camera, translation_m=as_vector(self.rig.T_world_camera.t + shift))
+
+    @property
+    def T_world_sphere(self) -> Pose:
+        """Mirror pose in the world."""
+        return self.T_world_camera @ self.rig.T_camera_sphere
+
+    @property
+    def camera_centre_m(self) -> Array:
+        """Lens centre in the world, shape (3,), metres."""
+        return self.T_world_camera.t
+
+    @property
+    def sphere_centre_m(self) -> Array:
+        """Sphere centre in the world, shape (3,), metres."""
+        return self.T_world_sphere.t

@@ -1,0 +1,86 @@
+"""The two shapes rooms and robots are built of: rectangles and cuboids."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from phibench.scenes.checks import finite_vector, positive
+from phibench.scenes.frames import Pose, Vector, rotation_facing
+from phibench.scenes.textures import Texture, Uniform
+
+_WHITE = Uniform((0.7, 0.7, 0.7))
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """One-sided-textured rectangle, centred at its pose; its z axis is the normal.
+
+    Parameters
+    ----------
+    name : str
+    T_world_shape : Pose
+    size_m : 2 floats
+        Full extent along the local x and y.
+    texture : Texture
+        Diffuse albedo.
+    radiance_w_m2_sr : 3 floats
+        Emitted radiance on the side of the normal, per ambient band; not 0 makes a lamp (its albedo is then 0).
+    """
+
+    name: str
+    T_world_shape: Pose
+    size_m: Vector
+    texture: Texture = _WHITE
+    radiance_w_m2_sr: Vector = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        _check_size(self, 2)
+        values = finite_vector(self.name, "radiance_w_m2_sr", self.radiance_w_m2_sr, 3)
+        object.__setattr__(self, "radiance_w_m2_sr", values)
+
+    @property
+    def emits(self) -> bool:
+        """Whether the rectangle is a lamp that is switched on."""
+        return any(value > 0.0 for value in self.radiance_w_m2_sr)
+
+
+@dataclass(frozen=True)
+class Cuboid:
+    """Solid box, centred at its pose, full extents `size_m` along the local axes, one diffuse albedo."""
+
+    name: str
+    T_world_shape: Pose
+    size_m: Vector
+    texture: Uniform = field(default=_WHITE)
+
+    def __post_init__(self) -> None:
+        _check_size(self, 3)
+
+    def contains(self, point_world_m: Vector) -> bool:
+        """Whether a world point lies strictly inside."""
+        local = self.T_world_shape.inverse().points(np.asarray(point_world_m, float))
+        return bool(np.all(np.abs(local) < 0.5 * np.array(self.size_m) - 1e-9))
+
+
+Shape = Rectangle | Cuboid
+
+
+def _check_size(shape: Rectangle | Cuboid, length: int) -> None:
+    size = finite_vector(shape.name, "size_m", shape.size_m, length)
+    for value in size:
+        positive(shape.name, "size_m", value)
+    object.__setattr__(shape, "size_m", size)
+
+
+def rectangle(name: str, centre_m: Vector, normal: Vector, size_m: Vector, **options: object) -> Rectangle:
+    """Rectangle at `centre_m` facing `normal`, its local y as near to world z as it can be."""
+    pose = Pose("world", "shape", centre_m, rotation_facing(normal))
+    return Rectangle(name, pose, size_m, **options)  # type: ignore[arg-type]
+
+
+def cuboid(name: str, centre_m: Vector, size_m: Vector, albedo: Vector, rotation: object = None) -> Cuboid:
+    """Cuboid at `centre_m` with one albedo; axis-aligned unless a rotation matrix is given."""
+    pose = Pose("world", "shape", centre_m) if rotation is None else Pose("world", "shape", centre_m, rotation)  # type: ignore[arg-type]
+    return Cuboid(name, pose, size_m, Uniform(albedo))
