@@ -67,8 +67,12 @@ def write_exr(
     _check_shapes(arrays)
     sums = {name: zlib.crc32(array.tobytes()) for name, array in arrays.items()}
     text = json.dumps({"header": dict(header), "crc32": sums}, allow_nan=False)
-    write_atomic(path, lambda temporary: _write(temporary, arrays, text, origin_px))
-    return path
+
+    def write(temporary: Path) -> None:
+        _write(temporary, arrays, text, origin_px)
+        read_exr(temporary)  # checks every pixel before the file gets its name
+
+    return write_atomic(path, write)
 
 
 def read_exr(path: Path) -> Exr:

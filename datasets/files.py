@@ -21,7 +21,7 @@ def write_atomic(path: Path, write: Callable[[Path], None]) -> Path:
     try:
         write(temporary)
         _flush(temporary)
-        os.replace(temporary, path)
+        temporary.replace(path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise

@@ -112,7 +112,9 @@ class TargetTable(Table):
     """`[[targets]]`: a board with a laser spot at its centre."""
 
     name: Name = Field(description="name of the target")
-    depth_m: float = Field(gt=0.0, le=100.0, description="horizontal distance of the board's face from the world's z axis")
+    depth_m: float = Field(
+        gt=0.0, le=100.0, description="horizontal distance of the board's face from the world's z axis"
+    )
     azimuth_deg: float = Field(ge=-360.0, le=360.0, description="direction from world x towards world y")
     height_m: float = Field(ge=0.0, le=100.0, description="height of the spot above the floor")
 

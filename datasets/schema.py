@@ -32,7 +32,7 @@ Vector3 = Annotated[tuple[Number, Number, Number], Field(strict=False)]
 
 
 class Document(BaseModel):
-    """A frozen document without unknown keys; values outside float range or of the wrong type are refused."""
+    """A frozen document without unknown keys; values of the wrong type are refused."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
@@ -60,10 +60,10 @@ class SpotRow(Document):
     offset_m: float = _field("m", "carriage offset along the stroke axis")
     u_px: Number = _field("px", "image of the spot's centre through the lens centre, to the right")
     v_px: Number = _field("px", "image of the spot's centre through the lens centre, downwards")
-    phi_ray_rad: Number = _field("rad", "half the angle between the mirror-to-spot ray and straight down")
-    phi_normal_rad: Number = _field("rad", "angle between the mirror's normal and straight down")
-    phi_incidence_rad: Number = _field("rad", "angle between the mirror's normal and the ray")
-    azimuth_rad: Number = _field("rad", "direction of the mirror-to-spot ray in the horizontal plane, from world x")
+    phi_ray_rad: Number = _field("rad", "theta / 2, theta between the mirror-to-spot ray and straight down")
+    phi_normal_rad: Number = _field("rad", "polar angle of the outward mirror normal from straight down")
+    phi_incidence_rad: Number = _field("rad", "angle of incidence on the mirror")
+    azimuth_rad: Number = _field("rad", "azimuth of the outward mirror normal, from world x towards world y")
     reflection_point_world_m: Vector3 = _field("m", "where the chief ray meets the mirror")
     camera_centre_world_m: Vector3 = _field("m", "lens centre")
     sphere_centre_world_m: Vector3 = _field("m", "sphere centre")
@@ -124,7 +124,7 @@ class DatasetInfo(Document):
     schema_version: int = _field("-", "version of this format")
     name: str = _field("-", "name of the data set")
     recipe: dict[str, Any] = _field("-", "the recipe, defaults filled in")
-    recipe_sha256: str = _field("-", "SHA-256 of the recipe as canonical JSON; two folders with equal values hold the same")
+    recipe_sha256: str = _field("-", "SHA-256 of the recipe's values as canonical JSON")
     rig: dict[str, Any] = _field("-", "resolved rig")
     room: dict[str, Any] = _field("-", "resolved room, all shapes")
     object_names: Annotated[tuple[str, ...], Field(strict=False)] = _field("-", "name by object_id of the truth layers")

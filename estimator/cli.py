@@ -66,13 +66,13 @@ def doctor() -> int:
 
 
 @dataset.command
-def make(recipe: Path, *, out: Path, workers: int | None = None) -> int:
+def make(recipe: str, *, out: Path, workers: int | None = None) -> int:
     """Render a data set.
 
     Parameters
     ----------
     recipe
-        TOML file.
+        TOML file, or the name of a shipped recipe ("paper", "smoke").
     out
         Folder to write; one that holds another data set is refused.
     workers
@@ -86,7 +86,7 @@ def make(recipe: Path, *, out: Path, workers: int | None = None) -> int:
 
 @dataset.command
 def verify(directory: Path) -> int:
-    """Check every file, hash, row and certificate of a data set.
+    """Check every file, hash, row and certificate of a data set; exit code 1 if there is a fault.
 
     Parameters
     ----------
@@ -95,8 +95,11 @@ def verify(directory: Path) -> int:
     """
     from phibench.datasets.verify import verify as verify_dataset
 
-    verify_dataset(directory)
-    return 0
+    report = verify_dataset(directory)
+    for fault in report.faults:
+        print(fault)
+    print(f"{directory}: {report.files} files, {report.samples} samples, {len(report.faults)} faults")
+    return 0 if report.ok else 1
 
 
 @dataset.command

@@ -23,7 +23,7 @@ ON_AXIS_SINE = 1e-9
 
 @dataclass(frozen=True)
 class _Angles:
-    """Sines and cosines of phi_1, phi_2 (s, c) and of 2 phi_1, 2 phi_2 (S, C), and of the disparity 2 phi_1 - 2 phi_2."""
+    """Sine and cosine of phi_1, phi_2 (s, c), of 2 phi_1, 2 phi_2 (S, C) and of the disparity 2 phi_1 - 2 phi_2."""
 
     s1: Array
     c1: Array
@@ -89,9 +89,10 @@ def depth_approx(
 
 
 def error_eq6(depth_m: ArrayLike, phi1_rad: ArrayLike, phi2_rad: ArrayLike, stroke_m: ArrayLike) -> Array:
-    """|dD/d disparity|, metres per radian, by eq. (6) corrected: D / (h s) sqrt(D^2 - (h s)^2), s = sin 2phi1 sin 2phi2.
+    """|dD/d disparity|, metres per radian, by eq. (6) corrected: D / (h s) sqrt(D^2 - (h s)^2).
 
-    Holds s constant, which is itself an approximation. NaN where D < h s (disparity beyond 90 degrees).
+    Holds s = sin 2phi1 sin 2phi2 constant, which is itself an approximation. NaN where D < h s: the
+    disparity is beyond 90 degrees.
     """
     D, hs = _depth_and_hs(depth_m, phi1_rad, phi2_rad, stroke_m)
     with np.errstate(all="ignore"):
@@ -111,9 +112,10 @@ def _inputs(phi1_rad: ArrayLike, phi2_rad: ArrayLike, stroke_m: ArrayLike) -> tu
 
 
 def _angles(phi1: Array, phi2: Array) -> _Angles:
-    first, second, disparity = (phi1, 2.0 * phi1), (phi2, 2.0 * phi2), 2.0 * (phi1 - phi2)
-    values = (f(x) for pair in (first, second) for x in pair for f in (np.sin, np.cos))
-    return _Angles(*values, np.sin(disparity), np.cos(disparity))
+    s1, c1, S1, C1, s2, c2, S2, C2, sin_disparity, cos_disparity = (
+        f(x) for x in (phi1, 2.0 * phi1, phi2, 2.0 * phi2, 2.0 * (phi1 - phi2)) for f in (np.sin, np.cos)
+    )
+    return _Angles(s1, c1, S1, C1, s2, c2, S2, C2, sin_disparity, cos_disparity)
 
 
 def _status(phi1: Array, phi2: Array, h: Array, a: _Angles) -> StatusArray:
@@ -127,7 +129,7 @@ def _status(phi1: Array, phi2: Array, h: Array, a: _Angles) -> StatusArray:
     return first_fault(angles, stroke_status(h))
 
 
-def _paper_gradient(a: _Angles, D: Array, h: Array, lam: ArrayLike, R: float) -> Array:
+def _paper_gradient(a: _Angles, D: Array, h: Array, lam: Array | float, R: float) -> Array:
     """dD/d(phi1, phi2), shape (..., 2), of D = N / sin(disparity)."""
     reach = h - lam
     dN1 = (2.0 * reach * a.C1 - R * a.s1 * a.S1) * a.S2 + R * (

@@ -69,7 +69,8 @@ def outline_circle(rig: Rig) -> tuple[Array, float]:
 
 
 def _ray_gradient(view: View, uv_px: Array) -> Array:
-    return _downward_gradient(reflect(view, uv_px).direction_world, reflect_jacobian(view, uv_px).direction_per_px) / 2.0
+    jacobian = reflect_jacobian(view, uv_px)
+    return _downward_gradient(reflect(view, uv_px).direction_world, jacobian.direction_per_px) / 2.0
 
 
 def _normal_gradient(view: View, uv_px: Array) -> Array:

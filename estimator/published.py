@@ -45,5 +45,5 @@ def find_published(experiment: str, depth_m: float, stroke_m: float) -> Publishe
 
 
 def _row(record: dict[str, str]) -> Published:
-    lengths = (float(record[name]) for name in ("real_depth_m", "baseline_printed_m", "baseline_m", "estimated_depth_m"))
-    return Published(f"table{record['table']}", *lengths)
+    lengths = {name: float(text) for name, text in record.items() if name != "table"}
+    return Published(f"table{record['table']}", **lengths)

@@ -111,7 +111,8 @@ def reflect_jacobian(view: View, uv_px: Array) -> ReflectionJacobian:
         dr = dd + 2.0 * (dcos * n + cos_i * dn)
         di = -dcos / hit.sin_i[..., None]
     R = view.T_world_camera.R
-    return ReflectionJacobian(keep(R @ dP, status), keep(R @ dr, status), keep(R @ dn, status), keep(di[..., 0, :], status))
+    origin, direction, normal = (keep(R @ tangents, status) for tangents in (dP, dr, dn))
+    return ReflectionJacobian(origin, direction, normal, keep(di[..., 0, :], status))
 
 
 def _first_hit(view: View, uv_px: Array) -> _Hit:

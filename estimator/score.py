@@ -194,9 +194,9 @@ def _pixels(sample: Sample, source: str) -> _Pixels:
     if source == "truth":
         row = sample.row
         return _Pixels(np.array([row.down.u_px, row.down.v_px]), np.array([row.up.u_px, row.up.v_px]))
-    down, up = (find_spot(sample.frame(p, laser=True), sample.frame(p, laser=False)) for p in POSITIONS)
-    faults = (f"{p}: {describe(s.status)}" for p, s in zip(POSITIONS, (down, up), strict=True) if s.status is not Status.OK)
-    return _Pixels(down.uv_px, up.uv_px, ", ".join(faults))
+    spots = {p: find_spot(sample.frame(p, laser=True), sample.frame(p, laser=False)) for p in POSITIONS}
+    faults = (f"{p}: {describe(spot.status)}" for p, spot in spots.items() if spot.status is not Status.OK)
+    return _Pixels(spots["down"].uv_px, spots["up"].uv_px, ", ".join(faults))
 
 
 def _score_one(rig: Rig, row: Any, name: str, source: str, pixels: _Pixels) -> Score:

@@ -83,7 +83,8 @@ def depth_exact(
         gap = np.abs(np.sum(w * n, axis=-1)) / np.sqrt(nn)
         radial = X[..., :2] - rig.at(0.0).sphere_centre_m[:2]
         D = np.hypot(radial[..., 0], radial[..., 1])
-        gradient = np.sum(_midpoint_tangent(rays, w, n, nn, t1, t2)[..., :2] * radial[..., None, :], axis=-1) / D[..., None]
+        dX = _midpoint_tangent(rays, w, n, nn, t1, t2)
+        gradient = np.sum(dX[..., :2] * radial[..., None, :], axis=-1) / D[..., None]
         meet = flag((nn < PARALLEL_SINE**2, Status.PARALLEL), (~((t1 > 0.0) & (t2 > 0.0)), Status.DIVERGING))
         status = first_fault(rays.status, meet)
         sigma = propagate(gradient, _joint_covariance(covariance_down_px2, covariance_up_px2))
@@ -113,24 +114,30 @@ def depth_in_plane(
     """
     _require_aligned(rig)
     rays = _rays(rig, stroke_m, uv_down_px, uv_up_px)
-    centre = rig.at(0.0).sphere_centre_m[:2]
     with np.errstate(all="ignore"):
-        rho1, drho1 = _length(rays.P1[..., :2] - centre, rays.dP1[..., :2])
-        rho2, drho2 = _length(rays.P2[..., :2] - centre, rays.dP2[..., :2])
-        (S1, dS1), (S2, dS2) = _length(rays.r1[..., :2], rays.dr1[..., :2]), _length(rays.r2[..., :2], rays.dr2[..., :2])
-        C1, C2, dC1, dC2 = -rays.r1[..., 2], -rays.r2[..., 2], -rays.dr1[..., 2], -rays.dr2[..., 2]
-        rise, drise = (rays.P2 - rays.P1)[..., 2], (rays.dP2 - rays.dP1)[..., 2]
-        q = S1 * C2 - C1 * S2
-        D = (rise * S1 * S2 + rho2 * C2 * S1 - rho1 * C1 * S2) / q
-        rise, rho1, rho2, s1, s2, c1, c2, depth = (x[..., None] for x in (rise, rho1, rho2, S1, S2, C1, C2, D))
-        dN = drise * s1 * s2 + drho2 * c2 * s1 - drho1 * c1 * s2
-        dN += dS1 * (rise * s2 + rho2 * c2) + dS2 * (rise * s1 - rho1 * c1) + dC2 * rho2 * s1 - dC1 * rho1 * s2
-        gradient = (dN - depth * (dS1 * c2 + s1 * dC2 - dC1 * s2 - c1 * dS2)) / q[..., None]
-        ahead = (D > rho1[..., 0]) & (D > rho2[..., 0])
-        meet = flag((np.abs(q) < PARALLEL_SINE, Status.PARALLEL), (~ahead, Status.DIVERGING))
+        D, gradient, q, rho = _meet_in_plane(rays, rig.at(0.0).sphere_centre_m[:2])
+        meet = flag((np.abs(q) < PARALLEL_SINE, Status.PARALLEL), (~(rho < D), Status.DIVERGING))
         status = first_fault(rays.status, meet)
         sigma = propagate(gradient, _joint_covariance(covariance_down_px2, covariance_up_px2))
     return DepthEstimate(keep(D, status), keep(sigma, status), status)
+
+
+def _meet_in_plane(rays: _Rays, centre: Array) -> tuple[Array, Array, Array, Array]:
+    """D = N / q, its gradient (..., 4) by the pixels, q, and the larger of the two rho."""
+    rho1, drho1 = _length(rays.P1[..., :2] - centre, rays.dP1[..., :2])
+    rho2, drho2 = _length(rays.P2[..., :2] - centre, rays.dP2[..., :2])
+    S1, dS1 = _length(rays.r1[..., :2], rays.dr1[..., :2])
+    S2, dS2 = _length(rays.r2[..., :2], rays.dr2[..., :2])
+    C1, C2, dC1, dC2 = -rays.r1[..., 2], -rays.r2[..., 2], -rays.dr1[..., 2], -rays.dr2[..., 2]
+    rise, drise = (rays.P2 - rays.P1)[..., 2], (rays.dP2 - rays.dP1)[..., 2]
+    q = S1 * C2 - C1 * S2
+    D = (rise * S1 * S2 + rho2 * C2 * S1 - rho1 * C1 * S2) / q
+    # -- product rule, with an axis for the four pixel coordinates
+    z, p1, p2, s1, s2, c1, c2, depth = (x[..., None] for x in (rise, rho1, rho2, S1, S2, C1, C2, D))
+    dN = drise * s1 * s2 + drho2 * c2 * s1 - drho1 * c1 * s2
+    dN += dS1 * (z * s2 + p2 * c2) + dS2 * (z * s1 - p1 * c1) + dC2 * p2 * s1 - dC1 * p1 * s2
+    dq = dS1 * c2 + s1 * dC2 - dC1 * s2 - c1 * dS2
+    return D, (dN - depth * dq) / q[..., None], q, np.maximum(rho1, rho2)
 
 
 def _rays(rig: Rig, stroke_m: ArrayLike, uv_down_px: Array, uv_up_px: Array) -> _Rays:
@@ -204,6 +211,6 @@ def _require_aligned(rig: Rig) -> None:
     tilt = np.linalg.norm(rig.stroke_axis_world[:2])
     if offset > _ALIGNED_M or tilt > _ALIGNED_M or rig.stroke_axis_world[2] < 0.0:
         raise SceneError(
-            f"depth_in_plane: sphere centre {offset:.2e} m beside the vertical through the camera, stroke axis tilted by "
-            f"{tilt:.2e} rad; both must be below {_ALIGNED_M:g}. Use depth_exact for such a rig"
+            f"depth_in_plane: sphere centre {offset:.2e} m beside the vertical through the camera, stroke axis tilted "
+            f"by {tilt:.2e} rad; both must be below {_ALIGNED_M:g}. Use depth_exact for such a rig"
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.render.translate import scene_dict
+from phibench.render.translate import load_scene, scene_dict
 from phibench.render.variant import activate
 from phibench.scenes.rig import View
 from phibench.scenes.room import Room
@@ -42,7 +42,7 @@ def render_ambient(
     if not any(surface.emits for surface in room.surfaces):
         return np.zeros((3, height, width), dtype=np.float32)
     mi = activate()
-    scene = mi.load_dict(scene_dict(mi, view, room, crop))
+    scene = load_scene(mi, scene_dict(mi, view, room, crop))
     integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 1000})
     passes = [_PASS] * (samples_per_pixel // _PASS) + [samples_per_pixel % _PASS] * (samples_per_pixel % _PASS > 0)
     seeds = np.random.SeedSequence(seed).generate_state(len(passes), dtype=np.uint32)

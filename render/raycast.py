@@ -78,7 +78,7 @@ def _plane(half: Array, o: Array, d: Array) -> Array:
 
 
 def _slabs(half: Array, o: Array, d: Array) -> Array:
-    inverse = 1.0 / d
+    inverse = 1.0 / np.where(d == 0.0, 1e-300, d)  # 1 / 0 would make NaN for a ray in a face's plane
     centre, reach = -o * inverse, half[:, None] * np.abs(inverse)
     near = (centre - reach).max(axis=0)
     far = (centre + reach).min(axis=0)

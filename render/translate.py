@@ -33,6 +33,14 @@ def scene_dict(
     return scene
 
 
+def load_scene(mi: ModuleType, scene: dict[str, Any]) -> Any:
+    """Load a scene dictionary so that lamps keep their order, and runs their bits.
+
+    Mitsuba's scene optimisation merges meshes and materials in an order that differs between loads.
+    """
+    return mi.load_dict(scene, parallel=False, optimize=False)
+
+
 def shape_key(index: int) -> str:
     """Key of the shape with an object id; sorts like the ids."""
     return f"shape_{index:04d}"

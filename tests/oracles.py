@@ -140,8 +140,9 @@ def project_cv2(camera: Camera, points_camera_m: np.ndarray) -> np.ndarray:
 def undistort_cv2(camera: Camera, uv_px: np.ndarray) -> np.ndarray:
     """Undistorted normalised coordinates, shape (N, 2), of pixels (N, 2), by OpenCV."""
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-15)
-    pixels = uv_px.reshape(-1, 1, 2)
-    return cv2.undistortPointsIter(pixels, camera_matrix(camera), distortion(camera), None, None, criteria).reshape(-1, 2)
+    solve = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # OpenCV 4 and 5
+    xy = solve(uv_px.reshape(-1, 1, 2), camera_matrix(camera), distortion(camera), R=None, P=None, criteria=criteria)
+    return xy.reshape(-1, 2)
 
 
 # -- spots in images ---------------------------------------------------------------------------------------------

@@ -241,17 +241,31 @@ def test_companions_are_the_other_libraries_of_the_same_tree(machine: Path) -> N
 
 APT = """#!/bin/sh
 echo "$(basename "$0") $*" >> "$LOG"
-state="$STATE"
-for word in "$@"; do case "$word" in Dir::State::Lists=*) state="$STATE.own";; esac; done
-case "$(basename "$0") $*" in
-  *policy*libllvm20*) test -e "$state" && echo "  Candidate: 1:20.1.2" || true;;
-  *policy*libllvm19*) test -e "$state" && echo "  Candidate: (none)" || true;;
-  *update*) test -z "$OFFLINE" || { echo "E: no network" >&2; exit 100; }; touch "$state";;
-  *-s*install*) printf 'Inst libz3-4 (4.8)\\nInst libc6 [2.36] (2.41)\\nInst libllvm20 (1:20)\\nConf libz3-4 (4.8)\\n';;
-  *download*) touch libllvm20.deb libz3-4.deb;;
-  *install*) test -e "$state" || { echo "E: Unable to locate" >&2; exit 100; }; touch "$STATE.installed";;
-  *dpkg-deb*) mkdir -p "$3/FOLDER"; echo 20.1.2 > "$3/FOLDER/$(basename "$2" .deb).so"
-     mv "$3/FOLDER/libllvm20.so" "$3/FOLDER/libLLVM.so.20.1" 2>/dev/null || true;;
+lists="$STATE"; verb=
+for word in "$@"; do
+  case "$word" in
+    Dir::State::Lists=*) lists="$STATE.own";;
+    policy|update|download|install|-x) verb="$verb$word";;
+    -s) verb=simulated-;;
+    libllvm19|libllvm20) package="$word";;
+  esac
+done
+case "$verb" in
+  policy)
+    test -e "$lists" || exit 0
+    if test "$package" = libllvm20; then echo "  Candidate: 1:20.1.2"; else echo "  Candidate: (none)"; fi;;
+  update) test -z "$OFFLINE" || { echo "E: no network" >&2; exit 100; }; touch "$lists";;
+  simulated-install)
+    echo "Inst libz3-4 (4.8)"; echo "Inst libc6 [2.36] (2.41)"; echo "Inst libllvm20 (1:20)"
+    echo "Conf libz3-4 (4.8)";;
+  install) test -e "$lists" || { echo "E: Unable to locate" >&2; exit 100; }; touch "$STATE.installed";;
+  download) touch libllvm20.deb libz3-4.deb;;
+  -x)
+    mkdir -p "$3/FOLDER"
+    case "$2" in
+      */libllvm20.deb) echo 20.1.2 > "$3/FOLDER/libLLVM.so.20.1";;
+      *) echo a companion > "$3/FOLDER/libz3-4.so";;
+    esac;;
 esac
 """.replace("FOLDER", FOLDER)
 

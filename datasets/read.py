@@ -1,0 +1,136 @@
+"""Reading a data set. Needs neither Mitsuba nor a recipe: everything comes out of the folder.
+
+>>> from phibench.datasets.read import open_dataset  # doctest: +SKIP
+>>> sample = open_dataset("out/paper")["table2-d3.180-h0.425"]  # doctest: +SKIP
+>>> sample.row.depth_m, sample.row.down.phi_ray_rad, sample.frame("down").shape  # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.datasets.codec import from_json
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.info import read_info
+from phibench.datasets.layers import SpotWindow, read_ambient, read_spot, read_truth
+from phibench.datasets.manifest import read_manifest
+from phibench.datasets.recipe import Recipe
+from phibench.datasets.recipe_faults import nearest
+from phibench.datasets.schema import DatasetInfo, ManifestRow, SpotRow
+from phibench.scenes.laser import LaserSpot
+from phibench.scenes.rig import POSITIONS, Rig, View
+from phibench.scenes.room import Room
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """An opened data set: iterate over its samples, or take one by its id.
+
+    Attributes
+    ----------
+    folder : Path
+    info : DatasetInfo
+    rig : Rig
+    room : Room
+    samples : tuple of Sample, in the order of the manifest
+    """
+
+    folder: Path
+    info: DatasetInfo
+    rig: Rig
+    room: Room
+    rows: tuple[ManifestRow, ...]
+
+    @cached_property
+    def samples(self) -> tuple[Sample, ...]:
+        """All samples."""
+        return tuple(Sample(self, row) for row in self.rows)
+
+    @cached_property
+    def recipe(self) -> Recipe:
+        """The recipe, defaults filled in."""
+        return Recipe.model_validate(self.info.recipe)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __iter__(self) -> Iterator[Sample]:
+        return iter(self.samples)
+
+    def __getitem__(self, sample_id: str) -> Sample:
+        found = next((sample for sample in self.samples if sample.row.sample_id == sample_id), None)
+        if found is None:
+            raise DatasetError(f"no sample '{sample_id}'; {nearest(sample_id, [row.sample_id for row in self.rows])}")
+        return found
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One stroke pair. `position` is "down" or "up" everywhere."""
+
+    dataset: Dataset
+    row: ManifestRow
+
+    def truth_row(self, position: str) -> SpotRow:
+        """Exact answer for the spot."""
+        if position not in POSITIONS:
+            raise DatasetError(f"position '{position}': must be 'down' or 'up'")
+        return self.row.position(position)
+
+    def view(self, position: str) -> View:
+        """Rig at that position."""
+        return self.dataset.rig.at(self.truth_row(position).offset_m)
+
+    @property
+    def laser_spot(self) -> LaserSpot:
+        """The laser spot as a scene description."""
+        laser = self.dataset.info.recipe["laser"]
+        return LaserSpot(
+            position_world_m=self.row.spot_world_m,
+            normal_world=self.row.spot_normal_world,
+            diameter_m=self.row.spot_diameter_m,
+            **{key: laser[key] for key in ("albedo", "power_w", "wavelength_nm", "profile")},
+        )
+
+    def ambient(self, position: str) -> NDArray[np.float32]:
+        """Ambient layer, shape (3, H, W), electrons per second behind R, G, B."""
+        return read_ambient(self.dataset.folder / self.truth_row(position).view_ambient_file)
+
+    def truth(self, position: str) -> dict[str, NDArray[Any]]:
+        """Truth of every pixel centre: planes of shape (H, W), NaN where there is nothing (see FORMAT.md)."""
+        return read_truth(self.dataset.folder / self.truth_row(position).view_truth_file)
+
+    def spot(self, position: str) -> SpotWindow:
+        """Spot layer; an empty window where no light of the spot reaches the image."""
+        name = self.truth_row(position).spot_file
+        return SpotWindow.empty() if name is None else read_spot(self.dataset.folder / name)
+
+    def frame(self, position: str, laser: bool = True) -> NDArray[np.float64]:
+        """Noise-free frame, shape (3, H, W), electrons per second: ambient, plus the spot if `laser`."""
+        image = self.ambient(position).astype(float)
+        if laser:
+            self.spot(position).add_to(image)
+        return image
+
+
+def open_dataset(folder: str | Path) -> Dataset:
+    """Open a data set; layers are read when they are asked for.
+
+    Raises
+    ------
+    DatasetError
+        If the folder is missing, not a data set, of another schema version, or its manifest is damaged.
+    """
+    folder = Path(folder)
+    info = read_info(folder)
+    rows = tuple(read_manifest(folder))
+    if len(rows) != info.samples:
+        raise DatasetError(f"{folder}: the manifest has {len(rows)} rows instead of {info.samples}")
+    return Dataset(folder, info, from_json(Rig, info.rig), from_json(Room, info.room), rows)

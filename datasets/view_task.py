@@ -1,0 +1,43 @@
+"""One mirror pose, rendered in a worker process: ambient layer, truth layer, preview."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from phibench.datasets import layout
+from phibench.datasets.layers import write_ambient, write_truth
+from phibench.datasets.plan import PosePlan
+from phibench.datasets.preview import exposure_s, save_png, to_srgb
+from phibench.datasets.recipe import AmbientTable
+from phibench.scenes.rig import Rig
+from phibench.scenes.room import Room
+
+
+def start_renderer() -> dict[str, Any]:
+    """Switch Mitsuba on in this process; return what it runs on."""
+    from phibench.render.llvm import find_llvm
+    from phibench.render.variant import THREADS, activate
+
+    variant = activate().variant()
+    llvm = find_llvm().label if variant.startswith("llvm") else None
+    return {"variant": variant, "llvm": llvm, "threads_per_process": THREADS}
+
+
+def render_view(dataset: str, rig: Rig, room: Room, pose: PosePlan, ambient: AmbientTable, out: Path) -> str:
+    """Render one pose and write its three files below `out`; return the pose's id."""
+    from phibench.render.ambient import render_ambient
+    from phibench.render.truth import truth_layer
+    from phibench.render.variant import activate
+
+    activate()
+    view = rig.at(pose.offset_m)
+    header = {"dataset": dataset, "pose": pose.pose_id, "offset_m": pose.offset_m}
+    planes = render_ambient(view, room, ambient.samples_per_pixel, ambient.max_depth, pose.seed)
+    settings = {**ambient.model_dump(), "seed": pose.seed}
+    write_ambient(out / layout.view_file(pose.pose_id, "ambient"), planes, {**header, **settings})
+    write_truth(out / layout.view_file(pose.pose_id, "truth"), truth_layer(view, room.shapes(view)), header)
+    detector = rig.camera.detector
+    picture = to_srgb(planes, detector, exposure_s(planes, detector))
+    save_png(out / layout.view_file(pose.pose_id, "preview"), picture)
+    return pose.pose_id

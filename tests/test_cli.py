@@ -1,0 +1,96 @@
+"""The command line: exit codes, one sentence per mistake, no traceback, no Mitsuba where none is needed."""
+
+from __future__ import annotations
+
+import pytest
+
+from phibench.datasets.errors import DatasetError, RecipeError
+from phibench.datasets.verify import Report
+from phibench.estimator import cli
+from phibench.scenes.checks import SceneError
+
+
+def run_with(monkeypatch, error):
+    """Run `phibench dataset verify x` with a verification that raises."""
+
+    def fail(directory):
+        raise error
+
+    monkeypatch.setattr("phibench.datasets.verify.verify", fail)
+    return cli.main(["dataset", "verify", "x"])
+
+
+@pytest.mark.parametrize(
+    ("error", "sentence"),
+    [
+        (SceneError("Stroke.stroke_m = 0: must be above 0"), "Stroke.stroke_m = 0: must be above 0"),
+        (DatasetError("no manifest"), "no manifest"),
+        (RecipeError("unknown key"), "unknown key"),
+        (OSError(28, "No space left on device", "/out/x.exr"), "No space left on device: /out/x.exr"),
+        (OSError("gone"), "gone"),
+    ],
+)
+def test_mistakes_end_in_one_sentence(monkeypatch, capsys, error, sentence):
+    assert run_with(monkeypatch, error) == 2
+    out, err = capsys.readouterr()
+    assert err == f"phibench: {sentence}\n"
+    assert out == ""
+
+
+@pytest.mark.parametrize(("faults", "code"), [((), 0), (("a.exr is damaged", "b.exr is missing"), 1)])
+def test_verify_prints_every_fault(monkeypatch, capsys, faults, code):
+    monkeypatch.setattr("phibench.datasets.verify.verify", lambda directory: Report(faults, 9, 3))
+    assert cli.main(["dataset", "verify", "x"]) == code
+    assert capsys.readouterr().out.splitlines() == [*faults, f"x: 9 files, 3 samples, {len(faults)} faults"]
+
+
+def test_interrupt_is_130(monkeypatch, capsys):
+    assert run_with(monkeypatch, KeyboardInterrupt()) == 130
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_fault_of_ours_is_not_hidden(monkeypatch):
+    with pytest.raises(ValueError, match="ours"):
+        run_with(monkeypatch, ValueError("ours"))
+
+
+@pytest.mark.parametrize("tokens", [["dataset", "verify"], ["scroe", "x"], ["score", "x", "--colour", "red"]])
+def test_unknown_words_are_2(tokens, capsys):
+    assert cli.main(tokens) == 2
+    out, err = capsys.readouterr()
+    assert "Traceback" not in out + err
+    assert out + err
+
+
+def test_score_of_a_folder_that_is_not_there(tmp_path, capsys):
+    assert cli.main(["score", str(tmp_path / "nothing")]) == 2
+    assert "nothing" in capsys.readouterr().err
+
+
+def test_doctor_returns_its_exit_code(monkeypatch):
+    def run(command, **options):
+        assert command[1:] == ["-m", "phibench.render.doctor"]
+        return type("Done", (), {"returncode": 3})
+
+    monkeypatch.setattr(cli.subprocess, "run", run)
+    assert cli.main(["doctor"]) == 3
+
+
+@pytest.mark.parametrize("command", ["score", "doctor", "dataset"])
+def test_help_names_every_command(command, capsys):
+    assert cli.main(["--help"]) == 0
+    assert command in capsys.readouterr().out
+
+
+def test_help_and_score_load_no_renderer(python):
+    code = """
+import sys
+from phibench.estimator import cli
+cli.main(["--help"])
+heavy = {"numpy", "scipy", "pydantic", "mitsuba"} & set(sys.modules)
+assert not heavy, heavy
+cli.main(["score", "nowhere"])
+assert not {"mitsuba", "drjit"} & set(sys.modules)
+"""
+    done = python(code)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,68 @@
+"""Mitsuba is switched on once, with the right LLVM and one thread, or says in one sentence why not."""
+
+import subprocess
+from collections.abc import Callable
+
+import pytest
+
+Python = Callable[..., subprocess.CompletedProcess[str]]
+ACTIVATE = "from phibench.render.variant import activate; mi = activate()\n"
+SUMS = """
+import sys, drjit as dr
+from drjit.llvm import Float, PCG32
+if len(sys.argv) > 1: dr.set_thread_count(int(sys.argv[1]))
+lots = PCG32(4_000_000)
+cell, value = lots.next_uint32() % 3, lots.next_float32()
+cells = dr.zeros(Float, 3)
+dr.scatter_add(cells, dr.sin(value), cell)
+print(*(float(x).hex() for x in cells), float(dr.sum(value, axis=None)[0]).hex())
+"""
+
+
+def test_one_thread_and_no_helpers(python: Python) -> None:
+    code = ACTIVATE + SUMS + "import os\nprint(dr.thread_count(), mi.variant())"
+    child = python(code)
+    assert child.returncode == 0, child.stderr
+    assert child.stdout.splitlines()[-1] == "1 llvm_ad_rgb"
+
+
+def test_two_processes_agree_to_the_last_bit(python: Python) -> None:
+    """A million float32 terms per cell: any other order of adding shows in the last bits."""
+    outputs = {python(ACTIVATE + SUMS).stdout for _ in range(3)}
+    assert len(outputs) == 1
+    assert len(outputs.pop().split()) == 4
+
+
+def test_the_sums_depend_on_the_order(python: Python) -> None:
+    """The opposite: with helpers the same code gives other bits, so that the test above could have failed."""
+    assert python(ACTIVATE + SUMS, "4").stdout != python(ACTIVATE + SUMS).stdout
+
+
+def test_again_is_nothing_and_another_is_refused(python: Python) -> None:
+    code = ACTIVATE + "assert activate() is mi\nactivate('scalar_rgb')"
+    child = python(code)
+    assert child.stderr.splitlines()[-1].endswith(
+        "this process renders with llvm_ad_rgb and cannot change to scalar_rgb: start another process for that."
+    )
+
+
+def test_the_environment_overrules(python: Python) -> None:
+    child = python(ACTIVATE + "print(mi.variant())", PHIBENCH_VARIANT="scalar_rgb", DRJIT_LIBLLVM_PATH="/nowhere")
+    assert (child.returncode, child.stdout.strip()) == (0, "scalar_rgb"), child.stderr
+
+
+@pytest.mark.parametrize(
+    ("code", "environment", "complaint"),
+    [
+        ("import sys; sys.modules['mitsuba'] = None\n" + ACTIVATE, {}, "run `pip install 'phibench[render]'`."),
+        (ACTIVATE, {"PHIBENCH_VARIANT": "llvm_nonsense"}, "Mitsuba has no variant llvm_nonsense: choose one of "),
+        (ACTIVATE, {"DRJIT_LIBLLVM_PATH": "/nowhere"}, "DRJIT_LIBLLVM_PATH names /nowhere, which is not a file"),
+        ("import drjit\n" + ACTIVATE, {"DRJIT_LIBLLVM_PATH": ""}, "Dr.Jit was imported before its LLVM was chosen"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(
+    python: Python, code: str, environment: dict[str, str], complaint: str
+) -> None:
+    child = python(code, **environment)
+    assert child.returncode == 1
+    assert complaint in child.stderr.splitlines()[-1]
