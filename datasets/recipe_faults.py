@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 Schema = dict[str, Any]
 Location = tuple[str | int, ...]
@@ -32,8 +33,14 @@ def structural_faults(model: type[BaseModel], raw: object) -> list[Fault]:
         model.model_validate(raw)
     except ValidationError as error:
         schema = model.model_json_schema()
-        return [_fault(schema, details["type"], details["loc"], details["input"]) for details in error.errors()]
+        found = [details for details in error.errors() if not _follows(details)]
+        return [_fault(schema, details["type"], details["loc"], details["input"]) for details in found]
     return []
+
+
+def _follows(details: ErrorDetails) -> bool:
+    """Whether a list is called too short only because its faulty entries were not counted."""
+    return details["type"] == "too_short" and len(details["input"]) >= details["ctx"]["min_length"]
 
 
 def path_text(location: Sequence[str | int]) -> str:

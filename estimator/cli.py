@@ -148,14 +148,13 @@ def _sentence(error: Exception) -> str:
 
 
 def _write_scores(out: Path, directory: Path, scores: Sequence[Score]) -> None:
-    from importlib.metadata import version
-
     from phibench.datasets.files import write_text
+    from phibench.datasets.provenance import provenance
     from phibench.estimator.score import as_records, summarise
 
     document = {
         "dataset": str(directory),
-        "versions": {name: version(name) for name in ("phibench", "numpy")},
+        "provenance": provenance(),
         "unit": "metre; relative errors are fractions of the true depth; null where there is no estimate",
         "summary": as_records(summarise(scores)),
         "scores": as_records(scores),

@@ -120,7 +120,8 @@ def _first_hit(view: View, uv_px: Array) -> _Hit:
     d = view.rig.camera.rays(uv_px)
     b = np.sum(d * s, axis=-1, keepdims=True)
     miss2 = np.sum(np.cross(d, s) ** 2, axis=-1, keepdims=True)  # squared distance of the ray from the sphere centre
-    root = np.sqrt(np.where(b > 0.0, radius**2 - miss2, -1.0))
+    # NaN where the line misses; a line that hits does so ahead, because a Rig has its whole sphere before the camera
+    root = np.sqrt(radius**2 - miss2)
     # t^2 - 2 b t + c = 0; the near root b - root loses digits, c / (b + root) does not
     t = (s @ s - radius**2) / (b + root)
     P = t * d - s

@@ -170,8 +170,8 @@ def bias_table(scores: Sequence[Score]) -> Table:
         grid.add_column(head, justify="left" if head == "phi" else "right")
     for item in summarise(scores):
         if item.source == "truth" and item.estimator.startswith("paper_"):
-            values = (f"{100.0 * value:+.3f}" for value in (item.minimum, item.maximum, item.mean, item.rms))
-            grid.add_row(item.estimator.removeprefix("paper_"), str(item.n), *values)
+            values = (_percent(value) for value in (item.minimum, item.maximum, item.mean))
+            grid.add_row(item.estimator.removeprefix("paper_"), str(item.n), *values, _rms(item.rms))
     return grid
 
 
@@ -239,14 +239,18 @@ def _percent(relative: float) -> str:
     return f"{percent:+.3f}" if abs(percent) >= 1e-3 or percent == 0.0 else f"{percent:+.0e}"
 
 
+def _rms(relative: float) -> str:
+    return _percent(relative).removeprefix("+")
+
+
 def _rms_cells(scores: Sequence[Score], source: str) -> list[str]:
-    return [f"{_percent(s.rms)} ({s.n})" for s in summarise(scores) if s.source == source]
+    return [f"{_rms(s.rms)} ({s.n})" for s in summarise(scores) if s.source == source]
 
 
 def _published_rms(rows: list[list[Score]]) -> str:
     relative = np.array([items[0].published_m / items[0].depth_m - 1.0 for items in rows])
     relative = relative[np.isfinite(relative)]
-    return f"{_percent(float(np.sqrt(np.mean(relative**2))))} ({len(relative)})" if len(relative) else "-"
+    return f"{_rms(float(np.sqrt(np.mean(relative**2))))} ({len(relative)})" if len(relative) else "-"
 
 
 def _json_value(value: object) -> object:

@@ -21,3 +21,19 @@ def python() -> Callable[..., subprocess.CompletedProcess[str]]:
         return subprocess.run(command, cwd=ROOT, env=merged, capture_output=True, text=True, timeout=300, check=False)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def tiny_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Data set of `tests/tiny.toml`, rendered once by two workers. Read only: copy it to change it."""
+    from phibench.datasets.make import make
+
+    return make(ROOT / "tests" / "tiny.toml", tmp_path_factory.mktemp("tiny") / "out", workers=2)
+
+
+@pytest.fixture(scope="session")
+def smoke_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Data set of the shipped recipe `smoke`, rendered once. Read only: copy it to change it."""
+    from phibench.datasets.make import make
+
+    return make("smoke", tmp_path_factory.mktemp("smoke") / "out", workers=2)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import math
+
 import pytest
 
 from phibench.datasets.errors import DatasetError, RecipeError
 from phibench.datasets.verify import Report
 from phibench.estimator import cli
+from phibench.estimator.score import Score
 from phibench.scenes.checks import SceneError
 
 
@@ -65,6 +69,19 @@ def test_unknown_words_are_2(tokens, capsys):
 def test_score_of_a_folder_that_is_not_there(tmp_path, capsys):
     assert cli.main(["score", str(tmp_path / "nothing")]) == 2
     assert "nothing" in capsys.readouterr().err
+
+
+def test_scores_are_written_to_a_file(monkeypatch, tmp_path, capsys):
+    scores = (Score("a", "mine", 2.0, 0.5, "exact", "truth", 2.1, 0.1, 0.05, math.nan, "ok"),)
+    monkeypatch.setattr("phibench.datasets.read.open_dataset", lambda directory: None)
+    monkeypatch.setattr("phibench.estimator.score.score", lambda dataset: scores)
+    assert cli.main(["score", "x", "--out", str(tmp_path / "scores.json")]) == 0
+    document = json.loads((tmp_path / "scores.json").read_text())
+    assert document["scores"][0]["estimate_m"] == 2.1
+    assert document["scores"][0]["published_m"] is None
+    assert document["summary"][0]["rms"] == pytest.approx(0.05)
+    assert "numpy" in document["provenance"]["packages"]
+    assert "2.1000" in capsys.readouterr().out
 
 
 def test_doctor_returns_its_exit_code(monkeypatch):

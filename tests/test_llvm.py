@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from phibench.render import llvm, llvm_apt, llvm_library
-from phibench.render.llvm_library import Llvm, LlvmError, Version
+from phibench.render.llvm_library import Llvm, LlvmError
 
 Python = Callable[..., subprocess.CompletedProcess[str]]
 FOLDER = "usr/lib/x86_64-linux-gnu"
@@ -365,25 +365,6 @@ def test_a_cache_that_cannot_be_written_is_one_sentence(tools: Path, monkeypatch
     assert one_sentence(caught.value)
 
 
-def test_the_cache_folder_follows_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PHIBENCH_CACHE", "/a")
-    monkeypatch.setenv("XDG_CACHE_HOME", "/b")
-    monkeypatch.setenv("HOME", "/c")
-    assert llvm_library.cache_folder() == Path("/a/llvm")
-    monkeypatch.delenv("PHIBENCH_CACHE")
-    assert llvm_library.cache_folder() == Path("/b/phibench/llvm")
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    assert llvm_library.cache_folder() == Path("/c/.cache/phibench/llvm")
-
-
-@pytest.mark.parametrize(
-    ("name", "hint"),
-    [("libLLVM-14.so.1", 14), ("libLLVM.so.19.1", 19), ("libLLVM-19.so", 19), ("libLLVM.so", 0), ("libLLVM.dylib", 0)],
-)
-def test_hints(name: str, hint: int) -> None:
-    assert llvm_library.version_hint(Path(name)) == hint
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(not llvm_apt.is_offered(), reason="fetching is for machines with apt-get; others install by hand")
 def test_a_real_fetch_without_root_is_found_and_proven(machine: Path) -> None:
@@ -398,10 +379,3 @@ def test_a_real_fetch_without_root_is_found_and_proven(machine: Path) -> None:
     assert found.is_proven
     assert [path.name for path in llvm_library.cache_folder().iterdir()] == [tree.name]
     shutil.rmtree(tree)
-
-
-def test_versions_are_compared_as_numbers() -> None:
-    versions: list[Version] = [(16, 0, 6), (17, 0, 0), (19, 0, 0), (100, 0, 0)]
-    found = [Llvm(Path("x"), version) for version in versions]
-    assert [one.is_candidate for one in found] == [False, True, True, True]
-    assert [one.is_proven for one in found] == [False, False, True, True]

@@ -1,0 +1,100 @@
+"""Nothing half-written ever stands under a final name."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from phibench.datasets import files
+from phibench.datasets.exr import write_exr
+from phibench.datasets.files import TEMPORARY_PREFIX, remove_temporary, sha256, write_atomic, write_bytes, write_text
+
+
+def test_bytes_text_and_hash(tmp_path: Path) -> None:
+    path = write_text(tmp_path / "deep" / "er" / "a.txt", "é\n")
+    assert path.read_bytes() == b"\xc3\xa9\n"
+    assert sha256(write_bytes(path, b"abc")) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert [p.name for p in path.parent.iterdir()] == ["a.txt"]
+
+
+def test_permissions_are_those_of_an_ordinary_file(tmp_path: Path) -> None:
+    (tmp_path / "plain").write_bytes(b"")
+    made = write_bytes(tmp_path / "made", b"")
+    assert made.stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def full_disk(*_: object) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def interrupted(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("stop", [full_disk, interrupted])
+@pytest.mark.parametrize("place", ["write", "fsync", "replace"])
+def test_any_failure_leaves_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: Callable[..., None], place: str
+) -> None:
+    path = write_bytes(tmp_path / "a", b"old")
+    if place == "fsync":
+        monkeypatch.setattr(files.os, "fsync", stop)
+    elif place == "replace":
+        monkeypatch.setattr(Path, "replace", stop)
+
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(b"new, and only a pa")
+        if place == "write":
+            stop()
+
+    with pytest.raises((OSError, KeyboardInterrupt)):
+        write_atomic(path, write)
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs resource limits")
+def test_a_full_disk_while_an_exr_is_written(tmp_path: Path) -> None:
+    """A limit on the file size makes write(2) fail half-way, as a full disk does, without being root."""
+    code = (
+        "import resource, sys, numpy\nfrom pathlib import Path\nfrom phibench.datasets.exr import write_exr\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))\n"
+        "write_exr(Path(sys.argv[1]), {'A': numpy.random.default_rng(0).random((200, 200))}, {})"
+    )
+    old = write_exr(tmp_path / "a.exr", {"A": np.zeros((2, 2))}, {}).read_bytes()
+    child = subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.exr")], capture_output=True, text=True)
+    assert "OSError" in child.stderr
+    assert (tmp_path / "a.exr").read_bytes() == old
+    assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+def test_control_c_in_a_real_process(tmp_path: Path) -> None:
+    code = (
+        "import sys, time\nfrom pathlib import Path\nfrom phibench.datasets.files import write_atomic\n"
+        "def write(path):\n    path.write_bytes(b'half')\n    print('writing', flush=True)\n    time.sleep(60)\n"
+        "write_atomic(Path(sys.argv[1]), write)"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "a")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "writing\n"
+        assert len(list(tmp_path.iterdir())) == 1
+        child.send_signal(signal.SIGINT)
+        _, errors = child.communicate(timeout=30)
+    assert "KeyboardInterrupt" in errors
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_killed_run_left_is_removed(tmp_path: Path) -> None:
+    keep = write_bytes(tmp_path / "x" / "keep", b"")
+    left = tmp_path / "x" / f"{TEMPORARY_PREFIX}abc.exr"
+    left.write_bytes(b"")
+    remove_temporary(tmp_path)
+    assert keep.exists()
+    assert not left.exists()

@@ -1,0 +1,81 @@
+"""FORMAT.md and the code say the same, in both directions."""
+
+import re
+from pathlib import Path
+
+import pytest
+from phibench.datasets import layers, layout, schema
+from phibench.render import spot_truth, truth
+from phibench.scenes.detector import FILTERS
+from pydantic import BaseModel
+
+PAGE = (Path(schema.__file__).resolve().with_name("FORMAT.md")).read_text(encoding="utf-8")
+MODELS = (schema.ManifestRow, schema.SpotRow, schema.CertificateRow, schema.DatasetInfo, schema.PoseInfo)
+
+
+def tables() -> list[list[list[str]]]:
+    """All tables of the page: rows of cells, heading first."""
+    blocks = re.findall(r"(?:^\|.*\|\n)+", PAGE, flags=re.MULTILINE)
+    return [[[cell.strip() for cell in line[1:-1].split("|")] for line in block.splitlines()] for block in blocks]
+
+
+def field_tables() -> list[list[list[str]]]:
+    return [table[2:] for table in tables() if table[0] == ["field", "type", "unit", "meaning"]]
+
+
+def table_with(*heading: str) -> list[list[str]]:
+    """Rows of all tables with that heading."""
+    return [row for table in tables() if table[0] == list(heading) for row in table[2:]]
+
+
+def names(cell: str) -> list[str]:
+    return re.findall(r"`([^`]+)`", cell)
+
+
+def test_there_is_one_table_per_document() -> None:
+    assert len(field_tables()) == len(MODELS)
+
+
+@pytest.mark.parametrize("index", range(len(MODELS)), ids=lambda i: MODELS[i].__name__)
+def test_fields_and_units(index: int) -> None:
+    model: type[BaseModel] = MODELS[index]
+    said = [(name, row[2]) for row in field_tables()[index] for name in names(row[0])]
+    meant = [(name, field.json_schema_extra["unit"]) for name, field in model.model_fields.items()]  # type: ignore[index]
+    assert said == meant
+    assert all(field.description for field in model.model_fields.values())
+
+
+@pytest.mark.parametrize("index", range(len(MODELS)), ids=lambda i: MODELS[i].__name__)
+def test_types(index: int) -> None:
+    kinds = {"string": "str", "double": "float", "3 doubles": "tuple", "2 doubles": "tuple", "bool": "bool", "integer": "int"}
+    for name, kind, *_ in field_tables()[index]:
+        annotation = str(MODELS[index].model_fields[names(name)[0]].annotation)
+        assert kinds.get(kind.removesuffix(" or null"), "") in annotation
+        assert ("None" in annotation) == ("null" in kind), name
+
+
+def test_files() -> None:
+    said = {name for row in table_with("file", "content") for name in names(row[0])}
+    views = {layout.view_file("POSE", name) for name in ("ambient", "truth", "preview")}
+    spots = {layout.spot_file("SAMPLE", position) for position in ("down", "up")}
+    single = {layout.INFO, layout.MANIFEST, layout.TABLE, layout.RECIPE, layout.SUMS, layout.RUN, layout.CONTACT_SHEET}
+    assert said == views | spots | single | {layout.preview_file("SAMPLE")}
+
+
+def test_planes() -> None:
+    said = [name for row in table_with("plane", "unit", "meaning") for name in names(row[0])]
+    assert tuple(said) == layers.TRUTH_PLANES == truth.TRUTH_PLANES
+    spots = [name for row in table_with("planes", "unit", "meaning") for name in names(row[0])]
+    assert tuple(spots) == layers.SPOT_PLANES
+    assert "`R`, `G`, `B`" in PAGE
+    assert FILTERS == ("R", "G", "B")
+
+
+def test_causes() -> None:
+    said = {name for row in table_with("cause", "meaning") for name in names(row[0])}
+    meant = {spot_truth.VISIBLE, spot_truth.NO_REFLECTION, spot_truth.FACES_AWAY, spot_truth.OUTSIDE}
+    assert said == meant | {spot_truth.OCCLUDED + "OBJECT"}
+
+
+def test_version() -> None:
+    assert f"schema version {schema.SCHEMA_VERSION}" in PAGE.splitlines()[0]

@@ -1,0 +1,158 @@
+"""Recipes: every fault in one go, with path, value, range and advice."""
+
+import math
+from typing import Any
+
+import pytest
+from phibench.datasets.errors import RecipeError
+from phibench.datasets.recipe import Recipe, recipe_schema
+from phibench.datasets.recipe_checks import warnings
+from phibench.datasets.recipe_file import RECIPES, check_recipe, load_recipe, parse_recipe
+from phibench.datasets.recipe_scene import build_rig, build_spot
+from phibench.scenes.catalog import c310_rig, default_rig
+
+SOUND: dict[str, Any] = {
+    "dataset": {"name": "x"},
+    "targets": [{"name": "a", "depth_m": 2.0, "azimuth_deg": 10.0, "height_m": 0.5}],
+    "experiments": [{"name": "e", "targets": ["a"], "strokes_m": [0.4]}],
+}
+
+
+def changed(**tables: Any) -> dict[str, Any]:
+    return {**SOUND, **tables}
+
+
+def complaints(raw: dict[str, Any]) -> list[str]:
+    with pytest.raises(RecipeError) as caught:
+        check_recipe(raw)
+    head, *lines = str(caught.value).splitlines()
+    assert head.startswith(f"recipe has {len(lines)} fault")
+    return [line.strip() for line in lines]
+
+
+def target(**values: Any) -> dict[str, Any]:
+    return {**SOUND["targets"][0], **values}
+
+
+def experiment(**values: Any) -> dict[str, Any]:
+    return {**SOUND["experiments"][0], **values}
+
+
+@pytest.mark.parametrize("path", sorted(RECIPES.glob("*.toml")), ids=lambda path: path.stem)
+def test_shipped_recipes_are_sound_and_give_no_warning(path: Any) -> None:
+    assert warnings(load_recipe(path)) == []
+
+
+def test_a_shipped_recipe_is_found_by_its_name() -> None:
+    assert load_recipe("paper").dataset.name == "paper"
+
+
+def test_defaults_are_the_default_rig_and_the_presets_theirs() -> None:
+    assert build_rig(check_recipe(SOUND).rig) == default_rig()
+    assert build_rig(check_recipe(changed(rig={"preset": "c310"})).rig) == c310_rig()
+
+
+def test_what_is_implied_follows_what_is_given() -> None:
+    rig = build_rig(check_recipe(changed(rig={"z_c_m": 0.30, "radius_m": 0.05, "width_px": 640, "height_px": 480})).rig)
+    assert rig.camera.focus_distance_m == pytest.approx(0.275)
+    assert (rig.camera.cx_px, rig.camera.cy_px) == (319.5, 239.5)
+    given = build_rig(check_recipe(changed(rig={"z_c_m": 0.30, "focus_distance_m": 0.46})).rig)
+    assert given.camera.focus_distance_m == 0.46
+
+
+def test_a_tilted_camera_leaves_the_mirror_where_it_is() -> None:
+    rig = build_rig(check_recipe(changed(rig={"tilt_x_rad": 0.02, "tilt_y_rad": -0.03, "decentre_x_m": 0.001})).rig)
+    assert rig.at(0.0).sphere_centre_m == pytest.approx([0.001, 0.0, 0.71], abs=1e-15)
+    assert rig.T_world_camera.R[2, 2] < 1.0
+
+
+def test_the_spot_grows_with_distance_or_has_one_diameter() -> None:
+    recipe = check_recipe(SOUND)
+    assert build_spot(recipe.laser, recipe.targets[0]).diameter_m == pytest.approx(5e-3)
+    fixed = check_recipe(changed(laser={"diameter_m": 0.01}))
+    assert build_spot(fixed.laser, fixed.targets[0]).diameter_m == 0.01
+
+
+@pytest.mark.parametrize(
+    ("raw", "path", "words"),
+    [
+        (changed(dataset={}), "dataset.name", ("missing", "string")),
+        (changed(dataset={"name": "a/b"}), "dataset.name", ("'a/b'", "letters")),
+        (changed(dataset={"name": "x", "seed": -1}), "dataset.seed", ("-1", "from 0")),
+        (changed(dataset={"name": "x", "sed": 1}), "dataset.sed", ("unknown", "'seed'")),
+        (changed(rig={"z_c": 0.3}), "rig.z_c", ("unknown", "'z_c_m'")),
+        (changed(rig={"preset": "defalt"}), "rig.preset", ("'default', 'c310'",)),
+        (changed(rig={"k1": math.nan}), "rig.k1", ("nan", "from -1000 up to 1000")),
+        (changed(rig={"f_number": True}), "rig.f_number", ("True", "a number from 0.5")),
+        (changed(rig={"z_c_m": "0.3"}), "rig.z_c_m", ("'0.3'", "a number above 0")),
+        (changed(rig={"z_c_m": 0.05}), "rig", ("0.0500 m", "mirror radius")),
+        (changed(room={"name": "kitchen"}), "room.name", ("'lab', 'dark'",)),
+        (changed(roooms={}), "roooms", ("unknown", "'room'")),
+        (changed(laser={"diameter_m": 0.01, "diameter_base_m": 0.01}), "laser.diameter_m", ("one or the other",)),
+        (changed(laser={"power_w": 0.0}), "laser.power_w", ("above 0",)),
+        (changed(ambient={"samples_per_pixel": 1.5}), "ambient.samples_per_pixel", ("an integer from 1",)),
+        (changed(targets=[target(depth_m=-2.0)]), "targets[0].depth_m", ("-2.0", "above 0")),
+        (changed(targets=[target(depth_m=math.inf)]), "targets[0].depth_m", ("inf", "up to 100")),
+        (changed(targets=[target(), target(name="A")]), "targets[1].name", ("targets[0]",)),
+        (changed(targets=[target(depth_m=0.2, height_m=0.2)]), "targets[0]", ("robot_body",)),
+        (changed(targets=[target(depth_m=4.45, azimuth_deg=160.0)]), "targets[0]", ("cabinet",)),
+        (changed(targets=[target(depth_m=9.0)]), "targets[0]", ("outside the room",)),
+        (changed(experiments=[experiment(targets=["b"])]), "experiments[0].targets[0]", ("'b'", "known: a")),
+        (changed(experiments=[experiment(targets=[])]), "experiments[0].targets", ("at least 1",)),
+        (changed(experiments=[experiment(strokes_m=[0.0])]), "experiments[0].strokes_m[0]", ("0.0", "above 0")),
+        (changed(experiments=[experiment(strokes_m=[0.3, -1])]), "experiments[0].strokes_m[1]", ("-1",)),
+        (changed(experiments=[experiment(strokes_m=[math.nan])]), "experiments[0].strokes_m[0]", ("nan",)),
+        (changed(experiments=[experiment(strokes_m=[0.3, 0.3])]), "experiments[0].strokes_m[1]", ("twice",)),
+        (changed(experiments=[experiment(strokes_m=[2.5])]), "experiments[0].strokes_m[0]", ("ceiling", "2.210")),
+    ],
+)
+def test_each_fault_is_one_line_that_helps(raw: dict[str, Any], path: str, words: tuple[str, ...]) -> None:
+    [line] = complaints(raw)
+    assert line.startswith(f"{path}: ")
+    assert [word for word in words if word not in line] == []
+
+
+def test_all_faults_come_in_one_go() -> None:
+    lines = complaints(
+        {
+            "dataset": {"name": "x", "seed": -1},
+            "rig": {"presett": "default", "k1": math.nan},
+            "laser": {"profile": "gauss", "diameter_m": 0.01, "diameter_base_m": 0.01},
+            "targets": [target(depth_m=0.2, height_m=0.2), target()],
+            "experiments": [{"name": "e", "targets": ["c"], "strokes_m": [0.0, 2.5]}],
+        }
+    )
+    paths = {line.split(": ")[0] for line in lines}
+    assert paths == {
+        *("dataset.seed", "rig.presett", "rig.k1", "laser.profile", "laser.diameter_m", "targets[0]", "targets[1].name"),
+        *("experiments[0].targets[0]", "experiments[0].strokes_m[0]", "experiments[0].strokes_m[1]"),
+    }
+
+
+@pytest.mark.parametrize("raw", [{}, {"targets": 3, "experiments": "x"}, {"targets": [1], "rig": 2, "laser": []}])
+def test_nonsense_is_reported_and_never_raises_anything_else(raw: dict[str, Any]) -> None:
+    assert len(complaints(raw)) >= 3
+
+
+def test_toml_and_file_faults(tmp_path: Any) -> None:
+    with pytest.raises(RecipeError, match=r"line 1, column"):
+        parse_recipe("a = = 1")
+    with pytest.raises(RecipeError, match="smoke"):
+        load_recipe(tmp_path / "smok")
+    (tmp_path / "latin.toml").write_bytes(b"# \xe9")
+    with pytest.raises(RecipeError, match="cannot be read"):
+        load_recipe(tmp_path / "latin.toml")
+
+
+def test_a_mirror_beyond_the_image_is_a_warning() -> None:
+    [warning] = warnings(check_recipe(changed(rig={"z_c_m": 0.2})))
+    assert "does not fit the image" in warning
+
+
+def test_a_board_that_nobody_uses_is_a_warning() -> None:
+    [warning] = warnings(check_recipe(changed(targets=[target(), target(name="b", azimuth_deg=90.0)])))
+    assert "b stand" in warning
+
+
+def test_the_schema_for_editors_knows_every_table() -> None:
+    assert set(recipe_schema()["properties"]) == set(Recipe.model_fields)
