@@ -57,11 +57,15 @@ def check_disk(out: Path, needed: int) -> None:
 
 
 def is_complete(out: Path, info: DatasetInfo) -> bool:
-    """Whether the folder holds exactly this data set, made by this code, undamaged."""
-    path = out / layout.INFO
-    if not (out / layout.SUMS).is_file() or not path.is_file():
+    """Whether the folder holds exactly this data set, made by this code, undamaged; the commit does not count."""
+    if not (out / layout.SUMS).is_file() or not (out / layout.INFO).is_file():
         return False
-    return path.read_text(encoding="utf-8", errors="replace") == info_text(info) and not damaged(out)
+    return _content(read_info(out)) == _content(info) and not damaged(out)
+
+
+def _content(info: DatasetInfo) -> str:
+    provenance = {key: value for key, value in info.provenance.items() if key != "commit"}
+    return info_text(info.model_copy(update={"provenance": provenance}))
 
 
 def _refuse_other(out: Path, name: str, recipe_hash: str) -> None:

@@ -66,6 +66,8 @@ def verify(folder: str | Path, truth_layers: bool = True, console: Console | Non
         If the folder is not a data set at all.
     """
     folder, console = Path(folder), console or Console(stderr=True)
+    if not (folder / layout.INFO).is_file():
+        raise DatasetError(f"{folder} is not a data set: it has no {layout.INFO}")
     try:
         faults, files = damaged(folder), len(read_sums(folder))
     except DatasetError as error:
@@ -73,8 +75,6 @@ def verify(folder: str | Path, truth_layers: bool = True, console: Console | Non
     try:
         dataset = open_dataset(folder)
     except DatasetError as error:
-        if not faults:
-            raise
         return Report((*faults, str(error)), files, 0)
     bad = {fault.split(" is ", 1)[0] for fault in faults}
     faults += [*_plan_faults(dataset), *differences(folder, dataset.rows)]

@@ -1,6 +1,6 @@
 """Draw docs/geometry.png: what D and the three phi are. Run `python docs/draw_geometry.py`.
 
-The rays are solved, not sketched; mirror, lens distance and stroke are enlarged against the room so that the angles show.
+The rays are solved, not sketched; mirror, lens distance and stroke are enlarged against the room: the angles show.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The C310 as one Mitsuba sensor: thin lens, focus, Brown distortion, principal point, Gaussian blur, electrons.
 
-Mitsuba's film coordinate is u + 0.5 (pixel centres at half integers); the scene is in millimetres with the origin at the
-sphere centre. Each ray's weight is its etendue times electrons per joule, so that an image of radiance in W/(m^2 sr) comes
-out in expected photo-electrons per second per pixel.
+Mitsuba's film coordinate is u + 0.5 (pixel centres at half integers); the scene is in millimetres with the origin at
+the sphere centre. Each ray's weight is its etendue times electrons per joule, so that an image of radiance in
+W/(m^2 sr) comes out in expected photo-electrons per second per pixel.
 """
 
 from __future__ import annotations
@@ -58,21 +58,20 @@ def _register(mi: ModuleType) -> None:
     """Define and register the plugin class; Mitsuba's classes exist only once a variant is set."""
     import drjit as dr
 
-    class C310(mi.Sensor):  # type: ignore[misc, name-defined]
+    class C310(mi.Sensor):  # type: ignore[name-defined]
         """See the module's docstring."""
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
-            self.number = {name: mi.Float64(props[name]) for name in props.keys() if name not in _NOT_NUMBERS}
+            self.number = {name: mi.Float64(props[name]) for name in props.keys() if name not in _NOT_NUMBERS}  # noqa: SIM118
             dr.make_opaque(self.number)  # same kernel for every camera
             self.distorted = any(props[name] != 0.0 for name in ("k1", "k2", "k3", "p1", "p2"))
             self.m_needs_sample_2 = True
             self.m_needs_sample_3 = True
 
         def sample_ray(self, time, wavelength_sample, position_sample, aperture_sample, active=True):  # type: ignore[no-untyped-def]
-            ray, weight = self.sample_ray_differential(
-                time, wavelength_sample, position_sample, aperture_sample, active
-            )
+            samples = (time, wavelength_sample, position_sample, aperture_sample, active)
+            ray, weight = self.sample_ray_differential(*samples)  # type: ignore[no-untyped-call]
             return mi.Ray3f(ray), weight
 
         def sample_ray_differential(  # type: ignore[no-untyped-def]

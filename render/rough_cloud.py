@@ -1,7 +1,7 @@
 """The spot's light through a rough mirror: microfacet reflection (Beckmann, Smith) instead of specular connections.
 
-For each pair (spot point, aperture point) film positions are drawn around the specular one with the lobe's own width, traced
-to the mirror, and weighted by the BRDF D F G / (4 cos_i cos_o), so that the weights are smooth and quasi-random
+For each pair (spot point, aperture point) film positions are drawn around the specular one with the lobe's own width,
+traced to the mirror, and weighted by the BRDF D F G / (4 cos_i cos_o), so that the weights are smooth and quasi-random
 points converge fast. As alpha goes to 0 the cloud goes to `specular_cloud` (tested).
 """
 
@@ -47,10 +47,10 @@ def rough_cloud(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> FilmClo
     spread = _lobe_px(view, np.array(spot.position_world_m), centre_uv[0])
     samples = _draw(view, spot)
     uv = _specular(view, samples.points_m, samples.lens_m) + samples.film @ (_WIDER * spread).T
-    lit = np.isfinite(uv).all(axis=1)
+    lit = np.all(np.isfinite(uv), axis=1)
     uv, points, lens, film = uv[lit], samples.points_m[lit], samples.lens_m[lit], samples.film[lit]
     density = np.exp(-0.5 * (film**2).sum(axis=1)) / (2.0 * math.pi * _WIDER**2 * abs(np.linalg.det(spread)))
-    watts = _power(view, spot, shapes, uv, lens, points) / density / len(lit)
+    watts = _power(view, spot, shapes, uv, lens, points) / density / len(samples.film)
     seen = np.isfinite(watts)
     return FilmCloud(uv[seen], watts[seen])
 
@@ -58,10 +58,8 @@ def rough_cloud(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> FilmClo
 def _draw(view: View, spot: LaserSpot) -> _Samples:
     x = qmc.Sobol(6, scramble=True, rng=_SEED).random_base2(_LOG2_SAMPLES)
     x = np.clip(x, 1e-12, 1.0 - 1e-12)
-    if spot.profile == "gaussian":
-        disc = spot.sigma_m * ndtri(x[:, :2])
-    else:
-        disc = spot.diameter_m / 2.0 * _disc(x[:, :2])
+    gaussian = spot.profile == "gaussian"
+    disc = spot.sigma_m * ndtri(x[:, :2]) if gaussian else spot.diameter_m / 2.0 * _disc(x[:, :2])
     points = np.array(spot.position_world_m) + disc @ np.stack(spot.tangents())
     return _Samples(points, view.rig.camera.aperture_radius_m * _disc(x[:, 2:4]), ndtri(x[:, 4:]))
 
@@ -88,7 +86,7 @@ def _lobe_px(view: View, point: Array, uv: Array) -> Array:
     half = _half_vector(rays, point[None])
     slope = half @ tangents.T / np.einsum("ni,ni->n", half, rays.normals)[:, None] - rays.normals @ tangents.T
     jacobian = np.stack([slope[0] - slope[1], slope[2] - slope[3]], axis=-1) / (2.0 * _STEP_PX)
-    return np.linalg.inv(jacobian) * view.rig.mirror.roughness_alpha / math.sqrt(2.0)
+    return np.asarray(np.linalg.inv(jacobian) * view.rig.mirror.roughness_alpha / math.sqrt(2.0), float)
 
 
 def _tangent_frame(normal: Array) -> Array:
@@ -106,9 +104,7 @@ def _half_vector(rays: MirrorRays, points: Array) -> Array:
     return half / np.linalg.norm(half, axis=-1, keepdims=True)
 
 
-def _power(
-    view: View, spot: LaserSpot, shapes: Sequence[Shape], uv: Array, lens: Array, points: Array
-) -> Array:
+def _power(view: View, spot: LaserSpot, shapes: Sequence[Shape], uv: Array, lens: Array, points: Array) -> Array:
     """Watts per square pixel that reach the film at uv from the whole spot's power concentrated in each point."""
     camera = view.rig.camera
     origins, directions = lens_rays(view, uv, lens)

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from phibench.render.rough_cloud import rough_cloud
 from phibench.render.quadrature import slices
+from phibench.render.rough_cloud import rough_cloud
 from phibench.render.spot_cloud import FilmCloud, specular_cloud
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
@@ -79,9 +79,9 @@ def splat(cloud: FilmCloud, sigma_px: float, electrons_per_joule: Array) -> Spot
         down *= watts[part, None]
         d_down *= watts[part, None]
         images += np.stack([down.T @ across, down.T @ d_across, d_down.T @ across])
-    planes = images[:, None] * electrons_per_joule[:, None, None]
+    layer, du, dv = images[:, None] * electrons_per_joule[:, None, None]
     total = watts.sum() * electrons_per_joule
-    return SpotLayer(int(low[0]), int(low[1]), *planes, cloud.centroid_px(), total)
+    return SpotLayer(int(low[0]), int(low[1]), layer, du, dv, cloud.centroid_px(), total)
 
 
 def _pixel_integrals(centre: Array, low: int, high: int, sigma: float) -> tuple[Array, Array]:

@@ -20,7 +20,7 @@ import numpy as np
 from phibench.render.alhazen import reflection_points
 from phibench.render.quadrature import disc_nodes
 from phibench.render.raycast import blocked_by
-from phibench.scenes.frames import Array
+from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
 from phibench.scenes.solids import Shape
@@ -138,7 +138,7 @@ def _connect(
     return FilmCloud(uv[lit], np.where(free, watts, 0.0)[lit])
 
 
-def _unobstructed(shapes: Sequence[Shape], points: Array, mirror: Array, eyes: Array, lit: Array) -> Array:
+def _unobstructed(shapes: Sequence[Shape], points: Array, mirror: Array, eyes: Array, lit: BoolArray) -> BoolArray:
     free = np.zeros(len(points), dtype=bool)
     legs = ((mirror[lit], points[lit]), (eyes[lit], mirror[lit]))
     free[lit] = np.all([blocked_by(shapes, start, end) < 0 for start, end in legs], axis=0)
@@ -149,5 +149,3 @@ def _split(vectors: Array) -> tuple[Array, Array]:
     """Lengths (N,) and unit vectors (N, 3)."""
     length = np.linalg.norm(vectors, axis=-1)
     return length, vectors / length[:, None]
-
-

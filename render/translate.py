@@ -1,9 +1,9 @@
 """scenes -> Mitsuba: shapes, textures, lamps and the mirror as a scene dictionary.
 
-Millimetres, sphere centre at the origin: in metres with the origin on the floor Mitsuba's ray offset moves the spot by 0.01 px
-(DESIGN section 6). Colours are three bands, one per colour filter of the detector, in Mitsuba's rgb mode: layers are per
-filter, no measured spectra of the room's materials exist, and the laser is handled at its own wavelength elsewhere; a
-spectral variant would add colour noise for no gain in truth. The steel's n and k are taken at each band's wavelength.
+Millimetres, sphere centre at the origin: in metres with the origin on the floor Mitsuba's ray offset moves the spot by
+0.01 px. Colours are three bands, one per colour filter of the detector, in Mitsuba's rgb mode: layers are per filter,
+no measured spectra of the room's materials exist, and the laser is handled at its own wavelength elsewhere; a spectral
+variant would add colour noise for no gain in truth. The steel's n and k are taken at each band's wavelength.
 """
 
 from __future__ import annotations
@@ -14,17 +14,15 @@ from typing import Any
 import numpy as np
 
 from phibench.render.c310_plugin import MM_PER_M, sensor_dict
-from phibench.scenes.frames import Array
+from phibench.scenes.frames import Array, Vector
 from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.rig import View
 from phibench.scenes.room import MIRROR_NAME, Room
 from phibench.scenes.solids import Cuboid, Rectangle, Shape
-from phibench.scenes.textures import Checker, Texture, Vector
+from phibench.scenes.textures import Checker, Texture
 
 
-def scene_dict(
-    mi: ModuleType, view: View, room: Room, crop: tuple[int, int, int, int] | None = None
-) -> dict[str, Any]:
+def scene_dict(mi: ModuleType, view: View, room: Room, crop: tuple[int, int, int, int] | None = None) -> dict[str, Any]:
     """Whole scene of one view: sensor, mirror, and every shape of the room under its name."""
     scene: dict[str, Any] = {"type": "scene", "sensor": sensor_dict(mi, view, crop)}
     scene[MIRROR_NAME] = mirror_dict(mi, view)

@@ -13,7 +13,7 @@ import numpy as np
 
 from phibench.scenes.checks import finite, positive, within
 from phibench.scenes.detector import Detector
-from phibench.scenes.frames import Array
+from phibench.scenes.frames import Array, BoolArray
 
 _NEWTON_STEPS = 30
 _NEWTON_TOLERANCE = 1e-14  # normalised image coordinates; 1.4e-11 px
@@ -131,14 +131,11 @@ class Camera:
         J = self.distort_jacobian(xy)
         return 1.0 / np.abs((J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]) * self.fx_px * self.fy_px)
 
-    def contains(self, uv_px: Array) -> NDArrayBool:
+    def contains(self, uv_px: Array) -> BoolArray:
         """Whether pixels (u, v), shape (..., 2), lie inside the image [-0.5, W - 0.5] x [-0.5, H - 0.5]."""
         uv = np.asarray(uv_px, float)
         inside_u = (uv[..., 0] >= -0.5) & (uv[..., 0] <= self.width_px - 0.5)
         return inside_u & (uv[..., 1] >= -0.5) & (uv[..., 1] <= self.height_px - 0.5)
-
-
-NDArrayBool = np.typing.NDArray[np.bool_]
 
 
 def _solve_2x2(matrix: Array, rhs: Array) -> Array:

@@ -66,7 +66,7 @@ def board(target: Target) -> Cuboid:
 
 
 def lab(targets: Sequence[Target] = ()) -> Room:
-    """Room of 10 x 9 x 3 m: tiled floor, striped and plain walls, six ceiling lamps, a door, furniture, target boards."""
+    """Room of 10 x 9 x 3 m: tiled floor, striped and plain walls, six lamps, a door, furniture, boards."""
     furniture = (
         cuboid("table", (3.6, -1.9, 0.72), (1.6, 0.8, 0.05), (0.45, 0.33, 0.20)),
         cuboid("table_base", (3.6, -1.9, 0.35), (1.2, 0.5, 0.69), (0.30, 0.30, 0.32)),
@@ -97,7 +97,9 @@ def _shell() -> tuple[Rectangle, ...]:
         rectangle("wall_east", (X_HIGH, y, z), (-1.0, 0.0, 0.0), (size_y, HEIGHT), texture=plain),
         rectangle("wall_south", (x, Y_LOW, z), (0.0, 1.0, 0.0), (size_x, HEIGHT), texture=plain),
         rectangle("wall_north", (x, Y_HIGH, z), (0.0, -1.0, 0.0), (size_x, HEIGHT), texture=blueish),
-        rectangle("door", (X_HIGH - 0.005, 1.2, 1.025), (-1.0, 0.0, 0.0), (0.9, 2.05), texture=Uniform((0.40, 0.22, 0.10))),
+        rectangle(
+            "door", (X_HIGH - 0.005, 1.2, 1.025), (-1.0, 0.0, 0.0), (0.9, 2.05), texture=Uniform((0.40, 0.22, 0.10))
+        ),
         rectangle("poster", (1.6, Y_LOW + 0.005, 1.5), (0.0, 1.0, 0.0), (1.2, 0.9), texture=_poster()),
     )
 

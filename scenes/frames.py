@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from phibench.scenes.checks import SceneError, finite_vector
 
 Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 Vector = tuple[float, ...]
 Matrix = tuple[Vector, Vector, Vector]
 

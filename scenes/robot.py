@@ -1,8 +1,8 @@
 """The robot ESCALADE360 as simple solids, with the mast and the camera's housing.
 
-The paper gives the overall dimensions 0.90 x 0.53 x 0.30 m, tracks with flippers after the PackBot; the split into body,
-tracks and flippers is ours. The mast that lifts the sensor and the housing are not in the paper either; they are there
-so that the middle of the mirror shows a camera on a robot. The holder of the mirror is not modelled.
+The paper gives the overall dimensions 0.90 x 0.53 x 0.30 m and tracks with flippers after the PackBot; the split into
+body, tracks and flippers is ours. The mast that lifts the sensor and the housing are not in the paper either; they are
+there so that the middle of the mirror shows a camera on a robot. The holder of the mirror is not modelled.
 """
 
 from __future__ import annotations
@@ -37,12 +37,14 @@ def chassis() -> tuple[Cuboid, ...]:
 def carriage(view: View) -> tuple[Cuboid, ...]:
     """Camera housing and the mast below it, for a rig at one stroke offset."""
     T_world_camera = view.T_world_camera
-    length, width, height = _HOUSING_M
+    height = _HOUSING_M[2]
     centre = Pose("camera", "shape", (0.0, 0.0, -_LENS_CLEARANCE_M - height / 2.0))
     housing = Cuboid("camera_housing", T_world_camera @ centre, _HOUSING_M, Uniform(_GREY))
     foot = T_world_camera.points(np.array([0.0, 0.0, -_LENS_CLEARANCE_M - height]))
     rise = max(float(foot[2]) - BODY_TOP_M, 1e-3)
-    mast = cuboid("robot_mast", as_vector(np.array([foot[0], foot[1], BODY_TOP_M + rise / 2.0])), (0.03, 0.02, rise), _GREY)
+    mast = cuboid(
+        "robot_mast", as_vector(np.array([foot[0], foot[1], BODY_TOP_M + rise / 2.0])), (0.03, 0.02, rise), _GREY
+    )
     return (housing, mast)
 
 

@@ -31,7 +31,8 @@ class Room:
     robot: bool = True
 
     def __post_init__(self) -> None:
-        names = [shape.name for shape in (*self.surfaces, *self.furniture)]
+        shapes: tuple[Shape, ...] = (*self.surfaces, *self.furniture)
+        names = [shape.name for shape in shapes]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise SceneError(f"Room '{self.name}': two shapes are called {twice[0]}; names must differ")

@@ -134,7 +134,9 @@ def _spot_scene(mi: ModuleType, view: View, spot: LaserSpot, crop: tuple[int, in
     return load_scene(mi, {"type": "scene", "sensor": sensor, "mirror": mirror_dict(mi, view), "spot": disk})
 
 
-def _brute_force(mi: ModuleType, view: View, spot: LaserSpot, crop: tuple[int, int, int, int], paths: float) -> np.ndarray:
+def _brute_force(
+    mi: ModuleType, view: View, spot: LaserSpot, crop: tuple[int, int, int, int], paths: float
+) -> np.ndarray:
     """Electrons per second (height, width) of the crop by the `path` integrator, and their standard error."""
     scene = _spot_scene(mi, view, spot, crop)
     integrator = mi.load_dict({"type": "path", "max_depth": 3})
@@ -183,8 +185,8 @@ def _compare(mi: ModuleType, rig: Rig, spot: LaserSpot, half: int, paths: float)
 def test_accuracy_spot_layer_against_brute_force_path_tracing(mi: ModuleType) -> None:
     """Flux within 0.3 % and shares of the columns within 0.002, at >= 1e8 paths.
 
-    A 12 mm spot at 2 m with little blur fills 1 to 2 pixels: about 2e6 of 1e8 paths reach it, flux error 7e-4, share error
-    4e-4 (one sigma), so that the tolerances stand at 4 and 5 sigma: false alarm below 1e-4.
+    A 12 mm spot at 2 m with little blur fills 1 to 2 pixels: about 2e6 of 1e8 paths reach it, flux error 7e-4, share
+    error 4e-4 (one sigma), so that the tolerances stand at 4 and 5 sigma: false alarm below 1e-4.
     """
     spot = LaserSpot((1.9, 0.7, 0.5), (-1.9, -0.7, 0.0), 12e-3, profile="uniform")
     figures = _compare(mi, _red_laser_rig(0.25), spot, 2, 1.05e8)
@@ -217,7 +219,9 @@ def test_accuracy_spot_layer_against_path_tracing_short(mi: ModuleType, name: st
 
 def _furnace(albedo: float) -> Room:
     """A closed box whose walls all emit 1 W/(m^2 sr) and reflect nothing: radiance 1 everywhere in it."""
-    sides = [((x, y, z), (-x, -y, -z)) for x, y, z in [(3, 0, 0), (-3, 0, 0), (0, 3, 0), (0, -3, 0), (0, 0, 3), (0, 0, -3)]]
+    sides = [
+        ((x, y, z), (-x, -y, -z)) for x, y, z in [(3, 0, 0), (-3, 0, 0), (0, 3, 0), (0, -3, 0), (0, 0, 3), (0, 0, -3)]
+    ]
     walls = [
         rectangle(f"wall_{i}", place, normal, (6.0, 6.0), radiance_w_m2_sr=(1.0, 1.0, 1.0))
         for i, (place, normal) in enumerate(sides)
@@ -226,7 +230,7 @@ def _furnace(albedo: float) -> Room:
 
 
 def test_accuracy_ambient_electrons_in_a_furnace(mi: ModuleType) -> None:
-    """Uniform radiance 1: beside the mirror a pixel gets etendue x electrons per joule; in it, that times the reflectance.
+    """Uniform radiance 1: beside the mirror a pixel gets etendue x electrons per joule; in it, times the reflectance.
 
     cos^4 and the pixel's solid angle from `scenes`; the aperture's finite size changes cos^4 by about 1e-5.
     """
@@ -247,7 +251,7 @@ def test_accuracy_ambient_electrons_in_a_furnace(mi: ModuleType) -> None:
 
 
 def test_ambient_shows_checkers_where_the_scene_has_them(mi: ModuleType) -> None:
-    """A lit checkerboard: path-traced contrast has the sign and size of `Checker.evaluate` at the truth layer's points."""
+    """A lit checkerboard: traced contrast has the sign and size of `Checker.evaluate` at the truth layer's points."""
     tiles = Checker((0.8, 0.8, 0.8), (0.2, 0.2, 0.2), (0.5, 0.7), (-2.75, -2.9))
     floor = rectangle("floor", (0.1, 0.2, 0.0), (0, 0, 1), (5.5, 5.8), texture=tiles)
     lamp = rectangle("lamp", (0, 0, 3.0), (0, 0, -1), (6, 6), texture=Uniform((0, 0, 0)), radiance_w_m2_sr=(1, 1, 1))

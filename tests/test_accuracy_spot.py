@@ -7,18 +7,17 @@ import math
 
 import numpy as np
 import pytest
+from oracles import TARGETS, alhazen_quartic, fermat_path, paper_cases, random_rig, random_spot, true_pixel
 
 from phibench.render.alhazen import reflection_points
 from phibench.render.certificate import CENTROID_TOLERANCE_PX, certify, pixel_centroid
-from phibench.render.spot import spot_layer, splat
+from phibench.render.spot import splat, spot_layer
 from phibench.render.spot_cloud import FilmCloud, specular_cloud
 from phibench.render.spot_truth import spot_truth
 from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.room import Room
-
-from oracles import TARGETS, alhazen_quartic, fermat_path, paper_cases, random_rig, random_spot, true_pixel
 
 EMPTY = Room("empty", (), (), robot=False)
 
@@ -172,7 +171,9 @@ def test_derivative_images_against_finite_differences() -> None:
     layer = splat(cloud, 0.6, gain)
     shifts = {"du_electrons_per_s_px": [step, 0.0], "dv_electrons_per_s_px": [0.0, step]}
     for name, shift in shifts.items():
-        plus, minus = (splat(FilmCloud(cloud.uv_px + sign * np.array(shift), cloud.watts), 0.6, gain) for sign in (1, -1))
+        plus, minus = (
+            splat(FilmCloud(cloud.uv_px + sign * np.array(shift), cloud.watts), 0.6, gain) for sign in (1, -1)
+        )
         assert (plus.u0_px, plus.v0_px) == (minus.u0_px, minus.v0_px)
         difference = (plus.electrons_per_s - minus.electrons_per_s) / (2.0 * step)
         assert np.abs(difference - getattr(layer, name)).max() < 1e-7
@@ -186,7 +187,7 @@ def test_layer_holds_all_flux_and_the_filters_ratio() -> None:
 
 
 def test_expected_signal_is_that_of_the_design() -> None:
-    """DESIGN: about 15 000 electrons at 2 m, 58 000 at 1 m, 3 300 at 4.2 m in 1/60 s at z_c about 0.30 m (section 5)."""
+    """DESIGN: about 15 000 electrons at 2 m, 58 000 at 1 m, 3 300 at 4.2 m in 1/60 s, at z_c about 0.30 m."""
     from phibench.scenes.frames import Pose
 
     rig = dataclasses.replace(default_rig(), T_camera_sphere=Pose("camera", "sphere", (0.0, 0.0, 0.30)))
@@ -236,7 +237,9 @@ def test_reflection_point_on_the_axis_and_at_grazing_incidence() -> None:
     found, valid = reflection_points(np.array([[0.0, 0.0, -2.0]]), eye, 0.06)
     assert valid.all()
     assert found == pytest.approx(np.array([[0.0, 0.0, -0.06]]), abs=1e-15)
-    rim = math.acos(0.06 / 0.26)  # where the eye's view grazes the sphere; the tangent leaves at right angles to the normal
+    rim = math.acos(
+        0.06 / 0.26
+    )  # where the eye's view grazes the sphere; the tangent leaves at right angles to the normal
     normal, tangent = np.array([math.sin(rim), 0, -math.cos(rim)]), np.array([math.cos(rim), 0, math.sin(rim)])
     for tilt, expected in ((1e-4, True), (-1e-4, False)):
         point = 0.06 * normal + 3.0 * (tangent + tilt * normal)

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exr import read_exr, write_exr
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from phibench.datasets import files
 from phibench.datasets.exr import write_exr
 from phibench.datasets.files import TEMPORARY_PREFIX, remove_temporary, sha256, write_atomic, write_bytes, write_text

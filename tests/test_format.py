@@ -4,10 +4,11 @@ import re
 from pathlib import Path
 
 import pytest
+from pydantic import BaseModel
+
 from phibench.datasets import layers, layout, schema
 from phibench.render import spot_truth, truth
 from phibench.scenes.detector import FILTERS
-from pydantic import BaseModel
 
 PAGE = (Path(schema.__file__).resolve().with_name("FORMAT.md")).read_text(encoding="utf-8")
 MODELS = (schema.ManifestRow, schema.SpotRow, schema.CertificateRow, schema.DatasetInfo, schema.PoseInfo)
@@ -47,7 +48,14 @@ def test_fields_and_units(index: int) -> None:
 
 @pytest.mark.parametrize("index", range(len(MODELS)), ids=lambda i: MODELS[i].__name__)
 def test_types(index: int) -> None:
-    kinds = {"string": "str", "double": "float", "3 doubles": "tuple", "2 doubles": "tuple", "bool": "bool", "integer": "int"}
+    kinds = {
+        "string": "str",
+        "double": "float",
+        "3 doubles": "tuple",
+        "2 doubles": "tuple",
+        "bool": "bool",
+        "integer": "int",
+    }
     for name, kind, *_ in field_tables()[index]:
         annotation = str(MODELS[index].model_fields[names(name)[0]].annotation)
         assert kinds.get(kind.removesuffix(" or null"), "") in annotation

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from phibench.datasets.errors import RecipeError
 from phibench.datasets.plan import make_plan, pose_name
 from phibench.datasets.recipe_file import check_recipe, load_recipe
@@ -81,7 +82,19 @@ def test_streams_depend_on_names_only() -> None:
         return int(generator(*names).integers(2**63))
 
     assert first("a", 0, "b") == first("a", 0, "b")
-    names = [("a", "bc"), ("ab", "c"), ("abc",), (1,), ("1",), (0,), ("a", 0), ("a", 1), ("a", "0"), ("a\0b",), ("a", "b")]
+    names = [
+        ("a", "bc"),
+        ("ab", "c"),
+        ("abc",),
+        (1,),
+        ("1",),
+        (0,),
+        ("a", 0),
+        ("a", 1),
+        ("a", "0"),
+        ("a\0b",),
+        ("a", "b"),
+    ]
     assert len({first(*name) for name in names}) == len(names)
 
 

@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 import pytest
+
 from phibench.datasets.errors import RecipeError
 from phibench.datasets.recipe import Recipe, recipe_schema
 from phibench.datasets.recipe_checks import warnings
@@ -124,7 +125,15 @@ def test_all_faults_come_in_one_go() -> None:
     )
     paths = {line.split(": ")[0] for line in lines}
     assert paths == {
-        *("dataset.seed", "rig.presett", "rig.k1", "laser.profile", "laser.diameter_m", "targets[0]", "targets[1].name"),
+        *(
+            "dataset.seed",
+            "rig.presett",
+            "rig.k1",
+            "laser.profile",
+            "laser.diameter_m",
+            "targets[0]",
+            "targets[1].name",
+        ),
         *("experiments[0].targets[0]", "experiments[0].strokes_m[0]", "experiments[0].strokes_m[1]"),
     }
 

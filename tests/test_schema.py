@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
+
 from phibench.datasets.codec import from_json, to_json
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.manifest import differences, read_manifest, to_frame, write_manifest
@@ -19,7 +21,6 @@ from phibench.datasets.spot_task import make_rows
 from phibench.scenes.catalog import c310_rig, lab
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
-from pydantic import ValidationError
 
 TINY = Path(__file__).with_name("tiny.toml")
 

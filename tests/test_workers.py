@@ -7,8 +7,10 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
+
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.recipe_file import load_recipe
 from phibench.datasets.workers import Pool, Task, WorkerError
@@ -43,7 +45,7 @@ def test_a_fault_says_which_task_and_why(task: Task, words: str) -> None:
     assert issubclass(WorkerError, DatasetError)
 
 
-@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs /proc")
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs /proc")
 def test_workers_leave_when_their_parent_is_killed() -> None:
     code = (
         "import time\nfrom phibench.datasets.workers import Pool, Task\n"
@@ -68,7 +70,6 @@ def test_workers_leave_when_their_parent_is_killed() -> None:
 
 def alive(pid: int) -> bool:
     try:
-        with open(f"/proc/{pid}/stat") as file:
-            return file.read().rsplit(")", 1)[1].split()[0] != "Z"
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except FileNotFoundError:
         return False

@@ -1,0 +1,131 @@
+"""Reading: layers as arrays, the rig as it was, clear errors; no Mitsuba."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from phibench.datasets import layout
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.layers import TRUTH_PLANES, SpotWindow
+from phibench.datasets.plan import make_plan
+from phibench.datasets.read import Dataset, open_dataset
+from phibench.datasets.recipe_file import load_recipe
+from phibench.render.spot import spot_layer
+from phibench.render.truth import truth_layer
+
+TINY = Path(__file__).with_name("tiny.toml")
+
+
+@pytest.fixture
+def dataset(tiny_dataset: Path) -> Dataset:
+    return open_dataset(tiny_dataset)
+
+
+def test_rig_room_and_recipe_come_back(dataset: Dataset) -> None:
+    plan = make_plan(load_recipe(TINY))
+    assert (dataset.rig, dataset.room, dataset.recipe) == (plan.rig, plan.room, plan.recipe)
+    assert [sample.laser_spot for sample in dataset] == [plan.spots[pair.target] for pair in plan.pairs]
+    assert len(dataset) == 2
+
+
+def test_layers_are_what_the_renderer_gave(dataset: Dataset) -> None:
+    sample = dataset["seen-near-h0.500"]
+    for position in ("down", "up"):
+        view = sample.view(position)
+        shapes = dataset.room.shapes(view)
+        layer, window = spot_layer(view, sample.laser_spot, shapes), sample.spot(position)
+        assert (window.u0_px, window.v0_px) == (layer.u0_px, layer.v0_px)
+        scale = layer.electrons_per_s.max()
+        assert np.abs(window.electrons_per_s - layer.electrons_per_s).max() < 1e-7 * scale  # float32
+        assert np.abs(window.du_electrons_per_s_px - layer.du_electrons_per_s_px).max() < 1e-7 * scale
+        expected, truth = truth_layer(view, shapes), sample.truth(position)
+        assert tuple(truth) == TRUTH_PLANES
+        for name in TRUTH_PLANES:
+            np.testing.assert_allclose(truth[name], expected[name], rtol=6e-8, atol=0.0, equal_nan=True)
+        assert truth["object_id"].dtype == np.int32
+        assert np.array_equal(np.isnan(truth["depth_m"]), truth["object_id"] < 0)
+
+
+def test_the_pixel_truth_at_the_spot_is_the_spots_truth(dataset: Dataset) -> None:
+    """Linear interpolation between the pixels around the spot, on the flat board that carries it."""
+    sample = dataset["seen-near-h0.500"]
+    for position in ("down", "up"):
+        row, truth = sample.truth_row(position), sample.truth(position)
+        u0, v0 = int(np.floor(row.u_px)), int(np.floor(row.v_px))
+        a, b = row.u_px - u0, row.v_px - v0
+        weights = np.outer([1.0 - b, b], [1.0 - a, a])
+        ids = truth["object_id"][v0 : v0 + 2, u0 : u0 + 2]
+        assert {dataset.info.object_names[i] for i in ids.ravel()} == {"board_near"}
+        point = [float((weights * truth[name][v0 : v0 + 2, u0 : u0 + 2]).sum()) for name in ("x_m", "y_m", "z_m")]
+        assert np.linalg.norm(np.array(point) - sample.row.spot_world_m) < 3e-3  # one pixel spans 6 cm here
+        phi = float((weights * truth["phi_ray_rad"][v0 : v0 + 2, u0 : u0 + 2]).sum())
+        assert abs(phi - row.phi_ray_rad) < 2e-4
+
+
+def test_a_frame_is_ambient_plus_spot(dataset: Dataset) -> None:
+    sample = dataset["seen-near-h0.500"]
+    off, on = sample.frame("up", laser=False), sample.frame("up")
+    assert on.shape == (3, 180, 320)
+    assert on.dtype == np.float64
+    assert np.array_equal(off, sample.ambient("up").astype(float))
+    row, red = sample.row.up, (on - off)[0]
+    v, u = np.indices(red.shape)
+    assert red.sum() == pytest.approx(row.electrons_per_s[0], rel=1e-6)
+    assert (red * u).sum() / red.sum() == pytest.approx(row.u_px + row.coma_shift_px[0], abs=2e-3)
+    assert (red * v).sum() / red.sum() == pytest.approx(row.v_px + row.coma_shift_px[1], abs=2e-3)
+
+
+def test_a_hidden_spot_has_an_empty_window(dataset: Dataset) -> None:
+    sample = dataset["half-hidden-h1.400"]
+    assert sample.spot("down").electrons_per_s.shape == (3, 0, 0)
+    assert np.array_equal(sample.frame("down"), sample.frame("down", laser=False))
+    assert sample.spot("up").electrons_per_s.sum() > 0.0
+
+
+@pytest.mark.parametrize("u0", [-9, -2, 0, 3, 6, 8, 30])
+def test_windows_are_clipped_at_the_image(u0: int) -> None:
+    ones = np.ones((3, 4, 5))
+    image, expected = np.zeros((3, 6, 8)), np.zeros((3, 60, 80))
+    SpotWindow(u0, u0 // 2, ones, ones, ones).add_to(image, gain=2.0)
+    expected[:, 20 + u0 // 2 : 24 + u0 // 2, 20 + u0 : 25 + u0] = 2.0
+    assert np.array_equal(image, expected[:, 20:26, 20:28])
+
+
+def test_errors_are_clear(dataset: Dataset, tiny_dataset: Path, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="there is no folder"):
+        open_dataset(tmp_path / "none")
+    with pytest.raises(DatasetError, match="is not a data set"):
+        open_dataset(tmp_path)
+    with pytest.raises(DatasetError, match=r"did you mean 'seen-near-h0\.500'"):
+        dataset["seen-near-h0.5"]
+    with pytest.raises(DatasetError, match="'down' or 'up'"):
+        dataset.samples[0].frame("left")
+    copy = Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
+    (copy / layout.view_file("h0.500", "ambient")).unlink()
+    with pytest.raises(DatasetError, match=r"ambient\.exr is missing"):
+        open_dataset(copy).samples[0].frame("up")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [({"schema_version": 99}, "schema version 99"), ({"samples": 3}, "2 rows instead of 3"), ({"rig": {}}, None)],
+)
+def test_a_foreign_info_is_refused(tiny_dataset: Path, tmp_path: Path, change: dict[str, object], words: str) -> None:
+    for name in (layout.INFO, layout.MANIFEST):
+        shutil.copy(tiny_dataset / name, tmp_path / name)
+    info = json.loads((tmp_path / layout.INFO).read_text())
+    (tmp_path / layout.INFO).write_text(json.dumps({**info, **change}))
+    if words is None:
+        assert open_dataset(tmp_path).rig != open_dataset(tiny_dataset).rig
+        return
+    with pytest.raises(DatasetError, match=words):
+        open_dataset(tmp_path)
+
+
+def test_damaged_json_is_refused(tmp_path: Path) -> None:
+    (tmp_path / layout.INFO).write_text('{"schema_version": 1,')
+    with pytest.raises(DatasetError, match="is damaged"):
+        open_dataset(tmp_path)

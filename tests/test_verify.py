@@ -1,0 +1,153 @@
+"""Verification finds every kind of damage, and nothing where there is none."""
+
+import io
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from phibench.datasets import layout
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.layers import read_truth, write_truth
+from phibench.datasets.manifest import read_manifest, write_manifest
+from phibench.datasets.show import show
+from phibench.datasets.sums import write_sums
+from phibench.datasets.verify import Report, verify
+
+AMBIENT, TRUTH = layout.view_file("h0.000", "ambient"), layout.view_file("h0.500", "truth")
+SPOT, OTHER_SPOT = "spots/seen-near-h0.500-down.exr", "spots/seen-near-h0.500-up.exr"
+
+
+def check(folder: Path, truth_layers: bool = False) -> Report:
+    return verify(folder, truth_layers, Console(file=io.StringIO()))
+
+
+@pytest.fixture
+def copy(tiny_dataset: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
+
+
+@pytest.mark.parametrize("name", ["tiny_dataset", "smoke_dataset"])
+def test_a_fresh_data_set_is_in_order(name: str, request: pytest.FixtureRequest) -> None:
+    report = check(request.getfixturevalue(name), truth_layers=True)
+    assert report.faults == ()
+    assert report.ok
+    assert report.files >= 15
+    assert report.samples in (2, 3)
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def flip_a_bit(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) * 2 // 3] ^= 1
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("damage", [truncate, flip_a_bit, Path.unlink])
+@pytest.mark.parametrize(
+    "name",
+    [AMBIENT, TRUTH, SPOT, layout.TABLE, layout.RECIPE, layout.preview_file("seen-near-h0.500"), layout.MANIFEST],
+)
+def test_a_damaged_file_is_named(copy: Path, name: str, damage: Callable[[Path], None]) -> None:
+    damage(copy / name)
+    report = check(copy)
+    assert not report.ok
+    assert [fault for fault in report.faults if name in fault]
+    assert not [fault for fault in report.faults if name not in fault and layout.MANIFEST not in fault]
+
+
+def swap(folder: Path, a: str, b: str) -> None:
+    (folder / a).rename(folder / "aside")
+    (folder / b).rename(folder / a)
+    (folder / "aside").rename(folder / b)
+
+
+@pytest.mark.parametrize(("a", "b"), [(SPOT, OTHER_SPOT), (AMBIENT, layout.view_file("h0.500", "ambient"))])
+@pytest.mark.parametrize("hide", [False, True], ids=["sums as they were", "sums made anew"])
+def test_swapped_files_are_found(copy: Path, a: str, b: str, hide: bool) -> None:
+    swap(copy, a, b)
+    if hide:
+        write_sums(copy)
+    faults = check(copy).faults
+    assert {name for name in (a, b) if any(name in fault for fault in faults)} == {a, b}
+
+
+def test_a_stray_file_is_named(copy: Path) -> None:
+    (copy / "spots" / "extra.exr").write_bytes(b"")
+    assert check(copy).faults == ("spots/extra.exr is not listed in SHA256SUMS",)
+
+
+def test_an_unfinished_data_set_is_found(copy: Path) -> None:
+    (copy / layout.SUMS).unlink()
+    [fault] = check(copy).faults
+    assert "was not finished" in fault
+
+
+def test_a_truth_that_the_parameters_do_not_give_is_found(copy: Path) -> None:
+    """The last digits of one number, with manifest, table and hashes made to fit."""
+    rows = read_manifest(copy)
+    up = rows[0].up.model_copy(update={"u_px": rows[0].up.u_px + 1e-7})
+    write_manifest(copy, [rows[0].model_copy(update={"up": up}), *rows[1:]])
+    write_sums(copy)
+    [fault] = check(copy).faults
+    assert fault.startswith("seen-near-h0.500 up: u_px is")
+
+
+def test_a_changed_rig_is_found(copy: Path) -> None:
+    info = json.loads((copy / layout.INFO).read_text())
+    info["rig"]["mirror"]["radius_m"] += 1e-6
+    (copy / layout.INFO).write_text(json.dumps(info))
+    write_sums(copy)
+    faults = check(copy).faults
+    assert any("u_px" in fault for fault in faults)
+    assert any("phi_ray_rad" in fault for fault in faults)
+
+
+def test_a_missing_row_is_found(copy: Path) -> None:
+    info = json.loads((copy / layout.INFO).read_text())
+    info["samples"] = 1
+    (copy / layout.INFO).write_text(json.dumps(info))
+    write_manifest(copy, read_manifest(copy)[:1])
+    write_sums(copy)
+    assert "manifest.jsonl: sample half-hidden-h1.400 of the recipe is missing" in check(copy).faults
+
+
+def test_a_changed_pixel_truth_is_found_when_asked_for(copy: Path) -> None:
+    planes = read_truth(copy / TRUTH)
+    planes["depth_m"][60:120, 100:200] *= 1.0 + 1e-5
+    write_truth(copy / TRUTH, planes, {"dataset": "tiny", "pose": "h0.500", "offset_m": 0.5})
+    write_sums(copy)
+    assert check(copy).ok
+    [fault] = check(copy, truth_layers=True).faults
+    assert "depth_m is not what the parameters give" in fault
+
+
+def test_what_is_no_data_set_raises(tmp_path: Path) -> None:
+    for folder in (tmp_path, tmp_path / "none"):
+        with pytest.raises(DatasetError, match="is not a data set"):
+            check(folder)
+
+
+def test_a_damaged_info_is_a_fault(copy: Path) -> None:
+    truncate(copy / layout.INFO)
+    assert len(check(copy).faults) == 2  # its hash, and that it cannot be read
+
+
+def test_show_prints_a_table_and_draws_the_spots(copy: Path) -> None:
+    console = Console(file=io.StringIO(), width=170)
+    sheet = show(copy, console)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "seen-near-h0.500" in text
+    assert "occluded:crate_red / yes" in text
+    with Image.open(sheet) as image:
+        assert image.size[0] > 400
+        colours = {colour for _, colour in image.getcolors(1 << 24)}
+    assert (0, 255, 80) in colours  # the mark
+    assert check(copy).ok  # the sheet is not part of the data
