@@ -15,8 +15,15 @@ from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
 from phibench.scenes.solids import Shape
 
-VISIBLE, NO_REFLECTION, FACES_AWAY, OUTSIDE = "none", "no_reflection", "faces_away", "outside_image"
+VISIBLE, NO_REFLECTION, EDGE, FACES_AWAY, OUTSIDE = (
+    "none",
+    "no_reflection",
+    "mirror_edge",
+    "faces_away",
+    "outside_image",
+)
 OCCLUDED = "occluded:"  # followed by the name of the object in the way
+EDGE_PX = 1.0  # nearer to the outline part of the aperture sees no reflection, and the blur goes past the mirror
 
 
 @dataclass(frozen=True)
@@ -33,7 +40,7 @@ class SpotTruth:
     path_spot_mirror_m, path_mirror_camera_m : float
     visible : bool
     cause : str
-        "none", "no_reflection", "faces_away", "outside_image" or "occluded:<object>".
+        "none", "no_reflection", "mirror_edge", "faces_away", "outside_image" or "occluded:<object>".
     """
 
     u_px: float
@@ -88,6 +95,8 @@ def _cause(view: View, spot: LaserSpot, shapes: Sequence[Shape], mirror: Array, 
     point, eye = np.array([spot.position_world_m]), view.camera_centre_m[None]
     if not np.isfinite(mirror).all():
         return NO_REFLECTION
+    if _outline_distance_px(view, mirror[0]) < EDGE_PX:
+        return EDGE
     if np.dot(mirror[0] - point[0], spot.normal_world) <= 0.0:
         return FACES_AWAY
     if not view.rig.camera.contains(uv):
@@ -97,6 +106,14 @@ def _cause(view: View, spot: LaserSpot, shapes: Sequence[Shape], mirror: Array, 
         if blocker >= 0:
             return OCCLUDED + shapes[blocker].name
     return VISIBLE
+
+
+def _outline_distance_px(view: View, mirror: Array) -> float:
+    """Distance of a mirror point's image from the mirror's outline, across it, pixels (angle times focal length)."""
+    to_mirror, to_centre = mirror - view.camera_centre_m, view.sphere_centre_m - view.camera_centre_m
+    across, along = np.linalg.norm(np.cross(to_mirror, to_centre)), np.dot(to_mirror, to_centre)
+    outline = np.arcsin(view.rig.mirror.radius_m / np.linalg.norm(to_centre))
+    return float((outline - np.arctan2(across, along)) * view.rig.camera.fx_px)
 
 
 def _floats(values: Array) -> tuple[float, ...]:

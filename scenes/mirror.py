@@ -67,7 +67,8 @@ class SphereMirror:
         """Unpolarised Fresnel power reflectance, shape of `cos_incidence` (cosine of the angle of incidence)."""
         m2 = self.refractive_index(wavelength_nm) ** 2
         cos_i = np.asarray(cos_incidence, float)
-        root = np.sqrt(m2 - (1.0 - cos_i * cos_i))
-        r_s = (cos_i - root) / (cos_i + root)
-        r_p = (m2 * cos_i - root) / (m2 * cos_i + root)
+        with np.errstate(invalid="ignore"):  # NaN in, NaN out
+            root = np.sqrt(m2 - (1.0 - cos_i * cos_i))
+            r_s = (cos_i - root) / (cos_i + root)
+            r_p = (m2 * cos_i - root) / (m2 * cos_i + root)
         return 0.5 * (np.abs(r_s) ** 2 + np.abs(r_p) ** 2)

@@ -224,6 +224,33 @@ def test_accuracy_rough_mirror_certificate(alpha: float) -> None:
         assert certificate.centroid_tolerance_px == CENTROID_TOLERANCE_PX == 0.002
 
 
+def test_near_the_outline_a_spot_is_certified_or_flagged() -> None:
+    """Spots that climb up a wall until the mirror's edge: each passes its certificate, or says why it is not seen."""
+    view, causes = default_rig().at(0.0), []
+    for x in (0.3, 0.5, 1.0, 2.0):
+        for z in np.arange(1.0, 5.0, 0.25):
+            spot = LaserSpot((x, 0.0, z), (-1, 0, 0), 4e-3)
+            truth = spot_truth(view, spot, ())
+            causes.append(truth.cause)
+            if truth.visible:
+                assert certify(view, spot, (), truth, spot_layer(view, spot, ())).passed, (x, z)
+    assert causes.count("none") > 20
+    assert causes.count("mirror_edge") > 5
+    assert causes.count("no_reflection") > 5
+
+
+def test_causes_of_a_spot_that_is_not_seen() -> None:
+    view = default_rig().at(0.0)
+    behind_wall = LaserSpot((2.0, 0.0, 0.5), (1, 0, 0), 4e-3)
+    below_camera = LaserSpot((0.0, 0.0, 0.31), (0, 0, 1), 4e-3)
+    narrow = dataclasses.replace(default_rig().camera, height_px=300, cy_px=149.5)
+    cut = dataclasses.replace(default_rig(), camera=narrow).at(0.0)
+    assert spot_truth(view, behind_wall, ()).cause == "faces_away"
+    assert spot_truth(cut, LaserSpot((0.0, 2.0, 0.5), (0, -1, 0), 4e-3), ()).cause == "outside_image"
+    assert spot_truth(view, below_camera, lab(TARGETS).shapes(view)).cause.startswith("occluded:")
+    assert spot_truth(view, LaserSpot((0.0, 0.0, 2.9), (0, 0, -1), 4e-3), ()).cause == "no_reflection"
+
+
 def test_no_reflection_point_in_the_shadow_of_the_sphere() -> None:
     eye = np.array([[0.0, 0.0, -0.26]])
     behind = np.array([[0.01, 0.0, 5.0]])  # straight above: hidden by the sphere

@@ -81,7 +81,7 @@ def test_planes() -> None:
 
 def test_causes() -> None:
     said = {name for row in table_with("cause", "meaning") for name in names(row[0])}
-    meant = {spot_truth.VISIBLE, spot_truth.NO_REFLECTION, spot_truth.FACES_AWAY, spot_truth.OUTSIDE}
+    meant = {spot_truth.VISIBLE, spot_truth.NO_REFLECTION, spot_truth.FACES_AWAY, spot_truth.OUTSIDE, spot_truth.EDGE}
     assert said == meant | {spot_truth.OCCLUDED + "OBJECT"}
 
 
