@@ -79,14 +79,23 @@ def _register(mi: ModuleType) -> None:
         ):
             film = self.film()
             size, offset = mi.ScalarVector2f(film.crop_size()), mi.ScalarVector2f(film.crop_offset())
-            n, F64 = self.number, mi.Float64
             # optical blur: the film point moves by a Gaussian; its deviates are hashed from the two samples
             blur = mi.warp.square_to_std_normal(_hashed_pair(mi, dr, position_sample, aperture_sample))
-            u = F64(position_sample.x) * size.x + offset.x - 0.5 + F64(blur.x) * n["blur_sigma_px"]
-            v = F64(position_sample.y) * size.y + offset.y - 0.5 + F64(blur.y) * n["blur_sigma_px"]
+            sigma = self.number["blur_sigma_px"]
+            u = mi.Float64(position_sample.x) * size.x + offset.x - 0.5 + mi.Float64(blur.x) * sigma
+            v = mi.Float64(position_sample.y) * size.y + offset.y - 0.5 + mi.Float64(blur.y) * sigma
+            lens = mi.warp.square_to_uniform_disk_concentric(aperture_sample)
+            ray, weight = self.film_ray(u, v, lens)  # type: ignore[no-untyped-call]
+            return mi.RayDifferential3f(ray.o, ray.d, time, mi.Color0f()), weight
+
+        def film_ray(self, u, v, lens):  # type: ignore[no-untyped-def]
+            """Ray and weight (electrons/s per W/(m^2 sr)) of a film position, float64 pixels, and a lens point.
+
+            `lens` lies on the unit disc. Optical blur is the caller's.
+            """
+            n, F64 = self.number, mi.Float64
             xd, yd = (u - n["cx_px"]) / n["fx_px"], (v - n["cy_px"]) / n["fy_px"]
             x, y, jacobian = _undistort(n, xd, yd) if self.distorted else (xd, yd, F64(1.0))
-            lens = mi.warp.square_to_uniform_disk_concentric(aperture_sample)
             a, b = F64(lens.x) * n["aperture_radius_m"], F64(lens.y) * n["aperture_radius_m"]
             dx, dy = x - a / n["focus_distance_m"], y - b / n["focus_distance_m"]
             cos2 = 1.0 / (1.0 + dx * dx + dy * dy)
@@ -95,10 +104,7 @@ def _register(mi: ModuleType) -> None:
             direction = [cos * (dx * n[f"x_{i}"] + dy * n[f"y_{i}"] + n[f"z_{i}"]) for i in "xyz"]
             etendue = math.pi * n["aperture_radius_m"] ** 2 * cos2 * cos2 / (n["fx_px"] * n["fy_px"] * jacobian)
             weight = mi.Color3f(*(mi.Float(etendue * n[f"electrons_per_joule_{c}"]) for c in "RGB"))
-            ray = mi.RayDifferential3f(
-                mi.Point3f(*map(mi.Float, origin)), mi.Vector3f(*map(mi.Float, direction)), time, mi.Color0f()
-            )
-            return ray, weight
+            return mi.Ray3f(mi.Point3f(*map(mi.Float, origin)), mi.Vector3f(*map(mi.Float, direction))), weight
 
         def bbox(self):  # type: ignore[no-untyped-def]
             return mi.ScalarBoundingBox3f()

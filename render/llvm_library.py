@@ -13,6 +13,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+from phibench.render.cache import cache_root
 from phibench.render.child import fault_of
 
 Version = tuple[int, int, int]
@@ -77,13 +78,8 @@ def version_hint(path: Path) -> int:
 
 
 def cache_folder() -> Path:
-    """Return the folder for LLVMs of our own: under PHIBENCH_CACHE, XDG_CACHE_HOME or ``~/.cache``, in this order."""
-    if own := os.environ.get("PHIBENCH_CACHE"):
-        return Path(own).absolute() / "llvm"
-    base = os.environ.get("XDG_CACHE_HOME")
-    # Not Path.home(), which raises for a user without a home: such a folder is reported where it cannot be made.
-    home = os.path.expanduser("~")  # noqa: PTH111
-    return Path(base or f"{home}/.cache").absolute() / "phibench" / "llvm"
+    """Return the folder for LLVMs of our own, in the user's cache."""
+    return cache_root() / "llvm"
 
 
 def companions_of(path: Path) -> tuple[Path, ...]:

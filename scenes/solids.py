@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from phibench.scenes.checks import finite_vector, positive
-from phibench.scenes.frames import Pose, Vector, rotation_facing
+from phibench.scenes.frames import Pose, Vector, as_vector, rotation_facing
 from phibench.scenes.textures import Texture, Uniform
 
 _WHITE = Uniform((0.7, 0.7, 0.7))
@@ -84,3 +84,21 @@ def cuboid(name: str, centre_m: Vector, size_m: Vector, albedo: Vector, rotation
     """Cuboid at `centre_m` with one albedo; axis-aligned unless a rotation matrix is given."""
     pose = Pose("world", "shape", centre_m) if rotation is None else Pose("world", "shape", centre_m, rotation)  # type: ignore[arg-type]
     return Cuboid(name, pose, size_m, Uniform(albedo))
+
+
+def faces(shape: Shape) -> tuple[Rectangle, ...]:
+    """The shape's surface as rectangles: itself, or the six sides of a cuboid in the order +x -x +y -y +z -z."""
+    if isinstance(shape, Rectangle):
+        return (shape,)
+    return tuple(_side(shape, axis, sign) for axis in range(3) for sign in (1.0, -1.0))
+
+
+def _side(box: Cuboid, axis: int, sign: float) -> Rectangle:
+    normal = np.zeros(3)
+    normal[axis] = sign
+    local = Pose("shape", "side", as_vector(0.5 * box.size_m[axis] * normal), rotation_facing(as_vector(normal)))
+    lengths = np.abs(local.R.T) @ np.array(box.size_m)
+    pose = box.T_world_shape @ local
+    pose = Pose("world", "shape", pose.translation_m, pose.rotation)
+    name = f"{box.name}{'+-'[sign < 0.0]}{'xyz'[axis]}"
+    return Rectangle(name, pose, (float(lengths[0]), float(lengths[1])), box.texture)
