@@ -1,0 +1,74 @@
+"""Rendering noise as an error of phi: against Monte Carlo of the weighted estimate, and its limits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from phibench.render import noise_budget as nb
+from phibench.render.spot import spot_layer
+from phibench.render.spot_truth import spot_truth
+from phibench.scenes.catalog import default_rig
+from phibench.scenes.laser import LaserSpot, beam_diameter_m
+
+VIEW = default_rig().at(0.2)
+SPOT = LaserSpot((2.0, 0.7, 0.5), (-2.0, -0.7, 0.0), beam_diameter_m(2.1))
+TRUTH = spot_truth(VIEW, SPOT, ())
+UV = np.array([TRUTH.u_px, TRUTH.v_px])
+LAYER = spot_layer(VIEW, SPOT, ())
+SIZE = (3, 720, 1280)
+ROOM = np.full(SIZE, 4e4)
+
+
+def test_gradient_of_phi_is_that_of_the_closed_form() -> None:
+    """Moving the spot by a little moves pixel and phi_ray together, to 1e-4 (second order of the move)."""
+    moved = spot_truth(VIEW, LaserSpot((2.0, 0.7, 0.501), (-2.0, -0.7, 0.0), 5e-3), ())
+    step = np.array([moved.u_px, moved.v_px]) - UV
+    change = moved.phi_ray_rad - TRUTH.phi_ray_rad
+    assert nb.phi_gradient(VIEW, UV) @ step == pytest.approx(change, rel=1e-3)
+    assert np.linalg.norm(nb.phi_gradient(VIEW, UV)) == pytest.approx(
+        7.6e-3 / 2.0, rel=0.1
+    )  # DESIGN: 7.6 mrad of theta
+
+
+@pytest.mark.parametrize("source", ["sensor", "render"])
+def test_predicted_errors_against_monte_carlo(source: str) -> None:
+    """4000 draws of one Newton step from the truth: the standard deviation's own error is 1.1 %; 6 sigma, 7 %."""
+    variance = np.full(SIZE, (0.1 * 4e4) ** 2)
+    budget = nb.noise_budget(VIEW, UV, LAYER, ROOM, variance)
+    rng, draws = np.random.default_rng(3), 4000
+    h, w = LAYER.electrons_per_s.shape[1:]
+    image = (slice(LAYER.v0_px, LAYER.v0_px + h), slice(LAYER.u0_px, LAYER.u0_px + w))
+    mosaic = nb._bayer(image)
+
+    def raw(stack: np.ndarray) -> np.ndarray:
+        return np.where(mosaic, stack, 0.0).sum(axis=0).ravel() * nb.EXPOSURE_S
+
+    mean = raw(LAYER.electrons_per_s + ROOM[:, *image])
+    slopes = np.stack([raw(LAYER.du_electrons_per_s_px), raw(LAYER.dv_electrons_per_s_px)])
+    weight = 1.0 / (mean + nb.READ_NOISE_E**2)
+    if source == "sensor":
+        noise = rng.poisson(mean, (draws, mean.size)) - mean + rng.normal(0, nb.READ_NOISE_E, (draws, mean.size))
+    else:
+        noise = rng.normal(0.0, 0.1 * 4e4 * nb.EXPOSURE_S, (draws, mean.size))
+    steps = np.linalg.solve((slopes * weight) @ slopes.T, (slopes * weight) @ noise.T)
+    measured = np.std(nb.phi_gradient(VIEW, UV) @ steps)
+    predicted = budget.phi_sensor_rad if source == "sensor" else budget.phi_render_rad
+    assert measured == pytest.approx(predicted, rel=0.07)
+    assert measured != pytest.approx(1.2 * predicted, rel=0.07)  # the test can tell 20 %
+
+
+def test_quiet_layers_keep_the_budget_and_noisy_ones_do_not() -> None:
+    quiet = nb.noise_budget(VIEW, UV, LAYER, ROOM, np.full(SIZE, (0.001 * 4e4) ** 2))
+    noisy = nb.noise_budget(VIEW, UV, LAYER, ROOM, np.full(SIZE, (0.2 * 4e4) ** 2))
+    assert quiet.kept
+    assert not noisy.kept
+    assert noisy.phi_render_rad == pytest.approx(200.0 * quiet.phi_render_rad)
+    assert quiet.phi_sensor_rad == noisy.phi_sensor_rad
+
+
+def test_a_spot_off_the_image_has_no_budget_to_keep() -> None:
+    dark = spot_layer(VIEW, LaserSpot((0.0, 0.0, 2.9), (0, 0, -1), 5e-3), ())
+    budget = nb.noise_budget(VIEW, UV, dark, ROOM, ROOM)
+    assert np.isnan(budget.phi_render_rad)
+    assert budget.kept
