@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from phibench.datasets.recipe import MAX_STROKE_M, LaserTable, Recipe, RigTable, RoomTable, Table, TargetTable
 from phibench.datasets.recipe_faults import Fault, nearest
+from phibench.datasets.recipe_places import boards_in_the_way, spots_on_boards
 from phibench.datasets.recipe_scene import build_rig, build_room, build_spot, build_target
 from phibench.scenes.checks import SceneError
 from phibench.scenes.rig import Rig
@@ -33,7 +34,8 @@ def semantic_faults(raw: Raw) -> list[Fault]:
         *_repeats(experiments),
         *_laser(_sound(raw.get("laser", {}), LaserTable)),
         *_places(_sound(raw.get("room", {}), RoomTable), targets),
-        *_rig(raw, experiments),
+        *spots_on_boards(_sound(raw.get("laser", {}), LaserTable), targets),
+        *_rig(raw, experiments, targets),
     ]
 
 
@@ -145,7 +147,7 @@ def _extent(room: Room) -> str:
     return ", ".join(f"{name} {low:g} to {high:g} m" for name, (low, high) in zip("xyz", _bounds(room), strict=True))
 
 
-def _rig(raw: Raw, experiments: list[tuple[int, Raw]]) -> Iterator[Fault]:
+def _rig(raw: Raw, experiments: list[tuple[int, Raw]], targets: list[tuple[int, TargetTable]]) -> Iterator[Fault]:
     table, room_table = _sound(raw.get("rig", {}), RigTable), _sound(raw.get("room", {}), RoomTable)
     if table is None:
         return
@@ -154,6 +156,7 @@ def _rig(raw: Raw, experiments: list[tuple[int, Raw]]) -> Iterator[Fault]:
     except SceneError as error:
         yield Fault("rig", str(error))
         return
+    yield from boards_in_the_way(rig, _legal_strokes(experiments), targets)
     if room_table is not None:
         yield from _strokes(rig, build_room(room_table, ()), experiments)
 
@@ -161,15 +164,28 @@ def _rig(raw: Raw, experiments: list[tuple[int, Raw]]) -> Iterator[Fault]:
 def _strokes(rig: Rig, room: Room, experiments: list[tuple[int, Raw]]) -> Iterator[Fault]:
     """The mirror must stay below the lowest thing that hangs from the ceiling."""
     ceiling_m = min(s.T_world_shape.translation_m[2] for s in room.surfaces if _faces_down(s))
+    down_m = rig.at(0.0).sphere_centre_m[2] + rig.mirror.radius_m
+    if down_m >= ceiling_m:
+        text = f"the mirror's top is at {down_m:.3f} m when down, above the ceiling at {ceiling_m:.2f} m"
+        yield Fault("rig.camera_height_m", f"{text}; give less than {rig.T_world_camera.t[2] - down_m + ceiling_m:.3f}")
+        return
     for i, experiment in experiments:
         for j, stroke_m in _items(experiment, "strokes_m"):
-            if type(stroke_m) not in (int, float) or not 0.0 < stroke_m <= MAX_STROKE_M:
+            if not _is_legal(stroke_m):
                 continue  # a structural fault
             top_m = rig.at(stroke_m).sphere_centre_m[2] + rig.mirror.radius_m
             if top_m >= ceiling_m:
                 longest_m = stroke_m - (top_m - ceiling_m)
                 text = f"{stroke_m} lifts the mirror's top to {top_m:.3f} m, through the ceiling at {ceiling_m:.2f} m"
                 yield Fault(f"experiments[{i}].strokes_m[{j}]", f"{text}; give less than {longest_m:.3f}")
+
+
+def _is_legal(stroke_m: object) -> bool:
+    return type(stroke_m) in (int, float) and 0.0 < cast(float, stroke_m) <= MAX_STROKE_M
+
+
+def _legal_strokes(experiments: list[tuple[int, Raw]]) -> list[float]:
+    return [float(h) for _, experiment in experiments for _, h in _items(experiment, "strokes_m") if _is_legal(h)]
 
 
 def _faces_down(surface: Rectangle) -> bool:

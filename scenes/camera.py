@@ -11,11 +11,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from phibench.scenes.checks import finite, positive, within
+from phibench.scenes.checks import SceneError, finite, positive, within
 from phibench.scenes.detector import Detector
 from phibench.scenes.frames import Array, BoolArray
 
 _NEWTON_STEPS = 30
+_FOLD_MARGIN_PX = 10.0
 _NEWTON_TOLERANCE = 1e-14  # normalised image coordinates; 1.4e-11 px
 
 
@@ -63,6 +64,8 @@ class Camera:
         for name in ("cx_px", "cy_px", "k1", "k2", "k3", "p1", "p2"):
             finite("Camera", name, getattr(self, name))
         within("Camera", "blur_sigma_px", self.blur_sigma_px, 0.05, 20.0)
+        if any((self.k1, self.k2, self.k3, self.p1, self.p2)):
+            self._check_one_to_one()
 
     @property
     def aperture_radius_m(self) -> float:
@@ -130,6 +133,28 @@ class Camera:
         """|d(x, y) / d(u, v)|, shape (...): area of normalised coordinates per square pixel."""
         J = self.distort_jacobian(xy)
         return 1.0 / np.abs((J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]) * self.fx_px * self.fy_px)
+
+    def _check_one_to_one(self) -> None:
+        """Raise `SceneError` if the distortion folds: pixel and direction must belong to each other up to the corners.
+
+        The Jacobian must stay positive all the way from the centre to each pixel of a grid, a blur's width beyond the
+        image: elsewhere a pixel would see two directions, or none.
+        """
+        low, high = -0.5 - _FOLD_MARGIN_PX, np.array([self.width_px, self.height_px]) - 0.5 + _FOLD_MARGIN_PX
+        u, v = np.meshgrid(np.linspace(low, high[0], 33), np.linspace(low, high[1], 19))
+        uv = np.stack([u.ravel(), v.ravel()], axis=-1)
+        xy = self.normalised(uv)
+        way = np.linspace(0.0, 1.0, 17)[1:, None, None] * xy
+        J = self.distort_jacobian(way)
+        with np.errstate(invalid="ignore"):
+            good = np.all(J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0] > 0.0, axis=0)
+        if not good.all():
+            u_px, v_px = uv[~good][np.argmin(np.linalg.norm(uv[~good] - uv.mean(axis=0), axis=-1))]
+            raise SceneError(
+                f"Camera: the distortion k1 = {self.k1:g}, k2 = {self.k2:g}, k3 = {self.k3:g}, p1 = {self.p1:g}, "
+                f"p2 = {self.p2:g} folds near pixel ({u_px:.0f}, {v_px:.0f}): it must be one-to-one over the image; "
+                "take smaller coefficients, and set all of k1, k2, k3 when a preset's are changed"
+            )
 
     def contains(self, uv_px: Array) -> BoolArray:
         """Whether pixels (u, v), shape (..., 2), lie inside the image [-0.5, W - 0.5] x [-0.5, H - 0.5]."""

@@ -17,7 +17,7 @@ from phibench.scenes.textures import Checker, Uniform
 # Inner faces of the lab, metres: about 10 x 9 x 3 with the stroke axis at the origin.
 X_LOW, X_HIGH, Y_LOW, Y_HIGH, HEIGHT = -4.8, 5.2, -4.6, 4.4, 3.0
 BOARD_THICKNESS_M = 0.02
-_BOARD_SIZE_M = (0.40, 0.30)  # width, height
+BOARD_SIZE_M = (0.40, 0.30)  # width, height
 _LAMP_RADIANCE = (3.6, 3.2, 2.4)  # W/m^2/sr per band: about 300 lx on the floor, warm white
 
 
@@ -61,7 +61,7 @@ def board(target: Target) -> Cuboid:
     """Thin cuboid whose front face carries the target's spot."""
     behind = target.depth_m + BOARD_THICKNESS_M / 2.0
     centre = (behind * math.cos(target.azimuth_rad), behind * math.sin(target.azimuth_rad), target.height_m)
-    size = (BOARD_THICKNESS_M, *_BOARD_SIZE_M)
+    size = (BOARD_THICKNESS_M, *BOARD_SIZE_M)
     return cuboid(f"board_{target.name}", centre, size, (0.70, 0.70, 0.70), rotation_xyz(z_rad=target.azimuth_rad))
 
 

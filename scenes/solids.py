@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from phibench.scenes.checks import finite_vector, positive
-from phibench.scenes.frames import Pose, Vector, as_vector, rotation_facing
+from phibench.scenes.frames import Array, Pose, Vector, as_vector, rotation_facing
 from phibench.scenes.textures import Texture, Uniform
 
 _WHITE = Uniform((0.7, 0.7, 0.7))
@@ -62,6 +62,18 @@ class Cuboid:
         """Whether a world point lies strictly inside."""
         local = self.T_world_shape.inverse().points(np.asarray(point_world_m, float))
         return bool(np.all(np.abs(local) < 0.5 * np.array(self.size_m) - 1e-9))
+
+    def distance_m(self, point_world_m: Array) -> float:
+        """Distance of a world point from the solid, 0 inside."""
+        local = np.abs(self.T_world_shape.inverse().points(np.asarray(point_world_m, float)))
+        return float(np.linalg.norm(np.maximum(local - 0.5 * np.array(self.size_m), 0.0)))
+
+    def meets(self, other: Cuboid) -> bool:
+        """Whether two boxes overlap: no axis separates them (of the faces, and the products of the edges)."""
+        a, b = self.T_world_shape.R, other.T_world_shape.R
+        axes = np.concatenate([a.T, b.T, np.cross(a.T[:, None], b.T[None]).reshape(-1, 3)])
+        reach = (np.abs(axes @ a) @ np.array(self.size_m) + np.abs(axes @ b) @ np.array(other.size_m)) / 2.0
+        return bool(np.all(np.abs(axes @ (self.T_world_shape.t - other.T_world_shape.t)) < reach + 1e-12))
 
 
 Shape = Rectangle | Cuboid

@@ -148,3 +148,27 @@ def test_aperture_radius_of_the_default_lens():
 def test_impossible_cameras_are_refused_by_name(name, value):
     with pytest.raises(SceneError, match=f"Camera.{name}"):
         replace(Camera(), **{name: value})
+
+
+@pytest.mark.parametrize(
+    "coefficients",
+    [
+        {"k1": -1.5},
+        {"k1": -5.0},
+        {"k1": -50.0},
+        {"k1": -0.12, "k2": 0.03, "k3": -3.4},
+        {"k1": -0.3, "p1": 0.5},
+    ],
+)
+def test_distortion_that_folds_inside_the_image_is_refused(coefficients):
+    with pytest.raises(SceneError, match="folds near pixel"):
+        Camera(**coefficients)
+
+
+@pytest.mark.parametrize("coefficients", [{}, {"k1": -0.12}, {"k1": -0.026, "k2": 1.06, "k3": -3.40}, {"k1": 5.0}])
+def test_distortion_that_is_one_to_one_is_accepted(coefficients):
+    """A brute-force count: along the diagonal the distorted radius rises to the corner's."""
+    camera = Camera(**coefficients)
+    corner = camera.normalised(np.array([-0.5, -0.5]))
+    way = camera.distort(np.linspace(0.0, 1.0, 500)[:, None] * corner)
+    assert np.all(np.diff(np.linalg.norm(way, axis=-1)) > 0.0)

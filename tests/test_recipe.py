@@ -165,3 +165,29 @@ def test_a_board_that_nobody_uses_is_a_warning() -> None:
 
 def test_the_schema_for_editors_knows_every_table() -> None:
     assert set(recipe_schema()["properties"]) == set(Recipe.model_fields)
+
+
+@pytest.mark.parametrize(
+    ("place", "part"),
+    [((0.01, 0.71), "mirror"), ((0.05, 0.71), "mirror"), ((0.02, 0.40), "camera housing"), ((0.02, 1.11), "mirror")],
+)
+def test_board_that_cuts_the_carriage_is_refused(place: tuple[float, float], part: str) -> None:
+    depth_m, height_m = place
+    targets = [{"name": "a", "depth_m": depth_m, "azimuth_deg": 0.0, "height_m": height_m}]
+    with pytest.raises(RecipeError, match=rf"targets\[0\].depth_m.*cuts the {part}"):
+        check_recipe(changed(targets=targets, experiments=[{"name": "e", "targets": ["a"], "strokes_m": [0.4]}]))
+
+
+def test_spot_larger_than_its_board_is_refused() -> None:
+    with pytest.raises(RecipeError, match=r"its board measures 0\.3 m"):
+        check_recipe(changed(laser={"diameter_m": 0.5}))
+
+
+def test_camera_above_the_ceiling_is_blamed_on_the_camera() -> None:
+    with pytest.raises(RecipeError, match=r"rig.camera_height_m.*above the ceiling"):
+        check_recipe(changed(rig={"camera_height_m": 2.9}))
+
+
+def test_distortion_that_folds_is_refused_with_its_coefficients() -> None:
+    with pytest.raises(RecipeError, match=r"k1 = -0.12, k2 = 0.03, k3 = -3.4.*folds"):
+        check_recipe(changed(rig={"preset": "c310", "k1": -0.12, "k2": 0.03}))

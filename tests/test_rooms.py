@@ -11,7 +11,7 @@ from oracles import TARGETS, paper_cases, true_reflection
 
 from phibench.scenes.catalog import RIGS, ROOMS, Target, dark, lab
 from phibench.scenes.checks import SceneError
-from phibench.scenes.frames import Pose
+from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.rig import Rig
 from phibench.scenes.robot import chassis, escalade360
 from phibench.scenes.room import Room
@@ -163,3 +163,31 @@ def test_impossible_targets_are_refused(change):
 def test_catalogue_builds():
     assert set(RIGS) == {"default", "c310"}
     assert all(make().fits_image() for make in RIGS.values())
+
+
+def test_boxes_meet_when_they_overlap_and_only_then():
+    """Against 4000 points of one box: overlapping boxes share some, separated ones none."""
+    rng, answers = np.random.default_rng(4), []
+
+    def turns(rng):
+        return rotation_xyz(*rng.uniform(-2, 2, 3))
+
+    grid = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 16)] * 3), axis=-1).reshape(-1, 3)
+    for _ in range(300):
+        poses = [Pose("world", "shape", tuple(rng.uniform(-0.5, 0.5, 3)), turns(rng)) for _ in "ab"]
+        a, b = (Cuboid(name, pose, tuple(rng.uniform(0.1, 0.7, 3))) for name, pose in zip("ab", poses, strict=True))
+        points = b.T_world_shape.inverse().points(a.T_world_shape.points(grid * np.array(a.size_m)))
+        shared = bool(np.any(np.all(np.abs(points) < 0.5 * np.array(b.size_m), axis=-1)))
+        answers.append((shared, a.meets(b)))
+        assert a.meets(b) == b.meets(a)
+        assert a.meets(b) or not shared
+    assert sum(shared for shared, _ in answers) > 50
+    assert sum(not meets for _, meets in answers) > 50
+    assert sum(meets and not shared for shared, meets in answers) < 30  # the grid misses thin overlaps only
+
+
+def test_distance_from_a_box():
+    box = cuboid("box", (1.0, 0.0, 0.0), (0.2, 0.4, 0.6), (0.5, 0.5, 0.5), rotation_xyz(z_rad=math.pi / 2))
+    assert box.distance_m(np.array([1.0, 0.0, 0.0])) == 0.0
+    assert box.distance_m(np.array([1.3, 0.0, 0.0])) == pytest.approx(0.1)  # turned: 0.4 along x
+    assert box.distance_m(np.array([1.0, 0.4, 0.7])) == pytest.approx(0.5)
