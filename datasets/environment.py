@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import multiprocessing
+import json
+import subprocess
+import sys
 import uuid
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +29,12 @@ def local_environment() -> Environment:
     DatasetError
         If Mitsuba cannot be used.
     """
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        try:
-            found = pool.submit(describe).result()
-        except BrokenProcessPool as error:
-            raise DatasetError("starting Mitsuba ended its process; ask `phibench doctor`") from error
-    return _checked({"this machine": found})
+    command = [sys.executable, "-m", "phibench.datasets.environment"]
+    child = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    if child.returncode != 0:
+        last = (child.stderr.strip().splitlines() or [f"exit status {child.returncode}"])[-1]
+        raise DatasetError(f"Mitsuba does not start on this machine ({last}); ask `phibench doctor`")
+    return _checked({"this machine": json.loads(child.stdout.splitlines()[-1])})
 
 
 def remote_environment(workers: Workers, out: Path) -> Environment:
@@ -94,3 +94,7 @@ def _checked(found: dict[str, Any]) -> Environment:
             unlike = [key for key in environment if environment[key] != bare[first].get(key)]
             raise DatasetError(f"workers {first} and {name} differ in {', '.join(unlike)}: their images would too")
     return bare[first]
+
+
+if __name__ == "__main__":
+    print(json.dumps(describe()))

@@ -45,6 +45,7 @@ def merge(out: str | Path, shards: Sequence[str | Path], console: Console | None
         claim(out, info.name)
         remove_temporary(out)
         (out / SUMS).unlink(missing_ok=True)
+        journal.begin(head, [])  # says what the folder is, should this be interrupted
         _copy(out, [entries[name] for name in names], console)
         journal.entries = {name: entries[name][0] for name in names}
         journal.begin(head, names)

@@ -10,11 +10,11 @@ from pathlib import Path
 from phibench.datasets import layout
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.estimate import megabytes
-from phibench.datasets.files import write_bytes
+from phibench.datasets.files import TEMPORARY_PREFIX, write_bytes
 from phibench.datasets.info import read_info
 from phibench.datasets.journal import Head, Journal
 
-_OWN = (layout.LOCK, layout.WORKING)
+_OWN = ".phibench-"  # locks, and temporary files that a killed run left
 
 
 def claim(out: Path, name: str) -> None:
@@ -30,7 +30,7 @@ def claim(out: Path, name: str) -> None:
     _refuse_other(out, name)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        write_bytes(out / ".phibench-probe", b"").unlink()
+        write_bytes(out / f"{TEMPORARY_PREFIX}probe", b"").unlink()
     except OSError as error:
         raise DatasetError(f"cannot write to {out}: {error.strerror or error}; give another folder") from error
 
@@ -70,7 +70,7 @@ def held_head(out: Path) -> Head | None:
     DatasetError
         If it holds something else.
     """
-    if not out.is_dir() or all(path.name in _OWN for path in out.iterdir()):
+    if not out.is_dir() or all(path.name.startswith(_OWN) for path in out.iterdir()):
         return None
     head = Journal(out).head
     if head is not None:

@@ -16,9 +16,11 @@ from test_make import TINY, living, quiet, said
 from phibench.datasets import layout
 from phibench.datasets.code_hash import closure, code_behind
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.files import TEMPORARY_PREFIX
 from phibench.datasets.journal import Entry, Head, Journal
 from phibench.datasets.lock import only_run
 from phibench.datasets.make import make
+from phibench.datasets.output import claim
 from phibench.datasets.sums import data_files
 
 RUN = (
@@ -154,6 +156,15 @@ def test_a_second_run_is_refused_and_a_killed_one_holds_nothing(tmp_path: Path) 
         holder.kill()
     with only_run(tmp_path):
         pass
+
+
+def test_what_a_run_leaves_that_is_killed_at_once_is_no_obstacle(tmp_path: Path) -> None:
+    for name in (layout.LOCK, layout.WORKING, f"{TEMPORARY_PREFIX}probe", f"{TEMPORARY_PREFIX}abc.txt"):
+        (tmp_path / name).write_bytes(b"")
+    claim(tmp_path, "tiny")
+    (tmp_path / "mine.txt").write_bytes(b"")
+    with pytest.raises(DatasetError, match="holds no data set"):
+        claim(tmp_path, "tiny")
 
 
 def kill_and_repeat(out: Path, kills: int, seed: int) -> int:
