@@ -1,4 +1,4 @@
-"""Dispatching: needs first, a window that does not grow, killers of workers found out, no bottleneck at 1 000 workers."""
+"""Dispatching: needs first, a window that does not grow, killers of workers found out, no bottleneck for many."""
 
 import heapq
 import resource
@@ -124,7 +124,7 @@ def simulate(samples: int, workers: int, folder: Path) -> tuple[int, float, floa
 
 @pytest.mark.parametrize("samples", [2_000, pytest.param(100_000, marks=pytest.mark.slow)])
 def test_a_thousand_workers_do_not_wait_for_us(tmp_path: Path, samples: int) -> None:
-    """The window, the journal and its rewriting. 1 000 workers with tasks of 2 s take 500 tasks/s: we must be faster."""
+    """The window, the journal and its rewriting. 1 000 workers with tasks of 2 s take 500 a second: be faster."""
     count, seconds, grown, executor = simulate(samples, 1000, tmp_path)
     ideal = count / 1000.0  # every simulated task takes a second
     text = f"{count} tasks, {count / seconds:.0f} tasks/s, {grown:.0f} MB, {1e6 * grown / count:.0f} bytes a task"
