@@ -119,4 +119,4 @@ def log_entry(task: Task, outcome: Done | Failed) -> dict[str, Any]:
 def _peak_mb() -> float:
     """Largest resident memory of this process so far, MB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return round(peak / (1e6 if sys.platform == "darwin" else 1e3), 1)
+    return round(peak * (1.0 if sys.platform == "darwin" else 1024.0) / 1e6, 1)

@@ -175,7 +175,6 @@ def test_workers_that_are_missing_or_do_not_fit(tmp_path: Path, monkeypatch: pyt
         (blocked / "mitsuba").mkdir(parents=True)
         (blocked / "mitsuba" / "__init__.py").write_text("raise ModuleNotFoundError('no', name='mitsuba')")
         path = os.pathsep.join([str(blocked), os.environ.get("PYTHONPATH", "")])
-    Path(file).unlink()
     with running(scheduler), running(worker, PYTHONPATH=path):
         text = refusal(tmp_path / "out", file)
         assert "cannot render: Mitsuba is not installed" in text

@@ -128,9 +128,8 @@ def test_a_thousand_workers_do_not_wait_for_us(tmp_path: Path, samples: int) -> 
     count, seconds, grown, executor = simulate(samples, 1000, tmp_path)
     ideal = count / 1000.0  # every simulated task takes a second
     text = f"{count} tasks, {count / seconds:.0f} tasks/s, {grown:.0f} MB, {1e6 * grown / count:.0f} bytes a task"
-    print(
-        f"\n{text}, workers busy {ideal / executor.now:.1%}, journal {sum(f.stat().st_size for f in tmp_path.iterdir()) / 1e6:.0f} MB"
-    )
+    size = sum(file.stat().st_size for file in tmp_path.iterdir())
+    print(f"\n{text}, workers busy {ideal / executor.now:.1%}, journal {size / 1e6:.0f} MB")
     assert count / seconds > 1000.0
     assert executor.most <= AHEAD * 1000
     assert executor.now < ideal + 5.0
