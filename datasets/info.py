@@ -46,6 +46,7 @@ def dataset_info(plan: Plan, environment: dict[str, Any]) -> DatasetInfo:
         object_names=plan.room.object_names(plan.rig.at(0.0)),
         poses=tuple(_pose_info(pose) for pose in plan.poses),
         samples=len(plan.pairs),
+        shard=plan.shard,
         conventions=CONVENTIONS,
         provenance={**provenance(), **environment},
     )
@@ -54,6 +55,16 @@ def dataset_info(plan: Plan, environment: dict[str, Any]) -> DatasetInfo:
 def info_text(info: DatasetInfo) -> str:
     """Text of `dataset.json`."""
     return json.dumps(info.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
+
+
+def same_content(a: DatasetInfo, b: DatasetInfo) -> bool:
+    """Whether two descriptions mean the same bytes; the commit does not count."""
+    return _without_commit(a) == _without_commit(b)
+
+
+def parse_info(text: str) -> DatasetInfo:
+    """Read the text of a `dataset.json` that this version wrote."""
+    return DatasetInfo.model_validate(json.loads(text))
 
 
 def recipe_sha256(recipe: Recipe) -> str:
@@ -94,6 +105,11 @@ def _json(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise DatasetError(f"{path} is damaged: it does not hold a JSON object")
     return document
+
+
+def _without_commit(info: DatasetInfo) -> str:
+    provenance = {key: value for key, value in info.provenance.items() if key != "commit"}
+    return info_text(info.model_copy(update={"provenance": provenance}))
 
 
 def _pose_info(pose: PosePlan) -> PoseInfo:

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import re
+
 INFO = "dataset.json"
 MANIFEST = "manifest.jsonl"
 TABLE = "manifest.parquet"
 RECIPE = "recipe.toml"
 SUMS = "SHA256SUMS"
 RUN = "run.json"
+LOG = "log.jsonl"
+JOURNAL = "journal.txt"
+LOCK = ".phibench-lock"
+WORKING = ".phibench-working"
 CONTACT_SHEET = "contact_sheet.png"
-NOT_DATA = (SUMS, RUN, CONTACT_SHEET)
-"""Files that SHA256SUMS does not list: itself, the diary of the run, and what `show` draws."""
+NOT_DATA = (SUMS, RUN, LOG, JOURNAL, LOCK, WORKING, CONTACT_SHEET)
+"""Files that SHA256SUMS does not list: itself, the diaries of the run, locks, and what `show` draws."""
+
+_TASK_FILE = re.compile(
+    r"views/[^/]+/(ambient|truth)\.exr|views/[^/]+/preview\.png|spots/[^/]+-(down|up)\.exr|previews/[^/]+\.png"
+)
 
 
 def view_file(pose_id: str, name: str) -> str:
@@ -26,3 +36,8 @@ def spot_file(sample_id: str, position: str) -> str:
 def preview_file(sample_id: str) -> str:
     """Picture of a sample: down and up side by side, laser on."""
     return f"previews/{sample_id}.png"
+
+
+def is_task_file(name: str) -> bool:
+    """Whether a file is called as what tasks write: a view's, a spot's or a preview's."""
+    return _TASK_FILE.fullmatch(name) is not None

@@ -5,38 +5,49 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 
 from rich.console import Console
 
 from phibench.datasets import layout
+from phibench.datasets.crew import Crew
+from phibench.datasets.documents import documents, unlike, write_documents
+from phibench.datasets.environment import versions
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.files import remove_temporary, write_bytes, write_text
-from phibench.datasets.info import dataset_info, info_text, recipe_sha256
-from phibench.datasets.manifest import write_manifest
-from phibench.datasets.output import bytes_needed, check_disk, claim, is_complete
+from phibench.datasets.files import remove_temporary, write_text
+from phibench.datasets.finish import finish_tasks, unfinished
+from phibench.datasets.info import dataset_info, info_text, parse_info, same_content
+from phibench.datasets.journal import Head, Journal
+from phibench.datasets.lock import only_run
+from phibench.datasets.output import claim, remove_files, stale_files
 from phibench.datasets.plan import Plan, make_plan
-from phibench.datasets.progress import Steps
 from phibench.datasets.recipe_checks import warnings
 from phibench.datasets.recipe_file import find_recipe, load_recipe
-from phibench.datasets.sample_preview import write_preview
-from phibench.datasets.schema import DatasetInfo, ManifestRow
-from phibench.datasets.spot_task import make_rows
-from phibench.datasets.sums import write_sums
-from phibench.datasets.view_task import render_view, start_renderer
-from phibench.datasets.workers import Pool, Task
+from phibench.datasets.schema import DatasetInfo
+from phibench.datasets.shard import shard_plan
+from phibench.datasets.work import plan_tasks
 
 
-def make(recipe: str | Path, out: str | Path, workers: int | None = None, console: Console | None = None) -> Path:
-    """Render the data set of a recipe into a folder.
+def make(
+    recipe: str | Path,
+    out: str | Path,
+    workers: int | None = None,
+    console: Console | None = None,
+    scheduler: str | None = None,
+    shard: str | None = None,
+) -> Path:
+    """Render the data set of a recipe into a folder; what is finished there is kept, whatever ended the last run.
 
     Parameters
     ----------
     recipe : path of a TOML file, or the name of a shipped recipe
-    out : folder; made if need be. A finished one of the same recipe and code is left alone, an unfinished one redone.
+    out : folder; made if need be. It may hold this data set, made from other values: what these change is made again.
     workers : processes; by default one per core
     console : where progress goes; by default the standard error
+    scheduler : address or scheduler file of a running dask scheduler, whose workers are used instead
+    shard : part of the recipe, "i/n"
 
     Returns
     -------
@@ -45,74 +56,75 @@ def make(recipe: str | Path, out: str | Path, workers: int | None = None, consol
     Raises
     ------
     DatasetError
-        If recipe, folder or disk will not do, a sample is refused, or a worker fails. Nothing is then half-written
-        under a final name, and `SHA256SUMS` is missing.
+        If recipe, folder or disk will not do, or a task fails (the others are finished first). Nothing is then
+        half-written under a final name, and `SHA256SUMS` is missing.
     """
     console, out = console or Console(stderr=True), Path(out)
-    count = workers if workers is not None else os.cpu_count() or 1
-    if count < 1:
-        raise DatasetError(f"workers = {count}: at least 1 is needed")
-    plan = make_plan(load_recipe(recipe))
+    plan = shard_plan(make_plan(load_recipe(recipe)), shard)
     for warning in warnings(plan.recipe):
         console.print(f"warning: {warning}", highlight=False, soft_wrap=True)
-    claim(out, plan.recipe.dataset.name, recipe_sha256(plan.recipe))
-    try:
-        _make(plan, find_recipe(recipe).read_bytes(), out, count, console)
-    except OSError as error:
-        raise DatasetError(f"could not write to {out}: {error}; then run the same command again") from error
-    finally:
-        remove_temporary(out)
+    make_from_plan(plan, find_recipe(recipe).read_text(encoding="utf-8"), out, workers, console, scheduler)
     return out
 
 
-def _make(plan: Plan, recipe: bytes, out: Path, count: int, console: Console) -> None:
+def make_from_plan(
+    plan: Plan, recipe: str, out: Path, workers: int | None, console: Console, scheduler: str | None = None
+) -> list[str]:
+    """Make what is unfinished or damaged of a plan; return the names of the tasks done and documents written."""
+    count = workers if workers is not None else os.cpu_count() or 1
+    if count < 1:
+        raise DatasetError(f"workers = {count}: at least 1 is needed")
+    claim(out, plan.recipe.dataset.name)
+    try:
+        with only_run(out):
+            claim(out, plan.recipe.dataset.name)  # again: now nobody else can
+            remove_temporary(out)
+            try:
+                with Crew(out, count, scheduler) as crew, Journal(out) as journal:
+                    return _make(plan, recipe, out, crew, journal, console)
+            finally:
+                remove_temporary(out)
+    except OSError as error:
+        raise DatasetError(f"could not write to {out}: {error}; then run the same command again") from error
+
+
+def _make(plan: Plan, recipe: str, out: Path, crew: Crew, journal: Journal, console: Console) -> list[str]:
     started, began = time.monotonic(), datetime.now(UTC)
-    with Pool(min(count, len(plan.poses))) as pool:
-        [(_, environment)] = pool.run([Task("starting Mitsuba", start_renderer)])
-        info = dataset_info(plan, environment)
-        if is_complete(out, info):
-            console.print(f"{out} is complete, nothing to do", highlight=False)
-            return
-        check_disk(out, bytes_needed(plan))
-        _begin(out, info, recipe)
-        rows = _spots(plan, out, console)
-        write_manifest(out, rows)
-        _views(plan, out, pool, console)
-        _previews(out, rows, pool, console)
-    _write_run(out, count, began, time.monotonic() - started)
-    write_sums(out)
+    environment = crew.environment()
+    head = Head(_info_text(dataset_info(plan, environment), journal), recipe)
+    tasks = plan_tasks(plan, versions(environment))
+    todo = unfinished(tasks, journal, out)
+    if not todo and not (faults := _loose_ends(plan, head, journal, tasks, out)):
+        console.print(f"{out} is complete, nothing to do", highlight=False)
+        return []
+    if todo:
+        (out / layout.SUMS).unlink(missing_ok=True)
+        finish_tasks(plan, tasks, todo, journal, head, out, crew, console)
+        faults = _loose_ends(plan, head, journal, tasks, out)
+    journal.begin(head, tasks)
+    wanted = documents(plan, head, journal.entries)
+    remove_files(out, [name for name in faults if name not in wanted])
+    write_documents(out, wanted, [name for name in faults if name in wanted])
+    _write_run(out, crew.width, began, time.monotonic() - started)
+    return [*todo, *faults]
 
 
-def _begin(out: Path, info: DatasetInfo, recipe: bytes) -> None:
-    """Mark the folder as this data set's, and as unfinished."""
-    (out / layout.SUMS).unlink(missing_ok=True)
-    write_text(out / layout.INFO, info_text(info))
-    write_bytes(out / layout.RECIPE, recipe)
+def _loose_ends(plan: Plan, head: Head, journal: Journal, tasks: Iterable[str], out: Path) -> list[str]:
+    """Documents to be written, and files to be removed, when every task is done."""
+    entries = {name: journal.entries[name] for name in tasks}
+    files = [name for entry in entries.values() for name in entry.files]
+    return [*unlike(out, documents(plan, head, entries)), *stale_files(out, files)]
 
 
-def _spots(plan: Plan, out: Path, console: Console) -> list[ManifestRow]:
-    with Steps(console, "spots", len(plan.pairs)) as steps:
-        return make_rows(plan, out, steps.advance)
-
-
-def _views(plan: Plan, out: Path, pool: Pool, console: Console) -> None:
-    recipe = plan.recipe
-    tasks = [
-        Task(f"view {pose.pose_id}", render_view, (recipe.dataset.name, plan.rig, plan.room, pose, recipe.ambient, out))
-        for pose in plan.poses
-    ]
-    _run(pool, tasks, "views", console)
-
-
-def _previews(out: Path, rows: list[ManifestRow], pool: Pool, console: Console) -> None:
-    tasks = [Task(f"preview {row.sample_id}", write_preview, (out, row.sample_id)) for row in rows]
-    _run(pool, tasks, "previews", console)
-
-
-def _run(pool: Pool, tasks: list[Task], title: str, console: Console) -> None:
-    with Steps(console, title, len(tasks)) as steps:
-        for _ in pool.run(tasks):
-            steps.advance()
+def _info_text(info: DatasetInfo, journal: Journal) -> str:
+    """Text of `dataset.json`: the one that is there if it means the same."""
+    if journal.head is not None:
+        try:
+            if same_content(parse_info(journal.head.info), info):
+                return journal.head.info
+        except ValueError:
+            pass  # of another version
+    return info_text(info)
 
 
 def _write_run(out: Path, count: int, began: datetime, seconds: float) -> None:

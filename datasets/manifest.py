@@ -12,16 +12,24 @@ from pydantic import ValidationError
 
 from phibench.datasets import layout
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.files import write_bytes, write_text
+from phibench.datasets.files import write_bytes
 from phibench.datasets.schema import ManifestRow, columns, row_line
 
 
 def write_manifest(folder: Path, rows: Sequence[ManifestRow]) -> None:
     """Write both forms."""
-    write_text(folder / layout.MANIFEST, "".join(row_line(row) + "\n" for row in rows))
+    for name, data in manifest_documents(rows).items():
+        write_bytes(folder / name, data)
+
+
+def manifest_documents(rows: Sequence[ManifestRow]) -> dict[str, bytes]:
+    """Both forms as bytes, by file name."""
     buffer = io.BytesIO()
     to_frame(rows).write_parquet(buffer, compression="zstd", statistics=False)
-    write_bytes(folder / layout.TABLE, buffer.getvalue())
+    return {
+        layout.MANIFEST: "".join(row_line(row) + "\n" for row in rows).encode(),
+        layout.TABLE: buffer.getvalue(),
+    }
 
 
 def read_manifest(folder: Path) -> list[ManifestRow]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 from phibench.datasets.errors import RecipeError
@@ -58,6 +59,8 @@ class Plan:
         In the order of their offsets; shared by all pairs.
     pairs : tuple of PairPlan
         In the order of the recipe.
+    shard : str or None
+        "i/n" where this is a part of the recipe (`shard.py`).
     """
 
     recipe: Recipe
@@ -66,6 +69,7 @@ class Plan:
     spots: dict[str, LaserSpot]
     poses: tuple[PosePlan, ...]
     pairs: tuple[PairPlan, ...]
+    shard: str | None = None
 
     def view(self, pair: PairPlan, position: str) -> View:
         """View of a pair at a stroke position."""
@@ -109,9 +113,8 @@ def _room(recipe: Recipe) -> Room:
 def _poses(recipe: Recipe, pairs: tuple[PairPlan, ...]) -> tuple[PosePlan, ...]:
     offsets = sorted({Stroke(pair.stroke_m).offset_m(position) for pair in pairs for position in POSITIONS})
     names = [pose_name(offset_m) for offset_m in offsets]
-    for name in names:
-        if names.count(name) > 1:
-            raise RecipeError(f"experiments: two strokes near {name[1:]} m differ by less than 1 nm; make them equal")
+    if twice := [name for name, count in Counter(names).items() if count > 1]:
+        raise RecipeError(f"experiments: two strokes near {twice[0][1:]} m differ by less than 1 nm; make them equal")
     dataset = recipe.dataset
     return tuple(
         PosePlan(name, offset_m, seed_32(dataset.name, dataset.seed, name, "ambient"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import platform
 import subprocess
+from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
 
@@ -23,6 +24,7 @@ def provenance() -> dict[str, str | dict[str, str | None] | None]:
     }
 
 
+@lru_cache
 def code_sha256() -> str:
     """SHA-256 over all Python files of scenes, render and datasets, by name."""
     root = Path(__file__).resolve().parent.parent

@@ -117,6 +117,9 @@ class TargetTable(Table):
     )
     azimuth_deg: float = Field(ge=-360.0, le=360.0, description="direction from world x towards world y")
     height_m: float = Field(ge=0.0, le=100.0, description="height of the spot above the floor")
+    diameter_m: float | None = Field(
+        default=None, gt=0.0, le=1.0, description="diameter of this spot, instead of what [laser] says"
+    )
 
 
 class ExperimentTable(Table):

@@ -51,10 +51,11 @@ def build_spot(laser: LaserTable, target: TargetTable) -> LaserSpot:
     """Laser spot at the centre of a target board."""
     board = build_target(target)
     growing = laser.diameter_base_m + laser.diameter_growth_m_per_m * target.depth_m
+    common = growing if laser.diameter_m is None else laser.diameter_m
     return LaserSpot(
         position_world_m=board.position_world_m,
         normal_world=board.normal_world,
-        diameter_m=growing if laser.diameter_m is None else laser.diameter_m,
+        diameter_m=common if target.diameter_m is None else target.diameter_m,
         albedo=laser.albedo,
         power_w=laser.power_w,
         wavelength_nm=laser.wavelength_nm,

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, model_validator
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 Position = Literal["down", "up"]
 
 
@@ -130,6 +130,7 @@ class DatasetInfo(Document):
     object_names: Annotated[tuple[str, ...], Field(strict=False)] = _field("-", "name by object_id of the truth layers")
     poses: Annotated[tuple[PoseInfo, ...], Field(strict=False)] = _field("-", "all mirror poses")
     samples: int = _field("-", "number of rows of the manifest")
+    shard: str | None = _field("-", "which part of the recipe this is, such as 1/4; null for all of it")
     conventions: dict[str, str] = _field("-", "frames, pixels, phi, units in one sentence each")
     provenance: dict[str, Any] = _field("-", "versions, commit, code hash, variant, LLVM, threads")
 

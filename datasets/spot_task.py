@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -11,13 +11,14 @@ import numpy as np
 from phibench.datasets import layout
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.layers import SpotWindow, write_spot
-from phibench.datasets.plan import PairPlan, Plan
+from phibench.datasets.plan import PairPlan
 from phibench.datasets.schema import CertificateRow, ManifestRow, SpotRow
+from phibench.datasets.task import Made
 from phibench.render.certificate import Certificate, certify
 from phibench.render.spot import SpotLayer, spot_layer
 from phibench.render.spot_truth import SpotTruth, depth_m, spot_truth
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.rig import POSITIONS, View
+from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
 from phibench.scenes.room import Room
 
 
@@ -49,54 +50,47 @@ def answer_spot(view: View, spot: LaserSpot, room: Room) -> SpotAnswer:
     return SpotAnswer(truth, layer, certificate, _reaches(view, _window(layer)))
 
 
-def make_rows(plan: Plan, out: Path, advance: Callable[[], None] = lambda: None) -> list[ManifestRow]:
-    """Compute all spots of a plan, write their layers below `out`, return the manifest's rows.
-
-    A spot that several pairs see from one pose is computed once.
+def make_spot(out: Path, dataset: str, rig: Rig, room: Room, spot: LaserSpot, pair: PairPlan) -> Made:
+    """Task: both spot layers of a sample and its row of the manifest.
 
     Raises
     ------
     RefusedSampleError
-        If a certificate is out of tolerance, with its numbers, for all such samples in one go.
+        If a certificate is out of tolerance, with its numbers.
     """
-    answers: dict[tuple[str, float], SpotAnswer] = {}
-    refused, rows = [], []
-    for pair in plan.pairs:
-        for position in POSITIONS:
-            view = plan.view(pair, position)
-            key = (pair.target, view.offset_m)
-            if key not in answers:
-                answers[key] = answer_spot(view, plan.spots[pair.target], plan.room)
-            refused += _complaints(pair, position, answers[key])
-        if not refused:
-            rows.append(_write_pair(plan, pair, answers, out))
-        advance()
-    if refused:
+    views = {position: rig.at(Stroke(pair.stroke_m).offset_m(position)) for position in POSITIONS}
+    answers = {position: answer_spot(view, spot, room) for position, view in views.items()}
+    if refused := [line for position in POSITIONS for line in _complaints(pair, position, answers[position])]:
         raise RefusedSampleError("\n".join(["refused, a certificate is out of tolerance:", *refused]))
-    return rows
+    rows = {}
+    for position, answer in answers.items():
+        file = _write_layer(out, dataset, pair, position, answer)
+        rows[position] = _spot_row(pair.pose_id(position), views[position], answer, file)
+    row = manifest_row(rig, spot, pair, rows["down"], rows["up"])
+    return Made(tuple(r.spot_file for r in rows.values() if r.spot_file is not None), row.model_dump(mode="json"))
 
 
-def _write_pair(plan: Plan, pair: PairPlan, answers: dict[tuple[str, float], SpotAnswer], out: Path) -> ManifestRow:
-    spots = {}
-    for position in POSITIONS:
-        view = plan.view(pair, position)
-        answer = answers[pair.target, view.offset_m]
-        file = layout.spot_file(pair.sample_id, position) if answer.on_image else None
-        if file is not None:
-            header = {"dataset": plan.recipe.dataset.name, "sample_id": pair.sample_id, "position": position}
-            write_spot(out / file, _window(answer.layer), header)
-        spots[position] = _spot_row(pair.pose_id(position), view, answer, file)
-    return manifest_row(plan, pair, spots["down"], spots["up"])
+def _write_layer(out: Path, dataset: str, pair: PairPlan, position: str, answer: SpotAnswer) -> str | None:
+    """Write a spot layer, or make sure that there is none where no light reaches the image."""
+    file = layout.spot_file(pair.sample_id, position)
+    if not answer.on_image:
+        (out / file).unlink(missing_ok=True)
+        return None
+    write_spot(
+        out / file,
+        _window(answer.layer),
+        {"dataset": dataset, "sample_id": pair.sample_id, "position": position},
+    )
+    return file
 
 
-def manifest_row(plan: Plan, pair: PairPlan, down: SpotRow, up: SpotRow) -> ManifestRow:
+def manifest_row(rig: Rig, spot: LaserSpot, pair: PairPlan, down: SpotRow, up: SpotRow) -> ManifestRow:
     """One row of the manifest."""
-    spot = plan.spots[pair.target]
     return ManifestRow(
         sample_id=pair.sample_id,
         experiment=pair.experiment,
         target=pair.target,
-        depth_m=float(depth_m(np.array(spot.position_world_m), plan.rig.at(0.0).sphere_centre_m)),
+        depth_m=float(depth_m(np.array(spot.position_world_m), rig.at(0.0).sphere_centre_m)),
         stroke_m=pair.stroke_m,
         spot_world_m=_triple(spot.position_world_m),
         spot_normal_world=_triple(spot.normal_world),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from phibench.datasets import layout
@@ -17,8 +18,12 @@ def data_files(folder: Path) -> list[str]:
 
 def write_sums(folder: Path) -> Path:
     """Hash all data files."""
-    lines = [f"{sha256(folder / name)}  {name}\n" for name in data_files(folder)]
-    return write_text(folder / layout.SUMS, "".join(lines))
+    return write_text(folder / layout.SUMS, sums_text({name: sha256(folder / name) for name in data_files(folder)}))
+
+
+def sums_text(hashes: Mapping[str, str]) -> str:
+    """Text of the list, sorted by name."""
+    return "".join(f"{hashes[name]}  {name}\n" for name in sorted(hashes))
 
 
 def read_sums(folder: Path) -> dict[str, str]:

@@ -19,6 +19,7 @@ from phibench.datasets.plan import make_plan
 from phibench.datasets.progress import Steps
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.schema import PoseInfo, SpotRow
+from phibench.datasets.shard import shard_plan
 from phibench.datasets.spot_task import SpotAnswer, answer_spot
 from phibench.datasets.sums import damaged, read_sums
 from phibench.scenes.rig import POSITIONS
@@ -98,7 +99,7 @@ def _content_faults(dataset: Dataset, bad: set[str], truth_layers: bool, console
 
 
 def _plan_faults(dataset: Dataset) -> Iterator[str]:
-    plan = make_plan(dataset.recipe)
+    plan = shard_plan(make_plan(dataset.recipe), dataset.info.shard)
     planned, found = {pair.sample_id for pair in plan.pairs}, [row.sample_id for row in dataset.rows]
     for name in sorted(planned - set(found)):
         yield f"{layout.MANIFEST}: sample {name} of the recipe is missing"

@@ -10,6 +10,7 @@ from phibench.datasets.layers import write_ambient, write_truth
 from phibench.datasets.plan import PosePlan
 from phibench.datasets.preview import exposure_s, save_png, to_srgb
 from phibench.datasets.recipe import AmbientTable
+from phibench.datasets.task import Made
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
 
@@ -24,8 +25,8 @@ def start_renderer() -> dict[str, Any]:
     return {"variant": variant, "llvm": llvm, "threads_per_process": THREADS}
 
 
-def render_view(dataset: str, rig: Rig, room: Room, pose: PosePlan, ambient: AmbientTable, out: Path) -> str:
-    """Render one pose and write its three files below `out`; return the pose's id."""
+def render_view(out: Path, dataset: str, rig: Rig, room: Room, pose: PosePlan, ambient: AmbientTable) -> Made:
+    """Task: render one pose and write its three files below `out`."""
     from phibench.render.ambient import render_ambient
     from phibench.render.truth import truth_layer
     from phibench.render.variant import activate
@@ -40,4 +41,4 @@ def render_view(dataset: str, rig: Rig, room: Room, pose: PosePlan, ambient: Amb
     detector = rig.camera.detector
     picture = to_srgb(planes, detector, exposure_s(planes, detector))
     save_png(out / layout.view_file(pose.pose_id, "preview"), picture)
-    return pose.pose_id
+    return Made(tuple(layout.view_file(pose.pose_id, name) for name in ("ambient", "truth", "preview")))

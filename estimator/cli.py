@@ -26,7 +26,7 @@ app = App(
     suppress_keyboard_interrupt=False,
     result_action="return_value",
 )
-dataset = App(name="dataset", help="Make, verify and show data sets.")
+dataset = App(name="dataset", help="Make, verify, repair, merge and show data sets.")
 app.command(dataset)
 
 
@@ -66,8 +66,15 @@ def doctor() -> int:
 
 
 @dataset.command
-def make(recipe: str, *, out: Path, workers: int | None = None) -> int:
-    """Render a data set.
+def make(
+    recipe: str,
+    *,
+    out: Path,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    shard: str | None = None,
+) -> int:
+    """Render a data set; what is finished already is kept.
 
     Parameters
     ----------
@@ -77,10 +84,51 @@ def make(recipe: str, *, out: Path, workers: int | None = None) -> int:
         Folder to write; one that holds another data set is refused.
     workers
         Number of processes; one for each core by default.
+    scheduler
+        Address or scheduler file of a running dask scheduler, to use its workers instead.
+    shard
+        Part of the recipe for job arrays, such as 1/8; put the parts together with `merge`.
     """
     from phibench.datasets.make import make as make_dataset
 
-    make_dataset(recipe, out, workers)
+    make_dataset(recipe, out, workers, scheduler=scheduler, shard=shard)
+    return 0
+
+
+@dataset.command
+def repair(directory: Path, *, workers: int | None = None, scheduler: str | None = None) -> int:
+    """Render again what is damaged or missing in a data set.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    workers
+        Number of processes; one for each core by default.
+    scheduler
+        Address or scheduler file of a running dask scheduler, to use its workers instead.
+    """
+    from phibench.datasets.repair import repair as repair_dataset
+
+    for name in repair_dataset(directory, workers, scheduler=scheduler):
+        print(f"made again: {name}")
+    return 0
+
+
+@dataset.command
+def merge(out: Path, *shards: Path) -> int:
+    """Put the shards of a data set together.
+
+    Parameters
+    ----------
+    out
+        Folder to write.
+    shards
+        Folders of all shards.
+    """
+    from phibench.datasets.merge import merge as merge_shards
+
+    merge_shards(out, shards)
     return 0
 
 

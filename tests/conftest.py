@@ -3,8 +3,10 @@
 import os
 import subprocess
 import sys
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -21,6 +23,54 @@ def python() -> Callable[..., subprocess.CompletedProcess[str]]:
         return subprocess.run(command, cwd=ROOT, env=merged, capture_output=True, text=True, timeout=300, check=False)
 
     return run
+
+
+class InlineCrew:
+    """Does tasks in this process, one after the other: for tests of what is done, not of who does it."""
+
+    width = 1
+
+    def __init__(self, out: Path, *_: object) -> None:
+        self._out = out
+
+    def __enter__(self) -> "InlineCrew":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return None
+
+    def environment(self) -> dict[str, object]:
+        from phibench.datasets.environment import describe
+
+        return {key: value for key, value in describe().items() if key != "worker"}
+
+    def executor(self, _: int) -> "Inline":
+        return Inline(self._out)
+
+
+class Inline:
+    """Executor of `InlineCrew`."""
+
+    def __init__(self, out: Path) -> None:
+        self._out, self._waiting = out, deque[Any]()
+
+    def width(self) -> int:
+        return 1
+
+    def submit(self, task: Any) -> None:
+        self._waiting.append(task)
+
+    def next(self) -> Any:
+        from phibench.datasets.task import perform
+
+        task = self._waiting.popleft()
+        return task, perform(task, self._out)
+
+
+@pytest.fixture
+def inline(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let `make` do its tasks in this process."""
+    monkeypatch.setattr("phibench.datasets.make.Crew", InlineCrew)
 
 
 @pytest.fixture(scope="session")

@@ -17,7 +17,7 @@ from phibench.datasets.manifest import differences, read_manifest, to_frame, wri
 from phibench.datasets.plan import make_plan
 from phibench.datasets.recipe_file import load_recipe
 from phibench.datasets.schema import ManifestRow, columns, flat, row_line
-from phibench.datasets.spot_task import make_rows
+from phibench.datasets.spot_task import make_spot
 from phibench.scenes.catalog import c310_rig, lab
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
@@ -27,7 +27,9 @@ TINY = Path(__file__).with_name("tiny.toml")
 
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory: pytest.TempPathFactory) -> list[ManifestRow]:
-    return make_rows(make_plan(load_recipe(TINY)), tmp_path_factory.mktemp("rows"))
+    plan, out = make_plan(load_recipe(TINY)), tmp_path_factory.mktemp("rows")
+    made = [make_spot(out, "tiny", plan.rig, plan.room, plan.spots[pair.target], pair) for pair in plan.pairs]
+    return [ManifestRow.model_validate_json(json.dumps(one.result)) for one in made]
 
 
 @pytest.fixture

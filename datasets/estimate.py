@@ -1,0 +1,75 @@
+"""What a run will take: bytes and seconds, from what each kind of task took on one core.
+
+Measured on 2 cores of an x86-64 server at 2.x GHz with AVX-512, llvm_ad_rgb, `lab`; another machine differs by its
+speed. The first run of a worker compiles its kernels once, which START_S holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from phibench.datasets.plan import Plan
+from phibench.datasets.task import Task
+
+# Seconds. `python -m pytest -s -k estimate_of_the_time` prints them beside a run's own.
+START_S = 5.0  # workers, Mitsuba, first kernels
+VIEW_S = 0.8
+VIEW_S_PER_MEGAPIXEL = 1.6  # truth, encoding, fsync
+VIEW_S_PER_MEGASAMPLE_SEGMENT = 0.12  # one path segment, a million of them
+SPOT_S = 0.35  # two positions with their certificates
+PREVIEW_S_PER_MEGAPIXEL = 0.9
+
+# Bytes.
+_AMBIENT_BYTES_PX = 12.0  # three noisy float32 planes do not compress
+_TRUTH_BYTES_PX = 13.5  # ten float32 planes; what is outside the mirror compresses to nothing
+_PREVIEW_BYTES_PX = 2.8
+_SPOT_BYTES = 8192
+_RESERVE = 1.1
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """How many tasks of each kind, how many bytes on the disk, how many seconds of one core."""
+
+    counts: dict[str, int]
+    size: int
+    core_s: float
+
+    def text(self, workers: int) -> str:
+        """One sentence for the terminal."""
+        counts = ", ".join(f"{n} {kind}{'s' * (n != 1)}" for kind, n in self.counts.items() if n)
+        seconds = START_S + self.core_s / max(min(workers, sum(self.counts.values())), 1)
+        took = f"{seconds:.0f} s" if seconds < 90.0 else f"{seconds / 60.0:.0f} min"
+        return f"to make: {counts}; about {megabytes(self.size)}, {took} with {workers} worker{'s' * (workers != 1)}"
+
+
+def estimate(plan: Plan, tasks: Collection[Task]) -> Estimate:
+    """Cost of these tasks of a plan."""
+    counts = {kind: sum(task.kind == kind for task in tasks) for kind in dict.fromkeys(task.kind for task in tasks)}
+    pixels = plan.rig.camera.width_px * plan.rig.camera.height_px
+    size = {
+        "view": pixels * (_AMBIENT_BYTES_PX + _TRUTH_BYTES_PX + _PREVIEW_BYTES_PX),
+        "spot": 2.0 * _SPOT_BYTES,
+        "preview": 0.5 * pixels * _PREVIEW_BYTES_PX,
+    }
+    seconds = _seconds(plan, pixels / 1e6)
+    total = sum(count * size.get(kind, 0.0) for kind, count in counts.items())
+    return Estimate(
+        counts, int(_RESERVE * total), sum(count * seconds.get(kind, 0.0) for kind, count in counts.items())
+    )
+
+
+def megabytes(count: int) -> str:
+    """Bytes for people."""
+    return f"{count / 1e6:.0f} MB" if count < 5e9 else f"{count / 1e9:.0f} GB"
+
+
+def _seconds(plan: Plan, megapixels: float) -> dict[str, float]:
+    ambient = plan.recipe.ambient
+    paths = megapixels * ambient.samples_per_pixel * ambient.max_depth * VIEW_S_PER_MEGASAMPLE_SEGMENT
+    return {
+        "view": VIEW_S + megapixels * VIEW_S_PER_MEGAPIXEL + paths,
+        "spot": SPOT_S,
+        "preview": megapixels * PREVIEW_S_PER_MEGAPIXEL,
+    }

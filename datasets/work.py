@@ -1,0 +1,82 @@
+"""The tasks of a plan, in the order of the recipe, each with its key.
+
+A view depends on rig, room, pose and ambient settings; a spot on rig, room, laser and stroke; a preview on its two
+views and its spot. A task of a new kind (a light map, say) is put before those that name it in their `needs`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from phibench.datasets.code_hash import code_behind
+from phibench.datasets.codec import to_json
+from phibench.datasets.plan import PairPlan, Plan, PosePlan
+from phibench.datasets.sample_preview import make_preview
+from phibench.datasets.spot_task import make_spot
+from phibench.datasets.task import Task, task_key
+from phibench.datasets.view_task import render_view
+from phibench.scenes.rig import POSITIONS
+
+Tasks = dict[str, Task]
+
+
+def plan_tasks(plan: Plan, versions: Mapping[str, Any]) -> Tasks:
+    """Tasks by name; `versions` says what they run on (Python, packages, renderer)."""
+    makers = _Makers(plan, versions)
+    spots = [makers.spot(pair) for pair in plan.pairs]  # first, they are quick and find faults of the recipe
+    views = {pose.pose_id: makers.view(pose) for pose in plan.poses}
+    previews = [makers.preview(pair, spot, views) for pair, spot in zip(plan.pairs, spots, strict=True)]
+    return {task.name: task for task in (*spots, *views.values(), *previews)}
+
+
+def task_names(plan: Plan) -> list[str]:
+    """Names of all tasks in the order of `plan_tasks`, without their keys."""
+    return list(plan_tasks(plan, {}))
+
+
+def spot_task_name(pair: PairPlan) -> str:
+    """Name of the task whose result is a sample's row."""
+    return f"spot {pair.sample_id}"
+
+
+class _Makers:
+    """Makes tasks; what many keys share is hashed once."""
+
+    def __init__(self, plan: Plan, versions: Mapping[str, Any]) -> None:
+        self._plan, self._versions = plan, dict(versions)
+        self._scene = [_digest(to_json(plan.rig)), _digest(to_json(plan.room))]
+        self._spots = {name: to_json(spot) for name, spot in plan.spots.items()}
+
+    def spot(self, pair: PairPlan) -> Task:
+        plan = self._plan
+        name = plan.recipe.dataset.name
+        inputs = ["spot", name, *self._scene, self._spots[pair.target], asdict(pair)]
+        key = self._key(inputs, make_spot)
+        return Task(spot_task_name(pair), key, make_spot, (name, plan.rig, plan.room, plan.spots[pair.target], pair))
+
+    def view(self, pose: PosePlan) -> Task:
+        plan = self._plan
+        name, ambient = plan.recipe.dataset.name, plan.recipe.ambient
+        key = self._key(["view", name, *self._scene, asdict(pose), ambient.model_dump()], render_view)
+        return Task(f"view {pose.pose_id}", key, render_view, (name, plan.rig, plan.room, pose, ambient))
+
+    def preview(self, pair: PairPlan, spot: Task, views: Mapping[str, Task]) -> Task:
+        detector = self._plan.rig.camera.detector
+        needs = list(
+            {views[pair.pose_id(position)].name: views[pair.pose_id(position)] for position in POSITIONS}.values()
+        )
+        keys = tuple(task.key for task in (spot, *needs))
+        key = self._key(["preview", pair.sample_id], make_preview, keys)
+        names = tuple(task.name for task in (spot, *needs))
+        return Task(f"preview {pair.sample_id}", key, make_preview, (pair, detector), names)
+
+    def _key(self, inputs: Any, function: Any, needs: tuple[str, ...] = ()) -> str:
+        return task_key(inputs, code_behind(function.__module__), self._versions, needs)
+
+
+def _digest(document: Any) -> str:
+    return hashlib.sha256(json.dumps(document, sort_keys=True, allow_nan=False).encode()).hexdigest()
