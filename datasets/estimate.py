@@ -11,12 +11,15 @@ from dataclasses import dataclass
 
 from phibench.datasets.plan import Plan
 from phibench.datasets.task import Task
+from phibench.render.bake import fixed_shapes
+from phibench.render.patches import cut, texel_count
 
 # Seconds. `python -m pytest -s -k estimate_of_the_time` prints them beside a run's own.
 START_S = 5.0  # workers, Mitsuba, first kernels
 VIEW_S = 0.8
 VIEW_S_PER_MEGAPIXEL = 1.6  # truth, encoding, fsync
-VIEW_S_PER_MEGASAMPLE_SEGMENT = 0.12  # one path segment, a million of them
+VIEW_S_PER_MEGASAMPLE = 0.45  # look-ups in the light map, a million of them
+BAKE_S_PER_MEGARAY = 0.13  # of the light map; none where the user's cache has it
 SPOT_S = 0.35  # two positions with their certificates
 PREVIEW_S_PER_MEGAPIXEL = 0.9
 
@@ -65,11 +68,19 @@ def megabytes(count: int) -> str:
     return f"{count / 1e6:.0f} MB" if count < 5e9 else f"{count / 1e9:.0f} GB"
 
 
+def _bake_rays(plan: Plan) -> float:
+    """Rays of a light map: texels times rays per texel."""
+    ambient, lamps = plan.recipe.ambient, sum(surface.emits for surface in plan.room.surfaces)
+    rays = ambient.bounces * ambient.bounce_rays + 2 * (lamps * ambient.lamp_rays + ambient.final_rays)
+    return float(rays * texel_count(cut(fixed_shapes(plan.room), ambient.texel_m)))
+
+
 def _seconds(plan: Plan, megapixels: float) -> dict[str, float]:
     ambient = plan.recipe.ambient
-    paths = megapixels * ambient.samples_per_pixel * ambient.max_depth * VIEW_S_PER_MEGASAMPLE_SEGMENT
+    samples = megapixels * ambient.samples_per_pixel * VIEW_S_PER_MEGASAMPLE
     return {
-        "view": VIEW_S + megapixels * VIEW_S_PER_MEGAPIXEL + paths,
+        "bake": _bake_rays(plan) / 1e6 * BAKE_S_PER_MEGARAY,
+        "view": VIEW_S + megapixels * VIEW_S_PER_MEGAPIXEL + samples,
         "spot": SPOT_S,
         "preview": megapixels * PREVIEW_S_PER_MEGAPIXEL,
     }

@@ -19,6 +19,7 @@ TRUTH_PLANES = (
     *("x_m", "y_m", "z_m", "depth_m", "path_m"),
     *("phi_ray_rad", "phi_normal_rad", "phi_incidence_rad", "azimuth_rad", "object_id"),
 )
+AMBIENT_PLANES = (*FILTERS, *(f"var.{name}" for name in FILTERS))
 SPOT_STACKS = {"electrons_per_s": "", "du_electrons_per_s_px": "du.", "dv_electrons_per_s_px": "dv."}
 """Arrays of a spot layer, shape (3, h, w), and the prefix of their planes: R, G, B, du.R, ..."""
 SPOT_PLANES = tuple(prefix + name for prefix in SPOT_STACKS.values() for name in FILTERS)
@@ -61,16 +62,22 @@ class SpotWindow:
             image[:, v0:v1, u0:u1] += gain * part
 
 
-def write_ambient(path: Path, planes: NDArray[Any], header: Mapping[str, Any]) -> Path:
-    """Write an ambient layer, shape (3, H, W): planes R, G, B."""
+def write_ambient(path: Path, planes: NDArray[Any], variance: NDArray[Any], header: Mapping[str, Any]) -> Path:
+    """Write an ambient layer and its variance, shape (3, H, W) each: planes R, G, B, var.R, var.G, var.B."""
     header = {"kind": "ambient", "unit": "electrons/s", **header}
-    return write_exr(path, dict(zip(FILTERS, planes, strict=True)), header)
+    return write_exr(path, dict(zip(AMBIENT_PLANES, (*planes, *variance), strict=True)), header)
 
 
 def read_ambient(path: Path) -> NDArray[np.float32]:
     """Read an ambient layer, shape (3, H, W), electrons per second."""
-    file = _read(path, "ambient", FILTERS)
+    file = _read(path, "ambient", AMBIENT_PLANES)
     return np.stack([file.planes[name] for name in FILTERS])
+
+
+def read_ambient_variance(path: Path) -> NDArray[np.float32]:
+    """Read the variance of an ambient layer, shape (3, H, W), (electrons per second) squared."""
+    file = _read(path, "ambient", AMBIENT_PLANES)
+    return np.stack([file.planes["var." + name] for name in FILTERS])
 
 
 def write_truth(path: Path, planes: Mapping[str, Array], header: Mapping[str, Any]) -> Path:

@@ -9,6 +9,7 @@ MANIFEST = "manifest.jsonl"
 TABLE = "manifest.parquet"
 RECIPE = "recipe.toml"
 SUMS = "SHA256SUMS"
+LIGHT_MAP = "lightmap.npz"
 RUN = "run.json"
 LOG = "log.jsonl"
 JOURNAL = "journal.txt"
@@ -19,7 +20,7 @@ NOT_DATA = (SUMS, RUN, LOG, JOURNAL, LOCK, WORKING, CONTACT_SHEET)
 """Files that SHA256SUMS does not list: itself, the diaries of the run, locks, and what `show` draws."""
 
 _TASK_FILE = re.compile(
-    r"views/[^/]+/(ambient|truth)\.exr|views/[^/]+/preview\.png|spots/[^/]+-(down|up)\.exr|previews/[^/]+\.png"
+    r"lightmap\.npz|views/[^/]+/(ambient|truth)\.exr|views/[^/]+/preview\.png|spots/[^/]+-(down|up)\.exr|previews/[^/]+\.png"
 )
 
 
@@ -39,5 +40,5 @@ def preview_file(sample_id: str) -> str:
 
 
 def is_task_file(name: str) -> bool:
-    """Whether a file is called as what tasks write: a view's, a spot's or a preview's."""
+    """Whether a file is called as what tasks write: the light map, a view's, a spot's or a preview's."""
     return _TASK_FILE.fullmatch(name) is not None

@@ -104,8 +104,12 @@ class LaserTable(Table):
 class AmbientTable(Table):
     """`[ambient]`: how well the room is rendered."""
 
-    samples_per_pixel: int = Field(default=64, ge=1, le=1 << 20, description="paths per pixel")
-    max_depth: int = Field(default=8, ge=1, le=256, description="longest path, in segments")
+    samples_per_pixel: int = Field(default=8, ge=2, le=65536, description="points per pixel: area, blur, aperture")
+    texel_m: float = Field(default=0.05, ge=0.01, le=2.0, description="size of the light map's texels")
+    lamp_rays: int = Field(default=64, ge=1, le=65536, description="shadow rays per texel and lamp, twice")
+    bounces: int = Field(default=12, ge=0, le=100, description="passes of bounced light before the last one")
+    bounce_rays: int = Field(default=64, ge=1, le=65536, description="rays per texel in such a pass")
+    final_rays: int = Field(default=1024, ge=1, le=65536, description="rays per texel in the last pass, twice")
 
 
 class TargetTable(Table):

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from phibench.datasets import layout
+from phibench.datasets.bake_task import bake_settings, read_light_map
 from phibench.datasets.layers import write_ambient, write_truth
 from phibench.datasets.plan import PosePlan
 from phibench.datasets.preview import exposure_s, save_png, to_srgb
@@ -27,16 +28,21 @@ def start_renderer() -> dict[str, Any]:
 
 def render_view(out: Path, dataset: str, rig: Rig, room: Room, pose: PosePlan, ambient: AmbientTable) -> Made:
     """Task: render one pose and write its three files below `out`."""
-    from phibench.render.ambient import render_ambient
+    from phibench.render.ambient import dark_layer, render_ambient
     from phibench.render.truth import truth_layer
     from phibench.render.variant import activate
 
     activate()
     view = rig.at(pose.offset_m)
     header = {"dataset": dataset, "pose": pose.pose_id, "offset_m": pose.offset_m}
-    planes = render_ambient(view, room, ambient.samples_per_pixel, ambient.max_depth, pose.seed)
-    settings = {**ambient.model_dump(), "seed": pose.seed}
-    write_ambient(out / layout.view_file(pose.pose_id, "ambient"), planes, {**header, **settings})
+    if room.lit:
+        light, settings = read_light_map(out), bake_settings(ambient)
+        layer = render_ambient(view, room, light, settings, ambient.samples_per_pixel, pose.seed)
+    else:
+        layer = dark_layer(rig.camera)
+    planes = layer.electrons_per_s
+    header_ambient = {**header, **ambient.model_dump(), "seed": pose.seed}
+    write_ambient(out / layout.view_file(pose.pose_id, "ambient"), planes, layer.variance_per_s2, header_ambient)
     write_truth(out / layout.view_file(pose.pose_id, "truth"), truth_layer(view, room.shapes(view)), header)
     detector = rig.camera.detector
     picture = to_srgb(planes, detector, exposure_s(planes, detector))

@@ -1,17 +1,18 @@
 """The tasks of a plan, in the order of the recipe, each with its key.
 
-A view depends on rig, room, pose and ambient settings; a spot on rig, room, laser and stroke; a preview on its two
-views and its spot. A task of a new kind (a light map, say) is put before those that name it in their `needs`.
+The light map depends on the room and its settings; a view on rig, room, pose, settings and light map; a spot on rig,
+room, laser and stroke; a preview on its two views and its spot. A task stands before those that name it in `needs`.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
+from phibench.datasets.bake_task import bake_room, bake_settings
 from phibench.datasets.code_hash import code_behind
 from phibench.datasets.codec import to_json
 from phibench.datasets.plan import PairPlan, Plan, PosePlan
@@ -28,9 +29,10 @@ def plan_tasks(plan: Plan, versions: Mapping[str, Any]) -> Tasks:
     """Tasks by name; `versions` says what they run on (Python, packages, renderer)."""
     makers = _Makers(plan, versions)
     spots = [makers.spot(pair) for pair in plan.pairs]  # first, they are quick and find faults of the recipe
-    views = {pose.pose_id: makers.view(pose) for pose in plan.poses}
+    bakes = [makers.bake()] if plan.room.lit else []
+    views = {pose.pose_id: makers.view(pose, bakes) for pose in plan.poses}
     previews = [makers.preview(pair, spot, views) for pair, spot in zip(plan.pairs, spots, strict=True)]
-    return {task.name: task for task in (*spots, *views.values(), *previews)}
+    return {task.name: task for task in (*spots, *bakes, *views.values(), *previews)}
 
 
 def task_names(plan: Plan) -> list[str]:
@@ -58,11 +60,19 @@ class _Makers:
         key = self._key(inputs, make_spot)
         return Task(spot_task_name(pair), key, make_spot, (name, plan.rig, plan.room, plan.spots[pair.target], pair))
 
-    def view(self, pose: PosePlan) -> Task:
+    def bake(self) -> Task:
+        plan, ambient = self._plan, self._plan.recipe.ambient
+        settings = asdict(bake_settings(ambient))
+        key = self._key(["bake", *self._scene, settings], bake_room)
+        return Task("bake room", key, bake_room, (plan.rig, plan.room, ambient))
+
+    def view(self, pose: PosePlan, bakes: Sequence[Task]) -> Task:
         plan = self._plan
         name, ambient = plan.recipe.dataset.name, plan.recipe.ambient
-        key = self._key(["view", name, *self._scene, asdict(pose), ambient.model_dump()], render_view)
-        return Task(f"view {pose.pose_id}", key, render_view, (name, plan.rig, plan.room, pose, ambient))
+        inputs = ["view", name, *self._scene, asdict(pose), ambient.model_dump()]
+        key = self._key(inputs, render_view, tuple(task.key for task in bakes))
+        arguments, needs = (name, plan.rig, plan.room, pose, ambient), tuple(task.name for task in bakes)
+        return Task(f"view {pose.pose_id}", key, render_view, arguments, needs)
 
     def preview(self, pair: PairPlan, spot: Task, views: Mapping[str, Task]) -> Task:
         detector = self._plan.rig.camera.detector

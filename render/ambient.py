@@ -19,6 +19,7 @@ from phibench.render.patches import cut, texel_count
 from phibench.render.quasi import points, shifts
 from phibench.render.surfaces import Surfaces
 from phibench.render.variant import activate
+from phibench.scenes.camera import Camera
 from phibench.scenes.rig import View
 from phibench.scenes.room import Room
 
@@ -40,6 +41,12 @@ class AmbientLayer:
 
     electrons_per_s: NDArray[np.float32]
     variance_per_s2: NDArray[np.float32]
+
+
+def dark_layer(camera: Camera) -> AmbientLayer:
+    """Ambient layer of a room without light."""
+    zeros = np.zeros((3, camera.height_px, camera.width_px), dtype=np.float32)
+    return AmbientLayer(zeros, zeros)
 
 
 def render_ambient(

@@ -37,6 +37,11 @@ class Room:
         if twice:
             raise SceneError(f"Room '{self.name}': two shapes are called {twice[0]}; names must differ")
 
+    @property
+    def lit(self) -> bool:
+        """Whether any lamp is on."""
+        return any(surface.emits for surface in self.surfaces)
+
     def shapes(self, view: View) -> tuple[Shape, ...]:
         """All shapes for one view; the index of a shape in this tuple is its object id, the same at every offset."""
         return (*self.surfaces, *self.furniture, *(escalade360(view) if self.robot else ()))

@@ -85,7 +85,7 @@ def test_what_cannot_be_repaired_is_refused(copy: Path, tmp_path: Path) -> None:
     head, *rest = (copy / layout.JOURNAL).read_bytes().splitlines(keepends=True)
     (copy / layout.JOURNAL).write_bytes(b"".join(rest))
     truth = (copy / layout.RECIPE).read_text()
-    (copy / layout.RECIPE).write_text(truth.replace("max_depth = 3", "max_depth = 2"))
+    (copy / layout.RECIPE).write_text(truth.replace("bounces = 2", "bounces = 1"))
     assert "is not the recipe that dataset.json names" in refusal(copy)
     (copy / layout.RECIPE).unlink()
     assert "recipe.toml is missing" in refusal(copy)

@@ -73,7 +73,7 @@ VIEWS = ["view h0.000", "view h0.500", "view h1.400"]
     [
         ("seed = 0", "seed = 0  # a comment", []),
         ("depth_m = 1.975", "depth_m = 1.975\ndiameter_m = 6e-3", [PREVIEWS[1], SPOTS[1]]),
-        ("max_depth = 3", "max_depth = 2", PREVIEWS + VIEWS),
+        ("bounces = 2", "bounces = 1", PREVIEWS + VIEWS),
         ("seed = 0", "seed = 1", PREVIEWS + VIEWS),
         ("[ambient]", "[laser]\npower_w = 2e-3\n\n[ambient]", PREVIEWS + SPOTS),
         ("[0.5]", "[0.6]", ["preview seen-near-h0.600", "spot seen-near-h0.600", "view h0.600"]),

@@ -89,7 +89,7 @@ def test_what_does_not_fit_is_refused(shards: list[Path], tmp_path: Path) -> Non
     third = make(TINY, tmp_path / "s3", workers=1, console=quiet(), shard="1/1")
     assert "different divisions" in refusal(out, [first, second, third])
     other = tmp_path / "other.toml"
-    other.write_text(TINY.read_text().replace("max_depth = 3", "max_depth = 2"))
+    other.write_text(TINY.read_text().replace("bounces = 2", "bounces = 1"))
     make(other, tmp_path / "s4", workers=1, console=quiet(), shard="2/2")
     assert "are of different recipes" in refusal(out, [first, tmp_path / "s4"])
     assert "is not a finished shard" in refusal(out, [first, tmp_path / "none"])

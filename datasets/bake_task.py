@@ -1,0 +1,40 @@
+"""The light map of a data set's room: baked once, or taken from the user's cache, and kept with the data set."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from phibench.datasets import layout
+from phibench.datasets.files import write_bytes
+from phibench.datasets.recipe import AmbientTable
+from phibench.datasets.task import Made
+from phibench.render.bake import BakeSettings, LightMap
+from phibench.scenes.rig import Rig
+from phibench.scenes.room import Room
+
+ARRAYS = ("irradiance_w_m2", "sigma_w_m2", "covered")
+
+
+def bake_settings(ambient: AmbientTable) -> BakeSettings:
+    """Settings of the light map in a recipe."""
+    return BakeSettings(**{name: getattr(ambient, name) for name in BakeSettings.__dataclass_fields__})
+
+
+def bake_room(out: Path, rig: Rig, room: Room, ambient: AmbientTable) -> Made:
+    """Task: write the room's light map below `out`."""
+    from phibench.render.lightcache import light_map
+
+    light = light_map(rig.at(0.0), room, bake_settings(ambient))
+    buffer = io.BytesIO()
+    np.savez(buffer, **{name: getattr(light, name) for name in ARRAYS})
+    write_bytes(out / layout.LIGHT_MAP, buffer.getvalue())
+    return Made((layout.LIGHT_MAP,))
+
+
+def read_light_map(out: Path) -> LightMap:
+    """Light map of a data set."""
+    with np.load(out / layout.LIGHT_MAP, allow_pickle=False) as arrays:
+        return LightMap(*(arrays[name] for name in ARRAYS))
