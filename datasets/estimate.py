@@ -1,7 +1,7 @@
 """What a run will take: bytes and seconds, from what each kind of task took on one core.
 
-Measured on 2 cores of an x86-64 server at 2.x GHz with AVX-512, llvm_ad_rgb, `lab`; another machine differs by its
-speed. The first run of a worker compiles its kernels once, which START_S holds.
+CPU seconds on one core of a 2-core AMD EPYC virtual machine, llvm_ad_rgb, room `lab`, 1280 x 720; another machine
+differs by its speed. `make bench` shows the forecast beside a run. A light map or another integrator has its numbers here.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from phibench.datasets.plan import Plan
 from phibench.datasets.task import Task
 
-# Seconds. `python -m pytest -s -k estimate_of_the_time` prints them beside a run's own.
-START_S = 5.0  # workers, Mitsuba, first kernels
-VIEW_S = 0.8
-VIEW_S_PER_MEGAPIXEL = 1.6  # truth, encoding, fsync
-VIEW_S_PER_MEGASAMPLE_SEGMENT = 0.12  # one path segment, a million of them
-SPOT_S = 0.35  # two positions with their certificates
-PREVIEW_S_PER_MEGAPIXEL = 0.9
+# Seconds.
+START_S = 6.0  # workers, Mitsuba in each, first kernels, hashes
+VIEW_S = 0.1
+VIEW_S_PER_MEGAPIXEL = 0.5  # truth, encoding, fsync
+VIEW_S_PER_MEGASAMPLE_SEGMENT = 0.216  # one path segment, a million of them
+SPOT_S = 0.28  # two positions with their certificates
+PREVIEW_S_PER_MEGAPIXEL = 0.3
 
 # Bytes.
 _AMBIENT_BYTES_PX = 12.0  # three noisy float32 planes do not compress
