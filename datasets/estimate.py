@@ -1,7 +1,7 @@
 """What a run will take: bytes and seconds, from what each kind of task took on one core.
 
-Measured on 2 cores of an x86-64 server at 2.x GHz with AVX-512, llvm_ad_rgb, `lab`; another machine differs by its
-speed. The first run of a worker compiles its kernels once, which START_S holds.
+CPU seconds on one core of a 2-core AMD EPYC virtual machine, llvm_ad_rgb, room `lab`, 1280 x 720; another machine
+differs by its speed. `make bench` shows the forecast beside a run. A light map or another integrator has its numbers here.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from phibench.datasets.task import Task
 from phibench.render.bake import fixed_shapes
 from phibench.render.patches import cut, texel_count
 
-# Seconds. `python -m pytest -s -k estimate_of_the_time` prints them beside a run's own.
-START_S = 5.0  # workers, Mitsuba, first kernels
+# Seconds.
+START_S = 6.0  # workers, Mitsuba in each, first kernels, hashes
 VIEW_S = 0.8
-VIEW_S_PER_MEGAPIXEL = 1.6  # truth, encoding, fsync
+VIEW_S_PER_MEGAPIXEL = 0.5  # truth, encoding, fsync
 VIEW_S_PER_MEGASAMPLE = 0.45  # look-ups in the light map, a million of them
 BAKE_S_PER_MEGARAY = 0.13  # of the light map; none where the user's cache has it
-SPOT_S = 0.35  # two positions with their certificates
-PREVIEW_S_PER_MEGAPIXEL = 0.9
+SPOT_S = 0.28  # two positions with their certificates
+PREVIEW_S_PER_MEGAPIXEL = 0.3
 
 # Bytes.
-_AMBIENT_BYTES_PX = 12.0  # three noisy float32 planes do not compress
+_AMBIENT_BYTES_PX = 24.0  # six noisy float32 planes do not compress
 _TRUTH_BYTES_PX = 13.5  # ten float32 planes; what is outside the mirror compresses to nothing
 _PREVIEW_BYTES_PX = 2.8
 _SPOT_BYTES = 8192

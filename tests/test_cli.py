@@ -111,3 +111,36 @@ assert not {"mitsuba", "drjit"} & set(sys.modules)
 """
     done = python(code)
     assert done.returncode == 0, done.stderr
+
+
+def test_repair_prints_what_it_made(monkeypatch, capsys):
+    monkeypatch.setattr("phibench.datasets.repair.repair", lambda *_, **__: ["view h0.000", "SHA256SUMS"])
+    assert cli.main(["dataset", "repair", "x", "--workers", "2"]) == 0
+    assert capsys.readouterr().out.splitlines() == ["made again: view h0.000", "made again: SHA256SUMS"]
+
+
+def test_merge_takes_any_number_of_shards(monkeypatch, tmp_path):
+    calls = []
+    monkeypatch.setattr("phibench.datasets.merge.merge", lambda out, shards: calls.append((out, list(shards))))
+    assert cli.main(["dataset", "merge", str(tmp_path / "o"), str(tmp_path / "a"), str(tmp_path / "b")]) == 0
+    assert calls == [(tmp_path / "o", [tmp_path / "a", tmp_path / "b"])]
+
+
+def test_make_passes_shard_and_scheduler_on(monkeypatch, tmp_path):
+    calls = []
+    monkeypatch.setattr("phibench.datasets.make.make", lambda *args, **options: calls.append((args, options)))
+    tokens = [
+        "dataset",
+        "make",
+        "smoke",
+        "--out",
+        str(tmp_path),
+        "--workers",
+        "3",
+        "--shard",
+        "2/5",
+        "--scheduler",
+        "s",
+    ]
+    assert cli.main(tokens) == 0
+    assert calls == [(("smoke", tmp_path, 3), {"scheduler": "s", "shard": "2/5"})]
