@@ -1,7 +1,9 @@
 """Verification finds every kind of damage, and nothing where there is none."""
 
+import errno
 import io
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +12,7 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from phibench.datasets import layout
+from phibench.datasets import layout, sums
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.layers import read_truth, write_truth
 from phibench.datasets.manifest import read_manifest, write_manifest
@@ -79,9 +81,35 @@ def test_swapped_files_are_found(copy: Path, a: str, b: str, hide: bool) -> None
     assert {name for name in (a, b) if any(name in fault for fault in faults)} == {a, b}
 
 
-def test_a_stray_file_is_named(copy: Path) -> None:
+def test_a_stray_file_is_a_note_and_neither_a_fault_nor_signed(copy: Path) -> None:
+    before = (copy / layout.SUMS).read_text()
     (copy / "spots" / "extra.exr").write_bytes(b"")
-    assert check(copy).faults == ("spots/extra.exr is not listed in SHA256SUMS",)
+    (copy / "scores.json").write_text("{}")
+    report = check(copy)
+    assert report.ok
+    assert ["scores.json" in report.notes[0], "spots/extra.exr" in report.notes[1]] == [True, True]
+    write_sums(copy)
+    assert (copy / layout.SUMS).read_text() == before
+
+
+def test_a_file_of_the_data_set_that_is_not_listed_is_a_fault(copy: Path) -> None:
+    lines = (copy / layout.SUMS).read_text().splitlines(keepends=True)
+    (copy / layout.SUMS).write_text("".join(line for line in lines if SPOT not in line))
+    assert check(copy).faults == (f"{SPOT} is not listed in SHA256SUMS",)
+
+
+def test_a_missing_folder_and_an_unreadable_file_are_called_so(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(DatasetError, match="there is no folder"):
+        check(copy / "nowhere")
+    sha256 = sums.sha256
+
+    def denied(path: Path) -> str:
+        if path.name == layout.TABLE:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        return sha256(path)
+
+    monkeypatch.setattr(sums, "sha256", denied)
+    assert check(copy).faults == (f"{layout.TABLE} is not readable: Permission denied",)
 
 
 def test_an_unfinished_data_set_is_found(copy: Path) -> None:
@@ -130,8 +158,8 @@ def test_a_changed_pixel_truth_is_found_when_asked_for(copy: Path) -> None:
 
 
 def test_what_is_no_data_set_raises(tmp_path: Path) -> None:
-    for folder in (tmp_path, tmp_path / "none"):
-        with pytest.raises(DatasetError, match="is not a data set"):
+    for folder, words in ((tmp_path, "is not a data set"), (tmp_path / "none", "there is no folder")):
+        with pytest.raises(DatasetError, match=words):
             check(folder)
 
 
