@@ -51,7 +51,7 @@ def make(recipe: str | Path, out: str | Path, workers: int | None = None, consol
     console, out = console or Console(stderr=True), Path(out)
     count = workers if workers is not None else os.cpu_count() or 1
     if count < 1:
-        raise DatasetError(f"workers = {count}: at least 1 is needed")
+        raise DatasetError(f"--workers: workers = {count}, at least 1 is needed")
     plan = make_plan(load_recipe(recipe))
     for warning in warnings(plan.recipe):
         console.print(f"warning: {warning}", highlight=False, soft_wrap=True)
