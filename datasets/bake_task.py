@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import io
+import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
 
 from phibench.datasets import layout
+from phibench.datasets.errors import DatasetError
 from phibench.datasets.files import write_bytes
 from phibench.datasets.recipe import AmbientTable
 from phibench.datasets.task import Made
@@ -35,6 +38,16 @@ def bake_room(out: Path, rig: Rig, room: Room, ambient: AmbientTable) -> Made:
 
 
 def read_light_map(out: Path) -> LightMap:
-    """Light map of a data set."""
-    with np.load(out / layout.LIGHT_MAP, allow_pickle=False) as arrays:
-        return LightMap(*(arrays[name] for name in ARRAYS))
+    """Light map of a data set.
+
+    Raises
+    ------
+    DatasetError
+        If the file is missing or not a light map.
+    """
+    path = out / layout.LIGHT_MAP
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return LightMap(*(arrays[name] for name in ARRAYS))
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        raise DatasetError(f"{path} is not readable as a light map: {error}") from error

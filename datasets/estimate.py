@@ -1,7 +1,7 @@
 """What a run will take: bytes and seconds, from what each kind of task took on one core.
 
 CPU seconds on one core of a 2-core AMD EPYC virtual machine, llvm_ad_rgb, room `lab`, 1280 x 720; another machine
-differs by its speed. `make bench` shows the forecast beside a run. A light map or another integrator has its numbers here.
+differs by its speed. `make bench` shows the forecast beside a run. The light map's cost is taken as if no cache held it.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ _AMBIENT_BYTES_PX = 24.0  # six noisy float32 planes do not compress
 _TRUTH_BYTES_PX = 13.5  # ten float32 planes; what is outside the mirror compresses to nothing
 _PREVIEW_BYTES_PX = 2.8
 _SPOT_BYTES = 8192
+_TEXEL_BYTES = 25.0  # six float32 and a bool
 _RESERVE = 1.1
 
 
@@ -52,6 +53,7 @@ def estimate(plan: Plan, tasks: Collection[Task]) -> Estimate:
     counts = {kind: sum(task.kind == kind for task in tasks) for kind in dict.fromkeys(task.kind for task in tasks)}
     pixels = plan.rig.camera.width_px * plan.rig.camera.height_px
     size = {
+        "bake": _TEXEL_BYTES * _texels(plan),
         "view": pixels * (_AMBIENT_BYTES_PX + _TRUTH_BYTES_PX + _PREVIEW_BYTES_PX),
         "spot": 2.0 * _SPOT_BYTES,
         "preview": 0.5 * pixels * _PREVIEW_BYTES_PX,
@@ -72,7 +74,11 @@ def _bake_rays(plan: Plan) -> float:
     """Rays of a light map: texels times rays per texel."""
     ambient, lamps = plan.recipe.ambient, sum(surface.emits for surface in plan.room.surfaces)
     rays = ambient.bounces * ambient.bounce_rays + 2 * (lamps * ambient.lamp_rays + ambient.final_rays)
-    return float(rays * texel_count(cut(fixed_shapes(plan.room), ambient.texel_m)))
+    return float(rays * _texels(plan))
+
+
+def _texels(plan: Plan) -> int:
+    return texel_count(cut(fixed_shapes(plan.room), plan.recipe.ambient.texel_m))
 
 
 def _seconds(plan: Plan, megapixels: float) -> dict[str, float]:

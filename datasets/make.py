@@ -73,7 +73,7 @@ def make_from_plan(
     """Make what is unfinished or damaged of a plan; return the names of the tasks done and documents written."""
     count = workers if workers is not None else os.cpu_count() or 1
     if count < 1:
-        raise DatasetError(f"workers = {count}: at least 1 is needed")
+        raise DatasetError(f"--workers: workers = {count}, at least 1 is needed")
     claim(out, plan.recipe.dataset.name)
     try:
         with only_run(out):

@@ -46,9 +46,8 @@ def check_disk(out: Path, needed: int, replaced: Collection[str]) -> None:
 
 def stale_files(out: Path, expected: Collection[str]) -> list[str]:
     """Files that are called like a task's and that no task of now writes: of removed samples and poses."""
-    names = (
-        path.relative_to(out).as_posix() for top in ("views", "spots", "previews") for path in (out / top).rglob("*")
-    )
+    below = (path for top in ("views", "spots", "previews") for path in (out / top).rglob("*"))
+    names = [path.relative_to(out).as_posix() for path in (*out.glob(layout.LIGHT_MAP), *below)]
     wanted = set(expected)
     return sorted(name for name in names if layout.is_task_file(name) and name not in wanted)
 

@@ -13,7 +13,7 @@ from rich.table import Table
 from phibench.datasets import layout
 from phibench.datasets.preview import Picture, exposure_s, halved, save_png, to_srgb
 from phibench.datasets.progress import Steps
-from phibench.datasets.read import Dataset, Sample, open_dataset
+from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.datasets.schema import ManifestRow, SpotRow
 from phibench.scenes.rig import POSITIONS
 
@@ -25,7 +25,7 @@ _CAPTION_PX = 16
 
 def show(folder: str | Path, console: Console | None = None) -> Path:
     """Print the table of a data set and write its contact sheet; return the path of the sheet."""
-    console, dataset = console or _console(), open_dataset(folder)
+    console, dataset = console or _console(), open_finished(folder)
     console.print(table(dataset))
     path = dataset.folder / layout.CONTACT_SHEET
     save_png(path, contact_sheet(dataset, console))

@@ -11,9 +11,10 @@ import numpy as np
 from rich.console import Console
 
 from phibench.datasets import layout
+from phibench.datasets.bake_task import read_light_map
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exr import read_exr
-from phibench.datasets.layers import SPOT_STACKS, read_ambient, read_spot, read_truth
+from phibench.datasets.layers import SPOT_STACKS, read_ambient, read_ambient_variance, read_spot, read_truth
 from phibench.datasets.manifest import differences, same_number
 from phibench.datasets.plan import make_plan
 from phibench.datasets.progress import Steps
@@ -21,7 +22,9 @@ from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.schema import PoseInfo, SpotRow
 from phibench.datasets.shard import shard_plan
 from phibench.datasets.spot_task import SpotAnswer, answer_spot
-from phibench.datasets.sums import damaged, read_sums
+from phibench.datasets.sums import damaged, read_sums, strays
+from phibench.render.bake import fixed_shapes
+from phibench.render.patches import cut, texel_count
 from phibench.scenes.rig import POSITIONS
 
 _FLOAT32 = 1e-6  # float32 rounds by 6e-8; other machines' libm adds a little
@@ -38,11 +41,14 @@ class Report:
         One sentence each; none means that everything is in order.
     files, samples : int
         How many were looked at.
+    notes : tuple of str
+        One sentence each on what is odd and no fault, such as a file that is not part of the data set.
     """
 
     faults: tuple[str, ...]
     files: int
     samples: int
+    notes: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -67,20 +73,23 @@ def verify(folder: str | Path, truth_layers: bool = True, console: Console | Non
         If the folder is not a data set at all.
     """
     folder, console = Path(folder), console or Console(stderr=True)
+    if not folder.is_dir():
+        raise DatasetError(f"there is no folder {folder}")
     if not (folder / layout.INFO).is_file():
         raise DatasetError(f"{folder} is not a data set: it has no {layout.INFO}")
     try:
         faults, files = damaged(folder), len(read_sums(folder))
+        notes = tuple(f"{name} is not part of the data set" for name in strays(folder))
     except DatasetError as error:
-        faults, files = [str(error)], 0
+        faults, files, notes = [str(error)], 0, ()
     try:
         dataset = open_dataset(folder)
     except DatasetError as error:
-        return Report((*faults, str(error)), files, 0)
+        return Report((*faults, str(error)), files, 0, notes)
     bad = {fault.split(" is ", 1)[0] for fault in faults}
     faults += [*_plan_faults(dataset), *differences(folder, dataset.rows)]
     faults += _content_faults(dataset, bad, truth_layers, console)
-    return Report(tuple(dict.fromkeys(faults)), files, len(dataset))
+    return Report(tuple(dict.fromkeys(faults)), files, len(dataset), notes)
 
 
 def _content_faults(dataset: Dataset, bad: set[str], truth_layers: bool, console: Console) -> list[str]:
@@ -92,6 +101,8 @@ def _content_faults(dataset: Dataset, bad: set[str], truth_layers: bool, console
             for position in POSITIONS:
                 faults += _spot_faults(sample, position, answers, bad)
             steps.advance()
+        if dataset.room.lit and layout.LIGHT_MAP not in bad:
+            faults += _guarded(_light_map_faults(dataset))
         for pose in dataset.info.poses:
             faults += _view_faults(dataset, pose, bad, truth_layers)
             steps.advance()
@@ -181,6 +192,21 @@ def _ambient_faults(dataset: Dataset, pose: PoseInfo, shape: tuple[int, int]) ->
         yield f"{pose.files['ambient']} has {planes.shape[1:]} pixels instead of {shape}"
     if not np.all(np.isfinite(planes) & (planes >= 0.0)):
         yield f"{pose.files['ambient']} has negative or non-finite electrons"
+    variance = read_ambient_variance(dataset.folder / pose.files["ambient"])
+    if not np.all(np.isfinite(variance) & (variance >= 0.0)):
+        yield f"{pose.files['ambient']} has negative or non-finite variances"
+
+
+def _light_map_faults(dataset: Dataset) -> Iterator[str]:
+    light = read_light_map(dataset.folder)
+    texels = texel_count(cut(fixed_shapes(dataset.room), dataset.recipe.ambient.texel_m))
+    shapes = {"irradiance_w_m2": (texels, 3), "sigma_w_m2": (texels, 3), "covered": (texels,)}
+    for name, shape in shapes.items():
+        array = getattr(light, name)
+        if array.shape != shape:
+            yield f"{layout.LIGHT_MAP}: {name} has the shape {array.shape} instead of {shape}"
+        if not np.all(np.isfinite(array) & (array >= 0)):
+            yield f"{layout.LIGHT_MAP}: {name} has negative or non-finite values"
 
 
 def _truth_faults(dataset: Dataset, pose: PoseInfo, shape: tuple[int, int]) -> Iterator[str]:

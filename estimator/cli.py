@@ -43,11 +43,11 @@ def score(directory: Path, *, out: Path | None = None) -> int:
     """
     from rich.console import Console
 
-    from phibench.datasets.read import open_dataset
+    from phibench.datasets.read import open_finished
     from phibench.estimator.score import bias_table, table
     from phibench.estimator.score import score as score_dataset
 
-    scores = score_dataset(open_dataset(directory))
+    scores = score_dataset(open_finished(directory))
     # a table cut off at the width of a pipe or of a narrow terminal would lose numbers
     console = Console()
     console = console if console.width >= _TABLE_WIDTH else Console(width=_TABLE_WIDTH)
@@ -146,6 +146,8 @@ def verify(directory: Path) -> int:
     report = verify_dataset(directory)
     for fault in report.faults:
         print(fault)
+    for note in report.notes:
+        print(f"note: {note}")
     print(f"{directory}: {report.files} files, {report.samples} samples, {len(report.faults)} faults")
     return 0 if report.ok else 1
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import subprocess
+from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
@@ -12,7 +14,9 @@ import pytest
 from oracles import TARGETS, project_cv2
 
 from phibench.render.ambient import render_ambient
+from phibench.render.bake import BakeSettings, bake
 from phibench.render.c310_plugin import MM_PER_M, sensor_dict
+from phibench.render.path_ambient import path_trace
 from phibench.render.spot import spot_layer
 from phibench.render.spot_truth import spot_truth
 from phibench.render.translate import load_scene, mirror_dict, scene_dict, to_scene_mm
@@ -237,7 +241,7 @@ def test_accuracy_ambient_electrons_in_a_furnace(mi: ModuleType) -> None:
     view = dataclasses.replace(default_rig(), T_world_camera=Pose("world", "camera", (0, 0, 0.45))).at(0.0)
     camera = view.rig.camera
     for u0, v0, seen_through_mirror in ((10, 10, False), (700, 300, True), (1200, 600, False)):
-        image = render_ambient(view, _furnace(0.0), 64, 4, 0, (u0, v0, 4, 4)).mean(axis=(1, 2))
+        image = path_trace(view, _furnace(0.0), 64, 4, 0, (u0, v0, 4, 4)).mean(axis=(1, 2))
         ray = camera.rays(np.array([[u0 + 1.5, v0 + 1.5]]))[0]
         etendue = math.pi * camera.aperture_radius_m**2 * ray[2] ** 4 / (camera.fx_px * camera.fy_px)
         expected = etendue * np.array(camera.detector.band_electrons_per_joule())
@@ -258,7 +262,7 @@ def test_ambient_shows_checkers_where_the_scene_has_them(mi: ModuleType) -> None
     room = Room("tiles", (floor, lamp), (), robot=False)
     view = default_rig().at(0.0)
     crop = (560, 280, 160, 160)
-    image = render_ambient(view, room, 16, 3, 3, crop)[0]
+    image = path_trace(view, room, 16, 3, 3, crop)[0]
     planes = truth_layer(view, room.shapes(view))
     window = np.s_[280:440, 560:720]
     points = np.stack([planes[k][window] for k in ("x_m", "y_m")], axis=-1) - [0.1, 0.2]
@@ -271,15 +275,44 @@ def test_ambient_shows_checkers_where_the_scene_has_them(mi: ModuleType) -> None
     assert np.mean(image[inside & (albedo < 0.5)] > np.median(light) / 2.0) < 0.01
 
 
-def test_ambient_is_bit_identical_and_seeds_matter(mi: ModuleType) -> None:
+def test_path_tracing_is_bit_identical_and_seeds_matter(mi: ModuleType) -> None:
     view, room, crop = default_rig().at(0.0), lab(TARGETS), (600, 400, 16, 16)
-    first, again, other = (render_ambient(view, room, 4, 4, seed, crop) for seed in (0, 0, 1))
+    first, again, other = (path_trace(view, room, 4, 4, seed, crop) for seed in (0, 0, 1))
     assert first.tobytes() == again.tobytes()
     assert first.tobytes() != other.tobytes()
 
 
+BAKE_AND_RENDER = """
+import hashlib, sys
+from phibench.render.ambient import render_ambient
+from phibench.render.bake import BakeSettings, bake
+from phibench.scenes.catalog import default_rig, lab
+room, rig = lab(), default_rig()
+settings = BakeSettings(texel_m=0.5, lamp_rays=4, bounces=2, bounce_rays=8, final_rays=8)
+light = bake(rig.at(0.0), room, settings)
+layer = render_ambient(rig.at(0.3), room, light, settings, 4, int(sys.argv[1]), (600, 400, 32, 32))
+for array in (light.irradiance_w_m2, light.sigma_w_m2, layer.electrons_per_s, layer.variance_per_s2):
+    print(hashlib.sha256(array.tobytes()).hexdigest())
+"""
+
+
+def test_ambient_is_bit_identical_in_two_processes_and_seeds_matter(
+    python: Callable[..., subprocess.CompletedProcess[str]],
+) -> None:
+    """Light map, layer and variance: all bytes; the seed is the view's and does not enter the light map."""
+    first, again, other = (python(BAKE_AND_RENDER, seed).stdout.split() for seed in ("0", "0", "1"))
+    assert len(first) == 4
+    assert first == again
+    assert [a == b for a, b in zip(first, other, strict=True)] == [True, True, False, False]
+
+
 def test_dark_room_has_no_ambient_light() -> None:
-    assert not render_ambient(default_rig().at(0.0), lab(TARGETS).dark(), 4, 4, 0).any()
+    view, room = default_rig().at(0.0), lab(TARGETS).dark()
+    assert not path_trace(view, room, 4, 4, 0).any()
+    settings, crop = BakeSettings(texel_m=0.5, lamp_rays=1, bounces=1, bounce_rays=2, final_rays=2), (600, 300, 32, 32)
+    light = bake(view, room, settings)
+    assert not light.irradiance_w_m2.any()
+    assert not render_ambient(view, room, light, settings, 2, 0, crop).electrons_per_s.any()
 
 
 def test_solid_in_the_way_is_seen_by_both(mi: ModuleType) -> None:

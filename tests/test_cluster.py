@@ -203,7 +203,7 @@ def test_this_machine_is_asked_in_another_process() -> None:
 
 def test_every_task_is_logged(tiny_dataset: Path) -> None:
     entries = [json.loads(line) for line in (tiny_dataset / layout.LOG).read_text().splitlines()]
-    assert len(entries) == 7
+    assert len(entries) == 8
     for entry in entries:
         assert entry["ok"]
         assert entry["seconds"] > 0.0
@@ -217,7 +217,7 @@ def test_a_worker_that_fails_half_way_leaves_the_rest_done(tmp_path: Path, monke
     monkeypatch.setattr(
         "phibench.datasets.sample_preview.save_png", lambda *_: (_ for _ in ()).throw(OSError(28, "full"))
     )
-    with pytest.raises(DatasetError, match="2 of 7 tasks failed"):
+    with pytest.raises(DatasetError, match="2 of 8 tasks failed"):
         make(TINY, tmp_path / "out", workers=1, console=quiet())
     monkeypatch.undo()
     console = quiet()

@@ -1,5 +1,6 @@
 """FORMAT.md and the code say the same, in both directions."""
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -7,7 +8,9 @@ import pytest
 from pydantic import BaseModel
 
 from phibench.datasets import layers, layout, schema
+from phibench.datasets.bake_task import ARRAYS
 from phibench.render import spot_truth, truth
+from phibench.render.bake import LightMap
 from phibench.scenes.detector import FILTERS
 
 PAGE = (Path(schema.__file__).resolve().with_name("FORMAT.md")).read_text(encoding="utf-8")
@@ -67,7 +70,7 @@ def test_files() -> None:
     views = {layout.view_file("POSE", name) for name in ("ambient", "truth", "preview")}
     spots = {layout.spot_file("SAMPLE", position) for position in ("down", "up")}
     single = {layout.INFO, layout.MANIFEST, layout.TABLE, layout.RECIPE, layout.SUMS, layout.RUN, layout.CONTACT_SHEET}
-    single |= {layout.LOG, layout.JOURNAL}
+    single |= {layout.LOG, layout.JOURNAL, layout.LIGHT_MAP}
     assert said == views | spots | single | {layout.preview_file("SAMPLE")}
 
 
@@ -76,8 +79,14 @@ def test_planes() -> None:
     assert tuple(said) == layers.TRUTH_PLANES == truth.TRUTH_PLANES
     spots = [name for row in table_with("planes", "unit", "meaning") for name in names(row[0])]
     assert tuple(spots) == layers.SPOT_PLANES
-    assert "`R`, `G`, `B`" in PAGE
+    ambient = [name for row in table_with("ambient plane", "unit", "meaning") for name in names(row[0])]
+    assert tuple(ambient) == layers.AMBIENT_PLANES
     assert FILTERS == ("R", "G", "B")
+
+
+def test_arrays_of_the_light_map() -> None:
+    said = [name for row in table_with("array", "unit", "meaning") for name in names(row[0])]
+    assert tuple(said) == ARRAYS == tuple(field.name for field in dataclasses.fields(LightMap))
 
 
 def test_causes() -> None:

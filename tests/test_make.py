@@ -49,7 +49,7 @@ def test_everything_is_there(tiny_dataset: Path) -> None:
     spots = {layout.spot_file(pair.sample_id, position) for pair in plan.pairs for position in ("down", "up")}
     spots.remove("spots/half-hidden-h1.400-down.exr")  # a crate hides it
     previews = {layout.preview_file(pair.sample_id) for pair in plan.pairs}
-    single = {layout.INFO, layout.MANIFEST, layout.TABLE, layout.RECIPE}
+    single = {layout.INFO, layout.MANIFEST, layout.TABLE, layout.RECIPE, layout.LIGHT_MAP}
     assert set(read_sums(tiny_dataset)) == views | spots | previews | single == set(data_files(tiny_dataset))
     assert damaged(tiny_dataset) == []
     assert (tiny_dataset / layout.RECIPE).read_bytes() == TINY.read_bytes()
@@ -88,6 +88,7 @@ def test_two_runs_are_byte_identical_whatever_the_number_of_workers(tiny_dataset
 def test_a_finished_data_set_is_left_alone_and_a_damaged_one_made_again(tiny_dataset: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
     console = quiet()
+    (copy / "scores.json").write_text("{}")  # somebody's file is no reason to start over
     make.make(TINY, copy, workers=1, console=console)
     assert "nothing to do" in said(console)
     (copy / layout.MANIFEST).unlink()
@@ -95,8 +96,8 @@ def test_a_finished_data_set_is_left_alone_and_a_damaged_one_made_again(tiny_dat
     (copy / f"{TEMPORARY_PREFIX}left.exr").write_bytes(b"")
     console = quiet()
     make.make(TINY, copy, workers=2, console=console)
-    assert "to make: 1 view; about 2 MB" in said(console)
-    assert "6 of 7 tasks are done" in said(console)
+    assert "to make: 1 view; about 3 MB" in said(console)
+    assert "7 of 8 tasks are done" in said(console)
     assert "tasks: 1/1" in said(console)
     assert (copy / layout.SUMS).read_text() == (tiny_dataset / layout.SUMS).read_text()
     assert list(copy.rglob(TEMPORARY_PREFIX + "*")) == []
@@ -161,7 +162,7 @@ def test_a_sample_out_of_tolerance_is_refused_with_its_numbers(tmp_path: Path, m
     monkeypatch.setattr(spot_task, "certify", off_by_a_hundredth)
     text = refusal(tmp_path / "out")
     assert "seen-near-h0.500 down: chief ray 0.01 px (tolerance 1e-06)" in text
-    assert "4 of 7 tasks failed" in text  # two spots and the previews that wait for them; the views were finished
+    assert "4 of 8 tasks failed" in text  # two spots and the previews that wait for them; the views were finished
     assert not (tmp_path / "out" / layout.SUMS).exists()
     assert not (tmp_path / "out" / layout.MANIFEST).exists()
 

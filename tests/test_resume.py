@@ -64,6 +64,7 @@ def test_bytes_do_not_depend_on_who_does_the_work(tiny_dataset: Path, tmp_path: 
 
 PREVIEWS = ["preview half-hidden-h1.400", "preview seen-near-h0.500"]
 SPOTS = ["spot half-hidden-h1.400", "spot seen-near-h0.500"]
+BAKE = ["bake room"]
 VIEWS = ["view h0.000", "view h0.500", "view h1.400"]
 
 
@@ -73,7 +74,8 @@ VIEWS = ["view h0.000", "view h0.500", "view h1.400"]
     [
         ("seed = 0", "seed = 0  # a comment", []),
         ("depth_m = 1.975", "depth_m = 1.975\ndiameter_m = 6e-3", [PREVIEWS[1], SPOTS[1]]),
-        ("bounces = 2", "bounces = 1", PREVIEWS + VIEWS),
+        ("bounces = 2", "bounces = 1", BAKE + PREVIEWS + VIEWS),
+        ("samples_per_pixel = 2", "samples_per_pixel = 3", PREVIEWS + VIEWS),
         ("seed = 0", "seed = 1", PREVIEWS + VIEWS),
         ("[ambient]", "[laser]\npower_w = 2e-3\n\n[ambient]", PREVIEWS + SPOTS),
         ("[0.5]", "[0.6]", ["preview seen-near-h0.600", "spot seen-near-h0.600", "view h0.600"]),
@@ -84,6 +86,13 @@ def test_only_what_a_change_changes_is_made_again(copy: Path, old: str, new: str
     assert again(copy, (old, new)) == expected
     fresh = make(copy.parent / "changed.toml", copy.parent / "fresh", workers=1, console=quiet())
     assert contents(copy) == contents(fresh)  # also: nothing of what was removed is left
+
+
+@pytest.mark.usefixtures("inline")
+def test_a_room_whose_lamps_go_out_loses_its_light_map(copy: Path) -> None:
+    assert "bake room" not in again(copy, ("[ambient]", '[room]\nname = "dark"\n\n[ambient]'))
+    assert not (copy / layout.LIGHT_MAP).exists()
+    assert layout.LIGHT_MAP not in (copy / layout.SUMS).read_text()
 
 
 @pytest.mark.usefixtures("inline")
@@ -101,10 +110,10 @@ def test_names_and_times_of_files_prove_nothing(copy: Path) -> None:
 
 
 @pytest.mark.usefixtures("inline")
-@pytest.mark.parametrize("line", range(1, 8))
+@pytest.mark.parametrize("line", range(1, 9))
 def test_a_damaged_line_of_the_journal_costs_its_task_only(copy: Path, tiny_dataset: Path, line: int) -> None:
     lines = (copy / layout.JOURNAL).read_bytes().splitlines(keepends=True)
-    assert len(lines) == 8
+    assert len(lines) == 9
     lines[line] = lines[line].replace(b'"', b"'", 1)
     (copy / layout.JOURNAL).write_bytes(b"".join(lines))
     assert len(again(copy)) == 1

@@ -1,24 +1,29 @@
 """Verification finds every kind of damage, and nothing where there is none."""
 
+import errno
 import io
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 from rich.console import Console
 
-from phibench.datasets import layout
+from phibench.datasets import layout, sums
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.layers import read_truth, write_truth
+from phibench.datasets.exr import read_exr
+from phibench.datasets.layers import read_ambient, read_ambient_variance, read_truth, write_ambient, write_truth
 from phibench.datasets.manifest import read_manifest, write_manifest
 from phibench.datasets.show import show
 from phibench.datasets.sums import write_sums
 from phibench.datasets.verify import Report, verify
 
 AMBIENT, TRUTH = layout.view_file("h0.000", "ambient"), layout.view_file("h0.500", "truth")
+PREVIEW = layout.preview_file("seen-near-h0.500")
 SPOT, OTHER_SPOT = "spots/seen-near-h0.500-down.exr", "spots/seen-near-h0.500-up.exr"
 
 
@@ -53,7 +58,16 @@ def flip_a_bit(path: Path) -> None:
 @pytest.mark.parametrize("damage", [truncate, flip_a_bit, Path.unlink])
 @pytest.mark.parametrize(
     "name",
-    [AMBIENT, TRUTH, SPOT, layout.TABLE, layout.RECIPE, layout.preview_file("seen-near-h0.500"), layout.MANIFEST],
+    [
+        AMBIENT,
+        TRUTH,
+        SPOT,
+        layout.LIGHT_MAP,
+        layout.TABLE,
+        layout.RECIPE,
+        layout.preview_file("seen-near-h0.500"),
+        layout.MANIFEST,
+    ],
 )
 def test_a_damaged_file_is_named(copy: Path, name: str, damage: Callable[[Path], None]) -> None:
     damage(copy / name)
@@ -79,9 +93,65 @@ def test_swapped_files_are_found(copy: Path, a: str, b: str, hide: bool) -> None
     assert {name for name in (a, b) if any(name in fault for fault in faults)} == {a, b}
 
 
-def test_a_stray_file_is_named(copy: Path) -> None:
+def test_a_stray_file_is_a_note_and_neither_a_fault_nor_signed(copy: Path) -> None:
+    before = (copy / layout.SUMS).read_text()
     (copy / "spots" / "extra.exr").write_bytes(b"")
-    assert check(copy).faults == ("spots/extra.exr is not listed in SHA256SUMS",)
+    (copy / "scores.json").write_text("{}")
+    report = check(copy)
+    assert report.ok
+    assert ["scores.json" in report.notes[0], "spots/extra.exr" in report.notes[1]] == [True, True]
+    write_sums(copy)
+    assert (copy / layout.SUMS).read_text() == before
+
+
+def test_a_file_of_the_data_set_that_is_not_listed_is_a_fault(copy: Path) -> None:
+    lines = (copy / layout.SUMS).read_text().splitlines(keepends=True)
+    (copy / layout.SUMS).write_text("".join(line for line in lines if SPOT not in line))
+    assert check(copy).faults == (f"{SPOT} is not listed in SHA256SUMS",)
+
+
+def test_a_missing_folder_and_an_unreadable_file_are_called_so(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(DatasetError, match="there is no folder"):
+        check(copy / "nowhere")
+    sha256 = sums.sha256
+
+    def denied(path: Path) -> str:
+        if path.name == layout.TABLE:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        return sha256(path)
+
+    monkeypatch.setattr(sums, "sha256", denied)
+    assert check(copy).faults == (f"{layout.TABLE} is not readable: Permission denied",)
+
+
+@pytest.mark.parametrize("name", ["irradiance_w_m2", "sigma_w_m2", "covered"])
+@pytest.mark.parametrize("spoil", ["negative", "nan", "short", "gone"])
+def test_a_spoilt_light_map_is_found_though_signed(copy: Path, name: str, spoil: str) -> None:
+    with np.load(copy / layout.LIGHT_MAP) as file:
+        arrays = dict(file)
+    if spoil == "short":
+        arrays[name] = arrays[name][:-1]
+    elif spoil == "gone":
+        del arrays[name]
+    elif name != "covered":
+        arrays[name][5] = -1.0 if spoil == "negative" else np.nan
+    else:
+        return
+    np.savez(copy / layout.LIGHT_MAP, **arrays)
+    write_sums(copy)
+    [fault] = check(copy).faults
+    assert layout.LIGHT_MAP in fault
+    assert name in fault
+
+
+@pytest.mark.parametrize("value", [-1.0, np.nan])
+def test_a_variance_that_is_none_is_found_though_signed(copy: Path, value: float) -> None:
+    path = copy / AMBIENT
+    planes, variance, header = read_ambient(path), read_ambient_variance(path), read_exr(path).header
+    variance[1, 2, 3] = value
+    write_ambient(path, planes, variance, header)
+    write_sums(copy)
+    assert check(copy).faults == (f"{AMBIENT} has negative or non-finite variances",)
 
 
 def test_an_unfinished_data_set_is_found(copy: Path) -> None:
@@ -130,8 +200,8 @@ def test_a_changed_pixel_truth_is_found_when_asked_for(copy: Path) -> None:
 
 
 def test_what_is_no_data_set_raises(tmp_path: Path) -> None:
-    for folder in (tmp_path, tmp_path / "none"):
-        with pytest.raises(DatasetError, match="is not a data set"):
+    for folder, words in ((tmp_path, "is not a data set"), (tmp_path / "none", "there is no folder")):
+        with pytest.raises(DatasetError, match=words):
             check(folder)
 
 
