@@ -144,7 +144,7 @@ def _is_users(error: Exception) -> bool:
 
 def _sentence(error: Exception) -> str:
     """Return the message of an error; an operating system's without its number."""
-    if isinstance(error, OSError) and error.strerror:
+    if isinstance(error, OSError) and error.strerror and type(error).__module__ == "builtins":
         return f"{error.strerror}: {error.filename}" if error.filename else str(error.strerror)
     return str(error)
 
