@@ -105,17 +105,19 @@ def verify(directory: Path) -> int:
 
 
 @dataset.command
-def show(directory: Path) -> int:
+def show(directory: Path, *, out: Path | None = None) -> int:
     """Print a table of a data set and write its contact sheet.
 
     Parameters
     ----------
     directory
         Folder of a data set.
+    out
+        PNG file for the contact sheet; by default contact_sheet.png in the folder.
     """
     from phibench.datasets.show import show as show_dataset
 
-    show_dataset(directory)
+    show_dataset(directory, out=out)
     return 0
 
 
