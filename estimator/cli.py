@@ -60,7 +60,10 @@ def score(directory: Path, *, out: Path | None = None) -> int:
 
 @app.command
 def doctor() -> int:
-    """Show Python, packages, LLVM, cores and disk, and render a test image."""
+    """Show Python, packages, LLVM, cores and disk, and render a test image.
+
+    The exit code is 1 if something is broken; an installation that can only score is not.
+    """
     # a bad LLVM aborts the process that loads it: never this one
     return subprocess.run([sys.executable, "-m", "phibench.render.doctor"], check=False).returncode
 
