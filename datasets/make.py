@@ -16,17 +16,19 @@ from phibench.datasets.crew import Crew
 from phibench.datasets.documents import documents, unlike, write_documents
 from phibench.datasets.environment import versions
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.files import remove_temporary, write_text
+from phibench.datasets.files import WriteError, remove_temporary, write_text
 from phibench.datasets.finish import finish_tasks, unfinished
 from phibench.datasets.info import dataset_info, info_text, parse_info, same_content
 from phibench.datasets.journal import Head, Journal
 from phibench.datasets.lock import only_run
+from phibench.datasets.manifest import read_manifest
 from phibench.datasets.output import claim, remove_files, stale_files
 from phibench.datasets.plan import Plan, make_plan
 from phibench.datasets.recipe_checks import warnings
 from phibench.datasets.recipe_file import find_recipe, load_recipe
 from phibench.datasets.schema import DatasetInfo
 from phibench.datasets.shard import shard_plan
+from phibench.datasets.visibility import visibility_line
 from phibench.datasets.work import plan_tasks
 
 
@@ -85,7 +87,8 @@ def make_from_plan(
             finally:
                 remove_temporary(out)
     except OSError as error:
-        raise DatasetError(f"could not write to {out}: {error}; then run the same command again") from error
+        text = str(error) if isinstance(error, WriteError) else f"could not write to {out}: {error}"
+        raise DatasetError(f"{text}; then run the same command again") from error
 
 
 def _make(plan: Plan, recipe: str, out: Path, crew: Crew, journal: Journal, console: Console) -> list[str]:
@@ -106,6 +109,7 @@ def _make(plan: Plan, recipe: str, out: Path, crew: Crew, journal: Journal, cons
     remove_files(out, [name for name in faults if name not in wanted])
     write_documents(out, wanted, [name for name in faults if name in wanted])
     _write_run(out, crew.width, began, time.monotonic() - started)
+    console.print(f"{out}: {visibility_line(read_manifest(out))}", highlight=False, soft_wrap=True)
     return [*todo, *faults]
 
 

@@ -75,14 +75,14 @@ class _Makers:
         return Task(f"view {pose.pose_id}", key, render_view, arguments, needs)
 
     def preview(self, pair: PairPlan, spot: Task, views: Mapping[str, Task]) -> Task:
-        detector = self._plan.rig.camera.detector
         needs = list(
             {views[pair.pose_id(position)].name: views[pair.pose_id(position)] for position in POSITIONS}.values()
         )
         keys = tuple(task.key for task in (spot, *needs))
         key = self._key(["preview", pair.sample_id], make_preview, keys)
         names = tuple(task.name for task in (spot, *needs))
-        return Task(f"preview {pair.sample_id}", key, make_preview, (pair, detector), names)
+        arguments = (pair, self._plan.rig, self._plan.room, self._plan.spots[pair.target])
+        return Task(f"preview {pair.sample_id}", key, make_preview, arguments, names)
 
     def _key(self, inputs: Any, function: Any, needs: tuple[str, ...] = ()) -> str:
         return task_key(inputs, code_behind(function.__module__), self._versions, needs)

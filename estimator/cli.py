@@ -60,7 +60,10 @@ def score(directory: Path, *, out: Path | None = None) -> int:
 
 @app.command
 def doctor() -> int:
-    """Show Python, packages, LLVM, cores and disk, and render a test image."""
+    """Show Python, packages, LLVM, cores and disk, and render a test image.
+
+    The exit code is 1 if something is broken; an installation that can only score is not.
+    """
     # a bad LLVM aborts the process that loads it: never this one
     return subprocess.run([sys.executable, "-m", "phibench.render.doctor"], check=False).returncode
 
@@ -153,17 +156,19 @@ def verify(directory: Path) -> int:
 
 
 @dataset.command
-def show(directory: Path) -> int:
+def show(directory: Path, *, out: Path | None = None) -> int:
     """Print a table of a data set and write its contact sheet.
 
     Parameters
     ----------
     directory
         Folder of a data set.
+    out
+        PNG file for the contact sheet; by default contact_sheet.png in the folder.
     """
     from phibench.datasets.show import show as show_dataset
 
-    show_dataset(directory)
+    show_dataset(directory, out=out)
     return 0
 
 
@@ -192,7 +197,7 @@ def _is_users(error: Exception) -> bool:
 
 def _sentence(error: Exception) -> str:
     """Return the message of an error; an operating system's without its number."""
-    if isinstance(error, OSError) and error.strerror:
+    if isinstance(error, OSError) and error.strerror and type(error).__module__ == "builtins":
         return f"{error.strerror}: {error.filename}" if error.filename else str(error.strerror)
     return str(error)
 
