@@ -8,9 +8,13 @@ a CRC-32 per plane which is checked on reading.
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import io
 import json
+import os
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -70,7 +74,10 @@ def write_exr(
 
     def write(temporary: Path) -> None:
         _write(temporary, arrays, text, origin_px)
-        read_exr(temporary)  # checks every pixel before the file gets its name
+        try:
+            read_exr(temporary)  # checks every pixel before the file gets its name
+        except DatasetError as error:
+            raise OSError(errno.EIO, "what was written does not read back") from error
 
     return write_atomic(path, write)
 
@@ -85,10 +92,9 @@ def read_exr(path: Path) -> Exr:
     """
     import OpenEXR
 
-    if not path.is_file():
-        raise DatasetError(f"{path} is missing")
+    _check_readable(path)
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with _quiet(), OpenEXR.File(str(path), separate_channels=True) as file:
             if not file.parts:
                 raise DatasetError(f"{path} is damaged or truncated")
             return _content(path, file.header(), {name: c.pixels for name, c in file.channels().items()})
@@ -113,7 +119,36 @@ def _write(path: Path, planes: dict[str, Plane], text: str, origin_px: tuple[int
         with OpenEXR.File(header, planes) as file:
             file.write(str(path))
     except RuntimeError as error:
-        raise OSError(f"could not write {path}: {error}") from error
+        # "Failed to write pixel data to image file "NAME". File too large.": the reason is what follows the name
+        reason = str(error).rsplit(str(path), 1)[-1].strip('". ') or "no reason given"
+        code = next((code for code in errno.errorcode if os.strerror(code) == reason), errno.EIO)
+        raise OSError(code, reason) from error
+
+
+def _check_readable(path: Path) -> None:
+    try:
+        path.open("rb").close()
+    except FileNotFoundError as error:
+        raise DatasetError(f"{path} is missing") from error
+    except OSError as error:
+        raise DatasetError(f"{path} is not readable: {error.strerror or error}") from error
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep what OpenEXR prints about a damaged file off the terminal: it is said once, by the exception."""
+    try:
+        terminal = os.dup(2)
+    except OSError:  # closed by whoever started us: nothing can be printed there
+        yield
+        return
+    try:
+        with Path(os.devnull).open("w") as nowhere, contextlib.redirect_stdout(io.StringIO()):
+            os.dup2(nowhere.fileno(), 2)
+            yield
+    finally:
+        os.dup2(terminal, 2)
+        os.close(terminal)
 
 
 def _content(path: Path, header: dict[str, Any], planes: dict[str, Plane]) -> Exr:

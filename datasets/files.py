@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import tempfile
@@ -9,23 +10,41 @@ from collections.abc import Callable
 from pathlib import Path
 
 TEMPORARY_PREFIX = ".phibench-tmp-"
+_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_NOT_ALLOWED = {errno.EACCES, errno.EPERM, errno.EROFS}
+
+
+class WriteError(OSError):
+    """A file that could not be written; the message names it, the reason and what to do."""
+
+    def __init__(self, path: Path, error: OSError) -> None:
+        super().__init__(error.errno or errno.EIO, error.strerror or str(error), str(path))
+
+    def __str__(self) -> str:
+        advice = "give another path"
+        if self.errno in _NO_ROOM:
+            advice = "free some space or write to another disk"
+        elif self.errno in _NOT_ALLOWED:
+            advice = "give a place where you may write"
+        return f"could not write {self.filename}: {self.strerror}; {advice}"
 
 
 def write_atomic(path: Path, write: Callable[[Path], None]) -> Path:
     """Let `write` fill a temporary file in the folder of `path`, flush it to the disk, then rename it to `path`.
 
     On any exception, a full disk and Ctrl-C included, the temporary file is removed and `path` is as before.
+
+    Raises
+    ------
+    WriteError
+        If the operating system refuses.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = _temporary(path)
     try:
-        write(temporary)
-        _flush(temporary)
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    _flush_folder(path.parent)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _write_and_rename(path, write)
+        _flush_folder(path.parent)
+    except OSError as error:
+        raise WriteError(path, error) from error
     return path
 
 
@@ -53,6 +72,17 @@ def remove_temporary(folder: Path) -> None:
     """Remove what a killed run left under temporary names, in `folder` and below."""
     for path in folder.rglob(TEMPORARY_PREFIX + "*"):
         path.unlink(missing_ok=True)
+
+
+def _write_and_rename(path: Path, write: Callable[[Path], None]) -> None:
+    temporary = _temporary(path)
+    try:
+        write(temporary)
+        _flush(temporary)
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 def _temporary(path: Path) -> Path:

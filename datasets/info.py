@@ -83,13 +83,16 @@ def read_info(folder: Path) -> DatasetInfo:
         return DatasetInfo.model_validate(document)
     except ValidationError as error:
         first = error.errors()[0]
-        raise DatasetError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+        where = ".".join(map(str, first["loc"]))
+        raise DatasetError(f"{path}: {where}: {first['msg']}" if where else f"{path}: {first['msg']}") from error
 
 
 def _json(path: Path) -> dict[str, Any]:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise DatasetError(f"{path} is not readable: {error.strerror or error}") from error
+    except ValueError as error:
         raise DatasetError(f"{path} is damaged: {error}") from error
     if not isinstance(document, dict):
         raise DatasetError(f"{path} is damaged: it does not hold a JSON object")

@@ -67,9 +67,9 @@ def write_ambient(path: Path, planes: NDArray[Any], header: Mapping[str, Any]) -
     return write_exr(path, dict(zip(FILTERS, planes, strict=True)), header)
 
 
-def read_ambient(path: Path) -> NDArray[np.float32]:
-    """Read an ambient layer, shape (3, H, W), electrons per second."""
-    file = _read(path, "ambient", FILTERS)
+def read_ambient(path: Path, **owner: str) -> NDArray[np.float32]:
+    """Read an ambient layer, shape (3, H, W), electrons per second; `owner` as in `read_layer`."""
+    file = read_layer(path, "ambient", FILTERS, **owner)
     return np.stack([file.planes[name] for name in FILTERS])
 
 
@@ -78,9 +78,9 @@ def write_truth(path: Path, planes: Mapping[str, Array], header: Mapping[str, An
     return write_exr(path, {name: planes[name] for name in TRUTH_PLANES}, {"kind": "truth", **header})
 
 
-def read_truth(path: Path) -> dict[str, NDArray[Any]]:
+def read_truth(path: Path, **owner: str) -> dict[str, NDArray[Any]]:
     """Read a truth layer: float64 planes (H, W) with NaN where there is nothing; `object_id` int32, -1 there."""
-    file = _read(path, "truth", TRUTH_PLANES)
+    file = read_layer(path, "truth", TRUTH_PLANES, **owner)
     planes: dict[str, NDArray[Any]] = {name: file.planes[name].astype(float) for name in TRUTH_PLANES}
     planes["object_id"] = planes["object_id"].astype(np.int32)
     return planes
@@ -94,19 +94,38 @@ def write_spot(path: Path, layer: SpotWindow, header: Mapping[str, Any]) -> Path
     return write_exr(path, planes, header, (layer.u0_px, layer.v0_px))
 
 
-def read_spot(path: Path) -> SpotWindow:
-    """Read a spot layer."""
-    file = _read(path, "spot", SPOT_PLANES)
+def read_spot(path: Path, **owner: str) -> SpotWindow:
+    """Read a spot layer; `owner` as in `read_layer`."""
+    file = read_layer(path, "spot", SPOT_PLANES, **owner)
     stacks = [
         np.stack([file.planes[prefix + name] for name in FILTERS]).astype(float) for prefix in SPOT_STACKS.values()
     ]
     return SpotWindow(*file.origin_px, *stacks)
 
 
-def _read(path: Path, kind: str, planes: tuple[str, ...]) -> Exr:
+def read_layer(path: Path, kind: str, planes: tuple[str, ...], **owner: str) -> Exr:
+    """Read a layer and check what it is.
+
+    Parameters
+    ----------
+    path : Path
+    kind : "ambient", "truth" or "spot"
+    planes : names of the planes that must be there
+    **owner : str
+        What the header must say: `dataset`, and `pose` or `sample_id` and `position`. A file of another pose or
+        sample under the right name is refused.
+
+    Raises
+    ------
+    DatasetError
+        If the file cannot be read or is not that layer.
+    """
     file = read_exr(path)
     if file.header.get("kind") != kind:
         raise DatasetError(f"{path} holds a layer of kind '{file.header.get('kind')}', not '{kind}'")
     if missing := [name for name in planes if name not in file.planes]:
         raise DatasetError(f"{path} lacks the planes {', '.join(missing)}")
+    if wrong := [key for key, value in owner.items() if file.header.get(key) != value]:
+        held, meant = (", ".join(f"{key} {table.get(key)}" for key in wrong) for table in (file.header, owner))
+        raise DatasetError(f"{path} is the {kind} layer of {held}, not of {meant}; run `phibench dataset verify`")
     return file

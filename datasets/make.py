@@ -12,7 +12,7 @@ from rich.console import Console
 
 from phibench.datasets import layout
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.files import remove_temporary, write_bytes, write_text
+from phibench.datasets.files import WriteError, remove_temporary, write_bytes, write_text
 from phibench.datasets.info import dataset_info, info_text, recipe_sha256
 from phibench.datasets.manifest import write_manifest
 from phibench.datasets.output import bytes_needed, check_disk, claim, is_complete
@@ -25,6 +25,7 @@ from phibench.datasets.schema import DatasetInfo, ManifestRow
 from phibench.datasets.spot_task import make_rows
 from phibench.datasets.sums import write_sums
 from phibench.datasets.view_task import render_view, start_renderer
+from phibench.datasets.visibility import visibility_line
 from phibench.datasets.workers import Pool, Task
 
 
@@ -51,7 +52,7 @@ def make(recipe: str | Path, out: str | Path, workers: int | None = None, consol
     console, out = console or Console(stderr=True), Path(out)
     count = workers if workers is not None else os.cpu_count() or 1
     if count < 1:
-        raise DatasetError(f"workers = {count}: at least 1 is needed")
+        raise DatasetError(f"--workers: workers = {count}, at least 1 is needed")
     plan = make_plan(load_recipe(recipe))
     for warning in warnings(plan.recipe):
         console.print(f"warning: {warning}", highlight=False, soft_wrap=True)
@@ -59,7 +60,8 @@ def make(recipe: str | Path, out: str | Path, workers: int | None = None, consol
     try:
         _make(plan, find_recipe(recipe).read_bytes(), out, count, console)
     except OSError as error:
-        raise DatasetError(f"could not write to {out}: {error}; then run the same command again") from error
+        text = str(error) if isinstance(error, WriteError) else f"could not write to {out}: {error}"
+        raise DatasetError(f"{text}; then run the same command again") from error
     finally:
         remove_temporary(out)
     return out
@@ -81,6 +83,7 @@ def _make(plan: Plan, recipe: bytes, out: Path, count: int, console: Console) ->
         _previews(out, rows, pool, console)
     _write_run(out, count, began, time.monotonic() - started)
     write_sums(out)
+    console.print(f"{out}: {visibility_line(rows)}", highlight=False, soft_wrap=True)
 
 
 def _begin(out: Path, info: DatasetInfo, recipe: bytes) -> None:

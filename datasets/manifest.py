@@ -33,9 +33,12 @@ def read_manifest(folder: Path) -> list[ManifestRow]:
         If it is missing, or with the number of the first line that is not a row.
     """
     path = folder / layout.MANIFEST
-    if not path.is_file():
-        raise DatasetError(f"{path} is missing")
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    except FileNotFoundError as error:
+        raise DatasetError(f"{path} is missing") from error
+    except OSError as error:
+        raise DatasetError(f"{path} is not readable: {error.strerror or error}") from error
     return [_row(path, number, line) for number, line in enumerate(lines, 1)]
 
 
@@ -83,7 +86,8 @@ def _row(path: Path, number: int, line: str) -> ManifestRow:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise DatasetError(f"{path} line {number}: {where}: {first['msg']}") from error
+        text = f"{where}: {first['msg']}" if where else first["msg"]
+        raise DatasetError(f"{path} line {number}: {text}") from error
 
 
 def same_number(a: float, b: float, relative: float = 1e-11, absolute: float = 1e-12) -> bool:

@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from phibench.datasets.manifest import read_manifest
 from phibench.datasets.recipe import Recipe
 from phibench.datasets.recipe_faults import nearest
 from phibench.datasets.schema import DatasetInfo, ManifestRow, SpotRow
+from phibench.datasets.sums import check_documents
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, View
 from phibench.scenes.room import Room
@@ -75,7 +76,7 @@ class Dataset:
 class Sample:
     """One stroke pair. `position` is "down" or "up" everywhere."""
 
-    dataset: Dataset
+    dataset: Dataset = field(repr=False)
     row: ManifestRow
 
     def truth_row(self, position: str) -> SpotRow:
@@ -101,16 +102,19 @@ class Sample:
 
     def ambient(self, position: str) -> NDArray[np.float32]:
         """Ambient layer, shape (3, H, W), electrons per second behind R, G, B."""
-        return read_ambient(self.dataset.folder / self.truth_row(position).view_ambient_file)
+        return read_ambient(self.dataset.folder / self.truth_row(position).view_ambient_file, **self._view(position))
 
     def truth(self, position: str) -> dict[str, NDArray[Any]]:
         """Truth of every pixel centre: planes of shape (H, W), NaN where there is nothing (see FORMAT.md)."""
-        return read_truth(self.dataset.folder / self.truth_row(position).view_truth_file)
+        return read_truth(self.dataset.folder / self.truth_row(position).view_truth_file, **self._view(position))
 
     def spot(self, position: str) -> SpotWindow:
         """Spot layer; an empty window where no light of the spot reaches the image."""
         name = self.truth_row(position).spot_file
-        return SpotWindow.empty() if name is None else read_spot(self.dataset.folder / name)
+        if name is None:
+            return SpotWindow.empty()
+        owner = {"dataset": self.dataset.info.name, "sample_id": self.row.sample_id, "position": position}
+        return read_spot(self.dataset.folder / name, **owner)
 
     def frame(self, position: str, laser: bool = True) -> NDArray[np.float64]:
         """Noise-free frame, shape (3, H, W), electrons per second: ambient, plus the spot if `laser`."""
@@ -118,6 +122,10 @@ class Sample:
         if laser:
             self.spot(position).add_to(image)
         return image
+
+    def _view(self, position: str) -> dict[str, str]:
+        """Return what the headers of the view's layers must say."""
+        return {"dataset": self.dataset.info.name, "pose": self.truth_row(position).pose}
 
 
 def open_dataset(folder: str | Path) -> Dataset:
@@ -134,3 +142,16 @@ def open_dataset(folder: str | Path) -> Dataset:
     if len(rows) != info.samples:
         raise DatasetError(f"{folder}: the manifest has {len(rows)} rows instead of {info.samples}")
     return Dataset(folder, info, from_json(Rig, info.rig), from_json(Room, info.room), rows)
+
+
+def open_finished(folder: str | Path) -> Dataset:
+    """Open a data set whose making was finished and whose manifest and description are the signed ones.
+
+    Raises
+    ------
+    DatasetError
+        As `open_dataset`, and if `SHA256SUMS` is missing or does not fit `manifest.jsonl` or `dataset.json`.
+    """
+    read_info(Path(folder))  # not a data set at all is said first
+    check_documents(Path(folder))
+    return open_dataset(folder)

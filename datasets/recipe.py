@@ -10,10 +10,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-MAX_STROKE_M = 10.0
+MIN_STROKE_M, MAX_STROKE_M = 1e-3, 10.0
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.]*$", max_length=48)]
 DatasetName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
-StrokeM = Annotated[float, Field(gt=0.0, le=MAX_STROKE_M)]
+StrokeM = Annotated[float, Field(ge=MIN_STROKE_M, le=MAX_STROKE_M)]
 Tilt = Annotated[float, Field(ge=-0.5, le=0.5)]
 Decentre = Annotated[float, Field(ge=-0.1, le=0.1)]
 Distortion = Annotated[float, Field(ge=-1000.0, le=1000.0)]

@@ -33,7 +33,7 @@ def structural_faults(model: type[BaseModel], raw: object) -> list[Fault]:
         model.model_validate(raw)
     except ValidationError as error:
         schema = model.model_json_schema()
-        found = [details for details in error.errors() if not _follows(details)]
+        found = _merged(schema, [details for details in error.errors() if not _follows(details)])
         return [_fault(schema, details["type"], details["loc"], details["input"]) for details in found]
     return []
 
@@ -41,6 +41,17 @@ def structural_faults(model: type[BaseModel], raw: object) -> list[Fault]:
 def _follows(details: ErrorDetails) -> bool:
     """Whether a list is called too short only because its faulty entries were not counted."""
     return details["type"] == "too_short" and len(details["input"]) >= details["ctx"]["min_length"]
+
+
+def _merged(schema: Schema, found: list[ErrorDetails]) -> list[ErrorDetails]:
+    """Leave out that a key is missing where an unknown one is its misspelling: one typo is one fault."""
+    meant: set[Location] = set()
+    for details in found:
+        if details["type"] == "extra_forbidden":
+            *table, name = details["loc"]
+            known = schema_node(schema, tuple(table)).get("properties", {})
+            meant.update((*table, close) for close in _close(str(name), known))
+    return [details for details in found if details["type"] != "missing" or details["loc"] not in meant]
 
 
 def path_text(location: Sequence[str | int]) -> str:
@@ -52,25 +63,32 @@ def path_text(location: Sequence[str | int]) -> str:
 def nearest(name: str, known: Iterable[str]) -> str:
     """Advice for an unknown name: the nearest known one, and what is known."""
     names = list(known)
-    close = difflib.get_close_matches(name, names, 1, 0.5)
+    close = _close(name, names)
     guess = f"did you mean '{close[0]}'? " if close else ""
     return f"{guess}known: {', '.join(names)}"
+
+
+def _close(name: str, known: Iterable[str]) -> list[str]:
+    """Nearest known name, if one is near."""
+    return difflib.get_close_matches(name, list(known), 1, 0.5)
 
 
 def _fault(schema: Schema, kind: str, location: Location, given: object) -> Fault:
     path = path_text(location)
     if kind == "extra_forbidden":
-        known = _node(schema, location[:-1]).get("properties", {})
+        known = schema_node(schema, location[:-1]).get("properties", {})
         return Fault(path, f"unknown key; {nearest(str(location[-1]), known)}")
-    node = _node(schema, location)
+    node = schema_node(schema, location)
     hint = f" ({node['description']})" if "description" in node else ""
     if kind == "missing":
         return Fault(path, f"missing; add {allowed(node)}{hint}")
+    if isinstance(given, dict) and node.get("type") == "array" and not _plain(node):
+        return Fault(path, f"a single table; write [[{path}]] with two brackets, once for each entry{hint}")
     return Fault(path, f"{_shown(given)} is not allowed; give {allowed(node)}{hint}")
 
 
-def _node(schema: Schema, location: Location) -> Schema:
-    """Part of a JSON schema that describes one key, references and optional values resolved."""
+def schema_node(schema: Schema, location: Location) -> Schema:
+    """Return the part of a JSON schema that describes one key, references and optional values resolved."""
     node = _resolve(schema, schema)
     for part in location:
         inner = node.get("items", {}) if isinstance(part, int) else node.get("properties", {}).get(part, {})

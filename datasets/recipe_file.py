@@ -10,6 +10,7 @@ from phibench.datasets.errors import RecipeError
 from phibench.datasets.recipe import Recipe
 from phibench.datasets.recipe_checks import semantic_faults
 from phibench.datasets.recipe_faults import nearest, structural_faults
+from phibench.datasets.recipe_height import height_faults
 
 RECIPES = Path(__file__).with_name("recipes")
 
@@ -45,18 +46,37 @@ def parse_recipe(text: str, source: str = "recipe") -> Recipe:
 
 def check_recipe(raw: dict[str, Any], source: str = "recipe") -> Recipe:
     """Check a recipe that is a dict already."""
-    faults = [*structural_faults(Recipe, raw), *semantic_faults(raw)]
+    height = height_faults(raw)
+    faults = [*structural_faults(Recipe, raw), *height, *semantic_faults(_judgeable(raw, strokes=not height))]
     if faults:
         count = f"{len(faults)} fault" + "s" * (len(faults) > 1)
         raise RecipeError("\n".join([f"{source} has {count}:", *(f"  {fault}" for fault in faults)]))
     return Recipe.model_validate(raw)
 
 
+def _judgeable(raw: dict[str, Any], strokes: bool) -> dict[str, Any]:
+    """Recipe without the keys about which only faults that follow from others could be found.
+
+    Experiments cannot name targets that have no names, and no stroke is short enough for a rig in the ceiling.
+    """
+    entries, targets = raw.get("experiments"), raw.get("targets")
+    if not isinstance(entries, list):
+        return raw
+    named = isinstance(targets, list) and all(isinstance(t, dict) and isinstance(t.get("name"), str) for t in targets)
+    dropped = {key for key, kept in (("targets", named), ("strokes_m", strokes)) if not kept}
+    kept = [{k: v for k, v in e.items() if k not in dropped} if isinstance(e, dict) else e for e in entries]
+    return {**raw, "experiments": kept}
+
+
 def _text(path: Path) -> str:
+    if path.is_dir():
+        raise RecipeError(f"{path} is a folder; give a TOML file")
     if not path.is_file():
         shipped = nearest(path.name, sorted(file.stem for file in RECIPES.glob("*.toml")))
         raise RecipeError(f"there is no recipe {path}; give a TOML file or the name of a shipped recipe ({shipped})")
     try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecipeError(f"{path} cannot be read: {error}") from error
+        return path.read_text(encoding="utf-8-sig")  # some editors put a byte order mark first
+    except UnicodeDecodeError as error:
+        raise RecipeError(f"{path} cannot be read: byte {error.start} is not UTF-8; save it as UTF-8") from error
+    except OSError as error:
+        raise RecipeError(f"{path} cannot be read: {error.strerror or error}") from error

@@ -11,13 +11,14 @@ import numpy as np
 from phibench.datasets.recipe import LaserTable, RigTable, RoomTable, TargetTable
 from phibench.scenes.camera import Camera
 from phibench.scenes.catalog import RIGS, ROOMS, Target
+from phibench.scenes.checks import SceneError
 from phibench.scenes.frames import Pose, as_vector, rotation_xyz
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
 
-_CAMERA_KEYS = (
+CAMERA_KEYS = (
     *("width_px", "height_px", "pixel_pitch_um", "fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "p1", "p2"),
     *("f_number", "focus_distance_m", "blur_sigma_px"),
 )
@@ -32,6 +33,12 @@ def build_rig(table: RigTable) -> Rig:
     T_world_camera = Pose("world", "camera", (0.0, 0.0, height_m), rotation_xyz(table.tilt_x_rad, table.tilt_y_rad))
     sphere_from_camera = np.array([table.decentre_x_m, table.decentre_y_m, z_c_m])  # world axes
     T_camera_sphere = Pose("camera", "sphere", as_vector(T_world_camera.R.T @ sphere_from_camera))
+    before_m = min(T_camera_sphere.translation_m[2], float(np.linalg.norm(sphere_from_camera)))
+    if before_m <= mirror.radius_m:
+        raise SceneError(
+            f"z_c_m = {z_c_m:g} with radius_m = {mirror.radius_m:g}: the sphere centre is {before_m:.4f} m in front of "
+            f"the lens, which is inside the sphere; give a z_c_m above the mirror radius or a smaller radius_m"
+        )
     stroke = np.array(rotation_xyz(table.stroke_tilt_x_rad, table.stroke_tilt_y_rad)) @ np.array([0.0, 0.0, 1.0])
     camera = _camera(base.camera, table, z_c_m, mirror)
     return Rig(camera, mirror, T_world_camera, T_camera_sphere, as_vector(stroke))
@@ -76,4 +83,4 @@ def _camera(base: Camera, table: RigTable, z_c_m: float, mirror: SphereMirror) -
         implied["cx_px"] = (table.width_px - 1) / 2.0
     if table.height_px is not None:
         implied["cy_px"] = (table.height_px - 1) / 2.0
-    return replace(base, **{**implied, **_given(table, _CAMERA_KEYS)})
+    return replace(base, **{**implied, **_given(table, CAMERA_KEYS)})

@@ -11,24 +11,42 @@ from rich.console import Console
 from rich.table import Table
 
 from phibench.datasets import layout
+from phibench.datasets.errors import DatasetError
 from phibench.datasets.preview import Picture, exposure_s, halved, save_png, to_srgb
 from phibench.datasets.progress import Steps
-from phibench.datasets.read import Dataset, Sample, open_dataset
+from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.datasets.schema import ManifestRow, SpotRow
+from phibench.datasets.spot_picture import TEXT, captioned, crop, enlarged, marked
 from phibench.scenes.rig import POSITIONS
 
-_CROP_PX, _ZOOM = 24, 8  # the enlarged window measures 24 x 24 pixels, each shown 8 x 8
+_ZOOM = 8  # pixels of the enlarged window are shown 8 x 8
 _COLUMNS = 2
-_MARK, _TEXT = (0, 255, 80), (255, 255, 255)
 _CAPTION_PX = 16
 
 
-def show(folder: str | Path, console: Console | None = None) -> Path:
-    """Print the table of a data set and write its contact sheet; return the path of the sheet."""
-    console, dataset = console or _console(), open_dataset(folder)
-    console.print(table(dataset))
-    path = dataset.folder / layout.CONTACT_SHEET
-    save_png(path, contact_sheet(dataset, console))
+def show(folder: str | Path, console: Console | None = None, out: str | Path | None = None) -> Path:
+    """Print the table of a data set and write its contact sheet; return the path of the sheet.
+
+    Parameters
+    ----------
+    folder : path
+    console : Console, optional
+    out : path, optional
+        PNG file for the contact sheet; by default `contact_sheet.png` in the folder.
+
+    Raises
+    ------
+    DatasetError
+        If the data set is damaged or unfinished, or, after the table, if the sheet cannot be written.
+    """
+    console, dataset = console or _console(), open_finished(folder)
+    _print_table(dataset, console)
+    path = dataset.folder / layout.CONTACT_SHEET if out is None else Path(out)
+    sheet = contact_sheet(dataset, console)
+    try:
+        save_png(path, sheet)
+    except OSError as error:
+        raise DatasetError(f"the contact sheet was not written: {error}, for example `--out sheet.png`") from error
     console.print(f"contact sheet: {path}", highlight=False, soft_wrap=True)
     return path
 
@@ -41,15 +59,42 @@ def _console() -> Console:
 
 def table(dataset: Dataset) -> Table:
     """Table of all samples."""
-    title = f"{dataset.info.name}: {len(dataset)} stroke pairs, {len(dataset.info.poses)} mirror poses"
-    result = Table(title=title, box=box.SIMPLE)
+    result = Table(title=_title(dataset), box=box.SIMPLE)
     for heading in ("sample", "experiment"):
-        result.add_column(heading)
+        result.add_column(heading, no_wrap=True)
     for heading in ("D (m)", "h (m)", "down u, v (px)", "up u, v (px)", "phi_ray (deg)", "visible", "certificate"):
-        result.add_column(heading, justify="right")
+        result.add_column(heading, justify="right", no_wrap=True)
     for row in dataset.rows:
         result.add_row(*_cells(row))
     return result
+
+
+def narrow_table(dataset: Dataset) -> Table:
+    """Table of all samples for terminals of 80 columns: a line for each image, without phi and certificate."""
+    result = Table(title=_title(dataset), box=None, padding=(0, 1, 0, 0))
+    for heading in ("sample", "D (m)", "h (m)", "image", "u, v (px)", "visible"):
+        result.add_column(
+            heading, justify="right" if heading in ("D (m)", "h (m)", "u, v (px)") else "left", no_wrap=True
+        )
+    for row in dataset.rows:
+        numbers = (row.sample_id, f"{row.depth_m:.3f}", f"{row.stroke_m:.3f}")
+        for position, cells in zip(POSITIONS, (numbers, ("", "", "")), strict=True):
+            spot = row.position(position)
+            result.add_row(*cells, position, _pixel(spot), "yes" if spot.visible else spot.cause)
+    return result
+
+
+def _print_table(dataset: Dataset, console: Console) -> None:
+    """Print the table that fits, or the narrow one uncut: neither numbers nor names are shortened."""
+    endless = console.options.update(width=10_000)
+    wide, narrow = table(dataset), narrow_table(dataset)
+    grid = wide if console.measure(wide, options=endless).maximum <= console.width else narrow
+    width = console.width
+    console.width = max(width, console.measure(grid, options=endless).maximum)
+    try:
+        console.print(grid)
+    finally:
+        console.width = width
 
 
 def contact_sheet(dataset: Dataset, console: Console) -> Picture:
@@ -66,18 +111,31 @@ def contact_sheet(dataset: Dataset, console: Console) -> Picture:
     return np.concatenate(rows)
 
 
+def _title(dataset: Dataset) -> str:
+    return f"{dataset.info.name}: {len(dataset)} stroke pairs, {len(dataset.info.poses)} mirror poses"
+
+
+def _pixel(spot: SpotRow) -> str:
+    return f"{spot.u_px:.2f}, {spot.v_px:.2f}" if np.isfinite(spot.u_px) else "-"
+
+
+def _certificate(spot: SpotRow) -> str:
+    if spot.certificate is None:
+        return "-"
+    return "passed" if spot.certificate.passed else "failed"
+
+
 def _cells(row: ManifestRow) -> tuple[str, ...]:
     spots = (row.down, row.up)
-    passed = all(spot.certificate is not None and spot.certificate.passed for spot in spots)
     return (
         row.sample_id,
         row.experiment,
         f"{row.depth_m:.3f}",
         f"{row.stroke_m:.3f}",
-        *(f"{spot.u_px:.2f}, {spot.v_px:.2f}" for spot in spots),
+        *(_pixel(spot) for spot in spots),
         " / ".join(f"{np.degrees(spot.phi_ray_rad):.3f}" for spot in spots),
         " / ".join("yes" if spot.visible else spot.cause for spot in spots),
-        "passed" if passed else "-",
+        " / ".join(_certificate(spot) for spot in spots),
     )
 
 
@@ -87,7 +145,7 @@ def _strip(sample: Sample) -> Picture:
     image = Image.fromarray(np.pad(strip, ((_CAPTION_PX, 4), (0, 0), (0, 0))))
     row = sample.row
     caption = f"{row.sample_id}   D = {row.depth_m:.3f} m   h = {row.stroke_m:.3f} m   left: down, right: up"
-    ImageDraw.Draw(image).text((4, 2), caption, fill=_TEXT)
+    ImageDraw.Draw(image).text((4, 2), caption, fill=TEXT)
     return np.asarray(image)
 
 
@@ -99,50 +157,8 @@ def _pictures(sample: Sample, position: str) -> tuple[Picture, Picture]:
     detector, spot = sample.dataset.rig.camera.detector, sample.truth_row(position)
     frame = sample.frame(position)
     exposure = exposure_s(halved(sample.ambient(position)), detector)
-    overview = _marked(to_srgb(halved(halved(frame)), detector, exposure), spot)
-    crop = _crop(frame, spot)
-    peak = float(crop[1].max(initial=1.0))
-    return overview, _enlarged(to_srgb(crop, detector, min(exposure, 1.0 / peak)), spot)
-
-
-def _marked(picture: Picture, spot: SpotRow) -> Picture:
-    """Frame at a quarter of its size, with a cross that leaves the spot itself free."""
-    if not np.isfinite(spot.u_px):
-        return picture
-    image = Image.fromarray(picture)
-    _cross(ImageDraw.Draw(image), (spot.u_px + 0.5) / 4.0, (spot.v_px + 0.5) / 4.0, 3.0, 8.0)
-    return np.asarray(image)
-
-
-def _crop(frame: np.ndarray, spot: SpotRow) -> np.ndarray:
-    """Window of 24 x 24 pixels around the spot, black outside the image, shape (3, 24, 24)."""
-    result = np.zeros((3, _CROP_PX, _CROP_PX))
-    corner = _corner(spot)
-    if corner is not None:
-        (u0, v0), (height, width) = corner, frame.shape[1:]
-        rows, columns = (slice(max(x, 0), max(min(x + _CROP_PX, n), 0)) for x, n in ((v0, height), (u0, width)))
-        part = frame[:, rows, columns]
-        if part.size:
-            v, u = rows.start - v0, columns.start - u0
-            result[:, v : v + part.shape[1], u : u + part.shape[2]] = part
-    return result
-
-
-def _corner(spot: SpotRow) -> tuple[int, int] | None:
-    if not np.isfinite(spot.u_px):
-        return None
-    return round(spot.u_px) - _CROP_PX // 2, round(spot.v_px) - _CROP_PX // 2
-
-
-def _enlarged(picture: Picture, spot: SpotRow) -> Picture:
-    image = Image.fromarray(np.kron(picture, np.ones((_ZOOM, _ZOOM, 1), np.uint8)))
-    corner = _corner(spot)
-    if corner is not None:
-        u, v = ((x - x0 + 0.5) * _ZOOM for x, x0 in zip((spot.u_px, spot.v_px), corner, strict=True))
-        _cross(ImageDraw.Draw(image), u, v, 2.5 * _ZOOM, 6.0 * _ZOOM)
-    return np.asarray(image)
-
-
-def _cross(draw: ImageDraw.ImageDraw, u: float, v: float, inner: float, outer: float) -> None:
-    for du, dv in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        draw.line((u + du * inner, v + dv * inner, u + du * outer, v + dv * outer), fill=_MARK)
+    overview = marked(to_srgb(halved(halved(frame)), detector, exposure), spot, 4)
+    window = crop(frame, spot)
+    peak = float(window[1].max(initial=1.0))
+    close = enlarged(to_srgb(window, detector, min(exposure, 1.0 / peak)), spot, _ZOOM)
+    return overview, close if spot.visible else captioned(close, f"{position}: not visible\n{spot.cause}")

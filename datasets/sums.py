@@ -2,17 +2,39 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 from phibench.datasets import layout
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.files import TEMPORARY_PREFIX, sha256, write_text
+from phibench.datasets.info import read_info
+from phibench.datasets.manifest import read_manifest
+from phibench.scenes.rig import POSITIONS
 
 
 def data_files(folder: Path) -> list[str]:
-    """Relative names of all data files in a folder, sorted."""
+    """Relative names of the files that make up the data set in a folder, sorted; what else lies there is not asked.
+
+    Raises
+    ------
+    DatasetError
+        If `dataset.json` or the manifest, which name them, cannot be read.
+    """
+    rows = read_manifest(folder)
+    names = {layout.INFO, layout.MANIFEST, layout.TABLE, layout.RECIPE}
+    names.update(name for pose in read_info(folder).poses for name in pose.files.values())
+    names.update(layout.preview_file(row.sample_id) for row in rows)
+    spots = (row.position(position) for row in rows for position in POSITIONS)
+    names.update(spot.spot_file for spot in spots if spot.spot_file is not None)
+    return sorted(names)
+
+
+def strays(folder: Path) -> list[str]:
+    """Relative names of files in a folder that are neither listed nor ours otherwise (notes, scores), sorted."""
+    known = {*read_sums(folder), *layout.NOT_DATA}
     names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
-    return sorted(name for name in names if name not in layout.NOT_DATA and TEMPORARY_PREFIX not in name)
+    return sorted(name for name in names if name not in known and TEMPORARY_PREFIX not in name)
 
 
 def write_sums(folder: Path) -> Path:
@@ -39,9 +61,33 @@ def read_sums(folder: Path) -> dict[str, str]:
 
 
 def damaged(folder: Path) -> list[str]:
-    """One sentence per file that is missing, changed or not listed."""
-    listed, present = read_sums(folder), set(data_files(folder))
-    faults = [f"{name} is missing" for name in listed if name not in present]
-    changed = (name for name in listed if name in present and sha256(folder / name) != listed[name])
-    faults += [f"{name} is damaged: its SHA-256 is not the listed one" for name in changed]
-    return faults + [f"{name} is not listed in {layout.SUMS}" for name in sorted(present - set(listed))]
+    """One sentence per file that is missing, cannot be read, was changed or is not listed although it belongs here."""
+    listed, planned = read_sums(folder), set()
+    with contextlib.suppress(DatasetError):  # a manifest that cannot be read is reported as what it is, below
+        planned = set(data_files(folder))
+    faults = [fault for name, digest in listed.items() if (fault := _fault(folder, name, digest))]
+    return faults + [f"{name} is not listed in {layout.SUMS}" for name in sorted(planned - set(listed))]
+
+
+def check_documents(folder: Path) -> None:
+    """Refuse a data set that is unfinished or whose `dataset.json` or manifest is not the listed one (cheap).
+
+    Raises
+    ------
+    DatasetError
+        In one sentence.
+    """
+    listed = read_sums(folder)
+    for name in (layout.INFO, layout.MANIFEST):
+        if fault := _fault(folder, name, listed.get(name, "")):
+            raise DatasetError(f"{folder}: {fault}; run `phibench dataset verify` to see all faults")
+
+
+def _fault(folder: Path, name: str, digest: str) -> str:
+    """Sentence about a file that is not what its hash says; empty if it is."""
+    try:
+        return "" if sha256(folder / name) == digest else f"{name} is damaged: its SHA-256 is not the listed one"
+    except (FileNotFoundError, NotADirectoryError):
+        return f"{name} is missing"
+    except OSError as error:
+        return f"{name} is not readable: {error.strerror or error}"

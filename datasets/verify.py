@@ -20,7 +20,7 @@ from phibench.datasets.progress import Steps
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.schema import PoseInfo, SpotRow
 from phibench.datasets.spot_task import SpotAnswer, answer_spot
-from phibench.datasets.sums import damaged, read_sums
+from phibench.datasets.sums import damaged, read_sums, strays
 from phibench.scenes.rig import POSITIONS
 
 _FLOAT32 = 1e-6  # float32 rounds by 6e-8; other machines' libm adds a little
@@ -37,11 +37,14 @@ class Report:
         One sentence each; none means that everything is in order.
     files, samples : int
         How many were looked at.
+    notes : tuple of str
+        One sentence each on what is odd and no fault, such as a file that is not part of the data set.
     """
 
     faults: tuple[str, ...]
     files: int
     samples: int
+    notes: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -66,20 +69,23 @@ def verify(folder: str | Path, truth_layers: bool = True, console: Console | Non
         If the folder is not a data set at all.
     """
     folder, console = Path(folder), console or Console(stderr=True)
+    if not folder.is_dir():
+        raise DatasetError(f"there is no folder {folder}")
     if not (folder / layout.INFO).is_file():
         raise DatasetError(f"{folder} is not a data set: it has no {layout.INFO}")
     try:
         faults, files = damaged(folder), len(read_sums(folder))
+        notes = tuple(f"{name} is not part of the data set" for name in strays(folder))
     except DatasetError as error:
-        faults, files = [str(error)], 0
+        faults, files, notes = [str(error)], 0, ()
     try:
         dataset = open_dataset(folder)
     except DatasetError as error:
-        return Report((*faults, str(error)), files, 0)
+        return Report((*faults, str(error)), files, 0, notes)
     bad = {fault.split(" is ", 1)[0] for fault in faults}
     faults += [*_plan_faults(dataset), *differences(folder, dataset.rows)]
     faults += _content_faults(dataset, bad, truth_layers, console)
-    return Report(tuple(dict.fromkeys(faults)), files, len(dataset))
+    return Report(tuple(dict.fromkeys(faults)), files, len(dataset), notes)
 
 
 def _content_faults(dataset: Dataset, bad: set[str], truth_layers: bool, console: Console) -> list[str]:

@@ -43,11 +43,11 @@ def score(directory: Path, *, out: Path | None = None) -> int:
     """
     from rich.console import Console
 
-    from phibench.datasets.read import open_dataset
+    from phibench.datasets.read import open_finished
     from phibench.estimator.score import bias_table, table
     from phibench.estimator.score import score as score_dataset
 
-    scores = score_dataset(open_dataset(directory))
+    scores = score_dataset(open_finished(directory))
     # a table cut off at the width of a pipe or of a narrow terminal would lose numbers
     console = Console()
     console = console if console.width >= _TABLE_WIDTH else Console(width=_TABLE_WIDTH)
@@ -60,7 +60,10 @@ def score(directory: Path, *, out: Path | None = None) -> int:
 
 @app.command
 def doctor() -> int:
-    """Show Python, packages, LLVM, cores and disk, and render a test image."""
+    """Show Python, packages, LLVM, cores and disk, and render a test image.
+
+    The exit code is 1 if something is broken; an installation that can only score is not.
+    """
     # a bad LLVM aborts the process that loads it: never this one
     return subprocess.run([sys.executable, "-m", "phibench.render.doctor"], check=False).returncode
 
@@ -98,22 +101,26 @@ def verify(directory: Path) -> int:
     report = verify_dataset(directory)
     for fault in report.faults:
         print(fault)
+    for note in report.notes:
+        print(f"note: {note}")
     print(f"{directory}: {report.files} files, {report.samples} samples, {len(report.faults)} faults")
     return 0 if report.ok else 1
 
 
 @dataset.command
-def show(directory: Path) -> int:
+def show(directory: Path, *, out: Path | None = None) -> int:
     """Print a table of a data set and write its contact sheet.
 
     Parameters
     ----------
     directory
         Folder of a data set.
+    out
+        PNG file for the contact sheet; by default contact_sheet.png in the folder.
     """
     from phibench.datasets.show import show as show_dataset
 
-    show_dataset(directory)
+    show_dataset(directory, out=out)
     return 0
 
 
@@ -142,7 +149,7 @@ def _is_users(error: Exception) -> bool:
 
 def _sentence(error: Exception) -> str:
     """Return the message of an error; an operating system's without its number."""
-    if isinstance(error, OSError) and error.strerror:
+    if isinstance(error, OSError) and error.strerror and type(error).__module__ == "builtins":
         return f"{error.strerror}: {error.filename}" if error.filename else str(error.strerror)
     return str(error)
 

@@ -234,7 +234,9 @@ def _cell(value_m: float, relative: float, status: str) -> str:
 
 
 def _percent(relative: float) -> str:
-    """Relative error in %; errors below 0.001 % as a power of ten, so that they do not read as zero."""
+    """Relative error in %, "-" where there is none; below 0.001 % as a power of ten, so that it does not read as 0."""
+    if np.isnan(relative):
+        return "-"
     percent = 100.0 * relative
     return f"{percent:+.3f}" if abs(percent) >= 1e-3 or percent == 0.0 else f"{percent:+.0e}"
 

@@ -1,6 +1,9 @@
 """What this machine can do: versions, LLVM, space, and one rendered image whose values are known.
 
 Run ``python -m phibench.render.doctor``. Every fault comes with one line that says what to do. Nothing is changed.
+
+The exit code is 1 if something is broken, and 0 otherwise: also where neither mitsuba nor drjit is installed, since
+scoring needs neither (one line then says what rendering needs). One of the two without the other is broken.
 """
 
 import os
@@ -52,14 +55,19 @@ class Finding:
 
 def examine() -> Iterator[Finding]:
     """Look at everything, cheap things first."""
-    variant = os.environ.get(ENVIRONMENT) or DEFAULT
     yield python_finding(sys.version_info[:3])
     packages = list(package_findings(pinned_versions()))
     yield from packages
+    if is_scoring_only():
+        yield cores_finding()
+        yield disk_finding(Path.cwd())
+        yield scoring_finding(after=packages)
+        return
+    variant = os.environ.get(ENVIRONMENT) or DEFAULT
     yield Finding("variant", variant)
     llvm = llvm_finding(is_needed=variant.startswith("llvm"))
     yield llvm
-    yield Finding("cores", str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()))
+    yield cores_finding()
     yield disk_finding(Path.cwd())
     yield image_finding(after=[*packages, llvm])
 
@@ -82,8 +90,10 @@ def pinned_versions() -> dict[str, str]:
 
 def package_findings(pinned: dict[str, str]) -> Iterator[Finding]:
     """Compare what is installed with what this checkout was tested with."""
-    for name in (*CORE, *RENDER):
+    for name in CORE:
         yield package_finding(name, pinned.get(name))
+    for name in RENDER:
+        yield Finding(name, "not installed") if is_scoring_only() else package_finding(name, pinned.get(name))
     for name in sorted(set(pinned) - set(CORE) - set(RENDER)):
         finding = package_finding(name, pinned[name])
         # What the tests or the checks need may be absent; what is there should be what was tested.
@@ -128,6 +138,24 @@ def is_installed(name: str) -> bool:
     except metadata.PackageNotFoundError:
         return False
     return True
+
+
+def is_scoring_only() -> bool:
+    """Return whether nothing that renders is installed: a choice, where half of it would be a fault."""
+    return not any(is_installed(name) for name in RENDER)
+
+
+def scoring_finding(after: list[Finding]) -> Finding:
+    """Say what an installation without the renderer can do, unless something it needs is already found missing."""
+    if any(finding.state == "fault" for finding in after):
+        return Finding("use", "scoring only, once the faults are set right")
+    advice = f"scoring works; rendering needs {' and '.join(RENDER)}: run `pip install 'phibench[render]'`."
+    return Finding("use", "scoring works, no renderer", "warning", advice)
+
+
+def cores_finding() -> Finding:
+    """Count the cores that this process may use."""
+    return Finding("cores", str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()))
 
 
 def disk_finding(folder: Path) -> Finding:

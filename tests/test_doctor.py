@@ -39,15 +39,36 @@ def test_a_bad_llvm_is_one_fault_and_the_image_is_not_tried(python: Python, tmp_
     assert "set right first LLVM" in image
 
 
-def test_missing_mitsuba_is_a_fault_with_the_command_to_run(python: Python) -> None:
-    hide = (
-        "from importlib import metadata; find = metadata.version\n"
+def without(*names: str) -> str:
+    """Code that hides packages."""
+    return (
+        "import sys; from importlib import metadata; find = metadata.version\n"
         "def version(name):\n"
-        "    if name in ('mitsuba', 'drjit'): raise metadata.PackageNotFoundError(name)\n"
+        f"    if name in {names}: raise metadata.PackageNotFoundError(name)\n"
         "    return find(name)\n"
         "metadata.version = version\n"
+        f"sys.modules.update(dict.fromkeys({names}))\n"
     )
-    child = python(hide + "import sys; sys.modules.update(mitsuba=None, drjit=None)\n" + DOCTOR)
+
+
+def test_an_installation_for_scoring_only_is_in_order(python: Python) -> None:
+    child = python(without("mitsuba", "drjit") + DOCTOR, DRJIT_LIBLLVM_PATH="/nowhere")
+    assert child.returncode == 0, child.stdout + child.stderr
+    assert lines_of(child.stdout, "fault") == []
+    [line] = [line for line in child.stdout.splitlines() if "scoring works; rendering needs" in line]
+    assert "pip install 'phibench[render]'" in line
+    assert "Traceback" not in child.stderr
+
+
+def test_scoring_only_with_a_missing_package_is_a_fault(python: Python) -> None:
+    child = python(without("mitsuba", "drjit", "polars") + DOCTOR)
+    assert child.returncode == 1, child.stdout + child.stderr
+    assert "scoring works" not in child.stdout
+    assert "fault: polars is not installed" in child.stdout
+
+
+def test_half_a_renderer_is_a_fault_with_the_command_to_run(python: Python) -> None:
+    child = python(without("mitsuba", "no-such-thing") + DOCTOR)
     assert child.returncode == 1, child.stderr
     assert "fault: mitsuba is not installed: run `pip install 'phibench[render]'`." in child.stdout
     assert "Traceback" not in child.stderr

@@ -1,5 +1,7 @@
 """EXR files give back what was written, whatever the memory layout, or raise."""
 
+import errno
+import os
 from pathlib import Path
 from typing import Any
 
@@ -124,3 +126,24 @@ def test_missing_and_foreign_files_raise(tmp_path: Path) -> None:
         foreign.write(str(tmp_path / "foreign.exr"))
     with pytest.raises(DatasetError, match="not written by phibench"):
         read_exr(tmp_path / "foreign.exr")
+
+
+@pytest.mark.parametrize("kept", [100, 0.5, 0.9])
+def test_a_damaged_file_is_told_by_the_exception_only(
+    file: Path, kept: float, capfd: pytest.CaptureFixture[str]
+) -> None:
+    data = file.read_bytes()
+    file.write_bytes(data[: int(len(data) * kept) if isinstance(kept, float) else kept])
+    with pytest.raises(DatasetError, match="damaged"):
+        read_exr(file)
+    os.write(2, b"heard again")
+    assert capfd.readouterr() == ("", "heard again")
+
+
+def test_a_file_that_may_not_be_read_is_not_called_missing(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def denied(*_: object) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    monkeypatch.setattr(Path, "open", denied)
+    with pytest.raises(DatasetError, match="not readable: Permission denied"):
+        read_exr(file)

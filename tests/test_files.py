@@ -69,7 +69,9 @@ def test_a_full_disk_while_an_exr_is_written(tmp_path: Path) -> None:
     )
     old = write_exr(tmp_path / "a.exr", {"A": np.zeros((2, 2))}, {}).read_bytes()
     child = subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.exr")], capture_output=True, text=True)
-    assert "OSError" in child.stderr
+    last = child.stderr.splitlines()[-1]
+    assert f"WriteError: could not write {tmp_path / 'a.exr'}: File too large; free some space" in last
+    assert TEMPORARY_PREFIX not in last
     assert (tmp_path / "a.exr").read_bytes() == old
     assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
 
@@ -99,3 +101,27 @@ def test_what_a_killed_run_left_is_removed(tmp_path: Path) -> None:
     remove_temporary(tmp_path)
     assert keep.exists()
     assert not left.exists()
+
+
+@pytest.mark.parametrize(
+    ("code", "advice"), [(errno.ENOSPC, "free some space"), (errno.EACCES, "may write"), (errno.EIO, "another path")]
+)
+def test_a_write_error_names_the_target_the_reason_and_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, advice: str
+) -> None:
+    def fails(*_: object) -> None:
+        raise OSError(code, os.strerror(code), "a-temporary-name")
+
+    monkeypatch.setattr(files.os, "fsync", fails)
+    with pytest.raises(files.WriteError) as caught:
+        write_bytes(tmp_path / "a.json", b"")
+    text = str(caught.value)
+    assert [word for word in (str(tmp_path / "a.json"), os.strerror(code), advice) if word not in text] == []
+    assert "temporary-name" not in text
+    assert TEMPORARY_PREFIX not in text
+
+
+def test_a_folder_that_is_a_file_is_a_write_error(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"")
+    with pytest.raises(files.WriteError, match=r"could not write .*a/b/c\.txt"):
+        write_bytes(tmp_path / "a" / "b" / "c.txt", b"")

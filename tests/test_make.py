@@ -86,6 +86,7 @@ def test_two_runs_are_byte_identical_whatever_the_number_of_workers(tiny_dataset
 def test_a_finished_data_set_is_left_alone_and_a_damaged_one_made_again(tiny_dataset: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
     console = quiet()
+    (copy / "scores.json").write_text("{}")  # somebody's file is no reason to start over
     make.make(TINY, copy, workers=1, console=console)
     assert "nothing to do" in said(console)
     (copy / layout.MANIFEST).unlink()

@@ -11,7 +11,7 @@ from phibench.datasets import layout
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.layers import TRUTH_PLANES, SpotWindow
 from phibench.datasets.plan import make_plan
-from phibench.datasets.read import Dataset, open_dataset
+from phibench.datasets.read import Dataset, open_dataset, open_finished
 from phibench.datasets.recipe_file import load_recipe
 from phibench.render.spot import spot_layer
 from phibench.render.truth import truth_layer
@@ -129,3 +129,58 @@ def test_damaged_json_is_refused(tmp_path: Path) -> None:
     (tmp_path / layout.INFO).write_text('{"schema_version": 1,')
     with pytest.raises(DatasetError, match="is damaged"):
         open_dataset(tmp_path)
+
+
+@pytest.fixture
+def copy(tiny_dataset: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(tiny_dataset, tmp_path / "swapped"))
+
+
+def view(name: str, pose: str = "h0.500") -> str:
+    return layout.view_file(pose, name)
+
+
+SPOTS = ("spots/seen-near-h0.500-down.exr", "spots/seen-near-h0.500-up.exr")
+
+
+@pytest.mark.parametrize(
+    "pair",
+    [SPOTS, (view("ambient", "h0.000"), view("ambient")), (view("truth", "h0.000"), view("truth"))],
+    ids=["spots", "ambient", "truth"],
+)
+def test_swapped_layers_are_refused(copy: Path, pair: tuple[str, str]) -> None:
+    before = open_dataset(copy)["seen-near-h0.500"]
+    assert before.frame("down").any()
+    assert before.truth("up")
+    a, b = (copy / name for name in pair)
+    a.rename(copy / "aside")
+    b.rename(a)
+    (copy / "aside").rename(b)
+    sample = open_dataset(copy)["seen-near-h0.500"]
+    for position in ("down", "up"):
+        with pytest.raises(DatasetError, match=r"is the \w+ layer of .*, not of"):
+            (sample.truth if "truth" in pair[0] else sample.frame)(position)
+
+
+def test_a_layer_of_another_data_set_is_refused(copy: Path, smoke_dataset: Path) -> None:
+    shutil.copy(smoke_dataset / view("ambient", "h0.000"), copy / view("ambient", "h0.000"))
+    with pytest.raises(DatasetError, match="dataset smoke, not of dataset tiny"):
+        open_dataset(copy).samples[0].ambient("down")
+
+
+def test_an_unfinished_or_changed_data_set_is_not_opened_as_finished(copy: Path) -> None:
+    assert len(open_finished(copy)) == 2
+    (copy / layout.RECIPE).write_text("")  # not read, so not hashed here
+    assert len(open_finished(copy)) == 2
+    manifest = (copy / layout.MANIFEST).read_text()
+    (copy / layout.MANIFEST).write_text(manifest + " ")
+    with pytest.raises(DatasetError, match=r"manifest\.jsonl is damaged"):
+        open_finished(copy)
+    (copy / layout.SUMS).unlink()
+    with pytest.raises(DatasetError, match="not finished"):
+        open_finished(copy)
+
+
+def test_a_sample_prints_short(dataset: Dataset) -> None:
+    assert "dataset" not in repr(dataset.samples[0]).split("(", 1)[1].split("row=")[0]
+    assert len(repr(dataset.samples[0])) < 5000

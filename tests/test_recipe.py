@@ -8,7 +8,7 @@ import pytest
 from phibench.datasets.errors import RecipeError
 from phibench.datasets.recipe import Recipe, recipe_schema
 from phibench.datasets.recipe_checks import warnings
-from phibench.datasets.recipe_file import RECIPES, check_recipe, load_recipe, parse_recipe
+from phibench.datasets.recipe_file import RECIPES, check_recipe, find_recipe, load_recipe, parse_recipe
 from phibench.datasets.recipe_scene import build_rig, build_spot
 from phibench.scenes.catalog import c310_rig, default_rig
 
@@ -86,7 +86,16 @@ def test_the_spot_grows_with_distance_or_has_one_diameter() -> None:
         (changed(rig={"k1": math.nan}), "rig.k1", ("nan", "from -1000 up to 1000")),
         (changed(rig={"f_number": True}), "rig.f_number", ("True", "a number from 0.5")),
         (changed(rig={"z_c_m": "0.3"}), "rig.z_c_m", ("'0.3'", "a number above 0")),
-        (changed(rig={"z_c_m": 0.05}), "rig", ("0.0500 m", "mirror radius")),
+        (changed(rig={"z_c_m": 0.05}), "rig", ("0.0500 m", "mirror radius", "z_c_m = 0.05", "radius_m = 0.06")),
+        (changed(rig={"camera_height_m": 3.0}), "rig.camera_height_m", ("ceiling", "less than 2.659")),
+        (changed(rig={"z_c_m": 2.6}), "rig.z_c_m", ("ceiling",)),
+        ({k: v for k, v in changed().items() if k != "targets"}, "targets", ("missing",)),
+        (changed(targets=target()), "targets", ("[[targets]]",)),
+        (
+            changed(targets=[{("nmae" if k == "name" else k): v for k, v in target().items()}]),
+            "targets[0].nmae",
+            ("'name'",),
+        ),
         (changed(room={"name": "kitchen"}), "room.name", ("'lab', 'dark'",)),
         (changed(roooms={}), "roooms", ("unknown", "'room'")),
         (changed(laser={"diameter_m": 0.01, "diameter_base_m": 0.01}), "laser.diameter_m", ("one or the other",)),
@@ -100,7 +109,12 @@ def test_the_spot_grows_with_distance_or_has_one_diameter() -> None:
         (changed(targets=[target(depth_m=9.0)]), "targets[0]", ("outside the room",)),
         (changed(experiments=[experiment(targets=["b"])]), "experiments[0].targets[0]", ("'b'", "known: a")),
         (changed(experiments=[experiment(targets=[])]), "experiments[0].targets", ("at least 1",)),
-        (changed(experiments=[experiment(strokes_m=[0.0])]), "experiments[0].strokes_m[0]", ("0.0", "above 0")),
+        (
+            changed(experiments=[experiment(strokes_m=[0.0])]),
+            "experiments[0].strokes_m[0]",
+            ("0.0", "from 0.001 up to 10"),
+        ),
+        (changed(experiments=[experiment(strokes_m=[0.0005])]), "experiments[0].strokes_m[0]", ("0.0005", "0.001")),
         (changed(experiments=[experiment(strokes_m=[0.3, -1])]), "experiments[0].strokes_m[1]", ("-1",)),
         (changed(experiments=[experiment(strokes_m=[math.nan])]), "experiments[0].strokes_m[0]", ("nan",)),
         (changed(experiments=[experiment(strokes_m=[0.3, 0.3])]), "experiments[0].strokes_m[1]", ("twice",)),
@@ -149,8 +163,15 @@ def test_toml_and_file_faults(tmp_path: Any) -> None:
     with pytest.raises(RecipeError, match="smoke"):
         load_recipe(tmp_path / "smok")
     (tmp_path / "latin.toml").write_bytes(b"# \xe9")
-    with pytest.raises(RecipeError, match="cannot be read"):
+    with pytest.raises(RecipeError, match=r"cannot be read.*UTF-8"):
         load_recipe(tmp_path / "latin.toml")
+    with pytest.raises(RecipeError, match="is a folder"):
+        load_recipe(tmp_path)
+
+
+def test_a_byte_order_mark_is_accepted(tmp_path: Any) -> None:
+    (tmp_path / "marked.toml").write_bytes(b"\xef\xbb\xbf" + find_recipe("smoke").read_bytes())
+    assert load_recipe(tmp_path / "marked.toml") == load_recipe("smoke")
 
 
 def test_a_mirror_beyond_the_image_is_a_warning() -> None:

@@ -132,6 +132,9 @@ def test_summary_without_estimates():
     only = score(make_dataset(make_sample(*paper_cases()[0], down="outside image")))
     assert all(s.n == 0 and s.missing == 1 and math.isnan(s.rms) for s in summarise(only))
     assert "outside image" in text(table(only))
+    for shown in (text(table(only)), text(bias_table(only))):
+        assert "nan" not in shown
+    assert "- (0)" in text(table(only))
 
 
 def test_table_shows_the_paper_beside_ours(three):

@@ -1,22 +1,30 @@
 """Verification finds every kind of damage, and nothing where there is none."""
 
+import errno
 import io
 import json
+import os
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 from rich.console import Console
 
-from phibench.datasets import layout
+from phibench.datasets import layout, spot_picture, sums
+from phibench.datasets import show as show_module
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.layers import read_truth, write_truth
 from phibench.datasets.manifest import read_manifest, write_manifest
+from phibench.datasets.preview import Picture
+from phibench.datasets.read import open_dataset
 from phibench.datasets.show import show
 from phibench.datasets.sums import write_sums
 from phibench.datasets.verify import Report, verify
+from phibench.datasets.visibility import visibility_line
 
 AMBIENT, TRUTH = layout.view_file("h0.000", "ambient"), layout.view_file("h0.500", "truth")
 SPOT, OTHER_SPOT = "spots/seen-near-h0.500-down.exr", "spots/seen-near-h0.500-up.exr"
@@ -79,9 +87,35 @@ def test_swapped_files_are_found(copy: Path, a: str, b: str, hide: bool) -> None
     assert {name for name in (a, b) if any(name in fault for fault in faults)} == {a, b}
 
 
-def test_a_stray_file_is_named(copy: Path) -> None:
+def test_a_stray_file_is_a_note_and_neither_a_fault_nor_signed(copy: Path) -> None:
+    before = (copy / layout.SUMS).read_text()
     (copy / "spots" / "extra.exr").write_bytes(b"")
-    assert check(copy).faults == ("spots/extra.exr is not listed in SHA256SUMS",)
+    (copy / "scores.json").write_text("{}")
+    report = check(copy)
+    assert report.ok
+    assert ["scores.json" in report.notes[0], "spots/extra.exr" in report.notes[1]] == [True, True]
+    write_sums(copy)
+    assert (copy / layout.SUMS).read_text() == before
+
+
+def test_a_file_of_the_data_set_that_is_not_listed_is_a_fault(copy: Path) -> None:
+    lines = (copy / layout.SUMS).read_text().splitlines(keepends=True)
+    (copy / layout.SUMS).write_text("".join(line for line in lines if SPOT not in line))
+    assert check(copy).faults == (f"{SPOT} is not listed in SHA256SUMS",)
+
+
+def test_a_missing_folder_and_an_unreadable_file_are_called_so(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(DatasetError, match="there is no folder"):
+        check(copy / "nowhere")
+    sha256 = sums.sha256
+
+    def denied(path: Path) -> str:
+        if path.name == layout.TABLE:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        return sha256(path)
+
+    monkeypatch.setattr(sums, "sha256", denied)
+    assert check(copy).faults == (f"{layout.TABLE} is not readable: Permission denied",)
 
 
 def test_an_unfinished_data_set_is_found(copy: Path) -> None:
@@ -130,8 +164,8 @@ def test_a_changed_pixel_truth_is_found_when_asked_for(copy: Path) -> None:
 
 
 def test_what_is_no_data_set_raises(tmp_path: Path) -> None:
-    for folder in (tmp_path, tmp_path / "none"):
-        with pytest.raises(DatasetError, match="is not a data set"):
+    for folder, words in ((tmp_path, "is not a data set"), (tmp_path / "none", "there is no folder")):
+        with pytest.raises(DatasetError, match=words):
             check(folder)
 
 
@@ -151,3 +185,59 @@ def test_show_prints_a_table_and_draws_the_spots(copy: Path) -> None:
         colours = {colour for _, colour in image.getcolors(1 << 24)}
     assert (0, 255, 80) in colours  # the mark
     assert check(copy).ok  # the sheet is not part of the data
+    assert "- / passed" in text  # one result for each image
+
+
+@pytest.mark.parametrize("width", [60, 80, 100, 170])
+def test_show_never_cuts_a_number_or_a_name(tiny_dataset: Path, tmp_path: Path, width: int) -> None:
+    console = Console(file=io.StringIO(), width=width)
+    show(tiny_dataset, console, out=tmp_path / "sheet.png")
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    shown = set(re.split(r"[\s,]+", text))
+    for row in read_manifest(tiny_dataset):
+        numbers = {f"{row.up.u_px:.2f}", f"{row.up.v_px:.2f}"}
+        assert {row.sample_id, f"{row.depth_m:.3f}", f"{row.stroke_m:.3f}"} | numbers <= shown
+    assert "occluded:crate_red" in shown
+    table = text.split("contact sheet")[0].splitlines()
+    assert width < 80 or max(map(len, table)) <= width
+    assert (tmp_path / "sheet.png").stat().st_size > 1000
+
+
+def test_a_sheet_that_cannot_be_written_is_said_after_the_table(tiny_dataset: Path, tmp_path: Path) -> None:
+    console = Console(file=io.StringIO(), width=170)
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(DatasetError, match=r"contact sheet was not written.*--out") as caught:
+        show(tiny_dataset, console, out=tmp_path / "file" / "sheet.png")
+    assert "\n" not in str(caught.value)
+    assert "seen-near-h0.500" in console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_a_sheet_says_why_a_spot_is_hidden(tiny_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said = []
+
+    def captioned(picture: Picture, text: str) -> Picture:
+        said.append(text)
+        changed = spot_picture.captioned(picture, text)
+        assert np.count_nonzero(changed != picture) > 100
+        return changed
+
+    monkeypatch.setattr(show_module, "captioned", captioned)
+    show_module.contact_sheet(open_dataset(tiny_dataset), Console(file=io.StringIO()))
+    [text] = said  # the other three spots are seen
+    assert "occluded:crate_red" in text
+
+
+def test_previews_mark_the_spot(tiny_dataset: Path) -> None:
+    with Image.open(tiny_dataset / layout.preview_file("seen-near-h0.500")) as image:
+        picture = np.asarray(image)
+    for half in np.split(picture, 2, axis=1):
+        marks = np.all(half == (0, 255, 80), axis=2)
+        assert np.count_nonzero(marks) > 4 * 24  # the inset's frame and the crosses
+
+
+def test_the_last_line_of_make_counts_what_can_be_used(tiny_dataset: Path) -> None:
+    rows = read_manifest(tiny_dataset)
+    assert visibility_line(rows) == (
+        "1 of 2 pairs are visible in both images; not visible: down occluded:crate_red (1)"
+    )
+    assert visibility_line(rows[:1]) == "1 of 1 pairs are visible in both images"

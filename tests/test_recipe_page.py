@@ -1,0 +1,42 @@
+"""RECIPE.md is what the generator writes, and the generator says what the models and presets say."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from phibench.datasets import recipe_page
+from phibench.datasets.recipe import RigTable
+from phibench.datasets.recipe_scene import build_rig
+from phibench.scenes.catalog import RIGS
+
+PAGE = Path(recipe_page.__file__).resolve().with_name("RECIPE.md").read_text(encoding="utf-8")
+
+
+def test_the_page_is_the_generated_one() -> None:
+    assert recipe_page.recipe_page() == PAGE, "run python -m phibench.datasets.recipe_page > datasets/RECIPE.md"
+
+
+@pytest.mark.parametrize("heading", recipe_page.TABLES)
+def test_every_key_has_its_line(heading: str) -> None:
+    section = PAGE.split(f"## `{heading}`\n")[1].split("\n## ")[0]
+    assert re.findall(r"^\| `(\w+)` \|", section, flags=re.MULTILINE) == list(recipe_page.TABLES[heading].model_fields)
+
+
+def test_units_ranges_and_defaults_are_there() -> None:
+    [line] = [line for line in PAGE.splitlines() if line.startswith("| `wavelength_nm`")]
+    assert line.split(" | ")[1:4] == ["nm", "a number from 400 up to 700", "650"]
+    [line] = [line for line in PAGE.splitlines() if line.startswith("| `strokes_m`")]
+    assert "from 0.001 up to 10" in line
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_a_recipe_that_writes_the_presets_values_gets_the_preset(name: str) -> None:
+    """The column can be typed in: it gives the same rig, from either preset."""
+    rig = RIGS[name]()
+    values = {key: recipe_page.preset_value(rig, key) for key in RigTable.model_fields}
+    table = {key: value for key, value in values.items() if value is not None}
+    table |= {key: int(table[key]) for key in ("width_px", "height_px")}
+    assert len(table) == len(RigTable.model_fields) - 1  # all but `preset` itself
+    for other in RIGS:
+        assert build_rig(RigTable.model_validate({"preset": other, **table})) == rig
