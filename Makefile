@@ -10,14 +10,15 @@ PYTHON ?=
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup dataset test test-slow test-all bench lint clean
+.PHONY: help setup dataset test test-slow proof test-all bench lint clean
 
 help:
 	@echo "make setup      make .venv with everything in it, and make sure of LLVM"
 	@echo "make dataset    render $(RECIPE) into $(OUT)"
 	@echo "make test       the tests, without the slow ones"
 	@echo "make test-slow  the slow tests"
-	@echo "make test-all   both"
+	@echo "make proof      the slow tests of accuracy alone"
+	@echo "make test-all   all tests"
 	@echo "make bench      the benchmarks"
 	@echo "make lint       ruff and mypy"
 	@echo "make clean      remove caches and builds; .venv and out/ stay"
@@ -52,6 +53,9 @@ test: $(READY)
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -m slow
+
+proof: $(READY)
+	$(BIN)/python -m pytest -m slow -k accuracy
 
 test-all: $(READY)
 	$(BIN)/python -m pytest

@@ -28,10 +28,11 @@ from phibench.scenes.solids import Shape
 CHIEF_TOLERANCE_PX = 1e-6
 CENTROID_TOLERANCE_PX = 2e-3
 FLUX_TOLERANCE = 3e-3
-_LOG2_RAYS = 13  # centroid within 4e-4 px, flux within 5e-4, for the random rigs of the tests
+_LOG2_RAYS = (13, 15, 17)  # 13: centroid within 4e-4 px, flux within 5e-4, for the random rigs of the tests
 _SEED = 0  # the scramble is part of the quadrature rule, not a noise draw
 _STEP_PX = 1e-3
 _NEWTON_STEPS = 8
+_HALVINGS = 6
 
 
 @dataclass(frozen=True)
@@ -59,21 +60,45 @@ class Certificate:
 
 
 def certify(view: View, spot: LaserSpot, shapes: Sequence[Shape], truth: SpotTruth, layer: SpotLayer) -> Certificate:
-    """Check one visible spot. Raises nothing: look at `passed`."""
+    """Check one visible spot. Raises nothing: look at `passed`.
+
+    More rays are traced before a difference counts: the first few may not be enough for a wide or a cut image.
+    """
     chief = np.array([truth.u_px, truth.v_px])
-    traced = aim(view, spot, _Bundle.chief(), np.zeros((1, 2)), chief)[0]
-    centroid, electrons = trace_spot(view, spot, shapes, chief)
-    chief_px = float(np.linalg.norm(traced - chief))
-    centroid_px = float(np.linalg.norm(pixel_centroid(layer) - centroid))
-    flux = float(abs(layer.electrons_per_s[0].sum() / electrons - 1.0))
-    # a NaN does not pass
-    passed = chief_px <= CHIEF_TOLERANCE_PX and centroid_px <= CENTROID_TOLERANCE_PX and flux <= FLUX_TOLERANCE
+    start = _through_chief_point(view, truth, np.zeros((1, 2)))
+    chief_px = float(np.linalg.norm(aim(view, spot, _Bundle.chief(), np.zeros((1, 2)), start)[0] - chief))
+    for log2_rays in _LOG2_RAYS:
+        centroid_px, flux = _differences(view, spot, shapes, truth, layer, log2_rays)
+        # a NaN does not pass
+        passed = chief_px <= CHIEF_TOLERANCE_PX and centroid_px <= CENTROID_TOLERANCE_PX and flux <= FLUX_TOLERANCE
+        if passed:
+            break
     return Certificate(chief_px, CHIEF_TOLERANCE_PX, centroid_px, CENTROID_TOLERANCE_PX, flux, FLUX_TOLERANCE, passed)
 
 
+def _differences(
+    view: View, spot: LaserSpot, shapes: Sequence[Shape], truth: SpotTruth, layer: SpotLayer, log2_rays: int
+) -> tuple[float, float]:
+    """Centroid difference, pixels, and relative flux difference of layer and traced rays; 0 where both are dark."""
+    centroid, watts = trace_spot(view, spot, shapes, truth, log2_rays)
+    plane = brightest(layer)
+    gain = view.rig.camera.detector.laser_electrons_per_joule(spot.wavelength_nm)[plane]
+    total = float(layer.electrons_per_s[plane].sum())
+    if total == 0.0 and watts * gain == 0.0:
+        return 0.0, 0.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        flux = abs(np.float64(total) / (watts * gain) - 1.0)
+    return float(np.linalg.norm(pixel_centroid(layer) - centroid)), float(flux)
+
+
+def brightest(layer: SpotLayer) -> int:
+    """Index of the brightest plane."""
+    return int(np.argmax(layer.electrons_per_s.sum(axis=(1, 2))))
+
+
 def pixel_centroid(layer: SpotLayer) -> Array:
-    """Centroid (u, v), shape (2,), of the red plane's pixels."""
-    image = layer.electrons_per_s[0]
+    """Centroid (u, v), shape (2,), of the brightest plane's pixels."""
+    image = layer.electrons_per_s[brightest(layer)]
     v, u = np.indices(image.shape)
     with np.errstate(invalid="ignore"):
         total = image.sum()
@@ -93,7 +118,7 @@ class _Bundle:
 
 
 def aim(view: View, spot: LaserSpot, bundle: _Bundle, wall_m: Array, start_px: Array) -> Array:
-    """Film positions, shape (N, 2), whose rays meet wall points.
+    """Film positions, shape (N, 2), whose rays meet wall points; NaN where none is found.
 
     Parameters
     ----------
@@ -101,38 +126,71 @@ def aim(view: View, spot: LaserSpot, bundle: _Bundle, wall_m: Array, start_px: A
         Aperture points and facet slopes of the N rays.
     wall_m : array, shape (N, 2)
         Points in the spot's plane, metres from the spot's centre along its tangents.
-    start_px : array, shape (2,)
+    start_px : array, shape (N, 2)
     """
-    uv = np.tile(start_px, (len(wall_m), 1))
+    uv, miss = start_px, _on_wall(view, spot, start_px, bundle) - wall_m
     for _ in range(_NEWTON_STEPS):
-        error = _on_wall(view, spot, uv, bundle) - wall_m
-        step = np.linalg.solve(_wall_jacobian(view, spot, uv, bundle), error[..., None])[..., 0]
-        uv = uv - step
+        step = _solve(_wall_jacobian(view, spot, uv, bundle), miss)
+        uv, miss = _step(view, spot, bundle, wall_m, uv, step)
         if not np.any(np.abs(step) > 1e-11):
             break
     return uv
 
 
-def trace_spot(view: View, spot: LaserSpot, shapes: Sequence[Shape], chief_px: Array) -> tuple[Array, float]:
-    """Centroid (2,) of the pixel-sampled image of the spot, and its electrons per second behind the red filter."""
-    x = np.clip(qmc.Sobol(6, scramble=True, rng=_SEED).random_base2(_LOG2_RAYS), 1e-12, 1.0 - 1e-12)
+def _step(view: View, spot: LaserSpot, bundle: _Bundle, wall_m: Array, uv: Array, step: Array) -> tuple[Array, Array]:
+    """Take a Newton step, halved where the ray would leave the mirror."""
+    for _ in range(_HALVINGS):
+        new = uv - step
+        miss = _on_wall(view, spot, new, bundle) - wall_m
+        lost = np.any(~np.isfinite(miss), axis=-1)
+        if not lost.any():
+            break
+        step = np.where(lost[:, None], 0.5 * step, step)
+    return new, miss
+
+
+def _solve(jacobian: Array, rhs: Array) -> Array:
+    """Solve 2 x 2 systems; NaN where a matrix is singular or not finite."""
+    (a, b), (c, d) = jacobian[:, 0].T, jacobian[:, 1].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        det = a * d - b * c
+        return np.stack([(d * rhs[:, 0] - b * rhs[:, 1]) / det, (a * rhs[:, 1] - c * rhs[:, 0]) / det], axis=-1)
+
+
+def _through_chief_point(view: View, truth: SpotTruth, lens_m: Array) -> Array:
+    """Film positions, shape (N, 2), of rays from aperture points to the chief ray's mirror point: a start for `aim`."""
+    camera, mirror = view.rig.camera, np.array(truth.reflection_point_world_m)
+    x, y, z = view.T_world_camera.inverse().points(mirror)
+    share = camera.focus_distance_m / z
+    at_focus = np.array([x, y]) * share + lens_m * (1.0 - share)
+    return camera.to_pixel(at_focus / camera.focus_distance_m)
+
+
+def trace_spot(
+    view: View, spot: LaserSpot, shapes: Sequence[Shape], truth: SpotTruth, log2_rays: int
+) -> tuple[Array, float]:
+    """Centroid (2,) of the pixel-sampled image of the spot, and its power on the film, watts."""
+    x = np.clip(qmc.Sobol(6, scramble=True, rng=_SEED).random_base2(log2_rays), 1e-12, 1.0 - 1e-12)
     bundle = _Bundle(view.rig.camera.aperture_radius_m * _disc(x[:, :2]), _facets(view, x[:, 4:]))
     wall, density = _wall_samples(spot, x[:, 2:4])
-    uv, jacobian = _linear_aim(view, spot, bundle, wall, chief_px)
-    watts = _watts(view, spot, shapes, uv, bundle) / (density * np.abs(np.linalg.det(jacobian))) / len(x)
-    watts = np.where(np.isfinite(watts), watts, 0.0)
-    electrons = watts.sum() * view.rig.camera.detector.laser_electrons_per_joule(spot.wavelength_nm)[0]
-    return watts @ _expected_pixel(uv, view.rig.camera.blur_sigma_px) / watts.sum(), float(electrons)
+    uv, jacobian = _linear_aim(view, spot, bundle, wall, truth)
+    with np.errstate(invalid="ignore"):
+        area = density * np.abs(jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0])
+        watts = _watts(view, spot, shapes, uv, bundle) / area / len(x)
+        lost = ~np.isfinite(watts) | ~np.isfinite(uv).all(axis=-1)
+        watts, uv = np.where(lost, 0.0, watts), np.where(lost[:, None], 0.0, uv)
+        return watts @ _expected_pixel(uv, view.rig.camera.blur_sigma_px) / watts.sum(), float(watts.sum())
 
 
-def _linear_aim(view: View, spot: LaserSpot, bundle: _Bundle, wall: Array, chief_px: Array) -> tuple[Array, Array]:
+def _linear_aim(view: View, spot: LaserSpot, bundle: _Bundle, wall: Array, truth: SpotTruth) -> tuple[Array, Array]:
     """Film samples: the exact image of the spot's centre for each ray, plus a linear map of the wall sample.
 
     Sampling only: where on the wall such a ray really lands, and with what weight, is traced afterwards.
     """
-    centres = aim(view, spot, bundle, np.zeros_like(wall), chief_px)
+    start = _through_chief_point(view, truth, bundle.lens_m)
+    centres = aim(view, spot, bundle, np.zeros_like(wall), start)
     jacobian = _wall_jacobian(view, spot, centres, bundle)
-    return centres + np.linalg.solve(jacobian, wall[..., None])[..., 0], jacobian
+    return centres + _solve(jacobian, wall), jacobian
 
 
 def _facets(view: View, x: Array) -> Array:

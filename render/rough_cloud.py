@@ -12,10 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import erf, ndtri
+from scipy.special import erf
 from scipy.stats import qmc
 
 from phibench.render.alhazen import reflection_points
+from phibench.render.quadrature import disc_points
 from phibench.render.raycast import blocked_by
 from phibench.render.spot_cloud import FilmCloud, film_position
 from phibench.render.trace import MirrorRays, lens_rays, reflect
@@ -24,7 +25,7 @@ from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
 from phibench.scenes.solids import Shape
 
-_LOG2_SAMPLES = 14
+_LOG2_SAMPLES, _LOG2_MOST = 14, 20  # for a lobe as narrow as the blur; a wider one needs more in proportion to its area
 _SEED = 0  # the scramble is part of the quadrature rule, not a noise draw
 _WIDER = 1.2  # film positions are drawn this much wider than the lobe: bounded weights
 _STEP_PX = 0.01
@@ -45,7 +46,7 @@ def rough_cloud(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> FilmClo
     if not np.isfinite(centre_uv).all():
         return FilmCloud(np.empty((0, 2)), np.empty(0))
     spread = _lobe_px(view, np.array(spot.position_world_m), centre_uv[0])
-    samples = _draw(view, spot)
+    samples = _draw(view, spot, _log2_samples(spread, view.rig.camera.blur_sigma_px))
     uv = _specular(view, samples.points_m, samples.lens_m) + samples.film @ (_WIDER * spread).T
     lit = np.all(np.isfinite(uv), axis=1)
     uv, points, lens, film = uv[lit], samples.points_m[lit], samples.lens_m[lit], samples.film[lit]
@@ -55,19 +56,19 @@ def rough_cloud(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> FilmClo
     return FilmCloud(uv[seen], watts[seen])
 
 
-def _draw(view: View, spot: LaserSpot) -> _Samples:
-    x = qmc.Sobol(6, scramble=True, rng=_SEED).random_base2(_LOG2_SAMPLES)
-    x = np.clip(x, 1e-12, 1.0 - 1e-12)
-    gaussian = spot.profile == "gaussian"
-    disc = spot.sigma_m * ndtri(x[:, :2]) if gaussian else spot.diameter_m / 2.0 * _disc(x[:, :2])
+def _log2_samples(spread_px: Array, blur_px: float) -> int:
+    """Number of samples, as a power of two, that keeps the same number of them in each blur's area."""
+    area = abs(float(np.linalg.det(spread_px))) / blur_px**2
+    return min(_LOG2_SAMPLES + max(0, math.ceil(math.log2(max(area, 1.0)))), _LOG2_MOST)
+
+
+def _draw(view: View, spot: LaserSpot, log2_samples: int) -> _Samples:
+    x = qmc.Sobol(6, scramble=True, rng=_SEED).random_base2(log2_samples)
+    scale = spot.sigma_m if spot.profile == "gaussian" else spot.diameter_m / 2.0
+    disc = scale * disc_points(spot.profile, x[:, :2])
     points = np.array(spot.position_world_m) + disc @ np.stack(spot.tangents())
-    return _Samples(points, view.rig.camera.aperture_radius_m * _disc(x[:, 2:4]), ndtri(x[:, 4:]))
-
-
-def _disc(x: Array) -> Array:
-    """Uniform points on the unit disc from uniform points on the unit square."""
-    radius, turn = np.sqrt(x[:, 0]), 2.0 * np.pi * x[:, 1]
-    return np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=-1)
+    lens = view.rig.camera.aperture_radius_m * disc_points("uniform", x[:, 2:4])
+    return _Samples(points, lens, disc_points("gaussian", x[:, 4:]))
 
 
 def _specular(view: View, points: Array, lens: Array) -> Array:

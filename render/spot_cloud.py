@@ -16,9 +16,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import qmc
 
 from phibench.render.alhazen import reflection_points
-from phibench.render.quadrature import disc_nodes
+from phibench.render.quadrature import disc_nodes, disc_points, slices
 from phibench.render.raycast import blocked_by
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import LaserSpot
@@ -26,6 +27,8 @@ from phibench.scenes.rig import View
 from phibench.scenes.solids import Shape
 
 _PAIRS_AT_ONCE = 65536
+_LOG2_DENSE = 17
+_SEED = 0  # the scramble is part of the quadrature rule, not a noise draw
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,14 @@ class FilmCloud:
 
 
 def specular_cloud(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> FilmCloud:
-    """Quadrature over spot and aperture; occluded pairs keep their place with power 0."""
+    """Quadrature over spot and aperture; occluded pairs keep their place with power 0.
+
+    Where an edge cuts the light, nodes would sample a step: dense quasi-random pairs take over.
+    """
+    return _dense_cloud(view, spot, shapes) if _is_cut(view, spot, shapes) else _node_cloud(view, spot, shapes)
+
+
+def _node_cloud(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> FilmCloud:
     spot_nodes, spot_weights, lens_nodes, lens_weights = _nodes(view, spot)
     lens_steps = max(1, _PAIRS_AT_ONCE // len(spot_nodes))
     parts = []
@@ -57,6 +67,33 @@ def specular_cloud(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> Film
         points, eyes = _pairs(spot_nodes, lens)
         weight = np.outer(lens_weights[start : start + lens_steps], spot_weights).ravel()
         parts.append(_connect(view, spot, shapes, points, eyes, weight))
+    return _joined(parts)
+
+
+def _dense_cloud(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> FilmCloud:
+    """Sobol pairs of spot and aperture: steps are found to about 1e-3 of the flux."""
+    x = qmc.Sobol(4, scramble=True, rng=_SEED).random_base2(_LOG2_DENSE)
+    points = _spot_points(spot, disc_points(spot.profile, x[:, :2]))
+    eyes = _lens_points(view, disc_points("uniform", x[:, 2:]))
+    area = math.pi * view.rig.camera.aperture_radius_m**2
+    weight = np.full(len(x), spot.albedo * spot.power_w / math.pi * area / len(x))
+    parts = [_connect(view, spot, shapes, points[s], eyes[s], weight[s]) for s in slices(len(x), _PAIRS_AT_ONCE)]
+    return _joined(parts)
+
+
+def _is_cut(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> bool:
+    """Whether part of the light is blocked and part is not: pairs of spot and aperture, centre to rim (4 sigma)."""
+    rim = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
+    reach = (4.0, 2.0, 1.0) if spot.profile == "gaussian" else (1.0, 0.8, 0.4)
+    disc = np.concatenate([np.zeros((1, 2)), *(scale * rim for scale in reach)])
+    lens = np.concatenate([np.zeros((1, 2)), rim])
+    points, eyes = _pairs(_spot_points(spot, disc), _lens_points(view, lens))
+    cloud = _connect(view, spot, shapes, points, eyes, np.ones(len(points)))
+    lit = cloud.watts > 0.0
+    return bool(lit.any()) and not bool(lit.all() and len(lit) == len(points))
+
+
+def _joined(parts: Sequence[FilmCloud]) -> FilmCloud:
     return FilmCloud(np.concatenate([p.uv_px for p in parts]), np.concatenate([p.watts for p in parts]))
 
 
@@ -80,7 +117,8 @@ _TURN = 2.0 * np.pi * np.arange(8) / 8.0
 
 
 def _reach(uv: Array) -> float:
-    return float(np.nanmax(np.linalg.norm(uv - uv.mean(axis=0), axis=-1), initial=0.0))
+    seen = uv[np.isfinite(uv).all(axis=-1)]  # rim points beyond the mirror's edge have no image
+    return float(np.linalg.norm(seen - seen.mean(axis=0), axis=-1).max()) if len(seen) else 0.0
 
 
 def _film(view: View, points: Array, eyes: Array) -> Array:

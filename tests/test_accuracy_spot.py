@@ -224,6 +224,73 @@ def test_accuracy_rough_mirror_certificate(alpha: float) -> None:
         assert certificate.centroid_tolerance_px == CENTROID_TOLERANCE_PX == 0.002
 
 
+def test_accuracy_of_a_spot_cut_by_an_edge() -> None:
+    """A board's edge moves across the beam: flux and centroid against 2^19 random pairs, to 0.4 % and 0.002 px.
+
+    Pairs scatter like sqrt(f (1 - f) / N) < 1e-3 of the flux even if they were random.
+    """
+    from phibench.render import spot_cloud
+    from phibench.scenes.solids import cuboid
+
+    view, spot = default_rig().at(0.4), LaserSpot((2.0, 0.0, 0.5), (-1, 0, 0), 5e-3)
+    rng, count, shares = np.random.default_rng(8), 2**19, []
+    disc, lens = rng.normal(size=(count, 2)), rng.uniform(size=(count, 2))
+    radius, turn = np.sqrt(lens[:, 0]), 2.0 * np.pi * lens[:, 1]
+    eyes = spot_cloud._lens_points(view, radius[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1))
+    free = specular_cloud(view, spot, ())
+    for edge_m in (-2e-3, -5e-4, 0.0, 7e-4, 1.5e-3):
+        screen = (cuboid("screen", (1.9, edge_m - 0.5, 0.5), (0.01, 1.0, 1.0), (0.5, 0.5, 0.5)),)
+        layer = spot_layer(view, spot, screen)
+        pairs = spot_cloud._connect(
+            view, spot, screen, spot_cloud._spot_points(spot, disc), eyes, np.full(count, 1.0 / count)
+        )
+        open_pairs = spot_cloud._connect(
+            view, spot, (), spot_cloud._spot_points(spot, disc), eyes, np.full(count, 1.0 / count)
+        )
+        share = pairs.watts.sum() / open_pairs.watts.sum()
+        ours = layer.total_electrons_per_s[0] / spot_layer(view, spot, ()).total_electrons_per_s[0]
+        assert ours == pytest.approx(share, abs=4e-3)
+        assert np.linalg.norm(layer.centroid_uv_px - pairs.centroid_px()) < 2e-3
+        shares.append(ours)
+    assert free.watts.sum() > 0.0
+    assert np.all(np.diff(shares) < 0.0)
+    assert 0.02 < shares[-1] < shares[0] < 0.98
+
+
+@pytest.mark.parametrize(
+    ("camera", "height_m"),
+    [({"f_number": 2.0, "focus_distance_m": 0.46}, 1.72), ({"f_number": 2.0, "focus_distance_m": 0.1}, 0.5)],
+)
+def test_accuracy_certificate_far_out_of_focus_and_near_the_rim(camera: dict[str, float], height_m: float) -> None:
+    rig = default_rig()
+    view = dataclasses.replace(rig, camera=dataclasses.replace(rig.camera, **camera)).at(0.0)
+    spot = LaserSpot((0.5, 0.0, height_m), (-1, 0, 0), 4e-3)
+    truth = spot_truth(view, spot, ())
+    assert truth.visible
+    assert certify(view, spot, (), truth, spot_layer(view, spot, ())).passed
+
+
+def test_a_black_wall_is_dark_and_certified() -> None:
+    view, spot = default_rig().at(0.0), LaserSpot((2.0, 0.0, 0.5), (-1, 0, 0), 4e-3, albedo=0.0)
+    assert certify(view, spot, (), spot_truth(view, spot, ()), spot_layer(view, spot, ())).passed
+
+
+def test_a_wide_spot_has_the_right_shape() -> None:
+    """0.1 m at 1 m is 7 blurs wide: image against Sobol pairs of spot and aperture, to 2 % of the peak.
+
+    2^17 points over about 2 pi 7^2 blur areas are 400 per area; Sobol points do better than their 5 %.
+    """
+    from phibench.render import spot_cloud
+
+    view, spot = default_rig().at(0.0), LaserSpot((1.0, 0.0, 0.5), (-1, 0, 0), 0.1)
+    gain = np.ones(3)
+    layer = splat(specular_cloud(view, spot, ()), 0.7, gain)
+    dense = splat(spot_cloud._dense_cloud(view, spot, ()), 0.7, gain)
+    low = (min(layer.u0_px, dense.u0_px), min(layer.v0_px, dense.v0_px))
+    a, b = (_embed(x, low[0], low[1], 160) for x in (layer, dense))
+    assert np.abs(a - b).max() <= 0.02 * b.max()
+
+
 def test_near_the_outline_a_spot_is_certified_or_flagged() -> None:
     """Spots that climb up a wall until the mirror's edge: each passes its certificate, or says why it is not seen."""
     view, causes = default_rig().at(0.0), []
