@@ -161,6 +161,8 @@ def _direct(mi: ModuleType, surfaces: Surfaces, texels: _Texels, lamps: Array, r
     """Irradiance from the lamps, shape (texels, 3): L cos cos' V / r^2 dA with `rays` points per lamp."""
     import drjit as dr
 
+    if len(lamps) == 0:
+        return np.zeros((dr.width(texels.points), 3))
     table = mi.Float(np.ascontiguousarray(lamps, dtype=np.float32).ravel())
     lanes = dr.arange(mi.UInt32, dr.width(texels.points))
     shift = shifts(mi, lanes, 2, seed)
