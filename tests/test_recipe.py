@@ -205,7 +205,7 @@ def test_spot_larger_than_its_board_is_refused() -> None:
 
 
 def test_camera_above_the_ceiling_is_blamed_on_the_camera() -> None:
-    with pytest.raises(RecipeError, match=r"rig.camera_height_m.*above the ceiling"):
+    with pytest.raises(RecipeError, match=r"rig.camera_height_m.*through the ceiling"):
         check_recipe(changed(rig={"camera_height_m": 2.9}))
 
 
