@@ -164,8 +164,6 @@ def _rig(raw: Raw, experiments: list[tuple[int, Raw]], targets: list[tuple[int, 
 def _strokes(rig: Rig, room: Room, experiments: list[tuple[int, Raw]]) -> Iterator[Fault]:
     """The mirror must stay below the lowest thing that hangs from the ceiling."""
     ceiling_m = min(s.T_world_shape.translation_m[2] for s in room.surfaces if _faces_down(s))
-    if rig.at(0.0).sphere_centre_m[2] + rig.mirror.radius_m >= ceiling_m:
-        return  # a fault of the height, not of the strokes
     for i, experiment in experiments:
         for j, stroke_m in _items(experiment, "strokes_m"):
             if not _is_legal(stroke_m):
