@@ -35,16 +35,18 @@ _RESERVE = 1.1
 
 @dataclass(frozen=True)
 class Estimate:
-    """How many tasks of each kind, how many bytes on the disk, how many seconds of one core."""
+    """How many tasks of each kind, how many bytes on the disk, how many seconds of one core, how many of them alone."""
 
     counts: dict[str, int]
     size: int
     core_s: float
+    alone_s: float  # the light map: views wait for it, and it is one task
 
     def text(self, workers: int) -> str:
         """One sentence for the terminal."""
         counts = ", ".join(f"{n} {kind}{'s' * (n != 1)}" for kind, n in self.counts.items() if n)
-        seconds = START_S + self.core_s / max(min(workers, sum(self.counts.values())), 1)
+        shared_s = (self.core_s - self.alone_s) / max(min(workers, sum(self.counts.values())), 1)
+        seconds = START_S + self.alone_s + shared_s
         took = f"{seconds:.0f} s" if seconds < 90.0 else f"{seconds / 60.0:.0f} min"
         return f"to make: {counts}; about {megabytes(self.size)}, {took} with {workers} worker{'s' * (workers != 1)}"
 
@@ -60,10 +62,9 @@ def estimate(plan: Plan, tasks: Collection[Task]) -> Estimate:
         "preview": 0.5 * pixels * _PREVIEW_BYTES_PX,
     }
     seconds = _seconds(plan, pixels / 1e6)
+    spent = {kind: count * seconds.get(kind, 0.0) for kind, count in counts.items()}
     total = sum(count * size.get(kind, 0.0) for kind, count in counts.items())
-    return Estimate(
-        counts, int(_RESERVE * total), sum(count * seconds.get(kind, 0.0) for kind, count in counts.items())
-    )
+    return Estimate(counts, int(_RESERVE * total), sum(spent.values()), spent.get("bake", 0.0))
 
 
 def megabytes(count: int) -> str:
