@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +10,7 @@ from rich.console import Console
 
 from phibench.datasets.documents import documents, write_documents
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.files import remove_temporary, sha256, write_atomic
+from phibench.datasets.files import WriteError, remove_temporary, sha256, write_atomic
 from phibench.datasets.finish import is_intact
 from phibench.datasets.info import dataset_info, info_text, parse_info, recipe_sha256, same_content
 from phibench.datasets.journal import Entry, Head, Journal
@@ -117,9 +116,9 @@ def _copy_file(source: Path, target: Path, digest: str) -> None:
         if sha256(temporary) != digest:
             raise DatasetError(f"{source} is damaged; run `phibench dataset repair` on its shard")
 
+    if not source.is_file():
+        raise DatasetError(f"{source} is missing; run `phibench dataset repair` on its shard")
     try:
         write_atomic(target, write)
-    except FileNotFoundError:
-        raise DatasetError(f"{source} is missing; run `phibench dataset repair` on its shard") from None
-    except OSError as error:
-        raise DatasetError(f"could not write {target}: {os.strerror(error.errno or 0)}") from error
+    except WriteError as error:
+        raise DatasetError(str(error)) from error

@@ -14,6 +14,7 @@ CODE = """
 import os, sys
 from dataclasses import replace
 from pathlib import Path
+from phibench.datasets.bake_task import bake_room
 from phibench.datasets.plan import make_plan
 from phibench.datasets.recipe_file import load_recipe
 from phibench.datasets.task import Done, Task, perform
@@ -26,6 +27,7 @@ plan, out, count = make_plan(load_recipe(sys.argv[1])), Path(sys.argv[2]), int(s
 camera = replace(plan.rig.camera, width_px=64, height_px=36, fx_px=71.5, fy_px=71.5, cx_px=31.5, cy_px=17.5,
                  pixel_pitch_um=56.0)
 rig = replace(plan.rig, camera=camera)
+assert isinstance(perform(Task("bake room", "", bake_room, (rig, plan.room, plan.recipe.ambient)), out), Done)
 for number in range(1, count + 1):
     pose = replace(plan.poses[0], pose_id="h0.000", offset_m=number / count, seed=number)
     outcome = perform(Task("view", "", render_view, ("x", rig, plan.room, pose, plan.recipe.ambient)), out)
