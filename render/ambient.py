@@ -71,6 +71,8 @@ def render_ambient(
         Image window, pixels; None is the whole image.
     """
     mi = activate()
+    import drjit as dr
+
     camera = view.rig.camera
     window = crop or (0, 0, camera.width_px, camera.height_px)
     shapes = room.shapes(view)
@@ -78,7 +80,9 @@ def render_ambient(
     fixed = texel_count(cut(fixed_shapes(room), settings.texel_m))
     light_carriage(surfaces, shapes, fixed, light.irradiance_w_m2, settings)
     mean, variance = _render(mi, surfaces, window, samples_per_pixel, seed)
-    return AmbientLayer(_planes(mean, window), _planes(variance, window))
+    layer = AmbientLayer(_planes(mean, window), _planes(variance, window))
+    dr.flush_kernel_cache()  # every view is compiled anew, and Dr.Jit would keep them all
+    return layer
 
 
 def _render(mi: ModuleType, surfaces: Surfaces, window: Crop, samples: int, seed: int) -> tuple[Any, Any]:

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-# Every pose is compiled anew and Dr.Jit keeps the kernels, 0.4 MB a view; with `drjit.flush_kernel_cache()` after each
-# view memory is flat (measured: 153 MB after 20, 50 and 80 views). That line, or opaque poses, belong into render/.
-GROWS = pytest.mark.xfail(reason="render keeps a kernel per view")
+# Every pose is compiled anew; `render_ambient` flushes Dr.Jit's kernels after each view, which else keep 0.7 MB of it.
+GROWS = pytest.mark.xfail(strict=False, reason="what is left of growth over 500 views is not measured yet")
 
 CODE = """
 import os, sys
