@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -117,6 +118,12 @@ def log_entry(task: Task, outcome: Done | Failed) -> dict[str, Any]:
 
 
 def _peak_mb() -> float:
-    """Largest resident memory of this process so far, MB."""
+    """Largest resident memory of this process so far, MB.
+
+    Linux' ru_maxrss starts at what the parent had before exec, so that /proc is asked first.
+    """
+    with contextlib.suppress(OSError, StopIteration):
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return round(int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) * 1024.0 / 1e6, 1)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return round(peak * (1.0 if sys.platform == "darwin" else 1024.0) / 1e6, 1)

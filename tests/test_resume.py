@@ -181,7 +181,7 @@ def kill_and_repeat(out: Path, kills: int, seed: int) -> int:
     moments, killed = random.Random(seed), 0
     for _ in range(kills):
         with start(out) as child:
-            time.sleep(moments.uniform(1.0, 12.0))
+            time.sleep(moments.uniform(0.5, 5.0))
             killed += child.poll() is None
             child.kill()  # the parent only: its workers must leave by themselves
             child.communicate(timeout=60)
@@ -200,7 +200,7 @@ def kill_and_repeat(out: Path, kills: int, seed: int) -> int:
 def test_killed_runs_end_in_the_same_bytes(tiny_dataset: Path, tmp_path: Path, kills: int) -> None:
     out = tmp_path / "out"
     killed = kill_and_repeat(out, kills, seed=kills)
-    assert killed >= min(kills, 2)
+    assert killed >= max(1, kills // 4)  # a quick machine may end a run before its moment comes
     assert contents(out) == contents(tiny_dataset)
 
 
