@@ -233,7 +233,7 @@ def _furnace(albedo: float) -> Room:
     return Room("furnace", tuple(walls), (), robot=False)
 
 
-def test_accuracy_ambient_electrons_in_a_furnace(mi: ModuleType) -> None:
+def test_ambient_electrons_in_a_furnace(mi: ModuleType) -> None:
     """Uniform radiance 1: beside the mirror a pixel gets etendue x electrons per joule; in it, times the reflectance.
 
     cos^4 and the pixel's solid angle from `scenes`; the aperture's finite size changes cos^4 by about 1e-5.

@@ -1,9 +1,9 @@
-"""The windows that `test_accuracy_ambient.py` leaves out, so that `pytest -k accuracy` stays short."""
+"""The windows that `test_ambient.py` leaves out, so that `pytest -k accuracy` stays short."""
 
 from __future__ import annotations
 
 import pytest
-from test_accuracy_ambient import CROPS, QUICK, RIG, ROOM, SETTINGS, check_means
+from test_ambient import CROPS, QUICK, RIG, ROOM, SETTINGS, check_means
 
 from phibench.render.bake import LightMap, bake
 

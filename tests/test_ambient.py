@@ -69,12 +69,12 @@ def check_means(light: LightMap, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", QUICK)
-def test_accuracy_ambient_means_against_path_tracing(light: LightMap, name: str) -> None:
+def test_ambient_means_against_path_tracing(light: LightMap, name: str) -> None:
     """The other windows are in `test_ambient_windows.py`."""
     check_means(light, name)
 
 
-def test_accuracy_ambient_pixels_by_z_test_which_rejects_two_per_cent(light: LightMap) -> None:
+def test_ambient_pixels_by_z_test_which_rejects_two_per_cent(light: LightMap) -> None:
     """Per-pixel z-scores on a smooth crop: their mean square is chi-square; a bias of 2 % is rejected.
 
     32 x 32 pixels, 8 runs: z has Student's t distribution with 7 degrees of freedom, mean square 7/5, and the mean over
@@ -96,7 +96,7 @@ def test_accuracy_ambient_pixels_by_z_test_which_rejects_two_per_cent(light: Lig
     assert mean_square(0.98 * ours) > 1.4 + 0.55
 
 
-def test_accuracy_irradiance_under_one_lamp() -> None:
+def test_irradiance_under_one_lamp() -> None:
     """Black room, one lamp: irradiance below its centre is Lambert's closed form for a rectangle, to 1e-3.
 
     E = 4 L f with f the form of one quarter a x b at height c: [a/A atan(b/A) + b/B atan(a/B)] / 2, A^2 = c^2 + a^2.
@@ -113,7 +113,7 @@ def test_accuracy_irradiance_under_one_lamp() -> None:
     assert centre == pytest.approx(expected * np.array([1.0, 2.0, 3.0]), rel=1e-3)
 
 
-def test_accuracy_integrating_box() -> None:
+def test_integrating_box() -> None:
     """Closed cube, albedo rho, a fraction of its wall emitting: mean irradiance is E_direct / (1 - rho) on average.
 
     Energy: every watt that reaches a wall is reflected with rho and reaches a wall again; the flux over all walls is
