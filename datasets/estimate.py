@@ -59,7 +59,7 @@ def estimate(plan: Plan, tasks: Collection[Task]) -> Estimate:
         "bake": _TEXEL_BYTES * _texels(plan),
         "view": pixels * (_AMBIENT_BYTES_PX + _TRUTH_BYTES_PX + _PREVIEW_BYTES_PX),
         "spot": 2.0 * _SPOT_BYTES,
-        "preview": 0.5 * pixels * _PREVIEW_BYTES_PX,
+        "sample": 0.5 * pixels * _PREVIEW_BYTES_PX,
     }
     seconds = _seconds(plan, pixels / 1e6)
     spent = {kind: count * seconds.get(kind, 0.0) for kind, count in counts.items()}
@@ -85,10 +85,10 @@ def _texels(plan: Plan) -> int:
 
 def _seconds(plan: Plan, megapixels: float) -> dict[str, float]:
     ambient = plan.recipe.ambient
-    samples = megapixels * ambient.samples_per_pixel * VIEW_S_PER_MEGASAMPLE
+    samples = megapixels * 2 * ambient.cells_per_pixel**2 * VIEW_S_PER_MEGASAMPLE
     return {
         "bake": _bake_rays(plan) / 1e6 * BAKE_S_PER_MEGARAY,
         "view": VIEW_S + megapixels * VIEW_S_PER_MEGAPIXEL + samples,
         "spot": SPOT_S,
-        "preview": megapixels * PREVIEW_S_PER_MEGAPIXEL,
+        "sample": megapixels * PREVIEW_S_PER_MEGAPIXEL,
     }

@@ -104,7 +104,9 @@ class LaserTable(Table):
 class AmbientTable(Table):
     """`[ambient]`: how well the room is rendered."""
 
-    samples_per_pixel: int = Field(default=8, ge=2, le=65536, description="points per pixel: area, blur, aperture")
+    cells_per_pixel: int = Field(
+        default=2, ge=1, le=32, description="cells along a pixel's side; two samples each, more where noise asks for it"
+    )
     texel_m: float = Field(default=0.05, ge=0.01, le=2.0, description="size of the light map's texels")
     lamp_rays: int = Field(default=64, ge=1, le=65536, description="shadow rays per texel and lamp, twice")
     bounces: int = Field(default=12, ge=0, le=100, description="passes of bounced light before the last one")

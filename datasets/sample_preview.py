@@ -2,47 +2,33 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets import layout
-from phibench.datasets.layers import read_ambient, read_spot
-from phibench.datasets.plan import PairPlan
-from phibench.datasets.preview import Picture, exposure_s, halved, save_png, to_srgb
+from phibench.datasets.preview import Picture, exposure_s, halved, to_srgb
 from phibench.datasets.spot_picture import CROP_PX, MARK, SpotPlace, captioned, crop, enlarged, marked
-from phibench.datasets.task import Made
-from phibench.render.spot_truth import spot_truth
 from phibench.scenes.detector import Detector
-from phibench.scenes.laser import LaserSpot
-from phibench.scenes.rig import POSITIONS, Rig, Stroke
-from phibench.scenes.room import Room
 
 _LARGEST_ZOOM = 6
 
 
-def make_preview(out: Path, pair: PairPlan, rig: Rig, room: Room, spot: LaserSpot) -> Made:
-    """Task: the picture of one sample, from its views and spot layers."""
-    detector = rig.camera.detector
-    down = read_ambient(out / layout.view_file(pair.pose_id("down"), "ambient"))
-    exposure, pictures = exposure_s(halved(down), detector), []
-    for position in POSITIONS:
-        view = rig.at(Stroke(pair.stroke_m).offset_m(position))
-        place = spot_truth(view, spot, room.shapes(view))
-        pictures.append(_picture(_frame(out, pair, position), position, place, detector, exposure))
-    file = layout.preview_file(pair.sample_id)
-    save_png(out / file, np.concatenate(pictures, axis=1))
-    return Made((file,))
+@dataclass(frozen=True)
+class Side:
+    """One position of a sample: where its spot is, its frame and its ambient layer, shape (3, H, W), electrons/s."""
+
+    position: str
+    spot: SpotPlace
+    frame: NDArray[np.float64]
+    ambient: NDArray[np.float32]
 
 
-def _frame(out: Path, pair: PairPlan, position: str) -> NDArray[np.float64]:
-    """Ambient layer and spot; the spot's task has made sure that there is a file exactly if light reaches the image."""
-    image = read_ambient(out / layout.view_file(pair.pose_id(position), "ambient")).astype(float)
-    path = out / layout.spot_file(pair.sample_id, position)
-    if path.is_file():
-        read_spot(path).add_to(image)
-    return image
+def sample_picture(sides: Sequence[Side], detector: Detector) -> Picture:
+    """Both positions side by side, exposed for the first."""
+    exposure = exposure_s(halved(sides[0].ambient), detector)
+    return np.concatenate([_picture(s.frame, s.position, s.spot, detector, exposure) for s in sides], axis=1)
 
 
 def _picture(

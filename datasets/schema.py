@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, model_validator
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 Position = Literal["down", "up"]
 
 
@@ -53,6 +53,13 @@ class CertificateRow(Document):
     passed: bool = _field("-", "all three differences are within their tolerances; false is never shipped")
 
 
+class NoiseRow(Document):
+    """Errors of phi_ray of one spot in one raw Bayer frame, preset `webcam`, 1/60 s (`render/noise_budget.py`)."""
+
+    phi_sensor_rad: Number = _field("rad", "standard deviation from photons and read noise, known shape and blur")
+    phi_render_rad: Number = _field("rad", "what the ambient layer's own noise adds; at most a quarter of the above")
+
+
 class SpotRow(Document):
     """The exact answer for one spot in one view, and where its layers are."""
 
@@ -77,13 +84,14 @@ class SpotRow(Document):
     view_truth_file: str = _field("-", "truth layer of the view")
     spot_file: str | None = _field("-", "spot layer; null where no light of the spot reaches the image")
     certificate: CertificateRow | None = _field("-", "null where the spot is not visible")
+    noise: NoiseRow | None = _field("-", "null where the spot is not visible")
 
     @model_validator(mode="after")
     def _complete_if_visible(self) -> SpotRow:
         """A visible spot has every number, a layer and a passed certificate."""
         if not self.visible:
             return self
-        if missing := [name for name, value in self if not _is_finite(value)]:
+        if missing := [name for name, value in self if name != "noise" and not _is_finite(value)]:
             raise ValueError(f"the spot is visible but has no {', '.join(missing)}")
         if self.certificate is None or not self.certificate.passed:
             raise ValueError("the spot is visible but its certificate is missing or not passed")

@@ -112,6 +112,7 @@ def _spot_row(pose_id: str, view: View, answer: SpotAnswer, file: str | None) ->
         view_truth_file=layout.view_file(pose_id, "truth"),
         spot_file=file,
         certificate=None if certificate is None else CertificateRow(**asdict(certificate)),
+        noise=None,  # known when the views are there: `sample_task`
     )
 
 

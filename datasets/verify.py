@@ -19,6 +19,7 @@ from phibench.datasets.manifest import differences, same_number
 from phibench.datasets.plan import make_plan
 from phibench.datasets.progress import Steps
 from phibench.datasets.read import Dataset, Sample, open_dataset
+from phibench.datasets.sample_task import noise_row, spot_noise
 from phibench.datasets.schema import PoseInfo, SpotRow
 from phibench.datasets.shard import shard_plan
 from phibench.datasets.spot_task import SpotAnswer, answer_spot
@@ -137,6 +138,8 @@ def _spot_faults(
         yield f"{name}: the certificate does not pass when it is computed again"
     if row.spot_file is not None and row.spot_file not in bad:
         yield from _guarded(_spot_layer_faults(sample, position, row, answer))
+        if row.view_ambient_file not in bad:
+            yield from _guarded(_noise_faults(sample, position, row, answer))
 
 
 def _expected(answer: SpotAnswer) -> list[tuple[str, Any]]:
@@ -166,6 +169,23 @@ def _spot_layer_faults(sample: Sample, position: str, row: SpotRow, answer: Spot
         scale = np.abs(expected).max()
         if stored.shape != expected.shape or np.abs(stored - expected).max() > _FLOAT32 * scale:
             yield f"{row.spot_file}: {name} is not what the parameters give"
+
+
+def _noise_faults(sample: Sample, position: str, row: SpotRow, answer: SpotAnswer) -> Iterator[str]:
+    """The noise budget is that of the stored layers, and it is kept."""
+    layers = sample.spot(position), sample.ambient(position), sample.ambient_variance(position)
+    budget = spot_noise(sample.view(position), answer.truth, *layers)
+    expected = None if budget is None else noise_row(budget)
+    name = f"{sample.row.sample_id} {position}"
+    if expected is None or row.noise is None:
+        if expected is not row.noise:
+            yield f"{name}: noise is {row.noise}, the layers give {expected}"
+        return
+    for (field, stored), (_, computed) in zip(row.noise, expected, strict=True):
+        if not same_number(stored, computed, _FLOAT32, 0.0):
+            yield f"{name}: noise.{field} is {stored}, the layers give {computed}"
+    if budget is not None and not budget.kept:
+        yield f"{name}: the rendering noise is above its budget"
 
 
 def _view_faults(dataset: Dataset, pose: PoseInfo, bad: set[str], truth_layers: bool) -> Iterator[str]:

@@ -37,7 +37,7 @@ def render_view(out: Path, dataset: str, rig: Rig, room: Room, pose: PosePlan, a
     header = {"dataset": dataset, "pose": pose.pose_id, "offset_m": pose.offset_m}
     if room.lit:
         light, settings = read_light_map(out), bake_settings(ambient)
-        layer = render_ambient(view, room, light, settings, ambient.samples_per_pixel, pose.seed)
+        layer = render_ambient(view, room, light, settings, ambient.cells_per_pixel, pose.seed)
     else:
         layer = dark_layer(rig.camera)
     planes = layer.electrons_per_s

@@ -1,7 +1,8 @@
 """The tasks of a plan, in the order of the recipe, each with its key.
 
 The light map depends on the room and its settings; a view on rig, room, pose, settings and light map; a spot on rig,
-room, laser and stroke; a preview on its two views and its spot. A task stands before those that name it in `needs`.
+room, laser and stroke; a sample (picture, noise budget) on its two views and its spot. A task stands before those that
+name it in `needs`.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from phibench.datasets.bake_task import bake_room, bake_settings
 from phibench.datasets.code_hash import code_behind
 from phibench.datasets.codec import to_json
 from phibench.datasets.plan import PairPlan, Plan, PosePlan
-from phibench.datasets.sample_preview import make_preview
+from phibench.datasets.sample_task import finish_sample
 from phibench.datasets.spot_task import make_spot
 from phibench.datasets.task import Task, task_key
 from phibench.datasets.view_task import render_view
@@ -31,8 +32,8 @@ def plan_tasks(plan: Plan, versions: Mapping[str, Any]) -> Tasks:
     spots = [makers.spot(pair) for pair in plan.pairs]  # first, they are quick and find faults of the recipe
     bakes = [makers.bake()] if plan.room.lit else []
     views = {pose.pose_id: makers.view(pose, bakes) for pose in plan.poses}
-    previews = [makers.preview(pair, spot, views) for pair, spot in zip(plan.pairs, spots, strict=True)]
-    return {task.name: task for task in (*spots, *bakes, *views.values(), *previews)}
+    samples = [makers.sample(pair, spot, views) for pair, spot in zip(plan.pairs, spots, strict=True)]
+    return {task.name: task for task in (*spots, *bakes, *views.values(), *samples)}
 
 
 def task_names(plan: Plan) -> list[str]:
@@ -41,8 +42,13 @@ def task_names(plan: Plan) -> list[str]:
 
 
 def spot_task_name(pair: PairPlan) -> str:
-    """Name of the task whose result is a sample's row."""
+    """Name of the task whose result is a sample's row, but for the noise."""
     return f"spot {pair.sample_id}"
+
+
+def sample_task_name(pair: PairPlan) -> str:
+    """Name of the task whose result is the noise of a sample."""
+    return f"sample {pair.sample_id}"
 
 
 class _Makers:
@@ -74,15 +80,15 @@ class _Makers:
         arguments, needs = (name, plan.rig, plan.room, pose, ambient), tuple(task.name for task in bakes)
         return Task(f"view {pose.pose_id}", key, render_view, arguments, needs)
 
-    def preview(self, pair: PairPlan, spot: Task, views: Mapping[str, Task]) -> Task:
+    def sample(self, pair: PairPlan, spot: Task, views: Mapping[str, Task]) -> Task:
         needs = list(
             {views[pair.pose_id(position)].name: views[pair.pose_id(position)] for position in POSITIONS}.values()
         )
         keys = tuple(task.key for task in (spot, *needs))
-        key = self._key(["preview", pair.sample_id], make_preview, keys)
+        key = self._key(["sample", pair.sample_id], finish_sample, keys)
         names = tuple(task.name for task in (spot, *needs))
         arguments = (pair, self._plan.rig, self._plan.room, self._plan.spots[pair.target])
-        return Task(f"preview {pair.sample_id}", key, make_preview, arguments, names)
+        return Task(sample_task_name(pair), key, finish_sample, arguments, names)
 
     def _key(self, inputs: Any, function: Any, needs: tuple[str, ...] = ()) -> str:
         return task_key(inputs, code_behind(function.__module__), self._versions, needs)

@@ -1,32 +1,63 @@
 """The renderer's noise as an error of phi, beside the sensor's own.
 
 A spot at (u, v) is located from raw Bayer pixels with the Fisher weights of a known shape: with mu the expected
-electrons of a pixel, r the read noise and d = dmu/d(u, v), F = sum d d^T / (mu + r^2) (Huang 2013) and the estimate is
-F^-1 sum d (x - mu) / (mu + r^2). The sensor's noise gives it the covariance F^-1; a variance V of mu itself, from
-rendering, gives F^-1 [sum d d^T V / (mu + r^2)^2] F^-1. Both become errors of phi_ray by its gradient. NumPy only.
+electrons of a pixel, r the read noise, w = 1/(mu + r^2) and d = dmu/d(u, v), F = sum d d^T w (Huang 2013) and the
+estimate is F^-1 sum d w (x - mu). The sensor's noise gives it the covariance F^-1. Rendering noise of mu with the
+covariance C gives F^-1 [sum d_p w_p C_pq w_q d_q^T] F^-1. Pixels within the blur share samples: C_pq =
+sqrt(V_p V_q) rho(p - q) with rho the autocorrelation of a pixel's weights (`film_grid`). Both become errors of phi_ray
+by its gradient. NumPy only.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import toeplitz
 
 from phibench.render.angles import mirror_angles
-from phibench.render.spot import SpotLayer
+from phibench.render.film_grid import FilmGrid
 from phibench.render.trace import trace_pixels
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import View
 
 EXPOSURE_S = 1.0 / 60.0  # nominal
 READ_NOISE_E = 4.0  # of the sensor preset `webcam`
+FULL_WELL_E = 12000.0  # likewise; a full pixel tells nothing
 BUDGET = 0.25  # largest allowed render error, in units of the sensor's
 _STEP_PX = 0.01
 
 
+class SpotImages(Protocol):
+    """What is needed of a spot layer: where its window begins, and its images of shape (3, h, w), electrons/s."""
+
+    @property
+    def u0_px(self) -> int:
+        """Image column of the window's first one."""
+
+    @property
+    def v0_px(self) -> int:
+        """Image row of the window's first one."""
+
+    @property
+    def electrons_per_s(self) -> Array:
+        """Image of the spot."""
+
+    @property
+    def du_electrons_per_s_px(self) -> Array:
+        """Derivative by a shift along u."""
+
+    @property
+    def dv_electrons_per_s_px(self) -> Array:
+        """Derivative by a shift along v."""
+
+
 @dataclass(frozen=True)
 class NoiseBudget:
-    """Standard deviations of phi_ray, radians; NaN where the spot is not on the image.
+    """Standard deviations of phi_ray, radians; NaN where the image says nothing about the spot.
 
     Attributes
     ----------
@@ -45,14 +76,45 @@ class NoiseBudget:
         return not self.phi_render_rad > BUDGET * self.phi_sensor_rad
 
 
-def noise_budget(view: View, uv_px: Array, layer: SpotLayer, ambient: Array, variance: Array) -> NoiseBudget:
+def excess(
+    electrons_per_s: NDArray[np.float32], variance_per_s2: NDArray[np.float32], blur_sigma_px: float
+) -> NDArray[np.float32]:
+    """By what factor a pixel's rendering variance is above its budget, largest of three colours, shape (H, W).
+
+    The budget of a pixel is b^2 (a + r^2) / kappa: the sensor's variance without any spot, times b = `BUDGET` squared.
+    If all pixels keep it and their noise were independent (kappa = 1), every spot would: V <= b^2 (a + r^2) and
+    w = 1/(s + a + r^2) give sum d d^T V w^2 <= b^2 sum d d^T w, hence F^-1 [..] F^-1 <= b^2 F^-1, whatever the spot's
+    shape, brightness and place. Noise that shares the spot's own blur, of variance S, counts for more: its spectrum is
+    4 pi S |G|^2 that of independent noise, and the integral of k^2 |G|^4 over that of k^2 |G|^2 is 1/4 for a Gaussian
+    G, hence kappa = pi S (1 where that is less). The number of each spot (`noise_budget`) has no such approximation.
+    Full pixels have 0.
+
+    Parameters
+    ----------
+    electrons_per_s, variance_per_s2 : arrays, shape (3, H, W)
+        Ambient layer and its variance.
+    blur_sigma_px : float
+        The camera's, without the pixel's own square (1/12 px^2).
+    """
+    over = variance_per_s2 / allowed_per_s2(electrons_per_s, blur_sigma_px)
+    return np.where(electrons_per_s * np.float32(EXPOSURE_S) > FULL_WELL_E, np.float32(0.0), over).max(axis=0)
+
+
+def allowed_per_s2(electrons_per_s: NDArray[np.float32], blur_sigma_px: float) -> NDArray[np.float32]:
+    """Largest rendering variance of a pixel within its budget, (electrons/s)^2, of the shape of the layer."""
+    kappa = max(1.0, math.pi * (blur_sigma_px**2 + 1.0 / 12.0))
+    mean_e = electrons_per_s * np.float32(EXPOSURE_S)
+    return np.float32((BUDGET / EXPOSURE_S) ** 2 / kappa) * (mean_e + np.float32(READ_NOISE_E**2))
+
+
+def noise_budget(view: View, uv_px: Array, layer: SpotImages, ambient: Array, variance: Array) -> NoiseBudget:
     """Compare the two for one spot in one view.
 
     Parameters
     ----------
     uv_px : array, shape (2,)
         Image of the spot.
-    layer : SpotLayer
+    layer : SpotLayer, or a window read from a file
     ambient, variance : arrays, shape (3, H, W)
         Ambient layer, electrons/s, and its variance, (electrons/s)^2, of the whole image.
     """
@@ -69,14 +131,27 @@ def noise_budget(view: View, uv_px: Array, layer: SpotLayer, ambient: Array, var
             np.sqrt(variance[:, *image].astype(float)),
         )
     )
-    weight = 1.0 / (spot + room + READ_NOISE_E**2)
-    slopes = np.stack([du.ravel(), dv.ravel()])
-    information = np.einsum("ip,jp,p->ij", slopes, slopes, weight.ravel())
-    spread = np.einsum("ip,jp,p->ij", slopes, slopes, (noise * weight).ravel() ** 2)
+    weight = np.where(room > FULL_WELL_E, 0.0, 1.0 / (spot + room + READ_NOISE_E**2))
+    slopes = np.stack([du, dv])
+    information = np.einsum("ihw,jhw,hw->ij", slopes, slopes, weight)
+    if np.linalg.matrix_rank(information) < 2:
+        return NoiseBudget(float("nan"), float("nan"))
+    part = slopes * weight * noise
+    rows, columns = (_correlation(view, length) for length in room.shape)
+    spread = np.einsum("ihw,jhw->ij", part, rows @ part @ columns)
     covariance = np.linalg.inv(information)
     gradient = phi_gradient(view, uv_px)
     sensor, render = (float(gradient @ c @ gradient) for c in (covariance, covariance @ spread @ covariance))
     return NoiseBudget(sensor**0.5, render**0.5)
+
+
+def _correlation(view: View, pixels: int) -> Array:
+    """Correlation of the rendering noise of pixels along an axis, shape (pixels, pixels)."""
+    grid = FilmGrid.of(view.rig.camera, 2)
+    full = np.correlate(grid.taps, grid.taps, mode="full")[len(grid.taps) - 1 :: grid.cells].astype(float)
+    steps = np.zeros(pixels)
+    steps[: len(full)] = full[:pixels] / full[0]
+    return np.asarray(toeplitz(steps))
 
 
 _STACKS = ("electrons_per_s", "du_electrons_per_s_px", "dv_electrons_per_s_px")
@@ -90,7 +165,7 @@ def phi_gradient(view: View, uv_px: Array) -> Array:
     return np.array([phi[0] - phi[1], phi[2] - phi[3]]) / (2.0 * _STEP_PX)
 
 
-def _on_image(layer: SpotLayer, size: tuple[int, ...]) -> tuple[tuple[slice, slice], tuple[slice, slice]] | None:
+def _on_image(layer: SpotImages, size: tuple[int, ...]) -> tuple[tuple[slice, slice], tuple[slice, slice]] | None:
     """Slices (rows, columns) of the part of the layer that is on the image, in the layer and in the image."""
     starts = (layer.v0_px, layer.u0_px)
     low = [max(start, 0) for start in starts]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -98,13 +99,13 @@ class View:
     rig: Rig
     offset_m: float
 
-    @property
+    @cached_property
     def T_world_camera(self) -> Pose:
         """Camera pose in the world."""
         shift = self.offset_m * np.array(self.rig.stroke_axis_world)
         return replace(self.rig.T_world_camera, translation_m=as_vector(self.rig.T_world_camera.t + shift))
 
-    @property
+    @cached_property
     def T_world_sphere(self) -> Pose:
         """Mirror pose in the world."""
         return self.T_world_camera @ self.rig.T_camera_sphere

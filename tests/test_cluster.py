@@ -214,9 +214,7 @@ def test_every_task_is_logged(tiny_dataset: Path) -> None:
 
 @pytest.mark.usefixtures("inline")
 def test_a_worker_that_fails_half_way_leaves_the_rest_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "phibench.datasets.sample_preview.save_png", lambda *_: (_ for _ in ()).throw(OSError(28, "full"))
-    )
+    monkeypatch.setattr("phibench.datasets.sample_task.save_png", lambda *_: (_ for _ in ()).throw(OSError(28, "full")))
     with pytest.raises(DatasetError, match="2 of 8 tasks failed"):
         make(TINY, tmp_path / "out", workers=1, console=quiet())
     monkeypatch.undo()

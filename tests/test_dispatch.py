@@ -106,7 +106,7 @@ def test_a_bug_is_not_repeated_and_the_others_go_on() -> None:
 def simulate(samples: int, workers: int, folder: Path) -> tuple[int, float, float, Simulated]:
     """Tasks, seconds, MB grown: scheduling and journal of a data set whose tasks take no time."""
     tasks = [task(f"spot {i}") for i in range(samples)] + [task(f"view {i}") for i in range(2 * samples)]
-    tasks += [task(f"preview {i}", f"spot {i}", f"view {2 * i}", f"view {2 * i + 1}") for i in range(samples)]
+    tasks += [task(f"sample {i}", f"spot {i}", f"view {2 * i}", f"view {2 * i + 1}") for i in range(samples)]
     row = {"sample_id": "x" * 24, **{f"number_{i}_m": 0.1 + i / 3.0 for i in range(80)}}  # about as long as a real one
     before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter()
     executor = Simulated(workers)

@@ -14,7 +14,14 @@ from phibench.render.bake import LightMap
 from phibench.scenes.detector import FILTERS
 
 PAGE = (Path(schema.__file__).resolve().with_name("FORMAT.md")).read_text(encoding="utf-8")
-MODELS = (schema.ManifestRow, schema.SpotRow, schema.CertificateRow, schema.DatasetInfo, schema.PoseInfo)
+MODELS = (
+    schema.ManifestRow,
+    schema.SpotRow,
+    schema.CertificateRow,
+    schema.NoiseRow,
+    schema.DatasetInfo,
+    schema.PoseInfo,
+)
 
 
 def tables() -> list[list[list[str]]]:

@@ -23,7 +23,7 @@ MADE_BY = {
     layout.LIGHT_MAP: "bake room",
     TRUTH: "view h0.500",
     SPOT: "spot seen-near-h0.500",
-    PREVIEW: "preview seen-near-h0.500",
+    PREVIEW: "sample seen-near-h0.500",
     **{name: name for name in (layout.INFO, layout.MANIFEST, layout.TABLE, layout.RECIPE, layout.SUMS)},
 }
 pytestmark = pytest.mark.usefixtures("inline")

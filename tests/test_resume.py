@@ -62,7 +62,7 @@ def test_bytes_do_not_depend_on_who_does_the_work(tiny_dataset: Path, tmp_path: 
     assert contents(make(TINY, tmp_path / "out", workers=1, console=quiet())) == contents(tiny_dataset)
 
 
-PREVIEWS = ["preview half-hidden-h1.400", "preview seen-near-h0.500"]
+SAMPLES = ["sample half-hidden-h1.400", "sample seen-near-h0.500"]
 SPOTS = ["spot half-hidden-h1.400", "spot seen-near-h0.500"]
 BAKE = ["bake room"]
 VIEWS = ["view h0.000", "view h0.500", "view h1.400"]
@@ -73,13 +73,13 @@ VIEWS = ["view h0.000", "view h0.500", "view h1.400"]
     ("old", "new", "expected"),
     [
         ("seed = 0", "seed = 0  # a comment", []),
-        ("depth_m = 1.975", "depth_m = 1.975\ndiameter_m = 6e-3", [PREVIEWS[1], SPOTS[1]]),
-        ("bounces = 2", "bounces = 1", BAKE + PREVIEWS + VIEWS),
-        ("samples_per_pixel = 2", "samples_per_pixel = 3", PREVIEWS + VIEWS),
-        ("seed = 0", "seed = 1", PREVIEWS + VIEWS),
-        ("[ambient]", "[laser]\npower_w = 2e-3\n\n[ambient]", PREVIEWS + SPOTS),
-        ("[0.5]", "[0.6]", ["preview seen-near-h0.600", "spot seen-near-h0.600", "view h0.600"]),
-        ("[0.5]", "[0.5, 1.4]", ["preview seen-near-h1.400", "spot seen-near-h1.400"]),
+        ("depth_m = 1.975", "depth_m = 1.975\ndiameter_m = 6e-3", [SAMPLES[1], SPOTS[1]]),
+        ("bounces = 2", "bounces = 1", BAKE + SAMPLES + VIEWS),
+        ("cells_per_pixel = 1", "cells_per_pixel = 2", SAMPLES + VIEWS),
+        ("seed = 0", "seed = 1", SAMPLES + VIEWS),
+        ("[ambient]", "[laser]\npower_w = 2e-3\n\n[ambient]", SAMPLES + SPOTS),
+        ("[0.5]", "[0.6]", ["sample seen-near-h0.600", "spot seen-near-h0.600", "view h0.600"]),
+        ("[0.5]", "[0.5, 1.4]", ["sample seen-near-h1.400", "spot seen-near-h1.400"]),
     ],
 )
 def test_only_what_a_change_changes_is_made_again(copy: Path, old: str, new: str, expected: list[str]) -> None:

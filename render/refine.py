@@ -1,0 +1,134 @@
+"""Which cells of the film are sampled further, and how finely.
+
+A cell is sampled on n x n strata, twice; half the difference, squared, is its variance. An edge through the cell leaves
+spread / (2 n^3), with `spread` the variance of single samples: about n strata are crossed, and each counts for 1/n^2.
+Once cells are refined, the larger of the two is taken: what is stopped by its own estimate would else be flattered.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from phibench.render.film import Film, Samples
+from phibench.render.film_grid import Crop, FilmGrid, Stack
+from phibench.render.noise_budget import allowed_per_s2, excess
+
+_TILE_PX = 48
+_SIDES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # strata along a cell; few values, few kernel launches
+_NEAR_PX = 3  # an edge that both samples of a cell missed shows in a cell not far away
+_GROWTH = 8.0  # of the strata along a side, in one round
+_BLIND = (16.0, 500.0)  # excess from which a cell's first refinement has 4 and 6 strata along a side, 2 below
+_SMALL = 0.1  # a cell below this part of its allowance is not what keeps a pixel above its budget
+_AIM = 0.8  # of the allowed variance
+
+
+@dataclass
+class Cells:
+    """A window's cells and the pixels made of them; changed in place while they are refined.
+
+    Attributes
+    ----------
+    grid : FilmGrid
+    numbers : array, shape (rows, columns), uint32
+    side : array, shape (rows, columns), int32
+        Strata along a side.
+    mean, variance : arrays, shape (3, rows, columns), float32
+        Of the cells, electrons/s per square pixel and its square.
+    pixels : list of two arrays, shape (3, height, width), float32
+        Mean and variance of the pixels.
+    mirrored : bool array, shape (height, width)
+        Pixels that see the mirror.
+    """
+
+    grid: FilmGrid
+    numbers: NDArray[np.uint32]
+    side: NDArray[np.int32]
+    mean: Stack
+    variance: Stack
+    pixels: tuple[Stack, Stack]
+    mirrored: NDArray[np.bool_]
+
+
+def first_pass(film: Film, window: Crop) -> Cells:
+    """All cells of a window, two samples each."""
+    grid, numbers = film.grid, film.grid.numbers(window)
+    a, b = (film.sample(numbers.ravel(), 1, half) for half in (0, 1))
+    mean, variance = (plane.reshape(3, *numbers.shape) for plane in _estimate(a, b))
+    pixels = grid.pixels(mean), grid.pixels(variance, power=2)
+    mirrored = grid.inner((a.mirrored | b.mirrored).reshape(numbers.shape))
+    return Cells(grid, numbers, np.ones(numbers.shape, dtype=np.int32), mean, variance, pixels, mirrored)
+
+
+def refine(film: Film, cells: Cells, turn: int) -> bool:
+    """Sample cells near pixels that are over their budget again; False if there are none.
+
+    Parameters
+    ----------
+    turn : int, from 1
+        Which round this is: each has its own random streams.
+    """
+    over = np.where(cells.mirrored, excess(*cells.pixels, cells.grid.blur_sigma_px), np.float32(0.0))
+    if not np.any(over > 1.0):
+        return False
+    near = ndimage.maximum_filter(over, size=_NEAR_PX, mode="nearest")
+    allowed = allowed_per_s2(cells.pixels[0], cells.grid.blur_sigma_px).sum(axis=0)
+    tight = ndimage.minimum_filter(allowed, size=_NEAR_PX, mode="nearest")
+    chosen = np.flatnonzero(cells.grid.spread(near > 1.0))
+    near, tight = (cells.grid.spread(plane).ravel()[chosen] for plane in (near, tight))
+    wanted = _wanted(cells, chosen, near, tight)
+    more = wanted > cells.side.ravel()[chosen]
+    for m in np.unique(wanted[more]):
+        _sample_again(film, cells, chosen[more & (wanted == m)], int(m), turn)
+    _update(cells, chosen[more])
+    return True
+
+
+def _wanted(cells: Cells, chosen: NDArray[np.intp], near: Stack, tight: Stack) -> NDArray[np.int32]:
+    """Strata of cells, by their own share of the variance and by what was found around, whichever asks for less.
+
+    Little is known of a cell with two samples: it gets more by the excess around it, whatever it seems to need, so that
+    the corner of a lamp that is in it is found.
+    """
+    side = cells.side.ravel()[chosen]
+    share = float(np.sum(cells.grid.taps**2) ** 2)  # of one cell's variance in a pixel's, if all cells have the same
+    ratio = share * cells.variance.reshape(3, -1)[:, chosen].sum(axis=0) / tight
+    growth = np.clip(np.cbrt(np.minimum(ratio, near) / _AIM), 1.2, _GROWTH)
+    aim = np.where(ratio > _SMALL, np.ceil(side * growth), side)
+    informed = np.array(_SIDES)[np.searchsorted(_SIDES, np.minimum(aim, _SIDES[-1]))]
+    blind = np.select([near < _BLIND[0], near < _BLIND[1]], [2, 4], 6)
+    return np.where(side == 1, blind, informed).astype(np.int32)
+
+
+def _sample_again(film: Film, cells: Cells, chosen: NDArray[np.intp], side: int, turn: int) -> None:
+    """Replace what is known of some cells (flat indices) by new samples."""
+    a, b = (film.sample(cells.numbers.ravel()[chosen], side, 2 * turn + half) for half in (0, 1))
+    mean, variance = _estimate(a, b)
+    spread = np.maximum(0.5 * (a.square + b.square) - mean**2, 0.0)
+    cells.mean.reshape(3, -1)[:, chosen] = mean
+    cells.variance.reshape(3, -1)[:, chosen] = np.maximum(variance, spread / np.float32(2.0 * side**3))
+    cells.side.ravel()[chosen] = side
+
+
+def _estimate(a: Samples, b: Samples) -> tuple[Stack, Stack]:
+    """Mean of two independent halves and its variance."""
+    return 0.5 * (a.electrons_per_s + b.electrons_per_s), (0.5 * (a.electrons_per_s - b.electrons_per_s)) ** 2
+
+
+def _update(cells: Cells, changed: NDArray[np.intp]) -> None:
+    """Fold the tiles that some cells (flat indices) belong to."""
+    grid = cells.grid
+    mark = np.zeros(cells.numbers.shape, dtype=bool)
+    mark.ravel()[changed] = True
+    height, width = cells.mirrored.shape
+    span = 2 * grid.margin_px
+    for v in range(0, height, _TILE_PX):
+        for u in range(0, width, _TILE_PX):
+            v1, u1 = min(v + _TILE_PX, height), min(u + _TILE_PX, width)
+            part = (slice(v * grid.cells, (v1 + span) * grid.cells), slice(u * grid.cells, (u1 + span) * grid.cells))
+            if mark[part].any():
+                cells.pixels[0][:, v:v1, u:u1] = grid.pixels(cells.mean[:, *part])
+                cells.pixels[1][:, v:v1, u:u1] = grid.pixels(cells.variance[:, *part], power=2)
