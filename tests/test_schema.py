@@ -29,7 +29,13 @@ TINY = Path(__file__).with_name("tiny.toml")
 def rows(tmp_path_factory: pytest.TempPathFactory) -> list[ManifestRow]:
     plan, out = make_plan(load_recipe(TINY)), tmp_path_factory.mktemp("rows")
     made = [make_spot(out, "tiny", plan.rig, plan.room, plan.spots[pair.target], pair) for pair in plan.pairs]
-    return [ManifestRow.model_validate_json(json.dumps(one.result)) for one in made]
+    return [ManifestRow.model_validate_json(json.dumps(_with_noise(one.result))) for one in made]
+
+
+def _with_noise(row: dict[str, Any]) -> dict[str, Any]:
+    """What the task `sample` adds: here some numbers, where the spot is visible."""
+    noise = {"phi_sensor_rad": 5e-5, "phi_render_rad": 1e-7}
+    return row | {side: row[side] | {"noise": noise if row[side]["visible"] else None} for side in ("down", "up")}
 
 
 @pytest.fixture
