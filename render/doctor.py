@@ -19,7 +19,7 @@ from typing import Literal
 from phibench.render.child import fault_of
 from phibench.render.llvm import find_llvm
 from phibench.render.llvm_library import LlvmError, prove
-from phibench.render.variant import DEFAULT, ENVIRONMENT
+from phibench.render.variant import ENVIRONMENT, default_variant
 
 State = Literal["ok", "warning", "fault"]
 
@@ -63,7 +63,7 @@ def examine() -> Iterator[Finding]:
         yield disk_finding(Path.cwd())
         yield scoring_finding(after=packages)
         return
-    variant = os.environ.get(ENVIRONMENT) or DEFAULT
+    variant = os.environ.get(ENVIRONMENT) or default_variant()
     yield Finding("variant", variant)
     llvm = llvm_finding(is_needed=variant.startswith("llvm"))
     yield llvm

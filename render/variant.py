@@ -1,4 +1,4 @@
-"""Mitsuba, switched on once per process: LLVM first, then the variant, then one Dr.Jit thread.
+"""Mitsuba, switched on once per process: the variant (CUDA where there is a GPU, else LLVM), then one Dr.Jit thread.
 
 Dr.Jit adds floating-point numbers with atomics, in whatever order its threads come, so two runs agree to the last bit
 only with one thread. Work is spread over processes instead, and the variant, global to the process, is never changed.
@@ -8,10 +8,11 @@ import os
 import sys
 from types import ModuleType
 
+from phibench.render.cuda import has_gpu
 from phibench.render.llvm import ENVIRONMENT as LLVM_ENVIRONMENT
 from phibench.render.llvm import use_llvm
 
-DEFAULT = "llvm_ad_rgb"
+CUDA, LLVM = "cuda_ad_rgb", "llvm_ad_rgb"
 ENVIRONMENT = "PHIBENCH_VARIANT"
 """Names a variant for everything, over what the code asks for (`scalar_rgb` where there is no LLVM)."""
 
@@ -23,13 +24,19 @@ class VariantError(RuntimeError):
     """Mitsuba cannot be used as asked. The message is one sentence."""
 
 
-def activate(variant: str = DEFAULT) -> ModuleType:
+def default_variant() -> str:
+    """CUDA where there is a GPU, LLVM elsewhere."""
+    return CUDA if has_gpu() else LLVM
+
+
+def activate(variant: str | None = None) -> ModuleType:
     """Import Mitsuba, set the variant and one thread, and return the module.
 
     Parameters
     ----------
-    variant : str
-        Mitsuba's name of a variant; PHIBENCH_VARIANT overrules it.
+    variant : str, optional
+        Mitsuba's name of a variant; PHIBENCH_VARIANT overrules it. Without either, what this process renders with, or
+        else `default_variant`.
 
     Raises
     ------
@@ -39,7 +46,7 @@ def activate(variant: str = DEFAULT) -> ModuleType:
     LlvmError
         If the variant needs an LLVM and there is none.
     """
-    wanted = os.environ.get(ENVIRONMENT) or variant
+    wanted = os.environ.get(ENVIRONMENT) or variant or _active() or default_variant()
     mitsuba = _import_mitsuba(needs_llvm=wanted.startswith("llvm"))
     active = mitsuba.variant()
     if active == wanted:
@@ -54,6 +61,12 @@ def activate(variant: str = DEFAULT) -> ModuleType:
     mitsuba.set_variant(wanted)
     _settle()
     return mitsuba
+
+
+def _active() -> str | None:
+    """Variant of this process, if Mitsuba is imported and has one."""
+    mitsuba = sys.modules.get("mitsuba")
+    return None if mitsuba is None else mitsuba.variant()
 
 
 def _import_mitsuba(*, needs_llvm: bool) -> ModuleType:

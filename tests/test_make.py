@@ -31,6 +31,7 @@ from phibench.datasets.schema import ManifestRow
 from phibench.datasets.sums import damaged, data_files, read_sums
 from phibench.datasets.work import plan_tasks
 from phibench.render.certificate import Certificate, certify
+from phibench.render.variant import default_variant
 from phibench.scenes.laser import LaserSpot
 
 TINY = Path(__file__).with_name("tiny.toml")
@@ -65,7 +66,7 @@ def test_the_sums_are_those_of_sha256sum(tiny_dataset: Path) -> None:
 def test_the_info_says_what_made_it(tiny_dataset: Path) -> None:
     info = json.loads((tiny_dataset / layout.INFO).read_text())
     provenance = info["provenance"]
-    assert provenance["variant"] == "llvm_ad_rgb"
+    assert provenance["variant"] == default_variant()
     assert int(provenance["llvm"].split(".")[0]) >= 17
     assert provenance["threads_per_process"] == 1
     assert provenance["packages"]["mitsuba"]

@@ -1,12 +1,16 @@
 """Mitsuba is switched on once, with the right LLVM and one thread, or says in one sentence why not."""
 
+import shutil
 import subprocess
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
+from phibench.render.variant import CUDA, LLVM
+
 Python = Callable[..., subprocess.CompletedProcess[str]]
-ACTIVATE = "from phibench.render.variant import activate; mi = activate()\n"
+ACTIVATE = "from phibench.render.variant import LLVM, activate; mi = activate(LLVM)\n"
 SUMS = """
 import sys, drjit as dr
 from drjit.llvm import Float, PCG32
@@ -49,6 +53,33 @@ def test_again_is_nothing_and_another_is_refused(python: Python) -> None:
 def test_the_environment_overrules(python: Python) -> None:
     child = python(ACTIVATE + "print(mi.variant())", PHIBENCH_VARIANT="scalar_rgb", DRJIT_LIBLLVM_PATH="/nowhere")
     assert (child.returncode, child.stdout.strip()) == (0, "scalar_rgb"), child.stderr
+
+
+FAKE = """
+int cuInit(unsigned flags) { return %d; }
+int cuDeviceGetCount(int *count) { *count = %d; return 0; }
+"""
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler to make a driver that answers")
+@pytest.mark.parametrize(("status", "devices", "expected"), [(0, 1, CUDA), (0, 0, LLVM), (100, 1, LLVM)])
+def test_cuda_is_taken_where_a_driver_says_that_there_is_a_gpu(
+    python: Python, tmp_path: Path, status: int, devices: int, expected: str
+) -> None:
+    """Drivers that answer: a device, none, and an error; a GPU itself is not needed."""
+    (tmp_path / "fake.c").write_text(FAKE % (status, devices))
+    library = tmp_path / "fake.so"
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", library, tmp_path / "fake.c"], check=True)
+    code = "from phibench.render.variant import default_variant; print(default_variant())"
+    child = python(code, DRJIT_LIBCUDA_PATH=str(library), DRJIT_LIBOPTIX_PATH=str(library))
+    assert child.stdout.strip() == expected, child.stderr
+    assert python(code, DRJIT_LIBCUDA_PATH=str(library), DRJIT_LIBOPTIX_PATH="/nowhere").stdout.strip() == LLVM
+
+
+def test_the_environment_forces_llvm_where_there_is_a_gpu(python: Python) -> None:
+    code = "import phibench.render.variant as v\nv.has_gpu = lambda: True\nprint(v.activate().variant())"
+    child = python(code, PHIBENCH_VARIANT=LLVM)
+    assert child.stdout.strip() == LLVM, child.stderr
 
 
 @pytest.mark.parametrize(
