@@ -14,7 +14,14 @@ from phibench.render.bake import LightMap
 from phibench.scenes.detector import FILTERS
 
 PAGE = (Path(schema.__file__).resolve().with_name("FORMAT.md")).read_text(encoding="utf-8")
-MODELS = (schema.ManifestRow, schema.SpotRow, schema.CertificateRow, schema.DatasetInfo, schema.PoseInfo)
+MODELS = (
+    schema.ManifestRow,
+    schema.SpotRow,
+    schema.CertificateRow,
+    schema.DatasetInfo,
+    schema.PoseInfo,
+    schema.RigInfo,
+)
 
 
 def tables() -> list[list[list[str]]]:
@@ -70,7 +77,7 @@ def test_files() -> None:
     views = {layout.view_file("POSE", name) for name in ("ambient", "truth", "preview")}
     spots = {layout.spot_file("SAMPLE", position) for position in ("down", "up")}
     single = {layout.INFO, layout.MANIFEST, layout.TABLE, layout.RECIPE, layout.SUMS, layout.RUN, layout.CONTACT_SHEET}
-    single |= {layout.LOG, layout.JOURNAL, layout.LIGHT_MAP}
+    single |= {layout.LOG, layout.JOURNAL, layout.LIGHT_MAP, layout.RIGS}
     assert said == views | spots | single | {layout.preview_file("SAMPLE")}
 
 
