@@ -18,7 +18,7 @@ from phibench.datasets.random_spot import Placed, place
 from phibench.datasets.recipe import RandomTable, Recipe, RigTable
 from phibench.datasets.recipe_places import Boards
 from phibench.datasets.recipe_scene import build_rig, build_target, ceiling_m
-from phibench.datasets.sampling import first_points, further_points
+from phibench.datasets.sampling import PARAMETERS, first_points, further_points
 from phibench.scenes.checks import SceneError
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
@@ -26,6 +26,7 @@ from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
 
 TRIES = 100
+_PILOT = 8  # samples
 _NANOMETRE = 9  # decimals of a stroke: a pose's name then says its offset exactly
 
 Value = float | str
@@ -64,16 +65,9 @@ def draw_samples(recipe: Recipe, table: RandomTable, room: Room) -> tuple[Random
     RecipeError
         If a sample stays impossible after `TRIES` draws, with the reason of the last one.
     """
-    makers, found = _Makers(recipe, room), dict[int, RandomSample]()
-    left = list(range(table.samples))
-    for attempt in range(TRIES):
-        outcomes = dict(makers.draw(table, np.array(left), attempt))
-        found |= {number: sample for number, sample in outcomes.items() if isinstance(sample, RandomSample)}
-        left = [number for number in left if number not in found]
-        if not left:
-            return tuple(found[number] for number in range(table.samples))
-    text = f"sample {left[0]} has no possible rig, spot and stroke in {TRIES} draws; the last: {outcomes[left[0]]}"
-    raise RecipeError(f"random: {text}; narrow the distributions or move the boards")
+    makers = _Makers(recipe, table, room)
+    pilot = min(_PILOT, table.samples)  # whether the recipe is possible at all is known after a few
+    return (*makers.draw(range(pilot)), *makers.draw(range(pilot, table.samples)))
 
 
 def rig_table(table: RigTable, values: Mapping[str, Value]) -> RigTable:
@@ -87,24 +81,43 @@ def rig_table(table: RigTable, values: Mapping[str, Value]) -> RigTable:
 class _Makers:
     """What all draws of a recipe share."""
 
-    def __init__(self, recipe: Recipe, room: Room) -> None:
-        self._recipe, self._room = recipe, room
+    def __init__(self, recipe: Recipe, table: RandomTable, room: Room) -> None:
+        self._recipe, self._table, self._room = recipe, table, room
         self._targets = {target.name: target for target in recipe.targets}
         self._boards = Boards([build_target(target) for target in recipe.targets])
         self._ceiling_m = ceiling_m(room)
+        dataset = recipe.dataset
+        self._first = first_points(table.sequence, dataset.name, dataset.seed, table.samples)
 
-    def draw(self, table: RandomTable, numbers: Array, attempt: int) -> Iterator[tuple[int, RandomSample | str]]:
+    def draw(self, numbers: range) -> list[RandomSample]:
+        """Draw some samples, those that are impossible again until they are not."""
+        found: dict[int, RandomSample] = {}
+        left = list(numbers)
+        for attempt in range(TRIES):
+            outcomes = self._once(left, attempt)
+            found |= {number: sample for number, sample in outcomes.items() if isinstance(sample, RandomSample)}
+            left = [number for number in left if number not in found]
+            if not left:
+                return [found[number] for number in numbers]
+        text = f"sample {left[0]} has no possible rig, spot and stroke in {TRIES} draws; the last: {outcomes[left[0]]}"
+        raise RecipeError(f"random: {text}; narrow the distributions or move the boards")
+
+    def _once(self, numbers: list[int], attempt: int) -> dict[int, RandomSample | str]:
         """Draw some samples once; the reason instead of a sample that is impossible."""
-        dataset = self._recipe.dataset
-        if attempt == 0:
-            points = first_points(table.sequence, dataset.name, dataset.seed, table.samples)
-        else:
-            points = further_points(dataset.name, dataset.seed, numbers, attempt)
-        values = draw_values(table, list(self._targets), points)
+        values = draw_values(self._table, list(self._targets), self._points(numbers, attempt))
         spots = place(self._recipe.laser, self._room, self._targets, values)
-        for k, (number, spot) in enumerate(zip(numbers, spots, strict=True)):
-            drawn = tuple((name, _plain(column[k])) for name, column in values.items())
-            yield int(number), self._sample(int(number), attempt + 1, drawn, spot)
+        rows = [tuple((name, _plain(column[k])) for name, column in values.items()) for k in range(len(numbers))]
+        return {
+            number: self._sample(number, attempt + 1, drawn, spot)
+            for number, drawn, spot in zip(numbers, rows, spots, strict=True)
+        }
+
+    def _points(self, numbers: list[int], attempt: int) -> dict[str, Array]:
+        drawn = drawn_parameters(self._table)
+        if attempt == 0:
+            return {name: self._first[name][numbers] for name in drawn}
+        dataset = self._recipe.dataset
+        return further_points(dataset.name, dataset.seed, drawn, numbers, attempt)
 
     def _sample(
         self, number: int, tries: int, drawn: tuple[tuple[str, Value], ...], placed: Placed
@@ -129,17 +142,21 @@ class _Makers:
         return self._boards.cut_by(rig, stroke_m)
 
 
+def drawn_parameters(table: RandomTable) -> list[str]:
+    """What a recipe draws, in the order of `sampling.PARAMETERS`."""
+    chosen = dict(_distributions(table))
+    return [name for name in PARAMETERS if name in chosen or (name == "spot.target" and not table.spot.by_ray)]
+
+
 def draw_values(table: RandomTable, targets: list[str], points: Mapping[str, Array]) -> dict[str, Any]:
     """Values of all samples by parameter, for the points in [0, 1) of each."""
     chosen = dict(_distributions(table))
-    values: dict[str, Any] = {}
-    for name, u in points.items():
-        if name == "spot.target" and not table.spot.by_ray:
-            values[name] = pick(targets if table.spot.target is None else table.spot.target.choice, u)
-        elif name in chosen:
-            values[name] = quantile(chosen[name], u)
+    values: dict[str, Any] = {name: quantile(chosen[name], u) for name, u in points.items() if name in chosen}
     values["stroke_m"] = np.round(values["stroke_m"], _NANOMETRE)
-    return values
+    if "spot.target" in points:
+        names = targets if table.spot.target is None else table.spot.target.choice
+        values["spot.target"] = pick(names, points["spot.target"])
+    return {name: values[name] for name in points}
 
 
 def _distributions(table: RandomTable) -> Iterator[tuple[str, DistributionTable]]:

@@ -204,7 +204,7 @@ class Recipe(Table):
     targets: Annotated[tuple[TargetTable, ...], Field(strict=False, min_length=1)] = Field(
         description="boards with a laser spot"
     )
-    experiments: Annotated[tuple[ExperimentTable, ...], Field(strict=False, min_length=1)] = Field(
+    experiments: Annotated[tuple[ExperimentTable, ...], Field(strict=False)] = Field(
         default=(), description="which targets with which strokes"
     )
     random: RandomTable | None = Field(default=None, description="samples that are drawn, instead of experiments")

@@ -30,8 +30,9 @@ def purpose_faults(raw: Raw, tables: Sequence[str]) -> Iterator[Fault]:
     misspelt = [key for key in raw if key not in tables and close_to(key, tables) in ("experiments", "random")]
     if len(given) == 2:
         yield Fault("random", "given together with [[experiments]]; give one or the other")
-    elif not given and not misspelt:
-        yield Fault("experiments", "missing; add [[experiments]] (which targets with which strokes) or [random]")
+    elif raw.get("experiments") == [] or not (given or misspelt):
+        what = "empty" if given else "missing"
+        yield Fault("experiments", f"{what}; add [[experiments]] (which targets with which strokes) or [random]")
 
 
 def random_faults(

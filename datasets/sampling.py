@@ -7,6 +7,7 @@ again with numbers of its own streams, so that no other sample moves.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Literal
 
 import numpy as np
@@ -41,10 +42,12 @@ def first_points(sequence: Sequence, dataset: str, seed: int, count: int) -> dic
     return {name: (points[:, k] + stream.random()) % 1.0 for k, (name, stream) in enumerate(streams.items())}
 
 
-def further_points(dataset: str, seed: int, numbers: Array, attempt: int) -> dict[str, Array]:
-    """Numbers of a later try, 1 and up, of the samples with these numbers: independent, whatever the sequence."""
+def further_points(
+    dataset: str, seed: int, names: Iterable[str], numbers: Iterable[int], attempt: int
+) -> dict[str, Array]:
+    """Numbers of a later try, 1 and up, of some samples for some parameters: independent, whatever the sequence."""
 
     def one(name: str, number: int) -> float:
         return float(generator(dataset, seed, "random", name, number, attempt).random())
 
-    return {name: np.array([one(name, int(i)) for i in numbers]) for name in PARAMETERS}
+    return {name: np.array([one(name, i) for i in numbers]) for name in names}
