@@ -86,8 +86,8 @@ carriage would cut a board or reach the lamps, a spot found by a ray would not l
 one face), the sample alone is drawn again, at most 100 times; the manifest counts `tries`.
 Spots that the mirror does not show are kept, with the cause.
 
-`sobol` takes Sobol's points, each dimension shifted by a number of its own; `independent`
-takes a random stream per parameter. Every distribution draws on its own: the value of one does
+`sobol` takes Sobol's points, each dimension scrambled by a random stream of its own;
+`independent` takes a random stream per parameter. Every distribution draws on its own: the value of one does
 not depend on which others are there.
 """,
     "[random.rig]": """Any number of `[rig]` but the size of the image, within the range that `[rig]` allows. What is

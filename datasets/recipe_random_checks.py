@@ -136,13 +136,18 @@ def _off_board(spot: Raw, laser: LaserTable, targets: Sequence[TargetTable]) -> 
     given = spot.get("target")
     chosen = [given] if isinstance(given, str) else _table(given).get("choice")
     drawn = [target for target in targets if not isinstance(chosen, list) or target.name in chosen]
+    if not drawn or any(key in spot for key in _BY_RAY):
+        return
     for axis, key in enumerate(("across_m", "up_m")):
         table = _sound(spot.get(key, 0.0))
         if table is None or [*distribution_faults(table)]:
             continue
         farthest = max(abs(value) for value in support(table))
-        left, name = min(((room_left_m(laser, target)[axis], target.name) for target in drawn), default=(0.0, ""))
-        if name and farthest > left >= 0.0:
+        left, name = min((room_left_m(laser, target)[axis], target.name) for target in drawn)
+        if left < 0.0:
+            text = f"a spot at the centre of the board '{name}' already reaches {-left:.3f} m beyond its edge"
+            yield Fault(f"random.spot.{key}", f"{text}; make the spot smaller (see laser.diameter_m)")
+        elif farthest > left:
             text = f"reaches {farthest:g} m, where the spot leaves the board '{name}'"
             yield Fault(f"random.spot.{key}", f"{text}; stay within -{left:.3f} to {left:.3f}")
 
