@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from functools import cache
+from typing import Any, TypeVar, cast
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -13,7 +14,7 @@ T = TypeVar("T")
 
 def to_json(value: object) -> Any:
     """JSON document (dicts, lists, numbers) of a frozen dataclass such as `Rig` or `Room`."""
-    return TypeAdapter(type(value)).dump_python(value, mode="json")
+    return _adapter(cast(Any, type(value))).dump_python(value, mode="json")
 
 
 def from_json(kind: type[T], document: Any) -> T:
@@ -25,8 +26,14 @@ def from_json(kind: type[T], document: Any) -> T:
         If the document does not describe one.
     """
     try:
-        return TypeAdapter(kind).validate_python(document)
+        return cast(T, _adapter(cast(Any, kind)).validate_python(document))
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         raise DatasetError(f"not a valid {kind.__name__} at {where or 'its root'}: {first['msg']}") from error
+
+
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    """Adapter of a type; making one takes longer than using it a hundred times."""
+    return TypeAdapter(kind)

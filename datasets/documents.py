@@ -12,6 +12,7 @@ from phibench.datasets.files import write_bytes
 from phibench.datasets.journal import Entry, Head
 from phibench.datasets.manifest import manifest_documents
 from phibench.datasets.plan import PairPlan, Plan
+from phibench.datasets.rigs import rigs_text
 from phibench.datasets.schema import ManifestRow
 from phibench.datasets.sums import sums_text
 from phibench.datasets.work import sample_task_name, spot_task_name
@@ -24,6 +25,7 @@ def documents(plan: Plan, head: Head, entries: Mapping[str, Entry]) -> dict[str,
     small = {
         layout.INFO: head.info.encode(),
         layout.RECIPE: head.recipe.encode(),
+        layout.RIGS: rigs_text(plan.rigs).encode(),
         **manifest_documents(rows),
     }
     hashes = {name: digest for entry in entries.values() for name, digest in entry.files.items()}

@@ -41,7 +41,7 @@ def dataset_info(plan: Plan, environment: dict[str, Any]) -> DatasetInfo:
         name=recipe.dataset.name,
         recipe=recipe.model_dump(mode="json"),
         recipe_sha256=recipe_sha256(recipe),
-        rig=to_json(plan.rig),
+        rigs=len(plan.rigs),
         room=to_json(plan.room),
         object_names=plan.room.object_names(plan.rig.at(0.0)),
         poses=tuple(_pose_info(pose) for pose in plan.poses),
@@ -117,4 +117,4 @@ def _without_commit(info: DatasetInfo) -> str:
 
 def _pose_info(pose: PosePlan) -> PoseInfo:
     files = {name: layout.view_file(pose.pose_id, name) for name in ("ambient", "truth", "preview")}
-    return PoseInfo(pose=pose.pose_id, offset_m=pose.offset_m, ambient_seed=pose.seed, files=files)
+    return PoseInfo(pose=pose.pose_id, rig=pose.rig, offset_m=pose.offset_m, ambient_seed=pose.seed, files=files)

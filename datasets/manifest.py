@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from phibench.datasets import layout
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.files import write_bytes
-from phibench.datasets.schema import ManifestRow, columns, row_line
+from phibench.datasets.schema import ManifestRow, columns, drawn_columns, row_line
 
 
 def write_manifest(folder: Path, rows: Sequence[ManifestRow]) -> None:
@@ -54,7 +54,7 @@ def to_frame(rows: Sequence[ManifestRow]) -> Any:
     """Rows as a polars DataFrame: one column per leaf, names joined by dots, null where a number does not exist."""
     import polars
 
-    types = {str: polars.String, float: polars.Float64, bool: polars.Boolean}
+    types = {str: polars.String, float: polars.Float64, bool: polars.Boolean, int: polars.Int64}
     documents = [row.model_dump(mode="json") for row in rows]
     data, schema = {}, {}
     for name, field in columns():
@@ -63,6 +63,9 @@ def to_frame(rows: Sequence[ManifestRow]) -> Any:
         is_list = getattr(kind, "__origin__", None) is tuple
         data[name] = [_leaf(document, name) for document in documents]
         schema[name] = polars.List(polars.Float64) if is_list else types[base]
+    for name, drawn in drawn_columns(rows).items():
+        data[name] = [row.drawn.get(name.removeprefix("drawn.")) for row in rows]
+        schema[name] = types[drawn]
     return polars.DataFrame(data, schema=schema)
 
 

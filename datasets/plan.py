@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from phibench.datasets.errors import RecipeError
-from phibench.datasets.recipe import Recipe
+from phibench.datasets.random_samples import RandomSample, draw_samples
+from phibench.datasets.recipe import RandomTable, Recipe
 from phibench.datasets.recipe_scene import build_rig, build_room, build_spot
 from phibench.datasets.streams import seed_32
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
 from phibench.scenes.room import Room
+
+RECIPE_RIG = "rig"
+"""Id of the rig of `[rig]`; a drawn one is called after the first sample that has it, such as ``r000042``."""
 
 
 @dataclass(frozen=True)
@@ -21,30 +26,52 @@ class PosePlan:
     Attributes
     ----------
     pose_id : str
-        ``h`` and the carriage offset in metres, such as ``h0.425``; down is ``h0.000``.
+        ``h`` and the carriage offset in metres, such as ``h0.425``; down is ``h0.000``. For a drawn rig, its id and a
+        hyphen come first: ``r000042-h0.425``.
     offset_m : float
         Carriage offset along the stroke axis.
     seed : int
         32-bit seed of the ambient layer, from the named stream (data set, seed, pose, "ambient").
+    rig : str
+        Id of the rig.
     """
 
     pose_id: str
     offset_m: float
     seed: int
+    rig: str = RECIPE_RIG
 
 
 @dataclass(frozen=True)
 class PairPlan:
-    """One stroke pair: a target seen from down and from up."""
+    """One stroke pair: a spot seen from down and from up.
+
+    Attributes
+    ----------
+    target : str
+        Name of the target, or of what a ray met.
+    spot : str
+        Key of the spot in `Plan.spots`.
+    rig : str
+        Id of the rig.
+    drawn : tuple of (parameter, value)
+        What was drawn; empty for an experiment.
+    tries : int
+        Which draw was the first possible one; 0 for an experiment.
+    """
 
     sample_id: str
     experiment: str
     target: str
     stroke_m: float
+    spot: str
+    rig: str = RECIPE_RIG
+    drawn: tuple[tuple[str, float | str], ...] = ()
+    tries: int = 0
 
     def pose_id(self, position: str) -> str:
         """Id of the pose at a stroke position, "down" or "up"."""
-        return pose_name(Stroke(self.stroke_m).offset_m(position))
+        return pose_of(self.rig, Stroke(self.stroke_m).offset_m(position))
 
 
 @dataclass(frozen=True)
@@ -53,10 +80,14 @@ class Plan:
 
     Attributes
     ----------
+    rig : Rig
+        That of `[rig]`: the light map takes its origin of coordinates from it. A sample's own is in `rigs`.
+    rigs : dict
+        Rigs of the samples, by id.
     spots : dict
-        Laser spot of every target that an experiment uses, by target name.
+        Laser spots of the samples, by `PairPlan.spot`: an experiment's by target, a drawn one by sample.
     poses : tuple of PosePlan
-        In the order of their offsets; shared by all pairs.
+        In the order of their offsets, of drawn ones in the order of the samples; pairs of one rig share them.
     pairs : tuple of PairPlan
         In the order of the recipe.
     shard : str or None
@@ -65,6 +96,7 @@ class Plan:
 
     recipe: Recipe
     rig: Rig
+    rigs: dict[str, Rig]
     room: Room
     spots: dict[str, LaserSpot]
     poses: tuple[PosePlan, ...]
@@ -73,7 +105,7 @@ class Plan:
 
     def view(self, pair: PairPlan, position: str) -> View:
         """View of a pair at a stroke position."""
-        return self.rig.at(Stroke(pair.stroke_m).offset_m(position))
+        return self.rigs[pair.rig].at(Stroke(pair.stroke_m).offset_m(position))
 
 
 def make_plan(recipe: Recipe) -> Plan:
@@ -82,23 +114,52 @@ def make_plan(recipe: Recipe) -> Plan:
     Raises
     ------
     RecipeError
-        If two strokes differ by less than a nanometre, so that their poses would share a name.
+        If two strokes differ by less than a nanometre, so that their poses would share a name, or if a sample of
+        `[random]` stays impossible.
     """
+    rig, room = build_rig(recipe.rig), build_room(recipe.room, recipe.targets)
+    if recipe.random is not None:
+        return _random_plan(recipe, recipe.random, rig, room)
     pairs = tuple(
-        PairPlan(_sample_name(experiment.name, target, stroke_m), experiment.name, target, float(stroke_m))
+        PairPlan(_sample_name(experiment.name, target, stroke_m), experiment.name, target, float(stroke_m), target)
         for experiment in recipe.experiments
         for target in experiment.targets
         for stroke_m in experiment.strokes_m
     )
     used = {pair.target for pair in pairs}
     spots = {table.name: build_spot(recipe.laser, table) for table in recipe.targets if table.name in used}
-    return Plan(recipe, build_rig(recipe.rig), _room(recipe), spots, _poses(recipe, pairs), pairs)
+    offsets = sorted({offset_m for _, offset_m in _offsets(pairs)})
+    poses = _poses(recipe, [(RECIPE_RIG, offset_m) for offset_m in offsets])
+    return Plan(recipe, rig, {RECIPE_RIG: rig}, room, spots, poses, pairs)
 
 
 def pose_name(offset_m: float) -> str:
-    """Name of a pose: the offset in metres, to the nanometre, at least three decimals."""
+    """Name of an offset in metres, to the nanometre, at least three decimals."""
     whole, decimals = f"{offset_m:.9f}".split(".")
     return f"h{whole}.{decimals.rstrip('0').ljust(3, '0')}"
+
+
+def pose_of(rig: str, offset_m: float) -> str:
+    """Id of the pose of a rig at an offset."""
+    return pose_name(offset_m) if rig == RECIPE_RIG else f"{rig}-{pose_name(offset_m)}"
+
+
+def _random_plan(recipe: Recipe, table: RandomTable, rig: Rig, room: Room) -> Plan:
+    """Equal rigs share an id, and so their views; the first sample that has one names it, so that more change none."""
+    samples = draw_samples(recipe, table, room)
+    ids = {rig: RECIPE_RIG}
+    for sample in samples:
+        ids.setdefault(sample.rig, f"r{sample.number:06d}")
+    pairs = tuple(_random_pair(sample, ids[sample.rig]) for sample in samples)
+    used = {pair.rig for pair in pairs}
+    rigs = {name: one for one, name in ids.items() if name in used}
+    spots = {pair.spot: sample.spot for pair, sample in zip(pairs, samples, strict=True)}
+    return Plan(recipe, rig, rigs, room, spots, _poses(recipe, dict.fromkeys(_offsets(pairs))), pairs)
+
+
+def _random_pair(sample: RandomSample, rig: str) -> PairPlan:
+    name = f"random-{sample.number:06d}"
+    return PairPlan(name, "random", sample.surface, sample.stroke_m, name, rig, sample.drawn, sample.tries)
 
 
 def _sample_name(experiment: str, target: str, stroke_m: float) -> str:
@@ -106,17 +167,17 @@ def _sample_name(experiment: str, target: str, stroke_m: float) -> str:
     return f"{experiment}-{target}-{pose_name(stroke_m)}"
 
 
-def _room(recipe: Recipe) -> Room:
-    return build_room(recipe.room, recipe.targets)
+def _offsets(pairs: Sequence[PairPlan]) -> list[tuple[str, float]]:
+    """Rig and offset of every view of every pair."""
+    return [(pair.rig, Stroke(pair.stroke_m).offset_m(position)) for pair in pairs for position in POSITIONS]
 
 
-def _poses(recipe: Recipe, pairs: tuple[PairPlan, ...]) -> tuple[PosePlan, ...]:
-    offsets = sorted({Stroke(pair.stroke_m).offset_m(position) for pair in pairs for position in POSITIONS})
-    names = [pose_name(offset_m) for offset_m in offsets]
-    if twice := [name for name, count in Counter(names).items() if count > 1]:
+def _poses(recipe: Recipe, places: Iterable[tuple[str, float]]) -> tuple[PosePlan, ...]:
+    poses = [(pose_of(*place), *place) for place in places]
+    if twice := [name for name, count in Counter(pose[0] for pose in poses).items() if count > 1]:
         raise RecipeError(f"experiments: two strokes near {twice[0][1:]} m differ by less than 1 nm; make them equal")
     dataset = recipe.dataset
     return tuple(
-        PosePlan(name, offset_m, seed_32(dataset.name, dataset.seed, name, "ambient"))
-        for name, offset_m in zip(names, offsets, strict=True)
+        PosePlan(name, offset_m, seed_32(dataset.name, dataset.seed, name, "ambient"), rig)
+        for name, rig, offset_m in poses
     )

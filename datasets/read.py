@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from phibench.datasets import layout
 from phibench.datasets.codec import from_json
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.info import read_info
@@ -23,6 +24,7 @@ from phibench.datasets.layers import SpotWindow, read_ambient, read_ambient_vari
 from phibench.datasets.manifest import read_manifest
 from phibench.datasets.recipe import Recipe
 from phibench.datasets.recipe_faults import nearest
+from phibench.datasets.rigs import Rigs, read_rigs
 from phibench.datasets.schema import DatasetInfo, ManifestRow, SpotRow
 from phibench.datasets.sums import check_documents
 from phibench.scenes.laser import LaserSpot
@@ -38,14 +40,15 @@ class Dataset:
     ----------
     folder : Path
     info : DatasetInfo
-    rig : Rig
+    rigs : Rigs
+        By id: `dataset.rigs[row.rig]`; a sample's own is `sample.rig`.
     room : Room
     samples : tuple of Sample, in the order of the manifest
     """
 
     folder: Path
     info: DatasetInfo
-    rig: Rig
+    rigs: Rigs
     room: Room
     rows: tuple[ManifestRow, ...]
 
@@ -53,6 +56,19 @@ class Dataset:
     def samples(self) -> tuple[Sample, ...]:
         """All samples."""
         return tuple(Sample(self, row) for row in self.rows)
+
+    @property
+    def rig(self) -> Rig:
+        """The rig of all samples, where they share one.
+
+        Raises
+        ------
+        DatasetError
+            If there are several.
+        """
+        if len(self.rigs) != 1:
+            raise DatasetError(f"{self.folder} has {len(self.rigs)} rigs; take each sample's own, `sample.rig`")
+        return self.rigs[next(iter(self.rigs.documents))]
 
     @cached_property
     def recipe(self) -> Recipe:
@@ -85,9 +101,14 @@ class Sample:
             raise DatasetError(f"position '{position}': must be 'down' or 'up'")
         return self.row.position(position)
 
+    @property
+    def rig(self) -> Rig:
+        """The sample's rig."""
+        return self.dataset.rigs[self.row.rig]
+
     def view(self, position: str) -> View:
         """Rig at that position."""
-        return self.dataset.rig.at(self.truth_row(position).offset_m)
+        return self.rig.at(self.truth_row(position).offset_m)
 
     @property
     def laser_spot(self) -> LaserSpot:
@@ -139,14 +160,17 @@ def open_dataset(folder: str | Path) -> Dataset:
     Raises
     ------
     DatasetError
-        If the folder is missing, not a data set, of another schema version, or its manifest is damaged.
+        If the folder is missing, not a data set, of another schema version, or its manifest or rigs are damaged.
     """
     folder = Path(folder)
     info = read_info(folder)
     rows = tuple(read_manifest(folder))
     if len(rows) != info.samples:
         raise DatasetError(f"{folder}: the manifest has {len(rows)} rows instead of {info.samples}")
-    return Dataset(folder, info, from_json(Rig, info.rig), from_json(Room, info.room), rows)
+    rigs = read_rigs(folder)
+    if len(rigs) != info.rigs:
+        raise DatasetError(f"{folder}: {layout.RIGS} has {len(rigs)} rigs instead of {info.rigs}")
+    return Dataset(folder, info, rigs, from_json(Room, info.room), rows)
 
 
 def open_finished(folder: str | Path) -> Dataset:
@@ -155,7 +179,7 @@ def open_finished(folder: str | Path) -> Dataset:
     Raises
     ------
     DatasetError
-        As `open_dataset`, and if `SHA256SUMS` is missing or does not fit `manifest.jsonl` or `dataset.json`.
+        As `open_dataset`, and if `SHA256SUMS` is missing or does not fit manifest, rigs or `dataset.json`.
     """
     read_info(Path(folder))  # not a data set at all is said first
     check_documents(Path(folder))

@@ -6,9 +6,12 @@ faults of a file in one go (`recipe_faults`, `recipe_checks`).
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BeforeValidator, Field, create_model
+
+from phibench.datasets.distribution import Distribution, one_name
+from phibench.datasets.recipe_table import Table
 
 MIN_STROKE_M, MAX_STROKE_M = 1e-3, 10.0
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.]*$", max_length=48)]
@@ -19,12 +22,6 @@ Decentre = Annotated[float, Field(ge=-0.1, le=0.1)]
 Distortion = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 FocalPx = Annotated[float, Field(ge=50.0, le=50000.0)]
 Unit = Annotated[float, Field(ge=0.0, le=1.0)]
-
-
-class Table(BaseModel):
-    """A table of a recipe: no unknown keys, no silent conversions, no NaN or infinity, immutable."""
-
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class DatasetTable(Table):
@@ -140,8 +137,66 @@ class ExperimentTable(Table):
     )
 
 
+DRAWABLE = tuple(key for key, field in RigTable.model_fields.items() if "float" in str(field.annotation))
+"""Keys of `[rig]` that may be drawn: all numbers but the size of the image, which all samples share."""
+
+if TYPE_CHECKING:
+    RandomRigTable = Table
+else:
+    RandomRigTable = create_model(
+        "RandomRigTable",
+        __base__=Table,
+        __doc__="`[random.rig]`: distributions of keys of `[rig]`.",
+        **{
+            key: (Distribution | None, Field(default=None, description=RigTable.model_fields[key].description))
+            for key in DRAWABLE
+        },
+    )
+
+
+class TargetChoice(Table):
+    """Boards to draw from, with equal probability."""
+
+    choice: Annotated[tuple[Name, ...], Field(strict=False, min_length=1)] = Field(
+        description="names from [[targets]], equally probable"
+    )
+
+
+class RandomSpotTable(Table):
+    """`[random.spot]`: on a board that is drawn, or where a horizontal ray from the axis meets what stands there."""
+
+    target: Annotated[
+        TargetChoice | None, BeforeValidator(one_name, json_schema_input_type=TargetChoice | str | None)
+    ] = Field(default=None, description="boards; all of them where not given")
+    across_m: Distribution | None = Field(
+        default=None, description="from the board's centre to the right, seen from the axis; 0 where not given"
+    )
+    up_m: Distribution | None = Field(default=None, description="from the board's centre upwards; 0 where not given")
+    azimuth_deg: Distribution | None = Field(
+        default=None, description="of the ray, from world x towards world y; instead of a board"
+    )
+    height_m: Distribution | None = Field(default=None, description="of the ray above the floor; with azimuth_deg")
+
+    @property
+    def by_ray(self) -> bool:
+        """Whether a ray finds the spot, instead of a board that is drawn."""
+        return self.azimuth_deg is not None
+
+
+class RandomTable(Table):
+    """`[random]`: samples that are drawn, each with a rig, a spot and a stroke of its own."""
+
+    samples: int = Field(default=100, ge=1, le=1_000_000, description="how many; more keep those that are there")
+    sequence: Literal["sobol", "independent"] = Field(
+        default="sobol", description="points that fill the space evenly, or independent ones"
+    )
+    stroke_m: Distribution = Field(description="distribution of the stroke; drawn ones are rounded to 1 nm")
+    rig: RandomRigTable = Field(default=RandomRigTable(), description="distributions of keys of [rig]")
+    spot: RandomSpotTable = Field(default=RandomSpotTable(), description="distribution of the laser spot")
+
+
 class Recipe(Table):
-    """A whole recipe."""
+    """A whole recipe: `[[experiments]]` or `[random]` says what is seen."""
 
     dataset: DatasetTable = Field(description="name and seed")
     rig: RigTable = Field(default=RigTable(), description="camera, mirror and stroke axis")
@@ -151,9 +206,10 @@ class Recipe(Table):
     targets: Annotated[tuple[TargetTable, ...], Field(strict=False, min_length=1)] = Field(
         description="boards with a laser spot"
     )
-    experiments: Annotated[tuple[ExperimentTable, ...], Field(strict=False, min_length=1)] = Field(
-        description="which targets with which strokes"
+    experiments: Annotated[tuple[ExperimentTable, ...], Field(strict=False)] = Field(
+        default=(), description="which targets with which strokes"
     )
+    random: RandomTable | None = Field(default=None, description="samples that are drawn, instead of experiments")
 
 
 def recipe_schema() -> dict[str, Any]:

@@ -10,14 +10,15 @@ from typing import Any, TypeVar, cast
 
 from pydantic import ValidationError
 
-from phibench.datasets.recipe import MAX_STROKE_M, LaserTable, Recipe, RigTable, RoomTable, Table, TargetTable
+from phibench.datasets.recipe import MAX_STROKE_M, LaserTable, Recipe, RigTable, RoomTable, TargetTable
 from phibench.datasets.recipe_faults import Fault, nearest
 from phibench.datasets.recipe_places import boards_in_the_way, spots_on_boards
-from phibench.datasets.recipe_scene import build_rig, build_room, build_spot, build_target
+from phibench.datasets.recipe_random_checks import purpose_faults, random_faults
+from phibench.datasets.recipe_scene import build_rig, build_room, build_spot, build_target, ceiling_m
+from phibench.datasets.recipe_table import Table
 from phibench.scenes.checks import SceneError
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
-from phibench.scenes.solids import Rectangle
 
 T = TypeVar("T", bound=Table)
 Raw = dict[str, Any]
@@ -27,14 +28,18 @@ def semantic_faults(raw: Raw) -> list[Fault]:
     """Faults between keys: names, places, strokes, the rig as a whole. Faulty keys are passed over."""
     experiments = _tables(raw, "experiments")
     targets = [(i, table) for i, entry in _tables(raw, "targets") if (table := _sound(entry, TargetTable)) is not None]
+    names = [entry["name"] for _, entry in _named(_tables(raw, "targets"))]
+    laser, room = _sound(raw.get("laser", {}), LaserTable), _sound(raw.get("room", {}), RoomTable)
     return [
+        *purpose_faults(raw, list(Recipe.model_fields)),
+        *random_faults(raw, laser, room, [table for _, table in targets], names),
         *_twice("targets", _tables(raw, "targets")),
         *_twice("experiments", experiments),
-        *_unknown_targets(experiments, [entry["name"] for _, entry in _named(_tables(raw, "targets"))]),
+        *_unknown_targets(experiments, names),
         *_repeats(experiments),
-        *_laser(_sound(raw.get("laser", {}), LaserTable)),
-        *_places(_sound(raw.get("room", {}), RoomTable), targets),
-        *spots_on_boards(_sound(raw.get("laser", {}), LaserTable), targets),
+        *_laser(laser),
+        *_places(room, targets),
+        *spots_on_boards(laser, targets),
         *_rig(raw, experiments, targets),
     ]
 
@@ -44,11 +49,19 @@ def warnings(recipe: Recipe) -> list[str]:
     result = []
     if not build_rig(recipe.rig).fits_image():
         result.append("rig: the mirror's outline does not fit the image; spots near its rim may fall outside")
-    used = {name for experiment in recipe.experiments for name in experiment.targets}
+    used = _used_targets(recipe)
     unused = [target.name for target in recipe.targets if target.name not in used]
     if unused:
-        result.append(f"targets: {', '.join(unused)} stand in the room but no experiment uses their spots")
+        what = "experiment uses" if recipe.random is None else "sample of [random] uses"
+        result.append(f"targets: {', '.join(unused)} stand in the room but no {what} their spots")
     return result
+
+
+def _used_targets(recipe: Recipe) -> set[str]:
+    if recipe.random is not None:
+        chosen = recipe.random.spot.target
+        return {target.name for target in recipe.targets} if chosen is None else set(chosen.choice)
+    return {name for experiment in recipe.experiments for name in experiment.targets}
 
 
 def _sound(raw: object, model: type[T]) -> T | None:
@@ -163,15 +176,15 @@ def _rig(raw: Raw, experiments: list[tuple[int, Raw]], targets: list[tuple[int, 
 
 def _strokes(rig: Rig, room: Room, experiments: list[tuple[int, Raw]]) -> Iterator[Fault]:
     """The mirror must stay below the lowest thing that hangs from the ceiling."""
-    ceiling_m = min(s.T_world_shape.translation_m[2] for s in room.surfaces if _faces_down(s))
+    limit_m = ceiling_m(room)
     for i, experiment in experiments:
         for j, stroke_m in _items(experiment, "strokes_m"):
             if not _is_legal(stroke_m):
                 continue  # a structural fault
             top_m = rig.at(stroke_m).sphere_centre_m[2] + rig.mirror.radius_m
-            if top_m >= ceiling_m:
-                longest_m = stroke_m - (top_m - ceiling_m)
-                text = f"{stroke_m} lifts the mirror's top to {top_m:.3f} m, through the ceiling at {ceiling_m:.2f} m"
+            if top_m >= limit_m:
+                longest_m = stroke_m - (top_m - limit_m)
+                text = f"{stroke_m} lifts the mirror's top to {top_m:.3f} m, through the ceiling at {limit_m:.2f} m"
                 yield Fault(f"experiments[{i}].strokes_m[{j}]", f"{text}; give less than {longest_m:.3f}")
 
 
@@ -181,7 +194,3 @@ def _is_legal(stroke_m: object) -> bool:
 
 def _legal_strokes(experiments: list[tuple[int, Raw]]) -> list[float]:
     return [float(h) for _, experiment in experiments for _, h in _items(experiment, "strokes_m") if _is_legal(h)]
-
-
-def _faces_down(surface: Rectangle) -> bool:
-    return bool(surface.T_world_shape.R[2, 2] < -0.5)

@@ -22,6 +22,7 @@ class Fault:
 
     path: str
     text: str
+    unknown: bool = False  # the key is none of the table's
 
     def __str__(self) -> str:
         return f"{self.path}: {self.text}"
@@ -68,6 +69,11 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f"{guess}known: {', '.join(names)}"
 
 
+def close_to(name: str, known: Iterable[str]) -> str | None:
+    """Known name that an unknown one is probably a misspelling of, if any."""
+    return next(iter(_close(name, known)), None)
+
+
 def _close(name: str, known: Iterable[str]) -> list[str]:
     """Nearest known name, if one is near."""
     return difflib.get_close_matches(name, list(known), 1, 0.5)
@@ -77,7 +83,7 @@ def _fault(schema: Schema, kind: str, location: Location, given: object) -> Faul
     path = path_text(location)
     if kind == "extra_forbidden":
         known = schema_node(schema, location[:-1]).get("properties", {})
-        return Fault(path, f"unknown key; {nearest(str(location[-1]), known)}")
+        return Fault(path, f"unknown key; {nearest(str(location[-1]), known)}", unknown=True)
     node = schema_node(schema, location)
     hint = f" ({node['description']})" if "description" in node else ""
     if kind == "missing":
@@ -115,7 +121,8 @@ def allowed(node: Schema) -> str:
     if "pattern" in node:
         words.append(f"of at most {node['maxLength']} letters, digits and signs like {_signs(node['pattern'])}")
     if "minItems" in node:
-        words.append(f"of at least {node['minItems']} ({allowed(node['items'])})" if _plain(node) else "with entries")
+        count = "of" if node["minItems"] == node.get("maxItems") else "of at least"
+        words.append(f"{count} {node['minItems']} ({allowed(node['items'])})" if _plain(node) else "with entries")
     return " ".join(words)
 
 

@@ -16,7 +16,7 @@ RECIPES = Path(__file__).with_name("recipes")
 
 
 def find_recipe(name: str | Path) -> Path:
-    """Path of a recipe: a file, or the name of one that is shipped (``paper``, ``smoke``)."""
+    """Path of a recipe: a file, or the name of one that is shipped (``paper``, ``random``, ``smoke``)."""
     path, shipped = Path(name), RECIPES / f"{name}.toml"
     if path.is_file() or not shipped.is_file():
         return path
@@ -47,7 +47,9 @@ def parse_recipe(text: str, source: str = "recipe") -> Recipe:
 def check_recipe(raw: dict[str, Any], source: str = "recipe") -> Recipe:
     """Check a recipe that is a dict already."""
     height = height_faults(raw)
-    faults = [*structural_faults(Recipe, raw), *height, *semantic_faults(_judgeable(raw, strokes=not height))]
+    found = [*height, *semantic_faults(_judgeable(raw, strokes=not height))]
+    explained = {fault.path for fault in found}  # better than that the key is unknown
+    faults = [*(f for f in structural_faults(Recipe, raw) if not (f.unknown and f.path in explained)), *found]
     if faults:
         count = f"{len(faults)} fault" + "s" * (len(faults) > 1)
         raise RecipeError("\n".join([f"{source} has {count}:", *(f"  {fault}" for fault in faults)]))

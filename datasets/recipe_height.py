@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from phibench.datasets.recipe import MIN_STROKE_M, RigTable, RoomTable
 from phibench.datasets.recipe_faults import Fault
-from phibench.datasets.recipe_scene import build_rig, build_room
+from phibench.datasets.recipe_scene import build_rig, build_room, ceiling_m
 from phibench.scenes.checks import SceneError
 
 
@@ -20,14 +20,13 @@ def height_faults(raw: dict[str, Any]) -> list[Fault]:
         rig = build_rig(table)
     except (ValidationError, SceneError):
         return []
-    places = (surface.T_world_shape for surface in room.surfaces)
-    ceiling_m = min(place.translation_m[2] for place in places if place.R[2, 2] < -0.5)  # lamps hang from it
+    limit_m = ceiling_m(room)
     top_m = rig.at(MIN_STROKE_M).sphere_centre_m[2] + rig.mirror.radius_m
-    if top_m < ceiling_m:
+    if top_m < limit_m:
         return []
     key = "z_c_m" if table.camera_height_m is None else "camera_height_m"
     value = getattr(table, key)
     if value is None:
         key, value = "radius_m", rig.mirror.radius_m
-    text = f"{value} puts the mirror's top at {top_m:.3f} m when it is down, through the ceiling at {ceiling_m:.2f} m"
-    return [Fault(f"rig.{key}", f"{text}; give less than {value - (top_m - ceiling_m):.3f}")]
+    text = f"{value} puts the mirror's top at {top_m:.3f} m when it is down, through the ceiling at {limit_m:.2f} m"
+    return [Fault(f"rig.{key}", f"{text}; give less than {value - (top_m - limit_m):.3f}")]

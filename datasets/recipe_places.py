@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
+
+import numpy as np
 
 from phibench.datasets.recipe import LaserTable, TargetTable
 from phibench.datasets.recipe_faults import Fault
 from phibench.datasets.recipe_scene import build_spot, build_target
-from phibench.scenes.catalog import BOARD_SIZE_M, board
-from phibench.scenes.rig import Rig
+from phibench.scenes.catalog import BOARD_SIZE_M, Target, board
+from phibench.scenes.rig import Rig, View
 from phibench.scenes.robot import carriage
+from phibench.scenes.solids import Cuboid
 
 Targets = Sequence[tuple[int, TargetTable]]
+_HOUSING_REACH_M = 0.1  # housing and mast stay within this of the lens
 
 
 def boards_in_the_way(rig: Rig, strokes_m: Sequence[float], targets: Targets) -> Iterator[Fault]:
@@ -36,9 +41,37 @@ def spots_on_boards(laser: LaserTable | None, targets: Targets) -> Iterator[Faul
             yield Fault(f"targets[{i}]", f"{text}; make laser.diameter_m (or its growth) smaller")
 
 
+class Boards:
+    """Boards of a room, for many rigs: nearly all are too far from the carriage to be asked."""
+
+    def __init__(self, targets: Sequence[Target]) -> None:
+        self._plates = [board(target) for target in targets]
+        self._centres_m = np.array([plate.T_world_shape.translation_m for plate in self._plates]).reshape(-1, 3)
+
+    def cut_by(self, rig: Rig, stroke_m: float) -> str | None:
+        """Say which board a rig cuts at an end of its stroke; None if none."""
+        lens_m = rig.T_world_camera.t
+        reach_m = float(np.linalg.norm(rig.sphere_in_camera_m[:2])) + rig.mirror.radius_m + _HOUSING_REACH_M
+        reach_m += abs(stroke_m) * math.hypot(*rig.stroke_axis_world[:2]) + rig.sphere_in_camera_m[2] * _tilt(rig)
+        near = np.hypot(*(self._centres_m - lens_m)[:, :2].T) < reach_m + math.hypot(*BOARD_SIZE_M)
+        for k in np.flatnonzero(near):
+            for offset_m in (0.0, stroke_m):
+                if hit := _cut(rig.at(offset_m), self._plates[k]):
+                    return f"the {self._plates[k].name} cuts the {hit} at stroke {offset_m:g} m"
+        return None
+
+
+def _tilt(rig: Rig) -> float:
+    """Sine of the angle between the optical axis and the vertical."""
+    return math.hypot(*rig.T_world_camera.R[:2, 2])
+
+
 def _hit(rig: Rig, offset_m: float, target: TargetTable) -> str | None:
     """What a board cuts with the carriage at an offset; None if nothing."""
-    plate, view = board(build_target(target)), rig.at(offset_m)
-    if plate.distance_m(view.sphere_centre_m) <= rig.mirror.radius_m:
+    return _cut(rig.at(offset_m), board(build_target(target)))
+
+
+def _cut(view: View, plate: Cuboid) -> str | None:
+    if plate.distance_m(view.sphere_centre_m) <= view.rig.mirror.radius_m:
         return "mirror"
     return next((part.name.replace("_", " ") for part in carriage(view) if plate.meets(part)), None)

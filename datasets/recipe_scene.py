@@ -12,7 +12,7 @@ from phibench.datasets.recipe import LaserTable, RigTable, RoomTable, TargetTabl
 from phibench.scenes.camera import Camera
 from phibench.scenes.catalog import RIGS, ROOMS, Target
 from phibench.scenes.checks import SceneError
-from phibench.scenes.frames import Pose, as_vector, rotation_xyz
+from phibench.scenes.frames import Pose, Vector, as_vector, rotation_xyz
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.rig import Rig
@@ -57,17 +57,33 @@ def build_room(table: RoomTable, targets: Iterable[TargetTable]) -> Room:
 def build_spot(laser: LaserTable, target: TargetTable) -> LaserSpot:
     """Laser spot at the centre of a target board."""
     board = build_target(target)
-    growing = laser.diameter_base_m + laser.diameter_growth_m_per_m * target.depth_m
-    common = growing if laser.diameter_m is None else laser.diameter_m
+    diameter_m = grown_diameter_m(laser, target.depth_m) if target.diameter_m is None else target.diameter_m
+    return make_spot(laser, board.position_world_m, board.normal_world, diameter_m)
+
+
+def grown_diameter_m(laser: LaserTable, depth_m: float) -> float:
+    """Diameter of a spot at a distance from the axis, unless its target says otherwise."""
+    growing = laser.diameter_base_m + laser.diameter_growth_m_per_m * depth_m
+    return growing if laser.diameter_m is None else laser.diameter_m
+
+
+def make_spot(laser: LaserTable, position_world_m: Vector, normal_world: Vector, diameter_m: float) -> LaserSpot:
+    """Spot of the recipe's laser somewhere."""
     return LaserSpot(
-        position_world_m=board.position_world_m,
-        normal_world=board.normal_world,
-        diameter_m=common if target.diameter_m is None else target.diameter_m,
+        position_world_m=position_world_m,
+        normal_world=normal_world,
+        diameter_m=diameter_m,
         albedo=laser.albedo,
         power_w=laser.power_w,
         wavelength_nm=laser.wavelength_nm,
         profile=laser.profile,
     )
+
+
+def ceiling_m(room: Room) -> float:
+    """Height of the lowest thing that hangs from the ceiling: the lamps."""
+    places = (surface.T_world_shape for surface in room.surfaces)
+    return min(place.translation_m[2] for place in places if place.R[2, 2] < -0.5)  # those that face down
 
 
 def _given(table: RigTable, keys: Iterable[str]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, model_validator
@@ -101,9 +101,10 @@ class SpotRow(Document):
 class ManifestRow(Document):
     """One stroke pair: one line of `manifest.jsonl`."""
 
-    sample_id: str = _field("-", "<experiment>-<target>-h<stroke>")
-    experiment: str = _field("-", "name of the experiment in the recipe")
-    target: str = _field("-", "name of the target in the recipe")
+    sample_id: str = _field("-", "<experiment>-<target>-h<stroke>, or random-<number> for a drawn sample")
+    experiment: str = _field("-", "name of the experiment in the recipe, or 'random'")
+    target: str = _field("-", "name of the target in the recipe, or of what carries the spot")
+    rig: str = _field("-", "id of the rig, in `rigs.jsonl`")
     depth_m: float = _field("m", "D: horizontal distance of the spot from the vertical through the sphere centre, down")
     stroke_m: float = _field("m", "stroke (baseline) h")
     spot_world_m: Vector3 = _field("m", "centre of the laser spot")
@@ -111,6 +112,8 @@ class ManifestRow(Document):
     spot_diameter_m: float = _field("m", "diameter of the spot: 4 sigma if gaussian, of the disc if uniform")
     down: SpotRow = _field("-", "stroke position 1, offset 0")
     up: SpotRow = _field("-", "stroke position 2, offset stroke_m")
+    tries: int = _field("-", "which draw was the first possible one; 1 is the sequence's own; 0 if nothing is drawn")
+    drawn: dict[str, float | str] = _field("-", "what was drawn, by parameter; empty if nothing is")
 
     def position(self, name: str) -> SpotRow:
         """Truth of the stroke position "down" or "up"."""
@@ -121,9 +124,17 @@ class PoseInfo(Document):
     """One mirror pose in `dataset.json`."""
 
     pose: str = _field("-", "id")
+    rig: str = _field("-", "id of the rig")
     offset_m: float = _field("m", "carriage offset along the stroke axis")
     ambient_seed: int = _field("-", "32-bit seed of the ambient layer")
     files: dict[str, str] = _field("-", "ambient, truth, preview")
+
+
+class RigInfo(Document):
+    """One rig: one line of `rigs.jsonl`."""
+
+    rig: str = _field("-", "id: `rig` is that of the recipe's `[rig]`, a drawn one is called after its first sample")
+    resolved: dict[str, Any] = _field("-", "the rig, field by field")
 
 
 class DatasetInfo(Document):
@@ -133,7 +144,7 @@ class DatasetInfo(Document):
     name: str = _field("-", "name of the data set")
     recipe: dict[str, Any] = _field("-", "the recipe, defaults filled in")
     recipe_sha256: str = _field("-", "SHA-256 of the recipe's values as canonical JSON")
-    rig: dict[str, Any] = _field("-", "resolved rig")
+    rigs: int = _field("-", "number of rigs, the lines of `rigs.jsonl`")
     room: dict[str, Any] = _field("-", "resolved room, all shapes")
     object_names: Annotated[tuple[str, ...], Field(strict=False)] = _field("-", "name by object_id of the truth layers")
     poses: Annotated[tuple[PoseInfo, ...], Field(strict=False)] = _field("-", "all mirror poses")
@@ -157,9 +168,16 @@ def flat(document: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]
             yield prefix + key, value
 
 
+def drawn_columns(rows: Iterable[ManifestRow]) -> dict[str, type]:
+    """Dotted names and types of the columns for what was drawn, in the order of their first appearance."""
+    return {f"drawn.{name}": type(value) for row in rows for name, value in row.drawn.items()}
+
+
 def columns(model: type[BaseModel] = ManifestRow, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted name and field of every leaf of a document, in order."""
+    """Dotted name and field of every leaf of a document, in order, but for `drawn`, whose keys depend on the recipe."""
     for name, field in model.model_fields.items():
+        if name == "drawn":
+            continue
         inner = next((kind for kind in _kinds(field.annotation) if _is_document(kind)), None)
         if inner is None:
             yield prefix + name, field

@@ -28,10 +28,12 @@ def shard_plan(plan: Plan, shard: str | None) -> Plan:
     if first == end:
         raise DatasetError(f"shard {shard} is empty: there are {len(plan.pairs)} samples; use at most as many shards")
     pairs = plan.pairs[first:end]
-    poses, targets = {pair.pose_id(p) for pair in pairs for p in POSITIONS}, {pair.target for pair in pairs}
+    poses, spots = {pair.pose_id(p) for pair in pairs for p in POSITIONS}, {pair.spot for pair in pairs}
+    rigs = {pair.rig for pair in pairs}
     return replace(
         plan,
-        spots={name: spot for name, spot in plan.spots.items() if name in targets},
+        rigs={name: rig for name, rig in plan.rigs.items() if name in rigs},
+        spots={name: spot for name, spot in plan.spots.items() if name in spots},
         poses=tuple(pose for pose in plan.poses if pose.pose_id in poses),
         pairs=pairs,
         shard=f"{i}/{n}",

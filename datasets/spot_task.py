@@ -90,6 +90,7 @@ def manifest_row(rig: Rig, spot: LaserSpot, pair: PairPlan, down: SpotRow, up: S
         sample_id=pair.sample_id,
         experiment=pair.experiment,
         target=pair.target,
+        rig=pair.rig,
         depth_m=float(depth_m(np.array(spot.position_world_m), rig.at(0.0).sphere_centre_m)),
         stroke_m=pair.stroke_m,
         spot_world_m=_triple(spot.position_world_m),
@@ -97,6 +98,8 @@ def manifest_row(rig: Rig, spot: LaserSpot, pair: PairPlan, down: SpotRow, up: S
         spot_diameter_m=spot.diameter_m,
         down=down,
         up=up,
+        tries=pair.tries,
+        drawn=dict(pair.drawn),
     )
 
 

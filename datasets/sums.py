@@ -25,7 +25,7 @@ def data_files(folder: Path) -> list[str]:
         If `dataset.json` or the manifest, which name them, cannot be read.
     """
     rows = read_manifest(folder)
-    names = {layout.INFO, layout.MANIFEST, layout.TABLE, layout.RECIPE}
+    names = {layout.INFO, layout.MANIFEST, layout.TABLE, layout.RECIPE, layout.RIGS}
     info = read_info(folder)
     if from_json(Room, info.room).lit:
         names.add(layout.LIGHT_MAP)
@@ -80,7 +80,7 @@ def damaged(folder: Path) -> list[str]:
 
 
 def check_documents(folder: Path) -> None:
-    """Refuse a data set that is unfinished or whose `dataset.json` or manifest is not the listed one (cheap).
+    """Refuse a data set that is unfinished or whose `dataset.json`, manifest or rigs are not the listed ones (cheap).
 
     Raises
     ------
@@ -88,7 +88,7 @@ def check_documents(folder: Path) -> None:
         In one sentence.
     """
     listed = read_sums(folder)
-    for name in (layout.INFO, layout.MANIFEST):
+    for name in (layout.INFO, layout.MANIFEST, layout.RIGS):
         if fault := _fault(folder, name, listed.get(name, "")):
             raise DatasetError(f"{folder}: {fault}; run `phibench dataset verify` to see all faults")
 

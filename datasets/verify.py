@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +17,21 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.exr import read_exr
 from phibench.datasets.layers import SPOT_STACKS, read_ambient, read_ambient_variance, read_spot, read_truth
 from phibench.datasets.manifest import differences, same_number
-from phibench.datasets.plan import make_plan
 from phibench.datasets.progress import Steps
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.sample_task import noise_row, spot_noise
 from phibench.datasets.schema import PoseInfo, SpotRow
-from phibench.datasets.shard import shard_plan
 from phibench.datasets.spot_task import SpotAnswer, answer_spot
 from phibench.datasets.sums import damaged, read_sums, strays
+from phibench.datasets.verify_plan import plan_faults
 from phibench.render.bake import fixed_shapes
 from phibench.render.patches import cut, texel_count
-from phibench.scenes.rig import POSITIONS
+from phibench.scenes.laser import LaserSpot
+from phibench.scenes.rig import POSITIONS, View
+from phibench.scenes.room import Room
 
 _FLOAT32 = 1e-6  # float32 rounds by 6e-8; other machines' libm adds a little
+_ANSWERS = 64  # of 0.1 MB each
 _EDGE_PIXELS = 8  # pixels whose ray grazes an edge may see another object on another machine
 
 
@@ -88,7 +91,7 @@ def verify(folder: str | Path, truth_layers: bool = True, console: Console | Non
     except DatasetError as error:
         return Report((*faults, str(error)), files, 0, notes)
     bad = {fault.split(" is ", 1)[0] for fault in faults}
-    faults += [*_plan_faults(dataset), *differences(folder, dataset.rows)]
+    faults += [*plan_faults(dataset), *differences(folder, dataset.rows)]
     faults += _content_faults(dataset, bad, truth_layers, console)
     return Report(tuple(dict.fromkeys(faults)), files, len(dataset), notes)
 
@@ -96,41 +99,25 @@ def verify(folder: str | Path, truth_layers: bool = True, console: Console | Non
 def _content_faults(dataset: Dataset, bad: set[str], truth_layers: bool, console: Console) -> list[str]:
     """Faults of spots and views; files in `bad` are reported already and not opened."""
     faults: list[str] = []
-    answers: dict[tuple[str, float], SpotAnswer] = {}
+    answer = lru_cache(_ANSWERS)(answer_spot)  # neighbours share spots and poses
     with Steps(console, "verify", len(dataset) + len(dataset.info.poses)) as steps:
         for sample in dataset:
             for position in POSITIONS:
-                faults += _spot_faults(sample, position, answers, bad)
+                faults += _guarded(_spot_faults(sample, position, answer, bad))
             steps.advance()
         if dataset.room.lit and layout.LIGHT_MAP not in bad:
             faults += _guarded(_light_map_faults(dataset))
         for pose in dataset.info.poses:
-            faults += _view_faults(dataset, pose, bad, truth_layers)
+            faults += _guarded(_view_faults(dataset, pose, bad, truth_layers))
             steps.advance()
     return faults
 
 
-def _plan_faults(dataset: Dataset) -> Iterator[str]:
-    plan = shard_plan(make_plan(dataset.recipe), dataset.info.shard)
-    planned, found = {pair.sample_id for pair in plan.pairs}, [row.sample_id for row in dataset.rows]
-    for name in sorted(planned - set(found)):
-        yield f"{layout.MANIFEST}: sample {name} of the recipe is missing"
-    for name in sorted(set(found) - planned):
-        yield f"{layout.MANIFEST}: sample {name} is not in the recipe"
-    if len(set(found)) != len(found):
-        yield f"{layout.MANIFEST}: a sample is listed twice"
-    if [pose.pose for pose in dataset.info.poses] != [pose.pose_id for pose in plan.poses]:
-        yield f"{layout.INFO}: the poses are not those of the recipe"
-
-
 def _spot_faults(
-    sample: Sample, position: str, answers: dict[tuple[str, float], SpotAnswer], bad: set[str]
+    sample: Sample, position: str, solve: Callable[[View, LaserSpot, Room], SpotAnswer], bad: set[str]
 ) -> Iterator[str]:
     row, name = sample.truth_row(position), f"{sample.row.sample_id} {position}"
-    key = (sample.row.target, row.offset_m)
-    if key not in answers:
-        answers[key] = answer_spot(sample.view(position), sample.laser_spot, sample.dataset.room)
-    answer = answers[key]
+    answer = solve(sample.view(position), sample.laser_spot, sample.dataset.room)
     for field, expected in _expected(answer):
         if not _same(getattr(row, field), expected):
             yield f"{name}: {field} is {getattr(row, field)}, the parameters give {expected}"
@@ -189,7 +176,7 @@ def _noise_faults(sample: Sample, position: str, row: SpotRow, answer: SpotAnswe
 
 
 def _view_faults(dataset: Dataset, pose: PoseInfo, bad: set[str], truth_layers: bool) -> Iterator[str]:
-    camera = dataset.rig.camera
+    camera = dataset.rigs[pose.rig].camera
     shape = (camera.height_px, camera.width_px)
     for kind in ("ambient", "truth"):
         if pose.files[kind] not in bad:
@@ -232,7 +219,7 @@ def _light_map_faults(dataset: Dataset) -> Iterator[str]:
 def _truth_faults(dataset: Dataset, pose: PoseInfo, shape: tuple[int, int]) -> Iterator[str]:
     from phibench.render.truth import truth_layer
 
-    stored, view = read_truth(dataset.folder / pose.files["truth"]), dataset.rig.at(pose.offset_m)
+    stored, view = read_truth(dataset.folder / pose.files["truth"]), dataset.rigs[pose.rig].at(pose.offset_m)
     expected = truth_layer(view, dataset.room.shapes(view))
     for name, plane in stored.items():
         if plane.shape != shape:

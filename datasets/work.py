@@ -56,28 +56,30 @@ class _Makers:
 
     def __init__(self, plan: Plan, versions: Mapping[str, Any]) -> None:
         self._plan, self._versions = plan, dict(versions)
-        self._scene = [_digest(to_json(plan.rig)), _digest(to_json(plan.room))]
+        self._room = _digest(to_json(plan.room))
+        self._rigs = {name: _digest(to_json(rig)) for name, rig in plan.rigs.items()}
         self._spots = {name: to_json(spot) for name, spot in plan.spots.items()}
 
     def spot(self, pair: PairPlan) -> Task:
         plan = self._plan
-        name = plan.recipe.dataset.name
-        inputs = ["spot", name, *self._scene, self._spots[pair.target], asdict(pair)]
-        key = self._key(inputs, make_spot)
-        return Task(spot_task_name(pair), key, make_spot, (name, plan.rig, plan.room, plan.spots[pair.target], pair))
+        name, rig, spot = plan.recipe.dataset.name, plan.rigs[pair.rig], plan.spots[pair.spot]
+        key = self._key(
+            ["spot", name, self._rigs[pair.rig], self._room, self._spots[pair.spot], asdict(pair)], make_spot
+        )
+        return Task(spot_task_name(pair), key, make_spot, (name, rig, plan.room, spot, pair))
 
     def bake(self) -> Task:
         plan, ambient = self._plan, self._plan.recipe.ambient
-        settings = asdict(bake_settings(ambient))
-        key = self._key(["bake", *self._scene, settings], bake_room)
+        scene = [_digest(to_json(plan.rig)), self._room]
+        key = self._key(["bake", *scene, asdict(bake_settings(ambient))], bake_room)
         return Task("bake room", key, bake_room, (plan.rig, plan.room, ambient))
 
     def view(self, pose: PosePlan, bakes: Sequence[Task]) -> Task:
         plan = self._plan
         name, ambient = plan.recipe.dataset.name, plan.recipe.ambient
-        inputs = ["view", name, *self._scene, asdict(pose), ambient.model_dump()]
+        inputs = ["view", name, self._rigs[pose.rig], self._room, asdict(pose), ambient.model_dump()]
         key = self._key(inputs, render_view, tuple(task.key for task in bakes))
-        arguments, needs = (name, plan.rig, plan.room, pose, ambient), tuple(task.name for task in bakes)
+        arguments, needs = (name, plan.rigs[pose.rig], plan.room, pose, ambient), tuple(task.name for task in bakes)
         return Task(f"view {pose.pose_id}", key, render_view, arguments, needs)
 
     def sample(self, pair: PairPlan, spot: Task, views: Mapping[str, Task]) -> Task:
@@ -87,7 +89,7 @@ class _Makers:
         keys = tuple(task.key for task in (spot, *needs))
         key = self._key(["sample", pair.sample_id], finish_sample, keys)
         names = tuple(task.name for task in (spot, *needs))
-        arguments = (pair, self._plan.rig, self._plan.room, self._plan.spots[pair.target])
+        arguments = (pair, self._plan.rigs[pair.rig], self._plan.room, self._plan.spots[pair.spot])
         return Task(sample_task_name(pair), key, finish_sample, arguments, names)
 
     def _key(self, inputs: Any, function: Any, needs: tuple[str, ...] = ()) -> str:

@@ -82,7 +82,7 @@ def make(
     Parameters
     ----------
     recipe
-        TOML file, or the name of a shipped recipe ("paper", "smoke").
+        TOML file, or the name of a shipped recipe ("paper", "random", "smoke").
     out
         Folder to write; one that holds another data set is refused.
     workers

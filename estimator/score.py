@@ -35,6 +35,10 @@ class Sample(Protocol):
     def row(self) -> Any:
         """Manifest row."""
 
+    @property
+    def rig(self) -> Rig:
+        """The sample's rig, at the down position."""
+
     def frame(self, position: str, laser: bool = True) -> Array:
         """Noise-free frame, shape (3, H, W), electrons per second."""
 
@@ -45,10 +49,6 @@ class Dataset(Protocol):
     @property
     def samples(self) -> Sequence[Any]:
         """All samples, visible or not."""
-
-    @property
-    def rig(self) -> Rig:
-        """The rig at the down position."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def score(dataset: Dataset) -> tuple[Score, ...]:
         Every sample appears for every estimator and source; what cannot be estimated carries its cause.
     """
     return tuple(
-        _score_one(dataset.rig, sample.row, name, source, pixels)
+        _score_one(sample.rig, sample.row, name, source, pixels)
         for sample in dataset.samples
         for source in SOURCES
         for pixels in (_pixels(sample, source),)

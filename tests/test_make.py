@@ -52,7 +52,7 @@ def test_everything_is_there(tiny_dataset: Path) -> None:
     spots = {layout.spot_file(pair.sample_id, position) for pair in plan.pairs for position in ("down", "up")}
     spots.remove("spots/half-hidden-h1.400-down.exr")  # a crate hides it
     previews = {layout.preview_file(pair.sample_id) for pair in plan.pairs}
-    single = {layout.INFO, layout.MANIFEST, layout.TABLE, layout.RECIPE, layout.LIGHT_MAP}
+    single = {layout.INFO, layout.MANIFEST, layout.TABLE, layout.RECIPE, layout.RIGS, layout.LIGHT_MAP}
     assert set(read_sums(tiny_dataset)) == views | spots | previews | single == set(data_files(tiny_dataset))
     assert damaged(tiny_dataset) == []
     assert (tiny_dataset / layout.RECIPE).read_bytes() == TINY.read_bytes()

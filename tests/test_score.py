@@ -42,12 +42,12 @@ def make_sample(published, spot, *, shift_px=0.0, frame=draw, **hidden):
     )
     ambient = np.full((3, 720, 1280), 123.25)
     return SimpleNamespace(
-        row=row, frame=lambda position, laser=True: ambient + frame(uv[position]) if laser else ambient
+        row=row, rig=RIG, frame=lambda position, laser=True: ambient + frame(uv[position]) if laser else ambient
     )
 
 
 def make_dataset(*samples):
-    return SimpleNamespace(samples=samples, rig=RIG)
+    return SimpleNamespace(samples=samples)
 
 
 @pytest.fixture(scope="module")

@@ -70,6 +70,7 @@ def flip_a_bit(path: Path) -> None:
         layout.LIGHT_MAP,
         layout.TABLE,
         layout.RECIPE,
+        layout.RIGS,
         layout.preview_file("seen-near-h0.500"),
         layout.MANIFEST,
     ],
@@ -176,13 +177,14 @@ def test_a_truth_that_the_parameters_do_not_give_is_found(copy: Path) -> None:
 
 
 def test_a_changed_rig_is_found(copy: Path) -> None:
-    info = json.loads((copy / layout.INFO).read_text())
-    info["rig"]["mirror"]["radius_m"] += 1e-6
-    (copy / layout.INFO).write_text(json.dumps(info))
+    rig = json.loads((copy / layout.RIGS).read_text())
+    rig["resolved"]["mirror"]["radius_m"] += 1e-6
+    (copy / layout.RIGS).write_text(json.dumps(rig))
     write_sums(copy)
     faults = check(copy).faults
     assert any("u_px" in fault for fault in faults)
     assert any("phi_ray_rad" in fault for fault in faults)
+    assert "rigs.jsonl: rig is not the rig that the recipe gives" in faults
 
 
 def test_a_missing_row_is_found(copy: Path) -> None:

@@ -1,0 +1,172 @@
+"""The samples of `[random]`: a rig, a spot and a stroke for each.
+
+Sample i is a function of the recipe without its number of samples, and of i. Where rig, spot and stroke do not go
+together (or with the room), the sample is drawn again from streams of its own (`sampling.further_points`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from phibench.datasets.distribution import DistributionTable, pick, quantile
+from phibench.datasets.errors import RecipeError
+from phibench.datasets.random_spot import Placed, place
+from phibench.datasets.recipe import RandomTable, Recipe, RigTable
+from phibench.datasets.recipe_places import Boards
+from phibench.datasets.recipe_scene import build_rig, build_target, ceiling_m
+from phibench.datasets.sampling import PARAMETERS, first_points, further_points
+from phibench.scenes.checks import SceneError
+from phibench.scenes.frames import Array
+from phibench.scenes.laser import LaserSpot
+from phibench.scenes.rig import Rig
+from phibench.scenes.room import Room
+
+TRIES = 100
+_PILOT = 8  # samples
+_NANOMETRE = 9  # decimals of a stroke: a pose's name then says its offset exactly
+
+Value = float | str
+
+
+@dataclass(frozen=True)
+class RandomSample:
+    """A drawn sample.
+
+    Attributes
+    ----------
+    number : int
+        Place in the sequence, from 0.
+    tries : int
+        Which draw was the first possible one; 1 is the sequence's own.
+    drawn : tuple of (parameter, value)
+        In the order of `sampling.PARAMETERS`.
+    surface : str
+        Name of the target, or of what carries the spot.
+    """
+
+    number: int
+    tries: int
+    drawn: tuple[tuple[str, Value], ...]
+    rig: Rig
+    surface: str
+    spot: LaserSpot
+    stroke_m: float
+
+
+def draw_samples(recipe: Recipe, table: RandomTable, room: Room) -> tuple[RandomSample, ...]:
+    """All samples of a recipe with `[random]`.
+
+    Raises
+    ------
+    RecipeError
+        If a sample stays impossible after `TRIES` draws, with the reason of the last one.
+    """
+    makers = _Makers(recipe, table, room)
+    pilot = min(_PILOT, table.samples)  # whether the recipe is possible at all is known after a few
+    return (*makers.draw(range(pilot)), *makers.draw(range(pilot, table.samples)))
+
+
+def rig_table(table: RigTable, values: Mapping[str, Value]) -> RigTable:
+    """`[rig]` with drawn numbers, by parameter; a drawn `fx_px` is `fy_px` as well where nothing else gives it."""
+    drawn = {key.removeprefix("rig."): value for key, value in values.items() if key.startswith("rig.")}
+    if "fx_px" in drawn and table.fy_px is None:
+        drawn.setdefault("fy_px", drawn["fx_px"])
+    return table.model_copy(update=drawn)
+
+
+class _Makers:
+    """What all draws of a recipe share."""
+
+    def __init__(self, recipe: Recipe, table: RandomTable, room: Room) -> None:
+        self._recipe, self._table, self._room = recipe, table, room
+        self._targets = {target.name: target for target in recipe.targets}
+        self._boards = Boards([build_target(target) for target in recipe.targets])
+        self._ceiling_m = ceiling_m(room)
+        dataset = recipe.dataset
+        self._first = first_points(table.sequence, dataset.name, dataset.seed, table.samples)
+
+    def draw(self, numbers: range) -> list[RandomSample]:
+        """Draw some samples, those that are impossible again until they are not."""
+        found: dict[int, RandomSample] = {}
+        left = list(numbers)
+        for attempt in range(TRIES):
+            outcomes = self._once(left, attempt)
+            found |= {number: sample for number, sample in outcomes.items() if isinstance(sample, RandomSample)}
+            left = [number for number in left if number not in found]
+            if not left:
+                return [found[number] for number in numbers]
+        text = f"sample {left[0]} has no possible rig, spot and stroke in {TRIES} draws; the last: {outcomes[left[0]]}"
+        raise RecipeError(f"random: {text}; narrow the distributions or move the boards")
+
+    def _once(self, numbers: list[int], attempt: int) -> dict[int, RandomSample | str]:
+        """Draw some samples once; the reason instead of a sample that is impossible."""
+        values = draw_values(self._table, list(self._targets), self._points(numbers, attempt))
+        spots = place(self._recipe.laser, self._room, self._targets, values)
+        rows = [tuple((name, _plain(column[k])) for name, column in values.items()) for k in range(len(numbers))]
+        return {
+            number: self._sample(number, attempt + 1, drawn, spot)
+            for number, drawn, spot in zip(numbers, rows, spots, strict=True)
+        }
+
+    def _points(self, numbers: list[int], attempt: int) -> dict[str, Array]:
+        drawn = drawn_parameters(self._table)
+        if attempt == 0:
+            return {name: self._first[name][numbers] for name in drawn}
+        dataset = self._recipe.dataset
+        return further_points(dataset.name, dataset.seed, drawn, numbers, attempt)
+
+    def _sample(
+        self, number: int, tries: int, drawn: tuple[tuple[str, Value], ...], placed: Placed
+    ) -> RandomSample | str:
+        if isinstance(placed, str):
+            return placed
+        values = dict(drawn)
+        stroke_m = float(values["stroke_m"])
+        try:
+            rig = build_rig(rig_table(self._recipe.rig, values))
+        except SceneError as error:
+            return str(error)
+        if fault := self._rig_fault(rig, stroke_m):
+            return fault
+        return RandomSample(number, tries, drawn, rig, placed[0], placed[1], stroke_m)
+
+    def _rig_fault(self, rig: Rig, stroke_m: float) -> str | None:
+        sphere_m = rig.T_world_camera.points(rig.sphere_in_camera_m)  # `rig.at` takes ten times as long
+        top_m = sphere_m[2] + stroke_m * rig.stroke_axis_world[2] + rig.mirror.radius_m
+        if top_m >= self._ceiling_m:
+            return f"the mirror's top at {top_m:.3f} m is above the ceiling's lamps at {self._ceiling_m:.2f} m"
+        return self._boards.cut_by(rig, stroke_m)
+
+
+def drawn_parameters(table: RandomTable) -> list[str]:
+    """What a recipe draws, in the order of `sampling.PARAMETERS`."""
+    chosen = dict(_distributions(table))
+    return [name for name in PARAMETERS if name in chosen or (name == "spot.target" and not table.spot.by_ray)]
+
+
+def draw_values(table: RandomTable, targets: list[str], points: Mapping[str, Array]) -> dict[str, Any]:
+    """Values of all samples by parameter, for the points in [0, 1) of each."""
+    chosen = dict(_distributions(table))
+    values: dict[str, Any] = {name: quantile(chosen[name], u) for name, u in points.items() if name in chosen}
+    values["stroke_m"] = np.round(values["stroke_m"], _NANOMETRE)
+    if "spot.target" in points:
+        names = targets if table.spot.target is None else table.spot.target.choice
+        values["spot.target"] = pick(names, points["spot.target"])
+    return {name: values[name] for name in points}
+
+
+def _distributions(table: RandomTable) -> Iterator[tuple[str, DistributionTable]]:
+    """Parameter and distribution of every number that is drawn."""
+    yield "stroke_m", table.stroke_m
+    for prefix, group in (("rig", table.rig), ("spot", table.spot)):
+        for key in type(group).model_fields:
+            if isinstance(value := getattr(group, key), DistributionTable):
+                yield f"{prefix}.{key}", value
+
+
+def _plain(value: Any) -> Value:
+    return value if isinstance(value, str) else float(value)

@@ -1,0 +1,72 @@
+"""The rigs of a data set: `rigs.jsonl`, one line each, rebuilt when they are asked for."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from phibench.datasets import layout
+from phibench.datasets.codec import from_json, to_json
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.recipe_faults import nearest
+from phibench.datasets.schema import RigInfo
+from phibench.scenes.rig import Rig
+
+
+@dataclass(frozen=True)
+class Rigs:
+    """Rigs by id, as JSON documents: a large data set has as many as samples, and few are looked at."""
+
+    documents: dict[str, dict[str, Any]]
+
+    def __len__(self) -> int:
+        return len(self.documents)
+
+    def __getitem__(self, name: str) -> Rig:
+        if name not in self.documents:
+            raise DatasetError(f"{layout.RIGS} has no rig '{name}'; {nearest(name, list(self.documents)[:20])}")
+        if name not in self._built:
+            self._built[name] = from_json(Rig, self.documents[name])
+        return self._built[name]
+
+    @cached_property
+    def _built(self) -> dict[str, Rig]:
+        return {}
+
+
+def rigs_text(rigs: Mapping[str, Rig]) -> str:
+    """Text of `rigs.jsonl`; doubles are written so that reading gives the same bits."""
+    lines = (json.dumps({"rig": name, "resolved": to_json(rig)}, allow_nan=False) for name, rig in rigs.items())
+    return "".join(line + "\n" for line in lines)
+
+
+def read_rigs(folder: Path) -> Rigs:
+    """Rigs of a data set.
+
+    Raises
+    ------
+    DatasetError
+        If the file is missing, or with the number of the first line that is not a rig.
+    """
+    path = folder / layout.RIGS
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    except FileNotFoundError as error:
+        raise DatasetError(f"{path} is missing") from error
+    except OSError as error:
+        raise DatasetError(f"{path} is not readable: {error.strerror or error}") from error
+    infos = (_info(path, number, line) for number, line in enumerate(lines, 1))
+    return Rigs({info.rig: info.resolved for info in infos})
+
+
+def _info(path: Path, number: int, line: str) -> RigInfo:
+    try:
+        return RigInfo.model_validate_json(line)
+    except ValidationError as error:
+        raise DatasetError(f"{path} line {number} is damaged: {error.errors()[0]['msg']}") from error
