@@ -186,7 +186,7 @@ def test_what_is_damaged_is_made_again(made: Path, copy: Path) -> None:
 def test_the_forecast_counts_every_view(made: Path) -> None:
     drawn = make_plan(load_recipe(TINY))
     cost = estimate(drawn, plan_tasks(drawn, {}).values())
-    assert cost.counts == {"spot": 3, "bake": 1, "view": 6, "preview": 3}
+    assert cost.counts == {"spot": 3, "bake": 1, "view": 6, "sample": 3}
     size = sum(len(data) for data in contents(made).values())
     assert 0.8 < cost.size / size < 1.6
 
