@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from phibench.datasets.errors import RecipeError
 from phibench.datasets.recipe import Recipe
 from phibench.datasets.recipe_scene import build_rig, build_room, build_spot
-from phibench.datasets.streams import seed_32
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
 from phibench.scenes.room import Room
+from phibench.scenes.streams import seed_32
 
 
 @dataclass(frozen=True)

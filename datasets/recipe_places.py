@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from phibench.datasets.recipe import LaserTable, TargetTable
-from phibench.datasets.recipe_faults import Fault
 from phibench.datasets.recipe_scene import build_spot, build_target
+from phibench.render.model_faults import Fault
 from phibench.scenes.catalog import BOARD_SIZE_M, board
 from phibench.scenes.rig import Rig
 from phibench.scenes.robot import carriage
