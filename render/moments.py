@@ -10,7 +10,8 @@ Closed form of a pixel with mean charge m (light x PRNU + dark current), system 
 
 1/12 DN^2 is the rounding's, once per pixel. For a noise of s DN before rounding it is off by up to
 (4 s^2 + 1/pi^2) exp(-2 pi^2 s^2) DN^2 (Sheppard's correction, first harmonic): 1e-8 at 1 DN, but 0.07 at the 0.32 DN of
-a dark pixel at gain 1, whose moments are better drawn. Full well and converter's ends are taken as out of reach. Speckle flicker adds the outer product of the spot's DN with itself, over M.
+a dark pixel at gain 1, whose moments are better drawn. Full well and converter's ends are taken as out of reach.
+Speckle flicker adds the outer product of the spot's DN with itself, over M.
 """
 
 from __future__ import annotations
