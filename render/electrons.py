@@ -89,7 +89,9 @@ def _add_spot(electrons: Array, light: Light, sensor: Sensor, region: Region, fa
     )
     if min(common.shape) > 0:
         part = planes[(slice(None), *common.slices(window))]
-        electrons[(..., *common.slices(region))] += factor * sampled(part, sensor, (common.v0_px, common.u0_px))
+        here = electrons[(..., *common.slices(region))]
+        here += factor * sampled(part, sensor, (common.v0_px, common.u0_px))
+        np.maximum(here, 0.0, out=here)  # a moving spot may undershoot
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from phibench.render.model_faults import structural_faults
 from phibench.scenes.names import nearest
@@ -79,12 +79,6 @@ class Sensor(BaseModel):
     exposure_max_s: float = Field(gt=0.0, le=10.0, description="longest automatic exposure")
     gain_max: float = Field(ge=1.0, le=16.0, description="largest automatic gain")
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Sensor:
-        for fault in _faults(self):
-            raise SensorError(f"sensor preset '{self.name}': {fault}")
-        return self
-
     @property
     def dn_per_e(self) -> float:
         """Overall system gain K, DN per electron, analogue gain included."""
@@ -130,9 +124,10 @@ def _tables() -> dict[str, Any]:
 
 
 def _checked(name: str, raw: dict[str, Any]) -> Sensor:
-    faults = structural_faults(Sensor, raw)
+    faults = [str(fault) for fault in structural_faults(Sensor, raw)]
+    faults = faults or _faults(Sensor.model_validate(raw))
     if faults:
-        raise SensorError(f"sensor preset '{name}': " + "; ".join(map(str, faults)))
+        raise SensorError(f"sensor preset '{name}': " + "; ".join(faults))
     return Sensor.model_validate(raw)
 
 

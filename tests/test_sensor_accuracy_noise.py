@@ -40,7 +40,7 @@ def p_value(counts: np.ndarray, mean: float) -> float:
 
 @pytest.mark.parametrize("mean", [0.5, 5.0, 50.0, 5000.0])
 def test_counts_follow_poisson(mean: float) -> None:
-    """A mean that is off by 3 % is seen with 512 x 512 pixels; a Gaussian of the same mean and variance too, below 50."""
+    """A mean that is off by 3 % is seen; below 50 a Gaussian of the same mean and variance, too."""
     region = Region.whole((512, 512))
     counts = poisson(STREAM.stage(str(mean)), np.full(region.shape, mean), region)
     assert p_value(counts, mean) > FALSE_ALARM

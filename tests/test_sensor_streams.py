@@ -62,7 +62,8 @@ from phibench.render.chain import Chain
 from phibench.render.light import Light
 from phibench.render.sensor import sensor
 from phibench.render.tiles import NoiseStream
-frame = Chain(sensor("mjpeg")).frame(Light.flat((6e4, 6e4, 6e4), (48, 48)), NoiseStream(("paper", 0, "s", "up", "on", 3)))
+light = Light.flat((6e4, 6e4, 6e4), (48, 48))
+frame = Chain(sensor("mjpeg")).frame(light, NoiseStream(("paper", 0, "s", "up", "on", 3)))
 print(hashlib.sha256(frame.tobytes()).hexdigest())
 """
     digests = {python(code, PYTHONHASHSEED=seed).stdout for seed in ("1", "2")}
