@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from phibench.render.light import Light
 from phibench.render.motion import moved_spot
 from phibench.render.region import Region
-from phibench.render.sensor import Sensor
+from phibench.render.sensor import Sensor, SensorError
 from phibench.render.tiles import NoiseStream, normal, poisson, row_normal
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
@@ -110,17 +110,21 @@ class FixedPattern:
     offset_e: Array | float
 
 
-@lru_cache(maxsize=4)
 def fixed_pattern(sensor: Sensor, camera_seed: int, region: Region) -> FixedPattern:
     """Fixed pattern of one camera on a region of whole tiles; read only, and kept for the next frame."""
+    return _pattern(sensor.prnu, sensor.dsnu_e, camera_seed, region)
+
+
+@lru_cache(maxsize=4)
+def _pattern(prnu: float, dsnu_e: float, camera_seed: int, region: Region) -> FixedPattern:
     stream = NoiseStream(("camera", camera_seed))
     responsivity: Array | float = 1.0
     offset_e: Array | float = 0.0
-    if sensor.prnu > 0.0:
-        # 0 where a spread of 20 % and more goes below: no pixel gives back light
-        responsivity = _kept(np.maximum(1.0 + sensor.prnu * normal(stream.stage("prnu"), region), 0.0))
-    if sensor.dsnu_e > 0.0:
-        offset_e = _kept(sensor.dsnu_e * normal(stream.stage("dsnu"), region))
+    if prnu > 0.0:
+        # a spread of 20 % may go below 0: such a pixel is dead
+        responsivity = _kept(np.maximum(1.0 + prnu * normal(stream.stage("prnu"), region), 0.0))
+    if dsnu_e > 0.0:
+        offset_e = _kept(dsnu_e * normal(stream.stage("dsnu"), region))
     return FixedPattern(responsivity, offset_e)
 
 
@@ -147,7 +151,15 @@ def mean_charge(photo_e: Array, sensor: Sensor, pattern: FixedPattern) -> Array:
 
 def collected(mean_e: Array, sensor: Sensor, stream: NoiseStream, region: Region) -> Array:
     """Charge in the wells, shape (h, w), on whole tiles: Poisson, cut at the full well."""
-    charge = poisson(stream.stage("shot"), mean_e, region) if sensor.shot_noise else mean_e
+    charge = mean_e
+    if sensor.shot_noise:
+        try:
+            charge = poisson(stream.stage("shot"), mean_e, region)
+        except ValueError as error:  # what numpy says of a mean below 0, NaN or above 9e18
+            raise SensorError(
+                f"layers: {mean_e.min():g} to {mean_e.max():g} expected electrons in a pixel; a layer must hold finite "
+                "numbers from 0 up, render it again"
+            ) from error
     return np.minimum(charge, sensor.full_well_e)
 
 

@@ -38,6 +38,11 @@ class NoiseStream:
         return np.random.Generator(np.random.Philox(key=philox_key(*self.names)))
 
 
+def frame_stream(dataset: str, seed: int, sample: str, position: str, laser: bool, draw: int) -> NoiseStream:
+    """Stream of one frame: every frame of a data set has its own, so that down and up, on and off are independent."""
+    return NoiseStream((dataset, seed, sample, position, "on" if laser else "off", draw))
+
+
 def whole_tiles(region: Region, size: tuple[int, int]) -> Region:
     """Smallest region of whole tiles around `region`, in an image of size (height, width)."""
     return region.grown(size, (TILE_PX, TILE_PX))

@@ -8,7 +8,7 @@ import pytest
 from sensor_light import room
 
 from phibench.render.chain import Chain
-from phibench.render.electrons import fixed_pattern
+from phibench.render.electrons import _pattern
 from phibench.render.region import Region
 from phibench.render.sensor import sensor
 from phibench.render.tiles import NoiseStream
@@ -45,7 +45,7 @@ def test_benchmark_region_of_a_new_camera(benchmark) -> None:
     chain, draws = Chain(sensor("mjpeg")), itertools.count()
 
     def region() -> int:
-        fixed_pattern.cache_clear()
+        _pattern.cache_clear()
         return int(chain.frame(LIGHT, STREAM.stage(next(draws)), REGION).max())
 
     assert benchmark(region) > 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from sensor_light import room
@@ -12,6 +14,7 @@ from phibench.render.jpeg import compressed
 from phibench.render.sensor import SensorError, preset_names, sensor
 from phibench.render.tiles import NoiseStream
 
+ROOT = Path(__file__).resolve().parent.parent
 STREAM = NoiseStream(("presets", 0))
 SHAPES = {
     "ideal": ((3, 48, 64), np.float64),
@@ -100,3 +103,20 @@ def test_a_typo_names_the_nearest_preset() -> None:
 def test_a_preset_is_immutable() -> None:
     with pytest.raises(ValueError, match="frozen"):
         sensor("mjpeg").exposure_s = 1.0  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("value", [-1.0, np.nan])
+def test_a_layer_below_zero_is_refused(value: float) -> None:
+    light = room((48, 64))
+    light.ambient_electrons_per_s[:, 20, 30] = value * 1e6
+    with pytest.raises(SensorError, match="a layer must hold finite numbers from 0 up"):
+        Chain(sensor("mjpeg")).frame(light, STREAM)
+
+
+def test_frames_need_no_mitsuba(python) -> None:
+    files = (ROOT / "render").glob("*.py")
+    modules = [file.stem for file in files if "mitsuba" not in file.read_text(encoding="utf-8")]
+    assert {"chain", "light", "motion", "moments", "photon_transfer", "auto_exposure"} <= set(modules)
+    code = "import importlib, sys\nsys.modules.update(mitsuba=None, drjit=None)\n"
+    child = python(code + "for name in sys.argv[1:]: importlib.import_module('phibench.render.' + name)", *modules)
+    assert child.returncode == 0, child.stderr

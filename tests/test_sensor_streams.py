@@ -12,7 +12,7 @@ from phibench.render.chain import Chain
 from phibench.render.light import Light
 from phibench.render.region import Region
 from phibench.render.sensor import sensor
-from phibench.render.tiles import TILE_PX, NoiseStream, normal, poisson
+from phibench.render.tiles import TILE_PX, NoiseStream, frame_stream, normal, poisson
 from phibench.scenes.streams import philox_key
 
 SIZE = (128, 128)
@@ -23,7 +23,7 @@ LIMIT = 6.0 / np.sqrt(PIXELS)
 
 
 def names(seed: int = 0, position: str = "down", laser: str = "on", draw: int = 0) -> NoiseStream:
-    return NoiseStream(("paper", seed, "table2-d3.180-h0.425", position, laser, draw))
+    return frame_stream("paper", seed, "table2-d3.180-h0.425", position, laser == "on", draw)
 
 
 def residual(stream: NoiseStream, camera_seed: int = 0, **changes: float) -> np.ndarray:
