@@ -18,7 +18,6 @@ from phibench.render.model_faults import structural_faults
 from phibench.scenes.names import nearest
 
 PRESETS_FILE = Path(__file__).with_name("sensor_presets.toml")
-OUTPUTS = ("electrons", "raw", "srgb8", "mjpeg")
 
 
 class SensorError(ValueError):
