@@ -10,10 +10,10 @@ from phibench.datasets.errors import RecipeError
 from phibench.datasets.random_samples import RandomSample, draw_samples
 from phibench.datasets.recipe import RandomTable, Recipe
 from phibench.datasets.recipe_scene import build_rig, build_room, build_spot
-from phibench.datasets.streams import seed_32
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
 from phibench.scenes.room import Room
+from phibench.scenes.streams import seed_32
 
 RECIPE_RIG = "rig"
 """Id of the rig of `[rig]`; a drawn one is called after the first sample that has it, such as ``r000042``."""

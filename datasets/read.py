@@ -23,11 +23,11 @@ from phibench.datasets.info import read_info
 from phibench.datasets.layers import SpotWindow, read_ambient, read_ambient_variance, read_spot, read_truth
 from phibench.datasets.manifest import read_manifest
 from phibench.datasets.recipe import Recipe
-from phibench.datasets.recipe_faults import nearest
 from phibench.datasets.rigs import Rigs, read_rigs
 from phibench.datasets.schema import DatasetInfo, ManifestRow, SpotRow
 from phibench.datasets.sums import check_documents
 from phibench.scenes.laser import LaserSpot
+from phibench.scenes.names import nearest
 from phibench.scenes.rig import POSITIONS, Rig, View
 from phibench.scenes.room import Room
 

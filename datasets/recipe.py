@@ -1,7 +1,7 @@
 """Recipes: what a data set is made of, as strict tables that TOML files fill.
 
 Lengths in metres, angles in radians unless the key says degrees. Every key says its unit. `load_recipe` reports all
-faults of a file in one go (`recipe_faults`, `recipe_checks`).
+faults of a file in one go (`render/model_faults`, `recipe_checks`).
 """
 
 from __future__ import annotations

@@ -11,12 +11,13 @@ from typing import Any, TypeVar, cast
 from pydantic import ValidationError
 
 from phibench.datasets.recipe import MAX_STROKE_M, LaserTable, Recipe, RigTable, RoomTable, TargetTable
-from phibench.datasets.recipe_faults import Fault, nearest
 from phibench.datasets.recipe_places import boards_in_the_way, spots_on_boards
 from phibench.datasets.recipe_random_checks import purpose_faults, random_faults
 from phibench.datasets.recipe_scene import build_rig, build_room, build_spot, build_target, ceiling_m
 from phibench.datasets.recipe_table import Table
+from phibench.render.model_faults import Fault
 from phibench.scenes.checks import SceneError
+from phibench.scenes.names import nearest
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
 

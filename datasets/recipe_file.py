@@ -9,8 +9,9 @@ from typing import Any
 from phibench.datasets.errors import RecipeError
 from phibench.datasets.recipe import Recipe
 from phibench.datasets.recipe_checks import semantic_faults
-from phibench.datasets.recipe_faults import nearest, structural_faults
 from phibench.datasets.recipe_height import height_faults
+from phibench.render.model_faults import structural_faults
+from phibench.scenes.names import nearest
 
 RECIPES = Path(__file__).with_name("recipes")
 

@@ -7,8 +7,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from phibench.datasets.recipe import MIN_STROKE_M, RigTable, RoomTable
-from phibench.datasets.recipe_faults import Fault
 from phibench.datasets.recipe_scene import build_rig, build_room, ceiling_m
+from phibench.render.model_faults import Fault
 from phibench.scenes.checks import SceneError
 
 

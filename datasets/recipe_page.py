@@ -23,8 +23,8 @@ from phibench.datasets.recipe import (
     RoomTable,
     TargetTable,
 )
-from phibench.datasets.recipe_faults import allowed, schema_node
 from phibench.datasets.recipe_scene import CAMERA_KEYS
+from phibench.render.model_faults import allowed, schema_node
 from phibench.scenes.catalog import RIGS
 from phibench.scenes.rig import Rig
 

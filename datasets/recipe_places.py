@@ -8,8 +8,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from phibench.datasets.recipe import LaserTable, TargetTable
-from phibench.datasets.recipe_faults import Fault
 from phibench.datasets.recipe_scene import build_spot, build_target
+from phibench.render.model_faults import Fault
 from phibench.scenes.catalog import BOARD_SIZE_M, Target, board
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.robot import carriage

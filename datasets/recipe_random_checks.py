@@ -17,8 +17,9 @@ from phibench.datasets.recipe import (
     StrokeM,
     TargetTable,
 )
-from phibench.datasets.recipe_faults import Fault, allowed, close_to, nearest, schema_node
 from phibench.datasets.recipe_scene import build_room, ceiling_m
+from phibench.render.model_faults import Fault, allowed, schema_node
+from phibench.scenes.names import close_names, nearest
 
 Raw = dict[str, Any]
 _ON_BOARD, _BY_RAY = ("target", "across_m", "up_m"), ("azimuth_deg", "height_m")
@@ -27,7 +28,7 @@ _ON_BOARD, _BY_RAY = ("target", "across_m", "up_m"), ("azimuth_deg", "height_m")
 def purpose_faults(raw: Raw, tables: Sequence[str]) -> Iterator[Fault]:
     """A recipe has `[[experiments]]` or `[random]`; `tables` are the names that it may have."""
     given = [key for key in ("experiments", "random") if key in raw]
-    misspelt = [key for key in raw if key not in tables and close_to(key, tables) in ("experiments", "random")]
+    misspelt = [key for key in raw if key not in tables and set(close_names(key, tables)) & {"experiments", "random"}]
     if len(given) == 2:
         yield Fault("random", "given together with [[experiments]]; give one or the other")
     elif raw.get("experiments") == [] or not (given or misspelt):

@@ -14,8 +14,8 @@ from pydantic import ValidationError
 from phibench.datasets import layout
 from phibench.datasets.codec import from_json, to_json
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.recipe_faults import nearest
 from phibench.datasets.schema import RigInfo
+from phibench.scenes.names import nearest
 from phibench.scenes.rig import Rig
 
 

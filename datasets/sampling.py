@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 
 from phibench.datasets.recipe import DRAWABLE
-from phibench.datasets.streams import generator
 from phibench.scenes.frames import Array
+from phibench.scenes.streams import generator
 
 Sequence = Literal["sobol", "independent"]
 

@@ -11,9 +11,9 @@ from phibench.datasets.errors import RecipeError
 from phibench.datasets.plan import make_plan, pose_name
 from phibench.datasets.recipe_file import check_recipe, load_recipe
 from phibench.datasets.spot_task import answer_spot
-from phibench.datasets.streams import generator, seed_32, seed_sequence
 from phibench.estimator import published as published
 from phibench.scenes.rig import POSITIONS
+from phibench.scenes.streams import generator, seed_32, seed_sequence
 
 # Tables 1 to 4 of the paper: real depth, baselines (the last of table 1 is printed 1.04; see the errata).
 PAPER = {

@@ -66,9 +66,7 @@ def test_more_samples_keep_every_byte_and_render_only_the_new_ones(made: Path, c
     new = ("000003", "000004")
     views = [f"view {pose.pose}" for pose in open_dataset(copy).info.poses if pose.rig.endswith(new)]
     assert len(views) == 4
-    assert done(copy) == sorted(
-        [*views, *(f"{kind} random-{number}" for kind in ("spot", "sample") for number in new)]
-    )
+    assert done(copy) == sorted([*views, *(f"{kind} random-{number}" for kind in ("spot", "sample") for number in new)])
     of_all = {layout.INFO, layout.MANIFEST, layout.TABLE, layout.RECIPE, layout.RIGS, layout.SUMS, layout.JOURNAL}
     before, after = contents(made), contents(copy)
     kept = set(before) - of_all

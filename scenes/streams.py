@@ -15,9 +15,13 @@ Name = str | int
 
 def seed_sequence(*names: Name) -> np.random.SeedSequence:
     """Seed sequence of a stream; ("a", "bc") differs from ("ab", "c"), and 1 differs from "1"."""
-    text = "\0".join(f"{type(name).__name__}:{len(str(name))}:{name}" for name in names)
-    digest = hashlib.sha256(text.encode()).digest()
+    digest = _digest(names)
     return np.random.SeedSequence([int.from_bytes(digest[i : i + 4], "little") for i in range(0, 32, 4)])
+
+
+def philox_key(*names: Name) -> np.ndarray[tuple[int], np.dtype[np.uint64]]:
+    """Key of a `numpy.random.Philox` stream, shape (2,): 128 bits of the same hash, for many counters under one key."""
+    return np.frombuffer(_digest(names)[:16], dtype="<u8").astype(np.uint64)
 
 
 def generator(*names: Name) -> np.random.Generator:
@@ -28,3 +32,8 @@ def generator(*names: Name) -> np.random.Generator:
 def seed_32(*names: Name) -> int:
     """Seed of a stream for a renderer that takes 32 bits."""
     return int(seed_sequence(*names).generate_state(1, np.uint32)[0])
+
+
+def _digest(names: tuple[Name, ...]) -> bytes:
+    text = "\0".join(f"{type(name).__name__}:{len(str(name))}:{name}" for name in names)
+    return hashlib.sha256(text.encode()).digest()

@@ -1,14 +1,15 @@
-"""Faults of a recipe: one line each, with path, value, allowed range, what to do and the nearest known name."""
+"""Faults of a table that a file fills: one line each, with path, value, allowed range and what to do."""
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
+
+from phibench.scenes.names import close_names, nearest
 
 Schema = dict[str, Any]
 Location = tuple[str | int, ...]
@@ -51,7 +52,7 @@ def _merged(schema: Schema, found: list[ErrorDetails]) -> list[ErrorDetails]:
         if details["type"] == "extra_forbidden":
             *table, name = details["loc"]
             known = schema_node(schema, tuple(table)).get("properties", {})
-            meant.update((*table, close) for close in _close(str(name), known))
+            meant.update((*table, close) for close in close_names(str(name), known))
     return [details for details in found if details["type"] != "missing" or details["loc"] not in meant]
 
 
@@ -59,24 +60,6 @@ def path_text(location: Sequence[str | int]) -> str:
     """Path of a key as people write it, such as ``targets[2].depth_m``."""
     parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
     return "".join(parts).removeprefix(".") or "recipe"
-
-
-def nearest(name: str, known: Iterable[str]) -> str:
-    """Advice for an unknown name: the nearest known one, and what is known."""
-    names = list(known)
-    close = _close(name, names)
-    guess = f"did you mean '{close[0]}'? " if close else ""
-    return f"{guess}known: {', '.join(names)}"
-
-
-def close_to(name: str, known: Iterable[str]) -> str | None:
-    """Known name that an unknown one is probably a misspelling of, if any."""
-    return next(iter(_close(name, known)), None)
-
-
-def _close(name: str, known: Iterable[str]) -> list[str]:
-    """Nearest known name, if one is near."""
-    return difflib.get_close_matches(name, list(known), 1, 0.5)
 
 
 def _fault(schema: Schema, kind: str, location: Location, given: object) -> Fault:

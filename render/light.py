@@ -1,0 +1,95 @@
+"""What falls on the sensor: layers with the level of the lamps, of the laser, and the spot's motion."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.render.sensor import SensorError
+from phibench.scenes.frames import Array
+
+
+class SpotImage(Protocol):
+    """A spot layer, rendered or read: see `phibench.render.spot.SpotLayer`."""
+
+    @property
+    def u0_px(self) -> int:
+        """Image column of the window's first column."""
+
+    @property
+    def v0_px(self) -> int:
+        """Image row of the window's first row."""
+
+    @property
+    def electrons_per_s(self) -> Array:
+        """Expected electrons per second, shape (3, h, w)."""
+
+    @property
+    def du_electrons_per_s_px(self) -> Array:
+        """Derivative by a shift of the spot's image by +u, shape (3, h, w)."""
+
+    @property
+    def dv_electrons_per_s_px(self) -> Array:
+        """Derivative by a shift of the spot's image by +v, shape (3, h, w)."""
+
+
+@dataclass(frozen=True)
+class Light:
+    """Expected photo-electrons per second behind the filters R, G, B, of one view.
+
+    The layers are radiance times etendue: the natural cos^4 fall-off is in them and is applied nowhere else.
+
+    Parameters
+    ----------
+    ambient_electrons_per_s : array, shape (3, H, W)
+    spot : spot layer or None
+    lamp_level, laser_level : float
+        Factors of the ambient and of the spot layer; `laser_level` 0 is laser off.
+    velocity_px_per_s : 2 floats
+        Velocity (u, v) of the spot's image; see `render/motion.py`. The room is taken to stand still.
+    f_number : float
+        Lens stop at which the layers were rendered.
+    """
+
+    ambient_electrons_per_s: NDArray[Any] = field(repr=False)
+    spot: SpotImage | None = field(default=None, repr=False)
+    lamp_level: float = 1.0
+    laser_level: float = 1.0
+    velocity_px_per_s: tuple[float, float] = (0.0, 0.0)
+    f_number: float = 2.4
+
+    def __post_init__(self) -> None:
+        shape = self.ambient_electrons_per_s.shape
+        if len(shape) != 3 or shape[0] != 3 or min(shape) < 2:
+            raise SensorError(
+                f"Light.ambient_electrons_per_s has the shape {shape}: (3, H, W) of 2 pixels or more is needed"
+            )
+        for name in ("lamp_level", "laser_level"):
+            _not_negative(name, getattr(self, name))
+        if not all(map(math.isfinite, self.velocity_px_per_s)):
+            raise SensorError(f"Light.velocity_px_per_s = {self.velocity_px_per_s}: must be two finite numbers")
+        if not 0.5 <= self.f_number <= 256.0:
+            raise SensorError(f"Light.f_number = {self.f_number:g}: allowed range is 0.5 to 256")
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) of the image, pixels."""
+        return self.ambient_electrons_per_s.shape[1], self.ambient_electrons_per_s.shape[2]
+
+    def laser_off(self) -> Light:
+        """Return the same view without the spot."""
+        return replace(self, laser_level=0.0)
+
+    @classmethod
+    def flat(cls, electrons_per_s: tuple[float, float, float], size: tuple[int, int]) -> Light:
+        """Return a uniform field, for tests and photon transfer; `size` is (height, width)."""
+        return cls(np.broadcast_to(np.array(electrons_per_s)[:, None, None], (3, *size)))
+
+
+def _not_negative(name: str, value: float) -> None:
+    if not (math.isfinite(value) and value >= 0.0):
+        raise SensorError(f"Light.{name} = {value}: must be 0 or above")
