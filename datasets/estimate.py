@@ -18,11 +18,11 @@ from phibench.render.patches import cut, texel_count
 # Seconds.
 START_S = 6.0  # workers, Mitsuba in each, first kernels, hashes
 VIEW_S = 0.8
-VIEW_S_PER_MEGAPIXEL = 0.5  # truth, encoding, fsync
-VIEW_S_PER_MEGASAMPLE = 0.45  # look-ups in the light map, a million of them
+VIEW_S_PER_MEGAPIXEL = 4.5  # refinement, truth, encoding, fsync
+VIEW_S_PER_MEGASAMPLE = 0.1  # look-ups in the light map, a million of them
 BAKE_S_PER_MEGARAY = 0.13  # of the light map; none where the user's cache has it
-SPOT_S = 0.28  # two positions with their certificates
-PREVIEW_S_PER_MEGAPIXEL = 0.3
+SPOT_S = 0.4  # two positions with their certificates
+SAMPLE_S_PER_MEGAPIXEL = 0.7  # picture, noise budget
 
 # Bytes.
 _AMBIENT_BYTES_PX = 24.0  # six noisy float32 planes do not compress
@@ -90,5 +90,5 @@ def _seconds(plan: Plan, megapixels: float) -> dict[str, float]:
         "bake": _bake_rays(plan) / 1e6 * BAKE_S_PER_MEGARAY,
         "view": VIEW_S + megapixels * VIEW_S_PER_MEGAPIXEL + samples,
         "spot": SPOT_S,
-        "sample": megapixels * PREVIEW_S_PER_MEGAPIXEL,
+        "sample": megapixels * SAMPLE_S_PER_MEGAPIXEL,
     }

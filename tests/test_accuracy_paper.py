@@ -20,7 +20,6 @@ def paper(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """The recipe `paper` with a coarse light map: spots, truth and geometry are the full recipe's."""
     text = find_recipe("paper").read_text()
     coarse = {
-        "cells_per_pixel": 1,
         "texel_m": 0.25,
         "lamp_rays": 8,
         "bounces": 3,

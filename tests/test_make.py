@@ -199,7 +199,7 @@ def test_a_full_disk_in_the_middle_loses_nothing(tmp_path: Path, monkeypatch: py
 def test_control_c_in_the_middle_loses_nothing(tmp_path: Path) -> None:
     """SIGINT to the whole process group, as a terminal does, while two workers render."""
     recipe, out = tmp_path / "slow.toml", tmp_path / "out"
-    recipe.write_text(TINY.read_text().replace("cells_per_pixel = 1", "cells_per_pixel = 32"))
+    recipe.write_text(TINY.read_text().replace("cells_per_pixel = 2", "cells_per_pixel = 32"))
     code = (
         "import sys\nfrom phibench.datasets.make import make\n"
         "if __name__ == '__main__':\n    make(sys.argv[1], sys.argv[2], workers=2)"

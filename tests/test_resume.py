@@ -75,7 +75,7 @@ VIEWS = ["view h0.000", "view h0.500", "view h1.400"]
         ("seed = 0", "seed = 0  # a comment", []),
         ("depth_m = 1.975", "depth_m = 1.975\ndiameter_m = 6e-3", [SAMPLES[1], SPOTS[1]]),
         ("bounces = 2", "bounces = 1", BAKE + SAMPLES + VIEWS),
-        ("cells_per_pixel = 1", "cells_per_pixel = 2", SAMPLES + VIEWS),
+        ("cells_per_pixel = 2", "cells_per_pixel = 3", SAMPLES + VIEWS),
         ("seed = 0", "seed = 1", SAMPLES + VIEWS),
         ("[ambient]", "[laser]\npower_w = 2e-3\n\n[ambient]", SAMPLES + SPOTS),
         ("[0.5]", "[0.6]", ["sample seen-near-h0.600", "spot seen-near-h0.600", "view h0.600"]),
