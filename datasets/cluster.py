@@ -22,6 +22,8 @@ from phibench.datasets.task import Done, Failed, Task, perform
 
 CONNECT_S = 10.0
 WORKERS_S = 60.0
+LOST_S = 300.0
+_POLL_S = 0.005
 _CENSUS_S = 2.0
 _MISSING = "dask.distributed is not installed: run `pip install 'phibench[cluster]'`"
 
@@ -52,12 +54,26 @@ class Workers:
 
     def next(self) -> Outcome:
         """Wait for any task; its result is released at once."""
+        self._wait()
         future = next(self._ended)
         task = self._tasks.pop(future.key)
         try:
             return task, self._outcome(future)
         finally:
             future.release()
+
+    def _wait(self) -> None:
+        """Wait until a task has ended; workers may go and come, but not stay away for ever."""
+        seen = time.monotonic()
+        while not self._ended.has_ready() and self.client.status == "running":
+            time.sleep(_POLL_S)
+            if time.monotonic() - self._counted >= _CENSUS_S:
+                self.width()
+            if self._count:
+                seen = time.monotonic()
+            elif time.monotonic() - seen > LOST_S:
+                text = f"the scheduler has had no workers for {LOST_S:g} s"
+                raise DatasetError(f"{text}; start some and run the same command again, finished work is kept")
 
     def _outcome(self, future: Any) -> Done | Failed:
         from distributed import KilledWorker

@@ -181,6 +181,21 @@ def test_workers_that_are_missing_or_do_not_fit(tmp_path: Path, monkeypatch: pyt
         assert text.count("\n") == 0
 
 
+@pytest.mark.slow
+def test_workers_that_all_go_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A task that waits for workers that never come back ends in a sentence, not in waiting."""
+    scheduler, worker, _ = commands("loopback", tmp_path)
+    monkeypatch.setattr(cluster, "LOST_S", 5.0)
+    with running(scheduler), contextlib.ExitStack() as stack:
+        first = stack.enter_context(contextlib.ExitStack())
+        first.enter_context(running(worker))
+        workers = stack.enter_context(cluster.remote_workers(scheduler[-1], tmp_path / "out"))
+        first.close()
+        workers.submit(Task("view x", "", dict))
+        with pytest.raises(DatasetError, match="no workers for 5 s; start some and run the same command again"):
+            workers.next()
+
+
 def test_environments_that_differ_are_refused() -> None:
     here = describe()
     assert _checked({"a": here, "b": {**here, "worker": "x"}}) == {k: v for k, v in here.items() if k != "worker"}
@@ -220,4 +235,4 @@ def test_a_worker_that_fails_half_way_leaves_the_rest_done(tmp_path: Path, monke
     monkeypatch.undo()
     console = quiet()
     make(TINY, tmp_path / "out", workers=2, console=console)
-    assert "to make: 2 previews" in said(console)
+    assert "to make: 2 samples" in said(console)
