@@ -91,10 +91,17 @@ class FilmGrid:
         core = cells[edge : cells.shape[0] - edge, edge : cells.shape[1] - edge]
         return np.asarray(core.reshape(core.shape[0] // n, n, core.shape[1] // n, n).any(axis=(1, 3)))
 
-    def spread(self, pixels: Stack) -> Stack:
-        """Pixel values (height, width) on the cells (rows, columns); those of the margin get the border's."""
-        padded = np.pad(pixels, self.margin_px, mode="edge")
-        return padded.repeat(self.cells, axis=0).repeat(self.cells, axis=1)
+    def cells_of(self, pixels: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Flat indices of the cells of some pixels (height, width), and of each one's pixel.
+
+        The margin belongs to the pixels of the border.
+        """
+        (height, width), m, n = pixels.shape, self.margin_px, self.cells
+        row, column = np.nonzero(np.pad(pixels, m, mode="edge"))
+        inside = np.clip(row - m, 0, height - 1) * width + np.clip(column - m, 0, width - 1)
+        cell = (np.arange(n)[:, None] * (width + 2 * m) * n + np.arange(n)).ravel()
+        corner = (row * (width + 2 * m) * n + column) * n
+        return (corner[:, None] + cell).ravel(), np.repeat(inside, n * n)
 
 
 @lru_cache(maxsize=32)

@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from phibench.render.film import Film, Samples
 from phibench.render.film_grid import Crop, FilmGrid, Stack
-from phibench.render.noise_budget import allowed_per_s2, excess
+from phibench.render.noise_budget import EXPOSURE_S, FULL_WELL_E, allowed_per_s2, excess
 
 _TILE_PX = 48
 _SIDES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # strata along a cell; few values, few kernel launches
@@ -23,7 +23,7 @@ _NEAR_PX = 3  # an edge that both samples of a cell missed shows in a cell not f
 _GROWTH = 8.0  # of the strata along a side, in one round
 _BLIND = (16.0, 500.0)  # excess from which a cell's first refinement has 4 and 6 strata along a side, 2 below
 _SMALL = 0.1  # a cell below this part of its allowance is not what keeps a pixel above its budget
-_AIM = 0.8  # of the allowed variance
+_AIM = 0.7  # of the allowed variance
 
 
 @dataclass
@@ -40,6 +40,10 @@ class Cells:
         Of the cells, electrons/s per square pixel and its square.
     pixels : list of two arrays, shape (3, height, width), float32
         Mean and variance of the pixels.
+    tight : array, shape (height, width)
+        Smallest allowed variance of the pixels around, sum of the colours.
+    suspected : array, shape (height, width)
+        Excess of the pixels by what may have been missed; 0 from the second round on.
     mirrored : bool array, shape (height, width)
         Pixels that see the mirror.
     """
@@ -50,6 +54,8 @@ class Cells:
     mean: Stack
     variance: Stack
     pixels: tuple[Stack, Stack]
+    tight: Stack
+    suspected: Stack
     mirrored: NDArray[np.bool_]
 
 
@@ -59,8 +65,15 @@ def first_pass(film: Film, window: Crop) -> Cells:
     a, b = (film.sample(numbers.ravel(), 1, half) for half in (0, 1))
     mean, variance = (plane.reshape(3, *numbers.shape) for plane in _estimate(a, b))
     pixels = grid.pixels(mean), grid.pixels(variance, power=2)
+    allowed = allowed_per_s2(pixels[0], grid.blur_sigma_px).sum(axis=0)
+    tight = ndimage.minimum_filter(allowed, size=_NEAR_PX, mode="nearest")
+    suspected = _suspected(
+        grid, *(half.electrons_per_s.reshape(3, *numbers.shape) for half in (a, b)), pixels[0], allowed
+    )
     mirrored = grid.inner((a.mirrored | b.mirrored).reshape(numbers.shape))
-    return Cells(grid, numbers, np.ones(numbers.shape, dtype=np.int32), mean, variance, pixels, mirrored)
+    return Cells(
+        grid, numbers, np.ones(numbers.shape, dtype=np.int32), mean, variance, pixels, tight, suspected, mirrored
+    )
 
 
 def refine(film: Film, cells: Cells, turn: int) -> bool:
@@ -72,19 +85,43 @@ def refine(film: Film, cells: Cells, turn: int) -> bool:
         Which round this is: each has its own random streams.
     """
     over = np.where(cells.mirrored, excess(*cells.pixels, cells.grid.blur_sigma_px), np.float32(0.0))
-    if not np.any(over > 1.0):
-        return False
     near = ndimage.maximum_filter(over, size=_NEAR_PX, mode="nearest")
-    allowed = allowed_per_s2(cells.pixels[0], cells.grid.blur_sigma_px).sum(axis=0)
-    tight = ndimage.minimum_filter(allowed, size=_NEAR_PX, mode="nearest")
-    chosen = np.flatnonzero(cells.grid.spread(near > 1.0))
-    near, tight = (cells.grid.spread(plane).ravel()[chosen] for plane in (near, tight))
+    near = np.where(cells.mirrored, np.maximum(near, cells.suspected), near)
+    if not np.any(near > 1.0):
+        return False
+    chosen, pixel = cells.grid.cells_of(near > 1.0)
+    near, tight = near.ravel()[pixel], cells.tight.ravel()[pixel]
     wanted = _wanted(cells, chosen, near, tight)
     more = wanted > cells.side.ravel()[chosen]
     for m in np.unique(wanted[more]):
         _sample_again(film, cells, chosen[more & (wanted == m)], int(m), turn)
     _update(cells, chosen[more])
+    cells.suspected[:] = 0.0
     return True
+
+
+def _suspected(grid: FilmGrid, a: Stack, b: Stack, pixels: Stack, allowed: Stack) -> Stack:
+    """Variance over allowed variance if every cell were cut by whatever edge is near, shape (height, width).
+
+    Two samples may both miss what cuts a cell. If only the cells that hit it were refined, misses would stay and bias
+    the mean; so what is refined first must not depend on a cell's own luck. An edge of contrast c that cuts cells at
+    random leaves c^2 / 12; it is seen in the 3 x 3 pixels around, of which about a half of the cells are not cut.
+    """
+    edge, n = grid.margin_px * grid.cells, grid.cells
+    inner = slice(edge, a.shape[1] - edge), slice(edge, a.shape[2] - edge)
+    height, width = pixels.shape[1:]
+    blocks = (half.sum(axis=0)[inner].reshape(height, n, width, n) for half in (a, b))
+    bright, dark = zip(*((block.max(axis=(1, 3)), block.min(axis=(1, 3))) for block in blocks), strict=True)
+    contrast = ndimage.maximum_filter(np.maximum(*bright), _NEAR_PX) - ndimage.minimum_filter(
+        np.minimum(*dark), _NEAR_PX
+    )
+    full = pixels.max(axis=0) * np.float32(EXPOSURE_S) > FULL_WELL_E
+    return np.where(full, np.float32(0.0), contrast**2 * np.float32(_share(grid) / 24.0) / allowed)
+
+
+def _share(grid: FilmGrid) -> float:
+    """Part of a cell's variance that is a pixel's, if all cells have the same."""
+    return float(np.sum(grid.taps**2) ** 2)
 
 
 def _wanted(cells: Cells, chosen: NDArray[np.intp], near: Stack, tight: Stack) -> NDArray[np.int32]:
@@ -94,8 +131,7 @@ def _wanted(cells: Cells, chosen: NDArray[np.intp], near: Stack, tight: Stack) -
     the corner of a lamp that is in it is found.
     """
     side = cells.side.ravel()[chosen]
-    share = float(np.sum(cells.grid.taps**2) ** 2)  # of one cell's variance in a pixel's, if all cells have the same
-    ratio = share * cells.variance.reshape(3, -1)[:, chosen].sum(axis=0) / tight
+    ratio = _share(cells.grid) * cells.variance.reshape(3, -1)[:, chosen].sum(axis=0) / tight
     growth = np.clip(np.cbrt(np.minimum(ratio, near) / _AIM), 1.2, _GROWTH)
     aim = np.where(ratio > _SMALL, np.ceil(side * growth), side)
     informed = np.array(_SIDES)[np.searchsorted(_SIDES, np.minimum(aim, _SIDES[-1]))]
