@@ -76,6 +76,20 @@ class FrameRequest:
         return {**asdict(self), "overrides": dict(self.overrides)}
 
 
+def exposure_of(text: str) -> Exposure:
+    """Exposure from a word: "auto" or seconds.
+
+    Raises
+    ------
+    DatasetError
+        If it is neither.
+    """
+    try:
+        return "auto" if text == "auto" else float(text)
+    except ValueError as error:
+        raise DatasetError(f"exposure = '{text}': give seconds above 0, or 'auto'") from error
+
+
 def whole_number(name: str, value: Any, low: int = 0) -> int:
     """Return `value` as a Python int: a NumPy integer would name another noise stream.
 

@@ -97,14 +97,20 @@ class FrameSource:
         DatasetError
             If the request cannot be met or a layer cannot be read; in one sentence.
         """
-        request = FrameRequest.of(preset, options)
+        return cls.from_request(pair, FrameRequest.of(preset, options))
+
+    @classmethod
+    def from_request(cls, pair: Pair, request: FrameRequest) -> FrameSource:
+        """As `of`, for a request that was checked before."""
         with in_one_sentence():
             sides = {position: _side(pair, position, request) for position in POSITIONS}
         return cls(request, pair.stream_names, sides)
 
     def frames(self, draw: int = 0, *, laser_off: bool = False) -> Frames:
         """Both positions with the laser on, and, if asked for, both with the laser off."""
-        return Frames.of([self.frame(p, draw, on) for on in ((True, False) if laser_off else (True,)) for p in POSITIONS])
+        return Frames.of(
+            [self.frame(p, draw, on) for on in ((True, False) if laser_off else (True,)) for p in POSITIONS]
+        )
 
     def frame(self, position: str, draw: int = 0, laser: bool = True) -> Frame:
         """One frame.

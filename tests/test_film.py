@@ -168,7 +168,7 @@ def test_phi_noise_of_a_spot_is_what_repeated_rendering_moves_it_by(light: Light
     def raw(stack: np.ndarray) -> np.ndarray:
         return np.where(mosaic, stack, 0.0).sum(axis=-3).reshape(*stack.shape[:-3], -1) * webcam().exposure_s
 
-    weight = 1.0 / (raw(layer.electrons_per_s + rooms.mean(axis=0)) + webcam().read_noise_e**2)
+    weight = 1.0 / (raw(layer.electrons_per_s + rooms.mean(axis=0)) + webcam().read_noise_e ** 2)
     slopes = np.stack([raw(layer.du_electrons_per_s_px), raw(layer.dv_electrons_per_s_px)])
     steps = np.linalg.solve((slopes * weight) @ slopes.T, (slopes * weight) @ (raw(rooms) - raw(rooms.mean(axis=0))).T)
     measured = np.std(phi_gradient(VIEW, uv) @ steps, ddof=1)

@@ -61,9 +61,11 @@ def test_predicted_errors_against_monte_carlo(source: str) -> None:
 
     mean = raw(LAYER.electrons_per_s + ROOM[:, *image])
     slopes = np.stack([raw(LAYER.du_electrons_per_s_px), raw(LAYER.dv_electrons_per_s_px)])
-    weight = 1.0 / (mean + nb.webcam().read_noise_e**2)
+    weight = 1.0 / (mean + nb.webcam().read_noise_e ** 2)
     if source == "sensor":
-        noise = rng.poisson(mean, (draws, mean.size)) - mean + rng.normal(0, nb.webcam().read_noise_e, (draws, mean.size))
+        noise = (
+            rng.poisson(mean, (draws, mean.size)) - mean + rng.normal(0, nb.webcam().read_noise_e, (draws, mean.size))
+        )
     else:
         noise = 0.1 * 4e4 * nb.webcam().exposure_s * _blurred_noise(rng, draws, h, w)
     steps = np.linalg.solve((slopes * weight) @ slopes.T, (slopes * weight) @ noise.T)
