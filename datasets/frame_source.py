@@ -7,7 +7,7 @@ order of the draws, nor processes, nor what else is drawn enters. NumPy only.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -137,13 +137,17 @@ class FrameSource:
 def _side(pair: Pair, position: str, request: FrameRequest) -> Side:
     camera = pair.rig.camera
     spot = pair.spot(position)
-    levels = {"lamp_level": request.lamp_level, "laser_level": request.laser_level, "f_number": camera.f_number}
-    light = Light(pair.ambient(position), spot, **levels)
+    light = Light(
+        pair.ambient(position),
+        spot,
+        lamp_level=request.lamp_level,
+        laser_level=request.laser_level,
+        f_number=camera.f_number,
+    )
     sensor = auto_exposed(request.sensor(), light) if request.exposure == "auto" else request.sensor()
     moving = _moving(pair, position, spot, sensor, request.carriage_speed_m_s)
-    light = Light(light.ambient_electrons_per_s, moving, **levels)
     region = _region(pair.row, position, request.region, light.size)
-    return Side(Chain(sensor, request.camera_seed, camera), light, region)
+    return Side(Chain(sensor, request.camera_seed, camera), replace(light, spot=moving), region)
 
 
 def _moving(pair: Pair, position: str, spot: SpotWindow, sensor: Sensor, speed_m_s: float) -> SpotWindow:
