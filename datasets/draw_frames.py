@@ -10,9 +10,11 @@ import hashlib
 import json
 import os
 import signal
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
@@ -34,6 +36,9 @@ from phibench.datasets.read import Dataset, Sample, open_dataset, open_finished
 from phibench.datasets.schema import row_line
 from phibench.datasets.sums import read_sums
 from phibench.scenes.rig import POSITIONS
+
+_FILES_PER_JOB = 32  # a few seconds of work; reading the layers again takes half a second
+_SAVE_EVERY_S = 30.0
 
 
 @dataclass(frozen=True)
@@ -63,13 +68,18 @@ class Item:
 
 @dataclass(frozen=True)
 class SampleJob:
-    """All files of one sample, for one process."""
+    """Some files of one sample, for one process; `known` are their rows in the index, if they have any."""
 
     dataset: Path
     out: Path
     sample_id: str
     request: FrameRequest
     items: tuple[Item, ...]
+    known: Mapping[str, FrameRow] = field(default_factory=dict)
+
+    def file(self, item: Item) -> str:
+        """Name of one of them."""
+        return item.file(self.sample_id, suffix(self.request.sensor(), self.request.region is None))
 
 
 def draw_frames(
@@ -119,15 +129,14 @@ def draw_frames(
 
 
 def perform(job: SampleJob) -> tuple[list[FrameRow], int]:
-    """Do one sample: rows of all its files, and how many were written."""
-    sample = open_dataset(job.dataset)[job.sample_id]
-    known, base, source = read_index(job.out), _key_base(sample, job.request), None
+    """Do a job: rows of all its files, and how many were written."""
+    sample = _opened(job.dataset, sha256(job.dataset / layout.SUMS))[job.sample_id]
+    base, source = _key_base(sample, job.request), None
     rows, made = [], 0
     with working(job.out):
         for item in job.items:
-            end = suffix(job.request.sensor(), job.request.region is None)
-            name, key = item.file(job.sample_id, end), _hash([base, repr(item)])
-            row = known.get(name)
+            name, key = job.file(item), _hash([base, repr(item)])
+            row = job.known.get(name)
             if row is None or row.key != key or not _is_whole(job.out / name, row.sha256):
                 source = source or FrameSource.from_request(sample, job.request)
                 row = _written(job, source, item, name, key)
@@ -136,21 +145,42 @@ def perform(job: SampleJob) -> tuple[list[FrameRow], int]:
     return rows, made
 
 
+@lru_cache(maxsize=1)
+def _opened(folder: Path, _sums_sha256: str) -> Dataset:
+    """Data set of the next jobs, too: reading a long manifest takes longer than a small frame."""
+    return open_dataset(folder)
+
+
 def _draw(
     jobs: list[SampleJob], dataset: Dataset, out: Path, request: FrameRequest, count: int, console: Console
 ) -> tuple[int, int]:
     rows = read_index(out)
     check_same_request(out, rows.values(), _names(dataset), _document(request))
-    made = total = 0
+    jobs = [_knowing(part, rows) for job in jobs for part in _parts(job)]
+    made, total, saved = 0, 0, time.monotonic()
     try:
         with Steps(console, "frames", len(jobs)) as steps:
             for done, written in _results(jobs, count):
                 rows |= {row.file: row for row in done}
                 made, total = made + written, total + len(done)
                 steps.advance()
+                if time.monotonic() - saved > _SAVE_EVERY_S:
+                    write_index(out, rows.values())
+                    saved = time.monotonic()
     finally:  # what an interrupted run has drawn is found by the next one
         write_index(out, rows.values())
     return made, total - made
+
+
+def _parts(job: SampleJob) -> Iterator[SampleJob]:
+    """Jobs short enough that an interrupted run loses little."""
+    for first in range(0, len(job.items), _FILES_PER_JOB):
+        yield replace(job, items=job.items[first : first + _FILES_PER_JOB])
+
+
+def _knowing(job: SampleJob, rows: Mapping[str, FrameRow]) -> SampleJob:
+    names = (job.file(item) for item in job.items)
+    return replace(job, known={name: rows[name] for name in names if name in rows})
 
 
 def _results(jobs: list[SampleJob], count: int) -> Iterator[tuple[list[FrameRow], int]]:
@@ -158,7 +188,7 @@ def _results(jobs: list[SampleJob], count: int) -> Iterator[tuple[list[FrameRow]
         yield from map(perform, jobs)
         return
     # spawned, not forked: a fork copies the locks of other threads
-    pool = ProcessPoolExecutor(min(count, len(jobs)), get_context("spawn"), initializer=_leave_ctrl_c_to_the_parent)
+    pool = ProcessPoolExecutor(min(count, len(jobs)), get_context("spawn"), initializer=_end_quietly_on_ctrl_c)
     try:
         futures: list[Future[tuple[list[FrameRow], int]]] = [pool.submit(perform, job) for job in jobs]
         for future in as_completed(futures):
@@ -167,8 +197,9 @@ def _results(jobs: list[SampleJob], count: int) -> Iterator[tuple[list[FrameRow]
         pool.shutdown(cancel_futures=True)
 
 
-def _leave_ctrl_c_to_the_parent() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _end_quietly_on_ctrl_c() -> None:
+    """End at once, without a traceback; what is half-written has a temporary name."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _written(job: SampleJob, source: FrameSource, item: Item, name: str, key: str) -> FrameRow:
