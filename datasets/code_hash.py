@@ -1,5 +1,7 @@
 """Hash of the code behind a function: its module and every module of phibench that it imports, near or far.
 
+The tables that a module keeps beside itself count as code: `sensor_presets.toml` belongs to `sensor.py`.
+
 Editing the progress bar then changes no key, editing the lens changes the keys of all that is seen through it.
 """
 
@@ -20,7 +22,8 @@ def code_behind(module: str) -> str:
     """SHA-256 over the source of a module, given by its full name, and of all that it imports from phibench."""
     digest = hashlib.sha256()
     for name in sorted(closure(module)):
-        digest.update(name.encode() + b"\0" + _file(name).read_bytes() + b"\0")
+        for path in (_file(name), *_tables(name)):
+            digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()
 
 
@@ -51,6 +54,11 @@ def _imports(tree: ast.AST) -> Iterator[str]:
 
 def _is_ours(name: str) -> bool:
     return name.startswith(_PACKAGE) and _file(name).is_file()
+
+
+def _tables(module: str) -> list[Path]:
+    path = _file(module)
+    return sorted(path.parent.glob(f"{path.stem}_*.toml"))
 
 
 def _file(module: str) -> Path:

@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from phibench.datasets import layout
 from phibench.datasets.codec import from_json
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.frame_source import FrameSource
+from phibench.datasets.frames import Frames
 from phibench.datasets.info import read_info
 from phibench.datasets.layers import SpotWindow, read_ambient, read_ambient_variance, read_spot, read_truth
 from phibench.datasets.manifest import read_manifest
@@ -148,6 +150,43 @@ class Sample:
         if laser:
             self.spot(position).add_to(image)
         return image
+
+    def frames(self, preset: str = "mjpeg", draw: int = 0, *, laser_off: bool = False, **options: Any) -> Frames:
+        """Draw the pair as the C310 delivers it: `frames.down`, `frames.up`, for MJPEG also `frames.jpeg`.
+
+        A pure function of data set, its seed, sample, position, laser on or off, draw and request. The layers are read
+        anew each time: to draw many, keep `frame_source` or `region_frames`.
+
+        Parameters
+        ----------
+        preset : "ideal", "mono-raw", "bayer-raw", "srgb8" or "mjpeg"
+        draw : int, 0 or above
+        laser_off : bool
+            Also `frames.down_off` and `frames.up_off`.
+        **options
+            Of `frame_request.FrameRequest`: exposure (seconds or "auto"), lamp_level, laser_level, carriage_speed_m_s,
+            region, camera_seed, and any number of the preset, such as ``jpeg_quality=60``.
+
+        Raises
+        ------
+        DatasetError
+            If the request cannot be met or a layer cannot be read; in one sentence.
+        """
+        return self.frame_source(preset, **options).frames(draw, laser_off=laser_off)
+
+    def frame_source(self, preset: str = "mjpeg", **options: Any) -> FrameSource:
+        """Layers read once, for many draws: `source.frames(k)`; options as for `frames`."""
+        return FrameSource.of(self, preset, **options)
+
+    def region_frames(self, preset: str = "mjpeg", side_px: int = 64, **options: Any) -> FrameSource:
+        """Return the source of squares around each spot: the pixels of the whole frames, to the bit."""
+        return FrameSource.of(self, preset, region=side_px, **options)
+
+    @property
+    def stream_names(self) -> tuple[str, int, str]:
+        """What names the noise of this sample: data set, its seed, sample id."""
+        info = self.dataset.info
+        return info.name, info.recipe["dataset"]["seed"], self.row.sample_id
 
     def _view(self, position: str) -> dict[str, str]:
         """Return what the headers of the view's layers must say."""

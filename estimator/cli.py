@@ -26,7 +26,7 @@ app = App(
     suppress_keyboard_interrupt=False,
     result_action="return_value",
 )
-dataset = App(name="dataset", help="Make, verify, repair, merge and show data sets.")
+dataset = App(name="dataset", help="Make, verify, repair, merge and show data sets, and draw camera frames.")
 app.command(dataset)
 
 
@@ -169,6 +169,59 @@ def show(directory: Path, *, out: Path | None = None) -> int:
     from phibench.datasets.show import show as show_dataset
 
     show_dataset(directory, out=out)
+    return 0
+
+
+@dataset.command
+def frames(
+    directory: Path,
+    *,
+    preset: str = "mjpeg",
+    draws: int = 1,
+    out: Path | None = None,
+    samples: str | None = None,
+    laser_off: bool = False,
+    exposure: str | None = None,
+    region: int | None = None,
+    camera_seed: int = 0,
+    workers: int | None = None,
+) -> int:
+    """Draw camera frames with noise, as PNG, JPEG or EXR files with an index; what is there already is kept.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    preset
+        Where the chain ends: "ideal" (EXR, expected electrons), "mono-raw", "bayer-raw" (PNG of 16 bits that holds
+        10-bit DN, not scaled), "srgb8" (PNG) or "mjpeg" (the camera's JPEG; PNG with --region).
+    draws
+        Draws of every image.
+    out
+        Folder to write; by default beside the data set, with "-frames" added to its name.
+    samples
+        Sample ids, joined by commas; all by default.
+    laser_off
+        Also every image without the spot.
+    exposure
+        Seconds, or "auto"; by default the preset's.
+    region
+        Side in pixels of a square around the spot, instead of the whole image.
+    camera_seed
+        Names the camera whose fixed pattern the frames share.
+    workers
+        Number of processes; one for each core by default.
+    """
+    from phibench.datasets.draw_frames import draw_frames
+    from phibench.datasets.frame_request import FrameRequest, exposure_of
+
+    seconds = None if exposure is None else exposure_of(exposure)
+    request = FrameRequest(preset, seconds, region=region, camera_seed=camera_seed)
+    names = None if samples is None else samples.split(",")
+    done = draw_frames(directory, request, draws, out=out, samples=names, laser_off=laser_off, workers=workers)
+    for note in done.notes:
+        print(f"note: {note}")
+    print(f"{done.folder}: {done.made} files written, {done.kept} kept, index frames.jsonl")
     return 0
 
 

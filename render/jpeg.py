@@ -24,7 +24,7 @@ def encoded(image: NDArray[np.uint8], quality: int, subsampling: str) -> bytes:
 
 def decoded(data: bytes) -> NDArray[np.uint8]:
     """Image, shape (H, W, 3), in a JPEG file."""
-    with Image.open(io.BytesIO(data)) as image:
+    with Image.open(io.BytesIO(data), formats=("JPEG",)) as image:
         return np.asarray(image.convert("RGB"))
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Protocol
 
 import numpy as np
@@ -20,15 +21,19 @@ from scipy.linalg import toeplitz
 
 from phibench.render.angles import mirror_angles
 from phibench.render.film_grid import FilmGrid
+from phibench.render.sensor import Sensor, sensor
 from phibench.render.trace import trace_pixels
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import View
 
-EXPOSURE_S = 1.0 / 60.0  # nominal
-READ_NOISE_E = 4.0  # of the sensor preset `webcam`
-FULL_WELL_E = 12000.0  # likewise; a full pixel tells nothing
 BUDGET = 0.25  # largest allowed render error, in units of the sensor's
 _STEP_PX = 0.01
+
+
+@cache
+def webcam() -> Sensor:
+    """The sensor whose noise is the measure: raw Bayer frames at the presets' nominal exposure."""
+    return sensor("bayer-raw")
 
 
 class SpotImages(Protocol):
@@ -97,14 +102,16 @@ def excess(
         The camera's, without the pixel's own square (1/12 px^2).
     """
     over = variance_per_s2 / allowed_per_s2(electrons_per_s, blur_sigma_px)
-    return np.where(electrons_per_s * np.float32(EXPOSURE_S) > FULL_WELL_E, np.float32(0.0), over).max(axis=0)
+    full = electrons_per_s * np.float32(webcam().exposure_s) > webcam().full_well_e
+    return np.where(full, np.float32(0.0), over).max(axis=0)
 
 
 def allowed_per_s2(electrons_per_s: NDArray[np.float32], blur_sigma_px: float) -> NDArray[np.float32]:
     """Largest rendering variance of a pixel within its budget, (electrons/s)^2, of the shape of the layer."""
     kappa = max(1.0, math.pi * (blur_sigma_px**2 + 1.0 / 12.0))
-    mean_e = electrons_per_s * np.float32(EXPOSURE_S)
-    return np.float32((BUDGET / EXPOSURE_S) ** 2 / kappa) * (mean_e + np.float32(READ_NOISE_E**2))
+    seconds = webcam().exposure_s
+    mean_e = electrons_per_s * np.float32(seconds)
+    return np.float32((BUDGET / seconds) ** 2 / kappa) * (mean_e + np.float32(webcam().read_noise_e ** 2))
 
 
 def noise_budget(view: View, uv_px: Array, layer: SpotImages, ambient: Array, variance: Array) -> NoiseBudget:
@@ -124,14 +131,15 @@ def noise_budget(view: View, uv_px: Array, layer: SpotImages, ambient: Array, va
     window, image = seen
     mosaic = _bayer(image)
     spot, du, dv, room, noise = (
-        np.where(mosaic, stack, 0.0).sum(axis=0) * EXPOSURE_S
+        np.where(mosaic, stack, 0.0).sum(axis=0) * webcam().exposure_s
         for stack in (
             *(getattr(layer, name)[:, *window] for name in _STACKS),
             ambient[:, *image].astype(float),
             np.sqrt(variance[:, *image].astype(float)),
         )
     )
-    weight = np.where(room > FULL_WELL_E, 0.0, 1.0 / (spot + room + READ_NOISE_E**2))
+    # a full pixel tells nothing
+    weight = np.where(room > webcam().full_well_e, 0.0, 1.0 / (spot + room + webcam().read_noise_e ** 2))
     slopes = np.stack([du, dv])
     information = np.einsum("ihw,jhw,hw->ij", slopes, slopes, weight)
     if np.linalg.matrix_rank(information) < 2:

@@ -3,7 +3,7 @@
 The image is cut into tiles of 32 x 32 pixels. A stage's names give the key of a Philox generator, the tile's row and
 column two words of its counter (J. K. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC11, 2011).
 Changing the counter is cheap, and every tile has 2^64 draws of its own, so that the Poisson draws, which take a
-variable number of them, disturb no other tile. A tile is always drawn as a whole.
+variable number of them, disturb no other tile. A tile is drawn row by row from its first one, over its whole width.
 """
 
 from __future__ import annotations
@@ -44,8 +44,12 @@ def frame_stream(dataset: str, seed: int, sample: str, position: str, laser: boo
 
 
 def whole_tiles(region: Region, size: tuple[int, int]) -> Region:
-    """Smallest region of whole tiles around `region`, in an image of size (height, width)."""
-    return region.grown(size, (TILE_PX, TILE_PX))
+    """Smallest region of tiles around `region`, in an image of size (height, width).
+
+    A tile is drawn row by row, so that the lowest tiles may end with the region: the rows before are the same.
+    """
+    tiles = region.grown(size, (TILE_PX, TILE_PX))
+    return Region(tiles.u0_px, tiles.v0_px, tiles.u1_px, region.v1_px)
 
 
 def poisson(stream: NoiseStream, mean: Array, region: Region) -> Array:

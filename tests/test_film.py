@@ -13,7 +13,7 @@ from scipy.special import ndtr
 from phibench.render.ambient import render_ambient
 from phibench.render.bake import BakeSettings, LightMap, bake
 from phibench.render.film_grid import FilmGrid
-from phibench.render.noise_budget import BUDGET, EXPOSURE_S, READ_NOISE_E, _bayer, excess, noise_budget, phi_gradient
+from phibench.render.noise_budget import BUDGET, _bayer, excess, noise_budget, phi_gradient, webcam
 from phibench.render.path_ambient import path_trace
 from phibench.render.quasi import golden_steps, shifts
 from phibench.render.spot import spot_layer
@@ -166,9 +166,9 @@ def test_phi_noise_of_a_spot_is_what_repeated_rendering_moves_it_by(light: Light
     mosaic = _bayer(image)
 
     def raw(stack: np.ndarray) -> np.ndarray:
-        return np.where(mosaic, stack, 0.0).sum(axis=-3).reshape(*stack.shape[:-3], -1) * EXPOSURE_S
+        return np.where(mosaic, stack, 0.0).sum(axis=-3).reshape(*stack.shape[:-3], -1) * webcam().exposure_s
 
-    weight = 1.0 / (raw(layer.electrons_per_s + rooms.mean(axis=0)) + READ_NOISE_E**2)
+    weight = 1.0 / (raw(layer.electrons_per_s + rooms.mean(axis=0)) + webcam().read_noise_e ** 2)
     slopes = np.stack([raw(layer.du_electrons_per_s_px), raw(layer.dv_electrons_per_s_px)])
     steps = np.linalg.solve((slopes * weight) @ slopes.T, (slopes * weight) @ (raw(rooms) - raw(rooms.mean(axis=0))).T)
     measured = np.std(phi_gradient(VIEW, uv) @ steps, ddof=1)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import tomllib
+
 import numpy as np
 import pytest
 from scipy import ndimage
 
 from phibench.render import noise_budget as nb
+from phibench.render.sensor import PRESETS_FILE
 from phibench.render.spot import spot_layer
 from phibench.render.spot_truth import spot_truth
 from phibench.scenes.catalog import default_rig
@@ -54,15 +57,17 @@ def test_predicted_errors_against_monte_carlo(source: str) -> None:
     mosaic = nb._bayer(image)
 
     def raw(stack: np.ndarray) -> np.ndarray:
-        return np.where(mosaic, stack, 0.0).sum(axis=0).ravel() * nb.EXPOSURE_S
+        return np.where(mosaic, stack, 0.0).sum(axis=0).ravel() * nb.webcam().exposure_s
 
     mean = raw(LAYER.electrons_per_s + ROOM[:, *image])
     slopes = np.stack([raw(LAYER.du_electrons_per_s_px), raw(LAYER.dv_electrons_per_s_px)])
-    weight = 1.0 / (mean + nb.READ_NOISE_E**2)
+    weight = 1.0 / (mean + nb.webcam().read_noise_e ** 2)
     if source == "sensor":
-        noise = rng.poisson(mean, (draws, mean.size)) - mean + rng.normal(0, nb.READ_NOISE_E, (draws, mean.size))
+        noise = (
+            rng.poisson(mean, (draws, mean.size)) - mean + rng.normal(0, nb.webcam().read_noise_e, (draws, mean.size))
+        )
     else:
-        noise = 0.1 * 4e4 * nb.EXPOSURE_S * _blurred_noise(rng, draws, h, w)
+        noise = 0.1 * 4e4 * nb.webcam().exposure_s * _blurred_noise(rng, draws, h, w)
     steps = np.linalg.solve((slopes * weight) @ slopes.T, (slopes * weight) @ noise.T)
     measured = np.std(nb.phi_gradient(VIEW, UV) @ steps)
     predicted = budget.phi_sensor_rad if source == "sensor" else budget.phi_render_rad
@@ -84,3 +89,14 @@ def test_a_spot_off_the_image_has_no_budget_to_keep() -> None:
     budget = nb.noise_budget(VIEW, UV, dark, ROOM, ROOM)
     assert np.isnan(budget.phi_render_rad)
     assert budget.kept
+
+
+def test_the_measure_is_the_presets_own() -> None:
+    """One source of truth: what the file says is what the budget uses."""
+    table = tomllib.loads(PRESETS_FILE.read_text())["webcam"]
+    measure = nb.webcam()
+    for name in ("exposure_s", "read_noise_e", "full_well_e"):
+        assert getattr(measure, name) == table[name]
+    assert measure is nb.webcam()
+    share = nb.allowed_per_s2(np.zeros((3, 1, 1), np.float32), 0.0) / (nb.BUDGET * 4.0 * 60.0) ** 2
+    np.testing.assert_allclose(share, 1.0, rtol=1e-6)  # a dark pixel's budget is the read noise's

@@ -14,7 +14,7 @@ import pytest
 from test_make import TINY, living, quiet, said
 
 from phibench.datasets import layout
-from phibench.datasets.code_hash import closure, code_behind
+from phibench.datasets.code_hash import _tables, closure, code_behind
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.files import TEMPORARY_PREFIX
 from phibench.datasets.journal import Entry, Head, Journal
@@ -140,6 +140,9 @@ def test_a_key_covers_the_code_behind_a_task_and_no_other() -> None:
     assert "phibench.render.certificate" in spot - view
     assert "phibench.render.ambient" in view - spot
     assert not {"phibench.datasets.make", "phibench.datasets.progress", "phibench.datasets.cluster"} & (view | spot)
+    # the sensor's numbers, which the noise budget takes from a table beside the code
+    assert "phibench.render.sensor" in view - spot
+    assert [path.name for path in _tables("phibench.render.sensor")] == ["sensor_presets.toml"]
     assert code_behind("phibench.datasets.view_task") != code_behind("phibench.datasets.spot_task")
 
 

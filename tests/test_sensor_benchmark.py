@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import pytest
 from sensor_light import room
 
+from phibench.datasets.frame_request import FrameRequest
+from phibench.datasets.frame_source import FrameSource, Side
+from phibench.datasets.layers import SpotWindow
 from phibench.render.chain import Chain
 from phibench.render.electrons import _pattern
+from phibench.render.motion import moved_spot
 from phibench.render.region import Region
 from phibench.render.sensor import sensor
 from phibench.render.tiles import NoiseStream
@@ -49,3 +54,40 @@ def test_benchmark_region_of_a_new_camera(benchmark) -> None:
         return int(chain.frame(LIGHT, STREAM.stage(next(draws)), REGION).max())
 
     assert benchmark(region) > 0
+
+
+def source(region: Region, preset: str = "mjpeg", velocity: tuple[float, float] = (0.0, 0.0), **changes) -> FrameSource:
+    """Source of a pair whose layers are read already."""
+    s = sensor(preset, **changes)
+    u0, v0, planes = moved_spot(LIGHT.spot, velocity, s.exposure_s, s.readout_s, LIGHT.size[0])
+    light = replace(LIGHT, spot=SpotWindow(u0, v0, planes, 0.0 * planes, 0.0 * planes))
+    side = Side(Chain(s), light, region)
+    return FrameSource(FrameRequest(preset, overrides=changes), ("benchmark", 0, "s"), {"down": side, "up": side})
+
+
+def rounds(benchmark, pair: FrameSource) -> None:
+    draws = itertools.count()
+    assert len(benchmark(lambda: pair.frames(next(draws))).by_name) == 2
+
+
+@pytest.mark.benchmark(group="frames")
+def test_benchmark_frames_of_a_pair(benchmark) -> None:
+    """Target: <= 0.4 s on one core for `source.frames(k)`, 1280 x 720, mjpeg, file and decoded image of both."""
+    rounds(benchmark, source(Region.whole(LIGHT.size)))
+
+
+CASES = {
+    "bayer-raw": {"preset": "bayer-raw"},
+    "srgb8": {"preset": "srgb8"},
+    "mjpeg": {},
+    "4:2:0": {"jpeg_subsampling": "4:2:0"},
+    "sharpened": {"sharpen_amount": 0.5},
+    "moving": {"velocity": (100.0, -50.0)},
+}
+
+
+@pytest.mark.benchmark(group="frames")
+@pytest.mark.parametrize("case", CASES)
+def test_benchmark_region_frames_of_a_pair(benchmark, case: str) -> None:
+    """Target: <= 6 ms on one core for `source.frames(k)`, two squares of 64 x 64 pixels: 3 ms each."""
+    rounds(benchmark, source(REGION, **CASES[case]))

@@ -109,6 +109,9 @@ def test_a_flat_field_is_recovered_within_the_noise(preset: str, matrix) -> None
     s = sensor(preset, colour_matrix=matrix, jpeg_quality=95)
     frame = Chain(s).frame(Light.flat(tuple(electrons / s.exposure_s), size), STREAM)
     found = isp.electrons_from_srgb(frame, s).mean(axis=(1, 2))
+    usual = Chain(s.replace(jpeg_quality=85)).frame(Light.flat(tuple(electrons / s.exposure_s), size), STREAM)
+    off = isp.electrons_from_srgb(usual, s).mean(axis=(1, 2)) / electrons - 1.0
+    print(f"{preset}: {100 * (found / electrons - 1.0)} %; quality 85: {100 * off} %")
     # noise per pixel below 150 e-, so 0.6 e- of the mean; the curve bends by 4 % of its slope per noise of 4 %: 0.1 %;
     # a rounding of 8 bits is dithered by 2 codes of noise. JPEG rounds the mean of a block's chroma to its table, and
     # colour by colour to 8 bits, undithered: half a code of 255, which is 1/255 of the slope's 0.45: 0.5 %

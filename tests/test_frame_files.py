@@ -1,0 +1,185 @@
+"""`phibench dataset frames`: the files are what the API gives, a rerun makes only what is missing or damaged."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from phibench.datasets.draw_frames import draw_frames
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.exr import read_exr
+from phibench.datasets.frame_files import preview
+from phibench.datasets.frame_index import INDEX, read_index
+from phibench.datasets.frame_request import FrameRequest
+from phibench.datasets.frames import Frame
+from phibench.datasets.read import open_dataset
+from phibench.datasets.sums import damaged, strays
+from phibench.estimator import cli
+from phibench.render.region import Region
+
+SEEN, HALF = "seen-near-h0.500", "half-hidden-h1.400"
+
+
+def run(*tokens: object) -> int:
+    return cli.main(["dataset", "frames", *map(str, tokens)])
+
+
+def image_in(path: Path) -> np.ndarray:
+    if path.suffix == ".exr":
+        return np.stack([read_exr(path).planes[name] for name in "RGB"])
+    with Image.open(path) as picture:
+        return np.asarray(picture)
+
+
+@pytest.mark.parametrize(
+    ("preset", "end", "mode"),
+    [("ideal", "exr", ""), ("bayer-raw", "png", "I;16"), ("srgb8", "png", "RGB"), ("mjpeg", "jpg", "RGB")],
+)
+def test_files_are_what_the_api_gives(tiny_dataset: Path, tmp_path: Path, preset: str, end: str, mode: str) -> None:
+    out = tmp_path / "f"
+    assert run(tiny_dataset, "--preset", preset, "--draws", 2, "--laser-off", "--out", out, "--workers", 1) == 0
+    rows = read_index(out)
+    frames = {name: row for name, row in rows.items() if row.kind == "frame"}
+    assert len(frames) == 2 * 2 * 2 * 2
+    assert len(rows) - len(frames) == (8 if preset in ("ideal", "bayer-raw") else 0)
+    assert f"{SEEN}-down-on-0000.{end}" in frames
+    dataset = open_dataset(tiny_dataset)
+    for name, row in frames.items():
+        source = dataset[row.sample_id].frame_source(preset)
+        frame = source.frame(row.position, row.draw, row.laser == "on")
+        expected = frame.image.astype(np.float32) if preset == "ideal" else frame.image
+        np.testing.assert_array_equal(image_in(out / name), expected)
+        assert hashlib.sha256((out / name).read_bytes()).hexdigest() == row.sha256
+        assert row.sensor == json.loads(frame.sensor.model_dump_json())
+        assert (row.width_px, row.height_px, row.exposure_s) == (320, 180, frame.sensor.exposure_s)
+        if mode:
+            with Image.open(out / name) as picture:
+                assert picture.mode == mode
+        if preset == "mjpeg":
+            assert (out / name).read_bytes() == frame.jpeg
+
+
+def test_raw_files_hold_ten_bits_unscaled(tiny_dataset: Path, tmp_path: Path) -> None:
+    draw_frames(tiny_dataset, FrameRequest("bayer-raw"), out=tmp_path / "f", samples=[SEEN], workers=1)
+    image = image_in(tmp_path / "f" / f"{SEEN}-up-on-0000.png")
+    assert image.dtype == np.uint16
+    assert 64 < np.median(image) <= 1023
+    assert image.max() == 1023  # the lamps
+    picture = image_in(tmp_path / "f" / "previews" / f"{SEEN}-up-on.png")
+    assert (picture.shape, picture.dtype) == ((180, 320, 3), np.uint8)
+
+
+def test_a_rerun_makes_what_is_missing_or_damaged(
+    tiny_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "f"
+    options = (tiny_dataset, "--region", 32, "--samples", SEEN, "--out", out, "--draws")
+    assert run(*options, 3) == 0
+    assert "6 files written, 0 kept" in capsys.readouterr().out
+    before = {path.name: path.read_bytes() for path in out.glob("*.*")}
+    assert run(*options, 3) == 0
+    assert "0 files written, 6 kept" in capsys.readouterr().out
+    (out / f"{SEEN}-down-on-0001.png").unlink()
+    (out / f"{SEEN}-up-on-0002.png").write_bytes(b"half")
+    assert run(*options, 3) == 0
+    assert "2 files written, 4 kept" in capsys.readouterr().out
+    assert {path.name: path.read_bytes() for path in out.glob("*.*")} == before
+    (out / INDEX).unlink()
+    assert run(*options, 4) == 0
+    assert "8 files written, 0 kept" in capsys.readouterr().out
+    assert {name: (out / name).read_bytes() for name in before if name.endswith("png")} == {
+        name: data for name, data in before.items() if name.endswith("png")
+    }
+
+
+def test_workers_give_the_same_bytes(tiny_dataset: Path, tmp_path: Path) -> None:
+    for workers in (1, 2):
+        assert run(tiny_dataset, "--draws", 2, "--out", tmp_path / str(workers), "--workers", workers) == 0
+    one, two = ({p.name: p.read_bytes() for p in (tmp_path / n).glob("*.*") if p.is_file()} for n in ("1", "2"))
+    one, two = ({name: data for name, data in x.items() if not name.startswith(".")} for x in (one, two))
+    assert one == two
+    assert len(one) == 2 * 2 * 2 + 1
+
+
+def test_changed_layers_are_drawn_again(tiny_dataset: Path, tmp_path: Path) -> None:
+    """The hash of a layer in SHA256SUMS enters the key of the frames that come from it."""
+    copy, out = Path(shutil.copytree(tiny_dataset, tmp_path / "copy")), tmp_path / "f"
+    request = FrameRequest("bayer-raw", region=16)
+    assert draw_frames(copy, request, out=out, samples=[SEEN], workers=1).made == 4
+    sums = (copy / "SHA256SUMS").read_text().splitlines()
+    changed = ["0" * 64 + line[64:] if line.endswith(f"{SEEN}-up.exr") else line for line in sums]
+    assert changed != sums
+    (copy / "SHA256SUMS").write_text("\n".join(changed) + "\n")
+    assert draw_frames(copy, request, out=out, samples=[SEEN], workers=1).made == 4
+
+
+def test_the_default_folder_is_beside_the_data_set(tiny_dataset: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
+    assert run(copy, "--region", 8, "--samples", SEEN) == 0
+    assert (tmp_path / "copy-frames" / INDEX).is_file()
+    assert damaged(copy) == strays(copy) == []
+
+
+def test_samples_without_a_place_for_a_region_are_named(
+    tiny_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("phibench.datasets.draw_frames.has_place", lambda spot, size: spot.pose != "h1.400")
+    assert run(tiny_dataset, "--region", 8, "--out", tmp_path / "f") == 0
+    out = capsys.readouterr().out
+    assert f"note: {HALF} is left out: no image of the spot" in out
+    assert "2 files written" in out
+
+
+@pytest.mark.parametrize(
+    ("tokens", "words"),
+    [
+        (["--preset", "mjpg"], "did you mean 'mjpeg'"),
+        (["--exposure", "long"], "give seconds above 0, or 'auto'"),
+        (["--exposure", "0"], "give a number above 0 up to 10"),
+        (["--draws", "0"], "draws = 0: must be an integer, 1 or above"),
+        (["--region", "0"], "region = 0: must be an integer, 1 or above"),
+        (["--region", "500", "--workers", "1"], "allowed sides are 1 to 180"),
+        (["--samples", "seen"], "no sample 'seen'"),
+        (["--workers", "0"], "workers = 0"),
+    ],
+)
+def test_mistakes_are_one_sentence(
+    tiny_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], tokens: list[str], words: str
+) -> None:
+    assert run(tiny_dataset, "--out", tmp_path / "f", *tokens) == 2
+    err = capsys.readouterr().err
+    assert words in err
+    assert "Traceback" not in err
+
+
+def test_folders_that_will_not_do_are_refused(tiny_dataset: Path, tmp_path: Path) -> None:
+    request, only = FrameRequest("bayer-raw", region=8), {"samples": [SEEN], "workers": 1}
+    with pytest.raises(DatasetError, match="lies inside the data set"):
+        draw_frames(tiny_dataset, request, out=tiny_dataset / "frames", **only)  # type: ignore[arg-type]
+    out = tmp_path / "f"
+    draw_frames(tiny_dataset, request, out=out, **only)  # type: ignore[arg-type]
+    with pytest.raises(DatasetError, match="holds frames with region 8, not 16: give another folder"):
+        draw_frames(tiny_dataset, FrameRequest("bayer-raw", region=16), out=out, **only)  # type: ignore[arg-type]
+    (out / INDEX).write_text("{}\n")
+    with pytest.raises(DatasetError, match=r"frames\.jsonl line 1 is damaged"):
+        draw_frames(tiny_dataset, request, out=out, **only)  # type: ignore[arg-type]
+    with pytest.raises(DatasetError, match="is a data set"):
+        draw_frames(tiny_dataset, request, out=shutil.copytree(tiny_dataset, tmp_path / "copy"), **only)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("corner", [(0, 0), (1, 0), (0, 1), (1, 1)])
+def test_previews_of_parts_keep_the_colours(tiny_dataset: Path, corner: tuple[int, int]) -> None:
+    """A part that begins at any site of the mosaic looks like the same part of the whole picture."""
+    sample = open_dataset(tiny_dataset)[SEEN]
+    u0, v0 = 100 + corner[0], 60 + corner[1]
+    whole = sample.frame_source("bayer-raw").frame("up")
+    part: Frame = sample.frame_source("bayer-raw", region=Region(u0, v0, u0 + 20, v0 + 16)).frame("up")
+    expected = preview(whole)[v0 + v0 % 2 : v0 + 16, u0 + u0 % 2 : u0 + 20]
+    # borders are mirrored: compare the inside
+    np.testing.assert_array_equal(preview(part)[1:-1, 1:-1], expected[1:-1, 1:-1])
