@@ -30,7 +30,7 @@ def covariance_bound(fisher: Array, keep: int = 2) -> Array:
     with np.errstate(all="ignore"):
         scale = 1.0 / np.sqrt(np.diagonal(fisher, axis1=-2, axis2=-1))
         scaled = fisher * scale[..., :, None] * scale[..., None, :]
-        finite = np.isfinite(scaled).all(axis=(-2, -1))
+        finite = np.asarray(np.isfinite(scaled).all(axis=(-2, -1)))
         # the unit matrix keeps what cannot be inverted from stopping the others
         safe = np.where(finite[..., None, None], scaled, np.eye(fisher.shape[-1]))
         good = finite & (np.linalg.cond(safe) < _CONDITION)

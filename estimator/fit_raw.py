@@ -9,7 +9,7 @@ without PRNU it is the exact one of the shifted Poisson law x + r^2 ~ Poisson(mu
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,7 +29,7 @@ _DAMPING = (1.0,) * 12 + (0.5,) * 16 + (0.25,) * 24  # of the steps after screen
 _DECREMENT = 1e-8  # squared distance from the minimum in standard deviations: 1e-4 of one
 _STEP_PX = 0.5
 _SIGMA_RANGE_PX = (0.15, 10.0)
-_AT_ONCE = 128
+_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,7 @@ class _Data:
 
     def rows(self, index: NDArray[np.int64]) -> _Data:
         arrays = ("x", "finite", "used", "response", "base", "levels", "sigma")
-        same = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in arrays}
-        return _Data(**{name: getattr(self, name)[index] for name in arrays}, **same)
+        return replace(self, **{name: getattr(self, name)[index] for name in arrays})
 
 
 def fit_raw(
@@ -121,7 +120,7 @@ def fit_raw(
         raise ValueError(f"regions have the shape {x.shape}: (n, h, w) of 3 x 3 pixels or more is needed")
     origin = np.broadcast_to(np.asarray(origin_px, np.int64), (len(x), 2))
     data = _data(x, origin, noise, np.broadcast_to(np.asarray(sigma_px, float), len(x)), response, background_e)
-    data = _Data(**{**data.__dict__, "used": data.used & (x < saturation_e), "free_width": free_width})
+    data = replace(data, used=data.used & (x < saturation_e), free_width=free_width)
     parts = [np.arange(i, min(i + _AT_ONCE, len(x))) for i in range(0, len(x), _AT_ONCE)]
     fits = [_fit(data.rows(part), origin[part]) for part in parts]
     if not fits:
@@ -150,17 +149,25 @@ def _data(
 
 
 def _fit(data: _Data, origin: NDArray[np.int64]) -> SpotFit:
-    n, grid = len(data.x), START_PX * np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), -1).reshape(-1, 2)
     with np.errstate(all="ignore"):
-        many = data.rows(np.repeat(np.arange(n), len(grid)))
-        theta = np.repeat(_first_guess(data), len(grid), axis=0)
-        theta[:, :2] += np.tile(grid, (n, 1))
-        for _ in range(_SCREENING_STEPS):
-            theta, _ = _step(many, theta)
-        best = np.argmin(_misfit(many, theta).reshape(n, -1), axis=1)
-        theta = theta.reshape(n, len(grid), -1)[np.arange(n), best]
+        theta = _screened(data, _first_guess(data))
         theta, converged = _polished(data, theta)
         return _result(data, theta, converged, origin)
+
+
+def _screened(data: _Data, guess: Array) -> Array:
+    """Guess with the position and flux of the deepest minimum of nine starts; background and width stay as guessed."""
+    n, c = len(guess), data.levels.shape[1]
+    grid = START_PX * np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), -1).reshape(-1, 2)
+    base = data.base + np.einsum("nc,nchw->nhw", guess[:, 3 : 3 + c], data.levels)
+    fixed = replace(data, base=base, levels=data.levels[:, :0], free_width=False)
+    many = fixed.rows(np.repeat(np.arange(n), len(grid)))
+    theta = np.repeat(guess[:, :3], len(grid), axis=0)
+    theta[:, :2] += np.tile(grid, (n, 1))
+    for _ in range(_SCREENING_STEPS):
+        theta, _ = _step(many, theta)
+    best = np.argmin(_misfit(many, theta).reshape(n, -1), axis=1)
+    return np.column_stack([theta.reshape(n, len(grid), 3)[np.arange(n), best], guess[:, 3:]])
 
 
 def _first_guess(data: _Data) -> Array:
@@ -182,7 +189,7 @@ def _first_guess(data: _Data) -> Array:
 
 
 def _median(x: Array, mask: BoolArray) -> Array:
-    """Lower median of the masked pixels, shape (n,), 0 where there are none; many times faster than a masked array's."""
+    """Lower median of the masked pixels, shape (n,), 0 where there are none; nanmedian takes ten times longer."""
     rising = np.sort(np.where(mask, x, np.inf).reshape(len(x), -1), axis=1)
     middle = np.maximum(mask.sum(axis=(1, 2)) - 1, 0) // 2
     median = np.take_along_axis(rising, middle[:, None], axis=1)[:, 0]
@@ -274,14 +281,14 @@ def _result(data: _Data, theta: Array, converged: BoolArray, origin: NDArray[np.
         (~converged, Status.NOT_CONVERGED),
     )
     mean, _ = _model(data, theta)
-    chi2 = np.sum(data.used * (data.x - mean) ** 2 / data.noise.variance_e2(mean), axis=(1, 2)) / np.maximum(
-        used - k, 1
-    )
+    square = data.used * (data.x - mean) ** 2 / data.noise.variance_e2(mean)
+    chi2 = np.sum(square, axis=(1, 2)) / np.maximum(used - k, 1)
     c = data.levels.shape[1]
     background = theta[:, 3 : 3 + c] if c else np.full((n, 1), np.nan)
     sigma = theta[:, -1] if data.free_width else data.sigma
     values = (theta[:, :2] + origin, covariance[:, :2, :2], theta[:, 2], background, sigma, chi2)
-    return SpotFit(*(keep(value, status) for value in values), status)
+    uv, uv_covariance, flux, levels, width, misfit = (keep(value, status) for value in values)
+    return SpotFit(uv, uv_covariance, flux, levels, width, misfit, status)
 
 
 def _nothing(levels: int) -> SpotFit:

@@ -1,8 +1,8 @@
 """The theoretical limit: how well u, v, phi and D of one spot can be known.
 
 Unknowns besides u, v: the spot's flux (laser, albedo and speckle are not known to a per cent), and the background, one
-level per colour filter, because the colour of the room's light behind the spot is not known; with the laser-off frame in
-hand it may count as known. Speckle flicker scales the whole spot and is covered by the unknown flux.
+level per colour filter, because the colour of the room's light behind the spot is not known; with the laser-off frame
+in hand it may count as known. Speckle flicker scales the whole spot and is covered by the unknown flux.
 """
 
 from __future__ import annotations

@@ -1,13 +1,14 @@
 """What an error of the rig's parameters does to D, with the pixels as they are.
 
-The parameters mean what they mean in a recipe's `[rig]`: decentre and z_c move the sphere centre along world axes, a tilt
-turns the camera about its lens while the sphere stays, `f_px` is fx and fy together.
+The parameters mean what they mean in a recipe's `[rig]`: decentre and z_c move the sphere centre along world axes, a
+tilt turns the camera about its lens while the sphere stays, `f_px` is fx and fy together.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -95,7 +96,7 @@ def rig_gradient(rig: Rig, stroke_m: ArrayLike, uv_down_px: Array, uv_up_px: Arr
         return depth_exact(changed_rig(rig, parameter, by), h, uv_down_px, uv_up_px).depth_m
 
     steps = {"stroke_m": _STROKE_STEP_M, **{name: size for name, (_, size) in _CHANGES.items()}}
-    return np.stack([_slope(lambda x, n=name: depth(n, x), step * size) for name, size in steps.items()], axis=-1)
+    return np.stack([_slope(partial(depth, name), step * size) for name, size in steps.items()], axis=-1)
 
 
 def _slope(f: Callable[[float], Array], step: float) -> Array:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,31 +32,31 @@ class SpotPositions:
     status: StatusArray
 
 
-def brightest_pixel(images: NDArray, origin_px: ArrayLike = (0, 0)) -> SpotPositions:
+def brightest_pixel(images: NDArray[Any], origin_px: ArrayLike = (0, 0)) -> SpotPositions:
     """Pixel of the largest luma; the first of several."""
     signal = _signal(images)
     return _positions(signal, _peak(signal), origin_px)
 
 
-def thresholded_centroid(images: NDArray, origin_px: ArrayLike = (0, 0), share: float = 0.3) -> SpotPositions:
+def thresholded_centroid(images: NDArray[Any], origin_px: ArrayLike = (0, 0), share: float = 0.3) -> SpotPositions:
     """Centroid of what exceeds `share` of the peak above the background, the threshold taken off."""
     signal = _signal(images)
     peak = signal.max(axis=(1, 2), keepdims=True)
     return _positions(signal, _centroid(np.maximum(signal - share * peak, 0.0)), origin_px)
 
 
-def laplacian_blob(images: NDArray, origin_px: ArrayLike = (0, 0), sigma_px: float = 1.0) -> SpotPositions:
+def laplacian_blob(images: NDArray[Any], origin_px: ArrayLike = (0, 0), sigma_px: float = 1.0) -> SpotPositions:
     """Maximum of the negative Laplacian of Gaussian at one scale, refined by a parabola along u and v.
 
-    scikit-image's `blob_log` is the same filter over several scales; it gives whole pixels and takes one image at a time.
+    scikit-image's `blob_log` is the same filter over several scales; it gives whole pixels, one image at a time.
     """
     signal = _signal(images)
-    response = -gaussian_laplace(signal, sigma=(0.0, sigma_px, sigma_px), axes=None, mode="nearest")
+    response = -gaussian_laplace(signal, sigma_px, mode="nearest", axes=(1, 2))
     uv = _peak(response)
     return _positions(signal, uv + _parabola(response, uv), origin_px)
 
 
-def windowed_centroid(images: NDArray, origin_px: ArrayLike = (0, 0), sigma_px: float = 1.5) -> SpotPositions:
+def windowed_centroid(images: NDArray[Any], origin_px: ArrayLike = (0, 0), sigma_px: float = 1.5) -> SpotPositions:
     """Iterated centroid under a Gaussian window: x += 2 sum(w I (x_i - x)) / sum(w I).
 
     The position XWIN of SExtractor, E. Bertin and S. Arnouts, A&AS 117, 393 (1996) and its manual. From the brightest
@@ -75,7 +76,7 @@ def windowed_centroid(images: NDArray, origin_px: ArrayLike = (0, 0), sigma_px: 
     return _positions(signal, uv, origin_px, moved < _WINDOW_TOLERANCE_PX)
 
 
-def gaussian_least_squares(images: NDArray, origin_px: ArrayLike = (0, 0)) -> SpotPositions:
+def gaussian_least_squares(images: NDArray[Any], origin_px: ArrayLike = (0, 0)) -> SpotPositions:
     """Unweighted least squares of a round Gaussian, sampled at pixel centres, plus a constant (scipy)."""
     signal = _signal(images)
     start = _peak(signal)
@@ -93,7 +94,7 @@ SIMPLE_METHODS: dict[str, Callable[..., SpotPositions]] = {
 }
 
 
-def luma(images: NDArray) -> Array:
+def luma(images: NDArray[Any]) -> Array:
     """Luma, shape (n, h, w), of colour images; images of one plane as they are.
 
     Raises
@@ -109,7 +110,7 @@ def luma(images: NDArray) -> Array:
     return x @ np.array(LUMA) if x.ndim == 4 else x
 
 
-def _signal(images: NDArray) -> Array:
+def _signal(images: NDArray[Any]) -> Array:
     x = luma(images)
     edge = np.concatenate([x[:, 0], x[:, -1], x[:, 1:-1, 0], x[:, 1:-1, -1]], axis=1)
     return x - np.median(edge, axis=1)[:, None, None]
