@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from phibench.scenes.frames import Array
 
 _CONDITION = 1e12  # of the scaled matrix; beyond it the unknowns cannot be told apart
+_DEPENDENT = 1e-11  # of the largest eigenvalue of a covariance: below this an output repeats others
 
 
 def fisher_matrix(derivatives: Array, information: Array) -> Array:
@@ -35,7 +36,7 @@ def covariance_bound(fisher: Array, keep: int = 2) -> Array:
         safe = np.where(finite[..., None, None], scaled, np.eye(fisher.shape[-1]))
         good = finite & (np.linalg.cond(safe) < _CONDITION)
         inverse = np.linalg.inv(np.where(good[..., None, None], safe, np.eye(fisher.shape[-1])))
-    bound = (inverse * scale[..., :, None] * scale[..., None, :])[..., :keep, :keep]
+        bound = (inverse * scale[..., :, None] * scale[..., None, :])[..., :keep, :keep]
     return np.where(good[..., None, None], bound, np.nan)
 
 
@@ -68,8 +69,9 @@ def processed_fisher(slopes: ArrayLike, covariance: Array, draws: int = 0) -> Ar
     n = int(varies.sum())
     factor = hartlap_factor(n, draws) if draws else 1.0
     D = D[:, :, varies]
-    solved = np.linalg.solve(covariance[np.ix_(varies, varies)], np.swapaxes(D, -1, -2))  # (s, n, k)
-    products = np.einsum("akn,bnl->abkl", D, solved)
+    # outputs that are sums of others (interpolated pixels before they are rounded) add nothing: pseudo-inverse
+    inverse = np.linalg.pinv(covariance[np.ix_(varies, varies)], rcond=_DEPENDENT, hermitian=True)
+    products = np.einsum("akn,nm,blm->abkl", D, inverse, D, optimize=True)
     apart = ~np.eye(len(D), dtype=bool) if len(D) > 1 else np.ones((1, 1), bool)
     mean = products[apart].mean(axis=0)
     return factor * 0.5 * (mean + mean.T)

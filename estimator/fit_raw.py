@@ -276,8 +276,8 @@ def _result(data: _Data, theta: Array, converged: BoolArray, origin: NDArray[np.
     status = flag(
         (~data.finite, Status.NOT_FINITE),
         (used <= k, Status.SATURATED),
-        (~inside, Status.SPOT_CUT),
         (~(theta[:, 2] > LEAST_SNR * np.sqrt(covariance[:, 2, 2])), Status.NO_SPOT),
+        (~inside, Status.SPOT_CUT),
         (~converged, Status.NOT_CONVERGED),
     )
     mean, _ = _model(data, theta)
