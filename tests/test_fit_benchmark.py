@@ -12,13 +12,14 @@ from phibench.estimator.fit_raw import LASER_RESPONSE, fit_raw
 from phibench.estimator.limits import NOISE_MODELS, spot_limit
 from phibench.estimator.raw_pixels import PixelNoise
 from phibench.estimator.simple_spots import SIMPLE_METHODS
+from phibench.estimator.status import Status
 from phibench.render.light import Light
 from phibench.render.sensor import sensor
 from phibench.scenes.streams import generator
 
 SPOTS = 256
 LIGHT = Light(np.full((3, 48, 48), 6e3), spot_at(24.3, 23.8, 0.7, 3e5))
-REGION = expected_of_light(LIGHT, sensor("bayer-raw"), margin_px=0)
+REGION = expected_of_light(LIGHT, sensor("bayer-raw"))
 
 
 def noisy() -> np.ndarray:
@@ -36,14 +37,14 @@ def test_benchmark_fit_of_256_spots(benchmark, case: str) -> None:
     background = np.full((13, 13), 100.0) if "known" in case else None
     x, noise = noisy(), PixelNoise(16.0)
     fit = benchmark(lambda: fit_raw(x, (18, 18), noise, 0.7, response, background, free_width="free" in case))
-    assert fit.uv_px.shape == (SPOTS, 2)
+    assert (fit.status == Status.OK).mean() > 0.99
 
 
 @pytest.mark.benchmark(group="fit")
 @pytest.mark.parametrize("name", SIMPLE_METHODS)
 def test_benchmark_simple_method_on_256_spots(benchmark, name: str) -> None:
     x = noisy()
-    assert benchmark(lambda: SIMPLE_METHODS[name](x)).uv_px.shape == (SPOTS, 2)
+    assert (benchmark(lambda: SIMPLE_METHODS[name](x)).status == Status.OK).mean() > 0.9
 
 
 @pytest.mark.benchmark(group="limit")
