@@ -57,10 +57,11 @@ def laplacian_blob(images: NDArray[Any], origin_px: ArrayLike = (0, 0), sigma_px
 
 
 def windowed_centroid(images: NDArray[Any], origin_px: ArrayLike = (0, 0), sigma_px: float = 1.5) -> SpotPositions:
-    """Iterated centroid under a Gaussian window: x += 2 sum(w I (x_i - x)) / sum(w I).
+    """Iterated centroid under a Gaussian window: where sum(w I (x_i - x)) = 0.
 
-    The position XWIN of SExtractor, E. Bertin and S. Arnouts, A&AS 117, 393 (1996) and its manual. From the brightest
-    pixel, at most 60 steps, to 1e-5 px.
+    The position XWIN of SExtractor, E. Bertin and S. Arnouts, A&AS 117, 393 (1996) and its manual. Its step of 2 times
+    the offset is taken as 1.5 times: the same end, but no oscillation for a spot much narrower than the window. From
+    the brightest pixel, at most 60 steps, to 1e-5 px.
     """
     signal = _signal(images)
     h, w = signal.shape[1:]
@@ -71,8 +72,10 @@ def windowed_centroid(images: NDArray[Any], origin_px: ArrayLike = (0, 0), sigma
             weighted = signal * np.exp(-0.5 * (du[:, None, :] ** 2 + dv[:, :, None] ** 2) / sigma_px**2)
             total = weighted.sum(axis=(1, 2))
             across, down = (np.sum(weighted.sum(axis=axis) * d, axis=1) for axis, d in ((1, du), (2, dv)))
-            step = 2.0 * np.stack([across, down], axis=1) / total[:, None]
+            step = 1.5 * np.stack([across, down], axis=1) / total[:, None]
             uv, moved = uv + step, np.abs(step).max(axis=1)
+            if not (moved >= _WINDOW_TOLERANCE_PX).any():
+                break
     return _positions(signal, uv, origin_px, moved < _WINDOW_TOLERANCE_PX)
 
 
