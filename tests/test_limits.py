@@ -207,9 +207,8 @@ def test_an_ideal_sampler_has_efficiency_one() -> None:
     errors = generator("limits", "ideal sampler").multivariate_normal([0.0, 0.0], limit.covariance_px2, n)
     square = np.einsum("ni,ij,nj->", errors, np.linalg.inv(limit.covariance_px2), errors)
     low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], 2 * n)
-    print(
-        f"efficiency of the sampler {np.sqrt(2 * n / square):.4f}, interval {low / (2 * n):.4f} to {high / (2 * n):.4f}"
-    )
+    interval = np.sqrt(2 * n / np.array([high, square, low]))
+    print("efficiency of the sampler {1:.4f}, between {0:.4f} and {2:.4f}".format(*interval))
     assert low < square < high
     assert square * 1.03**2 > high
     assert square / 1.03**2 < low

@@ -81,7 +81,7 @@ def test_rig_gradient_predicts_what_a_wrong_rig_gives() -> None:
     """Pixels of a true rig, estimated with the nominal one: D is off by minus the gradient times the error."""
     row, spot = paper_cases()[12]
     h = row.baseline_m
-    steps = {**{name: 0.02 * sigma for name, sigma in SIGMAS.items() if name != "stroke_m"}}
+    steps = {name: 0.02 * sigma for name, sigma in SIGMAS.items() if name != "stroke_m"}
     g = rig_gradient(RIG, h, *pixels(RIG, spot, h))
     for name, step in steps.items():
         true_rig = changed_rig(RIG, name, step)
