@@ -26,6 +26,8 @@ class Status(IntEnum):
     NO_SPOT = 8  # no light in the difference of the frames
     SPOT_CUT = 9  # the spot reaches the edge of the image
     NOT_ISOLATED = 10  # no empty border found around the spot
+    NOT_CONVERGED = 11  # a fit did not come to rest
+    SATURATED = 12  # too few pixels below saturation for the unknowns of a fit
 
 
 def flag(*cases: tuple[ArrayLike, Status]) -> StatusArray:

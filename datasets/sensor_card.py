@@ -1,0 +1,64 @@
+"""What an estimator may know of the sensor: the numbers of its preset, and none of the simulator's mathematics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from phibench.render.sensor import Sensor, sensor
+
+
+@dataclass(frozen=True)
+class SensorCard:
+    """Numbers of one sensor, as `render.sensor.Sensor` defines them.
+
+    Attributes
+    ----------
+    name : str
+    mosaic : "bayer" (RGGB, red at even row and even column) or "mono"
+    exposure_s : float
+    shot_noise : bool
+    full_well_e, read_noise_e, row_noise_e, dsnu_e : float, electrons
+    prnu : float, relative
+    dark_e_per_s : float
+    dn_per_e : float
+        Overall system gain K, analogue gain included.
+    black_level_dn : float
+    top_dn : int
+        Largest code.
+    """
+
+    name: str
+    mosaic: Literal["bayer", "mono"]
+    exposure_s: float
+    shot_noise: bool
+    full_well_e: float
+    read_noise_e: float
+    row_noise_e: float
+    prnu: float
+    dsnu_e: float
+    dark_e_per_s: float
+    dn_per_e: float
+    black_level_dn: float
+    top_dn: int
+
+    @property
+    def saturation_e(self) -> float:
+        """Electrons at which a pixel carries no more information: full well or last code, whichever comes first."""
+        return min(self.full_well_e, (self.top_dn - 0.5 - self.black_level_dn) / self.dn_per_e)
+
+
+def sensor_card(preset: str = "bayer-raw", **changes: Any) -> SensorCard:
+    """Card of a preset, with changes: ``sensor_card("mono-raw", analogue_gain=4.0)``.
+
+    Raises
+    ------
+    SensorError
+        If there is no such preset, or a change is not allowed.
+    """
+    return card_of(sensor(preset, **changes))
+
+
+def card_of(s: Sensor) -> SensorCard:
+    """Card of a sensor."""
+    return SensorCard(**{name: getattr(s, name) for name in SensorCard.__dataclass_fields__})

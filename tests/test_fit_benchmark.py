@@ -1,0 +1,54 @@
+"""Times of the limits and fits, `pytest --benchmark-enable --benchmark-only`; targets are stated, not asserted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sensor_light import spot_at
+
+from phibench.datasets.expected import expected_of_light
+from phibench.datasets.sensor_card import card_of
+from phibench.estimator.fit_raw import LASER_RESPONSE, fit_raw
+from phibench.estimator.limits import NOISE_MODELS, spot_limit
+from phibench.estimator.raw_pixels import PixelNoise
+from phibench.estimator.simple_spots import SIMPLE_METHODS
+from phibench.estimator.status import Status
+from phibench.render.light import Light
+from phibench.render.sensor import sensor
+from phibench.scenes.streams import generator
+
+SPOTS = 256
+LIGHT = Light(np.full((3, 48, 48), 6e3), spot_at(24.3, 23.8, 0.7, 3e5))
+REGION = expected_of_light(LIGHT, sensor("bayer-raw"))
+
+
+def noisy() -> np.ndarray:
+    """256 regions of 13 x 13 pixels around the same spot."""
+    v, u = 24 - REGION.v0_px, 24 - REGION.u0_px
+    mean = REGION.mean_e[v - 6 : v + 7, u - 6 : u + 7]
+    return generator("fit benchmark").poisson(mean, (SPOTS, 13, 13)).astype(float)
+
+
+@pytest.mark.benchmark(group="fit")
+@pytest.mark.parametrize("case", ["mono", "bayer", "bayer, known background", "bayer, free width"])
+def test_benchmark_fit_of_256_spots(benchmark, case: str) -> None:
+    """Target: <= 2 ms per spot on one core, so 0.5 s for the call."""
+    response = None if case == "mono" else LASER_RESPONSE
+    background = np.full((13, 13), 100.0) if "known" in case else None
+    x, noise = noisy(), PixelNoise(16.0)
+    fit = benchmark(lambda: fit_raw(x, (18, 18), noise, 0.7, response, background, free_width="free" in case))
+    assert (fit.status == Status.OK).mean() > 0.99
+
+
+@pytest.mark.benchmark(group="fit")
+@pytest.mark.parametrize("name", SIMPLE_METHODS)
+def test_benchmark_simple_method_on_256_spots(benchmark, name: str) -> None:
+    x = noisy()
+    assert (benchmark(lambda: SIMPLE_METHODS[name](x)).status == Status.OK).mean() > 0.9
+
+
+@pytest.mark.benchmark(group="limit")
+@pytest.mark.parametrize("model", NOISE_MODELS)
+def test_benchmark_limit_of_one_spot(benchmark, model: str) -> None:
+    card = card_of(sensor("bayer-raw"))
+    assert benchmark(lambda: spot_limit(REGION, card, model=model).rms_px) > 0
