@@ -102,7 +102,7 @@ class AmbientTable(Table):
     """`[ambient]`: how well the room is rendered."""
 
     cells_per_pixel: int = Field(
-        default=2, ge=1, le=32, description="cells along a pixel's side; two samples each, more where noise asks for it"
+        default=2, ge=2, le=32, description="cells along a pixel's side; two samples each, more where noise asks for it"
     )
     texel_m: float = Field(default=0.05, ge=0.01, le=2.0, description="size of the light map's texels")
     lamp_rays: int = Field(default=64, ge=1, le=65536, description="shadow rays per texel and lamp, twice")

@@ -10,11 +10,12 @@ from typing import Any, TypeVar, cast
 
 from pydantic import ValidationError
 
-from phibench.datasets.recipe import MAX_STROKE_M, LaserTable, Recipe, RigTable, RoomTable, TargetTable
+from phibench.datasets.recipe import MAX_STROKE_M, AmbientTable, LaserTable, Recipe, RigTable, RoomTable, TargetTable
 from phibench.datasets.recipe_places import boards_in_the_way, spots_on_boards
 from phibench.datasets.recipe_random_checks import purpose_faults, random_faults
 from phibench.datasets.recipe_scene import build_rig, build_room, build_spot, build_target, ceiling_m
 from phibench.datasets.recipe_table import Table
+from phibench.render.film_grid import FilmGrid
 from phibench.render.model_faults import Fault
 from phibench.scenes.checks import SceneError
 from phibench.scenes.names import nearest
@@ -170,9 +171,17 @@ def _rig(raw: Raw, experiments: list[tuple[int, Raw]], targets: list[tuple[int, 
     except SceneError as error:
         yield Fault("rig", str(error))
         return
+    yield from _cells(rig, _sound(raw.get("ambient", {}), AmbientTable))
     yield from boards_in_the_way(rig, _legal_strokes(experiments), targets)
     if room_table is not None:
         yield from _strokes(rig, build_room(room_table, ()), experiments)
+
+
+def _cells(rig: Rig, ambient: AmbientTable | None) -> Iterator[Fault]:
+    try:
+        FilmGrid.of(rig.camera, 1 if ambient is None else ambient.cells_per_pixel)
+    except SceneError as error:
+        yield Fault("ambient.cells_per_pixel", str(error))
 
 
 def _strokes(rig: Rig, room: Room, experiments: list[tuple[int, Raw]]) -> Iterator[Fault]:

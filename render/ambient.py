@@ -25,6 +25,7 @@ from phibench.scenes.rig import View
 from phibench.scenes.room import Room
 
 ROUNDS = 8  # of refinement at most; three or four do
+_OVERLAP_PX = 16  # refinement looks at neighbours
 _BAND_CELLS = 1 << 22  # cells at a time, 150 MB
 
 
@@ -37,7 +38,7 @@ class AmbientLayer:
     electrons_per_s : array, shape (3, height, width), float32
         Expected photo-electrons per second per pixel, planes R, G, B.
     variance_per_s2 : array, shape (3, height, width), float32
-        Unbiased estimate of that estimate's variance, (electrons/s)^2; neighbouring pixels share samples.
+        Estimated variance of that, (electrons/s)^2; neighbouring pixels share samples.
     """
 
     electrons_per_s: NDArray[np.float32]
@@ -71,7 +72,8 @@ def render_ambient(
     seed : int
         Of the named stream for this view; 0 is legal.
     crop : (u0, v0, width, height), or None
-        Image window, pixels; None is the whole image.
+        Image window, pixels; None is the whole image. Without refinement its pixels are those of the whole image;
+        with it, those within some pixels of its border may differ by their noise.
     rounds : int
         Rounds of refinement at most; 0 leaves the first pass alone.
     """
@@ -86,7 +88,7 @@ def render_ambient(
     light_carriage(surfaces, shapes, fixed, light.irradiance_w_m2, settings)
     grid = FilmGrid.of(camera, cells_per_pixel)
     film = Film(mi, surfaces, grid, seed)
-    layers = [_render(film, band, rounds) for band in _bands(grid, window)]
+    layers = [_band(film, band, window, rounds) for band in _bands(grid, window)]
     dr.flush_kernel_cache()  # every view is compiled anew, and Dr.Jit would keep them all
     return AmbientLayer(*(np.concatenate([pair[i] for pair in layers], axis=1) for i in (0, 1)))
 
@@ -97,6 +99,15 @@ def _bands(grid: FilmGrid, window: Crop) -> list[Crop]:
     across = (width + 2 * grid.margin_px) * grid.cells
     rows = max(16, _BAND_CELLS // (across * grid.cells) - 2 * grid.margin_px)
     return [(u0, v, width, min(rows, v0 + height - v)) for v in range(v0, v0 + height, rows)]
+
+
+def _band(film: Film, band: Crop, window: Crop, rounds: int) -> tuple[Stack, Stack]:
+    """Pixels of a band, refined with its neighbourhood: what is beyond it reaches the band by less than the budget."""
+    u0, v0, width, height = band
+    top, bottom = max(v0 - _OVERLAP_PX, window[1]), min(v0 + height + _OVERLAP_PX, window[1] + window[3])
+    mean, variance = _render(film, (u0, top, width, bottom - top), rounds)
+    inner = slice(v0 - top, v0 - top + height)
+    return mean[:, inner], variance[:, inner]
 
 
 def _render(film: Film, window: Crop, rounds: int) -> tuple[Stack, Stack]:

@@ -20,7 +20,9 @@ from scipy import sparse
 from scipy.special import ndtr
 
 from phibench.scenes.camera import Camera
+from phibench.scenes.checks import SceneError
 
+MOST_CELLS = 2**32 - 1
 _TAIL_SIGMAS = 5.0  # 6e-7 of the light is beyond
 Stack = NDArray[np.float32]
 Crop = tuple[int, int, int, int]
@@ -58,6 +60,19 @@ class FilmGrid:
     def margin_px(self) -> int:
         """Pixels beyond the image that send light into it."""
         return math.ceil(_TAIL_SIGMAS * self.blur_sigma_px)
+
+    def __post_init__(self) -> None:
+        if self.count > MOST_CELLS:
+            raise SceneError(
+                f"Camera: {self.width_px} x {self.height_px} pixels of {self.cells} x {self.cells} cells are "
+                f"{self.count:.2g} cells, more than {MOST_CELLS:.2g}; take a smaller image, fewer cells_per_pixel, or "
+                "a larger blur_sigma_px"
+            )
+
+    @property
+    def count(self) -> int:
+        """Cells of the whole grid; their numbers have 32 bits."""
+        return self.columns * (self.height_px + 2 * self.margin_px) * self.cells
 
     @property
     def columns(self) -> int:

@@ -6,10 +6,12 @@ changed in place: temporary name, fsync, rename.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import os
 import tempfile
+import time
 from importlib.metadata import version
 from pathlib import Path
 
@@ -20,6 +22,7 @@ from phibench.render.cache import cache_root
 from phibench.scenes.rig import View
 from phibench.scenes.room import Room
 
+_DAY_S = 86400.0
 _DIGEST = 64  # hexadecimal characters
 _CODE = ("bake.py", "surfaces.py", "patches.py", "quasi.py", "translate.py")
 _ARRAYS = ("irradiance_w_m2", "sigma_w_m2", "covered")
@@ -38,7 +41,8 @@ def light_map(view: View, room: Room, settings: BakeSettings, folder: Path | Non
     cached = _read(path)
     if cached is None:
         cached = bake(view, room, settings)
-        _write(path, cached)
+        with contextlib.suppress(OSError):  # a cache that cannot be written costs time, not the light map
+            _write(path, cached)
     return cached
 
 
@@ -54,7 +58,7 @@ def _read(path: Path) -> LightMap | None:
     """The entry, or None if there is none or its bytes are not those that were written."""
     try:
         content = path.read_bytes()
-    except FileNotFoundError:
+    except OSError:
         return None
     payload = content[_DIGEST:]
     if hashlib.sha256(payload).hexdigest().encode() != content[:_DIGEST]:
@@ -63,11 +67,20 @@ def _read(path: Path) -> LightMap | None:
         return LightMap(*(arrays[name] for name in _ARRAYS))
 
 
+def _sweep(folder: Path) -> None:
+    """Remove what killed processes left a day ago or earlier."""
+    for left in folder.glob(".*.tmp"):
+        with contextlib.suppress(OSError):
+            if time.time() - left.stat().st_mtime > _DAY_S:
+                left.unlink()
+
+
 def _write(path: Path, light: LightMap) -> None:
     buffer = io.BytesIO()
     np.savez(buffer, **{name: getattr(light, name) for name in _ARRAYS})
     payload = buffer.getvalue()
     path.parent.mkdir(parents=True, exist_ok=True)
+    _sweep(path.parent)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".tmp")
     try:
         with os.fdopen(handle, "wb") as file:

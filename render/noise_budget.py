@@ -102,8 +102,12 @@ def excess(
         The camera's, without the pixel's own square (1/12 px^2).
     """
     over = variance_per_s2 / allowed_per_s2(electrons_per_s, blur_sigma_px)
-    full = electrons_per_s * np.float32(webcam().exposure_s) > webcam().full_well_e
-    return np.where(full, np.float32(0.0), over).max(axis=0)
+    return np.where(is_full(electrons_per_s)[None], np.float32(0.0), over).max(axis=0)
+
+
+def is_full(electrons_per_s: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Whether a pixel of a layer, shape (3, H, W), is full in all colours at the nominal exposure, shape (H, W)."""
+    return np.asarray(electrons_per_s.min(axis=0) * np.float32(webcam().exposure_s) > webcam().full_well_e)
 
 
 def allowed_per_s2(electrons_per_s: NDArray[np.float32], blur_sigma_px: float) -> NDArray[np.float32]:
@@ -139,7 +143,8 @@ def noise_budget(view: View, uv_px: Array, layer: SpotImages, ambient: Array, va
         )
     )
     # a full pixel tells nothing
-    weight = np.where(room > webcam().full_well_e, 0.0, 1.0 / (spot + room + webcam().read_noise_e ** 2))
+    mean = spot + room
+    weight = np.where(mean > webcam().full_well_e, 0.0, 1.0 / (mean + webcam().read_noise_e ** 2))
     slopes = np.stack([du, dv])
     information = np.einsum("ihw,jhw,hw->ij", slopes, slopes, weight)
     if np.linalg.matrix_rank(information) < 2:

@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from phibench.render.film import Film, Samples
 from phibench.render.film_grid import Crop, FilmGrid, Stack
-from phibench.render.noise_budget import EXPOSURE_S, FULL_WELL_E, allowed_per_s2, excess
+from phibench.render.noise_budget import allowed_per_s2, excess, is_full
 
 _TILE_PX = 48
 _SIDES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # strata along a cell; few values, few kernel launches
@@ -67,13 +67,11 @@ def first_pass(film: Film, window: Crop) -> Cells:
     pixels = grid.pixels(mean), grid.pixels(variance, power=2)
     allowed = allowed_per_s2(pixels[0], grid.blur_sigma_px).sum(axis=0)
     tight = ndimage.minimum_filter(allowed, size=_NEAR_PX, mode="nearest")
-    suspected = _suspected(
-        grid, *(half.electrons_per_s.reshape(3, *numbers.shape) for half in (a, b)), pixels[0], allowed
-    )
+    halves = [half.electrons_per_s.sum(axis=0).reshape(numbers.shape) for half in (a, b)]
+    suspected = np.where(is_full(pixels[0]), np.float32(0.0), _suspected(grid, *halves) / allowed)
     mirrored = grid.inner((a.mirrored | b.mirrored).reshape(numbers.shape))
-    return Cells(
-        grid, numbers, np.ones(numbers.shape, dtype=np.int32), mean, variance, pixels, tight, suspected, mirrored
-    )
+    side = np.ones(numbers.shape, dtype=np.int32)
+    return Cells(grid, numbers, side, mean, variance, pixels, tight, suspected, mirrored)
 
 
 def refine(film: Film, cells: Cells, turn: int) -> bool:
@@ -100,23 +98,20 @@ def refine(film: Film, cells: Cells, turn: int) -> bool:
     return True
 
 
-def _suspected(grid: FilmGrid, a: Stack, b: Stack, pixels: Stack, allowed: Stack) -> Stack:
-    """Variance over allowed variance if every cell were cut by whatever edge is near, shape (height, width).
+def _suspected(grid: FilmGrid, a: Stack, b: Stack) -> Stack:
+    """Variance of pixels, shape (height, width), if every cell were cut by whatever edge is near.
 
     Two samples may both miss what cuts a cell. If only the cells that hit it were refined, misses would stay and bias
     the mean; so what is refined first must not depend on a cell's own luck. An edge of contrast c that cuts cells at
     random leaves c^2 / 12; it is seen in the 3 x 3 pixels around, of which about a half of the cells are not cut.
     """
     edge, n = grid.margin_px * grid.cells, grid.cells
-    inner = slice(edge, a.shape[1] - edge), slice(edge, a.shape[2] - edge)
-    height, width = pixels.shape[1:]
-    blocks = (half.sum(axis=0)[inner].reshape(height, n, width, n) for half in (a, b))
-    bright, dark = zip(*((block.max(axis=(1, 3)), block.min(axis=(1, 3))) for block in blocks), strict=True)
-    contrast = ndimage.maximum_filter(np.maximum(*bright), _NEAR_PX) - ndimage.minimum_filter(
-        np.minimum(*dark), _NEAR_PX
-    )
-    full = pixels.max(axis=0) * np.float32(EXPOSURE_S) > FULL_WELL_E
-    return np.where(full, np.float32(0.0), contrast**2 * np.float32(_share(grid) / 24.0) / allowed)
+    rows, columns = a.shape[0] - 2 * edge, a.shape[1] - 2 * edge
+    blocks = [half[edge : edge + rows, edge : edge + columns].reshape(rows // n, n, columns // n, n) for half in (a, b)]
+    bright = np.maximum(*(block.max(axis=(1, 3)) for block in blocks))
+    dark = np.minimum(*(block.min(axis=(1, 3)) for block in blocks))
+    contrast = ndimage.maximum_filter(bright, _NEAR_PX) - ndimage.minimum_filter(dark, _NEAR_PX)
+    return np.asarray(contrast**2 * np.float32(_share(grid) / 24.0))
 
 
 def _share(grid: FilmGrid) -> float:

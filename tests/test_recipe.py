@@ -100,7 +100,7 @@ def test_the_spot_grows_with_distance_or_has_one_diameter() -> None:
         (changed(roooms={}), "roooms", ("unknown", "'room'")),
         (changed(laser={"diameter_m": 0.01, "diameter_base_m": 0.01}), "laser.diameter_m", ("one or the other",)),
         (changed(laser={"power_w": 0.0}), "laser.power_w", ("above 0",)),
-        (changed(ambient={"cells_per_pixel": 1.5}), "ambient.cells_per_pixel", ("an integer from 1",)),
+        (changed(ambient={"cells_per_pixel": 1.5}), "ambient.cells_per_pixel", ("an integer from 2",)),
         (changed(targets=[target(depth_m=-2.0)]), "targets[0].depth_m", ("-2.0", "above 0")),
         (changed(targets=[target(depth_m=math.inf)]), "targets[0].depth_m", ("inf", "up to 100")),
         (changed(targets=[target(), target(name="A")]), "targets[1].name", ("targets[0]",)),
