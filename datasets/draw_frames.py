@@ -26,7 +26,7 @@ from phibench.datasets.code_hash import code_behind
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.files import WriteError, remove_temporary, sha256
 from phibench.datasets.frame_files import PREVIEW, VALUES, has_preview, suffix, write_frame, write_preview
-from phibench.datasets.frame_index import FrameRow, check_same_request, read_index, write_index
+from phibench.datasets.frame_index import FrameRow, claim, read_index, write_index
 from phibench.datasets.frame_request import FrameRequest, whole_number
 from phibench.datasets.frame_source import FrameSource, has_place
 from phibench.datasets.frames import Frame
@@ -37,8 +37,8 @@ from phibench.datasets.schema import row_line
 from phibench.datasets.sums import read_sums
 from phibench.scenes.rig import POSITIONS
 
-_FILES_PER_JOB = 32  # a few seconds of work; reading the layers again takes half a second
-_SAVE_EVERY_S = 30.0
+_FILES_PER_JOB = 16  # a few seconds of work; reading the layers again takes half a second
+_SAVE_EVERY_S = 2.0  # or twenty times what saving takes
 
 
 @dataclass(frozen=True)
@@ -155,18 +155,18 @@ def _draw(
     jobs: list[SampleJob], dataset: Dataset, out: Path, request: FrameRequest, count: int, console: Console
 ) -> tuple[int, int]:
     rows = read_index(out)
-    check_same_request(out, rows.values(), _names(dataset), _document(request))
+    claim(out, _names(dataset), _document(request))
     jobs = [_knowing(part, rows) for job in jobs for part in _parts(job)]
-    made, total, saved = 0, 0, time.monotonic()
+    made, total, due = 0, 0, time.monotonic() + _SAVE_EVERY_S
     try:
         with Steps(console, "frames", len(jobs)) as steps:
             for done, written in _results(jobs, count):
                 rows |= {row.file: row for row in done}
                 made, total = made + written, total + len(done)
                 steps.advance()
-                if time.monotonic() - saved > _SAVE_EVERY_S:
+                if (now := time.monotonic()) > due:
                     write_index(out, rows.values())
-                    saved = time.monotonic()
+                    due = now + max(_SAVE_EVERY_S, 20.0 * (time.monotonic() - now))
     finally:  # what an interrupted run has drawn is found by the next one
         write_index(out, rows.values())
     return made, total - made

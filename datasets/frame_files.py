@@ -62,14 +62,19 @@ def png_bytes(image: NDArray[Any]) -> bytes:
 
 
 def preview(frame: Frame) -> NDArray[np.uint8]:
-    """Picture of a frame of electrons or DN as the preset's processing would show it, shape (h, w, 3).
-
-    A part that begins between two red pixels loses a row or column: interpolation starts at a red one.
-    """
+    """Picture of a frame of electrons or DN as the preset's processing would show it, shape (h, w, 3)."""
     sensor = frame.sensor
     if sensor.output == "raw":
-        red_first = frame.image[frame.region.v0_px % 2 :, frame.region.u0_px % 2 :]
-        linear = isp.linear_rgb(isp.linear_signal(red_first, sensor, np.float32), sensor)
+        # interpolation starts at a red pixel and needs two rows and columns: reflection keeps the filters' order
+        before = frame.region.v0_px % 2, frame.region.u0_px % 2
+        padded = frame.image
+        for axis, (first, length) in enumerate(zip(before, frame.image.shape, strict=True)):
+            width = [(0, 0), (0, 0)]
+            width[axis] = (first, 1)
+            padded = np.pad(padded, width, mode="reflect" if length > 1 else "edge")
+        linear = isp.linear_rgb(isp.linear_signal(padded, sensor, np.float32), sensor)
+        height, length = frame.image.shape
+        linear = linear[..., before[0] : before[0] + height, before[1] : before[1] + length]
     else:
         full_scale_e = (sensor.top_dn - sensor.black_level_dn) / sensor.dn_per_e
         linear = isp.white_balanced(frame.image / full_scale_e, sensor.white_balance)

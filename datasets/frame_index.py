@@ -14,6 +14,7 @@ from phibench.datasets.files import write_text
 from phibench.datasets.schema import Document, Position
 
 INDEX = "frames.jsonl"
+REQUEST = "request.json"
 
 
 class FrameRow(Document):
@@ -74,21 +75,23 @@ def write_index(folder: Path, rows: Iterable[FrameRow]) -> Path:
     return write_text(folder / INDEX, "".join(lines))
 
 
-def check_same_request(
-    folder: Path, rows: Iterable[FrameRow], dataset: tuple[str, int], wanted: dict[str, Any]
-) -> None:
-    """Refuse a folder whose frames are another data set's, or were asked for with other numbers.
+def claim(folder: Path, dataset: tuple[str, int], wanted: dict[str, Any]) -> None:
+    """Write down what the folder is for, before its first frame; refuse one that is for something else.
 
     Raises
     ------
     DatasetError
-        With the names and values that differ.
+        With the names and values that differ, or if the note is damaged.
     """
-    row = next(iter(rows), None)
-    if row is None:
-        return
-    held = {"dataset": row.dataset, "dataset_seed": row.dataset_seed, **row.request}
+    path = folder / REQUEST
     meant = {"dataset": dataset[0], "dataset_seed": dataset[1], **wanted}
+    if not path.exists():
+        write_text(path, json.dumps(meant, indent=1, allow_nan=False) + "\n")
+        return
+    try:
+        held = dict(json.loads(path.read_text(encoding="utf-8")))
+    except (ValueError, TypeError) as error:
+        raise DatasetError(f"{path} is damaged: give another folder, `--out FOLDER`") from error
     if other := [name for name in meant if held.get(name) != meant[name]]:
         texts = ", ".join(f"{name} {held.get(name)}, not {meant[name]}" for name in other)
         raise DatasetError(f"{folder} holds frames with {texts}: give another folder, `--out FOLDER`")

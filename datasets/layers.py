@@ -127,7 +127,10 @@ def read_layer(path: Path, kind: str, planes: tuple[str, ...], **owner: str) -> 
     DatasetError
         If the file cannot be read or is not that layer.
     """
-    file = read_exr(path)
+    try:
+        file = read_exr(path)
+    except DatasetError as error:
+        raise DatasetError(f"{error}; `phibench dataset repair` renders it again") from error
     if file.header.get("kind") != kind:
         raise DatasetError(f"{path} holds a layer of kind '{file.header.get('kind')}', not '{kind}'")
     if missing := [name for name in planes if name not in file.planes]:

@@ -11,14 +11,25 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, Parameter, Token
 
 if TYPE_CHECKING:
     from phibench.estimator.score import Score
 
 _TABLE_WIDTH = 200
+
+
+def _whole(_kind: object, tokens: Sequence[Token]) -> int:
+    """A whole number as it is written: cyclopts would round 1.5 without a word."""
+    try:
+        return int(tokens[0].value)
+    except ValueError:
+        raise ValueError(f"{tokens[0].value!r} is not a whole number") from None
+
+
+Whole = Annotated[int, Parameter(converter=_whole)]
 
 app = App(
     name="phibench",
@@ -73,7 +84,7 @@ def make(
     recipe: str,
     *,
     out: Path,
-    workers: int | None = None,
+    workers: Whole | None = None,
     scheduler: str | None = None,
     shard: str | None = None,
 ) -> int:
@@ -99,7 +110,7 @@ def make(
 
 
 @dataset.command
-def repair(directory: Path, *, workers: int | None = None, scheduler: str | None = None) -> int:
+def repair(directory: Path, *, workers: Whole | None = None, scheduler: str | None = None) -> int:
     """Render again what is damaged or missing in a data set.
 
     Parameters
@@ -177,14 +188,14 @@ def frames(
     directory: Path,
     *,
     preset: str = "mjpeg",
-    draws: int = 1,
+    draws: Whole = 1,
     out: Path | None = None,
     samples: str | None = None,
     laser_off: bool = False,
     exposure: str | None = None,
-    region: int | None = None,
-    camera_seed: int = 0,
-    workers: int | None = None,
+    region: Whole | None = None,
+    camera_seed: Whole = 0,
+    workers: Whole | None = None,
 ) -> int:
     """Draw camera frames with noise, as PNG, JPEG or EXR files with an index; what is there already is kept.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import brentq
 
-from phibench.render.electrons import stop_factor
+from phibench.render.electrons import mono, stop_factor
 from phibench.render.isp import colour_corrected, srgb_encoded, white_balanced
 from phibench.render.light import Light
 from phibench.render.sensor import Sensor
@@ -45,9 +45,13 @@ def auto_exposed(sensor: Sensor, light: Light) -> Sensor:
 def mean_level(electrons: Array, sensor: Sensor) -> float:
     """Mean 8-bit luma, 0 to 255, of expected electrons behind R, G, B, shape (3, h, w), at gain 1.
 
-    The converter's upper end cuts, as it does in a frame; noise, mosaic and sharpening are left out.
+    The converter's upper end cuts, as it does in a frame; noise, dark current, full well, extra vignetting, the Bayer
+    pattern and sharpening are left out. A sensor without filters shows its one plane as grey.
     """
     full_scale_e = (sensor.top_dn - sensor.black_level_dn) / sensor.gain_dn_per_e
+    if sensor.mosaic == "mono":
+        grey = np.minimum(mono(electrons, sensor.mono_weights) / full_scale_e, 1.0)
+        return 255.0 * float(srgb_encoded(grey).mean())
     planes = np.minimum(electrons / full_scale_e, 1.0)
     encoded = srgb_encoded(colour_corrected(white_balanced(planes, sensor.white_balance), sensor.colour_matrix))
     return 255.0 * float(np.average(encoded.mean(axis=(1, 2)), weights=LUMA))

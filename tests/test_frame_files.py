@@ -104,7 +104,7 @@ def test_workers_give_the_same_bytes(tiny_dataset: Path, tmp_path: Path) -> None
     one, two = ({p.name: p.read_bytes() for p in (tmp_path / n).glob("*.*") if p.is_file()} for n in ("1", "2"))
     one, two = ({name: data for name, data in x.items() if not name.startswith(".")} for x in (one, two))
     assert one == two
-    assert len(one) == 2 * 2 * 2 + 1
+    assert len(one) == 2 * 2 * 2 + 2  # the index and the request
 
 
 def test_changed_layers_are_drawn_again(tiny_dataset: Path, tmp_path: Path) -> None:
@@ -180,6 +180,35 @@ def test_previews_of_parts_keep_the_colours(tiny_dataset: Path, corner: tuple[in
     u0, v0 = 100 + corner[0], 60 + corner[1]
     whole = sample.frame_source("bayer-raw").frame("up")
     part: Frame = sample.frame_source("bayer-raw", region=Region(u0, v0, u0 + 20, v0 + 16)).frame("up")
-    expected = preview(whole)[v0 + v0 % 2 : v0 + 16, u0 + u0 % 2 : u0 + 20]
+    expected = preview(whole)[v0 : v0 + 16, u0 : u0 + 20]
     # borders are mirrored: compare the inside
     np.testing.assert_array_equal(preview(part)[1:-1, 1:-1], expected[1:-1, 1:-1])
+
+
+@pytest.mark.parametrize("side", [1, 2, 33])
+@pytest.mark.parametrize("preset", ["mono-raw", "bayer-raw"])
+def test_previews_have_the_size_of_their_frames(tiny_dataset: Path, tmp_path: Path, preset: str, side: int) -> None:
+    out = tmp_path / "f"
+    request = ("--preset", preset, "--region", side, "--samples", SEEN, "--out", out, "--workers", 1)
+    assert run(tiny_dataset, *request) == 0
+    rows = read_index(out).values()
+    assert {row.kind for row in rows} == {"frame", "preview"}
+    for row in rows:
+        assert image_in(out / row.file).shape[:2] == (row.height_px, row.width_px) == (side, side)
+
+
+def test_a_folder_is_claimed_before_its_first_frame(tiny_dataset: Path, tmp_path: Path) -> None:
+    """After a kill there are files and no index: the folder is still for the first request alone."""
+    out = tmp_path / "f"
+    assert run(tiny_dataset, "--samples", SEEN, "--region", 16, "--exposure", 0.01, "--out", out, "--workers", 1) == 0
+    (out / INDEX).unlink()
+    with pytest.raises(DatasetError, match=r"exposure .*give another folder"):
+        draw_frames(tiny_dataset, FrameRequest("mjpeg", "auto", region=16), out=out, samples=[SEEN], workers=1)
+
+
+@pytest.mark.parametrize("option", ["--draws", "--region", "--camera-seed", "--workers"])
+def test_fractions_are_not_rounded(
+    tiny_dataset: Path, tmp_path: Path, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(tiny_dataset, "--out", tmp_path / "f", option, "1.5") == 2
+    assert "'1.5' is not a whole number" in capsys.readouterr().err

@@ -148,6 +148,16 @@ def test_auto_exposure_reaches_its_level() -> None:
     ) == pytest.approx(110.0, abs=0.01)
 
 
+@pytest.mark.parametrize("preset", ["mono-raw", "bayer-raw"])
+def test_auto_exposure_reaches_its_level_with_and_without_filters(preset: str) -> None:
+    """Developed frames of flat light, whose mean is known to 60 / sqrt(19200) = 0.4; rounding to 8 bits 0.3."""
+    light = Light.flat((1e5, 1e5, 7e4), (120, 160))
+    s = auto_exposed(sensor(preset), light)
+    image = Chain(s.replace(output="srgb8")).frame(light, STREAM)
+    luma = image if image.ndim == 2 else image @ [0.299, 0.587, 0.114]
+    assert luma.mean() == pytest.approx(110.0, abs=2.0)
+
+
 def test_auto_exposure_is_the_same_for_on_and_off_and_scales_with_the_lamps() -> None:
     light = room((120, 160))
     s = sensor("mjpeg")
