@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import zipfile
 import zlib
 from pathlib import Path
-
-import numpy as np
 
 from phibench.datasets import layout
 from phibench.datasets.errors import DatasetError
@@ -15,10 +12,9 @@ from phibench.datasets.files import write_bytes
 from phibench.datasets.recipe import AmbientTable
 from phibench.datasets.task import Made
 from phibench.render.bake import BakeSettings, LightMap
+from phibench.render.lightcache import decoded, encoded, light_map
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
-
-ARRAYS = ("irradiance_w_m2", "sigma_w_m2", "covered")
 
 
 def bake_settings(ambient: AmbientTable) -> BakeSettings:
@@ -28,12 +24,7 @@ def bake_settings(ambient: AmbientTable) -> BakeSettings:
 
 def bake_room(out: Path, rig: Rig, room: Room, ambient: AmbientTable) -> Made:
     """Task: write the room's light map below `out`."""
-    from phibench.render.lightcache import light_map
-
-    light = light_map(rig.at(0.0), room, bake_settings(ambient))
-    buffer = io.BytesIO()
-    np.savez(buffer, **{name: getattr(light, name) for name in ARRAYS})
-    write_bytes(out / layout.LIGHT_MAP, buffer.getvalue())
+    write_bytes(out / layout.LIGHT_MAP, encoded(light_map(rig.at(0.0), room, bake_settings(ambient))))
     return Made((layout.LIGHT_MAP,))
 
 
@@ -47,7 +38,6 @@ def read_light_map(out: Path) -> LightMap:
     """
     path = out / layout.LIGHT_MAP
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return LightMap(*(arrays[name] for name in ARRAYS))
+        return decoded(path.read_bytes())
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
         raise DatasetError(f"{path} is not readable as a light map: {error}") from error

@@ -263,6 +263,8 @@ def _jobs(
 
 def _check_folder(out: Path, dataset: Path) -> None:
     where = out.resolve()
+    if out.exists() and not out.is_dir():
+        raise DatasetError(f"{out} is a file: give a folder, `--out`")
     if where == dataset.resolve() or dataset.resolve() in where.parents:
         raise DatasetError(f"{out} lies inside the data set, whose files are signed: give a folder outside, `--out`")
     if (out / layout.INFO).exists():

@@ -7,14 +7,14 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import ValidationError
-
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.files import write_text
+from phibench.datasets.lines import read_rows
 from phibench.datasets.schema import Document, Position
 
 INDEX = "frames.jsonl"
 REQUEST = "request.json"
+_IMAGES = (".exr", ".jpg", ".png")
 
 
 class FrameRow(Document):
@@ -58,14 +58,10 @@ def read_index(folder: Path) -> dict[str, FrameRow]:
     path = folder / INDEX
     if not path.exists():
         return {}
-    rows = {}
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-        try:
-            row = FrameRow.model_validate_json(line)
-        except ValidationError as error:
-            raise DatasetError(f"{path} line {number} is damaged: delete the file and run the command again") from error
-        rows[row.file] = row
-    return rows
+    try:
+        return {row.file: row for row in read_rows(path, FrameRow)}
+    except DatasetError as error:
+        raise DatasetError(f"{error}; delete the file and run the command again") from error
 
 
 def write_index(folder: Path, rows: Iterable[FrameRow]) -> Path:
@@ -76,7 +72,7 @@ def write_index(folder: Path, rows: Iterable[FrameRow]) -> Path:
 
 
 def claim(folder: Path, dataset: tuple[str, int], wanted: dict[str, Any]) -> None:
-    """Write down what the folder is for, before its first frame; refuse one that is for something else.
+    """Write down what the folder is for, before its first frame; refuse one that has frames of something else.
 
     Raises
     ------
@@ -85,7 +81,7 @@ def claim(folder: Path, dataset: tuple[str, int], wanted: dict[str, Any]) -> Non
     """
     path = folder / REQUEST
     meant = {"dataset": dataset[0], "dataset_seed": dataset[1], **wanted}
-    if not path.exists():
+    if not path.exists() or not _has_frames(folder):
         write_text(path, json.dumps(meant, indent=1, allow_nan=False) + "\n")
         return
     try:
@@ -95,3 +91,8 @@ def claim(folder: Path, dataset: tuple[str, int], wanted: dict[str, Any]) -> Non
     if other := [name for name in meant if held.get(name) != meant[name]]:
         texts = ", ".join(f"{name} {held.get(name)}, not {meant[name]}" for name in other)
         raise DatasetError(f"{folder} holds frames with {texts}: give another folder, `--out FOLDER`")
+
+
+def _has_frames(folder: Path) -> bool:
+    """Whether a frame is there, in the index or not."""
+    return any(path.suffix in _IMAGES for path in folder.iterdir())

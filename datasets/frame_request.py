@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 import operator
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -14,6 +15,9 @@ from phibench.render.region import Region
 from phibench.render.sensor import Sensor, SensorError, sensor
 
 Exposure = float | Literal["auto"] | None
+
+
+_RANGES = {"lamp_level": (0.0, 1e6), "laser_level": (0.0, 1e6), "carriage_speed_m_s": (-1e3, 1e3)}
 
 
 @dataclass(frozen=True)
@@ -52,17 +56,24 @@ class FrameRequest:
             raise DatasetError("exposure and exposure_s are both given: give one of them")
         if isinstance(self.exposure, str) and self.exposure != "auto":
             raise DatasetError(f"exposure = '{self.exposure}': give seconds above 0, or 'auto'")
+        if not isinstance(self.preset, str):
+            raise DatasetError(f"preset = {self.preset!r}: give the name of a preset, such as 'mjpeg'")
+        for name, (low, high) in _RANGES.items():
+            object.__setattr__(self, name, _number(name, getattr(self, name), low, high))
         object.__setattr__(self, "camera_seed", whole_number("camera_seed", self.camera_seed))
-        if not isinstance(self.region, (Region, type(None))):
+        if isinstance(self.region, Region):
+            for name, value in asdict(self.region).items():
+                whole_number(f"region.{name}", value)
+        elif self.region is not None:
             object.__setattr__(self, "region", whole_number("region", self.region, 1))
-        if not math.isfinite(self.carriage_speed_m_s):
-            raise DatasetError(f"carriage_speed_m_s = {self.carriage_speed_m_s}: must be a finite number")
         with in_one_sentence():
             self.sensor()  # refused now rather than at the first draw
 
     @classmethod
     def of(cls, preset: str, options: Mapping[str, Any]) -> FrameRequest:
         """Request from keywords: those that are not ours are numbers of the preset."""
+        if "overrides" in options:
+            raise DatasetError("overrides: give the numbers of the preset by name, such as jpeg_quality=60")
         ours = {key: value for key, value in options.items() if key in cls.__dataclass_fields__}
         return cls(preset, overrides={key: options[key] for key in options if key not in ours}, **ours)
 
@@ -88,6 +99,14 @@ def exposure_of(text: str) -> Exposure:
         return "auto" if text == "auto" else float(text)
     except ValueError as error:
         raise DatasetError(f"exposure = '{text}': give seconds above 0, or 'auto'") from error
+
+
+def _number(name: str, value: Any, low: float, high: float) -> float:
+    """Return `value` as a Python float within its range."""
+    number = math.nan if isinstance(value, bool) or not isinstance(value, numbers.Real) else float(value)
+    if not low <= number <= high:
+        raise DatasetError(f"{name} = {value!r}: must be a number from {low:g} to {high:g}")
+    return number
 
 
 def whole_number(name: str, value: Any, low: int = 0) -> int:

@@ -8,11 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from phibench.datasets import layout
-from phibench.datasets.errors import DatasetError
 from phibench.datasets.files import write_bytes
+from phibench.datasets.lines import read_rows
 from phibench.datasets.schema import ManifestRow, columns, drawn_columns, row_line
 
 
@@ -40,14 +38,7 @@ def read_manifest(folder: Path) -> list[ManifestRow]:
     DatasetError
         If it is missing, or with the number of the first line that is not a row.
     """
-    path = folder / layout.MANIFEST
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except FileNotFoundError as error:
-        raise DatasetError(f"{path} is missing") from error
-    except OSError as error:
-        raise DatasetError(f"{path} is not readable: {error.strerror or error}") from error
-    return [_row(path, number, line) for number, line in enumerate(lines, 1)]
+    return read_rows(folder / layout.MANIFEST, ManifestRow)
 
 
 def to_frame(rows: Sequence[ManifestRow]) -> Any:
@@ -89,16 +80,6 @@ def _leaf(document: dict[str, Any], name: str) -> Any:
     for key in name.split("."):
         value = None if value is None else value[key]
     return value
-
-
-def _row(path: Path, number: int, line: str) -> ManifestRow:
-    try:
-        return ManifestRow.model_validate_json(line)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        text = f"{where}: {first['msg']}" if where else first["msg"]
-        raise DatasetError(f"{path} line {number}: {text}") from error
 
 
 def same_number(a: float, b: float, relative: float = 1e-11, absolute: float = 1e-12) -> bool:

@@ -9,11 +9,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from phibench.datasets import layout
 from phibench.datasets.codec import from_json, to_json
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.lines import read_rows
 from phibench.datasets.schema import RigInfo
 from phibench.scenes.names import nearest
 from phibench.scenes.rig import Rig
@@ -54,19 +53,4 @@ def read_rigs(folder: Path) -> Rigs:
     DatasetError
         If the file is missing, or with the number of the first line that is not a rig.
     """
-    path = folder / layout.RIGS
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except FileNotFoundError as error:
-        raise DatasetError(f"{path} is missing") from error
-    except OSError as error:
-        raise DatasetError(f"{path} is not readable: {error.strerror or error}") from error
-    infos = (_info(path, number, line) for number, line in enumerate(lines, 1))
-    return Rigs({info.rig: info.resolved for info in infos})
-
-
-def _info(path: Path, number: int, line: str) -> RigInfo:
-    try:
-        return RigInfo.model_validate_json(line)
-    except ValidationError as error:
-        raise DatasetError(f"{path} line {number} is damaged: {error.errors()[0]['msg']}") from error
+    return Rigs({info.rig: info.resolved for info in read_rows(folder / layout.RIGS, RigInfo)})

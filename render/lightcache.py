@@ -25,7 +25,7 @@ from phibench.scenes.room import Room
 _DAY_S = 86400.0
 _DIGEST = 64  # hexadecimal characters
 _CODE = ("bake.py", "surfaces.py", "patches.py", "quasi.py", "translate.py")
-_ARRAYS = ("irradiance_w_m2", "sigma_w_m2", "covered")
+ARRAYS = ("irradiance_w_m2", "sigma_w_m2", "covered")
 
 
 def light_map(view: View, room: Room, settings: BakeSettings, folder: Path | None = None) -> LightMap:
@@ -54,6 +54,19 @@ def key(view: View, room: Room, settings: BakeSettings) -> str:
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
+def encoded(light: LightMap) -> bytes:
+    """Bytes of an `.npz` file."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **{name: getattr(light, name) for name in ARRAYS})
+    return buffer.getvalue()
+
+
+def decoded(data: bytes) -> LightMap:
+    """Light map of the bytes of an `.npz` file."""
+    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+        return LightMap(*(arrays[name] for name in ARRAYS))
+
+
 def _read(path: Path) -> LightMap | None:
     """The entry, or None if there is none or its bytes are not those that were written."""
     try:
@@ -63,8 +76,7 @@ def _read(path: Path) -> LightMap | None:
     payload = content[_DIGEST:]
     if hashlib.sha256(payload).hexdigest().encode() != content[:_DIGEST]:
         return None
-    with np.load(io.BytesIO(payload), allow_pickle=False) as arrays:
-        return LightMap(*(arrays[name] for name in _ARRAYS))
+    return decoded(payload)
 
 
 def _sweep(folder: Path) -> None:
@@ -76,9 +88,7 @@ def _sweep(folder: Path) -> None:
 
 
 def _write(path: Path, light: LightMap) -> None:
-    buffer = io.BytesIO()
-    np.savez(buffer, **{name: getattr(light, name) for name in _ARRAYS})
-    payload = buffer.getvalue()
+    payload = encoded(light)
     path.parent.mkdir(parents=True, exist_ok=True)
     _sweep(path.parent)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".tmp")

@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from scipy.linalg import toeplitz
 
 from phibench.render.angles import mirror_angles
 from phibench.render.film_grid import FilmGrid
+from phibench.render.light import SpotImage
 from phibench.render.sensor import Sensor, sensor
 from phibench.render.trace import trace_pixels
 from phibench.scenes.frames import Array
@@ -34,30 +34,6 @@ _STEP_PX = 0.01
 def webcam() -> Sensor:
     """The sensor whose noise is the measure: raw Bayer frames at the presets' nominal exposure."""
     return sensor("bayer-raw")
-
-
-class SpotImages(Protocol):
-    """What is needed of a spot layer: where its window begins, and its images of shape (3, h, w), electrons/s."""
-
-    @property
-    def u0_px(self) -> int:
-        """Image column of the window's first one."""
-
-    @property
-    def v0_px(self) -> int:
-        """Image row of the window's first one."""
-
-    @property
-    def electrons_per_s(self) -> Array:
-        """Image of the spot."""
-
-    @property
-    def du_electrons_per_s_px(self) -> Array:
-        """Derivative by a shift along u."""
-
-    @property
-    def dv_electrons_per_s_px(self) -> Array:
-        """Derivative by a shift along v."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +68,7 @@ def excess(
     shape, brightness and place. Noise that shares the spot's own blur, of variance S, counts for more: its spectrum is
     4 pi S |G|^2 that of independent noise, and the integral of k^2 |G|^4 over that of k^2 |G|^2 is 1/4 for a Gaussian
     G, hence kappa = pi S (1 where that is less). The number of each spot (`noise_budget`) has no such approximation.
-    Full pixels have 0.
+    A colour in which the pixel is full counts 0: a raw pixel has one filter.
 
     Parameters
     ----------
@@ -102,12 +78,12 @@ def excess(
         The camera's, without the pixel's own square (1/12 px^2).
     """
     over = variance_per_s2 / allowed_per_s2(electrons_per_s, blur_sigma_px)
-    return np.where(is_full(electrons_per_s)[None], np.float32(0.0), over).max(axis=0)
+    return np.asarray(np.where(is_full(electrons_per_s), np.float32(0.0), over).max(axis=0))
 
 
 def is_full(electrons_per_s: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Whether a pixel of a layer, shape (3, H, W), is full in all colours at the nominal exposure, shape (H, W)."""
-    return np.asarray(electrons_per_s.min(axis=0) * np.float32(webcam().exposure_s) > webcam().full_well_e)
+    """Whether a pixel behind each filter is full at the nominal exposure, of the shape of the layer."""
+    return np.asarray(electrons_per_s * np.float32(webcam().exposure_s) > webcam().full_well_e)
 
 
 def allowed_per_s2(electrons_per_s: NDArray[np.float32], blur_sigma_px: float) -> NDArray[np.float32]:
@@ -118,7 +94,7 @@ def allowed_per_s2(electrons_per_s: NDArray[np.float32], blur_sigma_px: float) -
     return np.float32((BUDGET / seconds) ** 2 / kappa) * (mean_e + np.float32(webcam().read_noise_e ** 2))
 
 
-def noise_budget(view: View, uv_px: Array, layer: SpotImages, ambient: Array, variance: Array) -> NoiseBudget:
+def noise_budget(view: View, uv_px: Array, layer: SpotImage, ambient: Array, variance: Array) -> NoiseBudget:
     """Compare the two for one spot in one view.
 
     Parameters
@@ -178,7 +154,7 @@ def phi_gradient(view: View, uv_px: Array) -> Array:
     return np.array([phi[0] - phi[1], phi[2] - phi[3]]) / (2.0 * _STEP_PX)
 
 
-def _on_image(layer: SpotImages, size: tuple[int, ...]) -> tuple[tuple[slice, slice], tuple[slice, slice]] | None:
+def _on_image(layer: SpotImage, size: tuple[int, ...]) -> tuple[tuple[slice, slice], tuple[slice, slice]] | None:
     """Slices (rows, columns) of the part of the layer that is on the image, in the layer and in the image."""
     starts = (layer.v0_px, layer.u0_px)
     low = [max(start, 0) for start in starts]

@@ -21,7 +21,7 @@ _TILE_PX = 48
 _SIDES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # strata along a cell; few values, few kernel launches
 _NEAR_PX = 3  # an edge that both samples of a cell missed shows in a cell not far away
 _GROWTH = 8.0  # of the strata along a side, in one round
-_BLIND = (30.0, 1000.0)  # excess from which a cell's first refinement has 4 and 6 strata along a side, 2 below
+_BLIND = (16.0, 500.0)  # excess from which a cell's first refinement has 4 and 6 strata along a side, 2 below
 _SMALL = 0.1  # a cell below this part of its allowance is not what keeps a pixel above its budget
 _AIM = 0.7  # of the allowed variance
 
@@ -68,7 +68,8 @@ def first_pass(film: Film, window: Crop) -> Cells:
     allowed = allowed_per_s2(pixels[0], grid.blur_sigma_px).sum(axis=0)
     tight = ndimage.minimum_filter(allowed, size=_NEAR_PX, mode="nearest")
     halves = [half.electrons_per_s.sum(axis=0).reshape(numbers.shape) for half in (a, b)]
-    suspected = np.where(is_full(pixels[0]), np.float32(0.0), _suspected(grid, *halves) / allowed)
+    full = is_full(pixels[0]).all(axis=0)
+    suspected = np.where(full, np.float32(0.0), _suspected(grid, *halves) / allowed)
     mirrored = grid.inner((a.mirrored | b.mirrored).reshape(numbers.shape))
     side = np.ones(numbers.shape, dtype=np.int32)
     return Cells(grid, numbers, side, mean, variance, pixels, tight, suspected, mirrored)
@@ -111,7 +112,7 @@ def _suspected(grid: FilmGrid, a: Stack, b: Stack) -> Stack:
     bright = np.maximum(*(block.max(axis=(1, 3)) for block in blocks))
     dark = np.minimum(*(block.min(axis=(1, 3)) for block in blocks))
     contrast = ndimage.maximum_filter(bright, _NEAR_PX) - ndimage.minimum_filter(dark, _NEAR_PX)
-    return np.asarray(contrast**2 * np.float32(_share(grid) / 48.0))
+    return np.asarray(contrast**2 * np.float32(_share(grid) / 24.0))
 
 
 def _share(grid: FilmGrid) -> float:

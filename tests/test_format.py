@@ -8,9 +8,9 @@ import pytest
 from pydantic import BaseModel
 
 from phibench.datasets import layers, layout, schema
-from phibench.datasets.bake_task import ARRAYS
 from phibench.render import spot_truth, truth
 from phibench.render.bake import LightMap
+from phibench.render.lightcache import ARRAYS
 from phibench.scenes.detector import FILTERS
 
 PAGE = (Path(schema.__file__).resolve().with_name("FORMAT.md")).read_text(encoding="utf-8")

@@ -15,7 +15,7 @@ from phibench.datasets.draw_frames import draw_frames
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exr import read_exr
 from phibench.datasets.frame_files import preview
-from phibench.datasets.frame_index import INDEX, read_index
+from phibench.datasets.frame_index import INDEX, REQUEST, read_index
 from phibench.datasets.frame_request import FrameRequest
 from phibench.datasets.frames import Frame
 from phibench.datasets.read import open_dataset
@@ -202,8 +202,18 @@ def test_a_folder_is_claimed_before_its_first_frame(tiny_dataset: Path, tmp_path
     out = tmp_path / "f"
     assert run(tiny_dataset, "--samples", SEEN, "--region", 16, "--exposure", 0.01, "--out", out, "--workers", 1) == 0
     (out / INDEX).unlink()
+    claimed = (out / REQUEST).read_bytes()
     with pytest.raises(DatasetError, match=r"exposure .*give another folder"):
         draw_frames(tiny_dataset, FrameRequest("mjpeg", "auto", region=16), out=out, samples=[SEEN], workers=1)
+    assert (out / REQUEST).read_bytes() == claimed
+
+
+def test_a_refused_request_claims_nothing(tiny_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "f"
+    assert run(tiny_dataset, "--samples", SEEN, "--region", 181, "--out", out, "--workers", 1) == 2
+    assert run(tiny_dataset, "--samples", SEEN, "--region", 16, "--out", out, "--workers", 1) == 0
+    (tmp_path / "file").write_text("")
+    assert run(tiny_dataset, "--out", tmp_path / "file") == 2
 
 
 @pytest.mark.parametrize("option", ["--draws", "--region", "--camera-seed", "--workers"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -287,13 +288,20 @@ def _two_sided(law: object, value: float) -> float:
         ({"exposure": 0.1, "exposure_s": 0.1}, "are both given"),
         ({"jpeg_quality": 0}, "jpeg_quality: 0 is not allowed; give an integer from 1 up to 100"),
         ({"jpeg_qualty": 80}, "unknown key; did you mean 'jpeg_quality'"),
-        ({"laser_level": -1.0}, "laser_level = -1.0: must be 0 or above"),
-        ({"carriage_speed_m_s": float("nan")}, "carriage_speed_m_s = nan: must be a finite number"),
-        ({"carriage_speed_m_s": 1e4}, "move the carriage more slowly"),
+        ({"laser_level": -1.0}, "laser_level = -1.0: must be a number from 0 to 1e+06"),
+        ({"carriage_speed_m_s": float("nan")}, "carriage_speed_m_s = nan: must be a number from -1000 to 1000"),
+        ({"carriage_speed_m_s": 1e3}, "move the carriage more slowly"),
+        ({"carriage_speed_m_s": "1"}, "carriage_speed_m_s = '1': must be a number"),
+        ({"lamp_level": "2"}, "lamp_level = '2': must be a number from 0 to 1e+06"),
+        ({"lamp_level": 1e300}, "lamp_level = 1e+300: must be a number from 0 to 1e+06"),
+        ({"laser_level": None}, "laser_level = None: must be a number"),
+        ({"preset": 3}, "preset = 3: give the name of a preset"),
+        ({"region": Region(0.5, 0, 10, 10)}, "region.u0_px = 0.5: must be an integer"),
+        ({"overrides": {}}, "overrides: give the numbers of the preset by name"),
     ],
 )
 def test_a_mistake_is_one_sentence(sample: Sample, options: dict[str, object], words: str) -> None:
-    with pytest.raises(DatasetError, match=words.replace("(", r"\(")) as caught:
+    with pytest.raises(DatasetError, match=re.escape(words)) as caught:
         sample.frames(**options)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
 
