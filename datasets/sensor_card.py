@@ -26,6 +26,17 @@ class SensorCard:
     black_level_dn : float
     top_dn : int
         Largest code.
+    output : "electrons", "raw", "srgb8" or "mjpeg"
+        Stage after which the chain ends.
+    white_balance : 3 floats
+        Gains of R, G, B on linear planes.
+    colour_matrix : 3 x 3
+        Rows give linear sRGB from white-balanced R, G, B.
+    sharpen_amount : float
+        Gain of the unsharp mask x + amount (x - blur x), blur (1 2 1)/4 along both axes, after the sRGB curve.
+    jpeg_quality : int
+        libjpeg's quality.
+    jpeg_subsampling : "4:4:4", "4:2:2" or "4:2:0"
     """
 
     name: str
@@ -41,6 +52,12 @@ class SensorCard:
     dn_per_e: float
     black_level_dn: float
     top_dn: int
+    output: Literal["electrons", "raw", "srgb8", "mjpeg"]
+    white_balance: tuple[float, float, float]
+    colour_matrix: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+    sharpen_amount: float
+    jpeg_quality: int
+    jpeg_subsampling: Literal["4:4:4", "4:2:2", "4:2:0"]
 
     @property
     def saturation_e(self) -> float:

@@ -11,9 +11,11 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from cyclopts import App, CycloptsError, Parameter, Token
+from cyclopts import App, CycloptsError
+
+from phibench.estimator.cli_dataset import dataset
 
 if TYPE_CHECKING:
     from phibench.estimator.score import Score
@@ -21,23 +23,12 @@ if TYPE_CHECKING:
 _TABLE_WIDTH = 200
 
 
-def _whole(_kind: object, tokens: Sequence[Token]) -> int:
-    """A whole number as it is written: cyclopts would round 1.5 without a word."""
-    try:
-        return int(tokens[0].value)
-    except ValueError:
-        raise ValueError(f"{tokens[0].value!r} is not a whole number") from None
-
-
-Whole = Annotated[int, Parameter(converter=_whole)]
-
 app = App(
     name="phibench",
     help="Render an omnidirectional camera-mirror sensor with exact depth, and score depth estimators against it.",
     suppress_keyboard_interrupt=False,
     result_action="return_value",
 )
-dataset = App(name="dataset", help="Make, verify, repair, merge and show data sets, and draw camera frames.")
 app.command(dataset)
 
 
@@ -77,163 +68,6 @@ def doctor() -> int:
     """
     # a bad LLVM aborts the process that loads it: never this one
     return subprocess.run([sys.executable, "-m", "phibench.render.doctor"], check=False).returncode
-
-
-@dataset.command
-def make(
-    recipe: str,
-    *,
-    out: Path,
-    workers: Whole | None = None,
-    scheduler: str | None = None,
-    shard: str | None = None,
-) -> int:
-    """Render a data set; what is finished already is kept.
-
-    Parameters
-    ----------
-    recipe
-        TOML file, or the name of a shipped recipe ("paper", "random", "smoke").
-    out
-        Folder to write; one that holds another data set is refused.
-    workers
-        Number of processes; one for each core by default.
-    scheduler
-        Address or scheduler file of a running dask scheduler, to use its workers instead.
-    shard
-        Part of the recipe for job arrays, such as 1/8; put the parts together with `merge`.
-    """
-    from phibench.datasets.make import make as make_dataset
-
-    make_dataset(recipe, out, workers, scheduler=scheduler, shard=shard)
-    return 0
-
-
-@dataset.command
-def repair(directory: Path, *, workers: Whole | None = None, scheduler: str | None = None) -> int:
-    """Render again what is damaged or missing in a data set.
-
-    Parameters
-    ----------
-    directory
-        Folder of a data set.
-    workers
-        Number of processes; one for each core by default.
-    scheduler
-        Address or scheduler file of a running dask scheduler, to use its workers instead.
-    """
-    from phibench.datasets.repair import repair as repair_dataset
-
-    for name in repair_dataset(directory, workers, scheduler=scheduler):
-        print(f"made again: {name}")
-    return 0
-
-
-@dataset.command
-def merge(out: Path, *shards: Path) -> int:
-    """Put the shards of a data set together.
-
-    Parameters
-    ----------
-    out
-        Folder to write.
-    shards
-        Folders of all shards.
-    """
-    from phibench.datasets.merge import merge as merge_shards
-
-    merge_shards(out, shards)
-    return 0
-
-
-@dataset.command
-def verify(directory: Path) -> int:
-    """Check every file, hash, row and certificate of a data set; exit code 1 if there is a fault.
-
-    Parameters
-    ----------
-    directory
-        Folder of a data set.
-    """
-    from phibench.datasets.verify import verify as verify_dataset
-
-    report = verify_dataset(directory)
-    for fault in report.faults:
-        print(fault)
-    for note in report.notes:
-        print(f"note: {note}")
-    print(f"{directory}: {report.files} files, {report.samples} samples, {len(report.faults)} faults")
-    return 0 if report.ok else 1
-
-
-@dataset.command
-def show(directory: Path, *, out: Path | None = None) -> int:
-    """Print a table of a data set and write its contact sheet.
-
-    Parameters
-    ----------
-    directory
-        Folder of a data set.
-    out
-        PNG file for the contact sheet; by default contact_sheet.png in the folder.
-    """
-    from phibench.datasets.show import show as show_dataset
-
-    show_dataset(directory, out=out)
-    return 0
-
-
-@dataset.command
-def frames(
-    directory: Path,
-    *,
-    preset: str = "mjpeg",
-    draws: Whole = 1,
-    out: Path | None = None,
-    samples: str | None = None,
-    laser_off: bool = False,
-    exposure: str | None = None,
-    region: Whole | None = None,
-    camera_seed: Whole = 0,
-    workers: Whole | None = None,
-) -> int:
-    """Draw camera frames with noise, as PNG, JPEG or EXR files with an index; what is there already is kept.
-
-    Parameters
-    ----------
-    directory
-        Folder of a data set.
-    preset
-        Where the chain ends: "ideal" (EXR, expected electrons), "mono-raw", "bayer-raw" (PNG of 16 bits that holds
-        10-bit DN, not scaled), "srgb8" (PNG) or "mjpeg" (the camera's JPEG; PNG with --region).
-    draws
-        Draws of every image.
-    out
-        Folder to write; by default beside the data set, with "-frames" added to its name.
-    samples
-        Sample ids, joined by commas; all by default.
-    laser_off
-        Also every image without the spot.
-    exposure
-        Seconds, or "auto"; by default the preset's.
-    region
-        Side in pixels of a square around the spot, instead of the whole image.
-    camera_seed
-        Names the camera whose fixed pattern the frames share.
-    workers
-        Number of processes; one for each core by default.
-    """
-    from phibench.datasets.draw_frames import draw_frames
-    from phibench.datasets.frame_request import FrameRequest, exposure_of
-
-    seconds = None if exposure is None else exposure_of(exposure)
-    request = FrameRequest(preset, seconds, region=region, camera_seed=camera_seed)
-    names = None if samples is None else samples.split(",")
-    done = draw_frames(directory, request, draws, out=out, samples=names, laser_off=laser_off, workers=workers)
-    for note in done.notes:
-        print(f"note: {note}")
-    print(f"{done.folder}: {done.made} files written, {done.kept} kept, index frames.jsonl")
-    return 0
 
 
 def main(tokens: Sequence[str] | None = None) -> int:

@@ -1,0 +1,93 @@
+"""The exact answer for one pair, with what a score sorts by. Never shown to a method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import Rig
+
+
+@dataclass(frozen=True)
+class Distraction:
+    """Another light that a method may take for the spot, in one image."""
+
+    kind: str
+    uv_px: tuple[float, float]
+    electrons: float
+
+
+@dataclass(frozen=True)
+class SpotTruth:
+    """One image of a pair.
+
+    Attributes
+    ----------
+    uv_px : (u, v), the chief ray's; NaN where there is none
+    phi_rad : dict of "ray", "normal", "incidence" to float
+    azimuth_rad : float
+    visible : bool
+    cause : str
+        Why not: as in the manifest; "none" if visible.
+    electrons : float
+        Expected electrons of the whole spot behind the red filter (all filters of a mono sensor) in this exposure.
+    peak_e : float
+        Largest expected electrons of a pixel, room included.
+    snr : float
+        Flux over its standard deviation at the limit, position known: "so many sigma".
+    saturated : bool
+        Whether a pixel of the spot is expected above the sensor's saturation.
+    bound_px2 : array, shape (2, 2), or None
+        Cramer-Rao bound of (u, v): of the raw pixels for raw outputs, None where there is none.
+    raw_bound_px2 : array, shape (2, 2), or None
+        Bound of the raw pixels behind this image, whatever the output.
+    distractions : tuple of Distraction
+    """
+
+    uv_px: tuple[float, float]
+    phi_rad: dict[str, float]
+    azimuth_rad: float
+    visible: bool
+    cause: str
+    electrons: float
+    peak_e: float
+    snr: float
+    saturated: bool
+    bound_px2: Array | None
+    raw_bound_px2: Array | None
+    distractions: tuple[Distraction, ...] = ()
+
+
+@dataclass(frozen=True)
+class PairTruth:
+    """One pair.
+
+    Attributes
+    ----------
+    number : int
+        `Pair.number`.
+    sample_id : str
+    draw : int
+    preset : str
+    jpeg_quality : int or None
+        None unless the output is MJPEG.
+    hinted : bool
+        Whether the method got boxes.
+    depth_m, stroke_m : float
+    true_rig, believed_rig : Rig
+        The rig that was rendered, and the one in `Pair.rig`.
+    down, up : SpotTruth
+    """
+
+    number: int
+    sample_id: str
+    draw: int
+    preset: str
+    jpeg_quality: int | None
+    hinted: bool
+    depth_m: float
+    stroke_m: float
+    true_rig: Rig
+    believed_rig: Rig
+    down: SpotTruth
+    up: SpotTruth
