@@ -60,7 +60,7 @@ class Sight:
 
     @property
     def picture(self) -> Array:
-        """Box as a viewer shows it: R, G, B, shape (h, w, 3), or one plane; raw pixels are interpolated, not encoded."""
+        """Box as a viewer shows it: R, G, B, shape (h, w, 3), or one plane; raw ones interpolated, not encoded."""
         pixels = self.pixels.astype(float)
         if kind_of(self.pair.card) != "bayer-raw":
             return pixels
