@@ -79,7 +79,7 @@ def _table() -> Table:
     from rich.table import Table
 
     from phibench.estimator.methods.registry import KNOWN
-    from phibench.estimator.seat.reference import installed
+    from phibench.estimator.seat.resolve import installed
 
     table = Table("method", "from", "takes", "what it does")
     for method in KNOWN.values():

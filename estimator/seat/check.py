@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phibench.estimator.bench.pair_set import PairSet
 from phibench.estimator.bench.truth import PairTruth, SpotTruth
 from phibench.estimator.seat.diagnosis import Views, covariance_fault, position_fault, rms_pull
 from phibench.estimator.seat.easy_pairs import EasyPairs
@@ -16,7 +15,7 @@ from phibench.estimator.seat.harness import outcomes
 from phibench.estimator.seat.limits import Limits
 from phibench.estimator.seat.number_faults import depth_fault, phi_fault
 from phibench.estimator.seat.outcome import Outcome
-from phibench.estimator.seat.pair import OK, Pair, Spot
+from phibench.estimator.seat.pair import OK, Spot
 from phibench.scenes.frames import Array
 
 PAIRS = 10
@@ -45,8 +44,8 @@ class Check:
         return not self.faults
 
 
-def check_method(reference: str, preset: str = "bayer-raw", limits: Limits = LIMITS) -> Check:
-    """Run a method on ten easy pairs.
+def check_method(reference: str, preset: str = "bayer-raw", limits: Limits = LIMITS, count: int = PAIRS) -> Check:
+    """Run a method on easy pairs.
 
     Parameters
     ----------
@@ -54,19 +53,21 @@ def check_method(reference: str, preset: str = "bayer-raw", limits: Limits = LIM
         As for `harness.run_method`.
     preset : "bayer-raw", "mono-raw", "srgb8" or "mjpeg"
     limits : Limits
+    count : int
+        How many pairs.
 
     Raises
     ------
     MethodError
         If the method cannot be found or imported, or there is no such preset.
     """
-    pairs = EasyPairs(preset, PAIRS)
+    pairs = EasyPairs(preset, count)
     done = list(_until_hopeless(outcomes(reference, pairs, limits)))
     return judged(done, pairs)
 
 
-def judged(done: Sequence[Outcome], pairs: PairSet) -> Check:
-    """Faults and notes of outcomes on pairs whose truth is known and easy."""
+def judged(done: Sequence[Outcome], pairs: EasyPairs) -> Check:
+    """Faults and notes of outcomes on easy pairs."""
     faults = [*_failures(done), *_missing(done), *_wrong(done, pairs)]
     return Check(tuple(faults), tuple(_notes(done, pairs)))
 
@@ -108,7 +109,7 @@ def _missing(done: Sequence[Outcome]) -> Iterator[str]:
         yield f"{len(missing)} of {len(spots)} spots are missing, although all are easy: '{reason}' ({count} times)"
 
 
-def _wrong(done: Sequence[Outcome], pairs: PairSet) -> Iterator[str]:
+def _wrong(done: Sequence[Outcome], pairs: EasyPairs) -> Iterator[str]:
     """Sentences about positions, covariances, angles and depths."""
     answered = [outcome for outcome in done if outcome.answer is not None]
     if not answered:
@@ -122,7 +123,7 @@ def _wrong(done: Sequence[Outcome], pairs: PairSet) -> Iterator[str]:
     yield from filter(None, [phi_fault(list(_angles(answered, truths))), depth_fault(list(_depths(answered, truths)))])
 
 
-def _notes(done: Sequence[Outcome], pairs: PairSet) -> Iterator[str]:
+def _notes(done: Sequence[Outcome], pairs: EasyPairs) -> Iterator[str]:
     answered = [outcome for outcome in done if outcome.answer is not None]
     yield f"{len(answered)} of {len(done)} pairs answered"
     if not answered:
@@ -158,14 +159,11 @@ def _true_px(truth: PairTruth) -> list[tuple[float, float]]:
     return [truth.down.uv_px, truth.up.uv_px]
 
 
-def _views(pairs: PairSet, answered: Sequence[Outcome]) -> Views:
-    seen = [pairs.pair(outcome.number) for outcome in answered]
-    height, width = seen[0].down.shape[:2]
-    return Views((height, width), np.array([_origins(pair) for pair in seen], float))
-
-
-def _origins(pair: Pair) -> list[tuple[int, int]]:
-    return [(0, 0) if box is None else (box.u0_px, box.v0_px) for box in (pair.box_down, pair.box_up)]
+def _views(pairs: EasyPairs, answered: Sequence[Outcome]) -> Views:
+    camera = pairs.rig.camera
+    boxes = [pairs.boxes(outcome.number) for outcome in answered]
+    origins = [[(0, 0) if box is None else (box.u0_px, box.v0_px) for box in both] for both in boxes]
+    return Views((camera.height_px, camera.width_px), np.array(origins, float))
 
 
 def _of(truth: PairTruth, position: str) -> SpotTruth:

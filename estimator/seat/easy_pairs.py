@@ -71,10 +71,16 @@ class EasyPairs:
             for on in ((True, False) if self.laser_off else (True,))
             for name, spot in (("down", scene.down), ("up", scene.up))
         }
-        boxes: dict[str, Any] = {}
-        if self.hinted:
-            boxes = {f"box_{name}": self._box(number, name, spot) for name, spot in _spots(scene)}
-        return Pair(number, rig=self.rig, stroke_m=scene.stroke_m, card=camera.card, **images, **boxes)
+        down, up = self.boxes(number)
+        stroke, card = scene.stroke_m, camera.card
+        return Pair(number, rig=self.rig, stroke_m=stroke, card=card, box_down=down, box_up=up, **images)
+
+    def boxes(self, number: int) -> tuple[Box | None, Box | None]:
+        """Region hints of a pair."""
+        if not self.hinted:
+            return None, None
+        scene = _scene(self.rig, number)
+        return self._box(number, "down", scene.down), self._box(number, "up", scene.up)
 
     def truth(self, number: int) -> PairTruth:
         """The exact answer."""

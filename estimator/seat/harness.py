@@ -16,7 +16,8 @@ from phibench.estimator.seat.errors import MethodError
 from phibench.estimator.seat.limits import Limits
 from phibench.estimator.seat.outcome import Outcome
 from phibench.estimator.seat.process import MethodProcess
-from phibench.estimator.seat.reference import Reference, resolve
+from phibench.estimator.seat.reference import Reference
+from phibench.estimator.seat.resolve import resolve
 
 
 def run_method(

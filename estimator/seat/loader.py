@@ -11,7 +11,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from phibench.estimator.methods.registry import KNOWN
 from phibench.estimator.seat.errors import MethodError
 from phibench.estimator.seat.pair import Method
 from phibench.estimator.seat.reference import Reference
@@ -29,6 +28,8 @@ def load(reference: Reference) -> Method:
         If the import fails, the function is missing, is no function, or does not take one pair.
     """
     if reference.kind == "built-in":
+        from phibench.estimator.methods.registry import KNOWN  # a second of imports that a user's method need not have
+
         return KNOWN[reference.name]
     function = _from_file(reference) if reference.kind == "file" else _from_package(reference)
     _require_method(function, _title(reference))
