@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import convolve
 
 from phibench.datasets.sensor_card import SensorCard
 from phibench.estimator.raw_pixels import bayer_filters, raw_electrons
@@ -18,9 +17,6 @@ from phibench.scenes.frames import Array
 
 KINDS = ("bayer-raw", "mono-raw", "srgb8", "mjpeg")
 RAW = KINDS[:2]
-# of red and blue: a pixel's own value, the mean of two neighbours, or of four corners; of green: own or four neighbours
-_SPARSE = np.array([[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]])
-_DENSE = np.array([[0.0, 1.0, 0.0], [1.0, 4.0, 1.0], [0.0, 1.0, 0.0]])
 
 
 def kind_of(card: SensorCard) -> str:
@@ -52,15 +48,25 @@ def linear_planes(image: NDArray[Any], card: SensorCard, origin_px: tuple[int, i
 def demosaiced(signal: Array, origin_px: tuple[int, int] = (0, 0)) -> Array:
     """Bilinear interpolation of an RGGB mosaic, shape (h, w), to planes, shape (3, h, w).
 
-    As a convolution divided by that of the sites, so that the border takes what neighbours there are.
+    Beyond the border stands what is mirrored about the border pixel, which keeps the mosaic's colours in order.
     """
-    filters = bayer_filters(np.array([origin_px]), (signal.shape[0], signal.shape[1]))[0]
-    planes = []
-    for colour, kernel in enumerate((_SPARSE, _DENSE, _SPARSE)):
-        site = (filters == colour).astype(float)
-        total = convolve(site * signal, kernel, mode="constant")
-        planes.append(total / np.maximum(convolve(site, kernel, mode="constant"), 1e-12))
-    return np.stack(planes)
+    u0, v0 = origin_px
+    padded = np.pad(signal, 1, mode="reflect")
+    filters = bayer_filters(np.array([(u0 - 1, v0 - 1)]), (padded.shape[0], padded.shape[1]))[0]
+    red, green, blue = (np.where(filters == colour, padded, 0.0) for colour in range(3))
+    return np.stack([_of_quarter(red), _of_half(green), _of_quarter(blue)])
+
+
+def _of_quarter(sites: Array) -> Array:
+    """Plane of a filter on every fourth pixel: its own value, the mean of two neighbours, or of four corners."""
+    down = 0.5 * sites[:-2] + sites[1:-1] + 0.5 * sites[2:]
+    return 0.5 * down[:, :-2] + down[:, 1:-1] + 0.5 * down[:, 2:]
+
+
+def _of_half(sites: Array) -> Array:
+    """Plane of a filter on every second pixel: its own value, or the mean of four neighbours."""
+    beside = sites[1:-1, :-2] + sites[1:-1, 2:] + sites[:-2, 1:-1] + sites[2:, 1:-1]
+    return sites[1:-1, 1:-1] + 0.25 * beside
 
 
 def srgb_to_linear(encoded: Array) -> Array:
