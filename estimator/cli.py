@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from cyclopts import App, CycloptsError
 
+from phibench.estimator import cli_methods
 from phibench.estimator.cli_dataset import dataset
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ app = App(
     result_action="return_value",
 )
 app.command(dataset)
+cli_methods.register(app)
 
 
 @app.command
@@ -88,9 +90,10 @@ def main(tokens: Sequence[str] | None = None) -> int:
 
 def _is_users(error: Exception) -> bool:
     from phibench.datasets.errors import DatasetError
+    from phibench.estimator.seat.errors import MethodError
     from phibench.scenes.checks import SceneError
 
-    return isinstance(error, (SceneError, DatasetError, OSError))
+    return isinstance(error, (SceneError, DatasetError, MethodError, OSError))
 
 
 def _sentence(error: Exception) -> str:

@@ -1,0 +1,286 @@
+"""`phibench check`: each mistake that a method can make is made here, and the message must name it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from seat_pairs import HEADER, method_file
+
+from phibench.estimator import cli
+from phibench.estimator.methods.registry import METHODS
+from phibench.estimator.phi import phi_normal, phi_ray
+from phibench.estimator.seat.answer_check import AnswerError, checked
+from phibench.estimator.seat.answer_text import answer_text
+from phibench.estimator.seat.check import PAIRS, Check, check_method, judged
+from phibench.estimator.seat.diagnosis import Views, covariance_fault, position_fault
+from phibench.estimator.seat.easy_pairs import EasyPairs
+from phibench.estimator.seat.errors import MethodError
+from phibench.estimator.seat.limits import Limits
+from phibench.estimator.seat.outcome import Outcome
+from phibench.estimator.seat.pair import Answer, Method, Pair, Spot
+from phibench.estimator.triangulate import depth_exact
+from phibench.scenes.streams import generator
+
+Change = Callable[[Pair, Spot, str], Spot]
+SET = EasyPairs(count=PAIRS, laser_off=False)
+
+
+@pytest.fixture(scope="module")
+def pairs() -> list[Pair]:
+    return [SET.pair(number) for number in range(PAIRS)]
+
+
+def right(pair: Pair) -> Answer:
+    return METHODS["raw_maximum_likelihood"](pair)
+
+
+def coarse(pair: Pair) -> Answer:
+    return METHODS["brightest_pixel"](pair)
+
+
+def tried(method: Method, pairs: list[Pair]) -> Check:
+    """Judge a method in this process; answers go the way that they go from the method's process."""
+    done = []
+    for pair in pairs:
+        try:
+            done.append(Outcome(pair.number, checked(answer_text(method(pair))), 0.01))
+        except AnswerError as error:
+            done.append(Outcome(pair.number, None, 0.01, "invalid", str(error)))
+    return judged(done, SET)
+
+
+def each(change: Change, method: Method = right) -> Method:
+    """Method whose spots are changed."""
+
+    def changed(pair: Pair) -> Answer:
+        answer = method(pair)
+        return Answer(change(pair, answer.down, "down"), change(pair, answer.up, "up"))
+
+    return changed
+
+
+def moved(f: Callable[[float, float, Pair, str], tuple[float, float]]) -> Change:
+    """Change of positions alone."""
+
+    def change(pair: Pair, spot: Spot, name: str) -> Spot:
+        assert spot.uv_px is not None
+        return replace(spot, uv_px=f(*spot.uv_px, pair, name))
+
+    return change
+
+
+def swapped_frames(pair: Pair) -> Answer:
+    answer = right(pair)
+    return Answer(answer.up, answer.down)
+
+
+def box_of(pair: Pair, name: str) -> tuple[int, int]:
+    box = pair.box_down if name == "down" else pair.box_up
+    assert box is not None
+    return box.u0_px, box.v0_px
+
+
+def deviations(_: Pair, spot: Spot, __: str) -> Spot:
+    """Standard deviations on the diagonal of the covariance."""
+    assert spot.covariance_px2 is not None
+    (a, _b), (_c, d) = spot.covariance_px2
+    return replace(spot, covariance_px2=((math.sqrt(a), 0.0), (0.0, math.sqrt(d))))
+
+
+def scaled(factor: float) -> Change:
+    def change(_: Pair, spot: Spot, __: str) -> Spot:
+        (a, b), (c, d) = np.multiply(spot.covariance_px2, factor).tolist()
+        return replace(spot, covariance_px2=((a, b), (c, d)))
+
+    return change
+
+
+def phi(pair: Pair, spot: Spot, name: str) -> float:
+    view = pair.rig.at(0.0 if name == "down" else pair.stroke_m)
+    return float(phi_ray(view, np.array(spot.uv_px)))
+
+
+def depth(factor: float) -> Method:
+    def method(pair: Pair) -> Answer:
+        answer = right(pair)
+        D = depth_exact(pair.rig, pair.stroke_m, np.array(answer.down.uv_px), np.array(answer.up.uv_px)).depth_m
+        return replace(answer, depth_m=factor * float(D))
+
+    return method
+
+
+MISTAKES: dict[str, tuple[Method, str]] = {
+    "wrong type": (lambda pair: (1.0, 2.0), "10 of 10 pairs: the answer is none: the method returned a tuple of 2"),  # type: ignore[dict-item, return-value]
+    "nothing returned": (lambda pair: None, "the method returned None: an Answer(down, up) is needed"),  # type: ignore[dict-item, return-value]
+    "wrong shape": (each(moved(lambda u, v, *_: (u, v, 1.0))), "down.uv_px is ["),  # type: ignore[arg-type, return-value]
+    "swapped axes": (each(moved(lambda u, v, *_: (v, u))), "the axes are swapped"),
+    "swapped axes, coarse": (each(moved(lambda u, v, *_: (v, u)), coarse), "the axes are swapped"),
+    "half a pixel more": (each(moved(lambda u, v, *_: (u + 0.5, v + 0.5))), "half a pixel too large in u and v"),
+    "half a pixel less": (each(moved(lambda u, v, *_: (u - 0.5, v - 0.5))), "half a pixel too small in u and v"),
+    "half, blurred": (
+        each(moved(lambda u, v, *_: (u + 0.5, v + 0.5)), METHODS["windowed_centroid"]),
+        "half a pixel too large",
+    ),
+    "counted from 1": (each(moved(lambda u, v, *_: (u + 1.0, v + 1.0))), "one pixel too large in u and v"),
+    "off in u": (each(moved(lambda u, v, *_: (u + 0.4, v))), "off by (+0.40"),
+    "mirrored v": (each(moved(lambda u, v, *_: (u, 719.0 - v))), "v runs upwards"),
+    "mirrored v, counted from 1": (each(moved(lambda u, v, *_: (u, 720.0 - v))), "v runs upwards"),
+    "mirrored u": (each(moved(lambda u, v, *_: (1279.0 - u, v))), "u runs to the left"),
+    "swapped frames": (swapped_frames, "the frames are swapped"),
+    "relative to the box": (
+        each(moved(lambda u, v, p, n: (u - box_of(p, n)[0], v - box_of(p, n)[1]))),
+        "relative to the box",
+    ),
+    "binned": (each(moved(lambda u, v, *_: (u / 2.0, v / 2.0))), "positions are halved"),
+    "something else": (each(moved(lambda u, v, *_: (200.0, 200.0))), "something else than the laser spot"),
+    "degrees": (
+        each(lambda p, s, n: replace(s, phi_rad=math.degrees(phi(p, s, n)))),
+        "These look like degrees: give radians",
+    ),
+    "theta for phi": (each(lambda p, s, n: replace(s, phi_rad=min(2.0 * phi(p, s, n), 1.57))), "phi is half of it"),
+    "normal for ray": (
+        each(lambda p, s, n: replace(s, phi_rad=float(phi_normal(p.rig.at(0.0), np.array(s.uv_px))))),
+        "phi_rad is the angle 'normal', not 'ray'",
+    ),
+    "phi of nothing": (each(lambda p, s, n: replace(s, phi_rad=0.1)), "rad (median) from the angle 'ray'"),
+    "NaN": (each(moved(lambda *_: (math.nan, math.nan))), "finite numbers, or Spot.missing('why')"),
+    "indefinite": (
+        each(lambda p, s, n: replace(s, covariance_px2=((1.0, 2.0), (2.0, 1.0)))),
+        "covariance_px2 is not positive definite",
+    ),
+    "deviations": (each(deviations), "covariance_px2 holds standard deviations: variances are needed"),
+    "optimistic": (each(scaled(0.04)), "covariance_px2 is too small"),
+    "pessimistic": (each(scaled(25.0)), "covariance_px2 is too large"),
+    "millimetres": (depth(1000.0), "depth_m is in millimetres"),
+    "centimetres": (depth(100.0), "depth_m is in centimetres"),
+    "half the depth": (depth(0.4), "times the true depth"),
+    "gives up": (lambda pair: Answer(Spot.missing("dim"), Spot.missing("dim")), "all are easy: 'dim' (20 times)"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_each_mistake_is_named_and_nothing_else(pairs: list[Pair], name: str) -> None:
+    method, words = MISTAKES[name]
+    check = tried(method, pairs)
+    assert not check.ok
+    assert len(check.faults) == 1, check.faults
+    assert words in check.faults[0]
+    assert "\n" not in check.faults[0]
+
+
+@pytest.mark.parametrize("name", ["raw_maximum_likelihood", "brightest_pixel", "red_centroid", "windowed_centroid"])
+def test_sound_methods_pass(pairs: list[Pair], name: str) -> None:
+    """Coarse ones too: the brightest pixel of a mosaic is up to a pixel off, and no mistake of convention."""
+    check = tried(METHODS[name], pairs)
+    assert check.faults == ()
+    assert check.notes[0] == "10 of 10 pairs answered"
+
+
+def test_a_sound_method_may_give_angle_and_depth(pairs: list[Pair]) -> None:
+    assert tried(each(lambda p, s, n: replace(s, phi_rad=phi(p, s, n))), pairs).ok
+    assert tried(depth(1.0), pairs).ok
+
+
+def test_noise_alone_is_not_taken_for_a_mistake() -> None:
+    """400 drawn checks of an efficient method (20 spots, 20 mpx) and of one that rounds to whole pixels.
+
+    The rules' false-alarm rates are below 1e-5 and 3e-8 a check: none in 800. The same with 0.5 px added is seen
+    in every efficient one.
+    """
+    truth = np.array([[t.down.uv_px, t.up.uv_px] for t in map(SET.truth, range(PAIRS))])
+    views = Views((720, 1280), np.zeros_like(truth))
+    covariance = np.tile(4e-4 * np.eye(2), (20, 1, 1))
+    rng, seen = generator("check", "noise"), 0
+    for _ in range(400):
+        error = 0.02 * rng.standard_normal(truth.shape)
+        assert position_fault(truth + error, truth, views) == ""
+        assert covariance_fault(error.reshape(-1, 2), covariance) == ""
+        shifted = truth + rng.uniform(-0.5, 0.5, truth.shape)
+        assert position_fault(np.rint(shifted), shifted, views) == ""
+        assert "half a pixel too large" in position_fault(truth + error + 0.5, truth, views)
+        seen += 1
+    assert seen == 400
+
+
+# -- through the method's process and the command line ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ("x = 1\nreturn x / 0", "ZeroDivisionError: division by zero (my_phi.py, line 7, in extract)"),
+        (
+            "pair.down[0, 0] = 0",
+            "the input was written to: ValueError: assignment destination is read-only (my_phi.py, line 6",
+        ),
+        ("import time\ntime.sleep(60)", "2 of 2 pairs: too slow: no answer after 2 s, at my_phi.py, line 7"),
+    ],
+)
+def test_failures_name_the_users_own_line(tmp_path: Path, body: str, words: str) -> None:
+    check = check_method(method_file(tmp_path, body), limits=Limits(seconds=2.0), count=2)
+    assert len(check.faults) == 1
+    assert words in check.faults[0]
+    assert check.notes == ("0 of 2 pairs answered",)
+
+
+def test_check_gives_up_on_a_method_that_never_answers(tmp_path: Path) -> None:
+    reference = method_file(tmp_path, "while True: pass")
+    check = check_method(reference, limits=Limits(seconds=0.5))
+    assert check.faults[0].startswith("3 of 3 pairs: too slow")
+
+
+@pytest.mark.parametrize("preset", ["bayer-raw", "mono-raw", "srgb8", pytest.param("mjpeg", marks=pytest.mark.slow)])
+def test_the_written_example_passes(tmp_path: Path, monkeypatch, capsys, preset: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["new-method", "mine.py"]) == 0
+    assert "phibench check mine.py:extract" in capsys.readouterr().out
+    assert cli.main(["check", "mine.py:extract", "--preset", preset]) == 0
+    out = capsys.readouterr().out
+    assert "10 of 10 pairs answered" in out
+    assert "nothing wrong" in out
+    assert "mine.py:extract" in (tmp_path / "mine.py").read_text()
+
+
+def test_check_exits_with_1_and_says_what_is_wrong(tmp_path: Path, capsys) -> None:
+    reference = method_file(tmp_path, "return 5", header=HEADER)
+    assert cli.main(["check", reference]) == 1
+    assert "wrong: 10 of 10 pairs: the answer is none: the method returned an int" in capsys.readouterr().out
+
+
+def test_new_method_overwrites_nothing(tmp_path: Path, capsys) -> None:
+    (tmp_path / "mine.py").write_text("precious")
+    assert cli.main(["new-method", str(tmp_path / "mine.py")]) == 2
+    assert "is there already and is not overwritten" in capsys.readouterr().err
+    assert (tmp_path / "mine.py").read_text() == "precious"
+    assert cli.main(["new-method", str(tmp_path / "mine.txt")]) == 2
+    assert "must end in .py" in capsys.readouterr().err
+
+
+def test_mistakes_of_the_command_line_are_2(capsys) -> None:
+    assert cli.main(["check", "nowhere.py:extract"]) == 2
+    assert "is not there" in capsys.readouterr().err
+    assert cli.main(["check", "red_centroid", "--preset", "bayer"]) == 2
+    assert "did you mean 'bayer-raw'" in capsys.readouterr().err
+    assert cli.main(["check", "red_centroid", "--seconds", "0"]) == 2
+    assert "limit seconds = 0.0" in capsys.readouterr().err
+
+
+def test_methods_lists_all_and_what_is_not_installed(monkeypatch, capsys) -> None:
+    monkeypatch.setattr("phibench.estimator.methods.built_in.find_spec", lambda name: None)
+    assert cli.main(["methods"]) == 0
+    out = capsys.readouterr().out
+    for name in ("brightest_pixel", "raw_maximum_likelihood", "photutils: not installed", "off frames", "my_phi.py"):
+        assert name in out
+
+
+# -- the easy pairs ----------------------------------------------------------------------------------------------------
+
+
+def test_easy_pairs_say_what_they_cannot_be() -> None:
+    with pytest.raises(MethodError, match="did you mean 'srgb8'"):
+        EasyPairs("srgb")
