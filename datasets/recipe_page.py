@@ -117,8 +117,8 @@ image; where the image has no place of the spot, the box is anywhere. `hint` giv
     "[[distractors]]": """Optional. Each is a flat Lambertian disc of the laser's wavelength, not rendered but computed
 when frames are drawn, like the spot. Places, in this order: with `distance_m`, free in the room on the ray of
 `azimuth_deg` and `height_m`, facing the axis; with those two alone, where that ray ends; else anywhere on a board
-that is drawn from `target`, but not the sample's own. A distractor that the down image does not show, or whose image is nearer
-than 12 px to the spot's in either, is placed again, at most 20 times, and then left out; so is every
+that is drawn from `target`, but not the sample's own. A distractor that the down image does not show, or whose image
+is nearer than 12 px to the spot's in either, is placed again, at most 20 times, and then left out; so is every
 distractor of a sample whose spot is seen in neither image. `flux_ratio` is at most 0.5: the spot stays the
 strongest light that goes out with the laser.
 """,

@@ -7,7 +7,7 @@ that a take's number says nothing about the scene.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -85,11 +85,7 @@ def takes(dataset: Dataset, preset: str | None = None, draws: int | None = None)
     found = [take for sample in dataset for take in _of_sample(sample, frames, presets, count)]
     name, seed = dataset.info.name, dataset.info.recipe["dataset"]["seed"]
     order = generator(name, seed, "takes", "order", *presets, count).permutation(len(found))
-    return tuple(_numbered(found[k], number) for number, k in enumerate(order))
-
-
-def _numbered(take: Take, number: int) -> Take:
-    return Take(**{**{name: getattr(take, name) for name in Take.__dataclass_fields__}, "number": number})
+    return tuple(replace(found[k], number=number) for number, k in enumerate(order))
 
 
 def _of_sample(sample: Sample, frames: FramesTable, presets: tuple[str, ...], draws: int) -> Iterator[Take]:
