@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING
 
 from cyclopts import App, CycloptsError
 
+from phibench.estimator.cli_bench import bench
 from phibench.estimator.cli_dataset import dataset
+from phibench.estimator.cli_sealed import register as register_sealed
 
 if TYPE_CHECKING:
     from phibench.estimator.score import Score
@@ -30,6 +32,8 @@ app = App(
     result_action="return_value",
 )
 app.command(dataset)
+app.command(bench)
+register_sealed(app, dataset)
 
 
 @app.command

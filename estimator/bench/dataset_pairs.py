@@ -14,6 +14,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.expected import ExpectedRegion, expected_of_light
 from phibench.datasets.files import sha256
 from phibench.datasets.frame_source import FrameSource, Side
+from phibench.datasets.frames import Frames
 from phibench.datasets.provenance import provenance
 from phibench.datasets.read import Dataset
 from phibench.datasets.sensor_card import card_of
@@ -56,22 +57,25 @@ class DatasetPairs:
         """What is drawn, by number; it tells the sample, so it is not for methods."""
         return self._takes
 
+    @property
+    def dataset(self) -> Dataset:
+        """Where they come from."""
+        return self._dataset
+
     def pair(self, number: int) -> Pair:
         """What a method sees; its arrays are read-only."""
+        return self.pair_and_frames(number)[0]
+
+    def pair_and_frames(self, number: int) -> tuple[Pair, Frames]:
+        """What a method sees, and the frames behind it, with the camera's JPEG files."""
         take, sample, source = self._drawn_from(number)
         frames = source.frames(take.draw, laser_off=take.laser_off)
         images = {name: _sealed(frame.image) for name, frame in frames.by_name.items()}
         boxes = (None, None) if take.boxes is None else tuple(map(_box, take.boxes))
-        card = card_of(source.sides["down"].chain.sensor)
-        return Pair(
-            number,
-            **images,
-            rig=sample.rig,
-            stroke_m=sample.row.stroke_m,
-            card=card,
-            box_down=boxes[0],
-            box_up=boxes[1],
-        )
+        card, (box_down, box_up) = card_of(source.sides["down"].chain.sensor), boxes
+        rig, stroke_m = sample.rig, sample.row.stroke_m
+        pair = Pair(number, **images, rig=rig, stroke_m=stroke_m, card=card, box_down=box_down, box_up=box_up)
+        return pair, frames
 
     def truth(self, number: int) -> PairTruth:
         """The exact answer, with the bounds of the raw pixels."""
