@@ -5,21 +5,24 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.phibench-ready
 RECIPE ?= datasets/recipes/paper.toml
 OUT    ?= out/paper
+SAMPLES ?= 12
+BENCH  ?= out/bench-dev
 # Which Python makes the environment: `make setup PYTHON=python3.13`. Without it the first that is new enough.
 PYTHON ?=
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup dataset test test-slow proof test-all bench lint clean
+.PHONY: help setup dataset bench test test-slow proof test-all benchmark lint clean
 
 help:
 	@echo "make setup      make .venv with everything in it, and make sure of LLVM"
 	@echo "make dataset    render $(RECIPE) into $(OUT)"
+	@echo "make bench      $(SAMPLES) samples of bench-dev, all built-in methods on them, a report, in out/"
 	@echo "make test       the tests, without the slow ones"
 	@echo "make test-slow  the slow tests"
 	@echo "make proof      the slow tests of accuracy alone"
 	@echo "make test-all   all tests"
-	@echo "make bench      the benchmarks"
+	@echo "make benchmark  timings of what must be fast"
 	@echo "make lint       ruff and mypy"
 	@echo "make clean      remove caches and builds; .venv and out/ stay"
 
@@ -48,6 +51,11 @@ $(READY): pyproject.toml constraints.txt
 dataset: $(READY)
 	$(BIN)/phibench dataset make $(RECIPE) --out $(OUT)
 
+# Samples that are there already are kept: a larger number renders only the new ones.
+bench: $(READY)
+	$(BIN)/phibench dataset make bench-dev --samples $(SAMPLES) --out $(BENCH)
+	$(BIN)/phibench bench $(BENCH) --out $(BENCH)-report
+
 test: $(READY)
 	$(BIN)/python -m pytest -m "not slow"
 
@@ -60,7 +68,7 @@ proof: $(READY)
 test-all: $(READY)
 	$(BIN)/python -m pytest
 
-bench: $(READY)
+benchmark: $(READY)
 	$(BIN)/python -m pytest --benchmark-enable --benchmark-only
 
 lint: $(READY)

@@ -17,6 +17,7 @@ from phibench.scenes.frames import Array
 
 KINDS = ("uniform", "log_uniform", "normal", "choice")
 Pair = Annotated[tuple[float, ...], Field(strict=False, min_length=2, max_length=2)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.]*$", max_length=48)]
 
 
 class DistributionTable(Table):
@@ -49,6 +50,17 @@ def one_name(given: object) -> object:
 Distribution = Annotated[
     DistributionTable, BeforeValidator(one_number, json_schema_input_type=DistributionTable | float)
 ]
+
+
+class TargetChoice(Table):
+    """Boards to draw from, with equal probability."""
+
+    choice: Annotated[tuple[Name, ...], Field(strict=False, min_length=1)] = Field(
+        description="names from [[targets]], equally probable"
+    )
+
+
+Targets = Annotated[TargetChoice | None, BeforeValidator(one_name, json_schema_input_type=TargetChoice | str | None)]
 
 
 def distribution_faults(table: DistributionTable) -> Iterator[tuple[str, str]]:

@@ -32,7 +32,7 @@ class ExpectedRegion:
     filters : array of int, shape (h, w)
         0, 1, 2 for R, G, B; 0 everywhere without a mosaic.
     background_e : array
-        Room and dark current.
+        Room, other lights and dark current.
     spot_e, du_e_per_px, dv_e_per_px : arrays
         The spot, and its derivatives by a shift of its image by +u, +v.
     """
@@ -76,7 +76,7 @@ def expected_of_light(light: Light, sensor: Sensor, camera: Camera | None = None
     if spot is None or spot.electrons_per_s.size == 0:
         raise DatasetError("no light of the spot reaches the image: it has no region; leave such spots out")
     region = _around(spot, light.size, margin_px)
-    background = Chain(sensor, camera=camera).photo_electrons(light.laser_off(), region)
+    background = Chain(sensor, camera=camera).photo_electrons(light.without_spot(), region)
     scale = sensor.exposure_s * stop_factor(sensor, light) * light.laser_level
     factor = scale * vignetting(sensor.vignetting_exponent, camera, region)
     stacks = (spot.electrons_per_s, spot.du_electrons_per_s_px, spot.dv_electrons_per_s_px)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
@@ -21,13 +22,15 @@ from phibench.datasets.schema import ManifestRow, SpotRow
 from phibench.render.auto_exposure import auto_exposed
 from phibench.render.chain import Chain
 from phibench.render.jpeg import decoded
-from phibench.render.light import Light
+from phibench.render.light import Light, OtherSpot
 from phibench.render.motion import moved_spot, spot_velocity_px_per_s
 from phibench.render.region import Region
 from phibench.render.sensor import Sensor
 from phibench.render.tiles import frame_stream
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, View
+
+NO_OTHERS: Mapping[str, tuple[OtherSpot, ...]] = MappingProxyType({})
 
 
 class Pair(Protocol):
@@ -100,10 +103,12 @@ class FrameSource:
         return cls.from_request(pair, FrameRequest.of(preset, options))
 
     @classmethod
-    def from_request(cls, pair: Pair, request: FrameRequest) -> FrameSource:
-        """As `of`, for a request that was checked before."""
+    def from_request(
+        cls, pair: Pair, request: FrameRequest, others: Mapping[str, tuple[OtherSpot, ...]] = NO_OTHERS
+    ) -> FrameSource:
+        """As `of`, for a request that was checked before; `others` are further lights by position, standing still."""
         with in_one_sentence():
-            sides = {position: _side(pair, position, request) for position in POSITIONS}
+            sides = {position: _side(pair, position, request, others.get(position, ())) for position in POSITIONS}
         return cls(request, pair.stream_names, sides)
 
     def frames(self, draw: int = 0, *, laser_off: bool = False) -> Frames:
@@ -134,7 +139,7 @@ class FrameSource:
         return Frame(image, jpeg, position, laser, draw, side.chain.sensor, side.region)
 
 
-def _side(pair: Pair, position: str, request: FrameRequest) -> Side:
+def _side(pair: Pair, position: str, request: FrameRequest, others: tuple[OtherSpot, ...]) -> Side:
     camera = pair.rig.camera
     spot = pair.spot(position)
     light = Light(
@@ -143,6 +148,7 @@ def _side(pair: Pair, position: str, request: FrameRequest) -> Side:
         lamp_level=request.lamp_level,
         laser_level=request.laser_level,
         f_number=camera.f_number,
+        others=others,
     )
     sensor = auto_exposed(request.sensor(), light) if request.exposure == "auto" else request.sensor()
     moving = _moving(pair, position, spot, sensor, request.carriage_speed_m_s)

@@ -25,7 +25,8 @@ from phibench.datasets.manifest import read_manifest
 from phibench.datasets.output import claim, remove_files, stale_files
 from phibench.datasets.plan import Plan, make_plan
 from phibench.datasets.recipe_checks import warnings
-from phibench.datasets.recipe_file import find_recipe, load_recipe
+from phibench.datasets.recipe_file import find_recipe, parse_recipe, recipe_text
+from phibench.datasets.recipe_text import with_numbers
 from phibench.datasets.schema import DatasetInfo
 from phibench.datasets.shard import shard_plan
 from phibench.datasets.visibility import visibility_line
@@ -39,6 +40,8 @@ def make(
     console: Console | None = None,
     scheduler: str | None = None,
     shard: str | None = None,
+    samples: int | None = None,
+    seed: int | None = None,
 ) -> Path:
     """Render the data set of a recipe into a folder; what is finished there is kept, whatever ended the last run.
 
@@ -50,6 +53,7 @@ def make(
     console : where progress goes; by default the standard error
     scheduler : address or scheduler file of a running dask scheduler, whose workers are used instead
     shard : part of the recipe, "i/n"
+    samples, seed : numbers instead of the recipe's `[random].samples` and `[dataset].seed`
 
     Returns
     -------
@@ -62,11 +66,19 @@ def make(
         half-written under a final name, and `SHA256SUMS` is missing.
     """
     console, out = console or Console(stderr=True), Path(out)
-    plan = shard_plan(make_plan(load_recipe(recipe)), shard)
+    text = _recipe_text(recipe, samples, seed)
+    plan = shard_plan(make_plan(parse_recipe(text, str(find_recipe(recipe)))), shard)
     for warning in warnings(plan.recipe):
         console.print(f"warning: {warning}", highlight=False, soft_wrap=True)
-    make_from_plan(plan, find_recipe(recipe).read_text(encoding="utf-8"), out, workers, console, scheduler)
+    make_from_plan(plan, text, out, workers, console, scheduler)
     return out
+
+
+def _recipe_text(recipe: str | Path, samples: int | None, seed: int | None) -> str:
+    text = recipe_text(recipe)
+    if samples is None and seed is None:
+        return text
+    return with_numbers(text, str(find_recipe(recipe)), samples, seed)
 
 
 def make_from_plan(

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, create_model
+from pydantic import Field, create_model
 
-from phibench.datasets.distribution import Distribution, one_name
+from phibench.datasets.distribution import Distribution, Name, Targets
+from phibench.datasets.recipe_frames import DistractorTable, FramesTable
 from phibench.datasets.recipe_table import Table
 
 MIN_STROKE_M, MAX_STROKE_M = 1e-3, 10.0
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.]*$", max_length=48)]
 DatasetName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
 StrokeM = Annotated[float, Field(ge=MIN_STROKE_M, le=MAX_STROKE_M)]
 Tilt = Annotated[float, Field(ge=-0.5, le=0.5)]
@@ -22,6 +22,7 @@ Decentre = Annotated[float, Field(ge=-0.1, le=0.1)]
 Distortion = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 FocalPx = Annotated[float, Field(ge=50.0, le=50000.0)]
 Unit = Annotated[float, Field(ge=0.0, le=1.0)]
+Response = Annotated[tuple[Unit, ...], Field(strict=False, min_length=3, max_length=3)]
 
 
 class DatasetTable(Table):
@@ -67,6 +68,9 @@ class RigTable(Table):
     )
     blur_sigma_px: float | None = Field(
         default=None, ge=0.05, le=20.0, description="Gaussian optical blur besides defocus"
+    )
+    laser_filter_response: Response | None = Field(
+        default=None, description="response of the filters R, G, B at the laser's line, relative to red"
     )
     decentre_x_m: Decentre = Field(default=0.0, description="sphere centre off the camera's vertical, world x")
     decentre_y_m: Decentre = Field(default=0.0, description="sphere centre off the camera's vertical, world y")
@@ -137,8 +141,12 @@ class ExperimentTable(Table):
     )
 
 
-DRAWABLE = tuple(key for key, field in RigTable.model_fields.items() if "float" in str(field.annotation))
-"""Keys of `[rig]` that may be drawn: all numbers but the size of the image, which all samples share."""
+DRAWABLE = tuple(
+    key
+    for key, field in RigTable.model_fields.items()
+    if "float" in (kind := str(field.annotation)) and "tuple" not in kind
+)
+"""Keys of `[rig]` that may be drawn: all single numbers but the size of the image, which all samples share."""
 
 if TYPE_CHECKING:
     RandomRigTable = Table
@@ -154,20 +162,10 @@ else:
     )
 
 
-class TargetChoice(Table):
-    """Boards to draw from, with equal probability."""
-
-    choice: Annotated[tuple[Name, ...], Field(strict=False, min_length=1)] = Field(
-        description="names from [[targets]], equally probable"
-    )
-
-
 class RandomSpotTable(Table):
     """`[random.spot]`: on a board that is drawn, or where a horizontal ray from the axis meets what stands there."""
 
-    target: Annotated[
-        TargetChoice | None, BeforeValidator(one_name, json_schema_input_type=TargetChoice | str | None)
-    ] = Field(default=None, description="boards; all of them where not given")
+    target: Targets = Field(default=None, description="boards; all of them where not given")
     across_m: Distribution | None = Field(
         default=None, description="from the board's centre to the right, seen from the axis; 0 where not given"
     )
@@ -210,6 +208,10 @@ class Recipe(Table):
         default=(), description="which targets with which strokes"
     )
     random: RandomTable | None = Field(default=None, description="samples that are drawn, instead of experiments")
+    frames: FramesTable | None = Field(default=None, description="how frames of the samples are taken")
+    distractors: Annotated[tuple[DistractorTable, ...], Field(strict=False)] = Field(
+        default=(), description="other lights that may be taken for the spot"
+    )
 
 
 def recipe_schema() -> dict[str, Any]:

@@ -11,6 +11,7 @@ from typing import Any, TypeVar, cast
 from pydantic import ValidationError
 
 from phibench.datasets.recipe import MAX_STROKE_M, AmbientTable, LaserTable, Recipe, RigTable, RoomTable, TargetTable
+from phibench.datasets.recipe_frames_checks import distractor_faults, frames_faults
 from phibench.datasets.recipe_places import boards_in_the_way, spots_on_boards
 from phibench.datasets.recipe_random_checks import purpose_faults, random_faults
 from phibench.datasets.recipe_scene import build_rig, build_room, build_spot, build_target, ceiling_m
@@ -35,6 +36,8 @@ def semantic_faults(raw: Raw) -> list[Fault]:
     return [
         *purpose_faults(raw, list(Recipe.model_fields)),
         *random_faults(raw, laser, room, [table for _, table in targets], names),
+        *frames_faults(raw),
+        *distractor_faults(raw, room, names),
         *_twice("targets", _tables(raw, "targets")),
         *_twice("experiments", experiments),
         *_unknown_targets(experiments, names),

@@ -17,7 +17,7 @@ RECIPES = Path(__file__).with_name("recipes")
 
 
 def find_recipe(name: str | Path) -> Path:
-    """Path of a recipe: a file, or the name of one that is shipped (``paper``, ``random``, ``smoke``)."""
+    """Path of a recipe: a file, or the name of one that is shipped (such as ``paper``)."""
     path, shipped = Path(name), RECIPES / f"{name}.toml"
     if path.is_file() or not shipped.is_file():
         return path
@@ -32,8 +32,18 @@ def load_recipe(path: str | Path) -> Recipe:
     RecipeError
         With one line per fault, all of them.
     """
-    path = find_recipe(path)
-    return parse_recipe(_text(path), str(path))
+    return parse_recipe(recipe_text(path), str(find_recipe(path)))
+
+
+def recipe_text(path: str | Path) -> str:
+    """TOML text of a recipe, by file or by name.
+
+    Raises
+    ------
+    RecipeError
+        If there is no such file, or it cannot be read; in one sentence.
+    """
+    return _text(find_recipe(path))
 
 
 def parse_recipe(text: str, source: str = "recipe") -> Recipe:

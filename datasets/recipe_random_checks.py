@@ -43,27 +43,27 @@ def random_faults(
     table = raw.get("random")
     if not isinstance(table, dict):
         return
-    yield from _number_faults("random.stroke_m", table.get("stroke_m"), _stroke_range)
+    yield from number_faults("random.stroke_m", table.get("stroke_m"), _stroke_range)
     rig, spot = (_table(table.get(key)) for key in ("rig", "spot"))
     for key, given in rig.items():
         if key in DRAWABLE:
-            yield from _number_faults(f"random.rig.{key}", given, lambda value, key=key: _rig_range(key, value))
+            yield from number_faults(f"random.rig.{key}", given, lambda value, key=key: _rig_range(key, value))
         elif key in RigTable.model_fields:
             yield _not_drawable(key)
     for key in ("across_m", "up_m", "azimuth_deg", "height_m"):
         if key in spot:
-            yield from _number_faults(f"random.spot.{key}", spot[key], None)
+            yield from number_faults(f"random.spot.{key}", spot[key], None)
     yield from _either_way(spot)
-    yield from _choice_faults(spot.get("target"), names)
+    yield from choice_faults("random.spot.target", spot.get("target"), names)
     if laser is not None:
         yield from _off_board(spot, laser, targets)
     if room is not None:
-        yield from _off_wall(spot, room)
+        yield from off_wall("random.spot.height_m", spot.get("height_m"), room)
 
 
 def _not_drawable(key: str) -> Fault:
     """Fault of a distribution for a key of `[rig]` that is not a number, or must be the same for all samples."""
-    why = "is not a number" if key == "preset" else "must be the same for all samples"
+    why = "is not a number" if key in ("preset", "laser_filter_response") else "must be the same for all samples"
     return Fault(f"random.rig.{key}", f"cannot be drawn, it {why}; set {key} in [rig]")
 
 
@@ -71,7 +71,7 @@ def _table(given: object) -> Raw:
     return given if isinstance(given, dict) else {}
 
 
-def _sound(given: object) -> DistributionTable | None:
+def sound_distribution(given: object) -> DistributionTable | None:
     """Distribution without structural faults; None if there is none."""
     try:
         return DistributionTable.model_validate(one_number(given))
@@ -79,9 +79,9 @@ def _sound(given: object) -> DistributionTable | None:
         return None
 
 
-def _number_faults(path: str, given: object, in_range: Any) -> Iterator[Fault]:
+def number_faults(path: str, given: object, in_range: Any) -> Iterator[Fault]:
     """Faults of one distribution; `in_range` says what is allowed for a value that is not, else nothing."""
-    table = _sound(given)
+    table = sound_distribution(given)
     if table is None:
         return
     faults = [Fault(f"{path}.{key}".removesuffix("."), text) for key, text in distribution_faults(table)]
@@ -120,12 +120,13 @@ def _either_way(spot: Raw) -> Iterator[Fault]:
         yield Fault(f"random.spot.{missing}", f"missing; {ray[0]} needs it, the two make the ray")
 
 
-def _choice_faults(given: object, names: Sequence[str]) -> Iterator[Fault]:
+def choice_faults(where: str, given: object, names: Sequence[str]) -> Iterator[Fault]:
+    """Boards that are chosen from but not there, or listed twice."""
     chosen = [given] if isinstance(given, str) else _table(given).get("choice")
     if not isinstance(chosen, list):
         return
     for i, name in enumerate(chosen):
-        path = f"random.spot.target.choice[{i}]"
+        path = f"{where}.choice[{i}]"
         if isinstance(name, str) and names and name not in names:
             yield Fault(path, f"no target is called '{name}'; {nearest(name, names)}")
         elif name in chosen[:i]:
@@ -140,7 +141,7 @@ def _off_board(spot: Raw, laser: LaserTable, targets: Sequence[TargetTable]) -> 
     if not drawn or any(key in spot for key in _BY_RAY):
         return
     for axis, key in enumerate(("across_m", "up_m")):
-        table = _sound(spot.get(key, 0.0))
+        table = sound_distribution(spot.get(key, 0.0))
         if table is None or [*distribution_faults(table)]:
             continue
         farthest = max(abs(value) for value in support(table))
@@ -153,11 +154,12 @@ def _off_board(spot: Raw, laser: LaserTable, targets: Sequence[TargetTable]) -> 
             yield Fault(f"random.spot.{key}", f"{text}; stay within -{left:.3f} to {left:.3f}")
 
 
-def _off_wall(spot: Raw, room: RoomTable) -> Iterator[Fault]:
-    table, limit_m = _sound(spot.get("height_m")), ceiling_m(build_room(room, ()))
+def off_wall(path: str, given: object, room: RoomTable) -> Iterator[Fault]:
+    """Heights of rays below the floor or above the lamps."""
+    table, limit_m = sound_distribution(given), ceiling_m(build_room(room, ()))
     if table is None or [*distribution_faults(table)]:
         return
     low, high = support(table)
     if low <= 0.0 or high >= limit_m:
         text = f"reaches from {low:g} to {high:g} m, beyond floor or lamps"
-        yield Fault("random.spot.height_m", f"{text}; stay above 0 and below {limit_m:.2f}")
+        yield Fault(path, f"{text}; stay above 0 and below {limit_m:.2f}")

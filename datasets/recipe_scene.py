@@ -100,4 +100,6 @@ def _camera(base: Camera, table: RigTable, z_c_m: float, mirror: SphereMirror) -
         implied["cx_px"] = (table.width_px - 1) / 2.0
     if table.height_px is not None:
         implied["cy_px"] = (table.height_px - 1) / 2.0
+    if table.laser_filter_response is not None:
+        implied["detector"] = replace(base.detector, laser_filter_response=table.laser_filter_response)
     return replace(base, **{**implied, **_given(table, CAMERA_KEYS)})

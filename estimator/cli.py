@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING
 from cyclopts import App, CycloptsError
 
 from phibench.estimator import cli_methods
+from phibench.estimator.cli_bench import bench
 from phibench.estimator.cli_dataset import dataset
+from phibench.estimator.cli_sealed import register as register_sealed
 
 if TYPE_CHECKING:
     from phibench.estimator.score import Score
@@ -32,6 +34,8 @@ app = App(
 )
 app.command(dataset)
 cli_methods.register(app)
+app.command(bench)
+register_sealed(app, dataset)
 
 
 @app.command

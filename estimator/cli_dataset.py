@@ -19,13 +19,15 @@ def make(
     workers: Whole | None = None,
     scheduler: str | None = None,
     shard: str | None = None,
+    samples: Whole | None = None,
+    seed: Whole | None = None,
 ) -> int:
     """Render a data set; what is finished already is kept.
 
     Parameters
     ----------
     recipe
-        TOML file, or the name of a shipped recipe ("paper", "random", "smoke").
+        TOML file, or the name of a shipped recipe ("paper", "random", "smoke", "bench-dev", "bench-test").
     out
         Folder to write; one that holds another data set is refused.
     workers
@@ -34,10 +36,14 @@ def make(
         Address or scheduler file of a running dask scheduler, to use its workers instead.
     shard
         Part of the recipe for job arrays, such as 1/8; put the parts together with `merge`.
+    samples
+        How many samples to draw, instead of the recipe's number.
+    seed
+        Root of all random streams, instead of the recipe's; a secret one for a set that is to be sealed.
     """
     from phibench.datasets.make import make as make_dataset
 
-    make_dataset(recipe, out, workers, scheduler=scheduler, shard=shard)
+    make_dataset(recipe, out, workers, scheduler=scheduler, shard=shard, samples=samples, seed=seed)
     return 0
 
 

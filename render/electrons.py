@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.render.light import Light
+from phibench.render.light import Light, SpotImage
 from phibench.render.motion import moved_spot
 from phibench.render.region import Region
 from phibench.render.sensor import Sensor, SensorError
@@ -70,16 +70,28 @@ def expected_electrons(light: Light, sensor: Sensor, camera: Camera, region: Reg
     seconds = sensor.exposure_s * stop_factor(sensor, light)
     part = light.ambient_electrons_per_s[(slice(None), *region.slices())]
     electrons = sampled(part, sensor, phase).astype(float) * (seconds * light.lamp_level)
-    _add_spot(electrons, light, sensor, region, seconds * light.laser_level * flicker)
+    if light.spot is not None:
+        factor = seconds * light.laser_level * flicker
+        _add_spot(electrons, light.spot, factor, light.velocity_px_per_s, light, sensor, region)
+    for other in light.others:
+        factor = seconds * (light.laser_level if other.follows_laser else 1.0)
+        _add_spot(electrons, other.image, factor, (0.0, 0.0), light, sensor, region)
     return electrons * vignetting(sensor.vignetting_exponent, camera, region)
 
 
-def _add_spot(electrons: Array, light: Light, sensor: Sensor, region: Region, factor: float) -> None:
-    """Add the spot to what `expected_electrons` has of the ambient light, in place."""
-    if light.spot is None or factor == 0.0:
+def _add_spot(
+    electrons: Array,
+    spot: SpotImage,
+    factor: float,
+    velocity_px_per_s: tuple[float, float],
+    light: Light,
+    sensor: Sensor,
+    region: Region,
+) -> None:
+    """Add `factor` times a spot to what `expected_electrons` has of the ambient light, in place."""
+    if factor == 0.0:
         return
-    motion = (light.velocity_px_per_s, sensor.exposure_s, sensor.readout_s, light.size[0])
-    u0, v0, planes = moved_spot(light.spot, *motion)
+    u0, v0, planes = moved_spot(spot, velocity_px_per_s, sensor.exposure_s, sensor.readout_s, light.size[0])
     window = Region(u0, v0, u0 + planes.shape[2], v0 + planes.shape[1])
     common = Region(
         max(window.u0_px, region.u0_px),

@@ -38,6 +38,21 @@ class SpotImage(Protocol):
 
 
 @dataclass(frozen=True)
+class OtherSpot:
+    """Another small light in the view, for which a method may take the spot; it stands still.
+
+    Parameters
+    ----------
+    image : spot layer
+    follows_laser : bool
+        Whether the laser's level is its factor, so that it goes out with the laser; otherwise it is as the layer says.
+    """
+
+    image: SpotImage = field(repr=False)
+    follows_laser: bool = True
+
+
+@dataclass(frozen=True)
 class Light:
     """Expected photo-electrons per second behind the filters R, G, B, of one view.
 
@@ -53,6 +68,8 @@ class Light:
         Velocity (u, v) of the spot's image; see `render/motion.py`. The room is taken to stand still.
     f_number : float
         Lens stop at which the layers were rendered.
+    others : tuple of OtherSpot
+        Added to the spot. Neither `velocity_px_per_s` nor the spot's speckle flicker is theirs.
     """
 
     ambient_electrons_per_s: NDArray[Any] = field(repr=False)
@@ -61,6 +78,7 @@ class Light:
     laser_level: float = 1.0
     velocity_px_per_s: tuple[float, float] = (0.0, 0.0)
     f_number: float = 2.4
+    others: tuple[OtherSpot, ...] = ()
 
     def __post_init__(self) -> None:
         shape = self.ambient_electrons_per_s.shape
@@ -81,8 +99,12 @@ class Light:
         return self.ambient_electrons_per_s.shape[1], self.ambient_electrons_per_s.shape[2]
 
     def laser_off(self) -> Light:
-        """Return the same view without the spot."""
+        """Return the same view without the laser: neither the spot nor what follows the laser."""
         return replace(self, laser_level=0.0)
+
+    def without_spot(self) -> Light:
+        """Return the same view without the spot, but with every other light: what lies under the spot."""
+        return replace(self, spot=None)
 
     @classmethod
     def flat(cls, electrons_per_s: tuple[float, float, float], size: tuple[int, int]) -> Light:

@@ -14,7 +14,14 @@ from phibench.scenes.names import close_names, nearest
 Schema = dict[str, Any]
 Location = tuple[str | int, ...]
 _LIMITS = {"exclusiveMinimum": "above {}", "minimum": "from {}", "exclusiveMaximum": "below {}", "maximum": "up to {}"}
-_KINDS = {"number": "a number", "integer": "an integer", "string": "a string", "array": "a list", "object": "a table"}
+_KINDS = {
+    "number": "a number",
+    "integer": "an integer",
+    "string": "a string",
+    "boolean": "true or false",
+    "array": "a list",
+    "object": "a table",
+}
 
 
 @dataclass(frozen=True)

@@ -90,7 +90,7 @@ def raw_moments(chain: Chain, light: Light, region: Region) -> RawMoments:
     variance = np.broadcast_to(sensor.dn_per_e**2 * (shot + sensor.read_noise_e**2) + QUANTISATION_DN2, photo.shape)
     flicker = np.zeros(photo.shape)
     if sensor.speckle_m is not None:
-        spot = (photo - chain.photo_electrons(light.laser_off(), tiles)) * pattern.responsivity
+        spot = (photo - chain.photo_electrons(light.without_spot(), tiles)) * pattern.responsivity
         flicker = sensor.dn_per_e * spot / np.sqrt(sensor.speckle_m)
     return RawMoments(mean[part], variance[part], (sensor.dn_per_e * sensor.row_noise_e) ** 2, flicker[part])
 

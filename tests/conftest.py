@@ -87,3 +87,11 @@ def smoke_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from phibench.datasets.make import make
 
     return make("smoke", tmp_path_factory.mktemp("smoke") / "out", workers=2)
+
+
+@pytest.fixture(scope="session")
+def bench_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Data set of `tests/tiny_bench.toml`, rendered once. Read only: copy it to change it."""
+    from phibench.datasets.make import make
+
+    return make(ROOT / "tests" / "tiny_bench.toml", tmp_path_factory.mktemp("bench") / "out", workers=2)

@@ -143,4 +143,5 @@ def test_make_passes_shard_and_scheduler_on(monkeypatch, tmp_path):
         "s",
     ]
     assert cli.main(tokens) == 0
-    assert calls == [(("smoke", tmp_path, 3), {"scheduler": "s", "shard": "2/5"})]
+    others = {"samples": None, "seed": None}
+    assert calls == [(("smoke", tmp_path, 3), {"scheduler": "s", "shard": "2/5", **others})]

@@ -1,0 +1,213 @@
+"""The pairs of a data set: its takes as a method sees them, and the exact answers with their bounds.
+
+The bound of a spot counts room, dark current and distractors as background: one unknown level per filter.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from phibench.datasets import layout
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.expected import ExpectedRegion, expected_of_light
+from phibench.datasets.files import sha256
+from phibench.datasets.frame_source import FrameSource, Side
+from phibench.datasets.frames import Frames
+from phibench.datasets.provenance import provenance
+from phibench.datasets.read import Dataset
+from phibench.datasets.sensor_card import card_of
+from phibench.datasets.taken import TakenSample
+from phibench.datasets.takes import Take, takes
+from phibench.estimator.bench.truth import Distraction, PairTruth, SpotTruth
+from phibench.estimator.fisher import covariance_bound
+from phibench.estimator.limits import SpotLimit, spot_limit
+from phibench.estimator.seat.pair import Box, Image, Pair
+from phibench.scenes.frames import Array
+
+TASK_VERSION = 1
+"""Version of the task: what a method is given, what it must answer and what is counted. A change of any raises it."""
+
+_OF_THE_SPOT = 0.01  # of its brightest pixel: dimmer pixels are not the spot's
+_POSITION = 2  # unknowns of a position, the first ones of a Fisher matrix
+
+
+class DatasetPairs:
+    """Pairs of a data set by number; the layers of the last sample are kept.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    taken : tuple of Take
+        Numbered from 0.
+    """
+
+    def __init__(self, dataset: Dataset, taken: tuple[Take, ...]) -> None:
+        self._dataset, self._takes = dataset, taken
+        self._samples = {sample.row.sample_id: sample for sample in dataset}
+        self._kept: TakenSample | None = None
+        self._source: tuple[int, FrameSource] | None = None
+
+    def __len__(self) -> int:
+        return len(self._takes)
+
+    @property
+    def takes(self) -> tuple[Take, ...]:
+        """What is drawn, by number; it tells the sample, so it is not for methods."""
+        return self._takes
+
+    @property
+    def dataset(self) -> Dataset:
+        """Where they come from."""
+        return self._dataset
+
+    def pair(self, number: int) -> Pair:
+        """What a method sees; its arrays are read-only."""
+        return self.pair_and_frames(number)[0]
+
+    def pair_and_frames(self, number: int) -> tuple[Pair, Frames]:
+        """What a method sees, and the frames behind it, with the camera's JPEG files."""
+        take, sample, source = self._drawn_from(number)
+        frames = source.frames(take.draw, laser_off=take.laser_off)
+        images = {name: _sealed(frame.image) for name, frame in frames.by_name.items()}
+        boxes = (None, None) if take.boxes is None else tuple(map(_box, take.boxes))
+        card, (box_down, box_up) = card_of(source.sides["down"].chain.sensor), boxes
+        rig, stroke_m = sample.rig, sample.row.stroke_m
+        pair = Pair(number, **images, rig=rig, stroke_m=stroke_m, card=card, box_down=box_down, box_up=box_up)
+        return pair, frames
+
+    def truth(self, number: int) -> PairTruth:
+        """The exact answer, with the bounds of the raw pixels."""
+        take, sample, source = self._drawn_from(number)
+        sensor = source.sides["down"].chain.sensor
+        return PairTruth(
+            number=number,
+            sample_id=take.sample_id,
+            draw=take.draw,
+            preset=take.preset,
+            jpeg_quality=sensor.jpeg_quality if sensor.output == "mjpeg" else None,
+            hinted=take.boxes is not None,
+            depth_m=sample.row.depth_m,
+            stroke_m=sample.row.stroke_m,
+            true_rig=sample.rig,
+            believed_rig=sample.rig,
+            down=_spot_truth(sample, source, take, "down"),
+            up=_spot_truth(sample, source, take, "up"),
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Provenance of the set."""
+        info, listed = self._dataset.info, self._dataset.folder / layout.SUMS
+        return {
+            "name": info.name,
+            "task_version": TASK_VERSION,
+            "sealed": False,
+            "pairs": len(self),
+            "samples": len({take.sample_id for take in self._takes}),
+            "presets": sorted({take.preset for take in self._takes}),
+            "seed": info.recipe["dataset"]["seed"],
+            "recipe_sha256": info.recipe_sha256,
+            "dataset_sha256": sha256(listed) if listed.is_file() else None,
+            "provenance": provenance(),
+        }
+
+    def _drawn_from(self, number: int) -> tuple[Take, TakenSample, FrameSource]:
+        if not 0 <= number < len(self._takes):
+            raise DatasetError(f"pair {number}: there are {len(self._takes)}, numbered from 0; ask for one of them")
+        take = self._takes[number]
+        kept = self._kept
+        if kept is None or kept.row.sample_id != take.sample_id:
+            kept = self._kept = TakenSample(self._samples[take.sample_id])
+        if self._source is None or self._source[0] != number:
+            self._source = number, kept.source(take)
+        return take, kept, self._source[1]
+
+
+def dataset_pairs(
+    dataset: Dataset, preset: str | None = None, draws: int | None = None, pairs: int | None = None
+) -> DatasetPairs:
+    """Pairs of a data set in an order that is drawn.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    preset : str, optional
+        Sensor preset; those of the recipe's `[frames]` if not given.
+    draws : int, optional
+        Draws of the noise per sample and preset; the recipe's if not given.
+    pairs : int, optional
+        Only the first so many.
+
+    Raises
+    ------
+    DatasetError
+        If neither recipe nor caller names a preset, or `pairs` is not a number from 1 up.
+    """
+    taken = takes(dataset, preset, draws)
+    if pairs is not None and pairs < 1:
+        raise DatasetError(f"pairs = {pairs}: must be 1 or above")
+    return DatasetPairs(dataset, taken[:pairs])
+
+
+def _sealed(image: Image) -> Image:
+    """Image that cannot be written to, nor through its base."""
+    result = np.array(image)
+    result.flags.writeable = False
+    return result
+
+
+def _box(region: Any) -> Box:
+    height, width = region.shape
+    return Box(region.u0_px, region.v0_px, width, height)
+
+
+def _spot_truth(sample: TakenSample, source: FrameSource, take: Take, position: str) -> SpotTruth:
+    row, side = sample.row.position(position), source.sides[position]
+    raw = side.chain.sensor.replace(output="raw")
+    card = card_of(raw)
+    region = expected_of_light(side.light, raw, sample.rig.camera) if row.visible else None
+    limit = None if region is None else spot_limit(region, card)
+    bound = None if limit is None or not np.isfinite(limit.covariance_px2).all() else limit.covariance_px2
+    peak_e = 0.0 if region is None else _peak_e(region)
+    return SpotTruth(
+        uv_px=(row.u_px, row.v_px),
+        phi_rad={"ray": row.phi_ray_rad, "normal": row.phi_normal_rad, "incidence": row.phi_incidence_rad},
+        azimuth_rad=row.azimuth_rad,
+        visible=row.visible,
+        cause=row.cause,
+        electrons=_electrons(row.electrons_per_s, side),
+        peak_e=peak_e,
+        snr=0.0 if limit is None else _snr(limit),
+        saturated=peak_e > card.saturation_e,
+        bound_px2=bound if side.chain.sensor.output == "raw" else None,
+        raw_bound_px2=bound,
+        distractions=_distractions(sample, side, position),
+    )
+
+
+def _electrons(rates_per_s: tuple[float, float, float] | Array, side: Side) -> float:
+    """Electrons of a whole spot: behind the red filter, or all of them where there are no filters."""
+    sensor = side.chain.sensor
+    weights = sensor.mono_weights if sensor.mosaic == "mono" else (1.0, 0.0, 0.0)
+    return float(np.dot(rates_per_s, weights)) * sensor.exposure_s * side.light.laser_level
+
+
+def _peak_e(region: ExpectedRegion) -> float:
+    """Largest expected electrons of a pixel that belongs to the spot, room included."""
+    return float(region.mean_e[region.spot_e >= _OF_THE_SPOT * region.spot_e.max()].max())
+
+
+def _snr(limit: SpotLimit) -> float:
+    """Flux over its standard deviation at the limit, position known, background unknown."""
+    variance = covariance_bound(limit.fisher[_POSITION:, _POSITION:], keep=1)[0, 0]
+    return float(1.0 / np.sqrt(variance)) if variance > 0.0 else 0.0
+
+
+def _distractions(sample: TakenSample, side: Side, position: str) -> tuple[Distraction, ...]:
+    """Lights beside the spot that this image shows."""
+    return tuple(
+        Distraction(one.kind, (truth.u_px, truth.v_px), _electrons(one.layers[position].total_electrons_per_s, side))
+        for one in sample.distractors
+        if (truth := one.truths[position]).visible
+    )

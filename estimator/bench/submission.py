@@ -1,0 +1,212 @@
+"""Submissions: what a method answered on a sealed set, and which method it was. No images, no truth."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, ValidationError
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.files import sha256, write_text
+from phibench.datasets.provenance import provenance
+from phibench.datasets.schema import Document, Number, Vector2
+from phibench.estimator.bench.seal_layout import Seal
+from phibench.estimator.bench.sealed_pairs import SealedPairs
+from phibench.estimator.bench.wiring import Run, harness
+from phibench.estimator.seat.outcome import Outcome
+from phibench.estimator.seat.pair import Answer, Spot
+
+FORMAT = "phibench submission 1"
+Matrix = Annotated[tuple[Vector2, Vector2], Field(strict=False)]
+
+
+class SpotLine(Document):
+    """`estimator.seat.pair.Spot`."""
+
+    uv_px: Vector2 | None
+    covariance_px2: Matrix | None
+    phi_rad: Number | None
+    phi_convention: str
+    status: str
+
+
+class AnswerLine(Document):
+    """One pair: an answer, or the failure that was instead of it."""
+
+    number: int
+    down: SpotLine | None
+    up: SpotLine | None
+    depth_m: Number | None
+    sigma_depth_m: Number | None
+    seconds: Number
+    failure: str
+    message: str
+
+
+class Submission(Document):
+    """`submission.json`; `seal` is the id of the sealed set, `method_sha256` the hash of the method's own file."""
+
+    format: str
+    seal: str
+    task_version: int
+    method: str
+    method_sha256: str | None
+    provenance: dict[str, Any]
+    answers: Annotated[tuple[AnswerLine, ...], Field(strict=False)]
+
+
+@dataclass(frozen=True)
+class Submitted:
+    """What `submit` wrote, and how many pairs have an answer."""
+
+    path: Path
+    pairs: int
+    answered: int
+
+
+def submit(public: str | Path, method: str, out: str | Path, run: Run | None = None) -> Submitted:
+    """Run a method on a sealed set and write its answers.
+
+    Parameters
+    ----------
+    public : folder of the sealed set
+    method : str
+        Reference as the harness takes it: the name of a built-in one, or a file.
+    out : JSON file to write
+    run : callable, optional
+        Runs the method; by default the harness.
+
+    Raises
+    ------
+    DatasetError
+        If the set was changed, the method cannot be run, or an answer is missing.
+    """
+    pairs, out = SealedPairs(Path(public)), Path(out)
+    if out.is_dir():
+        raise DatasetError(f"{out} is a folder; give a file such as submission.json, --out")
+    pairs.check()
+    outcomes = (run or harness())(method, pairs)
+    document = submission(pairs.seal, method, outcomes)
+    check_complete(document, pairs.seal, "the run")
+    write_text(out, json.dumps(document.model_dump(mode="json"), indent=1, allow_nan=False) + "\n")
+    return Submitted(out, len(outcomes), sum(outcome.answer is not None for outcome in outcomes))
+
+
+def submission(seal: Seal, method: str, outcomes: Sequence[Outcome]) -> Submission:
+    """Document of a method's outcomes on a sealed set, by number."""
+    file = Path(method.partition(":")[0])
+    return Submission(
+        format=FORMAT,
+        seal=seal.id,
+        task_version=seal.task_version,
+        method=file.name + method[len(str(file)) :] if file.is_file() else method,  # no paths of somebody's machine
+        method_sha256=sha256(file) if file.is_file() else None,
+        provenance=provenance(),
+        answers=tuple(_line(outcome) for outcome in sorted(outcomes, key=lambda outcome: outcome.number)),
+    )
+
+
+def read_submission(path: Path) -> Submission:
+    """Read a submission.
+
+    Raises
+    ------
+    DatasetError
+        If it is not readable or no submission; in one sentence.
+    """
+    try:
+        document = Submission.model_validate(json.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise DatasetError(f"{path} is not readable: {error.strerror or error}; give a submission") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise DatasetError(
+            f"{path} is no submission: {where}: {first['msg']}; write it with `phibench submit`"
+        ) from error
+    except ValueError as error:
+        raise DatasetError(f"{path} is no submission: it is not JSON; write it with `phibench submit`") from error
+    if document.format != FORMAT:
+        raise DatasetError(f"{path} has the format '{document.format}', not '{FORMAT}'; write it with this phibench")
+    return document
+
+
+def check_complete(document: Submission, seal: Seal, name: str) -> None:
+    """Refuse a submission of another seal or version, and one that has not each pair once; `name` is what it is called.
+
+    Raises
+    ------
+    DatasetError
+        In one sentence.
+    """
+    if document.seal != seal.id:
+        raise DatasetError(
+            f"{name} answers the seal {document.seal}, not {seal.id}; submit to the set that is unsealed"
+        )
+    if document.task_version != seal.task_version:
+        text = f"{name} is of task version {document.task_version}, the seal of {seal.task_version}"
+        raise DatasetError(f"{text}; submit again with the version of the seal")
+    counts = Counter(line.number for line in document.answers)
+    if twice := sorted(number for number, count in counts.items() if count > 1):
+        raise DatasetError(f"{name} answers pair {twice[0]} twice; answer each once")
+    if missing := sorted(set(range(seal.pairs)) - set(counts)):
+        text = f"{name} lacks pair {missing[0]} ({len(missing)} of {seal.pairs} are missing)"
+        raise DatasetError(f"{text}; a pair without a spot is answered with a status")
+    if strange := sorted(set(counts) - set(range(seal.pairs))):
+        raise DatasetError(f"{name} answers pair {strange[0]}, the seal has 0 to {seal.pairs - 1}; remove it")
+
+
+def outcomes_of(document: Submission) -> list[Outcome]:
+    """Outcomes of a submission, by number."""
+    return [_outcome(line) for line in sorted(document.answers, key=lambda line: line.number)]
+
+
+def _line(outcome: Outcome) -> AnswerLine:
+    answer = outcome.answer
+    return AnswerLine(
+        number=outcome.number,
+        down=None if answer is None else _spot_line(answer.down),
+        up=None if answer is None else _spot_line(answer.up),
+        depth_m=None if answer is None else _finite(answer.depth_m),
+        sigma_depth_m=None if answer is None else _finite(answer.sigma_depth_m),
+        seconds=math.nan if _finite(outcome.seconds) is None else float(outcome.seconds),
+        failure=outcome.failure,
+        message=outcome.message,
+    )
+
+
+def _spot_line(spot: Spot) -> SpotLine:
+    uv, covariance = spot.uv_px, spot.covariance_px2
+    matrix = None
+    if covariance is not None:
+        (uu, cross), (vu, vv) = covariance
+        matrix = (float(uu), float(cross)), (float(vu), float(vv))
+    return SpotLine(
+        uv_px=None if uv is None else (float(uv[0]), float(uv[1])),
+        covariance_px2=matrix,
+        phi_rad=_finite(spot.phi_rad),
+        phi_convention=spot.phi_convention,
+        status=spot.status,
+    )
+
+
+def _finite(value: float | None) -> float | None:
+    """Python float; None for what is not finite, which JSON cannot hold."""
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def _outcome(line: AnswerLine) -> Outcome:
+    answer = None
+    if line.down is not None and line.up is not None:
+        answer = Answer(_spot(line.down), _spot(line.up), line.depth_m, line.sigma_depth_m)
+    return Outcome(line.number, answer, line.seconds, line.failure, line.message)
+
+
+def _spot(line: SpotLine) -> Spot:
+    return Spot(line.uv_px, line.covariance_px2, line.phi_rad, line.phi_convention, line.status)
