@@ -1,7 +1,7 @@
 """A believable set of pairs for tests of the score: truth by other mathematics, bounds, and methods that know it all.
 
-Not a test file. Pixels are those of `oracles.true_pixel` (Alhazen's quartic and OpenCV), phi those of the geometry of the
-reflection point, so that neither comes from what is tested.
+Not a test file. Pixels are those of `oracles.true_pixel` (Alhazen's quartic and OpenCV), phi those of the geometry of
+the reflection point, so that neither comes from what is tested.
 """
 
 from __future__ import annotations

@@ -91,7 +91,9 @@ def test_depth_errors_are_those_of_the_pixels_given():
     for truth, error in zip(pairs.truths[:50], table["depth_error_m"][:50], strict=True):
         centre = np.array([RIG.camera.cx_px, RIG.camera.cy_px])
         down, up = (centre + 1.001 * (np.array(s.uv_px) - centre) for s in (truth.down, truth.up))
-        assert error == pytest.approx(float(depth_exact(RIG, truth.stroke_m, down, up).depth_m) - truth.depth_m, abs=1e-12)
+        assert error == pytest.approx(
+            float(depth_exact(RIG, truth.stroke_m, down, up).depth_m) - truth.depth_m, abs=1e-12
+        )
 
 
 def test_swapped_frames_find_nothing():
@@ -205,9 +207,7 @@ def test_a_biased_method_has_a_pull_rms_above_its_deviation():
         answer = sampler()(t)
         move = {p: np.linalg.cholesky(getattr(t, p).bound_px2) @ [1.0, 0.0] for p in ("down", "up")}
         spots = {p: getattr(answer, p) for p in move}
-        return type(answer)(
-            *(type(s)(tuple(np.array(s.uv_px) + move[p]), s.covariance_px2) for p, s in spots.items())
-        )
+        return type(answer)(*(type(s)(tuple(np.array(s.uv_px) + move[p]), s.covariance_px2) for p, s in spots.items()))
 
     _, m = score(cases(), biased)
     assert abs(value(m, "pull_deviation") - 1.0) < 3 / np.sqrt(2 * 800)

@@ -1,7 +1,8 @@
 """BCa intervals over samples: all draws and both images of a sample are resampled together.
 
 A resample is a weight per sample: how often it was drawn. Statistics take weights, shape (b, n), so that one matrix
-product gives b resampled sums. The intervals are `scipy.stats.bootstrap`'s (B. Efron, J. Am. Stat. Assoc. 82, 171, 1987).
+product gives b resampled sums. The intervals are those of `scipy.stats.bootstrap` (B. Efron, J. Am. Stat. Assoc. 82,
+171, 1987).
 
 Where BCa is not defined:
 
@@ -89,7 +90,7 @@ def rms_ratio_of(clusters: Clusters, above: Array, below: Array) -> Statistic:
 
 def deviation_of(clusters: Clusters, *columns: Array) -> Statistic:
     """Standard deviation about each column's own mean, pooled over columns (division by the number of records)."""
-    table = clusters.sums(*columns, sum(column**2 for column in columns), np.ones_like(columns[0]))
+    table = clusters.sums(*columns, np.sum(np.square(columns), axis=0), np.ones_like(columns[0]))
 
     def deviation(weights: Array) -> Array:
         sums = weights @ table

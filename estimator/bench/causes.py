@@ -4,23 +4,24 @@ An image that is not detected is **unseen** (not visible, and no position was gi
 position) or **false** (a position where there is no spot, or too far from it). Whatever it is, it has one cause:
 
 1. ``occluded``: not visible, and the scene is why: an object in the way, or the wall that carries the spot.
-2. ``mirror_edge``: not visible because no point of the mirror reflects it, or its image touches the mirror's outline; or
-   visible and nearer to the outline than 3 blurs, where part of its light is cut off.
+2. ``mirror_edge``: not visible because no point of the mirror reflects it, or its image touches the mirror's outline;
+   or visible and nearer to the outline than 3 blurs, where part of its light is cut off.
 3. ``image_edge``: the same with the edge of the sensor.
 4. ``saturated``: a pixel of the spot is expected above saturation: its shape is lost.
 5. ``confused``: the position is within `match_px` of another light of the scene, or of a region that is brighter in the
-   image than the spot: mean of 4 x 4 pixels (two Bayer cells), in the difference to the laser-off image where there is one.
+   image than the spot: mean of 4 x 4 pixels (two Bayer cells), less the laser-off image if there is one.
 6. ``below_noise``: flux below 5 standard deviations. In 1280 x 720 pixels of Gaussian noise the largest is at 4.9
-   standard deviations on average, so that a fainter spot cannot be told from noise in the whole image (A. Rose, J. Opt.
-   Soc. Am. 38, 196, 1948, found the same 5 for the eye).
-7. ``compression``: the raw pixels would have been good enough (bound below 1 px along each axis), but in the 8-bit image
-   nothing is left at the spot's place: the mean of its 3 x 3 pixels, in every colour, is less than one code or less than
-   3 standard errors above the median of the ring 4 to 8 px around. The standard error is that of 9 pixels
-   with the ring's robust deviation (1.4826 MAD).
-8. the harness's word, if the method did not come back: ``error``, ``timeout``, ``crash``, ``memory``, ``invalid``, ``mutated``.
+   standard deviations on average, so that a fainter spot cannot be told from noise in the whole image (A. Rose, J.
+   Opt. Soc. Am. 38, 196, 1948, found the same 5 for the eye).
+7. ``compression``: the raw pixels would have been good enough (bound below 1 px along each axis), but nothing is left
+   at the spot's place in the 8-bit image: in every colour the mean of its 3 x 3 pixels is less than one code, or less
+   than 3 standard errors, above the median of the ring 4 to 8 px around. The standard error is that of 9 pixels with
+   the ring's robust deviation (1.4826 MAD).
+8. the harness's word, if the method did not come back: ``error``, ``timeout``, ``crash``, ``memory``, ``invalid``,
+   ``mutated``.
 9. ``method``: none of these. The light was there.
 
-So a crash on an image without a spot counts as ``occluded``; how often the method failed is counted apart, in `failures`.
+So a crash on an image without a spot counts as ``occluded``; how often the method failed is counted apart (`failures`).
 """
 
 from __future__ import annotations
@@ -105,9 +106,7 @@ def with_causes(records: pl.DataFrame, pairs: PairSet, rules: Rules) -> pl.DataF
         found = row["detected"]
         causes.append(None if found else cause_of(_case(row, pairs, rules, held)))
         kinds.append(None if found else _kind(row))
-    return records.with_columns(
-        pl.Series("kind", kinds, pl.String), pl.Series("cause", causes, pl.String)
-    )
+    return records.with_columns(pl.Series("kind", kinds, pl.String), pl.Series("cause", causes, pl.String))
 
 
 def count(records: pl.DataFrame) -> dict[str, dict[str, int]]:

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from phibench.estimator.phi import CONVENTIONS, estimate_phi, outline_circle
-from phibench.estimator.status import Status
-from phibench.estimator.triangulate import depth_exact
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
@@ -41,22 +39,6 @@ class PixelErrors:
         return np.hypot(self.du_px, self.dv_px)
 
 
-@dataclass(frozen=True)
-class Depths:
-    """Depths of n pairs from two positions each, shape (n,); NaN where the rays do not meet.
-
-    Attributes
-    ----------
-    depth_m
-    sigma_m : to first order, NaN without covariances
-    status : values of `Status`
-    """
-
-    depth_m: Array
-    sigma_m: Array
-    status: Array
-
-
 def pixel_errors(true_rig: Rig, true_px: Array, answer_px: Array) -> PixelErrors:
     """Errors of positions, shape (n, 2) both."""
     error = np.asarray(answer_px, float) - true_px
@@ -81,17 +63,6 @@ def phi_of(convention: str, rig: Rig, uv_px: Array) -> Array:
 def phi_variance(rig: Rig, uv_px: Array, covariance_px2: Array, convention: str = "ray") -> Array:
     """Variance of phi, shape (n,), rad^2: g C g^T; NaN for covariances, shape (n, 2, 2), that are NaN."""
     return estimate_phi(convention, rig.at(0.0), uv_px, covariance_px2).variance_rad2
-
-
-def depths(rig: Rig, stroke_m: Array, down_px: Array, up_px: Array, down_px2: Array, up_px2: Array) -> Depths:
-    """Exact depths of n pairs; covariances, shape (n, 2, 2), may be NaN."""
-    found = depth_exact(rig, stroke_m, down_px, up_px, down_px2, up_px2)
-    return Depths(found.depth_m, found.sigma_m, found.status)
-
-
-def is_ok(status: Array) -> Array:
-    """Where a status says that there is a value."""
-    return np.asarray(status == Status.OK)
 
 
 def usable_covariance(covariance_px2: Array) -> Array:

@@ -124,7 +124,12 @@ METRICS: dict[str, Metric] = {
         "bound", "efficiency", ("bound_px2", "du_px", "dv_px"), "1", "higher", "rms at the bound / rms distance"
     ),
     "efficiency_raw_px": Metric(
-        "raw bound", "efficiency", ("raw_bound_px2", "du_px", "dv_px"), "1", "higher", "the same, bound of the raw pixels"
+        "raw bound",
+        "efficiency",
+        ("raw_bound_px2", "du_px", "dv_px"),
+        "1",
+        "higher",
+        "the same, bound of the raw pixels",
     ),
     "pull_deviation": Metric("pull", "deviation", ("pull_u", "pull_v"), "1", "none", "deviation of L^-1 e; 1 is right"),
     "pull_rms": Metric("pull", "rms of each", ("pull_u", "pull_v"), "1", "none", "rms of L^-1 e; 1 is right"),
@@ -137,13 +142,19 @@ METRICS: dict[str, Metric] = {
     "bias_depth_m": Metric("depth", "mean", ("depth_error_m",), "m", "none", "mean error of D"),
     **_errors("depth", ("depth_error_m",), "depth_error_m", "m", "depth_m", "error of D"),
     "bias_depth_relative": Metric("depth", "mean", ("depth_relative",), "1", "none", "mean relative error of D"),
-    "rms_depth_counted": Metric("pair", "rms", ("depth_counted",), "1", "lower", "rms relative error of D, missed counted"),
+    "rms_depth_counted": Metric(
+        "pair", "rms", ("depth_counted",), "1", "lower", "rms relative error of D, missed counted"
+    ),
     **_errors("depth", ("depth_relative",), "depth_relative", "1", "depth_relative", "relative error of D"),
-    "bound_depth_relative": Metric("depth bound", "rms", ("root_bound_depth",), "1", "none", "D: relative rms at the bound"),
+    "bound_depth_relative": Metric(
+        "depth bound", "rms", ("root_bound_depth",), "1", "none", "D: relative rms at the bound"
+    ),
     "efficiency_depth": Metric(
         "depth bound", "efficiency", ("bound_depth_m2", "depth_error_m"), "1", "higher", "D: rms at the bound / rms"
     ),
-    "pull_depth": Metric("depth pull", "deviation", ("depth_pull",), "1", "none", "deviation of error / sigma of D; 1 is right"),
+    "pull_depth": Metric(
+        "depth pull", "deviation", ("depth_pull",), "1", "none", "deviation of error / sigma of D; 1 is right"
+    ),
     "seconds": Metric("timed", "mean", ("seconds",), "s", "lower", "mean time per pair"),
 }
 
@@ -166,7 +177,9 @@ def prepared(records: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def measure(records: pl.DataFrame, rules: Rules, *stream: Name, names: tuple[str, ...] | None = None) -> dict[str, Measured]:
+def measure(
+    records: pl.DataFrame, rules: Rules, *stream: Name, names: tuple[str, ...] | None = None
+) -> dict[str, Measured]:
     """All metrics of some records, or those of `names`.
 
     Parameters
@@ -221,7 +234,8 @@ def _resampled(ready: dict[str, _Ready], rules: Rules, rng: np.random.Generator)
     samples = next(iter(ready.values())).samples
     numbers = estimates([item.statistic for item in ready.values()], samples, rules, rng)
     return {
-        name: Measured(number, item.n, item.samples) for (name, item), number in zip(ready.items(), numbers, strict=True)
+        name: Measured(number, item.n, item.samples)
+        for (name, item), number in zip(ready.items(), numbers, strict=True)
     }
 
 

@@ -1,10 +1,10 @@
 """Rates with intervals: a rate over images, an interval over samples.
 
-Images of one sample succeed and fail together, so that the n of a binomial interval is an effective one: that of a simple
-random sample whose rate would vary as the clustered one does (E. L. Korn, B. I. Graubard, Survey Methodology 24, 193,
-1998), at most the number of images, and reduced for the degrees of freedom. Then the exact interval of C. J. Clopper and
-E. S. Pearson, Biometrika 26, 404 (1934), with beta quantiles. At a rate of 0 or 1 the spread cannot be seen: the samples
-are counted as if the images of one sample were always alike.
+Images of one sample succeed and fail together, so that the n of a binomial interval is an effective one: that of a
+simple random sample whose rate would vary as the clustered one does (E. L. Korn, B. I. Graubard, Survey Methodology 24,
+193, 1998), at most the number of images, and reduced for the degrees of freedom. Then the exact interval of
+C. J. Clopper and E. S. Pearson, Biometrika 26, 404 (1934), with beta quantiles. At a rate of 0 or 1 the spread cannot
+be seen: the samples are counted as if the images of one sample were always alike.
 """
 
 from __future__ import annotations

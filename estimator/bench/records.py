@@ -21,6 +21,7 @@ from phibench.estimator.bench.rules import Rules
 from phibench.estimator.bench.truth import PairTruth, SpotTruth
 from phibench.estimator.seat.outcome import Outcome
 from phibench.estimator.seat.pair import OK, Answer, Spot
+from phibench.estimator.triangulate import depth_exact
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig
 
@@ -76,7 +77,7 @@ COLUMNS: dict[str, str] = {
     "depth_estimate_m": "D of the answer",
     "depth_error_m": "depth_estimate_m - depth_m",
     "depth_relative": "depth_error_m / depth_m",
-    "depth_counted": "|depth_relative|, at most missed_relative; missed_relative if not found; null if a spot is unseen",
+    "depth_counted": "|depth_relative|, at most missed_relative; that too if not found; null unless pair_visible",
     "depth_sigma_m": "claimed: the method's with its own depth, else from its covariances; without calibration",
     "depth_pull": "depth_error_m / depth_sigma_m",
     "bound_depth_m2": "variance of D at the bounds of both spots; without calibration",
@@ -112,7 +113,9 @@ def record_table(truths: Sequence[PairTruth], outcomes: Sequence[Outcome], rules
     index: dict[tuple[Rig, Rig], list[int]] = {}
     for i, truth in enumerate(truths):
         index.setdefault((truth.believed_rig, truth.true_rig), []).append(i)
-    frames = [_of_rigs(*rigs, [truths[i] for i in rows], [outcomes[i] for i in rows], rules) for rigs, rows in index.items()]
+    frames = [
+        _of_rigs(*rigs, [truths[i] for i in rows], [outcomes[i] for i in rows], rules) for rigs, rows in index.items()
+    ]
     table = pl.concat(frames).sort("number", pl.col("image") == "up")
     return table.with_columns(pl.col(pl.Float64).fill_nan(None)).select(*COLUMNS)
 
@@ -128,9 +131,7 @@ def _ordered(outcomes: Iterable[Outcome], count: int) -> list[Outcome]:
     return ordered
 
 
-def _of_rigs(
-    believed: Rig, true: Rig, truths: list[PairTruth], outcomes: list[Outcome], rules: Rules
-) -> pl.DataFrame:
+def _of_rigs(believed: Rig, true: Rig, truths: list[PairTruth], outcomes: list[Outcome], rules: Rules) -> pl.DataFrame:
     """Records of pairs that share their rigs, image by image, then the pairs' own columns."""
     images = {p: _image_columns(p, believed, true, truths, outcomes, rules) for p in POSITIONS}
     pair = _pair_columns(believed, truths, outcomes, images, rules)
@@ -196,7 +197,9 @@ def _phi_columns(
     believed: Rig, true: Rig, xy: Array, uv: Array, spots: list[SpotTruth], answers: list[Spot | None]
 ) -> dict[str, Any]:
     own = np.array([_own_phi(answer) for answer in answers])
-    convention = [a.phi_convention if a is not None and np.isfinite(x) else "ray" for a, x in zip(answers, own, strict=True)]
+    convention = [
+        a.phi_convention if a is not None and np.isfinite(x) else "ray" for a, x in zip(answers, own, strict=True)
+    ]
     phi = np.where(np.isfinite(own), own, errors.phi_of("ray", believed, uv))
     outline = errors.phi_of("outline", true, xy)
     truth = np.array([s.phi_rad.get(c, o) for s, c, o in zip(spots, convention, outline, strict=True)])
@@ -215,8 +218,10 @@ def _pair_columns(
     bounds = [_bounds([getattr(t, p) for t in truths], "bound_px2") for p in POSITIONS]
     claims = [errors.usable_covariance(_claimed([_spot(o, p) for o in outcomes])) for p in POSITIONS]
     true_m, h = (np.array([getattr(t, name) for t in truths], float) for name in ("depth_m", "stroke_m"))
-    answers, truth = ([np.stack([i[u], i[v]], -1) for i in (down, up)] for u, v in (("u_px", "v_px"), ("u_true_px", "v_true_px")))
-    triangulated = errors.depths(believed, h, *answers, *claims)
+    answers, truth = (
+        [np.stack([i[u], i[v]], -1) for i in (down, up)] for u, v in (("u_px", "v_px"), ("u_true_px", "v_true_px"))
+    )
+    triangulated = depth_exact(believed, h, *answers, *claims)
     own, own_sigma = (np.array([_own_depth(o.answer, name) for o in outcomes]) for name in ("depth_m", "sigma_depth_m"))
     has_own = np.isfinite(own)
     depth, sigma = np.where(has_own, own, triangulated.depth_m), np.where(has_own, own_sigma, triangulated.sigma_m)
@@ -244,7 +249,7 @@ def _pair_columns(
         "depth_counted": np.where(both, counted, np.nan),
         "depth_sigma_m": sigma,
         "depth_pull": (depth - true_m) / np.where(sigma > 0.0, sigma, np.nan),
-        "bound_depth_m2": errors.depths(believed, h, *truth, *bounds).sigma_m ** 2,
+        "bound_depth_m2": depth_exact(believed, h, *truth, *bounds).sigma_m ** 2,
         "seconds": [float(o.seconds) for o in outcomes],
         "failure": [o.failure for o in outcomes],
         "message": [o.message for o in outcomes],

@@ -3,8 +3,8 @@
 * An image's spot is **detected** when a position is given within `match_px` of the chief ray's (u, v) and the spot is
   visible. Visible and not detected: **missed**. A position given where the spot is not visible, or further than
   `match_px` from it: **false detection**; an image can be missed and falsely detected at once.
-* Errors are over detected spots. Beside each rms stands a second one, "missed counted", over all visible spots, in which
-  a missed spot counts as an error of `match_px`, and a pair without a usable depth, or with one that is off by
+* Errors are over detected spots. Beside each rms stands a second one, "missed counted", over all visible spots, in
+  which a missed spot counts as an error of `match_px`, and a pair without a usable depth, or with one that is off by
   more than `missed_relative` of D, as `missed_relative`: an answer is never worth less than none.
 * A pair's depth is **found** when both spots are visible and a finite depth above 0 follows from the answer: the
   method's own, unless a position that it gave is a false detection, else the exact one of two detected spots.
@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from phibench.datasets.errors import DatasetError
 
 MATCH_PX = 3.0
-"""A spot at 5 sigma, the faintest that counts as there, is placed to 0.3 to 0.5 px (blur 0.7 px; mono to Bayer), so that 3 px
-is six standard deviations or more and an answer beyond it belongs to something else. A blind guess in the mirror's disc
-(radius 339 px) is within 3 px of the spot with a chance of 8e-5."""
+"""A spot at 5 sigma, the faintest that counts as there, is placed to 0.3 to 0.5 px (blur 0.7 px; mono to Bayer), so
+that 3 px is six standard deviations or more and an answer beyond it belongs to something else. A blind guess in the
+mirror's disc (radius 339 px) is within 3 px of the spot with a chance of 8e-5."""
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Strata: the same metrics over parts of the records, by depth, stroke, signal, Bayer phase, quality, azimuth, preset.
 
 A stratum takes images; its metrics of pairs take pairs. By signal an image counts with its own electrons, a pair with
-those of its fainter spot; by azimuth a pair counts with its "down" image. Bayer phase and image position belong to images
-alone: their strata have no metrics of pairs.
+those of its fainter spot; by azimuth a pair counts with its "down" image. Bayer phase and image position belong to
+images alone: their strata have no metrics of pairs.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import polars as pl
 
@@ -85,10 +86,12 @@ def count_pairs(stratum: Stratum) -> int:
 
 def _by_edges(by: str, table: pl.DataFrame) -> Iterator[Stratum]:
     column, edges, unit = _EDGES[by]
-    for low, high in zip(edges, edges[1:], strict=False):
+    for low, high in pairwise(edges):
         images = table.filter(_within(column, low, high, edges[-1]))
         if 0 < len(images) < len(table):
-            yield Stratum(by, _label(low, high, unit), low, high, images, _pairs(by, table, images, low, high, edges[-1]))
+            yield Stratum(
+                by, _label(low, high, unit), low, high, images, _pairs(by, table, images, low, high, edges[-1])
+            )
 
 
 def _pairs(by: str, table: pl.DataFrame, images: pl.DataFrame, low: float, high: float, last: float) -> pl.DataFrame:
