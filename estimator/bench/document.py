@@ -64,15 +64,20 @@ class StratumScore(Document):
 
 
 class MethodCard(Document):
-    """Which method: the reference it was called by, and the hash of its code (null if it could not be told)."""
+    """Which method: the reference it was called by, where it is, the hash of its code (null if it cannot be told)."""
 
     reference: str
+    name: str
+    kind: str = ""
+    place: str = ""
+    function: str = ""
     sha256: str | None = None
+    version: str | None = None
 
-    @property
-    def name(self) -> str:
-        """Short name: what follows the last slash."""
-        return self.reference.rsplit("/", 1)[-1]
+    @classmethod
+    def of(cls, reference: str, **fields: str | None) -> MethodCard:
+        """Of a reference; its name is what follows the last slash, unless it is given."""
+        return cls.model_validate({"name": reference.rsplit("/", 1)[-1], **fields, "reference": reference})
 
 
 class Worst(Document):

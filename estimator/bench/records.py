@@ -102,7 +102,7 @@ def records(pairs: PairSet, outcomes: Iterable[Outcome], rules: Rules) -> pl.Dat
     DatasetError
         If a pair has several outcomes, a number is none of the set, or the set is sealed.
     """
-    ordered = _ordered(outcomes, len(pairs))
+    ordered = in_order(outcomes, len(pairs))
     return record_table([pairs.truth(outcome.number) for outcome in ordered], ordered, rules)
 
 
@@ -120,7 +120,14 @@ def record_table(truths: Sequence[PairTruth], outcomes: Sequence[Outcome], rules
     return table.with_columns(pl.col(pl.Float64).fill_nan(None)).select(*COLUMNS)
 
 
-def _ordered(outcomes: Iterable[Outcome], count: int) -> list[Outcome]:
+def in_order(outcomes: Iterable[Outcome], count: int) -> list[Outcome]:
+    """Outcomes by number.
+
+    Raises
+    ------
+    DatasetError
+        If a pair has several, or a number is not 0 to count - 1.
+    """
     ordered = sorted(outcomes, key=lambda outcome: outcome.number)
     numbers = [outcome.number for outcome in ordered]
     if len(set(numbers)) != len(numbers):

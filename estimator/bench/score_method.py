@@ -14,7 +14,7 @@ from phibench.estimator.bench.causes import count, count_failures, with_causes
 from phibench.estimator.bench.document import KIND, VERSION, MethodCard, ScoreDocument, StratumScore, Value, finite
 from phibench.estimator.bench.metrics import METRICS
 from phibench.estimator.bench.pair_set import PairSet
-from phibench.estimator.bench.records import records
+from phibench.estimator.bench.records import in_order, record_table
 from phibench.estimator.bench.rules import Rules
 from phibench.estimator.bench.strata import Stratum, count_pairs, measured, strata
 from phibench.estimator.bench.worst import worst
@@ -69,7 +69,10 @@ def score_outcomes(
     limits: Mapping[str, Any] | None = None,
 ) -> Scored:
     """Score what a method has answered; parameters as for `score_method`."""
-    table = with_causes(records(pairs, outcomes, rules), pairs, rules)
+    ordered = in_order(outcomes, len(pairs))
+    truths = [pairs.truth(outcome.number) for outcome in ordered]  # once: a bound is not computed in no time
+    table = record_table(truths, ordered, rules)
+    table = with_causes(table, {truth.number: truth for truth in truths}, pairs.pair, rules)
     document = ScoreDocument(
         kind=KIND,
         version=VERSION,
@@ -87,7 +90,7 @@ def score_outcomes(
         strata=[_stratum(stratum, rules, seed) for stratum in strata(table)],
         causes=count(table),
         failures=count_failures(table),
-        worst=worst(table, pairs),
+        worst=worst(table, pairs.pair),
         records="",
         records_sha256="",
     )

@@ -101,13 +101,13 @@ def comparison(differences: Sequence[Difference], first: str, second: str) -> Ta
 
 def cell(estimate: Estimate, factor: float = 1.0, digits: int = 3) -> str:
     """Value, and its interval on a second line."""
-    value, interval = _parts(estimate, factor, digits, significant=False)
+    value, interval = cell_parts(estimate, factor, digits)
     return f"{value}\n{interval}" if interval else value
 
 
 def one_line(estimate: Estimate, factor: float = 1.0, digits: int = 3, significant: bool = False) -> str:
     """Value and interval on one line."""
-    return " ".join(part for part in _parts(estimate, factor, digits, significant) if part)
+    return " ".join(part for part in cell_parts(estimate, factor, digits, significant) if part)
 
 
 def number(value: float, digits: int, significant: bool = False) -> str:
@@ -119,7 +119,8 @@ def number(value: float, digits: int, significant: bool = False) -> str:
     return f"{value:.{digits}f}"
 
 
-def _parts(estimate: Estimate, factor: float, digits: int, significant: bool) -> tuple[str, str]:
+def cell_parts(estimate: Estimate, factor: float, digits: int, significant: bool = False) -> tuple[str, str]:
+    """Value and interval, or value and why there is none; "-" alone where there is no value."""
     if not math.isfinite(estimate.value):
         return "-", ""
     value = number(factor * estimate.value, digits, significant)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,14 +13,14 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from phibench.estimator.bench.document import Worst
-from phibench.estimator.bench.pair_set import PairSet
+from phibench.estimator.seat.pair import Pair
 from phibench.scenes.frames import Array
 
 CROP_PX = 48
 COUNT = 10
 
 
-def worst(records: pl.DataFrame, pairs: PairSet, count: int = COUNT) -> list[Worst]:
+def worst(records: pl.DataFrame, draw: Callable[[int], Pair], count: int = COUNT) -> list[Worst]:
     """Worst images first: wrong positions by distance, then no position, then detected spots by distance.
 
     Only visible spots, and one image of a sample: ten draws of one spot would show one thing ten times.
@@ -31,7 +32,7 @@ def worst(records: pl.DataFrame, pairs: PairSet, count: int = COUNT) -> list[Wor
         .sort("rank", "distance_px", "number", descending=[True, True, False], nulls_last=True)
         .unique("sample_id", keep="first", maintain_order=True)
     )
-    return [_entry(row, pairs) for row in order.head(count).iter_rows(named=True)]
+    return [_entry(row, draw) for row in order.head(count).iter_rows(named=True)]
 
 
 def crop(image: NDArray[Any], uv_px: Array, side_px: int = CROP_PX) -> tuple[NDArray[np.uint8], tuple[int, int]]:
@@ -49,9 +50,9 @@ def crop(image: NDArray[Any], uv_px: Array, side_px: int = CROP_PX) -> tuple[NDA
     return np.round(255.0 * (part - low) / max(high - low, 1e-9)).astype(np.uint8), (u0, v0)
 
 
-def _entry(row: dict[str, Any], pairs: PairSet) -> Worst:
+def _entry(row: dict[str, Any], draw: Callable[[int], Pair]) -> Worst:
     true = np.array([row["u_true_px"], row["v_true_px"]])
-    pixels, origin = crop(getattr(pairs.pair(row["number"]), row["image"]), true)
+    pixels, origin = crop(getattr(draw(row["number"]), row["image"]), true)
     answer = None if row["u_px"] is None else (row["u_px"] - origin[0], row["v_px"] - origin[1])
     return Worst(
         **{
