@@ -58,6 +58,7 @@ class StratumScore(Document):
     label: str
     low: float | None
     high: float | None
+    mean: float | None = Field(description="of what the stratum is by, over its images")
     images: int
     pairs: int
     metrics: dict[str, Value]

@@ -13,7 +13,9 @@ import matplotlib as mpl
 import numpy as np
 import polars as pl
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from scipy.stats import norm
 
 from phibench.estimator.bench.document import ScoreDocument, StratumScore, Value
@@ -61,6 +63,7 @@ def error_curves(scores: Named) -> Picture:
                 _curves(axes, scores, stratum, metric, factor)
                 _bound(axes, scores, stratum, bound, factor)
                 axes.set(xlabel=unit, ylabel=label, yscale="log", xscale="log" if stratum == "signal" else "linear")
+                _plain_ticks(axes)
         _legend(figure, grid[0][0])
         return _svg(figure, _curves_in_words(scores))
 
@@ -72,16 +75,15 @@ def error_map(tables: Tables) -> Picture:
         lines = math.ceil(len(tables) / columns)
         figure = Figure(figsize=(3.6 * columns + 1.0, 2.6 * lines + 0.4), layout="constrained", dpi=130)
         grid = figure.subplots(lines, columns, squeeze=False)
-        marks = None
-        for axes, (name, table) in zip(grid.flat, tables.items(), strict=False):
-            marks = _map(axes, name, table) or marks
+        scale = _scale(tables)
+        marks = [_map(axes, *item, scale) for axes, item in zip(grid.flat, tables.items(), strict=False)]
         for axes in list(grid.flat)[len(tables) :]:
             axes.remove()
-        if marks is not None:
-            figure.colorbar(marks, ax=list(grid.flat)[: len(tables)], label="distance / px")
+        bar = figure.colorbar(marks[0], ax=list(grid.flat)[: len(tables)], label="distance / px")
+        _plain_ticks(bar.ax)
         return _png(
             figure,
-            f"Maps of the image for {_names(tables)}: detected spots as discs, larger and brighter for "
+            f"Maps of the image for {_names(tables)}: detected spots as discs, larger and darker for "
             "larger errors; images without a right position as crosses.",
         )
 
@@ -97,6 +99,7 @@ def error_by_radius(tables: Tables) -> Picture:
                 axes.plot(radius, rms, label=name, **_line(i))
             axes.set(xlabel="distance from the image of the sphere centre / px", yscale="log")
             axes.set_ylabel(f"rms {label} error / px")
+            _plain_ticks(axes)
         _legend(figure, pair[0])
         return _svg(
             figure,
@@ -156,7 +159,7 @@ def pull_histogram(tables: Tables) -> Picture | None:
 
 def _curves(axes: Axes, scores: Named, by: str, metric: str, factor: float) -> None:
     for i, (name, score) in enumerate(scores.items()):
-        parts = [(_middle(part), part.metrics[metric]) for part in _strata(score, by) if metric in part.metrics]
+        parts = [(x, part.metrics[metric]) for x, part in _strata(score, by) if metric in part.metrics]
         shown = [(x * 1.02 ** (i - len(scores) / 2), value) for x, value in parts if (value.value or 0.0) > 0.0]
         if not shown:
             continue
@@ -175,41 +178,33 @@ def _bars(values: Sequence[Value], factor: float) -> Array:
 def _bound(axes: Axes, scores: Named, by: str, metric: str, factor: float) -> None:
     """The bound over the images that the first method with one has found."""
     for score in scores.values():
-        parts = [(_middle(part), part.metrics[metric].value) for part in _strata(score, by) if metric in part.metrics]
+        parts = [(x, part.metrics[metric].value) for x, part in _strata(score, by) if metric in part.metrics]
         shown = [(x, factor * value) for x, value in parts if value]
         if shown:
             axes.plot(*zip(*shown, strict=True), color="black", linewidth=2.0, linestyle=(0, (1, 1)), label="bound")
             return
 
 
-def _strata(score: ScoreDocument, by: str) -> list[StratumScore]:
-    parts = [part for part in score.strata if part.by == by]
-    return parts or [part for part in score.strata[:1] if by == "depth"]
+def _strata(score: ScoreDocument, by: str) -> list[tuple[float, StratumScore]]:
+    """Strata with the mean of what they are by."""
+    return [(part.mean, part) for part in score.strata if part.by == by and part.mean is not None]
 
 
-def _middle(part: StratumScore) -> float:
-    """Where a stratum is drawn: its middle; an open one half as far above its edge; geometric for signals."""
-    low, high = part.low or 0.0, part.high
-    if part.by == "signal":
-        return math.sqrt(max(low, 100.0) * (3.0 * low if high is None else high))
-    return 1.25 * low if high is None else 0.5 * (low + high)
+def _scale(tables: Tables) -> LogNorm:
+    """One scale of distances for all maps, a hundredth of the largest at least."""
+    largest = max(
+        float(table.filter("detected")["distance_px"].to_numpy().max(initial=0.0)) for table in tables.values()
+    )
+    return LogNorm(0.01 * max(largest, 1e-9), max(largest, 1e-9), clip=True)
 
 
-def _map(axes: Axes, name: str, table: pl.DataFrame) -> Any:
+def _map(axes: Axes, name: str, table: pl.DataFrame, scale: LogNorm) -> Any:
     seen = table.filter(pl.col("visible"))
     found, lost = seen.filter(pl.col("detected")), seen.filter(~pl.col("detected"))
-    marks = None
-    if len(found):
-        distance = found["distance_px"].to_numpy()
-        marks = axes.scatter(
-            found["u_true_px"],
-            found["v_true_px"],
-            s=4.0 + 20.0 * distance,
-            c=distance,
-            cmap="cividis",
-            vmin=0.0,
-            linewidths=0,
-        )
+    distance = found["distance_px"].to_numpy()
+    size = 3.0 + 24.0 * np.asarray(scale(distance))
+    u, v = found["u_true_px"], found["v_true_px"]
+    marks = axes.scatter(u, v, s=size, c=distance, cmap="cividis_r", norm=scale, linewidths=0.3, edgecolors="black")
     axes.scatter(lost["u_true_px"], lost["v_true_px"], s=18.0, marker="x", color="#d55e00", linewidths=0.9)
     axes.set(title=f"{name}\n{len(found)} found, {len(lost)} not", xlabel="u / px", ylabel="v / px", aspect="equal")
     axes.invert_yaxis()
@@ -240,6 +235,15 @@ def _line(i: int) -> dict[str, Any]:
         "linestyle": _LINES[i % len(_LINES)],
         "marker": _MARKERS[i % len(_MARKERS)],
     }
+
+
+def _plain_ticks(axes: Axes) -> None:
+    """Decimal numbers at 1, 2, 5 of a logarithmic axis, instead of powers that run into each other."""
+    for axis in (axes.xaxis, axes.yaxis):
+        if axis.get_scale() == "log":
+            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
+            axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+            axis.set_minor_formatter(NullFormatter())
 
 
 def _legend(figure: Figure, axes: Axes) -> None:

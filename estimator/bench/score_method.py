@@ -105,6 +105,7 @@ def _stratum(stratum: Stratum, rules: Rules, seed: int) -> StratumScore:
         label=stratum.label,
         low=finite(stratum.low),
         high=finite(stratum.high),
+        mean=finite(stratum.mean),
         images=len(stratum.images),
         pairs=count_pairs(stratum),
         metrics={name: Value.of(value) for name, value in values.items()},

@@ -40,6 +40,8 @@ class Stratum:
     label : str
     low, high : float or None
         Edges, low <= x < high; None where the stratum is a value; high may be infinite.
+    mean : float or None
+        Mean of x over the images.
     images : records of images
     pairs : records from which pairs are taken; None where pairs do not belong to it
     """
@@ -48,6 +50,7 @@ class Stratum:
     label: str
     low: float | None
     high: float | None
+    mean: float | None
     images: pl.DataFrame
     pairs: pl.DataFrame | None
 
@@ -55,7 +58,7 @@ class Stratum:
 def strata(records: pl.DataFrame) -> Iterator[Stratum]:
     """The whole, then all strata that hold some of the images, but not all."""
     table = prepared(records).with_columns(azimuth_deg=pl.col("azimuth_rad").degrees())
-    yield Stratum("all", "all", None, None, table, table)
+    yield Stratum("all", "all", None, None, None, table, table)
     for by in _EDGES:
         yield from _by_edges(by, table)
     for by, column in _VALUES.items():
@@ -63,7 +66,7 @@ def strata(records: pl.DataFrame) -> Iterator[Stratum]:
             part = table.filter(pl.col(column) == value)
             if len(part) == len(table):
                 continue  # the whole again
-            yield Stratum(by, str(value), None, None, part, None if by in _OF_IMAGES else part)
+            yield Stratum(by, str(value), None, None, None, part, None if by in _OF_IMAGES else part)
 
 
 def measured(stratum: Stratum, rules: Rules, *stream: Name) -> dict[str, Measured]:
@@ -89,9 +92,9 @@ def _by_edges(by: str, table: pl.DataFrame) -> Iterator[Stratum]:
     for low, high in pairwise(edges):
         images = table.filter(_within(column, low, high, edges[-1]))
         if 0 < len(images) < len(table):
-            yield Stratum(
-                by, _label(low, high, unit), low, high, images, _pairs(by, table, images, low, high, edges[-1])
-            )
+            pairs = _pairs(by, table, images, low, high, edges[-1])
+            mean = float(images[column].cast(pl.Float64).to_numpy().mean())
+            yield Stratum(by, _label(low, high, unit), low, high, mean, images, pairs)
 
 
 def _pairs(by: str, table: pl.DataFrame, images: pl.DataFrame, low: float, high: float, last: float) -> pl.DataFrame:
