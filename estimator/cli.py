@@ -6,25 +6,17 @@ Every command imports what it needs itself, so that ``--help`` is quick and scor
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 from cyclopts import App, CycloptsError
 
 from phibench.estimator import cli_methods
 from phibench.estimator.cli_bench import bench
 from phibench.estimator.cli_dataset import dataset
+from phibench.estimator.cli_score import compare, report, score
 from phibench.estimator.cli_sealed import register as register_sealed
-
-if TYPE_CHECKING:
-    from phibench.estimator.score import Score
-
-_TABLE_WIDTH = 200
-
 
 app = App(
     name="phibench",
@@ -34,36 +26,11 @@ app = App(
 )
 app.command(dataset)
 cli_methods.register(app)
+app.command(score)
+app.command(compare)
+app.command(report)
 app.command(bench)
 register_sealed(app, dataset)
-
-
-@app.command
-def score(directory: Path, *, out: Path | None = None) -> int:
-    """Score every estimator on a data set and print the paper's tables beside ours.
-
-    Parameters
-    ----------
-    directory
-        Folder of a data set.
-    out
-        JSON file for all scores.
-    """
-    from rich.console import Console
-
-    from phibench.datasets.read import open_finished
-    from phibench.estimator.score import bias_table, table
-    from phibench.estimator.score import score as score_dataset
-
-    scores = score_dataset(open_finished(directory))
-    # a table cut off at the width of a pipe or of a narrow terminal would lose numbers
-    console = Console()
-    console = console if console.width >= _TABLE_WIDTH else Console(width=_TABLE_WIDTH)
-    for grid in (table(scores, "truth"), table(scores, "frame"), bias_table(scores)):
-        console.print(grid)
-    if out is not None:
-        _write_scores(out, directory, scores)
-    return 0
 
 
 @app.command
@@ -105,21 +72,6 @@ def _sentence(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror and type(error).__module__ == "builtins":
         return f"{error.strerror}: {error.filename}" if error.filename else str(error.strerror)
     return str(error)
-
-
-def _write_scores(out: Path, directory: Path, scores: Sequence[Score]) -> None:
-    from phibench.datasets.files import write_text
-    from phibench.datasets.provenance import provenance
-    from phibench.estimator.score import as_records, summarise
-
-    document = {
-        "dataset": str(directory),
-        "provenance": provenance(),
-        "unit": "metre; relative errors are fractions of the true depth; null where there is no estimate",
-        "summary": as_records(summarise(scores)),
-        "scores": as_records(scores),
-    }
-    write_text(out, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
 if __name__ == "__main__":

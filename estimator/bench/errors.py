@@ -1,0 +1,92 @@
+"""Errors of answers, as arrays: position, phi, depth, and what the claimed covariance and the bound say of them.
+
+Kernels over n answers that share a believed and a true rig. NaN where there is nothing to compare. Pixels as
+everywhere: integer (u, v) at pixel centres. Phi does not depend on the carriage, so that rigs are taken at the down
+position.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from phibench.estimator.phi import CONVENTIONS, estimate_phi, outline_circle
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import Rig
+
+
+@dataclass(frozen=True)
+class PixelErrors:
+    """Errors of n positions, pixels, shape (n,).
+
+    Attributes
+    ----------
+    du_px, dv_px : answer - truth
+    radial_px, tangential_px
+        The same along and across the direction from the image of the sphere centre to the true position; radial
+        errors, outwards above 0, make errors of phi and D, tangential ones (u towards v above 0) only turn the azimuth.
+    """
+
+    du_px: Array
+    dv_px: Array
+    radial_px: Array
+    tangential_px: Array
+
+    @property
+    def distance_px(self) -> Array:
+        """Distance of the answer from the truth."""
+        return np.hypot(self.du_px, self.dv_px)
+
+
+def pixel_errors(true_rig: Rig, true_px: Array, answer_px: Array) -> PixelErrors:
+    """Errors of positions, shape (n, 2) both."""
+    error = np.asarray(answer_px, float) - true_px
+    outward = true_px - outline_circle(true_rig)[0]
+    with np.errstate(invalid="ignore"):  # at the centre itself there is no direction
+        a = outward / np.linalg.norm(outward, axis=-1, keepdims=True)
+    radial = error[:, 0] * a[:, 0] + error[:, 1] * a[:, 1]
+    tangential = error[:, 1] * a[:, 0] - error[:, 0] * a[:, 1]
+    return PixelErrors(error[:, 0], error[:, 1], radial, tangential)
+
+
+def from_centre_px(rig: Rig, uv_px: Array) -> Array:
+    """Distance from the image of the sphere centre, shape (n,)."""
+    return np.asarray(np.linalg.norm(uv_px - outline_circle(rig)[0], axis=-1))
+
+
+def phi_of(convention: str, rig: Rig, uv_px: Array) -> Array:
+    """Phi at pixels, shape (n,), radians."""
+    return CONVENTIONS[convention](rig.at(0.0), uv_px)
+
+
+def phi_variance(rig: Rig, uv_px: Array, covariance_px2: Array, convention: str = "ray") -> Array:
+    """Variance of phi, shape (n,), rad^2: g C g^T; NaN for covariances, shape (n, 2, 2), that are NaN."""
+    return estimate_phi(convention, rig.at(0.0), uv_px, covariance_px2).variance_rad2
+
+
+def usable_covariance(covariance_px2: Array) -> Array:
+    """Covariances, shape (n, 2, 2), NaN where one is not symmetric and positive definite."""
+    C = np.asarray(covariance_px2, float)
+    with np.errstate(invalid="ignore"):
+        symmetric = np.isclose(C[:, 0, 1], C[:, 1, 0], rtol=1e-9, atol=0.0)
+        definite = (C[:, 0, 0] > 0.0) & (C[:, 0, 0] * C[:, 1, 1] - C[:, 0, 1] * C[:, 1, 0] > 0.0)
+        finite = np.isfinite(C).all(axis=(1, 2))
+    return np.where((symmetric & definite & finite)[:, None, None], C, np.nan)
+
+
+def whitened(error_px: Array, covariance_px2: Array) -> Array:
+    """L^-1 e, shape (n, 2), with C = L L^T (Cholesky, lower): independent with variance 1 if C is right.
+
+    Parameters
+    ----------
+    error_px : shape (n, 2)
+    covariance_px2 : shape (n, 2, 2), positive definite or NaN
+    """
+    C = covariance_px2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        l11 = np.sqrt(C[:, 0, 0])
+        l21 = C[:, 0, 1] / l11
+        l22 = np.sqrt(C[:, 1, 1] - l21**2)
+        first = error_px[:, 0] / l11
+        return np.stack([first, (error_px[:, 1] - l21 * first) / l22], axis=-1)

@@ -1,0 +1,226 @@
+"""`phibench score`, `compare`, `report`: methods on pairs, and the depth estimators on the paper's tables."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from phibench.estimator.cli_words import Whole
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from phibench.estimator.bench.document import MethodCard, ScoreDocument
+    from phibench.estimator.bench.pair_set import PairSet
+    from phibench.estimator.bench.score_method import Runner
+    from phibench.estimator.score import Score
+
+_TABLE_WIDTH = 200
+
+
+def score(
+    directory: Path,
+    *,
+    method: list[str] | None = None,
+    preset: str | None = None,
+    draws: Whole | None = None,
+    pairs: Whole | None = None,
+    seed: Whole = 0,
+    workers: Whole = 1,
+    out: Path | None = None,
+) -> int:
+    """Score methods on a data set's pairs; without --method, every depth estimator on the paper's tables.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    method
+        Method to score: the name of one that is built in, or FILE.py:FUNCTION. May be given several times.
+    preset
+        Preset of the sensor; by default those of the data set's recipe.
+    draws
+        Draws of the noise per sample; by default the recipe's.
+    pairs
+        Only so many pairs.
+    seed
+        Of the bootstrap that makes the intervals.
+    workers
+        Pairs that are worked on at a time.
+    out
+        JSON file for the score, records beside it as Parquet; with several methods their names are added to it.
+    """
+    if method:
+        return _score_methods(directory, method, preset, draws, pairs, seed, workers, out)
+    _refuse_without_method(preset=preset, draws=draws, pairs=pairs)
+    return _score_estimators(directory, out)
+
+
+def compare(first: Path, second: Path, *, seed: Whole = 0) -> int:
+    """Compare two scores of the same pairs, sample by sample.
+
+    Parameters
+    ----------
+    first, second
+        JSON files that `score --method --out` wrote, with their Parquet files beside them.
+    seed
+        Of the bootstrap that makes the intervals.
+    """
+    from phibench.estimator.bench.compare import compare as compare_scores
+    from phibench.estimator.bench.document import read_score
+    from phibench.estimator.bench.tables import comparison
+
+    differences = compare_scores(first, second, _seed(seed))
+    a, b = (_distinct(path, read_score(path)) for path in (first, second))
+    console = _console()
+    console.print(comparison(differences, a, b))
+    if all(item.better == "no difference shown" for item in differences):
+        console.print("No metric shows a difference: every interval holds 0.")
+    return 0
+
+
+def report(*files: Path, out: Path) -> int:
+    """Write one HTML page about scores: ranking, errors, causes, the worst images. It needs no network.
+
+    Parameters
+    ----------
+    files
+        JSON files that `score --method --out` wrote, with their Parquet files beside them.
+    out
+        HTML file to write.
+    """
+    from phibench.estimator.bench.report import write_report
+
+    print(write_report(files, out))
+    return 0
+
+
+def _score_methods(
+    directory: Path,
+    references: Sequence[str],
+    preset: str | None,
+    draws: int | None,
+    count: int | None,
+    seed: int,
+    workers: int,
+    out: Path | None,
+) -> int:
+    from phibench.datasets.read import open_finished
+    from phibench.estimator.bench.document import write_score
+    from phibench.estimator.bench.score_method import score_method
+    from phibench.estimator.bench.tables import cause_table, leaderboard, strata_table
+
+    files = _files(out, cards := [_card(reference) for reference in references])
+    _seed(seed)
+    limits = _part("phibench.estimator.seat.limits", "Limits")()
+    pair_set = _part("phibench.estimator.bench.dataset_pairs", "dataset_pairs")(
+        open_finished(directory), preset, draws, count
+    )
+    console, documents = _console(), []
+    for card, file in zip(cards, files, strict=True):
+        scored = score_method(card, pair_set, _runner(limits, workers), seed=seed, limits=asdict(limits))
+        documents.append(scored.document if file is None else write_score(file, scored.document, scored.records))
+    console.print(leaderboard(documents))
+    console.print(cause_table(documents))
+    for document in documents:
+        console.print(strata_table(document))
+    for file in filter(None, files):
+        console.print(f"written: {file}", soft_wrap=True)
+    return 0
+
+
+def _runner(limits: Any, workers: int) -> Runner:
+    run_method = _part("phibench.estimator.seat.run", "run_method")
+
+    def run(reference: str, pairs: PairSet) -> Any:
+        return run_method(reference, pairs, limits, workers)
+
+    return run
+
+
+def _card(reference: str) -> MethodCard:
+    from phibench.estimator.bench.document import MethodCard
+
+    return MethodCard.of(reference, **_part("phibench.estimator.seat.reference", "resolve")(reference).document())
+
+
+def _part(module: str, name: str) -> Callable[..., Any]:
+    """A part of the package by its name, so that this file can be read without all of them."""
+    return getattr(import_module(module), name)
+
+
+def _files(out: Path | None, cards: Sequence[MethodCard]) -> list[Path | None]:
+    """One file per method: `out` itself for one, with the method's name added for several."""
+    from phibench.datasets.errors import DatasetError
+
+    if out is None:
+        return [None] * len(cards)
+    if out.suffix != ".json":
+        raise DatasetError(f"--out {out}: a score is a JSON file; give a name that ends in .json")
+    if len(cards) == 1:
+        return [out]
+    names = ["".join(c if c.isalnum() or c in "-_." else "-" for c in card.name) for card in cards]
+    if len(set(names)) != len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise DatasetError(f"--method: two methods are called {twice}; score them in two runs with an --out for each")
+    return [out.with_name(f"{out.stem}-{name}.json") for name in names]
+
+
+def _refuse_without_method(**given: object) -> None:
+    from phibench.datasets.errors import DatasetError
+
+    if wrong := [name for name, value in given.items() if value is not None]:
+        raise DatasetError(f"--{wrong[0]} is for methods: give --method too, or leave --{wrong[0]} out")
+
+
+def _seed(seed: int) -> int:
+    from phibench.datasets.errors import DatasetError
+
+    if seed < 0:
+        raise DatasetError(f"--seed {seed}: must be 0 or above")
+    return seed
+
+
+def _distinct(path: Path, document: ScoreDocument) -> str:
+    return f"{document.method.name} ({path.name})"
+
+
+def _console() -> Console:
+    """A console as wide as the tables: cut off at the width of a pipe or a narrow terminal they would lose numbers."""
+    from rich.console import Console
+
+    console = Console()
+    return console if console.width >= _TABLE_WIDTH else Console(width=_TABLE_WIDTH)
+
+
+def _score_estimators(directory: Path, out: Path | None) -> int:
+    from phibench.datasets.read import open_finished
+    from phibench.estimator.score import bias_table, table
+    from phibench.estimator.score import score as score_dataset
+
+    scores = score_dataset(open_finished(directory))
+    console = _console()
+    for grid in (table(scores, "truth"), table(scores, "frame"), bias_table(scores)):
+        console.print(grid)
+    if out is not None:
+        _write_scores(out, directory, scores)
+    return 0
+
+
+def _write_scores(out: Path, directory: Path, scores: Sequence[Score]) -> None:
+    from phibench.datasets.files import write_text
+    from phibench.datasets.provenance import provenance
+    from phibench.estimator.score import as_records, summarise
+
+    document = {
+        "dataset": str(directory),
+        "provenance": provenance(),
+        "unit": "metre; relative errors are fractions of the true depth; null where there is no estimate",
+        "summary": as_records(summarise(scores)),
+        "scores": as_records(scores),
+    }
+    write_text(out, json.dumps(document, indent=1, allow_nan=False) + "\n")
