@@ -36,7 +36,7 @@ def _first_guess(view: View, point: Array) -> Array:
     centre = view.sphere_centre_m
     to_camera, to_point = (x / np.linalg.norm(x) for x in (view.camera_centre_m - centre, point - centre))
     normal = to_camera + to_point
-    surface = centre + view.rig.mirror.radius_m * normal / np.linalg.norm(normal)
+    surface = centre + view.rig.mirror.radius_m * normal / max(float(np.linalg.norm(normal)), 1e-12)
     return view.rig.camera.project(view.T_world_camera.inverse().points(surface))
 
 

@@ -1,0 +1,365 @@
+"""Built-in methods: what each is worth on easy pairs, what each refuses, and the parts that they are made of.
+
+`pytest -s -k accuracy_of_the_built_in` prints the table.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from phibench.datasets.sensor_card import SensorCard, sensor_card
+from phibench.estimator.methods import raw_maximum_likelihood as likelihood
+from phibench.estimator.methods.blur import spot_sigma_px
+from phibench.estimator.methods.built_in import BuiltIn
+from phibench.estimator.methods.linear import (
+    KINDS,
+    demosaiced,
+    kind_of,
+    linear_planes,
+    linear_to_srgb,
+    redness,
+    srgb_to_linear,
+)
+from phibench.estimator.methods.locate import locate
+from phibench.estimator.methods.red_peak import red_peak
+from phibench.estimator.methods.registry import KNOWN, METHODS
+from phibench.estimator.methods.sight import Sight
+from phibench.estimator.methods.window import around, clipped
+from phibench.estimator.seat.easy_pairs import EasyPairs
+from phibench.estimator.seat.pair import Answer, Box, Pair, Spot
+from phibench.render import isp
+from phibench.render.sensor import sensor
+from phibench.render.spot import spot_layer
+from phibench.scenes.laser import LaserSpot
+from phibench.scenes.rig import Rig
+from phibench.scenes.streams import generator
+
+COUNT = 6
+# median distance from the spot, px, that a method must keep on 12 easy spots: about twice what it has, and what each
+# is limited by: whole pixels; the mosaic (0.25 to 0.55 px on interpolated colours); the threshold; noise (bound 0.015)
+WORST_PX = {
+    "bayer-raw": {
+        "brightest_pixel": 1.1,
+        "red_centroid": 0.9,
+        "laplacian_blob": 0.9,
+        "windowed_centroid": 0.5,
+        "gaussian_least_squares": 0.6,
+        "off_difference": 0.9,
+        "raw_maximum_likelihood": 0.035,
+    },
+    "mono-raw": {
+        "brightest_pixel": 0.6,
+        "red_centroid": 0.1,
+        "laplacian_blob": 0.1,
+        "windowed_centroid": 0.025,
+        "gaussian_least_squares": 0.03,
+        "off_difference": 0.1,
+        "raw_maximum_likelihood": 0.025,
+    },
+    "srgb8": {
+        "brightest_pixel": 0.9,
+        "red_centroid": 0.9,
+        "laplacian_blob": 0.7,
+        "windowed_centroid": 0.35,
+        "gaussian_least_squares": 0.4,
+        "off_difference": 0.9,
+    },
+}
+
+
+@cache
+def easy(preset: str, number: int, laser_off: bool = True) -> Pair:
+    return EasyPairs(preset, laser_off=laser_off).pair(number)
+
+
+def errors(method: BuiltIn, preset: str, count: int) -> np.ndarray:
+    """Errors (u, v) of the spots that are found, shape (n, 2)."""
+    found = []
+    for number in range(count):
+        answer, truth = method(easy(preset, number)), EasyPairs(preset).truth(number)
+        for spot, true in ((answer.down, truth.down), (answer.up, truth.up)):
+            if spot.uv_px is not None:
+                found.append(np.subtract(spot.uv_px, true.uv_px))
+    return np.array(found).reshape(-1, 2)
+
+
+@pytest.mark.parametrize(("preset", "name"), [(p, n) for p, names in WORST_PX.items() for n in names])
+def test_accuracy_of_the_built_in_methods(preset: str, name: str) -> None:
+    count = 2 if preset == "srgb8" else COUNT  # pictures of 8 bits take their time
+    error = errors(METHODS[name], preset, count)
+    distance = np.linalg.norm(error, axis=1)
+    print(f"{preset}, {name}: median {np.median(distance):.3f} px, {len(error)} of {2 * count} spots")
+    assert len(error) >= 2 * count - 1
+    assert np.median(distance) < WORST_PX[preset][name]
+    # half a pixel off would be seen by all but the coarsest
+    if WORST_PX[preset][name] < 0.5:
+        assert np.median(np.linalg.norm(error + 0.5, axis=1)) > WORST_PX[preset][name]
+
+
+def test_every_built_in_method_has_its_row() -> None:
+    own = {name for name, method in KNOWN.items() if not method.package}
+    assert own == set(WORST_PX["bayer-raw"])
+    for name, method in KNOWN.items():
+        assert name == method.name
+        assert name.isidentifier()
+        assert set(method.accepts) <= set(KINDS)
+        assert method.description
+        assert method.source
+        assert "\n" not in method.description
+    assert set(METHODS) == {name for name, method in KNOWN.items() if method.installed}
+
+
+@pytest.mark.parametrize("name", [name for name, method in KNOWN.items() if method.package])
+def test_accuracy_of_the_optional_methods(name: str) -> None:
+    pytest.importorskip(KNOWN[name].package)
+    error = errors(KNOWN[name], "mono-raw", COUNT)
+    print(f"mono-raw, {name}: median {np.median(np.linalg.norm(error, axis=1)):.3f} px")
+    assert len(error) == 2 * COUNT
+    assert np.median(np.linalg.norm(error, axis=1)) < 0.1
+
+
+# -- refusals ---------------------------------------------------------------------------------------------------------
+
+
+def statuses(answer: Answer) -> set[str]:
+    return {answer.down.status, answer.up.status}
+
+
+def test_a_pair_that_cannot_be_taken_gets_a_status() -> None:
+    pair = replace(easy("bayer-raw", 0), down_off=None, up_off=None)
+    assert statuses(METHODS["off_difference"](pair)) == {"needs laser-off frames"}
+    eight_bit = replace(pair, card=sensor_card("srgb8"))
+    assert statuses(METHODS["raw_maximum_likelihood"](eight_bit)) == {"takes bayer-raw, mono-raw, not srgb8"}
+    choosy = BuiltIn("choosy", METHODS["red_centroid"], "x", "y", needs_boxes=True)
+    assert statuses(choosy(replace(pair, box_down=None, box_up=None))) == {"needs region hints"}
+    assert statuses(choosy(pair)) == {"ok"}
+    absent = BuiltIn("absent", METHODS["red_centroid"], "x", "y", package="no_such_package_here")
+    assert not absent.installed
+    assert statuses(absent(pair)) == {"install no_such_package_here"}
+
+
+@pytest.mark.parametrize("name", [name for name, method in METHODS.items() if not method.package])
+def test_dark_images_boxes_outside_and_noise_are_no_exceptions(name: str) -> None:
+    pair = easy("bayer-raw", 0)
+    black = np.full_like(pair.down, 64)
+    outside = Box(5000, 5000, 64, 64)
+    tiny = Box(400, 400, 2, 2)
+    for changed in (
+        replace(pair, down=black, up=black),
+        replace(pair, box_down=outside, box_up=tiny),
+        replace(pair, box_down=Box(-30, -30, 64, 64), box_up=Box(1260, 700, 64, 64)),  # cut by the image's corners
+        replace(pair, down=black, up=black, box_down=None, box_up=None),
+    ):
+        answer = METHODS[name](changed)
+        for spot in (answer.down, answer.up):
+            assert (spot.uv_px is None) == (spot.status != "ok")
+
+
+def test_row_noise_is_refused_by_the_likelihood() -> None:
+    pair = easy("bayer-raw", 0)
+    noisy = replace(pair, card=replace(pair.card, row_noise_e=1.0))
+    assert all("row_noise_e" in status for status in statuses(METHODS["raw_maximum_likelihood"](noisy)))
+
+
+def test_methods_leave_their_input_alone() -> None:
+    pair = easy("bayer-raw", 1)
+    before = {name: image.copy() for name, image in pair.images.items()}
+    for method in METHODS.values():
+        method(pair)
+    for name, image in pair.images.items():
+        np.testing.assert_array_equal(image, before[name])
+
+
+# -- locate -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("laser_off", [True, False])
+def test_locate_finds_easy_spots_without_a_hint(laser_off: bool) -> None:
+    for number in range(3):
+        pair, truth = easy("bayer-raw", number, laser_off), EasyPairs().truth(number)
+        for box, true in zip(locate(pair), (truth.down, truth.up), strict=True):
+            assert box is not None
+            assert abs(box.u0_px + box.width_px // 2 - true.uv_px[0]) < 2.0
+            assert abs(box.v0_px + box.height_px // 2 - true.uv_px[1]) < 2.0
+
+
+def test_locate_looks_inside_the_mirror_only_and_may_find_nothing() -> None:
+    pair, truth = easy("bayer-raw", 0, False), EasyPairs().truth(0)
+    decoy = pair.down.copy()
+    decoy[100:104:2, 100:104:2] = 1000  # red pixels far outside the outline, brighter than the spot
+    box, _ = locate(replace(pair, down=decoy))
+    assert box is not None
+    assert abs(box.u0_px + box.width_px // 2 - truth.down.uv_px[0]) < 2.0
+    inside = pair.down.copy()
+    inside[300:304:2, 640:644:2] = 1000  # the same inside it is taken: the outline is what made the difference
+    other, _ = locate(replace(pair, down=inside))
+    assert other is not None
+    assert abs(other.u0_px - box.u0_px) > 50
+    flat = np.full_like(pair.down, 300)
+    assert locate(replace(pair, down=flat, up=flat)) == (None, None)
+
+
+def test_methods_without_a_hint_give_what_they_give_with_one() -> None:
+    """The windows begin elsewhere, by whole pixels; a fit's noise is the same, so 1e-6 px is its stopping."""
+    pair = easy("bayer-raw", 2)
+    hinted, blind = (METHODS["raw_maximum_likelihood"](p) for p in (pair, replace(pair, box_down=None, box_up=None)))
+    for a, b in ((hinted.down, blind.down), (hinted.up, blind.up)):
+        assert a.uv_px is not None
+        assert b.uv_px is not None
+        np.testing.assert_allclose(a.uv_px, b.uv_px, rtol=0, atol=1e-6)
+
+
+def test_red_peak_of_nothing_is_none() -> None:
+    assert red_peak(np.zeros((9, 9))) is None
+    assert red_peak(np.full((9, 9), np.nan)) is None
+    spot = np.zeros((9, 11))
+    spot[4, 7] = 1.0
+    assert red_peak(spot) == (7.0, 4.0)
+    assert red_peak(spot, np.zeros((9, 11), bool)) is None
+    noise = generator("red peak").standard_normal((300, 300))
+    assert red_peak(noise, least_sigmas=8.0) is None  # chance of one above 8 sigma in 90 000: 6e-11
+
+
+# -- light ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("origin", [(0, 0), (1, 0), (0, 1), (1, 1)])
+def test_interpolation_is_the_cameras_inside_of_a_border(origin: tuple[int, int]) -> None:
+    raw = generator("demosaic").uniform(0.0, 1.0, (14, 16))
+    u0, v0 = origin
+    ours = demosaiced(raw[v0:, u0:], origin)
+    theirs = isp.demosaic(raw)[:, v0:, u0:]
+    np.testing.assert_allclose(ours[:, 1:-1, 1:-1], theirs[:, 1:-1, 1:-1], rtol=0, atol=1e-14)
+    if origin == (0, 0):
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-14)
+
+
+def test_linear_light_of_raw_and_of_8_bits_agree() -> None:
+    """A flat grey patch: rounding to 8 bits costs half a code, 1/510 in sRGB, whose slope is below 1.3 here."""
+    card, s = sensor_card("bayer-raw"), sensor("bayer-raw")
+    dn = np.full((8, 8), 300, np.uint16)
+    planes = linear_planes(dn, card)
+    image = isp.eight_bit(isp.srgb_encoded(isp.linear_rgb(isp.linear_signal(dn, s), s)))
+    eight = linear_planes(image, sensor_card("srgb8"))
+    np.testing.assert_allclose(eight[:, 4, 4], planes[:, 4, 4], rtol=0, atol=1.3 * 0.5 / 255.0 + 1e-9)
+    assert planes.shape == eight.shape == (3, 8, 8)
+    assert linear_planes(dn, sensor_card("mono-raw")).shape == (1, 8, 8)
+
+
+def test_srgb_curve_both_ways_and_against_the_cameras() -> None:
+    x = np.linspace(0.0, 1.0, 1001)
+    np.testing.assert_allclose(linear_to_srgb(x), isp.srgb_encoded(x), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(srgb_to_linear(linear_to_srgb(x)), x, rtol=0, atol=1e-7)  # the two knees' digits
+
+
+def test_redness_of_grey_is_nothing() -> None:
+    grey = np.full((3, 4, 4), 0.3)
+    assert np.abs(redness(grey)).max() == 0.0
+    assert redness(grey * np.array([2.0, 1.0, 0.5])[:, None, None]).min() == pytest.approx(0.3)
+    assert redness(grey[:1]).max() == 0.3
+
+
+def test_kinds_of_cards() -> None:
+    assert [kind_of(sensor_card(name)) for name in KINDS] == list(KINDS)
+    assert kind_of(sensor_card("ideal")) == "electrons"
+
+
+def test_windows_are_cut_at_the_border() -> None:
+    assert around((10.4, 20.6), (100, 200)) == Box(3, 14, 15, 15)
+    assert around((0.0, 99.0), (100, 200)) == Box(0, 92, 8, 8)
+    assert clipped(Box(500, 500, 9, 9), (100, 200)).width_px == 0
+
+
+# -- blur and background of the likelihood ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("focus_m", "f_number"), [(0.23, 2.4), (0.46, 2.4), (0.30, 5.0)])
+def test_predicted_blur_is_that_of_the_rendered_spot(focus_m: float, f_number: float) -> None:
+    """Second moments of the spot layer of a point-like spot, less the pixel's own 1/12, against the prediction.
+
+    2 %: the target is 2 m away and not far, which moves the virtual images by R / (2 s) = 1.5 % of a few millimetres.
+    """
+    rig = Rig()
+    rig = replace(rig, camera=replace(rig.camera, focus_distance_m=focus_m, f_number=f_number))
+    checked = 0
+    for place in ((2.0, 0.0, 0.5), (0.0, 3.0, 0.3), (-1.0, 1.0, 1.2)):
+        inward = tuple(-np.array([place[0], place[1], 0.0]) / math.hypot(place[0], place[1]))
+        layer = spot_layer(rig.at(0.2), LaserSpot(place, inward, 1e-5), ())
+        image = layer.electrons_per_s[0]
+        rows, columns = np.indices(image.shape)
+        mean = [float((k * image).sum() / image.sum()) for k in (columns, rows)]
+        spread = [float(((k - m) ** 2 * image).sum() / image.sum()) for k, m in zip((columns, rows), mean, strict=True)]
+        rms = math.sqrt(sum(spread) / 2.0 - 1.0 / 12.0)
+        uv = (layer.u0_px + mean[0], layer.v0_px + mean[1])
+        assert spot_sigma_px(rig, uv) == pytest.approx(rms, rel=0.02)
+        assert rms > 1.01 * rig.camera.blur_sigma_px  # there is defocus to predict
+        checked += 1
+    assert checked == 3
+    assert math.isnan(spot_sigma_px(rig, (5.0, 5.0)))
+
+
+def striped(pair: Pair, truth_uv: tuple[float, float], contrast_e: float) -> Pair:
+    """Pair with stripes, drawn with their own noise, in both down frames."""
+    card: SensorCard = pair.card
+    stripes = contrast_e * (np.arange(pair.down.shape[1]) // 3 % 2) * card.dn_per_e
+    rng = generator("stripes", pair.number)
+    noise = (card.dn_per_e * np.sqrt(stripes / card.dn_per_e) * rng.standard_normal(pair.down.shape) for _ in range(2))
+    assert pair.down_off is not None
+    down, off = (
+        np.clip(np.rint(image + stripes + drawn), 0, card.top_dn).astype(np.uint16)
+        for image, drawn in zip((pair.down, pair.down_off), noise, strict=True)
+    )
+    return replace(pair, down=down, down_off=off)
+
+
+def test_the_off_frame_is_the_background_only_where_the_room_has_structure() -> None:
+    """Stripes of 400 e-, 3 px wide, behind the spot: levels cannot follow them, the off frame does.
+
+    Without stripes the off frame would only add its noise: sqrt(2) of the background's, so it is not taken.
+    """
+    plain, better = 0, 0
+    for number in range(COUNT):
+        pair, truth = easy("bayer-raw", number), EasyPairs().truth(number)
+        lined = striped(pair, truth.down.uv_px, 400.0)
+        for image, expected in ((pair, False), (lined, True)):
+            assert image.box_down is not None
+            near = Sight(image, "down", image.box_down).narrowed()
+            assert near is not None
+            noise = likelihood.noise_of(image.card)
+            assert (likelihood._background(near, noise).electrons is not None) == expected
+            plain += 1
+        known = METHODS["raw_maximum_likelihood"](lined).down
+        blind = METHODS["raw_maximum_likelihood"](replace(lined, down_off=None, up_off=None)).down
+        assert known.uv_px is not None
+        error = np.linalg.norm(np.subtract(known.uv_px, truth.down.uv_px))
+        assert error < 0.1
+        better += blind.uv_px is None or error < np.linalg.norm(np.subtract(blind.uv_px, truth.down.uv_px))
+    assert plain == 2 * COUNT
+    assert better >= COUNT - 1
+
+
+def test_pulls_of_the_likelihood() -> None:
+    """96 numbers of deviation 1: their rms is 1 +- 0.072, within 0.75 and 1.3 but for 1 in 1000 or less.
+
+    Twice the noise without the covariance knowing would give 1.4 and more.
+    """
+    pulls = []
+    for number in range(24):
+        pair, truth = easy("bayer-raw", number, False), EasyPairs().truth(number)
+        answer = METHODS["raw_maximum_likelihood"](pair)
+        for spot, true in ((answer.down, truth.down), (answer.up, truth.up)):
+            assert spot.covariance_px2 is not None
+            pulls.append(np.subtract(spot.uv_px, true.uv_px) / np.sqrt(np.diag(spot.covariance_px2)))
+    rms = float(np.sqrt(np.mean(np.square(pulls))))
+    print(f"pull of raw_maximum_likelihood on easy Bayer pairs: {rms:.3f} +- {1.0 / math.sqrt(2 * 96):.3f}")
+    assert len(pulls) == 48
+    assert 0.75 < rms < 1.3
+
+
+def test_spot_missing_has_no_position() -> None:
+    assert Spot.missing("why") == Spot(None, status="why")
