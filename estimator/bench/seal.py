@@ -41,6 +41,7 @@ from phibench.estimator.seat.pair import Box, Pair
 
 _FILE_TIME_S = 315532800  # 1980-01-01: a file's own time would tell the order of the work
 _SALT_BYTES = 32
+_SEED_BITS = 56
 
 
 @dataclass(frozen=True)
@@ -86,13 +87,18 @@ def seal(folder: str | Path, public: str | Path, preset: str | None = None, cons
 
 
 def seed_warnings(name: str, seed: int) -> tuple[str, ...]:
-    """Sentence about a seed that everybody knows; none if it is not the shipped recipe's."""
-    if not (RECIPES / f"{name}.toml").is_file() or load_recipe(name).dataset.seed != seed:
-        return ()
-    return (
-        f"seed {seed} is that of the shipped recipe '{name}': whoever has phibench can render the same truth, so seal "
-        "a set that was made with --seed and a secret number",
-    )
+    """Sentences about a seed that everybody knows or can find; none about a good one."""
+    if (RECIPES / f"{name}.toml").is_file() and load_recipe(name).dataset.seed == seed:
+        return (
+            f"seed {seed} is that of the shipped recipe '{name}': whoever has phibench can render the same truth, so "
+            "seal a set that was made with --seed and a secret number",
+        )
+    if seed < 2**_SEED_BITS:
+        return (
+            f"seed {seed} is short: the rigs in {PAIRS} show which seed they were drawn from to whoever tries all, so "
+            f"seal a set that was made with a random --seed above 2^{_SEED_BITS}",
+        )
+    return ()
 
 
 def _seal(pairs: DatasetPairs, folder: Path, work: Path, public: Path, console: Console) -> Sealed:
