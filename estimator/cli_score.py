@@ -134,7 +134,7 @@ def _score_methods(
 
 
 def _runner(limits: Any, workers: int) -> Runner:
-    run_method = _part("phibench.estimator.seat.run", "run_method")
+    run_method = _part("phibench.estimator.seat.harness", "run_method")
 
     def run(reference: str, pairs: PairSet) -> Any:
         return run_method(reference, pairs, limits, workers)
@@ -145,7 +145,7 @@ def _runner(limits: Any, workers: int) -> Runner:
 def _card(reference: str) -> MethodCard:
     from phibench.estimator.bench.document import MethodCard
 
-    return MethodCard.of(reference, **_part("phibench.estimator.seat.reference", "resolve")(reference).document())
+    return MethodCard.of(reference, **_part("phibench.estimator.seat.resolve", "resolve")(reference).document())
 
 
 def _part(module: str, name: str) -> Callable[..., Any]:

@@ -47,6 +47,7 @@ EDGE_BLURS = 3.0
 GOOD_RAW_PX = 1.0
 LEAST_CODES = 1.0
 LEAST_CONTRAST = 3.0
+_RING = (4, 8)
 KINDS = ("unseen", "missed", "false")
 _PIXEL_SIGMA2 = 1.0 / 12.0
 _OF_THE_MIRROR = ("no_reflection", "mirror_edge")
@@ -78,16 +79,16 @@ class Case:
         """Images."""
         return self.draw(self.truth.number)
 
-    @property
-    def image(self) -> Array:
-        """The image, shape (H, W, planes), codes."""
-        return _planes(getattr(self.pair, self.position))
+    def region(self, uv_px: Array, before: int, after: int, less_off: bool = False) -> Array:
+        """Codes of the pixels from `before` to `after` around one, inclusive, shape (h, w, planes).
 
-    @property
-    def signal(self) -> Array:
-        """The image, less the laser-off image if there is one."""
+        Empty outside the image; less the laser-off image if that is asked for and there is one.
+        """
+        u, v = (int(x) for x in np.floor(uv_px))
+        rows, columns = (slice(max(x - before, 0), max(x + after + 1, 0)) for x in (v, u))
+        part = _planes(getattr(self.pair, self.position)[rows, columns])
         off = getattr(self.pair, f"{self.position}_off")
-        return self.image if off is None else self.image - _planes(off)
+        return part - _planes(off[rows, columns]) if less_off and off is not None else part
 
 
 def cause_of(case: Case) -> str:
@@ -186,7 +187,7 @@ def _confused(case: Case) -> bool:
     others = (np.array(other.uv_px) for other in case.spot.distractions)
     if any(np.linalg.norm(case.answer_px - other) <= case.rules.match_px for other in others):
         return True
-    return _level(case.signal, case.answer_px) > _level(case.signal, np.array(case.spot.uv_px))
+    return _level(case, case.answer_px) > _level(case, np.array(case.spot.uv_px))
 
 
 def _below_noise(case: Case) -> bool:
@@ -197,7 +198,7 @@ def _compression(case: Case) -> bool:
     raw = case.spot.raw_bound_px2
     if raw is None or not np.sqrt(np.trace(raw) / 2.0) < GOOD_RAW_PX or case.pair.card.output not in ("srgb8", "mjpeg"):
         return False
-    return not _stands_out(case.image, np.array(case.spot.uv_px))
+    return not _stands_out(case)
 
 
 _RULES: dict[str, Callable[[Case], bool]] = {
@@ -221,18 +222,20 @@ def _planes(image: Any) -> Array:
     return planes[..., None] if planes.ndim == 2 else planes
 
 
-def _level(planes: Array, uv_px: Array) -> float:
+def _level(case: Case, uv_px: Array) -> float:
     """Mean of the 4 x 4 pixels around a position, all planes added; -inf outside the image."""
-    u, v = np.floor(uv_px).astype(int)
-    part = planes[max(v - 1, 0) : max(v + 3, 0), max(u - 1, 0) : max(u + 3, 0)]
+    part = case.region(uv_px, 1, 2, less_off=True)
     return float(part.sum(axis=-1).mean()) if part.size else -np.inf
 
 
-def _stands_out(planes: Array, uv_px: Array) -> bool:
-    u, v = np.floor(uv_px + 0.5).astype(int)
-    rows, columns = np.ogrid[: planes.shape[0], : planes.shape[1]]
-    distance = np.maximum(abs(rows - v), abs(columns - u))
-    spot, ring = planes[distance <= 1], planes[(distance >= 4) & (distance <= 8)]
+def _stands_out(case: Case) -> bool:
+    """Whether the 3 x 3 pixels of the spot rise above the ring around them in any colour; see rule 7."""
+    middle = np.floor(np.array(case.spot.uv_px) + 0.5)
+    around = case.region(middle, _RING[1], _RING[1])
+    inside = np.minimum(middle, _RING[1]).astype(int)  # of the pixel in the region: less where the image begins
+    rows, columns = np.ogrid[: around.shape[0], : around.shape[1]]
+    distance = np.maximum(abs(rows - inside[1]), abs(columns - inside[0]))
+    spot, ring = around[distance <= 1], around[distance >= _RING[0]]
     level = np.median(ring, axis=0)
     error = 1.4826 * np.median(abs(ring - level), axis=0) / 3.0
     contrast = spot.mean(axis=0) - level

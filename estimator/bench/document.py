@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import polars as pl
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.files import sha256, write_bytes, write_text
@@ -68,7 +68,7 @@ class MethodCard(Document):
     """Which method: the reference it was called by, where it is, the hash of its code (null if it cannot be told)."""
 
     reference: str
-    name: str
+    name: str = Field(default="", description="by default what follows the last slash of the reference")
     kind: str = ""
     place: str = ""
     function: str = ""
@@ -77,8 +77,14 @@ class MethodCard(Document):
 
     @classmethod
     def of(cls, reference: str, **fields: str | None) -> MethodCard:
-        """Of a reference; its name is what follows the last slash, unless it is given."""
-        return cls.model_validate({"name": reference.rsplit("/", 1)[-1], **fields, "reference": reference})
+        """Of a reference and what is known of it."""
+        return cls.model_validate({**fields, "reference": reference})
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name(cls, fields: Any) -> Any:
+        known = isinstance(fields, dict) and fields.get("reference") and not fields.get("name")
+        return {**fields, "name": fields["reference"].rsplit("/", 1)[-1]} if known else fields
 
 
 class Worst(Document):

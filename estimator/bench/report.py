@@ -16,7 +16,7 @@ from phibench.estimator.bench import figures
 from phibench.estimator.bench.compare import same_pairs
 from phibench.estimator.bench.document import ScoreDocument, read_records, read_score
 from phibench.estimator.bench.figures import Picture
-from phibench.estimator.bench.tables import BOARD, cell_parts, ranked
+from phibench.estimator.bench.tables import BOARD, cell_parts, rank_key
 
 _TEMPLATE = "report.html.j2"
 _STRATA = ("detection_rate", "false_rate", "rms_px", "median_px", "p95_px", "rms_phi_rad", "rms_depth_relative")
@@ -96,13 +96,12 @@ def _groups(scores: Sequence[tuple[ScoreDocument, pl.DataFrame]]) -> list[list[t
 
 
 def _ranking(group: list[tuple[ScoreDocument, pl.DataFrame]]) -> Ranking:
-    order = ranked([document for document, _ in group])
-    names = dict(zip(map(id, order), _distinct([document.method.name for document in order]), strict=True))
-    scores = {names[id(document)]: document for document in order}
-    tables_by_id = {id(document): table for document, table in group}
-    tables = {names[id(document)]: tables_by_id[id(document)] for document in order}
+    order = sorted(group, key=lambda item: rank_key(item[0]))
+    names = _distinct([document.method.name for document, _ in order])
+    scores = {name: document for name, (document, _) in zip(names, order, strict=True)}
+    tables = {name: table for name, (_, table) in zip(names, order, strict=True)}
     return Ranking(
-        order[0].pair_set,
+        order[0][0].pair_set,
         scores,
         figures.error_curves(scores),
         figures.error_map(tables),

@@ -21,7 +21,7 @@ from phibench.estimator.bench.worst import worst
 from phibench.estimator.seat.outcome import Outcome
 
 Runner = Callable[[str, PairSet], Iterable[Outcome]]
-"""Method reference and pairs to outcomes: `estimator.seat.run.run_method` with its limits, or one in this process."""
+"""Method reference and pairs to outcomes: `seat.harness.run_method` with its limits, or one in this process."""
 
 
 @dataclass(frozen=True)

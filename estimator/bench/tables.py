@@ -28,13 +28,14 @@ BOARD: tuple[tuple[str, str, float, int], ...] = (
 
 
 def ranked(documents: Sequence[ScoreDocument]) -> list[ScoreDocument]:
-    """Best first, by the rms distance in which missed spots count."""
+    """Best first."""
+    return sorted(documents, key=rank_key)
 
-    def key(document: ScoreDocument) -> float:
-        value = document.overall["rms_counted_px"].value
-        return math.inf if value is None else value
 
-    return sorted(documents, key=key)
+def rank_key(document: ScoreDocument) -> float:
+    """What ranks go by: the rms distance in which missed spots count; lower is better."""
+    value = document.overall["rms_counted_px"].value
+    return math.inf if value is None else value
 
 
 def leaderboard(documents: Sequence[ScoreDocument]) -> Table:

@@ -1,0 +1,175 @@
+"""Causes: each rule, its threshold from both sides, and their order."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bench_cases import RIG, Cases, cases, change, constant, image_of, outcomes, silent, truth_itself
+
+from phibench.datasets.sensor_card import sensor_card
+from phibench.estimator.bench.causes import CAUSES, KINDS, Case, cause_of, count, count_failures, with_causes
+from phibench.estimator.bench.records import record_table
+from phibench.estimator.bench.rules import MATCH_PX, Rules
+from phibench.estimator.bench.truth import Distraction
+from phibench.estimator.seat.outcome import FAILURES, Outcome
+from phibench.estimator.seat.pair import Answer, Pair, Spot
+
+RULES = Rules()
+TRUTH = cases(20).truths[0]
+UV = np.array(TRUTH.down.uv_px)
+
+
+def pair_of(truth, image=None, off=None, output="mjpeg"):
+    shown = image_of(truth.down) if image is None else image
+    card = sensor_card(output)
+    return Pair(0, shown, shown, RIG, truth.stroke_m, card, down_off=off, up_off=off)
+
+
+def cause(truth=TRUTH, answer=None, failure="", image=None, off=None, output="mjpeg", **spot):
+    truth = change(truth, "down", **spot) if spot else truth
+    asked = pair_of(truth, image, off, output)
+    return cause_of(Case("down", truth, None if answer is None else np.array(answer), failure, lambda _: asked, RULES))
+
+
+@pytest.mark.parametrize(
+    ("why", "expected"),
+    [
+        ("occluded:table", "occluded"),
+        ("faces_away", "occluded"),
+        ("no_reflection", "mirror_edge"),
+        ("mirror_edge", "mirror_edge"),
+        ("outside_image", "image_edge"),
+    ],
+)
+def test_what_is_not_visible_has_the_scenes_cause(why, expected):
+    # whatever else holds
+    assert cause(visible=False, cause=why, saturated=True, snr=0.0, failure="crash") == expected
+
+
+def test_a_visible_spot_at_the_mirrors_outline_is_clipped():
+    """Three blurs of sqrt(0.7^2 + 1/12) = 0.757 px are 2.27 px."""
+    centre = np.array([RIG.camera.cx_px, RIG.camera.cy_px])
+    radius = np.linalg.norm(RIG.outline_px()[0] - centre)
+    assert cause(uv_px=tuple(centre + [radius - 2.2, 0.0])) == "mirror_edge"
+    assert cause(uv_px=tuple(centre + [radius - 2.4, 0.0])) == "method"
+
+
+def test_a_visible_spot_at_the_edge_of_the_image_is_clipped():
+    low = replace(TRUTH, true_rig=replace(RIG, camera=replace(RIG.camera, cy_px=30.0)))  # the mirror reaches beyond
+    assert cause(low, uv_px=(640.0, -0.5 + 2.2)) == "image_edge"
+    assert cause(low, uv_px=(640.0, -0.5 + 2.4)) == "method"
+    assert cause(low, uv_px=(640.0, 100.0)) == "method"
+
+
+def test_a_saturated_spot():
+    assert cause(saturated=True) == "saturated"
+    assert cause(saturated=True, answer=UV + 50.0, snr=1.0) == "saturated"
+
+
+def test_a_distraction_is_what_the_answer_lies_on():
+    other = UV + [40.0, 0.0]
+    lamp = (Distraction("lamp", tuple(other), 500.0),)
+    for off, expected in ((MATCH_PX - 0.01, "confused"), (MATCH_PX + 0.01, "method")):
+        assert cause(answer=other + [0.0, off], distractions=lamp) == expected
+    assert cause(distractions=lamp) == "method"  # no answer: nothing was taken for the spot
+
+
+def test_a_brighter_region_is_a_distraction():
+    image = image_of(TRUTH.down)
+    image[100:110, 300:310] = 250
+    assert cause(answer=(304.0, 104.0), image=image) == "confused"
+    image[100:110, 300:310] = 10
+    assert cause(answer=(304.0, 104.0), image=image) == "method"
+
+
+def test_with_a_laser_off_image_the_difference_counts():
+    lamp = np.zeros_like(image_of(TRUTH.down))
+    lamp[100:110, 300:310] = 250
+    image = image_of(TRUTH.down) + lamp
+    assert cause(answer=(304.0, 104.0), image=image, off=lamp) == "method"  # bright, but there without the laser
+    assert cause(answer=(304.0, 104.0), image=image, off=np.zeros_like(lamp)) == "confused"
+
+
+def test_an_answer_outside_the_image_is_no_region():
+    assert cause(answer=(-500.0, 90_000.0)) == "method"
+
+
+@pytest.mark.parametrize(("snr", "expected"), [(4.99, "below_noise"), (5.0, "method")])
+def test_below_five_sigma_is_noise(snr, expected):
+    assert cause(snr=snr) == expected
+
+
+def test_compression_is_a_good_raw_spot_that_the_image_does_not_show():
+    black = np.zeros_like(image_of(TRUTH.down))
+    good, bad = 0.9**2 * np.eye(2), 1.1**2 * np.eye(2)
+    assert cause(image=black, raw_bound_px2=good) == "compression"
+    assert cause(image=black, raw_bound_px2=bad) == "method"
+    assert cause(image=black, raw_bound_px2=None) == "method"
+    assert cause(raw_bound_px2=good) == "method"  # the image shows it
+    assert cause(image=black[..., 0], raw_bound_px2=good, output="bayer-raw") == "method"
+
+
+def test_compression_leaves_less_than_three_standard_errors():
+    """Noise of 6 codes in the ring: the mean of 9 pixels has a standard error of 2 codes; 3 of them are 6."""
+    rng = np.random.default_rng(1)
+    noise = np.clip(100 + 6 * rng.standard_normal((720, 1280, 3)), 0, 255)
+    u, v = (round(x) for x in UV)
+    for level, expected in ((3, "compression"), (12, "method")):
+        image = noise.copy()
+        image[v - 1 : v + 2, u - 1 : u + 2, 0] = 100 + level
+        image[v - 1 : v + 2, u - 1 : u + 2, 1:] = 100
+        assert cause(image=image.astype(np.uint8), raw_bound_px2=0.01 * np.eye(2)) == expected
+
+
+@pytest.mark.parametrize("failure", FAILURES)
+def test_the_harness_s_word_comes_after_the_light(failure):
+    assert cause(failure=failure) == failure
+    assert cause(failure=failure, snr=1.0) == "below_noise"
+
+
+def test_every_image_that_is_not_detected_has_one_cause():
+    """A mixed set: each pair made to fail in another way."""
+    truths = list(cases(20).truths)
+    truths[0] = change(truths[0], "down", visible=False, cause="occluded:table")
+    truths[1] = change(truths[1], "down", saturated=True)
+    truths[2] = change(truths[2], "down", snr=2.0)
+    answers = [Outcome(t.number, silent(t), 0.1) for t in truths]
+    answers[3] = Outcome(3, None, float("nan"), "timeout", "too slow")
+    answers[4] = Outcome(4, truth_itself(truths[4]), 0.1)
+    answers[5] = Outcome(5, constant(truths[5]), 0.1)
+    answers[0] = Outcome(0, Answer(Spot((600.0, 300.0)), Spot(truths[0].up.uv_px)), 0.1)
+    pairs = Cases(tuple(truths))
+    table = with_causes(record_table(truths, answers, RULES), dict(enumerate(truths)), pairs.pair, RULES)
+    assert table["cause"].is_null().to_list() == table["detected"].to_list() == table["kind"].is_null().to_list()
+    down = table.filter(image="down")
+    assert down["cause"].to_list()[:6] == ["occluded", "saturated", "below_noise", "timeout", None, "method"]
+    assert down["kind"].to_list()[:6] == ["false", "missed", "missed", "missed", None, "false"]
+    numbers = count(table)
+    assert list(numbers) == list(CAUSES)
+    assert sum(sum(kinds.values()) for kinds in numbers.values()) == int((~table["detected"]).sum())
+    assert numbers["timeout"] == {"unseen": 0, "missed": 2, "false": 0}
+    assert count_failures(table) == dict.fromkeys(FAILURES, 0) | {"timeout": 1}
+
+
+def test_a_hidden_spot_that_is_not_answered_is_no_fault():
+    truth = change(TRUTH, "down", visible=False, cause="occluded:table")
+    table = record_table([truth], [Outcome(0, silent(truth), 0.1)], RULES)
+    table = with_causes(table, {0: truth}, Cases((truth,)).pair, RULES)
+    assert table["kind"].to_list() == ["unseen", "missed"]
+    assert set(table["kind"]) <= set(KINDS)
+
+
+def test_images_are_drawn_only_where_a_rule_looks_at_them():
+    asked = []
+
+    def draw(number):
+        asked.append(number)
+        return pairs.pair(number)
+
+    pairs = cases(20)
+    truths = dict(enumerate(pairs.truths))
+    for oracle, times in ((truth_itself, 0), (constant, 20)):  # down and up of a pair are drawn together
+        with_causes(record_table(pairs.truths, outcomes(pairs, oracle), RULES), truths, draw, RULES)
+        assert len(asked) == times

@@ -1,0 +1,183 @@
+"""The report as a page: complete, self-contained, readable by a machine that reads aloud."""
+
+from __future__ import annotations
+
+import base64
+import io
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from bench_cases import Cases, cases, change, constant, outcomes, sampler, shifted, silent, truth_itself
+from PIL import Image
+
+from phibench.datasets.errors import DatasetError
+from phibench.estimator.bench.document import MethodCard
+from phibench.estimator.bench.figures import Picture, pull_histogram
+from phibench.estimator.bench.report import Section, report_html, write_report
+from phibench.estimator.bench.rules import Rules
+from phibench.estimator.bench.score_method import score_outcomes
+
+RULES = Rules(resamples=199)
+
+
+class Page(HTMLParser):
+    """Tags with their attributes, headings, and whether tags are closed in their order."""
+
+    VOID = ("meta", "img", "br", "image", "circle", "path", "link", "hr", "input")
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.open, self.text = [], [], ""
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+    def of(self, tag):
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+def mixed(t):
+    if t.number % 7 == 0:
+        return silent(t)
+    return constant(t) if t.number % 11 == 0 else sampler(seed=5)(t)
+
+
+def scored(name, oracle, pairs=None):
+    pairs = pairs or cases(40)
+    result = score_outcomes(MethodCard.of(name), pairs, outcomes(pairs, oracle), RULES)
+    return result.document, result.records
+
+
+@pytest.fixture(scope="module")
+def scores():
+    return [scored("ideal", sampler()), scored("mixed <b>&", mixed), scored("half", shifted(0.5))]
+
+
+@pytest.fixture(scope="module")
+def html(scores):
+    return report_html(scores)
+
+
+def test_the_page_fetches_nothing_and_runs_nothing(html):
+    page = Page(html)
+    assert page.of("script") == []
+    assert page.of("link") == []
+    for attribute in ("src", "href"):
+        places = [attributes[attribute] for _, attributes in page.tags if attribute in attributes]
+        assert places
+        assert all(place.startswith(("data:image/", "#")) for place in places)
+    assert "url(" not in html
+    assert "@import" not in html
+
+
+def test_pictures_have_words_and_tables_have_heads(html):
+    page = Page(html)
+    assert len(page.of("img")) == 5
+    assert all(len(attributes["alt"]) > 60 for attributes in page.of("img"))
+    assert all(attributes.get("role") == "img" and attributes.get("aria-label") for attributes in page.of("svg"))
+    assert len(page.of("svg")) == 30  # ten of each method
+    assert len(page.of("caption")) == len(page.of("table")) >= 5
+    assert all(attributes.get("scope") in ("row", "col") for attributes in page.of("th"))
+    assert page.of("html")[0]["lang"] == "en-GB"
+    ids = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
+    assert len(ids) == len(set(ids))
+    assert {a["href"][1:] for a in page.of("a")} <= set(ids)
+
+
+def test_names_are_text_not_markup(html):
+    assert "mixed <b>&amp;" not in html
+    assert "mixed &lt;b&gt;&amp;" in html
+
+
+def test_methods_are_in_the_order_of_their_ranks(html):
+    text = Page(html).text
+    assert text.index("ideal") < text.index("half") < text.index("mixed")
+
+
+def test_the_leaderboard_has_its_numbers(html, scores):
+    assert "0.5000" in html
+    rate = scores[1][0].overall["detection_rate"]
+    assert f"[{100 * rate.low:.1f}, {100 * rate.high:.1f}]" in html
+
+
+def test_pictures_are_pictures(html):
+    for attributes in Page(html).of("img"):
+        head, data = attributes["src"].split(",", 1)
+        raw = base64.b64decode(data)
+        if "svg" in head:
+            assert raw.startswith(b"<?xml")
+            assert b"</svg>" in raw
+        else:
+            assert np.ptp(np.asarray(Image.open(io.BytesIO(raw)).convert("L"))) > 100
+
+
+def test_the_same_scores_give_the_same_page(html, scores):
+    assert report_html(scores) == html
+
+
+# -- a page of what is unusual: two sets, a name twice, nothing found, no bound, hidden spots, a section ------------
+
+
+def hidden(n=12):
+    """Pairs without bounds whose spot is hidden in the second image."""
+    truths = [change(t, "down", bound_px2=None) for t in cases(n).truths]
+    return Cases(tuple(change(t, "up", visible=False, cause="occluded:table") for t in truths), name="others")
+
+
+@pytest.fixture(scope="module")
+def crowded(scores):
+    section = Section(
+        "Tilt of the camera",
+        ("Predicted and measured.",),
+        (Picture("data:image/png;base64,AAAA", "nothing"),),
+        ((("tilt", "error"), ("0.5 deg", "0.9 %")),),
+    )
+    first = [scores[0], scores[0], scored("constant", constant), scored("silent", silent)]
+    return report_html([*first, scored("truth", truth_itself, hidden())], [section])
+
+
+def test_other_pairs_make_another_ranking(crowded):
+    page = Page(crowded)
+    assert page.text.count("Pairs: ") == 2
+    ids = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
+    assert len(ids) == len(set(ids))
+
+
+def test_methods_of_one_name_are_told_apart(crowded):
+    assert "ideal (1)" in crowded
+    assert "ideal (2)" in crowded
+
+
+def test_without_a_covariance_there_is_no_histogram(scores, crowded):
+    assert pull_histogram({"half": scores[2][1]}) is None
+    assert crowded.count("No method claims a covariance.") == 1
+
+
+def test_rightly_unanswered_and_wrongly_answered_are_told_apart(crowded):
+    assert "0 / 12 / 0" in Page(crowded).text  # the truth's position of a hidden spot is a false detection
+
+
+def test_sections_follow(crowded):
+    page = Page(crowded)
+    assert "Tilt of the camera" in page.text
+    assert "0.9 %" in page.text
+    assert {"src": "data:image/png;base64,AAAA", "alt": "nothing"} in page.of("img")
+
+
+def test_a_report_of_nothing_is_refused(tmp_path):
+    with pytest.raises(DatasetError, match="no scores"):
+        write_report([], tmp_path / "page.html")

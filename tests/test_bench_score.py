@@ -1,0 +1,277 @@
+"""A score from outcomes to files, the commands, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import polars as pl
+import pytest
+from bench_cases import Cases, cases, change, constant, outcomes, sampler, shifted, silent, truth_itself
+
+from phibench.datasets.errors import DatasetError
+from phibench.estimator import cli, cli_score
+from phibench.estimator.bench.document import MethodCard, ScoreDocument, read_records, read_score, write_score
+from phibench.estimator.bench.metrics import METRICS
+from phibench.estimator.bench.rules import Rules
+from phibench.estimator.bench.score_method import score_method, score_outcomes
+from phibench.estimator.bench.strata import STRATA
+from phibench.estimator.bench.tables import leaderboard, number, ranked
+from phibench.estimator.bench.worst import crop
+from phibench.estimator.seat.outcome import Outcome
+
+RULES = Rules(resamples=199)
+
+
+def scored(oracle=None, pairs=None, name="mine", **options):
+    return score_method(MethodCard.of(name), pairs or cases(40), runner(oracle or sampler()), RULES, **options)
+
+
+def runner(oracle):
+    return lambda reference, pairs: outcomes(pairs, oracle)
+
+
+@pytest.fixture(scope="module")
+def mine():
+    return scored(limits={"seconds": 30.0})
+
+
+def test_a_score_says_where_it_comes_from(mine):
+    d = mine.document
+    assert (d.pairs, d.images, d.samples, d.seed) == (40, 80, 40, 0)
+    assert d.pair_set == cases(40).document()
+    assert d.rules == {"match_px": 3, "missed_relative": 1, "confidence": 0.95, "resamples": 199, "least_samples": 5}
+    assert d.limits == {"seconds": 30.0}
+    assert "numpy" in d.provenance["packages"]
+    assert len(d.code_sha256) == 64
+    assert set(d.metrics) == set(METRICS)
+    assert d.strata[0].by == "all"
+
+
+def test_a_score_and_its_records_are_read_back(mine, tmp_path):
+    path = tmp_path / "deep" / "mine.json"
+    written = write_score(path, mine.document, mine.records)
+    assert read_score(path) == written
+    assert written.records == "mine.parquet"
+    assert read_records(path, written).equals(mine.records)
+    assert "NaN" not in path.read_text()
+    assert sorted(file.name for file in path.parent.iterdir()) == ["mine.json", "mine.parquet"]
+
+
+def test_the_same_run_gives_the_same_bytes(mine):
+    again = scored(limits={"seconds": 30.0})
+    assert again.document.model_dump_json() == mine.document.model_dump_json()
+    other = scored(limits={"seconds": 30.0}, seed=1)
+    assert other.document.overall["rms_px"].value == mine.document.overall["rms_px"].value
+    assert other.document.overall["rms_px"].low != mine.document.overall["rms_px"].low
+
+
+def test_strata_part_the_whole(mine):
+    """Images of the strata of one kind add up to all; the whole's rms is that of its parts."""
+    by = {}
+    for stratum in mine.document.strata:
+        by.setdefault(stratum.by, []).append(stratum)
+    assert set(by) == set(STRATA) - {"preset"}  # one preset: that stratum is the whole again
+    whole = by["all"][0].metrics["rms_px"].value
+    for name in ("depth", "stroke", "signal", "azimuth", "image", "bayer", "quality"):
+        assert sum(stratum.images for stratum in by[name]) == 80, name
+        square = sum(s.metrics["rms_px"].value ** 2 * s.metrics["rms_px"].n for s in by[name]) / 80
+        assert math.sqrt(square) == pytest.approx(whole, rel=1e-12)
+        if name not in ("image", "bayer"):
+            assert sum(s.metrics["rms_depth_m"].n for s in by[name]) == 40, name
+            assert sum(stratum.pairs for stratum in by[name] if stratum.pairs) >= 40
+    assert "rms_depth_m" not in by["bayer"][0].metrics
+
+
+def test_a_stratum_holds_its_own_errors():
+    """Half a pixel off at quality 60 alone."""
+    half = shifted(0.5)
+    d = scored(lambda t: half(t) if t.jpeg_quality == 60 else truth_itself(t)).document
+    rms = {s.label: s.metrics["rms_px"].value for s in d.strata if s.by == "quality"}
+    assert rms == {"60": pytest.approx(0.5), "75": 0.0, "85": 0.0}
+
+
+def test_ranks_go_by_the_error_with_missed_spots():
+    """The one that answers only easy pairs has the smaller rms, and the lower rank."""
+    good, half = sampler(spread=0.5), shifted(0.2)
+    easy = scored(lambda t: good(t) if t.number % 2 else silent(t), name="easy").document
+    every = scored(half, name="every").document
+    assert easy.overall["rms_px"].value < every.overall["rms_px"].value
+    assert [d.method.name for d in ranked([easy, every])] == ["every", "easy"]
+    assert leaderboard([easy, every]).row_count == 2
+
+
+def test_worst_images_first_one_of_a_sample():
+    truths = list(cases(15).truths)
+    truths[14] = change(truths[14], "down", visible=False, cause="occluded:table")
+    truths[14] = change(truths[14], "up", visible=False, cause="occluded:table")
+
+    def answer(t):
+        if t.number == 3:
+            return constant(t)
+        return silent(t) if t.number == 5 else shifted(0.01 * t.number)(t)
+
+    worst = scored(answer, Cases(tuple(truths))).document.worst
+    assert [w.sample_id for w in worst[:3]] == ["s0003", "s0005", "s0013"]
+    assert len(worst) == len({w.sample_id for w in worst}) == 10
+    assert "s0014" not in {w.sample_id for w in worst}  # nothing to see
+    assert (worst[1].distance_px, worst[1].answer_in_crop_px, worst[1].cause) == (None, None, "method")
+    shown = worst[2]
+    offset = shown.answer_in_crop_px[0] - shown.true_in_crop_px[0]
+    assert offset == pytest.approx(0.13, abs=1e-9)
+    assert all(max(w.size_px) <= 64 for w in worst)
+
+
+def test_crops_hold_the_spot_and_end_with_the_image():
+    import numpy as np
+
+    image = np.zeros((100, 200), np.uint16)
+    image[60, 50] = 700
+    part, (u0, v0) = crop(image, np.array([50.2, 59.8]))
+    assert part[60 - v0, 50 - u0] == 255
+    assert part.shape == (48, 48)
+    corner, origin = crop(image, np.array([1.0, 99.0]))
+    assert origin == (0, 75)
+    assert corner.shape == (25, 25)
+    flat, _ = crop(np.full((100, 200, 3), 7, np.uint8), np.array([50.0, 50.0]))
+    assert (flat == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{", "is not JSON"),
+        ("[]", "is no score"),
+        ('{"kind": "other"}', "is no score"),
+        ('{"kind": "phibench score", "version": 99}', "has version 99"),
+        ('{"kind": "phibench score", "version": 1}', "method"),
+    ],
+)
+def test_a_file_that_is_no_score(tmp_path, text, words):
+    (tmp_path / "x.json").write_text(text)
+    with pytest.raises(DatasetError, match=words) as error:
+        read_score(tmp_path / "x.json")
+    assert "\n" not in str(error.value)
+
+
+def test_records_that_do_not_belong(mine, tmp_path):
+    path = tmp_path / "a.json"
+    written = write_score(path, mine.document, mine.records)
+    (tmp_path / "a.parquet").write_bytes(b"something else")
+    with pytest.raises(DatasetError, match=r"is not the file that a\.json was written with"):
+        read_records(path, written)
+    (tmp_path / "a.parquet").unlink()
+    with pytest.raises(DatasetError, match="is missing"):
+        read_records(path, written)
+    with pytest.raises(DatasetError, match=r"ends in \.json"):
+        write_score(tmp_path / "a.txt", mine.document, mine.records)
+
+
+def test_a_sealed_set_is_refused():
+    class Sealed(Cases):
+        def truth(self, number):
+            raise DatasetError("the set is sealed: submit answers instead")
+
+    with pytest.raises(DatasetError, match="sealed"):
+        score_outcomes(MethodCard.of("x"), Sealed(cases(3).truths), [Outcome(0, None, 1.0, "error")], RULES)
+
+
+def test_small_numbers_do_not_read_as_zero():
+    assert number(0.00001, 3) == "1.00e-05"
+    assert number(0.0, 3) == "0.000"
+    assert number(math.nan, 3) == "-"
+    assert number(0.5, 3) == "0.500"
+    assert number(123.456, 3, significant=True) == "123"
+
+
+# -- commands ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def parts(monkeypatch):
+    """The harness, the loader and the pairs of a data set, replaced by ones in this process."""
+    asked = SimpleNamespace(pairs=None, limits=None)
+    methods = {"ideal": sampler(), "folder/half.py:extract": shifted(0.5), "half.py:extract": shifted(0.5)}
+
+    @dataclass(frozen=True)
+    class Limits:
+        seconds: float = 30.0
+
+    def dataset_pairs(dataset, preset, draws, count):
+        asked.pairs = (preset, draws, count)
+        return cases(20)
+
+    def run_method(reference, pairs, limits, workers):
+        asked.limits = (type(limits), workers)
+        return outcomes(pairs, methods[reference])
+
+    def resolve(reference):
+        name = reference.rsplit("/", 1)[-1].replace(".py", "")
+        fields = {"name": name, "kind": "built-in", "place": "", "function": "", "sha256": "0" * 64, "version": None}
+        return SimpleNamespace(document=lambda: fields)
+
+    given = {"dataset_pairs": dataset_pairs, "run_method": run_method, "resolve": resolve, "Limits": Limits}
+    monkeypatch.setattr(cli_score, "_part", lambda module, name: given[name])
+    monkeypatch.setattr("phibench.datasets.read.open_finished", lambda directory: None)
+    return asked
+
+
+def test_score_with_methods_compare_and_report(parts, tmp_path, capsys):
+    out = tmp_path / "run.json"
+    words = ["score", "x", "--method", "ideal", "--method", "folder/half.py:extract", "--preset", "mjpeg"]
+    assert cli.main([*words, "--draws", "2", "--pairs", "20", "--workers", "3", "--out", str(out)]) == 0
+    shown = capsys.readouterr().out
+    assert parts.pairs == ("mjpeg", 2, 20)
+    assert parts.limits[1] == 3
+    assert "0.5000" in shown
+    assert "[0.5000, 0.5000]" in shown
+    assert sorted(file.name for file in tmp_path.iterdir()) == [
+        "run-half-extract.json",
+        "run-half-extract.parquet",
+        "run-ideal.json",
+        "run-ideal.parquet",
+    ]
+    one, other = tmp_path / "run-ideal.json", tmp_path / "run-half-extract.json"
+    assert read_score(one).method.sha256 == "0" * 64
+    assert cli.main(["compare", str(one), str(other)]) == 0
+    shown = capsys.readouterr().out
+    assert "ideal (run-ideal.json)" in shown
+    assert cli.main(["report", str(one), str(other), "--out", str(tmp_path / "page.html")]) == 0
+    assert (tmp_path / "page.html").read_text().startswith("<!DOCTYPE html>")
+
+
+def test_one_method_has_the_file_that_was_named(parts, tmp_path):
+    assert cli.main(["score", "x", "--method", "ideal", "--out", str(tmp_path / "a.json")]) == 0
+    assert (tmp_path / "a.parquet").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--preset", "mjpeg"], "--preset is for methods"),
+        (["--draws", "2"], "--draws is for methods"),
+        (["--pairs", "2"], "--pairs is for methods"),
+        (["--method", "ideal", "--seed", "-1"], "--seed -1: must be 0 or above"),
+        (["--method", "ideal", "--out", "a.txt"], "ends in .json"),
+        (["--method", "half.py:extract", "--method", "folder/half.py:extract", "--out", "a.json"], "two methods"),
+    ],
+)
+def test_mistakes_are_one_sentence(parts, capsys, words, sentence):
+    assert cli.main(["score", "x", *words]) == 2
+    err = capsys.readouterr().err
+    assert sentence in err
+    assert err.count("\n") == 1
+
+
+def test_compare_of_what_is_not_there(tmp_path, capsys):
+    assert cli.main(["compare", str(tmp_path / "a.json"), str(tmp_path / "b.json")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_the_document_is_strict(mine):
+    raw = json.loads(mine.document.model_dump_json())
+    with pytest.raises(ValueError, match="surprise"):
+        ScoreDocument.model_validate_json(json.dumps({**raw, "surprise": 1}))
+    assert isinstance(mine.records, pl.DataFrame)
