@@ -41,9 +41,13 @@ class Steps:
 
     def advance(self) -> None:
         """Count one step."""
-        self._done += 1
+        self.reach(self._done + 1)
+
+    def reach(self, done: int) -> None:
+        """So many steps are done."""
+        self._done = done
         if self._bar is not None:
-            self._bar.advance(self._task)
+            self._bar.update(self._task, completed=done)
         elif self._done < self._total and time.monotonic() - self._told >= LINE_EVERY_S:
             self._tell()
 

@@ -8,7 +8,9 @@ from pathlib import Path
 from phibench.estimator.cli_words import Whole
 
 
-def bench(directory: Path, *, out: Path, methods: str | None = None, workers: Whole | None = None) -> int:
+def bench(
+    directory: Path, *, out: Path, methods: str | None = None, pairs: Whole | None = None, workers: Whole = 1
+) -> int:
     """Run the built-in methods on every preset of a data set and write scores and a report.
 
     Parameters
@@ -19,14 +21,16 @@ def bench(directory: Path, *, out: Path, methods: str | None = None, workers: Wh
         Folder for the scores and report.html.
     methods
         Names of methods, joined by commas; all that are installed by default.
+    pairs
+        Only the first so many of each preset.
     workers
-        Number of processes of each method.
+        Pairs that are worked on at a time.
     """
-    from phibench.estimator.bench.run_all import Parts, show
     from phibench.estimator.bench.run_all import bench as run_bench
+    from phibench.estimator.bench.run_all import show
 
     names = None if methods is None else methods.split(",")
-    done = run_bench(directory, out, names, Parts.installed(workers))
+    done = run_bench(directory, out, names, workers, pairs)
     for note in done.notes:
         print(f"note: {note}", file=sys.stderr)
     print(f"{done.report}: the report on {len(done.scores)} scores")

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
-from importlib import import_module
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from phibench.estimator.cli_words import Whole
 
@@ -15,8 +13,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from phibench.estimator.bench.document import MethodCard, ScoreDocument
-    from phibench.estimator.bench.pair_set import PairSet
-    from phibench.estimator.bench.score_method import Runner
     from phibench.estimator.score import Score
 
 _TABLE_WIDTH = 200
@@ -109,21 +105,21 @@ def _score_methods(
     workers: int,
     out: Path | None,
 ) -> int:
-    from phibench.datasets.read import open_finished
-    from phibench.estimator.bench.document import write_score
-    from phibench.estimator.bench.score_method import score_method
-    from phibench.estimator.bench.tables import cause_table, leaderboard, strata_table
+    from rich.console import Console
 
-    files = _files(out, cards := [_card(reference) for reference in references])
-    _seed(seed)
-    limits = _part("phibench.estimator.seat.limits", "Limits")()
-    pair_set = _part("phibench.estimator.bench.dataset_pairs", "dataset_pairs")(
-        open_finished(directory), preset, draws, count
-    )
+    from phibench.datasets.read import open_finished
+    from phibench.estimator.bench.dataset_pairs import dataset_pairs
+    from phibench.estimator.bench.document import MethodCard, write_score
+    from phibench.estimator.bench.run_all import run_and_score
+    from phibench.estimator.bench.tables import cause_table, leaderboard, strata_table
+    from phibench.estimator.seat.resolve import resolve
+
+    files = _files(out, [MethodCard.of(name, **resolve(name).document()) for name in references])
+    pair_set = dataset_pairs(open_finished(directory), preset, draws, count)
+    scored = run_and_score(references, pair_set, workers, Console(stderr=True), "pairs", _seed(seed))
     console, documents = _console(), []
-    for card, file in zip(cards, files, strict=True):
-        scored = score_method(card, pair_set, _runner(limits, workers), seed=seed, limits=asdict(limits))
-        documents.append(scored.document if file is None else write_score(file, scored.document, scored.records))
+    for one, file in zip(scored, files, strict=True):
+        documents.append(one.document if file is None else write_score(file, one.document, one.records))
     console.print(leaderboard(documents))
     console.print(cause_table(documents))
     for document in documents:
@@ -131,26 +127,6 @@ def _score_methods(
     for file in filter(None, files):
         console.print(f"written: {file}", soft_wrap=True)
     return 0
-
-
-def _runner(limits: Any, workers: int) -> Runner:
-    run_method = _part("phibench.estimator.seat.harness", "run_method")
-
-    def run(reference: str, pairs: PairSet) -> Any:
-        return run_method(reference, pairs, limits, workers)
-
-    return run
-
-
-def _card(reference: str) -> MethodCard:
-    from phibench.estimator.bench.document import MethodCard
-
-    return MethodCard.of(reference, **_part("phibench.estimator.seat.resolve", "resolve")(reference).document())
-
-
-def _part(module: str, name: str) -> Callable[..., Any]:
-    """A part of the package by its name, so that this file can be read without all of them."""
-    return getattr(import_module(module), name)
 
 
 def _files(out: Path | None, cards: Sequence[MethodCard]) -> list[Path | None]:

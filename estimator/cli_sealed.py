@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 
 from cyclopts import App
 
 from phibench.estimator.cli_words import Whole
+
+_TABLE_WIDTH = 200
 
 
 def register(app: App, dataset: App) -> None:
@@ -42,7 +43,7 @@ def seal(directory: Path, *, out: Path, preset: str | None = None) -> int:
     return 0
 
 
-def submit(public: Path, *, method: str, out: Path, workers: Whole | None = None) -> int:
+def submit(public: Path, *, method: str, out: Path, workers: Whole = 1) -> int:
     """Run a method on a sealed set and write its answers for who holds the truth.
 
     Parameters
@@ -54,12 +55,11 @@ def submit(public: Path, *, method: str, out: Path, workers: Whole | None = None
     out
         JSON file to write.
     workers
-        Number of processes; the harness decides by default.
+        Pairs that are worked on at a time.
     """
     from phibench.estimator.bench.submission import submit as submit_method
-    from phibench.estimator.bench.wiring import harness
 
-    done = submit_method(public, method, out, harness(workers))
+    done = submit_method(public, method, out, workers)
     print(f"{done.path}: {done.answered} of {done.pairs} pairs answered")
     return 0
 
@@ -78,12 +78,21 @@ def unseal(public: Path, *, truth: Path, submission: Path, out: Path | None = No
     out
         JSON file for the score.
     """
+    from rich.console import Console
+
+    from phibench.estimator.bench.document import write_score
+    from phibench.estimator.bench.rules import Rules
+    from phibench.estimator.bench.score_method import score_outcomes
+    from phibench.estimator.bench.tables import cause_table, leaderboard
     from phibench.estimator.bench.unseal import unseal as unseal_set
-    from phibench.estimator.bench.wiring import scorer
 
     opened = unseal_set(public, truth, submission)
     print(f"seal {opened.seal.id}: the truth is the sealed one, the submission has each of {opened.seal.pairs} pairs")
-    sent = opened.submission
-    document = scorer()(sent.method, sent.method_sha256, opened.pairs, opened.outcomes, out)
-    print(json.dumps(document, indent=1, allow_nan=False) if out is None else f"{out}: the score")
+    scored = score_outcomes(opened.submission.method, opened.pairs, opened.outcomes, Rules())
+    document = scored.document if out is None else write_score(out, scored.document, scored.records)
+    console = Console() if Console().width >= _TABLE_WIDTH else Console(width=_TABLE_WIDTH)
+    console.print(leaderboard([document]))
+    console.print(cause_table([document]))
+    if out is not None:
+        print(f"written: {out}")
     return 0

@@ -6,37 +6,29 @@ import os
 import sys
 import webbrowser
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.progress import Steps
 from phibench.datasets.read import Dataset, open_finished
 from phibench.estimator.bench.dataset_pairs import DatasetPairs, dataset_pairs
-from phibench.estimator.bench.wiring import Report, Run, Score, built_in, harness, reporter, scorer
+from phibench.estimator.bench.document import MethodCard, write_score
+from phibench.estimator.bench.report import write_report
+from phibench.estimator.bench.score_method import Scored, score_methods
+from phibench.estimator.methods.built_in import BuiltIn
+from phibench.estimator.methods.registry import METHODS
+from phibench.estimator.seat.harness import Harness
+from phibench.estimator.seat.limits import Limits
 from phibench.estimator.seat.pair import Box
+from phibench.estimator.seat.resolve import resolve
 
 PRESETS = ("bayer-raw", "srgb8", "mjpeg")
 """Of a data set whose recipe has no `[frames]`."""
 REPORT = "report.html"
 _PROBE_BOX = Box(0, 0, 16, 16)  # a method that needs boxes takes the pairs that have some
-
-
-@dataclass(frozen=True)
-class Parts:
-    """What the benchmark is put together from; a test gives its own."""
-
-    methods: Mapping[str, Any]
-    run: Run
-    score: Score
-    report: Report
-
-    @classmethod
-    def installed(cls, workers: int | None = None) -> Parts:
-        """Those of this installation."""
-        return cls(built_in(), harness(workers), scorer(), reporter())
 
 
 @dataclass(frozen=True)
@@ -52,18 +44,19 @@ def bench(
     folder: str | Path,
     out: str | Path,
     methods: Sequence[str] | None = None,
-    parts: Parts | None = None,
+    workers: int = 1,
+    pairs: int | None = None,
     console: Console | None = None,
 ) -> Benched:
-    """Run methods on all presets of a data set and write scores and a report.
+    """Run built-in methods on all presets of a data set and write scores and a report.
 
     Parameters
     ----------
     folder : finished data set
     out : folder for `<preset>-<method>.json` and `report.html`
     methods : names of built-in methods; all by default
-    parts : Parts, optional
-        Harness, methods, score and report; those of this installation by default.
+    workers : pairs that are worked on at a time
+    pairs : the first so many of each preset; all by default
     console : where progress goes; by default the standard error
 
     Raises
@@ -72,28 +65,51 @@ def bench(
         If the data set will not do, or a method is unknown.
     """
     dataset, out = open_finished(folder), Path(out)
-    parts, console = parts or Parts.installed(), console or Console(stderr=True)
-    chosen = _chosen(parts.methods, methods)
+    console, chosen = console or Console(stderr=True), _chosen(METHODS, methods)
     if out.resolve() == dataset.folder.resolve() or dataset.folder.resolve() in out.resolve().parents:
         raise DatasetError(f"{out} lies inside the data set, whose files are signed; give a folder outside, --out")
     scores, notes = [], []
     for preset in _presets(dataset):
-        pairs = dataset_pairs(dataset, preset)
-        for name in chosen:
-            if why := refusal(parts.methods[name], pairs):
-                notes.append(f"{name} is left out on {preset}: {why}")
-                continue
-            console.print(f"{preset}: {name} on {len(pairs)} pairs", highlight=False)
+        taken = dataset_pairs(dataset, preset, pairs=pairs)
+        refusals = {name: refusal(METHODS[name], taken) for name in chosen}
+        notes += [f"{name} is left out on {preset}: {why}" for name, why in refusals.items() if why]
+        names = [name for name, why in refusals.items() if not why]
+        for name, scored in zip(names, run_and_score(names, taken, workers, console, preset), strict=True):
             path = out / f"{preset}-{name}.json"
-            parts.score(name, None, pairs, parts.run(name, pairs), path)
+            write_score(path, scored.document, scored.records)
             scores.append(path)
-    return Benched(parts.report(scores, out / REPORT), tuple(scores), tuple(notes))
+    if not scores:
+        raise DatasetError(f"none of {', '.join(chosen)} takes a preset of {folder}: give other --methods")
+    return Benched(write_report(scores, out / REPORT), tuple(scores), tuple(notes))
 
 
-def refusal(method: Any, pairs: DatasetPairs) -> str:
+def run_and_score(
+    references: Sequence[str],
+    pairs: DatasetPairs,
+    workers: int,
+    console: Console,
+    title: str,
+    seed: int = 0,
+    limits: Limits | None = None,
+) -> list[Scored]:
+    """Score methods on the same pairs, each in a process of its own; parameters as for `bench`.
+
+    Raises
+    ------
+    MethodError
+        If a method cannot be found or imported.
+    """
+    found, limits = [resolve(reference) for reference in references], limits or Limits()
+    cards = [MethodCard.of(name, **method.document()) for name, method in zip(references, found, strict=True)]
+    if not cards:
+        return []
+    with Harness(found, limits, workers) as harness, Steps(console, title, len(pairs)) as steps:
+        return score_methods(cards, pairs, harness.outcomes, None, seed, asdict(limits), steps.reach)
+
+
+def refusal(method: BuiltIn, pairs: DatasetPairs) -> str:
     """Why a built-in method cannot take the pairs of a preset; "" if it can."""
-    why: str = method.refusal(replace(pairs.pair(0), box_down=_PROBE_BOX, box_up=_PROBE_BOX))
-    return why
+    return method.refusal(replace(pairs.pair(0), box_down=_PROBE_BOX, box_up=_PROBE_BOX))
 
 
 def show(page: Path) -> bool:
@@ -109,7 +125,7 @@ def _presets(dataset: Dataset) -> tuple[str, ...]:
     return PRESETS if frames is None else frames.presets
 
 
-def _chosen(known: Mapping[str, Any], wanted: Sequence[str] | None) -> list[str]:
+def _chosen(known: Mapping[str, BuiltIn], wanted: Sequence[str] | None) -> list[str]:
     names = list(known) if wanted is None else list(dict.fromkeys(wanted))
     if strange := [name for name in names if name not in known]:
         raise DatasetError(f"no built-in method '{strange[0]}'; known: {', '.join(known)}")

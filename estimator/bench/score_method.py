@@ -1,27 +1,40 @@
-"""A method's score on a pair set: run it, join answers and truth, measure, name causes, keep the worst."""
+"""Scores of methods on a pair set: run them, join answers and truth, measure, name causes, keep the worst."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import polars as pl
 
 from phibench.datasets.code_hash import code_behind
+from phibench.datasets.errors import DatasetError
 from phibench.datasets.provenance import provenance
 from phibench.estimator.bench.causes import count, count_failures, with_causes
-from phibench.estimator.bench.document import KIND, VERSION, MethodCard, ScoreDocument, StratumScore, Value, finite
+from phibench.estimator.bench.document import (
+    KIND,
+    VERSION,
+    MethodCard,
+    ScoreDocument,
+    StratumScore,
+    Value,
+    Worst,
+    finite,
+)
+from phibench.estimator.bench.held_pairs import HeldPairs
 from phibench.estimator.bench.metrics import METRICS
 from phibench.estimator.bench.pair_set import PairSet
 from phibench.estimator.bench.records import in_order, record_table
 from phibench.estimator.bench.rules import Rules
 from phibench.estimator.bench.strata import Stratum, count_pairs, measured, strata
-from phibench.estimator.bench.worst import worst
+from phibench.estimator.bench.worst import worst, worst_of
 from phibench.estimator.seat.outcome import Outcome
 
-Runner = Callable[[str, PairSet], Iterable[Outcome]]
-"""Method reference and pairs to outcomes: `seat.harness.run_method` with its limits, or one in this process."""
+Ask = Callable[[PairSet, Sequence[int]], Iterable[tuple[Outcome, ...]]]
+"""Pairs and numbers to the outcomes of every method: `estimator.seat.harness.Harness.outcomes`."""
+AT_ONCE = 16
+"""Pairs in memory at a time; one of MJPEG frames with the laser on and off takes 11 MB."""
 
 
 @dataclass(frozen=True)
@@ -32,32 +45,54 @@ class Scored:
     records: pl.DataFrame
 
 
-def score_method(
-    method: MethodCard,
+@dataclass(frozen=True)
+class Examined:
+    """Some pairs of one method: records with causes, and its worst images among them."""
+
+    records: pl.DataFrame
+    worst: list[Worst]
+
+
+def score_methods(
+    methods: Sequence[MethodCard],
     pairs: PairSet,
-    run: Runner,
+    ask: Ask,
     rules: Rules | None = None,
     seed: int = 0,
     limits: Mapping[str, Any] | None = None,
-) -> Scored:
-    """Run a method on all pairs of a set and score it.
+    told: Callable[[int], None] = lambda done: None,
+) -> list[Scored]:
+    """Run methods on all pairs of a set and score them; each pair is drawn once for all of them.
 
     Parameters
     ----------
-    method : MethodCard
+    methods : MethodCards, in the order in which `ask` answers
     pairs : PairSet
-    run : Runner
+    ask : Ask
     rules : Rules, by default the usual ones
     seed : int
         Of the bootstrap; 0 or above.
-    limits : the runner's, for the record
+    limits : the harness's, for the record
+    told : callable
+        Given the number of pairs that are done, now and then.
 
     Raises
     ------
     DatasetError
         If the set is sealed or empty, or an outcome belongs to no pair.
     """
-    return score_outcomes(method, pairs, run(method.reference, pairs), rules or Rules(), seed, limits or {})
+    rules = rules or Rules()
+    parts: list[list[Examined]] = [[] for _ in methods]
+    for start in range(0, len(pairs), AT_ONCE):
+        numbers = range(start, min(start + AT_ONCE, len(pairs)))
+        held = HeldPairs(pairs)
+        answers = list(ask(held, numbers))
+        for part, outcomes in zip(parts, zip(*answers, strict=True), strict=True):
+            part.append(examine(held, outcomes, rules))
+        told(numbers.stop)
+    return [
+        _scored(method, pairs, part, rules, seed, limits or {}) for method, part in zip(methods, parts, strict=True)
+    ]
 
 
 def score_outcomes(
@@ -68,11 +103,33 @@ def score_outcomes(
     seed: int = 0,
     limits: Mapping[str, Any] | None = None,
 ) -> Scored:
-    """Score what a method has answered; parameters as for `score_method`."""
+    """Score what a method has answered on all pairs; parameters as for `score_methods`."""
     ordered = in_order(outcomes, len(pairs))
-    truths = [pairs.truth(outcome.number) for outcome in ordered]  # once: a bound is not computed in no time
-    table = record_table(truths, ordered, rules)
+    parts = [
+        examine(HeldPairs(pairs), ordered[i : i + AT_ONCE], rules) for i in range(0, max(len(ordered), 1), AT_ONCE)
+    ]
+    return _scored(method, pairs, parts, rules, seed, limits or {})
+
+
+def examine(pairs: PairSet, outcomes: Sequence[Outcome], rules: Rules) -> Examined:
+    """Join outcomes with truth and images."""
+    truths = [pairs.truth(outcome.number) for outcome in outcomes]
+    table = record_table(truths, outcomes, rules)
     table = with_causes(table, {truth.number: truth for truth in truths}, pairs.pair, rules)
+    return Examined(table, worst(table, pairs.pair))
+
+
+def _scored(
+    method: MethodCard,
+    pairs: PairSet,
+    parts: Sequence[Examined],
+    rules: Rules,
+    seed: int,
+    limits: Mapping[str, Any],
+) -> Scored:
+    if not parts:
+        raise DatasetError("the pair set is empty: there is nothing to score")
+    table = pl.concat([part.records for part in parts])
     document = ScoreDocument(
         kind=KIND,
         version=VERSION,
@@ -83,14 +140,14 @@ def score_outcomes(
         samples=table["sample_id"].n_unique(),
         seed=seed,
         rules={name: float(value) for name, value in asdict(rules).items()},
-        limits=dict(limits or {}),
+        limits=dict(limits),
         provenance=dict(provenance()),
         code_sha256=code_behind(__name__),
         metrics={n: {"unit": m.unit, "better": m.better, "text": m.text} for n, m in METRICS.items()},
         strata=[_stratum(stratum, rules, seed) for stratum in strata(table)],
         causes=count(table),
         failures=count_failures(table),
-        worst=worst(table, pairs.pair),
+        worst=worst_of(table, [entry for part in parts for entry in part.worst]),
         records="",
         records_sha256="",
     )

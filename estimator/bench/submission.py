@@ -13,14 +13,17 @@ from typing import Annotated, Any
 from pydantic import Field, ValidationError
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.files import sha256, write_text
+from phibench.datasets.files import write_text
 from phibench.datasets.provenance import provenance
 from phibench.datasets.schema import Document, Number, Vector2
+from phibench.estimator.bench.document import MethodCard
 from phibench.estimator.bench.seal_layout import Seal
 from phibench.estimator.bench.sealed_pairs import SealedPairs
-from phibench.estimator.bench.wiring import Run, harness
+from phibench.estimator.seat.harness import run_method
 from phibench.estimator.seat.outcome import Outcome
 from phibench.estimator.seat.pair import Answer, Spot
+from phibench.estimator.seat.reference import Reference
+from phibench.estimator.seat.resolve import resolve
 
 FORMAT = "phibench submission 1"
 Matrix = Annotated[tuple[Vector2, Vector2], Field(strict=False)]
@@ -50,13 +53,12 @@ class AnswerLine(Document):
 
 
 class Submission(Document):
-    """`submission.json`; `seal` is the id of the sealed set, `method_sha256` the hash of the method's own file."""
+    """`submission.json`; `seal` is the id of the sealed set."""
 
     format: str
     seal: str
     task_version: int
-    method: str
-    method_sha256: str | None
+    method: MethodCard
     provenance: dict[str, Any]
     answers: Annotated[tuple[AnswerLine, ...], Field(strict=False)]
 
@@ -70,17 +72,16 @@ class Submitted:
     answered: int
 
 
-def submit(public: str | Path, method: str, out: str | Path, run: Run | None = None) -> Submitted:
+def submit(public: str | Path, method: str, out: str | Path, workers: int = 1) -> Submitted:
     """Run a method on a sealed set and write its answers.
 
     Parameters
     ----------
     public : folder of the sealed set
     method : str
-        Reference as the harness takes it: the name of a built-in one, or a file.
+        As for `seat.harness.Harness`.
     out : JSON file to write
-    run : callable, optional
-        Runs the method; by default the harness.
+    workers : pairs that are worked on at a time
 
     Raises
     ------
@@ -91,22 +92,21 @@ def submit(public: str | Path, method: str, out: str | Path, run: Run | None = N
     if out.is_dir():
         raise DatasetError(f"{out} is a folder; give a file such as submission.json, --out")
     pairs.check()
-    outcomes = (run or harness())(method, pairs)
-    document = submission(pairs.seal, method, outcomes)
+    found = resolve(method)
+    outcomes = run_method(found, pairs, workers=workers)
+    document = submission(pairs.seal, found, outcomes)
     check_complete(document, pairs.seal, "the run")
     write_text(out, json.dumps(document.model_dump(mode="json"), indent=1, allow_nan=False) + "\n")
     return Submitted(out, len(outcomes), sum(outcome.answer is not None for outcome in outcomes))
 
 
-def submission(seal: Seal, method: str, outcomes: Sequence[Outcome]) -> Submission:
+def submission(seal: Seal, method: Reference, outcomes: Sequence[Outcome]) -> Submission:
     """Document of a method's outcomes on a sealed set, by number."""
-    file = Path(method.partition(":")[0])
     return Submission(
         format=FORMAT,
         seal=seal.id,
         task_version=seal.task_version,
-        method=file.name + method[len(str(file)) :] if file.is_file() else method,  # no paths of somebody's machine
-        method_sha256=sha256(file) if file.is_file() else None,
+        method=MethodCard.of(method.name, **method.document()),
         provenance=provenance(),
         answers=tuple(_line(outcome) for outcome in sorted(outcomes, key=lambda outcome: outcome.number)),
     )

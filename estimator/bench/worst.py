@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,14 +25,25 @@ def worst(records: pl.DataFrame, draw: Callable[[int], Pair], count: int = COUNT
 
     Only visible spots, and one image of a sample: ten draws of one spot would show one thing ten times.
     """
+    return [_entry(row, draw) for row in _ranked(records).head(count).iter_rows(named=True)]
+
+
+def worst_of(records: pl.DataFrame, entries: Sequence[Worst], count: int = COUNT) -> list[Worst]:
+    """Worst images of all records, out of the worst ones of their parts."""
+    known = {(entry.number, entry.image): entry for entry in entries}
+    rows = _ranked(records).head(count).select("number", "image").iter_rows()
+    return [known[number, image] for number, image in rows]
+
+
+def _ranked(records: pl.DataFrame) -> pl.DataFrame:
+    """One image of each sample, the worst first."""
     rank = pl.when(pl.col("detected")).then(0).when(pl.col("distance_px").is_null()).then(1).otherwise(2)
-    order = (
+    return (
         records.filter(pl.col("visible"))
         .with_columns(rank=rank)
-        .sort("rank", "distance_px", "number", descending=[True, True, False], nulls_last=True)
+        .sort("rank", "distance_px", "number", "image", descending=[True, True, False, False], nulls_last=True)
         .unique("sample_id", keep="first", maintain_order=True)
     )
-    return [_entry(row, draw) for row in order.head(count).iter_rows(named=True)]
 
 
 def crop(image: NDArray[Any], uv_px: Array, side_px: int = CROP_PX) -> tuple[NDArray[np.uint8], tuple[int, int]]:

@@ -1,6 +1,6 @@
-"""Run a method over a set of pairs. What it does to its own process costs the pair at hand, and the run goes on.
+"""Run methods over a set of pairs. What one does to its own process costs the pair at hand, and the run goes on.
 
-The truth stays in this process: the method's gets the fields of `Pair` and nothing else. That keeps honest code honest;
+The truth stays in this process: the methods' get the fields of `Pair` and nothing else. That keeps honest code honest;
 it is no sandbox. A method that wants to cheat can read any file that its user can.
 """
 
@@ -10,35 +10,103 @@ import queue
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from types import TracebackType
 
 from phibench.estimator.bench.pair_set import PairSet
 from phibench.estimator.seat.errors import MethodError
 from phibench.estimator.seat.limits import Limits
 from phibench.estimator.seat.outcome import Outcome
+from phibench.estimator.seat.pair import Pair
 from phibench.estimator.seat.process import MethodProcess
 from phibench.estimator.seat.reference import Reference
 from phibench.estimator.seat.resolve import resolve
 
 
-def run_method(
-    reference: str | Reference, pairs: PairSet, limits: Limits | None = None, workers: int = 1
-) -> list[Outcome]:
-    """Outcomes of all pairs, in number order.
+class Harness:
+    """Methods in processes of their own, kept warm from pair to pair; a context manager.
+
+    Each pair is made once and shown to one method after the other; pairs are worked on side by side.
 
     Parameters
     ----------
-    reference : str or Reference
+    methods : sequence of str or Reference
         ``my_phi.py:extract``, a built-in name, or that of an installed package's method.
-    pairs : PairSet
     limits : Limits, optional
     workers : int
-        Processes of the method; each is given one pair at a time.
+        Pairs that are worked on at a time. One method alone has as many processes, several have one each.
 
     Raises
     ------
     MethodError
-        If the method cannot be found, imported or started.
+        If a method cannot be found; on entering, if one cannot be imported.
     """
+
+    def __init__(self, methods: Sequence[str | Reference], limits: Limits | None = None, workers: int = 1) -> None:
+        if workers < 1:
+            raise MethodError(f"workers = {workers}: must be 1 or more")
+        self._references = [resolve(method) if isinstance(method, str) else method for method in methods]
+        self._limits, self._workers = limits or Limits(), workers
+        self._making = threading.Lock()
+
+    def __enter__(self) -> Harness:
+        copies = self._workers if len(self._references) == 1 else 1
+        self._crews = [_Crew([MethodProcess(r, self._limits) for _ in range(copies)]) for r in self._references]
+        # one more than processes, so that a pair is made while the others are looked at
+        self._pool = ThreadPoolExecutor(self._workers + 1, thread_name_prefix="phibench-method")
+        try:
+            for crew in self._crews:
+                crew.start()  # a method that cannot be imported ends the run before it begins
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: object, trace: TracebackType | None) -> None:
+        for crew in self._crews:
+            crew.close()
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def outcomes(self, pairs: PairSet, numbers: Sequence[int]) -> Iterator[tuple[Outcome, ...]]:
+        """Outcomes of every method for some pairs, in the order of `numbers`.
+
+        Pairs are made one at a time, whatever the number of workers: a set need not be safe for threads.
+        """
+
+        def one(number: int) -> tuple[Outcome, ...]:
+            with self._making:
+                pair = pairs.pair(number)
+            return tuple(crew.ask(pair) for crew in self._crews)
+
+        return self._pool.map(one, numbers)
+
+
+class _Crew:
+    """Processes of one method, of which each looks at one pair at a time."""
+
+    def __init__(self, processes: list[MethodProcess]) -> None:
+        self._processes, self._free = processes, queue.SimpleQueue[MethodProcess]()
+        for process in processes:
+            self._free.put(process)
+
+    def start(self) -> None:
+        self._processes[0].start()
+
+    def ask(self, pair: Pair) -> Outcome:
+        process = self._free.get()
+        try:
+            return process.ask(pair)
+        finally:
+            self._free.put(process)
+
+    def close(self) -> None:
+        for process in self._processes:
+            process.close()
+
+
+def run_method(
+    reference: str | Reference, pairs: PairSet, limits: Limits | None = None, workers: int = 1
+) -> list[Outcome]:
+    """Outcomes of one method on all pairs, in number order; parameters and errors as for `Harness`."""
     return list(outcomes(reference, pairs, limits, workers))
 
 
@@ -49,40 +117,12 @@ def outcomes(
     workers: int = 1,
     numbers: Sequence[int] | None = None,
 ) -> Iterator[Outcome]:
-    """As `run_method`, one at a time, for some pairs or all of them; leaving the loop ends the processes.
-
-    Pairs are made one at a time, whatever the number of workers: a set need not be safe for threads.
-    """
-    if workers < 1:
-        raise MethodError(f"workers = {workers}: must be 1 or more")
-    found = resolve(reference) if isinstance(reference, str) else reference
+    """As `run_method`, one at a time, for some pairs or all of them; leaving the loop ends the processes."""
     wanted = range(len(pairs)) if numbers is None else numbers
-    return _outcomes(found, pairs, limits or Limits(), min(workers, max(len(wanted), 1)), wanted)
+    return _outcomes(Harness([reference], limits, min(workers, max(len(wanted), 1))), pairs, wanted)
 
 
-def _outcomes(
-    reference: Reference, pairs: PairSet, limits: Limits, workers: int, numbers: Sequence[int]
-) -> Iterator[Outcome]:
-    processes = [MethodProcess(reference, limits) for _ in range(workers)]
-    free, making = queue.SimpleQueue[MethodProcess](), threading.Lock()
-    for process in processes:
-        free.put(process)
-
-    def one(number: int) -> Outcome:
-        with making:
-            pair = pairs.pair(number)
-        process = free.get()
-        try:
-            return process.ask(pair)
-        finally:
-            free.put(process)
-
-    # one more than processes, so that a pair is made while the others are looked at
-    pool = ThreadPoolExecutor(workers + 1, thread_name_prefix="phibench-method")
-    try:
-        processes[0].start()  # a method that cannot be imported ends the run before it begins
-        yield from pool.map(one, numbers)
-    finally:
-        for process in processes:
-            process.close()
-        pool.shutdown(wait=True, cancel_futures=True)
+def _outcomes(harness: Harness, pairs: PairSet, numbers: Sequence[int]) -> Iterator[Outcome]:
+    with harness:
+        for (outcome,) in harness.outcomes(pairs, numbers):
+            yield outcome
