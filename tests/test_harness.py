@@ -24,7 +24,7 @@ from phibench.estimator.seat.harness import outcomes, run_method
 from phibench.estimator.seat.limits import Limits
 from phibench.estimator.seat.outcome import FAILURES, Outcome
 from phibench.estimator.seat.pair import Answer, Pair, Spot
-from phibench.estimator.seat.parcel import MemoryFile, pack, unpack
+from phibench.estimator.seat.parcel import MemoryFile, SharedPages, pack, unpack
 from phibench.estimator.seat.surroundings import environment
 
 LIMITS = Limits(seconds=3.0, memory_mb=1000.0)
@@ -255,10 +255,12 @@ def test_environment_keeps_what_libraries_need_and_nothing_else() -> None:
 
 def test_images_arrive_as_they_were_and_cannot_be_written() -> None:
     sent, memory = SmallPairs().pair(3), MemoryFile()
+    pages = SharedPages(memory.reader)
     rng = np.random.default_rng(0)
     images = [rng.integers(0, 1024, (5, 7), np.uint16), rng.integers(0, 255, (4, 3, 3), np.uint8)[:, ::-1]]
-    for image in images:  # the second is not contiguous, and smaller than what the file held before
-        parcel = unpack(pack(type(sent)(3, image, image, sent.rig, 0.5, sent.card), memory), memory.reader)
+    images.append(rng.integers(0, 1024, (500, 70), np.uint16))
+    for image in images:  # the second is not contiguous; they become smaller and larger than what the file held before
+        parcel = unpack(pack(type(sent)(3, image, image, sent.rig, 0.5, sent.card), memory), pages)
         np.testing.assert_array_equal(parcel.pair.down, image)
         assert parcel.pair.down.dtype == image.dtype
         assert parcel.pair.down_off is None

@@ -35,8 +35,8 @@ def raw_maximum_likelihood(sight: Sight) -> Spot:
     card, rig = sight.pair.card, sight.pair.rig
     try:
         noise = noise_of(card)
-    except ValueError as error:
-        return Spot.missing(str(error))
+    except ValueError:
+        return Spot.missing("the fit needs shot noise and no row noise")
     near = sight.narrowed()
     if near is None:
         return Spot.missing("no spot")

@@ -22,7 +22,7 @@ from phibench.estimator.seat.channel import Channel, ChannelError
 from phibench.estimator.seat.errors import MethodError
 from phibench.estimator.seat.loader import load, sentence_of
 from phibench.estimator.seat.pair import Method
-from phibench.estimator.seat.parcel import Parcel, unpack
+from phibench.estimator.seat.parcel import Parcel, SharedPages, unpack
 from phibench.estimator.seat.reference import Reference
 
 _READ_ONLY = "read-only"  # in numpy's words: "assignment destination is read-only", "output array is read-only"
@@ -33,7 +33,7 @@ def main() -> None:
     """Load one method and answer pairs until the parent hangs up."""
     line, reader = (int(text) for text in sys.argv[1:])
     sys.argv[1:] = []
-    channel = Channel(socket.socket(fileno=line))
+    channel, pages = Channel(socket.socket(fileno=line)), SharedPages(reader)
     faulthandler.enable(all_threads=False)
     faulthandler.register(signal.SIGUSR1, all_threads=False)
     threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
@@ -49,7 +49,7 @@ def main() -> None:
     channel.send(to_bytes({"fault": ""}))
     try:
         while True:
-            parcel = unpack(channel.receive(), reader)
+            parcel = unpack(channel.receive(), pages)
             channel.send(to_bytes(_reply(method, parcel, limit, file)))
     except ChannelError:
         return

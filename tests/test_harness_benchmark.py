@@ -1,0 +1,71 @@
+"""Time that the seat adds to a pair, `pytest --benchmark-enable --benchmark-only`; targets are stated, not asserted."""
+
+from __future__ import annotations
+
+import pickle
+import socket
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from seat_pairs import GOOD, SmallPairs, method_file
+
+from phibench.estimator.seat.channel import Channel
+from phibench.estimator.seat.limits import Limits
+from phibench.estimator.seat.pair import Pair
+from phibench.estimator.seat.parcel import MemoryFile, SharedPages, pack, unpack
+from phibench.estimator.seat.process import MethodProcess
+from phibench.estimator.seat.resolve import resolve
+
+
+def large() -> Pair:
+    """Four frames of 1280 x 720 x 3 bytes: 11 MB."""
+    small = SmallPairs().pair(0)
+    frames = [np.random.default_rng(k).integers(0, 255, (720, 1280, 3), np.uint8) for k in range(4)]
+    return Pair(0, frames[0], frames[1], small.rig, 0.5, small.card, frames[2], frames[3])
+
+
+@pytest.mark.benchmark(group="a pair's way")
+def test_benchmark_shared_memory(benchmark) -> None:
+    """Pack, private copy, comparison afterwards. Target: <= 20 ms, little against making the pair (0.3 s and more)."""
+    pair, memory = large(), MemoryFile()
+    pages = SharedPages(memory.reader)
+    assert benchmark(lambda: unpack(pack(pair, memory), pages).unchanged())
+
+
+@pytest.mark.benchmark(group="a pair's way")
+def test_benchmark_socket(benchmark) -> None:
+    """The alternative: the pair as a pickle through a socket, without any comparison."""
+    pair = large()
+    near, far = (Channel(end) for end in socket.socketpair())
+
+    def there() -> object:
+        message = pickle.dumps(pair, protocol=5)
+        thread = threading.Thread(target=near.send, args=(message,))
+        thread.start()
+        received = pickle.loads(far.receive())
+        thread.join()
+        return received
+
+    assert benchmark(there) is not None
+
+
+@pytest.mark.benchmark(group="the seat")
+def test_benchmark_empty_method_on_full_frames(benchmark, tmp_path: Path) -> None:
+    """Target: <= 30 ms a pair."""
+    process = MethodProcess(resolve(method_file(tmp_path, f"return {GOOD.replace('0, 0', '0, 0, 0')}")), Limits())
+    pair = large()
+    try:
+        assert benchmark(lambda: process.ask(pair)).failure == ""
+    finally:
+        process.close()
+
+
+@pytest.mark.benchmark(group="the seat")
+def test_benchmark_restart(benchmark, tmp_path: Path) -> None:
+    """What a failure costs besides its pair: a new process. Target: <= 1 s."""
+    process = MethodProcess(resolve(method_file(tmp_path, "1 / 0")), Limits())
+    pair = SmallPairs().pair(0)
+    assert benchmark.pedantic(lambda: process.ask(pair), rounds=5).failure == "error"
+    process.close()
