@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from phibench.estimator.bench.document import MethodCard, ScoreDocument
     from phibench.estimator.score import Score
 
-_TABLE_WIDTH = 200
+_TABLE_WIDTH = 210
 
 
 def score(

@@ -9,7 +9,7 @@ from cyclopts import App
 
 from phibench.estimator.cli_words import Whole
 
-_TABLE_WIDTH = 200
+_TABLE_WIDTH = 210
 
 
 def register(app: App, dataset: App) -> None:

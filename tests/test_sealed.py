@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,32 +19,36 @@ from test_make import quiet
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_dataset
 from phibench.estimator import cli
-from phibench.estimator.bench import wiring
 from phibench.estimator.bench.dataset_pairs import dataset_pairs
-from phibench.estimator.bench.pair_set import PairSet
-from phibench.estimator.bench.run_all import Parts, bench, show
+from phibench.estimator.bench.document import read_score
+from phibench.estimator.bench.run_all import bench, show
 from phibench.estimator.bench.seal import Sealed, seal, seed_warnings
 from phibench.estimator.bench.sealed_pairs import SealedPairs
 from phibench.estimator.bench.submission import outcomes_of, read_submission, submit
 from phibench.estimator.bench.truth import PairTruth
 from phibench.estimator.bench.truth_file import truth_document, truth_of
 from phibench.estimator.bench.unseal import unseal
-from phibench.estimator.seat.outcome import Outcome
-from phibench.estimator.seat.pair import Answer, Pair, Spot
+from phibench.estimator.seat.harness import run_method
 
+METHOD = """\
+import numpy as np
+from phibench.estimator.seat.pair import Answer, Spot
 
-def guess(pair: Pair) -> Answer:
-    """Brightest pixel: deterministic, and of this pair."""
+def extract(pair):  # brightest pixel: deterministic, and of this pair; pair 1 fails
+    if pair.number == 1:
+        raise ValueError("no spot")
     image = pair.down if pair.down.ndim == 2 else pair.down[..., 0]
     v, u = np.unravel_index(int(image.argmax()), image.shape)
     found = Spot((float(u), float(v)), ((0.1, 0.01), (0.01, 0.2)), 0.5, "normal")
-    return Answer(found, Spot.missing("not looked for"), 2.0, math.inf)
+    return Answer(found, Spot.missing("not looked for"), 2.0)
+"""
 
 
-def run(_: str, pairs: PairSet) -> Sequence[Outcome]:
-    """Harness of these tests: in this process; pair 1 fails."""
-    outcomes = [Outcome(i, guess(pairs.pair(i)), 0.25) for i in range(len(pairs)) if i != 1]
-    return [*outcomes, Outcome(1, None, math.nan, "error", "ValueError: no spot")]
+@pytest.fixture(scope="module")
+def method(tmp_path_factory: pytest.TempPathFactory) -> str:
+    file = tmp_path_factory.mktemp("method") / "mine.py"
+    file.write_text(METHOD)
+    return f"{file}:extract"
 
 
 @pytest.fixture(scope="module")
@@ -55,11 +59,9 @@ def sealed(bench_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Sea
 
 
 @pytest.fixture(scope="module")
-def submitted(sealed: Sealed, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    method = tmp_path_factory.mktemp("method") / "mine.py"
-    method.write_text("def extract(pair): ...\n")
-    out = method.with_name("submission.json")
-    done = submit(sealed.public, f"{method}:extract", out, run)
+def submitted(sealed: Sealed, method: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("submission") / "submission.json"
+    done = submit(sealed.public, method, out)
     assert (done.pairs, done.answered) == (9, 8)
     return out
 
@@ -207,21 +209,14 @@ def test_seeds_that_can_be_found_are_warned_of() -> None:
 # There and back
 
 
-def test_a_submission_comes_back_as_it_was(sealed: Sealed, submitted: Path) -> None:
+def test_a_submission_comes_back_as_it_was(sealed: Sealed, submitted: Path, method: str) -> None:
     opened = unseal(sealed.public, sealed.truth_file, submitted)
     assert opened.seal.id == sealed.seal.id
-    expected = sorted(run("", SealedPairs(sealed.public)), key=lambda outcome: outcome.number)
+    expected = run_method(method, SealedPairs(sealed.public))
     for ours, theirs in zip(expected, opened.outcomes, strict=True):
         assert (ours.number, ours.failure, ours.message) == (theirs.number, theirs.failure, theirs.message)
-        assert ours.seconds == theirs.seconds or (math.isnan(ours.seconds) and math.isnan(theirs.seconds))
-        if ours.answer is not None:
-            assert theirs.answer is not None
-            assert (ours.answer.down, ours.answer.up, ours.answer.depth_m) == (
-                theirs.answer.down,
-                theirs.answer.up,
-                theirs.answer.depth_m,
-            )
-            assert theirs.answer.sigma_depth_m is None  # infinity is no claim
+        assert ours.answer == theirs.answer  # to the bit: JSON holds doubles exactly
+        assert theirs.seconds >= 0.0
     assert [opened.pairs.truth(i).number for i in range(9)] == list(range(9))
     assert np.array_equal(opened.pairs.pair(2).up, SealedPairs(sealed.public).pair(2).up)
     assert opened.pairs.document()["id"] == sealed.seal.id
@@ -229,8 +224,8 @@ def test_a_submission_comes_back_as_it_was(sealed: Sealed, submitted: Path) -> N
 
 def test_a_submission_names_its_method_by_hash_and_no_path(submitted: Path) -> None:
     document = read_submission(submitted)
-    assert document.method == "mine.py:extract"
-    assert document.method_sha256 == hashlib.sha256(b"def extract(pair): ...\n").hexdigest()
+    assert (document.method.name, document.method.place) == ("mine:extract", "mine.py")
+    assert document.method.sha256 == hashlib.sha256(METHOD.encode()).hexdigest()
     assert str(submitted.parent) not in submitted.read_text()
     assert len(outcomes_of(document)) == 9
 
@@ -291,24 +286,18 @@ def test_another_submission_is_refused(
     assert words in refusal(sealed.public, sealed.truth_file, tampered(change, submitted, tmp_path / "s.json"))
 
 
-def test_a_run_that_leaves_a_pair_out_writes_nothing(sealed: Sealed, tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="the run lacks pair 0"):
-        submit(sealed.public, "m", tmp_path / "s.json", lambda m, pairs: run(m, pairs)[1:])
-    assert list(tmp_path.iterdir()) == []
-
-
 def flip(path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(bytes(data))
 
 
-def test_a_changed_frame_is_refused(sealed: Sealed, submitted: Path, copy: Path, tmp_path: Path) -> None:
+def test_a_changed_frame_is_refused(sealed: Sealed, submitted: Path, method: str, copy: Path, tmp_path: Path) -> None:
     frame = sorted((copy / "frames").iterdir())[7]
     flip(frame)
     assert f"{frame.name} was changed" in refusal(copy, sealed.truth_file, submitted)
     with pytest.raises(DatasetError, match=f"{frame.name} was changed"):
-        submit(copy, "m", tmp_path / "s.json", run)
+        submit(copy, method, tmp_path / "s.json")
     with pytest.raises(DatasetError, match=f"{frame.name} was changed"):
         SealedPairs(copy).pair(int(frame.name[:6]))
 
@@ -366,25 +355,19 @@ def test_an_interrupted_seal_leaves_nothing(
 
 
 def test_the_commands_say_what_they_did(
-    sealed: Sealed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    sealed: Sealed, method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(wiring, "harness", lambda workers=None: run)
-    scored: list[Any] = []
-
-    def score(method: str, sha256: str | None, pairs: PairSet, outcomes: Any, out: Path | None) -> dict[str, Any]:
-        scored.append((method, len(pairs), len(outcomes), pairs.truth(0).number))
-        return {"rms_px": 0.5}
-
-    monkeypatch.setattr(wiring, "scorer", lambda: score)
-    out = tmp_path / "s.json"
-    assert cli.main(["submit", str(sealed.public), "--method", "m", "--out", str(out)]) == 0
+    out, score = tmp_path / "s.json", tmp_path / "score.json"
+    assert cli.main(["submit", str(sealed.public), "--method", method, "--out", str(out)]) == 0
     words = ["unseal", str(sealed.public), "--truth", str(sealed.truth_file), "--submission", str(out)]
-    assert cli.main(words) == 0
+    assert cli.main([*words, "--out", str(score)]) == 0
     said = capsys.readouterr().out
     assert "8 of 9 pairs answered" in said
     assert "the truth is the sealed one" in said
-    assert '"rms_px": 0.5' in said
-    assert scored == [("m", 9, 9, 0)]
+    assert "mine:extract" in said
+    document = read_score(score)
+    assert (document.pairs, document.failures["error"], document.method.place) == (9, 1, "mine.py")
+    assert not show(score)  # no terminal here
 
 
 def test_seal_on_the_command_line_warns_of_its_seed(
@@ -401,44 +384,33 @@ def test_seal_on_the_command_line_warns_of_its_seed(
     assert "not an empty folder" in capsys.readouterr().err
 
 
-class RawOnly:
-    """A built-in method, as far as the benchmark looks at it."""
-
-    def refusal(self, pair: Pair) -> str:
-        if pair.box_down is None:
-            return "needs region hints"
-        return "" if pair.card.output == "raw" else "takes raw"
-
-
 def test_the_benchmark_runs_what_accepts_each_preset(bench_dataset: Path, tmp_path: Path) -> None:
-    class Everything(RawOnly):
-        def refusal(self, pair: Pair) -> str:
-            return ""
+    names = ["red_centroid", "raw_maximum_likelihood"]
+    done = bench(bench_dataset, tmp_path / "out", names, workers=2, console=quiet())
+    stems = ["bayer-raw-red_centroid", "bayer-raw-raw_maximum_likelihood", "srgb8-red_centroid", "mjpeg-red_centroid"]
+    assert [path.stem for path in done.scores] == stems
+    assert len(done.notes) == 2
+    assert all("takes mono-raw, bayer-raw, not" in note or "takes bayer-raw, mono-raw" in note for note in done.notes)
+    documents = [read_score(path) for path in done.scores]
+    assert [document.pairs for document in documents] == [3, 3, 3, 3]
+    assert "raw_maximum_likelihood" in done.report.read_text()
+    # one method alone on the same pairs answers the same: the harness keeps them apart
+    alone = bench(bench_dataset, tmp_path / "alone", names[:1], console=quiet())
+    one, other = read_score(alone.scores[0]), documents[0]
+    assert one.strata[0].metrics["rms_px"] == other.strata[0].metrics["rms_px"]
+    assert one.worst == other.worst
 
-    ran: list[tuple[str, int]] = []
 
-    def counted(method: str, pairs: PairSet) -> Sequence[Outcome]:
-        ran.append((method, len(pairs)))
-        return run(method, pairs)
-
-    def score(method: str, _: str | None, pairs: PairSet, outcomes: Any, path: Path | None) -> dict[str, Any]:
-        assert path is not None
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(json.dumps({"method": method, "outcomes": len(outcomes)}))
-        return {}
-
-    def report(paths: Sequence[Path], page: Path) -> Path:
-        page.write_text(" ".join(path.name for path in paths))
-        return page
-
-    parts = Parts({"raw": RawOnly(), "any": Everything()}, counted, score, report)
-    done = bench(bench_dataset, tmp_path / "out", parts=parts, console=quiet())
-    assert [path.stem for path in done.scores] == ["bayer-raw-raw", "bayer-raw-any", "srgb8-any", "mjpeg-any"]
-    assert done.notes == ("raw is left out on srgb8: takes raw", "raw is left out on mjpeg: takes raw")
-    assert ran == [("raw", 3), ("any", 3), ("any", 3), ("any", 3)]
-    assert "bayer-raw-raw.json" in done.report.read_text()
-    assert not show(done.report)  # no terminal here
-    with pytest.raises(DatasetError, match="no built-in method 'x'; known: raw, any"):
-        bench(bench_dataset, tmp_path / "out", ["x"], parts, quiet())
-    with pytest.raises(DatasetError, match="lies inside the data set"):
-        bench(bench_dataset, bench_dataset / "out", None, parts, quiet())
+@pytest.mark.parametrize(
+    ("out", "names", "words"),
+    [
+        ("out", ["x"], "no built-in method 'x'; known: "),
+        ("inside", None, "lies inside the data set"),
+    ],
+)
+def test_a_benchmark_that_cannot_be_is_refused(
+    bench_dataset: Path, tmp_path: Path, out: str, names: list[str] | None, words: str
+) -> None:
+    folder = bench_dataset / "out" if out == "inside" else tmp_path / out
+    with pytest.raises(DatasetError, match=words):
+        bench(bench_dataset, folder, names, console=quiet())

@@ -42,7 +42,7 @@ def leaderboard(documents: Sequence[ScoreDocument]) -> Table:
     """One line per method, best first; below each value its interval."""
     confidence = documents[0].rules["confidence"]
     grid = Table(title=f"Scores with {100 * confidence:g} % intervals over samples", show_lines=True)
-    grid.add_column("method")
+    grid.add_column("method", no_wrap=True)
     grid.add_column("pairs", justify="right")
     for _, head, _, _ in BOARD:
         grid.add_column(head, justify="right")
@@ -54,9 +54,10 @@ def leaderboard(documents: Sequence[ScoreDocument]) -> Table:
 
 def strata_table(document: ScoreDocument) -> Table:
     """One line per stratum of one method."""
-    grid = Table(title=f"{document.method.name}: strata")
+    least = round(document.rules["least_samples"])
+    grid = Table(title=f"{document.method.name}: strata", caption=f"*: fewer than {least} samples, no interval")
     for head in ("by", "stratum", "images", "found %", "rms px", "median px", "rms phi mrad", "rms D %", "efficiency"):
-        grid.add_column(head, justify="left" if head in ("by", "stratum") else "right")
+        grid.add_column(head, justify="left" if head in ("by", "stratum") else "right", no_wrap=True)
     for stratum in document.strata:
         shown = (
             ("detection_rate", 100.0, 1),
@@ -67,9 +68,15 @@ def strata_table(document: ScoreDocument) -> Table:
             ("efficiency_px", 1.0, 3),
         )
         there = ((stratum.metrics.get(name), factor, digits) for name, factor, digits in shown)
-        cells = ("" if value is None else one_line(value.estimate, f, d) for value, f, d in there)
+        cells = ("" if value is None else _starred(value.estimate, f, d) for value, f, d in there)
         grid.add_row(stratum.by, stratum.label, str(stratum.images), *cells)
     return grid
+
+
+def _starred(estimate: Estimate, factor: float, digits: int) -> str:
+    """As `one_line`, with a star where there are too few samples for an interval."""
+    value, rest = cell_parts(estimate, factor, digits)
+    return f"{value} *" if rest.startswith("(fewer") else f"{value} {rest}".strip()
 
 
 def cause_table(documents: Sequence[ScoreDocument]) -> Table:
