@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
-from types import SimpleNamespace
 
 import polars as pl
 import pytest
 from bench_cases import Cases, cases, change, constant, outcomes, sampler, shifted, silent, truth_itself
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator import cli, cli_score
+from phibench.estimator import cli
 from phibench.estimator.bench.document import MethodCard, ScoreDocument, read_records, read_score, write_score
 from phibench.estimator.bench.metrics import METRICS
 from phibench.estimator.bench.rules import Rules
-from phibench.estimator.bench.score_method import score_method, score_outcomes
+from phibench.estimator.bench.score_method import score_methods, score_outcomes
 from phibench.estimator.bench.strata import STRATA
 from phibench.estimator.bench.tables import leaderboard, number, ranked
 from phibench.estimator.bench.worst import crop
@@ -26,11 +24,8 @@ RULES = Rules(resamples=199)
 
 
 def scored(oracle=None, pairs=None, name="mine", **options):
-    return score_method(MethodCard.of(name), pairs or cases(40), runner(oracle or sampler()), RULES, **options)
-
-
-def runner(oracle):
-    return lambda reference, pairs: outcomes(pairs, oracle)
+    pairs = pairs or cases(40)
+    return score_outcomes(MethodCard.of(name), pairs, outcomes(pairs, oracle or sampler()), RULES, **options)
 
 
 @pytest.fixture(scope="module")
@@ -189,62 +184,63 @@ def test_small_numbers_do_not_read_as_zero():
 # -- commands ------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def parts(monkeypatch):
-    """The harness, the loader and the pairs of a data set, replaced by ones in this process."""
-    asked = SimpleNamespace(pairs=None, limits=None)
-    methods = {"ideal": sampler(), "folder/half.py:extract": shifted(0.5), "half.py:extract": shifted(0.5)}
+def test_several_methods_are_scored_as_each_alone():
+    """Pairs are drawn once for all and in parts of 16; what a method gets does not depend on that."""
+    pairs, oracles = cases(40), [sampler(), shifted(0.5)]
 
-    @dataclass(frozen=True)
-    class Limits:
-        seconds: float = 30.0
+    def ask(held, numbers):
+        answers = [{o.number: o for o in outcomes(pairs, oracle)} for oracle in oracles]
+        return [tuple(answer[number] for answer in answers) for number in numbers]
 
-    def dataset_pairs(dataset, preset, draws, count):
-        asked.pairs = (preset, draws, count)
-        return cases(20)
-
-    def run_method(reference, pairs, limits, workers):
-        asked.limits = (type(limits), workers)
-        return outcomes(pairs, methods[reference])
-
-    def resolve(reference):
-        name = reference.rsplit("/", 1)[-1].replace(".py", "")
-        fields = {"name": name, "kind": "built-in", "place": "", "function": "", "sha256": "0" * 64, "version": None}
-        return SimpleNamespace(document=lambda: fields)
-
-    given = {"dataset_pairs": dataset_pairs, "run_method": run_method, "resolve": resolve, "Limits": Limits}
-    monkeypatch.setattr(cli_score, "_part", lambda module, name: given[name])
-    monkeypatch.setattr("phibench.datasets.read.open_finished", lambda directory: None)
-    return asked
+    told = []
+    both = score_methods([MethodCard.of("a"), MethodCard.of("b")], pairs, ask, RULES, told=told.append)
+    assert told == [16, 32, 40]
+    for one, oracle, name in zip(both, oracles, "ab", strict=True):
+        alone = score_outcomes(MethodCard.of(name), pairs, outcomes(pairs, oracle), RULES)
+        assert one.records.equals(alone.records)
+        assert one.document == alone.document
 
 
-def test_score_with_methods_compare_and_report(parts, tmp_path, capsys):
+@pytest.fixture(scope="module")
+def half(tmp_path_factory):
+    file = tmp_path_factory.mktemp("method") / "half.py"
+    file.write_text(
+        "from phibench.estimator.methods.registry import METHODS\n"
+        "from phibench.estimator.seat.pair import Answer, Spot\n"
+        "def moved(s):\n"
+        "    return s if s.uv_px is None else Spot((s.uv_px[0] + 0.5, s.uv_px[1]))\n"
+        "def extract(pair):\n"
+        "    answer = METHODS['raw_maximum_likelihood'](pair)\n"
+        "    return Answer(moved(answer.down), moved(answer.up))\n"
+    )
+    return f"{file}:extract"
+
+
+def test_score_with_methods_compare_and_report(bench_dataset, half, tmp_path, capsys):
     out = tmp_path / "run.json"
-    words = ["score", "x", "--method", "ideal", "--method", "folder/half.py:extract", "--preset", "mjpeg"]
-    assert cli.main([*words, "--draws", "2", "--pairs", "20", "--workers", "3", "--out", str(out)]) == 0
+    words = ["score", str(bench_dataset), "--method", "raw_maximum_likelihood", "--method", half]
+    assert cli.main([*words, "--preset", "bayer-raw", "--draws", "2", "--workers", "2", "--out", str(out)]) == 0
     shown = capsys.readouterr().out
-    assert parts.pairs == ("mjpeg", 2, 20)
-    assert parts.limits[1] == 3
-    assert "0.5000" in shown
-    assert "[0.5000, 0.5000]" in shown
+    assert "raw_maximum_likelihood" in shown
     assert sorted(file.name for file in tmp_path.iterdir()) == [
         "run-half-extract.json",
         "run-half-extract.parquet",
-        "run-ideal.json",
-        "run-ideal.parquet",
+        "run-raw_maximum_likelihood.json",
+        "run-raw_maximum_likelihood.parquet",
     ]
-    one, other = tmp_path / "run-ideal.json", tmp_path / "run-half-extract.json"
-    assert read_score(one).method.sha256 == "0" * 64
+    one, other = tmp_path / "run-raw_maximum_likelihood.json", tmp_path / "run-half-extract.json"
+    assert len(read_score(other).method.sha256) == 64
+    records = [read_records(path, read_score(path)) for path in (one, other)]
+    key = ["number", "image"]
+    both = records[0].join(records[1], on=key, suffix="_half").filter(pl.col("u_px").is_not_null())
+    assert len(both) > 0
+    # the same pairs, drawn once and shown to both: half a pixel between the answers, to rounding
+    assert (both["u_px_half"] - both["u_px"]).to_list() == pytest.approx([0.5] * len(both), abs=1e-9)
     assert cli.main(["compare", str(one), str(other)]) == 0
     shown = capsys.readouterr().out
-    assert "ideal (run-ideal.json)" in shown
+    assert "raw_maximum_likelihood (run-raw_maximum_likelihood.json)" in " ".join(shown.split())
     assert cli.main(["report", str(one), str(other), "--out", str(tmp_path / "page.html")]) == 0
     assert (tmp_path / "page.html").read_text().startswith("<!DOCTYPE html>")
-
-
-def test_one_method_has_the_file_that_was_named(parts, tmp_path):
-    assert cli.main(["score", "x", "--method", "ideal", "--out", str(tmp_path / "a.json")]) == 0
-    assert (tmp_path / "a.parquet").is_file()
 
 
 @pytest.mark.parametrize(
@@ -253,13 +249,15 @@ def test_one_method_has_the_file_that_was_named(parts, tmp_path):
         (["--preset", "mjpeg"], "--preset is for methods"),
         (["--draws", "2"], "--draws is for methods"),
         (["--pairs", "2"], "--pairs is for methods"),
-        (["--method", "ideal", "--seed", "-1"], "--seed -1: must be 0 or above"),
-        (["--method", "ideal", "--out", "a.txt"], "ends in .json"),
-        (["--method", "half.py:extract", "--method", "folder/half.py:extract", "--out", "a.json"], "two methods"),
+        (["--method", "red_centroid", "--seed", "-1"], "--seed -1: must be 0 or above"),
+        (["--method", "red_centroid", "--out", "a.txt"], "ends in .json"),
+        (["--method", "red_centroid", "--method", "red_centroid", "--out", "a.json"], "two methods"),
+        (["--method", "red_centriod"], "no method 'red_centriod': did you mean 'red_centroid'?"),
+        (["--method", "red_centroid", "--pairs", "0"], "pairs = 0: must be 1 or above"),
     ],
 )
-def test_mistakes_are_one_sentence(parts, capsys, words, sentence):
-    assert cli.main(["score", "x", *words]) == 2
+def test_mistakes_are_one_sentence(bench_dataset, capsys, words, sentence):
+    assert cli.main(["score", str(bench_dataset), *words]) == 2
     err = capsys.readouterr().err
     assert sentence in err
     assert err.count("\n") == 1
