@@ -322,7 +322,7 @@ def test_the_off_frame_is_the_background_only_where_the_room_has_structure() -> 
 
     Without stripes the off frame would only add its noise: sqrt(2) of the background's, so it is not taken.
     """
-    plain, better = 0, 0
+    plain, better, pulls = 0, 0, []
     for number in range(COUNT):
         pair, truth = easy("bayer-raw", number), EasyPairs().truth(number)
         lined = striped(pair, truth.down.uv_px, 400.0)
@@ -338,9 +338,12 @@ def test_the_off_frame_is_the_background_only_where_the_room_has_structure() -> 
         assert known.uv_px is not None
         error = np.linalg.norm(np.subtract(known.uv_px, truth.down.uv_px))
         assert error < 0.1
+        pulls.append(np.subtract(known.uv_px, truth.down.uv_px) / np.sqrt(np.diag(known.covariance_px2)))
         better += blind.uv_px is None or error < np.linalg.norm(np.subtract(blind.uv_px, truth.down.uv_px))
     assert plain == 2 * COUNT
     assert better >= COUNT - 1
+    # 12 numbers of deviation 1: outside by chance 2e-4 and 1e-4 (chi squared); a covariance that is 9 times off is seen
+    assert 0.35 < np.sqrt(np.mean(np.square(pulls))) < 1.8
 
 
 def test_pulls_of_the_likelihood() -> None:
