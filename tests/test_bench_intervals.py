@@ -201,7 +201,7 @@ def test_a_rate_of_all_or_nothing_counts_samples():
 
 def test_few_samples_have_a_value_and_no_interval():
     (estimate,) = estimates([mean_of(alone(4), np.arange(4.0))], 4, RULES, np.random.default_rng(0))
-    assert (estimate.value, estimate.note) == (1.5, "fewer than 5 samples")
+    assert (estimate.value, estimate.note) == (1.5, "under 5 samples")
     assert math.isnan(estimate.low)
     (five,) = estimates([mean_of(alone(5), np.arange(5.0))], 5, RULES, np.random.default_rng(0))
     assert five.low < 2.0 < five.high

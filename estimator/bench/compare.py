@@ -107,6 +107,17 @@ def refuse_different(first: ScoreDocument, second: ScoreDocument, first_name: st
                 )
 
 
+def note_on_code(first: ScoreDocument, second: ScoreDocument) -> str:
+    """A warning if the code or the libraries that drew the frames differ between the runs; empty if not."""
+    a, b = (document.provenance for document in (first, second))
+    changed = [key for key in ("code_sha256", "packages") if a.get(key) != b.get(key)]
+    if not changed:
+        return ""
+    return (
+        f"the two runs differ in {' and '.join(changed)}: the frames may not be the same; score both again to be sure"
+    )
+
+
 def same_pairs(document: ScoreDocument) -> dict[str, Any]:
     """What must be equal for two scores to be of the same pairs."""
     return {key: value for key, value in document.pair_set.items() if key not in _MAY_DIFFER}

@@ -42,7 +42,7 @@ def leaderboard(documents: Sequence[ScoreDocument]) -> Table:
     """One line per method, best first; below each value its interval."""
     confidence = documents[0].rules["confidence"]
     grid = Table(title=f"Scores with {100 * confidence:g} % intervals over samples", show_lines=True)
-    grid.add_column("method")
+    grid.add_column("method", overflow="fold")
     grid.add_column("pairs", justify="right")
     for _, head, _, _ in BOARD:
         grid.add_column(head, justify="right")
