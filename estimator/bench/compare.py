@@ -17,7 +17,7 @@ import polars as pl
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.bench.bootstrap import Clusters, Estimate, Statistic, estimates
 from phibench.estimator.bench.document import ScoreDocument, read_records, read_score
-from phibench.estimator.bench.metrics import FAMILIES, METRICS, Metric, prepared, statistic_of
+from phibench.estimator.bench.metrics import FAMILIES, METRICS, Metric, prepared, statistic_of, trusted
 from phibench.estimator.bench.rules import Rules
 from phibench.scenes.frames import Array
 from phibench.scenes.streams import Name, generator
@@ -152,7 +152,8 @@ def _difference(name: str, a: pl.DataFrame, b: pl.DataFrame, rules: Rules, *stre
         return Difference(name, np.nan, np.nan, _NOTHING, 0, 0, "no difference shown")
     ours, theirs = (statistic_of(metric, clusters, table) for table in (a, b))
     everything = np.ones((1, clusters.n))
-    (difference,) = estimates([_minus(theirs, ours)], clusters.n, rules, generator(*stream, name))
+    (drawn,) = estimates([_minus(theirs, ours)], clusters.n, rules, generator(*stream, name))
+    difference = trusted(metric, drawn, clusters.n)
     first, second = (float(statistic(everything)[0]) for statistic in (ours, theirs))
     return Difference(name, first, second, difference, len(a), clusters.n, _verdict(metric, difference))
 
