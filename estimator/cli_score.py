@@ -67,13 +67,16 @@ def compare(first: Path, second: Path, *, seed: Whole = 0) -> int:
         Of the bootstrap that makes the intervals.
     """
     from phibench.estimator.bench.compare import compare as compare_scores
+    from phibench.estimator.bench.compare import note_on_code
     from phibench.estimator.bench.document import read_score
     from phibench.estimator.bench.tables import comparison
 
     differences = compare_scores(first, second, _seed(seed))
-    a, b = (_distinct(path, read_score(path)) for path in (first, second))
+    a, b = read_score(first), read_score(second)
     console = _console()
-    console.print(comparison(differences, a, b))
+    console.print(comparison(differences, _distinct(first, a), _distinct(second, b)))
+    if note := note_on_code(a, b):
+        console.print(f"note: {note}", soft_wrap=True)
     if all(item.better == "no difference shown" for item in differences):
         console.print("No metric shows a difference: every interval holds 0.")
     return 0
@@ -122,8 +125,8 @@ def _score_methods(
         documents.append(one.document if file is None else write_score(file, one.document, one.records))
     console.print(leaderboard(documents))
     console.print(cause_table(documents))
-    for document in documents:
-        console.print(strata_table(document))
+    if len(documents) == 1:
+        console.print(strata_table(documents[0]))
     for file in filter(None, files):
         console.print(f"written: {file}", soft_wrap=True)
     return 0

@@ -9,8 +9,8 @@ import pytest
 from bench_cases import Cases, cases, outcomes, sampler, scaled, shifted, silent, truth_itself
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.bench.compare import COMPARED, compare, compare_records
-from phibench.estimator.bench.document import MethodCard, write_score
+from phibench.estimator.bench.compare import COMPARED, compare, compare_records, note_on_code
+from phibench.estimator.bench.document import MethodCard, read_score, write_score
 from phibench.estimator.bench.metrics import METRICS
 from phibench.estimator.bench.records import records
 from phibench.estimator.bench.rules import Rules
@@ -116,6 +116,13 @@ def test_scores_on_disk_are_compared_over_the_pairs_of_both(tmp_path):
     found = {item.name: item for item in compare(whole, part)}
     assert found["rms_px"].n == 24
     assert found["rms_px"].better == "second"
+
+
+def test_other_code_is_noted(tmp_path):
+    d = read_score(write(tmp_path, "a", cases(10), truth_itself))
+    assert note_on_code(d, d) == ""
+    other = d.model_copy(update={"provenance": {**d.provenance, "code_sha256": "f" * 64}})
+    assert "differ in code_sha256" in note_on_code(d, other)
 
 
 @pytest.mark.parametrize("case", ["set", "rules", "truth", "no pair"])

@@ -7,6 +7,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from bench_cases import cases, outcomes, sampler
 from scipy.stats import binomtest, bootstrap
 
 from phibench.estimator.bench import bootstrap as ours
@@ -19,7 +20,9 @@ from phibench.estimator.bench.bootstrap import (
     rms_of,
     rms_ratio_of,
 )
+from phibench.estimator.bench.metrics import measure, prepared
 from phibench.estimator.bench.rates import clopper_pearson, rate
+from phibench.estimator.bench.records import records
 from phibench.estimator.bench.rules import Rules
 
 RULES = Rules(resamples=999)
@@ -201,10 +204,21 @@ def test_a_rate_of_all_or_nothing_counts_samples():
 
 def test_few_samples_have_a_value_and_no_interval():
     (estimate,) = estimates([mean_of(alone(4), np.arange(4.0))], 4, RULES, np.random.default_rng(0))
-    assert (estimate.value, estimate.note) == (1.5, "fewer than 5 samples")
+    assert (estimate.value, estimate.note) == (1.5, "under 5 samples")
     assert math.isnan(estimate.low)
     (five,) = estimates([mean_of(alone(5), np.arange(5.0))], 5, RULES, np.random.default_rng(0))
     assert five.low < 2.0 < five.high
+
+
+@pytest.mark.parametrize(("samples", "note"), [(49, "under 50 samples"), (50, "")])
+def test_a_95th_percentile_of_few_samples_has_no_interval(samples, note):
+    pairs = cases(samples)
+    table = prepared(records(pairs, outcomes(pairs, sampler()), RULES))
+    measured = measure(table, RULES, "tests", names=("p95_px", "median_px", "p95_depth_m"))
+    for name in ("p95_px", "p95_depth_m"):
+        assert measured[name].estimate.note == note
+        assert math.isnan(measured[name].estimate.low) == bool(note)
+    assert math.isfinite(measured["median_px"].estimate.low)
 
 
 def test_no_sample_is_nothing():

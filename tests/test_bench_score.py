@@ -268,6 +268,16 @@ def test_compare_of_what_is_not_there(tmp_path, capsys):
     assert capsys.readouterr().err.count("\n") == 1
 
 
+def test_a_method_is_named_by_the_end_of_its_reference():
+    assert MethodCard(reference="/home/me/my_phi.py:extract").name == "my_phi.py:extract"
+    assert MethodCard.of("a/b.py:f", name="b:f", sha256="1").name == "b:f"
+
+
+def test_a_report_of_no_files_is_refused(tmp_path, capsys):
+    assert cli.main(["report", "--out", str(tmp_path / "page.html")]) == 2
+    assert "no scores" in capsys.readouterr().err
+
+
 def test_the_document_is_strict(mine):
     raw = json.loads(mine.document.model_dump_json())
     with pytest.raises(ValueError, match="surprise"):

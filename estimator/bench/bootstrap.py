@@ -31,7 +31,7 @@ Statistic = Callable[[Array], Array]
 """Weights, shape (b, n samples), to values, shape (b,)."""
 
 EQUAL = "all resamples equal"
-FEW = "fewer than {} samples"
+FEW = "under {} samples"
 PERCENTILE = "BCa undefined: percentile interval"
 NOTHING = "nothing to compute it from"
 _AT_ONCE = 2**21  # weights held at a time: 16 MiB

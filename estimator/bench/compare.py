@@ -17,7 +17,7 @@ import polars as pl
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.bench.bootstrap import Clusters, Estimate, Statistic, estimates
 from phibench.estimator.bench.document import ScoreDocument, read_records, read_score
-from phibench.estimator.bench.metrics import FAMILIES, METRICS, Metric, prepared, statistic_of
+from phibench.estimator.bench.metrics import FAMILIES, METRICS, Metric, prepared, statistic_of, trusted
 from phibench.estimator.bench.rules import Rules
 from phibench.scenes.frames import Array
 from phibench.scenes.streams import Name, generator
@@ -107,6 +107,17 @@ def refuse_different(first: ScoreDocument, second: ScoreDocument, first_name: st
                 )
 
 
+def note_on_code(first: ScoreDocument, second: ScoreDocument) -> str:
+    """A warning if the code or the libraries that drew the frames differ between the runs; empty if not."""
+    a, b = (document.provenance for document in (first, second))
+    changed = [key for key in ("code_sha256", "packages") if a.get(key) != b.get(key)]
+    if not changed:
+        return ""
+    return (
+        f"the two runs differ in {' and '.join(changed)}: the frames may not be the same; score both again to be sure"
+    )
+
+
 def same_pairs(document: ScoreDocument) -> dict[str, Any]:
     """What must be equal for two scores to be of the same pairs."""
     return {key: value for key, value in document.pair_set.items() if key not in _MAY_DIFFER}
@@ -141,7 +152,8 @@ def _difference(name: str, a: pl.DataFrame, b: pl.DataFrame, rules: Rules, *stre
         return Difference(name, np.nan, np.nan, _NOTHING, 0, 0, "no difference shown")
     ours, theirs = (statistic_of(metric, clusters, table) for table in (a, b))
     everything = np.ones((1, clusters.n))
-    (difference,) = estimates([_minus(theirs, ours)], clusters.n, rules, generator(*stream, name))
+    (drawn,) = estimates([_minus(theirs, ours)], clusters.n, rules, generator(*stream, name))
+    difference = trusted(metric, drawn, clusters.n)
     first, second = (float(statistic(everything)[0]) for statistic in (ours, theirs))
     return Difference(name, first, second, difference, len(a), clusters.n, _verdict(metric, difference))
 

@@ -16,6 +16,7 @@ import numpy as np
 import polars as pl
 
 from phibench.estimator.bench.bootstrap import (
+    FEW,
     Clusters,
     Estimate,
     Statistic,
@@ -31,6 +32,8 @@ from phibench.estimator.bench.rules import Rules
 from phibench.scenes.frames import Array
 from phibench.scenes.streams import Name, generator
 
+LEAST_FOR_P95 = 50
+"""Samples below which a 95th percentile has no interval."""
 Better = Literal["lower", "higher", "none"]
 Kind = Literal["rate", "mean", "rms", "rms of each", "median", "p95", "efficiency", "deviation"]
 _DOWN, _DETECTED = pl.col("image") == "down", pl.col("detected")
@@ -203,8 +206,20 @@ def measure(
     return {name: found[name] for name in wanted}
 
 
+def trusted(metric: Metric, estimate: Estimate, samples: int) -> Estimate:
+    """The estimate, without its interval where that would not hold what it says.
+
+    With two images of each of n samples the interval of a 95th percentile covers in 56 % of the cases at n = 10, 88 %
+    at 25, 93 % at 50: below 50 samples the percentile hangs on the last few records, which resampling cannot vary.
+    """
+    if metric.kind != "p95" or samples >= LEAST_FOR_P95:
+        return estimate
+    return Estimate(estimate.value, math.nan, math.nan, FEW.format(LEAST_FOR_P95))
+
+
 @dataclass(frozen=True)
 class _Ready:
+    metric: Metric
     statistic: Statistic
     n: int
     samples: int
@@ -222,7 +237,7 @@ def _rates(metrics: dict[str, Metric], records: pl.DataFrame, clusters: Clusters
 def _statistics(metrics: dict[str, Metric], records: pl.DataFrame, clusters: Clusters) -> dict[str, _Ready]:
     """Every metric that is resampled."""
     return {
-        name: _Ready(statistic_of(metric, clusters, records), len(records), clusters.n)
+        name: _Ready(metric, statistic_of(metric, clusters, records), len(records), clusters.n)
         for name, metric in metrics.items()
         if clusters.n and metric.kind != "rate"
     }
@@ -234,7 +249,7 @@ def _resampled(ready: dict[str, _Ready], rules: Rules, rng: np.random.Generator)
     samples = next(iter(ready.values())).samples
     numbers = estimates([item.statistic for item in ready.values()], samples, rules, rng)
     return {
-        name: Measured(number, item.n, item.samples)
+        name: Measured(trusted(item.metric, number, item.samples), item.n, item.samples)
         for (name, item), number in zip(ready.items(), numbers, strict=True)
     }
 
