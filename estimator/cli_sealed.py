@@ -50,7 +50,7 @@ def submit(public: Path, *, method: str, out: Path, workers: Whole | None = None
     public
         Folder of the sealed set.
     method
-        Name of a built-in method, or a file.
+        Name of a built-in method, or a file and its function, such as mine.py:extract.
     out
         JSON file to write.
     workers
@@ -83,7 +83,6 @@ def unseal(public: Path, *, truth: Path, submission: Path, out: Path | None = No
 
     opened = unseal_set(public, truth, submission)
     print(f"seal {opened.seal.id}: the truth is the sealed one, the submission has each of {opened.seal.pairs} pairs")
-    sent = opened.submission
-    document = scorer()(sent.method, sent.method_sha256, opened.pairs, opened.outcomes, out)
+    document = scorer()(opened.submission.method.model_dump(), opened.pairs, opened.outcomes, out)
     print(json.dumps(document, indent=1, allow_nan=False) if out is None else f"{out}: the score")
     return 0

@@ -47,6 +47,13 @@ def run(_: str, pairs: PairSet) -> Sequence[Outcome]:
     return [*outcomes, Outcome(1, None, math.nan, "error", "ValueError: no spot")]
 
 
+def describe(reference: str) -> dict[str, str | None]:
+    """What the seat says of a method in a file."""
+    place, _, function = reference.rpartition(":")
+    digest = hashlib.sha256(Path(place).read_bytes()).hexdigest() if place else None
+    return {"name": Path(place).stem, "kind": "file", "place": place, "function": function, "sha256": digest}
+
+
 @pytest.fixture(scope="module")
 def sealed(bench_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Sealed:
     folder = tmp_path_factory.mktemp("private")
@@ -59,7 +66,7 @@ def submitted(sealed: Sealed, tmp_path_factory: pytest.TempPathFactory) -> Path:
     method = tmp_path_factory.mktemp("method") / "mine.py"
     method.write_text("def extract(pair): ...\n")
     out = method.with_name("submission.json")
-    done = submit(sealed.public, f"{method}:extract", out, run)
+    done = submit(sealed.public, f"{method}:extract", out, run, describe)
     assert (done.pairs, done.answered) == (9, 8)
     return out
 
@@ -229,8 +236,8 @@ def test_a_submission_comes_back_as_it_was(sealed: Sealed, submitted: Path) -> N
 
 def test_a_submission_names_its_method_by_hash_and_no_path(submitted: Path) -> None:
     document = read_submission(submitted)
-    assert document.method == "mine.py:extract"
-    assert document.method_sha256 == hashlib.sha256(b"def extract(pair): ...\n").hexdigest()
+    assert (document.method.name, document.method.function) == ("mine", "extract")
+    assert document.method.sha256 == hashlib.sha256(b"def extract(pair): ...\n").hexdigest()
     assert str(submitted.parent) not in submitted.read_text()
     assert len(outcomes_of(document)) == 9
 
@@ -293,7 +300,7 @@ def test_another_submission_is_refused(
 
 def test_a_run_that_leaves_a_pair_out_writes_nothing(sealed: Sealed, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="the run lacks pair 0"):
-        submit(sealed.public, "m", tmp_path / "s.json", lambda m, pairs: run(m, pairs)[1:])
+        submit(sealed.public, "m", tmp_path / "s.json", lambda m, pairs: run(m, pairs)[1:], describe)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -308,7 +315,7 @@ def test_a_changed_frame_is_refused(sealed: Sealed, submitted: Path, copy: Path,
     flip(frame)
     assert f"{frame.name} was changed" in refusal(copy, sealed.truth_file, submitted)
     with pytest.raises(DatasetError, match=f"{frame.name} was changed"):
-        submit(copy, "m", tmp_path / "s.json", run)
+        submit(copy, "m", tmp_path / "s.json", run, describe)
     with pytest.raises(DatasetError, match=f"{frame.name} was changed"):
         SealedPairs(copy).pair(int(frame.name[:6]))
 
@@ -369,10 +376,11 @@ def test_the_commands_say_what_they_did(
     sealed: Sealed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(wiring, "harness", lambda workers=None: run)
+    monkeypatch.setattr("phibench.estimator.bench.submission.describer", lambda: describe)
     scored: list[Any] = []
 
-    def score(method: str, sha256: str | None, pairs: PairSet, outcomes: Any, out: Path | None) -> dict[str, Any]:
-        scored.append((method, len(pairs), len(outcomes), pairs.truth(0).number))
+    def score(method: Any, pairs: PairSet, outcomes: Any, out: Path | None) -> dict[str, Any]:
+        scored.append((method["function"], len(pairs), len(outcomes), pairs.truth(0).number))
         return {"rms_px": 0.5}
 
     monkeypatch.setattr(wiring, "scorer", lambda: score)
@@ -421,17 +429,17 @@ def test_the_benchmark_runs_what_accepts_each_preset(bench_dataset: Path, tmp_pa
         ran.append((method, len(pairs)))
         return run(method, pairs)
 
-    def score(method: str, _: str | None, pairs: PairSet, outcomes: Any, path: Path | None) -> dict[str, Any]:
+    def score(method: Any, pairs: PairSet, outcomes: Any, path: Path | None) -> dict[str, Any]:
         assert path is not None
         path.parent.mkdir(exist_ok=True)
-        path.write_text(json.dumps({"method": method, "outcomes": len(outcomes)}))
+        path.write_text(json.dumps({**method, "outcomes": len(outcomes)}))
         return {}
 
     def report(paths: Sequence[Path], page: Path) -> Path:
         page.write_text(" ".join(path.name for path in paths))
         return page
 
-    parts = Parts({"raw": RawOnly(), "any": Everything()}, counted, score, report)
+    parts = Parts({"raw": RawOnly(), "any": Everything()}, describe, counted, score, report)
     done = bench(bench_dataset, tmp_path / "out", parts=parts, console=quiet())
     assert [path.stem for path in done.scores] == ["bayer-raw-raw", "bayer-raw-any", "srgb8-any", "mjpeg-any"]
     assert done.notes == ("raw is left out on srgb8: takes raw", "raw is left out on mjpeg: takes raw")

@@ -15,7 +15,17 @@ from rich.console import Console
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import Dataset, open_finished
 from phibench.estimator.bench.dataset_pairs import DatasetPairs, dataset_pairs
-from phibench.estimator.bench.wiring import Report, Run, Score, built_in, harness, reporter, scorer
+from phibench.estimator.bench.wiring import (
+    Describe,
+    Report,
+    Run,
+    Score,
+    built_in,
+    describer,
+    harness,
+    reporter,
+    scorer,
+)
 from phibench.estimator.seat.pair import Box
 
 PRESETS = ("bayer-raw", "srgb8", "mjpeg")
@@ -29,6 +39,7 @@ class Parts:
     """What the benchmark is put together from; a test gives its own."""
 
     methods: Mapping[str, Any]
+    describe: Describe
     run: Run
     score: Score
     report: Report
@@ -36,7 +47,7 @@ class Parts:
     @classmethod
     def installed(cls, workers: int | None = None) -> Parts:
         """Those of this installation."""
-        return cls(built_in(), harness(workers), scorer(), reporter())
+        return cls(built_in(), describer(), harness(workers), scorer(), reporter())
 
 
 @dataclass(frozen=True)
@@ -85,7 +96,7 @@ def bench(
                 continue
             console.print(f"{preset}: {name} on {len(pairs)} pairs", highlight=False)
             path = out / f"{preset}-{name}.json"
-            parts.score(name, None, pairs, parts.run(name, pairs), path)
+            parts.score(parts.describe(name), pairs, parts.run(name, pairs), path)
             scores.append(path)
     return Benched(parts.report(scores, out / REPORT), tuple(scores), tuple(notes))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,12 +13,12 @@ from typing import Annotated, Any
 from pydantic import Field, ValidationError
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.files import sha256, write_text
+from phibench.datasets.files import write_text
 from phibench.datasets.provenance import provenance
 from phibench.datasets.schema import Document, Number, Vector2
 from phibench.estimator.bench.seal_layout import Seal
 from phibench.estimator.bench.sealed_pairs import SealedPairs
-from phibench.estimator.bench.wiring import Run, harness
+from phibench.estimator.bench.wiring import Describe, Run, describer, harness
 from phibench.estimator.seat.outcome import Outcome
 from phibench.estimator.seat.pair import Answer, Spot
 
@@ -49,14 +49,23 @@ class AnswerLine(Document):
     message: str
 
 
+class MethodLine(Document):
+    """Which method it was; `sha256` is the hash of its file or of the code behind it, null for a package."""
+
+    name: str
+    kind: str
+    function: str
+    sha256: str | None
+    version: str | None
+
+
 class Submission(Document):
-    """`submission.json`; `seal` is the id of the sealed set, `method_sha256` the hash of the method's own file."""
+    """`submission.json`; `seal` is the id of the sealed set."""
 
     format: str
     seal: str
     task_version: int
-    method: str
-    method_sha256: str | None
+    method: MethodLine
     provenance: dict[str, Any]
     answers: Annotated[tuple[AnswerLine, ...], Field(strict=False)]
 
@@ -70,7 +79,9 @@ class Submitted:
     answered: int
 
 
-def submit(public: str | Path, method: str, out: str | Path, run: Run | None = None) -> Submitted:
+def submit(
+    public: str | Path, method: str, out: str | Path, run: Run | None = None, describe: Describe | None = None
+) -> Submitted:
     """Run a method on a sealed set and write its answers.
 
     Parameters
@@ -81,6 +92,8 @@ def submit(public: str | Path, method: str, out: str | Path, run: Run | None = N
     out : JSON file to write
     run : callable, optional
         Runs the method; by default the harness.
+    describe : callable, optional
+        Finds the method and says which it is; by default the seat's.
 
     Raises
     ------
@@ -91,22 +104,21 @@ def submit(public: str | Path, method: str, out: str | Path, run: Run | None = N
     if out.is_dir():
         raise DatasetError(f"{out} is a folder; give a file such as submission.json, --out")
     pairs.check()
+    described = (describe or describer())(method)
     outcomes = (run or harness())(method, pairs)
-    document = submission(pairs.seal, method, outcomes)
+    document = submission(pairs.seal, described, outcomes)
     check_complete(document, pairs.seal, "the run")
     write_text(out, json.dumps(document.model_dump(mode="json"), indent=1, allow_nan=False) + "\n")
     return Submitted(out, len(outcomes), sum(outcome.answer is not None for outcome in outcomes))
 
 
-def submission(seal: Seal, method: str, outcomes: Sequence[Outcome]) -> Submission:
-    """Document of a method's outcomes on a sealed set, by number."""
-    file = Path(method.partition(":")[0])
+def submission(seal: Seal, method: Mapping[str, str | None], outcomes: Sequence[Outcome]) -> Submission:
+    """Document of a method's outcomes on a sealed set, by number; without the place of the method's file."""
     return Submission(
         format=FORMAT,
         seal=seal.id,
         task_version=seal.task_version,
-        method=file.name + method[len(str(file)) :] if file.is_file() else method,  # no paths of somebody's machine
-        method_sha256=sha256(file) if file.is_file() else None,
+        method=MethodLine.model_validate({name: method.get(name) for name in MethodLine.model_fields}),
         provenance=provenance(),
         answers=tuple(_line(outcome) for outcome in sorted(outcomes, key=lambda outcome: outcome.number)),
     )

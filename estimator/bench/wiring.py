@@ -16,8 +16,10 @@ from phibench.estimator.seat.outcome import Outcome
 
 Run = Callable[[str, PairSet], Sequence[Outcome]]
 """Runs a method, given by its reference, on all pairs of a set."""
-Score = Callable[[str, str | None, PairSet, Sequence[Outcome], Path | None], dict[str, Any]]
-"""Scores outcomes of a method (reference, hash of its file or None) and writes the score, if a JSON file is given."""
+Describe = Callable[[str], Mapping[str, str | None]]
+"""What is known of a method, given by its reference: name, kind, place, function, sha256, version."""
+Score = Callable[[Mapping[str, str | None], PairSet, Sequence[Outcome], Path | None], dict[str, Any]]
+"""Scores outcomes of a method, given by its description, and writes the score, if a JSON file is given."""
 Report = Callable[[Sequence[Path], Path], Path]
 """Writes one HTML page about score files."""
 
@@ -27,6 +29,12 @@ def harness(workers: int | None = None) -> Run:
     run_method = _found("phibench.estimator.seat.harness", "run_method")
     options = {} if workers is None else {"workers": workers}
     return lambda method, pairs: list(run_method(method, pairs, **options))
+
+
+def describer() -> Describe:
+    """Return what finds a method and describes it."""
+    resolve = _found("phibench.estimator.seat.resolve", "resolve")
+    return lambda method: dict(resolve(method).document())
 
 
 def built_in() -> Mapping[str, Any]:
@@ -42,9 +50,9 @@ def scorer() -> Score:
     rules = _found("phibench.estimator.bench.rules", "Rules")
 
     def score(
-        method: str, method_sha256: str | None, pairs: PairSet, outcomes: Sequence[Outcome], path: Path | None
+        method: Mapping[str, str | None], pairs: PairSet, outcomes: Sequence[Outcome], path: Path | None
     ) -> dict[str, Any]:
-        found = score_outcomes(card(reference=method, sha256=method_sha256), pairs, outcomes, rules())
+        found = score_outcomes(card.of(method["name"], **method), pairs, outcomes, rules())
         document = found.document if path is None else write(path, found.document, found.records)
         as_json: dict[str, Any] = document.model_dump(mode="json")
         return as_json
