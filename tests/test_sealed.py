@@ -22,7 +22,7 @@ from phibench.estimator import cli
 from phibench.estimator.bench import wiring
 from phibench.estimator.bench.dataset_pairs import dataset_pairs
 from phibench.estimator.bench.pair_set import PairSet
-from phibench.estimator.bench.run_all import Parts, bench, show
+from phibench.estimator.bench.run_all import KeptPairs, Parts, bench, show
 from phibench.estimator.bench.seal import Sealed, seal, seed_warnings
 from phibench.estimator.bench.sealed_pairs import SealedPairs
 from phibench.estimator.bench.submission import outcomes_of, read_submission, submit
@@ -450,3 +450,13 @@ def test_the_benchmark_runs_what_accepts_each_preset(bench_dataset: Path, tmp_pa
         bench(bench_dataset, tmp_path / "out", ["x"], parts, quiet())
     with pytest.raises(DatasetError, match="lies inside the data set"):
         bench(bench_dataset, bench_dataset / "out", None, parts, quiet())
+
+
+def test_pairs_that_are_few_are_drawn_once(sealed: Sealed, monkeypatch: pytest.MonkeyPatch) -> None:
+    pairs = SealedPairs(sealed.public)
+    kept = KeptPairs(pairs)
+    assert kept.pair(3) is kept.pair(3)
+    assert np.array_equal(kept.pair(3).up, pairs.pair(3).up)
+    assert (len(kept), kept.document()) == (9, pairs.document())
+    monkeypatch.setattr("phibench.estimator.bench.run_all._KEPT", 8)
+    assert kept.pair(4) is not kept.pair(4)

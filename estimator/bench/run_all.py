@@ -14,7 +14,9 @@ from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import Dataset, open_finished
-from phibench.estimator.bench.dataset_pairs import DatasetPairs, dataset_pairs
+from phibench.estimator.bench.dataset_pairs import dataset_pairs
+from phibench.estimator.bench.pair_set import PairSet
+from phibench.estimator.bench.truth import PairTruth
 from phibench.estimator.bench.wiring import (
     Describe,
     Report,
@@ -26,11 +28,13 @@ from phibench.estimator.bench.wiring import (
     reporter,
     scorer,
 )
-from phibench.estimator.seat.pair import Box
+from phibench.estimator.seat.pair import Box, Pair
 
 PRESETS = ("bayer-raw", "srgb8", "mjpeg")
 """Of a data set whose recipe has no `[frames]`."""
 REPORT = "report.html"
+_KEPT = 32
+"""Pairs of a preset that stay in memory, some 10 MB each: up to so many are drawn once for all methods."""
 _PROBE_BOX = Box(0, 0, 16, 16)  # a method that needs boxes takes the pairs that have some
 
 
@@ -89,7 +93,7 @@ def bench(
         raise DatasetError(f"{out} lies inside the data set, whose files are signed; give a folder outside, --out")
     scores, notes = [], []
     for preset in _presets(dataset):
-        pairs = dataset_pairs(dataset, preset)
+        pairs = KeptPairs(dataset_pairs(dataset, preset))
         for name in chosen:
             if why := refusal(parts.methods[name], pairs):
                 notes.append(f"{name} is left out on {preset}: {why}")
@@ -101,7 +105,39 @@ def bench(
     return Benched(parts.report(scores, out / REPORT), tuple(scores), tuple(notes))
 
 
-def refusal(method: Any, pairs: DatasetPairs) -> str:
+class KeptPairs:
+    """Pairs that are drawn once where they are few.
+
+    Parameters
+    ----------
+    pairs : PairSet
+    """
+
+    def __init__(self, pairs: PairSet) -> None:
+        self._pairs = pairs
+        self._drawn: dict[int, Pair] = {}
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def pair(self, number: int) -> Pair:
+        """What a method sees; its arrays are read-only, so that all may have the same."""
+        if len(self) > _KEPT:
+            return self._pairs.pair(number)
+        if number not in self._drawn:
+            self._drawn[number] = self._pairs.pair(number)
+        return self._drawn[number]
+
+    def truth(self, number: int) -> PairTruth:
+        """The exact answer."""
+        return self._pairs.truth(number)
+
+    def document(self) -> dict[str, Any]:
+        """Provenance of the set."""
+        return self._pairs.document()
+
+
+def refusal(method: Any, pairs: PairSet) -> str:
     """Why a built-in method cannot take the pairs of a preset; "" if it can."""
     why: str = method.refusal(replace(pairs.pair(0), box_down=_PROBE_BOX, box_up=_PROBE_BOX))
     return why
