@@ -1,7 +1,7 @@
 """What a run will take: bytes and seconds, from what each kind of task took on one core.
 
 CPU seconds on one core of a 2-core AMD EPYC virtual machine, llvm_ad_rgb, room `lab`, 1280 x 720; another machine
-differs by its speed. `make bench` shows the forecast beside a run.
+differs by its speed. `make benchmark` shows the forecast beside a run.
 The light map is counted as if no cache held it.
 """
 

@@ -51,7 +51,7 @@ def submit(public: Path, *, method: str, out: Path, workers: Whole = 1) -> int:
     public
         Folder of the sealed set.
     method
-        Name of a built-in method, or a file.
+        Name of a method, or a file and its function, such as mine.py:extract.
     out
         JSON file to write.
     workers

@@ -1,4 +1,4 @@
-"""Benchmark: CPU time of a view at equal noise, light map against path tracing, both in one run (`make bench`)."""
+"""Benchmark: CPU time of a view at equal noise, light map against path tracing, both in one run (`make benchmark`)."""
 
 from __future__ import annotations
 

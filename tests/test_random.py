@@ -264,7 +264,7 @@ def shipped(count: int) -> Any:
 
 
 def test_planning_ten_thousand_samples(benchmark: Any) -> None:
-    """Plan and tasks of 10 000 samples (`make bench`)."""
+    """Plan and tasks of 10 000 samples (`make benchmark`)."""
     if benchmark.disabled:
         pytest.skip("a benchmark")
     recipe = load_recipe("random").model_copy(update={"random": shipped(10_000)})

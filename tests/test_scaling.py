@@ -1,4 +1,4 @@
-"""Benchmarks of the generator: tasks per hour at 1 and 2 workers, and what the forecast said (`make bench`)."""
+"""Benchmarks of the generator: tasks per hour at 1 and 2 workers, and what the forecast said (`make benchmark`)."""
 
 import os
 import time
