@@ -39,6 +39,16 @@ def test_a_file_is_found_hashed_and_not_run(tmp_path: Path) -> None:
     assert (tmp_path / "ran").exists()
 
 
+def test_a_file_that_was_edited_in_the_meantime_is_refused(tmp_path: Path) -> None:
+    found = resolve(written(tmp_path, "def extract(pair):\n    return 1\n"))
+    written(tmp_path, "def extract(pair):\n    return 2\n")
+    with pytest.raises(MethodError, match="was changed or removed"):
+        load(found)
+    (tmp_path / "my_phi.py").unlink()
+    with pytest.raises(MethodError, match="was changed or removed"):
+        load(found)
+
+
 def test_a_relative_path_is_made_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     written(tmp_path, "def extract(pair): return 1")
     monkeypatch.chdir(tmp_path)

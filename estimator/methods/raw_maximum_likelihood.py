@@ -2,11 +2,12 @@
 
 What it takes as known: the card's noise (PRNU and DSNU count as noise), the rig's detector for the filters' response
 at the laser line, and the blur that the rig predicts at the pixel (`blur.spot_sigma_px`). A rough mirror's blur is not
-predicted: there the width is fitted as well.
+predicted: there the width is fitted as well. Where the room behind the spot is not flat, chi2 widens the covariance.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from phibench.estimator.status import Status, describe
 from phibench.scenes.frames import Array
 
 _STRUCTURE_SIGMAS = 4.0  # by which the off frame's chi2 must exceed that of a flat room
+_MISFIT_SIGMAS = 3.0  # by which the fit's chi2 must exceed 1 before its covariance is widened
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ def raw_maximum_likelihood(sight: Sight) -> Spot:
         rig.mirror.roughness_alpha > 0.0,
         card.saturation_e,
     )
-    return _spot(fit)
+    return _spot(fit, near.pixels.size)
 
 
 def _background(near: Sight, noise: PixelNoise) -> _Background:
@@ -74,7 +76,7 @@ def _background(near: Sight, noise: PixelNoise) -> _Background:
     chi2 = float(np.mean((electrons - levels) ** 2 / noise.variance_e2(levels)))
     if chi2 < 1.0 + _STRUCTURE_SIGMAS * np.sqrt(2.0 / count):
         return _Background(None, noise)
-    added = float(np.mean(noise.variance_e2(levels)))
+    added = float(np.max(noise.variance_e2(levels)))  # that of the red pixels, which tell where the spot is
     return _Background(electrons, replace(noise, gaussian_e2=noise.gaussian_e2 + added))
 
 
@@ -87,9 +89,12 @@ def _levels(near: Sight, electrons: Array) -> Array:
     return means[filters]
 
 
-def _spot(fit: SpotFit) -> Spot:
+def _spot(fit: SpotFit, count: int) -> Spot:
     status = Status(int(fit.status[0]))
     if status is not Status.OK:
         return Spot.missing(describe(status))
-    (a, b), (c, d) = fit.covariance_px2[0].tolist()
+    # a room that the model does not follow shows in chi2; the claim is widened by it, as for any fit of least squares
+    chi2 = float(fit.chi2[0])
+    widened = chi2 if chi2 > 1.0 + _MISFIT_SIGMAS * math.sqrt(2.0 / count) else 1.0
+    (a, b), (c, d) = (widened * fit.covariance_px2[0]).tolist()
     return Spot((float(fit.uv_px[0, 0]), float(fit.uv_px[0, 1])), ((a, b), (c, d)))

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from phibench.datasets.files import sha256
 from phibench.estimator.seat.errors import MethodError
 from phibench.estimator.seat.pair import Method
 from phibench.estimator.seat.reference import Reference
@@ -25,7 +26,7 @@ def load(reference: Reference) -> Method:
     Raises
     ------
     MethodError
-        If the import fails, the function is missing, is no function, or does not take one pair.
+        If the file has changed, the import fails, the function is missing, is no function, or does not take one pair.
     """
     if reference.kind == "built-in":
         from phibench.estimator.methods.registry import KNOWN  # a second of imports that a user's method need not have
@@ -60,6 +61,9 @@ def _title(reference: Reference) -> str:
 
 def _from_file(reference: Reference) -> Any:
     path = Path(reference.place)
+    # a process that is started anew in the middle of a run must not take up an edited file
+    if not path.is_file() or sha256(path) != reference.sha256:
+        raise MethodError(f"{path.name} was changed or removed after it was looked up: run it again")
     sys.path.insert(0, str(path.parent))  # a method may import what lies beside it
     spec = importlib.util.spec_from_file_location(_MODULE, path)
     if spec is None or spec.loader is None:
