@@ -84,12 +84,20 @@ def test_a_brighter_region_is_a_distraction():
     assert cause(answer=(304.0, 104.0), image=image) == "method"
 
 
-def test_with_a_laser_off_image_the_difference_counts():
+def test_a_region_may_be_brighter_in_the_image_or_in_its_difference_to_the_laser_off_image():
     lamp = np.zeros_like(image_of(TRUTH.down))
     lamp[100:110, 300:310] = 250
-    image = image_of(TRUTH.down) + lamp
-    assert cause(answer=(304.0, 104.0), image=image, off=lamp) == "method"  # bright, but there without the laser
-    assert cause(answer=(304.0, 104.0), image=image, off=np.zeros_like(lamp)) == "confused"
+    dim = lamp // 25  # 30 codes in three planes, against a mean of 74 over the spot's 4 x 4 pixels
+    u, v = (round(x) for x in UV)
+    room = np.zeros_like(lamp)
+    room[v - 20 : v + 20, u - 20 : u + 20] = 120
+    spot = image_of(TRUTH.down)
+    assert cause(answer=(304.0, 104.0), image=spot + lamp, off=lamp) == "confused"  # there without the laser as well
+    assert cause(answer=(304.0, 104.0), image=spot + dim, off=np.zeros_like(lamp)) == "method"
+    dark = np.maximum(spot, room)  # the spot adds nothing but in its middle
+    shown = dark + lamp // 5  # 50 codes: darker than the room, brighter than what the spot adds to it
+    assert cause(answer=(304.0, 104.0), image=shown, off=None) == "method"
+    assert cause(answer=(304.0, 104.0), image=shown, off=room) == "confused"
 
 
 def test_an_answer_outside_the_image_is_no_region():

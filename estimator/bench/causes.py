@@ -8,8 +8,9 @@ position) or **false** (a position where there is no spot, or too far from it). 
    or visible and nearer to the outline than 3 blurs, where part of its light is cut off.
 3. ``image_edge``: the same with the edge of the sensor.
 4. ``saturated``: a pixel of the spot is expected above saturation: its shape is lost.
-5. ``confused``: the position is within `match_px` of another light of the scene, or of a region that is brighter in the
-   image than the spot: mean of 4 x 4 pixels (two Bayer cells), less the laser-off image if there is one.
+5. ``confused``: the position is within `match_px` of another light of the scene, or of a region that is brighter than
+   the spot, in the image as it is or less the laser-off image if there is one: mean of 4 x 4 pixels (two Bayer cells).
+   A lamp that the laser-off image would have ruled out is still what the method was confused by.
 6. ``below_noise``: flux below 5 standard deviations. In 1280 x 720 pixels of Gaussian noise the largest is at 4.9
    standard deviations on average, so that a fainter spot cannot be told from noise in the whole image (A. Rose, J.
    Opt. Soc. Am. 38, 196, 1948, found the same 5 for the eye).
@@ -187,7 +188,8 @@ def _confused(case: Case) -> bool:
     others = (np.array(other.uv_px) for other in case.spot.distractions)
     if any(np.linalg.norm(case.answer_px - other) <= case.rules.match_px for other in others):
         return True
-    return _level(case, case.answer_px) > _level(case, np.array(case.spot.uv_px))
+    true_px = np.array(case.spot.uv_px)
+    return any(_level(case, case.answer_px, off) > _level(case, true_px, off) for off in (False, True))
 
 
 def _below_noise(case: Case) -> bool:
@@ -222,9 +224,9 @@ def _planes(image: Any) -> Array:
     return planes[..., None] if planes.ndim == 2 else planes
 
 
-def _level(case: Case, uv_px: Array) -> float:
+def _level(case: Case, uv_px: Array, less_off: bool) -> float:
     """Mean of the 4 x 4 pixels around a position, all planes added; -inf outside the image."""
-    part = case.region(uv_px, 1, 2, less_off=True)
+    part = case.region(uv_px, 1, 2, less_off)
     return float(part.sum(axis=-1).mean()) if part.size else -np.inf
 
 
