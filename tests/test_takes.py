@@ -253,6 +253,7 @@ def test_tables_in_one_line_are_refused_rather_than_ignored() -> None:
         with_numbers(text, "t", None, 4)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("inline")
 def test_make_renders_what_the_command_line_says(tmp_path: Path) -> None:
     from phibench.datasets.repair import repair
