@@ -6,13 +6,13 @@ import hashlib
 import json
 import math
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from bench_samples import hidden
+from bench_samples import describe, hidden, run
 from PIL import Image
 from test_make import quiet
 
@@ -22,36 +22,12 @@ from phibench.estimator import cli
 from phibench.estimator.bench import wiring
 from phibench.estimator.bench.dataset_pairs import dataset_pairs
 from phibench.estimator.bench.pair_set import PairSet
-from phibench.estimator.bench.run_all import KeptPairs, Parts, bench, show
 from phibench.estimator.bench.seal import Sealed, seal, seed_warnings
 from phibench.estimator.bench.sealed_pairs import SealedPairs
 from phibench.estimator.bench.submission import outcomes_of, read_submission, submit
 from phibench.estimator.bench.truth import PairTruth
 from phibench.estimator.bench.truth_file import truth_document, truth_of
 from phibench.estimator.bench.unseal import unseal
-from phibench.estimator.seat.outcome import Outcome
-from phibench.estimator.seat.pair import Answer, Pair, Spot
-
-
-def guess(pair: Pair) -> Answer:
-    """Brightest pixel: deterministic, and of this pair."""
-    image = pair.down if pair.down.ndim == 2 else pair.down[..., 0]
-    v, u = np.unravel_index(int(image.argmax()), image.shape)
-    found = Spot((float(u), float(v)), ((0.1, 0.01), (0.01, 0.2)), 0.5, "normal")
-    return Answer(found, Spot.missing("not looked for"), 2.0, math.inf)
-
-
-def run(_: str, pairs: PairSet) -> Sequence[Outcome]:
-    """Harness of these tests: in this process; pair 1 fails."""
-    outcomes = [Outcome(i, guess(pairs.pair(i)), 0.25) for i in range(len(pairs)) if i != 1]
-    return [*outcomes, Outcome(1, None, math.nan, "error", "ValueError: no spot")]
-
-
-def describe(reference: str) -> dict[str, str | None]:
-    """What the seat says of a method in a file."""
-    place, _, function = reference.rpartition(":")
-    digest = hashlib.sha256(Path(place).read_bytes()).hexdigest() if place else None
-    return {"name": Path(place).stem, "kind": "file", "place": place, "function": function, "sha256": digest}
 
 
 @pytest.fixture(scope="module")
@@ -369,7 +345,7 @@ def test_an_interrupted_seal_leaves_nothing(
     assert not list(copy.glob("seal_*"))
 
 
-# Command line and the whole benchmark
+# Command line
 
 
 def test_the_commands_say_what_they_did(
@@ -407,56 +383,3 @@ def test_seal_on_the_command_line_warns_of_its_seed(
     assert len(list(copy.glob("seal_*.truth.json"))) == 1
     assert cli.main(tokens) == 2
     assert "not an empty folder" in capsys.readouterr().err
-
-
-class RawOnly:
-    """A built-in method, as far as the benchmark looks at it."""
-
-    def refusal(self, pair: Pair) -> str:
-        if pair.box_down is None:
-            return "needs region hints"
-        return "" if pair.card.output == "raw" else "takes raw"
-
-
-def test_the_benchmark_runs_what_accepts_each_preset(bench_dataset: Path, tmp_path: Path) -> None:
-    class Everything(RawOnly):
-        def refusal(self, pair: Pair) -> str:
-            return ""
-
-    ran: list[tuple[str, int]] = []
-
-    def counted(method: str, pairs: PairSet) -> Sequence[Outcome]:
-        ran.append((method, len(pairs)))
-        return run(method, pairs)
-
-    def score(method: Any, pairs: PairSet, outcomes: Any, path: Path | None) -> dict[str, Any]:
-        assert path is not None
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(json.dumps({**method, "outcomes": len(outcomes)}))
-        return {}
-
-    def report(paths: Sequence[Path], page: Path) -> Path:
-        page.write_text(" ".join(path.name for path in paths))
-        return page
-
-    parts = Parts({"raw": RawOnly(), "any": Everything()}, describe, counted, score, report)
-    done = bench(bench_dataset, tmp_path / "out", parts=parts, console=quiet())
-    assert [path.stem for path in done.scores] == ["bayer-raw-raw", "bayer-raw-any", "srgb8-any", "mjpeg-any"]
-    assert done.notes == ("raw is left out on srgb8: takes raw", "raw is left out on mjpeg: takes raw")
-    assert ran == [("raw", 3), ("any", 3), ("any", 3), ("any", 3)]
-    assert "bayer-raw-raw.json" in done.report.read_text()
-    assert not show(done.report)  # no terminal here
-    with pytest.raises(DatasetError, match="no built-in method 'x'; known: raw, any"):
-        bench(bench_dataset, tmp_path / "out", ["x"], parts, quiet())
-    with pytest.raises(DatasetError, match="lies inside the data set"):
-        bench(bench_dataset, bench_dataset / "out", None, parts, quiet())
-
-
-def test_pairs_that_are_few_are_drawn_once(sealed: Sealed, monkeypatch: pytest.MonkeyPatch) -> None:
-    pairs = SealedPairs(sealed.public)
-    kept = KeptPairs(pairs)
-    assert kept.pair(3) is kept.pair(3)
-    assert np.array_equal(kept.pair(3).up, pairs.pair(3).up)
-    assert (len(kept), kept.document()) == (9, pairs.document())
-    monkeypatch.setattr("phibench.estimator.bench.run_all._KEPT", 8)
-    assert kept.pair(4) is not kept.pair(4)
