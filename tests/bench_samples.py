@@ -1,13 +1,21 @@
-"""Data sets of many samples that share the rendered layers of one: for tests of what is drawn per sample."""
+"""Data sets of many samples that share the rendered layers of one, and a method and a harness for tests."""
 
 from __future__ import annotations
 
+import hashlib
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from phibench.datasets.read import Dataset, open_dataset
 from phibench.datasets.recipe import Recipe
+from phibench.estimator.bench.pair_set import PairSet
+from phibench.estimator.seat.outcome import Outcome
+from phibench.estimator.seat.pair import Answer, Pair, Spot
 
 
 def many(folder: Path, count: int, /, **tables: Any) -> Dataset:
@@ -30,3 +38,24 @@ def hidden(dataset: Dataset, *positions: str) -> Dataset:
     row = dataset.rows[0]
     spots = {p: row.position(p).model_copy(update={"visible": False, "cause": "occluded:crate"}) for p in positions}
     return replace(dataset, rows=(row.model_copy(update=spots), *dataset.rows[1:]))
+
+
+def guess(pair: Pair) -> Answer:
+    """Brightest pixel: deterministic, and of this pair."""
+    image = pair.down if pair.down.ndim == 2 else pair.down[..., 0]
+    v, u = np.unravel_index(int(image.argmax()), image.shape)
+    found = Spot((float(u), float(v)), ((0.1, 0.01), (0.01, 0.2)), 0.5, "normal")
+    return Answer(found, Spot.missing("not looked for"), 2.0, math.inf)
+
+
+def run(_: str, pairs: PairSet) -> Sequence[Outcome]:
+    """Harness of these tests: in this process; pair 1 fails."""
+    outcomes = [Outcome(i, guess(pairs.pair(i)), 0.25) for i in range(len(pairs)) if i != 1]
+    return [*outcomes, Outcome(1, None, math.nan, "error", "ValueError: no spot")]
+
+
+def describe(reference: str) -> dict[str, str | None]:
+    """What the seat says of a method in a file."""
+    place, _, function = reference.rpartition(":")
+    digest = hashlib.sha256(Path(place).read_bytes()).hexdigest() if place else None
+    return {"name": Path(place).stem, "kind": "file", "place": place, "function": function, "sha256": digest}
