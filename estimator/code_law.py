@@ -101,7 +101,7 @@ class CodeLaw:
         a, b = (self.low_e - mean) / s, (self.high_e - mean) / s
         chance, change = _interval(a, b, s, by_mean)
         near = np.where(a > 0.0, a, b)
-        far = (np.minimum(np.abs(a), np.abs(b)) > _FAR) & (a * b > 0.0)
+        far = (np.minimum(np.abs(a), np.abs(b)) > _FAR) & ((a > 0.0) == (b > 0.0))
         return np.asarray(np.where(far, near / s, change / np.maximum(chance, 1e-300)))
 
     def information(self, mean: Array) -> Array:
@@ -154,9 +154,11 @@ def _information(low: Array, high: Array, mean: Array, noise: PixelNoise) -> Arr
 
 
 def _deviation(noise: PixelNoise, mean: Array) -> tuple[Array, Array]:
-    """Standard deviation and its derivative by the mean."""
-    s = np.sqrt(noise.variance_e2(mean))
-    return s, np.where(mean > 0.0, 1.0 + 2.0 * noise.prnu**2 * mean, 0.0) / (2.0 * s)
+    """Standard deviation and its derivative by the mean; the mean goes over to 0 without a corner, within 1 electron."""
+    root = np.sqrt(mean * mean + 1.0)
+    smooth, slope = 0.5 * (mean + root), 0.5 * (1.0 + mean / root)
+    s = np.sqrt(noise.variance_e2(smooth))
+    return s, slope * (1.0 + 2.0 * noise.prnu**2 * smooth) / (2.0 * s)
 
 
 def _interval(a: Array, b: Array, s: Array, by_mean: Array) -> tuple[Array, Array]:
