@@ -154,7 +154,7 @@ def _information(low: Array, high: Array, mean: Array, noise: PixelNoise) -> Arr
 
 
 def _deviation(noise: PixelNoise, mean: Array) -> tuple[Array, Array]:
-    """Standard deviation and its derivative by the mean; the mean goes over to 0 without a corner, within 1 electron."""
+    """Standard deviation and its derivative by the mean; the mean's way to 0 has no corner, within 1 electron."""
     root = np.sqrt(mean * mean + 1.0)
     smooth, slope = 0.5 * (mean + root), 0.5 * (1.0 + mean / root)
     s = np.sqrt(noise.variance_e2(smooth))

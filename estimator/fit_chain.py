@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import convolve1d
 
 from phibench.datasets.sensor_card import SensorCard
+from phibench.estimator.chain_model import UNIT_MATRIX
 from phibench.estimator.code_law import code_law, code_table
 from phibench.estimator.fit_raw import LASER_RESPONSE, SpotFit, fit_law
 from phibench.estimator.pixel_law import GaussLaw
@@ -22,7 +23,6 @@ from phibench.estimator.tone_curve import decoded, slope
 from phibench.scenes.frames import Array
 
 _UNSHARP_STEPS = 24  # the error falls by amount / (1 + amount) in each
-_UNIT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 def fit_srgb(
@@ -60,7 +60,7 @@ def fit_srgb(
     origin = np.broadcast_to(np.asarray(origin_px, np.int64), (len(planes), 2))
     filters = bayer_filters(origin, planes.shape[1:3])
     noise = unrounded(card, pattern_known)
-    if card.sharpen_amount == 0.0 and card.colour_matrix == _UNIT:
+    if card.sharpen_amount == 0.0 and card.colour_matrix == UNIT_MATRIX:
         table = code_table(card)
         codes = np.take_along_axis(planes, filters[..., None], axis=3)[..., 0]
         law = code_law(codes, filters, card, noise, table)
