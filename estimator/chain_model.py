@@ -96,6 +96,10 @@ class Codes:
     regression: Array
     excess: Array
 
+    def one(self, index: int) -> Codes:
+        """Codes of one of the means."""
+        return Codes(self.mean[index], self.by_mean[index], self.regression[index], self.excess[index])
+
 
 @lru_cache(maxsize=8)
 def chain_model(card: SensorCard, noise: PixelNoise) -> ChainModel:
@@ -147,24 +151,17 @@ def code_slopes(model: ChainModel, at: Codes, derivatives: Array) -> Array:
     return at.by_mean[..., None, :] * _apply(model.linear, derivatives)
 
 
-def noise_factor(
-    model: ChainModel, at: Codes, variance_e2: Array, rows: NDArray[np.int64] | slice = slice(None)
-) -> Array:
+def noise_factor(model: ChainModel, at: Codes, variance_e2: Array, transform: Array) -> Array:
     """Matrix F, shape (n, r), of which F F^T is the coefficients' covariance from the raw pixels' noise; one window.
 
     Parameters
     ----------
     at : Codes, of one window
     variance_e2 : shape (r,)
-    rows : which coefficients
+    transform : shape (n, 3 p), of those coefficients
     """
     spread = sparse.diags_array(at.regression) @ model.linear @ sparse.diags_array(np.sqrt(variance_e2))
-    return np.asarray(sparse.csr_array(spread.T) @ model.transform[rows].T).T
-
-
-def white_variance(model: ChainModel, at: Codes) -> Array:
-    """Variance of the coefficients, shape (n,), from what the regression leaves and from roundings; one window."""
-    return model.squares @ at.excess + model.rounding
+    return np.asarray(sparse.csr_array(spread.T) @ transform.T).T
 
 
 def full_scale_e(card: SensorCard) -> float:
