@@ -53,7 +53,7 @@ class ChainModel:
         Colour and number of the pixels that a value is the mean of, as rows of the tables.
     tables : MeanCodes or None
         None where a colour matrix mixes the pixels.
-    transform, squares : shape (n, 3 p)
+    transform, squares : shape (3 p, n)
         From codes to coefficients, and the squares of its elements.
     step : shape (n,)
         Of the quantiser.
@@ -117,7 +117,7 @@ def chain_model(card: SensorCard, noise: PixelNoise) -> ChainModel:
     outer = (h + 2 * grown, w + 2 * grown)
     filters = bayer_filters(np.array([[margin % 2, margin % 2]]), (outer[0] + 2, outer[1] + 2))[0]
     linear = _linear(card, outer, margin)
-    T = transform((h, w), card.jpeg_subsampling) @ _sharpening(outer, card.sharpen_amount)
+    T = np.ascontiguousarray(_sharpening(outer, card.sharpen_amount).T @ transform((h, w), card.jpeg_subsampling).T)
     step = steps((h, w), card.jpeg_subsampling, card.jpeg_quality)
     shift, rounding = _shift((h, w), card.jpeg_subsampling), _rounding((h, w), card.jpeg_subsampling)
     tables = mean_codes(card, noise) if card.colour_matrix == UNIT_MATRIX else None
@@ -152,16 +152,16 @@ def code_slopes(model: ChainModel, at: Codes, derivatives: Array) -> Array:
 
 
 def noise_factor(model: ChainModel, at: Codes, variance_e2: Array, transform: Array) -> Array:
-    """Matrix F, shape (n, r), of which F F^T is the coefficients' covariance from the raw pixels' noise; one window.
+    """Matrix F, shape (r, n), of which F^T F is the coefficients' covariance from the raw pixels' noise; one window.
 
     Parameters
     ----------
     at : Codes, of one window
     variance_e2 : shape (r,)
-    transform : shape (n, 3 p), of those coefficients
+    transform : shape (3 p, n), of those coefficients
     """
     spread = sparse.diags_array(at.regression) @ model.linear @ sparse.diags_array(np.sqrt(variance_e2))
-    return np.asarray(sparse.csr_array(spread.T) @ transform.T).T
+    return np.asarray(sparse.csr_array(spread.T) @ transform)
 
 
 def full_scale_e(card: SensorCard) -> float:

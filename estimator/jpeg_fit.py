@@ -1,10 +1,10 @@
 """Fit of a spot to the quantised coefficients of one JPEG window: a quasi-score through the processing.
 
 With m the mean and C the covariance of the quantiser's output, the estimating equation J^T C^-1 (z - m) = 0 is unbiased
-whatever the law of the output (R. W. M. Wedderburn, Biometrika 61, 439, 1974), and its covariance (J^T C^-1 J)^-1 is the
+whatever the law of the output (R. W. M. Wedderburn, Biometrika 61, 439, 1974); its covariance (J^T C^-1 J)^-1 is the
 bound of M. Stein, A. Mezghani, J. A. Nossek (IEEE Signal Process. Lett. 21, 796, 2014). The quantiser of a Gaussian
-input gives m, and C_ij = g_i g_j C'_ij off the diagonal, g its mean slope and C' the input's covariance (J. J. Bussgang,
-1952); a coefficient that is 0 whatever the noise has no slope and is left out.
+input gives m, and C_ij = g_i g_j C'_ij off the diagonal, g its mean slope and C' the input's covariance (J. J.
+Bussgang, 1952); a coefficient that is 0 whatever the noise has no slope and is left out.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ class Rows:
     rounding: Array
 
     @classmethod
-    def of(cls, model: ChainModel, index: NDArray[np.int64]) -> Rows:
-        """Take rows of a model."""
+    def all(cls, model: ChainModel) -> Rows:
+        """All coefficients of a model."""
         names = ("transform", "squares", "step", "shift", "rounding")
-        return cls(index, *(getattr(model, name)[index] for name in names))
+        return cls(np.arange(len(model.step)), *(getattr(model, name) for name in names))
 
     def part(self, index: NDArray[np.int64]) -> Rows:
-        """Take rows of these rows."""
-        return Rows(*(getattr(self, f.name)[index] for f in fields(self)))
+        """Take some of them."""
+        return Rows(*(getattr(self, f.name)[..., index] for f in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -113,16 +113,16 @@ class Window:
     def noise(self, theta: Array, among: Rows | None = None) -> Noise:
         """Covariance of the quantised coefficients for one hypothesis, shape (k,)."""
         model = self.model
-        rows = among or Rows.of(model, np.arange(len(model.step)))
+        rows = among or Rows.all(model)
         mean, _ = self.means.at(theta[None])
         at = codes(model, mean).one(0)
         F = noise_factor(model, at, raw_variance_e2(model, mean[0]) + self.extra_e2, rows.transform)
-        sigma = np.sqrt(np.einsum("nr,nr->n", F, F) + rows.squares @ at.excess + rows.rounding)
-        output = quantised(rows.transform @ at.mean + rows.shift, sigma, rows.step)
+        sigma = np.sqrt(np.einsum("rn,rn->n", F, F) + at.excess @ rows.squares + rows.rounding)
+        output = quantised(at.mean @ rows.transform + rows.shift, sigma, rows.step)
         share = output.variance / rows.step**2
         live = np.flatnonzero(share > _LIVE)
-        F = F[live] * output.slope[live, None]
-        C = F @ F.T
+        F = F[:, live] * output.slope[live]
+        C = F.T @ F
         np.fill_diagonal(C, output.variance[live])
         candidates = rows if among else rows.part(np.flatnonzero(share > _CANDIDATE))
         return Noise(rows.part(live), sigma[live], np.linalg.cholesky(C), candidates)
@@ -132,9 +132,9 @@ class Window:
         rows = noise.rows
         mean, derivatives = self.means.at(theta)
         at = codes(self.model, mean)
-        output = quantised(at.mean @ rows.transform.T + rows.shift, noise.sigma, rows.step)
+        output = quantised(at.mean @ rows.transform + rows.shift, noise.sigma, rows.step)
         changes = code_slopes(self.model, at, derivatives)
-        slopes = (changes @ rows.transform.T) * output.slope[:, None, :]
+        slopes = (changes @ rows.transform) * output.slope[:, None, :]
         m, k, count = slopes.shape
         both = np.concatenate([(self.z[rows.index] - output.mean)[:, None], slopes], axis=1)
         white = noise.whitened(both.reshape(-1, count).T).T.reshape(m, k + 1, count)
