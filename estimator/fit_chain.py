@@ -43,6 +43,7 @@ def fit_srgb(
     background_e: Array | None = None,
     free_width: bool = False,
     pattern_known: bool = False,
+    extra_e2: float = 0.0,
 ) -> SpotFit:
     """Fit one spot in each region of processed 8-bit images.
 
@@ -59,6 +60,8 @@ def fit_srgb(
         As for `fit_raw`.
     pattern_known : bool
         Whether PRNU and DSNU were calibrated; otherwise they count as noise.
+    extra_e2 : float
+        Variance of the known background's error, electrons squared.
 
     Raises
     ------
@@ -69,6 +72,7 @@ def fit_srgb(
     origin = np.broadcast_to(np.asarray(origin_px, np.int64), (len(planes), 2))
     filters = bayer_filters(origin, planes.shape[1:3])
     noise = unrounded(card, pattern_known)
+    noise = PixelNoise(noise.gaussian_e2 + extra_e2, noise.prnu)
     if card.sharpen_amount == 0.0 and card.colour_matrix == UNIT_MATRIX:
         table = code_table(card)
         codes = np.take_along_axis(planes, filters[..., None], axis=3)[..., 0]

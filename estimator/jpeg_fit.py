@@ -27,7 +27,8 @@ _STEPS = 24  # of the fit in all; the covariance stays after `_FRESH` of them, s
 _SCREENING_STEPS = 3
 _STEP_PX = 0.4
 _HALVINGS = 3
-_SMALL = 1e-4  # squared step in standard deviations at which the fit has come to rest
+_SMALL = 1e-4  # squared step in standard deviations at which the fit ends
+_REST = 1e-2  # and at which it has come to rest, if it ends for its number of steps
 
 
 @dataclass(frozen=True)
@@ -160,7 +161,7 @@ def fit_window(window: Window, starts: Array) -> JpegFit:
         if k and length < _SMALL:
             break
     chi2 = float(r[0] @ r[0]) / max(len(noise.sigma) - len(theta), 1)
-    return JpegFit(theta, J[0] @ J[0].T, chi2, length < _SMALL)
+    return JpegFit(theta, J[0] @ J[0].T, chi2, length < _REST)
 
 
 def _best(window: Window, noise: Noise, starts: Array) -> Array:
