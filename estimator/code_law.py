@@ -52,7 +52,7 @@ def code_table(card: SensorCard) -> CodeTable:
     A code that no DN gives has the interval of the next one above that occurs.
     """
     dn = np.arange(card.top_dn + 1)
-    linear = (dn - card.black_level_dn) / (card.top_dn - card.black_level_dn)
+    linear = np.asarray((dn - card.black_level_dn) / (card.top_dn - card.black_level_dn), float)
     rows = [_ends(np.rint(255.0 * encoded(gain * linear)).astype(int), card.top_dn) for gain in card.white_balance]
     low, high = ((np.array(x) - card.black_level_dn) / card.dn_per_e for x in zip(*rows, strict=True))
     well = card.saturation_e - _WELL_SIGMAS * np.sqrt(card.read_noise_e**2 + card.dsnu_e**2)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 from scipy.special import ndtr
 from scipy.stats import poisson
@@ -49,7 +50,7 @@ class MeanCodes:
     regression: Array
     excess: Array
 
-    def at(self, name: str, mean_e: Array, which: Array) -> Array:
+    def at(self, name: str, mean_e: Array, which: NDArray[np.int64]) -> Array:
         """Values of one table, linear between nodes.
 
         Parameters

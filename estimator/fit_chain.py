@@ -181,8 +181,8 @@ def _cut(
     h, w = (min(_CUT_PX, side) for side in x.shape[1:])
     corner = np.stack([np.clip(u - w // 2, 0, x.shape[2] - w), np.clip(v - h // 2, 0, x.shape[1] - h)], axis=1)
     parts = [(slice(b, b + h), slice(a, a + w)) for a, b in corner]
-    squares = (np.stack([values[i][part] for i, part in enumerate(parts)]) for values in (x, extra))
-    return *squares, corner.astype(np.int64)
+    cut_x, cut_extra = (np.stack([values[i][part] for i, part in enumerate(parts)]) for values in (x, extra))
+    return cut_x, cut_extra, np.asarray(corner, np.int64)
 
 
 def _collected(
@@ -199,7 +199,8 @@ def _collected(
     sigma = theta[:, 6] if free_width else widths
     chi2 = np.array([fit.chi2 for fit, _ in rows], float)
     values = (theta[:, :2] + origin, covariance[:, :2, :2], theta[:, 2], theta[:, 3:6], sigma, chi2)
-    return SpotFit(*(keep(value, status) for value in values), status)
+    uv, uv_covariance, flux, levels, width, misfit = (keep(np.asarray(value, float), status) for value in values)
+    return SpotFit(uv, uv_covariance, flux, levels, width, misfit, status)
 
 
 def _on_grid(origin: NDArray[np.int64], shape: tuple[int, int], card: SensorCard) -> None:

@@ -126,7 +126,7 @@ class Window:
         C = F.T @ F
         np.fill_diagonal(C, output.variance[live])
         candidates = rows if among else rows.part(np.flatnonzero(share > _CANDIDATE))
-        return Noise(rows.part(live), sigma[live], np.linalg.cholesky(C), candidates)
+        return Noise(rows.part(live), sigma[live], np.asarray(np.linalg.cholesky(C), float), candidates)
 
     def residual(self, noise: Noise, theta: Array) -> tuple[Array, Array]:
         """Whitened residuals, shape (m, l), and derivatives of the mean, shape (m, k, l), of hypotheses (m, k)."""

@@ -104,7 +104,7 @@ def _interpolation(size: int, step: int, first: bool, last: bool) -> _Axis:
         far = near + (1 if pixel % 2 else -1)
         up[pixel, near + before] += 0.75
         up[pixel, min(max(far + before, 0), up.shape[1] - 1)] += 0.25
-    return _Axis(up, np.linalg.pinv(up), before, after)
+    return _Axis(up, np.asarray(np.linalg.pinv(up), float), before, after)
 
 
 def _quantised(rgb: Array, tables: tuple[Array, Array], down: _Axis, across: _Axis) -> tuple[Array, Array]:

@@ -26,7 +26,8 @@ def chain_fit(pair: Pair) -> Answer:
     """Fit both spots, each in its box or, without boxes, where `locate` sees them.
 
     The blur is what the rig predicts (`spot_blur`). The room behind comes from the laser-off frames where they are
-    there, otherwise from what surrounds the spot. A misfit above 1 per degree of freedom widens the covariance by as much.
+    there, otherwise from what surrounds the spot. A misfit above 1 per degree of freedom widens the covariance by as
+    much.
     """
     if pair.card.output not in ("srgb8", "mjpeg"):
         missing = Spot.missing(f"chain_fit needs srgb8 or mjpeg images, not {pair.card.output}")
@@ -38,7 +39,7 @@ def chain_fit(pair: Pair) -> Answer:
 def _boxes(pair: Pair) -> tuple[Box | None, Box | None]:
     if pair.box_down is not None and pair.box_up is not None:
         return pair.box_down, pair.box_up
-    from phibench.estimator.methods.locate import locate
+    from phibench.estimator.methods.locate import locate  # type: ignore[import-not-found,unused-ignore]
 
     return locate(pair)
 
@@ -53,8 +54,10 @@ def _spot(pair: Pair, image: NDArray[Any], off: NDArray[Any] | None, box: Box | 
     sigma, ratio = spot_blur(pair.rig, start)
     if pair.card.output == "srgb8":
         return _answer(_srgb(image, off, start, pair.card, sigma * np.sqrt(ratio)))
-    seen = (on, around(start[None], origin, on.shape[1:3])) if off is None else (off[region.slices][None], None)
-    base = _base(*seen, origin, pair.card)
+    if off is None:
+        base = _base(on, around(start[None], origin, (region.height_px, region.width_px)), origin, pair.card)
+    else:
+        base = _base(off[region.slices][None], None, origin, pair.card)
     size = (image.shape[1], image.shape[0])
     return _answer(fit_jpeg(on, origin, pair.card, sigma, _response(pair), base, ratio=ratio, size_px=size))
 
