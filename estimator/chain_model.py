@@ -5,7 +5,7 @@ The stages, for a window of whole JPEG units and the raw pixels around it:
 * raw pixels: independent, mean and variance in electrons, cut at saturation;
 * bilinear demosaicing, white balance, colour matrix: a sparse matrix A on electrons;
 * sRGB curve and 8 bits: mean and slope under the noise, from the converter's law (`code_means`), or, where a colour
-  matrix mixes the pixels, of a Gaussian value (`tone_curve.noisy`);
+  matrix or sharpening mixes the pixels, of a Gaussian value (`tone_curve.noisy`);
 * sharpening, Y Cb Cr, chroma averages, DCT: a matrix T.
 
 Covariance of the coefficients: (T D A) V (T D A)^T with the slopes D, plus what rounding adds.
@@ -52,7 +52,7 @@ class ChainModel:
     kinds : shape (3 p,)
         Colour and number of the pixels that a value is the mean of, as rows of the tables.
     tables : MeanCodes or None
-        None where a colour matrix mixes the pixels.
+        None where a colour matrix mixes the pixels, or sharpening comes between curve and rounding.
     transform, squares : shape (3 p, n)
         From codes to coefficients, and the squares of its elements.
     step : shape (n,)
@@ -120,7 +120,8 @@ def chain_model(card: SensorCard, noise: PixelNoise) -> ChainModel:
     T = np.ascontiguousarray(_sharpening(outer, card.sharpen_amount).T @ transform((h, w), card.jpeg_subsampling).T)
     step = steps((h, w), card.jpeg_subsampling, card.jpeg_quality)
     shift, rounding = _shift((h, w), card.jpeg_subsampling), _rounding((h, w), card.jpeg_subsampling)
-    tables = mean_codes(card, noise) if card.colour_matrix == UNIT_MATRIX else None
+    plain = card.colour_matrix == UNIT_MATRIX and card.sharpen_amount == 0.0
+    tables = mean_codes(card, noise) if plain else None
     kinds = _kinds(filters)
     return ChainModel(
         card, noise, (h, w), margin, filters, linear, linear.power(2), kinds, tables, T, T * T, step, shift, rounding

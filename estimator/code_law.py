@@ -57,7 +57,9 @@ def code_table(card: SensorCard) -> CodeTable:
     low, high = ((np.array(x) - card.black_level_dn) / card.dn_per_e for x in zip(*rows, strict=True))
     well = card.saturation_e - _WELL_SIGMAS * np.sqrt(card.read_noise_e**2 + card.dsnu_e**2)
     full = high > well
-    return CodeTable(np.where(full, np.minimum(low, well), low), np.where(full, np.inf, high))
+    # all that are full are one code: "at least the lowest of them"
+    lowest = np.min(np.where(full, low, np.inf), axis=1, keepdims=True)
+    return CodeTable(np.where(full, lowest, low), np.where(full, np.inf, high))
 
 
 def _ends(codes: NDArray[np.int64], top_dn: int) -> tuple[Array, Array]:

@@ -132,6 +132,8 @@ def fit_jpeg(
     n, (h, w) = len(planes), planes.shape[1:3]
     origin = np.broadcast_to(np.asarray(origin_px, np.int64), (n, 2))
     _on_grid(origin, (h, w), card)
+    if n == 0:
+        return _collected([], origin, np.zeros(0), free_width)
     model = chain_model(card, unrounded(card, pattern_known))
     first = first_fit(planes, origin, card, np.broadcast_to(np.asarray(sigma_px, float), n), response, base)
     zero = np.zeros((h, w))

@@ -19,7 +19,8 @@ from phibench.estimator.status import Status, describe
 from phibench.scenes.frames import Array
 
 _HALF_PX = 8
-_MOST_CHI2 = 4.0  # beyond it the light around the spot is not what the model says
+_FLAT_CHI2 = 1.5  # below it one level per filter describes the room
+_MOST_CHI2 = 30.0  # beyond it the light around the spot is not what the model says
 
 
 def chain_fit(pair: Pair) -> Answer:
@@ -50,14 +51,14 @@ def _spot(pair: Pair, image: NDArray[Any], off: NDArray[Any] | None, box: Box | 
     region = _region(box, pair.card, image.shape)
     origin = np.array([[region.u0_px, region.v0_px]])
     on = image[region.slices][None]
-    start = first_fit(on, origin, pair.card, np.array([pair.rig.camera.blur_sigma_px]))[0, :2] + origin[0]
+    base = None if off is None else _base(off[region.slices][None], None, origin, pair.card)
+    blur = np.array([pair.rig.camera.blur_sigma_px])
+    start = first_fit(on, origin, pair.card, blur, _response(pair), base)[0, :2] + origin[0]
     sigma, ratio = spot_blur(pair.rig, start)
     if pair.card.output == "srgb8":
         return _answer(_srgb(image, off, start, pair.card, sigma * np.sqrt(ratio)))
-    if off is None:
+    if base is None:
         base = _base(on, around(start[None], origin, (region.height_px, region.width_px)), origin, pair.card)
-    else:
-        base = _base(off[region.slices][None], None, origin, pair.card)
     size = (image.shape[1], image.shape[0])
     return _answer(fit_jpeg(on, origin, pair.card, sigma, _response(pair), base, ratio=ratio, size_px=size))
 
@@ -83,8 +84,12 @@ def _srgb(image: NDArray[Any], off: NDArray[Any] | None, start: Array, card: Sen
     square, origin = Box(u0, v0, 2 * _HALF_PX + 1, 2 * _HALF_PX + 1), np.array([[u0, v0]])
     on = image[square.slices][None]
     if off is None:
-        return fit_srgb(on, origin, card, sigma)
-    base = _base(off[square.slices][None], None, origin, card)
+        flat = fit_srgb(on, origin, card, sigma)
+        if flat.chi2[0] < _FLAT_CHI2:
+            return flat
+        base = _base(on, around(start[None], origin, (2 * _HALF_PX + 1, 2 * _HALF_PX + 1)), origin, card)
+    else:
+        base = _base(off[square.slices][None], None, origin, card)
     extra = float(np.median(base.variance_e2))
     return fit_srgb(on, origin, card, sigma, background_e=base.mean_e, extra_e2=extra)
 
