@@ -17,6 +17,7 @@ from scipy.ndimage import convolve1d
 
 from phibench.estimator.fisher import covariance_bound
 from phibench.estimator.gaussian_spot import outer, profile
+from phibench.estimator.pixel_law import GaussLaw, PixelLaw
 from phibench.estimator.raw_pixels import PixelNoise, bayer_filters
 from phibench.estimator.status import Status, StatusArray, flag, keep
 from phibench.scenes.frames import Array, BoolArray
@@ -30,6 +31,7 @@ _DECREMENT = 1e-8  # squared distance from the minimum in standard deviations: 1
 _STEP_PX = 0.5
 _SIGMA_RANGE_PX = (0.15, 10.0)
 _AT_ONCE = 64
+_LEAST_INFORMATION = 1e-12  # per electron squared: of a pixel that is full
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,8 @@ class SpotFit:
     flux_e : shape (n,), electrons that a pixel of response 1 would see in all
     background_e : shape (n, c), per filter R, G, B, or one; NaN where it was given
     sigma_px : shape (n,)
-    chi2 : shape (n,), sum of (x - mu)^2 / V over the pixels that were used, per degree of freedom
+    chi2 : shape (n,), sum over the pixels that were used of score^2 / information, which is (x - mu)^2 / V for raw
+        pixels, per degree of freedom
     status : shape (n,), values of `Status`
     """
 
@@ -66,13 +69,13 @@ class _Data:
     response: Array
     base: Array
     levels: Array  # (n, c, h, w): 1 where the pixel has that background level
-    noise: PixelNoise
+    law: PixelLaw
     sigma: Array  # (n,)
     free_width: bool
 
     def rows(self, index: NDArray[np.int64]) -> _Data:
         arrays = ("x", "finite", "used", "response", "base", "levels", "sigma")
-        return replace(self, **{name: getattr(self, name)[index] for name in arrays})
+        return replace(self, law=self.law.rows(index), **{name: getattr(self, name)[index] for name in arrays})
 
 
 def fit_raw(
@@ -116,11 +119,36 @@ def fit_raw(
         If the shapes do not go together.
     """
     x = np.asarray(regions_e, float)
+    return fit_law(x, origin_px, GaussLaw(noise), sigma_px, response, background_e, free_width, x < saturation_e)
+
+
+def fit_law(
+    regions_e: Array,
+    origin_px: ArrayLike,
+    law: PixelLaw,
+    sigma_px: ArrayLike,
+    response: tuple[float, float, float] | None = LASER_RESPONSE,
+    background_e: Array | None = None,
+    free_width: bool = False,
+    used: ArrayLike = True,
+) -> SpotFit:
+    """As `fit_raw`, for pixels of any law.
+
+    Parameters
+    ----------
+    law : PixelLaw
+        Of all regions.
+    used : boolean, shape (n, h, w) or one that broadcasts to it
+        Pixels that are not left out.
+
+    Other parameters, errors and the result are those of `fit_raw`.
+    """
+    x = np.asarray(regions_e, float)
     if x.ndim != 3 or min(x.shape[1:], default=0) < 3:
         raise ValueError(f"regions have the shape {x.shape}: (n, h, w) of 3 x 3 pixels or more is needed")
     origin = np.broadcast_to(np.asarray(origin_px, np.int64), (len(x), 2))
-    data = _data(x, origin, noise, np.broadcast_to(np.asarray(sigma_px, float), len(x)), response, background_e)
-    data = replace(data, used=data.used & (x < saturation_e), free_width=free_width)
+    data = _data(x, origin, law, np.broadcast_to(np.asarray(sigma_px, float), len(x)), response, background_e)
+    data = replace(data, used=data.used & np.asarray(used, bool), free_width=free_width)
     parts = [np.arange(i, min(i + _AT_ONCE, len(x))) for i in range(0, len(x), _AT_ONCE)]
     fits = [_fit(data.rows(part), origin[part]) for part in parts]
     if not fits:
@@ -131,7 +159,7 @@ def fit_raw(
 def _data(
     x: Array,
     origin: NDArray[np.int64],
-    noise: PixelNoise,
+    law: PixelLaw,
     sigma: Array,
     response: tuple[float, float, float] | None,
     background_e: Array | None,
@@ -145,7 +173,7 @@ def _data(
         base = np.zeros(x.shape)
         levels = (filters[:, None] == np.arange(len(weights))[:, None, None]).astype(float)
     finite = used.all(axis=(1, 2)) & np.isfinite(base).all(axis=(1, 2))
-    return _Data(np.where(used, x, 0.0), finite, used, weights[filters], base, levels, noise, sigma, False)
+    return _Data(np.where(used, x, 0.0), finite, used, weights[filters], base, levels, law, sigma, False)
 
 
 def _fit(data: _Data, origin: NDArray[np.int64]) -> SpotFit:
@@ -225,10 +253,10 @@ def _scores(data: _Data, theta: Array) -> tuple[Array, Array]:
     """Score, shape (n, k), and Fisher matrix, shape (n, k, k)."""
     mean, derivatives = _model(data, theta)
     n, k = theta.shape
-    weight = data.used / data.noise.variance_e2(mean)
+    weight = data.used * data.law.information(mean)
     flat = derivatives.reshape(n, k, -1)
     weighted = flat * weight.reshape(n, 1, -1)
-    score = (weighted @ (data.x - mean).reshape(n, -1, 1))[..., 0]
+    score = (flat @ (data.used * data.law.score(data.x, mean)).reshape(n, -1, 1))[..., 0]
     return score, weighted @ np.swapaxes(flat, 1, 2)
 
 
@@ -259,10 +287,9 @@ def _polished(data: _Data, theta: Array) -> tuple[Array, BoolArray]:
 
 
 def _misfit(data: _Data, theta: Array) -> Array:
-    """-2 log likelihood with a Gaussian of variance V(mu), shape (n,): which of the minima is the deepest."""
+    """-2 log likelihood, shape (n,): which of the minima is the deepest."""
     mean, _ = _model(data, theta)
-    variance = data.noise.variance_e2(mean)
-    value = np.sum(data.used * ((data.x - mean) ** 2 / variance + np.log(variance)), axis=(1, 2))
+    value = np.sum(data.used * data.law.misfit(data.x, mean), axis=(1, 2))
     return np.where(np.isfinite(value), value, np.inf)
 
 
@@ -281,7 +308,7 @@ def _result(data: _Data, theta: Array, converged: BoolArray, origin: NDArray[np.
         (~converged, Status.NOT_CONVERGED),
     )
     mean, _ = _model(data, theta)
-    square = data.used * (data.x - mean) ** 2 / data.noise.variance_e2(mean)
+    square = data.used * data.law.score(data.x, mean) ** 2 / np.maximum(data.law.information(mean), _LEAST_INFORMATION)
     chi2 = np.sum(square, axis=(1, 2)) / np.maximum(used - k, 1)
     c = data.levels.shape[1]
     background = theta[:, 3 : 3 + c] if c else np.full((n, 1), np.nan)

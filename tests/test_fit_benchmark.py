@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from chain_scenes import COLLECTED, MIDDLE, SQUARE, UNITS, scene
 from sensor_light import spot_at
 
 from phibench.datasets.expected import expected_of_light
 from phibench.datasets.sensor_card import card_of
+from phibench.estimator.chain_limit import chain_limit
+from phibench.estimator.fit_chain import fit_jpeg, fit_srgb
 from phibench.estimator.fit_raw import LASER_RESPONSE, fit_raw
 from phibench.estimator.limits import NOISE_MODELS, spot_limit
 from phibench.estimator.raw_pixels import PixelNoise
 from phibench.estimator.simple_spots import SIMPLE_METHODS
 from phibench.estimator.status import Status
+from phibench.render.chain import Chain
 from phibench.render.light import Light
 from phibench.render.sensor import sensor
+from phibench.render.tiles import NoiseStream
 from phibench.scenes.streams import generator
 
 SPOTS = 256
@@ -52,3 +57,24 @@ def test_benchmark_simple_method_on_256_spots(benchmark, name: str) -> None:
 def test_benchmark_limit_of_one_spot(benchmark, model: str) -> None:
     card = card_of(sensor("bayer-raw"))
     assert benchmark(lambda: spot_limit(REGION, card, model=model).rms_px) > 0
+
+
+@pytest.mark.benchmark(group="chain")
+@pytest.mark.parametrize("preset", ["srgb8", "mjpeg"])
+def test_benchmark_fit_through_the_chain_of_a_pair(benchmark, preset: str) -> None:
+    """Two spots, 5000 collected electrons over 100 e-; target: <= 100 ms on one core."""
+    s = sensor(preset)
+    box = UNITS if preset == "mjpeg" else SQUARE
+    light = scene(MIDDLE, 0.7, 5000.0 / COLLECTED, 100.0, s)
+    frames = np.stack([Chain(s).frame(light, NoiseStream(("benchmark", k)), box) for k in range(2)])
+    fit = fit_jpeg if preset == "mjpeg" else fit_srgb
+    fit(frames, (box.u0_px, box.v0_px), card_of(s), 0.7)  # tables of the card are computed once
+    assert (benchmark(lambda: fit(frames, (box.u0_px, box.v0_px), card_of(s), 0.7).status) == Status.OK).all()
+
+
+@pytest.mark.benchmark(group="chain")
+@pytest.mark.parametrize("preset", ["srgb8", "mjpeg"])
+def test_benchmark_chain_limit(benchmark, preset: str) -> None:
+    card = card_of(sensor(preset))
+    levels = (100.0, 90.0, 60.0)
+    assert benchmark(lambda: chain_limit(card, (48.3, 32.2), 0.7, 5000.0 / COLLECTED, levels).rms_px) > 0

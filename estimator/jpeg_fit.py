@@ -1,0 +1,205 @@
+"""Fit of a spot to the quantised coefficients of one JPEG window: a quasi-score through the processing.
+
+With m the mean and C the covariance of the quantiser's output, the estimating equation J^T C^-1 (z - m) = 0 is unbiased
+whatever the law of the output (R. W. M. Wedderburn, Biometrika 61, 439, 1974); its covariance (J^T C^-1 J)^-1 is the
+bound of M. Stein, A. Mezghani, J. A. Nossek (IEEE Signal Process. Lett. 21, 796, 2014). The quantiser of a Gaussian
+input gives m, and C_ij = g_i g_j C'_ij off the diagonal, g its mean slope and C' the input's covariance (J. J.
+Bussgang, 1952); a coefficient that is 0 whatever the noise has no slope and is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from phibench.estimator.chain_model import ChainModel, code_slopes, codes, noise_factor, raw_variance_e2
+from phibench.estimator.quantiser import quantised
+from phibench.estimator.spot_means import SpotMeans
+from phibench.scenes.frames import Array
+
+_LIVE = 3e-3  # variance of the output, in steps squared, below which a coefficient is taken as never changing
+_CANDIDATE = 1e-4  # and below which it is not looked at again
+_FRESH = 5  # times that the covariance is computed
+_STEPS = 24  # of the fit in all; the covariance stays after `_FRESH` of them, so that the misfit can only fall
+_SCREENING_STEPS = 3
+_STEP_PX = 0.4
+_HALVINGS = 3
+_SMALL = 1e-4  # squared step in standard deviations at which the fit ends
+_REST = 1e-2  # and at which it has come to rest, if it ends for its number of steps
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Some of a model's coefficients, with what belongs to them; `index` into all, shape (l,)."""
+
+    index: NDArray[np.int64]
+    transform: Array
+    squares: Array
+    step: Array
+    shift: Array
+    rounding: Array
+
+    @classmethod
+    def all(cls, model: ChainModel) -> Rows:
+        """All coefficients of a model."""
+        names = ("transform", "squares", "step", "shift", "rounding")
+        return cls(np.arange(len(model.step)), *(getattr(model, name) for name in names))
+
+    def part(self, index: NDArray[np.int64]) -> Rows:
+        """Take some of them."""
+        return Rows(*(getattr(self, f.name)[..., index] for f in fields(self)))
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Covariance of the live coefficients at one hypothesis.
+
+    Attributes
+    ----------
+    rows : Rows
+    sigma : shape (l,), of the quantiser's input
+    factor : shape (l, l), Cholesky factor of the output's covariance
+    candidates : Rows that may be live at a hypothesis nearby
+    """
+
+    rows: Rows
+    sigma: Array
+    factor: Array
+    candidates: Rows
+
+    def whitened(self, values: Array) -> Array:
+        """Values, shape (l, ...), in units in which their covariance is the unit matrix."""
+        return np.asarray(solve_triangular(self.factor, values, lower=True, check_finite=False))
+
+
+@dataclass(frozen=True)
+class JpegFit:
+    """Fit of one window; positions in the raw window's own pixels.
+
+    Attributes
+    ----------
+    theta : shape (k,), as `SpotMeans`
+    fisher : shape (k, k), J^T C^-1 J
+    chi2 : float, r^T C^-1 r per degree of freedom
+    converged : bool
+    """
+
+    theta: Array
+    fisher: Array
+    chi2: float
+    converged: bool
+
+
+@dataclass(frozen=True)
+class Window:
+    """What is fitted.
+
+    Attributes
+    ----------
+    z : shape (n,), quantised coefficients in the order of `jpeg_tables.coefficients`
+    model : ChainModel
+    means : SpotMeans
+    extra_e2 : shape (r,) or float
+        Variance of the base image, electrons squared, which counts as noise of the raw pixels.
+    """
+
+    z: Array
+    model: ChainModel
+    means: SpotMeans
+    extra_e2: Array | float = 0.0
+
+    def noise(self, theta: Array, among: Rows | None = None) -> Noise:
+        """Covariance of the quantised coefficients for one hypothesis, shape (k,)."""
+        model = self.model
+        rows = among or Rows.all(model)
+        mean, _ = self.means.at(theta[None])
+        at = codes(model, mean).one(0)
+        F = noise_factor(model, at, raw_variance_e2(model, mean[0]) + self.extra_e2, rows.transform)
+        sigma = np.sqrt(np.einsum("rn,rn->n", F, F) + at.excess @ rows.squares + rows.rounding)
+        output = quantised(at.mean @ rows.transform + rows.shift, sigma, rows.step)
+        share = output.variance / rows.step**2
+        live = np.flatnonzero(share > _LIVE)
+        F = F[:, live] * output.slope[live]
+        C = F.T @ F
+        np.fill_diagonal(C, output.variance[live])
+        candidates = rows if among else rows.part(np.flatnonzero(share > _CANDIDATE))
+        return Noise(rows.part(live), sigma[live], np.asarray(np.linalg.cholesky(C), float), candidates)
+
+    def residual(self, noise: Noise, theta: Array) -> tuple[Array, Array]:
+        """Whitened residuals, shape (m, l), and derivatives of the mean, shape (m, k, l), of hypotheses (m, k)."""
+        rows = noise.rows
+        mean, derivatives = self.means.at(theta)
+        at = codes(self.model, mean)
+        output = quantised(at.mean @ rows.transform + rows.shift, noise.sigma, rows.step)
+        changes = code_slopes(self.model, at, derivatives)
+        slopes = (changes @ rows.transform) * output.slope[:, None, :]
+        m, k, count = slopes.shape
+        both = np.concatenate([(self.z[rows.index] - output.mean)[:, None], slopes], axis=1)
+        white = noise.whitened(both.reshape(-1, count).T).T.reshape(m, k + 1, count)
+        return white[:, 0], white[:, 1:]
+
+    def fisher(self, theta: Array) -> Array:
+        """J^T C^-1 J of the model's output, shape (k, k)."""
+        _, J = self.residual(self.noise(theta), theta[None])
+        return np.asarray(J[0] @ J[0].T)
+
+
+def fit_window(window: Window, starts: Array) -> JpegFit:
+    """Fit one window from hypotheses, shape (s, k); the one with the smallest misfit after some steps goes on."""
+    noise = window.noise(starts[0])
+    theta = _best(window, noise, starts)
+    r, J = window.residual(noise, theta[None])
+    length = np.inf
+    for k in range(_STEPS):
+        if 0 < k < _FRESH:
+            noise = window.noise(theta, noise.candidates)
+            r, J = window.residual(noise, theta[None])
+        theta, r, J, length = _descended(window, noise, theta, r, J)
+        if k and length < _SMALL:
+            break
+    chi2 = float(r[0] @ r[0]) / max(len(noise.sigma) - len(theta), 1)
+    return JpegFit(theta, J[0] @ J[0].T, chi2, length < _REST)
+
+
+def _best(window: Window, noise: Noise, starts: Array) -> Array:
+    """The start with the smallest misfit after some steps."""
+    theta = starts
+    if len(starts) > 1:
+        for _ in range(_SCREENING_STEPS):
+            theta = _moved(theta, _newton(*window.residual(noise, theta)))
+    r, _ = window.residual(noise, theta)
+    return np.asarray(theta[np.argmin(np.einsum("ml,ml->m", r, r))])
+
+
+def _descended(window: Window, noise: Noise, theta: Array, r: Array, J: Array) -> tuple[Array, Array, Array, float]:
+    """One step that does not raise the misfit, what belongs to it, and its squared length in standard deviations."""
+    step = _newton(r, J)
+    length = float(np.sum((step[0] @ J[0]) ** 2))
+    for halving in range(_HALVINGS + 1):
+        tried = _moved(theta[None], 0.5**halving * step)
+        new_r, new_J = window.residual(noise, tried)
+        if new_r[0] @ new_r[0] <= r[0] @ r[0] * (1.0 + 1e-12):
+            return tried[0], new_r, new_J, length
+    return theta, r, J, 0.0  # at the bottom of a misfit with corners
+
+
+def _newton(r: Array, J: Array) -> Array:
+    """Gauss-Newton steps, shape (m, k)."""
+    fisher = J @ np.swapaxes(J, 1, 2)
+    diagonal = np.einsum("mkk->mk", fisher)
+    diagonal *= 1.0 + 1e-9
+    diagonal += 1e-12
+    return np.asarray(np.linalg.solve(fisher, np.einsum("mkl,ml->mk", J, r)[..., None])[..., 0])
+
+
+def _moved(theta: Array, step: Array) -> Array:
+    """Hypotheses after limited steps: positions by `_STEP_PX`, the flux not below a tenth, the width by a third."""
+    limit = np.minimum(1.0, _STEP_PX / np.maximum(np.abs(step[:, :2]).max(axis=1), 1e-300))
+    new = theta + limit[:, None] * step
+    new[:, 2] = np.maximum(new[:, 2], 0.1 * np.maximum(theta[:, 2], 1.0))
+    if theta.shape[1] > 6:
+        new[:, 6] = np.clip(new[:, 6], 0.7 * theta[:, 6], 1.4 * theta[:, 6]).clip(0.15, 6.0)
+    return np.where(np.isfinite(new), new, theta)

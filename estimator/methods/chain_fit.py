@@ -1,0 +1,115 @@
+"""Built-in method: fit of both spots through the camera's own processing, for "srgb8" and "mjpeg" images."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.datasets.sensor_card import SensorCard
+from phibench.estimator.base_image import BaseImage, around, base_of
+from phibench.estimator.fit_chain import first_fit, fit_jpeg, fit_srgb, undone, unrounded
+from phibench.estimator.fit_raw import SpotFit
+from phibench.estimator.jpeg_tables import mcu_px
+from phibench.estimator.raw_pixels import bayer_filters
+from phibench.estimator.seat.pair import Answer, Box, Pair, Spot
+from phibench.estimator.spot_blur import spot_blur
+from phibench.estimator.status import Status, describe
+from phibench.scenes.frames import Array
+
+_HALF_PX = 8
+_FLAT_CHI2 = 1.5  # below it one level per filter describes the room
+_MOST_CHI2 = 30.0  # beyond it the light around the spot is not what the model says
+
+
+def chain_fit(pair: Pair) -> Answer:
+    """Fit both spots, each in its box or, without boxes, where `locate` sees them.
+
+    The blur is what the rig predicts (`spot_blur`). The room behind comes from the laser-off frames where they are
+    there, otherwise from what surrounds the spot. A misfit above 1 per degree of freedom widens the covariance by as
+    much.
+    """
+    if pair.card.output not in ("srgb8", "mjpeg"):
+        missing = Spot.missing(f"chain_fit needs srgb8 or mjpeg images, not {pair.card.output}")
+        return Answer(missing, missing)
+    down, up = _boxes(pair)
+    return Answer(_spot(pair, pair.down, pair.down_off, down), _spot(pair, pair.up, pair.up_off, up))
+
+
+def _boxes(pair: Pair) -> tuple[Box | None, Box | None]:
+    if pair.box_down is not None and pair.box_up is not None:
+        return pair.box_down, pair.box_up
+    from phibench.estimator.methods.locate import locate  # type: ignore[import-not-found,unused-ignore]
+
+    return locate(pair)
+
+
+def _spot(pair: Pair, image: NDArray[Any], off: NDArray[Any] | None, box: Box | None) -> Spot:
+    if box is None:
+        return Spot.missing("no spot found")
+    region = _region(box, pair.card, image.shape)
+    origin = np.array([[region.u0_px, region.v0_px]])
+    on = image[region.slices][None]
+    base = None if off is None else _base(off[region.slices][None], None, origin, pair.card)
+    blur = np.array([pair.rig.camera.blur_sigma_px])
+    start = first_fit(on, origin, pair.card, blur, _response(pair), base)[0, :2] + origin[0]
+    sigma, ratio = spot_blur(pair.rig, start)
+    if pair.card.output == "srgb8":
+        return _answer(_srgb(image, off, start, pair.card, sigma * np.sqrt(ratio)))
+    if base is None:
+        base = _base(on, around(start[None], origin, (region.height_px, region.width_px)), origin, pair.card)
+    size = (image.shape[1], image.shape[0])
+    return _answer(fit_jpeg(on, origin, pair.card, sigma, _response(pair), base, ratio=ratio, size_px=size))
+
+
+def _region(box: Box, card: SensorCard, shape: tuple[int, ...]) -> Box:
+    """Whole units about a box, and one more on each side."""
+    down, across = mcu_px(card.jpeg_subsampling)
+    u0, u1 = _grown(box.u0_px, box.u0_px + box.width_px, across, shape[1])
+    v0, v1 = _grown(box.v0_px, box.v0_px + box.height_px, down, shape[0])
+    return Box(u0, v0, u1 - u0, v1 - v0)
+
+
+def _grown(first: int, last: int, unit: int, size: int) -> tuple[int, int]:
+    return max((first // unit - 1) * unit, 0), min((-(-last // unit) + 1) * unit, size // unit * unit)
+
+
+def _srgb(image: NDArray[Any], off: NDArray[Any] | None, start: Array, card: SensorCard, sigma: float) -> SpotFit:
+    """Fit a square of 17 x 17 pixels about the start."""
+    u0, v0 = (
+        int(np.clip(np.rint(centre) - _HALF_PX, 0, size - 2 * _HALF_PX - 1))
+        for centre, size in zip(start, (image.shape[1], image.shape[0]), strict=True)
+    )
+    square, origin = Box(u0, v0, 2 * _HALF_PX + 1, 2 * _HALF_PX + 1), np.array([[u0, v0]])
+    on = image[square.slices][None]
+    if off is None:
+        flat = fit_srgb(on, origin, card, sigma)
+        if flat.chi2[0] < _FLAT_CHI2:
+            return flat
+        base = _base(on, around(start[None], origin, (2 * _HALF_PX + 1, 2 * _HALF_PX + 1)), origin, card)
+    else:
+        base = _base(off[square.slices][None], None, origin, card)
+    extra = float(np.median(base.variance_e2))
+    return fit_srgb(on, origin, card, sigma, background_e=base.mean_e, extra_e2=extra)
+
+
+def _base(image: NDArray[Any], known: Array | None, origin: NDArray[np.int64], card: SensorCard) -> BaseImage:
+    x, rounding = undone(image, bayer_filters(origin, image.shape[1:3]), card)
+    variance = unrounded(card).variance_e2(x) + 1.0 / (12.0 * card.dn_per_e**2) + rounding
+    return base_of(x, variance, np.ones(x.shape) if known is None else known)
+
+
+def _response(pair: Pair) -> tuple[float, float, float]:
+    r, g, b = pair.rig.camera.detector.laser_filter_response
+    return r, g, b
+
+
+def _answer(fit: SpotFit) -> Spot:
+    if fit.status[0] != Status.OK:
+        return Spot.missing(describe(int(fit.status[0])))
+    if fit.chi2[0] > _MOST_CHI2:
+        return Spot.missing(f"what is there is no spot: misfit {fit.chi2[0]:.1f}")
+    c = fit.covariance_px2[0] * max(1.0, float(fit.chi2[0]))
+    u, v = (float(x) for x in fit.uv_px[0])
+    return Spot((u, v), ((float(c[0, 0]), float(c[0, 1])), (float(c[1, 0]), float(c[1, 1]))))

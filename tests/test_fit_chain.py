@@ -1,0 +1,232 @@
+"""Fit through the chain: its stages against the simulator's and against Pillow, its laws against sums, its failures."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from chain_scenes import COLLECTED, MIDDLE, ROOM, SQUARE, UNITS, scene
+from PIL import Image
+from scipy import integrate, stats
+
+from phibench.datasets.sensor_card import card_of
+from phibench.estimator import tone_curve
+from phibench.estimator.base_image import around, base_of
+from phibench.estimator.chain_limit import chain_limit
+from phibench.estimator.chain_model import chain_model, codes
+from phibench.estimator.code_law import code_law, code_table
+from phibench.estimator.fit_chain import fit_jpeg, fit_srgb, undone, unrounded
+from phibench.estimator.jpeg_recovery import recovered
+from phibench.estimator.jpeg_tables import coefficients, quantisation, steps
+from phibench.estimator.quantiser import quantised
+from phibench.estimator.raw_pixels import bayer_filters
+from phibench.estimator.status import Status
+from phibench.render import isp
+from phibench.render.chain import Chain
+from phibench.render.sensor import sensor
+from phibench.render.tiles import NoiseStream
+from phibench.scenes.streams import generator
+
+SRGB, MJPEG = sensor("srgb8"), sensor("mjpeg")
+FLUX_E = 5000.0 / COLLECTED
+
+
+def test_tone_curve_against_the_simulators() -> None:
+    x = np.concatenate([[-0.1, 0.0, 0.0031308, 1.0, 1.2], np.linspace(0.0, 1.0, 501)])
+    np.testing.assert_allclose(tone_curve.encoded(x), isp.srgb_encoded(x), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(tone_curve.decoded(isp.srgb_encoded(x)), np.clip(x, 0, 1), rtol=0, atol=1e-6)
+    inside = np.linspace(0.01, 0.99, 99)
+    h = 1e-6
+    slope = (isp.srgb_encoded(inside + h) - isp.srgb_encoded(inside - h)) / (2 * h)
+    np.testing.assert_allclose(tone_curve.slope(inside), slope, rtol=1e-6)
+
+
+def test_noisy_curve_against_quadrature() -> None:
+    """Smooth where the noise does not reach the cut: 1e-6; at the cut 9 nodes are good to 3 % of the deviation."""
+    for mean, sigma, tolerance in ((0.3, 0.02, 1e-6), (0.0005, 0.0006, 0.03 * 12.92 * 0.0006)):
+        wide = [mean + k * sigma for k in (-9.0, 9.0)]
+        exact, _ = integrate.quad(
+            lambda x, m=mean, s=sigma: float(isp.srgb_encoded(np.array(x))) * stats.norm.pdf(x, m, s),
+            *wide,
+            points=[0.0, 0.0031308] if wide[0] < 0 else None,
+            limit=400,
+        )
+        assert tone_curve.noisy(np.array([mean]), np.array([sigma])).mean[0] == pytest.approx(exact, abs=tolerance)
+
+
+def test_every_raw_code_lies_in_the_interval_of_its_8_bit_code() -> None:
+    """All DN of the converter, sent through the simulator's stages, three colours."""
+    card = card_of(SRGB)
+    table, dn = code_table(card), np.arange(card.top_dn + 1)
+    planes = isp.white_balanced(np.repeat(isp.linear_signal(dn, SRGB)[None, None], 3, axis=0), card.white_balance)
+    eight = isp.eight_bit(isp.srgb_encoded(planes))[0]  # (dn, 3)
+    electrons = (dn - card.black_level_dn) / card.dn_per_e
+    for colour in range(3):
+        low, high = table.low_e[colour, eight[:, colour]], table.high_e[colour, eight[:, colour]]
+        assert (electrons >= low).all()
+        assert (electrons < high).all()
+    assert np.isneginf(table.low_e[:, 0]).all()
+    assert np.isposinf(table.high_e[:, 255]).all()
+
+
+@pytest.mark.parametrize("mean_e", [0.0, 30.0, 800.0, 11_000.0])
+def test_law_of_a_code_sums_to_one_and_gives_its_information(mean_e: float) -> None:
+    """Sum of P, of the scores and of their squares over all codes that occur, by the likelihood itself."""
+    card = card_of(SRGB)
+    table = code_table(card)
+    for colour in range(3):
+        _, once = np.unique(table.low_e[colour], return_index=True)
+        filters = np.full((1, 1, len(once)), colour)
+        law = code_law(once[None, None].astype(np.uint8), filters, card, unrounded(card), table)
+        mean = np.full(filters.shape, mean_e)
+        P, score = np.exp(-0.5 * law.misfit(mean, mean)), law.score(mean, mean)
+        information = law.information(mean)[0, 0, 0]
+        assert P.sum() == pytest.approx(1.0, abs=1e-9)
+        assert (P * score).sum() == pytest.approx(0.0, abs=1e-6 * np.sqrt(information) + 1e-12)
+        # linear interpolation between 1024 nodes
+        assert (P * score**2).sum() == pytest.approx(information, rel=5e-3, abs=1e-9)
+
+
+def test_quantiser_against_its_sum_and_against_draws() -> None:
+    for mean, sigma in ((0.3, 0.05), (0.49, 0.05), (2.2, 0.3), (-1.4, 0.7), (0.5, 1.5)):
+        k = np.arange(-40, 41)
+        p = np.diff(stats.norm.cdf(np.append(k - 0.5, 40.5), mean, sigma))
+        one = quantised(np.array([4.0 * mean]), np.array([4.0 * sigma]), np.array([4.0]))
+        h = 1e-5
+        shifted = [np.diff(stats.norm.cdf(np.append(k - 0.5, 40.5), mean + d, sigma)) @ k for d in (h, -h)]
+        assert one.mean[0] == pytest.approx(4.0 * (p @ k), abs=1e-5)
+        assert one.slope[0] == pytest.approx((shifted[0] - shifted[1]) / (2 * h), abs=1e-5)
+        assert one.variance[0] == pytest.approx(16.0 * (p @ k**2 - (p @ k) ** 2), rel=1e-5)
+
+
+@pytest.mark.parametrize("quality", [10, 49, 50, 75, 85, 95, 100])
+def test_quantisation_tables_are_pillows(quality: int) -> None:
+    file = io.BytesIO()
+    Image.fromarray(np.zeros((16, 16, 3), np.uint8)).save(file, "JPEG", quality=quality)
+    tables = Image.open(io.BytesIO(file.getvalue())).quantization
+    for ours, theirs in zip(quantisation(quality), (tables[0], tables[1]), strict=True):
+        np.testing.assert_array_equal(ours.ravel(), theirs)
+
+
+@pytest.mark.parametrize("subsampling", ["4:4:4", "4:2:2", "4:2:0"])
+@pytest.mark.parametrize("background_e", [0.0, 400.0])
+def test_coefficients_behind_a_decoded_image(subsampling: str, background_e: float) -> None:
+    """Those of the image before JPEG, rounded; at most 3 % differ, where libjpeg's integers round the other way.
+
+    Without the quantiser's grid none of the 64 frequencies would agree. Dark rooms are cut at 0.
+    """
+    s = MJPEG.replace(jpeg_subsampling=subsampling)
+    light = scene(MIDDLE, 0.7, FLUX_E, background_e, s)
+    before = Chain(s.replace(output="srgb8")).frame(light, NoiseStream(("recovery",)))
+    after = Chain(s).frame(light, NoiseStream(("recovery",)))
+    found = recovered(after[None], 85, subsampling, (True,) * 4)
+    z = np.concatenate([found.luma.ravel(), found.chroma.ravel()])
+    step = steps(before.shape[:2], subsampling, 85)
+    codes_before = np.moveaxis(before.astype(float), -1, 0)
+    exact = coefficients(codes_before, subsampling)
+    exact[: before.shape[0] * before.shape[1] : 64] -= 1024.0  # the level shift, on Y's mean
+    differ = np.abs(z / step - np.rint(exact / step)) > 0.5
+    assert (after == 0).any() == (background_e == 0.0)
+    assert z.any()
+    assert differ.mean() < 0.03
+    assert found.wrong.mean() < 0.01
+
+
+@pytest.mark.parametrize("changes", [{}, {"sharpen_amount": 0.5}], ids=["plain", "sharpened"])
+def test_model_of_the_means_against_the_chain(changes: dict) -> None:
+    """Mean codes of 600 frames: chi-square of 1536 values; a false alarm in 1e-6, a shift by 0.3 codes is noticed."""
+    s = MJPEG.replace(prnu=0.0, dsnu_e=0.0, **changes)
+    model = chain_model(card_of(s), unrounded(card_of(s)))
+    light, m = scene(MIDDLE + [0.3, -0.2], 0.7, FLUX_E, 100.0, s), model.margin
+    from phibench.render.region import Region
+
+    window = Region(32, 24, 64, 40)
+    raw = Region(32 - m, 24 - m, 64 + m, 40 + m)
+    mean_e = Chain(s).photo_electrons(light, raw) + s.dark_e_per_s * s.exposure_s
+    at = codes(model, mean_e.ravel())
+    developed = Chain(s.replace(output="srgb8"))
+    n = 600
+    frames = np.stack([developed.frame(light, NoiseStream(("model", k)), window) for k in range(n)]).astype(float)
+    planes = np.moveaxis(frames, -1, 1)
+    wanted = at.mean @ model.transform + model.shift
+    drawn = coefficients(planes, "4:2:2") + model.shift
+    z = (drawn.mean(axis=0) - wanted) / (drawn.std(axis=0, ddof=1) / np.sqrt(n))
+    # nodes of the table and neighbours of unequal means leave some hundredths of a code
+    assert np.mean(z**2) < (1.6 if not changes else 2.2)
+    off = (drawn.mean(axis=0) - wanted + 0.3 * coefficients(np.ones((3, 16, 32)), "4:2:2")) / (
+        drawn.std(axis=0, ddof=1) / np.sqrt(n)
+    )
+    print(np.mean(z**2), np.mean(off**2))
+    assert np.mean(off**2) > 3.0
+
+
+@pytest.mark.parametrize("preset", ["srgb8", "mjpeg"])
+def test_fit_of_a_bright_spot(preset: str) -> None:
+    """Within 6 standard deviations of its own; flux within 10 %. What is offered as the wrong phase is not."""
+    s = sensor(preset)
+    uv = MIDDLE + [0.3, -0.4]
+    light, box = scene(uv, 0.7, FLUX_E, 100.0, s), UNITS if preset == "mjpeg" else SQUARE
+    frames = np.stack([Chain(s, k).frame(light, NoiseStream(("bright", k)), box) for k in range(4)])
+    fit = (fit_jpeg if preset == "mjpeg" else fit_srgb)(frames, (box.u0_px, box.v0_px), card_of(s), 0.7)
+    assert (fit.status == Status.OK).all()
+    sd = np.sqrt(np.diagonal(fit.covariance_px2, axis1=1, axis2=2))
+    assert (np.abs(fit.uv_px - uv) < 6.0 * sd).all()
+    assert (sd < 0.06).all()
+    np.testing.assert_allclose(fit.flux_e, FLUX_E, rtol=0.1)
+    limit = chain_limit(card_of(s), uv, 0.7, FLUX_E, 100.0 * ROOM)
+    np.testing.assert_allclose(sd.mean(axis=0), np.sqrt(np.diag(limit.covariance_px2)), rtol=0.15)
+
+
+def test_sharpening_and_matrix_are_undone() -> None:
+    s = SRGB.replace(sharpen_amount=0.5, colour_matrix=((1.4, -0.3, -0.1), (-0.2, 1.4, -0.2), (0.0, -0.4, 1.4)))
+    light = scene(MIDDLE, 0.9, FLUX_E, 1500.0, s.replace(shot_noise=False, read_noise_e=0.0))
+    frame = Chain(s.replace(shot_noise=False, read_noise_e=0.0, prnu=0.0, dsnu_e=0.0)).frame(
+        light, NoiseStream(("undone",)), SQUARE
+    )
+    filters = bayer_filters(np.array([[SQUARE.u0_px, SQUARE.v0_px]]), (17, 17))
+    x, extra = undone(frame[None], filters, card_of(s))
+    photo = Chain(s.replace(output="raw")).photo_electrons(light, SQUARE)
+    inner = (slice(4, -4), slice(4, -4))
+    # 5 deviations of 8 bits, and half a DN of the converter
+    assert (np.abs(x[0] - photo)[inner] < 5.0 * np.sqrt(extra[0][inner]) + 0.5 / s.dn_per_e + 1.0).all()
+
+
+def test_base_of_a_flat_room_is_quiet_and_of_an_edge_is_kept() -> None:
+    rng = generator("chain", "base")
+    room = np.full((1, 48, 64), 400.0)
+    room[:, :, 40:] = 1600.0
+    variance = room + 16.0
+    base = base_of(room + rng.normal(size=room.shape) * np.sqrt(variance), variance, np.ones(room.shape))
+    flat = (slice(None), slice(8, 40), slice(4, 24))
+    assert np.std(base.mean_e[flat] - room[flat]) < 0.4 * np.sqrt(416.0)
+    edge = (slice(None), slice(8, 40), slice(38, 42))
+    assert np.abs(base.mean_e[edge] - room[edge]).mean() < 3.0 * 40.0
+    assert base.variance_e2[edge].mean() > 3.0 * base.variance_e2[flat].mean()
+    hidden = around(np.array([[20.0, 20.0]]), np.zeros((1, 2)), (48, 64))
+    assert hidden[0, 20, 20] == 0.0
+    assert hidden[0, 20, 26] == 1.0
+
+
+def test_messages() -> None:
+    card, image = card_of(MJPEG), np.zeros((1, 32, 64, 3), np.uint8)
+    with pytest.raises(ValueError, match="uint8 is needed"):
+        fit_srgb(image.astype(float), (0, 0), card, 0.7)
+    with pytest.raises(ValueError, match="multiples of 16 x 8"):
+        fit_jpeg(image, (8, 8), card, 0.7)
+    with pytest.raises(ValueError, match="needs 'bayer'"):
+        fit_srgb(image, (0, 0), card_of(sensor("srgb8", mosaic="mono")), 0.7)
+    with pytest.raises(ValueError, match="knows 'srgb8' and 'mjpeg'"):
+        chain_limit(card_of(sensor("bayer-raw")), (10.0, 10.0), 0.7, 1e4, (1.0, 1.0, 1.0))
+    with pytest.raises(ValueError, match="1 to 100"):
+        quantisation(0)
+
+
+def test_nothing_there() -> None:
+    light = scene(MIDDLE, 0.7, 1.0, 100.0, MJPEG)
+    frame = Chain(MJPEG).frame(light, NoiseStream(("nothing",)), UNITS)
+    fit = fit_jpeg(frame[None], (UNITS.u0_px, UNITS.v0_px), card_of(MJPEG), 0.7)
+    assert fit.status[0] != Status.OK
+    assert np.isnan(fit.uv_px).all()
+    assert fit_srgb(np.zeros((0, 17, 17, 3), np.uint8), (0, 0), card_of(SRGB), 0.7).uv_px.shape == (0, 2)
+    assert fit_jpeg(np.zeros((0, 16, 32, 3), np.uint8), (0, 0), card_of(MJPEG), 0.7).uv_px.shape == (0, 2)
