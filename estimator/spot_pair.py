@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phibench.estimator.mirror_image import image_of
-from phibench.estimator.reflection import reflect
+from phibench.estimator.epipolar import up_image
 from phibench.estimator.spot_test import Tests
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig
@@ -82,20 +81,8 @@ def epipolar_curve(rig: Rig, stroke_m: float, uv_down_px: Array) -> Array:
 
     The points lie at k values of D from `NEAREST_M` to `FARTHEST_M`, even in 1 / D, which is nearly even in pixels.
     """
-    ray = reflect(rig.at(0.0), uv_down_px)
-    D = 1.0 / np.linspace(1.0 / NEAREST_M, 1.0 / FARTHEST_M, _POINTS)
-    t = _range_at(ray.origin_world_m - rig.at(0.0).sphere_centre_m, ray.direction_world, D)
-    points = ray.origin_world_m[:, None] + t[..., None] * ray.direction_world[:, None]
-    return image_of(rig.at(float(stroke_m)), points).uv_px
-
-
-def _range_at(origin_m: Array, direction: Array, D: Array) -> Array:
-    """Length along rays at which the horizontal distance from the vertical through the sphere is D, shape (n, k)."""
-    with np.errstate(all="ignore"):
-        a = np.sum(direction[:, :2] ** 2, axis=-1)[:, None]
-        b = np.sum(origin_m[:, :2] * direction[:, :2], axis=-1)[:, None]
-        c = np.sum(origin_m[:, :2] ** 2, axis=-1)[:, None] - D * D
-        return (np.sqrt(b * b - a * c) - b) / a
+    q = np.linspace(1.0 / NEAREST_M, 1.0 / FARTHEST_M, _POINTS)
+    return up_image(rig, stroke_m, uv_down_px[:, None, :], q).uv_px
 
 
 def _distance(curve: Array, points: Array) -> Array:
