@@ -8,8 +8,10 @@ correlated and only roughly what `variance` says: what uses it calibrates it on 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from phibench.datasets.sensor_card import SensorCard
 from phibench.estimator.raw_pixels import raw_electrons
@@ -26,7 +28,7 @@ class ColourPlanes:
 
     Attributes
     ----------
-    values_e : shape (c, h, w), float32
+    values_e : shape (c, h, w), float32 to be quick
         Electrons behind R, G, B, or of pixels without filters (c = 1).
     sites : shape (c, h, w), bool
         Pixels at which a plane was measured or interpolated.
@@ -36,7 +38,7 @@ class ColourPlanes:
         The part; its first row and column are even, so that red comes first.
     """
 
-    values_e: Array
+    values_e: NDArray[Any]
     sites: BoolArray
     full: BoolArray
     box: Box

@@ -16,7 +16,7 @@ from phibench.estimator.epipolar import up_image
 from phibench.estimator.estimate import DepthEstimate
 from phibench.estimator.status import Status, first_fault, flag, keep
 from phibench.estimator.triangulate import depth_exact
-from phibench.scenes.frames import Array
+from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig
 
 _STEPS = 30
@@ -81,7 +81,7 @@ def combine(
     )
     G = image.jacobian
     values = (1.0 / q, np.sqrt(C[..., 2, 2]) / (q * q), uv, image.uv_px, C[..., :2, :2], G @ C @ _t(G), chi2)
-    depth, sigma, uv1, uv2, C1, C2, misfit = (keep(value, status) for value in values)
+    depth, sigma, uv1, uv2, C1, C2, misfit = (keep(np.asarray(value), status) for value in values)
     return CombinedEstimate(depth, sigma, status, uv1, uv2, C1, C2, misfit)
 
 
@@ -124,7 +124,7 @@ def joint_information(down: Array, up: Array, jacobian: Array) -> Array:
 
 def _minimised(
     rig: Rig, h: Array, down: Array, up: Array, W1: Array, W2: Array, q: Array
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, BoolArray]:
     """Gauss-Newton from the down position and the midpoint's depth: (u, v), 1 / D and whether it came to rest."""
     uv, q = down.copy(), np.array(q)
     decrement = np.full(q.shape, np.inf)
@@ -138,7 +138,7 @@ def _minimised(
         decrement = np.sum(step * b, axis=-1)
         if not np.any(decrement > _DECREMENT):
             break
-    return uv, q, decrement < 1e4 * _DECREMENT
+    return uv, q, np.asarray(decrement < 1e4 * _DECREMENT)
 
 
 def _quadratic(W: Array, x: Array) -> Array:
@@ -155,6 +155,6 @@ def _t(M: Array) -> Array:
 
 def _invertible(M: Array) -> Array:
     """The matrices, and one of NaN for those that have no inverse, which stop no others."""
-    good = np.isfinite(M).all(axis=(-1, -2))
-    good = good & (np.abs(np.linalg.det(np.where(good[..., None, None], M, 0.0))) > 0.0)
+    finite = np.asarray(np.isfinite(M).all(axis=(-1, -2)))
+    good = np.asarray(finite & (np.abs(np.linalg.det(np.where(finite[..., None, None], M, 0.0))) > 0.0))
     return np.where(good[..., None, None], M, np.nan)

@@ -1,7 +1,7 @@
 """Detection of the laser spot in both whole frames of a pair, without a hint.
 
 Per image: the strongest places of a matched filter (`spot_map`) inside the mirror's outline, each tested for shape and
-colour (`spot_test`). Then both images together (`spot_pair`): the spot's images belong to one point of the room.
+colour (`spot_verdict`). Then both images together (`spot_pair`): the spot's images belong to one point of the room.
 
 False alarms. The mirror's disc has 3.6e5 pixels and each is asked at 4 half-pixel places, so that a frame has at most
 N = 1.44e6 trials; on raw pixels whose background is known the significance is never larger than a unit normal's,
@@ -27,12 +27,13 @@ from phibench.estimator.lamps import lamp_halo
 from phibench.estimator.seat.pair import Box, Image, Pair
 from phibench.estimator.spot_map import peaks
 from phibench.estimator.spot_pair import Choice, Thresholds, choose
-from phibench.estimator.spot_test import Tests, noise_of_tests, tested
+from phibench.estimator.spot_verdict import Verdicts, judged, noise_of_verdicts
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig
 
 RAW = Thresholds(alone=6.2, each=4.8, together=4.8)
 PROCESSED = Thresholds(alone=7.5, each=4.6, together=5.5)
+PROCESSED_ONE_FRAME = Thresholds(alone=8.5, each=5.0, together=6.5)  # without a laser-off frame
 UNSURE = Thresholds(alone=16.0, each=5.0, together=10.0)  # neither filters nor a laser-off frame
 _LEAST_PEAK = 4.0
 _MOST_PEAKS = 3000
@@ -74,13 +75,14 @@ class _Searched:
     on: ColourPlanes
     off: ColourPlanes | None
     sigma_px: float
-    found: Tests
+    found: Verdicts
 
 
 def detect(pair: Pair) -> PairDetection:
     """Find the strongest red laser light that both images agree on.
 
-    A spot in one image only must be more significant than one in both. Boxes of the pair, if there are any, restrict the search.
+    A spot in one image only must be more significant than one in both. Boxes of the pair, if
+    there are any, restrict the search.
 
     Raises
     ------
@@ -89,15 +91,18 @@ def detect(pair: Pair) -> PairDetection:
     """
     down = _searched(pair.down, pair.down_off, pair, pair.box_down)
     up = _searched(pair.up, pair.up_off, pair, pair.box_up)
-    sure = pair.down_off is not None or pair.card.mosaic == "bayer"
-    choice = choose(pair.rig, pair.stroke_m, down.found, up.found, _thresholds(pair.card, sure), sure)
+    off = pair.down_off is not None and pair.up_off is not None
+    sure = off or pair.card.mosaic == "bayer"
+    choice = choose(pair.rig, pair.stroke_m, down.found, up.found, _thresholds(pair.card, sure, off), sure)
     return _refined(choice, down, up, pair.card)
 
 
-def _thresholds(card: SensorCard, sure: bool) -> Thresholds:
+def _thresholds(card: SensorCard, sure: bool, off: bool) -> Thresholds:
     if not sure:
         return UNSURE
-    return RAW if card.output == "raw" else PROCESSED
+    if card.output == "raw":
+        return RAW
+    return PROCESSED if off else PROCESSED_ONE_FRAME
 
 
 def outline_mask(rig: Rig, box: Box) -> BoolArray:
@@ -124,12 +129,12 @@ def _searched(image: Image, dark: Image | None, pair: Pair, hint: Box | None, le
     inside = outline_mask(pair.rig, box)
     inside = inside & ~lamp_halo(off or on, inside, card)
     sigma = blur_of(card, pair.rig.camera.blur_sigma_px)
-    noise = noise_of_tests(on, off, card, sigma, inside)
+    noise = noise_of_verdicts(on, off, card, sigma, inside)
     where = inside if hint is None else inside & _hinted(hint, box)
     places = peaks(on, off, card, sigma, where, _LEAST_PEAK, _MOST_PEAKS).uv_px
-    first = tested(on, off, card, places, sigma, noise)
+    first = judged(on, off, card, places, sigma, noise)
     first = _rows(first, first.z >= np.sort(first.z)[-_MOST_TESTED:][:1].sum())
-    best = _better(first, tested(on, off, card, first.uv_px, _WIDER * sigma, noise))
+    best = _better(first, judged(on, off, card, first.uv_px, _WIDER * sigma, noise))
     keep = best.red & (best.z >= least_z)
     return _Searched(on, off, sigma, _moved(_rows(best, keep), box))
 
@@ -142,10 +147,10 @@ def _hinted(hint: Box, box: Box) -> BoolArray:
     return mask
 
 
-def _better(a: Tests, b: Tests) -> Tests:
+def _better(a: Verdicts, b: Verdicts) -> Verdicts:
     """At each place the test of the scale that fits better."""
     first = a.z >= b.z
-    return Tests(
+    return Verdicts(
         a.uv_px,
         np.where(first, a.z, b.z),
         np.where(first, a.electrons, b.electrons),
@@ -155,15 +160,15 @@ def _better(a: Tests, b: Tests) -> Tests:
     )
 
 
-def _rows(tests: Tests, keep: BoolArray) -> Tests:
+def _rows(tests: Verdicts, keep: BoolArray) -> Verdicts:
     order = np.flatnonzero(keep)[np.argsort(-tests.electrons[keep], kind="stable")]
-    return Tests(*(getattr(tests, name)[order] for name in tests.__dataclass_fields__))
+    return Verdicts(*(getattr(tests, name)[order] for name in tests.__dataclass_fields__))
 
 
-def _moved(tests: Tests, box: Box) -> Tests:
+def _moved(tests: Verdicts, box: Box) -> Verdicts:
     origin = np.array([box.u0_px, box.v0_px], float)
     values = {name: getattr(tests, name) for name in tests.__dataclass_fields__}
-    return Tests(**{**values, "uv_px": tests.uv_px + origin})
+    return Verdicts(**{**values, "uv_px": tests.uv_px + origin})
 
 
 def _refined(choice: Choice, down: _Searched, up: _Searched, card: SensorCard) -> PairDetection:
@@ -186,7 +191,7 @@ def parabola_peak(searched: _Searched, card: SensorCard, uv_px: Array, step_px: 
     """
     offsets = step_px * np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), -1).reshape(-1, 2)
     for _ in range(3):
-        test = tested(searched.on, searched.off, card, uv_px + offsets, searched.sigma_px)
+        test = judged(searched.on, searched.off, card, uv_px + offsets, searched.sigma_px)
         gain = (np.maximum(test.electrons, 0.0) / test.sigma_e) ** 2
         best = int(np.argmax(gain))
         if best == len(offsets) // 2:

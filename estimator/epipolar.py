@@ -1,4 +1,4 @@
-"""Where a point seen in the down image at distance D is seen in the up image, with derivatives: the epipolar constraint.
+"""Where a point seen in the down image at distance D is seen in the up image, with derivatives: the epipolar line.
 
 The down pixel's ray is X(t) = P + t r; t follows from |X_h - S_h| = D, h the horizontal part and S the sphere centre at
 the down position; X is seen in the up image at `mirror_image.image_of`.

@@ -164,7 +164,7 @@ def _step(theta: Array, score: Array, fisher: Array) -> Array:
 
 
 def _solved(fisher: Array, score: Array) -> Array:
-    """Step of Fisher scoring; the diagonal a little larger, so that unknowns that nothing tells apart stop no others."""
+    """Step of Fisher scoring; the diagonal a little larger, so that unknowns that nothing tells apart stop none."""
     matrix = np.where(np.isfinite(fisher), fisher, 0.0)
     diagonal = np.einsum("nkk->nk", matrix)
     diagonal *= 1.0 + 1e-9
@@ -221,9 +221,7 @@ def _joint_misfit(rig: Rig, h: Array, down: SpotRegions, up: SpotRegions, psi: A
     return misfit(down, theta_down) + misfit(up, theta_up)
 
 
-def _polished(
-    rig: Rig, h: Array, down: SpotRegions, up: SpotRegions, psi: Array
-) -> tuple[Array, BoolArray, Array]:
+def _polished(rig: Rig, h: Array, down: SpotRegions, up: SpotRegions, psi: Array) -> tuple[Array, BoolArray, Array]:
     """Go on until the step is small against the standard deviation; psi, whether it is, and the misfit."""
     psi, moving = psi.copy(), np.flatnonzero(np.isfinite(psi).all(axis=1))
     done = np.zeros(len(psi), bool)

@@ -9,8 +9,10 @@ light is not as red as the laser; without filters the mean of the surroundings.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import correlate1d, uniform_filter
 from skimage.feature import peak_local_max
 
@@ -62,7 +64,9 @@ def peaks(
     light, variance = _above_background(on, off, card)
     z, phase = _highest_phase(light, variance, on, sigma_px)
     z = np.where(inside, z / (1.0 if card.output == "raw" else _spread(z, inside)), np.float32(0.0))
-    vu = peak_local_max(z, min_distance=2, threshold_abs=least_z, exclude_border=False, num_peaks=most)
+    vu = peak_local_max(  # type: ignore[no-untyped-call]
+        z, min_distance=2, threshold_abs=least_z, exclude_border=False, num_peaks=most
+    )
     at = (vu[:, 0], vu[:, 1])
     shift = np.stack([phase[at] % 2, phase[at] // 2], axis=-1) * _PHASES[1]
     return Peaks(vu[:, ::-1] + shift, z[at])
@@ -102,12 +106,15 @@ def _variance(plane: Array, on: ColourPlanes, card: SensorCard, alike: bool) -> 
     return np.asarray(variance_e2(_mean(plane, on, _CORE_PX), card, alike), np.float32)
 
 
-def _highest_phase(light: Array, variance: Array, on: ColourPlanes, sigma_px: float) -> tuple[Array, Array]:
+def _highest_phase(
+    light: Array, variance: Array, on: ColourPlanes, sigma_px: float
+) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
     """Largest z over the places (u, v) + (0 or 1/2, 0 or 1/2), and which it was: 2 x (row's half) + column's half."""
     count = 2 * _REACH_PX + 1
     centres = _REACH_PX + np.array(_PHASES)
     kernels = profile(centres, np.full(2, sigma_px), count).share.astype(np.float32)
-    best, which = np.full(light.shape, -np.inf, np.float32), np.zeros(light.shape, np.int8)
+    best: NDArray[np.float32] = np.full(light.shape, -np.inf, np.float32)
+    which: NDArray[np.int8] = np.zeros(light.shape, np.int8)
     scale = np.sqrt(variance)
     for i, down in enumerate(kernels):
         rows = _correlated(light, down, 0)
@@ -130,7 +137,7 @@ def _squares(kernel: Array, on: ColourPlanes, axis: int) -> Array:
     return np.asarray(correlate1d(site.astype(float), kernel**2, mode="wrap"))
 
 
-def _spread(z: Array, inside: BoolArray) -> float:
+def _spread(z: NDArray[Any], inside: BoolArray) -> float:
     """Scale of the map, 1 for independent noise of the variance that was taken."""
     values = z[::3, ::3][inside[::3, ::3]]
     spread = 1.4826 * np.median(np.abs(values - np.median(values))) if values.size else 1.0

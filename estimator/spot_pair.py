@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from phibench.estimator.epipolar import up_image
-from phibench.estimator.spot_test import Tests
+from phibench.estimator.spot_verdict import Verdicts
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig
 
@@ -40,14 +40,14 @@ class Choice:
     up: int | None = None
 
 
-def choose(rig: Rig, stroke_m: float, down: Tests, up: Tests, least: Thresholds, sure: bool) -> Choice:
+def choose(rig: Rig, stroke_m: float, down: Verdicts, up: Verdicts, least: Thresholds, sure: bool) -> Choice:
     """Choose the strongest consistent pair, or one candidate alone.
 
     Parameters
     ----------
     rig : Rig
     stroke_m : float
-    down, up : Tests
+    down, up : Verdicts
         Candidates, pixels of the whole image, strongest first.
     least : Thresholds
     sure : bool
@@ -95,7 +95,7 @@ def _distance(curve: Array, points: Array) -> Array:
     return np.min(np.where(np.isfinite(distance), distance, np.inf), axis=-1)
 
 
-def _single(down: Tests, up: Tests, alone: float) -> Choice:
+def _single(down: Verdicts, up: Verdicts, alone: float) -> Choice:
     """The more significant one of the strongest candidates that pass alone; both could not be one point."""
     rows = [int(np.flatnonzero(side.z >= alone)[0]) if (side.z >= alone).any() else None for side in (down, up)]
     if rows[0] is None or rows[1] is None:

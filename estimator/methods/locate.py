@@ -29,7 +29,6 @@ def box_around(found: Detection | None, image: Image) -> Box | None:
     height, width = image.shape[:2]
     side = (min(_SIDE_PX, width), min(_SIDE_PX, height))
     u0, v0 = (
-        min(max(round(x) - s // 2, 0), size - s)
-        for x, s, size in zip(found.uv_px, side, (width, height), strict=True)
+        min(max(round(x) - s // 2, 0), size - s) for x, s, size in zip(found.uv_px, side, (width, height), strict=True)
     )
     return Box(u0, v0, side[0], side[1])

@@ -21,14 +21,15 @@ _REACH_PX = {True: 6, False: 4}  # of a patch: of a mosaic, where a quarter of t
 # of white light's green: where red ends; the laser's is 0.1, but for JPEG's coarse chroma
 _GREEN_SHARE = {"raw": 0.5, "srgb8": 0.5, "mjpeg": 0.75}
 _FULLER = 0.5
+_OUTSHINES = 0.7  # peak of a spot over the level around it, more than the contrast of walls and furniture
 _LATTICE_PX = 17
 _CHI2_SHARE = 0.75  # of places without a spot that count as fitted well: JPEG leaves many all but empty
 _FULL_PX = 3  # a saturated spot is not wider
 
 
 @dataclass(frozen=True)
-class Tests:
-    """Tests of n places.
+class Verdicts:
+    """Verdicts of n places.
 
     Attributes
     ----------
@@ -49,7 +50,7 @@ class Tests:
 
 
 @dataclass(frozen=True)
-class TestNoise:
+class VerdictNoise:
     """What tests of places without a spot give: for pixels that are correlated by processing it is not 1.
 
     Attributes
@@ -73,9 +74,14 @@ class _Fit:
     chi2: Array
 
 
-def tested(
-    on: ColourPlanes, off: ColourPlanes | None, card: SensorCard, uv_px: Array, sigma_px: float, noise: TestNoise = TestNoise()
-) -> Tests:
+def judged(
+    on: ColourPlanes,
+    off: ColourPlanes | None,
+    card: SensorCard,
+    uv_px: Array,
+    sigma_px: float,
+    noise: VerdictNoise = VerdictNoise(),
+) -> Verdicts:
     """Test places.
 
     Parameters
@@ -85,7 +91,7 @@ def tested(
     uv_px : shape (n, 2), relative to the part
     sigma_px : float
         Blur in the planes.
-    noise : TestNoise
+    noise : VerdictNoise
     """
     reach = _REACH_PX[on.mosaic]
     corner = np.rint(uv_px).astype(int) - reach
@@ -94,22 +100,24 @@ def tested(
     count = 2 if off is None and len(on.values_e) > 1 else 1
     fits = [_fitted(on, off, card, c, corner, template) for c in range(count)]
     red = fits[0]
+    if off is None and count == 2 and card.output != "raw":
+        red = _bright_or(red, on, card, corner, template)
     z = red.amplitude / np.sqrt(red.variance * np.maximum(red.chi2 / noise.chi2, 1.0)) / noise.spread
-    colour = _red(fits, card) | _fuller(on, uv_px) if len(fits) > 1 else np.ones(len(z), bool)
-    return Tests(uv_px, z, red.amplitude, np.sqrt(red.variance) * noise.spread, red.chi2, colour)
+    colour = _red([red, *fits[1:]], card) | _fuller(on, uv_px) if len(fits) > 1 else np.ones(len(z), bool)
+    return Verdicts(uv_px, z, red.amplitude, np.sqrt(red.variance) * noise.spread, red.chi2, colour)
 
 
-def noise_of_tests(
+def noise_of_verdicts(
     on: ColourPlanes, off: ColourPlanes | None, card: SensorCard, sigma_px: float, inside: BoolArray
-) -> TestNoise:
-    """What the tests give without a spot, from places all over the part; of raw pixels, whose noise is known, (1, 1)."""
+) -> VerdictNoise:
+    """What places all over the part give without a spot; (1, 1) for raw pixels, whose noise is known."""
     places = lattice(inside, _LATTICE_PX)
     if card.output == "raw" or not len(places):
-        return TestNoise()
-    tests = tested(on, off, card, places, sigma_px)
+        return VerdictNoise()
+    tests = judged(on, off, card, places, sigma_px)
     chi2 = float(max(np.quantile(tests.chi2, _CHI2_SHARE), 0.1))
     z = tests.z * np.sqrt(np.maximum(tests.chi2, 1.0) / np.maximum(tests.chi2 / chi2, 1.0))
-    return TestNoise(max(_spread(z), 0.5), chi2)
+    return VerdictNoise(max(_spread(z), 0.5), chi2)
 
 
 def _spread(z: Array) -> float:
@@ -122,7 +130,7 @@ def lattice(inside: BoolArray, step_px: int) -> Array:
     """Places all over the part, shape (n, 2): where the noise of a test is measured. Odd steps see every phase."""
     half = step_px // 2
     v, u = np.nonzero(inside[half::step_px, half::step_px])
-    return np.stack([u, v], axis=-1) * float(step_px) + half
+    return np.asarray(np.stack([u, v], axis=-1) * float(step_px) + half, float)
 
 
 def _template(centre_px: Array, sigma_px: float, reach: int) -> Array:
@@ -131,10 +139,26 @@ def _template(centre_px: Array, sigma_px: float, reach: int) -> Array:
     return outer(down, across)
 
 
+def _bright_or(guided: _Fit, on: ColourPlanes, card: SensorCard, corner: Array, template: Array) -> _Fit:
+    """Fits without green where the spot outshines the room: processing spreads a bright spot into green."""
+    plain = _fitted(on, None, card, 0, corner, template, guided=False)
+    size = template.shape[1]
+    level = _middle(_patches(on.values_e[0], corner, size), _patches(on.sites[0], corner, size))
+    bright = plain.amplitude * template.max(axis=(1, 2)) > _OUTSHINES * np.maximum(level, 1.0)
+    pairs = ((plain.amplitude, guided.amplitude), (plain.variance, guided.variance), (plain.chi2, guided.chi2))
+    return _Fit(*(np.where(bright, a, b) for a, b in pairs))
+
+
 def _fitted(
-    on: ColourPlanes, off: ColourPlanes | None, card: SensorCard, c: int, corner: Array, template: Array
+    on: ColourPlanes,
+    off: ColourPlanes | None,
+    card: SensorCard,
+    c: int,
+    corner: Array,
+    template: Array,
+    guided: bool = True,
 ) -> _Fit:
-    """Fit of one plane on patches; without a laser-off frame red's background may look like green."""
+    """Fit of one plane on patches; without a laser-off frame red's background may look like green (`guided`)."""
     size = template.shape[1]
     y, used = _patches(on.values_e[c], corner, size), _patches(on.sites[c], corner, size)
     level = _level(y, used)
@@ -142,7 +166,7 @@ def _fitted(
     if off is not None:
         dark = _patches(off.values_e[c], corner, size)
         y, level = y - dark, np.maximum(dark, _middle(dark, used)[:, None, None])
-    elif c == 0 and len(on.values_e) > 1:
+    elif guided and c == 0 and len(on.values_e) > 1:
         guide = _patches(green_at_red(on), corner, size)
         middle = _middle(guide, used)[:, None, None]
         level = np.maximum(level, guide * _middle(y, used)[:, None, None] / np.maximum(middle, 1.0))
