@@ -153,8 +153,8 @@ def _better(a: Verdicts, b: Verdicts) -> Verdicts:
     return Verdicts(
         a.uv_px,
         np.where(first, a.z, b.z),
-        np.where(first, a.electrons, b.electrons),
-        np.where(first, a.sigma_e, b.sigma_e),
+        a.electrons,  # of one scale everywhere, so that spots can be compared
+        a.sigma_e,
         np.where(first, a.chi2, b.chi2),
         a.red,  # the wider one takes more of green's surroundings in
     )
