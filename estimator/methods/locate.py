@@ -1,59 +1,34 @@
-"""Where the spot is, without a hint: a box for each image of a pair."""
+"""Where to look: a box around the spot in each image of a pair."""
 
 from __future__ import annotations
 
-from typing import Any
+from phibench.estimator.detect import Detection, detect
+from phibench.estimator.seat.pair import Box, Image, Pair
 
-import numpy as np
-from numpy.typing import NDArray
-
-from phibench.estimator.methods.linear import linear_planes, redness
-from phibench.estimator.methods.red_peak import red_peak
-from phibench.estimator.methods.window import around, clipped, cut
-from phibench.estimator.phi import outline_circle
-from phibench.estimator.seat.pair import Box, Pair
-from phibench.scenes.frames import Array, BoolArray
-
-BOX_PX = 33
-_INSIDE = 0.985  # of the outline's radius: the rim itself is an edge
-_LEAST_SIGMAS = 6.0  # of half a million pixels one exceeds 5 by chance
+_SIDE_PX = 21  # room for a fit's surroundings
 
 
 def locate(pair: Pair) -> tuple[Box | None, Box | None]:
-    """Box of 33 x 33 pixels around the most spot-like red place inside the mirror's outline.
+    """Boxes of the down and the up image: the pair's own hints, otherwise those of `detect`; None where there is none.
 
-    Where the pair has frames with the laser off, in on minus off. Without them a lamp's edge is often redder.
-
-    Parameters
-    ----------
-    pair : Pair
-
-    Returns
-    -------
-    (down, up)
-        None where nothing stands out by 6 standard deviations.
+    Raises
+    ------
+    ValueError
+        If an image does not fit the card's output.
     """
-    return _locate(pair, pair.down, pair.down_off), _locate(pair, pair.up, pair.up_off)
+    if pair.box_down is not None and pair.box_up is not None:
+        return pair.box_down, pair.box_up
+    found = detect(pair)
+    return box_around(found.down, pair.down), box_around(found.up, pair.up)
 
 
-def _locate(pair: Pair, image: NDArray[Any], off: NDArray[Any] | None) -> Box | None:
-    centre, radius = outline_circle(pair.rig)
-    side = 2 * int(np.ceil(radius)) + 1
-    disc = around((float(centre[0]), float(centre[1])), image.shape, side)
-    if disc.width_px == 0 or disc.height_px == 0:
+def box_around(found: Detection | None, image: Image) -> Box | None:
+    """Square of 21 pixels around a detection, moved inside the image where it would leave it."""
+    if found is None:
         return None
-    red = _redness(pair, image, disc) if off is None else _redness(pair, image, disc) - _redness(pair, off, disc)
-    peak = red_peak(red, _in_mirror(disc, (float(centre[0]), float(centre[1])), _INSIDE * radius), _LEAST_SIGMAS)
-    if peak is None:
-        return None
-    return clipped(around((peak[0] + disc.u0_px, peak[1] + disc.v0_px), image.shape, BOX_PX), image.shape)
-
-
-def _redness(pair: Pair, image: NDArray[Any], box: Box) -> Array:
-    return redness(linear_planes(cut(image, box), pair.card, (box.u0_px, box.v0_px)))
-
-
-def _in_mirror(disc: Box, centre: tuple[float, float], radius: float) -> BoolArray:
-    u = np.arange(disc.width_px) + disc.u0_px - centre[0]
-    v = np.arange(disc.height_px) + disc.v0_px - centre[1]
-    return u[None, :] ** 2 + v[:, None] ** 2 < radius**2
+    height, width = image.shape[:2]
+    side = (min(_SIDE_PX, width), min(_SIDE_PX, height))
+    u0, v0 = (
+        min(max(round(x) - s // 2, 0), size - s) for x, s, size in zip(found.uv_px, side, (width, height), strict=True)
+    )
+    return Box(u0, v0, side[0], side[1])

@@ -1,0 +1,208 @@
+"""Detection of the laser spot in both whole frames of a pair, without a hint.
+
+Per image: the strongest places of a matched filter (`spot_map`) inside the mirror's outline, each tested for shape and
+colour (`spot_verdict`). Then both images together (`spot_pair`): the spot's images belong to one point of the room.
+
+False alarms. The mirror's disc has 3.6e5 pixels and each is asked at 4 half-pixel places, so that a frame has at most
+N = 1.44e6 trials; on raw pixels whose background is known the significance is never larger than a unit normal's,
+because chi^2 only lowers it. A candidate alone: N Q(6.2) = 4e-4 a frame. A pair: the partner lies within 4 px of a
+curve at most 340 px long, n = 4 x 2700 trials, and both pass 4.8: N n Q(4.8)^2 = 0.01 by this count, which takes
+neighbouring places for independent; the pixels within a blur's area (about 7 px) share their noise, in both images,
+which leaves 1e-2 / 49 / 16 = 1e-5. Processed pixels have longer tails than a normal law, and a room seen without
+filters and without a laser-off frame has corners that look like spots: both have thresholds of their own, set by
+measurement (`docs/measurements.md`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image as Picture
+from PIL import ImageDraw
+
+from phibench.datasets.sensor_card import SensorCard
+from phibench.estimator.colour_planes import ColourPlanes, blur_of, colour_planes
+from phibench.estimator.lamps import lamp_halo
+from phibench.estimator.seat.pair import Box, Image, Pair
+from phibench.estimator.spot_map import peaks
+from phibench.estimator.spot_pair import Choice, Thresholds, choose
+from phibench.estimator.spot_verdict import Verdicts, judged, noise_of_verdicts
+from phibench.scenes.frames import Array, BoolArray
+from phibench.scenes.rig import Rig
+
+RAW = Thresholds(alone=6.2, each=4.8, together=4.8)
+PROCESSED = Thresholds(alone=7.5, each=4.6, together=5.5)
+PROCESSED_ONE_FRAME = Thresholds(alone=8.5, each=5.0, together=6.5)  # without a laser-off frame
+UNSURE = Thresholds(alone=16.0, each=5.0, together=10.0)  # neither filters nor a laser-off frame
+_LEAST_PEAK = 4.0
+_MOST_PEAKS = 3000
+_MOST_TESTED = 200  # at the second scale
+_WIDER = 1.8  # than the blur: a rough mirror's or a saturated spot
+_MARGIN_PX = 8
+
+
+@dataclass(frozen=True)
+class Detection:
+    """A spot that was found in an image.
+
+    Attributes
+    ----------
+    uv_px : (u, v), at the peak of the matched filter, to about a tenth of a pixel
+    electrons : float
+        Amplitude behind the red filter (or without filters); too low where pixels are full.
+    significance : float
+        In standard deviations of the noise.
+    """
+
+    uv_px: tuple[float, float]
+    electrons: float
+    significance: float
+
+
+@dataclass(frozen=True)
+class PairDetection:
+    """Both images of a pair; None where there is no spot."""
+
+    down: Detection | None
+    up: Detection | None
+
+
+@dataclass(frozen=True)
+class _Searched:
+    """One image: planes, blur in them, and what passed the tests."""
+
+    on: ColourPlanes
+    off: ColourPlanes | None
+    sigma_px: float
+    found: Verdicts
+
+
+def detect(pair: Pair) -> PairDetection:
+    """Find the strongest red laser light that both images agree on.
+
+    A spot in one image only must be more significant than one in both. Boxes of the pair, if
+    there are any, restrict the search.
+
+    Raises
+    ------
+    ValueError
+        If an image does not fit the card's output.
+    """
+    down = _searched(pair.down, pair.down_off, pair, pair.box_down)
+    up = _searched(pair.up, pair.up_off, pair, pair.box_up)
+    off = pair.down_off is not None and pair.up_off is not None
+    sure = off or pair.card.mosaic == "bayer"
+    choice = choose(pair.rig, pair.stroke_m, down.found, up.found, _thresholds(pair.card, sure, off), sure)
+    return _refined(choice, down, up, pair.card)
+
+
+def _thresholds(card: SensorCard, sure: bool, off: bool) -> Thresholds:
+    if not sure:
+        return UNSURE
+    if card.output == "raw":
+        return RAW
+    return PROCESSED if off else PROCESSED_ONE_FRAME
+
+
+def outline_mask(rig: Rig, box: Box) -> BoolArray:
+    """Pixels of a box inside the mirror's outline, shape (h, w)."""
+    # a hundred times faster than skimage.draw.polygon for as many corners
+    picture = Picture.new("1", (box.width_px, box.height_px))
+    outline = rig.outline_px() - [box.u0_px, box.v0_px]
+    ImageDraw.Draw(picture).polygon([(float(u), float(v)) for u, v in outline], fill=1)
+    return np.asarray(picture, bool)
+
+
+def mirror_box(rig: Rig) -> Box:
+    """Smallest part of the image around the mirror that begins at an even row and column."""
+    outline, size = rig.outline_px(), np.array([rig.camera.width_px, rig.camera.height_px])
+    low = np.clip(np.floor(outline.min(axis=0)).astype(int) - _MARGIN_PX, 0, size - 2) // 2 * 2
+    high = np.clip(np.ceil(outline.max(axis=0)).astype(int) + _MARGIN_PX, low + 2, size)
+    return Box(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
+
+
+def _searched(image: Image, dark: Image | None, pair: Pair, hint: Box | None, least_z: float = 4.6) -> _Searched:
+    card, box = pair.card, mirror_box(pair.rig)
+    on = colour_planes(image, card, box)
+    off = None if dark is None else colour_planes(dark, card, box)
+    inside = outline_mask(pair.rig, box)
+    inside = inside & ~lamp_halo(off or on, inside, card)
+    sigma = blur_of(card, pair.rig.camera.blur_sigma_px)
+    noise = noise_of_verdicts(on, off, card, sigma, inside)
+    where = inside if hint is None else inside & _hinted(hint, box)
+    places = peaks(on, off, card, sigma, where, _LEAST_PEAK, _MOST_PEAKS).uv_px
+    first = judged(on, off, card, places, sigma, noise)
+    first = _rows(first, first.z >= np.sort(first.z)[-_MOST_TESTED:][:1].sum())
+    best = _better(first, judged(on, off, card, first.uv_px, _WIDER * sigma, noise))
+    keep = best.red & (best.z >= least_z)
+    return _Searched(on, off, sigma, _moved(_rows(best, keep), box))
+
+
+def _hinted(hint: Box, box: Box) -> BoolArray:
+    mask = np.zeros((box.height_px, box.width_px), bool)
+    rows, columns = hint.slices
+    v0, u0 = max(rows.start - box.v0_px, 0), max(columns.start - box.u0_px, 0)
+    mask[v0 : max(rows.stop - box.v0_px, 0), u0 : max(columns.stop - box.u0_px, 0)] = True
+    return mask
+
+
+def _better(a: Verdicts, b: Verdicts) -> Verdicts:
+    """At each place the test of the scale that fits better."""
+    first = a.z >= b.z
+    return Verdicts(
+        a.uv_px,
+        np.where(first, a.z, b.z),
+        a.electrons,  # of one scale everywhere, so that spots can be compared
+        a.sigma_e,
+        np.where(first, a.chi2, b.chi2),
+        a.red,  # the wider one takes more of green's surroundings in
+    )
+
+
+def _rows(tests: Verdicts, keep: BoolArray) -> Verdicts:
+    order = np.flatnonzero(keep)[np.argsort(-tests.electrons[keep], kind="stable")]
+    return Verdicts(*(getattr(tests, name)[order] for name in tests.__dataclass_fields__))
+
+
+def _moved(tests: Verdicts, box: Box) -> Verdicts:
+    origin = np.array([box.u0_px, box.v0_px], float)
+    values = {name: getattr(tests, name) for name in tests.__dataclass_fields__}
+    return Verdicts(**{**values, "uv_px": tests.uv_px + origin})
+
+
+def _refined(choice: Choice, down: _Searched, up: _Searched, card: SensorCard) -> PairDetection:
+    return PairDetection(_detection(choice.down, down, card), _detection(choice.up, up, card))
+
+
+def _detection(index: int | None, searched: _Searched, card: SensorCard) -> Detection | None:
+    if index is None:
+        return None
+    origin = np.array([searched.on.box.u0_px, searched.on.box.v0_px], float)
+    uv = parabola_peak(searched, card, searched.found.uv_px[index] - origin) + origin
+    found = searched.found
+    return Detection((float(uv[0]), float(uv[1])), float(found.electrons[index]), float(found.z[index]))
+
+
+def parabola_peak(searched: _Searched, card: SensorCard, uv_px: Array, step_px: float = 0.5) -> Array:
+    """Vertex of a parabola along u and one along v through A^2 / variance at 3 x 3 places, shape (2,).
+
+    A^2 / variance is twice the gain of the log likelihood, so that on raw pixels the vertex is near its maximum.
+    """
+    offsets = step_px * np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), -1).reshape(-1, 2)
+    for _ in range(3):
+        test = judged(searched.on, searched.off, card, uv_px + offsets, searched.sigma_px)
+        gain = (np.maximum(test.electrons, 0.0) / test.sigma_e) ** 2
+        best = int(np.argmax(gain))
+        if best == len(offsets) // 2:
+            break
+        uv_px = uv_px + offsets[best]
+    grid = gain.reshape(3, 3)
+    return uv_px + step_px * np.array([_vertex(grid[1]), _vertex(grid[:, 1])])
+
+
+def _vertex(values: Array) -> float:
+    """Place of the maximum of a parabola through values at -1, 0, 1; within half a step."""
+    left, middle, right = values
+    bend = left - 2.0 * middle + right
+    return float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5)) if bend < 0.0 else 0.0

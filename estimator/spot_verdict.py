@@ -1,0 +1,236 @@
+"""Test of candidates: how significant a spot at a place is, and whether it is red.
+
+At each place and for each plane: least squares of a spot's profile on a tilted background, over a patch. The
+significance is amplitude over standard deviation, less where the model does not fit: divided by sqrt(chi^2), so that
+edges, lines and corners of the room, which match a spot a little and its surroundings not at all, stay below any
+threshold: with p pixels and correlation c between structure and profile it cannot pass c sqrt(p / (1 - c^2)).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from phibench.datasets.sensor_card import SensorCard
+from phibench.estimator.colour_planes import ColourPlanes, green_at_red, variance_e2
+from phibench.estimator.gaussian_spot import outer, profile
+from phibench.scenes.frames import Array, BoolArray
+
+_REACH_PX = {True: 6, False: 4}  # of a patch: of a mosaic, where a quarter of the pixels are red, and of whole planes
+# of white light's green: where red ends; the laser's is 0.1, but for JPEG's coarse chroma
+_GREEN_SHARE = {"raw": 0.5, "srgb8": 0.5, "mjpeg": 0.75}
+_FULLER = 0.5
+_OUTSHINES = 0.7  # peak of a spot over the level around it, more than the contrast of walls and furniture
+_LATTICE_PX = 17
+_CHI2_SHARE = 0.75  # of places without a spot that count as fitted well: JPEG leaves many all but empty
+_FULL_PX = 3  # a saturated spot is not wider
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """Verdicts of n places.
+
+    Attributes
+    ----------
+    uv_px : shape (n, 2), relative to the part
+    z : shape (n,), significance in the red plane
+    electrons : shape (n,), amplitude there; too low where pixels are full
+    sigma_e : shape (n,), standard deviation of `electrons`
+    chi2 : shape (n,), per degree of freedom
+    red : shape (n,), bool; True without filters, and where there is a laser-off frame
+    """
+
+    uv_px: Array
+    z: Array
+    electrons: Array
+    sigma_e: Array
+    chi2: Array
+    red: BoolArray
+
+
+@dataclass(frozen=True)
+class VerdictNoise:
+    """What tests of places without a spot give: for pixels that are correlated by processing it is not 1.
+
+    Attributes
+    ----------
+    spread : float
+        Standard deviation of the significance.
+    chi2 : float
+        Usual chi^2 per degree of freedom.
+    """
+
+    spread: float = 1.0
+    chi2: float = 1.0
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Amplitude, variance and chi^2 per degree of freedom, shape (n,) each."""
+
+    amplitude: Array
+    variance: Array
+    chi2: Array
+
+
+def judged(
+    on: ColourPlanes,
+    off: ColourPlanes | None,
+    card: SensorCard,
+    uv_px: Array,
+    sigma_px: float,
+    noise: VerdictNoise = VerdictNoise(),
+) -> Verdicts:
+    """Test places.
+
+    Parameters
+    ----------
+    on, off : ColourPlanes
+    card : SensorCard
+    uv_px : shape (n, 2), relative to the part
+    sigma_px : float
+        Blur in the planes.
+    noise : VerdictNoise
+    """
+    reach = _REACH_PX[on.mosaic]
+    corner = np.rint(uv_px).astype(int) - reach
+    template = _template(uv_px - corner, sigma_px, reach)
+    # what the laser-off frame does not hold is the laser's, whatever its colour looks like
+    count = 2 if off is None and len(on.values_e) > 1 else 1
+    fits = [_fitted(on, off, card, c, corner, template) for c in range(count)]
+    red = fits[0]
+    if off is None and count == 2 and card.output != "raw":
+        red = _bright_or(red, on, card, corner, template)
+    z = red.amplitude / np.sqrt(red.variance * np.maximum(red.chi2 / noise.chi2, 1.0)) / noise.spread
+    colour = _red([red, *fits[1:]], card) | _fuller(on, uv_px) if len(fits) > 1 else np.ones(len(z), bool)
+    return Verdicts(uv_px, z, red.amplitude, np.sqrt(red.variance) * noise.spread, red.chi2, colour)
+
+
+def noise_of_verdicts(
+    on: ColourPlanes, off: ColourPlanes | None, card: SensorCard, sigma_px: float, inside: BoolArray
+) -> VerdictNoise:
+    """What places all over the part give without a spot; (1, 1) for raw pixels, whose noise is known."""
+    places = lattice(inside, _LATTICE_PX)
+    if card.output == "raw" or not len(places):
+        return VerdictNoise()
+    tests = judged(on, off, card, places, sigma_px)
+    chi2 = float(max(np.quantile(tests.chi2, _CHI2_SHARE), 0.1))
+    z = tests.z * np.sqrt(np.maximum(tests.chi2, 1.0) / np.maximum(tests.chi2 / chi2, 1.0))
+    return VerdictNoise(max(_spread(z), 0.5), chi2)
+
+
+def _spread(z: Array) -> float:
+    """Standard deviation of a normal law with the middle, or with the tails of `z`, whichever is wider."""
+    tail = np.max(np.abs(np.quantile(z, (0.01, 0.99)))) / 2.326
+    return float(max(1.4826 * np.median(np.abs(z - np.median(z))), tail))
+
+
+def lattice(inside: BoolArray, step_px: int) -> Array:
+    """Places all over the part, shape (n, 2): where the noise of a test is measured. Odd steps see every phase."""
+    half = step_px // 2
+    v, u = np.nonzero(inside[half::step_px, half::step_px])
+    return np.asarray(np.stack([u, v], axis=-1) * float(step_px) + half, float)
+
+
+def _template(centre_px: Array, sigma_px: float, reach: int) -> Array:
+    n, count = len(centre_px), 2 * reach + 1
+    across, down = (profile(centre_px[:, i], np.full(n, sigma_px), count).share for i in (0, 1))
+    return outer(down, across)
+
+
+def _bright_or(guided: _Fit, on: ColourPlanes, card: SensorCard, corner: Array, template: Array) -> _Fit:
+    """Fits without green where the spot outshines the room: processing spreads a bright spot into green."""
+    plain = _fitted(on, None, card, 0, corner, template, guided=False)
+    size = template.shape[1]
+    level = _middle(_patches(on.values_e[0], corner, size), _patches(on.sites[0], corner, size))
+    bright = plain.amplitude * template.max(axis=(1, 2)) > _OUTSHINES * np.maximum(level, 1.0)
+    pairs = ((plain.amplitude, guided.amplitude), (plain.variance, guided.variance), (plain.chi2, guided.chi2))
+    return _Fit(*(np.where(bright, a, b) for a, b in pairs))
+
+
+def _fitted(
+    on: ColourPlanes,
+    off: ColourPlanes | None,
+    card: SensorCard,
+    c: int,
+    corner: Array,
+    template: Array,
+    guided: bool = True,
+) -> _Fit:
+    """Fit of one plane on patches; without a laser-off frame red's background may look like green (`guided`)."""
+    size = template.shape[1]
+    y, used = _patches(on.values_e[c], corner, size), _patches(on.sites[c], corner, size)
+    level = _level(y, used)
+    columns = [template]
+    if off is not None:
+        dark = _patches(off.values_e[c], corner, size)
+        y, level = y - dark, np.maximum(dark, _middle(dark, used)[:, None, None])
+    elif guided and c == 0 and len(on.values_e) > 1:
+        guide = _patches(green_at_red(on), corner, size)
+        middle = _middle(guide, used)[:, None, None]
+        level = np.maximum(level, guide * _middle(y, used)[:, None, None] / np.maximum(middle, 1.0))
+        columns.append(guide / np.maximum(middle, 1.0) - 1.0)
+    variance = (1.0 if off is None else 2.0) * variance_e2(level, card, off is not None)
+    return _least_squares(y, used / variance, np.stack(columns, axis=1))
+
+
+def _level(y: Array, used: Array) -> Array:
+    """Level that a pixel's noise belongs to, without a spot: its own outside the core, the median or more inside."""
+    far = np.abs(np.arange(y.shape[1]) - y.shape[1] // 2) > _FULL_PX
+    middle = _middle(y, used)[:, None, None]
+    return np.asarray(np.where(far[:, None] | far, np.maximum(y, middle), middle))
+
+
+def _least_squares(y: Array, weight: Array, columns: Array) -> _Fit:
+    """First of the columns, shape (n, k, p, p), beside the others and a tilted background."""
+    n, k, size = columns.shape[:3]
+    slope = np.linspace(-1.0, 1.0, size)
+    ones = np.ones((size, size))
+    plane = np.stack([ones, ones * slope, ones * slope[:, None]]).reshape(3, size * size)
+    flat_columns = columns.reshape(n, k, size * size)
+    X = np.concatenate([flat_columns, np.broadcast_to(plane, (n, *plane.shape))], axis=1)
+    w, flat = weight.reshape(n, 1, size * size), y.reshape(n, size * size)
+    normal = (X * w) @ np.swapaxes(X, 1, 2)
+    normal = normal + 1e-12 * np.eye(k + 3)
+    solution = np.linalg.solve(normal, (X * w) @ flat[..., None])[..., 0]
+    rest = flat - (solution[:, None] @ X)[:, 0]
+    freedom = np.maximum((w[:, 0] > 0.0).sum(axis=1) - k - 3, 1)
+    chi2 = np.sum(w[:, 0] * rest * rest, axis=1) / freedom
+    return _Fit(solution[:, 0], np.linalg.inv(normal)[:, 0, 0], chi2)
+
+
+def _patches(plane: Array, corner: Array, size: int) -> Array:
+    """Squares of a plane, shape (n, size, size); zero, and so no site, beyond its border."""
+    reach = np.arange(size)
+    v, u = corner[:, 1, None] + reach, corner[:, 0, None] + reach
+    inside_v, inside_u = (v >= 0) & (v < plane.shape[0]), (u >= 0) & (u < plane.shape[1])
+    rows, columns = np.clip(v, 0, plane.shape[0] - 1), np.clip(u, 0, plane.shape[1] - 1)
+    values = plane[rows[:, :, None], columns[:, None, :]]
+    return np.where(inside_v[:, :, None] & inside_u[:, None, :], values, 0).astype(float)
+
+
+def _middle(y: Array, used: Array) -> Array:
+    """Median of the used pixels, shape (n,); that of whole frames' patches, which use a fixed share of them."""
+    rising = np.sort(np.where(used > 0.0, y, np.inf).reshape(len(y), y.shape[1] * y.shape[2]), axis=1)
+    middle = np.maximum((used > 0.0).sum(axis=(1, 2)) - 1, 0) // 2
+    value = np.take_along_axis(rising, middle[:, None], axis=1)[:, 0]
+    return np.where(np.isfinite(value), value, 0.0)
+
+
+def _red(fits: list[_Fit], card: SensorCard) -> BoolArray:
+    """Whether green is below half of what white light of this red would have, within one standard deviation."""
+    share = _GREEN_SHARE[card.output] * card.white_balance[0] / card.white_balance[1]
+    red, green = fits[0], fits[1]
+    sigma = np.sqrt(green.variance * np.maximum(green.chi2, 1.0) + share**2 * red.variance * np.maximum(red.chi2, 1.0))
+    return np.asarray(green.amplitude < share * red.amplitude + sigma)
+
+
+def _fuller(on: ColourPlanes, uv_px: Array) -> BoolArray:
+    """Whether far more red than green pixels are full: a spot too bright for its amplitude to tell its colour."""
+    corner, size = np.rint(uv_px).astype(int) - _FULL_PX, 2 * _FULL_PX + 1
+    shares = []
+    for c in (0, 1):
+        full, sites = (_patches(planes[c], corner, size).sum(axis=(1, 2)) for planes in (on.full, on.sites))
+        shares.append(full / np.maximum(sites, 1.0))
+    return np.asarray((shares[0] > 0.0) & (shares[1] < _FULLER * shares[0]))
