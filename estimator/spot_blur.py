@@ -35,3 +35,9 @@ def spot_blur(rig: Rig, uv_px: ArrayLike) -> tuple[float, float]:
     if not np.isfinite(variances).all():
         return camera.blur_sigma_px, 1.0
     return float(np.sqrt(variances[0])), float(np.sqrt(variances[1] / variances[0]))
+
+
+def round_blur_px(rig: Rig, uv_px: ArrayLike) -> float:
+    """Blur of a round spot with the same variance: root mean square of both axes of `spot_blur`, pixels."""
+    sigma, ratio = spot_blur(rig, uv_px)
+    return sigma * float(np.sqrt(0.5 * (1.0 + ratio * ratio)))

@@ -12,6 +12,7 @@ from phibench.estimator.base_image import BaseImage, around, base_of
 from phibench.estimator.fit_chain import first_fit, fit_jpeg, fit_srgb, undone, unrounded
 from phibench.estimator.fit_raw import SpotFit
 from phibench.estimator.jpeg_tables import mcu_px
+from phibench.estimator.methods.locate import locate
 from phibench.estimator.raw_pixels import bayer_filters
 from phibench.estimator.seat.pair import Answer, Box, Pair, Spot
 from phibench.estimator.spot_blur import spot_blur
@@ -40,8 +41,6 @@ def chain_fit(pair: Pair) -> Answer:
 def _boxes(pair: Pair) -> tuple[Box | None, Box | None]:
     if pair.box_down is not None and pair.box_up is not None:
         return pair.box_down, pair.box_up
-    from phibench.estimator.methods.locate import locate  # type: ignore[import-not-found,unused-ignore]
-
     return locate(pair)
 
 

@@ -17,6 +17,7 @@ from phibench.scenes.frames import Array
 
 KINDS = ("bayer-raw", "mono-raw", "srgb8", "mjpeg")
 RAW = KINDS[:2]
+PROCESSED = KINDS[2:]
 
 
 def kind_of(card: SensorCard) -> str:

@@ -1,7 +1,7 @@
 """The likelihood fit of `estimator.fit_raw` as a method, on raw pixels with or without colour filters.
 
 What it takes as known: the card's noise (PRNU and DSNU count as noise), the rig's detector for the filters' response
-at the laser line, and the blur that the rig predicts at the pixel (`blur.spot_sigma_px`). A rough mirror's blur is not
+at the laser line, and the blur that the rig predicts at the pixel (`spot_blur`). A rough mirror's blur is not
 predicted: there the width is fitted as well. Where the room behind the spot is not flat, chi2 widens the covariance.
 """
 
@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from phibench.estimator.fit_raw import SpotFit, fit_raw
-from phibench.estimator.methods.blur import spot_sigma_px
 from phibench.estimator.methods.sight import Sight
 from phibench.estimator.raw_pixels import PixelNoise, bayer_filters, noise_of, raw_electrons
 from phibench.estimator.seat.pair import Spot
+from phibench.estimator.spot_blur import round_blur_px
 from phibench.estimator.status import Status, describe
 from phibench.scenes.frames import Array
 
@@ -43,9 +43,7 @@ def raw_maximum_likelihood(sight: Sight) -> Spot:
     if near is None:
         return Spot.missing("no spot")
     middle = (near.box.u0_px + near.box.width_px // 2, near.box.v0_px + near.box.height_px // 2)
-    sigma = spot_sigma_px(rig, middle)
-    if not np.isfinite(sigma):
-        return Spot.missing("the red peak is not in the mirror")
+    sigma = round_blur_px(rig, middle)
     response = rig.camera.detector.laser_filter_response if card.mosaic == "bayer" else None
     background = _background(near, noise)
     fit = fit_raw(

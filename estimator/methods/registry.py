@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from phibench.estimator.methods.built_in import BuiltIn
+from phibench.estimator.methods.chain_fit import chain_fit
+from phibench.estimator.methods.detect import detect
+from phibench.estimator.methods.joint_fit import joint_fit
 from phibench.estimator.methods.libraries import photutils_centroid_2dg, trackpy_refine
-from phibench.estimator.methods.linear import RAW
+from phibench.estimator.methods.linear import PROCESSED, RAW
 from phibench.estimator.methods.off_difference import off_difference
 from phibench.estimator.methods.raw_maximum_likelihood import raw_maximum_likelihood
 from phibench.estimator.methods.red_centroid import red_centroid
@@ -55,6 +58,25 @@ _ALL = (
         "maximum likelihood on raw pixels with the sensor's noise; claims a covariance",
         "F. Huang et al., Nature Methods 10, 653 (2013)",
         accepts=RAW,
+    ),
+    BuiltIn(
+        "chain_fit",
+        chain_fit,
+        "fit of the spot through mosaic, demosaicing, gamma, 8 bits and JPEG; claims a covariance",
+        "docs/limits.md",
+        accepts=PROCESSED,
+    ),
+    BuiltIn(
+        "joint_fit",
+        joint_fit,
+        "both images as one point of the room: likelihood on raw pixels, chain_fit's positions combined on others",
+        "docs/limits.md",
+    ),
+    BuiltIn(
+        "detect",
+        detect,
+        "peak of a matched filter over the whole mirror, boxes or not, refined by parabolas",
+        "docs/detection.md",
     ),
     BuiltIn(
         "photutils_centroid_2dg",
