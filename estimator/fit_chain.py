@@ -24,6 +24,7 @@ from phibench.estimator.jpeg_spots import Region, fit_region
 from phibench.estimator.jpeg_tables import mcu_px
 from phibench.estimator.pixel_law import GaussLaw
 from phibench.estimator.raw_pixels import PixelNoise, bayer_filters, noise_of
+from phibench.estimator.spot_blur import SpotBlur
 from phibench.estimator.status import Status, flag, keep
 from phibench.estimator.tone_curve import decoded, slope
 from phibench.scenes.frames import Array
@@ -44,6 +45,8 @@ def fit_srgb(
     free_width: bool = False,
     pattern_known: bool = False,
     extra_e2: float = 0.0,
+    ratio: ArrayLike = 1.0,
+    mixed_px2: ArrayLike = 0.0,
 ) -> SpotFit:
     """Fit one spot in each region of processed 8-bit images.
 
@@ -62,6 +65,8 @@ def fit_srgb(
         Whether PRNU and DSNU were calibrated; otherwise they count as noise.
     extra_e2 : float
         Variance of the known background's error, electrons squared.
+    ratio, mixed_px2
+        As for `fit_law`.
 
     Raises
     ------
@@ -77,11 +82,12 @@ def fit_srgb(
         table = code_table(card)
         codes = np.take_along_axis(planes, filters[..., None], axis=3)[..., 0]
         law = code_law(codes, filters, card, noise, table)
-        return fit_law(table.middle_e[filters, codes], origin, law, sigma_px, response, background_e, free_width)
+        x = table.middle_e[filters, codes]
+        return fit_law(x, origin, law, sigma_px, response, background_e, free_width, True, ratio, mixed_px2)
     x, extra = undone(planes, filters, card)
     used = (planes < 255).all(axis=3)
     gauss = GaussLaw(PixelNoise(noise.gaussian_e2 + 1.0 / (12.0 * card.dn_per_e**2), noise.prnu), extra)
-    return fit_law(x, origin, gauss, sigma_px, response, background_e, free_width, used)
+    return fit_law(x, origin, gauss, sigma_px, response, background_e, free_width, used, ratio, mixed_px2)
 
 
 def fit_jpeg(
@@ -94,6 +100,7 @@ def fit_jpeg(
     free_width: bool = False,
     pattern_known: bool = False,
     ratio: ArrayLike = 1.0,
+    mixed_px2: ArrayLike = 0.0,
     size_px: tuple[int, int] = (1280, 720),
 ) -> SpotFit:
     """Fit one spot in each region of decoded MJPEG images.
@@ -116,6 +123,8 @@ def fit_jpeg(
         Whether PRNU and DSNU were calibrated; otherwise they count as noise.
     ratio : float or shape (n,)
         Blur along v over blur along u.
+    mixed_px2 : float or shape (n,)
+        Mixed second moment of u and v of an oblique spot, to first order.
     size_px : (width, height) of the image
 
     Returns
@@ -137,7 +146,7 @@ def fit_jpeg(
     model = chain_model(card, unrounded(card, pattern_known))
     first = first_fit(planes, origin, card, np.broadcast_to(np.asarray(sigma_px, float), n), response, base)
     zero = np.zeros((h, w))
-    widths, ratios = (np.broadcast_to(np.asarray(x, float), n) for x in (sigma_px, ratio))
+    widths, ratios, mixed = (np.broadcast_to(np.asarray(x, float), n) for x in (sigma_px, ratio, mixed_px2))
     rows = []
     for i in range(n):
         u0, v0 = origin[i]
@@ -145,7 +154,8 @@ def fit_jpeg(
         known = (zero, zero) if base is None else (base.mean_e[i], base.variance_e2[i])
         start = first[i] if not free_width else np.append(first[i], widths[i])
         region = Region(planes[i], ends, *known)
-        rows.append(fit_region(region, model, start[None], widths[i], ratios[i], free_width, response))
+        blur = SpotBlur(float(widths[i]), float(ratios[i]), float(mixed[i]))
+        rows.append(fit_region(region, model, start[None], blur, free_width, response))
     return _collected(rows, origin, widths, free_width)
 
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import convolve1d
 
 from phibench.estimator.fisher import covariance_bound
-from phibench.estimator.gaussian_spot import outer, profile
+from phibench.estimator.gaussian_spot import Profile, outer, profile
 from phibench.estimator.pixel_law import GaussLaw, PixelLaw
 from phibench.estimator.raw_pixels import PixelNoise, bayer_filters
 from phibench.estimator.status import Status, StatusArray, flag, keep
@@ -71,10 +71,12 @@ class _Data:
     levels: Array  # (n, c, h, w): 1 where the pixel has that background level
     law: PixelLaw
     sigma: Array  # (n,)
+    ratio: Array  # (n,)
+    mixed: Array  # (n,)
     free_width: bool
 
     def rows(self, index: NDArray[np.int64]) -> _Data:
-        arrays = ("x", "finite", "used", "response", "base", "levels", "sigma")
+        arrays = ("x", "finite", "used", "response", "base", "levels", "sigma", "ratio", "mixed")
         return replace(self, law=self.law.rows(index), **{name: getattr(self, name)[index] for name in arrays})
 
 
@@ -131,6 +133,8 @@ def fit_law(
     background_e: Array | None = None,
     free_width: bool = False,
     used: ArrayLike = True,
+    ratio: ArrayLike = 1.0,
+    mixed_px2: ArrayLike = 0.0,
 ) -> SpotFit:
     """As `fit_raw`, for pixels of any law.
 
@@ -140,6 +144,10 @@ def fit_law(
         Of all regions.
     used : boolean, shape (n, h, w) or one that broadcasts to it
         Pixels that are not left out.
+    ratio : float or shape (n,)
+        Blur along v over blur along u.
+    mixed_px2 : float or shape (n,)
+        Mixed second moment of u and v of an oblique spot, to first order.
 
     Other parameters, errors and the result are those of `fit_raw`.
     """
@@ -148,7 +156,9 @@ def fit_law(
         raise ValueError(f"regions have the shape {x.shape}: (n, h, w) of 3 x 3 pixels or more is needed")
     origin = np.broadcast_to(np.asarray(origin_px, np.int64), (len(x), 2))
     data = _data(x, origin, law, np.broadcast_to(np.asarray(sigma_px, float), len(x)), response, background_e)
-    data = replace(data, used=data.used & np.asarray(used, bool), free_width=free_width)
+    ratios, mixed = (np.broadcast_to(np.asarray(value, float), len(x)) for value in (ratio, mixed_px2))
+    both = data.used & np.asarray(used, bool)
+    data = replace(data, used=both, free_width=free_width, ratio=ratios, mixed=mixed)
     parts = [np.arange(i, min(i + _AT_ONCE, len(x))) for i in range(0, len(x), _AT_ONCE)]
     fits = [_fit(data.rows(part), origin[part]) for part in parts]
     if not fits:
@@ -173,7 +183,19 @@ def _data(
         base = np.zeros(x.shape)
         levels = (filters[:, None] == np.arange(len(weights))[:, None, None]).astype(float)
     finite = used.all(axis=(1, 2)) & np.isfinite(base).all(axis=(1, 2))
-    return _Data(np.where(used, x, 0.0), finite, used, weights[filters], base, levels, law, sigma, False)
+    return _Data(
+        np.where(used, x, 0.0),
+        finite,
+        used,
+        weights[filters],
+        base,
+        levels,
+        law,
+        sigma,
+        np.ones(len(x)),
+        np.zeros(len(x)),
+        False,
+    )
 
 
 def _fit(data: _Data, origin: NDArray[np.int64]) -> SpotFit:
@@ -233,20 +255,32 @@ def _model(data: _Data, theta: Array) -> tuple[Array, Array]:
     h, w = data.x.shape[1:]
     c = data.levels.shape[1]
     sigma = theta[:, -1] if data.free_width else data.sigma
-    across, down = profile(theta[:, 0], sigma, w), profile(theta[:, 1], sigma, h)
-    flux = theta[:, 2, None]
+    across, down = profile(theta[:, 0], sigma, w), profile(theta[:, 1], data.ratio * sigma, h)
+    flux, ratio = theta[:, 2, None], data.ratio[:, None]
     derivatives = np.empty((len(theta), theta.shape[1], h, w))
     derivatives[:, 0] = outer(flux * down.share, across.by_centre) * data.response
     derivatives[:, 1] = outer(flux * down.by_centre, across.share) * data.response
     derivatives[:, 2] = outer(down.share, across.share) * data.response
     derivatives[:, 3 : 3 + c] = data.levels
     if data.free_width:
-        both = outer(flux * down.by_sigma, across.share) + outer(flux * down.share, across.by_sigma)
+        both = outer(flux * ratio * down.by_sigma, across.share) + outer(flux * down.share, across.by_sigma)
         derivatives[:, -1] = both * data.response
+    if data.mixed.any():
+        _add_mixed(derivatives, data, flux, sigma[:, None], (across, down))
     mean = flux[:, :, None] * derivatives[:, 2] + data.base
     for i in range(c):
         mean += theta[:, 3 + i, None, None] * data.levels[:, i]
     return mean, derivatives
+
+
+def _add_mixed(derivatives: Array, data: _Data, flux: Array, sigma: Array, profiles: tuple[Profile, Profile]) -> None:
+    """Add kappa d^2/du dv of the upright spot, in place; a second derivative by the centre is by_sigma / sigma."""
+    across, down = profiles
+    kappa = data.mixed[:, None]
+    tall = data.ratio[:, None] * sigma
+    derivatives[:, 0] += outer(kappa * flux * down.by_centre, across.by_sigma / sigma) * data.response
+    derivatives[:, 1] += outer(kappa * flux * down.by_sigma / tall, across.by_centre) * data.response
+    derivatives[:, 2] += outer(kappa * down.by_centre, across.by_centre) * data.response
 
 
 def _scores(data: _Data, theta: Array) -> tuple[Array, Array]:

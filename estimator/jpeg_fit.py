@@ -20,8 +20,8 @@ from phibench.estimator.quantiser import quantised
 from phibench.estimator.spot_means import SpotMeans
 from phibench.scenes.frames import Array
 
-_LIVE = 3e-3  # variance of the output, in steps squared, below which a coefficient is taken as never changing
-_CANDIDATE = 1e-4  # and below which it is not looked at again
+_LIVE = 2e-3  # variance of the output, in steps squared, from which a coefficient counts as one that changes
+_LEAST = 1e-3  # and that is taken for one whose variance falls below it
 _FRESH = 5  # times that the covariance is computed
 _STEPS = 24  # of the fit in all; the covariance stays after `_FRESH` of them, so that the misfit can only fall
 _SCREENING_STEPS = 3
@@ -50,7 +50,7 @@ class Rows:
 
     def part(self, index: NDArray[np.int64]) -> Rows:
         """Take some of them."""
-        return Rows(*(getattr(self, f.name)[..., index] for f in fields(self)))
+        return Rows(*(np.take(getattr(self, f.name), index, axis=-1) for f in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -62,13 +62,11 @@ class Noise:
     rows : Rows
     sigma : shape (l,), of the quantiser's input
     factor : shape (l, l), Cholesky factor of the output's covariance
-    candidates : Rows that may be live at a hypothesis nearby
     """
 
     rows: Rows
     sigma: Array
     factor: Array
-    candidates: Rows
 
     def whitened(self, values: Array) -> Array:
         """Values, shape (l, ...), in units in which their covariance is the unit matrix."""
@@ -111,22 +109,24 @@ class Window:
     means: SpotMeans
     extra_e2: Array | float = 0.0
 
-    def noise(self, theta: Array, among: Rows | None = None) -> Noise:
-        """Covariance of the quantised coefficients for one hypothesis, shape (k,)."""
+    def noise(self, theta: Array, live: Rows | None = None) -> Noise:
+        """Covariance of the quantised coefficients for one hypothesis, shape (k,); which are live, if it is known."""
         model = self.model
-        rows = among or Rows.all(model)
+        rows = live or Rows.all(model)
         mean, _ = self.means.at(theta[None])
         at = codes(model, mean).one(0)
         F = noise_factor(model, at, raw_variance_e2(model, mean[0]) + self.extra_e2, rows.transform)
         sigma = np.sqrt(np.einsum("rn,rn->n", F, F) + at.excess @ rows.squares + rows.rounding)
         output = quantised(at.mean @ rows.transform + rows.shift, sigma, rows.step)
-        share = output.variance / rows.step**2
-        live = np.flatnonzero(share > _LIVE)
-        F = F[:, live] * output.slope[live]
+        variance = np.maximum(output.variance, _LEAST * rows.step**2)
+        slope = output.slope
+        if live is None:
+            index = np.flatnonzero(output.variance > _LIVE * rows.step**2)
+            F, slope, variance, sigma, rows = F[:, index], slope[index], variance[index], sigma[index], rows.part(index)
+        F *= slope
         C = F.T @ F
-        np.fill_diagonal(C, output.variance[live])
-        candidates = rows if among else rows.part(np.flatnonzero(share > _CANDIDATE))
-        return Noise(rows.part(live), sigma[live], np.asarray(np.linalg.cholesky(C), float), candidates)
+        np.fill_diagonal(C, variance)
+        return Noise(rows, sigma, np.asarray(np.linalg.cholesky(C), float))
 
     def residual(self, noise: Noise, theta: Array) -> tuple[Array, Array]:
         """Whitened residuals, shape (m, l), and derivatives of the mean, shape (m, k, l), of hypotheses (m, k)."""
@@ -155,7 +155,7 @@ def fit_window(window: Window, starts: Array) -> JpegFit:
     length = np.inf
     for k in range(_STEPS):
         if 0 < k < _FRESH:
-            noise = window.noise(theta, noise.candidates)
+            noise = window.noise(theta, noise.rows)
             r, J = window.residual(noise, theta[None])
         theta, r, J, length = _descended(window, noise, theta, r, J)
         if k and length < _SMALL:

@@ -12,6 +12,7 @@ from phibench.estimator.chain_model import ChainModel
 from phibench.estimator.jpeg_fit import JpegFit, Window, fit_window
 from phibench.estimator.jpeg_recovery import recovered
 from phibench.estimator.jpeg_tables import mcu_px
+from phibench.estimator.spot_blur import SpotBlur
 from phibench.estimator.spot_means import SpotMeans
 from phibench.scenes.frames import Array
 
@@ -46,7 +47,7 @@ def window_at(region: Region, model: ChainModel, uv: Array) -> tuple[int, int]:
 
 
 def fit_region(
-    region: Region, model: ChainModel, starts: Array, sigma_px: float, ratio: float, free_width: bool, response: Any
+    region: Region, model: ChainModel, starts: Array, blur: SpotBlur, free_width: bool, response: Any
 ) -> tuple[JpegFit, Array]:
     """Fit the spot of one region.
 
@@ -54,7 +55,8 @@ def fit_region(
     ----------
     starts : shape (s, 6) or (s, 7)
         u, v in the region, flux, levels on top of the base, width if it is free.
-    sigma_px, ratio, free_width, response
+    blur : SpotBlur
+    free_width, response
         As `SpotMeans`.
 
     Returns
@@ -68,7 +70,7 @@ def fit_region(
     (h, w), m = model.shape, model.margin
     raw = (slice(row, row + h + 2 * m), slice(column, column + w + 2 * m))
     base, extra = (np.pad(x, m, mode="reflect")[raw].ravel() for x in (region.base_e, region.extra_e2))
-    means = SpotMeans(model.filters, response, base, sigma_px, ratio, free_width)
+    means = SpotMeans(model.filters, response, base, blur.sigma_px, blur.ratio, blur.mixed_px2, free_width)
     corner = np.array([column - m, row - m], float)
     shifted = starts.copy()
     shifted[:, :2] -= corner

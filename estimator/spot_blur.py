@@ -2,15 +2,45 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from phibench.estimator.reflection import reflect
+from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
 
-def spot_blur(rig: Rig, uv_px: ArrayLike) -> tuple[float, float]:
-    """Sigma along u, pixels, and sigma along v over it; the lens's blur and 1 where the pixel does not see the mirror.
+@dataclass(frozen=True)
+class SpotBlur:
+    """Second moments of a spot's image.
+
+    Attributes
+    ----------
+    sigma_px : float, along u
+    ratio : float, sigma along v over it
+    mixed_px2 : float, mixed moment of u and v
+    """
+
+    sigma_px: float
+    ratio: float = 1.0
+    mixed_px2: float = 0.0
+
+    @classmethod
+    def of(cls, moments_px2: Array) -> SpotBlur:
+        """From a covariance matrix."""
+        sigma = np.sqrt(np.diag(moments_px2))
+        return cls(float(sigma[0]), float(sigma[1] / sigma[0]), float(moments_px2[0, 1]))
+
+    @property
+    def round_px(self) -> float:
+        """Sigma of a round spot with the same variance: root mean square of both axes."""
+        return self.sigma_px * float(np.sqrt(0.5 * (1.0 + self.ratio**2)))
+
+
+def spot_blur(rig: Rig, uv_px: ArrayLike) -> SpotBlur:
+    """Blur that the rig predicts; the lens's alone where the pixel does not see the mirror.
 
     The virtual images of a far point lie R cos(i) / 2 (tangential: along the radius from the mirror's centre) and
     R / (2 cos i) (sagittal) behind the mirror (Coddington's equations). A point at the depth z is a disc of the radius
@@ -30,14 +60,6 @@ def spot_blur(rig: Rig, uv_px: ArrayLike) -> tuple[float, float]:
     depth_m = into_camera.points(hit.origin_world_m)[2] + halves * camera.rays(uv)[2]
     disc = camera.fx_px * camera.aperture_radius_m * (1.0 / depth_m - 1.0 / camera.focus_distance_m)
     away = uv - camera.project(into_camera.points(view.sphere_centre_m))
-    share = away**2 / max(float(away @ away), 1e-12)  # of the radial direction along u and v
-    variances = camera.blur_sigma_px**2 + (disc[0] ** 2 * share + disc[1] ** 2 * (1.0 - share)) / 4.0
-    if not np.isfinite(variances).all():
-        return camera.blur_sigma_px, 1.0
-    return float(np.sqrt(variances[0])), float(np.sqrt(variances[1] / variances[0]))
-
-
-def round_blur_px(rig: Rig, uv_px: ArrayLike) -> float:
-    """Blur of a round spot with the same variance: root mean square of both axes of `spot_blur`, pixels."""
-    sigma, ratio = spot_blur(rig, uv_px)
-    return sigma * float(np.sqrt(0.5 * (1.0 + ratio * ratio)))
+    along = np.outer(away, away) / max(float(away @ away), 1e-12)  # the radial direction
+    moments = camera.blur_sigma_px**2 * np.eye(2) + 0.25 * (disc[0] ** 2 * along + disc[1] ** 2 * (np.eye(2) - along))
+    return SpotBlur.of(moments) if np.isfinite(moments).all() else SpotBlur(camera.blur_sigma_px)

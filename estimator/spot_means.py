@@ -25,6 +25,8 @@ class SpotMeans:
     base_e : shape (r,), what the levels add to
     ratio : float
         Sigma along v over sigma along u.
+    mixed_px2 : float
+        Mixed second moment of u and v, to first order: kappa d^2/du dv of the upright Gaussian.
     sigma_px : float
         Blur along u; where it is not free.
     free_width : bool
@@ -35,6 +37,7 @@ class SpotMeans:
     base_e: Array
     sigma_px: float
     ratio: float = 1.0
+    mixed_px2: float = 0.0
     free_width: bool = False
 
     @property
@@ -49,12 +52,16 @@ class SpotMeans:
         across, down = profile(theta[:, 0], sigma, w), profile(theta[:, 1], self.ratio * sigma, h)
         flux = theta[:, 2, None]
         weights = np.asarray(self.response)[self.filters]
+        # kappa times the mixed derivative; a second one by the centre is by_sigma / sigma (heat equation)
+        kappa, tall = self.mixed_px2, self.ratio * sigma[:, None]
         images = [
-            outer(flux * down.share, across.by_centre) * weights,
-            outer(flux * down.by_centre, across.share) * weights,
-            outer(down.share, across.share) * weights,
-            *(np.broadcast_to(self.filters == c, (len(theta), h, w)) for c in range(3)),
+            outer(flux * down.share, across.by_centre)
+            + kappa * outer(flux * down.by_centre, across.by_sigma / sigma[:, None]),
+            outer(flux * down.by_centre, across.share) + kappa * outer(flux * down.by_sigma / tall, across.by_centre),
+            outer(down.share, across.share) + kappa * outer(down.by_centre, across.by_centre),
         ]
+        images = [weights * image for image in images]
+        images += [np.broadcast_to(self.filters == c, (len(theta), h, w)) for c in range(3)]
         if self.free_width:
             along_v = outer(self.ratio * flux * down.by_sigma, across.share)
             images.append((along_v + outer(flux * down.share, across.by_sigma)) * weights)

@@ -10,7 +10,7 @@ from sensor_light import spot_at
 from phibench.datasets.sensor_card import card_of
 from phibench.estimator.methods.chain_fit import chain_fit
 from phibench.estimator.seat.pair import Box, Pair
-from phibench.estimator.spot_blur import spot_blur
+from phibench.estimator.spot_blur import SpotBlur, spot_blur
 from phibench.render.chain import Chain
 from phibench.render.light import Light
 from phibench.render.sensor import sensor
@@ -29,7 +29,7 @@ def pair_of(preset: str, off: bool, stripes: bool = False) -> Pair:
         room[:, np.arange(1280) // 5 % 2 == 0] *= 4.0
     images = {}
     for position, uv in PLACES.items():
-        spot = spot_at(*uv, spot_blur(RIG, uv)[0], 5000.0 / COLLECTED / s.exposure_s)
+        spot = spot_at(*uv, spot_blur(RIG, uv).sigma_px, 5000.0 / COLLECTED / s.exposure_s)
         light = Light(ROOM[:, None, None] * room, spot)
         images[position] = Chain(s).frame(light, NoiseStream(("method", position, stripes)))
         if off:
@@ -70,11 +70,13 @@ def test_raw_images_are_refused() -> None:
 def test_blur_is_that_of_spot_layers() -> None:
     """Second moments, less the pixel's, of the spot layers of `paper` at D = 2.18 m, down, and 3.97 m, down.
 
-    Left out are the spot's own size and the mixed moment: 0.015 px.
+    Left out is the spot's own size: 0.015 px, and 0.01 px^2 of the mixed moment.
     """
-    for uv, sigma_u, sigma_v in (((424.8, 483.5), 0.719, 0.748), ((876.5, 445.7), 0.710, 0.755)):
-        ours, ratio = spot_blur(RIG, uv)
-        assert ours == pytest.approx(sigma_u, abs=0.015)
-        assert ours * ratio == pytest.approx(sigma_v, abs=0.015)
-    assert spot_blur(RIG, (639.5, 150.0))[1] < 0.98  # the long axis lies across the radius
-    assert spot_blur(RIG, (5.0, 5.0)) == (RIG.camera.blur_sigma_px, 1.0)
+    layers = (((424.8, 483.5), 0.719, 0.748, 0.036), ((876.5, 445.7), 0.710, 0.755, -0.0275))
+    for uv, sigma_u, sigma_v, mixed in layers:
+        ours = spot_blur(RIG, uv)
+        assert ours.sigma_px == pytest.approx(sigma_u, abs=0.015)
+        assert ours.sigma_px * ours.ratio == pytest.approx(sigma_v, abs=0.015)
+        assert ours.mixed_px2 == pytest.approx(mixed, abs=0.01)
+    assert spot_blur(RIG, (639.5, 150.0)).ratio < 0.98  # the long axis lies across the radius
+    assert spot_blur(RIG, (5.0, 5.0)) == SpotBlur(RIG.camera.blur_sigma_px)

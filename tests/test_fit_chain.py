@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,10 +18,14 @@ from phibench.estimator.chain_limit import chain_limit
 from phibench.estimator.chain_model import chain_model, codes
 from phibench.estimator.code_law import code_law, code_table
 from phibench.estimator.fit_chain import fit_jpeg, fit_srgb, undone, unrounded
+from phibench.estimator.fit_raw import fit_law
 from phibench.estimator.jpeg_recovery import recovered
 from phibench.estimator.jpeg_tables import coefficients, quantisation, steps
+from phibench.estimator.pixel_law import GaussLaw
 from phibench.estimator.quantiser import quantised
-from phibench.estimator.raw_pixels import bayer_filters
+from phibench.estimator.raw_pixels import PixelNoise, bayer_filters
+from phibench.estimator.spot_blur import SpotBlur
+from phibench.estimator.spot_means import SpotMeans
 from phibench.estimator.status import Status
 from phibench.render import isp
 from phibench.render.chain import Chain
@@ -230,3 +235,53 @@ def test_nothing_there() -> None:
     assert np.isnan(fit.uv_px).all()
     assert fit_srgb(np.zeros((0, 17, 17, 3), np.uint8), (0, 0), card_of(SRGB), 0.7).uv_px.shape == (0, 2)
     assert fit_jpeg(np.zeros((0, 16, 32, 3), np.uint8), (0, 0), card_of(MJPEG), 0.7).uv_px.shape == (0, 2)
+
+
+def oblique(centre: np.ndarray, moments: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Share of each pixel of a Gaussian with any covariance, 9 x 9 Gauss-Legendre points a pixel."""
+    x, w = np.polynomial.legendre.leggauss(9)
+    v, u = (np.arange(n)[:, None] + 0.5 * x for n in shape)
+    points = np.stack(np.broadcast_arrays(u[None, :, None, :], v[:, None, :, None]), axis=-1) - centre
+    density = np.exp(-0.5 * np.einsum("...i,ij,...j->...", points, np.linalg.inv(moments), points))
+    return np.einsum("vukl,k,l->vu", density, 0.5 * w, 0.5 * w) / (2.0 * np.pi * np.sqrt(np.linalg.det(moments)))
+
+
+def test_means_and_derivatives_of_an_oblique_spot() -> None:
+    """Mixed moment of 0.035 px^2 on 0.5: its second order is 0.5 (0.07)^2 = 0.25 % of the peak; the first is 7 %."""
+    blur = SpotBlur.of(np.array([[0.515, 0.035], [0.035, 0.56]]))
+    filters = bayer_filters(np.array([[0, 0]]), (14, 16))[0]
+    means = SpotMeans(
+        filters, (1.0, 0.1, 0.03), np.zeros(filters.size), blur.sigma_px, blur.ratio, blur.mixed_px2, True
+    )
+    theta = np.array([[7.3, 6.6, 1e4, 100.0, 90.0, 60.0, blur.sigma_px]])
+    mean, derivatives = means.at(theta)
+    exact = (
+        1e4
+        * np.array([1.0, 0.1, 0.03])[filters]
+        * oblique(theta[0, :2], np.array([[0.515, 0.035], [0.035, 0.56]]), filters.shape)
+    )
+    level = np.array([100.0, 90.0, 60.0])[filters]
+    np.testing.assert_allclose(mean[0], (exact + level).ravel(), rtol=0, atol=0.004 * exact.max())
+    upright = replace(means, mixed_px2=0.0).at(theta)[0]
+    assert np.abs(upright[0] - (exact + level).ravel()).max() > 0.008 * exact.max()
+    for k, h in enumerate((1e-5, 1e-5, 1.0, 1.0, 1.0, 1.0)):  # the mixed term's change with the width is left out
+        step = np.zeros(7)
+        step[k] = h
+        difference = (means.at(theta + step)[0] - means.at(theta - step)[0])[0] / (2.0 * h)
+        np.testing.assert_allclose(derivatives[0, k], difference, rtol=0, atol=1e-6 * np.abs(difference).max() + 1e-6)
+
+
+def test_an_oblique_spot_is_not_biased() -> None:
+    """Four phases, over 100 e-: within 3 mpx with the mixed moment, beyond 8 without."""
+    moments = np.array([[0.515, 0.035], [0.035, 0.56]])
+    blur, worst = SpotBlur.of(moments), {0.0: 0.0, 1.0: 0.0}
+    for origin in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        filters = bayer_filters(np.array([origin]), (15, 15))
+        x = 1e4 * np.array([1.0, 0.1, 0.03])[filters] * oblique(np.array([7.2, 6.9]), moments, (15, 15)) + 100.0
+        for share in worst:
+            law, kappa = GaussLaw(PixelNoise(18.0)), share * blur.mixed_px2
+            fit = fit_law(x, origin, law, blur.sigma_px, ratio=blur.ratio, mixed_px2=kappa)
+            worst[share] = max(worst[share], float(np.abs(fit.uv_px[0] - origin - [7.2, 6.9]).max()))
+    print(worst)
+    assert worst[1.0] < 0.003
+    assert worst[0.0] > 0.008

@@ -31,7 +31,7 @@ from phibench.estimator.methods.sight import Sight
 from phibench.estimator.methods.window import around, clipped
 from phibench.estimator.seat.easy_pairs import EasyPairs
 from phibench.estimator.seat.pair import Answer, Box, Pair, Spot
-from phibench.estimator.spot_blur import round_blur_px
+from phibench.estimator.spot_blur import spot_blur
 from phibench.render import isp
 from phibench.render.sensor import sensor
 from phibench.render.spot import spot_layer
@@ -296,11 +296,11 @@ def test_predicted_blur_is_that_of_the_rendered_spot(focus_m: float, f_number: f
         spread = [float(((k - m) ** 2 * image).sum() / image.sum()) for k, m in zip((columns, rows), mean, strict=True)]
         rms = math.sqrt(sum(spread) / 2.0 - 1.0 / 12.0)
         uv = (layer.u0_px + mean[0], layer.v0_px + mean[1])
-        assert round_blur_px(rig, uv) == pytest.approx(rms, rel=0.02)
+        assert spot_blur(rig, uv).round_px == pytest.approx(rms, rel=0.02)
         assert rms > 1.01 * rig.camera.blur_sigma_px  # there is defocus to predict
         checked += 1
     assert checked == 3
-    assert round_blur_px(rig, (5.0, 5.0)) == rig.camera.blur_sigma_px  # not in the mirror
+    assert spot_blur(rig, (5.0, 5.0)).round_px == rig.camera.blur_sigma_px  # not in the mirror
 
 
 def striped(pair: Pair, truth_uv: tuple[float, float], contrast_e: float) -> Pair:

@@ -15,7 +15,7 @@ from phibench.estimator.jpeg_tables import mcu_px
 from phibench.estimator.methods.locate import locate
 from phibench.estimator.raw_pixels import bayer_filters
 from phibench.estimator.seat.pair import Answer, Box, Pair, Spot
-from phibench.estimator.spot_blur import spot_blur
+from phibench.estimator.spot_blur import SpotBlur, spot_blur
 from phibench.estimator.status import Status, describe
 from phibench.scenes.frames import Array
 
@@ -51,15 +51,27 @@ def _spot(pair: Pair, image: NDArray[Any], off: NDArray[Any] | None, box: Box | 
     origin = np.array([[region.u0_px, region.v0_px]])
     on = image[region.slices][None]
     base = None if off is None else _base(off[region.slices][None], None, origin, pair.card)
-    blur = np.array([pair.rig.camera.blur_sigma_px])
-    start = first_fit(on, origin, pair.card, blur, _response(pair), base)[0, :2] + origin[0]
-    sigma, ratio = spot_blur(pair.rig, start)
+    sigma = np.array([pair.rig.camera.blur_sigma_px])
+    start = first_fit(on, origin, pair.card, sigma, _response(pair), base)[0, :2] + origin[0]
+    blur = spot_blur(pair.rig, start)
     if pair.card.output == "srgb8":
-        return _answer(_srgb(image, off, start, pair.card, sigma * np.sqrt(ratio)))
+        return _answer(_srgb(image, off, start, pair.card, blur, _response(pair)))
     if base is None:
         base = _base(on, around(start[None], origin, (region.height_px, region.width_px)), origin, pair.card)
     size = (image.shape[1], image.shape[0])
-    return _answer(fit_jpeg(on, origin, pair.card, sigma, _response(pair), base, ratio=ratio, size_px=size))
+    return _answer(
+        fit_jpeg(
+            on,
+            origin,
+            pair.card,
+            blur.sigma_px,
+            _response(pair),
+            base,
+            ratio=blur.ratio,
+            mixed_px2=blur.mixed_px2,
+            size_px=size,
+        )
+    )
 
 
 def _region(box: Box, card: SensorCard, shape: tuple[int, ...]) -> Box:
@@ -74,7 +86,14 @@ def _grown(first: int, last: int, unit: int, size: int) -> tuple[int, int]:
     return max((first // unit - 1) * unit, 0), min((-(-last // unit) + 1) * unit, size // unit * unit)
 
 
-def _srgb(image: NDArray[Any], off: NDArray[Any] | None, start: Array, card: SensorCard, sigma: float) -> SpotFit:
+def _srgb(
+    image: NDArray[Any],
+    off: NDArray[Any] | None,
+    start: Array,
+    card: SensorCard,
+    blur: SpotBlur,
+    response: tuple[float, float, float],
+) -> SpotFit:
     """Fit a square of 17 x 17 pixels about the start."""
     u0, v0 = (
         int(np.clip(np.rint(centre) - _HALF_PX, 0, size - 2 * _HALF_PX - 1))
@@ -82,15 +101,28 @@ def _srgb(image: NDArray[Any], off: NDArray[Any] | None, start: Array, card: Sen
     )
     square, origin = Box(u0, v0, 2 * _HALF_PX + 1, 2 * _HALF_PX + 1), np.array([[u0, v0]])
     on = image[square.slices][None]
+
+    def fit(background_e: Array | None, extra_e2: float) -> SpotFit:
+        return fit_srgb(
+            on,
+            origin,
+            card,
+            blur.sigma_px,
+            response,
+            background_e,
+            extra_e2=extra_e2,
+            ratio=blur.ratio,
+            mixed_px2=blur.mixed_px2,
+        )
+
     if off is None:
-        flat = fit_srgb(on, origin, card, sigma)
+        flat = fit(None, 0.0)
         if flat.chi2[0] < _FLAT_CHI2:
             return flat
         base = _base(on, around(start[None], origin, (2 * _HALF_PX + 1, 2 * _HALF_PX + 1)), origin, card)
     else:
         base = _base(off[square.slices][None], None, origin, card)
-    extra = float(np.median(base.variance_e2))
-    return fit_srgb(on, origin, card, sigma, background_e=base.mean_e, extra_e2=extra)
+    return fit(base.mean_e, float(np.median(base.variance_e2)))
 
 
 def _base(image: NDArray[Any], known: Array | None, origin: NDArray[np.int64], card: SensorCard) -> BaseImage:

@@ -19,7 +19,7 @@ from phibench.estimator.methods.raw_maximum_likelihood import raw_maximum_likeli
 from phibench.estimator.methods.sight import each_spot
 from phibench.estimator.raw_pixels import PixelNoise, noise_of, raw_electrons
 from phibench.estimator.seat.pair import Answer, Image, Matrix2, Pair, Spot
-from phibench.estimator.spot_blur import round_blur_px
+from phibench.estimator.spot_blur import spot_blur
 from phibench.estimator.spot_likelihood import SpotRegions, spot_regions
 from phibench.estimator.status import Status
 from phibench.scenes.frames import Array
@@ -77,7 +77,7 @@ def _region(image: Image, dark: Image | None, pair: Pair, start: Array) -> SpotR
         x, extra = x - off + float(np.median(off)), _variance(off, pair.card)[None]
     r, g, b = pair.rig.camera.detector.laser_filter_response
     response = (r, g, b) if pair.card.mosaic == "bayer" else None
-    sigma = round_blur_px(pair.rig, start)
+    sigma = spot_blur(pair.rig, start).round_px
     return spot_regions(x[None], (u0, v0), noise_of(pair.card), sigma, response, extra_e2=extra)
 
 

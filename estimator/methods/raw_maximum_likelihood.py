@@ -16,7 +16,7 @@ from phibench.estimator.fit_raw import SpotFit, fit_raw
 from phibench.estimator.methods.sight import Sight
 from phibench.estimator.raw_pixels import PixelNoise, bayer_filters, noise_of, raw_electrons
 from phibench.estimator.seat.pair import Spot
-from phibench.estimator.spot_blur import round_blur_px
+from phibench.estimator.spot_blur import spot_blur
 from phibench.estimator.status import Status, describe
 from phibench.scenes.frames import Array
 
@@ -43,7 +43,7 @@ def raw_maximum_likelihood(sight: Sight) -> Spot:
     if near is None:
         return Spot.missing("no spot")
     middle = (near.box.u0_px + near.box.width_px // 2, near.box.v0_px + near.box.height_px // 2)
-    sigma = round_blur_px(rig, middle)
+    sigma = spot_blur(rig, middle).round_px
     response = rig.camera.detector.laser_filter_response if card.mosaic == "bayer" else None
     background = _background(near, noise)
     fit = fit_raw(

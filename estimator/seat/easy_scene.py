@@ -9,7 +9,7 @@ import numpy as np
 
 from phibench.estimator.phi import phi_incidence, phi_normal, phi_ray
 from phibench.estimator.seat.mirror_image import mirror_image
-from phibench.estimator.spot_blur import round_blur_px
+from phibench.estimator.spot_blur import spot_blur
 from phibench.scenes.rig import Rig
 from phibench.scenes.streams import generator
 
@@ -60,4 +60,4 @@ def _spot(rig: Rig, offset_m: float, point: np.ndarray[tuple[int], np.dtype[np.f
     uv = mirror_image(view, point)
     at = np.array(uv)
     angles = {"ray": phi_ray(view, at), "normal": phi_normal(view, at), "incidence": phi_incidence(view, at)}
-    return EasySpot(uv, round_blur_px(rig, uv), {name: float(phi) for name, phi in angles.items()}, azimuth)
+    return EasySpot(uv, spot_blur(rig, uv).round_px, {name: float(phi) for name, phi in angles.items()}, azimuth)
