@@ -6,11 +6,10 @@ colour (`spot_verdict`). Then both images together (`spot_pair`): the spot's ima
 False alarms. The mirror's disc has 3.6e5 pixels and each is asked at 4 half-pixel places, so that a frame has at most
 N = 1.44e6 trials; on raw pixels whose background is known the significance is never larger than a unit normal's,
 because chi^2 only lowers it. A candidate alone: N Q(6.2) = 4e-4 a frame. A pair: the partner lies within 4 px of a
-curve at most 340 px long, n = 4 x 2700 trials, and both pass 4.8: N n Q(4.8)^2 = 0.01 by this count, which takes
-neighbouring places for independent; the pixels within a blur's area (about 7 px) share their noise, in both images,
-which leaves 1e-2 / 49 / 16 = 1e-5. Processed pixels have longer tails than a normal law, and a room seen without
-filters and without a laser-off frame has corners that look like spots: both have thresholds of their own, set by
-measurement (`docs/measurements.md`).
+curve at most 340 px long, n = 4 x 2700 trials, and both pass 4.8: N n Q(4.8)^2 = 0.01 with all places taken for
+independent. Those within a blur's area (7 px, 4 places each) share their noise, in both images, which leaves about
+1e-5 a pair. Processed pixels have longer tails than a normal law, and a room seen without filters and without a
+laser-off frame has corners that look like spots: both have thresholds of their own, set by measurement.
 """
 
 from __future__ import annotations
