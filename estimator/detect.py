@@ -34,7 +34,9 @@ RAW = Thresholds(alone=6.2, each=4.8, together=4.8)
 PROCESSED = Thresholds(alone=7.5, each=4.6, together=5.5)
 PROCESSED_ONE_FRAME = Thresholds(alone=8.5, each=5.0, together=6.5)  # without a laser-off frame
 UNSURE = Thresholds(alone=16.0, each=5.0, together=10.0)  # neither filters nor a laser-off frame
-_LEAST_PEAK = 4.0
+_IN_A_BOX = 0.7  # less than in the whole mirror, see above
+_SMALL_BOX_PX2 = 10_000
+_LEAST_PEAK = 3.8
 _MOST_PEAKS = 3000
 _MOST_TESTED = 200  # at the second scale
 _WIDER = 1.8  # than the blur: a rough mirror's or a saturated spot
@@ -88,11 +90,13 @@ def detect(pair: Pair) -> PairDetection:
     ValueError
         If an image does not fit the card's output.
     """
-    down = _searched(pair.down, pair.down_off, pair, pair.box_down)
-    up = _searched(pair.up, pair.up_off, pair, pair.box_up)
     off = pair.down_off is not None and pair.up_off is not None
     sure = off or pair.card.mosaic == "bayer"
-    choice = choose(pair.rig, pair.stroke_m, down.found, up.found, _thresholds(pair.card, sure, off), sure)
+    least = _thresholds(pair.card, sure, off)
+    least = _lowered(least) if _is_small(pair.box_down) and _is_small(pair.box_up) else least
+    down = _searched(pair.down, pair.down_off, pair, pair.box_down, least.each)
+    up = _searched(pair.up, pair.up_off, pair, pair.box_up, least.each)
+    choice = choose(pair.rig, pair.stroke_m, down.found, up.found, least, sure)
     return _refined(choice, down, up, pair.card)
 
 
@@ -102,6 +106,14 @@ def _thresholds(card: SensorCard, sure: bool, off: bool) -> Thresholds:
     if card.output == "raw":
         return RAW
     return PROCESSED if off else PROCESSED_ONE_FRAME
+
+
+def _is_small(hint: Box | None) -> bool:
+    return hint is not None and hint.width_px * hint.height_px <= _SMALL_BOX_PX2
+
+
+def _lowered(least: Thresholds) -> Thresholds:
+    return Thresholds(least.alone - _IN_A_BOX, least.each - _IN_A_BOX, least.together - _IN_A_BOX)
 
 
 def outline_mask(rig: Rig, box: Box) -> BoolArray:
@@ -121,7 +133,7 @@ def mirror_box(rig: Rig) -> Box:
     return Box(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
 
 
-def _searched(image: Image, dark: Image | None, pair: Pair, hint: Box | None, least_z: float = 4.6) -> _Searched:
+def _searched(image: Image, dark: Image | None, pair: Pair, hint: Box | None, least_z: float) -> _Searched:
     card, box = pair.card, mirror_box(pair.rig)
     on = colour_planes(image, card, box)
     off = None if dark is None else colour_planes(dark, card, box)

@@ -25,7 +25,7 @@ _MOST_CHI2 = 30.0  # beyond it the light around the spot is not what the model s
 
 
 def chain_fit(pair: Pair) -> Answer:
-    """Fit both spots, each in its box or, without boxes, where `locate` sees them.
+    """Fit both spots where `locate` sees them.
 
     The blur is what the rig predicts (`spot_blur`). The room behind comes from the laser-off frames where they are
     there, otherwise from what surrounds the spot. A misfit above 1 per degree of freedom widens the covariance by as
@@ -34,14 +34,8 @@ def chain_fit(pair: Pair) -> Answer:
     if pair.card.output not in ("srgb8", "mjpeg"):
         missing = Spot.missing(f"chain_fit needs srgb8 or mjpeg images, not {pair.card.output}")
         return Answer(missing, missing)
-    down, up = _boxes(pair)
+    down, up = locate(pair)
     return Answer(_spot(pair, pair.down, pair.down_off, down), _spot(pair, pair.up, pair.up_off, up))
-
-
-def _boxes(pair: Pair) -> tuple[Box | None, Box | None]:
-    if pair.box_down is not None and pair.box_up is not None:
-        return pair.box_down, pair.box_up
-    return locate(pair)
 
 
 def _spot(pair: Pair, image: NDArray[Any], off: NDArray[Any] | None, box: Box | None) -> Spot:

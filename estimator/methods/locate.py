@@ -9,17 +9,15 @@ _SIDE_PX = 21  # room for a fit's surroundings
 
 
 def locate(pair: Pair) -> tuple[Box | None, Box | None]:
-    """Boxes of the down and the up image: the pair's own hints, otherwise those of `detect`; None where there is none.
+    """Boxes around the spots that `detect` sees; where it sees none, the pair's own hint, or None.
 
     Raises
     ------
     ValueError
         If an image does not fit the card's output.
     """
-    if pair.box_down is not None and pair.box_up is not None:
-        return pair.box_down, pair.box_up
     found = detect(pair)
-    return box_around(found.down, pair.down), box_around(found.up, pair.up)
+    return box_around(found.down, pair.down) or pair.box_down, box_around(found.up, pair.up) or pair.box_up
 
 
 def box_around(found: Detection | None, image: Image) -> Box | None:

@@ -85,12 +85,10 @@ class Sight:
 
 
 def each_spot(find: Callable[[Sight], Spot]) -> Method:
-    """Method that looks at each image by itself, in the hinted box or where `locate` sees a spot."""
+    """Method that looks at each image by itself, where `locate` sees a spot."""
 
     def method(pair: Pair) -> Answer:
-        hinted = pair.box_down is not None and pair.box_up is not None
-        boxes = (pair.box_down, pair.box_up) if hinted else locate(pair)
-        down, up = (_seen(find, pair, name, box) for name, box in zip(("down", "up"), boxes, strict=True))
+        down, up = (_seen(find, pair, name, box) for name, box in zip(("down", "up"), locate(pair), strict=True))
         return Answer(down, up)
 
     return method
