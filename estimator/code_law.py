@@ -9,6 +9,7 @@ s^2 = V(mu). Rounding and clipping at both ends are in it exactly. The Poisson l
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -140,11 +141,19 @@ def code_law(
     table : CodeTable
         Of the card.
     """
+    step, information = _information_table(card, noise)
+    return CodeLaw(table.low_e[filters, codes], table.high_e[filters, codes], filters, noise, information, step)
+
+
+@lru_cache(maxsize=8)
+def _information_table(card: SensorCard, noise: PixelNoise) -> tuple[float, Array]:
+    """Distance of the nodes and information on them, shape (3, m), read only; kept, because fits repeat a card."""
     root, step = np.linspace(-_BELOW, np.sqrt(1.3 * card.saturation_e), _NODES, retstep=True)
-    mean = (np.sign(root) * root**2)[:, None]
+    mean, table = (np.sign(root) * root**2)[:, None], code_table(card)
     ends = zip(table.low_e, table.high_e, strict=True)
     information = np.stack([_information(low, high, mean, noise) for low, high in ends])
-    return CodeLaw(table.low_e[filters, codes], table.high_e[filters, codes], filters, noise, information, float(step))
+    information.flags.writeable = False
+    return float(step), information
 
 
 def _information(low: Array, high: Array, mean: Array, noise: PixelNoise) -> Array:
