@@ -21,10 +21,14 @@ from phibench.datasets.sensor_card import card_of
 from phibench.datasets.taken import TakenSample
 from phibench.datasets.takes import Take, takes
 from phibench.estimator.bench.truth import Distraction, PairTruth, SpotTruth
+from phibench.estimator.chain_limit import chain_limit
 from phibench.estimator.fisher import covariance_bound
 from phibench.estimator.limits import SpotLimit, spot_limit
+from phibench.estimator.methods.linear import PROCESSED
 from phibench.estimator.seat.pair import Box, Image, Pair
+from phibench.estimator.spot_blur import spot_blur
 from phibench.scenes.frames import Array
+from phibench.scenes.rig import Rig
 
 TASK_VERSION = 1
 """Version of the task: what a method is given, what it must answer and what is counted. A change of any raises it."""
@@ -78,7 +82,7 @@ class DatasetPairs:
         return pair, frames
 
     def truth(self, number: int) -> PairTruth:
-        """The exact answer, with the bounds of the raw pixels."""
+        """The exact answer, with the bounds of the image and of the raw pixels behind it."""
         take, sample, source = self._drawn_from(number)
         sensor = source.sides["down"].chain.sensor
         return PairTruth(
@@ -167,8 +171,10 @@ def _spot_truth(sample: TakenSample, source: FrameSource, take: Take, position: 
     raw = side.chain.sensor.replace(output="raw")
     card = card_of(raw)
     region = expected_of_light(side.light, raw, sample.rig.camera) if row.visible else None
-    limit = None if region is None else spot_limit(region, card)
-    bound = None if limit is None or not np.isfinite(limit.covariance_px2).all() else limit.covariance_px2
+    raw_limit = None if region is None else spot_limit(region, card)
+    limit, electrons, unit = raw_limit, _electrons(row.electrons_per_s, side), 1.0
+    if region is not None and side.chain.sensor.output in PROCESSED:
+        limit, unit = _processed_limit(region, side, sample.rig, (row.u_px, row.v_px), electrons), electrons
     peak_e = 0.0 if region is None else _peak_e(region)
     return SpotTruth(
         uv_px=(row.u_px, row.v_px),
@@ -176,14 +182,32 @@ def _spot_truth(sample: TakenSample, source: FrameSource, take: Take, position: 
         azimuth_rad=row.azimuth_rad,
         visible=row.visible,
         cause=row.cause,
-        electrons=_electrons(row.electrons_per_s, side),
+        electrons=electrons,
         peak_e=peak_e,
-        snr=0.0 if limit is None else _snr(limit),
+        snr=0.0 if limit is None else _snr(limit, unit),
         saturated=peak_e > card.saturation_e,
-        bound_px2=bound if side.chain.sensor.output == "raw" else None,
-        raw_bound_px2=bound,
+        bound_px2=_bound(limit),
+        raw_bound_px2=_bound(raw_limit),
         distractions=_distractions(sample, side, position),
     )
+
+
+def _processed_limit(
+    region: ExpectedRegion, side: Side, rig: Rig, uv_px: tuple[float, float], electrons: float
+) -> SpotLimit:
+    """Limit of the 8-bit or JPEG image: the room as one level per filter, its mean under the spot; a Gaussian spot."""
+    blur = spot_blur(rig, uv_px)
+    weight = region.spot_e + 1e-3 * region.spot_e.max()  # of a filter that sees nothing of the spot: the mean of all
+    levels = [
+        float(np.average(region.background_e[region.filters == c], weights=weight[region.filters == c]))
+        for c in range(3)
+    ]
+    r, g, b = rig.camera.detector.laser_filter_response
+    return chain_limit(card_of(side.chain.sensor), uv_px, blur.sigma_px, electrons, levels, (r, g, b), blur.ratio)
+
+
+def _bound(limit: SpotLimit | None) -> Array | None:
+    return None if limit is None or not np.isfinite(limit.covariance_px2).all() else limit.covariance_px2
 
 
 def _electrons(rates_per_s: tuple[float, float, float] | Array, side: Side) -> float:
@@ -198,10 +222,10 @@ def _peak_e(region: ExpectedRegion) -> float:
     return float(region.mean_e[region.spot_e >= _OF_THE_SPOT * region.spot_e.max()].max())
 
 
-def _snr(limit: SpotLimit) -> float:
-    """Flux over its standard deviation at the limit, position known, background unknown."""
+def _snr(limit: SpotLimit, flux: float) -> float:
+    """Flux, in the unit of the limit, over its deviation at the limit: position known, background unknown."""
     variance = covariance_bound(limit.fisher[_POSITION:, _POSITION:], keep=1)[0, 0]
-    return float(1.0 / np.sqrt(variance)) if variance > 0.0 else 0.0
+    return float(flux / np.sqrt(variance)) if variance > 0.0 else 0.0
 
 
 def _distractions(sample: TakenSample, side: Side, position: str) -> tuple[Distraction, ...]:

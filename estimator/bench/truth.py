@@ -34,11 +34,13 @@ class SpotTruth:
     peak_e : float
         Largest expected electrons of a pixel, room included.
     snr : float
-        Flux over its standard deviation at the limit, position known: "so many sigma".
+        Flux over its standard deviation at the limit of this image, after all processing; position known, the room's
+        levels not: "so many sigma".
     saturated : bool
         Whether a pixel of the spot is expected above the sensor's saturation.
     bound_px2 : array, shape (2, 2), or None
-        Cramer-Rao bound of (u, v): of the raw pixels for raw outputs, None where there is none.
+        Cramer-Rao bound of (u, v) from this image: `estimator.limits` for raw outputs, `estimator.chain_limit` for
+        processed ones; None where there is none.
     raw_bound_px2 : array, shape (2, 2), or None
         Bound of the raw pixels behind this image, whatever the output.
     distractions : tuple of Distraction
