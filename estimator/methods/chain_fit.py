@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from phibench.datasets.sensor_card import SensorCard
 from phibench.estimator.base_image import BaseImage, around, base_of
+from phibench.estimator.detect import Detection, detect
 from phibench.estimator.fit_chain import first_fit, fit_jpeg, fit_srgb, undone, unrounded
 from phibench.estimator.fit_raw import SpotFit
 from phibench.estimator.jpeg_tables import mcu_px
-from phibench.estimator.methods.locate import locate
+from phibench.estimator.methods.locate import box_around
 from phibench.estimator.raw_pixels import bayer_filters
 from phibench.estimator.seat.pair import Answer, Box, Pair, Spot
 from phibench.estimator.spot_blur import SpotBlur, spot_blur
@@ -25,7 +26,7 @@ _MOST_CHI2 = 30.0  # beyond it the light around the spot is not what the model s
 
 
 def chain_fit(pair: Pair) -> Answer:
-    """Fit both spots where `locate` sees them.
+    """Fit both spots where `detect` sees them, or in their boxes.
 
     The blur is what the rig predicts (`spot_blur`). The room behind comes from the laser-off frames where they are
     there, otherwise from what surrounds the spot. A misfit above 1 per degree of freedom widens the covariance by as
@@ -34,8 +35,19 @@ def chain_fit(pair: Pair) -> Answer:
     if pair.card.output not in ("srgb8", "mjpeg"):
         missing = Spot.missing(f"chain_fit needs srgb8 or mjpeg images, not {pair.card.output}")
         return Answer(missing, missing)
-    down, up = locate(pair)
-    return Answer(_spot(pair, pair.down, pair.down_off, down), _spot(pair, pair.up, pair.up_off, up))
+    found = detect(pair)
+    return Answer(
+        _spot_or_place(pair, pair.down, pair.down_off, found.down, pair.box_down),
+        _spot_or_place(pair, pair.up, pair.up_off, found.up, pair.box_up),
+    )
+
+
+def _spot_or_place(
+    pair: Pair, image: NDArray[Any], off: NDArray[Any] | None, found: Detection | None, hint: Box | None
+) -> Spot:
+    """Fit; or, of a spot that was seen but gives no fit, the place of the matched filter, without covariance."""
+    spot = _spot(pair, image, off, box_around(found, image) or hint)
+    return Spot(found.uv_px) if spot.uv_px is None and found is not None else spot
 
 
 def _spot(pair: Pair, image: NDArray[Any], off: NDArray[Any] | None, box: Box | None) -> Spot:

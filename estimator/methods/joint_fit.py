@@ -46,6 +46,8 @@ def _raw(pair: Pair, separate: Answer) -> Answer:
 
 
 def _processed(pair: Pair, separate: Answer) -> Answer:
+    if separate.down.covariance_px2 is None or separate.up.covariance_px2 is None:
+        return separate
     (uv1, C1), (uv2, C2) = (
         (np.array([spot.uv_px], float), np.array([spot.covariance_px2], float)) for spot in (separate.down, separate.up)
     )
