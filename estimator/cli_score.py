@@ -25,6 +25,7 @@ def score(
     preset: str | None = None,
     draws: Whole | None = None,
     pairs: Whole | None = None,
+    hints: bool = True,
     seed: Whole = 0,
     workers: Whole = 1,
     out: Path | None = None,
@@ -43,6 +44,8 @@ def score(
         Draws of the noise per sample; by default the recipe's.
     pairs
         Only so many pairs.
+    hints
+        Show the boxes that pairs have; --no-hints leaves the method to search the whole image.
     seed
         Of the bootstrap that makes the intervals.
     workers
@@ -51,7 +54,7 @@ def score(
         JSON file for the score, records beside it as Parquet; with several methods their names are added to it.
     """
     if method:
-        return _score_methods(directory, method, preset, draws, pairs, seed, workers, out)
+        return _score_methods(directory, method, preset, draws, pairs, hints, seed, workers, out)
     _refuse_without_method(preset=preset, draws=draws, pairs=pairs)
     return _score_estimators(directory, out)
 
@@ -104,6 +107,7 @@ def _score_methods(
     preset: str | None,
     draws: int | None,
     count: int | None,
+    hints: bool,
     seed: int,
     workers: int,
     out: Path | None,
@@ -118,7 +122,7 @@ def _score_methods(
     from phibench.estimator.seat.resolve import resolve
 
     files = _files(out, [MethodCard.of(name, **resolve(name).document()) for name in references])
-    pair_set = dataset_pairs(open_finished(directory), preset, draws, count)
+    pair_set = dataset_pairs(open_finished(directory), preset, draws, count, hints)
     scored = run_and_score(references, pair_set, workers, Console(stderr=True), "pairs", _seed(seed))
     console, documents = _console(), []
     for one, file in zip(scored, files, strict=True):

@@ -106,13 +106,22 @@ def test_the_truth_is_the_manifests(dataset: Dataset, pairs: DatasetPairs) -> No
         assert float(depth.depth_m) == pytest.approx(truth.depth_m, rel=1e-9)
 
 
-def test_bounds_are_of_the_raw_pixels_and_given_for_raw_outputs(pairs: DatasetPairs) -> None:
+def test_bounds_are_of_the_image_and_of_the_raw_pixels_behind_it(pairs: DatasetPairs) -> None:
+    """Processing takes information away: no processed bound is below the raw one, but for what its model leaves out.
+
+    It takes the spot as a Gaussian of the rig's blur and the room as level; the layers' own spot differs by its size
+    (0.2 px in a blur of 0.7 px: 4 % of the width, 8 % of the variance), hence 0.8.
+    """
     found = {truth.preset: truth for _, truth in every(pairs)}
     for preset, truth in found.items():
         for spot in (truth.down, truth.up):
             assert spot.raw_bound_px2 is not None
-            assert (spot.bound_px2 is not None) == (preset == "bayer-raw")
             assert np.linalg.eigvalsh(spot.raw_bound_px2).min() > 0.0
+            if preset == "bayer-raw":
+                assert np.array_equal(spot.bound_px2, spot.raw_bound_px2)
+            elif spot.bound_px2 is not None:
+                assert np.trace(spot.bound_px2) > 0.8 * np.trace(spot.raw_bound_px2)
+    assert found["srgb8"].down.bound_px2 is not None
     by_sample: dict[str, list[np.ndarray]] = {}
     for _, truth in every(pairs):
         assert truth.down.raw_bound_px2 is not None

@@ -40,7 +40,8 @@ COMPARED = (
 )
 _KEY = ("number", "image")
 _TRUTH = ("sample_id", "draw", "depth_m", "u_true_px", "v_true_px", "visible")
-_MAY_DIFFER = ("pairs", "samples", "provenance")  # of a pair set: how much of it was taken, with which versions
+# of a pair set: how much of it was taken, with which versions
+_MAY_DIFFER = ("pairs", "samples", "hinted", "provenance")
 
 _NOTHING = Estimate(np.nan, np.nan, np.nan, "no record counts for both")
 

@@ -5,6 +5,7 @@ The bound of a spot counts room, dark current and distractors as background: one
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -110,6 +111,7 @@ class DatasetPairs:
             "pairs": len(self),
             "samples": len({take.sample_id for take in self._takes}),
             "presets": sorted({take.preset for take in self._takes}),
+            "hinted": sum(take.boxes is not None for take in self._takes),
             "seed": info.recipe["dataset"]["seed"],
             "recipe_sha256": info.recipe_sha256,
             "dataset_sha256": sha256(listed) if listed.is_file() else None,
@@ -129,7 +131,11 @@ class DatasetPairs:
 
 
 def dataset_pairs(
-    dataset: Dataset, preset: str | None = None, draws: int | None = None, pairs: int | None = None
+    dataset: Dataset,
+    preset: str | None = None,
+    draws: int | None = None,
+    pairs: int | None = None,
+    hints: bool = True,
 ) -> DatasetPairs:
     """Pairs of a data set in an order that is drawn.
 
@@ -142,6 +148,8 @@ def dataset_pairs(
         Draws of the noise per sample and preset; the recipe's if not given.
     pairs : int, optional
         Only the first so many.
+    hints : bool
+        Whether pairs that have boxes show them.
 
     Raises
     ------
@@ -151,7 +159,8 @@ def dataset_pairs(
     taken = takes(dataset, preset, draws)
     if pairs is not None and pairs < 1:
         raise DatasetError(f"pairs = {pairs}: must be 1 or above")
-    return DatasetPairs(dataset, taken[:pairs])
+    shown = taken if hints else tuple(replace(take, boxes=None) for take in taken)
+    return DatasetPairs(dataset, shown[:pairs])
 
 
 def _sealed(image: Image) -> Image:

@@ -1,8 +1,8 @@
-"""Strata: the same metrics over parts of the records, by depth, stroke, signal, Bayer phase, quality, azimuth, preset.
+"""Strata: the same metrics over parts of the records, by depth, stroke, signal, azimuth, Bayer phase and so on.
 
 A stratum takes images; its metrics of pairs take pairs. By signal an image counts with its own electrons, a pair with
-those of its fainter spot; by azimuth a pair counts with its "down" image. Bayer phase and image position belong to
-images alone: their strata have no metrics of pairs.
+those of its fainter spot; by azimuth a pair counts with its "down" image. Signal to noise ("sigmas"), Bayer phase and
+image position belong to images alone: their strata have no metrics of pairs.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ _EDGES: dict[str, tuple[str, tuple[float, ...], str]] = {
     "depth": ("depth_m", (0.0, 1.5, 2.5, 3.5, math.inf), "m"),
     "stroke": ("stroke_m", (0.0, 0.3, 0.6, 0.9, math.inf), "m"),
     "signal": ("electrons", (0.0, 300.0, 1e3, 3e3, 1e4, 3e4, math.inf), "e-"),
+    "sigmas": ("snr", (0.0, 3.0, 5.0, 10.0, 30.0, math.inf), "sigma"),
     "azimuth": ("azimuth_deg", tuple(float(x) for x in range(-180, 181, 45)), "deg"),
 }
-_VALUES = {"image": "image", "bayer": "bayer", "quality": "jpeg_quality", "preset": "preset"}
-_OF_IMAGES = ("image", "bayer")
+_VALUES = {"hint": "hint", "image": "image", "bayer": "bayer", "quality": "jpeg_quality", "preset": "preset"}
+_OF_IMAGES = ("sigmas", "image", "bayer")
 _IMAGE_METRICS = tuple(name for name, metric in METRICS.items() if metric.family not in OF_PAIRS)
 STRATA = ("all", *_EDGES, *_VALUES)
 
@@ -57,7 +58,8 @@ class Stratum:
 
 def strata(records: pl.DataFrame) -> Iterator[Stratum]:
     """The whole, then all strata that hold some of the images, but not all."""
-    table = prepared(records).with_columns(azimuth_deg=pl.col("azimuth_rad").degrees())
+    hint = pl.when(pl.col("hinted")).then(pl.lit("boxes")).otherwise(pl.lit("no boxes"))
+    table = prepared(records).with_columns(azimuth_deg=pl.col("azimuth_rad").degrees(), hint=hint)
     yield Stratum("all", "all", None, None, None, table, table)
     for by in _EDGES:
         yield from _by_edges(by, table)
@@ -97,7 +99,11 @@ def _by_edges(by: str, table: pl.DataFrame) -> Iterator[Stratum]:
             yield Stratum(by, _label(low, high, unit), low, high, mean, images, pairs)
 
 
-def _pairs(by: str, table: pl.DataFrame, images: pl.DataFrame, low: float, high: float, last: float) -> pl.DataFrame:
+def _pairs(
+    by: str, table: pl.DataFrame, images: pl.DataFrame, low: float, high: float, last: float
+) -> pl.DataFrame | None:
+    if by in _OF_IMAGES:
+        return None
     if by == "signal":
         return table.filter(_within("pair_electrons", low, high, last))
     if by == "azimuth":
