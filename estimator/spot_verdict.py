@@ -3,7 +3,8 @@
 At each place and for each plane: least squares of a spot's profile on a tilted background, over a patch. The
 significance is amplitude over standard deviation, less where the model does not fit: divided by sqrt(chi^2), so that
 edges, lines and corners of the room, which match a spot a little and its surroundings not at all, stay below any
-threshold: with p pixels and correlation c between structure and profile it cannot pass c sqrt(p / (1 - c^2)).
+threshold: with p pixels and correlation c between structure and profile it cannot pass c sqrt(p / (1 - c^2)) by what
+lies beside the profile. In chi^2 a pixel of the spot has its shot noise and a tenth of its light as further noise.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ _FULLER = 0.5
 _OUTSHINES = 0.7  # peak of a spot over the level around it, more than the contrast of walls and furniture
 _LATTICE_PX = 17
 _CHI2_SHARE = 0.75  # of places without a spot that count as fitted well: JPEG leaves many all but empty
+_SHAPE = 0.1  # of a spot's light in a pixel: what blur, defocus and demosaicing leave unknown of it
 _FULL_PX = 3  # a saturated spot is not wider
 
 
@@ -196,7 +198,10 @@ def _least_squares(y: Array, weight: Array, columns: Array) -> _Fit:
     solution = np.linalg.solve(normal, (X * w) @ flat[..., None])[..., 0]
     rest = flat - (solution[:, None] @ X)[:, 0]
     freedom = np.maximum((w[:, 0] > 0.0).sum(axis=1) - k - 3, 1)
-    chi2 = np.sum(w[:, 0] * rest * rest, axis=1) / freedom
+    # a bright spot's own shot noise, and its shape, which is known to a part only, are no reason to doubt it
+    own = np.maximum(solution[:, :1], 0.0) * flat_columns[:, 0]
+    trust = w[:, 0] / (1.0 + w[:, 0] * (own + (_SHAPE * own) ** 2))
+    chi2 = np.sum(trust * rest * rest, axis=1) / freedom
     return _Fit(solution[:, 0], np.linalg.inv(normal)[:, 0, 0], chi2)
 
 

@@ -1,90 +1,83 @@
 """The likelihood fit of `estimator.fit_raw` as a method, on raw pixels with or without colour filters.
 
 What it takes as known: the card's noise (PRNU and DSNU count as noise), the rig's detector for the filters' response
-at the laser line, and the blur that the rig predicts at the pixel (`spot_blur`). A rough mirror's blur is not
-predicted: there the width is fitted as well. Where the room behind the spot is not flat, chi2 widens the covariance.
+at the laser line, and the oblique blur that the rig predicts at the pixel (`spot_blur`). A rough mirror's blur is not
+predicted: there the width is fitted as well. The room behind is the laser-off frame, smoothed as far as it is flat
+(`base_image`); without one it is a level per filter, or, where that does not describe it, what surrounds the spot. A
+misfit that is left widens the covariance.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 
 import numpy as np
 
-from phibench.estimator.fit_raw import SpotFit, fit_raw
+from phibench.estimator.base_image import BaseImage, around, base_of
+from phibench.estimator.fit_raw import SpotFit, fit_law
 from phibench.estimator.methods.sight import Sight
-from phibench.estimator.raw_pixels import PixelNoise, bayer_filters, noise_of, raw_electrons
+from phibench.estimator.pixel_law import GaussLaw
+from phibench.estimator.raw_pixels import PixelNoise, noise_of, raw_electrons
 from phibench.estimator.seat.pair import Spot
 from phibench.estimator.spot_blur import spot_blur
 from phibench.estimator.status import Status, describe
 from phibench.scenes.frames import Array
 
-_STRUCTURE_SIGMAS = 4.0  # by which the off frame's chi2 must exceed that of a flat room
+_FLAT_SIGMAS = 4.0  # by which the chi2 of a fit with flat levels must exceed 1 for the room to have structure
 _MISFIT_SIGMAS = 3.0  # by which the fit's chi2 must exceed 1 before its covariance is widened
-
-
-@dataclass(frozen=True)
-class _Background:
-    """Known background, shape (h, w), electrons, and what its own noise adds; or none, and levels are fitted."""
-
-    electrons: Array | None
-    noise: PixelNoise
 
 
 def raw_maximum_likelihood(sight: Sight) -> Spot:
     """Position and covariance by maximum likelihood on 15 x 15 raw pixels around the red peak."""
-    card, rig = sight.pair.card, sight.pair.rig
     try:
-        noise = noise_of(card)
+        noise = noise_of(sight.pair.card)
     except ValueError:
         return Spot.missing("the fit needs shot noise and no row noise")
     near = sight.narrowed()
     if near is None:
         return Spot.missing("no spot")
-    middle = (near.box.u0_px + near.box.width_px // 2, near.box.v0_px + near.box.height_px // 2)
-    sigma = spot_blur(rig, middle).round_px
-    response = rig.camera.detector.laser_filter_response if card.mosaic == "bayer" else None
-    background = _background(near, noise)
-    fit = fit_raw(
-        raw_electrons(near.pixels, card)[None],
+    x = raw_electrons(near.pixels, sight.pair.card)[None]
+    flat = _fit(near, x, noise, None)
+    if (
+        near.off_pixels is None
+        and flat.status[0] == Status.OK
+        and flat.chi2[0] < 1.0 + _FLAT_SIGMAS * math.sqrt(2.0 / x.size)
+    ):
+        return _spot(flat, x.size)
+    based = _fit(near, x, noise, _base(near, x, noise, flat))
+    return _spot(based if based.status[0] == Status.OK else flat, x.size)
+
+
+def _fit(near: Sight, x: Array, noise: PixelNoise, base: BaseImage | None) -> SpotFit:
+    """Fit with a known background, or with a level per filter."""
+    card, rig = near.pair.card, near.pair.rig
+    u0, v0 = near.origin_px
+    blur = spot_blur(rig, (u0 + near.box.width_px // 2, v0 + near.box.height_px // 2))
+    r, g, b = rig.camera.detector.laser_filter_response
+    return fit_law(
+        x,
         near.origin_px,
-        background.noise,
-        sigma,
-        None if response is None else (response[0], response[1], response[2]),
-        background.electrons,
+        GaussLaw(noise, 0.0 if base is None else base.variance_e2),
+        blur.sigma_px,
+        (r, g, b) if card.mosaic == "bayer" else None,
+        None if base is None else base.mean_e,
         rig.mirror.roughness_alpha > 0.0,
-        card.saturation_e,
+        x < card.saturation_e,
+        blur.ratio,
+        blur.mixed_px2,
     )
-    return _spot(fit, near.pixels.size)
 
 
-def _background(near: Sight, noise: PixelNoise) -> _Background:
-    """Off frame as known background where the room behind the spot has structure; otherwise levels per filter.
-
-    One off frame brings its own noise, which costs more than fitting three levels to a flat room. Its chi2 about those
-    levels tells which it is.
-    """
+def _base(near: Sight, x: Array, noise: PixelNoise, flat: SpotFit) -> BaseImage:
+    """Room of the laser-off frame; without one, of the pixels around the spot."""
     off = near.off_pixels
-    if off is None:
-        return _Background(None, noise)
-    electrons = raw_electrons(off, near.pair.card)
-    levels = _levels(near, electrons)
-    count = electrons.size
-    chi2 = float(np.mean((electrons - levels) ** 2 / noise.variance_e2(levels)))
-    if chi2 < 1.0 + _STRUCTURE_SIGMAS * np.sqrt(2.0 / count):
-        return _Background(None, noise)
-    added = float(np.max(noise.variance_e2(levels)))  # that of the red pixels, which tell where the spot is
-    return _Background(electrons, replace(noise, gaussian_e2=noise.gaussian_e2 + added))
-
-
-def _levels(near: Sight, electrons: Array) -> Array:
-    """Mean of the off frame per filter, at each pixel."""
-    if near.pair.card.mosaic == "mono":
-        return np.full(electrons.shape, electrons.mean())
-    filters = bayer_filters(np.array([near.origin_px]), (electrons.shape[0], electrons.shape[1]))[0]
-    means = np.array([electrons[filters == colour].mean() for colour in range(3)])
-    return means[filters]
+    if off is not None:
+        electrons = raw_electrons(off, near.pair.card)[None]
+        return base_of(electrons, noise.variance_e2(electrons), np.ones(x.shape))
+    origin = np.array([near.origin_px], float)
+    middle = origin + (np.array([x.shape[2], x.shape[1]]) - 1.0) / 2.0
+    uv = np.where(np.isfinite(flat.uv_px), flat.uv_px, middle)
+    return base_of(x, noise.variance_e2(x), around(uv, origin, (x.shape[1], x.shape[2])))
 
 
 def _spot(fit: SpotFit, count: int) -> Spot:

@@ -17,7 +17,7 @@ from phibench.estimator.limits import spot_limit
 from phibench.estimator.methods.linear import KINDS
 from phibench.estimator.methods.window import clipped
 from phibench.estimator.seat.easy_image import EasyCamera
-from phibench.estimator.seat.easy_scene import EasyScene, EasySpot, easy_scene
+from phibench.estimator.seat.easy_scene import EasyScene, EasySpot, easy_rig, easy_scene
 from phibench.estimator.seat.errors import MethodError
 from phibench.estimator.seat.pair import Box, Pair
 from phibench.scenes.names import nearest
@@ -49,7 +49,7 @@ class EasyPairs:
 
     preset: str = "bayer-raw"
     count: int = 10
-    rig: Rig = field(default_factory=Rig)
+    rig: Rig = field(default_factory=easy_rig)
     laser_off: bool = True
     hinted: bool = True
 

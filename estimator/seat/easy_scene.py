@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,6 +42,12 @@ class EasyScene:
     flux_e: float
     down: EasySpot
     up: EasySpot
+
+
+def easy_rig() -> Rig:
+    """The default rig, stopped down to f/16: without astigmatism from defocus a spot is round, as it is drawn here."""
+    rig = Rig()
+    return replace(rig, camera=replace(rig.camera, f_number=16.0))
 
 
 def easy_scene(rig: Rig, number: int) -> EasyScene:

@@ -27,4 +27,6 @@ def environment(folder: str, inherited: Mapping[str, str]) -> dict[str, str]:
     paths = [str(Path(part).absolute()) for part in inherited.get("PYTHONPATH", "").split(os.pathsep) if part]
     if paths:
         kept["PYTHONPATH"] = os.pathsep.join(paths)
-    return {**kept, "PWD": folder, "TMPDIR": folder, "PYTHONDONTWRITEBYTECODE": "1"}
+    # a pair's small matrices gain nothing from many threads, and lose much where several methods share the cores
+    one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    return {**one, **kept, "PWD": folder, "TMPDIR": folder, "PYTHONDONTWRITEBYTECODE": "1"}
