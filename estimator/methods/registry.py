@@ -76,7 +76,7 @@ _ALL = (
         "detect",
         detect,
         "peak of a matched filter over the whole mirror, boxes or not, refined by parabolas",
-        "docs/detection.md",
+        "estimator/detect.py",
     ),
     BuiltIn(
         "photutils_centroid_2dg",
