@@ -23,6 +23,7 @@ from phibench.datasets.recipe import (
     RoomTable,
     TargetTable,
 )
+from phibench.datasets.recipe_misalignment import MisalignmentTable, RandomMisalignmentTable
 from phibench.datasets.recipe_scene import CAMERA_KEYS
 from phibench.render.model_faults import allowed, schema_node
 from phibench.scenes.catalog import RIGS
@@ -31,6 +32,7 @@ from phibench.scenes.rig import Rig
 TABLES: dict[str, type[BaseModel]] = {
     "[dataset]": DatasetTable,
     "[rig]": RigTable,
+    "[misalignment]": MisalignmentTable,
     "[room]": RoomTable,
     "[laser]": LaserTable,
     "[ambient]": AmbientTable,
@@ -38,6 +40,7 @@ TABLES: dict[str, type[BaseModel]] = {
     "[[experiments]]": ExperimentTable,
     "[random]": RandomTable,
     "[random.rig]": RandomRigTable,
+    "[random.misalignment]": RandomMisalignmentTable,
     "[random.spot]": RandomSpotTable,
     "a distribution": DistributionTable,
 }
@@ -65,6 +68,11 @@ _NOTES = {
 follows `z_c_m` and `radius_m` (z_c - R/2, on the virtual image), `cx_px` follows
 `width_px`, and `cy_px` follows `height_px` (the image centre), where those are given.
 `z_c_m` must exceed `radius_m`.
+""",
+    "[misalignment]": """What the true rig deviates by from `[rig]`, which then is the nominal one: what an estimator
+believes. Images and truth are those of the true rig. Signs, axes and figures: `docs/misalignment.md`.
+Motions between the images hold at every carriage position but down. The light of the room stays
+that of the nominal rig, and the robot's body where it is.
 """,
     "[laser]": """A spot's diameter is `diameter_m`, or else `diameter_base_m` + `diameter_growth_m_per_m` x
 `depth_m` of its target. For a Gaussian profile that is 4 sigma (the 1/e^2 diameter).
@@ -94,6 +102,9 @@ not depend on which others are there.
 not drawn is as in `[rig]`, which must be a possible rig itself. A drawn `fx_px` is `fy_px` too
 (square pixels) unless `fy_px` is drawn or set in `[rig]`.
 """,
+    "[random.misalignment]": """Any key of `[misalignment]`, within its range, in place of the value there. The rig
+that `[random.rig]` gives is the nominal one.
+""",
     "[random.spot]": """Either on a board: `target`, `across_m`, `up_m`; a Gaussian spot needs 4 sigma (its diameter) to
 every edge, a uniform one its radius. The boards themselves stand still: all samples share the
 light of the room. Or by a ray: `azimuth_deg` and `height_m`. The spot is then where a horizontal
@@ -105,6 +116,11 @@ it; lamps carry no spots. Its diameter grows with that distance, its albedo is
 `{ normal = [639.5, 15.0], clip = [590.0, 690.0] }`. A normal distribution is truncated at
 `clip`: nothing piles up there.
 """,
+}
+_ABSENT: dict[type[BaseModel], str] = {
+    RigTable: "as preset",
+    RandomRigTable: "as in [rig]",
+    RandomMisalignmentTable: "as in [misalignment]",
 }
 
 
@@ -165,7 +181,7 @@ def _default(field: Any, model: type[BaseModel]) -> str:
     if field.is_required():
         return "must be given"
     if field.default is None:
-        return "as preset" if model is RigTable else "as in [rig]" if model is RandomRigTable else "none"
+        return _ABSENT.get(model, "none")
     return "see below" if isinstance(field.default, BaseModel) else _shown(field.default)
 
 
