@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from cyclopts import App, CycloptsError
 
 from phibench.estimator.cli_dataset import dataset
+from phibench.estimator.cli_misalignment import sensitivities
 
 if TYPE_CHECKING:
     from phibench.estimator.score import Score
@@ -30,6 +31,7 @@ app = App(
     result_action="return_value",
 )
 app.command(dataset)
+app.command(sensitivities)
 
 
 @app.command

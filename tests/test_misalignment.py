@@ -18,7 +18,6 @@ from test_recipe import changed, complaints
 from phibench.datasets import recipe as recipes
 from phibench.datasets.codec import from_json, to_json
 from phibench.datasets.layers import read_ambient, read_truth
-from phibench.datasets.make import make
 from phibench.datasets.plan import make_plan
 from phibench.datasets.read import open_finished
 from phibench.datasets.recipe_file import check_recipe
@@ -34,7 +33,6 @@ from phibench.scenes.motion import Motion
 from phibench.scenes.rig import Rig
 from phibench.scenes.robot import carriage
 
-TINY = (Path(__file__).parent / "tiny.toml").read_text(encoding="utf-8")
 EPS = 1e-14  # metres or cosines: a few roundings of numbers of order 1
 
 
@@ -269,19 +267,10 @@ def test_a_drawn_rig_that_cannot_be_is_drawn_again() -> None:
 # -- data sets -----------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def misaligned(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Data set of `tiny.toml` with a tilt, a decentre, a stroke that is too long and a yaw between the images."""
-    folder = tmp_path_factory.mktemp("misaligned")
-    table = "[misalignment]\ntilt_x_rad = 0.01\ndecentre_y_m = 2e-3\nstroke_relative = 0.01\nyaw_rad = 0.02\n\n"
-    (folder / "recipe.toml").write_text(TINY.replace("[[targets]]", f"{table}[[targets]]", 1), encoding="utf-8")
-    return make(folder / "recipe.toml", folder / "out", workers=2)
-
-
-def test_a_data_set_says_what_is_true_and_what_is_believed(misaligned: Path) -> None:
-    report = verify(misaligned)
+def test_a_data_set_says_what_is_true_and_what_is_believed(misaligned_dataset: Path) -> None:
+    report = verify(misaligned_dataset)
     assert report.ok, report.faults
-    dataset = open_finished(misaligned)
+    dataset = open_finished(misaligned_dataset)
     nominal, true = dataset.rigs["rig"], dataset.rigs["true"]
     assert dataset.rig == true == nominal.perturbed(Misalignment(0.0, 2e-3, tilt_x_rad=0.01, yaw_rad=0.02))
     assert len(dataset.samples) >= 2
@@ -294,7 +283,7 @@ def test_a_data_set_says_what_is_true_and_what_is_believed(misaligned: Path) -> 
         assert sample.row.up.sphere_centre_world_m == pytest.approx(sample.view("up").sphere_centre_m, abs=1e-12)
 
 
-def test_a_moved_view_is_the_view_of_a_rig_that_was_built_there(misaligned: Path) -> None:
+def test_a_moved_view_is_the_view_of_a_rig_that_was_built_there(misaligned_dataset: Path) -> None:
     """Ambient and truth layers of the up position, to the bit: the motion enters by the pose and by nothing else.
 
     The truth's D alone counts from the sphere at the down position, where the two rigs differ.
@@ -305,20 +294,20 @@ def test_a_moved_view_is_the_view_of_a_rig_that_was_built_there(misaligned: Path
     from phibench.render.variant import activate
 
     activate()
-    dataset = open_finished(misaligned)
+    dataset = open_finished(misaligned_dataset)
     sample, settings = dataset.samples[0], dataset.recipe.ambient
     view = sample.view("up")
     built = dataclasses.replace(sample.rig, T_world_camera=view.T_world_camera, motion=None).at(0.0)
     [pose] = [pose for pose in dataset.info.poses if pose.pose == sample.row.up.pose]
-    light = read_light_map(misaligned)
+    light = read_light_map(misaligned_dataset)
     layer = render_ambient(
         built, dataset.room, light, bake_settings(settings), settings.cells_per_pixel, pose.ambient_seed
     )
-    stored = read_ambient(misaligned / sample.row.up.view_ambient_file)
+    stored = read_ambient(misaligned_dataset / sample.row.up.view_ambient_file)
     assert stored.max() > 0.0
     assert np.array_equal(layer.electrons_per_s, stored)
     planes, truth = (
-        read_truth(misaligned / sample.row.up.view_truth_file),
+        read_truth(misaligned_dataset / sample.row.up.view_truth_file),
         truth_layer(built, dataset.room.shapes(built)),
     )
     for name, plane in planes.items():
