@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 import math
 from pathlib import Path
@@ -318,3 +319,20 @@ def test_a_moved_view_is_the_view_of_a_rig_that_was_built_there(misaligned_datas
         still, dataset.room, light, bake_settings(settings), settings.cells_per_pixel, pose.ambient_seed
     )
     assert not np.array_equal(other.electrons_per_s, stored)
+
+
+# -- the page ------------------------------------------------------------------------------------------------------
+
+
+def test_the_page_has_the_tables_of_the_code() -> None:
+    """docs/misalignment.md against `python docs/draw_misalignment.py`."""
+    folder = Path(__file__).resolve().parent.parent / "docs"
+    spec = importlib.util.spec_from_file_location("draw_misalignment", folder / "draw_misalignment.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    page = (folder / "misalignment.md").read_text(encoding="utf-8")
+    for text in (module.parameter_table(), module.budget_table(), module.estimator_table()):
+        assert text.count("\n") > 10
+        assert text in page
