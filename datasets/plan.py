@@ -35,8 +35,8 @@ class PosePlan:
     Attributes
     ----------
     pose_id : str
-        ``h`` and the carriage offset in metres, such as ``h0.425``; down is ``h0.000``. For a drawn rig, its id and a
-        hyphen come first: ``r000042-h0.425``.
+        ``h`` and the carriage offset in metres, such as ``h0.425``; down is ``h0.000``. For any rig but that of
+        `[rig]`, its id and a hyphen come first: ``r000042-h0.425``.
     offset_m : float
         Carriage offset along the stroke axis.
     seed : int

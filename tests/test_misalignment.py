@@ -18,12 +18,15 @@ from test_recipe import changed, complaints
 
 from phibench.datasets import recipe as recipes
 from phibench.datasets.codec import from_json, to_json
+from phibench.datasets.errors import RecipeError
 from phibench.datasets.layers import read_ambient, read_truth
 from phibench.datasets.plan import make_plan
 from phibench.datasets.read import open_finished
 from phibench.datasets.recipe_file import check_recipe
 from phibench.datasets.shard import shard_plan
 from phibench.datasets.verify import verify
+from phibench.estimator.score import score
+from phibench.estimator.triangulate import depth_exact
 from phibench.render.motion import spot_velocity_px_per_s
 from phibench.scenes.catalog import c310_rig, default_rig
 from phibench.scenes.checks import SceneError
@@ -265,6 +268,37 @@ def test_a_drawn_rig_that_cannot_be_is_drawn_again() -> None:
     assert max(pair.tries for pair in plan.pairs) > 1
 
 
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [({"shift_x_m": 0.25}, "cuts the mirror at stroke 0.4"), ({"pitch_rad": 0.5}, ""), ({"decentre_x_m": -0.05}, "")],
+)
+def test_a_board_in_the_way_of_the_true_rig_is_refused(values: dict[str, float], words: str) -> None:
+    """A board 0.3 m ahead at the height of the raised mirror is reached by a shift, not by a pitch of 0.13 m there."""
+    raw = changed(targets=[{"name": "a", "depth_m": 0.3, "azimuth_deg": 0.0, "height_m": 1.11}])
+    recipe = {**raw, "misalignment": values}
+    if words:
+        [line] = complaints(recipe)
+        assert line.startswith("targets[0].depth_m: ")
+        assert words in line
+    else:
+        check_recipe(recipe)
+
+
+def test_drawn_motions_keep_clear_of_boards_and_lamps() -> None:
+    targets = [{"name": "a", "depth_m": 0.5, "azimuth_deg": 0.0, "height_m": 1.4}]
+    raw = {
+        **drawing(misalignment={"shift_x_m": {"uniform": [-0.9, 0.9]}}, stroke_m={"choice": [0.6]}),
+        "targets": targets,
+    }
+    plan = make_plan(check_recipe(raw))
+    shifts = np.array([dict(pair.drawn)["misalignment.shift_x_m"] for pair in plan.pairs])
+    assert max(pair.tries for pair in plan.pairs) > 1
+    assert not np.any((shifts > 0.44) & (shifts < 0.58))  # the mirror, 0.06 m, through the board, 0.02 m
+    assert np.any(shifts > 0.58)
+    with pytest.raises(RecipeError, match="lamps"):
+        make_plan(check_recipe(drawing(misalignment={"shift_z_m": 1.0}, stroke_m={"uniform": [1.35, 1.4]})))
+
+
 # -- data sets -----------------------------------------------------------------------------------------------------
 
 
@@ -282,6 +316,18 @@ def test_a_data_set_says_what_is_true_and_what_is_believed(misaligned_dataset: P
         offset = np.array(sample.row.spot_world_m)[:2] - [0.0, 2e-3]
         assert sample.row.depth_m == pytest.approx(np.hypot(*offset), abs=1e-12)
         assert sample.row.up.sphere_centre_world_m == pytest.approx(sample.view("up").sphere_centre_m, abs=1e-12)
+
+
+def test_scores_are_those_of_who_believes_the_nominal_rig(misaligned_dataset: Path) -> None:
+    dataset = open_finished(misaligned_dataset)
+    exact = {s.sample_id: s for s in score(dataset) if (s.estimator, s.source, s.status) == ("exact", "truth", "ok")}
+    assert exact
+    for name, result in exact.items():
+        sample = dataset[name]
+        pixels = [np.array([spot.u_px, spot.v_px]) for spot in (sample.row.down, sample.row.up)]
+        nominal = depth_exact(sample.nominal_rig, sample.row.nominal_stroke_m, *pixels)
+        assert result.estimate_m == float(nominal.depth_m)
+        assert abs(result.relative_error) > 1e-3  # 0.6 degrees of tilt are seen
 
 
 def test_a_moved_view_is_the_view_of_a_rig_that_was_built_there(misaligned_dataset: Path) -> None:

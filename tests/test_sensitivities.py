@@ -16,6 +16,7 @@ from phibench.datasets.read import open_finished
 from phibench.estimator.cli import main
 from phibench.estimator.depth import paper_gradient
 from phibench.estimator.forward import ray_basis, seen_pixel
+from phibench.estimator.rig_errors import RIG_PARAMETERS, rig_gradient
 from phibench.estimator.score import ESTIMATORS
 from phibench.estimator.sensitivities import (
     PARAMETERS,
@@ -37,6 +38,7 @@ from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import POSITIONS, Rig, View
 
 Pixels = tuple[np.ndarray, np.ndarray]
+STILL = dict.fromkeys(("roll_rad", "pitch_rad", "yaw_rad", "shift_x_m", "shift_y_m", "shift_z_m"), 0.0)
 
 
 def seen_cases(seed: int, count: int) -> Iterator[Case]:
@@ -214,6 +216,37 @@ def test_the_error_is_estimate_minus_truth() -> None:
     assert found.truth_gradient[PARAMETERS.index("decentre_x_m")] == -1.0
 
 
+SAME = {
+    **{"axial_m": ("z_c_m", 1.0), "radius_m": ("radius_m", 1.0), "focal_relative": ("f_px", 1430.0)},
+    **{"stroke_offset_m": ("stroke_m", 1.0), "cx_px": ("cx_px", 1.0), "cy_px": ("cy_px", 1.0)},
+    **{name: (name, 1.0) for name in ("decentre_x_m", "decentre_y_m", "tilt_x_rad", "tilt_y_rad")},
+    **{name: (name, 1.0) for name in ("stroke_tilt_x_rad", "stroke_tilt_y_rad")},
+}
+"""Parameter, its name in `rig_errors`, and how many of its units are one of ours."""
+
+
+def test_accuracy_what_is_believed_and_what_is_true_cancel() -> None:
+    """An estimator that believes the truth finds D: dD/d(believed) + dD/d(true) = d(true D)/dp, whatever the rig.
+
+    `rig_errors` differentiates by differences, good to 1e-7, with the pixels as they are; here the pixels move.
+    """
+    checked = 0
+    for case in seen_cases(7, 10):
+        rig, h = case.nominal.perturbed(dataclasses.replace(case.misalignment, **STILL)), case.nominal_stroke_m
+        rig = dataclasses.replace(rig, camera=dataclasses.replace(rig.camera, fx_px=1430.0, fy_px=1430.0))
+        point = np.array(case.spot.position_world_m)
+        pixels = [seen_pixel(rig.at(offset), point) for offset in (0.0, h)]
+        found = sensitivity("exact", rig, h, rig, h, point)
+        believed = dict(zip(RIG_PARAMETERS, rig_gradient(rig, h, *pixels), strict=True))
+        true, truth = (dict(zip(PARAMETERS, g, strict=True)) for g in (found.estimate_gradient, found.truth_gradient))
+        if not math.isfinite(found.estimate_m):
+            continue
+        for name, (other, scale) in SAME.items():
+            assert scale * believed[other] + true[name] == pytest.approx(truth[name], abs=1e-6 * abs(true[name]) + 1e-7)
+        checked += 1
+    assert checked > 7
+
+
 def test_what_moves_no_chief_ray_is_left_out() -> None:
     rig, point = default_rig(), (2.0, 1.0, 0.5)
     spot = LaserSpot(point, (-1.0, -0.5, 0.0), 5e-3)
@@ -322,3 +355,11 @@ def test_a_folder_that_is_no_data_set(tmp_path: Path, capsys: pytest.CaptureFixt
     assert main(["sensitivities", str(tmp_path), "--out", str(tmp_path / "x.parquet")]) == 2
     assert capsys.readouterr().err.startswith("phibench: ")
     assert not (tmp_path / "x.parquet").exists()
+
+
+@pytest.mark.benchmark(group="sensitivities")
+def test_benchmark_sensitivity(benchmark) -> None:
+    """One sample, the exact estimator, all parameters. Target: <= 20 ms on one core."""
+    rig, point = default_rig(), np.array([2.0, 1.0, 0.5])
+    found = benchmark(sensitivity, "exact", rig, 0.5, rig, 0.5, point)
+    assert np.isfinite(found.estimate_gradient).all()
