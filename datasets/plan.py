@@ -174,7 +174,6 @@ def _random_plan(recipe: Recipe, table: RandomTable, rig: Rig, room: Room) -> Pl
     ids = {rig: RECIPE_RIG}
     for sample in samples:
         ids.setdefault(sample.rig, f"r{sample.number:06d}")
-    for sample in samples:
         ids.setdefault(sample.nominal_rig, f"n{sample.number:06d}")
     pairs = tuple(_random_pair(sample, ids[sample.rig], ids[sample.nominal_rig]) for sample in samples)
     used = {name for pair in pairs for name in (pair.rig, pair.nominal_rig)}

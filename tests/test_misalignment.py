@@ -258,6 +258,11 @@ def test_drawn_misalignments_are_rigs_beside_drawn_nominal_ones() -> None:
         assert pair.stroke_m == round(m.stroke_m(pair.nominal_stroke_m), 9)
         assert (pair.rig[0], pair.nominal_rig[0], pair.rig[1:]) == ("r", "n", pair.nominal_rig[1:])
     assert len({dict(pair.drawn)["misalignment.pitch_rad"] for pair in plan.pairs}) == 50
+    fewer = make_plan(
+        check_recipe({**drawn, "random": {**drawn["random"], "samples": 20}, "misalignment": {"yaw_rad": 0.01}})
+    )
+    assert list(fewer.rigs.items()) == list(plan.rigs.items())[: len(fewer.rigs)]
+    assert fewer.pairs == plan.pairs[:20]
     part = shard_plan(plan, "2/5")
     assert set(part.rigs) == {name for pair in part.pairs for name in (pair.rig, pair.nominal_rig)}
 
