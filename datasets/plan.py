@@ -9,14 +9,23 @@ from dataclasses import dataclass
 from phibench.datasets.errors import RecipeError
 from phibench.datasets.random_samples import RandomSample, draw_samples
 from phibench.datasets.recipe import RandomTable, Recipe
-from phibench.datasets.recipe_scene import build_rig, build_room, build_spot
+from phibench.datasets.recipe_scene import (
+    build_misalignment,
+    build_rig,
+    build_room,
+    build_spot,
+    true_stroke_m,
+)
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
 from phibench.scenes.room import Room
 from phibench.scenes.streams import seed_32
 
 RECIPE_RIG = "rig"
-"""Id of the rig of `[rig]`; a drawn one is called after the first sample that has it, such as ``r000042``."""
+"""Id of the rig of `[rig]`; a drawn one is called after the first sample that has it, such as ``r000042``, and one that
+no sample has but that an estimator believes in ``n000042``."""
+TRUE_RIG = "true"
+"""Id of the rig of `[rig]` with `[misalignment]`, for experiments."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +35,8 @@ class PosePlan:
     Attributes
     ----------
     pose_id : str
-        ``h`` and the carriage offset in metres, such as ``h0.425``; down is ``h0.000``. For a drawn rig, its id and a
-        hyphen come first: ``r000042-h0.425``.
+        ``h`` and the carriage offset in metres, such as ``h0.425``; down is ``h0.000``. For any rig but that of
+        `[rig]`, its id and a hyphen come first: ``r000042-h0.425``.
     offset_m : float
         Carriage offset along the stroke axis.
     seed : int
@@ -50,10 +59,12 @@ class PairPlan:
     ----------
     target : str
         Name of the target, or of what a ray met.
+    stroke_m, nominal_stroke_m : float
+        The true stroke, and the one that an estimator believes.
     spot : str
         Key of the spot in `Plan.spots`.
-    rig : str
-        Id of the rig.
+    rig, nominal_rig : str
+        Id of the true rig, and of the one that an estimator believes.
     drawn : tuple of (parameter, value)
         What was drawn; empty for an experiment.
     tries : int
@@ -64,8 +75,10 @@ class PairPlan:
     experiment: str
     target: str
     stroke_m: float
+    nominal_stroke_m: float
     spot: str
     rig: str = RECIPE_RIG
+    nominal_rig: str = RECIPE_RIG
     drawn: tuple[tuple[str, float | str], ...] = ()
     tries: int = 0
 
@@ -83,7 +96,7 @@ class Plan:
     rig : Rig
         That of `[rig]`: the light map takes its origin of coordinates from it. A sample's own is in `rigs`.
     rigs : dict
-        Rigs of the samples, by id.
+        True and nominal rigs of the samples, by id.
     spots : dict
         Laser spots of the samples, by `PairPlan.spot`: an experiment's by target, a drawn one by sample.
     poses : tuple of PosePlan
@@ -120,8 +133,19 @@ def make_plan(recipe: Recipe) -> Plan:
     rig, room = build_rig(recipe.rig), build_room(recipe.room, recipe.targets)
     if recipe.random is not None:
         return _random_plan(recipe, recipe.random, rig, room)
+    misalignment = build_misalignment(recipe.misalignment)
+    true_rig = rig.perturbed(misalignment)
+    true_id = RECIPE_RIG if true_rig == rig else TRUE_RIG
     pairs = tuple(
-        PairPlan(_sample_name(experiment.name, target, stroke_m), experiment.name, target, float(stroke_m), target)
+        PairPlan(
+            _sample_name(experiment.name, target, stroke_m),
+            experiment.name,
+            target,
+            true_stroke_m(misalignment, float(stroke_m)),
+            float(stroke_m),
+            target,
+            true_id,
+        )
         for experiment in recipe.experiments
         for target in experiment.targets
         for stroke_m in experiment.strokes_m
@@ -129,8 +153,8 @@ def make_plan(recipe: Recipe) -> Plan:
     used = {pair.target for pair in pairs}
     spots = {table.name: build_spot(recipe.laser, table) for table in recipe.targets if table.name in used}
     offsets = sorted({offset_m for _, offset_m in _offsets(pairs)})
-    poses = _poses(recipe, [(RECIPE_RIG, offset_m) for offset_m in offsets])
-    return Plan(recipe, rig, {RECIPE_RIG: rig}, room, spots, poses, pairs)
+    poses = _poses(recipe, [(true_id, offset_m) for offset_m in offsets])
+    return Plan(recipe, rig, {RECIPE_RIG: rig, true_id: true_rig}, room, spots, poses, pairs)
 
 
 def pose_name(offset_m: float) -> str:
@@ -150,16 +174,17 @@ def _random_plan(recipe: Recipe, table: RandomTable, rig: Rig, room: Room) -> Pl
     ids = {rig: RECIPE_RIG}
     for sample in samples:
         ids.setdefault(sample.rig, f"r{sample.number:06d}")
-    pairs = tuple(_random_pair(sample, ids[sample.rig]) for sample in samples)
-    used = {pair.rig for pair in pairs}
+        ids.setdefault(sample.nominal_rig, f"n{sample.number:06d}")
+    pairs = tuple(_random_pair(sample, ids[sample.rig], ids[sample.nominal_rig]) for sample in samples)
+    used = {name for pair in pairs for name in (pair.rig, pair.nominal_rig)}
     rigs = {name: one for one, name in ids.items() if name in used}
     spots = {pair.spot: sample.spot for pair, sample in zip(pairs, samples, strict=True)}
     return Plan(recipe, rig, rigs, room, spots, _poses(recipe, dict.fromkeys(_offsets(pairs))), pairs)
 
 
-def _random_pair(sample: RandomSample, rig: str) -> PairPlan:
-    name = f"random-{sample.number:06d}"
-    return PairPlan(name, "random", sample.surface, sample.stroke_m, name, rig, sample.drawn, sample.tries)
+def _random_pair(sample: RandomSample, rig: str, nominal_rig: str) -> PairPlan:
+    name, strokes_m = f"random-{sample.number:06d}", (sample.stroke_m, sample.nominal_stroke_m)
+    return PairPlan(name, "random", sample.surface, *strokes_m, name, rig, nominal_rig, sample.drawn, sample.tries)
 
 
 def _sample_name(experiment: str, target: str, stroke_m: float) -> str:

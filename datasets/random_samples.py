@@ -16,18 +16,22 @@ from phibench.datasets.distribution import DistributionTable, pick, quantile
 from phibench.datasets.errors import RecipeError
 from phibench.datasets.random_spot import Placed, place
 from phibench.datasets.recipe import RandomTable, Recipe, RigTable
+from phibench.datasets.recipe_misalignment import MisalignmentTable
 from phibench.datasets.recipe_places import Boards
-from phibench.datasets.recipe_scene import build_rig, build_target, ceiling_m
+from phibench.datasets.recipe_scene import build_misalignment, build_rig, build_target, ceiling_m, true_stroke_m
 from phibench.datasets.sampling import PARAMETERS, first_points, further_points
 from phibench.scenes.checks import SceneError
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
+from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
 
 TRIES = 100
 _PILOT = 8  # samples
 _NANOMETRE = 9  # decimals of a stroke: a pose's name then says its offset exactly
+
+_PREFIX = "misalignment."
 
 Value = float | str
 
@@ -46,6 +50,10 @@ class RandomSample:
         In the order of `sampling.PARAMETERS`.
     surface : str
         Name of the target, or of what carries the spot.
+    rig, stroke_m
+        The true ones.
+    nominal_rig, nominal_stroke_m
+        Those that an estimator believes.
     """
 
     number: int
@@ -55,6 +63,8 @@ class RandomSample:
     surface: str
     spot: LaserSpot
     stroke_m: float
+    nominal_rig: Rig
+    nominal_stroke_m: float
 
 
 def draw_samples(recipe: Recipe, table: RandomTable, room: Room) -> tuple[RandomSample, ...]:
@@ -78,6 +88,12 @@ def rig_table(table: RigTable, values: Mapping[str, Value]) -> RigTable:
     return table.model_copy(update=drawn)
 
 
+def drawn_misalignment(table: MisalignmentTable, values: Mapping[str, Value]) -> Misalignment:
+    """Misalignment with drawn numbers, by parameter, in place of those of `[misalignment]`."""
+    drawn = {key.removeprefix(_PREFIX): value for key, value in values.items() if key.startswith(_PREFIX)}
+    return build_misalignment(table.model_copy(update=drawn))
+
+
 class _Makers:
     """What all draws of a recipe share."""
 
@@ -87,7 +103,7 @@ class _Makers:
         self._boards = Boards([build_target(target) for target in recipe.targets])
         self._ceiling_m = ceiling_m(room)
         dataset = recipe.dataset
-        self._first = first_points(table.sequence, dataset.name, dataset.seed, table.samples)
+        self._first = first_points(table.sequence, dataset.name, dataset.seed, table.samples, drawn_parameters(table))
 
     def draw(self, numbers: range) -> list[RandomSample]:
         """Draw some samples, those that are impossible again until they are not."""
@@ -125,18 +141,23 @@ class _Makers:
         if isinstance(placed, str):
             return placed
         values = dict(drawn)
-        stroke_m = float(values["stroke_m"])
+        nominal_stroke_m = float(values["stroke_m"])
         try:
-            rig = build_rig(rig_table(self._recipe.rig, values))
+            nominal_rig = build_rig(rig_table(self._recipe.rig, values))
+            misalignment = drawn_misalignment(self._recipe.misalignment, values)
+            rig, stroke_m = nominal_rig.perturbed(misalignment), true_stroke_m(misalignment, nominal_stroke_m)
         except SceneError as error:
             return str(error)
         if fault := self._rig_fault(rig, stroke_m):
             return fault
-        return RandomSample(number, tries, drawn, rig, placed[0], placed[1], stroke_m)
+        return RandomSample(number, tries, drawn, rig, *placed, stroke_m, nominal_rig, nominal_stroke_m)
 
     def _rig_fault(self, rig: Rig, stroke_m: float) -> str | None:
         sphere_m = rig.T_world_camera.points(rig.sphere_in_camera_m)  # `rig.at` takes ten times as long
-        top_m = sphere_m[2] + stroke_m * rig.stroke_axis_world[2] + rig.mirror.radius_m
+        if rig.motion is None:
+            top_m = sphere_m[2] + stroke_m * rig.stroke_axis_world[2] + rig.mirror.radius_m
+        else:
+            top_m = rig.at(stroke_m).sphere_centre_m[2] + rig.mirror.radius_m
         if top_m >= self._ceiling_m:
             return f"the mirror's top at {top_m:.3f} m is above the ceiling's lamps at {self._ceiling_m:.2f} m"
         return self._boards.cut_by(rig, stroke_m)
@@ -162,7 +183,7 @@ def draw_values(table: RandomTable, targets: list[str], points: Mapping[str, Arr
 def _distributions(table: RandomTable) -> Iterator[tuple[str, DistributionTable]]:
     """Parameter and distribution of every number that is drawn."""
     yield "stroke_m", table.stroke_m
-    for prefix, group in (("rig", table.rig), ("spot", table.spot)):
+    for prefix, group in (("rig", table.rig), ("spot", table.spot), ("misalignment", table.misalignment)):
         for key in type(group).model_fields:
             if isinstance(value := getattr(group, key), DistributionTable):
                 yield f"{prefix}.{key}", value

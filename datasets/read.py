@@ -61,16 +61,17 @@ class Dataset:
 
     @property
     def rig(self) -> Rig:
-        """The rig of all samples, where they share one.
+        """The true rig of all samples, where they share one.
 
         Raises
         ------
         DatasetError
             If there are several.
         """
-        if len(self.rigs) != 1:
-            raise DatasetError(f"{self.folder} has {len(self.rigs)} rigs; take each sample's own, `sample.rig`")
-        return self.rigs[next(iter(self.rigs.documents))]
+        names = {row.rig for row in self.rows}
+        if len(names) != 1:
+            raise DatasetError(f"{self.folder} has {len(names)} rigs; take each sample's own, `sample.rig`")
+        return self.rigs[names.pop()]
 
     @cached_property
     def recipe(self) -> Recipe:
@@ -105,8 +106,13 @@ class Sample:
 
     @property
     def rig(self) -> Rig:
-        """The sample's rig."""
+        """The sample's true rig."""
         return self.dataset.rigs[self.row.rig]
+
+    @property
+    def nominal_rig(self) -> Rig:
+        """The rig that an estimator believes, with `row.nominal_stroke_m`; the true one where nothing is misaligned."""
+        return self.dataset.rigs[self.row.nominal_rig]
 
     def view(self, position: str) -> View:
         """Rig at that position."""

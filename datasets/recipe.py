@@ -12,6 +12,7 @@ from pydantic import Field, create_model
 
 from phibench.datasets.distribution import Distribution, Name, Targets
 from phibench.datasets.recipe_frames import DistractorTable, FramesTable
+from phibench.datasets.recipe_misalignment import MisalignmentTable, RandomMisalignmentTable
 from phibench.datasets.recipe_table import Table
 
 MIN_STROKE_M, MAX_STROKE_M = 1e-3, 10.0
@@ -190,6 +191,9 @@ class RandomTable(Table):
     )
     stroke_m: Distribution = Field(description="distribution of the stroke; drawn ones are rounded to 1 nm")
     rig: RandomRigTable = Field(default=RandomRigTable(), description="distributions of keys of [rig]")
+    misalignment: RandomMisalignmentTable = Field(
+        default=RandomMisalignmentTable(), description="distributions of keys of [misalignment]"
+    )
     spot: RandomSpotTable = Field(default=RandomSpotTable(), description="distribution of the laser spot")
 
 
@@ -197,7 +201,8 @@ class Recipe(Table):
     """A whole recipe: `[[experiments]]` or `[random]` says what is seen."""
 
     dataset: DatasetTable = Field(description="name and seed")
-    rig: RigTable = Field(default=RigTable(), description="camera, mirror and stroke axis")
+    rig: RigTable = Field(default=RigTable(), description="camera, mirror and stroke axis, as the estimator knows them")
+    misalignment: MisalignmentTable = Field(default=MisalignmentTable(), description="what the true rig deviates by")
     room: RoomTable = Field(default=RoomTable(), description="the room")
     laser: LaserTable = Field(default=LaserTable(), description="the laser")
     ambient: AmbientTable = Field(default=AmbientTable(), description="quality of the ambient layer")

@@ -12,13 +12,24 @@ from pydantic import ValidationError
 
 from phibench.datasets.recipe import MAX_STROKE_M, AmbientTable, LaserTable, Recipe, RigTable, RoomTable, TargetTable
 from phibench.datasets.recipe_frames_checks import distractor_faults, frames_faults
+from phibench.datasets.recipe_misalignment import MisalignmentTable
 from phibench.datasets.recipe_places import boards_in_the_way, spots_on_boards
 from phibench.datasets.recipe_random_checks import purpose_faults, random_faults
-from phibench.datasets.recipe_scene import build_rig, build_room, build_spot, build_target, ceiling_m
+from phibench.datasets.recipe_scene import (
+    build_misalignment,
+    build_rig,
+    build_room,
+    build_spot,
+    build_target,
+    build_true_rig,
+    ceiling_m,
+    true_stroke_m,
+)
 from phibench.datasets.recipe_table import Table
 from phibench.render.film_grid import FilmGrid
 from phibench.render.model_faults import Fault
 from phibench.scenes.checks import SceneError
+from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.names import nearest
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
@@ -52,7 +63,7 @@ def semantic_faults(raw: Raw) -> list[Fault]:
 def warnings(recipe: Recipe) -> list[str]:
     """What is legal but probably not meant."""
     result = []
-    if not build_rig(recipe.rig).fits_image():
+    if not build_true_rig(recipe).fits_image():
         result.append("rig: the mirror's outline does not fit the image; spots near its rim may fall outside")
     used = _used_targets(recipe)
     unused = [target.name for target in recipe.targets if target.name not in used]
@@ -175,9 +186,18 @@ def _rig(raw: Raw, experiments: list[tuple[int, Raw]], targets: list[tuple[int, 
         yield Fault("rig", str(error))
         return
     yield from _cells(rig, _sound(raw.get("ambient", {}), AmbientTable))
-    yield from boards_in_the_way(rig, _legal_strokes(experiments), targets)
+    misalignment = _sound(raw.get("misalignment", {}), MisalignmentTable)
+    if misalignment is None:
+        return
+    try:
+        deviation = build_misalignment(misalignment)
+        rig, strokes_m = rig.perturbed(deviation), [true_stroke_m(deviation, h) for h in _legal_strokes(experiments)]
+    except SceneError as error:
+        yield Fault("misalignment", str(error))
+        return
+    yield from boards_in_the_way(rig, strokes_m, targets)
     if room_table is not None:
-        yield from _strokes(rig, build_room(room_table, ()), experiments)
+        yield from _strokes(rig, deviation, build_room(room_table, ()), experiments)
 
 
 def _cells(rig: Rig, ambient: AmbientTable | None) -> Iterator[Fault]:
@@ -187,14 +207,14 @@ def _cells(rig: Rig, ambient: AmbientTable | None) -> Iterator[Fault]:
         yield Fault("ambient.cells_per_pixel", str(error))
 
 
-def _strokes(rig: Rig, room: Room, experiments: list[tuple[int, Raw]]) -> Iterator[Fault]:
+def _strokes(rig: Rig, misalignment: Misalignment, room: Room, experiments: list[tuple[int, Raw]]) -> Iterator[Fault]:
     """The mirror must stay below the lowest thing that hangs from the ceiling."""
     limit_m = ceiling_m(room)
     for i, experiment in experiments:
         for j, stroke_m in _items(experiment, "strokes_m"):
             if not _is_legal(stroke_m):
                 continue  # a structural fault
-            top_m = rig.at(stroke_m).sphere_centre_m[2] + rig.mirror.radius_m
+            top_m = rig.at(true_stroke_m(misalignment, stroke_m)).sphere_centre_m[2] + rig.mirror.radius_m
             if top_m >= limit_m:
                 longest_m = stroke_m - (top_m - limit_m)
                 text = f"{stroke_m} lifts the mirror's top to {top_m:.3f} m, through the ceiling at {limit_m:.2f} m"

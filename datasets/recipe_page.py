@@ -25,6 +25,7 @@ from phibench.datasets.recipe import (
     TargetTable,
 )
 from phibench.datasets.recipe_frames import DistractorTable, FramesTable
+from phibench.datasets.recipe_misalignment import MisalignmentTable, RandomMisalignmentTable
 from phibench.datasets.recipe_scene import CAMERA_KEYS
 from phibench.render.model_faults import allowed, schema_node
 from phibench.scenes.catalog import RIGS
@@ -33,6 +34,7 @@ from phibench.scenes.rig import Rig
 TABLES: dict[str, type[BaseModel]] = {
     "[dataset]": DatasetTable,
     "[rig]": RigTable,
+    "[misalignment]": MisalignmentTable,
     "[room]": RoomTable,
     "[laser]": LaserTable,
     "[ambient]": AmbientTable,
@@ -40,6 +42,7 @@ TABLES: dict[str, type[BaseModel]] = {
     "[[experiments]]": ExperimentTable,
     "[random]": RandomTable,
     "[random.rig]": RandomRigTable,
+    "[random.misalignment]": RandomMisalignmentTable,
     "[random.spot]": RandomSpotTable,
     "[frames]": FramesTable,
     "[[distractors]]": DistractorTable,
@@ -72,6 +75,11 @@ follows `z_c_m` and `radius_m` (z_c - R/2, on the virtual image), `cx_px` follow
 `width_px`, and `cy_px` follows `height_px` (the image centre), where those are given.
 `z_c_m` must exceed `radius_m`.
 """,
+    "[misalignment]": """What the true rig deviates by from `[rig]`, which then is the nominal one: what an estimator
+believes. Images and truth are those of the true rig. Signs, axes and figures: `docs/misalignment.md`.
+Motions between the images hold at every carriage position but down. The light of the room stays
+that of the nominal rig, and the robot's body where it is.
+""",
     "[laser]": """A spot's diameter is `diameter_m`, or else `diameter_base_m` + `diameter_growth_m_per_m` x
 `depth_m` of its target. For a Gaussian profile that is 4 sigma (the 1/e^2 diameter).
 """,
@@ -100,6 +108,9 @@ not depend on which others are there.
 not drawn is as in `[rig]`, which must be a possible rig itself. A drawn `fx_px` is `fy_px` too
 (square pixels) unless `fy_px` is drawn or set in `[rig]`.
 """,
+    "[random.misalignment]": """Any key of `[misalignment]`, within its range, in place of the value there. The rig
+that `[random.rig]` gives is the nominal one.
+""",
     "[random.spot]": """Either on a board: `target`, `across_m`, `up_m`; a Gaussian spot needs 4 sigma (its diameter) to
 every edge, a uniform one its radius. The boards themselves stand still: all samples share the
 light of the room. Or by a ray: `azimuth_deg` and `height_m`. The spot is then where a horizontal
@@ -126,6 +137,12 @@ strongest light that goes out with the laser.
 `{ normal = [639.5, 15.0], clip = [590.0, 690.0] }`. A normal distribution is truncated at
 `clip`: nothing piles up there.
 """,
+}
+_ABSENT: dict[type[BaseModel], str] = {
+    RigTable: "as preset",
+    RandomRigTable: "as in [rig]",
+    RandomMisalignmentTable: "as in [misalignment]",
+    FramesTable: "as preset",
 }
 
 
@@ -188,12 +205,7 @@ def _default(field: Any, model: type[BaseModel]) -> str:
     if field.is_required():
         return "must be given"
     if field.default is None:
-        by_model: dict[type[BaseModel], str] = {
-            RigTable: "as preset",
-            RandomRigTable: "as in [rig]",
-            FramesTable: "as preset",
-        }
-        return by_model.get(model, "none")
+        return _ABSENT.get(model, "none")
     if isinstance(field.default, DistributionTable):
         return _distribution(field.default)
     return "see below" if isinstance(field.default, BaseModel) else _shown(field.default)

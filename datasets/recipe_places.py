@@ -53,6 +53,8 @@ class Boards:
         lens_m = rig.T_world_camera.t
         reach_m = float(np.linalg.norm(rig.sphere_in_camera_m[:2])) + rig.mirror.radius_m + _HOUSING_REACH_M
         reach_m += abs(stroke_m) * math.hypot(*rig.stroke_axis_world[:2]) + rig.sphere_in_camera_m[2] * _tilt(rig)
+        if rig.motion is not None:  # at most: the sphere swings about the lens as far as it is from it, twice
+            reach_m += math.hypot(*rig.motion.translation_m) + 2.0 * float(np.linalg.norm(rig.sphere_in_camera_m))
         near = np.hypot(*(self._centres_m - lens_m)[:, :2].T) < reach_m + math.hypot(*BOARD_SIZE_M)
         for k in np.flatnonzero(near):
             for offset_m in (0.0, stroke_m):

@@ -17,7 +17,9 @@ from phibench.datasets.recipe import (
     StrokeM,
     TargetTable,
 )
+from phibench.datasets.recipe_misalignment import MisalignmentTable
 from phibench.datasets.recipe_scene import build_room, ceiling_m
+from phibench.datasets.recipe_table import Table
 from phibench.render.model_faults import Fault, allowed, schema_node
 from phibench.scenes.names import close_names, nearest
 
@@ -44,12 +46,16 @@ def random_faults(
     if not isinstance(table, dict):
         return
     yield from number_faults("random.stroke_m", table.get("stroke_m"), _stroke_range)
-    rig, spot = (_table(table.get(key)) for key in ("rig", "spot"))
+    rig, spot, misalignment = (_table(table.get(key)) for key in ("rig", "spot", "misalignment"))
     for key, given in rig.items():
         if key in DRAWABLE:
-            yield from number_faults(f"random.rig.{key}", given, lambda value, key=key: _rig_range(key, value))
+            yield from number_faults(f"random.rig.{key}", given, lambda value, key=key: _range(RigTable, key, value))
         elif key in RigTable.model_fields:
             yield _not_drawable(key)
+    for key, given in misalignment.items():
+        if key in MisalignmentTable.model_fields:
+            path = f"random.misalignment.{key}"
+            yield from number_faults(path, given, lambda value, key=key: _range(MisalignmentTable, key, value))
     for key in ("across_m", "up_m", "azimuth_deg", "height_m"):
         if key in spot:
             yield from number_faults(f"random.spot.{key}", spot[key], None)
@@ -93,11 +99,11 @@ def number_faults(path: str, given: object, in_range: Any) -> Iterator[Fault]:
             yield Fault(path, f"reaches {value:g}, which is not allowed; stay with {words}")
 
 
-def _rig_range(key: str, value: float) -> str | None:
+def _range(table: type[Table], key: str, value: float) -> str | None:
     try:
-        RigTable.model_validate({key: value})
+        table.model_validate({key: value})
     except ValidationError:
-        return allowed(schema_node(RigTable.model_json_schema(), (key,)))
+        return allowed(schema_node(table.model_json_schema(), (key,)))
     return None
 
 

@@ -8,13 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from phibench.datasets.recipe import LaserTable, RigTable, RoomTable, TargetTable
+from phibench.datasets.recipe import LaserTable, Recipe, RigTable, RoomTable, TargetTable
+from phibench.datasets.recipe_misalignment import MisalignmentTable
 from phibench.scenes.camera import Camera
 from phibench.scenes.catalog import RIGS, ROOMS, Target
 from phibench.scenes.checks import SceneError
 from phibench.scenes.frames import Pose, Vector, as_vector, rotation_xyz
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import SphereMirror
+from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
 
@@ -22,6 +24,8 @@ CAMERA_KEYS = (
     *("width_px", "height_px", "pixel_pitch_um", "fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "p1", "p2"),
     *("f_number", "focus_distance_m", "blur_sigma_px"),
 )
+
+_NANOMETRE = 9  # decimals
 
 
 def build_rig(table: RigTable) -> Rig:
@@ -42,6 +46,28 @@ def build_rig(table: RigTable) -> Rig:
     stroke = np.array(rotation_xyz(table.stroke_tilt_x_rad, table.stroke_tilt_y_rad)) @ np.array([0.0, 0.0, 1.0])
     camera = _camera(base.camera, table, z_c_m, mirror)
     return Rig(camera, mirror, T_world_camera, T_camera_sphere, as_vector(stroke))
+
+
+def build_misalignment(table: MisalignmentTable) -> Misalignment:
+    """Deviations of the true rig from the nominal one."""
+    return Misalignment(**table.model_dump())
+
+
+def build_true_rig(recipe: Recipe) -> Rig:
+    """True rig of a recipe without drawn numbers; raises `SceneError` as `build_rig`."""
+    return build_rig(recipe.rig).perturbed(build_misalignment(recipe.misalignment))
+
+
+def true_stroke_m(misalignment: Misalignment, nominal_stroke_m: float) -> float:
+    """True stroke, to the nanometre where it is not the nominal one: a pose's name then says its offset exactly.
+
+    Raises
+    ------
+    SceneError
+        If it is not above 0.
+    """
+    true_m = misalignment.stroke_m(nominal_stroke_m)
+    return true_m if true_m == nominal_stroke_m else round(true_m, _NANOMETRE)
 
 
 def build_target(table: TargetTable) -> Target:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, model_validator
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 Position = Literal["down", "up"]
 
 
@@ -104,9 +104,11 @@ class ManifestRow(Document):
     sample_id: str = _field("-", "<experiment>-<target>-h<stroke>, or random-<number> for a drawn sample")
     experiment: str = _field("-", "name of the experiment in the recipe, or 'random'")
     target: str = _field("-", "name of the target in the recipe, or of what carries the spot")
-    rig: str = _field("-", "id of the rig, in `rigs.jsonl`")
+    rig: str = _field("-", "id of the true rig, in `rigs.jsonl`")
+    nominal_rig: str = _field("-", "id of the rig that an estimator believes, in `rigs.jsonl`")
     depth_m: float = _field("m", "D: horizontal distance of the spot from the vertical through the sphere centre, down")
-    stroke_m: float = _field("m", "stroke (baseline) h")
+    stroke_m: float = _field("m", "stroke (baseline) h, the true one")
+    nominal_stroke_m: float = _field("m", "stroke that an estimator believes")
     spot_world_m: Vector3 = _field("m", "centre of the laser spot")
     spot_normal_world: Vector3 = _field("1", "unit normal of the wall at the spot")
     spot_diameter_m: float = _field("m", "diameter of the spot: 4 sigma if gaussian, of the disc if uniform")
@@ -133,7 +135,7 @@ class PoseInfo(Document):
 class RigInfo(Document):
     """One rig: one line of `rigs.jsonl`."""
 
-    rig: str = _field("-", "id: `rig` is that of the recipe's `[rig]`, a drawn one is called after its first sample")
+    rig: str = _field("-", "id: `rig` is that of the recipe's `[rig]`, others are called after their first sample")
     resolved: dict[str, Any] = _field("-", "the rig, field by field")
 
 

@@ -29,7 +29,7 @@ def shard_plan(plan: Plan, shard: str | None) -> Plan:
         raise DatasetError(f"shard {shard} is empty: there are {len(plan.pairs)} samples; use at most as many shards")
     pairs = plan.pairs[first:end]
     poses, spots = {pair.pose_id(p) for pair in pairs for p in POSITIONS}, {pair.spot for pair in pairs}
-    rigs = {pair.rig for pair in pairs}
+    rigs = {name for pair in pairs for name in (pair.rig, pair.nominal_rig)}
     return replace(
         plan,
         rigs={name: rig for name, rig in plan.rigs.items() if name in rigs},

@@ -36,6 +36,11 @@ class TakenSample:
         return self.sample.rig
 
     @property
+    def nominal_rig(self) -> Rig:
+        """The rig that the user believes in."""
+        return self.sample.nominal_rig
+
+    @property
     def laser_spot(self) -> LaserSpot:
         """The laser spot."""
         return self.sample.laser_spot

@@ -40,7 +40,8 @@ def plan_faults(dataset: Dataset) -> Iterator[str]:
 def _row_faults(plan: Plan, pair: PairPlan, row: ManifestRow) -> Iterator[str]:
     spot = plan.spots[pair.spot]
     expected = {
-        **{name: getattr(pair, name) for name in ("experiment", "target", "rig", "stroke_m", "tries")},
+        **{name: getattr(pair, name) for name in ("experiment", "target", "rig", "nominal_rig", "tries")},
+        **{name: getattr(pair, name) for name in ("stroke_m", "nominal_stroke_m")},
         "drawn": dict(pair.drawn),
         "spot_world_m": spot.position_world_m,
         "spot_normal_world": spot.normal_world,

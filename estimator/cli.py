@@ -15,6 +15,7 @@ from cyclopts import App, CycloptsError
 from phibench.estimator import cli_methods
 from phibench.estimator.cli_bench import bench
 from phibench.estimator.cli_dataset import dataset
+from phibench.estimator.cli_misalignment import sensitivities
 from phibench.estimator.cli_score import compare, report, score
 from phibench.estimator.cli_sealed import register as register_sealed
 
@@ -31,6 +32,7 @@ app.command(compare)
 app.command(report)
 app.command(bench)
 register_sealed(app, dataset)
+app.command(sensitivities)
 
 
 @app.command

@@ -88,6 +88,14 @@ def depth_approx(
     return DepthEstimate(keep(D, status), keep(sigma, status), status)
 
 
+def paper_gradient(phi1_rad: ArrayLike, phi2_rad: ArrayLike, stroke_m: ArrayLike, radius_m: float) -> Array:
+    """dD/d(phi1, phi2) of eq. (4), shape (..., 2), metres per radian, analytic; of eq. (5) for radius 0."""
+    phi1, phi2, h = _inputs(phi1_rad, phi2_rad, stroke_m)
+    with np.errstate(all="ignore"):
+        a, D = _angles(phi1, phi2), depth_paper(phi1, phi2, h, radius_m).depth_m
+        return _paper_gradient(a, D, h, radius_m * (a.c2 - a.c1), radius_m)
+
+
 def error_eq6(depth_m: ArrayLike, phi1_rad: ArrayLike, phi2_rad: ArrayLike, stroke_m: ArrayLike) -> Array:
     """|dD/d disparity|, metres per radian, by eq. (6) corrected: D / (h s) sqrt(D^2 - (h s)^2).
 

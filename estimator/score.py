@@ -36,8 +36,8 @@ class Sample(Protocol):
         """Manifest row."""
 
     @property
-    def rig(self) -> Rig:
-        """The sample's rig, at the down position."""
+    def nominal_rig(self) -> Rig:
+        """The rig that an estimator believes, at the down position."""
 
     def frame(self, position: str, laser: bool = True) -> Array:
         """Noise-free frame, shape (3, H, W), electrons per second."""
@@ -128,7 +128,7 @@ def score(dataset: Dataset) -> tuple[Score, ...]:
         Every sample appears for every estimator and source; what cannot be estimated carries its cause.
     """
     return tuple(
-        _score_one(sample.rig, sample.row, name, source, pixels)
+        _score_one(sample.nominal_rig, sample.row, name, source, pixels)
         for sample in dataset.samples
         for source in SOURCES
         for pixels in (_pixels(sample, source),)
@@ -200,9 +200,9 @@ def _pixels(sample: Sample, source: str) -> _Pixels:
 
 
 def _score_one(rig: Rig, row: Any, name: str, source: str, pixels: _Pixels) -> Score:
-    estimate = ESTIMATORS[name](rig, row.stroke_m, pixels.down, pixels.up)
+    estimate = ESTIMATORS[name](rig, row.nominal_stroke_m, pixels.down, pixels.up)
     depth = float(estimate.depth_m)
-    published = find_published(row.experiment, row.depth_m, row.stroke_m)
+    published = find_published(row.experiment, row.depth_m, row.nominal_stroke_m)
     return Score(
         sample_id=row.sample_id,
         experiment=row.experiment,

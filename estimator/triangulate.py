@@ -64,6 +64,7 @@ def depth_exact(
     Parameters
     ----------
     rig : Rig
+        One for both images, the one that is believed: a motion between them (`rig.motion`) is not used.
     stroke_m : shape (...), h
     uv_down_px, uv_up_px : shape (..., 2), pixels
     covariance_down_px2, covariance_up_px2 : shape (..., 2, 2), of (u, v), independent of each other, both or none
@@ -73,22 +74,16 @@ def depth_exact(
     PointEstimate
         sigma by the analytic derivatives of the point. The midpoint is the least-squares point for equal weights.
     """
-    rays = _rays(rig, stroke_m, uv_down_px, uv_up_px)
+    D, gradient, X, gap, status = _midpoint(rig, stroke_m, uv_down_px, uv_up_px)
     with np.errstate(all="ignore"):
-        w = rays.P2 - rays.P1
-        n = np.cross(rays.r1, rays.r2)
-        nn = np.sum(n * n, axis=-1)
-        t1, t2 = (np.sum(np.cross(w, r) * n, axis=-1) / nn for r in (rays.r2, rays.r1))
-        X = 0.5 * (rays.P1 + t1[..., None] * rays.r1 + rays.P2 + t2[..., None] * rays.r2)
-        gap = np.abs(np.sum(w * n, axis=-1)) / np.sqrt(nn)
-        radial = X[..., :2] - rig.at(0.0).sphere_centre_m[:2]
-        D = np.hypot(radial[..., 0], radial[..., 1])
-        dX = _midpoint_tangent(rays, w, n, nn, t1, t2)
-        gradient = np.sum(dX[..., :2] * radial[..., None, :], axis=-1) / D[..., None]
-        meet = flag((nn < PARALLEL_SINE**2, Status.PARALLEL), (~((t1 > 0.0) & (t2 > 0.0)), Status.DIVERGING))
-        status = first_fault(rays.status, meet)
         sigma = propagate(gradient, _joint_covariance(covariance_down_px2, covariance_up_px2))
     return PointEstimate(keep(D, status), keep(sigma, status), status, keep(X, status), keep(gap, status))
+
+
+def exact_gradient(rig: Rig, stroke_m: ArrayLike, uv_down_px: Array, uv_up_px: Array) -> Array:
+    """dD/d(u1, v1, u2, v2) of `depth_exact`, shape (..., 4), metres per pixel, analytic; NaN where D is."""
+    _, gradient, _, _, status = _midpoint(rig, stroke_m, uv_down_px, uv_up_px)
+    return keep(gradient, status)
 
 
 def depth_in_plane(
@@ -120,6 +115,26 @@ def depth_in_plane(
         status = first_fault(rays.status, meet)
         sigma = propagate(gradient, _joint_covariance(covariance_down_px2, covariance_up_px2))
     return DepthEstimate(keep(D, status), keep(sigma, status), status)
+
+
+def _midpoint(
+    rig: Rig, stroke_m: ArrayLike, uv_down_px: Array, uv_up_px: Array
+) -> tuple[Array, Array, Array, Array, StatusArray]:
+    """D, its gradient by the pixels, the midpoint, the gap, and the status."""
+    rays = _rays(rig, stroke_m, uv_down_px, uv_up_px)
+    with np.errstate(all="ignore"):
+        w = rays.P2 - rays.P1
+        n = np.cross(rays.r1, rays.r2)
+        nn = np.sum(n * n, axis=-1)
+        t1, t2 = (np.sum(np.cross(w, r) * n, axis=-1) / nn for r in (rays.r2, rays.r1))
+        X = 0.5 * (rays.P1 + t1[..., None] * rays.r1 + rays.P2 + t2[..., None] * rays.r2)
+        gap = np.abs(np.sum(w * n, axis=-1)) / np.sqrt(nn)
+        radial = X[..., :2] - rig.at(0.0).sphere_centre_m[:2]
+        D = np.hypot(radial[..., 0], radial[..., 1])
+        dX = _midpoint_tangent(rays, w, n, nn, t1, t2)
+        gradient = np.sum(dX[..., :2] * radial[..., None, :], axis=-1) / D[..., None]
+        meet = flag((nn < PARALLEL_SINE**2, Status.PARALLEL), (~((t1 > 0.0) & (t2 > 0.0)), Status.DIVERGING))
+    return D, gradient, X, gap, first_fault(rays.status, meet)
 
 
 def _meet_in_plane(rays: _Rays, centre: Array) -> tuple[Array, Array, Array, Array]:

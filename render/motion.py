@@ -13,6 +13,7 @@ once is taken as zero: below 1e-3 of the peak for a blur of 0.7 px (measured 4e-
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,9 @@ _MAX_MOTION_PX = 200
 
 def spot_velocity_px_per_s(view: View, spot: LaserSpot, carriage_m_per_s: float) -> tuple[float, float]:
     """Velocity (u, v) of the spot's image while the carriage moves along the stroke axis, pixels per second."""
-    before, after = (spot_truth(view.rig.at(view.offset_m + step), spot, ()) for step in (-_STEP_M, _STEP_M))
+    # the rig's motion between the images is none of the carriage's: the view keeps what it has of it
+    nearby = (replace(view, offset_m=view.offset_m + step) for step in (-_STEP_M, _STEP_M))
+    before, after = (spot_truth(each, spot, ()) for each in nearby)
     scale = carriage_m_per_s / (2.0 * _STEP_M)
     return (after.u_px - before.u_px) * scale, (after.v_px - before.v_px) * scale
 

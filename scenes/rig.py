@@ -12,6 +12,8 @@ from phibench.scenes.camera import Camera
 from phibench.scenes.checks import SceneError, finite, positive, unit_vector
 from phibench.scenes.frames import Array, Pose, Vector, as_vector
 from phibench.scenes.mirror import SphereMirror
+from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.motion import Motion
 
 POSITIONS = ("down", "up")  # stroke positions 1 and 2 of the paper
 
@@ -43,6 +45,8 @@ class Rig:
         Mirror pose in the camera frame; aligned optics have the translation (0, 0, z_c).
     stroke_axis_world : 3 floats
         Direction of the stroke, made a unit vector.
+    motion : Motion or None
+        What else moves the rig between the two images: it holds at every carriage position but down.
     """
 
     camera: Camera = field(default_factory=Camera)
@@ -50,6 +54,7 @@ class Rig:
     T_world_camera: Pose = Pose("world", "camera", (0.0, 0.0, 0.45))
     T_camera_sphere: Pose = Pose("camera", "sphere", (0.0, 0.0, 0.26))
     stroke_axis_world: Vector = (0.0, 0.0, 1.0)
+    motion: Motion | None = None
 
     def __post_init__(self) -> None:
         axis = unit_vector("Rig", "stroke_axis_world", self.stroke_axis_world)
@@ -73,7 +78,29 @@ class Rig:
     def at(self, offset_m: float) -> View:
         """Return the rig with its carriage moved by `offset_m` along the stroke axis."""
         finite("Rig", "offset_m", offset_m)
-        return View(self, float(offset_m))
+        return View(self, float(offset_m), None if offset_m == 0.0 else self.motion)
+
+    def perturbed(self, misalignment: Misalignment) -> Rig:
+        """Return the true rig where this is the nominal one.
+
+        The true stroke is `misalignment.stroke_m(nominal)`: strokes are no part of a rig.
+
+        Raises
+        ------
+        SceneError
+            If the true rig cannot exist.
+        """
+        if misalignment == Misalignment():
+            return self
+        T_world_camera, T_camera_sphere = misalignment.poses(self.T_world_camera, self.T_camera_sphere)
+        return Rig(
+            camera=misalignment.camera(self.camera),
+            mirror=misalignment.mirror(self.mirror),
+            T_world_camera=T_world_camera,
+            T_camera_sphere=T_camera_sphere,
+            stroke_axis_world=misalignment.stroke_axis(self.stroke_axis_world),
+            motion=misalignment.motion(self.motion),
+        )
 
     def outline_px(self, count: int = 720) -> Array:
         """Image of the mirror's outline (its occluding contour), shape (count, 2), pixels."""
@@ -94,16 +121,18 @@ class Rig:
 
 @dataclass(frozen=True)
 class View:
-    """A rig with its carriage at one offset: what one image is taken from."""
+    """A rig with its carriage at one offset, and moved where it is not down: what one image is taken from."""
 
     rig: Rig
     offset_m: float
+    motion: Motion | None = None
 
     @cached_property
     def T_world_camera(self) -> Pose:
         """Camera pose in the world."""
         shift = self.offset_m * np.array(self.rig.stroke_axis_world)
-        return replace(self.rig.T_world_camera, translation_m=as_vector(self.rig.T_world_camera.t + shift))
+        carried = replace(self.rig.T_world_camera, translation_m=as_vector(self.rig.T_world_camera.t + shift))
+        return carried if self.motion is None else self.motion.moved(carried)
 
     @cached_property
     def T_world_sphere(self) -> Pose:

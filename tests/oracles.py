@@ -148,19 +148,26 @@ def undistort_cv2(camera: Camera, uv_px: np.ndarray) -> np.ndarray:
 # -- spots in images ---------------------------------------------------------------------------------------------
 
 
+def camera_at(rig: Rig, offset_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Lens centre, shape (3,), and camera axes as columns, shape (3, 3), with the motion at every offset but 0."""
+    centre, axes = rig.T_world_camera.t + offset_m * np.array(rig.stroke_axis_world), rig.T_world_camera.R
+    if rig.motion is None or offset_m == 0.0:
+        return centre, axes
+    return centre + rig.motion.translation_m, np.array(rig.motion.rotation) @ axes
+
+
 def true_reflection(rig: Rig, offset_m: float, spot_world_m: np.ndarray, solve=alhazen_quartic) -> np.ndarray:
     """Reflection point in the world, shape (3,)."""
-    shift = offset_m * np.array(rig.stroke_axis_world)
-    camera = rig.T_world_camera.t + shift
-    centre = camera + rig.T_world_camera.R @ rig.T_camera_sphere.t
+    camera, axes = camera_at(rig, offset_m)
+    centre = camera + axes @ rig.T_camera_sphere.t
     return centre + solve(camera - centre, spot_world_m - centre, rig.mirror.radius_m)
 
 
 def true_pixel(rig: Rig, offset_m: float, spot_world_m: np.ndarray, solve=alhazen_quartic) -> np.ndarray:
     """Pixel of a world point seen in the mirror, shape (2,)."""
     P = true_reflection(rig, offset_m, spot_world_m, solve)
-    camera = rig.T_world_camera.t + offset_m * np.array(rig.stroke_axis_world)
-    return project_cv2(rig.camera, (rig.T_world_camera.R.T @ (P - camera))[None])[0]
+    camera, axes = camera_at(rig, offset_m)
+    return project_cv2(rig.camera, (axes.T @ (P - camera))[None])[0]
 
 
 def random_rig(rng: np.random.Generator) -> Rig:

@@ -128,14 +128,18 @@ def test_what_was_drawn_has_columns(made: Path) -> None:
     assert table["rig"].to_list() == [row.rig for row in rows]
 
 
-@pytest.mark.parametrize("change", ["drawn", "tries", "rig", "stroke_m", "spot_world_m"])
+@pytest.mark.parametrize(
+    "change", ["drawn", "tries", "rig", "nominal_rig", "stroke_m", "nominal_stroke_m", "spot_world_m"]
+)
 def test_a_row_that_the_recipe_does_not_draw_is_found_though_signed(copy: Path, change: str) -> None:
     rows = read_manifest(copy)
     value = {
         "drawn": {**rows[1].drawn, "rig.z_c_m": 0.27},
         "tries": 2,
         "rig": rows[0].rig,
+        "nominal_rig": rows[0].rig,
         "stroke_m": rows[1].stroke_m + 1e-9,
+        "nominal_stroke_m": rows[1].stroke_m + 1e-9,
         "spot_world_m": (*rows[1].spot_world_m[:2], rows[1].spot_world_m[2] + 1e-9),
     }[change]
     write_manifest(copy, [rows[0], rows[1].model_copy(update={change: value}), rows[2]])
@@ -206,7 +210,9 @@ def test_estimators_use_each_samples_rig(made: Path) -> None:
     assert len(exact) == sum(row.down.visible and row.up.visible for row in dataset.rows) >= 2
     for one in exact:
         assert abs(one.relative_error) < 1e-11  # as for random rigs in test_triangulate
-    rows = [row.model_copy(update={"rig": dataset.rows[0].rig}) for row in dataset.rows]  # the first rig for all
+    rows = [
+        row.model_copy(update={"nominal_rig": dataset.rows[0].rig}) for row in dataset.rows
+    ]  # the first rig for all
     wrong = [s for s in score(replace(dataset, rows=tuple(rows))) if s.estimator == "exact" and s.source == "truth"]
     assert max(abs(s.relative_error) for s in wrong[1:] if s.status == "ok") > 1e-3
 

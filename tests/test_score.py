@@ -38,11 +38,12 @@ def make_sample(published, spot, *, shift_px=0.0, frame=draw, **hidden):
         experiment=published.experiment,
         depth_m=published.real_depth_m,
         stroke_m=published.baseline_m,
+        nominal_stroke_m=published.baseline_m,
         **spots,
     )
     ambient = np.full((3, 720, 1280), 123.25)
     return SimpleNamespace(
-        row=row, rig=RIG, frame=lambda position, laser=True: ambient + frame(uv[position]) if laser else ambient
+        row=row, nominal_rig=RIG, frame=lambda position, laser=True: ambient + frame(uv[position]) if laser else ambient
     )
 
 

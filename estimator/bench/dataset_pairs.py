@@ -78,7 +78,7 @@ class DatasetPairs:
         images = {name: _sealed(frame.image) for name, frame in frames.by_name.items()}
         boxes = (None, None) if take.boxes is None else tuple(map(_box, take.boxes))
         card, (box_down, box_up) = card_of(source.sides["down"].chain.sensor), boxes
-        rig, stroke_m = sample.rig, sample.row.stroke_m
+        rig, stroke_m = sample.nominal_rig, sample.row.nominal_stroke_m
         pair = Pair(number, **images, rig=rig, stroke_m=stroke_m, card=card, box_down=box_down, box_up=box_up)
         return pair, frames
 
@@ -96,9 +96,10 @@ class DatasetPairs:
             depth_m=sample.row.depth_m,
             stroke_m=sample.row.stroke_m,
             true_rig=sample.rig,
-            believed_rig=sample.rig,
+            believed_rig=sample.nominal_rig,
             down=_spot_truth(sample, source, take, "down"),
             up=_spot_truth(sample, source, take, "up"),
+            believed_stroke_m=sample.row.nominal_stroke_m,
         )
 
     def document(self) -> dict[str, Any]:

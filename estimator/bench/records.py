@@ -225,10 +225,11 @@ def _pair_columns(
     bounds = [_bounds([getattr(t, p) for t in truths], "bound_px2") for p in POSITIONS]
     claims = [errors.usable_covariance(_claimed([_spot(o, p) for o in outcomes])) for p in POSITIONS]
     true_m, h = (np.array([getattr(t, name) for t in truths], float) for name in ("depth_m", "stroke_m"))
+    believed_h = np.array([t.stroke_m if t.believed_stroke_m is None else t.believed_stroke_m for t in truths], float)
     answers, truth = (
         [np.stack([i[u], i[v]], -1) for i in (down, up)] for u, v in (("u_px", "v_px"), ("u_true_px", "v_true_px"))
     )
-    triangulated = depth_exact(believed, h, *answers, *claims)
+    triangulated = depth_exact(believed, believed_h, *answers, *claims)
     own, own_sigma = (np.array([_own_depth(o.answer, name) for o in outcomes]) for name in ("depth_m", "sigma_depth_m"))
     has_own = np.isfinite(own)
     depth, sigma = np.where(has_own, own, triangulated.depth_m), np.where(has_own, own_sigma, triangulated.sigma_m)
@@ -256,7 +257,7 @@ def _pair_columns(
         "depth_counted": np.where(both, counted, np.nan),
         "depth_sigma_m": sigma,
         "depth_pull": (depth - true_m) / np.where(sigma > 0.0, sigma, np.nan),
-        "bound_depth_m2": depth_exact(believed, h, *truth, *bounds).sigma_m ** 2,
+        "bound_depth_m2": depth_exact(believed, believed_h, *truth, *bounds).sigma_m ** 2,
         "seconds": [float(o.seconds) for o in outcomes],
         "failure": [o.failure for o in outcomes],
         "message": [o.message for o in outcomes],

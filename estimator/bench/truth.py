@@ -79,6 +79,8 @@ class PairTruth:
     true_rig, believed_rig : Rig
         The rig that was rendered, and the one in `Pair.rig`.
     down, up : SpotTruth
+    believed_stroke_m : float or None
+        The stroke in `Pair.stroke_m`; None if it is the true one.
     """
 
     number: int
@@ -93,3 +95,4 @@ class PairTruth:
     believed_rig: Rig
     down: SpotTruth
     up: SpotTruth
+    believed_stroke_m: float | None = None

@@ -1,0 +1,147 @@
+"""What is wrong with a real rig: signed deviations of the true rig from the nominal one, which the estimator believes.
+
+All are 0 by default. World axes (z up; the robot's front is world +x); angles turn right-handed. Of several at once:
+the sphere moves first, then the camera turns about its lens and leaves sphere and lens where they are. What a recipe
+calls `decentre`, `tilt` and `stroke_tilt` in `[rig]` means the same here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+
+from phibench.scenes.camera import Camera
+from phibench.scenes.checks import SceneError, within
+from phibench.scenes.frames import Pose, Vector, as_matrix, as_vector, rotation_xyz
+from phibench.scenes.mirror import SphereMirror
+from phibench.scenes.motion import Motion
+
+
+def _number(unit: str, limit: float, study: float, meaning: str) -> Any:
+    """Field of one parameter: unit, largest allowed and usual study magnitude, meaning."""
+    return field(default=0.0, metadata={"unit": unit, "limit": limit, "study": study, "meaning": meaning})
+
+
+@dataclass(frozen=True)
+class Misalignment:
+    """Deviations of the true rig from the nominal one; `PARAMETERS` has unit, range and meaning of each.
+
+    Raises
+    ------
+    SceneError
+        If a number is beyond its range.
+    """
+
+    decentre_x_m: float = _number("m", 0.1, 1e-3, "sphere centre moved along world +x, at the down position")
+    decentre_y_m: float = _number("m", 0.1, 1e-3, "sphere centre moved along world +y, at the down position")
+    axial_m: float = _number("m", 0.1, 1e-3, "sphere centre moved along world +z, away from the lens")
+    tilt_x_rad: float = _number("rad", 0.5, 8.7e-3, "camera turned about world x through its lens; the sphere stays")
+    tilt_y_rad: float = _number("rad", 0.5, 8.7e-3, "camera turned about world y through its lens; the sphere stays")
+    radius_m: float = _number("m", 0.1, 6e-4, "added to the mirror's radius")
+    focal_relative: float = _number("1", 0.5, 0.01, "added to fx and fy, relative to them; the aperture follows fx")
+    cx_px: float = _number("px", 2000.0, 15.0, "added to the principal point u")
+    cy_px: float = _number("px", 2000.0, 15.0, "added to the principal point v")
+    k1: float = _number("1", 1000.0, 0.03, "added to the radial distortion k1")
+    k2: float = _number("1", 1000.0, 0.3, "added to the radial distortion k2")
+    k3: float = _number("1", 1000.0, 1.0, "added to the radial distortion k3")
+    p1: float = _number("1", 1000.0, 1e-3, "added to the tangential distortion p1")
+    p2: float = _number("1", 1000.0, 1e-3, "added to the tangential distortion p2")
+    focus_distance_m: float = _number("m", 100.0, 0.05, "added to the distance of the plane of focus")
+    stroke_relative: float = _number("1", 0.5, 2e-3, "true stroke is (1 + this) x nominal stroke + stroke_offset_m")
+    stroke_offset_m: float = _number("m", 1.0, 1e-3, "added to the stroke")
+    stroke_tilt_x_rad: float = _number("rad", 0.5, 8.7e-3, "stroke axis turned about world x")
+    stroke_tilt_y_rad: float = _number("rad", 0.5, 8.7e-3, "stroke axis turned about world y, after x")
+    roll_rad: float = _number("rad", 0.5, 1.7e-3, "rig turned about world x between the images, left side up")
+    pitch_rad: float = _number("rad", 0.5, 1.7e-3, "rig turned about world y between the images, front down")
+    yaw_rad: float = _number("rad", 0.5, 1.7e-3, "rig turned about world z between the images, front to the left")
+    shift_x_m: float = _number("m", 1.0, 1e-3, "rig moved along world +x between the images")
+    shift_y_m: float = _number("m", 1.0, 1e-3, "rig moved along world +y between the images")
+    shift_z_m: float = _number("m", 1.0, 1e-3, "rig moved along world +z between the images")
+    roughness_alpha: float = _number("1", 0.05, 2e-3, "added to the mirror's Beckmann roughness")
+
+    def __post_init__(self) -> None:
+        for name, parameter in PARAMETERS.items():
+            object.__setattr__(self, name, float(getattr(self, name)))
+            within("Misalignment", name, getattr(self, name), -parameter.limit, parameter.limit)
+
+    def camera(self, nominal: Camera) -> Camera:
+        """True camera."""
+        scale = 1.0 + self.focal_relative
+        added = {name: getattr(nominal, name) + getattr(self, name) for name in _ADDED_TO_CAMERA}
+        return replace(nominal, fx_px=nominal.fx_px * scale, fy_px=nominal.fy_px * scale, **added)
+
+    def mirror(self, nominal: SphereMirror) -> SphereMirror:
+        """True mirror."""
+        return SphereMirror(nominal.radius_m + self.radius_m, nominal.roughness_alpha + self.roughness_alpha)
+
+    def poses(self, T_world_camera: Pose, T_camera_sphere: Pose) -> tuple[Pose, Pose]:
+        """True camera pose in the world and sphere pose in the camera, both down."""
+        moved_m = (self.decentre_x_m, self.decentre_y_m, self.axial_m)
+        if not any((*moved_m, self.tilt_x_rad, self.tilt_y_rad)):
+            return T_world_camera, T_camera_sphere
+        R = np.array(rotation_xyz(self.tilt_x_rad, self.tilt_y_rad)) @ T_world_camera.R
+        sphere = T_world_camera.directions(T_camera_sphere.t) + moved_m  # from the lens, world axes
+        turned = R.T @ T_world_camera.R @ T_camera_sphere.R
+        return (
+            replace(T_world_camera, rotation=as_matrix(R)),
+            replace(T_camera_sphere, translation_m=as_vector(R.T @ sphere), rotation=as_matrix(turned)),
+        )
+
+    def stroke_axis(self, nominal: Vector) -> Vector:
+        """True direction of the stroke, world."""
+        if not any((self.stroke_tilt_x_rad, self.stroke_tilt_y_rad)):
+            return nominal
+        return as_vector(np.array(rotation_xyz(self.stroke_tilt_x_rad, self.stroke_tilt_y_rad)) @ np.array(nominal))
+
+    def motion(self, nominal: Motion | None) -> Motion | None:
+        """Motion between the images: Rz(yaw) Ry(pitch) Rx(roll) about the lens centre when up, then the shift."""
+        turn, shift_m = (self.roll_rad, self.pitch_rad, self.yaw_rad), (self.shift_x_m, self.shift_y_m, self.shift_z_m)
+        if not any((*turn, *shift_m)):
+            return nominal
+        added = Motion(shift_m, rotation_xyz(*turn))
+        return added if nominal is None else nominal.then(added)
+
+    def stroke_m(self, nominal_stroke_m: float) -> float:
+        """True stroke.
+
+        Raises
+        ------
+        SceneError
+            If it is not above 0.
+        """
+        true_m = (1.0 + self.stroke_relative) * nominal_stroke_m + self.stroke_offset_m
+        if not true_m > 0.0:
+            raise SceneError(
+                f"Misalignment: stroke_relative = {self.stroke_relative:g} and stroke_offset_m = "
+                f"{self.stroke_offset_m:g} make the stroke {nominal_stroke_m:g} m {true_m:g} m; it must stay above 0"
+            )
+        return true_m
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of `Misalignment`.
+
+    Attributes
+    ----------
+    unit : str
+        "m", "rad", "px" or "1".
+    limit : float
+        Largest allowed magnitude.
+    study : float
+        Magnitude that a study takes unless told otherwise: what is left after careful mounting.
+    meaning : str
+    """
+
+    unit: str
+    limit: float
+    study: float
+    meaning: str
+
+
+PARAMETERS = {entry.name: Parameter(**entry.metadata) for entry in fields(Misalignment)}
+"""All parameters of `Misalignment` by name, in order."""
+
+_ADDED_TO_CAMERA = ("cx_px", "cy_px", "k1", "k2", "k3", "p1", "p2", "focus_distance_m")
