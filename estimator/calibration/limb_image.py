@@ -79,7 +79,9 @@ def planes_of(image: NDArray[Any], card: SensorCard | None = None) -> tuple[Plan
         "raw": image.ndim == 2,
     }.get(output, image.ndim == 3 and image.shape[-1] == 3)
     if not shape_is_right or image.size == 0:
-        raise ImageError(f"an image of shape {image.shape} is no '{output}' image: name the preset that it was drawn with")
+        raise ImageError(
+            f"an image of shape {image.shape} is no '{output}' image: name the preset that it was drawn with"
+        )
     if card is None or output == "electrons":
         return tuple(_whole(image[i], (Tap(1.0, i),)) for i in range(3))
     if output == "raw":
@@ -124,6 +126,12 @@ def srgb_decoded(encoded: Array) -> Array:
     return np.where(x <= _SRGB_KNEE, x / _SRGB_SLOPE, ((x + 0.055) / 1.055) ** 2.4)
 
 
+def srgb_encoded(linear: Array) -> Array:
+    """sRGB curve of linear values, cut to [0, 1]; the inverse of `srgb_decoded`."""
+    x = np.clip(np.asarray(linear, float), 0.0, 1.0)
+    return np.where(x <= _SRGB_KNEE / _SRGB_SLOPE, x * _SRGB_SLOPE, 1.055 * x ** (1.0 / 2.4) - 0.055)
+
+
 _CROSS = tuple((0.25, du, dv) for du, dv in ((-1, 0), (1, 0), (0, -1), (0, 1)))
 _CORNERS = tuple((0.25, du, dv) for du in (-1, 1) for dv in (-1, 1))
 _BESIDE, _ABOVE, _OWN = ((0.5, -1, 0), (0.5, 1, 0)), ((0.5, 0, -1), (0.5, 0, 1)), ((1.0, 0, 0),)
@@ -144,7 +152,7 @@ def _luma_taps(parity: int, share: Array, card: SensorCard) -> Iterable[Tap]:
 
 
 def _sharpening(amount: float) -> Iterable[tuple[float, int, int]]:
-    """Unsharp mask as a sum. The camera applies it after the sRGB curve; on a limb, which is faint, that is the same."""
+    """Unsharp mask as a sum. After the sRGB curve, in the camera; on a faint limb that is the same."""
     if amount == 0.0:
         yield 1.0, 0, 0
         return

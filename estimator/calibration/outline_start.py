@@ -10,7 +10,7 @@ import numpy as np
 from scipy import ndimage
 from skimage.feature import canny
 from skimage.measure import CircleModel, EllipseModel, block_reduce, ransac
-from skimage.transform import hough_circle, hough_circle_peaks
+from skimage.transform import hough_circle
 
 from phibench.estimator.calibration.limb_image import ImageError, Plane
 from phibench.scenes.camera import Camera
@@ -55,15 +55,14 @@ def hough(picture: Array, rig: Rig) -> tuple[float, float, float]:
     edges = canny(small, sigma=1.5)
     outline = rig.outline_px()
     believed = 0.5 * float(np.ptp(outline, axis=0).mean())
-    radii = np.arange(_RADII[0] * believed / _BLOCK_PX, _RADII[1] * believed / _BLOCK_PX, 1.0)
-    if edges.sum() < 20:
+    radii = np.arange(_RADII[0] * believed / _BLOCK_PX, _RADII[1] * believed / _BLOCK_PX, 1.0).astype(int)
+    if edges.sum() < _MIN_EDGES:
         raise ImageError("an image without a mirror: it has no edges")
-    space = hough_circle(edges, radii.astype(int), full_output=True)
-    _, u, v, r = hough_circle_peaks(space, radii.astype(int), total_num_peaks=1)
-    beyond = int(radii.astype(int).max())  # full_output pads by the largest radius
-    centre = np.array([u[0] - beyond, v[0] - beyond], float)
-    u_px, v_px = (centre + 0.5) * _BLOCK_PX - 0.5
-    return float(u_px), float(v_px), float(r[0]) * _BLOCK_PX
+    space = hough_circle(edges, radii, full_output=True)
+    best, v, u = np.unravel_index(int(np.argmax(space)), space.shape)
+    beyond = int(radii.max())  # by which full_output widens the picture
+    u_px, v_px = ((x - beyond + 0.5) * _BLOCK_PX - 0.5 for x in (int(u), int(v)))
+    return u_px, v_px, float(radii[best]) * _BLOCK_PX
 
 
 def circle_edges(picture: Array, circle: tuple[float, float, float]) -> Array:

@@ -11,7 +11,7 @@ from phibench.scenes.frames import Array
 
 MIN_PIXELS = 12
 """Pixels that a sector needs to count: four times its coefficients."""
-_HUBER, _CUT = 2.0, 6.0
+_HUBER, _CUT, _TUKEY = 2.0, 6.0, 4.685
 _ROUNDS = 3
 NEIGHBOURS = 2
 """Sectors on each side whose errors may be correlated."""
@@ -98,6 +98,22 @@ class Sectors:
         return np.hypot(spread, np.maximum(0.5 * usual * np.abs(mean), 1e-12 * np.abs(mean).max() + 1e-300))
 
 
+def sector_weights(where: Sectors, weight: Array, shift: Array, residual: Array) -> Array:
+    """Tukey weights of the sectors, shape (count,), from the limb's own shift in each over its usual scatter.
+
+    An edge of the room along the limb moves a whole sector, which no weight of single pixels can see.
+    """
+    information = where.summed((weight * shift * shift)[:, None])[:, 0]
+    score = where.summed((weight * shift * residual)[:, None])[:, 0]
+    seen = information > 0.0
+    if not seen.any():
+        return np.ones(where.count)
+    z = np.zeros(where.count)
+    z[seen] = score[seen] / np.sqrt(information[seen])
+    scale = 1.4826 * float(np.median(np.abs(z[seen])))
+    return np.clip(1.0 - (z / max(_TUKEY * scale, 1e-300)) ** 2, 0.0, None) ** 2
+
+
 def sandwich(A: Array, scores: Array) -> Array:
     """Covariance A^-1 M A^-1 of estimates with normal matrix A and the sums of scores of the sectors, shape (K, p).
 
@@ -113,9 +129,7 @@ def sandwich(A: Array, scores: Array) -> Array:
     return np.asarray(inverse @ M @ inverse * used / max(used - A.shape[0], 1))
 
 
-def _normal(
-    group: NDArray[np.int64], groups: int, basis: Array, columns: Array, weight: Array
-) -> tuple[Array, Array]:
+def _normal(group: NDArray[np.int64], groups: int, basis: Array, columns: Array, weight: Array) -> tuple[Array, Array]:
     """Normal matrices (groups, m, m) and right sides (groups, m, p)."""
     m, p = basis.shape[1], columns.shape[1]
     normal, right = np.empty((groups, m, m)), np.empty((groups, m, p))
