@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from cyclopts import App, CycloptsError
 
+from phibench.estimator.cli_calibration import align, calibrate
 from phibench.estimator.cli_dataset import dataset
 
 if TYPE_CHECKING:
@@ -30,6 +31,8 @@ app = App(
     result_action="return_value",
 )
 app.command(dataset)
+app.command(calibrate)
+app.command(align)
 
 
 @app.command

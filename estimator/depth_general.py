@@ -1,14 +1,14 @@
-"""Depth from two rays that need not meet, with everything that is uncertain, and a test whether they should have met.
+"""Depth from two rays that need not meet, with everything that is uncertain, and a test whether they should meet.
 
-Ray k (1 down, 2 up): X = P_k + t_k r_k, world frame. Pixels and rig parameters together, z, have a covariance C. The two
-rays of the true z meet: the gap e(z), the signed length of their common perpendicular, is 0. The least-squares solution
-moves z onto e = 0 by as little as C allows (condition equations; E. M. Mikhail, Observations and Least Squares, 1976,
-ch. 9):
+Ray k (1 down, 2 up): X = P_k + t_k r_k, world frame. Pixels and rig parameters together, z, have a covariance C. The
+two rays of the true z meet: the gap e(z), the signed length of their common perpendicular, is 0. The least-squares
+solution moves z onto e = 0 by as little as C allows (condition equations; E. M. Mikhail, Observations and Least
+Squares, 1976, ch. 9):
 
     z' = z - C e_z^T (e + e_z (z0 - z)) / (e_z C e_z^T),    chi^2 = e^2 / (e_z C e_z^T), one degree of freedom,
 
-which is the weighted least-squares point in pixels, calibration included. D is then that of the meeting rays. Everything
-is vectorised over leading axes that broadcast together.
+which is the weighted least-squares point in pixels, calibration included. D is then that of the meeting rays.
+Everything is vectorised over leading axes that broadcast together.
 """
 
 from __future__ import annotations

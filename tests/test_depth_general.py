@@ -46,9 +46,7 @@ def test_against_minimisation_in_pixels() -> None:
         down, up = (true_pixel(rig, h, SPOT) + rng.normal(0.0, 0.15, 2) for h in (0.0, STROKE))
 
         def misfit(X, rig=rig, down=down, up=up):
-            return np.concatenate(
-                [L1 @ (true_pixel(rig, 0.0, X) - down), L2 @ (true_pixel(rig, STROKE, X) - up)]
-            )
+            return np.concatenate([L1 @ (true_pixel(rig, 0.0, X) - down), L2 @ (true_pixel(rig, STROKE, X) - up)])
 
         found = optimize.least_squares(misfit, SPOT, x_scale=[0.1, 0.1, 0.1], xtol=1e-14, ftol=1e-14, gtol=1e-14)
         ours = depth_general(rig, STROKE, down, up, C1, C2)

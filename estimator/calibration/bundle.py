@@ -27,7 +27,7 @@ from phibench.estimator.triangulate import depth_exact
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig, View
 
-_NEWTON = 4
+_NEWTON = 3
 _WEAK = 0.9  # of the prior's variance: a direction that keeps so much was not measured
 
 
@@ -145,7 +145,7 @@ def calibrate(
     free = np.flatnonzero(prior > 0.0)
     problem = _Problem(believed, outline, tuple(spots), vertical, prior, free)
     start = np.concatenate([np.zeros(free.size), *(_start(believed, spot) for spot in spots)])
-    found = optimize.least_squares(problem.residuals, start, x_scale="jac", jac="3-point", xtol=1e-13, ftol=1e-13)
+    found = optimize.least_squares(problem.residuals, start, x_scale="jac", xtol=1e-12, ftol=1e-12)
     if not found.success or not np.isfinite(found.cost):
         raise DatasetError(f"the calibration does not come to rest: {found.message}")
     normal = found.jac.T @ found.jac
@@ -181,8 +181,8 @@ class _Problem:
             up = rig.T_world_camera.R.T[:2, 2]
             parts.append(_whitened(up - self.vertical.value, self.vertical.covariance))
         points = x[self.free.size :].reshape(-1, 3)
-        for spot, point in zip(self.spots, points, strict=True):
-            parts.append(_spot_residuals(rig, values, spot, point))
+        if self.spots:
+            parts.append(_spot_residuals(rig, values, self.spots, points))
         return np.concatenate(parts)
 
 
@@ -199,39 +199,42 @@ def _outline_shift(believed: Rig, true: Rig) -> Array:
     return np.asarray(true.sphere_in_camera_m - apparent)
 
 
-def _spot_residuals(rig: Rig, values: Array, spot: KnownSpot, point: Array) -> Array:
-    stroke = float(stroke_of(np.array(spot.stroke_m), values))
-    axis = np.array(rig.stroke_axis_world)
-    down = _seen_at(rig.at(0.0), point, spot.uv_down_px) - spot.uv_down_px
-    up = _seen_at(rig.at(0.0), point - stroke * axis, spot.uv_up_px) - spot.uv_up_px
-    flat = point[:2] - rig.at(0.0).sphere_centre_m[:2]
-    turn = np.arctan2(flat[1], flat[0]) - spot.azimuth_rad
-    known = [
-        (float(np.hypot(*flat)) - spot.depth_m) / spot.depth_sigma_m,
-        (point[2] - spot.height_m) / spot.height_sigma_m,
-        float(np.arctan2(np.sin(turn), np.cos(turn))) / spot.azimuth_sigma_rad,
-    ]
-    finite = [np.isfinite(s) for s in (spot.depth_sigma_m, spot.height_sigma_m, spot.azimuth_sigma_rad)]
-    return np.concatenate(
+def _spot_residuals(rig: Rig, values: Array, spots: Sequence[KnownSpot], points: Array) -> Array:
+    """Pixels, and the finite ones of distance, height and azimuth, of all spots; points have the shape (K, 3)."""
+    strokes = stroke_of(np.array([spot.stroke_m for spot in spots]), values)
+    up_points = points - strokes[:, None] * np.array(rig.stroke_axis_world)
+    view, seen = rig.at(0.0), []
+    for where, name in ((points, "down"), (up_points, "up")):
+        found = np.array([getattr(spot, f"uv_{name}_px") for spot in spots], float)
+        covariance = np.array([getattr(spot, f"covariance_{name}_px2") for spot in spots], float)
+        off = (_seen_at(view, where, found) - found)[..., None]
+        seen.append(np.linalg.solve(np.linalg.cholesky(covariance), off).ravel())
+    flat = points[:, :2] - view.sphere_centre_m[:2]
+    turn = np.arctan2(flat[:, 1], flat[:, 0]) - [spot.azimuth_rad for spot in spots]
+    known = np.stack(
         [
-            _whitened(down, spot.covariance_down_px2),
-            _whitened(up, spot.covariance_up_px2),
-            np.array(known)[finite],
-        ]
+            np.hypot(flat[:, 0], flat[:, 1]) - [spot.depth_m for spot in spots],
+            points[:, 2] - [spot.height_m for spot in spots],
+            np.arctan2(np.sin(turn), np.cos(turn)),
+        ],
+        axis=-1,
     )
+    sigma = np.array([(s.depth_sigma_m, s.height_sigma_m, s.azimuth_sigma_rad) for s in spots])
+    return np.concatenate([*seen, (known / sigma)[np.isfinite(sigma)]])
 
 
-def _seen_at(view: View, point: Array, near_px: Array) -> Array:
-    """Pixel at which a world point is seen in the mirror, by Newton's method from a pixel nearby; shape (2,)."""
+def _seen_at(view: View, points: Array, near_px: Array) -> Array:
+    """Pixels (K, 2) at which world points (K, 3) are seen in the mirror, by Newton's method from pixels nearby."""
     uv = np.asarray(near_px, float)
     for _ in range(_NEWTON):
         ray, J = reflect(view, uv), reflect_jacobian(view, uv)
-        r, w = ray.direction_world, point - ray.origin_world_m
-        t = float(w @ r)
-        basis = np.linalg.svd(r[None])[2][1:]  # two directions across the ray
-        miss = basis @ w
-        slope = basis @ (-J.origin_m_per_px - t * J.direction_per_px)
-        uv = uv - np.linalg.solve(slope, miss)
+        r, w = ray.direction_world, points - ray.origin_world_m
+        t = np.sum(w * r, axis=-1)[:, None, None]
+        # what is across the ray, seen along two of its normals
+        first = np.cross(r, np.where(np.abs(r[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]))
+        basis = np.stack([first, np.cross(r, first)], axis=-2)
+        slope = -basis @ (J.origin_m_per_px + t * J.direction_per_px)
+        uv = uv - np.linalg.solve(slope, basis @ w[..., None])[..., 0]
     return uv
 
 

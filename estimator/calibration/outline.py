@@ -30,6 +30,9 @@ HALF_WIDTH_PX = 3.0
 SECTORS = 120
 MIN_ARC = 0.5
 """Part of the outline that must lie in the image."""
+JPEG_HALF_WIDTH_PX = 5.0
+JPEG_SHIFT_PX, JPEG_SCATTER_PX, JPEG_ACROSS_PX = 0.041, 0.010, 0.022
+"""By how much JPEG makes the outline's radius smaller, the scatter of that, and of the centre, pixels."""
 _COARSE_HALF_PX, _COARSE_STEPS = 8.0, 6
 _STEPS, _REST_M, _REST_SIGMAS = 25, 1e-8, 0.02
 _MIN_CONTRAST, _MAX_CONTRAST = 0.5, 1.6
@@ -96,7 +99,25 @@ def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) 
     """
     planes = planes_of(image, card)
     _require_size(planes[0].values, rig.camera)
-    return fit_outline(planes, rig, rough_outline(grey(planes), rig))
+    start = rough_outline(grey(planes), rig)
+    if card is None or card.output != "mjpeg":
+        return fit_outline(planes, rig, start)
+    return without_jpeg(fit_outline(planes, rig, start, JPEG_HALF_WIDTH_PX), rig)
+
+
+def without_jpeg(found: Outline, rig: Rig) -> Outline:
+    """Outline of a JPEG frame, less what JPEG does to the limb, with the scatter of that in the covariance.
+
+    JPEG cuts away the fine waves of the limb's light: the limb becomes wider and, its light being lopsided, smaller.
+    Shift and scatter were measured; docs/calibration.md has the numbers, which hold for qualities of 75 to 95.
+    """
+    s, distance = found.sphere_in_camera_m, float(np.linalg.norm(found.sphere_in_camera_m))
+    n, f_px = s / distance, float(np.sqrt(rig.camera.fx_px * rig.camera.fy_px))
+    radius_px = f_px * rig.mirror.radius_m / distance
+    along, across = JPEG_SCATTER_PX * distance / radius_px, JPEG_ACROSS_PX * distance / f_px
+    own = along**2 * np.outer(n, n) + across**2 * (np.eye(3) - np.outer(n, n))
+    moved = s * (1.0 - JPEG_SHIFT_PX / radius_px)
+    return replace(found, sphere_in_camera_m=moved, covariance_m2=found.covariance_m2 + own)
 
 
 def fit_outline(planes: tuple[Plane, ...], rig: Rig, start_m: Array, half_px: float = HALF_WIDTH_PX) -> Outline:
