@@ -34,7 +34,7 @@ JPEG_HALF_WIDTH_PX = 5.0
 JPEG_SHIFT_PX, JPEG_SCATTER_PX, JPEG_ACROSS_PX = 0.041, 0.010, 0.022
 """By how much JPEG makes the outline's radius smaller, the scatter of that, and of the centre, pixels."""
 _COARSE_HALF_PX, _COARSE_STEPS = 8.0, 6
-_STEPS, _REST_M, _REST_SIGMAS = 25, 1e-8, 0.02
+_STEPS, _REST_M, _REST_SIGMAS = 30, 1e-7, 0.05
 _MIN_CONTRAST, _MAX_CONTRAST = 0.5, 1.6
 _BLUR_RANGE_PX2 = (0.02, 9.0)
 

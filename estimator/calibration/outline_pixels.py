@@ -102,15 +102,15 @@ def place_of_rays(ray: Array, by_pixel: Array, s: Array, radius_m: float) -> Pla
 
 def through_taps(
     rays: OutlinePixels, planes: tuple[Plane, ...], limb: Limb, place: Place
-) -> tuple[Array, Array, Array]:
-    """Light, slope and curvature for every pixel, summed over its taps."""
-    sums = np.zeros((3, rays.y.size))
+) -> tuple[Array, Array, Array, Array]:
+    """Light, slope, curvature and turned light for every pixel, summed over its taps."""
+    sums = np.zeros((4, rays.y.size))
     parity = 2 * (rays.v % 2) + rays.u % 2
     for number, plane in enumerate(planes):
         for kind in range(4):
             rows = np.flatnonzero((rays.plane == number) & (parity == kind))
             for tap in plane.taps[kind]:
                 d = place.d_px[rows] + place.by_uv[rows] @ np.array([tap.du_px, tap.dv_px], float)
-                for k, table in enumerate((limb.light, limb.slope_per_px, limb.curvature_per_px2)):
+                for k, table in enumerate((limb.light, limb.slope_per_px, limb.curvature_per_px2, limb.turned)):
                     sums[k, rows] += tap.weight * limb.at(table, tap.filter_index, d)
-    return sums[0], sums[1], sums[2]
+    return sums[0], sums[1], sums[2], sums[3]
