@@ -1,7 +1,7 @@
 """A sphere's limb in a made-up room, by plain ray casting: images for the tests of the outline. Not a test file.
 
 Other mathematics than the estimator's and no Mitsuba: rays through 3 x 3 points of every pixel near the outline are
-reflected in space and meet a ceiling with lamps and a slow pattern, or a wall; lens and pixel blur are those of the grid.
+reflected in space and meet a ceiling with lamps and a slow pattern, or a wall; lens and pixel blur are the grid's.
 """
 
 from __future__ import annotations
@@ -37,10 +37,13 @@ def drawn_rig(rng: np.random.Generator, blur_px: tuple[float, float] = (0.5, 1.0
     return replace(rig, camera=camera, T_world_camera=pose, T_camera_sphere=Pose("camera", "sphere", as_vector(sphere)))
 
 
-def limb_light(rig: Rig, rng: np.random.Generator, mean_e_per_s: float = 1.5e5) -> np.ndarray:
-    """Expected electrons per second, shape (3, H, W); away from the outline the room's mean level."""
+def limb_light(rig: Rig, rng: np.random.Generator, mean_e_per_s: float = 1.5e5, room=None) -> np.ndarray:
+    """Expected electrons per second, shape (3, H, W); away from the outline the room's mean level.
+
+    `room` is a function (points, directions) -> radiance; by default it is drawn from `rng`.
+    """
     camera, size = rig.camera, (rig.camera.height_px, rig.camera.width_px)
-    radiance = _room(rng)
+    radiance = room or _room(rng)
     outline = rig.outline_px(4000)
     mask = np.zeros(size, bool)
     cells = np.rint(outline).astype(int)
@@ -80,7 +83,7 @@ def _room(rng: np.random.Generator):
         with np.errstate(all="ignore"):
             t = np.where(up > 0.05, (3.0 - points[:, 2]) / up, np.nan)
         x, y = (points[:, i] + t * directions[:, i] for i in (0, 1))
-        slow = 1.0 + 0.15 * np.sin(wave[0] * x + phase[0]) + 0.15 * np.sin(wave[1] * y + phase[1])
+        slow = 1.0 + 0.05 * np.sin(wave[0] * x + phase[0]) + 0.05 * np.sin(wave[1] * y + phase[1])
         for a, b in lamps:
             slow = np.where((np.abs(x - a) < 0.6) & (np.abs(y - b) < 0.15), 4.0, slow)
         return np.where(np.isfinite(t), slow, 0.7)

@@ -207,7 +207,7 @@ def _spot_residuals(rig: Rig, values: Array, spots: Sequence[KnownSpot], points:
     for where, name in ((points, "down"), (up_points, "up")):
         found = np.array([getattr(spot, f"uv_{name}_px") for spot in spots], float)
         covariance = np.array([getattr(spot, f"covariance_{name}_px2") for spot in spots], float)
-        off = (_seen_at(view, where, found) - found)[..., None]
+        off = (seen_at(view, where, found) - found)[..., None]
         seen.append(np.linalg.solve(np.linalg.cholesky(covariance), off).ravel())
     flat = points[:, :2] - view.sphere_centre_m[:2]
     turn = np.arctan2(flat[:, 1], flat[:, 0]) - [spot.azimuth_rad for spot in spots]
@@ -223,7 +223,7 @@ def _spot_residuals(rig: Rig, values: Array, spots: Sequence[KnownSpot], points:
     return np.concatenate([*seen, (known / sigma)[np.isfinite(sigma)]])
 
 
-def _seen_at(view: View, points: Array, near_px: Array) -> Array:
+def seen_at(view: View, points: Array, near_px: Array) -> Array:
     """Pixels (K, 2) at which world points (K, 3) are seen in the mirror, by Newton's method from pixels nearby."""
     uv = np.asarray(near_px, float)
     for _ in range(_NEWTON):

@@ -26,11 +26,10 @@ from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.rig import Rig
 
-HALF_WIDTH_PX = 3.0
+HALF_WIDTH_PX = 5.0
 SECTORS = 120
 MIN_ARC = 0.5
 """Part of the outline that must lie in the image."""
-JPEG_HALF_WIDTH_PX = 5.0
 JPEG_SHIFT_PX, JPEG_SCATTER_PX, JPEG_ACROSS_PX = 0.041, 0.010, 0.022
 """By how much JPEG makes the outline's radius smaller, the scatter of that, and of the centre, pixels."""
 _COARSE_HALF_PX, _COARSE_STEPS = 8.0, 6
@@ -102,7 +101,7 @@ def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) 
     start = rough_outline(grey(planes), rig)
     if card is None or card.output != "mjpeg":
         return fit_outline(planes, rig, start)
-    return without_jpeg(fit_outline(planes, rig, start, JPEG_HALF_WIDTH_PX), rig)
+    return without_jpeg(fit_outline(planes, rig, start), rig)
 
 
 def without_jpeg(found: Outline, rig: Rig) -> Outline:

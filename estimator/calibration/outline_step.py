@@ -57,7 +57,7 @@ def step_from(
     light, slope, curvature, turned = through_taps(pixels, planes, limb, place)
     where = Sectors.of(pixels.plane, place.turn_rad, sectors)
     d = place.d_px / half_px
-    fit = where.fit(pixels.y, np.stack([light, light * where.offset, turned], axis=-1))
+    fit = where.fit(pixels.y, np.stack([light, light * where.offset, turned, light * d], axis=-1))
     level = fit.model / light
     by_parameters = np.concatenate([place.by_s * slope[:, None], 0.5 * curvature[:, None]], axis=-1)
     columns = fit.without_nuisance(np.concatenate([by_parameters, slope[:, None]], axis=-1) * level[:, None])
