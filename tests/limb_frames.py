@@ -64,12 +64,14 @@ def limb_light(rig: Rig, rng: np.random.Generator, mean_e_per_s: float = 1.5e5, 
     out = np.where(hit[:, None], d + 2.0 * cosine[:, None] * normal, d)
     start = np.where(hit[:, None], P, 0.0)
     light = radiance(start @ rig.T_world_camera.R.T + rig.T_world_camera.t, out @ rig.T_world_camera.R.T)
+    rows, columns = np.indices(size)
+    fall_off = camera.rays(np.stack([columns, rows], axis=-1).astype(float))[..., 2] ** 4
     planes = []
     for nm, tint in zip(camera.detector.band_wavelength_nm, (1.0, 0.85, 0.45), strict=True):
         fine = np.ones((size[0] * FINE, size[1] * FINE), np.float32)
         fine[v, u] = light * np.where(hit, rig.mirror.reflectance(np.where(hit, cosine, 1.0), nm), 1.0)
         fine = ndimage.gaussian_filter(fine, FINE * camera.blur_sigma_px, mode="nearest", truncate=5.0)
-        planes.append(tint * mean_e_per_s * fine.reshape(size[0], FINE, size[1], FINE).mean(axis=(1, 3)))
+        planes.append(tint * mean_e_per_s * fall_off * fine.reshape(size[0], FINE, size[1], FINE).mean(axis=(1, 3)))
     return np.array(planes, np.float32)
 
 

@@ -1,8 +1,8 @@
 """The light across the limb of a polished sphere, seen by a pinhole.
 
 At the limb a ray grazes the sphere and goes on undeviated: radiance is continuous over the limb but for the steel's
-reflectance, which rises to 1 at grazing incidence. Across the limb the light is therefore B (1 + slope d) x the Fresnel
-reflectance, 1 outside, blurred by lens, defocus and pixel. d is the distance from the limb across it, pixels, outwards
+reflectance, which rises to 1 at grazing incidence. Across the limb the light is therefore the room's, a smooth function
+of the angle by which the mirror turns the ray, x the Fresnel reflectance, 1 outside, blurred by lens, defocus and pixel. d is the distance from the limb across it, pixels, outwards
 positive.
 
 Symbols: s sphere centre in the camera frame, R radius, a angle of a ray from s, a0 = asin(R / |s|) that of the limb.
@@ -33,9 +33,9 @@ class Limb:
     d_px : shape (n,)
     light, slope_per_px, curvature_per_px2 : shape (3, n)
         The light, its first and its second derivative by d.
-    turned : shape (3, n)
-        The light times the angle by which the mirror turns the ray, 0 outside: what a change of the room's light with
-        direction adds. That angle grows as the root of -d: 15 degrees at 3 px.
+    turned, turned_squared : shape (3, n)
+        The light times the angle by which the mirror turns the ray, 0 outside, and times its square: what the room's
+        light adds that changes with direction. That angle grows as the root of -d: 15 degrees at 3 px.
     """
 
     d_px: Array
@@ -43,6 +43,7 @@ class Limb:
     slope_per_px: Array
     curvature_per_px2: Array
     turned: Array
+    turned_squared: Array
 
     def at(self, table: Array, filter_index: int, d_px: Array) -> Array:
         """Value of `light`, `slope_per_px` or `curvature_per_px2` at distances, shape of `d_px`."""
@@ -72,14 +73,16 @@ def limb_of(rig: Rig, s: Array, blur_px2: float) -> Limb:
     miss = distance / rig.mirror.radius_m * np.sin(a0 + d / scale)  # sine of the angle of incidence
     cos_i = np.sqrt(np.clip(1.0 - miss * miss, 0.0, None))
     kernel = _kernel(camera, limb_depth_m=distance * np.cos(a0) ** 2, blur_px2=blur_px2)
-    light, turned = [], []
+    light, turned, squared = [], [], []
+    turn = 2.0 * np.arcsin(cos_i)
     for wavelength_nm in camera.detector.band_wavelength_nm:
         sharp = np.where(d < 0.0, rig.mirror.reflectance(cos_i, wavelength_nm), 1.0)
         light.append(_blurred(sharp, kernel))
-        turned.append(_blurred(sharp * 2.0 * np.arcsin(cos_i), kernel))
+        turned.append(_blurred(sharp * turn, kernel))
+        squared.append(_blurred(sharp * turn**2, kernel))
     table = np.array(light)
     slope = np.gradient(table, _STEP_PX, axis=-1)
-    return Limb(d, table, slope, np.gradient(slope, _STEP_PX, axis=-1), np.array(turned))
+    return Limb(d, table, slope, np.gradient(slope, _STEP_PX, axis=-1), np.array(turned), np.array(squared))
 
 
 def _kernel(camera: Camera, limb_depth_m: float, blur_px2: float) -> Array:

@@ -59,7 +59,7 @@ def band(planes: tuple[Plane, ...], camera: Camera, s: Array, radius_m: float, h
     parts = []
     for number, plane in enumerate(planes):
         keep = near & inside & plane.usable[v, u]
-        y = plane.values[v[keep], u[keep]]
+        y = plane.values[v[keep], u[keep]] / ray[keep, 2] ** 4  # natural fall-off of a thin lens
         parts.append(OutlinePixels(np.full(y.size, number), u[keep], v[keep], ray[keep], by_pixel[keep], y))
     return OutlinePixels(
         *(np.concatenate([getattr(p, name) for p in parts]) for name in OutlinePixels.__dataclass_fields__)
@@ -102,15 +102,16 @@ def place_of_rays(ray: Array, by_pixel: Array, s: Array, radius_m: float) -> Pla
 
 def through_taps(
     rays: OutlinePixels, planes: tuple[Plane, ...], limb: Limb, place: Place
-) -> tuple[Array, Array, Array, Array]:
-    """Light, slope, curvature and turned light for every pixel, summed over its taps."""
-    sums = np.zeros((4, rays.y.size))
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Light, slope, curvature, turned and turned squared for every pixel, summed over its taps."""
+    sums = np.zeros((5, rays.y.size))
+    tables = (limb.light, limb.slope_per_px, limb.curvature_per_px2, limb.turned, limb.turned_squared)
     parity = 2 * (rays.v % 2) + rays.u % 2
     for number, plane in enumerate(planes):
         for kind in range(4):
             rows = np.flatnonzero((rays.plane == number) & (parity == kind))
             for tap in plane.taps[kind]:
                 d = place.d_px[rows] + place.by_uv[rows] @ np.array([tap.du_px, tap.dv_px], float)
-                for k, table in enumerate((limb.light, limb.slope_per_px, limb.curvature_per_px2, limb.turned)):
+                for k, table in enumerate(tables):
                     sums[k, rows] += tap.weight * limb.at(table, tap.filter_index, d)
-    return sums[0], sums[1], sums[2], sums[3]
+    return sums[0], sums[1], sums[2], sums[3], sums[4]

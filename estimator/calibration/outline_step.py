@@ -54,10 +54,10 @@ def step_from(
         If there is no light across the outline.
     """
     place, limb = place_of(pixels, s, rig.mirror.radius_m), limb_of(rig, s, blur_px2)
-    light, slope, curvature, turned = through_taps(pixels, planes, limb, place)
+    light, slope, curvature, turned, squared = through_taps(pixels, planes, limb, place)
     where = Sectors.of(pixels.plane, place.turn_rad, sectors)
     d = place.d_px / half_px
-    fit = where.fit(pixels.y, np.stack([light, light * where.offset, turned, light * d], axis=-1))
+    fit = where.fit(pixels.y, np.stack([light, light * where.offset, turned, squared], axis=-1))
     level = fit.model / light
     by_parameters = np.concatenate([place.by_s * slope[:, None], 0.5 * curvature[:, None]], axis=-1)
     columns = fit.without_nuisance(np.concatenate([by_parameters, slope[:, None]], axis=-1) * level[:, None])
