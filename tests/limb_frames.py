@@ -65,10 +65,13 @@ def limb_light(rig: Rig, rng: np.random.Generator, mean_e_per_s: float = 1.5e5, 
     start = np.where(hit[:, None], P, 0.0)
     light = radiance(start @ rig.T_world_camera.R.T + rig.T_world_camera.t, out @ rig.T_world_camera.R.T)
     rows, columns = np.indices(size)
-    fall_off = camera.rays(np.stack([columns, rows], axis=-1).astype(float))[..., 2] ** 4
+    chief = camera.rays(np.stack([columns, rows], axis=-1).astype(float))
+    fall_off = chief[..., 2] ** 4
+    inside = chief @ s > np.sqrt(s @ s - R * R)  # the mirror's disc, roughly as bright as steel makes it
+    level = np.kron(np.where(inside, 0.67, 1.0), np.ones((FINE, FINE))).astype(np.float32)
     planes = []
     for nm, tint in zip(camera.detector.band_wavelength_nm, (1.0, 0.85, 0.45), strict=True):
-        fine = np.ones((size[0] * FINE, size[1] * FINE), np.float32)
+        fine = level.copy()
         fine[v, u] = light * np.where(hit, rig.mirror.reflectance(np.where(hit, cosine, 1.0), nm), 1.0)
         fine = ndimage.gaussian_filter(fine, FINE * camera.blur_sigma_px, mode="nearest", truncate=5.0)
         planes.append(tint * mean_e_per_s * fall_off * fine.reshape(size[0], FINE, size[1], FINE).mean(axis=(1, 3)))

@@ -1,9 +1,9 @@
 """The light across the limb of a polished sphere, seen by a pinhole.
 
 At the limb a ray grazes the sphere and goes on undeviated: radiance is continuous over the limb but for the steel's
-reflectance, which rises to 1 at grazing incidence. Across the limb the light is therefore the room's, a smooth function
-of the angle by which the mirror turns the ray, x the Fresnel reflectance, 1 outside, blurred by lens, defocus and pixel. d is the distance from the limb across it, pixels, outwards
-positive.
+reflectance, which rises to 1 at grazing incidence. Across the limb the light is therefore the room's, a smooth
+function of the angle by which the mirror turns the ray, x the Fresnel reflectance, 1 outside, blurred by lens, defocus
+and pixel. d is the distance from the limb across it, pixels, outwards positive.
 
 Symbols: s sphere centre in the camera frame, R radius, a angle of a ray from s, a0 = asin(R / |s|) that of the limb.
 """

@@ -30,7 +30,7 @@ HALF_WIDTH_PX = 5.0
 SECTORS = 120
 MIN_ARC = 0.5
 """Part of the outline that must lie in the image."""
-JPEG_SHIFT_PX, JPEG_SCATTER_PX, JPEG_ACROSS_PX = 0.041, 0.010, 0.022
+JPEG_SHIFT_PX, JPEG_SCATTER_PX, JPEG_ACROSS_PX = -0.014, 0.008, 0.016
 """By how much JPEG makes the outline's radius smaller, the scatter of that, and of the centre, pixels."""
 _COARSE_HALF_PX, _COARSE_STEPS = 8.0, 6
 _STEPS, _REST_M, _REST_SIGMAS = 30, 1e-7, 0.05
@@ -101,13 +101,13 @@ def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) 
     start = rough_outline(grey(planes), rig)
     if card is None or card.output != "mjpeg":
         return fit_outline(planes, rig, start)
-    return without_jpeg(fit_outline(planes, rig, start), rig)
+    return without_jpeg(fit_outline(planes, rig, start, jpeg=True), rig)
 
 
 def without_jpeg(found: Outline, rig: Rig) -> Outline:
     """Outline of a JPEG frame, less what JPEG does to the limb, with the scatter of that in the covariance.
 
-    JPEG cuts away the fine waves of the limb's light: the limb becomes wider and, its light being lopsided, smaller.
+    JPEG cuts away the fine waves of the limb's light: the limb becomes wider and, its light being lopsided, moves.
     Shift and scatter were measured; docs/calibration.md has the numbers, which hold for qualities of 75 to 95.
     """
     s, distance = found.sphere_in_camera_m, float(np.linalg.norm(found.sphere_in_camera_m))
@@ -119,8 +119,10 @@ def without_jpeg(found: Outline, rig: Rig) -> Outline:
     return replace(found, sphere_in_camera_m=moved, covariance_m2=found.covariance_m2 + own)
 
 
-def fit_outline(planes: tuple[Plane, ...], rig: Rig, start_m: Array, half_px: float = HALF_WIDTH_PX) -> Outline:
-    """As `find_outline`, from a start within some pixels of the outline."""
+def fit_outline(
+    planes: tuple[Plane, ...], rig: Rig, start_m: Array, half_px: float = HALF_WIDTH_PX, jpeg: bool = False
+) -> Outline:
+    """As `find_outline`, from a start within some pixels of the outline; for JPEG frames without `without_jpeg`."""
     s, blur = np.asarray(start_m, float), rig.camera.blur_sigma_px**2
     s = _approach(planes, rig, s, blur)
     arc = visible_arc(rig, s, half_px)
@@ -129,7 +131,7 @@ def fit_outline(planes: tuple[Plane, ...], rig: Rig, start_m: Array, half_px: fl
             f"a mirror cut by the frame: {100.0 * arc:.0f} % of its outline lie in the image, {100.0 * MIN_ARC:.0f} % "
             "are needed; move the camera away from the mirror or centre it"
         )
-    return _settle(planes, rig, s, blur, half_px)
+    return _settle(planes, rig, s, blur, half_px, jpeg)
 
 
 def visible_arc(rig: Rig, s: Array, margin_px: float = 0.0) -> float:
@@ -149,12 +151,12 @@ def _approach(planes: tuple[Plane, ...], rig: Rig, s: Array, blur: float) -> Arr
     return s
 
 
-def _settle(planes: tuple[Plane, ...], rig: Rig, s: Array, blur: float, half_px: float) -> Outline:
+def _settle(planes: tuple[Plane, ...], rig: Rig, s: Array, blur: float, half_px: float, jpeg: bool) -> Outline:
     pixels = None
     for count in range(1, _STEPS + 1):
         if pixels is None or count <= 4:  # later the pixels stay, so that the steps come to rest
             pixels = band(planes, rig.camera, s, rig.mirror.radius_m, half_px)
-        step = step_from(pixels, planes, rig, s, blur, SECTORS, half_px)
+        step = step_from(pixels, planes, rig, s, blur, SECTORS, half_px, jpeg)
         s, blur = _moved(s, step.move[:3], rig), float(np.clip(blur + step.move[3], *_BLUR_RANGE_PX2))
         rest = np.maximum(_REST_M, _REST_SIGMAS * np.sqrt(np.diag(step.covariance)[:3]))
         if count > 4 and np.all(np.abs(step.move[:3]) < rest):

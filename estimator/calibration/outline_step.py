@@ -45,6 +45,7 @@ def step_from(
     blur_px2: float,
     sectors: int,
     half_px: float,
+    jpeg: bool = False,
 ) -> Step:
     """Linearise the light around (s, blur) and solve, robustly within sectors and over them.
 
@@ -57,7 +58,9 @@ def step_from(
     light, slope, curvature, turned, squared = through_taps(pixels, planes, limb, place)
     where = Sectors.of(pixels.plane, place.turn_rad, sectors)
     d = place.d_px / half_px
-    fit = where.fit(pixels.y, np.stack([light, light * where.offset, turned, squared], axis=-1))
+    # JPEG's lack of fine waves looks like a slope on both sides of the limb more than like the room's curvature
+    room = np.stack([light, light * where.offset, turned, light * d if jpeg else squared], axis=-1)
+    fit = where.fit(pixels.y, room)
     level = fit.model / light
     by_parameters = np.concatenate([place.by_s * slope[:, None], 0.5 * curvature[:, None]], axis=-1)
     columns = fit.without_nuisance(np.concatenate([by_parameters, slope[:, None]], axis=-1) * level[:, None])
