@@ -228,16 +228,16 @@ def _pixel_gradients(rig: Rig, h: Array, y: Array) -> tuple[Array, Array]:
 
 def _rig_gradients(rig: Rig, h: Array, y: Array) -> tuple[Array, Array, Array]:
     """Derivatives of e, D and the point by the parameters and this pair's stroke, by central differences."""
-    gaps, depths, points = [], [], []
+    slopes: dict[str, list[Array]] = {"gap": [], "depth": [], "point": []}
     for i, size in enumerate(steps()):
         values = np.zeros(len(PARAMETERS))
         values[i] = size
         plus, minus = (_meet_exact(changed(rig, v), stroke_of(h, v), y) for v in (values, -values))
-        for slopes, name in ((gaps, "gap"), (depths, "depth"), (points, "point")):
-            slopes.append((getattr(plus, name) - getattr(minus, name)) / (2.0 * size))
+        for name, found in slopes.items():
+            found.append((getattr(plus, name) - getattr(minus, name)) / (2.0 * size))
     own = PARAMETERS.index("stroke_m")
-    gaps, depths, points = (slopes + [slopes[own]] for slopes in (gaps, depths, points))
-    return np.stack(gaps, axis=-1), np.stack(depths, axis=-1), np.stack(points, axis=-2)
+    gap, depth, point = (found + [found[own]] for found in slopes.values())
+    return np.stack(gap, axis=-1), np.stack(depth, axis=-1), np.stack(point, axis=-2)
 
 
 def _padded(jacobian: Array, start: int) -> Array:

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import optimize
 
 from phibench.datasets.errors import DatasetError
@@ -167,7 +168,7 @@ class _Problem:
     spots: tuple[KnownSpot, ...]
     vertical: Measured | None
     prior: Array
-    free: Array
+    free: NDArray[np.intp]
 
     def residuals(self, x: Array) -> Array:
         values = np.zeros(len(PARAMETERS))

@@ -51,14 +51,14 @@ def rough_outline(picture: Array, rig: Rig) -> Array:
 
 def hough(picture: Array, rig: Rig) -> tuple[float, float, float]:
     """Centre (u, v) and radius of the strongest circle, to some pixels."""
-    small = block_reduce(np.log(np.clip(picture, 1e-2, 1e2)), (_BLOCK_PX, _BLOCK_PX), np.mean)
-    edges = canny(small, sigma=1.5)
+    small = block_reduce(np.log(np.clip(picture, 1e-2, 1e2)), (_BLOCK_PX, _BLOCK_PX), np.mean)  # type: ignore[no-untyped-call]
+    edges = canny(small, sigma=1.5)  # type: ignore[no-untyped-call]
     outline = rig.outline_px()
     believed = 0.5 * float(np.ptp(outline, axis=0).mean())
     radii = np.arange(_RADII[0] * believed / _BLOCK_PX, _RADII[1] * believed / _BLOCK_PX, 1.0).astype(int)
     if edges.sum() < _MIN_EDGES:
         raise ImageError("an image without a mirror: it has no edges")
-    space = hough_circle(edges, radii, full_output=True)
+    space = hough_circle(edges, radii, full_output=True)  # type: ignore[no-untyped-call]
     best, v, u = np.unravel_index(int(np.argmax(space)), space.shape)
     beyond = int(radii.max())  # by which full_output widens the picture
     u_px, v_px = ((x - beyond + 0.5) * _BLOCK_PX - 0.5 for x in (int(u), int(v)))
@@ -69,7 +69,7 @@ def circle_edges(picture: Array, circle: tuple[float, float, float]) -> Array:
     """Steepest places of the light on rays from the circle's centre, shape (n, 2), those that RANSAC keeps."""
     points = _steepest(picture, circle)
     if len(points) >= _MIN_EDGES:
-        model, inliers = ransac(points, CircleModel, 3, 2.0, max_trials=300, rng=np.random.default_rng(0))
+        model, inliers = ransac(points, CircleModel, 3, 2.0, max_trials=300, rng=np.random.default_rng(0))  # type: ignore[no-untyped-call]
         if model is not None and inliers is not None and inliers.sum() >= _MIN_EDGES:
             centre, radius = np.asarray(model.center, float), float(model.radius)
             again = _steepest(picture, (centre[0], centre[1], radius), reach_px=5)
@@ -83,7 +83,7 @@ def circle_edges(picture: Array, circle: tuple[float, float, float]) -> Array:
 
 def plain_circle(points_px: Array) -> tuple[float, float, float]:
     """Least-squares circle (u, v, radius) through edges, shape (n, 2), pixels."""
-    model = CircleModel.from_estimate(points_px)
+    model = CircleModel.from_estimate(points_px)  # type: ignore[no-untyped-call]
     return float(model.center[0]), float(model.center[1]), float(model.radius)
 
 
@@ -96,7 +96,7 @@ def sphere_from_circle(circle: tuple[float, float, float], camera: Camera, radiu
 
 def sphere_from_ellipse(points_px: Array, camera: Camera, radius_m: float) -> Array:
     """Sphere centre from the least-squares ellipse through edges: the cone over it."""
-    model = EllipseModel.from_estimate(points_px)
+    model = EllipseModel.from_estimate(points_px)  # type: ignore[no-untyped-call]
     return sphere_from_rays(camera.rays(model.predict_xy(np.linspace(0.0, 2.0 * np.pi, 360))), radius_m)
 
 

@@ -71,7 +71,7 @@ def step_from(
         A = J.T @ (weight[:, None] * J)
         if not np.isfinite(A).all() or np.linalg.matrix_rank(A, tol=1e-12 * np.abs(A).max()) < 1:
             raise ImageError("an image without a mirror: there is no light across the outline")
-        move = np.linalg.lstsq(A, J.T @ (weight * fit.residual), rcond=1e-14)[0]
+        move = np.asarray(np.linalg.lstsq(A, J.T @ (weight * fit.residual), rcond=1e-14)[0], np.float64)
         left = fit.residual - J @ move
         trust = sector_weights(where, fit.weight, shift, left)
     scores = where.summed(J * (weight * left)[:, None])
