@@ -70,7 +70,7 @@ def test_exact_data_of_the_believed_rig_change_nothing() -> None:
 def test_covariance_by_simulation() -> None:
     """40 drawn rigs: chi2 of all parameters against their covariance, and the fit's own chi2, both chi-square sums.
 
-    False alarm rate 1e-4 each. A covariance 1.4 times too large or too small is noticed.
+    False alarm rate 1e-4 each. A covariance 1.7 times too large or too small (a sigma 1.3 times) is noticed.
     """
     rng, sigmas = np.random.default_rng(21), 0.3 * prior_sigmas()
     pulls, misfits, degrees = [], [], 0
@@ -85,8 +85,8 @@ def test_covariance_by_simulation() -> None:
     n = 40 * len(PARAMETERS)
     low, high = stats.chi2.ppf([5e-5, 1 - 5e-5], n)
     assert low < sum(pulls) < high
-    assert not low < sum(pulls) * 1.4 < high
-    assert not low < sum(pulls) / 1.4 < high
+    assert not low < sum(pulls) * 1.7 < high
+    assert not low < sum(pulls) / 1.7 < high
     assert stats.chi2.ppf(5e-5, degrees) < sum(misfits) < stats.chi2.isf(5e-5, degrees)
 
 

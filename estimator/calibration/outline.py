@@ -33,7 +33,7 @@ MIN_ARC = 0.5
 JPEG_SHIFT_PX, JPEG_SCATTER_PX, JPEG_ACROSS_PX = -0.014, 0.008, 0.016
 """By how much JPEG makes the outline's radius smaller, the scatter of that, and of the centre, pixels."""
 _COARSE_HALF_PX, _COARSE_STEPS = 8.0, 6
-_STEPS, _REST_M, _REST_SIGMAS = 30, 1e-7, 0.05
+_STEPS, _REST_M, _REST_SIGMAS, _UNREST_M = 30, 1e-7, 0.05, 1e-6
 _MIN_CONTRAST, _MAX_CONTRAST = 0.5, 1.6
 _BLUR_RANGE_PX2 = (0.02, 9.0)
 
@@ -157,11 +157,13 @@ def _settle(planes: tuple[Plane, ...], rig: Rig, s: Array, blur: float, half_px:
         if pixels is None or count <= 4:  # later the pixels stay, so that the steps come to rest
             pixels = band(planes, rig.camera, s, rig.mirror.radius_m, half_px)
         step = step_from(pixels, planes, rig, s, blur, SECTORS, half_px, jpeg)
-        s, blur = _moved(s, step.move[:3], rig), float(np.clip(blur + step.move[3], *_BLUR_RANGE_PX2))
-        rest = np.maximum(_REST_M, _REST_SIGMAS * np.sqrt(np.diag(step.covariance)[:3]))
-        if count > 4 and np.all(np.abs(step.move[:3]) < rest):
+        # weights that are cut off can take turns for ever: shorter steps end between them
+        move = step.move * min(1.0, 6.0 / count)
+        s, blur = _moved(s, move[:3], rig), float(np.clip(blur + move[3], *_BLUR_RANGE_PX2))
+        sigma = np.sqrt(np.diag(step.covariance)[:3])
+        if count > 4 and np.all(np.abs(move[:3]) < np.maximum(_REST_M, _REST_SIGMAS * sigma)):
             break
-    else:
+    if np.any(np.abs(move[:3]) > np.maximum(_UNREST_M, sigma)):
         raise ImageError("an image without a mirror: the fit of the outline does not come to rest")
     if not _MIN_CONTRAST < step.contrast < _MAX_CONTRAST:
         raise ImageError(
