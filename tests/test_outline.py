@@ -68,7 +68,7 @@ def test_plain_fits_are_biased(case) -> None:
     """The steepest place of the light is inside the limb: circle, ellipse and cone put the sphere 0.1 mm too far."""
     rig, light = case
     picture = grey(planes_of(light))
-    points, s = circle_edges(picture, hough(picture, believed(rig))), rig.sphere_in_camera_m
+    points, s = circle_edges(picture, hough(picture, believed(rig))[0]), rig.sphere_in_camera_m
     camera, R = rig.camera, rig.mirror.radius_m
     for found in (
         sphere_from_circle(plain_circle(points), camera, R),

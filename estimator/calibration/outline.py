@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from phibench.datasets.sensor_card import SensorCard
 from phibench.estimator.calibration.limb_image import ImageError, Plane, planes_of
 from phibench.estimator.calibration.outline_pixels import band
-from phibench.estimator.calibration.outline_start import grey, rough_outline
+from phibench.estimator.calibration.outline_start import grey, rough_outlines
 from phibench.estimator.calibration.outline_step import step_from
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, as_vector
@@ -98,10 +98,15 @@ def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) 
     """
     planes = planes_of(image, card)
     _require_size(planes[0].values, rig.camera)
-    start = rough_outline(grey(planes), rig)
-    if card is None or card.output != "mjpeg":
-        return fit_outline(planes, rig, start)
-    return without_jpeg(fit_outline(planes, rig, start, jpeg=True), rig)
+    jpeg, fault = card is not None and card.output == "mjpeg", ImageError("an image without a mirror")
+    for start in rough_outlines(grey(planes), rig):
+        try:
+            found = fit_outline(planes, rig, start, jpeg=jpeg)
+            return without_jpeg(found, rig) if jpeg else found
+        except ImageError as error:
+            # that it is cut says more than that the last circle tried was none
+            fault = fault if "cut by the frame" in str(fault) else error
+    raise fault
 
 
 def without_jpeg(found: Outline, rig: Rig) -> Outline:

@@ -6,6 +6,8 @@ outside. They are where the fit of the light across the limb starts, and what it
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy import ndimage
 from skimage.feature import canny
@@ -17,7 +19,8 @@ from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
-_BLOCK_PX = 4
+Circle = tuple[float, float, float]
+_BLOCK_PX, _CANDIDATES = 4, 6
 _RADII = (0.7, 1.4)  # of the believed rig's outline
 _TURNS = 360
 _SEARCH_PX = 12
@@ -37,35 +40,57 @@ def grey(planes: tuple[Plane, ...]) -> Array:
     return np.nan_to_num(picture / level)
 
 
-def rough_outline(picture: Array, rig: Rig) -> Array:
-    """Sphere centre in the camera frame, shape (3,), metres, to about a pixel of the outline.
+def rough_outlines(picture: Array, rig: Rig) -> Iterator[Array]:
+    """Sphere centres in the camera frame, shape (3,), metres, to about a pixel of the outline, the likeliest first.
+
+    Circles of tiles and lamps in the mirror may be stronger than the mirror's own; the fit of the light across them
+    tells which is which.
 
     Raises
     ------
     ImageError
         If no circle of about the expected size is found.
     """
-    points = circle_edges(picture, hough(picture, rig))
-    return sphere_from_rays(rig.camera.rays(points), rig.mirror.radius_m)
+    found = 0
+    for circle in [*hough(picture, rig), _believed(rig)]:
+        try:
+            points = circle_edges(picture, circle)
+        except ImageError:
+            continue
+        found += 1
+        yield sphere_from_rays(rig.camera.rays(points), rig.mirror.radius_m)
+    if not found:
+        raise ImageError(
+            "an image without a mirror: no circle of the outline's size has edges all around; check the picture, and "
+            "the rig's focal length, radius and distance"
+        )
 
 
-def hough(picture: Array, rig: Rig) -> tuple[float, float, float]:
-    """Centre (u, v) and radius of the strongest circle, to some pixels."""
+def hough(picture: Array, rig: Rig) -> list[Circle]:
+    """Centre (u, v) and radius of the strongest circles, to some pixels."""
     small = block_reduce(np.log(np.clip(picture, 1e-2, 1e2)), (_BLOCK_PX, _BLOCK_PX), np.mean)  # type: ignore[no-untyped-call]
     edges = canny(small, sigma=1.5)  # type: ignore[no-untyped-call]
-    outline = rig.outline_px()
-    believed = 0.5 * float(np.ptp(outline, axis=0).mean())
+    believed = _believed(rig)[2]
     radii = np.arange(_RADII[0] * believed / _BLOCK_PX, _RADII[1] * believed / _BLOCK_PX, 1.0).astype(int)
     if edges.sum() < _MIN_EDGES:
         raise ImageError("an image without a mirror: it has no edges")
     space = hough_circle(edges, radii, full_output=True)  # type: ignore[no-untyped-call]
-    best, v, u = np.unravel_index(int(np.argmax(space)), space.shape)
-    beyond = int(radii.max())  # by which full_output widens the picture
-    u_px, v_px = ((x - beyond + 0.5) * _BLOCK_PX - 0.5 for x in (int(u), int(v)))
-    return u_px, v_px, float(radii[best]) * _BLOCK_PX
+    beyond, circles = int(radii.max()), []  # by which full_output widens the picture
+    for _ in range(_CANDIDATES):
+        best, v, u = (int(i) for i in np.unravel_index(int(np.argmax(space)), space.shape))
+        u_px, v_px = ((x - beyond + 0.5) * _BLOCK_PX - 0.5 for x in (u, v))
+        circles.append((u_px, v_px, float(radii[best]) * _BLOCK_PX))
+        space[max(0, best - 2) : best + 3, max(0, v - 3) : v + 4, max(0, u - 3) : u + 4] = 0.0
+    return circles
 
 
-def circle_edges(picture: Array, circle: tuple[float, float, float]) -> Array:
+def _believed(rig: Rig) -> Circle:
+    outline = rig.outline_px()
+    u, v = outline.mean(axis=0)
+    return float(u), float(v), 0.5 * float(np.ptp(outline, axis=0).mean())
+
+
+def circle_edges(picture: Array, circle: Circle) -> Array:
     """Steepest places of the light on rays from the circle's centre, shape (n, 2), those that RANSAC keeps."""
     points = _steepest(picture, circle)
     if len(points) >= _MIN_EDGES:
@@ -75,19 +100,16 @@ def circle_edges(picture: Array, circle: tuple[float, float, float]) -> Array:
             again = _steepest(picture, (centre[0], centre[1], radius), reach_px=5)
             off = np.abs(np.linalg.norm(again - centre, axis=-1) - radius)
             return np.asarray(again[off < 2.0]) if (off < 2.0).sum() >= _MIN_EDGES else points[inliers]
-    raise ImageError(
-        "an image without a mirror: no circle of the outline's size has edges all around; check the picture, and the "
-        "rig's focal length, radius and distance"
-    )
+    raise ImageError("no circle has edges all around")
 
 
-def plain_circle(points_px: Array) -> tuple[float, float, float]:
+def plain_circle(points_px: Array) -> Circle:
     """Least-squares circle (u, v, radius) through edges, shape (n, 2), pixels."""
     model = CircleModel.from_estimate(points_px)  # type: ignore[no-untyped-call]
     return float(model.center[0]), float(model.center[1]), float(model.radius)
 
 
-def sphere_from_circle(circle: tuple[float, float, float], camera: Camera, radius_m: float) -> Array:
+def sphere_from_circle(circle: Circle, camera: Camera, radius_m: float) -> Array:
     """Sphere centre as the plain circle has it: its centre's ray, and |s| = R / sin(radius / f)."""
     u, v, radius = circle
     f = np.sqrt(camera.fx_px * camera.fy_px)
@@ -109,7 +131,7 @@ def sphere_from_rays(rays: Array, radius_m: float) -> Array:
     return np.asarray(x * cosine * radius_m / np.sqrt((1.0 - cosine) * (1.0 + cosine)))
 
 
-def _steepest(picture: Array, circle: tuple[float, float, float], reach_px: int = _SEARCH_PX) -> Array:
+def _steepest(picture: Array, circle: Circle, reach_px: int = _SEARCH_PX) -> Array:
     u0, v0, radius = circle
     turn = np.linspace(0.0, 2.0 * np.pi, _TURNS, endpoint=False)
     r = radius + np.arange(-reach_px - 1.0, reach_px + 1.5, 0.5)
