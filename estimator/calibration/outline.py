@@ -157,9 +157,8 @@ def _approach(planes: tuple[Plane, ...], rig: Rig, s: Array, blur: float) -> Arr
 
 
 def _settle(planes: tuple[Plane, ...], rig: Rig, s: Array, blur: float, half_px: float, jpeg: bool) -> Outline:
-    pixels = None
     for count in range(1, _STEPS + 1):
-        if pixels is None or count <= 4:  # later the pixels stay, so that the steps come to rest
+        if count <= 4:  # later the pixels stay, so that the steps come to rest
             pixels = band(planes, rig.camera, s, rig.mirror.radius_m, half_px)
         step = step_from(pixels, planes, rig, s, blur, SECTORS, half_px, jpeg)
         # weights that are cut off can take turns for ever: shorter steps end between them
