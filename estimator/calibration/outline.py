@@ -113,8 +113,7 @@ def without_jpeg(found: Outline, rig: Rig) -> Outline:
     """Outline of a JPEG frame, less what JPEG does to the limb, with the scatter of that in the covariance.
 
     JPEG cuts away the fine waves of the limb's light: the limb becomes wider and, its light being lopsided, moves.
-    Shift and scatter were
-    measured on frames of quality 85; docs/calibration.md has the numbers, and where they fail.
+    Shift and scatter were measured on frames of quality 85; docs/calibration.md has the numbers, and where they fail.
     """
     s, distance = found.sphere_in_camera_m, float(np.linalg.norm(found.sphere_in_camera_m))
     n, f_px = s / distance, float(np.sqrt(rig.camera.fx_px * rig.camera.fy_px))
