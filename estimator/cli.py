@@ -14,6 +14,7 @@ from cyclopts import App, CycloptsError
 
 from phibench.estimator import cli_methods
 from phibench.estimator.cli_bench import bench
+from phibench.estimator.cli_calibration import align, calibrate
 from phibench.estimator.cli_dataset import dataset
 from phibench.estimator.cli_misalignment import sensitivities
 from phibench.estimator.cli_score import compare, report, score
@@ -33,6 +34,8 @@ app.command(report)
 app.command(bench)
 register_sealed(app, dataset)
 app.command(sensitivities)
+app.command(calibrate)
+app.command(align)
 
 
 @app.command

@@ -103,7 +103,7 @@ def reflect_jacobian(view: View, uv_px: Array) -> ReflectionJacobian:
         hit = _first_hit(view, uv_px)
         status = _status(hit)
         d, P, n, cos_i, t = (x[..., None] for x in (hit.d, hit.P, hit.n, hit.cos_i, hit.t))
-        dd = _ray_jacobian(view.rig.camera, uv_px)
+        dd = ray_jacobian(view.rig.camera, uv_px)
         dt = -t * _dot(P, dd) / _dot(P, d)  # P stays on the sphere: P . dP = 0
         dP = t * dd + d * dt
         dn = dP / view.rig.mirror.radius_m
@@ -137,7 +137,7 @@ def _status(hit: _Hit) -> StatusArray:
     )
 
 
-def _ray_jacobian(camera: Camera, uv_px: Array) -> Array:
+def ray_jacobian(camera: Camera, uv_px: Array) -> Array:
     """Derivative of the unit camera ray by the pixel, shape (..., 3, 2)."""
     xy = camera.normalised(uv_px)
     J = camera.distort_jacobian(xy)

@@ -76,7 +76,7 @@ def strata_table(document: ScoreDocument) -> Table:
 def _starred(estimate: Estimate, factor: float, digits: int) -> str:
     """As `one_line`, with a star where there are too few samples for an interval."""
     value, rest = cell_parts(estimate, factor, digits)
-    return f"{value} *" if rest.startswith("(fewer") else f"{value} {rest}".strip()
+    return f"{value} *" if rest.startswith("(") else f"{value} {rest}".strip()
 
 
 def cause_table(documents: Sequence[ScoreDocument]) -> Table:

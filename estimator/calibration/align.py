@@ -1,0 +1,132 @@
+"""The paper's alignment: with the camera vertical, move the mirror sideways until its image is centred.
+
+The mirror stands right when its centre is on the vertical through the lens. The outline says where it is; what is
+believed of the camera's tilt and principal point says where the vertical is, and is usually the larger doubt.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, UnidentifiedImageError
+
+from phibench.datasets.files import write_bytes
+from phibench.datasets.sensor_card import SensorCard, sensor_card
+from phibench.estimator.calibration.limb_image import ImageError
+from phibench.estimator.calibration.outline import Outline, find_outline
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import Rig
+
+_ARROW_TIMES = 20.0  # the move is a few pixels: the picture draws it larger
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How to move the mirror.
+
+    Attributes
+    ----------
+    move_world_m : shape (3,), horizontal
+    move_camera_m : shape (3,), the same in the camera's axes: x to the right in the image, y down
+    move_px : shape (2,), by which the outline's centre will move
+    sigma_outline_m, sigma_m : float
+        Standard deviation along each horizontal axis: from the image alone, and with tilt and principal point.
+    outline : Outline
+    """
+
+    move_world_m: Array
+    move_camera_m: Array
+    move_px: Array
+    sigma_outline_m: float
+    sigma_m: float
+    outline: Outline = field(repr=False)
+
+
+def alignment(
+    image: NDArray[Any],
+    rig: Rig,
+    card: SensorCard | None = None,
+    tilt_sigma_rad: float = math.radians(0.1),
+    principal_point_sigma_px: float = 5.0,
+) -> Alignment:
+    """Find how far and in which direction the mirror must move.
+
+    Parameters
+    ----------
+    image, rig, card : see `outline.find_outline`
+    tilt_sigma_rad : float
+        How well the camera is known to be vertical, each axis.
+    principal_point_sigma_px : float
+        How well its principal point is known, each axis.
+    """
+    found = find_outline(image, rig, card)
+    s, R = found.sphere_in_camera_m, rig.T_world_camera.R
+    offset = R @ s
+    move = np.array([-offset[0], -offset[1], 0.0])
+    in_camera = R.T @ move
+    camera = rig.camera
+    move_px = camera.project(s + in_camera) - camera.project(s)
+    own = R @ found.covariance_m2 @ R.T
+    sigma_outline = float(np.sqrt(0.5 * (own[0, 0] + own[1, 1])))
+    doubt = math.hypot(tilt_sigma_rad, principal_point_sigma_px / camera.fx_px) * float(s[2])
+    return Alignment(move, in_camera, move_px, sigma_outline, math.hypot(sigma_outline, doubt), found)
+
+
+def read_picture(path: Path) -> tuple[NDArray[np.uint8], SensorCard]:
+    """Image, shape (H, W, 3), of a PNG or JPEG file, with the card of its kind.
+
+    Raises
+    ------
+    ImageError
+        If the file is no colour picture of 8 bits.
+    """
+    try:
+        with Image.open(path) as picture:
+            kind, mode = picture.format, picture.mode
+            pixels = np.asarray(picture.convert("RGB"))
+    except (UnidentifiedImageError, SyntaxError, EOFError) as error:
+        raise ImageError(f"{path} is not a picture: give a PNG or JPEG file of the camera") from error
+    if mode not in ("RGB", "RGBA") or kind not in ("PNG", "JPEG"):
+        raise ImageError(f"{path} is a {kind} file of mode {mode}: give the camera's colour frame as PNG or JPEG")
+    return pixels, sensor_card("mjpeg" if kind == "JPEG" else "srgb8")
+
+
+def write_alignment_picture(path: Path, image: NDArray[np.uint8], rig: Rig, found: Alignment) -> Path:
+    """Draw the outline, its centre, and the move, enlarged, into a copy of the image; PNG, written atomically."""
+    picture = Image.fromarray(np.ascontiguousarray(image))
+    draw = ImageDraw.Draw(picture)
+    rim = found.outline.rig(rig).outline_px(720)
+    draw.line([tuple(p) for p in np.vstack([rim, rim[:1]])], fill=(0, 255, 0), width=1)
+    u, v = rig.camera.project(found.outline.sphere_in_camera_m)
+    du, dv = _ARROW_TIMES * found.move_px
+    draw.ellipse((u - 3, v - 3, u + 3, v + 3), outline=(0, 255, 0))
+    draw.line((u, v, u + du, v + dv), fill=(255, 255, 0), width=2)
+    turn = math.atan2(dv, du)
+    for side in (-0.4, 0.4):
+        draw.line(
+            (u + du, v + dv, u + du - 10 * math.cos(turn + side), v + dv - 10 * math.sin(turn + side)),
+            fill=(255, 255, 0),
+            width=2,
+        )
+    buffer = io.BytesIO()
+    picture.save(buffer, format="PNG")
+    return write_bytes(path, buffer.getvalue())
+
+
+def in_words(found: Alignment) -> str:
+    """Return the instruction for the person at the rig."""
+    size = float(np.linalg.norm(found.move_world_m))
+    x, y = (1e3 * float(v) for v in found.move_world_m[:2])
+    right, down = (float(v) for v in found.move_px)
+    return (
+        f"move the mirror by {1e3 * size:.2f} mm (world x {x:+.2f} mm, y {y:+.2f} mm); in the image its outline moves "
+        f"{abs(right):.1f} px {'right' if right >= 0 else 'left'} and {abs(down):.1f} px "
+        f"{'down' if down >= 0 else 'up'}; standard deviation {1e3 * found.sigma_m:.2f} mm per axis, of which "
+        f"{1e3 * found.sigma_outline_m:.3f} mm are the image's"
+    )

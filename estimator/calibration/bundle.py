@@ -1,0 +1,270 @@
+"""All that is known of a rig in one least-squares fit: priors, the outline, the vertical, and spots at known places.
+
+The unknowns are the parameters of `parameters.PARAMETERS`, as deviations from the believed rig, and the world point of
+every calibration spot. The data:
+
+* the prior of every parameter (what the believed numbers are worth);
+* the sphere centre from an outline, 3 numbers. It was found with the believed camera and radius: a camera or radius
+  off by some per cent moves it, and the fit knows by how much (`_outline_shift`);
+* for every spot, 4 pixel coordinates, its distance D, and its azimuth and height where they were measured.
+
+Which are needed: a spot has 4 pixel coordinates for 3 unknowns, so that one of unknown azimuth and height and exact D
+leaves two conditions on the rig, D itself and the meeting of the rays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize
+
+from phibench.datasets.errors import DatasetError
+from phibench.estimator.calibration.parameters import PARAMETERS, changed, prior_sigmas, stroke_of
+from phibench.estimator.reflection import reflect, reflect_jacobian
+from phibench.estimator.triangulate import depth_exact
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import Rig, View
+
+_NEWTON = 3
+_WEAK = 0.9  # of the prior's variance: a direction that keeps so much was not measured
+
+
+@dataclass(frozen=True)
+class KnownSpot:
+    """A laser spot at a known distance, seen in both images.
+
+    Parameters
+    ----------
+    uv_down_px, uv_up_px : shape (2,)
+    covariance_down_px2, covariance_up_px2 : shape (2, 2)
+    stroke_m : float
+    depth_m, depth_sigma_m : float
+        D from the vertical through the sphere centre at the down position.
+    height_m, height_sigma_m : float
+        Above the floor of the world; an infinite sigma where it was not measured.
+    azimuth_rad, azimuth_sigma_rad : float
+        From the world's x axis, about the sphere centre; an infinite sigma where it was not measured.
+    """
+
+    uv_down_px: Array
+    uv_up_px: Array
+    covariance_down_px2: Array
+    covariance_up_px2: Array
+    stroke_m: float
+    depth_m: float
+    depth_sigma_m: float = 1e-3
+    height_m: float = 0.0
+    height_sigma_m: float = np.inf
+    azimuth_rad: float = 0.0
+    azimuth_sigma_rad: float = np.inf
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A sphere centre or a tilt that was measured, with its covariance."""
+
+    value: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A combination of parameters that the data do not tell apart.
+
+    Attributes
+    ----------
+    parts : dict of str to float
+        Share of each parameter, in units of its own prior sigma; those above 0.2.
+    remaining : float
+        Part of the prior's standard deviation that is left.
+    """
+
+    parts: dict[str, float]
+    remaining: float
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Result of the fit.
+
+    Attributes
+    ----------
+    rig : Rig
+        The believed rig with its parameters corrected. Stroke scale and offset are in `values`.
+    values, covariance : shape (p,), (p, p)
+        Deviations from the believed rig, in the order of `PARAMETERS`.
+    chi2, degrees : float, int
+    undetermined : directions with more than `_WEAK` of the prior's variance left, the weakest first
+    """
+
+    rig: Rig
+    values: Array
+    covariance: Array = field(repr=False)
+    chi2: float
+    degrees: int
+    undetermined: tuple[Direction, ...] = ()
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Standard deviations by name."""
+        return dict(zip(PARAMETERS, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    def stroke(self, nominal_m: Array) -> Array:
+        """Strokes with scale and offset applied, metres."""
+        return stroke_of(nominal_m, self.values)
+
+
+def calibrate(
+    believed: Rig,
+    outline: Measured | None = None,
+    spots: Sequence[KnownSpot] = (),
+    vertical: Measured | None = None,
+    sigmas: Array | None = None,
+) -> Bundle:
+    """Fit a rig.
+
+    Parameters
+    ----------
+    believed : Rig
+    outline : Measured, optional
+        Sphere centre in the camera frame, found with the believed camera and radius.
+    spots : sequence of KnownSpot
+    vertical : Measured, optional
+        The world's vertical in the camera frame, x and y of the unit vector, shape (2,).
+    sigmas : shape (p,), optional
+        Standard deviations of the believed numbers; 0 holds one. `prior_sigmas()` by default.
+
+    Raises
+    ------
+    DatasetError
+        If a spot is not seen in the believed rig, or the fit does not come to rest.
+    """
+    prior = prior_sigmas() if sigmas is None else np.asarray(sigmas, float)
+    free = np.flatnonzero(prior > 0.0)
+    problem = _Problem(believed, outline, tuple(spots), vertical, prior, free)
+    start = np.concatenate([np.zeros(free.size), *(_start(believed, spot) for spot in spots)])
+    found = optimize.least_squares(problem.residuals, start, x_scale="jac", xtol=1e-12, ftol=1e-12)
+    if not found.success or not np.isfinite(found.cost):
+        raise DatasetError(f"the calibration does not come to rest: {found.message}")
+    normal = found.jac.T @ found.jac
+    whole = np.linalg.inv(normal)
+    values, covariance = np.zeros(len(PARAMETERS)), np.zeros((len(PARAMETERS),) * 2)
+    values[free] = found.x[: free.size] * prior[free]
+    covariance[np.ix_(free, free)] = whole[: free.size, : free.size] * np.outer(prior[free], prior[free])
+    degrees = found.fun.size - found.x.size
+    weak = _undetermined(whole[: free.size, : free.size], [PARAMETERS[i] for i in free])
+    return Bundle(changed(believed, values), values, covariance, 2.0 * float(found.cost), degrees, weak)
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Residuals over their standard deviations. Unknowns: parameters over prior sigma, then points (x, y, z)."""
+
+    believed: Rig
+    outline: Measured | None
+    spots: tuple[KnownSpot, ...]
+    vertical: Measured | None
+    prior: Array
+    free: NDArray[np.intp]
+
+    def residuals(self, x: Array) -> Array:
+        values = np.zeros(len(PARAMETERS))
+        values[self.free] = x[: self.free.size] * self.prior[self.free]
+        rig = changed(self.believed, values)
+        parts = [x[: self.free.size]]
+        if self.outline is not None:
+            sphere = rig.sphere_in_camera_m - _outline_shift(self.believed, rig)
+            parts.append(_whitened(sphere - self.outline.value, self.outline.covariance))
+        if self.vertical is not None:
+            up = rig.T_world_camera.R.T[:2, 2]
+            parts.append(_whitened(up - self.vertical.value, self.vertical.covariance))
+        points = x[self.free.size :].reshape(-1, 3)
+        if self.spots:
+            parts.append(_spot_residuals(rig, values, self.spots, points))
+        return np.concatenate(parts)
+
+
+def _outline_shift(believed: Rig, true: Rig) -> Array:
+    """By how much an outline analysed with the believed camera and radius misses the true sphere centre, shape (3,).
+
+    The true outline's pixels, as the believed camera sees them, are a cone: its axis and its opening give the centre.
+    """
+    uv = true.outline_px(90)
+    rays = believed.camera.rays(uv)
+    x = np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0]  # n / cos a0
+    cosine = 1.0 / np.linalg.norm(x)
+    apparent = x * cosine * believed.mirror.radius_m / np.sqrt((1.0 - cosine) * (1.0 + cosine))
+    return np.asarray(true.sphere_in_camera_m - apparent)
+
+
+def _spot_residuals(rig: Rig, values: Array, spots: Sequence[KnownSpot], points: Array) -> Array:
+    """Pixels, and the finite ones of distance, height and azimuth, of all spots; points have the shape (K, 3)."""
+    strokes = stroke_of(np.array([spot.stroke_m for spot in spots]), values)
+    up_points = points - strokes[:, None] * np.array(rig.stroke_axis_world)
+    view, seen = rig.at(0.0), []
+    for where, name in ((points, "down"), (up_points, "up")):
+        found = np.array([getattr(spot, f"uv_{name}_px") for spot in spots], float)
+        covariance = np.array([getattr(spot, f"covariance_{name}_px2") for spot in spots], float)
+        off = (seen_at(view, where, found) - found)[..., None]
+        seen.append(np.linalg.solve(np.linalg.cholesky(covariance), off).ravel())
+    flat = points[:, :2] - view.sphere_centre_m[:2]
+    turn = np.arctan2(flat[:, 1], flat[:, 0]) - [spot.azimuth_rad for spot in spots]
+    known = np.stack(
+        [
+            np.hypot(flat[:, 0], flat[:, 1]) - [spot.depth_m for spot in spots],
+            points[:, 2] - [spot.height_m for spot in spots],
+            np.arctan2(np.sin(turn), np.cos(turn)),
+        ],
+        axis=-1,
+    )
+    sigma = np.array([(s.depth_sigma_m, s.height_sigma_m, s.azimuth_sigma_rad) for s in spots])
+    return np.concatenate([*seen, (known / sigma)[np.isfinite(sigma)]])
+
+
+def seen_at(view: View, points: Array, near_px: Array) -> Array:
+    """Pixels (K, 2) at which world points (K, 3) are seen in the mirror, by Newton's method from pixels nearby."""
+    uv = np.asarray(near_px, float)
+    for _ in range(_NEWTON):
+        ray, J = reflect(view, uv), reflect_jacobian(view, uv)
+        r, w = ray.direction_world, points - ray.origin_world_m
+        t = np.sum(w * r, axis=-1)[:, None, None]
+        # what is across the ray, seen along two of its normals
+        first = np.cross(r, np.where(np.abs(r[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]))
+        basis = np.stack([first, np.cross(r, first)], axis=-2)
+        slope = -basis @ (J.origin_m_per_px + t * J.direction_per_px)
+        uv = uv - np.linalg.solve(slope, basis @ w[..., None])[..., 0]
+    return uv
+
+
+def _start(rig: Rig, spot: KnownSpot) -> Array:
+    """World point where the believed rig's rays meet, moved to the known distance."""
+    estimate = depth_exact(rig, spot.stroke_m, np.asarray(spot.uv_down_px), np.asarray(spot.uv_up_px))
+    if not np.isfinite(estimate.depth_m):
+        raise DatasetError(
+            f"a calibration spot at ({spot.uv_down_px[0]:.1f}, {spot.uv_down_px[1]:.1f}) px has no depth with the "
+            "believed rig: its rays miss the mirror or do not meet; check the pixels and the rig"
+        )
+    point, centre = np.array(estimate.point_world_m), rig.at(0.0).sphere_centre_m
+    point[:2] = centre[:2] + (point[:2] - centre[:2]) * spot.depth_m / float(estimate.depth_m)
+    return point
+
+
+def _whitened(residual: Array, covariance: Array) -> Array:
+    return np.linalg.solve(np.linalg.cholesky(covariance), residual)
+
+
+def _undetermined(covariance: Array, names: Sequence[str]) -> tuple[Direction, ...]:
+    """Eigenvectors of the covariance in units of the prior, those with nearly all of its variance left."""
+    size, vectors = np.linalg.eigh(covariance)
+    weak = [i for i in np.argsort(-size) if size[i] > _WEAK]
+    parts = [{n: float(x) for n, x in zip(names, vectors[:, i], strict=True) if abs(x) > 0.2} for i in weak]
+    return tuple(Direction(part, float(np.sqrt(size[i]))) for part, i in zip(parts, weak, strict=True))
+
+
+def with_radius(measured: Measured, believed_m: float, other_m: float) -> Measured:
+    """An outline's centre for another radius: R and |s| scale together."""
+    factor = other_m / believed_m
+    return replace(measured, value=measured.value * factor, covariance=measured.covariance * factor**2)

@@ -1,0 +1,147 @@
+"""Calibration files: a rig's numbers with their covariance, and what they were made from. JSON, strict, versioned."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from phibench.datasets.codec import from_json, to_json
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.files import write_text
+from phibench.estimator.calibration.bundle import Bundle
+from phibench.estimator.calibration.parameters import PARAMETERS
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import Rig
+
+VERSION = 1
+
+
+class CalibrationError(DatasetError):
+    """A calibration that cannot be read or does not belong here; one sentence for the person at the terminal."""
+
+
+class CalibrationDocument(BaseModel):
+    """The file. `sha256` is that of all other fields, as compact JSON with sorted keys."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
+
+    kind: Literal["phibench calibration"]
+    version: int
+    parameters: list[str]
+    values: list[float]
+    covariance: list[list[float]]
+    rig: dict[str, Any]
+    believed_rig: dict[str, Any]
+    made_from: dict[str, Any]
+    chi2: float
+    degrees: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A calibrated rig.
+
+    Attributes
+    ----------
+    rig : Rig
+        Corrected; strokes are corrected by `parameters.stroke_of(stroke_m, values)`.
+    believed : Rig
+        What it was before.
+    parameters : tuple of str
+        Names of `values` and `covariance`: `PARAMETERS`.
+    values : shape (p,), deviations from the believed rig
+    covariance : shape (p, p)
+    made_from : what the file says of its images
+    """
+
+    rig: Rig
+    believed: Rig
+    parameters: tuple[str, ...]
+    values: Array = field(repr=False)
+    covariance: Array = field(repr=False)
+    made_from: dict[str, Any] = field(repr=False)
+
+
+def write_calibration(path: Path, bundle: Bundle, believed: Rig, made_from: dict[str, Any]) -> Path:
+    """Write a calibration, atomically; `made_from` says in JSON what it was made from."""
+    content = {
+        "kind": "phibench calibration",
+        "version": VERSION,
+        "parameters": list(PARAMETERS),
+        "values": bundle.values.tolist(),
+        "covariance": bundle.covariance.tolist(),
+        "rig": to_json(bundle.rig),
+        "believed_rig": to_json(believed),
+        "made_from": made_from,
+        "chi2": bundle.chi2,
+        "degrees": bundle.degrees,
+    }
+    return write_text(path, json.dumps({**content, "sha256": _digest(content)}, indent=1, allow_nan=False) + "\n")
+
+
+def read_calibration(path: str | Path, believed: Rig | None = None) -> Calibration:
+    """Read a calibration.
+
+    Parameters
+    ----------
+    path : path of the file
+    believed : Rig, optional
+        The rig that is to be corrected: the calibration must have started from it.
+
+    Raises
+    ------
+    CalibrationError
+        If the file is missing, of another version, damaged, or of another rig.
+    """
+    path = Path(path)
+    raw = _raw(path)
+    if raw.get("kind") != "phibench calibration":
+        raise CalibrationError(f"{path} is not a calibration: make one with `phibench calibrate`")
+    if raw.get("version") != VERSION:
+        raise CalibrationError(
+            f"{path} is a calibration of version {raw.get('version')}; this program reads version {VERSION}: "
+            "make it again with `phibench calibrate`"
+        )
+    document = _validated(path, raw)
+    p = len(PARAMETERS)
+    covariance, values = np.array(document.covariance), np.array(document.values)
+    if tuple(document.parameters) != PARAMETERS or covariance.shape != (p, p) or values.shape != (p,):
+        raise CalibrationError(f"{path} has other parameters than this program's {p}: make it again")
+    if document.sha256 != _digest({k: v for k, v in raw.items() if k != "sha256"}):
+        raise CalibrationError(f"{path} was changed after it was written: its hash does not fit; make it again")
+    start = from_json(Rig, document.believed_rig)
+    if believed is not None and to_json(believed) != to_json(start):
+        raise CalibrationError(f"{path} is the calibration of another rig than the one that it shall correct")
+    return Calibration(from_json(Rig, document.rig), start, PARAMETERS, values, covariance, document.made_from)
+
+
+def _raw(path: Path) -> dict[str, Any]:
+    try:
+        raw = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CalibrationError(f"cannot read the calibration {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise CalibrationError(f"{path} is not JSON: {error}") from error
+    if not isinstance(raw, dict):
+        raise CalibrationError(f"{path} is not a calibration: make one with `phibench calibrate`")
+    return raw
+
+
+def _validated(path: Path, raw: dict[str, Any]) -> CalibrationDocument:
+    try:
+        return CalibrationDocument.model_validate(raw)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise CalibrationError(f"{path} is damaged at {where}: {first['msg']}") from error
+
+
+def _digest(content: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

@@ -1,0 +1,194 @@
+"""Where the sphere is, from the image of its outline.
+
+The outline of a sphere under a pinhole is the cone of pixels with the angle a0 = asin(R / |s|) from s. `limb` gives the
+light across it; its level, and its slope along and across the limb, are free in every sector of the outline, and so is
+the blur. What is left is the centre s: Gauss-Newton with robust weights. The covariance is a sandwich over sectors,
+with the correlation of neighbours, because the room behind the limb and JPEG's blocks err over many pixels together.
+
+R and |s| scale together: the outline is that of every sphere with the same R / |s|. s is as wrong as R is:
+ds / s = dR / R. The camera's numbers are taken as exact, too; `bundle` puts their errors in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.datasets.sensor_card import SensorCard
+from phibench.estimator.calibration.limb_image import ImageError, Plane, planes_of
+from phibench.estimator.calibration.outline_pixels import band
+from phibench.estimator.calibration.outline_start import grey, rough_outlines
+from phibench.estimator.calibration.outline_step import step_from
+from phibench.scenes.camera import Camera
+from phibench.scenes.frames import Array, as_vector
+from phibench.scenes.rig import Rig
+
+HALF_WIDTH_PX = 5.0
+SECTORS = 120
+MIN_ARC = 0.5
+"""Part of the outline that must lie in the image."""
+JPEG_SHIFT_PX, JPEG_SCATTER_PX, JPEG_ACROSS_PX = -0.014, 0.008, 0.016
+"""By how much JPEG makes the outline's radius smaller, the scatter of that, and of the centre, pixels."""
+_COARSE_HALF_PX, _COARSE_STEPS = 8.0, 6
+_STEPS, _REST_M, _REST_SIGMAS, _UNREST_M = 30, 1e-7, 0.05, 1e-6
+_MIN_CONTRAST, _MAX_CONTRAST = 0.5, 1.6
+_BLUR_RANGE_PX2 = (0.02, 9.0)
+
+
+@dataclass(frozen=True)
+class Outline:
+    """What the outline says.
+
+    Attributes
+    ----------
+    sphere_in_camera_m : shape (3,), s
+    covariance_m2 : shape (3, 3)
+        For radius and camera as believed.
+    arc : float
+        Part of the outline that was used.
+    contrast : float
+        Fall of the light inside the limb over what the steel's reflectance gives; 1 for this mirror.
+    blur_px : float
+        Standard deviation of the lens's blur that was found.
+    residual : float
+        Robust standard deviation of the residuals over the light.
+    pixels, steps : int
+    """
+
+    sphere_in_camera_m: Array
+    covariance_m2: Array = field(repr=False)
+    arc: float
+    contrast: float
+    blur_px: float
+    residual: float
+    pixels: int
+    steps: int
+
+    @property
+    def sigma_m(self) -> Array:
+        """Standard deviations of s, shape (3,)."""
+        return np.sqrt(np.diag(self.covariance_m2))
+
+    def rig(self, believed: Rig) -> Rig:
+        """The believed rig with the sphere where its outline is."""
+        pose = replace(believed.T_camera_sphere, translation_m=as_vector(self.sphere_in_camera_m))
+        return replace(believed, T_camera_sphere=pose)
+
+
+def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) -> Outline:
+    """Sphere centre from an image of the mirror, from scratch.
+
+    Parameters
+    ----------
+    image : array
+        See `limb_image.planes_of`.
+    rig : Rig
+        Believed: its camera, radius, steel and blur are used; the outline is looked for with 0.7 to 1.4 times the
+        radius that the rig gives it, anywhere in the image.
+    card : SensorCard, optional
+        Of the image's preset; none for a layer.
+
+    Raises
+    ------
+    ImageError
+        For an image without a mirror, or with less than half of its outline.
+    """
+    planes = planes_of(image, card)
+    _require_size(planes[0].values, rig.camera)
+    jpeg, fault = card is not None and card.output == "mjpeg", ImageError("an image without a mirror")
+    for start in rough_outlines(grey(planes), rig):
+        try:
+            found = fit_outline(planes, rig, start, jpeg=jpeg)
+            return without_jpeg(found, rig) if jpeg else found
+        except ImageError as error:
+            # that it is cut says more than that the last circle tried was none
+            fault = fault if "cut by the frame" in str(fault) else error
+    raise fault
+
+
+def without_jpeg(found: Outline, rig: Rig) -> Outline:
+    """Outline of a JPEG frame, less what JPEG does to the limb, with the scatter of that in the covariance.
+
+    JPEG cuts away the fine waves of the limb's light: the limb becomes wider and, its light being lopsided, moves.
+    Shift and scatter were measured on frames of quality 85; docs/calibration.md has the numbers, and where they fail.
+    """
+    s, distance = found.sphere_in_camera_m, float(np.linalg.norm(found.sphere_in_camera_m))
+    n, f_px = s / distance, float(np.sqrt(rig.camera.fx_px * rig.camera.fy_px))
+    radius_px = f_px * rig.mirror.radius_m / distance
+    along, across = JPEG_SCATTER_PX * distance / radius_px, JPEG_ACROSS_PX * distance / f_px
+    own = along**2 * np.outer(n, n) + across**2 * (np.eye(3) - np.outer(n, n))
+    moved = s * (1.0 - JPEG_SHIFT_PX / radius_px)
+    return replace(found, sphere_in_camera_m=moved, covariance_m2=found.covariance_m2 + own)
+
+
+def fit_outline(
+    planes: tuple[Plane, ...], rig: Rig, start_m: Array, half_px: float = HALF_WIDTH_PX, jpeg: bool = False
+) -> Outline:
+    """As `find_outline`, from a start within some pixels of the outline; for JPEG frames without `without_jpeg`."""
+    s, blur = np.asarray(start_m, float), rig.camera.blur_sigma_px**2
+    s = _approach(planes, rig, s, blur)
+    arc = visible_arc(rig, s, half_px)
+    if arc < MIN_ARC:
+        raise ImageError(
+            f"a mirror cut by the frame: {100.0 * arc:.0f} % of its outline lie in the image, {100.0 * MIN_ARC:.0f} % "
+            "are needed; move the camera away from the mirror or centre it"
+        )
+    return _settle(planes, rig, s, blur, half_px, jpeg)
+
+
+def visible_arc(rig: Rig, s: Array, margin_px: float = 0.0) -> float:
+    """Part of the outline of a sphere at `s` that lies in the image, `margin_px` inside its border."""
+    moved = replace(rig, T_camera_sphere=replace(rig.T_camera_sphere, translation_m=as_vector(s)))
+    uv, camera = moved.outline_px(), rig.camera
+    low, high = margin_px - 0.5, np.array([camera.width_px, camera.height_px]) - 0.5 - margin_px
+    return float(np.mean(np.all((uv >= low) & (uv <= high), axis=-1)))
+
+
+def _approach(planes: tuple[Plane, ...], rig: Rig, s: Array, blur: float) -> Array:
+    """Come near with a wide band, whose pixels are chosen anew at every step."""
+    for _ in range(_COARSE_STEPS):
+        pixels = band(planes, rig.camera, s, rig.mirror.radius_m, _COARSE_HALF_PX)
+        step = step_from(pixels, planes, rig, s, blur, SECTORS // 2, _COARSE_HALF_PX)
+        s = _moved(s, step.move[:3], rig)
+    return s
+
+
+def _settle(planes: tuple[Plane, ...], rig: Rig, s: Array, blur: float, half_px: float, jpeg: bool) -> Outline:
+    for count in range(1, _STEPS + 1):
+        if count <= 4:  # later the pixels stay, so that the steps come to rest
+            pixels = band(planes, rig.camera, s, rig.mirror.radius_m, half_px)
+        step = step_from(pixels, planes, rig, s, blur, SECTORS, half_px, jpeg)
+        # weights that are cut off can take turns for ever: shorter steps end between them
+        move = step.move * min(1.0, 6.0 / count)
+        s, blur = _moved(s, move[:3], rig), float(np.clip(blur + move[3], *_BLUR_RANGE_PX2))
+        sigma = np.sqrt(np.diag(step.covariance)[:3])
+        if count > 4 and np.all(np.abs(move[:3]) < np.maximum(_REST_M, _REST_SIGMAS * sigma)):
+            break
+    if np.any(np.abs(move[:3]) > np.maximum(_UNREST_M, sigma)):
+        raise ImageError("an image without a mirror: the fit of the outline does not come to rest")
+    if not _MIN_CONTRAST < step.contrast < _MAX_CONTRAST:
+        raise ImageError(
+            f"an image without a mirror: across the outline found, the light falls by {step.contrast:.2f} times what "
+            f"polished steel gives; allowed is {_MIN_CONTRAST} to {_MAX_CONTRAST}"
+        )
+    arc = step.sectors_used / SECTORS
+    return Outline(s, step.covariance[:3, :3], arc, step.contrast, blur**0.5, step.residual, len(pixels.y), count)
+
+
+def _moved(s: Array, move: Array, rig: Rig) -> Array:
+    """Take a step of at most 3 mm; a centre that runs away is no mirror's."""
+    s = s + move * min(1.0, 3e-3 / max(float(np.abs(move).max()), 1e-12))
+    if not (np.isfinite(s).all() and s[2] > 1.02 * rig.mirror.radius_m):
+        raise ImageError("an image without a mirror: no outline of a sphere fits the light")
+    return s
+
+
+def _require_size(image: Array, camera: Camera) -> None:
+    if image.shape != (camera.height_px, camera.width_px):
+        raise ImageError(
+            f"an image of {image.shape[1]} x {image.shape[0]} pixels for a camera of {camera.width_px} x "
+            f"{camera.height_px}: give a whole frame of this camera"
+        )

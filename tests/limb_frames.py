@@ -1,0 +1,96 @@
+"""A sphere's limb in a made-up room, by plain ray casting: images for the tests of the outline. Not a test file.
+
+Other mathematics than the estimator's and no Mitsuba: rays through 3 x 3 points of every pixel near the outline are
+reflected in space and meet a ceiling with lamps and a slow pattern, or a wall; lens and pixel blur are the grid's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy import ndimage
+
+from phibench.scenes.frames import Pose, as_matrix, as_vector, rotation_xyz
+from phibench.scenes.rig import Rig
+
+FINE = 3
+REACH_PX = 12.0
+
+
+def drawn_rig(rng: np.random.Generator, blur_px: tuple[float, float] = (0.5, 1.0)) -> Rig:
+    """Centre 1 mm, tilt 0.5 deg, z_c 2 mm, f 0.3 %, principal point 5 px (standard deviations), blur uniform."""
+    n, rig = rng.standard_normal, Rig()
+    z, f = 0.262 + 0.002 * n(), 1430.0 * (1.0 + 0.003 * n())
+    camera = replace(
+        rig.camera,
+        fx_px=f,
+        fy_px=f,
+        cx_px=639.5 + 5.0 * n(),
+        cy_px=359.5 + 5.0 * n(),
+        blur_sigma_px=rng.uniform(*blur_px),
+        focus_distance_m=z - 0.03,
+    )
+    R = np.array(rotation_xyz(*(np.radians(0.5) * rng.standard_normal(2)), rng.uniform(0.0, 2.0 * np.pi)))
+    sphere = R.T @ np.array([1e-3 * n(), 1e-3 * n(), z])
+    pose = Pose("world", "camera", (0.0, 0.0, 0.45), as_matrix(R))
+    return replace(rig, camera=camera, T_world_camera=pose, T_camera_sphere=Pose("camera", "sphere", as_vector(sphere)))
+
+
+def limb_light(rig: Rig, rng: np.random.Generator, mean_e_per_s: float = 1.5e5, room=None) -> np.ndarray:
+    """Expected electrons per second, shape (3, H, W); away from the outline the room's mean level.
+
+    `room` is a function (points, directions) -> radiance; by default it is drawn from `rng`.
+    """
+    camera, size = rig.camera, (rig.camera.height_px, rig.camera.width_px)
+    radiance = room or _room(rng)
+    outline = rig.outline_px(4000)
+    mask = np.zeros(size, bool)
+    cells = np.rint(outline).astype(int)
+    cells = cells[np.all((cells >= 0) & (cells < [size[1], size[0]]), axis=-1)]
+    mask[cells[:, 1], cells[:, 0]] = True
+    ring = ndimage.distance_transform_edt(~mask) < REACH_PX
+    v, u = np.nonzero(np.kron(ring, np.ones((FINE, FINE), bool)))
+    uv = (np.stack([u, v], axis=-1) + 0.5) / FINE - 0.5
+    d = camera.rays(uv)
+    s, R = rig.sphere_in_camera_m, rig.mirror.radius_m
+    along = d @ s
+    gap2 = s @ s - along**2 - R * R  # squared distance of the ray from the sphere centre, less R^2
+    hit = gap2 < 0.0
+    t = along - np.sqrt(np.where(hit, -gap2, 0.0))
+    P = t[:, None] * d
+    normal = (P - s) / R
+    cosine = -np.sum(d * normal, axis=-1)
+    out = np.where(hit[:, None], d + 2.0 * cosine[:, None] * normal, d)
+    start = np.where(hit[:, None], P, 0.0)
+    light = radiance(start @ rig.T_world_camera.R.T + rig.T_world_camera.t, out @ rig.T_world_camera.R.T)
+    rows, columns = np.indices(size)
+    chief = camera.rays(np.stack([columns, rows], axis=-1).astype(float))
+    fall_off = chief[..., 2] ** 4
+    inside = chief @ s > np.sqrt(s @ s - R * R)  # the mirror's disc, roughly as bright as steel makes it
+    level = np.kron(np.where(inside, 0.67, 1.0), np.ones((FINE, FINE))).astype(np.float32)
+    planes = []
+    for nm, tint in zip(camera.detector.band_wavelength_nm, (1.0, 0.85, 0.45), strict=True):
+        fine = level.copy()
+        fine[v, u] = light * np.where(hit, rig.mirror.reflectance(np.where(hit, cosine, 1.0), nm), 1.0)
+        fine = ndimage.gaussian_filter(fine, FINE * camera.blur_sigma_px, mode="nearest", truncate=5.0)
+        planes.append(tint * mean_e_per_s * fall_off * fine.reshape(size[0], FINE, size[1], FINE).mean(axis=(1, 3)))
+    return np.array(planes, np.float32)
+
+
+def _room(rng: np.random.Generator):
+    """Radiance at (points, directions): a ceiling at 3 m with a slow pattern and some lamps, and walls."""
+    phase, wave = rng.uniform(0.0, 2.0 * np.pi, 4), rng.uniform(0.5, 2.0, 4)
+    lamps = rng.uniform(-3.0, 3.0, (5, 2))
+
+    def radiance(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        up = directions[:, 2]
+        with np.errstate(all="ignore"):
+            t = np.where(up > 0.05, (3.0 - points[:, 2]) / up, np.nan)
+        x, y = (points[:, i] + t * directions[:, i] for i in (0, 1))
+        slow = 1.0 + 0.05 * np.sin(wave[0] * x + phase[0]) + 0.05 * np.sin(wave[1] * y + phase[1])
+        for a, b in lamps:
+            slow = np.where((np.abs(x - a) < 0.6) & (np.abs(y - b) < 0.15), 4.0, slow)
+        return np.where(np.isfinite(t), slow, 0.7)
+
+    return radiance

@@ -1,0 +1,176 @@
+"""The outline's fit against images of known spheres, drawn by other mathematics (`limb_frames`)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from limb_frames import drawn_rig, limb_light
+from scipy import stats
+
+from phibench.datasets.sensor_card import sensor_card
+from phibench.estimator.calibration.limb_image import ImageError, planes_of, srgb_decoded, srgb_encoded
+from phibench.estimator.calibration.outline import find_outline, fit_outline, visible_arc
+from phibench.estimator.calibration.outline_start import (
+    circle_edges,
+    grey,
+    hough,
+    plain_circle,
+    sphere_from_circle,
+    sphere_from_ellipse,
+    sphere_from_rays,
+)
+from phibench.estimator.calibration.sectors import sandwich
+from phibench.render.chain import Chain
+from phibench.render.isp import demosaic, eight_bit
+from phibench.render.isp import srgb_encoded as srgb_of_the_camera
+from phibench.render.light import Light
+from phibench.render.sensor import sensor
+from phibench.render.tiles import NoiseStream
+from phibench.scenes.frames import Pose
+from phibench.scenes.rig import Rig
+
+
+def grey_room(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """A room whose light changes slowly with direction."""
+    return 1.0 + 0.1 * directions[:, 0] - 0.05 * directions[:, 1] * directions[:, 2]
+
+
+@pytest.fixture(scope="module")
+def case() -> tuple[Rig, np.ndarray]:
+    rng = np.random.default_rng(11)
+    rig = drawn_rig(rng)
+    return rig, limb_light(rig, rng, room=grey_room)
+
+
+@pytest.fixture(scope="module")
+def frames(case) -> dict[str, np.ndarray]:
+    rig, light = case
+    names = ("bayer-raw", "srgb8", "mjpeg")
+    return {name: Chain(sensor(name), 0, rig.camera).frame(Light(light), NoiseStream(("outline",))) for name in names}
+
+
+def believed(rig: Rig) -> Rig:
+    """What a user starts from: the mirror straight above, at about the right distance."""
+    return replace(rig, T_camera_sphere=Pose("camera", "sphere", (0.0, 0.0, 0.258)))
+
+
+def test_accuracy_from_scratch_on_light_without_noise(case) -> None:
+    """Targets 5 um across and 20 um along the axis; the 3 x 3 rays per pixel of the picture itself are good to 1 um."""
+    rig, light = case
+    error = find_outline(light, believed(rig)).sphere_in_camera_m - rig.sphere_in_camera_m
+    assert np.abs(error[:2]).max() < 1e-6
+    assert abs(error[2]) < 4e-6
+
+
+def test_plain_fits_are_biased(case) -> None:
+    """The steepest place of the light is inside the limb: circle, ellipse and cone put the sphere 0.1 mm too far."""
+    rig, light = case
+    picture = grey(planes_of(light))
+    points, s = circle_edges(picture, hough(picture, believed(rig))[0]), rig.sphere_in_camera_m
+    camera, R = rig.camera, rig.mirror.radius_m
+    for found in (
+        sphere_from_circle(plain_circle(points), camera, R),
+        sphere_from_ellipse(points, camera, R),
+        sphere_from_rays(camera.rays(points), R),
+    ):
+        assert found[2] - s[2] > 1e-4
+
+
+@pytest.mark.parametrize("preset", ["bayer-raw", "srgb8", "mjpeg"])
+def test_frames_within_their_covariance(case, frames, preset: str) -> None:
+    """Mahalanobis distance of 3 numbers, false alarm rate 1e-4; a centre 0.2 mm off is refused."""
+    rig = case[0]
+    found = find_outline(frames[preset], believed(rig), sensor_card(preset))
+    limit = stats.chi2.isf(1e-4, 3)
+
+    def distance(error: np.ndarray) -> float:
+        return float(error @ np.linalg.solve(found.covariance_m2, error))
+
+    error = found.sphere_in_camera_m - rig.sphere_in_camera_m
+    assert distance(error) < limit
+    assert distance(error + [0.0, 0.0, 2e-4]) > limit
+    assert found.sigma_m.max() < 3e-5
+    assert found.contrast == pytest.approx(1.0, abs=0.1)
+
+
+def test_radius_and_distance_scale_together(case) -> None:
+    rig, light = case
+    planes, s = planes_of(light), rig.sphere_in_camera_m
+    larger = replace(rig, mirror=replace(rig.mirror, radius_m=1.01 * rig.mirror.radius_m))
+    a, b = fit_outline(planes, rig, s + 1e-4), fit_outline(planes, larger, 1.01 * (s + 1e-4))
+    # the same cone; Fresnel's angle across the limb is the same too; 1e-7 m is where the steps come to rest
+    assert b.sphere_in_camera_m == pytest.approx(1.01 * a.sphere_in_camera_m, abs=1e-6)
+
+
+def test_an_image_without_a_mirror_is_refused() -> None:
+    rng = np.random.default_rng(12)
+    blocks = np.kron(rng.uniform(0.5, 2.0, (9, 16)), np.ones((80, 80)))
+    for image in (np.ones((3, 720, 1280)), np.zeros((3, 720, 1280)), rng.poisson(900.0, (3, 720, 1280)), [blocks] * 3):
+        with pytest.raises(ImageError, match="without a mirror"):
+            find_outline(np.asarray(image, float), Rig())
+
+
+def test_a_mirror_cut_by_the_frame(case) -> None:
+    """Moved up by 100 px, 70 % of the outline are left, which is enough; by 400 px, 40 %, which is not."""
+    rig, light = case
+    for shift, enough in ((100, True), (400, False)):
+        cut = np.roll(light, -shift, axis=1)
+        cut[:, -shift:] = np.median(light)
+        moved = replace(rig, camera=replace(rig.camera, cy_px=rig.camera.cy_px - shift))
+        assert (visible_arc(moved, rig.sphere_in_camera_m) > 0.5) is enough
+        if enough:
+            found = fit_outline(planes_of(cut), moved, rig.sphere_in_camera_m + 2e-4)
+            error = found.sphere_in_camera_m - rig.sphere_in_camera_m
+            assert np.abs(error).max() < 2e-5
+            assert found.arc < 0.85
+        else:
+            with pytest.raises(ImageError, match="cut by the frame"):
+                fit_outline(planes_of(cut), moved, rig.sphere_in_camera_m + 2e-4)
+
+
+def test_images_of_the_wrong_shape_are_refused() -> None:
+    with pytest.raises(ImageError, match="preset"):
+        planes_of(np.zeros((720, 1280, 3), np.uint8), sensor_card("bayer-raw"))
+    with pytest.raises(ImageError, match="whole frame"):
+        find_outline(np.ones((3, 72, 128)), Rig())
+
+
+def test_taps_are_the_cameras_demosaicing() -> None:
+    """A grey mosaic through the camera's processing gives the plane's taps times the mosaic, to 8-bit rounding."""
+    rng = np.random.default_rng(13)
+    mosaic = ndimage_smooth(rng.uniform(0.2, 0.5, (40, 60)))
+    image = eight_bit(srgb_of_the_camera(demosaic(mosaic)))
+    (plane,) = planes_of(image, sensor_card("srgb8"))
+    for v, u in ((10, 20), (11, 20), (10, 21), (11, 21)):
+        taps = plane.taps[2 * (v % 2) + u % 2]
+        assert sum(tap.weight for tap in taps) == pytest.approx(1.0)
+        model = sum(tap.weight * mosaic[v + tap.dv_px, u + tap.du_px] for tap in taps)
+        assert plane.values[v, u] == pytest.approx(model, abs=0.01)
+
+
+def ndimage_smooth(image: np.ndarray) -> np.ndarray:
+    from scipy import ndimage
+
+    return ndimage.gaussian_filter(image, 2.0)
+
+
+def test_srgb_curve_and_its_inverse() -> None:
+    x = np.linspace(0.0, 1.0, 1001)
+    assert srgb_decoded(srgb_encoded(x)) == pytest.approx(x, abs=1e-7)  # the standard's two branches meet to 1e-8
+    assert srgb_encoded(x) == pytest.approx(srgb_of_the_camera(x), abs=1e-7)
+
+
+def test_sandwich_knows_correlated_neighbours() -> None:
+    """Sum of 120 sectors whose errors are moving averages of 2: variance 2 x that of white ones less the edge terms.
+
+    2000 draws: a ratio of variances is good to sqrt(2 / 2000) = 3 %; accepted 0.8 to 1.1, Bartlett's weights taking
+    off 1/6. Without neighbours it would be 0.5.
+    """
+    rng = np.random.default_rng(14)
+    white = rng.standard_normal((2000, 120))
+    scores = (white + np.roll(white, 1, axis=1)) / np.sqrt(2.0)
+    true = np.var(scores.sum(axis=1))
+    stated = np.mean([sandwich(np.eye(1), row[:, None])[0, 0] for row in scores])
+    assert 0.75 < stated / true < 1.1
