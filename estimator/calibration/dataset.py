@@ -46,7 +46,7 @@ def calibrate_dataset(
     """
     dataset = open_dataset(folder)
     chosen = [dataset[name] for name in samples] or [dataset.samples[0]]
-    rig = _one_rig(dataset, chosen)
+    rig = _one_rig(chosen)
     if spots and preset != LAYERS:
         raise DatasetError(f"--spots with preset '{preset}': spots are found in noise-free layers only; leave one out")
     outlines = [_outline(sample, position, preset) for sample in chosen for position in POSITIONS]
@@ -68,18 +68,19 @@ def mean_outline(outlines: Sequence[Outline]) -> Measured:
     return Measured(mean, covariance * max(1.0, chi2 / degrees if degrees else 1.0))
 
 
-def _one_rig(dataset: Dataset, samples: Sequence[Sample]) -> Rig:
+def _one_rig(samples: Sequence[Sample]) -> Rig:
+    """The rig that is believed in; all samples must have one true rig."""
     names = sorted({sample.row.rig for sample in samples})
     if len(names) != 1:
         raise DatasetError(f"the samples have {len(names)} rigs ({', '.join(names[:4])}, ...): calibrate one at a time")
-    return dataset.rigs[names[0]]
+    return samples[0].nominal_rig
 
 
 def _outline(sample: Sample, position: str, preset: str) -> Outline:
     if preset == LAYERS:
-        return find_outline(sample.ambient(position), sample.rig)
+        return find_outline(sample.ambient(position), sample.nominal_rig)
     frame = sample.frame_source(preset).frame(position, 0, False)
-    return find_outline(frame.image, sample.rig, sensor_card(preset))
+    return find_outline(frame.image, sample.nominal_rig, sensor_card(preset))
 
 
 def _known(sample: Sample) -> KnownSpot:
@@ -90,7 +91,7 @@ def _known(sample: Sample) -> KnownSpot:
     C = SPOT_SIGMA_PX**2 * np.eye(2)
     depth = sample.row.depth_m
     return KnownSpot(
-        found["down"].uv_px, found["up"].uv_px, C, C, sample.row.stroke_m, depth, depth_sigma_m=DISTANCE_SIGMA_M
+        found["down"].uv_px, found["up"].uv_px, C, C, sample.row.nominal_stroke_m, depth, depth_sigma_m=DISTANCE_SIGMA_M
     )
 
 
