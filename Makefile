@@ -20,7 +20,7 @@ help:
 	@echo "make bench      $(SAMPLES) samples of bench-dev, all built-in methods on them, a report, in out/"
 	@echo "make test       the tests, without the slow ones"
 	@echo "make test-slow  the slow tests"
-	@echo "make proof      the slow tests of accuracy alone"
+	@echo "make proof      the slow tests of accuracy, but those of many minutes"
 	@echo "make test-all   all tests"
 	@echo "make benchmark  timings of what must be fast"
 	@echo "make lint       ruff and mypy"
@@ -63,7 +63,7 @@ test-slow: $(READY)
 	$(BIN)/python -m pytest -m slow
 
 proof: $(READY)
-	$(BIN)/python -m pytest -m slow -k accuracy
+	$(BIN)/python -m pytest -m "slow and not study" -k accuracy
 
 test-all: $(READY)
 	$(BIN)/python -m pytest

@@ -62,6 +62,7 @@ def test_accuracy_of_the_chain_in_short(cell: tuple[Sensor, float, float, float]
 
 
 @pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("cell", CELLS, ids=NAMES)
 def test_accuracy_of_the_chain(cell: tuple[Sensor, float, float, float]) -> None:
     """4000 draws: a standard error of 0.8 %."""
@@ -69,6 +70,7 @@ def test_accuracy_of_the_chain(cell: tuple[Sensor, float, float, float]) -> None
 
 
 @pytest.mark.slow
+@pytest.mark.study
 def test_accuracy_of_the_chain_limit_against_drawn_moments() -> None:
     """sRGB, 8 bit: bound of the model against slopes and covariance of 3000 drawn frames, position unknown alone.
 

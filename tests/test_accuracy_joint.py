@@ -20,25 +20,38 @@ POSITIONS, CAMERAS = 40, 100
 LEAST = 4.5  # standard deviations: a chance of 7e-6
 
 
-@pytest.mark.parametrize(
-    ("s", "depth_m", "stroke_m", "collected_e"),
-    [
-        pytest.param(MONO, 3.18, 0.425, 5000.0),
-        pytest.param(BAYER, 3.18, 0.425, 5000.0),
-        pytest.param(BAYER, 3.18, 0.425, 2000.0, marks=pytest.mark.slow),
-        pytest.param(BAYER, 1.0, 0.425, 5000.0, marks=pytest.mark.slow),
-        pytest.param(MONO, 4.18, 1.0, 2000.0, marks=pytest.mark.slow),
-        pytest.param(BAYER, 2.18, 1.2, 2000.0, marks=pytest.mark.slow),
-    ],
-    ids=lambda x: x.name if isinstance(x, Sensor) else f"{x:g}",
-)
-def test_accuracy_of_the_joint_fit(s: Sensor, depth_m: float, stroke_m: float, collected_e: float) -> None:
-    """Errors of D over the joint bound, whose rms is known to 1 / sqrt(2 n) = 1.1 %; 95 % intervals are printed.
+CELLS = [
+    (MONO, 3.18, 0.425, 5000.0),
+    (BAYER, 3.18, 0.425, 5000.0),
+    (BAYER, 3.18, 0.425, 2000.0),
+    (BAYER, 1.0, 0.425, 5000.0),
+    (MONO, 4.18, 1.0, 2000.0),
+    (BAYER, 2.18, 1.2, 2000.0),
+]
+NAMES = [f"{s.name}-{d:g}-{h:g}-{e:g}" for s, d, h, e in CELLS]
+
+
+@pytest.mark.parametrize("cell", CELLS[:2], ids=NAMES[:2])
+def test_accuracy_of_the_joint_fit_in_short(cell: tuple[Sensor, float, float, float]) -> None:
+    """480 draws: a standard deviation of 3 %."""
+    checked(*cell, 12)
+
+
+@pytest.mark.slow
+@pytest.mark.study
+@pytest.mark.parametrize("cell", CELLS, ids=NAMES)
+def test_accuracy_of_the_joint_fit(cell: tuple[Sensor, float, float, float]) -> None:
+    """4000 draws."""
+    checked(*cell, CAMERAS)
+
+
+def checked(s: Sensor, depth_m: float, stroke_m: float, collected_e: float, cameras: int) -> None:
+    """Errors of D over the joint bound, whose rms is known to 1 / sqrt(2 n), 1.1 % for 4000 draws; 95 % intervals are printed.
 
     The rms may be 5 % above the bound plus `LEAST` standard deviations (0.05), not below it by more than those; the
     joint fit is not worse than the midpoint of separate fits of the same draws; pulls have the standard deviation 1.
     """
-    pairs = drawn_pairs(s, depth_m, stroke_m, collected_e, 100.0, POSITIONS, CAMERAS)
+    pairs = drawn_pairs(s, depth_m, stroke_m, collected_e, 100.0, POSITIONS, cameras)
     joint, one, two = pairs.joint(), pairs.separate(pairs.down), pairs.separate(pairs.up)
     apart = depth_exact(RIG, stroke_m, one.uv_px, two.uv_px)
     bounds = pairs.down.bound_px2, pairs.up.bound_px2
@@ -56,7 +69,7 @@ def test_accuracy_of_the_joint_fit(s: Sensor, depth_m: float, stroke_m: float, c
         f"{ratio:.3f} +- {ratio * half:.3f}, separate {ratio_apart:.3f} +- {ratio_apart * half:.3f}; pull {pull:.3f} "
         f"+- {pull * half:.3f}; chi2 {np.mean(joint.chi2[good]):.3f}; n = {n}"
     )
-    assert n >= 0.995 * POSITIONS * CAMERAS
+    assert n >= 0.995 * POSITIONS * cameras
     assert (bound <= free * (1.0 + 1e-9)).all()
     spread = LEAST / np.sqrt(2.0 * n)
     assert 1.0 - spread <= ratio <= 1.05 + spread
@@ -65,5 +78,5 @@ def test_accuracy_of_the_joint_fit(s: Sensor, depth_m: float, stroke_m: float, c
     assert 0.95 - spread <= pull <= 1.05 + spread
     # chi^2 of one degree of freedom: mean 1, standard deviation sqrt(2 / n); faint spots add some per cent
     assert np.mean(joint.chi2[good]) == pytest.approx(1.0, abs=0.08 + LEAST * np.sqrt(2.0 / n))
-    # a bias of half a standard deviation in the same draws is rejected
-    assert not float(np.sqrt(np.mean((error + 0.6) ** 2))) <= 1.05 + spread
+    # a bias of 0.8 standard deviations in the same draws is rejected
+    assert not float(np.sqrt(np.mean((error + 0.8) ** 2))) <= 1.05 + spread

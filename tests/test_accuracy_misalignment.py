@@ -163,6 +163,7 @@ def test_accuracy_chief_ray_and_centroid_of_misaligned_rigs() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.study
 def test_accuracy_chief_ray_and_centroid_of_500_misaligned_rigs() -> None:
     """All parameters at once, to twice their study magnitudes: every visible view passes."""
     rng = np.random.default_rng(5)
