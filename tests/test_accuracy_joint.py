@@ -46,7 +46,7 @@ def test_accuracy_of_the_joint_fit(cell: tuple[Sensor, float, float, float]) -> 
 
 
 def checked(s: Sensor, depth_m: float, stroke_m: float, collected_e: float, cameras: int) -> None:
-    """Errors of D over the joint bound, whose rms is known to 1 / sqrt(2 n), 1.1 % for 4000 draws; 95 % intervals are printed.
+    """Errors of D over the joint bound: their rms is known to 1 / sqrt(2 n), 1.1 % for 4000 draws; intervals of 95 %.
 
     The rms may be 5 % above the bound plus `LEAST` standard deviations (0.05), not below it by more than those; the
     joint fit is not worse than the midpoint of separate fits of the same draws; pulls have the standard deviation 1.
