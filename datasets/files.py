@@ -9,6 +9,8 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+from phibench.datasets.errors import DatasetError
+
 TEMPORARY_PREFIX = ".phibench-tmp-"
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _NOT_ALLOWED = {errno.EACCES, errno.EPERM, errno.EROFS}
@@ -113,3 +115,20 @@ def _flush_folder(folder: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def require_writable(path: Path) -> None:
+    """Find out before long work whether a file can be written; its folder is made.
+
+    Raises
+    ------
+    DatasetError
+        If not.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise DatasetError(f"{path} cannot be written: {reason}; give another path") from error

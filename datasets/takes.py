@@ -77,7 +77,7 @@ def takes(dataset: Dataset, preset: str | None = None, draws: int | None = None)
     frames = dataset.recipe.frames
     if frames is None and preset is None:
         raise DatasetError(
-            f"{dataset.folder}: its recipe has no [frames] that names presets; name one, such as bayer-raw"
+            f"{dataset.folder}: its recipe has no [frames] that names presets; give one, such as --preset bayer-raw"
         )
     frames = frames or FramesTable()
     presets = frames.presets if preset is None else (preset,)

@@ -64,8 +64,10 @@ def compare(first: Path, second: Path, *, seed: Whole = 0) -> int:
 
     Parameters
     ----------
-    first, second
-        JSON files that `score --method --out` wrote, with their Parquet files beside them.
+    first
+        JSON file that `score --method --out` wrote, with its Parquet file beside it.
+    second
+        Another one, of the same pairs.
     seed
         Of the bootstrap that makes the intervals.
     """
@@ -80,8 +82,10 @@ def compare(first: Path, second: Path, *, seed: Whole = 0) -> int:
     console.print(comparison(differences, _distinct(first, a), _distinct(second, b)))
     if note := note_on_code(a, b):
         console.print(f"note: {note}", soft_wrap=True)
-    if all(item.better == "no difference shown" for item in differences):
-        console.print("No metric shows a difference: every interval holds 0.")
+    if all(item.better == "too few samples" for item in differences):
+        console.print(f"Too few samples for any interval: {a.rules['least_samples']:g} are the least.")
+    elif all(item.better in ("no difference shown", "too few samples") for item in differences):
+        console.print("No metric shows a difference: every interval that there is holds 0.")
     return 0
 
 
@@ -114,21 +118,28 @@ def _score_methods(
 ) -> int:
     from rich.console import Console
 
+    from phibench.datasets.files import require_writable
     from phibench.datasets.read import open_finished
     from phibench.estimator.bench.dataset_pairs import dataset_pairs
     from phibench.estimator.bench.document import MethodCard, write_score
     from phibench.estimator.bench.run_all import run_and_score
-    from phibench.estimator.bench.tables import cause_table, leaderboard, strata_table
+    from phibench.estimator.bench.tables import cause_table, leaderboard, silences, strata_table
     from phibench.estimator.seat.resolve import resolve
 
     files = _files(out, [MethodCard.of(name, **resolve(name).document()) for name in references])
+    for target in filter(None, files):
+        require_writable(target)
     pair_set = dataset_pairs(open_finished(directory), preset, draws, count, hints)
     scored = run_and_score(references, pair_set, workers, Console(stderr=True), "pairs", _seed(seed))
     console, documents = _console(), []
     for one, file in zip(scored, files, strict=True):
         documents.append(one.document if file is None else write_score(file, one.document, one.records))
     console.print(leaderboard(documents))
-    console.print(cause_table(documents))
+    if any(any(kind.values()) for document in documents for kind in document.causes.values()):
+        console.print(cause_table(documents))
+    for one in scored:
+        for line in silences(one.records):
+            console.print(f"{one.document.method.name}: {line}", soft_wrap=True, emoji=False, highlight=False)
     if len(documents) == 1:
         console.print(strata_table(documents[0]))
     for file in filter(None, files):

@@ -22,7 +22,7 @@ def register(app: App, dataset: App) -> None:
 def seal(directory: Path, *, out: Path, preset: str | None = None) -> int:
     """Write the frames of a data set without the truth, and a seal that says by hash which truth it was.
 
-    The truth goes into the data set's folder, as seal_<id>.truth.json: keep both to yourself until the end.
+    The truth goes into the data set's folder, as `seal_ID.truth.json`: keep both to yourself until the end.
 
     Parameters
     ----------
@@ -60,7 +60,11 @@ def submit(public: Path, *, method: str, out: Path, workers: Whole = 1) -> int:
     from phibench.estimator.bench.submission import submit as submit_method
 
     done = submit_method(public, method, out, workers)
-    print(f"{done.path}: {done.answered} of {done.pairs} pairs answered")
+    print(
+        f"{done.path}: {done.answered} of {done.pairs} pairs answered, {done.positions} of {2 * done.pairs} positions"
+    )
+    if done.silence:
+        print(f"most often without a position: {done.silence}")
     return 0
 
 
@@ -80,12 +84,18 @@ def unseal(public: Path, *, truth: Path, submission: Path, out: Path | None = No
     """
     from rich.console import Console
 
+    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.files import require_writable
     from phibench.estimator.bench.document import write_score
     from phibench.estimator.bench.rules import Rules
     from phibench.estimator.bench.score_method import score_outcomes
     from phibench.estimator.bench.tables import cause_table, leaderboard
     from phibench.estimator.bench.unseal import unseal as unseal_set
 
+    if out is not None:
+        if out.suffix != ".json":
+            raise DatasetError(f"--out {out}: a score is a JSON file; give a name that ends in .json")
+        require_writable(out)
     opened = unseal_set(public, truth, submission)
     print(f"seal {opened.seal.id}: the truth is the sealed one, the submission has each of {opened.seal.pairs} pairs")
     scored = score_outcomes(opened.submission.method, opened.pairs, opened.outcomes, Rules())

@@ -45,7 +45,7 @@ _MAY_DIFFER = ("pairs", "samples", "hinted", "provenance")
 
 _NOTHING = Estimate(np.nan, np.nan, np.nan, "no record counts for both")
 
-Verdict = Literal["first", "second", "no difference shown"]
+Verdict = Literal["first", "second", "no difference shown", "too few samples"]
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,8 @@ class Difference:
         Values over the records that count for both.
     difference : Estimate
     n, samples : int
-    better : "first", "second" or "no difference shown"
-        Which is better; only if the interval of the difference excludes 0.
+    better : "first", "second", "no difference shown" or "too few samples"
+        Which is better, only if the interval of the difference excludes 0; or that there is no interval.
     """
 
     name: str
@@ -150,7 +150,7 @@ def _difference(name: str, a: pl.DataFrame, b: pl.DataFrame, rules: Rules, *stre
     a, b = a.filter(both), b.filter(both)
     clusters = Clusters.of(a["sample_code"].to_numpy())
     if clusters.n == 0:
-        return Difference(name, np.nan, np.nan, _NOTHING, 0, 0, "no difference shown")
+        return Difference(name, np.nan, np.nan, _NOTHING, 0, 0, "too few samples")
     ours, theirs = (statistic_of(metric, clusters, table) for table in (a, b))
     everything = np.ones((1, clusters.n))
     (drawn,) = estimates([_minus(theirs, ours)], clusters.n, rules, generator(*stream, name))
@@ -171,6 +171,8 @@ def _minus(second: Statistic, first: Statistic) -> Statistic:
 
 
 def _verdict(metric: Metric, difference: Estimate) -> Verdict:
+    if not (np.isfinite(difference.low) and np.isfinite(difference.high)):
+        return "too few samples"
     if metric.better == "none" or not (difference.low > 0.0 or difference.high < 0.0):
         return "no difference shown"
     second_is_lower = difference.high < 0.0

@@ -12,6 +12,7 @@ from pathlib import Path
 from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.files import require_writable
 from phibench.datasets.progress import Steps
 from phibench.datasets.read import Dataset, open_finished
 from phibench.estimator.bench.dataset_pairs import DatasetPairs, dataset_pairs
@@ -68,6 +69,7 @@ def bench(
     console, chosen = console or Console(stderr=True), _chosen(METHODS, methods)
     if out.resolve() == dataset.folder.resolve() or dataset.folder.resolve() in out.resolve().parents:
         raise DatasetError(f"{out} lies inside the data set, whose files are signed; give a folder outside, --out")
+    require_writable(out / REPORT)
     scores, notes = [], []
     for preset in _presets(dataset):
         taken = dataset_pairs(dataset, preset, pairs=pairs)

@@ -65,11 +65,13 @@ class Submission(Document):
 
 @dataclass(frozen=True)
 class Submitted:
-    """What `submit` wrote, and how many pairs have an answer."""
+    """What `submit` wrote; pairs with an answer, images with a position, and what most of the others have instead."""
 
     path: Path
     pairs: int
     answered: int
+    positions: int
+    silence: str
 
 
 def submit(public: str | Path, method: str, out: str | Path, workers: int = 1) -> Submitted:
@@ -97,7 +99,12 @@ def submit(public: str | Path, method: str, out: str | Path, workers: int = 1) -
     document = submission(pairs.seal, found, outcomes)
     check_complete(document, pairs.seal, "the run")
     write_text(out, json.dumps(document.model_dump(mode="json"), indent=1, allow_nan=False) + "\n")
-    return Submitted(out, len(outcomes), sum(outcome.answer is not None for outcome in outcomes))
+    spots = [spot for o in outcomes if o.answer is not None for spot in (o.answer.down, o.answer.up)]
+    silent = Counter([f"{o.failure}: {o.message}" for o in outcomes if o.answer is None])
+    silent.update(spot.status for spot in spots if spot.uv_px is None)
+    positions = sum(spot.uv_px is not None for spot in spots)
+    answered = sum(outcome.answer is not None for outcome in outcomes)
+    return Submitted(out, len(outcomes), answered, positions, "".join(text for text, _ in silent.most_common(1)))
 
 
 def submission(seal: Seal, method: Reference, outcomes: Sequence[Outcome]) -> Submission:

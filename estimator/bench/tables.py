@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import polars as pl
 from rich.table import Table
+from rich.text import Text
 
 from phibench.estimator.bench.bootstrap import Estimate
 from phibench.estimator.bench.compare import Difference
@@ -55,7 +57,8 @@ def leaderboard(documents: Sequence[ScoreDocument]) -> Table:
 def strata_table(document: ScoreDocument) -> Table:
     """One line per stratum of one method."""
     least = round(document.rules["least_samples"])
-    grid = Table(title=f"{document.method.name}: strata", caption=f"*: fewer than {least} samples, no interval")
+    title = Text(f"{document.method.name}: strata")  # a string would be searched for emoji
+    grid = Table(title=title, caption=f"*: fewer than {least} samples, no interval")
     for head in ("by", "stratum", "images", "found %", "rms px", "median px", "rms phi mrad", "rms D %", "efficiency"):
         grid.add_column(head, justify="left" if head in ("by", "stratum") else "right", no_wrap=True)
     for stratum in document.strata:
@@ -92,9 +95,17 @@ def cause_table(documents: Sequence[ScoreDocument]) -> Table:
     return grid
 
 
+def silences(records: pl.DataFrame, count: int = 3) -> list[str]:
+    """What a method or the harness said most often where there is no position, one line each."""
+    words = pl.when(pl.col("message") != "").then(pl.col("failure") + ": " + pl.col("message"))
+    said = records.filter(pl.col("u_px").is_null()).with_columns(words=words.otherwise(pl.col("status")))
+    most = said.group_by("words").len().sort("len", "words", descending=[True, False]).head(count)
+    return [f"{number} of {len(records)} images without a position: {text}" for text, number in most.rows()]
+
+
 def comparison(differences: Sequence[Difference], first: str, second: str) -> Table:
     """One line per metric: both values, the difference with its interval, and which is better if that is shown."""
-    grid = Table(title=f"second - first, over what both have; first: {first}, second: {second}")
+    grid = Table(title=Text(f"second - first, over what both have; first: {first}, second: {second}"))
     for head in ("metric", "unit", "first", "second", "difference", "n", "samples", "better"):
         grid.add_column(head, justify="left" if head in ("metric", "better") else "right")
     for item in differences:

@@ -86,5 +86,5 @@ def _owner(point: EntryPoint) -> str:
 def _unknown(name: str) -> str:
     known = [*KNOWN, *(point.name for point in installed())]
     guess = close_names(name, known)
-    advice = f"did you mean '{guess[0]}'?" if guess else "`phibench methods` lists what there is"
+    advice = f"did you mean '{guess[0]}'?" if guess else "`phibench methods` lists what there is."
     return f"no method '{name}': {advice} A method of your own is given as file and function, my_phi.py:extract"
