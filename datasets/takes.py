@@ -24,6 +24,7 @@ from phibench.scenes.streams import Name, generator
 
 BOX_MARGIN_PX = 4
 """A hinted spot is at least this far from the edges of its box."""
+PRESETS = ("mono-raw", "bayer-raw", "srgb8", "mjpeg")
 _CAMERAS = 2**31
 
 
@@ -56,6 +57,11 @@ class Take:
     laser_off: bool
     boxes: tuple[Region, Region] | None
     distractors: tuple[int, ...]
+
+    @property
+    def exposure_number(self) -> int:
+        """Draw of `FrameSource.frames`: another one in each preset, or JPEG frames would have a raw twin's noise."""
+        return self.draw * len(PRESETS) + PRESETS.index(self.preset)
 
 
 def takes(dataset: Dataset, preset: str | None = None, draws: int | None = None) -> tuple[Take, ...]:
@@ -91,8 +97,8 @@ def takes(dataset: Dataset, preset: str | None = None, draws: int | None = None)
 def _of_sample(sample: Sample, frames: FramesTable, presets: tuple[str, ...], draws: int) -> Iterator[Take]:
     lights = present(sample.stream_names, sample.dataset.recipe.distractors)
     requests = {preset: _request(sample, frames, preset) for preset in presets}
+    boxes = _boxes(sample, frames)
     for draw in range(draws):
-        boxes = _boxes(sample, frames, draw)
         for preset, request in requests.items():
             yield Take(0, sample.row.sample_id, preset, draw, request, frames.laser_off, boxes, lights)
 
@@ -123,18 +129,19 @@ def _camera_seed(sample: Sample, frames: FramesTable) -> int:
     return int(generator(name, seed, "take", "camera", *owner).integers(_CAMERAS))
 
 
-def _boxes(sample: Sample, frames: FramesTable, draw: int) -> tuple[Region, Region] | None:
-    if _generator(sample, "hint", draw).random() >= frames.hint:
+def _boxes(sample: Sample, frames: FramesTable) -> tuple[Region, Region] | None:
+    """One pair of boxes for all takes of a sample: of several, the overlap would tell where the spot is."""
+    if _generator(sample, "hint").random() >= frames.hint:
         return None
-    down, up = (_box(sample, position, frames.hint_box_px, draw) for position in POSITIONS)
+    down, up = (_box(sample, position, frames.hint_box_px) for position in POSITIONS)
     return down, up
 
 
-def _box(sample: Sample, position: str, side_px: int, draw: int) -> Region:
+def _box(sample: Sample, position: str, side_px: int) -> Region:
     """Box that holds the spot anywhere with the same probability, as far as the image has room for it."""
     camera, row = sample.rig.camera, sample.truth_row(position)
     sizes = camera.width_px, camera.height_px
-    random = _generator(sample, "box", position, draw)
+    random = _generator(sample, "box", position)
     place = (row.u_px, row.v_px) if has_place(row, (camera.height_px, camera.width_px)) else (None, None)
     u, v = (_start(random, centre, side_px, size) for centre, size in zip(place, sizes, strict=True))
     return Region(u, v, u + min(side_px, sizes[0]), v + min(side_px, sizes[1]))

@@ -14,7 +14,7 @@ from scipy.linalg import cholesky, solve_triangular
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.bench.records import COLUMNS, records
 from phibench.estimator.bench.rules import MATCH_PX, Rules
-from phibench.estimator.phi import outline_circle
+from phibench.estimator.phi import CONVENTIONS, outline_circle
 from phibench.estimator.seat.outcome import Outcome
 from phibench.estimator.seat.pair import Answer, Spot
 from phibench.estimator.triangulate import depth_exact
@@ -63,18 +63,20 @@ def test_a_covariance_that_is_none_gives_no_pull(claim):
     assert down["detected"]
 
 
-def test_the_method_s_own_phi_is_compared_in_its_own_sense():
+def test_the_method_s_own_phi_is_compared_in_its_own_sense_and_in_units_of_ray():
+    """0.01 px outwards is the same error in every sense: that of phi_ray, to the curvature (0.01 / 339 px, 1e-3)."""
     t = cases(1).truths[0]
-    for convention, true in t.down.phi_rad.items():
-        down, up = one(Answer(Spot(t.down.uv_px, None, true + 1e-3, convention), Spot(t.up.uv_px)))
+    view, centre = RIG.at(0.0), outline_circle(RIG)[0]
+    uv = np.array(t.down.uv_px)
+    moved = uv + 0.01 * (uv - centre) / np.linalg.norm(uv - centre)
+    expected = float(CONVENTIONS["ray"](view, moved)) - t.down.phi_rad["ray"]
+    assert abs(expected) > 1e-5
+    for convention, phi in CONVENTIONS.items():
+        answer = Spot(t.down.uv_px, None, float(phi(view, moved)), convention)
+        down, up = one(Answer(answer, Spot(t.up.uv_px)))
         assert down["phi_convention"] == convention
-        assert down["phi_error_rad"] == pytest.approx(1e-3, rel=1e-9)
+        assert down["phi_error_rad"] == pytest.approx(expected, rel=1e-3)
         assert (up["phi_convention"], abs(up["phi_error_rad"]) < 1e-12) == ("ray", True)
-    # asin(r / r_outline) has no truth at the mirror: it is compared with itself at the true pixel
-    centre, radius = outline_circle(RIG)
-    outline = np.arcsin(np.linalg.norm(np.array(t.down.uv_px) - centre) / radius)
-    down, _ = one(Answer(Spot(t.down.uv_px, None, float(outline) - 2e-3, "outline"), NOTHING))
-    assert down["phi_error_rad"] == pytest.approx(-2e-3, rel=1e-6)
 
 
 def test_a_phi_in_the_wrong_sense_is_an_error():

@@ -160,7 +160,7 @@ def test_hints_come_as_often_as_the_recipe_says(bench_dataset: Path) -> None:
 
 def test_a_data_set_without_the_table_needs_a_preset(tiny_dataset: Path) -> None:
     dataset = open_dataset(tiny_dataset)
-    with pytest.raises(DatasetError, match=r"no \[frames\] that names presets; name one"):
+    with pytest.raises(DatasetError, match=r"no \[frames\] that names presets; give one"):
         takes(dataset)
     [first, *_] = takes(dataset, "mjpeg")
     assert (first.preset, first.boxes, first.laser_off, first.distractors) == ("mjpeg", None, True, ())

@@ -74,7 +74,7 @@ class DatasetPairs:
     def pair_and_frames(self, number: int) -> tuple[Pair, Frames]:
         """What a method sees, and the frames behind it, with the camera's JPEG files."""
         take, sample, source = self._drawn_from(number)
-        frames = source.frames(take.draw, laser_off=take.laser_off)
+        frames = source.frames(take.exposure_number, laser_off=take.laser_off)
         images = {name: _sealed(frame.image) for name, frame in frames.by_name.items()}
         boxes = (None, None) if take.boxes is None else tuple(map(_box, take.boxes))
         card, (box_down, box_up) = card_of(source.sides["down"].chain.sensor), boxes

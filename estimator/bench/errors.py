@@ -7,11 +7,12 @@ position.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from phibench.estimator.phi import CONVENTIONS, estimate_phi, outline_circle
+from phibench.estimator.phi import CONVENTIONS, GRADIENTS, estimate_phi, outline_circle
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
@@ -90,3 +91,18 @@ def whitened(error_px: Array, covariance_px2: Array) -> Array:
         l22 = np.sqrt(C[:, 1, 1] - l21**2)
         first = error_px[:, 0] / l11
         return np.stack([first, (error_px[:, 1] - l21 * first) / l22], axis=-1)
+
+
+def in_ray_units(rig: Rig, uv_px: Array, conventions: Sequence[str]) -> Array:
+    """d phi_ray / d phi of each sense, shape (n,), at pixels (n, 2): a pixel off is then one error in all senses.
+
+    Along the gradient of the other sense: (g_ray . g) / (g . g).
+    """
+    view, factor = rig.at(0.0), np.ones(len(uv_px))
+    named = np.array(conventions)
+    for sense in sorted(set(conventions) - {"ray"}):
+        chosen = named == sense
+        with np.errstate(all="ignore"):
+            g, ray = (GRADIENTS[name](view, uv_px[chosen]) for name in (sense, "ray"))
+            factor[chosen] = np.sum(g * ray, axis=-1) / np.sum(g * g, axis=-1)
+    return factor

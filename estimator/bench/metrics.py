@@ -28,7 +28,7 @@ from phibench.estimator.bench.bootstrap import (
     rms_ratio_of,
 )
 from phibench.estimator.bench.rates import rate
-from phibench.estimator.bench.rules import Rules
+from phibench.estimator.bench.rules import MATCH_PX, Rules
 from phibench.scenes.frames import Array
 from phibench.scenes.streams import Name, generator
 
@@ -38,6 +38,9 @@ Better = Literal["lower", "higher", "none"]
 Kind = Literal["rate", "mean", "rms", "rms of each", "median", "p95", "efficiency", "deviation"]
 _DOWN, _DETECTED = pl.col("image") == "down", pl.col("detected")
 _FOUND = _DOWN & pl.col("depth_found")
+# where the bound is not small against what counts as found, the cut at `match_px` makes errors smaller than the bound
+_SHARP = pl.col("bound_px2") < (MATCH_PX / 3.0) ** 2
+_DEEP = pl.col("bound_depth_m2").sqrt() < 0.1 * pl.col("depth_m")
 
 FAMILIES: dict[str, pl.Expr] = {
     "image": pl.lit(True),
@@ -45,13 +48,13 @@ FAMILIES: dict[str, pl.Expr] = {
     "detected": _DETECTED,
     "radial": _DETECTED & pl.col("radial_px").is_not_null(),
     "phi": _DETECTED & pl.col("phi_error_rad").is_not_null(),
-    "phi bound": _DETECTED & pl.col("phi_error_rad").is_not_null() & pl.col("bound_phi_rad2").is_not_null(),
-    "bound": _DETECTED & pl.col("bound_px2").is_not_null(),
-    "raw bound": _DETECTED & pl.col("raw_bound_px2").is_not_null(),
+    "phi bound": _DETECTED & pl.col("phi_error_rad").is_not_null() & pl.col("bound_phi_rad2").is_not_null() & _SHARP,
+    "bound": _DETECTED & pl.col("bound_px2").is_not_null() & _SHARP,
+    "raw bound": _DETECTED & pl.col("raw_bound_px2").is_not_null() & _SHARP,
     "pull": _DETECTED & pl.col("pull_u").is_not_null(),
     "pair": _DOWN & pl.col("pair_visible"),
     "depth": _FOUND,
-    "depth bound": _FOUND & pl.col("bound_depth_m2").is_not_null(),
+    "depth bound": _FOUND & pl.col("bound_depth_m2").is_not_null() & _DEEP,
     "depth pull": _FOUND & pl.col("depth_pull").is_not_null(),
     "timed": _DOWN & pl.col("seconds").is_not_null(),
 }
@@ -63,14 +66,14 @@ WHY_EMPTY = {
     "detected": "no spot detected",
     "radial": "no spot detected off the centre",
     "phi": "no detected spot has a phi",
-    "phi bound": "no bound for these images",
-    "bound": "no bound for these images",
-    "raw bound": "no bound for these images",
+    "phi bound": "no bound for these images, or none below a third of 3 px",
+    "bound": "no bound for these images, or none below a third of 3 px",
+    "raw bound": "no bound for these images, or none below a third of 3 px",
     "pull": "no covariance claimed",
     "visible": "no visible spot",
     "pair": "no pair with both spots visible",
     "depth": "no depth found",
-    "depth bound": "no bound for these images",
+    "depth bound": "no bound for these images, or none below a third of 3 px",
     "depth pull": "no uncertainty of depth claimed",
     "timed": "no pair came back",
     "image": "no image",

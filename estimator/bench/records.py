@@ -63,7 +63,7 @@ COLUMNS: dict[str, str] = {
     "phi_convention": "ray, normal, incidence or outline",
     "phi_rad": "the method's, else estimator.phi of its pixel through the believed rig",
     "phi_true_rad": "truth in that convention; outline: estimator.phi of the true pixel through the true rig",
-    "phi_error_rad": "phi_rad - phi_true_rad",
+    "phi_error_rad": "phi_rad - phi_true_rad, in units of phi_ray: times d phi_ray / d phi along the gradient",
     "pull_u": "first component of L^-1 e, C = L L^T the claimed covariance",
     "pull_v": "second component",
     "mahalanobis2": "e^T C^-1 e",
@@ -214,7 +214,7 @@ def _phi_columns(
         "phi_convention": [c if np.isfinite(x) else None for c, x in zip(convention, phi, strict=True)],
         "phi_rad": phi,
         "phi_true_rad": truth,
-        "phi_error_rad": phi - truth,
+        "phi_error_rad": (phi - truth) * errors.in_ray_units(true, xy, convention),
     }
 
 

@@ -21,6 +21,7 @@ from phibench.datasets.frame_files import png_bytes
 from phibench.datasets.frames import Frames
 from phibench.datasets.progress import Steps
 from phibench.datasets.read import open_finished
+from phibench.datasets.recipe import Recipe
 from phibench.datasets.recipe_file import RECIPES, load_recipe
 from phibench.datasets.sums import sums_text
 from phibench.estimator.bench.dataset_pairs import TASK_VERSION, DatasetPairs, dataset_pairs
@@ -86,6 +87,16 @@ def seal(folder: str | Path, public: str | Path, preset: str | None = None, cons
         raise DatasetError(f"{text}; then run the same command again") from error
 
 
+def sequence_warnings(recipe: Recipe) -> tuple[str, ...]:
+    """A sentence about samples of which some tell where the others are."""
+    if recipe.random is None or recipe.random.sequence != "sobol":
+        return ()
+    return (
+        "the samples are of a Sobol sequence: whoever has located some spots finds the others from the public strokes, "
+        'so seal a set with sequence = "independent"',
+    )
+
+
 def seed_warnings(name: str, seed: int) -> tuple[str, ...]:
     """Sentences about a seed that everybody knows or can find; none about a good one."""
     if (RECIPES / f"{name}.toml").is_file() and load_recipe(name).dataset.seed == seed:
@@ -128,7 +139,8 @@ def _seal(pairs: DatasetPairs, folder: Path, work: Path, public: Path, console: 
     truth_file = write_text(folder / f"seal_{document.id}.truth.json", text)  # first: no seal without its truth
     _publish(work, public)
     recipe = pairs.dataset.info.recipe["dataset"]
-    return Sealed(public, truth_file, document, seed_warnings(pairs.dataset.info.name, recipe["seed"]))
+    warnings = (*seed_warnings(pairs.dataset.info.name, recipe["seed"]), *sequence_warnings(pairs.dataset.recipe))
+    return Sealed(public, truth_file, document, warnings)
 
 
 def _by_sample(pairs: DatasetPairs) -> list[int]:

@@ -19,9 +19,10 @@ from phibench.datasets.schema import Document, Number, Vector2
 from phibench.estimator.bench.document import MethodCard
 from phibench.estimator.bench.seal_layout import Seal
 from phibench.estimator.bench.sealed_pairs import SealedPairs
+from phibench.estimator.seat.answer_check import AnswerError, checked
 from phibench.estimator.seat.harness import run_method
-from phibench.estimator.seat.outcome import Outcome
-from phibench.estimator.seat.pair import Answer, Spot
+from phibench.estimator.seat.outcome import FAILURES, Outcome
+from phibench.estimator.seat.pair import Spot
 from phibench.estimator.seat.reference import Reference
 from phibench.estimator.seat.resolve import resolve
 
@@ -209,11 +210,23 @@ def _finite(value: float | None) -> float | None:
 
 
 def _outcome(line: AnswerLine) -> Outcome:
-    answer = None
-    if line.down is not None and line.up is not None:
-        answer = Answer(_spot(line.down), _spot(line.up), line.depth_m, line.sigma_depth_m)
-    return Outcome(line.number, answer, line.seconds, line.failure, line.message)
+    """Outcome of a line, by the rules of the seat: what is no answer there is none here."""
+    has_answer = line.down is not None and line.up is not None
+    if line.failure not in ("", *FAILURES) or has_answer == bool(line.failure) or line.seconds < 0.0:
+        raise DatasetError(
+            f"the submission's pair {line.number} is not one that `phibench submit` writes: an answer or a failure of "
+            f"{', '.join(FAILURES)}, and seconds of 0 or above; submit again"
+        )
+    if line.down is None or line.up is None:
+        return Outcome(line.number, None, line.seconds, line.failure, line.message)
+    try:
+        answer = checked({**_plain(line), "down": _plain(line.down), "up": _plain(line.up)})
+    except AnswerError as error:
+        return Outcome(line.number, None, line.seconds, "invalid", str(error))
+    return Outcome(line.number, answer, line.seconds)
 
 
-def _spot(line: SpotLine) -> Spot:
-    return Spot(line.uv_px, line.covariance_px2, line.phi_rad, line.phi_convention, line.status)
+def _plain(line: Document) -> dict[str, Any]:
+    """Fields as `answer_check` takes them: JSON's lists."""
+    fields: dict[str, Any] = json.loads(line.model_dump_json())
+    return fields
