@@ -51,7 +51,7 @@ def test_pairs_are_the_frames_of_their_takes(dataset: Dataset, pairs: DatasetPai
     assert len(pairs) == 9
     for take in pairs.takes:
         pair = pairs.pair(take.number)
-        frames = TakenSample(dataset[take.sample_id]).source(take).frames(take.draw, laser_off=True)
+        frames = TakenSample(dataset[take.sample_id]).source(take).frames(take.exposure_number, laser_off=True)
         assert set(pair.images) == {"down", "up", "down_off", "up_off"}
         for name, image in pair.images.items():
             assert np.array_equal(image, frames.by_name[name].image)

@@ -320,3 +320,18 @@ def test_the_filters_of_the_recipe_are_the_detectors() -> None:
     table = RigTable.model_validate({"laser_filter_response": [1.0, 0.2, 0.05]})
     assert build_rig(table).camera.detector.laser_filter_response == (1.0, 0.2, 0.05)
     assert build_rig(RigTable()).camera.detector.laser_filter_response == (1.0, 0.10, 0.03)
+
+
+def test_no_two_takes_of_a_sample_share_their_noise(dataset: Dataset) -> None:
+    """A raw frame with the noise of an MJPEG one would tell the JPEG's spot better than the JPEG itself."""
+    found = takes(with_tables(dataset, frames={"presets": ["mono-raw", "bayer-raw", "srgb8", "mjpeg"], "draws": 3}))
+    keys = {(take.sample_id, take.exposure_number) for take in found}
+    assert len(keys) == len(found) == 12 * len(dataset)
+
+
+def test_all_takes_of_a_sample_have_one_pair_of_boxes(dataset: Dataset) -> None:
+    """Of several boxes the overlap would tell where the spot is."""
+    found = takes(with_tables(dataset, frames={"presets": ["bayer-raw", "mjpeg"], "draws": 5, "hint": 1.0}))
+    boxes = {(take.sample_id, take.boxes) for take in found}
+    assert len(boxes) == len(dataset)
+    assert None not in {box for _, box in boxes}
