@@ -10,6 +10,7 @@ import queue
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from types import TracebackType
 
 from phibench.estimator.bench.pair_set import PairSet
@@ -46,7 +47,6 @@ class Harness:
             raise MethodError(f"workers = {workers}: must be 1 or more")
         self._references = [resolve(method) if isinstance(method, str) else method for method in methods]
         self._limits, self._workers = limits or Limits(), workers
-        self._making = threading.Lock()
 
     def __enter__(self) -> Harness:
         copies = self._workers if len(self._references) == 1 else 1
@@ -69,15 +69,42 @@ class Harness:
     def outcomes(self, pairs: PairSet, numbers: Sequence[int]) -> Iterator[tuple[Outcome, ...]]:
         """Outcomes of every method for some pairs, in the order of `numbers`.
 
-        Pairs are made one at a time, whatever the number of workers: a set need not be safe for threads.
+        Pairs are made one at a time and given out in this order, whatever the number of workers: a set need not be
+        safe for threads, and one process alone sees the same pairs in the same order in every run.
         """
+        making, turns = _Turns(), [_Turns() for _ in self._crews]
 
-        def one(number: int) -> tuple[Outcome, ...]:
-            with self._making:
-                pair = pairs.pair(number)
-            return tuple(crew.ask(pair) for crew in self._crews)
+        def one(place: int, number: int) -> tuple[Outcome, ...]:
+            try:
+                with making.turn(place):
+                    pair = pairs.pair(number)
+            except BaseException:
+                for skipped in turns:  # or those that come after would wait for it
+                    with skipped.turn(place):
+                        pass
+                raise
+            return tuple(crew.ask(pair, turn, place) for crew, turn in zip(self._crews, turns, strict=True))
 
-        return self._pool.map(one, numbers)
+        return self._pool.map(one, range(len(numbers)), numbers)
+
+
+class _Turns:
+    """Lets threads through one after the other, in the order of their places."""
+
+    def __init__(self) -> None:
+        self._condition, self._now = threading.Condition(), 0
+
+    @contextmanager
+    def turn(self, place: int) -> Iterator[None]:
+        """Wait for all places before this one."""
+        with self._condition:
+            self._condition.wait_for(lambda: self._now == place)
+        try:
+            yield
+        finally:
+            with self._condition:
+                self._now += 1
+                self._condition.notify_all()
 
 
 class _Crew:
@@ -91,8 +118,9 @@ class _Crew:
     def start(self) -> None:
         self._processes[0].start()
 
-    def ask(self, pair: Pair) -> Outcome:
-        process = self._free.get()
+    def ask(self, pair: Pair, turns: _Turns, place: int) -> Outcome:
+        with turns.turn(place):
+            process = self._free.get()
         try:
             return process.ask(pair)
         finally:
