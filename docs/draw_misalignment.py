@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch
 
-from phibench.estimator.forward import seen_pixel
+from phibench.estimator.mirror_image import image_of
 from phibench.estimator.sensitivities import PARAMETERS as GEOMETRIC
 from phibench.estimator.sensitivities import sensitivity
 from phibench.estimator.triangulate import depth_exact
@@ -72,7 +72,7 @@ def whole_change(name: str, by: float, depth_m: float) -> float:
     """D by the exact estimator with nominal numbers, over the nominal D, minus 1."""
     nominal, m = budget_rig(), Misalignment(**{name: by})
     true = nominal.perturbed(m)
-    down, up = (seen_pixel(true.at(offset), spot_at(depth_m)) for offset in (0.0, m.stroke_m(STROKE_M)))
+    down, up = (image_of(true.at(offset), spot_at(depth_m)).uv_px for offset in (0.0, m.stroke_m(STROKE_M)))
     return float(depth_exact(nominal, STROKE_M, down, up).depth_m) / depth_m - 1.0
 
 

@@ -15,8 +15,9 @@ from functools import partial
 import numpy as np
 
 from phibench.estimator.depth import paper_gradient
-from phibench.estimator.forward import ray_basis, ray_slope, seen_pixel
+from phibench.estimator.mirror_image import image_of
 from phibench.estimator.phi import CONVENTIONS, GRADIENTS
+from phibench.estimator.ray_slope import ray_basis, ray_slope
 from phibench.estimator.reflection import reflect
 from phibench.estimator.score import ESTIMATORS
 from phibench.estimator.triangulate import exact_gradient
@@ -65,7 +66,7 @@ def sensitivity(
     Everything is NaN where the spot is not seen or the estimator has no answer.
     """
     views = [true_rig.at(Stroke(true_stroke_m).offset_m(position)) for position in POSITIONS]
-    pixels = [seen_pixel(view, point_world_m) for view in views]
+    pixels = [image_of(view, point_world_m).uv_px for view in views]
     by_pixel = PIXEL_GRADIENTS[estimator](nominal_rig, nominal_stroke_m, *pixels)
     moved = [pixel_gradient(view, uv, point_world_m) for view, uv in zip(views, pixels, strict=True)]
     estimate = ESTIMATORS[estimator](nominal_rig, nominal_stroke_m, *pixels)

@@ -1,6 +1,7 @@
 """What several test files share."""
 
 import os
+import shutil
 import subprocess
 import sys
 from collections import deque
@@ -110,3 +111,36 @@ def bench_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from phibench.datasets.make import make
 
     return make(ROOT / "tests" / "tiny_bench.toml", tmp_path_factory.mktemp("bench") / "out", workers=2)
+
+
+@pytest.fixture(scope="session")
+def method(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Reference of a method in a file: the brightest pixel; it fails on pair 1."""
+    from sealed_sets import METHOD
+
+    file = tmp_path_factory.mktemp("method") / "mine.py"
+    file.write_text(METHOD)
+    return f"{file}:extract"
+
+
+@pytest.fixture(scope="session")
+def sealed(bench_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Sealed set of 9 pairs, with its truth. Read only: copy it to change it."""
+    from rich.console import Console
+
+    from phibench.estimator.bench.seal import seal
+
+    folder = tmp_path_factory.mktemp("private")
+    shutil.copytree(bench_dataset, folder / "set")
+    return seal(folder / "set", folder / "public", console=Console(quiet=True))
+
+
+@pytest.fixture(scope="session")
+def submitted(sealed: Any, method: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Submission of `method` to `sealed`."""
+    from phibench.estimator.bench.submission import submit
+
+    out = tmp_path_factory.mktemp("submission") / "submission.json"
+    done = submit(sealed.public, method, out)
+    assert (done.pairs, done.answered) == (9, 8)
+    return out

@@ -68,9 +68,8 @@ def test_strata_part_the_whole(mine):
     by = {}
     for stratum in mine.document.strata:
         by.setdefault(stratum.by, []).append(stratum)
-    # one preset, no hints, all above 10 sigma and below 30 or not: what does not part the whole is left out
-    assert set(STRATA) - set(by) <= {"preset", "hint", "sigmas"}
-    assert "preset" not in by
+    # one preset, no hints, and one class of signal to noise: these strata are the whole again
+    assert set(by) == set(STRATA) - {"preset", "hint", "sigmas"}
     whole = by["all"][0].metrics["rms_px"].value
     for name in ("depth", "stroke", "signal", "azimuth", "image", "bayer", "quality"):
         assert sum(stratum.images for stratum in by[name]) == 80, name

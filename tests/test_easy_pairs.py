@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from oracles import alhazen_quartic
 
+from phibench.estimator.mirror_image import image_of
 from phibench.estimator.raw_pixels import raw_electrons
 from phibench.estimator.seat.easy_pairs import BOX_PX, EasyPairs
-from phibench.estimator.seat.mirror_image import mirror_image
 from phibench.estimator.triangulate import depth_exact
 from phibench.scenes.catalog import c310_rig
 from phibench.scenes.rig import Rig
@@ -29,14 +29,14 @@ def test_mirror_images_against_alhazens_quartic() -> None:
             centre = view.sphere_centre_m
             P = alhazen_quartic(view.camera_centre_m - centre, place - centre, rig.mirror.radius_m) + centre
             expected = rig.camera.project(view.T_world_camera.inverse().points(P))
-            np.testing.assert_allclose(mirror_image(view, place), expected, rtol=0, atol=1e-6)
+            np.testing.assert_allclose(image_of(view, place).uv_px, expected, rtol=0, atol=1e-6)
             checked += 1
     assert checked == 20
 
 
 def test_a_point_that_the_mirror_does_not_show_has_no_image() -> None:
     view = Rig().at(0.0)
-    assert all(math.isnan(x) for x in mirror_image(view, view.sphere_centre_m + [0.0, 0.0, 3.0]))
+    assert all(math.isnan(x) for x in image_of(view, view.sphere_centre_m + [0.0, 0.0, 3.0]).uv_px)
 
 
 def test_truth_closes() -> None:

@@ -6,7 +6,6 @@ import hashlib
 import json
 import math
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,56 +13,22 @@ import numpy as np
 import pytest
 from bench_samples import hidden
 from PIL import Image
+from sealed_sets import refusal
 from test_make import quiet
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_dataset
+from phibench.datasets.recipe import Recipe
+from phibench.datasets.recipe_file import load_recipe
 from phibench.estimator import cli
 from phibench.estimator.bench.dataset_pairs import dataset_pairs
 from phibench.estimator.bench.document import read_score
-from phibench.estimator.bench.run_all import bench, show
-from phibench.estimator.bench.seal import Sealed, seal, seed_warnings
+from phibench.estimator.bench.run_all import show
+from phibench.estimator.bench.seal import Sealed, seal, seed_warnings, sequence_warnings
 from phibench.estimator.bench.sealed_pairs import SealedPairs
-from phibench.estimator.bench.submission import outcomes_of, read_submission, submit
+from phibench.estimator.bench.submission import submit
 from phibench.estimator.bench.truth import PairTruth
 from phibench.estimator.bench.truth_file import truth_document, truth_of
-from phibench.estimator.bench.unseal import unseal
-from phibench.estimator.seat.harness import run_method
-
-METHOD = """\
-import numpy as np
-from phibench.estimator.seat.pair import Answer, Spot
-
-def extract(pair):  # brightest pixel: deterministic, and of this pair; pair 1 fails
-    if pair.number == 1:
-        raise ValueError("no spot")
-    image = pair.down if pair.down.ndim == 2 else pair.down[..., 0]
-    v, u = np.unravel_index(int(image.argmax()), image.shape)
-    found = Spot((float(u), float(v)), ((0.1, 0.01), (0.01, 0.2)), 0.5, "normal")
-    return Answer(found, Spot.missing("not looked for"), 2.0)
-"""
-
-
-@pytest.fixture(scope="module")
-def method(tmp_path_factory: pytest.TempPathFactory) -> str:
-    file = tmp_path_factory.mktemp("method") / "mine.py"
-    file.write_text(METHOD)
-    return f"{file}:extract"
-
-
-@pytest.fixture(scope="module")
-def sealed(bench_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Sealed:
-    folder = tmp_path_factory.mktemp("private")
-    shutil.copytree(bench_dataset, folder / "set")
-    return seal(folder / "set", folder / "public", console=quiet())
-
-
-@pytest.fixture(scope="module")
-def submitted(sealed: Sealed, method: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("submission") / "submission.json"
-    done = submit(sealed.public, method, out)
-    assert (done.pairs, done.answered) == (9, 8)
-    return out
 
 
 @pytest.fixture
@@ -206,84 +171,21 @@ def test_seeds_that_can_be_found_are_warned_of() -> None:
     assert "short" in seed_warnings("mine", 0)[0]
 
 
-# There and back
+def test_samples_of_a_sobol_sequence_are_warned_of(bench_dataset: Path) -> None:
+    recipe = open_dataset(bench_dataset).recipe
+    assert recipe.random is not None
+    [warning] = sequence_warnings(with_random(recipe, "sobol"))
+    assert 'sequence = "independent"' in warning
+    assert sequence_warnings(with_random(recipe, "independent")) == ()
+    assert sequence_warnings(recipe.model_copy(update={"random": None})) == ()
+    shipped = load_recipe("bench-test").random
+    assert shipped is not None
+    assert shipped.sequence == "independent"
 
 
-def test_a_submission_comes_back_as_it_was(sealed: Sealed, submitted: Path, method: str) -> None:
-    opened = unseal(sealed.public, sealed.truth_file, submitted)
-    assert opened.seal.id == sealed.seal.id
-    expected = run_method(method, SealedPairs(sealed.public))
-    for ours, theirs in zip(expected, opened.outcomes, strict=True):
-        assert (ours.number, ours.failure, ours.message) == (theirs.number, theirs.failure, theirs.message)
-        assert ours.answer == theirs.answer  # to the bit: JSON holds doubles exactly
-        assert theirs.seconds >= 0.0
-    assert [opened.pairs.truth(i).number for i in range(9)] == list(range(9))
-    assert np.array_equal(opened.pairs.pair(2).up, SealedPairs(sealed.public).pair(2).up)
-    assert opened.pairs.document()["id"] == sealed.seal.id
-
-
-def test_a_submission_names_its_method_by_hash_and_no_path(submitted: Path) -> None:
-    document = read_submission(submitted)
-    assert (document.method.name, document.method.place) == ("mine:extract", "mine.py")
-    assert document.method.sha256 == hashlib.sha256(METHOD.encode()).hexdigest()
-    assert str(submitted.parent) not in submitted.read_text()
-    assert len(outcomes_of(document)) == 9
-
-
-def tampered(change: Callable[[dict[str, Any]], Any], path: Path, out: Path) -> Path:
-    document = json.loads(path.read_text())
-    change(document)
-    out.write_text(json.dumps(document, sort_keys=True, separators=(",", ":")) + "\n")
-    return out
-
-
-def refusal(public: Path, truth: Path, submission: Path) -> str:
-    with pytest.raises(DatasetError) as caught:
-        unseal(public, truth, submission)
-    message = str(caught.value)
-    assert "\n" not in message
-    return message
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda d: d["truths"][4].update(depth_m=d["truths"][4]["depth_m"] * (1.0 + 2.0**-52)),
-        lambda d: d.update(salt="00" * 32),
-        lambda d: d.update(salt=d["salt"][::-1]),
-        lambda d: d["truths"].pop(),
-        lambda d: d["truths"].reverse(),
-    ],
-    ids=["last bit of a depth", "no salt", "swapped salt", "a pair less", "another order"],
-)
-def test_another_truth_is_refused(sealed: Sealed, submitted: Path, tmp_path: Path, change: Any) -> None:
-    truth = tampered(change, sealed.truth_file, tmp_path / "truth.json")
-    assert "is not the truth that was sealed: its SHA-256" in refusal(sealed.public, truth, submitted)
-
-
-def test_the_truths_file_written_again_is_the_same(sealed: Sealed, submitted: Path, tmp_path: Path) -> None:
-    """The tampering above is what is refused, not the writing."""
-    again = tampered(lambda _: None, sealed.truth_file, tmp_path / "truth.json")
-    assert unseal(sealed.public, again, submitted).seal == sealed.seal
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda d: d.update(seal="0" * 16), "answers the seal 0000000000000000, not"),
-        (lambda d: d.update(task_version=9), "of task version 9, the seal of 1"),
-        (lambda d: d["answers"].pop(5), "lacks pair 5 (1 of 9 are missing)"),
-        (lambda d: d["answers"].append(d["answers"][5]), "answers pair 5 twice"),
-        (lambda d: d["answers"][8].update(number=7), "answers pair 7 twice"),
-        (lambda d: d["answers"].append({**d["answers"][5], "number": 9}), "answers pair 9, the seal has 0 to 8"),
-        (lambda d: d["answers"][0].update(depth="2"), "is no submission: answers.0.depth"),
-        (lambda d: d.update(format="x"), "has the format 'x'"),
-    ],
-)
-def test_another_submission_is_refused(
-    sealed: Sealed, submitted: Path, tmp_path: Path, change: Any, words: str
-) -> None:
-    assert words in refusal(sealed.public, sealed.truth_file, tampered(change, submitted, tmp_path / "s.json"))
+def with_random(recipe: Recipe, sequence: str) -> Recipe:
+    assert recipe.random is not None
+    return recipe.model_copy(update={"random": recipe.random.model_copy(update={"sequence": sequence})})
 
 
 def flip(path: Path) -> None:
@@ -351,7 +253,7 @@ def test_an_interrupted_seal_leaves_nothing(
     assert not list(copy.glob("seal_*"))
 
 
-# Command line and the whole benchmark
+# Command line
 
 
 def test_the_commands_say_what_they_did(
@@ -382,35 +284,3 @@ def test_seal_on_the_command_line_warns_of_its_seed(
     assert len(list(copy.glob("seal_*.truth.json"))) == 1
     assert cli.main(tokens) == 2
     assert "not an empty folder" in capsys.readouterr().err
-
-
-def test_the_benchmark_runs_what_accepts_each_preset(bench_dataset: Path, tmp_path: Path) -> None:
-    names = ["red_centroid", "raw_maximum_likelihood"]
-    done = bench(bench_dataset, tmp_path / "out", names, workers=2, console=quiet())
-    stems = ["bayer-raw-red_centroid", "bayer-raw-raw_maximum_likelihood", "srgb8-red_centroid", "mjpeg-red_centroid"]
-    assert [path.stem for path in done.scores] == stems
-    assert len(done.notes) == 2
-    assert all("takes mono-raw, bayer-raw, not" in note or "takes bayer-raw, mono-raw" in note for note in done.notes)
-    documents = [read_score(path) for path in done.scores]
-    assert [document.pairs for document in documents] == [3, 3, 3, 3]
-    assert "raw_maximum_likelihood" in done.report.read_text()
-    # one method alone on the same pairs answers the same: the harness keeps them apart
-    alone = bench(bench_dataset, tmp_path / "alone", names[:1], console=quiet())
-    one, other = read_score(alone.scores[0]), documents[0]
-    assert one.strata[0].metrics["rms_px"] == other.strata[0].metrics["rms_px"]
-    assert one.worst == other.worst
-
-
-@pytest.mark.parametrize(
-    ("out", "names", "words"),
-    [
-        ("out", ["x"], "no built-in method 'x'; known: "),
-        ("inside", None, "lies inside the data set"),
-    ],
-)
-def test_a_benchmark_that_cannot_be_is_refused(
-    bench_dataset: Path, tmp_path: Path, out: str, names: list[str] | None, words: str
-) -> None:
-    folder = bench_dataset / "out" if out == "inside" else tmp_path / out
-    with pytest.raises(DatasetError, match=words):
-        bench(bench_dataset, folder, names, console=quiet())

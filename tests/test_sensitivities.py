@@ -15,7 +15,8 @@ from test_accuracy_misalignment import Case, draw_case
 from phibench.datasets.read import open_finished
 from phibench.estimator.cli import main
 from phibench.estimator.depth import paper_gradient
-from phibench.estimator.forward import ray_basis, seen_pixel
+from phibench.estimator.mirror_image import image_of
+from phibench.estimator.ray_slope import ray_basis
 from phibench.estimator.rig_errors import RIG_PARAMETERS, rig_gradient
 from phibench.estimator.score import ESTIMATORS
 from phibench.estimator.sensitivities import (
@@ -93,7 +94,7 @@ def test_accuracy_inverted_reflection_against_the_simulator() -> None:
     for case in seen_cases(1, 60):
         for position in POSITIONS:
             truth = spot_truth(case.view(position), case.spot, ())
-            uv = seen_pixel(case.view(position), np.array(case.spot.position_world_m))
+            uv = image_of(case.view(position), np.array(case.spot.position_world_m)).uv_px
             assert math.dist(uv, (truth.u_px, truth.v_px)) <= 1e-9
             checked += 1
     assert checked == 120
@@ -102,11 +103,11 @@ def test_accuracy_inverted_reflection_against_the_simulator() -> None:
 def test_many_points_at_once_and_those_that_are_not_seen() -> None:
     view = default_rig().at(0.3)
     points = np.array([[[2.0, 1.0, 0.5], [-1.0, 0.3, 1.2]], [[0.0, 0.0, 2.9], [3.0, -2.0, 0.1]]])
-    uv = seen_pixel(view, points)
+    uv = image_of(view, points).uv_px
     assert uv.shape == (2, 2, 2)
     assert np.isnan(uv[1, 0]).all()  # above the sphere: hidden by it
     for index in ((0, 0), (0, 1), (1, 1)):
-        assert uv[index] == pytest.approx(seen_pixel(view, points[index]), abs=1e-10)
+        assert uv[index] == pytest.approx(image_of(view, points[index]).uv_px, abs=1e-10)
 
 
 def test_two_directions_across_a_ray() -> None:
@@ -126,7 +127,7 @@ def test_accuracy_pixel_gradient_against_differences_of_the_simulator() -> None:
     for case in seen_cases(2, 5):
         point = np.array(case.spot.position_world_m)
         for index, view in enumerate(views(case, Misalignment())):
-            analytic = pixel_gradient(view, seen_pixel(view, point), point)
+            analytic = pixel_gradient(view, image_of(view, point).uv_px, point)
             for k, name in enumerate(PARAMETERS):
                 found = slope(
                     lambda x, c=case, n=name, i=index: chief_pixels(c, Misalignment(**{n: x}))[i], small(name)
@@ -177,7 +178,7 @@ def test_accuracy_depth_sensitivity_against_rendering() -> None:
     case = dataclasses.replace(case, nominal=dataclasses.replace(case.nominal, camera=camera))
     nominal, point = (case.nominal, case.nominal_stroke_m), np.array(case.spot.position_world_m)
     still = views(case, Misalignment())
-    moves = np.stack([np.abs(pixel_gradient(view, seen_pixel(view, point), point)).max(axis=0) for view in still])
+    moves = np.stack([np.abs(pixel_gradient(view, image_of(view, point).uv_px, point)).max(axis=0) for view in still])
     checked = 0
     for k, name in enumerate(PARAMETERS):
         step = min(0.1 / moves[:, k].max(), MISALIGNMENT[name].study)
@@ -233,7 +234,7 @@ def test_accuracy_what_is_believed_and_what_is_true_cancel() -> None:
     for case in seen_cases(7, 10):
         rig, h = case.nominal.perturbed(dataclasses.replace(case.misalignment, **STILL)), case.nominal_stroke_m
         point = np.array(case.spot.position_world_m)
-        pixels = [seen_pixel(rig.at(offset), point) for offset in (0.0, h)]
+        pixels = [image_of(rig.at(offset), point).uv_px for offset in (0.0, h)]
         found = sensitivity("exact", rig, h, rig, h, point)
         believed = dict(zip(RIG_PARAMETERS, rig_gradient(rig, h, *pixels), strict=True))
         true, truth = (dict(zip(PARAMETERS, g, strict=True)) for g in (found.estimate_gradient, found.truth_gradient))

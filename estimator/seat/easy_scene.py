@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from phibench.estimator.mirror_image import image_of
 from phibench.estimator.phi import phi_incidence, phi_normal, phi_ray
-from phibench.estimator.seat.mirror_image import mirror_image
 from phibench.estimator.spot_blur import spot_blur
 from phibench.scenes.rig import Rig
 from phibench.scenes.streams import generator
@@ -63,7 +63,8 @@ def easy_scene(rig: Rig, number: int) -> EasyScene:
 
 def _spot(rig: Rig, offset_m: float, point: np.ndarray[tuple[int], np.dtype[np.float64]], azimuth: float) -> EasySpot:
     view = rig.at(offset_m)
-    uv = mirror_image(view, point)
+    u, v = image_of(view, point).uv_px
+    uv = (float(u), float(v))
     at = np.array(uv)
     angles = {"ray": phi_ray(view, at), "normal": phi_normal(view, at), "incidence": phi_incidence(view, at)}
     return EasySpot(uv, spot_blur(rig, uv).round_px, {name: float(phi) for name, phi in angles.items()}, azimuth)
