@@ -29,6 +29,7 @@ CELLS = [
     (MJPEG, 0.7, 2000.0, 100.0),
     (MJPEG, 0.7, 5000.0, 100.0),
     (MJPEG, 1.2, 20_000.0, 400.0),
+    (MJPEG, 0.7, 5000.0, 0.0),
 ]
 NAMES = [f"{s.output}-{e:g}-{b:g}" for s, _, e, b in CELLS]
 
