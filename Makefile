@@ -7,17 +7,20 @@ RECIPE ?= datasets/recipes/paper.toml
 OUT    ?= out/paper
 SAMPLES ?= 12
 BENCH  ?= out/bench-dev
+STUDIES ?= out/studies
+STUDIES_ALL := noise misalignment baseline cause isotropy stroke
 # Which Python makes the environment: `make setup PYTHON=python3.13`. Without it the first that is new enough.
 PYTHON ?=
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup dataset bench test test-slow proof test-all benchmark lint clean
+.PHONY: help setup dataset bench studies test test-slow proof test-all benchmark lint clean
 
 help:
 	@echo "make setup      make .venv with everything in it, and make sure of LLVM"
 	@echo "make dataset    render $(RECIPE) into $(OUT)"
 	@echo "make bench      $(SAMPLES) samples of bench-dev, all built-in methods on them, a report, in out/"
+	@echo "make studies    the six studies, reduced, and a report on them, in out/studies"
 	@echo "make test       the tests, without the slow ones"
 	@echo "make test-slow  the slow tests"
 	@echo "make proof      the slow tests of accuracy, but those of many minutes"
@@ -55,6 +58,13 @@ dataset: $(READY)
 bench: $(READY)
 	$(BIN)/phibench dataset make bench-dev --samples $(SAMPLES) --out $(BENCH)
 	$(BIN)/phibench bench $(BENCH) --out $(BENCH)-report
+
+# One after the other; the data sets are shared and kept.
+studies: $(READY)
+	@set -e; for name in $(STUDIES_ALL); do \
+	    echo "== $$name"; $(BIN)/phibench study $$name --quick --out $(STUDIES)/$$name --data $(STUDIES)/data; \
+	done
+	$(BIN)/phibench report --study $(addprefix $(STUDIES)/,$(STUDIES_ALL)) --out $(STUDIES)/report.html
 
 test: $(READY)
 	$(BIN)/python -m pytest -m "not slow"

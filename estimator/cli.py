@@ -19,6 +19,7 @@ from phibench.estimator.cli_dataset import dataset
 from phibench.estimator.cli_misalignment import sensitivities
 from phibench.estimator.cli_score import compare, report, score
 from phibench.estimator.cli_sealed import register as register_sealed
+from phibench.estimator.cli_studies import study
 
 app = App(
     name="phibench",
@@ -36,6 +37,7 @@ register_sealed(app, dataset)
 app.command(sensitivities)
 app.command(calibrate)
 app.command(align)
+app.command(study)
 
 
 @app.command

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
 
 from phibench.estimator.cli_words import Whole
 
@@ -89,8 +91,10 @@ def compare(first: Path, second: Path, *, seed: Whole = 0) -> int:
     return 0
 
 
-def report(*files: Path, out: Path) -> int:
-    """Write one HTML page about scores: ranking, errors, causes, the worst images. It needs no network.
+def report(
+    *files: Path, out: Path, study: Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative="")] = ()
+) -> int:
+    """Write one HTML page about scores (ranking, errors, causes, the worst images) and studies. It needs no network.
 
     Parameters
     ----------
@@ -98,10 +102,13 @@ def report(*files: Path, out: Path) -> int:
         JSON files that `score --method --out` wrote, with their Parquet files beside them.
     out
         HTML file to write.
+    study
+        Folders that `phibench study` wrote.
     """
     from phibench.estimator.bench.report import write_report
+    from phibench.estimator.studies.folder import section
 
-    print(write_report(files, out))
+    print(write_report(files, out, [section(folder) for folder in study]))
     return 0
 
 

@@ -179,5 +179,5 @@ def test_sections_follow(crowded):
 
 
 def test_a_report_of_nothing_is_refused(tmp_path):
-    with pytest.raises(DatasetError, match="no scores"):
+    with pytest.raises(DatasetError, match="a report of nothing"):
         write_report([], tmp_path / "page.html")

@@ -33,12 +33,14 @@ class Section:
     paragraphs : plain text
     pictures : tuple of Picture
     tables : rows of cells, the first row being heads
+    captions : one for each table, or none at all
     """
 
     title: str
     paragraphs: tuple[str, ...] = ()
     pictures: tuple[Picture, ...] = ()
     tables: tuple[tuple[tuple[str, ...], ...], ...] = ()
+    captions: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -66,10 +68,13 @@ def write_report(files: Sequence[Path], out: Path, sections: Sequence[Section] =
     Raises
     ------
     DatasetError
-        If there is no file, or one is no score or lacks its records.
+        If there is neither a score nor a section, or a file is no score or lacks its records.
     """
-    if not files:
-        raise DatasetError("a report of no scores: give at least one JSON file that `score --method --out` wrote")
+    if not (files or sections):
+        raise DatasetError(
+            "a report of nothing: give at least one JSON file that `score --method --out` wrote, or the folder of a "
+            "study (--study)"
+        )
     read = [(path, read_score(path)) for path in files]
     return write_text(out, report_html([(document, read_records(path, document)) for path, document in read], sections))
 

@@ -1,0 +1,129 @@
+"""The frame of the studies: settings, folders, reports; each study has a test file of its own."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import polars as pl
+import pytest
+from pydantic import Field
+from rich.console import Console
+
+from phibench.datasets.errors import DatasetError
+from phibench.estimator.bench.report import write_report
+from phibench.estimator.cli import main
+from phibench.estimator.studies.drawing import canvas, drawn
+from phibench.estimator.studies.folder import read_study, section, write_study
+from phibench.estimator.studies.material import Material
+from phibench.estimator.studies.registry import find_study
+from phibench.estimator.studies.result import Result
+from phibench.estimator.studies.settings import read_settings
+from phibench.estimator.studies.study import Settings, Study
+
+
+class Counting(Settings):
+    """Settings of the study below."""
+
+    upto: int = Field(ge=1, le=100)
+    step: int = Field(default=1, ge=1)
+
+
+def _count(settings: Counting, material: Material) -> Result:
+    numbers = list(range(0, settings.upto, settings.step))
+    with canvas() as figure:
+        figure.subplots().plot(numbers, numbers)
+        drawing = drawn("line", figure, f"A line up to {numbers[-1]}.")
+    return Result(
+        {"table": pl.DataFrame({"number": numbers})},
+        (f"There are {len(numbers)} numbers.",),
+        (drawing,),
+        {"Numbers": (("number",), *((str(n),) for n in numbers))},
+        ("nothing is left out",),
+    )
+
+
+COUNT = Study("count", "Counting", "How many numbers are there?", Counting, _count)
+
+
+@pytest.fixture
+def material(tmp_path: Path) -> Material:
+    return Material(tmp_path / "data", Console(quiet=True))
+
+
+def _written(folder: Path, material: Material) -> Path:
+    settings = Counting(upto=5)
+    write_study(folder, COUNT, settings, True, COUNT.run(settings, material))
+    return folder
+
+
+def test_settings_take_the_reduced_numbers_only_when_asked(tmp_path: Path) -> None:
+    file = tmp_path / "count.toml"
+    file.write_text("upto = 50\nstep = 2\n[quick]\nupto = 4\n", encoding="utf-8")
+    assert read_settings(COUNT, False, file) == Counting(upto=50, step=2)
+    assert read_settings(COUNT, True, file) == Counting(upto=4, step=2)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("upto = 0", ("upto", "1")),
+        ("upto = 5\nwidth = 3", ("width",)),
+        ("step = 1", ("upto",)),
+        ("upto = ", ("not valid TOML",)),
+        ("upto = 5\nquick = 3", ("[quick]", "table")),
+    ],
+)
+def test_bad_settings_end_in_a_sentence(tmp_path: Path, text: str, words: tuple[str, ...]) -> None:
+    file = tmp_path / "count.toml"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(DatasetError) as caught:
+        read_settings(COUNT, False, file)
+    assert all(word in str(caught.value) for word in words)
+
+
+def test_same_study_same_bytes(tmp_path: Path, material: Material) -> None:
+    first, second = (_written(tmp_path / name, material) for name in "ab")
+    names = sorted(path.name for path in first.iterdir())
+    assert names == ["findings.md", "line.svg", "settings.json", "study.json", "table.parquet"]
+    assert all((first / name).read_bytes() == (second / name).read_bytes() for name in names)
+
+
+def test_read_back_and_in_a_report(tmp_path: Path, material: Material) -> None:
+    folder = _written(tmp_path / "study", material)
+    assert read_study(folder).findings == ("There are 5 numbers.",)
+    page = write_report([], tmp_path / "report.html", [section(folder)]).read_text(encoding="utf-8")
+    for words in (
+        "Study: Counting",
+        "How many numbers",
+        "There are 5 numbers.",
+        "data:image/svg",
+        "nothing is left out",
+    ):
+        assert words in page
+    assert "<caption>Numbers</caption>" in page
+
+
+def test_changed_or_missing_files_are_refused(tmp_path: Path, material: Material) -> None:
+    folder = _written(tmp_path / "study", material)
+    (folder / "line.svg").write_text("other", encoding="utf-8")
+    with pytest.raises(DatasetError, match=r"line\.svg is missing or was changed"):
+        read_study(folder)
+    document = json.loads((folder / "study.json").read_text(encoding="utf-8"))
+    (folder / "study.json").write_text(json.dumps({**document, "version": 2}), encoding="utf-8")
+    with pytest.raises(DatasetError, match="not the document of a study"):
+        read_study(folder)
+    (folder / "study.json").unlink()
+    with pytest.raises(DatasetError, match="holds no study"):
+        read_study(folder)
+
+
+def test_mistakes_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(DatasetError, match="did you mean 'noise'"):
+        find_study("nois")
+    assert main(["study", "nois", "--out", str(tmp_path)]) == 2
+    assert "nois" in capsys.readouterr().err
+    assert main(["report", "--study", str(tmp_path), "--out", str(tmp_path / "r.html")]) == 2
+    assert "holds no study" in capsys.readouterr().err
+    assert main(["report", "--out", str(tmp_path / "r.html")]) == 2
+    assert "a report of nothing" in capsys.readouterr().err
