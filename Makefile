@@ -11,6 +11,8 @@ STUDIES ?= out/studies
 STUDIES_ALL := noise misalignment baseline cause isotropy stroke
 # Which Python makes the environment: `make setup PYTHON=python3.13`. Without it the first that is new enough.
 PYTHON ?=
+# Test files are shared between two processes; `make test PARALLEL=` runs them one after the other.
+PARALLEL ?= --numprocesses 2 --dist loadfile
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -67,7 +69,7 @@ studies: $(READY)
 	$(BIN)/phibench report --study $(addprefix $(STUDIES)/,$(STUDIES_ALL)) --out $(STUDIES)/report.html
 
 test: $(READY)
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -m "not slow" $(PARALLEL)
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -m slow
