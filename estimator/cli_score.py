@@ -126,7 +126,7 @@ def _score_methods(
     from phibench.datasets.read import open_finished
     from phibench.estimator.bench.document import MethodCard, write_score
     from phibench.estimator.bench.run_all import run_and_score, wanted_pairs
-    from phibench.estimator.bench.tables import cause_table, leaderboard, silences, strata_table
+    from phibench.estimator.bench.tables import cause_table, depth_line, leaderboard, silences, strata_table
     from phibench.estimator.seat.resolve import resolve
 
     files = _files(out, [MethodCard.of(name, **resolve(name).document()) for name in references])
@@ -138,6 +138,9 @@ def _score_methods(
     for one, file in zip(scored, files, strict=True):
         documents.append(one.document if file is None else write_score(file, one.document, one.records))
     console.print(leaderboard(documents))
+    if calibration is not None:
+        for document in documents:
+            console.print(depth_line(document), soft_wrap=True, emoji=False, highlight=False)
     if any(any(kind.values()) for document in documents for kind in document.causes.values()):
         console.print(cause_table(documents))
     for one in scored:
