@@ -35,6 +35,8 @@ from phibench.scenes.rig import POSITIONS
 
 CALIBRATION = "calibration"
 """Experiment of a recipe whose spots stand at known distances."""
+LEAST_SPOTS = 2
+"""Calibration spots without which a rig counts as not calibrated; those that are not found are left out."""
 WITHIN = 1.959963984540054
 """Standard deviations of a normal error that hold 95 %."""
 _NO_MATRIX = np.full((2, 2), np.nan)
@@ -137,7 +139,7 @@ def calibrate_rig(dataset: Dataset, rig: str, procedure: Procedure) -> Bundle:
     Raises
     ------
     DatasetError
-        If there are no calibration spots, or one was not found.
+        If there are no calibration spots, or fewer than `LEAST_SPOTS` were found.
     """
     samples = _of_rig(dataset, rig)
     known = [sample for sample in samples if sample.row.experiment == procedure.calibration]
@@ -148,7 +150,7 @@ def calibrate_rig(dataset: Dataset, rig: str, procedure: Procedure) -> Bundle:
         )
     preset, off = procedure.preset, procedure.laser_off
     outlines = [frame_outline(dataset, sample, position, preset, off) for sample, position in one_per_pose(samples)]
-    spots = frame_spots(dataset, known, preset, procedure.ruler, off)
+    spots = frame_spots(dataset, known, preset, procedure.ruler, off, LEAST_SPOTS)
     return calibrate(known[0].nominal_rig, mean_outline(outlines), spots)
 
 

@@ -80,19 +80,36 @@ def frame_outline(dataset: Dataset, sample: Sample, position: str, preset: str, 
 
 
 def frame_spots(
-    dataset: Dataset, samples: Sequence[Sample], preset: str, ruler: Ruler, laser_off: bool = True
+    dataset: Dataset,
+    samples: Sequence[Sample],
+    preset: str,
+    ruler: Ruler,
+    laser_off: bool = True,
+    least: int | None = None,
 ) -> list[KnownSpot]:
     """Calibration spots of drawn frames.
+
+    Parameters
+    ----------
+    dataset, samples, preset, ruler, laser_off
+    least : int, optional
+        So many spots are enough, and those that are not found are left out; by default all must be found.
 
     Raises
     ------
     DatasetError
-        If a spot was not found.
+        If too few spots were found; what it says is about the last one that was not.
     """
     pairs, found = pairs_of(dataset, samples, preset, laser_off=laser_off), []
+    fault: DatasetError | None = None
     for number, sample in enumerate(samples):
         pair = pairs.pair(number)
-        found.append(known_spot(sample, pair, method_for(pair.card)(pair), ruler))
+        try:
+            found.append(known_spot(sample, pair, method_for(pair.card)(pair), ruler))
+        except DatasetError as error:
+            fault = error
+    if fault is not None and len(found) < (len(samples) if least is None else least):
+        raise fault
     return found
 
 
