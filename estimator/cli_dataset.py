@@ -45,7 +45,8 @@ def make(
     from phibench.estimator.sensitivity_table import keep_sensitivities
 
     make_dataset(recipe, out, workers, scheduler=scheduler, shard=shard, samples=samples, seed=seed)
-    keep_sensitivities(out)
+    if shard is None:  # the table of a merged set is made by `merge`
+        keep_sensitivities(out)
     return 0
 
 
