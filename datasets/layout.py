@@ -17,8 +17,9 @@ JOURNAL = "journal.txt"
 LOCK = ".phibench-lock"
 WORKING = ".phibench-working"
 CONTACT_SHEET = "contact_sheet.png"
-NOT_DATA = (SUMS, RUN, LOG, JOURNAL, LOCK, WORKING, CONTACT_SHEET)
-"""Files that SHA256SUMS does not list: itself, the diaries of the run, locks, and what `show` draws."""
+SENSITIVITIES = "sensitivities.parquet"
+NOT_DATA = (SUMS, RUN, LOG, JOURNAL, LOCK, WORKING, CONTACT_SHEET, SENSITIVITIES)
+"""Files that SHA256SUMS does not list: itself, the diaries of the run, locks, and what is computed from it all."""
 
 _TASK_FILE = re.compile(
     r"lightmap\.npz|views/[^/]+/(ambient|truth)\.exr|views/[^/]+/preview\.png|spots/[^/]+-(down|up)\.exr|previews/[^/]+\.png"

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from phibench.datasets.drawn_rigs import draw_rigs
 from phibench.datasets.errors import RecipeError
 from phibench.datasets.random_samples import RandomSample, draw_samples
-from phibench.datasets.recipe import RandomTable, Recipe
+from phibench.datasets.recipe import RandomTable, Recipe, RigsTable
 from phibench.datasets.recipe_scene import (
     build_misalignment,
     build_rig,
@@ -17,6 +18,7 @@ from phibench.datasets.recipe_scene import (
     true_stroke_m,
 )
 from phibench.scenes.laser import LaserSpot
+from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
 from phibench.scenes.room import Room
 from phibench.scenes.streams import seed_32
@@ -66,9 +68,9 @@ class PairPlan:
     rig, nominal_rig : str
         Id of the true rig, and of the one that an estimator believes.
     drawn : tuple of (parameter, value)
-        What was drawn; empty for an experiment.
+        What was drawn; empty for an experiment without drawn rigs.
     tries : int
-        Which draw was the first possible one; 0 for an experiment.
+        Which draw was the first possible one; 0 where nothing is drawn.
     """
 
     sample_id: str
@@ -133,10 +135,28 @@ def make_plan(recipe: Recipe) -> Plan:
     rig, room = build_rig(recipe.rig), build_room(recipe.room, recipe.targets)
     if recipe.random is not None:
         return _random_plan(recipe, recipe.random, rig, room)
+    if recipe.rigs is not None:
+        return _rigs_plan(recipe, recipe.rigs, rig, room)
     misalignment = build_misalignment(recipe.misalignment)
     true_rig = rig.perturbed(misalignment)
     true_id = RECIPE_RIG if true_rig == rig else TRUE_RIG
+    pairs = _experiment_pairs(recipe, misalignment, true_id)
+    return _experiment_plan(recipe, {RECIPE_RIG: rig, true_id: true_rig}, room, pairs)
+
+
+def _rigs_plan(recipe: Recipe, table: RigsTable, rig: Rig, room: Room) -> Plan:
+    """Every experiment with every drawn rig; samples are called after both."""
+    drawn = draw_rigs(recipe, table, rig, room)
     pairs = tuple(
+        replace(pair, sample_id=f"{pair.sample_id}-{one.rig_id}", drawn=one.drawn, tries=one.tries)
+        for one in drawn
+        for pair in _experiment_pairs(recipe, one.misalignment, one.rig_id)
+    )
+    return _experiment_plan(recipe, {RECIPE_RIG: rig} | {one.rig_id: one.rig for one in drawn}, room, pairs)
+
+
+def _experiment_pairs(recipe: Recipe, misalignment: Misalignment, rig_id: str) -> tuple[PairPlan, ...]:
+    return tuple(
         PairPlan(
             _sample_name(experiment.name, target, stroke_m),
             experiment.name,
@@ -144,17 +164,21 @@ def make_plan(recipe: Recipe) -> Plan:
             true_stroke_m(misalignment, float(stroke_m)),
             float(stroke_m),
             target,
-            true_id,
+            rig_id,
         )
         for experiment in recipe.experiments
         for target in experiment.targets
         for stroke_m in experiment.strokes_m
     )
+
+
+def _experiment_plan(recipe: Recipe, rigs: dict[str, Rig], room: Room, pairs: tuple[PairPlan, ...]) -> Plan:
+    """Poses in the order of the rigs, then of their offsets."""
     used = {pair.target for pair in pairs}
     spots = {table.name: build_spot(recipe.laser, table) for table in recipe.targets if table.name in used}
-    offsets = sorted({offset_m for _, offset_m in _offsets(pairs)})
-    poses = _poses(recipe, [(true_id, offset_m) for offset_m in offsets])
-    return Plan(recipe, rig, {RECIPE_RIG: rig, true_id: true_rig}, room, spots, poses, pairs)
+    order = {rig: number for number, rig in enumerate(rigs)}
+    places = sorted(set(_offsets(pairs)), key=lambda place: (order[place[0]], place[1]))
+    return Plan(recipe, rigs[RECIPE_RIG], rigs, room, spots, _poses(recipe, places), pairs)
 
 
 def pose_name(offset_m: float) -> str:

@@ -148,19 +148,21 @@ class _Makers:
             rig, stroke_m = nominal_rig.perturbed(misalignment), true_stroke_m(misalignment, nominal_stroke_m)
         except SceneError as error:
             return str(error)
-        if fault := self._rig_fault(rig, stroke_m):
+        if fault := rig_fault(rig, stroke_m, self._ceiling_m, self._boards):
             return fault
         return RandomSample(number, tries, drawn, rig, *placed, stroke_m, nominal_rig, nominal_stroke_m)
 
-    def _rig_fault(self, rig: Rig, stroke_m: float) -> str | None:
-        sphere_m = rig.T_world_camera.points(rig.sphere_in_camera_m)  # `rig.at` takes ten times as long
-        if rig.motion is None:
-            top_m = sphere_m[2] + stroke_m * rig.stroke_axis_world[2] + rig.mirror.radius_m
-        else:
-            top_m = rig.at(stroke_m).sphere_centre_m[2] + rig.mirror.radius_m
-        if top_m >= self._ceiling_m:
-            return f"the mirror's top at {top_m:.3f} m is above the ceiling's lamps at {self._ceiling_m:.2f} m"
-        return self._boards.cut_by(rig, stroke_m)
+
+def rig_fault(rig: Rig, stroke_m: float, ceiling_m: float, boards: Boards) -> str | None:
+    """Why a rig cannot make a stroke in its room: the ceiling's lamps or a board are in the way; None if it can."""
+    sphere_m = rig.T_world_camera.points(rig.sphere_in_camera_m)  # `rig.at` takes ten times as long
+    if rig.motion is None:
+        top_m = sphere_m[2] + stroke_m * rig.stroke_axis_world[2] + rig.mirror.radius_m
+    else:
+        top_m = rig.at(stroke_m).sphere_centre_m[2] + rig.mirror.radius_m
+    if top_m >= ceiling_m:
+        return f"the mirror's top at {top_m:.3f} m is above the ceiling's lamps at {ceiling_m:.2f} m"
+    return boards.cut_by(rig, stroke_m)
 
 
 def drawn_parameters(table: RandomTable) -> list[str]:

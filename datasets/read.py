@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,11 +27,15 @@ from phibench.datasets.manifest import read_manifest
 from phibench.datasets.recipe import Recipe
 from phibench.datasets.rigs import Rigs, read_rigs
 from phibench.datasets.schema import DatasetInfo, ManifestRow, SpotRow
+from phibench.datasets.sensitivity_file import read_sensitivities
 from phibench.datasets.sums import check_documents
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.names import nearest
 from phibench.scenes.rig import POSITIONS, Rig, View
 from phibench.scenes.room import Room
+
+if TYPE_CHECKING:
+    from polars import DataFrame
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,16 @@ class Dataset:
     def recipe(self) -> Recipe:
         """The recipe, defaults filled in."""
         return Recipe.model_validate(self.info.recipe)
+
+    def sensitivities(self) -> DataFrame:
+        """dD/d(parameter) per sample and estimator, a polars table; docs/misalignment.md has its columns.
+
+        Raises
+        ------
+        DatasetError
+            If the folder has none, or one of another state of the data set.
+        """
+        return read_sensitivities(self.folder)
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -197,6 +197,15 @@ class RandomTable(Table):
     spot: RandomSpotTable = Field(default=RandomSpotTable(), description="distribution of the laser spot")
 
 
+class RigsTable(Table):
+    """`[rigs]`: drawn rigs, each of which sees all `[[experiments]]`."""
+
+    count: int = Field(default=1, ge=1, le=100_000, description="how many; more keep those that are there")
+    misalignment: RandomMisalignmentTable = Field(
+        default=RandomMisalignmentTable(), description="distributions of keys of [misalignment]"
+    )
+
+
 class Recipe(Table):
     """A whole recipe: `[[experiments]]` or `[random]` says what is seen."""
 
@@ -212,6 +221,7 @@ class Recipe(Table):
     experiments: Annotated[tuple[ExperimentTable, ...], Field(strict=False)] = Field(
         default=(), description="which targets with which strokes"
     )
+    rigs: RigsTable | None = Field(default=None, description="drawn rigs, each of which sees all experiments")
     random: RandomTable | None = Field(default=None, description="samples that are drawn, instead of experiments")
     frames: FramesTable | None = Field(default=None, description="how frames of the samples are taken")
     distractors: Annotated[tuple[DistractorTable, ...], Field(strict=False)] = Field(

@@ -14,7 +14,7 @@ from phibench.datasets.recipe import MAX_STROKE_M, AmbientTable, LaserTable, Rec
 from phibench.datasets.recipe_frames_checks import distractor_faults, frames_faults
 from phibench.datasets.recipe_misalignment import MisalignmentTable
 from phibench.datasets.recipe_places import boards_in_the_way, spots_on_boards
-from phibench.datasets.recipe_random_checks import purpose_faults, random_faults
+from phibench.datasets.recipe_random_checks import purpose_faults, random_faults, rigs_faults
 from phibench.datasets.recipe_scene import (
     build_misalignment,
     build_rig,
@@ -47,6 +47,7 @@ def semantic_faults(raw: Raw) -> list[Fault]:
     return [
         *purpose_faults(raw, list(Recipe.model_fields)),
         *random_faults(raw, laser, room, [table for _, table in targets], names),
+        *rigs_faults(raw),
         *frames_faults(raw),
         *distractor_faults(raw, room, names),
         *_twice("targets", _tables(raw, "targets")),

@@ -52,10 +52,7 @@ def random_faults(
             yield from number_faults(f"random.rig.{key}", given, lambda value, key=key: _range(RigTable, key, value))
         elif key in RigTable.model_fields:
             yield _not_drawable(key)
-    for key, given in misalignment.items():
-        if key in MisalignmentTable.model_fields:
-            path = f"random.misalignment.{key}"
-            yield from number_faults(path, given, lambda value, key=key: _range(MisalignmentTable, key, value))
+    yield from _misalignment_faults("random", misalignment)
     for key in ("across_m", "up_m", "azimuth_deg", "height_m"):
         if key in spot:
             yield from number_faults(f"random.spot.{key}", spot[key], None)
@@ -65,6 +62,26 @@ def random_faults(
         yield from _off_board(spot, laser, targets)
     if room is not None:
         yield from off_wall("random.spot.height_m", spot.get("height_m"), room)
+
+
+def rigs_faults(raw: Raw) -> Iterator[Fault]:
+    """Faults of `[rigs]`."""
+    table = raw.get("rigs")
+    if not isinstance(table, dict):
+        return
+    if "random" in raw:
+        yield Fault("rigs", "given together with [random], whose samples have rigs of their own; remove one")
+    misalignment = _table(table.get("misalignment"))
+    if not misalignment:
+        yield Fault("rigs.misalignment", "draws nothing; add distributions of keys of [misalignment] or remove [rigs]")
+    yield from _misalignment_faults("rigs", misalignment)
+
+
+def _misalignment_faults(where: str, misalignment: Raw) -> Iterator[Fault]:
+    for key, given in misalignment.items():
+        if key in MisalignmentTable.model_fields:
+            path = f"{where}.misalignment.{key}"
+            yield from number_faults(path, given, lambda value, key=key: _range(MisalignmentTable, key, value))
 
 
 def _not_drawable(key: str) -> Fault:

@@ -101,7 +101,7 @@ class SpotRow(Document):
 class ManifestRow(Document):
     """One stroke pair: one line of `manifest.jsonl`."""
 
-    sample_id: str = _field("-", "<experiment>-<target>-h<stroke>, or random-<number> for a drawn sample")
+    sample_id: str = _field("-", "<experiment>-<target>-h<stroke>, with -<rig> if rigs are drawn; or random-<number>")
     experiment: str = _field("-", "name of the experiment in the recipe, or 'random'")
     target: str = _field("-", "name of the target in the recipe, or of what carries the spot")
     rig: str = _field("-", "id of the true rig, in `rigs.jsonl`")

@@ -21,6 +21,7 @@ from phibench.datasets.progress import Steps
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.sample_task import noise_row, spot_noise
 from phibench.datasets.schema import PoseInfo, SpotRow
+from phibench.datasets.sensitivity_file import sensitivity_fault
 from phibench.datasets.spot_task import SpotAnswer, answer_spot
 from phibench.datasets.sums import damaged, read_sums, strays
 from phibench.datasets.verify_plan import plan_faults
@@ -92,6 +93,7 @@ def verify(folder: str | Path, truth_layers: bool = True, console: Console | Non
         return Report((*faults, str(error)), files, 0, notes)
     bad = {fault.split(" is ", 1)[0] for fault in faults}
     faults += [*plan_faults(dataset), *differences(folder, dataset.rows)]
+    faults += filter(None, [sensitivity_fault(folder)])
     faults += _content_faults(dataset, bad, truth_layers, console)
     return Report(tuple(dict.fromkeys(faults)), files, len(dataset), notes)
 

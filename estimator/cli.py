@@ -16,6 +16,7 @@ from phibench.estimator import cli_methods
 from phibench.estimator.cli_bench import bench
 from phibench.estimator.cli_calibration import align, calibrate
 from phibench.estimator.cli_dataset import dataset
+from phibench.estimator.cli_experiments import experiments
 from phibench.estimator.cli_misalignment import sensitivities
 from phibench.estimator.cli_score import compare, report, score
 from phibench.estimator.cli_sealed import register as register_sealed
@@ -35,6 +36,7 @@ app.command(report)
 app.command(bench)
 register_sealed(app, dataset)
 app.command(sensitivities)
+app.command(experiments)
 app.command(calibrate)
 app.command(align)
 app.command(study)

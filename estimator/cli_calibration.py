@@ -17,6 +17,9 @@ def calibrate(
     sample: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
     preset: str = "layers",
     spots: bool = False,
+    distance_sigma_m: float = 1e-3,
+    height_sigma_m: float = math.inf,
+    azimuth_sigma_deg: float = math.inf,
 ) -> int:
     """Calibrate a rig from the images of a data set and write a calibration file.
 
@@ -29,14 +32,22 @@ def calibrate(
     sample
         Ids of samples; the first one by default.
     preset
-        "layers" (noise-free), or the preset of the frames to draw: "bayer-raw", "srgb8", "mjpeg".
+        "layers" (noise-free), or the preset of the frames to draw: "bayer-raw", "mono-raw", "srgb8", "mjpeg".
     spots
-        Also use the laser spots at their known distances (noise-free layers only).
+        Also use the laser spots at their known distances.
+    distance_sigma_m
+        How well the distance of each spot was measured, one standard deviation, metres.
+    height_sigma_m
+        The same of its height above the floor; not measured by default.
+    azimuth_sigma_deg
+        The same of its azimuth, degrees; not measured by default.
     """
     from phibench.estimator.calibration.dataset import calibrate_dataset
     from phibench.estimator.calibration.parameters import PARAMETERS
+    from phibench.estimator.calibration.spots import Ruler
 
-    bundle = calibrate_dataset(directory, out, sample, preset, spots)
+    ruler = Ruler(distance_sigma_m, height_sigma_m, math.radians(azimuth_sigma_deg))
+    bundle = calibrate_dataset(directory, out, sample, preset, spots, ruler)
     for name, value in zip(PARAMETERS, bundle.values, strict=True):
         print(f"{name:18s} {value:+.3e} +- {bundle.sigmas[name]:.1e}")
     for weak in bundle.undetermined:

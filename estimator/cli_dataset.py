@@ -22,12 +22,12 @@ def make(
     samples: Whole | None = None,
     seed: Whole | None = None,
 ) -> int:
-    """Render a data set; what is finished already is kept.
+    """Render a data set; what is finished already is kept. Sensitivities of D come last, sensitivities.parquet.
 
     Parameters
     ----------
     recipe
-        TOML file, or the name of a shipped recipe ("paper", "random", "smoke", "bench-dev", "bench-test").
+        TOML file, or the name of a shipped recipe ("paper", "paper-misaligned", "random", "smoke", ...).
     out
         Folder to write; one that holds another data set is refused.
     workers
@@ -42,8 +42,11 @@ def make(
         Root of all random streams, instead of the recipe's; a secret one for a set that is to be sealed.
     """
     from phibench.datasets.make import make as make_dataset
+    from phibench.estimator.sensitivity_table import keep_sensitivities
 
     make_dataset(recipe, out, workers, scheduler=scheduler, shard=shard, samples=samples, seed=seed)
+    if shard is None:  # the table of a merged set is made by `merge`
+        keep_sensitivities(out)
     return 0
 
 
@@ -61,9 +64,11 @@ def repair(directory: Path, *, workers: Whole | None = None, scheduler: str | No
         Address or scheduler file of a running dask scheduler, to use its workers instead.
     """
     from phibench.datasets.repair import repair as repair_dataset
+    from phibench.estimator.sensitivity_table import keep_sensitivities
 
     for name in repair_dataset(directory, workers, scheduler=scheduler):
         print(f"made again: {name}")
+    keep_sensitivities(directory)
     return 0
 
 
@@ -79,8 +84,10 @@ def merge(out: Path, *shards: Path) -> int:
         Folders of all shards.
     """
     from phibench.datasets.merge import merge as merge_shards
+    from phibench.estimator.sensitivity_table import keep_sensitivities
 
     merge_shards(out, shards)
+    keep_sensitivities(out)
     return 0
 
 

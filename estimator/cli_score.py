@@ -30,6 +30,7 @@ def score(
     hints: bool = True,
     seed: Whole = 0,
     workers: Whole = 1,
+    calibration: Path | None = None,
     out: Path | None = None,
 ) -> int:
     """Score methods on a data set's pairs; without --method, every depth estimator on the paper's tables.
@@ -52,13 +53,15 @@ def score(
         Of the bootstrap that makes the intervals.
     workers
         Pairs that are worked on at a time.
+    calibration
+        File of `phibench calibrate`: its rig's samples, with the calibrated rig, stroke and covariance.
     out
         JSON file for the score, records beside it as Parquet; with several methods their names are added to it.
     """
     if method:
-        return _score_methods(directory, method, preset, draws, pairs, hints, seed, workers, out)
+        return _score_methods(directory, method, preset, draws, pairs, hints, seed, workers, calibration, out)
     _refuse_without_method(preset=preset, draws=draws, pairs=pairs)
-    return _score_estimators(directory, out)
+    return _score_estimators(directory, calibration, out)
 
 
 def compare(first: Path, second: Path, *, seed: Whole = 0) -> int:
@@ -121,27 +124,30 @@ def _score_methods(
     hints: bool,
     seed: int,
     workers: int,
+    calibration: Path | None,
     out: Path | None,
 ) -> int:
     from rich.console import Console
 
     from phibench.datasets.files import require_writable
     from phibench.datasets.read import open_finished
-    from phibench.estimator.bench.dataset_pairs import dataset_pairs
     from phibench.estimator.bench.document import MethodCard, write_score
-    from phibench.estimator.bench.run_all import run_and_score
-    from phibench.estimator.bench.tables import cause_table, leaderboard, silences, strata_table
+    from phibench.estimator.bench.run_all import run_and_score, wanted_pairs
+    from phibench.estimator.bench.tables import cause_table, depth_line, leaderboard, silences, strata_table
     from phibench.estimator.seat.resolve import resolve
 
     files = _files(out, [MethodCard.of(name, **resolve(name).document()) for name in references])
     for target in filter(None, files):
         require_writable(target)
-    pair_set = dataset_pairs(open_finished(directory), preset, draws, count, hints)
+    pair_set = wanted_pairs(open_finished(directory), preset, draws, count, hints, calibration)
     scored = run_and_score(references, pair_set, workers, Console(stderr=True), "pairs", _seed(seed))
     console, documents = _console(), []
     for one, file in zip(scored, files, strict=True):
         documents.append(one.document if file is None else write_score(file, one.document, one.records))
     console.print(leaderboard(documents))
+    if calibration is not None:
+        for document in documents:
+            console.print(depth_line(document), soft_wrap=True, emoji=False, highlight=False)
     if any(any(kind.values()) for document in documents for kind in document.causes.values()):
         console.print(cause_table(documents))
     for one in scored:
@@ -198,12 +204,16 @@ def _console() -> Console:
     return console if console.width >= _TABLE_WIDTH else Console(width=_TABLE_WIDTH)
 
 
-def _score_estimators(directory: Path, out: Path | None) -> int:
+def _score_estimators(directory: Path, calibration: Path | None, out: Path | None) -> int:
     from phibench.datasets.read import open_finished
+    from phibench.estimator.bench.calibrated_pairs import of_calibration
+    from phibench.estimator.calibration.file import read_calibration
     from phibench.estimator.score import bias_table, table
     from phibench.estimator.score import score as score_dataset
 
-    scores = score_dataset(open_finished(directory))
+    dataset = open_finished(directory)
+    calibrated = None if calibration is None else read_calibration(calibration)
+    scores = score_dataset(dataset if calibrated is None else of_calibration(dataset, calibrated), calibrated)
     console = _console()
     for grid in (table(scores, "truth"), table(scores, "frame"), bias_table(scores)):
         console.print(grid)

@@ -6,6 +6,7 @@ An estimator takes (rig, stroke, pixel down, pixel up) and returns a `DepthEstim
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -14,8 +15,11 @@ from typing import Any, Protocol
 import numpy as np
 from rich.table import Table
 
+from phibench.estimator.calibration.file import Calibration
+from phibench.estimator.calibration.parameters import stroke_of
 from phibench.estimator.centroid import find_spot
 from phibench.estimator.depth import depth_approx, depth_paper
+from phibench.estimator.depth_general import GeneralDepth, depth_general
 from phibench.estimator.estimate import DepthEstimate
 from phibench.estimator.phi import CONVENTIONS
 from phibench.estimator.published import find_published
@@ -26,6 +30,10 @@ from phibench.scenes.rig import POSITIONS, Rig
 
 Estimator = Callable[[Rig, float, Array, Array], DepthEstimate]
 SOURCES = ("truth", "frame")
+GENERAL = "general"
+"""Row of `depth_general`, which takes a calibration's covariance."""
+CENTROID_SIGMA_PX = 0.02
+"""Of `find_spot` on noise-free frames: the pixels' share in the predicted error of `GENERAL` from "frame"."""
 
 
 class Sample(Protocol):
@@ -64,6 +72,8 @@ class Score:
     estimate_m, error_m, relative_error : float, NaN unless `status` is "ok"
     published_m : float, the paper's estimate, NaN if it has none
     status : "ok", or why there is no estimate
+    sigma_m, p_value : float
+        Of `GENERAL`: predicted standard deviation, and the test whether both rays meet; NaN for the others.
     """
 
     sample_id: str
@@ -77,6 +87,8 @@ class Score:
     relative_error: float
     published_m: float
     status: str
+    sigma_m: float = math.nan
+    p_value: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -100,6 +112,23 @@ class _Pixels:
     fault: str = ""
 
 
+@dataclass(frozen=True)
+class _Believed:
+    """What an estimator is given besides pixels."""
+
+    rig: Rig
+    stroke_m: float
+    covariance: Array | None = None
+
+    @classmethod
+    def of(cls, sample: Sample, calibration: Calibration | None) -> _Believed:
+        """Nominal numbers, or those of a calibration."""
+        if calibration is None:
+            return cls(sample.nominal_rig, sample.row.nominal_stroke_m)
+        stroke_m = float(stroke_of(np.array(sample.row.nominal_stroke_m), calibration.values))
+        return cls(calibration.rig, stroke_m, calibration.covariance)
+
+
 def paper_estimator(convention: str, rig: Rig, stroke_m: float, uv_down_px: Array, uv_up_px: Array) -> DepthEstimate:
     """Eq. (4) with phi in one convention."""
     phi1, phi2 = _phis(convention, rig, stroke_m, uv_down_px, uv_up_px)
@@ -119,20 +148,27 @@ ESTIMATORS: dict[str, Estimator] = {
 }
 
 
-def score(dataset: Dataset) -> tuple[Score, ...]:
+def score(dataset: Dataset, calibration: Calibration | None = None) -> tuple[Score, ...]:
     """Score all estimators on all samples, from true pixels and from noise-free frames.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    calibration : Calibration, optional
+        Every estimator gets its rig and its strokes, and `GENERAL` its covariance, too.
 
     Returns
     -------
     tuple of Score
         Every sample appears for every estimator and source; what cannot be estimated carries its cause.
     """
+    names = tuple(ESTIMATORS) if calibration is None else (*ESTIMATORS, GENERAL)
     return tuple(
-        _score_one(sample.nominal_rig, sample.row, name, source, pixels)
+        _score_one(_Believed.of(sample, calibration), sample.row, name, source, pixels)
         for sample in dataset.samples
         for source in SOURCES
         for pixels in (_pixels(sample, source),)
-        for name in ESTIMATORS
+        for name in names
     )
 
 
@@ -147,7 +183,7 @@ def summarise(scores: Iterable[Score]) -> tuple[Summary, ...]:
 def table(scores: Sequence[Score], source: str = "truth") -> Table:
     """The paper's tables beside ours: one line per sample, one column per estimator (estimate and relative error)."""
     grid = Table(title=f"Depth in metres, relative error in %; pixels: {source}")
-    for head in ("experiment", "h", "real D", "published", *ESTIMATORS):
+    for head in ("experiment", "h", "real D", "published", *dict.fromkeys(item.estimator for item in scores)):
         grid.add_column(head, justify="left" if head == "experiment" else "right")
     rows: dict[str, list[Score]] = {}
     for item in scores:
@@ -156,7 +192,7 @@ def table(scores: Sequence[Score], source: str = "truth") -> Table:
     for items in rows.values():
         first = items[0]
         published = _cell(first.published_m, first.published_m / first.depth_m - 1.0, "")
-        cells = (_cell(item.estimate_m, item.relative_error, item.status) for item in items)
+        cells = (_cell(item.estimate_m, item.relative_error, item.status) + _doubt(item) for item in items)
         grid.add_row(first.experiment, f"{first.stroke_m:.3f}", f"{first.depth_m:.3f}", published, *cells)
     grid.add_section()
     grid.add_row("rms relative error (n)", "", "", _published_rms(list(rows.values())), *_rms_cells(scores, source))
@@ -199,8 +235,8 @@ def _pixels(sample: Sample, source: str) -> _Pixels:
     return _Pixels(spots["down"].uv_px, spots["up"].uv_px, ", ".join(faults))
 
 
-def _score_one(rig: Rig, row: Any, name: str, source: str, pixels: _Pixels) -> Score:
-    estimate = ESTIMATORS[name](rig, row.nominal_stroke_m, pixels.down, pixels.up)
+def _score_one(believed: _Believed, row: Any, name: str, source: str, pixels: _Pixels) -> Score:
+    estimate = _estimate(believed, name, source, pixels)
     depth = float(estimate.depth_m)
     published = find_published(row.experiment, row.depth_m, row.nominal_stroke_m)
     return Score(
@@ -215,7 +251,16 @@ def _score_one(rig: Rig, row: Any, name: str, source: str, pixels: _Pixels) -> S
         relative_error=depth / row.depth_m - 1.0,
         published_m=published.estimated_depth_m if published else float("nan"),
         status=pixels.fault or describe(int(estimate.status)),
+        sigma_m=float(estimate.sigma_m) if isinstance(estimate, GeneralDepth) else math.nan,
+        p_value=float(estimate.p_value) if isinstance(estimate, GeneralDepth) else math.nan,
     )
+
+
+def _estimate(believed: _Believed, name: str, source: str, pixels: _Pixels) -> DepthEstimate:
+    if name != GENERAL:
+        return ESTIMATORS[name](believed.rig, believed.stroke_m, pixels.down, pixels.up)
+    C = (CENTROID_SIGMA_PX**2 if source == "frame" else 0.0) * np.eye(2)
+    return depth_general(believed.rig, believed.stroke_m, pixels.down, pixels.up, C, C, believed.covariance)
 
 
 def _summary(estimator: str, source: str, items: list[Score]) -> Summary:
@@ -231,6 +276,11 @@ def _cell(value_m: float, relative: float, status: str) -> str:
     if np.isnan(value_m):
         return status if status != "ok" else "-"
     return f"{value_m:.4f} {_percent(relative):>8}"
+
+
+def _doubt(item: Score) -> str:
+    """Predicted error and p value, where there are any."""
+    return "" if math.isnan(item.sigma_m) else f" ± {100.0 * item.sigma_m / item.depth_m:.3f}, p {item.p_value:.2f}"
 
 
 def _percent(relative: float) -> str:

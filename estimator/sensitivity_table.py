@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from phibench.datasets import layout
 from phibench.datasets.files import write_bytes
-from phibench.datasets.read import Dataset, Sample
+from phibench.datasets.read import Dataset, Sample, open_finished
+from phibench.datasets.sensitivity_file import metadata_of, sensitivity_fault
 from phibench.estimator.score import ESTIMATORS
 from phibench.estimator.sensitivities import PARAMETERS, sensitivity
 from phibench.scenes.rig import POSITIONS
@@ -41,14 +43,22 @@ def sensitivity_rows(samples: Iterable[Sample]) -> Iterator[Row]:
 
 
 def write_sensitivities(dataset: Dataset, out: Path) -> Path:
-    """Write the table of a data set as Parquet."""
+    """Write the table of a data set as Parquet; its metadata say of which state of the data set."""
     import polars
 
     schema = dict.fromkeys(columns(), polars.Float64) | dict.fromkeys(_WORDS, polars.String)
     buffer = io.BytesIO()
     table = polars.DataFrame(list(sensitivity_rows(dataset)), schema={name: schema[name] for name in columns()})
-    table.write_parquet(buffer, compression="zstd", statistics=False)
+    table.write_parquet(buffer, compression="zstd", statistics=False, metadata=metadata_of(dataset.folder))
     return write_bytes(out, buffer.getvalue())
+
+
+def keep_sensitivities(folder: Path) -> Path:
+    """Write the table into a finished data set's folder, unless the one there is good."""
+    path = folder / layout.SENSITIVITIES
+    if path.is_file() and sensitivity_fault(folder) is None:
+        return path
+    return write_sensitivities(open_finished(folder), path)
 
 
 def columns() -> tuple[str, ...]:

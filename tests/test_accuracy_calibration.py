@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy import stats
 from test_calibration import apparent
 
 from phibench.estimator.calibration.bundle import KnownSpot, Measured, calibrate
-from phibench.estimator.calibration.parameters import PARAMETERS, changed, prior_sigmas
+from phibench.estimator.calibration.parameters import PARAMETERS, changed, prior_sigmas, stroke_of
+from phibench.estimator.depth_general import depth_general
 from phibench.estimator.triangulate import depth_exact
 from phibench.render.spot_truth import spot_truth
 from phibench.scenes.laser import LaserSpot
@@ -74,3 +76,62 @@ def test_accuracy_of_depth_with_drawn_misalignments() -> None:
     assert rms["nominal"] > 0.01
     assert rms["outline"] < 0.004
     assert rms["spots"] < 0.0005
+
+
+OUTLINE = np.diag([5e-6, 5e-6, 2e-5])
+PIXEL = 0.02
+KNOWN = {"distance": (1e-3, np.inf, np.inf), "place": (1e-3, 2e-3, math.radians(0.1))}
+"""Sigmas of D, height and azimuth of a calibration spot."""
+
+
+def drawn_spots(true: Rig, values: np.ndarray, rng: np.random.Generator, known: str) -> list[KnownSpot]:
+    """Four spots at the true strokes, with noise of pixels, distance, height and azimuth as stated."""
+    C, sigmas, found = PIXEL**2 * np.eye(2), KNOWN[known], []
+    h = float(stroke_of(np.array(STROKE), values))
+    for depth, azimuth in ((1.0, 0.3), (1.7, 1.9), (2.6, 3.4), (3.6, 5.0)):
+        point = around(true, depth, azimuth)
+        down, up = (pixel(true, point, offset) + PIXEL * rng.standard_normal(2) for offset in (0.0, h))
+        read = np.array([depth, point[2], azimuth]) + [s * rng.standard_normal() if s < 1.0 else 0.0 for s in sigmas]
+        places = (read[0], sigmas[0], read[1], sigmas[1], read[2], sigmas[2])
+        found.append(KnownSpot(down, up, C, C, STROKE, *places))
+    return found
+
+
+def calibrated_errors(known: str, rigs: int) -> tuple[np.ndarray, np.ndarray]:
+    """Relative errors of D and their predicted sigma, shape (rigs, 5): exact pixels, drawn strokes and stroke axes."""
+    sigmas, errors, predicted = prior_sigmas(), np.zeros((rigs, 5)), np.zeros((rigs, 5))
+    for k in range(rigs):
+        rng = generator("test", "strokes", k)
+        values = rng.normal(0.0, sigmas)
+        true = changed(BELIEVED, values)
+        outline = Measured(apparent(true).value + OUTLINE @ rng.standard_normal(3), OUTLINE**2)
+        bundle = calibrate(BELIEVED, outline, drawn_spots(true, values, rng, known))
+        for i, depth in enumerate((1.0, 1.8, 2.6, 3.4, 4.2)):
+            point, h = around(true, depth, rng.uniform(0.0, 2.0 * np.pi)), float(stroke_of(np.array(STROKE), values))
+            uv = [pixel(true, point, offset) for offset in (0.0, h)]
+            C = 1e-6 * np.eye(2)  # exact pixels; the condition needs some weight
+            found = depth_general(bundle.rig, bundle.stroke(np.array(STROKE)), *uv, C, C, bundle.covariance)
+            errors[k, i], predicted[k, i] = float(found.depth_m) / depth - 1.0, float(found.sigma_m) / depth
+    return errors, predicted
+
+
+def test_accuracy_of_depth_with_drawn_strokes_and_measured_places() -> None:
+    """Strokes off by 0.5 mm and 0.05 %, their axis by 0.2 deg, besides all else; spots of 0.02 px, D to 1 mm.
+
+    The mean square pull of each rig lies between a chi-square of 5 degrees over 5 and of 1; the worst case, common
+    errors, over 8 rigs is chi-square with 8 degrees: false alarm 1e-4 per case. With half the covariance's sigma the
+    mean square would be 4 times as large, which the test notices if it is above 0.97 (median 1).
+    Measured heights and azimuths never make the prediction worse.
+    """
+    low, high = stats.chi2.ppf([5e-5, 1.0 - 5e-5], 8) / 8
+    means = {}
+    for known in KNOWN:
+        errors, predicted = calibrated_errors(known, 8)
+        pulls = float(np.mean((errors / predicted) ** 2))
+        rms = float(np.sqrt(np.mean(errors**2)))
+        claimed = float(np.sqrt(np.mean(predicted**2)))
+        print(f"{known}: rms {100 * rms:.3f} %, predicted {100 * claimed:.3f} %, mean square pull {pulls:.2f}")
+        assert low < pulls < high
+        assert rms < 0.003
+        means[known] = float(np.mean(predicted**2))
+    assert means["place"] < 0.9 * means["distance"]

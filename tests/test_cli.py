@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from pathlib import Path
 
 import pytest
 
@@ -74,7 +75,7 @@ def test_score_of_a_folder_that_is_not_there(tmp_path, capsys):
 def test_scores_are_written_to_a_file(monkeypatch, tmp_path, capsys):
     scores = (Score("a", "mine", 2.0, 0.5, "exact", "truth", 2.1, 0.1, 0.05, math.nan, "ok"),)
     monkeypatch.setattr("phibench.datasets.read.open_finished", lambda directory: None)
-    monkeypatch.setattr("phibench.estimator.score.score", lambda dataset: scores)
+    monkeypatch.setattr("phibench.estimator.score.score", lambda dataset, calibration: scores)
     assert cli.main(["score", "x", "--out", str(tmp_path / "scores.json")]) == 0
     document = json.loads((tmp_path / "scores.json").read_text())
     assert document["scores"][0]["estimate_m"] == 2.1
@@ -113,17 +114,28 @@ assert not {"mitsuba", "drjit"} & set(sys.modules)
     assert done.returncode == 0, done.stderr
 
 
+def sensitivities_kept(monkeypatch) -> list[Path]:
+    """Folders whose sensitivities are asked for, instead of writing them."""
+    kept: list[Path] = []
+    monkeypatch.setattr("phibench.estimator.sensitivity_table.keep_sensitivities", kept.append)
+    return kept
+
+
 def test_repair_prints_what_it_made(monkeypatch, capsys):
     monkeypatch.setattr("phibench.datasets.repair.repair", lambda *_, **__: ["view h0.000", "SHA256SUMS"])
+    kept = sensitivities_kept(monkeypatch)
     assert cli.main(["dataset", "repair", "x", "--workers", "2"]) == 0
+    assert kept == [Path("x")]
     assert capsys.readouterr().out.splitlines() == ["made again: view h0.000", "made again: SHA256SUMS"]
 
 
 def test_merge_takes_any_number_of_shards(monkeypatch, tmp_path):
     calls = []
     monkeypatch.setattr("phibench.datasets.merge.merge", lambda out, shards: calls.append((out, list(shards))))
+    kept = sensitivities_kept(monkeypatch)
     assert cli.main(["dataset", "merge", str(tmp_path / "o"), str(tmp_path / "a"), str(tmp_path / "b")]) == 0
     assert calls == [(tmp_path / "o", [tmp_path / "a", tmp_path / "b"])]
+    assert kept == [tmp_path / "o"]
 
 
 def test_make_passes_shard_and_scheduler_on(monkeypatch, tmp_path):
@@ -142,6 +154,8 @@ def test_make_passes_shard_and_scheduler_on(monkeypatch, tmp_path):
         "--scheduler",
         "s",
     ]
+    kept = sensitivities_kept(monkeypatch)
     assert cli.main(tokens) == 0
+    assert kept == []  # a shard's are made when it is merged
     others = {"samples": None, "seed": None}
     assert calls == [(("smoke", tmp_path, 3), {"scheduler": "s", "shard": "2/5", **others})]

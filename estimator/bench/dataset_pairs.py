@@ -5,6 +5,7 @@ The bound of a spot counts room, dark current and distractors as background: one
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +18,7 @@ from phibench.datasets.files import sha256
 from phibench.datasets.frame_source import FrameSource, Side
 from phibench.datasets.frames import Frames
 from phibench.datasets.provenance import provenance
-from phibench.datasets.read import Dataset
+from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.sensor_card import card_of
 from phibench.datasets.taken import TakenSample
 from phibench.datasets.takes import Take, takes
@@ -162,6 +163,27 @@ def dataset_pairs(
         raise DatasetError(f"pairs = {pairs}: must be 1 or above")
     shown = taken if hints else tuple(replace(take, boxes=None) for take in taken)
     return DatasetPairs(dataset, shown[:pairs])
+
+
+def pairs_of(
+    dataset: Dataset, samples: Sequence[Sample], preset: str, draws: int = 1, laser_off: bool = True
+) -> DatasetPairs:
+    """Pairs of some samples in one preset, in the order of the samples, then of the draws.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    samples : of the data set
+    preset : str
+    draws : int
+    laser_off : bool
+        Whether frames with the laser off belong to them, whatever the recipe says.
+    """
+    order = {sample.row.sample_id: place for place, sample in enumerate(samples)}
+    few = replace(dataset, rows=tuple(sample.row for sample in samples))
+    taken = sorted(takes(few, preset, draws), key=lambda take: (order[take.sample_id], take.draw))
+    numbered = (replace(take, number=number, laser_off=laser_off) for number, take in enumerate(taken))
+    return DatasetPairs(few, tuple(numbered))
 
 
 def _sealed(image: Image) -> Image:

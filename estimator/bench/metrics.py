@@ -32,6 +32,8 @@ from phibench.estimator.bench.rules import MATCH_PX, Rules
 from phibench.scenes.frames import Array
 from phibench.scenes.streams import Name, generator
 
+WITHIN = 1.959963984540054
+"""Standard deviations of a normal error that hold 95 %."""
 LEAST_FOR_P95 = 50
 """Samples below which a 95th percentile has no interval."""
 Better = Literal["lower", "higher", "none"]
@@ -161,6 +163,9 @@ METRICS: dict[str, Metric] = {
     "pull_depth": Metric(
         "depth pull", "deviation", ("depth_pull",), "1", "none", "deviation of error / sigma of D; 1 is right"
     ),
+    "coverage_depth": Metric(
+        "depth pull", "rate", ("depth_within",), "1", "none", "errors of D within 1.96 sigma; 0.95 is right"
+    ),
     "seconds": Metric("timed", "mean", ("seconds",), "s", "lower", "mean time per pair"),
 }
 
@@ -179,6 +184,7 @@ def prepared(records: pl.DataFrame) -> pl.DataFrame:
     return records.with_columns(
         root_bound_px=pl.col("bound_px2").sqrt(),
         root_bound_depth=pl.col("bound_depth_m2").sqrt() / pl.col("depth_m"),
+        depth_within=pl.col("depth_pull").abs() <= WITHIN,
         sample_code=pl.col("sample_id").rank("dense").cast(pl.Int64),
     )
 

@@ -16,6 +16,7 @@ import polars as pl
 
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.bench import errors
+from phibench.estimator.bench.believed_depth import believed_depth
 from phibench.estimator.bench.pair_set import PairSet
 from phibench.estimator.bench.rules import Rules
 from phibench.estimator.bench.truth import PairTruth, SpotTruth
@@ -78,7 +79,7 @@ COLUMNS: dict[str, str] = {
     "depth_error_m": "depth_estimate_m - depth_m",
     "depth_relative": "depth_error_m / depth_m",
     "depth_counted": "|depth_relative|, at most missed_relative; that too if not found; null unless pair_visible",
-    "depth_sigma_m": "claimed: the method's with its own depth, else from its covariances; without calibration",
+    "depth_sigma_m": "claimed: the method's with its own depth, else from its covariances; with a calibration's part",
     "depth_pull": "depth_error_m / depth_sigma_m",
     "bound_depth_m2": "variance of D at the bounds of both spots; without calibration",
     "seconds": "inside the method",
@@ -110,11 +111,13 @@ def record_table(truths: Sequence[PairTruth], outcomes: Sequence[Outcome], rules
     """As `records`, from truths and outcomes side by side."""
     if not truths:
         raise DatasetError("a score of no pairs: give at least one")
-    index: dict[tuple[Rig, Rig], list[int]] = {}
+    index: dict[tuple[Rig, Rig, int], list[int]] = {}
     for i, truth in enumerate(truths):
-        index.setdefault((truth.believed_rig, truth.true_rig), []).append(i)
+        # a calibration goes with its rig; its array is one object for all pairs, or rows that are equal stay apart
+        index.setdefault((truth.believed_rig, truth.true_rig, id(truth.calibration_covariance)), []).append(i)
     frames = [
-        _of_rigs(*rigs, [truths[i] for i in rows], [outcomes[i] for i in rows], rules) for rigs, rows in index.items()
+        _of_rigs(believed, true, [truths[i] for i in rows], [outcomes[i] for i in rows], rules)
+        for (believed, true, _), rows in index.items()
     ]
     table = pl.concat(frames).sort("number", pl.col("image") == "up")
     return table.with_columns(pl.col(pl.Float64).fill_nan(None)).select(*COLUMNS)
@@ -229,10 +232,12 @@ def _pair_columns(
     answers, truth = (
         [np.stack([i[u], i[v]], -1) for i in (down, up)] for u, v in (("u_px", "v_px"), ("u_true_px", "v_true_px"))
     )
-    triangulated = depth_exact(believed, believed_h, *answers, *claims)
+    calibration = truths[0].calibration_covariance
+    found_m = believed_depth(believed, believed_h, (answers[0], answers[1]), (claims[0], claims[1]), calibration)
     own, own_sigma = (np.array([_own_depth(o.answer, name) for o in outcomes]) for name in ("depth_m", "sigma_depth_m"))
     has_own = np.isfinite(own)
-    depth, sigma = np.where(has_own, own, triangulated.depth_m), np.where(has_own, own_sigma, triangulated.sigma_m)
+    own_sigma = np.hypot(own_sigma, found_m.calibration_sigma_m)
+    depth, sigma = np.where(has_own, own, found_m.depth_m), np.where(has_own, own_sigma, found_m.sigma_m)
     both = down["visible"] & up["visible"]
     wrong = down["false_detection"] | up["false_detection"]
     found = both & (depth > 0.0) & np.where(has_own, ~wrong, down["detected"] & up["detected"])

@@ -15,10 +15,13 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.files import require_writable
 from phibench.datasets.progress import Steps
 from phibench.datasets.read import Dataset, open_finished
-from phibench.estimator.bench.dataset_pairs import DatasetPairs, dataset_pairs
+from phibench.estimator.bench.calibrated_pairs import CalibratedPairs, of_calibration
+from phibench.estimator.bench.dataset_pairs import dataset_pairs
 from phibench.estimator.bench.document import MethodCard, write_score
+from phibench.estimator.bench.pair_set import PairSet
 from phibench.estimator.bench.report import write_report
 from phibench.estimator.bench.score_method import Scored, score_methods
+from phibench.estimator.calibration.file import read_calibration
 from phibench.estimator.methods.built_in import BuiltIn
 from phibench.estimator.methods.registry import METHODS
 from phibench.estimator.seat.harness import Harness
@@ -48,6 +51,7 @@ def bench(
     workers: int = 1,
     pairs: int | None = None,
     console: Console | None = None,
+    calibration: str | Path | None = None,
 ) -> Benched:
     """Run built-in methods on all presets of a data set and write scores and a report.
 
@@ -59,6 +63,7 @@ def bench(
     workers : pairs that are worked on at a time
     pairs : the first so many of each preset; all by default
     console : where progress goes; by default the standard error
+    calibration : file of `phibench calibrate`; the pairs are then those of its rig, with its numbers
 
     Raises
     ------
@@ -72,7 +77,7 @@ def bench(
     require_writable(out / REPORT)
     scores, notes = [], []
     for preset in _presets(dataset):
-        taken = dataset_pairs(dataset, preset, pairs=pairs)
+        taken = wanted_pairs(dataset, preset, pairs=pairs, calibration=calibration)
         refusals = {name: refusal(METHODS[name], taken) for name in chosen}
         notes += [f"{name} is left out on {preset}: {why}" for name, why in refusals.items() if why]
         names = [name for name, why in refusals.items() if not why]
@@ -87,7 +92,7 @@ def bench(
 
 def run_and_score(
     references: Sequence[str],
-    pairs: DatasetPairs,
+    pairs: PairSet,
     workers: int,
     console: Console,
     title: str,
@@ -109,7 +114,28 @@ def run_and_score(
         return score_methods(cards, pairs, harness.outcomes, None, seed, asdict(limits), steps.reach)
 
 
-def refusal(method: BuiltIn, pairs: DatasetPairs) -> str:
+def wanted_pairs(
+    dataset: Dataset,
+    preset: str | None,
+    draws: int | None = None,
+    pairs: int | None = None,
+    hints: bool = True,
+    calibration: str | Path | None = None,
+) -> PairSet:
+    """As `dataset_pairs`; with a calibration file its rig's pairs, with the calibrated rig, stroke and covariance.
+
+    Raises
+    ------
+    DatasetError
+        As `dataset_pairs`, or if the calibration cannot be read or is that of another rig.
+    """
+    if calibration is None:
+        return dataset_pairs(dataset, preset, draws, pairs, hints)
+    read = read_calibration(calibration)
+    return CalibratedPairs(dataset_pairs(of_calibration(dataset, read), preset, draws, pairs, hints), read)
+
+
+def refusal(method: BuiltIn, pairs: PairSet) -> str:
     """Why a built-in method cannot take the pairs of a preset; "" if it can."""
     return method.refusal(replace(pairs.pair(0), box_down=_PROBE_BOX, box_up=_PROBE_BOX))
 

@@ -54,6 +54,13 @@ def leaderboard(documents: Sequence[ScoreDocument]) -> Table:
     return grid
 
 
+def depth_line(document: ScoreDocument) -> str:
+    """Whether the predicted error of D, the calibration's part included, is that of the errors."""
+    pull, within = (document.overall[name].estimate for name in ("pull_depth", "coverage_depth"))
+    share = one_line(within, 100.0, 1)
+    return f"{document.method.name}: pull of D {one_line(pull, 1.0, 3)}; within 1.96 sigma of D {share} %, 95 is right"
+
+
 def strata_table(document: ScoreDocument) -> Table:
     """One line per stratum of one method."""
     least = round(document.rules["least_samples"])

@@ -81,6 +81,8 @@ class PairTruth:
     down, up : SpotTruth
     believed_stroke_m : float or None
         The stroke in `Pair.stroke_m`; None if it is the true one.
+    calibration_covariance : array, shape (p, p), or None
+        That of the pair: the predicted error of D then includes the calibration's.
     """
 
     number: int
@@ -96,3 +98,4 @@ class PairTruth:
     down: SpotTruth
     up: SpotTruth
     believed_stroke_m: float | None = None
+    calibration_covariance: Array | None = None

@@ -20,6 +20,7 @@ from phibench.scenes.rig import Rig
 
 _MATRICES = ("bound_px2", "raw_bound_px2")
 _RIGS = ("true_rig", "believed_rig")
+_NOT_SEALED = ("calibration_covariance",)  # a calibration comes with the score, never with the set
 
 
 def truth_text(truths: Sequence[PairTruth], salt: str, public_sha256: str) -> str:
@@ -57,7 +58,7 @@ def read_truth_file(path: Path, sha256: str) -> list[PairTruth]:
 def truth_document(truth: PairTruth) -> dict[str, Any]:
     """A pair's truth as JSON can hold it."""
     bare = replace(truth, down=_without_arrays(truth.down), up=_without_arrays(truth.up))
-    document = {name: getattr(bare, name) for name in PairTruth.__dataclass_fields__}
+    document = {name: getattr(bare, name) for name in PairTruth.__dataclass_fields__ if name not in _NOT_SEALED}
     document |= {name: to_json(document[name]) for name in _RIGS}
     for position in ("down", "up"):
         spot = getattr(truth, position)

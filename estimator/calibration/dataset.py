@@ -9,22 +9,31 @@ from typing import Any
 import numpy as np
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.files import require_writable
 from phibench.datasets.read import Dataset, Sample, open_dataset
-from phibench.datasets.sensor_card import sensor_card
+from phibench.estimator.bench.dataset_pairs import pairs_of
 from phibench.estimator.calibration.bundle import Bundle, KnownSpot, Measured, calibrate
 from phibench.estimator.calibration.file import write_calibration
 from phibench.estimator.calibration.outline import Outline, find_outline
+from phibench.estimator.calibration.outline_mean import mean_outline
+from phibench.estimator.calibration.spots import Ruler, known_spot, measured_spot, method_for, one_per_pose
 from phibench.estimator.centroid import find_spot
 from phibench.estimator.status import Status, describe
 from phibench.scenes.rig import POSITIONS, Rig
 
 LAYERS = "layers"
 SPOT_SIGMA_PX = 0.02
-DISTANCE_SIGMA_M = 1e-3
+"""Of the centroid in noise-free layers."""
 
 
 def calibrate_dataset(
-    folder: Path, out: Path, samples: Sequence[str] = (), preset: str = LAYERS, spots: bool = False
+    folder: Path,
+    out: Path,
+    samples: Sequence[str] = (),
+    preset: str = LAYERS,
+    spots: bool = False,
+    ruler: Ruler | None = None,
+    vertical: Measured | None = None,
 ) -> Bundle:
     """Calibrate the rig of some samples and write the file.
 
@@ -35,37 +44,73 @@ def calibrate_dataset(
     out : Path
     samples : ids; the first of the data set by default
     preset : str
-        "layers" for the noise-free layers, or a preset of the sensor whose frames are drawn.
+        "layers" for the noise-free layers, or a preset of the sensor whose frames are drawn, with the laser on and off.
     spots : bool
-        Also use the samples' laser spots, with their D as if measured to 1 mm. Noise-free layers only.
+        Also use the samples' laser spots, at places that the ruler measures. In frames they are found by the built-in
+        method that reaches the limit there, which gives their covariance, too.
+    ruler : Ruler, optional
+        By default D is measured to 1 mm, height and azimuth not at all.
+    vertical : Measured, optional
+        The world's vertical in the camera frame, see `bundle.calibrate`.
 
     Raises
     ------
     DatasetError
         If the samples have different rigs, an image has no whole mirror, or a spot is not found.
     """
-    dataset = open_dataset(folder)
+    require_writable(out)
+    dataset, ruler = open_dataset(folder), ruler or Ruler()
     chosen = [dataset[name] for name in samples] or [dataset.samples[0]]
     rig = _one_rig(chosen)
-    if spots and preset != LAYERS:
-        raise DatasetError(f"--spots with preset '{preset}': spots are found in noise-free layers only; leave one out")
-    outlines = [_outline(sample, position, preset) for sample in chosen for position in POSITIONS]
-    known = [_known(sample) for sample in chosen] if spots else []
-    bundle = calibrate(rig, mean_outline(outlines), known)
-    write_calibration(out, bundle, rig, _made_from(dataset, chosen, preset, outlines, spots))
+    if preset == LAYERS:
+        outlines = [find_outline(s.ambient(p), rig) for s, p in one_per_pose(chosen)]
+        known = [_known_in_layers(sample, ruler) for sample in chosen] if spots else []
+    else:
+        outlines = [frame_outline(dataset, sample, position, preset) for sample, position in one_per_pose(chosen)]
+        known = frame_spots(dataset, chosen, preset, ruler) if spots else []
+    bundle = calibrate(rig, mean_outline(outlines), known, vertical)
+    write_calibration(out, bundle, rig, _made_from(dataset, chosen, preset, outlines, known))
     return bundle
 
 
-def mean_outline(outlines: Sequence[Outline]) -> Measured:
-    """Weighted mean of sphere centres; their scatter widens the covariance where it is larger than they claim."""
-    weights = np.array([np.linalg.inv(outline.covariance_m2) for outline in outlines])
-    covariance = np.linalg.inv(weights.sum(axis=0))
-    centres = np.array([outline.sphere_in_camera_m for outline in outlines])
-    mean = covariance @ np.einsum("kij,kj->i", weights, centres)
-    off = centres - mean
-    degrees = 3 * (len(outlines) - 1)
-    chi2 = float(np.einsum("ki,kij,kj->", off, weights, off))
-    return Measured(mean, covariance * max(1.0, chi2 / degrees if degrees else 1.0))
+def frame_outline(dataset: Dataset, sample: Sample, position: str, preset: str, laser_off: bool = True) -> Outline:
+    """Outline in one drawn frame of a sample, with the believed rig."""
+    pair = pairs_of(dataset, [sample], preset, laser_off=laser_off).pair(0)
+    return find_outline(getattr(pair, f"{position}_off" if laser_off else position), sample.nominal_rig, pair.card)
+
+
+def frame_spots(
+    dataset: Dataset,
+    samples: Sequence[Sample],
+    preset: str,
+    ruler: Ruler,
+    laser_off: bool = True,
+    least: int | None = None,
+) -> list[KnownSpot]:
+    """Calibration spots of drawn frames.
+
+    Parameters
+    ----------
+    dataset, samples, preset, ruler, laser_off
+    least : int, optional
+        So many spots are enough, and those that are not found are left out; by default all must be found.
+
+    Raises
+    ------
+    DatasetError
+        If too few spots were found; what it says is about the last one that was not.
+    """
+    pairs, found = pairs_of(dataset, samples, preset, laser_off=laser_off), []
+    fault: DatasetError | None = None
+    for number, sample in enumerate(samples):
+        pair = pairs.pair(number)
+        try:
+            found.append(known_spot(sample, pair, method_for(pair.card)(pair), ruler))
+        except DatasetError as error:
+            fault = error
+    if fault is not None and len(found) < (len(samples) if least is None else least):
+        raise fault
+    return found
 
 
 def _one_rig(samples: Sequence[Sample]) -> Rig:
@@ -76,33 +121,26 @@ def _one_rig(samples: Sequence[Sample]) -> Rig:
     return samples[0].nominal_rig
 
 
-def _outline(sample: Sample, position: str, preset: str) -> Outline:
-    if preset == LAYERS:
-        return find_outline(sample.ambient(position), sample.nominal_rig)
-    frame = sample.frame_source(preset).frame(position, 0, False)
-    return find_outline(frame.image, sample.nominal_rig, sensor_card(preset))
-
-
-def _known(sample: Sample) -> KnownSpot:
+def _known_in_layers(sample: Sample, ruler: Ruler) -> KnownSpot:
     found = {p: find_spot(sample.frame(p, laser=True), sample.frame(p, laser=False)) for p in POSITIONS}
     for position, spot in found.items():
         if spot.status is not Status.OK:
             raise DatasetError(f"{sample.row.sample_id} {position}: no spot to calibrate with: {describe(spot.status)}")
-    C = SPOT_SIGMA_PX**2 * np.eye(2)
-    depth = sample.row.depth_m
-    return KnownSpot(
-        found["down"].uv_px, found["up"].uv_px, C, C, sample.row.nominal_stroke_m, depth, depth_sigma_m=DISTANCE_SIGMA_M
-    )
+    places = {position: spot.uv_px for position, spot in found.items()}
+    C = dict.fromkeys(POSITIONS, SPOT_SIGMA_PX**2 * np.eye(2))
+    return measured_spot(sample, places, C, sample.row.nominal_stroke_m, ruler)
 
 
 def _made_from(
-    dataset: Dataset, samples: Sequence[Sample], preset: str, outlines: Sequence[Outline], spots: bool
+    dataset: Dataset, samples: Sequence[Sample], preset: str, outlines: Sequence[Outline], spots: Sequence[KnownSpot]
 ) -> dict[str, Any]:
     return {
         "dataset": dataset.info.name,
         "samples": [sample.row.sample_id for sample in samples],
         "preset": preset,
-        "spots": spots,
+        "spots": bool(spots),
         "sphere_in_camera_m": [outline.sphere_in_camera_m.tolist() for outline in outlines],
         "sigma_m": [outline.sigma_m.tolist() for outline in outlines],
+        "spot_uv_px": [[spot.uv_down_px.tolist(), spot.uv_up_px.tolist()] for spot in spots],
+        "spot_depth_m": [spot.depth_m for spot in spots],
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -15,7 +16,8 @@ from phibench.datasets.codec import from_json, to_json
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.files import write_text
 from phibench.estimator.calibration.bundle import Bundle
-from phibench.estimator.calibration.parameters import PARAMETERS
+from phibench.estimator.calibration.parameters import LIMITS, PARAMETERS, changed
+from phibench.scenes.checks import SceneError
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
@@ -59,6 +61,7 @@ class Calibration:
     values : shape (p,), deviations from the believed rig
     covariance : shape (p, p)
     made_from : what the file says of its images
+    sha256 : of the file's content
     """
 
     rig: Rig
@@ -67,6 +70,7 @@ class Calibration:
     values: Array = field(repr=False)
     covariance: Array = field(repr=False)
     made_from: dict[str, Any] = field(repr=False)
+    sha256: str = ""
 
 
 def write_calibration(path: Path, bundle: Bundle, believed: Rig, made_from: dict[str, Any]) -> Path:
@@ -119,7 +123,42 @@ def read_calibration(path: str | Path, believed: Rig | None = None) -> Calibrati
     start = from_json(Rig, document.believed_rig)
     if believed is not None and to_json(believed) != to_json(start):
         raise CalibrationError(f"{path} is the calibration of another rig than the one that it shall correct")
-    return Calibration(from_json(Rig, document.rig), start, PARAMETERS, values, covariance, document.made_from)
+    rig = from_json(Rig, document.rig)
+    _require_sound(path, start, rig, values, covariance)
+    return Calibration(rig, start, PARAMETERS, values, covariance, document.made_from, document.sha256)
+
+
+def _require_sound(path: Path, believed: Rig, rig: Rig, values: Array, covariance: Array) -> None:
+    """Refuse numbers that no calibration gives, whoever has put them into the file."""
+    for name, value in zip(PARAMETERS, values.tolist(), strict=True):
+        if not abs(value) <= (limit := LIMITS[name]):
+            raise CalibrationError(
+                f"{path} corrects {name} by {value:g}: allowed is -{limit:g} to {limit:g}; make it again"
+            )
+    scale = np.sqrt(np.abs(np.diag(covariance)))
+    whole = np.where(scale > 0.0, scale, 1.0)
+    unit = covariance / np.outer(whole, whole)
+    if not np.allclose(unit, unit.T, atol=1e-9) or np.linalg.eigvalsh((unit + unit.T) / 2.0).min() < -1e-9:
+        raise CalibrationError(
+            f"{path} has no covariance: its matrix is not symmetric with eigenvalues of 0 or above; make it again"
+        )
+    try:
+        same = _close(to_json(changed(believed, values)), to_json(rig))
+    except SceneError as error:
+        raise CalibrationError(f"{path} corrects the rig to one that cannot be: {error}; make it again") from error
+    if not same:
+        raise CalibrationError(f"{path} has a rig that is not the believed one with its corrections; make it again")
+
+
+def _close(a: Any, b: Any) -> bool:
+    """Equality of documents, of their numbers to 1e-9: another machine rounds the last bits otherwise."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(_close(a[key], b[key]) for key in a)
+    if isinstance(a, list | tuple) and isinstance(b, list | tuple):
+        return len(a) == len(b) and all(_close(x, y) for x, y in zip(a, b, strict=True))
+    if isinstance(a, float) and isinstance(b, float | int):
+        return math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12)
+    return bool(a == b)
 
 
 def _raw(path: Path) -> dict[str, Any]:

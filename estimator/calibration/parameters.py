@@ -56,6 +56,24 @@ PRIOR_SIGMA: Mapping[str, float] = {
 """Standard deviations of independent errors of a rig whose numbers were read off a drawing and a ruler."""
 
 
+LIMITS: Mapping[str, float] = {
+    "stroke_m": 1.0,
+    "z_c_m": 0.1,
+    "radius_m": 0.1,
+    "f_px": 1000.0,
+    "cx_px": 2000.0,
+    "cy_px": 2000.0,
+    "decentre_x_m": 0.1,
+    "decentre_y_m": 0.1,
+    "tilt_x_rad": 0.5,
+    "tilt_y_rad": 0.5,
+    "stroke_tilt_x_rad": 0.5,
+    "stroke_tilt_y_rad": 0.5,
+    STROKE_SCALE: 0.5,
+}
+"""Largest size of a correction: those of a recipe's `[misalignment]`."""
+
+
 def steps() -> Array:
     """Steps for differences, shape (p,), about the size of a real error."""
     return np.array([_STEPS[name] for name in PARAMETERS])

@@ -60,6 +60,9 @@ class Pair:
         Numbers of the sensor and of its processing.
     box_down, box_up : Box or None
         Region hints; both or none.
+    calibration_covariance : array, shape (p, p), or None
+        Of the rig's parameters, `estimator.calibration.parameters.PARAMETERS`, where rig and stroke come from a
+        calibration file; read-only.
     """
 
     number: int
@@ -72,6 +75,7 @@ class Pair:
     up_off: Image | None = field(default=None, repr=False)
     box_down: Box | None = None
     box_up: Box | None = None
+    calibration_covariance: NDArray[Any] | None = field(default=None, repr=False)
 
     @property
     def images(self) -> Mapping[str, Image]:
@@ -117,6 +121,7 @@ class Answer:
     ----------
     down, up : Spot
     depth_m, sigma_depth_m : float or None
+        The standard deviation is that of the pixels' noise: what a calibration adds, the score adds.
     """
 
     down: Spot
