@@ -21,14 +21,17 @@ def first_meeting(origin_m: Array, directions: Array, radius_m: float, form: For
     NaN where the mirror is missed. The first place is looked for before that where g is least, which tells hit from
     miss: a sphere of the radius that the mirror has there gives the start.
     """
-    t = -np.sum(origin_m * directions, axis=-1)
-    for _ in range(_NEAREST_STEPS):
-        _, slope, curvature = _along(origin_m, directions, t, radius_m, form)
-        t = t - slope / curvature
-    g, _, _ = _along(origin_m, directions, t, radius_m, form)
-    rho = np.linalg.norm(origin_m + t[..., None] * directions, axis=-1)
-    with np.errstate(invalid="ignore"):
-        t = t - np.sqrt(-g * (2.0 * rho - g))  # (rho - g)^2 - rho^2
+    foot = -np.sum(origin_m * directions, axis=-1)
+    off_centre = np.linalg.norm(origin_m + foot[..., None] * directions, axis=-1)
+    central = off_centre < 0.5 * radius_m  # such a ray hits, and near the centre g has no use for Newton's method
+    with np.errstate(invalid="ignore", divide="ignore"):
+        t = foot
+        for _ in range(_NEAREST_STEPS):
+            _, slope, curvature = _along(origin_m, directions, t, radius_m, form)
+            t = np.where(central, foot, t - slope / curvature)
+        g, _, _ = _along(origin_m, directions, t, radius_m, form)
+        rho = np.linalg.norm(origin_m + t[..., None] * directions, axis=-1)
+        t = t - np.sqrt(np.where(central, radius_m**2 - off_centre**2, -g * (2.0 * rho - g)))  # (rho - g)^2 - rho^2
         for _ in range(_STEPS):
             g, slope, _ = _along(origin_m, directions, t, radius_m, form)
             step = g / slope

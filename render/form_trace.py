@@ -64,7 +64,11 @@ def meet(origins_m: Array, directions: Array, radius_m: float, form: Form) -> tu
         with np.errstate(invalid="ignore"):
             return rho2 - (radius_m + added((foot + x[:, None] * directions) / np.sqrt(rho2)[:, None])) ** 2
 
-    x = _first_zero(q, radius_m, len(foot2))
+    # certainly hits, and q is no parabola near the sphere's centre
+    central = foot2 < 0.25 * radius_m**2
+    lowest = np.where(central, 0.0, _lowest(q, radius_m, len(foot2)))
+    with np.errstate(invalid="ignore"):
+        x = _first_zero(q, lowest, np.sqrt(-np.where(central, foot2 - radius_m**2, q(lowest))))
     points = foot + x[:, None] * directions
     return points, _normals(points, radius_m, added), approach + x
 
@@ -79,15 +83,20 @@ def _added(form: Form) -> Radius:
     return added
 
 
-def _first_zero(q: Radius, radius_m: float, count: int) -> Array:
-    """Smaller zero of a function that is nearly a parabola x^2 + c, shape (N,); NaN where it stays above 0."""
+def _lowest(q: Radius, radius_m: float, count: int) -> Array:
+    """Where a function that is nearly a parabola x^2 + c is least, shape (N,)."""
     lowest = np.zeros(count)
-    for width in _NARROWING:
-        h = width * radius_m
-        left, middle, right = (q(lowest + shift) for shift in (-h, 0.0, h))
-        lowest = lowest - 0.5 * h * (right - left) / (right - 2.0 * middle + left)
     with np.errstate(invalid="ignore", divide="ignore"):
-        reach = np.sqrt(-q(lowest))
+        for width in _NARROWING:
+            h = width * radius_m
+            left, middle, right = (q(lowest + shift) for shift in (-h, 0.0, h))
+            lowest = lowest - 0.5 * h * (right - left) / (right - 2.0 * middle + left)
+    return lowest
+
+
+def _first_zero(q: Radius, lowest: Array, reach: Array) -> Array:
+    """Zero of q about `reach` before its lowest place, shape (N,); NaN where `reach` is."""
+    with np.errstate(invalid="ignore", divide="ignore"):
         old, new = lowest - reach, lowest - 0.999 * reach
         q_old, q_new = q(old), q(new)
         for _ in range(_SECANTS):
