@@ -155,9 +155,9 @@ class _Makers:
     def _rig_fault(self, rig: Rig, stroke_m: float) -> str | None:
         sphere_m = rig.T_world_camera.points(rig.sphere_in_camera_m)  # `rig.at` takes ten times as long
         if rig.motion is None:
-            top_m = sphere_m[2] + stroke_m * rig.stroke_axis_world[2] + rig.mirror.radius_m
+            top_m = sphere_m[2] + stroke_m * rig.stroke_axis_world[2] + rig.mirror.bound_m
         else:
-            top_m = rig.at(stroke_m).sphere_centre_m[2] + rig.mirror.radius_m
+            top_m = rig.at(stroke_m).sphere_centre_m[2] + rig.mirror.bound_m
         if top_m >= self._ceiling_m:
             return f"the mirror's top at {top_m:.3f} m is above the ceiling's lamps at {self._ceiling_m:.2f} m"
         return self._boards.cut_by(rig, stroke_m)
