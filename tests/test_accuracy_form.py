@@ -14,6 +14,7 @@ from test_form import formed
 from phibench.render.certificate import certify, trace_spot
 from phibench.render.spot import spot_layer
 from phibench.render.spot_truth import spot_truth
+from phibench.scenes.camera import Camera
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.checks import SceneError
 from phibench.scenes.form import HARMONICS, Form
@@ -111,8 +112,9 @@ def test_accuracy_chief_ray_and_centroid_of_500_formed_mirrors() -> None:
     assert sum(check(draw_formed(rng)) for _ in range(500)) > 850
 
 
-def test_a_certificate_notices_the_layer_of_another_form() -> None:
+def test_a_certificate_notices_the_layer_of_another_form(monkeypatch: pytest.MonkeyPatch) -> None:
     """The spot of a perfect sphere, or of the same form turned inside out, is refused; the true one passes."""
+    monkeypatch.setattr("phibench.render.certificate._LOG2_RAYS", (13,))  # more rays would only find the same again
     spot, form = LaserSpot((2.0, 0.7, 0.5), (-1.0, -0.3, 0.1), 5e-3), Form(form_21c_m=2e-6, form_31c_m=-2e-6)
     view = formed(form).at(0.4)
     truth = spot_truth(view, spot, ())
@@ -124,17 +126,17 @@ def test_a_certificate_notices_the_layer_of_another_form() -> None:
 
 
 def test_accuracy_flux_against_traced_rays() -> None:
-    """Power of the spot on the film against rays over film and aperture: 1e-4; the form changes it by per cents.
+    """Power of the spot on the film against rays over film and aperture: 3e-4; the form changes it by 0.5 % and more.
 
-    131072 quasi-random rays: the certificate's tests find their flux good to 5e-4 at 8192.
+    8192 quasi-random rays give the flux to 5e-4 in the worst case (`certificate`); these are 32768.
     """
     spot, checked = LaserSpot((2.0, 0.7, 0.5), (-1.0, -0.3, 0.1), 5e-3), 0
-    for form in (Form(form_20_m=2e-4), Form(form_22c_m=2e-4, form_33s_m=-1e-4), Form(form_31c_m=2e-4)):
+    for form in (Form(form_20_m=1e-3), Form(form_22c_m=8e-4, form_21s_m=-4e-4), Form(form_31c_m=5e-4)):
         view = formed(form).at(0.4)
         gain = view.rig.camera.detector.laser_electrons_per_joule(spot.wavelength_nm)[0]
         total = float(spot_layer(view, spot, ()).total_electrons_per_s[0])
-        _, watts = trace_spot(view, spot, (), spot_truth(view, spot, ()), 17)
-        assert total == pytest.approx(watts * gain, rel=1e-4)
+        _, watts = trace_spot(view, spot, (), spot_truth(view, spot, ()), 15)
+        assert total == pytest.approx(watts * gain, rel=3e-4)
         sphere = float(spot_layer(default_rig().at(0.4), spot, ()).total_electrons_per_s[0])
         checked += abs(total / sphere - 1.0) > 5e-3
     assert checked == 3
@@ -158,12 +160,17 @@ def moments(image: np.ndarray) -> tuple[float, float, float]:
     return total, float((image * u).sum() / total), float((image * v).sum() / total)
 
 
-def lamp_image(view: View, room: Room) -> np.ndarray:
+def lamp_image(view: View, room: Room, crop: tuple[int, int, int, int] = CROP) -> np.ndarray:
+    """Ambient layer, plane R, of a room with nothing in it but a lamp: its light map is dark."""
     from phibench.render.ambient import render_ambient
-    from phibench.render.bake import BakeSettings, bake
+    from phibench.render.bake import BakeSettings, LightMap, fixed_shapes
+    from phibench.render.patches import cut, texel_count
 
     settings = BakeSettings(lamp_rays=4, bounce_rays=4, final_rays=4)
-    return render_ambient(view, room, bake(view, room, settings), settings, 4, 0, CROP).electrons_per_s[0]
+    texels = texel_count(cut(fixed_shapes(room), settings.texel_m))
+    dark = np.zeros((texels, 3), dtype=np.float32)
+    light = LightMap(dark, dark, np.zeros(texels, dtype=bool))
+    return render_ambient(view, room, light, settings, 4, 0, crop).electrons_per_s[0]
 
 
 @pytest.fixture(scope="module")
@@ -172,39 +179,50 @@ def lamp_room() -> Room:
 
 
 def test_accuracy_ambient_image_of_a_lamp(lamp_room: Room) -> None:
-    """Flux 0.1 % and centroid 0.02 px of a lamp in the mirror, against float64 rays; the sphere's are far off.
+    """Flux 0.2 % and centroid 0.02 px of a lamp in the mirror, against float64 rays; the sphere's are far off.
 
-    The expected image: 3 x 3 rays per pixel through the lens centre, which sees the lamp's centroid as the whole lens
-    does to 1e-3 px; film cells of a quarter of a pixel keep an edge to 0.01 px (docs/model.md).
+    The expected image: 5 x 5 jittered rays per pixel, over the lens: some 130 pixels on the lamp's edge err by 0.05
+    each, 0.06 % of its 1000; film cells of a quarter of a pixel keep an edge to 0.01 px (docs/model.md), 0.06 %.
     """
     view = formed(FORM).at(0.2)
     flux, u, v = moments(lamp_image(view, lamp_room))
     expected = moments(traced_lamp(view))
-    assert flux == pytest.approx(expected[0], rel=1e-3)
+    assert flux == pytest.approx(expected[0], rel=2e-3)
     assert math.dist((u, v), expected[1:]) < 0.02
     sphere = moments(traced_lamp(default_rig().at(0.2)))
     assert abs(sphere[0] / flux - 1.0) > 0.03
     assert math.dist(sphere[1:], (u, v)) > 0.5
 
 
-def traced_lamp(view: View) -> np.ndarray:
-    """Image of the lamp, electrons/s per pixel behind R, without blur or aperture, by `trace` and `raycast`."""
+def traced_lamp(view: View, side: int = 5) -> np.ndarray:
+    """Image of the lamp, electrons/s per pixel behind R, without blur, by `trace` and `raycast`.
+
+    Rays go all over the lens: through its centre alone the centroid would be 0.02 px off, of a sphere's image as well.
+    """
     from phibench.render.raycast import first_hit
     from phibench.render.trace import trace_pixels
 
     u0, v0, width, height = CROP
-    place = (np.arange(3) - 1.0) / 3.0
-    v, u = (grid[..., None] for grid in np.mgrid[v0 : v0 + height, u0 : u0 + width].astype(float))
-    uv = np.stack(np.broadcast_arrays(u + np.tile(place, 3), v + np.repeat(place, 3)), axis=-1).reshape(-1, 2)
-    rays, camera = trace_pixels(view, uv), view.rig.camera
+    cell, rng = np.mgrid[0:side, 0:side].reshape(2, -1).T, np.random.default_rng(0)
+    place = (cell + rng.random((width * height, side * side, 2))) / side - 0.5  # one ray in each cell of a pixel
+    v, u = np.mgrid[v0 : v0 + height, u0 : u0 + width]
+    uv = (np.stack([u.ravel(), v.ravel()], axis=-1)[:, None] + place).reshape(-1, 2)
+    radius, turn = np.sqrt(rng.random(len(uv))), 2.0 * np.pi * rng.random(len(uv))
+    lens = view.rig.camera.aperture_radius_m * radius[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    rays = trace_pixels(view, uv, lens)
     seen = np.isfinite(rays.cos_incidence)
     lit = np.zeros(len(uv))
     lit[seen] = first_hit((LAMP,), rays.points_m[seen], rays.directions[seen])[1] == 0
-    band = camera.detector.band_wavelength_nm[0]
+    reflectance = view.rig.mirror.reflectance(rays.cos_incidence, view.rig.camera.detector.band_wavelength_nm[0])
+    value = np.nan_to_num(lit * electrons(view.rig.camera, uv) * reflectance)
+    return value.reshape(height, width, side * side).mean(axis=-1)
+
+
+def electrons(camera: Camera, uv: np.ndarray) -> np.ndarray:
+    """Electrons/s per pixel behind R for a radiance of 1 W/(m^2 sr) at film positions (N, 2)."""
     cos_lens = camera.rays(uv)[:, 2]
     etendue = camera.solid_angle_density(camera.normalised(uv)) * cos_lens**4 * math.pi * camera.aperture_radius_m**2
-    value = np.nan_to_num(lit * etendue * view.rig.mirror.reflectance(rays.cos_incidence, band))
-    return camera.detector.band_electrons_per_joule()[0] * value.reshape(height, width, 9).mean(axis=-1)
+    return camera.detector.band_electrons_per_joule()[0] * etendue
 
 
 @pytest.mark.slow
@@ -218,7 +236,7 @@ def test_accuracy_ambient_against_a_mesh_in_the_path_tracer(lamp_room: Room) -> 
     assert math.dist(ours[1:], traced[1:]) < 0.03
 
 
-def test_rays_past_the_mirror_go_on_as_if_it_were_not_there(lamp_room: Room) -> None:
+def test_rays_past_the_mirror_go_on_as_if_it_were_not_there() -> None:
     """A lamp seen beside the mirror, some of it through the shell between mirror and enclosing sphere."""
     lamp = rectangle(
         *("lamp", (0.0, 0.0, 2.5), (0, 0, -1), (4.0, 4.0)),
@@ -230,16 +248,15 @@ def test_rays_past_the_mirror_go_on_as_if_it_were_not_there(lamp_room: Room) -> 
     v_out = view.rig.outline_px()[:, 1]
     crop = (635, round(359.5 - radius) - 12, 10, 24)  # across the outline, which the form draws in there by 5 px
     assert 3.0 < radius - float(np.ptp(v_out) / 2.0) < 8.0
-    from phibench.render.ambient import render_ambient
-    from phibench.render.bake import BakeSettings, bake
-
-    settings = BakeSettings(lamp_rays=4, bounce_rays=4, final_rays=4)
-    image = render_ambient(view, room, bake(view, room, settings), settings, 4, 0, crop).electrons_per_s[0]
+    image = lamp_image(view, room, crop)
     edge = float(v_out.min()) - crop[1]
     rows = np.arange(24)
     beside, inside = image[rows < edge - 4.0], image[rows > edge + 4.0]
-    assert beside.min() > 0.999 * beside.max() > 0.0  # one lamp, no gap where the enclosing sphere is
-    assert inside.max() < 1e-3 * beside.max()  # the mirror there shows the empty room below
+    v, u = np.mgrid[crop[1] : crop[1] + 24, crop[0] : crop[0] + 10]
+    alone = electrons(view.rig.camera, np.stack([u.ravel(), v.ravel()], axis=-1).astype(float)).reshape(24, 10)
+    assert len(beside) >= 8  # of which five are in the shell
+    assert beside == pytest.approx(alone[rows < edge - 4.0], rel=1e-3)
+    assert 0.5 < inside.max() / beside.min() < 0.9  # the lamp again, by the steel at grazing incidence
 
 
 def test_a_form_of_zeros_gives_the_bytes_of_the_sphere() -> None:
