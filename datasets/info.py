@@ -15,7 +15,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan import Plan, PosePlan
 from phibench.datasets.provenance import provenance
 from phibench.datasets.recipe import Recipe
-from phibench.datasets.schema import SCHEMA_VERSION, DatasetInfo, PoseInfo
+from phibench.datasets.schema import READABLE_VERSIONS, SCHEMA_VERSION, DatasetInfo, PoseInfo
 
 CONVENTIONS = {
     "units": "SI: metres, radians, seconds, watts; layers are expected photo-electrons per second per pixel",
@@ -88,8 +88,9 @@ def read_info(folder: Path) -> DatasetInfo:
         raise DatasetError(f"{folder} is not a data set: it has no {layout.INFO}")
     document = _json(path)
     version = document.get("schema_version")
-    if version != SCHEMA_VERSION:
-        raise DatasetError(f"{path} has schema version {version}; this phibench reads version {SCHEMA_VERSION}")
+    if version not in READABLE_VERSIONS:
+        known = " and ".join(map(str, READABLE_VERSIONS))
+        raise DatasetError(f"{path} has schema version {version}; this phibench reads versions {known}")
     try:
         return DatasetInfo.model_validate(document)
     except ValidationError as error:

@@ -157,9 +157,9 @@ def rig_fault(rig: Rig, stroke_m: float, ceiling_m: float, boards: Boards) -> st
     """Why a rig cannot make a stroke in its room: the ceiling's lamps or a board are in the way; None if it can."""
     sphere_m = rig.T_world_camera.points(rig.sphere_in_camera_m)  # `rig.at` takes ten times as long
     if rig.motion is None:
-        top_m = sphere_m[2] + stroke_m * rig.stroke_axis_world[2] + rig.mirror.radius_m
+        top_m = sphere_m[2] + stroke_m * rig.stroke_axis_world[2] + rig.mirror.bound_m
     else:
-        top_m = rig.at(stroke_m).sphere_centre_m[2] + rig.mirror.radius_m
+        top_m = rig.at(stroke_m).sphere_centre_m[2] + rig.mirror.bound_m
     if top_m >= ceiling_m:
         return f"the mirror's top at {top_m:.3f} m is above the ceiling's lamps at {ceiling_m:.2f} m"
     return boards.cut_by(rig, stroke_m)

@@ -215,7 +215,7 @@ def _strokes(rig: Rig, misalignment: Misalignment, room: Room, experiments: list
         for j, stroke_m in _items(experiment, "strokes_m"):
             if not _is_legal(stroke_m):
                 continue  # a structural fault
-            top_m = rig.at(true_stroke_m(misalignment, stroke_m)).sphere_centre_m[2] + rig.mirror.radius_m
+            top_m = rig.at(true_stroke_m(misalignment, stroke_m)).sphere_centre_m[2] + rig.mirror.bound_m
             if top_m >= limit_m:
                 longest_m = stroke_m - (top_m - limit_m)
                 text = f"{stroke_m} lifts the mirror's top to {top_m:.3f} m, through the ceiling at {limit_m:.2f} m"

@@ -82,7 +82,8 @@ follows `z_c_m` and `radius_m` (z_c - R/2, on the virtual image), `cx_px` follow
     "[misalignment]": """What the true rig deviates by from `[rig]`, which then is the nominal one: what an estimator
 believes. Images and truth are those of the true rig. Signs, axes and figures: `docs/misalignment.md`.
 Motions between the images hold at every carriage position but down. The light of the room stays
-that of the nominal rig, and the robot's body where it is.
+that of the nominal rig, and the robot's body where it is. `form_...` are harmonics with their peaks in
+metres, (x, y, z) the direction from the sphere centre in the world's axes at the down position.
 """,
     "[laser]": """A spot's diameter is `diameter_m`, or else `diameter_base_m` + `diameter_growth_m_per_m` x
 `depth_m` of its target. For a Gaussian profile that is 4 sigma (the 1/e^2 diameter).

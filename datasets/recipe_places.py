@@ -51,7 +51,7 @@ class Boards:
     def cut_by(self, rig: Rig, stroke_m: float) -> str | None:
         """Say which board a rig cuts at an end of its stroke; None if none."""
         lens_m = rig.T_world_camera.t
-        reach_m = float(np.linalg.norm(rig.sphere_in_camera_m[:2])) + rig.mirror.radius_m + _HOUSING_REACH_M
+        reach_m = float(np.linalg.norm(rig.sphere_in_camera_m[:2])) + rig.mirror.bound_m + _HOUSING_REACH_M
         reach_m += abs(stroke_m) * math.hypot(*rig.stroke_axis_world[:2]) + rig.sphere_in_camera_m[2] * _tilt(rig)
         if rig.motion is not None:  # at most: the sphere swings about the lens as far as it is from it, twice
             reach_m += math.hypot(*rig.motion.translation_m) + 2.0 * float(np.linalg.norm(rig.sphere_in_camera_m))
@@ -74,6 +74,6 @@ def _hit(rig: Rig, offset_m: float, target: TargetTable) -> str | None:
 
 
 def _cut(view: View, plate: Cuboid) -> str | None:
-    if plate.distance_m(view.sphere_centre_m) <= view.rig.mirror.radius_m:
+    if plate.distance_m(view.sphere_centre_m) <= view.rig.mirror.bound_m:
         return "mirror"
     return next((part.name.replace("_", " ") for part in carriage(view) if plate.meets(part)), None)

@@ -12,7 +12,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, model_validator
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
+READABLE_VERSIONS = (4, 5)
+"""Version 5 gave mirrors a form, `mirror.form` in `rigs.jsonl`; in version 4 every mirror is a perfect sphere."""
 Position = Literal["down", "up"]
 
 

@@ -20,6 +20,7 @@ from phibench.estimator.sensitivities import PARAMETERS as GEOMETRIC
 from phibench.estimator.sensitivities import sensitivity
 from phibench.estimator.triangulate import depth_exact
 from phibench.scenes.catalog import default_rig
+from phibench.scenes.form import HARMONICS
 from phibench.scenes.frames import Pose
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
 from phibench.scenes.rig import Rig
@@ -53,6 +54,7 @@ BUDGET: dict[str, tuple[float, str, str]] = {
     "roll_rad": (TENTH, "0.1 deg", "-"),
     "yaw_rad": (TENTH, "0.1 deg", "-"),
     "shift_y_m": (1e-3, "1 mm", "-"),
+    **{name: (2e-5, "20 um", "-") for name in HARMONICS},
 }
 ESTIMATORS = ("exact", "paper_ray", "paper_normal", "paper_incidence", "paper_outline", "approx_ray")
 COMPARED = tuple(name for name in BUDGET if name not in ("k1", "k2", "k3", "p1", "p2", "stroke_relative"))[:10]

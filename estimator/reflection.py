@@ -1,4 +1,4 @@
-"""Camera rays reflected at the sphere, in closed form.
+"""Camera rays reflected at the sphere, in closed form; at one with a form error, by Newton's method.
 
 Symbols: d unit camera ray, s sphere centre in the camera frame, P reflection point relative to the sphere centre,
 n outward normal, i angle of incidence, r unit ray that leaves the mirror. Frames, poses and pixels as in
@@ -11,8 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from phibench.estimator.form_meeting import first_meeting, normal_slope, unit_normal
 from phibench.estimator.status import Status, StatusArray, flag, keep
 from phibench.scenes.camera import Camera
+from phibench.scenes.form import Form, level
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import View
 
@@ -104,9 +106,10 @@ def reflect_jacobian(view: View, uv_px: Array) -> ReflectionJacobian:
         status = _status(hit)
         d, P, n, cos_i, t = (x[..., None] for x in (hit.d, hit.P, hit.n, hit.cos_i, hit.t))
         dd = ray_jacobian(view.rig.camera, uv_px)
-        dt = -t * _dot(P, dd) / _dot(P, d)  # P stays on the sphere: P . dP = 0
+        outward = P if view.rig.mirror.form is None else n  # of any length
+        dt = -t * _dot(outward, dd) / _dot(outward, d)  # P stays on the mirror: n . dP = 0
         dP = t * dd + d * dt
-        dn = dP / view.rig.mirror.radius_m
+        dn = _normal_change(view, hit.P, dP)
         dcos = -(_dot(dd, n) + _dot(d, dn))
         dr = dd + 2.0 * (dcos * n + cos_i * dn)
         di = -dcos / hit.sin_i[..., None]
@@ -115,7 +118,18 @@ def reflect_jacobian(view: View, uv_px: Array) -> ReflectionJacobian:
     return ReflectionJacobian(origin, direction, normal, keep(di[..., 0, :], status))
 
 
+def _normal_change(view: View, P: Array, dP: Array) -> Array:
+    """Change of the unit normal, camera frame, when P, shape (..., 3), moves on the mirror by dP, shape (..., 3, k)."""
+    mirror = view.rig.mirror
+    if mirror.form is None:
+        return dP / mirror.radius_m
+    turned = view.rig.T_camera_sphere.R
+    return turned @ normal_slope(level(P @ turned, mirror.radius_m, mirror.form)) @ turned.T @ dP
+
+
 def _first_hit(view: View, uv_px: Array) -> _Hit:
+    if view.rig.mirror.form is not None:
+        return _first_hit_of_form(view, uv_px, view.rig.mirror.form)
     s, radius = view.rig.sphere_in_camera_m, view.rig.mirror.radius_m
     d = view.rig.camera.rays(uv_px)
     b = np.sum(d * s, axis=-1, keepdims=True)
@@ -126,6 +140,17 @@ def _first_hit(view: View, uv_px: Array) -> _Hit:
     t = (s @ s - radius**2) / (b + root)
     P = t * d - s
     return _Hit(d, t, P, P / radius, root / radius, np.sqrt(miss2) / radius)
+
+
+def _first_hit_of_form(view: View, uv_px: Array, form: Form) -> _Hit:
+    turned, radius = view.rig.T_camera_sphere.R, view.rig.mirror.radius_m
+    d = view.rig.camera.rays(uv_px)
+    t = first_meeting(-view.rig.sphere_in_camera_m @ turned, d @ turned, radius, form)[..., None]
+    P = t * d - view.rig.sphere_in_camera_m
+    n = unit_normal(level(P @ turned, radius, form)) @ turned.T
+    cos_i = -np.sum(d * n, axis=-1, keepdims=True)
+    sin_i = np.linalg.norm(np.cross(d, n), axis=-1, keepdims=True)
+    return _Hit(d, t, P, n, cos_i, sin_i)
 
 
 def _status(hit: _Hit) -> StatusArray:

@@ -22,6 +22,7 @@ from phibench.estimator.reflection import reflect
 from phibench.estimator.score import ESTIMATORS
 from phibench.estimator.triangulate import exact_gradient
 from phibench.scenes.camera import Camera
+from phibench.scenes.form import HARMONICS, Form, Level, gradients_by_parameter, level
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
@@ -103,24 +104,42 @@ def pixel_gradient(view: View, uv_px: Array, point_world_m: Array) -> Array:
 def _ray_changes(view: View, uv_px: Array) -> tuple[Array, Array]:
     """d(mirror point)/dp and d(ray that leaves)/dp at a fixed pixel, shape (p, 3), world.
 
-    d camera ray, q sphere centre from the lens, t distance lens to mirror point, n normal there, R radius:
-    |t d - q| = R gives dt; then n = (t d - q) / R and r = d + 2 cos(i) n, cos(i) = -d . n.
+    d camera ray, q sphere centre from the lens, t distance lens to mirror point, P = t d - q: the mirror's level
+    function g(P) = 0 gives dt; then its gradient gives the normal n, and r = d + 2 cos(i) n, cos(i) = -d . n.
     """
-    lens, sphere, turn, R1 = _rigid_changes(view)
-    ray, R = reflect(view, uv_px), view.rig.mirror.radius_m
-    n, d = ray.normal_world, view.T_world_camera.directions(view.rig.camera.rays(uv_px))
+    lens, sphere, turn, mirror_turn = _rigid_changes(view)
+    ray = reflect(view, uv_px)
+    P, n = ray.origin_world_m - view.sphere_centre_m, ray.normal_world
+    d = view.T_world_camera.directions(view.rig.camera.rays(uv_px))
     t, cos_i = np.linalg.norm(ray.origin_world_m - view.camera_centre_m), -d @ n
     d1 = np.cross(turn, d) + _camera_ray_changes(view, uv_px)
     q1 = sphere - lens
-    t1 = (R1 - (t * d1 - q1) @ n) / (d @ n)
+    surface, g1, gradient1 = _surface_changes(view, P)
+    length = np.linalg.norm(surface.gradient)
+    carried = np.cross(mirror_turn, P)  # with the mirror
+    t1 = -(g1 / length + (t * d1 - q1 - carried) @ n) / (d @ n)
     P1 = t1[:, None] * d + t * d1 - q1  # relative to the sphere centre
-    n1 = (P1 - R1[:, None] * n) / R
+    across = np.eye(3) - np.outer(n, n)
+    n1 = np.cross(mirror_turn, n) + ((P1 - carried) @ surface.hessian_per_m + gradient1) @ across / length
     cos1 = -(d1 @ n + n1 @ d)
     return sphere + P1, d1 + 2.0 * (cos1[:, None] * n + cos_i * n1)
 
 
+def _surface_changes(view: View, P: Array) -> tuple[Level, Array, Array]:
+    """Level function g of the mirror, world axes about its centre, at P, shape (3,), and dg/dp, d(grad g)/dp at P."""
+    axes, mirror = view.form_axes, view.rig.mirror
+    at = level(P @ axes, mirror.radius_m, mirror.form or Form())
+    world = Level(at.value_m, axes @ at.gradient, axes @ at.hessian_per_m @ axes.T)
+    g1, gradient1 = np.zeros(len(PARAMETERS)), np.zeros((len(PARAMETERS), 3))
+    values, gradients = gradients_by_parameter(P @ axes)
+    rows = [PARAMETERS.index(name) for name in HARMONICS]
+    g1[rows], gradient1[rows] = -values, -gradients @ axes.T
+    g1[PARAMETERS.index("radius_m")] = -1.0
+    return world, g1, gradient1
+
+
 def _rigid_changes(view: View) -> tuple[Array, Array, Array, Array]:
-    """d(lens centre), d(sphere centre), d(camera's turn), shape (p, 3), world, and d(radius), shape (p,), by p."""
+    """d(lens centre), d(sphere centre), d(camera's turn), d(mirror's turn), shape (p, 3), world, by p."""
     lens, sphere, turn = (dict.fromkeys(PARAMETERS, np.zeros(3)) for _ in range(3))
     moved = np.eye(3) if view.motion is None else np.array(view.motion.rotation)
     for name, axis in zip(("decentre_x_m", "decentre_y_m", "axial_m"), moved.T, strict=True):
@@ -133,8 +152,10 @@ def _rigid_changes(view: View) -> tuple[Array, Array, Array, Array]:
         to_sphere = view.sphere_centre_m - view.camera_centre_m
         for name, axis in zip(("roll_rad", "pitch_rad", "yaw_rad"), _AXES, strict=True):
             turn[name], sphere[name] = axis, np.cross(axis, to_sphere)
-    radius = np.array([float(name == "radius_m") for name in PARAMETERS])
-    return np.array([*lens.values()]), np.array([*sphere.values()]), np.array([*turn.values()]), radius
+    # a tilt of the camera leaves the mirror as it is
+    mirror_turn = {name: np.zeros(3) if name.startswith("tilt") else axis for name, axis in turn.items()}
+    a, b, c, d = (np.array([*changes.values()]) for changes in (lens, sphere, turn, mirror_turn))
+    return a, b, c, d
 
 
 def _stroke_changes(view: View) -> dict[str, Array]:

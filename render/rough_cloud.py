@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import erf
 from scipy.stats import qmc
 
-from phibench.render.alhazen import reflection_points
+from phibench.render.mirror_points import mirror_points
 from phibench.render.quadrature import disc_points
 from phibench.render.raycast import blocked_by
 from phibench.render.spot_cloud import FilmCloud, film_position
@@ -73,10 +73,10 @@ def _draw(view: View, spot: LaserSpot, log2_samples: int) -> _Samples:
 
 def _specular(view: View, points: Array, lens: Array) -> Array:
     """Film position of the specular connection, shape (N, 2)."""
-    pose, centre = view.T_world_camera, view.sphere_centre_m
+    pose = view.T_world_camera
     eyes = np.concatenate([lens, np.zeros((len(lens), 1))], axis=-1)
-    mirror, _ = reflection_points(points - centre, pose.points(eyes) - centre, view.rig.mirror.radius_m)
-    return film_position(view, eyes, pose.inverse().points(mirror + centre))
+    mirror = mirror_points(view, points, pose.points(eyes)).points_m
+    return film_position(view, eyes, pose.inverse().points(mirror))
 
 
 def _lobe_px(view: View, point: Array, uv: Array) -> Array:

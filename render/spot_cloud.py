@@ -1,12 +1,13 @@
 """The laser spot's light on the film, as weighted points: specular connections spot -> mirror -> lens.
 
-Pairs of a point on the spot and a point on the aperture are joined by the reflection law (`alhazen`); each pair's power
-follows from the geometry of the reflected bundle. With s the distance spot to mirror, l mirror to lens and i the
+Pairs of a point on the spot and a point on the aperture are joined by the reflection law (`mirror_points`); each pair's
+power follows from the geometry of the reflected bundle. With s the distance spot to mirror, l mirror to lens and i the
 angle of incidence, Coddington's equations for a convex sphere give the distances of the virtual image behind the mirror
 
     1/s_t = 1/s + 2 / (R cos i)      1/s_s = 1/s + 2 cos(i) / R
 
-and dPhi = L rho(i) cos(theta_spot) cos(theta_lens) / (s^2 (1 + l/s_t) (1 + l/s_s)) dA_spot dA_lens (DESIGN section 5).
+and dPhi = L rho(i) cos(theta_spot) cos(theta_lens) / (s^2 (1 + l/s_t) (1 + l/s_s)) dA_spot dA_lens (DESIGN section 5). With a form
+error the two factors become the determinant of the reflected bundle's curvature (`fermat`).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import qmc
 
-from phibench.render.alhazen import reflection_points
+from phibench.render.mirror_points import bundle_spread, mirror_points
 from phibench.render.quadrature import disc_nodes, disc_points, slices
 from phibench.render.raycast import blocked_by
 from phibench.scenes.frames import Array, BoolArray
@@ -122,9 +123,8 @@ def _reach(uv: Array) -> float:
 
 
 def _film(view: View, points: Array, eyes: Array) -> Array:
-    centre, pose = view.sphere_centre_m, view.T_world_camera.inverse()
-    mirror, _ = reflection_points(points - centre, eyes - centre, view.rig.mirror.radius_m)
-    return film_position(view, pose.points(eyes), pose.points(mirror + centre))
+    pose = view.T_world_camera.inverse()
+    return film_position(view, pose.points(eyes), pose.points(mirror_points(view, points, eyes).points_m))
 
 
 def _nodes(view: View, spot: LaserSpot) -> tuple[Array, Array, Array, Array]:
@@ -157,17 +157,13 @@ def _connect(
     view: View, spot: LaserSpot, shapes: Sequence[Shape], points: Array, eyes: Array, weight: Array
 ) -> FilmCloud:
     """Film positions and powers of pairs (spot point, aperture point), shapes (N, 3), with quadrature weights (N,)."""
-    centre, radius = view.sphere_centre_m, view.rig.mirror.radius_m
-    mirror, lit = reflection_points(points - centre, eyes - centre, radius)
-    mirror = np.where(lit[:, None], mirror + centre, np.nan)
-    normal = (mirror - centre) / radius
-    s, from_spot = _split(mirror - points)
-    to_lens_length, to_lens = _split(eyes - mirror)
-    cos_i = np.einsum("ni,ni->n", to_lens, normal)
+    found = mirror_points(view, points, eyes)
+    mirror, lit = found.points_m, found.lit
+    from_spot, to_lens = _unit(mirror - points), _unit(eyes - mirror)
+    cos_i = np.einsum("ni,ni->n", to_lens, found.normals)
     cos_spot = from_spot @ np.array(spot.normal_world)
     cos_lens = -to_lens @ view.T_world_camera.R[:, 2]
-    spread = s**2 * (1.0 + to_lens_length * (1.0 / s + 2.0 / (radius * cos_i)))
-    spread *= 1.0 + to_lens_length * (1.0 / s + 2.0 * cos_i / radius)
+    spread = bundle_spread(view, mirror, points, eyes, cos_i)
     rho = view.rig.mirror.reflectance(cos_i, spot.wavelength_nm)
     watts = weight * rho * np.maximum(cos_spot, 0.0) * np.maximum(cos_lens, 0.0) / spread
     free = lit & _unobstructed(shapes, points, mirror, eyes, lit)
@@ -183,7 +179,5 @@ def _unobstructed(shapes: Sequence[Shape], points: Array, mirror: Array, eyes: A
     return free
 
 
-def _split(vectors: Array) -> tuple[Array, Array]:
-    """Lengths (N,) and unit vectors (N, 3)."""
-    length = np.linalg.norm(vectors, axis=-1)
-    return length, vectors / length[:, None]
+def _unit(vectors: Array) -> Array:
+    return vectors / np.linalg.norm(vectors, axis=-1)[:, None]

@@ -1,4 +1,4 @@
-"""Exact answers for one laser spot in one view: the chief ray, by closed form in float64."""
+"""Exact answers for one laser spot in one view: the chief ray, by closed form (a form error: Fermat's path) in float64."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phibench.render.alhazen import reflection_points
 from phibench.render.angles import mirror_angles
+from phibench.render.mirror_points import mirror_points
 from phibench.render.raycast import blocked_by
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
+from phibench.scenes.limb import limb_points
 from phibench.scenes.rig import View
 from phibench.scenes.solids import Shape
 
@@ -61,9 +62,9 @@ class SpotTruth:
 def spot_truth(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> SpotTruth:
     """Trace the chief ray of a spot: position, angles, lengths, and why it is not seen where it is not."""
     point, eye, centre = np.array([spot.position_world_m]), view.camera_centre_m[None], view.sphere_centre_m
-    mirror, _ = reflection_points(point - centre, eye - centre, view.rig.mirror.radius_m)
-    mirror = mirror + centre
-    normals, leaving = (mirror - centre) / view.rig.mirror.radius_m, point - mirror
+    found = mirror_points(view, point, eye)
+    mirror = found.points_m
+    normals, leaving = found.normals, point - mirror
     path = np.linalg.norm(leaving, axis=-1)
     uv = view.rig.camera.project(view.T_world_camera.inverse().points(mirror))[0]
     angles = mirror_angles(normals, leaving / path[:, None])
@@ -112,8 +113,22 @@ def _outline_distance_px(view: View, mirror: Array) -> float:
     """Distance of a mirror point's image from the mirror's outline, across it, pixels (angle times focal length)."""
     to_mirror, to_centre = mirror - view.camera_centre_m, view.sphere_centre_m - view.camera_centre_m
     across, along = np.linalg.norm(np.cross(to_mirror, to_centre)), np.dot(to_mirror, to_centre)
-    outline = np.arcsin(view.rig.mirror.radius_m / np.linalg.norm(to_centre))
+    outline = _outline_angle(view, to_mirror, to_centre)
     return float((outline - np.arctan2(across, along)) * view.rig.camera.fx_px)
+
+
+def _outline_angle(view: View, to_mirror: Array, to_centre: Array) -> float:
+    """Angle, seen from the lens, between the sphere centre and the outline on the mirror point's side."""
+    distance, mirror = np.linalg.norm(to_centre), view.rig.mirror
+    if mirror.form is None:
+        return float(np.arcsin(mirror.radius_m / distance))
+    axes, axis = view.T_world_sphere.R, to_centre / distance
+    across = to_mirror - np.dot(to_mirror, axis) * axis
+    if np.linalg.norm(across) < 1e-12:  # on the axis: any side will do
+        across = np.cross(axis, axes[:, np.argmin(np.abs(axis @ axes))])
+    across = across / np.linalg.norm(across)
+    limb = limb_points(-to_centre @ axes, (across @ axes)[None], mirror.radius_m, mirror.form)[0] @ axes.T + to_centre
+    return float(np.arctan2(np.linalg.norm(np.cross(axis, limb)), np.dot(axis, limb)))
 
 
 def _floats(values: Array) -> tuple[float, ...]:

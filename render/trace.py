@@ -1,7 +1,7 @@
-"""Rays from the camera, reflected once at the sphere: pixel -> mirror -> world, in float64.
+"""Rays from the camera, reflected once at the mirror: pixel -> mirror -> world, in float64.
 
-This is the camera-side ray tracer. It shares no mathematics with the world-side closed form (`alhazen`), so that
-the two can certify each other.
+This is the camera-side ray tracer. It shares no mathematics with the world-side answer (`alhazen`; `fermat` for a form
+error), so that the two can certify each other.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from phibench.render.form_trace import meet
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import View
 
@@ -60,7 +61,9 @@ def lens_rays(view: View, uv_px: Array, lens_m: Array | None = None) -> tuple[Ar
 
 
 def reflect(view: View, origins_m: Array, directions: Array) -> MirrorRays:
-    """Intersect world rays, shape (N, 3), with the mirror sphere and reflect them."""
+    """Intersect world rays, shape (N, 3), with the mirror and reflect them."""
+    if view.rig.mirror.form is not None:
+        return _reflect_at_form(view, origins_m, directions)
     radius = view.rig.mirror.radius_m
     offset = origins_m - view.sphere_centre_m
     approach = -_dot(offset, directions)
@@ -74,6 +77,17 @@ def reflect(view: View, origins_m: Array, directions: Array) -> MirrorRays:
     cos_i = -_dot(normals, directions)
     out = directions + 2.0 * cos_i[:, None] * normals
     return MirrorRays(view.sphere_centre_m + radius * normals, normals, out, cos_i, t)
+
+
+def _reflect_at_form(view: View, origins_m: Array, directions: Array) -> MirrorRays:
+    axes, centre, mirror = view.T_world_sphere.R, view.sphere_centre_m, view.rig.mirror
+    assert mirror.form is not None
+    points, normals, t = meet((origins_m - centre) @ axes, directions @ axes, mirror.radius_m, mirror.form)
+    behind = ~(t > 0.0)
+    points, normals, t = (np.where(behind.reshape(-1, *[1] * (v.ndim - 1)), np.nan, v) for v in (points, normals, t))
+    normals = normals @ axes.T
+    cos_i = -_dot(normals, directions)
+    return MirrorRays(points @ axes.T + centre, normals, directions + 2.0 * cos_i[:, None] * normals, cos_i, t)
 
 
 def trace_pixels(view: View, uv_px: Array, lens_m: Array | None = None) -> MirrorRays:

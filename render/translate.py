@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from phibench.render.c310_plugin import MM_PER_M, sensor_dict
+from phibench.render.form_mesh import form_mesh
 from phibench.scenes.frames import Array, Vector
 from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.rig import View
@@ -23,9 +24,12 @@ from phibench.scenes.textures import Checker, Texture
 
 
 def scene_dict(mi: ModuleType, view: View, room: Room, crop: tuple[int, int, int, int] | None = None) -> dict[str, Any]:
-    """Whole scene of one view: sensor, mirror, and every shape of the room under its name."""
+    """Whole scene of one view: sensor, mirror, and every shape of the room under its name.
+
+    A mirror with a form error is a fine mesh.
+    """
     scene: dict[str, Any] = {"type": "scene", "sensor": sensor_dict(mi, view, crop)}
-    scene[MIRROR_NAME] = mirror_dict(mi, view)
+    scene[MIRROR_NAME] = mirror_dict(mi, view) if view.rig.mirror.form is None else _mirror_mesh(mi, view)
     for index, shape in enumerate(room.shapes(view)):
         scene[shape_key(index)] = shape_dict(mi, view, shape)
     return scene
@@ -59,10 +63,16 @@ def shape_dict(mi: ModuleType, view: View, shape: Shape) -> dict[str, Any]:
 
 
 def mirror_dict(mi: ModuleType, view: View) -> dict[str, Any]:
-    """The steel sphere at the origin."""
+    """The steel sphere at the origin; for a mirror with a form error a sphere that encloses it (`view_rays` knows)."""
     rig = view.rig
     bsdf = mirror_bsdf(rig.mirror, rig.camera.detector.band_wavelength_nm)
-    return {"type": "sphere", "center": [0.0, 0.0, 0.0], "radius": MM_PER_M * rig.mirror.radius_m, "bsdf": bsdf}
+    return {"type": "sphere", "center": [0.0, 0.0, 0.0], "radius": MM_PER_M * rig.mirror.bound_m, "bsdf": bsdf}
+
+
+def _mirror_mesh(mi: ModuleType, view: View) -> Any:
+    """The steel mirror with its form error."""
+    bsdf = mirror_bsdf(view.rig.mirror, view.rig.camera.detector.band_wavelength_nm)
+    return form_mesh(mi, view, MIRROR_NAME, mi.load_dict(bsdf))
 
 
 def mirror_bsdf(mirror: SphereMirror, wavelengths_nm: Vector) -> dict[str, Any]:

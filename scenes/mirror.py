@@ -1,4 +1,4 @@
-"""The spherical mirror and the optical constants of its steel.
+"""The spherical mirror, its form error, and the optical constants of its steel.
 
 Source of the table: austenitic stainless steel (about 316), B. Karlsson and C. G. Ribbing,
 "Optical constants and spectral selectivity of stainless steel and its oxides", J. Appl. Phys. 53, 6340 (1982),
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from phibench.scenes.checks import SceneError, positive, within
+from phibench.scenes.form import Form, curvatures, directions, level
 from phibench.scenes.frames import Array
 
 # wavelength in nm, n, k
@@ -37,6 +38,9 @@ STEEL = np.array(
 )
 STEEL.setflags(write=False)
 
+_LEAST_CURVATURE = 0.5  # times 1/R: convex with a margin, so that every point has one image at most
+_PLACES = 2000  # where the curvature is looked at: 3 degrees apart, for harmonics that turn over in 60
+
 
 @dataclass(frozen=True)
 class SphereMirror:
@@ -47,14 +51,28 @@ class SphereMirror:
     radius_m : float
     roughness_alpha : float
         Beckmann roughness (rms slope x sqrt 2); 0 is an ideal mirror, 0.005 blurs by about 1 px.
+    form : Form or None
+        Deviations from the sphere; None is a perfect one, and so is a `Form` whose numbers are all 0.
     """
 
     radius_m: float = 0.060
     roughness_alpha: float = 0.0
+    form: Form | None = None
 
     def __post_init__(self) -> None:
         positive("SphereMirror", "radius_m", self.radius_m)
         within("SphereMirror", "roughness_alpha", self.roughness_alpha, 0.0, 0.05)
+        if self.form is None:
+            return
+        if not any(self.form.coefficients_m):
+            object.__setattr__(self, "form", None)
+            return
+        _check_convex(self.radius_m, self.form)
+
+    @property
+    def bound_m(self) -> float:
+        """No point of the surface is farther from the centre than this; the radius of a perfect sphere."""
+        return self.radius_m if self.form is None else self.radius_m + self.form.bound_m
 
     def refractive_index(self, wavelength_nm: float) -> complex:
         """Complex index n + i k of the steel, linear between the table's wavelengths (400 to 700 nm)."""
@@ -72,3 +90,15 @@ class SphereMirror:
             r_s = (cos_i - root) / (cos_i + root)
             r_p = (m2 * cos_i - root) / (m2 * cos_i + root)
         return 0.5 * (np.abs(r_s) ** 2 + np.abs(r_p) ** 2)
+
+
+def _check_convex(radius_m: float, form: Form) -> None:
+    """Raise `SceneError` for a form that is too far from round."""
+    if form.bound_m < 0.5 * radius_m:
+        least = float(curvatures(level(radius_m * directions(_PLACES), radius_m, form))[0].min()) * radius_m
+        if least >= _LEAST_CURVATURE:
+            return
+        found = f"its curvature falls to {least:.2f} of the sphere's; at least {_LEAST_CURVATURE} is needed"
+    else:
+        found = f"its peaks add up to {form.bound_m:g} m; less than half the radius is needed"
+    raise SceneError(f"SphereMirror.form is too far from round for radius_m = {radius_m:g}: {found}; make it smaller")

@@ -1,6 +1,7 @@
 """What is wrong with a real rig: signed deviations of the true rig from the nominal one, which the estimator believes.
 
-All are 0 by default. World axes (z up; the robot's front is world +x); angles turn right-handed. Of several at once:
+All are 0 by default. World axes (z up; the robot's front is world +x); angles turn right-handed. The form's x, y, z are
+the world's at the down position, about the sphere centre; from there the form goes with the rig. Of several at once:
 the sphere moves first, then the camera turns about its lens and leaves sphere and lens where they are. What a recipe
 calls `decentre`, `tilt` and `stroke_tilt` in `[rig]` means the same here.
 """
@@ -14,6 +15,7 @@ import numpy as np
 
 from phibench.scenes.camera import Camera
 from phibench.scenes.checks import SceneError, within
+from phibench.scenes.form import HARMONICS, Form
 from phibench.scenes.frames import Pose, Vector, as_matrix, as_vector, rotation_xyz
 from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.motion import Motion
@@ -60,6 +62,18 @@ class Misalignment:
     shift_y_m: float = _number("m", 1.0, 1e-3, "rig moved along world +y between the images")
     shift_z_m: float = _number("m", 1.0, 1e-3, "rig moved along world +z between the images")
     roughness_alpha: float = _number("1", 0.05, 2e-3, "added to the mirror's Beckmann roughness")
+    form_20_m: float = _number("m", 1e-3, 2e-5, "form: peak of (3 z^2 - 1)/2, added to the mirror's radius")
+    form_21c_m: float = _number("m", 1e-3, 2e-5, "form: peak of 2 x z")
+    form_21s_m: float = _number("m", 1e-3, 2e-5, "form: peak of 2 y z")
+    form_22c_m: float = _number("m", 1e-3, 2e-5, "form: peak of x^2 - y^2")
+    form_22s_m: float = _number("m", 1e-3, 2e-5, "form: peak of 2 x y")
+    form_30_m: float = _number("m", 1e-3, 2e-5, "form: peak of (5 z^3 - 3 z)/2")
+    form_31c_m: float = _number("m", 1e-3, 2e-5, "form: peak of 0.726 x (5 z^2 - 1)")
+    form_31s_m: float = _number("m", 1e-3, 2e-5, "form: peak of 0.726 y (5 z^2 - 1)")
+    form_32c_m: float = _number("m", 1e-3, 2e-5, "form: peak of 2.598 z (x^2 - y^2)")
+    form_32s_m: float = _number("m", 1e-3, 2e-5, "form: peak of 5.196 x y z")
+    form_33c_m: float = _number("m", 1e-3, 2e-5, "form: peak of x^3 - 3 x y^2")
+    form_33s_m: float = _number("m", 1e-3, 2e-5, "form: peak of 3 x^2 y - y^3")
 
     def __post_init__(self) -> None:
         for name, parameter in PARAMETERS.items():
@@ -73,8 +87,12 @@ class Misalignment:
         return replace(nominal, fx_px=nominal.fx_px * scale, fy_px=nominal.fy_px * scale, **added)
 
     def mirror(self, nominal: SphereMirror) -> SphereMirror:
-        """True mirror."""
-        return SphereMirror(nominal.radius_m + self.radius_m, nominal.roughness_alpha + self.roughness_alpha)
+        """True mirror; forms add up in the sphere's own frame."""
+        form, old = Form(**{name: getattr(self, name) for name in HARMONICS}), nominal.form
+        if old is not None:
+            form = Form(*(a + b for a, b in zip(old.coefficients_m, form.coefficients_m, strict=True)))
+        alpha = nominal.roughness_alpha + self.roughness_alpha
+        return SphereMirror(nominal.radius_m + self.radius_m, alpha, form)
 
     def poses(self, T_world_camera: Pose, T_camera_sphere: Pose) -> tuple[Pose, Pose]:
         """True camera pose in the world and sphere pose in the camera, both down."""

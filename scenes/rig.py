@@ -10,7 +10,8 @@ import numpy as np
 
 from phibench.scenes.camera import Camera
 from phibench.scenes.checks import SceneError, finite, positive, unit_vector
-from phibench.scenes.frames import Array, Pose, Vector, as_vector
+from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector
+from phibench.scenes.limb import limb_points
 from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.motion import Motion
@@ -42,7 +43,8 @@ class Rig:
     T_world_camera : Pose
         Camera pose at the down position.
     T_camera_sphere : Pose
-        Mirror pose in the camera frame; aligned optics have the translation (0, 0, z_c).
+        Mirror pose in the camera frame; aligned optics have the translation (0, 0, z_c). Its rotation says how a form
+        error lies, and means nothing for a perfect sphere.
     stroke_axis_world : 3 floats
         Direction of the stroke, made a unit vector.
     motion : Motion or None
@@ -63,7 +65,7 @@ class Rig:
             pose = getattr(self, name)
             if (pose.target, pose.source) != frames:
                 raise SceneError(f"Rig.{name} joins frames {pose.target}, {pose.source}: must be {frames}")
-        distance, radius = math.hypot(*self.T_camera_sphere.translation_m), self.mirror.radius_m
+        distance, radius = math.hypot(*self.T_camera_sphere.translation_m), self.mirror.bound_m
         if self.T_camera_sphere.translation_m[2] <= radius or distance <= radius:
             raise SceneError(
                 f"Rig.T_camera_sphere: the sphere centre is {self.T_camera_sphere.translation_m[2]:.4f} m in front of "
@@ -83,7 +85,8 @@ class Rig:
     def perturbed(self, misalignment: Misalignment) -> Rig:
         """Return the true rig where this is the nominal one.
 
-        The true stroke is `misalignment.stroke_m(nominal)`: strokes are no part of a rig.
+        The true stroke is `misalignment.stroke_m(nominal)`: strokes are no part of a rig. A perfect sphere that gets a
+        form gets its axes as well: the world's, at the down position.
 
         Raises
         ------
@@ -93,9 +96,12 @@ class Rig:
         if misalignment == Misalignment():
             return self
         T_world_camera, T_camera_sphere = misalignment.poses(self.T_world_camera, self.T_camera_sphere)
+        mirror = misalignment.mirror(self.mirror)
+        if mirror.form is not None and self.mirror.form is None:
+            T_camera_sphere = replace(T_camera_sphere, rotation=as_matrix(T_world_camera.R.T))
         return Rig(
             camera=misalignment.camera(self.camera),
-            mirror=misalignment.mirror(self.mirror),
+            mirror=mirror,
             T_world_camera=T_world_camera,
             T_camera_sphere=T_camera_sphere,
             stroke_axis_world=misalignment.stroke_axis(self.stroke_axis_world),
@@ -111,6 +117,10 @@ class Rig:
         side /= np.linalg.norm(side)
         turn = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)[:, None]
         rim = np.cos(turn) * side + np.sin(turn) * np.cross(axis, side)
+        if self.mirror.form is not None:
+            turned = self.T_camera_sphere.R
+            limb = limb_points(-s @ turned, rim @ turned, self.mirror.radius_m, self.mirror.form)
+            return self.camera.project(self.T_camera_sphere.points(limb))
         sine = self.mirror.radius_m / distance
         return self.camera.project(math.sqrt(1.0 - sine * sine) * axis + sine * rim)
 
@@ -138,6 +148,13 @@ class View:
     def T_world_sphere(self) -> Pose:
         """Mirror pose in the world."""
         return self.T_world_camera @ self.rig.T_camera_sphere
+
+    @cached_property
+    def form_axes(self) -> Array:
+        """Axes of the mirror's form as columns, world, shape (3, 3); where there is none, those that one would get."""
+        if self.rig.mirror.form is not None:
+            return self.T_world_sphere.R
+        return np.eye(3) if self.motion is None else np.array(self.motion.rotation)
 
     @property
     def camera_centre_m(self) -> Array:

@@ -1,4 +1,4 @@
-"""Misaligned rigs, all parameters drawn at once: closed form, spot layer and truth against other mathematics."""
+"""Misaligned rigs, all parameters but the form (`test_accuracy_form.py`) drawn at once: closed form, spot layer and truth against other mathematics."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from phibench.render.spot_truth import SpotTruth, depth_m, spot_truth
 from phibench.scenes.camera import Camera
 from phibench.scenes.catalog import c310_camera
 from phibench.scenes.checks import SceneError
+from phibench.scenes.form import HARMONICS
 from phibench.scenes.frames import Pose
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
@@ -39,13 +40,14 @@ class Case:
         return self.rig.at({"down": 0.0, "up": self.misalignment.stroke_m(self.nominal_stroke_m)}[position])
 
 
-def draw_misalignment(rng: np.random.Generator, size: float) -> Misalignment:
-    """All parameters, uniform within `size` times their study magnitudes; roughness not below 0."""
-    values = {name: rng.uniform(-size, size) * one.study for name, one in PARAMETERS.items()}
+def draw_misalignment(rng: np.random.Generator, size: float, *, form: bool) -> Misalignment:
+    """All parameters, uniform within `size` times their study magnitudes; roughness not below 0; form on demand."""
+    names = [name for name in PARAMETERS if form or name not in HARMONICS]
+    values = {name: rng.uniform(-size, size) * PARAMETERS[name].study for name in names}
     return Misalignment(**{**values, "roughness_alpha": abs(values["roughness_alpha"]) / size})
 
 
-def draw_case(rng: np.random.Generator) -> Case:
+def draw_case(rng: np.random.Generator, *, form: bool = False) -> Case:
     """Default or C310 lens, z_c 0.26 to 0.4 m, stroke 0.1 to 1.2 m, a spot on a wall that faces the axis."""
     z_c = rng.uniform(0.26, 0.40)
     camera = (Camera(), c310_camera())[rng.integers(2)]
@@ -55,7 +57,7 @@ def draw_case(rng: np.random.Generator) -> Case:
     inward = -position * [1, 1, 0] / np.hypot(*position[:2]) + rng.uniform(-0.3, 0.3, 3)
     spot = LaserSpot(tuple(position), tuple(inward), beam_diameter_m(float(np.hypot(*position[:2]))))
     while True:
-        case = Case(nominal, draw_misalignment(rng, 2.0), rng.uniform(0.1, 1.2), spot)
+        case = Case(nominal, draw_misalignment(rng, 2.0, form=form), rng.uniform(0.1, 1.2), spot)
         try:
             case.rig  # noqa: B018
         except SceneError:  # three coefficients at twice their usual size may fold the image
@@ -139,7 +141,9 @@ def test_accuracy_from_the_numbers_alone() -> None:
     assert checked > 170
 
 
-@pytest.mark.parametrize("name", [name for name in PARAMETERS if name not in ("focus_distance_m", "roughness_alpha")])
+@pytest.mark.parametrize(
+    "name", [name for name in PARAMETERS if name not in ("focus_distance_m", "roughness_alpha", *HARMONICS)]
+)
 def test_a_wrong_sign_of_any_parameter_is_noticed(name: str) -> None:
     """The comparison above with one sign turned is off by more than 1e-3 px in one of the two images."""
     rng = np.random.default_rng(3)

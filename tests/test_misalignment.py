@@ -52,7 +52,7 @@ def test_all_are_zero_by_default_and_zero_changes_nothing() -> None:
     for rig in (default_rig(), tilted):
         assert rig.perturbed(Misalignment()) == rig
     assert Misalignment().stroke_m(0.1 + 0.2) == 0.1 + 0.2
-    assert len(PARAMETERS) == 26
+    assert len(PARAMETERS) == 38
 
 
 @pytest.mark.parametrize("name", PARAMETERS)
