@@ -11,6 +11,7 @@ Symbols: s sphere centre in the camera frame, R radius, a angle of a ray from s,
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.signal import fftconvolve
@@ -45,9 +46,18 @@ class Limb:
     turned: Array
     turned_squared: Array
 
-    def at(self, table: Array, filter_index: int, d_px: Array) -> Array:
-        """Value of `light`, `slope_per_px` or `curvature_per_px2` at distances, shape of `d_px`."""
-        return np.interp(d_px, self.d_px, table[filter_index])
+    @cached_property
+    def rows(self) -> Array:
+        """All five, shape (3, n, 5): what one distance needs lies together."""
+        tables = (self.light, self.slope_per_px, self.curvature_per_px2, self.turned, self.turned_squared)
+        return np.ascontiguousarray(np.stack(tables, axis=-1))
+
+    def all_at(self, filter_index: int, d_px: Array) -> Array:
+        """Values of the five at distances, shape (..., 5), linear between the table's evenly spaced rows."""
+        at = np.clip((d_px - self.d_px[0]) / _STEP_PX, 0.0, len(self.d_px) - 1.001)
+        row = at.astype(np.intp)
+        rows, part = self.rows[filter_index], (at - row)[..., None]
+        return np.asarray(rows[row] * (1.0 - part) + rows[row + 1] * part)
 
 
 def limb_angle_rad(s: Array, radius_m: float) -> float:

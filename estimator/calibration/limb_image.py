@@ -19,7 +19,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.sensor_card import SensorCard
 from phibench.scenes.frames import Array, BoolArray
 
-_LUMA = (0.299, 0.587, 0.114)  # JPEG's (ITU-R BT.601): errors of its coarse chroma cancel in this sum
+JPEG_LUMA = (0.299, 0.587, 0.114)  # JPEG's (ITU-R BT.601): errors of its coarse chroma cancel in this sum
 _CLIPPED = 250  # of 255: JPEG moves clipped pixels by some codes
 _NEAR_FULL = 0.97
 _SRGB_KNEE, _SRGB_SLOPE = 0.04045, 12.92  # IEC 61966-2-1
@@ -111,11 +111,11 @@ def _raw(image: NDArray[Any], card: SensorCard) -> tuple[Plane, ...]:
 def _luma(image: NDArray[Any], card: SensorCard) -> Plane:
     """Luma of the linear, white-balanced planes. It is a filter's own light only where the colour matrix is one."""
     linear = srgb_decoded(np.asarray(image, float) / 255.0)
-    values = linear @ np.array(_LUMA)
+    values = linear @ np.array(JPEG_LUMA)
     clipped = ndimage.binary_dilation((image >= _CLIPPED).any(axis=-1), iterations=2)
-    level = np.median(linear.reshape(-1, 3), axis=0) * _LUMA
+    level = np.median(linear.reshape(-1, 3), axis=0) * np.array(JPEG_LUMA)
     # shares of the filters in the luma of this picture; three equal ones would be as good, the room is nearly grey
-    share = level / level.sum() if level.sum() > 0.0 else np.array(_LUMA)
+    share = level / level.sum() if level.sum() > 0.0 else np.array(JPEG_LUMA)
     taps = [_merged(_luma_taps(parity, share, card)) for parity in range(4)]
     return Plane(values, ~clipped, (taps[0], taps[1], taps[2], taps[3]))
 

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from phibench.datasets.sensor_card import SensorCard
 from phibench.estimator.calibration.limb_image import ImageError, Plane, planes_of
-from phibench.estimator.calibration.outline_pixels import band
+from phibench.estimator.calibration.outline_jpeg import JpegAgain
+from phibench.estimator.calibration.outline_pixels import OutlinePixels, band
 from phibench.estimator.calibration.outline_start import grey, rough_outlines
-from phibench.estimator.calibration.outline_step import step_from
+from phibench.estimator.calibration.outline_step import Step, step_from
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.rig import Rig
@@ -30,8 +31,8 @@ HALF_WIDTH_PX = 5.0
 SECTORS = 120
 MIN_ARC = 0.5
 """Part of the outline that must lie in the image."""
-JPEG_SHIFT_PX, JPEG_SCATTER_PX, JPEG_ACROSS_PX = -0.014, 0.008, 0.016
-"""By how much JPEG makes the outline's radius smaller, the scatter of that, and of the centre, pixels."""
+JPEG_DRAWS = (2, 8)
+"""Draws of noise and JPEG from which the change of an outline by JPEG is taken, in a first and a second round."""
 _COARSE_HALF_PX, _COARSE_STEPS = 8.0, 6
 _STEPS, _REST_M, _REST_SIGMAS, _UNREST_M = 30, 1e-7, 0.05, 1e-6
 _MIN_CONTRAST, _MAX_CONTRAST = 0.5, 1.6
@@ -98,36 +99,24 @@ def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) 
     """
     planes = planes_of(image, card)
     _require_size(planes[0].values, rig.camera)
-    jpeg, fault = card is not None and card.output == "mjpeg", ImageError("an image without a mirror")
+    fault = ImageError("an image without a mirror")
     for start in rough_outlines(grey(planes), rig):
         try:
-            found = fit_outline(planes, rig, start, jpeg=jpeg)
-            return without_jpeg(found, rig) if jpeg else found
+            return fit_outline(planes, rig, start, again=(image, card) if card and card.output == "mjpeg" else None)
         except ImageError as error:
             # that it is cut says more than that the last circle tried was none
             fault = fault if "cut by the frame" in str(fault) else error
     raise fault
 
 
-def without_jpeg(found: Outline, rig: Rig) -> Outline:
-    """Outline of a JPEG frame, less what JPEG does to the limb, with the scatter of that in the covariance.
-
-    JPEG cuts away the fine waves of the limb's light: the limb becomes wider and, its light being lopsided, moves.
-    Shift and scatter were measured on frames of quality 85; docs/calibration.md has the numbers, and where they fail.
-    """
-    s, distance = found.sphere_in_camera_m, float(np.linalg.norm(found.sphere_in_camera_m))
-    n, f_px = s / distance, float(np.sqrt(rig.camera.fx_px * rig.camera.fy_px))
-    radius_px = f_px * rig.mirror.radius_m / distance
-    along, across = JPEG_SCATTER_PX * distance / radius_px, JPEG_ACROSS_PX * distance / f_px
-    own = along**2 * np.outer(n, n) + across**2 * (np.eye(3) - np.outer(n, n))
-    moved = s * (1.0 - JPEG_SHIFT_PX / radius_px)
-    return replace(found, sphere_in_camera_m=moved, covariance_m2=found.covariance_m2 + own)
-
-
 def fit_outline(
-    planes: tuple[Plane, ...], rig: Rig, start_m: Array, half_px: float = HALF_WIDTH_PX, jpeg: bool = False
+    planes: tuple[Plane, ...],
+    rig: Rig,
+    start_m: Array,
+    half_px: float = HALF_WIDTH_PX,
+    again: tuple[NDArray[Any], SensorCard] | None = None,
 ) -> Outline:
-    """As `find_outline`, from a start within some pixels of the outline; for JPEG frames without `without_jpeg`."""
+    """As `find_outline`, from a start within some pixels of the outline; `again` is frame and card of a JPEG frame."""
     s, blur = np.asarray(start_m, float), rig.camera.blur_sigma_px**2
     s = _approach(planes, rig, s, blur)
     arc = visible_arc(rig, s, half_px)
@@ -136,7 +125,7 @@ def fit_outline(
             f"a mirror cut by the frame: {100.0 * arc:.0f} % of its outline lie in the image, {100.0 * MIN_ARC:.0f} % "
             "are needed; move the camera away from the mirror or centre it"
         )
-    return _settle(planes, rig, s, blur, half_px, jpeg)
+    return _settle(planes, rig, s, blur, half_px, again)
 
 
 def visible_arc(rig: Rig, s: Array, margin_px: float = 0.0) -> float:
@@ -156,17 +145,24 @@ def _approach(planes: tuple[Plane, ...], rig: Rig, s: Array, blur: float) -> Arr
     return s
 
 
-def _settle(planes: tuple[Plane, ...], rig: Rig, s: Array, blur: float, half_px: float, jpeg: bool) -> Outline:
+def _settle(
+    planes: tuple[Plane, ...],
+    rig: Rig,
+    s: Array,
+    blur: float,
+    half_px: float,
+    again: tuple[NDArray[Any], SensorCard] | None,
+) -> Outline:
     for count in range(1, _STEPS + 1):
         if count <= 4:  # later the pixels stay, so that the steps come to rest
             pixels = band(planes, rig.camera, s, rig.mirror.radius_m, half_px)
-        step = step_from(pixels, planes, rig, s, blur, SECTORS, half_px, jpeg)
+        step = step_from(pixels, planes, rig, s, blur, SECTORS, half_px, again is not None, near=True)
         # weights that are cut off can take turns for ever: shorter steps end between them
         move = step.move * min(1.0, 6.0 / count)
-        s, blur = _moved(s, move[:3], rig), float(np.clip(blur + move[3], *_BLUR_RANGE_PX2))
         sigma = np.sqrt(np.diag(step.covariance)[:3])
         if count > 4 and np.all(np.abs(move[:3]) < np.maximum(_REST_M, _REST_SIGMAS * sigma)):
             break
+        s, blur = _moved(s, move[:3], rig), float(np.clip(blur + move[3], *_BLUR_RANGE_PX2))
     if np.any(np.abs(move[:3]) > np.maximum(_UNREST_M, sigma)):
         raise ImageError("an image without a mirror: the fit of the outline does not come to rest")
     if not _MIN_CONTRAST < step.contrast < _MAX_CONTRAST:
@@ -175,7 +171,22 @@ def _settle(planes: tuple[Plane, ...], rig: Rig, s: Array, blur: float, half_px:
             f"polished steel gives; allowed is {_MIN_CONTRAST} to {_MAX_CONTRAST}"
         )
     arc = step.sectors_used / SECTORS
-    return Outline(s, step.covariance[:3, :3], arc, step.contrast, blur**0.5, step.residual, len(pixels.y), count)
+    change, covariance = (step.move, step.covariance) if again is None else without_jpeg(pixels, step, *again)
+    s, blur = _moved(s, change[:3], rig), float(np.clip(blur + change[3], *_BLUR_RANGE_PX2))
+    return Outline(s, covariance[:3, :3], arc, step.contrast, blur**0.5, step.residual, len(pixels.y), count)
+
+
+def without_jpeg(pixels: OutlinePixels, step: Step, frame: NDArray[Any], card: SensorCard) -> tuple[Array, Array]:
+    """Last step of the fit of a JPEG frame, shape (4,), and its covariance, less what JPEG does to the fit.
+
+    The model of the light is drawn through the camera's noise and JPEG, and the fit's answer compared with what was
+    put in: first with the blur that was found, which JPEG has made wider, then with the blur that this leaves.
+    """
+    again, change = JpegAgain(frame, pixels, card), step.move
+    for draws in JPEG_DRAWS:
+        off = np.mean(again.drawn(step.model + step.by_parameters @ change, draws), axis=0) - step.model
+        change = step.move - (step.solution.move(off) - change)
+    return change, step.solution.covariance(pixels.y - step.model - off)
 
 
 def _moved(s: Array, move: Array, rig: Rig) -> Array:

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from phibench.estimator.calibration.limb import Limb, limb_angle_rad
 from phibench.estimator.calibration.limb_image import Plane
@@ -19,6 +18,9 @@ from phibench.estimator.reflection import ray_jacobian
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.rig import Rig
+
+_OUTLINE_POINTS = 720
+_RING_MARGIN_PX = 2.5
 
 
 @dataclass(frozen=True)
@@ -49,9 +51,7 @@ class Place:
 def band(planes: tuple[Plane, ...], camera: Camera, s: Array, radius_m: float, half_px: float) -> OutlinePixels:
     """Usable pixels within `half_px` of the outline."""
     height, width = planes[0].values.shape
-    v, u = np.mgrid[:height, :width]
-    ring = _ring(camera, s, radius_m, half_px, (height, width))
-    u, v = u[ring], v[ring]
+    u, v = _ring(camera, s, radius_m, half_px)
     uv = np.stack([u, v], axis=-1).astype(float)
     ray, by_pixel = camera.rays(uv), ray_jacobian(camera, uv)
     near = np.abs(place_of_rays(ray, by_pixel, s, radius_m).d_px) < half_px
@@ -66,19 +66,27 @@ def band(planes: tuple[Plane, ...], camera: Camera, s: Array, radius_m: float, h
     )
 
 
-def _ring(camera: Camera, s: Array, radius_m: float, half_px: float, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Pixels that may be within `half_px`, by a mask around the outline's pixels: quick, and distorted as the lens."""
+def _ring(camera: Camera, s: Array, radius_m: float, half_px: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pixels (u, v) that may be within `half_px`: by their distance from the outline's centre, at its own azimuths."""
     mark = Rig(camera=camera)
     uv = replace(
         mark,
         mirror=replace(mark.mirror, radius_m=radius_m),
         T_camera_sphere=replace(mark.T_camera_sphere, translation_m=as_vector(s)),
-    ).outline_px(4000)
-    mask = np.zeros(size, bool)
-    cells = np.rint(uv).astype(int)
-    good = np.all((cells >= 0) & (cells < np.array(size)[::-1]), axis=-1)
-    mask[cells[good, 1], cells[good, 0]] = True
-    return np.asarray(ndimage.distance_transform_edt(~mask) < half_px + 2.5)
+    ).outline_px(_OUTLINE_POINTS)
+    low = np.clip(np.floor(uv.min(axis=0) - half_px).astype(int), 0, None)
+    high = np.clip(np.ceil(uv.max(axis=0) + half_px).astype(int) + 1, 0, (camera.width_px, camera.height_px))
+    centre = uv.mean(axis=0)
+    v, u = np.mgrid[low[1] : high[1], low[0] : high[0]]
+    off = np.hypot(u - centre[0], v - centre[1])
+    own = np.hypot(*(uv - centre).T)
+    rough = np.abs(off - 0.5 * (own.min() + own.max())) < half_px + 0.5 * np.ptp(own) + _RING_MARGIN_PX
+    u, v, off = u[rough], v[rough], off[rough]
+    azimuth = np.arctan2(uv[:, 1] - centre[1], uv[:, 0] - centre[0])
+    order = np.argsort(azimuth)
+    there = np.interp(np.arctan2(v - centre[1], u - centre[0]), azimuth[order], own[order], period=2.0 * np.pi)
+    near = np.abs(off - there) < half_px + _RING_MARGIN_PX
+    return u[near], v[near]
 
 
 def place_of(rays: OutlinePixels, s: Array, radius_m: float) -> Place:
@@ -104,14 +112,13 @@ def through_taps(
     rays: OutlinePixels, planes: tuple[Plane, ...], limb: Limb, place: Place
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Light, slope, curvature, turned and turned squared for every pixel, summed over its taps."""
-    sums = np.zeros((5, rays.y.size))
-    tables = (limb.light, limb.slope_per_px, limb.curvature_per_px2, limb.turned, limb.turned_squared)
+    sums = np.zeros((rays.y.size, 5))
     parity = 2 * (rays.v % 2) + rays.u % 2
     for number, plane in enumerate(planes):
         for kind in range(4):
             rows = np.flatnonzero((rays.plane == number) & (parity == kind))
             for tap in plane.taps[kind]:
                 d = place.d_px[rows] + place.by_uv[rows] @ np.array([tap.du_px, tap.dv_px], float)
-                for k, table in enumerate(tables):
-                    sums[k, rows] += tap.weight * limb.at(table, tap.filter_index, d)
-    return sums[0], sums[1], sums[2], sums[3], sums[4]
+                sums[rows] += tap.weight * limb.all_at(tap.filter_index, d)
+    light, slope, curvature, turned, squared = sums.T
+    return light, slope, curvature, turned, squared
