@@ -19,7 +19,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.sensor_card import SensorCard, sensor_card
@@ -38,6 +37,7 @@ ROOM_E_PER_S = (5.8e4, 4.9e4, 2.5e4)
 """Electrons per second and pixel behind R, G, B of a white wall under about 300 lx, the default lab's."""
 _DEPTH_M = (0.05, 100.0)
 _STROKE_M = (1e-3, 20.0)
+_FINE = 21  # strokes between two of the grid: 0.3 % apart, and the minimum is flat
 
 
 @dataclass(frozen=True)
@@ -145,14 +145,10 @@ def best_stroke(
     if not np.isfinite(curve.allowed_sigma_m).any():
         return BestStroke(depth_m, math.nan, *(math.nan,) * 4, tuple(dict.fromkeys(curve.causes)), curve)
     index = int(np.argmin(curve.allowed_sigma_m))
-    low, high = grid_neighbours(curve.strokes_m.tolist(), index)
-    fine = minimize_scalar(
-        lambda h: float(curve_of(strokes_m=np.array([h])).allowed_sigma_m[0]), bounds=(low, high), method="bounded"
-    )
-    found = min((float(curve.strokes_m[index]), float(fine.x)), key=lambda h: _sigma_at(curve_of, h))
-    best = curve_of(strokes_m=np.array([found]))
-    parts = (best.sigma_m, best.sigma_spot_m, best.sigma_calibration_m, best.sigma_stroke_m)
-    return BestStroke(depth_m, found, *(float(part[0]) for part in parts), _limits(curve, index), curve)
+    fine = curve_of(strokes_m=np.linspace(*grid_neighbours(curve.strokes_m.tolist(), index), _FINE))
+    at = int(np.argmin(fine.allowed_sigma_m))
+    parts = (fine.strokes_m, fine.sigma_m, fine.sigma_spot_m, fine.sigma_calibration_m, fine.sigma_stroke_m)
+    return BestStroke(depth_m, *(float(part[at]) for part in parts), _limits(curve, index), curve)
 
 
 def spot_bound(rig: Rig, card: SensorCard, room_e_per_s: tuple[float, float, float] = ROOM_E_PER_S) -> SpotSigma:
@@ -179,10 +175,6 @@ def spot_bound(rig: Rig, card: SensorCard, room_e_per_s: tuple[float, float, flo
 def without_limits(around: Surroundings) -> Surroundings:
     """Surroundings in which only geometry bounds the stroke: no ceiling and no robot."""
     return replace(around, room_height_m=math.inf, robot=False)
-
-
-def _sigma_at(curve_of: partial[StrokeCurve], stroke_m: float) -> float:
-    return float(curve_of(strokes_m=np.array([stroke_m])).allowed_sigma_m[0])
 
 
 def _limits(curve: StrokeCurve, index: int) -> tuple[str, ...]:

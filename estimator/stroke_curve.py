@@ -19,7 +19,7 @@ from phibench.estimator.spot_flux import Laser, spot_electrons_per_s
 from phibench.estimator.spot_sigma import SpotSigma
 from phibench.estimator.status import Status
 from phibench.scenes.frames import Array
-from phibench.scenes.rig import POSITIONS, Rig
+from phibench.scenes.rig import Rig
 from phibench.scenes.robot import escalade360
 
 FREE = ""
