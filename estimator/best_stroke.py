@@ -143,12 +143,21 @@ def best_stroke(
     )
     curve = curve_of(strokes_m=stroke_grid(*strokes_m))
     if not np.isfinite(curve.allowed_sigma_m).any():
-        return BestStroke(depth_m, math.nan, *(math.nan,) * 4, tuple(dict.fromkeys(curve.causes)), curve)
+        nothing = (math.nan, math.nan, math.nan, math.nan, math.nan)
+        return BestStroke(depth_m, *nothing, tuple(dict.fromkeys(curve.causes)), curve)
     index = int(np.argmin(curve.allowed_sigma_m))
     fine = curve_of(strokes_m=np.linspace(*grid_neighbours(curve.strokes_m.tolist(), index), _FINE))
     at = int(np.argmin(fine.allowed_sigma_m))
-    parts = (fine.strokes_m, fine.sigma_m, fine.sigma_spot_m, fine.sigma_calibration_m, fine.sigma_stroke_m)
-    return BestStroke(depth_m, *(float(part[at]) for part in parts), _limits(curve, index), curve)
+    return BestStroke(
+        depth_m=depth_m,
+        stroke_m=float(fine.strokes_m[at]),
+        sigma_m=float(fine.sigma_m[at]),
+        sigma_spot_m=float(fine.sigma_spot_m[at]),
+        sigma_calibration_m=float(fine.sigma_calibration_m[at]),
+        sigma_stroke_m=float(fine.sigma_stroke_m[at]),
+        limits=_limits(curve, index),
+        curve=curve,
+    )
 
 
 def spot_bound(rig: Rig, card: SensorCard, room_e_per_s: tuple[float, float, float] = ROOM_E_PER_S) -> SpotSigma:

@@ -118,12 +118,12 @@ def stroke_curve(
     """Predicted error of D for strokes, shape (n,); parameters as for `best_stroke.best_stroke`."""
     h, points = np.asarray(strokes_m, float), around.points_m(rig, depth_m)
     images = [_images(rig, points, offset) for offset in (np.zeros(1), h)]
-    covariances = [_covariance(rig, image, spot, around, laser, exposure_s) for image in images]
+    C_down, C_up = (_covariance(rig, image, spot, around, laser, exposure_s) for image in images)
     down, up = (image.uv_px for image in images)
-    found = depth_general(rig, h[:, None], down, up, *covariances, covariance_rig, stroke_sigma_m)
+    found = depth_general(rig, h[:, None], down, up, C_down, C_up, covariance_rig, np.asarray(stroke_sigma_m))
     parts = (found.sigma_spot_m, found.sigma_calibration_m, found.sigma_stroke_m)
-    rms = [np.sqrt(np.mean(part**2, axis=-1)) for part in parts]
-    return StrokeCurve(h, *rms, causes(rig, points, images[0], images[1], h, around))
+    of_spot, of_rig, of_stroke = (np.sqrt(np.mean(part**2, axis=-1)) for part in parts)
+    return StrokeCurve(h, of_spot, of_rig, of_stroke, causes(rig, points, images[0], images[1], h, around))
 
 
 def causes(

@@ -161,8 +161,9 @@ def taken(
         for key, light, word in ((position, side.light, "on"), (f"{position}_off", side.light.laser_off(), "off")):
             images[key] = side.chain.frame(light, _stream(names, position, word))
             images[key].flags.writeable = False
-    boxes = {f"box_{p}": _box(names, p, pair.views[p].truth, side_px=box_px, rig=pair.rig) for p in POSITIONS}
-    return Pair(number, **images, rig=believed[0], stroke_m=believed[1], card=card_of(shot.sensor), **boxes)
+    box_down, box_up = (_box(names, p, pair.views[p].truth, side_px=box_px, rig=pair.rig) for p in POSITIONS)
+    card, (rig, stroke_m) = card_of(shot.sensor), believed
+    return Pair(number, **images, rig=rig, stroke_m=stroke_m, card=card, box_down=box_down, box_up=box_up)
 
 
 def without_off(pair: Pair) -> Pair:
