@@ -13,7 +13,6 @@ import numpy as np
 
 from phibench.datasets import layout
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.expected import ExpectedRegion, expected_of_light
 from phibench.datasets.files import sha256
 from phibench.datasets.frame_source import FrameSource, Side
 from phibench.datasets.frames import Frames
@@ -22,21 +21,12 @@ from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.sensor_card import card_of
 from phibench.datasets.taken import TakenSample
 from phibench.datasets.takes import Take, takes
+from phibench.estimator.bench.spot_bounds import spot_bounds, spot_electrons
 from phibench.estimator.bench.truth import Distraction, PairTruth, SpotTruth
-from phibench.estimator.chain_limit import chain_limit
-from phibench.estimator.fisher import covariance_bound
-from phibench.estimator.limits import SpotLimit, spot_limit
-from phibench.estimator.methods.linear import PROCESSED
 from phibench.estimator.seat.pair import Box, Image, Pair
-from phibench.estimator.spot_blur import spot_blur
-from phibench.scenes.frames import Array
-from phibench.scenes.rig import Rig
 
 TASK_VERSION = 1
 """Version of the task: what a method is given, what it must answer and what is counted. A change of any raises it."""
-
-_OF_THE_SPOT = 0.01  # of its brightest pixel: dimmer pixels are not the spot's
-_POSITION = 2  # unknowns of a position, the first ones of a Fisher matrix
 
 
 class DatasetPairs:
@@ -98,8 +88,8 @@ class DatasetPairs:
             stroke_m=sample.row.stroke_m,
             true_rig=sample.rig,
             believed_rig=sample.nominal_rig,
-            down=_spot_truth(sample, source, take, "down"),
-            up=_spot_truth(sample, source, take, "up"),
+            down=_spot_truth(sample, source, "down"),
+            up=_spot_truth(sample, source, "up"),
             believed_stroke_m=sample.row.nominal_stroke_m,
         )
 
@@ -198,72 +188,27 @@ def _box(region: Any) -> Box:
     return Box(region.u0_px, region.v0_px, width, height)
 
 
-def _spot_truth(sample: TakenSample, source: FrameSource, take: Take, position: str) -> SpotTruth:
+def _spot_truth(sample: TakenSample, source: FrameSource, position: str) -> SpotTruth:
     row, side = sample.row.position(position), source.sides[position]
-    raw = side.chain.sensor.replace(output="raw")
-    card = card_of(raw)
-    region = expected_of_light(side.light, raw, sample.rig.camera) if row.visible else None
-    raw_limit = None if region is None else spot_limit(region, card)
-    limit, electrons, unit = raw_limit, _electrons(row.electrons_per_s, side), 1.0
-    if region is not None and side.chain.sensor.output in PROCESSED:
-        limit, unit = _processed_limit(region, side, sample.rig, (row.u_px, row.v_px), electrons), electrons
-    peak_e = 0.0 if region is None else _peak_e(region)
+    uv_px = (row.u_px, row.v_px)
+    bounds = spot_bounds(side, sample.rig, uv_px, row.electrons_per_s, row.visible)
     return SpotTruth(
-        uv_px=(row.u_px, row.v_px),
+        uv_px=uv_px,
         phi_rad={"ray": row.phi_ray_rad, "normal": row.phi_normal_rad, "incidence": row.phi_incidence_rad},
         azimuth_rad=row.azimuth_rad,
         visible=row.visible,
         cause=row.cause,
-        electrons=electrons,
-        peak_e=peak_e,
-        snr=0.0 if limit is None else _snr(limit, unit),
-        saturated=peak_e > card.saturation_e,
-        bound_px2=_bound(limit),
-        raw_bound_px2=_bound(raw_limit),
+        **vars(bounds),
         distractions=_distractions(sample, side, position),
     )
-
-
-def _processed_limit(
-    region: ExpectedRegion, side: Side, rig: Rig, uv_px: tuple[float, float], electrons: float
-) -> SpotLimit:
-    """Limit of the 8-bit or JPEG image: the room as one level per filter, its mean under the spot; a Gaussian spot."""
-    blur = spot_blur(rig, uv_px)
-    weight = region.spot_e + 1e-3 * region.spot_e.max()  # of a filter that sees nothing of the spot: the mean of all
-    levels = [
-        float(np.average(region.background_e[region.filters == c], weights=weight[region.filters == c]))
-        for c in range(3)
-    ]
-    r, g, b = rig.camera.detector.laser_filter_response
-    return chain_limit(card_of(side.chain.sensor), uv_px, blur.sigma_px, electrons, levels, (r, g, b), blur.ratio)
-
-
-def _bound(limit: SpotLimit | None) -> Array | None:
-    return None if limit is None or not np.isfinite(limit.covariance_px2).all() else limit.covariance_px2
-
-
-def _electrons(rates_per_s: tuple[float, float, float] | Array, side: Side) -> float:
-    """Electrons of a whole spot: behind the red filter, or all of them where there are no filters."""
-    sensor = side.chain.sensor
-    weights = sensor.mono_weights if sensor.mosaic == "mono" else (1.0, 0.0, 0.0)
-    return float(np.dot(rates_per_s, weights)) * sensor.exposure_s * side.light.laser_level
-
-
-def _peak_e(region: ExpectedRegion) -> float:
-    """Largest expected electrons of a pixel that belongs to the spot, room included."""
-    return float(region.mean_e[region.spot_e >= _OF_THE_SPOT * region.spot_e.max()].max())
-
-
-def _snr(limit: SpotLimit, flux: float) -> float:
-    """Flux, in the unit of the limit, over its deviation at the limit: position known, background unknown."""
-    variance = covariance_bound(limit.fisher[_POSITION:, _POSITION:], keep=1)[0, 0]
-    return float(flux / np.sqrt(variance)) if variance > 0.0 else 0.0
 
 
 def _distractions(sample: TakenSample, side: Side, position: str) -> tuple[Distraction, ...]:
     """Lights beside the spot that this image shows."""
     return tuple(
-        Distraction(one.kind, (truth.u_px, truth.v_px), _electrons(one.layers[position].total_electrons_per_s, side))
+        Distraction(
+            one.kind, (truth.u_px, truth.v_px), spot_electrons(one.layers[position].total_electrons_per_s, side)
+        )
         for one in sample.distractors
         if (truth := one.truths[position]).visible
     )

@@ -32,7 +32,11 @@ _each = each_spot(raw_maximum_likelihood)
 
 def joint_fit(pair: Pair) -> Answer:
     """Positions and depth of a pair; the separate answers where one image has no spot or the two are not one point."""
-    separate = _each(pair) if pair.card.output == "raw" else chain_fit(pair)
+    return joint_of(pair, _each(pair) if pair.card.output == "raw" else chain_fit(pair))
+
+
+def joint_of(pair: Pair, separate: Answer) -> Answer:
+    """Answer for both images together, from that for each by itself: `raw_maximum_likelihood`'s or `chain_fit`'s."""
     if separate.down.uv_px is None or separate.up.uv_px is None:
         return separate
     return (_raw if pair.card.output == "raw" else _processed)(pair, separate)

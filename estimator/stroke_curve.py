@@ -1,0 +1,187 @@
+"""Predicted error of D against the stroke h, and what stands in the way of a stroke.
+
+A rig raised by h sees a point as a rig that stays sees the point lowered by h, so that all strokes are one array.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from phibench.estimator.depth_general import depth_general
+from phibench.estimator.line_of_sight import first_blocker
+from phibench.estimator.mirror_image import MirrorImage, image_of
+from phibench.estimator.reflection import reflect
+from phibench.estimator.spot_flux import Laser, spot_electrons_per_s
+from phibench.estimator.spot_sigma import SpotSigma
+from phibench.estimator.status import Status
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import Rig
+from phibench.scenes.robot import escalade360
+
+FREE = ""
+"""Cause of a stroke that nothing stands in the way of."""
+CEILING, NO_IMAGE, MIRROR_EDGE, IMAGE_EDGE, OCCLUDED = (
+    "ceiling",
+    "no image in the mirror",
+    "mirror's edge",
+    "image's edge",
+    "occluded by",  # and the name of the solid
+)
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Where spots are, and what bounds the strokes besides the carriage.
+
+    Parameters
+    ----------
+    heights_m : tuple of float
+        Heights of the spots above the floor; the error is the root mean square over them.
+    azimuths_rad : tuple of float
+        Directions of the spots, as a tilt or a decentre matters along the spot's azimuth only; likewise.
+    room_height_m : float
+        The mirror's top stays below it.
+    robot : bool
+        Whether the robot, its mast and the camera's housing may stand in the way.
+    edge_px : float
+        Least distance of a spot from the edge of the mirror and of the image: the blur's skirt and the fit's window.
+    """
+
+    heights_m: tuple[float, ...] = (0.5,)
+    azimuths_rad: tuple[float, ...] = tuple(2.0 * math.pi * k / 8.0 for k in range(8))
+    room_height_m: float = 3.0
+    robot: bool = True
+    edge_px: float = 4.0
+
+    def points_m(self, rig: Rig, depth_m: float) -> Array:
+        """Places of the spots, shape (m, 3), about the vertical line through the sphere centre when down."""
+        axis = rig.at(0.0).sphere_centre_m
+        return np.array(
+            [
+                (axis[0] + depth_m * math.cos(a), axis[1] + depth_m * math.sin(a), z)
+                for z in self.heights_m
+                for a in self.azimuths_rad
+            ]
+        )
+
+    def wall_normals(self) -> Array:
+        """Normals of upright walls that face the axis, shape (m, 3)."""
+        return np.array([(-math.cos(a), -math.sin(a), 0.0) for _ in self.heights_m for a in self.azimuths_rad])
+
+
+@dataclass(frozen=True)
+class StrokeCurve:
+    """Predicted error of D by stroke, shape (n,), metres; root mean square over the places of the spot.
+
+    Attributes
+    ----------
+    strokes_m
+    sigma_spot_m, sigma_calibration_m, sigma_stroke_m
+        From the pixels' noise, the rig's parameters and the single stroke; NaN where the spot has no image.
+    causes : tuple of str
+        Why a stroke cannot be taken; `FREE` where it can.
+    """
+
+    strokes_m: Array
+    sigma_spot_m: Array = field(repr=False)
+    sigma_calibration_m: Array = field(repr=False)
+    sigma_stroke_m: Array = field(repr=False)
+    causes: tuple[str, ...] = field(repr=False)
+
+    @property
+    def sigma_m(self) -> Array:
+        """All parts together: their squares add up."""
+        return np.sqrt(self.sigma_spot_m**2 + self.sigma_calibration_m**2 + self.sigma_stroke_m**2)
+
+    @property
+    def allowed_sigma_m(self) -> Array:
+        """The same, infinite where the stroke cannot be taken."""
+        free = np.array([cause == FREE for cause in self.causes])
+        return np.where(free & np.isfinite(self.sigma_m), self.sigma_m, np.inf)
+
+
+def stroke_curve(
+    rig: Rig,
+    depth_m: float,
+    strokes_m: Array,
+    spot: SpotSigma,
+    covariance_rig: Array,
+    around: Surroundings,
+    laser: Laser,
+    exposure_s: float,
+    stroke_sigma_m: float,
+) -> StrokeCurve:
+    """Predicted error of D for strokes, shape (n,); parameters as for `best_stroke.best_stroke`."""
+    h, points = np.asarray(strokes_m, float), around.points_m(rig, depth_m)
+    images = [_images(rig, points, offset) for offset in (np.zeros(1), h)]
+    C_down, C_up = (_covariance(rig, image, spot, around, laser, exposure_s) for image in images)
+    down, up = (image.uv_px for image in images)
+    found = depth_general(rig, h[:, None], down, up, C_down, C_up, covariance_rig, np.asarray(stroke_sigma_m))
+    parts = (found.sigma_spot_m, found.sigma_calibration_m, found.sigma_stroke_m)
+    of_spot, of_rig, of_stroke = (np.sqrt(np.mean(part**2, axis=-1)) for part in parts)
+    return StrokeCurve(h, of_spot, of_rig, of_stroke, causes(rig, points, images[0], images[1], h, around))
+
+
+def causes(
+    rig: Rig, points_m: Array, down: MirrorImage, up: MirrorImage, strokes_m: Array, around: Surroundings
+) -> tuple[str, ...]:
+    """Why each stroke, shape (n,), cannot be taken for spots at all of the points, shape (m, 3)."""
+    first = _fault(rig, points_m, down.uv_px[0], 0.0, around)
+    return tuple(
+        first or _fault(rig, points_m, uv, float(h), around) for uv, h in zip(up.uv_px, strokes_m, strict=True)
+    )
+
+
+def _fault(rig: Rig, points_m: Array, uv_px: Array, offset_m: float, around: Surroundings) -> str:
+    """Why the rig at one offset does not see all of the points, which it has at pixels (m, 2)."""
+    view = rig.at(offset_m)
+    if view.sphere_centre_m[2] + rig.mirror.radius_m > around.room_height_m:
+        return CEILING
+    if not np.isfinite(uv_px).all():
+        return NO_IMAGE
+    if np.any(_outline_distance_px(rig, uv_px) < around.edge_px):
+        return MIRROR_EDGE
+    if not np.all(rig.camera.contains(uv_px - around.edge_px) & rig.camera.contains(uv_px + around.edge_px)):
+        return IMAGE_EDGE
+    if not around.robot:
+        return FREE
+    mirror = reflect(view, uv_px).origin_world_m
+    eye = np.broadcast_to(view.camera_centre_m, mirror.shape)
+    name = first_blocker(escalade360(view), ((mirror, points_m), (eye, mirror)))
+    return FREE if name is None else f"{OCCLUDED} {name}"
+
+
+def _images(rig: Rig, points_m: Array, offsets_m: Array) -> MirrorImage:
+    """Images of points, shape (m, 3), from offsets, shape (n,), of the carriage: shape (n, m)."""
+    lowered = points_m - offsets_m[:, None, None] * np.array(rig.stroke_axis_world)
+    return image_of(rig.at(0.0), lowered)
+
+
+def _covariance(
+    rig: Rig, image: MirrorImage, spot: SpotSigma, around: Surroundings, laser: Laser, exposure_s: float
+) -> Array:
+    electrons = spot_electrons_per_s(rig, laser, image, around.wall_normals()) * exposure_s
+    variance = np.where(image.status == Status.OK, spot.at(electrons) ** 2, np.nan)
+    return np.asarray(np.where(np.isfinite(variance), variance, np.nan)[..., None, None] * np.eye(2))
+
+
+def _outline_distance_px(rig: Rig, uv_px: Array) -> Array:
+    """Distance of pixels, shape (m, 2), from the mirror's outline, inwards: angle times focal length."""
+    centre = rig.sphere_in_camera_m
+    away = np.arccos(np.clip(rig.camera.rays(uv_px) @ centre / np.linalg.norm(centre), -1.0, 1.0))
+    rim = math.asin(rig.mirror.radius_m / float(np.linalg.norm(centre)))
+    return np.asarray((rim - away) * rig.camera.fx_px)
+
+
+def stroke_grid(low_m: float, high_m: float, count: int = 81) -> Array:
+    """Strokes from low to high, evenly in their logarithm."""
+    return np.geomspace(low_m, high_m, count)
+
+
+def grid_neighbours(grid: Sequence[float], index: int) -> tuple[float, float]:
+    """Values before and after an element."""
+    return grid[max(index - 1, 0)], grid[min(index + 1, len(grid) - 1)]

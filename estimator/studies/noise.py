@@ -1,0 +1,162 @@
+"""Study `noise`: depth, phi and pixel error against exposure, laser, read noise, blur, focus, JPEG, bits and speckle.
+
+One factor at a time about base cases; all methods that take the preset, on the same draws, with the bound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated
+
+import polars as pl
+from pydantic import Field, field_validator
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.read import Dataset
+from phibench.estimator.bench.rules import Rules
+from phibench.estimator.methods.registry import METHODS
+from phibench.estimator.studies.drawing import Drawing
+from phibench.estimator.studies.material import Material
+from phibench.estimator.studies.noise_cells import Cell, all_records
+from phibench.estimator.studies.noise_drawings import error_drawing, ranking_drawing
+from phibench.estimator.studies.noise_factors import BASE, FACTORS, applied
+from phibench.estimator.studies.noise_findings import (
+    REFERENCE,
+    base_sentence,
+    base_table,
+    floor_sentence,
+    ranking_sentence,
+    ranking_table,
+    useless_sentence,
+)
+from phibench.estimator.studies.noise_table import elasticities, table_of, with_levels
+from phibench.estimator.studies.result import Result, Row
+from phibench.estimator.studies.study import Settings, Study
+from phibench.render.sensor import SensorError
+from phibench.scenes.names import nearest
+
+_Words = Annotated[tuple[str, ...], Field(strict=False)]
+_Levels = Annotated[tuple[float, ...], Field(strict=False, min_length=1)]
+
+
+class NoiseSettings(Settings):
+    """Settings of the study."""
+
+    recipe: str = Field(default="paper", description="recipe of the base cases, rendered for 1 mW")
+    samples: _Words = Field(min_length=1, description="base cases; the first is the main one")
+    presets: _Words = Field(min_length=1, description="of bayer-raw, srgb8, mjpeg")
+    methods: _Words = Field(default=(), description="built-in methods; all if empty")
+    places: int = Field(ge=2, le=200, description="places of the spot on its board")
+    draws: int = Field(ge=2, le=200, description="draws of the noise at each place")
+    box_px: int = Field(ge=24, le=256, description="side of the boxes that methods are given")
+    resamples: int = Field(ge=99, le=9999, description="of the bootstrap over places")
+    levels: dict[str, _Levels] = Field(min_length=1, description="levels by factor; the base is added")
+
+    @field_validator("levels")
+    @classmethod
+    def _known_factors(cls, levels: dict[str, tuple[float, ...]]) -> dict[str, tuple[float, ...]]:
+        for name in levels:
+            if name not in FACTORS:
+                raise ValueError(f"no factor '{name}'; {nearest(name, tuple(FACTORS))}")
+        return levels
+
+    @field_validator("presets")
+    @classmethod
+    def _known_presets(cls, presets: tuple[str, ...]) -> tuple[str, ...]:
+        for name in presets:
+            if name not in REFERENCE:
+                raise ValueError(f"preset '{name}': {nearest(name, tuple(REFERENCE))}")
+        return presets
+
+    @field_validator("methods")
+    @classmethod
+    def _known_methods(cls, methods: tuple[str, ...]) -> tuple[str, ...]:
+        for name in methods:
+            if name not in METHODS:
+                raise ValueError(f"no method '{name}'; {nearest(name, tuple(METHODS))}")
+        return methods
+
+
+def run(settings: NoiseSettings, material: Material) -> Result:
+    """Run the study."""
+    dataset = material.dataset(settings.recipe)
+    planned = cells(settings, dataset)
+    records = with_levels(all_records(planned, material), dict(settings.levels))
+    rules = Rules(resamples=settings.resamples)
+    table = table_of(records, rules)
+    slopes = elasticities(records, rules)
+    slope_rows = [
+        {**{k: v for k, v in vars(e).items() if k != "estimate"}, "slope": e.estimate.value}
+        | {"slope_low": e.estimate.low, "slope_high": e.estimate.high}
+        for e in slopes
+    ]
+    shown: dict[str, tuple[Row, ...]] = {}
+    findings, pictures = [], list[Drawing]()
+    for preset in settings.presets:
+        for sample in settings.samples:
+            findings.append(base_sentence(table, sample, preset))
+            findings.append(floor_sentence(table, sample, preset))
+            findings.append(useless_sentence(table, sample, preset))
+            findings.append(ranking_sentence(slopes, sample, preset))
+            shown[f"{preset}, {sample}: base case, 95 % intervals over places"] = base_table(table, sample, preset)
+            shown[f"{preset}, {sample}: elasticities of {REFERENCE[preset]}"] = ranking_table(slopes, sample, preset)
+        pictures.append(error_drawing(table, settings.samples[0], preset))
+    pictures.append(ranking_drawing(slopes, settings.samples[0], settings.presets))
+    tables = {"table": table, "elasticities": pl.DataFrame(slope_rows)}
+    return Result(tables, tuple(findings), tuple(pictures), shown, _notes(settings))
+
+
+def cells(settings: NoiseSettings, dataset: Dataset) -> list[Cell]:
+    """All cells, those of the costly presets first.
+
+    Raises
+    ------
+    DatasetError
+        If a sample is not in the data set or not visible, or a level is not allowed.
+    """
+    for name in settings.samples:
+        row = dataset[name].row
+        if not (row.down.visible and row.up.visible):
+            raise DatasetError(f"{name}: its spot is not visible in both images; take another base case")
+    methods = settings.methods or tuple(METHODS)
+    plan = [(s, p, f, x) for p in reversed(settings.presets) for s in settings.samples for f, x in _levels(settings, p)]
+    for sample, preset, factor, level in plan:
+        try:
+            applied(factor, preset, dataset[sample].rig, level)
+        except SensorError as error:
+            raise DatasetError(f"levels of {factor}: {level:g} is not allowed: {error}") from error
+    size = (settings.places, settings.draws, methods, settings.box_px)
+    return [Cell(dataset.folder, *case, *size) for case in plan]
+
+
+def _levels(settings: NoiseSettings, preset: str) -> Iterator[tuple[str, float]]:
+    """The base case, then every level that is not the base's."""
+    yield BASE, 0.0
+    for name, levels in settings.levels.items():
+        factor = FACTORS[name]
+        if preset in factor.presets:
+            yield from ((name, x) for x in levels if abs(x - factor.base) > 1e-9)
+
+
+def _notes(settings: NoiseSettings) -> tuple[str, ...]:
+    pairs = settings.places * settings.draws
+    return (
+        f"{pairs} pairs per level ({settings.places} places of the spot, {settings.draws} draws each); intervals are "
+        "95 %, bootstrap over places.",
+        "Methods get boxes of "
+        f"{settings.box_px} px; rates of detection are those inside such a box, not in the whole mirror.",
+        "Laser-off frames go only to methods that cannot do without. Bounds are those of one frame per position, with "
+        "flux and one background level per filter unknown.",
+        "Methods know the rig, its blur and focus and the sensor's numbers; the room behind keeps the "
+        "blur and the focus at which it was rendered.",
+    )
+
+
+STUDY = Study(
+    "noise",
+    "Noise, blur and compression",
+    "How do the errors of pixel, phi and depth depend on exposure, laser power, read noise, blur, focus, JPEG quality, "
+    "bits and speckle, for every method, and what is the bound?",
+    NoiseSettings,
+    run,
+)
