@@ -17,6 +17,7 @@ from phibench.estimator.cli_bench import bench
 from phibench.estimator.cli_calibration import align, calibrate
 from phibench.estimator.cli_dataset import dataset
 from phibench.estimator.cli_misalignment import sensitivities
+from phibench.estimator.cli_panorama import panorama
 from phibench.estimator.cli_score import compare, report, score
 from phibench.estimator.cli_sealed import register as register_sealed
 from phibench.estimator.cli_studies import study
@@ -37,6 +38,7 @@ register_sealed(app, dataset)
 app.command(sensitivities)
 app.command(calibrate)
 app.command(align)
+app.command(panorama)
 app.command(study)
 
 
