@@ -49,7 +49,9 @@ class Grid:
 
     def __post_init__(self) -> None:
         if not _WIDTHS[0] <= self.width_px <= _WIDTHS[1]:
-            raise DatasetError(f"width of the panorama = {self.width_px} px: allowed range is {_WIDTHS[0]} to {_WIDTHS[1]}")
+            raise DatasetError(
+                f"width of the panorama = {self.width_px} px: allowed range is {_WIDTHS[0]} to {_WIDTHS[1]}"
+            )
         low, high = math.degrees(self.low_rad), math.degrees(self.high_rad)
         if not -90.0 <= low < high <= 90.0 or self.height_px < 1:
             raise DatasetError(
