@@ -18,6 +18,7 @@ from phibench.estimator.cli_calibration import align, calibrate
 from phibench.estimator.cli_dataset import dataset
 from phibench.estimator.cli_experiments import experiments
 from phibench.estimator.cli_misalignment import sensitivities
+from phibench.estimator.cli_panorama import panorama
 from phibench.estimator.cli_score import compare, report, score
 from phibench.estimator.cli_sealed import register as register_sealed
 from phibench.estimator.cli_studies import study
@@ -39,6 +40,7 @@ app.command(sensitivities)
 app.command(experiments)
 app.command(calibrate)
 app.command(align)
+app.command(panorama)
 app.command(study)
 
 

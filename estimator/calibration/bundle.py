@@ -5,7 +5,7 @@ every calibration spot. The data:
 
 * the prior of every parameter (what the believed numbers are worth);
 * the sphere centre from an outline, 3 numbers. It was found with the believed camera and radius: a camera or radius
-  off by some per cent moves it, and the fit knows by how much (`_outline_shift`);
+  off by some per cent moves it, and the fit knows by how much (`apparent_centre`);
 * for every spot, 4 pixel coordinates, its distance D, and its azimuth and height where they were measured.
 
 Which are needed: a spot has 4 pixel coordinates for 3 unknowns, so that one of unknown azimuth and height and exact D
@@ -176,8 +176,8 @@ class _Problem:
         rig = changed(self.believed, values)
         parts = [x[: self.free.size]]
         if self.outline is not None:
-            sphere = rig.sphere_in_camera_m - _outline_shift(self.believed, rig)
-            parts.append(_whitened(sphere - self.outline.value, self.outline.covariance))
+            seen = apparent_centre(self.believed, rig)
+            parts.append(_whitened(seen - self.outline.value, self.outline.covariance))
         if self.vertical is not None:
             up = rig.T_world_camera.R.T[:2, 2]
             parts.append(_whitened(up - self.vertical.value, self.vertical.covariance))
@@ -187,8 +187,8 @@ class _Problem:
         return np.concatenate(parts)
 
 
-def _outline_shift(believed: Rig, true: Rig) -> Array:
-    """By how much an outline analysed with the believed camera and radius misses the true sphere centre, shape (3,).
+def apparent_centre(believed: Rig, true: Rig) -> Array:
+    """Sphere centre, camera frame, shape (3,), that the true rig's outline gives with the believed camera and radius.
 
     The true outline's pixels, as the believed camera sees them, are a cone: its axis and its opening give the centre.
     """
@@ -196,8 +196,7 @@ def _outline_shift(believed: Rig, true: Rig) -> Array:
     rays = believed.camera.rays(uv)
     x = np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0]  # n / cos a0
     cosine = 1.0 / np.linalg.norm(x)
-    apparent = x * cosine * believed.mirror.radius_m / np.sqrt((1.0 - cosine) * (1.0 + cosine))
-    return np.asarray(true.sphere_in_camera_m - apparent)
+    return np.asarray(x * cosine * believed.mirror.radius_m / np.sqrt((1.0 - cosine) * (1.0 + cosine)))
 
 
 def _spot_residuals(rig: Rig, values: Array, spots: Sequence[KnownSpot], points: Array) -> Array:

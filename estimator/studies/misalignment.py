@@ -1,0 +1,172 @@
+"""Study: what each misalignment costs each estimator, predicted and rendered; tolerances, ranking, interactions."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import polars as pl
+
+from phibench.estimator.calibration.bundle import Bundle
+from phibench.estimator.studies.drawing import Drawing
+from phibench.estimator.studies.material import Material
+from phibench.estimator.studies.misaligned import CALIBRATED, NOMINAL, Calibrate, Places, true_depth_m
+from phibench.estimator.studies.misalignment_drawings import azimuth_drawing, interaction_drawing, ranking_drawing
+from phibench.estimator.studies.misalignment_interactions import Interactions, interactions, rows
+from phibench.estimator.studies.misalignment_rendered import Rendered, rendered
+from phibench.estimator.studies.misalignment_settings import MisalignmentSettings
+from phibench.estimator.studies.misalignment_table import Rank, ranking, rendered_table, slope_misses, study_table
+from phibench.estimator.studies.misalignment_tolerance import tolerance_rows
+from phibench.estimator.studies.misalignment_words import (
+    calibrated_sentence,
+    interaction_sentence,
+    noise_sentence,
+    ranked,
+    ranking_rows,
+    rendered_sentence,
+    slope_sentence,
+    tolerance_sentence,
+    tolerance_table,
+    worst_disagreement,
+)
+from phibench.estimator.studies.result import Result
+from phibench.estimator.studies.study import Study
+from phibench.estimator.studies.misaligned import pixels
+from phibench.estimator.triangulate import depth_exact
+from phibench.scenes.catalog import default_rig
+from phibench.scenes.frames import Array
+from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.rig import Rig
+from phibench.scenes.streams import generator
+
+_SLOPE_TARGET = 1e-3  # of D: a slope that misses by more is said to be not enough
+
+
+def run(settings: MisalignmentSettings, _: Material) -> Result:
+    """Run the study; it renders spots itself and needs no data set."""
+    nominal = default_rig()
+    strokes = [settings.places(stroke) for stroke in settings.strokes_m]
+    places = strokes[0]
+    calibrate = _calibration(settings, nominal, places.stroke_m)
+    table = study_table(nominal, strokes, calibrate)
+    some = settings.places(places.stroke_m, settings.azimuths_rad[1 :: settings.rendered_every])
+    seen = tuple(rendered(nominal, some))
+    fine, coarse = settings.tolerance_search(), settings.tolerance_search(calibrated=True)
+    tolerances = list(tolerance_rows(nominal, places, fine, coarse, calibrate))
+    drawn = _interactions(settings, nominal, places.stroke_m)
+    noise = _noise(settings, nominal, places)
+    ranks = {name: ranking(table, name, places.stroke_m) for name in (*NOMINAL, CALIBRATED)}
+    pictures = rendered_table(seen, some)
+    return Result(
+        {
+            "table": table.join(pictures.drop("whole_relative"), on=_KEYS, how="left"),
+            "tolerance": pl.DataFrame(tolerances, infer_schema_length=None),
+            "interactions": pl.DataFrame(rows(drawn, "exact", places)),
+        },
+        _findings(settings, table, seen, tolerances, drawn, noise, ranks, places),
+        _drawings(table, pictures, drawn, ranks, places),
+        {
+            "Change of D by a misalignment of the usual size, %, rms over azimuths and signs; exact estimator, nominal "
+            "numbers and calibrated": ranking_rows(ranks["exact"], ranks[CALIBRATED]),
+            f"Value that costs {100.0 * settings.cost:g} % of D, rms over azimuths and signs; - is never reached": (
+                tolerance_table(tolerances, "rms", ("exact", "paper_normal", CALIBRATED))
+            ),
+            f"Value that costs {100.0 * settings.cost:g} % of D at the worst azimuth and sign": (
+                tolerance_table(tolerances, "worst", ("exact", "paper_normal", CALIBRATED))
+            ),
+        },
+        _notes(settings, seen),
+    )
+
+
+_KEYS = ["parameter", "unit", "value", "estimator", "stroke_m", "height_m", "depth_m", "azimuth_deg"]
+
+
+def _calibration(settings: MisalignmentSettings, nominal: Rig, stroke_m: float) -> Calibrate:
+    """Calibrations of a run, each done once: the table and the tolerances ask for the same."""
+    bench = settings.bench
+
+    @cache
+    def calibrated(misalignment: Misalignment) -> Bundle:
+        return bench.calibrated(nominal, stroke_m, misalignment)
+
+    return calibrated
+
+
+def _interactions(settings: MisalignmentSettings, nominal: Rig, stroke_m: float) -> tuple[Interactions, ...]:
+    # four azimuths give the mean of all terms up to the third harmonic, and the first one is world x
+    places = settings.places(stroke_m, np.radians([0.0, 90.0, 180.0, 270.0]))
+    rng = generator("study", "misalignment", "sobol")
+    return interactions(nominal, places, "exact", settings.sobol_n, settings.resamples, rng)
+
+
+def _noise(settings: MisalignmentSettings, nominal: Rig, places: Places) -> Array:
+    """Relative errors of an aligned rig that was calibrated with noise, shape (draws, d, a)."""
+    down, up = pixels(nominal, Misalignment(), places)
+    D, bench = true_depth_m(nominal, Misalignment(), places), settings.bench
+    errors = []
+    for draw in range(settings.noise_draws):
+        rng = generator("study", "misalignment", "calibration", draw)
+        found = bench.calibrated(nominal, places.stroke_m, Misalignment(), rng)
+        errors.append(depth_exact(found.rig, found.stroke(np.asarray(places.stroke_m)), down, up).depth_m / D - 1.0)
+    return np.stack(errors)
+
+
+def _findings(
+    settings: MisalignmentSettings,
+    table: pl.DataFrame,
+    seen: tuple[Rendered, ...],
+    tolerances: list[dict[str, object]],
+    drawn: tuple[Interactions, ...],
+    noise: Array,
+    ranks: dict[str, list[Rank]],
+    places: Places,
+) -> tuple[str, ...]:
+    middle = float(places.depths_m[len(places.depths_m) // 2])
+    return (
+        ranked(ranks["exact"], "the exact estimator with nominal numbers"),
+        ranked(ranks["paper_normal"], "eq. (4) with phi_normal"),
+        slope_sentence(slope_misses(table, "exact"), _SLOPE_TARGET),
+        rendered_sentence(seen, settings.agreement),
+        tolerance_sentence(tolerances, "exact", middle, settings.cost),
+        calibrated_sentence(ranks[CALIBRATED], ranks["exact"]),
+        noise_sentence(noise, places.depths_m),
+        interaction_sentence(drawn),
+    )
+
+
+def _drawings(
+    table: pl.DataFrame,
+    pictures: pl.DataFrame,
+    drawn: tuple[Interactions, ...],
+    ranks: dict[str, list[Rank]],
+    places: Places,
+) -> tuple[Drawing, ...]:
+    chosen = {name: ranks[name] for name in ("exact", "paper_normal", "paper_incidence", CALIBRATED)}
+    return (
+        azimuth_drawing(table, pictures, ranks["exact"], places.stroke_m),
+        ranking_drawing(chosen, len(places.depths_m) - 1),
+        interaction_drawing(drawn),
+    )
+
+
+def _notes(settings: MisalignmentSettings, seen: tuple[Rendered, ...]) -> tuple[str, ...]:
+    off, name = worst_disagreement(seen)
+    missed = [
+        f"rendered and predicted change differ by {off:.1e} of D ({name}); {settings.agreement:.0e} was the target"
+    ]
+    coarse = settings.search_calibrated
+    limited = [
+        f"tolerances after calibration are searched up to {coarse.largest:g} times the usual size only, in steps of "
+        f"{coarse.factor:g}"
+    ]
+    return (*missed[: off > settings.agreement], *limited)
+
+
+STUDY = Study(
+    "misalignment",
+    "Misalignment",
+    "What does each misalignment cost each estimator, how tight must it be for 1 % of depth, and do misalignments add up?",
+    MisalignmentSettings,
+    run,
+)
