@@ -8,7 +8,7 @@ variance), and the paper's real depth of a target is measured (common to all exp
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -88,6 +88,7 @@ class Explanation(Settings):
     noise: Literal["free", "whole pixels"] = "free"
     shared_down: bool = Field(default=False, description="one down image for all strokes with a target")
     tails: Literal["normal", "student"] = "normal"
+    priors: dict[str, Prior] = Field(default={}, description="in place of the study's")
 
     @property
     def reader(self) -> Reader:
@@ -211,11 +212,6 @@ def without_table(model: Model, table: int) -> tuple[Model, NDArray[np.bool_]]:
     out = model.experiments.table == table
     chosen = model.experiments.chosen(~out)
     return Model(model.explanation, model.priors, chosen, model.rig, model.depth_sigma_m), out
-
-
-def scaled_priors(priors: Mapping[str, Prior], by: float, keep: Iterable[str] = ()) -> dict[str, Prior]:
-    """Priors with the normal ones so many times as wide, those of `keep` excepted."""
-    return {name: prior if name in keep else prior.scaled(by) for name, prior in priors.items()}
 
 
 def _normal(residual: Array, covariance: Array) -> Array:
