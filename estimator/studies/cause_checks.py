@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from phibench.estimator.studies.cause_model import Model, standardised, without_table
+from phibench.estimator.studies.cause_model import FREEDOM, Model, standardised, without_table
 from phibench.estimator.studies.cause_simulation import simulate
 from phibench.estimator.studies.paper_reading import PARAMETERS, Experiments, read
 from phibench.scenes.frames import Array
@@ -17,6 +17,7 @@ STEPS = {
     "decentre_x_m": 1e-5,
     "tilt_y_rad": 1e-5,
     "cx_px": 1e-2,
+    "pitch_rad": 1e-5,
     "stroke_relative": 1e-5,
     "stroke_offset_m": 1e-5,
     "focal_relative": 1e-5,
@@ -50,12 +51,14 @@ class Fit:
 def fit_of(model: Model, points: Array, random: np.random.Generator) -> Fit:
     """Fit of a posterior, points of shape (m, d); every point gets one replica of the data.
 
-    Under a Gaussian with known covariance the standardised residuals of a replica are independent unit normals.
+    Under a Gaussian with known covariance the standardised residuals of a replica are independent unit normals; with
+    heavy tails they are independent Student t.
     """
+    heavy = model.explanation.tails == "student"
     depth = np.mean(model.reading(points).depth_m, axis=0)
     relative = (model.experiments.estimate_m - depth) / model.experiments.depth_m
-    seen = standardised(model, points)
-    replica = random.normal(size=seen.shape)
+    seen = standardised(model, points, independent=heavy)
+    replica = random.standard_t(FREEDOM, seen.shape) if heavy else random.normal(size=seen.shape)
     (chi2, chi2_of), (trend, trend_of) = (
         (f(seen), f(replica)) for f in (lambda z: np.sum(z * z, axis=-1), lambda z: _trend(z, model.experiments))
     )

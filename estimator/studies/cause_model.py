@@ -19,7 +19,16 @@ from pydantic import Field, model_validator
 from scipy.special import ndtr, ndtri
 from scipy.stats import t as student
 
-from phibench.estimator.studies.paper_reading import PARAMETERS, Convention, Experiments, Parameters, Reader, Reading, read
+from phibench.estimator.studies.paper_reading import (
+    AZIMUTHS,
+    PARAMETERS,
+    Convention,
+    Experiments,
+    Parameters,
+    Reader,
+    Reading,
+    read,
+)
 from phibench.estimator.studies.study import Settings
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
@@ -27,13 +36,16 @@ from phibench.scenes.rig import Rig
 NOISE = "noise_px"
 WHOLE_PIXEL_PX = 12.0**-0.5  # standard deviation of what rounding to whole pixels takes away
 GROUPS: dict[str, tuple[str, ...]] = {
-    "misalignment": PARAMETERS[:7],
+    "misalignment": PARAMETERS[:4],
+    "turn": ("roll_rad", "pitch_rad"),
     "stroke": ("stroke_relative", "stroke_offset_m"),
     "scale": ("focal_relative", "axial_m", "radius_m"),
 }
 """What an explanation can leave free besides lens distance, spot heights and noise."""
+_DIRECTED = ("misalignment", "turn")  # their effect depends on the spot's azimuth
 COMMON = ("z_c_m", "height_1_m", "height_2_m", "height_3_m", "height_4_m")
-_STUDENT_FREEDOM = 4.0
+FREEDOM = 4.0  # of Student's t where noise has heavy tails
+_STUDENT_TOP = float(student.logpdf(0.0, FREEDOM))
 _IMPOSSIBLE = -1e300  # a finite number, as samplers want it
 
 
@@ -84,7 +96,7 @@ class Explanation(Settings):
     convention: Convention = "ray"
     equation: Literal[4, 5] = 4
     centred: bool = Field(default=False, description="radii count from the image of the sphere")
-    free: list[Literal["misalignment", "stroke", "scale"]] = Field(default=[])
+    free: list[Literal["misalignment", "turn", "stroke", "scale"]] = Field(default=[])
     noise: Literal["free", "whole pixels"] = "free"
     shared_down: bool = Field(default=False, description="one down image for all strokes with a target")
     tails: Literal["normal", "student"] = "normal"
@@ -99,7 +111,9 @@ class Explanation(Settings):
     def parameters(self) -> tuple[str, ...]:
         """Names of what is free."""
         noise = (NOISE,) if self.noise == "free" else ()
-        return (*noise, *COMMON, *(name for group in GROUPS if group in self.free for name in GROUPS[group]))
+        azimuths = AZIMUTHS if set(self.free) & set(_DIRECTED) else ()
+        groups = (name for group in GROUPS if group in self.free for name in GROUPS[group])
+        return (*noise, *COMMON, *azimuths, *groups)
 
 
 @dataclass(frozen=True)
@@ -167,30 +181,45 @@ class Model:
                 return np.asarray(self._student(residual, reading, points) + jacobian)
             if not np.isfinite(reading.by_down).all():
                 return self._one_by_one(points)
-            return np.asarray(_normal(residual, self.covariance(reading, points)) + jacobian)
+            own, common = self._variances(reading, points)
+            if self.explanation.shared_down:
+                return np.asarray(_normal(residual, self.covariance(reading, points)) + jacobian)
+            return np.asarray(_normal_in_groups(residual, own, common, self._targets) + jacobian)
 
     def covariance(self, reading: Reading, points: Array) -> Array:
         """Covariance of the inverse estimates, shape (..., n, n), in m^-2."""
-        noise = self.noise_px(self.named(points))
-        down, up = noise * reading.by_down, noise * reading.by_up
-        inverse = reading.inverse_depth_per_m
-        scale = self.depth_sigma_m * inverse * inverse  # d(1/D) of an error of D
-        rounding = self.experiments.rounding_m**2 / 12.0 * inverse**4
-        common = _outer(scale)
-        own = rounding + up * up
+        own, common = self._variances(reading, points)
         if self.explanation.shared_down:
-            common = common + _outer(down)
-        else:
-            own = own + down * down
-        result = common * self._same_target
+            common = [*common, self.noise_px(self.named(points)) * reading.by_down]
+        result = sum((_outer(effect) for effect in common), np.zeros(())) * self._same_target
         diagonal = np.arange(len(self.experiments))
         result[..., diagonal, diagonal] += own
         return np.asarray(result)
 
+    def _variances(self, reading: Reading, points: Array) -> tuple[Array, list[Array]]:
+        """Variances of each inverse estimate by itself, and effects that all estimates of a target share."""
+        noise, square = self.noise_px(self.named(points)), reading.inverse_depth_per_m * reading.inverse_depth_per_m
+        seen = reading.by_up * reading.by_up
+        if not self.explanation.shared_down:
+            seen = seen + reading.by_down * reading.by_down
+        own = self._rounding_m2 * square * square + noise * noise * seen
+        return own, [self.depth_sigma_m * square]  # d(1/D) of an error of D
+
+    @cached_property
+    def _rounding_m2(self) -> Array:
+        return self.experiments.rounding_m**2 / 12.0
+
+    @cached_property
+    def _targets(self) -> NDArray[np.int64]:
+        """Where the experiments of a target begin: those of one target follow each other."""
+        changes = np.diagonal(self.experiments.same_target, 1)
+        return np.concatenate([[0], np.flatnonzero(~changes) + 1])
+
     def _student(self, residual: Array, reading: Reading, points: Array) -> Array:
         """Independent Student t of 4 degrees of freedom with the scale of the Gaussian."""
         scale = np.sqrt(np.diagonal(self.covariance(reading, points), axis1=-2, axis2=-1))
-        return np.asarray(np.sum(student.logpdf(residual / scale, _STUDENT_FREEDOM) - np.log(scale), axis=-1))
+        heavy = 0.5 * (FREEDOM + 1.0) * np.log1p((residual / scale) ** 2 / FREEDOM)
+        return np.asarray(np.sum(_STUDENT_TOP - heavy - np.log(scale), axis=-1))
 
     def _one_by_one(self, points: Array) -> Array:
         """Points of which some show no spot."""
@@ -199,11 +228,17 @@ class Model:
         return np.array([self.log_likelihood(point) for point in points])
 
 
-def standardised(model: Model, points: Array) -> Array:
-    """Residuals made independent with unit variance by the Cholesky factor of their covariance, shape (..., n)."""
+def standardised(model: Model, points: Array, independent: bool = False) -> Array:
+    """Residuals made independent with unit variance, shape (..., n).
+
+    By the Cholesky factor of their covariance, or by their own deviations where they count as independent.
+    """
     reading = model.reading(points)
     residual = 1.0 / model.experiments.estimate_m - reading.inverse_depth_per_m
-    factor = np.linalg.cholesky(model.covariance(reading, points))
+    covariance = model.covariance(reading, points)
+    if independent:
+        return np.asarray(residual / np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1)))
+    factor = np.linalg.cholesky(covariance)
     return np.asarray(np.linalg.solve(factor, residual[..., None])[..., 0])
 
 
@@ -219,6 +254,15 @@ def _normal(residual: Array, covariance: Array) -> Array:
     z = np.linalg.solve(factor, residual[..., None])[..., 0]
     log_root = np.sum(np.log(np.diagonal(factor, axis1=-2, axis2=-1)), axis=-1)
     return np.asarray(-0.5 * np.sum(z * z, axis=-1) - log_root - 0.5 * residual.shape[-1] * np.log(2.0 * np.pi))
+
+
+def _normal_in_groups(residual: Array, own: Array, common: list[Array], starts: NDArray[np.int64]) -> Array:
+    """Log density of a normal with covariance diag(own) + v v^T within each group (Sherman and Morrison)."""
+    (v,), weight = common, 1.0 / own
+    inner, size = (np.add.reduceat(x, starts, axis=-1) for x in (residual * v * weight, v * v * weight))
+    square = np.sum(residual * residual * weight, axis=-1) - np.sum(inner * inner / (1.0 + size), axis=-1)
+    log_det = np.sum(np.log(own), axis=-1) + np.sum(np.log1p(size), axis=-1)
+    return np.asarray(-0.5 * (square + log_det + residual.shape[-1] * np.log(2.0 * np.pi)))
 
 
 def _outer(vector: Array) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field, model_validator
 
 from phibench.estimator.studies.cause_model import COMMON, GROUPS, NOISE, Explanation, Model, Prior
-from phibench.estimator.studies.paper_reading import Experiments
+from phibench.estimator.studies.paper_reading import AZIMUTHS, Experiments
 from phibench.estimator.studies.study import Settings
 from phibench.scenes.rig import Rig
 
@@ -52,7 +52,7 @@ class CauseSettings(Settings):
         for truth in self.validation.truths:
             if missing := set(self.explanation(truth.explanation).parameters) - set(truth.values):
                 raise ValueError(f"validation of {truth.explanation}: no value of {', '.join(sorted(missing))}")
-        needed = {NOISE, *COMMON, *(name for group in GROUPS.values() for name in group)}
+        needed = {NOISE, *COMMON, *AZIMUTHS, *(name for group in GROUPS.values() for name in group)}
         if missing := needed - set(self.priors):
             raise ValueError(f"no prior of {', '.join(sorted(missing))}")
         if any(not scale > 0.0 for scale in self.prior_scales):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -22,7 +23,7 @@ from phibench.scenes.rig import Rig
 Convention = Literal["ray", "normal", "incidence", "outline"]
 Parameters = Mapping[str, Array]
 TABLES = 4
-_NEWTON_STEPS = 5  # the error of the start, some 0.1 rad, squares in each
+_NEWTON_STEPS = 3  # the error of the start is some 0.1 rad, then 5e-4, 1e-8 and 1e-17
 _STEP_PX = 1e-4  # of the differences: curvature costs 1e-4 of the slope, rounding 1e-9
 
 
@@ -55,6 +56,11 @@ class Experiments:
         """The same with other estimates."""
         return Experiments(self.table, self.depth_m, self.stroke_m, estimate_m, self.rounding_m)
 
+    @cached_property
+    def of_table(self) -> Array:
+        """1 where an experiment is of a table, shape (4, n)."""
+        return (self.table == np.arange(TABLES)[:, None]).astype(float)
+
     @property
     def same_target(self) -> BoolArray:
         """Whether two experiments look at the same spot, shape (n, n): same table and same depth."""
@@ -81,7 +87,7 @@ class Reader:
         Equation of the paper that gives D.
     centred : bool
         Whether radii count from the image of the sphere (section 5 of the paper centres it) or from the principal
-        point of an aligned rig. "outline" always counts from the image of the sphere, and measures its radius there.
+        point, where an aligned rig has it. "outline" measures the radius of the mirror's image in either case.
     """
 
     convention: Convention = "ray"
@@ -118,7 +124,7 @@ def read(parameters: Parameters, experiments: Experiments, reader: Reader, rig: 
     ----------
     parameters : by name, each a scalar or shape (m, 1) for m rigs
         Of the true rig: `z_c_m`, `height_1_m` to `height_4_m` (spot above the sphere centre, down, by table), and what
-        `PARAMETERS` lists, 0 where missing.
+        `PARAMETERS` and `AZIMUTHS` list, 0 where missing.
     experiments : Experiments
     reader : Reader
     rig : Rig
@@ -140,9 +146,8 @@ PARAMETERS = (
     "decentre_y_m",
     "tilt_x_rad",
     "tilt_y_rad",
-    "azimuth_2_rad",
-    "azimuth_3_rad",
-    "azimuth_4_rad",
+    "roll_rad",
+    "pitch_rad",
     "stroke_relative",
     "stroke_offset_m",
     "focal_relative",
@@ -151,8 +156,9 @@ PARAMETERS = (
     "cx_px",
     "cy_px",
 )
-"""What may be wrong, in the sense of `scenes.misalignment`; world x is the azimuth of Table 1's spot, `azimuth_k_rad`
-are those of the other tables."""
+"""What may be wrong, in the sense of `scenes.misalignment`; world x is the azimuth of Table 1's spot."""
+AZIMUTHS = ("azimuth_2_rad", "azimuth_3_rad", "azimuth_4_rad")
+"""Azimuths of the spots of the other tables."""
 
 
 def radii_px(parameters: Parameters, experiments: Experiments, reader: Reader, rig: Rig) -> Array:
@@ -161,7 +167,7 @@ def radii_px(parameters: Parameters, experiments: Experiments, reader: Reader, r
     ray = _camera_ray(_spot_from_sphere(parameters, experiments), axis, _true_radius_m(parameters, rig))
     focal_px = _true_focal_px(parameters, rig)
     u, v = (focal_px * x for x in _image(ray, parameters))
-    if reader.centred or reader.convention == "outline":
+    if reader.centred:
         u0, v0 = (focal_px * x for x in _image(axis, parameters))
     else:
         u0, v0 = (-_get(parameters, name) for name in ("cx_px", "cy_px"))
@@ -173,7 +179,7 @@ def inverse_depth(
 ) -> Array:
     """1 / D by equation (4), or (5), from radii, shape (..., n); the printed stroke and the believed rig are used."""
     R, h = rig.mirror.radius_m, experiments.stroke_m
-    phi1, phi2 = phi = phi_of(parameters, reader, rig, np.stack([down_px, up_px]))
+    phi = phi_of(parameters, reader, rig, np.stack([down_px, up_px]))
     (S1, S2), (C1, C2) = np.sin(2.0 * phi), np.cos(2.0 * phi)
     sine = S1 * C2 - C1 * S2
     if reader.equation == 5:
@@ -184,9 +190,9 @@ def inverse_depth(
 
 
 def phi_of(parameters: Parameters, reader: Reader, rig: Rig, radius_px: Array) -> Array:
-    """Angle of a reader who believes an aligned rig, from radii in the image: sin i = z_c / R sin(alpha), phi_n = i - alpha.
+    """Angle of a reader who believes an aligned rig, from radii in the image.
 
-    NaN where the pixel misses the mirror.
+    sin i = z_c / R sin(alpha), phi_n = i - alpha. NaN where the pixel misses the mirror.
     """
     with np.errstate(invalid="ignore"):
         if reader.convention == "outline":
@@ -224,17 +230,31 @@ def _spot_from_sphere(parameters: Parameters, experiments: Experiments) -> tuple
     """Spot from the sphere centre; the last component has the leading axis down, up."""
     height, azimuth = (_by_table(parameters, name, experiments) for name in ("height_{}_m", "azimuth_{}_rad"))
     stroke = (1.0 + _get(parameters, "stroke_relative")) * experiments.stroke_m + _get(parameters, "stroke_offset_m")
-    z = np.stack(np.broadcast_arrays(height, height - stroke))
-    return experiments.depth_m * np.cos(azimuth), experiments.depth_m * np.sin(azimuth), z
+    x, y = experiments.depth_m * np.cos(azimuth), experiments.depth_m * np.sin(azimuth)
+    if "roll_rad" in parameters or "pitch_rad" in parameters:
+        return _turned(parameters, (x, y, height), (x, y, height - stroke))
+    return x, y, np.stack(np.broadcast_arrays(height, height - stroke))
+
+
+def _turned(
+    parameters: Parameters, down: tuple[Array, Array, Array], up: tuple[Array, Array, Array]
+) -> tuple[Array, Array, Array]:
+    """Spot where the rig has turned about its lens in between: the spot turns back about the lens, for the up image."""
+    axis = _axis(parameters)
+    from_lens = (up[0] + axis[0], up[1] + axis[1], up[2] + axis[2])
+    back = _turned_back(from_lens, _get(parameters, "roll_rad"), _get(parameters, "pitch_rad"))
+    pairs = (np.broadcast_arrays(first, second - q) for first, second, q in zip(down, back, axis, strict=True))
+    x, y, z = (np.stack(pair) for pair in pairs)
+    return x, y, z
 
 
 def _by_table(parameters: Parameters, name: str, experiments: Experiments) -> Array:
     """Values of the parameters of the four tables for each experiment, shape (..., n)."""
-    result: Array = np.zeros(())
-    for table in range(TABLES):
-        if (key := name.format(table + 1)) in parameters:
-            result = result + parameters[key] * (experiments.table == table)
-    return result
+    tables = [table for table in range(TABLES) if name.format(table + 1) in parameters]
+    if not tables:
+        return _ZERO
+    values = np.concatenate([np.atleast_1d(parameters[name.format(table + 1)]) for table in tables], axis=-1)
+    return np.asarray(values @ experiments.of_table[tables])
 
 
 def _camera_ray(
@@ -267,11 +287,16 @@ def _image(direction: tuple[Array, Array, Array], parameters: Parameters) -> tup
     x, y, z = direction
     if "tilt_x_rad" not in parameters and "tilt_y_rad" not in parameters:
         return x / z, y / z
-    a, b = (_get(parameters, name) for name in ("tilt_x_rad", "tilt_y_rad"))
+    x, y, z = _turned_back(direction, _get(parameters, "tilt_x_rad"), _get(parameters, "tilt_y_rad"))
+    return x / z, y / z
+
+
+def _turned_back(vector: tuple[Array, Array, Array], a: Array, b: Array) -> tuple[Array, Array, Array]:
+    """Components of a vector in axes that were turned by Ry(b) Rx(a)."""
+    x, y, z = vector
     cb, sb, ca, sa = np.cos(b), np.sin(b), np.cos(a), np.sin(a)
     x1, z1 = cb * x - sb * z, sb * x + cb * z  # undo Ry, then Rx
-    y2, z2 = ca * y + sa * z1, -sa * y + ca * z1
-    return x1 / z2, y2 / z2
+    return x1, ca * y + sa * z1, -sa * y + ca * z1
 
 
 def _get(parameters: Parameters, name: str) -> Array:
