@@ -43,8 +43,7 @@ def all_runs(settings: CauseSettings) -> list[Run]:
     names = [explanation.name for explanation in settings.explanations]
     runs = [Run(("published", n), settings.model(n, data), settings.live_points, stop) for n in names]
     for scale in settings.prior_scales:
-        free = [n for n in names if settings.explanation(n).free]
-        runs += [Run(("scale", f"{scale:g}", n), settings.model(n, data, scale), few, stop) for n in free]
+        runs += [Run(("scale", f"{scale:g}", n), settings.model(n, data, scale), few, stop) for n in settings.scaled]
     for n in settings.left_out:
         for table in range(TABLES):
             model, _ = without_table(settings.model(n, data), table)

@@ -32,6 +32,7 @@ class CauseSettings(Settings):
     live_points_other: int = Field(ge=20, le=5000)
     stop: float = Field(gt=0.0, le=20.0)
     prior_scales: list[float]
+    scaled: list[str] = Field(description="explanations that are tried with them")
     predictive: int = Field(ge=20, le=100_000)
     brute_force: int = Field(ge=100, le=1_000_000)
     left_out: list[str]
@@ -47,7 +48,7 @@ class CauseSettings(Settings):
         if len(set(names)) < len(names):
             raise ValueError(f"explanations have the same name: {sorted({n for n in names if names.count(n) > 1})}")
         truths = [truth.explanation for truth in self.validation.truths]
-        if unknown := {*self.left_out, *self.drawn, *self.validation.candidates, *truths} - set(names):
+        if unknown := {*self.scaled, *self.left_out, *self.drawn, *self.validation.candidates, *truths} - set(names):
             raise ValueError(f"no explanation {', '.join(sorted(unknown))}; there are {', '.join(names)}")
         for truth in self.validation.truths:
             if missing := set(self.explanation(truth.explanation).parameters) - set(truth.values):

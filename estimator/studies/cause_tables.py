@@ -63,14 +63,12 @@ def scale_table(settings: CauseSettings, posteriors: Posteriors) -> pl.DataFrame
     """Log evidence against the first explanation with priors of misalignment, stroke and scale wider or narrower."""
     first = posteriors["published", settings.explanations[0].name]
     rows = []
-    for explanation in settings.explanations:
+    for name in settings.scaled if settings.prior_scales else ():
         for scale in (1.0, *settings.prior_scales):
-            key = ("published", explanation.name) if scale == 1.0 else ("scale", f"{scale:g}", explanation.name)
-            if explanation.free and key in posteriors:
-                own = posteriors[key]
-                error = float(np.hypot(own.log_evidence_error, first.log_evidence_error))
-                against = own.log_evidence - first.log_evidence
-                rows.append({"explanation": explanation.name, "scale": scale, "against": against, "error": error})
+            own = posteriors[("published", name) if scale == 1.0 else ("scale", f"{scale:g}", name)]
+            error = float(np.hypot(own.log_evidence_error, first.log_evidence_error))
+            against = own.log_evidence - first.log_evidence
+            rows.append({"explanation": name, "scale": scale, "against": against, "error": error})
     schema = {"explanation": pl.String, "scale": pl.Float64, "against": pl.Float64, "error": pl.Float64}
     return pl.DataFrame(rows, schema=schema)
 

@@ -9,6 +9,7 @@ from phibench.estimator.mirror_image import image_of
 from phibench.estimator.phi import CONVENTIONS
 from phibench.estimator.sensitivities import PARAMETERS
 from phibench.estimator.triangulate import depth_exact
+from phibench.scenes.checks import SceneError
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.misalignment import Misalignment
@@ -16,11 +17,22 @@ from phibench.scenes.rig import Rig
 
 EXACT = "exact"
 SENSES = (*CONVENTIONS, EXACT)
+_TRIES = 1000
 
 
-def drawn_misalignment(random: np.random.Generator) -> Misalignment:
-    """Independent normal errors of the usual study magnitudes, of all that moves a chief ray."""
-    return Misalignment(**{name: random.normal(scale=MISALIGNMENT[name].study) for name in PARAMETERS})
+def drawn_misalignment(rig: Rig, random: np.random.Generator) -> Misalignment:
+    """Independent normal errors of the usual study magnitudes, of all that moves a chief ray.
+
+    One that cannot exist (a distortion that folds the image) is drawn again.
+    """
+    for _ in range(_TRIES):
+        drawn = Misalignment(**{name: random.normal(scale=MISALIGNMENT[name].study) for name in PARAMETERS})
+        try:
+            rig.perturbed(drawn)
+        except SceneError:
+            continue
+        return drawn
+    raise SceneError(f"none of {_TRIES} drawn misalignments of the rig can exist: take a rig with less distortion")
 
 
 def seen(rig: Rig, misalignment: Misalignment, points_m: Array, strokes_m: Array) -> tuple[Array, Array, Array]:
@@ -51,6 +63,6 @@ def drawn_errors(
     rig: Rig, points_m: Array, strokes_m: Array, count: int, random: np.random.Generator
 ) -> dict[str, Array]:
     """Errors of D, shape (count, n), metres, in every sense of phi, of an aligned reader of drawn rigs."""
-    pictures = [seen(rig, drawn_misalignment(random), points_m, strokes_m) for _ in range(count)]
+    pictures = [seen(rig, drawn_misalignment(rig, random), points_m, strokes_m) for _ in range(count)]
     down, up, true = (np.stack(part) for part in zip(*pictures, strict=True))
     return {sense: estimates(sense, rig, strokes_m, down, up) - true for sense in SENSES}
