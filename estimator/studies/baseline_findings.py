@@ -1,0 +1,174 @@
+"""Sentences of the study `baseline`, made from its tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import polars as pl
+
+from phibench.estimator.studies.baseline_laws import EXPECTED, Curve, LawFit
+from phibench.estimator.studies.result import Row
+from phibench.scenes.frames import Array
+
+
+def findings(
+    table: pl.DataFrame, bands: pl.DataFrame, laws: Sequence[LawFit], curves: Sequence[Curve], rendered: pl.DataFrame
+) -> tuple[str, ...]:
+    """Sentences: published and ours, senses of phi, misalignment, laws, published curves, rendered misalignment."""
+    return (
+        _noise(table),
+        _senses(table),
+        _misaligned(table, bands),
+        " ".join(map(_law, laws)),
+        *map(_curve, curves),
+        *([_rendered(rendered)] if len(rendered) else []),
+    )
+
+
+def notes(rendered: Sequence[str], fit_draws: int, table: pl.DataFrame) -> tuple[str, ...]:
+    """What this run leaves out."""
+    missing = int(table.filter(pl.col("sense") == "exact")["missing"].sum())
+    return tuple(
+        text
+        for text, holds in (
+            ("no misaligned rig was rendered: drawn misalignments are in closed form alone", not rendered),
+            ("chain_fit read one draw per experiment: it has no error bars", fit_draws == 1),
+            (f"{missing} readings gave no estimate and are left out", missing > 0),
+        )
+        if holds
+    )
+
+
+def senses_shown(table: pl.DataFrame, bands: pl.DataFrame) -> tuple[Row, ...]:
+    """Relative errors by sense of phi: rms and extremes, and how many published points lie in the misaligned band."""
+    rows: list[Row] = [("phi", "rms, %", "smallest, %", "largest, %", "rms to published, %", "published in the band")]
+    for sense in table["sense"].unique(maintain_order=True):
+        own, inside = _own(table, sense), _inside(table, bands, sense)
+        error = own["noise_free_m"].to_numpy() / own["depth_m"].to_numpy() - 1.0
+        apart = (own["published_m"].to_numpy() - own["noise_free_m"].to_numpy()) / own["depth_m"].to_numpy()
+        cells = (f"{100.0 * x:.3f}" for x in (_rms(error), error.min(), error.max()))
+        rows.append((sense, *cells, f"{100.0 * _rms(apart):.2f}", f"{inside.sum()} of {len(inside)}"))
+    return tuple(rows)
+
+
+def laws_shown(laws: Sequence[LawFit]) -> tuple[Row, ...]:
+    """Exponents with intervals."""
+    head = ("standard deviation of D from", "exponent of D", "95 %", "exponent of h", "95 %", "residual, %")
+    return (head, *(_law_row(law) for law in laws))
+
+
+def _noise(table: pl.DataFrame) -> str:
+    parts = []
+    for method in table["method"].unique(maintain_order=True):
+        own = _own(table, "exact", method)
+        error, depth = (own["mean_m"] - own["depth_m"]).to_numpy(), own["depth_m"].to_numpy()
+        sd = own["sd_m"].to_numpy() / depth
+        scatter = f", scatter of a draw {100.0 * _rms(sd[np.isfinite(sd)]):.2f} %" if np.isfinite(sd).any() else ""
+        parts.append(f"{method} {100.0 * _rms(error[np.isfinite(error)] / depth[np.isfinite(error)]):.2f} %{scatter}")
+    own = _own(table, "exact")
+    published = ((own["published_m"] - own["depth_m"]) / own["depth_m"]).to_numpy()
+    bound = own["bound_m"].to_numpy()
+    apart = np.abs((own["published_m"] - own["depth_m"]).to_numpy()) > 2.0 * bound
+    return (
+        f"The {len(own)} published estimates err by {100.0 * _rms(published):.2f} % rms; rendered on an aligned rig and "
+        f"read with exact geometry, the mean errors are, rms, {'; '.join(parts)}. The bound of one pair is "
+        f"{100.0 * _rms(bound / own['depth_m'].to_numpy()):.2f} % rms, and {int(apart.sum())} of the published errors "
+        f"are more than twice the bound of their experiment."
+    )
+
+
+def _senses(table: pl.DataFrame) -> str:
+    apart = {}
+    for sense in ("ray", "normal", "incidence", "outline"):
+        own = _own(table, sense)
+        apart[sense] = _rms(((own["published_m"] - own["noise_free_m"]) / own["depth_m"]).to_numpy())
+    own = _own(table, "ray")
+    alone = _rms(((own["published_m"] - own["depth_m"]) / own["depth_m"]).to_numpy())
+    best = min(apart, key=lambda sense: apart[sense])
+    words = ", ".join(f"phi_{sense} {100.0 * value:.2f} %" for sense, value in apart.items())
+    verdict = (
+        f"phi_{best} comes nearest, and leaves {100.0 * (apart[best] / alone) ** 2:.0f} % of the sum of squares"
+        if apart[best] < alone and best != "ray"
+        else "no sense of phi comes nearer to them than phi_ray, which is exact"
+    )
+    return f"Published minus noise-free estimate of an aligned rig, with spots 0.50 m above the floor, rms: {words}; {verdict}."
+
+
+def _misaligned(table: pl.DataFrame, bands: pl.DataFrame) -> str:
+    inside = {sense: _inside(table, bands, sense) for sense in ("ray", "normal", "incidence", "outline")}
+    counts = ", ".join(f"phi_{sense} {int(flags.sum())}" for sense, flags in inside.items())
+    n = len(inside["ray"])
+    return (
+        f"With misalignments drawn at the study magnitudes, the central 95 % of the errors hold, of {n} published points, "
+        f"{counts}; the points of one table share a rig, so that these counts are no test."
+    )
+
+
+def _law(law: LawFit) -> str:
+    (p, q), low, high = law.law.exponents, law.law.low, law.law.high
+    verdicts = " and ".join(
+        f"{'agrees' if holds else 'does not agree'} with {expected:g}"
+        for holds, expected in zip(law.holds, EXPECTED, strict=True)
+    )
+    first, second = verdicts.split(" and ")
+    return (
+        f"{law.name[0].upper()}{law.name[1:]}: sigma of D goes as D^{p:.2f} ({low[0]:.2f} to {high[0]:.2f}), which {first}, "
+        f"and h^{q:.2f} ({low[1]:.2f} to {high[1]:.2f}), which {second}."
+    )
+
+
+def _curve(curve: Curve) -> str:
+    number = curve.experiment.removeprefix("table")
+    q, low, high = (float(x[0]) for x in (curve.law.exponents, curve.law.low, curve.law.high))
+    left = {"c/h": curve.inverse_m, "a + b h": curve.line_m, "a + b/h": curve.offset_m}
+    best = min(left, key=lambda name: left[name])
+    words = ", ".join(f"{name} {value:.3f} m" for name, value in left.items())
+    crossing = f"change sign {_times(curve.signs)}" if curve.signs else "keep one sign"
+    agrees = "an interval that holds -1" if curve.law.holds(0, -1.0) else "an interval without -1"
+    return (
+        f"The published errors of Table {number} {crossing} along h (rms {curve.rms_m:.3f} m); their magnitude goes as "
+        f"h^{q:.2f} ({low:.2f} to {high:.2f}, {agrees}). Signed laws leave, per degree of freedom, {words}: {best} "
+        "fits best."
+    )
+
+
+def _rendered(rendered: pl.DataFrame) -> str:
+    gap = (rendered["rendered_error_m"] - rendered["closed_form_error_m"]).to_numpy()
+    largest = np.abs(rendered["closed_form_error_m"].to_numpy()).max()
+    worst = float(np.nanmax(np.abs(gap)))
+    return (
+        f"A misaligned rig that was rendered errs by up to {1e3 * largest:.0f} mm; its noise-free frames and the closed "
+        f"form differ by at most {1e3 * worst:.1f} mm over {len(rendered)} estimates."
+    )
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
+
+
+def _own(table: pl.DataFrame, sense: str, method: str | None = None) -> pl.DataFrame:
+    """Rows of one sense and one method, the first if none is named."""
+    return table.filter((pl.col("sense") == sense) & (pl.col("method") == (method or table["method"][0])))
+
+
+def _inside(table: pl.DataFrame, bands: pl.DataFrame, sense: str) -> Array:
+    own = _own(table, sense).join(bands, on=["sample_id", "sense"])
+    error = own["published_m"] - own["depth_m"]
+    return ((error >= own["low_m"]) & (error <= own["high_m"])).to_numpy()
+
+
+def _law_row(law: LawFit) -> Row:
+    (p, q), low, high = law.law.exponents, law.law.low, law.law.high
+    return (
+        law.name,
+        f"{p:.2f}",
+        f"{low[0]:.2f} to {high[0]:.2f}",
+        f"{q:.2f}",
+        f"{low[1]:.2f} to {high[1]:.2f}",
+        f"{100.0 * law.law.rms_log:.0f}",
+    )
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")

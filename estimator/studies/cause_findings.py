@@ -1,0 +1,223 @@
+"""Sentences of the study `cause`, made from its tables."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+
+from phibench.estimator.studies.cause_settings import CauseSettings
+from phibench.estimator.studies.result import Row
+
+DECIDED = float(np.log(10.0))  # odds of 10 to 1: less is called undecided
+ALIKE = 0.95  # cosine from which two parameters do the same
+SMALL_P = 0.05
+
+
+def best_sentence(table: pl.DataFrame) -> str:
+    """Best evidence, and what cannot be told from it."""
+    rows = table.sort("log_evidence", descending=True)
+    best, first = rows.row(0, named=True), table.row(0, named=True)
+    near = rows[1:].filter(pl.col("log_evidence") > best["log_evidence"] - DECIDED)
+    rest = (
+        f"Within odds of 10 to 1 of it are {'; '.join(near['text'])}: the 25 numbers do not decide between them."
+        if len(near)
+        else "No other explanation comes within odds of 10 to 1 of it."
+    )
+    gain = (
+        "the reference itself"
+        if best["explanation"] == first["explanation"]
+        else f"log evidence {best['against']:+.1f} +- {best['against_error']:.1f} against '{first['text']}'"
+    )
+    return f"Of {len(table)} explanations '{best['text']}' has the largest evidence ({gain}). {rest}"
+
+
+def convention_sentence(settings: CauseSettings, table: pl.DataFrame) -> str:
+    """What the data say of the sense of phi, in each family that differs by nothing else."""
+    families: dict[str, dict[str, float]] = {}
+    evidence = dict(zip(table["explanation"], table["log_evidence"], strict=True))
+    for explanation in settings.explanations:
+        key = explanation.model_dump_json(exclude={"name", "text", "convention"})
+        families.setdefault(key, {})[explanation.convention] = evidence[explanation.name]
+    named = {"": "noise alone", "misalignment": "tilt and decentre", "misalignment,stroke,scale": "all errors"}
+    parts = []
+    for key, values in families.items():
+        if len(values) > 1:
+            example = next(e for e in settings.explanations if e.model_dump_json(exclude={"name", "text", "convention"}) == key)
+            label = named.get(",".join(example.free), ", ".join(example.free)) + (", centred" if example.centred else "")
+            top = max(values.values())
+            order = sorted(values, key=lambda c: -values[c])
+            parts.append(f"{label}: " + ", ".join(f"phi_{c} {values[c] - top:+.1f}" for c in order))
+    return f"Log evidence by sense of phi, against the best of its family: {'; '.join(parts)}." if parts else ""
+
+
+def noise_sentence(table: pl.DataFrame) -> str:
+    """Reading noise that the first and the best explanation need."""
+    best, first = table.sort("log_evidence", descending=True).row(0, named=True), table.row(0, named=True)
+    chosen = [first] if best["explanation"] == first["explanation"] else [first, best]
+    parts = [
+        f"'{row['text']}' needs {row['noise_px']:.2f} px ({row['noise_low_px']:.2f} to {row['noise_high_px']:.2f}) and "
+        f"leaves {100.0 * row['left_rms']:.2f} % rms of the real depth"
+        for row in chosen
+    ]
+    low = chosen[-1]["noise_low_px"]
+    whole = 12.0**-0.5
+    verdict = (
+        f"more than rounding to whole pixels makes ({whole:.2f} px)"
+        if low > whole
+        else f"an interval that reaches down to what rounding to whole pixels makes ({whole:.2f} px)"
+    )
+    return f"Reading noise of a radius, mean and 95 %: {'; '.join(parts)}. The last is {verdict}."
+
+
+def rival_sentences(settings: CauseSettings, table: pl.DataFrame) -> list[str]:
+    """One sentence for each explanation but the first: evidence for or against it."""
+    first = table.row(0, named=True)
+    words = []
+    for row in table.iter_rows(named=True):
+        if row["explanation"] == first["explanation"]:
+            continue
+        low, high = (row["against"] + sign * 2.0 * row["against_error"] for sign in (-1, 1))
+        verdict = "favoured" if low > DECIDED else "disfavoured" if high < -DECIDED else "neither favoured nor disfavoured"
+        faults = [
+            text
+            for text, p in (("its residuals are too large", row["chi2_p"]), ("its residuals run in trends", row["trend_p"]))
+            if p < SMALL_P
+        ]
+        smallest = min(row["chi2_p"], row["trend_p"])
+        tail = f"; {' and '.join(faults)} (p down to {smallest:.3f})" if faults else ""
+        words.append(f"{row['text']}: {row['against']:+.1f} +- {row['against_error']:.1f}, {verdict}{tail}")
+    head = f"Log evidence against '{first['text']}'"
+    fault = f", whose own residuals run in trends (p {first['trend_p']:.3f})" if first["trend_p"] < SMALL_P else ""
+    return [f"{head}{fault}: {'; '.join(words)}."] if words else []
+
+
+def scale_sentence(scales: pl.DataFrame) -> str:
+    """How far prior widths move the evidences."""
+    if scales["scale"].n_unique() < 2:
+        return ""
+    parts = []
+    for name in scales["explanation"].unique(maintain_order=True):
+        own = scales.filter(pl.col("explanation") == name).sort("scale")
+        parts.append(f"{name} {' / '.join(f'{x:+.1f}' for x in own['against'])}")
+    widths = " / ".join(f"{x:g}" for x in sorted(scales["scale"].unique()))
+    return f"With the normal priors of misalignment, stroke and scale {widths} times as wide: {'; '.join(parts)}."
+
+
+def left_out_sentence(table: pl.DataFrame) -> str:
+    """Prediction of each table from the other three."""
+    rows = table.filter(pl.col("left_out_score").is_not_nan()).sort("left_out_score", descending=True)
+    if not len(rows):
+        return ""
+    words = "; ".join(
+        f"{row['text']} {row['left_out_score']:.1f} +- {row['left_out_error']:.1f}" for row in rows.iter_rows(named=True)
+    )
+    return (
+        f"Each table predicted from the other three, sum of the four log densities: {words}. "
+        f"Here '{rows['text'][0]}' predicts best."
+    )
+
+
+def alike_sentence(settings: CauseSettings, alike: pl.DataFrame, correlations: pl.DataFrame) -> str:
+    """What the 25 numbers cannot tell apart."""
+    name = next((n for n in settings.drawn if settings.explanation(n).free), settings.drawn[0])
+    own = alike.filter(pl.col("explanation") == name)
+    same = own.filter(pl.col("cosine").abs() > ALIKE)
+    pairs = ", ".join(f"{a} and {b} ({c:+.3f})" for a, b, c in same.select("first", "second", "cosine").iter_rows())
+    strongest = correlations.filter(pl.col("explanation") == name).row(0, named=True)
+    told = f"do the same to within a cosine of {ALIKE:g}: {pairs}" if pairs else f"all differ by more than a cosine of {ALIKE:g}"
+    return (
+        f"For '{settings.explanation(name).text}' the effects of parameters on the 25 estimates, in units of their noise, "
+        f"{told}. The strongest correlation of its posterior is {strongest['correlation']:+.2f}, between "
+        f"{strongest['first']} and {strongest['second']}."
+    )
+
+
+def made_up_sentence(made_up: pl.DataFrame) -> str:
+    """What the method says of worlds that are known."""
+    parts = []
+    for truth in made_up["truth"].unique(maintain_order=True):
+        own = made_up.filter(pl.col("truth") == truth)
+        wins = gains = 0
+        for repeat in own["repeat"].unique():
+            rows = own.filter(pl.col("repeat") == repeat)
+            best = rows["log_evidence"].max()
+            right = rows.filter(pl.col("explanation") == truth)["log_evidence"]
+            wins += bool(len(right) and right[0] == best)
+            gains += bool(len(right) and right[0] > best - DECIDED)
+        held, of = own["covered"].sum(), own["parameters"].sum()
+        n = own["repeat"].n_unique()
+        parts.append(
+            f"data of '{truth}' gave it the largest evidence in {wins} of {n} draws and kept it within odds of 10 to 1 in "
+            f"{gains}, with {held} of {of} true values in the 90 % intervals"
+        )
+    return f"Made-up data: {'; '.join(parts)}." if parts else ""
+
+
+def density_sentence(density: pl.DataFrame) -> str:
+    """How well the likelihood agrees with simulation."""
+    gap = (density["linear"] - density["simulated"]).to_numpy()
+    good = np.isfinite(gap)
+    worst = density.row(int(np.nanargmax(np.where(good, np.abs(gap), np.nan))), named=True)
+    sums = [
+        f"{name} {float(own['linear'].sum() - own['simulated'].sum()):+.2f}"
+        for (name,), own in density.group_by("explanation", maintain_order=True)
+    ]
+    return (
+        f"The Gaussian in 1/D differs from brute-force simulation by at most {np.abs(gap[good]).max():.2f} in the log "
+        f"density of one estimate (Table {worst['table']}, h = {worst['stroke_m']:g} m), and in the sum over all by "
+        f"{', '.join(sums)}."
+    )
+
+
+def short_stroke_sentence(short: pl.DataFrame) -> str:
+    """Whether h << D can make the error rise at long h."""
+    own = short.filter(pl.col("table") == 1).sort("stroke_m")
+    first, last = own.row(0, named=True), own.row(-1, named=True)
+    change = "grows" if abs(last["eq5_error_m"]) > abs(first["eq5_error_m"]) else "falls"
+    worst4, worst5 = (float(short[f"eq{k}_error_m"].abs().max()) for k in (4, 5))
+    published = last["published_error_m"] - first["published_error_m"]
+    moved = last["eq5_error_m"] - first["eq5_error_m"]
+    return (
+        f"Can a stroke that is not short against D make the error rise (section 6)? Eq. (4) does not use h << D: with exact "
+        f"phi_ray its error stays below {1e3 * worst4:.2f} mm in all 25 experiments. Eq. (5) leaves out the mirror's radius "
+        f"alone: its error is at most {1e3 * worst5:.0f} mm, and in Table 1 it {change} from {1e3 * first['eq5_error_m']:+.0f} "
+        f"mm at h = {first['stroke_m']:g} m to {1e3 * last['eq5_error_m']:+.0f} mm at {last['stroke_m']:g} m, a change of "
+        f"{1e3 * moved:+.0f} mm where the published errors change by {1e3 * published:+.0f} mm."
+    )
+
+
+def explanations_shown(table: pl.DataFrame) -> tuple[Row, ...]:
+    """All explanations, best first."""
+    rows: list[Row] = [
+        ("explanation", "free", "log evidence against the first", "noise, px", "rms left, %", "chi2 p", "trend p", "left-out score")
+    ]
+    for row in table.sort("log_evidence", descending=True).iter_rows(named=True):
+        score = row["left_out_score"]
+        rows.append(
+            (
+                row["text"],
+                str(row["parameters"]),
+                f"{row['against']:+.1f} +- {row['against_error']:.1f}",
+                f"{row['noise_px']:.2f} ({row['noise_low_px']:.2f} to {row['noise_high_px']:.2f})",
+                f"{100.0 * row['left_rms']:.2f}",
+                f"{row['chi2_p']:.3f}",
+                f"{row['trend_p']:.3f}",
+                "-" if np.isnan(score) else f"{score:.1f} +- {row['left_out_error']:.1f}",
+            )
+        )
+    return tuple(rows)
+
+
+def posterior_shown(posterior: pl.DataFrame, explanation: str) -> tuple[Row, ...]:
+    """Parameters of one explanation with the intervals of posterior and prior."""
+    own = posterior.filter(pl.col("explanation") == explanation)
+    rows = [
+        (
+            row["parameter"],
+            f"{row['mean']:.3g}",
+            f"{row['low']:.3g} to {row['high']:.3g}",
+            f"{row['prior_low']:.3g} to {row['prior_high']:.3g}",
+        )
+        for row in own.iter_rows(named=True)
+    ]
+    return (("parameter", "mean", "95 %", "prior, 95 %"), *rows)

@@ -1,0 +1,269 @@
+"""Explanations of the published estimates: what is unknown, with which priors, and the likelihood.
+
+The reading noise is Gaussian in the radius in the image; the inverse of an estimate is nearly linear in it
+(`cause_checks.brute_force` measures how nearly), so that the density of a published value is a Gaussian in 1/D times
+the Jacobian 1/D^2. Two errors add to it: the printed estimate is rounded (uniform, taken as a Gaussian of the same
+variance), and the paper's real depth of a target is measured (common to all experiments with that target).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+from scipy.special import ndtr, ndtri
+from scipy.stats import t as student
+
+from phibench.estimator.studies.paper_reading import (
+    AZIMUTHS,
+    PARAMETERS,
+    Convention,
+    Experiments,
+    Parameters,
+    Reader,
+    Reading,
+    read,
+)
+from phibench.estimator.studies.study import Settings
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import Rig
+
+NOISE = "noise_px"
+WHOLE_PIXEL_PX = 12.0**-0.5  # standard deviation of what rounding to whole pixels takes away
+GROUPS: dict[str, tuple[str, ...]] = {
+    "misalignment": PARAMETERS[:4],
+    "turn": ("roll_rad", "pitch_rad"),
+    "stroke": ("stroke_relative", "stroke_offset_m"),
+    "scale": ("focal_relative", "axial_m", "radius_m"),
+}
+"""What an explanation can leave free besides lens distance, spot heights and noise."""
+_DIRECTED = ("misalignment", "turn")  # their effect depends on the spot's azimuth
+COMMON = ("z_c_m", "height_1_m", "height_2_m", "height_3_m", "height_4_m")
+FREEDOM = 4.0  # of Student's t where noise has heavy tails
+_STUDENT_TOP = float(student.logpdf(0.0, FREEDOM))
+_IMPOSSIBLE = -1e300  # a finite number, as samplers want it
+
+
+class Prior(Settings):
+    """Prior of one parameter: exactly one of the three."""
+
+    normal: list[float] | None = Field(default=None, min_length=2, max_length=2, description="mean, sigma")
+    uniform: list[float] | None = Field(default=None, min_length=2, max_length=2, description="low, high")
+    log_uniform: list[float] | None = Field(default=None, min_length=2, max_length=2, description="low, high; above 0")
+
+    @model_validator(mode="after")
+    def _one(self) -> Prior:
+        given = [name for name in ("normal", "uniform", "log_uniform") if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError("a prior is exactly one of normal, uniform, log_uniform")
+        low, high = getattr(self, given[0])
+        if (given[0] == "normal" and not high > 0.0) or (given[0] != "normal" and not low < high):
+            raise ValueError("a normal prior needs a sigma above 0, the others low < high")
+        if given[0] == "log_uniform" and not low > 0.0:
+            raise ValueError("a log_uniform prior needs a low above 0")
+        return self
+
+    def scaled(self, by: float) -> Prior:
+        """The same with the sigma of a normal prior so many times as large; the others have no scale to change."""
+        return self if self.normal is None else Prior(normal=[self.normal[0], self.normal[1] * by])
+
+    def of_share(self, share: Array) -> Array:
+        """Quantiles of shares in (0, 1)."""
+        if self.normal is not None:
+            return np.asarray(self.normal[0] + self.normal[1] * ndtri(share))
+        low, high = self.uniform or [np.log(x) for x in self.log_uniform or ()]
+        value = low + (high - low) * share
+        return np.asarray(value if self.uniform else np.exp(value))
+
+    def share_of(self, value: Array) -> Array:
+        """Prior probability below values."""
+        if self.normal is not None:
+            return np.asarray(ndtr((value - self.normal[0]) / self.normal[1]))
+        low, high = self.uniform or [np.log(x) for x in self.log_uniform or ()]
+        return np.clip(((value if self.uniform else np.log(value)) - low) / (high - low), 0.0, 1.0)
+
+
+class Explanation(Settings):
+    """One explanation of the published estimates."""
+
+    name: str = Field(pattern="^[a-z0-9_]+$")
+    text: str = Field(description="in a few words, for tables")
+    convention: Convention = "ray"
+    equation: Literal[4, 5] = 4
+    centred: bool = Field(default=False, description="radii count from the image of the sphere")
+    free: list[Literal["misalignment", "turn", "stroke", "scale"]] = Field(default=[])
+    noise: Literal["free", "whole pixels"] = "free"
+    shared_down: bool = Field(default=False, description="one down image for all strokes with a target")
+    tails: Literal["normal", "student"] = "normal"
+    priors: dict[str, Prior] = Field(default={}, description="in place of the study's")
+
+    @property
+    def reader(self) -> Reader:
+        """What its reader does with pixels."""
+        return Reader(self.convention, self.equation, self.centred)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of what is free."""
+        noise = (NOISE,) if self.noise == "free" else ()
+        azimuths = AZIMUTHS if set(self.free) & set(_DIRECTED) else ()
+        groups = (name for group in GROUPS if group in self.free for name in GROUPS[group])
+        return (*noise, *COMMON, *azimuths, *groups)
+
+
+@dataclass(frozen=True)
+class Model:
+    """An explanation with priors, data and the believed rig: what a sampler needs.
+
+    Parameters
+    ----------
+    explanation : Explanation
+    priors : Prior by parameter
+    experiments : Experiments
+    rig : Rig
+        Focal length and mirror that the paper's user believes.
+    depth_sigma_m : float
+        Of the paper's real depth of a target.
+    """
+
+    explanation: Explanation
+    priors: Mapping[str, Prior]
+    experiments: Experiments
+    rig: Rig
+    depth_sigma_m: float
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Free parameters, in the order of points."""
+        return self.explanation.parameters
+
+    @cached_property
+    def _chosen(self) -> tuple[Prior, ...]:
+        return tuple(self.priors[name] for name in self.names)
+
+    @cached_property
+    def _same_target(self) -> Array:
+        return self.experiments.same_target.astype(float)
+
+    def point(self, shares: Array) -> Array:
+        """Parameters, shape (..., d), from the unit cube."""
+        return np.stack([prior.of_share(shares[..., i]) for i, prior in enumerate(self._chosen)], axis=-1)
+
+    def named(self, points: Array) -> dict[str, Array]:
+        """Parameters by name for `read`: scalars of a point (d,), columns (m, 1) of points (m, d)."""
+        return dict(zip(self.names, points if points.ndim == 1 else points.T[..., None], strict=True))
+
+    def noise_px(self, named: Parameters) -> Array:
+        """Sigma of the reading noise."""
+        return named.get(NOISE, np.asarray(WHOLE_PIXEL_PX))
+
+    def reading(self, points: Array) -> Reading:
+        """Noise-free estimates, shape (..., n)."""
+        return read(self.named(points), self.experiments, self.explanation.reader, self.rig)
+
+    def log_likelihood(self, point: Array) -> float:
+        """Log density of the published estimates, per metre each, at one point, shape (d,)."""
+        value = float(self.log_likelihoods(point))
+        return value if np.isfinite(value) else _IMPOSSIBLE
+
+    def log_likelihoods(self, points: Array) -> Array:
+        """Log densities at points, shape (..., d); not finite where a rig shows no spot."""
+        with np.errstate(all="ignore"):
+            reading = self.reading(points)
+            residual = 1.0 / self.experiments.estimate_m - reading.inverse_depth_per_m
+            jacobian = -2.0 * np.sum(np.log(self.experiments.estimate_m))
+            if self.explanation.tails == "student":
+                return np.asarray(self._student(residual, reading, points) + jacobian)
+            if not np.isfinite(reading.by_down).all():
+                return self._one_by_one(points)
+            own, common = self._variances(reading, points)
+            if self.explanation.shared_down:
+                return np.asarray(_normal(residual, self.covariance(reading, points)) + jacobian)
+            return np.asarray(_normal_in_groups(residual, own, common, self._targets) + jacobian)
+
+    def covariance(self, reading: Reading, points: Array) -> Array:
+        """Covariance of the inverse estimates, shape (..., n, n), in m^-2."""
+        own, common = self._variances(reading, points)
+        if self.explanation.shared_down:
+            common = [*common, self.noise_px(self.named(points)) * reading.by_down]
+        result = sum((_outer(effect) for effect in common), np.zeros(())) * self._same_target
+        diagonal = np.arange(len(self.experiments))
+        result[..., diagonal, diagonal] += own
+        return np.asarray(result)
+
+    def _variances(self, reading: Reading, points: Array) -> tuple[Array, list[Array]]:
+        """Variances of each inverse estimate by itself, and effects that all estimates of a target share."""
+        noise, square = self.noise_px(self.named(points)), reading.inverse_depth_per_m * reading.inverse_depth_per_m
+        seen = reading.by_up * reading.by_up
+        if not self.explanation.shared_down:
+            seen = seen + reading.by_down * reading.by_down
+        own = self._rounding_m2 * square * square + noise * noise * seen
+        return own, [self.depth_sigma_m * square]  # d(1/D) of an error of D
+
+    @cached_property
+    def _rounding_m2(self) -> Array:
+        return self.experiments.rounding_m**2 / 12.0
+
+    @cached_property
+    def _targets(self) -> NDArray[np.int64]:
+        """Where the experiments of a target begin: those of one target follow each other."""
+        changes = np.diagonal(self.experiments.same_target, 1)
+        return np.concatenate([[0], np.flatnonzero(~changes) + 1])
+
+    def _student(self, residual: Array, reading: Reading, points: Array) -> Array:
+        """Independent Student t of 4 degrees of freedom with the scale of the Gaussian."""
+        scale = np.sqrt(np.diagonal(self.covariance(reading, points), axis1=-2, axis2=-1))
+        heavy = 0.5 * (FREEDOM + 1.0) * np.log1p((residual / scale) ** 2 / FREEDOM)
+        return np.asarray(np.sum(_STUDENT_TOP - heavy - np.log(scale), axis=-1))
+
+    def _one_by_one(self, points: Array) -> Array:
+        """Points of which some show no spot."""
+        if points.ndim == 1:
+            return np.asarray(-np.inf)
+        return np.array([self.log_likelihood(point) for point in points])
+
+
+def standardised(model: Model, points: Array, independent: bool = False) -> Array:
+    """Residuals made independent with unit variance, shape (..., n).
+
+    By the Cholesky factor of their covariance, or by their own deviations where they count as independent.
+    """
+    reading = model.reading(points)
+    residual = 1.0 / model.experiments.estimate_m - reading.inverse_depth_per_m
+    covariance = model.covariance(reading, points)
+    if independent:
+        return np.asarray(residual / np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1)))
+    factor = np.linalg.cholesky(covariance)
+    return np.asarray(np.linalg.solve(factor, residual[..., None])[..., 0])
+
+
+def without_table(model: Model, table: int) -> tuple[Model, NDArray[np.bool_]]:
+    """The model on the other three tables, and the mask of the experiments that are left out."""
+    out = model.experiments.table == table
+    chosen = model.experiments.chosen(~out)
+    return Model(model.explanation, model.priors, chosen, model.rig, model.depth_sigma_m), out
+
+
+def _normal(residual: Array, covariance: Array) -> Array:
+    factor = np.linalg.cholesky(covariance)
+    z = np.linalg.solve(factor, residual[..., None])[..., 0]
+    log_root = np.sum(np.log(np.diagonal(factor, axis1=-2, axis2=-1)), axis=-1)
+    return np.asarray(-0.5 * np.sum(z * z, axis=-1) - log_root - 0.5 * residual.shape[-1] * np.log(2.0 * np.pi))
+
+
+def _normal_in_groups(residual: Array, own: Array, common: list[Array], starts: NDArray[np.int64]) -> Array:
+    """Log density of a normal with covariance diag(own) + v v^T within each group (Sherman and Morrison)."""
+    (v,), weight = common, 1.0 / own
+    inner, size = (np.add.reduceat(x, starts, axis=-1) for x in (residual * v * weight, v * v * weight))
+    square = np.sum(residual * residual * weight, axis=-1) - np.sum(inner * inner / (1.0 + size), axis=-1)
+    log_det = np.sum(np.log(own), axis=-1) + np.sum(np.log1p(size), axis=-1)
+    return np.asarray(-0.5 * (square + log_det + residual.shape[-1] * np.log(2.0 * np.pi)))
+
+
+def _outer(vector: Array) -> Array:
+    return vector[..., :, None] * vector[..., None, :]
