@@ -31,8 +31,9 @@ MIN_EDGES = 3
 MAX_TILT_RAD = 0.05
 """How far the vertical may be from the believed one; farther ones are other lines of the room."""
 _PER_M = (0.35, 0.65)  # an edge's inverse distance, as taken and one standard deviation nearer
-_SLOPE_LIMIT_RAD = 4e-3  # of an edge's slope against the others' vertical, before scatter is known
-_TUKEY = 4.685
+_TOGETHER = 6.0  # points of an edge that are wrong together: smoothing, and JPEG's blocks of 8 px
+_SLOPE_LIMIT = 4.0  # of an edge's slope against the others' vertical, over its own sigma
+_TUKEY, _LEAST_SCALE = 4.685, 0.5
 _ROUNDS = 12
 
 
@@ -47,15 +48,15 @@ class Vertical:
         Of its x and y; for camera and sphere as given.
     edges, points : int
         Edges that were used, and their points.
-    slope_rad : float
-        Robust standard deviation of the edges' slopes.
+    scale : float
+        Robust standard deviation of the edges' slopes over what their points' own scatter gives.
     """
 
     up: Array
     covariance: Array
     edges: int
     points: int
-    slope_rad: float
+    scale: float
 
 
 def find_vertical(
@@ -112,7 +113,7 @@ def vertical_of(edges: Sequence[Array], rig: Rig) -> Vertical:
         up = up / np.linalg.norm(up)
     x, y = _horizontal(up)
     turn = np.stack([x[:2], y[:2]])
-    return Vertical(up, turn.T @ fit.covariance @ turn, len(kept), sum(len(r.origin_m) for r in kept), fit.scale_rad)
+    return Vertical(up, turn.T @ fit.covariance @ turn, len(kept), sum(len(r.origin_m) for r in kept), fit.scale)
 
 
 @dataclass(frozen=True)
@@ -137,7 +138,8 @@ def _horizontal(up: Array) -> tuple[Array, Array]:
 
 
 def _azimuth_and_slope(rays: EdgeRays, up: Array, per_m: float = _PER_M[0]) -> tuple[float, float, float]:
-    """Azimuth of an edge, its slope along the azimuth, radians, and that slope's weight: its heights' sum of squares."""
+    """Azimuth of an edge, its slope along the azimuth, radians, and that slope's weight: one over the variance that
+    the points' own scatter gives it."""
     x, y = _horizontal(up)
     a, b = rays.direction @ x, rays.direction @ y
     t = (1.0 / per_m - np.hypot(rays.origin_m @ x, rays.origin_m @ y)) / np.hypot(a, b)
@@ -145,7 +147,10 @@ def _azimuth_and_slope(rays: EdgeRays, up: Array, per_m: float = _PER_M[0]) -> t
     azimuth = float(np.arctan2((point @ y).mean(), (point @ x).mean()))
     along, height = point @ (np.cos(azimuth) * y - np.sin(azimuth) * x), point @ up
     centred = height - height.mean()
-    return azimuth, float(centred @ along / (centred @ centred)), float(centred @ centred) * per_m**2
+    square = float(centred @ centred)
+    slope = float(centred @ along / square)
+    left = along - along.mean() - slope * centred
+    return azimuth, slope, square / (_TOGETHER * float(left @ left) / max(left.size - 2, 1) + 1e-300)
 
 
 def _agreeing(rays: Sequence[EdgeRays], up: Array) -> list[int]:
@@ -161,18 +166,23 @@ def _agreeing(rays: Sequence[EdgeRays], up: Array) -> list[int]:
     tilt = (tilt / sine).T[np.linalg.norm(tilt / sine, axis=0) < MAX_TILT_RAD]
     if not len(tilt):
         return []
-    off = np.abs(slope - tilt @ across.T)
-    score = np.sum(np.sqrt(weight) * np.clip(1.0 - (off / _SLOPE_LIMIT_RAD) ** 2, 0.0, None), axis=-1)
-    return [int(k) for k in np.flatnonzero(off[np.argmax(score)] < _SLOPE_LIMIT_RAD)]
+    off = np.abs(slope - tilt @ across.T) * np.sqrt(_evened(weight))
+    score = np.sum(np.clip(1.0 - (off / _SLOPE_LIMIT) ** 2, 0.0, None), axis=-1)
+    return [int(k) for k in np.flatnonzero(off[np.argmax(score)] < _SLOPE_LIMIT)]
+
+
+def _evened(weight: Array) -> Array:
+    """Weights of slopes, an usual edge's variance added to each: no edge is better than its neighbourhood allows."""
+    return np.asarray(1.0 / (1.0 / weight + 1.0 / np.median(weight)))
 
 
 @dataclass(frozen=True)
 class Regression:
-    """Tilt, shape (2,), of the vertical along `_horizontal`, its covariance, and the scatter of the slopes, radians."""
+    """Tilt, shape (2,), of the vertical along `_horizontal`, its covariance, and the slopes' scatter."""
 
     tilt: Array
     covariance: Array
-    scale_rad: float
+    scale: float
 
 
 def _regression(rays: Sequence[EdgeRays], up: Array) -> Regression:
@@ -185,16 +195,15 @@ def _regression(rays: Sequence[EdgeRays], up: Array) -> Regression:
     azimuth, slope, weight = np.array([_azimuth_and_slope(edge, up) for edge in rays]).T
     nearer = np.array([_azimuth_and_slope(edge, up, _PER_M[1])[1] for edge in rays])
     across = np.stack([-np.sin(azimuth), np.cos(azimuth)], axis=-1)
-    # a long edge is no better than its neighbourhood allows: half of the usual edge's variance is common to all
-    weight = 1.0 / (1.0 / weight + 1.0 / np.median(weight))
-    weight = weight / weight.max()
+    weight = _evened(weight)
     trust = np.ones(slope.size)
     for _ in range(8):
         w = weight * trust
-        inverse = np.linalg.inv(across.T @ (w[:, None] * across) + 1e-9 * np.eye(2))
+        inverse = np.linalg.inv(across.T @ (w[:, None] * across))
         tilt = inverse @ across.T @ (w * slope)
         off = np.sqrt(weight) * (slope - across @ tilt)
-        scale = 1.4826 * float(np.median(np.abs(off))) * np.sqrt(slope.size / (slope.size - 2.0)) + 1e-9
+        scale = 1.4826 * float(np.median(np.abs(off))) * np.sqrt(slope.size / (slope.size - 2.0))
+        scale = max(scale, _LEAST_SCALE)  # few edges may agree by chance
         trust = np.clip(1.0 - (off / (_TUKEY * scale)) ** 2, 0.0, None) ** 2
     u2 = np.minimum((off / (_TUKEY * scale)) ** 2, 1.0)
     slack = np.clip(np.sum(weight * (1.0 - u2) * (1.0 - 5.0 * u2)) / np.sum(w), 0.5, 1.0)  # psi' over psi / x
@@ -202,7 +211,7 @@ def _regression(rays: Sequence[EdgeRays], up: Array) -> Regression:
     scores = across * (trust * np.sqrt(weight) * off / np.sqrt(1.0 - leverage))[:, None]
     meat = across.T @ ((w * trust)[:, None] * across)
     degrees = max(float(trust.sum()) - 2.0, 1.0)
-    pooled = float(np.sum(trust * off**2)) / degrees * meat
+    pooled = max(float(np.sum(trust * off**2)) / degrees, _LEAST_SCALE**2) * meat
     far = across.T @ ((w * (nearer - slope))[:, None] ** 2 * across)
     covariance = inverse @ (0.5 * (scores.T @ scores + pooled) / slack**2 + far) @ inverse
     return Regression(tilt, covariance, scale)
