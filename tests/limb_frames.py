@@ -16,6 +16,7 @@ from phibench.scenes.rig import Rig
 
 FINE = 3
 REACH_PX = 12.0
+BOX_PX = 24
 
 
 def drawn_rig(rng: np.random.Generator, blur_px: tuple[float, float] = (0.5, 1.0)) -> Rig:
@@ -37,7 +38,12 @@ def drawn_rig(rng: np.random.Generator, blur_px: tuple[float, float] = (0.5, 1.0
     return replace(rig, camera=camera, T_world_camera=pose, T_camera_sphere=Pose("camera", "sphere", as_vector(sphere)))
 
 
-def limb_light(rig: Rig, rng: np.random.Generator, mean_e_per_s: float = 1.5e5, room=None) -> np.ndarray:
+TINT = (1.0, 0.85, 0.45)
+
+
+def limb_light(
+    rig: Rig, rng: np.random.Generator, mean_e_per_s: float = 1.5e5, room=None, tint=TINT
+) -> np.ndarray:
     """Expected electrons per second, shape (3, H, W); away from the outline the room's mean level.
 
     `room` is a function (points, directions) -> radiance; by default it is drawn from `rng`.
@@ -68,14 +74,47 @@ def limb_light(rig: Rig, rng: np.random.Generator, mean_e_per_s: float = 1.5e5, 
     chief = camera.rays(np.stack([columns, rows], axis=-1).astype(float))
     fall_off = chief[..., 2] ** 4
     inside = chief @ s > np.sqrt(s @ s - R * R)  # the mirror's disc, roughly as bright as steel makes it
-    level = np.kron(np.where(inside, 0.67, 1.0), np.ones((FINE, FINE))).astype(np.float32)
+    level = np.where(inside, 0.67, 1.0).astype(np.float32)
+    # only the box around the ring is drawn on the fine grid
+    low, high = cells.min(axis=0) - BOX_PX, cells.max(axis=0) + BOX_PX
+    low, high = np.clip(low, 0, None), np.clip(high, 0, [size[1], size[0]])
+    box = (slice(low[1], high[1]), slice(low[0], high[0]))
+    start_fine = np.kron(level[box], np.ones((FINE, FINE), np.float32))
     planes = []
-    for nm, tint in zip(camera.detector.band_wavelength_nm, (1.0, 0.85, 0.45), strict=True):
-        fine = level.copy()
-        fine[v, u] = light * np.where(hit, rig.mirror.reflectance(np.where(hit, cosine, 1.0), nm), 1.0)
+    for nm, share in zip(camera.detector.band_wavelength_nm, tint, strict=True):
+        fine = start_fine.copy()
+        steel = rig.mirror.reflectance(np.where(hit, cosine, 1.0), nm)
+        fine[v - FINE * low[1], u - FINE * low[0]] = light * np.where(hit, steel, 1.0)
         fine = ndimage.gaussian_filter(fine, FINE * camera.blur_sigma_px, mode="nearest", truncate=5.0)
-        planes.append(tint * mean_e_per_s * fall_off * fine.reshape(size[0], FINE, size[1], FINE).mean(axis=(1, 3)))
+        plane = level.copy()
+        plane[box] = fine.reshape(high[1] - low[1], FINE, high[0] - low[0], FINE).mean(axis=(1, 3))
+        planes.append(share * mean_e_per_s * fall_off * plane)
     return np.array(planes, np.float32)
+
+
+def drawn_tint(rng: np.random.Generator) -> tuple[float, float, float]:
+    """Colour of a room: from candle light to a cloudy day."""
+    return (1.0, rng.uniform(0.7, 1.1), rng.uniform(0.3, 1.0))
+
+
+def drawn_room(rng: np.random.Generator):
+    """Radiance at (points, directions) of a ceiling, 2.3 to 4 m high, with a pattern and up to 8 lamps, and of walls."""
+    phase, wave, depth = rng.uniform(0.0, 2.0 * np.pi, 4), rng.uniform(0.3, 2.5, 4), rng.uniform(0.0, 0.08, 2)
+    count, height, wall = rng.integers(0, 9), rng.uniform(2.3, 4.0), rng.uniform(0.4, 0.9)
+    lamps = rng.uniform(-3.0, 3.0, (count, 2))
+    half, level = rng.uniform(0.1, 0.7, (count, 2)), rng.uniform(1.3, 6.0, count)
+
+    def radiance(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        up = directions[:, 2]
+        with np.errstate(all="ignore"):
+            t = np.where(up > 0.05, (height - points[:, 2]) / up, np.nan)
+        x, y = (points[:, i] + t * directions[:, i] for i in (0, 1))
+        light = 1.0 + depth[0] * np.sin(wave[0] * x + phase[0]) + depth[1] * np.sin(wave[1] * y + phase[1])
+        for (a, b), (p, q), bright in zip(lamps, half, level, strict=True):
+            light = np.where((np.abs(x - a) < p) & (np.abs(y - b) < q), bright, light)
+        return np.where(np.isfinite(t), light, wall)
+
+    return radiance
 
 
 def _room(rng: np.random.Generator):

@@ -22,8 +22,9 @@ RADII = (0.55, 0.93)
 _LENGTH_PX, _GAP_PX, _LEAN_RAD = 18, 2, 0.12
 _STEP_PX = 0.5  # across the edge
 _REACH_PX = 4.0
-_SMOOTH_PX = (1.0, 1.5)  # along the radius, along the azimuth
+_SMOOTH_PX = (1.5, 0.8)  # along the radius, along the azimuth
 _MIN_STEP = 0.012  # of the logarithm of light, per pixel
+_MIN_OVER_NOISE = 4.0  # of an edge over the usual gradient, which is noise, JPEG's waves and shading
 _MIN_POINTS = 14
 _NEAR_PX = 5.0
 
@@ -60,11 +61,15 @@ def edges_of(picture: Array, rig: Rig) -> list[Array]:
     polar = unwrapped(picture, rig)
     across = _gradient(polar.light)
     found, taken = [], np.zeros(across.shape, bool)
-    for (c0, r0), (c1, r1) in _segments(polar):
-        track = _track(across, min(r0, r1), max(r0, r1), *((c0, c1) if r0 < r1 else (c1, c0)))
+    noise = 1.4826 * float(np.median(np.abs(across)))
+    least = max(_MIN_STEP, _MIN_OVER_NOISE * noise)
+    for (c0, r0), (c1, r1) in _segments(polar, least):
+        track = _track(across, least, min(r0, r1), max(r0, r1), *((c0, c1) if r0 < r1 else (c1, c0)))
         if track is None:
             continue
         row, column = track
+        if _is_block_border(polar.pixels(row.astype(float), column)):
+            continue
         cell = np.rint(column).astype(int) % across.shape[1]
         if taken[row, cell].mean() > 0.2:
             continue
@@ -80,13 +85,13 @@ def _gradient(light: Array) -> Array:
     return np.asarray(ndimage.gaussian_filter(light, sigma, order=(0, 1), mode=("nearest", "wrap")) / _STEP_PX)
 
 
-def _segments(polar: Unwrapped) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+def _segments(polar: Unwrapped, least: float) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     """Upright segments ((column, row), (column, row)), the longest first, of a picture with square pixels."""
     factor = round(1.0 / _STEP_PX)
     square = polar.light[:, ::factor]
     seam = 40  # columns again, so that an edge at azimuth 0 is whole
     wide = np.concatenate([square, square[:, :seam]], axis=1)
-    edges = canny(wide, sigma=1.5, low_threshold=0.01, high_threshold=0.03)  # type: ignore[no-untyped-call]
+    edges = canny(wide, sigma=1.5, low_threshold=least, high_threshold=2.0 * least)  # type: ignore[no-untyped-call]
     # upright edges alone: tiles and lamps give Hough much to do
     upright = np.abs(ndimage.gaussian_filter(wide, 1.5, order=(0, 1))) > 2.0 * np.abs(
         ndimage.gaussian_filter(wide, 1.5, order=(1, 0))
@@ -99,7 +104,13 @@ def _segments(polar: Unwrapped) -> list[tuple[tuple[int, int], tuple[int, int]]]
     return sorted(whole, key=lambda line: -abs(line[0][1] - line[1][1]))
 
 
-def _track(across: Array, r0: int, r1: int, c0: float, c1: float) -> tuple[Array, Array] | None:
+def _is_block_border(uv_px: Array) -> bool:
+    """Whether an edge runs along the border of JPEG's blocks, pixels 7.5 mod 8: such an edge may be JPEG's own."""
+    off = np.abs((uv_px - 7.5 + 4.0) % 8.0 - 4.0)
+    return bool(np.any((np.ptp(uv_px, axis=0) < 2.5) & (np.median(off, axis=0) < 1.0)))
+
+
+def _track(across: Array, least: float, r0: int, r1: int, c0: float, c1: float) -> tuple[Array, Array] | None:
     """Rows and columns of the steepest places near a segment, or None where there is no clean edge.
 
     Two passes: about the segment, and about the straight line through the places of the first one.
@@ -111,7 +122,7 @@ def _track(across: Array, r0: int, r1: int, c0: float, c1: float) -> tuple[Array
     sign = np.sign(np.median(across[row, np.rint(line(row)).astype(int) % across.shape[1]])) or 1.0
     for reach in (_REACH_PX, 0.6 * _REACH_PX):
         column, steep = _steepest(sign * across, row, line(row), reach)
-        good = np.isfinite(column) & (steep > _MIN_STEP)
+        good = np.isfinite(column) & (steep > least)
         if good.sum() < _MIN_POINTS:
             return None
         line = np.polynomial.Polynomial.fit(row[good], column[good], 1)

@@ -34,6 +34,8 @@ MIN_ARC = 0.5
 JPEG_DRAWS = (2, 8)
 """Draws of noise and JPEG from which the change of an outline by JPEG is taken, in a first and a second round."""
 _COARSE_HALF_PX, _COARSE_STEPS = 8.0, 6
+_NEAR_M = (3e-5, 3e-5, 1.2e-4)  # about 0.15 px of the outline
+_CHOOSE = 3  # steps that choose their pixels anew
 _STEPS, _REST_M, _REST_SIGMAS, _UNREST_M = 30, 1e-7, 0.05, 1e-6
 _MIN_CONTRAST, _MAX_CONTRAST = 0.5, 1.6
 _BLUR_RANGE_PX2 = (0.02, 9.0)
@@ -142,6 +144,8 @@ def _approach(planes: tuple[Plane, ...], rig: Rig, s: Array, blur: float) -> Arr
         pixels = band(planes, rig.camera, s, rig.mirror.radius_m, _COARSE_HALF_PX)
         step = step_from(pixels, planes, rig, s, blur, SECTORS // 2, _COARSE_HALF_PX)
         s = _moved(s, step.move[:3], rig)
+        if np.all(np.abs(step.move[:3]) < _NEAR_M):
+            break
     return s
 
 
@@ -154,13 +158,13 @@ def _settle(
     again: tuple[NDArray[Any], SensorCard] | None,
 ) -> Outline:
     for count in range(1, _STEPS + 1):
-        if count <= 4:  # later the pixels stay, so that the steps come to rest
+        if count <= _CHOOSE:  # later the pixels stay, so that the steps come to rest
             pixels = band(planes, rig.camera, s, rig.mirror.radius_m, half_px)
         step = step_from(pixels, planes, rig, s, blur, SECTORS, half_px, again is not None, near=True)
         # weights that are cut off can take turns for ever: shorter steps end between them
         move = step.move * min(1.0, 6.0 / count)
         sigma = np.sqrt(np.diag(step.covariance)[:3])
-        if count > 4 and np.all(np.abs(move[:3]) < np.maximum(_REST_M, _REST_SIGMAS * sigma)):
+        if count >= _CHOOSE and np.all(np.abs(move[:3]) < np.maximum(_REST_M, _REST_SIGMAS * sigma)):
             break
         s, blur = _moved(s, move[:3], rig), float(np.clip(blur + move[3], *_BLUR_RANGE_PX2))
     if np.any(np.abs(move[:3]) > np.maximum(_UNREST_M, sigma)):

@@ -1,14 +1,12 @@
 """The world's vertical in the camera frame, from vertical edges of the room in the mirror.
 
 The paper's own check of the alignment is that all vertical edges go through the image's centre (section 5). Here the
-check becomes a measurement. A vertical edge is the line p + t n: n the vertical, common to all edges, p its foot. Every
-pixel (u, v) on its image has a reflected ray (o, r), which meets the line where
-
-    (p - o) . (n x r) = 0.
-
-A sphere has no single viewpoint, so that o differs from ray to ray. Unknown are n (2 numbers) and each edge's azimuth and
-inverse distance (2 numbers); the latter is next to nothing for an aligned rig and has a wide prior. Residuals are
-distances from the edge's image in pixels, to first order. Frames: everything in the camera frame.
+check becomes a measurement. Every pixel on an edge's image has a reflected ray (o, r): a sphere has no single viewpoint,
+so that o differs from ray to ray. The rays are taken to the edge's distance from the vertical n, and there the points'
+place across the edge is a straight line of their height: if n is right, it does not change with height. A wrong n by
+the tilt t gives the edge at azimuth a the slope t . (-sin a, cos a), so that edges of two azimuths give n, and more of
+them say how well. The distance hardly matters, since o and r lie nearly in one vertical plane; it is taken as 1 / 0.35 m,
+and what other distances would change is in the edge's variance. Frames: everything in the camera frame.
 """
 
 from __future__ import annotations
@@ -19,24 +17,24 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize
 
 from phibench.datasets.sensor_card import SensorCard
 from phibench.estimator.calibration.bundle import Measured
 from phibench.estimator.calibration.edge_points import edges_of
 from phibench.estimator.calibration.limb_image import ImageError, planes_of
 from phibench.estimator.calibration.outline_start import grey
-from phibench.estimator.reflection import reflect, reflect_jacobian
+from phibench.estimator.reflection import reflect
 from phibench.scenes.frames import Array, Pose
 from phibench.scenes.rig import Rig
 
 MIN_EDGES = 3
 MAX_TILT_RAD = 0.05
 """How far the vertical may be from the believed one; farther ones are other lines of the room."""
-_PER_M = (0.35, 0.3)  # mean and standard deviation of an edge's inverse distance
-_SLOPE_LIMIT_RAD = 4e-3  # of an edge's slope against the others' vertical, before scatter is known
-_CUT = 4.0
-_ROUNDS = 4
+_PER_M = (0.35, 0.65)  # an edge's inverse distance, as taken and one standard deviation nearer
+_TOGETHER = 6.0  # points of an edge that are wrong together: smoothing, and JPEG's blocks of 8 px
+_SLOPE_LIMIT = 4.0  # of an edge's slope against the others' vertical, over its own sigma
+_TUKEY, _LEAST_SCALE = 4.685, 0.5
+_ROUNDS = 12
 
 
 @dataclass(frozen=True)
@@ -50,15 +48,15 @@ class Vertical:
         Of its x and y; for camera and sphere as given.
     edges, points : int
         Edges that were used, and their points.
-    residual_px : float
-        Root mean square distance of the points from their edges.
+    scale : float
+        Robust standard deviation of the edges' slopes over what their points' own scatter gives.
     """
 
     up: Array
     covariance: Array
     edges: int
     points: int
-    residual_px: float
+    scale: float
 
 
 def find_vertical(
@@ -103,36 +101,33 @@ def vertical_of(edges: Sequence[Array], rig: Rig) -> Vertical:
     up = rig.T_world_camera.R.T[:, 2]
     rays = [_rays(edge, rig) for edge in edges]
     chosen = _agreeing(rays, up)
+    if len(chosen) < MIN_EDGES:
+        raise ImageError(
+            f"{len(chosen)} vertical edges were found that agree: {MIN_EDGES} are needed; show the mirror a room with "
+            "door frames, corners or shelves, or leave the vertical out"
+        )
+    kept = [rays[k] for k in chosen]
     for _ in range(_ROUNDS):
-        if len(chosen) < MIN_EDGES:
-            raise ImageError(
-                f"{len(chosen)} vertical edges were found that agree: {MIN_EDGES} are needed; show the mirror a room with "
-                "door frames, corners or shelves, or leave the vertical out"
-            )
-        kept = [rays[k] for k in chosen]
-        up, slopes, covariance, rms_px = _solved(kept, up)
-        size = np.abs(slopes) / max(1.4826 * float(np.median(np.abs(slopes))), 1e-12)
-        if np.all(size < _CUT) or len(chosen) == MIN_EDGES:
-            break
-        chosen = [k for k, off in zip(chosen, size, strict=True) if off < _CUT]
-    return Vertical(up, covariance, len(kept), sum(len(r.origin_m) for r in kept), rms_px)
+        fit = _regression(kept, up)
+        up = up + fit.tilt @ np.stack(_horizontal(up))
+        up = up / np.linalg.norm(up)
+    x, y = _horizontal(up)
+    turn = np.stack([x[:2], y[:2]])
+    return Vertical(up, turn.T @ fit.covariance @ turn, len(kept), sum(len(r.origin_m) for r in kept), fit.scale)
 
 
 @dataclass(frozen=True)
 class EdgeRays:
-    """Reflected rays of an edge's pixels, relative to the sphere centre, camera frame; derivatives by the pixel."""
+    """Reflected rays of an edge's pixels, shape (k, 3), from the sphere centre, camera frame."""
 
     origin_m: Array
     direction: Array
-    origin_m_per_px: Array
-    direction_per_px: Array
 
 
 def _rays(uv_px: Array, rig: Rig) -> EdgeRays:
     view = replace(rig, T_world_camera=Pose("world", "camera")).at(0.0)
-    ray, slope = reflect(view, uv_px), reflect_jacobian(view, uv_px)
-    origin = ray.origin_world_m - view.sphere_centre_m
-    return EdgeRays(origin, ray.direction_world, slope.origin_m_per_px, slope.direction_per_px)
+    ray = reflect(view, uv_px)
+    return EdgeRays(ray.origin_world_m - view.sphere_centre_m, ray.direction_world)
 
 
 def _horizontal(up: Array) -> tuple[Array, Array]:
@@ -142,16 +137,20 @@ def _horizontal(up: Array) -> tuple[Array, Array]:
     return x, np.cross(up, x)
 
 
-def _azimuth_and_slope(rays: EdgeRays, up: Array) -> tuple[float, float, float]:
-    """Azimuth of an edge at the usual distance, its slope along the azimuth, radians, and that slope's weight."""
+def _azimuth_and_slope(rays: EdgeRays, up: Array, per_m: float = _PER_M[0]) -> tuple[float, float, float]:
+    """Azimuth of an edge, its slope along the azimuth, radians, and that slope's weight: one over the variance that
+    the points' own scatter gives it."""
     x, y = _horizontal(up)
     a, b = rays.direction @ x, rays.direction @ y
-    t = (1.0 / _PER_M[0] - np.hypot(rays.origin_m @ x, rays.origin_m @ y)) / np.hypot(a, b)
+    t = (1.0 / per_m - np.hypot(rays.origin_m @ x, rays.origin_m @ y)) / np.hypot(a, b)
     point = rays.origin_m + t[:, None] * rays.direction
     azimuth = float(np.arctan2((point @ y).mean(), (point @ x).mean()))
     along, height = point @ (np.cos(azimuth) * y - np.sin(azimuth) * x), point @ up
     centred = height - height.mean()
-    return azimuth, float(centred @ along / (centred @ centred)), float(centred @ centred)
+    square = float(centred @ centred)
+    slope = float(centred @ along / square)
+    left = along - along.mean() - slope * centred
+    return azimuth, slope, square / (_TOGETHER * float(left @ left) / max(left.size - 2, 1) + 1e-300)
 
 
 def _agreeing(rays: Sequence[EdgeRays], up: Array) -> list[int]:
@@ -167,65 +166,55 @@ def _agreeing(rays: Sequence[EdgeRays], up: Array) -> list[int]:
     tilt = (tilt / sine).T[np.linalg.norm(tilt / sine, axis=0) < MAX_TILT_RAD]
     if not len(tilt):
         return []
-    off = np.abs(slope - tilt @ across.T)
-    score = np.sum(np.sqrt(weight) * np.clip(1.0 - (off / _SLOPE_LIMIT_RAD) ** 2, 0.0, None), axis=-1)
-    return [int(k) for k in np.flatnonzero(off[np.argmax(score)] < _SLOPE_LIMIT_RAD)]
+    off = np.abs(slope - tilt @ across.T) * np.sqrt(_evened(weight))
+    score = np.sum(np.clip(1.0 - (off / _SLOPE_LIMIT) ** 2, 0.0, None), axis=-1)
+    return [int(k) for k in np.flatnonzero(off[np.argmax(score)] < _SLOPE_LIMIT)]
 
 
-def _solved(rays: Sequence[EdgeRays], up: Array) -> tuple[Array, Array, Array, float]:
-    """Vertical, slopes of the edges against it, covariance of its x and y, and rms distance in pixels."""
-    x, y = _horizontal(up)
-    start = [0.0, 0.0]
-    for edge in rays:
-        start += [_azimuth_and_slope(edge, up)[0], 0.0]
-
-    def distances(theta: Array) -> list[Array]:
-        n = up + theta[0] * x + theta[1] * y
-        n = n / np.linalg.norm(n)
-        return [_distance_px(edge, n, *theta[2 + 2 * k : 4 + 2 * k]) for k, edge in enumerate(rays)]
-
-    def residuals(theta: Array) -> Array:
-        return np.concatenate([*distances(theta), theta[3::2]])
-
-    found = optimize.least_squares(residuals, np.array(start), x_scale="jac", loss="soft_l1", f_scale=0.3)
-    tilt = found.x[:2]
-    n = up + tilt[0] * x + tilt[1] * y
-    n = n / np.linalg.norm(n)
-    slopes, covariance = _scatter(rays, n)
-    parts = np.concatenate(distances(found.x))
-    return n, slopes, covariance, float(np.sqrt(np.mean(parts**2)))
+def _evened(weight: Array) -> Array:
+    """Weights of slopes, an usual edge's variance added to each: no edge is better than its neighbourhood allows."""
+    return np.asarray(1.0 / (1.0 / weight + 1.0 / np.median(weight)))
 
 
-def _distance_px(rays: EdgeRays, n: Array, azimuth_rad: float, nearness: float) -> Array:
-    """Distance of pixels from the image of a vertical line, shape (k,), pixels; `nearness` in prior sigmas."""
-    x, y = _horizontal(n)
-    foot = np.cos(azimuth_rad) * x + np.sin(azimuth_rad) * y
-    per_m = np.abs(_PER_M[0] + _PER_M[1] * nearness)
-    gap = foot - per_m * rays.origin_m  # (p - o) / |p|
-    across = np.cross(n, rays.direction)
-    value = np.sum(gap * across, axis=-1)
-    by_px = np.einsum("ki,kij->kj", gap, np.cross(n, rays.direction_per_px, axisb=1, axisc=1))
-    by_px = by_px - per_m * np.einsum("ki,kij->kj", across, rays.origin_m_per_px)
-    return np.asarray(value / np.linalg.norm(by_px, axis=-1))
+@dataclass(frozen=True)
+class Regression:
+    """Tilt, shape (2,), of the vertical along `_horizontal`, its covariance, and the slopes' scatter."""
+
+    tilt: Array
+    covariance: Array
+    scale: float
 
 
-def _scatter(rays: Sequence[EdgeRays], n: Array) -> tuple[Array, Array]:
-    """Slopes of the edges against the vertical, and its covariance from their scatter.
+def _regression(rays: Sequence[EdgeRays], up: Array) -> Regression:
+    """Tilt from the edges' slopes, with Tukey's weights.
 
-    An edge's points are wrong together (its neighbourhood, JPEG's blocks): what counts is how well edges agree. Slopes
-    are fitted with the points' weights; two degrees of freedom are the vertical's own.
+    An edge's points are wrong together (its neighbourhood, JPEG's blocks): what counts is how well edges agree. So the
+    covariance is a sandwich over edges (CR2: Bell and McCaffrey, Survey Methodology 28, 169, 2002), averaged with the
+    pooled one, which is steadier where edges are few. Two degrees of freedom are the vertical's own.
     """
-    azimuth, slope, weight = np.array([_azimuth_and_slope(edge, n) for edge in rays]).T
-    x, y = _horizontal(n)
-    across = np.stack([-np.sin(azimuth), np.cos(azimuth)], axis=-1) @ np.stack([x[:2], y[:2]])
-    # an edge's slope is known no better than the room is vertical to it and its own errors of position allow
-    weight = 1.0 / (1.0 / weight + 1.0 / np.median(weight))
-    inverse = np.linalg.inv(across.T @ (weight[:, None] * across))
-    leverage = np.einsum("ki,ij,kj->k", across, inverse, across) * weight
-    scores = across * (weight * slope / np.sqrt(np.clip(1.0 - leverage, 0.1, None)))[:, None]  # CR2
-    own = inverse @ (scores.T @ scores) @ inverse
-    pooled = inverse * float(np.sum(weight * slope**2) / max(len(rays) - 2, 1))
-    return slope, np.asarray(0.5 * (own + pooled))
+    azimuth, slope, weight = np.array([_azimuth_and_slope(edge, up) for edge in rays]).T
+    nearer = np.array([_azimuth_and_slope(edge, up, _PER_M[1])[1] for edge in rays])
+    across = np.stack([-np.sin(azimuth), np.cos(azimuth)], axis=-1)
+    weight = _evened(weight)
+    trust = np.ones(slope.size)
+    for _ in range(8):
+        w = weight * trust
+        inverse = np.linalg.inv(across.T @ (w[:, None] * across))
+        tilt = inverse @ across.T @ (w * slope)
+        off = np.sqrt(weight) * (slope - across @ tilt)
+        scale = 1.4826 * float(np.median(np.abs(off))) * np.sqrt(slope.size / (slope.size - 2.0))
+        scale = max(scale, _LEAST_SCALE)  # few edges may agree by chance
+        trust = np.clip(1.0 - (off / (_TUKEY * scale)) ** 2, 0.0, None) ** 2
+    u2 = np.minimum((off / (_TUKEY * scale)) ** 2, 1.0)
+    slack = np.clip(np.sum(weight * (1.0 - u2) * (1.0 - 5.0 * u2)) / np.sum(w), 0.5, 1.0)  # psi' over psi / x
+    leverage = np.clip(np.einsum("ki,ij,kj->k", across, inverse, across) * w, 0.0, 0.9)
+    scores = across * (trust * np.sqrt(weight) * off / np.sqrt(1.0 - leverage))[:, None]
+    meat = across.T @ ((w * trust)[:, None] * across)
+    degrees = max(float(trust.sum()) - 2.0, 1.0)
+    pooled = max(float(np.sum(trust * off**2)) / degrees, _LEAST_SCALE**2) * meat
+    far = across.T @ ((w * (nearer - slope))[:, None] ** 2 * across)
+    covariance = inverse @ (0.5 * (scores.T @ scores + pooled) / slack**2 + far) @ inverse
+    return Regression(tilt, covariance, scale)
 
 
 def _by_sphere(edges: Sequence[Array], rig: Rig, found: Vertical, step_m: float = 2e-5) -> Array:
