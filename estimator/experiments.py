@@ -2,7 +2,7 @@
 
 For every rig of a data set (recipe `paper-misaligned`, or any with experiments and calibration spots):
 
-1. outlines of the mirror in the frames, one per mirror pose, and the spots of the experiment "calibration", whose
+1. outlines of the mirror in the frames, one for each of some mirror poses, and the spots of the experiment "calibration", whose
    distances were measured with a ruler, give the rig with its covariance (`calibration.bundle`);
 2. every other pair gives D with its standard deviation (`depth_general`), from the method that reaches the limit of
    such frames, with the calibrated rig;
@@ -87,6 +87,8 @@ class Procedure:
         How the places of the calibration spots are measured.
     calibration : str
         Experiment with these spots.
+    outlines : int
+        Mirror poses whose outlines are taken, spread over those that there are; the room behind the limb differs.
     """
 
     preset: str = "mjpeg"
@@ -94,6 +96,7 @@ class Procedure:
     laser_off: bool = True
     ruler: Ruler = field(default=Ruler())
     calibration: str = CALIBRATION
+    outlines: int = 6
 
 
 Told = Callable[[str], None]
@@ -134,7 +137,7 @@ def run_experiments(
 
 
 def calibrate_rig(dataset: Dataset, rig: str, procedure: Procedure) -> Bundle:
-    """Calibration of one rig from its frames: outlines of all poses, and the calibration spots.
+    """Calibration of one rig from its frames: outlines of some poses, and the calibration spots.
 
     Raises
     ------
@@ -149,7 +152,9 @@ def calibrate_rig(dataset: Dataset, rig: str, procedure: Procedure) -> Bundle:
             "distances; make the recipe paper-misaligned, or add such an experiment to yours"
         )
     preset, off = procedure.preset, procedure.laser_off
-    outlines = [frame_outline(dataset, sample, position, preset, off) for sample, position in one_per_pose(samples)]
+    poses = one_per_pose(samples)
+    chosen = sorted({round(place) for place in np.linspace(0, len(poses) - 1, max(procedure.outlines, 1))})
+    outlines = [frame_outline(dataset, *poses[place], preset, off) for place in chosen]
     spots = frame_spots(dataset, known, preset, procedure.ruler, off, LEAST_SPOTS)
     return calibrate(known[0].nominal_rig, mean_outline(outlines), spots)
 
