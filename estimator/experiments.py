@@ -2,8 +2,8 @@
 
 For every rig of a data set (recipe `paper-misaligned`, or any with experiments and calibration spots):
 
-1. outlines of the mirror in the frames, one for each of some mirror poses, and the spots of the experiment "calibration", whose
-   distances were measured with a ruler, give the rig with its covariance (`calibration.bundle`);
+1. outlines of the mirror in the frames, one for each of some mirror poses, and the spots of the experiment
+   "calibration", whose distances were measured with a ruler, give the rig with its covariance (`calibration.bundle`);
 2. every other pair gives D with its standard deviation (`depth_general`), from the method that reaches the limit of
    such frames, with the calibrated rig;
 3. beside it stands the bound: the pixels' Cramer-Rao bound and the same calibration, at the true pixels.
