@@ -29,8 +29,8 @@ from phibench.estimator.calibration.dataset import frame_outline, frame_spots
 from phibench.estimator.calibration.outline_mean import mean_outline
 from phibench.estimator.calibration.spots import Ruler, method_for, one_per_pose
 from phibench.estimator.depth_general import GeneralDepth, depth_general
-from phibench.estimator.seat.pair import Answer, Pair
-from phibench.estimator.status import Status, describe
+from phibench.estimator.seat.pair import OK, Answer, Pair
+from phibench.estimator.status import describe
 from phibench.scenes.rig import POSITIONS
 
 CALIBRATION = "calibration"
@@ -184,9 +184,7 @@ def measure(dataset: Dataset, samples: Sequence[Sample], bundle: Bundle, procedu
 
 def _estimate(pair: Pair, answer: Answer, bundle: Bundle, depth_m: float) -> dict[str, Any]:
     found = _depth_of(pair, answer, bundle)
-    status = next((s.status for s in (answer.down, answer.up) if s.status != "ok"), describe(int(found.status)))
-    if status == describe(int(Status.OK)) and not np.isfinite(found.sigma_m):
-        status = "no covariance claimed"
+    fault = _answer_fault(answer)
     error, sigma = float(found.depth_m) - depth_m, float(found.sigma_m)
     return {
         "estimate_m": float(found.depth_m),
@@ -198,8 +196,19 @@ def _estimate(pair: Pair, answer: Answer, bundle: Bundle, depth_m: float) -> dic
         "chi2": float(found.chi2),
         "p_value": float(found.p_value),
         "within_95": bool(abs(error) <= WITHIN * sigma),
-        "status": status,
+        "status": fault or describe(int(found.status)),
     }
+
+
+def _answer_fault(answer: Answer) -> str:
+    """Why an answer gives no depth with a standard deviation; empty if it does."""
+    for position in POSITIONS:
+        spot = getattr(answer, position)
+        if spot.status != OK or spot.uv_px is None:
+            return f"{position}: {spot.status}"
+        if spot.covariance_px2 is None:
+            return f"{position}: a place without covariance"
+    return ""
 
 
 def _depth_of(pair: Pair, answer: Answer, bundle: Bundle | None) -> GeneralDepth:
