@@ -2,8 +2,8 @@
 
 For every rig of a data set (recipe `paper-misaligned`, or any with experiments and calibration spots):
 
-1. outlines of the mirror in the frames, one per mirror pose, and the spots of the experiment "calibration", whose
-   distances were measured with a ruler, give the rig with its covariance (`calibration.bundle`);
+1. outlines of the mirror in the frames, one for each of some mirror poses, and the spots of the experiment
+   "calibration", whose distances were measured with a ruler, give the rig with its covariance (`calibration.bundle`);
 2. every other pair gives D with its standard deviation (`depth_general`), from the method that reaches the limit of
    such frames, with the calibrated rig;
 3. beside it stands the bound: the pixels' Cramer-Rao bound and the same calibration, at the true pixels.
@@ -29,8 +29,8 @@ from phibench.estimator.calibration.dataset import frame_outline, frame_spots
 from phibench.estimator.calibration.outline_mean import mean_outline
 from phibench.estimator.calibration.spots import Ruler, method_for, one_per_pose
 from phibench.estimator.depth_general import GeneralDepth, depth_general
-from phibench.estimator.seat.pair import Answer, Pair
-from phibench.estimator.status import Status, describe
+from phibench.estimator.seat.pair import OK, Answer, Pair
+from phibench.estimator.status import describe
 from phibench.scenes.rig import POSITIONS
 
 CALIBRATION = "calibration"
@@ -87,6 +87,8 @@ class Procedure:
         How the places of the calibration spots are measured.
     calibration : str
         Experiment with these spots.
+    outlines : int
+        Mirror poses whose outlines are taken, spread over those that there are; the room behind the limb differs.
     """
 
     preset: str = "mjpeg"
@@ -94,6 +96,7 @@ class Procedure:
     laser_off: bool = True
     ruler: Ruler = field(default=Ruler())
     calibration: str = CALIBRATION
+    outlines: int = 6
 
 
 Told = Callable[[str], None]
@@ -134,7 +137,7 @@ def run_experiments(
 
 
 def calibrate_rig(dataset: Dataset, rig: str, procedure: Procedure) -> Bundle:
-    """Calibration of one rig from its frames: outlines of all poses, and the calibration spots.
+    """Calibration of one rig from its frames: outlines of some poses, and the calibration spots.
 
     Raises
     ------
@@ -149,7 +152,9 @@ def calibrate_rig(dataset: Dataset, rig: str, procedure: Procedure) -> Bundle:
             "distances; make the recipe paper-misaligned, or add such an experiment to yours"
         )
     preset, off = procedure.preset, procedure.laser_off
-    outlines = [frame_outline(dataset, sample, position, preset, off) for sample, position in one_per_pose(samples)]
+    poses = one_per_pose(samples)
+    chosen = sorted({round(place) for place in np.linspace(0, len(poses) - 1, max(procedure.outlines, 1))})
+    outlines = [frame_outline(dataset, *poses[place], preset, off) for place in chosen]
     spots = frame_spots(dataset, known, preset, procedure.ruler, off, LEAST_SPOTS)
     return calibrate(known[0].nominal_rig, mean_outline(outlines), spots)
 
@@ -179,9 +184,7 @@ def measure(dataset: Dataset, samples: Sequence[Sample], bundle: Bundle, procedu
 
 def _estimate(pair: Pair, answer: Answer, bundle: Bundle, depth_m: float) -> dict[str, Any]:
     found = _depth_of(pair, answer, bundle)
-    status = next((s.status for s in (answer.down, answer.up) if s.status != "ok"), describe(int(found.status)))
-    if status == describe(int(Status.OK)) and not np.isfinite(found.sigma_m):
-        status = "no covariance claimed"
+    fault = _answer_fault(answer)
     error, sigma = float(found.depth_m) - depth_m, float(found.sigma_m)
     return {
         "estimate_m": float(found.depth_m),
@@ -193,8 +196,19 @@ def _estimate(pair: Pair, answer: Answer, bundle: Bundle, depth_m: float) -> dic
         "chi2": float(found.chi2),
         "p_value": float(found.p_value),
         "within_95": bool(abs(error) <= WITHIN * sigma),
-        "status": status,
+        "status": fault or describe(int(found.status)),
     }
+
+
+def _answer_fault(answer: Answer) -> str:
+    """Why an answer gives no depth with a standard deviation; empty if it does."""
+    for position in POSITIONS:
+        spot = getattr(answer, position)
+        if spot.status != OK or spot.uv_px is None:
+            return f"{position}: {spot.status}"
+        if spot.covariance_px2 is None:
+            return f"{position}: a place without covariance"
+    return ""
 
 
 def _depth_of(pair: Pair, answer: Answer, bundle: Bundle | None) -> GeneralDepth:

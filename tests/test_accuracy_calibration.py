@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 from scipy import stats
 from test_calibration import apparent
 
@@ -115,6 +116,7 @@ def calibrated_errors(known: str, rigs: int) -> tuple[np.ndarray, np.ndarray]:
     return errors, predicted
 
 
+@pytest.mark.slow
 def test_accuracy_of_depth_with_drawn_strokes_and_measured_places() -> None:
     """Strokes off by 0.5 mm and 0.05 %, their axis by 0.2 deg, besides all else; spots of 0.02 px, D to 1 mm.
 

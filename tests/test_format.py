@@ -78,7 +78,7 @@ def test_files() -> None:
     views = {layout.view_file("POSE", name) for name in ("ambient", "truth", "preview")}
     spots = {layout.spot_file("SAMPLE", position) for position in ("down", "up")}
     single = {layout.INFO, layout.MANIFEST, layout.TABLE, layout.RECIPE, layout.SUMS, layout.RUN, layout.CONTACT_SHEET}
-    single |= {layout.LOG, layout.JOURNAL, layout.LIGHT_MAP, layout.RIGS}
+    single |= {layout.LOG, layout.JOURNAL, layout.LIGHT_MAP, layout.RIGS, layout.SENSITIVITIES}
     assert said == views | spots | single | {layout.preview_file("SAMPLE")}
 
 

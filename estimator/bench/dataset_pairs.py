@@ -18,7 +18,7 @@ from phibench.datasets.frame_source import FrameSource, Side
 from phibench.datasets.frames import Frames
 from phibench.datasets.provenance import provenance
 from phibench.datasets.read import Dataset, Sample
-from phibench.datasets.sensor_card import card_of
+from phibench.datasets.sensor_card import SensorCard, card_of
 from phibench.datasets.taken import TakenSample
 from phibench.datasets.takes import Take, takes
 from phibench.estimator.bench.spot_bounds import spot_bounds, spot_electrons
@@ -92,6 +92,15 @@ class DatasetPairs:
             up=_spot_truth(sample, source, "up"),
             believed_stroke_m=sample.row.nominal_stroke_m,
         )
+
+    def image(self, number: int, position: str, laser: bool) -> Image:
+        """One image of a pair, alone; the same bytes as in `pair`."""
+        take, _, source = self._drawn_from(number)
+        return source.frame(position, take.exposure_number, laser).image
+
+    def card(self, number: int) -> SensorCard:
+        """Numbers of the sensor, with the exposure that was chosen; no frame is drawn."""
+        return card_of(self._drawn_from(number)[2].sides["down"].chain.sensor)
 
     def document(self) -> dict[str, Any]:
         """Provenance of the set."""

@@ -75,8 +75,8 @@ def calibrate_dataset(
 
 def frame_outline(dataset: Dataset, sample: Sample, position: str, preset: str, laser_off: bool = True) -> Outline:
     """Outline in one drawn frame of a sample, with the believed rig."""
-    pair = pairs_of(dataset, [sample], preset, laser_off=laser_off).pair(0)
-    return find_outline(getattr(pair, f"{position}_off" if laser_off else position), sample.nominal_rig, pair.card)
+    pairs = pairs_of(dataset, [sample], preset, laser_off=laser_off)
+    return find_outline(pairs.image(0, position, not laser_off), sample.nominal_rig, pairs.card(0))
 
 
 def frame_spots(
