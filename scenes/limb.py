@@ -1,7 +1,8 @@
 """The occluding contour of a mirror with a form error: where lines of sight touch it.
 
-A mirror point P shows itself to the eye E as an edge where g(P) = 0 and grad g . (P - E) = 0 (`form`). In the half-plane
-of the eye, the centre and a direction across there is one such point, because the mirror is convex and holds the centre.
+A mirror point P shows itself to the eye E as an edge where g(P) = 0 and grad g . (P - E) = 0 (`form`). In the
+half-plane of the eye, the centre and a direction across there is one such point, because the mirror is convex and holds
+the centre.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ def limb_points(eye_m: Array, across: Array, radius_m: float, form: Form) -> Arr
         P = _surface(n, radius_m, form)
         at = level(P, radius_m, form)
         rho = np.linalg.norm(P, axis=-1, keepdims=True)
-        rho1 = -rho * np.sum(at.gradient * n1, axis=-1, keepdims=True)  # d rho / d angle: n is radial, grad g = n - grad f
+        rho1 = -rho * np.sum(
+            at.gradient * n1, axis=-1, keepdims=True
+        )  # d rho / d angle: n is radial, grad g = n - grad f
         P1 = rho * n1 + rho1 * n
         facing = np.sum(at.gradient * (P - eye_m), axis=-1)
         slope = np.einsum("ni,nij,nj->n", P1, at.hessian_per_m, P - eye_m)

@@ -30,6 +30,7 @@ from phibench.estimator.triangulate import depth_exact
 from phibench.render.motion import spot_velocity_px_per_s
 from phibench.scenes.catalog import c310_rig, default_rig
 from phibench.scenes.checks import SceneError
+from phibench.scenes.form import Form
 from phibench.scenes.frames import Pose
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
@@ -312,7 +313,9 @@ def test_a_data_set_says_what_is_true_and_what_is_believed(misaligned_dataset: P
     assert report.ok, report.faults
     dataset = open_finished(misaligned_dataset)
     nominal, true = dataset.rigs["rig"], dataset.rigs["true"]
-    assert dataset.rig == true == nominal.perturbed(Misalignment(0.0, 2e-3, tilt_x_rad=0.01, yaw_rad=0.02))
+    wrong = Misalignment(0.0, 2e-3, tilt_x_rad=0.01, yaw_rad=0.02, form_31c_m=5e-5)
+    assert dataset.rig == true == nominal.perturbed(wrong)
+    assert (nominal.mirror.form, true.mirror.form) == (None, Form(form_31c_m=5e-5))
     assert len(dataset.samples) >= 2
     for sample in dataset:
         assert (sample.rig, sample.nominal_rig) == (true, nominal)
