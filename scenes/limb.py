@@ -13,6 +13,7 @@ from phibench.scenes.form import Form, deviation, level
 from phibench.scenes.frames import Array
 
 _STEPS = 8  # Newton's method starts within the form's slopes, some 1e-3 rad
+_CLOSE_RAD = 1e-9  # the step after that would be its square
 
 
 def limb_points(eye_m: Array, across: Array, radius_m: float, form: Form) -> Array:
@@ -39,7 +40,10 @@ def limb_points(eye_m: Array, across: Array, radius_m: float, form: Form) -> Arr
         P1 = rho * n1 + rho1 * n
         facing = np.sum(at.gradient * (P - eye_m), axis=-1)
         slope = np.einsum("ni,nij,nj->n", P1, at.hessian_per_m, P - eye_m)
-        angle = angle - facing / slope
+        step = facing / slope
+        angle = angle - step
+        if not np.any(np.abs(step) > _CLOSE_RAD):
+            break
     return _surface(_directions(axis, across, angle)[0], radius_m, form)
 
 

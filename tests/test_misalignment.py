@@ -30,7 +30,7 @@ from phibench.estimator.triangulate import depth_exact
 from phibench.render.motion import spot_velocity_px_per_s
 from phibench.scenes.catalog import c310_rig, default_rig
 from phibench.scenes.checks import SceneError
-from phibench.scenes.form import Form
+from phibench.scenes.form import HARMONICS, Form
 from phibench.scenes.frames import Pose
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
@@ -42,8 +42,9 @@ EPS = 1e-14  # metres or cosines: a few roundings of numbers of order 1
 
 
 def draw(rng: np.random.Generator, size: float = 1.0) -> Misalignment:
-    """All parameters at once, uniform within their study magnitudes times `size`; roughness not below 0."""
-    values = {name: rng.uniform(-1.0, 1.0) * size * one.study for name, one in PARAMETERS.items()}
+    """All parameters but the form, uniform within their study magnitudes times `size`; roughness not below 0."""
+    names = [name for name in PARAMETERS if name not in HARMONICS]
+    values = {name: rng.uniform(-1.0, 1.0) * size * PARAMETERS[name].study for name in names}
     return Misalignment(**{**values, "roughness_alpha": abs(values["roughness_alpha"])})
 
 
