@@ -221,6 +221,8 @@ def test_a_stroke_error_alone_keeps_the_rig() -> None:
         ({"axial_m": -0.1, "radius_m": 0.1}, "misalignment", ("in front of",)),
         ({"stroke_offset_m": -1.0}, "misalignment", ("it must stay above 0",)),
         ({"roughness_alpha": -0.01}, "misalignment", ("roughness_alpha", "0.0 to 0.05")),
+        ({"form_20_m": 0.002}, "misalignment.form_20_m", ("0.002", "from -0.001 up to 0.001")),
+        ({"radius_m": -0.056, "form_33c_m": 1e-3}, "misalignment", ("too far from round", "make it smaller")),
     ],
 )
 def test_faults_of_a_recipe(values: dict[str, Any], path: str, words: tuple[str, ...]) -> None:
