@@ -54,7 +54,7 @@ BUDGET: dict[str, tuple[float, str, str]] = {
     "roll_rad": (TENTH, "0.1 deg", "-"),
     "yaw_rad": (TENTH, "0.1 deg", "-"),
     "shift_y_m": (1e-3, "1 mm", "-"),
-    **{name: (2e-5, "20 um", "-") for name in HARMONICS},
+    **dict.fromkeys(HARMONICS, (2e-5, "20 um", "-")),
 }
 ESTIMATORS = ("exact", "paper_ray", "paper_normal", "paper_incidence", "paper_outline", "approx_ray")
 COMPARED = tuple(name for name in BUDGET if name not in ("k1", "k2", "k3", "p1", "p2", "stroke_relative"))[:10]

@@ -1,9 +1,10 @@
 """The certificate of a spot in one view: the world-side closed form against a camera-side ray tracer.
 
-`spot_truth` and `spot_cloud` go from the spot to the lens (Alhazen's problem, Coddington's equations). Here rays go
-from the film through the aperture to the mirror and on to the wall, and the film position that meets a given wall point
-is found by Newton's method. Power is radiance times etendue. A rough mirror reflects each ray at a facet with a drawn
-slope, where `rough_cloud` evaluates the BRDF at given pairs. Only the scene's numbers are shared.
+`spot_truth` and `spot_cloud` go from the spot to the lens (Alhazen's problem, Coddington's equations; Fermat's path and
+its second derivatives where the mirror has a form error). Here rays go from the film through the aperture to the mirror
+(for a form from values of its radius alone, `form_trace`) and on to the wall, and the film position that meets a given
+wall point is found by Newton's method. Power is radiance times etendue. A rough mirror reflects each ray at a facet
+with a drawn slope, where `rough_cloud` evaluates the BRDF at given pairs. Only the scene's numbers are shared.
 """
 
 from __future__ import annotations

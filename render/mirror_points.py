@@ -56,5 +56,5 @@ def bundle_spread(view: View, mirror_m: Array, points_m: Array, eyes_m: Array, c
         spread = s**2 * (1.0 + far * (1.0 / s + 2.0 / (mirror.radius_m * cos_i)))
         return spread * (1.0 + far * (1.0 / s + 2.0 * cos_i / mirror.radius_m))
     axes, centre = view.T_world_sphere.R, view.sphere_centre_m
-    places = ((place - centre) @ axes for place in (mirror_m, points_m, eyes_m))
-    return (s * far / cos_i) ** 2 * path_determinant(*places, mirror.radius_m, mirror.form)
+    P, a, b = ((place - centre) @ axes for place in (mirror_m, points_m, eyes_m))
+    return (s * far / cos_i) ** 2 * path_determinant(P, a, b, mirror.radius_m, mirror.form)

@@ -1,4 +1,4 @@
-"""Exact answers for one laser spot in one view: the chief ray, by closed form (a form error: Fermat's path) in float64."""
+"""Exact answers for one laser spot in one view: the chief ray, by closed form (or Fermat's path) in float64."""
 
 from __future__ import annotations
 

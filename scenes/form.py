@@ -1,9 +1,10 @@
 """Form error of the mirror: low-order harmonics that are added to the sphere's radius.
 
-The surface is r(n) = R + sum of c_k h_k(n), n = (x, y, z) a unit direction in the sphere's own frame (`T_camera_sphere`;
-`Rig.perturbed` lays its axes along the world's at the down position: z up, so that -z faces the camera). The real
-harmonics h_k of degree 2 and 3 are scaled to a largest magnitude of 1: a coefficient is the peak of what it adds, in
-metres, and not its rms. Degree 0 is the radius and degree 1, to first order, a decentre: both are parameters already.
+The surface is r(n) = R + sum of c_k h_k(n), with n = (x, y, z) a unit direction in the sphere's own frame
+(`T_camera_sphere`; `Rig.perturbed` lays its axes along the world's at the down position: z up, so that -z faces the
+camera). The real harmonics h_k of degree 2 and 3 are scaled to a largest magnitude of 1: a coefficient is the peak of
+what it adds, in metres, and not its rms. Degree 0 is the radius and degree 1, to first order, a decentre: both are
+parameters already.
 
     20    (3 z^2 - 1) / 2        +1 at the poles (top and bottom), -1/2 around the equator
     21c   2 x z                  21s  2 y z
@@ -127,7 +128,10 @@ def deviation(points_m: Array, form: Form) -> Level:
     n, I3 = points_m / rho[..., None], np.eye(3)
     q, t2 = n @ Q, (n @ T.reshape(3, 9)).reshape(*n.shape, 3)
     t1 = np.einsum("...ij,...j->...i", t2, n)
-    parts = ((2, np.einsum("...i,...i", q, n), 2.0 * q, 2.0 * Q), (3, np.einsum("...i,...i", t1, n), 3.0 * t1, 6.0 * t2))
+    parts = (
+        (2, np.einsum("...i,...i", q, n), 2.0 * q, 2.0 * Q),
+        (3, np.einsum("...i,...i", t1, n), 3.0 * t1, 6.0 * t2),
+    )
     value, gradient, hessian = np.zeros_like(rho), np.zeros_like(n), np.zeros((*n.shape, 3))
     nn = n[..., :, None] * n[..., None, :]
     for degree, H, dH, ddH in parts:  # of |P|^-l H(P) at |P| = 1; rho comes in at the end

@@ -1,7 +1,8 @@
 """The occluding contour of a mirror with a form error: where lines of sight touch it.
 
-A mirror point P shows itself to the eye E as an edge where g(P) = 0 and grad g . (P - E) = 0 (`form`). In the half-plane
-of the eye, the centre and a direction across there is one such point, because the mirror is convex and holds the centre.
+A mirror point P shows itself to the eye E as an edge where g(P) = 0 and grad g . (P - E) = 0 (`form`). In the
+half-plane of the eye, the centre and a direction across there is one such point, because the mirror is convex and holds
+the centre.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from phibench.scenes.form import Form, deviation, level
 from phibench.scenes.frames import Array
 
 _STEPS = 8  # Newton's method starts within the form's slopes, some 1e-3 rad
+_CLOSE_RAD = 1e-9  # the step after that would be its square
 
 
 def limb_points(eye_m: Array, across: Array, radius_m: float, form: Form) -> Array:
@@ -32,11 +34,16 @@ def limb_points(eye_m: Array, across: Array, radius_m: float, form: Form) -> Arr
         P = _surface(n, radius_m, form)
         at = level(P, radius_m, form)
         rho = np.linalg.norm(P, axis=-1, keepdims=True)
-        rho1 = -rho * np.sum(at.gradient * n1, axis=-1, keepdims=True)  # d rho / d angle: n is radial, grad g = n - grad f
+        rho1 = -rho * np.sum(
+            at.gradient * n1, axis=-1, keepdims=True
+        )  # d rho / d angle: n is radial, grad g = n - grad f
         P1 = rho * n1 + rho1 * n
         facing = np.sum(at.gradient * (P - eye_m), axis=-1)
         slope = np.einsum("ni,nij,nj->n", P1, at.hessian_per_m, P - eye_m)
-        angle = angle - facing / slope
+        step = facing / slope
+        angle = angle - step
+        if not np.any(np.abs(step) > _CLOSE_RAD):
+            break
     return _surface(_directions(axis, across, angle)[0], radius_m, form)
 
 

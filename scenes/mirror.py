@@ -39,7 +39,7 @@ STEEL = np.array(
 STEEL.setflags(write=False)
 
 _LEAST_CURVATURE = 0.5  # times 1/R: convex with a margin, so that every point has one image at most
-_PLACES = 2000  # where the curvature is looked at: 3 degrees apart, for harmonics that turn over in 60
+_PLACES = 500  # where the curvature is looked at, 9 degrees apart: peaks of degree 3 are missed by 5 % at most
 
 
 @dataclass(frozen=True)

@@ -88,11 +88,18 @@ def tiny_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def misaligned_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Data set of `tests/tiny.toml` with a tilt, a decentre, a stroke that is too long and a yaw between the images."""
+    """Data set of `tests/tiny.toml` with a tilt, a decentre, a form, a stroke too long and a yaw between the images."""
     from phibench.datasets.make import make
 
     folder, text = tmp_path_factory.mktemp("misaligned"), (ROOT / "tests" / "tiny.toml").read_text(encoding="utf-8")
-    table = "[misalignment]\ntilt_x_rad = 0.01\ndecentre_y_m = 2e-3\nstroke_relative = 0.01\nyaw_rad = 0.02\n\n"
+    wrong = (
+        "tilt_x_rad = 0.01",
+        "decentre_y_m = 2e-3",
+        "form_31c_m = 5e-5",
+        "stroke_relative = 0.01",
+        "yaw_rad = 0.02",
+    )
+    table = "\n".join(("[misalignment]", *wrong, "", ""))
     (folder / "recipe.toml").write_text(text.replace("[[targets]]", f"{table}[[targets]]", 1), encoding="utf-8")
     return make(folder / "recipe.toml", folder / "out", workers=2)
 

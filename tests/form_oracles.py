@@ -89,8 +89,9 @@ def _across(n: np.ndarray) -> np.ndarray:
     return np.stack([first, np.cross(n, first)])
 
 
-def _derivatives(f, h: np.longdouble = np.longdouble(1e-4)) -> tuple[np.ndarray, np.ndarray]:
+def _derivatives(f) -> tuple[np.ndarray, np.ndarray]:
     """Gradient (2,) and second derivatives (2, 2) at 0 by five-point stencils."""
+    h = np.longdouble(1e-4)
     e = h * np.eye(2, dtype=np.longdouble)
     centre = f(0 * e[0])
     slope, curvature = np.zeros(2, np.longdouble), np.zeros((2, 2), np.longdouble)

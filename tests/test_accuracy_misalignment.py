@@ -1,4 +1,5 @@
-"""Misaligned rigs, all parameters but the form (`test_accuracy_form.py`) drawn at once: closed form, spot layer and truth against other mathematics."""
+"""Misaligned rigs, all parameters but the form drawn at once: closed form, spot layer and truth against other
+mathematics. With the form: `test_accuracy_form.py`."""
 
 from __future__ import annotations
 

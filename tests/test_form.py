@@ -173,16 +173,16 @@ def test_the_form_lies_along_the_worlds_axes_and_goes_with_the_rig() -> None:
 @pytest.mark.parametrize("name", HARMONICS)
 def test_the_largest_form_is_possible_and_more_than_the_mirror_bears_is_not(name: str) -> None:
     assert SphereMirror(form=Form(**{name: 1e-3})).bound_m == R + 1e-3
-    with pytest.raises(SceneError, match="SphereMirror.form is too far from round"):
+    with pytest.raises(SceneError, match=r"SphereMirror.form is too far from round"):
         SphereMirror(form=Form(**{name: 0.02}))
-    with pytest.raises(SceneError, match="too far from round.*make it smaller"):
+    with pytest.raises(SceneError, match=r"too far from round.*make it smaller"):
         SphereMirror(form=Form(**{name: 0.04}))
 
 
 def test_faults_of_a_form() -> None:
-    with pytest.raises(SceneError, match="Form.form_30_m = nan: must be a finite number"):
+    with pytest.raises(SceneError, match=r"Form.form_30_m = nan: must be a finite number"):
         Form(form_30_m=math.nan)
-    with pytest.raises(SceneError, match="Misalignment.form_30_m = 0.002"):
+    with pytest.raises(SceneError, match=r"Misalignment.form_30_m = 0.002"):
         Misalignment(form_30_m=0.002)
 
 
@@ -226,7 +226,7 @@ def test_rays_from_values_against_newtons_method() -> None:
 
 
 def test_rays_inside_a_kernel_against_those_in_float64() -> None:
-    """The ambient layer's rays: the origin, 200 to 300 mm off, is float32 in the scene: 1.5e-5 mm, over cos i >= 0.05."""
+    """The ambient layer's rays start 200 to 300 mm off, in float32: 1.5e-5 mm, over cos i >= 0.05."""
     from phibench.render import form_kernel
     from phibench.render.variant import activate
 

@@ -30,6 +30,7 @@ from phibench.estimator.triangulate import depth_exact
 from phibench.render.motion import spot_velocity_px_per_s
 from phibench.scenes.catalog import c310_rig, default_rig
 from phibench.scenes.checks import SceneError
+from phibench.scenes.form import HARMONICS, Form
 from phibench.scenes.frames import Pose
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
@@ -41,8 +42,9 @@ EPS = 1e-14  # metres or cosines: a few roundings of numbers of order 1
 
 
 def draw(rng: np.random.Generator, size: float = 1.0) -> Misalignment:
-    """All parameters at once, uniform within their study magnitudes times `size`; roughness not below 0."""
-    values = {name: rng.uniform(-1.0, 1.0) * size * one.study for name, one in PARAMETERS.items()}
+    """All parameters but the form, uniform within their study magnitudes times `size`; roughness not below 0."""
+    names = [name for name in PARAMETERS if name not in HARMONICS]
+    values = {name: rng.uniform(-1.0, 1.0) * size * PARAMETERS[name].study for name in names}
     return Misalignment(**{**values, "roughness_alpha": abs(values["roughness_alpha"])})
 
 
@@ -219,6 +221,8 @@ def test_a_stroke_error_alone_keeps_the_rig() -> None:
         ({"axial_m": -0.1, "radius_m": 0.1}, "misalignment", ("in front of",)),
         ({"stroke_offset_m": -1.0}, "misalignment", ("it must stay above 0",)),
         ({"roughness_alpha": -0.01}, "misalignment", ("roughness_alpha", "0.0 to 0.05")),
+        ({"form_20_m": 0.002}, "misalignment.form_20_m", ("0.002", "from -0.001 up to 0.001")),
+        ({"radius_m": -0.056, "form_33c_m": 1e-3}, "misalignment", ("too far from round", "make it smaller")),
     ],
 )
 def test_faults_of_a_recipe(values: dict[str, Any], path: str, words: tuple[str, ...]) -> None:
@@ -312,7 +316,9 @@ def test_a_data_set_says_what_is_true_and_what_is_believed(misaligned_dataset: P
     assert report.ok, report.faults
     dataset = open_finished(misaligned_dataset)
     nominal, true = dataset.rigs["rig"], dataset.rigs["true"]
-    assert dataset.rig == true == nominal.perturbed(Misalignment(0.0, 2e-3, tilt_x_rad=0.01, yaw_rad=0.02))
+    wrong = Misalignment(0.0, 2e-3, tilt_x_rad=0.01, yaw_rad=0.02, form_31c_m=5e-5)
+    assert dataset.rig == true == nominal.perturbed(wrong)
+    assert (nominal.mirror.form, true.mirror.form) == (None, Form(form_31c_m=5e-5))
     assert len(dataset.samples) >= 2
     for sample in dataset:
         assert (sample.rig, sample.nominal_rig) == (true, nominal)

@@ -196,3 +196,19 @@ def test_an_unfinished_or_changed_data_set_is_not_opened_as_finished(copy: Path)
 def test_a_sample_prints_short(dataset: Dataset) -> None:
     assert "dataset" not in repr(dataset.samples[0]).split("(", 1)[1].split("row=")[0]
     assert len(repr(dataset.samples[0])) < 5000
+
+
+def test_a_data_set_of_version_4_is_read_as_perfect_spheres(tiny_dataset: Path, tmp_path: Path) -> None:
+    """Version 4 has no `mirror.form`: what was true then is true now, and verification agrees."""
+    from phibench.datasets.verify_plan import plan_faults
+
+    copy = Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
+    info = json.loads((copy / layout.INFO).read_text())
+    (copy / layout.INFO).write_text(json.dumps({**info, "schema_version": 4}))
+    lines = [json.loads(line) for line in (copy / layout.RIGS).read_text().splitlines()]
+    assert [line["resolved"]["mirror"].pop("form") for line in lines] == [None] * len(lines)
+    (copy / layout.RIGS).write_text("".join(json.dumps(line) + "\n" for line in lines))
+    old, new = open_dataset(copy), open_dataset(tiny_dataset)
+    assert old.rigs["rig"] == new.rigs["rig"]
+    assert old.rigs["rig"].mirror.form is None
+    assert list(plan_faults(old)) == []
