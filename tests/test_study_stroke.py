@@ -41,6 +41,7 @@ outline_sigma_um = [8.0, 8.0, 24.0]
 [check]
 preset = "bayer-raw"
 depths_m = [1.0]
+power_mw = 0.3
 factors = [0.3, 1.0]
 strokes_m = [0.1, 2.1]
 draws = 8
@@ -49,13 +50,13 @@ draws = 8
 
 def _best(sigmas: list[float], limits: tuple[str, ...] = (), causes: tuple[str, ...] | None = None) -> BestStroke:
     strokes, zero = np.linspace(0.2, 1.4, len(sigmas)), np.zeros(len(sigmas))
-    curve = StrokeCurve(strokes, np.array(sigmas), zero, zero, causes or (FREE,) * len(sigmas))
+    curve = StrokeCurve(strokes, np.array(sigmas), zero, zero, zero, causes or (FREE,) * len(sigmas))
     k = int(np.argmin(sigmas))
-    return BestStroke(2.0, float(strokes[k]), sigmas[k], sigmas[k], 0.0, 0.0, limits, curve)
+    return BestStroke(2.0, float(strokes[k]), sigmas[k], sigmas[k], 0.0, 0.0, 0.0, limits, curve)
 
 
 def _checked(factor: float, predicted: float, size: float, n: int = 400, name: str = AS_BUILT) -> Checked:
-    check = Check(name, 1.0, 0.5 * factor, factor, predicted, (), 0.5, "bayer-raw", n)
+    check = Check(name, 1.0, 0.5 * factor, factor, predicted, (), 0.5, "bayer-raw", 0.3, n)
     return Checked(check, tuple(np.resize([size, -size], n).tolist()))
 
 
@@ -74,18 +75,18 @@ def test_drawn_rigs_have_the_covariance() -> None:
 
 
 def test_intervals_of_an_rms_cover() -> None:
-    # 400 samples of 20 normal numbers: 95 % +- 1.1 %; 4 sigma
+    # 200 samples of 48 normal numbers: a rate of 95 % is seen to 1.5 %; 4 sigma. BCa itself lacks a per cent or two
     random = generator("test", "rms")
-    covered = [_inside(Checked(_checked(1.0, 1.0, 1.0).check, tuple(random.standard_normal(20)))) for _ in range(400)]
-    assert abs(np.mean(covered) - 0.95) < 0.044
+    covered = [_inside(Checked(_checked(1.0, 1.0, 1.0).check, tuple(random.standard_normal(48)))) for _ in range(200)]
+    assert 0.87 < np.mean(covered) <= 1.0
     wrong = [
         _inside(Checked(_checked(1.0, 1.0, 1.0).check, tuple(1.5 * random.standard_normal(20)))) for _ in range(99)
     ]
-    assert np.mean(wrong) < 0.6
+    assert np.mean(wrong) < 0.5
 
 
 def _inside(checked: Checked) -> bool:
-    low, high = checked.interval_m()
+    low, high = checked.interval_m
     return bool(low <= 1.0 <= high) and checked.fits
 
 
@@ -115,7 +116,7 @@ def test_best_strokes_with_and_without_limit_or_stroke() -> None:
         "a: D = 2 m best h 1.40 m, sigma 2 mm (0.1 %; within 5 % from 1.40 to 1.40 m; limit: longest stroke)."
     )
     assert "limit" not in best_sentence({("a", 2.0): _best([4e-3, 2e-3, 3e-3])}, "a", (2.0,))
-    nan = (math.nan,) * 5
+    nan = (math.nan,) * 6
     none = BestStroke(2.0, *nan, (CEILING,), _best([1.0, 1.0]).curve)
     assert best_sentence({("a", 2.0): none}, "a", (2.0,)) == "a: D = 2 m: no stroke, ceiling."
 

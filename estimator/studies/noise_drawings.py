@@ -61,11 +61,8 @@ def _panel(ax: Any, part: pl.DataFrame, factor: str, methods: Sequence[str]) -> 
         ends = (curve[f"rms_px_{end}"].to_numpy() for end in ("low", "high"))
         low, high = (np.where(np.isfinite(end), np.abs(y - end), 0.0) for end in ends)
         # more methods than colours: those of the second round have open markers and other lines
-        style = {
-            **line_style(i),
-            "marker": line_style(i + i // 8)["marker"],
-            "linestyle": line_style(i + i // 8)["linestyle"],
-        }
+        other = line_style(i + i // len(COLOURS))
+        style = {**line_style(i), "marker": other["marker"], "linestyle": other["linestyle"]}
         face = style["color"] if i < len(COLOURS) else "white"
         ax.errorbar(x, y, np.stack([low, high]), label=method, markersize=3.5, linewidth=1.0, mfc=face, **style)
     bound = part.group_by("level").agg(pl.col("bound_px").max()).sort("level")
@@ -92,9 +89,10 @@ def _bars(ax: Any, found: list[tuple[int, Elasticity]], shift: float, k: int, la
 def _alt(mine: pl.DataFrame, sample: str, preset: str) -> str:
     known = mine.filter(pl.col("rms_px").is_not_nan())
     low, high = (float(getattr(known["rms_px"], name)() or math.nan) for name in ("min", "max"))
+    factors = sum(name in FACTORS for name in mine["factor"].unique())
     return (
-        f"Rms distance of {mine['method'].n_unique()} methods on {preset} frames of {sample} against "
-        f"{sum(name in FACTORS for name in mine['factor'].unique())} factors, from {low:.3g} to {high:.3g} px, with the bound."
+        f"Rms distance of {mine['method'].n_unique()} methods on {preset} frames of {sample} against {factors} "
+        f"factors, from {low:.3g} to {high:.3g} px, with the bound."
     )
 
 
