@@ -15,6 +15,7 @@ from phibench.estimator.depth_general import depth_general
 from phibench.estimator.line_of_sight import first_blocker
 from phibench.estimator.mirror_image import MirrorImage, image_of
 from phibench.estimator.reflection import reflect
+from phibench.estimator.rig_draws import even_part_m
 from phibench.estimator.spot_flux import Laser, spot_electrons_per_s
 from phibench.estimator.spot_sigma import SpotSigma
 from phibench.estimator.status import Status
@@ -81,7 +82,10 @@ class StrokeCurve:
     ----------
     strokes_m
     sigma_spot_m, sigma_calibration_m, sigma_stroke_m
-        From the pixels' noise, the rig's parameters and the single stroke; NaN where the spot has no image.
+        From the pixels' noise, the rig's parameters and the single stroke, to first order; NaN where the spot has no
+        image.
+    sigma_second_order_m
+        What the rig's parameters do beyond: `rig_draws.even_part_m`.
     causes : tuple of str
         Why a stroke cannot be taken; `FREE` where it can.
     """
@@ -90,12 +94,14 @@ class StrokeCurve:
     sigma_spot_m: Array = field(repr=False)
     sigma_calibration_m: Array = field(repr=False)
     sigma_stroke_m: Array = field(repr=False)
+    sigma_second_order_m: Array = field(repr=False)
     causes: tuple[str, ...] = field(repr=False)
 
     @property
     def sigma_m(self) -> Array:
         """All parts together: their squares add up."""
-        return np.sqrt(self.sigma_spot_m**2 + self.sigma_calibration_m**2 + self.sigma_stroke_m**2)
+        parts = (self.sigma_spot_m, self.sigma_calibration_m, self.sigma_stroke_m, self.sigma_second_order_m)
+        return np.asarray(np.sqrt(sum(part**2 for part in parts)))
 
     @property
     def allowed_sigma_m(self) -> Array:
@@ -123,7 +129,8 @@ def stroke_curve(
     found = depth_general(rig, h[:, None], down, up, C_down, C_up, covariance_rig, np.asarray(stroke_sigma_m))
     parts = (found.sigma_spot_m, found.sigma_calibration_m, found.sigma_stroke_m)
     of_spot, of_rig, of_stroke = (np.sqrt(np.mean(part**2, axis=-1)) for part in parts)
-    return StrokeCurve(h, of_spot, of_rig, of_stroke, causes(rig, points, images[0], images[1], h, around))
+    even = even_part_m(rig, h, points, C_down, C_up, covariance_rig, stroke_sigma_m)
+    return StrokeCurve(h, of_spot, of_rig, of_stroke, even, causes(rig, points, images[0], images[1], h, around))
 
 
 def causes(

@@ -25,6 +25,7 @@ from phibench.estimator.studies.noise_findings import (
     base_sentence,
     base_table,
     floor_sentence,
+    leaving_sentence,
     ranking_sentence,
     ranking_table,
     useless_sentence,
@@ -96,6 +97,7 @@ def run(settings: NoiseSettings, material: Material) -> Result:
         for sample in settings.samples:
             findings.append(base_sentence(table, sample, preset))
             findings.append(floor_sentence(table, sample, preset))
+            findings.append(leaving_sentence(table, sample, preset))
             findings.append(useless_sentence(table, sample, preset))
             findings.append(ranking_sentence(slopes, sample, preset))
             shown[f"{preset}, {sample}: base case, 95 % intervals over places"] = base_table(table, sample, preset)

@@ -60,12 +60,19 @@ def _panel(ax: Any, part: pl.DataFrame, factor: str, methods: Sequence[str]) -> 
         x, y = curve["level"].to_numpy(), curve["rms_px"].to_numpy()
         ends = (curve[f"rms_px_{end}"].to_numpy() for end in ("low", "high"))
         low, high = (np.where(np.isfinite(end), np.abs(y - end), 0.0) for end in ends)
-        ax.errorbar(x, y, np.stack([low, high]), label=method, markersize=3.5, linewidth=1.0, **line_style(i))
+        # more methods than colours: those of the second round have open markers and other lines
+        other = line_style(i + i // len(COLOURS))
+        style = {**line_style(i), "marker": other["marker"], "linestyle": other["linestyle"]}
+        face = style["color"] if i < len(COLOURS) else "white"
+        ax.errorbar(x, y, np.stack([low, high]), label=method, markersize=3.5, linewidth=1.0, mfc=face, **style)
     bound = part.group_by("level").agg(pl.col("bound_px").max()).sort("level")
     ax.plot(bound["level"], bound["bound_px"], color="black", linewidth=2.0, label="bound")
     ax.axvline(FACTORS[factor].base, color="grey", linewidth=0.8, linestyle=":")
     ax.set_xscale("linear" if factor in _LINEAR else "log")
     ax.set_yscale("log")
+    levels = bound["level"].to_list()
+    ax.set_xticks(levels, [f"{x:.3g}" for x in levels], fontsize=7)
+    ax.minorticks_off()
     ax.set_xlabel(FACTORS[factor].label)
 
 
@@ -82,9 +89,10 @@ def _bars(ax: Any, found: list[tuple[int, Elasticity]], shift: float, k: int, la
 def _alt(mine: pl.DataFrame, sample: str, preset: str) -> str:
     known = mine.filter(pl.col("rms_px").is_not_nan())
     low, high = (float(getattr(known["rms_px"], name)() or math.nan) for name in ("min", "max"))
+    factors = sum(name in FACTORS for name in mine["factor"].unique())
     return (
-        f"Rms distance of {mine['method'].n_unique()} methods on {preset} frames of {sample} against "
-        f"{mine['factor'].n_unique()} factors, from {low:.3g} to {high:.3g} px, with the bound."
+        f"Rms distance of {mine['method'].n_unique()} methods on {preset} frames of {sample} against {factors} "
+        f"factors, from {low:.3g} to {high:.3g} px, with the bound."
     )
 
 

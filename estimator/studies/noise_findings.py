@@ -18,6 +18,10 @@ FLOOR = 2.0
 """A method has a floor where its error is surely above so many times the bound with the strongest signal."""
 FEW = 0.9
 """Detection rate below which a local bound says little."""
+BELOW = 0.9
+"""Errors that are surely below so many times the bound speak against the bound."""
+ABOVE = 1.25
+"""The reference method leaves the bound where it is surely so many times above it."""
 
 
 def base_sentence(table: pl.DataFrame, sample: str, preset: str) -> str:
@@ -66,17 +70,11 @@ def floor_sentence(table: pl.DataFrame, sample: str, preset: str) -> str:
 
 
 def useless_sentence(table: pl.DataFrame, sample: str, preset: str) -> str:
-    """Where the bound stops to say anything: spots are missed, or errors surely fall below it."""
-    rows = table.filter(_case(sample, preset), pl.col("method") == REFERENCE[preset], pl.col("factor") != BASE)
-    full = [r for r in rows.iter_rows(named=True) if r["saturated"] > 0.0]
-    missed = [r for r in rows.iter_rows(named=True) if r["detection_rate"] < FEW]
-    below = [r for r in rows.iter_rows(named=True) if r not in missed and _is_number(r["efficiency_px_low"])]
-    below = [r for r in below if r["efficiency_px_low"] > 1.1]
-    if not missed and not below and not full:
-        return (
-            f"{preset}, {sample}: at every level {REFERENCE[preset]} finds {100 * FEW:g} % of the spots or more in "
-            "their boxes and is nowhere surely better than the bound, which therefore holds over all ranges tried."
-        )
+    """Where the bound stops to say anything: pixels are full, spots are missed, or errors surely fall below it."""
+    rows = _levels(table, sample, preset)
+    full = [r for r in rows if r["saturated"] > 0.0]
+    missed = [r for r in rows if r["detection_rate"] < FEW]
+    below = [r for r in rows if r not in missed and r not in full and ratio_of(r)[2] < BELOW]
     text = []
     if full:
         text.append("pixels are full, which the bound leaves out, at " + ", ".join(map(_with_ratio, full)))
@@ -84,10 +82,29 @@ def useless_sentence(table: pl.DataFrame, sample: str, preset: str) -> str:
         text.append("spots are missed, so that the local bound means little, at " + ", ".join(map(_missed, missed)))
     if below:
         text.append(
-            "errors are surely below the bound, which is then no bound of the frames, at "
+            f"errors are surely below {BELOW:g} times the bound, which is then no bound of the frames, at "
             + ", ".join(map(_with_ratio, below))
+            + " (levels share their draws and go together)"
+        )
+    if not text:
+        return (
+            f"{preset}, {sample}: at every level {REFERENCE[preset]} finds {100 * FEW:g} % of the spots or more in "
+            f"their boxes and is nowhere surely below {BELOW:g} times the bound, which therefore holds over all ranges "
+            "tried."
         )
     return f"{preset}, {sample}: " + "; ".join(text) + "."
+
+
+def leaving_sentence(table: pl.DataFrame, sample: str, preset: str) -> str:
+    """Where the reference method itself leaves the bound while the spot is seen and no pixel is full."""
+    rows = [r for r in _levels(table, sample, preset) if r["saturated"] == 0.0 and r["detection_rate"] >= FEW]
+    left = [r for r in rows if ratio_of(r)[1] > ABOVE]
+    if not left:
+        return f"{preset}, {sample}: {REFERENCE[preset]} is at no level surely above {ABOVE:g} times the bound."
+    listed = ", ".join(
+        f"{_with_ratio(r)}, scatter {1e3 * r['scatter_px']:.3g} and bias {1e3 * r['bias_px']:.3g} mpx" for r in left
+    )
+    return f"{preset}, {sample}: {REFERENCE[preset]} leaves the bound (surely above {ABOVE:g} times) at {listed}."
 
 
 def ranking_sentence(found: Sequence[Elasticity], sample: str, preset: str) -> str:
@@ -152,11 +169,21 @@ def _base_row(row: dict[str, Any]) -> Row:
 
 
 def _missed(row: dict[str, Any]) -> str:
-    return f"{FACTORS[row['factor']].label} {row['level']:.3g} ({100 * row['detection_rate']:.0f} % found)"
+    return f"{_where(row)} ({100 * row['detection_rate']:.0f} % found)"
+
+
+def _where(row: dict[str, Any]) -> str:
+    return "the base case" if row["factor"] == BASE else f"{FACTORS[row['factor']].label} {row['level']:.3g}"
 
 
 def _with_ratio(row: dict[str, Any]) -> str:
-    return f"{FACTORS[row['factor']].label} {row['level']:.3g} (rms / bound {_ratio(row)})"
+    return f"{_where(row)} (rms / bound {_ratio(row)})"
+
+
+def _levels(table: pl.DataFrame, sample: str, preset: str) -> list[dict[str, Any]]:
+    """Rows of the reference method: the base case once, and every level that is not the base's."""
+    rows = table.filter(_case(sample, preset), pl.col("method") == REFERENCE[preset]).iter_rows(named=True)
+    return [r for r in rows if r["factor"] == BASE or abs(r["level"] - FACTORS[r["factor"]].base) > 1e-9]
 
 
 def _one(table: pl.DataFrame, sample: str, preset: str, factor: str, method: str) -> dict[str, Any] | None:

@@ -48,6 +48,7 @@ class CheckSettings(Settings):
     depths_m: _Depths = Field(description="distances")
     factors: Annotated[tuple[float, ...], Field(strict=False, min_length=1)] = Field(description="of the best stroke")
     strokes_m: _Range = Field(description="between which the best stroke is sought")
+    power_mw: float = Field(gt=0.0, le=10.0, description="of the laser; weak enough that no pixel is full")
     draws: int = Field(ge=8, le=5000, description="pairs, each of a rig of its own")
 
     @field_validator("factors")
@@ -148,19 +149,19 @@ def tolerances(rig: Rig, outline_sigma_um: Sequence[float]) -> dict[str, Array]:
 def planned(settings: StrokeSettings, rig: Rig, rigs: Mapping[str, Array]) -> list[Check]:
     """Cells of the check that lie within the limits."""
     wanted, card = settings.check, sensor_card(settings.check.preset)
+    taken = (wanted.preset, wanted.power_mw, wanted.draws)
     spot, around = spot_bound(rig, card), Surroundings(heights_m=(settings.spot_height_m,))
     checks = []
     for name, C in rigs.items():
         rows = tuple(tuple(row) for row in C.tolist())
         for d in wanted.depths_m:
-            options: dict[str, Any] = {"covariance_rig": C, "around": around, "spot": spot}
+            laser = Laser(power_w=1e-3 * wanted.power_mw)
+            options: dict[str, Any] = {"covariance_rig": C, "around": around, "spot": spot, "laser": laser}
             best = best_stroke(d, rig, strokes_m=wanted.strokes_m, card=card, **options)
             strokes = np.array([f * best.stroke_m for f in wanted.factors])
-            curve = stroke_curve(
-                rig, d, strokes, laser=Laser(), exposure_s=card.exposure_s, stroke_sigma_m=0.0, **options
-            )
+            curve = stroke_curve(rig, d, strokes, exposure_s=card.exposure_s, stroke_sigma_m=0.0, **options)
             checks += [
-                Check(name, d, float(h), f, float(s), rows, settings.spot_height_m, wanted.preset, wanted.draws)
+                Check(name, d, float(h), f, float(s), rows, settings.spot_height_m, *taken)
                 for f, h, s in zip(wanted.factors, strokes, curve.allowed_sigma_m, strict=True)
                 if math.isfinite(s)
             ]
@@ -169,7 +170,7 @@ def planned(settings: StrokeSettings, rig: Rig, rigs: Mapping[str, Array]) -> li
 
 def best_frame(found: Mapping[tuple[str, float], BestStroke]) -> pl.DataFrame:
     """A row per tolerance and distance."""
-    keys = ("depth_m", "stroke_m", "sigma_m", "sigma_spot_m", "sigma_calibration_m")
+    keys = ("depth_m", "stroke_m", "sigma_m", "sigma_spot_m", "sigma_calibration_m", "sigma_second_order_m")
     rows = [
         {
             "tolerance": name,
@@ -193,7 +194,7 @@ def check_frame(checks: Sequence[Checked]) -> pl.DataFrame:
     keys = ("tolerance", "depth_m", "stroke_m", "factor", "predicted_m")
     rows = [
         {**{key: getattr(c.check, key) for key in keys}, "rms_m": c.rms_m, "pairs": len(c.errors_m)}
-        | dict(zip(("rms_low_m", "rms_high_m"), c.interval_m(), strict=True))
+        | dict(zip(("rms_low_m", "rms_high_m"), c.interval_m, strict=True))
         for c in checks
     ]
     return pl.DataFrame(rows)
@@ -201,7 +202,8 @@ def check_frame(checks: Sequence[Checked]) -> pl.DataFrame:
 
 def _curve(name: str, best: BestStroke) -> pl.DataFrame:
     c = best.curve
-    columns = {"sigma_m": c.sigma_m, "sigma_spot_m": c.sigma_spot_m, "sigma_calibration_m": c.sigma_calibration_m}
+    names = ("sigma_m", "sigma_spot_m", "sigma_calibration_m", "sigma_second_order_m")
+    columns = {name: getattr(c, name) for name in names}
     return pl.DataFrame({"stroke_m": c.strokes_m, **columns, "cause": c.causes}).with_columns(
         tolerance=pl.lit(name), depth_m=pl.lit(best.depth_m)
     )
@@ -218,8 +220,11 @@ def _free_curves(
 
 def _notes(settings: StrokeSettings, checks: Sequence[Checked]) -> tuple[str, ...]:
     notes = [
-        "Predictions are to first order, for a round spot over a flat white wall at 1 mW and 1/60 s, rms over 8 "
-        f"azimuths; frames of the check are {settings.check.preset}, before a wall of flat light."
+        "Predictions are for a round spot over a flat white wall at 1 mW and 1/60 s, rms over 8 "
+        f"azimuths; frames of the check are {settings.check.preset} at {settings.check.power_mw:g} mW, before a "
+        "wall of flat light.",
+        "Bounds leave full pixels out: at 1 mW and 1/60 s the spot fills pixels nearer than about 1.5 m, where "
+        "exposure is to be shortened.",
     ]
     wanted = 2 * len(settings.check.depths_m) * len(settings.check.factors)
     if len(checks) < wanted:

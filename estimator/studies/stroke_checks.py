@@ -10,15 +10,18 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from multiprocessing import get_context
 
 import numpy as np
-from scipy.stats import chi2
 
+from phibench.estimator.bench.bootstrap import Clusters, estimates, rms_of
+from phibench.estimator.bench.rules import Rules
 from phibench.estimator.best_stroke import ROOM_E_PER_S
 from phibench.estimator.calibration.parameters import PARAMETERS, changed, stroke_of
 from phibench.estimator.depth_general import depth_general
 from phibench.estimator.methods.registry import METHODS
+from phibench.estimator.rig_draws import covariance_root
 from phibench.estimator.studies.cut import Shot, SpotPair, cut_region, cut_rig, taken, without_off
 from phibench.estimator.studies.material import Material
 from phibench.render.sensor import sensor
@@ -51,6 +54,7 @@ class Check:
     covariance : shape (p, p), of the rig's parameters; rows
     height_m : float
     preset : str
+    power_mw : float
     draws : int
     """
 
@@ -62,6 +66,7 @@ class Check:
     covariance: tuple[tuple[float, ...], ...]
     height_m: float
     preset: str
+    power_mw: float
     draws: int
 
 
@@ -84,18 +89,18 @@ class Checked:
         """Root mean square error; NaN without a pair."""
         return math.sqrt(float(np.mean(np.square(self.errors_m)))) if self.errors_m else math.nan
 
-    def interval_m(self, confidence: float = 0.95) -> tuple[float, float]:
-        """Interval of the rms of normal errors of mean 0: n rms^2 / sigma^2 has chi^2 of n degrees of freedom."""
-        n, tail = len(self.errors_m), 0.5 * (1.0 - confidence)
-        if n == 0:
-            return math.nan, math.nan
-        low, high = (math.sqrt(n / float(chi2.ppf(q, n))) for q in (1.0 - tail, tail))
-        return self.rms_m * low, self.rms_m * high
+    @cached_property
+    def interval_m(self) -> tuple[float, float]:
+        """95 % interval of the rms, by bootstrap: errors of rigs as built have long tails."""
+        n = len(self.errors_m)
+        rms = rms_of(Clusters(np.arange(n), n), np.square(self.errors_m))
+        (estimate,) = estimates([rms], n, Rules(resamples=999), generator(*_NAMES, "interval"))
+        return estimate.low, estimate.high
 
     @property
     def fits(self) -> bool:
         """Whether the predicted error lies in the interval of the measured one."""
-        low, high = self.interval_m()
+        low, high = self.interval_m
         return low <= self.check.predicted_m <= high
 
 
@@ -150,18 +155,15 @@ def _answer(check: Check, believed: Rig, draw: int) -> tuple[float, Array, Array
 
 def deviations(covariance: Array, names: tuple[Name, ...]) -> Array:
     """Errors of the rig's parameters, shape (p,), normal with a covariance that may be singular."""
-    normal = generator(*names, "rig").standard_normal(len(PARAMETERS))
-    scale = np.sqrt(np.diag(covariance))
-    safe = np.where(scale > 0.0, scale, 1.0)
-    value, vector = np.linalg.eigh(covariance / np.outer(safe, safe))  # scaled: units differ by many powers of ten
-    return np.asarray(safe * (vector @ (np.sqrt(np.maximum(value, 0.0)) * normal)))
+    return np.asarray(covariance_root(covariance) @ generator(*names, "rig").standard_normal(len(PARAMETERS)))
 
 
 def _spot(check: Check, rig: Rig, azimuth_rad: float) -> LaserSpot:
     axis = rig.at(0.0).sphere_centre_m
     away = np.array([math.cos(azimuth_rad), math.sin(azimuth_rad)])
     x, y = (axis[:2] + check.depth_m * away).tolist()
-    return LaserSpot((x, y, check.height_m), (-away[0], -away[1], 0.0), beam_diameter_m(check.depth_m))
+    place, normal, power_w = (x, y, check.height_m), (-away[0], -away[1], 0.0), 1e-3 * check.power_mw
+    return LaserSpot(place, normal, beam_diameter_m(check.depth_m), power_w=power_w)
 
 
 def _pixel(rig: Rig, stroke_m: float, spot: LaserSpot, position: str) -> tuple[float, float]:

@@ -69,7 +69,7 @@ def check_drawing(checks: Sequence[Checked]) -> Drawing:
                 mine = [c for c in checks if c.check.tolerance == name and c.check.depth_m == depth]
                 h = [c.check.stroke_m for c in mine]
                 rms = np.array([1e3 * c.rms_m for c in mine])
-                ends = np.array([c.interval_m() for c in mine]).T * 1e3
+                ends = np.array([c.interval_m for c in mine]).T * 1e3
                 ax.plot(h, [1e3 * c.check.predicted_m for c in mine], color=COLOURS[i], linewidth=1.0)
                 label = f"D = {depth:g} m"
                 ax.errorbar(h, rms, np.abs(ends - rms), fmt=MARKERS[i], color=COLOURS[i], capsize=2, label=label)

@@ -55,8 +55,8 @@ def reason_sentence(rig: Rig, depth_m: float, height_m: float, strokes_m: tuple[
     return (
         f"D = {depth_m:g} m: the ray to the spot leaves the mirror at {turned[0]:.0f} deg from straight down at the "
         f"lower position, at {turned[1]:.0f} deg at h = {strokes_m[0]:.2f} m and at {turned[2]:.0f} deg at "
-        f"{strokes_m[1]:.2f} m; of the parameters of a rig as built {parts[0][0]} costs most at the first stroke "
-        f"({1e3 * parts[0][1]:.1f} mm), {parts[1][0]} at the second ({1e3 * parts[1][1]:.1f} mm)."
+        f"{strokes_m[1]:.2f} m; to first order, of the parameters of a rig as built {parts[0][0]} costs most at the "
+        f"first stroke ({1e3 * parts[0][1]:.1f} mm), {parts[1][0]} at the second ({1e3 * parts[1][1]:.1f} mm)."
     )
 
 
@@ -102,6 +102,8 @@ def _best(best: BestStroke) -> str:
     low, high = best.near()
     text = f"D = {best.depth_m:g} m best h {best.stroke_m:.2f} m, sigma {1e3 * best.sigma_m:.2g} mm"
     text += f" ({100 * best.sigma_m / best.depth_m:.2g} %; within 5 % from {low:.2f} to {high:.2f} m"
+    if best.sigma_second_order_m > best.sigma_calibration_m:
+        text += ", most of it beyond first order"
     return text + (f"; limit: {', '.join(best.limits)})" if best.limits else ")")
 
 
@@ -139,7 +141,7 @@ def _best_of(check: Checked, checks: Sequence[Checked]) -> Checked:
 
 
 def _surely_better(a: Checked, b: Checked) -> bool:
-    return a.interval_m()[1] < b.interval_m()[0]
+    return a.interval_m[1] < b.interval_m[0]
 
 
 def _tolerances(checks: Sequence[Checked]) -> tuple[str, ...]:
@@ -151,7 +153,7 @@ def _cells(best: BestStroke) -> tuple[str, str, str]:
 
 
 def _check_row(c: Checked) -> Row:
-    low, high = c.interval_m()
+    low, high = c.interval_m
     rms = f"{1e3 * c.rms_m:.3g} ({1e3 * low:.3g} to {1e3 * high:.3g})"
     where = (f"{c.check.depth_m:g}", f"{c.check.factor:g}", f"{c.check.stroke_m:.3f}")
     return (c.check.tolerance, *where, f"{1e3 * c.check.predicted_m:.3g}", rms, str(len(c.errors_m)))
