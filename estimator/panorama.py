@@ -72,12 +72,12 @@ class Grid:
     @property
     def azimuths_rad(self) -> Array:
         """Of the columns, shape (W,), falling from pi to -pi."""
-        return math.pi - (np.arange(self.width_px) + 0.5) * self.step_rad
+        return np.asarray(math.pi - (np.arange(self.width_px) + 0.5) * self.step_rad, float)
 
     @property
     def elevations_rad(self) -> Array:
         """Of the rows, shape (H,), falling."""
-        return self.high_rad - (np.arange(self.height_px) + 0.5) * self.step_rad
+        return np.asarray(self.high_rad - (np.arange(self.height_px) + 0.5) * self.step_rad, float)
 
     def directions(self) -> Array:
         """Unit vectors, shape (H, W, 3), world."""
@@ -94,7 +94,7 @@ class Grid:
 
 
 def pixels_by_model(view: View, grid: Grid, distance_m: float = FAR_M) -> Array:
-    """Image pixel (u, v) of every grid point, shape (H, W, 2), by the closed form; NaN where the image does not show it.
+    """Image pixel (u, v) of every grid point, shape (H, W, 2), by the closed form; NaN where the image shows it not.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def unrolled(image: NDArray[np.generic], uv_px: Array) -> Array:
     -------
     array, shape (H, W) or (H, W, c)
     """
-    seen = np.isfinite(uv_px).all(axis=-1)
+    seen = np.asarray(np.isfinite(uv_px).all(axis=-1))
     where = np.where(seen[..., None], uv_px, 0.0)
     planes = np.asarray(image, float)
     stacked = planes[..., None] if planes.ndim == 2 else planes

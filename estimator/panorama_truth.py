@@ -45,7 +45,7 @@ def pixels_by_truth(directions: Array, grid: Grid) -> Array:
 
 
 def _with_neighbours(directions: Array) -> NDArray[np.bool_]:
-    seen = np.isfinite(directions).all(axis=-1)
+    seen = np.asarray(np.isfinite(directions).all(axis=-1))
     shifts = [slice(0, -2), slice(1, -1), slice(2, None)]
     return np.logical_and.reduce([seen[rows, columns] for rows in shifts for columns in shifts])
 

@@ -10,7 +10,7 @@ import polars as pl
 from phibench.estimator.calibration.bundle import Bundle
 from phibench.estimator.studies.drawing import Drawing
 from phibench.estimator.studies.material import Material
-from phibench.estimator.studies.misaligned import CALIBRATED, NOMINAL, Calibrate, Places, true_depth_m
+from phibench.estimator.studies.misaligned import CALIBRATED, NOMINAL, Calibrate, Places, pixels, true_depth_m
 from phibench.estimator.studies.misalignment_drawings import azimuth_drawing, interaction_drawing, ranking_drawing
 from phibench.estimator.studies.misalignment_interactions import Interactions, interactions, rows
 from phibench.estimator.studies.misalignment_rendered import Rendered, rendered
@@ -31,7 +31,6 @@ from phibench.estimator.studies.misalignment_words import (
 )
 from phibench.estimator.studies.result import Result
 from phibench.estimator.studies.study import Study
-from phibench.estimator.studies.misaligned import pixels
 from phibench.estimator.triangulate import depth_exact
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Array
@@ -166,7 +165,7 @@ def _notes(settings: MisalignmentSettings, seen: tuple[Rendered, ...]) -> tuple[
 STUDY = Study(
     "misalignment",
     "Misalignment",
-    "What does each misalignment cost each estimator, how tight must it be for 1 % of depth, and do misalignments add up?",
+    "What does each misalignment cost each estimator, how tight must it be for 1 % of depth, and do errors add up?",
     MisalignmentSettings,
     run,
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import polars as pl
@@ -35,13 +35,14 @@ def azimuth_drawing(table: pl.DataFrame, rendered: pl.DataFrame, ranks: Sequence
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
         parts = ", ".join(f"{one.parameter} {percent(one.worst[-1])} %" for one in ranks[:_CURVES])
         alt = (
-            "Change of the exact estimator's D against the spot's azimuth for the five costliest misalignments, predicted "
-            f"as lines and rendered as crosses, at D = {depths[0]:g} and {depths[1]:g} m; largest at {depths[1]:g} m: {parts}."
+            "Change of the exact estimator's D against the spot's azimuth for the costliest misalignments, predicted "
+            f"as lines and rendered as crosses, at D = {depths[0]:g} and {depths[1]:g} m; largest at {depths[1]:g} m: "
+            f"{parts}."
         )
         return drawn("azimuth", figure, alt)
 
 
-def ranking_drawing(by_estimator: dict[str, Sequence[Rank]], depth_index: int) -> Drawing:
+def ranking_drawing(by_estimator: Mapping[str, Sequence[Rank]], depth_index: int) -> Drawing:
     """Bars: what each parameter costs each estimator at one D."""
     first = next(iter(by_estimator.values()))
     D = first[0].depths_m[depth_index]

@@ -1,8 +1,8 @@
 """Do misalignments add up? First-order and total Sobol indices of the relative error of D.
 
 I. M. Sobol, Math. Comput. Simul. 55, 271 (2001); estimators of A. Saltelli et al., Comput. Phys. Commun. 181, 259
-(2010), as scipy has them. The parameters are uniform from minus to plus the study's magnitude, independent of each other.
-First-order indices that sum to 1 mean errors that add; what is missing is interaction.
+(2010), as scipy has them. The parameters are uniform from minus to plus the study's magnitude, independent of each
+other. First-order indices that sum to 1 mean errors that add; what is missing is interaction.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from phibench.estimator.studies.misaligned_many import errors_of_many
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
 from phibench.scenes.rig import Rig
-
 
 OUTPUTS = (("error", 2), ("square", 1))
 """Outputs, and the power whose mean is the mean square error."""
@@ -145,7 +144,7 @@ def with_intervals(
     Points are drawn again (percentiles); scipy's own bootstrap of its result takes no generator.
     """
     n = values.A.shape[1]
-    drawn = np.stack([indices_of(values.taken(rng.integers(0, n, n)), powers) for _ in range(resamples)])
+    drawn = np.stack([indices_of(values.taken(rng.integers(0, n, (n,))), powers) for _ in range(resamples)])
     low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
     return indices_of(values, powers), low, high
 

@@ -64,7 +64,7 @@ class MisalignmentSettings(Settings):
     @property
     def azimuths_rad(self) -> Array:
         """All azimuths."""
-        return np.arange(self.azimuths) * (2.0 * math.pi / self.azimuths)
+        return np.asarray(np.arange(self.azimuths) * (2.0 * math.pi / self.azimuths), float)
 
     def places(self, stroke_m: float, azimuths_rad: Array | None = None) -> Places:
         """Spots at a stroke, at all azimuths or at others."""

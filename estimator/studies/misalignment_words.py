@@ -30,8 +30,8 @@ def ranked(ranks: Sequence[Rank], estimator_words: str) -> str:
         for one in ranks[:_LISTED]
     ]
     return (
-        f"With misalignments of the usual size, one at a time, {estimator_words} errs most (rms over azimuths and signs, "
-        f"% of D at D = {first:g} and {last:g} m) by {'; '.join(parts)}."
+        f"With misalignments of the usual size, one at a time, {estimator_words} changes most (rms over azimuths and "
+        f"signs, % of D at D = {first:g} and {last:g} m) by {'; '.join(parts)}."
     )
 
 
@@ -39,7 +39,8 @@ def slope_sentence(miss: tuple[str, float, float], target: float) -> str:
     """How far the sensitivities alone lead."""
     name, depth, off = miss
     verdict = "slopes do" if off <= target else "slopes are not enough for errors of this size"
-    return f"Slope times error misses the whole change by at most {percent(off)} % of D ({name}, D = {depth:g} m): {verdict}."
+    size = f"{percent(off)} % of D ({name}, D = {depth:g} m)"
+    return f"Slope times error misses the whole change by at most {size}: {verdict}."
 
 
 def rendered_sentence(found: Sequence[Rendered], tolerance: float) -> str:
@@ -49,8 +50,8 @@ def rendered_sentence(found: Sequence[Rendered], tolerance: float) -> str:
     shift = max(one.centroid_px for one in found)
     verdict = "as predicted" if off <= tolerance else "not as predicted"
     return (
-        f"Rendered spots (centroids of noise-free layers, {count} estimates) move D {verdict}: the largest difference is "
-        f"{off:.1e} of D ({name}), {tolerance:.0e} are allowed; centroid and chief ray drift apart by at most "
+        f"Rendered spots (centroids of noise-free layers, {count} estimates) move D {verdict}: the largest difference "
+        f"is {off:.1e} of D ({name}), {tolerance:.0e} are allowed; centroid and chief ray drift apart by at most "
         f"{1e3 * shift:.2f} mpx."
     )
 
@@ -87,8 +88,8 @@ def calibrated_sentence(ranks: Sequence[Rank], before: Sequence[Rank]) -> str:
     largest = float(np.max(ranks[0].rms))
     size = "less" if largest < far else "no less"
     return (
-        f"After a calibration from the outline and a few spots {size} is left: at most {percent(largest)} % of D against "
-        f"{percent(far)} %; the largest, at D = {ranks[0].depths_m[0]:g} and {ranks[0].depths_m[-1]:g} m, "
+        f"After a calibration from the outline and a few spots {size} is left: at most {percent(largest)} % of D "
+        f"against {percent(far)} %; the largest, at D = {ranks[0].depths_m[0]:g} and {ranks[0].depths_m[-1]:g} m, "
         f"are {'; '.join(left)}."
     )
 
@@ -106,7 +107,7 @@ def noise_sentence(noise: Array, depths_m: Array) -> str:
 
 
 def noise_intervals(noise: Array) -> tuple[Array, Array, Array]:
-    """Lower end, rms and upper end, shape (d,), of the mean square over azimuths; Student's t over the draws' logarithms.
+    """Lower end, rms and upper end over azimuths and draws, shape (d,); Student's t for the mean square.
 
     The errors at the azimuths of one draw belong together: a draw counts once.
     """
