@@ -57,7 +57,12 @@ def _panel(ax: Any, rows: pl.DataFrame, axis: str) -> None:
     ax.axhline(0.0, color=COLOURS[7], linewidth=0.8)
     exact = rows.filter(pl.col("sense") == "ray")
     ax.fill_between(
-        exact[axis], exact["low_m"], exact["high_m"], color=COLOURS[4], alpha=0.3, label="misaligned rigs, phi_ray, 95 %"
+        exact[axis],
+        exact["low_m"],
+        exact["high_m"],
+        color=COLOURS[4],
+        alpha=0.3,
+        label="misaligned rigs, phi_ray, 95 %",
     )
     for i, (sense, label) in enumerate(_NAMES.items()):
         own = rows.filter(pl.col("sense") == sense)
