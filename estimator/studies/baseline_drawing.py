@@ -66,7 +66,8 @@ def _panel(ax: Any, rows: pl.DataFrame, axis: str) -> None:
     )
     for i, (sense, label) in enumerate(_NAMES.items()):
         own = rows.filter(pl.col("sense") == sense)
-        bars = {} if sense != "ray" else {"yerr": own["sd_m"].fill_nan(0.0)}
+        # scatter of a draw; the bound where there is one draw only
+        bars = {} if sense != "ray" else {"yerr": np.where(own["sd_m"].is_nan(), own["bound_m"], own["sd_m"])}
         ax.errorbar(
             own[axis],
             own["mean_m"] - own["depth_m"],

@@ -7,7 +7,7 @@ from phibench.estimator.studies import cause_tables as tables
 from phibench.estimator.studies.cause_drawing import evidence_drawing, posterior_drawing, predictive_drawing
 from phibench.estimator.studies.cause_runs import all_runs, run_all
 from phibench.estimator.studies.cause_sampler import require_sampler
-from phibench.estimator.studies.cause_settings import CauseSettings
+from phibench.estimator.studies.cause_settings import CauseSettings, require_consistent
 from phibench.estimator.studies.material import Material
 from phibench.estimator.studies.result import Result
 from phibench.estimator.studies.study import Study
@@ -22,6 +22,7 @@ _LIMITS = (
 
 def run(settings: CauseSettings, material: Material) -> Result:
     """Run the study; it needs no data set."""
+    require_consistent(settings)
     require_sampler()
     runs = all_runs(settings)
     posteriors = run_all(runs, material.workers)

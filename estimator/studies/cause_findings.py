@@ -176,8 +176,8 @@ def made_up_sentence(made_up: pl.DataFrame) -> str:
         wins = gains = 0
         for repeat in own["repeat"].unique():
             rows = own.filter(pl.col("repeat") == repeat)
-            best = rows["log_evidence"].max()
-            right = rows.filter(pl.col("explanation") == truth)["log_evidence"]
+            best = float(rows["log_evidence"].to_numpy().max())
+            right = rows.filter(pl.col("explanation") == truth)["log_evidence"].to_list()
             wins += bool(len(right) and right[0] == best)
             gains += bool(len(right) and right[0] > best - DECIDED)
         held, of = own["covered"].sum(), own["parameters"].sum()
@@ -195,7 +195,7 @@ def density_sentence(density: pl.DataFrame) -> str:
     good = np.isfinite(gap)
     worst = density.row(int(np.nanargmax(np.where(good, np.abs(gap), np.nan))), named=True)
     sums = [
-        f"{name} {float(own['linear'].sum() - own['simulated'].sum()):+.2f}"
+        f"{name} {float(np.sum((own['linear'] - own['simulated']).to_numpy())):+.2f}"
         for (name,), own in density.group_by("explanation", maintain_order=True)
     ]
     return (
@@ -210,7 +210,7 @@ def short_stroke_sentence(short: pl.DataFrame) -> str:
     own = short.filter(pl.col("table") == 1).sort("stroke_m")
     first, last = own.row(0, named=True), own.row(-1, named=True)
     change = "grows" if abs(last["eq5_error_m"]) > abs(first["eq5_error_m"]) else "falls"
-    worst4, worst5 = (float(short[f"eq{k}_error_m"].abs().max()) for k in (4, 5))
+    worst4, worst5 = (float(np.abs(short[f"eq{k}_error_m"].to_numpy()).max()) for k in (4, 5))
     published = last["published_error_m"] - first["published_error_m"]
     moved = last["eq5_error_m"] - first["eq5_error_m"]
     return (

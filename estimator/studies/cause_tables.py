@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Literal
 
 import numpy as np
 import polars as pl
@@ -129,7 +130,7 @@ def correlation_table(settings: CauseSettings, posteriors: Posteriors) -> pl.Dat
     rows = []
     for name in settings.drawn:
         names = settings.explanation(name).parameters
-        matrix = np.corrcoef(posteriors["published", name].points.T)
+        matrix = np.atleast_2d(np.corrcoef(posteriors["published", name].points.T))
         rows += [
             {"explanation": name, "first": a, "second": b, "correlation": float(matrix[i, j])}
             for i, a in enumerate(names)
@@ -219,8 +220,9 @@ def short_stroke_table(height_m: float = -0.21, z_c_m: float = 0.26) -> pl.DataF
         "stroke_m": data.stroke_m,
         "published_error_m": data.estimate_m - data.depth_m,
     }
-    for equation in (4, 5):
-        depth = read(world, data, Reader(equation=equation), Rig()).depth_m  # type: ignore[arg-type]
+    equations: tuple[Literal[4, 5], ...] = (4, 5)
+    for equation in equations:
+        depth = read(world, data, Reader(equation=equation), Rig()).depth_m
         columns[f"eq{equation}_error_m"] = depth - data.depth_m
     return pl.DataFrame(columns)
 
@@ -243,4 +245,4 @@ def _left_out(settings: CauseSettings, posteriors: Posteriors, name: str) -> tup
     if name not in settings.left_out:
         return float("nan"), float("nan")
     own = left_out_table(settings.model_copy(update={"left_out": [name]}), posteriors)
-    return float(own["score"].sum()), float(np.sqrt((own["error"] ** 2).sum()))
+    return float(np.sum(own["score"].to_numpy())), float(np.linalg.norm(own["error"].to_numpy()))
