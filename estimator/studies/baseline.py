@@ -25,6 +25,7 @@ from phibench.scenes.streams import generator
 
 METHODS = ("red_centroid", "chain_fit")
 TABLES = ("table1", "table2", "table3")
+_LEAST = 3
 
 
 class BaselineSettings(Settings):
@@ -47,7 +48,9 @@ def run(settings: BaselineSettings, material: Material) -> Result:
     table = experiment_table(experiments, rig, found_spots(dataset, settings.preset, draws, material.workers))
     bands = band_table(experiments, rig, settings.rigs, generator("study", "baseline", "rigs"))
     laws = laws_of_noise(table, METHODS[0], settings.resamples)
-    curves = [published_curve(name, *_published(table, name), settings.resamples) for name in TABLES]
+    curves = [
+        published_curve(name, *_published(table, name), settings.resamples) for name in TABLES if _long(table, name)
+    ]
     rendered = pl.concat([_rendered(name, material) for name in settings.rendered] or [_NONE])
     words = findings(table, bands, laws, curves, rendered)
     return Result(
@@ -99,6 +102,11 @@ def _rendered(recipe: str, material: Material) -> pl.DataFrame:
             for i, row in enumerate(rows)
         ]
     )
+
+
+def _long(table: pl.DataFrame, experiment: str) -> bool:
+    """Whether enough strokes of a table are there for two constants and a residual."""
+    return len(_published(table, experiment)[0]) >= _LEAST
 
 
 def _published(table: pl.DataFrame, experiment: str) -> tuple[Array, Array]:

@@ -57,11 +57,17 @@ def _panel(ax: Any, rows: pl.DataFrame, axis: str) -> None:
     ax.axhline(0.0, color=COLOURS[7], linewidth=0.8)
     exact = rows.filter(pl.col("sense") == "ray")
     ax.fill_between(
-        exact[axis], exact["low_m"], exact["high_m"], color=COLOURS[4], alpha=0.3, label="misaligned rigs, phi_ray, 95 %"
+        exact[axis],
+        exact["low_m"],
+        exact["high_m"],
+        color=COLOURS[4],
+        alpha=0.3,
+        label="misaligned rigs, phi_ray, 95 %",
     )
     for i, (sense, label) in enumerate(_NAMES.items()):
         own = rows.filter(pl.col("sense") == sense)
-        bars = {} if sense != "ray" else {"yerr": own["sd_m"].fill_nan(0.0)}
+        # scatter of a draw; the bound where there is one draw only
+        bars = {} if sense != "ray" else {"yerr": np.where(own["sd_m"].is_nan(), own["bound_m"], own["sd_m"])}
         ax.errorbar(
             own[axis],
             own["mean_m"] - own["depth_m"],

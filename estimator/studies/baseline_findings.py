@@ -71,8 +71,8 @@ def _noise(table: pl.DataFrame) -> str:
     bound = own["bound_m"].to_numpy()
     apart = np.abs((own["published_m"] - own["depth_m"]).to_numpy()) > 2.0 * bound
     return (
-        f"The {len(own)} published estimates err by {100.0 * _rms(published):.2f} % rms; rendered on an aligned rig and "
-        f"read with exact geometry, the mean errors are, rms, {'; '.join(parts)}. The bound of one pair is "
+        f"The {len(own)} published estimates err by {100.0 * _rms(published):.2f} % rms; rendered on an aligned rig "
+        f"and read with exact geometry, the mean errors are, rms, {'; '.join(parts)}. The bound of one pair is "
         f"{100.0 * _rms(bound / own['depth_m'].to_numpy()):.2f} % rms, and {int(apart.sum())} of the published errors "
         f"are more than twice the bound of their experiment."
     )
@@ -92,7 +92,7 @@ def _senses(table: pl.DataFrame) -> str:
         if apart[best] < alone and best != "ray"
         else "no sense of phi comes nearer to them than phi_ray, which is exact"
     )
-    return f"Published minus noise-free estimate of an aligned rig, with spots 0.50 m above the floor, rms: {words}; {verdict}."
+    return f"Published minus noise-free estimate of the recipe's aligned rig, relative rms: {words}; {verdict}."
 
 
 def _misaligned(table: pl.DataFrame, bands: pl.DataFrame) -> str:
@@ -100,8 +100,8 @@ def _misaligned(table: pl.DataFrame, bands: pl.DataFrame) -> str:
     counts = ", ".join(f"phi_{sense} {int(flags.sum())}" for sense, flags in inside.items())
     n = len(inside["ray"])
     return (
-        f"With misalignments drawn at the study magnitudes, the central 95 % of the errors hold, of {n} published points, "
-        f"{counts}; the points of one table share a rig, so that these counts are no test."
+        f"With misalignments drawn at the study magnitudes, the central 95 % of the errors hold, of {n} published "
+        f"points, {counts}; the points of one table share a rig, so that these counts are no test."
     )
 
 
@@ -113,8 +113,8 @@ def _law(law: LawFit) -> str:
     )
     first, second = verdicts.split(" and ")
     return (
-        f"{law.name[0].upper()}{law.name[1:]}: sigma of D goes as D^{p:.2f} ({low[0]:.2f} to {high[0]:.2f}), which {first}, "
-        f"and h^{q:.2f} ({low[1]:.2f} to {high[1]:.2f}), which {second}."
+        f"{law.name[0].upper()}{law.name[1:]}: sigma of D goes as D^{p:.2f} ({low[0]:.2f} to {high[0]:.2f}), which "
+        f"{first}, and h^{q:.2f} ({low[1]:.2f} to {high[1]:.2f}), which {second}."
     )
 
 
@@ -138,8 +138,8 @@ def _rendered(rendered: pl.DataFrame) -> str:
     largest = np.abs(rendered["closed_form_error_m"].to_numpy()).max()
     worst = float(np.nanmax(np.abs(gap)))
     return (
-        f"A misaligned rig that was rendered errs by up to {1e3 * largest:.0f} mm; its noise-free frames and the closed "
-        f"form differ by at most {1e3 * worst:.1f} mm over {len(rendered)} estimates."
+        f"A misaligned rig that was rendered errs by up to {1e3 * largest:.0f} mm; its noise-free frames and the "
+        f"closed form differ by at most {1e3 * worst:.1f} mm over {len(rendered)} estimates."
     )
 
 

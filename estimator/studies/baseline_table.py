@@ -77,7 +77,9 @@ def experiment_table(experiments: list[Experiment], rig: Rig, spots: Mapping[str
                 "noise_free_m": float(estimates(sense, rig, stroke, *experiment.true_px)),
             }
             for method, uv in found.uv_px.items():
-                rows.append({**common, "method": method, **_statistics(estimates(sense, rig, stroke, *uv.swapaxes(0, 1)))})
+                rows.append(
+                    {**common, "method": method, **_statistics(estimates(sense, rig, stroke, *uv.swapaxes(0, 1)))}
+                )
     bounds = pl.DataFrame([bound_row(experiment, rig, spots[experiment.sample_id]) for experiment in experiments])
     return pl.DataFrame(rows).join(bounds, on="sample_id", how="left", maintain_order="left")
 

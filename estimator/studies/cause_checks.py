@@ -80,9 +80,7 @@ def _trend(residuals: Array, experiments: Experiments) -> Array:
 def left_out_score(model: Model, points: Array, table: int) -> tuple[float, float]:
     """Log density of one table given draws from the posterior without it, shape (m, d), and its Monte Carlo error."""
     _, out = without_table(model, table)
-    only = Model(
-        model.explanation, model.priors, model.experiments.chosen(out), model.rig, model.depth_sigma_m
-    )
+    only = Model(model.explanation, model.priors, model.experiments.chosen(out), model.rig, model.depth_sigma_m)
     logs = only.log_likelihoods(points)
     logs = np.where(np.isfinite(logs), logs, -np.inf)
     top = logs.max()
@@ -95,9 +93,7 @@ def coverage(model: Model, points: Array, truth: dict[str, float], level: float)
     """Whether the central interval of each parameter holds its true value."""
     tail = (1.0 - level) / 2.0
     low, high = np.quantile(points, [tail, 1.0 - tail], axis=0)
-    return {
-        name: bool(low[i] <= truth[name] <= high[i]) for i, name in enumerate(model.names) if name in truth
-    }
+    return {name: bool(low[i] <= truth[name] <= high[i]) for i, name in enumerate(model.names) if name in truth}
 
 
 def band(model: Model, points: Array, grid: Experiments, random: np.random.Generator, level: float) -> Array:

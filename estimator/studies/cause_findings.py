@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import polars as pl
 
@@ -42,8 +44,12 @@ def convention_sentence(settings: CauseSettings, table: pl.DataFrame) -> str:
     parts = []
     for key, values in families.items():
         if len(values) > 1:
-            example = next(e for e in settings.explanations if e.model_dump_json(exclude={"name", "text", "convention"}) == key)
-            label = named.get(",".join(example.free), ", ".join(example.free)) + (", centred" if example.centred else "")
+            example = next(
+                e for e in settings.explanations if e.model_dump_json(exclude={"name", "text", "convention"}) == key
+            )
+            label = named.get(",".join(example.free), ", ".join(example.free)) + (
+                ", centred" if example.centred else ""
+            )
             top = max(values.values())
             order = sorted(values, key=lambda c: -values[c])
             parts.append(f"{label}: " + ", ".join(f"phi_{c} {values[c] - top:+.1f}" for c in order))
@@ -69,26 +75,51 @@ def noise_sentence(table: pl.DataFrame) -> str:
     return f"Reading noise of a radius, mean and 95 %: {'; '.join(parts)}. The last is {verdict}."
 
 
-def rival_sentences(settings: CauseSettings, table: pl.DataFrame) -> list[str]:
-    """One sentence for each explanation but the first: evidence for or against it."""
-    first = table.row(0, named=True)
+def rival_sentences(table: pl.DataFrame) -> tuple[str, ...]:
+    """For, against and neither, at two sigma of the sampler; and whose residuals are not what noise makes."""
+    first, groups = table.row(0, named=True), _verdicts(table)
+    parts = [
+        f"{verdict}: "
+        + ", ".join(f"{row['text']} ({row['against']:+.1f} +- {row['against_error']:.1f})" for row in rows)
+        for verdict, rows in groups.items()
+        if rows
+    ]
     words = []
-    for row in table.iter_rows(named=True):
-        if row["explanation"] == first["explanation"]:
-            continue
+    if parts:
+        words.append(f"Log evidence against '{first['text']}', odds of 10 to 1 at two sigma: {'; '.join(parts)}.")
+    for column, fault in (
+        ("chi2_p", "are too large"),
+        ("trend_p", "run in trends that independent noise does not make"),
+    ):
+        bad = table.filter(pl.col(column) < SMALL_P).sort(column)
+        if len(bad):
+            named = ", ".join(f"{row['text']} ({row[column]:.3f})" for row in bad.iter_rows(named=True))
+            words.append(f"Residuals {fault} (posterior predictive p below {SMALL_P:g}) for: {named}.")
+    return tuple(words)
+
+
+def _verdicts(table: pl.DataFrame) -> dict[str, list[dict[str, Any]]]:
+    groups: dict[str, list[dict[str, Any]]] = {"favoured": [], "disfavoured": [], "neither": []}
+    for row in table[1:].sort("against", descending=True).iter_rows(named=True):
         low, high = (row["against"] + sign * 2.0 * row["against_error"] for sign in (-1, 1))
-        verdict = "favoured" if low > DECIDED else "disfavoured" if high < -DECIDED else "neither favoured nor disfavoured"
-        faults = [
-            text
-            for text, p in (("its residuals are too large", row["chi2_p"]), ("its residuals run in trends", row["trend_p"]))
-            if p < SMALL_P
-        ]
-        smallest = min(row["chi2_p"], row["trend_p"])
-        tail = f"; {' and '.join(faults)} (p down to {smallest:.3f})" if faults else ""
-        words.append(f"{row['text']}: {row['against']:+.1f} +- {row['against_error']:.1f}, {verdict}{tail}")
-    head = f"Log evidence against '{first['text']}'"
-    fault = f", whose own residuals run in trends (p {first['trend_p']:.3f})" if first["trend_p"] < SMALL_P else ""
-    return [f"{head}{fault}: {'; '.join(words)}."] if words else []
+        groups["favoured" if low > DECIDED else "disfavoured" if high < -DECIDED else "neither"].append(row)
+    return groups
+
+
+def offset_sentence(table: pl.DataFrame, offsets: pl.DataFrame) -> str:
+    """How far from the mirror's image radii must have been counted."""
+    texts = dict(table.select("explanation", "text").iter_rows())
+    best = table.join(offsets, on="explanation").sort("log_evidence", descending=True)
+    if not len(best):
+        return ""
+    row = best.row(0, named=True)
+    moved = "above" if row["low_px"] > row["prior_low_px"] * 1.5 else "not above"
+    return (
+        f"Of those with tilt and decentre '{texts[row['explanation']]}' does best; there the image of the sphere lies "
+        f"{row['mean_px']:.0f} px ({row['low_px']:.0f} to {row['high_px']:.0f}) from the point from which radii are "
+        f"counted (prior: {row['prior_low_px']:.0f} to {row['prior_high_px']:.0f}); its lower end is {moved} the "
+        f"prior's. Section 5 of the paper says that the mirror's image was centred."
+    )
 
 
 def scale_sentence(scales: pl.DataFrame) -> str:
@@ -109,7 +140,8 @@ def left_out_sentence(table: pl.DataFrame) -> str:
     if not len(rows):
         return ""
     words = "; ".join(
-        f"{row['text']} {row['left_out_score']:.1f} +- {row['left_out_error']:.1f}" for row in rows.iter_rows(named=True)
+        f"{row['text']} {row['left_out_score']:.1f} +- {row['left_out_error']:.1f}"
+        for row in rows.iter_rows(named=True)
     )
     return (
         f"Each table predicted from the other three, sum of the four log densities: {words}. "
@@ -124,9 +156,13 @@ def alike_sentence(settings: CauseSettings, alike: pl.DataFrame, correlations: p
     same = own.filter(pl.col("cosine").abs() > ALIKE)
     pairs = ", ".join(f"{a} and {b} ({c:+.3f})" for a, b, c in same.select("first", "second", "cosine").iter_rows())
     strongest = correlations.filter(pl.col("explanation") == name).row(0, named=True)
-    told = f"do the same to within a cosine of {ALIKE:g}: {pairs}" if pairs else f"all differ by more than a cosine of {ALIKE:g}"
+    told = (
+        f"do the same to within a cosine of {ALIKE:g}: {pairs}"
+        if pairs
+        else f"all differ by more than a cosine of {ALIKE:g}"
+    )
     return (
-        f"For '{settings.explanation(name).text}' the effects of parameters on the 25 estimates, in units of their noise, "
+        f"For '{settings.explanation(name).text}' the effects of parameters on the estimates, in units of their noise, "
         f"{told}. The strongest correlation of its posterior is {strongest['correlation']:+.2f}, between "
         f"{strongest['first']} and {strongest['second']}."
     )
@@ -140,15 +176,15 @@ def made_up_sentence(made_up: pl.DataFrame) -> str:
         wins = gains = 0
         for repeat in own["repeat"].unique():
             rows = own.filter(pl.col("repeat") == repeat)
-            best = rows["log_evidence"].max()
-            right = rows.filter(pl.col("explanation") == truth)["log_evidence"]
+            best = float(rows["log_evidence"].to_numpy().max())
+            right = rows.filter(pl.col("explanation") == truth)["log_evidence"].to_list()
             wins += bool(len(right) and right[0] == best)
             gains += bool(len(right) and right[0] > best - DECIDED)
         held, of = own["covered"].sum(), own["parameters"].sum()
         n = own["repeat"].n_unique()
         parts.append(
-            f"data of '{truth}' gave it the largest evidence in {wins} of {n} draws and kept it within odds of 10 to 1 in "
-            f"{gains}, with {held} of {of} true values in the 90 % intervals"
+            f"data of '{truth}' gave it the largest evidence in {wins} of {n} draws and kept it within odds of 10 to 1 "
+            f"in {gains}, with {held} of {of} true values in the 90 % intervals"
         )
     return f"Made-up data: {'; '.join(parts)}." if parts else ""
 
@@ -159,7 +195,7 @@ def density_sentence(density: pl.DataFrame) -> str:
     good = np.isfinite(gap)
     worst = density.row(int(np.nanargmax(np.where(good, np.abs(gap), np.nan))), named=True)
     sums = [
-        f"{name} {float(own['linear'].sum() - own['simulated'].sum()):+.2f}"
+        f"{name} {float(np.sum((own['linear'] - own['simulated']).to_numpy())):+.2f}"
         for (name,), own in density.group_by("explanation", maintain_order=True)
     ]
     return (
@@ -174,22 +210,32 @@ def short_stroke_sentence(short: pl.DataFrame) -> str:
     own = short.filter(pl.col("table") == 1).sort("stroke_m")
     first, last = own.row(0, named=True), own.row(-1, named=True)
     change = "grows" if abs(last["eq5_error_m"]) > abs(first["eq5_error_m"]) else "falls"
-    worst4, worst5 = (float(short[f"eq{k}_error_m"].abs().max()) for k in (4, 5))
+    worst4, worst5 = (float(np.abs(short[f"eq{k}_error_m"].to_numpy()).max()) for k in (4, 5))
     published = last["published_error_m"] - first["published_error_m"]
     moved = last["eq5_error_m"] - first["eq5_error_m"]
     return (
-        f"Can a stroke that is not short against D make the error rise (section 6)? Eq. (4) does not use h << D: with exact "
-        f"phi_ray its error stays below {1e3 * worst4:.2f} mm in all 25 experiments. Eq. (5) leaves out the mirror's radius "
-        f"alone: its error is at most {1e3 * worst5:.0f} mm, and in Table 1 it {change} from {1e3 * first['eq5_error_m']:+.0f} "
-        f"mm at h = {first['stroke_m']:g} m to {1e3 * last['eq5_error_m']:+.0f} mm at {last['stroke_m']:g} m, a change of "
-        f"{1e3 * moved:+.0f} mm where the published errors change by {1e3 * published:+.0f} mm."
+        f"Can a stroke that is not short against D make the error rise (section 6)? Eq. (4) does not use h << D: with "
+        f"exact phi_ray its error stays below {1e3 * worst4:.2f} mm in all {len(short)} experiments. Eq. (5) leaves "
+        f"out the mirror's radius alone: its error is at most {1e3 * worst5:.0f} mm, and in Table 1 it {change} from "
+        f"{1e3 * first['eq5_error_m']:+.0f} mm at h = {first['stroke_m']:g} m to {1e3 * last['eq5_error_m']:+.0f} mm "
+        f"at {last['stroke_m']:g} m, a change of {1e3 * moved:+.0f} mm where the published errors change by "
+        f"{1e3 * published:+.0f} mm."
     )
 
 
 def explanations_shown(table: pl.DataFrame) -> tuple[Row, ...]:
     """All explanations, best first."""
     rows: list[Row] = [
-        ("explanation", "free", "log evidence against the first", "noise, px", "rms left, %", "chi2 p", "trend p", "left-out score")
+        (
+            "explanation",
+            "free",
+            "log evidence against the first",
+            "noise, px",
+            "rms left, %",
+            "chi2 p",
+            "trend p",
+            "left-out score",
+        )
     ]
     for row in table.sort("log_evidence", descending=True).iter_rows(named=True):
         score = row["left_out_score"]

@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 from scipy.special import ndtr, ndtri
 from scipy.stats import t as student
 
@@ -56,17 +56,17 @@ class Prior(Settings):
     uniform: list[float] | None = Field(default=None, min_length=2, max_length=2, description="low, high")
     log_uniform: list[float] | None = Field(default=None, min_length=2, max_length=2, description="low, high; above 0")
 
-    @model_validator(mode="after")
-    def _one(self) -> Prior:
+    @property
+    def fault(self) -> str:
+        """What is wrong with it, "" if nothing."""
         given = [name for name in ("normal", "uniform", "log_uniform") if getattr(self, name) is not None]
         if len(given) != 1:
-            raise ValueError("a prior is exactly one of normal, uniform, log_uniform")
+            return "must have exactly one of normal, uniform, log_uniform"
         low, high = getattr(self, given[0])
-        if (given[0] == "normal" and not high > 0.0) or (given[0] != "normal" and not low < high):
-            raise ValueError("a normal prior needs a sigma above 0, the others low < high")
-        if given[0] == "log_uniform" and not low > 0.0:
-            raise ValueError("a log_uniform prior needs a low above 0")
-        return self
+        if given[0] == "normal":
+            return "" if high > 0.0 else f"normal = [{low:g}, {high:g}]: the sigma must be above 0"
+        lowest = 0.0 if given[0] == "log_uniform" else -np.inf
+        return "" if lowest < low < high else f"{given[0]} = [{low:g}, {high:g}]: must be {lowest:g} < low < high"
 
     def scaled(self, by: float) -> Prior:
         """The same with the sigma of a normal prior so many times as large; the others have no scale to change."""
@@ -91,7 +91,7 @@ class Prior(Settings):
 class Explanation(Settings):
     """One explanation of the published estimates."""
 
-    name: str = Field(pattern="^[a-z0-9_]+$")
+    name: str = Field(pattern="^[a-z0-9_]+$", max_length=60)
     text: str = Field(description="in a few words, for tables")
     convention: Convention = "ray"
     equation: Literal[4, 5] = 4

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from pydantic import Field, model_validator
+from collections.abc import Iterator
 
+from pydantic import Field
+
+from phibench.datasets.errors import DatasetError
 from phibench.estimator.studies.cause_model import COMMON, GROUPS, NOISE, Explanation, Model, Prior
 from phibench.estimator.studies.paper_reading import AZIMUTHS, Experiments
 from phibench.estimator.studies.study import Settings
+from phibench.scenes.names import nearest
 from phibench.scenes.rig import Rig
 
 
@@ -42,23 +46,10 @@ class CauseSettings(Settings):
     explanations: list[Explanation] = Field(min_length=1)
     validation: Validation
 
-    @model_validator(mode="after")
-    def _known(self) -> CauseSettings:
-        names = [explanation.name for explanation in self.explanations]
-        if len(set(names)) < len(names):
-            raise ValueError(f"explanations have the same name: {sorted({n for n in names if names.count(n) > 1})}")
-        truths = [truth.explanation for truth in self.validation.truths]
-        if unknown := {*self.scaled, *self.left_out, *self.drawn, *self.validation.candidates, *truths} - set(names):
-            raise ValueError(f"no explanation {', '.join(sorted(unknown))}; there are {', '.join(names)}")
-        for truth in self.validation.truths:
-            if missing := set(self.explanation(truth.explanation).parameters) - set(truth.values):
-                raise ValueError(f"validation of {truth.explanation}: no value of {', '.join(sorted(missing))}")
-        needed = {NOISE, *COMMON, *AZIMUTHS, *(name for group in GROUPS.values() for name in group)}
-        if missing := needed - set(self.priors):
-            raise ValueError(f"no prior of {', '.join(sorted(missing))}")
-        if any(not scale > 0.0 for scale in self.prior_scales):
-            raise ValueError("prior_scales must be above 0")
-        return self
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """What does not fit together, a sentence each."""
+        return tuple(filter(None, (*_faults_of_names(self), *_faults_of_priors(self), *_faults_of_truths(self))))
 
     def explanation(self, name: str) -> Explanation:
         """Explanation of a name."""
@@ -70,3 +61,51 @@ class CauseSettings(Settings):
         priors = {**self.priors, **explanation.priors}
         scaled = {n: prior if n in COMMON else prior.scaled(scale) for n, prior in priors.items()}
         return Model(explanation, scaled, experiments, Rig(), self.depth_sigma_m)
+
+
+def require_consistent(settings: CauseSettings) -> None:
+    """Raise `DatasetError` with all faults, a line each, if the settings do not fit together."""
+    if settings.faults:
+        raise DatasetError("\n".join(["settings of the study 'cause':", *(f"  {fault}" for fault in settings.faults)]))
+
+
+def _faults_of_names(settings: CauseSettings) -> Iterator[str]:
+    names = [explanation.name for explanation in settings.explanations]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        yield f"explanations: two have the same name: {', '.join(twice)}; give each its own"
+    asked = {
+        "scaled": settings.scaled,
+        "left_out": settings.left_out,
+        "drawn": settings.drawn,
+        "validation.candidates": settings.validation.candidates,
+        "validation.truths": [truth.explanation for truth in settings.validation.truths],
+    }
+    for key, given in asked.items():
+        for name in given:
+            if name not in names:
+                yield f"{key}: no explanation '{name}'; {nearest(name, names)}"
+
+
+def _faults_of_priors(settings: CauseSettings) -> Iterator[str]:
+    for name in (NOISE, *COMMON, *AZIMUTHS, *(name for group in GROUPS.values() for name in group)):
+        if name not in settings.priors:
+            yield f"priors: no prior of {name}; add one, such as {name} = {{ normal = [0.0, 1.0] }}"
+    for name, prior in settings.priors.items():
+        if prior.fault:
+            yield f"priors.{name}: {prior.fault}"
+    for explanation in settings.explanations:
+        for name, prior in explanation.priors.items():
+            if prior.fault or name not in explanation.parameters:
+                yield f"explanation '{explanation.name}', priors.{name}: {prior.fault or 'is not free there'}"
+    for scale in settings.prior_scales:
+        if not scale > 0.0:
+            yield f"prior_scales: {scale:g}; must be above 0"
+
+
+def _faults_of_truths(settings: CauseSettings) -> Iterator[str]:
+    known = {explanation.name: explanation for explanation in settings.explanations}
+    for truth in settings.validation.truths:
+        for name in known[truth.explanation].parameters if truth.explanation in known else ():
+            if name not in truth.values:
+                yield f"validation of '{truth.explanation}': no value of {name}; add it"

@@ -15,6 +15,17 @@ from phibench.scenes.frames import Array
 def simulate(model: Model, points: Array, random: np.random.Generator, experiments: Experiments | None = None) -> Array:
     """Printed estimates of as many worlds as there are points, shape (m, n), metres.
 
+    Parameters as for `unrounded`.
+    """
+    step = (experiments or model.experiments).rounding_m
+    return np.asarray(np.round(unrounded(model, points, random, experiments) / step) * step)
+
+
+def unrounded(
+    model: Model, points: Array, random: np.random.Generator, experiments: Experiments | None = None
+) -> Array:
+    """Estimates of as many worlds as there are points, before they are printed, shape (m, n), metres.
+
     Parameters
     ----------
     model : Model
@@ -33,16 +44,17 @@ def simulate(model: Model, points: Array, random: np.random.Generator, experimen
     errors = _reading_errors(model, points, random, size)
     if model.explanation.shared_down:
         errors[0] = errors[0][:, first]
-    estimates = 1.0 / inverse_depth(named, asked, reader, model.rig, down + errors[0], up + errors[1])
-    return np.asarray(np.round(estimates / asked.rounding_m) * asked.rounding_m)
+    return np.asarray(1.0 / inverse_depth(named, asked, reader, model.rig, down + errors[0], up + errors[1]))
 
 
 def brute_force(model: Model, point: Array, random: np.random.Generator, draws: int) -> tuple[Array, Array]:
     """Log density of each published estimate, by simulation and by the likelihood, shape (n,) each.
 
-    The simulated density is a kernel estimate in 1/D of `draws` worlds with the same parameters.
+    The simulated density is a kernel estimate in 1/D of `draws` worlds with the same parameters. The probability of a
+    printed value over its step is the density of estimate plus a uniform error of one step, there.
     """
-    worlds = 1.0 / simulate(model, np.repeat(point[None], draws, axis=0), random)
+    worlds = unrounded(model, np.repeat(point[None], draws, axis=0), random)
+    worlds = 1.0 / (worlds + model.experiments.rounding_m * random.uniform(-0.5, 0.5, size=worlds.shape))
     seen = 1.0 / model.experiments.estimate_m
     simulated = np.array(
         [gaussian_kde(worlds[:, i][np.isfinite(worlds[:, i])]).logpdf(y)[0] for i, y in enumerate(seen)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Literal
 
 import numpy as np
 import polars as pl
@@ -13,7 +14,14 @@ from phibench.estimator.studies.cause_runs import Run
 from phibench.estimator.studies.cause_sampler import Posterior
 from phibench.estimator.studies.cause_settings import CauseSettings
 from phibench.estimator.studies.cause_simulation import brute_force
-from phibench.estimator.studies.paper_reading import TABLES, Experiments, Reader, published_experiments, read
+from phibench.estimator.studies.paper_reading import (
+    TABLES,
+    Experiments,
+    Reader,
+    published_experiments,
+    read,
+    sphere_image_px,
+)
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 from phibench.scenes.streams import Name, generator
@@ -32,7 +40,9 @@ def explanation_table(settings: CauseSettings, posteriors: Posteriors) -> pl.Dat
         own, model = posteriors["published", name], settings.model(name, published_experiments())
         fit = fit_of(model, own.thinned(settings.predictive), generator("study", "cause", "fit", name))
         noise = own.points[:, model.names.index(NOISE)] if NOISE in model.names else np.full(2, WHOLE_PIXEL_PX)
-        error = own.log_evidence_error if name == names[0] else np.hypot(own.log_evidence_error, first.log_evidence_error)
+        error = (
+            own.log_evidence_error if name == names[0] else np.hypot(own.log_evidence_error, first.log_evidence_error)
+        )
         score, score_error = _left_out(settings, posteriors, name)
         rows.append(
             {
@@ -97,12 +107,30 @@ def posterior_table(settings: CauseSettings, posteriors: Posteriors) -> pl.DataF
     return pl.DataFrame(rows)
 
 
+def offset_table(settings: CauseSettings, posteriors: Posteriors) -> pl.DataFrame:
+    """How far the image of the sphere lies from where radii were counted, mean and central 95 %, and by the prior."""
+    rows = []
+    for explanation in settings.explanations:
+        if "misalignment" in explanation.free and not explanation.centred:
+            model = settings.model(explanation.name, published_experiments())
+            shares = generator("study", "cause", "offset").uniform(size=(4000, len(model.names)))
+            row: dict[str, object] = {"explanation": explanation.name}
+            points = posteriors["published", explanation.name].points
+            for label, drawn in (("", points), ("prior_", model.point(shares))):
+                offset = np.hypot(*sphere_image_px(model.named(drawn), model.rig))
+                low, high = np.quantile(offset, INTERVAL)
+                mean = float(np.mean(offset))
+                row |= {f"{label}mean_px": mean, f"{label}low_px": float(low), f"{label}high_px": float(high)}
+            rows.append(row)
+    return pl.DataFrame(rows)
+
+
 def correlation_table(settings: CauseSettings, posteriors: Posteriors) -> pl.DataFrame:
     """Correlations of the posteriors of the drawn explanations, strongest first."""
     rows = []
     for name in settings.drawn:
         names = settings.explanation(name).parameters
-        matrix = np.corrcoef(posteriors["published", name].points.T)
+        matrix = np.atleast_2d(np.corrcoef(posteriors["published", name].points.T))
         rows += [
             {"explanation": name, "first": a, "second": b, "correlation": float(matrix[i, j])}
             for i, a in enumerate(names)
@@ -137,7 +165,7 @@ def left_out_table(settings: CauseSettings, posteriors: Posteriors) -> pl.DataFr
 
 
 def made_up_table(settings: CauseSettings, posteriors: Posteriors, runs: list[Run]) -> pl.DataFrame:
-    """Candidates on made-up data: evidence against the truth's, and how many true parameters the 90 % intervals hold."""
+    """Candidates on made-up data: evidence, and how many true values the truth's 90 % intervals hold."""
     rows = []
     for run in runs:
         if run.key[0] == "made-up":
@@ -192,8 +220,9 @@ def short_stroke_table(height_m: float = -0.21, z_c_m: float = 0.26) -> pl.DataF
         "stroke_m": data.stroke_m,
         "published_error_m": data.estimate_m - data.depth_m,
     }
-    for equation in (4, 5):
-        depth = read(world, data, Reader(equation=equation), Rig()).depth_m  # type: ignore[arg-type]
+    equations: tuple[Literal[4, 5], ...] = (4, 5)
+    for equation in equations:
+        depth = read(world, data, Reader(equation=equation), Rig()).depth_m
         columns[f"eq{equation}_error_m"] = depth - data.depth_m
     return pl.DataFrame(columns)
 
@@ -216,4 +245,4 @@ def _left_out(settings: CauseSettings, posteriors: Posteriors, name: str) -> tup
     if name not in settings.left_out:
         return float("nan"), float("nan")
     own = left_out_table(settings.model_copy(update={"left_out": [name]}), posteriors)
-    return float(own["score"].sum()), float(np.sqrt((own["error"] ** 2).sum()))
+    return float(np.sum(own["score"].to_numpy())), float(np.linalg.norm(own["error"].to_numpy()))

@@ -36,7 +36,7 @@ def drawn_misalignment(rig: Rig, random: np.random.Generator) -> Misalignment:
 
 
 def seen(rig: Rig, misalignment: Misalignment, points_m: Array, strokes_m: Array) -> tuple[Array, Array, Array]:
-    """Pixels down and up, shape (n, 2) each, and true D, shape (n,), of world points (n, 3) with nominal strokes (n,)."""
+    """Pixels down and up, shape (n, 2), and true D, shape (n,), of world points (n, 3) with nominal strokes (n,)."""
     true = rig.perturbed(misalignment)
     down = image_of(true.at(0.0), points_m).uv_px
     up = np.full_like(down, np.nan)

@@ -50,7 +50,9 @@ class Experiments:
 
     def chosen(self, keep: BoolArray) -> Experiments:
         """Some of them, by a mask of shape (n,)."""
-        return Experiments(*(x[keep] for x in (self.table, self.depth_m, self.stroke_m, self.estimate_m, self.rounding_m)))
+        return Experiments(
+            *(x[keep] for x in (self.table, self.depth_m, self.stroke_m, self.estimate_m, self.rounding_m))
+        )
 
     def with_estimates(self, estimate_m: Array) -> Experiments:
         """The same with other estimates."""
@@ -71,7 +73,9 @@ def published_experiments(rounding_m: float = 0.01, rounding_table4_m: float = 0
     """The 25 published results; Table 4 is printed to the millimetre."""
     rows = load_published()
     table = np.array([int(row.experiment.removeprefix("table")) - 1 for row in rows])
-    columns = (np.array([getattr(row, name) for row in rows]) for name in ("real_depth_m", "baseline_m", "estimated_depth_m"))
+    columns = (
+        np.array([getattr(row, name) for row in rows]) for name in ("real_depth_m", "baseline_m", "estimated_depth_m")
+    )
     return Experiments(table, *columns, np.where(table == TABLES - 1, rounding_table4_m, rounding_m))
 
 
@@ -168,10 +172,16 @@ def radii_px(parameters: Parameters, experiments: Experiments, reader: Reader, r
     focal_px = _true_focal_px(parameters, rig)
     u, v = (focal_px * x for x in _image(ray, parameters))
     if reader.centred:
-        u0, v0 = (focal_px * x for x in _image(axis, parameters))
+        u0, v0 = sphere_image_px(parameters, rig)
     else:
         u0, v0 = (-_get(parameters, name) for name in ("cx_px", "cy_px"))
     return np.hypot(u - u0, v - v0)
+
+
+def sphere_image_px(parameters: Parameters, rig: Rig) -> tuple[Array, Array]:
+    """Image of the sphere centre from the true principal point, (u, v), pixels: (0, 0) for an aligned rig."""
+    u, v = (_true_focal_px(parameters, rig) * x for x in _image(_axis(parameters), parameters))
+    return u, v
 
 
 def inverse_depth(

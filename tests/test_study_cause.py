@@ -1,0 +1,449 @@
+"""The study `cause`: readings, likelihood, sampler, made-up data, sentences."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from rich.console import Console
+from scipy.stats import multivariate_normal, norm
+
+from phibench.datasets.errors import DatasetError
+from phibench.estimator.depth import depth_approx
+from phibench.estimator.mirror_image import image_of
+from phibench.estimator.phi import outline_circle, phi_outline
+from phibench.estimator.score import ESTIMATORS
+from phibench.estimator.studies import cause_findings as say
+from phibench.estimator.studies.cause import STUDY
+from phibench.estimator.studies.cause_checks import alike, coverage, fit_of, left_out_score
+from phibench.estimator.studies.cause_model import COMMON, NOISE, Explanation, Model, Prior, without_table
+from phibench.estimator.studies.cause_runs import all_runs
+from phibench.estimator.studies.cause_sampler import sample
+from phibench.estimator.studies.cause_settings import CauseSettings
+from phibench.estimator.studies.cause_simulation import brute_force, simulate
+from phibench.estimator.studies.cause_tables import short_stroke_table
+from phibench.estimator.studies.paper_reading import AZIMUTHS, PARAMETERS, Reader, published_experiments, radii_px, read
+from phibench.estimator.studies.run import run_study
+from phibench.estimator.studies.settings import read_settings
+from phibench.scenes.frames import Array, Pose
+from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
+from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.rig import Rig
+from phibench.scenes.streams import generator
+
+DATA = published_experiments()
+HEIGHTS = {f"height_{k}_m": -0.2 for k in (1, 2, 3, 4)}
+
+
+@pytest.fixture(scope="module")
+def settings() -> CauseSettings:
+    return read_settings(STUDY)
+
+
+def _world(random: np.random.Generator, scale: float = 1.0) -> dict[str, Array]:
+    """A rig with every error at `scale` times its study magnitude."""
+    wrong = {name: random.normal(scale=scale * MISALIGNMENT[name].study) for name in PARAMETERS}
+    heights = {f"height_{k}_m": random.uniform(-0.5, 0.4) for k in (1, 2, 3, 4)}
+    azimuths = {name: random.uniform(0.0, 2.0 * np.pi) for name in AZIMUTHS}
+    return {k: np.asarray(v) for k, v in {"z_c_m": random.uniform(0.25, 0.3), **wrong, **heights, **azimuths}.items()}
+
+
+def _pixels(world: dict[str, Array], i: int) -> tuple[Rig, Array, Array]:
+    """Nominal rig and the true pixels of experiment i by the Newton iteration in pixels of `mirror_image`."""
+    nominal = replace(Rig(), T_camera_sphere=Pose("camera", "sphere", (0.0, 0.0, float(world["z_c_m"]))))
+    wrong = Misalignment(**{name: float(world[name]) for name in PARAMETERS if name in world})
+    true, table = nominal.perturbed(wrong), int(DATA.table[i]) + 1
+    azimuth = float(world.get(f"azimuth_{table}_rad", 0.0))
+    away = DATA.depth_m[i] * np.array([np.cos(azimuth), np.sin(azimuth)])
+    point = true.at(0.0).sphere_centre_m + np.array([*away, float(world[f"height_{table}_m"])])
+    down, up = (image_of(true.at(o), point).uv_px for o in (0.0, wrong.stroke_m(float(DATA.stroke_m[i]))))
+    return nominal, down, up
+
+
+@pytest.mark.parametrize("convention", ["ray", "normal", "incidence"])
+def test_readings_are_those_of_misaligned_rigs(convention: str) -> None:
+    """Against other mathematics for image, phi and eq. (4); the 1e-10 px of `mirror_image` are below 1e-9 m."""
+    checked = 0
+    for draw in range(3):
+        world = _world(generator("test", "cause", "world", draw))
+        ours = read(world, DATA, Reader(convention), Rig()).depth_m  # type: ignore[arg-type]
+        for i in range(0, 25, 3):
+            rig, down, up = _pixels(world, i)
+            expected = ESTIMATORS[f"paper_{convention}"](rig, float(DATA.stroke_m[i]), down, up).depth_m
+            assert ours[i] == pytest.approx(float(expected), abs=1e-9 * max(1.0, abs(float(expected))) ** 2)
+            checked += 1
+    assert checked == 27
+
+
+def test_centred_radii_and_the_outline() -> None:
+    world = _world(generator("test", "cause", "centred"))
+    world.update(cx_px=np.asarray(0.0), cy_px=np.asarray(0.0), roll_rad=np.asarray(0.0), pitch_rad=np.asarray(0.0))
+    radii = radii_px(world, DATA, Reader("ray", centred=True), Rig())
+    aligned = {name: value for name, value in world.items() if name not in PARAMETERS}
+    angles = read(aligned, DATA, Reader("outline"), Rig()).depth_m
+    for i in (0, 9, 20):
+        rig, down, up = _pixels(world, i)
+        true = rig.perturbed(Misalignment(**{name: float(world[name]) for name in PARAMETERS}))
+        centre, _ = outline_circle(true)
+        assert radii[:, i] == pytest.approx([np.hypot(*(uv - centre)) for uv in (down, up)], abs=1e-8)
+        rig, down, up = _pixels(aligned, i)
+        expected = ESTIMATORS["paper_outline"](rig, float(DATA.stroke_m[i]), down, up).depth_m
+        assert angles[i] == pytest.approx(float(expected), rel=1e-9)
+        assert np.isfinite(phi_outline(rig.at(0.0), down))
+
+
+def test_h_against_d_cannot_make_the_error_rise() -> None:
+    """Eq. (4) with phi_ray is off by less than a millimetre (errata); eq. (5) is depth.depth_approx."""
+    short = short_stroke_table()
+    assert short["eq4_error_m"].abs().max() < 1e-3
+    world = {"z_c_m": np.asarray(0.26), **{name: np.asarray(-0.21) for name in HEIGHTS}}
+    rig, down, up = _pixels(world, 6)
+    phi = [ESTIMATORS["approx_ray"](rig, float(DATA.stroke_m[6]), down, up).depth_m]
+    assert short["eq5_error_m"][6] == pytest.approx(float(phi[0]) - 2.18, abs=1e-9)
+    assert float(depth_approx(0.7, 0.5, 1.0).depth_m) == pytest.approx(np.sin(1.4) * np.sin(1.0) / np.sin(0.4))
+    own = short.filter(pl.col("table") == 1).sort("stroke_m")["eq5_error_m"].abs()
+    assert own[-1] < own[0]
+    sentence = say.short_stroke_sentence(short)
+    assert "falls from" in sentence
+    grown = short.with_columns(
+        pl.when(pl.col("stroke_m") > 1.35).then(1.0).otherwise(pl.col("eq5_error_m")).alias("eq5_error_m")
+    )
+    assert "grows from" in say.short_stroke_sentence(grown)
+
+
+def test_readings_of_many_rigs_are_those_of_each(settings: CauseSettings) -> None:
+    random = generator("test", "cause", "many")
+    for name in ("ray_full", "outline_misaligned", "ray_shared", "ray_turn", "ray_misaligned_student"):
+        model = settings.model(name, DATA)
+        points = model.point(random.uniform(0.05, 0.95, size=(6, len(model.names))))
+        each = np.array([model.log_likelihood(point) for point in points])
+        # two orders of summation; the largest terms are some 1e4
+        assert model.log_likelihoods(points) == pytest.approx(each, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", ["ray", "ray_misaligned", "ray_shared", "ray_pixels"])
+def test_likelihood_is_a_normal_in_the_inverse(settings: CauseSettings, name: str) -> None:
+    """scipy's multivariate normal with a covariance built here from the definition, times the Jacobian."""
+    model = settings.model(name, DATA)
+    point = model.point(np.full(len(model.names), 0.6))
+    named, reading = model.named(point), model.reading(point)
+    noise = float(named.get(NOISE, np.asarray(12.0**-0.5)))
+    step = 1e-3
+    worlds = [read({**named, "cx_px": np.asarray(0.0)}, DATA, model.explanation.reader, Rig())]
+    assert worlds[0].inverse_depth_per_m == pytest.approx(reading.inverse_depth_per_m)
+    covariance = np.zeros((25, 25))
+    scale = reading.inverse_depth_per_m**2
+    for i in range(25):
+        for j in range(25):
+            same = DATA.table[i] == DATA.table[j] and DATA.depth_m[i] == DATA.depth_m[j]
+            if same:
+                covariance[i, j] += settings.depth_sigma_m**2 * scale[i] * scale[j]
+            if i == j or (same and model.explanation.shared_down):
+                covariance[i, j] += noise**2 * reading.by_down[i] * reading.by_down[j]
+            if i == j:
+                rounding = 0.001 if DATA.table[i] == 3 else 0.01
+                covariance[i, j] += noise**2 * reading.by_up[i] ** 2 + rounding**2 / 12.0 * scale[i] ** 2
+    expected = multivariate_normal.logpdf(1.0 / DATA.estimate_m, reading.inverse_depth_per_m, covariance)
+    assert model.log_likelihood(point) == pytest.approx(expected - 2.0 * np.log(DATA.estimate_m).sum(), rel=1e-9)
+    assert step > 0.0
+
+
+def test_slopes_are_those_of_simulated_noise(settings: CauseSettings) -> None:
+    """Standard deviation of 1/D over 4000 worlds against the slopes; 1 / sqrt(2 n) = 1.1 %, so 5 % is 4.5 sigma.
+
+    False alarm below 2e-4 over 25 experiments; a slope that is a tenth off fails.
+    """
+    model = settings.model("ray", DATA)
+    values = {NOISE: 0.05, "z_c_m": 0.27, **HEIGHTS}
+    point = np.array([values[name] for name in model.names])
+    smooth = replace(DATA, rounding_m=np.full(25, 1e-9))
+    exact = Model(model.explanation, model.priors, smooth, model.rig, 0.0)
+    worlds = 1.0 / simulate(exact, np.repeat(point[None], 4000, axis=0), generator("test", "cause", "slopes"))
+    predicted = np.sqrt(np.diagonal(exact.covariance(exact.reading(point), point)))
+    ratio = worlds.std(axis=0) / predicted
+    assert np.abs(ratio - 1.0).max() < 0.05
+
+
+def test_brute_force_agrees_with_the_likelihood_at_small_noise(settings: CauseSettings) -> None:
+    """A kernel density of 20000 draws is good to a few per cent near the middle of a normal; doubled noise is not."""
+    model = settings.model("ray", DATA)
+    values = {NOISE: 0.1, "z_c_m": 0.27, **HEIGHTS}
+    point = np.array([values[name] for name in model.names])
+    middle = Model(
+        model.explanation,
+        model.priors,
+        DATA.with_estimates(model.reading(point).depth_m),
+        model.rig,
+        settings.depth_sigma_m,
+    )
+    simulated, linear = brute_force(middle, point, generator("test", "cause", "brute"), 20_000)
+    assert np.abs(simulated - linear)[DATA.table < 3].max() < 0.1
+    values[NOISE] = 0.2
+    _, other = brute_force(middle, np.array([values[n] for n in model.names]), generator("test", "cause", "brute"), 200)
+    assert np.abs(simulated - other)[DATA.table < 3].min() > 0.3
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [Prior(normal=[1.0, 2.0]), Prior(uniform=[-1.0, 3.0]), Prior(log_uniform=[0.02, 3.0])],
+)
+def test_priors_turn_shares_into_values_and_back(prior: Prior) -> None:
+    shares = np.linspace(0.01, 0.99, 7)
+    assert prior.share_of(prior.of_share(shares)) == pytest.approx(shares)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({}, "exactly one"),
+        ({"normal": [0.0, 1.0], "uniform": [0.0, 1.0]}, "exactly one"),
+        ({"normal": [0.0, 0.0]}, "sigma must be above 0"),
+        ({"uniform": [1.0, 0.0]}, "low < high"),
+        ({"log_uniform": [0.0, 1.0]}, "must be 0 < low"),
+        ({"normal": [0.0, 1.0]}, ""),
+    ],
+)
+def test_priors_that_are_none_say_so(given: dict[str, list[float]], words: str) -> None:
+    fault = Prior(**given).fault
+    assert words in fault
+    assert bool(words) == bool(fault)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('left_out = ["ray"]', 'left_out = ["rays"]', "no explanation 'rays'; did you mean 'ray'"),
+        ("radius_m = { normal", "radius_mm = { normal", "no prior of radius_m"),
+        ('name = "outline"', 'name = "ray"', "same name: ray"),
+        ("z_c_m = 0.27, height_1_m", "height_1_m", "no value of z_c_m"),
+        ("prior_scales = [2.0]", "prior_scales = [0.0]", "must be above 0"),
+        ("axial_m = { normal = [0.0, 0.001] }", "axial_m = { normal = [0.0, -1.0] }", "sigma must be above 0"),
+        ('name = "outline"', 'name = "Out line"', "name"),
+    ],
+)
+def test_bad_settings_end_in_sentences(tmp_path: Path, old: str, new: str, words: str) -> None:
+    text = _tiny()
+    assert old in text
+    (tmp_path / "cause.toml").write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(DatasetError, match=words):
+        run_study("cause", tmp_path / "out", settings=tmp_path / "cause.toml", console=Console(quiet=True))
+
+
+def test_the_sampler_is_asked_for_in_a_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "dynesty", None)
+    with pytest.raises(DatasetError, match=r"pip install 'phibench\[study\]'"):
+        run_study("cause", tmp_path, quick=True, console=Console(quiet=True))
+
+
+class _Line(Model):
+    """Two unknowns with unit normal priors, each measured once: everything in closed form."""
+
+    @property
+    def names(self) -> tuple[str, ...]:  # type: ignore[override]
+        return ("a", "b")
+
+    def point(self, shares: Array) -> Array:
+        return np.asarray(norm.ppf(shares))
+
+    def log_likelihood(self, point: Array) -> float:
+        return float(norm.logpdf([0.5, -1.0], point, 0.3).sum())
+
+
+def test_evidence_and_posterior_of_a_closed_form(settings: CauseSettings) -> None:
+    """Evidence N(y; 0, 1 + s^2) of each; 200 live points: sampler's error 0.13, four of which are one alarm in 16000.
+
+    Posterior mean y / (1 + s^2), deviation 0.287: some 800 draws with about 200 live points' worth, 0.02 and 0.1.
+    """
+    pytest.importorskip("dynesty")
+    line = _Line(settings.explanations[0], settings.priors, DATA, Rig(), 0.0)
+    found = sample(line, 200, 0.05, "line")
+    expected = norm.logpdf([0.5, -1.0], 0.0, np.hypot(1.0, 0.3)).sum()
+    assert found.log_evidence == pytest.approx(expected, abs=4.0 * max(found.log_evidence_error, 0.13))
+    assert found.points.mean(axis=0) == pytest.approx(np.array([0.5, -1.0]) / 1.09, abs=0.1)
+    assert found.points.std(axis=0) == pytest.approx([0.287, 0.287], rel=0.25)
+    again = sample(line, 200, 0.05, "line")
+    assert np.array_equal(found.points, again.points)
+
+
+def test_made_up_data_give_back_their_cause(settings: CauseSettings) -> None:
+    """A tilt of 1.1 degrees at 0.2 px beats noise alone by far; noise alone does not make a tilt favoured."""
+    pytest.importorskip("dynesty")
+    gains, tilts = {}, {}
+    for truth, tilt in (("ray", 0.0), ("ray_misaligned", 0.02)):
+        model = settings.model("ray_misaligned", DATA)
+        values = {NOISE: 0.2, "z_c_m": 0.27, **HEIGHTS, "tilt_y_rad": tilt, "azimuth_2_rad": 1.0, "azimuth_3_rad": 3.0}
+        point = np.array([[values.get(name, 0.0) for name in model.names]])
+        data = DATA.with_estimates(simulate(model, point, generator("test", "cause", "made-up", truth))[0])
+        found = {
+            name: sample(settings.model(name, data), 30, 2.0, "test", truth, name) for name in ("ray", "ray_misaligned")
+        }
+        gains[truth] = found["ray_misaligned"].log_evidence - found["ray"].log_evidence
+        tilts[truth] = found["ray_misaligned"].points[:, model.names.index("tilt_y_rad")]
+    # error of a difference with 30 live points about 1; nested runs of these data give -6 and +20
+    assert gains["ray"] < say.DECIDED
+    assert gains["ray_misaligned"] > 5.0
+    low, high = np.quantile(tilts["ray_misaligned"], [0.005, 0.995])
+    assert low < 0.02 < high
+    assert abs(tilts["ray"].mean()) < 0.01
+
+
+def test_fit_of_right_and_wrong_residuals(settings: CauseSettings) -> None:
+    """Estimates as predicted are too good, estimates that run are caught by the trend."""
+    model = settings.model("ray", DATA)
+    values = {NOISE: 0.5, "z_c_m": 0.27, **HEIGHTS}
+    point = np.array([values[name] for name in model.names])
+    points, random = np.repeat(point[None], 400, axis=0), generator("test", "cause", "fit")
+    inverse = model.reading(point).inverse_depth_per_m
+    sigma = np.sqrt(np.diagonal(model.covariance(model.reading(point), point)))
+
+    def fit(shift: Array) -> object:
+        data = DATA.with_estimates(1.0 / (inverse + shift * sigma))
+        return fit_of(Model(model.explanation, model.priors, data, model.rig, settings.depth_sigma_m), points, random)
+
+    exact, running, jumping = fit(np.zeros(25)), fit(np.full(25, 1.2)), fit(1.2 * (-1.0) ** np.arange(25))
+    assert exact.chi2_p > 0.99  # type: ignore[attr-defined]
+    assert running.trend_p < 0.01  # type: ignore[attr-defined]
+    assert jumping.trend_p > 0.9  # type: ignore[attr-defined]
+
+
+def test_left_out_score_is_the_density_of_the_table(settings: CauseSettings) -> None:
+    """With one point only the mean over the posterior is the density there: all minus the rest."""
+    model = settings.model("ray", DATA)
+    point = model.point(np.full(len(model.names), 0.5))
+    rest, out = without_table(model, 1)
+    assert out.sum() == 7
+    score, error = left_out_score(model, np.repeat(point[None], 3, axis=0), 1)
+    assert score == pytest.approx(model.log_likelihood(point) - rest.log_likelihood(point), rel=1e-9)
+    assert error == pytest.approx(0.0, abs=1e-9)
+
+
+def test_principal_point_and_tilt_are_alike(settings: CauseSettings) -> None:
+    """A turned camera moves the image as a shifted principal point does, but for (r/f)^2 = 6 %: cosine near -1."""
+    model = settings.model("ray", DATA)
+    pairs = {(a, b): c for a, b, c in alike(model, model.point(np.full(len(model.names), 0.5)))}
+    assert pairs["tilt_y_rad", "cx_px"] < -0.98
+    assert pairs["focal_relative", "radius_m"] > 0.98
+    assert abs(pairs["tilt_y_rad", "focal_relative"]) < 0.95
+
+
+def test_coverage_counts_intervals(settings: CauseSettings) -> None:
+    model = settings.model("ray", DATA)
+    points = np.repeat(np.linspace(0.0, 1.0, 101)[:, None], len(model.names), axis=1)
+    truth = dict.fromkeys(COMMON, 0.5) | {NOISE: 0.99}
+    held = coverage(model, points, truth, 0.9)
+    assert held == dict.fromkeys(COMMON, True) | {NOISE: False}
+
+
+def _rows(**changes: list[float]) -> pl.DataFrame:
+    columns = {
+        "explanation": ["ray", "tilted", "worse"],
+        "text": ["noise", "tilt", "wrong"],
+        "log_evidence": [0.0, 10.0, -9.0],
+        "log_evidence_error": [0.5, 0.5, 0.5],
+        "against": [0.0, 10.0, -9.0],
+        "against_error": [0.0, 0.7, 0.7],
+        "noise_px": [1.0, 0.5, 1.1],
+        "noise_low_px": [0.8, 0.4, 0.8],
+        "noise_high_px": [1.3, 0.6, 1.4],
+        "left_rms": [0.06, 0.04, 0.07],
+        "chi2_p": [0.5, 0.5, 0.01],
+        "trend_p": [0.001, 0.4, 0.5],
+        "left_out_score": [-5.0, 2.0, float("nan")],
+        "left_out_error": [0.1, 0.1, float("nan")],
+    }
+    return pl.DataFrame({**columns, **changes})
+
+
+def test_sentences_follow_the_numbers() -> None:
+    table = _rows()
+    assert "'tilt' has the largest evidence" in say.best_sentence(table)
+    assert "No other explanation" in say.best_sentence(table)
+    near = _rows(log_evidence=[9.0, 10.0, -9.0], against=[0.0, 1.0, -18.0])
+    assert "do not decide" in say.best_sentence(near)
+    words = " ".join(say.rival_sentences(table))
+    assert "favoured: tilt (+10.0" in words
+    assert "disfavoured: wrong (-9.0" in words
+    assert "too large" in words
+    assert "run in trends" in words
+    calm = _rows(chi2_p=[0.5] * 3, trend_p=[0.5] * 3, against=[0.0, 1.0, -1.0])
+    words = " ".join(say.rival_sentences(calm))
+    assert "neither: tilt" in words
+    assert "trends" not in words
+    assert "more than rounding" in say.noise_sentence(table)
+    assert "reaches down" in say.noise_sentence(_rows(noise_low_px=[0.8, 0.2, 0.8]))
+    assert "'tilt' predicts best" in say.left_out_sentence(table)
+    assert say.scale_sentence(pl.DataFrame({"explanation": ["a"], "scale": [1.0], "against": [0.0]})) == ""
+    offsets = {"explanation": ["tilted"], "mean_px": [20.0], "low_px": [15.0], "high_px": [30.0]}
+    prior = {"prior_mean_px": [20.0], "prior_low_px": [4.0], "prior_high_px": [50.0]}
+    assert "is above the prior's" in say.offset_sentence(table, pl.DataFrame({**offsets, **prior}))
+    wide = pl.DataFrame({**offsets, **prior, "low_px": [4.0]})
+    assert "is not above the prior's" in say.offset_sentence(table, wide)
+
+
+def _tiny() -> str:
+    """Settings smaller than the reduced ones: three explanations, few points."""
+    text = (Path(__file__).parents[1] / "estimator" / "studies" / "cause.toml").read_text(encoding="utf-8")
+    priors = text[text.index("[priors]") : text.index("[[explanations]]")]
+    truth = text[
+        text.index('[[validation.truths]]\nexplanation = "ray"') : text.index(
+            '[[validation.truths]]\nexplanation = "normal'
+        )
+    ]
+    return f"""
+live_points = 30
+live_points_other = 25
+stop = 5.0
+prior_scales = [2.0]
+scaled = ["tilted"]
+predictive = 60
+brute_force = 300
+left_out = ["ray"]
+drawn = ["ray", "tilted"]
+depth_sigma_m = 0.005
+{priors}
+[[explanations]]
+name = "ray"
+text = "noise"
+
+[[explanations]]
+name = "outline"
+text = "parallel rays"
+convention = "outline"
+
+[[explanations]]
+name = "tilted"
+text = "tilt"
+free = ["misalignment"]
+
+[validation]
+candidates = ["ray"]
+repeats = 1
+
+{truth}"""
+
+
+def test_the_whole_study_in_small(tmp_path: Path) -> None:
+    pytest.importorskip("dynesty")
+    (tmp_path / "cause.toml").write_text(_tiny(), encoding="utf-8")
+    result = run_study(
+        "cause", tmp_path / "out", settings=tmp_path / "cause.toml", workers=1, console=Console(quiet=True)
+    )
+    assert result.tables["table"]["explanation"].to_list() == ["ray", "outline", "tilted"]
+    assert result.tables["left_out"].height == 4
+    assert result.tables["made_up"].height == 1
+    assert {drawing.name for drawing in result.drawings} == {"predictive", "evidence", "posterior"}
+    text = " ".join(result.findings)
+    for words in ("explanations", "Reading noise", "Made-up data", "section 6", "brute-force", "times as wide"):
+        assert words in text
+    assert (tmp_path / "out" / "findings.md").stat().st_size > 1000
+
+
+def test_runs_have_streams_of_their_own(settings: CauseSettings) -> None:
+    keys = [run.key for run in all_runs(settings)]
+    assert len(keys) == len(set(keys))
+    assert len(keys) > 50
+    assert isinstance(settings.explanations[0], Explanation)
