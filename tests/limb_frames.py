@@ -41,9 +41,7 @@ def drawn_rig(rng: np.random.Generator, blur_px: tuple[float, float] = (0.5, 1.0
 TINT = (1.0, 0.85, 0.45)
 
 
-def limb_light(
-    rig: Rig, rng: np.random.Generator, mean_e_per_s: float = 1.5e5, room=None, tint=TINT
-) -> np.ndarray:
+def limb_light(rig: Rig, rng: np.random.Generator, mean_e_per_s: float = 1.5e5, room=None, tint=TINT) -> np.ndarray:
     """Expected electrons per second, shape (3, H, W); away from the outline the room's mean level.
 
     `room` is a function (points, directions) -> radiance; by default it is drawn from `rng`.

@@ -55,8 +55,4 @@ def cases(rigs: range, *kinds: tuple[str, dict]) -> Iterator[Case]:
                 print(f"rig {k} {preset} {changes}: {error}")
                 continue
             name = preset + str(changes.get("jpeg_quality", ""))
-            yield Case(name, k, found.sphere_in_camera_m - _seen(rig), found.sigma_m)
-
-
-def _seen(rig: Rig) -> np.ndarray:
-    return rig.sphere_in_camera_m
+            yield Case(name, k, found.sphere_in_camera_m - rig.sphere_in_camera_m, found.sigma_m)

@@ -23,7 +23,8 @@ _LENGTH_PX, _GAP_PX, _LEAN_RAD = 18, 2, 0.12
 _STEP_PX = 0.5  # across the edge
 _REACH_PX = 4.0
 _SMOOTH_PX = (1.5, 0.8)  # along the radius, along the azimuth
-_MIN_STEP = 0.012  # of the logarithm of light, per pixel
+_LEVEL_PX = 20.0
+_MIN_STEP = 0.012  # of the light, per pixel
 _MIN_OVER_NOISE = 4.0  # of an edge over the usual gradient, which is noise, JPEG's waves and shading
 _MIN_POINTS = 14
 _NEAR_PX = 5.0
@@ -31,7 +32,10 @@ _NEAR_PX = 5.0
 
 @dataclass(frozen=True)
 class Unwrapped:
-    """Logarithm of the light by radius (rows, 1 px) and azimuth (columns)."""
+    """Light over the usual light around, by radius (rows, 1 px) and azimuth (columns).
+
+    Not its logarithm: that would move a blurred edge to its dark side, by more where the contrast is larger.
+    """
 
     light: Array
     centre_px: Array
@@ -52,8 +56,9 @@ def unwrapped(picture: Array, rig: Rig) -> Unwrapped:
     columns = int(2.0 * np.pi * 0.5 * (low + high) / _STEP_PX)
     r, azimuth = np.arange(low, high), np.arange(columns) * (2.0 * np.pi / columns)
     u, v = centre[0] + np.outer(r, np.cos(azimuth)), centre[1] + np.outer(r, np.sin(azimuth))
-    light = ndimage.map_coordinates(np.log(np.clip(picture, 2e-3, None)), [v, u], order=3, mode="nearest")
-    return Unwrapped(light, centre, low, 2.0 * np.pi / columns)
+    light = ndimage.map_coordinates(picture, [v, u], order=3, mode="nearest")
+    level = ndimage.gaussian_filter(light, (_LEVEL_PX, _LEVEL_PX / _STEP_PX), mode=("nearest", "wrap"))
+    return Unwrapped(light / np.clip(level, 2e-3, None), centre, low, 2.0 * np.pi / columns)
 
 
 def edges_of(picture: Array, rig: Rig) -> list[Array]:

@@ -190,7 +190,8 @@ def without_jpeg(pixels: OutlinePixels, step: Step, frame: NDArray[Any], card: S
     for draws in JPEG_DRAWS:
         off = np.mean(again.drawn(step.model + step.by_parameters @ change, draws), axis=0) - step.model
         change = step.move - (step.solution.move(off) - change)
-    return change, step.solution.covariance(pixels.y - step.model - off)
+    # the draws' own mean is left in the scatter: what is large there was not drawn from quite the true light
+    return change, step.solution.covariance(pixels.y - step.model)
 
 
 def _moved(s: Array, move: Array, rig: Rig) -> Array:

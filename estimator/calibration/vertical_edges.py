@@ -34,6 +34,7 @@ _PER_M = (0.35, 0.65)  # an edge's inverse distance, as taken and one standard d
 _TOGETHER = 6.0  # points of an edge that are wrong together: smoothing, and JPEG's blocks of 8 px
 _SLOPE_LIMIT = 4.0  # of an edge's slope against the others' vertical, over its own sigma
 _TUKEY, _LEAST_SCALE = 4.685, 0.5
+_LEAST_SLOPE_RAD = 1e-4  # of an edge's own sigma: rooms are not built better
 _ROUNDS = 12
 
 
@@ -153,16 +154,25 @@ def _azimuth_and_slope(rays: EdgeRays, up: Array, per_m: float = _PER_M[0]) -> t
     return azimuth, slope, square / (_TOGETHER * float(left @ left) / max(left.size - 2, 1) + 1e-300)
 
 
+def _slopes(rays: Sequence[EdgeRays], up: Array) -> tuple[Array, Array, Array]:
+    """Azimuths, slopes and one over the slopes' variances of edges, shape (K,) each; their distances are not known."""
+    azimuth, slope, weight = np.array([_azimuth_and_slope(r, up) for r in rays]).T
+    nearer = np.array([_azimuth_and_slope(r, up, _PER_M[1])[1] for r in rays])
+    return azimuth, slope, 1.0 / (1.0 / weight + (nearer - slope) ** 2 + _LEAST_SLOPE_RAD**2)
+
+
 def _agreeing(rays: Sequence[EdgeRays], up: Array) -> list[int]:
     """Numbers of the edges whose slopes belong to one vertical near `up`: the pair that most others agree with."""
     if len(rays) < MIN_EDGES:
         return list(range(len(rays)))
-    azimuth, slope, weight = np.array([_azimuth_and_slope(r, up) for r in rays]).T
+    azimuth, slope, weight = _slopes(rays, up)
     across = np.stack([-np.sin(azimuth), np.cos(azimuth)], axis=-1)
     i, j = np.triu_indices(len(rays), 1)
     sine = across[i, 0] * across[j, 1] - across[i, 1] * across[j, 0]
     i, j, sine = i[np.abs(sine) > 0.3], j[np.abs(sine) > 0.3], sine[np.abs(sine) > 0.3]
-    tilt = np.stack([slope[i] * across[j, 1] - slope[j] * across[i, 1], slope[j] * across[i, 0] - slope[i] * across[j, 0]])
+    tilt = np.stack(
+        [slope[i] * across[j, 1] - slope[j] * across[i, 1], slope[j] * across[i, 0] - slope[i] * across[j, 0]]
+    )
     tilt = (tilt / sine).T[np.linalg.norm(tilt / sine, axis=0) < MAX_TILT_RAD]
     if not len(tilt):
         return []
@@ -192,8 +202,7 @@ def _regression(rays: Sequence[EdgeRays], up: Array) -> Regression:
     covariance is a sandwich over edges (CR2: Bell and McCaffrey, Survey Methodology 28, 169, 2002), averaged with the
     pooled one, which is steadier where edges are few. Two degrees of freedom are the vertical's own.
     """
-    azimuth, slope, weight = np.array([_azimuth_and_slope(edge, up) for edge in rays]).T
-    nearer = np.array([_azimuth_and_slope(edge, up, _PER_M[1])[1] for edge in rays])
+    azimuth, slope, weight = _slopes(rays, up)
     across = np.stack([-np.sin(azimuth), np.cos(azimuth)], axis=-1)
     weight = _evened(weight)
     trust = np.ones(slope.size)
@@ -212,8 +221,7 @@ def _regression(rays: Sequence[EdgeRays], up: Array) -> Regression:
     meat = across.T @ ((w * trust)[:, None] * across)
     degrees = max(float(trust.sum()) - 2.0, 1.0)
     pooled = max(float(np.sum(trust * off**2)) / degrees, _LEAST_SCALE**2) * meat
-    far = across.T @ ((w * (nearer - slope))[:, None] ** 2 * across)
-    covariance = inverse @ (0.5 * (scores.T @ scores + pooled) / slack**2 + far) @ inverse
+    covariance = inverse @ (0.5 * (scores.T @ scores + pooled) / slack**2) @ inverse
     return Regression(tilt, covariance, scale)
 
 
