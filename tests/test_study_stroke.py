@@ -36,8 +36,8 @@ depths_m = [1.0, 2.0]
 spot_height_m = 0.5
 strokes_m = [0.1, 1.4]
 outline_sigma_um = [8.0, 8.0, 24.0]
-[paper_strokes_m]
-"2.18" = 1.4
+paper_depths_m = [2.18]
+paper_strokes_m = [1.4]
 [check]
 preset = "bayer-raw"
 depths_m = [1.0]
@@ -151,19 +151,19 @@ def test_checks_are_judged_by_their_intervals() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("old", "new", "words"),
     [
-        ('preset = "bayer-raw"\ndepths_m = [1.0, 2.0]', ("preset", "bayer")),
-        ("factors = [0.3, 1.0]", ("factors", "1.0")),
-        ('"2.18" = 1.4', ("paper_strokes_m", "no distance")),
+        ('preset = "bayer-raw"\ndepths', 'preset = "bayer"\ndepths', ("preset", "'mjpeg'")),
+        ("factors = [0.3, 1.0]", "factors = [0.3]", ("check.factors = [0.3]", "hold 1.0")),
+        ("paper_strokes_m = [1.4]", "paper_strokes_m = [1.4, 1.0]", ("1 entries", "2: give as many")),
+        ("spot_height_m = 0.5", "spot_height_m = 9.0", ("spot_height_m",)),
     ],
 )
-def test_bad_settings(tmp_path: Path, change: str, words: tuple[str, ...]) -> None:
-    wrong = {"p": 'preset = "bayer"\ndepths_m = [1.0]', "f": "factors = [0.3]", '"': '"far" = 1.4'}[change[0]]
+def test_bad_settings(tmp_path: Path, old: str, new: str, words: tuple[str, ...]) -> None:
     file = tmp_path / "stroke.toml"
-    file.write_text(TINY.replace(change, wrong), encoding="utf-8")
+    file.write_text(TINY.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(DatasetError) as caught:
-        read_settings(STUDY, False, file)
+        STUDY.run(read_settings(STUDY, False, file), Material(tmp_path, Console(quiet=True), 1))
     assert all(word in str(caught.value) for word in words)
 
 

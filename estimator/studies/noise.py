@@ -6,10 +6,10 @@ One factor at a time about base cases; all methods that take the preset, on the 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated
+from typing import Annotated, Literal
 
 import polars as pl
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import Dataset
@@ -37,7 +37,25 @@ from phibench.render.sensor import SensorError
 from phibench.scenes.names import nearest
 
 _Words = Annotated[tuple[str, ...], Field(strict=False)]
-_Levels = Annotated[tuple[float, ...], Field(strict=False, min_length=1)]
+_Levels = Annotated[tuple[float, ...], Field(strict=False)]
+
+
+class LevelSettings(Settings):
+    """Levels by factor; a factor without levels is left out, and the base's own level is measured anyway."""
+
+    exposure_s: _Levels = Field(default=(), description="exposure times, s")
+    power_mw: _Levels = Field(default=(), description="powers of the laser, mW")
+    read_noise_e: _Levels = Field(default=(), description="read noise, electrons")
+    blur_sigma_px: _Levels = Field(default=(), description="optical blur besides defocus, px")
+    focus_distance_m: _Levels = Field(default=(), description="distances of the plane of focus, m")
+    jpeg_quality: _Levels = Field(default=(), description="libjpeg's quality")
+    adc_bits: _Levels = Field(default=(), description="bits of the converter")
+    speckle_contrast: _Levels = Field(default=(), description="contrast of the flux, 0.41 to 1")
+
+    @property
+    def given(self) -> dict[str, tuple[float, ...]]:
+        """Levels of the factors that have some."""
+        return {name: tuple(levels) for name, levels in self if levels}
 
 
 class NoiseSettings(Settings):
@@ -45,44 +63,22 @@ class NoiseSettings(Settings):
 
     recipe: str = Field(default="paper", description="recipe of the base cases, rendered for 1 mW")
     samples: _Words = Field(min_length=1, description="base cases; the first is the main one")
-    presets: _Words = Field(min_length=1, description="of bayer-raw, srgb8, mjpeg")
+    presets: Annotated[tuple[Literal["bayer-raw", "srgb8", "mjpeg"], ...], Field(strict=False, min_length=1)] = Field(
+        description="of the sensor"
+    )
     methods: _Words = Field(default=(), description="built-in methods; all if empty")
     places: int = Field(ge=2, le=200, description="places of the spot on its board")
     draws: int = Field(ge=2, le=200, description="draws of the noise at each place")
     box_px: int = Field(ge=24, le=256, description="side of the boxes that methods are given")
     resamples: int = Field(ge=99, le=9999, description="of the bootstrap over places")
-    levels: dict[str, _Levels] = Field(min_length=1, description="levels by factor; the base is added")
-
-    @field_validator("levels")
-    @classmethod
-    def _known_factors(cls, levels: dict[str, tuple[float, ...]]) -> dict[str, tuple[float, ...]]:
-        for name in levels:
-            if name not in FACTORS:
-                raise ValueError(f"no factor '{name}'; {nearest(name, tuple(FACTORS))}")
-        return levels
-
-    @field_validator("presets")
-    @classmethod
-    def _known_presets(cls, presets: tuple[str, ...]) -> tuple[str, ...]:
-        for name in presets:
-            if name not in REFERENCE:
-                raise ValueError(f"preset '{name}': {nearest(name, tuple(REFERENCE))}")
-        return presets
-
-    @field_validator("methods")
-    @classmethod
-    def _known_methods(cls, methods: tuple[str, ...]) -> tuple[str, ...]:
-        for name in methods:
-            if name not in METHODS:
-                raise ValueError(f"no method '{name}'; {nearest(name, tuple(METHODS))}")
-        return methods
+    levels: LevelSettings = Field(description="levels by factor; the base is added")
 
 
 def run(settings: NoiseSettings, material: Material) -> Result:
     """Run the study."""
     dataset = material.dataset(settings.recipe)
     planned = cells(settings, dataset)
-    records = with_levels(all_records(planned, material), dict(settings.levels))
+    records = with_levels(all_records(planned, material), settings.levels.given)
     rules = Rules(resamples=settings.resamples)
     table = table_of(records, rules)
     slopes = elasticities(records, rules)
@@ -121,6 +117,9 @@ def cells(settings: NoiseSettings, dataset: Dataset) -> list[Cell]:
         if not (row.down.visible and row.up.visible):
             raise DatasetError(f"{name}: its spot is not visible in both images; take another base case")
     methods = settings.methods or tuple(METHODS)
+    for name in methods:
+        if name not in METHODS:
+            raise DatasetError(f"methods: there is no '{name}' here; {nearest(name, tuple(METHODS))}")
     plan = [(s, p, f, x) for p in reversed(settings.presets) for s in settings.samples for f, x in _levels(settings, p)]
     for sample, preset, factor, level in plan:
         try:
@@ -134,7 +133,7 @@ def cells(settings: NoiseSettings, dataset: Dataset) -> list[Cell]:
 def _levels(settings: NoiseSettings, preset: str) -> Iterator[tuple[str, float]]:
     """The base case, then every level that is not the base's."""
     yield BASE, 0.0
-    for name, levels in settings.levels.items():
+    for name, levels in settings.levels.given.items():
         factor = FACTORS[name]
         if preset in factor.presets:
             yield from ((name, x) for x in levels if abs(x - factor.base) > 1e-9)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import polars as pl
-from pydantic import Field, field_validator
+from pydantic import Field
 
+from phibench.datasets.errors import DatasetError
 from phibench.datasets.sensor_card import SensorCard, sensor_card
 from phibench.estimator.best_stroke import BestStroke, best_stroke, spot_bound
 from phibench.estimator.calibration.bundle import Measured, calibrate
@@ -19,7 +20,7 @@ from phibench.estimator.spot_sigma import SpotSigma
 from phibench.estimator.stroke_curve import StrokeCurve, Surroundings, stroke_curve, stroke_grid
 from phibench.estimator.studies.material import Material
 from phibench.estimator.studies.result import Result
-from phibench.estimator.studies.stroke_checks import METHOD, Check, Checked, run_checks
+from phibench.estimator.studies.stroke_checks import Check, Checked, run_checks
 from phibench.estimator.studies.stroke_drawings import best_drawing, check_drawing, curves_drawing
 from phibench.estimator.studies.stroke_findings import (
     best_sentence,
@@ -32,11 +33,11 @@ from phibench.estimator.studies.stroke_findings import (
 )
 from phibench.estimator.studies.study import Settings, Study
 from phibench.scenes.frames import Array
-from phibench.scenes.names import nearest
 from phibench.scenes.rig import Rig
 
 AS_BUILT, CALIBRATED, EXACT = "as built", "calibrated by the outline", "pixels alone"
 _Depths = Annotated[tuple[Annotated[float, Field(ge=0.2, le=20.0)], ...], Field(strict=False, min_length=1)]
+_Preset = Literal["bayer-raw", "srgb8", "mjpeg"]
 _Range = Annotated[tuple[float, float], Field(strict=False)]
 _FREE_STROKES_M = (0.1, 6.0)
 
@@ -44,57 +45,27 @@ _FREE_STROKES_M = (0.1, 6.0)
 class CheckSettings(Settings):
     """Frames that are drawn and evaluated."""
 
-    preset: str = Field(description="bayer-raw, srgb8 or mjpeg")
+    preset: _Preset = Field(description="of the sensor")
     depths_m: _Depths = Field(description="distances")
     factors: Annotated[tuple[float, ...], Field(strict=False, min_length=1)] = Field(description="of the best stroke")
     strokes_m: _Range = Field(description="between which the best stroke is sought")
     power_mw: float = Field(gt=0.0, le=10.0, description="of the laser; weak enough that no pixel is full")
     draws: int = Field(ge=8, le=5000, description="pairs, each of a rig of its own")
 
-    @field_validator("factors")
-    @classmethod
-    def _with_the_best(cls, factors: tuple[float, ...]) -> tuple[float, ...]:
-        if 1.0 not in factors or min(factors) <= 0.0:
-            raise ValueError(f"factors = {list(factors)}: must be above 0 and hold 1.0, the best stroke itself")
-        return factors
-
-    @field_validator("preset")
-    @classmethod
-    def _known(cls, preset: str) -> str:
-        if preset not in METHOD:
-            raise ValueError(f"preset '{preset}': {nearest(preset, tuple(METHOD))}")
-        return preset
-
 
 class StrokeSettings(Settings):
     """Settings of the study."""
 
-    preset: str = Field(description="sensor of the charts: bayer-raw, srgb8 or mjpeg")
+    preset: _Preset = Field(description="sensor of the charts")
     depths_m: _Depths = Field(description="distances of the chart")
     spot_height_m: float = Field(ge=0.0, le=3.0, description="above the floor")
     strokes_m: _Range = Field(description="of the carriage")
     outline_sigma_um: Annotated[tuple[float, float, float], Field(strict=False)] = Field(
         description="sphere centre from the outline: across, across, along the axis"
     )
-    paper_strokes_m: dict[str, float] = Field(min_length=1, description="longest stroke by the distance of a table")
+    paper_depths_m: _Depths = Field(description="distances of the paper's tables 1 to 3")
+    paper_strokes_m: _Depths = Field(description="longest stroke of each of these tables")
     check: CheckSettings
-
-    @field_validator("preset")
-    @classmethod
-    def _known(cls, preset: str) -> str:
-        if preset not in METHOD:
-            raise ValueError(f"preset '{preset}': {nearest(preset, tuple(METHOD))}")
-        return preset
-
-    @field_validator("paper_strokes_m")
-    @classmethod
-    def _distances(cls, table: dict[str, float]) -> dict[str, float]:
-        for key in table:
-            try:
-                float(key)
-            except ValueError as error:
-                raise ValueError(f"paper_strokes_m: '{key}' is no distance in metres") from error
-        return table
 
 
 def run(settings: StrokeSettings, material: Material) -> Result:
@@ -102,7 +73,7 @@ def run(settings: StrokeSettings, material: Material) -> Result:
     rig, card = Rig(), sensor_card(settings.preset)
     around = Surroundings(heights_m=(settings.spot_height_m,))
     rigs, spot = tolerances(rig, settings.outline_sigma_um), spot_bound(rig, card)
-    longest = {float(key): value for key, value in settings.paper_strokes_m.items()}
+    longest = _paper(settings)
     depths = sorted({*settings.depths_m, *longest})
     found = {
         (name, d): best_stroke(
@@ -134,6 +105,24 @@ def run(settings: StrokeSettings, material: Material) -> Result:
         },
         _notes(settings, checks),
     )
+
+
+def _paper(settings: StrokeSettings) -> dict[float, float]:
+    """Longest strokes of the paper's tables by distance.
+
+    Raises
+    ------
+    DatasetError
+        If there are not as many of both, or the check leaves out the best stroke itself.
+    """
+    depths, strokes = settings.paper_depths_m, settings.paper_strokes_m
+    if len(depths) != len(strokes):
+        raise DatasetError(f"paper_depths_m has {len(depths)} entries, paper_strokes_m {len(strokes)}: give as many")
+    if 1.0 not in settings.check.factors or min(settings.check.factors) <= 0.0:
+        raise DatasetError(
+            f"check.factors = {list(settings.check.factors)}: must be above 0 and hold 1.0, the best stroke itself"
+        )
+    return dict(zip(depths, strokes, strict=True))
 
 
 def tolerances(rig: Rig, outline_sigma_um: Sequence[float]) -> dict[str, Array]:
