@@ -171,9 +171,9 @@ def test_sentences_of_errors_follow_the_numbers() -> None:
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Quarter-size images of five published experiments, and of three of them with a misaligned rig."""
+    """Quarter-size images, in the dark, of five published experiments, and of one of them with a misaligned rig."""
     text = (Path(__file__).with_name("tiny.toml")).read_text(encoding="utf-8")
-    head = text[: text.index("[[targets]]")]
+    head = text[: text.index("[[targets]]")] + '[room]\nname = "dark"\n\n'
     targets = "".join(
         f'[[targets]]\nname = "d{d}"\ndepth_m = {d}\nazimuth_deg = {a}\nheight_m = 0.5\n\n'
         for d, a in ((1.0, 200.0), (1.975, 100.0), (2.18, 150.0))
@@ -184,8 +184,9 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     folder = tmp_path_factory.mktemp("baseline")
     (folder / "small.toml").write_text(head.replace('"tiny"', '"small"') + targets + experiments, encoding="utf-8")
+    one = experiments[: experiments.index("[[experiments]]", 1)].replace("0.8, 1.1, ", "")
     wrong = head.replace('"tiny"', '"wrong"') + "[misalignment]\ntilt_y_rad = 0.01\npitch_rad = 0.001\n\n"
-    (folder / "wrong.toml").write_text(wrong + targets + experiments, encoding="utf-8")
+    (folder / "wrong.toml").write_text(wrong + targets + one, encoding="utf-8")
     return folder
 
 
