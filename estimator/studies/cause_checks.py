@@ -97,10 +97,11 @@ def coverage(model: Model, points: Array, truth: dict[str, float], level: float)
 
 
 def band(model: Model, points: Array, grid: Experiments, random: np.random.Generator, level: float) -> Array:
-    """Lower end, median and upper end of simulated estimates on a grid, shape (3, n)."""
-    drawn = simulate(model, points, random, grid)
+    """Lower end of simulated estimates on a grid, median of noise-free ones, upper end; shape (3, n)."""
     tail = (1.0 - level) / 2.0
-    return np.asarray(np.nanquantile(drawn, [tail, 0.5, 1.0 - tail], axis=0))
+    low, high = np.nanquantile(simulate(model, points, random, grid), [tail, 1.0 - tail], axis=0)
+    middle = read(model.named(points), grid, model.explanation.reader, model.rig).depth_m
+    return np.stack([low, np.nanmedian(middle, axis=0), high])
 
 
 def alike(model: Model, point: Array) -> list[tuple[str, str, float]]:

@@ -62,7 +62,7 @@ def evidence_drawing(table: pl.DataFrame, scales: pl.DataFrame, alt: str) -> Dra
                 y = [places[name] + 0.18 * (i - 1) * (i > 0) for name in own["explanation"]]
                 ax.errorbar(own["against"], y, xerr=own["error"], fmt="osD"[i], color=COLOURS[i], ms=4, label=label)
         ax.set_yticks(range(len(rows)), rows["text"])
-        ax.set(xlabel=f"log evidence against '{table['text'][0]}', with the sampler's error (1 sigma)")
+        ax.set(xlabel="log evidence against the one at 0 (bars: 1 sigma of the sampler)")
         ax.legend(loc="lower right", fontsize=7)
         return drawn("evidence", figure, alt)
 
