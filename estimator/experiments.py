@@ -154,7 +154,7 @@ def calibrate_rig(dataset: Dataset, rig: str, procedure: Procedure) -> Bundle:
     preset, off = procedure.preset, procedure.laser_off
     poses = one_per_pose(samples)
     chosen = sorted({round(place) for place in np.linspace(0, len(poses) - 1, max(procedure.outlines, 1))})
-    outlines = [frame_outline(dataset, *poses[place], preset, off) for place in chosen]
+    outlines = [frame_outline(dataset, s, p, preset, off) for s, p in (poses[place] for place in chosen)]
     spots = frame_spots(dataset, known, preset, procedure.ruler, off, LEAST_SPOTS)
     return calibrate(known[0].nominal_rig, mean_outline(outlines), spots)
 
