@@ -8,8 +8,7 @@ from outline_pulls import Case, cases
 
 LIMIT = {20: (0.6, 1.6), 60: (0.75, 1.35), 200: (0.85, 1.2)}
 """Pull that is accepted for so many rigs. A pull over n rigs scatters by 1 / sqrt(2 n), and by somewhat more because
-sigma itself is only known to a tenth: 20 %, 11 % and 6 %. Three of these about 1.0 give a false alarm
-of 0.3 % a number."""
+sigma itself is only known to a tenth: 20 %, 11 % and 6 %. Three of these about 1.0 give a false alarm of 0.3 %."""
 
 
 def pulls(found: list[Case], count: int) -> np.ndarray:

@@ -1,9 +1,11 @@
 """Where the sphere is, from the image of its outline.
 
-The outline of a sphere under a pinhole is the cone of pixels with the angle a0 = asin(R / |s|) from s. `limb` gives the
-light across it; its level, and its slope along and across the limb, are free in every sector of the outline, and so is
-the blur. What is left is the centre s: Gauss-Newton with robust weights. The covariance is a sandwich over sectors,
-with the correlation of neighbours, because the room behind the limb and JPEG's blocks err over many pixels together.
+The outline of a sphere under a pinhole is the cone of pixels with the angle a0 = asin(R / |s|) from s. `limb` gives
+the light across it; its level, and its slope along and across the limb, are free in every sector of the outline, and
+so is the blur. What is left is the centre s: Gauss-Newton with robust weights. Sectors whose light the model does not
+describe (lamps, edges of the room) are left out, with their neighbours. The covariance is taken from the scatter of
+the sectors' shifts, with the correlation of neighbours, because the room and JPEG's blocks err over many pixels
+together. What JPEG does to the limb is drawn from the frame itself (`outline_jpeg`).
 
 R and |s| scale together: the outline is that of every sphere with the same R / |s|. s is as wrong as R is:
 ds / s = dR / R. The camera's numbers are taken as exact, too; `bundle` puts their errors in.

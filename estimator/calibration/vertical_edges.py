@@ -3,10 +3,11 @@
 The paper's own check of the alignment is that all vertical edges go through the image's centre (section 5). Here the
 check becomes a measurement. Every pixel on an edge's image has a reflected ray (o, r): a sphere has no single
 viewpoint, so that o differs from ray to ray. The rays are taken to the edge's distance from the vertical n, and there
-the points' place across the edge is a straight line of their height: if n is right, it does not change with height. A wrong n by
-the tilt t gives the edge at azimuth a the slope t . (-sin a, cos a), so that edges of two azimuths give n, and more of
-them say how well. The distance hardly matters, since o and r lie nearly in one vertical plane; it is taken as
-1 / 0.35 m, and what other distances would change is in the edge's variance. Frames: everything in the camera frame.
+the points' place across the edge is a straight line of their height: if n is right, it does not change with height.
+An n that is wrong by the tilt t gives the edge at azimuth a the slope t . (-sin a, cos a), so that edges of two
+azimuths give n, and more of them say how well. The distance hardly matters, since o and r lie nearly in one vertical
+plane; it is taken as 1 / 0.35 m, and what other distances would change is in the edge's variance. Frames: everything
+in the camera frame.
 """
 
 from __future__ import annotations
