@@ -96,7 +96,7 @@ def drawn_tint(rng: np.random.Generator) -> tuple[float, float, float]:
 
 
 def drawn_room(rng: np.random.Generator):
-    """Radiance at (points, directions) of a ceiling, 2.3 to 4 m high, with a pattern and up to 8 lamps, and of walls."""
+    """Radiance at (points, directions) of a ceiling, 2.3 to 4 m high, with a pattern and up to 8 lamps, and walls."""
     phase, wave, depth = rng.uniform(0.0, 2.0 * np.pi, 4), rng.uniform(0.3, 2.5, 4), rng.uniform(0.0, 0.08, 2)
     count, height, wall = rng.integers(0, 9), rng.uniform(2.3, 4.0), rng.uniform(0.4, 0.9)
     lamps = rng.uniform(-3.0, 3.0, (count, 2))

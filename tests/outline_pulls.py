@@ -16,7 +16,6 @@ from phibench.render.light import Light
 from phibench.render.sensor import sensor
 from phibench.render.tiles import NoiseStream
 from phibench.scenes.frames import Pose
-from phibench.scenes.rig import Rig
 from phibench.scenes.streams import generator
 
 SCRATCH_EVERY = 8

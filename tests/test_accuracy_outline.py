@@ -7,8 +7,8 @@ import pytest
 from outline_pulls import Case, cases
 
 LIMIT = {20: (0.6, 1.6), 60: (0.75, 1.35), 200: (0.85, 1.2)}
-"""Pull that is accepted for so many rigs. A pull over n rigs scatters by 1 / sqrt(2 n), and by somewhat more because sigma
-itself is only known to a tenth: 20 %, 11 % and 6 %. Three of these about 1.0 give a false alarm of 0.3 % a number."""
+"""Pull that is accepted for so many rigs. A pull over n rigs scatters by 1 / sqrt(2 n), and by somewhat more because
+sigma itself is only known to a tenth: 20 %, 11 % and 6 %. Three of these about 1.0 give a false alarm of 0.3 %."""
 
 
 def pulls(found: list[Case], count: int) -> np.ndarray:
@@ -21,7 +21,7 @@ def pulls(found: list[Case], count: int) -> np.ndarray:
     print(
         found[0].name, len(found), "rms um", rms[0], "sigma um", rms[1], "pull", pull, "+-", pull / np.sqrt(2 * len(z))
     )
-    assert len(found) >= 0.97 * count
+    assert len(found) >= 0.9 * count
     return pull
 
 

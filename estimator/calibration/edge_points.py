@@ -1,8 +1,8 @@
 """Long, nearly radial edges in the mirror, as sub-pixel points.
 
-The image is unwrapped about the image of the mirror's nadir: columns are azimuth, rows radius, both of about a pixel at
-the middle radius. There a vertical edge of the room is an upright line. Canny's edges and a probabilistic Hough transform
-find it; its points are then taken anew, at every radius, where the gradient across the edge is largest.
+The image is unwrapped about the middle of the outline: columns are azimuth, half a pixel at the middle radius, rows
+radius, one pixel. There a vertical edge of the room is an upright line. Canny's edges and a probabilistic Hough
+transform find it; its points are then taken anew, at every radius, where the gradient across the edge is largest.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 from skimage.feature import canny
 from skimage.transform import probabilistic_hough_line
@@ -17,6 +18,7 @@ from skimage.transform import probabilistic_hough_line
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
+Rows = NDArray[np.int64]
 RADII = (0.55, 0.93)
 """Rows of the unwrapped image, over the outline's radius: walls; the floor is inside, the ceiling outside."""
 _LENGTH_PX, _GAP_PX, _LEAN_RAD = 18, 2, 0.12
@@ -115,12 +117,12 @@ def _is_block_border(uv_px: Array) -> bool:
     return bool(np.any((np.ptp(uv_px, axis=0) < 2.5) & (np.median(off, axis=0) < 1.0)))
 
 
-def _track(across: Array, least: float, r0: int, r1: int, c0: float, c1: float) -> tuple[Array, Array] | None:
+def _track(across: Array, least: float, r0: int, r1: int, c0: float, c1: float) -> tuple[Rows, Array] | None:
     """Rows and columns of the steepest places near a segment, or None where there is no clean edge.
 
     Two passes: about the segment, and about the straight line through the places of the first one.
     """
-    row = np.arange(r0 + 1, r1)
+    row = np.arange(r0 + 1, r1, dtype=np.int64)
     if row.size < _MIN_POINTS:
         return None
     line = np.polynomial.Polynomial([c0 - r0 * (c1 - c0) / max(r1 - r0, 1), (c1 - c0) / max(r1 - r0, 1)])
@@ -136,7 +138,7 @@ def _track(across: Array, least: float, r0: int, r1: int, c0: float, c1: float) 
     return (row[good], column[good]) if good.sum() >= _MIN_POINTS else None
 
 
-def _steepest(across: Array, row: Array, near: Array, reach_px: float) -> tuple[Array, Array]:
+def _steepest(across: Array, row: Rows, near: Array, reach_px: float) -> tuple[Array, Array]:
     """Column of the largest gradient within reach in each row, by a parabola, and the gradient; NaN at the reach."""
     half = int(reach_px / _STEP_PX)
     columns = np.rint(near).astype(int)[:, None] + np.arange(-half, half + 1)

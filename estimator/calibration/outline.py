@@ -1,9 +1,11 @@
 """Where the sphere is, from the image of its outline.
 
-The outline of a sphere under a pinhole is the cone of pixels with the angle a0 = asin(R / |s|) from s. `limb` gives the
-light across it; its level, and its slope along and across the limb, are free in every sector of the outline, and so is
-the blur. What is left is the centre s: Gauss-Newton with robust weights. The covariance is a sandwich over sectors,
-with the correlation of neighbours, because the room behind the limb and JPEG's blocks err over many pixels together.
+The outline of a sphere under a pinhole is the cone of pixels with the angle a0 = asin(R / |s|) from s. `limb` gives
+the light across it; its level, and its slope along and across the limb, are free in every sector of the outline, and
+so is the blur. What is left is the centre s: Gauss-Newton with robust weights. Sectors whose light the model does not
+describe (lamps, edges of the room) are left out, with their neighbours. The covariance is taken from the scatter of
+the sectors' shifts, with the correlation of neighbours, because the room and JPEG's blocks err over many pixels
+together. What JPEG does to the limb is drawn from the frame itself (`outline_jpeg`).
 
 R and |s| scale together: the outline is that of every sphere with the same R / |s|. s is as wrong as R is:
 ds / s = dR / R. The camera's numbers are taken as exact, too; `bundle` puts their errors in.
@@ -31,6 +33,8 @@ HALF_WIDTH_PX = 5.0
 SECTORS = 120
 MIN_ARC = 0.5
 """Part of the outline that must lie in the image."""
+MIN_USED = 0.6
+"""Part of that whose light must be as the model has it: with less, the rest is not to be trusted either."""
 JPEG_DRAWS = (2, 8)
 """Draws of noise and JPEG from which the change of an outline by JPEG is taken, in a first and a second round."""
 _COARSE_HALF_PX, _COARSE_STEPS = 8.0, 6
@@ -106,8 +110,8 @@ def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) 
         try:
             return fit_outline(planes, rig, start, again=(image, card) if card and card.output == "mjpeg" else None)
         except ImageError as error:
-            # that it is cut says more than that the last circle tried was none
-            fault = fault if "cut by the frame" in str(fault) else error
+            # that it is cut, or lit badly, says more than that the last circle tried was none
+            fault = error if "without a mirror" in str(fault) else fault
     raise fault
 
 
@@ -127,7 +131,13 @@ def fit_outline(
             f"a mirror cut by the frame: {100.0 * arc:.0f} % of its outline lie in the image, {100.0 * MIN_ARC:.0f} % "
             "are needed; move the camera away from the mirror or centre it"
         )
-    return _settle(planes, rig, s, blur, half_px, again)
+    found = _settle(planes, rig, s, blur, half_px, again)
+    if found.arc < MIN_USED * arc:
+        raise ImageError(
+            f"lamps or edges of the room along the mirror's outline: {100.0 * found.arc / arc:.0f} % of it can be used, "
+            f"{100.0 * MIN_USED:.0f} % are needed; switch lamps off, or move the robot"
+        )
+    return found
 
 
 def visible_arc(rig: Rig, s: Array, margin_px: float = 0.0) -> float:

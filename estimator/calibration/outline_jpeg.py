@@ -1,8 +1,8 @@
 """What JPEG does to an outline, from the image itself: the fitted light goes through noise and JPEG again.
 
-JPEG cuts away the limb's fine waves. The limb becomes wider and moves, by an amount that depends on the quality, on how
-the limb lies in the blocks and on the noise. No table has it; but the fit's own model, known exactly, can be sent through
-the camera's noise and the same compression, in the same blocks, and what the fit then finds is wrong by about the same.
+JPEG cuts away the limb's fine waves. The limb becomes wider and moves, by an amount that depends on the quality, on
+how the limb lies in the blocks and on the noise. No table has it; but the fit's own model, known exactly, can be sent
+through the camera's noise and the same compression, in the same blocks, and the fit then errs by about the same.
 Luma blocks are independent of each other: only the units that the pixels lie in are compressed.
 """
 

@@ -13,7 +13,6 @@ from phibench.estimator.calibration.sectors import SectorFit, Sectors, scatter, 
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
-
 _MIN_SLACK = 0.5
 
 

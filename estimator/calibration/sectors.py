@@ -17,7 +17,9 @@ _ROUNDS = 3
 NEIGHBOURS = 3
 """Sectors on each side, each of 18 px, whose errors may be correlated: JPEG's blocks and the room's structures."""
 _MISFIT = (1.4, 2.0)
+"""Rms of what the model leaves in a sector, over the usual one: trusted up to the first, not from the second on."""
 _SPOILT = 2
+"""Sectors on each side of a spoilt one that are not trusted either."""
 
 
 @dataclass(frozen=True)

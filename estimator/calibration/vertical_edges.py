@@ -1,12 +1,13 @@
 """The world's vertical in the camera frame, from vertical edges of the room in the mirror.
 
 The paper's own check of the alignment is that all vertical edges go through the image's centre (section 5). Here the
-check becomes a measurement. Every pixel on an edge's image has a reflected ray (o, r): a sphere has no single viewpoint,
-so that o differs from ray to ray. The rays are taken to the edge's distance from the vertical n, and there the points'
-place across the edge is a straight line of their height: if n is right, it does not change with height. A wrong n by
-the tilt t gives the edge at azimuth a the slope t . (-sin a, cos a), so that edges of two azimuths give n, and more of
-them say how well. The distance hardly matters, since o and r lie nearly in one vertical plane; it is taken as 1 / 0.35 m,
-and what other distances would change is in the edge's variance. Frames: everything in the camera frame.
+check becomes a measurement. Every pixel on an edge's image has a reflected ray (o, r): a sphere has no single
+viewpoint, so that o differs from ray to ray. The rays are taken to the edge's distance from the vertical n, and there
+the points' place across the edge is a straight line of their height: if n is right, it does not change with height.
+An n that is wrong by the tilt t gives the edge at azimuth a the slope t . (-sin a, cos a), so that edges of two
+azimuths give n, and more of them say how well. The distance hardly matters, since o and r lie nearly in one vertical
+plane; it is taken as 1 / 0.35 m, and what other distances would change is in the edge's variance. Frames: everything
+in the camera frame.
 """
 
 from __future__ import annotations
@@ -139,8 +140,7 @@ def _horizontal(up: Array) -> tuple[Array, Array]:
 
 
 def _azimuth_and_slope(rays: EdgeRays, up: Array, per_m: float = _PER_M[0]) -> tuple[float, float, float]:
-    """Azimuth of an edge, its slope along the azimuth, radians, and that slope's weight: one over the variance that
-    the points' own scatter gives it."""
+    """Azimuth of an edge, its slope along the azimuth, radians, and one over the variance that its points give it."""
     x, y = _horizontal(up)
     a, b = rays.direction @ x, rays.direction @ y
     t = (1.0 / per_m - np.hypot(rays.origin_m @ x, rays.origin_m @ y)) / np.hypot(a, b)
