@@ -89,8 +89,8 @@ def useless_sentence(table: pl.DataFrame, sample: str, preset: str) -> str:
     if not text:
         return (
             f"{preset}, {sample}: at every level {REFERENCE[preset]} finds {100 * FEW:g} % of the spots or more in "
-            f"their boxes and is nowhere by its interval below {BELOW:g} times the bound, which therefore holds over all "
-            "ranges tried."
+            f"their boxes and is nowhere by its interval below {BELOW:g} times the bound, which therefore holds over "
+            "all ranges tried."
         )
     return f"{preset}, {sample}: " + "; ".join(text) + "."
 
@@ -98,17 +98,14 @@ def useless_sentence(table: pl.DataFrame, sample: str, preset: str) -> str:
 def leaving_sentence(table: pl.DataFrame, sample: str, preset: str) -> str:
     """Where the reference method itself leaves the bound while the spot is seen and no pixel is full."""
     rows = [r for r in _levels(table, sample, preset) if r["saturated"] == 0.0 and r["detection_rate"] >= FEW]
-    left, lead = [r for r in rows if ratio_of(r)[1] > ABOVE], f"{preset}, {sample}: {REFERENCE[preset]}"
+    lead = f"{preset}, {sample}: {REFERENCE[preset]}"
+    left = [r for r in rows if ratio_of(r)[1] > ABOVE]
     if not left:
-        return (
-            f"{preset}, {sample}: {REFERENCE[preset]} is at no level by its interval above {ABOVE:g} times the bound."
-        )
+        return f"{lead} is at no level by its interval above {ABOVE:g} times the bound."
     listed = ", ".join(
         f"{_with_ratio(r)}, scatter {1e3 * r['scatter_px']:.3g} and bias {1e3 * r['bias_px']:.3g} mpx" for r in left
     )
-    return (
-        f"{preset}, {sample}: {REFERENCE[preset]} leaves the bound (by its interval above {ABOVE:g} times) at {listed}."
-    )
+    return f"{lead} leaves the bound (by its interval above {ABOVE:g} times) at {listed}."
 
 
 def ranking_sentence(found: Sequence[Elasticity], sample: str, preset: str) -> str:
