@@ -10,6 +10,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from phibench.estimator.calibration.parameters import PARAMETERS, changed, stroke_of
@@ -20,7 +21,7 @@ from phibench.scenes.rig import Rig
 
 _PAIRS = 32  # the even part is then good to some 15 %
 _SEED = 0  # the scramble is part of the rule, not a noise draw
-_STROKES = 9  # the even part is smooth in the stroke: interpolated between
+_LOG_STEP = 0.35  # the even part is smooth in the logarithm of the stroke: interpolated between
 
 
 def covariance_root(covariance: Array) -> Array:
@@ -53,7 +54,7 @@ def even_part_m(
     """
     if not np.any(covariance_rig):
         return np.zeros(len(strokes_m))
-    chosen = np.unique(np.linspace(0, len(strokes_m) - 1, min(_STROKES, len(strokes_m))).round().astype(int))
+    chosen = _chosen(strokes_m)
     h, up_px2 = strokes_m[chosen], np.broadcast_to(covariance_up_px2, (len(strokes_m), *covariance_up_px2.shape[1:]))
     half = _normals(_PAIRS) @ covariance_root(covariance_rig).T
     seen = [_seen(rig, v, h, points_m) for v in (*half, *-half)]
@@ -75,6 +76,13 @@ def _seen(rig: Rig, values: Array, strokes_m: Array, points_m: Array) -> tuple[A
     down = np.broadcast_to(image_of(view, points_m).uv_px, up.shape)
     away = points_m[:, :2] - view.sphere_centre_m[:2]
     return down, up, np.hypot(away[:, 0], away[:, 1])[None]
+
+
+def _chosen(strokes_m: Array) -> NDArray[np.int64]:
+    """Indices of strokes of which no two neighbours are further apart than the step, the ends among them."""
+    goals = np.arange(np.log(strokes_m[0]), np.log(strokes_m[-1]), _LOG_STEP)
+    nearest = np.searchsorted(np.log(strokes_m), goals, side="right") - 1
+    return np.unique([*nearest.tolist(), 0, len(strokes_m) - 1]).astype(np.int64)
 
 
 @lru_cache(maxsize=1)

@@ -20,10 +20,11 @@ from phibench.estimator.best_stroke import (
     spot_bound,
     without_limits,
 )
-from phibench.estimator.calibration.parameters import PARAMETERS, prior_sigmas
+from phibench.estimator.calibration.parameters import PARAMETERS, changed, prior_sigmas, stroke_of
 from phibench.estimator.depth_general import depth_general
 from phibench.estimator.line_of_sight import blocked, first_blocker
 from phibench.estimator.mirror_image import image_of
+from phibench.estimator.rig_draws import covariance_root
 from phibench.estimator.spot_flux import Laser, spot_electrons_per_s
 from phibench.estimator.spot_sigma import SpotSigma, spot_sigma
 from phibench.estimator.stroke_curve import (
@@ -34,6 +35,7 @@ from phibench.estimator.stroke_curve import (
     NO_IMAGE,
     OCCLUDED,
     Surroundings,
+    causes,
     stroke_curve,
 )
 from phibench.render.raycast import blocked_by
@@ -205,7 +207,34 @@ def test_minimum_is_that_of_a_brute_force_search_with_a_rig_as_built() -> None:
     assert best.stroke_m == pytest.approx(strokes[np.argmin(sigma)], abs=0.012)
     low, high = best.near()
     assert low < best.stroke_m < high
-    assert sigma[-1] > 1.5 * best.sigma_m  # the error of a rig as built grows again
+    assert sigma[-1] > 1.2 * best.sigma_m  # the error of a rig as built grows again
+
+
+def test_a_rig_as_built_errs_beyond_first_order_as_drawn_rigs_do() -> None:
+    """At D = 1.4 m, h = 0.4 m the first order of a tilt is nearly 0; what is left is its square."""
+    random, n, D, h = generator("test", "drawn rigs"), 250, 1.4, 0.4
+    C, one = np.diag(prior_sigmas() ** 2), replace(OPEN, azimuths_rad=(0.0, 1.6, 3.1, 4.7))
+    curve = stroke_curve(RIG, D, np.array([h]), SAME, C, one, Laser(), 1.0 / 60.0, 0.0)
+    points, root = one.points_m(RIG, D), covariance_root(C)
+    down, up, true = [], [], []
+    for _ in range(n):
+        values = root @ random.standard_normal(P)
+        rig, real_h = changed(RIG, values), float(stroke_of(np.array(h), values))
+        down.append(image_of(rig.at(0.0), points).uv_px)
+        up.append(image_of(rig.at(real_h), points).uv_px)
+        true.append(np.hypot(*(points[:, :2] - rig.at(0.0).sphere_centre_m[:2]).T))
+    pixels = 0.05**2 * np.eye(2)
+    found = depth_general(RIG, h, np.array(down), np.array(up), pixels, pixels, C).depth_m
+    rms = float(np.sqrt(np.mean((found - np.array(true)) ** 2)))
+    # squares of 250 rigs scatter by about 2: the rms by 2 / (2 sqrt(250)) = 6 %, that of the rule's 32 pairs by 15 %
+    assert rms == pytest.approx(float(curve.sigma_m[0]), rel=0.45)
+    assert rms > 2.0 * float(curve.sigma_calibration_m[0])
+
+
+def test_exact_rigs_have_no_second_order() -> None:
+    curve = stroke_curve(RIG, 1.4, np.array([0.4, 0.8]), SAME, EXACT, OPEN, Laser(), 1.0 / 60.0, 0.0)
+    assert not curve.sigma_second_order_m.any()
+    assert not curve.sigma_calibration_m.any()
 
 
 def test_parts_add_up_and_the_strokes_own_error_counts() -> None:
@@ -252,17 +281,19 @@ def test_causes_are_the_simulators() -> None:
         azimuth, height = random.uniform(-3.0, 3.0), random.uniform(0.0, 2.9)
         depth, h = random.uniform(0.1, 1.5) * random.uniform(0.3, 1.0), random.uniform(0.1, 1.4)
         around = Surroundings((height,), (azimuth,), edge_px=1.0)
-        cause = stroke_curve(RIG, depth, np.array([h]), SAME, EXACT, around, Laser(), 1.0, 0.0).causes[0]
+        points = around.points_m(RIG, depth)
+        down, up = (image_of(RIG.at(0.0), points[None] - [0.0, 0.0, z]) for z in (0.0, h))
+        cause = causes(RIG, points, down, up, np.array([h]), around)[0]
         spot = LaserSpot(tuple(around.points_m(RIG, depth)[0]), tuple(around.wall_normals()[0]), 5e-3)
         truths = [spot_truth(RIG.at(z), spot, escalade360(RIG.at(z))) for z in (0.0, h)]
-        causes = [t.cause for t in truths if not t.visible]
+        expected = [t.cause for t in truths if not t.visible]
         if any(solid.contains(spot.position_world_m) for solid in escalade360(RIG.at(0.0))):
             continue  # a spot inside the robot is no place
-        if not causes:
+        if not expected:
             assert cause == FREE
             seen += 1
-        elif causes[0] != "faces_away":  # a wall that faces the axis shows its back to a mirror that is beyond it
-            assert cause in words.get(causes[0], (causes[0].replace(RENDERED_OCCLUDED, f"{OCCLUDED} "),))
+        elif expected[0] != "faces_away":  # a wall that faces the axis shows its back to a mirror that is beyond it
+            assert cause in words.get(expected[0], (expected[0].replace(RENDERED_OCCLUDED, f"{OCCLUDED} "),))
             hidden.add(cause)
     assert seen > 100
     assert len(hidden) >= 2

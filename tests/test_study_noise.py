@@ -255,7 +255,7 @@ def test_where_the_bound_is_useless() -> None:
         pl.DataFrame(faint), "s", "bayer-raw"
     )
     below = [*good, _row("read_noise_e", 16.0, efficiency_px=1.5)]
-    assert "surely below 0.9 times the bound" in useless_sentence(pl.DataFrame(below), "s", "bayer-raw")
+    assert "by their intervals below 0.9 times the bound" in useless_sentence(pl.DataFrame(below), "s", "bayer-raw")
     full = [*good, _row("power_mw", 3.0, saturated=0.5, efficiency_px=0.4)]
     assert "pixels are full, which the bound leaves out, at laser power, mW 3 (rms / bound 2.5" in useless_sentence(
         pl.DataFrame(full), "s", "bayer-raw"
@@ -265,9 +265,9 @@ def test_where_the_bound_is_useless() -> None:
 def test_where_the_reference_leaves_the_bound() -> None:
     rows = [_row(BASE, 0.0), _row("focus_distance_m", 0.19, efficiency_px=0.5, scatter_px=0.04, bias_px=0.05)]
     text = leaving_sentence(pl.DataFrame(rows), "s", "bayer-raw")
-    assert "leaves the bound (surely above 1.25 times) at focus distance, m 0.19 (rms / bound 2" in text
+    assert "leaves the bound (by its interval above 1.25 times) at focus distance, m 0.19 (rms / bound 2" in text
     assert "scatter 40 and bias 50 mpx" in text
-    assert "at no level surely above" in leaving_sentence(pl.DataFrame(rows[:1]), "s", "bayer-raw")
+    assert "at no level by its interval above" in leaving_sentence(pl.DataFrame(rows[:1]), "s", "bayer-raw")
     full = [rows[0], _row("power_mw", 3.0, efficiency_px=0.3, saturated=1.0)]
     assert "at no level" in leaving_sentence(pl.DataFrame(full), "s", "bayer-raw")
 
@@ -287,7 +287,7 @@ def test_ranking_says_what_is_sure() -> None:
     close = ranking_sentence([strong, _elasticity("exposure_s", -0.85, 0.1)], "s", "bayer-raw")
     assert "laser power matters most, though not surely more than exposure" in close
     assert "Only" not in close
-    assert "no factor" in ranking_sentence([], "s", "bayer-raw")
+    assert "no factor" in ranking_sentence([_elasticity("focus_distance_m", 1.0, 0.1)], "s", "bayer-raw")
 
 
 def test_base_case_in_a_sentence() -> None:

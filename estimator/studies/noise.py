@@ -36,6 +36,7 @@ from phibench.estimator.studies.study import Settings, Study
 from phibench.render.sensor import SensorError
 from phibench.scenes.names import nearest
 
+FEW_PLACES = 20
 _Words = Annotated[tuple[str, ...], Field(strict=False)]
 _Levels = Annotated[tuple[float, ...], Field(strict=False)]
 
@@ -141,6 +142,7 @@ def _levels(settings: NoiseSettings, preset: str) -> Iterator[tuple[str, float]]
 
 def _notes(settings: NoiseSettings) -> tuple[str, ...]:
     pairs = settings.places * settings.draws
+    few = settings.places < FEW_PLACES
     return (
         f"{pairs} pairs per level ({settings.places} places of the spot, {settings.draws} draws each); intervals are "
         "95 %, bootstrap over places.",
@@ -150,6 +152,8 @@ def _notes(settings: NoiseSettings) -> tuple[str, ...]:
         "flux and one background level per filter unknown.",
         "Methods know the rig, its blur and focus and the sensor's numbers; the room behind keeps the "
         "blur and the focus at which it was rendered.",
+        "The base is in focus, an optimum: focus distance has no elasticity.",
+        *((f"Bootstrap intervals of fewer than {FEW_PLACES} places are too narrow.",) if few else ()),
     )
 
 

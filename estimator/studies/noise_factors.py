@@ -25,14 +25,14 @@ class Factor:
     change : from preset, rig and level to how pairs are taken and by which rig
     base : level of the base case
     presets : those that it acts on
-    whole : whether levels are whole numbers
+    ranked : whether an elasticity about the base says something; not where the base is an optimum
     """
 
     label: str
     change: Change
     base: float
     presets: tuple[str, ...] = ("bayer-raw", "srgb8", "mjpeg")
-    whole: bool = False
+    ranked: bool = True
 
 
 def _sensor(key: str, whole: bool = False) -> Change:
@@ -68,9 +68,9 @@ FACTORS: dict[str, Factor] = {
     "power_mw": Factor("laser power, mW", _power, 1.0),
     "read_noise_e": Factor("read noise, e-", _sensor("read_noise_e"), 4.0),
     "blur_sigma_px": Factor("optical blur sigma, px", _blur, 0.7),
-    "focus_distance_m": Factor("focus distance, m", _focus, 0.23),
-    "jpeg_quality": Factor("JPEG quality", _sensor("jpeg_quality", True), 85.0, ("mjpeg",), True),
-    "adc_bits": Factor("converter, bits", _bits, 10.0, whole=True),
+    "focus_distance_m": Factor("focus distance, m", _focus, 0.23, ranked=False),
+    "jpeg_quality": Factor("JPEG quality", _sensor("jpeg_quality", True), 85.0, ("mjpeg",)),
+    "adc_bits": Factor("converter, bits", _bits, 10.0),
     "speckle_contrast": Factor("speckle contrast of the flux", _speckle, OFF),
 }
 """By name; the keys are those of the settings, whose levels include the base."""

@@ -82,15 +82,15 @@ def useless_sentence(table: pl.DataFrame, sample: str, preset: str) -> str:
         text.append("spots are missed, so that the local bound means little, at " + ", ".join(map(_missed, missed)))
     if below:
         text.append(
-            f"errors are surely below {BELOW:g} times the bound, which is then no bound of the frames, at "
+            f"errors are by their intervals below {BELOW:g} times the bound, which is then no bound of the frames, at "
             + ", ".join(map(_with_ratio, below))
             + " (levels share their draws and go together)"
         )
     if not text:
         return (
             f"{preset}, {sample}: at every level {REFERENCE[preset]} finds {100 * FEW:g} % of the spots or more in "
-            f"their boxes and is nowhere surely below {BELOW:g} times the bound, which therefore holds over all ranges "
-            "tried."
+            f"their boxes and is nowhere by its interval below {BELOW:g} times the bound, which therefore holds over "
+            "all ranges tried."
         )
     return f"{preset}, {sample}: " + "; ".join(text) + "."
 
@@ -98,13 +98,14 @@ def useless_sentence(table: pl.DataFrame, sample: str, preset: str) -> str:
 def leaving_sentence(table: pl.DataFrame, sample: str, preset: str) -> str:
     """Where the reference method itself leaves the bound while the spot is seen and no pixel is full."""
     rows = [r for r in _levels(table, sample, preset) if r["saturated"] == 0.0 and r["detection_rate"] >= FEW]
+    lead = f"{preset}, {sample}: {REFERENCE[preset]}"
     left = [r for r in rows if ratio_of(r)[1] > ABOVE]
     if not left:
-        return f"{preset}, {sample}: {REFERENCE[preset]} is at no level surely above {ABOVE:g} times the bound."
+        return f"{lead} is at no level by its interval above {ABOVE:g} times the bound."
     listed = ", ".join(
         f"{_with_ratio(r)}, scatter {1e3 * r['scatter_px']:.3g} and bias {1e3 * r['bias_px']:.3g} mpx" for r in left
     )
-    return f"{preset}, {sample}: {REFERENCE[preset]} leaves the bound (surely above {ABOVE:g} times) at {listed}."
+    return f"{lead} leaves the bound (by its interval above {ABOVE:g} times) at {listed}."
 
 
 def ranking_sentence(found: Sequence[Elasticity], sample: str, preset: str) -> str:
@@ -124,8 +125,8 @@ def ranking_sentence(found: Sequence[Elasticity], sample: str, preset: str) -> s
 
 
 def ranked(found: Sequence[Elasticity], sample: str, preset: str, method: str) -> list[Elasticity]:
-    """Elasticities of one method, largest size first; those without a value are left out."""
-    mine = [e for e in found if (e.sample, e.preset, e.method) == (sample, preset, method)]
+    """Elasticities of one method, largest size first, without those that have no value or an optimum at the base."""
+    mine = [e for e in found if (e.sample, e.preset, e.method) == (sample, preset, method) and FACTORS[e.factor].ranked]
     return sorted((e for e in mine if math.isfinite(e.estimate.value)), key=lambda e: -abs(e.estimate.value))
 
 

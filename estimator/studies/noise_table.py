@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,7 +56,7 @@ class Elasticity:
     bound: float
 
 
-def with_levels(records: pl.DataFrame, levels: dict[str, Sequence[float]]) -> pl.DataFrame:
+def with_levels(records: pl.DataFrame, levels: Mapping[str, Sequence[float]]) -> pl.DataFrame:
     """Records in which the base case also stands among the levels of every factor that acts on its preset."""
     base = records.filter(pl.col("factor") == BASE)
     copies = []
