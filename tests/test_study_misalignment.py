@@ -288,8 +288,15 @@ def test_tolerances_name_the_tightest_and_those_never_reached() -> None:
 
 def test_calibration_is_praised_only_where_it_helps() -> None:
     before = [_rank("cx_px", 0.02, 0.03)]
-    assert "less is left" in calibrated_sentence([_rank("pitch_rad", 0.002, 0.008)], before)
-    assert "no less is left" in calibrated_sentence([_rank("pitch_rad", 0.02, 0.08)], before)
+    assert "spots less is left" in calibrated_sentence([_rank("cx_px", 0.002, 0.008)], before)
+    assert "no less is left" in calibrated_sentence([_rank("cx_px", 0.02, 0.08)], before)
+
+
+def test_harm_by_a_calibration_is_said() -> None:
+    before = [_rank("cx_px", 0.02, 0.03), _rank("yaw_rad", 1e-5, 1e-4)]
+    after = [_rank("yaw_rad", 0.003, 0.002), _rank("cx_px", 1e-4, 1e-4)]
+    assert "it makes yaw_rad worse" in calibrated_sentence(after, before)
+    assert "worse" not in calibrated_sentence([_rank("yaw_rad", 1e-5, 1e-4), after[1]], before)
 
 
 def test_noise_interval_covers_as_often_as_it_says() -> None:

@@ -23,10 +23,11 @@ def noise_sentence(name: str, noise: Sequence[AzimuthNoise], test: Isotropy) -> 
     most = max(noise, key=lambda one: one.scatter_m.value)
     verdict = "isotropic" if test.isotropic else "not isotropic"
     follows = "is the same everywhere" if test.explained else "still differs"
+    over_bound = _probability(test.p_value_over_bound)
     return (
         f"{name}: at D = {least.depth_m:.3g} m the noise of D is {verdict} ({_probability(test.p_value)}, "
         f"false alarms {100.0 * test.false_alarm:g} %): {_scatter(least)} to {_scatter(most)}, a factor of "
-        f"{test.ratio:.2g}; as a multiple of each spot's own bound it {follows} ({_probability(test.p_value_over_bound)})."
+        f"{test.ratio:.2g}; as a multiple of each spot's own bound it {follows} ({over_bound})."
     )
 
 
