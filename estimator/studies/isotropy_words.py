@@ -13,6 +13,7 @@ from phibench.estimator.studies.isotropy_noise import AzimuthNoise, Isotropy
 from phibench.estimator.studies.result import Row
 from phibench.scenes.frames import Array
 
+_LEAST_P = 1e-9  # smaller ones say no more
 _STRAIGHT_PX = 0.1  # a tenth of a pixel matters, less does not
 
 
@@ -22,10 +23,11 @@ def noise_sentence(name: str, noise: Sequence[AzimuthNoise], test: Isotropy) -> 
     most = max(noise, key=lambda one: one.scatter_m.value)
     verdict = "isotropic" if test.isotropic else "not isotropic"
     follows = "is the same everywhere" if test.explained else "still differs"
+    over_bound = _probability(test.p_value_over_bound)
     return (
-        f"{name}: at D = {least.depth_m:.3g} m the noise of D is {verdict} (p = {test.p_value:.1g}, "
+        f"{name}: at D = {least.depth_m:.3g} m the noise of D is {verdict} ({_probability(test.p_value)}, "
         f"false alarms {100.0 * test.false_alarm:g} %): {_scatter(least)} to {_scatter(most)}, a factor of "
-        f"{test.ratio:.2g}; as a multiple of each spot's own bound it {follows} (p = {test.p_value_over_bound:.2g})."
+        f"{test.ratio:.2g}; as a multiple of each spot's own bound it {follows} ({over_bound})."
     )
 
 
@@ -162,6 +164,10 @@ def ratio(values: Array) -> float:
     """Largest over smallest; NaN without any."""
     known = values[np.isfinite(values)]
     return float(known.max() / known.min()) if known.size else math.nan
+
+
+def _probability(p: float) -> str:
+    return f"p = {p:.2g}" if p >= _LEAST_P else f"p below {_LEAST_P:g}"
 
 
 def _scatter(one: AzimuthNoise) -> str:

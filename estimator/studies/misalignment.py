@@ -96,7 +96,7 @@ def _interactions(settings: MisalignmentSettings, nominal: Rig, stroke_m: float)
     # four azimuths give the mean of all terms up to the third harmonic, and the first one is world x
     places = settings.places(stroke_m, np.radians([0.0, 90.0, 180.0, 270.0]))
     rng = generator("study", "misalignment", "sobol")
-    return interactions(nominal, places, "exact", settings.sobol_n, settings.resamples, rng)
+    return interactions(nominal, places, "exact", 2**settings.sobol_log2, settings.resamples, rng)
 
 
 def _noise(settings: MisalignmentSettings, nominal: Rig, places: Places) -> Array:

@@ -6,7 +6,7 @@ import math
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from phibench.estimator.studies.misaligned import Places
 from phibench.estimator.studies.misalignment_tolerance import Search
@@ -52,14 +52,8 @@ class MisalignmentSettings(Settings):
     calibration_distance_sigma_m: Positive
     calibration_outline_sigma_m: Annotated[tuple[Positive, Positive, Positive], BeforeValidator(_tuples)]
     noise_draws: int = Field(ge=2, le=10000, description="calibrations of the aligned rig from noisy measurements")
-    sobol_n: int = Field(ge=8, le=2**16, description="base sample, a power of two")
+    sobol_log2: int = Field(ge=3, le=16, description="base sample of the Sobol indices: 2 to this power")
     resamples: int = Field(ge=20, le=100000, description="of the bootstrap")
-
-    @model_validator(mode="after")
-    def _consistent(self) -> MisalignmentSettings:
-        if self.sobol_n & (self.sobol_n - 1):
-            raise ValueError(f"sobol_n = {self.sobol_n}: must be a power of two, such as 512")
-        return self
 
     @property
     def azimuths_rad(self) -> Array:

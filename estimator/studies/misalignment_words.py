@@ -18,6 +18,7 @@ from phibench.scenes.misalignment import PARAMETERS
 
 _LISTED = 5
 _ADDITIVE = 0.9
+_NOTABLE = 1e-3  # of D: a change of less is not worth a word
 _SCALES = {"m": (1e3, "mm"), "rad": (math.degrees(1.0), "deg"), "px": (1.0, "px"), "1": (1.0, "")}
 
 
@@ -87,10 +88,13 @@ def calibrated_sentence(ranks: Sequence[Rank], before: Sequence[Rank]) -> str:
     left = [f"{one.parameter} {percent(one.rms[0])} and {percent(one.rms[-1])}" for one in ranks[:3]]
     largest = float(np.max(ranks[0].rms))
     size = "less" if largest < far else "no less"
+    untouched = {one.parameter: one for one in before}
+    worse = [one.parameter for one in ranks if bool(np.any(one.rms > untouched[one.parameter].rms + _NOTABLE))]
+    harm = f"; it makes {_list(worse)} worse" if worse else ""
     return (
         f"After a calibration from the outline and a few spots {size} is left: at most {percent(largest)} % of D "
         f"against {percent(far)} %; the largest, at D = {ranks[0].depths_m[0]:g} and {ranks[0].depths_m[-1]:g} m, "
-        f"are {'; '.join(left)}."
+        f"are {'; '.join(left)}{harm}."
     )
 
 
