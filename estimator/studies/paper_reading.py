@@ -160,9 +160,9 @@ PARAMETERS = (
     "cx_px",
     "cy_px",
 )
-"""What may be wrong, in the sense of `scenes.misalignment`; world x is the azimuth of Table 1's spot."""
-AZIMUTHS = ("azimuth_2_rad", "azimuth_3_rad", "azimuth_4_rad")
-"""Azimuths of the spots of the other tables."""
+"""What may be wrong, in the sense of `scenes.misalignment`."""
+AZIMUTHS = ("azimuth_1_rad", "azimuth_2_rad", "azimuth_3_rad", "azimuth_4_rad")
+"""Azimuths of the tables' spots, from world x."""
 
 
 def radii_px(parameters: Parameters, experiments: Experiments, reader: Reader, rig: Rig) -> Array:
