@@ -21,7 +21,6 @@ from scipy.stats import t as student
 
 from phibench.estimator.studies.paper_reading import (
     AZIMUTHS,
-    PARAMETERS,
     Convention,
     Experiments,
     Parameters,
