@@ -206,8 +206,8 @@ def test_the_whole_study_in_small(data: Path) -> None:
     assert table.height == 5 * 2 * len(SENSES)
     exact = table.filter((pl.col("sense") == "exact") & (pl.col("method") == "chain_fit"))
     assert exact["noise_free_m"].to_list() == pytest.approx(exact["depth_m"].to_list(), rel=1e-9)
-    # the bound of a pair, six times: an image of a quarter of the size has larger pixels, and the bound says so
-    assert ((exact["mean_m"] - exact["depth_m"]).abs() < 6.0 * exact["bound_m"]).all()
+    # a spot in the dark is overexposed and still read within half a pixel; the published errors are several
+    assert ((exact["mean_m"] - exact["depth_m"]).abs() < 0.5 * exact["m_per_px"]).all()
     rendered = result.tables["rendered"].filter(pl.col("sense") == "ray")
     assert rendered["closed_form_error_m"].abs().max() > 0.02
     # the centroid of a noise-free frame is within 0.02 px of the chief ray, some 0.3 m per px of these images

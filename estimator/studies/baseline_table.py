@@ -91,8 +91,9 @@ def bound_row(experiment: Experiment, rig: Rig, found: FoundSpots) -> dict[str, 
         estimate_phi("ray", view, uv, bound)
         for view, uv, bound in zip(views, experiment.true_px, found.bounds_px2, strict=True)
     ]
-    pixel = depth_exact(rig, stroke, *experiment.true_px, np.eye(2), np.eye(2))
-    bound = depth_exact(rig, stroke, *experiment.true_px, *found.bounds_px2)
+    (down, up), (bound_down, bound_up) = experiment.true_px, found.bounds_px2
+    pixel = depth_exact(rig, stroke, down, up, np.eye(2), np.eye(2))
+    bound = depth_exact(rig, stroke, down, up, bound_down, bound_up)
     return {
         "sample_id": experiment.sample_id,
         "bound_m": float(bound.sigma_m),

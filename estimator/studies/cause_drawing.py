@@ -82,7 +82,7 @@ def posterior_drawing(settings: CauseSettings, posteriors: Posteriors, alt: str)
                 plane.plot(x, y, ".", ms=2, alpha=0.5, color=COLOURS[i], label=explanation.text)
         noise.axvline(12.0**-0.5, color=COLOURS[7], linestyle=":", label="whole pixels")
         noise.set(xlabel="reading noise of a radius (px)", ylabel="posterior density (1/px)")
-        plane.set(xlabel="tilt along Table 1's spot (deg)", ylabel="decentre along Table 1's spot (mm)")
+        plane.set(xlabel="tilt (deg)", ylabel="decentre along the tilt (mm)")
         for ax in (noise, plane):
             ax.legend(fontsize=6, markerscale=4)
         return drawn("posterior", figure, alt)

@@ -21,7 +21,6 @@ from scipy.stats import t as student
 
 from phibench.estimator.studies.paper_reading import (
     AZIMUTHS,
-    PARAMETERS,
     Convention,
     Experiments,
     Parameters,
@@ -36,12 +35,17 @@ from phibench.scenes.rig import Rig
 NOISE = "noise_px"
 WHOLE_PIXEL_PX = 12.0**-0.5  # standard deviation of what rounding to whole pixels takes away
 GROUPS: dict[str, tuple[str, ...]] = {
-    "misalignment": PARAMETERS[:4],
-    "turn": ("roll_rad", "pitch_rad"),
+    "misalignment": ("decentre_x_m", "tilt_y_rad"),
+    "turn": ("pitch_rad",),
     "stroke": ("stroke_relative", "stroke_offset_m"),
     "scale": ("focal_relative", "axial_m", "radius_m"),
 }
-"""What an explanation can leave free besides lens distance, spot heights and noise."""
+"""What an explanation can leave free besides lens distance, spot heights and noise.
+
+World x is the direction of the tilt (of the turn), so that its size is not negative and the other component is 0; the
+decentre counts along it. Azimuths run from 0 to pi, because a spot and its mirror image about that direction are seen
+alike. Without these choices the posterior has some sixteen equal modes, of which nested sampling loses some.
+"""
 _DIRECTED = ("misalignment", "turn")  # their effect depends on the spot's azimuth
 COMMON = ("z_c_m", "height_1_m", "height_2_m", "height_3_m", "height_4_m")
 FREEDOM = 4.0  # of Student's t where noise has heavy tails
@@ -50,18 +54,22 @@ _IMPOSSIBLE = -1e300  # a finite number, as samplers want it
 
 
 class Prior(Settings):
-    """Prior of one parameter: exactly one of the three."""
+    """Prior of one parameter: exactly one of the four."""
 
     normal: list[float] | None = Field(default=None, min_length=2, max_length=2, description="mean, sigma")
     uniform: list[float] | None = Field(default=None, min_length=2, max_length=2, description="low, high")
     log_uniform: list[float] | None = Field(default=None, min_length=2, max_length=2, description="low, high; above 0")
 
+    rayleigh: float | None = Field(default=None, gt=0.0, description="sigma of each component of a vector: its length")
+
     @property
     def fault(self) -> str:
         """What is wrong with it, "" if nothing."""
-        given = [name for name in ("normal", "uniform", "log_uniform") if getattr(self, name) is not None]
+        given = [name for name in ("normal", "uniform", "log_uniform", "rayleigh") if getattr(self, name) is not None]
         if len(given) != 1:
-            return "must have exactly one of normal, uniform, log_uniform"
+            return "must have exactly one of normal, uniform, log_uniform, rayleigh"
+        if self.rayleigh is not None:
+            return ""
         low, high = getattr(self, given[0])
         if given[0] == "normal":
             return "" if high > 0.0 else f"normal = [{low:g}, {high:g}]: the sigma must be above 0"
@@ -69,11 +77,15 @@ class Prior(Settings):
         return "" if lowest < low < high else f"{given[0]} = [{low:g}, {high:g}]: must be {lowest:g} < low < high"
 
     def scaled(self, by: float) -> Prior:
-        """The same with the sigma of a normal prior so many times as large; the others have no scale to change."""
+        """The same with sigma so many times as large; uniform priors have no scale to change."""
+        if self.rayleigh is not None:
+            return Prior(rayleigh=self.rayleigh * by)
         return self if self.normal is None else Prior(normal=[self.normal[0], self.normal[1] * by])
 
     def of_share(self, share: Array) -> Array:
         """Quantiles of shares in (0, 1)."""
+        if self.rayleigh is not None:
+            return np.asarray(self.rayleigh * np.sqrt(-2.0 * np.log1p(-share)))
         if self.normal is not None:
             return np.asarray(self.normal[0] + self.normal[1] * ndtri(share))
         low, high = self.uniform or [np.log(x) for x in self.log_uniform or ()]
@@ -82,6 +94,8 @@ class Prior(Settings):
 
     def share_of(self, value: Array) -> Array:
         """Prior probability below values."""
+        if self.rayleigh is not None:
+            return np.asarray(-np.expm1(-0.5 * (np.maximum(value, 0.0) / self.rayleigh) ** 2))
         if self.normal is not None:
             return np.asarray(ndtr((value - self.normal[0]) / self.normal[1]))
         low, high = self.uniform or [np.log(x) for x in self.log_uniform or ()]

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
 from phibench.estimator.studies.cause_model import Model, without_table
-from phibench.estimator.studies.cause_sampler import Posterior, sample
+from phibench.estimator.studies.cause_sampler import Posterior, pooled, sample
 from phibench.estimator.studies.cause_settings import CauseSettings, Truth
 from phibench.estimator.studies.cause_simulation import simulate
 from phibench.estimator.studies.paper_reading import TABLES, published_experiments
@@ -41,7 +41,11 @@ def all_runs(settings: CauseSettings) -> list[Run]:
     """Every sampling that the settings ask for: published data, other priors, left-out tables, made-up data."""
     data, few, stop = published_experiments(), settings.live_points_other, settings.stop
     names = [explanation.name for explanation in settings.explanations]
-    runs = [Run(("published", n), settings.model(n, data), settings.live_points, stop) for n in names]
+    runs = [
+        Run(("published", n, *again), settings.model(n, data), settings.live_points, stop)
+        for n in names
+        for again in _again(settings.repeats)
+    ]
     for scale in settings.prior_scales:
         runs += [Run(("scale", f"{scale:g}", n), settings.model(n, data, scale), few, stop) for n in settings.scaled]
     for n in settings.left_out:
@@ -55,6 +59,22 @@ def all_runs(settings: CauseSettings) -> list[Run]:
                 model = settings.model(n, made.experiments)
                 runs.append(Run(("made-up", number, repeat, n), model, few, stop))
     return runs
+
+
+def pooled_runs(
+    posteriors: Mapping[tuple[Name, ...], Posterior], settings: CauseSettings
+) -> dict[tuple[Name, ...], Posterior]:
+    """Posteriors by key, those of repeated samplings pooled under the key of the first."""
+    result = dict(posteriors)
+    for explanation in settings.explanations:
+        key = ("published", explanation.name)
+        result[key] = pooled([posteriors[(*key, *again)] for again in _again(settings.repeats)], *key)
+    return result
+
+
+def _again(repeats: int) -> list[tuple[Name, ...]]:
+    """What is added to the key of each repetition; nothing for the first."""
+    return [(), *((repeat,) for repeat in range(1, repeats))]
 
 
 def made_up(settings: CauseSettings, truth: Truth, number: int, repeat: int) -> Model:

@@ -5,6 +5,7 @@ J. S. Speagle, Mon. Not. R. Astron. Soc. 493, 3132 (2020); J. Skilling, Bayesian
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,6 +38,24 @@ class Posterior:
     def thinned(self, count: int) -> Array:
         """Up to so many draws, evenly picked."""
         return self.points[np.linspace(0, len(self.points) - 1, min(count, len(self.points))).astype(int)]
+
+
+def pooled(runs: Sequence[Posterior], *names: Name) -> Posterior:
+    """One posterior of several independent samplings of a model.
+
+    The evidence is the mean of theirs, with the larger of the samplers' own error and of their scatter; draws are taken
+    from each run in proportion to its evidence.
+    """
+    if len(runs) == 1:
+        return runs[0]
+    logs, own = (np.array([getattr(run, name) for run in runs]) for name in ("log_evidence", "log_evidence_error"))
+    weights = np.exp(logs - logs.max())
+    error = max(float(np.sqrt(np.mean(own**2))), float(logs.std(ddof=1))) / np.sqrt(len(runs))
+    random, count = generator("study", "cause", "pooled", *names), max(len(run.points) for run in runs)
+    chosen = random.multinomial(count, weights / weights.sum())
+    points = [run.points[random.integers(len(run.points), size=n)] for run, n in zip(runs, chosen, strict=True)]
+    evaluations = sum(run.evaluations for run in runs)
+    return Posterior(np.concatenate(points), float(logs.max() + np.log(weights.mean())), error, evaluations)
 
 
 def require_sampler() -> None:

@@ -34,6 +34,7 @@ class CauseSettings(Settings):
 
     live_points: int = Field(ge=20, le=5000)
     live_points_other: int = Field(ge=20, le=5000)
+    repeats: int = Field(ge=1, le=100, description="independent samplings of each explanation")
     stop: float = Field(gt=0.0, le=20.0)
     prior_scales: list[float]
     scaled: list[str] = Field(description="explanations that are tried with them")

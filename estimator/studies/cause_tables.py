@@ -141,7 +141,7 @@ def correlation_table(settings: CauseSettings, posteriors: Posteriors) -> pl.Dat
 
 
 def alike_table(settings: CauseSettings, posteriors: Posteriors) -> pl.DataFrame:
-    """Cosines between what parameters do to the estimates, at the posterior median, azimuths of Table 1 for all."""
+    """Cosines between what parameters do to the estimates, at the posterior median."""
     rows = []
     for name in settings.drawn:
         model = settings.model(name, published_experiments())

@@ -55,8 +55,8 @@ def estimates(sense: str, rig: Rig, strokes_m: Array, down_px: Array, up_px: Arr
     if sense == EXACT:
         return depth_exact(rig, strokes_m, down_px, up_px).depth_m
     view = rig.at(0.0)
-    phi = [CONVENTIONS[sense](view, uv) for uv in (down_px, up_px)]
-    return depth_paper(*phi, strokes_m, rig.mirror.radius_m).depth_m
+    phi1, phi2 = (CONVENTIONS[sense](view, uv) for uv in (down_px, up_px))
+    return depth_paper(phi1, phi2, strokes_m, rig.mirror.radius_m).depth_m
 
 
 def drawn_errors(

@@ -50,9 +50,10 @@ class Experiments:
 
     def chosen(self, keep: BoolArray) -> Experiments:
         """Some of them, by a mask of shape (n,)."""
-        return Experiments(
-            *(x[keep] for x in (self.table, self.depth_m, self.stroke_m, self.estimate_m, self.rounding_m))
+        depth, stroke, estimate, rounding = (
+            x[keep] for x in (self.depth_m, self.stroke_m, self.estimate_m, self.rounding_m)
         )
+        return Experiments(self.table[keep], depth, stroke, estimate, rounding)
 
     def with_estimates(self, estimate_m: Array) -> Experiments:
         """The same with other estimates."""
@@ -73,10 +74,10 @@ def published_experiments(rounding_m: float = 0.01, rounding_table4_m: float = 0
     """The 25 published results; Table 4 is printed to the millimetre."""
     rows = load_published()
     table = np.array([int(row.experiment.removeprefix("table")) - 1 for row in rows])
-    columns = (
+    depth, stroke, estimate = (
         np.array([getattr(row, name) for row in rows]) for name in ("real_depth_m", "baseline_m", "estimated_depth_m")
     )
-    return Experiments(table, *columns, np.where(table == TABLES - 1, rounding_table4_m, rounding_m))
+    return Experiments(table, depth, stroke, estimate, np.where(table == TABLES - 1, rounding_table4_m, rounding_m))
 
 
 @dataclass(frozen=True)
@@ -160,9 +161,9 @@ PARAMETERS = (
     "cx_px",
     "cy_px",
 )
-"""What may be wrong, in the sense of `scenes.misalignment`; world x is the azimuth of Table 1's spot."""
-AZIMUTHS = ("azimuth_2_rad", "azimuth_3_rad", "azimuth_4_rad")
-"""Azimuths of the spots of the other tables."""
+"""What may be wrong, in the sense of `scenes.misalignment`."""
+AZIMUTHS = ("azimuth_1_rad", "azimuth_2_rad", "azimuth_3_rad", "azimuth_4_rad")
+"""Azimuths of the tables' spots, from world x."""
 
 
 def radii_px(parameters: Parameters, experiments: Experiments, reader: Reader, rig: Rig) -> Array:
