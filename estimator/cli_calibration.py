@@ -17,6 +17,7 @@ def calibrate(
     sample: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
     preset: str = "layers",
     spots: bool = False,
+    vertical: Annotated[bool, Parameter(negative="")] = False,
     distance_sigma_m: float = 1e-3,
     height_sigma_m: float = math.inf,
     azimuth_sigma_deg: float = math.inf,
@@ -35,6 +36,8 @@ def calibrate(
         "layers" (noise-free), or the preset of the frames to draw: "bayer-raw", "mono-raw", "srgb8", "mjpeg".
     spots
         Also use the laser spots at their known distances.
+    vertical
+        Also use the room's vertical edges, which give the camera's tilt.
     distance_sigma_m
         How well the distance of each spot was measured, one standard deviation, metres.
     height_sigma_m
@@ -47,7 +50,7 @@ def calibrate(
     from phibench.estimator.calibration.spots import Ruler
 
     ruler = Ruler(distance_sigma_m, height_sigma_m, math.radians(azimuth_sigma_deg))
-    bundle = calibrate_dataset(directory, out, sample, preset, spots, ruler)
+    bundle = calibrate_dataset(directory, out, sample, preset, spots, ruler, vertical)
     for name, value in zip(PARAMETERS, bundle.values, strict=True):
         print(f"{name:18s} {value:+.3e} +- {bundle.sigmas[name]:.1e}")
     for weak in bundle.undetermined:

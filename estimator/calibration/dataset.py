@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.files import require_writable
 from phibench.datasets.read import Dataset, Sample, open_dataset
+from phibench.datasets.sensor_card import SensorCard
 from phibench.estimator.bench.dataset_pairs import pairs_of
 from phibench.estimator.calibration.bundle import Bundle, KnownSpot, Measured, calibrate
 from phibench.estimator.calibration.file import write_calibration
 from phibench.estimator.calibration.outline import Outline, find_outline
-from phibench.estimator.calibration.outline_mean import mean_outline
+from phibench.estimator.calibration.outline_mean import mean_measured, mean_outline
 from phibench.estimator.calibration.spots import Ruler, known_spot, measured_spot, method_for, one_per_pose
+from phibench.estimator.calibration.vertical_edges import find_vertical
 from phibench.estimator.centroid import find_spot
 from phibench.estimator.status import Status, describe
 from phibench.scenes.rig import POSITIONS, Rig
@@ -26,6 +30,14 @@ SPOT_SIGMA_PX = 0.02
 """Of the centroid in noise-free layers."""
 
 
+@dataclass(frozen=True)
+class Photograph:
+    """An image to calibrate with: pixels as `limb_image.planes_of` takes them, and the card of its preset."""
+
+    pixels: NDArray[Any]
+    card: SensorCard | None = None
+
+
 def calibrate_dataset(
     folder: Path,
     out: Path,
@@ -33,7 +45,7 @@ def calibrate_dataset(
     preset: str = LAYERS,
     spots: bool = False,
     ruler: Ruler | None = None,
-    vertical: Measured | None = None,
+    vertical: bool = False,
 ) -> Bundle:
     """Calibrate the rig of some samples and write the file.
 
@@ -50,33 +62,42 @@ def calibrate_dataset(
         method that reaches the limit there, which gives their covariance, too.
     ruler : Ruler, optional
         By default D is measured to 1 mm, height and azimuth not at all.
-    vertical : Measured, optional
-        The world's vertical in the camera frame, see `bundle.calibrate`.
+    vertical : bool
+        Also use the room's vertical edges, see `find_vertical`; the room is to have some.
 
     Raises
     ------
     DatasetError
-        If the samples have different rigs, an image has no whole mirror, or a spot is not found.
+        If the samples have different rigs, an image has no whole mirror or too few vertical edges, or a spot is not found.
     """
     require_writable(out)
     dataset, ruler = open_dataset(folder), ruler or Ruler()
     chosen = [dataset[name] for name in samples] or [dataset.samples[0]]
     rig = _one_rig(chosen)
     if preset == LAYERS:
-        outlines = [find_outline(s.ambient(p), rig) for s, p in one_per_pose(chosen)]
+        images = [Photograph(s.ambient(p)) for s, p in one_per_pose(chosen)]
         known = [_known_in_layers(sample, ruler) for sample in chosen] if spots else []
     else:
-        outlines = [frame_outline(dataset, sample, position, preset) for sample, position in one_per_pose(chosen)]
+        images = [photograph(dataset, sample, position, preset) for sample, position in one_per_pose(chosen)]
         known = frame_spots(dataset, chosen, preset, ruler) if spots else []
-    bundle = calibrate(rig, mean_outline(outlines), known, vertical)
-    write_calibration(out, bundle, rig, _made_from(dataset, chosen, preset, outlines, known))
+    outlines = [find_outline(image.pixels, rig, image.card) for image in images]
+    upright = _vertical(images, outlines, rig) if vertical else None
+    bundle = calibrate(rig, mean_outline(outlines), known, upright)
+    made_from = _made_from(dataset, chosen, preset, outlines, known, upright)
+    write_calibration(out, bundle, rig, made_from)
     return bundle
 
 
 def frame_outline(dataset: Dataset, sample: Sample, position: str, preset: str, laser_off: bool = True) -> Outline:
     """Outline in one drawn frame of a sample, with the believed rig."""
+    image = photograph(dataset, sample, position, preset, laser_off)
+    return find_outline(image.pixels, sample.nominal_rig, image.card)
+
+
+def photograph(dataset: Dataset, sample: Sample, position: str, preset: str, laser_off: bool = True) -> Photograph:
+    """One drawn frame of a sample."""
     pairs = pairs_of(dataset, [sample], preset, laser_off=laser_off)
-    return find_outline(pairs.image(0, position, not laser_off), sample.nominal_rig, pairs.card(0))
+    return Photograph(pairs.image(0, position, not laser_off), pairs.card(0))
 
 
 def frame_spots(
@@ -113,6 +134,12 @@ def frame_spots(
     return found
 
 
+def _vertical(images: Sequence[Photograph], outlines: Sequence[Outline], believed: Rig) -> Measured:
+    """Mean vertical of images whose outlines are known."""
+    pairs = zip(images, outlines, strict=True)
+    return mean_measured([find_vertical(i.pixels, o.rig(believed), i.card, o.covariance_m2) for i, o in pairs])
+
+
 def _one_rig(samples: Sequence[Sample]) -> Rig:
     """The rig that is believed in; all samples must have one true rig."""
     names = sorted({sample.row.rig for sample in samples})
@@ -132,7 +159,12 @@ def _known_in_layers(sample: Sample, ruler: Ruler) -> KnownSpot:
 
 
 def _made_from(
-    dataset: Dataset, samples: Sequence[Sample], preset: str, outlines: Sequence[Outline], spots: Sequence[KnownSpot]
+    dataset: Dataset,
+    samples: Sequence[Sample],
+    preset: str,
+    outlines: Sequence[Outline],
+    spots: Sequence[KnownSpot],
+    vertical: Measured | None,
 ) -> dict[str, Any]:
     return {
         "dataset": dataset.info.name,
@@ -141,6 +173,7 @@ def _made_from(
         "spots": bool(spots),
         "sphere_in_camera_m": [outline.sphere_in_camera_m.tolist() for outline in outlines],
         "sigma_m": [outline.sigma_m.tolist() for outline in outlines],
+        "vertical_in_camera": None if vertical is None else vertical.value.tolist(),
         "spot_uv_px": [[spot.uv_down_px.tolist(), spot.uv_up_px.tolist()] for spot in spots],
         "spot_depth_m": [spot.depth_m for spot in spots],
     }
