@@ -134,7 +134,7 @@ def fit_outline(
     found = _settle(planes, rig, s, blur, half_px, again)
     if found.arc < MIN_USED * arc:
         raise ImageError(
-            f"lamps or edges of the room along the mirror's outline: {100.0 * found.arc / arc:.0f} % of it can be used, "
+            f"lamps or edges of the room along the mirror's outline: {100.0 * found.arc / arc:.0f} % of it are usable, "
             f"{100.0 * MIN_USED:.0f} % are needed; switch lamps off, or move the robot"
         )
     return found
