@@ -32,7 +32,7 @@ from phibench.scenes.streams import generator
 
 TINY = """
 preset = "bayer-raw"
-depths_m = [1.0, 2.0]
+depths_m = [1.0]
 spot_height_m = 0.5
 strokes_m = [0.1, 1.4]
 outline_sigma_um = [8.0, 8.0, 24.0]

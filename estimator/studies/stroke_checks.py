@@ -37,7 +37,7 @@ _NAMES: tuple[Name, ...] = ("study", "stroke")
 _ROOM = Room("wall", ())  # the robot stands in it
 _BOX_PX = 48
 _MARGIN_PX = 32
-_AZIMUTHS = 8
+_TURN = 0.618033988749895  # golden: azimuths, and with them sub-pixel phases, never repeat
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def _answer(check: Check, believed: Rig, draw: int) -> tuple[float, Array, Array
     names = (*_NAMES, check.tolerance, f"{check.depth_m:.6f}", f"{check.stroke_m:.6f}", draw)
     values = deviations(np.array(check.covariance), (*_NAMES, check.tolerance, f"{check.depth_m:.6f}", draw))
     true, stroke_m = changed(believed, values), float(stroke_of(np.array(check.stroke_m), values))
-    spot = _spot(check, believed, 2.0 * math.pi * draw / _AZIMUTHS)
+    spot = _spot(check, believed, 2.0 * math.pi * (draw * _TURN % 1.0))
     uv = [_pixel(true, stroke_m, spot, p) for p in POSITIONS]
     camera = believed.camera
     region = cut_region(uv, (camera.height_px, camera.width_px), _MARGIN_PX)
