@@ -172,6 +172,14 @@ def test_isotropy_is_said_as_tested() -> None:
     assert "still differs" in text
 
 
+def test_too_few_azimuths_are_no_verdict() -> None:
+    rng = generator("test", "isotropy", "few")
+    noise = _noise(rng, np.ones(1), np.ones(1))
+    text = noise_sentence("A", noise, isotropy(noise, 0.01))
+    assert "too few azimuths" in text
+    assert "isotropic" not in text
+
+
 def test_the_grid_is_blamed_only_where_averaging_helps() -> None:
     assert "makes the difference" in grid_sentence(np.array([1.0, 2.0]), np.array([1.0, 1.1]))
     assert "not the cause" in grid_sentence(np.array([1.0, 2.0]), np.array([1.0, 1.9]))

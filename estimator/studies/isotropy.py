@@ -74,6 +74,11 @@ def run(settings: IsotropySettings, material: Material) -> Result:
         material.dataset(name) for name in ("study-isotropy", "study-isotropy-sideways", "study-isotropy-tilted")
     )
     pairs = {VERTICAL: tuple(pairs_of(upright)), HORIZONTAL: tuple(pairs_of(moved))}
+    for name, each in pairs.items():
+        if not each:
+            raise DatasetError(
+                f"{name}: the data set has no spot that both images show; render it again from its recipe"
+            )
     scene = _scene(pairs[VERTICAL])
     noise = _noise(settings, pairs)
     tests = {name: isotropy(rows, settings.false_alarm) for name, rows in noise.items()}
@@ -124,8 +129,6 @@ def run(settings: IsotropySettings, material: Material) -> Result:
 
 
 def _scene(pairs: Sequence[Pair]) -> _Scene:
-    if not pairs:
-        raise DatasetError("study-isotropy has no spot that both images show; render it again from its recipe")
     first = pairs[0]
     light, (u, v) = first.lights[0], np.rint(first.uv_px[0]).astype(int)
     around = light.ambient_electrons_per_s[:, v - 4 : v + 5, u - 4 : u + 5]

@@ -17,6 +17,7 @@ from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 from phibench.scenes.streams import generator
 
+_LEAST_GROUPS, _LEAST_ERRORS = 2, 3
 _PHASES = 4  # per axis, over the two pixels of a Bayer cell
 _STREAM = ("study", "isotropy")
 
@@ -54,7 +55,7 @@ class Isotropy:
     Attributes
     ----------
     p_value : float
-        Of the errors: small where their scatter depends on the azimuth.
+        Of the errors: small where their scatter depends on the azimuth; NaN with too few azimuths.
     p_value_over_bound : float
         Of the errors over each spot's own bound.
     false_alarm : float
@@ -67,6 +68,11 @@ class Isotropy:
     p_value_over_bound: float
     false_alarm: float
     ratio: float
+
+    @property
+    def tested(self) -> bool:
+        """Whether there were azimuths enough for a test."""
+        return math.isfinite(self.p_value) and math.isfinite(self.p_value_over_bound)
 
     @property
     def isotropic(self) -> bool:
@@ -101,12 +107,15 @@ def azimuth_noise(pair: Pair, sensor: Sensor, draws: int, baseline: str, rules: 
 def isotropy(noise: Sequence[AzimuthNoise], false_alarm: float) -> Isotropy:
     """Test whether the scatter is the same at all azimuths, and whether it is relative to each spot's bound."""
     scatter = [one.scatter_m.value for one in noise]
-    return Isotropy(
-        float(stats.levene(*(one.errors_m for one in noise), center="median").pvalue),
-        float(stats.levene(*(one.errors_m / one.bound_m for one in noise), center="median").pvalue),
-        false_alarm,
-        max(scatter) / min(scatter),
-    )
+    plain, scaled = ([one.errors_m for one in noise], [one.errors_m / one.bound_m for one in noise])
+    return Isotropy(_equal_scatter(plain), _equal_scatter(scaled), false_alarm, max(scatter) / min(scatter))
+
+
+def _equal_scatter(groups: Sequence[Array]) -> float:
+    """Probability of scatter that differs by more; NaN with fewer than two groups of three."""
+    if len(groups) < _LEAST_GROUPS or min(map(len, groups)) < _LEAST_ERRORS:
+        return math.nan
+    return float(stats.levene(*groups, center="median").pvalue)
 
 
 def bounds(rig: Rig, baseline_m: float, points_m: Array, background: Array, sensor: Sensor) -> Array:

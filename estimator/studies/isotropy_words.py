@@ -21,6 +21,8 @@ def noise_sentence(name: str, noise: Sequence[AzimuthNoise], test: Isotropy) -> 
     """Scatter of one baseline, and whether it depends on the azimuth."""
     least = min(noise, key=lambda one: one.scatter_m.value)
     most = max(noise, key=lambda one: one.scatter_m.value)
+    if not test.tested:
+        return f"{name}: too few azimuths for a test of isotropy; the scatter of D is {_scatter(least)}."
     verdict = "isotropic" if test.isotropic else "not isotropic"
     follows = "is the same everywhere" if test.explained else "still differs"
     over_bound = _probability(test.p_value_over_bound)
