@@ -68,7 +68,7 @@ def calibrate_dataset(
     Raises
     ------
     DatasetError
-        If the samples have different rigs, an image has no whole mirror or too few upright edges, or a spot is not found.
+        If the samples have different rigs, an image has no whole mirror or too few upright edges, or a spot is lacking.
     """
     require_writable(out)
     dataset, ruler = open_dataset(folder), ruler or Ruler()
