@@ -19,9 +19,11 @@ def best_sentence(table: pl.DataFrame) -> str:
     """Best evidence, and what cannot be told from it."""
     rows = table.sort("log_evidence", descending=True)
     best, first = rows.row(0, named=True), table.row(0, named=True)
-    near = rows[1:].filter(pl.col("log_evidence") > best["log_evidence"] - DECIDED)
+    error = (pl.col("log_evidence_error") ** 2 + best["log_evidence_error"] ** 2).sqrt()
+    near = rows[1:].filter(pl.col("log_evidence") + 2.0 * error > best["log_evidence"] - DECIDED)
     rest = (
-        f"Within odds of 10 to 1 of it are {'; '.join(near['text'])}: the 25 numbers do not decide between them."
+        f"Within odds of 10 to 1 of it, or two sigma of that, are {'; '.join(near['text'])}: "
+        "the 25 numbers do not decide between them."
         if len(near)
         else "No other explanation comes within odds of 10 to 1 of it."
     )
