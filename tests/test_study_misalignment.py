@@ -51,6 +51,7 @@ from phibench.scenes.streams import generator
 RIG = default_rig()
 PLACES = Places(np.array([1.0, 3.18]), np.radians([0.0, 90.0, 200.0]), 0.5, 0.425)
 GEOMETRIC = tuple(name for name in PARAMETERS if name not in ("focus_distance_m", "roughness_alpha"))
+SPHERICAL = tuple(name for name in GEOMETRIC if not name.startswith("form_"))
 BENCH = Bench(
     np.array([[1.2, 0.3, 0.5], [-1.0, 1.8, 0.5], [-2.0, -2.1, 0.5], [2.6, -3.0, 0.5]]), 0.02, 1e-3, (8e-6, 8e-6, 24e-6)
 )
@@ -60,7 +61,7 @@ def test_errors_of_many_rigs_agree_with_one_at_a_time() -> None:
     """Alhazen's problem in the plane of three points against Newton's method in the image, over drawn rigs."""
     rng = generator("test", "misalignment", "many")
     drawn = [
-        Misalignment(**{name: float(rng.uniform(-1.0, 1.0)) * PARAMETERS[name].study for name in GEOMETRIC})
+        Misalignment(**{name: float(rng.uniform(-1.0, 1.0)) * PARAMETERS[name].study for name in SPHERICAL})
         for _ in range(12)
     ]
     many = errors_of_many(RIG, drawn, PLACES, NOMINAL)
@@ -71,8 +72,16 @@ def test_errors_of_many_rigs_agree_with_one_at_a_time() -> None:
     assert np.min(np.abs(many[:, -1]).max(axis=(1, 2))) > 1e-4
 
 
-def test_pixels_are_those_of_the_simulator() -> None:
-    m = Misalignment(tilt_y_rad=0.0087, decentre_x_m=1e-3, pitch_rad=1e-3, stroke_relative=2e-3, k1=0.02)
+def test_many_rigs_refuse_errors_of_form() -> None:
+    with pytest.raises(ValueError, match="spheres only"):
+        errors_of_many(RIG, [Misalignment(), Misalignment(form_20_m=2e-5)], PLACES, NOMINAL)
+
+
+@pytest.mark.parametrize("form_m", [0.0, 1e-4])
+def test_pixels_are_those_of_the_simulator(form_m: float) -> None:
+    m = Misalignment(
+        form_22c_m=form_m, tilt_y_rad=0.0087, decentre_x_m=1e-3, pitch_rad=1e-3, stroke_relative=2e-3, k1=0.02
+    )
     true, h = RIG.perturbed(m), m.stroke_m(PLACES.stroke_m)
     found = pixels(RIG, m, PLACES)
     checked = 0

@@ -18,7 +18,6 @@ from phibench.estimator.score import ESTIMATORS
 from phibench.estimator.sensitivities import PARAMETERS as ANALYTIC
 from phibench.estimator.sensitivities import sensitivity
 from phibench.estimator.triangulate import depth_exact
-from phibench.render.spot_truth import spot_truth
 from phibench.scenes.checks import SceneError
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
@@ -58,14 +57,8 @@ class Places:
 
 
 def seen_px(view: View, points_m: Array) -> Array:
-    """Pixels (..., 2) of points (..., 3); NaN where the image does not show them.
-
-    A mirror with an error of form is traced by the simulator: the estimator's closed form knows spheres.
-    """
-    if getattr(view.rig.mirror, "form", None) is None:
-        uv = image_of(view, points_m).uv_px
-    else:
-        uv = np.array([_traced(view, point) for point in points_m.reshape(-1, 3)]).reshape(*points_m.shape[:-1], 2)
+    """Pixels (..., 2) of points (..., 3); NaN where the image does not show them."""
+    uv = image_of(view, points_m).uv_px
     return np.where(view.rig.camera.contains(uv)[..., None], uv, np.nan)
 
 
@@ -127,11 +120,6 @@ def spot_of(point_m: Array) -> LaserSpot:
     return LaserSpot(
         tuple(float(x) for x in point_m), (-float(point_m[0]) / D, -float(point_m[1]) / D, 0.0), beam_diameter_m(D)
     )
-
-
-def _traced(view: View, point_m: Array) -> tuple[float, float]:
-    truth = spot_truth(view, spot_of(point_m), ())
-    return truth.u_px, truth.v_px
 
 
 def _gradients(name: str, nominal: Rig, places: Places, point_m: Array) -> Array:

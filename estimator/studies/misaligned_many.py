@@ -37,8 +37,15 @@ def errors_of_many(nominal: Rig, drawn: Sequence[Misalignment], places: Places, 
     """Relative errors of D, shape (m, estimators, d, a), as `misaligned.errors` has them for one rig.
 
     A distortion that folds the image is not refused here: check the largest coefficients beforehand.
+
+    Raises
+    ------
+    ValueError
+        If a mirror has an error of form.
     """
     undistorted = [nominal.perturbed(replace(m, **dict.fromkeys(_BROWN, 0.0))) for m in drawn]
+    if any(rig.mirror.form is not None for rig in undistorted):
+        raise ValueError("errors_of_many: a mirror has an error of form; spheres only")
     down = _views([rig.at(0.0) for rig in undistorted], drawn)
     up = _views([rig.at(m.stroke_m(places.stroke_m)) for rig, m in zip(undistorted, drawn, strict=True)], drawn)
     seen = [_seen_px(views, places.points_m, nominal) for views in (down, up)]

@@ -60,12 +60,16 @@ class Interactions:
 
 
 def moving(nominal: Rig, places: Places, estimators: tuple[str, ...]) -> tuple[str, ...]:
-    """Parameters that the closed form knows and that change any estimate at all, at the study's magnitude."""
+    """Parameters of a spherical mirror that change any estimate at all, at the study's magnitude.
+
+    Errors of form are left out: `errors_of_many` takes spheres.
+    """
     aligned = errors(nominal, Misalignment(), places, estimators)
     return tuple(
         name
         for name, one in PARAMETERS.items()
         if name in ANALYTIC
+        and nominal.perturbed(Misalignment(**{name: one.study})).mirror.form is None
         and np.max(np.abs(errors(nominal, Misalignment(**{name: one.study}), places, estimators) - aligned)) > 0.0
     )
 
