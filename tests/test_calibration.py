@@ -12,8 +12,9 @@ from scipy import optimize, stats
 
 from phibench.datasets.errors import DatasetError
 from phibench.estimator import cli
-from phibench.estimator.calibration.bundle import Bundle, KnownSpot, Measured, calibrate, seen_at
+from phibench.estimator.calibration.bundle import Bundle, KnownSpot, calibrate, seen_at
 from phibench.estimator.calibration.file import CalibrationError, read_calibration, write_calibration
+from phibench.estimator.calibration.measured import Measured
 from phibench.estimator.calibration.outline import Outline
 from phibench.estimator.calibration.outline_mean import mean_outline
 from phibench.estimator.calibration.parameters import PARAMETERS, changed, prior_sigmas, stroke_of

@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from phibench.datasets.errors import DatasetError
+from phibench.estimator.calibration.apparent import apparent_centre, vertical_by_principal_point
+from phibench.estimator.calibration.measured import Measured
 from phibench.estimator.calibration.parameters import PARAMETERS, changed, prior_sigmas, stroke_of
 from phibench.estimator.reflection import reflect, reflect_jacobian
 from phibench.estimator.triangulate import depth_exact
@@ -60,14 +62,6 @@ class KnownSpot:
     height_sigma_m: float = np.inf
     azimuth_rad: float = 0.0
     azimuth_sigma_rad: float = np.inf
-
-
-@dataclass(frozen=True)
-class Measured:
-    """A sphere centre or a tilt that was measured, with its covariance."""
-
-    value: Array
-    covariance: Array
 
 
 @dataclass(frozen=True)
@@ -133,7 +127,8 @@ def calibrate(
         Sphere centre in the camera frame, found with the believed camera and radius.
     spots : sequence of KnownSpot
     vertical : Measured, optional
-        The world's vertical in the camera frame, x and y of the unit vector, shape (2,).
+        The world's vertical in the camera frame, x and y of the unit vector, shape (2,), found with the believed camera
+        and the sphere where the outline is (`find_vertical`): a wrong principal point turns it.
     sigmas : shape (p,), optional
         Standard deviations of the believed numbers; 0 holds one. `prior_sigmas()` by default.
 
@@ -144,7 +139,8 @@ def calibrate(
     """
     prior = prior_sigmas() if sigmas is None else np.asarray(sigmas, float)
     free = np.flatnonzero(prior > 0.0)
-    problem = _Problem(believed, outline, tuple(spots), vertical, prior, free)
+    turned = np.zeros((2, 2)) if vertical is None else vertical_by_principal_point(believed)
+    problem = _Problem(believed, outline, tuple(spots), vertical, prior, free, turned)
     start = np.concatenate([np.zeros(free.size), *(_start(believed, spot) for spot in spots)])
     found = optimize.least_squares(problem.residuals, start, x_scale="jac", xtol=1e-12, ftol=1e-12)
     if not found.success or not np.isfinite(found.cost):
@@ -169,6 +165,7 @@ class _Problem:
     vertical: Measured | None
     prior: Array
     free: NDArray[np.intp]
+    by_principal_point: Array
 
     def residuals(self, x: Array) -> Array:
         values = np.zeros(len(PARAMETERS))
@@ -179,7 +176,7 @@ class _Problem:
             seen = apparent_centre(self.believed, rig)
             parts.append(_whitened(seen - self.outline.value, self.outline.covariance))
         if self.vertical is not None:
-            up = rig.T_world_camera.R.T[:2, 2]
+            up = rig.T_world_camera.R.T[:2, 2] + self.by_principal_point @ (_centre_px(rig) - _centre_px(self.believed))
             parts.append(_whitened(up - self.vertical.value, self.vertical.covariance))
         points = x[self.free.size :].reshape(-1, 3)
         if self.spots:
@@ -187,16 +184,8 @@ class _Problem:
         return np.concatenate(parts)
 
 
-def apparent_centre(believed: Rig, true: Rig) -> Array:
-    """Sphere centre, camera frame, shape (3,), that the true rig's outline gives with the believed camera and radius.
-
-    The true outline's pixels, as the believed camera sees them, are a cone: its axis and its opening give the centre.
-    """
-    uv = true.outline_px(90)
-    rays = believed.camera.rays(uv)
-    x = np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0]  # n / cos a0
-    cosine = 1.0 / np.linalg.norm(x)
-    return np.asarray(x * cosine * believed.mirror.radius_m / np.sqrt((1.0 - cosine) * (1.0 + cosine)))
+def _centre_px(rig: Rig) -> Array:
+    return np.array([rig.camera.cx_px, rig.camera.cy_px])
 
 
 def _spot_residuals(rig: Rig, values: Array, spots: Sequence[KnownSpot], points: Array) -> Array:

@@ -15,8 +15,9 @@ from phibench.datasets.files import require_writable
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.sensor_card import SensorCard
 from phibench.estimator.bench.dataset_pairs import pairs_of
-from phibench.estimator.calibration.bundle import Bundle, KnownSpot, Measured, calibrate
+from phibench.estimator.calibration.bundle import Bundle, KnownSpot, calibrate
 from phibench.estimator.calibration.file import write_calibration
+from phibench.estimator.calibration.measured import Measured
 from phibench.estimator.calibration.outline import Outline, find_outline
 from phibench.estimator.calibration.outline_mean import mean_measured, mean_outline
 from phibench.estimator.calibration.spots import Ruler, known_spot, measured_spot, method_for, one_per_pose

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from phibench.estimator.calibration.bundle import Measured
+from phibench.estimator.calibration.measured import Measured
 from phibench.estimator.calibration.outline import Outline
 
 

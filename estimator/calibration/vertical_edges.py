@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.sensor_card import SensorCard
-from phibench.estimator.calibration.bundle import Measured
 from phibench.estimator.calibration.edge_points import edges_of
 from phibench.estimator.calibration.limb_image import ImageError, planes_of
+from phibench.estimator.calibration.measured import Measured
 from phibench.estimator.calibration.outline_start import grey
 from phibench.estimator.reflection import reflect
 from phibench.scenes.frames import Array, Pose

@@ -11,7 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.calibration.bundle import Bundle, KnownSpot, Measured, apparent_centre, calibrate
+from phibench.estimator.calibration.apparent import apparent_centre
+from phibench.estimator.calibration.bundle import Bundle, KnownSpot, calibrate
+from phibench.estimator.calibration.measured import Measured
 from phibench.estimator.calibration.parameters import PRIOR_SIGMA, prior_sigmas
 from phibench.estimator.studies.misaligned import seen_px
 from phibench.scenes.frames import Array

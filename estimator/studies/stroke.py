@@ -13,7 +13,8 @@ from pydantic import Field
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.sensor_card import SensorCard, sensor_card
 from phibench.estimator.best_stroke import BestStroke, best_stroke, spot_bound
-from phibench.estimator.calibration.bundle import Measured, calibrate
+from phibench.estimator.calibration.bundle import calibrate
+from phibench.estimator.calibration.measured import Measured
 from phibench.estimator.calibration.parameters import PARAMETERS, prior_sigmas
 from phibench.estimator.spot_flux import Laser
 from phibench.estimator.spot_sigma import SpotSigma
