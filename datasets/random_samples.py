@@ -155,6 +155,8 @@ class _Makers:
 
 def rig_fault(rig: Rig, stroke_m: float, ceiling_m: float, boards: Boards) -> str | None:
     """Why a rig cannot make a stroke in its room: the ceiling's lamps or a board are in the way; None if it can."""
+    if not rig.in_image():
+        return "the mirror is outside of the image"
     sphere_m = rig.T_world_camera.points(rig.sphere_in_camera_m)  # `rig.at` takes ten times as long
     if rig.motion is None:
         top_m = sphere_m[2] + stroke_m * rig.stroke_axis_world[2] + rig.mirror.bound_m

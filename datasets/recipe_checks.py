@@ -187,6 +187,9 @@ def _rig(raw: Raw, experiments: list[tuple[int, Raw]], targets: list[tuple[int, 
         yield Fault("rig", str(error))
         return
     yield from _cells(rig, _sound(raw.get("ambient", {}), AmbientTable))
+    if not rig.in_image():
+        yield Fault("rig", "the mirror is outside of the image; move it or the principal point")
+        return
     misalignment = _sound(raw.get("misalignment", {}), MisalignmentTable)
     if misalignment is None:
         return
@@ -195,6 +198,9 @@ def _rig(raw: Raw, experiments: list[tuple[int, Raw]], targets: list[tuple[int, 
         rig, strokes_m = rig.perturbed(deviation), [true_stroke_m(deviation, h) for h in _legal_strokes(experiments)]
     except SceneError as error:
         yield Fault("misalignment", str(error))
+        return
+    if not rig.in_image():
+        yield Fault("misalignment", "the mirror is outside of the image; take smaller deviations")
         return
     yield from boards_in_the_way(rig, strokes_m, targets)
     if room_table is not None:

@@ -45,17 +45,23 @@ def calibrate(
     azimuth_sigma_deg
         The same of its azimuth, degrees; not measured by default.
     """
+    from phibench.datasets.errors import DatasetError
     from phibench.estimator.calibration.dataset import calibrate_dataset
     from phibench.estimator.calibration.parameters import PARAMETERS
     from phibench.estimator.calibration.spots import Ruler
 
+    if not spots and (math.isfinite(height_sigma_m) or math.isfinite(azimuth_sigma_deg)):
+        raise DatasetError("--height-sigma-m and --azimuth-sigma-deg are about calibration spots: give --spots too")
     ruler = Ruler(distance_sigma_m, height_sigma_m, math.radians(azimuth_sigma_deg))
     bundle = calibrate_dataset(directory, out, sample, preset, spots, ruler, vertical)
+    print("correction of the believed rig, metres, radians, pixels or relative, and its standard deviation:")
     for name, value in zip(PARAMETERS, bundle.values, strict=True):
         print(f"{name:18s} {value:+.3e} +- {bundle.sigmas[name]:.1e}")
+    if bundle.undetermined:
+        print("combinations that the data say little about (shares over what was believed of each):")
     for weak in bundle.undetermined:
         parts = ", ".join(f"{name} {share:+.2f}" for name, share in weak.parts.items())
-        print(f"not told apart: {parts} ({100.0 * weak.remaining:.0f} % of what was believed is left)")
+        print(f"  {parts} ({100.0 * weak.remaining:.0f} % of what was believed is left)")
     print(f"{out}: chi2 {bundle.chi2:.2f} for {bundle.degrees} degrees of freedom")
     return 0
 
@@ -67,8 +73,8 @@ def align(
     radius_mm: float = 60.0,
     distance_mm: float = 260.0,
     focal_px: float = 1430.0,
-    cx_px: float = 639.5,
-    cy_px: float = 359.5,
+    cx_px: float | None = None,
+    cy_px: float | None = None,
     focus_mm: float | None = None,
     tilt_sigma_deg: float = 0.1,
     principal_point_sigma_px: float = 5.0,
@@ -84,7 +90,8 @@ def align(
     radius_mm, distance_mm
         Of the mirror: its radius, and its centre from the lens, roughly.
     focal_px, cx_px, cy_px
-        Focal length and principal point, pixels.
+        Focal length and principal point, pixels. The principal point may be left out for a whole frame of the C310,
+        which has 1280 x 720.
     focus_mm
         Distance of the plane of focus; by default on the virtual image, half a radius before the mirror's centre.
     tilt_sigma_deg
@@ -92,12 +99,19 @@ def align(
     principal_point_sigma_px
         How well the principal point is known.
     """
-    from phibench.estimator.calibration.align import alignment, in_words, read_picture, write_alignment_picture
+    from phibench.estimator.calibration.align import (
+        alignment,
+        believed_centre,
+        in_words,
+        read_picture,
+        write_alignment_picture,
+    )
     from phibench.scenes.mirror import SphereMirror
     from phibench.scenes.rig import Rig
 
     pixels, card = read_picture(image)
     rig = Rig()
+    centre = believed_centre(pixels, rig.camera, cx_px, cy_px)
     focus_m = 1e-3 * (distance_mm - 0.5 * radius_mm if focus_mm is None else focus_mm)
     camera = replace(
         rig.camera,
@@ -105,8 +119,8 @@ def align(
         height_px=pixels.shape[0],
         fx_px=focal_px,
         fy_px=focal_px,
-        cx_px=cx_px,
-        cy_px=cy_px,
+        cx_px=centre[0],
+        cy_px=centre[1],
         focus_distance_m=focus_m,
     )
     pose = replace(rig.T_camera_sphere, translation_m=(0.0, 0.0, 1e-3 * distance_mm))

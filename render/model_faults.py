@@ -121,7 +121,7 @@ def _limits(node: Schema) -> list[str]:
 
 
 def _plain(node: Schema) -> bool:
-    return "$ref" not in node["items"]
+    return "$ref" not in node.get("items", {"$ref": ""})
 
 
 def _number(value: float) -> str:

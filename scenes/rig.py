@@ -124,6 +124,11 @@ class Rig:
         sine = self.mirror.radius_m / distance
         return self.camera.project(math.sqrt(1.0 - sine * sine) * axis + sine * rim)
 
+    def in_image(self) -> bool:
+        """Whether the mirror's middle or any of its outline lies inside the image."""
+        places = np.vstack([self.camera.project(self.sphere_in_camera_m), self.outline_px(24)])
+        return bool(np.any(self.camera.contains(places)))
+
     def fits_image(self) -> bool:
         """Whether the whole outline of the mirror lies inside the image."""
         return bool(np.all(self.camera.contains(self.outline_px())))

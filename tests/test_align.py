@@ -11,7 +11,7 @@ from limb_frames import limb_light
 from PIL import Image
 
 from phibench.estimator import cli
-from phibench.estimator.calibration.align import alignment, read_picture
+from phibench.estimator.calibration.align import alignment, believed_centre, read_picture
 from phibench.estimator.calibration.limb_image import ImageError
 from phibench.render.chain import Chain
 from phibench.render.light import Light
@@ -77,3 +77,17 @@ def test_what_is_no_frame_is_refused_in_one_sentence(tmp_path, capsys) -> None:
     assert cli.main(["align", str(text)]) == 2
     assert cli.main(["align", str(tmp_path / "none.png")]) == 2
     assert capsys.readouterr().err.count("\n") == 2
+
+
+def test_a_picture_that_is_no_whole_frame_needs_its_principal_point() -> None:
+    whole = Rig().camera
+    assert believed_centre(np.zeros((720, 1280, 3)), whole) == (639.5, 359.5)
+    assert believed_centre(np.zeros((720, 1180, 3)), whole, 539.5, 359.5) == (539.5, 359.5)
+    for shape in ((720, 1180), (540, 960)):
+        with pytest.raises(ImageError, match="1280 x 720"):
+            believed_centre(np.zeros((*shape, 3)), whole)
+
+
+def test_standard_deviations_below_0_are_refused() -> None:
+    with pytest.raises(ImageError, match="0 or above"):
+        alignment(np.zeros((720, 1280, 3), np.uint8), Rig(), None, -0.1)

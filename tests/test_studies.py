@@ -27,6 +27,7 @@ class Counting(Settings):
 
     upto: int = Field(ge=1, le=100)
     step: int = Field(default=1, ge=1)
+    ends: tuple[float, float] | None = Field(default=None, strict=False)
 
 
 def _count(settings: Counting, material: Material) -> Result:
@@ -72,6 +73,7 @@ def test_settings_take_the_reduced_numbers_only_when_asked(tmp_path: Path) -> No
         ("step = 1", ("upto",)),
         ("upto = ", ("not valid TOML",)),
         ("upto = 5\nquick = 3", ("[quick]", "table")),
+        ("upto = 5\nends = [1.0]", ("ends", "2")),
     ],
 )
 def test_bad_settings_end_in_a_sentence(tmp_path: Path, text: str, words: tuple[str, ...]) -> None:
@@ -127,3 +129,5 @@ def test_mistakes_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "holds no study" in capsys.readouterr().err
     assert main(["report", "--out", str(tmp_path / "r.html")]) == 2
     assert "a report of nothing" in capsys.readouterr().err
+    assert main(["study", "noise", "--workers", "0", "--out", str(tmp_path)]) == 2
+    assert "--workers 0" in capsys.readouterr().err

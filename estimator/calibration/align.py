@@ -20,6 +20,7 @@ from phibench.datasets.files import write_bytes
 from phibench.datasets.sensor_card import SensorCard, sensor_card
 from phibench.estimator.calibration.limb_image import ImageError
 from phibench.estimator.calibration.outline import Outline, find_outline
+from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
@@ -48,6 +49,26 @@ class Alignment:
     outline: Outline = field(repr=False)
 
 
+def believed_centre(
+    image: NDArray[Any], whole: Camera, cx_px: float | None = None, cy_px: float | None = None
+) -> tuple[float, float]:
+    """Principal point to believe: as given, or that of the whole camera.
+
+    Raises
+    ------
+    ImageError
+        If it is not given and the image is no whole frame: a cropped or shrunk one has its principal point elsewhere.
+    """
+    height, width = image.shape[:2]
+    if (cx_px is None or cy_px is None) and (width, height) != (whole.width_px, whole.height_px):
+        raise ImageError(
+            f"the picture has {width} x {height} pixels: a whole frame has {whole.width_px} x {whole.height_px}, and "
+            "one that was cut or shrunk has its principal point elsewhere; give a whole frame, or --cx-px, --cy-px and "
+            "--focal-px"
+        )
+    return (whole.cx_px if cx_px is None else cx_px, whole.cy_px if cy_px is None else cy_px)
+
+
 def alignment(
     image: NDArray[Any],
     rig: Rig,
@@ -64,7 +85,14 @@ def alignment(
         How well the camera is known to be vertical, each axis.
     principal_point_sigma_px : float
         How well its principal point is known, each axis.
+
+    Raises
+    ------
+    ImageError
+        If the image shows no whole mirror, or a standard deviation is below 0.
     """
+    if not (tilt_sigma_rad >= 0.0 and principal_point_sigma_px >= 0.0):
+        raise ImageError("the standard deviations of tilt and principal point must be 0 or above")
     found = find_outline(image, rig, card)
     s, R = found.sphere_in_camera_m, rig.T_world_camera.R
     offset = R @ s

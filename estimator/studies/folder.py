@@ -114,7 +114,7 @@ def section(folder: Path) -> Section:
     notes = tuple(f"Note: {note}" for note in document.notes)
     return Section(
         title=f"Study: {document.title}",
-        paragraphs=tuple(filter(None, (document.question, " ".join(document.findings), *notes, size))),
+        paragraphs=tuple(filter(None, (document.question, *document.findings, *notes, size))),
         pictures=tuple(pictures),
         tables=tuple(document.shown.values()),
         captions=tuple(document.shown),
@@ -122,8 +122,8 @@ def section(folder: Path) -> Section:
 
 
 def findings_text(study: Study[Any], result: Result) -> str:
-    """The findings as Markdown: question, paragraph, notes, tables, drawings."""
-    lines = [f"# {study.title}", "", study.question, "", " ".join(result.findings), ""]
+    """The findings as Markdown: question, findings, notes, tables, drawings."""
+    lines = [f"# {study.title}", "", study.question, "", *(f"* {finding}" for finding in result.findings), ""]
     lines += [f"* Note: {note}" for note in result.notes] + [""] * bool(result.notes)
     for caption, rows in result.shown.items():
         lines += [caption, "", *_markdown(rows), ""]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from phibench.datasets.errors import DatasetError
 from phibench.datasets.files import require_writable
 from phibench.estimator.studies.folder import DOCUMENT, write_study
 from phibench.estimator.studies.material import Material
@@ -44,6 +45,10 @@ def run_study(
     """
     study = find_study(name)
     chosen = read_settings(study, quick, settings)
+    if workers is not None and workers < 1:
+        raise DatasetError(f"--workers {workers}: at least 1 is needed")
+    if data is not None and data.exists() and not data.is_dir():
+        raise DatasetError(f"--data {data} is a file; give the folder of the data sets")
     require_writable(out / DOCUMENT)
     result = study.run(chosen, Material(data or out / DATA, console or Console(stderr=True), workers))
     write_study(out, study, chosen, quick, result)
