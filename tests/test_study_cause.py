@@ -403,7 +403,7 @@ def test_the_whole_study_in_small(tmp_path: Path) -> None:
     table = result.tables["table"]  # two samplings: the floor holds, and the sampler's own error is kept beside it
     assert (table["log_evidence_error"] >= FLOOR).all()
     assert (table["sampler_error"] <= table["log_evidence_error"]).all()
-    assert result.tables["scale"]["error"].min() >= FLOOR * 2.0**0.5 - 1e-9
+    assert result.tables["prior_scales"]["error"].min() >= FLOOR * 2.0**0.5 - 1e-9
     assert result.tables["made_up"]["log_evidence_error"].min() >= FLOOR
     assert "sampled 2 time(s)" in " ".join(result.notes)
     assert result.tables["left_out"].height == 4
