@@ -15,12 +15,13 @@ from phibench.datasets.errors import DatasetError
 from phibench.estimator.studies import cause_findings as say
 from phibench.estimator.studies.cause import STUDY
 from phibench.estimator.studies.cause_checks import alike, coverage, fit_of, left_out_score
+from phibench.estimator.studies.cause_evidence import DECIDED, ENOUGH, FLOOR, evidence_error, verdict
 from phibench.estimator.studies.cause_model import COMMON, NOISE, Explanation, Model, Prior, without_table
 from phibench.estimator.studies.cause_runs import all_runs
 from phibench.estimator.studies.cause_sampler import Posterior, pooled, sample
 from phibench.estimator.studies.cause_settings import CauseSettings
 from phibench.estimator.studies.cause_simulation import simulate
-from phibench.estimator.studies.paper_reading import published_experiments
+from phibench.estimator.studies.paper_reading import Reader, published_experiments, read
 from phibench.estimator.studies.run import run_study
 from phibench.estimator.studies.settings import read_settings
 from phibench.scenes.frames import Array
@@ -155,7 +156,7 @@ def test_made_up_data_give_back_their_cause(settings: CauseSettings) -> None:
         gains[truth] = found["ray_misaligned"].log_evidence - found["ray"].log_evidence
         tilts[truth] = found["ray_misaligned"].points[:, model.names.index("tilt_y_rad")]
     # error of a difference with 30 live points about 1; nested runs of these data give -6 and +20
-    assert gains["ray"] < say.DECIDED
+    assert gains["ray"] < DECIDED
     assert gains["ray_misaligned"] > 5.0
     low, high = np.quantile(tilts["ray_misaligned"], [0.005, 0.995])
     assert low < 0.02 < high
@@ -201,6 +202,33 @@ def test_principal_point_and_tilt_are_alike(settings: CauseSettings) -> None:
     assert abs(pairs["tilt_y_rad", "focal_relative"]) < 0.95
 
 
+def _moved(azimuth_deg: float, **errors: float) -> Array:
+    """Estimates of a rig with a tilt of 0.0136 rad and spots in one azimuth, of the real depth, shape (25,)."""
+    world = {"z_c_m": 0.28, "tilt_y_rad": 0.0136, **HEIGHTS, **errors}
+    world |= {f"azimuth_{k}_rad": np.radians(azimuth_deg) for k in (1, 2, 3, 4)}
+    given = {name: np.asarray(value) for name, value in world.items()}
+    return np.asarray(read(given, DATA, Reader(), Rig()).depth_m / DATA.depth_m)
+
+
+@pytest.mark.parametrize(
+    ("azimuth_deg", "along", "across"), [(0, 1.34, 0.07), (45, 0.74, 0.97), (90, 0.21, 1.80), (135, 1.86, 2.11)]
+)
+def test_the_decentre_that_is_left_out_counts(azimuth_deg: float, along: float, across: float) -> None:
+    """Figures of cause.toml and docs/studies/cause.md: rms of what 1 mm changes, in per cent, as printed (0.005)."""
+    plain = _moved(azimuth_deg)
+    changes = (_moved(azimuth_deg, **{f"decentre_{axis}_m": 1e-3}) - plain for axis in "xy")
+    assert [100.0 * float(np.sqrt(np.mean(c**2))) for c in changes] == pytest.approx([along, across], abs=0.0051)
+
+
+def test_azimuths_fold_only_without_a_decentre_across_the_tilt() -> None:
+    """The mirror image of a spot about the tilt's direction gives the same reading only where the rig is symmetric."""
+    for azimuth_deg in (20.0, 90.0, 160.0):
+        kept = [_moved(sign * azimuth_deg, decentre_x_m=1e-3) for sign in (1, -1)]
+        broken = [_moved(sign * azimuth_deg, decentre_y_m=1e-3) for sign in (1, -1)]
+        assert kept[0] == pytest.approx(kept[1], rel=1e-9)  # only the sine of the azimuth changes sign
+        assert np.abs(broken[0] - broken[1]).max() > 1e-3
+
+
 def test_coverage_counts_intervals(settings: CauseSettings) -> None:
     model = settings.model("ray", DATA)
     points = np.repeat(np.linspace(0.0, 1.0, 101)[:, None], len(model.names), axis=1)
@@ -232,9 +260,9 @@ def _rows(**changes: list[float]) -> pl.DataFrame:
 def test_sentences_follow_the_numbers() -> None:
     table = _rows()
     assert "'tilt' has the largest evidence" in say.best_sentence(table)
-    assert "No other explanation" in say.best_sentence(table)
+    assert "favoured over every other" in say.best_sentence(table)
     near = _rows(log_evidence=[9.0, 10.0, -9.0], against=[0.0, 1.0, -18.0])
-    assert "do not decide" in say.best_sentence(near)
+    assert "Undecided against it: noise (decided is" in say.best_sentence(near)
     words = " ".join(say.rival_sentences(table))
     assert "favoured: tilt (+10.0" in words
     assert "disfavoured: wrong (-9.0" in words
@@ -242,7 +270,7 @@ def test_sentences_follow_the_numbers() -> None:
     assert "run in trends" in words
     calm = _rows(chi2_p=[0.5] * 3, trend_p=[0.5] * 3, against=[0.0, 1.0, -1.0])
     words = " ".join(say.rival_sentences(calm))
-    assert "neither: tilt" in words
+    assert "undecided: tilt" in words
     assert "trends" not in words
     assert "more than rounding" in say.noise_sentence(table)
     assert "reaches down" in say.noise_sentence(_rows(noise_low_px=[0.8, 0.2, 0.8]))
@@ -253,6 +281,73 @@ def test_sentences_follow_the_numbers() -> None:
     assert "is above the prior's" in say.offset_sentence(table, pl.DataFrame({**offsets, **prior}))
     wide = pl.DataFrame({**offsets, **prior, "low_px": [4.0]})
     assert "is not above the prior's" in say.offset_sentence(table, wide)
+
+
+def test_errors_of_few_samplings_have_a_floor() -> None:
+    assert evidence_error(0.6, 1) == evidence_error(0.6, ENOUGH - 1) == FLOOR
+    assert evidence_error(2.5, 1) == 2.5
+    assert evidence_error(0.6, ENOUGH) == 0.6
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_verdicts_ask_for_odds_beyond_twice_the_error(sign: float) -> None:
+    """ln 10 = 2.303: with an error of 2.12 (1.5 of each) 6.54 is the limit, with one of 0.1 it is 2.50."""
+    decided = "favoured" if sign > 0.0 else "disfavoured"
+    assert verdict(sign * 6.5, 1.5 * 2.0**0.5) == "undecided"
+    assert verdict(sign * 6.6, 1.5 * 2.0**0.5) == decided
+    assert verdict(sign * 2.45, 0.1) == "undecided"
+    assert verdict(sign * 2.55, 0.1) == decided
+    assert verdict(sign * 2.25, 0.0) == "undecided"
+
+
+def test_the_same_difference_is_decided_or_not_by_its_error() -> None:
+    """5 in log evidence: decided with 0.7 of error (3.7 is the limit), undecided with 2.1 (6.5)."""
+    evidence = [0.0, 5.0, -5.0]
+    sure = _rows(log_evidence=evidence, against=evidence)
+    unsure = _rows(
+        log_evidence=evidence, log_evidence_error=[FLOOR] * 3, against=evidence, against_error=[0.0, 2.1, 2.1]
+    )
+    words = say.rival_sentences(sure)[0]
+    assert "favoured: tilt (+5.0 +- 0.7); disfavoured: wrong (-5.0 +- 0.7)" in words
+    assert "undecided" not in words
+    words = say.rival_sentences(unsure)[0]
+    assert "undecided: tilt (+5.0 +- 2.1), wrong (-5.0 +- 2.1)" in words
+    assert "favoured:" not in words
+    assert "favoured over every other" in say.best_sentence(sure)
+    assert "Undecided against it: noise (decided" in say.best_sentence(unsure)
+
+
+@pytest.mark.parametrize(("error", "word"), [(0.5, "disfavoured"), (FLOOR, "undecided")])
+def test_senses_of_phi_are_told_apart_by_the_same_rule(settings: CauseSettings, error: float, word: str) -> None:
+    chosen = settings.model_copy(update={"explanations": settings.explanations[:2]})
+    table = pl.DataFrame(
+        {"explanation": ["ray", "normal"], "log_evidence": [-6.2, 0.0], "log_evidence_error": [error] * 2}
+    )
+    words = say.convention_sentence(chosen, table)
+    assert f"noise alone: phi_normal has most, then phi_ray -6.2 +- {error * 2.0**0.5:.1f} ({word})" in words
+
+
+@pytest.mark.parametrize(("error", "lost"), [(0.5, 1), (FLOOR, 0)])
+def test_made_up_data_decide_by_the_same_rule(error: float, lost: int) -> None:
+    made_up = pl.DataFrame(
+        {
+            "truth": ["ray"] * 2,
+            "repeat": [0, 0],
+            "explanation": ["ray", "tilted"],
+            "log_evidence": [0.0, 5.0],
+            "log_evidence_error": [error] * 2,
+            "covered": [6, 0],
+            "parameters": [6, 0],
+        }
+    )
+    words = say.made_up_sentence(made_up)
+    assert f"largest evidence in 0 of 1 draws and decided against it in {lost}" in words
+    assert "6 of 6 true values" in words
+
+
+def test_wider_priors_come_with_errors() -> None:
+    rows = {"explanation": ["a", "a"], "scale": [1.0, 2.0], "against": [11.9, 13.9], "error": [1.6, 2.1]}
+    assert "1 / 2 times as wide: a +11.9 +- 1.6 / +13.9 +- 2.1." in say.scale_sentence(pl.DataFrame(rows))
 
 
 def _tiny() -> str:
@@ -305,6 +400,12 @@ def test_the_whole_study_in_small(tmp_path: Path) -> None:
         "cause", tmp_path / "out", settings=tmp_path / "cause.toml", workers=1, console=Console(quiet=True)
     )
     assert result.tables["table"]["explanation"].to_list() == ["ray", "outline", "tilted"]
+    table = result.tables["table"]  # two samplings: the floor holds, and the sampler's own error is kept beside it
+    assert (table["log_evidence_error"] >= FLOOR).all()
+    assert (table["sampler_error"] <= table["log_evidence_error"]).all()
+    assert result.tables["prior_scales"]["error"].min() >= FLOOR * 2.0**0.5 - 1e-9
+    assert result.tables["made_up"]["log_evidence_error"].min() >= FLOOR
+    assert "sampled 2 time(s)" in " ".join(result.notes)
     assert result.tables["left_out"].height == 4
     assert result.tables["made_up"].height == 1
     assert {drawing.name for drawing in result.drawings} == {"predictive", "evidence", "posterior"}

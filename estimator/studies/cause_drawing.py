@@ -8,6 +8,7 @@ import numpy as np
 import polars as pl
 
 from phibench.estimator.studies.cause_checks import band
+from phibench.estimator.studies.cause_evidence import DECIDED
 from phibench.estimator.studies.cause_model import NOISE
 from phibench.estimator.studies.cause_settings import CauseSettings
 from phibench.estimator.studies.cause_tables import Posteriors, grid_of
@@ -53,7 +54,7 @@ def evidence_drawing(table: pl.DataFrame, scales: pl.DataFrame, alt: str) -> Dra
     with canvas(9.0, 0.6 + 0.28 * len(rows)) as figure:
         ax = figure.subplots()
         ax.axvline(0.0, color=COLOURS[7], linewidth=0.8)
-        ax.axvspan(-2.3, 2.3, color=COLOURS[6], alpha=0.15, label="odds below 10 to 1")
+        ax.axvspan(-DECIDED, DECIDED, color=COLOURS[6], alpha=0.15, label="odds below 10 to 1")
         for i, (scale, label) in enumerate(_SCALES.items()):
             own = scales.filter(pl.col("scale") == scale)
             if scale == 1.0:
@@ -62,7 +63,7 @@ def evidence_drawing(table: pl.DataFrame, scales: pl.DataFrame, alt: str) -> Dra
                 y = [places[name] + 0.18 * (i - 1) * (i > 0) for name in own["explanation"]]
                 ax.errorbar(own["against"], y, xerr=own["error"], fmt="osD"[i], color=COLOURS[i], ms=4, label=label)
         ax.set_yticks(range(len(rows)), rows["text"])
-        ax.set(xlabel="log evidence against the one at 0 (bars: 1 sigma of the sampler)")
+        ax.set(xlabel="log evidence against the one at 0 (bars: 1 sigma; decided: two bars or more outside the band)")
         ax.legend(loc="lower right", fontsize=7)
         return drawn("evidence", figure, alt)
 

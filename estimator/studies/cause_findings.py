@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from phibench.estimator.studies.cause_evidence import RULE, Verdict, verdict
 from phibench.estimator.studies.cause_settings import CauseSettings
 from phibench.estimator.studies.result import Row
 
-DECIDED = float(np.log(10.0))  # odds of 10 to 1: less is called undecided
 ALIKE = 0.95  # cosine from which two parameters do the same
 SMALL_P = 0.05
 
@@ -19,13 +19,11 @@ def best_sentence(table: pl.DataFrame) -> str:
     """Best evidence, and what cannot be told from it."""
     rows = table.sort("log_evidence", descending=True)
     best, first = rows.row(0, named=True), table.row(0, named=True)
-    error = (pl.col("log_evidence_error") ** 2 + best["log_evidence_error"] ** 2).sqrt()
-    near = rows[1:].filter(pl.col("log_evidence") + 2.0 * error > best["log_evidence"] - DECIDED)
+    near = [row["text"] for row in rows[1:].iter_rows(named=True) if _of_two(best, row)[2] == "undecided"]
     rest = (
-        f"Within odds of 10 to 1 of it, or two sigma of that, are {'; '.join(near['text'])}: "
-        "the 25 numbers do not decide between them."
-        if len(near)
-        else "No other explanation comes within odds of 10 to 1 of it."
+        f"Undecided against it: {'; '.join(near)} ({RULE})."
+        if near
+        else f"It is favoured over every other explanation ({RULE})."
     )
     gain = (
         "the reference itself"
@@ -35,10 +33,17 @@ def best_sentence(table: pl.DataFrame) -> str:
     return f"Of {len(table)} explanations '{best['text']}' has the largest evidence ({gain}). {rest}"
 
 
+def _of_two(row: dict[str, Any], other: dict[str, Any]) -> tuple[float, float, Verdict]:
+    """Difference of two log evidences, its error, the verdict on the first."""
+    difference = row["log_evidence"] - other["log_evidence"]
+    error = float(np.hypot(row["log_evidence_error"], other["log_evidence_error"]))
+    return difference, error, verdict(difference, error)
+
+
 def convention_sentence(settings: CauseSettings, table: pl.DataFrame) -> str:
     """What the data say of the sense of phi, in each family that differs by nothing else."""
-    families: dict[str, dict[str, float]] = {}
-    evidence = dict(zip(table["explanation"], table["log_evidence"], strict=True))
+    families: dict[str, dict[str, dict[str, Any]]] = {}
+    evidence = {row["explanation"]: row for row in table.iter_rows(named=True)}
     for explanation in settings.explanations:
         key = explanation.model_dump_json(exclude={"name", "text", "convention"})
         families.setdefault(key, {})[explanation.convention] = evidence[explanation.name]
@@ -52,10 +57,13 @@ def convention_sentence(settings: CauseSettings, table: pl.DataFrame) -> str:
             label = named.get(",".join(example.free), ", ".join(example.free)) + (
                 ", centred" if example.centred else ""
             )
-            top = max(values.values())
-            order = sorted(values, key=lambda c: -values[c])
-            parts.append(f"{label}: " + ", ".join(f"phi_{c} {values[c] - top:+.1f}" for c in order))
-    return f"Log evidence by sense of phi, against the best of its family: {'; '.join(parts)}." if parts else ""
+            best, *others = sorted(values, key=lambda c: -values[c]["log_evidence"])
+            against = ((c, *_of_two(values[c], values[best])) for c in others)
+            parts.append(
+                f"{label}: phi_{best} has most, then "
+                + ", ".join(f"phi_{c} {by:+.1f} +- {error:.1f} ({word})" for c, by, error, word in against)
+            )
+    return f"Log evidence by sense of phi, against the largest of its family: {'; '.join(parts)}." if parts else ""
 
 
 def noise_sentence(table: pl.DataFrame) -> str:
@@ -78,17 +86,16 @@ def noise_sentence(table: pl.DataFrame) -> str:
 
 
 def rival_sentences(table: pl.DataFrame) -> tuple[str, ...]:
-    """For, against and neither, at two sigma of the sampler; and whose residuals are not what noise makes."""
+    """For, against and undecided; and whose residuals are not what noise makes."""
     first, groups = table.row(0, named=True), _verdicts(table)
     parts = [
-        f"{verdict}: "
-        + ", ".join(f"{row['text']} ({row['against']:+.1f} +- {row['against_error']:.1f})" for row in rows)
-        for verdict, rows in groups.items()
+        f"{word}: " + ", ".join(f"{row['text']} ({row['against']:+.1f} +- {row['against_error']:.1f})" for row in rows)
+        for word, rows in groups.items()
         if rows
     ]
     words = []
     if parts:
-        words.append(f"Log evidence against '{first['text']}', odds of 10 to 1 at two sigma: {'; '.join(parts)}.")
+        words.append(f"Log evidence against '{first['text']}' ({RULE}): {'; '.join(parts)}.")
     for column, fault in (
         ("chi2_p", "are too large"),
         ("trend_p", "run in trends that independent noise does not make"),
@@ -100,11 +107,10 @@ def rival_sentences(table: pl.DataFrame) -> tuple[str, ...]:
     return tuple(words)
 
 
-def _verdicts(table: pl.DataFrame) -> dict[str, list[dict[str, Any]]]:
-    groups: dict[str, list[dict[str, Any]]] = {"favoured": [], "disfavoured": [], "neither": []}
+def _verdicts(table: pl.DataFrame) -> dict[Verdict, list[dict[str, Any]]]:
+    groups: dict[Verdict, list[dict[str, Any]]] = {"favoured": [], "disfavoured": [], "undecided": []}
     for row in table[1:].sort("against", descending=True).iter_rows(named=True):
-        low, high = (row["against"] + sign * 2.0 * row["against_error"] for sign in (-1, 1))
-        groups["favoured" if low > DECIDED else "disfavoured" if high < -DECIDED else "neither"].append(row)
+        groups[verdict(row["against"], row["against_error"])].append(row)
     return groups
 
 
@@ -117,10 +123,10 @@ def offset_sentence(table: pl.DataFrame, offsets: pl.DataFrame) -> str:
     row = best.row(0, named=True)
     moved = "above" if row["low_px"] > row["prior_low_px"] * 1.5 else "not above"
     return (
-        f"Of those with tilt and decentre '{texts[row['explanation']]}' does best; there the image of the sphere lies "
-        f"{row['mean_px']:.0f} px ({row['low_px']:.0f} to {row['high_px']:.0f}) from the point from which radii are "
-        f"counted (prior: {row['prior_low_px']:.0f} to {row['prior_high_px']:.0f}); its lower end is {moved} the "
-        f"prior's. Section 5 of the paper says that the mirror's image was centred."
+        f"Of those with tilt and decentre '{texts[row['explanation']]}' has the largest evidence; there the image of "
+        f"the sphere lies {row['mean_px']:.0f} px ({row['low_px']:.0f} to {row['high_px']:.0f}) from the point from "
+        f"which radii are counted (prior: {row['prior_low_px']:.0f} to {row['prior_high_px']:.0f}); its lower "
+        f"end is {moved} the prior's. Section 5 of the paper says that the mirror's image was centred."
     )
 
 
@@ -131,7 +137,8 @@ def scale_sentence(scales: pl.DataFrame) -> str:
     parts = []
     for name in scales["explanation"].unique(maintain_order=True):
         own = scales.filter(pl.col("explanation") == name).sort("scale")
-        parts.append(f"{name} {' / '.join(f'{x:+.1f}' for x in own['against'])}")
+        values = own.select("against", "error").iter_rows()
+        parts.append(f"{name} {' / '.join(f'{x:+.1f} +- {error:.1f}' for x, error in values)}")
     widths = " / ".join(f"{x:g}" for x in sorted(scales["scale"].unique()))
     return f"With the normal priors of misalignment, stroke and scale {widths} times as wide: {'; '.join(parts)}."
 
@@ -175,18 +182,18 @@ def made_up_sentence(made_up: pl.DataFrame) -> str:
     parts = []
     for truth in made_up["truth"].unique(maintain_order=True):
         own = made_up.filter(pl.col("truth") == truth)
-        wins = gains = 0
+        wins = lost = 0
         for repeat in own["repeat"].unique():
             rows = own.filter(pl.col("repeat") == repeat)
-            best = float(rows["log_evidence"].to_numpy().max())
-            right = rows.filter(pl.col("explanation") == truth)["log_evidence"].to_list()
-            wins += bool(len(right) and right[0] == best)
-            gains += bool(len(right) and right[0] > best - DECIDED)
+            best = rows.sort("log_evidence", descending=True).row(0, named=True)
+            right = rows.filter(pl.col("explanation") == truth).to_dicts()
+            wins += best["explanation"] == truth
+            lost += bool(right) and _of_two(right[0], best)[2] == "disfavoured"
         held, of = own["covered"].sum(), own["parameters"].sum()
         n = own["repeat"].n_unique()
         parts.append(
-            f"data of '{truth}' gave it the largest evidence in {wins} of {n} draws and kept it within odds of 10 to 1 "
-            f"in {gains}, with {held} of {of} true values in the 90 % intervals"
+            f"data of '{truth}' gave it the largest evidence in {wins} of {n} draws and decided against it in {lost}, "
+            f"with {held} of {of} true values in the 90 % intervals"
         )
     return f"Made-up data: {'; '.join(parts)}." if parts else ""
 

@@ -43,8 +43,10 @@ GROUPS: dict[str, tuple[str, ...]] = {
 """What an explanation can leave free besides lens distance, spot heights and noise.
 
 World x is the direction of the tilt (of the turn), so that its size is not negative and the other component is 0; the
-decentre counts along it. Azimuths run from 0 to pi, because a spot and its mirror image about that direction are seen
-alike. Without these choices the posterior has some sixteen equal modes, of which nested sampling loses some.
+decentre has its component along it alone. Then a spot and its mirror image about that direction are seen alike, and
+azimuths run from 0 to pi. Without these choices the posterior has some sixteen equal modes, of which nested sampling
+loses some. The missing component is a restriction of the prior, not a small effect: the spot's azimuth decides which of
+the two counts. With it azimuths would have to run from -pi to pi.
 """
 _DIRECTED = ("misalignment", "turn")  # their effect depends on the spot's azimuth
 COMMON = ("z_c_m", "height_1_m", "height_2_m", "height_3_m", "height_4_m")

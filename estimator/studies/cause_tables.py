@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 
 from phibench.estimator.studies.cause_checks import alike, coverage, fit_of, left_out_score
+from phibench.estimator.studies.cause_evidence import evidence_error
 from phibench.estimator.studies.cause_model import NOISE, WHOLE_PIXEL_PX
 from phibench.estimator.studies.cause_runs import Run
 from phibench.estimator.studies.cause_sampler import Posterior
@@ -35,14 +36,13 @@ def explanation_table(settings: CauseSettings, posteriors: Posteriors) -> pl.Dat
     """A row per explanation: evidence, noise, fit, scores of left-out tables; `against` is the first explanation."""
     names = [explanation.name for explanation in settings.explanations]
     first = posteriors["published", names[0]]
+    first_error = evidence_error(first.log_evidence_error, settings.repeats)
     rows = []
     for name in names:
         own, model = posteriors["published", name], settings.model(name, published_experiments())
         fit = fit_of(model, own.thinned(settings.predictive), generator("study", "cause", "fit", name))
         noise = own.points[:, model.names.index(NOISE)] if NOISE in model.names else np.full(2, WHOLE_PIXEL_PX)
-        error = (
-            own.log_evidence_error if name == names[0] else np.hypot(own.log_evidence_error, first.log_evidence_error)
-        )
+        error = evidence_error(own.log_evidence_error, settings.repeats)
         score, score_error = _left_out(settings, posteriors, name)
         rows.append(
             {
@@ -50,9 +50,10 @@ def explanation_table(settings: CauseSettings, posteriors: Posteriors) -> pl.Dat
                 "text": model.explanation.text,
                 "parameters": len(model.names),
                 "log_evidence": own.log_evidence,
-                "log_evidence_error": own.log_evidence_error,
+                "log_evidence_error": error,
+                "sampler_error": own.log_evidence_error,
                 "against": own.log_evidence - first.log_evidence,
-                "against_error": float(error) if name != names[0] else 0.0,
+                "against_error": float(np.hypot(error, first_error)) if name != names[0] else 0.0,
                 "noise_px": float(noise.mean()),
                 "noise_low_px": float(np.quantile(noise, INTERVAL[0])),
                 "noise_high_px": float(np.quantile(noise, INTERVAL[1])),
@@ -72,11 +73,13 @@ def explanation_table(settings: CauseSettings, posteriors: Posteriors) -> pl.Dat
 def scale_table(settings: CauseSettings, posteriors: Posteriors) -> pl.DataFrame:
     """Log evidence against the first explanation with priors of misalignment, stroke and scale wider or narrower."""
     first = posteriors["published", settings.explanations[0].name]
+    first_error = evidence_error(first.log_evidence_error, settings.repeats)
     rows = []
     for name in settings.scaled if settings.prior_scales else ():
         for scale in (1.0, *settings.prior_scales):
             own = posteriors[("published", name) if scale == 1.0 else ("scale", f"{scale:g}", name)]
-            error = float(np.hypot(own.log_evidence_error, first.log_evidence_error))
+            repeats = settings.repeats if scale == 1.0 else 1
+            error = float(np.hypot(evidence_error(own.log_evidence_error, repeats), first_error))
             against = own.log_evidence - first.log_evidence
             rows.append({"explanation": name, "scale": scale, "against": against, "error": error})
     schema = {"explanation": pl.String, "scale": pl.Float64, "against": pl.Float64, "error": pl.Float64}
@@ -178,7 +181,7 @@ def made_up_table(settings: CauseSettings, posteriors: Posteriors, runs: list[Ru
                     "repeat": int(repeat),
                     "explanation": str(name),
                     "log_evidence": own.log_evidence,
-                    "log_evidence_error": own.log_evidence_error,
+                    "log_evidence_error": evidence_error(own.log_evidence_error, 1),
                     "covered": sum(held.values()),
                     "parameters": len(held),
                 }
@@ -210,7 +213,10 @@ def density_table(settings: CauseSettings, posteriors: Posteriors) -> pl.DataFra
 
 
 def short_stroke_table(height_m: float = -0.21, z_c_m: float = 0.26) -> pl.DataFrame:
-    """Errors of eqs. (4) and (5) from exact pixels of an aligned rig, by experiment; eq. (5) is what h << D leaves."""
+    """Errors of eqs. (4) and (5) from exact pixels of an aligned rig, by experiment.
+
+    Eq. (4) does not use h << D; eq. (5) leaves out the mirror's radius alone.
+    """
     data = published_experiments()
     world: dict[str, Array] = {"z_c_m": np.asarray(z_c_m)}
     world.update({f"height_{k}_m": np.asarray(height_m) for k in range(1, TABLES + 1)})
