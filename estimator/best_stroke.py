@@ -52,7 +52,7 @@ class BestStroke:
     depth_m : float
     stroke_m : float
         NaN where no stroke can be taken.
-    sigma_m, sigma_spot_m, sigma_calibration_m, sigma_stroke_m, sigma_second_order_m : float
+    sigma_m, sigma_spot_m, sigma_calibration_m, sigma_stroke_m, sigma_higher_order_m : float
         Predicted standard deviation of D and its parts, whose squares add up.
     limits : tuple of str
         What keeps the stroke from being better: "shortest stroke", "longest stroke", or the cause beside it, such as
@@ -66,7 +66,7 @@ class BestStroke:
     sigma_spot_m: float
     sigma_calibration_m: float
     sigma_stroke_m: float
-    sigma_second_order_m: float
+    sigma_higher_order_m: float
     limits: tuple[str, ...]
     curve: StrokeCurve = field(repr=False)
 
@@ -159,7 +159,7 @@ def best_stroke(
         sigma_spot_m=float(fine.sigma_spot_m[at]),
         sigma_calibration_m=float(fine.sigma_calibration_m[at]),
         sigma_stroke_m=float(fine.sigma_stroke_m[at]),
-        sigma_second_order_m=float(fine.sigma_second_order_m[at]),
+        sigma_higher_order_m=float(fine.sigma_higher_order_m[at]),
         limits=_limits(curve, index),
         curve=curve,
     )

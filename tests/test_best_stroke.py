@@ -233,7 +233,7 @@ def test_a_rig_as_built_errs_beyond_first_order_as_drawn_rigs_do() -> None:
 
 def test_exact_rigs_have_no_second_order() -> None:
     curve = stroke_curve(RIG, 1.4, np.array([0.4, 0.8]), SAME, EXACT, OPEN, Laser(), 1.0 / 60.0, 0.0)
-    assert not curve.sigma_second_order_m.any()
+    assert not curve.sigma_higher_order_m.any()
     assert not curve.sigma_calibration_m.any()
 
 
