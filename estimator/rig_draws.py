@@ -14,6 +14,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
 from scipy.stats import qmc
 
 from phibench.estimator.calibration.parameters import PARAMETERS, changed, stroke_of
@@ -69,8 +70,8 @@ def beyond_first_order_m(
     down, up, true = (np.stack(column) for column in zip(*seen, strict=True))
     C_down, C_up = covariance_down_px2, up_px2[chosen]
     found = depth_general(rig, h[:, None], down, up, C_down, C_up, covariance_rig, np.asarray(stroke_sigma_m))
-    square_m2 = _beyond_m2(found.depth_m - true, normals)
-    return np.asarray(np.interp(np.log(strokes_m), np.log(h), np.sqrt(np.maximum(square_m2, 0.0))))
+    square_m2 = _between(strokes_m, h, _beyond_m2(found.depth_m - true, normals))
+    return np.asarray(np.sqrt(np.maximum(square_m2, 0.0)))
 
 
 def _beyond_m2(errors_m: Array, normals: Array) -> Array:
@@ -80,6 +81,15 @@ def _beyond_m2(errors_m: Array, normals: Array) -> Array:
     k = len(normals)
     linear = np.einsum("kp,pnm->knm", normals, odd[k:] / _STEP)
     return np.asarray(np.mean(even[:k] ** 2 + odd[:k] ** 2 - linear**2, axis=(0, 2)))
+
+
+def _between(strokes_m: Array, known_m: Array, values: Array) -> Array:
+    """Values at strokes, from those at known ones, smoothly in the logarithm; NaN beyond the finite ones."""
+    finite = np.isfinite(values)
+    if finite.sum() < 2:  # nothing to interpolate between
+        return np.where(np.isin(strokes_m, known_m[finite]), values[finite].sum(), np.nan)
+    smooth = PchipInterpolator(np.log(known_m[finite]), values[finite], extrapolate=False)
+    return np.asarray(smooth(np.log(strokes_m)))
 
 
 def _seen(rig: Rig, values: Array, strokes_m: Array, points_m: Array) -> tuple[Array, Array, Array]:

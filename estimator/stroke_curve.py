@@ -91,7 +91,7 @@ class StrokeCurve:
         From the pixels' noise, the rig's parameters and the single stroke, to first order; NaN where the spot has no
         image.
     sigma_higher_order_m
-        What the rig's parameters do beyond: `rig_draws.beyond_first_order_m`.
+        What the rig's parameters do beyond, a mean error (bias) included: `rig_draws.beyond_first_order_m`.
     causes : tuple of str
         Why a stroke cannot be taken, or why its error is not known; `FREE` where neither.
     """
