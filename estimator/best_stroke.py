@@ -9,10 +9,11 @@ It falls as D^2 / h while h << D and rises as h^3 / D^2 beyond: for x_1 = 0 it i
 half way up (x_1 = -x_2) at h = 2 D. `best_stroke` takes the same from the exact rays, with the spot's bound where it
 appears in the mirror and with the covariance of the rig's parameters:
 
-    sigma_D^2 = g_y C_y g_y + g_p C_p g_p + g_h^2 sigma_h^2 + E[even part]^2    (`depth_general`, `rig_draws`).
+    sigma_D^2 = g_y C_y g_y + g_p C_p g_p + g_h^2 sigma_h^2 + higher orders    (`depth_general`, `rig_draws`).
 
 The last is what a rig's tolerance does beyond first order; a stroke at which the first order vanishes is no better than
-that.
+that. sigma_D is a root mean square error: for a rig as built it contains the mean of the second order, a bias of
+`depth_general`, which is not scatter about a mean.
 """
 
 from __future__ import annotations
@@ -52,8 +53,9 @@ class BestStroke:
     depth_m : float
     stroke_m : float
         NaN where no stroke can be taken.
-    sigma_m, sigma_spot_m, sigma_calibration_m, sigma_stroke_m, sigma_second_order_m : float
-        Predicted standard deviation of D and its parts, whose squares add up.
+    sigma_m, sigma_spot_m, sigma_calibration_m, sigma_stroke_m, sigma_higher_order_m : float
+        Predicted root mean square error of D and its parts, whose squares add up. The first three parts are standard
+        deviations; the last contains a bias, see `rig_draws`.
     limits : tuple of str
         What keeps the stroke from being better: "shortest stroke", "longest stroke", or the cause beside it, such as
         "ceiling"; empty at a minimum of the error. Where no stroke can be taken, all causes.
@@ -66,7 +68,7 @@ class BestStroke:
     sigma_spot_m: float
     sigma_calibration_m: float
     sigma_stroke_m: float
-    sigma_second_order_m: float
+    sigma_higher_order_m: float
     limits: tuple[str, ...]
     curve: StrokeCurve = field(repr=False)
 
@@ -159,7 +161,7 @@ def best_stroke(
         sigma_spot_m=float(fine.sigma_spot_m[at]),
         sigma_calibration_m=float(fine.sigma_calibration_m[at]),
         sigma_stroke_m=float(fine.sigma_stroke_m[at]),
-        sigma_second_order_m=float(fine.sigma_second_order_m[at]),
+        sigma_higher_order_m=float(fine.sigma_higher_order_m[at]),
         limits=_limits(curve, index),
         curve=curve,
     )

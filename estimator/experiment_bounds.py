@@ -1,8 +1,13 @@
-"""What single frames of experiments give at best: the bound of D from the pixels alone, and what would improve it."""
+"""What single frames of experiments give at best: the bound of D from the pixels alone, and what would improve it.
+
+The bound counts PRNU and DSNU as noise. They are a camera's own, the same in all of its frames, so that a mean of n
+frames keeps their part; the rest (photons, read noise, rounding) falls as 1 / n.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +15,14 @@ import polars as pl
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frame_request import Exposure
+from phibench.datasets.frame_source import FrameSource
 from phibench.datasets.read import Dataset, Sample
-from phibench.estimator.bench.dataset_pairs import DatasetPairs, pairs_of
-from phibench.estimator.bench.truth import PairTruth
+from phibench.datasets.taken import TakenSample
+from phibench.estimator.bench.dataset_pairs import pairs_of
+from phibench.estimator.bench.spot_bounds import spot_bounds as bounds_of_spot
 from phibench.estimator.depth_general import depth_general
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import POSITIONS
 
 _NO_MATRIX = np.full((2, 2), np.nan)
 
@@ -40,54 +49,89 @@ def spot_bounds(
     Returns
     -------
     polars.DataFrame
-        sample_id, experiment, depth_m, stroke_m, exposure_s, bound_m (NaN where a spot has none), and relative, which
-        is bound_m / depth_m.
+        sample_id, experiment, depth_m, stroke_m, exposure_s, bound_m (NaN where a spot has none) and relative, which
+        is bound_m / depth_m; bound_pattern_known_m and relative_pattern_known are the same for a camera whose PRNU and
+        DSNU are calibrated.
     """
-    pairs = _pairs(dataset, preset, dataset.samples if samples is None else samples, laser_level, exposure)
     rows = []
-    for number, take in enumerate(pairs.takes):
-        truth, card = pairs.truth(number), pairs.card(number)
-        bound_m = _bound_m(truth)
-        row = dataset[take.sample_id].row
+    wanted = dataset.samples if samples is None else samples
+    for sample, source in _sources(dataset, preset, wanted, laser_level, exposure):
+        row = sample.row
+        bound_m, known_m = (_bound_m(sample, source, pattern_known) for pattern_known in (False, True))
         rows.append(
             {
                 "sample_id": row.sample_id,
                 "experiment": row.experiment,
                 "depth_m": row.depth_m,
                 "stroke_m": row.nominal_stroke_m,
-                "exposure_s": card.exposure_s,
+                "exposure_s": source.sides["down"].chain.sensor.exposure_s,
                 "bound_m": bound_m,
                 "relative": bound_m / row.depth_m,
+                "bound_pattern_known_m": known_m,
+                "relative_pattern_known": known_m / row.depth_m,
             }
         )
     return pl.DataFrame(rows)
 
 
-def frames_needed(bounds: pl.DataFrame, target: float) -> int:
-    """Frames per position whose mean has a bound with an rms relative error of at most `target`: variances fall as 1/n.
+def frames_needed(bounds: pl.DataFrame, target: float, pattern_known: bool = False) -> int | None:
+    """Frames per position of one camera whose mean has a bound with an rms relative error of at most `target`.
+
+    With B of one frame and B_0 of one frame without a pattern, both mean squares over the samples, n frames have
+    B(n) = (B - B_0) + B_0 / n. The bound of n frames with weights of its own is not above that: the inverse Fisher
+    matrix is concave and homogeneous in the pixels' variance P + R / n, so that its slope in 1 / n at n = 1 is B_0 or
+    more. For a method at k times the bound ask for target / k.
+
+    Parameters
+    ----------
+    bounds : polars.DataFrame
+        Of `spot_bounds`.
+    target : float
+        Of sigma_D / D.
+    pattern_known : bool
+        Whether PRNU and DSNU are calibrated and taken out: then all of the bound falls as 1 / n.
+
+    Returns
+    -------
+    int or None
+        None where the pattern alone is the target or more, so that no number of frames reaches it.
 
     Raises
     ------
     DatasetError
         If no sample has a bound, or the target is not above 0.
     """
-    relative = bounds["relative"].drop_nulls().drop_nans().to_numpy()
-    if not len(relative) or not target > 0.0:
-        raise DatasetError(f"{len(relative)} bounds and a target of {target:g}: both must be above 0")
-    return int(np.ceil(np.mean(relative**2) / target**2))
+    names = ("relative_pattern_known",) * 2 if pattern_known else ("relative", "relative_pattern_known")
+    squares = np.stack([bounds[name].cast(pl.Float64).to_numpy() ** 2 for name in names])
+    squares = squares[:, np.isfinite(squares).all(axis=0)]
+    if not squares.size or not target > 0.0:
+        raise DatasetError(f"{squares.shape[1]} bounds and a target of {target:g}: both must be above 0")
+    one, rest = (float(mean) for mean in np.mean(squares, axis=1))
+    left = target**2 - max(one - rest, 0.0)
+    return max(math.ceil(rest / left), 1) if left > 0.0 else None
 
 
-def _pairs(
+def _sources(
     dataset: Dataset, preset: str, samples: Sequence[Sample], laser_level: float, exposure: Exposure
-) -> DatasetPairs:
-    plain = pairs_of(dataset, samples, preset)
-    asked = (replace(t.request, exposure=exposure, laser_level=laser_level) for t in plain.takes)
-    return DatasetPairs(
-        plain.dataset, tuple(replace(t, request=request) for t, request in zip(plain.takes, asked, strict=True))
-    )
+) -> Iterator[tuple[TakenSample, FrameSource]]:
+    """Each sample with what draws its frames."""
+    by_id = {sample.row.sample_id: sample for sample in samples}
+    for take in pairs_of(dataset, samples, preset).takes:
+        sample = TakenSample(by_id[take.sample_id])
+        request = replace(take.request, exposure=exposure, laser_level=laser_level)
+        yield sample, sample.source(replace(take, request=request))
 
 
-def _bound_m(truth: PairTruth) -> float:
-    C1, C2 = (_NO_MATRIX if b is None else b for b in (truth.down.bound_px2, truth.up.bound_px2))
-    down, up = (np.array(spot.uv_px) for spot in (truth.down, truth.up))
-    return float(depth_general(truth.true_rig, truth.stroke_m, down, up, C1, C2).sigma_m)
+def _bound_m(sample: TakenSample, source: FrameSource, pattern_known: bool) -> float:
+    rows = [sample.row.position(position) for position in POSITIONS]
+    C_down, C_up = (_bound_px2(sample, source, position, pattern_known) for position in POSITIONS)
+    down, up = (np.array([row.u_px, row.v_px]) for row in rows)
+    return float(depth_general(sample.rig, sample.row.stroke_m, down, up, C_down, C_up).sigma_m)
+
+
+def _bound_px2(sample: TakenSample, source: FrameSource, position: str, pattern_known: bool) -> Array:
+    """Bound of (u, v), shape (2, 2), pixels squared; NaN where there is none."""
+    row = sample.row.position(position)
+    uv_px, rates = (row.u_px, row.v_px), row.electrons_per_s
+    found = bounds_of_spot(source.sides[position], sample.rig, uv_px, rates, row.visible, pattern_known).bound_px2
+    return _NO_MATRIX if found is None else found

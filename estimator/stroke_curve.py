@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from phibench.estimator.depth_general import depth_general
 from phibench.estimator.line_of_sight import first_blocker
 from phibench.estimator.mirror_image import MirrorImage, image_of
 from phibench.estimator.reflection import reflect
-from phibench.estimator.rig_draws import even_part_m
+from phibench.estimator.rig_draws import beyond_first_order_m
 from phibench.estimator.spot_flux import Laser, spot_electrons_per_s
 from phibench.estimator.spot_sigma import SpotSigma
 from phibench.estimator.status import Status
@@ -32,6 +32,12 @@ CEILING, NO_IMAGE, MIRROR_EDGE, IMAGE_EDGE, OCCLUDED = (
     "image's edge",
     "occluded by",  # and the name of the solid
 )
+TOO_BRIGHT, TOO_FAINT, NO_BOUND = (
+    "the spot is brighter than the bound is known for",
+    "the spot is fainter than the bound is known for",
+    "no finite error of D",
+)
+"""Causes of strokes that nothing stands in the way of, but whose error is not known."""
 
 
 @dataclass(frozen=True)
@@ -84,23 +90,23 @@ class StrokeCurve:
     sigma_spot_m, sigma_calibration_m, sigma_stroke_m
         From the pixels' noise, the rig's parameters and the single stroke, to first order; NaN where the spot has no
         image.
-    sigma_second_order_m
-        What the rig's parameters do beyond: `rig_draws.even_part_m`.
+    sigma_higher_order_m
+        What the rig's parameters do beyond, a mean error (bias) included: `rig_draws.beyond_first_order_m`.
     causes : tuple of str
-        Why a stroke cannot be taken; `FREE` where it can.
+        Why a stroke cannot be taken, or why its error is not known; `FREE` where neither.
     """
 
     strokes_m: Array
     sigma_spot_m: Array = field(repr=False)
     sigma_calibration_m: Array = field(repr=False)
     sigma_stroke_m: Array = field(repr=False)
-    sigma_second_order_m: Array = field(repr=False)
+    sigma_higher_order_m: Array = field(repr=False)
     causes: tuple[str, ...] = field(repr=False)
 
     @property
     def sigma_m(self) -> Array:
         """All parts together: their squares add up."""
-        parts = (self.sigma_spot_m, self.sigma_calibration_m, self.sigma_stroke_m, self.sigma_second_order_m)
+        parts = (self.sigma_spot_m, self.sigma_calibration_m, self.sigma_stroke_m, self.sigma_higher_order_m)
         return np.asarray(np.sqrt(sum(part**2 for part in parts)))
 
     @property
@@ -124,13 +130,15 @@ def stroke_curve(
     """Predicted error of D for strokes, shape (n,); parameters as for `best_stroke.best_stroke`."""
     h, points = np.asarray(strokes_m, float), around.points_m(rig, depth_m)
     images = [_images(rig, points, offset) for offset in (np.zeros(1), h)]
-    C_down, C_up = (_covariance(rig, image, spot, around, laser, exposure_s) for image in images)
+    electrons = [spot_electrons_per_s(rig, laser, image, around.wall_normals()) * exposure_s for image in images]
+    C_down, C_up = (_covariance(image, spot, light) for image, light in zip(images, electrons, strict=True))
     down, up = (image.uv_px for image in images)
     found = depth_general(rig, h[:, None], down, up, C_down, C_up, covariance_rig, np.asarray(stroke_sigma_m))
     parts = (found.sigma_spot_m, found.sigma_calibration_m, found.sigma_stroke_m)
     of_spot, of_rig, of_stroke = (np.sqrt(np.mean(part**2, axis=-1)) for part in parts)
-    even = even_part_m(rig, h, points, C_down, C_up, covariance_rig, stroke_sigma_m)
-    return StrokeCurve(h, of_spot, of_rig, of_stroke, even, causes(rig, points, images[0], images[1], h, around))
+    even = beyond_first_order_m(rig, h, points, C_down, C_up, covariance_rig, stroke_sigma_m)
+    curve = StrokeCurve(h, of_spot, of_rig, of_stroke, even, causes(rig, points, images[0], images[1], h, around))
+    return replace(curve, causes=_with_unknown(curve, spot, electrons[0], electrons[1]))
 
 
 def causes(
@@ -168,10 +176,22 @@ def _images(rig: Rig, points_m: Array, offsets_m: Array) -> MirrorImage:
     return image_of(rig.at(0.0), lowered)
 
 
-def _covariance(
-    rig: Rig, image: MirrorImage, spot: SpotSigma, around: Surroundings, laser: Laser, exposure_s: float
-) -> Array:
-    electrons = spot_electrons_per_s(rig, laser, image, around.wall_normals()) * exposure_s
+def _with_unknown(curve: StrokeCurve, spot: SpotSigma, down_e: Array, up_e: Array) -> tuple[str, ...]:
+    """Causes, and why the error of a stroke that is free is not known; spots' electrons (1, m) and (n, m)."""
+    light_e = np.concatenate([np.broadcast_to(down_e, up_e.shape), up_e], axis=-1)
+    unknown = np.select(
+        [(light_e > spot.flux_e[-1]).any(axis=-1), (light_e < spot.flux_e[0]).any(axis=-1)],
+        [TOO_BRIGHT, TOO_FAINT],
+        NO_BOUND,
+    )
+    known = np.isfinite(curve.sigma_m)
+    return tuple(
+        str(why) if cause == FREE and not fine else cause
+        for cause, fine, why in zip(curve.causes, known, unknown, strict=True)
+    )
+
+
+def _covariance(image: MirrorImage, spot: SpotSigma, electrons: Array) -> Array:
     variance = np.where(image.status == Status.OK, spot.at(electrons) ** 2, np.nan)
     return np.asarray(np.where(np.isfinite(variance), variance, np.nan)[..., None, None] * np.eye(2))
 

@@ -32,8 +32,11 @@ from phibench.estimator.stroke_curve import (
     FREE,
     IMAGE_EDGE,
     MIRROR_EDGE,
+    NO_BOUND,
     NO_IMAGE,
     OCCLUDED,
+    TOO_BRIGHT,
+    TOO_FAINT,
     Surroundings,
     causes,
     stroke_curve,
@@ -203,8 +206,10 @@ def test_minimum_is_that_of_a_brute_force_search_with_a_rig_as_built() -> None:
     best = best_stroke(2.18, covariance_rig=np.diag(prior_sigmas() ** 2), spot=SAME)
     strokes = np.linspace(0.1, 1.4, 131)
     sigma = _curve(2.18, strokes, covariance_rig=np.diag(prior_sigmas() ** 2))
-    assert best.sigma_m <= sigma.min() * (1.0 + 1e-9)
-    assert best.stroke_m == pytest.approx(strokes[np.argmin(sigma)], abs=0.012)
+    # the higher orders are interpolated between 9 strokes: within 2e-4 of all strokes by themselves
+    assert best.sigma_m <= sigma.min() * (1.0 + 5e-4)
+    # the error is flat: 5e-4 of it are 0.02 m of the stroke
+    assert best.stroke_m == pytest.approx(strokes[np.argmin(sigma)], abs=0.03)
     low, high = best.near()
     assert low < best.stroke_m < high
     assert sigma[-1] > 1.2 * best.sigma_m  # the error of a rig as built grows again
@@ -231,9 +236,39 @@ def test_a_rig_as_built_errs_beyond_first_order_as_drawn_rigs_do() -> None:
     assert rms > 2.0 * float(curve.sigma_calibration_m[0])
 
 
-def test_exact_rigs_have_no_second_order() -> None:
+def test_errors_of_a_rig_as_built_grow_with_the_third_order_at_short_strokes_and_shrink_at_long_ones() -> None:
+    """Against drawn rigs, exact pixels, at the distance of the paper's Table 1; the linear part misses on both sides.
+
+    The root of the mean square over 100 pairs of opposite rigs is good to 7 % (from the spread of the squares), the
+    rule's 32 pairs to 2.5 %: 4 x 7.5 % = 30 %, wrong once in 16 000. Squares at two strokes scatter together: the
+    ratio is good to 4 %, 12 % is 3 sigma, and the ratio of linear and even part alone is 16 % off.
+    """
+    random, n, D, strokes = generator("test", "third order"), 100, 2.18, np.array([0.45, 1.4])
+    C, one = np.diag(prior_sigmas() ** 2), replace(OPEN, azimuths_rad=(0.0, 1.6, 3.1, 4.7))
+    exact = SpotSigma((1.0, 1e9), (1e-3, 1e-3))
+    curve = stroke_curve(RIG, D, strokes, exact, C, one, Laser(), 1.0 / 60.0, 0.0)
+    drawn, points = random.standard_normal((n, P)) @ covariance_root(C).T, one.points_m(RIG, D)
+    plus, minus = (np.array([_errors_m(k * values, strokes, points, C) for values in drawn]) for k in (1.0, -1.0))
+    rms = np.sqrt(np.mean(0.5 * (plus**2 + minus**2), axis=(0, 2)))
+    assert rms == pytest.approx(curve.sigma_m, rel=0.3)
+    assert rms[0] / rms[1] == pytest.approx(curve.sigma_m[0] / curve.sigma_m[1], rel=0.12)
+    second = np.sqrt(curve.sigma_calibration_m**2 + np.mean((0.5 * (plus + minus)) ** 2, axis=(0, 2)))
+    assert rms[0] / rms[1] != pytest.approx(second[0] / second[1], rel=0.12)
+
+
+def _errors_m(values: np.ndarray, strokes_m: np.ndarray, points_m: np.ndarray, C: np.ndarray) -> np.ndarray:
+    """Errors of D of a rig that deviates, shape (n, m): view and stroke of its own, the believed rig's answer."""
+    rig = changed(RIG, values)
+    down = image_of(rig.at(0.0), points_m).uv_px
+    up = np.stack([image_of(rig.at(float(stroke_of(h, values))), points_m).uv_px for h in strokes_m])
+    true_m = np.hypot(*(points_m[:, :2] - rig.at(0.0).sphere_centre_m[:2]).T)
+    pixels = 1e-6 * np.eye(2)
+    return depth_general(RIG, strokes_m[:, None], down, up, pixels, pixels, C).depth_m - true_m
+
+
+def test_exact_rigs_have_no_higher_order() -> None:
     curve = stroke_curve(RIG, 1.4, np.array([0.4, 0.8]), SAME, EXACT, OPEN, Laser(), 1.0 / 60.0, 0.0)
-    assert not curve.sigma_second_order_m.any()
+    assert not curve.sigma_higher_order_m.any()
     assert not curve.sigma_calibration_m.any()
 
 
@@ -269,6 +304,25 @@ def test_what_cannot_be_seen_has_no_stroke() -> None:
     small = replace(RIG, camera=replace(RIG.camera, height_px=400, cy_px=199.5))
     cut = best_stroke(2.2, small, spot=SAME)
     assert cut.limits == (IMAGE_EDGE,)
+
+
+def test_strokes_whose_error_is_unknown_have_a_cause() -> None:
+    """At 0.2 m and 1 mW a spot has more electrons than the bound's table; a free stroke has a finite error."""
+    near = best_stroke(0.2)
+    assert math.isnan(near.stroke_m)
+    assert TOO_BRIGHT in near.limits
+    assert all(near.limits)
+    few = best_stroke(2.0, laser=Laser(power_w=1e-9), spot=SpotSigma((1e3, 1e6), (0.5, 0.01)), covariance_rig=EXACT)
+    assert few.limits == (TOO_FAINT,)
+    full = best_stroke(2.0, spot=SpotSigma((1.0, 1e9), (math.inf, math.inf)), covariance_rig=EXACT)
+    assert full.limits == (NO_BOUND,)
+    checked = 0
+    for depth_m in (0.2, 0.4, 0.8, 2.0):
+        curve = best_stroke(depth_m, covariance_rig=EXACT).curve
+        free = np.array([cause == FREE for cause in curve.causes])
+        assert np.isfinite(curve.sigma_m[free]).all()
+        checked += int(free.sum())
+    assert checked > 80
 
 
 def test_causes_are_the_simulators() -> None:

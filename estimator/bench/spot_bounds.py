@@ -34,7 +34,12 @@ class SpotBounds:
 
 
 def spot_bounds(
-    side: Side, rig: Rig, uv_px: tuple[float, float], rates_per_s: tuple[float, ...], visible: bool
+    side: Side,
+    rig: Rig,
+    uv_px: tuple[float, float],
+    rates_per_s: tuple[float, ...],
+    visible: bool,
+    pattern_known: bool = False,
 ) -> SpotBounds:
     """Bounds of a spot in the image of a sensor and in the raw pixels behind it.
 
@@ -48,15 +53,17 @@ def spot_bounds(
         Electrons per second of the whole spot behind R, G, B at laser level 1.
     visible : bool
         Whether the spot is seen; there are no bounds of one that is not.
+    pattern_known : bool
+        Whether the camera's PRNU and DSNU are calibrated; otherwise the bounds count them as noise.
     """
     sensor = side.chain.sensor
     raw = sensor.replace(output="raw")
     card = card_of(raw)
     region = expected_of_light(side.light, raw, rig.camera) if visible else None
-    raw_limit = None if region is None else spot_limit(region, card)
+    raw_limit = None if region is None else spot_limit(region, card, pattern_known=pattern_known)
     limit, electrons, unit = raw_limit, spot_electrons(rates_per_s, side), 1.0
     if region is not None and sensor.output in PROCESSED:
-        limit, unit = _processed_limit(region, card_of(sensor), rig, uv_px, electrons), electrons
+        limit, unit = _processed_limit(region, card_of(sensor), rig, uv_px, electrons, pattern_known), electrons
     peak_e = 0.0 if region is None else _peak_e(region)
     return SpotBounds(
         electrons=electrons,
@@ -76,7 +83,12 @@ def spot_electrons(rates_per_s: tuple[float, ...] | Array, side: Side) -> float:
 
 
 def _processed_limit(
-    region: ExpectedRegion, card: SensorCard, rig: Rig, uv_px: tuple[float, float], electrons: float
+    region: ExpectedRegion,
+    card: SensorCard,
+    rig: Rig,
+    uv_px: tuple[float, float],
+    electrons: float,
+    pattern_known: bool,
 ) -> SpotLimit:
     """Limit of the 8-bit or JPEG image: the room as one level per filter, its mean under the spot; a Gaussian spot."""
     blur = spot_blur(rig, uv_px)
@@ -86,7 +98,7 @@ def _processed_limit(
         for c in range(3)
     ]
     r, g, b = rig.camera.detector.laser_filter_response
-    return chain_limit(card, uv_px, blur.sigma_px, electrons, levels, (r, g, b), blur.ratio)
+    return chain_limit(card, uv_px, blur.sigma_px, electrons, levels, (r, g, b), blur.ratio, pattern_known)
 
 
 def _bound(limit: SpotLimit | None) -> Array | None:

@@ -160,7 +160,7 @@ def planned(settings: StrokeSettings, rig: Rig, rigs: Mapping[str, Array]) -> li
 
 def best_frame(found: Mapping[tuple[str, float], BestStroke]) -> pl.DataFrame:
     """A row per tolerance and distance."""
-    keys = ("depth_m", "stroke_m", "sigma_m", "sigma_spot_m", "sigma_calibration_m", "sigma_second_order_m")
+    keys = ("depth_m", "stroke_m", "sigma_m", "sigma_spot_m", "sigma_calibration_m", "sigma_higher_order_m")
     rows = [
         {
             "tolerance": name,
@@ -192,7 +192,7 @@ def check_frame(checks: Sequence[Checked]) -> pl.DataFrame:
 
 def _curve(name: str, best: BestStroke) -> pl.DataFrame:
     c = best.curve
-    names = ("sigma_m", "sigma_spot_m", "sigma_calibration_m", "sigma_second_order_m")
+    names = ("sigma_m", "sigma_spot_m", "sigma_calibration_m", "sigma_higher_order_m")
     columns = {name: getattr(c, name) for name in names}
     return pl.DataFrame({"stroke_m": c.strokes_m, **columns, "cause": c.causes}).with_columns(
         tolerance=pl.lit(name), depth_m=pl.lit(best.depth_m)

@@ -102,7 +102,7 @@ def _best(best: BestStroke) -> str:
     low, high = best.near()
     text = f"D = {best.depth_m:g} m best h {best.stroke_m:.2f} m, sigma {1e3 * best.sigma_m:.3g} mm"
     text += f" ({100 * best.sigma_m / best.depth_m:.2g} %; within 5 % from {low:.2f} to {high:.2f} m"
-    if best.sigma_second_order_m > best.sigma_calibration_m:
+    if best.sigma_higher_order_m > best.sigma_calibration_m:
         text += ", most of it beyond first order"
     return text + (f"; limit: {', '.join(best.limits)})" if best.limits else ")")
 
