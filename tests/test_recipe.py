@@ -41,7 +41,12 @@ def experiment(**values: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("path", sorted(RECIPES.glob("*.toml")), ids=lambda path: path.stem)
 def test_shipped_recipes_are_sound_and_give_no_warning(path: Any) -> None:
-    assert warnings(load_recipe(path)) == []
+    found = warnings(load_recipe(path))
+    if path.stem == "study-isotropy-tilted":  # boards without spots: the room, and so its light map, is that of the others
+        assert len(found) == 1
+        assert "stand in the room" in found[0]
+    else:
+        assert found == []
 
 
 def test_a_shipped_recipe_is_found_by_its_name() -> None:

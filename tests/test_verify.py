@@ -80,7 +80,8 @@ def test_a_damaged_file_is_named(copy: Path, name: str, damage: Callable[[Path],
     report = check(copy)
     assert not report.ok
     assert [fault for fault in report.faults if name in fault]
-    assert not [fault for fault in report.faults if name not in fault and layout.MANIFEST not in fault]
+    if name != layout.RIGS or damage is not flip_a_bit:  # another digit there is another rig: its spots do not fit it
+        assert not [fault for fault in report.faults if name not in fault and layout.MANIFEST not in fault]
 
 
 def swap(folder: Path, a: str, b: str) -> None:
