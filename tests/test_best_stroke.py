@@ -248,7 +248,7 @@ def test_errors_of_a_rig_as_built_grow_with_the_third_order_at_short_strokes_and
     exact = SpotSigma((1.0, 1e9), (1e-3, 1e-3))
     curve = stroke_curve(RIG, D, strokes, exact, C, one, Laser(), 1.0 / 60.0, 0.0)
     drawn, points = random.standard_normal((n, P)) @ covariance_root(C).T, one.points_m(RIG, D)
-    plus, minus = (np.array([_errors_m(k * values, strokes, points, C) for values in drawn]) for k in (1.0, -1.0))
+    plus, minus = (_errors_m(k * drawn, strokes, points, C) for k in (1.0, -1.0))
     rms = np.sqrt(np.mean(0.5 * (plus**2 + minus**2), axis=(0, 2)))
     assert rms == pytest.approx(curve.sigma_m, rel=0.3)
     assert rms[0] / rms[1] == pytest.approx(curve.sigma_m[0] / curve.sigma_m[1], rel=0.12)
@@ -256,14 +256,17 @@ def test_errors_of_a_rig_as_built_grow_with_the_third_order_at_short_strokes_and
     assert rms[0] / rms[1] != pytest.approx(second[0] / second[1], rel=0.12)
 
 
-def _errors_m(values: np.ndarray, strokes_m: np.ndarray, points_m: np.ndarray, C: np.ndarray) -> np.ndarray:
-    """Errors of D of a rig that deviates, shape (n, m): view and stroke of its own, the believed rig's answer."""
-    rig = changed(RIG, values)
-    down = image_of(rig.at(0.0), points_m).uv_px
-    up = np.stack([image_of(rig.at(float(stroke_of(h, values))), points_m).uv_px for h in strokes_m])
-    true_m = np.hypot(*(points_m[:, :2] - rig.at(0.0).sphere_centre_m[:2]).T)
+def _errors_m(drawn: np.ndarray, strokes_m: np.ndarray, points_m: np.ndarray, C: np.ndarray) -> np.ndarray:
+    """Errors of D of rigs that deviate, shape (k, n, m): views and strokes of their own, the believed rig's answer."""
+    down, up, true_m = [], [], []
+    for values in drawn:
+        rig = changed(RIG, values)
+        down.append(image_of(rig.at(0.0), points_m).uv_px[None])
+        up.append([image_of(rig.at(float(stroke_of(h, values))), points_m).uv_px for h in strokes_m])
+        true_m.append(np.hypot(*(points_m[:, :2] - rig.at(0.0).sphere_centre_m[:2]).T)[None])
     pixels = 1e-6 * np.eye(2)
-    return depth_general(RIG, strokes_m[:, None], down, up, pixels, pixels, C).depth_m - true_m
+    found = depth_general(RIG, strokes_m[:, None], np.array(down), np.array(up), pixels, pixels, C).depth_m
+    return found - np.array(true_m)
 
 
 def test_exact_rigs_have_no_higher_order() -> None:
