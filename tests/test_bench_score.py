@@ -276,7 +276,7 @@ def test_a_method_is_named_by_the_end_of_its_reference():
 
 def test_a_report_of_no_files_is_refused(tmp_path, capsys):
     assert cli.main(["report", "--out", str(tmp_path / "page.html")]) == 2
-    assert "no scores" in capsys.readouterr().err
+    assert "a report of nothing" in capsys.readouterr().err
 
 
 def test_the_document_is_strict(mine):
