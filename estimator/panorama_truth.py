@@ -2,7 +2,8 @@
 
 The truth has, for every pixel, the outward normal and the world point that it sees. The ray leaves at
 P = S + R n and goes to X, so that its direction is (X - P) / |X - P|. Of every grid point the pixel with the nearest
-direction is looked up; the step to the place between pixels comes from differences over its 3 x 3 neighbours.
+direction is looked up; the step to the place between pixels comes from differences over its 3 x 3 neighbours. A mirror
+with an error of form is taken for its sphere here: at a peak of 50 um P is off by as much, and the place by 0.014 px.
 """
 
 from __future__ import annotations

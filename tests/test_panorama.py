@@ -76,7 +76,8 @@ def test_truth_of_a_misaligned_rig_differs_from_the_nominal_model(misaligned_dat
     true = pixels_by_model(sample.view("down"), GRID)
     both = np.isfinite(by_model + by_truth + true).all(axis=-1)
     assert both.mean() > 0.9
-    assert np.max(np.abs(true - by_truth)[both]) < 1e-3
+    # the truth's search takes P on the sphere: 50 um of form over 1 m or more are 5e-5 rad, a pixel is 3 mrad or more
+    assert np.max(np.abs(true - by_truth)[both]) < 5e-5 / 3e-3 + 1e-3
     assert np.max(np.abs(by_model - by_truth)[both]) > 1.0
 
 
