@@ -42,9 +42,7 @@ def experiment(**values: Any) -> dict[str, Any]:
 @pytest.mark.parametrize("path", sorted(RECIPES.glob("*.toml")), ids=lambda path: path.stem)
 def test_shipped_recipes_are_sound_and_give_no_warning(path: Any) -> None:
     found = warnings(load_recipe(path))
-    if (
-        path.stem == "study-isotropy-tilted"
-    ):  # boards without spots: its light map is that of the others
+    if path.stem == "study-isotropy-tilted":  # boards without spots: its light map is that of the others
         assert len(found) == 1
         assert "stand in the room" in found[0]
     else:
