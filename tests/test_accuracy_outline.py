@@ -40,7 +40,7 @@ def test_accuracy_of_the_sigma_of_mjpeg_outlines_short() -> None:
 @pytest.mark.study
 @pytest.mark.slow
 def test_accuracy_of_the_sigma_of_mjpeg_outlines() -> None:
-    check(list(cases(range(2000, 2200), ("mjpeg", {}))), 200)
+    check(list(cases(range(3000, 3200), ("mjpeg", {}))), 200)
 
 
 @pytest.mark.study

@@ -13,7 +13,8 @@ from PIL import Image
 
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.bench.document import MethodCard
-from phibench.estimator.bench.figures import Picture, pull_histogram
+from phibench.estimator.bench.figures import pull_histogram
+from phibench.estimator.bench.picture import Picture
 from phibench.estimator.bench.report import Section, report_html, write_report
 from phibench.estimator.bench.rules import Rules
 from phibench.estimator.bench.score_method import score_outcomes

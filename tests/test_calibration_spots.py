@@ -13,8 +13,10 @@ from scipy import stats
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import Dataset, open_finished
 from phibench.estimator.bench.dataset_pairs import pairs_of
+from phibench.estimator.calibration.apparent import vertical_by_principal_point
 from phibench.estimator.calibration.dataset import calibrate_dataset, frame_spots
-from phibench.estimator.calibration.parameters import prior_sigmas
+from phibench.estimator.calibration.file import read_calibration
+from phibench.estimator.calibration.parameters import PARAMETERS, prior_sigmas
 from phibench.estimator.calibration.spots import Ruler, known_spot, method_for, one_per_pose
 from phibench.estimator.cli import main
 from phibench.estimator.experiments import Procedure, run_experiments
@@ -161,3 +163,35 @@ def test_the_command_refuses_in_one_sentence(tiny: Dataset, tmp_path: Path, caps
         assert said.count("\n") == 1, said
         assert word in said or "mirror" in said
     assert not (tmp_path / "c.json").exists()
+
+
+def test_upright_edges_give_the_tilt(smoke: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The believed rig is the true one: all stays within 5 sigmas. What is measured is the tilt with the principal point.
+
+    A principal point 5 px off turns the edges' vertical by 2.9e-3 rad, so that the tilt alone is not known better
+    than that, and together with 5.8e-4 rad/px of the principal point it is known to some 4e-4 rad an image.
+    """
+    plain, upright = tmp_path / "plain.json", tmp_path / "upright.json"
+    without = calibrate_dataset(smoke.folder, plain)
+    assert main(["calibrate", str(smoke.folder), "--vertical", "--out", str(upright)]) == 0
+    assert "tilt_x_rad" in capsys.readouterr().out
+    rig = smoke.samples[0].nominal_rig
+    found = read_calibration(upright, rig)
+    sigma, slope = np.sqrt(np.diag(found.covariance)), vertical_by_principal_point(rig)[0, 0]
+    assert slope == pytest.approx(5.8e-4, rel=0.02)
+    assert np.all(np.abs(found.values) < 5.0 * sigma + 1e-12)
+    for tilt, centre in (("tilt_x_rad", "cy_px"), ("tilt_y_rad", "cx_px")):
+        k, c = PARAMETERS.index(tilt), PARAMETERS.index(centre)
+        assert without.sigmas[tilt] > 4e-3
+        assert 2e-3 < sigma[k] < 3e-3
+        both = [found.covariance[k, k] + 2.0 * x * found.covariance[k, c] + x**2 * found.covariance[c, c]
+                for x in (slope, -slope)]  # fmt: skip
+        assert np.sqrt(min(both)) < 1.2e-3
+    made = [json.loads(path.read_text())["made_from"]["vertical_in_camera"] for path in (plain, upright)]
+    assert made[0] is None
+    assert len(made[1]) == 2
+
+
+def test_errors_of_places_are_about_spots(smoke: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["calibrate", str(smoke.folder), "--height-sigma-m", "0.01", "--out", str(tmp_path / "c.json")]) == 2
+    assert "give --spots too" in capsys.readouterr().err

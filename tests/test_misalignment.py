@@ -22,7 +22,7 @@ from phibench.datasets.errors import RecipeError
 from phibench.datasets.layers import read_ambient, read_truth
 from phibench.datasets.plan import make_plan
 from phibench.datasets.read import open_finished
-from phibench.datasets.recipe_file import check_recipe, parse_recipe
+from phibench.datasets.recipe_file import check_recipe
 from phibench.datasets.shard import shard_plan
 from phibench.datasets.verify import verify
 from phibench.estimator.score import score
@@ -393,9 +393,3 @@ def test_the_page_has_the_tables_of_the_code() -> None:
     for text in (module.parameter_table(), module.budget_table(), module.estimator_table()):
         assert text.count("\n") > 10
         assert text in page
-
-
-def test_a_mirror_outside_of_the_image_is_a_fault_of_the_recipe() -> None:
-    text = (Path(__file__).with_name("tiny.toml")).read_text(encoding="utf-8")
-    with pytest.raises(RecipeError, match="the mirror is outside of the image"):
-        parse_recipe(text.replace("[[targets]]", "[misalignment]\ncx_px = 1500.0\n\n[[targets]]", 1))

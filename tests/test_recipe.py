@@ -217,3 +217,8 @@ def test_camera_above_the_ceiling_is_blamed_on_the_camera() -> None:
 def test_distortion_that_folds_is_refused_with_its_coefficients() -> None:
     with pytest.raises(RecipeError, match=r"k1 = -0.12, k2 = 0.03, k3 = -3.4.*folds"):
         check_recipe(changed(rig={"preset": "c310", "k1": -0.12, "k2": 0.03}))
+
+
+@pytest.mark.parametrize("table", [{"misalignment": {"cx_px": 1500.0}}, {"rig": {"cx_px": 3000.0}}], ids=str)
+def test_a_mirror_outside_of_the_image_is_a_fault(table: dict[str, Any]) -> None:
+    assert any("the mirror is outside of the image" in line for line in complaints(changed(**table)))

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import matplotlib as mpl
@@ -19,33 +16,15 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from scipy.stats import norm
 
 from phibench.estimator.bench.document import ScoreDocument, StratumScore, Value
+from phibench.estimator.bench.picture import COLOURS, STYLE, Picture, encoded, line_style, picture
 from phibench.scenes.frames import Array
 
-# M. Okabe, K. Ito: told apart with every kind of colour vision; markers, lines and hatches repeat the distinction
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f7f7f")
-_MARKERS = "osD^vP*X<>"
-_LINES = ("-", "--", "-.", ":")
 _HATCHES = ("", "///", "...", "xx", "\\\\\\", "++", "oo", "--", "**", "||", "//", "O.", "xx..", "+++")
-_STYLE: Any = {
-    "svg.hashsalt": "phibench",
-    "font.size": 9.0,
-    "axes.grid": True,
-    "grid.alpha": 0.35,
-    "hatch.linewidth": 0.6,
-}
 _BINS = 12
 _LEAST_IN_BIN = 3
 
 Named = Mapping[str, ScoreDocument]
 Tables = Mapping[str, pl.DataFrame]
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A figure as a data address, with its alternative in words."""
-
-    source: str
-    alt: str
 
 
 def error_curves(scores: Named) -> Picture:
@@ -55,7 +34,7 @@ def error_curves(scores: Named) -> Picture:
         ("rms_depth_relative", "bound_depth_relative", 100.0, "rms error of D / %"),
     )
     by = (("depth", "D / m"), ("stroke", "h / m"), ("signal", "signal / electrons"))
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(10.5, 6.4), layout="constrained")
         grid = figure.subplots(len(rows), len(by), squeeze=False)
         for line, (metric, bound, factor, label) in zip(grid, rows, strict=True):
@@ -70,7 +49,7 @@ def error_curves(scores: Named) -> Picture:
 
 def error_map(tables: Tables) -> Picture:
     """Where in the image errors happen: every image at its true position, its mark as large as its error."""
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         columns = min(len(tables), 3)
         lines = math.ceil(len(tables) / columns)
         figure = Figure(figsize=(3.6 * columns + 1.0, 2.6 * lines + 0.4), layout="constrained", dpi=130)
@@ -90,13 +69,13 @@ def error_map(tables: Tables) -> Picture:
 
 def error_by_radius(tables: Tables) -> Picture:
     """Radial and tangential rms error against the distance from the image of the sphere centre."""
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9.0, 3.3), layout="constrained")
         pair = figure.subplots(1, 2, sharey=True)
         for axes, column, label in zip(pair, ("radial_px", "tangential_px"), ("radial", "tangential"), strict=True):
             for i, (name, table) in enumerate(tables.items()):
                 radius, rms = _binned(table, column)
-                axes.plot(radius, rms, label=name, **_line(i))
+                axes.plot(radius, rms, label=name, **line_style(i))
             axes.set(xlabel="distance from the image of the sphere centre / px", yscale="log")
             axes.set_ylabel(f"rms {label} error / px")
             _plain_ticks(axes)
@@ -111,7 +90,7 @@ def error_by_radius(tables: Tables) -> Picture:
 def cause_bars(scores: Named) -> Picture:
     """Images without a right position by cause, one bar per method."""
     causes = [c for c in next(iter(scores.values())).causes if any(sum(s.causes[c].values()) for s in scores.values())]
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(
             figsize=(9.0, 0.9 + 0.45 * len(scores) + 0.25 * math.ceil(len(causes) / 4)), layout="constrained"
         )
@@ -119,7 +98,7 @@ def cause_bars(scores: Named) -> Picture:
         start = np.zeros(len(scores))
         for i, cause in enumerate(causes):
             share = np.array([100.0 * sum(s.causes[cause].values()) / s.images for s in scores.values()])
-            style: Any = {"color": _COLOURS[i % len(_COLOURS)], "hatch": _HATCHES[i % len(_HATCHES)]}
+            style: Any = {"color": COLOURS[i % len(COLOURS)], "hatch": _HATCHES[i % len(_HATCHES)]}
             axes.barh(list(scores), share, left=start, label=cause, edgecolor="black", linewidth=0.5, **style)
             start += share
         axes.invert_yaxis()
@@ -137,12 +116,12 @@ def pull_histogram(tables: Tables) -> Picture | None:
     if not pulls:
         return None
     edges = np.linspace(-5.0, 5.0, 41)
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.0, 3.4), layout="constrained")
         axes = figure.subplots()
         for i, (name, values) in enumerate(pulls.items()):
             density = np.histogram(np.clip(values, -5.0, 5.0), edges, density=True)[0]
-            style = {key: value for key, value in _line(i).items() if key != "marker"}
+            style = {key: value for key, value in line_style(i).items() if key != "marker"}
             axes.stairs(density, edges, label=f"{name} (n = {values.size})", **style)
         x = np.linspace(-5.0, 5.0, 201)
         axes.plot(x, norm.pdf(x), color="black", linewidth=2.0, alpha=0.6, label="normal, deviation 1")
@@ -164,7 +143,7 @@ def _curves(axes: Axes, scores: Named, by: str, metric: str, factor: float) -> N
         if not shown:
             continue
         x, y = [x for x, _ in shown], [factor * (value.value or math.nan) for _, value in shown]
-        axes.errorbar(x, y, yerr=_bars([value for _, value in shown], factor), label=name, capsize=3, **_line(i))
+        axes.errorbar(x, y, yerr=_bars([value for _, value in shown], factor), label=name, capsize=3, **line_style(i))
 
 
 def _bars(values: Sequence[Value], factor: float) -> Array:
@@ -229,14 +208,6 @@ def _pulls(table: pl.DataFrame) -> Array:
     return np.concatenate([both["pull_u"].to_numpy(), both["pull_v"].to_numpy()])
 
 
-def _line(i: int) -> dict[str, Any]:
-    return {
-        "color": _COLOURS[i % len(_COLOURS)],
-        "linestyle": _LINES[i % len(_LINES)],
-        "marker": _MARKERS[i % len(_MARKERS)],
-    }
-
-
 def _plain_ticks(axes: Axes) -> None:
     """Decimal numbers at 1, 2, 5 of a logarithmic axis, instead of powers that run into each other."""
     for axis in (axes.xaxis, axes.yaxis):
@@ -271,14 +242,8 @@ def _shares(score: ScoreDocument) -> str:
 
 
 def _svg(figure: Figure, alt: str) -> Picture:
-    return Picture(_address(figure, "svg", "image/svg+xml", {"Date": None}), alt)
+    return picture(encoded(figure, "svg"), "svg", alt)
 
 
 def _png(figure: Figure, alt: str) -> Picture:
-    return Picture(_address(figure, "png", "image/png", {"Software": None}), alt)
-
-
-def _address(figure: Figure, kind: str, mime: str, metadata: dict[str, Any]) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=kind, metadata=metadata)
-    return f"data:{mime};base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
+    return picture(encoded(figure, "png"), "png", alt)

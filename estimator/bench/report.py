@@ -15,7 +15,7 @@ from phibench.datasets.files import write_text
 from phibench.estimator.bench import figures
 from phibench.estimator.bench.compare import same_pairs
 from phibench.estimator.bench.document import ScoreDocument, read_records, read_score
-from phibench.estimator.bench.figures import Picture
+from phibench.estimator.bench.picture import Picture
 from phibench.estimator.bench.tables import BOARD, cell_parts, rank_key
 
 _TEMPLATE = "report.html.j2"
