@@ -166,7 +166,7 @@ def test_the_command_refuses_in_one_sentence(tiny: Dataset, tmp_path: Path, caps
 
 
 def test_upright_edges_give_the_tilt(smoke: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The believed rig is the true one: all stays within 5 sigmas. What is measured is the tilt with the principal point.
+    """The believed rig is the true one: all stays within 5 sigmas. Measured is the tilt with the principal point.
 
     A principal point 5 px off turns the edges' vertical by 2.9e-3 rad, so that the tilt alone is not known better
     than that, and together with 5.8e-4 rad/px of the principal point it is known to some 4e-4 rad an image.
