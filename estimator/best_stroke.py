@@ -183,9 +183,8 @@ def spot_bound(rig: Rig, card: SensorCard, room_e_per_s: tuple[float, float, flo
     blur = spot_blur(rig, 0.4 * centre + 0.6 * rim)
     r, g, b = rig.camera.detector.laser_filter_response
     room = [rate * card.exposure_s for rate in room_e_per_s]
-    places = 16 if card.output == "raw" else 8
     fluxes = np.geomspace(100.0, 1e6, 25 if card.output == "raw" else 9)
-    return spot_sigma(card, blur.round_px, room, (r, g, b), places, tuple(fluxes.tolist()))
+    return spot_sigma(card, blur.round_px, room, (r, g, b), flux_e=tuple(fluxes.tolist()))
 
 
 def without_limits(around: Surroundings) -> Surroundings:
