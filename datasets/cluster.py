@@ -17,6 +17,7 @@ from typing import Any
 
 from phibench.datasets.dispatch import Outcome
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.one_thread import ONE_THREAD
 from phibench.datasets.provenance import code_sha256
 from phibench.datasets.task import Done, Failed, Task, perform
 
@@ -27,7 +28,6 @@ _POLL_S = 0.005
 _CENSUS_S = 2.0
 # dask lets glibc return memory at once; a view's arrays of 45 MB would then fault every page anew, 1 s a view
 _MEMORY = {"MALLOC_TRIM_THRESHOLD_": 2**31, "MALLOC_MMAP_THRESHOLD_": 2**30, "MALLOC_TOP_PAD_": 2**26}
-_ONE_THREAD = {"OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1, "OPENBLAS_NUM_THREADS": 1}
 _MISSING = "dask.distributed is not installed: run `pip install 'phibench[cluster]'`"
 
 
@@ -105,7 +105,7 @@ def local_workers(count: int, out: Path) -> Iterator[Workers]:
         "distributed.worker.memory.terminate": False,
         "distributed.comm.timeouts.connect": "60s",
         "distributed.worker.profile.enabled": False,
-        "distributed.nanny.pre-spawn-environ": {**_MEMORY, **_ONE_THREAD},
+        "distributed.nanny.pre-spawn-environ": {**_MEMORY, **ONE_THREAD},
     }
     with tempfile.TemporaryDirectory(prefix="phibench-") as folder, dask.config.set(settings), deaths.listening():
         cluster = distributed.LocalCluster(

@@ -29,7 +29,7 @@ from phibench.datasets.rigs import Rigs, read_rigs
 from phibench.datasets.schema import DatasetInfo, ManifestRow, SpotRow
 from phibench.datasets.sensitivity_file import read_sensitivities
 from phibench.datasets.sums import check_documents
-from phibench.scenes.laser import LaserSpot
+from phibench.scenes.laser import Beam, LaserSpot
 from phibench.scenes.names import nearest
 from phibench.scenes.rig import POSITIONS, Rig, View
 from phibench.scenes.room import Room
@@ -91,6 +91,14 @@ class Dataset:
             If the folder has none, or one of another state of the data set.
         """
         return read_sensitivities(self.folder)
+
+    @property
+    def beam(self) -> Beam:
+        """What the recipe says of the laser's spots; single targets may differ."""
+        laser = self.info.recipe["laser"]
+        if laser["diameter_m"] is not None:
+            return Beam(laser["diameter_m"], 0.0)
+        return Beam(laser["diameter_base_m"], laser["diameter_growth_m_per_m"])
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -6,12 +6,14 @@ Every command imports what it needs itself, so that ``--help`` is quick and scor
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Sequence
 
 from cyclopts import App, CycloptsError
 
+from phibench.datasets.one_thread import ONE_THREAD
 from phibench.estimator import cli_methods
 from phibench.estimator.cli_bench import bench
 from phibench.estimator.cli_calibration import align, calibrate
@@ -56,6 +58,8 @@ def doctor() -> int:
 
 def main(tokens: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
+    for name, value in ONE_THREAD.items():  # of the processes that a command starts, too; who sets one has his way
+        os.environ.setdefault(name, value)
     try:
         return int(app(tokens, exit_on_error=False) or 0)
     except CycloptsError:

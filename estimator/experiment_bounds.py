@@ -22,6 +22,7 @@ from phibench.estimator.bench.dataset_pairs import pairs_of
 from phibench.estimator.bench.spot_bounds import spot_bounds as bounds_of_spot
 from phibench.estimator.depth_general import depth_general
 from phibench.scenes.frames import Array
+from phibench.scenes.laser import Beam
 from phibench.scenes.rig import POSITIONS
 
 _NO_MATRIX = np.full((2, 2), np.nan)
@@ -133,5 +134,6 @@ def _bound_px2(sample: TakenSample, source: FrameSource, position: str, pattern_
     """Bound of (u, v), shape (2, 2), pixels squared; NaN where there is none."""
     row = sample.row.position(position)
     uv_px, rates = (row.u_px, row.v_px), row.electrons_per_s
-    found = bounds_of_spot(source.sides[position], sample.rig, uv_px, rates, row.visible, pattern_known).bound_px2
+    side, beam, depth_m = source.sides[position], Beam(sample.row.spot_diameter_m, 0.0), sample.row.depth_m
+    found = bounds_of_spot(side, sample.rig, uv_px, rates, row.visible, pattern_known, depth_m, beam).bound_px2
     return _NO_MATRIX if found is None else found

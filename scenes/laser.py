@@ -80,6 +80,28 @@ class LaserSpot:
         return a, np.cross(n, a)
 
 
+@dataclass(frozen=True)
+class Beam:
+    """What a data sheet says of a laser's beam: the diameter of the spot, D4sigma, grows with the distance.
+
+    Parameters
+    ----------
+    diameter_base_m : float
+    diameter_growth_m_per_m : float
+    """
+
+    diameter_base_m: float = 3e-3
+    diameter_growth_m_per_m: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for name in ("diameter_base_m", "diameter_growth_m_per_m"):
+            within("Beam", name, getattr(self, name), 0.0, 1.0)
+
+    def diameter_m(self, distance_m: float) -> float:
+        """Diameter of the spot after `distance_m`."""
+        return self.diameter_base_m + self.diameter_growth_m_per_m * distance_m
+
+
 def beam_diameter_m(distance_m: float) -> float:
     """Diameter of the default laser's spot after `distance_m`: 3 mm + 1 mm per metre."""
-    return 3e-3 + 1e-3 * distance_m
+    return Beam().diameter_m(distance_m)

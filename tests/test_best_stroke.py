@@ -142,7 +142,9 @@ def test_places_stand_for_the_whole_bayer_cell() -> None:
     card, levels = sensor_card("bayer-raw"), (900.0, 800.0, 400.0)
     found = spot_sigma(card, 0.73, levels, flux_e=(1e4,)).sigma_px[0]
     middles = 1600.0 + (np.arange(8) + 0.5) / 4.0
-    cell = [_variance_px2(card, np.array([u, v]), 0.73, 1e4, levels, (1.0, 0.10, 0.03)) for u in middles for v in middles]
+    cell = [
+        _variance_px2(card, np.array([u, v]), 0.73, 1e4, levels, (1.0, 0.10, 0.03)) for u in middles for v in middles
+    ]
     assert found == pytest.approx(math.sqrt(np.mean(cell)), rel=0.02)  # 16 places: 1 % found
 
 

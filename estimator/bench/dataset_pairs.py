@@ -24,6 +24,7 @@ from phibench.datasets.takes import Take, takes
 from phibench.estimator.bench.spot_bounds import spot_bounds, spot_electrons
 from phibench.estimator.bench.truth import Distraction, PairTruth, SpotTruth
 from phibench.estimator.seat.pair import Box, Image, Pair
+from phibench.scenes.laser import Beam
 
 TASK_VERSION = 1
 """Version of the task: what a method is given, what it must answer and what is counted. A change of any raises it."""
@@ -67,10 +68,17 @@ class DatasetPairs:
         take, sample, source = self._drawn_from(number)
         frames = source.frames(take.exposure_number, laser_off=take.laser_off)
         images = {name: _sealed(frame.image) for name, frame in frames.by_name.items()}
-        boxes = (None, None) if take.boxes is None else tuple(map(_box, take.boxes))
-        card, (box_down, box_up) = card_of(source.sides["down"].chain.sensor), boxes
-        rig, stroke_m = sample.nominal_rig, sample.row.nominal_stroke_m
-        pair = Pair(number, **images, rig=rig, stroke_m=stroke_m, card=card, box_down=box_down, box_up=box_up)
+        box_down, box_up = (None, None) if take.boxes is None else tuple(map(_box, take.boxes))
+        pair = Pair(
+            number,
+            **images,
+            rig=sample.nominal_rig,
+            stroke_m=sample.row.nominal_stroke_m,
+            card=card_of(source.sides["down"].chain.sensor),
+            box_down=box_down,
+            box_up=box_up,
+            beam=self._dataset.beam,
+        )
         return pair, frames
 
     def truth(self, number: int) -> PairTruth:
@@ -200,7 +208,8 @@ def _box(region: Any) -> Box:
 def _spot_truth(sample: TakenSample, source: FrameSource, position: str) -> SpotTruth:
     row, side = sample.row.position(position), source.sides[position]
     uv_px = (row.u_px, row.v_px)
-    bounds = spot_bounds(side, sample.rig, uv_px, row.electrons_per_s, row.visible)
+    beam, depth_m = Beam(sample.row.spot_diameter_m, 0.0), sample.row.depth_m
+    bounds = spot_bounds(side, sample.rig, uv_px, row.electrons_per_s, row.visible, beam=beam, depth_m=depth_m)
     return SpotTruth(
         uv_px=uv_px,
         phi_rad={"ray": row.phi_ray_rad, "normal": row.phi_normal_rad, "incidence": row.phi_incidence_rad},

@@ -27,6 +27,7 @@ from phibench.estimator.bench.seal_layout import (
 )
 from phibench.estimator.bench.truth import PairTruth
 from phibench.estimator.seat.pair import Box, Image, Pair
+from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
 
 
@@ -76,6 +77,7 @@ class SealedPairs:
             up_off=images.get("up_off"),
             box_down=_box(row.box_down),
             box_up=_box(row.box_up),
+            beam=None if row.beam is None else Beam(**row.beam),
         )
 
     def truth(self, number: int) -> PairTruth:

@@ -13,8 +13,9 @@ from phibench.estimator.chain_limit import chain_limit
 from phibench.estimator.fisher import covariance_bound
 from phibench.estimator.limits import SpotLimit, spot_limit
 from phibench.estimator.methods.linear import PROCESSED
-from phibench.estimator.spot_blur import spot_blur
+from phibench.estimator.spot_blur import SpotBlur, spot_blur
 from phibench.scenes.frames import Array
+from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
 
 _OF_THE_SPOT = 0.01  # of its brightest pixel: dimmer pixels are not the spot's
@@ -40,6 +41,8 @@ def spot_bounds(
     rates_per_s: tuple[float, ...],
     visible: bool,
     pattern_known: bool = False,
+    depth_m: float | None = None,
+    beam: Beam | None = None,
 ) -> SpotBounds:
     """Bounds of a spot in the image of a sensor and in the raw pixels behind it.
 
@@ -55,6 +58,8 @@ def spot_bounds(
         Whether the spot is seen; there are no bounds of one that is not.
     pattern_known : bool
         Whether the camera's PRNU and DSNU are calibrated; otherwise the bounds count them as noise.
+    depth_m, beam
+        As for `spot_blur`: the spot's own size. Raw pixels' bound does not need it, it takes the light as it is.
     """
     sensor = side.chain.sensor
     raw = sensor.replace(output="raw")
@@ -63,7 +68,8 @@ def spot_bounds(
     raw_limit = None if region is None else spot_limit(region, card, pattern_known=pattern_known)
     limit, electrons, unit = raw_limit, spot_electrons(rates_per_s, side), 1.0
     if region is not None and sensor.output in PROCESSED:
-        limit, unit = _processed_limit(region, card_of(sensor), rig, uv_px, electrons, pattern_known), electrons
+        blur = spot_blur(rig, uv_px, depth_m, beam)
+        limit, unit = _processed_limit(region, card_of(sensor), rig, uv_px, blur, electrons, pattern_known), electrons
     peak_e = 0.0 if region is None else _peak_e(region)
     return SpotBounds(
         electrons=electrons,
@@ -87,11 +93,11 @@ def _processed_limit(
     card: SensorCard,
     rig: Rig,
     uv_px: tuple[float, float],
+    blur: SpotBlur,
     electrons: float,
     pattern_known: bool,
 ) -> SpotLimit:
     """Limit of the 8-bit or JPEG image: the room as one level per filter, its mean under the spot; a Gaussian spot."""
-    blur = spot_blur(rig, uv_px)
     weight = region.spot_e + 1e-3 * region.spot_e.max()  # of a filter that sees nothing of the spot: the mean of all
     levels = [
         float(np.average(region.background_e[region.filters == c], weights=weight[region.filters == c]))

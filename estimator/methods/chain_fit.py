@@ -13,10 +13,11 @@ from phibench.estimator.detect import Detection, detect
 from phibench.estimator.fit_chain import first_fit, fit_jpeg, fit_srgb, undone, unrounded
 from phibench.estimator.fit_raw import SpotFit
 from phibench.estimator.jpeg_tables import mcu_px
+from phibench.estimator.methods.beam_size import measured_twice, pair_blur, seen_depth_m
 from phibench.estimator.methods.locate import box_around
 from phibench.estimator.raw_pixels import bayer_filters
 from phibench.estimator.seat.pair import Answer, Box, Pair, Spot
-from phibench.estimator.spot_blur import SpotBlur, spot_blur
+from phibench.estimator.spot_blur import SpotBlur
 from phibench.estimator.status import Status, describe
 from phibench.scenes.frames import Array
 
@@ -28,29 +29,41 @@ _MOST_CHI2 = 30.0  # beyond it the light around the spot is not what the model s
 def chain_fit(pair: Pair) -> Answer:
     """Fit both spots where `detect` sees them, or in their boxes.
 
-    The blur is what the rig predicts (`spot_blur`). The room behind comes from the laser-off frames where they are
-    there, otherwise from what surrounds the spot. A misfit above 1 per degree of freedom widens the covariance by as
-    much.
+    The blur is what the rig predicts (`spot_blur`), with the beam's size once the distance is known. The room behind
+    comes from the laser-off frames where they are there, otherwise from what surrounds the spot. A misfit above 1 per
+    degree of freedom widens the covariance by as much.
     """
     if pair.card.output not in ("srgb8", "mjpeg"):
         missing = Spot.missing(f"chain_fit needs srgb8 or mjpeg images, not {pair.card.output}")
         return Answer(missing, missing)
     found = detect(pair)
-    return Answer(
-        _spot_or_place(pair, pair.down, pair.down_off, found.down, pair.box_down),
-        _spot_or_place(pair, pair.up, pair.up_off, found.up, pair.box_up),
-    )
+
+    def measure(depth_m: float | None) -> Answer:
+        return Answer(
+            _spot_or_place(pair, pair.down, pair.down_off, found.down, pair.box_down, depth_m),
+            _spot_or_place(pair, pair.up, pair.up_off, found.up, pair.box_up, depth_m),
+        )
+
+    depth_m = None
+    if found.down is not None and found.up is not None:  # to 0.2 px, enough for the beam's size
+        depth_m = seen_depth_m(pair, Answer(Spot(found.down.uv_px), Spot(found.up.uv_px)))
+    return measured_twice(measure, pair) if depth_m is None else measure(depth_m)
 
 
 def _spot_or_place(
-    pair: Pair, image: NDArray[Any], off: NDArray[Any] | None, found: Detection | None, hint: Box | None
+    pair: Pair,
+    image: NDArray[Any],
+    off: NDArray[Any] | None,
+    found: Detection | None,
+    hint: Box | None,
+    depth_m: float | None,
 ) -> Spot:
     """Fit; or, of a spot that was seen but gives no fit, the place of the matched filter, without covariance."""
-    spot = _spot(pair, image, off, box_around(found, image) or hint)
+    spot = _spot(pair, image, off, box_around(found, image) or hint, depth_m)
     return Spot(found.uv_px) if spot.uv_px is None and found is not None else spot
 
 
-def _spot(pair: Pair, image: NDArray[Any], off: NDArray[Any] | None, box: Box | None) -> Spot:
+def _spot(pair: Pair, image: NDArray[Any], off: NDArray[Any] | None, box: Box | None, depth_m: float | None) -> Spot:
     if box is None:
         return Spot.missing("no spot found")
     region = _region(box, pair.card, image.shape)
@@ -59,7 +72,7 @@ def _spot(pair: Pair, image: NDArray[Any], off: NDArray[Any] | None, box: Box | 
     base = None if off is None else _base(off[region.slices][None], None, origin, pair.card)
     sigma = np.array([pair.rig.camera.blur_sigma_px])
     start = first_fit(on, origin, pair.card, sigma, _response(pair), base)[0, :2] + origin[0]
-    blur = spot_blur(pair.rig, start)
+    blur = pair_blur(pair, start, depth_m)
     if pair.card.output == "srgb8":
         return _answer(_srgb(image, off, start, pair.card, blur, _response(pair)))
     if base is None:

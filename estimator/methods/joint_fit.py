@@ -14,12 +14,12 @@ import numpy as np
 from phibench.datasets.sensor_card import SensorCard
 from phibench.estimator.combine import CombinedEstimate, combine
 from phibench.estimator.fit_joint import JointFit, fit_joint
+from phibench.estimator.methods.beam_size import pair_blur, seen_depth_m
 from phibench.estimator.methods.chain_fit import chain_fit
 from phibench.estimator.methods.raw_maximum_likelihood import raw_maximum_likelihood
-from phibench.estimator.methods.sight import each_spot
+from phibench.estimator.methods.sight import each_spot_twice
 from phibench.estimator.raw_pixels import PixelNoise, noise_of, raw_electrons
 from phibench.estimator.seat.pair import Answer, Image, Matrix2, Pair, Spot
-from phibench.estimator.spot_blur import spot_blur
 from phibench.estimator.spot_likelihood import SpotRegions, spot_regions
 from phibench.estimator.status import Status
 from phibench.scenes.frames import Array
@@ -27,7 +27,7 @@ from phibench.scenes.frames import Array
 _SIDE_PX = {True: 15, False: 9}  # with a laser-off frame, and without: a level is flat over a few pixels only
 _MOST_CHI2 = 24.0  # of one degree of freedom: 1e-6 by chance
 
-_each = each_spot(raw_maximum_likelihood)
+_each = each_spot_twice(raw_maximum_likelihood)
 
 
 def joint_fit(pair: Pair) -> Answer:
@@ -45,7 +45,8 @@ def joint_of(pair: Pair, separate: Answer) -> Answer:
 def _raw(pair: Pair, separate: Answer) -> Answer:
     starts = [np.array([spot.uv_px], float) for spot in (separate.down, separate.up)]
     images = ((pair.down, pair.down_off), (pair.up, pair.up_off))
-    down, up = (_region(*image, pair, start[0]) for image, start in zip(images, starts, strict=True))
+    depth_m = seen_depth_m(pair, separate)
+    down, up = (_region(*image, pair, start[0], depth_m) for image, start in zip(images, starts, strict=True))
     return _answer(fit_joint(pair.rig, pair.stroke_m, down, up, *starts), separate)
 
 
@@ -69,7 +70,7 @@ def _answer(found: JointFit | CombinedEstimate, separate: Answer) -> Answer:
     )
 
 
-def _region(image: Image, dark: Image | None, pair: Pair, start: Array) -> SpotRegions:
+def _region(image: Image, dark: Image | None, pair: Pair, start: Array, depth_m: float | None) -> SpotRegions:
     """Square around a start, moved inside the image."""
     height, width = image.shape
     side = _SIDE_PX[dark is not None]
@@ -83,7 +84,7 @@ def _region(image: Image, dark: Image | None, pair: Pair, start: Array) -> SpotR
         x, extra = x - off + float(np.median(off)), _variance(off, pair.card)[None]
     r, g, b = pair.rig.camera.detector.laser_filter_response
     response = (r, g, b) if pair.card.mosaic == "bayer" else None
-    sigma = spot_blur(pair.rig, start).round_px
+    sigma = pair_blur(pair, start, depth_m).round_px
     return spot_regions(x[None], (u0, v0), noise_of(pair.card), sigma, response, extra_e2=extra)
 
 

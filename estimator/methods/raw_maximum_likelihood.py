@@ -1,10 +1,10 @@
 """The likelihood fit of `estimator.fit_raw` as a method, on raw pixels with or without colour filters.
 
 What it takes as known: the card's noise (PRNU and DSNU count as noise), the rig's detector for the filters' response
-at the laser line, and the oblique blur that the rig predicts at the pixel (`spot_blur`). A rough mirror's blur is not
-predicted: there the width is fitted as well. The room behind is the laser-off frame, smoothed as far as it is flat
-(`base_image`); without one it is a level per filter, or, where that does not describe it, what surrounds the spot. A
-misfit that is left widens the covariance.
+at the laser line, and the oblique blur that the rig predicts at the pixel (`spot_blur`), with the beam's size once the
+pair's distance is known. A rough mirror's blur is not predicted: there the width is fitted as well. The room behind is
+the laser-off frame, smoothed as far as it is flat (`base_image`); without one it is a level per filter, or, where that
+does not describe it, what surrounds the spot. A misfit that is left widens the covariance.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import numpy as np
 
 from phibench.estimator.base_image import BaseImage, around, base_of
 from phibench.estimator.fit_raw import SpotFit, fit_law
+from phibench.estimator.methods.beam_size import pair_blur
 from phibench.estimator.methods.sight import Sight
 from phibench.estimator.pixel_law import GaussLaw
 from phibench.estimator.raw_pixels import PixelNoise, noise_of, raw_electrons
 from phibench.estimator.seat.pair import Spot
-from phibench.estimator.spot_blur import spot_blur
 from phibench.estimator.status import Status, describe
 from phibench.scenes.frames import Array
 
@@ -52,7 +52,7 @@ def _fit(near: Sight, x: Array, noise: PixelNoise, base: BaseImage | None) -> Sp
     """Fit with a known background, or with a level per filter."""
     card, rig = near.pair.card, near.pair.rig
     u0, v0 = near.origin_px
-    blur = spot_blur(rig, (u0 + near.box.width_px // 2, v0 + near.box.height_px // 2))
+    blur = pair_blur(near.pair, (u0 + near.box.width_px // 2, v0 + near.box.height_px // 2), near.depth_m)
     r, g, b = rig.camera.detector.laser_filter_response
     return fit_law(
         x,

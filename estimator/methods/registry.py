@@ -11,7 +11,7 @@ from phibench.estimator.methods.linear import PROCESSED, RAW
 from phibench.estimator.methods.off_difference import off_difference
 from phibench.estimator.methods.raw_maximum_likelihood import raw_maximum_likelihood
 from phibench.estimator.methods.red_centroid import red_centroid
-from phibench.estimator.methods.sight import each_spot
+from phibench.estimator.methods.sight import each_spot, each_spot_twice
 from phibench.estimator.methods.simple import at_the_red_peak, in_the_box
 
 _ALL = (
@@ -54,7 +54,7 @@ _ALL = (
     ),
     BuiltIn(
         "raw_maximum_likelihood",
-        each_spot(raw_maximum_likelihood),
+        each_spot_twice(raw_maximum_likelihood),
         "maximum likelihood on raw pixels with the sensor's noise; claims a covariance",
         "F. Huang et al., Nature Methods 10, 653 (2013)",
         accepts=RAW,

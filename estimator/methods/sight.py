@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from phibench.estimator.methods.beam_size import measured_twice
 from phibench.estimator.methods.linear import demosaiced, kind_of, linear_planes, redness
 from phibench.estimator.methods.locate import locate
 from phibench.estimator.methods.red_peak import red_peak
@@ -31,11 +32,14 @@ class Sight:
     position : "down" or "up"
     box : Box
         In the image; from the hint, or from `locate`.
+    depth_m : float or None
+        Of the spot, where it is known already.
     """
 
     pair: Pair
     position: str
     box: Box
+    depth_m: float | None = None
 
     @property
     def origin_px(self) -> tuple[int, int]:
@@ -81,26 +85,38 @@ class Sight:
         if peak is None:
             return None
         uv = (peak[0] + self.box.u0_px, peak[1] + self.box.v0_px)
-        return Sight(self.pair, self.position, around(uv, self.pair.images[self.position].shape))
+        return replace(self, box=around(uv, self.pair.images[self.position].shape))
 
 
 def each_spot(find: Callable[[Sight], Spot]) -> Method:
     """Method that looks at each image by itself, where `locate` sees a spot."""
+    return lambda pair: _both(find, pair, locate(pair), None)
+
+
+def each_spot_twice(find: Callable[[Sight], Spot]) -> Method:
+    """The same, and once more with the distance that the first answer gives, for methods that use the beam's size."""
 
     def method(pair: Pair) -> Answer:
-        down, up = (_seen(find, pair, name, box) for name, box in zip(("down", "up"), locate(pair), strict=True))
-        return Answer(down, up)
+        boxes = locate(pair)
+        return measured_twice(lambda depth_m: _both(find, pair, boxes, depth_m), pair)
 
     return method
 
 
-def _seen(find: Callable[[Sight], Spot], pair: Pair, position: str, box: Box | None) -> Spot:
+def _both(
+    find: Callable[[Sight], Spot], pair: Pair, boxes: tuple[Box | None, Box | None], depth_m: float | None
+) -> Answer:
+    down, up = (_seen(find, pair, name, box, depth_m) for name, box in zip(("down", "up"), boxes, strict=True))
+    return Answer(down, up)
+
+
+def _seen(find: Callable[[Sight], Spot], pair: Pair, position: str, box: Box | None, depth_m: float | None) -> Spot:
     if box is None:
         return Spot.missing("nothing spot-like in the mirror")
     inside = clipped(box, pair.images[position].shape)
     if min(inside.width_px, inside.height_px) < LEAST_PX:
         return Spot.missing("the box lies outside the image")
-    return find(Sight(pair, position, inside))
+    return find(Sight(pair, position, inside, depth_m))
 
 
 def spot_of(found: SpotPositions) -> Spot:

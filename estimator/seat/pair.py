@@ -17,6 +17,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from phibench.datasets.sensor_card import SensorCard
+from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
 
 OK = "ok"
@@ -63,6 +64,8 @@ class Pair:
     calibration_covariance : array, shape (p, p), or None
         Of the rig's parameters, `estimator.calibration.parameters.PARAMETERS`, where rig and stroke come from a
         calibration file; read-only.
+    beam : Beam or None
+        What the user knows of the laser's spot: its diameter by the distance.
     """
 
     number: int
@@ -76,6 +79,7 @@ class Pair:
     box_down: Box | None = None
     box_up: Box | None = None
     calibration_covariance: NDArray[Any] | None = field(default=None, repr=False)
+    beam: Beam | None = None
 
     @property
     def images(self) -> Mapping[str, Image]:

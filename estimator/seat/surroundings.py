@@ -7,6 +7,8 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
+from phibench.datasets.one_thread import ONE_THREAD
+
 _KEPT = re.compile(
     r"PATH|HOME|USER|LOGNAME|SHELL|LANG|LC_\w+|TZ|VIRTUAL_ENV|PYTHONHOME|LD_LIBRARY_PATH|DYLD_LIBRARY_PATH|XDG_CACHE_HOME"
     r"|(OMP|MKL|OPENBLAS|NUMBA|CUDA|NVIDIA|TORCH|TF|JAX|XLA)_\w+"
@@ -27,6 +29,4 @@ def environment(folder: str, inherited: Mapping[str, str]) -> dict[str, str]:
     paths = [str(Path(part).absolute()) for part in inherited.get("PYTHONPATH", "").split(os.pathsep) if part]
     if paths:
         kept["PYTHONPATH"] = os.pathsep.join(paths)
-    # a pair's small matrices gain nothing from many threads, and lose much where several methods share the cores
-    one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    return {**one, **kept, "PWD": folder, "TMPDIR": folder, "PYTHONDONTWRITEBYTECODE": "1"}
+    return {**ONE_THREAD, **kept, "PWD": folder, "TMPDIR": folder, "PYTHONDONTWRITEBYTECODE": "1"}

@@ -27,6 +27,7 @@ from phibench.render.sensor import Sensor
 from phibench.render.spot import spot_layer
 from phibench.render.tiles import NoiseStream
 from phibench.scenes.frames import Array, as_vector
+from phibench.scenes.laser import Beam
 from phibench.scenes.rig import POSITIONS, Rig, View
 
 _SIDE_PX = 11  # a board of 0.3 m at 2.5 m is 16 px high in the image: a larger square has its edges in the corners
@@ -137,7 +138,7 @@ def _fitted(pair: Pair, i: int, sensor: Sensor, draws: int, names: tuple[str, ..
             for k in range(draws)
         ]
     )
-    x, blur = raw_electrons(dn, card), spot_blur(pair.rig, (u, v))
+    x, blur = raw_electrons(dn, card), spot_blur(pair.rig, (u, v), pair.depth_m, Beam())
     r, g, b = pair.rig.camera.detector.laser_filter_response
     fit = fit_law(
         x,

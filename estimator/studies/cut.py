@@ -26,7 +26,7 @@ from phibench.render.spot import SpotLayer, spot_layer
 from phibench.render.spot_truth import SpotTruth, depth_m, spot_truth
 from phibench.render.tiles import NoiseStream
 from phibench.scenes.frames import Array
-from phibench.scenes.laser import LaserSpot
+from phibench.scenes.laser import Beam, LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
 from phibench.scenes.room import Room
 from phibench.scenes.streams import Name, generator
@@ -95,6 +95,8 @@ class SpotPair:
     views : down and up
     name : str
         Place of the spot; intervals resample these.
+    beam : Beam
+        Whose spot at `depth_m` is that of the views.
     """
 
     rig: Rig
@@ -102,6 +104,7 @@ class SpotPair:
     depth_m: float
     views: dict[str, SpotView] = field(repr=False)
     name: str = ""
+    beam: Beam = Beam()
 
     @classmethod
     def of(
@@ -111,7 +114,7 @@ class SpotPair:
         at = {p: rig.at(Stroke(stroke_m).offset_m(p)) for p in POSITIONS}
         views = {p: SpotView.of(view, spot, room, ambient[p]) for p, view in at.items()}
         depth = float(depth_m(np.array(spot.position_world_m), at["down"].sphere_centre_m))
-        return cls(rig, stroke_m, depth, views, name)
+        return cls(rig, stroke_m, depth, views, name, Beam(spot.diameter_m, 0.0))
 
     @property
     def visible(self) -> bool:
@@ -162,8 +165,17 @@ def taken(
             images[key] = side.chain.frame(light, _stream(names, position, word))
             images[key].flags.writeable = False
     box_down, box_up = (_box(names, p, pair.views[p].truth, side_px=box_px, rig=pair.rig) for p in POSITIONS)
-    card, (rig, stroke_m) = card_of(shot.sensor), believed
-    return Pair(number, **images, rig=rig, stroke_m=stroke_m, card=card, box_down=box_down, box_up=box_up)
+    rig, stroke_m = believed
+    return Pair(
+        number,
+        **images,
+        rig=rig,
+        stroke_m=stroke_m,
+        card=card_of(shot.sensor),
+        box_down=box_down,
+        box_up=box_up,
+        beam=pair.beam,
+    )
 
 
 def without_off(pair: Pair) -> Pair:
@@ -203,7 +215,8 @@ def _bounds(shot: Shot, pair: SpotPair, position: str, flicker: float) -> SpotBo
     view = pair.views[position]
     rates = tuple(float(x) for x in view.layer.total_electrons_per_s)
     uv = (view.truth.u_px, view.truth.v_px)
-    return spot_bounds(shot.side(pair, position, 0, flicker), pair.rig, uv, rates, view.truth.visible)
+    side = shot.side(pair, position, 0, flicker)
+    return spot_bounds(side, pair.rig, uv, rates, view.truth.visible, beam=pair.beam, depth_m=pair.depth_m)
 
 
 def _flicker(shot: Shot, names: tuple[Name, ...], position: str) -> float:
