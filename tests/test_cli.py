@@ -121,6 +121,23 @@ def sensitivities_kept(monkeypatch) -> list[Path]:
     return kept
 
 
+@pytest.mark.parametrize(("before", "after"), [("", "1"), ("2", "2")])
+def test_linear_algebra_has_one_thread_unless_asked(python, before, after):
+    """It must be set before NumPy is loaded."""
+    code = """
+import os, sys
+os.environ.pop("OPENBLAS_NUM_THREADS", None)
+if sys.argv[1]:
+    os.environ["OPENBLAS_NUM_THREADS"] = sys.argv[1]
+from phibench.estimator.cli import main
+assert "numpy" not in sys.modules
+assert main(["--version"]) == 0
+print(os.environ["OPENBLAS_NUM_THREADS"])
+"""
+    done = python(code, before)
+    assert done.stdout.splitlines()[-1] == after, done.stderr
+
+
 def test_repair_prints_what_it_made(monkeypatch, capsys):
     monkeypatch.setattr("phibench.datasets.repair.repair", lambda *_, **__: ["view h0.000", "SHA256SUMS"])
     kept = sensitivities_kept(monkeypatch)

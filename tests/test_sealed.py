@@ -29,6 +29,7 @@ from phibench.estimator.bench.sealed_pairs import SealedPairs
 from phibench.estimator.bench.submission import submit
 from phibench.estimator.bench.truth import PairTruth
 from phibench.estimator.bench.truth_file import truth_document, truth_of
+from phibench.scenes.laser import Beam
 
 
 @pytest.fixture
@@ -51,6 +52,7 @@ def test_the_public_pairs_are_the_pairs(bench_dataset: Path, sealed: Sealed) -> 
             assert not theirs.images[name].flags.writeable
         assert (ours.rig, ours.stroke_m, ours.card) == (theirs.rig, theirs.stroke_m, theirs.card)
         assert (ours.box_down, ours.box_up) == (theirs.box_down, theirs.box_up)
+        assert ours.beam == theirs.beam == Beam()
 
 
 def digits(value: float) -> list[str]:
