@@ -99,6 +99,7 @@ def align(
     principal_point_sigma_px
         How well the principal point is known.
     """
+    from phibench.datasets.errors import DatasetError
     from phibench.estimator.calibration.align import (
         alignment,
         believed_centre,
@@ -109,6 +110,11 @@ def align(
     from phibench.scenes.mirror import SphereMirror
     from phibench.scenes.rig import Rig
 
+    if not 0.0 < 1.02 * radius_mm < distance_mm <= 1e4:
+        raise DatasetError(
+            f"--radius-mm {radius_mm:g}, --distance-mm {distance_mm:g}: the radius must be above 0, and the mirror's "
+            "centre 1.02 radii to 10 m from the lens"
+        )
     pixels, card = read_picture(image)
     rig = Rig()
     centre = believed_centre(pixels, rig.camera, cx_px, cy_px)

@@ -79,6 +79,25 @@ def test_what_is_no_frame_is_refused_in_one_sentence(tmp_path, capsys) -> None:
     assert capsys.readouterr().err.count("\n") == 2
 
 
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [
+        (("--radius-mm", "600"), ("--radius-mm 600", "--distance-mm 260")),
+        (("--radius-mm", "-3"), ("above 0",)),
+        (("--distance-mm", "40"), ("1.02 radii to 10 m",)),
+        (("--radius-mm", "1"), ("radius of 6 px", "check these numbers")),
+        (("--radius-mm", "30"), ("without a mirror", "looked for was an outline", "116 to 233 px")),
+    ],
+)
+def test_numbers_of_another_mirror_are_named(light, tmp_path, capsys, numbers, words) -> None:
+    file = tmp_path / "frame.jpg"
+    file.write_bytes(Chain(sensor("mjpeg")).jpeg_bytes(Light(light), NoiseStream(("align",))))
+    assert cli.main(["align", str(file), *numbers]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert all(word in said for word in words), said
+
+
 def test_a_picture_that_is_no_whole_frame_needs_its_principal_point() -> None:
     whole = Rig().camera
     assert believed_centre(np.zeros((720, 1280, 3)), whole) == (639.5, 359.5)

@@ -23,7 +23,7 @@ from phibench.datasets.sensor_card import SensorCard
 from phibench.estimator.calibration.limb_image import ImageError, Plane, planes_of
 from phibench.estimator.calibration.outline_jpeg import JpegAgain
 from phibench.estimator.calibration.outline_pixels import OutlinePixels, band
-from phibench.estimator.calibration.outline_start import grey, rough_outlines
+from phibench.estimator.calibration.outline_start import grey, radii_px, rough_outlines
 from phibench.estimator.calibration.outline_step import Step, step_from
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, as_vector
@@ -106,13 +106,23 @@ def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) 
     planes = planes_of(image, card)
     _require_size(planes[0].values, rig.camera)
     fault = ImageError("an image without a mirror")
-    for start in rough_outlines(grey(planes), rig):
-        try:
-            return fit_outline(planes, rig, start, again=(image, card) if card and card.output == "mjpeg" else None)
-        except ImageError as error:
-            # that it is cut, or lit badly, says more than that the last circle tried was none
-            fault = error if "without a mirror" in str(fault) else fault
-    raise fault
+    again = (image, card) if card and card.output == "mjpeg" else None
+    low, high = radii_px(rig)
+    try:
+        for start in rough_outlines(grey(planes), rig):
+            try:
+                return fit_outline(planes, rig, start, again=again)
+            except ImageError as error:
+                # that it is cut, or lit badly, says more than that the last circle tried was none
+                fault = error if "without a mirror" in str(fault) else fault
+    except ImageError as error:
+        fault = error
+    if "without a mirror" not in str(fault):
+        raise fault
+    raise ImageError(
+        f"{fault}; looked for was an outline with a radius of {low:.0f} to {high:.0f} px, as the rig's focal length, "
+        "mirror radius and distance say: check these numbers, too"
+    )
 
 
 def fit_outline(

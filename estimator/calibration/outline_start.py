@@ -6,6 +6,7 @@ outside. They are where the fit of the light across the limb starts, and what it
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -22,6 +23,7 @@ from phibench.scenes.rig import Rig
 Circle = tuple[float, float, float]
 _BLOCK_PX, _CANDIDATES = 4, 6
 _RADII = (0.7, 1.4)  # of the believed rig's outline
+_LEAST_RADIUS_PX = 30.0
 _TURNS = 360
 _SEARCH_PX = 12
 _MIN_EDGES = 60  # of `_TURNS`
@@ -61,17 +63,35 @@ def rough_outlines(picture: Array, rig: Rig) -> Iterator[Array]:
         yield sphere_from_rays(rig.camera.rays(points), rig.mirror.radius_m)
     if not found:
         raise ImageError(
-            "an image without a mirror: no circle of the outline's size has edges all around; check the picture, and "
-            "the rig's focal length, radius and distance"
+            "an image without a mirror: no circle of the outline's size has edges all around; check the picture"
         )
+
+
+def radii_px(rig: Rig) -> tuple[float, float]:
+    """Least and largest radius of the outline that is looked for, pixels.
+
+    Raises
+    ------
+    ImageError
+        If no such outline can be seen in the rig's image.
+    """
+    camera, radius = rig.camera, _believed(rig)[2]
+    largest = math.hypot(camera.width_px, camera.height_px)
+    if not _LEAST_RADIUS_PX <= radius <= largest:
+        raise ImageError(
+            f"focal length, mirror radius and distance of the rig give an outline with a radius of {radius:.0f} px, in "
+            f"an image of {camera.width_px} x {camera.height_px}: check these numbers, {_LEAST_RADIUS_PX:.0f} to "
+            f"{largest:.0f} px can be measured"
+        )
+    return _RADII[0] * radius, _RADII[1] * radius
 
 
 def hough(picture: Array, rig: Rig) -> list[Circle]:
     """Centre (u, v) and radius of the strongest circles, to some pixels."""
     small = block_reduce(np.log(np.clip(picture, 1e-2, 1e2)), (_BLOCK_PX, _BLOCK_PX), np.mean)  # type: ignore[no-untyped-call]
     edges = canny(small, sigma=1.5)  # type: ignore[no-untyped-call]
-    believed = _believed(rig)[2]
-    radii = np.arange(_RADII[0] * believed / _BLOCK_PX, _RADII[1] * believed / _BLOCK_PX, 1.0).astype(int)
+    low, high = radii_px(rig)
+    radii = np.arange(low / _BLOCK_PX, high / _BLOCK_PX, 1.0).astype(int)
     if edges.sum() < _MIN_EDGES:
         raise ImageError("an image without a mirror: it has no edges")
     space = hough_circle(edges, radii, full_output=True)  # type: ignore[no-untyped-call]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -103,9 +104,10 @@ class Sectors:
             light = np.bincount(self.group, y, self.groups) / pixels
             square = np.bincount(self.group, residual * residual, self.groups) / pixels / light
         size = np.sqrt(np.where((pixels >= MIN_PIXELS) & (light > 0.0), square, np.nan)).reshape(-1, self.count)
-        usual = np.hypot(
-            np.nanmedian(size, axis=1, keepdims=True), _HARMLESS * np.sqrt(np.abs(light)).reshape(size.shape)
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # a group without a single sector
+            median = np.nanmedian(size, axis=1, keepdims=True)
+        usual = np.hypot(median, _HARMLESS * np.sqrt(np.abs(light)).reshape(size.shape))
         worst = np.nan_to_num((size / usual).max(axis=0), nan=np.inf)
         trust = np.clip((_MISFIT[1] - worst) / (_MISFIT[1] - _MISFIT[0]), 0.0, 1.0)
         return np.asarray(minimum_filter1d(trust, 2 * _SPOILT + 1, mode="wrap"))

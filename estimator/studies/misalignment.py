@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import polars as pl
 
+from phibench.datasets.progress import Steps
 from phibench.estimator.calibration.bundle import Bundle
 from phibench.estimator.studies.drawing import Drawing
 from phibench.estimator.studies.material import Material
@@ -38,22 +39,29 @@ from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig
 from phibench.scenes.streams import generator
 
+_PARTS = 5  # table, rendered spots, tolerances, interactions, calibrations with noise; of unequal length
 _SLOPE_TARGET = 1e-3  # of D: a slope that misses by more is said to be not enough
 
 
-def run(settings: MisalignmentSettings, _: Material) -> Result:
+def run(settings: MisalignmentSettings, material: Material) -> Result:
     """Run the study; it renders spots itself and needs no data set."""
     nominal = default_rig()
     strokes = [settings.places(stroke) for stroke in settings.strokes_m]
     places = strokes[0]
     calibrate = _calibration(settings, nominal, places.stroke_m)
-    table = study_table(nominal, strokes, calibrate)
-    some = settings.places(places.stroke_m, settings.azimuths_rad[1 :: settings.rendered_every])
-    seen = tuple(rendered(nominal, some))
-    fine, coarse = settings.tolerance_search(), settings.tolerance_search(calibrated=True)
-    tolerances = list(tolerance_rows(nominal, places, fine, coarse, calibrate))
-    drawn = _interactions(settings, nominal, places.stroke_m)
-    noise = _noise(settings, nominal, places)
+    with Steps(material.console, "misalignment, parts", _PARTS) as steps:
+        table = study_table(nominal, strokes, calibrate)
+        steps.advance()
+        some = settings.places(places.stroke_m, settings.azimuths_rad[1 :: settings.rendered_every])
+        seen = tuple(rendered(nominal, some))
+        steps.advance()
+        fine, coarse = settings.tolerance_search(), settings.tolerance_search(calibrated=True)
+        tolerances = list(tolerance_rows(nominal, places, fine, coarse, calibrate))
+        steps.advance()
+        drawn = _interactions(settings, nominal, places.stroke_m)
+        steps.advance()
+        noise = _noise(settings, nominal, places)
+        steps.advance()
     ranks = {name: ranking(table, name, places.stroke_m) for name in (*NOMINAL, CALIBRATED)}
     pictures = rendered_table(seen, some)
     return Result(

@@ -11,6 +11,7 @@ import polars as pl
 from pydantic import Field
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.progress import Steps
 from phibench.datasets.sensor_card import SensorCard, sensor_card
 from phibench.estimator.best_stroke import BestStroke, best_stroke, spot_bound
 from phibench.estimator.calibration.bundle import calibrate
@@ -76,13 +77,14 @@ def run(settings: StrokeSettings, material: Material) -> Result:
     rigs, spot = tolerances(rig, settings.outline_sigma_um), spot_bound(rig, card)
     longest = _paper(settings)
     depths = sorted({*settings.depths_m, *longest})
-    found = {
-        (name, d): best_stroke(
-            d, rig, covariance_rig=C, strokes_m=settings.strokes_m, around=around, card=card, spot=spot
-        )
-        for name, C in rigs.items()
-        for d in depths
-    }
+    found = {}
+    with Steps(material.console, "stroke, curves", len(rigs) * len(depths)) as steps:
+        for name, C in rigs.items():
+            for d in depths:
+                found[name, d] = best_stroke(
+                    d, rig, covariance_rig=C, strokes_m=settings.strokes_m, around=around, card=card, spot=spot
+                )
+                steps.advance()
     checks = run_checks(planned(settings, rig, {k: rigs[k] for k in (AS_BUILT, EXACT)}), material)
     names, top = tuple(rigs), settings.strokes_m[1]
     findings = [best_sentence(found, name, tuple(longest)) for name in names]

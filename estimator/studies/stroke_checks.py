@@ -15,6 +15,7 @@ from multiprocessing import get_context
 
 import numpy as np
 
+from phibench.datasets.progress import Steps
 from phibench.estimator.bench.bootstrap import Clusters, estimates, rms_of
 from phibench.estimator.bench.rules import Rules
 from phibench.estimator.best_stroke import ROOM_E_PER_S
@@ -106,7 +107,12 @@ class Checked:
 
 def run_checks(checks: Sequence[Check], material: Material) -> list[Checked]:
     """Measure, with the material's workers."""
-    return list(_results(checks, material.workers or os.cpu_count() or 1))
+    with Steps(material.console, "stroke, frames", len(checks)) as steps:
+        found = []
+        for one in _results(checks, material.workers or os.cpu_count() or 1):
+            found.append(one)
+            steps.advance()
+    return found
 
 
 def _results(checks: Sequence[Check], workers: int) -> Iterator[Checked]:
