@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -63,6 +64,16 @@ class SensorCard:
     def saturation_e(self) -> float:
         """Electrons at which a pixel carries no more information: full well or last code, whichever comes first."""
         return min(self.full_well_e, (self.top_dn - 0.5 - self.black_level_dn) / self.dn_per_e)
+
+
+    @property
+    def full_from_e(self) -> float:
+        """Reading, electrons, from which on a pixel may be full, though noise that is added later hides it.
+
+        5 deviations of read noise and DSNU, and half a code, below the full well.
+        """
+        added = 5.0 * math.hypot(self.read_noise_e, self.dsnu_e) + 0.5 / self.dn_per_e
+        return min(self.full_well_e - added, self.saturation_e)
 
 
 def sensor_card(preset: str = "bayer-raw", **changes: Any) -> SensorCard:

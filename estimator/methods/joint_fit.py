@@ -78,7 +78,7 @@ def _region(image: Image, dark: Image | None, pair: Pair, start: Array, depth_m:
     v0 = min(max(round(start[1]) - side // 2, 0), max(height - side, 0))
     window = (slice(v0, v0 + side), slice(u0, u0 + side))
     x, extra = raw_electrons(image[window], pair.card), np.zeros((1, 1, 1))
-    x = np.where(x < pair.card.saturation_e, x, np.nan)
+    x = np.where(x < pair.card.full_from_e, x, np.nan)
     if dark is not None:
         off = raw_electrons(dark[window], pair.card)
         x, extra = x - off + float(np.median(off)), _variance(off, pair.card)[None]

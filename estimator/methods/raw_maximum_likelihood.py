@@ -62,7 +62,7 @@ def _fit(near: Sight, x: Array, noise: PixelNoise, base: BaseImage | None) -> Sp
         (r, g, b) if card.mosaic == "bayer" else None,
         None if base is None else base.mean_e,
         rig.mirror.roughness_alpha > 0.0,
-        x < card.saturation_e,
+        x < card.full_from_e,
         blur.ratio,
         blur.mixed_px2,
     )

@@ -146,7 +146,7 @@ def _fitted(pair: Pair, i: int, sensor: Sensor, draws: int, names: tuple[str, ..
         GaussLaw(noise_of(card)),
         blur.sigma_px,
         (r, g, b),
-        used=x < card.saturation_e,
+        used=x < card.full_from_e,
         ratio=blur.ratio,
         mixed_px2=blur.mixed_px2,
     )
