@@ -65,7 +65,6 @@ class SensorCard:
         """Electrons at which a pixel carries no more information: full well or last code, whichever comes first."""
         return min(self.full_well_e, (self.top_dn - 0.5 - self.black_level_dn) / self.dn_per_e)
 
-
     @property
     def full_from_e(self) -> float:
         """Reading, electrons, from which on a pixel may be full, though noise that is added later hides it.

@@ -8,8 +8,10 @@ noise.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from phibench.scenes.frames import Array
@@ -28,10 +30,13 @@ class BaseImage:
     mean_e : shape (n, h, w)
     variance_e2 : shape (n, h, w)
         Of its error, taken as independent from pixel to pixel.
+    image : shape (n, h, w, 3), uint8, optional
+        The decoded JPEG frame that it was taken from.
     """
 
     mean_e: Array
     variance_e2: Array
+    image: NDArray[Any] | None = None
 
 
 def base_of(x_e: Array, variance_e2: Array, known: Array) -> BaseImage:

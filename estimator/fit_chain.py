@@ -152,8 +152,9 @@ def fit_jpeg(
         u0, v0 = origin[i]
         ends = (bool(v0 == 0), bool(v0 + h == size_px[1]), bool(u0 == 0), bool(u0 + w == size_px[0]))
         known = (zero, zero) if base is None else (base.mean_e[i], base.variance_e2[i])
+        room = None if base is None or base.image is None else base.image[i]
         start = first[i] if not free_width else np.append(first[i], widths[i])
-        region = Region(planes[i], ends, *known)
+        region = Region(planes[i], ends, known[0], known[1], room)
         blur = SpotBlur(float(widths[i]), float(ratios[i]), float(mixed[i]))
         rows.append(fit_region(region, model, start[None], blur, free_width, response))
     return _collected(rows, origin, widths, free_width)

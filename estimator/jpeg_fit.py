@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from phibench.estimator.chain_model import ChainModel, code_slopes, codes, noise_factor, raw_variance_e2
+from phibench.estimator.full_wells import CutPixels, cut_pixels
 from phibench.estimator.quantiser import quantised
 from phibench.estimator.spot_means import SpotMeans
 from phibench.scenes.frames import Array
@@ -102,21 +103,26 @@ class Window:
     means : SpotMeans
     extra_e2 : shape (r,) or float
         Variance of the base image, electrons squared, which counts as noise of the raw pixels.
+    room : shape (n,) or float
+        Variance of the base's coefficients by quantisation (`room_coefficients`).
     """
 
     z: Array
     model: ChainModel
     means: SpotMeans
     extra_e2: Array | float = 0.0
+    room: Array | float = 0.0
 
     def noise(self, theta: Array, live: Rows | None = None) -> Noise:
         """Covariance of the quantised coefficients for one hypothesis, shape (k,); which are live, if it is known."""
         model = self.model
         rows = live or Rows.all(model)
-        mean, _ = self.means.at(theta[None])
-        at = codes(model, mean).one(0)
-        F = noise_factor(model, at, raw_variance_e2(model, mean[0]) + self.extra_e2, rows.transform)
-        sigma = np.sqrt(np.einsum("rn,rn->n", F, F) + at.excess @ rows.squares + rows.rounding)
+        raw, _ = self._raw(theta[None])
+        at = codes(model, raw.mean_e).one(0)
+        extra = raw.slope[0] ** 2 * self.extra_e2
+        F = noise_factor(model, at, raw.variance_e2[0] + extra, rows.transform)
+        room = np.broadcast_to(self.room, len(model.step))[rows.index]
+        sigma = np.sqrt(np.einsum("rn,rn->n", F, F) + at.excess @ rows.squares + rows.rounding + room)
         output = quantised(at.mean @ rows.transform + rows.shift, sigma, rows.step)
         variance = np.maximum(output.variance, _LEAST * rows.step**2)
         slope = output.slope
@@ -131,8 +137,8 @@ class Window:
     def residual(self, noise: Noise, theta: Array) -> tuple[Array, Array]:
         """Whitened residuals, shape (m, l), and derivatives of the mean, shape (m, k, l), of hypotheses (m, k)."""
         rows = noise.rows
-        mean, derivatives = self.means.at(theta)
-        at = codes(self.model, mean)
+        raw, derivatives = self._raw(theta)
+        at = codes(self.model, raw.mean_e)
         output = quantised(at.mean @ rows.transform + rows.shift, noise.sigma, rows.step)
         changes = code_slopes(self.model, at, derivatives)
         slopes = (changes @ rows.transform) * output.slope[:, None, :]
@@ -140,6 +146,12 @@ class Window:
         both = np.concatenate([(self.z[rows.index] - output.mean)[:, None], slopes], axis=1)
         white = noise.whitened(both.reshape(-1, count).T).T.reshape(m, k + 1, count)
         return white[:, 0], white[:, 1:]
+
+    def _raw(self, theta: Array) -> tuple[CutPixels, Array]:
+        """Raw pixels, shape (m, r), with full ones cut, and derivatives of their means, shape (m, k, r)."""
+        mean, derivatives = self.means.at(theta)
+        cut = cut_pixels(mean, raw_variance_e2(self.model, mean), self.model.card.saturation_e)
+        return cut, derivatives * cut.slope[:, None, :]
 
     def fisher(self, theta: Array) -> Array:
         """J^T C^-1 J of the model's output, shape (k, k)."""

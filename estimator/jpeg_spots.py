@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from phibench.estimator.chain_model import ChainModel
 from phibench.estimator.jpeg_fit import JpegFit, Window, fit_window
 from phibench.estimator.jpeg_recovery import recovered
 from phibench.estimator.jpeg_tables import mcu_px
+from phibench.estimator.room_coefficients import room_variance
 from phibench.estimator.spot_blur import SpotBlur
 from phibench.estimator.spot_means import SpotMeans
 from phibench.scenes.frames import Array
@@ -28,12 +29,15 @@ class Region:
         Whether top, bottom, left and right side are the image's own.
     base_e, extra_e2 : shape (h, w)
         Base of the raw pixels, and the variance of its error.
+    room : shape (h, w, 3), uint8, optional
+        Decoded frame without the laser that the base was taken from.
     """
 
     image: NDArray[Any]
     ends: tuple[bool, bool, bool, bool]
     base_e: Array
     extra_e2: Array
+    room: NDArray[Any] | None = None
 
 
 def window_at(region: Region, model: ChainModel, uv: Array) -> tuple[int, int]:
@@ -74,7 +78,10 @@ def fit_region(
     corner = np.array([column - m, row - m], float)
     shifted = starts.copy()
     shifted[:, :2] -= corner
-    fit = fit_window(Window(coefficients_at(region, model, row, column), model, means, extra), shifted)
+    room: Array | float = 0.0
+    if region.room is not None:
+        room = room_variance(coefficients_at(replace(region, image=region.room), model, row, column), model.step)
+    fit = fit_window(Window(coefficients_at(region, model, row, column), model, means, extra, room), shifted)
     middle = np.array([(w - 1) / 2.0 + m, (h - 1) / 2.0 + m])
     off = np.abs(fit.theta[:2] - middle) / np.array([w / 2.0, h / 2.0])
     theta = fit.theta.copy()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -69,7 +70,11 @@ def _spot(pair: Pair, image: NDArray[Any], off: NDArray[Any] | None, box: Box | 
     region = _region(box, pair.card, image.shape)
     origin = np.array([[region.u0_px, region.v0_px]])
     on = image[region.slices][None]
-    base = None if off is None else _base(off[region.slices][None], None, origin, pair.card)
+    base = (
+        None
+        if off is None
+        else replace(_base(off[region.slices][None], None, origin, pair.card), image=off[region.slices][None])
+    )
     sigma = np.array([pair.rig.camera.blur_sigma_px])
     start = first_fit(on, origin, pair.card, sigma, _response(pair), base)[0, :2] + origin[0]
     blur = pair_blur(pair, start, depth_m)
