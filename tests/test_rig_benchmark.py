@@ -1,0 +1,59 @@
+"""Times of what misaligned rigs need, `pytest --benchmark-enable --benchmark-only`: ratios within one run."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from phibench.datasets.sensor_card import card_of
+from phibench.estimator.best_stroke import best_stroke, spot_bound
+from phibench.estimator.panorama import Grid, pixels_by_model, unrolled
+from phibench.estimator.spot_blur import spot_blur
+from phibench.render.sensor import sensor
+from phibench.render.spot import spot_layer
+from phibench.scenes.form import Form
+from phibench.scenes.laser import Beam, LaserSpot, beam_diameter_m
+from phibench.scenes.rig import Rig
+
+SPOT = LaserSpot((2.0, 0.5, 0.5), (-2.0, -0.5, 0.0), beam_diameter_m(2.06))
+FORMS = {"sphere": None, "form error": Form(form_20_m=2e-5, form_31c_m=-1e-5)}
+
+
+@pytest.mark.benchmark(group="form")
+@pytest.mark.parametrize("mirror", FORMS)
+def test_benchmark_spot_layer(benchmark, mirror: str) -> None:
+    rig = Rig()
+    view = replace(rig, mirror=replace(rig.mirror, form=FORMS[mirror])).at(0.0)
+    assert benchmark(lambda: spot_layer(view, SPOT, ())).electrons_per_s.sum() > 0.0
+
+
+@pytest.mark.benchmark(group="panorama")
+def test_benchmark_panorama_by_the_model(benchmark) -> None:
+    """1440 x 360 pixels, geometry and interpolation."""
+    view, grid = Rig().at(0.0), Grid(1440, math.radians(-60.0), math.radians(30.0))
+    image = np.ones((720, 1280, 3))
+    found = benchmark.pedantic(lambda: unrolled(image, pixels_by_model(view, grid)), rounds=3)
+    assert found.shape == (grid.height_px, 1440, 3)
+
+
+@pytest.mark.benchmark(group="planning")
+def test_benchmark_blur_with_the_beam(benchmark) -> None:
+    rig, beam = Rig(), Beam()
+    assert benchmark(lambda: spot_blur(rig, (430.0, 300.0), 2.0, beam)).sigma_px > 0.7
+
+
+@pytest.mark.benchmark(group="planning")
+@pytest.mark.parametrize("preset", ["bayer-raw", "mjpeg"])
+def test_benchmark_bound_by_the_light(benchmark, preset: str) -> None:
+    rig, card = Rig(), card_of(sensor(preset))
+    assert benchmark.pedantic(lambda: spot_bound(rig, card), rounds=1).sigma_px[-1] > 0.0
+
+
+@pytest.mark.benchmark(group="planning")
+def test_benchmark_best_stroke_without_its_bound(benchmark) -> None:
+    rig, card = Rig(), card_of(sensor("bayer-raw"))
+    spot = spot_bound(rig, card)
+    assert benchmark.pedantic(lambda: best_stroke(2.0, rig, card=card, spot=spot), rounds=1).stroke_m > 0.1
