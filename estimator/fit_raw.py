@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import convolve1d
 
 from phibench.estimator.fisher import covariance_bound
-from phibench.estimator.gaussian_spot import Profile, outer, profile
+from phibench.estimator.gaussian_spot import profile, spot_images
 from phibench.estimator.pixel_law import GaussLaw, PixelLaw
 from phibench.estimator.raw_pixels import PixelNoise, bayer_filters
 from phibench.estimator.status import Status, StatusArray, flag, keep
@@ -252,35 +252,19 @@ def _blurred(images: Array, kernel: Array) -> Array:
 
 def _model(data: _Data, theta: Array) -> tuple[Array, Array]:
     """Mean, shape (n, h, w), and its derivatives, shape (n, k, h, w)."""
-    h, w = data.x.shape[1:]
-    c = data.levels.shape[1]
+    shape, c = data.x.shape[1:], data.levels.shape[1]
     sigma = theta[:, -1] if data.free_width else data.sigma
-    across, down = profile(theta[:, 0], sigma, w), profile(theta[:, 1], data.ratio * sigma, h)
-    flux, ratio = theta[:, 2, None], data.ratio[:, None]
-    derivatives = np.empty((len(theta), theta.shape[1], h, w))
-    derivatives[:, 0] = outer(flux * down.share, across.by_centre) * data.response
-    derivatives[:, 1] = outer(flux * down.by_centre, across.share) * data.response
-    derivatives[:, 2] = outer(down.share, across.share) * data.response
+    spots = spot_images(theta[:, :2], theta[:, 2], sigma, data.ratio, data.mixed, shape, data.free_width)
+    spots *= data.response[:, None]
+    derivatives = np.empty((len(theta), theta.shape[1], *shape))
+    derivatives[:, :3] = spots[:, :3]
     derivatives[:, 3 : 3 + c] = data.levels
     if data.free_width:
-        both = outer(flux * ratio * down.by_sigma, across.share) + outer(flux * down.share, across.by_sigma)
-        derivatives[:, -1] = both * data.response
-    if data.mixed.any():
-        _add_mixed(derivatives, data, flux, sigma[:, None], (across, down))
-    mean = flux[:, :, None] * derivatives[:, 2] + data.base
+        derivatives[:, -1] = spots[:, 3]
+    mean = theta[:, 2, None, None] * spots[:, 2] + data.base
     for i in range(c):
         mean += theta[:, 3 + i, None, None] * data.levels[:, i]
     return mean, derivatives
-
-
-def _add_mixed(derivatives: Array, data: _Data, flux: Array, sigma: Array, profiles: tuple[Profile, Profile]) -> None:
-    """Add kappa d^2/du dv of the upright spot, in place; a second derivative by the centre is by_sigma / sigma."""
-    across, down = profiles
-    kappa = data.mixed[:, None]
-    tall = data.ratio[:, None] * sigma
-    derivatives[:, 0] += outer(kappa * flux * down.by_centre, across.by_sigma / sigma) * data.response
-    derivatives[:, 1] += outer(kappa * flux * down.by_sigma / tall, across.by_centre) * data.response
-    derivatives[:, 2] += outer(kappa * down.by_centre, across.by_centre) * data.response
 
 
 def _scores(data: _Data, theta: Array) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from phibench.estimator.gaussian_spot import outer, profile
+from phibench.estimator.gaussian_spot import spot_images
 from phibench.estimator.raw_pixels import PixelNoise, bayer_filters
 from phibench.scenes.frames import Array, BoolArray
 
@@ -30,7 +30,8 @@ class SpotRegions:
     noise : PixelNoise
     extra_e2 : shape (n, h, w)
         Variance besides that of `noise`, such as a subtracted frame's.
-    sigma_px : shape (n,)
+    sigma_px, ratio, mixed_px2 : shape (n,)
+        Blur along u, that along v over it, and its mixed second moment.
     """
 
     x: Array
@@ -41,13 +42,15 @@ class SpotRegions:
     noise: PixelNoise
     extra_e2: Array
     sigma_px: Array
+    ratio: Array
+    mixed_px2: Array
 
     def __len__(self) -> int:
         return len(self.x)
 
     def rows(self, index: NDArray[np.int64]) -> SpotRegions:
         """Regions of some of the spots."""
-        names = ("x", "used", "response", "levels", "origin_px", "extra_e2", "sigma_px")
+        names = ("x", "used", "response", "levels", "origin_px", "extra_e2", "sigma_px", "ratio", "mixed_px2")
         return replace(self, **{name: getattr(self, name)[index] for name in names})
 
     @property
@@ -64,6 +67,8 @@ def spot_regions(
     response: tuple[float, float, float] | None,
     saturation_e: float = np.inf,
     extra_e2: ArrayLike = 0.0,
+    ratio: ArrayLike = 1.0,
+    mixed_px2: ArrayLike = 0.0,
 ) -> SpotRegions:
     """Regions as `fit_raw` takes them; pixels that are not finite or from `saturation_e` on are left out.
 
@@ -82,8 +87,8 @@ def spot_regions(
     levels = (filters[:, None] == np.arange(len(weights))[:, None, None]).astype(float)
     used = np.isfinite(data) & (np.nan_to_num(data, nan=np.inf) < saturation_e)
     extra = np.broadcast_to(np.asarray(extra_e2, float), data.shape)
-    sigma = np.broadcast_to(np.asarray(sigma_px, float), n)
-    return SpotRegions(np.where(used, data, 0.0), used, weights[filters], levels, origin, noise, extra, sigma)
+    blur = (np.broadcast_to(np.asarray(value, float), n) for value in (sigma_px, ratio, mixed_px2))
+    return SpotRegions(np.where(used, data, 0.0), used, weights[filters], levels, origin, noise, extra, *blur)
 
 
 def scores(data: SpotRegions, theta: Array) -> tuple[Array, Array]:
@@ -107,16 +112,12 @@ def misfit(data: SpotRegions, theta: Array) -> Array:
 
 def _model(data: SpotRegions, theta: Array) -> tuple[Array, Array]:
     """Mean, shape (n, h, w), and its derivatives, shape (n, k, h, w)."""
-    h, w = data.x.shape[1:]
-    place = theta[:, :2] - data.origin_px
-    across, down = profile(place[:, 0], data.sigma_px, w), profile(place[:, 1], data.sigma_px, h)
-    flux = theta[:, 2, None]
-    derivatives = np.empty((*theta.shape, h, w))
-    derivatives[:, 0] = outer(flux * down.share, across.by_centre) * data.response
-    derivatives[:, 1] = outer(flux * down.by_centre, across.share) * data.response
-    derivatives[:, 2] = outer(down.share, across.share) * data.response
+    shape, place = data.x.shape[1:], theta[:, :2] - data.origin_px
+    derivatives = np.empty((*theta.shape, *shape))
+    derivatives[:, :3] = spot_images(place, theta[:, 2], data.sigma_px, data.ratio, data.mixed_px2, shape)
+    derivatives[:, :3] *= data.response[:, None]
     derivatives[:, 3:] = data.levels
-    mean = flux[:, :, None] * derivatives[:, 2] + np.einsum("nc,nchw->nhw", theta[:, 3:], data.levels)
+    mean = theta[:, 2, None, None] * derivatives[:, 2] + np.einsum("nc,nchw->nhw", theta[:, 3:], data.levels)
     return mean, derivatives
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.estimator.gaussian_spot import outer, profile
+from phibench.estimator.gaussian_spot import spot_images
 from phibench.scenes.frames import Array
 
 
@@ -47,24 +47,16 @@ class SpotMeans:
 
     def at(self, theta: Array) -> tuple[Array, Array]:
         """Mean, shape (m, r), and derivatives, shape (m, k, r), for hypotheses, shape (m, k)."""
-        h, w = self.filters.shape
+        shape = (self.filters.shape[0], self.filters.shape[1])
         sigma = theta[:, 6] if self.free_width else np.full(len(theta), self.sigma_px)
-        across, down = profile(theta[:, 0], sigma, w), profile(theta[:, 1], self.ratio * sigma, h)
-        flux = theta[:, 2, None]
-        weights = np.asarray(self.response)[self.filters]
-        # kappa times the mixed derivative; a second one by the centre is by_sigma / sigma (heat equation)
-        kappa, tall = self.mixed_px2, self.ratio * sigma[:, None]
-        images = [
-            outer(flux * down.share, across.by_centre)
-            + kappa * outer(flux * down.by_centre, across.by_sigma / sigma[:, None]),
-            outer(flux * down.by_centre, across.share) + kappa * outer(flux * down.by_sigma / tall, across.by_centre),
-            outer(down.share, across.share) + kappa * outer(down.by_centre, across.by_centre),
-        ]
-        images = [weights * image for image in images]
-        images += [np.broadcast_to(self.filters == c, (len(theta), h, w)) for c in range(3)]
+        ratio, mixed = (np.full(len(theta), value) for value in (self.ratio, self.mixed_px2))
+        spots = spot_images(theta[:, :2], theta[:, 2], sigma, ratio, mixed, shape, self.free_width)
+        spots *= np.asarray(self.response)[self.filters]
+        derivatives = np.empty((len(theta), self.unknowns, *shape))
+        derivatives[:, :3] = spots[:, :3]
+        derivatives[:, 3:6] = self.filters == np.arange(3)[:, None, None]
         if self.free_width:
-            along_v = outer(self.ratio * flux * down.by_sigma, across.share)
-            images.append((along_v + outer(flux * down.share, across.by_sigma)) * weights)
-        derivatives = np.stack(images, axis=1).reshape(len(theta), self.unknowns, h * w).astype(float)
-        levels = np.einsum("mc,mcr->mr", theta[:, 3:6], derivatives[:, 3:6])
-        return self.base_e + levels + flux * derivatives[:, 2], derivatives
+            derivatives[:, 6] = spots[:, 3]
+        flat = derivatives.reshape(len(theta), self.unknowns, -1)
+        levels = np.einsum("mc,mcr->mr", theta[:, 3:6], flat[:, 3:6])
+        return self.base_e + levels + theta[:, 2, None] * flat[:, 2], flat

@@ -84,8 +84,9 @@ def _region(image: Image, dark: Image | None, pair: Pair, start: Array, depth_m:
         x, extra = x - off + float(np.median(off)), _variance(off, pair.card)[None]
     r, g, b = pair.rig.camera.detector.laser_filter_response
     response = (r, g, b) if pair.card.mosaic == "bayer" else None
-    sigma = pair_blur(pair, start, depth_m).round_px
-    return spot_regions(x[None], (u0, v0), noise_of(pair.card), sigma, response, extra_e2=extra)
+    blur, noise = pair_blur(pair, start, depth_m), noise_of(pair.card)
+    shape = {"ratio": blur.ratio, "mixed_px2": blur.mixed_px2}
+    return spot_regions(x[None], (u0, v0), noise, blur.sigma_px, response, extra_e2=extra, **shape)
 
 
 def _variance(off_e: Array, card: SensorCard) -> Array:
