@@ -95,8 +95,9 @@ def _moments(mu: float, card: SensorCard, noise: PixelNoise) -> Array:
         dx = x - x @ p
         variance = dx**2 @ p
         covariance = (y - mean[:, None]) * dx @ p
-        left = (y - mean[:, None]) ** 2 @ p - covariance**2 / variance
-        result[:, i] = np.stack([mean, covariance / variance * card.dn_per_e, np.maximum(left, 0.0)], axis=-1)
+        slope = covariance / variance if variance > 0.0 else np.zeros(3)  # 0: full pixels have one DN only
+        left = (y - mean[:, None]) ** 2 @ p - slope * covariance
+        result[:, i] = np.stack([mean, slope * card.dn_per_e, np.maximum(left, 0.0)], axis=-1)
     return result
 
 

@@ -69,6 +69,11 @@ class Noise:
     sigma: Array
     factor: Array
 
+    @property
+    def dead(self) -> bool:
+        """Whether no coefficient changes with the noise: the quantiser's output says nothing."""
+        return len(self.sigma) == 0
+
     def whitened(self, values: Array) -> Array:
         """Values, shape (l, ...), in units in which their covariance is the unit matrix."""
         return np.asarray(solve_triangular(self.factor, values, lower=True, check_finite=False))
@@ -155,13 +160,18 @@ class Window:
 
     def fisher(self, theta: Array) -> Array:
         """J^T C^-1 J of the model's output, shape (k, k)."""
-        _, J = self.residual(self.noise(theta), theta[None])
+        noise = self.noise(theta)
+        if noise.dead:
+            return np.zeros((len(theta), len(theta)))
+        _, J = self.residual(noise, theta[None])
         return np.asarray(J[0] @ J[0].T)
 
 
 def fit_window(window: Window, starts: Array) -> JpegFit:
     """Fit one window from hypotheses, shape (s, k); the one with the smallest misfit after some steps goes on."""
     noise = window.noise(starts[0])
+    if noise.dead:
+        return JpegFit(starts[0], np.zeros((starts.shape[1],) * 2), np.nan, False)
     theta = _best(window, noise, starts)
     r, J = window.residual(noise, theta[None])
     length = np.inf

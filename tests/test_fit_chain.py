@@ -37,6 +37,15 @@ SRGB, MJPEG = sensor("srgb8"), sensor("mjpeg")
 FLUX_E = 5000.0 / COLLECTED
 
 
+def test_an_image_that_compression_has_emptied_has_no_spot() -> None:
+    """Hardly any noise and coarse steps: no coefficient changes, so that there is nothing to fit; no error either."""
+    card = card_of(sensor("mjpeg", jpeg_quality=1, read_noise_e=0.01, prnu=0.0, dsnu_e=0.0))
+    flat = np.full((1, 48, 64, 3), 20, np.uint8)
+    fit = fit_jpeg(flat, (0, 0), card, 0.7)
+    assert fit.status[0] == Status.NO_SPOT
+    assert not np.isfinite(chain_limit(card, (30.2, 22.7), 0.7, 50.0, (1.0, 1.0, 1.0)).covariance_px2).any()
+
+
 def test_tone_curve_against_the_simulators() -> None:
     x = np.concatenate([[-0.1, 0.0, 0.0031308, 1.0, 1.2], np.linspace(0.0, 1.0, 501)])
     np.testing.assert_allclose(tone_curve.encoded(x), isp.srgb_encoded(x), rtol=0, atol=1e-12)
