@@ -9,8 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from phibench.datasets.sensor_card import card_of
+from phibench.estimator.fit_raw import fit_law
 from phibench.estimator.methods.registry import METHODS
 from phibench.estimator.mirror_image import image_of
+from phibench.estimator.pixel_law import GaussLaw
+from phibench.estimator.raw_pixels import bayer_filters, noise_of
 from phibench.estimator.seat.pair import Pair
 from phibench.estimator.spot_blur import SpotBlur, spot_blur
 from phibench.estimator.studies.cut import Shot, SpotPair, cut_region, cut_rig, taken, without_off
@@ -42,6 +46,37 @@ def test_the_beam_is_as_wide_as_in_the_rendered_image(depth_m: float) -> None:
         assert without == pytest.approx(point[1] - np.eye(2) / 12.0, abs=3e-4)
         far = moments(spot_blur(rig, sized[0]))
         assert np.trace(with_size - far) > 0.01  # so that leaving both out would be seen
+
+
+@pytest.mark.parametrize(("depth_m", "without_mpx"), [(1.0, 25.0), (2.18, 8.0)])
+def test_fit_of_noise_free_spots(depth_m: float, without_mpx: float) -> None:
+    """Expected electrons of a rendered spot in a Bayer mosaic: what is left is not the noise's.
+
+    3 mpx: the spot is a disc of defocus, not a Gaussian, and the chief ray is not its centroid (coma, 0.3 mpx).
+    """
+    card, rig, beam = card_of(sensor("bayer-raw")), Rig(), Beam()
+    with_size, without = [], []
+    for k in range(10):
+        azimuth = 2.399963 * k
+        away = (math.cos(azimuth), math.sin(azimuth))
+        place, inward = (depth_m * away[0], depth_m * away[1], 0.5), (-away[0], -away[1], 0.0)
+        layer = spot_layer(rig.at(0.0), LaserSpot(place, inward, beam.diameter_m(depth_m)), ())
+        uv = image_of(rig.at(0.0), np.array(place)).uv_px
+        middle = np.rint(uv).astype(int) - [layer.u0_px, layer.v0_px]
+        square = (slice(middle[1] - 5, middle[1] + 6), slice(middle[0] - 5, middle[0] + 6))
+        corner = np.array([[layer.u0_px + middle[0] - 5, layer.v0_px + middle[1] - 5]])
+        filters = bayer_filters(corner, (11, 11))
+        light = layer.electrons_per_s[:, square[0], square[1]] * card.exposure_s
+        room = np.array([900.0, 800.0, 400.0])[filters]
+        x = np.take_along_axis(light, filters, axis=0) + room
+        for known, errors in (((depth_m, beam), with_size), ((), without)):
+            blur = spot_blur(rig, uv, *known)
+            fit = fit_law(
+                x, corner, GaussLaw(noise_of(card)), blur.sigma_px, ratio=blur.ratio, mixed_px2=blur.mixed_px2
+            )
+            errors.append(1e3 * np.abs(fit.uv_px[0] - uv).max())
+    assert max(with_size) < 3.0
+    assert max(without) > without_mpx
 
 
 def test_near_spots_are_as_far_off_as_claimed() -> None:
