@@ -158,7 +158,7 @@ def _rendered(rendered: pl.DataFrame) -> str:
     worst = float(np.nanmax(np.abs(gap)))
     return (
         f"A misaligned rig that was rendered errs by up to {1e3 * largest:.0f} mm; its noise-free frames and the "
-        f"closed form differ by at most {1e3 * worst:.1f} mm over {len(rendered)} estimates."
+        f"closed form differ by at most {1e3 * worst:.2g} mm over {len(rendered)} estimates."
     )
 
 
