@@ -61,7 +61,7 @@ class Isotropy:
     false_alarm : float
         Probability, in each test, of "not isotropic" where the scatter is the same.
     ratio : float
-        Largest over smallest scatter.
+        Largest over smallest scatter, of spots with two errors or more; NaN if there is none.
     """
 
     p_value: float
@@ -106,9 +106,10 @@ def azimuth_noise(pair: Pair, sensor: Sensor, draws: int, baseline: str, rules: 
 
 def isotropy(noise: Sequence[AzimuthNoise], false_alarm: float) -> Isotropy:
     """Test whether the scatter is the same at all azimuths, and whether it is relative to each spot's bound."""
-    scatter = [one.scatter_m.value for one in noise]
+    scatter = [one.scatter_m.value for one in noise if one.errors_m.size > 1]
+    ratio = max(scatter) / min(scatter) if scatter else math.nan
     plain, scaled = ([one.errors_m for one in noise], [one.errors_m / one.bound_m for one in noise])
-    return Isotropy(_equal_scatter(plain), _equal_scatter(scaled), false_alarm, max(scatter) / min(scatter))
+    return Isotropy(_equal_scatter(plain), _equal_scatter(scaled), false_alarm, ratio)
 
 
 def _equal_scatter(groups: Sequence[Array]) -> float:

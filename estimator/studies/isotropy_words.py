@@ -35,7 +35,10 @@ def noise_sentence(name: str, noise: Sequence[AzimuthNoise], test: Isotropy) -> 
 
 def bias_sentence(name: str, noise: Sequence[AzimuthNoise]) -> str:
     """Largest systematic error of the likelihood fits."""
-    worst = max(noise, key=lambda one: abs(one.bias_m))
+    usable = [one for one in noise if one.errors_m.size > 1]
+    if not usable:
+        return f"{name}: too few estimates for a mean error."
+    worst = max(usable, key=lambda one: abs(one.bias_m))
     share = abs(worst.bias_m) / worst.scatter_m.value
     return (
         f"{name}: the mean error is at most {1e3 * abs(worst.bias_m):.2g} +- {1e3 * worst.bias_sigma_m:.1g} mm, "
