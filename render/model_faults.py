@@ -87,7 +87,7 @@ def schema_node(schema: Schema, location: Location) -> Schema:
     """Return the part of a JSON schema that describes one key, references and optional values resolved."""
     node = _resolve(schema, schema)
     for part in location:
-        inner = node.get("items", {}) if isinstance(part, int) else node.get("properties", {}).get(part, {})
+        inner = _entry(node, part) if isinstance(part, int) else node.get("properties", {}).get(part, {})
         description = inner.get("description")
         node = _resolve(schema, inner)
         node = {**node, "description": description} if description else node
@@ -112,7 +112,7 @@ def allowed(node: Schema) -> str:
         words.append(f"of at most {node['maxLength']} letters, digits and signs like {_signs(node['pattern'])}")
     if "minItems" in node:
         count = "of" if node["minItems"] == node.get("maxItems") else "of at least"
-        words.append(f"{count} {node['minItems']} ({allowed(node['items'])})" if _plain(node) else "with entries")
+        words.append(f"{count} {node['minItems']} ({allowed(_entry(node))})" if _plain(node) else "with entries")
     return " ".join(words)
 
 
@@ -121,7 +121,15 @@ def _limits(node: Schema) -> list[str]:
 
 
 def _plain(node: Schema) -> bool:
-    return "$ref" not in node.get("items", {"$ref": ""})
+    entry = _entry(node)
+    return bool(entry) and "$ref" not in entry
+
+
+def _entry(node: Schema, index: int = 0) -> Schema:
+    """Schema of a list's entry; a list of so many entries has one for each."""
+    each = node.get("prefixItems", ())
+    found: Schema = each[min(index, len(each) - 1)] if each else node.get("items") or {}
+    return found
 
 
 def _number(value: float) -> str:
