@@ -22,7 +22,7 @@ def error_drawing(table: pl.DataFrame, sample: str, preset: str) -> Drawing:
     """Rms error of position against every factor, a curve per method, and the bound."""
     mine = table.filter(pl.col("sample") == sample, pl.col("preset") == preset)
     factors = [name for name in FACTORS if name in mine["factor"].unique().to_list()]
-    methods = sorted(mine["method"].unique().to_list())
+    methods = sorted(table["method"].unique().to_list())  # of all presets: a method has one look in all drawings
     rows = math.ceil(len(factors) / _COLUMNS)
     with canvas(11.0, 2.6 * rows + 0.9) as figure:
         axes = np.atleast_1d(figure.subplots(rows, min(_COLUMNS, len(factors)), sharey=True, squeeze=False)).ravel()
@@ -32,8 +32,8 @@ def error_drawing(table: pl.DataFrame, sample: str, preset: str) -> Drawing:
             ax.set_axis_off()
         for ax in axes[:: min(_COLUMNS, len(factors))]:
             ax.set_ylabel("rms distance, px")
-        handles, labels = axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
+        seen = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+        figure.legend(list(seen.values()), list(seen), loc="outside lower center", ncols=5, frameon=False)
         figure.suptitle(f"{sample}, {preset}")
         return drawn(f"errors-{preset}-{sample}", figure, _alt(mine, sample, preset), "png")
 
@@ -57,6 +57,8 @@ def ranking_drawing(found: Sequence[Elasticity], sample: str, presets: Sequence[
 def _panel(ax: Any, part: pl.DataFrame, factor: str, methods: Sequence[str]) -> None:
     for i, method in enumerate(methods):
         curve = part.filter(pl.col("method") == method, pl.col("rms_px").is_not_nan()).sort("level")
+        if curve.is_empty():
+            continue
         x, y = curve["level"].to_numpy(), curve["rms_px"].to_numpy()
         ends = (curve[f"rms_px_{end}"].to_numpy() for end in ("low", "high"))
         low, high = (np.where(np.isfinite(end), np.abs(y - end), 0.0) for end in ends)
