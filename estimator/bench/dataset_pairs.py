@@ -26,7 +26,7 @@ from phibench.estimator.bench.truth import Distraction, PairTruth, SpotTruth
 from phibench.estimator.seat.pair import Box, Image, Pair
 from phibench.scenes.laser import Beam
 
-TASK_VERSION = 1
+TASK_VERSION = 2
 """Version of the task: what a method is given, what it must answer and what is counted. A change of any raises it."""
 
 

@@ -162,7 +162,7 @@ def _write_pair(work: Path, pair: Pair, frames: Frames) -> PublicPair:
         card=to_json(pair.card),
         box_down=_box(pair.box_down),
         box_up=_box(pair.box_up),
-        beam=None if pair.beam is None else asdict(pair.beam),
+        beam=None if pair.beam is None else to_json(pair.beam),
     )
 
 

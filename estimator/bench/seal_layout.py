@@ -61,7 +61,7 @@ class PublicPair(Document):
     card: dict[str, Any]
     box_down: PublicBox | None
     box_up: PublicBox | None
-    beam: dict[str, float] | None = None
+    beam: dict[str, Any] | None = None
 
 
 def seal_id(public_sha256: str, truth_sha256: str) -> str:

@@ -77,7 +77,7 @@ class SealedPairs:
             up_off=images.get("up_off"),
             box_down=_box(row.box_down),
             box_up=_box(row.box_up),
-            beam=None if row.beam is None else Beam(**row.beam),
+            beam=None if row.beam is None else from_json(Beam, row.beam),
         )
 
     def truth(self, number: int) -> PairTruth:
