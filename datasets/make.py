@@ -11,26 +11,19 @@ from pathlib import Path
 
 from rich.console import Console
 
-from phibench.datasets import layout
-from phibench.datasets.crew import Crew
-from phibench.datasets.documents import documents, unlike, write_documents
-from phibench.datasets.environment import versions
+from phibench.datasets.build.assemble import documents, unlike, visibility_line, write_documents
+from phibench.datasets.build.journal import Head, Journal
+from phibench.datasets.build.run_tasks import claim, finish_tasks, remove_files, stale_files, unfinished
+from phibench.datasets.build.task_list import plan_tasks
+from phibench.datasets.build.workers import Crew, versions
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.files import WriteError, remove_temporary, write_text
-from phibench.datasets.finish import finish_tasks, unfinished
-from phibench.datasets.info import dataset_info, info_text, parse_info, same_content
-from phibench.datasets.journal import Head, Journal
-from phibench.datasets.lock import only_run
-from phibench.datasets.manifest import read_manifest
-from phibench.datasets.output import claim, remove_files, stale_files
-from phibench.datasets.plan import Plan, make_plan
-from phibench.datasets.recipe_checks import warnings
-from phibench.datasets.recipe_file import find_recipe, parse_recipe, recipe_text
-from phibench.datasets.recipe_text import with_numbers
-from phibench.datasets.schema import DatasetInfo
-from phibench.datasets.shard import shard_plan
-from phibench.datasets.visibility import visibility_line
-from phibench.datasets.work import plan_tasks
+from phibench.datasets.plan.plan import Plan, make_plan, shard_plan
+from phibench.datasets.recipe.checks import warnings
+from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_text, with_numbers
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.documents import dataset_info, info_text, parse_info, read_manifest, same_content
+from phibench.datasets.store.files import WriteError, only_run, remove_temporary, write_text
+from phibench.datasets.store.schema import DatasetInfo
 
 
 def make(

@@ -16,23 +16,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets import layout
-from phibench.datasets.codec import from_json
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.frame_source import FrameSource
-from phibench.datasets.frames import Frames
-from phibench.datasets.info import read_info
-from phibench.datasets.layers import SpotWindow, read_ambient, read_ambient_variance, read_spot, read_truth
-from phibench.datasets.manifest import read_manifest
-from phibench.datasets.recipe import Recipe
-from phibench.datasets.rigs import Rigs, read_rigs
-from phibench.datasets.schema import DatasetInfo, ManifestRow, SpotRow
-from phibench.datasets.sensitivity_file import read_sensitivities
-from phibench.datasets.sums import check_documents
+from phibench.datasets.frames.source import Frames, FrameSource
+from phibench.datasets.recipe.tables import Recipe
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.checksums import check_documents
+from phibench.datasets.store.documents import Rigs, from_json, read_info, read_manifest, read_rigs, read_sensitivities
+from phibench.datasets.store.layers import SpotWindow, read_ambient, read_ambient_variance, read_spot, read_truth
+from phibench.datasets.store.schema import DatasetInfo, ManifestRow, SpotRow
 from phibench.scenes.laser import Beam, LaserSpot
-from phibench.scenes.names import nearest
 from phibench.scenes.rig import POSITIONS, Rig, View
 from phibench.scenes.room import Room
+from phibench.scenes.validation import nearest
 
 if TYPE_CHECKING:
     from polars import DataFrame

@@ -10,13 +10,23 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from phibench.datasets import layout
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.preview import Picture, exposure_s, halved, save_png, to_srgb
 from phibench.datasets.progress import Steps
 from phibench.datasets.read import Dataset, Sample, open_finished
-from phibench.datasets.schema import ManifestRow, SpotRow
-from phibench.datasets.spot_picture import TEXT, captioned, crop, enlarged, marked
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.pictures import (
+    TEXT,
+    Picture,
+    captioned,
+    crop,
+    enlarged,
+    exposure_s,
+    halved,
+    marked,
+    save_png,
+    to_srgb,
+)
+from phibench.datasets.store.schema import ManifestRow, SpotRow
 from phibench.scenes.rig import POSITIONS
 
 _ZOOM = 8  # pixels of the enlarged window are shown 8 x 8

@@ -1,7 +1,11 @@
-"""Is a data set what it says it is: every file opened, every truth computed again from the parameters."""
+"""Whether a data set holds what its recipe means: samples, poses, and for each sample its rig, spot and stroke.
+
+Is a data set what it says it is: every file opened, every truth computed again from the parameters.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -11,25 +15,91 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from phibench.datasets import layout
-from phibench.datasets.bake_task import read_light_map
+from phibench.datasets.build.bake_task import read_light_map
+from phibench.datasets.build.sample_task import noise_row, spot_noise
+from phibench.datasets.build.spot_task import SpotAnswer, answer_spot
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.exr import read_exr
-from phibench.datasets.layers import SPOT_STACKS, read_ambient, read_ambient_variance, read_spot, read_truth
-from phibench.datasets.manifest import differences, same_number
+from phibench.datasets.plan.plan import PairPlan, Plan, make_plan, shard_plan
 from phibench.datasets.progress import Steps
 from phibench.datasets.read import Dataset, Sample, open_dataset
-from phibench.datasets.sample_task import noise_row, spot_noise
-from phibench.datasets.schema import PoseInfo, SpotRow
-from phibench.datasets.sensitivity_file import sensitivity_fault
-from phibench.datasets.spot_task import SpotAnswer, answer_spot
-from phibench.datasets.sums import damaged, read_sums, strays
-from phibench.datasets.verify_plan import plan_faults
-from phibench.render.bake import fixed_shapes
-from phibench.render.patches import cut, texel_count
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.checksums import damaged, read_sums, strays
+from phibench.datasets.store.documents import differences, same_number, sensitivity_fault, to_json
+from phibench.datasets.store.layers import (
+    SPOT_STACKS,
+    read_ambient,
+    read_ambient_variance,
+    read_exr,
+    read_spot,
+    read_truth,
+)
+from phibench.datasets.store.schema import ManifestRow, PoseInfo, SpotRow
+from phibench.render.room.light_map import fixed_shapes
+from phibench.render.room.shading import cut, texel_count
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import POSITIONS, View
 from phibench.scenes.room import Room
+
+
+def plan_faults(dataset: Dataset) -> Iterator[str]:
+    """Faults of manifest, rigs and poses against the plan of the recipe."""
+    try:
+        plan = shard_plan(make_plan(dataset.recipe), dataset.info.shard)
+    except DatasetError as error:
+        yield f"{layout.INFO}: its recipe cannot be followed: {error}"
+        return
+    rows, pairs = {row.sample_id: row for row in dataset.rows}, {pair.sample_id: pair for pair in plan.pairs}
+    for name in sorted(set(pairs) - set(rows)):
+        yield f"{layout.MANIFEST}: sample {name} of the recipe is missing"
+    for name in sorted(set(rows) - set(pairs)):
+        yield f"{layout.MANIFEST}: sample {name} is not in the recipe"
+    if len(rows) != len(dataset.rows):
+        yield f"{layout.MANIFEST}: a sample is listed twice"
+    for name in (name for name in pairs if name in rows):
+        yield from _row_faults(plan, pairs[name], rows[name])
+    yield from _rig_faults(plan, dataset)
+    if [(pose.pose, pose.rig) for pose in dataset.info.poses] != [(pose.pose_id, pose.rig) for pose in plan.poses]:
+        yield f"{layout.INFO}: the poses are not those of the recipe"
+
+
+def _row_faults(plan: Plan, pair: PairPlan, row: ManifestRow) -> Iterator[str]:
+    spot = plan.spots[pair.spot]
+    expected = {
+        **{name: getattr(pair, name) for name in ("experiment", "target", "rig", "nominal_rig", "tries")},
+        **{name: getattr(pair, name) for name in ("stroke_m", "nominal_stroke_m")},
+        "drawn": dict(pair.drawn),
+        "spot_world_m": spot.position_world_m,
+        "spot_normal_world": spot.normal_world,
+        "spot_diameter_m": spot.diameter_m,
+    }
+    for name, value in expected.items():
+        if not alike(getattr(row, name), value):
+            yield f"{row.sample_id}: {name} is {getattr(row, name)}, the recipe gives {value}"
+
+
+def _rig_faults(plan: Plan, dataset: Dataset) -> Iterator[str]:
+    held = dataset.rigs.documents
+    if set(held) != set(plan.rigs):
+        yield f"{layout.RIGS}: the rigs are not those of the recipe"
+    for name in (name for name in plan.rigs if name in held):
+        if not alike(_with_form(held[name]), json.loads(json.dumps(to_json(plan.rigs[name])))):
+            yield f"{layout.RIGS}: {name} is not the rig that the recipe gives"
+
+
+def _with_form(rig: dict[str, Any]) -> dict[str, Any]:
+    """Document of a rig; one of schema version 4 knows no form, and its mirror has none."""
+    mirror = rig.get("mirror")
+    return {**rig, "mirror": {"form": None, **mirror}} if isinstance(mirror, dict) else rig
+
+
+def alike(a: Any, b: Any) -> bool:
+    """Equality of nested documents, of their numbers to rounding."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(alike(a[key], b[key]) for key in a)
+    if isinstance(a, list | tuple) and isinstance(b, list | tuple):
+        return len(a) == len(b) and all(alike(x, y) for x, y in zip(a, b, strict=True))
+    return same_number(a, b) if isinstance(a, float) and isinstance(b, float | int) else bool(a == b)
+
 
 _FLOAT32 = 1e-6  # float32 rounds by 6e-8; other machines' libm adds a little
 _ANSWERS = 64  # of 0.1 MB each
@@ -219,7 +289,7 @@ def _light_map_faults(dataset: Dataset) -> Iterator[str]:
 
 
 def _truth_faults(dataset: Dataset, pose: PoseInfo, shape: tuple[int, int]) -> Iterator[str]:
-    from phibench.render.truth import truth_layer
+    from phibench.render.optics.truth import truth_layer
 
     stored, view = read_truth(dataset.folder / pose.files["truth"]), dataset.rigs[pose.rig].at(pose.offset_m)
     expected = truth_layer(view, dataset.room.shapes(view))

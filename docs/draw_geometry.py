@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Arc, Circle
 
-from phibench.render.alhazen import reflection_points
+from phibench.render.optics.reflection_point import reflection_points
 
 RADIUS, Z_C, STROKE, SPOT = 0.42, 1.0, 1.75, np.array([4.2, 0.35])
 BLUE, RED, GREY = "#1f5fa8", "#c03028", "0.45"

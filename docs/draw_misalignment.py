@@ -15,13 +15,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch
 
-from phibench.estimator.mirror_image import image_of
-from phibench.estimator.sensitivities import PARAMETERS as GEOMETRIC
-from phibench.estimator.sensitivities import sensitivity
-from phibench.estimator.triangulate import depth_exact
+from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.sensitivities import PARAMETERS as GEOMETRIC
+from phibench.estimator.geometry.sensitivities import sensitivity
+from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.scenes.catalog import default_rig
-from phibench.scenes.form import HARMONICS
 from phibench.scenes.frames import Pose
+from phibench.scenes.mirror import HARMONICS
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
 from phibench.scenes.rig import Rig
 

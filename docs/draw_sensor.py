@@ -14,23 +14,21 @@ import numpy as np
 
 matplotlib.use("Agg")
 
+from helpers.photon_transfer import Stack
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from phibench.datasets.files import write_bytes
-from phibench.datasets.frame_source import FrameSource
+from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Sample, open_dataset
-from phibench.render import isp
-from phibench.render.chain import Chain
-from phibench.render.electrons import collected, expected_electrons, mean_charge
-from phibench.render.isp import linear_rgb, linear_signal, srgb_encoded
-from phibench.render.jpeg import compressed
-from phibench.render.light import Light
-from phibench.render.photon_transfer import Stack
-from phibench.render.region import Region
-from phibench.render.sensor import Sensor, sensor
-from phibench.render.tiles import NoiseStream, frame_stream, whole_tiles
+from phibench.datasets.store.files import write_bytes
+from phibench.render.sensor import processing as isp
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import collected, expected_electrons, mean_charge
+from phibench.render.sensor.light import Light, Region
+from phibench.render.sensor.noise_tiles import NoiseStream, frame_stream, whole_tiles
+from phibench.render.sensor.processing import compressed, linear_rgb, linear_signal, srgb_encoded
+from phibench.render.sensor.settings import Sensor, sensor
 
 _POSITION, _SIDE_PX, _ZOOM = "down", 24, 16
 _FOLDER = Path(__file__).parent

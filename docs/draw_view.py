@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from phibench.datasets.preview import exposure_s, to_srgb
 from phibench.datasets.read import Sample, open_dataset
+from phibench.datasets.store.pictures import exposure_s, to_srgb
 
 _HALF, _ZOOM, _POSITION = 14, 12, "down"  # enlarged part, in image pixels either side
 

@@ -7,12 +7,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from phibench.scenes.camera import Camera
-from phibench.scenes.checks import finite, positive
 from phibench.scenes.frames import Vector, rotation_xyz
 from phibench.scenes.rig import Rig
-from phibench.scenes.room import Room
-from phibench.scenes.solids import Cuboid, Rectangle, cuboid, rectangle
-from phibench.scenes.textures import Checker, Uniform
+from phibench.scenes.room import Checker, Cuboid, Rectangle, Room, Uniform, cuboid, rectangle
+from phibench.scenes.validation import finite, positive
 
 # Inner faces of the lab, metres: about 10 x 9 x 3 with the stroke axis at the origin.
 X_LOW, X_HIGH, Y_LOW, Y_HIGH, HEIGHT = -4.8, 5.2, -4.6, 4.4, 3.0

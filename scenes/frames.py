@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.scenes.checks import SceneError, finite_vector
+from phibench.scenes.validation import SceneError, finite_vector
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from phibench.scenes.checks import SceneError, finite_vector, positive, unit_vector, within
 from phibench.scenes.frames import Array, Vector
+from phibench.scenes.validation import SceneError, finite_vector, positive, unit_vector, within
 
 Profile = Literal["gaussian", "uniform"]
 

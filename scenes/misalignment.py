@@ -1,4 +1,6 @@
-"""What is wrong with a real rig: signed deviations of the true rig from the nominal one, which the estimator believes.
+"""Rigid motion of the whole rig between the two images of a pair: the robot rolls, pitches, yaws or slips a little.
+
+What is wrong with a real rig: signed deviations of the true rig from the nominal one, which the estimator believes.
 
 All are 0 by default. World axes (z up; the robot's front is world +x); angles turn right-handed. The form's x, y, z are
 the world's at the down position, about the sphere centre; from there the form goes with the rig. Of several at once:
@@ -14,11 +16,43 @@ from typing import Any
 import numpy as np
 
 from phibench.scenes.camera import Camera
-from phibench.scenes.checks import SceneError, within
-from phibench.scenes.form import HARMONICS, Form
-from phibench.scenes.frames import Pose, Vector, as_matrix, as_vector, rotation_xyz
-from phibench.scenes.mirror import SphereMirror
-from phibench.scenes.motion import Motion
+from phibench.scenes.frames import IDENTITY, Matrix, Pose, Vector, as_matrix, as_vector, rotation_xyz
+from phibench.scenes.mirror import HARMONICS, Form, SphereMirror
+from phibench.scenes.validation import SceneError, within
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Turn about the lens centre, then shift, in world axes; camera and mirror go together.
+
+    Parameters
+    ----------
+    translation_m : 3 floats
+        Shift of the lens centre.
+    rotation : 3 x 3 nested tuple, proper orthogonal to 1e-9
+        Turn about the lens centre, where the carriage has brought it.
+    """
+
+    translation_m: Vector = (0.0, 0.0, 0.0)
+    rotation: Matrix = IDENTITY
+
+    def __post_init__(self) -> None:
+        checked = Pose("world", "world", self.translation_m, self.rotation)
+        object.__setattr__(self, "translation_m", checked.translation_m)
+        object.__setattr__(self, "rotation", checked.rotation)
+
+    def moved(self, T_world_camera: Pose) -> Pose:
+        """Camera pose after the motion."""
+        return replace(
+            T_world_camera,
+            translation_m=as_vector(T_world_camera.t + np.array(self.translation_m)),
+            rotation=as_matrix(np.array(self.rotation) @ T_world_camera.R),
+        )
+
+    def then(self, other: Motion) -> Motion:
+        """Both motions, `other` last; both turn about the lens centre, so that shifts add."""
+        shift = np.array(self.translation_m) + np.array(other.translation_m)
+        return Motion(as_vector(shift), as_matrix(np.array(other.rotation) @ np.array(self.rotation)))
 
 
 def _number(unit: str, limit: float, study: float, meaning: str) -> Any:

@@ -45,7 +45,7 @@ class InlineCrew:
         return None
 
     def environment(self) -> dict[str, object]:
-        from phibench.datasets.environment import describe
+        from phibench.datasets.build.workers import describe
 
         return {key: value for key, value in describe().items() if key != "worker"}
 
@@ -66,7 +66,7 @@ class Inline:
         self._waiting.append(task)
 
     def next(self) -> Any:
-        from phibench.datasets.task import perform
+        from phibench.datasets.build.tasks import perform
 
         task = self._waiting.popleft()
         return task, perform(task, self._out)
@@ -123,7 +123,7 @@ def bench_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def method(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Reference of a method in a file: the brightest pixel; it fails on pair 1."""
-    from sealed_sets import METHOD
+    from helpers.sealed_sets import METHOD
 
     file = tmp_path_factory.mktemp("method") / "mine.py"
     file.write_text(METHOD)
@@ -135,7 +135,7 @@ def sealed(bench_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Any
     """Sealed set of 9 pairs, with its truth. Read only: copy it to change it."""
     from rich.console import Console
 
-    from phibench.estimator.bench.seal import seal
+    from phibench.estimator.benchmark.sealed_set import seal
 
     folder = tmp_path_factory.mktemp("private")
     shutil.copytree(bench_dataset, folder / "set")
@@ -145,7 +145,7 @@ def sealed(bench_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Any
 @pytest.fixture(scope="session")
 def submitted(sealed: Any, method: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Submission of `method` to `sealed`."""
-    from phibench.estimator.bench.submission import submit
+    from phibench.estimator.benchmark.submission import submit
 
     out = tmp_path_factory.mktemp("submission") / "submission.json"
     done = submit(sealed.public, method, out)

@@ -11,15 +11,15 @@ from scipy import stats
 from test_calibration import apparent
 
 from phibench.estimator.calibration.bundle import KnownSpot, calibrate
-from phibench.estimator.calibration.measured import Measured
-from phibench.estimator.calibration.parameters import PARAMETERS, changed, prior_sigmas, stroke_of
+from phibench.estimator.calibration.limb_image import Measured
 from phibench.estimator.calibration.vertical_edges import vertical_of
-from phibench.estimator.depth_general import depth_general
-from phibench.estimator.triangulate import depth_exact
-from phibench.render.spot_truth import spot_truth
+from phibench.estimator.geometry.least_squares_depth import depth_general
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas, stroke_of
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.render.optics.truth import spot_truth
 from phibench.scenes.laser import LaserSpot
+from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
-from phibench.scenes.streams import generator
 
 BELIEVED, STROKE = Rig(), 0.5
 DRAWN = {

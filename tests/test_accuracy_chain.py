@@ -7,18 +7,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from chain_scenes import COLLECTED, MIDDLE, ROOM, SQUARE, drawn, scene
+from helpers.chain_scenes import COLLECTED, MIDDLE, ROOM, SQUARE, drawn, scene
 from scipy import stats
 
-from phibench.datasets.sensor_card import card_of
-from phibench.estimator.chain_limit import chain_limit
-from phibench.estimator.fisher import processed_fisher
-from phibench.estimator.limits import limit_of
-from phibench.render.chain import Chain
-from phibench.render.moments import drawn_moments
-from phibench.render.region import Region
-from phibench.render.sensor import Sensor, sensor
-from phibench.render.tiles import NoiseStream
+from phibench.datasets.frames.sensor_card import card_of
+from phibench.estimator.limits.position_bound import limit_of
+from phibench.estimator.limits.processed_bound import chain_limit
+from phibench.estimator.spots.fit_raw import processed_fisher
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.light import Region
+from phibench.render.sensor.moments import drawn_moments
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.settings import Sensor, sensor
 
 SRGB, MJPEG = sensor("srgb8"), sensor("mjpeg")
 CELLS = [
@@ -102,9 +102,8 @@ def test_accuracy_of_the_srgb_limit_lies_above_the_raw_one() -> None:
     """8 bits cost at most some per cent, and never gain: the raw signal is a finer reading of the same pixels."""
     flux_e = 5000.0 / COLLECTED
     raw = card_of(sensor("bayer-raw", prnu=0.0, dsnu_e=0.0, gain_dn_per_e=1.3, adc_bits=14))
-    from phibench.datasets.expected import expected_of_light
-    from phibench.estimator.limits import derivative_images
-    from phibench.estimator.pixel_information import exact_information
+    from phibench.datasets.exposures.expected import expected_of_light
+    from phibench.estimator.limits.position_bound import derivative_images, exact_information
 
     s = sensor("srgb8", prnu=0.0, dsnu_e=0.0)
     region = expected_of_light(scene(MIDDLE, 0.7, flux_e, 100.0, s), s.replace(output="raw"))

@@ -7,23 +7,21 @@ import math
 
 import numpy as np
 import pytest
-from form_oracles import form_pixel
+from helpers.form_oracles import form_pixel
 from test_accuracy_misalignment import Case, check, draw_case
 from test_form import formed
 
-from phibench.render.certificate import certify, trace_spot
-from phibench.render.spot import spot_layer
-from phibench.render.spot_truth import spot_truth
+from phibench.render.optics.certificate import certify, trace_spot
+from phibench.render.optics.spot_layer import spot_layer
+from phibench.render.optics.truth import spot_truth
 from phibench.scenes.camera import Camera
 from phibench.scenes.catalog import default_rig
-from phibench.scenes.checks import SceneError
-from phibench.scenes.form import HARMONICS, Form
 from phibench.scenes.laser import LaserSpot
+from phibench.scenes.mirror import HARMONICS, Form
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import POSITIONS, View
-from phibench.scenes.room import Room
-from phibench.scenes.solids import rectangle
-from phibench.scenes.textures import Uniform
+from phibench.scenes.room import Room, Uniform, rectangle
+from phibench.scenes.validation import SceneError
 
 UNSEEN = ("no_reflection", "mirror_edge")
 
@@ -114,7 +112,9 @@ def test_accuracy_chief_ray_and_centroid_of_500_formed_mirrors() -> None:
 
 def test_a_certificate_notices_the_layer_of_another_form(monkeypatch: pytest.MonkeyPatch) -> None:
     """The spot of a perfect sphere, or of the same form turned inside out, is refused; the true one passes."""
-    monkeypatch.setattr("phibench.render.certificate._LOG2_RAYS", (13,))  # more rays would only find the same again
+    monkeypatch.setattr(
+        "phibench.render.optics.certificate._LOG2_RAYS", (13,)
+    )  # more rays would only find the same again
     spot, form = LaserSpot((2.0, 0.7, 0.5), (-1.0, -0.3, 0.1), 5e-3), Form(form_21c_m=2e-6, form_31c_m=-2e-6)
     view = formed(form).at(0.4)
     truth = spot_truth(view, spot, ())
@@ -162,9 +162,9 @@ def moments(image: np.ndarray) -> tuple[float, float, float]:
 
 def lamp_image(view: View, room: Room, crop: tuple[int, int, int, int] = CROP) -> np.ndarray:
     """Ambient layer, plane R, of a room with nothing in it but a lamp: its light map is dark."""
-    from phibench.render.ambient import render_ambient
-    from phibench.render.bake import BakeSettings, LightMap, fixed_shapes
-    from phibench.render.patches import cut, texel_count
+    from phibench.render.room.ambient import render_ambient
+    from phibench.render.room.light_map import BakeSettings, LightMap, fixed_shapes
+    from phibench.render.room.shading import cut, texel_count
 
     settings = BakeSettings(lamp_rays=4, bounce_rays=4, final_rays=4)
     texels = texel_count(cut(fixed_shapes(room), settings.texel_m))
@@ -199,8 +199,7 @@ def traced_lamp(view: View, side: int = 5) -> np.ndarray:
 
     Rays go all over the lens: through its centre alone the centroid would be 0.02 px off, of a sphere's image as well.
     """
-    from phibench.render.raycast import first_hit
-    from phibench.render.trace import trace_pixels
+    from phibench.render.optics.ray_tracer import first_hit, trace_pixels
 
     u0, v0, width, height = CROP
     cell, rng = np.mgrid[0:side, 0:side].reshape(2, -1).T, np.random.default_rng(0)
@@ -228,7 +227,7 @@ def electrons(camera: Camera, uv: np.ndarray) -> np.ndarray:
 @pytest.mark.slow
 def test_accuracy_ambient_against_a_mesh_in_the_path_tracer(lamp_room: Room) -> None:
     """The same image by Mitsuba's own path tracer on a fine mesh: flux 0.3 %, centroid 0.03 px (64 samples)."""
-    from phibench.render.path_ambient import path_trace
+    from helpers.path_ambient import path_trace
 
     view = formed(FORM, yaw_rad=0.02).at(0.2)
     ours, traced = moments(lamp_image(view, lamp_room)), moments(path_trace(view, lamp_room, 64, 3, 0, CROP)[0])

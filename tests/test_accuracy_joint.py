@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from joint_pairs import BAYER, MONO, RIG, drawn_pairs
+from helpers.joint_pairs import BAYER, MONO, RIG, drawn_pairs
 from scipy import stats
 
-from phibench.estimator.combine import joint_sigma_m
-from phibench.estimator.status import Status
-from phibench.estimator.triangulate import depth_exact
-from phibench.render.sensor import Sensor
+from phibench.estimator.geometry.combine import joint_sigma_m
+from phibench.estimator.geometry.status import Status
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.render.sensor.settings import Sensor
 
 POSITIONS, CAMERAS = 40, 100
 LEAST = 4.5  # standard deviations: a chance of 7e-6

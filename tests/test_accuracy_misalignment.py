@@ -8,20 +8,20 @@ import math
 
 import numpy as np
 import pytest
-from oracles import alhazen_quartic, fermat_path, random_spot, true_pixel
+from helpers.oracles import alhazen_quartic, fermat_path, random_spot, true_pixel
 from scipy.spatial.transform import Rotation
 
-from phibench.render.certificate import CENTROID_TOLERANCE_PX, CHIEF_TOLERANCE_PX, certify
-from phibench.render.spot import spot_layer
-from phibench.render.spot_truth import SpotTruth, depth_m, spot_truth
+from phibench.render.optics.certificate import CENTROID_TOLERANCE_PX, CHIEF_TOLERANCE_PX, certify
+from phibench.render.optics.spot_layer import spot_layer
+from phibench.render.optics.truth import SpotTruth, depth_m, spot_truth
 from phibench.scenes.camera import Camera
 from phibench.scenes.catalog import c310_camera
-from phibench.scenes.checks import SceneError
-from phibench.scenes.form import HARMONICS
 from phibench.scenes.frames import Pose
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
+from phibench.scenes.mirror import HARMONICS
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
 from phibench.scenes.rig import POSITIONS, Rig, View
+from phibench.scenes.validation import SceneError
 
 
 @dataclasses.dataclass(frozen=True)

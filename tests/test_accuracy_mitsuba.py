@@ -11,26 +11,22 @@ from typing import Any
 
 import numpy as np
 import pytest
-from oracles import TARGETS, project_cv2
+from helpers.oracles import TARGETS, project_cv2
+from helpers.path_ambient import path_trace
 
-from phibench.render.ambient import render_ambient
-from phibench.render.bake import BakeSettings, bake
-from phibench.render.c310_plugin import MM_PER_M, sensor_dict
-from phibench.render.path_ambient import path_trace
-from phibench.render.spot import spot_layer
-from phibench.render.spot_truth import spot_truth
-from phibench.render.translate import load_scene, mirror_dict, scene_dict, to_scene_mm
-from phibench.render.truth import truth_layer
-from phibench.render.variant import activate
-from phibench.scenes.camera import Camera
+from phibench.render.optics.spot_layer import spot_layer
+from phibench.render.optics.truth import spot_truth, truth_layer
+from phibench.render.room.ambient import render_ambient
+from phibench.render.room.camera_plugin import MM_PER_M, sensor_dict
+from phibench.render.room.light_map import BakeSettings, bake
+from phibench.render.room.scene import load_scene, mirror_dict, scene_dict, to_scene_mm
+from phibench.render.setup.variant import activate
+from phibench.scenes.camera import Camera, Detector
 from phibench.scenes.catalog import c310_camera, default_rig, lab
-from phibench.scenes.detector import Detector
 from phibench.scenes.frames import Pose, rotation_facing, rotation_xyz
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import Rig, View
-from phibench.scenes.room import Room
-from phibench.scenes.solids import cuboid, rectangle
-from phibench.scenes.textures import Checker, Uniform
+from phibench.scenes.room import Checker, Room, Uniform, cuboid, rectangle
 
 SHARP = 0.05  # px; the least blur that Camera allows
 TILTED = Rig(
@@ -246,7 +242,7 @@ def test_ambient_electrons_in_a_furnace(mi: ModuleType) -> None:
         etendue = math.pi * camera.aperture_radius_m**2 * ray[2] ** 4 / (camera.fx_px * camera.fy_px)
         expected = etendue * np.array(camera.detector.band_electrons_per_joule())
         if seen_through_mirror:
-            from phibench.render.trace import trace_pixels
+            from phibench.render.optics.ray_tracer import trace_pixels
 
             cos_i = trace_pixels(view, np.array([[u0 + 1.5, v0 + 1.5]])).cos_incidence
             waves = camera.detector.band_wavelength_nm
@@ -284,8 +280,8 @@ def test_path_tracing_is_bit_identical_and_seeds_matter(mi: ModuleType) -> None:
 
 BAKE_AND_RENDER = """
 import hashlib, sys
-from phibench.render.ambient import render_ambient
-from phibench.render.bake import BakeSettings, bake
+from phibench.render.room.ambient import render_ambient
+from phibench.render.room.light_map import BakeSettings, bake
 from phibench.scenes.catalog import default_rig, lab
 room, rig = lab(), default_rig()
 settings = BakeSettings(texel_m=0.5, lamp_rays=4, bounces=2, bounce_rays=8, final_rays=8)

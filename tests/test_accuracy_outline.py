@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from outline_pulls import Case, cases
+from helpers.outline_pulls import Case, cases
 
 LIMIT = {20: (0.6, 1.6), 60: (0.75, 1.35), 200: (0.85, 1.2)}
 """Pull that is accepted for so many rigs. A pull over n rigs scatters by 1 / sqrt(2 n), and by somewhat more because

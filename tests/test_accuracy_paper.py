@@ -9,10 +9,10 @@ import pytest
 
 from phibench.datasets.make import make
 from phibench.datasets.read import Dataset, open_dataset
-from phibench.datasets.recipe_file import find_recipe
+from phibench.datasets.recipe.load import find_recipe
 from phibench.datasets.verify import verify
-from phibench.estimator.cli import main
-from phibench.estimator.score import Score, score, summarise
+from phibench.estimator.cli.main import main
+from phibench.estimator.paper.paper_tables import Score, score, summarise
 
 
 @pytest.fixture(scope="module")

@@ -7,13 +7,13 @@ import math
 
 import numpy as np
 import pytest
-from oracles import TARGETS, alhazen_quartic, fermat_path, paper_cases, random_rig, random_spot, true_pixel
+from helpers.oracles import TARGETS, alhazen_quartic, fermat_path, paper_cases, random_rig, random_spot, true_pixel
 
-from phibench.render.alhazen import reflection_points
-from phibench.render.certificate import CENTROID_TOLERANCE_PX, certify, pixel_centroid
-from phibench.render.spot import splat, spot_layer
-from phibench.render.spot_cloud import FilmCloud, specular_cloud
-from phibench.render.spot_truth import spot_truth
+from phibench.render.optics.certificate import CENTROID_TOLERANCE_PX, certify, pixel_centroid
+from phibench.render.optics.reflection_point import reflection_points
+from phibench.render.optics.spot_layer import splat, spot_layer
+from phibench.render.optics.spot_samples import FilmCloud, specular_cloud
+from phibench.render.optics.truth import spot_truth
 from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
 from phibench.scenes.rig import Rig, View
@@ -120,7 +120,7 @@ def test_coma_is_small_in_focus_and_grows_out_of_focus() -> None:
 
 def test_node_count_is_sufficient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Doubling all node counts changes no pixel by more than 1e-4 of the peak and the flux by less than 1e-6."""
-    from phibench.render import spot_cloud
+    from phibench.render.optics import spot_samples as spot_cloud
 
     coarse = [(view, spot, spot_layer(view, spot, ())) for view, spot in _cases(3, 20)]
     nodes = spot_cloud.disc_nodes
@@ -150,7 +150,7 @@ def test_random_pairs_give_the_same_image() -> None:
     rng, count = np.random.default_rng(5), 262144
     radius, turn = np.sqrt(rng.uniform(size=(2, count))), rng.uniform(0.0, 2.0 * np.pi, (2, count))
     disc = radius[..., None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    from phibench.render import spot_cloud
+    from phibench.render.optics import spot_samples as spot_cloud
 
     points, eyes = spot_cloud._spot_points(spot, disc[0]), spot_cloud._lens_points(view, disc[1])
     area = math.pi * view.rig.camera.aperture_radius_m**2
@@ -229,8 +229,8 @@ def test_accuracy_of_a_spot_cut_by_an_edge() -> None:
 
     Pairs scatter like sqrt(f (1 - f) / N) < 1e-3 of the flux even if they were random.
     """
-    from phibench.render import spot_cloud
-    from phibench.scenes.solids import cuboid
+    from phibench.render.optics import spot_samples as spot_cloud
+    from phibench.scenes.room import cuboid
 
     view, spot = default_rig().at(0.4), LaserSpot((2.0, 0.0, 0.5), (-1, 0, 0), 5e-3)
     rng, count, shares = np.random.default_rng(8), 2**19, []
@@ -280,7 +280,7 @@ def test_a_wide_spot_has_the_right_shape() -> None:
 
     2^17 points over about 2 pi 7^2 blur areas are 400 per area; Sobol points do better than their 5 %.
     """
-    from phibench.render import spot_cloud
+    from phibench.render.optics import spot_samples as spot_cloud
 
     view, spot = default_rig().at(0.0), LaserSpot((1.0, 0.0, 0.5), (-1, 0, 0), 0.1)
     gain = np.ones(3)

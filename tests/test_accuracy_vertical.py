@@ -6,21 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from limb_frames import drawn_rig
+from helpers.limb_frames import drawn_rig
 
-from phibench.datasets.sensor_card import sensor_card
+from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.calibration.vertical_edges import find_vertical
-from phibench.render.ambient import render_ambient
-from phibench.render.bake import BakeSettings
-from phibench.render.chain import Chain
-from phibench.render.light import Light
-from phibench.render.lightcache import light_map
-from phibench.render.sensor import sensor
-from phibench.render.tiles import NoiseStream
+from phibench.render.room.ambient import render_ambient
+from phibench.render.room.light_map import BakeSettings, light_map
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.light import Light
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.settings import sensor
 from phibench.scenes.catalog import lab
 from phibench.scenes.frames import as_matrix
+from phibench.scenes.random_streams import generator, seed_32
 from phibench.scenes.rig import Rig
-from phibench.scenes.streams import generator, seed_32
 
 RIGS = 6
 

@@ -7,16 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from limb_frames import limb_light
+from helpers.limb_frames import limb_light
 from PIL import Image
 
-from phibench.estimator import cli
 from phibench.estimator.calibration.align import alignment, believed_centre, read_picture
 from phibench.estimator.calibration.limb_image import ImageError
-from phibench.render.chain import Chain
-from phibench.render.light import Light
-from phibench.render.sensor import sensor
-from phibench.render.tiles import NoiseStream
+from phibench.estimator.cli import main as cli
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.light import Light
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.settings import sensor
 from phibench.scenes.frames import Pose
 from phibench.scenes.rig import Rig
 

@@ -7,17 +7,14 @@ import math
 
 import numpy as np
 import pytest
-from oracles import TARGETS
+from helpers.oracles import TARGETS
+from helpers.path_ambient import path_trace
 
-from phibench.render.ambient import AmbientLayer, render_ambient
-from phibench.render.bake import BakeSettings, LightMap, bake
-from phibench.render.lightcache import light_map
-from phibench.render.patches import cut, texel_count
-from phibench.render.path_ambient import path_trace
+from phibench.render.room.ambient import AmbientLayer, render_ambient
+from phibench.render.room.light_map import BakeSettings, LightMap, bake, light_map
+from phibench.render.room.shading import cut, texel_count
 from phibench.scenes.catalog import default_rig, lab
-from phibench.scenes.room import Room
-from phibench.scenes.solids import cuboid, faces, rectangle
-from phibench.scenes.textures import Uniform
+from phibench.scenes.room import Room, Uniform, cuboid, faces, rectangle
 
 ROOM, RIG = lab(TARGETS), default_rig()
 SETTINGS = BakeSettings(lamp_rays=32, bounce_rays=16, final_rays=256)

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from oracles import TARGETS
+from helpers.oracles import TARGETS
 
-from phibench.render.ambient import render_ambient
-from phibench.render.bake import BakeSettings, LightMap, bake
-from phibench.render.translate import load_scene, scene_dict
-from phibench.render.variant import activate
+from phibench.render.room.ambient import render_ambient
+from phibench.render.room.light_map import BakeSettings, LightMap, bake
+from phibench.render.room.scene import load_scene, scene_dict
+from phibench.render.setup.variant import activate
 from phibench.scenes.catalog import c310_rig, lab
 
 ROOM, RIG, SETTINGS = lab(TARGETS), c310_rig(), BakeSettings()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from test_ambient import CROPS, QUICK, RIG, ROOM, SETTINGS, check_means
 
-from phibench.render.bake import LightMap, bake
+from phibench.render.room.light_map import LightMap, bake
 
 
 @pytest.fixture(scope="module")

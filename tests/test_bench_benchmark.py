@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from bench_cases import cases, outcomes, sampler, shifted
+from helpers.bench_cases import cases, outcomes, sampler, shifted
 
-from phibench.estimator.bench.document import MethodCard
-from phibench.estimator.bench.rules import Rules
-from phibench.estimator.bench.score_method import score_outcomes
+from phibench.estimator.benchmark.answer_errors import Rules
+from phibench.estimator.benchmark.document import MethodCard
+from phibench.estimator.benchmark.score import score_outcomes
 
 
 def test_score_of_500_pairs_and_8_methods(benchmark):

@@ -6,15 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bench_cases import RIG, Cases, cases, change, constant, image_of, outcomes, silent, truth_itself
+from helpers.bench_cases import RIG, Cases, cases, change, constant, image_of, outcomes, silent, truth_itself
 
-from phibench.datasets.sensor_card import sensor_card
-from phibench.estimator.bench.causes import CAUSES, KINDS, Case, cause_of, count, count_failures, with_causes
-from phibench.estimator.bench.records import record_table
-from phibench.estimator.bench.rules import MATCH_PX, Rules
-from phibench.estimator.bench.truth import Distraction
-from phibench.estimator.seat.outcome import FAILURES, Outcome
-from phibench.estimator.seat.pair import Answer, Pair, Spot
+from phibench.datasets.frames.sensor_card import sensor_card
+from phibench.estimator.benchmark.answer_errors import MATCH_PX, Rules
+from phibench.estimator.benchmark.causes import CAUSES, KINDS, Case, cause_of, count, count_failures, with_causes
+from phibench.estimator.benchmark.records import record_table
+from phibench.estimator.interface import FAILURES, Answer, Outcome, Pair, Spot
+from phibench.estimator.pair_set import Distraction
 
 RULES = Rules()
 TRUTH = cases(20).truths[0]

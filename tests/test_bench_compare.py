@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bench_cases import Cases, cases, outcomes, sampler, scaled, shifted, silent, truth_itself
+from helpers.bench_cases import Cases, cases, outcomes, sampler, scaled, shifted, silent, truth_itself
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.bench.compare import COMPARED, compare, compare_records, note_on_code
-from phibench.estimator.bench.document import MethodCard, read_score, write_score
-from phibench.estimator.bench.metrics import METRICS
-from phibench.estimator.bench.records import records
-from phibench.estimator.bench.rules import Rules
-from phibench.estimator.bench.score_method import score_outcomes
-from phibench.estimator.seat.outcome import Outcome
+from phibench.estimator.benchmark.answer_errors import Rules
+from phibench.estimator.benchmark.compare import COMPARED, compare, compare_records, note_on_code
+from phibench.estimator.benchmark.document import MethodCard, read_score, write_score
+from phibench.estimator.benchmark.metrics import METRICS
+from phibench.estimator.benchmark.records import records
+from phibench.estimator.benchmark.score import score_outcomes
+from phibench.estimator.interface import Outcome
 
 RULES = Rules(resamples=999)
 

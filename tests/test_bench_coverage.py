@@ -9,12 +9,12 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from bench_cases import cases, outcomes, sampler
+from helpers.bench_cases import cases, outcomes, sampler
 
-from phibench.estimator.bench.bootstrap import Clusters, estimates, quantile_of, rms_of
-from phibench.estimator.bench.compare import compare_records
-from phibench.estimator.bench.records import records
-from phibench.estimator.bench.rules import Rules
+from phibench.estimator.benchmark.answer_errors import Rules
+from phibench.estimator.benchmark.compare import compare_records
+from phibench.estimator.benchmark.intervals import Clusters, estimates, quantile_of, rms_of
+from phibench.estimator.benchmark.records import records
 
 RULES = Rules(resamples=999)
 TRIALS, COMPARISONS = 200, 60

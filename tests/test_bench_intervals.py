@@ -7,23 +7,24 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from bench_cases import cases, outcomes, sampler
+from helpers.bench_cases import cases, outcomes, sampler
 from scipy.stats import binomtest, bootstrap
 
-from phibench.estimator.bench import bootstrap as ours
-from phibench.estimator.bench.bootstrap import (
+from phibench.estimator.benchmark import intervals as ours
+from phibench.estimator.benchmark.answer_errors import Rules
+from phibench.estimator.benchmark.intervals import (
     Clusters,
+    clopper_pearson,
     deviation_of,
     estimates,
     mean_of,
     quantile_of,
+    rate,
     rms_of,
     rms_ratio_of,
 )
-from phibench.estimator.bench.metrics import measure, prepared
-from phibench.estimator.bench.rates import clopper_pearson, rate
-from phibench.estimator.bench.records import records
-from phibench.estimator.bench.rules import Rules
+from phibench.estimator.benchmark.metrics import measure, prepared
+from phibench.estimator.benchmark.records import records
 
 RULES = Rules(resamples=999)
 SINGLE = 50

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 import pytest
-from bench_cases import (
+from helpers.bench_cases import (
     RIG,
     cases,
     constant,
@@ -18,10 +18,10 @@ from bench_cases import (
     truth_itself,
 )
 
-from phibench.estimator.bench.metrics import METRICS, measure, prepared
-from phibench.estimator.bench.records import COLUMNS, records
-from phibench.estimator.bench.rules import MATCH_PX, Rules
-from phibench.estimator.triangulate import depth_exact
+from phibench.estimator.benchmark.answer_errors import MATCH_PX, Rules
+from phibench.estimator.benchmark.metrics import METRICS, measure, prepared
+from phibench.estimator.benchmark.records import COLUMNS, records
+from phibench.estimator.geometry.triangulate import depth_exact
 
 RULES = Rules(resamples=999)
 
@@ -215,7 +215,7 @@ def test_a_biased_method_has_a_pull_rms_above_its_deviation():
 
 
 def test_every_metric_has_a_definition_and_every_family_a_reason():
-    from phibench.estimator.bench.metrics import FAMILIES, WHY_EMPTY
+    from phibench.estimator.benchmark.metrics import FAMILIES, WHY_EMPTY
 
     assert set(WHY_EMPTY) == set(FAMILIES) == {metric.family for metric in METRICS.values()}
     assert all(metric.text and metric.unit for metric in METRICS.values())

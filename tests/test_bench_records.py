@@ -7,17 +7,16 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 import pytest
-from bench_cases import RIG, Cases, cases, change, outcomes, sampler, shifted, truth_itself
-from oracles import random_rig, true_pixel
+from helpers.bench_cases import RIG, Cases, cases, change, outcomes, sampler, shifted, truth_itself
+from helpers.oracles import random_rig, true_pixel
 from scipy.linalg import cholesky, solve_triangular
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.bench.records import COLUMNS, records
-from phibench.estimator.bench.rules import MATCH_PX, Rules
-from phibench.estimator.phi import CONVENTIONS, outline_circle
-from phibench.estimator.seat.outcome import Outcome
-from phibench.estimator.seat.pair import Answer, Spot
-from phibench.estimator.triangulate import depth_exact
+from phibench.estimator.benchmark.answer_errors import MATCH_PX, Rules
+from phibench.estimator.benchmark.records import COLUMNS, records
+from phibench.estimator.geometry.phi import CONVENTIONS, outline_circle
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.interface import Answer, Outcome, Spot
 
 RULES = Rules()
 NOTHING = Spot.missing("no light")

@@ -8,16 +8,14 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from bench_cases import Cases, cases, change, constant, outcomes, sampler, shifted, silent, truth_itself
+from helpers.bench_cases import Cases, cases, change, constant, outcomes, sampler, shifted, silent, truth_itself
 from PIL import Image
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.bench.document import MethodCard
-from phibench.estimator.bench.figures import pull_histogram
-from phibench.estimator.bench.picture import Picture
-from phibench.estimator.bench.report import Section, report_html, write_report
-from phibench.estimator.bench.rules import Rules
-from phibench.estimator.bench.score_method import score_outcomes
+from phibench.estimator.benchmark.answer_errors import Rules
+from phibench.estimator.benchmark.document import MethodCard
+from phibench.estimator.benchmark.report import Picture, Section, pull_histogram, report_html, write_report
+from phibench.estimator.benchmark.score import score_outcomes
 
 RULES = Rules(resamples=199)
 

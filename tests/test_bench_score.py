@@ -7,18 +7,17 @@ import math
 
 import polars as pl
 import pytest
-from bench_cases import Cases, cases, change, constant, outcomes, sampler, shifted, silent, truth_itself
+from helpers.bench_cases import Cases, cases, change, constant, outcomes, sampler, shifted, silent, truth_itself
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator import cli
-from phibench.estimator.bench.document import MethodCard, ScoreDocument, read_records, read_score, write_score
-from phibench.estimator.bench.metrics import METRICS
-from phibench.estimator.bench.rules import Rules
-from phibench.estimator.bench.score_method import score_methods, score_outcomes
-from phibench.estimator.bench.strata import STRATA
-from phibench.estimator.bench.tables import leaderboard, number, ranked
-from phibench.estimator.bench.worst import crop
-from phibench.estimator.seat.outcome import Outcome
+from phibench.estimator.benchmark.answer_errors import Rules
+from phibench.estimator.benchmark.document import MethodCard, ScoreDocument, read_records, read_score, write_score
+from phibench.estimator.benchmark.metrics import METRICS
+from phibench.estimator.benchmark.score import crop, score_methods, score_outcomes
+from phibench.estimator.benchmark.strata import STRATA
+from phibench.estimator.benchmark.tables import leaderboard, number, ranked
+from phibench.estimator.cli import main as cli
+from phibench.estimator.interface import Outcome
 
 RULES = Rules(resamples=199)
 
@@ -207,7 +206,7 @@ def half(tmp_path_factory):
     file = tmp_path_factory.mktemp("method") / "half.py"
     file.write_text(
         "from phibench.estimator.methods.registry import METHODS\n"
-        "from phibench.estimator.seat.pair import Answer, Spot\n"
+        "from phibench.estimator.interface import Answer, Spot\n"
         "def moved(s):\n"
         "    return s if s.uv_px is None else Spot((s.uv_px[0] + 0.5, s.uv_px[1]))\n"
         "def extract(pair):\n"

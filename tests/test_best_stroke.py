@@ -12,22 +12,19 @@ from scipy.optimize import minimize_scalar
 from scipy.special import erf
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.sensor_card import sensor_card
-from phibench.estimator.best_stroke import (
+from phibench.datasets.frames.sensor_card import sensor_card
+from phibench.estimator.geometry.least_squares_depth import depth_general
+from phibench.estimator.geometry.mirror_image import blocked, first_blocker, image_of
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas, stroke_of
+from phibench.estimator.limits.best_stroke import (
     LARGEST,
     LEAST,
     best_stroke,
     spot_bound,
     without_limits,
 )
-from phibench.estimator.calibration.parameters import PARAMETERS, changed, prior_sigmas, stroke_of
-from phibench.estimator.depth_general import depth_general
-from phibench.estimator.line_of_sight import blocked, first_blocker
-from phibench.estimator.mirror_image import image_of
-from phibench.estimator.rig_draws import covariance_root
-from phibench.estimator.spot_flux import Laser, spot_electrons_per_s
-from phibench.estimator.spot_sigma import SpotSigma, _variance_px2, spot_sigma
-from phibench.estimator.stroke_curve import (
+from phibench.estimator.limits.processed_bound import SpotSigma, _variance_px2, spot_sigma
+from phibench.estimator.limits.stroke_curve import (
     CEILING,
     FREE,
     IMAGE_EDGE,
@@ -39,18 +36,19 @@ from phibench.estimator.stroke_curve import (
     TOO_FAINT,
     Surroundings,
     causes,
+    covariance_root,
     stroke_curve,
 )
-from phibench.render.raycast import blocked_by
-from phibench.render.spot import spot_layer
-from phibench.render.spot_truth import EDGE, NO_REFLECTION, OUTSIDE, spot_truth
-from phibench.render.spot_truth import OCCLUDED as RENDERED_OCCLUDED
+from phibench.estimator.spots.spot_prediction import Laser, spot_electrons_per_s
+from phibench.render.optics.ray_tracer import blocked_by
+from phibench.render.optics.spot_layer import spot_layer
+from phibench.render.optics.truth import EDGE, NO_REFLECTION, OUTSIDE, spot_truth
+from phibench.render.optics.truth import OCCLUDED as RENDERED_OCCLUDED
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
+from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
-from phibench.scenes.robot import escalade360
-from phibench.scenes.solids import Cuboid
-from phibench.scenes.streams import generator
+from phibench.scenes.room import Cuboid, escalade360
 
 RIG = Rig()
 P = len(PARAMETERS)

@@ -9,24 +9,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bench_cases import RIG, Cases, cases
+from helpers.bench_cases import RIG, Cases, cases
 from scipy import stats
 
 from phibench.datasets.read import Dataset, open_finished
-from phibench.estimator.bench.calibrated_pairs import CalibratedPairs, of_calibration
-from phibench.estimator.bench.metrics import measure, prepared
-from phibench.estimator.bench.records import records
-from phibench.estimator.bench.rules import Rules
+from phibench.estimator.benchmark.answer_errors import Rules
+from phibench.estimator.benchmark.dataset_pairs import CalibratedPairs, of_calibration
+from phibench.estimator.benchmark.metrics import measure, prepared
+from phibench.estimator.benchmark.records import records
 from phibench.estimator.calibration.bundle import Bundle
 from phibench.estimator.calibration.file import Calibration, CalibrationError, read_calibration, write_calibration
-from phibench.estimator.calibration.parameters import PARAMETERS, changed, prior_sigmas
-from phibench.estimator.cli import main
-from phibench.estimator.score import GENERAL, score
-from phibench.estimator.seat.outcome import Outcome
-from phibench.estimator.seat.pair import Answer, Spot
+from phibench.estimator.cli.main import main
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas
+from phibench.estimator.interface import Answer, Outcome, Spot
+from phibench.estimator.paper.paper_tables import GENERAL, score
 from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
-from phibench.scenes.streams import generator
 
 SIGMAS = 0.05 * prior_sigmas()
 COVARIANCE = np.diag(SIGMAS**2)

@@ -7,17 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oracles import true_pixel
+from helpers.oracles import true_pixel
 from scipy import optimize, stats
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator import cli
 from phibench.estimator.calibration.bundle import Bundle, KnownSpot, calibrate, seen_at
 from phibench.estimator.calibration.file import CalibrationError, read_calibration, write_calibration
-from phibench.estimator.calibration.measured import Measured
-from phibench.estimator.calibration.outline import Outline
-from phibench.estimator.calibration.outline_mean import mean_outline
-from phibench.estimator.calibration.parameters import PARAMETERS, changed, prior_sigmas, stroke_of
+from phibench.estimator.calibration.limb_image import Measured
+from phibench.estimator.calibration.outline import Outline, mean_outline
+from phibench.estimator.cli import main as cli
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas, stroke_of
 from phibench.scenes.rig import Rig
 
 RIG, STROKE = Rig(), 0.5

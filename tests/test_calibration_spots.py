@@ -12,15 +12,15 @@ from scipy import stats
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import Dataset, open_finished
-from phibench.estimator.bench.dataset_pairs import pairs_of
-from phibench.estimator.calibration.apparent import vertical_by_principal_point
-from phibench.estimator.calibration.dataset import calibrate_dataset, frame_spots
+from phibench.estimator.benchmark.dataset_pairs import pairs_of
+from phibench.estimator.calibration.bundle import vertical_by_principal_point
 from phibench.estimator.calibration.file import read_calibration
-from phibench.estimator.calibration.parameters import PARAMETERS, prior_sigmas
+from phibench.estimator.calibration.from_dataset import calibrate_dataset, frame_spots
 from phibench.estimator.calibration.spots import Ruler, known_spot, method_for, one_per_pose
-from phibench.estimator.cli import main
-from phibench.estimator.experiments import Procedure, run_experiments
-from phibench.estimator.seat.pair import Answer, Spot
+from phibench.estimator.cli.main import main
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
+from phibench.estimator.interface import Answer, Spot
+from phibench.estimator.paper.experiment_tables import Procedure, run_experiments
 
 EVERYTHING = Ruler(distance_m=2e-3, height_m=5e-3, azimuth_rad=0.01)
 

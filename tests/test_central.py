@@ -5,9 +5,15 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from oracles import true_pixel
+from helpers.oracles import true_pixel
 
-from phibench.estimator.central import CentralModel, depth_central, error_by_distance, fit_central, unified
+from phibench.estimator.calibration.central_model import (
+    CentralModel,
+    depth_central,
+    error_by_distance,
+    fit_central,
+    unified,
+)
 from phibench.scenes.rig import Rig
 
 RIG = Rig()

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from phibench.estimator.centroid import MAX_WIDTH_PX, find_spot
-from phibench.estimator.status import Status
+from phibench.estimator.geometry.status import Status
+from phibench.estimator.spots.simple_spots import MAX_WIDTH_PX, find_spot
 
 SHAPE = (120, 160)
 

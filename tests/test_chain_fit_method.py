@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from chain_scenes import COLLECTED, ROOM
-from sensor_light import spot_at
+from helpers.chain_scenes import COLLECTED, ROOM
+from helpers.sensor_light import spot_at
 
-from phibench.datasets.sensor_card import card_of
+from phibench.datasets.frames.sensor_card import card_of
+from phibench.estimator.interface import Box, Pair
 from phibench.estimator.methods.chain_fit import chain_fit
-from phibench.estimator.seat.pair import Box, Pair
-from phibench.estimator.spot_blur import SpotBlur, spot_blur
-from phibench.render.chain import Chain
-from phibench.render.light import Light
-from phibench.render.sensor import sensor
-from phibench.render.tiles import NoiseStream
+from phibench.estimator.spots.spot_prediction import SpotBlur, spot_blur
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.light import Light
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.settings import sensor
 from phibench.scenes.rig import Rig
 
 RIG = Rig()

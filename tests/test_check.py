@@ -9,22 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from seat_pairs import HEADER, method_file
+from helpers.seat_pairs import HEADER, method_file
 
-from phibench.estimator import cli
+from phibench.estimator.cli import main as cli
+from phibench.estimator.geometry.phi import phi_normal, phi_ray
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.interface import Answer, Method, Outcome, Pair, Spot
 from phibench.estimator.methods.registry import METHODS
-from phibench.estimator.phi import phi_normal, phi_ray
-from phibench.estimator.seat.answer_check import AnswerError, checked
-from phibench.estimator.seat.answer_text import answer_text
-from phibench.estimator.seat.check import PAIRS, Check, check_method, judged
-from phibench.estimator.seat.diagnosis import Views, covariance_fault, position_fault
-from phibench.estimator.seat.easy_pairs import EasyPairs
-from phibench.estimator.seat.errors import MethodError
-from phibench.estimator.seat.limits import Limits
-from phibench.estimator.seat.outcome import Outcome
-from phibench.estimator.seat.pair import Answer, Method, Pair, Spot
-from phibench.estimator.triangulate import depth_exact
-from phibench.scenes.streams import generator
+from phibench.estimator.sandbox.answers import AnswerError, answer_text, checked
+from phibench.estimator.sandbox.check import PAIRS, Check, Views, check_method, covariance_fault, judged, position_fault
+from phibench.estimator.sandbox.easy_pairs import EasyPairs
+from phibench.estimator.sandbox.resolve import Limits, MethodError
+from phibench.scenes.random_streams import generator
 
 Change = Callable[[Pair, Spot, str], Spot]
 SET = EasyPairs(count=PAIRS, laser_off=False)
@@ -271,7 +267,7 @@ def test_mistakes_of_the_command_line_are_2(capsys) -> None:
 
 
 def test_methods_lists_all_and_what_is_not_installed(monkeypatch, capsys) -> None:
-    monkeypatch.setattr("phibench.estimator.methods.built_in.find_spec", lambda name: None)
+    monkeypatch.setattr("phibench.estimator.methods.registry.find_spec", lambda name: None)
     assert cli.main(["methods"]) == 0
     out = capsys.readouterr().out
     for name in ("brightest_pixel", "raw_maximum_likelihood", "photutils: not installed", "off frames", "my_phi.py"):

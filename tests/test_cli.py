@@ -10,9 +10,9 @@ import pytest
 
 from phibench.datasets.errors import DatasetError, RecipeError
 from phibench.datasets.verify import Report
-from phibench.estimator import cli
-from phibench.estimator.score import Score
-from phibench.scenes.checks import SceneError
+from phibench.estimator.cli import main as cli
+from phibench.estimator.paper.paper_tables import Score
+from phibench.scenes.validation import SceneError
 
 
 def run_with(monkeypatch, error):
@@ -75,7 +75,7 @@ def test_score_of_a_folder_that_is_not_there(tmp_path, capsys):
 def test_scores_are_written_to_a_file(monkeypatch, tmp_path, capsys):
     scores = (Score("a", "mine", 2.0, 0.5, "exact", "truth", 2.1, 0.1, 0.05, math.nan, "ok"),)
     monkeypatch.setattr("phibench.datasets.read.open_finished", lambda directory: None)
-    monkeypatch.setattr("phibench.estimator.score.score", lambda dataset, calibration: scores)
+    monkeypatch.setattr("phibench.estimator.paper.paper_tables.score", lambda dataset, calibration: scores)
     assert cli.main(["score", "x", "--out", str(tmp_path / "scores.json")]) == 0
     document = json.loads((tmp_path / "scores.json").read_text())
     assert document["scores"][0]["estimate_m"] == 2.1
@@ -87,7 +87,7 @@ def test_scores_are_written_to_a_file(monkeypatch, tmp_path, capsys):
 
 def test_doctor_returns_its_exit_code(monkeypatch):
     def run(command, **options):
-        assert command[1:] == ["-m", "phibench.render.doctor"]
+        assert command[1:] == ["-m", "phibench.render.setup.doctor"]
         return type("Done", (), {"returncode": 3})
 
     monkeypatch.setattr(cli.subprocess, "run", run)
@@ -103,7 +103,7 @@ def test_help_names_every_command(command, capsys):
 def test_help_and_score_load_no_renderer(python):
     code = """
 import sys
-from phibench.estimator import cli
+from phibench.estimator.cli import main as cli
 cli.main(["--help"])
 heavy = {"numpy", "scipy", "pydantic", "mitsuba"} & set(sys.modules)
 assert not heavy, heavy
@@ -117,7 +117,7 @@ assert not {"mitsuba", "drjit"} & set(sys.modules)
 def sensitivities_kept(monkeypatch) -> list[Path]:
     """Folders whose sensitivities are asked for, instead of writing them."""
     kept: list[Path] = []
-    monkeypatch.setattr("phibench.estimator.sensitivity_table.keep_sensitivities", kept.append)
+    monkeypatch.setattr("phibench.estimator.paper.sensitivity_table.keep_sensitivities", kept.append)
     return kept
 
 
@@ -129,7 +129,7 @@ import os, sys
 os.environ.pop("OPENBLAS_NUM_THREADS", None)
 if sys.argv[1]:
     os.environ["OPENBLAS_NUM_THREADS"] = sys.argv[1]
-from phibench.estimator.cli import main
+from phibench.estimator.cli.main import main
 assert "numpy" not in sys.modules
 assert main(["--version"]) == 0
 print(os.environ["OPENBLAS_NUM_THREADS"])
@@ -139,7 +139,7 @@ print(os.environ["OPENBLAS_NUM_THREADS"])
 
 
 def test_repair_prints_what_it_made(monkeypatch, capsys):
-    monkeypatch.setattr("phibench.datasets.repair.repair", lambda *_, **__: ["view h0.000", "SHA256SUMS"])
+    monkeypatch.setattr("phibench.datasets.merge_repair.repair", lambda *_, **__: ["view h0.000", "SHA256SUMS"])
     kept = sensitivities_kept(monkeypatch)
     assert cli.main(["dataset", "repair", "x", "--workers", "2"]) == 0
     assert kept == [Path("x")]
@@ -148,7 +148,7 @@ def test_repair_prints_what_it_made(monkeypatch, capsys):
 
 def test_merge_takes_any_number_of_shards(monkeypatch, tmp_path):
     calls = []
-    monkeypatch.setattr("phibench.datasets.merge.merge", lambda out, shards: calls.append((out, list(shards))))
+    monkeypatch.setattr("phibench.datasets.merge_repair.merge", lambda out, shards: calls.append((out, list(shards))))
     kept = sensitivities_kept(monkeypatch)
     assert cli.main(["dataset", "merge", str(tmp_path / "o"), str(tmp_path / "a"), str(tmp_path / "b")]) == 0
     assert calls == [(tmp_path / "o", [tmp_path / "a", tmp_path / "b"])]

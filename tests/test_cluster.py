@@ -16,13 +16,13 @@ import pytest
 from test_make import TINY, living, quiet, said, wait_for
 from test_resume import contents
 
-from phibench.datasets import cluster, layout
-from phibench.datasets.cluster import local_workers
-from phibench.datasets.dispatch import dispatch
-from phibench.datasets.environment import _checked, describe, local_environment
+from phibench.datasets.build import workers as cluster
+from phibench.datasets.build.scheduler import dispatch
+from phibench.datasets.build.tasks import Done, Failed, Made, Task
+from phibench.datasets.build.workers import _checked, describe, local_environment, local_workers
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import make
-from phibench.datasets.task import Done, Failed, Made, Task
+from phibench.datasets.store import schema as layout
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
@@ -78,7 +78,7 @@ def test_who_kills_workers_is_named_and_all_others_finish(tmp_path: Path, count:
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs /proc")
 def test_workers_leave_when_their_parent_is_killed(tmp_path: Path) -> None:
     code = (
-        "import sys, time\nfrom pathlib import Path\nfrom phibench.datasets.cluster import local_workers\n"
+        "import sys, time\nfrom pathlib import Path\nfrom phibench.datasets.build.workers import local_workers\n"
         "if __name__ == '__main__':\n    with local_workers(2, Path(sys.argv[1])) as workers:\n"
         "        print(*workers.client.run(__import__('os').getpid).values(), flush=True)\n"
         "        workers.client.submit(time.sleep, 300, pure=False)\n        time.sleep(300)"
@@ -107,7 +107,7 @@ def commands(mark: str, folder: Path) -> list[list[str]]:
     words = {"smoke": str(TINY), "dask": str(BIN / "dask")}
     found = []
     for line in lines:
-        program = [sys.executable, "-m", "phibench.estimator.cli"] if line[0] == "phibench" else [words[line[0]]]
+        program = [sys.executable, "-m", "phibench.estimator.cli.main"] if line[0] == "phibench" else [words[line[0]]]
         found.append([*program, *(words.get(word, re.sub("^out(?=/)", str(folder), word)) for word in line[1:])])
     return found
 
@@ -229,7 +229,9 @@ def test_every_task_is_logged(tiny_dataset: Path) -> None:
 
 @pytest.mark.usefixtures("inline")
 def test_a_worker_that_fails_half_way_leaves_the_rest_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("phibench.datasets.sample_task.save_png", lambda *_: (_ for _ in ()).throw(OSError(28, "full")))
+    monkeypatch.setattr(
+        "phibench.datasets.build.sample_task.save_png", lambda *_: (_ for _ in ()).throw(OSError(28, "full"))
+    )
     with pytest.raises(DatasetError, match="2 of 8 tasks failed"):
         make(TINY, tmp_path / "out", workers=1, console=quiet())
     monkeypatch.undo()

@@ -9,20 +9,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bench_samples import hidden, with_tables
+from helpers.bench_samples import hidden, with_tables
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.expected import expected_of_light, expected_region
+from phibench.datasets.exposures.expected import expected_of_light, expected_region
+from phibench.datasets.exposures.exposures import TakenSample
+from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import Dataset, open_dataset
-from phibench.datasets.sensor_card import card_of
-from phibench.datasets.taken import TakenSample
-from phibench.estimator.bench.dataset_pairs import DatasetPairs, dataset_pairs
-from phibench.estimator.bench.truth import PairTruth
-from phibench.estimator.limits import spot_limit
-from phibench.estimator.seat.pair import Pair
-from phibench.estimator.triangulate import depth_exact
-from phibench.render.region import Region
-from phibench.render.tiles import NoiseStream
+from phibench.estimator.benchmark.dataset_pairs import DatasetPairs, dataset_pairs
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.interface import Pair
+from phibench.estimator.limits.position_bound import spot_limit
+from phibench.estimator.pair_set import PairTruth
+from phibench.render.sensor.light import Region
+from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.scenes.rig import POSITIONS
 
 SHAPES = {

@@ -7,14 +7,13 @@ from functools import partial
 
 import numpy as np
 import pytest
+from helpers.oracles import alhazen_quartic, paper_cases
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracles import alhazen_quartic, paper_cases
 from scipy import stats
 
-from phibench.estimator.depth import depth_approx, depth_paper, error_eq6, error_eq7
-from phibench.estimator.estimate import covariance_of
-from phibench.estimator.status import Status
+from phibench.estimator.geometry.paper_depth import depth_approx, depth_paper, error_eq6, error_eq7
+from phibench.estimator.geometry.status import Status, covariance_of
 
 R = 0.06
 

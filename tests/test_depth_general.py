@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from oracles import random_rig, random_spot, true_pixel
+from helpers.oracles import random_rig, random_spot, true_pixel
 from scipy import optimize, stats
 
-from phibench.estimator.calibration.parameters import PARAMETERS, changed, prior_sigmas, stroke_of
-from phibench.estimator.depth_general import GeneralDepth, depth_general
-from phibench.estimator.status import Status
+from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas, stroke_of
+from phibench.estimator.geometry.status import Status
 from phibench.scenes.rig import Rig
 
 RIG, SPOT, STROKE = Rig(), np.array([1.9, 1.1, 0.5]), 0.5
@@ -62,7 +62,7 @@ def test_against_minimisation_in_pixels() -> None:
 
 def test_pixel_gradient_against_differences() -> None:
     """Five-point differences; the closed form is exact, the differences are good to 1e-8."""
-    from phibench.estimator.depth_general import _meet_exact, _pixel_gradients
+    from phibench.estimator.geometry.least_squares_depth import _meet_exact, _pixel_gradients
 
     y = np.concatenate([true_pixel(RIG, 0.0, SPOT), true_pixel(RIG, STROKE, SPOT) + [0.3, -0.2]])
     e_y, D_y = _pixel_gradients(RIG, np.array(STROKE), y)

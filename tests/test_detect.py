@@ -12,32 +12,39 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.sensor_light import FILTERS, spot_at
 from scipy.ndimage import gaussian_filter
-from sensor_light import FILTERS, spot_at
 
-from phibench.datasets.expected import expected_of_light
+from phibench.datasets.exposures.expected import expected_of_light
+from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import open_dataset
-from phibench.datasets.sensor_card import card_of
-from phibench.estimator.colour_planes import colour_planes
-from phibench.estimator.detect import RAW, PairDetection, detect, mirror_box, outline_mask
-from phibench.estimator.fisher import covariance_bound
-from phibench.estimator.limits import spot_limit
-from phibench.estimator.methods.detect import detect as detect_method
-from phibench.estimator.methods.joint_fit import joint_fit
+from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.interface import Box, Pair
+from phibench.estimator.limits.position_bound import spot_limit
 from phibench.estimator.methods.locate import box_around, locate
-from phibench.estimator.mirror_image import image_of
-from phibench.estimator.seat.pair import Box, Pair
-from phibench.estimator.spot_pair import consistent, epipolar_curve
-from phibench.estimator.spot_verdict import judged, lattice
-from phibench.render.chain import Chain
-from phibench.render.light import Light
-from phibench.render.sensor import Sensor, sensor
-from phibench.render.spot import SpotLayer
-from phibench.render.tiles import NoiseStream
+from phibench.estimator.methods.raw_likelihood import joint_fit
+from phibench.estimator.methods.simple import detect as detect_method
+from phibench.estimator.spots.candidates import judged, lattice
+from phibench.estimator.spots.detect import (
+    RAW,
+    PairDetection,
+    consistent,
+    detect,
+    epipolar_curve,
+    mirror_box,
+    outline_mask,
+)
+from phibench.estimator.spots.fit_raw import covariance_bound
+from phibench.estimator.spots.image_planes import colour_planes
+from phibench.render.optics.spot_layer import SpotLayer
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.light import Light
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.settings import Sensor, sensor
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
+from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
-from phibench.scenes.streams import generator
 
 RIG = Rig(camera=Camera(320, 180, 11.2, 357.5, 357.5, 159.5, 89.5))
 SIZE = (180, 320)

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from sensor_light import spot_at
+from helpers.sensor_light import spot_at
 
-from phibench.datasets.sensor_card import card_of
-from phibench.estimator.detect import detect
-from phibench.estimator.mirror_image import image_of
-from phibench.estimator.seat.pair import Pair
-from phibench.render.chain import Chain
-from phibench.render.light import Light
-from phibench.render.sensor import sensor
-from phibench.render.tiles import NoiseStream
+from phibench.datasets.frames.sensor_card import card_of
+from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.interface import Pair
+from phibench.estimator.spots.detect import detect
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.light import Light
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.settings import sensor
 from phibench.scenes.rig import Rig
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from phibench.datasets.dispatch import AHEAD, TRIALS, dispatch
-from phibench.datasets.journal import Entry, Head, Journal
-from phibench.datasets.task import Done, Failed, Made, Task
+from phibench.datasets.build.journal import Entry, Head, Journal
+from phibench.datasets.build.scheduler import AHEAD, TRIALS, dispatch
+from phibench.datasets.build.tasks import Done, Failed, Made, Task
 
 
 def nothing(out: Path) -> Made:

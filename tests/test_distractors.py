@@ -8,21 +8,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bench_samples import hidden, many, with_tables
-from oracles import true_pixel
-from sensor_light import room, spot_at
+from helpers.bench_samples import hidden, many, with_tables
+from helpers.oracles import true_pixel
+from helpers.sensor_light import room, spot_at
 
-from phibench.datasets.distractors import MIN_APART_PX, Distractor, distractors, present
-from phibench.datasets.expected import expected_of_light
+from phibench.datasets.exposures.distractors import MIN_APART_PX, Distractor, distractors, present
+from phibench.datasets.exposures.expected import expected_of_light
+from phibench.datasets.exposures.exposures import TakenSample, takes
 from phibench.datasets.read import Dataset, Sample, open_dataset
-from phibench.datasets.taken import TakenSample
-from phibench.datasets.takes import takes
-from phibench.render.chain import Chain
-from phibench.render.electrons import expected_electrons
-from phibench.render.light import Light, OtherSpot
-from phibench.render.region import Region
-from phibench.render.sensor import sensor
-from phibench.render.tiles import NoiseStream
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import expected_electrons
+from phibench.render.sensor.light import Light, OtherSpot, Region
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.settings import sensor
 from phibench.scenes.camera import Camera
 
 SIZE = (72, 130)
@@ -171,7 +169,7 @@ def test_none_is_in_the_spots_window_and_each_is_in_the_down_image(found: list[t
 
 def test_the_power_is_that_of_the_layer(found: list[tuple[Sample, Distractor]]) -> None:
     """The disc in the truth would give the same layer: its power was scaled with it."""
-    from phibench.render.spot import spot_layer
+    from phibench.render.optics.spot_layer import spot_layer
 
     sample, one = found[0]
     view = sample.view("down")

@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from phibench.render import doctor, known_image
-from phibench.render.child import fault_of
-from phibench.render.doctor import Finding
+from phibench.render.setup import doctor
+from phibench.render.setup import selftest as known_image
+from phibench.render.setup.doctor import Finding
+from phibench.render.setup.llvm_library import fault_of
 
 Python = Callable[..., subprocess.CompletedProcess[str]]
-DOCTOR = "import sys; from phibench.render.doctor import main; sys.exit(main())"
+DOCTOR = "import sys; from phibench.render.setup.doctor import main; sys.exit(main())"
 
 
 def lines_of(output: str, word: str) -> list[str]:

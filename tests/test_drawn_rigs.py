@@ -10,12 +10,11 @@ import pytest
 from scipy import stats
 
 from phibench.datasets.errors import RecipeError
-from phibench.datasets.plan import RECIPE_RIG, make_plan
-from phibench.datasets.recipe import Recipe
-from phibench.datasets.recipe_file import RECIPES, check_recipe, load_recipe
-from phibench.datasets.recipe_scene import build_misalignment
-from phibench.datasets.shard import shard_plan
-from phibench.estimator.calibration.parameters import PRIOR_SIGMA
+from phibench.datasets.plan.plan import RECIPE_RIG, make_plan, shard_plan
+from phibench.datasets.recipe.build import build_misalignment
+from phibench.datasets.recipe.load import RECIPES, check_recipe, load_recipe
+from phibench.datasets.recipe.tables import Recipe
+from phibench.estimator.geometry.rig_parameters import PRIOR_SIGMA
 
 SHIPPED = (RECIPES / "paper-misaligned.toml").read_text(encoding="utf-8")
 

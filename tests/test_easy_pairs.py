@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oracles import alhazen_quartic
+from helpers.oracles import alhazen_quartic
 
-from phibench.estimator.mirror_image import image_of
-from phibench.estimator.raw_pixels import raw_electrons
-from phibench.estimator.seat.easy_pairs import BOX_PX, EasyPairs
-from phibench.estimator.triangulate import depth_exact
+from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.sandbox.easy_pairs import BOX_PX, EasyPairs
+from phibench.estimator.spots.raw_pixels import raw_electrons
 from phibench.scenes.catalog import c310_rig
 from phibench.scenes.rig import Rig
 

@@ -10,10 +10,10 @@ import polars as pl
 import pytest
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.datasets.read import open_finished
-from phibench.datasets.sensor_card import SensorCard, sensor_card
-from phibench.estimator.experiment_bounds import frames_needed, spot_bounds
-from phibench.estimator.spot_sigma import spot_sigma
+from phibench.estimator.limits.processed_bound import spot_sigma
+from phibench.estimator.paper.experiment_bounds import frames_needed, spot_bounds
 
 
 @pytest.mark.parametrize("preset", ["bayer-raw", "mjpeg"])

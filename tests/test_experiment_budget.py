@@ -7,9 +7,9 @@ import polars as pl
 import pytest
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.experiment_budget import budget, budgets
-from phibench.estimator.experiments import COLUMNS, WITHIN
-from phibench.scenes.streams import generator
+from phibench.estimator.paper.experiment_bounds import budget, budgets
+from phibench.estimator.paper.experiment_tables import COLUMNS, WITHIN
+from phibench.scenes.random_streams import generator
 
 SAMPLES, DRAWS = 60, 4
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.exr import read_exr, write_exr
+from phibench.datasets.store.layers import read_exr, write_exr
 
 LAYOUTS = {
     "C": np.ascontiguousarray,

@@ -11,9 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from phibench.datasets import files
-from phibench.datasets.exr import write_exr
-from phibench.datasets.files import TEMPORARY_PREFIX, remove_temporary, sha256, write_atomic, write_bytes, write_text
+from phibench.datasets.store import files
+from phibench.datasets.store.files import (
+    TEMPORARY_PREFIX,
+    remove_temporary,
+    sha256,
+    write_atomic,
+    write_bytes,
+    write_text,
+)
+from phibench.datasets.store.layers import write_exr
 
 
 def test_bytes_text_and_hash(tmp_path: Path) -> None:
@@ -63,7 +70,7 @@ def test_any_failure_leaves_the_old_file(
 def test_a_full_disk_while_an_exr_is_written(tmp_path: Path) -> None:
     """A limit on the file size makes write(2) fail half-way, as a full disk does, without being root."""
     code = (
-        "import resource, sys, numpy\nfrom pathlib import Path\nfrom phibench.datasets.exr import write_exr\n"
+        "import resource, sys, numpy\nfrom pathlib import Path\nfrom phibench.datasets.store.layers import write_exr\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))\n"
         "write_exr(Path(sys.argv[1]), {'A': numpy.random.default_rng(0).random((200, 200))}, {})"
     )
@@ -79,7 +86,7 @@ def test_a_full_disk_while_an_exr_is_written(tmp_path: Path) -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
 def test_control_c_in_a_real_process(tmp_path: Path) -> None:
     code = (
-        "import sys, time\nfrom pathlib import Path\nfrom phibench.datasets.files import write_atomic\n"
+        "import sys, time\nfrom pathlib import Path\nfrom phibench.datasets.store.files import write_atomic\n"
         "def write(path):\n    path.write_bytes(b'half')\n    print('writing', flush=True)\n    time.sleep(60)\n"
         "write_atomic(Path(sys.argv[1]), write)"
     )

@@ -7,18 +7,17 @@ import itertools
 
 import numpy as np
 import pytest
-from oracles import TARGETS
+from helpers.oracles import TARGETS
+from helpers.path_ambient import path_trace
 from scipy.special import ndtr
 
-from phibench.render.ambient import render_ambient
-from phibench.render.bake import BakeSettings, LightMap, bake
-from phibench.render.film_grid import FilmGrid
-from phibench.render.noise_budget import BUDGET, _bayer, excess, noise_budget, phi_gradient, webcam
-from phibench.render.path_ambient import path_trace
-from phibench.render.quasi import golden_steps, shifts
-from phibench.render.spot import spot_layer
-from phibench.render.spot_truth import spot_truth
-from phibench.render.variant import activate
+from phibench.render.optics.spot_layer import spot_layer
+from phibench.render.optics.truth import spot_truth
+from phibench.render.room.ambient import render_ambient
+from phibench.render.room.film import FilmGrid, golden_steps, shifts
+from phibench.render.room.light_map import BakeSettings, LightMap, bake
+from phibench.render.room.noise_budget import BUDGET, _bayer, excess, noise_budget, phi_gradient, webcam
+from phibench.render.setup.variant import activate
 from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
 

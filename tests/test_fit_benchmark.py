@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from chain_scenes import COLLECTED, MIDDLE, SQUARE, UNITS, scene
-from sensor_light import spot_at
+from helpers.chain_scenes import COLLECTED, MIDDLE, SQUARE, UNITS, scene
+from helpers.sensor_light import spot_at
 
-from phibench.datasets.expected import expected_of_light
-from phibench.datasets.sensor_card import card_of
-from phibench.estimator.chain_limit import chain_limit
-from phibench.estimator.fit_chain import fit_jpeg, fit_srgb
-from phibench.estimator.fit_raw import LASER_RESPONSE, fit_raw
-from phibench.estimator.limits import NOISE_MODELS, spot_limit
-from phibench.estimator.raw_pixels import PixelNoise
-from phibench.estimator.simple_spots import SIMPLE_METHODS
-from phibench.estimator.status import Status
-from phibench.render.chain import Chain
-from phibench.render.light import Light
-from phibench.render.sensor import sensor
-from phibench.render.tiles import NoiseStream
-from phibench.scenes.streams import generator
+from phibench.datasets.exposures.expected import expected_of_light
+from phibench.datasets.frames.sensor_card import card_of
+from phibench.estimator.geometry.status import Status
+from phibench.estimator.limits.position_bound import NOISE_MODELS, spot_limit
+from phibench.estimator.limits.processed_bound import chain_limit
+from phibench.estimator.spots.fit_chain import fit_jpeg, fit_srgb
+from phibench.estimator.spots.fit_raw import LASER_RESPONSE, fit_raw
+from phibench.estimator.spots.raw_pixels import PixelNoise
+from phibench.estimator.spots.simple_spots import SIMPLE_METHODS
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.light import Light
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.settings import sensor
+from phibench.scenes.random_streams import generator
 
 SPOTS = 256
 LIGHT = Light(np.full((3, 48, 48), 6e3), spot_at(24.3, 23.8, 0.7, 3e5))

@@ -7,31 +7,27 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from chain_scenes import COLLECTED, MIDDLE, ROOM, SQUARE, UNITS, scene
+from helpers.chain_scenes import COLLECTED, MIDDLE, ROOM, SQUARE, UNITS, scene
 from PIL import Image
 from scipy import integrate, stats
 
-from phibench.datasets.sensor_card import card_of
-from phibench.estimator import tone_curve
-from phibench.estimator.base_image import around, base_of
-from phibench.estimator.chain_limit import chain_limit
-from phibench.estimator.chain_model import chain_model, codes
-from phibench.estimator.code_law import code_law, code_table
-from phibench.estimator.fit_chain import fit_jpeg, fit_srgb, undone, unrounded
-from phibench.estimator.fit_raw import fit_law
-from phibench.estimator.jpeg_recovery import recovered
-from phibench.estimator.jpeg_tables import coefficients, quantisation, steps
-from phibench.estimator.pixel_law import GaussLaw
-from phibench.estimator.quantiser import quantised
-from phibench.estimator.raw_pixels import PixelNoise, bayer_filters
-from phibench.estimator.spot_blur import SpotBlur
-from phibench.estimator.spot_means import SpotMeans
-from phibench.estimator.status import Status
-from phibench.render import isp
-from phibench.render.chain import Chain
-from phibench.render.sensor import sensor
-from phibench.render.tiles import NoiseStream
-from phibench.scenes.streams import generator
+from phibench.datasets.frames.sensor_card import card_of
+from phibench.estimator.geometry.status import Status
+from phibench.estimator.limits.processed_bound import chain_limit
+from phibench.estimator.spots import image_planes as tone_curve
+from phibench.estimator.spots.chain_model import chain_model, codes
+from phibench.estimator.spots.code_statistics import code_law, code_table
+from phibench.estimator.spots.fit_chain import fit_jpeg, fit_srgb, undone, unrounded
+from phibench.estimator.spots.fit_raw import fit_law
+from phibench.estimator.spots.gaussian_spot import SpotMeans
+from phibench.estimator.spots.jpeg_coefficients import coefficients, quantisation, quantised, recovered, steps
+from phibench.estimator.spots.raw_pixels import GaussLaw, PixelNoise, around, base_of, bayer_filters
+from phibench.estimator.spots.spot_prediction import SpotBlur
+from phibench.render.sensor import processing as isp
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.settings import sensor
+from phibench.scenes.random_streams import generator
 
 SRGB, MJPEG = sensor("srgb8"), sensor("mjpeg")
 FLUX_E = 5000.0 / COLLECTED
@@ -153,7 +149,7 @@ def test_model_of_the_means_against_the_chain(changes: dict) -> None:
     s = MJPEG.replace(prnu=0.0, dsnu_e=0.0, **changes)
     model = chain_model(card_of(s), unrounded(card_of(s)))
     light, m = scene(MIDDLE + [0.3, -0.2], 0.7, FLUX_E, 100.0, s), model.margin
-    from phibench.render.region import Region
+    from phibench.render.sensor.light import Region
 
     window = Region(32, 24, 64, 40)
     raw = Region(32 - m, 24 - m, 64 + m, 40 + m)

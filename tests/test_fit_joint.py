@@ -9,19 +9,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from joint_pairs import BAYER, MONO, RIG, Pairs, drawn_pairs
-from oracles import random_rig, random_spot, true_pixel
+from helpers.joint_pairs import BAYER, MONO, RIG, Pairs, drawn_pairs
+from helpers.oracles import random_rig, random_spot, true_pixel
 
-from phibench.estimator.combine import combine, joint_sigma_m
-from phibench.estimator.epipolar import up_image
-from phibench.estimator.fit_joint import fit_joint
-from phibench.estimator.mirror_image import image_of
-from phibench.estimator.raw_pixels import PixelNoise
-from phibench.estimator.spot_likelihood import spot_regions
-from phibench.estimator.status import Status
-from phibench.estimator.triangulate import depth_exact
+from phibench.estimator.geometry.combine import combine, joint_sigma_m
+from phibench.estimator.geometry.mirror_image import image_of, up_image
+from phibench.estimator.geometry.status import Status
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.spots.fit_joint import fit_joint, spot_regions
+from phibench.estimator.spots.raw_pixels import PixelNoise
 from phibench.scenes.frames import Array
-from phibench.scenes.streams import generator
+from phibench.scenes.random_streams import generator
 
 
 def some_pairs(count: int = 12) -> tuple[Array, Array, Array, Array]:

@@ -10,22 +10,21 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from helpers.sensor_light import FILTERS, spot_at
 from scipy import integrate, stats
-from sensor_light import FILTERS, spot_at
 
-from phibench.datasets.expected import expected_of_light
-from phibench.datasets.sensor_card import card_of
-from phibench.estimator.fit_raw import LASER_RESPONSE, SpotFit, fit_raw
-from phibench.estimator.gaussian_spot import outer, profile
-from phibench.estimator.limits import spot_limit
-from phibench.estimator.raw_pixels import PixelNoise, bayer_filters, noise_of, raw_electrons
-from phibench.estimator.status import Status
-from phibench.render.chain import Chain
-from phibench.render.light import Light
-from phibench.render.region import Region
-from phibench.render.sensor import Sensor, sensor
-from phibench.render.tiles import NoiseStream
-from phibench.scenes.streams import generator
+from phibench.datasets.exposures.expected import expected_of_light
+from phibench.datasets.frames.sensor_card import card_of
+from phibench.estimator.geometry.status import Status
+from phibench.estimator.limits.position_bound import spot_limit
+from phibench.estimator.spots.fit_raw import LASER_RESPONSE, SpotFit, fit_raw
+from phibench.estimator.spots.gaussian_spot import outer, profile
+from phibench.estimator.spots.raw_pixels import PixelNoise, bayer_filters, noise_of, raw_electrons
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.light import Light, Region
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.settings import Sensor, sensor
+from phibench.scenes.random_streams import generator
 
 SIZE, BOX = (48, 48), Region.around(24.0, 24.0, (48, 48), 15)
 POSITIONS, CAMERAS = 40, 100

@@ -7,34 +7,31 @@ import math
 
 import numpy as np
 import pytest
-from form_oracles import radius_at
+from helpers.form_oracles import radius_at
 from scipy.special import sph_harm_y
 
-from phibench.datasets.codec import from_json, to_json
-from phibench.estimator.reflection import reflect as estimated
-from phibench.render.fermat import fermat_points
-from phibench.render.form_trace import meet
-from phibench.render.mirror_points import bundle_spread, mirror_points
-from phibench.render.spot import spot_layer
-from phibench.render.spot_truth import spot_truth
-from phibench.render.trace import lens_rays, reflect, trace_pixels
-from phibench.render.truth import truth_layer
+from phibench.datasets.store.documents import from_json, to_json
+from phibench.estimator.geometry.reflection import reflect as estimated
+from phibench.render.optics.ray_tracer import lens_rays, meet, reflect, trace_pixels
+from phibench.render.optics.reflection_point import bundle_spread, fermat_points, mirror_points
+from phibench.render.optics.spot_layer import spot_layer
+from phibench.render.optics.truth import spot_truth, truth_layer
 from phibench.scenes.catalog import default_rig
-from phibench.scenes.checks import SceneError
-from phibench.scenes.form import (
+from phibench.scenes.frames import Pose, rotation_xyz
+from phibench.scenes.laser import LaserSpot
+from phibench.scenes.mirror import (
     HARMONICS,
     Form,
+    SphereMirror,
     curvatures,
     deviation,
     directions,
     gradients_by_parameter,
     level,
 )
-from phibench.scenes.frames import Pose, rotation_xyz
-from phibench.scenes.laser import LaserSpot
-from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
 from phibench.scenes.rig import Rig, View
+from phibench.scenes.validation import SceneError
 
 R = 0.06
 SPOT = LaserSpot((2.0, 0.7, 0.5), (-1.0, -0.3, 0.1), 5e-3)
@@ -227,8 +224,8 @@ def test_rays_from_values_against_newtons_method() -> None:
 
 def test_rays_inside_a_kernel_against_those_in_float64() -> None:
     """The ambient layer's rays start 200 to 300 mm off, in float32: 1.5e-5 mm, over cos i >= 0.05."""
-    from phibench.render import form_kernel
-    from phibench.render.variant import activate
+    from phibench.render.room import shading as form_kernel
+    from phibench.render.setup.variant import activate
 
     mi, rng = activate(), np.random.default_rng(6)
     view = random_view(rng)
@@ -325,7 +322,7 @@ def test_a_vanishing_form_is_the_sphere() -> None:
 
 def test_the_truth_layer_is_that_of_the_form() -> None:
     """Pixel by pixel the world point that the estimator's own ray through the pixel reaches; the sphere's is not."""
-    from phibench.scenes.solids import cuboid
+    from phibench.scenes.room import cuboid
 
     rng = np.random.default_rng(9)
     view = random_view(rng, 3e-4)

@@ -7,11 +7,12 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
-from phibench.datasets import layers, layout, schema
-from phibench.render import spot_truth, truth
-from phibench.render.bake import LightMap
-from phibench.render.lightcache import ARRAYS
-from phibench.scenes.detector import FILTERS
+from phibench.datasets.store import layers, schema
+from phibench.datasets.store import schema as layout
+from phibench.render.optics import truth
+from phibench.render.optics import truth as spot_truth
+from phibench.render.room.light_map import ARRAYS, LightMap
+from phibench.scenes.camera import FILTERS
 
 PAGE = (Path(schema.__file__).resolve().with_name("FORMAT.md")).read_text(encoding="utf-8")
 MODELS = (

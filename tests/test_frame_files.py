@@ -11,17 +11,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from phibench.datasets.draw_frames import draw_frames
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.exr import read_exr
-from phibench.datasets.frame_files import preview
-from phibench.datasets.frame_index import INDEX, REQUEST, read_index
-from phibench.datasets.frame_request import FrameRequest
-from phibench.datasets.frames import Frame
+from phibench.datasets.exposures.draw import draw_frames
+from phibench.datasets.frames.frame_files import INDEX, REQUEST, preview, read_index
+from phibench.datasets.frames.request import FrameRequest
+from phibench.datasets.frames.source import Frame
 from phibench.datasets.read import open_dataset
-from phibench.datasets.sums import damaged, strays
-from phibench.estimator import cli
-from phibench.render.region import Region
+from phibench.datasets.store.checksums import damaged, strays
+from phibench.datasets.store.layers import read_exr
+from phibench.estimator.cli import main as cli
+from phibench.render.sensor.light import Region
 
 SEEN, HALF = "seen-near-h0.500", "half-hidden-h1.400"
 
@@ -129,7 +128,7 @@ def test_the_default_folder_is_beside_the_data_set(tiny_dataset: Path, tmp_path:
 def test_samples_without_a_place_for_a_region_are_named(
     tiny_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("phibench.datasets.draw_frames.has_place", lambda spot, size: spot.pose != "h1.400")
+    monkeypatch.setattr("phibench.datasets.exposures.draw.has_place", lambda spot, size: spot.pose != "h1.400")
     assert run(tiny_dataset, "--region", 8, "--out", tmp_path / "f") == 0
     out = capsys.readouterr().out
     assert f"note: {HALF} is left out: no image of the spot" in out

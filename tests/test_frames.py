@@ -16,11 +16,11 @@ from PIL import Image
 from scipy import stats
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.frame_source import FrameSource
+from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, Sample, open_dataset
-from phibench.render.moments import raw_moments
-from phibench.render.region import Region
-from phibench.render.tiles import NoiseStream
+from phibench.render.sensor.light import Region
+from phibench.render.sensor.moments import raw_moments
+from phibench.render.sensor.noise_tiles import NoiseStream
 
 SEEN, HALF = "seen-near-h0.500", "half-hidden-h1.400"
 NAMES = ("down", "up", "down_off", "up_off")
@@ -226,7 +226,7 @@ def test_a_shared_stream_is_noticed(dataset: Dataset, monkeypatch: pytest.Monkey
         names = {"data": data, "seed": seed, "sample": sample, "position": position, "laser": str(laser), "draw": draw}
         return NoiseStream(tuple(value for name, value in names.items() if name != forgotten))
 
-    monkeypatch.setattr("phibench.datasets.frame_source.frame_stream", stream)
+    monkeypatch.setattr("phibench.datasets.frames.source.frame_stream", stream)
     sources = [sample.frame_source("bayer-raw", analogue_gain=4.0, exposure=4e-3) for sample in dataset]
     found = _dependent([_residual(source, *frame) for source in sources for frame in FRAMES])
     assert sum(found) == 8  # every frame has exactly one twin

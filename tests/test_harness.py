@@ -14,18 +14,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from seat_pairs import GOOD, HEADER, SHAPE, SmallPairs, method_file
+from helpers.seat_pairs import GOOD, HEADER, SHAPE, SmallPairs, method_file
 
-from phibench.estimator.bench.truth import PairTruth, SpotTruth
-from phibench.estimator.seat.answer_check import AnswerError, checked
-from phibench.estimator.seat.answer_text import answer_text
-from phibench.estimator.seat.errors import MethodError
-from phibench.estimator.seat.harness import outcomes, run_method
-from phibench.estimator.seat.limits import Limits
-from phibench.estimator.seat.outcome import FAILURES, Outcome
-from phibench.estimator.seat.pair import Answer, Pair, Spot
-from phibench.estimator.seat.parcel import MemoryFile, SharedPages, pack, unpack
-from phibench.estimator.seat.surroundings import environment
+from phibench.estimator.interface import FAILURES, Answer, Outcome, Pair, Spot
+from phibench.estimator.pair_set import PairTruth, SpotTruth
+from phibench.estimator.sandbox.answers import AnswerError, answer_text, checked
+from phibench.estimator.sandbox.process import environment
+from phibench.estimator.sandbox.resolve import Limits, MethodError
+from phibench.estimator.sandbox.runner import outcomes, run_method
+from phibench.estimator.sandbox.transport import MemoryFile, SharedPages, pack, unpack
 
 LIMITS = Limits(seconds=3.0, memory_mb=1000.0)
 
@@ -138,8 +135,8 @@ def test_leaving_the_loop_ends_the_process(tmp_path: Path) -> None:
 
 INTERRUPTED = """
 import sys
-from seat_pairs import SmallPairs
-from phibench.estimator.seat.harness import outcomes
+from helpers.seat_pairs import SmallPairs
+from phibench.estimator.sandbox.runner import outcomes
 try:
     for outcome in outcomes(sys.argv[1], SmallPairs(3)):
         print(int(outcome.answer.down.uv_px[0]), flush=True)

@@ -9,14 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from seat_pairs import GOOD, SmallPairs, method_file
+from helpers.seat_pairs import GOOD, SmallPairs, method_file
 
-from phibench.estimator.seat.channel import Channel
-from phibench.estimator.seat.limits import Limits
-from phibench.estimator.seat.pair import Pair
-from phibench.estimator.seat.parcel import MemoryFile, SharedPages, pack, unpack
-from phibench.estimator.seat.process import MethodProcess
-from phibench.estimator.seat.resolve import resolve
+from phibench.estimator.interface import Pair
+from phibench.estimator.sandbox.process import MethodProcess
+from phibench.estimator.sandbox.resolve import Limits, resolve
+from phibench.estimator.sandbox.transport import Channel, MemoryFile, SharedPages, pack, unpack
 
 
 def large() -> Pair:

@@ -94,14 +94,18 @@ def test_the_tree_obeys_every_rule() -> None:
 @pytest.mark.parametrize(
     ("path", "source", "complaint"),
     [
-        ("scenes/a.py", "from phibench.render.variant import activate", "may not import phibench.render"),
+        ("scenes/a.py", "from phibench.render.setup.variant import activate", "may not import phibench.render"),
         ("scenes/a.py", "import phibench.datasets.read", "may not import phibench.datasets"),
         ("scenes/a.py", "import phibench", "may not import phibench"),
         ("render/a.py", "from phibench.datasets import read", "may not import phibench.datasets"),
-        ("render/a.py", "from phibench.estimator.phi import phi", "may not import phibench.estimator"),
+        ("render/a.py", "from phibench.estimator.geometry.phi import phi", "may not import phibench.estimator"),
         ("datasets/a.py", "from phibench.estimator import phi", "may not import phibench.estimator"),
-        ("estimator/a.py", "from phibench.render.truth import truth", "may not import phibench.render"),
-        ("estimator/methods/a.py", "def f():\n    import phibench.render.truth", "may not import phibench.render"),
+        ("estimator/a.py", "from phibench.render.optics.truth import truth", "may not import phibench.render"),
+        (
+            "estimator/methods/a.py",
+            "def f():\n    import phibench.render.optics.truth",
+            "may not import phibench.render",
+        ),
         ("datasets/a.py", "def f():\n    import mitsuba as mi", "imports mitsuba outside render/"),
         ("estimator/studies/a.py", "from drjit.llvm import Float", "imports drjit outside render/"),
         ("scenes/a.py", "from . import rig", "relative or unqualified import"),
@@ -123,12 +127,12 @@ def test_each_rule_catches_what_it_forbids(tmp_path: Path, path: str, source: st
     ("path", "source"),
     [
         ("render/a.py", "import mitsuba\nfrom drjit.llvm import Float\nfrom phibench.scenes.rig import Rig"),
-        ("datasets/a.py", "from phibench.render.truth import truth\nfrom phibench.scenes import rig"),
+        ("datasets/a.py", "from phibench.render.optics.truth import truth\nfrom phibench.scenes import rig"),
         (
             "estimator/a.py",
             "import numpy\nfrom phibench.datasets.read import read\nfrom phibench.scenes.rig import Rig",
         ),
-        ("estimator/studies/a.py", "from phibench.render.truth import truth"),
+        ("estimator/studies/a.py", "from phibench.render.optics.truth import truth"),
     ],
 )
 def test_what_is_allowed_passes(tmp_path: Path, path: str, source: str) -> None:

@@ -7,23 +7,29 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.sensor_light import spot_at
 from scipy import integrate, stats
-from sensor_light import spot_at
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.expected import ExpectedRegion, expected_of_light, expected_region
-from phibench.datasets.sensor_card import card_of, sensor_card
-from phibench.estimator.fisher import covariance_bound, fisher_matrix, hartlap_factor, processed_fisher
-from phibench.estimator.limits import UNKNOWNS, derivative_images, limit_of, spot_limit
-from phibench.estimator.pixel_information import approximate_information, exact_information, quantised_information
-from phibench.estimator.raw_pixels import PixelNoise, noise_of
-from phibench.render.chain import Chain
-from phibench.render.light import Light
-from phibench.render.moments import drawn_moments, linear_operator, raw_moments
-from phibench.render.region import Region
-from phibench.render.sensor import Sensor, sensor
-from phibench.render.tiles import NoiseStream
-from phibench.scenes.streams import generator
+from phibench.datasets.exposures.expected import ExpectedRegion, expected_of_light, expected_region
+from phibench.datasets.frames.sensor_card import card_of, sensor_card
+from phibench.estimator.limits.position_bound import (
+    UNKNOWNS,
+    approximate_information,
+    derivative_images,
+    exact_information,
+    limit_of,
+    quantised_information,
+    spot_limit,
+)
+from phibench.estimator.spots.fit_raw import covariance_bound, fisher_matrix, hartlap_factor, processed_fisher
+from phibench.estimator.spots.raw_pixels import PixelNoise, noise_of
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.light import Light, Region
+from phibench.render.sensor.moments import drawn_moments, linear_operator, raw_moments
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.settings import Sensor, sensor
+from phibench.scenes.random_streams import generator
 
 FALSE_ALARM = 1e-6  # per assertion
 MONO = sensor("mono-raw", mono_weights=(1.0, 0.0, 0.0), dark_e_per_s=0.0)

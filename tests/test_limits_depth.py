@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from oracles import alhazen_quartic, paper_cases, random_rig, random_spot, true_pixel
+from helpers.oracles import alhazen_quartic, paper_cases, random_rig, random_spot, true_pixel
 from scipy import stats
 
-from phibench.estimator.limits import SpotLimit, depth_limit, phi_limit
-from phibench.estimator.phi import estimate_phi
-from phibench.estimator.rig_errors import RIG_PARAMETERS, changed_rig, rig_covariance, rig_gradient
-from phibench.estimator.triangulate import depth_exact
+from phibench.estimator.geometry.phi import estimate_phi
+from phibench.estimator.geometry.rig_parameters import RIG_PARAMETERS, changed_rig, rig_covariance, rig_gradient
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.limits.position_bound import SpotLimit, depth_limit, phi_limit
+from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
-from phibench.scenes.streams import generator
 
 RIG = Rig()
 SIGMAS = {

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from phibench.render import llvm, llvm_apt, llvm_library
-from phibench.render.llvm_library import Llvm, LlvmError
+from phibench.render.setup import llvm, llvm_library
+from phibench.render.setup.llvm_library import Llvm, LlvmError
 
 Python = Callable[..., subprocess.CompletedProcess[str]]
 FOLDER = "usr/lib/x86_64-linux-gnu"
@@ -40,7 +40,7 @@ def pretend(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
         def prove(found: Llvm) -> str:
             return "" if found.version[0] in proof else "it aborts"
 
-        for module in (llvm, llvm_apt):
+        for module in (llvm,):
             monkeypatch.setattr(module, "probe", probe)
         monkeypatch.setattr(llvm, "prove", prove)
 
@@ -131,7 +131,7 @@ def test_a_bad_wish_of_the_user_is_refused_and_not_replaced(
     if content:
         put(named, content)
     monkeypatch.setenv(llvm.ENVIRONMENT, str(named))
-    monkeypatch.setattr(llvm_apt, "fetch", lambda: pytest.fail("nothing is to be fetched against the user's wish"))
+    monkeypatch.setattr(llvm, "fetch_llvm", lambda: pytest.fail("nothing is to be fetched against the user's wish"))
     with pytest.raises(LlvmError, match=complaint) as caught:
         llvm.ensure_llvm()
     assert str(named) in str(caught.value)
@@ -151,8 +151,8 @@ def test_ensure_fetches_when_the_found_one_fails_the_proof(
     pretend(proof=(20,))
     put(machine / "system/libLLVM.so.19.1", "19.1.7")
     cached = machine / "cache/llvm/libllvm20" / FOLDER / "libLLVM.so.20.1"
-    monkeypatch.setattr(llvm_apt, "is_offered", lambda: True)
-    monkeypatch.setattr(llvm_apt, "fetch", lambda: put(cached, "20.1.2"))
+    monkeypatch.setattr(llvm, "is_offered", lambda: True)
+    monkeypatch.setattr(llvm, "fetch_llvm", lambda: put(cached, "20.1.2"))
     with pytest.raises(LlvmError, match="fails the proof, it aborts"):
         llvm.ensure_llvm(fetch=False)
     assert llvm.ensure_llvm().path == cached
@@ -209,7 +209,7 @@ def test_the_old_ones_of_this_machine_are_never_picked(machine: Path, monkeypatc
 
 def test_use_sets_the_variable_and_loads_the_library(python: Python) -> None:
     code = (
-        "import os; from phibench.render.llvm import use_llvm; found = use_llvm()\n"
+        "import os; from phibench.render.setup.llvm import use_llvm; found = use_llvm()\n"
         "assert os.environ['DRJIT_LIBLLVM_PATH'] == str(found.path)\n"
         "from drjit.llvm import Float; import drjit as dr\n"
         "print(dr.sum(dr.minimum(dr.arange(Float, 5), 2.0), axis=None)[0])\n"
@@ -290,7 +290,7 @@ def asked(tools: Path, word: str) -> list[str]:
 
 
 def test_unpacking_renews_lists_of_its_own_and_takes_what_is_missing(tools: Path) -> None:
-    tree = llvm_apt.unpack(llvm_library.cache_folder())
+    tree = llvm.unpack(llvm_library.cache_folder())
     assert tree == tools / "cache/llvm/libllvm20"
     found = llvm.find_llvm()
     assert found.path == tree / FOLDER / "libLLVM.so.20.1"
@@ -303,7 +303,7 @@ def test_unpacking_renews_lists_of_its_own_and_takes_what_is_missing(tools: Path
 
 def test_unpacking_uses_the_lists_of_the_system_where_there_are_some(tools: Path) -> None:
     put(tools / "lists", "")
-    llvm_apt.unpack(llvm_library.cache_folder())
+    llvm.unpack(llvm_library.cache_folder())
     assert asked(tools, "update") == []
 
 
@@ -311,20 +311,20 @@ def test_a_failed_fetch_leaves_nothing_and_can_be_repeated(tools: Path, monkeypa
     cache = llvm_library.cache_folder()
     monkeypatch.setenv("OFFLINE", "yes")
     with pytest.raises(LlvmError, match="no network") as caught:
-        llvm_apt.unpack(cache)
+        llvm.unpack(cache)
     assert one_sentence(caught.value)
     assert list(cache.iterdir()) == []
     monkeypatch.setenv("OFFLINE", "")
-    assert llvm_apt.unpack(cache).is_dir()
+    assert llvm.unpack(cache).is_dir()
     assert [path.name for path in cache.iterdir()] == ["libllvm20"]
 
 
 def test_a_broken_tree_is_replaced_and_a_good_one_is_kept(tools: Path) -> None:
     library = put(tools / "cache/llvm/libllvm20" / FOLDER / "libLLVM.so.20.1", "broken")
-    llvm_apt.unpack(llvm_library.cache_folder())
+    llvm.unpack(llvm_library.cache_folder())
     assert library.read_text().strip() == "20.1.2"
     put(library, "20.9.9")
-    llvm_apt.unpack(llvm_library.cache_folder())
+    llvm.unpack(llvm_library.cache_folder())
     assert library.read_text() == "20.9.9"
 
 
@@ -332,13 +332,13 @@ def test_what_a_killed_process_left_goes_after_a_day(tools: Path) -> None:
     cache = llvm_library.cache_folder()
     old, young = put(cache / ".partial-a/x", ""), put(cache / ".partial-b/x", "")
     os.utime(old.parent, (0, 0))
-    llvm_apt.unpack(cache)
+    llvm.unpack(cache)
     assert (old.parent.exists(), young.parent.exists()) == (False, True)
 
 
 def test_root_installs_for_all_after_renewing_the_lists(tools: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 0)
-    llvm_apt.fetch()
+    llvm.fetch_llvm()
     assert (tools / "lists.installed").exists()
     assert not (tools / "cache").exists()
 
@@ -347,13 +347,13 @@ def test_root_that_may_not_install_unpacks(tools: Path, monkeypatch: pytest.Monk
     script = tools / "bin/apt-get"
     script.write_text(APT.replace('touch "$STATE.installed"', "exit 100"))
     monkeypatch.setattr(os, "geteuid", lambda: 0)
-    llvm_apt.fetch()
+    llvm.fetch_llvm()
     assert llvm.find_llvm().path.is_relative_to(tools / "cache")
 
 
 def test_a_user_never_asks_to_install(tools: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    llvm_apt.fetch()
+    llvm.fetch_llvm()
     assert [line for line in asked(tools, "install") if "-s" not in line.split()] == []
     assert asked(tools, "download") != []
 
@@ -361,16 +361,16 @@ def test_a_user_never_asks_to_install(tools: Path, monkeypatch: pytest.MonkeyPat
 def test_a_cache_that_cannot_be_written_is_one_sentence(tools: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PHIBENCH_CACHE", str(put(tools / "file", "")))
     with pytest.raises(LlvmError, match="set PHIBENCH_CACHE") as caught:
-        llvm_apt.unpack(llvm_library.cache_folder())
+        llvm.unpack(llvm_library.cache_folder())
     assert one_sentence(caught.value)
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not llvm_apt.is_offered(), reason="fetching is for machines with apt-get; others install by hand")
+@pytest.mark.skipif(not llvm.is_offered(), reason="fetching is for machines with apt-get; others install by hand")
 def test_a_real_fetch_without_root_is_found_and_proven(machine: Path) -> None:
     try:
-        tree = llvm_apt.unpack(llvm_library.cache_folder())
-    except llvm_apt.AptError as error:
+        tree = llvm.unpack(llvm_library.cache_folder())
+    except llvm.AptError as error:
         if "resolve" in str(error) or "onnect" in str(error):
             pytest.skip(f"no network: {error}")
         raise

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from phibench.render import llvm_library
-from phibench.render.llvm_library import Llvm, Version
+from phibench.render.setup import llvm_library
+from phibench.render.setup.llvm_library import Llvm, Version
 
 
 @pytest.mark.parametrize(

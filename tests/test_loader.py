@@ -8,12 +8,11 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
-from seat_pairs import GOOD, SmallPairs, method_file
+from helpers.seat_pairs import GOOD, SmallPairs, method_file
 
-from phibench.estimator.seat import resolve as resolving
-from phibench.estimator.seat.errors import MethodError
-from phibench.estimator.seat.loader import load
-from phibench.estimator.seat.resolve import resolve
+from phibench.estimator.sandbox import resolve as resolving
+from phibench.estimator.sandbox.resolve import MethodError, resolve
+from phibench.estimator.sandbox.worker import load
 
 
 @pytest.fixture(autouse=True)
@@ -170,13 +169,13 @@ def test_two_methods_of_one_name_are_refused(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_an_optional_method_without_its_package_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("phibench.estimator.methods.built_in.find_spec", lambda name: None)
+    monkeypatch.setattr("phibench.estimator.methods.registry.find_spec", lambda name: None)
     with pytest.raises(MethodError, match="pip install photutils"):
         resolve("photutils_centroid_2dg")
 
 
 def test_a_fault_of_loading_reaches_the_user_through_the_harness(tmp_path: Path) -> None:
-    from phibench.estimator.seat.harness import run_method
+    from phibench.estimator.sandbox.runner import run_method
 
     with pytest.raises(MethodError, match=r"my_phi\.py has no function 'extrakt': did you mean 'extract'"):
         run_method(method_file(tmp_path, f"return {GOOD}").replace(":extract", ":extrakt"), SmallPairs(1))

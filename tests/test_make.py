@@ -18,20 +18,23 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from phibench.datasets import layout, make, output, spot_task
+from phibench.datasets import make
+from phibench.datasets.build import run_tasks as output
+from phibench.datasets.build import spot_task
+from phibench.datasets.build.run_tasks import estimate
+from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.estimate import estimate
-from phibench.datasets.exr import read_exr
-from phibench.datasets.files import TEMPORARY_PREFIX
-from phibench.datasets.manifest import read_manifest
-from phibench.datasets.plan import make_plan
+from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.progress import Steps
-from phibench.datasets.recipe_file import load_recipe
-from phibench.datasets.schema import ManifestRow
-from phibench.datasets.sums import damaged, data_files, read_sums
-from phibench.datasets.work import plan_tasks
-from phibench.render.certificate import Certificate, certify
-from phibench.render.variant import default_variant
+from phibench.datasets.recipe.load import load_recipe
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.checksums import damaged, data_files, read_sums
+from phibench.datasets.store.documents import read_manifest
+from phibench.datasets.store.files import TEMPORARY_PREFIX
+from phibench.datasets.store.layers import read_exr
+from phibench.datasets.store.schema import ManifestRow
+from phibench.render.optics.certificate import Certificate, certify
+from phibench.render.setup.variant import default_variant
 from phibench.scenes.laser import LaserSpot
 
 TINY = Path(__file__).with_name("tiny.toml")

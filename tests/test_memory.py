@@ -13,11 +13,11 @@ CODE = """
 import os, sys
 from dataclasses import replace
 from pathlib import Path
-from phibench.datasets.bake_task import bake_room
-from phibench.datasets.plan import make_plan
-from phibench.datasets.recipe_file import load_recipe
-from phibench.datasets.task import Done, Task, perform
-from phibench.datasets.view_task import render_view
+from phibench.datasets.build.bake_task import bake_room
+from phibench.datasets.plan.plan import make_plan
+from phibench.datasets.recipe.load import load_recipe
+from phibench.datasets.build.tasks import Done, Task, perform
+from phibench.datasets.build.view_task import render_view
 
 def resident_mb():
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6

@@ -12,9 +12,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from phibench.datasets.sensor_card import SensorCard, sensor_card
-from phibench.estimator.methods.built_in import BuiltIn
-from phibench.estimator.methods.linear import (
+from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
+from phibench.estimator.interface import Answer, Box, Pair, Spot
+from phibench.estimator.methods.locate import around, clipped, locate, red_peak
+from phibench.estimator.methods.registry import KNOWN, METHODS, BuiltIn
+from phibench.estimator.sandbox.easy_pairs import EasyPairs
+from phibench.estimator.spots.image_planes import (
     KINDS,
     demosaiced,
     kind_of,
@@ -23,19 +26,13 @@ from phibench.estimator.methods.linear import (
     redness,
     srgb_to_linear,
 )
-from phibench.estimator.methods.locate import locate
-from phibench.estimator.methods.red_peak import red_peak
-from phibench.estimator.methods.registry import KNOWN, METHODS
-from phibench.estimator.methods.window import around, clipped
-from phibench.estimator.seat.easy_pairs import EasyPairs
-from phibench.estimator.seat.pair import Answer, Box, Pair, Spot
-from phibench.estimator.spot_blur import spot_blur
-from phibench.render import isp
-from phibench.render.sensor import sensor
-from phibench.render.spot import spot_layer
+from phibench.estimator.spots.spot_prediction import spot_blur
+from phibench.render.optics.spot_layer import spot_layer
+from phibench.render.sensor import processing as isp
+from phibench.render.sensor.settings import sensor
 from phibench.scenes.laser import LaserSpot
+from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
-from phibench.scenes.streams import generator
 
 COUNT = 6
 # median distance from the spot, px, that a method must keep on 12 easy spots: about twice what it has, and what each

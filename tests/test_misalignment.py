@@ -11,32 +11,30 @@ from typing import Any
 
 import numpy as np
 import pytest
-from oracles import camera_at, random_rig
+from helpers.oracles import camera_at, random_rig
 from scipy.spatial.transform import Rotation
 from test_random import drawing
 from test_recipe import changed, complaints
 
-from phibench.datasets import recipe as recipes
-from phibench.datasets.codec import from_json, to_json
 from phibench.datasets.errors import RecipeError
-from phibench.datasets.layers import read_ambient, read_truth
-from phibench.datasets.plan import make_plan
+from phibench.datasets.plan.plan import make_plan, shard_plan
 from phibench.datasets.read import open_finished
-from phibench.datasets.recipe_file import check_recipe
-from phibench.datasets.shard import shard_plan
+from phibench.datasets.recipe.load import check_recipe
+from phibench.datasets.recipe.tables import tables as recipes
+from phibench.datasets.store.documents import from_json, to_json
+from phibench.datasets.store.layers import read_ambient, read_truth
 from phibench.datasets.verify import verify
-from phibench.estimator.score import score
-from phibench.estimator.triangulate import depth_exact
-from phibench.render.motion import spot_velocity_px_per_s
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.paper.paper_tables import score
+from phibench.render.sensor.rolling_shutter import spot_velocity_px_per_s
 from phibench.scenes.catalog import c310_rig, default_rig
-from phibench.scenes.checks import SceneError
-from phibench.scenes.form import HARMONICS, Form
 from phibench.scenes.frames import Pose
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.misalignment import PARAMETERS, Misalignment
-from phibench.scenes.motion import Motion
+from phibench.scenes.mirror import HARMONICS, Form
+from phibench.scenes.misalignment import PARAMETERS, Misalignment, Motion
 from phibench.scenes.rig import Rig
-from phibench.scenes.robot import carriage
+from phibench.scenes.room import carriage
+from phibench.scenes.validation import SceneError
 
 EPS = 1e-14  # metres or cosines: a few roundings of numbers of order 1
 
@@ -346,10 +344,10 @@ def test_a_moved_view_is_the_view_of_a_rig_that_was_built_there(misaligned_datas
 
     The truth's D alone counts from the sphere at the down position, where the two rigs differ.
     """
-    from phibench.datasets.bake_task import bake_settings, read_light_map
-    from phibench.render.ambient import render_ambient
-    from phibench.render.truth import truth_layer
-    from phibench.render.variant import activate
+    from phibench.datasets.build.bake_task import bake_settings, read_light_map
+    from phibench.render.optics.truth import truth_layer
+    from phibench.render.room.ambient import render_ambient
+    from phibench.render.setup.variant import activate
 
     activate()
     dataset = open_finished(misaligned_dataset)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from phibench.render import noise_budget as nb
-from phibench.render.sensor import PRESETS_FILE
-from phibench.render.spot import spot_layer
-from phibench.render.spot_truth import spot_truth
+from phibench.render.optics.spot_layer import spot_layer
+from phibench.render.optics.truth import spot_truth
+from phibench.render.room import noise_budget as nb
+from phibench.render.sensor.settings import PRESETS_FILE
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
 

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from limb_frames import drawn_rig, limb_light
+from helpers.limb_frames import drawn_rig, limb_light
 from scipy import stats
 
-from phibench.datasets.sensor_card import sensor_card
+from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.calibration.limb_image import ImageError, planes_of, srgb_decoded, srgb_encoded
 from phibench.estimator.calibration.outline import find_outline, fit_outline, visible_arc
+from phibench.estimator.calibration.outline_fit import Sectors, scatter
 from phibench.estimator.calibration.outline_start import (
     circle_edges,
     grey,
@@ -21,13 +22,12 @@ from phibench.estimator.calibration.outline_start import (
     sphere_from_ellipse,
     sphere_from_rays,
 )
-from phibench.estimator.calibration.sectors import Sectors, scatter
-from phibench.render.chain import Chain
-from phibench.render.isp import demosaic, eight_bit
-from phibench.render.isp import srgb_encoded as srgb_of_the_camera
-from phibench.render.light import Light
-from phibench.render.sensor import sensor
-from phibench.render.tiles import NoiseStream
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.light import Light
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.processing import demosaic, eight_bit
+from phibench.render.sensor.processing import srgb_encoded as srgb_of_the_camera
+from phibench.render.sensor.settings import sensor
 from phibench.scenes.frames import Pose
 from phibench.scenes.rig import Rig
 

@@ -12,11 +12,19 @@ from PIL import Image
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_dataset
-from phibench.estimator.cli import main
-from phibench.estimator.panorama import Grid, pixels_by_model, unrolled
-from phibench.estimator.panorama_edges import RoomEdge, seen_edge, track, vertical_edges
-from phibench.estimator.panorama_picture import panorama, places
-from phibench.render.spot_truth import spot_truth
+from phibench.estimator.cli.main import main
+from phibench.estimator.geometry.panorama import (
+    Grid,
+    RoomEdge,
+    panorama,
+    pixels_by_model,
+    places,
+    seen_edge,
+    track,
+    unrolled,
+    vertical_edges,
+)
+from phibench.render.optics.truth import spot_truth
 from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import Misalignment

@@ -9,23 +9,29 @@ import polars as pl
 import pytest
 from scipy.stats import multivariate_normal
 
-from phibench.estimator.depth import depth_approx
-from phibench.estimator.mirror_image import image_of
-from phibench.estimator.phi import outline_circle, phi_outline
-from phibench.estimator.score import ESTIMATORS
-from phibench.estimator.studies import cause_findings as say
-from phibench.estimator.studies.cause import STUDY
-from phibench.estimator.studies.cause_model import NOISE, Model
-from phibench.estimator.studies.cause_settings import CauseSettings
-from phibench.estimator.studies.cause_simulation import brute_force, simulate
-from phibench.estimator.studies.cause_tables import short_stroke_table
-from phibench.estimator.studies.paper_reading import AZIMUTHS, PARAMETERS, Reader, published_experiments, radii_px, read
-from phibench.estimator.studies.settings import read_settings
+from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.paper_depth import depth_approx
+from phibench.estimator.geometry.phi import outline_circle, phi_outline
+from phibench.estimator.paper.paper_tables import ESTIMATORS
+from phibench.estimator.studies.cause import study as say
+from phibench.estimator.studies.cause.model import NOISE, Model, brute_force, simulate
+from phibench.estimator.studies.cause.nested_sampling import CauseSettings
+from phibench.estimator.studies.cause.paper_reading import (
+    AZIMUTHS,
+    PARAMETERS,
+    Reader,
+    published_experiments,
+    radii_px,
+    read,
+)
+from phibench.estimator.studies.cause.study import STUDY
+from phibench.estimator.studies.cause.tables import short_stroke_table
+from phibench.estimator.studies.framework import read_settings
 from phibench.scenes.frames import Array, Pose
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
-from phibench.scenes.streams import generator
 
 DATA = published_experiments()
 HEIGHTS = {f"height_{k}_m": -0.2 for k in (1, 2, 3, 4)}

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 import pytest
-from oracles import TARGETS, alhazen_quartic, paper_cases, true_pixel
+from helpers.oracles import TARGETS, alhazen_quartic, paper_cases, true_pixel
 from scipy import stats
 
-from phibench.estimator.depth import depth_paper
-from phibench.estimator.phi import CONVENTIONS, GRADIENTS, estimate_phi, outline_circle
-from phibench.estimator.status import Status
+from phibench.estimator.geometry.paper_depth import depth_paper
+from phibench.estimator.geometry.phi import CONVENTIONS, GRADIENTS, estimate_phi, outline_circle
+from phibench.estimator.geometry.status import Status
 from phibench.scenes.catalog import c310_rig
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.rig import Rig

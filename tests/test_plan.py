@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from phibench.datasets.build.spot_task import answer_spot
 from phibench.datasets.errors import RecipeError
-from phibench.datasets.plan import make_plan, pose_name
-from phibench.datasets.recipe_file import check_recipe, load_recipe
-from phibench.datasets.spot_task import answer_spot
-from phibench.estimator import published as published
+from phibench.datasets.plan.plan import make_plan, pose_name
+from phibench.datasets.recipe.load import check_recipe, load_recipe
+from phibench.estimator.geometry import paper_depth as published
+from phibench.scenes.random_streams import generator, seed_32, seed_sequence
 from phibench.scenes.rig import POSITIONS
-from phibench.scenes.streams import generator, seed_32, seed_sequence
 
 # Tables 1 to 4 of the paper: real depth, baselines (the last of table 1 is printed 1.04; see the errata).
 PAPER = {

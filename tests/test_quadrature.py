@@ -7,7 +7,7 @@ import pytest
 from scipy import integrate
 from scipy.special import i0e
 
-from phibench.render.quadrature import disc_nodes, disc_points, slices
+from phibench.render.optics.spot_samples import disc_nodes, disc_points, slices
 
 SMOOTHNESS = [0.0, 0.2, 0.7, 0.999, 1.001, 2.0, 4.0, 8.0, 16.0]
 

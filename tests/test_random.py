@@ -10,19 +10,18 @@ import pytest
 from scipy import stats
 from test_recipe import changed, target
 
-from phibench.datasets.distribution import DistributionTable, quantile, support
+from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.errors import RecipeError
-from phibench.datasets.plan import Plan, make_plan
-from phibench.datasets.random_samples import drawn_parameters
-from phibench.datasets.recipe_checks import warnings
-from phibench.datasets.recipe_file import check_recipe, load_recipe
-from phibench.datasets.sampling import PARAMETERS, first_points
-from phibench.datasets.work import plan_tasks
-from phibench.render.raycast import blocked_by
-from phibench.render.spot_truth import spot_truth
+from phibench.datasets.plan.plan import Plan, make_plan
+from phibench.datasets.plan.sampling import PARAMETERS, drawn_parameters, first_points
+from phibench.datasets.recipe.checks import warnings
+from phibench.datasets.recipe.distributions import DistributionTable, quantile, support
+from phibench.datasets.recipe.load import check_recipe, load_recipe
+from phibench.render.optics.ray_tracer import blocked_by
+from phibench.render.optics.truth import spot_truth
 from phibench.scenes.catalog import X_HIGH, X_LOW, Y_HIGH, Y_LOW
 from phibench.scenes.rig import POSITIONS
-from phibench.scenes.solids import Cuboid
+from phibench.scenes.room import Cuboid
 
 RAY = {"azimuth_deg": {"uniform": [0, 360]}, "height_m": {"uniform": [0.35, 1.5]}}
 

@@ -15,23 +15,22 @@ from test_make import quiet
 from test_random import shipped
 from test_resume import contents, done
 
-from phibench.datasets import layout
+from phibench.datasets.build.run_tasks import estimate
+from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.estimate import estimate
-from phibench.datasets.exr import read_exr
 from phibench.datasets.make import make
-from phibench.datasets.manifest import read_manifest, write_manifest
-from phibench.datasets.merge import merge
-from phibench.datasets.plan import make_plan
+from phibench.datasets.merge_repair import merge, repair
+from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.read import open_dataset, open_finished
-from phibench.datasets.recipe_file import load_recipe
-from phibench.datasets.repair import repair
+from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.show import contact_sheet
-from phibench.datasets.sums import write_sums
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.checksums import write_sums
+from phibench.datasets.store.documents import read_manifest, write_manifest
+from phibench.datasets.store.layers import read_exr
 from phibench.datasets.verify import verify
-from phibench.datasets.work import plan_tasks
-from phibench.estimator.score import score
-from phibench.render.spot_truth import spot_truth
+from phibench.estimator.paper.paper_tables import score
+from phibench.render.optics.truth import spot_truth
 from phibench.scenes.rig import POSITIONS
 
 TINY = Path(__file__).with_name("tiny_random.toml")
@@ -218,7 +217,7 @@ def test_estimators_use_each_samples_rig(made: Path) -> None:
 
 
 def test_the_exact_depth_comes_out_of_200_drawn_rigs() -> None:
-    from phibench.estimator.triangulate import depth_exact
+    from phibench.estimator.geometry.triangulate import depth_exact
 
     drawn = make_plan(load_recipe("random").model_copy(update={"random": shipped(200)}))
     errors = []

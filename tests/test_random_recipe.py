@@ -8,9 +8,9 @@ import pytest
 from test_random import RAY, drawing
 from test_recipe import changed, complaints
 
-from phibench.datasets.recipe import DRAWABLE, RandomRigTable, Recipe
-from phibench.datasets.recipe_file import check_recipe
-from phibench.datasets.sampling import MISALIGNMENT, PARAMETERS
+from phibench.datasets.plan.sampling import MISALIGNMENT, PARAMETERS
+from phibench.datasets.recipe.load import check_recipe
+from phibench.datasets.recipe.tables import DRAWABLE, RandomRigTable, Recipe
 
 UNIFORM = {"uniform": [0.1, 1.4]}
 

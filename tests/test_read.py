@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from phibench.datasets import layout
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.layers import TRUTH_PLANES, SpotWindow
-from phibench.datasets.plan import make_plan
+from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.read import Dataset, open_dataset, open_finished
-from phibench.datasets.recipe_file import load_recipe
-from phibench.render.spot import spot_layer
-from phibench.render.truth import truth_layer
+from phibench.datasets.recipe.load import load_recipe
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.layers import TRUTH_PLANES, SpotWindow
+from phibench.render.optics.spot_layer import spot_layer
+from phibench.render.optics.truth import truth_layer
 
 TINY = Path(__file__).with_name("tiny.toml")
 
@@ -200,7 +200,7 @@ def test_a_sample_prints_short(dataset: Dataset) -> None:
 
 def test_a_data_set_of_version_4_is_read_as_perfect_spheres(tiny_dataset: Path, tmp_path: Path) -> None:
     """Version 4 has no `mirror.form`: what was true then is true now, and verification agrees."""
-    from phibench.datasets.verify_plan import plan_faults
+    from phibench.datasets.verify import plan_faults
 
     copy = Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
     info = json.loads((copy / layout.INFO).read_text())

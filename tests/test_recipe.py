@@ -6,10 +6,10 @@ from typing import Any
 import pytest
 
 from phibench.datasets.errors import RecipeError
-from phibench.datasets.recipe import Recipe, recipe_schema
-from phibench.datasets.recipe_checks import warnings
-from phibench.datasets.recipe_file import RECIPES, check_recipe, find_recipe, load_recipe, parse_recipe
-from phibench.datasets.recipe_scene import build_rig, build_spot
+from phibench.datasets.recipe.build import build_rig, build_spot
+from phibench.datasets.recipe.checks import warnings
+from phibench.datasets.recipe.load import RECIPES, check_recipe, find_recipe, load_recipe, parse_recipe
+from phibench.datasets.recipe.tables import Recipe, recipe_schema
 from phibench.scenes.catalog import c310_rig, default_rig
 
 SOUND: dict[str, Any] = {

@@ -5,16 +5,18 @@ from pathlib import Path
 
 import pytest
 
-from phibench.datasets import recipe_page
-from phibench.datasets.recipe import RigTable
-from phibench.datasets.recipe_scene import build_rig
+from phibench.datasets.recipe.build import build_rig
+from phibench.datasets.recipe.tables import RigTable
+from phibench.datasets.recipe.tables import reference_page as recipe_page
 from phibench.scenes.catalog import RIGS
 
 PAGE = Path(recipe_page.__file__).resolve().with_name("RECIPE.md").read_text(encoding="utf-8")
 
 
 def test_the_page_is_the_generated_one() -> None:
-    assert recipe_page.recipe_page() == PAGE, "run python -m phibench.datasets.recipe_page > datasets/RECIPE.md"
+    assert recipe_page.recipe_page() == PAGE, (
+        "run python -m phibench.datasets.recipe.reference_page > datasets/RECIPE.md"
+    )
 
 
 @pytest.mark.parametrize("heading", recipe_page.TABLES)

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.oracles import (
+    alhazen_quartic,
+    fermat_on_sphere,
+    fermat_path,
+    random_rig,
+    random_spot,
+    true_pixel,
+    true_reflection,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracles import alhazen_quartic, fermat_on_sphere, fermat_path, random_rig, random_spot, true_pixel, true_reflection
 
-from phibench.estimator.reflection import GRAZING_COSINE, reflect, reflect_jacobian
-from phibench.estimator.status import Status
+from phibench.estimator.geometry.reflection import GRAZING_COSINE, reflect, reflect_jacobian
+from phibench.estimator.geometry.status import Status
 from phibench.scenes.catalog import c310_rig
 from phibench.scenes.rig import Rig
 

@@ -10,11 +10,11 @@ from test_make import quiet
 from test_resume import contents
 from test_verify import AMBIENT, OTHER_SPOT, SPOT, TRUTH, flip_a_bit, swap, truncate
 
-from phibench.datasets import layout
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.files import sha256
-from phibench.datasets.repair import repair
-from phibench.datasets.sums import read_sums, sums_text, write_sums
+from phibench.datasets.merge_repair import repair
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.checksums import read_sums, sums_text, write_sums
+from phibench.datasets.store.files import sha256
 from phibench.datasets.verify import verify
 
 PREVIEW = layout.preview_file("seen-near-h0.500")

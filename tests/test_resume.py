@@ -13,15 +13,14 @@ from pathlib import Path
 import pytest
 from test_make import TINY, living, quiet, said
 
-from phibench.datasets import layout
-from phibench.datasets.code_hash import _tables, closure, code_behind
+from phibench.datasets.build.journal import Entry, Head, Journal
+from phibench.datasets.build.run_tasks import claim
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.files import TEMPORARY_PREFIX
-from phibench.datasets.journal import Entry, Head, Journal
-from phibench.datasets.lock import only_run
 from phibench.datasets.make import make
-from phibench.datasets.output import claim
-from phibench.datasets.sums import data_files
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.checksums import data_files
+from phibench.datasets.store.files import TEMPORARY_PREFIX, only_run
+from phibench.datasets.store.provenance import _tables, closure, code_behind
 
 RUN = (
     "import sys\nfrom phibench.datasets.make import make\n"
@@ -135,15 +134,17 @@ def test_a_torn_last_line_is_as_if_it_were_not_there(tmp_path: Path) -> None:
 
 
 def test_a_key_covers_the_code_behind_a_task_and_no_other() -> None:
-    view, spot = closure("phibench.datasets.view_task"), closure("phibench.datasets.spot_task")
-    assert {"phibench.render.ambient", "phibench.scenes.camera", "phibench.datasets.exr"} <= view
-    assert "phibench.render.certificate" in spot - view
-    assert "phibench.render.ambient" in view - spot
-    assert not {"phibench.datasets.make", "phibench.datasets.progress", "phibench.datasets.cluster"} & (view | spot)
+    view, spot = closure("phibench.datasets.build.view_task"), closure("phibench.datasets.build.spot_task")
+    assert {"phibench.render.room.ambient", "phibench.scenes.camera", "phibench.datasets.store.layers"} <= view
+    assert "phibench.render.optics.certificate" in spot - view
+    assert "phibench.render.room.ambient" in view - spot
+    assert not {"phibench.datasets.make", "phibench.datasets.progress", "phibench.datasets.build.workers"} & (
+        view | spot
+    )
     # the sensor's numbers, which the noise budget takes from a table beside the code
-    assert "phibench.render.sensor" in view - spot
-    assert [path.name for path in _tables("phibench.render.sensor")] == ["sensor_presets.toml"]
-    assert code_behind("phibench.datasets.view_task") != code_behind("phibench.datasets.spot_task")
+    assert "phibench.render.sensor.settings" in view - spot
+    assert [path.name for path in _tables("phibench.render.sensor.settings")] == ["sensor_presets.toml"]
+    assert code_behind("phibench.datasets.build.view_task") != code_behind("phibench.datasets.build.spot_task")
 
 
 # Two runs into one folder, and runs that are killed.
@@ -156,7 +157,7 @@ def start(out: Path, recipe: Path = TINY) -> "subprocess.Popen[str]":
 
 def test_a_second_run_is_refused_and_a_killed_one_holds_nothing(tmp_path: Path) -> None:
     code = (
-        "import sys, time\nfrom pathlib import Path\nfrom phibench.datasets.lock import only_run\n"
+        "import sys, time\nfrom pathlib import Path\nfrom phibench.datasets.store.files import only_run\n"
         "with only_run(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True) as holder:

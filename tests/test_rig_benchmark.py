@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from phibench.datasets.sensor_card import card_of
-from phibench.estimator.best_stroke import best_stroke, spot_bound
-from phibench.estimator.panorama import Grid, pixels_by_model, unrolled
-from phibench.estimator.spot_blur import spot_blur
-from phibench.render.sensor import sensor
-from phibench.render.spot import spot_layer
-from phibench.scenes.form import Form
+from phibench.datasets.frames.sensor_card import card_of
+from phibench.estimator.geometry.panorama import Grid, pixels_by_model, unrolled
+from phibench.estimator.limits.best_stroke import best_stroke, spot_bound
+from phibench.estimator.spots.spot_prediction import spot_blur
+from phibench.render.optics.spot_layer import spot_layer
+from phibench.render.sensor.settings import sensor
 from phibench.scenes.laser import Beam, LaserSpot, beam_diameter_m
+from phibench.scenes.mirror import Form
 from phibench.scenes.rig import Rig
 
 SPOT = LaserSpot((2.0, 0.5, 0.5), (-2.0, -0.5, 0.0), beam_diameter_m(2.06))

@@ -8,8 +8,8 @@ import pytest
 from test_make import quiet
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.bench.document import read_score
-from phibench.estimator.bench.run_all import bench
+from phibench.estimator.benchmark.document import read_score
+from phibench.estimator.benchmark.score import bench
 
 
 def test_the_benchmark_runs_what_accepts_each_preset(bench_dataset: Path, tmp_path: Path) -> None:

@@ -7,15 +7,14 @@ from pathlib import Path
 import pytest
 from test_make import quiet
 
-from phibench.datasets.cluster import local_workers
-from phibench.datasets.dispatch import dispatch
-from phibench.datasets.environment import local_environment, versions
-from phibench.datasets.estimate import START_S, estimate
+from phibench.datasets.build.run_tasks import START_S, estimate
+from phibench.datasets.build.scheduler import dispatch
+from phibench.datasets.build.task_list import plan_tasks
+from phibench.datasets.build.tasks import Done
+from phibench.datasets.build.workers import local_environment, local_workers, versions
 from phibench.datasets.make import make
-from phibench.datasets.plan import make_plan
-from phibench.datasets.recipe_file import load_recipe, parse_recipe
-from phibench.datasets.task import Done
-from phibench.datasets.work import plan_tasks
+from phibench.datasets.plan.plan import make_plan
+from phibench.datasets.recipe.load import load_recipe, parse_recipe
 
 TINY = Path(__file__).with_name("tiny.toml")
 STROKES = ", ".join(f"{0.5 + k / 100.0:.2f}" for k in range(24))

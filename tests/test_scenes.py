@@ -7,16 +7,16 @@ import math
 
 import numpy as np
 import pytest
-from oracles import TARGETS
+from helpers.oracles import TARGETS
 
 from phibench.scenes.camera import Camera
 from phibench.scenes.catalog import c310_rig, lab
-from phibench.scenes.checks import SceneError
 from phibench.scenes.frames import Pose, rotation_facing, rotation_xyz
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
 from phibench.scenes.mirror import STEEL, SphereMirror
 from phibench.scenes.rig import POSITIONS, Rig, Stroke
-from phibench.scenes.textures import Uniform
+from phibench.scenes.room import Uniform
+from phibench.scenes.validation import SceneError
 
 NAN, INF = math.nan, math.inf
 

@@ -11,13 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from phibench.datasets.codec import from_json, to_json
+from phibench.datasets.build.spot_task import make_spot
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.manifest import differences, read_manifest, to_frame, write_manifest
-from phibench.datasets.plan import make_plan
-from phibench.datasets.recipe_file import load_recipe
-from phibench.datasets.schema import ManifestRow, columns, flat, row_line
-from phibench.datasets.spot_task import make_spot
+from phibench.datasets.plan.plan import make_plan
+from phibench.datasets.recipe.load import load_recipe
+from phibench.datasets.store.documents import differences, from_json, read_manifest, to_frame, to_json, write_manifest
+from phibench.datasets.store.schema import ManifestRow, columns, flat, row_line
 from phibench.scenes.catalog import c310_rig, lab
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room

@@ -9,12 +9,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from oracles import paper_cases, true_pixel
+from helpers.oracles import paper_cases, true_pixel
 from rich.console import Console
 from scipy.special import ndtr
 
-from phibench.estimator.published import find_published, load_published
-from phibench.estimator.score import ESTIMATORS, SOURCES, as_records, bias_table, score, summarise, table
+from phibench.estimator.geometry.paper_depth import find_published, load_published
+from phibench.estimator.paper.paper_tables import ESTIMATORS, SOURCES, as_records, bias_table, score, summarise, table
 from phibench.scenes.rig import Rig
 
 RIG = Rig()

@@ -11,24 +11,30 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bench_samples import hidden
+from helpers.bench_samples import hidden
+from helpers.sealed_sets import refusal
 from PIL import Image
-from sealed_sets import refusal
 from test_make import quiet
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_dataset
-from phibench.datasets.recipe import Recipe
-from phibench.datasets.recipe_file import load_recipe
-from phibench.estimator import cli
-from phibench.estimator.bench.dataset_pairs import dataset_pairs
-from phibench.estimator.bench.document import read_score
-from phibench.estimator.bench.run_all import show
-from phibench.estimator.bench.seal import Sealed, seal, seed_warnings, sequence_warnings
-from phibench.estimator.bench.sealed_pairs import SealedPairs
-from phibench.estimator.bench.submission import submit
-from phibench.estimator.bench.truth import PairTruth
-from phibench.estimator.bench.truth_file import truth_document, truth_of
+from phibench.datasets.recipe.load import load_recipe
+from phibench.datasets.recipe.tables import Recipe
+from phibench.estimator.benchmark.dataset_pairs import dataset_pairs
+from phibench.estimator.benchmark.document import read_score
+from phibench.estimator.benchmark.score import show
+from phibench.estimator.benchmark.sealed_pairs import SealedPairs
+from phibench.estimator.benchmark.sealed_set import (
+    Sealed,
+    seal,
+    seed_warnings,
+    sequence_warnings,
+    truth_document,
+    truth_of,
+)
+from phibench.estimator.benchmark.submission import submit
+from phibench.estimator.cli import main as cli
+from phibench.estimator.pair_set import PairTruth
 from phibench.scenes.laser import Beam
 
 
@@ -248,7 +254,7 @@ def test_an_interrupted_seal_leaves_nothing(
     def fail(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("phibench.estimator.bench.seal.truth_text", fail)
+    monkeypatch.setattr("phibench.estimator.benchmark.sealed_set.truth_text", fail)
     with pytest.raises(KeyboardInterrupt):
         seal(copy, tmp_path / "public", "bayer-raw", quiet())
     assert [path.name for path in tmp_path.iterdir()] == ["set"]

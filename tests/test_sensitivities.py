@@ -13,24 +13,24 @@ import pytest
 from test_accuracy_misalignment import Case, draw_case
 
 from phibench.datasets.read import open_finished
-from phibench.estimator.cli import main
-from phibench.estimator.depth import paper_gradient
-from phibench.estimator.mirror_image import image_of
-from phibench.estimator.ray_slope import ray_basis
-from phibench.estimator.rig_errors import RIG_PARAMETERS, rig_gradient
-from phibench.estimator.score import ESTIMATORS
-from phibench.estimator.sensitivities import (
+from phibench.estimator.cli.main import main
+from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.paper_depth import paper_gradient
+from phibench.estimator.geometry.reflection import ray_basis
+from phibench.estimator.geometry.rig_parameters import RIG_PARAMETERS, rig_gradient
+from phibench.estimator.geometry.sensitivities import (
     PARAMETERS,
     PIXEL_GRADIENTS,
     pixel_gradient,
     sensitivity,
     truth_gradient,
 )
-from phibench.estimator.sensitivity_table import TRUTH, columns
-from phibench.estimator.triangulate import depth_exact, exact_gradient
-from phibench.render.certificate import pixel_centroid
-from phibench.render.spot import spot_layer
-from phibench.render.spot_truth import depth_m, spot_truth
+from phibench.estimator.geometry.triangulate import depth_exact, exact_gradient
+from phibench.estimator.paper.paper_tables import ESTIMATORS
+from phibench.estimator.paper.sensitivity_table import TRUTH, columns
+from phibench.render.optics.certificate import pixel_centroid
+from phibench.render.optics.spot_layer import spot_layer
+from phibench.render.optics.truth import depth_m, spot_truth
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose
 from phibench.scenes.laser import LaserSpot
@@ -347,7 +347,7 @@ def test_the_table_of_a_data_set(misaligned_dataset: Path, tmp_path: Path, capsy
 
 
 def test_a_hidden_spot_is_a_row_of_nulls_with_its_cause(misaligned_dataset: Path) -> None:
-    from phibench.estimator.sensitivity_table import sensitivity_rows
+    from phibench.estimator.paper.sensitivity_table import sensitivity_rows
 
     sample = open_finished(misaligned_dataset).samples[0]
     nowhere = sample.row.up.model_copy(update={"visible": False, "cause": "occluded:crate"})

@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from phibench.datasets import layout
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_finished
-from phibench.datasets.sums import strays
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.checksums import strays
 from phibench.datasets.verify import verify
-from phibench.estimator.score import ESTIMATORS
-from phibench.estimator.sensitivity_table import columns, keep_sensitivities
+from phibench.estimator.paper.paper_tables import ESTIMATORS
+from phibench.estimator.paper.sensitivity_table import columns, keep_sensitivities
 
 
 @pytest.fixture

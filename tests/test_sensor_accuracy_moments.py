@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.sensor_light import spot_at
 from scipy import stats
-from sensor_light import spot_at
 
-from phibench.render import isp
-from phibench.render.chain import Chain
-from phibench.render.light import Light
-from phibench.render.moments import QUANTISATION_DN2, drawn_moments, linear_moments, linear_operator, raw_moments
-from phibench.render.region import Region
-from phibench.render.sensor import sensor
-from phibench.render.tiles import NoiseStream
+from phibench.render.sensor import processing as isp
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.light import Light, Region
+from phibench.render.sensor.moments import QUANTISATION_DN2, drawn_moments, linear_moments, linear_operator, raw_moments
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.settings import sensor
 
 STREAM = NoiseStream(("moments", 0))
 LIGHT = Light(np.full((3, 40, 48), 6e4) * np.linspace(0.5, 1.5, 48), spot_at(21.3, 18.8, electrons_per_s=3e5))

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from phibench.render.chain import Chain
-from phibench.render.electrons import digitised
-from phibench.render.light import Light
-from phibench.render.region import Region
-from phibench.render.sensor import Sensor, sensor
-from phibench.render.tiles import NoiseStream, poisson
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import digitised
+from phibench.render.sensor.light import Light, Region
+from phibench.render.sensor.noise_tiles import NoiseStream, poisson
+from phibench.render.sensor.settings import Sensor, sensor
 
 FALSE_ALARM = 2e-6  # per assertion; 13 of them in this file: 3e-5 per run
 STREAM = NoiseStream(("accuracy", 0))
@@ -124,7 +123,7 @@ def test_row_noise_is_common_to_a_row() -> None:
 
 
 def test_speckle_flicker_has_the_gamma_law() -> None:
-    from phibench.render.electrons import speckle_gain
+    from phibench.render.sensor.electrons import speckle_gain
 
     s = sensor("mjpeg", speckle_m=2.5)
     gains = [speckle_gain(s, STREAM.stage("speckle test", k)) for k in range(60000)]

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import photon_transfer as ptc
 from PIL import Image
 from scipy.stats import norm
 
-from phibench.render import photon_transfer as ptc
-from phibench.render.chain import Chain
-from phibench.render.light import Light
-from phibench.render.sensor import Sensor, sensor
-from phibench.render.tiles import NoiseStream
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.light import Light
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.settings import Sensor, sensor
 from phibench.scenes.frames import Array
 
 SIZE = (288, 288)

@@ -6,17 +6,17 @@ import itertools
 from dataclasses import replace
 
 import pytest
-from sensor_light import room
+from helpers.sensor_light import room
 
-from phibench.datasets.frame_request import FrameRequest
-from phibench.datasets.frame_source import FrameSource, Side
-from phibench.datasets.layers import SpotWindow
-from phibench.render.chain import Chain
-from phibench.render.electrons import _pattern
-from phibench.render.motion import moved_spot
-from phibench.render.region import Region
-from phibench.render.sensor import sensor
-from phibench.render.tiles import NoiseStream
+from phibench.datasets.frames.request import FrameRequest
+from phibench.datasets.frames.source import FrameSource, Side
+from phibench.datasets.store.layers import SpotWindow
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import _pattern
+from phibench.render.sensor.light import Region
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.rolling_shutter import moved_spot
+from phibench.render.sensor.settings import sensor
 
 LIGHT = room((720, 1280))
 STREAM = NoiseStream(("benchmark", 0))

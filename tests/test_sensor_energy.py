@@ -13,19 +13,18 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from phibench.render.ambient import render_ambient
-from phibench.render.bake import BakeSettings, LightMap, bake
-from phibench.render.chain import Chain
-from phibench.render.light import Light
-from phibench.render.patches import cut, texel_count
-from phibench.render.sensor import sensor
-from phibench.render.spot import spot_layer
-from phibench.render.tiles import NoiseStream
+from phibench.render.optics.spot_layer import spot_layer
+from phibench.render.room.ambient import render_ambient
+from phibench.render.room.light_map import BakeSettings, LightMap, bake
+from phibench.render.room.shading import cut, texel_count
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.light import Light
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.settings import sensor
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
-from phibench.scenes.room import Room
-from phibench.scenes.solids import cuboid, rectangle
+from phibench.scenes.room import Room, cuboid, rectangle
 
 STREAM = NoiseStream(("energy", 0))
 SEED_OF_PHOTONS = 650e-9 / (6.62607015e-34 * 299792458.0)  # photons in a joule at 650 nm

@@ -7,19 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.sensor_light import room
 from PIL import Image
 from scipy.ndimage import convolve
-from sensor_light import room
 
-from phibench.datasets.files import write_bytes
-from phibench.render import isp
-from phibench.render.auto_exposure import auto_exposed, mean_level
-from phibench.render.chain import Chain
-from phibench.render.electrons import mosaic
-from phibench.render.jpeg import compressed, decoded, encoded
-from phibench.render.light import Light
-from phibench.render.sensor import sensor
-from phibench.render.tiles import NoiseStream
+from phibench.datasets.store.files import write_bytes
+from phibench.render.sensor import processing as isp
+from phibench.render.sensor.camera_chain import Chain, auto_exposed, mean_level
+from phibench.render.sensor.electrons import mosaic
+from phibench.render.sensor.light import Light
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.processing import compressed, decoded, encoded
+from phibench.render.sensor.settings import sensor
 
 STREAM = NoiseStream(("isp", 0))
 MATRIX = ((1.5, -0.4, -0.1), (-0.25, 1.45, -0.2), (-0.05, -0.45, 1.5))

@@ -6,16 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sensor_light import FILTERS, spot_at
+from helpers.sensor_light import FILTERS, spot_at
 
-from phibench.render.chain import Chain
-from phibench.render.electrons import mono, mosaic, vignetting
-from phibench.render.light import Light
-from phibench.render.motion import moved_spot, row_times_s, spot_velocity_px_per_s
-from phibench.render.region import Region
-from phibench.render.sensor import SensorError, sensor
-from phibench.render.spot import spot_layer
-from phibench.render.tiles import NoiseStream
+from phibench.render.optics.spot_layer import spot_layer
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import mono, mosaic, vignetting
+from phibench.render.sensor.light import Light, Region
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.rolling_shutter import moved_spot, row_times_s, spot_velocity_px_per_s
+from phibench.render.sensor.settings import SensorError, sensor
 from phibench.scenes.camera import Camera
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.laser import LaserSpot

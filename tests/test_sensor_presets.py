@@ -6,13 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sensor_light import room
+from helpers.sensor_light import room
 
-from phibench.render.chain import Chain
-from phibench.render.isp import eight_bit, linear_rgb, linear_signal, rendered
-from phibench.render.jpeg import compressed
-from phibench.render.sensor import SensorError, preset_names, sensor
-from phibench.render.tiles import NoiseStream
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.processing import compressed, eight_bit, linear_rgb, linear_signal, rendered
+from phibench.render.sensor.settings import SensorError, preset_names, sensor
 
 ROOT = Path(__file__).resolve().parent.parent
 STREAM = NoiseStream(("presets", 0))

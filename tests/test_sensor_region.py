@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sensor_light import room
+from helpers.sensor_light import room
 
-from phibench.render.chain import Chain
-from phibench.render.region import Region
-from phibench.render.sensor import SensorError, sensor
-from phibench.render.tiles import NoiseStream
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.light import Region
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.settings import SensorError, sensor
 from phibench.scenes.camera import Camera
 
 STREAM = NoiseStream(("region", 0, "sample", "down", "on", 0))

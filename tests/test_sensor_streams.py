@@ -6,14 +6,13 @@ import itertools
 
 import numpy as np
 import pytest
-from sensor_light import room
+from helpers.sensor_light import room
 
-from phibench.render.chain import Chain
-from phibench.render.light import Light
-from phibench.render.region import Region
-from phibench.render.sensor import sensor
-from phibench.render.tiles import TILE_PX, NoiseStream, frame_stream, normal, poisson
-from phibench.scenes.streams import philox_key
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.light import Light, Region
+from phibench.render.sensor.noise_tiles import TILE_PX, NoiseStream, frame_stream, normal, poisson
+from phibench.render.sensor.settings import sensor
+from phibench.scenes.random_streams import philox_key
 
 SIZE = (128, 128)
 PIXELS = SIZE[0] * SIZE[1]
@@ -58,10 +57,10 @@ def test_the_same_names_give_the_same_frame() -> None:
 def test_another_process_draws_the_same(python) -> None:
     code = """
 import hashlib
-from phibench.render.chain import Chain
-from phibench.render.light import Light
-from phibench.render.sensor import sensor
-from phibench.render.tiles import NoiseStream
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.light import Light
+from phibench.render.sensor.settings import sensor
+from phibench.render.sensor.noise_tiles import NoiseStream
 light = Light.flat((6e4, 6e4, 6e4), (48, 48))
 frame = Chain(sensor("mjpeg")).frame(light, NoiseStream(("paper", 0, "s", "up", "on", 3)))
 print(hashlib.sha256(frame.tobytes()).hexdigest())

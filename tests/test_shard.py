@@ -8,14 +8,13 @@ import pytest
 from test_make import TINY, quiet
 from test_resume import contents
 
-from phibench.datasets import layout
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import make
-from phibench.datasets.merge import merge
-from phibench.datasets.plan import make_plan
+from phibench.datasets.merge_repair import merge
+from phibench.datasets.plan.plan import make_plan, shard_plan
 from phibench.datasets.read import open_dataset
-from phibench.datasets.recipe_file import load_recipe
-from phibench.datasets.shard import shard_plan
+from phibench.datasets.recipe.load import load_recipe
+from phibench.datasets.store import schema as layout
 from phibench.datasets.verify import verify
 from phibench.scenes.rig import POSITIONS
 

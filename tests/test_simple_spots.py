@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from phibench.estimator.simple_spots import LUMA, SIMPLE_METHODS, gaussian_least_squares, luma, windowed_centroid
-from phibench.estimator.status import Status
-from phibench.scenes.streams import generator
+from phibench.estimator.geometry.status import Status
+from phibench.estimator.spots.simple_spots import LUMA, SIMPLE_METHODS, gaussian_least_squares, luma, windowed_centroid
+from phibench.scenes.random_streams import generator
 
 ORIGIN = np.array([300, 150])
 # largest error on a round, pixel-integrated Gaussian of 0.9 px, mono, px: half a pixel; bias of the threshold; of the

@@ -9,18 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from phibench.datasets.sensor_card import card_of
-from phibench.estimator.fit_raw import fit_law
+from phibench.datasets.frames.sensor_card import card_of
+from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.interface import Pair
 from phibench.estimator.methods.registry import METHODS
-from phibench.estimator.mirror_image import image_of
-from phibench.estimator.pixel_law import GaussLaw
-from phibench.estimator.raw_pixels import bayer_filters, noise_of
-from phibench.estimator.seat.pair import Pair
-from phibench.estimator.spot_blur import SpotBlur, spot_blur
-from phibench.estimator.studies.cut import Shot, SpotPair, cut_region, cut_rig, taken, without_off
-from phibench.estimator.triangulate import depth_exact
-from phibench.render.sensor import sensor
-from phibench.render.spot import SpotLayer, spot_layer
+from phibench.estimator.spots.fit_raw import fit_law
+from phibench.estimator.spots.raw_pixels import GaussLaw, bayer_filters, noise_of
+from phibench.estimator.spots.spot_prediction import SpotBlur, spot_blur
+from phibench.estimator.studies.image_cutout import Shot, SpotPair, cut_region, cut_rig, taken, without_off
+from phibench.render.optics.spot_layer import SpotLayer, spot_layer
+from phibench.render.sensor.settings import sensor
 from phibench.scenes.laser import Beam, LaserSpot, beam_diameter_m
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room

@@ -11,15 +11,10 @@ from pydantic import Field
 from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.bench.report import write_report
-from phibench.estimator.cli import main
-from phibench.estimator.studies.drawing import canvas, drawn
-from phibench.estimator.studies.folder import read_study, section, write_study
-from phibench.estimator.studies.material import Material
-from phibench.estimator.studies.registry import find_study
-from phibench.estimator.studies.result import Result
-from phibench.estimator.studies.settings import read_settings
-from phibench.estimator.studies.study import Settings, Study
+from phibench.estimator.benchmark.report import write_report
+from phibench.estimator.cli.main import main
+from phibench.estimator.studies.framework import Material, Result, Settings, Study, canvas, drawn, read_settings
+from phibench.estimator.studies.run import find_study, read_study, section, write_study
 
 
 class Counting(Settings):

@@ -11,21 +11,28 @@ from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_dataset
-from phibench.estimator.published import load_published
-from phibench.estimator.score import ESTIMATORS
-from phibench.estimator.studies import baseline_findings as say
-from phibench.estimator.studies.baseline import STUDY
-from phibench.estimator.studies.baseline_laws import LawFit, published_curve
-from phibench.estimator.studies.baseline_table import experiments_of
-from phibench.estimator.studies.drawn_rigs import SENSES, drawn_errors, drawn_misalignment, estimates, seen
-from phibench.estimator.studies.drawn_spots import auto_takes
-from phibench.estimator.studies.power_law import PowerLaw, fit_power_law
+from phibench.estimator.geometry.paper_depth import load_published
+from phibench.estimator.paper.paper_tables import ESTIMATORS
+from phibench.estimator.studies.baseline import study as say
+from phibench.estimator.studies.baseline.study import STUDY
+from phibench.estimator.studies.baseline.tables import (
+    SENSES,
+    LawFit,
+    auto_takes,
+    drawn_errors,
+    drawn_misalignment,
+    estimates,
+    experiments_of,
+    published_curve,
+    seen,
+)
+from phibench.estimator.studies.framework import read_settings
 from phibench.estimator.studies.run import run_study
-from phibench.estimator.studies.settings import read_settings
+from phibench.estimator.studies.statistics import PowerLaw, fit_power_law
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
-from phibench.scenes.streams import generator
 
 DEPTH_M = np.array([1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.2, 2.2, 3.2])
 STROKE_M = np.array([0.4, 0.5, 0.3, 0.6, 0.9, 0.2, 0.1, 1.4, 1.0, 0.7])

@@ -12,21 +12,17 @@ from rich.console import Console
 from scipy.stats import norm
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.studies import cause_findings as say
-from phibench.estimator.studies.cause import STUDY
-from phibench.estimator.studies.cause_checks import alike, coverage, fit_of, left_out_score
-from phibench.estimator.studies.cause_evidence import DECIDED, FLOOR
-from phibench.estimator.studies.cause_model import COMMON, NOISE, Explanation, Model, Prior, without_table
-from phibench.estimator.studies.cause_runs import all_runs
-from phibench.estimator.studies.cause_sampler import Posterior, pooled, sample
-from phibench.estimator.studies.cause_settings import CauseSettings
-from phibench.estimator.studies.cause_simulation import simulate
-from phibench.estimator.studies.paper_reading import Reader, published_experiments, read
+from phibench.estimator.studies.cause import study as say
+from phibench.estimator.studies.cause.model import COMMON, NOISE, Explanation, Model, Prior, simulate, without_table
+from phibench.estimator.studies.cause.nested_sampling import CauseSettings, Posterior, all_runs, pooled, sample
+from phibench.estimator.studies.cause.paper_reading import Reader, published_experiments, read
+from phibench.estimator.studies.cause.study import STUDY
+from phibench.estimator.studies.cause.tables import DECIDED, FLOOR, alike, coverage, fit_of, left_out_score
+from phibench.estimator.studies.framework import read_settings
 from phibench.estimator.studies.run import run_study
-from phibench.estimator.studies.settings import read_settings
 from phibench.scenes.frames import Array
+from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
-from phibench.scenes.streams import generator
 
 DATA = published_experiments()
 HEIGHTS = {f"height_{k}_m": -0.2 for k in (1, 2, 3, 4)}

@@ -5,8 +5,8 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from phibench.estimator.studies import cause_findings as say
-from phibench.estimator.studies.cause_evidence import ENOUGH, FLOOR, evidence_error, verdict
+from phibench.estimator.studies.cause import study as say
+from phibench.estimator.studies.cause.tables import ENOUGH, FLOOR, evidence_error, verdict
 
 
 def test_errors_of_few_samplings_have_a_floor() -> None:

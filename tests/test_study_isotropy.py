@@ -14,28 +14,32 @@ from rich.console import Console
 from scipy.optimize import brentq
 
 from phibench.datasets.read import Dataset, open_dataset
-from phibench.datasets.recipe_file import find_recipe, load_recipe
-from phibench.estimator.bench.bootstrap import Estimate
-from phibench.estimator.epipolar import up_image
-from phibench.estimator.panorama import Grid
-from phibench.estimator.panorama_edges import SeenEdge
-from phibench.estimator.studies.baselines import bound_m, flat_pair, sideways
-from phibench.estimator.studies.isotropy import STUDY
-from phibench.estimator.studies.isotropy_lines import beside, beside_best, epipolar_line
-from phibench.estimator.studies.isotropy_noise import AzimuthNoise, circle, isotropy
-from phibench.estimator.studies.isotropy_words import (
+from phibench.datasets.recipe.load import find_recipe, load_recipe
+from phibench.estimator.benchmark.intervals import Estimate
+from phibench.estimator.geometry.mirror_image import up_image
+from phibench.estimator.geometry.panorama import Grid, SeenEdge
+from phibench.estimator.studies.framework import Material, read_settings
+from phibench.estimator.studies.isotropy.lines import (
+    beside,
+    beside_best,
+    epipolar_line,
+    half_width_rad,
+    hidden_by,
+    hidden_share,
+    moved,
+)
+from phibench.estimator.studies.isotropy.noise import AzimuthNoise, bound_m, circle, flat_pair, isotropy, sideways
+from phibench.estimator.studies.isotropy.study import (
+    STUDY,
     edge_sentence,
     grid_sentence,
     noise_sentence,
     occlusion_sentence,
 )
-from phibench.estimator.studies.material import Material
-from phibench.estimator.studies.mutual_occlusion import half_width_rad, hidden_by, hidden_share, moved
-from phibench.estimator.studies.settings import read_settings
-from phibench.render.sensor import sensor
+from phibench.render.sensor.settings import sensor
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.misalignment import Misalignment
-from phibench.scenes.streams import generator
+from phibench.scenes.random_streams import generator
 
 RIG = default_rig()
 GRID = Grid(1440, -0.35, 0.35)
@@ -60,8 +64,8 @@ def test_level_rays_from_afar_give_the_arcsine() -> None:
     """A far spot at the height at which its ray leaves the mirror: the other sphere is seen under asin(r / b)."""
 
     def climb(height_m: float) -> float:
-        from phibench.estimator.mirror_image import image_of
-        from phibench.estimator.reflection import reflect
+        from phibench.estimator.geometry.mirror_image import image_of
+        from phibench.estimator.geometry.reflection import reflect
 
         view = RIG.at(0.0)
         return float(reflect(view, image_of(view, np.array([1e4, 0.0, height_m])).uv_px).direction_world[2])

@@ -13,40 +13,44 @@ from rich.console import Console
 from scipy.optimize import brentq
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.calibration.parameters import PARAMETERS as CALIBRATION
-from phibench.estimator.depth import depth_paper
-from phibench.estimator.studies.material import Material
-from phibench.estimator.studies.misaligned import (
+from phibench.estimator.geometry.paper_depth import depth_paper
+from phibench.estimator.geometry.rig_parameters import PARAMETERS as CALIBRATION
+from phibench.estimator.studies.framework import Material, read_settings
+from phibench.estimator.studies.misaligned_rigs import (
     NOMINAL,
+    Bench,
     Places,
+    Rendered,
+    believed_sigmas,
     calibrated_errors,
     errors,
+    errors_of_many,
     pixels,
+    rendered,
     seen_px,
     slopes,
 )
-from phibench.estimator.studies.misaligned_many import errors_of_many
-from phibench.estimator.studies.misalignment import STUDY
-from phibench.estimator.studies.misalignment_interactions import Interactions, evaluated, with_intervals
-from phibench.estimator.studies.misalignment_rendered import Rendered, rendered
-from phibench.estimator.studies.misalignment_table import Rank
-from phibench.estimator.studies.misalignment_tolerance import Search, over_azimuths, signs, tolerance
-from phibench.estimator.studies.misalignment_words import (
+from phibench.estimator.studies.misalignment.interactions import Interactions, evaluated, with_intervals
+from phibench.estimator.studies.misalignment.study import STUDY
+from phibench.estimator.studies.misalignment.tables import (
+    Rank,
+    Search,
     calibrated_sentence,
     interaction_sentence,
     noise_intervals,
+    over_azimuths,
     rendered_sentence,
+    signs,
     slope_sentence,
+    tolerance,
     tolerance_sentence,
 )
-from phibench.estimator.studies.settings import read_settings
-from phibench.estimator.studies.simulated_calibration import Bench, believed_sigmas
-from phibench.estimator.studies.tolerance import first_crossing
-from phibench.render.spot_truth import spot_truth
+from phibench.estimator.studies.statistics import first_crossing
+from phibench.render.optics.truth import spot_truth
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
-from phibench.scenes.streams import generator
+from phibench.scenes.random_streams import generator
 
 RIG = default_rig()
 PLACES = Places(np.array([1.0, 3.18]), np.radians([0.0, 90.0, 200.0]), 0.5, 0.425)

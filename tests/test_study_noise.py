@@ -13,30 +13,32 @@ import pytest
 from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.expected import expected_region
+from phibench.datasets.exposures.expected import expected_region
+from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import Sample, open_dataset
-from phibench.datasets.sensor_card import card_of
-from phibench.estimator.bench.bootstrap import Estimate
-from phibench.estimator.bench.rules import Rules
-from phibench.estimator.limits import spot_limit
-from phibench.estimator.studies.cut import Shot, SpotPair, bounds_of, cut_region, cut_rig, taken
-from phibench.estimator.studies.material import Material
-from phibench.estimator.studies.noise import STUDY
-from phibench.estimator.studies.noise_factors import BASE, FACTORS, OFF, applied
-from phibench.estimator.studies.noise_findings import (
+from phibench.estimator.benchmark.answer_errors import Rules
+from phibench.estimator.benchmark.intervals import Estimate
+from phibench.estimator.limits.position_bound import spot_limit
+from phibench.estimator.studies.framework import Material, read_settings
+from phibench.estimator.studies.image_cutout import Shot, SpotPair, bounds_of, cut_region, cut_rig, taken
+from phibench.estimator.studies.noise.cells import BASE, FACTORS, OFF, applied
+from phibench.estimator.studies.noise.study import STUDY
+from phibench.estimator.studies.noise.tables import (
+    Elasticity,
+    around_base,
     base_sentence,
+    elasticities,
     floor_sentence,
     leaving_sentence,
     ranking_sentence,
+    scatter_and_bias_px,
     useless_sentence,
 )
-from phibench.estimator.studies.noise_table import Elasticity, around_base, elasticities, scatter_and_bias_px
-from phibench.estimator.studies.settings import read_settings
-from phibench.render.electrons import expected_electrons
-from phibench.render.region import Region
-from phibench.render.sensor import sensor
+from phibench.render.sensor.electrons import expected_electrons
+from phibench.render.sensor.light import Region
+from phibench.render.sensor.settings import sensor
+from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import POSITIONS, Rig
-from phibench.scenes.streams import generator
 
 ROOT = Path(__file__).resolve().parent.parent
 REF = "raw_maximum_likelihood"

@@ -11,24 +11,25 @@ import pytest
 from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.best_stroke import LARGEST, BestStroke
-from phibench.estimator.calibration.parameters import PARAMETERS, PRIOR_SIGMA, prior_sigmas
-from phibench.estimator.stroke_curve import CEILING, FREE, StrokeCurve
-from phibench.estimator.studies.material import Material
-from phibench.estimator.studies.settings import read_settings
-from phibench.estimator.studies.stroke import AS_BUILT, CALIBRATED, EXACT, STUDY, tolerances
-from phibench.estimator.studies.stroke_checks import Check, Checked, deviations
-from phibench.estimator.studies.stroke_findings import (
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, prior_sigmas
+from phibench.estimator.limits.best_stroke import LARGEST, BestStroke
+from phibench.estimator.limits.stroke_curve import CEILING, FREE, StrokeCurve
+from phibench.estimator.studies.framework import Material, read_settings
+from phibench.estimator.studies.stroke.rendered_checks import (
+    Check,
+    Checked,
     best_sentence,
     check_sentences,
+    deviations,
     growth,
     growth_sentence,
     limits_sentence,
     reason_sentence,
     theta_rad,
 )
+from phibench.estimator.studies.stroke.study import AS_BUILT, CALIBRATED, EXACT, STUDY, tolerances
+from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
-from phibench.scenes.streams import generator
 
 TINY = """
 preset = "bayer-raw"

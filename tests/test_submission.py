@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sealed_sets import METHOD, refusal, tampered
+from helpers.sealed_sets import METHOD, refusal, tampered
 
-from phibench.estimator.bench.seal import Sealed
-from phibench.estimator.bench.sealed_pairs import SealedPairs
-from phibench.estimator.bench.submission import outcomes_of, read_submission
-from phibench.estimator.bench.unseal import unseal
-from phibench.estimator.seat.harness import run_method
+from phibench.estimator.benchmark.sealed_pairs import SealedPairs
+from phibench.estimator.benchmark.sealed_set import Sealed
+from phibench.estimator.benchmark.submission import outcomes_of, read_submission, unseal
+from phibench.estimator.sandbox.runner import run_method
 
 
 def test_a_submission_comes_back_as_it_was(sealed: Sealed, submitted: Path, method: str) -> None:

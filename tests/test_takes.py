@@ -10,25 +10,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bench_samples import many, with_tables
+from helpers.bench_samples import many, with_tables
 from scipy import stats
 from test_make import quiet
 from test_recipe import changed, complaints
 
-from phibench.datasets import takes as takes_module
+from phibench.datasets.build.journal import Journal
+from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.errors import DatasetError, RecipeError
-from phibench.datasets.journal import Journal
+from phibench.datasets.exposures import exposures as takes_module
+from phibench.datasets.exposures.exposures import BOX_MARGIN_PX, Take, TakenSample, takes
 from phibench.datasets.make import make, make_from_plan
-from phibench.datasets.plan import make_plan
+from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.read import Dataset, open_dataset, open_finished
-from phibench.datasets.recipe import Recipe, RigTable
-from phibench.datasets.recipe_file import load_recipe, parse_recipe, recipe_text
-from phibench.datasets.recipe_scene import build_rig
-from phibench.datasets.recipe_text import with_numbers
-from phibench.datasets.taken import TakenSample
-from phibench.datasets.takes import BOX_MARGIN_PX, Take, takes
-from phibench.datasets.work import plan_tasks
-from phibench.render.region import Region
+from phibench.datasets.recipe.build import build_rig
+from phibench.datasets.recipe.load import load_recipe, parse_recipe, recipe_text, with_numbers
+from phibench.datasets.recipe.tables import Recipe, RigTable
+from phibench.render.sensor.light import Region
 
 TINY_BENCH = Path(__file__).with_name("tiny_bench.toml")
 FALSE_ALARM = 1e-4
@@ -256,7 +254,7 @@ def test_tables_in_one_line_are_refused_rather_than_ignored() -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("inline")
 def test_make_renders_what_the_command_line_says(tmp_path: Path) -> None:
-    from phibench.datasets.repair import repair
+    from phibench.datasets.merge_repair import repair
 
     out = make(TINY_BENCH, tmp_path / "one", 1, quiet(), samples=1, seed=9)
     info = json.loads((out / "dataset.json").read_text())

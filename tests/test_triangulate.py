@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oracles import alhazen_quartic, fermat_path, paper_cases, random_rig, random_spot, true_pixel
+from helpers.oracles import alhazen_quartic, fermat_path, paper_cases, random_rig, random_spot, true_pixel
 from scipy import stats
 
-from phibench.estimator.status import Status
-from phibench.estimator.triangulate import depth_exact, depth_in_plane
-from phibench.scenes.checks import SceneError
+from phibench.estimator.geometry.status import Status
+from phibench.estimator.geometry.triangulate import depth_exact, depth_in_plane
 from phibench.scenes.rig import Rig
+from phibench.scenes.validation import SceneError
 
 RIG = Rig()
 CENTRE = np.array([639.5, 359.5])
@@ -87,7 +87,7 @@ def test_rays_that_miss_each_other():
 
 def test_midpoint_against_least_squares():
     """The point minimises the sum of squared distances to the two rays, solved by the normal equations."""
-    from phibench.estimator.reflection import reflect
+    from phibench.estimator.geometry.reflection import reflect
 
     down, up = CENTRE + [180.0, 60.0], CENTRE + [170.0, 55.0]
     estimate = depth_exact(RIG, 0.4, down, up)

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from phibench.render.variant import CUDA, LLVM
+from phibench.render.setup.variant import CUDA, LLVM
 
 Python = Callable[..., subprocess.CompletedProcess[str]]
-ACTIVATE = "from phibench.render.variant import LLVM, activate; mi = activate(LLVM)\n"
+ACTIVATE = "from phibench.render.setup.variant import LLVM, activate; mi = activate(LLVM)\n"
 SUMS = """
 import sys, drjit as dr
 from drjit.llvm import Float, PCG32
@@ -70,14 +70,14 @@ def test_cuda_is_taken_where_a_driver_says_that_there_is_a_gpu(
     (tmp_path / "fake.c").write_text(FAKE % (status, devices))
     library = tmp_path / "fake.so"
     subprocess.run(["cc", "-shared", "-fPIC", "-o", library, tmp_path / "fake.c"], check=True)
-    code = "from phibench.render.variant import default_variant; print(default_variant())"
+    code = "from phibench.render.setup.variant import default_variant; print(default_variant())"
     child = python(code, DRJIT_LIBCUDA_PATH=str(library), DRJIT_LIBOPTIX_PATH=str(library))
     assert child.stdout.strip() == expected, child.stderr
     assert python(code, DRJIT_LIBCUDA_PATH=str(library), DRJIT_LIBOPTIX_PATH="/nowhere").stdout.strip() == LLVM
 
 
 def test_the_environment_forces_llvm_where_there_is_a_gpu(python: Python) -> None:
-    code = "import phibench.render.variant as v\nv.has_gpu = lambda: True\nprint(v.activate().variant())"
+    code = "import phibench.render.setup.variant as v\nv.has_gpu = lambda: True\nprint(v.activate().variant())"
     child = python(code, PHIBENCH_VARIANT=LLVM)
     assert child.stdout.strip() == LLVM, child.stderr
 

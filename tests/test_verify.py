@@ -14,18 +14,26 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from phibench.datasets import layout, spot_picture, sums
 from phibench.datasets import show as show_module
+from phibench.datasets.build.assemble import visibility_line
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.exr import read_exr
-from phibench.datasets.layers import read_ambient, read_ambient_variance, read_truth, write_ambient, write_truth
-from phibench.datasets.manifest import read_manifest, write_manifest
-from phibench.datasets.preview import Picture
 from phibench.datasets.read import open_dataset
 from phibench.datasets.show import show
-from phibench.datasets.sums import write_sums
+from phibench.datasets.store import checksums as sums
+from phibench.datasets.store import pictures as spot_picture
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.checksums import write_sums
+from phibench.datasets.store.documents import read_manifest, write_manifest
+from phibench.datasets.store.layers import (
+    read_ambient,
+    read_ambient_variance,
+    read_exr,
+    read_truth,
+    write_ambient,
+    write_truth,
+)
+from phibench.datasets.store.pictures import Picture
 from phibench.datasets.verify import Report, verify
-from phibench.datasets.visibility import visibility_line
 
 AMBIENT, TRUTH = layout.view_file("h0.000", "ambient"), layout.view_file("h0.500", "truth")
 PREVIEW = layout.preview_file("seen-near-h0.500")

@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oracles import true_pixel
+from helpers.oracles import true_pixel
 
-from phibench.estimator.calibration.edge_points import edges_of
 from phibench.estimator.calibration.limb_image import ImageError
-from phibench.estimator.calibration.vertical_edges import find_vertical, vertical_of
+from phibench.estimator.calibration.vertical_edges import edges_of, find_vertical, vertical_of
 from phibench.scenes.frames import Pose, as_matrix, as_vector, rotation_xyz
 from phibench.scenes.rig import Rig
 

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, UnidentifiedImageError
 
-from phibench.datasets.files import write_bytes
-from phibench.datasets.sensor_card import SensorCard, sensor_card
+from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
+from phibench.datasets.store.files import write_bytes
 from phibench.estimator.calibration.limb_image import ImageError
 from phibench.estimator.calibration.outline import Outline, find_outline
 from phibench.scenes.camera import Camera

@@ -12,14 +12,14 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from phibench.datasets.codec import from_json, to_json
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.files import write_text
+from phibench.datasets.store.documents import from_json, to_json
+from phibench.datasets.store.files import write_text
 from phibench.estimator.calibration.bundle import Bundle
-from phibench.estimator.calibration.parameters import LIMITS, PARAMETERS, changed
-from phibench.scenes.checks import SceneError
+from phibench.estimator.geometry.rig_parameters import LIMITS, PARAMETERS, changed
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
+from phibench.scenes.validation import SceneError
 
 VERSION = 1
 

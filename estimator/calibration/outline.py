@@ -9,22 +9,24 @@ together. What JPEG does to the limb is drawn from the frame itself (`outline_jp
 
 R and |s| scale together: the outline is that of every sphere with the same R / |s|. s is as wrong as R is:
 ds / s = dR / R. The camera's numbers are taken as exact, too; `bundle` puts their errors in.
+
+The mean of what several images say of the sphere's centre, or of the vertical.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets.sensor_card import SensorCard
-from phibench.estimator.calibration.limb_image import ImageError, Plane, planes_of
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.calibration.limb_image import ImageError, Measured, Plane, planes_of
+from phibench.estimator.calibration.outline_fit import OutlinePixels, Step, band, step_from
 from phibench.estimator.calibration.outline_jpeg import JpegAgain
-from phibench.estimator.calibration.outline_pixels import OutlinePixels, band
 from phibench.estimator.calibration.outline_start import grey, radii_px, rough_outlines
-from phibench.estimator.calibration.outline_step import Step, step_from
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.rig import Rig
@@ -228,3 +230,20 @@ def _require_size(image: Array, camera: Camera) -> None:
             f"an image of {image.shape[1]} x {image.shape[0]} pixels for a camera of {camera.width_px} x "
             f"{camera.height_px}: give a whole frame of this camera"
         )
+
+
+def mean_outline(outlines: Sequence[Outline]) -> Measured:
+    """Weighted mean of sphere centres, see `mean_measured`."""
+    return mean_measured([Measured(outline.sphere_in_camera_m, outline.covariance_m2) for outline in outlines])
+
+
+def mean_measured(parts: Sequence[Measured]) -> Measured:
+    """Weighted mean of vectors; their scatter widens the covariance where it is larger than they claim."""
+    weights = np.array([np.linalg.inv(part.covariance) for part in parts])
+    covariance = np.linalg.inv(weights.sum(axis=0))
+    values = np.array([part.value for part in parts])
+    mean = covariance @ np.einsum("kij,kj->i", weights, values)
+    off = values - mean
+    degrees = values.shape[1] * (len(parts) - 1)
+    chi2 = float(np.einsum("ki,kij,kj->", off, weights, off))
+    return Measured(mean, covariance * max(1.0, chi2 / degrees if degrees else 1.0))

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from phibench.datasets.sensor_card import SensorCard
+from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.calibration.limb_image import JPEG_LUMA, srgb_decoded, srgb_encoded
-from phibench.estimator.calibration.outline_pixels import OutlinePixels
-from phibench.estimator.chain_model import full_scale_e
-from phibench.estimator.jpeg_tables import mcu_px
+from phibench.estimator.calibration.outline_fit import OutlinePixels
+from phibench.estimator.spots.chain_model import full_scale_e
+from phibench.estimator.spots.jpeg_coefficients import mcu_px
 from phibench.scenes.frames import Array
-from phibench.scenes.streams import generator
+from phibench.scenes.random_streams import generator
 
 _ROW = 40  # units side by side in the picture that is compressed
 _SUBSAMPLING = {"4:4:4": 0, "4:2:2": 1, "4:2:0": 2}  # Pillow's numbers

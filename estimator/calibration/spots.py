@@ -12,16 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.read import Sample
-from phibench.datasets.sensor_card import SensorCard
 from phibench.estimator.calibration.bundle import KnownSpot
-from phibench.estimator.methods.built_in import BuiltIn
-from phibench.estimator.methods.linear import RAW, kind_of
-from phibench.estimator.methods.registry import METHODS
-from phibench.estimator.seat.pair import Answer, Pair, Spot
+from phibench.estimator.interface import Answer, Pair, Spot
+from phibench.estimator.methods.registry import METHODS, BuiltIn
+from phibench.estimator.spots.image_planes import RAW, kind_of
 from phibench.scenes.frames import Array
+from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import POSITIONS
-from phibench.scenes.streams import generator
 
 MAX_SIGMA = 1e3
 """Largest sigma of a measured place, metres or radians: beyond it nothing was measured."""

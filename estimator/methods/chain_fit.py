@@ -8,18 +8,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.datasets.sensor_card import SensorCard
-from phibench.estimator.base_image import BaseImage, around, base_of
-from phibench.estimator.detect import Detection, detect
-from phibench.estimator.fit_chain import first_fit, fit_jpeg, fit_srgb, undone, unrounded
-from phibench.estimator.fit_raw import SpotFit
-from phibench.estimator.jpeg_tables import mcu_px
-from phibench.estimator.methods.beam_size import measured_twice, pair_blur, seen_depth_m
-from phibench.estimator.methods.locate import box_around
-from phibench.estimator.raw_pixels import bayer_filters
-from phibench.estimator.seat.pair import Answer, Box, Pair, Spot
-from phibench.estimator.spot_blur import SpotBlur
-from phibench.estimator.status import Status, describe
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.geometry.status import Status, describe
+from phibench.estimator.interface import Answer, Box, Pair, Spot
+from phibench.estimator.methods.locate import box_around, measured_twice, pair_blur, seen_depth_m
+from phibench.estimator.spots.detect import Detection, detect
+from phibench.estimator.spots.fit_chain import first_fit, fit_jpeg, fit_srgb, undone, unrounded
+from phibench.estimator.spots.fit_raw import SpotFit
+from phibench.estimator.spots.jpeg_coefficients import mcu_px
+from phibench.estimator.spots.raw_pixels import BaseImage, around, base_of, bayer_filters
+from phibench.estimator.spots.spot_prediction import SpotBlur
 from phibench.scenes.frames import Array
 
 _HALF_PX = 8

@@ -1,18 +1,83 @@
-"""The methods that come with phibench, by name. One entry adds one."""
+"""A method that comes with phibench, and what it can be asked.
+
+The methods that come with phibench, by name. One entry adds one.
+"""
 
 from __future__ import annotations
 
-from phibench.estimator.methods.built_in import BuiltIn
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+from phibench.estimator.interface import Answer, Method, Pair, Spot
 from phibench.estimator.methods.chain_fit import chain_fit
-from phibench.estimator.methods.detect import detect
-from phibench.estimator.methods.joint_fit import joint_fit
-from phibench.estimator.methods.libraries import photutils_centroid_2dg, trackpy_refine
-from phibench.estimator.methods.linear import PROCESSED, RAW
-from phibench.estimator.methods.off_difference import off_difference
-from phibench.estimator.methods.raw_maximum_likelihood import raw_maximum_likelihood
-from phibench.estimator.methods.red_centroid import red_centroid
-from phibench.estimator.methods.sight import each_spot, each_spot_twice
-from phibench.estimator.methods.simple import at_the_red_peak, in_the_box
+from phibench.estimator.methods.locate import each_spot, each_spot_twice
+from phibench.estimator.methods.raw_likelihood import joint_fit, raw_maximum_likelihood
+from phibench.estimator.methods.simple import (
+    at_the_red_peak,
+    detect,
+    in_the_box,
+    off_difference,
+    photutils_centroid_2dg,
+    red_centroid,
+    trackpy_refine,
+)
+from phibench.estimator.spots.image_planes import KINDS, PROCESSED, RAW, kind_of
+
+
+@dataclass(frozen=True)
+class BuiltIn:
+    """One built-in method; call it like any method. A pair that it cannot take gets a status, never an exception.
+
+    Parameters
+    ----------
+    name : str
+    function : Method
+    description : str
+        One line.
+    source : str
+        Where the idea comes from.
+    accepts : tuple of str
+        Kinds of images, of `linear.KINDS`.
+    needs_off : bool
+        Whether it cannot do without laser-off frames.
+    needs_boxes : bool
+        Whether it cannot do without region hints.
+    package : str
+        What must be installed besides phibench; "" for nothing.
+    """
+
+    name: str
+    function: Method
+    description: str
+    source: str
+    accepts: tuple[str, ...] = KINDS
+    needs_off: bool = False
+    needs_boxes: bool = False
+    package: str = ""
+
+    @property
+    def installed(self) -> bool:
+        """Whether its package can be imported."""
+        return not self.package or find_spec(self.package) is not None
+
+    def refusal(self, pair: Pair) -> str:
+        """Why this pair cannot be taken; "" if it can."""
+        kind = kind_of(pair.card)
+        if not self.installed:
+            return f"install {self.package}"
+        if kind not in self.accepts:
+            return f"takes {', '.join(self.accepts)}, not {kind}"
+        if self.needs_off and (pair.down_off is None or pair.up_off is None):
+            return "needs laser-off frames"
+        if self.needs_boxes and (pair.box_down is None or pair.box_up is None):
+            return "needs region hints"
+        return ""
+
+    def __call__(self, pair: Pair) -> Answer:
+        """Answer for a pair, or a status that says why there is none."""
+        why = self.refusal(pair)
+        return Answer(Spot.missing(why), Spot.missing(why)) if why else self.function(pair)
+
 
 _ALL = (
     BuiltIn(
@@ -76,7 +141,7 @@ _ALL = (
         "detect",
         detect,
         "peak of a matched filter over the whole mirror, boxes or not, refined by parabolas",
-        "estimator/detect.py",
+        "estimator/spots/detect.py",
     ),
     BuiltIn(
         "photutils_centroid_2dg",

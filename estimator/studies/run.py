@@ -1,18 +1,187 @@
-"""Running a study: settings and data sets in, a folder out."""
+"""A study on disk: `study.json`, `findings.md`, the settings, a Parquet file per table and a file per drawing.
+
+The studies by name, in the order in which they are read.
+
+Running a study: settings and data sets in, a folder out.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import importlib
+import io
+import json
 from pathlib import Path
+from typing import Any, Literal
 
+import polars as pl
+from pydantic import Field, ValidationError
 from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.files import require_writable
-from phibench.estimator.studies.folder import DOCUMENT, write_study
-from phibench.estimator.studies.material import Material
-from phibench.estimator.studies.registry import find_study
-from phibench.estimator.studies.result import Result
-from phibench.estimator.studies.settings import read_settings
+from phibench.datasets.store.files import require_writable, sha256, write_bytes, write_text
+from phibench.datasets.store.provenance import provenance
+from phibench.datasets.store.schema import Document
+from phibench.estimator.benchmark.report import Section
+from phibench.estimator.studies.framework import Drawing, Material, Result, Settings, Study, read_settings
+from phibench.scenes.validation import nearest
+
+KIND: Literal["phibench study"] = "phibench study"
+DOCUMENT = "study.json"
+FINDINGS = "findings.md"
+
+
+class DrawingEntry(Document):
+    """A drawing in the folder."""
+
+    name: str
+    kind: Literal["svg", "png"]
+    alt: str
+
+
+class StudyDocument(Document):
+    """What `study.json` holds."""
+
+    kind: Literal["phibench study"] = KIND
+    version: Literal[1] = 1
+    name: str
+    title: str
+    question: str
+    quick: bool
+    settings: dict[str, Any]
+    findings: tuple[str, ...]
+    notes: tuple[str, ...]
+    drawings: tuple[DrawingEntry, ...]
+    shown: dict[str, tuple[tuple[str, ...], ...]] = Field(description="tables of text by caption, heads first")
+    files: dict[str, str] = Field(description="SHA-256 of every other file by name")
+    provenance: dict[str, Any]
+
+
+def write_study(out: Path, study: Study[Any], settings: Settings, quick: bool, result: Result) -> Path:
+    """Write a result into a folder, the document last; files of an earlier run are replaced.
+
+    Returns
+    -------
+    path : Path of `study.json`
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    (out / DOCUMENT).unlink(missing_ok=True)  # a folder without it holds no study
+    files = {}
+    for name, data in _files(study, settings, result).items():
+        write_bytes(out / name, data)
+        files[name] = hashlib.sha256(data).hexdigest()
+    document = StudyDocument(
+        name=study.name,
+        title=study.title,
+        question=study.question,
+        quick=quick,
+        settings=settings.model_dump(mode="json"),
+        findings=result.findings,
+        notes=result.notes,
+        drawings=tuple(DrawingEntry(name=d.name, kind=d.kind, alt=d.alt) for d in result.drawings),  # type: ignore[arg-type]
+        shown=result.shown,
+        files=files,
+        provenance=dict(provenance()),
+    )
+    return write_text(out / DOCUMENT, document.model_dump_json(indent=1) + "\n")
+
+
+def read_study(folder: Path) -> StudyDocument:
+    """The document of a study's folder.
+
+    Raises
+    ------
+    DatasetError
+        If there is no finished study, it is of another version, or a file was changed.
+    """
+    path = folder / DOCUMENT
+    if not path.is_file():
+        raise DatasetError(f"{folder} holds no study: {DOCUMENT} is missing; make one with `phibench study`")
+    try:
+        document = StudyDocument.model_validate_json(path.read_text(encoding="utf-8"))
+    except (ValidationError, UnicodeDecodeError) as error:
+        raise DatasetError(
+            f"{path} is not the document of a study of this version; run `phibench study` again"
+        ) from error
+    for name, digest in document.files.items():
+        if not (folder / name).is_file() or sha256(folder / name) != digest:
+            raise DatasetError(f"{folder / name} is missing or was changed after the study; run `phibench study` again")
+    return document
+
+
+def section(folder: Path) -> Section:
+    """Section of a report about the study in a folder."""
+    document = read_study(folder)
+    pictures = [
+        Drawing(entry.name, (folder / f"{entry.name}.{entry.kind}").read_bytes(), entry.alt, entry.kind).picture()
+        for entry in document.drawings
+    ]
+    size = "Reduced version of the study (--quick)." if document.quick else ""
+    notes = tuple(f"Note: {note}" for note in document.notes)
+    return Section(
+        title=f"Study: {document.title}",
+        paragraphs=tuple(filter(None, (document.question, *document.findings, *notes, size))),
+        pictures=tuple(pictures),
+        tables=tuple(document.shown.values()),
+        captions=tuple(document.shown),
+    )
+
+
+def findings_text(study: Study[Any], result: Result) -> str:
+    """The findings as Markdown: question, findings, notes, tables, drawings."""
+    lines = [f"# {study.title}", "", study.question, "", *(f"* {finding}" for finding in result.findings), ""]
+    lines += [f"* Note: {note}" for note in result.notes] + [""] * bool(result.notes)
+    for caption, rows in result.shown.items():
+        lines += [caption, "", *_markdown(rows), ""]
+    for drawing in result.drawings:
+        lines += [f"![{drawing.alt}]({drawing.file_name})", ""]
+    return "\n".join(lines)
+
+
+def _files(study: Study[Any], settings: Settings, result: Result) -> dict[str, bytes]:
+    tables = {f"{name}.parquet": _parquet(table) for name, table in result.tables.items()}
+    drawings = {drawing.file_name: drawing.data for drawing in result.drawings}
+    text = json.dumps(settings.model_dump(mode="json"), indent=1) + "\n"
+    return {
+        **tables,
+        **drawings,
+        "settings.json": text.encode(),
+        FINDINGS: findings_text(study, result).encode(),
+    }
+
+
+def _parquet(table: pl.DataFrame) -> bytes:
+    buffer = io.BytesIO()
+    table.write_parquet(buffer)
+    return buffer.getvalue()
+
+
+def _markdown(rows: tuple[tuple[str, ...], ...]) -> list[str]:
+    head, *body = rows
+    return [_line(head), _line(("---",) * len(head)), *map(_line, body)]
+
+
+def _line(cells: tuple[str, ...]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+NAMES = ("noise", "misalignment", "baseline", "cause", "isotropy", "stroke")
+
+
+def find_study(name: str) -> Study[Any]:
+    """Study of a name; each module `studies/NAME.py` has its `STUDY`.
+
+    Raises
+    ------
+    DatasetError
+        If there is none.
+    """
+    if name not in NAMES:
+        raise DatasetError(f"no study '{name}'; {nearest(name, NAMES)}")
+    found = importlib.import_module(f"phibench.estimator.studies.{name}.study").STUDY
+    assert isinstance(found, Study)
+    return found
+
 
 DATA = "data"
 

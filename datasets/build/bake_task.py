@@ -1,0 +1,42 @@
+"""The light map of a data set's room: baked once, or taken from the user's cache, and kept with the data set."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from pathlib import Path
+
+from phibench.datasets.build.tasks import Made
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.recipe.tables import AmbientTable
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.files import write_bytes
+from phibench.render.room.light_map import BakeSettings, LightMap, decoded, encoded, light_map
+from phibench.scenes.rig import Rig
+from phibench.scenes.room import Room
+
+
+def bake_settings(ambient: AmbientTable) -> BakeSettings:
+    """Settings of the light map in a recipe."""
+    return BakeSettings(**{name: getattr(ambient, name) for name in BakeSettings.__dataclass_fields__})
+
+
+def bake_room(out: Path, rig: Rig, room: Room, ambient: AmbientTable) -> Made:
+    """Task: write the room's light map below `out`."""
+    write_bytes(out / layout.LIGHT_MAP, encoded(light_map(rig.at(0.0), room, bake_settings(ambient))))
+    return Made((layout.LIGHT_MAP,))
+
+
+def read_light_map(out: Path) -> LightMap:
+    """Light map of a data set.
+
+    Raises
+    ------
+    DatasetError
+        If the file is missing or not a light map.
+    """
+    path = out / layout.LIGHT_MAP
+    try:
+        return decoded(path.read_bytes())
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        raise DatasetError(f"{path} is not readable as a light map: {error}") from error

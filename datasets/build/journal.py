@@ -1,0 +1,95 @@
+"""The journal of a folder: which task made which bytes. It decides what is finished; names and times of files do not.
+
+One line per entry, a CRC-32 and a JSON object: first the head (the texts of `dataset.json` and `recipe.toml`, so that
+these can be repaired), then one entry per finished task; the last one of a name counts. A line that a killed run left
+half-written, or that was damaged, fails its CRC and is as if it were not there: its task is done again.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.files import write_bytes
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A finished task: its key, the SHA-256 of each of its files, its result."""
+
+    task: str
+    key: str
+    files: dict[str, str]
+    result: Any = None
+
+
+@dataclass(frozen=True)
+class Head:
+    """What the folder holds: the text of `dataset.json`, and of the recipe."""
+
+    info: str
+    recipe: str
+
+
+class Journal:
+    """The journal of one folder, as a context manager: read when made, appended to inside.
+
+    Attributes
+    ----------
+    head : Head or None
+    entries : dict of Entry by task
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / layout.JOURNAL
+        self._file: IO[bytes] | None = None
+        self.head: Head | None = None
+        self.entries: dict[str, Entry] = {}
+        for document in _documents(self._path):
+            if "info" in document:
+                self.head = Head(**document)
+            else:
+                self.entries[document["task"]] = Entry(**document)
+
+    def __enter__(self) -> Journal:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def begin(self, head: Head, tasks: Iterable[str]) -> None:
+        """Write the journal anew, atomically: this head, and the entries of these tasks in this order."""
+        self.__exit__()
+        self.head = head
+        self.entries = {name: self.entries[name] for name in tasks if name in self.entries}
+        lines = [_line(asdict(head)), *(_line(asdict(entry)) for entry in self.entries.values())]
+        write_bytes(self._path, b"".join(lines))
+
+    def add(self, entry: Entry) -> None:
+        """Append one entry. The operating system has it before this returns, so that kill -9 cannot take it."""
+        if self._file is None:
+            self._file = self._path.open("ab", buffering=0)
+        self._file.write(_line(asdict(entry)))
+        self.entries[entry.task] = entry
+
+
+def _line(document: dict[str, Any]) -> bytes:
+    text = json.dumps(document, allow_nan=False).encode()
+    return b"%08x %b\n" % (zlib.crc32(text), text)
+
+
+def _documents(path: Path) -> Iterator[dict[str, Any]]:
+    if not path.is_file():
+        return
+    with path.open("rb") as file:
+        for line in file:
+            check, _, text = line.rstrip(b"\n").partition(b" ")
+            if check == b"%08x" % zlib.crc32(text):
+                yield json.loads(text)

@@ -1,0 +1,73 @@
+"""What needs a sample's spot layers and its views: the picture of the sample, and its noise budget."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from phibench.datasets.build.spot_task import RefusedSampleError
+from phibench.datasets.build.tasks import Made
+from phibench.datasets.plan.plan import PairPlan
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.layers import SpotWindow, read_ambient, read_ambient_variance, read_spot
+from phibench.datasets.store.pictures import Side, sample_picture, save_png
+from phibench.datasets.store.schema import NoiseRow
+from phibench.render.optics.truth import SpotTruth, spot_truth
+from phibench.render.room.noise_budget import BUDGET, NoiseBudget, noise_budget
+from phibench.scenes.laser import LaserSpot
+from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
+from phibench.scenes.room import Room
+
+
+def finish_sample(out: Path, pair: PairPlan, rig: Rig, room: Room, spot: LaserSpot) -> Made:
+    """Task: the picture of one sample, and as its result the `NoiseRow` of both positions.
+
+    Raises
+    ------
+    RefusedSampleError
+        If a view's noise is more than a quarter of the sensor's at the spot, with the numbers.
+    """
+    sides, rows = [], {}
+    for position in POSITIONS:
+        view = rig.at(Stroke(pair.stroke_m).offset_m(position))
+        truth = spot_truth(view, spot, room.shapes(view))
+        ambient = out / layout.view_file(pair.pose_id(position), "ambient")
+        planes, window = read_ambient(ambient), _window(out, pair, position)
+        budget = spot_noise(view, truth, window, planes, read_ambient_variance(ambient))
+        _check(f"{pair.sample_id} {position}", budget)
+        rows[position] = None if budget is None else noise_row(budget).model_dump(mode="json")
+        frame = planes.astype(float)
+        window.add_to(frame)
+        sides.append(Side(position, truth, frame, planes))
+    file = layout.preview_file(pair.sample_id)
+    save_png(out / file, sample_picture(sides, rig.camera.detector))
+    return Made((file,), rows)
+
+
+def spot_noise(
+    view: View, truth: SpotTruth, window: SpotWindow, ambient: np.ndarray, variance: np.ndarray
+) -> NoiseBudget | None:
+    """Noise budget of a spot from its layers; None where it is not visible."""
+    if not truth.visible:
+        return None
+    return noise_budget(view, np.array([truth.u_px, truth.v_px]), window, ambient, variance)
+
+
+def noise_row(budget: NoiseBudget) -> NoiseRow:
+    """Row of the manifest."""
+    return NoiseRow(phi_sensor_rad=budget.phi_sensor_rad, phi_render_rad=budget.phi_render_rad)
+
+
+def _check(name: str, budget: NoiseBudget | None) -> None:
+    if budget is not None and not budget.kept:
+        raise RefusedSampleError(
+            f"refused: the rendering noise of {name} is an error of phi of {budget.phi_render_rad:.2g} rad, more than "
+            f"{BUDGET:g} of the sensor's {budget.phi_sensor_rad:.2g} rad; give ambient.cells_per_pixel a larger value"
+        )
+
+
+def _window(out: Path, pair: PairPlan, position: str) -> SpotWindow:
+    """Spot layer; the spot's task has made sure that there is a file exactly if light reaches the image."""
+    path = out / layout.spot_file(pair.sample_id, position)
+    return read_spot(path) if path.is_file() else SpotWindow.empty()

@@ -1,0 +1,95 @@
+"""In which order tasks go to workers: a sliding window, needs before their readers, killers of workers by themselves.
+
+Only a few tasks per worker are submitted ahead, so that nothing grows with the number of tasks. When a worker dies,
+all that it had been given comes back: one task is to blame, the others were near. All of them become suspects and are
+done again at the end, each alone, so that a poisoned task takes no innocent one with it. One that kills its worker
+every time is reported.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from collections.abc import Iterable, Iterator
+from typing import Protocol
+
+from phibench.datasets.build.tasks import Done, Failed, Task
+
+AHEAD = 3
+TRIALS = 3
+Outcome = tuple[Task, Done | Failed]
+
+
+class Executor(Protocol):
+    """Whoever does tasks."""
+
+    def width(self) -> int:
+        """How many tasks run at a time."""
+
+    def submit(self, task: Task) -> None:
+        """Begin a task, or queue it."""
+
+    def next(self) -> Outcome:
+        """Wait for any submitted task; `Failed.lethal` means that its worker died."""
+
+
+def dispatch(tasks: Iterable[Task], executor: Executor) -> Iterator[Outcome]:
+    """Yield every task with its outcome, as they end. Needs that are not among `tasks` count as done."""
+    queue, suspects, flying = _Queue(tasks), deque[Task](), 0
+    while True:
+        while flying < AHEAD * executor.width() and queue.ready:
+            executor.submit(queue.ready.popleft())
+            flying += 1
+        if flying:
+            task, outcome = executor.next()
+            flying -= 1
+            if isinstance(outcome, Failed) and outcome.lethal:
+                suspects.append(task)
+                continue
+        elif suspects:
+            task = suspects.popleft()
+            outcome = _alone(task, executor)
+        else:
+            return
+        yield task, outcome
+        yield from queue.settle(task, outcome)
+
+
+def _alone(task: Task, executor: Executor) -> Done | Failed:
+    """Do a suspect while nothing else runs; it has seen one worker die already."""
+    cause = ""
+    for _ in range(TRIALS - 1):
+        executor.submit(task)
+        _, outcome = executor.next()
+        if not isinstance(outcome, Failed) or not outcome.lethal:
+            return outcome
+        cause = outcome.cause
+    return Failed(
+        f"its worker process died every time, {TRIALS} in all ({cause}); out of memory, or a fault of the renderer"
+    )
+
+
+class _Queue:
+    """Tasks that wait, and those whose needs are met, in the given order."""
+
+    def __init__(self, tasks: Iterable[Task]) -> None:
+        tasks = list(tasks)
+        names = {task.name for task in tasks}
+        self._missing = {task.name: sum(need in names for need in task.needs) for task in tasks}
+        self._readers = defaultdict[str, list[Task]](list)
+        for task in tasks:
+            for need in task.needs:
+                self._readers[need].append(task)
+        self.ready = deque(task for task in tasks if not self._missing[task.name])
+
+    def settle(self, task: Task, outcome: Done | Failed) -> Iterator[Outcome]:
+        """Let those go that waited for a task; if it failed, yield them as failed, and what waits for them."""
+        for reader in self._readers.pop(task.name, ()):
+            if isinstance(outcome, Failed):
+                if self._missing.pop(reader.name, None) is not None:
+                    failed = Failed(f"not made, because {task.name} failed")
+                    yield reader, failed
+                    yield from self.settle(reader, failed)
+            elif reader.name in self._missing:
+                self._missing[reader.name] -= 1
+                if not self._missing[reader.name]:
+                    self.ready.append(reader)

@@ -1,0 +1,151 @@
+"""One spot in one view: exact answer, layer, certificate. Needs NumPy only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from phibench.datasets.build.tasks import Made
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.plan.plan import PairPlan
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.layers import SpotWindow, write_spot
+from phibench.datasets.store.schema import CertificateRow, ManifestRow, SpotRow
+from phibench.render.optics.certificate import Certificate, certify
+from phibench.render.optics.spot_layer import SpotLayer, spot_layer
+from phibench.render.optics.truth import SpotTruth, depth_m, spot_truth
+from phibench.scenes.laser import LaserSpot
+from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
+from phibench.scenes.room import Room
+
+
+@dataclass(frozen=True)
+class SpotAnswer:
+    """Everything about one spot in one view; `certificate` is None where the spot is not visible."""
+
+    truth: SpotTruth
+    layer: SpotLayer
+    certificate: Certificate | None
+    on_image: bool
+
+    @property
+    def coma_shift_px(self) -> tuple[float, float]:
+        """Energy centroid minus chief ray, pixels (u, v)."""
+        u_px, v_px = self.layer.centroid_uv_px
+        return float(u_px) - self.truth.u_px, float(v_px) - self.truth.v_px
+
+
+class RefusedSampleError(DatasetError):
+    """A sample whose certificate is out of tolerance."""
+
+
+def answer_spot(view: View, spot: LaserSpot, room: Room) -> SpotAnswer:
+    """Compute one spot in one view."""
+    shapes = room.shapes(view)
+    truth, layer = spot_truth(view, spot, shapes), spot_layer(view, spot, shapes)
+    certificate = certify(view, spot, shapes, truth, layer) if truth.visible else None
+    return SpotAnswer(truth, layer, certificate, _reaches(view, _window(layer)))
+
+
+def make_spot(out: Path, dataset: str, rig: Rig, room: Room, spot: LaserSpot, pair: PairPlan) -> Made:
+    """Task: both spot layers of a sample and its row of the manifest.
+
+    Raises
+    ------
+    RefusedSampleError
+        If a certificate is out of tolerance, with its numbers.
+    """
+    views = {position: rig.at(Stroke(pair.stroke_m).offset_m(position)) for position in POSITIONS}
+    answers = {position: answer_spot(view, spot, room) for position, view in views.items()}
+    if refused := [line for position in POSITIONS for line in _complaints(pair, position, answers[position])]:
+        raise RefusedSampleError("\n".join(["refused, a certificate is out of tolerance:", *refused]))
+    rows = {}
+    for position, answer in answers.items():
+        file = _write_layer(out, dataset, pair, position, answer)
+        rows[position] = _spot_row(pair.pose_id(position), views[position], answer, file)
+    row = manifest_row(rig, spot, pair, rows["down"], rows["up"])
+    return Made(tuple(r.spot_file for r in rows.values() if r.spot_file is not None), row.model_dump(mode="json"))
+
+
+def _write_layer(out: Path, dataset: str, pair: PairPlan, position: str, answer: SpotAnswer) -> str | None:
+    """Write a spot layer, or make sure that there is none where no light reaches the image."""
+    file = layout.spot_file(pair.sample_id, position)
+    if not answer.on_image:
+        (out / file).unlink(missing_ok=True)
+        return None
+    write_spot(
+        out / file,
+        _window(answer.layer),
+        {"dataset": dataset, "sample_id": pair.sample_id, "position": position},
+    )
+    return file
+
+
+def manifest_row(rig: Rig, spot: LaserSpot, pair: PairPlan, down: SpotRow, up: SpotRow) -> ManifestRow:
+    """One row of the manifest."""
+    return ManifestRow(
+        sample_id=pair.sample_id,
+        experiment=pair.experiment,
+        target=pair.target,
+        rig=pair.rig,
+        nominal_rig=pair.nominal_rig,
+        depth_m=float(depth_m(np.array(spot.position_world_m), rig.at(0.0).sphere_centre_m)),
+        stroke_m=pair.stroke_m,
+        nominal_stroke_m=pair.nominal_stroke_m,
+        spot_world_m=_triple(spot.position_world_m),
+        spot_normal_world=_triple(spot.normal_world),
+        spot_diameter_m=spot.diameter_m,
+        down=down,
+        up=up,
+        tries=pair.tries,
+        drawn=dict(pair.drawn),
+    )
+
+
+def _spot_row(pose_id: str, view: View, answer: SpotAnswer, file: str | None) -> SpotRow:
+    certificate = answer.certificate
+    return SpotRow(
+        pose=pose_id,
+        offset_m=view.offset_m,
+        **asdict(answer.truth),
+        coma_shift_px=answer.coma_shift_px,
+        electrons_per_s=_triple(answer.layer.total_electrons_per_s),
+        view_ambient_file=layout.view_file(pose_id, "ambient"),
+        view_truth_file=layout.view_file(pose_id, "truth"),
+        spot_file=file,
+        certificate=None if certificate is None else CertificateRow(**asdict(certificate)),
+        noise=None,  # known when the views are there: `sample_task`
+    )
+
+
+def _triple(values: Iterable[float]) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def _complaints(pair: PairPlan, position: str, answer: SpotAnswer) -> list[str]:
+    c = answer.certificate
+    if c is None or c.passed:
+        return []
+    numbers = (
+        f"chief ray {c.chief_difference_px:.3g} px (tolerance {c.chief_tolerance_px:g}), "
+        f"centroid {c.centroid_difference_px:.3g} px ({c.centroid_tolerance_px:g}), "
+        f"flux {c.flux_difference:.3g} ({c.flux_tolerance:g})"
+    )
+    return [f"  {pair.sample_id} {position}: {numbers}"]
+
+
+def _window(layer: SpotLayer) -> SpotWindow:
+    images = (layer.electrons_per_s, layer.du_electrons_per_s_px, layer.dv_electrons_per_s_px)
+    return SpotWindow(layer.u0_px, layer.v0_px, *images)
+
+
+def _reaches(view: View, window: SpotWindow) -> bool:
+    """Whether any light of the spot falls on the image."""
+    camera = view.rig.camera
+    image = np.zeros((3, camera.height_px, camera.width_px))
+    window.add_to(image)
+    return bool(image.any())

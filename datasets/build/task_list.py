@@ -1,0 +1,100 @@
+"""The tasks of a plan, in the order of the recipe, each with its key.
+
+The light map depends on the room and its settings; a view on rig, room, pose, settings and light map; a spot on rig,
+room, laser and stroke; a sample (picture, noise budget) on its two views and its spot. A task stands before those that
+name it in `needs`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+from phibench.datasets.build.bake_task import bake_room, bake_settings
+from phibench.datasets.build.sample_task import finish_sample
+from phibench.datasets.build.spot_task import make_spot
+from phibench.datasets.build.tasks import Task, task_key
+from phibench.datasets.build.view_task import render_view
+from phibench.datasets.plan.plan import PairPlan, Plan, PosePlan
+from phibench.datasets.store.documents import to_json
+from phibench.datasets.store.provenance import code_behind
+from phibench.scenes.rig import POSITIONS
+
+Tasks = dict[str, Task]
+
+
+def plan_tasks(plan: Plan, versions: Mapping[str, Any]) -> Tasks:
+    """Tasks by name; `versions` says what they run on (Python, packages, renderer)."""
+    makers = _Makers(plan, versions)
+    spots = [makers.spot(pair) for pair in plan.pairs]  # first, they are quick and find faults of the recipe
+    bakes = [makers.bake()] if plan.room.lit else []
+    views = {pose.pose_id: makers.view(pose, bakes) for pose in plan.poses}
+    samples = [makers.sample(pair, spot, views) for pair, spot in zip(plan.pairs, spots, strict=True)]
+    return {task.name: task for task in (*spots, *bakes, *views.values(), *samples)}
+
+
+def task_names(plan: Plan) -> list[str]:
+    """Names of all tasks in the order of `plan_tasks`, without their keys."""
+    return list(plan_tasks(plan, {}))
+
+
+def spot_task_name(pair: PairPlan) -> str:
+    """Name of the task whose result is a sample's row, but for the noise."""
+    return f"spot {pair.sample_id}"
+
+
+def sample_task_name(pair: PairPlan) -> str:
+    """Name of the task whose result is the noise of a sample."""
+    return f"sample {pair.sample_id}"
+
+
+class _Makers:
+    """Makes tasks; what many keys share is hashed once."""
+
+    def __init__(self, plan: Plan, versions: Mapping[str, Any]) -> None:
+        self._plan, self._versions = plan, dict(versions)
+        self._room = _digest(to_json(plan.room))
+        self._rigs = {name: _digest(to_json(rig)) for name, rig in plan.rigs.items()}
+        self._spots = {name: to_json(spot) for name, spot in plan.spots.items()}
+
+    def spot(self, pair: PairPlan) -> Task:
+        plan = self._plan
+        name, rig, spot = plan.recipe.dataset.name, plan.rigs[pair.rig], plan.spots[pair.spot]
+        key = self._key(
+            ["spot", name, self._rigs[pair.rig], self._room, self._spots[pair.spot], asdict(pair)], make_spot
+        )
+        return Task(spot_task_name(pair), key, make_spot, (name, rig, plan.room, spot, pair))
+
+    def bake(self) -> Task:
+        plan, ambient = self._plan, self._plan.recipe.ambient
+        scene = [_digest(to_json(plan.rig)), self._room]
+        key = self._key(["bake", *scene, asdict(bake_settings(ambient))], bake_room)
+        return Task("bake room", key, bake_room, (plan.rig, plan.room, ambient))
+
+    def view(self, pose: PosePlan, bakes: Sequence[Task]) -> Task:
+        plan = self._plan
+        name, ambient = plan.recipe.dataset.name, plan.recipe.ambient
+        inputs = ["view", name, self._rigs[pose.rig], self._room, asdict(pose), ambient.model_dump()]
+        key = self._key(inputs, render_view, tuple(task.key for task in bakes))
+        arguments, needs = (name, plan.rigs[pose.rig], plan.room, pose, ambient), tuple(task.name for task in bakes)
+        return Task(f"view {pose.pose_id}", key, render_view, arguments, needs)
+
+    def sample(self, pair: PairPlan, spot: Task, views: Mapping[str, Task]) -> Task:
+        needs = list(
+            {views[pair.pose_id(position)].name: views[pair.pose_id(position)] for position in POSITIONS}.values()
+        )
+        keys = tuple(task.key for task in (spot, *needs))
+        key = self._key(["sample", pair.sample_id], finish_sample, keys)
+        names = tuple(task.name for task in (spot, *needs))
+        arguments = (pair, self._plan.rigs[pair.rig], self._plan.room, self._plan.spots[pair.spot])
+        return Task(sample_task_name(pair), key, finish_sample, arguments, names)
+
+    def _key(self, inputs: Any, function: Any, needs: tuple[str, ...] = ()) -> str:
+        return task_key(inputs, code_behind(function.__module__), self._versions, needs)
+
+
+def _digest(document: Any) -> str:
+    return hashlib.sha256(json.dumps(document, sort_keys=True, allow_nan=False).encode()).hexdigest()

@@ -1,0 +1,128 @@
+"""A task: a pure function whose outputs are files, known by the hash of all that enters it."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import resource
+import sys
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from phibench.datasets.store.files import sha256, working
+from phibench.datasets.store.provenance import code_sha256
+
+
+@dataclass(frozen=True)
+class Made:
+    """What a task's function returns: the files it wrote, relative to the folder, and a JSON document."""
+
+    files: tuple[str, ...]
+    result: Any = None
+
+
+@dataclass(frozen=True)
+class Task:
+    """One piece of work.
+
+    Attributes
+    ----------
+    name : str
+        Unique within a data set: the kind, a blank, and what it makes, such as ``view h0.425``.
+    key : str
+        SHA-256 of inputs, code and versions, and of the keys of `needs`.
+    function : callable
+        Of a module, called as ``function(out, *arguments)``; returns `Made`. It writes every file atomically.
+    arguments : tuple
+        Can be pickled; no paths.
+    needs : tuple of str
+        Tasks whose files it reads.
+    """
+
+    name: str
+    key: str
+    function: Callable[..., Made]
+    arguments: tuple[Any, ...] = ()
+    needs: tuple[str, ...] = ()
+
+    @property
+    def kind(self) -> str:
+        """First word of the name."""
+        return self.name.split(" ", 1)[0]
+
+
+@dataclass(frozen=True)
+class Done:
+    """A task that ended well: SHA-256 by file, its result, and what it cost."""
+
+    files: dict[str, str]
+    result: Any
+    seconds: float
+    peak_mb: float
+    worker: str
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A task that ended badly; `cause` is for people."""
+
+    cause: str
+    lethal: bool = field(default=False, kw_only=True)
+
+
+def task_key(inputs: Any, code: str, versions: Mapping[str, Any], needs: tuple[str, ...] = ()) -> str:
+    """Key of a task: `inputs` as JSON, hash of the code, versions of what it runs on, keys of what it needs."""
+    document = {"inputs": inputs, "code": code, "versions": versions, "needs": needs}
+    return hashlib.sha256(json.dumps(document, sort_keys=True, allow_nan=False).encode()).hexdigest()
+
+
+def perform(task: Task, out: Path, code: str | None = None) -> Done | Failed:
+    """Do a task in this process. Errors meant for people come back as their message, others with their traceback.
+
+    `code` is the hash of the code that the sender runs; another one here is refused.
+    """
+    if code is not None and code != code_sha256():
+        return Failed(f"worker {worker_name()} runs other code than the sender: install the same version on both")
+    began = time.perf_counter()
+    try:
+        with working(out):
+            made = task.function(out, *task.arguments)
+            files = {name: sha256(out / name) for name in made.files}
+    except Exception as error:
+        return Failed(fault_text(error))
+    return Done(files, made.result, round(time.perf_counter() - began, 3), _peak_mb(), worker_name())
+
+
+def worker_name() -> str:
+    """Name of this process for logs."""
+    return f"{os.uname().nodename}:{os.getpid()}"
+
+
+def fault_text(error: Exception) -> str:
+    """Message of an error that is meant for people, the traceback of any other."""
+    told = isinstance(error, OSError | MemoryError) or type(error).__module__.startswith("phibench")
+    return (str(error) or type(error).__name__) if told else traceback.format_exc()
+
+
+def log_entry(task: Task, outcome: Done | Failed) -> dict[str, Any]:
+    """One line of `log.jsonl`, without the time."""
+    entry = {"task": task.name, "key": task.key, "ok": isinstance(outcome, Done), **asdict(outcome)}
+    return {key: value for key, value in entry.items() if key not in ("files", "result", "lethal")}
+
+
+def _peak_mb() -> float:
+    """Largest resident memory of this process so far, MB.
+
+    Linux' ru_maxrss starts at what the parent had before exec, so that /proc is asked first.
+    """
+    with contextlib.suppress(OSError, StopIteration):
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return round(int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) * 1024.0 / 1e6, 1)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak * (1.0 if sys.platform == "darwin" else 1024.0) / 1e6, 1)

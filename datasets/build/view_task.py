@@ -1,0 +1,50 @@
+"""One mirror pose, rendered in a worker process: ambient layer, truth layer, preview."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from phibench.datasets.build.bake_task import bake_settings, read_light_map
+from phibench.datasets.build.tasks import Made
+from phibench.datasets.plan.plan import PosePlan
+from phibench.datasets.recipe.tables import AmbientTable
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.layers import write_ambient, write_truth
+from phibench.datasets.store.pictures import exposure_s, save_png, to_srgb
+from phibench.scenes.rig import Rig
+from phibench.scenes.room import Room
+
+
+def start_renderer() -> dict[str, Any]:
+    """Switch Mitsuba on in this process; return what it runs on."""
+    from phibench.render.setup.llvm import find_llvm
+    from phibench.render.setup.variant import THREADS, activate
+
+    variant = activate().variant()
+    llvm = find_llvm().label if variant.startswith("llvm") else None
+    return {"variant": variant, "llvm": llvm, "threads_per_process": THREADS}
+
+
+def render_view(out: Path, dataset: str, rig: Rig, room: Room, pose: PosePlan, ambient: AmbientTable) -> Made:
+    """Task: render one pose and write its three files below `out`."""
+    from phibench.render.optics.truth import truth_layer
+    from phibench.render.room.ambient import dark_layer, render_ambient
+    from phibench.render.setup.variant import activate
+
+    activate()
+    view = rig.at(pose.offset_m)
+    header = {"dataset": dataset, "pose": pose.pose_id, "offset_m": pose.offset_m}
+    if room.lit:
+        light, settings = read_light_map(out), bake_settings(ambient)
+        layer = render_ambient(view, room, light, settings, ambient.cells_per_pixel, pose.seed)
+    else:
+        layer = dark_layer(rig.camera)
+    planes = layer.electrons_per_s
+    header_ambient = {**header, **ambient.model_dump(), "seed": pose.seed}
+    write_ambient(out / layout.view_file(pose.pose_id, "ambient"), planes, layer.variance_per_s2, header_ambient)
+    write_truth(out / layout.view_file(pose.pose_id, "truth"), truth_layer(view, room.shapes(view)), header)
+    detector = rig.camera.detector
+    picture = to_srgb(planes, detector, exposure_s(planes, detector))
+    save_png(out / layout.view_file(pose.pose_id, "preview"), picture)
+    return Made(tuple(layout.view_file(pose.pose_id, name) for name in ("ambient", "truth", "preview")))

@@ -1,0 +1,346 @@
+"""Worker processes by dask.distributed: our own on this machine, or those of a running scheduler.
+
+One process and one Dr.Jit thread per worker, under a nanny that replaces it when it dies. Our own listen on the
+loopback device only and end with this process. The same code serves both; only the opening differs.
+
+What renders: versions, variant, LLVM, asked of the processes that will do the work.
+
+Who does the work: processes of our own, or a running scheduler's. Opened only when it is needed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import uuid
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from phibench.datasets.build.scheduler import Executor, Outcome
+from phibench.datasets.build.tasks import Done, Failed, Task, fault_text, perform, worker_name
+from phibench.datasets.build.view_task import start_renderer
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.store.files import write_text
+from phibench.datasets.store.provenance import ONE_THREAD, code_sha256, provenance
+
+CONNECT_S = 10.0
+WORKERS_S = 60.0
+LOST_S = 300.0
+_POLL_S = 0.005
+_CENSUS_S = 2.0
+# dask lets glibc return memory at once; a view's arrays of 45 MB would then fault every page anew, 1 s a view
+_MEMORY = {"MALLOC_TRIM_THRESHOLD_": 2**31, "MALLOC_MMAP_THRESHOLD_": 2**30, "MALLOC_TOP_PAD_": 2**26}
+_MISSING = "dask.distributed is not installed: run `pip install 'phibench[cluster]'`"
+
+
+class Workers:
+    """Connected workers; an `Executor` of tasks whose files go to `out`."""
+
+    def __init__(self, client: Any, out: Path, deaths: _Deaths | None = None) -> None:
+        from distributed import as_completed
+
+        self.client = client
+        self._out, self._deaths, self._code = out.resolve(), deaths, code_sha256()
+        self._ended, self._tasks = as_completed(loop=client.loop), dict[str, Task]()
+        self._count, self._counted, self._number = 0, -_CENSUS_S, 0
+
+    def width(self) -> int:
+        """Number of workers; asked now and then, they come and go."""
+        if time.monotonic() - self._counted >= _CENSUS_S:
+            self._count, self._counted = len(self.client.nthreads()), time.monotonic()
+        return max(self._count, 1)
+
+    def submit(self, task: Task) -> None:
+        """Send a task; it is not repeated by dask."""
+        self._number += 1
+        key = f"{task.name} #{self._number}"
+        self._tasks[key] = task
+        self._ended.add(self.client.submit(perform, task, self._out, self._code, key=key, pure=False, retries=0))
+
+    def next(self) -> Outcome:
+        """Wait for any task; its result is released at once."""
+        self._wait()
+        future = next(self._ended)
+        task = self._tasks.pop(future.key)
+        try:
+            return task, self._outcome(future)
+        finally:
+            future.release()
+
+    def _wait(self) -> None:
+        """Wait until a task has ended; workers may go and come, but not stay away for ever."""
+        seen = time.monotonic()
+        while not self._ended.has_ready() and self.client.status == "running":
+            time.sleep(_POLL_S)
+            if time.monotonic() - self._counted >= _CENSUS_S:
+                self.width()
+            if self._count:
+                seen = time.monotonic()
+            elif time.monotonic() - seen > LOST_S:
+                text = f"the scheduler has had no workers for {LOST_S:g} s"
+                raise DatasetError(f"{text}; start some and run the same command again, finished work is kept")
+
+    def _outcome(self, future: Any) -> Done | Failed:
+        from distributed import KilledWorker
+
+        if future.status in ("cancelled", "lost"):
+            raise DatasetError("the scheduler has gone away; run the same command again, finished work is kept")
+        error = future.exception()
+        if error is None:
+            outcome: Done | Failed = future.result()
+            return outcome
+        if isinstance(error, KilledWorker):
+            return Failed(self._deaths.last if self._deaths else "see the worker's log", lethal=True)
+        return Failed(f"{type(error).__name__}: {error}")
+
+
+@contextlib.contextmanager
+def local_workers(count: int, out: Path) -> Iterator[Workers]:
+    """Start worker processes on this machine; leaving ends them, however it is left."""
+    dask, distributed = _libraries()
+    deaths = _Deaths()
+    settings = {
+        "distributed.scheduler.allowed-failures": 0,  # who is to blame is found out in `dispatch`
+        "distributed.worker.memory.target": False,
+        "distributed.worker.memory.spill": False,
+        "distributed.worker.memory.pause": False,
+        "distributed.worker.memory.terminate": False,
+        "distributed.comm.timeouts.connect": "60s",
+        "distributed.worker.profile.enabled": False,
+        "distributed.nanny.pre-spawn-environ": {**_MEMORY, **ONE_THREAD},
+    }
+    with tempfile.TemporaryDirectory(prefix="phibench-") as folder, dask.config.set(settings), deaths.listening():
+        cluster = distributed.LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
+            memory_limit=0,
+            silence_logs=logging.CRITICAL,
+            local_directory=folder,
+        )
+        with cluster, distributed.Client(cluster, set_as_default=False) as client:
+            client.run(_hear_no_interrupt)
+            client.register_plugin(_deaf_plugin())
+            yield Workers(client, out, deaths)
+
+
+@contextlib.contextmanager
+def remote_workers(scheduler: str, out: Path) -> Iterator[Workers]:
+    """Connect to a running scheduler, by its address or its scheduler file.
+
+    Raises
+    ------
+    DatasetError
+        If nothing answers there, or no worker comes.
+    """
+    _, distributed = _libraries()
+    with _connect(distributed, scheduler) as client:
+        try:
+            client.wait_for_workers(1, timeout=WORKERS_S)
+        except TimeoutError:
+            raise DatasetError(
+                f"the scheduler at {scheduler} has no workers after {WORKERS_S:g} s; start some"
+            ) from None
+        yield Workers(client, out)
+
+
+def _connect(distributed: Any, scheduler: str) -> Any:
+    path = Path(scheduler)
+    is_file = scheduler.endswith(".json") or path.is_file()
+    if is_file and not path.is_file():
+        raise DatasetError(f"there is no scheduler file {path}; start `dask scheduler --scheduler-file {path}` first")
+    where = {"scheduler_file": str(path)} if is_file else {"address": scheduler}
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    try:
+        return distributed.Client(**where, timeout=CONNECT_S, set_as_default=False)
+    except Exception as error:  # nonsense in an address or a file ends in many kinds
+        text = f"no dask scheduler answers at {scheduler} within {CONNECT_S:g} s"
+        raise DatasetError(f"{text} ({str(error).splitlines()[0] if str(error) else type(error).__name__})") from None
+
+
+def _libraries() -> tuple[Any, Any]:
+    try:
+        import dask
+        import distributed
+    except ModuleNotFoundError as error:
+        raise DatasetError(_MISSING) from error
+    return dask, distributed
+
+
+def _hear_no_interrupt() -> None:
+    """Leave Ctrl-C to the parent, which then ends its workers."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _deaf_plugin() -> Any:
+    """Make a plugin that does the same in the workers that come later."""
+    from distributed import WorkerPlugin
+
+    class Deaf(WorkerPlugin):
+        def setup(self, worker: Any) -> None:
+            _hear_no_interrupt()
+
+    return Deaf()
+
+
+class _Deaths(logging.Handler):
+    """Hears from the nannies how a worker died."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
+        self.last = "no cause known"
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = record.getMessage()
+        if " was killed by " in text or " exited with " in text:
+            self.last = text.split(" ", 3)[-1]
+
+    @contextlib.contextmanager
+    def listening(self) -> Iterator[None]:
+        logger = logging.getLogger("distributed.nanny")
+        before = logger.level, logger.propagate
+        logger.setLevel(logging.INFO)
+        logger.propagate = False
+        logger.addHandler(self)
+        try:
+            yield
+        finally:
+            logger.removeHandler(self)
+            logger.level, logger.propagate = before
+
+
+Environment = dict[str, Any]
+_UNLIKE = ("commit",)  # may differ between two equal runs
+_IN_KEYS = ("numpy", "scipy", "mitsuba", "drjit", "OpenEXR", "pillow")
+
+
+def local_environment() -> Environment:
+    """Environment of a fresh process on this machine.
+
+    Raises
+    ------
+    DatasetError
+        If Mitsuba cannot be used.
+    """
+    command = [sys.executable, "-m", "phibench.datasets.build.workers"]
+    child = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    if child.returncode != 0:
+        last = (child.stderr.strip().splitlines() or [f"exit status {child.returncode}"])[-1]
+        raise DatasetError(f"Mitsuba does not start on this machine ({last}); ask `phibench doctor`")
+    return _checked({"this machine": json.loads(child.stdout.splitlines()[-1])})
+
+
+def remote_environment(workers: Workers, out: Path) -> Environment:
+    """Environment of all workers of a scheduler, which must be one and the same.
+
+    Raises
+    ------
+        DatasetError If a worker lacks phibench or Mitsuba, has other versions than the rest, other code than this
+        process, more than one thread, or does not see the folder.
+    """
+    if threaded := [name for name, count in workers.client.nthreads().items() if count != 1]:
+        raise DatasetError(f"worker {threaded[0]} has more than one thread; start workers with --nthreads 1")
+    probe = write_text(out.resolve() / f".phibench-tmp-{uuid.uuid4().hex}", "probe")
+    try:
+        return _checked(workers.client.run(describe, probe, on_error="return"))
+    finally:
+        probe.unlink(missing_ok=True)
+
+
+def versions(environment: Environment) -> Environment:
+    """What of an environment enters the keys of tasks."""
+    packages = {name: environment["packages"][name] for name in _IN_KEYS}
+    kept = {key: environment[key] for key in ("python", "machine", "variant", "llvm", "threads_per_process")}
+    return {**kept, "packages": packages}
+
+
+def describe(probe: Path | None = None) -> Environment:
+    """Environment of this process; ``{"fault": ...}`` where it cannot render or does not see `probe`."""
+    if probe is not None and not probe.is_file():
+        return {"fault": f"it does not see the folder {probe.parent}: use one that all machines share"}
+    try:
+        rendering = start_renderer()
+    except Exception as error:
+        return {"fault": fault_text(error)}
+    return {
+        **{key: value for key, value in provenance().items() if key not in _UNLIKE},
+        **rendering,
+        "worker": worker_name(),
+    }
+
+
+def _checked(found: dict[str, Any]) -> Environment:
+    """Return the one environment of all."""
+    for name, environment in found.items():
+        if isinstance(environment, ModuleNotFoundError):
+            raise DatasetError(f"worker {name} has no {environment.name}: install phibench[render,cluster] there")
+        if isinstance(environment, BaseException):
+            raise DatasetError(f"worker {name} failed: {environment}")
+        if "fault" in environment:
+            raise DatasetError(f"{name} cannot render: {environment['fault']}")
+        if environment["code_sha256"] != code_sha256():
+            raise DatasetError(f"worker {name} runs other code than this process: install the same version on both")
+    bare = {name: {k: v for k, v in e.items() if k != "worker"} for name, e in found.items()}
+    first = next(iter(bare))
+    for name, environment in bare.items():
+        if environment != bare[first]:
+            unlike = [key for key in environment if environment[key] != bare[first].get(key)]
+            raise DatasetError(f"workers {first} and {name} differ in {', '.join(unlike)}: their images would too")
+    return bare[first]
+
+
+class Crew:
+    """Workers for one folder, as a context manager; leaving it ends our own and lets others' go.
+
+    Parameters
+    ----------
+    out : folder that tasks write to
+    count : processes on this machine, at most
+    scheduler : address or scheduler file of a running scheduler, which is used instead
+    """
+
+    def __init__(self, out: Path, count: int, scheduler: str | None = None) -> None:
+        self._out, self._count, self._scheduler = out, count, scheduler
+        self._stack = ExitStack()
+        self._remote: Workers | None = None
+
+    def __enter__(self) -> Crew:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
+
+    @property
+    def width(self) -> int:
+        """How many tasks run at a time."""
+        return self._count if self._remote is None else self._remote.width()
+
+    def environment(self) -> Environment:
+        """What the workers render with."""
+        if self._scheduler is None:
+            return local_environment()
+        self._remote = self._stack.enter_context(remote_workers(self._scheduler, self._out))
+        return remote_environment(self._remote, self._out)
+
+    def executor(self, tasks: int) -> Executor:
+        """Workers for that many tasks."""
+        if self._remote is not None:
+            return self._remote
+        return self._stack.enter_context(local_workers(min(self._count, tasks), self._out))
+
+
+if __name__ == "__main__":
+    print(json.dumps(describe()))

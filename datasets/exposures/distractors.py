@@ -1,0 +1,182 @@
+"""Lights that a method may take for the spot: drawn per sample, computed when frames are, never on disk.
+
+They are flat Lambertian discs at the laser's wavelength and have an exact place in both images, as the spot has.
+A sample's distractors are a pure function of the recipe, the sample's names and its row of the manifest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from phibench.datasets.read import Sample
+from phibench.datasets.recipe.distributions import DistributionTable, quantile
+from phibench.datasets.recipe.spot_placement import by_ray, on_board
+from phibench.datasets.recipe.tables import DistractorTable
+from phibench.datasets.store.layers import SpotWindow
+from phibench.render.optics.spot_layer import SpotLayer, spot_layer
+from phibench.render.optics.truth import SpotTruth, spot_truth
+from phibench.render.sensor.light import OtherSpot
+from phibench.scenes.catalog import BOARD_SIZE_M
+from phibench.scenes.frames import Vector
+from phibench.scenes.laser import LaserSpot
+from phibench.scenes.random_streams import Name, generator
+from phibench.scenes.rig import POSITIONS
+
+MIN_APART_PX = 12.0
+"""Nearer than this a distractor would lie in the spot's window, and the spot's own place would be in doubt."""
+TRIES = 20
+
+Names = tuple[str, int, str]
+
+
+@dataclass(frozen=True)
+class Distractor:
+    """One light beside the spot.
+
+    Attributes
+    ----------
+    kind : "spot", "glow" or "led"
+    follows_laser : bool
+        Whether it goes out with the laser.
+    spot : LaserSpot
+        The disc, its power such that the flux ratio is that of the recipe.
+    layers : mapping of position to SpotLayer
+        Electrons per second at laser level 1.
+    truths : mapping of position to SpotTruth
+    """
+
+    kind: str
+    follows_laser: bool
+    spot: LaserSpot
+    layers: Mapping[str, SpotLayer] = field(repr=False)
+    truths: Mapping[str, SpotTruth] = field(repr=False)
+
+    def other(self, position: str, laser_level: float) -> OtherSpot:
+        """Its light in one view; a lamp that stays on keeps its ratio to the spot at this level."""
+        level = 1.0 if self.follows_laser else laser_level
+        layer = self.layers[position]
+        stacks = (layer.electrons_per_s, layer.du_electrons_per_s_px, layer.dv_electrons_per_s_px)
+        window = SpotWindow(layer.u0_px, layer.v0_px, *(level * stack for stack in stacks))
+        return OtherSpot(window, self.follows_laser)
+
+
+def present(names: Names, tables: tuple[DistractorTable, ...]) -> tuple[int, ...]:
+    """Numbers of the tables that a sample was drawn to have."""
+    return tuple(i for i, table in enumerate(tables) if _unit(names, i, "present") < table.probability)
+
+
+def distractors(sample: Sample) -> tuple[Distractor, ...]:
+    """Distractors of a sample, in the order of the recipe; those that find no place are left out."""
+    tables = sample.dataset.recipe.distractors
+    if not any(sample.truth_row(position).visible for position in POSITIONS):
+        return ()
+    placed = (_placed(sample, i, tables[i]) for i in present(sample.stream_names, tables))
+    return tuple(one for one in placed if one is not None)
+
+
+def _placed(sample: Sample, number: int, table: DistractorTable) -> Distractor | None:
+    """First of `TRIES` places that the down image shows, apart from the spot in both images."""
+    for attempt in range(TRIES):
+        spot = _drawn_spot(sample, number, table, attempt)
+        if spot is None:
+            continue
+        views = {position: sample.view(position) for position in POSITIONS}
+        shapes = {position: sample.dataset.room.shapes(view) for position, view in views.items()}
+        truths = {position: spot_truth(view, spot, shapes[position]) for position, view in views.items()}
+        if not truths["down"].visible or any(_too_near(sample, position, truths[position]) for position in POSITIONS):
+            continue
+        layers = {position: spot_layer(view, spot, shapes[position]) for position, view in views.items()}
+        ratio = max(_ratio(sample, position, layers[position]) for position in POSITIONS)
+        if ratio > 0.0:
+            wanted = _value(sample.stream_names, number, "flux_ratio", table.flux_ratio)
+            scaled = {position: _scaled(layer, wanted / ratio) for position, layer in layers.items()}
+            spot = replace(spot, power_w=spot.power_w * wanted / ratio)
+            return Distractor(table.kind, table.follows_laser, spot, scaled, truths)
+    return None
+
+
+def _ratio(sample: Sample, position: str, layer: SpotLayer) -> float:
+    """Electrons relative to the spot's; 0 where the spot is not seen."""
+    row = sample.truth_row(position)
+    return float(layer.total_electrons_per_s.sum() / sum(row.electrons_per_s)) if row.visible else 0.0
+
+
+def _too_near(sample: Sample, position: str, truth: SpotTruth) -> bool:
+    row = sample.truth_row(position)
+    return math.hypot(truth.u_px - row.u_px, truth.v_px - row.v_px) < MIN_APART_PX  # False where one is NaN
+
+
+def _scaled(layer: SpotLayer, factor: float) -> SpotLayer:
+    return replace(
+        layer,
+        electrons_per_s=factor * layer.electrons_per_s,
+        du_electrons_per_s_px=factor * layer.du_electrons_per_s_px,
+        dv_electrons_per_s_px=factor * layer.dv_electrons_per_s_px,
+        total_electrons_per_s=factor * layer.total_electrons_per_s,
+    )
+
+
+def _drawn_spot(sample: Sample, number: int, table: DistractorTable, attempt: int) -> LaserSpot | None:
+    """Disc at one drawn place; None where there can be none."""
+    place = _ray_place if table.azimuth_deg is not None else _board_place
+    found = place(sample, number, table, attempt)
+    if found is None:
+        return None
+    recipe = sample.dataset.recipe
+    return LaserSpot(
+        *found,
+        diameter_m=_value(sample.stream_names, number, "diameter_m", table.diameter_m),
+        albedo=max(recipe.laser.albedo, 0.01),  # its power is scaled to the flux ratio anyway
+        power_w=recipe.laser.power_w,
+        wavelength_nm=recipe.laser.wavelength_nm,
+        profile=recipe.laser.profile if table.kind == "spot" else "uniform",
+    )
+
+
+def _ray_place(sample: Sample, number: int, table: DistractorTable, attempt: int) -> tuple[Vector, Vector] | None:
+    """Position and normal on a horizontal ray from the axis: free in the room, or where it ends."""
+    names, room = sample.stream_names, sample.dataset.room
+    azimuth_deg, height_m, distance_m = (
+        0.0 if given is None else _value(names, number, key, given, attempt)
+        for key, given in (
+            ("azimuth_deg", table.azimuth_deg),
+            ("height_m", table.height_m),
+            ("distance_m", table.distance_m),
+        )
+    )
+    if table.distance_m is None:
+        [found] = by_ray(sample.dataset.recipe.laser, room, np.array([azimuth_deg]), np.array([height_m]))
+        return None if isinstance(found, str) else (found[1].position_world_m, found[1].normal_world)
+    x, y = math.cos(math.radians(azimuth_deg)), math.sin(math.radians(azimuth_deg))
+    position = (distance_m * x, distance_m * y, height_m)
+    return None if room.solid_around(position) is not None else (position, (-x, -y, 0.0))
+
+
+def _board_place(sample: Sample, number: int, table: DistractorTable, attempt: int) -> tuple[Vector, Vector] | None:
+    """Position and normal anywhere on a board that is not the sample's own."""
+    recipe, names = sample.dataset.recipe, sample.stream_names
+    allowed = None if table.target is None else set(table.target.choice)
+    boards = [t for t in recipe.targets if t.name != sample.row.target and (allowed is None or t.name in allowed)]
+    if not boards:
+        return None
+    board = boards[int(_unit(names, number, "target", attempt) * len(boards))]
+    reach_m = _value(names, number, "diameter_m", table.diameter_m)
+    across_m, up_m = (
+        (2.0 * _unit(names, number, key, attempt) - 1.0) * max(size_m / 2.0 - reach_m, 0.0)
+        for key, size_m in zip(("across", "up"), BOARD_SIZE_M, strict=True)
+    )
+    spot = on_board(recipe.laser, board, across_m, up_m)
+    return spot.position_world_m, spot.normal_world
+
+
+def _value(names: Names, number: int, key: str, table: DistributionTable, attempt: int = 0) -> float:
+    return float(quantile(table, np.array(_unit(names, number, key, attempt))[None])[0])
+
+
+def _unit(names: Names, number: int, *key: Name) -> float:
+    """Number in [0, 1) of a stream of its own."""
+    return float(generator(*names, "distractor", number, *key).random())

@@ -1,0 +1,175 @@
+"""A frame as a file that other programs read: PNG, the camera's own JPEG, or EXR; and a picture of it for people.
+
+`frames.jsonl`: one line per file of drawn frames, with every number that it depends on and its SHA-256.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.source import Frame
+from phibench.datasets.store.files import read_rows, write_bytes, write_text
+from phibench.datasets.store.layers import write_exr
+from phibench.datasets.store.schema import Document, Position
+from phibench.render.sensor import processing as isp
+from phibench.render.sensor.settings import Sensor
+from phibench.scenes.camera import FILTERS
+
+VALUES = {
+    "electrons": "expected electrons in one exposure behind R, G, B, float32",
+    "raw": "DN of the converter, not scaled, in 16 bits; RGGB by the pixel's place on the sensor",
+    "srgb8": "sRGB, 8 bits",
+    "mjpeg": "sRGB, 8 bits, as the camera sends it",
+}
+PREVIEW = "sRGB, 8 bits, for people; not the camera's"
+
+
+def suffix(sensor: Sensor, whole: bool) -> str:
+    """End of the file's name; a part of an MJPEG frame is no JPEG file of the camera and goes into a PNG."""
+    if sensor.output == "electrons":
+        return ".exr"
+    return ".jpg" if sensor.output == "mjpeg" and whole else ".png"
+
+
+def has_preview(sensor: Sensor) -> bool:
+    """Whether a picture for people is wanted, because the frame itself is dark or unreadable to a viewer."""
+    return sensor.output in ("electrons", "raw")
+
+
+def write_frame(path: Path, frame: Frame, names: tuple[str, int, str]) -> Path:
+    """Write one frame, atomically; `names` are data set, seed and sample id for the EXR's header."""
+    if frame.sensor.output == "electrons":
+        header = {"kind": "frame", "unit": "electrons", "exposure_s": frame.sensor.exposure_s}
+        header |= dict(zip(("dataset", "dataset_seed", "sample_id"), names, strict=True))
+        header |= {"position": frame.position, "laser": frame.laser, "draw": frame.draw}
+        planes = dict(zip(FILTERS, frame.image, strict=True))
+        return write_exr(path, planes, header, (frame.region.u0_px, frame.region.v0_px))
+    return write_bytes(path, frame.jpeg if frame.jpeg is not None else png_bytes(frame.image))
+
+
+def write_preview(path: Path, frame: Frame) -> Path:
+    """Write the picture of a frame, atomically."""
+    return write_bytes(path, png_bytes(preview(frame)))
+
+
+def png_bytes(image: NDArray[Any]) -> bytes:
+    """PNG of an image, shape (h, w) of 16 bits or (h, w, 3) of 8 bits."""
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, format="PNG", compress_level=6)
+    return buffer.getvalue()
+
+
+def preview(frame: Frame) -> NDArray[np.uint8]:
+    """Picture of a frame of electrons or DN as the preset's processing would show it, shape (h, w, 3)."""
+    sensor = frame.sensor
+    if sensor.output == "raw":
+        # interpolation starts at a red pixel and needs two rows and columns: reflection keeps the filters' order
+        before = frame.region.v0_px % 2, frame.region.u0_px % 2
+        padded = frame.image
+        for axis, (first, length) in enumerate(zip(before, frame.image.shape, strict=True)):
+            width = [(0, 0), (0, 0)]
+            width[axis] = (first, 1)
+            padded = np.pad(padded, width, mode="reflect" if length > 1 else "edge")
+        linear = isp.linear_rgb(isp.linear_signal(padded, sensor, np.float32), sensor)
+        height, length = frame.image.shape
+        linear = linear[..., before[0] : before[0] + height, before[1] : before[1] + length]
+    else:
+        full_scale_e = (sensor.top_dn - sensor.black_level_dn) / sensor.dn_per_e
+        linear = isp.white_balanced(frame.image / full_scale_e, sensor.white_balance)
+        linear = isp.colour_corrected(linear, sensor.colour_matrix)
+    return isp.eight_bit(isp.rendered(linear, sensor))
+
+
+INDEX = "frames.jsonl"
+REQUEST = "request.json"
+_IMAGES = (".exr", ".jpg", ".png")
+
+
+class FrameRow(Document):
+    """One file.
+
+    `values` says what a number in the file means; `sensor` has the exposure and gain that were used, `request` what was
+    asked for. The image's pixel (0, 0) is pixel (u0_px, v0_px) of the sensor. `key` is a hash of all that the file
+    depends on, layers and code included.
+    """
+
+    file: str
+    sha256: str
+    kind: Literal["frame", "preview"]
+    values: str
+    dataset: str
+    dataset_seed: int
+    sample_id: str
+    position: Position
+    laser: Literal["on", "off"]
+    draw: int
+    preset: str
+    exposure_s: float
+    analogue_gain: float
+    u0_px: int
+    v0_px: int
+    width_px: int
+    height_px: int
+    sensor: dict[str, Any]
+    request: dict[str, Any]
+    key: str
+
+
+def read_index(folder: Path) -> dict[str, FrameRow]:
+    """Rows by file name; none where there is no index.
+
+    Raises
+    ------
+    DatasetError
+        With the number of the first line that is not a row.
+    """
+    path = folder / INDEX
+    if not path.exists():
+        return {}
+    try:
+        return {row.file: row for row in read_rows(path, FrameRow)}
+    except DatasetError as error:
+        raise DatasetError(f"{error}; delete the file and run the command again") from error
+
+
+def write_index(folder: Path, rows: Iterable[FrameRow]) -> Path:
+    """Write all rows, sorted by file name, atomically."""
+    ordered = sorted(rows, key=lambda row: row.file)
+    lines = (json.dumps(row.model_dump(mode="json"), allow_nan=False) + "\n" for row in ordered)
+    return write_text(folder / INDEX, "".join(lines))
+
+
+def claim(folder: Path, dataset: tuple[str, int], wanted: dict[str, Any]) -> None:
+    """Write down what the folder is for, before its first frame; refuse one that has frames of something else.
+
+    Raises
+    ------
+    DatasetError
+        With the names and values that differ, or if the note is damaged.
+    """
+    path = folder / REQUEST
+    meant = {"dataset": dataset[0], "dataset_seed": dataset[1], **wanted}
+    if not path.exists() or not _has_frames(folder):
+        write_text(path, json.dumps(meant, indent=1, allow_nan=False) + "\n")
+        return
+    try:
+        held = dict(json.loads(path.read_text(encoding="utf-8")))
+    except (ValueError, TypeError) as error:
+        raise DatasetError(f"{path} is damaged: give another folder, `--out FOLDER`") from error
+    if other := [name for name in meant if held.get(name) != meant[name]]:
+        texts = ", ".join(f"{name} {held.get(name)}, not {meant[name]}" for name in other)
+        raise DatasetError(f"{folder} holds frames with {texts}: give another folder, `--out FOLDER`")
+
+
+def _has_frames(folder: Path) -> bool:
+    """Whether a frame is there, in the index or not."""
+    return any(path.suffix in _IMAGES for path in folder.iterdir())

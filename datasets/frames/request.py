@@ -1,0 +1,135 @@
+"""What frames are asked for: preset, exposure, levels, motion and region, checked and frozen."""
+
+from __future__ import annotations
+
+import math
+import numbers
+import operator
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+from phibench.datasets.errors import DatasetError
+from phibench.render.sensor.light import Region
+from phibench.render.sensor.settings import Sensor, SensorError, sensor
+
+Exposure = float | Literal["auto"] | None
+
+
+_RANGES = {"lamp_level": (0.0, 1e6), "laser_level": (0.0, 1e6), "carriage_speed_m_s": (-1e3, 1e3)}
+
+
+@dataclass(frozen=True)
+class FrameRequest:
+    """How frames are taken; everything but the draw.
+
+    Parameters
+    ----------
+    preset : str
+        Sensor preset: "ideal", "mono-raw", "bayer-raw", "srgb8" or "mjpeg".
+    exposure : float, "auto" or None
+        Seconds; "auto" is the camera's auto exposure, for each position by itself; None is the preset's time.
+    lamp_level, laser_level : float
+        Factors of the room's light and of the spot.
+    carriage_speed_m_s : float
+        Speed of the carriage along the stroke axis while the frame is read (rolling shutter).
+    region : int, Region or None
+        Side of a square around each spot, pixels; the same pixels in all frames; or the whole image.
+    camera_seed : int
+        Names the camera: frames of one seed share the fixed pattern. 0 is a camera like others.
+    overrides : dict
+        Other numbers of the preset, such as ``jpeg_quality=60``.
+    """
+
+    preset: str = "mjpeg"
+    exposure: Exposure = None
+    lamp_level: float = 1.0
+    laser_level: float = 1.0
+    carriage_speed_m_s: float = 0.0
+    region: int | Region | None = None
+    camera_seed: int = 0
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.exposure is not None and "exposure_s" in self.overrides:
+            raise DatasetError("exposure and exposure_s are both given: give one of them")
+        if isinstance(self.exposure, str) and self.exposure != "auto":
+            raise DatasetError(f"exposure = '{self.exposure}': give seconds above 0, or 'auto'")
+        if not isinstance(self.preset, str):
+            raise DatasetError(f"preset = {self.preset!r}: give the name of a preset, such as 'mjpeg'")
+        for name, (low, high) in _RANGES.items():
+            object.__setattr__(self, name, _number(name, getattr(self, name), low, high))
+        object.__setattr__(self, "camera_seed", whole_number("camera_seed", self.camera_seed))
+        if isinstance(self.region, Region):
+            for name, value in asdict(self.region).items():
+                whole_number(f"region.{name}", value)
+        elif self.region is not None:
+            object.__setattr__(self, "region", whole_number("region", self.region, 1))
+        with in_one_sentence():
+            self.sensor()  # refused now rather than at the first draw
+
+    @classmethod
+    def of(cls, preset: str, options: Mapping[str, Any]) -> FrameRequest:
+        """Request from keywords: those that are not ours are numbers of the preset."""
+        if "overrides" in options:
+            raise DatasetError("overrides: give the numbers of the preset by name, such as jpeg_quality=60")
+        ours = {key: value for key, value in options.items() if key in cls.__dataclass_fields__}
+        return cls(preset, overrides={key: options[key] for key in options if key not in ours}, **ours)
+
+    def sensor(self) -> Sensor:
+        """Sensor before auto exposure."""
+        seconds = {} if self.exposure in (None, "auto") else {"exposure_s": self.exposure}
+        return sensor(self.preset, **seconds, **self.overrides)
+
+    def document(self) -> dict[str, Any]:
+        """The request as JSON can hold it."""
+        return {**asdict(self), "overrides": dict(self.overrides)}
+
+
+def exposure_of(text: str) -> Exposure:
+    """Exposure from a word: "auto" or seconds.
+
+    Raises
+    ------
+    DatasetError
+        If it is neither.
+    """
+    try:
+        return "auto" if text == "auto" else float(text)
+    except ValueError as error:
+        raise DatasetError(f"exposure = '{text}': give seconds above 0, or 'auto'") from error
+
+
+def _number(name: str, value: Any, low: float, high: float) -> float:
+    """Return `value` as a Python float within its range."""
+    number = math.nan if isinstance(value, bool) or not isinstance(value, numbers.Real) else float(value)
+    if not low <= number <= high:
+        raise DatasetError(f"{name} = {value!r}: must be a number from {low:g} to {high:g}")
+    return number
+
+
+def whole_number(name: str, value: Any, low: int = 0) -> int:
+    """Return `value` as a Python int: a NumPy integer would name another noise stream.
+
+    Raises
+    ------
+    DatasetError
+        If it is not an integer of at least `low`.
+    """
+    try:
+        number = None if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or number < low:
+        raise DatasetError(f"{name} = {value!r}: must be an integer, {low} or above")
+    return number
+
+
+@contextmanager
+def in_one_sentence() -> Iterator[None]:
+    """Say what the sensor refuses as a fault of the request."""
+    try:
+        yield
+    except SensorError as error:
+        raise DatasetError(str(error)) from error

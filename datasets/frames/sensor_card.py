@@ -1,0 +1,91 @@
+"""What an estimator may know of the sensor: the numbers of its preset, and none of the simulator's mathematics."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from phibench.render.sensor.settings import Sensor, sensor
+
+
+@dataclass(frozen=True)
+class SensorCard:
+    """Numbers of one sensor, as `render.sensor.Sensor` defines them.
+
+    Attributes
+    ----------
+    name : str
+    mosaic : "bayer" (RGGB, red at even row and even column) or "mono"
+    exposure_s : float
+    shot_noise : bool
+    full_well_e, read_noise_e, row_noise_e, dsnu_e : float, electrons
+    prnu : float, relative
+    dark_e_per_s : float
+    dn_per_e : float
+        Overall system gain K, analogue gain included.
+    black_level_dn : float
+    top_dn : int
+        Largest code.
+    output : "electrons", "raw", "srgb8" or "mjpeg"
+        Stage after which the chain ends.
+    white_balance : 3 floats
+        Gains of R, G, B on linear planes.
+    colour_matrix : 3 x 3
+        Rows give linear sRGB from white-balanced R, G, B.
+    sharpen_amount : float
+        Gain of the unsharp mask x + amount (x - blur x), blur (1 2 1)/4 along both axes, after the sRGB curve.
+    jpeg_quality : int
+        libjpeg's quality.
+    jpeg_subsampling : "4:4:4", "4:2:2" or "4:2:0"
+    """
+
+    name: str
+    mosaic: Literal["bayer", "mono"]
+    exposure_s: float
+    shot_noise: bool
+    full_well_e: float
+    read_noise_e: float
+    row_noise_e: float
+    prnu: float
+    dsnu_e: float
+    dark_e_per_s: float
+    dn_per_e: float
+    black_level_dn: float
+    top_dn: int
+    output: Literal["electrons", "raw", "srgb8", "mjpeg"]
+    white_balance: tuple[float, float, float]
+    colour_matrix: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+    sharpen_amount: float
+    jpeg_quality: int
+    jpeg_subsampling: Literal["4:4:4", "4:2:2", "4:2:0"]
+
+    @property
+    def saturation_e(self) -> float:
+        """Electrons at which a pixel carries no more information: full well or last code, whichever comes first."""
+        return min(self.full_well_e, (self.top_dn - 0.5 - self.black_level_dn) / self.dn_per_e)
+
+    @property
+    def full_from_e(self) -> float:
+        """Reading, electrons, from which on a pixel may be full, though noise that is added later hides it.
+
+        5 deviations of read noise and DSNU, and half a code, below the full well.
+        """
+        added = 5.0 * math.hypot(self.read_noise_e, self.dsnu_e) + 0.5 / self.dn_per_e
+        return min(self.full_well_e - added, self.saturation_e)
+
+
+def sensor_card(preset: str = "bayer-raw", **changes: Any) -> SensorCard:
+    """Card of a preset, with changes: ``sensor_card("mono-raw", analogue_gain=4.0)``.
+
+    Raises
+    ------
+    SensorError
+        If there is no such preset, or a change is not allowed.
+    """
+    return card_of(sensor(preset, **changes))
+
+
+def card_of(s: Sensor) -> SensorCard:
+    """Card of a sensor."""
+    return SensorCard(**{name: getattr(s, name) for name in SensorCard.__dataclass_fields__})

@@ -1,0 +1,270 @@
+"""Frames of a stroke pair: what the C310 delivers for one draw of its noise, as arrays and as JPEG files.
+
+Where frames of a stroke pair come from: its layers, read once and kept, and the camera that looks at them.
+
+A frame is a pure function of (data set, seed, sample, position, laser on or off, draw) and of the request: neither the
+order of the draws, nor processes, nor what else is drawn enters. NumPy only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.request import FrameRequest, in_one_sentence, whole_number
+from phibench.datasets.store.layers import SpotWindow
+from phibench.datasets.store.schema import ManifestRow, SpotRow
+from phibench.render.sensor.camera_chain import Chain, auto_exposed
+from phibench.render.sensor.light import Light, OtherSpot, Region
+from phibench.render.sensor.noise_tiles import frame_stream
+from phibench.render.sensor.processing import decoded
+from phibench.render.sensor.rolling_shutter import moved_spot, spot_velocity_px_per_s
+from phibench.render.sensor.settings import Sensor
+from phibench.scenes.laser import LaserSpot
+from phibench.scenes.rig import POSITIONS, Rig, View
+
+Image = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame.
+
+    Attributes
+    ----------
+    image : array
+        By `sensor.output`: "electrons" (3, h, w) float64, expected electrons behind R, G, B; "raw" (h, w) uint16, DN;
+        "srgb8" and "mjpeg" (h, w, 3) uint8.
+    jpeg : bytes or None
+        The file that the camera sends; None for a region and for other outputs than "mjpeg".
+    position : "down" or "up"
+    laser : bool
+    draw : int
+    sensor : Sensor
+        With the exposure and the gain that were used.
+    region : Region
+        Pixels of the sensor that `image` holds.
+    """
+
+    image: Image = field(repr=False)
+    jpeg: bytes | None = field(repr=False)
+    position: str
+    laser: bool
+    draw: int
+    sensor: Sensor
+    region: Region
+
+    @property
+    def name(self) -> str:
+        """Its name in `Frames`: "down", "up", "down_off" or "up_off"."""
+        return self.position if self.laser else f"{self.position}_off"
+
+
+@dataclass(frozen=True)
+class Frames:
+    """One draw of a stroke pair; images as `Frame.image`.
+
+    Attributes
+    ----------
+    by_name : mapping of str to Frame
+        "down" and "up", and "down_off" and "up_off" where they were asked for.
+    """
+
+    by_name: Mapping[str, Frame]
+
+    @classmethod
+    def of(cls, frames: list[Frame]) -> Frames:
+        """Put frames of one draw together."""
+        return cls(MappingProxyType({frame.name: frame for frame in frames}))
+
+    @property
+    def down(self) -> Image:
+        """Stroke position 1, laser on."""
+        return self._image("down")
+
+    @property
+    def up(self) -> Image:
+        """Stroke position 2, laser on."""
+        return self._image("up")
+
+    @property
+    def down_off(self) -> Image:
+        """Stroke position 1, laser off."""
+        return self._image("down_off")
+
+    @property
+    def up_off(self) -> Image:
+        """Stroke position 2, laser off."""
+        return self._image("up_off")
+
+    @property
+    def jpeg(self) -> dict[str, bytes]:
+        """JPEG files by name; empty where the frames are not whole MJPEG frames."""
+        return {name: frame.jpeg for name, frame in self.by_name.items() if frame.jpeg is not None}
+
+    def _image(self, name: str) -> Image:
+        if name not in self.by_name:
+            raise DatasetError(f"'{name}' was not drawn: ask for frames(laser_off=True)")
+        return self.by_name[name].image
+
+
+NO_OTHERS: Mapping[str, tuple[OtherSpot, ...]] = MappingProxyType({})
+
+
+class Pair(Protocol):
+    """What is needed of a sample: see `phibench.datasets.read.Sample`."""
+
+    @property
+    def row(self) -> ManifestRow:
+        """Exact numbers."""
+
+    @property
+    def rig(self) -> Rig:
+        """The rig."""
+
+    @property
+    def laser_spot(self) -> LaserSpot:
+        """The spot."""
+
+    @property
+    def stream_names(self) -> tuple[str, int, str]:
+        """Data set, its seed, sample id."""
+
+    def view(self, position: str) -> View:
+        """Rig at a position."""
+
+    def ambient(self, position: str) -> NDArray[np.float32]:
+        """Ambient layer."""
+
+    def spot(self, position: str) -> SpotWindow:
+        """Spot layer."""
+
+
+@dataclass(frozen=True)
+class Side:
+    """One position: the camera, the light that falls on it, and which pixels are read."""
+
+    chain: Chain
+    light: Light = field(repr=False)
+    region: Region
+
+
+@dataclass(frozen=True)
+class FrameSource:
+    """Draws frames of one stroke pair; holds its layers, so keep it to draw many.
+
+    Examples
+    --------
+    >>> source = sample.region_frames("mjpeg", 64)  # doctest: +SKIP
+    >>> spots = [source.frames(k).down for k in range(10_000)]  # doctest: +SKIP
+
+    Attributes
+    ----------
+    request : FrameRequest
+    names : (data set, seed, sample id)
+    sides : mapping of "down" and "up" to Side
+    """
+
+    request: FrameRequest
+    names: tuple[str, int, str]
+    sides: Mapping[str, Side]
+
+    @classmethod
+    def of(cls, pair: Pair, preset: str = "mjpeg", **options: Any) -> FrameSource:
+        """Read the layers of a sample; options as in `FrameRequest`.
+
+        Raises
+        ------
+        DatasetError
+            If the request cannot be met or a layer cannot be read; in one sentence.
+        """
+        return cls.from_request(pair, FrameRequest.of(preset, options))
+
+    @classmethod
+    def from_request(
+        cls, pair: Pair, request: FrameRequest, others: Mapping[str, tuple[OtherSpot, ...]] = NO_OTHERS
+    ) -> FrameSource:
+        """As `of`, for a request that was checked before; `others` are further lights by position, standing still."""
+        with in_one_sentence():
+            sides = {position: _side(pair, position, request, others.get(position, ())) for position in POSITIONS}
+        return cls(request, pair.stream_names, sides)
+
+    def frames(self, draw: int = 0, *, laser_off: bool = False) -> Frames:
+        """Both positions with the laser on, and, if asked for, both with the laser off."""
+        return Frames.of(
+            [self.frame(p, draw, on) for on in ((True, False) if laser_off else (True,)) for p in POSITIONS]
+        )
+
+    def frame(self, position: str, draw: int = 0, laser: bool = True) -> Frame:
+        """One frame.
+
+        Raises
+        ------
+        DatasetError
+            If the position is not "down" or "up", the draw not an integer from 0 up, or a layer holds no light.
+        """
+        if position not in self.sides:
+            raise DatasetError(f"position '{position}': must be 'down' or 'up'")
+        side, draw = self.sides[position], whole_number("draw", draw)
+        stream = frame_stream(*self.names, position, laser, draw)
+        light, jpeg = side.light if laser else side.light.laser_off(), None
+        with in_one_sentence():
+            if side.chain.sensor.output == "mjpeg" and side.region == Region.whole(light.size):
+                jpeg = side.chain.jpeg_bytes(light, stream)  # encoded once: the image is what is in the file
+                image: NDArray[Any] = decoded(jpeg)
+            else:
+                image = side.chain.frame(light, stream, side.region)
+        return Frame(image, jpeg, position, laser, draw, side.chain.sensor, side.region)
+
+
+def _side(pair: Pair, position: str, request: FrameRequest, others: tuple[OtherSpot, ...]) -> Side:
+    camera = pair.rig.camera
+    spot = pair.spot(position)
+    light = Light(
+        pair.ambient(position),
+        spot,
+        lamp_level=request.lamp_level,
+        laser_level=request.laser_level,
+        f_number=camera.f_number,
+        others=others,
+    )
+    sensor = auto_exposed(request.sensor(), light) if request.exposure == "auto" else request.sensor()
+    moving = _moving(pair, position, spot, sensor, request.carriage_speed_m_s)
+    region = _region(pair.row, position, request.region, light.size)
+    return Side(Chain(sensor, request.camera_seed, camera), replace(light, spot=moving), region)
+
+
+def _moving(pair: Pair, position: str, spot: SpotWindow, sensor: Sensor, speed_m_s: float) -> SpotWindow:
+    """Spot as the rolling shutter sees it; its mean is the same in all draws, so it is moved once."""
+    if speed_m_s == 0.0 or spot.electrons_per_s.size == 0:
+        return spot
+    velocity = spot_velocity_px_per_s(pair.view(position), pair.laser_spot, speed_m_s)
+    height = pair.rig.camera.height_px
+    u0, v0, planes = moved_spot(spot, velocity, sensor.exposure_s, sensor.readout_s, height)
+    nothing = np.zeros_like(planes)
+    return SpotWindow(u0, v0, planes, nothing, nothing)
+
+
+def _region(row: ManifestRow, position: str, wanted: int | Region | None, size: tuple[int, int]) -> Region:
+    if wanted is None:
+        return Region.whole(size)
+    if isinstance(wanted, Region):
+        return wanted.within(size)
+    spot = row.position(position)
+    if not has_place(spot, size):
+        raise DatasetError(
+            f"{row.sample_id} {position}: no image of the spot ({spot.cause}) to put a region of {wanted} px around; "
+            "ask for whole frames or give a Region"
+        )
+    return Region.around(spot.u_px, spot.v_px, size, wanted)
+
+
+def has_place(spot: SpotRow, size: tuple[int, int]) -> bool:
+    """Whether the spot, seen or hidden, has a place on an image of (height, width)."""
+    return -0.5 <= spot.u_px <= size[1] - 0.5 and -0.5 <= spot.v_px <= size[0] - 0.5

@@ -1,0 +1,266 @@
+"""The plan of a data set: which poses, spots and pairs a recipe means. Pure, nothing is rendered or written.
+
+Parts of a data set for job arrays: shard i of n, by position in the recipe, so that nobody has to agree on anything.
+
+A shard owns a contiguous run of samples (neighbours share views) and renders every view that these need; a view that
+two shards need is rendered by both, to the same bytes. A shard is a data set of its own, complete and readable.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+from phibench.datasets.errors import DatasetError, RecipeError
+from phibench.datasets.plan.sampling import RandomSample, draw_rigs, draw_samples
+from phibench.datasets.recipe.build import build_misalignment, build_rig, build_room, build_spot, true_stroke_m
+from phibench.datasets.recipe.tables import RandomTable, Recipe, RigsTable
+from phibench.scenes.laser import LaserSpot
+from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.random_streams import seed_32
+from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
+from phibench.scenes.room import Room
+
+RECIPE_RIG = "rig"
+"""Id of the rig of `[rig]`; a drawn one is called after the first sample that has it, such as ``r000042``, and one that
+no sample has but that an estimator believes in ``n000042``."""
+TRUE_RIG = "true"
+"""Id of the rig of `[rig]` with `[misalignment]`, for experiments."""
+
+
+@dataclass(frozen=True)
+class PosePlan:
+    """One mirror pose: everything a view needs besides rig and room.
+
+    Attributes
+    ----------
+    pose_id : str
+        ``h`` and the carriage offset in metres, such as ``h0.425``; down is ``h0.000``. For any rig but that of
+        `[rig]`, its id and a hyphen come first: ``r000042-h0.425``.
+    offset_m : float
+        Carriage offset along the stroke axis.
+    seed : int
+        32-bit seed of the ambient layer, from the named stream (data set, seed, pose, "ambient").
+    rig : str
+        Id of the rig.
+    """
+
+    pose_id: str
+    offset_m: float
+    seed: int
+    rig: str = RECIPE_RIG
+
+
+@dataclass(frozen=True)
+class PairPlan:
+    """One stroke pair: a spot seen from down and from up.
+
+    Attributes
+    ----------
+    target : str
+        Name of the target, or of what a ray met.
+    stroke_m, nominal_stroke_m : float
+        The true stroke, and the one that an estimator believes.
+    spot : str
+        Key of the spot in `Plan.spots`.
+    rig, nominal_rig : str
+        Id of the true rig, and of the one that an estimator believes.
+    drawn : tuple of (parameter, value)
+        What was drawn; empty for an experiment without drawn rigs.
+    tries : int
+        Which draw was the first possible one; 0 where nothing is drawn.
+    """
+
+    sample_id: str
+    experiment: str
+    target: str
+    stroke_m: float
+    nominal_stroke_m: float
+    spot: str
+    rig: str = RECIPE_RIG
+    nominal_rig: str = RECIPE_RIG
+    drawn: tuple[tuple[str, float | str], ...] = ()
+    tries: int = 0
+
+    def pose_id(self, position: str) -> str:
+        """Id of the pose at a stroke position, "down" or "up"."""
+        return pose_of(self.rig, Stroke(self.stroke_m).offset_m(position))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a recipe means.
+
+    Attributes
+    ----------
+    rig : Rig
+        That of `[rig]`: the light map takes its origin of coordinates from it. A sample's own is in `rigs`.
+    rigs : dict
+        True and nominal rigs of the samples, by id.
+    spots : dict
+        Laser spots of the samples, by `PairPlan.spot`: an experiment's by target, a drawn one by sample.
+    poses : tuple of PosePlan
+        In the order of their offsets, of drawn ones in the order of the samples; pairs of one rig share them.
+    pairs : tuple of PairPlan
+        In the order of the recipe.
+    shard : str or None
+        "i/n" where this is a part of the recipe (`shard.py`).
+    """
+
+    recipe: Recipe
+    rig: Rig
+    rigs: dict[str, Rig]
+    room: Room
+    spots: dict[str, LaserSpot]
+    poses: tuple[PosePlan, ...]
+    pairs: tuple[PairPlan, ...]
+    shard: str | None = None
+
+    def view(self, pair: PairPlan, position: str) -> View:
+        """View of a pair at a stroke position."""
+        return self.rigs[pair.rig].at(Stroke(pair.stroke_m).offset_m(position))
+
+
+def make_plan(recipe: Recipe) -> Plan:
+    """Plan of a recipe.
+
+    Raises
+    ------
+    RecipeError
+        If two strokes differ by less than a nanometre, so that their poses would share a name, or if a sample of
+        `[random]` stays impossible.
+    """
+    rig, room = build_rig(recipe.rig), build_room(recipe.room, recipe.targets)
+    if recipe.random is not None:
+        return _random_plan(recipe, recipe.random, rig, room)
+    if recipe.rigs is not None:
+        return _rigs_plan(recipe, recipe.rigs, rig, room)
+    misalignment = build_misalignment(recipe.misalignment)
+    true_rig = rig.perturbed(misalignment)
+    true_id = RECIPE_RIG if true_rig == rig else TRUE_RIG
+    pairs = _experiment_pairs(recipe, misalignment, true_id)
+    return _experiment_plan(recipe, {RECIPE_RIG: rig, true_id: true_rig}, room, pairs)
+
+
+def _rigs_plan(recipe: Recipe, table: RigsTable, rig: Rig, room: Room) -> Plan:
+    """Every experiment with every drawn rig; samples are called after both."""
+    drawn = draw_rigs(recipe, table, rig, room)
+    pairs = tuple(
+        replace(pair, sample_id=f"{pair.sample_id}-{one.rig_id}", drawn=one.drawn, tries=one.tries)
+        for one in drawn
+        for pair in _experiment_pairs(recipe, one.misalignment, one.rig_id)
+    )
+    return _experiment_plan(recipe, {RECIPE_RIG: rig} | {one.rig_id: one.rig for one in drawn}, room, pairs)
+
+
+def _experiment_pairs(recipe: Recipe, misalignment: Misalignment, rig_id: str) -> tuple[PairPlan, ...]:
+    return tuple(
+        PairPlan(
+            _sample_name(experiment.name, target, stroke_m),
+            experiment.name,
+            target,
+            true_stroke_m(misalignment, float(stroke_m)),
+            float(stroke_m),
+            target,
+            rig_id,
+        )
+        for experiment in recipe.experiments
+        for target in experiment.targets
+        for stroke_m in experiment.strokes_m
+    )
+
+
+def _experiment_plan(recipe: Recipe, rigs: dict[str, Rig], room: Room, pairs: tuple[PairPlan, ...]) -> Plan:
+    """Poses in the order of the rigs, then of their offsets."""
+    used = {pair.target for pair in pairs}
+    spots = {table.name: build_spot(recipe.laser, table) for table in recipe.targets if table.name in used}
+    order = {rig: number for number, rig in enumerate(rigs)}
+    places = sorted(set(_offsets(pairs)), key=lambda place: (order[place[0]], place[1]))
+    return Plan(recipe, rigs[RECIPE_RIG], rigs, room, spots, _poses(recipe, places), pairs)
+
+
+def pose_name(offset_m: float) -> str:
+    """Name of an offset in metres, to the nanometre, at least three decimals."""
+    whole, decimals = f"{offset_m:.9f}".split(".")
+    return f"h{whole}.{decimals.rstrip('0').ljust(3, '0')}"
+
+
+def pose_of(rig: str, offset_m: float) -> str:
+    """Id of the pose of a rig at an offset."""
+    return pose_name(offset_m) if rig == RECIPE_RIG else f"{rig}-{pose_name(offset_m)}"
+
+
+def _random_plan(recipe: Recipe, table: RandomTable, rig: Rig, room: Room) -> Plan:
+    """Equal rigs share an id, and so their views; the first sample that has one names it, so that more change none."""
+    samples = draw_samples(recipe, table, room)
+    ids = {rig: RECIPE_RIG}
+    for sample in samples:
+        ids.setdefault(sample.rig, f"r{sample.number:06d}")
+        ids.setdefault(sample.nominal_rig, f"n{sample.number:06d}")
+    pairs = tuple(_random_pair(sample, ids[sample.rig], ids[sample.nominal_rig]) for sample in samples)
+    used = {name for pair in pairs for name in (pair.rig, pair.nominal_rig)}
+    rigs = {name: one for one, name in ids.items() if name in used}
+    spots = {pair.spot: sample.spot for pair, sample in zip(pairs, samples, strict=True)}
+    return Plan(recipe, rig, rigs, room, spots, _poses(recipe, dict.fromkeys(_offsets(pairs))), pairs)
+
+
+def _random_pair(sample: RandomSample, rig: str, nominal_rig: str) -> PairPlan:
+    name, strokes_m = f"random-{sample.number:06d}", (sample.stroke_m, sample.nominal_stroke_m)
+    return PairPlan(name, "random", sample.surface, *strokes_m, name, rig, nominal_rig, sample.drawn, sample.tries)
+
+
+def _sample_name(experiment: str, target: str, stroke_m: float) -> str:
+    """Neither names nor numbers contain a hyphen, so that no two samples share a name."""
+    return f"{experiment}-{target}-{pose_name(stroke_m)}"
+
+
+def _offsets(pairs: Sequence[PairPlan]) -> list[tuple[str, float]]:
+    """Rig and offset of every view of every pair."""
+    return [(pair.rig, Stroke(pair.stroke_m).offset_m(position)) for pair in pairs for position in POSITIONS]
+
+
+def _poses(recipe: Recipe, places: Iterable[tuple[str, float]]) -> tuple[PosePlan, ...]:
+    poses = [(pose_of(*place), *place) for place in places]
+    if twice := [name for name, count in Counter(pose[0] for pose in poses).items() if count > 1]:
+        raise RecipeError(f"experiments: two strokes near {twice[0][1:]} m differ by less than 1 nm; make them equal")
+    dataset = recipe.dataset
+    return tuple(
+        PosePlan(name, offset_m, seed_32(dataset.name, dataset.seed, name, "ambient"), rig)
+        for name, rig, offset_m in poses
+    )
+
+
+def shard_plan(plan: Plan, shard: str | None) -> Plan:
+    """Plan of one shard, "i/n" with i from 1 to n; None is the whole.
+
+    Raises
+    ------
+    DatasetError
+        If that is no shard, or has no sample.
+    """
+    if shard is None:
+        return plan
+    i, n = parse_shard(shard)
+    first, end = (k * len(plan.pairs) // n for k in (i - 1, i))
+    if first == end:
+        raise DatasetError(f"shard {shard} is empty: there are {len(plan.pairs)} samples; use at most as many shards")
+    pairs = plan.pairs[first:end]
+    poses, spots = {pair.pose_id(p) for pair in pairs for p in POSITIONS}, {pair.spot for pair in pairs}
+    rigs = {name for pair in pairs for name in (pair.rig, pair.nominal_rig)}
+    return replace(
+        plan,
+        rigs={name: rig for name, rig in plan.rigs.items() if name in rigs},
+        spots={name: spot for name, spot in plan.spots.items() if name in spots},
+        poses=tuple(pose for pose in plan.poses if pose.pose_id in poses),
+        pairs=pairs,
+        shard=f"{i}/{n}",
+    )
+
+
+def parse_shard(shard: str) -> tuple[int, int]:
+    """Return i and n of "i/n"."""
+    i, slash, n = shard.partition("/")
+    if not (slash and i.isdecimal() and n.isdecimal() and 1 <= int(i) <= int(n)):
+        raise DatasetError(f"shard '{shard}': must be i/n with i from 1 to n, such as 1/4")
+    return int(i), int(n)

@@ -1,0 +1,337 @@
+"""Which part of the probability each parameter of each drawn sample takes: numbers in [0, 1).
+
+The number of sample i for parameter p is a function of (data set, seed, sequence, p, i) and of nothing else: neither of
+how many samples there are nor of which other parameters are drawn. A sample that turns out to be impossible is tried
+again with numbers of its own streams, so that no other sample moves.
+
+The samples of `[random]`: a rig, a spot and a stroke for each.
+
+Sample i is a function of the recipe without its number of samples, and of i. Where rig, spot and stroke do not go
+together (or with the room), the sample is drawn again from streams of its own (`sampling.further_points`).
+
+The rigs of `[rigs]`: misalignments that are drawn once per rig, and seen by all experiments.
+
+Rig k is a function of the recipe's seed and distributions, and of k: more rigs change none. A rig that is impossible,
+or cannot make one of the strokes, is drawn again from streams of its own (`sampling.further_points`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from phibench.datasets.errors import RecipeError
+from phibench.datasets.recipe.build import build_misalignment, build_rig, build_target, ceiling_m, true_stroke_m
+from phibench.datasets.recipe.distributions import DistributionTable, pick, quantile
+from phibench.datasets.recipe.spot_placement import Boards, Placed, place
+from phibench.datasets.recipe.tables import DRAWABLE, MisalignmentTable, RandomTable, Recipe, RigsTable, RigTable
+from phibench.scenes.frames import Array
+from phibench.scenes.laser import LaserSpot
+from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
+from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.random_streams import generator
+from phibench.scenes.rig import Rig
+from phibench.scenes.room import Room
+from phibench.scenes.validation import SceneError
+
+Sequence = Literal["sobol", "independent"]
+
+_OFTEN = (
+    *("stroke_m", "spot.target", "spot.across_m", "spot.up_m", "rig.z_c_m", "rig.fx_px", "rig.cx_px", "rig.cy_px"),
+    *("rig.radius_m", "rig.decentre_x_m", "rig.decentre_y_m", "rig.tilt_x_rad", "rig.tilt_y_rad"),
+    *("rig.stroke_tilt_x_rad", "rig.stroke_tilt_y_rad", "rig.blur_sigma_px", "spot.azimuth_deg", "spot.height_m"),
+)
+PARAMETERS = (
+    *_OFTEN,
+    *(name for key in DRAWABLE if (name := f"rig.{key}") not in _OFTEN),
+    *(f"misalignment.{key}" for key in MISALIGNMENT),
+)
+"""Everything that can be drawn; the place in this list is the dimension in Sobol's sequence, whose first ones are the
+best: 16 of them correlate by at most 0.25 at 100 samples, where independent ones reach 0.38 (12 seeds each)."""
+
+
+def first_points(
+    sequence: Sequence, dataset: str, seed: int, count: int, names: Iterable[str] = PARAMETERS
+) -> dict[str, Array]:
+    """Numbers of the first try of samples 0 to `count` - 1, shape (count,), for some parameters.
+
+    "sobol": Sobol's points, each dimension scrambled by the parameter's own stream (Matousek, J. Complexity 14, 527,
+    1998), so that longer sequences begin with the shorter ones. Shifts modulo 1 do the same, but leave twice the
+    correlation between dimensions at some hundred samples.
+    "independent": the parameter's own stream.
+    """
+    streams = {name: generator(dataset, seed, "random", sequence, name) for name in names}
+    if sequence == "independent":
+        return {name: stream.random(count) for name, stream in streams.items()}
+    from scipy.stats import qmc  # takes a second, and recipes without `[random]` need none
+
+    power = max(count - 1, 0).bit_length()  # scipy warns about numbers that are no power of two
+    sequences = (qmc.Sobol(PARAMETERS.index(name) + 1, rng=stream) for name, stream in streams.items())
+    return {name: one.random_base2(power)[:count, -1] for name, one in zip(streams, sequences, strict=True)}
+
+
+def further_points(
+    dataset: str, seed: int, names: Iterable[str], numbers: Iterable[int], attempt: int
+) -> dict[str, Array]:
+    """Numbers of a later try, 1 and up, of some samples for some parameters: independent, whatever the sequence."""
+
+    def one(name: str, number: int) -> float:
+        return float(generator(dataset, seed, "random", name, number, attempt).random())
+
+    return {name: np.array([one(name, i) for i in numbers]) for name in names}
+
+
+TRIES = 100
+_PILOT = 8  # samples
+_NANOMETRE = 9  # decimals of a stroke: a pose's name then says its offset exactly
+
+_PREFIX = "misalignment."
+
+Value = float | str
+
+
+@dataclass(frozen=True)
+class RandomSample:
+    """A drawn sample.
+
+    Attributes
+    ----------
+    number : int
+        Place in the sequence, from 0.
+    tries : int
+        Which draw was the first possible one; 1 is the sequence's own.
+    drawn : tuple of (parameter, value)
+        In the order of `sampling.PARAMETERS`.
+    surface : str
+        Name of the target, or of what carries the spot.
+    rig, stroke_m
+        The true ones.
+    nominal_rig, nominal_stroke_m
+        Those that an estimator believes.
+    """
+
+    number: int
+    tries: int
+    drawn: tuple[tuple[str, Value], ...]
+    rig: Rig
+    surface: str
+    spot: LaserSpot
+    stroke_m: float
+    nominal_rig: Rig
+    nominal_stroke_m: float
+
+
+def draw_samples(recipe: Recipe, table: RandomTable, room: Room) -> tuple[RandomSample, ...]:
+    """All samples of a recipe with `[random]`.
+
+    Raises
+    ------
+    RecipeError
+        If a sample stays impossible after `TRIES` draws, with the reason of the last one.
+    """
+    makers = _Makers(recipe, table, room)
+    pilot = min(_PILOT, table.samples)  # whether the recipe is possible at all is known after a few
+    return (*makers.draw(range(pilot)), *makers.draw(range(pilot, table.samples)))
+
+
+def rig_table(table: RigTable, values: Mapping[str, Value]) -> RigTable:
+    """`[rig]` with drawn numbers, by parameter; a drawn `fx_px` is `fy_px` as well where nothing else gives it."""
+    drawn = {key.removeprefix("rig."): value for key, value in values.items() if key.startswith("rig.")}
+    if "fx_px" in drawn and table.fy_px is None:
+        drawn.setdefault("fy_px", drawn["fx_px"])
+    return table.model_copy(update=drawn)
+
+
+def drawn_misalignment(table: MisalignmentTable, values: Mapping[str, Value]) -> Misalignment:
+    """Misalignment with drawn numbers, by parameter, in place of those of `[misalignment]`."""
+    drawn = {key.removeprefix(_PREFIX): value for key, value in values.items() if key.startswith(_PREFIX)}
+    return build_misalignment(table.model_copy(update=drawn))
+
+
+class _Makers:
+    """What all draws of a recipe share."""
+
+    def __init__(self, recipe: Recipe, table: RandomTable, room: Room) -> None:
+        self._recipe, self._table, self._room = recipe, table, room
+        self._targets = {target.name: target for target in recipe.targets}
+        self._boards = Boards([build_target(target) for target in recipe.targets])
+        self._ceiling_m = ceiling_m(room)
+        dataset = recipe.dataset
+        self._first = first_points(table.sequence, dataset.name, dataset.seed, table.samples, drawn_parameters(table))
+
+    def draw(self, numbers: range) -> list[RandomSample]:
+        """Draw some samples, those that are impossible again until they are not."""
+        found: dict[int, RandomSample] = {}
+        left = list(numbers)
+        for attempt in range(TRIES):
+            outcomes = self._once(left, attempt)
+            found |= {number: sample for number, sample in outcomes.items() if isinstance(sample, RandomSample)}
+            left = [number for number in left if number not in found]
+            if not left:
+                return [found[number] for number in numbers]
+        text = f"sample {left[0]} has no possible rig, spot and stroke in {TRIES} draws; the last: {outcomes[left[0]]}"
+        raise RecipeError(f"random: {text}; narrow the distributions or move the boards")
+
+    def _once(self, numbers: list[int], attempt: int) -> dict[int, RandomSample | str]:
+        """Draw some samples once; the reason instead of a sample that is impossible."""
+        values = draw_values(self._table, list(self._targets), self._points(numbers, attempt))
+        spots = place(self._recipe.laser, self._room, self._targets, values)
+        rows = [tuple((name, _plain(column[k])) for name, column in values.items()) for k in range(len(numbers))]
+        return {
+            number: self._sample(number, attempt + 1, drawn, spot)
+            for number, drawn, spot in zip(numbers, rows, spots, strict=True)
+        }
+
+    def _points(self, numbers: list[int], attempt: int) -> dict[str, Array]:
+        drawn = drawn_parameters(self._table)
+        if attempt == 0:
+            return {name: self._first[name][numbers] for name in drawn}
+        dataset = self._recipe.dataset
+        return further_points(dataset.name, dataset.seed, drawn, numbers, attempt)
+
+    def _sample(
+        self, number: int, tries: int, drawn: tuple[tuple[str, Value], ...], placed: Placed
+    ) -> RandomSample | str:
+        if isinstance(placed, str):
+            return placed
+        values = dict(drawn)
+        nominal_stroke_m = float(values["stroke_m"])
+        try:
+            nominal_rig = build_rig(rig_table(self._recipe.rig, values))
+            misalignment = drawn_misalignment(self._recipe.misalignment, values)
+            rig, stroke_m = nominal_rig.perturbed(misalignment), true_stroke_m(misalignment, nominal_stroke_m)
+        except SceneError as error:
+            return str(error)
+        if fault := rig_fault(rig, stroke_m, self._ceiling_m, self._boards):
+            return fault
+        return RandomSample(number, tries, drawn, rig, *placed, stroke_m, nominal_rig, nominal_stroke_m)
+
+
+def rig_fault(rig: Rig, stroke_m: float, ceiling_m: float, boards: Boards) -> str | None:
+    """Why a rig cannot make a stroke in its room: the ceiling's lamps or a board are in the way; None if it can."""
+    if not rig.in_image():
+        return "the mirror is outside of the image"
+    sphere_m = rig.T_world_camera.points(rig.sphere_in_camera_m)  # `rig.at` takes ten times as long
+    if rig.motion is None:
+        top_m = sphere_m[2] + stroke_m * rig.stroke_axis_world[2] + rig.mirror.bound_m
+    else:
+        top_m = rig.at(stroke_m).sphere_centre_m[2] + rig.mirror.bound_m
+    if top_m >= ceiling_m:
+        return f"the mirror's top at {top_m:.3f} m is above the ceiling's lamps at {ceiling_m:.2f} m"
+    return boards.cut_by(rig, stroke_m)
+
+
+def drawn_parameters(table: RandomTable) -> list[str]:
+    """What a recipe draws, in the order of `sampling.PARAMETERS`."""
+    chosen = dict(_sample_distributions(table))
+    return [name for name in PARAMETERS if name in chosen or (name == "spot.target" and not table.spot.by_ray)]
+
+
+def draw_values(table: RandomTable, targets: list[str], points: Mapping[str, Array]) -> dict[str, Any]:
+    """Values of all samples by parameter, for the points in [0, 1) of each."""
+    chosen = dict(_sample_distributions(table))
+    values: dict[str, Any] = {name: quantile(chosen[name], u) for name, u in points.items() if name in chosen}
+    values["stroke_m"] = np.round(values["stroke_m"], _NANOMETRE)
+    if "spot.target" in points:
+        names = targets if table.spot.target is None else table.spot.target.choice
+        values["spot.target"] = pick(names, points["spot.target"])
+    return {name: values[name] for name in points}
+
+
+def _sample_distributions(table: RandomTable) -> Iterator[tuple[str, DistributionTable]]:
+    """Parameter and distribution of every number that is drawn."""
+    yield "stroke_m", table.stroke_m
+    for prefix, group in (("rig", table.rig), ("spot", table.spot), ("misalignment", table.misalignment)):
+        for key in type(group).model_fields:
+            if isinstance(value := getattr(group, key), DistributionTable):
+                yield f"{prefix}.{key}", value
+
+
+def _plain(value: Any) -> Value:
+    return value if isinstance(value, str) else float(value)
+
+
+@dataclass(frozen=True)
+class DrawnRig:
+    """A drawn rig.
+
+    Attributes
+    ----------
+    rig_id : str
+        Such as ``r000002``, the third one.
+    tries : int
+        Which draw was the first possible one.
+    drawn : tuple of (parameter, value)
+        Parameters as in `sampling.PARAMETERS`.
+    misalignment : Misalignment
+    rig : Rig, the true one
+    """
+
+    rig_id: str
+    tries: int
+    drawn: tuple[tuple[str, Value], ...]
+    misalignment: Misalignment
+    rig: Rig
+
+
+def draw_rigs(recipe: Recipe, table: RigsTable, nominal: Rig, room: Room) -> tuple[DrawnRig, ...]:
+    """All rigs of a recipe with `[rigs]`.
+
+    Raises
+    ------
+    RecipeError
+        If a rig stays impossible after `TRIES` draws, with the reason of the last one.
+    """
+    chosen = _rig_distributions(table)
+    first = first_points("independent", recipe.dataset.name, recipe.dataset.seed, table.count, chosen)
+    values = {name: quantile(chosen[name], u) for name, u in first.items()}
+    top_m, boards = ceiling_m(room), Boards([build_target(target) for target in recipe.targets])
+    return tuple(_possible(recipe, chosen, _row(values, k), k, nominal, top_m, boards) for k in range(table.count))
+
+
+def _possible(
+    recipe: Recipe,
+    chosen: Mapping[str, DistributionTable],
+    drawn: dict[str, Value],
+    number: int,
+    nominal: Rig,
+    top_m: float,
+    boards: Boards,
+) -> DrawnRig:
+    for attempt in range(TRIES):
+        if attempt:
+            points = further_points(recipe.dataset.name, recipe.dataset.seed, chosen, [number], attempt)
+            drawn = _row({name: quantile(chosen[name], u) for name, u in points.items()}, 0)
+        made = _made(recipe, drawn, number, attempt + 1, nominal, top_m, boards)
+        if isinstance(made, DrawnRig):
+            return made
+    text = f"rig {number} stays impossible in {TRIES} draws; the last: {made}"
+    raise RecipeError(f"rigs: {text}; narrow the distributions, move the boards or shorten the strokes")
+
+
+def _made(
+    recipe: Recipe, drawn: dict[str, Value], number: int, tries: int, nominal: Rig, top_m: float, boards: Boards
+) -> DrawnRig | str:
+    """The rig, or why it is impossible."""
+    try:
+        misalignment = drawn_misalignment(recipe.misalignment, drawn)
+        rig = nominal.perturbed(misalignment)
+        strokes_m = {true_stroke_m(misalignment, h) for one in recipe.experiments for h in one.strokes_m}
+    except SceneError as error:
+        return str(error)
+    faults = (rig_fault(rig, stroke_m, top_m, boards) for stroke_m in sorted(strokes_m))
+    why = next((fault for fault in faults if fault), None)
+    return why or DrawnRig(f"r{number:06d}", tries, tuple(drawn.items()), misalignment, rig)
+
+
+def _rig_distributions(table: RigsTable) -> dict[str, DistributionTable]:
+    """Distribution by parameter, in the order of `[misalignment]`."""
+    given = ((key, getattr(table.misalignment, key)) for key in type(table.misalignment).model_fields)
+    return {_PREFIX + key: one for key, one in given if isinstance(one, DistributionTable)}
+
+
+def _row(values: Mapping[str, Array], k: int) -> dict[str, Value]:
+    return {name: float(np.asarray(column)[k]) for name, column in values.items()}

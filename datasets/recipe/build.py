@@ -1,0 +1,162 @@
+"""From the tables of a recipe to the descriptions of `scenes`.
+
+A rig that is in the ceiling before it makes a stroke: the fault of its height, not of the strokes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from phibench.datasets.recipe.tables import (
+    MIN_STROKE_M,
+    LaserTable,
+    MisalignmentTable,
+    Recipe,
+    RigTable,
+    RoomTable,
+    TargetTable,
+)
+from phibench.scenes.camera import Camera
+from phibench.scenes.catalog import RIGS, ROOMS, Target
+from phibench.scenes.frames import Pose, Vector, as_vector, rotation_xyz
+from phibench.scenes.laser import LaserSpot
+from phibench.scenes.mirror import SphereMirror
+from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.rig import Rig
+from phibench.scenes.room import Room
+from phibench.scenes.validation import Fault, SceneError
+
+CAMERA_KEYS = (
+    *("width_px", "height_px", "pixel_pitch_um", "fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "p1", "p2"),
+    *("f_number", "focus_distance_m", "blur_sigma_px"),
+)
+
+_NANOMETRE = 9  # decimals
+
+
+def build_rig(table: RigTable) -> Rig:
+    """Rig of a recipe; raises `SceneError` where the numbers do not go together."""
+    base = RIGS[table.preset]()
+    mirror = replace(base.mirror, **_given(table, ("radius_m", "roughness_alpha")))
+    z_c_m = base.sphere_in_camera_m[2] if table.z_c_m is None else table.z_c_m
+    height_m = base.T_world_camera.t[2] if table.camera_height_m is None else table.camera_height_m
+    T_world_camera = Pose("world", "camera", (0.0, 0.0, height_m), rotation_xyz(table.tilt_x_rad, table.tilt_y_rad))
+    sphere_from_camera = np.array([table.decentre_x_m, table.decentre_y_m, z_c_m])  # world axes
+    T_camera_sphere = Pose("camera", "sphere", as_vector(T_world_camera.R.T @ sphere_from_camera))
+    before_m = min(T_camera_sphere.translation_m[2], float(np.linalg.norm(sphere_from_camera)))
+    if before_m <= mirror.radius_m:
+        raise SceneError(
+            f"z_c_m = {z_c_m:g} with radius_m = {mirror.radius_m:g}: the sphere centre is {before_m:.4f} m in front of "
+            f"the lens, which is inside the sphere; give a z_c_m above the mirror radius or a smaller radius_m"
+        )
+    stroke = np.array(rotation_xyz(table.stroke_tilt_x_rad, table.stroke_tilt_y_rad)) @ np.array([0.0, 0.0, 1.0])
+    camera = _camera(base.camera, table, z_c_m, mirror)
+    return Rig(camera, mirror, T_world_camera, T_camera_sphere, as_vector(stroke))
+
+
+def build_misalignment(table: MisalignmentTable) -> Misalignment:
+    """Deviations of the true rig from the nominal one."""
+    return Misalignment(**table.model_dump())
+
+
+def build_true_rig(recipe: Recipe) -> Rig:
+    """True rig of a recipe without drawn numbers; raises `SceneError` as `build_rig`."""
+    return build_rig(recipe.rig).perturbed(build_misalignment(recipe.misalignment))
+
+
+def true_stroke_m(misalignment: Misalignment, nominal_stroke_m: float) -> float:
+    """True stroke, to the nanometre where it is not the nominal one: a pose's name then says its offset exactly.
+
+    Raises
+    ------
+    SceneError
+        If it is not above 0.
+    """
+    true_m = misalignment.stroke_m(nominal_stroke_m)
+    return true_m if true_m == nominal_stroke_m else round(true_m, _NANOMETRE)
+
+
+def build_target(table: TargetTable) -> Target:
+    """Target board of a recipe."""
+    return Target(table.name, table.depth_m, float(np.radians(table.azimuth_deg)), table.height_m)
+
+
+def build_room(table: RoomTable, targets: Iterable[TargetTable]) -> Room:
+    """Room of a recipe with its target boards."""
+    return ROOMS[table.name]([build_target(target) for target in targets])
+
+
+def build_spot(laser: LaserTable, target: TargetTable) -> LaserSpot:
+    """Laser spot at the centre of a target board."""
+    board = build_target(target)
+    diameter_m = grown_diameter_m(laser, target.depth_m) if target.diameter_m is None else target.diameter_m
+    return make_spot(laser, board.position_world_m, board.normal_world, diameter_m)
+
+
+def grown_diameter_m(laser: LaserTable, depth_m: float) -> float:
+    """Diameter of a spot at a distance from the axis, unless its target says otherwise."""
+    growing = laser.diameter_base_m + laser.diameter_growth_m_per_m * depth_m
+    return growing if laser.diameter_m is None else laser.diameter_m
+
+
+def make_spot(laser: LaserTable, position_world_m: Vector, normal_world: Vector, diameter_m: float) -> LaserSpot:
+    """Spot of the recipe's laser somewhere."""
+    return LaserSpot(
+        position_world_m=position_world_m,
+        normal_world=normal_world,
+        diameter_m=diameter_m,
+        albedo=laser.albedo,
+        power_w=laser.power_w,
+        wavelength_nm=laser.wavelength_nm,
+        profile=laser.profile,
+    )
+
+
+def ceiling_m(room: Room) -> float:
+    """Height of the lowest thing that hangs from the ceiling: the lamps."""
+    places = (surface.T_world_shape for surface in room.surfaces)
+    return min(place.translation_m[2] for place in places if place.R[2, 2] < -0.5)  # those that face down
+
+
+def _given(table: RigTable, keys: Iterable[str]) -> dict[str, Any]:
+    """Those keys of the rig's table that the recipe sets."""
+    return {key: value for key in keys if (value := getattr(table, key)) is not None}
+
+
+def _camera(base: Camera, table: RigTable, z_c_m: float, mirror: SphereMirror) -> Camera:
+    """Camera with the recipe's numbers; focus and principal point follow what they depend on unless they are set."""
+    implied: dict[str, Any] = {}
+    if table.z_c_m is not None or table.radius_m is not None:
+        implied["focus_distance_m"] = z_c_m - mirror.radius_m / 2.0  # on the virtual image
+    if table.width_px is not None:
+        implied["cx_px"] = (table.width_px - 1) / 2.0
+    if table.height_px is not None:
+        implied["cy_px"] = (table.height_px - 1) / 2.0
+    if table.laser_filter_response is not None:
+        implied["detector"] = replace(base.detector, laser_filter_response=table.laser_filter_response)
+    return replace(base, **{**implied, **_given(table, CAMERA_KEYS)})
+
+
+def height_faults(raw: dict[str, Any]) -> list[Fault]:
+    """Fault of a rig that leaves no room for the shortest stroke; none if rig or room are faulty themselves."""
+    try:
+        table = RigTable.model_validate(raw.get("rig", {}))
+        room = build_room(RoomTable.model_validate(raw.get("room", {})), ())
+        rig = build_rig(table)
+    except (ValidationError, SceneError):
+        return []
+    limit_m = ceiling_m(room)
+    top_m = rig.at(MIN_STROKE_M).sphere_centre_m[2] + rig.mirror.radius_m
+    if top_m < limit_m:
+        return []
+    key = "z_c_m" if table.camera_height_m is None else "camera_height_m"
+    value = getattr(table, key)
+    if value is None:
+        key, value = "radius_m", rig.mirror.radius_m
+    text = f"{value} puts the mirror's top at {top_m:.3f} m when it is down, through the ceiling at {limit_m:.2f} m"
+    return [Fault(f"rig.{key}", f"{text}; give less than {value - (top_m - limit_m):.3f}")]

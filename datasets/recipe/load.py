@@ -1,0 +1,137 @@
+"""Reading recipe files.
+
+The text of a recipe with other numbers in it: the file that a data set keeps must say what it was made from.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from phibench.datasets.errors import RecipeError
+from phibench.datasets.recipe.build import height_faults
+from phibench.datasets.recipe.checks import semantic_faults
+from phibench.datasets.recipe.tables import Recipe
+from phibench.scenes.validation import nearest, structural_faults
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+
+
+def find_recipe(name: str | Path) -> Path:
+    """Path of a recipe: a file, or the name of one that is shipped (such as ``paper``)."""
+    path, shipped = Path(name), RECIPES / f"{name}.toml"
+    if path.is_file() or not shipped.is_file():
+        return path
+    return shipped
+
+
+def load_recipe(path: str | Path) -> Recipe:
+    """Read and check a recipe.
+
+    Raises
+    ------
+    RecipeError
+        With one line per fault, all of them.
+    """
+    return parse_recipe(recipe_text(path), str(find_recipe(path)))
+
+
+def recipe_text(path: str | Path) -> str:
+    """TOML text of a recipe, by file or by name.
+
+    Raises
+    ------
+    RecipeError
+        If there is no such file, or it cannot be read; in one sentence.
+    """
+    return _text(find_recipe(path))
+
+
+def parse_recipe(text: str, source: str = "recipe") -> Recipe:
+    """Check the TOML text of a recipe; `source` is what the error calls it."""
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise RecipeError(f"{source} is not valid TOML: {error}") from error
+    return check_recipe(raw, source)
+
+
+def check_recipe(raw: dict[str, Any], source: str = "recipe") -> Recipe:
+    """Check a recipe that is a dict already."""
+    height = height_faults(raw)
+    found = [*height, *semantic_faults(_judgeable(raw, strokes=not height))]
+    explained = {fault.path for fault in found}  # better than that the key is unknown
+    faults = [*(f for f in structural_faults(Recipe, raw) if not (f.unknown and f.path in explained)), *found]
+    if faults:
+        count = f"{len(faults)} fault" + "s" * (len(faults) > 1)
+        raise RecipeError("\n".join([f"{source} has {count}:", *(f"  {fault}" for fault in faults)]))
+    return Recipe.model_validate(raw)
+
+
+def _judgeable(raw: dict[str, Any], strokes: bool) -> dict[str, Any]:
+    """Recipe without the keys about which only faults that follow from others could be found.
+
+    Experiments cannot name targets that have no names, and no stroke is short enough for a rig in the ceiling.
+    """
+    entries, targets = raw.get("experiments"), raw.get("targets")
+    if not isinstance(entries, list):
+        return raw
+    named = isinstance(targets, list) and all(isinstance(t, dict) and isinstance(t.get("name"), str) for t in targets)
+    dropped = {key for key, kept in (("targets", named), ("strokes_m", strokes)) if not kept}
+    kept = [{k: v for k, v in e.items() if k not in dropped} if isinstance(e, dict) else e for e in entries]
+    return {**raw, "experiments": kept}
+
+
+def _text(path: Path) -> str:
+    if path.is_dir():
+        raise RecipeError(f"{path} is a folder; give a TOML file")
+    if not path.is_file():
+        shipped = nearest(path.name, sorted(file.stem for file in RECIPES.glob("*.toml")))
+        raise RecipeError(f"there is no recipe {path}; give a TOML file or the name of a shipped recipe ({shipped})")
+    try:
+        return path.read_text(encoding="utf-8-sig")  # some editors put a byte order mark first
+    except UnicodeDecodeError as error:
+        raise RecipeError(f"{path} cannot be read: byte {error.start} is not UTF-8; save it as UTF-8") from error
+    except OSError as error:
+        raise RecipeError(f"{path} cannot be read: {error.strerror or error}") from error
+
+
+def with_numbers(text: str, source: str, samples: int | None, seed: int | None) -> str:
+    """TOML text with another `[random].samples` and `[dataset].seed`; None leaves a number as it is.
+
+    Raises
+    ------
+    RecipeError
+        If the recipe is faulty, has no `[random]` to take samples from, or does not have its tables as tables.
+    """
+    if samples is not None:
+        if parse_recipe(text, source).random is None:
+            raise RecipeError(
+                f"--samples {samples}: {source} draws nothing, it has no [random]; leave --samples out or give a "
+                "recipe that draws its samples, such as bench-dev"
+            )
+        text = _replaced(text, "random", "samples", samples)
+    if seed is not None:
+        text = _replaced(text, "dataset", "seed", seed)
+    recipe = parse_recipe(text, source)
+    held = (None if recipe.random is None else recipe.random.samples, recipe.dataset.seed)
+    if (samples is not None and held[0] != samples) or (seed is not None and held[1] != seed):
+        raise RecipeError(f"{source}: --samples and --seed need [dataset] and [random] as tables with headings of [ ]")
+    return text
+
+
+def _replaced(text: str, table: str, key: str, value: int) -> str:
+    """Text with `key = value` in `[table]`; a comment behind the old number stays."""
+    head = re.search(rf"^[ \t]*\[[ \t]*{table}[ \t]*\].*$", text, re.MULTILINE)
+    if head is None:
+        return text
+    following = re.search(r"^[ \t]*\[", text[head.end() :], re.MULTILINE)
+    end = len(text) if following is None else head.end() + following.start()
+    body, count = re.subn(
+        rf"^([ \t]*{key}[ \t]*=[ \t]*)[^\s#]+", rf"\g<1>{value}", text[head.end() : end], count=1, flags=re.MULTILINE
+    )
+    if not count:
+        body = f"\n{key} = {value}{body}"
+    return text[: head.end()] + body + text[end:]

@@ -1,0 +1,319 @@
+"""The part of a recipe that is not rendered: how frames of a benchmark are taken, and lights that mislead.
+
+`[misalignment]` and `[random.misalignment]`: the deviations of the true rig, with names and ranges of `scenes`.
+
+Recipes: what a data set is made of, as strict tables that TOML files fill.
+
+Lengths in metres, angles in radians unless the key says degrees. Every key says its unit. `load_recipe` reports all
+faults of a file in one go (`render/model_faults`, `recipe_checks`).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Field, create_model
+
+from phibench.datasets.recipe.distributions import Distribution, DistributionTable, Name, Table, Targets
+from phibench.scenes.misalignment import PARAMETERS
+
+Preset = Literal["mono-raw", "bayer-raw", "srgb8", "mjpeg"]
+Probability = Annotated[float, Field(ge=0.0, le=1.0)]
+LEVELS = ("laser_level", "lamp_level")
+SENSOR_KEYS = ("jpeg_quality", "sharpen_amount", "analogue_gain", "read_noise_e", "prnu")
+"""Keys of `[frames]` that are numbers of the sensor's preset."""
+
+_ONE = DistributionTable(choice=(1.0,))
+_HALF = DistributionTable(log_uniform=(0.05, 0.5))
+
+
+class FramesTable(Table):
+    """`[frames]`: how frames are taken; every number is drawn per sample and is the same in all presets."""
+
+    presets: Annotated[tuple[Preset, ...], Field(strict=False, min_length=1)] = Field(
+        default=("bayer-raw",), description="sensor presets; every sample is taken in each"
+    )
+    draws: int = Field(default=1, ge=1, le=10_000, description="draws of the noise, per sample and preset")
+    exposure_s: Distribution | Literal["auto"] | None = Field(
+        default=None, description="exposure time; 'auto' is the camera's for the down image, kept for the others"
+    )
+    laser_level: Distribution = Field(default=_ONE, description="factor of the laser's light")
+    lamp_level: Distribution = Field(default=_ONE, description="factor of the room's light")
+    jpeg_quality: Distribution | None = Field(default=None, description="libjpeg's quality; whole numbers")
+    sharpen_amount: Distribution | None = Field(default=None, description="gain of the unsharp mask")
+    analogue_gain: Distribution | None = Field(default=None, description="gain before the converter")
+    read_noise_e: Distribution | None = Field(default=None, description="read noise, rms electrons per pixel")
+    prnu: Distribution | None = Field(default=None, description="relative spread of the pixels' responsivity")
+    laser_off: bool = Field(default=True, description="whether frames with the laser off are given too")
+    hint: Probability = Field(default=0.0, description="probability that a pair comes with boxes that hold its spots")
+    hint_box_px: int = Field(default=64, ge=16, le=8192, description="side of such a box")
+    camera: Literal["per_sample", "one"] = Field(
+        default="per_sample", description="whether each sample has a camera, hence a fixed pattern, of its own"
+    )
+
+
+class DistractorTable(Table):
+    """`[[distractors]]`: another light; on a board, where a ray ends, or free in the room."""
+
+    kind: Literal["spot", "glow", "led"] = Field(
+        description="'spot' a reflection of the laser, 'glow' the laser itself, 'led' a lamp that stays on"
+    )
+    probability: Probability = Field(default=1.0, description="part of the samples that have it")
+    flux_ratio: Distribution = Field(
+        default=_HALF, description="its electrons relative to the spot's, in the image where that is more"
+    )
+    diameter_m: Distribution = Field(default=DistributionTable(choice=(0.005,)), description="diameter of the disc")
+    target: Targets = Field(default=None, description="boards; all but the sample's own where no place is given")
+    azimuth_deg: Distribution | None = Field(
+        default=None, description="of a horizontal ray from the world's z axis, from x towards y; instead of a board"
+    )
+    height_m: Distribution | None = Field(default=None, description="of the ray above the floor; with azimuth_deg")
+    distance_m: Distribution | None = Field(
+        default=None, description="along the ray to a disc that hangs free; where the ray ends if not given"
+    )
+
+    @property
+    def follows_laser(self) -> bool:
+        """Whether it goes out with the laser."""
+        return self.kind != "led"
+
+
+if TYPE_CHECKING:
+    MisalignmentTable = Table
+    RandomMisalignmentTable = Table
+else:
+    MisalignmentTable = create_model(
+        "MisalignmentTable",
+        __base__=Table,
+        __doc__="`[misalignment]`: what the true rig deviates by from `[rig]`, which is the nominal one.",
+        **{
+            key: (float, Field(default=0.0, ge=-one.limit, le=one.limit, description=one.meaning))
+            for key, one in PARAMETERS.items()
+        },
+    )
+    RandomMisalignmentTable = create_model(
+        "RandomMisalignmentTable",
+        __base__=Table,
+        __doc__="`[random.misalignment]`: distributions of keys of `[misalignment]`.",
+        **{key: (Distribution | None, Field(default=None, description=one.meaning)) for key, one in PARAMETERS.items()},
+    )
+
+
+MIN_STROKE_M, MAX_STROKE_M = 1e-3, 10.0
+DatasetName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
+StrokeM = Annotated[float, Field(ge=MIN_STROKE_M, le=MAX_STROKE_M)]
+Tilt = Annotated[float, Field(ge=-0.5, le=0.5)]
+Decentre = Annotated[float, Field(ge=-0.1, le=0.1)]
+Distortion = Annotated[float, Field(ge=-1000.0, le=1000.0)]
+FocalPx = Annotated[float, Field(ge=50.0, le=50000.0)]
+Unit = Annotated[float, Field(ge=0.0, le=1.0)]
+Response = Annotated[tuple[Unit, ...], Field(strict=False, min_length=3, max_length=3)]
+
+
+class DatasetTable(Table):
+    """`[dataset]`."""
+
+    name: DatasetName = Field(description="name of the data set")
+    seed: int = Field(default=0, ge=0, le=2**63 - 1, description="root of all random streams; 0 is legal")
+
+
+class RigTable(Table):
+    """`[rig]`: a preset, and what differs from it."""
+
+    preset: Literal["default", "c310"] = Field(default="default", description="rig to start from")
+    z_c_m: float | None = Field(
+        default=None, gt=0.0, le=5.0, description="camera centre to sphere centre, along the camera's axis"
+    )
+    camera_height_m: float | None = Field(
+        default=None, ge=0.34, le=10.0, description="height of the lens centre above the floor at the down position"
+    )
+    radius_m: float | None = Field(default=None, gt=0.0, le=1.0, description="radius of the spherical mirror")
+    roughness_alpha: float | None = Field(
+        default=None, ge=0.0, le=0.05, description="Beckmann roughness of the mirror; 0 is ideal"
+    )
+    width_px: int | None = Field(default=None, ge=16, le=8192, description="image width")
+    height_px: int | None = Field(default=None, ge=16, le=8192, description="image height")
+    pixel_pitch_um: float | None = Field(default=None, gt=0.0, le=100.0, description="pixel pitch")
+    fx_px: FocalPx | None = Field(default=None, description="focal length along u")
+    fy_px: FocalPx | None = Field(default=None, description="focal length along v")
+    cx_px: float | None = Field(
+        default=None, ge=-8192.0, le=16384.0, description="principal point u; the image centre if width_px is given"
+    )
+    cy_px: float | None = Field(
+        default=None, ge=-8192.0, le=16384.0, description="principal point v; the image centre if height_px is given"
+    )
+    k1: Distortion | None = Field(default=None, description="radial distortion (Brown, as OpenCV)")
+    k2: Distortion | None = Field(default=None, description="radial distortion (Brown, as OpenCV)")
+    k3: Distortion | None = Field(default=None, description="radial distortion (Brown, as OpenCV)")
+    p1: Distortion | None = Field(default=None, description="tangential distortion (Brown, as OpenCV)")
+    p2: Distortion | None = Field(default=None, description="tangential distortion (Brown, as OpenCV)")
+    f_number: float | None = Field(default=None, ge=0.5, le=256.0, description="focal length over aperture diameter")
+    focus_distance_m: float | None = Field(
+        default=None, ge=0.01, le=1000.0, description="plane of focus from the lens; z_c - R/2 where not given"
+    )
+    blur_sigma_px: float | None = Field(
+        default=None, ge=0.05, le=20.0, description="Gaussian optical blur besides defocus"
+    )
+    laser_filter_response: Response | None = Field(
+        default=None, description="response of the filters R, G, B at the laser's line, relative to red"
+    )
+    decentre_x_m: Decentre = Field(default=0.0, description="sphere centre off the camera's vertical, world x")
+    decentre_y_m: Decentre = Field(default=0.0, description="sphere centre off the camera's vertical, world y")
+    tilt_x_rad: Tilt = Field(default=0.0, description="camera turned about world x, the mirror stays")
+    tilt_y_rad: Tilt = Field(default=0.0, description="camera turned about world y, the mirror stays")
+    stroke_tilt_x_rad: Tilt = Field(default=0.0, description="stroke axis turned about world x")
+    stroke_tilt_y_rad: Tilt = Field(default=0.0, description="stroke axis turned about world y")
+
+
+class RoomTable(Table):
+    """`[room]`."""
+
+    name: Literal["lab", "dark"] = Field(default="lab", description="'dark' is the lab with every lamp off")
+
+
+class LaserTable(Table):
+    """`[laser]`: one laser for all targets."""
+
+    power_w: float = Field(default=1e-3, gt=0.0, le=10.0, description="laser power on the wall")
+    wavelength_nm: float = Field(default=650.0, ge=400.0, le=700.0, description="vacuum wavelength")
+    profile: Literal["gaussian", "uniform"] = Field(default="gaussian", description="shape of the spot")
+    albedo: Unit = Field(default=0.7, description="diffuse albedo of the boards at the laser's wavelength")
+    diameter_m: float | None = Field(
+        default=None, gt=0.0, le=1.0, description="one diameter for every spot, instead of base and growth"
+    )
+    diameter_base_m: float = Field(default=3e-3, ge=0.0, le=1.0, description="spot diameter at distance 0")
+    diameter_growth_m_per_m: float = Field(
+        default=1e-3, ge=0.0, le=0.1, description="growth of the spot diameter per metre of depth_m"
+    )
+
+
+class AmbientTable(Table):
+    """`[ambient]`: how well the room is rendered."""
+
+    cells_per_pixel: int = Field(
+        default=2, ge=2, le=32, description="cells along a pixel's side; two samples each, more where noise asks for it"
+    )
+    texel_m: float = Field(default=0.05, ge=0.01, le=2.0, description="size of the light map's texels")
+    lamp_rays: int = Field(default=64, ge=1, le=65536, description="shadow rays per texel and lamp, twice")
+    bounces: int = Field(default=12, ge=0, le=100, description="passes of bounced light before the last one")
+    bounce_rays: int = Field(default=64, ge=1, le=65536, description="rays per texel in such a pass")
+    final_rays: int = Field(default=1024, ge=1, le=65536, description="rays per texel in the last pass, twice")
+
+
+class TargetTable(Table):
+    """`[[targets]]`: a board with a laser spot at its centre."""
+
+    name: Name = Field(description="name of the target")
+    depth_m: float = Field(
+        gt=0.0, le=100.0, description="horizontal distance of the board's face from the world's z axis"
+    )
+    azimuth_deg: float = Field(ge=-360.0, le=360.0, description="direction from world x towards world y")
+    height_m: float = Field(ge=0.0, le=100.0, description="height of the spot above the floor")
+    diameter_m: float | None = Field(
+        default=None, gt=0.0, le=1.0, description="diameter of this spot, instead of what [laser] says"
+    )
+
+
+class ExperimentTable(Table):
+    """`[[experiments]]`: every target with every stroke."""
+
+    name: Name = Field(description="name of the experiment")
+    targets: Annotated[tuple[Name, ...], Field(strict=False, min_length=1)] = Field(
+        description="names from [[targets]]"
+    )
+    strokes_m: Annotated[tuple[StrokeM, ...], Field(strict=False, min_length=1)] = Field(
+        description="strokes (baselines); 0 has no parallax and gives no depth"
+    )
+
+
+DRAWABLE = tuple(
+    key
+    for key, field in RigTable.model_fields.items()
+    if "float" in (kind := str(field.annotation)) and "tuple" not in kind
+)
+"""Keys of `[rig]` that may be drawn: all single numbers but the size of the image, which all samples share."""
+
+if TYPE_CHECKING:
+    RandomRigTable = Table
+else:
+    RandomRigTable = create_model(
+        "RandomRigTable",
+        __base__=Table,
+        __doc__="`[random.rig]`: distributions of keys of `[rig]`.",
+        **{
+            key: (Distribution | None, Field(default=None, description=RigTable.model_fields[key].description))
+            for key in DRAWABLE
+        },
+    )
+
+
+class RandomSpotTable(Table):
+    """`[random.spot]`: on a board that is drawn, or where a horizontal ray from the axis meets what stands there."""
+
+    target: Targets = Field(default=None, description="boards; all of them where not given")
+    across_m: Distribution | None = Field(
+        default=None, description="from the board's centre to the right, seen from the axis; 0 where not given"
+    )
+    up_m: Distribution | None = Field(default=None, description="from the board's centre upwards; 0 where not given")
+    azimuth_deg: Distribution | None = Field(
+        default=None, description="of the ray, from world x towards world y; instead of a board"
+    )
+    height_m: Distribution | None = Field(default=None, description="of the ray above the floor; with azimuth_deg")
+
+    @property
+    def by_ray(self) -> bool:
+        """Whether a ray finds the spot, instead of a board that is drawn."""
+        return self.azimuth_deg is not None
+
+
+class RandomTable(Table):
+    """`[random]`: samples that are drawn, each with a rig, a spot and a stroke of its own."""
+
+    samples: int = Field(default=100, ge=1, le=1_000_000, description="how many; more keep those that are there")
+    sequence: Literal["sobol", "independent"] = Field(
+        default="sobol", description="points that fill the space evenly, or independent ones"
+    )
+    stroke_m: Distribution = Field(description="distribution of the stroke; drawn ones are rounded to 1 nm")
+    rig: RandomRigTable = Field(default=RandomRigTable(), description="distributions of keys of [rig]")
+    misalignment: RandomMisalignmentTable = Field(
+        default=RandomMisalignmentTable(), description="distributions of keys of [misalignment]"
+    )
+    spot: RandomSpotTable = Field(default=RandomSpotTable(), description="distribution of the laser spot")
+
+
+class RigsTable(Table):
+    """`[rigs]`: drawn rigs, each of which sees all `[[experiments]]`."""
+
+    count: int = Field(default=1, ge=1, le=100_000, description="how many; more keep those that are there")
+    misalignment: RandomMisalignmentTable = Field(
+        default=RandomMisalignmentTable(), description="distributions of keys of [misalignment]"
+    )
+
+
+class Recipe(Table):
+    """A whole recipe: `[[experiments]]` or `[random]` says what is seen."""
+
+    dataset: DatasetTable = Field(description="name and seed")
+    rig: RigTable = Field(default=RigTable(), description="camera, mirror and stroke axis, as the estimator knows them")
+    misalignment: MisalignmentTable = Field(default=MisalignmentTable(), description="what the true rig deviates by")
+    room: RoomTable = Field(default=RoomTable(), description="the room")
+    laser: LaserTable = Field(default=LaserTable(), description="the laser")
+    ambient: AmbientTable = Field(default=AmbientTable(), description="quality of the ambient layer")
+    targets: Annotated[tuple[TargetTable, ...], Field(strict=False, min_length=1)] = Field(
+        description="boards with a laser spot"
+    )
+    experiments: Annotated[tuple[ExperimentTable, ...], Field(strict=False)] = Field(
+        default=(), description="which targets with which strokes"
+    )
+    rigs: RigsTable | None = Field(default=None, description="drawn rigs, each of which sees all experiments")
+    random: RandomTable | None = Field(default=None, description="samples that are drawn, instead of experiments")
+    frames: FramesTable | None = Field(default=None, description="how frames of the samples are taken")
+    distractors: Annotated[tuple[DistractorTable, ...], Field(strict=False)] = Field(
+        default=(), description="other lights that may be taken for the spot"
+    )
+
+
+def recipe_schema() -> dict[str, Any]:
+    """JSON schema of a recipe, for editors that complete and check TOML."""
+    schema = Recipe.model_json_schema()
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "phibench recipe"}

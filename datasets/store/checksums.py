@@ -1,0 +1,101 @@
+"""SHA256SUMS, for ``sha256sum -c``. It is written last: where it is, the data set is complete."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping
+from pathlib import Path
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.documents import from_json, read_info, read_manifest
+from phibench.datasets.store.files import TEMPORARY_PREFIX, sha256, write_text
+from phibench.scenes.rig import POSITIONS
+from phibench.scenes.room import Room
+
+
+def data_files(folder: Path) -> list[str]:
+    """Relative names of the files that make up the data set in a folder, sorted; what else lies there is not asked.
+
+    Raises
+    ------
+    DatasetError
+        If `dataset.json` or the manifest, which name them, cannot be read.
+    """
+    rows = read_manifest(folder)
+    names = {layout.INFO, layout.MANIFEST, layout.TABLE, layout.RECIPE, layout.RIGS}
+    info = read_info(folder)
+    if from_json(Room, info.room).lit:
+        names.add(layout.LIGHT_MAP)
+    names.update(name for pose in info.poses for name in pose.files.values())
+    names.update(layout.preview_file(row.sample_id) for row in rows)
+    spots = (row.position(position) for row in rows for position in POSITIONS)
+    names.update(spot.spot_file for spot in spots if spot.spot_file is not None)
+    return sorted(names)
+
+
+def strays(folder: Path) -> list[str]:
+    """Relative names of files in a folder that are neither listed nor ours otherwise (notes, scores), sorted."""
+    known = {*read_sums(folder), *layout.NOT_DATA}
+    names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    return sorted(name for name in names if name not in known and TEMPORARY_PREFIX not in name)
+
+
+def write_sums(folder: Path) -> Path:
+    """Hash all data files."""
+    return write_text(folder / layout.SUMS, sums_text({name: sha256(folder / name) for name in data_files(folder)}))
+
+
+def sums_text(hashes: Mapping[str, str]) -> str:
+    """Text of the list, sorted by name."""
+    return "".join(f"{hashes[name]}  {name}\n" for name in sorted(hashes))
+
+
+def read_sums(folder: Path) -> dict[str, str]:
+    """Hash by relative name.
+
+    Raises
+    ------
+    DatasetError
+        If the list is missing (the data set is not complete) or not one.
+    """
+    path = folder / layout.SUMS
+    if not path.is_file():
+        raise DatasetError(f"{folder} has no {layout.SUMS}: it was not finished; run `phibench dataset make` again")
+    entries = [line.split("  ", 1) for line in path.read_text(encoding="utf-8", errors="replace").splitlines()]
+    if any(len(entry) != 2 or len(entry[0]) != 64 for entry in entries):
+        raise DatasetError(f"{path} is damaged: a line is not '<SHA-256>  <file>'")
+    return {name: digest for digest, name in entries}
+
+
+def damaged(folder: Path) -> list[str]:
+    """One sentence per file that is missing, cannot be read, was changed or is not listed although it belongs here."""
+    listed, planned = read_sums(folder), set()
+    with contextlib.suppress(DatasetError):  # a manifest that cannot be read is reported as what it is, below
+        planned = set(data_files(folder))
+    faults = [fault for name, digest in listed.items() if (fault := _fault(folder, name, digest))]
+    return faults + [f"{name} is not listed in {layout.SUMS}" for name in sorted(planned - set(listed))]
+
+
+def check_documents(folder: Path) -> None:
+    """Refuse a data set that is unfinished or whose `dataset.json`, manifest or rigs are not the listed ones (cheap).
+
+    Raises
+    ------
+    DatasetError
+        In one sentence.
+    """
+    listed = read_sums(folder)
+    for name in (layout.INFO, layout.MANIFEST, layout.RIGS):
+        if fault := _fault(folder, name, listed.get(name, "")):
+            raise DatasetError(f"{folder}: {fault}; run `phibench dataset verify` to see all faults")
+
+
+def _fault(folder: Path, name: str, digest: str) -> str:
+    """Sentence about a file that is not what its hash says; empty if it is."""
+    try:
+        return "" if sha256(folder / name) == digest else f"{name} is damaged: its SHA-256 is not the listed one"
+    except (FileNotFoundError, NotADirectoryError):
+        return f"{name} is missing"
+    except OSError as error:
+        return f"{name} is not readable: {error.strerror or error}"

@@ -1,0 +1,340 @@
+"""Frozen descriptions of `scenes` to JSON and back; doubles survive exactly.
+
+`dataset.json`: what is in the folder, in which conventions, made by what.
+
+The manifest: `manifest.jsonl`, and the same as a flat Parquet table.
+
+The rigs of a data set: `rigs.jsonl`, one line each, rebuilt when they are asked for.
+
+`sensitivities.parquet`: dD/d(parameter) per sample and estimator, beside the data set that it was computed from.
+
+The estimators are not this folder's business: the command line has the table written after the data set is finished
+(`phibench dataset make`, `phibench sensitivities`). It is therefore not listed in SHA256SUMS, whose bytes follow from
+the recipe alone; instead the table's metadata hold the SHA-256 of SHA256SUMS, which tells what it belongs to.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar, cast
+
+from pydantic import TypeAdapter, ValidationError
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.plan.plan import Plan, PosePlan
+from phibench.datasets.recipe.tables import Recipe
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.files import read_rows, sha256, write_bytes
+from phibench.datasets.store.provenance import provenance
+from phibench.datasets.store.schema import (
+    READABLE_VERSIONS,
+    SCHEMA_VERSION,
+    DatasetInfo,
+    ManifestRow,
+    PoseInfo,
+    RigInfo,
+    columns,
+    drawn_columns,
+    row_line,
+)
+from phibench.scenes.rig import Rig
+from phibench.scenes.validation import nearest
+
+if TYPE_CHECKING:
+    from polars import DataFrame
+
+
+T = TypeVar("T")
+
+
+def to_json(value: object) -> Any:
+    """JSON document (dicts, lists, numbers) of a frozen dataclass such as `Rig` or `Room`."""
+    return _adapter(cast(Any, type(value))).dump_python(value, mode="json")
+
+
+def from_json(kind: type[T], document: Any) -> T:
+    """Rebuild a frozen dataclass of type `kind` from its JSON document.
+
+    Raises
+    ------
+    DatasetError
+        If the document does not describe one.
+    """
+    try:
+        return cast(T, _adapter(cast(Any, kind)).validate_python(document))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise DatasetError(f"not a valid {kind.__name__} at {where or 'its root'}: {first['msg']}") from error
+
+
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    """Adapter of a type; making one takes longer than using it a hundred times."""
+    return TypeAdapter(kind)
+
+
+CONVENTIONS = {
+    "units": "SI: metres, radians, seconds, watts; layers are expected photo-electrons per second per pixel",
+    "world": "right-handed, z up, origin on the floor below the stroke axis",
+    "camera": "OpenCV axes: x right, y down, z along the optical axis, which looks up",
+    "pixels": "integer (u, v) at pixel centres; the image spans [-0.5, W - 0.5] x [-0.5, H - 0.5]",
+    "positions": "down is stroke position 1 (offset 0), up is position 2 (offset stroke_m)",
+    "depth_m": "horizontal distance from the vertical line through the sphere centre at the down position",
+    "phi_ray_rad": "theta / 2, theta between the ray that leaves the mirror and straight down",
+    "phi_normal_rad": "polar angle of the outward mirror normal from straight down",
+    "phi_incidence_rad": "angle of incidence on the mirror",
+    "fall_off": "layers include the natural (cos^4) fall-off of the thin lens; do not apply it again",
+    "bands": "planes R, G, B are electrons behind the three filters, not colours of light",
+    "missing": "NaN in EXR planes and in Python, null in JSON and Parquet; object_id is -1",
+}
+
+
+def dataset_info(plan: Plan, environment: dict[str, Any]) -> DatasetInfo:
+    """Describe a plan that is rendered in `environment` (variant, LLVM, threads)."""
+    recipe = plan.recipe
+    return DatasetInfo(
+        schema_version=SCHEMA_VERSION,
+        name=recipe.dataset.name,
+        recipe=recipe.model_dump(mode="json"),
+        recipe_sha256=recipe_sha256(recipe),
+        rigs=len(plan.rigs),
+        room=to_json(plan.room),
+        object_names=plan.room.object_names(plan.rig.at(0.0)),
+        poses=tuple(_pose_info(pose) for pose in plan.poses),
+        samples=len(plan.pairs),
+        shard=plan.shard,
+        conventions=CONVENTIONS,
+        provenance={**provenance(), **environment},
+    )
+
+
+def info_text(info: DatasetInfo) -> str:
+    """Text of `dataset.json`."""
+    return json.dumps(info.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
+
+
+def same_content(a: DatasetInfo, b: DatasetInfo) -> bool:
+    """Whether two descriptions mean the same bytes; the commit does not count."""
+    return _without_commit(a) == _without_commit(b)
+
+
+def parse_info(text: str) -> DatasetInfo:
+    """Read the text of a `dataset.json` that this version wrote."""
+    return DatasetInfo.model_validate(json.loads(text))
+
+
+def recipe_sha256(recipe: Recipe) -> str:
+    """Hash of a recipe's values: comments, order of keys and defaults left out do not count."""
+    text = json.dumps(recipe.model_dump(mode="json"), sort_keys=True, allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def read_info(folder: Path) -> DatasetInfo:
+    """Read `dataset.json`.
+
+    Raises
+    ------
+    DatasetError
+        If the folder is missing, not a data set, of another schema version, or the file damaged.
+    """
+    path = folder / layout.INFO
+    if not folder.is_dir():
+        raise DatasetError(f"there is no folder {folder}")
+    if not path.is_file():
+        raise DatasetError(f"{folder} is not a data set: it has no {layout.INFO}")
+    document = _json(path)
+    version = document.get("schema_version")
+    if version not in READABLE_VERSIONS:
+        known = " and ".join(map(str, READABLE_VERSIONS))
+        raise DatasetError(f"{path} has schema version {version}; this phibench reads versions {known}")
+    try:
+        return DatasetInfo.model_validate(document)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise DatasetError(f"{path}: {where}: {first['msg']}" if where else f"{path}: {first['msg']}") from error
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DatasetError(f"{path} is not readable: {error.strerror or error}") from error
+    except ValueError as error:
+        raise DatasetError(f"{path} is damaged: {error}") from error
+    if not isinstance(document, dict):
+        raise DatasetError(f"{path} is damaged: it does not hold a JSON object")
+    return document
+
+
+def _without_commit(info: DatasetInfo) -> str:
+    provenance = {key: value for key, value in info.provenance.items() if key != "commit"}
+    return info_text(info.model_copy(update={"provenance": provenance}))
+
+
+def _pose_info(pose: PosePlan) -> PoseInfo:
+    files = {name: layout.view_file(pose.pose_id, name) for name in ("ambient", "truth", "preview")}
+    return PoseInfo(pose=pose.pose_id, rig=pose.rig, offset_m=pose.offset_m, ambient_seed=pose.seed, files=files)
+
+
+def write_manifest(folder: Path, rows: Sequence[ManifestRow]) -> None:
+    """Write both forms."""
+    for name, data in manifest_documents(rows).items():
+        write_bytes(folder / name, data)
+
+
+def manifest_documents(rows: Sequence[ManifestRow]) -> dict[str, bytes]:
+    """Both forms as bytes, by file name."""
+    buffer = io.BytesIO()
+    to_frame(rows).write_parquet(buffer, compression="zstd", statistics=False)
+    return {
+        layout.MANIFEST: "".join(row_line(row) + "\n" for row in rows).encode(),
+        layout.TABLE: buffer.getvalue(),
+    }
+
+
+def read_manifest(folder: Path) -> list[ManifestRow]:
+    """Rows of `manifest.jsonl`.
+
+    Raises
+    ------
+    DatasetError
+        If it is missing, or with the number of the first line that is not a row.
+    """
+    return read_rows(folder / layout.MANIFEST, ManifestRow)
+
+
+def to_frame(rows: Sequence[ManifestRow]) -> Any:
+    """Rows as a polars DataFrame: one column per leaf, names joined by dots, null where a number does not exist."""
+    import polars
+
+    types = {str: polars.String, float: polars.Float64, bool: polars.Boolean, int: polars.Int64}
+    documents = [row.model_dump(mode="json") for row in rows]
+    data, schema = {}, {}
+    for name, field in columns():
+        kind = field.annotation
+        base = next((known for known in types if known in (kind, *getattr(kind, "__args__", ()))), float)
+        is_list = getattr(kind, "__origin__", None) is tuple
+        data[name] = [_leaf(document, name) for document in documents]
+        schema[name] = polars.List(polars.Float64) if is_list else types[base]
+    for name, drawn in drawn_columns(rows).items():
+        data[name] = [row.drawn.get(name.removeprefix("drawn.")) for row in rows]
+        schema[name] = types[drawn]
+    return polars.DataFrame(data, schema=schema)
+
+
+def differences(folder: Path, rows: Sequence[ManifestRow]) -> list[str]:
+    """One sentence per column in which the Parquet table differs from the rows."""
+    import polars
+
+    expected = to_frame(rows)
+    try:
+        table = polars.read_parquet(folder / layout.TABLE)
+    except (OSError, polars.exceptions.PolarsError) as error:
+        return [f"{layout.TABLE} cannot be read: {error}"]
+    if table.schema != expected.schema or table.height != expected.height:
+        return [f"{layout.TABLE} has other columns or rows than {layout.MANIFEST}"]
+    changed = [name for name in table.columns if not table[name].equals(expected[name], null_equal=True)]
+    return [f"{layout.TABLE} differs from {layout.MANIFEST} in column {name}" for name in changed]
+
+
+def _leaf(document: dict[str, Any], name: str) -> Any:
+    value: Any = document
+    for key in name.split("."):
+        value = None if value is None else value[key]
+    return value
+
+
+def same_number(a: float, b: float, relative: float = 1e-11, absolute: float = 1e-12) -> bool:
+    """Whether two doubles agree to rounding; two NaN do."""
+    return (math.isnan(a) and math.isnan(b)) or math.isclose(a, b, rel_tol=relative, abs_tol=absolute)
+
+
+@dataclass(frozen=True)
+class Rigs:
+    """Rigs by id, as JSON documents: a large data set has as many as samples, and few are looked at."""
+
+    documents: dict[str, dict[str, Any]]
+
+    def __len__(self) -> int:
+        return len(self.documents)
+
+    def __getitem__(self, name: str) -> Rig:
+        if name not in self.documents:
+            raise DatasetError(f"{layout.RIGS} has no rig '{name}'; {nearest(name, list(self.documents)[:20])}")
+        if name not in self._built:
+            self._built[name] = from_json(Rig, self.documents[name])
+        return self._built[name]
+
+    @cached_property
+    def _built(self) -> dict[str, Rig]:
+        return {}
+
+
+def rigs_text(rigs: Mapping[str, Rig]) -> str:
+    """Text of `rigs.jsonl`; doubles are written so that reading gives the same bits."""
+    lines = (json.dumps({"rig": name, "resolved": to_json(rig)}, allow_nan=False) for name, rig in rigs.items())
+    return "".join(line + "\n" for line in lines)
+
+
+def read_rigs(folder: Path) -> Rigs:
+    """Rigs of a data set.
+
+    Raises
+    ------
+    DatasetError
+        If the file is missing, or with the number of the first line that is not a rig.
+    """
+    return Rigs({info.rig: info.resolved for info in read_rows(folder / layout.RIGS, RigInfo)})
+
+
+DIGEST = "phibench.dataset_sha256"
+"""Key of the metadata."""
+
+
+def metadata_of(folder: Path) -> dict[str, str]:
+    """Metadata of a table for the data set in a folder as it is now."""
+    return {DIGEST: sha256(folder / layout.SUMS)}
+
+
+def sensitivity_fault(folder: Path) -> str | None:
+    """One sentence on a table that is damaged or of another state of the data set; None if there is no fault."""
+    import polars
+
+    path = folder / layout.SENSITIVITIES
+    if not path.is_file():
+        return None
+    try:
+        digest = polars.read_parquet_metadata(path).get(DIGEST)
+        polars.scan_parquet(path).select(polars.all().count()).collect()
+    except (polars.exceptions.PolarsError, OSError) as error:
+        why = str(error).splitlines()[0]
+        return f"{layout.SENSITIVITIES} cannot be read: {why}; run `phibench sensitivities` again"
+    if digest != metadata_of(folder)[DIGEST]:
+        return f"{layout.SENSITIVITIES} belongs to another state of this data set; run `phibench sensitivities` again"
+    return None
+
+
+def read_sensitivities(folder: Path) -> DataFrame:
+    """Table of a data set.
+
+    Raises
+    ------
+    DatasetError
+        If there is none, or it is not that of this data set.
+    """
+    import polars
+
+    if not (folder / layout.SENSITIVITIES).is_file():
+        raise DatasetError(f"{folder} has no {layout.SENSITIVITIES}; run `phibench sensitivities {folder}`")
+    if fault := sensitivity_fault(folder):
+        raise DatasetError(f"{folder}: {fault}")
+    return polars.read_parquet(folder / layout.SENSITIVITIES)

@@ -1,0 +1,311 @@
+"""The one writer and the one reader of EXR files.
+
+OpenEXR's Python module writes wrong pixels for arrays that are not C-contiguous, reads truncated files without
+raising, and keeps header floats as float32 (all of 3.5). So: planes are forced to C-contiguous native float32, the
+compression is lossless ZIP, exact parameters travel in one JSON string (attribute `phibench`), and that string carries
+a CRC-32 per plane which is checked on reading.
+
+The three kinds of layers as EXR files: which planes they have and what their headers say.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import json
+import os
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.store.files import write_atomic
+from phibench.scenes.camera import FILTERS
+
+ATTRIBUTE = "phibench"
+Plane = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Exr:
+    """Content of one EXR file.
+
+    Attributes
+    ----------
+    planes : dict of str to float32 arrays, shape (H, W)
+    header : dict
+        The JSON header that was given to `write_exr`.
+    origin_px : (u0, v0)
+        Image pixel of the first column and row (the EXR data window).
+    """
+
+    planes: dict[str, Plane]
+    header: dict[str, Any]
+    origin_px: tuple[int, int] = (0, 0)
+
+
+def write_exr(
+    path: Path, planes: Mapping[str, ArrayLike], header: Mapping[str, Any], origin_px: tuple[int, int] = (0, 0)
+) -> Path:
+    """Write named planes of one shape (H, W) as float32, losslessly compressed, atomically.
+
+    Parameters
+    ----------
+    path : Path
+    planes : mapping of str to array, shape (H, W)
+        Any memory order, byte order and real type; rounded to float32. A finite value beyond float32 is refused.
+    header : mapping
+        Anything that JSON can hold; floats survive exactly.
+    origin_px : (u0, v0)
+        Image pixel of the first column and row.
+
+    Raises
+    ------
+    DatasetError
+        If the planes are none, not two-dimensional, empty, of several shapes or beyond float32.
+    """
+    arrays = {name: _float32(name, plane) for name, plane in planes.items()}
+    _check_shapes(arrays)
+    sums = {name: zlib.crc32(array.tobytes()) for name, array in arrays.items()}
+    text = json.dumps({"header": dict(header), "crc32": sums}, allow_nan=False)
+
+    def write(temporary: Path) -> None:
+        _write(temporary, arrays, text, origin_px)
+        try:
+            read_exr(temporary)  # checks every pixel before the file gets its name
+        except DatasetError as error:
+            raise OSError(errno.EIO, "what was written does not read back") from error
+
+    return write_atomic(path, write)
+
+
+def read_exr(path: Path) -> Exr:
+    """Read a file that `write_exr` wrote.
+
+    Raises
+    ------
+    DatasetError
+        If the file is missing, damaged, truncated or not one of ours.
+    """
+    import OpenEXR
+
+    _check_readable(path)
+    try:
+        with _quiet(), OpenEXR.File(str(path), separate_channels=True) as file:
+            if not file.parts:
+                raise DatasetError(f"{path} is damaged or truncated")
+            return _content(path, file.header(), {name: c.pixels for name, c in file.channels().items()})
+    except (RuntimeError, ValueError, TypeError) as error:
+        raise error if isinstance(error, DatasetError) else DatasetError(f"{path} is damaged: {error}") from error
+
+
+def _write(path: Path, planes: dict[str, Plane], text: str, origin_px: tuple[int, int]) -> None:
+    import OpenEXR
+
+    height, width = next(iter(planes.values())).shape
+    low = np.array(origin_px, np.int32)
+    window = (low, low + np.array([width - 1, height - 1], np.int32))
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "dataWindow": window,
+        "displayWindow": window,
+        ATTRIBUTE: text,
+    }
+    try:
+        with OpenEXR.File(header, planes) as file:
+            file.write(str(path))
+    except RuntimeError as error:
+        # "Failed to write pixel data to image file "NAME". File too large.": the reason is what follows the name
+        reason = str(error).rsplit(str(path), 1)[-1].strip('". ') or "no reason given"
+        code = next((code for code in errno.errorcode if os.strerror(code) == reason), errno.EIO)
+        raise OSError(code, reason) from error
+
+
+def _check_readable(path: Path) -> None:
+    try:
+        path.open("rb").close()
+    except FileNotFoundError as error:
+        raise DatasetError(f"{path} is missing") from error
+    except OSError as error:
+        raise DatasetError(f"{path} is not readable: {error.strerror or error}") from error
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep what OpenEXR prints about a damaged file off the terminal: it is said once, by the exception."""
+    try:
+        terminal = os.dup(2)
+    except OSError:  # closed by whoever started us: nothing can be printed there
+        yield
+        return
+    try:
+        with Path(os.devnull).open("w") as nowhere, contextlib.redirect_stdout(io.StringIO()):
+            os.dup2(nowhere.fileno(), 2)
+            yield
+    finally:
+        os.dup2(terminal, 2)
+        os.close(terminal)
+
+
+def _content(path: Path, header: dict[str, Any], planes: dict[str, Plane]) -> Exr:
+    if ATTRIBUTE not in header:
+        raise DatasetError(f"{path} was not written by phibench: it has no attribute '{ATTRIBUTE}'")
+    document = json.loads(header[ATTRIBUTE])
+    if {name: zlib.crc32(plane.tobytes()) for name, plane in planes.items()} != document["crc32"]:
+        raise DatasetError(f"{path} is damaged: its pixels do not have the checksums of its header")
+    u0, v0 = (int(x) for x in header["dataWindow"][0])
+    return Exr(planes, document["header"], (u0, v0))
+
+
+def _float32(name: str, plane: ArrayLike) -> Plane:
+    array = np.asarray(plane)
+    if array.dtype.kind not in "fiub":
+        raise DatasetError(f"plane '{name}' has type {array.dtype}: real numbers are needed")
+    with np.errstate(over="ignore"):
+        result = np.ascontiguousarray(array, dtype=np.float32)
+    if np.any(np.isinf(result) & np.isfinite(array)):
+        raise DatasetError(f"plane '{name}' has a finite value beyond float32 (3.4e38)")
+    return result
+
+
+def _check_shapes(arrays: dict[str, Plane]) -> None:
+    shapes = {array.shape for array in arrays.values()}
+    if len(shapes) != 1:
+        raise DatasetError(f"planes of one shape are needed, not of {len(shapes)}: {sorted(shapes)}")
+    shape = shapes.pop()
+    if len(shape) != 2 or 0 in shape:
+        raise DatasetError(f"planes of shape (H, W), both above 0, are needed, not {shape}")
+
+
+Array = NDArray[np.float64]
+TRUTH_PLANES = (
+    *("x_m", "y_m", "z_m", "depth_m", "path_m"),
+    *("phi_ray_rad", "phi_normal_rad", "phi_incidence_rad", "azimuth_rad", "object_id"),
+)
+AMBIENT_PLANES = (*FILTERS, *(f"var.{name}" for name in FILTERS))
+SPOT_STACKS = {"electrons_per_s": "", "du_electrons_per_s_px": "du.", "dv_electrons_per_s_px": "dv."}
+"""Arrays of a spot layer, shape (3, h, w), and the prefix of their planes: R, G, B, du.R, ..."""
+SPOT_PLANES = tuple(prefix + name for prefix in SPOT_STACKS.values() for name in FILTERS)
+
+
+@dataclass(frozen=True)
+class SpotWindow:
+    """A spot layer: images of one spot on a small window.
+
+    Attributes
+    ----------
+    u0_px, v0_px : int
+        Image pixel of the window's first column and row; the window may reach beyond the image.
+    electrons_per_s : array, shape (3, h, w), float64
+        Expected photo-electrons per second per pixel behind R, G, B. h = w = 0 where no light reaches the image.
+    du_electrons_per_s_px, dv_electrons_per_s_px : arrays, shape (3, h, w)
+        Derivatives with respect to a shift of the spot's image by +u, +v.
+    """
+
+    u0_px: int
+    v0_px: int
+    electrons_per_s: Array
+    du_electrons_per_s_px: Array
+    dv_electrons_per_s_px: Array
+
+    @classmethod
+    def empty(cls) -> SpotWindow:
+        """Return the window of a spot that sends no light to the image."""
+        none = np.zeros((3, 0, 0))
+        return cls(0, 0, none, none, none)
+
+    def add_to(self, image: Array, gain: float = 1.0) -> None:
+        """Add `gain` times the window to an image, shape (3, H, W), in place; what lies outside is lost."""
+        height, width = image.shape[1:]
+        rows, columns = self.electrons_per_s.shape[1:]
+        v0, v1 = max(self.v0_px, 0), min(self.v0_px + rows, height)
+        u0, u1 = max(self.u0_px, 0), min(self.u0_px + columns, width)
+        if v0 < v1 and u0 < u1:
+            part = self.electrons_per_s[:, v0 - self.v0_px : v1 - self.v0_px, u0 - self.u0_px : u1 - self.u0_px]
+            image[:, v0:v1, u0:u1] += gain * part
+
+
+def write_ambient(path: Path, planes: NDArray[Any], variance: NDArray[Any], header: Mapping[str, Any]) -> Path:
+    """Write an ambient layer and its variance, shape (3, H, W) each: planes R, G, B, var.R, var.G, var.B."""
+    header = {"kind": "ambient", "unit": "electrons/s", **header}
+    return write_exr(path, dict(zip(AMBIENT_PLANES, (*planes, *variance), strict=True)), header)
+
+
+def read_ambient(path: Path, **owner: str) -> NDArray[np.float32]:
+    """Read an ambient layer, shape (3, H, W), electrons per second; `owner` as in `read_layer`."""
+    file = read_layer(path, "ambient", AMBIENT_PLANES, **owner)
+    return np.stack([file.planes[name] for name in FILTERS])
+
+
+def read_ambient_variance(path: Path, **owner: str) -> NDArray[np.float32]:
+    """Read the variance of an ambient layer, shape (3, H, W), (electrons per second) squared; `owner` likewise."""
+    file = read_layer(path, "ambient", AMBIENT_PLANES, **owner)
+    return np.stack([file.planes["var." + name] for name in FILTERS])
+
+
+def write_truth(path: Path, planes: Mapping[str, Array], header: Mapping[str, Any]) -> Path:
+    """Write a truth layer: the planes `TRUTH_PLANES`."""
+    return write_exr(path, {name: planes[name] for name in TRUTH_PLANES}, {"kind": "truth", **header})
+
+
+def read_truth(path: Path, **owner: str) -> dict[str, NDArray[Any]]:
+    """Read a truth layer: float64 planes (H, W) with NaN where there is nothing; `object_id` int32, -1 there."""
+    file = read_layer(path, "truth", TRUTH_PLANES, **owner)
+    planes: dict[str, NDArray[Any]] = {name: file.planes[name].astype(float) for name in TRUTH_PLANES}
+    planes["object_id"] = planes["object_id"].astype(np.int32)
+    return planes
+
+
+def write_spot(path: Path, layer: SpotWindow, header: Mapping[str, Any]) -> Path:
+    """Write a spot layer: planes R, G, B and their derivatives, in a data window."""
+    stacks = ((prefix, getattr(layer, name)) for name, prefix in SPOT_STACKS.items())
+    planes = {prefix + name: plane for prefix, stack in stacks for name, plane in zip(FILTERS, stack, strict=True)}
+    header = {"kind": "spot", "unit": "electrons/s", **header}
+    return write_exr(path, planes, header, (layer.u0_px, layer.v0_px))
+
+
+def read_spot(path: Path, **owner: str) -> SpotWindow:
+    """Read a spot layer; `owner` as in `read_layer`."""
+    file = read_layer(path, "spot", SPOT_PLANES, **owner)
+    stacks = [
+        np.stack([file.planes[prefix + name] for name in FILTERS]).astype(float) for prefix in SPOT_STACKS.values()
+    ]
+    return SpotWindow(*file.origin_px, *stacks)
+
+
+def read_layer(path: Path, kind: str, planes: tuple[str, ...], **owner: str) -> Exr:
+    """Read a layer and check what it is.
+
+    Parameters
+    ----------
+    path : Path
+    kind : "ambient", "truth" or "spot"
+    planes : names of the planes that must be there
+    **owner : str
+        What the header must say: `dataset`, and `pose` or `sample_id` and `position`. A file of another pose or
+        sample under the right name is refused.
+
+    Raises
+    ------
+    DatasetError
+        If the file cannot be read or is not that layer.
+    """
+    try:
+        file = read_exr(path)
+    except DatasetError as error:
+        raise DatasetError(f"{error}; `phibench dataset repair` renders it again") from error
+    if file.header.get("kind") != kind:
+        raise DatasetError(f"{path} holds a layer of kind '{file.header.get('kind')}', not '{kind}'")
+    if missing := [name for name in planes if name not in file.planes]:
+        raise DatasetError(f"{path} lacks the planes {', '.join(missing)}")
+    if wrong := [key for key, value in owner.items() if file.header.get(key) != value]:
+        held, meant = (", ".join(f"{key} {table.get(key)}" for key in wrong) for table in (file.header, owner))
+        raise DatasetError(f"{path} is the {kind} layer of {held}, not of {meant}; run `phibench dataset verify`")
+    return file

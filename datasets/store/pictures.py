@@ -1,0 +1,167 @@
+"""Layers to pictures for people. No camera model: neither noise nor mosaic, and an exposure that suits the eye.
+
+Pictures that show people where a spot is: a cross that leaves it free, and its surroundings enlarged.
+
+Picture of a sample: down and up side by side at half size, laser on, the spot marked and enlarged in a corner.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from phibench.datasets.store.files import write_bytes
+from phibench.datasets.store.schema import SpotRow
+from phibench.render.optics.truth import SpotTruth
+from phibench.scenes.camera import Detector
+
+Picture = NDArray[np.uint8]
+_WHITE_PERCENTILE = 98.0
+_WHITE_LEVEL = 0.8
+_DARK_ROOM_ELECTRONS_PER_S = 1e5  # a room below this is shown black, the spot at its own exposure
+
+
+def exposure_s(planes: NDArray[Any], detector: Detector) -> float:
+    """Factor that brings the brighter parts of a layer, shape (3, H, W), electrons/s, to near white."""
+    bright = float(np.percentile(_balanced(planes, detector), _WHITE_PERCENTILE))
+    return _WHITE_LEVEL / max(bright, _DARK_ROOM_ELECTRONS_PER_S)
+
+
+def to_srgb(planes: NDArray[Any], detector: Detector, exposure: float) -> Picture:
+    """8-bit sRGB picture, shape (H, W, 3), of a layer, shape (3, H, W), electrons per second."""
+    linear = np.clip(_balanced(planes, detector) * exposure, 0.0, 1.0)
+    coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
+    return np.ascontiguousarray(np.rint(255.0 * coded).astype(np.uint8).transpose(1, 2, 0))
+
+
+def halved(planes: NDArray[Any]) -> NDArray[Any]:
+    """Mean of 2 x 2 pixels, shape (3, H // 2, W // 2)."""
+    height, width = planes.shape[1] // 2 * 2, planes.shape[2] // 2 * 2
+    cropped = planes[:, :height, :width]
+    return cropped.reshape(3, height // 2, 2, width // 2, 2).mean(axis=(2, 4))
+
+
+def save_png(path: Path, picture: Picture) -> Path:
+    """Write a picture, shape (H, W, 3), atomically."""
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, format="PNG", compress_level=6)
+    return write_bytes(path, buffer.getvalue())
+
+
+def _balanced(planes: NDArray[Any], detector: Detector) -> NDArray[Any]:
+    """Planes on one scale: electrons per second of the green band (white light gives three equal planes)."""
+    gains = np.array(detector.band_electrons_per_joule())
+    return (
+        np.asarray(planes, float)
+        * np.where(gains > 0.0, gains[1] / np.where(gains > 0.0, gains, 1.0), 0.0)[:, None, None]
+    )
+
+
+CROP_PX = 24  # the enlarged window measures 24 x 24 pixels
+SpotPlace = SpotRow | SpotTruth
+MARK, TEXT = (0, 255, 80), (255, 255, 255)
+
+
+def marked(picture: Picture, spot: SpotPlace, scale: int) -> Picture:
+    """Frame at 1 / `scale` of its size, with a cross that leaves the spot itself free."""
+    if not np.isfinite(spot.u_px):
+        return picture
+    image = Image.fromarray(picture)
+    _cross(ImageDraw.Draw(image), (spot.u_px + 0.5) / scale, (spot.v_px + 0.5) / scale, 3.0, 8.0)
+    return np.asarray(image)
+
+
+def crop(frame: NDArray[Any], spot: SpotPlace) -> NDArray[Any]:
+    """Window of 24 x 24 pixels around the spot, black outside the image, shape (3, 24, 24)."""
+    result = np.zeros((3, CROP_PX, CROP_PX))
+    corner = _corner(spot)
+    if corner is not None:
+        (u0, v0), (height, width) = corner, frame.shape[1:]
+        rows, columns = (slice(max(x, 0), max(min(x + CROP_PX, n), 0)) for x, n in ((v0, height), (u0, width)))
+        part = frame[:, rows, columns]
+        if part.size:
+            v, u = rows.start - v0, columns.start - u0
+            result[:, v : v + part.shape[1], u : u + part.shape[2]] = part
+    return result
+
+
+def enlarged(picture: Picture, spot: SpotPlace, zoom: int) -> Picture:
+    """Picture of a crop, each pixel shown zoom x zoom, with a cross at the true position."""
+    image = Image.fromarray(np.kron(picture, np.ones((zoom, zoom, 1), np.uint8)))
+    corner = _corner(spot)
+    if corner is not None:
+        u, v = ((x - x0 + 0.5) * zoom for x, x0 in zip((spot.u_px, spot.v_px), corner, strict=True))
+        _cross(ImageDraw.Draw(image), u, v, 2.5 * zoom, 6.0 * zoom)
+    return np.asarray(image)
+
+
+def captioned(picture: Picture, text: str) -> Picture:
+    """Picture with a text, white on black, in its upper left corner."""
+    image = Image.fromarray(picture)
+    draw = ImageDraw.Draw(image)
+    draw.rectangle(draw.multiline_textbbox((4, 4), text), fill=(0, 0, 0))
+    draw.multiline_text((4, 4), text, fill=TEXT)
+    return np.asarray(image)
+
+
+def _corner(spot: SpotPlace) -> tuple[int, int] | None:
+    if not np.isfinite(spot.u_px):
+        return None
+    return round(spot.u_px) - CROP_PX // 2, round(spot.v_px) - CROP_PX // 2
+
+
+def _cross(draw: ImageDraw.ImageDraw, u: float, v: float, inner: float, outer: float) -> None:
+    for du, dv in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        draw.line((u + du * inner, v + dv * inner, u + du * outer, v + dv * outer), fill=MARK)
+
+
+_LARGEST_ZOOM = 6
+
+
+@dataclass(frozen=True)
+class Side:
+    """One position of a sample: where its spot is, its frame and its ambient layer, shape (3, H, W), electrons/s."""
+
+    position: str
+    spot: SpotPlace
+    frame: NDArray[np.float64]
+    ambient: NDArray[np.float32]
+
+
+def sample_picture(sides: Sequence[Side], detector: Detector) -> Picture:
+    """Both positions side by side, exposed for the first."""
+    exposure = exposure_s(halved(sides[0].ambient), detector)
+    return np.concatenate([_picture(s.frame, s.position, s.spot, detector, exposure) for s in sides], axis=1)
+
+
+def _picture(
+    frame: NDArray[np.float64], position: str, spot: SpotPlace, detector: Detector, exposure: float
+) -> Picture:
+    picture = marked(to_srgb(halved(frame), detector, exposure), spot, 2)
+    if not spot.visible:
+        return captioned(picture, f"{position}: not visible, {spot.cause}")
+    window = crop(frame, spot)
+    peak = float(window[1].max(initial=1.0))
+    zoom = min(max(min(picture.shape[:2]) // 3 // CROP_PX, 1), _LARGEST_ZOOM)
+    return _with_inset(picture, enlarged(to_srgb(window, detector, min(exposure, 1.0 / peak)), spot, zoom), spot)
+
+
+def _with_inset(picture: Picture, inset: Picture, spot: SpotPlace) -> Picture:
+    """Framed inset in the corner that is farthest from the spot; left out where the picture is too small for it."""
+    framed = np.full((inset.shape[0] + 2, inset.shape[1] + 2, 3), MARK, np.uint8)
+    framed[1:-1, 1:-1] = inset
+    (height, width), (rows, columns) = picture.shape[:2], framed.shape[:2]
+    if rows > height or columns > width:
+        return picture
+    v = height - rows if spot.v_px / 2.0 < height / 2.0 else 0
+    u = width - columns if spot.u_px / 2.0 < width / 2.0 else 0
+    result = picture.copy()
+    result[v : v + rows, u : u + columns] = framed
+    return result

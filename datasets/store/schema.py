@@ -1,0 +1,249 @@
+"""The on-disk documents: one row of the manifest, and `dataset.json`. FORMAT.md describes them; a test compares.
+
+A number is NaN in Python and null in JSON where it does not exist (a spot without a reflection point).
+
+Where the files of a data set are, relative to its folder, with forward slashes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterable, Iterator
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, model_validator
+
+SCHEMA_VERSION = 5
+READABLE_VERSIONS = (4, 5)
+"""Version 5 gave mirrors a form, `mirror.form` in `rigs.jsonl`; in version 4 every mirror is a perfect sphere."""
+Position = Literal["down", "up"]
+
+
+def _nan_from_null(value: object) -> object:
+    return math.nan if value is None else value
+
+
+def _null_from_nan(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+Number = Annotated[float, BeforeValidator(_nan_from_null), PlainSerializer(_null_from_nan, when_used="json")]
+"""A double that may be NaN: null in JSON."""
+
+Vector2 = Annotated[tuple[Number, Number], Field(strict=False)]
+Vector3 = Annotated[tuple[Number, Number, Number], Field(strict=False)]
+
+
+class Document(BaseModel):
+    """A frozen document without unknown keys; values of the wrong type are refused."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+
+
+def _field(unit: str, text: str) -> Any:
+    return Field(description=text, json_schema_extra={"unit": unit})
+
+
+class CertificateRow(Document):
+    """Differences of two independent answers for one spot in one view, and the tolerances they were held to."""
+
+    chief_difference_px: float = _field("px", "chief ray: closed form against ray tracer")
+    chief_tolerance_px: float = _field("px", "largest allowed chief_difference_px")
+    centroid_difference_px: float = _field("px", "centroid of the spot layer against rays over aperture and spot")
+    centroid_tolerance_px: float = _field("px", "largest allowed centroid_difference_px")
+    flux_difference: float = _field("1", "relative difference of the spot's electrons per second, same two")
+    flux_tolerance: float = _field("1", "largest allowed flux_difference")
+    passed: bool = _field("-", "all three differences are within their tolerances; false is never shipped")
+
+
+class NoiseRow(Document):
+    """Errors of phi_ray of one spot in one raw Bayer frame, preset `webcam`, 1/60 s (`render/noise_budget.py`)."""
+
+    phi_sensor_rad: Number = _field("rad", "standard deviation from photons and read noise, known shape and blur")
+    phi_render_rad: Number = _field("rad", "what the ambient layer's own noise adds; at most a quarter of the above")
+
+
+class SpotRow(Document):
+    """The exact answer for one spot in one view, and where its layers are."""
+
+    pose: str = _field("-", "id of the mirror pose")
+    offset_m: float = _field("m", "carriage offset along the stroke axis")
+    u_px: Number = _field("px", "image of the spot's centre through the lens centre, to the right")
+    v_px: Number = _field("px", "image of the spot's centre through the lens centre, downwards")
+    phi_ray_rad: Number = _field("rad", "theta / 2, theta between the mirror-to-spot ray and straight down")
+    phi_normal_rad: Number = _field("rad", "polar angle of the outward mirror normal from straight down")
+    phi_incidence_rad: Number = _field("rad", "angle of incidence on the mirror")
+    azimuth_rad: Number = _field("rad", "azimuth of the outward mirror normal, from world x towards world y")
+    reflection_point_world_m: Vector3 = _field("m", "where the chief ray meets the mirror")
+    camera_centre_world_m: Vector3 = _field("m", "lens centre")
+    sphere_centre_world_m: Vector3 = _field("m", "sphere centre")
+    path_spot_mirror_m: Number = _field("m", "spot centre to reflection point")
+    path_mirror_camera_m: Number = _field("m", "reflection point to lens centre")
+    visible: bool = _field("-", "whether the chief ray reaches the sensor")
+    cause: str = _field("-", "why not; 'none' if visible")
+    coma_shift_px: Vector2 = _field("px", "energy centroid of the spot minus (u_px, v_px)")
+    electrons_per_s: Vector3 = _field("1/s", "electrons per second of the whole spot behind R, G, B")
+    view_ambient_file: str = _field("-", "ambient layer of the view")
+    view_truth_file: str = _field("-", "truth layer of the view")
+    spot_file: str | None = _field("-", "spot layer; null where no light of the spot reaches the image")
+    certificate: CertificateRow | None = _field("-", "null where the spot is not visible")
+    noise: NoiseRow | None = _field("-", "null where the spot is not visible")
+
+    @model_validator(mode="after")
+    def _complete_if_visible(self) -> SpotRow:
+        """A visible spot has every number, a layer and a passed certificate."""
+        if not self.visible:
+            return self
+        if missing := [name for name, value in self if name != "noise" and not _is_finite(value)]:
+            raise ValueError(f"the spot is visible but has no {', '.join(missing)}")
+        if self.certificate is None or not self.certificate.passed:
+            raise ValueError("the spot is visible but its certificate is missing or not passed")
+        return self
+
+
+class ManifestRow(Document):
+    """One stroke pair: one line of `manifest.jsonl`."""
+
+    sample_id: str = _field("-", "<experiment>-<target>-h<stroke>, with -<rig> if rigs are drawn; or random-<number>")
+    experiment: str = _field("-", "name of the experiment in the recipe, or 'random'")
+    target: str = _field("-", "name of the target in the recipe, or of what carries the spot")
+    rig: str = _field("-", "id of the true rig, in `rigs.jsonl`")
+    nominal_rig: str = _field("-", "id of the rig that an estimator believes, in `rigs.jsonl`")
+    depth_m: float = _field("m", "D: horizontal distance of the spot from the vertical through the sphere centre, down")
+    stroke_m: float = _field("m", "stroke (baseline) h, the true one")
+    nominal_stroke_m: float = _field("m", "stroke that an estimator believes")
+    spot_world_m: Vector3 = _field("m", "centre of the laser spot")
+    spot_normal_world: Vector3 = _field("1", "unit normal of the wall at the spot")
+    spot_diameter_m: float = _field("m", "diameter of the spot: 4 sigma if gaussian, of the disc if uniform")
+    down: SpotRow = _field("-", "stroke position 1, offset 0")
+    up: SpotRow = _field("-", "stroke position 2, offset stroke_m")
+    tries: int = _field("-", "which draw was the first possible one; 1 is the sequence's own; 0 if nothing is drawn")
+    drawn: dict[str, float | str] = _field("-", "what was drawn, by parameter; empty if nothing is")
+
+    def position(self, name: str) -> SpotRow:
+        """Truth of the stroke position "down" or "up"."""
+        return {"down": self.down, "up": self.up}[name]
+
+
+class PoseInfo(Document):
+    """One mirror pose in `dataset.json`."""
+
+    pose: str = _field("-", "id")
+    rig: str = _field("-", "id of the rig")
+    offset_m: float = _field("m", "carriage offset along the stroke axis")
+    ambient_seed: int = _field("-", "32-bit seed of the ambient layer")
+    files: dict[str, str] = _field("-", "ambient, truth, preview")
+
+
+class RigInfo(Document):
+    """One rig: one line of `rigs.jsonl`."""
+
+    rig: str = _field("-", "id: `rig` is that of the recipe's `[rig]`, others are called after their first sample")
+    resolved: dict[str, Any] = _field("-", "the rig, field by field")
+
+
+class DatasetInfo(Document):
+    """`dataset.json`."""
+
+    schema_version: int = _field("-", "version of this format")
+    name: str = _field("-", "name of the data set")
+    recipe: dict[str, Any] = _field("-", "the recipe, defaults filled in")
+    recipe_sha256: str = _field("-", "SHA-256 of the recipe's values as canonical JSON")
+    rigs: int = _field("-", "number of rigs, the lines of `rigs.jsonl`")
+    room: dict[str, Any] = _field("-", "resolved room, all shapes")
+    object_names: Annotated[tuple[str, ...], Field(strict=False)] = _field("-", "name by object_id of the truth layers")
+    poses: Annotated[tuple[PoseInfo, ...], Field(strict=False)] = _field("-", "all mirror poses")
+    samples: int = _field("-", "number of rows of the manifest")
+    shard: str | None = _field("-", "which part of the recipe this is, such as 1/4; null for all of it")
+    conventions: dict[str, str] = _field("-", "frames, pixels, phi, units in one sentence each")
+    provenance: dict[str, Any] = _field("-", "versions, commit, code hash, variant, LLVM, threads")
+
+
+def row_line(row: ManifestRow) -> str:
+    """One line of `manifest.jsonl`; doubles are written so that reading gives the same bits."""
+    return json.dumps(row.model_dump(mode="json"), allow_nan=False)
+
+
+def flat(document: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Key and value of every leaf of a row, keys joined by dots: the columns of `manifest.parquet`."""
+    for key, value in document.items():
+        if isinstance(value, dict):
+            yield from flat(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
+
+
+def drawn_columns(rows: Iterable[ManifestRow]) -> dict[str, type]:
+    """Dotted names and types of the columns for what was drawn, in the order of their first appearance."""
+    return {f"drawn.{name}": type(value) for row in rows for name, value in row.drawn.items()}
+
+
+def columns(model: type[BaseModel] = ManifestRow, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted name and field of every leaf of a document, in order, but for `drawn`, whose keys depend on the recipe."""
+    for name, field in model.model_fields.items():
+        if name == "drawn":
+            continue
+        inner = next((kind for kind in _kinds(field.annotation) if _is_document(kind)), None)
+        if inner is None:
+            yield prefix + name, field
+        else:
+            yield from columns(inner, f"{prefix}{name}.")
+
+
+def _kinds(annotation: Any) -> tuple[Any, ...]:
+    """An annotation or the options of a union."""
+    return (annotation, *getattr(annotation, "__args__", ()))
+
+
+def _is_document(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, Document)
+
+
+def _is_finite(value: object) -> bool:
+    if isinstance(value, tuple):
+        return all(_is_finite(item) for item in value)
+    return value is not None and not (isinstance(value, float) and not math.isfinite(value))
+
+
+INFO = "dataset.json"
+MANIFEST = "manifest.jsonl"
+TABLE = "manifest.parquet"
+RECIPE = "recipe.toml"
+RIGS = "rigs.jsonl"
+SUMS = "SHA256SUMS"
+LIGHT_MAP = "lightmap.npz"
+RUN = "run.json"
+LOG = "log.jsonl"
+JOURNAL = "journal.txt"
+LOCK = ".phibench-lock"
+WORKING = ".phibench-working"
+CONTACT_SHEET = "contact_sheet.png"
+SENSITIVITIES = "sensitivities.parquet"
+NOT_DATA = (SUMS, RUN, LOG, JOURNAL, LOCK, WORKING, CONTACT_SHEET, SENSITIVITIES)
+"""Files that SHA256SUMS does not list: itself, the diaries of the run, locks, and what is computed from it all."""
+
+_TASK_FILE = re.compile(
+    r"lightmap\.npz|views/[^/]+/(ambient|truth)\.exr|views/[^/]+/preview\.png|spots/[^/]+-(down|up)\.exr|previews/[^/]+\.png"
+)
+
+
+def view_file(pose_id: str, name: str) -> str:
+    """File of a mirror pose; `name` is "ambient", "truth" or "preview"."""
+    return f"views/{pose_id}/{name}.{'png' if name == 'preview' else 'exr'}"
+
+
+def spot_file(sample_id: str, position: str) -> str:
+    """Spot layer of a sample at a stroke position."""
+    return f"spots/{sample_id}-{position}.exr"
+
+
+def preview_file(sample_id: str) -> str:
+    """Picture of a sample: down and up side by side, laser on."""
+    return f"previews/{sample_id}.png"
+
+
+def is_task_file(name: str) -> bool:
+    """Whether a file is called as what tasks write: the light map, a view's, a spot's or a preview's."""
+    return _TASK_FILE.fullmatch(name) is not None

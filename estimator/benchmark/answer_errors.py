@@ -1,0 +1,164 @@
+"""Errors of answers, as arrays: position, phi, depth, and what the claimed covariance and the bound say of them.
+
+Kernels over n answers that share a believed and a true rig. NaN where there is nothing to compare. Pixels as
+everywhere: integer (u, v) at pixel centres. Phi does not depend on the carriage, so that rigs are taken at the down
+position.
+
+The rules of a score: what counts as found, how a missed spot counts, how intervals are made.
+
+* An image's spot is **detected** when a position is given within `match_px` of the chief ray's (u, v) and the spot is
+  visible. Visible and not detected: **missed**. A position given where the spot is not visible, or further than
+  `match_px` from it: **false detection**; an image can be missed and falsely detected at once.
+* Errors are over detected spots. Beside each rms stands a second one, "missed counted", over all visible spots, in
+  which a missed spot counts as an error of `match_px`, and a pair without a usable depth, or with one that is off by
+  more than `missed_relative` of D, as `missed_relative`: an answer is never worth less than none.
+* A pair's depth is **found** when both spots are visible and a finite depth above 0 follows from the answer: the
+  method's own, unless a position that it gave is a false detection, else the exact one of two detected spots.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from phibench.datasets.errors import DatasetError
+from phibench.estimator.geometry.phi import CONVENTIONS, GRADIENTS, estimate_phi, outline_circle
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import Rig
+
+
+@dataclass(frozen=True)
+class PixelErrors:
+    """Errors of n positions, pixels, shape (n,).
+
+    Attributes
+    ----------
+    du_px, dv_px : answer - truth
+    radial_px, tangential_px
+        The same along and across the direction from the image of the sphere centre to the true position; radial
+        errors, outwards above 0, make errors of phi and D, tangential ones (u towards v above 0) only turn the azimuth.
+    """
+
+    du_px: Array
+    dv_px: Array
+    radial_px: Array
+    tangential_px: Array
+
+    @property
+    def distance_px(self) -> Array:
+        """Distance of the answer from the truth."""
+        return np.hypot(self.du_px, self.dv_px)
+
+
+def pixel_errors(true_rig: Rig, true_px: Array, answer_px: Array) -> PixelErrors:
+    """Errors of positions, shape (n, 2) both."""
+    error = np.asarray(answer_px, float) - true_px
+    outward = true_px - outline_circle(true_rig)[0]
+    with np.errstate(invalid="ignore"):  # at the centre itself there is no direction
+        a = outward / np.linalg.norm(outward, axis=-1, keepdims=True)
+    radial = error[:, 0] * a[:, 0] + error[:, 1] * a[:, 1]
+    tangential = error[:, 1] * a[:, 0] - error[:, 0] * a[:, 1]
+    return PixelErrors(error[:, 0], error[:, 1], radial, tangential)
+
+
+def from_centre_px(rig: Rig, uv_px: Array) -> Array:
+    """Distance from the image of the sphere centre, shape (n,)."""
+    return np.asarray(np.linalg.norm(uv_px - outline_circle(rig)[0], axis=-1))
+
+
+def phi_of(convention: str, rig: Rig, uv_px: Array) -> Array:
+    """Phi at pixels, shape (n,), radians."""
+    return CONVENTIONS[convention](rig.at(0.0), uv_px)
+
+
+def phi_variance(rig: Rig, uv_px: Array, covariance_px2: Array, convention: str = "ray") -> Array:
+    """Variance of phi, shape (n,), rad^2: g C g^T; NaN for covariances, shape (n, 2, 2), that are NaN."""
+    return estimate_phi(convention, rig.at(0.0), uv_px, covariance_px2).variance_rad2
+
+
+def usable_covariance(covariance_px2: Array) -> Array:
+    """Covariances, shape (n, 2, 2), NaN where one is not symmetric and positive definite."""
+    C = np.asarray(covariance_px2, float)
+    with np.errstate(invalid="ignore"):
+        symmetric = np.isclose(C[:, 0, 1], C[:, 1, 0], rtol=1e-9, atol=0.0)
+        definite = (C[:, 0, 0] > 0.0) & (C[:, 0, 0] * C[:, 1, 1] - C[:, 0, 1] * C[:, 1, 0] > 0.0)
+        finite = np.isfinite(C).all(axis=(1, 2))
+    return np.where((symmetric & definite & finite)[:, None, None], C, np.nan)
+
+
+def whitened(error_px: Array, covariance_px2: Array) -> Array:
+    """L^-1 e, shape (n, 2), with C = L L^T (Cholesky, lower): independent with variance 1 if C is right.
+
+    Parameters
+    ----------
+    error_px : shape (n, 2)
+    covariance_px2 : shape (n, 2, 2), positive definite or NaN
+    """
+    C = covariance_px2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        l11 = np.sqrt(C[:, 0, 0])
+        l21 = C[:, 0, 1] / l11
+        l22 = np.sqrt(C[:, 1, 1] - l21**2)
+        first = error_px[:, 0] / l11
+        return np.stack([first, (error_px[:, 1] - l21 * first) / l22], axis=-1)
+
+
+def in_ray_units(rig: Rig, uv_px: Array, conventions: Sequence[str]) -> Array:
+    """d phi_ray / d phi of each sense, shape (n,), at pixels (n, 2): a pixel off is then one error in all senses.
+
+    Along the gradient of the other sense: (g_ray . g) / (g . g).
+    """
+    view, factor = rig.at(0.0), np.ones(len(uv_px))
+    named = np.array(conventions)
+    for sense in sorted(set(conventions) - {"ray"}):
+        chosen = named == sense
+        with np.errstate(all="ignore"):
+            g, ray = (GRADIENTS[name](view, uv_px[chosen]) for name in (sense, "ray"))
+            factor[chosen] = np.sum(g * ray, axis=-1) / np.sum(g * g, axis=-1)
+    return factor
+
+
+MATCH_PX = 3.0
+"""A spot at 5 sigma, the faintest that counts as there, is placed to 0.3 to 0.5 px (blur 0.7 px; mono to Bayer), so
+that 3 px is six standard deviations or more and an answer beyond it belongs to something else. A blind guess in the
+mirror's disc (radius 339 px) is within 3 px of the spot with a chance of 8e-5."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """Numbers of a score.
+
+    Parameters
+    ----------
+    match_px : float
+        Largest distance of a position from the truth that counts as found.
+    missed_relative : float
+        Relative depth error for which a missed pair counts.
+    confidence : float
+        Of every interval.
+    resamples : int
+        Bootstrap resamples of the samples.
+    least_samples : int
+        With fewer samples a metric has no interval.
+    """
+
+    match_px: float = MATCH_PX
+    missed_relative: float = 1.0
+    confidence: float = 0.95
+    resamples: int = 1999
+    least_samples: int = 5
+
+    def __post_init__(self) -> None:
+        _above("match_px", self.match_px, 0.0)
+        _above("missed_relative", self.missed_relative, 0.0)
+        _above("resamples", self.resamples, 98)
+        _above("least_samples", self.least_samples, 1)
+        if not 0.5 <= self.confidence < 1.0:
+            raise DatasetError(f"Rules.confidence = {self.confidence:g}: allowed are 0.5 up to below 1")
+
+
+def _above(name: str, value: float, low: float) -> None:
+    if not value > low:
+        raise DatasetError(f"Rules.{name} = {value:g}: must be above {low:g}")

@@ -1,0 +1,322 @@
+"""The pairs of a data set: its takes as a method sees them, and the exact answers with their bounds.
+
+The bound of a spot counts room, dark current and distractors as background: one unknown level per filter.
+
+Pairs of a data set as somebody sees them who has calibrated the rig: rig, stroke and their covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.exposures.exposures import Take, TakenSample, takes
+from phibench.datasets.frames.sensor_card import SensorCard, card_of
+from phibench.datasets.frames.source import Frames, FrameSource, Side
+from phibench.datasets.read import Dataset, Sample
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.files import sha256
+from phibench.datasets.store.provenance import provenance
+from phibench.estimator.benchmark.spot_bounds import spot_bounds, spot_electrons
+from phibench.estimator.calibration.file import Calibration, CalibrationError
+from phibench.estimator.geometry.rig_parameters import stroke_of
+from phibench.estimator.interface import Box, Image, Pair
+from phibench.estimator.pair_set import Distraction, PairSet, PairTruth, SpotTruth
+from phibench.scenes.laser import Beam
+
+TASK_VERSION = 2
+"""Version of the task: what a method is given, what it must answer and what is counted. A change of any raises it."""
+
+
+class DatasetPairs:
+    """Pairs of a data set by number; the layers of the last sample are kept.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    taken : tuple of Take
+        Numbered from 0.
+    """
+
+    def __init__(self, dataset: Dataset, taken: tuple[Take, ...]) -> None:
+        self._dataset, self._takes = dataset, taken
+        self._samples = {sample.row.sample_id: sample for sample in dataset}
+        self._kept: TakenSample | None = None
+        self._source: tuple[int, FrameSource] | None = None
+
+    def __len__(self) -> int:
+        return len(self._takes)
+
+    @property
+    def takes(self) -> tuple[Take, ...]:
+        """What is drawn, by number; it tells the sample, so it is not for methods."""
+        return self._takes
+
+    @property
+    def dataset(self) -> Dataset:
+        """Where they come from."""
+        return self._dataset
+
+    def pair(self, number: int) -> Pair:
+        """What a method sees; its arrays are read-only."""
+        return self.pair_and_frames(number)[0]
+
+    def pair_and_frames(self, number: int) -> tuple[Pair, Frames]:
+        """What a method sees, and the frames behind it, with the camera's JPEG files."""
+        take, sample, source = self._drawn_from(number)
+        frames = source.frames(take.exposure_number, laser_off=take.laser_off)
+        images = {name: _sealed(frame.image) for name, frame in frames.by_name.items()}
+        box_down, box_up = (None, None) if take.boxes is None else tuple(map(_box, take.boxes))
+        pair = Pair(
+            number,
+            **images,
+            rig=sample.nominal_rig,
+            stroke_m=sample.row.nominal_stroke_m,
+            card=card_of(source.sides["down"].chain.sensor),
+            box_down=box_down,
+            box_up=box_up,
+            beam=self._dataset.beam,
+        )
+        return pair, frames
+
+    def truth(self, number: int) -> PairTruth:
+        """The exact answer, with the bounds of the image and of the raw pixels behind it."""
+        take, sample, source = self._drawn_from(number)
+        sensor = source.sides["down"].chain.sensor
+        return PairTruth(
+            number=number,
+            sample_id=take.sample_id,
+            draw=take.draw,
+            preset=take.preset,
+            jpeg_quality=sensor.jpeg_quality if sensor.output == "mjpeg" else None,
+            hinted=take.boxes is not None,
+            depth_m=sample.row.depth_m,
+            stroke_m=sample.row.stroke_m,
+            true_rig=sample.rig,
+            believed_rig=sample.nominal_rig,
+            down=_spot_truth(sample, source, "down"),
+            up=_spot_truth(sample, source, "up"),
+            believed_stroke_m=sample.row.nominal_stroke_m,
+        )
+
+    def image(self, number: int, position: str, laser: bool) -> Image:
+        """One image of a pair, alone; the same bytes as in `pair`."""
+        take, _, source = self._drawn_from(number)
+        return source.frame(position, take.exposure_number, laser).image
+
+    def card(self, number: int) -> SensorCard:
+        """Numbers of the sensor, with the exposure that was chosen; no frame is drawn."""
+        return card_of(self._drawn_from(number)[2].sides["down"].chain.sensor)
+
+    def document(self) -> dict[str, Any]:
+        """Provenance of the set."""
+        info, listed = self._dataset.info, self._dataset.folder / layout.SUMS
+        return {
+            "name": info.name,
+            "task_version": TASK_VERSION,
+            "sealed": False,
+            "pairs": len(self),
+            "samples": len({take.sample_id for take in self._takes}),
+            "presets": sorted({take.preset for take in self._takes}),
+            "hinted": sum(take.boxes is not None for take in self._takes),
+            "seed": info.recipe["dataset"]["seed"],
+            "recipe_sha256": info.recipe_sha256,
+            "dataset_sha256": sha256(listed) if listed.is_file() else None,
+            "provenance": provenance(),
+        }
+
+    def _drawn_from(self, number: int) -> tuple[Take, TakenSample, FrameSource]:
+        if not 0 <= number < len(self._takes):
+            raise DatasetError(f"pair {number}: there are {len(self._takes)}, numbered from 0; ask for one of them")
+        take = self._takes[number]
+        kept = self._kept
+        if kept is None or kept.row.sample_id != take.sample_id:
+            kept = self._kept = TakenSample(self._samples[take.sample_id])
+        if self._source is None or self._source[0] != number:
+            self._source = number, kept.source(take)
+        return take, kept, self._source[1]
+
+
+def dataset_pairs(
+    dataset: Dataset,
+    preset: str | None = None,
+    draws: int | None = None,
+    pairs: int | None = None,
+    hints: bool = True,
+) -> DatasetPairs:
+    """Pairs of a data set in an order that is drawn.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    preset : str, optional
+        Sensor preset; those of the recipe's `[frames]` if not given.
+    draws : int, optional
+        Draws of the noise per sample and preset; the recipe's if not given.
+    pairs : int, optional
+        Only the first so many.
+    hints : bool
+        Whether pairs that have boxes show them.
+
+    Raises
+    ------
+    DatasetError
+        If neither recipe nor caller names a preset, or `pairs` is not a number from 1 up.
+    """
+    taken = takes(dataset, preset, draws)
+    if pairs is not None and pairs < 1:
+        raise DatasetError(f"pairs = {pairs}: must be 1 or above")
+    shown = taken if hints else tuple(replace(take, boxes=None) for take in taken)
+    return DatasetPairs(dataset, shown[:pairs])
+
+
+def pairs_of(
+    dataset: Dataset, samples: Sequence[Sample], preset: str, draws: int = 1, laser_off: bool = True
+) -> DatasetPairs:
+    """Pairs of some samples in one preset, in the order of the samples, then of the draws.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    samples : of the data set
+    preset : str
+    draws : int
+    laser_off : bool
+        Whether frames with the laser off belong to them, whatever the recipe says.
+    """
+    order = {sample.row.sample_id: place for place, sample in enumerate(samples)}
+    few = replace(dataset, rows=tuple(sample.row for sample in samples))
+    taken = sorted(takes(few, preset, draws), key=lambda take: (order[take.sample_id], take.draw))
+    numbered = (replace(take, number=number, laser_off=laser_off) for number, take in enumerate(taken))
+    return DatasetPairs(few, tuple(numbered))
+
+
+def _sealed(image: Image) -> Image:
+    """Image that cannot be written to, nor through its base."""
+    result = np.array(image)
+    result.flags.writeable = False
+    return result
+
+
+def _box(region: Any) -> Box:
+    height, width = region.shape
+    return Box(region.u0_px, region.v0_px, width, height)
+
+
+def _spot_truth(sample: TakenSample, source: FrameSource, position: str) -> SpotTruth:
+    row, side = sample.row.position(position), source.sides[position]
+    uv_px = (row.u_px, row.v_px)
+    beam, depth_m = Beam(sample.row.spot_diameter_m, 0.0), sample.row.depth_m
+    bounds = spot_bounds(side, sample.rig, uv_px, row.electrons_per_s, row.visible, beam=beam, depth_m=depth_m)
+    return SpotTruth(
+        uv_px=uv_px,
+        phi_rad={"ray": row.phi_ray_rad, "normal": row.phi_normal_rad, "incidence": row.phi_incidence_rad},
+        azimuth_rad=row.azimuth_rad,
+        visible=row.visible,
+        cause=row.cause,
+        **vars(bounds),
+        distractions=_distractions(sample, side, position),
+    )
+
+
+def _distractions(sample: TakenSample, side: Side, position: str) -> tuple[Distraction, ...]:
+    """Lights beside the spot that this image shows."""
+    return tuple(
+        Distraction(
+            one.kind, (truth.u_px, truth.v_px), spot_electrons(one.layers[position].total_electrons_per_s, side)
+        )
+        for one in sample.distractors
+        if (truth := one.truths[position]).visible
+    )
+
+
+class CalibratedPairs:
+    """A pair set whose believed rig and stroke are those of a calibration.
+
+    Parameters
+    ----------
+    pairs : PairSet
+        All of one true rig: see `of_calibration`.
+    calibration : Calibration
+    """
+
+    def __init__(self, pairs: PairSet, calibration: Calibration) -> None:
+        self._pairs, self._calibration = pairs, calibration
+        self._covariance = np.array(calibration.covariance)
+        self._covariance.flags.writeable = False
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def pair(self, number: int) -> Pair:
+        """What a method sees."""
+        seen = self._pairs.pair(number)
+        return replace(
+            seen,
+            rig=self._calibration.rig,
+            stroke_m=self._stroke_m(seen.stroke_m),
+            calibration_covariance=self._covariance,
+        )
+
+    def truth(self, number: int) -> PairTruth:
+        """The exact answer."""
+        truth = self._pairs.truth(number)
+        believed_m = truth.stroke_m if truth.believed_stroke_m is None else truth.believed_stroke_m
+        return replace(
+            truth,
+            believed_rig=self._calibration.rig,
+            believed_stroke_m=self._stroke_m(believed_m),
+            calibration_covariance=self._covariance,
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Provenance of the set, with the calibration's hash."""
+        made_from = self._calibration.made_from
+        return {**self._pairs.document(), "calibration": self._calibration.sha256, "calibrated_from": made_from}
+
+    def _stroke_m(self, nominal_m: float) -> float:
+        return float(stroke_of(np.array(nominal_m), self._calibration.values))
+
+
+def of_calibration(dataset: Dataset, calibration: Calibration) -> Dataset:
+    """The samples of a data set that a calibration is for: those of the rig that it was made from.
+
+    Raises
+    ------
+    CalibrationError
+        If a sample believes in another rig than the calibration started from, or the samples have several true rigs
+        and the calibration was made from none of them.
+    """
+    for sample in dataset:
+        if sample.nominal_rig != calibration.believed:
+            raise CalibrationError(
+                f"the calibration is that of another rig than the one that sample {sample.row.sample_id} believes in; "
+                "calibrate with samples of this data set"
+            )
+    rigs = {row.rig for row in dataset.rows}
+    if len(rigs) == 1 and not _of_another(dataset, calibration):
+        return dataset
+    own = _samples_of_its_rig(dataset, calibration)
+    if not own:
+        raise CalibrationError(
+            f"{dataset.folder} has {len(rigs)} true rig{'s' * (len(rigs) > 1)} and the calibration was made from none "
+            "of them; calibrate with samples of this data set"
+        )
+    return replace(dataset, rows=tuple(sample.row for sample in own))
+
+
+def _of_another(dataset: Dataset, calibration: Calibration) -> bool:
+    """Whether the calibration says that it was made from another data set."""
+    return calibration.made_from.get("dataset", dataset.info.name) != dataset.info.name
+
+
+def _samples_of_its_rig(dataset: Dataset, calibration: Calibration) -> list[Sample]:
+    if _of_another(dataset, calibration):
+        return []
+    made_from = set(calibration.made_from.get("samples", ()))
+    rigs = {row.rig for row in dataset.rows if row.sample_id in made_from}
+    return [sample for sample in dataset if sample.row.rig in rigs]

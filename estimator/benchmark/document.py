@@ -1,0 +1,195 @@
+"""A score on disk: one JSON document per run of one method, and its records beside it as Parquet with the same stem."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+import polars as pl
+from pydantic import Field, ValidationError, model_validator
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.store.files import sha256, write_bytes, write_text
+from phibench.datasets.store.schema import Document
+from phibench.estimator.benchmark.intervals import Estimate
+from phibench.estimator.benchmark.metrics import Measured
+
+KIND: Literal["phibench score"] = "phibench score"
+VERSION = 1
+
+
+class Value(Document):
+    """A metric: value and interval in the metric's unit; null where there is none, and `note` says why."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+    n: int = Field(description="records")
+    samples: int = Field(description="samples that the interval resamples")
+    note: str
+
+    @classmethod
+    def of(cls, measured: Measured) -> Value:
+        """From a measurement."""
+        e = measured.estimate
+        return cls(
+            value=finite(e.value),
+            low=finite(e.low),
+            high=finite(e.high),
+            n=measured.n,
+            samples=measured.samples,
+            note=e.note,
+        )
+
+    @property
+    def estimate(self) -> Estimate:
+        """The same with NaN for null."""
+        value, low, high = (math.nan if x is None else x for x in (self.value, self.low, self.high))
+        return Estimate(value, low, high, self.note)
+
+
+class StratumScore(Document):
+    """Metrics of one stratum; edges are null where the stratum is a value or open."""
+
+    by: str
+    label: str
+    low: float | None
+    high: float | None
+    mean: float | None = Field(description="of what the stratum is by, over its images")
+    images: int
+    pairs: int
+    metrics: dict[str, Value]
+
+
+class MethodCard(Document):
+    """Which method: the reference it was called by, where it is, the hash of its code (null if it cannot be told)."""
+
+    reference: str
+    name: str = Field(default="", description="by default what follows the last slash of the reference")
+    kind: str = ""
+    place: str = ""
+    function: str = ""
+    sha256: str | None = None
+    version: str | None = None
+
+    @classmethod
+    def of(cls, reference: str, **fields: str | None) -> MethodCard:
+        """Of a reference and what is known of it."""
+        return cls.model_validate({**fields, "reference": reference})
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name(cls, fields: Any) -> Any:
+        known = isinstance(fields, dict) and fields.get("reference") and not fields.get("name")
+        return {**fields, "name": fields["reference"].rsplit("/", 1)[-1]} if known else fields
+
+
+class Worst(Document):
+    """One of the worst images."""
+
+    number: int
+    sample_id: str
+    image: Literal["down", "up"]
+    depth_m: float
+    electrons: float
+    distance_px: float | None
+    status: str
+    cause: str | None
+    true_in_crop_px: tuple[float, float] = Field(strict=False, description="pixel centres are integers")
+    answer_in_crop_px: tuple[float, float] | None = Field(strict=False)
+    size_px: tuple[int, int] = Field(strict=False, description="width, height")
+    png_base64: str | None
+
+
+class ScoreDocument(Document):
+    """One run of one method on one pair set."""
+
+    kind: Literal["phibench score"]
+    version: int
+    method: MethodCard
+    pair_set: dict[str, Any]
+    pairs: int
+    images: int
+    samples: int
+    seed: int
+    rules: dict[str, float]
+    limits: dict[str, Any]
+    provenance: dict[str, Any]
+    code_sha256: str = Field(description="of everything behind the score")
+    metrics: dict[str, dict[str, str]] = Field(description="unit, direction and definition of every metric")
+    strata: list[StratumScore]
+    causes: dict[str, dict[str, int]] = Field(description="images by cause and kind")
+    failures: dict[str, int] = Field(description="pairs for which the method did not come back, by the harness's word")
+    worst: list[Worst]
+    records: str = Field(description="name of the Parquet file")
+    records_sha256: str
+
+    @property
+    def overall(self) -> dict[str, Value]:
+        """Metrics of the whole."""
+        return self.strata[0].metrics
+
+
+def finite(value: float | None) -> float | None:
+    """Value, or None where it is not finite."""
+    return value if value is not None and math.isfinite(value) else None
+
+
+def parquet_path(path: Path) -> Path:
+    """Where the records of a score lie."""
+    return path.with_suffix(".parquet")
+
+
+def write_score(path: Path, document: ScoreDocument, records: pl.DataFrame) -> ScoreDocument:
+    """Write records, then the document that names their hash; both complete or not at all."""
+    if path.suffix != ".json":
+        raise DatasetError(f"{path}: a score is a JSON file; give a name that ends in .json")
+    buffer = io.BytesIO()
+    records.write_parquet(buffer)
+    target = write_bytes(parquet_path(path), buffer.getvalue())
+    complete = document.model_copy(update={"records": target.name, "records_sha256": sha256(target)})
+    write_text(path, json.dumps(complete.model_dump(mode="json"), indent=1, allow_nan=False) + "\n")
+    return complete
+
+
+def read_score(path: Path) -> ScoreDocument:
+    """Read a score.
+
+    Raises
+    ------
+    DatasetError
+        If the file is no score, or one of another version; in one sentence.
+    """
+    try:
+        raw = json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise DatasetError(f"{path} is not JSON ({error}): give a file that `phibench score --method` wrote") from None
+    if not isinstance(raw, dict) or raw.get("kind") != KIND:
+        raise DatasetError(f"{path} is no score: give a JSON file that `phibench score --method ... --out` wrote")
+    if raw.get("version") != VERSION:
+        raise DatasetError(f"{path} has version {raw.get('version')}, this program reads {VERSION}: score again")
+    try:
+        return ScoreDocument.model_validate_json(json.dumps(raw))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise DatasetError(f"{path}: {where}: {first['msg']}; the file was changed: score again") from None
+
+
+def read_records(path: Path, document: ScoreDocument) -> pl.DataFrame:
+    """Records of the score at `path`.
+
+    Raises
+    ------
+    DatasetError
+        If the Parquet file is not there or not the one that belongs to the score.
+    """
+    target = path.with_name(document.records)
+    if not target.is_file():
+        raise DatasetError(f"{target} is missing: it belongs to {path.name}; keep both together, or score again")
+    if sha256(target) != document.records_sha256:
+        raise DatasetError(f"{target} is not the file that {path.name} was written with: score again")
+    return pl.read_parquet(target)

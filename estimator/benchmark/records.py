@@ -1,0 +1,322 @@
+"""One record per pair and image: answer, truth, errors, bound. The table that every score is computed from.
+
+Two rows per pair, "down" and "up"; columns of the pair are in both. Null where there is nothing: no answer, no
+truth (a spot without an image), no claimed covariance, no bound, or a ray that does not reach. Never NaN.
+`COLUMNS` says what each column is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from phibench.datasets.errors import DatasetError
+from phibench.estimator.benchmark import answer_errors as errors
+from phibench.estimator.benchmark.answer_errors import Rules
+from phibench.estimator.geometry.least_squares_depth import believed_depth
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.interface import OK, Answer, Outcome, Spot
+from phibench.estimator.pair_set import PairSet, PairTruth, SpotTruth
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import POSITIONS, Rig
+
+_NO_MATRIX = np.full((2, 2), np.nan)
+_BAYER = {(0, 0): "red", (1, 0): "green in red row", (0, 1): "green in blue row", (1, 1): "blue"}
+
+COLUMNS: dict[str, str] = {
+    "number": "pair, as in the pair set",
+    "sample_id": "sample; intervals resample these",
+    "draw": "draw of the noise",
+    "image": "down or up",
+    "preset": "preset of the sensor",
+    "jpeg_quality": "libjpeg's quality; null unless MJPEG",
+    "hinted": "whether the method got boxes",
+    "depth_m": "D",
+    "stroke_m": "h",
+    "azimuth_rad": "azimuth of the mirror's normal",
+    "electrons": "expected electrons of the spot",
+    "snr": "flux over its standard deviation, position known",
+    "saturated": "a pixel of the spot is expected above saturation",
+    "visible": "whether the chief ray reaches the sensor",
+    "unseen_because": "why not; none if visible",
+    "u_true_px": "chief ray",
+    "v_true_px": "chief ray",
+    "from_centre_px": "true distance from the image of the sphere centre",
+    "bayer": "2 x 2 cell's pixel that holds the true position",
+    "status": "ok, or the method's or the harness's word why there is no position",
+    "u_px": "answer",
+    "v_px": "answer",
+    "du_px": "answer - truth",
+    "dv_px": "answer - truth",
+    "distance_px": "hypot(du, dv)",
+    "radial_px": "error outwards from the image of the sphere centre",
+    "tangential_px": "error across it, u towards v",
+    "detected": "visible, and a position within match_px",
+    "missed": "visible and not detected",
+    "false_detection": "a position where the spot is not visible, or further than match_px from it",
+    "counted_px": "distance_px if detected, match_px if missed",
+    "phi_convention": "ray, normal, incidence or outline",
+    "phi_rad": "the method's, else estimator.phi of its pixel through the believed rig",
+    "phi_true_rad": "truth in that convention; outline: estimator.phi of the true pixel through the true rig",
+    "phi_error_rad": "phi_rad - phi_true_rad, in units of phi_ray: times d phi_ray / d phi along the gradient",
+    "pull_u": "first component of L^-1 e, C = L L^T the claimed covariance",
+    "pull_v": "second component",
+    "mahalanobis2": "e^T C^-1 e",
+    "bound_px2": "trace of the Cramer-Rao bound: expected squared distance at the limit",
+    "raw_bound_px2": "the same of the raw pixels behind the image",
+    "bound_phi_rad2": "variance of phi at the bound",
+    "pair_visible": "both spots are visible",
+    "pair_electrons": "the fainter spot's electrons",
+    "depth_found": "see bench/rules.py",
+    "depth_from": "method or pixels",
+    "depth_estimate_m": "D of the answer",
+    "depth_error_m": "depth_estimate_m - depth_m",
+    "depth_relative": "depth_error_m / depth_m",
+    "depth_counted": "|depth_relative|, at most missed_relative; that too if not found; null unless pair_visible",
+    "depth_sigma_m": "claimed: the method's with its own depth, else from its covariances; with a calibration's part",
+    "depth_pull": "depth_error_m / depth_sigma_m",
+    "bound_depth_m2": "variance of D at the bounds of both spots; without calibration",
+    "seconds": "inside the method",
+    "failure": "of the harness; empty if none",
+    "message": "about the failure",
+}
+
+
+def records(pairs: PairSet, outcomes: Iterable[Outcome], rules: Rules) -> pl.DataFrame:
+    """Records of a run, `COLUMNS`, two rows per pair in the order of their numbers.
+
+    Parameters
+    ----------
+    pairs : PairSet
+        Truths are taken of the pairs that have an outcome.
+    outcomes : one per pair
+    rules : Rules
+
+    Raises
+    ------
+    DatasetError
+        If a pair has several outcomes, a number is none of the set, or the set is sealed.
+    """
+    ordered = in_order(outcomes, len(pairs))
+    return record_table([pairs.truth(outcome.number) for outcome in ordered], ordered, rules)
+
+
+def record_table(truths: Sequence[PairTruth], outcomes: Sequence[Outcome], rules: Rules) -> pl.DataFrame:
+    """As `records`, from truths and outcomes side by side."""
+    if not truths:
+        raise DatasetError("a score of no pairs: give at least one")
+    index: dict[tuple[Rig, Rig, int], list[int]] = {}
+    for i, truth in enumerate(truths):
+        # a calibration goes with its rig; its array is one object for all pairs, or rows that are equal stay apart
+        index.setdefault((truth.believed_rig, truth.true_rig, id(truth.calibration_covariance)), []).append(i)
+    frames = [
+        _of_rigs(believed, true, [truths[i] for i in rows], [outcomes[i] for i in rows], rules)
+        for (believed, true, _), rows in index.items()
+    ]
+    table = pl.concat(frames).sort("number", pl.col("image") == "up")
+    return table.with_columns(pl.col(pl.Float64).fill_nan(None)).select(*COLUMNS)
+
+
+def in_order(outcomes: Iterable[Outcome], count: int) -> list[Outcome]:
+    """Outcomes by number.
+
+    Raises
+    ------
+    DatasetError
+        If a pair has several, or a number is not 0 to count - 1.
+    """
+    ordered = sorted(outcomes, key=lambda outcome: outcome.number)
+    numbers = [outcome.number for outcome in ordered]
+    if len(set(numbers)) != len(numbers):
+        twice = next(number for number in numbers if numbers.count(number) > 1)
+        raise DatasetError(f"pair {twice} has several outcomes: a score takes one of each pair")
+    if numbers and not (numbers[0] >= 0 and numbers[-1] < count):
+        raise DatasetError(f"outcomes of pairs {numbers[0]} to {numbers[-1]}, but the set has {count} pairs from 0 up")
+    return ordered
+
+
+def _of_rigs(believed: Rig, true: Rig, truths: list[PairTruth], outcomes: list[Outcome], rules: Rules) -> pl.DataFrame:
+    """Records of pairs that share their rigs, image by image, then the pairs' own columns."""
+    images = {p: _image_columns(p, believed, true, truths, outcomes, rules) for p in POSITIONS}
+    pair = _pair_columns(believed, truths, outcomes, images, rules)
+    return pl.concat([pl.DataFrame({**images[p], **pair}, schema_overrides=_TYPES) for p in POSITIONS])
+
+
+_TYPES = {
+    "jpeg_quality": pl.Int64,
+    "status": pl.String,
+    "phi_convention": pl.String,
+    "depth_from": pl.String,
+    "bayer": pl.String,
+}
+
+
+def _image_columns(
+    position: str, believed: Rig, true: Rig, truths: list[PairTruth], outcomes: list[Outcome], rules: Rules
+) -> dict[str, Any]:
+    spots: list[SpotTruth] = [getattr(truth, position) for truth in truths]
+    answers = [_spot(outcome, position) for outcome in outcomes]
+    xy, uv = _stack(spot.uv_px for spot in spots), _stack(map(_position, answers))
+    error = errors.pixel_errors(true, xy, uv)
+    given, visible = np.isfinite(uv).all(axis=1), np.array([spot.visible for spot in spots])
+    near = error.distance_px <= rules.match_px  # False for NaN
+    detected = visible & near
+    pull = errors.whitened(np.stack([error.du_px, error.dv_px], -1), errors.usable_covariance(_claimed(answers)))
+    bound, raw = (_bounds(spots, name) for name in ("bound_px2", "raw_bound_px2"))
+    return {
+        "image": [position] * len(spots),
+        "azimuth_rad": [spot.azimuth_rad for spot in spots],
+        "electrons": [float(spot.electrons) for spot in spots],
+        "snr": [float(spot.snr) for spot in spots],
+        "saturated": [bool(spot.saturated) for spot in spots],
+        "visible": visible,
+        "unseen_because": [spot.cause for spot in spots],
+        "u_true_px": xy[:, 0],
+        "v_true_px": xy[:, 1],
+        "from_centre_px": errors.from_centre_px(true, xy),
+        "bayer": [_bayer(x) for x in xy],
+        "status": [_status(*both, position) for both in zip(answers, outcomes, strict=True)],
+        "u_px": uv[:, 0],
+        "v_px": uv[:, 1],
+        "du_px": error.du_px,
+        "dv_px": error.dv_px,
+        "distance_px": error.distance_px,
+        "radial_px": error.radial_px,
+        "tangential_px": error.tangential_px,
+        "detected": detected,
+        "missed": visible & ~detected,
+        "false_detection": given & ~detected,
+        "counted_px": np.where(visible, np.where(detected, error.distance_px, rules.match_px), np.nan),
+        **_phi_columns(believed, true, xy, uv, spots, answers),
+        "pull_u": pull[:, 0],
+        "pull_v": pull[:, 1],
+        "mahalanobis2": np.sum(pull**2, axis=-1),
+        "bound_px2": np.trace(bound, axis1=1, axis2=2),
+        "raw_bound_px2": np.trace(raw, axis1=1, axis2=2),
+        "bound_phi_rad2": errors.phi_variance(believed, xy, bound),
+    }
+
+
+def _phi_columns(
+    believed: Rig, true: Rig, xy: Array, uv: Array, spots: list[SpotTruth], answers: list[Spot | None]
+) -> dict[str, Any]:
+    own = np.array([_own_phi(answer) for answer in answers])
+    convention = [
+        a.phi_convention if a is not None and np.isfinite(x) else "ray" for a, x in zip(answers, own, strict=True)
+    ]
+    phi = np.where(np.isfinite(own), own, errors.phi_of("ray", believed, uv))
+    outline = errors.phi_of("outline", true, xy)
+    truth = np.array([s.phi_rad.get(c, o) for s, c, o in zip(spots, convention, outline, strict=True)])
+    return {
+        "phi_convention": [c if np.isfinite(x) else None for c, x in zip(convention, phi, strict=True)],
+        "phi_rad": phi,
+        "phi_true_rad": truth,
+        "phi_error_rad": (phi - truth) * errors.in_ray_units(true, xy, convention),
+    }
+
+
+def _pair_columns(
+    believed: Rig, truths: list[PairTruth], outcomes: list[Outcome], images: dict[str, dict[str, Any]], rules: Rules
+) -> dict[str, Any]:
+    down, up = (images[p] for p in POSITIONS)
+    bounds = [_bounds([getattr(t, p) for t in truths], "bound_px2") for p in POSITIONS]
+    claims = [errors.usable_covariance(_claimed([_spot(o, p) for o in outcomes])) for p in POSITIONS]
+    true_m, h = (np.array([getattr(t, name) for t in truths], float) for name in ("depth_m", "stroke_m"))
+    believed_h = np.array([t.stroke_m if t.believed_stroke_m is None else t.believed_stroke_m for t in truths], float)
+    answers, truth = (
+        [np.stack([i[u], i[v]], -1) for i in (down, up)] for u, v in (("u_px", "v_px"), ("u_true_px", "v_true_px"))
+    )
+    calibration = truths[0].calibration_covariance
+    found_m = believed_depth(believed, believed_h, (answers[0], answers[1]), (claims[0], claims[1]), calibration)
+    own, own_sigma = (np.array([_own_depth(o.answer, name) for o in outcomes]) for name in ("depth_m", "sigma_depth_m"))
+    has_own = np.isfinite(own)
+    own_sigma = np.hypot(own_sigma, found_m.calibration_sigma_m)
+    depth, sigma = np.where(has_own, own, found_m.depth_m), np.where(has_own, own_sigma, found_m.sigma_m)
+    both = down["visible"] & up["visible"]
+    wrong = down["false_detection"] | up["false_detection"]
+    found = both & (depth > 0.0) & np.where(has_own, ~wrong, down["detected"] & up["detected"])
+    relative = depth / true_m - 1.0
+    counted = np.where(found, np.minimum(np.abs(relative), rules.missed_relative), rules.missed_relative)
+    return {
+        "number": [t.number for t in truths],
+        "sample_id": [t.sample_id for t in truths],
+        "draw": [t.draw for t in truths],
+        "preset": [t.preset for t in truths],
+        "jpeg_quality": [t.jpeg_quality for t in truths],
+        "hinted": [t.hinted for t in truths],
+        "depth_m": true_m,
+        "stroke_m": h,
+        "pair_visible": both,
+        "pair_electrons": np.minimum(down["electrons"], up["electrons"]),
+        "depth_found": found,
+        "depth_from": [_depth_from(*x) for x in zip(has_own, np.isfinite(depth), strict=True)],
+        "depth_estimate_m": depth,
+        "depth_error_m": depth - true_m,
+        "depth_relative": relative,
+        "depth_counted": np.where(both, counted, np.nan),
+        "depth_sigma_m": sigma,
+        "depth_pull": (depth - true_m) / np.where(sigma > 0.0, sigma, np.nan),
+        "bound_depth_m2": depth_exact(believed, believed_h, *truth, *bounds).sigma_m ** 2,
+        "seconds": [float(o.seconds) for o in outcomes],
+        "failure": [o.failure for o in outcomes],
+        "message": [o.message for o in outcomes],
+    }
+
+
+def _spot(outcome: Outcome, position: str) -> Spot | None:
+    return None if outcome.answer is None else getattr(outcome.answer, position)
+
+
+def _position(spot: Spot | None) -> tuple[float, float]:
+    """(u, v), NaN where there is none; a status other than "ok" takes a position back."""
+    if spot is None or spot.status != OK or spot.uv_px is None or not np.isfinite(spot.uv_px).all():
+        return math.nan, math.nan
+    return spot.uv_px
+
+
+def _status(spot: Spot | None, outcome: Outcome, position: str) -> str:
+    if spot is None:
+        return outcome.failure or "no answer"
+    return spot.status if spot.status != OK or np.isfinite(_position(spot)).all() else "no position"
+
+
+def _claimed(spots: list[Spot | None]) -> Array:
+    claims = (None if spot is None else spot.covariance_px2 for spot in spots)
+    return np.stack([_NO_MATRIX if claim is None else np.asarray(claim, float) for claim in claims])
+
+
+def _own_phi(spot: Spot | None) -> float:
+    if spot is None or spot.phi_rad is None or not np.isfinite(_position(spot)).all():
+        return math.nan
+    return spot.phi_rad
+
+
+def _own_depth(answer: Answer | None, name: str) -> float:
+    value = None if answer is None else getattr(answer, name)
+    return math.nan if value is None else float(value)
+
+
+def _depth_from(own: bool, there: bool) -> str | None:
+    if not there:
+        return None
+    return "method" if own else "pixels"
+
+
+def _bounds(spots: list[SpotTruth], name: str) -> Array:
+    matrices: Iterator[Array | None] = (getattr(spot, name) for spot in spots)
+    return np.stack([_NO_MATRIX if matrix is None else np.asarray(matrix, float) for matrix in matrices])
+
+
+def _bayer(uv_px: Array) -> str | None:
+    if not np.isfinite(uv_px).all():
+        return None
+    u, v = np.floor(uv_px + 0.5).astype(int) % 2
+    return _BAYER[int(u), int(v)]
+
+
+def _stack(points: Iterable[tuple[float, float]]) -> Array:
+    return np.array(list(points), float).reshape(-1, 2)

@@ -1,0 +1,391 @@
+"""The worst images of a run, each with a small crop that lies in the score: a report needs no data set.
+
+Scores of methods on a pair set: run them, join answers and truth, measure, name causes, keep the worst.
+
+The whole benchmark on one data set: every built-in method on every preset that it accepts, then one report.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import os
+import sys
+import webbrowser
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+from PIL import Image
+from rich.console import Console
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.progress import Steps
+from phibench.datasets.read import Dataset, open_finished
+from phibench.datasets.store.files import require_writable
+from phibench.datasets.store.provenance import code_behind, provenance
+from phibench.estimator.benchmark.answer_errors import Rules
+from phibench.estimator.benchmark.causes import count, count_failures, with_causes
+from phibench.estimator.benchmark.dataset_pairs import CalibratedPairs, dataset_pairs, of_calibration
+from phibench.estimator.benchmark.document import (
+    KIND,
+    VERSION,
+    MethodCard,
+    ScoreDocument,
+    StratumScore,
+    Value,
+    Worst,
+    finite,
+    write_score,
+)
+from phibench.estimator.benchmark.metrics import METRICS
+from phibench.estimator.benchmark.records import in_order, record_table
+from phibench.estimator.benchmark.report import write_report
+from phibench.estimator.benchmark.strata import Stratum, count_pairs, measured, strata
+from phibench.estimator.calibration.file import read_calibration
+from phibench.estimator.interface import Box, Outcome, Pair
+from phibench.estimator.methods.registry import METHODS, BuiltIn
+from phibench.estimator.pair_set import HeldPairs, PairSet
+from phibench.estimator.sandbox.resolve import Limits, resolve
+from phibench.estimator.sandbox.runner import Harness
+from phibench.scenes.frames import Array
+
+CROP_PX = 48
+COUNT = 10
+
+
+def worst(records: pl.DataFrame, draw: Callable[[int], Pair], count: int = COUNT) -> list[Worst]:
+    """Worst images first: wrong positions by distance, then no position, then detected spots by distance.
+
+    Only visible spots, and one image of a sample: ten draws of one spot would show one thing ten times.
+    """
+    return [_entry(row, draw) for row in _ranked(records).head(count).iter_rows(named=True)]
+
+
+def worst_of(records: pl.DataFrame, entries: Sequence[Worst], count: int = COUNT) -> list[Worst]:
+    """Worst images of all records, out of the worst ones of their parts."""
+    known = {(entry.number, entry.image): entry for entry in entries}
+    rows = _ranked(records).head(count).select("number", "image").iter_rows()
+    return [known[number, image] for number, image in rows]
+
+
+def _ranked(records: pl.DataFrame) -> pl.DataFrame:
+    """One image of each sample, the worst first."""
+    rank = pl.when(pl.col("detected")).then(0).when(pl.col("distance_px").is_null()).then(1).otherwise(2)
+    return (
+        records.filter(pl.col("visible"))
+        .with_columns(rank=rank)
+        .sort("rank", "distance_px", "number", "image", descending=[True, True, False, False], nulls_last=True)
+        .unique("sample_id", keep="first", maintain_order=True)
+    )
+
+
+def crop(image: NDArray[Any], uv_px: Array, side_px: int = CROP_PX) -> tuple[NDArray[np.uint8], tuple[int, int]]:
+    """Part of an image around a position, 8 bits, stretched to its own darkest and brightest value.
+
+    Returns
+    -------
+    pixels : shape (h, w) or (h, w, 3)
+    origin : (u, v) of the first column and row
+    """
+    u, v = (int(x) for x in np.floor(uv_px + 0.5) - side_px // 2)
+    u0, v0 = max(u, 0), max(v, 0)
+    part = np.asarray(image[v0 : max(v + side_px, 0), u0 : max(u + side_px, 0)], float)
+    low, high = (part.min(), part.max()) if part.size else (0.0, 1.0)
+    return np.round(255.0 * (part - low) / max(high - low, 1e-9)).astype(np.uint8), (u0, v0)
+
+
+def _entry(row: dict[str, Any], draw: Callable[[int], Pair]) -> Worst:
+    true = np.array([row["u_true_px"], row["v_true_px"]])
+    pixels, origin = crop(getattr(draw(row["number"]), row["image"]), true)
+    answer = None if row["u_px"] is None else (row["u_px"] - origin[0], row["v_px"] - origin[1])
+    return Worst(
+        **{
+            name: row[name]
+            for name in ("number", "sample_id", "image", "depth_m", "electrons", "distance_px", "status")
+        },
+        cause=row["cause"],
+        true_in_crop_px=(float(true[0] - origin[0]), float(true[1] - origin[1])),
+        answer_in_crop_px=answer,
+        size_px=(pixels.shape[1], pixels.shape[0]),
+        png_base64=_png(pixels) if pixels.size else None,
+    )
+
+
+def _png(pixels: NDArray[np.uint8]) -> str:
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="PNG", optimize=True)
+    return base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+Ask = Callable[[PairSet, Sequence[int]], Iterable[tuple[Outcome, ...]]]
+"""Pairs and numbers to the outcomes of every method: `estimator.seat.harness.Harness.outcomes`."""
+AT_ONCE = 16
+"""Pairs in memory at a time; one of MJPEG frames with the laser on and off takes 11 MB."""
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A score with the records that it was computed from."""
+
+    document: ScoreDocument
+    records: pl.DataFrame
+
+
+@dataclass(frozen=True)
+class Examined:
+    """Some pairs of one method: records with causes, and its worst images among them."""
+
+    records: pl.DataFrame
+    worst: list[Worst]
+
+
+def score_methods(
+    methods: Sequence[MethodCard],
+    pairs: PairSet,
+    ask: Ask,
+    rules: Rules | None = None,
+    seed: int = 0,
+    limits: Mapping[str, Any] | None = None,
+    told: Callable[[int], None] = lambda done: None,
+) -> list[Scored]:
+    """Run methods on all pairs of a set and score them; each pair is drawn once for all of them.
+
+    Parameters
+    ----------
+    methods : MethodCards, in the order in which `ask` answers
+    pairs : PairSet
+    ask : Ask
+    rules : Rules, by default the usual ones
+    seed : int
+        Of the bootstrap; 0 or above.
+    limits : the harness's, for the record
+    told : callable
+        Given the number of pairs that are done, now and then.
+
+    Raises
+    ------
+    DatasetError
+        If the set is sealed or empty, or an outcome belongs to no pair.
+    """
+    rules = rules or Rules()
+    parts: list[list[Examined]] = [[] for _ in methods]
+    for start in range(0, len(pairs), AT_ONCE):
+        numbers = range(start, min(start + AT_ONCE, len(pairs)))
+        held = HeldPairs(pairs)
+        answers = list(ask(held, numbers))
+        for part, outcomes in zip(parts, zip(*answers, strict=True), strict=True):
+            part.append(examine(held, outcomes, rules))
+        told(numbers.stop)
+    return [
+        _scored(method, pairs, part, rules, seed, limits or {}) for method, part in zip(methods, parts, strict=True)
+    ]
+
+
+def score_outcomes(
+    method: MethodCard,
+    pairs: PairSet,
+    outcomes: Iterable[Outcome],
+    rules: Rules,
+    seed: int = 0,
+    limits: Mapping[str, Any] | None = None,
+) -> Scored:
+    """Score what a method has answered on all pairs; parameters as for `score_methods`."""
+    ordered = in_order(outcomes, len(pairs))
+    parts = [
+        examine(HeldPairs(pairs), ordered[i : i + AT_ONCE], rules) for i in range(0, max(len(ordered), 1), AT_ONCE)
+    ]
+    return _scored(method, pairs, parts, rules, seed, limits or {})
+
+
+def examine(pairs: PairSet, outcomes: Sequence[Outcome], rules: Rules) -> Examined:
+    """Join outcomes with truth and images."""
+    truths = [pairs.truth(outcome.number) for outcome in outcomes]
+    table = record_table(truths, outcomes, rules)
+    table = with_causes(table, {truth.number: truth for truth in truths}, pairs.pair, rules)
+    return Examined(table, worst(table, pairs.pair))
+
+
+def _scored(
+    method: MethodCard,
+    pairs: PairSet,
+    parts: Sequence[Examined],
+    rules: Rules,
+    seed: int,
+    limits: Mapping[str, Any],
+) -> Scored:
+    if not parts:
+        raise DatasetError("the pair set is empty: there is nothing to score")
+    table = pl.concat([part.records for part in parts])
+    document = ScoreDocument(
+        kind=KIND,
+        version=VERSION,
+        method=method,
+        pair_set=pairs.document(),
+        pairs=table["number"].n_unique(),
+        images=len(table),
+        samples=table["sample_id"].n_unique(),
+        seed=seed,
+        rules={name: float(value) for name, value in asdict(rules).items()},
+        limits=dict(limits),
+        provenance=dict(provenance()),
+        code_sha256=code_behind(__name__),
+        metrics={n: {"unit": m.unit, "better": m.better, "text": m.text} for n, m in METRICS.items()},
+        strata=[_stratum(stratum, rules, seed) for stratum in strata(table)],
+        causes=count(table),
+        failures=count_failures(table),
+        worst=worst_of(table, [entry for part in parts for entry in part.worst]),
+        records="",
+        records_sha256="",
+    )
+    return Scored(document, table)
+
+
+def _stratum(stratum: Stratum, rules: Rules, seed: int) -> StratumScore:
+    # the same stream for every method: on the same pairs they are resampled alike, so that their intervals compare
+    values = measured(stratum, rules, "score", seed)
+    return StratumScore(
+        by=stratum.by,
+        label=stratum.label,
+        low=finite(stratum.low),
+        high=finite(stratum.high),
+        mean=finite(stratum.mean),
+        images=len(stratum.images),
+        pairs=count_pairs(stratum),
+        metrics={name: Value.of(value) for name, value in values.items()},
+    )
+
+
+PRESETS = ("bayer-raw", "srgb8", "mjpeg")
+"""Of a data set whose recipe has no `[frames]`."""
+REPORT = "report.html"
+_PROBE_BOX = Box(0, 0, 16, 16)  # a method that needs boxes takes the pairs that have some
+
+
+@dataclass(frozen=True)
+class Benched:
+    """What a run wrote: the report, the score files, and which methods were left out, why."""
+
+    report: Path
+    scores: tuple[Path, ...]
+    notes: tuple[str, ...]
+
+
+def bench(
+    folder: str | Path,
+    out: str | Path,
+    methods: Sequence[str] | None = None,
+    workers: int = 1,
+    pairs: int | None = None,
+    console: Console | None = None,
+    calibration: str | Path | None = None,
+) -> Benched:
+    """Run built-in methods on all presets of a data set and write scores and a report.
+
+    Parameters
+    ----------
+    folder : finished data set
+    out : folder for `<preset>-<method>.json` and `report.html`
+    methods : names of built-in methods; all by default
+    workers : pairs that are worked on at a time
+    pairs : the first so many of each preset; all by default
+    console : where progress goes; by default the standard error
+    calibration : file of `phibench calibrate`; the pairs are then those of its rig, with its numbers
+
+    Raises
+    ------
+    DatasetError
+        If the data set will not do, or a method is unknown.
+    """
+    dataset, out = open_finished(folder), Path(out)
+    console, chosen = console or Console(stderr=True), _chosen(METHODS, methods)
+    if out.resolve() == dataset.folder.resolve() or dataset.folder.resolve() in out.resolve().parents:
+        raise DatasetError(f"{out} lies inside the data set, whose files are signed; give a folder outside, --out")
+    require_writable(out / REPORT)
+    scores, notes = [], []
+    for preset in _presets(dataset):
+        taken = wanted_pairs(dataset, preset, pairs=pairs, calibration=calibration)
+        refusals = {name: refusal(METHODS[name], taken) for name in chosen}
+        notes += [f"{name} is left out on {preset}: {why}" for name, why in refusals.items() if why]
+        names = [name for name, why in refusals.items() if not why]
+        for name, scored in zip(names, run_and_score(names, taken, workers, console, preset), strict=True):
+            path = out / f"{preset}-{name}.json"
+            write_score(path, scored.document, scored.records)
+            scores.append(path)
+    if not scores:
+        raise DatasetError(f"none of {', '.join(chosen)} takes a preset of {folder}: give other --methods")
+    return Benched(write_report(scores, out / REPORT), tuple(scores), tuple(notes))
+
+
+def run_and_score(
+    references: Sequence[str],
+    pairs: PairSet,
+    workers: int,
+    console: Console,
+    title: str,
+    seed: int = 0,
+    limits: Limits | None = None,
+) -> list[Scored]:
+    """Score methods on the same pairs, each in a process of its own; parameters as for `bench`.
+
+    Raises
+    ------
+    MethodError
+        If a method cannot be found or imported.
+    """
+    found, limits = [resolve(reference) for reference in references], limits or Limits()
+    cards = [MethodCard.of(name, **method.document()) for name, method in zip(references, found, strict=True)]
+    if not cards:
+        return []
+    with Harness(found, limits, workers) as harness, Steps(console, title, len(pairs)) as steps:
+        return score_methods(cards, pairs, harness.outcomes, None, seed, asdict(limits), steps.reach)
+
+
+def wanted_pairs(
+    dataset: Dataset,
+    preset: str | None,
+    draws: int | None = None,
+    pairs: int | None = None,
+    hints: bool = True,
+    calibration: str | Path | None = None,
+) -> PairSet:
+    """As `dataset_pairs`; with a calibration file its rig's pairs, with the calibrated rig, stroke and covariance.
+
+    Raises
+    ------
+    DatasetError
+        As `dataset_pairs`, or if the calibration cannot be read or is that of another rig.
+    """
+    if calibration is None:
+        return dataset_pairs(dataset, preset, draws, pairs, hints)
+    read = read_calibration(calibration)
+    return CalibratedPairs(dataset_pairs(of_calibration(dataset, read), preset, draws, pairs, hints), read)
+
+
+def refusal(method: BuiltIn, pairs: PairSet) -> str:
+    """Why a built-in method cannot take the pairs of a preset; "" if it can."""
+    return method.refusal(replace(pairs.pair(0), box_down=_PROBE_BOX, box_up=_PROBE_BOX))
+
+
+def show(page: Path) -> bool:
+    """Open a page in a browser, where somebody sits before one; return whether it was opened."""
+    display = sys.platform in ("darwin", "win32") or any(
+        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
+    )
+    return sys.stdout.isatty() and display and webbrowser.open(page.resolve().as_uri())
+
+
+def _presets(dataset: Dataset) -> tuple[str, ...]:
+    frames = dataset.recipe.frames
+    return PRESETS if frames is None else frames.presets
+
+
+def _chosen(known: Mapping[str, BuiltIn], wanted: Sequence[str] | None) -> list[str]:
+    names = list(known) if wanted is None else list(dict.fromkeys(wanted))
+    if strange := [name for name in names if name not in known]:
+        raise DatasetError(f"no built-in method '{strange[0]}'; known: {', '.join(known)}")
+    return names

@@ -1,0 +1,382 @@
+"""What is where in a sealed set, and the documents in it.
+
+seal.json       what was sealed, and the SHA-256 that the truth must have
+pairs.jsonl     per pair what a user knows: rig, stroke, sensor, boxes, files
+frames/         images: PNG of 8 or 16 bits, or the camera's JPEG
+SHA256SUMS      of everything above
+
+The truth of a set as one canonical JSON file: same truth and salt, same bytes. NaN is null.
+
+Sealing a data set: frames and what a user knows go out, the truth stays, and its hash says which truth it was.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import secrets
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+from rich.console import Console
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.frame_files import png_bytes
+from phibench.datasets.frames.source import Frames
+from phibench.datasets.progress import Steps
+from phibench.datasets.read import open_finished
+from phibench.datasets.recipe.load import RECIPES, load_recipe
+from phibench.datasets.recipe.tables import Recipe
+from phibench.datasets.store.checksums import read_sums, sums_text
+from phibench.datasets.store.documents import from_json, to_json
+from phibench.datasets.store.files import TEMPORARY_PREFIX, WriteError, read_rows, sha256, write_bytes, write_text
+from phibench.datasets.store.schema import Document
+from phibench.estimator.benchmark.dataset_pairs import TASK_VERSION, DatasetPairs, dataset_pairs
+from phibench.estimator.interface import Box, Pair
+from phibench.estimator.pair_set import Distraction, PairTruth, SpotTruth
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import Rig
+
+SEAL, PAIRS, FRAMES, SUMS = "seal.json", "pairs.jsonl", "frames", "SHA256SUMS"
+FORMAT = "phibench sealed set 1"
+
+
+class Seal(Document):
+    """`seal.json`.
+
+    `public_sha256` is the hash of the list of hashes of `pairs.jsonl` and of the frames, `truth_sha256` that of the
+    truth's file, which holds a random number of 256 bits, so that nobody can try out truths against it. The id follows
+    from both.
+    """
+
+    format: str
+    id: str
+    task_version: int
+    pairs: int
+    public_sha256: str
+    truth_sha256: str
+    phibench: str | None
+
+
+class PublicBox(Document):
+    """A region hint, as `estimator.seat.pair.Box`."""
+
+    u0_px: int
+    v0_px: int
+    width_px: int
+    height_px: int
+
+
+class PublicPair(Document):
+    """One line of `pairs.jsonl`; `files` by image name: "down", "up", and "down_off", "up_off" where they are."""
+
+    number: int
+    files: dict[str, str]
+    stroke_m: float
+    rig: dict[str, Any]
+    card: dict[str, Any]
+    box_down: PublicBox | None
+    box_up: PublicBox | None
+    beam: dict[str, Any] | None = None
+
+
+def seal_id(public_sha256: str, truth_sha256: str) -> str:
+    """Id of a seal."""
+    return hashlib.sha256(f"{public_sha256}\n{truth_sha256}\n".encode()).hexdigest()[:16]
+
+
+def public_sha256(hashes: Mapping[str, str]) -> str:
+    """Hash of what a method may see: pairs and frames, by relative name."""
+    content = {name: digest for name, digest in hashes.items() if name == PAIRS or name.startswith(f"{FRAMES}/")}
+    return hashlib.sha256(sums_text(content).encode()).hexdigest()
+
+
+def read_seal(folder: Path) -> Seal:
+    """Read `seal.json` and check that it fits the folder's list of hashes.
+
+    Raises
+    ------
+    DatasetError
+        In one sentence: no sealed set, damaged, or changed.
+    """
+    path = folder / SEAL
+    if not path.is_file():
+        raise DatasetError(f"{folder} is no sealed set: it has no {SEAL}; give what `phibench dataset seal` wrote")
+    if not (folder / SUMS).is_file():
+        raise DatasetError(f"{folder / SUMS} is missing; download the set again")
+    try:
+        seal = Seal.model_validate(json.loads(path.read_text(encoding="utf-8")))
+    except (ValidationError, ValueError) as error:
+        raise DatasetError(f"{path} is damaged: it is not a seal; download the set again") from error
+    listed = public_sha256(read_sums(folder))
+    if seal.format != FORMAT or listed != seal.public_sha256 or seal.id != seal_id(listed, seal.truth_sha256):
+        raise DatasetError(
+            f"{folder}: {SEAL} and {SUMS} do not belong together, one was changed; download the set again"
+        )
+    return seal
+
+
+def read_pairs(folder: Path) -> list[PublicPair]:
+    """Lines of `pairs.jsonl`, by number."""
+    return read_rows(folder / PAIRS, PublicPair)
+
+
+_MATRICES = ("bound_px2", "raw_bound_px2")
+_RIGS = ("true_rig", "believed_rig")
+_NOT_SEALED = ("calibration_covariance",)  # a calibration comes with the score, never with the set
+
+
+def truth_text(truths: Sequence[PairTruth], salt: str, public_sha256: str) -> str:
+    """Text of the truth's file: sorted keys, no blanks, doubles that read back to the same bits."""
+    document = {
+        "format": "phibench truth 1",
+        "public_sha256": public_sha256,
+        "salt": salt,
+        "truths": [truth_document(truth) for truth in truths],
+    }
+    return json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False) + "\n"
+
+
+def read_truth_file(path: Path, sha256: str) -> list[PairTruth]:
+    """Truths of a file whose bytes must have a hash.
+
+    Raises
+    ------
+    DatasetError
+        If the file is missing or its bytes are others.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DatasetError(f"{path} is not readable: {error.strerror or error}; give the truth's file") from error
+    found = hashlib.sha256(data).hexdigest()
+    if found != sha256:
+        raise DatasetError(
+            f"{path} is not the truth that was sealed: its SHA-256 begins with {found[:12]}, the seal says "
+            f"{sha256[:12]}; give the file that `phibench dataset seal` wrote for this set"
+        )
+    return [truth_of(document) for document in json.loads(data)["truths"]]
+
+
+def truth_document(truth: PairTruth) -> dict[str, Any]:
+    """A pair's truth as JSON can hold it."""
+    bare = replace(truth, down=_without_arrays(truth.down), up=_without_arrays(truth.up))
+    document = {name: getattr(bare, name) for name in PairTruth.__dataclass_fields__ if name not in _NOT_SEALED}
+    document |= {name: to_json(document[name]) for name in _RIGS}
+    for position in ("down", "up"):
+        spot = getattr(truth, position)
+        matrices = {name: _lists(getattr(spot, name)) for name in _MATRICES}
+        document[position] = {**asdict(getattr(bare, position)), **matrices}
+    nulled: dict[str, Any] = _null_for_nan(document)
+    return nulled
+
+
+def truth_of(document: dict[str, Any]) -> PairTruth:
+    """A pair's truth from its document."""
+    rigs = {name: from_json(Rig, document[name]) for name in _RIGS}
+    return PairTruth(**{**document, **rigs, "down": _spot(document["down"]), "up": _spot(document["up"])})
+
+
+def _spot(document: dict[str, Any]) -> SpotTruth:
+    u_px, v_px = map(_number, document["uv_px"])
+    found = {
+        "uv_px": (u_px, v_px),
+        "phi_rad": {name: _number(value) for name, value in document["phi_rad"].items()},
+        "distractions": tuple(
+            Distraction(one["kind"], (one["uv_px"][0], one["uv_px"][1]), one["electrons"])
+            for one in document["distractions"]
+        ),
+        **{name: _array(document[name]) for name in _MATRICES},
+        **{name: _number(document[name]) for name in ("azimuth_rad", "electrons", "peak_e", "snr")},
+    }
+    return SpotTruth(**{**document, **found})
+
+
+def _without_arrays(spot: SpotTruth) -> SpotTruth:
+    return replace(spot, bound_px2=None, raw_bound_px2=None)
+
+
+def _lists(matrix: Array | None) -> list[list[float]] | None:
+    return None if matrix is None else [[float(x) for x in row] for row in matrix]
+
+
+def _array(rows: list[list[float | None]] | None) -> Array | None:
+    return None if rows is None else np.array([[_number(x) for x in row] for row in rows])
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _null_for_nan(value: Any) -> Any:
+    if isinstance(value, float):
+        return None if math.isnan(value) else value
+    if isinstance(value, dict):
+        return {key: _null_for_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_null_for_nan(item) for item in value]
+    return value
+
+
+_FILE_TIME_S = 315532800  # 1980-01-01: a file's own time would tell the order of the work
+_SALT_BYTES = 32
+_SEED_BITS = 56
+
+
+@dataclass(frozen=True)
+class Sealed:
+    """What sealing wrote: the public folder, the truth's file, the seal, and sentences to heed."""
+
+    public: Path
+    truth_file: Path
+    seal: Seal
+    warnings: tuple[str, ...]
+
+
+def seal(folder: str | Path, public: str | Path, preset: str | None = None, console: Console | None = None) -> Sealed:
+    """Seal the takes of a finished data set.
+
+    Parameters
+    ----------
+    folder : data set
+        The truth's file, `seal_<id>.truth.json`, is written into it.
+    public : folder to write; new or empty
+    preset : str, optional
+        One preset instead of those of the recipe's `[frames]`.
+    console : where progress goes; by default the standard error
+
+    Raises
+    ------
+    DatasetError
+        If the data set or the folder will not do; then nothing is left behind.
+    """
+    public, console = Path(public), console or Console(stderr=True)
+    pairs = dataset_pairs(open_finished(folder), preset)
+    _check_folder(public, Path(folder))
+    try:
+        public.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=TEMPORARY_PREFIX, dir=public.parent))
+        try:
+            return _seal(pairs, Path(folder), work, public, console)
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
+    except OSError as error:
+        text = str(error) if isinstance(error, WriteError) else f"could not write to {public}: {error}"
+        raise DatasetError(f"{text}; then run the same command again") from error
+
+
+def sequence_warnings(recipe: Recipe) -> tuple[str, ...]:
+    """A sentence about samples of which some tell where the others are."""
+    if recipe.random is None or recipe.random.sequence != "sobol":
+        return ()
+    return (
+        "the samples are of a Sobol sequence: whoever has located some spots finds the others from the public strokes, "
+        'so seal a set with sequence = "independent"',
+    )
+
+
+def seed_warnings(name: str, seed: int) -> tuple[str, ...]:
+    """Sentences about a seed that everybody knows or can find; none about a good one."""
+    if (RECIPES / f"{name}.toml").is_file() and load_recipe(name).dataset.seed == seed:
+        return (
+            f"seed {seed} is that of the shipped recipe '{name}': whoever has phibench can render the same truth, so "
+            "seal a set that was made with --seed and a secret number",
+        )
+    if seed < 2**_SEED_BITS:
+        return (
+            f"seed {seed} is short: the rigs in {PAIRS} show which seed they were drawn from to whoever tries all, so "
+            f"seal a set that was made with a random --seed above 2^{_SEED_BITS}",
+        )
+    return ()
+
+
+def _seal(pairs: DatasetPairs, folder: Path, work: Path, public: Path, console: Console) -> Sealed:
+    rows = {}
+    with Steps(console, "pairs", len(pairs)) as steps:
+        for number in _by_sample(pairs):
+            rows[number] = _write_pair(work, *pairs.pair_and_frames(number))
+            steps.advance()
+    lines = (json.dumps(rows[k].model_dump(mode="json"), allow_nan=False) + "\n" for k in range(len(pairs)))
+    write_text(work / PAIRS, "".join(lines))
+    listed = _hashes(work)
+    content = public_sha256(listed)
+    # a secret is the one number that must not come from a named stream
+    text = truth_text([pairs.truth(k) for k in range(len(pairs))], secrets.token_hex(_SALT_BYTES), content)
+    truth_sha256 = hashlib.sha256(text.encode()).hexdigest()
+    document = Seal(
+        format=FORMAT,
+        id=seal_id(content, truth_sha256),
+        task_version=TASK_VERSION,
+        pairs=len(pairs),
+        public_sha256=content,
+        truth_sha256=truth_sha256,
+        phibench=version("phibench"),
+    )
+    write_text(work / SEAL, json.dumps(document.model_dump(mode="json"), indent=1) + "\n")
+    write_text(work / SUMS, sums_text(_hashes(work)))
+    truth_file = write_text(folder / f"seal_{document.id}.truth.json", text)  # first: no seal without its truth
+    _publish(work, public)
+    recipe = pairs.dataset.info.recipe["dataset"]
+    warnings = (*seed_warnings(pairs.dataset.info.name, recipe["seed"]), *sequence_warnings(pairs.dataset.recipe))
+    return Sealed(public, truth_file, document, warnings)
+
+
+def _by_sample(pairs: DatasetPairs) -> list[int]:
+    """Numbers in the order in which layers are read once; the files' names and times do not show it."""
+    return sorted(range(len(pairs)), key=lambda number: pairs.takes[number].sample_id)
+
+
+def _write_pair(work: Path, pair: Pair, frames: Frames) -> PublicPair:
+    files = {}
+    for name, frame in frames.by_name.items():
+        end = "png" if frame.jpeg is None else "jpg"
+        files[name] = f"{FRAMES}/{pair.number:06d}-{name}.{end}"
+        write_bytes(work / files[name], png_bytes(frame.image) if frame.jpeg is None else frame.jpeg)
+    return PublicPair(
+        number=pair.number,
+        files=files,
+        stroke_m=pair.stroke_m,
+        rig=to_json(pair.rig),
+        card=to_json(pair.card),
+        box_down=_public_box(pair.box_down),
+        box_up=_public_box(pair.box_up),
+        beam=None if pair.beam is None else to_json(pair.beam),
+    )
+
+
+def _public_box(box: Box | None) -> PublicBox | None:
+    return None if box is None else PublicBox(**asdict(box))
+
+
+def _hashes(folder: Path) -> dict[str, str]:
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): sha256(path) for path in files}
+
+
+def _check_folder(public: Path, folder: Path) -> None:
+    where = public.resolve()
+    if where == folder.resolve() or folder.resolve() in where.parents:
+        raise DatasetError(f"{public} lies inside the data set, which holds the truth; give a folder outside, --out")
+    if public.exists() and (not public.is_dir() or any(public.iterdir())):
+        raise DatasetError(f"{public} exists and is not an empty folder; give a new one, --out")
+
+
+def _publish(work: Path, public: Path) -> None:
+    """Give every file the same time, then the folder its name."""
+    umask = os.umask(0)
+    os.umask(umask)
+    work.chmod(0o777 & ~umask)
+    for path in (*work.rglob("*"), work):
+        os.utime(path, (_FILE_TIME_S, _FILE_TIME_S))
+    if public.exists():
+        public.rmdir()
+    work.replace(public)

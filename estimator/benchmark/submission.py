@@ -1,0 +1,297 @@
+"""Submissions: what a method answered on a sealed set, and which method it was. No images, no truth.
+
+Unsealing: proof that truth and submission belong to the seal, then truths and outcomes for the score.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, ValidationError
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.store.files import write_text
+from phibench.datasets.store.provenance import provenance
+from phibench.datasets.store.schema import Document, Number, Vector2
+from phibench.estimator.benchmark.document import MethodCard
+from phibench.estimator.benchmark.sealed_pairs import SealedPairs
+from phibench.estimator.benchmark.sealed_set import Seal, read_truth_file
+from phibench.estimator.interface import FAILURES, Outcome, Pair, Spot
+from phibench.estimator.pair_set import PairTruth
+from phibench.estimator.sandbox.answers import AnswerError, checked
+from phibench.estimator.sandbox.resolve import Reference, resolve
+from phibench.estimator.sandbox.runner import run_method
+
+FORMAT = "phibench submission 1"
+Matrix = Annotated[tuple[Vector2, Vector2], Field(strict=False)]
+
+
+class SpotLine(Document):
+    """`estimator.seat.pair.Spot`."""
+
+    uv_px: Vector2 | None
+    covariance_px2: Matrix | None
+    phi_rad: Number | None
+    phi_convention: str
+    status: str
+
+
+class AnswerLine(Document):
+    """One pair: an answer, or the failure that was instead of it."""
+
+    number: int
+    down: SpotLine | None
+    up: SpotLine | None
+    depth_m: Number | None
+    sigma_depth_m: Number | None
+    seconds: Number
+    failure: str
+    message: str
+
+
+class Submission(Document):
+    """`submission.json`; `seal` is the id of the sealed set."""
+
+    format: str
+    seal: str
+    task_version: int
+    method: MethodCard
+    provenance: dict[str, Any]
+    answers: Annotated[tuple[AnswerLine, ...], Field(strict=False)]
+
+
+@dataclass(frozen=True)
+class Submitted:
+    """What `submit` wrote; pairs with an answer, images with a position, and what most of the others have instead."""
+
+    path: Path
+    pairs: int
+    answered: int
+    positions: int
+    silence: str
+
+
+def submit(public: str | Path, method: str, out: str | Path, workers: int = 1) -> Submitted:
+    """Run a method on a sealed set and write its answers.
+
+    Parameters
+    ----------
+    public : folder of the sealed set
+    method : str
+        As for `seat.harness.Harness`.
+    out : JSON file to write
+    workers : pairs that are worked on at a time
+
+    Raises
+    ------
+    DatasetError
+        If the set was changed, the method cannot be run, or an answer is missing.
+    """
+    pairs, out = SealedPairs(Path(public)), Path(out)
+    if out.is_dir():
+        raise DatasetError(f"{out} is a folder; give a file such as submission.json, --out")
+    pairs.check()
+    found = resolve(method)
+    outcomes = run_method(found, pairs, workers=workers)
+    document = submission(pairs.seal, found, outcomes)
+    check_complete(document, pairs.seal, "the run")
+    write_text(out, json.dumps(document.model_dump(mode="json"), indent=1, allow_nan=False) + "\n")
+    spots = [spot for o in outcomes if o.answer is not None for spot in (o.answer.down, o.answer.up)]
+    silent = Counter([f"{o.failure}: {o.message}" for o in outcomes if o.answer is None])
+    silent.update(spot.status for spot in spots if spot.uv_px is None)
+    positions = sum(spot.uv_px is not None for spot in spots)
+    answered = sum(outcome.answer is not None for outcome in outcomes)
+    return Submitted(out, len(outcomes), answered, positions, "".join(text for text, _ in silent.most_common(1)))
+
+
+def submission(seal: Seal, method: Reference, outcomes: Sequence[Outcome]) -> Submission:
+    """Document of a method's outcomes on a sealed set, by number."""
+    return Submission(
+        format=FORMAT,
+        seal=seal.id,
+        task_version=seal.task_version,
+        method=MethodCard.of(method.name, **method.document()),
+        provenance=provenance(),
+        answers=tuple(_line(outcome) for outcome in sorted(outcomes, key=lambda outcome: outcome.number)),
+    )
+
+
+def read_submission(path: Path) -> Submission:
+    """Read a submission.
+
+    Raises
+    ------
+    DatasetError
+        If it is not readable or no submission; in one sentence.
+    """
+    try:
+        document = Submission.model_validate(json.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise DatasetError(f"{path} is not readable: {error.strerror or error}; give a submission") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise DatasetError(
+            f"{path} is no submission: {where}: {first['msg']}; write it with `phibench submit`"
+        ) from error
+    except ValueError as error:
+        raise DatasetError(f"{path} is no submission: it is not JSON; write it with `phibench submit`") from error
+    if document.format != FORMAT:
+        raise DatasetError(f"{path} has the format '{document.format}', not '{FORMAT}'; write it with this phibench")
+    return document
+
+
+def check_complete(document: Submission, seal: Seal, name: str) -> None:
+    """Refuse a submission of another seal or version, and one that has not each pair once; `name` is what it is called.
+
+    Raises
+    ------
+    DatasetError
+        In one sentence.
+    """
+    if document.seal != seal.id:
+        raise DatasetError(
+            f"{name} answers the seal {document.seal}, not {seal.id}; submit to the set that is unsealed"
+        )
+    if document.task_version != seal.task_version:
+        text = f"{name} is of task version {document.task_version}, the seal of {seal.task_version}"
+        raise DatasetError(f"{text}; submit again with the version of the seal")
+    counts = Counter(line.number for line in document.answers)
+    if twice := sorted(number for number, count in counts.items() if count > 1):
+        raise DatasetError(f"{name} answers pair {twice[0]} twice; answer each once")
+    if missing := sorted(set(range(seal.pairs)) - set(counts)):
+        text = f"{name} lacks pair {missing[0]} ({len(missing)} of {seal.pairs} are missing)"
+        raise DatasetError(f"{text}; a pair without a spot is answered with a status")
+    if strange := sorted(set(counts) - set(range(seal.pairs))):
+        raise DatasetError(f"{name} answers pair {strange[0]}, the seal has 0 to {seal.pairs - 1}; remove it")
+
+
+def outcomes_of(document: Submission) -> list[Outcome]:
+    """Outcomes of a submission, by number."""
+    return [_outcome(line) for line in sorted(document.answers, key=lambda line: line.number)]
+
+
+def _line(outcome: Outcome) -> AnswerLine:
+    answer = outcome.answer
+    return AnswerLine(
+        number=outcome.number,
+        down=None if answer is None else _spot_line(answer.down),
+        up=None if answer is None else _spot_line(answer.up),
+        depth_m=None if answer is None else _finite(answer.depth_m),
+        sigma_depth_m=None if answer is None else _finite(answer.sigma_depth_m),
+        seconds=math.nan if _finite(outcome.seconds) is None else float(outcome.seconds),
+        failure=outcome.failure,
+        message=outcome.message,
+    )
+
+
+def _spot_line(spot: Spot) -> SpotLine:
+    uv, covariance = spot.uv_px, spot.covariance_px2
+    matrix = None
+    if covariance is not None:
+        (uu, cross), (vu, vv) = covariance
+        matrix = (float(uu), float(cross)), (float(vu), float(vv))
+    return SpotLine(
+        uv_px=None if uv is None else (float(uv[0]), float(uv[1])),
+        covariance_px2=matrix,
+        phi_rad=_finite(spot.phi_rad),
+        phi_convention=spot.phi_convention,
+        status=spot.status,
+    )
+
+
+def _finite(value: float | None) -> float | None:
+    """Python float; None for what is not finite, which JSON cannot hold."""
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def _outcome(line: AnswerLine) -> Outcome:
+    """Outcome of a line, by the rules of the seat: what is no answer there is none here."""
+    has_answer = line.down is not None and line.up is not None
+    if line.failure not in ("", *FAILURES) or has_answer == bool(line.failure) or line.seconds < 0.0:
+        raise DatasetError(
+            f"the submission's pair {line.number} is not one that `phibench submit` writes: an answer or a failure of "
+            f"{', '.join(FAILURES)}, and seconds of 0 or above; submit again"
+        )
+    if line.down is None or line.up is None:
+        return Outcome(line.number, None, line.seconds, line.failure, line.message)
+    try:
+        answer = checked({**_plain(line), "down": _plain(line.down), "up": _plain(line.up)})
+    except AnswerError as error:
+        return Outcome(line.number, None, line.seconds, "invalid", str(error))
+    return Outcome(line.number, answer, line.seconds)
+
+
+def _plain(line: Document) -> dict[str, Any]:
+    """Fields as `answer_check` takes them: JSON's lists."""
+    fields: dict[str, Any] = json.loads(line.model_dump_json())
+    return fields
+
+
+@dataclass(frozen=True)
+class Unsealed:
+    """Pairs with their truth, outcomes by number, and what they were proved to belong to."""
+
+    seal: Seal
+    submission: Submission
+    pairs: UnsealedPairs
+    outcomes: tuple[Outcome, ...]
+
+
+class UnsealedPairs:
+    """A sealed set with its truth.
+
+    Parameters
+    ----------
+    pairs : SealedPairs
+    truths : tuple of PairTruth, by number
+    """
+
+    def __init__(self, pairs: SealedPairs, truths: tuple[PairTruth, ...]) -> None:
+        self._pairs, self._truths = pairs, truths
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def pair(self, number: int) -> Pair:
+        """What a method saw."""
+        return self._pairs.pair(number)
+
+    def truth(self, number: int) -> PairTruth:
+        """The exact answer."""
+        return self._truths[number]
+
+    def document(self) -> dict[str, Any]:
+        """Provenance of the set."""
+        return self._pairs.document()
+
+
+def unseal(public: str | Path, truth: str | Path, submission: str | Path) -> Unsealed:
+    """Join a submission with the truth that was sealed.
+
+    Parameters
+    ----------
+    public : folder of the sealed set
+    truth : file that `seal` wrote beside the data set
+    submission : file that `submit` wrote
+
+    Raises
+    ------
+    DatasetError
+        If a file of the set was changed, the truth is not the sealed one, or the submission answers another seal or
+        not each pair once; in one sentence.
+    """
+    pairs = SealedPairs(Path(public))
+    pairs.check()
+    truths = read_truth_file(Path(truth), pairs.seal.truth_sha256)
+    if [one.number for one in truths] != list(range(len(pairs))):
+        raise DatasetError(f"{truth} does not hold the truth of each pair once; seal the data set again")
+    document = read_submission(Path(submission))
+    check_complete(document, pairs.seal, str(submission))
+    return Unsealed(pairs.seal, document, UnsealedPairs(pairs, tuple(truths)), tuple(outcomes_of(document)))

@@ -1,0 +1,467 @@
+"""The pixels around an outline: their rays, their distance from the limb, and the light a model puts on them.
+
+s is the sphere centre in the camera frame, a0 = asin(R / |s|) the angle of the limb from it; d is the distance of a
+pixel from the limb, across it, outwards positive, pixels.
+
+Least squares with free coefficients in every sector of an outline, robust weights, and an honest covariance.
+
+One Gauss-Newton step of the outline's fit: sphere centre and blur.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
+
+from phibench.estimator.calibration.limb_image import ImageError, Limb, Plane, limb_angle_rad, limb_of
+from phibench.estimator.geometry.reflection import ray_jacobian
+from phibench.scenes.camera import Camera
+from phibench.scenes.frames import Array, BoolArray, as_vector
+from phibench.scenes.rig import Rig
+
+_OUTLINE_POINTS = 720
+_RING_MARGIN_PX = 2.5
+
+
+@dataclass(frozen=True)
+class OutlinePixels:
+    """Pixels around the outline; rows belong together."""
+
+    plane: NDArray[np.int64]
+    u: NDArray[np.int64]
+    v: NDArray[np.int64]
+    ray: Array
+    by_pixel: Array  # d ray / d (u, v), shape (N, 3, 2)
+    y: Array
+
+    def __getitem__(self, keep: NDArray[Any]) -> OutlinePixels:
+        return OutlinePixels(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
+class Place:
+    """Distance from the limb of every pixel, its gradients, and where along the limb it is."""
+
+    d_px: Array
+    by_s: Array  # (N, 3), pixels per metre
+    by_uv: Array  # (N, 2), unit vectors
+    turn_rad: Array
+
+
+def band(planes: tuple[Plane, ...], camera: Camera, s: Array, radius_m: float, half_px: float) -> OutlinePixels:
+    """Usable pixels within `half_px` of the outline."""
+    height, width = planes[0].values.shape
+    u, v = _ring(camera, s, radius_m, half_px)
+    uv = np.stack([u, v], axis=-1).astype(float)
+    ray, by_pixel = camera.rays(uv), ray_jacobian(camera, uv)
+    near = np.abs(place_of_rays(ray, by_pixel, s, radius_m).d_px) < half_px
+    inside = (u >= 2) & (v >= 2) & (u < width - 2) & (v < height - 2)
+    parts = []
+    for number, plane in enumerate(planes):
+        keep = near & inside & plane.usable[v, u]
+        y = plane.values[v[keep], u[keep]] / ray[keep, 2] ** 4  # natural fall-off of a thin lens
+        parts.append(OutlinePixels(np.full(y.size, number), u[keep], v[keep], ray[keep], by_pixel[keep], y))
+    return OutlinePixels(
+        *(np.concatenate([getattr(p, name) for p in parts]) for name in OutlinePixels.__dataclass_fields__)
+    )
+
+
+def _ring(camera: Camera, s: Array, radius_m: float, half_px: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pixels (u, v) that may be within `half_px`: by their distance from the outline's centre, at its own azimuths."""
+    mark = Rig(camera=camera)
+    uv = replace(
+        mark,
+        mirror=replace(mark.mirror, radius_m=radius_m),
+        T_camera_sphere=replace(mark.T_camera_sphere, translation_m=as_vector(s)),
+    ).outline_px(_OUTLINE_POINTS)
+    low = np.clip(np.floor(uv.min(axis=0) - half_px).astype(int), 0, None)
+    high = np.clip(np.ceil(uv.max(axis=0) + half_px).astype(int) + 1, 0, (camera.width_px, camera.height_px))
+    centre = uv.mean(axis=0)
+    v, u = np.mgrid[low[1] : high[1], low[0] : high[0]]
+    off = np.hypot(u - centre[0], v - centre[1])
+    own = np.hypot(*(uv - centre).T)
+    rough = np.abs(off - 0.5 * (own.min() + own.max())) < half_px + 0.5 * np.ptp(own) + _RING_MARGIN_PX
+    u, v, off = u[rough], v[rough], off[rough]
+    azimuth = np.arctan2(uv[:, 1] - centre[1], uv[:, 0] - centre[0])
+    order = np.argsort(azimuth)
+    there = np.interp(np.arctan2(v - centre[1], u - centre[0]), azimuth[order], own[order], period=2.0 * np.pi)
+    near = np.abs(off - there) < half_px + _RING_MARGIN_PX
+    return u[near], v[near]
+
+
+def place_of(rays: OutlinePixels, s: Array, radius_m: float) -> Place:
+    """Where pixels are from the limb of a sphere at `s`."""
+    return place_of_rays(rays.ray, rays.by_pixel, s, radius_m)
+
+
+def place_of_rays(ray: Array, by_pixel: Array, s: Array, radius_m: float) -> Place:
+    """With n = s / |s|, cos a = ray . n: d a = -n . d ray / sin a, and d a / d s = -(ray - n cos a) / (|s| sin a)."""
+    distance = float(np.linalg.norm(s))
+    n, a0 = s / distance, limb_angle_rad(s, radius_m)
+    across = ray - (ray @ n)[:, None] * n
+    sine = np.linalg.norm(across, axis=-1)
+    angle = np.arctan2(sine, ray @ n)
+    by_uv = -np.einsum("i,nij->nj", n, by_pixel) / sine[:, None]
+    scale = 1.0 / np.linalg.norm(by_uv, axis=-1)  # pixels per radian across the limb
+    by_s = -across / (sine * distance)[:, None] + np.tan(a0) * n / distance
+    turn = np.arctan2(across[:, 1], across[:, 0])
+    return Place((angle - a0) * scale, by_s * scale[:, None], by_uv * scale[:, None], turn)
+
+
+def through_taps(
+    rays: OutlinePixels, planes: tuple[Plane, ...], limb: Limb, place: Place
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Light, slope, curvature, turned and turned squared for every pixel, summed over its taps."""
+    sums = np.zeros((rays.y.size, 5))
+    parity = 2 * (rays.v % 2) + rays.u % 2
+    for number, plane in enumerate(planes):
+        for kind in range(4):
+            rows = np.flatnonzero((rays.plane == number) & (parity == kind))
+            for tap in plane.taps[kind]:
+                d = place.d_px[rows] + place.by_uv[rows] @ np.array([tap.du_px, tap.dv_px], float)
+                sums[rows] += tap.weight * limb.all_at(tap.filter_index, d)
+    light, slope, curvature, turned, squared = sums.T
+    return light, slope, curvature, turned, squared
+
+
+MIN_PIXELS = 12
+"""Pixels that a sector needs to count: four times its coefficients."""
+_HUBER, _CUT, _TUKEY = 2.0, 6.0, 4.685
+_ROUNDS = 3
+NEIGHBOURS = 3
+"""Sectors on each side, each of 18 px, whose errors may be correlated: JPEG's blocks and the room's structures."""
+_MISFIT = (1.4, 2.0)
+"""Rms of what the model leaves in a sector, over the usual one: trusted up to the first, not from the second on."""
+_HARMLESS = 0.003
+"""What the model may leave of the light where there is no noise: it moves sectors by thousandths of a pixel."""
+_SPOILT = 2
+"""Sectors on each side of a spoilt one that are not trusted either."""
+
+
+@dataclass(frozen=True)
+class SectorFit:
+    """Fit of a model that is linear in its coefficients, sector by sector.
+
+    Attributes
+    ----------
+    coefficients : shape (groups, m)
+    model, residual, weight : shape (N,)
+    core : shape (N,), bool
+        Pixels whose residual is within Huber's bound: the others pull, but do not pull harder when they are off more.
+    relative_residual : float
+        Median over the sectors of the robust standard deviation over the mean light.
+    """
+
+    coefficients: Array
+    model: Array
+    residual: Array
+    weight: Array
+    core: BoolArray
+    relative_residual: float
+    basis: Array
+    group: NDArray[np.int64]
+
+    def without_nuisance(self, columns: Array) -> Array:
+        """Columns, shape (N, p), less what the coefficients of the own sector can imitate."""
+        normal, right = _normal(self.group, len(self.coefficients), self.basis, columns, self.weight)
+        return np.asarray(columns - np.einsum("nm,nmp->np", self.basis, _solve(normal, right)[self.group]))
+
+
+@dataclass(frozen=True)
+class Sectors:
+    """Which sector each pixel is in: `group` for one plane's, `sector` for all planes' together."""
+
+    group: NDArray[np.int64]
+    sector: NDArray[np.int64]
+    offset: Array
+    count: int
+    groups: int
+
+    @classmethod
+    def of(cls, plane: NDArray[np.int64], turn_rad: Array, count: int) -> Sectors:
+        """Cut the turn into `count` sectors; `offset` is the place within the own one, -0.5 to 0.5."""
+        turn = (turn_rad + np.pi) / (2.0 * np.pi) * count
+        sector = np.floor(turn).astype(np.int64) % count
+        planes = int(plane.max()) + 1 if plane.size else 1
+        return cls(plane * count + sector, sector, turn - np.floor(turn) - 0.5, count, planes * count)
+
+    def fit(self, y: Array, basis: Array) -> SectorFit:
+        """Iteratively reweighted least squares; a sector's weight is one over its own variance."""
+        pixels = np.bincount(self.group, minlength=self.groups)
+        enough = (pixels >= MIN_PIXELS)[self.group]
+        weight = enough.astype(float)
+        mean = np.bincount(self.group, y, self.groups) / np.maximum(pixels, 1)
+        for _ in range(_ROUNDS):
+            coefficients = _solve(*_normal(self.group, self.groups, basis, y[:, None], weight))[..., 0]
+            model = np.einsum("nm,nm->n", basis, coefficients[self.group])
+            residual = y - model
+            spread = self._spread(residual, mean, pixels)
+            with np.errstate(all="ignore"):
+                size = np.abs(residual) / spread[self.group]
+                weight = np.where(size > _CUT, 0.0, np.minimum(1.0, _HUBER / size)) / spread[self.group] ** 2
+            weight = np.where(enough & np.isfinite(weight), weight, 0.0)
+            core = (size <= _HUBER) & (weight > 0.0)
+        seen = pixels >= MIN_PIXELS
+        with np.errstate(all="ignore"):
+            relative = float(np.nanmedian(spread[seen] / np.abs(mean[seen]))) if seen.any() else float("nan")
+        return SectorFit(coefficients, model, residual, weight, core, relative, basis, self.group)
+
+    def described(self, y: Array, residual: Array) -> Array:
+        """Trust in the sectors, shape (count,), 0 to 1, by how well the model describes the light in them.
+
+        A lamp's edge, reflected 1 px inside the limb, looks like a limb that is somewhere else; what gives it away is
+        what the model leaves. Noise grows as the root of the light. The sectors beside a spoilt one have the same edge.
+        """
+        pixels = np.bincount(self.group, minlength=self.groups)
+        with np.errstate(all="ignore"):
+            light = np.bincount(self.group, y, self.groups) / pixels
+            square = np.bincount(self.group, residual * residual, self.groups) / pixels / light
+        size = np.sqrt(np.where((pixels >= MIN_PIXELS) & (light > 0.0), square, np.nan)).reshape(-1, self.count)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # a group without a single sector
+            median = np.nanmedian(size, axis=1, keepdims=True)
+        usual = np.hypot(median, _HARMLESS * np.sqrt(np.abs(light)).reshape(size.shape))
+        worst = np.nan_to_num((size / usual).max(axis=0), nan=np.inf)
+        trust = np.clip((_MISFIT[1] - worst) / (_MISFIT[1] - _MISFIT[0]), 0.0, 1.0)
+        return np.asarray(minimum_filter1d(trust, 2 * _SPOILT + 1, mode="wrap"))
+
+    def summed(self, rows: Array) -> Array:
+        """Sums over the sectors, shape (count, p), of rows (N, p)."""
+        columns = [np.bincount(self.sector, column, self.count) for column in rows.T]
+        return np.stack(columns, axis=-1)
+
+    def _spread(self, residual: Array, mean: Array, pixels: NDArray[np.int64]) -> Array:
+        """Robust standard deviation of each group; half of the usual relative one at least, so that no sector rules."""
+        order = np.argsort(self.group, kind="stable")
+        parts = np.split(np.abs(residual[order]), np.cumsum(np.bincount(self.group, minlength=self.groups))[:-1])
+        spread = np.array([1.4826 * np.median(part) if part.size else 0.0 for part in parts])
+        seen = (pixels >= MIN_PIXELS) & (mean > 0.0)
+        if not seen.any():
+            return np.ones(self.groups)
+        usual = float(np.median(spread[seen] / mean[seen]))
+        return np.hypot(spread, np.maximum(0.5 * usual * np.abs(mean), 1e-12 * np.abs(mean).max() + 1e-300))
+
+
+@dataclass(frozen=True)
+class SectorWeights:
+    """Tukey weights of the sectors, shape (count,), and the derivatives of their scores, in units of the unweighted."""
+
+    trust: Array
+    bread: Array
+
+
+def sector_weights(where: Sectors, weight: Array, shift: Array, residual: Array) -> SectorWeights:
+    """Weights of the sectors from the limb's own shift in each over its usual scatter.
+
+    An edge of the room along the limb moves a whole sector, which no weight of single pixels can see.
+    """
+    information = where.summed((weight * shift * shift)[:, None])[:, 0]
+    score = where.summed((weight * shift * residual)[:, None])[:, 0]
+    seen = information > 0.0
+    if not seen.any():
+        return SectorWeights(np.ones(where.count), np.ones(where.count))
+    z = np.zeros(where.count)
+    z[seen] = score[seen] / np.sqrt(information[seen])
+    scale = 1.4826 * float(np.median(np.abs(z[seen])))
+    u2 = np.minimum((z / max(_TUKEY * scale, 1e-300)) ** 2, 1.0)
+    return SectorWeights((1.0 - u2) ** 2, (1.0 - u2) * (1.0 - 5.0 * u2))
+
+
+def scatter(z: Array, trust: Array, directions: Array) -> Array:
+    """Variance of the sectors' shifts over what their pixels promise, with the correlation of neighbours, shape ().
+
+    One number for all of the limb: a sandwich of the parameters' own scores has a relative error of a quarter in sigma
+    from 120 sectors, this has an eighth. Bartlett weights around the full turn (Newey and West, Econometrica 55, 703,
+    1987). The scatter left by a fit is too small; what white errors would leave is computed and divided out (the idea
+    of Bell and McCaffrey, Survey Methodology 28, 169, 2002).
+
+    Parameters
+    ----------
+    z : shape (K,)
+        Shifts that the fit leaves, over their standard deviations as pixels promise them, times the root of `trust`.
+    trust : shape (K,), 0 to 1
+    directions : shape (K, p)
+        Change of z with the parameters.
+    """
+    lag = np.abs(np.arange(z.size)[:, None] - np.arange(z.size))
+    W = np.clip(1.0 - np.minimum(lag, z.size - lag) / (NEIGHBOURS + 1), 0.0, None)
+    left = np.eye(z.size) - directions @ np.linalg.pinv(directions)
+    white = float(np.sum(W * (left @ (trust[:, None] * left))))
+    return np.asarray(max(float(z @ W @ z), float(z @ z)) / max(white, 1.0))
+
+
+def _normal(group: NDArray[np.int64], groups: int, basis: Array, columns: Array, weight: Array) -> tuple[Array, Array]:
+    """Normal matrices (groups, m, m) and right sides (groups, m, p)."""
+    m, p = basis.shape[1], columns.shape[1]
+    normal, right = np.empty((groups, m, m)), np.empty((groups, m, p))
+    for i in range(m):
+        weighted = weight * basis[:, i]
+        for j in range(i, m):
+            normal[:, i, j] = normal[:, j, i] = np.bincount(group, weighted * basis[:, j], groups)
+        for j in range(p):
+            right[:, i, j] = np.bincount(group, weighted * columns[:, j], groups)
+    return normal, right
+
+
+def _solve(normal: Array, right: Array) -> Array:
+    """Solve all; a sector without pixels gets zeros, and one that cannot tell its coefficients apart small ones."""
+    size = np.trace(normal, axis1=-2, axis2=-1)[:, None, None]
+    ridge = np.where(size > 0.0, 1e-10 * size, 1.0) * np.eye(normal.shape[-1])
+    return np.asarray(np.linalg.solve(normal + ridge, right))
+
+
+_MIN_SLACK = 0.5
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of (x, y, z of s, blur variance), and what is known where it starts.
+
+    Attributes
+    ----------
+    move : shape (4,), metres and square pixels
+    covariance : shape (4, 4)
+    contrast, residual : float
+        See `outline.Outline`.
+    sectors_used : int
+    model : shape (N,)
+        Light of the pixels, as fitted.
+    by_parameters : shape (N, 4)
+        Its derivatives.
+    solution : Solution
+    """
+
+    move: Array
+    covariance: Array
+    contrast: float
+    residual: float
+    sectors_used: int
+    model: Array
+    by_parameters: Array
+    solution: Solution
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The step as a linear function of the light, weights held.
+
+    Attributes
+    ----------
+    where : Sectors
+    J : shape (N, 4)
+        Derivatives, less what the sectors' coefficients can imitate.
+    shift : shape (N,)
+        The same of a limb that is displaced by 1 px.
+    own : shape (N,)
+        Weights of the pixels, one over variance.
+    trust : shape (count,)
+        Of the sectors, 0 to 1.
+    slack : float
+        Part of the information that is left when the weights' own change with the errors is counted (M-estimators:
+        psi' in place of psi / x).
+    """
+
+    where: Sectors
+    J: Array
+    shift: Array
+    own: Array
+    trust: Array
+    slack: float = 1.0
+
+    @property
+    def weight(self) -> Array:
+        """Weights of pixels and sectors, shape (N,)."""
+        return np.asarray(self.own * self.trust[self.where.sector])
+
+    def move(self, residual: Array) -> Array:
+        """Step of the parameters, shape (4,), for residuals (N,)."""
+        return np.asarray(np.linalg.lstsq(self.normal(), self.J.T @ (self.weight * residual), rcond=1e-14)[0])
+
+    def covariance(self, residual: Array) -> Array:
+        """Covariance of the step, shape (4, 4), from the scatter of the residuals (N,) that it leaves."""
+        where, own, trust = self.where, self.own, self.trust
+        information = where.summed((own * self.shift**2)[:, None])[:, 0]
+        root = np.sqrt(np.maximum(information, 1e-300))
+        left = (own * self.shift * (residual - self.J @ self.move(residual)))[:, None]
+        z = np.sqrt(trust) * np.where(information > 0.0, where.summed(left)[:, 0] / root, 0.0)
+        by_s = where.summed((own * self.shift)[:, None] * self.J[:, :3])
+        directions = np.where(information > 0.0, np.sqrt(trust) / root, 0.0)[:, None] * by_s
+        size = scatter(z, trust * (information > 0.0), directions / np.abs(directions).max())
+        inverse = np.linalg.inv(self.normal())
+        meat = self.J.T @ ((self.weight * trust[where.sector])[:, None] * self.J)
+        return np.asarray(inverse @ meat @ inverse * size / self.slack**2)
+
+    def normal(self) -> Array:
+        """Normal matrix, shape (4, 4)."""
+        return np.asarray(self.J.T @ (self.weight[:, None] * self.J))
+
+
+def step_from(
+    pixels: OutlinePixels,
+    planes: tuple[Plane, ...],
+    rig: Rig,
+    s: Array,
+    blur_px2: float,
+    sectors: int,
+    half_px: float,
+    jpeg: bool = False,
+    near: bool = False,
+) -> Step:
+    """Linearise the light around (s, blur) and solve, robustly within sectors and over them.
+
+    `near` leaves out the sectors whose light is not described; far from the limb that is all of them.
+
+    Raises
+    ------
+    ImageError
+        If there is no light across the outline.
+    """
+    place, limb = place_of(pixels, s, rig.mirror.radius_m), limb_of(rig, s, blur_px2)
+    light, slope, curvature, turned, squared = through_taps(pixels, planes, limb, place)
+    where = Sectors.of(pixels.plane, place.turn_rad, sectors)
+    d = place.d_px / half_px
+    # JPEG's lack of fine waves looks like a slope on both sides of the limb more than like the room's curvature
+    room = np.stack([light, light * where.offset, turned, squared], axis=-1)
+    fit = where.fit(pixels.y, room)
+    level = fit.model / light
+    by_parameters = np.concatenate([place.by_s * slope[:, None], 0.5 * curvature[:, None]], axis=-1) * level[:, None]
+    columns = fit.without_nuisance(np.concatenate([by_parameters, (slope * level)[:, None]], axis=-1))
+    trust = where.described(pixels.y, fit.residual) if near else np.ones(sectors)
+    solution = _solution(where, fit, columns, trust)
+    move = solution.move(fit.residual)
+    used = int(np.unique(where.sector[solution.weight > 0.0]).size)
+    contrast = _contrast(where, pixels.y, light, d)
+    covariance = solution.covariance(fit.residual)
+    return Step(move, covariance, contrast, fit.relative_residual, used, fit.model, by_parameters, solution)
+
+
+def _solution(where: Sectors, fit: SectorFit, columns: Array, described: Array) -> Solution:
+    """Weights of the sectors by their shifts, and with them the whole step."""
+    J, shift = columns[:, :4], columns[:, 4]
+    own = fit.weight * (described > 0.0)[where.sector]
+    trust = bread = described
+    for _ in range(4):
+        solution = Solution(where, J, shift, own, trust)
+        A = solution.normal()
+        if not np.isfinite(A).all() or np.linalg.matrix_rank(A, tol=1e-12 * np.abs(A).max()) < 1:
+            raise ImageError("an image without a mirror: there is no light across the outline")
+        weights = sector_weights(where, own, shift, fit.residual - J @ solution.move(fit.residual))
+        trust, bread = described * weights.trust, described * weights.bread
+    core = np.sum(own * fit.core * bread[where.sector] * shift * shift)
+    whole = np.sum(own * trust[where.sector] * shift * shift)
+    slack = float(np.clip(core / max(float(whole), 1e-300), _MIN_SLACK, 1.0))
+    return Solution(where, J, shift, own, trust, slack)
+
+
+def _contrast(where: Sectors, y: Array, light: Array, d: Array) -> float:
+    """Median over sectors of the steel's fall of light, in units of itself, with level and slope free."""
+    fit = where.fit(y, np.stack([np.ones_like(y), d, light - 1.0], axis=-1))
+    with np.errstate(all="ignore"):
+        ratio = fit.coefficients[:, 2] / fit.coefficients[:, 0]
+    good = ratio[np.isfinite(ratio)]
+    return float(np.median(good)) if good.size else 0.0

@@ -1,0 +1,139 @@
+"""`phibench calibrate` and `phibench align`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+
+def calibrate(
+    directory: Path,
+    *,
+    out: Path,
+    sample: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
+    preset: str = "layers",
+    spots: bool = False,
+    vertical: Annotated[bool, Parameter(negative="")] = False,
+    distance_sigma_m: float = 1e-3,
+    height_sigma_m: float = math.inf,
+    azimuth_sigma_deg: float = math.inf,
+) -> int:
+    """Calibrate a rig from the images of a data set and write a calibration file.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    out
+        JSON file to write.
+    sample
+        Ids of samples; the first one by default.
+    preset
+        "layers" (noise-free), or the preset of the frames to draw: "bayer-raw", "mono-raw", "srgb8", "mjpeg".
+    spots
+        Also use the laser spots at their known distances.
+    vertical
+        Also use the room's vertical edges, which give the camera's tilt.
+    distance_sigma_m
+        How well the distance of each spot was measured, one standard deviation, metres.
+    height_sigma_m
+        The same of its height above the floor; not measured by default.
+    azimuth_sigma_deg
+        The same of its azimuth, degrees; not measured by default.
+    """
+    from phibench.datasets.errors import DatasetError
+    from phibench.estimator.calibration.from_dataset import calibrate_dataset
+    from phibench.estimator.calibration.spots import Ruler
+    from phibench.estimator.geometry.rig_parameters import PARAMETERS
+
+    if not spots and (math.isfinite(height_sigma_m) or math.isfinite(azimuth_sigma_deg)):
+        raise DatasetError("--height-sigma-m and --azimuth-sigma-deg are about calibration spots: give --spots too")
+    ruler = Ruler(distance_sigma_m, height_sigma_m, math.radians(azimuth_sigma_deg))
+    bundle = calibrate_dataset(directory, out, sample, preset, spots, ruler, vertical)
+    print("correction of the believed rig, metres, radians, pixels or relative, and its standard deviation:")
+    for name, value in zip(PARAMETERS, bundle.values, strict=True):
+        print(f"{name:18s} {value:+.3e} +- {bundle.sigmas[name]:.1e}")
+    if bundle.undetermined:
+        print("combinations that the data say little about (shares over what was believed of each):")
+    for weak in bundle.undetermined:
+        parts = ", ".join(f"{name} {share:+.2f}" for name, share in weak.parts.items())
+        print(f"  {parts} ({100.0 * weak.remaining:.0f} % of what was believed is left)")
+    print(f"{out}: chi2 {bundle.chi2:.2f} for {bundle.degrees} degrees of freedom")
+    return 0
+
+
+def align(
+    image: Path,
+    *,
+    out: Path | None = None,
+    radius_mm: float = 60.0,
+    distance_mm: float = 260.0,
+    focal_px: float = 1430.0,
+    cx_px: float | None = None,
+    cy_px: float | None = None,
+    focus_mm: float | None = None,
+    tilt_sigma_deg: float = 0.1,
+    principal_point_sigma_px: float = 5.0,
+) -> int:
+    """Say how far and in which direction to move the mirror so that it is centred.
+
+    Parameters
+    ----------
+    image
+        PNG or JPEG frame of the camera.
+    out
+        PNG to write: the outline and an arrow, 20 times as long as the move.
+    radius_mm, distance_mm
+        Of the mirror: its radius, and its centre from the lens, roughly.
+    focal_px, cx_px, cy_px
+        Focal length and principal point, pixels. The principal point may be left out for a whole frame of the C310,
+        which has 1280 x 720.
+    focus_mm
+        Distance of the plane of focus; by default on the virtual image, half a radius before the mirror's centre.
+    tilt_sigma_deg
+        How well the camera is known to be vertical.
+    principal_point_sigma_px
+        How well the principal point is known.
+    """
+    from phibench.datasets.errors import DatasetError
+    from phibench.estimator.calibration.align import (
+        alignment,
+        believed_centre,
+        in_words,
+        read_picture,
+        write_alignment_picture,
+    )
+    from phibench.scenes.mirror import SphereMirror
+    from phibench.scenes.rig import Rig
+
+    if not 0.0 < 1.02 * radius_mm < distance_mm <= 1e4:
+        raise DatasetError(
+            f"--radius-mm {radius_mm:g}, --distance-mm {distance_mm:g}: the radius must be above 0, and the mirror's "
+            "centre 1.02 radii to 10 m from the lens"
+        )
+    pixels, card = read_picture(image)
+    rig = Rig()
+    centre = believed_centre(pixels, rig.camera, cx_px, cy_px)
+    focus_m = 1e-3 * (distance_mm - 0.5 * radius_mm if focus_mm is None else focus_mm)
+    camera = replace(
+        rig.camera,
+        width_px=pixels.shape[1],
+        height_px=pixels.shape[0],
+        fx_px=focal_px,
+        fy_px=focal_px,
+        cx_px=centre[0],
+        cy_px=centre[1],
+        focus_distance_m=focus_m,
+    )
+    pose = replace(rig.T_camera_sphere, translation_m=(0.0, 0.0, 1e-3 * distance_mm))
+    rig = Rig(camera=camera, mirror=SphereMirror(radius_m=1e-3 * radius_mm), T_camera_sphere=pose)
+    found = alignment(pixels, rig, card, math.radians(tilt_sigma_deg), principal_point_sigma_px)
+    print(in_words(found))
+    if out is not None:
+        write_alignment_picture(out, pixels, rig, found)
+        print(f"{out}: outline and arrow")
+    return 0

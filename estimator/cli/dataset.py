@@ -1,0 +1,276 @@
+"""`phibench dataset ...`: making, checking and showing data sets, and drawing frames.
+
+`phibench panorama`.
+
+`phibench sensitivities`: what misalignments of the rig do to the estimates of a data set.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Literal
+
+from cyclopts import App
+
+from phibench.estimator.cli.options import Whole
+
+dataset = App(name="dataset", help="Make, verify, repair, merge and show data sets, and draw camera frames.")
+
+
+@dataset.command
+def make(
+    recipe: str,
+    *,
+    out: Path,
+    workers: Whole | None = None,
+    scheduler: str | None = None,
+    shard: str | None = None,
+    samples: Whole | None = None,
+    seed: Whole | None = None,
+) -> int:
+    """Render a data set; what is finished already is kept. Sensitivities of D come last, sensitivities.parquet.
+
+    Parameters
+    ----------
+    recipe
+        TOML file, or the name of a shipped recipe ("paper", "paper-misaligned", "random", "smoke", ...).
+    out
+        Folder to write; one that holds another data set is refused.
+    workers
+        Number of processes; one for each core by default.
+    scheduler
+        Address or scheduler file of a running dask scheduler, to use its workers instead.
+    shard
+        Part of the recipe for job arrays, such as 1/8; put the parts together with `merge`.
+    samples
+        How many samples to draw, instead of the recipe's number.
+    seed
+        Root of all random streams, instead of the recipe's; a secret one for a set that is to be sealed.
+    """
+    from phibench.datasets.make import make as make_dataset
+    from phibench.estimator.paper.sensitivity_table import keep_sensitivities
+
+    make_dataset(recipe, out, workers, scheduler=scheduler, shard=shard, samples=samples, seed=seed)
+    if shard is None:  # the table of a merged set is made by `merge`
+        keep_sensitivities(out)
+    return 0
+
+
+@dataset.command
+def repair(directory: Path, *, workers: Whole | None = None, scheduler: str | None = None) -> int:
+    """Render again what is damaged or missing in a data set.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    workers
+        Number of processes; one for each core by default.
+    scheduler
+        Address or scheduler file of a running dask scheduler, to use its workers instead.
+    """
+    from phibench.datasets.merge_repair import repair as repair_dataset
+    from phibench.estimator.paper.sensitivity_table import keep_sensitivities
+
+    for name in repair_dataset(directory, workers, scheduler=scheduler):
+        print(f"made again: {name}")
+    keep_sensitivities(directory)
+    return 0
+
+
+@dataset.command
+def merge(out: Path, *shards: Path) -> int:
+    """Put the shards of a data set together.
+
+    Parameters
+    ----------
+    out
+        Folder to write.
+    shards
+        Folders of all shards.
+    """
+    from phibench.datasets.merge_repair import merge as merge_shards
+    from phibench.estimator.paper.sensitivity_table import keep_sensitivities
+
+    merge_shards(out, shards)
+    keep_sensitivities(out)
+    return 0
+
+
+@dataset.command
+def verify(directory: Path) -> int:
+    """Check every file, hash, row and certificate of a data set; exit code 1 if there is a fault.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    """
+    from phibench.datasets.verify import verify as verify_dataset
+
+    report = verify_dataset(directory)
+    for fault in report.faults:
+        print(fault)
+    for note in report.notes:
+        print(f"note: {note}")
+    print(f"{directory}: {report.files} files, {report.samples} samples, {len(report.faults)} faults")
+    return 0 if report.ok else 1
+
+
+@dataset.command
+def show(directory: Path, *, out: Path | None = None) -> int:
+    """Print a table of a data set and write its contact sheet.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    out
+        PNG file for the contact sheet; by default contact_sheet.png in the folder.
+    """
+    from phibench.datasets.show import show as show_dataset
+
+    show_dataset(directory, out=out)
+    return 0
+
+
+@dataset.command
+def frames(
+    directory: Path,
+    *,
+    preset: str = "mjpeg",
+    draws: Whole = 1,
+    out: Path | None = None,
+    samples: str | None = None,
+    laser_off: bool = False,
+    exposure: str | None = None,
+    region: Whole | None = None,
+    camera_seed: Whole = 0,
+    workers: Whole | None = None,
+) -> int:
+    """Draw camera frames with noise, as PNG, JPEG or EXR files with an index; what is there already is kept.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    preset
+        Where the chain ends: "ideal" (EXR, expected electrons), "mono-raw", "bayer-raw" (PNG of 16 bits that holds
+        10-bit DN, not scaled), "srgb8" (PNG) or "mjpeg" (the camera's JPEG; PNG with --region).
+    draws
+        Draws of every image.
+    out
+        Folder to write; by default beside the data set, with "-frames" added to its name.
+    samples
+        Sample ids, joined by commas; all by default.
+    laser_off
+        Also every image without the spot.
+    exposure
+        Seconds, or "auto"; by default the preset's.
+    region
+        Side in pixels of a square around the spot, instead of the whole image.
+    camera_seed
+        Names the camera whose fixed pattern the frames share.
+    workers
+        Number of processes; one for each core by default.
+    """
+    from phibench.datasets.exposures.draw import draw_frames
+    from phibench.datasets.frames.request import FrameRequest, exposure_of
+
+    seconds = None if exposure is None else exposure_of(exposure)
+    request = FrameRequest(preset, seconds, region=region, camera_seed=camera_seed)
+    names = None if samples is None else samples.split(",")
+    done = draw_frames(directory, request, draws, out=out, samples=names, laser_off=laser_off, workers=workers)
+    for note in done.notes:
+        print(f"note: {note}")
+    print(f"{done.folder}: {done.made} files written, {done.kept} kept, index frames.jsonl")
+    return 0
+
+
+def panorama(
+    directory: Path,
+    *,
+    out: Path,
+    sample: str | None = None,
+    position: Literal["down", "up"] = "down",
+    by: Literal["model", "truth"] = "model",
+    width: Whole = 1440,
+    elevation_deg: tuple[float, float] = (-60.0, 30.0),
+    preset: str = "layers",
+    image: Path | None = None,
+    distance_m: float | None = None,
+) -> int:
+    """Unroll a view of a data set: columns are azimuths, rows elevations of the rays that leave the mirror.
+
+    The middle is the robot's front (world x), left of it its left (world y). A pixel is the direction of a ray, or a
+    point at --distance-m: a sphere has no single viewpoint.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    out
+        PNG file to write.
+    sample
+        Id of a sample; the first one by default.
+    position
+        Which of its two views.
+    by
+        "model": closed form with the nominal rig. "truth": the truth layer of the true rig, no model of the mirror.
+    width
+        Columns for 360 degrees; rows are as far apart as columns are at the horizon.
+    elevation_deg
+        Lower and upper edge, degrees above the horizon.
+    preset
+        "layers" (noise-free), or the preset of a frame to draw: "srgb8", "mjpeg".
+    image
+        PNG or JPEG to unroll in place of the sample's frame, taken with the same rig.
+    distance_m
+        Of the scene from the mirror's centre; by default far away.
+    """
+    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.read import open_finished
+    from phibench.datasets.store.files import require_writable
+    from phibench.datasets.store.pictures import save_png
+    from phibench.estimator.geometry.panorama import FAR_M, Grid, picture_of
+    from phibench.estimator.geometry.panorama import panorama as unroll
+
+    grid = Grid(width, *(math.radians(each) for each in elevation_deg))
+    dataset = open_finished(directory)
+    if not dataset.samples:
+        raise DatasetError(f"{directory} has no samples to unroll")
+    chosen = dataset.samples[0] if sample is None else dataset[sample]
+    require_writable(out)
+    distance = FAR_M if distance_m is None else distance_m
+    result = unroll(chosen, position, grid, by, distance, picture_of(chosen, position, preset, image))
+    save_png(out, result.pixels)
+    print(
+        f"{out}: {grid.width_px} x {grid.height_px} pixels of {360.0 / grid.width_px:g} degrees, "
+        f"{chosen.row.sample_id} {position}, by {by}; {100.0 * result.seen:.1f} % of it is in the image"
+    )
+    return 0
+
+
+def sensitivities(directory: Path, *, out: Path | None = None) -> int:
+    """Write dD/d(parameter) of every sample and estimator as a Parquet table.
+
+    The estimate is made with the nominal rig, the parameter is one of the true rig: docs/misalignment.md has them all.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    out
+        Parquet file to write; by default sensitivities.parquet in the folder, as `dataset make` does.
+    """
+    from phibench.datasets.read import open_finished
+    from phibench.datasets.store import schema as layout
+    from phibench.estimator.paper.paper_tables import ESTIMATORS
+    from phibench.estimator.paper.sensitivity_table import columns, write_sensitivities
+
+    dataset = open_finished(directory)
+    out = directory / layout.SENSITIVITIES if out is None else out
+    write_sensitivities(dataset, out)
+    print(f"{out}: {len(dataset)} samples x {len(ESTIMATORS)} estimators, {len(columns())} columns")
+    return 0

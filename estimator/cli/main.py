@@ -1,0 +1,89 @@
+"""The command line ``phibench``: a thin layer over the packages.
+
+Exit codes: 0 done, 1 checked and found wanting, 2 a mistake of the user or the machine in one sentence, 130 Ctrl-C.
+Every command imports what it needs itself, so that ``--help`` is quick and scoring runs without Mitsuba.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+
+from cyclopts import App, CycloptsError
+
+from phibench.datasets.store.provenance import ONE_THREAD
+from phibench.estimator.cli import methods as cli_methods
+from phibench.estimator.cli.calibration import align, calibrate
+from phibench.estimator.cli.dataset import dataset, panorama, sensitivities
+from phibench.estimator.cli.score import bench, compare, report, score
+from phibench.estimator.cli.score import register as register_sealed
+from phibench.estimator.cli.studies import experiments, study
+
+app = App(
+    name="phibench",
+    help="Render an omnidirectional camera-mirror sensor with exact depth, and score depth estimators against it.",
+    suppress_keyboard_interrupt=False,
+    result_action="return_value",
+)
+app.command(dataset)
+cli_methods.register(app)
+app.command(score)
+app.command(compare)
+app.command(report)
+app.command(bench)
+register_sealed(app, dataset)
+app.command(sensitivities)
+app.command(experiments)
+app.command(calibrate)
+app.command(align)
+app.command(panorama)
+app.command(study)
+
+
+@app.command
+def doctor() -> int:
+    """Show Python, packages, LLVM, cores and disk, and render a test image.
+
+    The exit code is 1 if something is broken; an installation that can only score is not.
+    """
+    # a bad LLVM aborts the process that loads it: never this one
+    return subprocess.run([sys.executable, "-m", "phibench.render.setup.doctor"], check=False).returncode
+
+
+def main(tokens: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    for name, value in ONE_THREAD.items():  # of the processes that a command starts, too; who sets one has his way
+        os.environ.setdefault(name, value)
+    try:
+        return int(app(tokens, exit_on_error=False) or 0)
+    except CycloptsError:
+        return 2  # cyclopts has said what is wrong
+    except KeyboardInterrupt:
+        print("Interrupted: stopped at your request.", file=sys.stderr)
+        return 130
+    except (ValueError, OSError) as error:
+        if not _is_users(error):
+            raise
+        print(f"phibench: {_sentence(error)}", file=sys.stderr)
+        return 2
+
+
+def _is_users(error: Exception) -> bool:
+    from phibench.datasets.errors import DatasetError
+    from phibench.estimator.sandbox.resolve import MethodError
+    from phibench.scenes.validation import SceneError
+
+    return isinstance(error, (SceneError, DatasetError, MethodError, OSError))
+
+
+def _sentence(error: Exception) -> str:
+    """Return the message of an error; an operating system's without its number."""
+    if isinstance(error, OSError) and error.strerror and type(error).__module__ == "builtins":
+        return f"{error.strerror}: {error.filename}" if error.filename else str(error.strerror)
+    return str(error)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

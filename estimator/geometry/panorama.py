@@ -1,0 +1,426 @@
+"""A view unrolled: columns are azimuths and rows elevations of the rays that leave the mirror.
+
+A sphere has no single viewpoint: rays of one azimuth and elevation leave it from a place that only they have. A grid
+point therefore stands for a direction (a scene far away, exactly one pixel), or for a point at a stated distance from
+the sphere centre. Elevation is spaced evenly, in steps of the columns' angle: squares at the horizon.
+
+Vertical edges of a room in a panorama: where they are in each row, and how far they lean.
+
+The same panorama without any model of the mirror: directions from a data set's truth layer, inverted by search.
+
+The truth has, for every pixel, the outward normal and the world point that it sees. The ray leaves at
+P = S + R n and goes to X, so that its direction is (X - P) / |X - P|. Of every grid point the pixel with the nearest
+direction is looked up; the step to the place between pixels comes from differences over its 3 x 3 neighbours. A mirror
+with an error of form is taken for its sphere here: at a peak of 50 um P is off by as much, and the place by 0.014 px.
+
+Panorama of a sample's view as a picture.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.read import Sample
+from phibench.datasets.store.pictures import exposure_s, to_srgb
+from phibench.estimator.calibration.align import read_picture
+from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.reflection import reflect
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import POSITIONS, View
+from phibench.scenes.room import Room, Shape, faces
+from phibench.scenes.validation import nearest
+
+FAR_M = 1e9  # a far scene: 60 mm of mirror at this distance are 6e-11 rad
+_AT_ONCE = 32768
+_WIDTHS = (16, 16384)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Directions of a panorama's pixels, seen from inside: left edge behind the robot, middle its front (world x).
+
+    Column j has the azimuth pi - (j + 1/2) step from world x towards y, row i the elevation high - (i + 1/2) step, with
+    step = 2 pi / width.
+
+    Parameters
+    ----------
+    width_px : int
+    low_rad, high_rad : float
+        Elevations above the horizon of the lower and the upper edge; the lower moves to a whole number of rows.
+
+    Raises
+    ------
+    DatasetError
+        If a number is out of range.
+    """
+
+    width_px: int
+    low_rad: float
+    high_rad: float
+
+    def __post_init__(self) -> None:
+        if not _WIDTHS[0] <= self.width_px <= _WIDTHS[1]:
+            raise DatasetError(
+                f"width of the panorama = {self.width_px} px: allowed range is {_WIDTHS[0]} to {_WIDTHS[1]}"
+            )
+        low, high = math.degrees(self.low_rad), math.degrees(self.high_rad)
+        if not -90.0 <= low < high <= 90.0 or self.height_px < 1:
+            raise DatasetError(
+                f"elevations {low:g} to {high:g} degrees: give two numbers from -90 to 90, the lower one first and "
+                f"at least {math.degrees(self.step_rad):.2g} degrees apart"
+            )
+
+    @property
+    def step_rad(self) -> float:
+        """Angle of a pixel."""
+        return 2.0 * math.pi / self.width_px
+
+    @property
+    def height_px(self) -> int:
+        """Rows."""
+        return round((self.high_rad - self.low_rad) / self.step_rad)
+
+    @property
+    def azimuths_rad(self) -> Array:
+        """Of the columns, shape (W,), falling from pi to -pi."""
+        return np.asarray(math.pi - (np.arange(self.width_px) + 0.5) * self.step_rad, float)
+
+    @property
+    def elevations_rad(self) -> Array:
+        """Of the rows, shape (H,), falling."""
+        return np.asarray(self.high_rad - (np.arange(self.height_px) + 0.5) * self.step_rad, float)
+
+    def directions(self) -> Array:
+        """Unit vectors, shape (H, W, 3), world."""
+        turn, up = self.azimuths_rad[None, :], self.elevations_rad[:, None]
+        flat = np.cos(up)
+        return np.stack(np.broadcast_arrays(flat * np.cos(turn), flat * np.sin(turn), np.sin(up)), axis=-1)
+
+    def place(self, directions: Array) -> Array:
+        """Column and row, shape (..., 2), of directions (..., 3) of any length; columns in [-1/2, W - 1/2)."""
+        d = np.asarray(directions, float)
+        column = (math.pi - np.arctan2(d[..., 1], d[..., 0])) / self.step_rad - 0.5
+        elevation = np.arctan2(d[..., 2], np.hypot(d[..., 0], d[..., 1]))
+        return np.stack([column, (self.high_rad - elevation) / self.step_rad - 0.5], axis=-1)
+
+
+def pixels_by_model(view: View, grid: Grid, distance_m: float = FAR_M) -> Array:
+    """Image pixel (u, v) of every grid point, shape (H, W, 2), by the closed form; NaN where the image shows it not.
+
+    Parameters
+    ----------
+    view : View
+        Of the rig that is believed.
+    grid : Grid
+    distance_m : float
+        Of the scene from the sphere centre.
+    """
+    if not distance_m > view.rig.mirror.radius_m:
+        raise DatasetError(f"distance of the scene = {distance_m:g} m: must be above the mirror's radius")
+    points = (view.sphere_centre_m + distance_m * grid.directions()).reshape(-1, 3)
+    parts = [image_of(view, points[i : i + _AT_ONCE]).uv_px for i in range(0, len(points), _AT_ONCE)]
+    uv = np.concatenate(parts)
+    uv[~view.rig.camera.contains(uv)] = np.nan
+    return uv.reshape(grid.height_px, grid.width_px, 2)
+
+
+def unrolled(image: NDArray[np.generic], uv_px: Array) -> Array:
+    """Image values at pixels, bilinear between the four around each; NaN where the pixel is.
+
+    Parameters
+    ----------
+    image : shape (h, w) or (h, w, c)
+    uv_px : shape (H, W, 2)
+
+    Returns
+    -------
+    array, shape (H, W) or (H, W, c)
+    """
+    seen = np.asarray(np.isfinite(uv_px).all(axis=-1))
+    where = np.where(seen[..., None], uv_px, 0.0)
+    planes = np.asarray(image, float)
+    stacked = planes[..., None] if planes.ndim == 2 else planes
+    each = [
+        map_coordinates(stacked[..., k], (where[..., 1], where[..., 0]), order=1, mode="nearest")
+        for k in range(stacked.shape[-1])
+    ]
+    result = np.where(seen[..., None], np.stack(each, axis=-1), np.nan)
+    return result[..., 0] if planes.ndim == 2 else result
+
+
+_HALF_WIDTH_PX = 6
+_LEVEL_PX = 2  # columns at each end of a row's window that give the levels beside the edge
+_LEAST_CONTRAST = 0.15
+_LEAST_ROWS = 8
+_TRIMMED = 0.3  # of the height, at both ends: what stands before its foot, and what is above it
+_TRACK = 65
+
+
+@dataclass(frozen=True)
+class RoomEdge:
+    """A vertical edge of the room: a line from `low_m` to `high_m`, shape (3,) each, world."""
+
+    name: str
+    low_m: Array
+    high_m: Array
+
+
+@dataclass(frozen=True)
+class SeenEdge:
+    """An edge in a panorama.
+
+    Attributes
+    ----------
+    name : str
+    azimuth_deg : float
+    rows : int
+    lean_px, lean_sigma_px : float
+        Columns by which the line through the measured places moves from its lowest to its highest row, to the left
+        positive (towards larger azimuths), and the standard error from the scatter about the line.
+    expected_lean_px : float
+        The same of the places where the edge must be.
+    offset_px : float
+        Mean column less that.
+    scatter_px : float
+        Rms distance of the places from the line, in columns.
+    """
+
+    name: str
+    azimuth_deg: float
+    rows: int
+    lean_px: float
+    lean_sigma_px: float
+    expected_lean_px: float
+    offset_px: float
+    scatter_px: float
+
+
+def vertical_edges(room: Room, names: tuple[str, ...]) -> Iterator[RoomEdge]:
+    """Both upright edges of the faces of shapes, by name; of a solid, of the face that looks at the world's z axis."""
+    shapes: tuple[Shape, ...] = (*room.surfaces, *room.furniture)
+    for shape in shapes:
+        if shape.name not in names:
+            continue
+        face = min(faces(shape), key=lambda each: float(np.dot(each.T_world_shape.R[:, 2], each.T_world_shape.t)))
+        width, height = face.size_m
+        for side in (-0.5, 0.5):
+            ends = [face.T_world_shape.points(np.array([side * width, end * height, 0.0])) for end in (-0.5, 0.5)]
+            low, high = sorted(ends, key=lambda point: float(point[2]))
+            yield RoomEdge(f"{shape.name} {'left' if side < 0.0 else 'right'}", low, high)
+
+
+def track(true_view: View, believed_view: View, grid: Grid, edge: RoomEdge) -> Array:
+    """Columns and rows, shape (n, 2), bottom to top, of an edge that one rig sees and another one unrolls."""
+    share = np.linspace(0.0, 1.0, _TRACK)[:, None]
+    uv = image_of(true_view, (1.0 - share) * edge.low_m + share * edge.high_m).uv_px
+    places = grid.place(reflect(believed_view, uv).direction_world)
+    places[:, 0] = np.unwrap(places[:, 0], period=grid.width_px)
+    return places
+
+
+def seen_edge(panorama: Array, grid: Grid, name: str, expected_px: Array) -> SeenEdge | None:
+    """Measure an edge; None where it has too little contrast or too few rows.
+
+    In each row the levels beside the edge are the means of the outer columns of a window; between them the edge is
+    where a sharp step of the same sum would be (moments are kept: A. J. Tabatabai and O. R. Mitchell, IEEE Trans. PAMI
+    6, 188, 1984), which no symmetric blur moves.
+
+    Parameters
+    ----------
+    panorama : shape (H, W), linear in the light
+    grid : Grid
+    name : str
+    expected_px : shape (n, 2), see `track`
+    """
+    (bottom, top), trim = expected_px[[0, -1], 1], _TRIMMED * float(expected_px[0, 1] - expected_px[-1, 1])
+    rows = np.arange(max(int(np.ceil(top + trim)), 0), min(int(np.floor(bottom - trim)) + 1, grid.height_px))
+    if len(rows) < _LEAST_ROWS:
+        return None
+    predicted = np.interp(rows, expected_px[::-1, 1], expected_px[::-1, 0])
+    start = np.rint(predicted).astype(int) - _HALF_WIDTH_PX
+    window = (start[:, None] + np.arange(2 * _HALF_WIDTH_PX + 1)) % grid.width_px
+    places = start - 0.5 + _step_place(panorama[rows[:, None], window])
+    good = np.isfinite(places)
+    if np.count_nonzero(good) < _LEAST_ROWS:
+        return None
+    heights = rows[good].astype(float)
+    lean, sigma, scatter = _line(heights, places[good])
+    middle = float(predicted.mean())
+    return SeenEdge(
+        name,
+        float(np.degrees(grid.azimuths_rad[0] - middle * grid.step_rad)),
+        int(good.sum()),
+        lean,
+        sigma,
+        _line(heights, predicted[good])[0],
+        float((places - predicted)[good].mean()),
+        scatter,
+    )
+
+
+def _step_place(values: Array) -> Array:
+    """Place of a step in each row (n, w), columns from the window's left side; NaN where there is none."""
+    left, right = values[:, :_LEVEL_PX].mean(axis=1), values[:, -_LEVEL_PX:].mean(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        place = np.sum((right[:, None] - values) / (right - left)[:, None], axis=1)
+    clear = np.abs(right - left) > _LEAST_CONTRAST * 0.5 * (np.abs(left) + np.abs(right))
+    inside = (place > _LEVEL_PX) & (place < values.shape[1] - _LEVEL_PX)
+    return np.where(clear & inside, place, np.nan)
+
+
+def _line(rows: Array, places: Array) -> tuple[float, float, float]:
+    """Lean over all rows, its standard error, and the scatter about the line."""
+    x = rows - rows.mean()
+    slope = float(np.sum(x * places) / np.sum(x * x))
+    rest = places - places.mean() - slope * x
+    scatter = float(np.sqrt(np.sum(rest**2) / max(len(rows) - 2, 1)))
+    height = float(np.ptp(rows))
+    # rows run downwards: a line that leans to the left with height has a column that grows with the row
+    return slope * height, scatter / float(np.sqrt(np.sum(x * x))) * height, scatter
+
+
+_ROUNDS = 4
+_REACH_PX = 1.5  # the place must be within reach of the nearest pixel's neighbours
+
+
+def ray_directions(sample: Sample, position: str) -> Array:
+    """Unit vectors of the rays that leave the mirror, shape (H, W, 3), from the truth layer; NaN beside the mirror."""
+    truth, row = sample.truth(position), sample.truth_row(position)
+    angle, turn = truth["phi_normal_rad"], truth["azimuth_rad"]
+    n = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), -np.cos(angle)], axis=-1)
+    X = np.stack([truth[name] for name in ("x_m", "y_m", "z_m")], axis=-1)
+    away = X - (np.array(row.sphere_centre_world_m) + sample.rig.mirror.radius_m * n)
+    return np.asarray(away / np.linalg.norm(away, axis=-1, keepdims=True))
+
+
+def pixels_by_truth(directions: Array, grid: Grid) -> Array:
+    """Image pixel (u, v) of every grid point, shape (H, W, 2), from `ray_directions`; NaN where no pixel shows it."""
+    inner = np.zeros(directions.shape[:2], bool)
+    inner[1:-1, 1:-1] = _with_neighbours(directions)
+    v, u = np.nonzero(inner)
+    if v.size == 0:
+        return np.full((grid.height_px, grid.width_px, 2), np.nan)
+    wanted = grid.directions().reshape(-1, 3)
+    _, nearest = cKDTree(directions[v, u]).query(wanted)
+    step = _steps(directions, v[nearest], u[nearest], wanted)
+    uv = np.stack([u[nearest], v[nearest]], axis=-1) + step
+    uv[~(np.abs(step) < _REACH_PX).all(axis=-1)] = np.nan
+    return uv.reshape(grid.height_px, grid.width_px, 2)
+
+
+def _with_neighbours(directions: Array) -> NDArray[np.bool_]:
+    seen = np.asarray(np.isfinite(directions).all(axis=-1))
+    shifts = [slice(0, -2), slice(1, -1), slice(2, None)]
+    return np.logical_and.reduce([seen[rows, columns] for rows in shifts for columns in shifts])
+
+
+def _steps(r: Array, v: NDArray[np.intp], u: NDArray[np.intp], wanted: Array) -> Array:
+    """Steps (du, dv), shape (n, 2), at which the quadratic through the neighbours has the wanted direction."""
+    here, left, right, above, below = r[v, u], r[v, u - 1], r[v, u + 1], r[v - 1, u], r[v + 1, u]
+    by_u, by_v = 0.5 * (right - left), 0.5 * (below - above)
+    uu, vv = right - 2.0 * here + left, below - 2.0 * here + above
+    uv = 0.25 * (r[v + 1, u + 1] - r[v + 1, u - 1] - r[v - 1, u + 1] + r[v - 1, u - 1])
+    step = np.zeros((len(v), 2))
+    for _ in range(_ROUNDS):
+        a, b = step[:, :1], step[:, 1:]
+        model = here + a * by_u + b * by_v + 0.5 * (a * a * uu + b * b * vv) + a * b * uv
+        slope = np.stack([by_u + a * uu + b * uv, by_v + b * vv + a * uv], axis=-1)
+        normal = np.swapaxes(slope, -1, -2)
+        step = step + np.linalg.solve(normal @ slope, normal @ (wanted - model)[..., None])[..., 0]
+        step = np.clip(step, -2.0 * _REACH_PX, 2.0 * _REACH_PX)
+    return step
+
+
+LAYERS = "layers"
+COLOUR_PRESETS = (LAYERS, "srgb8", "mjpeg")
+By = Literal["model", "truth"]
+
+
+@dataclass(frozen=True)
+class Panorama:
+    """A panorama.
+
+    Attributes
+    ----------
+    pixels : uint8 array, shape (H, W, 3), sRGB; black where the image shows nothing of it
+    seen : float
+        Part of it that the image shows.
+    """
+
+    pixels: NDArray[np.uint8] = field(repr=False)
+    seen: float
+
+
+def panorama(
+    sample: Sample, position: str, grid: Grid, by: By = "model", distance_m: float = FAR_M, image: Array | None = None
+) -> Panorama:
+    """Unroll a picture, shape (h, w, 3), uint8, or the noise-free view with the laser on."""
+    picture = frame(sample, position) if image is None else image
+    height, width = sample.nominal_rig.camera.height_px, sample.nominal_rig.camera.width_px
+    if picture.shape[:2] != (height, width):
+        raise DatasetError(
+            f"the picture has {picture.shape[1]} x {picture.shape[0]} pixels, the rig's camera {width} x {height}: "
+            "give a whole frame of this camera"
+        )
+    values = unrolled(picture, places(sample, position, grid, by, distance_m))
+    seen = np.isfinite(values[..., 0])
+    return Panorama(np.rint(np.where(seen[..., None], values, 0.0)).astype(np.uint8), float(seen.mean()))
+
+
+def places(sample: Sample, position: str, grid: Grid, by: By = "model", distance_m: float = FAR_M) -> Array:
+    """Image pixel of every grid point, shape (H, W, 2), by the nominal rig or by the truth layer of the true one."""
+    if by == "model":
+        return pixels_by_model(nominal_view(sample, position), grid, distance_m)
+    if distance_m != FAR_M:
+        raise DatasetError("a distance of the scene needs the model (--by model): the truth layer gives directions")
+    return pixels_by_truth(ray_directions(sample, position), grid)
+
+
+def nominal_view(sample: Sample, position: str) -> View:
+    """View of the rig that is believed."""
+    return sample.nominal_rig.at(0.0 if position == "down" else sample.row.nominal_stroke_m)
+
+
+def frame(sample: Sample, position: str, preset: str = LAYERS) -> NDArray[Any]:
+    """Colour picture of the view, laser on, shape (h, w, 3), uint8.
+
+    Parameters
+    ----------
+    sample : Sample
+    position : "down" or "up"
+    preset : "layers" (noise-free), "srgb8" or "mjpeg"
+
+    Raises
+    ------
+    DatasetError
+        If there is no such position or colour picture.
+    """
+    if position not in POSITIONS:
+        raise DatasetError(f"position '{position}': must be 'down' or 'up'")
+    if preset not in COLOUR_PRESETS:
+        raise DatasetError(f"no colour picture of preset '{preset}'; {nearest(preset, COLOUR_PRESETS)}")
+    if preset == LAYERS:
+        planes, detector = sample.frame(position), sample.rig.camera.detector
+        return to_srgb(planes, detector, exposure_s(sample.ambient(position), detector))
+    return np.asarray(sample.frame_source(preset).frame(position, 0, True).image)
+
+
+def picture_of(sample: Sample, position: str, preset: str, file: Path | None) -> NDArray[Any]:
+    """Picture to unroll: a file's, or a frame of the sample.
+
+    Raises
+    ------
+    DatasetError
+        As `frame`, and if the file is no colour picture.
+    """
+    return frame(sample, position, preset) if file is None else read_picture(file)[0]

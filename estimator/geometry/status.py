@@ -1,0 +1,99 @@
+"""What can be wrong with one ray, one angle or one depth.
+
+A depth with its uncertainty.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from phibench.scenes.frames import Array
+
+StatusArray = NDArray[np.int64]
+
+
+class Status(IntEnum):
+    """Outcome of one element of an array kernel; everything but OK comes with NaN."""
+
+    OK = 0
+    NOT_FINITE = 1  # an input is NaN or infinite, or the lens model has no ray for the pixel
+    OUT_OF_RANGE = 2  # an angle outside [0, 90] degrees or a stroke that is not above 0
+    MISSES_MIRROR = 3
+    GRAZING = 4  # on the outline of the mirror, where the derivatives grow without limit
+    ON_AXIS = 5  # the ray returns to the camera: no azimuth, no depth
+    PARALLEL = 6  # the two rays meet at infinity
+    DIVERGING = 7  # the two lines meet behind the mirror, not on the rays
+    NO_SPOT = 8  # no light in the difference of the frames
+    SPOT_CUT = 9  # the spot reaches the edge of the image
+    NOT_ISOLATED = 10  # no empty border found around the spot
+    NOT_CONVERGED = 11  # a fit did not come to rest
+    SATURATED = 12  # too few pixels below saturation for the unknowns of a fit
+
+
+def flag(*cases: tuple[ArrayLike, Status]) -> StatusArray:
+    """Return the status of the first condition that holds, elementwise, and OK where none does.
+
+    Parameters
+    ----------
+    *cases : pairs (condition, status)
+        Conditions are boolean arrays that broadcast together.
+    """
+    conditions = np.broadcast_arrays(*(np.asarray(condition, bool) for condition, _ in cases))
+    return np.asarray(np.select(conditions, [int(status) for _, status in cases], int(Status.OK)), np.int64)
+
+
+def first_fault(*statuses: ArrayLike) -> StatusArray:
+    """Return the first status that is not OK, elementwise."""
+    arrays = np.broadcast_arrays(*(np.asarray(status, np.int64) for status in statuses))
+    return np.asarray(np.select([array != Status.OK for array in arrays], arrays, int(Status.OK)), np.int64)
+
+
+def keep(values: Array, status: StatusArray) -> Array:
+    """Return `values` with NaN where the status is not OK; trailing axes of `values` follow those of `status`."""
+    good = (status == Status.OK).reshape(status.shape + (1,) * (values.ndim - status.ndim))
+    return np.where(good, values, np.nan)
+
+
+def describe(status: int) -> str:
+    """Return a status in words: "misses mirror"."""
+    return Status(status).name.lower().replace("_", " ")
+
+
+@dataclass(frozen=True)
+class DepthEstimate:
+    """Depths D, shape (...).
+
+    Parameters
+    ----------
+    depth_m : shape (...), metres
+    sigma_m : shape (...), standard deviation to first order, NaN if no input covariance was given
+    status : shape (...), values of `Status`
+    """
+
+    depth_m: Array
+    sigma_m: Array
+    status: StatusArray
+
+
+def propagate(gradient: Array, covariance: Array | None) -> Array:
+    """Return sqrt(g C g^T), shape (...), for gradients (..., n) and covariances (..., n, n); NaN without covariance."""
+    if covariance is None:
+        return np.full(gradient.shape[:-1], np.nan)
+    return np.sqrt(np.einsum("...i,...ij,...j->...", gradient, np.asarray(covariance, float), gradient))
+
+
+def covariance_of(sigma_1: ArrayLike, sigma_2: ArrayLike, correlation: ArrayLike = 0.0) -> Array:
+    """Covariance matrix, shape (..., 2, 2), of two values from their standard deviations and correlation."""
+    s1, s2, rho = np.broadcast_arrays(*(np.asarray(x, float) for x in (sigma_1, sigma_2, correlation)))
+    cross = rho * s1 * s2
+    return np.stack([np.stack([s1 * s1, cross], -1), np.stack([cross, s2 * s2], -1)], -2)
+
+
+def stroke_status(stroke_m: ArrayLike) -> StatusArray:
+    """Status of strokes: NOT_FINITE, OUT_OF_RANGE unless above 0."""
+    h = np.asarray(stroke_m, float)
+    return flag((~np.isfinite(h), Status.NOT_FINITE), (~(h > 0.0), Status.OUT_OF_RANGE))

@@ -1,0 +1,167 @@
+"""What a method sees of a stroke pair, and what it answers. Nothing of the truth is in here.
+
+>>> from phibench.estimator.interface import Answer, Pair, Spot
+>>> def extract(pair: Pair) -> Answer:
+...     return Answer(Spot((640.0, 120.0)), Spot.missing("not looked for"))
+
+Pixels: integer (u, v) are pixel centres, u to the right, v downwards, whole image: it spans [-0.5, W - 0.5].
+
+What became of one pair in the hands of a method.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+from numpy.typing import NDArray
+
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.scenes.laser import Beam
+from phibench.scenes.rig import Rig
+
+OK = "ok"
+Image = NDArray[Any]
+Matrix2 = tuple[tuple[float, float], tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Box:
+    """Pixels [u0, u0 + width) x [v0, v0 + height) of the image that hold the spot; the spot is anywhere in them."""
+
+    u0_px: int
+    v0_px: int
+    width_px: int
+    height_px: int
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Index of the box in an image, shape (H, W, ...)."""
+        return slice(self.v0_px, self.v0_px + self.height_px), slice(self.u0_px, self.u0_px + self.width_px)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One draw of a stroke pair, as a camera and a user deliver it.
+
+    Attributes
+    ----------
+    number : int
+        Of the pair in its set; says nothing about the scene.
+    down, up : array
+        Images at stroke position 1 and 2, laser on, read-only. By `card.output`: "raw" (H, W) uint16, DN of the mosaic
+        (RGGB, red at even row and column) or of a sensor without filters; "srgb8" and "mjpeg" (H, W, 3) uint8, R, G, B.
+    down_off, up_off : array or None
+        The same with the laser off, from another exposure.
+    rig : Rig
+        What the user believes of camera, mirror and stroke axis, at the down position.
+    stroke_m : float
+        h, as the user believes it.
+    card : SensorCard
+        Numbers of the sensor and of its processing.
+    box_down, box_up : Box or None
+        Region hints; both or none.
+    calibration_covariance : array, shape (p, p), or None
+        Of the rig's parameters, `estimator.calibration.parameters.PARAMETERS`, where rig and stroke come from a
+        calibration file; read-only.
+    beam : Beam or None
+        What the user knows of the laser's spot: its diameter by the distance.
+    """
+
+    number: int
+    down: Image = field(repr=False)
+    up: Image = field(repr=False)
+    rig: Rig
+    stroke_m: float
+    card: SensorCard
+    down_off: Image | None = field(default=None, repr=False)
+    up_off: Image | None = field(default=None, repr=False)
+    box_down: Box | None = None
+    box_up: Box | None = None
+    calibration_covariance: NDArray[Any] | None = field(default=None, repr=False)
+    beam: Beam | None = None
+
+    @property
+    def images(self) -> Mapping[str, Image]:
+        """Images by name, those that are there: "down", "up", "down_off", "up_off"."""
+        named = {name: getattr(self, name) for name in ("down", "up", "down_off", "up_off")}
+        return MappingProxyType({name: image for name, image in named.items() if image is not None})
+
+
+@dataclass(frozen=True)
+class Spot:
+    """Answer for one image.
+
+    Parameters
+    ----------
+    uv_px : (u, v) or None
+        Position of the spot's centre; None where `status` is not "ok".
+    covariance_px2 : 2 x 2 or None
+        Covariance of (u, v), if the method claims one.
+    phi_rad : float or None
+        Angle in the sense `phi_convention`; None leaves it to `estimator.phi`.
+    phi_convention : "ray", "normal", "incidence" or "outline"
+    status : str
+        "ok", or in a few words why there is no position.
+    """
+
+    uv_px: tuple[float, float] | None = None
+    covariance_px2: Matrix2 | None = None
+    phi_rad: float | None = None
+    phi_convention: str = "ray"
+    status: str = OK
+
+    @classmethod
+    def missing(cls, why: str) -> Spot:
+        """No position, and why."""
+        return cls(status=why)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a method answers for a pair; the depth is computed from the positions unless it gives one itself.
+
+    Parameters
+    ----------
+    down, up : Spot
+    depth_m, sigma_depth_m : float or None
+        The standard deviation is that of the pixels' noise: what a calibration adds, the score adds.
+    """
+
+    down: Spot
+    up: Spot
+    depth_m: float | None = None
+    sigma_depth_m: float | None = None
+
+
+Method = Callable[[Pair], Answer]
+
+
+FAILURES = ("error", "timeout", "crash", "memory", "invalid", "mutated")
+"""Exception; time limit; the process died; memory limit; an answer that is none; the method wrote into its input."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One pair.
+
+    Attributes
+    ----------
+    number : int
+        `Pair.number`.
+    answer : Answer or None
+        None where `failure` says why.
+    seconds : float
+        Wall-clock time inside the method; NaN where it did not come back.
+    failure : "" or one of `FAILURES`
+    message : str
+        One sentence about the failure, with the method's own line where there is one.
+    """
+
+    number: int
+    answer: Answer | None
+    seconds: float
+    failure: str = ""
+    message: str = ""

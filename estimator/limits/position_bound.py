@@ -1,0 +1,257 @@
+"""Fisher information of one pixel about its mean mu, per electron squared: what a Cramer-Rao bound sums up.
+
+Three models of the noise:
+
+* approximate: 1 / variance, F. Huang et al., Nature Methods 10, 653 (2013), with mu + r^2 for Poisson plus Gauss;
+* exact: of the convolution of a Poisson with a normal distribution;
+* quantised: of the converter's codes, with full well and both ends of the converter.
+
+The theoretical limit: how well u, v, phi and D of one spot can be known.
+
+Unknowns besides u, v: the spot's flux (laser, albedo and speckle are not known to a per cent), and the background, one
+level per colour filter, because the colour of the room's light behind the spot is not known; with the laser-off frame
+in hand it may count as known. Speckle flicker scales the whole spot and is covered by the unknown flux.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
+from scipy.special import ndtr
+from scipy.stats import norm, poisson
+
+from phibench.datasets.exposures.expected import ExpectedRegion
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.geometry.phi import PhiEstimate, estimate_phi
+from phibench.estimator.geometry.rig_parameters import rig_gradient
+from phibench.estimator.geometry.status import StatusArray
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.spots.fit_raw import covariance_bound, fisher_matrix
+from phibench.estimator.spots.raw_pixels import PixelNoise, noise_of
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import Rig, View
+from phibench.scenes.validation import nearest
+
+_SIGMAS = 9.0  # tails of 1e-19 are left out
+_NODES = 48  # of the spline; see the test of its error
+_GAUSSIAN_FROM_E = 3000.0  # there the exact value is within 1e-4 of the approximate one
+_PURE_POISSON_E = 0.1  # below this read noise counts are resolved: 1 / mu
+
+
+def approximate_information(mean_e: Array, noise: PixelNoise) -> Array:
+    """1 / variance, shape of `mean_e`; electrons and electrons^-2."""
+    return 1.0 / noise.variance_e2(mean_e)
+
+
+def exact_information(mean_e: Array, gaussian_e2: float) -> Array:
+    """Information of Poisson plus Gaussian noise, shape of `mean_e`.
+
+    Parameters
+    ----------
+    mean_e : array of any shape, 0 or above, electrons
+    gaussian_e2 : float
+        Variance of the Gaussian part, electrons squared.
+    """
+    mean = np.asarray(mean_e, float)
+    r = float(np.sqrt(gaussian_e2))
+    if r < _PURE_POISSON_E:
+        return 1.0 / mean
+    scale = mean + gaussian_e2
+    return _interpolated(np.minimum(mean, _GAUSSIAN_FROM_E), r) / scale
+
+
+def _interpolated(mean: Array, r: float) -> Array:
+    """J (mu + r^2), which is smooth and near 1, through nodes where there are many values."""
+    flat = mean.ravel()
+    if flat.size <= _NODES or np.ptp(flat) == 0.0:
+        values = {mu: _poisson_gauss(mu, r) * (mu + r * r) for mu in set(flat.tolist())}
+        return np.array([values[mu] for mu in flat.tolist()]).reshape(mean.shape)
+    x = np.log(flat + r * r)
+    nodes = np.linspace(x.min(), x.max(), _NODES)
+    table = [_poisson_gauss(max(mu, 0.0), r) * (mu + r * r) for mu in np.exp(nodes) - r * r]
+    return np.asarray(CubicSpline(nodes, table)(x)).reshape(mean.shape)
+
+
+def _poisson_gauss(mu: float, r: float) -> float:
+    """Integral of (dp/dmu)^2 / p over the signal x, p = sum_n P(n; mu) N(x - n; r).
+
+    The trapezoidal rule with a step of r / 3 is exact to exp(-2 pi^2 9) for functions as smooth as the normal's.
+    """
+    n = _counts(mu)
+    x = np.arange(n[0] - _SIGMAS * r, n[-1] + _SIGMAS * r, r / 3.0)
+    density = norm.pdf(x[:, None], n, r)
+    p, slope = density @ poisson.pmf(n, mu), density @ (poisson.pmf(n - 1, mu) - poisson.pmf(n, mu))
+    seen = p > 0.0
+    return float(np.sum(slope[seen] ** 2 / p[seen]) * r / 3.0)
+
+
+def _counts(mu: float) -> Array:
+    """Counts that occur, and one more on either side for the derivative."""
+    reach = _SIGMAS * np.sqrt(mu)
+    return np.arange(max(np.floor(mu - reach) - 1.0, 0.0), np.ceil(mu + reach + _SIGMAS) + 2.0)
+
+
+def quantised_information(mean_e: Array, card: SensorCard, pattern_known: bool = False) -> Array:
+    """Information of the converter's codes, shape of `mean_e`: sum over codes of (dP/dmu)^2 / P.
+
+    DSNU counts as read noise unless `pattern_known`; PRNU is left out.
+    """
+    r = float(np.hypot(card.read_noise_e, 0.0 if pattern_known else card.dsnu_e))
+    mean = np.asarray(mean_e, float)
+    values = {mu: _of_codes(mu, r, card) for mu in set(mean.ravel().tolist())}
+    return np.array([values[mu] for mu in mean.ravel().tolist()]).reshape(mean.shape)
+
+
+def _of_codes(mu: float, r: float, card: SensorCard) -> float:
+    n = _counts(mu)
+    charge, well = np.minimum(n, card.full_well_e), card.full_well_e
+    chance, slope = poisson.pmf(n, mu), poisson.pmf(n - 1, mu) - poisson.pmf(n, mu)
+    low, high = (card.black_level_dn + card.dn_per_e * x for x in (charge[0] - _SIGMAS * r, charge[-1] + _SIGMAS * r))
+    edges = np.arange(np.floor(max(low, 0.0)), np.ceil(min(high, card.top_dn))) + 0.5  # between one code and the next
+    if charge[0] >= well or edges.size == 0:
+        return 0.0
+    below = ndtr((edges[:, None] - card.black_level_dn - card.dn_per_e * charge) / (card.dn_per_e * max(r, 1e-9)))
+    shares = np.diff(np.vstack([np.zeros_like(charge), below, np.ones_like(charge)]), axis=0)
+    P, dP = shares @ chance, shares @ slope
+    seen = P > 1e-300
+    return float(np.sum(dP[seen] ** 2 / P[seen]))
+
+
+Unknown = Literal["position", "flux", "flux+background"]
+NoiseModel = Literal["approximate", "exact", "quantised"]
+UNKNOWNS: tuple[Unknown, ...] = ("position", "flux", "flux+background")
+NOISE_MODELS: tuple[NoiseModel, ...] = ("approximate", "exact", "quantised")
+
+
+@dataclass(frozen=True)
+class SpotLimit:
+    """Bound of one spot.
+
+    Attributes
+    ----------
+    covariance_px2 : shape (2, 2), of (u, v); NaN where the pixels cannot tell
+    fisher : shape (k, k), by u, v, relative flux, background levels in electrons, as far as they are unknown
+    """
+
+    covariance_px2: Array
+    fisher: Array
+
+    @property
+    def rms_px(self) -> float:
+        """Root of the mean variance of u and v."""
+        return float(np.sqrt(np.trace(self.covariance_px2) / 2.0))
+
+
+@dataclass(frozen=True)
+class DepthLimit:
+    """Bound of D, shape (...), in its two parts, which add in squares.
+
+    Attributes
+    ----------
+    depth_m : shape (...)
+    sigma_spot_m : shape (...)
+        From the pixels' noise: sqrt(g^T F^-1 g).
+    sigma_calibration_m : shape (...)
+        From what is not known of the rig: sqrt(g_c^T Sigma_c g_c).
+    gradient : shape (..., p)
+        g_c, dD by each of `rig_errors.RIG_PARAMETERS`, metres per its unit.
+    status : shape (...), values of `Status`
+    """
+
+    depth_m: Array
+    sigma_spot_m: Array
+    sigma_calibration_m: Array
+    gradient: Array
+    status: StatusArray
+
+    @property
+    def sigma_m(self) -> Array:
+        """Both parts together."""
+        return np.hypot(self.sigma_spot_m, self.sigma_calibration_m)
+
+
+def spot_limit(
+    region: ExpectedRegion,
+    card: SensorCard,
+    unknown: Unknown = "flux+background",
+    model: NoiseModel = "approximate",
+    pattern_known: bool = False,
+) -> SpotLimit:
+    """Cramer-Rao bound of a spot's position on raw pixels.
+
+    Parameters
+    ----------
+    region : ExpectedRegion
+    card : SensorCard
+    unknown : "position", "flux" or "flux+background"
+        What is unknown: the position alone, the flux too, or the background levels too.
+    model : "approximate", "exact" or "quantised"
+        Noise: 1 / variance with all terms; Poisson and Gauss exactly, the rounding as Gaussian; the converter's codes.
+        The last two leave PRNU out.
+    pattern_known : bool
+        Whether the camera's PRNU and DSNU are calibrated.
+    """
+    information = _information(region.mean_e, card, model, pattern_known)
+    return limit_of(derivative_images(region, unknown), information)
+
+
+def limit_of(derivatives: Array, information: Array) -> SpotLimit:
+    """Bound from derivative images, shape (k, h, w), u and v first, and the pixels' information, shape (h, w)."""
+    fisher = fisher_matrix(derivatives, information)
+    return SpotLimit(covariance_bound(fisher), fisher)
+
+
+def derivative_images(region: ExpectedRegion, unknown: Unknown = "flux+background") -> Array:
+    """Derivatives of the mean by u, v, relative flux and the background of each filter, shape (k, h, w)."""
+    if unknown not in UNKNOWNS:
+        raise ValueError(f"unknown '{unknown}': {nearest(unknown, UNKNOWNS)}")
+    images = [region.du_e_per_px, region.dv_e_per_px]
+    if unknown != "position":
+        images.append(region.spot_e)
+    if unknown == "flux+background":
+        images += [(region.filters == colour).astype(float) for colour in np.unique(region.filters)]
+    return np.stack(images)
+
+
+def phi_limit(view: View, uv_px: ArrayLike, limit: SpotLimit, convention: str = "ray") -> PhiEstimate:
+    """Phi at a pixel with the bound of its variance, g C g^T."""
+    return estimate_phi(convention, view, np.asarray(uv_px, float), limit.covariance_px2)
+
+
+def depth_limit(
+    rig: Rig,
+    stroke_m: ArrayLike,
+    uv_down_px: Array,
+    uv_up_px: Array,
+    covariance_down_px2: Array,
+    covariance_up_px2: Array,
+    covariance_rig: Array,
+) -> DepthLimit:
+    """Bound of D in its two parts, to first order.
+
+    Parameters
+    ----------
+    rig, stroke_m, uv_down_px, uv_up_px, covariance_down_px2, covariance_up_px2
+        As for `triangulate.depth_exact`; the covariances are bounds of (u, v).
+    covariance_rig : shape (p, p)
+        Of the calibration's parameters, see `rig_errors.rig_covariance`.
+    """
+    spot = depth_exact(rig, stroke_m, uv_down_px, uv_up_px, covariance_down_px2, covariance_up_px2)
+    g = rig_gradient(rig, stroke_m, uv_down_px, uv_up_px)
+    calibration = np.sqrt(np.einsum("...i,ij,...j->...", g, covariance_rig, g))
+    return DepthLimit(spot.depth_m, spot.sigma_m, calibration, g, spot.status)
+
+
+def _information(mean_e: Array, card: SensorCard, model: NoiseModel, pattern_known: bool) -> Array:
+    if model not in NOISE_MODELS:
+        raise ValueError(f"noise model '{model}': {nearest(model, NOISE_MODELS)}")
+    noise = noise_of(card, pattern_known)
+    if model == "approximate":
+        return approximate_information(mean_e, noise)
+    if model == "exact":
+        return exact_information(mean_e, noise.gaussian_e2)
+    return quantised_information(mean_e, card, pattern_known)

@@ -1,0 +1,208 @@
+"""Bound of a spot's position behind the camera's processing, from the estimator's own model: no frame is drawn.
+
+For "srgb8" the information of each pixel's own code (`code_law`), for "mjpeg" the bound J^T C^-1 J of Stein, Mezghani
+and Nossek (2014) with the mean and covariance of the quantised coefficients (`jpeg_fit`). The coefficients carry all
+that the decoded image does, as long as the decoder cuts nothing.
+
+What a spot of so many electrons can be known to: the bound of one coordinate, mean over the sub-pixel places.
+
+A round spot of the lens's blur over flat levels: what the strength of the light alone says, for planning. The bound of
+one given spot is `limits.spot_limit` or `chain_limit.chain_limit`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.limits.position_bound import SpotLimit, approximate_information, limit_of
+from phibench.estimator.spots.chain_model import chain_model
+from phibench.estimator.spots.code_statistics import code_law, code_table
+from phibench.estimator.spots.fit_chain import unrounded
+from phibench.estimator.spots.fit_jpeg import Window
+from phibench.estimator.spots.fit_raw import LASER_RESPONSE, covariance_bound, fisher_matrix
+from phibench.estimator.spots.gaussian_spot import SpotMeans
+from phibench.estimator.spots.jpeg_coefficients import mcu_px
+from phibench.estimator.spots.raw_pixels import bayer_filters, noise_of
+from phibench.scenes.frames import Array
+
+_REACH_PX = 10  # around the spot, for "srgb8"
+
+
+def chain_limit(
+    card: SensorCard,
+    uv_px: ArrayLike,
+    sigma_px: float,
+    flux_e: float,
+    background_e: ArrayLike,
+    response: tuple[float, float, float] = LASER_RESPONSE,
+    ratio: float = 1.0,
+    pattern_known: bool = False,
+) -> SpotLimit:
+    """Bound of (u, v) with the flux and one background level per colour filter unknown.
+
+    Parameters
+    ----------
+    card : SensorCard
+        Of the output "srgb8" or "mjpeg".
+    uv_px : shape (2,), in the image
+    sigma_px, ratio : float
+        Blur along u, and that along v over it.
+    flux_e : float
+        Electrons of the whole spot in pixels of response 1, as `SpotFit.flux_e`.
+    background_e : shape (3,)
+        Electrons of the room per pixel behind R, G, B, dark current included.
+    response : 3 floats
+        Of the filters at the laser's wavelength.
+    pattern_known : bool
+        Whether PRNU and DSNU are calibrated.
+
+    Raises
+    ------
+    ValueError
+        If the output is neither of the two.
+    """
+    uv = np.asarray(uv_px, float)
+    theta = np.array([*uv, flux_e, *np.asarray(background_e, float)])
+    if card.output == "srgb8":
+        return _of_codes(card, theta, sigma_px, response, ratio, pattern_known)
+    if card.output == "mjpeg":
+        return _of_coefficients(card, theta, sigma_px, response, ratio, pattern_known)
+    raise ValueError(
+        f"output '{card.output}': chain_limit knows 'srgb8' and 'mjpeg'; take limits.spot_limit for raw pixels"
+    )
+
+
+def _of_codes(
+    card: SensorCard, theta: Array, sigma_px: float, response: tuple[float, float, float], ratio: float, known: bool
+) -> SpotLimit:
+    corner = np.floor(theta[:2]).astype(np.int64) - _REACH_PX
+    filters = bayer_filters(corner[None], (2 * _REACH_PX + 2, 2 * _REACH_PX + 2))
+    theta = theta - np.array([*corner, 0, 0, 0, 0])
+    means = SpotMeans(filters[0], response, np.zeros(filters.size), sigma_px, ratio)
+    mean, derivatives = means.at(theta[None])
+    law = code_law(np.zeros(filters.shape, np.uint8), filters, card, unrounded(card, known), code_table(card))
+    information = law.information(mean.reshape(filters.shape))[0]
+    fisher = fisher_matrix(derivatives[0].reshape(-1, *information.shape), information)
+    return SpotLimit(covariance_bound(fisher), fisher)
+
+
+def _of_coefficients(
+    card: SensorCard, theta: Array, sigma_px: float, response: tuple[float, float, float], ratio: float, known: bool
+) -> SpotLimit:
+    model = chain_model(card, unrounded(card, known))
+    down, across = mcu_px(card.jpeg_subsampling)
+    units = np.array([across, down])
+    corner = (np.rint((theta[:2] + 0.5) / units) - 1.0) * units - model.margin
+    theta = theta - np.array([*corner, 0, 0, 0, 0])
+    means = SpotMeans(model.filters, response, np.zeros(model.filters.size), sigma_px, ratio)
+    fisher = Window(np.zeros(len(model.step)), model, means).fisher(theta)
+    return SpotLimit(covariance_bound(fisher), fisher)
+
+
+_SIDE_PX = 16
+_MCU_PX = (16, 8)  # of 4:2:2; an even number of Bayer cells
+_PLASTIC = 1.324717957244746  # root of x^3 = x + 1
+_FLUXES_E = tuple(float(x) for x in np.geomspace(100.0, 3e6, 19))
+
+
+@dataclass(frozen=True)
+class SpotSigma:
+    """Bound of one coordinate by the electrons of the spot.
+
+    Attributes
+    ----------
+    flux_e : tuple of float
+        Electrons behind the red filter, rising.
+    sigma_px : tuple of float
+        Root mean square over places of the bound of u and v; infinite where pixels tell nothing.
+    """
+
+    flux_e: tuple[float, ...]
+    sigma_px: tuple[float, ...]
+
+    def at(self, flux_e: ArrayLike) -> Array:
+        """Bound, shape of `flux_e`, pixels; log-log interpolation, infinite beyond the table."""
+        x, y = np.log(self.flux_e), np.log(self.sigma_px)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(np.exp(np.interp(np.log(flux_e), x, y, left=np.inf, right=np.inf)))
+
+
+def spot_sigma(
+    card: SensorCard,
+    blur_sigma_px: float,
+    background_e: Sequence[float],
+    response: tuple[float, float, float] = (1.0, 0.10, 0.03),
+    places: int = 16,
+    flux_e: Sequence[float] = _FLUXES_E,
+) -> SpotSigma:
+    """Table of the bound for a sensor.
+
+    Parameters
+    ----------
+    card : SensorCard
+        Raw output of a Bayer sensor, "srgb8" or "mjpeg".
+    blur_sigma_px : float
+        Of the spot's image.
+    background_e : 3 floats
+        Electrons of the room per pixel behind R, G, B.
+    response : 3 floats
+        Of the filters at the laser's wavelength.
+    places : int
+        Sub-pixel places over 16 x 8 pixels, whole JPEG units and Bayer cells: 16 are within 2 % of thousands.
+    flux_e : electrons of the spot, rising
+    """
+    where = (_even_places(places) + 100.0) * np.array(_MCU_PX)
+    rows = [[_variance_px2(card, uv, blur_sigma_px, x, background_e, response) for uv in where] for x in flux_e]
+    return SpotSigma(tuple(flux_e), tuple(math.sqrt(x) for x in np.mean(rows, axis=1)))
+
+
+def _even_places(count: int) -> Array:
+    """Points spread over the unit square, shape (count, 2): multiples of two irrational steps.
+
+    Sequences of dyadic fractions (Halton, Sobol) will not do: 16 of them lie on whole pixels of a unit of 16, all in
+    the same place of the Bayer cell, where the bound is 15 % worse than its mean.
+    """
+    steps = np.array([1.0 / _PLASTIC, 1.0 / _PLASTIC**2])
+    return (0.5 + np.arange(count)[:, None] * steps) % 1.0
+
+
+def _variance_px2(
+    card: SensorCard,
+    uv_px: Array,
+    sigma_px: float,
+    flux_e: float,
+    background_e: Sequence[float],
+    response: tuple[float, float, float],
+) -> float:
+    """Mean variance of u and v at the bound of one spot; infinite where there is none."""
+    if card.output == "raw":
+        covariance = _raw_covariance(card, uv_px, sigma_px, flux_e, background_e, response)
+    else:
+        covariance = chain_limit(card, uv_px, sigma_px, flux_e, np.asarray(background_e), response).covariance_px2
+    variance = float(np.trace(covariance)) / 2.0
+    return variance if math.isfinite(variance) else math.inf
+
+
+def _raw_covariance(
+    card: SensorCard,
+    uv_px: Array,
+    sigma_px: float,
+    flux_e: float,
+    background_e: Sequence[float],
+    response: tuple[float, float, float],
+) -> Array:
+    """Bound on raw Bayer pixels; a pixel expected within three deviations of saturation tells nothing."""
+    corner = np.floor(uv_px).astype(np.int64) - _SIDE_PX // 2
+    filters = bayer_filters(corner[None], (_SIDE_PX, _SIDE_PX))[0]
+    means = SpotMeans(filters, response, np.zeros(filters.size), sigma_px)
+    mean, derivatives = means.at(np.array([[*(uv_px - corner), flux_e, *background_e]]))
+    mean_e = mean.reshape(filters.shape)
+    information = approximate_information(mean_e, noise_of(card))
+    information = np.where(mean_e + 3.0 * np.sqrt(mean_e) < card.saturation_e, information, 0.0)
+    return limit_of(derivatives[0].reshape(-1, *filters.shape), information).covariance_px2

@@ -1,0 +1,185 @@
+"""The likelihood fit of `estimator.fit_raw` as a method, on raw pixels with or without colour filters.
+
+What it takes as known: the card's noise (PRNU and DSNU count as noise), the rig's detector for the filters' response
+at the laser line, and the oblique blur that the rig predicts at the pixel (`spot_blur`), with the beam's size once the
+pair's distance is known. A rough mirror's blur is not predicted: there the width is fitted as well. The room behind is
+the laser-off frame, smoothed as far as it is flat (`base_image`); without one it is a level per filter, or, where that
+does not describe it, what surrounds the spot. A misfit that is left widens the covariance.
+
+Built-in method: both spots as images of one point of the room.
+
+Each image is first fitted by itself: raw pixels by `raw_maximum_likelihood`, processed ones by `chain_fit`. Raw pixels
+are then fitted together (`fit_joint`): with laser-off frames the fit sees on - off + the usual level of off, and the
+off frame's noise is added to the on frame's; without them a level per filter is fitted. Of processed pixels the two
+positions are combined by their covariances (`combine`), which is the same where both are Gaussian. Where the two are
+not one point, the separate answer stands, without a depth of its own.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.geometry.combine import CombinedEstimate, combine
+from phibench.estimator.geometry.status import Status, describe
+from phibench.estimator.interface import Answer, Image, Matrix2, Pair, Spot
+from phibench.estimator.methods.chain_fit import chain_fit
+from phibench.estimator.methods.locate import Sight, each_spot_twice, pair_blur, seen_depth_m
+from phibench.estimator.spots.fit_joint import JointFit, SpotRegions, fit_joint, spot_regions
+from phibench.estimator.spots.fit_raw import SpotFit, fit_law
+from phibench.estimator.spots.raw_pixels import (
+    BaseImage,
+    GaussLaw,
+    PixelNoise,
+    around,
+    base_of,
+    noise_of,
+    raw_electrons,
+)
+from phibench.scenes.frames import Array
+
+_FLAT_SIGMAS = 4.0  # by which the chi2 of a fit with flat levels must exceed 1 for the room to have structure
+_MISFIT_SIGMAS = 3.0  # by which the fit's chi2 must exceed 1 before its covariance is widened
+
+
+def raw_maximum_likelihood(sight: Sight) -> Spot:
+    """Position and covariance by maximum likelihood on 15 x 15 raw pixels around the red peak."""
+    try:
+        noise = noise_of(sight.pair.card)
+    except ValueError:
+        return Spot.missing("the fit needs shot noise and no row noise")
+    near = sight.narrowed()
+    if near is None:
+        return Spot.missing("no spot")
+    x = raw_electrons(near.pixels, sight.pair.card)[None]
+    flat = _fit(near, x, noise, None)
+    if (
+        near.off_pixels is None
+        and flat.status[0] == Status.OK
+        and flat.chi2[0] < 1.0 + _FLAT_SIGMAS * math.sqrt(2.0 / x.size)
+    ):
+        return _fitted_spot(flat, x.size)
+    based = _fit(near, x, noise, _base(near, x, noise, flat))
+    return _fitted_spot(based if based.status[0] == Status.OK else flat, x.size)
+
+
+def _fit(near: Sight, x: Array, noise: PixelNoise, base: BaseImage | None) -> SpotFit:
+    """Fit with a known background, or with a level per filter."""
+    card, rig = near.pair.card, near.pair.rig
+    u0, v0 = near.origin_px
+    blur = pair_blur(near.pair, (u0 + near.box.width_px // 2, v0 + near.box.height_px // 2), near.depth_m)
+    r, g, b = rig.camera.detector.laser_filter_response
+    return fit_law(
+        x,
+        near.origin_px,
+        GaussLaw(noise, 0.0 if base is None else base.variance_e2),
+        blur.sigma_px,
+        (r, g, b) if card.mosaic == "bayer" else None,
+        None if base is None else base.mean_e,
+        rig.mirror.roughness_alpha > 0.0,
+        x < card.full_from_e,
+        blur.ratio,
+        blur.mixed_px2,
+    )
+
+
+def _base(near: Sight, x: Array, noise: PixelNoise, flat: SpotFit) -> BaseImage:
+    """Room of the laser-off frame; without one, of the pixels around the spot."""
+    off = near.off_pixels
+    if off is not None:
+        electrons = raw_electrons(off, near.pair.card)[None]
+        return base_of(electrons, noise.variance_e2(electrons), np.ones(x.shape))
+    origin = np.array([near.origin_px], float)
+    middle = origin + (np.array([x.shape[2], x.shape[1]]) - 1.0) / 2.0
+    uv = np.where(np.isfinite(flat.uv_px), flat.uv_px, middle)
+    return base_of(x, noise.variance_e2(x), around(uv, origin, (x.shape[1], x.shape[2])))
+
+
+def _fitted_spot(fit: SpotFit, count: int) -> Spot:
+    status = Status(int(fit.status[0]))
+    if status is not Status.OK:
+        return Spot.missing(describe(status))
+    # a room that the model does not follow shows in chi2; the claim is widened by it, as for any fit of least squares
+    chi2 = float(fit.chi2[0])
+    widened = chi2 if chi2 > 1.0 + _MISFIT_SIGMAS * math.sqrt(2.0 / count) else 1.0
+    (a, b), (c, d) = (widened * fit.covariance_px2[0]).tolist()
+    return Spot((float(fit.uv_px[0, 0]), float(fit.uv_px[0, 1])), ((a, b), (c, d)))
+
+
+_SIDE_PX = {True: 15, False: 9}  # with a laser-off frame, and without: a level is flat over a few pixels only
+_MOST_CHI2 = 24.0  # of one degree of freedom: 1e-6 by chance
+
+_each = each_spot_twice(raw_maximum_likelihood)
+
+
+def joint_fit(pair: Pair) -> Answer:
+    """Positions and depth of a pair; the separate answers where one image has no spot or the two are not one point."""
+    return joint_of(pair, _each(pair) if pair.card.output == "raw" else chain_fit(pair))
+
+
+def joint_of(pair: Pair, separate: Answer) -> Answer:
+    """Answer for both images together, from that for each by itself: `raw_maximum_likelihood`'s or `chain_fit`'s."""
+    if separate.down.uv_px is None or separate.up.uv_px is None:
+        return separate
+    return (_raw if pair.card.output == "raw" else _processed)(pair, separate)
+
+
+def _raw(pair: Pair, separate: Answer) -> Answer:
+    starts = [np.array([spot.uv_px], float) for spot in (separate.down, separate.up)]
+    images = ((pair.down, pair.down_off), (pair.up, pair.up_off))
+    depth_m = seen_depth_m(pair, separate)
+    down, up = (_region(*image, pair, start[0], depth_m) for image, start in zip(images, starts, strict=True))
+    return _answer(fit_joint(pair.rig, pair.stroke_m, down, up, *starts), separate)
+
+
+def _processed(pair: Pair, separate: Answer) -> Answer:
+    if separate.down.covariance_px2 is None or separate.up.covariance_px2 is None:
+        return separate
+    (uv1, C1), (uv2, C2) = (
+        (np.array([spot.uv_px], float), np.array([spot.covariance_px2], float)) for spot in (separate.down, separate.up)
+    )
+    return _answer(combine(pair.rig, pair.stroke_m, uv1, C1, uv2, C2), separate)
+
+
+def _answer(found: JointFit | CombinedEstimate, separate: Answer) -> Answer:
+    if int(found.status[0]) != Status.OK or not found.chi2[0] < _MOST_CHI2:
+        return separate
+    return Answer(
+        _joint_spot(found.uv_down_px[0], found.covariance_down_px2[0]),
+        _joint_spot(found.uv_up_px[0], found.covariance_up_px2[0]),
+        float(found.depth_m[0]),
+        float(found.sigma_m[0]),
+    )
+
+
+def _region(image: Image, dark: Image | None, pair: Pair, start: Array, depth_m: float | None) -> SpotRegions:
+    """Square around a start, moved inside the image."""
+    height, width = image.shape
+    side = _SIDE_PX[dark is not None]
+    u0 = min(max(round(start[0]) - side // 2, 0), max(width - side, 0))
+    v0 = min(max(round(start[1]) - side // 2, 0), max(height - side, 0))
+    window = (slice(v0, v0 + side), slice(u0, u0 + side))
+    x, extra = raw_electrons(image[window], pair.card), np.zeros((1, 1, 1))
+    x = np.where(x < pair.card.full_from_e, x, np.nan)
+    if dark is not None:
+        off = raw_electrons(dark[window], pair.card)
+        x, extra = x - off + float(np.median(off)), _variance(off, pair.card)[None]
+    r, g, b = pair.rig.camera.detector.laser_filter_response
+    response = (r, g, b) if pair.card.mosaic == "bayer" else None
+    blur, noise = pair_blur(pair, start, depth_m), noise_of(pair.card)
+    shape = {"ratio": blur.ratio, "mixed_px2": blur.mixed_px2}
+    return spot_regions(x[None], (u0, v0), noise, blur.sigma_px, response, extra_e2=extra, **shape)
+
+
+def _variance(off_e: Array, card: SensorCard) -> Array:
+    """Noise of the off frame's pixels; of the fixed pattern, which cancels, nothing."""
+    noise: PixelNoise = noise_of(card, pattern_known=True)
+    return noise.variance_e2(off_e)
+
+
+def _joint_spot(uv_px: Array, covariance_px2: Array) -> Spot:
+    (a, b), (c, d) = covariance_px2.tolist()
+    matrix: Matrix2 = ((a, b), (c, d))
+    return Spot((float(uv_px[0]), float(uv_px[1])), matrix)

@@ -1,0 +1,307 @@
+"""Every estimator on every sample of a dataset, and the paper's tables beside ours.
+
+An estimator takes (rig, stroke, pixel down, pixel up) and returns a `DepthEstimate`; the pixels are the true ones
+("truth") or those that the centroid finds on the noise-free frames ("frame").
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any, Protocol
+
+import numpy as np
+from rich.table import Table
+
+from phibench.estimator.calibration.file import Calibration
+from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
+from phibench.estimator.geometry.paper_depth import depth_approx, depth_paper, find_published
+from phibench.estimator.geometry.phi import CONVENTIONS
+from phibench.estimator.geometry.rig_parameters import stroke_of
+from phibench.estimator.geometry.status import DepthEstimate, Status, describe
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.spots.simple_spots import find_spot
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import POSITIONS, Rig
+
+Estimator = Callable[[Rig, float, Array, Array], DepthEstimate]
+SOURCES = ("truth", "frame")
+GENERAL = "general"
+"""Row of `depth_general`, which takes a calibration's covariance."""
+CENTROID_SIGMA_PX = 0.02
+"""Of `find_spot` on noise-free frames: the pixels' share in the predicted error of `GENERAL` from "frame"."""
+
+
+class Sample(Protocol):
+    """What scoring needs of a sample of `phibench.datasets.read`."""
+
+    @property
+    def row(self) -> Any:
+        """Manifest row."""
+
+    @property
+    def nominal_rig(self) -> Rig:
+        """The rig that an estimator believes, at the down position."""
+
+    def frame(self, position: str, laser: bool = True) -> Array:
+        """Noise-free frame, shape (3, H, W), electrons per second."""
+
+
+class Dataset(Protocol):
+    """What scoring needs of a dataset of `phibench.datasets.read`."""
+
+    @property
+    def samples(self) -> Sequence[Any]:
+        """All samples, visible or not."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """One estimator on one sample.
+
+    Parameters
+    ----------
+    sample_id, experiment : str
+    depth_m, stroke_m : float, truth
+    estimator : key of `ESTIMATORS`
+    source : "truth" or "frame", where the pixels come from
+    estimate_m, error_m, relative_error : float, NaN unless `status` is "ok"
+    published_m : float, the paper's estimate, NaN if it has none
+    status : "ok", or why there is no estimate
+    sigma_m, p_value : float
+        Of `GENERAL`: predicted standard deviation, and the test whether both rays meet; NaN for the others.
+    """
+
+    sample_id: str
+    experiment: str
+    depth_m: float
+    stroke_m: float
+    estimator: str
+    source: str
+    estimate_m: float
+    error_m: float
+    relative_error: float
+    published_m: float
+    status: str
+    sigma_m: float = math.nan
+    p_value: float = math.nan
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Relative errors of one estimator over the samples that have an estimate."""
+
+    estimator: str
+    source: str
+    n: int
+    missing: int
+    rms: float
+    mean: float
+    minimum: float
+    maximum: float
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    down: Array
+    up: Array
+    fault: str = ""
+
+
+@dataclass(frozen=True)
+class _Believed:
+    """What an estimator is given besides pixels."""
+
+    rig: Rig
+    stroke_m: float
+    covariance: Array | None = None
+
+    @classmethod
+    def of(cls, sample: Sample, calibration: Calibration | None) -> _Believed:
+        """Nominal numbers, or those of a calibration."""
+        if calibration is None:
+            return cls(sample.nominal_rig, sample.row.nominal_stroke_m)
+        stroke_m = float(stroke_of(np.array(sample.row.nominal_stroke_m), calibration.values))
+        return cls(calibration.rig, stroke_m, calibration.covariance)
+
+
+def paper_estimator(convention: str, rig: Rig, stroke_m: float, uv_down_px: Array, uv_up_px: Array) -> DepthEstimate:
+    """Eq. (4) with phi in one convention."""
+    phi1, phi2 = _phis(convention, rig, stroke_m, uv_down_px, uv_up_px)
+    return depth_paper(phi1, phi2, stroke_m, rig.mirror.radius_m)
+
+
+def approx_estimator(convention: str, rig: Rig, stroke_m: float, uv_down_px: Array, uv_up_px: Array) -> DepthEstimate:
+    """Eq. (5) with phi in one convention."""
+    phi1, phi2 = _phis(convention, rig, stroke_m, uv_down_px, uv_up_px)
+    return depth_approx(phi1, phi2, stroke_m)
+
+
+ESTIMATORS: dict[str, Estimator] = {
+    **{f"paper_{name}": partial(paper_estimator, name) for name in CONVENTIONS},
+    "approx_ray": partial(approx_estimator, "ray"),
+    "exact": depth_exact,
+}
+
+
+def score(dataset: Dataset, calibration: Calibration | None = None) -> tuple[Score, ...]:
+    """Score all estimators on all samples, from true pixels and from noise-free frames.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    calibration : Calibration, optional
+        Every estimator gets its rig and its strokes, and `GENERAL` its covariance, too.
+
+    Returns
+    -------
+    tuple of Score
+        Every sample appears for every estimator and source; what cannot be estimated carries its cause.
+    """
+    names = tuple(ESTIMATORS) if calibration is None else (*ESTIMATORS, GENERAL)
+    return tuple(
+        _score_one(_Believed.of(sample, calibration), sample.row, name, source, pixels)
+        for sample in dataset.samples
+        for source in SOURCES
+        for pixels in (_pixels(sample, source),)
+        for name in names
+    )
+
+
+def summarise(scores: Iterable[Score]) -> tuple[Summary, ...]:
+    """Summaries per estimator and source, in the order of first appearance."""
+    groups: dict[tuple[str, str], list[Score]] = {}
+    for item in scores:
+        groups.setdefault((item.estimator, item.source), []).append(item)
+    return tuple(_summary(*key, items) for key, items in groups.items())
+
+
+def table(scores: Sequence[Score], source: str = "truth") -> Table:
+    """The paper's tables beside ours: one line per sample, one column per estimator (estimate and relative error)."""
+    grid = Table(title=f"Depth in metres, relative error in %; pixels: {source}")
+    for head in ("experiment", "h", "real D", "published", *dict.fromkeys(item.estimator for item in scores)):
+        grid.add_column(head, justify="left" if head == "experiment" else "right")
+    rows: dict[str, list[Score]] = {}
+    for item in scores:
+        if item.source == source:
+            rows.setdefault(item.sample_id, []).append(item)
+    for items in rows.values():
+        first = items[0]
+        published = _cell(first.published_m, first.published_m / first.depth_m - 1.0, "")
+        cells = (_cell(item.estimate_m, item.relative_error, item.status) + _doubt(item) for item in items)
+        grid.add_row(first.experiment, f"{first.stroke_m:.3f}", f"{first.depth_m:.3f}", published, *cells)
+    grid.add_section()
+    grid.add_row("rms relative error (n)", "", "", _published_rms(list(rows.values())), *_rms_cells(scores, source))
+    return grid
+
+
+def bias_table(scores: Sequence[Score]) -> Table:
+    """Relative error of eq. (4) from true pixels per phi convention: smallest, largest, mean, rms."""
+    grid = Table(title="Bias of eq. (4) by what is taken for phi, true pixels, relative error in %")
+    for head in ("phi", "n", "min", "max", "mean", "rms"):
+        grid.add_column(head, justify="left" if head == "phi" else "right")
+    for item in summarise(scores):
+        if item.source == "truth" and item.estimator.startswith("paper_"):
+            values = (_percent(value) for value in (item.minimum, item.maximum, item.mean))
+            grid.add_row(item.estimator.removeprefix("paper_"), str(item.n), *values, _rms(item.rms))
+    return grid
+
+
+def as_records(items: Iterable[Score | Summary]) -> list[dict[str, object]]:
+    """Scores or summaries as JSON-ready records; NaN becomes None."""
+    return [{key: _json_value(value) for key, value in asdict(item).items()} for item in items]
+
+
+def _phis(convention: str, rig: Rig, stroke_m: float, down_px: Array, up_px: Array) -> tuple[Array, Array]:
+    phi = CONVENTIONS[convention]
+    return phi(rig.at(0.0), down_px), phi(rig.at(stroke_m), up_px)
+
+
+def _pixels(sample: Sample, source: str) -> _Pixels:
+    nowhere = np.full(2, np.nan)
+    for position in POSITIONS:
+        spot = getattr(sample.row, position)
+        if not spot.visible:
+            return _Pixels(nowhere, nowhere, f"{position}: {spot.cause}")
+    if source == "truth":
+        row = sample.row
+        return _Pixels(np.array([row.down.u_px, row.down.v_px]), np.array([row.up.u_px, row.up.v_px]))
+    spots = {p: find_spot(sample.frame(p, laser=True), sample.frame(p, laser=False)) for p in POSITIONS}
+    faults = (f"{p}: {describe(spot.status)}" for p, spot in spots.items() if spot.status is not Status.OK)
+    return _Pixels(spots["down"].uv_px, spots["up"].uv_px, ", ".join(faults))
+
+
+def _score_one(believed: _Believed, row: Any, name: str, source: str, pixels: _Pixels) -> Score:
+    estimate = _estimate(believed, name, source, pixels)
+    depth = float(estimate.depth_m)
+    published = find_published(row.experiment, row.depth_m, row.nominal_stroke_m)
+    return Score(
+        sample_id=row.sample_id,
+        experiment=row.experiment,
+        depth_m=row.depth_m,
+        stroke_m=row.stroke_m,
+        estimator=name,
+        source=source,
+        estimate_m=depth,
+        error_m=depth - row.depth_m,
+        relative_error=depth / row.depth_m - 1.0,
+        published_m=published.estimated_depth_m if published else float("nan"),
+        status=pixels.fault or describe(int(estimate.status)),
+        sigma_m=float(estimate.sigma_m) if isinstance(estimate, GeneralDepth) else math.nan,
+        p_value=float(estimate.p_value) if isinstance(estimate, GeneralDepth) else math.nan,
+    )
+
+
+def _estimate(believed: _Believed, name: str, source: str, pixels: _Pixels) -> DepthEstimate:
+    if name != GENERAL:
+        return ESTIMATORS[name](believed.rig, believed.stroke_m, pixels.down, pixels.up)
+    C = (CENTROID_SIGMA_PX**2 if source == "frame" else 0.0) * np.eye(2)
+    return depth_general(believed.rig, believed.stroke_m, pixels.down, pixels.up, C, C, believed.covariance)
+
+
+def _summary(estimator: str, source: str, items: list[Score]) -> Summary:
+    errors = np.array([item.relative_error for item in items if item.status == "ok"])
+    missing = len(items) - len(errors)
+    if not len(errors):
+        return Summary(estimator, source, 0, missing, *[float("nan")] * 4)
+    rms = float(np.sqrt(np.mean(errors**2)))
+    return Summary(estimator, source, len(errors), missing, rms, *(float(f(errors)) for f in (np.mean, np.min, np.max)))
+
+
+def _cell(value_m: float, relative: float, status: str) -> str:
+    if np.isnan(value_m):
+        return status if status != "ok" else "-"
+    return f"{value_m:.4f} {_percent(relative):>8}"
+
+
+def _doubt(item: Score) -> str:
+    """Predicted error and p value, where there are any."""
+    return "" if math.isnan(item.sigma_m) else f" ± {100.0 * item.sigma_m / item.depth_m:.3f}, p {item.p_value:.2f}"
+
+
+def _percent(relative: float) -> str:
+    """Relative error in %, "-" where there is none; below 0.001 % as a power of ten, so that it does not read as 0."""
+    if np.isnan(relative):
+        return "-"
+    percent = 100.0 * relative
+    return f"{percent:+.3f}" if abs(percent) >= 1e-3 or percent == 0.0 else f"{percent:+.0e}"
+
+
+def _rms(relative: float) -> str:
+    return _percent(relative).removeprefix("+")
+
+
+def _rms_cells(scores: Sequence[Score], source: str) -> list[str]:
+    return [f"{_rms(s.rms)} ({s.n})" for s in summarise(scores) if s.source == source]
+
+
+def _published_rms(rows: list[list[Score]]) -> str:
+    relative = np.array([items[0].published_m / items[0].depth_m - 1.0 for items in rows])
+    relative = relative[np.isfinite(relative)]
+    return f"{_rms(float(np.sqrt(np.mean(relative**2))))} ({len(relative)})" if len(relative) else "-"
+
+
+def _json_value(value: object) -> object:
+    return None if isinstance(value, float) and not np.isfinite(value) else value

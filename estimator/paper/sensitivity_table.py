@@ -1,0 +1,92 @@
+"""Sensitivities of every sample of a data set and every estimator, as one table."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from phibench.datasets.read import Dataset, Sample, open_finished
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.documents import metadata_of, sensitivity_fault
+from phibench.datasets.store.files import write_bytes
+from phibench.estimator.geometry.sensitivities import PARAMETERS, sensitivity
+from phibench.estimator.paper.paper_tables import ESTIMATORS
+from phibench.scenes.rig import POSITIONS
+
+Row = dict[str, str | float | None]
+TRUTH = ("decentre_x_m", "decentre_y_m")
+"""The only parameters on which the true D depends."""
+
+
+def sensitivity_rows(samples: Iterable[Sample]) -> Iterator[Row]:
+    """One row per sample and estimator; numbers are None where a spot is not visible or there is no estimate.
+
+    Columns
+    -------
+    sample_id, estimator : str
+    cause : str
+        Why a spot is not visible, "none" if both are.
+    depth_m, estimate_m : float
+        True D, and the estimate with nominal rig and stroke from the exact pixels.
+    estimate_m_per_<parameter> : float
+        d(estimate)/d(parameter), metres per unit of the parameter: its name ends in m, rad or px, or it is a number.
+    truth_m_per_<parameter> : float
+        d(true D)/d(parameter), for `TRUTH`; 0 for all others.
+    """
+    for sample in samples:
+        for estimator in ESTIMATORS:
+            yield _row(sample, estimator)
+
+
+def write_sensitivities(dataset: Dataset, out: Path) -> Path:
+    """Write the table of a data set as Parquet; its metadata say of which state of the data set."""
+    import polars
+
+    schema = dict.fromkeys(columns(), polars.Float64) | dict.fromkeys(_WORDS, polars.String)
+    buffer = io.BytesIO()
+    table = polars.DataFrame(list(sensitivity_rows(dataset)), schema={name: schema[name] for name in columns()})
+    table.write_parquet(buffer, compression="zstd", statistics=False, metadata=metadata_of(dataset.folder))
+    return write_bytes(out, buffer.getvalue())
+
+
+def keep_sensitivities(folder: Path) -> Path:
+    """Write the table into a finished data set's folder, unless the one there is good."""
+    path = folder / layout.SENSITIVITIES
+    if path.is_file() and sensitivity_fault(folder) is None:
+        return path
+    return write_sensitivities(open_finished(folder), path)
+
+
+def columns() -> tuple[str, ...]:
+    """Names of the columns, in order."""
+    numbers = (f"estimate_m_per_{name}" for name in PARAMETERS)
+    return (*_WORDS, "depth_m", "estimate_m", *numbers, *(f"truth_m_per_{name}" for name in TRUTH))
+
+
+_WORDS = ("sample_id", "estimator", "cause")
+
+
+def _row(sample: Sample, estimator: str) -> Row:
+    row = sample.row
+    hidden = [f"{name}: {row.position(name).cause}" for name in POSITIONS if not row.position(name).visible]
+    words: Row = {"sample_id": row.sample_id, "estimator": estimator, "cause": ", ".join(hidden) or "none"}
+    if hidden:
+        return {**dict.fromkeys(columns()), **words, "depth_m": row.depth_m}
+    spot = np.array(row.spot_world_m)
+    found = sensitivity(estimator, sample.nominal_rig, row.nominal_stroke_m, sample.rig, row.stroke_m, spot)
+    truth = dict(zip(PARAMETERS, found.truth_gradient, strict=True))
+    return {
+        **words,
+        "depth_m": row.depth_m,
+        "estimate_m": _number(found.estimate_m),
+        **{f"estimate_m_per_{p}": _number(x) for p, x in zip(PARAMETERS, found.estimate_gradient, strict=True)},
+        **{f"truth_m_per_{p}": _number(truth[p]) for p in TRUTH},
+    }
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if np.isfinite(value) else None

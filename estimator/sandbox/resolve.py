@@ -1,0 +1,160 @@
+"""What goes wrong with a method before its first pair; every message is for the person at the terminal.
+
+A method that was found: what it is called, where it is, and which version of it.
+
+Find the method that a user names, without running any of its code: this is done in the process that knows the truth.
+
+A reference is ``my_phi.py:extract`` (a file and a function in it), the name of a built-in method, or the name under
+which an installed package registers a method (entry-point group ``phibench.methods``).
+
+What a method may take.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Literal
+
+from phibench.datasets.store.files import sha256
+from phibench.datasets.store.provenance import code_behind
+from phibench.estimator.methods.registry import KNOWN
+from phibench.scenes.validation import close_names
+
+
+class MethodError(ValueError):
+    """A method that cannot be found, loaded or started; one sentence."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A method that is there.
+
+    Attributes
+    ----------
+    name : str
+        Of the method: what a score is filed under.
+    kind : "file", "built-in" or "package"
+    place : str
+        Absolute path of the file; module of the built-in registry; ``module:function`` of an entry point.
+    function : str
+        Function in the file; "" otherwise.
+    sha256 : str or None
+        Of the file, or of the code behind the built-in methods; None for packages.
+    version : str or None
+        Distribution and version of a package.
+    """
+
+    name: str
+    kind: Literal["file", "built-in", "package"]
+    place: str
+    function: str = ""
+    sha256: str | None = None
+    version: str | None = None
+
+    def document(self) -> dict[str, str | None]:
+        """Provenance, as JSON can hold it; of a file its name alone, not where it lies."""
+        place = Path(self.place).name if self.kind == "file" else self.place
+        return {**asdict(self), "place": place}
+
+
+GROUP = "phibench.methods"
+
+
+def resolve(reference: str) -> Reference:
+    """Find a method.
+
+    Raises
+    ------
+    MethodError
+        If the file or its function is missing, the file is not Python, the name is unknown, or two methods share it.
+    """
+    if reference.endswith(".py") or ".py:" in reference:
+        return _of_file(reference)
+    found = [point for point in installed() if point.name == reference]
+    if reference in KNOWN:
+        if found:
+            raise MethodError(f"method '{reference}' is built in, and {_owner(found[0])} registers another")
+        return _built_in(reference)
+    if len(found) > 1:
+        raise MethodError(f"method '{reference}' is registered by {' and by '.join(map(_owner, found))}: remove one")
+    if not found:
+        raise MethodError(_unknown(reference))
+    return Reference(reference, "package", found[0].value, version=_owner(found[0]))
+
+
+def installed() -> tuple[EntryPoint, ...]:
+    """Entry points of installed packages, by name; none of them is imported."""
+    return tuple(sorted(entry_points(group=GROUP), key=lambda point: point.name))
+
+
+def _built_in(name: str) -> Reference:
+    method = KNOWN[name]
+    if not method.installed:
+        raise MethodError(f"method '{name}' needs {method.package}: pip install {method.package}")
+    module = "phibench.estimator.methods.registry"
+    return Reference(name, "built-in", module, sha256=code_behind(module))
+
+
+def _of_file(reference: str) -> Reference:
+    text, colon, function = reference.rpartition(":")
+    if not colon or not function.isidentifier():
+        file = Path(text if colon else reference).name
+        raise MethodError(f"method '{reference}': say which function is meant, such as {file}:extract")
+    path = Path(text).absolute()
+    if not path.is_file():
+        advice = f"`phibench new-method {text}` writes an example"
+        what = "is a folder" if path.is_dir() else "is not there"
+        raise MethodError(f"method '{reference}': the file {path} {what}; {advice}")
+    _require_python(path)
+    return Reference(f"{path.stem}:{function}", "file", str(path), function, sha256=sha256(path))
+
+
+def _require_python(path: Path) -> None:
+    """Compile the file, which runs nothing of it."""
+    try:
+        compile(path.read_bytes(), str(path), "exec", dont_inherit=True)
+    except SyntaxError as error:
+        line = "" if error.lineno is None else f", line {error.lineno}"
+        raise MethodError(f"{path.name}{line}: {error.msg}: Python cannot read the file") from error
+    except (ValueError, UnicodeDecodeError) as error:
+        raise MethodError(f"{path.name}: {error}: Python cannot read the file") from error
+
+
+def _owner(point: EntryPoint) -> str:
+    return "an unknown package" if point.dist is None else f"{point.dist.name} {point.dist.version}"
+
+
+def _unknown(name: str) -> str:
+    known = [*KNOWN, *(point.name for point in installed())]
+    guess = close_names(name, known)
+    advice = f"did you mean '{guess[0]}'?" if guess else "`phibench methods` lists what there is."
+    return f"no method '{name}': {advice} A method of your own is given as file and function, my_phi.py:extract"
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of one method.
+
+    Parameters
+    ----------
+    seconds : float
+        Wall clock for one pair.
+    memory_mb : float
+        Address space (RLIMIT_AS) on top of what the process has after the method was imported, 1e6 bytes; each process
+        that the method starts has its own. Linux only: elsewhere the system does not keep it.
+    start_seconds : float
+        Wall clock for starting Python and importing the method.
+    """
+
+    seconds: float = 30.0
+    memory_mb: float = 4096.0
+    start_seconds: float = 120.0
+
+    def __post_init__(self) -> None:
+        for name in ("seconds", "memory_mb", "start_seconds"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise MethodError(f"limit {name} = {value}: must be a finite number above 0")

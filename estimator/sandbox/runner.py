@@ -1,0 +1,152 @@
+"""Run methods over a set of pairs. What one does to its own process costs the pair at hand, and the run goes on.
+
+The truth stays in this process: the methods' get the fields of `Pair` and nothing else. That keeps honest code honest;
+it is no sandbox. A method that wants to cheat can read any file that its user can.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from types import TracebackType
+
+from phibench.estimator.interface import Outcome, Pair
+from phibench.estimator.pair_set import PairSet
+from phibench.estimator.sandbox.process import MethodProcess
+from phibench.estimator.sandbox.resolve import Limits, MethodError, Reference, resolve
+
+
+class Harness:
+    """Methods in processes of their own, kept warm from pair to pair; a context manager.
+
+    Each pair is made once and shown to one method after the other; pairs are worked on side by side.
+
+    Parameters
+    ----------
+    methods : sequence of str or Reference
+        ``my_phi.py:extract``, a built-in name, or that of an installed package's method.
+    limits : Limits, optional
+    workers : int
+        Pairs that are worked on at a time. One method alone has as many processes, several have one each.
+
+    Raises
+    ------
+    MethodError
+        If a method cannot be found; on entering, if one cannot be imported.
+    """
+
+    def __init__(self, methods: Sequence[str | Reference], limits: Limits | None = None, workers: int = 1) -> None:
+        if workers < 1:
+            raise MethodError(f"workers = {workers}: must be 1 or more")
+        self._references = [resolve(method) if isinstance(method, str) else method for method in methods]
+        self._limits, self._workers = limits or Limits(), workers
+
+    def __enter__(self) -> Harness:
+        copies = self._workers if len(self._references) == 1 else 1
+        self._crews = [_Crew([MethodProcess(r, self._limits) for _ in range(copies)]) for r in self._references]
+        # one more than processes, so that a pair is made while the others are looked at
+        self._pool = ThreadPoolExecutor(self._workers + 1, thread_name_prefix="phibench-method")
+        try:
+            for crew in self._crews:
+                crew.start()  # a method that cannot be imported ends the run before it begins
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: object, trace: TracebackType | None) -> None:
+        for crew in self._crews:
+            crew.close()
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def outcomes(self, pairs: PairSet, numbers: Sequence[int]) -> Iterator[tuple[Outcome, ...]]:
+        """Outcomes of every method for some pairs, in the order of `numbers`.
+
+        Pairs are made one at a time and given out in this order, whatever the number of workers: a set need not be
+        safe for threads, and one process alone sees the same pairs in the same order in every run.
+        """
+        making, turns = _Turns(), [_Turns() for _ in self._crews]
+
+        def one(place: int, number: int) -> tuple[Outcome, ...]:
+            try:
+                with making.turn(place):
+                    pair = pairs.pair(number)
+            except BaseException:
+                for skipped in turns:  # or those that come after would wait for it
+                    with skipped.turn(place):
+                        pass
+                raise
+            return tuple(crew.ask(pair, turn, place) for crew, turn in zip(self._crews, turns, strict=True))
+
+        return self._pool.map(one, range(len(numbers)), numbers)
+
+
+class _Turns:
+    """Lets threads through one after the other, in the order of their places."""
+
+    def __init__(self) -> None:
+        self._condition, self._now = threading.Condition(), 0
+
+    @contextmanager
+    def turn(self, place: int) -> Iterator[None]:
+        """Wait for all places before this one."""
+        with self._condition:
+            self._condition.wait_for(lambda: self._now == place)
+        try:
+            yield
+        finally:
+            with self._condition:
+                self._now += 1
+                self._condition.notify_all()
+
+
+class _Crew:
+    """Processes of one method, of which each looks at one pair at a time."""
+
+    def __init__(self, processes: list[MethodProcess]) -> None:
+        self._processes, self._free = processes, queue.SimpleQueue[MethodProcess]()
+        for process in processes:
+            self._free.put(process)
+
+    def start(self) -> None:
+        self._processes[0].start()
+
+    def ask(self, pair: Pair, turns: _Turns, place: int) -> Outcome:
+        with turns.turn(place):
+            process = self._free.get()
+        try:
+            return process.ask(pair)
+        finally:
+            self._free.put(process)
+
+    def close(self) -> None:
+        for process in self._processes:
+            process.close()
+
+
+def run_method(
+    reference: str | Reference, pairs: PairSet, limits: Limits | None = None, workers: int = 1
+) -> list[Outcome]:
+    """Outcomes of one method on all pairs, in number order; parameters and errors as for `Harness`."""
+    return list(outcomes(reference, pairs, limits, workers))
+
+
+def outcomes(
+    reference: str | Reference,
+    pairs: PairSet,
+    limits: Limits | None = None,
+    workers: int = 1,
+    numbers: Sequence[int] | None = None,
+) -> Iterator[Outcome]:
+    """As `run_method`, one at a time, for some pairs or all of them; leaving the loop ends the processes."""
+    wanted = range(len(pairs)) if numbers is None else numbers
+    return _outcomes(Harness([reference], limits, min(workers, max(len(wanted), 1))), pairs, wanted)
+
+
+def _outcomes(harness: Harness, pairs: PairSet, numbers: Sequence[int]) -> Iterator[Outcome]:
+    with harness:
+        for (outcome,) in harness.outcomes(pairs, numbers):
+            yield outcome

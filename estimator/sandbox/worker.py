@@ -1,0 +1,225 @@
+"""Limit of the address space of this process, for a while (POSIX; kept by Linux).
+
+Import a method, in the process that will run it.
+
+The process in which a method runs: ``python -m phibench.estimator.sandbox.worker SOCKET MEMORY``.
+
+It gets numbers of two open files, a reference and pairs, and answers with JSON. What the method prints goes elsewhere.
+The fatal signals print Python's stack, and SIGUSR1 does so at any time: the parent reads the method's line from it.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import importlib
+import importlib.util
+import inspect
+import json
+import os
+import resource
+import signal
+import socket
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from phibench.datasets.store.files import sha256
+from phibench.estimator.interface import Method
+from phibench.estimator.sandbox.answers import answer_text, to_bytes
+from phibench.estimator.sandbox.resolve import MethodError, Reference
+from phibench.estimator.sandbox.transport import Channel, ChannelError, Parcel, SharedPages, unpack
+from phibench.scenes.validation import close_names
+
+_STATM = Path("/proc/self/statm")
+
+
+def size_bytes() -> int:
+    """Address space in use; 0 where the system does not tell."""
+    if not _STATM.is_file():
+        return 0
+    return int(_STATM.read_text().split()[0]) * resource.getpagesize()
+
+
+@contextmanager
+def limited(limit_bytes: int) -> Iterator[None]:
+    """Keep RLIMIT_AS at a limit; taken off afterwards, so that what went wrong can be told."""
+    if not _STATM.is_file():
+        yield
+        return
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    lowest = min((x for x in (limit_bytes, soft, hard) if x != resource.RLIM_INFINITY), default=limit_bytes)
+    resource.setrlimit(resource.RLIMIT_AS, (lowest, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+_MODULE = "phibench_method"
+
+
+def load(reference: Reference) -> Method:
+    """Import the method of a reference; runs the code of its file or package.
+
+    Raises
+    ------
+    MethodError
+        If the file has changed, the import fails, the function is missing, is no function, or does not take one pair.
+    """
+    if reference.kind == "built-in":
+        from phibench.estimator.methods.registry import KNOWN  # a second of imports that a user's method need not have
+
+        return KNOWN[reference.name]
+    function = _from_file(reference) if reference.kind == "file" else _from_package(reference)
+    _require_method(function, _title(reference))
+    return function
+
+
+def place_in(error: BaseException, file: str = "") -> str:
+    """Last line of `file` that an exception went through, or the line that raised it: "my_phi.py, line 12, in f"."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if frame.filename == file] or frames[-1:]
+    if not own:
+        return ""
+    frame = own[-1]
+    return f"{Path(frame.filename).name}, line {frame.lineno}, in {frame.name}"
+
+
+def sentence_of(error: BaseException, file: str = "") -> str:
+    """An exception in one sentence, with the method's own line."""
+    text = " ".join(str(error).split())
+    what = f"{type(error).__name__}: {text}" if text else type(error).__name__
+    place = place_in(error, file)
+    return f"{what} ({place})" if place else what
+
+
+def _title(reference: Reference) -> str:
+    return f"{Path(reference.place).name}:{reference.function}" if reference.kind == "file" else reference.name
+
+
+def _from_file(reference: Reference) -> Any:
+    path = Path(reference.place)
+    # a process that is started anew in the middle of a run must not take up an edited file
+    if not path.is_file() or sha256(path) != reference.sha256:
+        raise MethodError(f"{path.name} was changed or removed after it was looked up: run it again")
+    sys.path.insert(0, str(path.parent))  # a method may import what lies beside it
+    spec = importlib.util.spec_from_file_location(_MODULE, path)
+    if spec is None or spec.loader is None:
+        raise MethodError(f"{path.name}: Python does not know how to import it")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[_MODULE] = module  # dataclasses and pickle look their module up
+    try:
+        spec.loader.exec_module(module)
+    except BaseException as error:
+        raise MethodError(f"{path.name} cannot be imported: {sentence_of(error, str(path))}") from error
+    if not hasattr(module, reference.function):
+        raise MethodError(f"{path.name} has no function '{reference.function}': {_advice(reference.function, module)}")
+    return getattr(module, reference.function)
+
+
+def _advice(name: str, module: ModuleType) -> str:
+    own = [
+        key for key, value in vars(module).items() if inspect.isfunction(value) and value.__module__ == module.__name__
+    ]
+    guess = close_names(name, own)
+    if guess:
+        return f"did you mean '{guess[0]}'?"
+    return f"it has {', '.join(own)}" if own else "it has no function at all"
+
+
+def _from_package(reference: Reference) -> Any:
+    module, _, attribute = reference.place.partition(":")
+    try:
+        found: Any = importlib.import_module(module)
+        for name in filter(None, attribute.split(".")):
+            found = getattr(found, name)
+    except BaseException as error:
+        raise MethodError(f"method '{reference.name}' cannot be imported: {sentence_of(error)}") from error
+    return found
+
+
+def _require_method(function: Any, title: str) -> None:
+    if not callable(function):
+        raise MethodError(f"{title} is of type {type(function).__name__}, not a function: write def extract(pair): ...")
+    if inspect.isclass(function):
+        raise MethodError(f"{title} is a class: give a function, or an object that can be called with a pair")
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return  # compiled code need not tell
+    try:
+        signature.bind(object())
+    except TypeError:
+        raise MethodError(f"{title}{signature} must take one pair and nothing else: def extract(pair): ...") from None
+    if inspect.iscoroutinefunction(function) or inspect.isgeneratorfunction(function):
+        raise MethodError(f"{title} is a coroutine or generator: it must return an Answer itself")
+
+
+_READ_ONLY = "read-only"  # in numpy's words: "assignment destination is read-only", "output array is read-only"
+_ORPHAN_SECONDS = 2.0
+
+
+def main() -> None:
+    """Load one method and answer pairs until the parent hangs up."""
+    line, reader = (int(text) for text in sys.argv[1:])
+    sys.argv[1:] = []
+    channel, pages = Channel(socket.socket(fileno=line)), SharedPages(reader)
+    faulthandler.enable(all_threads=False)
+    faulthandler.register(signal.SIGUSR1, all_threads=False)
+    threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
+    order = json.loads(channel.receive())
+    reference = Reference(**order["reference"])
+    try:
+        method = load(reference)
+    except MethodError as error:
+        channel.send(to_bytes({"fault": str(error)}))
+        return
+    file = reference.place if reference.kind == "file" else ""
+    limit = size_bytes() + int(order["memory_bytes"])
+    channel.send(to_bytes({"fault": ""}))
+    try:
+        while True:
+            parcel = unpack(channel.receive(), pages)
+            channel.send(to_bytes(_reply(method, parcel, limit, file)))
+    except ChannelError:
+        return
+
+
+def _reply(method: Method, parcel: Parcel, limit: int, file: str) -> dict[str, Any]:
+    start = time.perf_counter()
+    try:
+        with limited(limit):
+            answer = method(parcel.pair)
+        reply: dict[str, Any] = {"failure": "", "answer": answer_text(answer)}
+    except MemoryError as error:
+        reply = {"failure": "memory", "message": f"more memory than the limit: {sentence_of(error, file)}"}
+    except BaseException as error:
+        reply = _of_exception(error, file)
+    reply["seconds"] = time.perf_counter() - start
+    if not parcel.unchanged():
+        return {**reply, "failure": "mutated", "message": "the method wrote into the pair's images: work on a copy"}
+    return reply
+
+
+def _of_exception(error: BaseException, file: str) -> dict[str, Any]:
+    if isinstance(error, ValueError) and _READ_ONLY in str(error):
+        advice = "the pair's images are read-only: work on a copy, such as pair.down.astype(float)"
+        return {"failure": "mutated", "message": f"{sentence_of(error, file)}; {advice}"}
+    return {"failure": "error", "message": sentence_of(error, file)}
+
+
+def _end_with_parent(parent: int) -> None:
+    """Leave when the parent has died: nobody else would end a method that hangs."""
+    while os.getppid() == parent:
+        time.sleep(_ORPHAN_SECONDS)
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main()

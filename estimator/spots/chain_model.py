@@ -1,0 +1,249 @@
+"""Mean and covariance of processed images from the mean electrons of the raw pixels.
+
+The stages, for a window of whole JPEG units and the raw pixels around it:
+
+* raw pixels: independent, mean and variance in electrons, cut at saturation;
+* bilinear demosaicing, white balance, colour matrix: a sparse matrix A on electrons;
+* sRGB curve and 8 bits: mean and slope under the noise, from the converter's law (`code_means`), or, where a colour
+  matrix or sharpening mixes the pixels, of a Gaussian value (`tone_curve.noisy`);
+* sharpening, Y Cb Cr, chroma averages, DCT: a matrix T.
+
+Covariance of the coefficients: (T D A) V (T D A)^T with the slopes D, plus what rounding adds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.spots.code_statistics import COUNTS, MeanCodes, mean_codes
+from phibench.estimator.spots.image_planes import noisy
+from phibench.estimator.spots.jpeg_coefficients import CHROMA_STEP, YCC_FROM_RGB, coefficients, mcu_px, steps, transform
+from phibench.estimator.spots.raw_pixels import PixelNoise, bayer_filters
+from phibench.scenes.frames import Array
+
+_UNITS = 2  # a window holds 2 x 2 units: the spot is at least half a unit from its sides
+_ROUNDING = 1.0 / 12.0
+UNIT_MATRIX = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class ChainModel:
+    """One sensor's processing of one window.
+
+    Attributes
+    ----------
+    card : SensorCard
+    noise : PixelNoise
+        Without the converter's rounding.
+    shape : (h, w) of the window, whole units
+    margin : int
+        Raw pixels around the window on each side.
+    filters : shape (h + 2 margin, w + 2 margin)
+    linear : sparse, shape (3 p, r)
+        From electrons of the raw pixels to linear R, G, B, full scale 1, on the window (and what sharpening needs).
+    squared : sparse, shape (3 p, r)
+        Squares of its elements.
+    kinds : shape (3 p,)
+        Colour and number of the pixels that a value is the mean of, as rows of the tables.
+    tables : MeanCodes or None
+        None where a colour matrix mixes the pixels, or sharpening comes between curve and rounding.
+    transform, squares : shape (3 p, n)
+        From codes to coefficients, and the squares of its elements.
+    step : shape (n,)
+        Of the quantiser.
+    shift : shape (n,)
+        Of the coefficients by the level shift, and by libjpeg's way to round chroma averages.
+    rounding : shape (n,)
+        Variance of the coefficients from all roundings before the quantiser.
+    """
+
+    card: SensorCard
+    noise: PixelNoise
+    shape: tuple[int, int]
+    margin: int
+    filters: NDArray[np.int64]
+    linear: sparse.csr_array
+    squared: sparse.csr_array
+    kinds: NDArray[np.int64]
+    tables: MeanCodes | None
+    transform: Array
+    squares: Array
+    step: Array
+    shift: Array
+    rounding: Array
+
+
+@dataclass(frozen=True)
+class Codes:
+    """Mean codes of one raw mean, and how they change; p values of a plane, three planes.
+
+    Attributes
+    ----------
+    mean : shape (..., 3 p), codes
+    by_mean : shape (..., 3 p), change of the mean code with that of the linear light, codes per unit of full scale
+    regression : shape (..., 3 p), change of a drawn code with that of the drawn light
+    excess : shape (..., 3 p), variance of the codes that the regression leaves
+    """
+
+    mean: Array
+    by_mean: Array
+    regression: Array
+    excess: Array
+
+    def one(self, index: int) -> Codes:
+        """Codes of one of the means."""
+        return Codes(self.mean[index], self.by_mean[index], self.regression[index], self.excess[index])
+
+
+@lru_cache(maxsize=8)
+def chain_model(card: SensorCard, noise: PixelNoise) -> ChainModel:
+    """Model of a sensor with JPEG, on 2 x 2 units; kept, because it is the same for all spots.
+
+    Parameters
+    ----------
+    card : SensorCard
+    noise : PixelNoise
+        Without the converter's rounding.
+    """
+    h, w = (_UNITS * side for side in mcu_px(card.jpeg_subsampling))
+    grown = 1 if card.sharpen_amount > 0.0 else 0
+    margin = grown + 1
+    outer = (h + 2 * grown, w + 2 * grown)
+    filters = bayer_filters(np.array([[margin % 2, margin % 2]]), (outer[0] + 2, outer[1] + 2))[0]
+    linear = _linear(card, outer, margin)
+    T = np.ascontiguousarray(_sharpening(outer, card.sharpen_amount).T @ transform((h, w), card.jpeg_subsampling).T)
+    step = steps((h, w), card.jpeg_subsampling, card.jpeg_quality)
+    shift, rounding = _shift((h, w), card.jpeg_subsampling), _rounding((h, w), card.jpeg_subsampling)
+    plain = card.colour_matrix == UNIT_MATRIX and card.sharpen_amount == 0.0
+    tables = mean_codes(card, noise) if plain else None
+    kinds = _kinds(filters)
+    return ChainModel(
+        card, noise, (h, w), margin, filters, linear, linear.power(2), kinds, tables, T, T * T, step, shift, rounding
+    )
+
+
+def codes(model: ChainModel, mean_e: Array) -> Codes:
+    """Mean codes and their slopes for means of the raw pixels, shape (..., r), electrons."""
+    linear = _apply(model.linear, mean_e)
+    if model.tables is None:
+        sigma = np.sqrt(_apply(model.squared, raw_variance_e2(model, mean_e)))
+        n = noisy(linear, sigma)
+        excess = np.maximum(n.variance - (n.by_mean * sigma) ** 2, 0.0)
+        return Codes(255.0 * n.mean, 255.0 * n.by_mean, 255.0 * n.by_mean, 255.0**2 * excess + _ROUNDING)
+    gain = np.repeat(full_scale_e(model.card) / np.asarray(model.card.white_balance), linear.shape[-1] // 3)
+    at, table = linear * gain, model.tables.at
+    by_mean, regression = (table(name, at, model.kinds) * gain for name in ("by_mean", "regression"))
+    return Codes(table("mean", at, model.kinds), by_mean, regression, table("excess", at, model.kinds))
+
+
+def raw_variance_e2(model: ChainModel, mean_e: Array) -> Array:
+    """Variance of the raw pixels, shape as `mean_e`, rounding included."""
+    return model.noise.variance_e2(mean_e) + 1.0 / (12.0 * model.card.dn_per_e**2)
+
+
+def code_slopes(model: ChainModel, at: Codes, derivatives: Array) -> Array:
+    """Derivatives of the mean codes, shape (..., k, 3 p), from those of the raw pixels, shape (..., k, r)."""
+    return at.by_mean[..., None, :] * _apply(model.linear, derivatives)
+
+
+def noise_factor(model: ChainModel, at: Codes, variance_e2: Array, transform: Array) -> Array:
+    """Matrix F, shape (r, n), of which F^T F is the coefficients' covariance from the raw pixels' noise; one window.
+
+    Parameters
+    ----------
+    at : Codes, of one window
+    variance_e2 : shape (r,)
+    transform : shape (3 p, n), of those coefficients
+    """
+    spread = sparse.diags_array(at.regression) @ model.linear @ sparse.diags_array(np.sqrt(variance_e2))
+    return np.asarray(sparse.csr_array(spread.T) @ transform)
+
+
+def full_scale_e(card: SensorCard) -> float:
+    """Electrons of linear light 1."""
+    return (card.top_dn - card.black_level_dn) / card.dn_per_e
+
+
+def _apply(matrix: sparse.csr_array, values: Array) -> Array:
+    """Matrix times the last axis."""
+    flat = values.reshape(-1, values.shape[-1])
+    return np.asarray((matrix @ flat.T).T).reshape(*values.shape[:-1], -1)
+
+
+def _linear(card: SensorCard, outer: tuple[int, int], margin: int) -> sparse.csr_array:
+    """Demosaicing by the mean of a colour's pixels among the nearest 3 x 3, or the own one; gains; matrix."""
+    h, w = outer
+    planes = sparse.vstack([_interpolation(h, w, margin, colour) for colour in range(3)]).tocsr()
+    mix = np.asarray(card.colour_matrix) * np.asarray(card.white_balance) / full_scale_e(card)
+    return sparse.csr_array(sparse.kron(sparse.csr_array(mix), sparse.eye_array(h * w)) @ planes)
+
+
+def _kinds(filters: NDArray[np.int64]) -> NDArray[np.int64]:
+    """3 x colour + place of the number of pixels in `COUNTS`, of all values of three planes."""
+    inner = filters[1:-1, 1:-1]
+    rows = []
+    for colour in range(3):
+        distance = np.abs(inner - colour)  # 0: own pixel
+        count = np.where(distance == 0, 1, np.where((inner == 1) & (colour != 1), 2, 4))
+        rows.append(3 * colour + np.searchsorted(COUNTS, count))
+    return np.concatenate([row.ravel() for row in rows])
+
+
+def _interpolation(h: int, w: int, margin: int, colour: int) -> sparse.csr_array:
+    """One plane, shape (h w, (h + 2)(w + 2))."""
+    filters = bayer_filters(np.array([[margin % 2, margin % 2]]), (h + 2, w + 2))[0]
+    rows, columns, values = [], [], []
+    for v in range(1, h + 1):
+        for u in range(1, w + 1):
+            own = filters[v, u] == colour
+            near = (
+                [(v, u)]
+                if own
+                else [(a, b) for a in (v - 1, v, v + 1) for b in (u - 1, u, u + 1) if filters[a, b] == colour]
+            )
+            rows += [(v - 1) * w + u - 1] * len(near)
+            columns += [a * (w + 2) + b for a, b in near]
+            values += [1.0 / len(near)] * len(near)
+    return sparse.csr_array((values, (rows, columns)), shape=(h * w, (h + 2) * (w + 2)))
+
+
+def _sharpening(outer: tuple[int, int], amount: float) -> sparse.csr_array:
+    """Unsharp mask of three planes from the grown window to the window; the unit matrix without sharpening."""
+    h, w = outer
+    if amount == 0.0:
+        return sparse.csr_array(sparse.eye_array(3 * h * w))
+    blur, cut = (sparse.kron(_band(h, weights), _band(w, weights)) for weights in ((0.25, 0.5, 0.25), (0.0, 1.0, 0.0)))
+    return sparse.csr_array(sparse.kron(sparse.eye_array(3), (1.0 + amount) * cut - amount * blur))
+
+
+def _band(size: int, weights: tuple[float, float, float]) -> sparse.csr_array:
+    """Filter of three taps, shape (size - 2, size)."""
+    return sparse.csr_array(sparse.diags_array(weights, offsets=(0, 1, 2), shape=(size - 2, size)))
+
+
+def _shift(shape: tuple[int, int], subsampling: str) -> Array:
+    """Coefficients of what is added before the DCT: -128 on Y, and the mean error of libjpeg's chroma averages."""
+    h, w = shape
+    down, across = CHROMA_STEP[subsampling]
+    ycc = np.zeros((3, h, w))
+    ycc[0] = -128.0
+    # libjpeg adds 0, 1, 0, 1 before it halves (1, 2, 1, 2 before it quarters): -1/4 and +1/4 (-1/8, +1/8) in turns
+    if across > 1:
+        ycc[1:] = (0.25 / down) * np.where(np.arange(w) // across % 2 == 0, -1.0, 1.0)
+    return coefficients(np.einsum("ij,jhw->ihw", np.linalg.inv(YCC_FROM_RGB), ycc), subsampling)
+
+
+def _rounding(shape: tuple[int, int], subsampling: str) -> Array:
+    """Variance of orthonormal coefficients of white rounding: R, G, B to codes, Y Cb Cr to integers, averages."""
+    down, across = CHROMA_STEP[subsampling]
+    count, n = shape[0] * shape[1], down * across
+    of_codes = _ROUNDING * np.sum(YCC_FROM_RGB**2, axis=1)
+    average = {1: 0.0, 2: 0.125, 4: 0.094}[n]  # rounding of whole, half and quarter numbers
+    chroma = [(part + _ROUNDING) / n + average for part in of_codes[1:]]
+    return np.concatenate([np.full(count, of_codes[0] + _ROUNDING), *(np.full(count // n, part) for part in chroma)])

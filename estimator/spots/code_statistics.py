@@ -1,0 +1,330 @@
+"""Law of an 8-bit code at a pixel's own colour: each code is an interval of the raw signal.
+
+Bilinear demosaicing keeps the value of a pixel behind its own filter. White balance, sRGB curve and both roundings are
+then a monotonic map from the converter's DN to the code, so that a code stands for a range of DN, and a range of DN for
+an interval [low, high) of electrons before the converter: the likelihood is Phi((high - mu) / s) - Phi((low - mu) / s),
+s^2 = V(mu). Rounding and clipping at both ends are in it exactly. The Poisson law is taken as a Gaussian.
+
+Mean and spread of the 8-bit codes of interpolated pixels, from the exact law of the converter's DN.
+
+A demosaiced value is the mean of 1, 2 or 4 pixels, so it stands on a lattice of 1, 1/2 or 1/4 DN. A webcam's converter
+and the sRGB curve are coarse against the noise (12.5 electrons a DN, up to 3 codes a DN): the code's rounding does not
+average out, and smooth expansions are off by up to half a code. The sums over the lattice are done once, on nodes of
+the mean, as for pixels of equal means; along the slope of a spot the variances add up to the same, V being affine.
+
+Pixels that the full well cuts: mean, slope and variance of min(X, W) for a Gaussian X.
+
+With z = (W - mu) / s, Phi and phi of the normal law, and T = W - min(X, W):
+
+    E[T] = s (z Phi(z) + phi(z)),    E[T^2] = s^2 ((z^2 + 1) Phi(z) + z phi(z)),    dE[min(X, W)] / dmu = Phi(z).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import fftconvolve
+from scipy.special import log_ndtr, ndtr
+from scipy.stats import poisson
+
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.spots.image_planes import encoded
+from phibench.estimator.spots.raw_pixels import PixelNoise
+from phibench.scenes.frames import Array
+
+_LAW_NODES = 1024  # of the table of information, even in sign(mu) sqrt(|mu|)
+_BELOW = 8.0  # square root of the electrons below 0 that a fit may try
+_FAR = 6.0  # standard deviations beyond which an interval's score is that of its nearer end
+_WELL_SIGMAS = 4.0  # of read noise: what is this near to saturation only says "at least"
+_ROOT_2PI = np.sqrt(2.0 * np.pi)
+
+
+@dataclass(frozen=True)
+class CodeTable:
+    """Intervals of electrons, shape (3, 256): R, G, B, code; open ends are infinite.
+
+    Attributes
+    ----------
+    low_e, high_e : shape (3, 256)
+    """
+
+    low_e: Array
+    high_e: Array
+
+    @property
+    def middle_e(self) -> Array:
+        """A value in each interval, shape (3, 256), electrons; the finite end where the other is open."""
+        low = np.where(np.isfinite(self.low_e), self.low_e, self.high_e)
+        return 0.5 * (low + np.where(np.isfinite(self.high_e), self.high_e, low))
+
+
+def code_table(card: SensorCard) -> CodeTable:
+    """Intervals of a sensor without sharpening whose colour matrix is the unit matrix.
+
+    A code that no DN gives has the interval of the next one above that occurs.
+    """
+    dn = np.arange(card.top_dn + 1)
+    linear = np.asarray((dn - card.black_level_dn) / (card.top_dn - card.black_level_dn), float)
+    rows = [_ends(np.rint(255.0 * encoded(gain * linear)).astype(int), card.top_dn) for gain in card.white_balance]
+    low, high = ((np.array(x) - card.black_level_dn) / card.dn_per_e for x in zip(*rows, strict=True))
+    well = card.saturation_e - _WELL_SIGMAS * np.sqrt(card.read_noise_e**2 + card.dsnu_e**2)
+    full = high > well
+    # all that are full are one code: "at least the lowest of them"
+    lowest = np.min(np.where(full, low, np.inf), axis=1, keepdims=True)
+    return CodeTable(np.where(full, lowest, low), np.where(full, np.inf, high))
+
+
+def _ends(codes: NDArray[np.int64], top_dn: int) -> tuple[Array, Array]:
+    """DN between which each of 256 codes lies, from the code of each DN, which rises."""
+    there = np.unique(codes)
+    k = there[np.minimum(np.searchsorted(there, np.arange(256)), len(there) - 1)]
+    first, last = np.searchsorted(codes, k, "left"), np.searchsorted(codes, k, "right") - 1
+    return np.where(first == 0, -np.inf, first - 0.5), np.where(last == top_dn, np.inf, last + 0.5)
+
+
+@dataclass(frozen=True)
+class CodeLaw:
+    """`PixelLaw` of codes; `x` of its methods is not looked at, the codes' intervals are.
+
+    Attributes
+    ----------
+    low_e, high_e : shape (n, h, w)
+    filters : shape (n, h, w)
+    noise : PixelNoise
+        Without the converter's rounding, which is in the intervals.
+    table : shape (3, m)
+        Information on nodes even in sign(mu) sqrt(|mu|) from -8, per filter.
+    step : float
+        Distance of the nodes, square roots of electrons.
+    """
+
+    low_e: Array
+    high_e: Array
+    filters: NDArray[np.int64]
+    noise: PixelNoise
+    table: Array
+    step: float
+
+    def rows(self, index: NDArray[np.int64]) -> CodeLaw:
+        """Law of some of the spots."""
+        return replace(self, low_e=self.low_e[index], high_e=self.high_e[index], filters=self.filters[index])
+
+    def score(self, x: Array, mean: Array) -> Array:
+        """Derivative of log(Phi(b) - Phi(a)) by the mean; far out that of the Gaussian at the nearer end."""
+        s, by_mean = _deviation(self.noise, mean)
+        a, b = (self.low_e - mean) / s, (self.high_e - mean) / s
+        chance, change = _interval(a, b, s, by_mean)
+        near = np.where(a > 0.0, a, b)
+        far = (np.minimum(np.abs(a), np.abs(b)) > _FAR) & ((a > 0.0) == (b > 0.0))
+        return np.asarray(np.where(far, near / s, change / np.maximum(chance, 1e-300)))
+
+    def information(self, mean: Array) -> Array:
+        """Sum over the codes of (dP/dmu)^2 / P, by linear interpolation in a table."""
+        at = np.maximum(_BELOW + np.sign(mean) * np.sqrt(np.abs(mean)), 0.0) / self.step
+        node = np.minimum(at.astype(np.int64), self.table.shape[1] - 2)
+        share = np.minimum(at - node, 1.0)
+        first = self.table[self.filters, node]
+        return np.asarray(first + share * (self.table[self.filters, node + 1] - first))
+
+    def misfit(self, x: Array, mean: Array) -> Array:
+        """-2 log P."""
+        s, _ = _deviation(self.noise, mean)
+        a, b = (self.low_e - mean) / s, (self.high_e - mean) / s
+        # the smaller tail of the two keeps its digits
+        a, b = np.where(a > 0.0, -b, a), np.where(a > 0.0, -a, b)
+        upper = log_ndtr(b)
+        return np.asarray(-2.0 * (upper + np.log(np.maximum(-np.expm1(log_ndtr(a) - upper), 1e-300))))
+
+
+def code_law(
+    codes: NDArray[Any], filters: NDArray[np.int64], card: SensorCard, noise: PixelNoise, table: CodeTable
+) -> CodeLaw:
+    """Law of own-colour codes.
+
+    Parameters
+    ----------
+    codes : shape (n, h, w), uint8
+        Of each pixel's own colour.
+    filters : shape (n, h, w), 0, 1, 2
+    card : SensorCard
+    noise : PixelNoise
+        Without rounding.
+    table : CodeTable
+        Of the card.
+    """
+    step, information = _information_table(card, noise)
+    return CodeLaw(table.low_e[filters, codes], table.high_e[filters, codes], filters, noise, information, step)
+
+
+@lru_cache(maxsize=8)
+def _information_table(card: SensorCard, noise: PixelNoise) -> tuple[float, Array]:
+    """Distance of the nodes and information on them, shape (3, m), read only; kept, because fits repeat a card."""
+    root, step = np.linspace(-_BELOW, np.sqrt(1.3 * card.saturation_e), _LAW_NODES, retstep=True)
+    mean, table = (np.sign(root) * root**2)[:, None], code_table(card)
+    ends = zip(table.low_e, table.high_e, strict=True)
+    information = np.stack([_information(low, high, mean, noise) for low, high in ends])
+    information.flags.writeable = False
+    return float(step), information
+
+
+def _information(low: Array, high: Array, mean: Array, noise: PixelNoise) -> Array:
+    """Information on the nodes `mean`, shape (m, 1), about codes with the ends `low`, `high`, shape (256,)."""
+    s, by_mean = _deviation(noise, mean)
+    _, once = np.unique(low, return_index=True)  # codes that do not occur repeat others
+    chance, change = _interval((low[once] - mean) / s, (high[once] - mean) / s, s, by_mean)
+    return np.sum(np.where(chance > 1e-30, change**2 / np.maximum(chance, 1e-30), 0.0), axis=1)
+
+
+def _deviation(noise: PixelNoise, mean: Array) -> tuple[Array, Array]:
+    """Standard deviation and its derivative by the mean; the mean's way to 0 has no corner, within 1 electron."""
+    root = np.sqrt(mean * mean + 1.0)
+    smooth, slope = 0.5 * (mean + root), 0.5 * (1.0 + mean / root)
+    s = np.sqrt(noise.variance_e2(smooth))
+    return s, slope * (1.0 + 2.0 * noise.prnu**2 * smooth) / (2.0 * s)
+
+
+def _interval(a: Array, b: Array, s: Array, by_mean: Array) -> tuple[Array, Array]:
+    """Phi(b) - Phi(a) and its derivative by the mean; a and b are (end - mean) / s, `by_mean` is ds/dmean."""
+    # of two upper tails the difference loses its digits, of two lower ones it does not
+    flip = a > 0.0
+    chance = np.where(flip, ndtr(-a) - ndtr(-b), ndtr(b) - ndtr(a))
+    change = (_density(a) * (1.0 + _finite(a) * by_mean) - _density(b) * (1.0 + _finite(b) * by_mean)) / s
+    return chance, change
+
+
+def _density(x: Array) -> Array:
+    return np.asarray(np.exp(-0.5 * x * x) / _ROOT_2PI)
+
+
+def _finite(x: Array) -> Array:
+    return np.where(np.isfinite(x), x, 0.0)
+
+
+COUNTS = (1, 2, 4)
+"""Pixels in a mean."""
+
+_MEAN_NODES = 400  # even in sqrt(mu)
+_POISSON_UP_TO_E = 300.0  # from there a Gaussian: skewness 0.06
+_SIGMAS = 8.0
+
+
+@dataclass(frozen=True)
+class MeanCodes:
+    """Tables on nodes even in sqrt(mean), shape (3, 3, m): colour, one of `COUNTS`, node.
+
+    Attributes
+    ----------
+    step : float
+        Distance of the nodes, square roots of electrons.
+    mean : codes
+    by_mean : codes per electron of the pixels' mean
+    regression : codes per electron: covariance of code and mean of the pixels, over the variance of the latter
+    excess : variance of the code that the regression leaves, codes squared
+    """
+
+    step: float
+    mean: Array
+    by_mean: Array
+    regression: Array
+    excess: Array
+
+    def at(self, name: str, mean_e: Array, which: NDArray[np.int64]) -> Array:
+        """Values of one table, linear between nodes.
+
+        Parameters
+        ----------
+        name : "mean", "by_mean", "regression" or "excess"
+        mean_e : shape (..., p)
+            Below 0 the mean goes on along its slope at 0.
+        which : shape (p,), int
+            Row of the table, 3 x colour + place in `COUNTS`.
+        """
+        table = getattr(self, name).reshape(9, -1)
+        root = np.sqrt(np.maximum(mean_e, 0.0)) / self.step
+        node = np.minimum(root.astype(np.int64), table.shape[1] - 2)
+        share = np.minimum(root - node, 1.0)
+        first = table[which, node]
+        value = first + share * (table[which, node + 1] - first)
+        return value + np.minimum(mean_e, 0.0) * self.by_mean.reshape(9, -1)[which, 0] if name == "mean" else value
+
+
+@lru_cache(maxsize=8)
+def mean_codes(card: SensorCard, noise: PixelNoise) -> MeanCodes:
+    """Tables of a sensor whose colour matrix is the unit matrix; `noise` is without the converter's rounding."""
+    root, step = np.linspace(0.0, np.sqrt(1.3 * card.saturation_e), _MEAN_NODES, retstep=True)
+    sums = np.array([_moments(mu, card, noise) for mu in root**2])  # (m, colour, count, 4)
+    mean, regression, excess = np.ascontiguousarray(sums.transpose(3, 1, 2, 0))
+    by_mean = np.gradient(mean, root**2, axis=-1)
+    return MeanCodes(float(step), mean, by_mean, regression, excess)
+
+
+def _moments(mu: float, card: SensorCard, noise: PixelNoise) -> Array:
+    """Mean code, regression and excess, shape (3 colours, 3 counts, 3)."""
+    first, chance = _law(mu, card, noise)
+    result = np.empty((3, len(COUNTS), 3))
+    for i, count in enumerate(COUNTS):
+        if count > 1:
+            chance = np.maximum(fftconvolve(chance, chance), 0.0)
+        x = first + np.arange(len(chance)) / count - card.black_level_dn  # DN above black
+        p = chance / chance.sum()
+        linear = x / (card.top_dn - card.black_level_dn)
+        y = np.stack([np.rint(255.0 * encoded(gain * linear)) for gain in card.white_balance])
+        mean = y @ p
+        dx = x - x @ p
+        variance = dx**2 @ p
+        covariance = (y - mean[:, None]) * dx @ p
+        slope = covariance / variance if variance > 0.0 else np.zeros(3)  # 0: full pixels have one DN only
+        left = (y - mean[:, None]) ** 2 @ p - slope * covariance
+        result[:, i] = np.stack([mean, slope * card.dn_per_e, np.maximum(left, 0.0)], axis=-1)
+    return result
+
+
+def _law(mu: float, card: SensorCard, noise: PixelNoise) -> tuple[float, Array]:
+    """First DN and the chances of the DN from there on, of one pixel."""
+    spread = _SIGMAS * np.sqrt(noise.variance_e2(np.array(mu)) + 1.0 / card.dn_per_e**2)
+    ends = np.rint(card.black_level_dn + card.dn_per_e * np.array([mu - spread, mu + spread]))
+    low, high = np.clip(ends, [0.0, 1.0], [card.top_dn - 1.0, card.top_dn])
+    edges = (np.arange(low, high) + 0.5 - card.black_level_dn) / card.dn_per_e
+    if mu > _POISSON_UP_TO_E:
+        below = ndtr((edges - mu) / np.sqrt(noise.variance_e2(np.array(mu))))
+    else:
+        n = np.arange(0.0, mu + 8.0 * np.sqrt(mu) + 12.0)
+        r = max(float(np.sqrt(noise.gaussian_e2 + (noise.prnu * mu) ** 2)), 1e-6)
+        below = ndtr((edges[:, None] - n) / r) @ poisson.pmf(n, mu)
+    return float(low), np.diff(np.concatenate([[0.0], below, [1.0]]))
+
+
+@dataclass(frozen=True)
+class CutPixels:
+    """What is left of pixels, shapes as the means.
+
+    Attributes
+    ----------
+    mean_e, variance_e2 : electrons, electrons squared
+    slope : of the mean by the uncut mean, 1 far below the full well and 0 above it
+    """
+
+    mean_e: Array
+    slope: Array
+    variance_e2: Array
+
+
+def cut_pixels(mean_e: Array, variance_e2: Array, well_e: float) -> CutPixels:
+    """Cut pixels of these means and variances, any shape, at a full well."""
+    s = np.sqrt(variance_e2)
+    z = (well_e - mean_e) / s
+    if not (z < _FAR).any():
+        return CutPixels(mean_e, np.ones_like(mean_e), variance_e2)
+    below, density = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)
+    lost = s * (z * below + density)
+    square = variance_e2 * ((z * z + 1.0) * below + z * density)
+    free = z >= _FAR
+    return CutPixels(
+        np.where(free, mean_e, well_e - lost),
+        np.where(free, 1.0, below),
+        np.where(free, variance_e2, np.maximum(square - lost * lost, 0.0)),
+    )

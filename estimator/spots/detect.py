@@ -1,0 +1,332 @@
+"""Where lamps are in an image: large bright areas, around which an edge, clipping or JPEG's ringing look like anything.
+
+Bright is a multiple of the usual level; a spot, however strong, is small.
+
+Which candidates of both images are the spot: they must show one point of the room.
+
+The ray of a pixel of the down image passes points at distances D; their images sweep a curve in the up image, for
+tilted rigs too. A candidate of the up image belongs to it if it lies near the curve.
+
+Detection of the laser spot in both whole frames of a pair, without a hint.
+
+Per image: the strongest places of a matched filter (`spot_map`) inside the mirror's outline, each tested for shape and
+colour (`spot_verdict`). Then both images together (`spot_pair`): the spot's images belong to one point of the room.
+
+False alarms. The mirror's disc has 3.6e5 pixels and each is asked at 4 half-pixel places, so that a frame has at most
+N = 1.44e6 trials; on raw pixels whose background is known the significance is never larger than a unit normal's,
+because chi^2 only lowers it. A candidate alone: N Q(6.2) = 4e-4 a frame. A pair: the partner lies within 4 px of a
+curve at most 340 px long, n = 4 x 2700 trials, and both pass 4.8: N n Q(4.8)^2 = 0.01 with all places taken for
+independent. Those within a blur's area (7 px, 4 places each) share their noise, in both images, which leaves about
+1e-5 a pair. Processed pixels have longer tails than a normal law, and a room seen without filters and without a
+laser-off frame has corners that look like spots: both have thresholds of their own, set by measurement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image as Picture
+from PIL import ImageDraw
+from scipy.ndimage import label, maximum_filter
+
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.geometry.mirror_image import up_image
+from phibench.estimator.interface import Box, Image, Pair
+from phibench.estimator.spots.candidates import Verdicts, judged, noise_of_verdicts, peaks
+from phibench.estimator.spots.image_planes import ColourPlanes, blur_of, colour_planes
+from phibench.scenes.frames import Array, BoolArray
+from phibench.scenes.rig import Rig
+
+_BRIGHT = 3.0  # times the median inside the mirror
+_LEAST_AREA_PX = 80
+_HALO_PX = {True: 5, False: 12}  # of raw pixels; of processed ones, a JPEG's block and its neighbour's interpolation
+
+
+def lamp_halo(planes: ColourPlanes, inside: BoolArray, card: SensorCard) -> BoolArray:
+    """Lamps and what is near to them, shape (h, w)."""
+    step = 2 if planes.mosaic else 1
+    red = planes.values_e[0][::step, ::step]
+    bright = (red > _BRIGHT * np.median(red[inside[::step, ::step]])) | planes.full[0][::step, ::step]
+    areas, count = label(bright)
+    large = np.bincount(areas.ravel(), minlength=count + 1) * step**2 >= _LEAST_AREA_PX
+    large[0] = False
+    lamps = np.repeat(np.repeat(large[areas], step, axis=0), step, axis=1)[: planes.shape[0], : planes.shape[1]]
+    return np.asarray(maximum_filter(lamps, 2 * _HALO_PX[card.output == "raw"] + 1))
+
+
+NEAREST_M, FARTHEST_M = 0.3, 12.0  # of D
+NEAR_CURVE_PX = 4.0  # what a rig that is not quite as believed moves the curve by
+_POINTS = 48
+_FLUX_RATIO = 6.0  # of one spot in both images, at most
+_STRONGER = 1.5  # a single candidate over a pair's: others have half the spot's light at most
+_MOST = 24  # candidates of an image that are compared
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Least significance of a candidate alone, of each of a pair, and of their root mean square."""
+
+    alone: float
+    each: float
+    together: float
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Rows of the chosen candidates; None where there is none."""
+
+    down: int | None = None
+    up: int | None = None
+
+
+def choose(rig: Rig, stroke_m: float, down: Verdicts, up: Verdicts, least: Thresholds, sure: bool) -> Choice:
+    """Choose the strongest consistent pair, or one candidate alone.
+
+    Parameters
+    ----------
+    rig : Rig
+    stroke_m : float
+    down, up : Verdicts
+        Candidates, pixels of the whole image, strongest first.
+    least : Thresholds
+    sure : bool
+        Whether the candidates are known to be red or the laser's; otherwise a pair is always preferred.
+    """
+    fits = consistent(rig, stroke_m, down.uv_px[:_MOST], up.uv_px[:_MOST])
+    ratio = up.electrons[None, :_MOST] / np.maximum(down.electrons[:_MOST, None], 1e-9)
+    fits &= (ratio < _FLUX_RATIO) & (ratio > 1.0 / _FLUX_RATIO)
+    z_down, z_up = down.z[:_MOST, None], up.z[None, :_MOST]
+    fits &= (np.minimum(z_down, z_up) >= least.each) & (z_down**2 + z_up**2 >= 2.0 * least.together**2)
+    single = _single(down, up, least.alone)
+    if not fits.any():
+        return single
+    row = int(np.flatnonzero(fits.any(axis=1))[0])
+    pair = Choice(row, int(np.flatnonzero(fits[row])[0]))
+    if sure and single.down is not None and down.electrons[single.down] > _STRONGER * down.electrons[row]:
+        return Choice(single.down)
+    return pair
+
+
+def consistent(rig: Rig, stroke_m: float, uv_down_px: Array, uv_up_px: Array) -> BoolArray:
+    """Whether pixels of both images can show one point, shape (n, m), for pixels (n, 2) and (m, 2)."""
+    if len(uv_down_px) == 0 or len(uv_up_px) == 0:
+        return np.zeros((len(uv_down_px), len(uv_up_px)), bool)
+    curve = epipolar_curve(rig, stroke_m, uv_down_px)
+    return np.asarray(_distance(curve, uv_up_px) < NEAR_CURVE_PX)
+
+
+def epipolar_curve(rig: Rig, stroke_m: float, uv_down_px: Array) -> Array:
+    """Images in the up frame of the points seen by pixels of the down frame, shape (n, k, 2), near ones first.
+
+    The points lie at k values of D from `NEAREST_M` to `FARTHEST_M`, even in 1 / D, which is nearly even in pixels.
+    """
+    q = np.linspace(1.0 / NEAREST_M, 1.0 / FARTHEST_M, _POINTS)
+    return up_image(rig, stroke_m, uv_down_px[:, None, :], q).uv_px
+
+
+def _distance(curve: Array, points: Array) -> Array:
+    """Distance of points (m, 2) from polylines (n, k, 2), shape (n, m); infinite where there is no line."""
+    start, along = curve[:, None, :-1], np.diff(curve, axis=1)[:, None]
+    to = points[None, :, None] - start
+    with np.errstate(all="ignore"):
+        share = np.clip(np.sum(to * along, axis=-1) / np.sum(along * along, axis=-1), 0.0, 1.0)
+        distance = np.linalg.norm(to - share[..., None] * along, axis=-1)
+    return np.min(np.where(np.isfinite(distance), distance, np.inf), axis=-1)
+
+
+def _single(down: Verdicts, up: Verdicts, alone: float) -> Choice:
+    """The more significant one of the strongest candidates that pass alone; both could not be one point."""
+    rows = [int(np.flatnonzero(side.z >= alone)[0]) if (side.z >= alone).any() else None for side in (down, up)]
+    if rows[0] is None or rows[1] is None:
+        return Choice(rows[0], rows[1])
+    return Choice(rows[0]) if down.z[rows[0]] >= up.z[rows[1]] else Choice(None, rows[1])
+
+
+RAW = Thresholds(alone=6.2, each=4.8, together=4.8)
+PROCESSED = Thresholds(alone=7.5, each=4.6, together=5.5)
+PROCESSED_ONE_FRAME = Thresholds(alone=8.5, each=5.0, together=6.5)  # without a laser-off frame
+UNSURE = Thresholds(alone=16.0, each=5.0, together=10.0)  # neither filters nor a laser-off frame
+_IN_A_BOX = 0.7  # less than in the whole mirror, see above
+_SMALL_BOX_PX2 = 10_000
+_LEAST_PEAK = 3.8
+_MOST_PEAKS = 3000
+_MOST_TESTED = 200  # at the second scale
+_WIDER = 1.8  # than the blur: a rough mirror's or a saturated spot
+_MARGIN_PX = 8
+
+
+@dataclass(frozen=True)
+class Detection:
+    """A spot that was found in an image.
+
+    Attributes
+    ----------
+    uv_px : (u, v), at the peak of the matched filter, to about a tenth of a pixel
+    electrons : float
+        Amplitude behind the red filter (or without filters); too low where pixels are full.
+    significance : float
+        In standard deviations of the noise.
+    """
+
+    uv_px: tuple[float, float]
+    electrons: float
+    significance: float
+
+
+@dataclass(frozen=True)
+class PairDetection:
+    """Both images of a pair; None where there is no spot."""
+
+    down: Detection | None
+    up: Detection | None
+
+
+@dataclass(frozen=True)
+class _Searched:
+    """One image: planes, blur in them, and what passed the tests."""
+
+    on: ColourPlanes
+    off: ColourPlanes | None
+    sigma_px: float
+    found: Verdicts
+
+
+def detect(pair: Pair) -> PairDetection:
+    """Find the strongest red laser light that both images agree on.
+
+    A spot in one image only must be more significant than one in both. Boxes of the pair, if
+    there are any, restrict the search.
+
+    Raises
+    ------
+    ValueError
+        If an image does not fit the card's output.
+    """
+    off = pair.down_off is not None and pair.up_off is not None
+    sure = off or pair.card.mosaic == "bayer"
+    least = _thresholds(pair.card, sure, off)
+    least = _lowered(least) if _is_small(pair.box_down) and _is_small(pair.box_up) else least
+    down = _searched(pair.down, pair.down_off, pair, pair.box_down, least.each)
+    up = _searched(pair.up, pair.up_off, pair, pair.box_up, least.each)
+    choice = choose(pair.rig, pair.stroke_m, down.found, up.found, least, sure)
+    return _refined(choice, down, up, pair.card)
+
+
+def _thresholds(card: SensorCard, sure: bool, off: bool) -> Thresholds:
+    if not sure:
+        return UNSURE
+    if card.output == "raw":
+        return RAW
+    return PROCESSED if off else PROCESSED_ONE_FRAME
+
+
+def _is_small(hint: Box | None) -> bool:
+    return hint is not None and hint.width_px * hint.height_px <= _SMALL_BOX_PX2
+
+
+def _lowered(least: Thresholds) -> Thresholds:
+    return Thresholds(least.alone - _IN_A_BOX, least.each - _IN_A_BOX, least.together - _IN_A_BOX)
+
+
+def outline_mask(rig: Rig, box: Box) -> BoolArray:
+    """Pixels of a box inside the mirror's outline, shape (h, w)."""
+    # a hundred times faster than skimage.draw.polygon for as many corners
+    picture = Picture.new("1", (box.width_px, box.height_px))
+    outline = rig.outline_px() - [box.u0_px, box.v0_px]
+    ImageDraw.Draw(picture).polygon([(float(u), float(v)) for u, v in outline], fill=1)
+    return np.asarray(picture, bool)
+
+
+def mirror_box(rig: Rig) -> Box:
+    """Smallest part of the image around the mirror that begins at an even row and column."""
+    outline, size = rig.outline_px(), np.array([rig.camera.width_px, rig.camera.height_px])
+    low = np.clip(np.floor(outline.min(axis=0)).astype(int) - _MARGIN_PX, 0, size - 2) // 2 * 2
+    high = np.clip(np.ceil(outline.max(axis=0)).astype(int) + _MARGIN_PX, low + 2, size)
+    return Box(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
+
+
+def _searched(image: Image, dark: Image | None, pair: Pair, hint: Box | None, least_z: float) -> _Searched:
+    card, box = pair.card, mirror_box(pair.rig)
+    on = colour_planes(image, card, box)
+    off = None if dark is None else colour_planes(dark, card, box)
+    inside = outline_mask(pair.rig, box)
+    inside = inside & ~lamp_halo(off or on, inside, card)
+    sigma = blur_of(card, pair.rig.camera.blur_sigma_px)
+    noise = noise_of_verdicts(on, off, card, sigma, inside)
+    where = inside if hint is None else inside & _hinted(hint, box)
+    places = peaks(on, off, card, sigma, where, _LEAST_PEAK, _MOST_PEAKS).uv_px
+    first = judged(on, off, card, places, sigma, noise)
+    first = _rows(first, first.z >= np.sort(first.z)[-_MOST_TESTED:][:1].sum())
+    best = _better(first, judged(on, off, card, first.uv_px, _WIDER * sigma, noise))
+    keep = best.red & (best.z >= least_z)
+    return _Searched(on, off, sigma, _moved(_rows(best, keep), box))
+
+
+def _hinted(hint: Box, box: Box) -> BoolArray:
+    mask = np.zeros((box.height_px, box.width_px), bool)
+    rows, columns = hint.slices
+    v0, u0 = max(rows.start - box.v0_px, 0), max(columns.start - box.u0_px, 0)
+    mask[v0 : max(rows.stop - box.v0_px, 0), u0 : max(columns.stop - box.u0_px, 0)] = True
+    return mask
+
+
+def _better(a: Verdicts, b: Verdicts) -> Verdicts:
+    """At each place the test of the scale that fits better."""
+    first = a.z >= b.z
+    return Verdicts(
+        a.uv_px,
+        np.where(first, a.z, b.z),
+        a.electrons,  # of one scale everywhere, so that spots can be compared
+        a.sigma_e,
+        np.where(first, a.chi2, b.chi2),
+        a.red,  # the wider one takes more of green's surroundings in
+    )
+
+
+def _rows(tests: Verdicts, keep: BoolArray) -> Verdicts:
+    order = np.flatnonzero(keep)[np.argsort(-tests.electrons[keep], kind="stable")]
+    return Verdicts(*(getattr(tests, name)[order] for name in tests.__dataclass_fields__))
+
+
+def _moved(tests: Verdicts, box: Box) -> Verdicts:
+    origin = np.array([box.u0_px, box.v0_px], float)
+    values = {name: getattr(tests, name) for name in tests.__dataclass_fields__}
+    return Verdicts(**{**values, "uv_px": tests.uv_px + origin})
+
+
+def _refined(choice: Choice, down: _Searched, up: _Searched, card: SensorCard) -> PairDetection:
+    return PairDetection(_detection(choice.down, down, card), _detection(choice.up, up, card))
+
+
+def _detection(index: int | None, searched: _Searched, card: SensorCard) -> Detection | None:
+    if index is None:
+        return None
+    origin = np.array([searched.on.box.u0_px, searched.on.box.v0_px], float)
+    uv = parabola_peak(searched, card, searched.found.uv_px[index] - origin) + origin
+    found = searched.found
+    return Detection((float(uv[0]), float(uv[1])), float(found.electrons[index]), float(found.z[index]))
+
+
+def parabola_peak(searched: _Searched, card: SensorCard, uv_px: Array, step_px: float = 0.5) -> Array:
+    """Vertex of a parabola along u and one along v through A^2 / variance at 3 x 3 places, shape (2,).
+
+    A^2 / variance is twice the gain of the log likelihood, so that on raw pixels the vertex is near its maximum.
+    """
+    offsets = step_px * np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), -1).reshape(-1, 2)
+    for _ in range(3):
+        test = judged(searched.on, searched.off, card, uv_px + offsets, searched.sigma_px)
+        gain = (np.maximum(test.electrons, 0.0) / test.sigma_e) ** 2
+        best = int(np.argmax(gain))
+        if best == len(offsets) // 2:
+            break
+        uv_px = uv_px + offsets[best]
+    grid = gain.reshape(3, 3)
+    return uv_px + step_px * np.array([_vertex(grid[1]), _vertex(grid[:, 1])])
+
+
+def _vertex(values: Array) -> float:
+    """Place of the maximum of a parabola through values at -1, 0, 1; within half a step."""
+    left, middle, right = values
+    bend = left - 2.0 * middle + right
+    return float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5)) if bend < 0.0 else 0.0

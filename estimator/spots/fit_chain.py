@@ -1,0 +1,273 @@
+"""Fit of a spot through the camera's own processing: mosaic, demosaicing, white balance, sRGB curve, 8 bits, JPEG.
+
+`fit_srgb` takes processed 8-bit images, `fit_jpeg` decoded MJPEG ones. Fits to luminance have a floor of 0.1 to 0.25 px
+that does not fall with the signal, because a demosaiced, gamma-encoded spot is no Gaussian; a fit of the raw pixels'
+model through the same processing has none.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import convolve1d, gaussian_filter
+
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.geometry.status import Status, flag, keep
+from phibench.estimator.spots.chain_model import UNIT_MATRIX, chain_model
+from phibench.estimator.spots.code_statistics import code_law, code_table
+from phibench.estimator.spots.fit_jpeg import JpegFit, Region, fit_region
+from phibench.estimator.spots.fit_raw import LASER_RESPONSE, LEAST_SNR, SpotFit, covariance_bound, fit_law
+from phibench.estimator.spots.image_planes import decoded, slope
+from phibench.estimator.spots.jpeg_coefficients import mcu_px
+from phibench.estimator.spots.raw_pixels import BaseImage, GaussLaw, PixelNoise, bayer_filters, noise_of
+from phibench.estimator.spots.spot_prediction import SpotBlur
+from phibench.scenes.frames import Array
+
+_CUT_PX = 15
+_MATCHED = (0.0, 0.8, 0.8)
+_ROUGH_CODES2 = 4.0  # variance of a decoded code that the first fit reckons with, codes squared
+_UNSHARP_STEPS = 24  # the error falls by amount / (1 + amount) in each
+
+
+def fit_srgb(
+    images: NDArray[Any],
+    origin_px: ArrayLike,
+    card: SensorCard,
+    sigma_px: ArrayLike,
+    response: tuple[float, float, float] = LASER_RESPONSE,
+    background_e: Array | None = None,
+    free_width: bool = False,
+    pattern_known: bool = False,
+    extra_e2: float = 0.0,
+    ratio: ArrayLike = 1.0,
+    mixed_px2: ArrayLike = 0.0,
+) -> SpotFit:
+    """Fit one spot in each region of processed 8-bit images.
+
+    Without sharpening and with the unit colour matrix each pixel's own colour is an interval of electrons, and the
+    likelihood is exact (`code_law`). Otherwise sharpening and matrix are undone, and the codes' widths count as noise.
+
+    Parameters
+    ----------
+    images : shape (n, h, w, 3), uint8
+    origin_px : shape (2,) or (n, 2)
+        Image pixel (u, v) of the first column and row.
+    card : SensorCard
+    sigma_px, response, background_e, free_width
+        As for `fit_raw`.
+    pattern_known : bool
+        Whether PRNU and DSNU were calibrated; otherwise they count as noise.
+    extra_e2 : float
+        Variance of the known background's error, electrons squared.
+    ratio, mixed_px2
+        As for `fit_law`.
+
+    Raises
+    ------
+    ValueError
+        If the images are not of three planes, or the sensor has no mosaic.
+    """
+    planes = _checked(images, card)
+    origin = np.broadcast_to(np.asarray(origin_px, np.int64), (len(planes), 2))
+    filters = bayer_filters(origin, planes.shape[1:3])
+    noise = unrounded(card, pattern_known)
+    noise = PixelNoise(noise.gaussian_e2 + extra_e2, noise.prnu)
+    if card.sharpen_amount == 0.0 and card.colour_matrix == UNIT_MATRIX:
+        table = code_table(card)
+        codes = np.take_along_axis(planes, filters[..., None], axis=3)[..., 0]
+        law = code_law(codes, filters, card, noise, table)
+        x = table.middle_e[filters, codes]
+        return fit_law(x, origin, law, sigma_px, response, background_e, free_width, True, ratio, mixed_px2)
+    x, extra = undone(planes, filters, card)
+    used = (planes < 255).all(axis=3)
+    gauss = GaussLaw(PixelNoise(noise.gaussian_e2 + 1.0 / (12.0 * card.dn_per_e**2), noise.prnu), extra)
+    return fit_law(x, origin, gauss, sigma_px, response, background_e, free_width, used, ratio, mixed_px2)
+
+
+def fit_jpeg(
+    images: NDArray[Any],
+    origin_px: ArrayLike,
+    card: SensorCard,
+    sigma_px: ArrayLike,
+    response: tuple[float, float, float] = LASER_RESPONSE,
+    base: BaseImage | None = None,
+    free_width: bool = False,
+    pattern_known: bool = False,
+    ratio: ArrayLike = 1.0,
+    mixed_px2: ArrayLike = 0.0,
+    size_px: tuple[int, int] = (1280, 720),
+) -> SpotFit:
+    """Fit one spot in each region of decoded MJPEG images.
+
+    Parameters
+    ----------
+    images : shape (n, h, w, 3), uint8
+        Whole units of the JPEG, 2 x 2 or more; one more on each side helps.
+    origin_px : shape (2,) or (n, 2)
+        Image pixel (u, v) of the first column and row, on the grid of units.
+    card : SensorCard
+        With the quality and the subsampling of the JPEG.
+    sigma_px : float or shape (n,)
+        Blur along u; the start of it with `free_width`.
+    response, free_width
+        As for `fit_raw`.
+    base : BaseImage, optional
+        Room behind the spot; flat if it is not given. Levels per filter are fitted on top of it.
+    pattern_known : bool
+        Whether PRNU and DSNU were calibrated; otherwise they count as noise.
+    ratio : float or shape (n,)
+        Blur along v over blur along u.
+    mixed_px2 : float or shape (n,)
+        Mixed second moment of u and v of an oblique spot, to first order.
+    size_px : (width, height) of the image
+
+    Returns
+    -------
+    SpotFit
+        As of `fit_raw`; `background_e` are the levels, `chi2` is of the coefficients.
+
+    Raises
+    ------
+    ValueError
+        If the images are not of three planes or not on the grid of units, or the sensor has no mosaic.
+    """
+    planes = _checked(images, card)
+    n, (h, w) = len(planes), planes.shape[1:3]
+    origin = np.broadcast_to(np.asarray(origin_px, np.int64), (n, 2))
+    _on_grid(origin, (h, w), card)
+    if n == 0:
+        return _collected([], origin, np.zeros(0), free_width)
+    model = chain_model(card, unrounded(card, pattern_known))
+    first = first_fit(planes, origin, card, np.broadcast_to(np.asarray(sigma_px, float), n), response, base)
+    zero = np.zeros((h, w))
+    widths, ratios, mixed = (np.broadcast_to(np.asarray(x, float), n) for x in (sigma_px, ratio, mixed_px2))
+    rows = []
+    for i in range(n):
+        u0, v0 = origin[i]
+        ends = (bool(v0 == 0), bool(v0 + h == size_px[1]), bool(u0 == 0), bool(u0 + w == size_px[0]))
+        known = (zero, zero) if base is None else (base.mean_e[i], base.variance_e2[i])
+        room = None if base is None or base.image is None else base.image[i]
+        start = first[i] if not free_width else np.append(first[i], widths[i])
+        region = Region(planes[i], ends, known[0], known[1], room)
+        blur = SpotBlur(float(widths[i]), float(ratios[i]), float(mixed[i]))
+        rows.append(fit_region(region, model, start[None], blur, free_width, response))
+    return _collected(rows, origin, widths, free_width)
+
+
+def first_fit(
+    images: NDArray[Any],
+    origin: NDArray[np.int64],
+    card: SensorCard,
+    sigma_px: Array,
+    response: tuple[float, float, float] = LASER_RESPONSE,
+    base: BaseImage | None = None,
+) -> Array:
+    """Where to begin, shape (n, 6): u, v in the region, flux, levels; a Gaussian fit of each pixel's own colour."""
+    filters = bayer_filters(origin, images.shape[1:3])
+    x, extra = undone(images, filters, card)
+    x = x - (0.0 if base is None else base.mean_e)
+    rough, spread = _ROUGH_CODES2 * 12.0 * extra, unrounded(card)
+    x, rough, corner = _cut(x, rough, filters, response)
+    fit = fit_law(x, origin + corner, GaussLaw(spread, rough), sigma_px, response)
+    middle = np.array([x.shape[2] - 1.0, x.shape[1] - 1.0]) / 2.0
+    good = fit.status == Status.OK
+    uv = np.where(good[:, None], fit.uv_px - origin, middle + corner)
+    levels = np.where(good[:, None], fit.background_e, np.median(x, axis=(1, 2))[:, None])
+    flux = np.where(good, fit.flux_e, np.maximum(x.reshape(len(x), -1).max(axis=1) * 4.0, 1.0))
+    return np.column_stack([uv, flux, levels])
+
+
+def _cut(
+    x: Array, extra: Array, filters: NDArray[np.int64], response: tuple[float, float, float]
+) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Squares about the brightest place: pixels, variances, and the squares' corners (u, v)."""
+    weight = np.asarray(response)[filters]
+    level = np.stack([np.where(filters == c, np.median(x, axis=(1, 2))[:, None, None], 0.0) for c in range(3)]).sum(0)
+    match = gaussian_filter(weight * (x - level), _MATCHED) / np.sqrt(gaussian_filter(weight**2, _MATCHED))
+    v, u = np.unravel_index(np.argmax(match.reshape(len(x), -1), axis=1), x.shape[1:])
+    h, w = (min(_CUT_PX, side) for side in x.shape[1:])
+    corner = np.stack([np.clip(u - w // 2, 0, x.shape[2] - w), np.clip(v - h // 2, 0, x.shape[1] - h)], axis=1)
+    parts = [(slice(b, b + h), slice(a, a + w)) for a, b in corner]
+    cut_x, cut_extra = (np.stack([values[i][part] for i, part in enumerate(parts)]) for values in (x, extra))
+    return cut_x, cut_extra, np.asarray(corner, np.int64)
+
+
+def _collected(
+    rows: list[tuple[JpegFit, Array]], origin: NDArray[np.int64], widths: Array, free_width: bool
+) -> SpotFit:
+    theta = np.array([fit.theta for fit, _ in rows]).reshape(-1, 7 if free_width else 6)
+    covariance = np.stack([covariance_bound(fit.fisher, keep=3) for fit, _ in rows]) if rows else np.zeros((0, 3, 3))
+    off = np.array([off for _, off in rows]).reshape(-1, 2)
+    status = flag(
+        (~(theta[:, 2] > LEAST_SNR * np.sqrt(covariance[:, 2, 2])), Status.NO_SPOT),
+        ((off > 1.0).any(axis=1), Status.SPOT_CUT),
+        (np.array([not fit.converged for fit, _ in rows], bool), Status.NOT_CONVERGED),
+    )
+    sigma = theta[:, 6] if free_width else widths
+    chi2 = np.array([fit.chi2 for fit, _ in rows], float)
+    values = (theta[:, :2] + origin, covariance[:, :2, :2], theta[:, 2], theta[:, 3:6], sigma, chi2)
+    uv, uv_covariance, flux, levels, width, misfit = (keep(np.asarray(value, float), status) for value in values)
+    return SpotFit(uv, uv_covariance, flux, levels, width, misfit, status)
+
+
+def _on_grid(origin: NDArray[np.int64], shape: tuple[int, int], card: SensorCard) -> None:
+    down, across = mcu_px(card.jpeg_subsampling)
+    units, left = np.divmod(shape, (down, across))
+    if (origin % [across, down]).any() or left.any() or units.min() < 2:
+        raise ValueError(
+            f"region of {shape[1]} x {shape[0]} pixels: origin and size must be multiples of {across} x {down} "
+            f"pixels, the JPEG's units, and the size 2 x 2 units or more"
+        )
+
+
+def unrounded(card: SensorCard, pattern_known: bool = False) -> PixelNoise:
+    """Noise of a sensor's pixels before the converter rounds; errors as `noise_of`."""
+    noise = noise_of(card, pattern_known)
+    return PixelNoise(max(noise.gaussian_e2 - 1.0 / (12.0 * card.dn_per_e**2), 0.0), noise.prnu)
+
+
+def undone(images: NDArray[Any], filters: NDArray[np.int64], card: SensorCard) -> tuple[Array, Array]:
+    """Electrons of each pixel's own colour and the variance that 8 bits add, electrons squared, shape (n, h, w) each.
+
+    Undoes, from the end: sharpening, sRGB curve, colour matrix, white balance.
+
+    Parameters
+    ----------
+    images : shape (n, h, w, 3), codes 0 to 255, whole or not
+    filters : shape (n, h, w)
+    card : SensorCard
+    """
+    code = _unsharpened(np.asarray(images, float), card.sharpen_amount) / 255.0
+    linear = decoded(code)
+    width = 1.0 / (255.0 * np.maximum(slope(np.clip(linear, 0.0, 1.0)), 1e-3))
+    inverse = np.linalg.inv(np.asarray(card.colour_matrix)) / np.asarray(card.white_balance)[:, None]
+    full_scale_e = (card.top_dn - card.black_level_dn) / card.dn_per_e
+    own = inverse[filters] * full_scale_e  # (n, h, w, 3): row of the inverse for the pixel's filter
+    return np.sum(own * linear, axis=3), np.sum((own * width) ** 2, axis=3) / 12.0
+
+
+def _unsharpened(codes: Array, amount: float) -> Array:
+    """Solution x of x + amount (x - blur x) = codes, shape (n, h, w, 3), by fixed-point iteration."""
+    x = codes
+    if amount > 0.0:
+        for _ in range(_UNSHARP_STEPS):
+            blurred = convolve1d(
+                convolve1d(x, (0.25, 0.5, 0.25), axis=1, mode="mirror"), (0.25, 0.5, 0.25), 2, mode="mirror"
+            )
+            x = (codes + amount * blurred) / (1.0 + amount)
+    return x
+
+
+def _checked(images: NDArray[Any], card: SensorCard) -> NDArray[np.uint8]:
+    planes = np.asarray(images)
+    if planes.ndim != 4 or planes.shape[3] != 3 or planes.dtype != np.uint8:
+        raise ValueError(
+            f"images have the shape {planes.shape} and are {planes.dtype}: (n, h, w, 3) of uint8 is needed"
+        )
+    if card.mosaic != "bayer":
+        raise ValueError(
+            f"sensor '{card.name}' has the mosaic '{card.mosaic}': the fit through the chain needs 'bayer'"
+        )
+    return planes

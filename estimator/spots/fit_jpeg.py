@@ -1,0 +1,322 @@
+"""Fit of a spot to the quantised coefficients of one JPEG window: a quasi-score through the processing.
+
+With m the mean and C the covariance of the quantiser's output, the estimating equation J^T C^-1 (z - m) = 0 is unbiased
+whatever the law of the output (R. W. M. Wedderburn, Biometrika 61, 439, 1974); its covariance (J^T C^-1 J)^-1 is the
+bound of M. Stein, A. Mezghani, J. A. Nossek (IEEE Signal Process. Lett. 21, 796, 2014). The quantiser of a Gaussian
+input gives m, and C_ij = g_i g_j C'_ij off the diagonal, g its mean slope and C' the input's covariance (J. J.
+Bussgang, 1952); a coefficient that is 0 whatever the noise has no slope and is left out.
+
+Windows of decoded MJPEG images around spots: where they lie, what is in them, and the fit of each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from phibench.estimator.spots.chain_model import ChainModel, code_slopes, codes, noise_factor, raw_variance_e2
+from phibench.estimator.spots.code_statistics import CutPixels, cut_pixels
+from phibench.estimator.spots.gaussian_spot import SpotMeans
+from phibench.estimator.spots.jpeg_coefficients import mcu_px, quantised, recovered, room_variance
+from phibench.estimator.spots.spot_prediction import SpotBlur
+from phibench.scenes.frames import Array
+
+_LIVE = 2e-3  # variance of the output, in steps squared, from which a coefficient counts as one that changes
+_LEAST = 1e-3  # and that is taken for one whose variance falls below it
+_FRESH = 5  # times that the covariance is computed
+_STEPS = 24  # of the fit in all; the covariance stays after `_FRESH` of them, so that the misfit can only fall
+_SCREENING_STEPS = 3
+_STEP_PX = 0.4
+_HALVINGS = 3
+_SMALL = 1e-4  # squared step in standard deviations at which the fit ends
+_REST = 1e-2  # and at which it has come to rest, if it ends for its number of steps
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Some of a model's coefficients, with what belongs to them; `index` into all, shape (l,)."""
+
+    index: NDArray[np.int64]
+    transform: Array
+    squares: Array
+    step: Array
+    shift: Array
+    rounding: Array
+
+    @classmethod
+    def all(cls, model: ChainModel) -> Rows:
+        """All coefficients of a model."""
+        names = ("transform", "squares", "step", "shift", "rounding")
+        return cls(np.arange(len(model.step)), *(getattr(model, name) for name in names))
+
+    def part(self, index: NDArray[np.int64]) -> Rows:
+        """Take some of them."""
+        return Rows(*(np.take(getattr(self, f.name), index, axis=-1) for f in fields(self)))
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Covariance of the live coefficients at one hypothesis.
+
+    Attributes
+    ----------
+    rows : Rows
+    sigma : shape (l,), of the quantiser's input
+    factor : shape (l, l), Cholesky factor of the output's covariance
+    """
+
+    rows: Rows
+    sigma: Array
+    factor: Array
+
+    @property
+    def dead(self) -> bool:
+        """Whether no coefficient changes with the noise: the quantiser's output says nothing."""
+        return len(self.sigma) == 0
+
+    def whitened(self, values: Array) -> Array:
+        """Values, shape (l, ...), in units in which their covariance is the unit matrix."""
+        return np.asarray(solve_triangular(self.factor, values, lower=True, check_finite=False))
+
+
+@dataclass(frozen=True)
+class JpegFit:
+    """Fit of one window; positions in the raw window's own pixels.
+
+    Attributes
+    ----------
+    theta : shape (k,), as `SpotMeans`
+    fisher : shape (k, k), J^T C^-1 J
+    chi2 : float, r^T C^-1 r per degree of freedom
+    converged : bool
+    """
+
+    theta: Array
+    fisher: Array
+    chi2: float
+    converged: bool
+
+
+@dataclass(frozen=True)
+class Window:
+    """What is fitted.
+
+    Attributes
+    ----------
+    z : shape (n,), quantised coefficients in the order of `jpeg_tables.coefficients`
+    model : ChainModel
+    means : SpotMeans
+    extra_e2 : shape (r,) or float
+        Variance of the base image, electrons squared, which counts as noise of the raw pixels.
+    room : shape (n,) or float
+        Variance of the base's coefficients by quantisation (`room_coefficients`).
+    """
+
+    z: Array
+    model: ChainModel
+    means: SpotMeans
+    extra_e2: Array | float = 0.0
+    room: Array | float = 0.0
+
+    def noise(self, theta: Array, live: Rows | None = None) -> Noise:
+        """Covariance of the quantised coefficients for one hypothesis, shape (k,); which are live, if it is known."""
+        model = self.model
+        rows = live or Rows.all(model)
+        raw, _ = self._raw(theta[None])
+        at = codes(model, raw.mean_e).one(0)
+        extra = raw.slope[0] ** 2 * self.extra_e2
+        F = noise_factor(model, at, raw.variance_e2[0] + extra, rows.transform)
+        room = np.broadcast_to(self.room, len(model.step))[rows.index]
+        sigma = np.sqrt(np.einsum("rn,rn->n", F, F) + at.excess @ rows.squares + rows.rounding + room)
+        output = quantised(at.mean @ rows.transform + rows.shift, sigma, rows.step)
+        variance = np.maximum(output.variance, _LEAST * rows.step**2)
+        slope = output.slope
+        if live is None:
+            index = np.flatnonzero(output.variance > _LIVE * rows.step**2)
+            F, slope, variance, sigma, rows = F[:, index], slope[index], variance[index], sigma[index], rows.part(index)
+        F *= slope
+        C = F.T @ F
+        np.fill_diagonal(C, variance)
+        return Noise(rows, sigma, np.asarray(np.linalg.cholesky(C), float))
+
+    def residual(self, noise: Noise, theta: Array) -> tuple[Array, Array]:
+        """Whitened residuals, shape (m, l), and derivatives of the mean, shape (m, k, l), of hypotheses (m, k)."""
+        rows = noise.rows
+        raw, derivatives = self._raw(theta)
+        at = codes(self.model, raw.mean_e)
+        output = quantised(at.mean @ rows.transform + rows.shift, noise.sigma, rows.step)
+        changes = code_slopes(self.model, at, derivatives)
+        slopes = (changes @ rows.transform) * output.slope[:, None, :]
+        m, k, count = slopes.shape
+        both = np.concatenate([(self.z[rows.index] - output.mean)[:, None], slopes], axis=1)
+        white = noise.whitened(both.reshape(-1, count).T).T.reshape(m, k + 1, count)
+        return white[:, 0], white[:, 1:]
+
+    def _raw(self, theta: Array) -> tuple[CutPixels, Array]:
+        """Raw pixels, shape (m, r), with full ones cut, and derivatives of their means, shape (m, k, r)."""
+        mean, derivatives = self.means.at(theta)
+        cut = cut_pixels(mean, raw_variance_e2(self.model, mean), self.model.card.saturation_e)
+        return cut, derivatives * cut.slope[:, None, :]
+
+    def fisher(self, theta: Array) -> Array:
+        """J^T C^-1 J of the model's output, shape (k, k)."""
+        noise = self.noise(theta)
+        if noise.dead:
+            return np.zeros((len(theta), len(theta)))
+        _, J = self.residual(noise, theta[None])
+        return np.asarray(J[0] @ J[0].T)
+
+
+def fit_window(window: Window, starts: Array) -> JpegFit:
+    """Fit one window from hypotheses, shape (s, k); the one with the smallest misfit after some steps goes on."""
+    noise = window.noise(starts[0])
+    if noise.dead:
+        return JpegFit(starts[0], np.zeros((starts.shape[1],) * 2), np.nan, False)
+    theta = _best(window, noise, starts)
+    r, J = window.residual(noise, theta[None])
+    length = np.inf
+    for k in range(_STEPS):
+        if 0 < k < _FRESH:
+            noise = window.noise(theta, noise.rows)
+            r, J = window.residual(noise, theta[None])
+        theta, r, J, length = _descended(window, noise, theta, r, J)
+        if k and length < _SMALL:
+            break
+    chi2 = float(r[0] @ r[0]) / max(len(noise.sigma) - len(theta), 1)
+    return JpegFit(theta, J[0] @ J[0].T, chi2, length < _REST)
+
+
+def _best(window: Window, noise: Noise, starts: Array) -> Array:
+    """The start with the smallest misfit after some steps."""
+    theta = starts
+    if len(starts) > 1:
+        for _ in range(_SCREENING_STEPS):
+            theta = _moved(theta, _newton(*window.residual(noise, theta)))
+    r, _ = window.residual(noise, theta)
+    return np.asarray(theta[np.argmin(np.einsum("ml,ml->m", r, r))])
+
+
+def _descended(window: Window, noise: Noise, theta: Array, r: Array, J: Array) -> tuple[Array, Array, Array, float]:
+    """One step that does not raise the misfit, what belongs to it, and its squared length in standard deviations."""
+    step = _newton(r, J)
+    length = float(np.sum((step[0] @ J[0]) ** 2))
+    for halving in range(_HALVINGS + 1):
+        tried = _moved(theta[None], 0.5**halving * step)
+        new_r, new_J = window.residual(noise, tried)
+        if new_r[0] @ new_r[0] <= r[0] @ r[0] * (1.0 + 1e-12):
+            return tried[0], new_r, new_J, length
+    return theta, r, J, 0.0  # at the bottom of a misfit with corners
+
+
+def _newton(r: Array, J: Array) -> Array:
+    """Gauss-Newton steps, shape (m, k)."""
+    fisher = J @ np.swapaxes(J, 1, 2)
+    diagonal = np.einsum("mkk->mk", fisher)
+    diagonal *= 1.0 + 1e-9
+    diagonal += 1e-12
+    return np.asarray(np.linalg.solve(fisher, np.einsum("mkl,ml->mk", J, r)[..., None])[..., 0])
+
+
+def _moved(theta: Array, step: Array) -> Array:
+    """Hypotheses after limited steps: positions by `_STEP_PX`, the flux not below a tenth, the width by a third."""
+    limit = np.minimum(1.0, _STEP_PX / np.maximum(np.abs(step[:, :2]).max(axis=1), 1e-300))
+    new = theta + limit[:, None] * step
+    new[:, 2] = np.maximum(new[:, 2], 0.1 * np.maximum(theta[:, 2], 1.0))
+    if theta.shape[1] > 6:
+        new[:, 6] = np.clip(new[:, 6], 0.7 * theta[:, 6], 1.4 * theta[:, 6]).clip(0.15, 6.0)
+    return np.where(np.isfinite(new), new, theta)
+
+
+@dataclass(frozen=True)
+class Region:
+    """One decoded region on the grid of JPEG units.
+
+    Attributes
+    ----------
+    image : shape (h, w, 3), uint8
+    ends : 4 booleans
+        Whether top, bottom, left and right side are the image's own.
+    base_e, extra_e2 : shape (h, w)
+        Base of the raw pixels, and the variance of its error.
+    room : shape (h, w, 3), uint8, optional
+        Decoded frame without the laser that the base was taken from.
+    """
+
+    image: NDArray[Any]
+    ends: tuple[bool, bool, bool, bool]
+    base_e: Array
+    extra_e2: Array
+    room: NDArray[Any] | None = None
+
+
+def window_at(region: Region, model: ChainModel, uv: Array) -> tuple[int, int]:
+    """First row and column, in the region, of the 2 x 2 units that have (u, v) nearest to their middle."""
+    sides = mcu_px(model.card.jpeg_subsampling)
+    places = []
+    for centre, unit, size in zip((uv[1], uv[0]), sides, region.image.shape[:2], strict=True):
+        first = int(np.clip(np.rint((centre + 0.5) / unit) - 1, 0, size // unit - 2))
+        places.append(first * unit)
+    return places[0], places[1]
+
+
+def fit_region(
+    region: Region, model: ChainModel, starts: Array, blur: SpotBlur, free_width: bool, response: Any
+) -> tuple[JpegFit, Array]:
+    """Fit the spot of one region.
+
+    Parameters
+    ----------
+    starts : shape (s, 6) or (s, 7)
+        u, v in the region, flux, levels on top of the base, width if it is free.
+    blur : SpotBlur
+    free_width, response
+        As `SpotMeans`.
+
+    Returns
+    -------
+    JpegFit
+        Positions in the region.
+    shape (2,)
+        Distance of (u, v) from the window's middle, in half windows: above 1 it lies outside.
+    """
+    row, column = window_at(region, model, starts[0, :2])
+    (h, w), m = model.shape, model.margin
+    raw = (slice(row, row + h + 2 * m), slice(column, column + w + 2 * m))
+    base, extra = (np.pad(x, m, mode="reflect")[raw].ravel() for x in (region.base_e, region.extra_e2))
+    means = SpotMeans(model.filters, response, base, blur.sigma_px, blur.ratio, blur.mixed_px2, free_width)
+    corner = np.array([column - m, row - m], float)
+    shifted = starts.copy()
+    shifted[:, :2] -= corner
+    room: Array | float = 0.0
+    if region.room is not None:
+        room = room_variance(coefficients_at(replace(region, image=region.room), model, row, column), model.step)
+    fit = fit_window(Window(coefficients_at(region, model, row, column), model, means, extra, room), shifted)
+    middle = np.array([(w - 1) / 2.0 + m, (h - 1) / 2.0 + m])
+    off = np.abs(fit.theta[:2] - middle) / np.array([w / 2.0, h / 2.0])
+    theta = fit.theta.copy()
+    theta[:2] += corner
+    return JpegFit(theta, fit.fisher, fit.chi2, fit.converged), off
+
+
+def coefficients_at(region: Region, model: ChainModel, row: int, column: int) -> Array:
+    """Quantised coefficients, shape (n,), of the window that begins at (row, column) of the region."""
+    card, (h, w) = model.card, model.shape
+    down, across = mcu_px(card.jpeg_subsampling)
+    height, width = region.image.shape[:2]
+    top, left = max(row - down, 0), max(column - across, 0)
+    bottom, right = min(row + h + down, height), min(column + w + across, width)
+    ends = (
+        region.ends[0] and top == 0,
+        region.ends[1] and bottom == height,
+        region.ends[2] and left == 0,
+        region.ends[3] and right == width,
+    )
+    found = recovered(region.image[None, top:bottom, left:right], card.jpeg_quality, card.jpeg_subsampling, ends)
+    v, u = row - top, column - left
+    luma = found.luma[0, v // 8 : (v + h) // 8, u // 8 : (u + w) // 8]
+    chroma = found.chroma[0, :, v // down : (v + h) // down, u // across : (u + w) // across]
+    return np.concatenate([luma.ravel(), chroma.ravel()])

@@ -1,0 +1,288 @@
+"""An image of any output as planes of linear electrons, one per colour filter, for what looks for a spot in it.
+
+Raw pixels stay where they are: a mosaic's plane holds values at its own sites and zeros elsewhere. 8-bit images go back
+through the sRGB curve, the colour matrix and the white balance; their pixels are interpolated, so that their noise is
+correlated and only roughly what `variance` says: what uses it calibrates it on the image.
+
+Linear light of an image as a camera delivers it, raw or 8 bits; and which kind of image it is.
+
+Planes stand first, shape (3, h, w): linear sRGB, in which a grey room under the camera's own white balance has three
+equal planes. A sensor without filters has one plane, shape (1, h, w).
+
+The sRGB curve (IEC 61966-2-1) as an estimator needs it: forwards, backwards, and of a noisy value.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.interface import Box, Image
+from phibench.estimator.spots.raw_pixels import bayer_filters, raw_electrons
+from phibench.scenes.frames import Array, BoolArray
+
+_TOP_CODE = 254  # of 8 bits: from here on a pixel may be cut
+_DEMOSAIC_VARIANCE_PX2 = 0.5  # of bilinear interpolation's kernel (1/2, 1, 1/2), per axis
+
+
+@dataclass(frozen=True)
+class ColourPlanes:
+    """Part of an image.
+
+    Attributes
+    ----------
+    values_e : shape (c, h, w), float32 to be quick
+        Electrons behind R, G, B, or of pixels without filters (c = 1).
+    sites : shape (c, h, w), bool
+        Pixels at which a plane was measured or interpolated.
+    full : shape (c, h, w), bool
+        Pixels at saturation.
+    box : Box
+        The part; its first row and column are even, so that red comes first.
+    """
+
+    values_e: NDArray[Any]
+    sites: BoolArray
+    full: BoolArray
+    box: Box
+
+    @property
+    def mosaic(self) -> bool:
+        """Whether each pixel has one colour only."""
+        return len(self.values_e) > 1 and not bool(self.sites[0, 0, 1])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(h, w)."""
+        return self.values_e.shape[1], self.values_e.shape[2]
+
+
+def colour_planes(image: Image, card: SensorCard, box: Box) -> ColourPlanes:
+    """Planes of the part `box` of an image; see `seat.pair.Pair` for the outputs.
+
+    Raises
+    ------
+    ValueError
+        If the card's output is neither "raw", "srgb8" nor "mjpeg", or the image has another shape than it says.
+    """
+    part = image[box.slices]
+    if card.output not in ("raw", "srgb8", "mjpeg") or part.ndim != (2 if card.output == "raw" else 3):
+        raise ValueError(
+            f"an image of the shape {image.shape} for the output '{card.output}': raw needs (H, W), srgb8 and mjpeg "
+            "need (H, W, 3)"
+        )
+    if card.output == "raw":
+        return _raw(part, card, box)
+    return _developed(part, card, box)
+
+
+def blur_of(card: SensorCard, sigma_px: float) -> float:
+    """Blur of a spot of the optical blur `sigma_px` in the planes: interpolation between red pixels widens it."""
+    interpolated = card.output != "raw" and card.mosaic == "bayer"
+    return float(np.sqrt(sigma_px**2 + (_DEMOSAIC_VARIANCE_PX2 if interpolated else 0.0)))
+
+
+def green_at_red(on: ColourPlanes) -> Array:
+    """Green at the red sites: of a mosaic the mean of the four neighbours, zero elsewhere."""
+    green = on.values_e[1]
+    if not on.mosaic:
+        return green
+    p = np.pad(green, 1, mode="reflect")
+    result = np.zeros_like(green)
+    here = (slice(None, None, 2), slice(None, None, 2))
+    around = p[:-2, 1:-1][here] + p[2:, 1:-1][here] + p[1:-1, :-2][here] + p[1:-1, 2:][here]
+    result[here] = np.float32(0.25) * around
+    return result
+
+
+def variance_e2(mean_e: Array, card: SensorCard, alike: bool) -> Array:
+    """Variance of a pixel's electrons, shape of `mean_e`.
+
+    Parameters
+    ----------
+    mean_e : array of any shape
+    card : SensorCard
+    alike : bool
+        Whether the fixed pattern cancels: in the difference of two frames of one camera.
+    """
+    mean = np.maximum(mean_e, 0.0)
+    constant = card.read_noise_e**2 + card.row_noise_e**2 + 1.0 / (12.0 * card.dn_per_e**2)
+    pattern = 0.0 if alike else card.dsnu_e**2 + (card.prnu * mean) ** 2
+    code = 0.0 if card.output == "raw" else _code_step_e(mean, card) ** 2 / 12.0
+    return mean + constant + pattern + code
+
+
+def _raw(part: Image, card: SensorCard, box: Box) -> ColourPlanes:
+    electrons = raw_electrons(part, card).astype(np.float32)
+    full = electrons >= card.saturation_e
+    if card.mosaic == "mono":
+        return ColourPlanes(electrons[None], np.ones((1, *part.shape), bool), full[None], box)
+    colour = (np.arange(part.shape[0])[:, None] + box.v0_px) % 2 + (np.arange(part.shape[1]) + box.u0_px) % 2
+    sites = np.stack([colour == c for c in range(3)])
+    return ColourPlanes(np.where(sites, electrons, np.float32(0.0)), sites, full & sites, box)
+
+
+def _developed(part: Image, card: SensorCard, box: Box) -> ColourPlanes:
+    planes = [np.ascontiguousarray(part[..., c]) for c in range(3 if card.mosaic == "bayer" else 1)]
+    curve = (_decoded(np.arange(256) / 255.0) * _full_scale_e(card)).astype(np.float32)
+    linear = np.stack([curve[plane] for plane in planes])
+    if card.mosaic == "bayer":
+        linear = np.einsum("ij,jhw->ihw", _to_sensor(card).astype(np.float32), linear, optimize=True)
+    full = np.stack([plane >= _TOP_CODE for plane in planes])
+    return ColourPlanes(linear, np.ones(linear.shape, bool), full, box)
+
+
+def _to_sensor(card: SensorCard) -> Array:
+    """Matrix, shape (3, 3), from linear sRGB to the sensor's R, G, B."""
+    return np.linalg.inv(np.array(card.colour_matrix)) / np.array(card.white_balance)[:, None]
+
+
+def _full_scale_e(card: SensorCard) -> float:
+    return (card.top_dn - card.black_level_dn) / card.dn_per_e
+
+
+def _code_step_e(mean_e: Array, card: SensorCard) -> Array:
+    """Electrons per 8-bit code at a level: the slope of the sRGB curve."""
+    x = np.clip(mean_e / _full_scale_e(card), 0.0, 1.0)
+    slope = np.where(x <= 0.0031308, 1.0 / 12.92, 2.4 / 1.055 * np.maximum(x, 1e-6) ** (1.4 / 2.4))
+    return np.asarray(slope * _full_scale_e(card) / 255.0)
+
+
+def _decoded(encoded: Array) -> Array:
+    """Linear values of the sRGB curve, both in [0, 1] (IEC 61966-2-1)."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+KINDS = ("bayer-raw", "mono-raw", "srgb8", "mjpeg")
+RAW = KINDS[:2]
+PROCESSED = KINDS[2:]
+
+
+def kind_of(card: SensorCard) -> str:
+    """One of `KINDS`, or the card's output if it is none of them."""
+    return f"{card.mosaic}-raw" if card.output == "raw" else card.output
+
+
+def linear_planes(image: NDArray[Any], card: SensorCard, origin_px: tuple[int, int] = (0, 0)) -> Array:
+    """Linear light, shape (3, h, w) or, without filters, (1, h, w); full scale is 1 before gains.
+
+    Parameters
+    ----------
+    image : shape (h, w) DN or (h, w, 3) 8-bit R, G, B
+        An image or a part of one.
+    card : SensorCard
+    origin_px : (u, v)
+        Image pixel of the first column and row: where the mosaic's red pixels are.
+    """
+    if card.output != "raw":
+        return srgb_to_linear(np.moveaxis(np.asarray(image, float) / 255.0, -1, 0))
+    full_scale_e = (card.top_dn - card.black_level_dn) / card.dn_per_e
+    signal = raw_electrons(image, card) / full_scale_e
+    if card.mosaic == "mono":
+        return signal[None]
+    balanced = demosaiced(signal, origin_px) * np.array(card.white_balance)[:, None, None]
+    return np.einsum("ij,jhw->ihw", np.array(card.colour_matrix), balanced)
+
+
+def demosaiced(signal: Array, origin_px: tuple[int, int] = (0, 0)) -> Array:
+    """Bilinear interpolation of an RGGB mosaic, shape (h, w), to planes, shape (3, h, w).
+
+    Beyond the border stands what is mirrored about the border pixel, which keeps the mosaic's colours in order.
+    """
+    u0, v0 = origin_px
+    padded = np.pad(signal, 1, mode="reflect")
+    filters = bayer_filters(np.array([(u0 - 1, v0 - 1)]), (padded.shape[0], padded.shape[1]))[0]
+    red, green, blue = (np.where(filters == colour, padded, 0.0) for colour in range(3))
+    return np.stack([_of_quarter(red), _of_half(green), _of_quarter(blue)])
+
+
+def _of_quarter(sites: Array) -> Array:
+    """Plane of a filter on every fourth pixel: its own value, the mean of two neighbours, or of four corners."""
+    down = 0.5 * sites[:-2] + sites[1:-1] + 0.5 * sites[2:]
+    return 0.5 * down[:, :-2] + down[:, 1:-1] + 0.5 * down[:, 2:]
+
+
+def _of_half(sites: Array) -> Array:
+    """Plane of a filter on every second pixel: its own value, or the mean of four neighbours."""
+    beside = sites[1:-1, :-2] + sites[1:-1, 2:] + sites[:-2, 1:-1] + sites[2:, 1:-1]
+    return sites[1:-1, 1:-1] + 0.25 * beside
+
+
+def srgb_to_linear(encoded: Array) -> Array:
+    """Linear values of the sRGB curve, both in [0, 1] (IEC 61966-2-1)."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def linear_to_srgb(linear: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """sRGB curve of values cut to [0, 1] (IEC 61966-2-1)."""
+    x = np.clip(linear, 0.0, 1.0)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1.0 / 2.4) - 0.055)
+
+
+def redness(planes: Array) -> Array:
+    """R - max(G, B), shape (h, w), of planes (3, h, w); the plane itself where there is one."""
+    return planes[0] if len(planes) == 1 else planes[0] - np.maximum(planes[1], planes[2])
+
+
+_KNEE, _SLOPE = 0.0031308, 12.92
+_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
+_WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
+
+
+def encoded(linear: Array) -> Array:
+    """Values in [0, 1] of linear light, cut to [0, 1]; any shape."""
+    x = np.clip(linear, 0.0, 1.0)
+    return np.asarray(np.where(x <= _KNEE, _SLOPE * x, 1.055 * x ** (1.0 / 2.4) - 0.055))
+
+
+def decoded(code: Array) -> Array:
+    """Linear light of values in [0, 1]; any shape."""
+    y = np.asarray(code, float)
+    return np.asarray(np.where(y <= _SLOPE * _KNEE, y / _SLOPE, ((np.maximum(y, 0.0) + 0.055) / 1.055) ** 2.4))
+
+
+def slope(linear: Array) -> Array:
+    """Derivative of `encoded`, any shape; 0 outside [0, 1]."""
+    x = np.asarray(linear, float)
+    inside = (x >= 0.0) & (x <= 1.0)
+    power = 1.055 / 2.4 * np.maximum(x, _KNEE) ** (1.0 / 2.4 - 1.0)
+    return np.asarray(np.where(inside, np.where(x <= _KNEE, _SLOPE, power), 0.0))
+
+
+@dataclass(frozen=True)
+class NoisyCode:
+    """Encoded value of a Gaussian, arrays of the shape of its mean.
+
+    Attributes
+    ----------
+    mean : E f(x)
+    by_mean : its derivative by the mean of x, E f'(x)
+    by_sigma : its derivative by the standard deviation of x
+    variance : of f(x)
+    """
+
+    mean: Array
+    by_mean: Array
+    by_sigma: Array
+    variance: Array
+
+
+def noisy(mean: Array, sigma: Array) -> NoisyCode:
+    """Encoded value of linear light with a Gaussian error, by Gauss-Hermite quadrature with 9 nodes.
+
+    Derivatives by Stein's lemma: E f' = E f z / s, d E f / ds = E f (z^2 - 1) / s, z the standardised error. Where the
+    curve is cut within the error, at 0 and 1, the quadrature is good to some per cent of the error.
+
+    Parameters
+    ----------
+    mean, sigma : arrays of the same shape, full scale 1; sigma above 0
+    """
+    f = encoded(mean[..., None] + sigma[..., None] * _NODES)
+    first = f @ _WEIGHTS
+    by_mean = f @ (_WEIGHTS * _NODES) / sigma
+    by_sigma = f @ (_WEIGHTS * (_NODES**2 - 1.0)) / sigma
+    return NoisyCode(first, by_mean, by_sigma, (f - first[..., None]) ** 2 @ _WEIGHTS)

@@ -1,0 +1,299 @@
+"""Numbers of baseline JPEG: quantisation tables, units, colour conversion, and the linear part of the encoder.
+
+ITU-T T.81 (1992), annex K for the tables; libjpeg's scaling of them by the quality; JFIF 1.02 for the colours.
+
+Quantised coefficients behind a decoded JPEG image.
+
+The decoder interpolates the chroma samples (libjpeg's triangle filter, 3/4 and 1/4 of the two nearest), converts to
+R, G, B and cuts to 0 to 255. Interpolation is undone by least squares, and each coefficient is one of the quantiser's
+multiples, which takes out the decoder's rounding. Where a pixel was cut, the value that the coefficients found so far
+would give takes its place, and the search goes on until the image comes out again.
+
+What the JPEG frame with the laser off does not say of the room: each coefficient is known to a quantiser's step.
+
+A coefficient c of the room that was quantised lies anywhere in its step s, with the variance s^2 / 12. Where the room
+is flat, the high frequencies are 0 and their step says nothing: of a coefficient whose neighbours have the mean square
+P the error is taken to have the variance (s^2 / 12) P / (P + s^2 / 12), Wiener's for two Gaussian laws.
+
+What a uniform quantiser makes of a Gaussian: mean, its slopes, and variance. Steps and values in the same unit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dctn, idctn
+from scipy.ndimage import uniform_filter
+from scipy.special import ndtr
+
+from phibench.scenes.frames import Array, BoolArray
+
+BLOCK_PX = 8
+CHROMA_STEP = {"4:4:4": (1, 1), "4:2:2": (1, 2), "4:2:0": (2, 2)}
+"""Rows and columns of pixels per chroma sample."""
+
+RGB_FROM_YCC = np.array([[1.0, 0.0, 1.402], [1.0, -0.344136286, -0.714136286], [1.0, 1.772, 0.0]])
+YCC_FROM_RGB = np.linalg.inv(RGB_FROM_YCC)
+
+_LUMA = """16 11 10 16 24 40 51 61 12 12 14 19 26 58 60 55 14 13 16 24 40 57 69 56 14 17 22 29 51 87 80 62
+18 22 37 56 68 109 103 77 24 35 55 64 81 104 113 92 49 64 78 87 103 121 120 101 72 92 95 98 112 100 103 99"""
+_CHROMA = """17 18 24 47 99 99 99 99 18 21 26 66 99 99 99 99 24 26 56 99 99 99 99 99 47 66 99 99 99 99 99 99
+99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99"""
+
+
+def mcu_px(subsampling: str) -> tuple[int, int]:
+    """Rows and columns of a minimum coded unit."""
+    down, across = CHROMA_STEP[subsampling]
+    return BLOCK_PX * down, BLOCK_PX * across
+
+
+def quantisation(quality: int) -> tuple[Array, Array]:
+    """Steps of luma and chroma coefficients, shape (8, 8) each, rows are vertical frequencies, quality 1 to 100.
+
+    Raises
+    ------
+    ValueError
+        If the quality is none of libjpeg's.
+    """
+    if not 1 <= quality <= 100:
+        raise ValueError(f"JPEG quality {quality}: allowed range is 1 to 100")
+    percent = 5000 // quality if quality < 50 else 200 - 2 * quality
+    tables = (np.array(text.split(), int).reshape(8, 8) for text in (_LUMA, _CHROMA))
+    luma, chroma = (np.clip((table * percent + 50) // 100, 1, 255).astype(float) for table in tables)
+    return luma, chroma
+
+
+def blocks(plane: Array) -> Array:
+    """DCT coefficients of 8 x 8 blocks, shape (..., h/8, w/8, 8, 8), of a plane, shape (..., h, w); orthonormal."""
+    *lead, h, w = plane.shape
+    cut = plane.reshape(*lead, h // 8, 8, w // 8, 8)
+    return np.asarray(dctn(np.moveaxis(cut, -2, -3), axes=(-2, -1), norm="ortho"))
+
+
+def averaged(plane: Array, step: tuple[int, int]) -> Array:
+    """Means of `step` pixels, shape (..., h / down, w / across)."""
+    *lead, h, w = plane.shape
+    return np.asarray(plane.reshape(*lead, h // step[0], step[0], w // step[1], step[1]).mean(axis=(-3, -1)))
+
+
+def coefficients(rgb: Array, subsampling: str) -> Array:
+    """Coefficients of an image, shape (..., n): Y, then Cb, then Cr, block after block, without rounding.
+
+    Parameters
+    ----------
+    rgb : shape (..., 3, h, w), whole units, codes 0 to 255
+    subsampling : "4:4:4", "4:2:2" or "4:2:0"
+    """
+    ycc = np.einsum("ij,...jhw->i...hw", YCC_FROM_RGB, rgb)
+    step = CHROMA_STEP[subsampling]
+    planes = (ycc[0], averaged(ycc[1], step), averaged(ycc[2], step))
+    lead = rgb.shape[:-3]
+    return np.concatenate([blocks(plane).reshape(*lead, -1) for plane in planes], axis=-1)
+
+
+@lru_cache(maxsize=8)
+def transform(shape: tuple[int, int], subsampling: str) -> Array:
+    """Matrix of `coefficients`, shape (n, 3 h w), for an image of `shape`, read only."""
+    h, w = shape
+    matrix = np.ascontiguousarray(coefficients(np.eye(3 * h * w).reshape(-1, 3, h, w), subsampling).T)
+    matrix.flags.writeable = False
+    return matrix
+
+
+def steps(shape: tuple[int, int], subsampling: str, quality: int) -> Array:
+    """Quantiser's step of each of `coefficients`, shape (n,)."""
+    luma, chroma = quantisation(quality)
+    down, across = CHROMA_STEP[subsampling]
+    count = shape[0] * shape[1] // 64
+    return np.concatenate([np.tile(luma.ravel(), count), np.tile(chroma.ravel(), 2 * count // (down * across))])
+
+
+_SHIFT = 128.0
+_SAME_CODES = 3.5  # of the decoder's own rounding, between our decoder in floating point and libjpeg's integers
+_MOST_ROUNDS = 40
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """Coefficients of images, level shift taken off.
+
+    Attributes
+    ----------
+    luma : shape (n, h / 8, w / 8, 8, 8)
+    chroma : shape (n, 2, ...), Cb and Cr
+    wrong : boolean, shape (n, h, w)
+        Pixels that do not come out again.
+    """
+
+    luma: Array
+    chroma: Array
+    wrong: BoolArray
+
+
+def recovered(
+    images: NDArray[Any], quality: int, subsampling: str, ends: tuple[bool, bool, bool, bool] = (False,) * 4
+) -> Recovered:
+    """Coefficients of decoded images of whole units.
+
+    The chroma at sides that are not the image's own is interpolated with samples outside: leave a unit there.
+
+    Parameters
+    ----------
+    images : shape (n, h, w, 3), uint8
+    quality : int
+    subsampling : "4:4:4", "4:2:2" or "4:2:0"
+    ends : 4 booleans
+        Whether top, bottom, left and right side are the image's own.
+    """
+    rgb = np.moveaxis(np.asarray(images, float), -1, 1)
+    tables = quantisation(quality)
+    down, across = (
+        _interpolation(size, step, *end)
+        for size, step, end in zip(rgb.shape[2:], CHROMA_STEP[subsampling], (ends[:2], ends[2:]), strict=True)
+    )
+    seen, found = rgb, _quantised(rgb, tables, down, across)
+    for _ in range(_MOST_ROUNDS):
+        again = _decoded(*found, tables, down, across)
+        cut = ((rgb <= 0.0) & (again < 0.0)) | ((rgb >= 255.0) & (again > 255.0))
+        seen, before = np.where(cut, again, rgb), found
+        found = _quantised(seen, tables, down, across)
+        if all(np.array_equal(a, b) for a, b in zip(found, before, strict=True)):
+            break
+    luma, chroma = found
+    again = np.clip(_decoded(luma, chroma, tables, down, across), 0.0, 255.0)
+    wrong = (np.abs(again - rgb) > _SAME_CODES).any(axis=1)
+    return Recovered(luma * tables[0], chroma * tables[1], wrong)
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """Interpolation along one axis: `up` (pixels, samples), its pseudo-inverse, and how many samples lie outside."""
+
+    up: Array
+    back: Array
+    before: int
+    after: int
+
+
+@lru_cache(maxsize=32)
+def _interpolation(size: int, step: int, first: bool, last: bool) -> _Axis:
+    """Triangle filter from samples to `size` pixels; a sample outside is unknown where the side is not the image's."""
+    if step == 1:
+        return _Axis(np.eye(size), np.eye(size), 0, 0)
+    n, before, after = size // 2, int(not first), int(not last)
+    up = np.zeros((size, n + before + after))
+    for pixel in range(size):
+        near = pixel // 2
+        far = near + (1 if pixel % 2 else -1)
+        up[pixel, near + before] += 0.75
+        up[pixel, min(max(far + before, 0), up.shape[1] - 1)] += 0.25
+    return _Axis(up, np.asarray(np.linalg.pinv(up), float), before, after)
+
+
+def _quantised(rgb: Array, tables: tuple[Array, Array], down: _Axis, across: _Axis) -> tuple[Array, Array]:
+    """Multiples of the steps, of luma and chroma."""
+    ycc = np.einsum("ij,njhw->inhw", YCC_FROM_RGB, rgb)
+    samples = np.einsum("ah,inhw,bw->niab", down.back, ycc[1:], across.back, optimize=True)
+    inner = samples[:, :, down.before : samples.shape[2] - down.after, across.before : samples.shape[3] - across.after]
+    return np.rint(blocks(ycc[0] - _SHIFT) / tables[0]), np.rint(blocks(inner) / tables[1])
+
+
+def _decoded(luma: Array, chroma: Array, tables: tuple[Array, Array], down: _Axis, across: _Axis) -> Array:
+    """Image, shape (n, 3, h, w), of multiples, not cut; samples outside repeat the outermost ones."""
+    y = np.rint(_plane(luma * tables[0])) + _SHIFT
+    inner = np.rint(_plane(chroma * tables[1]))
+    pads = [(0, 0), (0, 0), (down.before, down.after), (across.before, across.after)]
+    samples = np.pad(inner, pads, mode="edge")
+    full = np.einsum("ha,niab,wb->inhw", down.up, samples, across.up, optimize=True)
+    return np.einsum("ij,jnhw->nihw", RGB_FROM_YCC, np.concatenate([y[None], full]))
+
+
+def _plane(coefficients: Array) -> Array:
+    """Plane, shape (..., h, w), of blocks."""
+    *lead, rows, columns, _, _ = coefficients.shape
+    cut = np.moveaxis(np.asarray(idctn(coefficients, axes=(-2, -1), norm="ortho")), -3, -2)
+    return cut.reshape(*lead, 8 * rows, 8 * columns)
+
+
+_SIDE = 8
+_NEAR = 3  # frequencies on a side of the square that the mean is taken over
+
+
+def room_variance(coefficients: Array, step: Array) -> Array:
+    """Variance of the error of the room's coefficients, shape (n,).
+
+    Parameters
+    ----------
+    coefficients : shape (n,)
+        Of the quantised frame without the laser, blocks of 8 x 8 one after the other.
+    step : shape (n,), of the quantiser
+    """
+    blocks = np.asarray(coefficients, float).reshape(-1, _SIDE, _SIDE)
+    power = blocks * blocks
+    power[:, 0, 0] = 0.0  # the level says nothing of the structure
+    near = uniform_filter(power, (0, _NEAR, _NEAR), mode="constant") * _NEAR**2 / _counts()
+    quantised = step * step / 12.0
+    mean = near.ravel()
+    variance = quantised * mean / (mean + quantised)
+    levels = np.zeros((_SIDE, _SIDE), bool)
+    levels[0, 0] = True
+    return np.where(np.tile(levels.ravel(), len(blocks)), quantised, variance)
+
+
+def _counts() -> Array:
+    """Frequencies in each square: at the block's sides, and beside the level, there are fewer."""
+    there = np.ones((_SIDE, _SIDE))
+    there[0, 0] = 0.0
+    return np.asarray(np.maximum(uniform_filter(there, _NEAR, mode="constant") * _NEAR**2, 1.0))
+
+
+_FINE = 0.9  # standard deviations per step from which the output is input plus rounding: off by 2e-7 steps
+_THRESHOLDS = np.arange(-5, 6) + 0.5  # about the nearest multiple: 5 steps are 5.5 of the coarsest deviation
+_LEAST = 1e-4  # standard deviation in steps; a smaller one would make slopes that no step of a fit can follow
+
+
+@dataclass(frozen=True)
+class Quantised:
+    """Output for Gaussian inputs, arrays of the inputs' shape.
+
+    Attributes
+    ----------
+    mean : E Q
+    slope : its derivative by the input's mean
+    variance : of Q
+    """
+
+    mean: Array
+    slope: Array
+    variance: Array
+
+
+def quantised(mean: Array, sigma: Array, step: Array) -> Quantised:
+    """Round to multiples of `step`, halves either way; arrays broadcast together."""
+    m, s, q = np.broadcast_arrays(mean / step, np.maximum(sigma / step, _LEAST), step)
+    fine = s >= _FINE
+    result = Quantised(m * q, np.ones_like(m), (s**2 + 1.0 / 12.0) * q**2)
+    if fine.all():
+        return result
+    coarse = ~fine
+    first, slope, variance = _sums(m[coarse], s[coarse])
+    q = q[coarse]
+    result.mean[coarse], result.slope[coarse], result.variance[coarse] = first * q, slope, variance * q**2
+    return result
+
+
+def _sums(m: Array, s: Array) -> tuple[Array, Array, Array]:
+    """Unit step: round(x) = nearest + sum over thresholds above of 1[x > t] - sum below of 1[x < t]."""
+    nearest = np.rint(m)
+    t = (nearest[:, None] + _THRESHOLDS - m[:, None]) / s[:, None]
+    above = ndtr(-t)  # chance to be above each threshold
+    slope = np.exp(-0.5 * t * t).sum(axis=1) / (np.sqrt(2.0 * np.pi) * s)
+    low = _THRESHOLDS[0] - 0.5
+    mean = low + above.sum(axis=1)  # relative to the nearest
+    # k^2 = sum of its increases 2 k' - 1 over the thresholds passed, k' the multiple above the threshold
+    square = low**2 + above @ (2.0 * _THRESHOLDS)
+    return nearest + mean, slope, np.maximum(square - mean**2, 0.0)

@@ -1,0 +1,210 @@
+"""Raw pixels as an estimator sees them: electrons from DN, the filter of each pixel, the noise of each pixel.
+
+Integer (u, v) are pixel centres. RGGB: red at even row and even column of the image.
+
+Laws of one pixel's reading x, given its mean mu: what a likelihood fit needs to know of them.
+
+All values are in electrons; arrays are of shape (n, h, w): spot, row, column.
+
+Base image: the room behind a spot, in electrons of the raw pixels, with the variance of what is not known of it.
+
+Each of the mosaic's four phases is smoothed as strongly as its local variance allows (adaptive Wiener filter: J. S.
+Lim, "Two-Dimensional Signal and Image Processing", 1990, section 9.2): where the room is flat, the base has next to no
+noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import gaussian_filter
+
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.scenes.frames import Array
+
+
+@dataclass(frozen=True)
+class PixelNoise:
+    """Variance of a pixel with the mean mu: mu + gaussian_e2 + (prnu mu)^2, electrons squared.
+
+    Parameters
+    ----------
+    gaussian_e2 : float
+        What does not depend on the light: read noise, DSNU, rounding.
+    prnu : float
+        Relative spread of the responsivity that nobody has calibrated.
+    """
+
+    gaussian_e2: float
+    prnu: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.gaussian_e2 >= 0.0 or not 0.0 <= self.prnu < 1.0:
+            raise ValueError(
+                f"PixelNoise: gaussian_e2 = {self.gaussian_e2:g} must be 0 or above and prnu = {self.prnu:g} in [0, 1)"
+            )
+
+    def variance_e2(self, mean_e: Array) -> Array:
+        """Variance for means of any shape; a mean below 0, which a fit may try, counts as 0."""
+        mean = np.maximum(mean_e, 0.0)
+        return mean + self.gaussian_e2 + (self.prnu * mean) ** 2
+
+
+def noise_of(card: SensorCard, pattern_known: bool = False) -> PixelNoise:
+    """Noise of a sensor's pixels.
+
+    Parameters
+    ----------
+    card : SensorCard
+    pattern_known : bool
+        Whether PRNU and DSNU of the camera were calibrated and taken out; otherwise they count as noise.
+
+    Raises
+    ------
+    ValueError
+        If the sensor has row noise, which is common to the pixels of a row, or no shot noise.
+    """
+    if card.row_noise_e > 0.0 or not card.shot_noise:
+        raise ValueError(
+            f"sensor '{card.name}': row_noise_e = {card.row_noise_e:g}, shot_noise = {card.shot_noise}; independent "
+            "pixels need row_noise_e = 0 and shot noise: take processed_fisher with the covariance of the pixels"
+        )
+    rounding_e2 = 1.0 / (12.0 * card.dn_per_e**2)
+    fixed_e2 = 0.0 if pattern_known else card.dsnu_e**2
+    return PixelNoise(card.read_noise_e**2 + fixed_e2 + rounding_e2, 0.0 if pattern_known else card.prnu)
+
+
+def raw_electrons(dn: NDArray[Any], card: SensorCard) -> Array:
+    """Electrons of DN: black level taken off, divided by the system gain."""
+    return (np.asarray(dn, float) - card.black_level_dn) / card.dn_per_e
+
+
+def bayer_filters(origin_px: ArrayLike, shape: tuple[int, int]) -> NDArray[np.int64]:
+    """Filter of each pixel, 0, 1, 2 for R, G, B, shape (n, h, w).
+
+    Parameters
+    ----------
+    origin_px : shape (n, 2)
+        Image pixel (u, v) of each region's first column and row.
+    shape : (h, w)
+    """
+    origin = np.asarray(origin_px, np.int64)
+    v = (origin[:, 1, None] + np.arange(shape[0])) % 2
+    u = (origin[:, 0, None] + np.arange(shape[1])) % 2
+    return v[:, :, None] + u[:, None, :]
+
+
+class PixelLaw(Protocol):
+    """Score, information and misfit of pixels."""
+
+    def rows(self, index: NDArray[np.int64]) -> PixelLaw:
+        """Law of some of the spots."""
+
+    def score(self, x: Array, mean: Array) -> Array:
+        """Derivative of the log likelihood by the mean."""
+
+    def information(self, mean: Array) -> Array:
+        """Mean square of the score."""
+
+    def misfit(self, x: Array, mean: Array) -> Array:
+        """-2 log likelihood, up to a constant of the pixel."""
+
+
+@dataclass(frozen=True)
+class GaussLaw:
+    """Gaussian quasi-likelihood with the variance V(mu), plus `extra_e2` of other origin.
+
+    Parameters
+    ----------
+    noise : PixelNoise
+    extra_e2 : float or shape (n, h, w)
+        Variance that does not depend on the mean, such as that of a base image.
+    """
+
+    noise: PixelNoise
+    extra_e2: float | Array = 0.0
+
+    def rows(self, index: NDArray[np.int64]) -> GaussLaw:
+        """Law of some of the spots."""
+        extra = self.extra_e2[index] if isinstance(self.extra_e2, np.ndarray) else self.extra_e2
+        return replace(self, extra_e2=extra)
+
+    def score(self, x: Array, mean: Array) -> Array:
+        """(x - mu) / V."""
+        return (x - mean) * self.information(mean)
+
+    def information(self, mean: Array) -> Array:
+        """1 / V."""
+        return np.asarray(1.0 / (self.noise.variance_e2(mean) + self.extra_e2))
+
+    def misfit(self, x: Array, mean: Array) -> Array:
+        """(x - mu)^2 / V + log V."""
+        information = self.information(mean)
+        return np.asarray((x - mean) ** 2 * information - np.log(information))
+
+
+_SIGMA_PX = 2.5  # of the local mean, pixels of one phase: 5 pixels of the image
+_HIDDEN_PX = 5.0  # radius around the spot that the laser-on frame says nothing about
+_LEAST_WEIGHT = 1e-6
+
+
+@dataclass(frozen=True)
+class BaseImage:
+    """Base of n regions.
+
+    Attributes
+    ----------
+    mean_e : shape (n, h, w)
+    variance_e2 : shape (n, h, w)
+        Of its error, taken as independent from pixel to pixel.
+    image : shape (n, h, w, 3), uint8, optional
+        The decoded JPEG frame that it was taken from.
+    """
+
+    mean_e: Array
+    variance_e2: Array
+    image: NDArray[Any] | None = None
+
+
+def base_of(x_e: Array, variance_e2: Array, known: Array) -> BaseImage:
+    """Smooth images without the spot, or around it.
+
+    Parameters
+    ----------
+    x_e : shape (n, h, w), electrons of each pixel's own colour
+    variance_e2 : shape (n, h, w), of its noise
+    known : shape (n, h, w), 0 or 1
+        0 where the image says nothing about the base: what surrounds it is carried on, and its structure counts as
+        variance.
+    """
+    mean, variance = np.empty(x_e.shape), np.empty(x_e.shape)
+    for row in (0, 1):
+        for column in (0, 1):
+            at = (slice(None), slice(row, None, 2), slice(column, None, 2))
+            mean[at], variance[at] = _of_phase(x_e[at], variance_e2[at], np.asarray(known, float)[at])
+    return BaseImage(mean, variance)
+
+
+def around(uv_px: Array, origin_px: Array, shape: tuple[int, int]) -> Array:
+    """Pixels farther than 5 px from (u, v), shape (n, h, w), 0 or 1; positions and origins of shape (n, 2)."""
+    v = np.arange(shape[0]) + origin_px[:, 1, None] - uv_px[:, 1, None]
+    u = np.arange(shape[1]) + origin_px[:, 0, None] - uv_px[:, 0, None]
+    return (v[:, :, None] ** 2 + u[:, None, :] ** 2 > _HIDDEN_PX**2).astype(float)
+
+
+def _of_phase(x: Array, noise: Array, known: Array) -> tuple[Array, Array]:
+    weight = np.maximum(_smooth(known), _LEAST_WEIGHT)
+    local = _smooth(known * x) / weight
+    spread = _smooth(known * (x - local) ** 2) / weight
+    typical = _smooth(known * noise) / weight
+    structure = np.maximum(spread - typical, 0.0)
+    gain = known * structure / np.maximum(spread, _LEAST_WEIGHT)
+    left = np.where(known > 0.0, (gain + (1.0 - gain) / (4.0 * np.pi * _SIGMA_PX**2)) * typical, structure)
+    return local + gain * (x - local), left
+
+
+def _smooth(x: Array) -> Array:
+    return np.asarray(gaussian_filter(x, (0.0, _SIGMA_PX, _SIGMA_PX), mode="nearest"))

@@ -1,0 +1,228 @@
+"""What a study works on: data sets rendered from recipes, kept between runs and shared between studies.
+
+Drawings of a study: SVG, or PNG where there are many marks, each with its text alternative.
+
+What a study finds: tables, drawings, and sentences made from the numbers.
+
+What a study is: a question, settings that a TOML file fills, and a function from data sets to a result.
+
+Settings of a study from its TOML file: the top level is the full study, `[quick]` what a reduced one changes.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import matplotlib as mpl
+import polars as pl
+from matplotlib.figure import Figure
+from pydantic import BaseModel, ConfigDict
+from rich.console import Console
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.read import Dataset, open_finished
+from phibench.datasets.recipe.load import find_recipe
+from phibench.estimator.benchmark import report as picture
+from phibench.estimator.benchmark.report import Picture
+from phibench.scenes.validation import structural_faults
+
+
+@dataclass(frozen=True)
+class Material:
+    """Where data sets are, and how many processes render them.
+
+    Parameters
+    ----------
+    folder : Path
+        Data sets lie in it under the names of their recipes; what is finished there is not rendered again.
+    console : Console
+        For progress.
+    workers : int, optional
+        Processes; by default one per core.
+    """
+
+    folder: Path
+    console: Console
+    workers: int | None = None
+
+    def dataset(self, recipe: str | Path, samples: int | None = None) -> Dataset:
+        """Data set of a recipe, rendered if need be.
+
+        Parameters
+        ----------
+        recipe : name of a shipped recipe, or a TOML file
+        samples : number instead of the recipe's, for recipes with `[random]`
+
+        Raises
+        ------
+        DatasetError
+            If the recipe has faults, rendering fails, or Mitsuba is not installed and the data set is not there.
+        """
+        name = find_recipe(recipe).stem if samples is None else f"{find_recipe(recipe).stem}-{samples}"
+        target = self.folder / name
+        try:
+            from phibench.datasets.make import make
+
+            make(recipe, target, workers=self.workers, console=self.console, samples=samples)
+        except ImportError as error:
+            if (error.name or "").split(".")[0] not in ("mitsuba", "drjit"):
+                raise
+            if not target.is_dir():
+                raise DatasetError(
+                    f"the study needs the data set {name}, which is not in {self.folder}, and Mitsuba is not "
+                    "installed: pip install 'phibench[render]', or put a rendered one there (--data)"
+                ) from error
+        return open_finished(target)
+
+
+COLOURS = (*picture.COLOURS, "#000000")
+MARKERS, LINES, line_style = picture.MARKERS, picture.LINES, picture.line_style
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A drawing.
+
+    Attributes
+    ----------
+    name : str
+        File name without its ending.
+    data : bytes
+    alt : str
+        What it shows, in words, with its main numbers.
+    kind : "svg" or "png"
+    """
+
+    name: str
+    data: bytes
+    alt: str
+    kind: str = "svg"
+
+    @property
+    def file_name(self) -> str:
+        """Name of its file."""
+        return f"{self.name}.{self.kind}"
+
+    def picture(self) -> Picture:
+        """The drawing as a data address, for a report."""
+        return picture.picture(self.data, self.kind, self.alt)
+
+
+@contextmanager
+def canvas(width_in: float = 9.0, height_in: float = 4.0) -> Iterator[Figure]:
+    """A figure in the style of all studies; draw and call `drawn` inside of the block."""
+    with mpl.rc_context(picture.STYLE):
+        yield Figure(figsize=(width_in, height_in), layout="constrained", dpi=130)
+
+
+def drawn(name: str, figure: Figure, alt: str, kind: str = "svg") -> Drawing:
+    """The finished drawing; the same marks give the same bytes."""
+    return Drawing(name, picture.encoded(figure, kind), alt, kind)
+
+
+Row = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Result:
+    """Result of a study.
+
+    Attributes
+    ----------
+    tables : dict of str to DataFrame
+        By name; "table" is the main one, one row per measured case, units in the column names. Each is written as
+        `NAME.parquet`.
+    findings : tuple of str
+        Sentences of a paragraph, every number in them computed; an uncertain number carries its interval.
+    drawings : tuple of Drawing
+    shown : dict of str to rows
+        Small tables of text for the report, by caption, the first row being heads.
+    notes : tuple of str
+        What this run leaves out or could not do: few samples, missing packages, targets missed.
+    """
+
+    tables: dict[str, pl.DataFrame]
+    findings: tuple[str, ...]
+    drawings: tuple[Drawing, ...] = ()
+    shown: dict[str, tuple[Row, ...]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+class Settings(BaseModel):
+    """Settings of a study; each study has its own, frozen and strict, with ranges and descriptions."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+S = TypeVar("S", bound=Settings)
+
+
+@dataclass(frozen=True)
+class Study(Generic[S]):
+    """A study.
+
+    Parameters
+    ----------
+    name : str
+        As in `phibench study NAME`; its settings are in `NAME.toml` beside the code.
+    title : str
+        Heading of its section in the report.
+    question : str
+        What it answers, one sentence.
+    settings : type
+    run : callable
+        From settings and material to the result; the same settings and data sets give the same result.
+    """
+
+    name: str
+    title: str
+    question: str
+    settings: type[S]
+    run: Callable[[S, Material], Result]
+
+
+QUICK = "quick"
+
+
+def settings_file(name: str) -> Path:
+    """Path of the settings that a study comes with."""
+    return Path(__file__).parent / name / "settings.toml"
+
+
+def read_settings(study: Study[S], quick: bool = False, path: Path | None = None) -> S:
+    """Settings of a study.
+
+    Parameters
+    ----------
+    study : Study
+    quick : bool
+        Take the numbers of the table `[quick]` in place of those of the same names.
+    path : Path, optional
+        Another TOML file than the study's own.
+
+    Raises
+    ------
+    DatasetError
+        If the file cannot be read or has faults: all of them, a line each.
+    """
+    path = path or settings_file(study.name)
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{path} is not valid TOML: {error}") from error
+    reduced = raw.pop(QUICK, {})
+    if not isinstance(reduced, dict):
+        raise DatasetError(f"{path}: [quick] is {reduced!r}; must be a table of settings")
+    checked = _checked(study, raw, str(path))
+    return _checked(study, {**raw, **reduced}, f"{path} with its [quick]") if quick else checked
+
+
+def _checked(study: Study[S], raw: dict[str, Any], source: str) -> S:
+    if faults := structural_faults(study.settings, raw):
+        raise DatasetError("\n".join([f"{source}: settings of the study '{study.name}':", *(f"  {f}" for f in faults)]))
+    return study.settings.model_validate(raw)

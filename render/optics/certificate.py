@@ -1,0 +1,292 @@
+"""The certificate of a spot in one view: the world-side closed form against a camera-side ray tracer.
+
+`spot_truth` and `spot_cloud` go from the spot to the lens (Alhazen's problem, Coddington's equations; Fermat's path and
+its second derivatives where the mirror has a form error). Here rays go from the film through the aperture to the mirror
+(for a form from values of its radius alone, `form_trace`) and on to the wall, and the film position that meets a given
+wall point is found by Newton's method. Power is radiance times etendue. A rough mirror reflects each ray at a facet
+with a drawn slope, where `rough_cloud` evaluates the BRDF at given pairs. Only the scene's numbers are shared.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtri
+from scipy.stats import qmc
+
+from phibench.render.optics.ray_tracer import MirrorRays, blocked_by, lens_rays, reflect
+from phibench.render.optics.spot_layer import SpotLayer
+from phibench.render.optics.truth import SpotTruth
+from phibench.scenes.frames import Array
+from phibench.scenes.laser import LaserSpot
+from phibench.scenes.rig import View
+from phibench.scenes.room import Shape
+
+CHIEF_TOLERANCE_PX = 1e-6
+CENTROID_TOLERANCE_PX = 2e-3
+FLUX_TOLERANCE = 3e-3
+_LOG2_RAYS = (13, 15, 17)  # 13: centroid within 4e-4 px, flux within 5e-4, for the random rigs of the tests
+_SEED = 0  # the scramble is part of the quadrature rule, not a noise draw
+_STEP_PX = 1e-3
+_NEWTON_STEPS = 8
+_HALVINGS = 6
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Differences between two independent answers, and the tolerances they were held to.
+
+    Attributes
+    ----------
+    chief_difference_px, chief_tolerance_px : float
+        Closed form against ray tracer, chief ray.
+    centroid_difference_px, centroid_tolerance_px : float
+        Centroid of the spot layer's pixels against the centroid predicted by rays over aperture and spot.
+    flux_difference, flux_tolerance : float
+        Relative difference of the electrons per second of the same two.
+    passed : bool
+    """
+
+    chief_difference_px: float
+    chief_tolerance_px: float
+    centroid_difference_px: float
+    centroid_tolerance_px: float
+    flux_difference: float
+    flux_tolerance: float
+    passed: bool
+
+
+def certify(view: View, spot: LaserSpot, shapes: Sequence[Shape], truth: SpotTruth, layer: SpotLayer) -> Certificate:
+    """Check one visible spot. Raises nothing: look at `passed`.
+
+    More rays are traced before a difference counts: the first few may not be enough for a wide or a cut image.
+    """
+    chief = np.array([truth.u_px, truth.v_px])
+    start = _through_chief_point(view, truth, np.zeros((1, 2)))
+    chief_px = float(np.linalg.norm(aim(view, spot, _Bundle.chief(), np.zeros((1, 2)), start)[0] - chief))
+    for log2_rays in _LOG2_RAYS:
+        centroid_px, flux = _differences(view, spot, shapes, truth, layer, log2_rays)
+        # a NaN does not pass
+        passed = chief_px <= CHIEF_TOLERANCE_PX and centroid_px <= CENTROID_TOLERANCE_PX and flux <= FLUX_TOLERANCE
+        if passed:
+            break
+    return Certificate(chief_px, CHIEF_TOLERANCE_PX, centroid_px, CENTROID_TOLERANCE_PX, flux, FLUX_TOLERANCE, passed)
+
+
+def _differences(
+    view: View, spot: LaserSpot, shapes: Sequence[Shape], truth: SpotTruth, layer: SpotLayer, log2_rays: int
+) -> tuple[float, float]:
+    """Centroid difference, pixels, and relative flux difference of layer and traced rays; 0 where both are dark."""
+    centroid, watts = trace_spot(view, spot, shapes, truth, log2_rays)
+    plane = brightest(layer)
+    gain = view.rig.camera.detector.laser_electrons_per_joule(spot.wavelength_nm)[plane]
+    total = float(layer.electrons_per_s[plane].sum())
+    if total == 0.0 and watts * gain == 0.0:
+        return 0.0, 0.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        flux = abs(np.float64(total) / (watts * gain) - 1.0)
+    return float(np.linalg.norm(pixel_centroid(layer) - centroid)), float(flux)
+
+
+def brightest(layer: SpotLayer) -> int:
+    """Index of the brightest plane."""
+    return int(np.argmax(layer.electrons_per_s.sum(axis=(1, 2))))
+
+
+def pixel_centroid(layer: SpotLayer) -> Array:
+    """Centroid (u, v), shape (2,), of the brightest plane's pixels."""
+    image = layer.electrons_per_s[brightest(layer)]
+    v, u = np.indices(image.shape)
+    with np.errstate(invalid="ignore"):
+        total = image.sum()
+        return np.array([(image * u).sum() / total + layer.u0_px, (image * v).sum() / total + layer.v0_px])
+
+
+@dataclass(frozen=True)
+class _Bundle:
+    """Rays that differ in aperture point (metres, camera x and y) and facet slope, both of shape (N, 2)."""
+
+    lens_m: Array
+    slopes: Array
+
+    @staticmethod
+    def chief() -> _Bundle:
+        return _Bundle(np.zeros((1, 2)), np.zeros((1, 2)))
+
+
+def aim(view: View, spot: LaserSpot, bundle: _Bundle, wall_m: Array, start_px: Array) -> Array:
+    """Film positions, shape (N, 2), whose rays meet wall points; NaN where none is found.
+
+    Parameters
+    ----------
+    bundle
+        Aperture points and facet slopes of the N rays.
+    wall_m : array, shape (N, 2)
+        Points in the spot's plane, metres from the spot's centre along its tangents.
+    start_px : array, shape (N, 2)
+    """
+    uv, miss = start_px, _on_wall(view, spot, start_px, bundle) - wall_m
+    for _ in range(_NEWTON_STEPS):
+        step = _solve(_wall_jacobian(view, spot, uv, bundle), miss)
+        uv, miss = _step(view, spot, bundle, wall_m, uv, step)
+        if not np.any(np.abs(step) > 1e-11):
+            break
+    return uv
+
+
+def _step(view: View, spot: LaserSpot, bundle: _Bundle, wall_m: Array, uv: Array, step: Array) -> tuple[Array, Array]:
+    """Take a Newton step, halved where the ray would leave the mirror."""
+    for _ in range(_HALVINGS):
+        new = uv - step
+        miss = _on_wall(view, spot, new, bundle) - wall_m
+        lost = np.any(~np.isfinite(miss), axis=-1)
+        if not lost.any():
+            break
+        step = np.where(lost[:, None], 0.5 * step, step)
+    return new, miss
+
+
+def _solve(jacobian: Array, rhs: Array) -> Array:
+    """Solve 2 x 2 systems; NaN where a matrix is singular or not finite."""
+    (a, b), (c, d) = jacobian[:, 0].T, jacobian[:, 1].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        det = a * d - b * c
+        return np.stack([(d * rhs[:, 0] - b * rhs[:, 1]) / det, (a * rhs[:, 1] - c * rhs[:, 0]) / det], axis=-1)
+
+
+def _through_chief_point(view: View, truth: SpotTruth, lens_m: Array) -> Array:
+    """Film positions, shape (N, 2), of rays from aperture points to the chief ray's mirror point: a start for `aim`."""
+    camera, mirror = view.rig.camera, np.array(truth.reflection_point_world_m)
+    x, y, z = view.T_world_camera.inverse().points(mirror)
+    share = camera.focus_distance_m / z
+    at_focus = np.array([x, y]) * share + lens_m * (1.0 - share)
+    return camera.to_pixel(at_focus / camera.focus_distance_m)
+
+
+def trace_spot(
+    view: View, spot: LaserSpot, shapes: Sequence[Shape], truth: SpotTruth, log2_rays: int
+) -> tuple[Array, float]:
+    """Centroid (2,) of the pixel-sampled image of the spot, and its power on the film, watts."""
+    x = np.clip(qmc.Sobol(6, scramble=True, rng=_SEED).random_base2(log2_rays), 1e-12, 1.0 - 1e-12)
+    bundle = _Bundle(view.rig.camera.aperture_radius_m * _disc(x[:, :2]), _facets(view, x[:, 4:]))
+    wall, density = _wall_samples(spot, x[:, 2:4])
+    uv, jacobian = _linear_aim(view, spot, bundle, wall, truth)
+    with np.errstate(invalid="ignore"):
+        area = density * np.abs(jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0])
+        watts = _watts(view, spot, shapes, uv, bundle) / area / len(x)
+        lost = ~np.isfinite(watts) | ~np.isfinite(uv).all(axis=-1)
+        watts, uv = np.where(lost, 0.0, watts), np.where(lost[:, None], 0.0, uv)
+        return watts @ _expected_pixel(uv, view.rig.camera.blur_sigma_px) / watts.sum(), float(watts.sum())
+
+
+def _linear_aim(view: View, spot: LaserSpot, bundle: _Bundle, wall: Array, truth: SpotTruth) -> tuple[Array, Array]:
+    """Film samples: the exact image of the spot's centre for each ray, plus a linear map of the wall sample.
+
+    Sampling only: where on the wall such a ray really lands, and with what weight, is traced afterwards.
+    """
+    start = _through_chief_point(view, truth, bundle.lens_m)
+    centres = aim(view, spot, bundle, np.zeros_like(wall), start)
+    jacobian = _wall_jacobian(view, spot, centres, bundle)
+    return centres + _solve(jacobian, wall), jacobian
+
+
+def _facets(view: View, x: Array) -> Array:
+    """Beckmann slopes, shape (N, 2): variance alpha^2 / 2 each way; 0 for an ideal mirror."""
+    return view.rig.mirror.roughness_alpha / math.sqrt(2.0) * ndtri(x)
+
+
+def _wall_samples(spot: LaserSpot, x: Array) -> tuple[Array, Array]:
+    """Points in the spot's plane (N, 2) that cover the spot generously, and their density, 1/m^2."""
+    if spot.profile == "gaussian":
+        z, sigma = ndtri(x), 1.2 * spot.sigma_m
+        return sigma * z, np.exp(-0.5 * (z**2).sum(axis=1)) / (2.0 * math.pi * sigma**2)
+    radius = 1.05 * spot.diameter_m / 2.0
+    return radius * _disc(x), np.full(len(x), 1.0 / (math.pi * radius**2))
+
+
+def _disc(x: Array) -> Array:
+    radius, turn = np.sqrt(x[:, 0]), 2.0 * np.pi * x[:, 1]
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=-1)
+
+
+@dataclass(frozen=True)
+class _Reflected:
+    """Rays of film positions after the mirror."""
+
+    lens_points_m: Array
+    mirror_points_m: Array
+    directions: Array
+    cos_facet: Array
+    cos_lens: Array
+    facet_weight: Array
+
+
+def _reflect(view: View, spot: LaserSpot, uv: Array, bundle: _Bundle) -> _Reflected:
+    """Reflect each ray at its facet; the weight (o.m) / (o.n n.m) turns drawn facets into f_r cos_i, shadowing 1."""
+    origins, directions = lens_rays(view, uv, bundle.lens_m)
+    rays = reflect(view, origins, directions)
+    facet = rays.normals + np.einsum("nk,nki->ni", bundle.slopes, _tangents(view, spot, rays))
+    facet /= np.linalg.norm(facet, axis=-1, keepdims=True)
+    cos_facet = -np.einsum("ni,ni->n", facet, directions)
+    out = directions + 2.0 * cos_facet[:, None] * facet
+    weight = cos_facet / (rays.cos_incidence * np.einsum("ni,ni->n", facet, rays.normals))
+    return _Reflected(origins, rays.points_m, out, cos_facet, directions @ view.T_world_camera.R[:, 2], weight)
+
+
+def _tangents(view: View, spot: LaserSpot, rays: MirrorRays) -> Array:
+    """Two tangents per ray, shape (N, 2, 3), smooth over the film: the first along the plane of incidence's normal."""
+    to_spot = np.array(spot.position_world_m) - view.sphere_centre_m
+    across = np.cross(to_spot, view.camera_centre_m - view.sphere_centre_m)
+    if np.linalg.norm(across) < 1e-12:  # spot, sphere and camera in one line: any direction across will do
+        across = view.T_world_camera.R[:, 0]
+    first = across - np.einsum("ni,i->n", rays.normals, across)[:, None] * rays.normals
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    return np.stack([first, np.cross(rays.normals, first)], axis=1)
+
+
+def _on_wall(view: View, spot: LaserSpot, uv: Array, bundle: _Bundle) -> Array:
+    """Where rays of film positions land in the spot's plane, metres along its tangents, shape (N, 2)."""
+    rays = _reflect(view, spot, uv, bundle)
+    return _meet(spot, rays.mirror_points_m, rays.directions)[0]
+
+
+def _meet(spot: LaserSpot, origins: Array, directions: Array) -> tuple[Array, Array]:
+    normal, centre = np.array(spot.normal_world), np.array(spot.position_world_m)
+    distance = (centre - origins) @ normal / (directions @ normal)
+    points = origins + distance[:, None] * directions
+    return (points - centre) @ np.stack(spot.tangents()).T, points
+
+
+def _wall_jacobian(view: View, spot: LaserSpot, uv: Array, bundle: _Bundle) -> Array:
+    """d(wall) / d(u, v), shape (N, 2, 2), by central differences."""
+    sides = [[_on_wall(view, spot, uv + sign * step, bundle) for sign in (1, -1)] for step in _STEP_PX * np.eye(2)]
+    return np.stack([(plus - minus) / (2.0 * _STEP_PX) for plus, minus in sides], axis=-1)
+
+
+def _watts(view: View, spot: LaserSpot, shapes: Sequence[Shape], uv: Array, bundle: _Bundle) -> Array:
+    """Radiance x etendue, watts per square pixel for the whole aperture, shape (N,)."""
+    camera = view.rig.camera
+    rays = _reflect(view, spot, uv, bundle)
+    wall, points = _meet(spot, rays.mirror_points_m, rays.directions)
+    facing = rays.directions @ np.array(spot.normal_world) < 0.0
+    radiance = spot.radiance_w_m2_sr(np.linalg.norm(wall, axis=-1)) * facing * rays.facet_weight
+    radiance *= view.rig.mirror.reflectance(rays.cos_facet, spot.wavelength_nm)
+    density = camera.solid_angle_density(camera.normalised(uv))
+    watts = radiance * density * rays.cos_lens**4 * math.pi * camera.aperture_radius_m**2
+    hit = np.isfinite(watts)
+    legs = ((rays.mirror_points_m[hit], points[hit]), (rays.lens_points_m[hit], rays.mirror_points_m[hit]))
+    watts[hit] *= np.all([blocked_by(shapes, start, end) < 0 for start, end in legs], axis=0)
+    return watts
+
+
+def _expected_pixel(uv: Array, sigma: float) -> Array:
+    """Mean pixel index of a point blurred by a Gaussian: the centroid that pixels can show (Fourier series).
+
+    round(x) = x - sum_m (-1)^(m+1) sin(2 pi m x) / (pi m); the Gaussian damps term m by exp(-2 pi^2 m^2 sigma^2).
+    """
+    m = np.arange(1, 2 + math.ceil(1.4 / sigma))  # the first left out is below 1e-16
+    damping = (-1.0) ** (m + 1) / (np.pi * m) * np.exp(-2.0 * (np.pi * m * sigma) ** 2)
+    return uv - np.sin(2.0 * np.pi * uv[..., None] * m) @ damping

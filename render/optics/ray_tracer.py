@@ -1,0 +1,302 @@
+"""Rays that meet a mirror with a form error, from the values of its radius alone.
+
+This is the camera-side answer: it neither uses the tensors, the gradients nor the Hessians by which `fermat` goes from
+the world's side, nor its equations. The harmonics are written out as they stand in `scenes/form.py`; a ray's place is
+found by the secant method on q = |P|^2 - r(P / |P|)^2, which for a sphere is a parabola in the distance along the ray;
+the normal follows from differences of surface points.
+
+Rays from the camera, reflected once at the mirror: pixel -> mirror -> world, in float64.
+
+This is the camera-side ray tracer. It shares no mathematics with the world-side answer (`alhazen`; `fermat` for a form
+error), so that the two can certify each other.
+
+Where straight rays hit a room, in float64: the exact counterpart of Mitsuba's float32 intersections.
+
+Closed forms per shape (plane, slabs), nothing shared with Mitsuba. Rays have shape (N, 3); metres.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.scenes.frames import Array
+from phibench.scenes.mirror import Form
+from phibench.scenes.rig import View
+from phibench.scenes.room import Cuboid, Shape
+
+Radius = Callable[[Array], Array]
+
+_NARROWING = (0.3, 0.03, 3e-3, 3e-4)  # radii: half width of the parabola that looks for the nearest place
+_SECANTS = 12  # 4 to 6 do
+_SETTLED = 1e-17  # metres: below a rounding of the distance
+_STENCIL_RAD = 1e-3  # a five-point stencil errs by 3^5 / 30 of its fourth power: 1e-11 of the form, 1e-13 rad for 1 mm
+
+_HARMONICS: dict[str, Callable[[Array, Array, Array], Array]] = {
+    "form_20_m": lambda x, y, z: 1.5 * z * z - 0.5,
+    "form_21c_m": lambda x, y, z: 2.0 * x * z,
+    "form_21s_m": lambda x, y, z: 2.0 * y * z,
+    "form_22c_m": lambda x, y, z: x * x - y * y,
+    "form_22s_m": lambda x, y, z: 2.0 * x * y,
+    "form_30_m": lambda x, y, z: (2.5 * z * z - 1.5) * z,
+    "form_31c_m": lambda x, y, z: 0.1875 * math.sqrt(15.0) * x * (5.0 * z * z - 1.0),
+    "form_31s_m": lambda x, y, z: 0.1875 * math.sqrt(15.0) * y * (5.0 * z * z - 1.0),
+    "form_32c_m": lambda x, y, z: 1.5 * math.sqrt(3.0) * z * (x * x - y * y),
+    "form_32s_m": lambda x, y, z: 3.0 * math.sqrt(3.0) * x * y * z,
+    "form_33c_m": lambda x, y, z: x * (x * x - 3.0 * y * y),
+    "form_33s_m": lambda x, y, z: y * (3.0 * x * x - y * y),
+}
+
+
+def meet(origins_m: Array, directions: Array, radius_m: float, form: Form) -> tuple[Array, Array, Array]:
+    """First points of the mirror on rays from outside, in the sphere's frame.
+
+    Parameters
+    ----------
+    origins_m, directions : arrays, shape (N, 3); directions of unit length
+    radius_m, form
+
+    Returns
+    -------
+    points_m, normals : arrays, shape (N, 3); NaN where the mirror is missed
+    distance_m : array, shape (N,); NaN likewise
+    """
+    added = _added(form)
+    approach = -np.einsum("ni,ni->n", origins_m, directions)
+    foot = origins_m + approach[:, None] * directions  # nearest point to the centre
+    foot2 = np.einsum("ni,ni->n", foot, foot)
+
+    def q(x: Array) -> Array:
+        """How far beyond the surface the ray is at a distance x from the foot, in squares of metres."""
+        rho2 = foot2 + x * x
+        with np.errstate(invalid="ignore"):
+            return rho2 - (radius_m + added((foot + x[:, None] * directions) / np.sqrt(rho2)[:, None])) ** 2
+
+    # certainly hits, and q is no parabola near the sphere's centre
+    central = foot2 < 0.25 * radius_m**2
+    lowest = np.where(central, 0.0, _lowest(q, radius_m, len(foot2)))
+    with np.errstate(invalid="ignore"):
+        x = _first_zero(q, lowest, np.sqrt(-np.where(central, foot2 - radius_m**2, q(lowest))))
+    points = foot + x[:, None] * directions
+    return points, _normals(points, radius_m, added), approach + x
+
+
+def _added(form: Form) -> Radius:
+    """Deviation of the radius in unit directions, shape (N, 3) -> (N,)."""
+    terms = [(peak, _HARMONICS[name]) for name, peak in asdict(form).items() if peak]
+
+    def added(n: Array) -> Array:
+        return np.asarray(sum(peak * harmonic(*n.T) for peak, harmonic in terms))
+
+    return added
+
+
+def _lowest(q: Radius, radius_m: float, count: int) -> Array:
+    """Where a function that is nearly a parabola x^2 + c is least, shape (N,)."""
+    lowest = np.zeros(count)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        for width in _NARROWING:
+            h = width * radius_m
+            left, middle, right = (q(lowest + shift) for shift in (-h, 0.0, h))
+            lowest = lowest - 0.5 * h * (right - left) / (right - 2.0 * middle + left)
+    return lowest
+
+
+def _first_zero(q: Radius, lowest: Array, reach: Array) -> Array:
+    """Zero of q about `reach` before its lowest place, shape (N,); NaN where `reach` is."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        old, new = lowest - reach, lowest - 0.999 * reach
+        q_old, q_new = q(old), q(new)
+        for _ in range(_SECANTS):
+            step = q_new * (new - old) / (q_new - q_old)
+            step = np.where(np.isfinite(step) | np.isnan(new), step, 0.0)  # two equal values: nothing more to find
+            old, q_old, new = new, q_new, new - step
+            q_new = q(new)
+            if not np.any(np.abs(step) > _SETTLED):
+                break
+    return new
+
+
+def _normals(points_m: Array, radius_m: float, added: Radius) -> Array:
+    """Outward unit normals, shape (N, 3), at surface points: the cross product of two tangents."""
+    n = points_m / np.linalg.norm(points_m, axis=-1, keepdims=True)
+    helper = np.eye(3)[np.argmin(np.nan_to_num(np.abs(n)), axis=-1)]
+    first = np.cross(n, helper)
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    second = np.cross(n, first)
+    radius = (radius_m + added(n))[:, None]
+    tangents = [radius * e + _slope(added, n, e)[:, None] * n for e in (first, second)]
+    normals = np.cross(*tangents)
+    return np.asarray(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
+
+
+def _slope(added: Radius, n: Array, e: Array) -> Array:
+    """Derivative of the radius, metres per radian, from n towards e at right angles to it."""
+    near, far = (_difference(added, n, e, angle) for angle in (_STENCIL_RAD, 2.0 * _STENCIL_RAD))
+    return (8.0 * near - far) / (12.0 * _STENCIL_RAD)
+
+
+def _difference(added: Radius, n: Array, e: Array, angle: float) -> Array:
+    c, s = math.cos(angle), math.sin(angle)
+    return added(c * n + s * e) - added(c * n - s * e)
+
+
+@dataclass(frozen=True)
+class MirrorRays:
+    """Rays after the mirror, world frame; NaN where the mirror is missed.
+
+    Attributes
+    ----------
+    points_m : array, shape (N, 3)
+        Reflection points.
+    normals : array, shape (N, 3)
+        Outward unit normals there.
+    directions : array, shape (N, 3)
+        Unit directions of the reflected rays, away from the mirror.
+    cos_incidence : array, shape (N,)
+    path_camera_mirror_m : array, shape (N,)
+    """
+
+    points_m: Array
+    normals: Array
+    directions: Array
+    cos_incidence: Array
+    path_camera_mirror_m: Array
+
+
+def lens_rays(view: View, uv_px: Array, lens_m: Array | None = None) -> tuple[Array, Array]:
+    """Origins on the lens and unit directions, world frame, of the rays that belong to film positions.
+
+    A film position (u, v) looks at one point of the plane of focus, through every point of the aperture.
+
+    Parameters
+    ----------
+    uv_px : array, shape (N, 2)
+    lens_m : array, shape (N, 2), or None
+        Points on the aperture, metres from the lens centre, camera x and y; None is the lens centre.
+    """
+    camera, pose = view.rig.camera, view.T_world_camera
+    xy = camera.normalised(uv_px)
+    focus = camera.focus_distance_m * np.concatenate([xy, np.ones((len(xy), 1))], axis=-1)
+    lens = np.zeros_like(focus)
+    if lens_m is not None:
+        lens[:, :2] = lens_m
+    direction = focus - lens
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    return pose.points(lens), pose.directions(direction)
+
+
+def reflect(view: View, origins_m: Array, directions: Array) -> MirrorRays:
+    """Intersect world rays, shape (N, 3), with the mirror and reflect them."""
+    if view.rig.mirror.form is not None:
+        return _reflect_at_form(view, origins_m, directions)
+    radius = view.rig.mirror.radius_m
+    offset = origins_m - view.sphere_centre_m
+    approach = -_dot(offset, directions)
+    miss = offset + approach[:, None] * directions  # nearest point to the centre: no cancellation
+    with np.errstate(invalid="ignore"):
+        root = np.sqrt(radius**2 - _dot(miss, miss))
+        t = (_dot(offset, offset) - radius**2) / (approach + root)
+        t = np.where(t > 0.0, t, np.nan)
+    normals = (offset + t[:, None] * directions) / radius
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    cos_i = -_dot(normals, directions)
+    out = directions + 2.0 * cos_i[:, None] * normals
+    return MirrorRays(view.sphere_centre_m + radius * normals, normals, out, cos_i, t)
+
+
+def _reflect_at_form(view: View, origins_m: Array, directions: Array) -> MirrorRays:
+    axes, centre, mirror = view.T_world_sphere.R, view.sphere_centre_m, view.rig.mirror
+    assert mirror.form is not None
+    points, normals, t = meet((origins_m - centre) @ axes, directions @ axes, mirror.radius_m, mirror.form)
+    behind = ~(t > 0.0)
+    points, normals, t = (np.where(behind.reshape(-1, *[1] * (v.ndim - 1)), np.nan, v) for v in (points, normals, t))
+    normals = normals @ axes.T
+    cos_i = -_dot(normals, directions)
+    return MirrorRays(points @ axes.T + centre, normals, directions + 2.0 * cos_i[:, None] * normals, cos_i, t)
+
+
+def trace_pixels(view: View, uv_px: Array, lens_m: Array | None = None) -> MirrorRays:
+    """Trace film positions, shape (N, 2), through the lens (its centre by default) to the mirror and away."""
+    return reflect(view, *lens_rays(view, uv_px, lens_m))
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.einsum("ni,ni->n", a, b)
+
+
+IntArray = NDArray[np.int64]
+
+SURFACE_GAP_M = 1e-7  # a segment may touch the surface it ends on by this much; far above float64 rounding
+_CHUNK = 8192  # rays at a time: the work arrays stay in the cache
+
+
+def first_hit(shapes: Sequence[Shape], origins_m: Array, directions: Array) -> tuple[Array, IntArray]:
+    """Distance to the first shape along each ray, and that shape's index.
+
+    Parameters
+    ----------
+    shapes : sequence of Rectangle or Cuboid
+    origins_m, directions : arrays, shape (N, 3); directions of unit length
+
+    Returns
+    -------
+    distance_m : array, shape (N,); inf where nothing is hit
+    object_id : int array, shape (N,); -1 where nothing is hit
+    """
+    count = len(directions)
+    distance, object_id = np.full(count, np.inf), np.full(count, -1, dtype=np.int64)
+    for start in range(0, count, _CHUNK):
+        part = slice(start, start + _CHUNK)
+        o, d = np.ascontiguousarray(origins_m[part].T), np.ascontiguousarray(directions[part].T)
+        for index, shape in enumerate(shapes):
+            t = _hit(shape, o, d)
+            nearer = t < distance[part]
+            distance[part][nearer] = t[nearer]
+            object_id[part][nearer] = index
+    return distance, object_id
+
+
+def blocked_by(shapes: Sequence[Shape], starts_m: Array, ends_m: Array) -> IntArray:
+    """Index of the first shape between two points, shape (N,), or -1 where the segment is free.
+
+    Shapes within `SURFACE_GAP_M` of either end do not count: the ends lie on surfaces themselves.
+    """
+    span = ends_m - starts_m
+    length = np.linalg.norm(span, axis=-1)
+    directions = span / length[:, None]
+    distance, object_id = first_hit(shapes, starts_m + SURFACE_GAP_M * directions, directions)
+    return np.where(distance < length - 2.0 * SURFACE_GAP_M, object_id, -1)
+
+
+def _hit(shape: Shape, origins: Array, directions: Array) -> Array:
+    """Distance to one shape for rays of shape (3, N); inf where missed."""
+    pose = shape.T_world_shape
+    offset = origins - pose.t[:, None]
+    if shape.T_world_shape.rotation != _UPRIGHT:
+        offset, directions = pose.R.T @ offset, pose.R.T @ directions
+    half = 0.5 * np.array(shape.size_m)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return _slabs(half, offset, directions) if isinstance(shape, Cuboid) else _plane(half, offset, directions)
+
+
+_UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+def _plane(half: Array, o: Array, d: Array) -> Array:
+    t = -o[2] / d[2]
+    inside = (np.abs(o[0] + t * d[0]) <= half[0]) & (np.abs(o[1] + t * d[1]) <= half[1])
+    return np.where(inside & (t > 0.0), t, np.inf)
+
+
+def _slabs(half: Array, o: Array, d: Array) -> Array:
+    inverse = 1.0 / np.where(d == 0.0, 1e-300, d)  # 1 / 0 would make NaN for a ray in a face's plane
+    centre, reach = -o * inverse, half[:, None] * np.abs(inverse)
+    near = (centre - reach).max(axis=0)
+    far = (centre + reach).min(axis=0)
+    t = np.where(near > 0.0, near, far)  # from inside, the way out
+    return np.where((near <= far) & (far > 0.0), t, np.inf)

@@ -1,0 +1,251 @@
+"""Alhazen's problem: the point of a sphere that reflects one given point to another.
+
+In the plane of the two points and the sphere centre one angle gamma is unknown. With c and p the distances of the two
+points from the centre and beta the angle between them, the path length is stationary where
+
+    f(gamma) = c sin(gamma) / l_c - p sin(beta - gamma) / l_p = 0,
+
+l_c and l_p being the two path lengths. Both points see the mirror point for gamma between beta - acos(R / p) and
+acos(R / c); there f rises from a value <= 0 to a value >= 0, so the root is single and Newton's method inside the
+shrinking bracket cannot fail. An empty interval means that there is no reflection.
+
+The point of a mirror with a form error that reflects one given point to another: Fermat's path.
+
+With u and v the unit vectors from the two points a, b to a surface point P, l and m the distances, N the outward
+normal and K the curvature matrix of the surface (positive where convex), the path |a P| + |P b| has on the surface the
+gradient (u + v), taken tangentially, and the second derivatives
+
+    M = (I - u u^T) / l + (I - v v^T) / m - ((u + v) . N) K,    tangentially.
+
+Newton's method takes P to where the gradient vanishes. It starts from Alhazen's point of the largest sphere about the
+centre that is certainly inside: where that sphere is in the way, so is the mirror. The mirror is convex (`SphereMirror`
+sees to that), and the tangent plane at a point that both ends see has the straight line between them on one side and
+the mirror on the other, so that there is one such point at most. M is the optics of the reflected bundle as well: with
+a the source, l^2 m^2 det(M) / cos^2 i is its spread from steradians to square metres at b, which is Coddington's
+(1 + m / s_t) (1 + m / s_s) l^2 for any curvature matrix.
+
+Where a view's mirror reflects points of the world to points of the lens, and how far the bundle spreads.
+
+A perfect sphere takes Alhazen's closed problem and Coddington's equations, a form error Fermat's path (`fermat`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.scenes.frames import Array, BoolArray
+from phibench.scenes.mirror import Form, deviation, level
+from phibench.scenes.rig import View
+
+_ALHAZEN_STEPS = 60  # bisection alone would need 53; Newton takes 4 to 7
+
+
+def reflection_points(points_m: Array, eyes_m: Array, radius_m: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Reflection points on the convex side of a sphere at the origin.
+
+    Parameters
+    ----------
+    points_m, eyes_m : arrays, shape (N, 3)
+        The two points, metres, relative to the sphere centre.
+    radius_m : float
+
+    Returns
+    -------
+    reflection_m : array, shape (N, 3); NaN where there is none
+    valid : bool array, shape (N,)
+        Both points lie on the outer side of the tangent plane at the reflection point.
+    """
+    p, c = (np.linalg.norm(v, axis=-1) for v in (points_m, eyes_m))
+    e1 = eyes_m / c[:, None]
+    across = points_m - np.einsum("ni,ni->n", points_m, e1)[:, None] * e1
+    width = np.linalg.norm(across, axis=-1)
+    beta = np.arctan2(width, np.einsum("ni,ni->n", points_m, e1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        e2 = np.where(width[:, None] > 0.0, across / width[:, None], 0.0)
+        low = np.maximum(0.0, beta - np.arccos(radius_m / p))
+        high = np.minimum(beta, np.arccos(radius_m / c))
+        lit = low <= high
+        gamma = _solve(p, c, beta, np.where(lit, low, np.nan), np.where(lit, high, np.nan), radius_m)
+    found = radius_m * (np.cos(gamma)[:, None] * e1 + np.sin(gamma)[:, None] * e2)
+    return np.where(lit[:, None], found, np.nan), lit
+
+
+def _solve(p: Array, c: Array, beta: Array, low: Array, high: Array, radius: float) -> Array:
+    """Root gamma of f in [low, high], shape (N,): Newton, bisection where a step would leave the bracket."""
+    gamma = 0.5 * (low + high)
+    for _ in range(_ALHAZEN_STEPS):
+        f, slope = _stationarity(p, c, beta, gamma, radius)
+        low, high = np.where(f < 0.0, gamma, low), np.where(f > 0.0, gamma, high)
+        step = gamma - f / slope
+        new = np.where((step >= low) & (step <= high), step, 0.5 * (low + high))
+        moving = np.abs(new - gamma) > 4e-16 * beta
+        gamma = new
+        if not moving.any():
+            break
+    return gamma
+
+
+def _stationarity(p: Array, c: Array, beta: Array, gamma: Array, radius: float) -> tuple[Array, Array]:
+    """f(gamma) and its derivative."""
+    f_c, slope_c = _tangential(c, gamma, radius)
+    f_p, slope_p = _tangential(p, beta - gamma, radius)
+    return f_c - f_p, slope_c + slope_p
+
+
+def _tangential(distance: Array, angle: Array, radius: float) -> tuple[Array, Array]:
+    """d sin(a) / l and its derivative by a, with l the distance from the mirror point."""
+    # l^2 = (d - R)^2 + 4 d R sin^2(a/2): no cancellation near the surface
+    length = np.sqrt((distance - radius) ** 2 + 4.0 * distance * radius * np.sin(0.5 * angle) ** 2)
+    value = distance * np.sin(angle) / length
+    return value, (distance * np.cos(angle) - radius * value**2) / length
+
+
+_FERMAT_STEPS = 30  # 4 to 6 do, but at grazing incidence
+_LONGEST = 0.2  # step, in radii: the next point stays on the same side of the mirror
+_CLOSE = 1e-9  # of the radius: the step after that would be its square
+_FOUND = 1e-6  # of the radius: the last step of a search that went well
+
+
+def fermat_points(
+    points_m: Array, eyes_m: Array, radius_m: float, form: Form
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Reflection points in the sphere's frame.
+
+    Parameters
+    ----------
+    points_m, eyes_m : arrays, shape (N, 3)
+        The two points, metres, relative to the sphere centre.
+    radius_m, form
+
+    Returns
+    -------
+    reflection_m : array, shape (N, 3); NaN where there is none
+    normals : array, shape (N, 3), unit, outward; NaN where there is none
+    valid : bool array, shape (N,)
+        Both points lie on the outer side of the tangent plane at the reflection point.
+    """
+    inner = radius_m - form.bound_m
+    start, possible = reflection_points(points_m, eyes_m, inner)
+    index = np.flatnonzero(possible)
+    a, b = points_m[index], eyes_m[index]
+    P = _onto(start[index], radius_m, form)
+    step = np.full(len(P), np.inf)
+    for _ in range(_FERMAT_STEPS):
+        going = np.flatnonzero(~(step <= _CLOSE * radius_m))
+        if not len(going):
+            break
+        move = _newton(P[going], a[going], b[going], radius_m, form)
+        P[going] = _onto(P[going] + move, radius_m, form)
+        step[going] = np.linalg.norm(move, axis=-1)
+    N = _normals(P, radius_m, form)
+    seen = [np.einsum("ni,ni->n", end - P, N) >= 0.0 for end in (a, b)]
+    lit = np.all(seen, axis=0) & (step <= _FOUND * radius_m)
+    reflection, normals = np.full((2, *points_m.shape), np.nan)
+    valid = np.zeros(len(points_m), dtype=bool)
+    reflection[index[lit]], normals[index[lit]], valid[index[lit]] = P[lit], N[lit], True
+    return reflection, normals, valid
+
+
+def path_determinant(mirror_m: Array, points_m: Array, eyes_m: Array, radius_m: float, form: Form) -> Array:
+    """det(M), shape (N,), 1/m^2, at reflection points, all in the sphere's frame."""
+    _, _, M = _path(mirror_m, points_m, eyes_m, radius_m, form)
+    return M[:, 0, 0] * M[:, 1, 1] - M[:, 0, 1] ** 2
+
+
+def _newton(P: Array, a: Array, b: Array, radius_m: float, form: Form) -> Array:
+    """Step in the tangent plane, shape (N, 3), no longer than `_LONGEST` radii."""
+    tangents, slope, M = _path(P, a, b, radius_m, form)
+    det = M[:, 0, 0] * M[:, 1, 1] - M[:, 0, 1] ** 2
+    x = (M[:, 1, 1] * slope[:, 0] - M[:, 0, 1] * slope[:, 1]) / det
+    y = (M[:, 0, 0] * slope[:, 1] - M[:, 0, 1] * slope[:, 0]) / det
+    move = -(x[:, None] * tangents[:, 0] + y[:, None] * tangents[:, 1])
+    length = np.linalg.norm(move, axis=-1, keepdims=True)
+    return move * np.minimum(1.0, _LONGEST * radius_m / np.maximum(length, 1e-300))
+
+
+def _path(P: Array, a: Array, b: Array, radius_m: float, form: Form) -> tuple[Array, Array, Array]:
+    """Two tangents (N, 2, 3), the path's slopes along them (N, 2) and second derivatives M (N, 2, 2)."""
+    surface = level(P, radius_m, form)
+    length = np.linalg.norm(surface.gradient, axis=-1)
+    N = surface.gradient / length[:, None]
+    tangents = _tangents(N)
+    (near, u), (far, v) = _split(P - a), _split(P - b)
+    flat_u, flat_v, slope = (np.einsum("nki,ni->nk", tangents, w) for w in (u, v, u + v))
+    M = tangents @ surface.hessian_per_m @ tangents.transpose(0, 2, 1)
+    M *= (-np.einsum("ni,ni->n", u + v, N) / length)[:, None, None]
+    for flat, distance in ((flat_u, near), (flat_v, far)):
+        M += (np.eye(2) - flat[:, :, None] * flat[:, None, :]) / distance[:, None, None]
+    return tangents, slope, M
+
+
+def _tangents(N: Array) -> Array:
+    """Two unit vectors across each unit normal, shape (N, 2, 3)."""
+    helper = np.eye(3)[np.argmin(np.abs(N), axis=-1)]
+    first = np.cross(N, helper)
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    return np.stack([first, np.cross(N, first)], axis=1)
+
+
+def _onto(P: Array, radius_m: float, form: Form) -> Array:
+    """Surface points in the directions of P."""
+    n = P / np.linalg.norm(P, axis=-1, keepdims=True)
+    return (radius_m + deviation(n, form).value_m)[:, None] * n
+
+
+def _normals(P: Array, radius_m: float, form: Form) -> Array:
+    gradient = level(P, radius_m, form).gradient
+    return gradient / np.linalg.norm(gradient, axis=-1, keepdims=True)
+
+
+def _split(vectors: Array) -> tuple[Array, Array]:
+    """Lengths (N,) and unit vectors (N, 3)."""
+    length = np.linalg.norm(vectors, axis=-1)
+    return length, vectors / length[:, None]
+
+
+@dataclass(frozen=True)
+class MirrorPoints:
+    """Reflection points, world frame; NaN where there is none.
+
+    Attributes
+    ----------
+    points_m, normals : arrays, shape (N, 3)
+    lit : bool array, shape (N,)
+        Whether both ends see the point.
+    """
+
+    points_m: Array
+    normals: Array
+    lit: BoolArray
+
+
+def mirror_points(view: View, points_m: Array, eyes_m: Array) -> MirrorPoints:
+    """Reflection points for pairs of world points, shape (N, 3) each."""
+    centre, mirror = view.sphere_centre_m, view.rig.mirror
+    if mirror.form is None:
+        found, lit = reflection_points(points_m - centre, eyes_m - centre, mirror.radius_m)
+        found = found + centre
+        return MirrorPoints(found, (found - centre) / mirror.radius_m, lit)
+    axes = view.T_world_sphere.R
+    ends = ((points_m - centre) @ axes, (eyes_m - centre) @ axes)
+    found, normals, lit = fermat_points(*ends, mirror.radius_m, mirror.form)
+    return MirrorPoints(found @ axes.T + centre, normals @ axes.T, lit)
+
+
+def bundle_spread(view: View, mirror_m: Array, points_m: Array, eyes_m: Array, cos_i: Array) -> Array:
+    """Square metres at the eye per steradian at the point, shape (N,), of the bundle that is reflected there.
+
+    With s the distance point to mirror, l mirror to eye and i the angle of incidence, on a sphere
+    s^2 (1 + l/s_t) (1 + l/s_s); otherwise s^2 l^2 det(M) / cos^2 i.
+    """
+    mirror = view.rig.mirror
+    s, far = (np.linalg.norm(end - mirror_m, axis=-1) for end in (points_m, eyes_m))
+    if mirror.form is None:
+        spread = s**2 * (1.0 + far * (1.0 / s + 2.0 / (mirror.radius_m * cos_i)))
+        return spread * (1.0 + far * (1.0 / s + 2.0 * cos_i / mirror.radius_m))
+    axes, centre = view.T_world_sphere.R, view.sphere_centre_m
+    P, a, b = ((place - centre) @ axes for place in (mirror_m, points_m, eyes_m))
+    return (s * far / cos_i) ** 2 * path_determinant(P, a, b, mirror.radius_m, mirror.form)

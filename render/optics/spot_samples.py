@@ -1,0 +1,246 @@
+"""Product quadrature on discs: nodes and weights whose sums replace random samples of spot and aperture.
+
+The laser spot's light on the film, as weighted points: specular connections spot -> mirror -> lens.
+
+Pairs of a point on the spot and a point on the aperture are joined by the reflection law (`mirror_points`); each pair's
+power follows from the geometry of the reflected bundle. With s the distance spot to mirror, l mirror to lens and i the
+angle of incidence, Coddington's equations for a convex sphere give the distances of the virtual image behind the mirror
+
+    1/s_t = 1/s + 2 / (R cos i)      1/s_s = 1/s + 2 cos(i) / R
+
+and dPhi = L rho(i) cos(theta_spot) cos(theta_lens) / (s^2 (1 + l/s_t) (1 + l/s_s)) dA_spot dA_lens (DESIGN section 5).
+With a form error the two factors become a determinant, that of the reflected bundle's curvature (`fermat`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.polynomial.laguerre import laggauss
+from numpy.polynomial.legendre import leggauss
+from scipy.special import ndtri
+from scipy.stats import qmc
+
+from phibench.render.optics.ray_tracer import blocked_by
+from phibench.render.optics.reflection_point import bundle_spread, mirror_points
+from phibench.scenes.frames import Array, BoolArray
+from phibench.scenes.laser import LaserSpot
+from phibench.scenes.rig import View
+from phibench.scenes.room import Shape
+
+Profile = Literal["uniform", "gaussian"]
+
+_SMALL = 1.0  # Gaussian spots up to this many blurs: few Gauss-Laguerre rings do
+_REACH = 5.5  # sigmas; a Gaussian's flux beyond is 3e-7
+
+
+def disc_nodes(profile: Profile, smoothness: float) -> tuple[Array, Array]:
+    """Nodes on a disc of unit radius ("uniform") or of unit sigma ("gaussian"), weights summing to 1.
+
+    The image's blur damps spatial frequencies k (in units of 1 / blur) as exp(-k^2 / 2): beyond 4 nothing is left, and
+    rings and points per ring are as many as exp(i k x) with k = 4 needs (tested against closed forms).
+
+    Parameters
+    ----------
+    profile
+        Weight function: constant on the unit disc, or exp(-r^2 / 2) / (2 pi) on the plane.
+    smoothness : float
+        Extent of the disc's image (radius or sigma) in units of the blur that smooths it.
+
+    Returns
+    -------
+    nodes : array, shape (n, 2)
+    weights : array, shape (n,)
+    """
+    radius, weight = _rings(profile, smoothness)
+    around = 8 + 2 * np.ceil(2.5 * smoothness * np.maximum(radius, 1.0)).astype(int)
+    turns = [2.0 * np.pi * (np.arange(n) + 0.5) / n for n in around]
+    nodes = [r * np.stack([np.cos(turn), np.sin(turn)], axis=-1) for r, turn in zip(radius, turns, strict=True)]
+    weights = np.repeat(weight / around, around)
+    return np.concatenate(nodes), weights / weights.sum()
+
+
+def disc_points(profile: Profile, uniform: Array) -> Array:
+    """Points of the same discs, shape (n, 2), from uniform points on the unit square."""
+    if profile == "gaussian":
+        return np.asarray(ndtri(np.clip(uniform, 1e-12, 1.0 - 1e-12)))
+    radius, turn = np.sqrt(uniform[:, 0]), 2.0 * np.pi * uniform[:, 1]
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=-1)
+
+
+def _rings(profile: Profile, smoothness: float) -> tuple[Array, Array]:
+    """Radii and weights of the rings."""
+    if profile == "uniform":
+        t, weight = leggauss(3 + math.ceil(1.5 * smoothness))  # uniform in r^2
+        return np.sqrt(0.5 * (t + 1.0)), weight
+    if smoothness <= _SMALL:
+        t, weight = laggauss(4 + math.ceil(1.5 * smoothness))  # t = r^2 / 2 has the density exp(-t)
+        return np.sqrt(2.0 * t), weight
+    t, weight = leggauss(6 + math.ceil(2.0 * _REACH * smoothness))  # k r / 2 with k = 4
+    radius = 0.5 * _REACH * (t + 1.0)
+    return radius, weight * radius * np.exp(-0.5 * radius**2)
+
+
+def slices(total: int, size: int) -> Iterator[slice]:
+    """Slices that cover range(total) in pieces of at most `size`."""
+    return (slice(start, min(start + size, total)) for start in range(0, total, size))
+
+
+_PAIRS_AT_ONCE = 65536
+_LOG2_DENSE = 17
+_SEED = 0  # the scramble is part of the quadrature rule, not a noise draw
+
+
+@dataclass(frozen=True)
+class FilmCloud:
+    """Light that reaches the film before optical blur.
+
+    Attributes
+    ----------
+    uv_px : array, shape (N, 2)
+    watts : array, shape (N,)
+    """
+
+    uv_px: Array
+    watts: Array
+
+    def centroid_px(self) -> Array:
+        """Energy centroid (u, v), shape (2,); NaN when there is no light."""
+        with np.errstate(invalid="ignore"):
+            return self.watts @ self.uv_px / self.watts.sum()
+
+
+def specular_cloud(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> FilmCloud:
+    """Quadrature over spot and aperture; occluded pairs keep their place with power 0.
+
+    Where an edge cuts the light, nodes would sample a step: dense quasi-random pairs take over.
+    """
+    return _dense_cloud(view, spot, shapes) if _is_cut(view, spot, shapes) else _node_cloud(view, spot, shapes)
+
+
+def _node_cloud(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> FilmCloud:
+    spot_nodes, spot_weights, lens_nodes, lens_weights = _nodes(view, spot)
+    lens_steps = max(1, _PAIRS_AT_ONCE // len(spot_nodes))
+    parts = []
+    for start in range(0, len(lens_nodes), lens_steps):
+        lens = lens_nodes[start : start + lens_steps]
+        points, eyes = _pairs(spot_nodes, lens)
+        weight = np.outer(lens_weights[start : start + lens_steps], spot_weights).ravel()
+        parts.append(_connect(view, spot, shapes, points, eyes, weight))
+    return _joined(parts)
+
+
+def _dense_cloud(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> FilmCloud:
+    """Sobol pairs of spot and aperture: steps are found to about 1e-3 of the flux."""
+    x = qmc.Sobol(4, scramble=True, rng=_SEED).random_base2(_LOG2_DENSE)
+    points = _spot_points(spot, disc_points(spot.profile, x[:, :2]))
+    eyes = _lens_points(view, disc_points("uniform", x[:, 2:]))
+    area = math.pi * view.rig.camera.aperture_radius_m**2
+    weight = np.full(len(x), spot.albedo * spot.power_w / math.pi * area / len(x))
+    parts = [_connect(view, spot, shapes, points[s], eyes[s], weight[s]) for s in slices(len(x), _PAIRS_AT_ONCE)]
+    return _joined(parts)
+
+
+def _is_cut(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> bool:
+    """Whether part of the light is blocked and part is not: pairs of spot and aperture, centre to rim (4 sigma)."""
+    rim = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
+    reach = (4.0, 2.0, 1.0) if spot.profile == "gaussian" else (1.0, 0.8, 0.4)
+    disc = np.concatenate([np.zeros((1, 2)), *(scale * rim for scale in reach)])
+    lens = np.concatenate([np.zeros((1, 2)), rim])
+    points, eyes = _pairs(_spot_points(spot, disc), _lens_points(view, lens))
+    cloud = _connect(view, spot, shapes, points, eyes, np.ones(len(points)))
+    lit = cloud.watts > 0.0
+    return bool(lit.any()) and not bool(lit.all() and len(lit) == len(points))
+
+
+def _joined(parts: Sequence[FilmCloud]) -> FilmCloud:
+    return FilmCloud(np.concatenate([p.uv_px for p in parts]), np.concatenate([p.watts for p in parts]))
+
+
+def film_position(view: View, lens_m: Array, mirror_m: Array) -> Array:
+    """Film position (u, v), shape (N, 2), of rays from mirror points to aperture points, both in the camera frame."""
+    focus = view.rig.camera.focus_distance_m
+    ray = mirror_m - lens_m
+    at_focus = lens_m + ray * (focus / ray[:, 2:])
+    return view.rig.camera.to_pixel(at_focus[:, :2] / focus)
+
+
+def image_radii_px(view: View, spot: LaserSpot) -> tuple[float, float]:
+    """Extent of the image, before blur, of the spot's rim (or sigma) and of the aperture's rim, pixels."""
+    rim = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
+    spot_uv = _film(view, _spot_points(spot, rim), _lens_points(view, np.zeros_like(rim)))
+    lens_uv = _film(view, np.broadcast_to(spot.position_world_m, (len(rim), 3)), _lens_points(view, rim))
+    return _reach(spot_uv), _reach(lens_uv)
+
+
+_TURN = 2.0 * np.pi * np.arange(8) / 8.0
+
+
+def _reach(uv: Array) -> float:
+    seen = uv[np.isfinite(uv).all(axis=-1)]  # rim points beyond the mirror's edge have no image
+    return float(np.linalg.norm(seen - seen.mean(axis=0), axis=-1).max()) if len(seen) else 0.0
+
+
+def _film(view: View, points: Array, eyes: Array) -> Array:
+    pose = view.T_world_camera.inverse()
+    return film_position(view, pose.points(eyes), pose.points(mirror_points(view, points, eyes).points_m))
+
+
+def _nodes(view: View, spot: LaserSpot) -> tuple[Array, Array, Array, Array]:
+    """World points on the spot, their weights (W / sr if unobstructed), world points on the aperture, weights (m^2)."""
+    blur = view.rig.camera.blur_sigma_px
+    spot_px, lens_px = image_radii_px(view, spot)
+    disc, share = disc_nodes(spot.profile, spot_px / blur)
+    aperture, area = disc_nodes("uniform", lens_px / blur)
+    intensity = share * spot.albedo * spot.power_w / math.pi
+    area = area * math.pi * view.rig.camera.aperture_radius_m**2
+    return _spot_points(spot, disc), intensity, _lens_points(view, aperture), area
+
+
+def _spot_points(spot: LaserSpot, disc: Array) -> Array:
+    scale = spot.sigma_m if spot.profile == "gaussian" else spot.diameter_m / 2.0
+    return np.array(spot.position_world_m) + scale * disc @ np.stack(spot.tangents())
+
+
+def _lens_points(view: View, disc: Array) -> Array:
+    flat = np.concatenate([view.rig.camera.aperture_radius_m * disc, np.zeros((len(disc), 1))], axis=-1)
+    return view.T_world_camera.points(flat)
+
+
+def _pairs(points: Array, eyes: Array) -> tuple[Array, Array]:
+    """Every eye with every point, shapes (len(eyes) * len(points), 3)."""
+    return np.tile(points, (len(eyes), 1)), np.repeat(eyes, len(points), axis=0)
+
+
+def _connect(
+    view: View, spot: LaserSpot, shapes: Sequence[Shape], points: Array, eyes: Array, weight: Array
+) -> FilmCloud:
+    """Film positions and powers of pairs (spot point, aperture point), shapes (N, 3), with quadrature weights (N,)."""
+    found = mirror_points(view, points, eyes)
+    mirror, lit = found.points_m, found.lit
+    from_spot, to_lens = _unit(mirror - points), _unit(eyes - mirror)
+    cos_i = np.einsum("ni,ni->n", to_lens, found.normals)
+    cos_spot = from_spot @ np.array(spot.normal_world)
+    cos_lens = -to_lens @ view.T_world_camera.R[:, 2]
+    spread = bundle_spread(view, mirror, points, eyes, cos_i)
+    rho = view.rig.mirror.reflectance(cos_i, spot.wavelength_nm)
+    watts = weight * rho * np.maximum(cos_spot, 0.0) * np.maximum(cos_lens, 0.0) / spread
+    free = lit & _unobstructed(shapes, points, mirror, eyes, lit)
+    pose = view.T_world_camera.inverse()
+    uv = film_position(view, pose.points(eyes), pose.points(mirror))
+    return FilmCloud(uv[lit], np.where(free, watts, 0.0)[lit])
+
+
+def _unobstructed(shapes: Sequence[Shape], points: Array, mirror: Array, eyes: Array, lit: BoolArray) -> BoolArray:
+    free = np.zeros(len(points), dtype=bool)
+    legs = ((mirror[lit], points[lit]), (eyes[lit], mirror[lit]))
+    free[lit] = np.all([blocked_by(shapes, start, end) < 0 for start, end in legs], axis=0)
+    return free
+
+
+def _unit(vectors: Array) -> Array:
+    return vectors / np.linalg.norm(vectors, axis=-1)[:, None]

@@ -1,0 +1,117 @@
+"""The ambient layer: the room seen directly and through the mirror, from its light map; no laser.
+
+Camera -> (mirror) -> surface: radiance is albedo x irradiance / pi, plus what a lamp emits. The film is cut into cells
+(`film_grid`); every cell gets two independent samples, whose difference is the noise estimate. Where that noise is
+above the budget of `noise_budget`, the cells around are sampled again, more finely, until it is kept. The light map's
+own noise is the same in every view.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.render.room.film import Crop, Film, FilmGrid, Stack
+from phibench.render.room.light_map import BakeSettings, LightMap, fixed_shapes, light_carriage
+from phibench.render.room.refinement import first_pass, refine
+from phibench.render.room.shading import Surfaces, cut, texel_count
+from phibench.render.setup.variant import activate
+from phibench.scenes.camera import Camera
+from phibench.scenes.rig import View
+from phibench.scenes.room import Room
+
+ROUNDS = 8  # of refinement at most; three or four do
+_OVERLAP_PX = 16  # refinement looks at neighbours
+_BAND_CELLS = 1 << 22  # cells at a time, 150 MB
+
+
+@dataclass(frozen=True)
+class AmbientLayer:
+    """Ambient light of one view.
+
+    Attributes
+    ----------
+    electrons_per_s : array, shape (3, height, width), float32
+        Expected photo-electrons per second per pixel, planes R, G, B.
+    variance_per_s2 : array, shape (3, height, width), float32
+        Estimated variance of that, (electrons/s)^2; neighbouring pixels share samples.
+    """
+
+    electrons_per_s: NDArray[np.float32]
+    variance_per_s2: NDArray[np.float32]
+
+
+def dark_layer(camera: Camera) -> AmbientLayer:
+    """Ambient layer of a room without light."""
+    zeros = np.zeros((3, camera.height_px, camera.width_px), dtype=np.float32)
+    return AmbientLayer(zeros, zeros)
+
+
+def render_ambient(
+    view: View,
+    room: Room,
+    light: LightMap,
+    settings: BakeSettings,
+    cells_per_pixel: int,
+    seed: int,
+    crop: Crop | None = None,
+    rounds: int = ROUNDS,
+) -> AmbientLayer:
+    """Render one view from a room's light map.
+
+    Parameters
+    ----------
+    light, settings
+        Of `bake.bake` for this room.
+    cells_per_pixel : int
+        Cells per pixel side; the first pass takes two samples a cell.
+    seed : int
+        Of the named stream for this view; 0 is legal.
+    crop : (u0, v0, width, height), or None
+        Image window, pixels; None is the whole image. Without refinement its pixels are those of the whole image;
+        with it, those within some pixels of its border may differ by their noise.
+    rounds : int
+        Rounds of refinement at most; 0 leaves the first pass alone.
+    """
+    mi = activate()
+    import drjit as dr
+
+    camera = view.rig.camera
+    window = crop or (0, 0, camera.width_px, camera.height_px)
+    shapes = room.shapes(view)
+    surfaces = Surfaces(mi, view, cut(shapes, settings.texel_m), camera=True)
+    fixed = texel_count(cut(fixed_shapes(room), settings.texel_m))
+    light_carriage(surfaces, shapes, fixed, light.irradiance_w_m2, settings)
+    grid = FilmGrid.of(camera, cells_per_pixel)
+    film = Film(mi, surfaces, grid, seed)
+    layers = [_band(film, band, window, rounds) for band in _bands(grid, window)]
+    dr.flush_kernel_cache()  # every view is compiled anew, and Dr.Jit would keep them all
+    return AmbientLayer(*(np.concatenate([pair[i] for pair in layers], axis=1) for i in (0, 1)))
+
+
+def _bands(grid: FilmGrid, window: Crop) -> list[Crop]:
+    """Horizontal bands of a window that are small enough for the memory."""
+    u0, v0, width, height = window
+    across = (width + 2 * grid.margin_px) * grid.cells
+    rows = max(16, _BAND_CELLS // (across * grid.cells) - 2 * grid.margin_px)
+    return [(u0, v, width, min(rows, v0 + height - v)) for v in range(v0, v0 + height, rows)]
+
+
+def _band(film: Film, band: Crop, window: Crop, rounds: int) -> tuple[Stack, Stack]:
+    """Pixels of a band, refined with its neighbourhood: what is beyond it reaches the band by less than the budget."""
+    u0, v0, width, height = band
+    top, bottom = max(v0 - _OVERLAP_PX, window[1]), min(v0 + height + _OVERLAP_PX, window[1] + window[3])
+    mean, variance = _render(film, (u0, top, width, bottom - top), rounds)
+    inner = slice(v0 - top, v0 - top + height)
+    return mean[:, inner], variance[:, inner]
+
+
+def _render(film: Film, window: Crop, rounds: int) -> tuple[Stack, Stack]:
+    """Pixels of a window and their variance, shape (3, height, width) each."""
+    cells = first_pass(film, window)
+    for turn in range(1, rounds + 1):
+        if not refine(film, cells, turn):
+            break
+    return cells.pixels

@@ -1,0 +1,165 @@
+"""Which cells of the film are sampled further, and how finely.
+
+A cell is sampled on n x n strata, twice; half the difference, squared, is its variance. An edge through the cell leaves
+spread / (2 n^3), with `spread` the variance of single samples: about n strata are crossed, and each counts for 1/n^2.
+Once cells are refined, the larger of the two is taken: what is stopped by its own estimate would else be flattered.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from phibench.render.room.film import Crop, Film, FilmGrid, Samples, Stack
+from phibench.render.room.noise_budget import allowed_per_s2, excess, is_full
+
+_TILE_PX = 48
+_SIDES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # strata along a cell; few values, few kernel launches
+_NEAR_PX = 3  # an edge that both samples of a cell missed shows in a cell not far away
+_GROWTH = 8.0  # of the strata along a side, in one round
+_BLIND = (16.0, 500.0)  # excess from which a cell's first refinement has 4 and 6 strata along a side, 2 below
+_SMALL = 0.1  # a cell below this part of its allowance is not what keeps a pixel above its budget
+_AIM = 0.7  # of the allowed variance
+
+
+@dataclass
+class Cells:
+    """A window's cells and the pixels made of them; changed in place while they are refined.
+
+    Attributes
+    ----------
+    grid : FilmGrid
+    numbers : array, shape (rows, columns), uint32
+    side : array, shape (rows, columns), int32
+        Strata along a side.
+    mean, variance : arrays, shape (3, rows, columns), float32
+        Of the cells, electrons/s per square pixel and its square.
+    pixels : list of two arrays, shape (3, height, width), float32
+        Mean and variance of the pixels.
+    tight : array, shape (height, width)
+        Smallest allowed variance of the pixels around, sum of the colours.
+    suspected : array, shape (height, width)
+        Excess of the pixels by what may have been missed; 0 from the second round on.
+    mirrored : bool array, shape (height, width)
+        Pixels that see the mirror.
+    """
+
+    grid: FilmGrid
+    numbers: NDArray[np.uint32]
+    side: NDArray[np.int32]
+    mean: Stack
+    variance: Stack
+    pixels: tuple[Stack, Stack]
+    tight: Stack
+    suspected: Stack
+    mirrored: NDArray[np.bool_]
+
+
+def first_pass(film: Film, window: Crop) -> Cells:
+    """All cells of a window, two samples each."""
+    grid, numbers = film.grid, film.grid.numbers(window)
+    a, b = (film.sample(numbers.ravel(), 1, half) for half in (0, 1))
+    mean, variance = (plane.reshape(3, *numbers.shape) for plane in _estimate(a, b))
+    pixels = grid.pixels(mean), grid.pixels(variance, power=2)
+    allowed = allowed_per_s2(pixels[0], grid.blur_sigma_px).sum(axis=0)
+    tight = ndimage.minimum_filter(allowed, size=_NEAR_PX, mode="nearest")
+    halves = [half.electrons_per_s.sum(axis=0).reshape(numbers.shape) for half in (a, b)]
+    full = is_full(pixels[0]).all(axis=0)
+    suspected = np.where(full, np.float32(0.0), _suspected(grid, *halves) / allowed)
+    mirrored = grid.inner((a.mirrored | b.mirrored).reshape(numbers.shape))
+    side = np.ones(numbers.shape, dtype=np.int32)
+    return Cells(grid, numbers, side, mean, variance, pixels, tight, suspected, mirrored)
+
+
+def refine(film: Film, cells: Cells, turn: int) -> bool:
+    """Sample cells near pixels that are over their budget again; False if there are none.
+
+    Parameters
+    ----------
+    turn : int, from 1
+        Which round this is: each has its own random streams.
+    """
+    over = np.where(cells.mirrored, excess(*cells.pixels, cells.grid.blur_sigma_px), np.float32(0.0))
+    near = ndimage.maximum_filter(over, size=_NEAR_PX, mode="nearest")
+    near = np.where(cells.mirrored, np.maximum(near, cells.suspected), near)
+    if not np.any(near > 1.0):
+        return False
+    chosen, pixel = cells.grid.cells_of(near > 1.0)
+    near, tight = near.ravel()[pixel], cells.tight.ravel()[pixel]
+    wanted = _wanted(cells, chosen, near, tight)
+    more = wanted > cells.side.ravel()[chosen]
+    for m in np.unique(wanted[more]):
+        _sample_again(film, cells, chosen[more & (wanted == m)], int(m), turn)
+    _update(cells, chosen[more])
+    cells.suspected[:] = 0.0
+    return True
+
+
+def _suspected(grid: FilmGrid, a: Stack, b: Stack) -> Stack:
+    """Variance of pixels, shape (height, width), if every cell were cut by whatever edge is near.
+
+    Two samples may both miss what cuts a cell. If only the cells that hit it were refined, misses would stay and bias
+    the mean; so what is refined first must not depend on a cell's own luck. An edge of contrast c that cuts cells at
+    random leaves c^2 / 12; it is seen in the 3 x 3 pixels around, of which about a half of the cells are not cut.
+    """
+    edge, n = grid.margin_px * grid.cells, grid.cells
+    rows, columns = a.shape[0] - 2 * edge, a.shape[1] - 2 * edge
+    blocks = [half[edge : edge + rows, edge : edge + columns].reshape(rows // n, n, columns // n, n) for half in (a, b)]
+    bright = np.maximum(*(block.max(axis=(1, 3)) for block in blocks))
+    dark = np.minimum(*(block.min(axis=(1, 3)) for block in blocks))
+    contrast = ndimage.maximum_filter(bright, _NEAR_PX) - ndimage.minimum_filter(dark, _NEAR_PX)
+    return np.asarray(contrast**2 * np.float32(_share(grid) / 24.0))
+
+
+def _share(grid: FilmGrid) -> float:
+    """Part of a cell's variance that is a pixel's, if all cells have the same."""
+    return float(np.sum(grid.taps**2) ** 2)
+
+
+def _wanted(cells: Cells, chosen: NDArray[np.intp], near: Stack, tight: Stack) -> NDArray[np.int32]:
+    """Strata of cells, by their own share of the variance and by what was found around, whichever asks for less.
+
+    Little is known of a cell with two samples: it gets more by the excess around it, whatever it seems to need, so that
+    the corner of a lamp that is in it is found.
+    """
+    side = cells.side.ravel()[chosen]
+    ratio = _share(cells.grid) * cells.variance.reshape(3, -1)[:, chosen].sum(axis=0) / tight
+    growth = np.clip(np.cbrt(np.minimum(ratio, near) / _AIM), 1.2, _GROWTH)
+    aim = np.where(ratio > _SMALL, np.ceil(side * growth), side)
+    informed = np.array(_SIDES)[np.searchsorted(_SIDES, np.minimum(aim, _SIDES[-1]))]
+    blind = np.select([near < _BLIND[0], near < _BLIND[1]], [2, 4], 6)
+    return np.where(side == 1, blind, informed).astype(np.int32)
+
+
+def _sample_again(film: Film, cells: Cells, chosen: NDArray[np.intp], side: int, turn: int) -> None:
+    """Replace what is known of some cells (flat indices) by new samples."""
+    a, b = (film.sample(cells.numbers.ravel()[chosen], side, 2 * turn + half) for half in (0, 1))
+    mean, variance = _estimate(a, b)
+    spread = np.maximum(0.5 * (a.square + b.square) - mean**2, 0.0)
+    cells.mean.reshape(3, -1)[:, chosen] = mean
+    cells.variance.reshape(3, -1)[:, chosen] = np.maximum(variance, spread / np.float32(2.0 * side**3))
+    cells.side.ravel()[chosen] = side
+
+
+def _estimate(a: Samples, b: Samples) -> tuple[Stack, Stack]:
+    """Mean of two independent halves and its variance."""
+    return 0.5 * (a.electrons_per_s + b.electrons_per_s), (0.5 * (a.electrons_per_s - b.electrons_per_s)) ** 2
+
+
+def _update(cells: Cells, changed: NDArray[np.intp]) -> None:
+    """Fold the tiles that some cells (flat indices) belong to."""
+    grid = cells.grid
+    mark = np.zeros(cells.numbers.shape, dtype=bool)
+    mark.ravel()[changed] = True
+    height, width = cells.mirrored.shape
+    span = 2 * grid.margin_px
+    for v in range(0, height, _TILE_PX):
+        for u in range(0, width, _TILE_PX):
+            v1, u1 = min(v + _TILE_PX, height), min(u + _TILE_PX, width)
+            part = (slice(v * grid.cells, (v1 + span) * grid.cells), slice(u * grid.cells, (u1 + span) * grid.cells))
+            if mark[part].any():
+                cells.pixels[0][:, v:v1, u:u1] = grid.pixels(cells.mean[:, *part])
+                cells.pixels[1][:, v:v1, u:u1] = grid.pixels(cells.variance[:, *part], power=2)

@@ -1,0 +1,152 @@
+"""A mirror with a form error as a triangle mesh, for the reference by path tracing alone.
+
+Facets 0.4 degrees wide lie within R (0.4 degrees)^2 / 8 = 0.4 micrometres of the surface; the normals, which steer the
+reflection, are those of the surface at the corners and interpolated between.
+
+scenes -> Mitsuba: shapes, textures, lamps and the mirror as a scene dictionary.
+
+Millimetres, sphere centre at the origin: in metres with the origin on the floor Mitsuba's ray offset moves the spot by
+0.01 px. Colours are three bands, one per colour filter of the detector, in Mitsuba's rgb mode: layers are per filter,
+no measured spectra of the room's materials exist, and the laser is handled at its own wavelength elsewhere; a spectral
+variant would add colour noise for no gain in truth. The steel's n and k are taken at each band's wavelength.
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.render.room.camera_plugin import MM_PER_M, sensor_dict
+from phibench.scenes.frames import Array, Vector
+from phibench.scenes.mirror import SphereMirror, deviation, level
+from phibench.scenes.rig import View
+from phibench.scenes.room import MIRROR_NAME, Checker, Cuboid, Rectangle, Room, Shape, Texture
+
+_RINGS, _SPOKES = 450, 900
+
+
+def form_mesh(mi: ModuleType, view: View, name: str, bsdf: Any) -> Any:
+    """Mesh in the scene's coordinates: millimetres, world axes, the sphere centre at the origin."""
+    mirror, axes = view.rig.mirror, view.T_world_sphere.R
+    assert mirror.form is not None
+    n = _directions()
+    points = (mirror.radius_m + deviation(n, mirror.form).value_m)[:, None] * n
+    normals = level(points, mirror.radius_m, mirror.form).gradient
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    props = mi.Properties()
+    props["bsdf"] = bsdf
+    triangles = _triangles()
+    mesh = mi.Mesh(name, len(n), len(triangles), has_vertex_normals=True, props=props)
+    buffers = mi.traverse(mesh)
+    buffers["vertex_positions"] = (MM_PER_M * points @ axes.T).ravel().astype(np.float32)
+    buffers["vertex_normals"] = (normals @ axes.T).ravel().astype(np.float32)
+    buffers["faces"] = triangles.ravel()
+    buffers.update()
+    return mesh
+
+
+def _directions() -> Array:
+    """Unit vectors on rings from pole to pole, shape (rings * spokes, 3)."""
+    polar = np.linspace(0.0, np.pi, _RINGS)[:, None]
+    turn = np.linspace(0.0, 2.0 * np.pi, _SPOKES, endpoint=False)
+    grid = np.broadcast_arrays(np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar))
+    return np.stack(grid, axis=-1).reshape(-1, 3)
+
+
+def _triangles() -> NDArray[np.uint32]:
+    """Corners of the triangles between the rings, outside first, shape (n, 3)."""
+    ring, spoke = np.mgrid[0 : _RINGS - 1, 0:_SPOKES]
+    a, b = _SPOKES * ring + spoke, _SPOKES * ring + (spoke + 1) % _SPOKES
+    c, d = a + _SPOKES, b + _SPOKES
+    return np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)]).reshape(-1, 3).astype(np.uint32)
+
+
+def scene_dict(mi: ModuleType, view: View, room: Room, crop: tuple[int, int, int, int] | None = None) -> dict[str, Any]:
+    """Whole scene of one view: sensor, mirror, and every shape of the room under its name.
+
+    A mirror with a form error is a fine mesh.
+    """
+    scene: dict[str, Any] = {"type": "scene", "sensor": sensor_dict(mi, view, crop)}
+    scene[MIRROR_NAME] = mirror_dict(mi, view) if view.rig.mirror.form is None else _mirror_mesh(mi, view)
+    for index, shape in enumerate(room.shapes(view)):
+        scene[shape_key(index)] = shape_dict(mi, view, shape)
+    return scene
+
+
+def load_scene(mi: ModuleType, scene: dict[str, Any]) -> Any:
+    """Load a scene dictionary so that lamps keep their order, and runs their bits.
+
+    Mitsuba's scene optimisation merges meshes and materials in an order that differs between loads.
+    """
+    return mi.load_dict(scene, parallel=False, optimize=False)
+
+
+def shape_key(index: int) -> str:
+    """Key of the shape with an object id; sorts like the ids."""
+    return f"shape_{index:04d}"
+
+
+def shape_dict(mi: ModuleType, view: View, shape: Shape) -> dict[str, Any]:
+    """One rectangle or cuboid with its diffuse material; lamps have albedo 0."""
+    half = [0.5 * MM_PER_M * length for length in shape.size_m]
+    to_world = mi.ScalarTransform4f(_matrix(view, shape)) @ mi.ScalarTransform4f().scale([*half, 1.0][:3])
+    kind = "cube" if isinstance(shape, Cuboid) else "rectangle"
+    entry: dict[str, Any] = {"type": kind, "to_world": to_world}
+    if isinstance(shape, Rectangle) and shape.emits:
+        entry["emitter"] = {"type": "area", "radiance": _rgb(shape.radiance_w_m2_sr)}
+        entry["bsdf"] = {"type": "diffuse", "reflectance": _rgb((0.0, 0.0, 0.0))}
+    else:
+        entry["bsdf"] = {"type": "diffuse", "reflectance": texture_dict(mi, shape.texture, shape.size_m)}
+    return entry
+
+
+def mirror_dict(mi: ModuleType, view: View) -> dict[str, Any]:
+    """The steel sphere at the origin; for a mirror with a form error a sphere that encloses it (`view_rays` knows)."""
+    rig = view.rig
+    bsdf = mirror_bsdf(rig.mirror, rig.camera.detector.band_wavelength_nm)
+    return {"type": "sphere", "center": [0.0, 0.0, 0.0], "radius": MM_PER_M * rig.mirror.bound_m, "bsdf": bsdf}
+
+
+def _mirror_mesh(mi: ModuleType, view: View) -> Any:
+    """The steel mirror with its form error."""
+    bsdf = mirror_bsdf(view.rig.mirror, view.rig.camera.detector.band_wavelength_nm)
+    return form_mesh(mi, view, MIRROR_NAME, mi.load_dict(bsdf))
+
+
+def mirror_bsdf(mirror: SphereMirror, wavelengths_nm: Vector) -> dict[str, Any]:
+    """Smooth or rough conductor with the steel's n and k at the three bands' wavelengths."""
+    index = [mirror.refractive_index(nm) for nm in wavelengths_nm]
+    entry: dict[str, Any] = {"eta": _rgb([m.real for m in index]), "k": _rgb([m.imag for m in index])}
+    if mirror.roughness_alpha > 0.0:
+        return {"type": "roughconductor", "distribution": "beckmann", "alpha": mirror.roughness_alpha, **entry}
+    return {"type": "conductor", **entry}
+
+
+def texture_dict(mi: ModuleType, texture: Texture, size_m: Vector) -> dict[str, Any]:
+    """Albedo as Mitsuba's rgb or checkerboard; a period of the latter is two cells."""
+    if not isinstance(texture, Checker):
+        return _rgb(texture.albedo)
+    scale = [0.5 * size_m[i] / texture.cell_m[i] for i in (0, 1)]
+    shift = [-0.5 * (0.5 * size_m[i] + texture.origin_m[i]) / texture.cell_m[i] for i in (0, 1)]
+    to_uv = mi.ScalarTransform4f().translate([*shift, 0.0]) @ mi.ScalarTransform4f().scale([*scale, 1.0])
+    colours = {"color0": _rgb(texture.albedo_even), "color1": _rgb(texture.albedo_odd)}
+    return {"type": "checkerboard", "to_uv": to_uv, **colours}
+
+
+def to_scene_mm(view: View, points_world_m: Array) -> Array:
+    """World points, metres, in Mitsuba's scene: millimetres from the sphere centre."""
+    return MM_PER_M * (points_world_m - view.sphere_centre_m)
+
+
+def _matrix(view: View, shape: Shape) -> Array:
+    matrix = np.eye(4)
+    matrix[:3, :3] = shape.T_world_shape.R
+    matrix[:3, 3] = to_scene_mm(view, shape.T_world_shape.t)
+    return matrix
+
+
+def _rgb(values: Any) -> dict[str, Any]:
+    return {"type": "rgb", "value": [float(x) for x in values]}

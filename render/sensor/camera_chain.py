@@ -1,0 +1,185 @@
+"""The sensor chain: expected electrons per second in, a frame of the C310 out.
+
+A frame is a pure function of the light, the sensor, the camera's seed and the names of its noise stream. A region of
+it has the same pixels as the whole frame, to the bit, and costs what its pixels cost: stages that look at neighbours
+are given a margin, noise comes in tiles that are drawn whole, and JPEG works on whole units plus one around.
+
+Auto exposure: the exposure time and gain at which the expected image has the level that the camera aims at.
+
+It looks at the expectation, never at a draw, so that two draws, or laser on and off, have the same exposure. The light
+of the room alone decides: the spot is too small to count.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from phibench.render.sensor.electrons import (
+    FixedPattern,
+    collected,
+    digitised,
+    expected_electrons,
+    fixed_pattern,
+    mean_charge,
+    mono,
+    read_out,
+    speckle_gain,
+    stop_factor,
+)
+from phibench.render.sensor.light import Light, Region
+from phibench.render.sensor.noise_tiles import NoiseStream, whole_tiles
+from phibench.render.sensor.processing import (
+    MCU_PX,
+    colour_corrected,
+    compressed,
+    eight_bit,
+    encoded,
+    linear_rgb,
+    linear_signal,
+    rendered,
+    srgb_encoded,
+    white_balanced,
+)
+from phibench.render.sensor.settings import Sensor, SensorError
+from phibench.scenes.camera import Camera
+from phibench.scenes.frames import Array
+
+
+@dataclass(frozen=True)
+class Chain:
+    """One camera: its sensor, the seed of its fixed pattern, and the lens (used by the extra vignetting alone).
+
+    Examples
+    --------
+    >>> from phibench.render.sensor.settings import sensor
+    >>> chain = Chain(sensor("mjpeg"))
+    >>> light = Light.flat((9e4, 9e4, 6e4), (72, 128))
+    >>> chain.frame(light, NoiseStream(("readme", 0, "down", "on", 0))).shape
+    (72, 128, 3)
+    """
+
+    sensor: Sensor
+    camera_seed: int = 0
+    camera: Camera = Camera()
+
+    def frame(self, light: Light, stream: NoiseStream, region: Region | None = None) -> NDArray[Any]:
+        """One draw.
+
+        Parameters
+        ----------
+        light : Light
+        stream : NoiseStream
+            Name it after all that makes the frame: data set, seed, sample, position, laser on or off, draw.
+        region : Region, optional
+            Part of the image; all of it if not given.
+
+        Returns
+        -------
+        array
+            By `sensor.output`: "electrons" (3, h, w) float64, expected; "raw" (h, w) uint16 DN; "srgb8" and "mjpeg"
+            (h, w, 3) uint8.
+
+        Raises
+        ------
+        SensorError
+            If the region is not inside the image.
+        """
+        region = (region or Region.whole(light.size)).within(light.size)
+        if self.sensor.output == "electrons":
+            gain = speckle_gain(self.sensor, stream)
+            return expected_electrons(light, self.sensor, self.camera, region, gain)
+        if self.sensor.output == "raw":
+            return self.raw(light, stream, region)
+        if self.sensor.output == "srgb8":
+            return self.developed(light, stream, region)
+        box = self.jpeg_region(region, light.size)
+        image = self.developed(light, stream, box)
+        return compressed(image, self.sensor.jpeg_quality, self.sensor.jpeg_subsampling)[region.slices(box)]
+
+    def jpeg_bytes(self, light: Light, stream: NoiseStream) -> bytes:
+        """Return the whole frame as the camera sends it, one JPEG file."""
+        image = self.developed(light, stream, Region.whole(light.size))
+        return encoded(image, self.sensor.jpeg_quality, self.sensor.jpeg_subsampling)
+
+    def raw(self, light: Light, stream: NoiseStream, region: Region) -> NDArray[np.uint16]:
+        """Return the converter's DN, shape (h, w)."""
+        tiles = whole_tiles(region, light.size)
+        photo = self.photo_electrons(light, tiles, speckle_gain(self.sensor, stream))
+        pattern = self.pattern(tiles)
+        charge = collected(mean_charge(photo, self.sensor, pattern), self.sensor, stream, tiles)
+        return digitised(read_out(charge, self.sensor, pattern, stream, tiles), self.sensor)[region.slices(tiles)]
+
+    def developed(self, light: Light, stream: NoiseStream, region: Region) -> NDArray[np.uint8]:
+        """Return the processed image before JPEG, shape (h, w, 3)."""
+        box = self.raw_region(region, light.size)
+        signal = linear_signal(self.raw(light, stream, box), self.sensor, np.float32)
+        return eight_bit(rendered(linear_rgb(signal, self.sensor), self.sensor))[region.slices(box)]
+
+    def photo_electrons(self, light: Light, region: Region, gain: float = 1.0) -> Array:
+        """Expected photo-electrons of the pixels, shape (h, w), without the fixed pattern."""
+        if self.sensor.output == "electrons":
+            raise SensorError(
+                f"sensor preset '{self.sensor.name}' ends before the pixels: take 'bayer-raw' or 'mono-raw'"
+            )
+        return expected_electrons(light, self.sensor, self.camera, region, gain)
+
+    def pattern(self, region: Region) -> FixedPattern:
+        """Fixed pattern on a region of whole tiles."""
+        return fixed_pattern(self.sensor, self.camera_seed, region)
+
+    def raw_region(self, region: Region, size: tuple[int, int]) -> Region:
+        """Pixels of the mosaic that the processed pixels of `region` depend on, red first."""
+        margin = 2 if self.sensor.sharpen_amount > 0.0 else 1
+        return region.grown(size, (2, 2), (margin, margin))
+
+    def jpeg_region(self, region: Region, size: tuple[int, int]) -> Region:
+        """Pixels that the JPEG's pixels of `region` depend on: whole units, and one more on each side."""
+        unit = MCU_PX[self.sensor.jpeg_subsampling]
+        return region.grown(size, unit, unit)
+
+
+LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601, the Y of JPEG
+_STEP_PX = 8
+
+
+def auto_exposed(sensor: Sensor, light: Light) -> Sensor:
+    """Return the sensor with the exposure time and the gain that auto exposure chooses for this light.
+
+    The time goes first, from `exposure_min_s` to `exposure_max_s`; the gain rises from 1 to `gain_max` where the
+    longest time is not enough. What no setting reaches ends at the limit.
+    """
+    rates = light.ambient_electrons_per_s[:, ::_STEP_PX, ::_STEP_PX].astype(float)
+    rates *= light.lamp_level * stop_factor(sensor, light)
+
+    def excess(log_gain_s: float) -> float:
+        return mean_level(rates * np.exp(log_gain_s), sensor) - sensor.auto_exposure_level
+
+    low, high = np.log(sensor.exposure_min_s), np.log(sensor.exposure_max_s * sensor.gain_max)
+    if excess(low) >= 0.0:
+        product = sensor.exposure_min_s
+    elif excess(high) <= 0.0:
+        product = sensor.exposure_max_s * sensor.gain_max
+    else:
+        product = float(np.exp(brentq(excess, low, high, xtol=1e-6)))
+    seconds = min(product, sensor.exposure_max_s)
+    return sensor.replace(exposure_s=seconds, analogue_gain=min(max(product / seconds, 1.0), sensor.gain_max))
+
+
+def mean_level(electrons: Array, sensor: Sensor) -> float:
+    """Mean 8-bit luma, 0 to 255, of expected electrons behind R, G, B, shape (3, h, w), at gain 1.
+
+    The converter's upper end cuts, as it does in a frame; noise, dark current, full well, extra vignetting, the Bayer
+    pattern and sharpening are left out. A sensor without filters shows its one plane as grey.
+    """
+    full_scale_e = (sensor.top_dn - sensor.black_level_dn) / sensor.gain_dn_per_e
+    if sensor.mosaic == "mono":
+        grey = np.minimum(mono(electrons, sensor.mono_weights) / full_scale_e, 1.0)
+        return 255.0 * float(srgb_encoded(grey).mean())
+    planes = np.minimum(electrons / full_scale_e, 1.0)
+    encoded = srgb_encoded(colour_corrected(white_balanced(planes, sensor.white_balance), sensor.colour_matrix))
+    return 255.0 * float(np.average(encoded.mean(axis=(1, 2)), weights=LUMA))

@@ -1,0 +1,190 @@
+"""From light to collected electrons to DN: the stages in front of and in the converter. NumPy only.
+
+Order: mosaic, exposure, vignetting, PRNU, shot noise of light and dark current together (a sum of Poisson numbers is a
+Poisson number), full well, DSNU and read noise, gain, black level, rounding, clipping.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.render.sensor.light import Light, Region, SpotImage
+from phibench.render.sensor.noise_tiles import NoiseStream, normal, poisson, row_normal
+from phibench.render.sensor.rolling_shutter import moved_spot
+from phibench.render.sensor.settings import Sensor, SensorError
+from phibench.scenes.camera import Camera
+from phibench.scenes.frames import Array
+
+
+def mosaic(planes: Array, phase: tuple[int, int] = (0, 0)) -> Array:
+    """RGGB mosaic, shape (..., H, W), of planes R, G, B, shape (..., 3, H, W).
+
+    `phase` is the (row, column) of the first pixel, of which only even or odd matters: red at even row, even column.
+    """
+    result = np.empty((*planes.shape[:-3], *planes.shape[-2:]), planes.dtype)
+    for row in (0, 1):
+        for column in (0, 1):
+            site = (..., slice(row, None, 2), slice(column, None, 2))
+            result[site] = planes[..., (row + phase[0]) % 2 + (column + phase[1]) % 2, :, :][site]
+    return result
+
+
+def mono(planes: Array, weights: tuple[float, float, float]) -> Array:
+    """Pixels without filters, shape (..., H, W): the weighted sum of planes, shape (..., 3, H, W)."""
+    red, green, blue = (planes[..., i, :, :] * weights[i] for i in range(3))
+    return red + green + blue
+
+
+def sampled(planes: Array, sensor: Sensor, phase: tuple[int, int]) -> Array:
+    """What the sensor's pixels see of planes R, G, B; all three planes if its output is electrons."""
+    if sensor.output == "electrons":
+        return planes
+    return mosaic(planes, phase) if sensor.mosaic == "bayer" else mono(planes, sensor.mono_weights)
+
+
+def stop_factor(sensor: Sensor, light: Light) -> float:
+    """Light at the sensor's stop relative to the layers'; the depth of field stays that of the layers."""
+    return 1.0 if sensor.f_number is None else (light.f_number / sensor.f_number) ** 2
+
+
+def vignetting(exponent: float, camera: Camera, region: Region) -> Array | float:
+    """Extra fall-off cos^n of the angle to the optical axis, shape (h, w); 1 for n = 0.
+
+    On top of the natural cos^4, which the layers contain.
+    """
+    if exponent == 0.0:
+        return 1.0
+    x = (np.arange(region.u0_px, region.u1_px) - camera.cx_px) / camera.fx_px
+    y = (np.arange(region.v0_px, region.v1_px) - camera.cy_px) / camera.fy_px
+    return (1.0 + x * x + (y * y)[:, None]) ** (-0.5 * exponent)
+
+
+def expected_electrons(light: Light, sensor: Sensor, camera: Camera, region: Region, flicker: float = 1.0) -> Array:
+    """Expected photo-electrons in one exposure, shape (h, w) (planes, shape (3, h, w), for the output "electrons")."""
+    phase = (region.v0_px, region.u0_px)
+    seconds = sensor.exposure_s * stop_factor(sensor, light)
+    part = light.ambient_electrons_per_s[(slice(None), *region.slices())]
+    electrons = sampled(part, sensor, phase).astype(float) * (seconds * light.lamp_level)
+    if light.spot is not None:
+        factor = seconds * light.laser_level * flicker
+        _add_spot(electrons, light.spot, factor, light.velocity_px_per_s, light, sensor, region)
+    for other in light.others:
+        factor = seconds * (light.laser_level if other.follows_laser else 1.0)
+        _add_spot(electrons, other.image, factor, (0.0, 0.0), light, sensor, region)
+    return electrons * vignetting(sensor.vignetting_exponent, camera, region)
+
+
+def _add_spot(
+    electrons: Array,
+    spot: SpotImage,
+    factor: float,
+    velocity_px_per_s: tuple[float, float],
+    light: Light,
+    sensor: Sensor,
+    region: Region,
+) -> None:
+    """Add `factor` times a spot to what `expected_electrons` has of the ambient light, in place."""
+    if factor == 0.0:
+        return
+    u0, v0, planes = moved_spot(spot, velocity_px_per_s, sensor.exposure_s, sensor.readout_s, light.size[0])
+    window = Region(u0, v0, u0 + planes.shape[2], v0 + planes.shape[1])
+    common = Region(
+        max(window.u0_px, region.u0_px),
+        max(window.v0_px, region.v0_px),
+        min(window.u1_px, region.u1_px),
+        min(window.v1_px, region.v1_px),
+    )
+    if min(common.shape) > 0:
+        part = planes[(slice(None), *common.slices(window))]
+        here = electrons[(..., *common.slices(region))]
+        here += factor * sampled(part, sensor, (common.v0_px, common.u0_px))
+        np.maximum(here, 0.0, out=here)  # a moving spot may undershoot
+
+
+@dataclass(frozen=True)
+class FixedPattern:
+    """What differs from pixel to pixel and stays: the same in all frames of one camera.
+
+    Attributes
+    ----------
+    responsivity : array, shape (h, w), or 1
+        Relative, mean 1, standard deviation PRNU.
+    offset_e : array, shape (h, w), or 0
+        Dark offset, electrons, mean 0, standard deviation DSNU.
+    """
+
+    responsivity: Array | float
+    offset_e: Array | float
+
+
+def fixed_pattern(sensor: Sensor, camera_seed: int, region: Region) -> FixedPattern:
+    """Fixed pattern of one camera on a region of whole tiles; read only, and kept for the next frame."""
+    return _pattern(sensor.prnu, sensor.dsnu_e, camera_seed, region)
+
+
+@lru_cache(maxsize=4)
+def _pattern(prnu: float, dsnu_e: float, camera_seed: int, region: Region) -> FixedPattern:
+    stream = NoiseStream(("camera", camera_seed))
+    responsivity: Array | float = 1.0
+    offset_e: Array | float = 0.0
+    if prnu > 0.0:
+        # a spread of 20 % may go below 0: such a pixel is dead
+        responsivity = _kept(np.maximum(1.0 + prnu * normal(stream.stage("prnu"), region), 0.0))
+    if dsnu_e > 0.0:
+        offset_e = _kept(dsnu_e * normal(stream.stage("dsnu"), region))
+    return FixedPattern(responsivity, offset_e)
+
+
+def _kept(values: Array) -> Array:
+    values.flags.writeable = False
+    return values
+
+
+def speckle_gain(sensor: Sensor, stream: NoiseStream) -> float:
+    """Flicker of the whole spot in one frame: gamma distributed, mean 1, variance 1/M.
+
+    The pupil seen through the mirror is smaller than a speckle, so that the spot changes as a whole (J. W. Goodman,
+    "Speckle Phenomena in Optics", 2nd ed., 2020, section 4.6: gamma law of integrated intensity).
+    """
+    if sensor.speckle_m is None:
+        return 1.0
+    return float(stream.stage("speckle").generator().gamma(sensor.speckle_m, 1.0 / sensor.speckle_m))
+
+
+def mean_charge(photo_e: Array, sensor: Sensor, pattern: FixedPattern) -> Array:
+    """Expected charge of each pixel before the full well, electrons, shape (h, w): light, PRNU, dark current."""
+    return photo_e * pattern.responsivity + sensor.dark_e_per_s * sensor.exposure_s
+
+
+def collected(mean_e: Array, sensor: Sensor, stream: NoiseStream, region: Region) -> Array:
+    """Charge in the wells, shape (h, w), on whole tiles: Poisson, cut at the full well."""
+    charge = mean_e
+    if sensor.shot_noise:
+        try:
+            charge = poisson(stream.stage("shot"), mean_e, region)
+        except ValueError as error:  # what numpy says of a mean below 0, NaN or above 9e18
+            raise SensorError(
+                f"layers: {mean_e.min():g} to {mean_e.max():g} expected electrons in a pixel; a layer must hold finite "
+                "numbers from 0 up, render it again"
+            ) from error
+    return np.minimum(charge, sensor.full_well_e)
+
+
+def read_out(charge_e: Array, sensor: Sensor, pattern: FixedPattern, stream: NoiseStream, region: Region) -> Array:
+    """Signal at the converter, electrons, shape (h, w), on whole tiles: DSNU, read noise and row noise added."""
+    signal = charge_e + pattern.offset_e
+    if sensor.read_noise_e > 0.0:
+        signal = signal + sensor.read_noise_e * normal(stream.stage("read"), region)
+    if sensor.row_noise_e > 0.0:
+        signal = signal + sensor.row_noise_e * row_normal(stream.stage("row"), region)
+    return signal
+
+
+def digitised(signal_e: Array, sensor: Sensor) -> NDArray[np.uint16]:
+    """DN: gain, black level, rounding to the nearest code, clipping to what the converter has."""
+    dn = np.rint(sensor.black_level_dn + sensor.dn_per_e * signal_e)
+    return np.clip(dn, 0.0, sensor.top_dn).astype(np.uint16)

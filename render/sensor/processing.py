@@ -1,0 +1,156 @@
+"""Image processing of the camera, from DN to 8 bits: pure functions on stacks of images. NumPy only.
+
+Planes R, G, B stand in the third axis from the end, shape (..., 3, H, W); the 8-bit image has them last. Every function
+takes any number of leading axes and keeps float32 as it is, so that a fit can send many model images through at once.
+What a function reads beyond the border is mirrored about the border pixel, which keeps the mosaic's colours in order.
+
+The JPEG in MJPEG: encoding and decoding by Pillow (libjpeg-turbo), and the grid on which it works.
+"""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from phibench.render.sensor.settings import Sensor
+from phibench.scenes.frames import Array
+
+_SRGB_KNEE, _SRGB_SLOPE = 0.0031308, 12.92  # IEC 61966-2-1
+Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+def linear_signal(dn: NDArray[Any], sensor: Sensor, dtype: type[np.floating[Any]] = np.float64) -> Array:
+    """Signal relative to full scale, shape as `dn`: black level 0, largest code 1."""
+    return (dn.astype(dtype) - dtype(sensor.black_level_dn)) * dtype(1.0 / (sensor.top_dn - sensor.black_level_dn))
+
+
+def demosaic(raw: Array) -> Array:
+    """Bilinear interpolation of an RGGB mosaic, shape (..., H, W) with red first, to planes, shape (..., 3, H, W)."""
+    *lead, height, width = raw.shape
+    p = np.pad(raw, [(0, 0)] * len(lead) + [(1, 1), (1, 1)], mode="reflect")
+    planes = np.empty((*lead, 3, height, width), raw.dtype)
+    quarter = raw.dtype.type(0.25)
+    half = raw.dtype.type(0.5)
+    for row in (0, 1):
+        for column in (0, 1):
+
+            def at(down: int, across: int, row: int = row, column: int = column) -> Array:
+                rows = slice(1 + row + down, 1 + height + down, 2)
+                return p[..., rows, slice(1 + column + across, 1 + width + across, 2)]
+
+            site = (slice(row, None, 2), slice(column, None, 2))
+            beside, above = at(0, -1) + at(0, 1), at(-1, 0) + at(1, 0)
+            if row == column:
+                corners = (at(-1, -1) + at(-1, 1)) + (at(1, -1) + at(1, 1))
+                planes[(..., 2 * row, *site)] = at(0, 0)
+                planes[(..., 1, *site)] = (beside + above) * quarter
+                planes[(..., 2 - 2 * row, *site)] = corners * quarter
+            else:
+                planes[(..., 1, *site)] = at(0, 0)
+                planes[(..., 2 * row, *site)] = beside * half
+                planes[(..., 2 * column, *site)] = above * half
+    return planes
+
+
+def white_balanced(planes: Array, gains: tuple[float, float, float]) -> Array:
+    """Planes times the gains of R, G, B."""
+    return planes * np.asarray(gains, planes.dtype)[:, None, None]
+
+
+def colour_corrected(planes: Array, matrix: Matrix) -> Array:
+    """Colour matrix times planes; written out, because a matrix product's rounding depends on the image's size."""
+    if matrix == IDENTITY:
+        return planes
+    r, g, b = (planes[..., i, :, :] for i in range(3))
+    m = np.asarray(matrix, planes.dtype)
+    return np.stack([m[i, 0] * r + m[i, 1] * g + m[i, 2] * b for i in range(3)], axis=-3)
+
+
+def srgb_encoded(linear: Array) -> Array:
+    """sRGB curve of values cut to [0, 1] (IEC 61966-2-1)."""
+    x = np.clip(linear, 0.0, 1.0)
+    curve = x.dtype.type(1.055) * np.power(x, x.dtype.type(1.0 / 2.4)) - x.dtype.type(0.055)
+    return np.where(x <= _SRGB_KNEE, x * x.dtype.type(_SRGB_SLOPE), curve)
+
+
+def srgb_decoded(encoded: Array) -> Array:
+    """Linear values of the sRGB curve, both in [0, 1]."""
+    x = np.asarray(encoded)
+    return np.where(x <= _SRGB_KNEE * _SRGB_SLOPE, x / _SRGB_SLOPE, ((x + 0.055) / 1.055) ** 2.4)
+
+
+def sharpened(planes: Array, amount: float) -> Array:
+    """Unsharp mask x + amount (x - blur x), blur (1 2 1)/4 along both axes."""
+    if amount == 0.0:
+        return planes
+    *lead, _, _ = planes.shape
+    p = np.pad(planes, [(0, 0)] * len(lead) + [(1, 1), (1, 1)], mode="reflect")
+    quarter, two = planes.dtype.type(0.25), planes.dtype.type(2.0)
+    down = (p[..., :-2, :] + two * p[..., 1:-1, :] + p[..., 2:, :]) * quarter
+    blurred = (down[..., :-2] + two * down[..., 1:-1] + down[..., 2:]) * quarter
+    return planes + planes.dtype.type(amount) * (planes - blurred)
+
+
+def eight_bit(planes: Array) -> NDArray[np.uint8]:
+    """Image, shape (..., H, W, 3), of planes in [0, 1], rounded and clipped."""
+    scaled = np.clip(np.rint(planes * planes.dtype.type(255.0)), 0.0, 255.0).astype(np.uint8)
+    return np.ascontiguousarray(np.moveaxis(scaled, -3, -1))
+
+
+def linear_rgb(signal: Array, sensor: Sensor) -> Array:
+    """Demosaicing, white balance and colour matrix: the linear part; planes, shape (..., 3, H, W).
+
+    A sensor without mosaic gives its signal to all three planes and has no colours to balance.
+    """
+    if sensor.mosaic == "mono":
+        return np.repeat(signal[..., None, :, :], 3, axis=-3)
+    return colour_corrected(white_balanced(demosaic(signal), sensor.white_balance), sensor.colour_matrix)
+
+
+def rendered(linear: Array, sensor: Sensor) -> Array:
+    """sRGB curve and sharpening: planes, shape (..., 3, H, W), before they are rounded to 8 bits."""
+    return sharpened(srgb_encoded(linear), sensor.sharpen_amount)
+
+
+def electrons_from_srgb(image: NDArray[np.uint8], sensor: Sensor) -> Array:
+    """Electrons behind R, G, B, shape (..., 3, H, W): the inverse for flat, unclipped, unsharpened light."""
+    encoded = np.moveaxis(image, -1, -3) / 255.0
+    balanced = colour_corrected(srgb_decoded(encoded), _inverse(sensor.colour_matrix))
+    gains = sensor.white_balance
+    full_scale_e = (sensor.top_dn - sensor.black_level_dn) / sensor.dn_per_e
+    return white_balanced(balanced, (1.0 / gains[0], 1.0 / gains[1], 1.0 / gains[2])) * full_scale_e
+
+
+def _inverse(matrix: Matrix) -> Matrix:
+    return matrix if matrix == IDENTITY else tuple(map(tuple, np.linalg.inv(matrix)))  # type: ignore[return-value]
+
+
+MCU_PX = {"4:4:4": (8, 8), "4:2:2": (8, 16), "4:2:0": (16, 16)}
+"""Rows and columns of a minimum coded unit.
+
+A decoded pixel depends on its own unit and, where chroma is interpolated between samples, on the units beside it.
+"""
+
+
+def encoded(image: NDArray[np.uint8], quality: int, subsampling: str) -> bytes:
+    """JPEG file of an image, shape (H, W, 3)."""
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, "JPEG", quality=quality, subsampling=subsampling)
+    return file.getvalue()
+
+
+def decoded(data: bytes) -> NDArray[np.uint8]:
+    """Image, shape (H, W, 3), in a JPEG file."""
+    with Image.open(io.BytesIO(data), formats=("JPEG",)) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def compressed(images: NDArray[np.uint8], quality: int, subsampling: str) -> NDArray[np.uint8]:
+    """Images, shape (..., H, W, 3), encoded and decoded again."""
+    flat = images.reshape(-1, *images.shape[-3:])
+    return np.stack([decoded(encoded(image, quality, subsampling)) for image in flat]).reshape(images.shape)

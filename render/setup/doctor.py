@@ -1,0 +1,216 @@
+"""What this machine can do: versions, LLVM, space, and one rendered image whose values are known.
+
+Run ``python -m phibench.render.setup.doctor``. Every fault comes with one line that says what to do.
+Nothing is changed.
+
+The exit code is 1 if something is broken, and 0 otherwise: also where neither mitsuba nor drjit is installed, since
+scoring needs neither (one line then says what rendering needs). One of the two without the other is broken.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Literal
+
+from phibench.render.setup.llvm import find_llvm
+from phibench.render.setup.llvm_library import LlvmError, fault_of, prove
+from phibench.render.setup.variant import ENVIRONMENT, default_variant
+
+State = Literal["ok", "warning", "fault"]
+
+CORE = (
+    "cyclopts",
+    "Jinja2",
+    "matplotlib",
+    "numpy",
+    "OpenEXR",
+    "pillow",
+    "polars",
+    "pydantic",
+    "rich",
+    "scikit-image",
+    "scipy",
+)
+RENDER = ("mitsuba", "drjit")
+OLDEST_PYTHON = (3, 11)
+LEAST_DISK_GIB = 2.0
+_RENDER_S = 180.0
+_COLOURS: dict[State, str] = {"ok": "green", "warning": "yellow", "fault": "red"}
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line of the table; `advice` says what to do about it."""
+
+    subject: str
+    value: str
+    state: State = "ok"
+    advice: str = ""
+
+
+def examine() -> Iterator[Finding]:
+    """Look at everything, cheap things first."""
+    yield python_finding(sys.version_info[:3])
+    packages = list(package_findings(pinned_versions()))
+    yield from packages
+    if is_scoring_only():
+        yield cores_finding()
+        yield disk_finding(Path.cwd())
+        yield scoring_finding(after=packages)
+        return
+    variant = os.environ.get(ENVIRONMENT) or default_variant()
+    yield Finding("variant", variant)
+    llvm = llvm_finding(is_needed=variant.startswith("llvm"))
+    yield llvm
+    yield cores_finding()
+    yield disk_finding(Path.cwd())
+    yield image_finding(after=[*packages, llvm])
+
+
+def python_finding(version: tuple[int, ...]) -> Finding:
+    """Judge the version of Python."""
+    text = f"{'.'.join(map(str, version))} on {platform.system()} {platform.machine()}"
+    if version >= OLDEST_PYTHON:
+        return Finding("Python", text)
+    oldest = ".".join(map(str, OLDEST_PYTHON))
+    return Finding("Python", text, "fault", f"Python is too old: make the environment with Python {oldest} or later.")
+
+
+def pinned_versions() -> dict[str, str]:
+    """Read ``constraints.txt`` of the checkout; empty where the package was installed without one."""
+    file = Path(__file__).resolve().parents[2] / "constraints.txt"
+    lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
+    return dict(line.strip().split("==", 1) for line in lines if "==" in line)
+
+
+def package_findings(pinned: dict[str, str]) -> Iterator[Finding]:
+    """Compare what is installed with what this checkout was tested with."""
+    for name in CORE:
+        yield package_finding(name, pinned.get(name))
+    for name in RENDER:
+        yield Finding(name, "not installed") if is_scoring_only() else package_finding(name, pinned.get(name))
+    for name in sorted(set(pinned) - set(CORE) - set(RENDER)):
+        finding = package_finding(name, pinned[name])
+        # What the tests or the checks need may be absent; what is there should be what was tested.
+        if finding.state == "warning":
+            yield finding
+
+
+def package_finding(name: str, pinned: str | None) -> Finding:
+    """Judge one package: absent is a fault, another version than the pinned one a warning."""
+    try:
+        installed = metadata.version(name)
+    except metadata.PackageNotFoundError:
+        extra = "phibench[render]" if name in RENDER else "phibench"
+        return Finding(name, "not installed", "fault", f"{name} is not installed: run `pip install '{extra}'`.")
+    if pinned in (None, installed):
+        return Finding(name, installed)
+    advice = f"{name} is {installed}, tested with {pinned}: run `pip install -c constraints.txt {name}`."
+    return Finding(name, installed, "warning", advice)
+
+
+def llvm_finding(*, is_needed: bool) -> Finding:
+    """Find an LLVM and prove it; without one only the variants that need none can be used."""
+    state: State = "fault" if is_needed else "warning"
+    try:
+        llvm = find_llvm()
+    except LlvmError as error:
+        return Finding("LLVM", "none usable", state, f"LLVM: {error}")
+    text = f"{llvm.label} at {llvm.path}"
+    if not is_installed("drjit"):
+        return Finding("LLVM", f"{text}, untried without drjit")
+    if fault := prove(llvm):
+        return Finding(
+            "LLVM",
+            text,
+            state,
+            f"LLVM {llvm.label} fails the proof, {fault}: run `python -m phibench.render.setup.llvm`.",
+        )
+    return Finding("LLVM", text)
+
+
+def is_installed(name: str) -> bool:
+    """Return whether a distribution is there, without importing it."""
+    try:
+        metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+def is_scoring_only() -> bool:
+    """Return whether nothing that renders is installed: a choice, where half of it would be a fault."""
+    return not any(is_installed(name) for name in RENDER)
+
+
+def scoring_finding(after: list[Finding]) -> Finding:
+    """Say what an installation without the renderer can do, unless something it needs is already found missing."""
+    if any(finding.state == "fault" for finding in after):
+        return Finding("use", "scoring only, once the faults are set right")
+    advice = f"scoring works; rendering needs {' and '.join(RENDER)}: run `pip install 'phibench[render]'`."
+    return Finding("use", "scoring works, no renderer", "warning", advice)
+
+
+def cores_finding() -> Finding:
+    """Count the cores that this process may use."""
+    return Finding("cores", str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()))
+
+
+def disk_finding(folder: Path) -> Finding:
+    """Judge the free space where data sets are written by default."""
+    free = shutil.disk_usage(folder).free / 2**30
+    text = f"{free:.1f} GiB free in the current folder"
+    if free >= LEAST_DISK_GIB:
+        return Finding("disk", text)
+    return Finding(
+        "disk", text, "warning", f"only {free:.1f} GiB are free here: write data sets elsewhere with `--out`."
+    )
+
+
+def image_finding(after: list[Finding]) -> Finding:
+    """Render the known image in a child process, unless something it needs is already found missing."""
+    if causes := [finding.subject for finding in after if finding.state == "fault"]:
+        advice = f"no test image was rendered: set right first {', '.join(causes)}."
+        return Finding("test image", "not tried", "fault", advice)
+    if fault := fault_of("phibench.render.setup.selftest", timeout_s=_RENDER_S):
+        advice = f"the test image failed, {fault}: run `python -m phibench.render.setup.selftest` to see all of it."
+        return Finding("test image", "wrong", "fault", advice)
+    return Finding("test image", "rendered, values as expected")
+
+
+def show(findings: list[Finding]) -> None:
+    """Print the table, then one line per warning or fault."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(show_header=False)
+    table.add_column()
+    table.add_column(overflow="fold")  # a path must stay whole
+    table.add_column()
+    for finding in findings:
+        table.add_row(finding.subject, escape(finding.value), f"[{_COLOURS[finding.state]}]{finding.state}[/]")
+    console = Console()
+    console.print(table)
+    for finding in findings:
+        if finding.advice:
+            # Not wrapped and without markup: one line, with paths and brackets as they are.
+            console.print(f"{finding.state}: {finding.advice}", markup=False, highlight=False, soft_wrap=True)
+
+
+def main() -> int:
+    """Examine, show, and return 0 if there is no fault."""
+    findings = list(examine())
+    show(findings)
+    return 1 if any(finding.state == "fault" for finding in findings) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

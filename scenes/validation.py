@@ -1,0 +1,210 @@
+"""Validation shared by every description in ``scenes``: one clear sentence per fault.
+
+Advice for a misspelt name.
+
+Faults of a table that a file fills: one line each, with path, value, allowed range and what to do.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+
+class SceneError(ValueError):
+    """A description that no real rig, room or laser can have."""
+
+
+def finite(owner: str, name: str, value: float) -> float:
+    """Return `value`, or raise `SceneError` if it is NaN or infinite."""
+    if not math.isfinite(value):
+        raise SceneError(f"{owner}.{name} = {value}: must be a finite number")
+    return value
+
+
+def within(owner: str, name: str, value: float, low: float, high: float) -> float:
+    """Return `value` if low <= value <= high, else raise `SceneError` naming the range."""
+    finite(owner, name, value)
+    if not low <= value <= high:
+        raise SceneError(f"{owner}.{name} = {value}: allowed range is {low} to {high}")
+    return value
+
+
+def positive(owner: str, name: str, value: float) -> float:
+    """Return `value` if it is finite and above zero, else raise `SceneError`."""
+    finite(owner, name, value)
+    if value <= 0.0:
+        raise SceneError(f"{owner}.{name} = {value}: must be above 0")
+    return value
+
+
+def finite_vector(owner: str, name: str, value: Sequence[float], length: int) -> tuple[float, ...]:
+    """Return `value` as a tuple of `length` finite floats, else raise `SceneError`."""
+    vector = tuple(float(x) for x in value)
+    if len(vector) != length:
+        raise SceneError(f"{owner}.{name} has {len(vector)} numbers: {length} are needed")
+    for x in vector:
+        finite(owner, name, x)
+    return vector
+
+
+def unit_vector(owner: str, name: str, value: Sequence[float]) -> tuple[float, ...]:
+    """Return the 3-vector `value` scaled to length 1; raise `SceneError` for a zero vector."""
+    vector = finite_vector(owner, name, value, 3)
+    length = math.hypot(*vector)
+    if length < 1e-9:
+        raise SceneError(f"{owner}.{name} = {vector}: a direction must not be the zero vector")
+    return tuple(x / length for x in vector)
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Advice for an unknown name: the nearest known one, and what is known."""
+    names = list(known)
+    guesses = close_names(name, names)
+    guess = f"did you mean '{guesses[0]}'? " if guesses else ""
+    return f"{guess}known: {', '.join(names)}"
+
+
+def close_names(name: str, known: Iterable[str]) -> list[str]:
+    """Nearest known name, if one is near: a list of one or none."""
+    return difflib.get_close_matches(name, list(known), 1, 0.5)
+
+
+Schema = dict[str, Any]
+Location = tuple[str | int, ...]
+_LIMITS = {"exclusiveMinimum": "above {}", "minimum": "from {}", "exclusiveMaximum": "below {}", "maximum": "up to {}"}
+_KINDS = {
+    "number": "a number",
+    "integer": "an integer",
+    "string": "a string",
+    "boolean": "true or false",
+    "array": "a list",
+    "object": "a table",
+}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault: where it is and what to do about it."""
+
+    path: str
+    text: str
+    unknown: bool = False  # the key is none of the table's
+
+    def __str__(self) -> str:
+        return f"{self.path}: {self.text}"
+
+
+def structural_faults(model: type[BaseModel], raw: object) -> list[Fault]:
+    """All keys of `raw` that are wrong, missing or unknown for `model`."""
+    try:
+        model.model_validate(raw)
+    except ValidationError as error:
+        schema = model.model_json_schema()
+        found = _merged(schema, [details for details in error.errors() if not _follows(details)])
+        return [_fault(schema, details["type"], details["loc"], details["input"]) for details in found]
+    return []
+
+
+def _follows(details: ErrorDetails) -> bool:
+    """Whether a list is called too short only because its faulty entries were not counted."""
+    return details["type"] == "too_short" and len(details["input"]) >= details["ctx"]["min_length"]
+
+
+def _merged(schema: Schema, found: list[ErrorDetails]) -> list[ErrorDetails]:
+    """Leave out that a key is missing where an unknown one is its misspelling: one typo is one fault."""
+    meant: set[Location] = set()
+    for details in found:
+        if details["type"] == "extra_forbidden":
+            *table, name = details["loc"]
+            known = schema_node(schema, tuple(table)).get("properties", {})
+            meant.update((*table, close) for close in close_names(str(name), known))
+    return [details for details in found if details["type"] != "missing" or details["loc"] not in meant]
+
+
+def path_text(location: Sequence[str | int]) -> str:
+    """Path of a key as people write it, such as ``targets[2].depth_m``."""
+    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
+    return "".join(parts).removeprefix(".") or "recipe"
+
+
+def _fault(schema: Schema, kind: str, location: Location, given: object) -> Fault:
+    path = path_text(location)
+    if kind == "extra_forbidden":
+        known = schema_node(schema, location[:-1]).get("properties", {})
+        return Fault(path, f"unknown key; {nearest(str(location[-1]), known)}", unknown=True)
+    node = schema_node(schema, location)
+    hint = f" ({node['description']})" if "description" in node else ""
+    if kind == "missing":
+        return Fault(path, f"missing; add {allowed(node)}{hint}")
+    if isinstance(given, dict) and node.get("type") == "array" and not _plain(node):
+        return Fault(path, f"a single table; write [[{path}]] with two brackets, once for each entry{hint}")
+    return Fault(path, f"{_shown(given)} is not allowed; give {allowed(node)}{hint}")
+
+
+def schema_node(schema: Schema, location: Location) -> Schema:
+    """Return the part of a JSON schema that describes one key, references and optional values resolved."""
+    node = _resolve(schema, schema)
+    for part in location:
+        inner = _entry(node, part) if isinstance(part, int) else node.get("properties", {}).get(part, {})
+        description = inner.get("description")
+        node = _resolve(schema, inner)
+        node = {**node, "description": description} if description else node
+    return node
+
+
+def _resolve(schema: Schema, node: Schema) -> Schema:
+    options = [option for option in node.get("anyOf", ()) if option.get("type") != "null"]
+    if options:
+        return _resolve(schema, {**node, **options[0], "anyOf": ()})
+    if "$ref" in node:
+        return _resolve(schema, schema["$defs"][node["$ref"].rsplit("/", 1)[-1]])
+    return node
+
+
+def allowed(node: Schema) -> str:
+    """Say in words what a JSON schema node allows."""
+    if "enum" in node or "const" in node:
+        return "one of " + ", ".join(repr(value) for value in node.get("enum", [node.get("const")]))
+    words = [_KINDS.get(node.get("type", ""), "a value"), *_limits(node)]
+    if "pattern" in node:
+        words.append(f"of at most {node['maxLength']} letters, digits and signs like {_signs(node['pattern'])}")
+    if "minItems" in node:
+        count = "of" if node["minItems"] == node.get("maxItems") else "of at least"
+        words.append(f"{count} {node['minItems']} ({allowed(_entry(node))})" if _plain(node) else "with entries")
+    return " ".join(words)
+
+
+def _limits(node: Schema) -> list[str]:
+    return [text.format(_number(node[key])) for key, text in _LIMITS.items() if key in node]
+
+
+def _plain(node: Schema) -> bool:
+    entry = _entry(node)
+    return bool(entry) and "$ref" not in entry
+
+
+def _entry(node: Schema, index: int = 0) -> Schema:
+    """Schema of a list's entry; a list of so many entries has one for each."""
+    each = node.get("prefixItems", ())
+    found: Schema = each[min(index, len(each) - 1)] if each else node.get("items") or {}
+    return found
+
+
+def _number(value: float) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _signs(pattern: str) -> str:
+    return "_ . -" if "-]" in pattern else "_ ."
+
+
+def _shown(given: object) -> str:
+    text = repr(given)
+    return text if len(text) <= 60 else text[:57] + "..."

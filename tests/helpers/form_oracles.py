@@ -1,0 +1,104 @@
+"""Slow answers for a mirror with a form error, by other mathematics than the package's. Not a test file.
+
+The surface is written with angles and associated Legendre functions; the reflection point is the minimum of the path,
+found from values alone, in long double.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from helpers.oracles import camera_at, project_cv2
+from scipy import optimize
+
+from phibench.scenes.mirror import Form
+from phibench.scenes.rig import Rig
+
+# magnitude of each polar factor's peak, from its derivative's zero
+_P31 = 16.0 / (3.0 * np.sqrt(np.longdouble(15)))  # sin (5 cos^2 - 1) where sin^2 = 4/15
+_P32 = 2.0 / (3.0 * np.sqrt(np.longdouble(3)))  # sin^2 cos where cos^2 = 1/3
+
+
+def radius_at(n: np.ndarray, radius_m: float, form: Form) -> np.longdouble:
+    """Radius in a direction, shape (3,), long double."""
+    polar, turn = np.arctan2(np.hypot(n[0], n[1]), n[2]), np.arctan2(n[1], n[0])
+    s, c = np.sin(polar), np.cos(polar)
+    waves = {
+        "20": (3 * c * c - 1) / 2,
+        "21": np.sin(2 * polar),
+        "22": s * s,
+        "30": (5 * c**3 - 3 * c) / 2,
+        "31": s * (5 * c * c - 1) / _P31,
+        "32": s * s * c / _P32,
+        "33": s**3,
+    }
+    total = np.longdouble(radius_m)
+    for name, wave in waves.items():
+        order = int(name[1])
+        total += np.longdouble(getattr(form, f"form_{name}{'c' if order else ''}_m")) * wave * np.cos(order * turn)
+        if order:
+            total += np.longdouble(getattr(form, f"form_{name}s_m")) * wave * np.sin(order * turn)
+    return total
+
+
+def fermat_on_form(a: np.ndarray, b: np.ndarray, radius_m: float, form: Form) -> np.ndarray:
+    """Point, shape (3,), that makes |a P| + |P b| least, sphere's frame: Nelder-Mead, then Newton by differences.
+
+    Differences of fourth order with a step h = 1e-4 rad in long double (eps 5e-20): slopes err by eps / h = 5e-16 and
+    h^4 = 1e-16 of the radius, which the curvature of the path, about 2, turns into some 1e-15 rad.
+    """
+    a, b = (np.asarray(x).astype(np.longdouble) for x in (a, b))
+    start = a / np.sqrt(a @ a) + b / np.sqrt(b @ b)
+
+    def place(centre: np.ndarray, across: np.ndarray, x: np.ndarray) -> np.ndarray:
+        n = centre + x @ across
+        n = n / np.sqrt(n @ n)
+        return radius_at(n, radius_m, form) * n
+
+    def path(x: np.ndarray) -> np.longdouble:
+        P = place(centre, across, np.asarray(x))
+        return np.sqrt((P - a) @ (P - a)) + np.sqrt((P - b) @ (P - b))
+
+    centre = start / np.sqrt(start @ start)
+    across = _across(centre)
+    found = optimize.minimize(lambda x: float(path(x)), np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-7})
+    x = found.x.astype(np.longdouble)
+    for _ in range(6):
+        centre = place(centre, across, x)
+        centre = centre / np.sqrt(centre @ centre)
+        across, x = _across(centre), np.zeros(2, np.longdouble)
+        slope, curvature = _derivatives(path)
+        x = -np.linalg.solve(curvature.astype(float), slope.astype(float)).astype(np.longdouble)
+    return place(centre, across, x).astype(float)
+
+
+def form_pixel(rig: Rig, offset_m: float, spot_world_m: np.ndarray) -> np.ndarray:
+    """Pixel of a world point seen in the mirror of a rig, shape (2,)."""
+    camera, axes = camera_at(rig, offset_m)
+    centre, turned = camera + axes @ rig.T_camera_sphere.t, axes @ rig.T_camera_sphere.R
+    assert rig.mirror.form is not None
+    P = fermat_on_form(
+        turned.T @ (camera - centre), turned.T @ (spot_world_m - centre), rig.mirror.radius_m, rig.mirror.form
+    )
+    return project_cv2(rig.camera, (axes.T @ (turned @ P + centre - camera))[None])[0]
+
+
+def _across(n: np.ndarray) -> np.ndarray:
+    """Two unit vectors across a direction, as rows."""
+    first = np.cross(n, np.eye(3, dtype=np.longdouble)[np.argmin(np.abs(n))])
+    first = first / np.sqrt(first @ first)
+    return np.stack([first, np.cross(n, first)])
+
+
+def _derivatives(f) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient (2,) and second derivatives (2, 2) at 0 by five-point stencils."""
+    h = np.longdouble(1e-4)
+    e = h * np.eye(2, dtype=np.longdouble)
+    centre = f(0 * e[0])
+    slope, curvature = np.zeros(2, np.longdouble), np.zeros((2, 2), np.longdouble)
+    for i in range(2):
+        near, far = (f(k * e[i]) - f(-k * e[i]) for k in (1, 2))
+        slope[i] = (8 * near - far) / (12 * h)
+        curvature[i, i] = (f(e[i]) - 2 * centre + f(-e[i])) / h**2
+    mixed = f(e[0] + e[1]) - f(e[0] - e[1]) - f(e[1] - e[0]) + f(-e[0] - e[1])
+    curvature[0, 1] = curvature[1, 0] = mixed / (4 * h**2)
+    return slope, curvature

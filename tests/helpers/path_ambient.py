@@ -1,0 +1,52 @@
+"""The ambient layer by plain path tracing: slow and noisy, the reference that `ambient` is held against."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.render.room.scene import load_scene, scene_dict
+from phibench.render.setup.variant import activate
+from phibench.scenes.rig import View
+from phibench.scenes.room import Room
+
+_PASS = 16  # samples per pixel and pass: bounds the memory
+
+
+def path_trace(
+    view: View,
+    room: Room,
+    samples_per_pixel: int,
+    max_depth: int,
+    seed: int,
+    crop: tuple[int, int, int, int] | None = None,
+) -> NDArray[np.float32]:
+    """Expected photo-electrons per second per pixel, planes R, G, B.
+
+    Parameters
+    ----------
+    samples_per_pixel : int
+        Taken in passes of at most 16, each stratified by the multijitter sampler.
+    max_depth : int
+        Longest light path; 1 is directly visible lamps, the mirror counts as a bounce.
+    seed : int
+        Of the named stream for this view; 0 is legal.
+    crop : (u0, v0, width, height), or None
+
+    Returns
+    -------
+    layer : array, shape (3, height, width), float32
+    """
+    camera = view.rig.camera
+    _, _, width, height = crop or (0, 0, camera.width_px, camera.height_px)
+    if not any(surface.emits for surface in room.surfaces):
+        return np.zeros((3, height, width), dtype=np.float32)
+    mi = activate()
+    scene = load_scene(mi, scene_dict(mi, view, room, crop))
+    integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 1000})
+    passes = [_PASS] * (samples_per_pixel // _PASS) + [samples_per_pixel % _PASS] * (samples_per_pixel % _PASS > 0)
+    seeds = np.random.SeedSequence(seed).generate_state(len(passes), dtype=np.uint32)
+    total = np.zeros((height, width, 3))
+    for count, pass_seed in zip(passes, seeds, strict=True):
+        total += count * np.array(mi.render(scene, integrator=integrator, spp=count, seed=int(pass_seed)))
+    return np.ascontiguousarray((total / samples_per_pixel).transpose(2, 0, 1), dtype=np.float32)

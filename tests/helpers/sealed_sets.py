@@ -1,0 +1,41 @@
+"""What the tests of sealed sets and of submissions share."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from phibench.datasets.errors import DatasetError
+from phibench.estimator.benchmark.submission import unseal
+
+METHOD = """\
+import numpy as np
+from phibench.estimator.interface import Answer, Spot
+
+def extract(pair):  # brightest pixel: deterministic, and of this pair; pair 1 fails
+    if pair.number == 1:
+        raise ValueError("no spot")
+    image = pair.down if pair.down.ndim == 2 else pair.down[..., 0]
+    v, u = np.unravel_index(int(image.argmax()), image.shape)
+    found = Spot((float(u), float(v)), ((0.1, 0.01), (0.01, 0.2)), 0.5, "normal")
+    return Answer(found, Spot.missing("not looked for"), 2.0)
+"""
+
+
+def tampered(change: Callable[[dict[str, Any]], Any], path: Path, out: Path) -> Path:
+    document = json.loads(path.read_text())
+    change(document)
+    out.write_text(json.dumps(document, sort_keys=True, separators=(",", ":")) + "\n")
+    return out
+
+
+def refusal(public: Path, truth: Path, submission: Path) -> str:
+    with pytest.raises(DatasetError) as caught:
+        unseal(public, truth, submission)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
