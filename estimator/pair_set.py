@@ -83,10 +83,10 @@ class PairTruth:
     hinted : bool
         Whether the method got boxes.
     depth_m, stroke_m : float
-    true_rig, believed_rig : Rig
+    true_rig, nominal_rig : Rig
         The rig that was rendered, and the one in `Pair.rig`.
     down, up : SpotTruth
-    believed_stroke_m : float or None
+    nominal_stroke_m : float or None
         The stroke in `Pair.stroke_m`; None if it is the true one.
     calibration_covariance : array, shape (p, p), or None
         That of the pair: the predicted error of D then includes the calibration's.
@@ -101,10 +101,10 @@ class PairTruth:
     depth_m: float
     stroke_m: float
     true_rig: Rig
-    believed_rig: Rig
+    nominal_rig: Rig
     down: SpotTruth
     up: SpotTruth
-    believed_stroke_m: float | None = None
+    nominal_stroke_m: float | None = None
     calibration_covariance: Array | None = None
 
 

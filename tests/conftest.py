@@ -4,7 +4,6 @@ import os
 import shutil
 import subprocess
 import sys
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import pytest  # noqa: E402
+from helpers.inline_workers import InlineCrew  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -28,48 +28,6 @@ def python() -> Callable[..., subprocess.CompletedProcess[str]]:
         return subprocess.run(command, cwd=ROOT, env=merged, capture_output=True, text=True, timeout=300, check=False)
 
     return run
-
-
-class InlineCrew:
-    """Does tasks in this process, one after the other: for tests of what is done, not of who does it."""
-
-    width = 1
-
-    def __init__(self, out: Path, *_: object) -> None:
-        self._out = out
-
-    def __enter__(self) -> "InlineCrew":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        return None
-
-    def environment(self) -> dict[str, object]:
-        from phibench.datasets.build.workers import describe
-
-        return {key: value for key, value in describe().items() if key != "worker"}
-
-    def executor(self, _: int) -> "Inline":
-        return Inline(self._out)
-
-
-class Inline:
-    """Executor of `InlineCrew`."""
-
-    def __init__(self, out: Path) -> None:
-        self._out, self._waiting = out, deque[Any]()
-
-    def width(self) -> int:
-        return 1
-
-    def submit(self, task: Any) -> None:
-        self._waiting.append(task)
-
-    def next(self) -> Any:
-        from phibench.datasets.build.tasks import perform
-
-        task = self._waiting.popleft()
-        return task, perform(task, self._out)
 
 
 @pytest.fixture

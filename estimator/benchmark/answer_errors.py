@@ -1,6 +1,6 @@
 """Errors of answers, as arrays: position, phi, depth, and what the claimed covariance and the bound say of them.
 
-Kernels over n answers that share a believed and a true rig. NaN where there is nothing to compare. Pixels as
+Kernels over n answers that share a nominal and a true rig. NaN where there is nothing to compare. Pixels as
 everywhere: integer (u, v) at pixel centres. Phi does not depend on the carriage, so that rigs are taken at the down
 position.
 

@@ -7,24 +7,23 @@ Pairs of a data set as somebody sees them who has calibrated the rig: rig, strok
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.exposures.exposures import Take, TakenSample, takes
-from phibench.datasets.frames.sensor_card import SensorCard, card_of
-from phibench.datasets.frames.source import Frames, FrameSource, Side
+from phibench.datasets.exposures.exposures import TakenSample, takes
+from phibench.datasets.frames.source import FrameSource, Side
 from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.store import schema as layout
 from phibench.datasets.store.files import sha256
 from phibench.datasets.store.provenance import provenance
 from phibench.estimator.benchmark.spot_bounds import spot_bounds, spot_electrons
 from phibench.estimator.calibration.file import Calibration, CalibrationError
+from phibench.estimator.draw_pairs import DrawnPairs
 from phibench.estimator.geometry.rig_parameters import stroke_of
-from phibench.estimator.interface import Box, Image, Pair
+from phibench.estimator.interface import Pair
 from phibench.estimator.pair_set import Distraction, PairSet, PairTruth, SpotTruth
 from phibench.scenes.laser import Beam
 
@@ -32,8 +31,8 @@ TASK_VERSION = 2
 """Version of the task: what a method is given, what it must answer and what is counted. A change of any raises it."""
 
 
-class DatasetPairs:
-    """Pairs of a data set by number; the layers of the last sample are kept.
+class DatasetPairs(DrawnPairs):
+    """Pairs of a data set by number, with their truth; the layers of the last sample are kept.
 
     Parameters
     ----------
@@ -42,50 +41,9 @@ class DatasetPairs:
         Numbered from 0.
     """
 
-    def __init__(self, dataset: Dataset, taken: tuple[Take, ...]) -> None:
-        self._dataset, self._takes = dataset, taken
-        self._samples = {sample.row.sample_id: sample for sample in dataset}
-        self._kept: TakenSample | None = None
-        self._source: tuple[int, FrameSource] | None = None
-
-    def __len__(self) -> int:
-        return len(self._takes)
-
-    @property
-    def takes(self) -> tuple[Take, ...]:
-        """What is drawn, by number; it tells the sample, so it is not for methods."""
-        return self._takes
-
-    @property
-    def dataset(self) -> Dataset:
-        """Where they come from."""
-        return self._dataset
-
-    def pair(self, number: int) -> Pair:
-        """What a method sees; its arrays are read-only."""
-        return self.pair_and_frames(number)[0]
-
-    def pair_and_frames(self, number: int) -> tuple[Pair, Frames]:
-        """What a method sees, and the frames behind it, with the camera's JPEG files."""
-        take, sample, source = self._drawn_from(number)
-        frames = source.frames(take.exposure_number, laser_off=take.laser_off)
-        images = {name: _sealed(frame.image) for name, frame in frames.by_name.items()}
-        box_down, box_up = (None, None) if take.boxes is None else tuple(map(_box, take.boxes))
-        pair = Pair(
-            number,
-            **images,
-            rig=sample.nominal_rig,
-            stroke_m=sample.row.nominal_stroke_m,
-            card=card_of(source.sides["down"].chain.sensor),
-            box_down=box_down,
-            box_up=box_up,
-            beam=self._dataset.beam,
-        )
-        return pair, frames
-
     def truth(self, number: int) -> PairTruth:
         """The exact answer, with the bounds of the image and of the raw pixels behind it."""
-        take, sample, source = self._drawn_from(number)
+        take, sample, source = self.drawn_from(number)
         sensor = source.sides["down"].chain.sensor
         return PairTruth(
             number=number,
@@ -97,48 +55,28 @@ class DatasetPairs:
             depth_m=sample.row.depth_m,
             stroke_m=sample.row.stroke_m,
             true_rig=sample.rig,
-            believed_rig=sample.nominal_rig,
+            nominal_rig=sample.nominal_rig,
             down=_spot_truth(sample, source, "down"),
             up=_spot_truth(sample, source, "up"),
-            believed_stroke_m=sample.row.nominal_stroke_m,
+            nominal_stroke_m=sample.row.nominal_stroke_m,
         )
-
-    def image(self, number: int, position: str, laser: bool) -> Image:
-        """One image of a pair, alone; the same bytes as in `pair`."""
-        take, _, source = self._drawn_from(number)
-        return source.frame(position, take.exposure_number, laser).image
-
-    def card(self, number: int) -> SensorCard:
-        """Numbers of the sensor, with the exposure that was chosen; no frame is drawn."""
-        return card_of(self._drawn_from(number)[2].sides["down"].chain.sensor)
 
     def document(self) -> dict[str, Any]:
         """Provenance of the set."""
-        info, listed = self._dataset.info, self._dataset.folder / layout.SUMS
+        info, listed = self.dataset.info, self.dataset.folder / layout.SUMS
         return {
             "name": info.name,
             "task_version": TASK_VERSION,
             "sealed": False,
             "pairs": len(self),
-            "samples": len({take.sample_id for take in self._takes}),
-            "presets": sorted({take.preset for take in self._takes}),
-            "hinted": sum(take.boxes is not None for take in self._takes),
+            "samples": len({take.sample_id for take in self.takes}),
+            "presets": sorted({take.preset for take in self.takes}),
+            "hinted": sum(take.boxes is not None for take in self.takes),
             "seed": info.recipe["dataset"]["seed"],
             "recipe_sha256": info.recipe_sha256,
             "dataset_sha256": sha256(listed) if listed.is_file() else None,
             "provenance": provenance(),
         }
-
-    def _drawn_from(self, number: int) -> tuple[Take, TakenSample, FrameSource]:
-        if not 0 <= number < len(self._takes):
-            raise DatasetError(f"pair {number}: there are {len(self._takes)}, numbered from 0; ask for one of them")
-        take = self._takes[number]
-        kept = self._kept
-        if kept is None or kept.row.sample_id != take.sample_id:
-            kept = self._kept = TakenSample(self._samples[take.sample_id])
-        if self._source is None or self._source[0] != number:
-            self._source = number, kept.source(take)
-        return take, kept, self._source[1]
 
 
 def dataset_pairs(
@@ -174,39 +112,6 @@ def dataset_pairs(
     return DatasetPairs(dataset, shown[:pairs])
 
 
-def pairs_of(
-    dataset: Dataset, samples: Sequence[Sample], preset: str, draws: int = 1, laser_off: bool = True
-) -> DatasetPairs:
-    """Pairs of some samples in one preset, in the order of the samples, then of the draws.
-
-    Parameters
-    ----------
-    dataset : Dataset
-    samples : of the data set
-    preset : str
-    draws : int
-    laser_off : bool
-        Whether frames with the laser off belong to them, whatever the recipe says.
-    """
-    order = {sample.row.sample_id: place for place, sample in enumerate(samples)}
-    few = replace(dataset, rows=tuple(sample.row for sample in samples))
-    taken = sorted(takes(few, preset, draws), key=lambda take: (order[take.sample_id], take.draw))
-    numbered = (replace(take, number=number, laser_off=laser_off) for number, take in enumerate(taken))
-    return DatasetPairs(few, tuple(numbered))
-
-
-def _sealed(image: Image) -> Image:
-    """Image that cannot be written to, nor through its base."""
-    result = np.array(image)
-    result.flags.writeable = False
-    return result
-
-
-def _box(region: Any) -> Box:
-    height, width = region.shape
-    return Box(region.u0_px, region.v0_px, width, height)
-
-
 def _spot_truth(sample: TakenSample, source: FrameSource, position: str) -> SpotTruth:
     row, side = sample.row.position(position), source.sides[position]
     uv_px = (row.u_px, row.v_px)
@@ -235,7 +140,7 @@ def _distractions(sample: TakenSample, side: Side, position: str) -> tuple[Distr
 
 
 class CalibratedPairs:
-    """A pair set whose believed rig and stroke are those of a calibration.
+    """A pair set whose nominal rig and stroke are those of a calibration.
 
     Parameters
     ----------
@@ -265,11 +170,11 @@ class CalibratedPairs:
     def truth(self, number: int) -> PairTruth:
         """The exact answer."""
         truth = self._pairs.truth(number)
-        believed_m = truth.stroke_m if truth.believed_stroke_m is None else truth.believed_stroke_m
+        nominal_m = truth.stroke_m if truth.nominal_stroke_m is None else truth.nominal_stroke_m
         return replace(
             truth,
-            believed_rig=self._calibration.rig,
-            believed_stroke_m=self._stroke_m(believed_m),
+            nominal_rig=self._calibration.rig,
+            nominal_stroke_m=self._stroke_m(nominal_m),
             calibration_covariance=self._covariance,
         )
 
@@ -292,7 +197,7 @@ def of_calibration(dataset: Dataset, calibration: Calibration) -> Dataset:
         and the calibration was made from none of them.
     """
     for sample in dataset:
-        if sample.nominal_rig != calibration.believed:
+        if sample.nominal_rig != calibration.nominal:
             raise CalibrationError(
                 f"the calibration is that of another rig than the one that sample {sample.row.sample_id} believes in; "
                 "calibrate with samples of this data set"

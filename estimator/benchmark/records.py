@@ -17,7 +17,7 @@ import polars as pl
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.benchmark import answer_errors as errors
 from phibench.estimator.benchmark.answer_errors import Rules
-from phibench.estimator.geometry.least_squares_depth import believed_depth
+from phibench.estimator.geometry.least_squares_depth import nominal_depth
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import OK, Answer, Outcome, Spot
 from phibench.estimator.pair_set import PairSet, PairTruth, SpotTruth
@@ -60,7 +60,7 @@ COLUMNS: dict[str, str] = {
     "false_detection": "a position where the spot is not visible, or further than match_px from it",
     "counted_px": "distance_px if detected, match_px if missed",
     "phi_convention": "ray, normal, incidence or outline",
-    "phi_rad": "the method's, else estimator.phi of its pixel through the believed rig",
+    "phi_rad": "the method's, else estimator.phi of its pixel through the nominal rig",
     "phi_true_rad": "truth in that convention; outline: estimator.phi of the true pixel through the true rig",
     "phi_error_rad": "phi_rad - phi_true_rad, in units of phi_ray: times d phi_ray / d phi along the gradient",
     "pull_u": "first component of L^-1 e, C = L L^T the claimed covariance",
@@ -112,10 +112,10 @@ def record_table(truths: Sequence[PairTruth], outcomes: Sequence[Outcome], rules
     index: dict[tuple[Rig, Rig, int], list[int]] = {}
     for i, truth in enumerate(truths):
         # a calibration goes with its rig; its array is one object for all pairs, or rows that are equal stay apart
-        index.setdefault((truth.believed_rig, truth.true_rig, id(truth.calibration_covariance)), []).append(i)
+        index.setdefault((truth.nominal_rig, truth.true_rig, id(truth.calibration_covariance)), []).append(i)
     frames = [
-        _of_rigs(believed, true, [truths[i] for i in rows], [outcomes[i] for i in rows], rules)
-        for (believed, true, _), rows in index.items()
+        _of_rigs(nominal, true, [truths[i] for i in rows], [outcomes[i] for i in rows], rules)
+        for (nominal, true, _), rows in index.items()
     ]
     table = pl.concat(frames).sort("number", pl.col("image") == "up")
     return table.with_columns(pl.col(pl.Float64).fill_nan(None)).select(*COLUMNS)
@@ -139,10 +139,10 @@ def in_order(outcomes: Iterable[Outcome], count: int) -> list[Outcome]:
     return ordered
 
 
-def _of_rigs(believed: Rig, true: Rig, truths: list[PairTruth], outcomes: list[Outcome], rules: Rules) -> pl.DataFrame:
+def _of_rigs(nominal: Rig, true: Rig, truths: list[PairTruth], outcomes: list[Outcome], rules: Rules) -> pl.DataFrame:
     """Records of pairs that share their rigs, image by image, then the pairs' own columns."""
-    images = {p: _image_columns(p, believed, true, truths, outcomes, rules) for p in POSITIONS}
-    pair = _pair_columns(believed, truths, outcomes, images, rules)
+    images = {p: _image_columns(p, nominal, true, truths, outcomes, rules) for p in POSITIONS}
+    pair = _pair_columns(nominal, truths, outcomes, images, rules)
     return pl.concat([pl.DataFrame({**images[p], **pair}, schema_overrides=_TYPES) for p in POSITIONS])
 
 
@@ -156,7 +156,7 @@ _TYPES = {
 
 
 def _image_columns(
-    position: str, believed: Rig, true: Rig, truths: list[PairTruth], outcomes: list[Outcome], rules: Rules
+    position: str, nominal: Rig, true: Rig, truths: list[PairTruth], outcomes: list[Outcome], rules: Rules
 ) -> dict[str, Any]:
     spots: list[SpotTruth] = [getattr(truth, position) for truth in truths]
     answers = [_spot(outcome, position) for outcome in outcomes]
@@ -191,24 +191,24 @@ def _image_columns(
         "missed": visible & ~detected,
         "false_detection": given & ~detected,
         "counted_px": np.where(visible, np.where(detected, error.distance_px, rules.match_px), np.nan),
-        **_phi_columns(believed, true, xy, uv, spots, answers),
+        **_phi_columns(nominal, true, xy, uv, spots, answers),
         "pull_u": pull[:, 0],
         "pull_v": pull[:, 1],
         "mahalanobis2": np.sum(pull**2, axis=-1),
         "bound_px2": np.trace(bound, axis1=1, axis2=2),
         "raw_bound_px2": np.trace(raw, axis1=1, axis2=2),
-        "bound_phi_rad2": errors.phi_variance(believed, xy, bound),
+        "bound_phi_rad2": errors.phi_variance(nominal, xy, bound),
     }
 
 
 def _phi_columns(
-    believed: Rig, true: Rig, xy: Array, uv: Array, spots: list[SpotTruth], answers: list[Spot | None]
+    nominal: Rig, true: Rig, xy: Array, uv: Array, spots: list[SpotTruth], answers: list[Spot | None]
 ) -> dict[str, Any]:
     own = np.array([_own_phi(answer) for answer in answers])
     convention = [
         a.phi_convention if a is not None and np.isfinite(x) else "ray" for a, x in zip(answers, own, strict=True)
     ]
-    phi = np.where(np.isfinite(own), own, errors.phi_of("ray", believed, uv))
+    phi = np.where(np.isfinite(own), own, errors.phi_of("ray", nominal, uv))
     outline = errors.phi_of("outline", true, xy)
     truth = np.array([s.phi_rad.get(c, o) for s, c, o in zip(spots, convention, outline, strict=True)])
     return {
@@ -220,18 +220,18 @@ def _phi_columns(
 
 
 def _pair_columns(
-    believed: Rig, truths: list[PairTruth], outcomes: list[Outcome], images: dict[str, dict[str, Any]], rules: Rules
+    nominal: Rig, truths: list[PairTruth], outcomes: list[Outcome], images: dict[str, dict[str, Any]], rules: Rules
 ) -> dict[str, Any]:
     down, up = (images[p] for p in POSITIONS)
     bounds = [_bounds([getattr(t, p) for t in truths], "bound_px2") for p in POSITIONS]
     claims = [errors.usable_covariance(_claimed([_spot(o, p) for o in outcomes])) for p in POSITIONS]
     true_m, h = (np.array([getattr(t, name) for t in truths], float) for name in ("depth_m", "stroke_m"))
-    believed_h = np.array([t.stroke_m if t.believed_stroke_m is None else t.believed_stroke_m for t in truths], float)
+    nominal_h = np.array([t.stroke_m if t.nominal_stroke_m is None else t.nominal_stroke_m for t in truths], float)
     answers, truth = (
         [np.stack([i[u], i[v]], -1) for i in (down, up)] for u, v in (("u_px", "v_px"), ("u_true_px", "v_true_px"))
     )
     calibration = truths[0].calibration_covariance
-    found_m = believed_depth(believed, believed_h, (answers[0], answers[1]), (claims[0], claims[1]), calibration)
+    found_m = nominal_depth(nominal, nominal_h, (answers[0], answers[1]), (claims[0], claims[1]), calibration)
     own, own_sigma = (np.array([_own_depth(o.answer, name) for o in outcomes]) for name in ("depth_m", "sigma_depth_m"))
     has_own = np.isfinite(own)
     own_sigma = np.hypot(own_sigma, found_m.calibration_sigma_m)
@@ -260,7 +260,7 @@ def _pair_columns(
         "depth_counted": np.where(both, counted, np.nan),
         "depth_sigma_m": sigma,
         "depth_pull": (depth - true_m) / np.where(sigma > 0.0, sigma, np.nan),
-        "bound_depth_m2": depth_exact(believed, believed_h, *truth, *bounds).sigma_m ** 2,
+        "bound_depth_m2": depth_exact(nominal, nominal_h, *truth, *bounds).sigma_m ** 2,
         "seconds": [float(o.seconds) for o in outcomes],
         "failure": [o.failure for o in outcomes],
         "message": [o.message for o in outcomes],

@@ -131,7 +131,7 @@ def read_pairs(folder: Path) -> list[PublicPair]:
 
 
 _MATRICES = ("bound_px2", "raw_bound_px2")
-_RIGS = ("true_rig", "believed_rig")
+_RIGS = ("true_rig", "nominal_rig")
 _NOT_SEALED = ("calibration_covariance",)  # a calibration comes with the score, never with the set
 
 

@@ -1,7 +1,7 @@
 """The paper's alignment: with the camera vertical, move the mirror sideways until its image is centred.
 
 The mirror stands right when its centre is on the vertical through the lens. The outline says where it is; what is
-believed of the camera's tilt and principal point says where the vertical is, and is usually the larger doubt.
+nominal of the camera's tilt and principal point says where the vertical is, and is usually the larger doubt.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, UnidentifiedImageError
+from PIL import Image, ImageDraw
 
-from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
+from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.store.files import write_bytes
-from phibench.estimator.calibration.limb_image import ImageError
 from phibench.estimator.calibration.outline import Outline, find_outline
+from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
@@ -49,7 +49,7 @@ class Alignment:
     outline: Outline = field(repr=False)
 
 
-def believed_centre(
+def nominal_centre(
     image: NDArray[Any], whole: Camera, cx_px: float | None = None, cy_px: float | None = None
 ) -> tuple[float, float]:
     """Principal point to believe: as given, or that of the whole camera.
@@ -104,25 +104,6 @@ def alignment(
     sigma_outline = float(np.sqrt(0.5 * (own[0, 0] + own[1, 1])))
     doubt = math.hypot(tilt_sigma_rad, principal_point_sigma_px / camera.fx_px) * float(s[2])
     return Alignment(move, in_camera, move_px, sigma_outline, math.hypot(sigma_outline, doubt), found)
-
-
-def read_picture(path: Path) -> tuple[NDArray[np.uint8], SensorCard]:
-    """Image, shape (H, W, 3), of a PNG or JPEG file, with the card of its kind.
-
-    Raises
-    ------
-    ImageError
-        If the file is no colour picture of 8 bits.
-    """
-    try:
-        with Image.open(path) as picture:
-            kind, mode = picture.format, picture.mode
-            pixels = np.asarray(picture.convert("RGB"))
-    except (UnidentifiedImageError, SyntaxError, EOFError) as error:
-        raise ImageError(f"{path} is not a picture: give a PNG or JPEG file of the camera") from error
-    if mode not in ("RGB", "RGBA") or kind not in ("PNG", "JPEG"):
-        raise ImageError(f"{path} is a {kind} file of mode {mode}: give the camera's colour frame as PNG or JPEG")
-    return pixels, sensor_card("mjpeg" if kind == "JPEG" else "srgb8")
 
 
 def write_alignment_picture(path: Path, image: NDArray[np.uint8], rig: Rig, found: Alignment) -> Path:

@@ -2,11 +2,11 @@
 
 All that is known of a rig in one least-squares fit: priors, the outline, the vertical, and spots at known places.
 
-The unknowns are the parameters of `parameters.PARAMETERS`, as deviations from the believed rig, and the world point of
+The unknowns are the parameters of `parameters.PARAMETERS`, as deviations from the nominal rig, and the world point of
 every calibration spot. The data:
 
-* the prior of every parameter (what the believed numbers are worth);
-* the sphere centre from an outline, 3 numbers. It was found with the believed camera and radius: a camera or radius
+* the prior of every parameter (what the nominal numbers are worth);
+* the sphere centre from an outline, 3 numbers. It was found with the nominal camera and radius: a camera or radius
   off by some per cent moves it, and the fit knows by how much (`apparent_centre`);
 * for every spot, 4 pixel coordinates, its distance D, and its azimuth and height where they were measured.
 
@@ -39,29 +39,29 @@ _DISTANCE_M = 2.5
 _ELEVATIONS_RAD = (-0.35, 0.5)  # walls of a room
 
 
-def apparent_centre(believed: Rig, true: Rig) -> Array:
-    """Sphere centre, camera frame, shape (3,), that the true rig's outline gives with the believed camera and radius.
+def apparent_centre(nominal: Rig, true: Rig) -> Array:
+    """Sphere centre, camera frame, shape (3,), that the true rig's outline gives with the nominal camera and radius.
 
-    The true outline's pixels, as the believed camera sees them, are a cone: its axis and its opening give the centre.
+    The true outline's pixels, as the nominal camera sees them, are a cone: its axis and its opening give the centre.
     """
     uv = true.outline_px(90)
-    rays = believed.camera.rays(uv)
+    rays = nominal.camera.rays(uv)
     x = np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0]  # n / cos a0
     cosine = 1.0 / np.linalg.norm(x)
-    return np.asarray(x * cosine * believed.mirror.radius_m / np.sqrt((1.0 - cosine) * (1.0 + cosine)))
+    return np.asarray(x * cosine * nominal.mirror.radius_m / np.sqrt((1.0 - cosine) * (1.0 + cosine)))
 
 
-def apparent_vertical(believed: Rig, true: Rig) -> Array:
-    """The vertical, x and y in the camera frame, that upright edges all around the true rig give with the believed one.
+def apparent_vertical(nominal: Rig, true: Rig) -> Array:
+    """The vertical, x and y in the camera frame, that upright edges all around the true rig give with the nominal one.
 
     The sphere is where the outline puts it, as `find_vertical` wants it.
     """
-    pose = replace(believed.T_camera_sphere, translation_m=as_vector(apparent_centre(believed, true)))
+    pose = replace(nominal.T_camera_sphere, translation_m=as_vector(apparent_centre(nominal, true)))
     edges = [image_of(true.at(0.0), line).uv_px for line in _lines(true)]
-    return np.asarray(vertical_of(edges, replace(believed, T_camera_sphere=pose)).up[:2])
+    return np.asarray(vertical_of(edges, replace(nominal, T_camera_sphere=pose)).up[:2])
 
 
-def vertical_by_principal_point(believed: Rig) -> Array:
+def vertical_by_principal_point(nominal: Rig) -> Array:
     """Derivative of the apparent vertical by the true principal point, shape (2, 2), rad/px.
 
     Tilt, focal length, radius and distance leave the apparent vertical at the true one, a decentre of 1 mm turns it by
@@ -71,8 +71,8 @@ def vertical_by_principal_point(believed: Rig) -> Array:
     for name in ("cx_px", "cy_px"):
         both = []
         for step in (_STEP_PX, -_STEP_PX):
-            camera = replace(believed.camera, **{name: getattr(believed.camera, name) + step})
-            both.append(apparent_vertical(believed, replace(believed, camera=camera)))
+            camera = replace(nominal.camera, **{name: getattr(nominal.camera, name) + step})
+            both.append(apparent_vertical(nominal, replace(nominal, camera=camera)))
         columns.append((both[0] - both[1]) / (2.0 * _STEP_PX))
     return np.stack(columns, axis=-1)
 
@@ -142,9 +142,9 @@ class Bundle:
     Attributes
     ----------
     rig : Rig
-        The believed rig with its parameters corrected. Stroke scale and offset are in `values`.
+        The nominal rig with its parameters corrected. Stroke scale and offset are in `values`.
     values, covariance : shape (p,), (p, p)
-        Deviations from the believed rig, in the order of `PARAMETERS`.
+        Deviations from the nominal rig, in the order of `PARAMETERS`.
     chi2, degrees : float, int
     undetermined : directions with more than `_WEAK` of the prior's variance left, the weakest first
     """
@@ -167,7 +167,7 @@ class Bundle:
 
 
 def calibrate(
-    believed: Rig,
+    nominal: Rig,
     outline: Measured | None = None,
     spots: Sequence[KnownSpot] = (),
     vertical: Measured | None = None,
@@ -177,26 +177,26 @@ def calibrate(
 
     Parameters
     ----------
-    believed : Rig
+    nominal : Rig
     outline : Measured, optional
-        Sphere centre in the camera frame, found with the believed camera and radius.
+        Sphere centre in the camera frame, found with the nominal camera and radius.
     spots : sequence of KnownSpot
     vertical : Measured, optional
-        The world's vertical in the camera frame, x and y of the unit vector, shape (2,), found with the believed camera
+        The world's vertical in the camera frame, x and y of the unit vector, shape (2,), found with the nominal camera
         and the sphere where the outline is (`find_vertical`): a wrong principal point turns it.
     sigmas : shape (p,), optional
-        Standard deviations of the believed numbers; 0 holds one. `prior_sigmas()` by default.
+        Standard deviations of the nominal numbers; 0 holds one. `prior_sigmas()` by default.
 
     Raises
     ------
     DatasetError
-        If a spot is not seen in the believed rig, or the fit does not come to rest.
+        If a spot is not seen in the nominal rig, or the fit does not come to rest.
     """
     prior = prior_sigmas() if sigmas is None else np.asarray(sigmas, float)
     free = np.flatnonzero(prior > 0.0)
-    turned = np.zeros((2, 2)) if vertical is None else vertical_by_principal_point(believed)
-    problem = _Problem(believed, outline, tuple(spots), vertical, prior, free, turned)
-    start = np.concatenate([np.zeros(free.size), *(_start(believed, spot) for spot in spots)])
+    turned = np.zeros((2, 2)) if vertical is None else vertical_by_principal_point(nominal)
+    problem = _Problem(nominal, outline, tuple(spots), vertical, prior, free, turned)
+    start = np.concatenate([np.zeros(free.size), *(_start(nominal, spot) for spot in spots)])
     found = optimize.least_squares(problem.residuals, start, x_scale="jac", xtol=1e-12, ftol=1e-12)
     if not found.success or not np.isfinite(found.cost):
         raise DatasetError(f"the calibration does not come to rest: {found.message}")
@@ -207,14 +207,14 @@ def calibrate(
     covariance[np.ix_(free, free)] = whole[: free.size, : free.size] * np.outer(prior[free], prior[free])
     degrees = found.fun.size - found.x.size
     weak = _undetermined(whole[: free.size, : free.size], [PARAMETERS[i] for i in free])
-    return Bundle(changed(believed, values), values, covariance, 2.0 * float(found.cost), degrees, weak)
+    return Bundle(changed(nominal, values), values, covariance, 2.0 * float(found.cost), degrees, weak)
 
 
 @dataclass(frozen=True)
 class _Problem:
     """Residuals over their standard deviations. Unknowns: parameters over prior sigma, then points (x, y, z)."""
 
-    believed: Rig
+    nominal: Rig
     outline: Measured | None
     spots: tuple[KnownSpot, ...]
     vertical: Measured | None
@@ -225,13 +225,13 @@ class _Problem:
     def residuals(self, x: Array) -> Array:
         values = np.zeros(len(PARAMETERS))
         values[self.free] = x[: self.free.size] * self.prior[self.free]
-        rig = changed(self.believed, values)
+        rig = changed(self.nominal, values)
         parts = [x[: self.free.size]]
         if self.outline is not None:
-            seen = apparent_centre(self.believed, rig)
+            seen = apparent_centre(self.nominal, rig)
             parts.append(_whitened(seen - self.outline.value, self.outline.covariance))
         if self.vertical is not None:
-            up = rig.T_world_camera.R.T[:2, 2] + self.by_principal_point @ (_centre_px(rig) - _centre_px(self.believed))
+            up = rig.T_world_camera.R.T[:2, 2] + self.by_principal_point @ (_centre_px(rig) - _centre_px(self.nominal))
             parts.append(_whitened(up - self.vertical.value, self.vertical.covariance))
         points = x[self.free.size :].reshape(-1, 3)
         if self.spots:
@@ -283,12 +283,12 @@ def seen_at(view: View, points: Array, near_px: Array) -> Array:
 
 
 def _start(rig: Rig, spot: KnownSpot) -> Array:
-    """World point where the believed rig's rays meet, moved to the known distance."""
+    """World point where the nominal rig's rays meet, moved to the known distance."""
     estimate = depth_exact(rig, spot.stroke_m, np.asarray(spot.uv_down_px), np.asarray(spot.uv_up_px))
     if not np.isfinite(estimate.depth_m):
         raise DatasetError(
             f"a calibration spot at ({spot.uv_down_px[0]:.1f}, {spot.uv_down_px[1]:.1f}) px has no depth with the "
-            "believed rig: its rays miss the mirror or do not meet; check the pixels and the rig"
+            "nominal rig: its rays miss the mirror or do not meet; check the pixels and the rig"
         )
     point, centre = np.array(estimate.point_world_m), rig.at(0.0).sphere_centre_m
     point[:2] = centre[:2] + (point[:2] - centre[:2]) * spot.depth_m / float(estimate.depth_m)
@@ -307,7 +307,7 @@ def _undetermined(covariance: Array, names: Sequence[str]) -> tuple[Direction, .
     return tuple(Direction(part, float(np.sqrt(size[i]))) for part, i in zip(parts, weak, strict=True))
 
 
-def with_radius(measured: Measured, believed_m: float, other_m: float) -> Measured:
+def with_radius(measured: Measured, nominal_m: float, other_m: float) -> Measured:
     """An outline's centre for another radius: R and |s| scale together."""
-    factor = other_m / believed_m
+    factor = other_m / nominal_m
     return replace(measured, value=measured.value * factor, covariance=measured.covariance * factor**2)

@@ -39,7 +39,7 @@ class CalibrationDocument(BaseModel):
     values: list[float]
     covariance: list[list[float]]
     rig: dict[str, Any]
-    believed_rig: dict[str, Any]
+    nominal_rig: dict[str, Any]
     made_from: dict[str, Any]
     chi2: float
     degrees: int
@@ -54,18 +54,18 @@ class Calibration:
     ----------
     rig : Rig
         Corrected; strokes are corrected by `parameters.stroke_of(stroke_m, values)`.
-    believed : Rig
+    nominal : Rig
         What it was before.
     parameters : tuple of str
         Names of `values` and `covariance`: `PARAMETERS`.
-    values : shape (p,), deviations from the believed rig
+    values : shape (p,), deviations from the nominal rig
     covariance : shape (p, p)
     made_from : what the file says of its images
     sha256 : of the file's content
     """
 
     rig: Rig
-    believed: Rig
+    nominal: Rig
     parameters: tuple[str, ...]
     values: Array = field(repr=False)
     covariance: Array = field(repr=False)
@@ -73,7 +73,7 @@ class Calibration:
     sha256: str = ""
 
 
-def write_calibration(path: Path, bundle: Bundle, believed: Rig, made_from: dict[str, Any]) -> Path:
+def write_calibration(path: Path, bundle: Bundle, nominal: Rig, made_from: dict[str, Any]) -> Path:
     """Write a calibration, atomically; `made_from` says in JSON what it was made from."""
     content = {
         "kind": "phibench calibration",
@@ -82,7 +82,7 @@ def write_calibration(path: Path, bundle: Bundle, believed: Rig, made_from: dict
         "values": bundle.values.tolist(),
         "covariance": bundle.covariance.tolist(),
         "rig": to_json(bundle.rig),
-        "believed_rig": to_json(believed),
+        "nominal_rig": to_json(nominal),
         "made_from": made_from,
         "chi2": bundle.chi2,
         "degrees": bundle.degrees,
@@ -90,13 +90,13 @@ def write_calibration(path: Path, bundle: Bundle, believed: Rig, made_from: dict
     return write_text(path, json.dumps({**content, "sha256": _digest(content)}, indent=1, allow_nan=False) + "\n")
 
 
-def read_calibration(path: str | Path, believed: Rig | None = None) -> Calibration:
+def read_calibration(path: str | Path, nominal: Rig | None = None) -> Calibration:
     """Read a calibration.
 
     Parameters
     ----------
     path : path of the file
-    believed : Rig, optional
+    nominal : Rig, optional
         The rig that is to be corrected: the calibration must have started from it.
 
     Raises
@@ -120,15 +120,15 @@ def read_calibration(path: str | Path, believed: Rig | None = None) -> Calibrati
         raise CalibrationError(f"{path} has other parameters than this program's {p}: make it again")
     if document.sha256 != _digest({k: v for k, v in raw.items() if k != "sha256"}):
         raise CalibrationError(f"{path} was changed after it was written: its hash does not fit; make it again")
-    start = from_json(Rig, document.believed_rig)
-    if believed is not None and to_json(believed) != to_json(start):
+    start = from_json(Rig, document.nominal_rig)
+    if nominal is not None and to_json(nominal) != to_json(start):
         raise CalibrationError(f"{path} is the calibration of another rig than the one that it shall correct")
     rig = from_json(Rig, document.rig)
     _require_sound(path, start, rig, values, covariance)
     return Calibration(rig, start, PARAMETERS, values, covariance, document.made_from, document.sha256)
 
 
-def _require_sound(path: Path, believed: Rig, rig: Rig, values: Array, covariance: Array) -> None:
+def _require_sound(path: Path, nominal: Rig, rig: Rig, values: Array, covariance: Array) -> None:
     """Refuse numbers that no calibration gives, whoever has put them into the file."""
     for name, value in zip(PARAMETERS, values.tolist(), strict=True):
         if not abs(value) <= (limit := LIMITS[name]):
@@ -143,11 +143,11 @@ def _require_sound(path: Path, believed: Rig, rig: Rig, values: Array, covarianc
             f"{path} has no covariance: its matrix is not symmetric with eigenvalues of 0 or above; make it again"
         )
     try:
-        same = _close(to_json(changed(believed, values)), to_json(rig))
+        same = _close(to_json(changed(nominal, values)), to_json(rig))
     except SceneError as error:
         raise CalibrationError(f"{path} corrects the rig to one that cannot be: {error}; make it again") from error
     if not same:
-        raise CalibrationError(f"{path} has a rig that is not the believed one with its corrections; make it again")
+        raise CalibrationError(f"{path} has a rig that is not the nominal one with its corrections; make it again")
 
 
 def _close(a: Any, b: Any) -> bool:

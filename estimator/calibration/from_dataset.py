@@ -14,13 +14,13 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.store.files import require_writable
-from phibench.estimator.benchmark.dataset_pairs import pairs_of
 from phibench.estimator.calibration.bundle import Bundle, KnownSpot, calibrate
 from phibench.estimator.calibration.file import write_calibration
 from phibench.estimator.calibration.limb_image import Measured
 from phibench.estimator.calibration.outline import Outline, find_outline, mean_measured, mean_outline
 from phibench.estimator.calibration.spots import Ruler, known_spot, measured_spot, method_for, one_per_pose
 from phibench.estimator.calibration.vertical_edges import find_vertical
+from phibench.estimator.draw_pairs import pairs_of
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.spots.simple_spots import find_spot
 from phibench.scenes.rig import POSITIONS, Rig
@@ -52,7 +52,7 @@ def calibrate_dataset(
     Parameters
     ----------
     folder : Path
-        Data set; its rig is what is believed.
+        Data set; its rig is what is nominal.
     out : Path
     samples : ids; the first of the data set by default
     preset : str
@@ -89,7 +89,7 @@ def calibrate_dataset(
 
 
 def frame_outline(dataset: Dataset, sample: Sample, position: str, preset: str, laser_off: bool = True) -> Outline:
-    """Outline in one drawn frame of a sample, with the believed rig."""
+    """Outline in one drawn frame of a sample, with the nominal rig."""
     image = photograph(dataset, sample, position, preset, laser_off)
     return find_outline(image.pixels, sample.nominal_rig, image.card)
 
@@ -134,14 +134,14 @@ def frame_spots(
     return found
 
 
-def _vertical(images: Sequence[Photograph], outlines: Sequence[Outline], believed: Rig) -> Measured:
+def _vertical(images: Sequence[Photograph], outlines: Sequence[Outline], nominal: Rig) -> Measured:
     """Mean vertical of images whose outlines are known."""
     pairs = zip(images, outlines, strict=True)
-    return mean_measured([find_vertical(i.pixels, o.rig(believed), i.card, o.covariance_m2) for i, o in pairs])
+    return mean_measured([find_vertical(i.pixels, o.rig(nominal), i.card, o.covariance_m2) for i, o in pairs])
 
 
 def _one_rig(samples: Sequence[Sample]) -> Rig:
-    """The rig that is believed in; all samples must have one true rig."""
+    """The rig that is nominal in; all samples must have one true rig."""
     names = sorted({sample.row.rig for sample in samples})
     if len(names) != 1:
         raise DatasetError(f"the samples have {len(names)} rigs ({', '.join(names[:4])}, ...): calibrate one at a time")

@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.signal import fftconvolve
 
-from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig
@@ -38,10 +38,6 @@ JPEG_LUMA = (0.299, 0.587, 0.114)  # JPEG's (ITU-R BT.601): errors of its coarse
 _CLIPPED = 250  # of 255: JPEG moves clipped pixels by some codes
 _NEAR_FULL = 0.97
 _SRGB_KNEE, _SRGB_SLOPE = 0.04045, 12.92  # IEC 61966-2-1
-
-
-class ImageError(DatasetError):
-    """An image that a calibration cannot be made from; the message is one sentence for the person at the terminal."""
 
 
 @dataclass(frozen=True)

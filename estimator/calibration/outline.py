@@ -23,10 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.calibration.limb_image import ImageError, Measured, Plane, planes_of
+from phibench.estimator.calibration.limb_image import Measured, Plane, planes_of
 from phibench.estimator.calibration.outline_fit import OutlinePixels, Step, band, step_from
 from phibench.estimator.calibration.outline_jpeg import JpegAgain
 from phibench.estimator.calibration.outline_start import grey, radii_px, rough_outlines
+from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.rig import Rig
@@ -55,7 +56,7 @@ class Outline:
     ----------
     sphere_in_camera_m : shape (3,), s
     covariance_m2 : shape (3, 3)
-        For radius and camera as believed.
+        For radius and camera as nominal.
     arc : float
         Part of the outline that was used.
     contrast : float
@@ -81,10 +82,10 @@ class Outline:
         """Standard deviations of s, shape (3,)."""
         return np.sqrt(np.diag(self.covariance_m2))
 
-    def rig(self, believed: Rig) -> Rig:
-        """The believed rig with the sphere where its outline is."""
-        pose = replace(believed.T_camera_sphere, translation_m=as_vector(self.sphere_in_camera_m))
-        return replace(believed, T_camera_sphere=pose)
+    def rig(self, nominal: Rig) -> Rig:
+        """The nominal rig with the sphere where its outline is."""
+        pose = replace(nominal.T_camera_sphere, translation_m=as_vector(self.sphere_in_camera_m))
+        return replace(nominal, T_camera_sphere=pose)
 
 
 def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) -> Outline:
@@ -95,7 +96,7 @@ def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) 
     image : array
         See `limb_image.planes_of`.
     rig : Rig
-        Believed: its camera, radius, steel and blur are used; the outline is looked for with 0.7 to 1.4 times the
+        Nominal: its camera, radius, steel and blur are used; the outline is looked for with 0.7 to 1.4 times the
         radius that the rig gives it, anywhere in the image.
     card : SensorCard, optional
         Of the image's preset; none for a layer.

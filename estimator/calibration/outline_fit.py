@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
-from phibench.estimator.calibration.limb_image import ImageError, Limb, Plane, limb_angle_rad, limb_of
+from phibench.estimator.calibration.limb_image import Limb, Plane, limb_angle_rad, limb_of
 from phibench.estimator.geometry.reflection import ray_jacobian
+from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, BoolArray, as_vector
 from phibench.scenes.rig import Rig

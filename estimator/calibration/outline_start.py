@@ -15,14 +15,15 @@ from skimage.feature import canny
 from skimage.measure import CircleModel, EllipseModel, block_reduce, ransac
 from skimage.transform import hough_circle
 
-from phibench.estimator.calibration.limb_image import ImageError, Plane
+from phibench.estimator.calibration.limb_image import Plane
+from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
 Circle = tuple[float, float, float]
 _BLOCK_PX, _CANDIDATES = 4, 6
-_RADII = (0.7, 1.4)  # of the believed rig's outline
+_RADII = (0.7, 1.4)  # of the nominal rig's outline
 _LEAST_RADIUS_PX = 30.0
 _TURNS = 360
 _SEARCH_PX = 12
@@ -54,7 +55,7 @@ def rough_outlines(picture: Array, rig: Rig) -> Iterator[Array]:
         If no circle of about the expected size is found.
     """
     found = 0
-    for circle in [*hough(picture, rig), _believed(rig)]:
+    for circle in [*hough(picture, rig), _nominal(rig)]:
         try:
             points = circle_edges(picture, circle)
         except ImageError:
@@ -75,7 +76,7 @@ def radii_px(rig: Rig) -> tuple[float, float]:
     ImageError
         If no such outline can be seen in the rig's image.
     """
-    camera, radius = rig.camera, _believed(rig)[2]
+    camera, radius = rig.camera, _nominal(rig)[2]
     largest = math.hypot(camera.width_px, camera.height_px)
     if not _LEAST_RADIUS_PX <= radius <= largest:
         raise ImageError(
@@ -104,7 +105,7 @@ def hough(picture: Array, rig: Rig) -> list[Circle]:
     return circles
 
 
-def _believed(rig: Rig) -> Circle:
+def _nominal(rig: Rig) -> Circle:
     outline = rig.outline_px()
     u, v = outline.mean(axis=0)
     return float(u), float(v), 0.5 * float(np.ptp(outline, axis=0).mean())

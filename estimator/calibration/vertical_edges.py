@@ -29,9 +29,10 @@ from skimage.feature import canny
 from skimage.transform import probabilistic_hough_line
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.calibration.limb_image import ImageError, Measured, planes_of
+from phibench.estimator.calibration.limb_image import Measured, planes_of
 from phibench.estimator.calibration.outline_start import grey
 from phibench.estimator.geometry.reflection import reflect
+from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array, Pose
 from phibench.scenes.rig import Rig
 
@@ -173,7 +174,7 @@ def _steepest(across: Array, row: Rows, near: Array, reach_px: float) -> tuple[A
 
 MIN_EDGES = 3
 MAX_TILT_RAD = 0.05
-"""How far the vertical may be from the believed one; farther ones are other lines of the room."""
+"""How far the vertical may be from the nominal one; farther ones are other lines of the room."""
 _PER_M = (0.35, 0.65)  # an edge's inverse distance, as taken and one standard deviation nearer
 _TOGETHER = 6.0  # points of an edge that are wrong together: smoothing, and JPEG's blocks of 8 px
 _SLOPE_LIMIT = 4.0  # of an edge's slope against the others' vertical, over its own sigma
@@ -214,7 +215,7 @@ def find_vertical(
     image : array
         See `limb_image.planes_of`.
     rig : Rig
-        Camera as believed and the sphere where its outline is (`Outline.rig`): a sphere that is 4 um off across the
+        Camera as nominal and the sphere where its outline is (`Outline.rig`): a sphere that is 4 um off across the
         axis turns the vertical by 0.008 degrees.
     card : SensorCard, optional
         Of the image's preset; none for a layer.
@@ -224,7 +225,7 @@ def find_vertical(
     Raises
     ------
     ImageError
-        If fewer than three edges agree on a vertical within 0.05 rad of the believed one.
+        If fewer than three edges agree on a vertical within 0.05 rad of the nominal one.
     """
     edges = edges_of(grey(planes_of(image, card)), rig)
     found = vertical_of(edges, rig)

@@ -54,14 +54,14 @@ def calibrate(
         raise DatasetError("--height-sigma-m and --azimuth-sigma-deg are about calibration spots: give --spots too")
     ruler = Ruler(distance_sigma_m, height_sigma_m, math.radians(azimuth_sigma_deg))
     bundle = calibrate_dataset(directory, out, sample, preset, spots, ruler, vertical)
-    print("correction of the believed rig, metres, radians, pixels or relative, and its standard deviation:")
+    print("correction of the nominal rig, metres, radians, pixels or relative, and its standard deviation:")
     for name, value in zip(PARAMETERS, bundle.values, strict=True):
         print(f"{name:18s} {value:+.3e} +- {bundle.sigmas[name]:.1e}")
     if bundle.undetermined:
-        print("combinations that the data say little about (shares over what was believed of each):")
+        print("combinations that the data say little about (shares over what was nominal of each):")
     for weak in bundle.undetermined:
         parts = ", ".join(f"{name} {share:+.2f}" for name, share in weak.parts.items())
-        print(f"  {parts} ({100.0 * weak.remaining:.0f} % of what was believed is left)")
+        print(f"  {parts} ({100.0 * weak.remaining:.0f} % of what was nominal is left)")
     print(f"{out}: chi2 {bundle.chi2:.2f} for {bundle.degrees} degrees of freedom")
     return 0
 
@@ -102,11 +102,11 @@ def align(
     from phibench.datasets.errors import DatasetError
     from phibench.estimator.calibration.align import (
         alignment,
-        believed_centre,
         in_words,
-        read_picture,
+        nominal_centre,
         write_alignment_picture,
     )
+    from phibench.estimator.spots.image_planes import read_picture
     from phibench.scenes.mirror import SphereMirror
     from phibench.scenes.rig import Rig
 
@@ -117,7 +117,7 @@ def align(
         )
     pixels, card = read_picture(image)
     rig = Rig()
-    centre = believed_centre(pixels, rig.camera, cx_px, cy_px)
+    centre = nominal_centre(pixels, rig.camera, cx_px, cy_px)
     focus_m = 1e-3 * (distance_mm - 0.5 * radius_mm if focus_mm is None else focus_mm)
     camera = replace(
         rig.camera,

@@ -9,11 +9,16 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from cyclopts import App
 
 from phibench.estimator.cli.options import Whole
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from phibench.datasets.read import Sample
 
 dataset = App(name="dataset", help="Make, verify, repair, merge and show data sets, and draw camera frames.")
 
@@ -233,7 +238,7 @@ def panorama(
     from phibench.datasets.read import open_finished
     from phibench.datasets.store.files import require_writable
     from phibench.datasets.store.pictures import save_png
-    from phibench.estimator.geometry.panorama import FAR_M, Grid, picture_of
+    from phibench.estimator.geometry.panorama import FAR_M, Grid
     from phibench.estimator.geometry.panorama import panorama as unroll
 
     grid = Grid(width, *(math.radians(each) for each in elevation_deg))
@@ -243,7 +248,7 @@ def panorama(
     chosen = dataset.samples[0] if sample is None else dataset[sample]
     require_writable(out)
     distance = FAR_M if distance_m is None else distance_m
-    result = unroll(chosen, position, grid, by, distance, picture_of(chosen, position, preset, image))
+    result = unroll(chosen, position, grid, by, distance, _picture(chosen, position, preset, image))
     save_png(out, result.pixels)
     print(
         f"{out}: {grid.width_px} x {grid.height_px} pixels of {360.0 / grid.width_px:g} degrees, "
@@ -266,7 +271,7 @@ def sensitivities(directory: Path, *, out: Path | None = None) -> int:
     """
     from phibench.datasets.read import open_finished
     from phibench.datasets.store import schema as layout
-    from phibench.estimator.paper.paper_tables import ESTIMATORS
+    from phibench.estimator.geometry.estimators import ESTIMATORS
     from phibench.estimator.paper.sensitivity_table import columns, write_sensitivities
 
     dataset = open_finished(directory)
@@ -274,3 +279,11 @@ def sensitivities(directory: Path, *, out: Path | None = None) -> int:
     write_sensitivities(dataset, out)
     print(f"{out}: {len(dataset)} samples x {len(ESTIMATORS)} estimators, {len(columns())} columns")
     return 0
+
+
+def _picture(sample: Sample, position: str, preset: str, file: Path | None) -> NDArray[Any]:
+    """Picture to unroll: a file's, or a frame of the sample."""
+    from phibench.estimator.geometry.panorama import frame
+    from phibench.estimator.spots.image_planes import read_picture
+
+    return frame(sample, position, preset) if file is None else read_picture(file)[0]

@@ -10,7 +10,7 @@ Squares, 1976, ch. 9):
 which is the weighted least-squares point in pixels, calibration included. D is then that of the meeting rays.
 Everything is vectorised over leading axes that broadcast together.
 
-D of two positions through the believed rig, with its predicted error: of the pixels, and of a calibration.
+D of two positions through the nominal rig, with its predicted error: of the pixels, and of a calibration.
 """
 
 from __future__ import annotations
@@ -261,7 +261,7 @@ _ROUND_PX2 = 0.1**2
 
 
 @dataclass(frozen=True)
-class BelievedDepth:
+class NominalDepth:
     """Depths, shape (n,), NaN where there is none.
 
     Attributes
@@ -277,13 +277,13 @@ class BelievedDepth:
     calibration_sigma_m: Array
 
 
-def believed_depth(
+def nominal_depth(
     rig: Rig,
     stroke_m: Array,
     uv_px: tuple[Array, Array],
     covariance_px2: tuple[Array, Array],
     calibration: Array | None,
-) -> BelievedDepth:
+) -> NominalDepth:
     """Depths of pairs of positions, shape (n, 2) each.
 
     Without a calibration the rays' midpoint; with one the weighted point of `depth_general`, and the midpoint where no
@@ -291,14 +291,14 @@ def believed_depth(
     """
     plain = depth_exact(rig, stroke_m, *uv_px, *covariance_px2)
     if calibration is None:
-        return BelievedDepth(plain.depth_m, plain.sigma_m, np.zeros_like(plain.depth_m))
+        return NominalDepth(plain.depth_m, plain.sigma_m, np.zeros_like(plain.depth_m))
     (down, up), (C1, C2) = uv_px, covariance_px2
     general = depth_general(rig, stroke_m, down, up, C1, C2, calibration)
     claimed = np.isfinite(general.sigma_m)
     # equal weights where there is no claim: the calibration's part is then that of round spots of one size
     unclaimed = _calibration_sigma_m(rig, stroke_m, uv_px, calibration)
     part = np.hypot(general.sigma_calibration_m, general.sigma_stroke_m)
-    return BelievedDepth(
+    return NominalDepth(
         np.where(claimed, general.depth_m, plain.depth_m), general.sigma_m, np.where(claimed, part, unclaimed)
     )
 

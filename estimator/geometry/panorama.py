@@ -21,7 +21,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -32,7 +31,6 @@ from scipy.spatial import cKDTree
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import Sample
 from phibench.datasets.store.pictures import exposure_s, to_srgb
-from phibench.estimator.calibration.align import read_picture
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.reflection import reflect
 from phibench.scenes.frames import Array
@@ -120,7 +118,7 @@ def pixels_by_model(view: View, grid: Grid, distance_m: float = FAR_M) -> Array:
     Parameters
     ----------
     view : View
-        Of the rig that is believed.
+        Of the rig that is nominal.
     grid : Grid
     distance_m : float
         Of the scene from the sphere centre.
@@ -219,11 +217,11 @@ def vertical_edges(room: Room, names: tuple[str, ...]) -> Iterator[RoomEdge]:
             yield RoomEdge(f"{shape.name} {'left' if side < 0.0 else 'right'}", low, high)
 
 
-def track(true_view: View, believed_view: View, grid: Grid, edge: RoomEdge) -> Array:
+def track(true_view: View, nominal_view: View, grid: Grid, edge: RoomEdge) -> Array:
     """Columns and rows, shape (n, 2), bottom to top, of an edge that one rig sees and another one unrolls."""
     share = np.linspace(0.0, 1.0, _TRACK)[:, None]
     uv = image_of(true_view, (1.0 - share) * edge.low_m + share * edge.high_m).uv_px
-    places = grid.place(reflect(believed_view, uv).direction_world)
+    places = grid.place(reflect(nominal_view, uv).direction_world)
     places[:, 0] = np.unwrap(places[:, 0], period=grid.width_px)
     return places
 
@@ -387,7 +385,7 @@ def places(sample: Sample, position: str, grid: Grid, by: By = "model", distance
 
 
 def nominal_view(sample: Sample, position: str) -> View:
-    """View of the rig that is believed."""
+    """View of the rig that is nominal."""
     return sample.nominal_rig.at(0.0 if position == "down" else sample.row.nominal_stroke_m)
 
 
@@ -413,14 +411,3 @@ def frame(sample: Sample, position: str, preset: str = LAYERS) -> NDArray[Any]:
         planes, detector = sample.frame(position), sample.rig.camera.detector
         return to_srgb(planes, detector, exposure_s(sample.ambient(position), detector))
     return np.asarray(sample.frame_source(preset).frame(position, 0, True).image)
-
-
-def picture_of(sample: Sample, position: str, preset: str, file: Path | None) -> NDArray[Any]:
-    """Picture to unroll: a file's, or a frame of the sample.
-
-    Raises
-    ------
-    DatasetError
-        As `frame`, and if the file is no colour picture.
-    """
-    return frame(sample, position, preset) if file is None else read_picture(file)[0]

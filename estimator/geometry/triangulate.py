@@ -72,7 +72,7 @@ def depth_exact(
     Parameters
     ----------
     rig : Rig
-        One for both images, the one that is believed: a motion between them (`rig.motion`) is not used.
+        One for both images, the one that is nominal: a motion between them (`rig.motion`) is not used.
     stroke_m : shape (...), h
     uv_down_px, uv_up_px : shape (..., 2), pixels
     covariance_down_px2, covariance_up_px2 : shape (..., 2, 2), of (u, v), independent of each other, both or none

@@ -5,7 +5,7 @@ of both errors is the even part, to which the linear prediction is blind, and ha
 linear one with the third order. The even part matters where the linear part passes through 0: a tilt of half a degree
 does so near h = 0.3 D; the third order adds 28 % to the linear part at D = 2.18 m, h = 0.45 m and takes 14 % off at
 1.4 m. The even part is no scatter about 0: its mean, some -40 mm for a rig as built at D = 2.18 m and h = 0.9 m, is a
-bias of `depth_general`, which takes D at the believed rig.
+bias of `depth_general`, which takes D at the nominal rig.
 
 Predicted error of D against the stroke h, and what stands in the way of a stroke.
 
@@ -65,7 +65,7 @@ def beyond_first_order_m(
 
     Parameters
     ----------
-    rig : Rig, the believed one
+    rig : Rig, the nominal one
     strokes_m : shape (n,), rising
     points_m : shape (m, 3)
     covariance_down_px2, covariance_up_px2 : shapes (1 or n, m, 2, 2)

@@ -30,7 +30,7 @@ from phibench.estimator.spots.simple_spots import SpotPositions
 from phibench.estimator.spots.spot_prediction import SpotBlur, spot_blur
 from phibench.scenes.frames import Array, BoolArray
 
-_REACH_M = (0.3, 20.0)  # distances to which a beam is believed
+_REACH_M = (0.3, 20.0)  # distances to which a beam is nominal
 
 
 def measured_twice(measure: Callable[[float | None], Answer], pair: Pair) -> Answer:

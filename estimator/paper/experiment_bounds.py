@@ -25,10 +25,10 @@ from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.store.files import write_bytes
 from phibench.estimator.benchmark.answer_errors import Rules
-from phibench.estimator.benchmark.dataset_pairs import pairs_of
 from phibench.estimator.benchmark.intervals import Clusters, Estimate, estimates, rate, rms_of, rms_ratio_of
 from phibench.estimator.benchmark.spot_bounds import spot_bounds as bounds_of_spot
 from phibench.estimator.benchmark.tables import one_line
+from phibench.estimator.draw_pairs import pairs_of
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import Beam
@@ -169,8 +169,8 @@ class Budget:
         measured / bound; 1 is the limit.
     within_95 : Estimate
         Share of errors within the predicted interval.
-    believed : float
-        Rms relative error with the rigs as believed.
+    nominal : float
+        Rms relative error with the rigs as nominal.
     """
 
     n: int
@@ -182,7 +182,7 @@ class Budget:
     closure: Estimate
     over_bound: Estimate
     within_95: Estimate
-    believed: float
+    nominal: float
 
 
 def budget(rows: pl.DataFrame, rules: Rules | None = None, seed: int = 0) -> Budget:
@@ -204,11 +204,11 @@ def budget(rows: pl.DataFrame, rules: Rules | None = None, seed: int = 0) -> Bud
         rms_ratio_of(clusters, error2, bound2),
     )
     measured, closure, over = estimates(statistics, clusters.n, rules, generator("budget", seed))
-    believed2 = _squares(found["believed_error"])
-    predicted, bound, believed = (float(np.sqrt(np.mean(x))) for x in (sigma2, bound2, believed2))
+    nominal2 = _squares(found["nominal_error"])
+    predicted, bound, nominal = (float(np.sqrt(np.mean(x))) for x in (sigma2, bound2, nominal2))
     within = rate(clusters, found["within_95"].cast(pl.Float64).to_numpy(), rules)
     numbers = len(found), clusters.n, len(rows) - len(found)
-    return Budget(*numbers, measured, predicted, bound, closure, over, within, believed)
+    return Budget(*numbers, measured, predicted, bound, closure, over, within, nominal)
 
 
 def budgets(rows: pl.DataFrame, by: str, rules: Rules | None = None) -> dict[str, Budget]:
@@ -221,7 +221,7 @@ def budget_table(rows: pl.DataFrame) -> Table:
     """Budgets per experiment and per distance, of all rows, and of those whose bound is at most 1 % of D."""
     grid = Table(title="Relative errors of D in %; 95 % intervals over samples")
     heads = ("rows", "n", "missing", "measured", "predicted", "bound", "predicted / measured", "measured / bound")
-    for head in (*heads, "within 95 %", "as believed"):
+    for head in (*heads, "within 95 %", "as nominal"):
         grid.add_column(head, justify="left" if head == "rows" else "right")
     for name, part in _parts(rows):
         grid.add_row(name, *_cells(budget(part)))
@@ -247,7 +247,7 @@ def _parts(rows: pl.DataFrame) -> Iterator[tuple[str, pl.DataFrame]]:
 def _cells(one: Budget) -> list[str]:
     errors = [one_line(one.measured, 100.0, 3), *(f"{100.0 * x:.3f}" for x in (one.predicted, one.bound))]
     ratios = [one_line(x, 1.0, 2) for x in (one.closure, one.over_bound)]
-    return [str(one.n), str(one.missing), *errors, *ratios, one_line(one.within_95, 100.0, 1), _percent(one.believed)]
+    return [str(one.n), str(one.missing), *errors, *ratios, one_line(one.within_95, 100.0, 1), _percent(one.nominal)]
 
 
 def _percent(share: float) -> str:

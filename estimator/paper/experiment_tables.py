@@ -22,11 +22,12 @@ import polars as pl
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import Dataset, Sample
-from phibench.estimator.benchmark.dataset_pairs import DatasetPairs, pairs_of
+from phibench.estimator.benchmark.dataset_pairs import DatasetPairs
 from phibench.estimator.calibration.bundle import Bundle, calibrate
 from phibench.estimator.calibration.from_dataset import frame_outline, frame_spots
 from phibench.estimator.calibration.outline import mean_outline
 from phibench.estimator.calibration.spots import Ruler, method_for, one_per_pose
+from phibench.estimator.draw_pairs import pairs_of
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
 from phibench.estimator.geometry.status import describe
 from phibench.estimator.interface import OK, Answer, Pair
@@ -47,7 +48,7 @@ COLUMNS: dict[str, str] = {
     "rig": "id of the true rig",
     "draw": "draw of the noise",
     "depth_m": "D",
-    "stroke_m": "stroke as believed before calibration",
+    "stroke_m": "stroke as nominal before calibration",
     "estimate_m": "D from the frames and the calibrated rig",
     "error_m": "estimate_m - depth_m",
     "relative_error": "error_m / depth_m",
@@ -60,7 +61,7 @@ COLUMNS: dict[str, str] = {
     "chi2": "of the two rays' meeting, one degree of freedom",
     "p_value": "probability of a larger chi2",
     "within_95": "whether the error is within 1.96 sigma_m",
-    "believed_error": "relative error with the rig as believed before calibration, same pixels",
+    "nominal_error": "relative error with the rig as nominal before calibration, same pixels",
     "status": "ok, or why there is no estimate",
 }
 
@@ -176,7 +177,7 @@ def measure(dataset: Dataset, samples: Sequence[Sample], bundle: Bundle, procedu
                 "stroke_m": sample.row.nominal_stroke_m,
                 **_estimate(pair, answer, bundle, truth.depth_m),
                 **_bound(truth, bundle),
-                "believed_error": _believed(seen, answer) / truth.depth_m - 1.0,
+                "nominal_error": _nominal(seen, answer) / truth.depth_m - 1.0,
             }
         )
     return [{name: row[name] for name in COLUMNS} for row in rows]
@@ -219,7 +220,7 @@ def _depth_of(pair: Pair, answer: Answer, bundle: Bundle | None) -> GeneralDepth
     return depth_general(pair.rig, pair.stroke_m, down, up, C1, C2, covariance)
 
 
-def _believed(seen: Pair, answer: Answer) -> float:
+def _nominal(seen: Pair, answer: Answer) -> float:
     return float(_depth_of(seen, answer, None).depth_m)
 
 
@@ -236,7 +237,8 @@ def _bound(truth: PairTruth, bundle: Bundle) -> dict[str, float]:
 
 
 def _pairs(dataset: Dataset, samples: Sequence[Sample], procedure: Procedure, draws: int = 1) -> DatasetPairs:
-    return pairs_of(dataset, samples, procedure.preset, draws, procedure.laser_off)
+    drawn = pairs_of(dataset, samples, procedure.preset, draws, procedure.laser_off)
+    return DatasetPairs(drawn.dataset, drawn.takes)
 
 
 def _of_rig(dataset: Dataset, rig: str) -> list[Sample]:

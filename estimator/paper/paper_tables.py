@@ -7,26 +7,23 @@ An estimator takes (rig, stroke, pixel down, pixel up) and returns a `DepthEstim
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 from rich.table import Table
 
 from phibench.estimator.calibration.file import Calibration
+from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
-from phibench.estimator.geometry.paper_depth import depth_approx, depth_paper, find_published
-from phibench.estimator.geometry.phi import CONVENTIONS
+from phibench.estimator.geometry.paper_depth import find_published
 from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.geometry.status import DepthEstimate, Status, describe
-from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.spots.simple_spots import find_spot
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig
 
-Estimator = Callable[[Rig, float, Array, Array], DepthEstimate]
 SOURCES = ("truth", "frame")
 GENERAL = "general"
 """Row of `depth_general`, which takes a calibration's covariance."""
@@ -111,7 +108,7 @@ class _Pixels:
 
 
 @dataclass(frozen=True)
-class _Believed:
+class _Nominal:
     """What an estimator is given besides pixels."""
 
     rig: Rig
@@ -119,31 +116,12 @@ class _Believed:
     covariance: Array | None = None
 
     @classmethod
-    def of(cls, sample: Sample, calibration: Calibration | None) -> _Believed:
+    def of(cls, sample: Sample, calibration: Calibration | None) -> _Nominal:
         """Nominal numbers, or those of a calibration."""
         if calibration is None:
             return cls(sample.nominal_rig, sample.row.nominal_stroke_m)
         stroke_m = float(stroke_of(np.array(sample.row.nominal_stroke_m), calibration.values))
         return cls(calibration.rig, stroke_m, calibration.covariance)
-
-
-def paper_estimator(convention: str, rig: Rig, stroke_m: float, uv_down_px: Array, uv_up_px: Array) -> DepthEstimate:
-    """Eq. (4) with phi in one convention."""
-    phi1, phi2 = _phis(convention, rig, stroke_m, uv_down_px, uv_up_px)
-    return depth_paper(phi1, phi2, stroke_m, rig.mirror.radius_m)
-
-
-def approx_estimator(convention: str, rig: Rig, stroke_m: float, uv_down_px: Array, uv_up_px: Array) -> DepthEstimate:
-    """Eq. (5) with phi in one convention."""
-    phi1, phi2 = _phis(convention, rig, stroke_m, uv_down_px, uv_up_px)
-    return depth_approx(phi1, phi2, stroke_m)
-
-
-ESTIMATORS: dict[str, Estimator] = {
-    **{f"paper_{name}": partial(paper_estimator, name) for name in CONVENTIONS},
-    "approx_ray": partial(approx_estimator, "ray"),
-    "exact": depth_exact,
-}
 
 
 def score(dataset: Dataset, calibration: Calibration | None = None) -> tuple[Score, ...]:
@@ -162,7 +140,7 @@ def score(dataset: Dataset, calibration: Calibration | None = None) -> tuple[Sco
     """
     names = tuple(ESTIMATORS) if calibration is None else (*ESTIMATORS, GENERAL)
     return tuple(
-        _score_one(_Believed.of(sample, calibration), sample.row, name, source, pixels)
+        _score_one(_Nominal.of(sample, calibration), sample.row, name, source, pixels)
         for sample in dataset.samples
         for source in SOURCES
         for pixels in (_pixels(sample, source),)
@@ -214,11 +192,6 @@ def as_records(items: Iterable[Score | Summary]) -> list[dict[str, object]]:
     return [{key: _json_value(value) for key, value in asdict(item).items()} for item in items]
 
 
-def _phis(convention: str, rig: Rig, stroke_m: float, down_px: Array, up_px: Array) -> tuple[Array, Array]:
-    phi = CONVENTIONS[convention]
-    return phi(rig.at(0.0), down_px), phi(rig.at(stroke_m), up_px)
-
-
 def _pixels(sample: Sample, source: str) -> _Pixels:
     nowhere = np.full(2, np.nan)
     for position in POSITIONS:
@@ -233,8 +206,8 @@ def _pixels(sample: Sample, source: str) -> _Pixels:
     return _Pixels(spots["down"].uv_px, spots["up"].uv_px, ", ".join(faults))
 
 
-def _score_one(believed: _Believed, row: Any, name: str, source: str, pixels: _Pixels) -> Score:
-    estimate = _estimate(believed, name, source, pixels)
+def _score_one(nominal: _Nominal, row: Any, name: str, source: str, pixels: _Pixels) -> Score:
+    estimate = _estimate(nominal, name, source, pixels)
     depth = float(estimate.depth_m)
     published = find_published(row.experiment, row.depth_m, row.nominal_stroke_m)
     return Score(
@@ -254,11 +227,11 @@ def _score_one(believed: _Believed, row: Any, name: str, source: str, pixels: _P
     )
 
 
-def _estimate(believed: _Believed, name: str, source: str, pixels: _Pixels) -> DepthEstimate:
+def _estimate(nominal: _Nominal, name: str, source: str, pixels: _Pixels) -> DepthEstimate:
     if name != GENERAL:
-        return ESTIMATORS[name](believed.rig, believed.stroke_m, pixels.down, pixels.up)
+        return ESTIMATORS[name](nominal.rig, nominal.stroke_m, pixels.down, pixels.up)
     C = (CENTROID_SIGMA_PX**2 if source == "frame" else 0.0) * np.eye(2)
-    return depth_general(believed.rig, believed.stroke_m, pixels.down, pixels.up, C, C, believed.covariance)
+    return depth_general(nominal.rig, nominal.stroke_m, pixels.down, pixels.up, C, C, nominal.covariance)
 
 
 def _summary(estimator: str, source: str, items: list[Score]) -> Summary:

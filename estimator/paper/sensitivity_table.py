@@ -13,8 +13,8 @@ from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.datasets.store import schema as layout
 from phibench.datasets.store.documents import metadata_of, sensitivity_fault
 from phibench.datasets.store.files import write_bytes
+from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.sensitivities import PARAMETERS, sensitivity
-from phibench.estimator.paper.paper_tables import ESTIMATORS
 from phibench.scenes.rig import POSITIONS
 
 Row = dict[str, str | float | None]

@@ -15,18 +15,26 @@ The sRGB curve (IEC 61966-2-1) as an estimator needs it: forwards, backwards, an
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image as PillowImage
+from PIL import UnidentifiedImageError
 
-from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.estimator.interface import Box, Image
 from phibench.estimator.spots.raw_pixels import bayer_filters, raw_electrons
 from phibench.scenes.frames import Array, BoolArray
 
 _TOP_CODE = 254  # of 8 bits: from here on a pixel may be cut
 _DEMOSAIC_VARIANCE_PX2 = 0.5  # of bilinear interpolation's kernel (1/2, 1, 1/2), per axis
+
+
+class ImageError(DatasetError):
+    """An image that cannot be used; the message is one sentence for the person at the terminal."""
 
 
 @dataclass(frozen=True)
@@ -286,3 +294,22 @@ def noisy(mean: Array, sigma: Array) -> NoisyCode:
     by_mean = f @ (_WEIGHTS * _NODES) / sigma
     by_sigma = f @ (_WEIGHTS * (_NODES**2 - 1.0)) / sigma
     return NoisyCode(first, by_mean, by_sigma, (f - first[..., None]) ** 2 @ _WEIGHTS)
+
+
+def read_picture(path: Path) -> tuple[NDArray[np.uint8], SensorCard]:
+    """Image, shape (H, W, 3), of a PNG or JPEG file, with the card of its kind.
+
+    Raises
+    ------
+    ImageError
+        If the file is no colour picture of 8 bits.
+    """
+    try:
+        with PillowImage.open(path) as picture:
+            kind, mode = picture.format, picture.mode
+            pixels = np.asarray(picture.convert("RGB"))
+    except (UnidentifiedImageError, SyntaxError, EOFError) as error:
+        raise ImageError(f"{path} is not a picture: give a PNG or JPEG file of the camera") from error
+    if mode not in ("RGB", "RGBA") or kind not in ("PNG", "JPEG"):
+        raise ImageError(f"{path} is a {kind} file of mode {mode}: give the camera's colour frame as PNG or JPEG")
+    return pixels, sensor_card("mjpeg" if kind == "JPEG" else "srgb8")

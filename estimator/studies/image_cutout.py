@@ -143,7 +143,7 @@ class Shot:
 
 
 def taken(
-    number: int, shot: Shot, pair: SpotPair, believed: tuple[Rig, float], names: tuple[Name, ...], box_px: int
+    number: int, shot: Shot, pair: SpotPair, nominal: tuple[Rig, float], names: tuple[Name, ...], box_px: int
 ) -> Pair:
     """One draw of a pair with laser-off frames and boxes, as a method sees it.
 
@@ -152,7 +152,7 @@ def taken(
     number : int
     shot : Shot
     pair : SpotPair
-    believed : rig, cut, and stroke that the user believes in
+    nominal : rig, cut, and stroke that the user believes in
     names : of the noise's stream, the draw last; the camera's pattern is that of the draw, too
     box_px : side of the boxes around the spots
     """
@@ -164,7 +164,7 @@ def taken(
             images[key] = side.chain.frame(light, _stream(names, position, word))
             images[key].flags.writeable = False
     box_down, box_up = (_box(names, p, pair.views[p].truth, side_px=box_px, rig=pair.rig) for p in POSITIONS)
-    rig, stroke_m = believed
+    rig, stroke_m = nominal
     return Pair(
         number,
         **images,
@@ -183,7 +183,7 @@ def without_off(pair: Pair) -> Pair:
 
 
 def truth_of(
-    number: int, shot: Shot, pair: SpotPair, believed: tuple[Rig, float], bounds: dict[str, SpotBounds], draw: int
+    number: int, shot: Shot, pair: SpotPair, nominal: tuple[Rig, float], bounds: dict[str, SpotBounds], draw: int
 ) -> PairTruth:
     """The exact answer to a drawn pair."""
     sensor = shot.sensor
@@ -198,10 +198,10 @@ def truth_of(
         depth_m=pair.depth_m,
         stroke_m=pair.stroke_m,
         true_rig=pair.rig,
-        believed_rig=believed[0],
+        nominal_rig=nominal[0],
         down=down,
         up=up,
-        believed_stroke_m=believed[1],
+        nominal_stroke_m=nominal[1],
     )
 
 

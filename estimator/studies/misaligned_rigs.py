@@ -14,7 +14,7 @@ The prediction against rendered spots: D from the centroids of noise-free spot l
 What a calibration makes of a misaligned rig: simulated measurements in, `bundle.calibrate` out.
 
 Measured are the outline of the mirror, and a few laser spots at known distances with the study's own stroke. What is
-believed beforehand is the nominal rig, each number as good as the study's magnitude says.
+nominal beforehand is the nominal rig, each number as good as the study's magnitude says.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ import numpy as np
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.calibration.bundle import Bundle, KnownSpot, apparent_centre, calibrate
 from phibench.estimator.calibration.limb_image import Measured
+from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.rig_parameters import PRIOR_SIGMA, prior_sigmas
 from phibench.estimator.geometry.sensitivities import PARAMETERS as ANALYTIC
 from phibench.estimator.geometry.sensitivities import sensitivity
 from phibench.estimator.geometry.triangulate import depth_exact, exact_gradient
-from phibench.estimator.paper.paper_tables import ESTIMATORS
 from phibench.render.optics.reflection_point import reflection_points
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.scenes.frames import Array
@@ -349,10 +349,10 @@ class Bench:
             for d, u, each in zip(down, up, D, strict=True)
         ]
         measured = Measured(outline, np.diag(np.square(self.outline_sigma_m)))
-        return calibrate(nominal, measured, spots, sigmas=believed_sigmas(nominal))
+        return calibrate(nominal, measured, spots, sigmas=nominal_sigmas(nominal))
 
 
-def believed_sigmas(nominal: Rig) -> Array:
+def nominal_sigmas(nominal: Rig) -> Array:
     """Priors, shape (p,): the study's magnitudes, or the calibration's own where they are larger."""
     focal_px = nominal.camera.fx_px * PARAMETERS["focal_relative"].study
     study = {name: PARAMETERS[_SAME.get(name, name)].study for name in PRIOR_SIGMA if name != "f_px"}

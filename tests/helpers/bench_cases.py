@@ -39,7 +39,7 @@ class Cases:
     def pair(self, number: int) -> Pair:
         truth = self.truths[number]
         images = {p: image_of(getattr(truth, p)) for p in ("down", "up")}
-        return Pair(number, **images, rig=truth.believed_rig, stroke_m=truth.stroke_m, card=sensor_card("mjpeg"))
+        return Pair(number, **images, rig=truth.nominal_rig, stroke_m=truth.stroke_m, card=sensor_card("mjpeg"))
 
     def document(self) -> dict[str, object]:
         return {"name": self.name, "task_version": 2, "sha256": "0" * 64, "draws": 1}

@@ -139,7 +139,7 @@ class Explanation(Settings):
 
 @dataclass(frozen=True)
 class Model:
-    """An explanation with priors, data and the believed rig: what a sampler needs.
+    """An explanation with priors, data and the nominal rig: what a sampler needs.
 
     Parameters
     ----------

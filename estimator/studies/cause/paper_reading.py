@@ -188,7 +188,7 @@ def sphere_image_px(parameters: Parameters, rig: Rig) -> tuple[Array, Array]:
 def inverse_depth(
     parameters: Parameters, experiments: Experiments, reader: Reader, rig: Rig, down_px: Array, up_px: Array
 ) -> Array:
-    """1 / D by equation (4), or (5), from radii, shape (..., n); the printed stroke and the believed rig are used."""
+    """1 / D by equation (4), or (5), from radii, shape (..., n); the printed stroke and the nominal rig are used."""
     R, h = rig.mirror.radius_m, experiments.stroke_m
     phi = phi_of(parameters, reader, rig, np.stack([down_px, up_px]))
     (S1, S2), (C1, C2) = np.sin(2.0 * phi), np.cos(2.0 * phi)

@@ -65,7 +65,7 @@ def epipolar_line(
     Parameters
     ----------
     nominal : Rig
-        Believed: centre of the mirror's image, and the panorama.
+        Nominal: centre of the mirror's image, and the panorama.
     true : Rig
     stroke_m : float, true
     down_point_m : shape (3,)

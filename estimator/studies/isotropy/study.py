@@ -398,10 +398,10 @@ def _edges(settings: IsotropySettings, dataset: Dataset) -> tuple[SeenEdge, ...]
     """Upright edges in the down view's noise-free panorama, unrolled with the nominal rig."""
     sample: Sample = dataset.samples[0]
     grid = Grid(settings.panorama_width_px, _LOW_RAD, _HIGH_RAD)
-    believed = sample.nominal_rig.at(0.0)
-    image = unrolled(np.asarray(sample.ambient("down"), float).sum(axis=0), pixels_by_model(believed, grid))
+    nominal = sample.nominal_rig.at(0.0)
+    image = unrolled(np.asarray(sample.ambient("down"), float).sum(axis=0), pixels_by_model(nominal, grid))
     edges = vertical_edges(dataset.room, settings.edges)
-    found = (seen_edge(image, grid, e.name, track(sample.rig.at(0.0), believed, grid, e)) for e in edges)
+    found = (seen_edge(image, grid, e.name, track(sample.rig.at(0.0), nominal, grid, e)) for e in edges)
     return tuple(edge for edge in found if edge is not None)
 
 

@@ -167,10 +167,10 @@ def cell_records(cell: Cell) -> pl.DataFrame:
         steady = bounds_of(shot, spot) if shot.sensor.speckle_m is None else None
         for draw in range(cell.draws):
             names = (*NAMES, cell.sample, k, draw)
-            number, believed = k * cell.draws + draw, (spot.rig, spot.stroke_m)
+            number, nominal = k * cell.draws + draw, (spot.rig, spot.stroke_m)
             bounds = steady or bounds_of(shot, spot, names)
-            truths.append(truth_of(number, shot, spot, believed, bounds, draw))
-            pairs.append(taken(number, shot, spot, believed, names, cell.box_px))
+            truths.append(truth_of(number, shot, spot, nominal, bounds, draw))
+            pairs.append(taken(number, shot, spot, nominal, names, cell.box_px))
     answers = [answered(pair, cell.methods) for pair in pairs]
     tables = []
     for name in answers[0]:

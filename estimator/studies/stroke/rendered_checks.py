@@ -1,4 +1,4 @@
-"""Frames of a spot at a distance and a stroke, taken by rigs that are not what is believed, and the error of D.
+"""Frames of a spot at a distance and a stroke, taken by rigs that are not what is nominal, and the error of D.
 
 The spot's light is rendered for every rig; the wall behind it is flat light, as strong as the lab's.
 
@@ -136,29 +136,29 @@ def _results(checks: Sequence[Check], workers: int) -> Iterator[Checked]:
 
 def measured(check: Check) -> Checked:
     """Draw and evaluate all frames of a check."""
-    believed = Rig()
-    answers = [_answer(check, believed, k) for k in range(check.draws)]
+    nominal = Rig()
+    answers = [_answer(check, nominal, k) for k in range(check.draws)]
     found = [a for a in answers if a is not None]
     if not found:
         return Checked(check, ())
     true, down, up, C_down, C_up = (np.array(column) for column in zip(*found, strict=True))
-    depth = depth_general(believed, check.stroke_m, down, up, C_down, C_up, np.array(check.covariance)).depth_m
+    depth = depth_general(nominal, check.stroke_m, down, up, C_down, C_up, np.array(check.covariance)).depth_m
     errors = depth - true
     return Checked(check, tuple(errors[np.isfinite(errors)].tolist()))
 
 
-def _answer(check: Check, believed: Rig, draw: int) -> tuple[float, Array, Array, Array, Array] | None:
+def _answer(check: Check, nominal: Rig, draw: int) -> tuple[float, Array, Array, Array, Array] | None:
     """True D, positions in the whole image and claimed covariances of one draw; None if a spot is not found."""
     names = (*_NAMES, check.tolerance, f"{check.depth_m:.6f}", f"{check.stroke_m:.6f}", draw)
     values = deviations(np.array(check.covariance), (*_NAMES, check.tolerance, f"{check.depth_m:.6f}", draw))
-    true, stroke_m = changed(believed, values), float(stroke_of(np.array(check.stroke_m), values))
-    spot = _spot(check, believed, 2.0 * math.pi * (draw * _TURN % 1.0))
+    true, stroke_m = changed(nominal, values), float(stroke_of(np.array(check.stroke_m), values))
+    spot = _spot(check, nominal, 2.0 * math.pi * (draw * _TURN % 1.0))
     uv = [_pixel(true, stroke_m, spot, p) for p in POSITIONS]
-    camera = believed.camera
+    camera = nominal.camera
     region = cut_region(uv, (camera.height_px, camera.width_px), _MARGIN_PX)
     flat = np.broadcast_to(np.array(ROOM_E_PER_S)[:, None, None], (3, *region.shape))
     pair = SpotPair.of(cut_rig(true, region), stroke_m, spot, _ROOM, dict.fromkeys(POSITIONS, flat), str(draw))
-    seen = taken(draw, Shot(sensor(check.preset)), pair, (cut_rig(believed, region), check.stroke_m), names, _BOX_PX)
+    seen = taken(draw, Shot(sensor(check.preset)), pair, (cut_rig(nominal, region), check.stroke_m), names, _BOX_PX)
     answer = METHODS[METHOD[check.preset]](without_off(seen))
     spots = (answer.down, answer.up)
     if any(one.uv_px is None or one.covariance_px2 is None for one in spots):

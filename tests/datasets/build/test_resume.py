@@ -1,0 +1,212 @@
+"""Going on where a run ended: only what changed or was lost is made again, with the bytes of an undisturbed run."""
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from helpers.folders import contents, done
+from helpers.processes import TINY, living, quiet, said
+
+from phibench.datasets.build.journal import Entry, Head, Journal
+from phibench.datasets.build.run_tasks import claim
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.make import make
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.files import TEMPORARY_PREFIX, only_run
+from phibench.datasets.store.provenance import _tables, closure, code_behind
+
+RUN = (
+    "import sys\nfrom phibench.datasets.make import make\n"
+    "if __name__ == '__main__':\n    make(sys.argv[1], sys.argv[2], workers=2)"
+)
+
+
+@pytest.fixture
+def copy(tiny_dataset: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
+
+
+def again(out: Path, *changes: tuple[str, str]) -> list[str]:
+    """Make with a changed recipe; the tasks that were done."""
+    text = TINY.read_text()
+    for old, new in changes:
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    recipe = out.parent / "changed.toml"
+    recipe.write_text(text)
+    (out / layout.LOG).write_text("")
+    make(recipe, out, workers=1, console=quiet())
+    return done(out)
+
+
+@pytest.mark.usefixtures("inline")
+def test_bytes_do_not_depend_on_who_does_the_work(tiny_dataset: Path, tmp_path: Path) -> None:
+    assert contents(make(TINY, tmp_path / "out", workers=1, console=quiet())) == contents(tiny_dataset)
+
+
+SAMPLES = ["sample half-hidden-h1.400", "sample seen-near-h0.500"]
+SPOTS = ["spot half-hidden-h1.400", "spot seen-near-h0.500"]
+BAKE = ["bake room"]
+VIEWS = ["view h0.000", "view h0.500", "view h1.400"]
+
+
+@pytest.mark.usefixtures("inline")
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("seed = 0", "seed = 0  # a comment", []),
+        ("depth_m = 1.975", "depth_m = 1.975\ndiameter_m = 6e-3", [SAMPLES[1], SPOTS[1]]),
+        ("bounces = 2", "bounces = 1", BAKE + SAMPLES + VIEWS),
+        ("cells_per_pixel = 2", "cells_per_pixel = 3", SAMPLES + VIEWS),
+        ("seed = 0", "seed = 1", SAMPLES + VIEWS),
+        ("[ambient]", "[laser]\npower_w = 2e-3\n\n[ambient]", SAMPLES + SPOTS),
+        ("[0.5]", "[0.6]", ["sample seen-near-h0.600", "spot seen-near-h0.600", "view h0.600"]),
+        ("[0.5]", "[0.5, 1.4]", ["sample seen-near-h1.400", "spot seen-near-h1.400"]),
+    ],
+)
+def test_only_what_a_change_changes_is_made_again(copy: Path, old: str, new: str, expected: list[str]) -> None:
+    assert again(copy, (old, new)) == expected
+    fresh = make(copy.parent / "changed.toml", copy.parent / "fresh", workers=1, console=quiet())
+    assert contents(copy) == contents(fresh)  # also: nothing of what was removed is left
+
+
+@pytest.mark.usefixtures("inline")
+def test_a_room_whose_lamps_go_out_loses_its_light_map(copy: Path) -> None:
+    assert "bake room" not in again(copy, ("[ambient]", '[room]\nname = "dark"\n\n[ambient]'))
+    assert not (copy / layout.LIGHT_MAP).exists()
+    assert layout.LIGHT_MAP not in (copy / layout.SUMS).read_text()
+
+
+@pytest.mark.usefixtures("inline")
+def test_names_and_times_of_files_prove_nothing(copy: Path) -> None:
+    spot = copy / layout.spot_file("seen-near-h0.500", "up")
+    for when in (0.0, time.time() + 1e8):
+        for path in copy.rglob("*"):
+            os.utime(path, (when, when))
+        assert again(copy) == []
+    data = spot.read_bytes()
+    spot.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    os.utime(spot, (0.0, 0.0))
+    assert again(copy) == [SPOTS[1]]
+    assert spot.read_bytes() == data
+
+
+@pytest.mark.usefixtures("inline")
+@pytest.mark.parametrize("line", range(1, 9))
+def test_a_damaged_line_of_the_journal_costs_its_task_only(copy: Path, tiny_dataset: Path, line: int) -> None:
+    lines = (copy / layout.JOURNAL).read_bytes().splitlines(keepends=True)
+    assert len(lines) == 9
+    lines[line] = lines[line].replace(b'"', b"'", 1)
+    (copy / layout.JOURNAL).write_bytes(b"".join(lines))
+    assert len(again(copy)) == 1
+    assert contents(copy) == contents(tiny_dataset)
+
+
+def test_a_torn_last_line_is_as_if_it_were_not_there(tmp_path: Path) -> None:
+    with Journal(tmp_path) as journal:
+        journal.begin(Head("{}", ""), [])
+        journal.add(Entry("view a", "k", {"f": "0"}))
+        journal.add(Entry("view b", "k", {"g": "0"}, [1.5, None]))
+    whole = (tmp_path / layout.JOURNAL).read_bytes()
+    start = whole.index(b"view b")
+    for end in range(start, len(whole) - 1):
+        (tmp_path / layout.JOURNAL).write_bytes(whole[:end])
+        assert list(Journal(tmp_path).entries) == ["view a"]
+    (tmp_path / layout.JOURNAL).write_bytes(whole)
+    assert Journal(tmp_path).entries["view b"] == Entry("view b", "k", {"g": "0"}, [1.5, None])
+
+
+def test_a_key_covers_the_code_behind_a_task_and_no_other() -> None:
+    view, spot = closure("phibench.datasets.build.view_task"), closure("phibench.datasets.build.spot_task")
+    assert {"phibench.render.room.ambient", "phibench.scenes.camera", "phibench.datasets.store.layers"} <= view
+    assert "phibench.render.optics.certificate" in spot - view
+    assert "phibench.render.room.ambient" in view - spot
+    assert not {"phibench.datasets.make", "phibench.datasets.progress", "phibench.datasets.build.workers"} & (
+        view | spot
+    )
+    # the sensor's numbers, which the noise budget takes from a table beside the code
+    assert "phibench.render.sensor.settings" in view - spot
+    assert [path.name for path in _tables("phibench.render.sensor.settings")] == ["sensor_presets.toml"]
+    assert code_behind("phibench.datasets.build.view_task") != code_behind("phibench.datasets.build.spot_task")
+
+
+# Two runs into one folder, and runs that are killed.
+
+
+def start(out: Path, recipe: Path = TINY) -> "subprocess.Popen[str]":
+    command = [sys.executable, "-c", RUN, str(recipe), str(out)]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True, text=True)
+
+
+def test_a_second_run_is_refused_and_a_killed_one_holds_nothing(tmp_path: Path) -> None:
+    code = (
+        "import sys, time\nfrom pathlib import Path\nfrom phibench.datasets.store.files import only_run\n"
+        "with only_run(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        with pytest.raises(DatasetError, match=rf"another run \(process {holder.pid}\) is writing") as caught:
+            make(TINY, tmp_path, workers=1, console=quiet())
+        assert "\n" not in str(caught.value)
+        holder.kill()
+    with only_run(tmp_path):
+        pass
+
+
+def test_what_a_run_leaves_that_is_killed_at_once_is_no_obstacle(tmp_path: Path) -> None:
+    for name in (layout.LOCK, layout.WORKING, f"{TEMPORARY_PREFIX}probe", f"{TEMPORARY_PREFIX}abc.txt"):
+        (tmp_path / name).write_bytes(b"")
+    claim(tmp_path, "tiny")
+    (tmp_path / "mine.txt").write_bytes(b"")
+    with pytest.raises(DatasetError, match="holds no data set"):
+        claim(tmp_path, "tiny")
+
+
+def kill_and_repeat(out: Path, kills: int, seed: int) -> int:
+    """Kill runs at random moments, then let one end; the number that were killed before their end."""
+    moments, killed = random.Random(seed), 0
+    for _ in range(kills):
+        with start(out) as child:
+            time.sleep(moments.uniform(0.5, 5.0))
+            killed += child.poll() is None
+            child.kill()  # the parent only: its workers must leave by themselves
+            child.communicate(timeout=60)
+    with start(out) as child:
+        _, errors = child.communicate(timeout=300)
+        assert child.returncode == 0, errors
+    deadline = time.monotonic() + 20.0
+    while (left := living(child.pid)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert left == []
+    return killed
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs /proc")
+@pytest.mark.parametrize("kills", [3, pytest.param(24, marks=pytest.mark.slow)])
+def test_killed_runs_end_in_the_same_bytes(tiny_dataset: Path, tmp_path: Path, kills: int) -> None:
+    out = tmp_path / "out"
+    killed = kill_and_repeat(out, kills, seed=kills)
+    assert killed >= max(1, kills // 4)  # a quick machine may end a run before its moment comes
+    assert contents(out) == contents(tiny_dataset)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_runs_killed_one_by_one_from_the_start_lose_nothing(tiny_dataset: Path, tmp_path: Path, seed: int) -> None:
+    """Each kill, of the whole process group, meets a folder that was begun anew: early and late moments are met."""
+    moments = random.Random(seed)
+    for attempt in range(7):
+        out = tmp_path / str(attempt)
+        with start(out) as child:
+            time.sleep(moments.uniform(3.0, 12.0))
+            os.killpg(child.pid, signal.SIGKILL)
+            child.communicate(timeout=60)
+        make(TINY, out, workers=2, console=(console := quiet()))
+        assert contents(out) == contents(tiny_dataset), said(console)

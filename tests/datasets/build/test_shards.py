@@ -1,0 +1,101 @@
+"""Shards: any division gives the bytes of an undivided run, and a merge of what does not fit is refused."""
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from helpers.folders import contents
+from helpers.processes import TINY, quiet
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.make import make
+from phibench.datasets.merge_repair import merge
+from phibench.datasets.plan.plan import make_plan, shard_plan
+from phibench.datasets.read import open_dataset
+from phibench.datasets.recipe.load import load_recipe
+from phibench.datasets.store import schema as layout
+from phibench.datasets.verify import verify
+from phibench.scenes.rig import POSITIONS
+
+
+@pytest.fixture
+def shards(tiny_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, inline: None) -> list[Path]:
+    return [make(TINY, tmp_path / f"s{i}", workers=1, console=quiet(), shard=f"{i}/2") for i in (1, 2)]
+
+
+def test_merged_shards_are_the_undivided_run(shards: list[Path], tiny_dataset: Path, tmp_path: Path) -> None:
+    for order in (shards, shards[::-1]):
+        out = merge(tmp_path / order[0].name / "merged", order, quiet())
+        assert contents(out) == contents(tiny_dataset)
+        merge(out, order, quiet())  # again, into the same folder
+        assert contents(out) == contents(tiny_dataset)
+        shutil.rmtree(out)
+
+
+def test_a_shard_is_a_data_set(shards: list[Path]) -> None:
+    for i, shard in enumerate(shards, 1):
+        dataset = open_dataset(shard)
+        assert (len(dataset), len(dataset.info.poses), dataset.info.shard) == (1, 2, f"{i}/2")
+        assert dataset.samples[0].frame("up").shape == (3, 180, 320)
+        assert verify(shard, console=quiet()).faults == ()
+
+
+def test_a_merged_folder_goes_on_as_a_made_one(shards: list[Path], tmp_path: Path) -> None:
+    out = merge(tmp_path / "merged", shards, quiet())
+    console = quiet()
+    make(TINY, out, workers=1, console=console)
+    assert "nothing to do" in console.file.getvalue()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 7, 25])
+def test_every_sample_has_one_owner(n: int) -> None:
+    whole = make_plan(load_recipe("paper"))
+    parts = [shard_plan(whole, f"{i}/{n}") for i in range(1, n + 1)]
+    assert [pair for part in parts for pair in part.pairs] == list(whole.pairs)
+    sizes = [len(part.pairs) for part in parts]
+    assert max(sizes) - min(sizes) <= 1
+    for part in parts:
+        assert {pose.pose_id for pose in part.poses} == {pair.pose_id(p) for pair in part.pairs for p in POSITIONS}
+        assert set(part.poses) <= set(whole.poses)  # seeds come from names
+
+
+@pytest.mark.parametrize("shard", ["", "1", "0/2", "3/2", "1/0", "a/b", "-1/2", "1/2/3", "1.0/2"])
+def test_what_is_no_shard_is_refused(shard: str) -> None:
+    with pytest.raises(DatasetError, match="must be i/n"):
+        shard_plan(make_plan(load_recipe("smoke")), shard)
+
+
+def test_an_empty_shard_is_refused() -> None:
+    with pytest.raises(DatasetError, match="shard 1/9 is empty: there are 3 samples"):
+        shard_plan(make_plan(load_recipe("smoke")), "1/9")
+
+
+def refusal(out: Path, shards: Sequence[Path]) -> str:
+    with pytest.raises(DatasetError) as caught:
+        merge(out, shards, quiet())
+    assert not (out / layout.SUMS).exists()
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_what_does_not_fit_is_refused(shards: list[Path], tmp_path: Path) -> None:
+    first, second = shards
+    out = tmp_path / "merged"
+    assert "give the folders" in refusal(out, [])
+    assert "shard 2/2 is missing" in refusal(out, [first])
+    assert "shard 1/2 is given more than once" in refusal(out, [first, first, second])
+    third = make(TINY, tmp_path / "s3", workers=1, console=quiet(), shard="1/1")
+    assert "different divisions" in refusal(out, [first, second, third])
+    other = tmp_path / "other.toml"
+    other.write_text(TINY.read_text().replace("bounces = 2", "bounces = 1"))
+    make(other, tmp_path / "s4", workers=1, console=quiet(), shard="2/2")
+    assert "are of different recipes" in refusal(out, [first, tmp_path / "s4"])
+    assert "is not a finished shard" in refusal(out, [first, tmp_path / "none"])
+    file = second / layout.spot_file("half-hidden-h1.400", "up")
+    file.write_bytes(file.read_bytes()[:-1])
+    assert "is damaged; run `phibench dataset repair`" in refusal(out, shards)
+    file.unlink()
+    assert "is missing; run `phibench dataset repair`" in refusal(out, shards)
+    (second / layout.SUMS).unlink()
+    assert "is not a finished shard" in refusal(out, shards)

@@ -1,0 +1,240 @@
+"""Real workers: faults and deaths, nobody left behind, and a scheduler of others on the loopback device."""
+
+import contextlib
+import json
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from helpers.folders import contents
+from helpers.processes import TINY, living, quiet, said, wait_for
+
+from phibench.datasets.build import workers as cluster
+from phibench.datasets.build.scheduler import dispatch
+from phibench.datasets.build.tasks import Done, Failed, Made, Task
+from phibench.datasets.build.workers import _checked, describe, local_environment, local_workers
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.make import make
+from phibench.datasets.store import schema as layout
+
+ROOT = Path(__file__).resolve().parents[3]
+PAGE = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
+BIN = Path(sys.executable).parent
+
+
+def square(out: Path, number: int) -> Made:
+    time.sleep(0.05)
+    return Made((), number * number)
+
+
+def die(out: Path, signum: int) -> Made:
+    time.sleep(0.2)
+    os.kill(os.getpid(), signum)
+    time.sleep(60.0)
+    return Made(())
+
+
+def bug(out: Path) -> Made:
+    raise ZeroDivisionError
+
+
+def told(out: Path) -> Made:
+    raise DatasetError("no such spot")
+
+
+def tasks() -> list[Task]:
+    """Twelve innocents, two that kill their worker, two with faults, one that needs a killer."""
+    innocent = [Task(f"square {i}", "", square, (i,)) for i in range(12)]
+    guilty = [
+        Task("kill 9", "", die, (9,)),
+        Task("kill 11", "", die, (11,)),
+        Task("bug", "", bug),
+        Task("told", "", told),
+    ]
+    return [*innocent[:3], *guilty, *innocent[3:], Task("reader", "", square, (1,), ("kill 9",))]
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_who_kills_workers_is_named_and_all_others_finish(tmp_path: Path, count: int) -> None:
+    with local_workers(count, tmp_path) as workers:
+        outcomes = {task.name: outcome for task, outcome in dispatch(tasks(), workers)}
+    good = {name: outcome.result for name, outcome in outcomes.items() if isinstance(outcome, Done)}
+    assert good == {f"square {i}": i * i for i in range(12)}
+    causes = {name: outcome.cause for name, outcome in outcomes.items() if isinstance(outcome, Failed)}
+    assert "died every time, 3 in all (was killed by signal 9)" in causes["kill 9"]
+    assert "died every time, 3 in all (was killed by signal 11)" in causes["kill 11"]
+    assert "ZeroDivisionError" in causes["bug"]
+    assert causes["told"] == "no such spot"
+    assert causes["reader"] == "not made, because kill 9 failed"
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs /proc")
+def test_workers_leave_when_their_parent_is_killed(tmp_path: Path) -> None:
+    code = (
+        "import sys, time\nfrom pathlib import Path\nfrom phibench.datasets.build.workers import local_workers\n"
+        "if __name__ == '__main__':\n    with local_workers(2, Path(sys.argv[1])) as workers:\n"
+        "        print(*workers.client.run(__import__('os').getpid).values(), flush=True)\n"
+        "        workers.client.submit(time.sleep, 300, pure=False)\n        time.sleep(300)"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True) as parent:
+        assert parent.stdout is not None
+        assert len(parent.stdout.readline().split()) == 2
+        assert len(living(parent.pid)) >= 3
+        parent.kill()
+        parent.wait()
+    deadline = time.monotonic() + 20.0
+    while living(parent.pid) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert living(parent.pid) == []
+
+
+# A scheduler of others.
+
+
+def commands(mark: str, folder: Path) -> list[list[str]]:
+    """Commands of docs/cluster.md below a mark, for a smaller recipe and another folder."""
+    block = re.search(rf"<!-- {mark} -->\n((?:    .*\n)+)", PAGE)
+    assert block is not None
+    lines = [shlex.split(line) for line in block[1].splitlines()]
+    words = {"smoke": str(TINY), "dask": str(BIN / "dask")}
+    found = []
+    for line in lines:
+        program = [sys.executable, "-m", "phibench.estimator.cli.main"] if line[0] == "phibench" else [words[line[0]]]
+        found.append([*program, *(words.get(word, re.sub("^out(?=/)", str(folder), word)) for word in line[1:])])
+    return found
+
+
+@contextlib.contextmanager
+def running(*commands: list[str], **environment: str) -> Iterator[None]:
+    with contextlib.ExitStack() as stack:
+        for command in commands:
+            options = {"env": {**os.environ, **environment}, "stderr": subprocess.DEVNULL, "start_new_session": True}
+            child = stack.enter_context(subprocess.Popen(command, **options))  # type: ignore[call-overload]
+            stack.callback(child.wait)
+            stack.callback(os.killpg, child.pid, signal.SIGTERM)
+            if "scheduler" in command:
+                wait_for(Path(command[command.index("--scheduler-file") + 1]))
+        yield
+
+
+@pytest.mark.slow
+def test_the_documented_scheduler_gives_the_same_bytes(tiny_dataset: Path, tmp_path: Path) -> None:
+    scheduler, worker, run = commands("loopback", tmp_path)
+    with running(scheduler, worker):
+        done = subprocess.run(run, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        assert contents(tmp_path / "smoke") == contents(tiny_dataset)
+        again = subprocess.run(run, capture_output=True, text=True, timeout=300)
+        assert "nothing to do" in again.stderr
+
+
+@pytest.mark.slow
+def test_the_documented_shards_give_the_same_bytes(tiny_dataset: Path, tmp_path: Path) -> None:
+    for command in commands("loopback shards", tmp_path):
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+    assert contents(tmp_path / "smoke") == contents(tiny_dataset)
+
+
+def refusal(out: Path, scheduler: str) -> str:
+    with pytest.raises(DatasetError) as caught:
+        make(TINY, out, console=quiet(), scheduler=scheduler)
+    assert not (out / layout.MANIFEST).exists()
+    return str(caught.value)
+
+
+def test_a_scheduler_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "CONNECT_S", 1.0)
+    assert "no dask scheduler answers at tcp://127.0.0.1:9 within 1 s" in refusal(tmp_path, "tcp://127.0.0.1:9")
+    assert "no dask scheduler answers at nonsense://x" in refusal(tmp_path, "nonsense://x")
+    assert "there is no scheduler file" in refusal(tmp_path, str(tmp_path / "none.json"))
+    (tmp_path / "bad.json").write_text("{}")
+    (tmp_path / "worse.json").write_text("{")
+    for name in ("bad.json", "worse.json"):
+        assert "no dask scheduler answers at" in refusal(tmp_path / "out", str(tmp_path / name))
+
+
+def test_workers_that_are_missing_or_do_not_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scheduler, worker, _ = commands("loopback", tmp_path)
+    file = scheduler[-1]
+    monkeypatch.setattr(cluster, "WORKERS_S", 1.0)
+    with running(scheduler):
+        assert "has no workers after 1 s" in refusal(tmp_path / "out", file)
+        monkeypatch.setattr(cluster, "WORKERS_S", 60.0)
+        with running([word if word != "1" else "2" for word in worker]):
+            assert "has more than one thread" in refusal(tmp_path / "out", file)
+        blocked = tmp_path / "blocked"
+        (blocked / "mitsuba").mkdir(parents=True)
+        (blocked / "mitsuba" / "__init__.py").write_text("raise ModuleNotFoundError('no', name='mitsuba')")
+        path = os.pathsep.join([str(blocked), os.environ.get("PYTHONPATH", "")])
+    with running(scheduler), running(worker, PYTHONPATH=path):
+        text = refusal(tmp_path / "out", file)
+        assert "cannot render: Mitsuba is not installed" in text
+        assert text.count("\n") == 0
+
+
+@pytest.mark.slow
+def test_workers_that_all_go_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A task that waits for workers that never come back ends in a sentence, not in waiting."""
+    scheduler, worker, _ = commands("loopback", tmp_path)
+    monkeypatch.setattr(cluster, "LOST_S", 5.0)
+    with running(scheduler), contextlib.ExitStack() as stack:
+        first = stack.enter_context(contextlib.ExitStack())
+        first.enter_context(running(worker))
+        workers = stack.enter_context(cluster.remote_workers(scheduler[-1], tmp_path / "out"))
+        first.close()
+        workers.submit(Task("view x", "", dict))
+        with pytest.raises(DatasetError, match="no workers for 5 s; start some and run the same command again"):
+            workers.next()
+
+
+def test_environments_that_differ_are_refused() -> None:
+    here = describe()
+    assert _checked({"a": here, "b": {**here, "worker": "x"}}) == {k: v for k, v in here.items() if k != "worker"}
+    for change, words in (
+        ({"llvm": "LLVM 1"}, "workers a and b differ in llvm"),
+        ({"code_sha256": "0"}, "worker b runs other code"),
+        ({"fault": "no LLVM"}, "b cannot render: no LLVM"),
+    ):
+        with pytest.raises(DatasetError, match=words):
+            _checked({"a": here, "b": {**here, **change}})
+    with pytest.raises(DatasetError, match="worker b has no phibench"):
+        _checked({"a": here, "b": ModuleNotFoundError("No module", name="phibench")})
+    with pytest.raises(DatasetError, match="does not see the folder"):
+        _checked({"a": describe(Path("/nowhere/probe"))})
+
+
+def test_this_machine_is_asked_in_another_process() -> None:
+    assert local_environment()["code_sha256"] == describe()["code_sha256"]
+
+
+def test_every_task_is_logged(tiny_dataset: Path) -> None:
+    entries = [json.loads(line) for line in (tiny_dataset / layout.LOG).read_text().splitlines()]
+    assert len(entries) == 8
+    for entry in entries:
+        assert entry["ok"]
+        assert entry["seconds"] > 0.0
+        assert 50.0 < entry["peak_mb"] < 5000.0
+        assert {"time", "task", "key", "worker"} < set(entry)
+    assert len({entry["worker"] for entry in entries}) == 2
+
+
+@pytest.mark.usefixtures("inline")
+def test_a_worker_that_fails_half_way_leaves_the_rest_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "phibench.datasets.build.sample_task.save_png", lambda *_: (_ for _ in ()).throw(OSError(28, "full"))
+    )
+    with pytest.raises(DatasetError, match="2 of 8 tasks failed"):
+        make(TINY, tmp_path / "out", workers=1, console=quiet())
+    monkeypatch.undo()
+    console = quiet()
+    make(TINY, tmp_path / "out", workers=2, console=console)
+    assert "to make: 2 samples" in said(console)

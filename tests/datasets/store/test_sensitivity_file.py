@@ -1,0 +1,65 @@
+"""`sensitivities.parquet` beside a data set: written once, read back, told from one that is out of date or damaged."""
+
+from __future__ import annotations
+
+import io
+import shutil
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.read import open_finished
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.checksums import strays
+from phibench.datasets.verify import verify
+from phibench.estimator.geometry.estimators import ESTIMATORS
+from phibench.estimator.paper.sensitivity_table import columns, keep_sensitivities
+
+
+@pytest.fixture
+def copy(tiny_dataset: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
+
+
+def faults(folder: Path) -> tuple[str, ...]:
+    return verify(folder, False, Console(file=io.StringIO())).faults
+
+
+def test_it_is_written_once_read_and_in_order(copy: Path) -> None:
+    path = keep_sensitivities(copy)
+    assert path == copy / layout.SENSITIVITIES
+    table = open_finished(copy).sensitivities()
+    assert tuple(table.columns) == columns()
+    assert len(table) == len(open_finished(copy)) * len(ESTIMATORS)
+    assert strays(copy) == []
+    assert faults(copy) == ()
+    before = path.stat().st_mtime_ns
+    assert keep_sensitivities(copy) == path
+    assert path.stat().st_mtime_ns == before
+
+
+def test_a_table_of_another_state_is_noticed_and_made_again(copy: Path) -> None:
+    keep_sensitivities(copy)
+    sums = copy / layout.SUMS
+    sums.write_text(sums.read_text() + f"{'0' * 64}  more.txt\n")
+    with pytest.raises(DatasetError, match="belongs to another state of this data set"):
+        open_finished(copy).sensitivities()
+    assert any("sensitivities.parquet belongs to another state" in fault for fault in faults(copy))
+    keep_sensitivities(copy)
+    assert len(open_finished(copy).sensitivities()) > 0
+
+
+def test_a_damaged_table_is_noticed(copy: Path) -> None:
+    path = keep_sensitivities(copy)
+    path.write_bytes(path.read_bytes()[:200])
+    [fault] = faults(copy)
+    assert fault.startswith("sensitivities.parquet cannot be read: ")
+    assert "\n" not in fault
+
+
+def test_a_data_set_without_one_says_how_to_get_it(copy: Path) -> None:
+    with pytest.raises(DatasetError, match=r"has no sensitivities\.parquet; run `phibench sensitivities"):
+        open_finished(copy).sensitivities()
+    assert faults(copy) == ()

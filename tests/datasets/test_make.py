@@ -1,0 +1,232 @@
+"""Making data sets: complete, repeatable to the byte, and nothing lost when something goes wrong."""
+
+import errno
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import namedtuple
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.processes import TINY, living, quiet, said, wait_for
+
+from phibench.datasets import make
+from phibench.datasets.build import run_tasks as output
+from phibench.datasets.build import spot_task
+from phibench.datasets.build.run_tasks import estimate
+from phibench.datasets.build.task_list import plan_tasks
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.plan.plan import make_plan
+from phibench.datasets.progress import Steps
+from phibench.datasets.recipe.load import load_recipe
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.checksums import damaged, data_files, read_sums
+from phibench.datasets.store.documents import read_manifest
+from phibench.datasets.store.files import TEMPORARY_PREFIX
+from phibench.datasets.store.layers import read_exr
+from phibench.datasets.store.schema import ManifestRow
+from phibench.render.optics.certificate import Certificate, certify
+from phibench.render.setup.variant import default_variant
+from phibench.scenes.laser import LaserSpot
+
+Usage = namedtuple("Usage", "total used free")
+
+
+def test_everything_is_there(tiny_dataset: Path) -> None:
+    plan = make_plan(load_recipe(TINY))
+    views = {layout.view_file(p.pose_id, name) for p in plan.poses for name in ("ambient", "truth", "preview")}
+    spots = {layout.spot_file(pair.sample_id, position) for pair in plan.pairs for position in ("down", "up")}
+    spots.remove("spots/half-hidden-h1.400-down.exr")  # a crate hides it
+    previews = {layout.preview_file(pair.sample_id) for pair in plan.pairs}
+    single = {layout.INFO, layout.MANIFEST, layout.TABLE, layout.RECIPE, layout.RIGS, layout.LIGHT_MAP}
+    assert set(read_sums(tiny_dataset)) == views | spots | previews | single == set(data_files(tiny_dataset))
+    assert damaged(tiny_dataset) == []
+    assert (tiny_dataset / layout.RECIPE).read_bytes() == TINY.read_bytes()
+
+
+def test_the_sums_are_those_of_sha256sum(tiny_dataset: Path) -> None:
+    child = subprocess.run(["sha256sum", "--quiet", "-c", layout.SUMS], cwd=tiny_dataset, capture_output=True)
+    assert child.returncode == 0, child.stdout
+
+
+def test_the_info_says_what_made_it(tiny_dataset: Path) -> None:
+    info = json.loads((tiny_dataset / layout.INFO).read_text())
+    provenance = info["provenance"]
+    assert provenance["variant"] == default_variant()
+    assert int(provenance["llvm"].split(".")[0]) >= 17
+    assert provenance["threads_per_process"] == 1
+    assert provenance["packages"]["mitsuba"]
+    assert len(provenance["code_sha256"]) == 64
+    assert json.loads((tiny_dataset / layout.RUN).read_text())["seconds"] > 0.0
+
+
+def test_two_runs_are_byte_identical_whatever_the_number_of_workers(tiny_dataset: Path, tmp_path: Path) -> None:
+    again = make.make(TINY, tmp_path / "again", workers=1, console=quiet())
+    assert (again / layout.SUMS).read_text() == (tiny_dataset / layout.SUMS).read_text()
+    assert len(read_sums(again)) >= 15
+    # The comparison can fail: another seed gives other ambient light and the same truth.
+    text = TINY.read_text().replace("seed = 0", "seed = 1")
+    (tmp_path / "other.toml").write_text(text)
+    other = make.make(tmp_path / "other.toml", tmp_path / "other", workers=2, console=quiet())
+    changed = {name for name, digest in read_sums(other).items() if digest != read_sums(again)[name]}
+    assert layout.view_file("h0.000", "ambient") in changed
+    assert layout.view_file("h0.000", "truth") not in changed
+    assert [_without_noise(row) for row in read_manifest(other)] == [
+        _without_noise(row) for row in read_manifest(again)
+    ]
+
+
+def _without_noise(row: ManifestRow) -> dict[str, object]:
+    return row.model_dump(exclude={"down": {"noise"}, "up": {"noise"}})
+
+
+def test_a_finished_data_set_is_left_alone_and_a_damaged_one_made_again(tiny_dataset: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
+    console = quiet()
+    (copy / "scores.json").write_text("{}")  # somebody's file is no reason to start over
+    make.make(TINY, copy, workers=1, console=console)
+    assert "nothing to do" in said(console)
+    (copy / layout.MANIFEST).unlink()
+    (copy / layout.view_file("h0.500", "truth")).write_bytes(b"")
+    (copy / f"{TEMPORARY_PREFIX}left.exr").write_bytes(b"")
+    console = quiet()
+    make.make(TINY, copy, workers=2, console=console)
+    assert "to make: 1 view; about 3 MB" in said(console)
+    assert "7 of 8 tasks are done" in said(console)
+    assert "tasks: 1/1" in said(console)
+    assert (copy / layout.SUMS).read_text() == (tiny_dataset / layout.SUMS).read_text()
+    assert list(copy.rglob(TEMPORARY_PREFIX + "*")) == []
+
+
+# Refusals: one sentence, before anything is rendered.
+
+
+def refusal(out: Path, recipe: Path = TINY, workers: int | None = 1) -> str:
+    with pytest.raises(DatasetError) as caught:
+        make.make(recipe, out, workers=workers, console=quiet())
+    return str(caught.value)
+
+
+def test_a_folder_with_other_things_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("x")
+    assert "not empty and holds no data set" in refusal(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+    assert "is a file" in refusal(tmp_path / "thesis.tex")
+
+
+def test_a_folder_with_another_data_set_is_refused(tiny_dataset: Path) -> None:
+    before = (tiny_dataset / layout.SUMS).read_text()
+    assert "holds another data set ('tiny')" in refusal(tiny_dataset, Path("smoke"))
+    assert (tiny_dataset / layout.SUMS).read_text() == before
+    assert damaged(tiny_dataset) == []
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def denied(*_: object) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    monkeypatch.setattr(output, "write_bytes", denied)
+    text = refusal(tmp_path / "out")
+    assert "Permission denied" in text
+    assert "\n" not in text
+
+
+@pytest.mark.usefixtures("inline")
+def test_no_room_on_the_disk_is_refused_with_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(output.shutil, "disk_usage", lambda _: Usage(10**9, 10**9 - 2_000_000, 2_000_000))
+    text = refusal(tmp_path / "out")
+    assert "are needed and 2 MB are free" in text
+
+
+def test_no_workers_is_refused(tmp_path: Path) -> None:
+    assert "workers = 0" in refusal(tmp_path / "out", workers=0)
+
+
+def test_the_estimate_of_the_size_is_honest(tiny_dataset: Path, smoke_dataset: Path) -> None:
+    for folder, recipe in ((tiny_dataset, TINY), (smoke_dataset, Path("smoke"))):
+        size = sum((folder / name).stat().st_size for name in data_files(folder))
+        plan = make_plan(load_recipe(recipe))
+        assert 1.0 <= estimate(plan, plan_tasks(plan, {}).values()).size / size < 1.5
+
+
+@pytest.mark.usefixtures("inline")
+def test_a_sample_out_of_tolerance_is_refused_with_its_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def off_by_a_hundredth(*arguments: Any) -> Certificate:
+        return replace(certify(*arguments), chief_difference_px=0.01, passed=False)
+
+    monkeypatch.setattr(spot_task, "certify", off_by_a_hundredth)
+    text = refusal(tmp_path / "out")
+    assert "seen-near-h0.500 down: chief ray 0.01 px (tolerance 1e-06)" in text
+    assert "4 of 8 tasks failed" in text  # two spots and the previews that wait for them; the views were finished
+    assert not (tmp_path / "out" / layout.SUMS).exists()
+    assert not (tmp_path / "out" / layout.MANIFEST).exists()
+
+
+def test_a_spot_that_no_mirror_point_reflects_is_flagged() -> None:
+    plan = make_plan(load_recipe(TINY))
+    above = LaserSpot((0.0, 0.0, 2.5), (0.0, 0.0, -1.0), 3e-3)
+    answer = spot_task.answer_spot(plan.rig.at(0.0), above, plan.room)
+    assert answer.truth.cause == "no_reflection"
+    assert answer.certificate is None
+    assert not answer.on_image
+
+
+@pytest.mark.usefixtures("inline")
+def test_a_full_disk_in_the_middle_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(make, "write_documents", full)
+    assert "No space left on device" in refusal(tmp_path / "out")
+    assert complete_but_unfinished(tmp_path / "out") == 3 + 6
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs /proc")
+def test_control_c_in_the_middle_loses_nothing(tmp_path: Path) -> None:
+    """SIGINT to the whole process group, as a terminal does, while two workers render."""
+    recipe, out = tmp_path / "slow.toml", tmp_path / "out"
+    recipe.write_text(TINY.read_text().replace("cells_per_pixel = 2", "cells_per_pixel = 32"))
+    code = (
+        "import sys\nfrom phibench.datasets.make import make\n"
+        "if __name__ == '__main__':\n    make(sys.argv[1], sys.argv[2], workers=2)"
+    )
+    command = [sys.executable, "-c", code, str(recipe), str(out)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True, text=True) as child:
+        wait_for(out / "spots")
+        time.sleep(3.0)
+        os.killpg(child.pid, signal.SIGINT)
+        _, errors = child.communicate(timeout=60)
+    assert errors.count("KeyboardInterrupt") == 1  # the parent's, and none of a worker
+    deadline = time.monotonic() + 20.0
+    while (left := living(child.pid)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert left == []
+    assert complete_but_unfinished(out) >= 1
+
+
+def complete_but_unfinished(out: Path) -> int:
+    """What is there is whole, no temporary file is left, the folder does not pass for finished. Number of layers."""
+    assert not (out / layout.SUMS).exists()
+    assert [path.name for path in out.rglob(TEMPORARY_PREFIX + "*")] == []
+    layers = list(out.rglob("*.exr"))
+    for path in layers:
+        read_exr(path)
+    return len(layers)
+
+
+def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("phibench.datasets.progress.LINE_EVERY_S", 0.0)
+    console = quiet()
+    with Steps(console, "views", 3) as steps:
+        for _ in range(3):
+            steps.advance()
+    lines = said(console).splitlines()
+    assert len(lines) == 3
+    assert lines[0].startswith("views: 1/3 after 0 s, about 0 s left")
+    assert lines[-1].startswith("views: 3/3")

@@ -1,0 +1,278 @@
+"""Verification finds every kind of damage, and nothing where there is none."""
+
+import errno
+import io
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.damage import AMBIENT, OTHER_SPOT, SPOT, TRUTH, flip_a_bit, swap, truncate
+from PIL import Image
+from rich.console import Console
+
+from phibench.datasets import show as show_module
+from phibench.datasets.build.assemble import visibility_line
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.read import open_dataset
+from phibench.datasets.show import show
+from phibench.datasets.store import checksums as sums
+from phibench.datasets.store import pictures as spot_picture
+from phibench.datasets.store import schema as layout
+from phibench.datasets.store.checksums import write_sums
+from phibench.datasets.store.documents import read_manifest, write_manifest
+from phibench.datasets.store.layers import (
+    read_ambient,
+    read_ambient_variance,
+    read_exr,
+    read_truth,
+    write_ambient,
+    write_truth,
+)
+from phibench.datasets.store.pictures import Picture
+from phibench.datasets.verify import Report, verify
+
+PREVIEW = layout.preview_file("seen-near-h0.500")
+
+
+def check(folder: Path, truth_layers: bool = False) -> Report:
+    return verify(folder, truth_layers, Console(file=io.StringIO()))
+
+
+@pytest.fixture
+def copy(tiny_dataset: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
+
+
+@pytest.mark.parametrize("name", ["tiny_dataset", "smoke_dataset"])
+def test_a_fresh_data_set_is_in_order(name: str, request: pytest.FixtureRequest) -> None:
+    report = check(request.getfixturevalue(name), truth_layers=True)
+    assert report.faults == ()
+    assert report.ok
+    assert report.files >= 15
+    assert report.samples in (2, 3)
+
+
+@pytest.mark.parametrize("damage", [truncate, flip_a_bit, Path.unlink])
+@pytest.mark.parametrize(
+    "name",
+    [
+        AMBIENT,
+        TRUTH,
+        SPOT,
+        layout.LIGHT_MAP,
+        layout.TABLE,
+        layout.RECIPE,
+        layout.RIGS,
+        layout.preview_file("seen-near-h0.500"),
+        layout.MANIFEST,
+    ],
+)
+def test_a_damaged_file_is_named(copy: Path, name: str, damage: Callable[[Path], None]) -> None:
+    damage(copy / name)
+    report = check(copy)
+    assert not report.ok
+    assert [fault for fault in report.faults if name in fault]
+    if name != layout.RIGS or damage is not flip_a_bit:  # another digit there is another rig: its spots do not fit it
+        assert not [fault for fault in report.faults if name not in fault and layout.MANIFEST not in fault]
+
+
+@pytest.mark.parametrize(("a", "b"), [(SPOT, OTHER_SPOT), (AMBIENT, layout.view_file("h0.500", "ambient"))])
+@pytest.mark.parametrize("hide", [False, True], ids=["sums as they were", "sums made anew"])
+def test_swapped_files_are_found(copy: Path, a: str, b: str, hide: bool) -> None:
+    swap(copy, a, b)
+    if hide:
+        write_sums(copy)
+    faults = check(copy).faults
+    assert {name for name in (a, b) if any(name in fault for fault in faults)} == {a, b}
+
+
+def test_a_stray_file_is_a_note_and_neither_a_fault_nor_signed(copy: Path) -> None:
+    before = (copy / layout.SUMS).read_text()
+    (copy / "spots" / "extra.exr").write_bytes(b"")
+    (copy / "scores.json").write_text("{}")
+    report = check(copy)
+    assert report.ok
+    assert ["scores.json" in report.notes[0], "spots/extra.exr" in report.notes[1]] == [True, True]
+    write_sums(copy)
+    assert (copy / layout.SUMS).read_text() == before
+
+
+def test_a_file_of_the_data_set_that_is_not_listed_is_a_fault(copy: Path) -> None:
+    lines = (copy / layout.SUMS).read_text().splitlines(keepends=True)
+    (copy / layout.SUMS).write_text("".join(line for line in lines if SPOT not in line))
+    assert check(copy).faults == (f"{SPOT} is not listed in SHA256SUMS",)
+
+
+def test_a_missing_folder_and_an_unreadable_file_are_called_so(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(DatasetError, match="there is no folder"):
+        check(copy / "nowhere")
+    sha256 = sums.sha256
+
+    def denied(path: Path) -> str:
+        if path.name == layout.TABLE:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        return sha256(path)
+
+    monkeypatch.setattr(sums, "sha256", denied)
+    assert check(copy).faults == (f"{layout.TABLE} is not readable: Permission denied",)
+
+
+@pytest.mark.parametrize("name", ["irradiance_w_m2", "sigma_w_m2", "covered"])
+@pytest.mark.parametrize("spoil", ["negative", "nan", "short", "gone"])
+def test_a_spoilt_light_map_is_found_though_signed(copy: Path, name: str, spoil: str) -> None:
+    with np.load(copy / layout.LIGHT_MAP) as file:
+        arrays = dict(file)
+    if spoil == "short":
+        arrays[name] = arrays[name][:-1]
+    elif spoil == "gone":
+        del arrays[name]
+    elif name != "covered":
+        arrays[name][5] = -1.0 if spoil == "negative" else np.nan
+    else:
+        return
+    np.savez(copy / layout.LIGHT_MAP, **arrays)
+    write_sums(copy)
+    [fault] = check(copy).faults
+    assert layout.LIGHT_MAP in fault
+    assert name in fault
+
+
+@pytest.mark.parametrize("value", [-1.0, np.nan])
+def test_a_variance_that_is_none_is_found_though_signed(copy: Path, value: float) -> None:
+    path = copy / AMBIENT
+    planes, variance, header = read_ambient(path), read_ambient_variance(path), read_exr(path).header
+    variance[1, 2, 3] = value
+    write_ambient(path, planes, variance, header)
+    write_sums(copy)
+    assert check(copy).faults == (f"{AMBIENT} has negative or non-finite variances",)
+
+
+def test_an_unfinished_data_set_is_found(copy: Path) -> None:
+    (copy / layout.SUMS).unlink()
+    [fault] = check(copy).faults
+    assert "was not finished" in fault
+
+
+def test_a_truth_that_the_parameters_do_not_give_is_found(copy: Path) -> None:
+    """The last digits of one number, with manifest, table and hashes made to fit."""
+    rows = read_manifest(copy)
+    up = rows[0].up.model_copy(update={"u_px": rows[0].up.u_px + 1e-7})
+    write_manifest(copy, [rows[0].model_copy(update={"up": up}), *rows[1:]])
+    write_sums(copy)
+    [fault] = check(copy).faults
+    assert fault.startswith("seen-near-h0.500 up: u_px is")
+
+
+def test_a_changed_rig_is_found(copy: Path) -> None:
+    rig = json.loads((copy / layout.RIGS).read_text())
+    rig["resolved"]["mirror"]["radius_m"] += 1e-6
+    (copy / layout.RIGS).write_text(json.dumps(rig))
+    write_sums(copy)
+    faults = check(copy).faults
+    assert any("u_px" in fault for fault in faults)
+    assert any("phi_ray_rad" in fault for fault in faults)
+    assert "rigs.jsonl: rig is not the rig that the recipe gives" in faults
+
+
+def test_a_missing_row_is_found(copy: Path) -> None:
+    info = json.loads((copy / layout.INFO).read_text())
+    info["samples"] = 1
+    (copy / layout.INFO).write_text(json.dumps(info))
+    write_manifest(copy, read_manifest(copy)[:1])
+    write_sums(copy)
+    assert "manifest.jsonl: sample half-hidden-h1.400 of the recipe is missing" in check(copy).faults
+
+
+def test_a_changed_pixel_truth_is_found_when_asked_for(copy: Path) -> None:
+    planes = read_truth(copy / TRUTH)
+    planes["depth_m"][60:120, 100:200] *= 1.0 + 1e-5
+    write_truth(copy / TRUTH, planes, {"dataset": "tiny", "pose": "h0.500", "offset_m": 0.5})
+    write_sums(copy)
+    assert check(copy).ok
+    [fault] = check(copy, truth_layers=True).faults
+    assert "depth_m is not what the parameters give" in fault
+
+
+def test_what_is_no_data_set_raises(tmp_path: Path) -> None:
+    for folder, words in ((tmp_path, "is not a data set"), (tmp_path / "none", "there is no folder")):
+        with pytest.raises(DatasetError, match=words):
+            check(folder)
+
+
+def test_a_damaged_info_is_a_fault(copy: Path) -> None:
+    truncate(copy / layout.INFO)
+    assert len(check(copy).faults) == 2  # its hash, and that it cannot be read
+
+
+def test_show_prints_a_table_and_draws_the_spots(copy: Path) -> None:
+    console = Console(file=io.StringIO(), width=170)
+    sheet = show(copy, console)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "seen-near-h0.500" in text
+    assert "occluded:crate_red / yes" in text
+    with Image.open(sheet) as image:
+        assert image.size[0] > 400
+        colours = {colour for _, colour in image.getcolors(1 << 24)}
+    assert (0, 255, 80) in colours  # the mark
+    assert check(copy).ok  # the sheet is not part of the data
+    assert "- / passed" in text  # one result for each image
+
+
+@pytest.mark.parametrize("width", [60, 80, 100, 170])
+def test_show_never_cuts_a_number_or_a_name(tiny_dataset: Path, tmp_path: Path, width: int) -> None:
+    console = Console(file=io.StringIO(), width=width)
+    show(tiny_dataset, console, out=tmp_path / "sheet.png")
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    shown = set(re.split(r"[\s,]+", text))
+    for row in read_manifest(tiny_dataset):
+        numbers = {f"{row.up.u_px:.2f}", f"{row.up.v_px:.2f}"}
+        assert {row.sample_id, f"{row.depth_m:.3f}", f"{row.stroke_m:.3f}"} | numbers <= shown
+    assert "occluded:crate_red" in shown
+    table = text.split("contact sheet")[0].splitlines()
+    assert width < 80 or max(map(len, table)) <= width
+    assert (tmp_path / "sheet.png").stat().st_size > 1000
+
+
+def test_a_sheet_that_cannot_be_written_is_said_after_the_table(tiny_dataset: Path, tmp_path: Path) -> None:
+    console = Console(file=io.StringIO(), width=170)
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(DatasetError, match=r"contact sheet was not written.*--out") as caught:
+        show(tiny_dataset, console, out=tmp_path / "file" / "sheet.png")
+    assert "\n" not in str(caught.value)
+    assert "seen-near-h0.500" in console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_a_sheet_says_why_a_spot_is_hidden(tiny_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said = []
+
+    def captioned(picture: Picture, text: str) -> Picture:
+        said.append(text)
+        changed = spot_picture.captioned(picture, text)
+        assert np.count_nonzero(changed != picture) > 100
+        return changed
+
+    monkeypatch.setattr(show_module, "captioned", captioned)
+    show_module.contact_sheet(open_dataset(tiny_dataset), Console(file=io.StringIO()))
+    [text] = said  # the other three spots are seen
+    assert "occluded:crate_red" in text
+
+
+def test_previews_mark_the_spot(tiny_dataset: Path) -> None:
+    with Image.open(tiny_dataset / layout.preview_file("seen-near-h0.500")) as image:
+        picture = np.asarray(image)
+    for half in np.split(picture, 2, axis=1):
+        marks = np.all(half == (0, 255, 80), axis=2)
+        assert np.count_nonzero(marks) > 4 * 24  # the inset's frame and the crosses
+
+
+def test_the_last_line_of_make_counts_what_can_be_used(tiny_dataset: Path) -> None:
+    rows = read_manifest(tiny_dataset)
+    assert visibility_line(rows) == (
+        "1 of 2 pairs are visible in both images; not visible: down occluded:crate_red (1)"
+    )
+    assert visibility_line(rows[:1]) == "1 of 1 pairs are visible in both images"

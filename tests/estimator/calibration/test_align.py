@@ -1,0 +1,112 @@
+"""Alignment: direction and size of the move, its sigma, the picture, and the command."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.limb_frames import limb_light
+from PIL import Image
+
+from phibench.estimator.calibration.align import alignment, nominal_centre
+from phibench.estimator.cli import main as cli
+from phibench.estimator.spots.image_planes import ImageError, read_picture
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.light import Light
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.settings import sensor
+from phibench.scenes.frames import Pose
+from phibench.scenes.rig import Rig
+
+OFF_M = (1.5e-3, -0.8e-3)
+
+
+def room(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    return 1.0 + 0.1 * directions[:, 0]
+
+
+@pytest.fixture(scope="module")
+def light() -> np.ndarray:
+    rig = replace(Rig(), T_camera_sphere=Pose("camera", "sphere", (*OFF_M, 0.2605)))
+    return limb_light(rig, np.random.default_rng(31), room=room)
+
+
+def test_the_move_brings_the_mirror_above_the_lens(light) -> None:
+    found = alignment(light, Rig(), tilt_sigma_rad=0.0, principal_point_sigma_px=0.0)
+    assert found.move_world_m == pytest.approx([-OFF_M[0], -OFF_M[1], 0.0], abs=3e-6)
+    assert found.move_px == pytest.approx(-1430.0 / 0.2605 * np.array(OFF_M), abs=0.05)
+    assert found.sigma_m == found.sigma_outline_m
+
+
+def test_doubts_about_the_camera_are_in_sigma(light) -> None:
+    """0.1 deg and 5 px at 0.26 m: 0.45 mm and 0.91 mm."""
+    found = alignment(light, Rig())
+    assert found.sigma_m == pytest.approx(np.hypot(0.2605 * np.radians(0.1), 0.2605 * 5.0 / 1430.0), rel=1e-3)
+
+
+def test_a_tilted_camera_moves_along_the_worlds_axes(light) -> None:
+    """Turned by 90 degrees about the vertical, the image's right is the world's y."""
+    turned = replace(Rig(), T_world_camera=Pose("world", "camera", (0, 0, 0.45), ((0, -1, 0), (1, 0, 0), (0, 0, 1))))
+    found = alignment(light, turned)
+    assert found.move_world_m == pytest.approx([OFF_M[1], -OFF_M[0], 0.0], abs=3e-6)
+    assert found.move_camera_m == pytest.approx([-OFF_M[0], -OFF_M[1], 0.0], abs=3e-6)
+
+
+def test_command_reads_the_cameras_jpeg_and_draws(light, tmp_path, capsys) -> None:
+    file, out = tmp_path / "frame.jpg", tmp_path / "arrow.png"
+    file.write_bytes(Chain(sensor("mjpeg")).jpeg_bytes(Light(light), NoiseStream(("align",))))
+    assert cli.main(["align", str(file), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "1.70 mm" in said  # |(1.5, 0.8)|
+    assert "left" in said
+    assert "down" in said
+    before, after = (np.asarray(Image.open(path).convert("RGB"), float) for path in (file, out))
+    assert (np.abs(after - before).max(axis=-1) > 30).sum() > 1000  # the outline alone is 2000 px long
+
+
+def test_what_is_no_frame_is_refused_in_one_sentence(tmp_path, capsys) -> None:
+    text = tmp_path / "a.png"
+    text.write_text("no picture")
+    with pytest.raises(ImageError, match="not a picture"):
+        read_picture(text)
+    buffer = io.BytesIO()
+    Image.fromarray(np.zeros((720, 1280), np.uint8)).save(buffer, "PNG")
+    text.write_bytes(buffer.getvalue())
+    assert cli.main(["align", str(text)]) == 2
+    assert cli.main(["align", str(tmp_path / "none.png")]) == 2
+    assert capsys.readouterr().err.count("\n") == 2
+
+
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [
+        (("--radius-mm", "600"), ("--radius-mm 600", "--distance-mm 260")),
+        (("--radius-mm", "-3"), ("above 0",)),
+        (("--distance-mm", "40"), ("1.02 radii to 10 m",)),
+        (("--radius-mm", "1"), ("radius of 6 px", "check these numbers")),
+        (("--radius-mm", "30"), ("without a mirror", "looked for was an outline", "116 to 233 px")),
+    ],
+)
+def test_numbers_of_another_mirror_are_named(light, tmp_path, capsys, numbers, words) -> None:
+    file = tmp_path / "frame.jpg"
+    file.write_bytes(Chain(sensor("mjpeg")).jpeg_bytes(Light(light), NoiseStream(("align",))))
+    assert cli.main(["align", str(file), *numbers]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert all(word in said for word in words), said
+
+
+def test_a_picture_that_is_no_whole_frame_needs_its_principal_point() -> None:
+    whole = Rig().camera
+    assert nominal_centre(np.zeros((720, 1280, 3)), whole) == (639.5, 359.5)
+    assert nominal_centre(np.zeros((720, 1180, 3)), whole, 539.5, 359.5) == (539.5, 359.5)
+    for shape in ((720, 1180), (540, 960)):
+        with pytest.raises(ImageError, match="1280 x 720"):
+            nominal_centre(np.zeros((*shape, 3)), whole)
+
+
+def test_standard_deviations_below_0_are_refused() -> None:
+    with pytest.raises(ImageError, match="0 or above"):
+        alignment(np.zeros((720, 1280, 3), np.uint8), Rig(), None, -0.1)

@@ -1,0 +1,199 @@
+"""The outline's fit against images of known spheres, drawn by other mathematics (`limb_frames`)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.limb_frames import drawn_rig, limb_light
+from scipy import stats
+
+from phibench.datasets.frames.sensor_card import sensor_card
+from phibench.estimator.calibration.limb_image import planes_of, srgb_decoded, srgb_encoded
+from phibench.estimator.calibration.outline import find_outline, fit_outline, visible_arc
+from phibench.estimator.calibration.outline_fit import Sectors, scatter
+from phibench.estimator.calibration.outline_start import (
+    circle_edges,
+    grey,
+    hough,
+    plain_circle,
+    sphere_from_circle,
+    sphere_from_ellipse,
+    sphere_from_rays,
+)
+from phibench.estimator.spots.image_planes import ImageError
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.light import Light
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.processing import demosaic, eight_bit
+from phibench.render.sensor.processing import srgb_encoded as srgb_of_the_camera
+from phibench.render.sensor.settings import sensor
+from phibench.scenes.frames import Pose
+from phibench.scenes.rig import Rig
+
+
+def grey_room(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """A room whose light changes slowly with direction."""
+    return 1.0 + 0.1 * directions[:, 0] - 0.05 * directions[:, 1] * directions[:, 2]
+
+
+@pytest.fixture(scope="module")
+def case() -> tuple[Rig, np.ndarray]:
+    rng = np.random.default_rng(11)
+    rig = drawn_rig(rng)
+    return rig, limb_light(rig, rng, room=grey_room)
+
+
+@pytest.fixture(scope="module")
+def frames(case) -> dict[str, np.ndarray]:
+    rig, light = case
+    names = ("bayer-raw", "srgb8", "mjpeg")
+    return {name: Chain(sensor(name), 0, rig.camera).frame(Light(light), NoiseStream(("outline",))) for name in names}
+
+
+def nominal(rig: Rig) -> Rig:
+    """What a user starts from: the mirror straight above, at about the right distance."""
+    return replace(rig, T_camera_sphere=Pose("camera", "sphere", (0.0, 0.0, 0.258)))
+
+
+def test_accuracy_from_scratch_on_light_without_noise(case) -> None:
+    """Targets 5 um across and 20 um along the axis; the 3 x 3 rays per pixel of the picture itself are good to 1 um."""
+    rig, light = case
+    error = find_outline(light, nominal(rig)).sphere_in_camera_m - rig.sphere_in_camera_m
+    assert np.abs(error[:2]).max() < 1e-6
+    assert abs(error[2]) < 4e-6
+
+
+def test_plain_fits_are_biased(case) -> None:
+    """The steepest place of the light is inside the limb: circle, ellipse and cone put the sphere 0.1 mm too far."""
+    rig, light = case
+    picture = grey(planes_of(light))
+    points, s = circle_edges(picture, hough(picture, nominal(rig))[0]), rig.sphere_in_camera_m
+    camera, R = rig.camera, rig.mirror.radius_m
+    for found in (
+        sphere_from_circle(plain_circle(points), camera, R),
+        sphere_from_ellipse(points, camera, R),
+        sphere_from_rays(camera.rays(points), R),
+    ):
+        assert found[2] - s[2] > 1e-4
+
+
+@pytest.mark.parametrize("preset", ["bayer-raw", "srgb8", "mjpeg"])
+def test_frames_within_their_covariance(case, frames, preset: str) -> None:
+    """Mahalanobis distance of 3 numbers, false alarm rate 1e-4; a centre 0.2 mm off is refused."""
+    rig = case[0]
+    found = find_outline(frames[preset], nominal(rig), sensor_card(preset))
+    limit = stats.chi2.isf(1e-4, 3)
+
+    def distance(error: np.ndarray) -> float:
+        return float(error @ np.linalg.solve(found.covariance_m2, error))
+
+    error = found.sphere_in_camera_m - rig.sphere_in_camera_m
+    assert distance(error) < limit
+    assert distance(error + [0.0, 0.0, 2e-4]) > limit
+    assert found.sigma_m.max() < 3e-5
+    assert found.contrast == pytest.approx(1.0, abs=0.1)
+
+
+def test_radius_and_distance_scale_together(case) -> None:
+    rig, light = case
+    planes, s = planes_of(light), rig.sphere_in_camera_m
+    larger = replace(rig, mirror=replace(rig.mirror, radius_m=1.01 * rig.mirror.radius_m))
+    a, b = fit_outline(planes, rig, s + 1e-4), fit_outline(planes, larger, 1.01 * (s + 1e-4))
+    # the same cone; Fresnel's angle across the limb is the same too; 1e-7 m is where the steps come to rest
+    assert b.sphere_in_camera_m == pytest.approx(1.01 * a.sphere_in_camera_m, abs=1e-6)
+
+
+def test_an_image_without_a_mirror_is_refused() -> None:
+    rng = np.random.default_rng(12)
+    blocks = np.kron(rng.uniform(0.5, 2.0, (9, 16)), np.ones((80, 80)))
+    for image in (np.ones((3, 720, 1280)), np.zeros((3, 720, 1280)), rng.poisson(900.0, (3, 720, 1280)), [blocks] * 3):
+        with pytest.raises(ImageError, match="without a mirror"):
+            find_outline(np.asarray(image, float), Rig())
+
+
+def test_a_mirror_cut_by_the_frame(case) -> None:
+    """Moved up by 100 px, 70 % of the outline are left, which is enough; by 400 px, 40 %, which is not."""
+    rig, light = case
+    for shift, enough in ((100, True), (400, False)):
+        cut = np.roll(light, -shift, axis=1)
+        cut[:, -shift:] = np.median(light)
+        moved = replace(rig, camera=replace(rig.camera, cy_px=rig.camera.cy_px - shift))
+        assert (visible_arc(moved, rig.sphere_in_camera_m) > 0.5) is enough
+        if enough:
+            found = fit_outline(planes_of(cut), moved, rig.sphere_in_camera_m + 2e-4)
+            error = found.sphere_in_camera_m - rig.sphere_in_camera_m
+            assert np.abs(error).max() < 2e-5
+            assert found.arc < 0.85
+        else:
+            with pytest.raises(ImageError, match="cut by the frame"):
+                fit_outline(planes_of(cut), moved, rig.sphere_in_camera_m + 2e-4)
+
+
+def test_images_of_the_wrong_shape_are_refused() -> None:
+    with pytest.raises(ImageError, match="preset"):
+        planes_of(np.zeros((720, 1280, 3), np.uint8), sensor_card("bayer-raw"))
+    with pytest.raises(ImageError, match="whole frame"):
+        find_outline(np.ones((3, 72, 128)), Rig())
+
+
+def test_taps_are_the_cameras_demosaicing() -> None:
+    """A grey mosaic through the camera's processing gives the plane's taps times the mosaic, to 8-bit rounding."""
+    rng = np.random.default_rng(13)
+    mosaic = ndimage_smooth(rng.uniform(0.2, 0.5, (40, 60)))
+    image = eight_bit(srgb_of_the_camera(demosaic(mosaic)))
+    (plane,) = planes_of(image, sensor_card("srgb8"))
+    for v, u in ((10, 20), (11, 20), (10, 21), (11, 21)):
+        taps = plane.taps[2 * (v % 2) + u % 2]
+        assert sum(tap.weight for tap in taps) == pytest.approx(1.0)
+        model = sum(tap.weight * mosaic[v + tap.dv_px, u + tap.du_px] for tap in taps)
+        assert plane.values[v, u] == pytest.approx(model, abs=0.01)
+
+
+def ndimage_smooth(image: np.ndarray) -> np.ndarray:
+    from scipy import ndimage
+
+    return ndimage.gaussian_filter(image, 2.0)
+
+
+def test_srgb_curve_and_its_inverse() -> None:
+    x = np.linspace(0.0, 1.0, 1001)
+    assert srgb_decoded(srgb_encoded(x)) == pytest.approx(x, abs=1e-7)  # the standard's two branches meet to 1e-8
+    assert srgb_encoded(x) == pytest.approx(srgb_of_the_camera(x), abs=1e-7)
+
+
+def _unwrapped_turns() -> np.ndarray:
+    turn = np.linspace(-np.pi, np.pi, 120, endpoint=False)
+    return np.stack([np.ones(120), np.cos(turn), np.sin(turn)], axis=-1)
+
+
+@pytest.mark.parametrize(("together", "low", "high"), [(1, 1.05, 1.18), (2, 1.65, 1.8)])
+def test_scatter_knows_correlated_neighbours(together: int, low: float, high: float) -> None:
+    """Shifts that a fit of radius and centre leaves: white ones, and moving averages of 2, variance of whose mean is 2.
+
+    White ones give 1.12, because the scatter is never taken below that without neighbours: sigma is 6 % too large then.
+    Bartlett's weights of 3 neighbours see 1 + 2 x 0.75 x 0.5 = 1.75 of that, less what the fit takes of slow waves.
+    2000 draws of a number with relative standard deviation 0.2: good to 0.5 %; false alarm below 1e-6.
+    """
+    rng = np.random.default_rng(14)
+    white = rng.standard_normal((2000, 120))
+    errors = white if together == 1 else (white + np.roll(white, 1, axis=1)) / np.sqrt(2.0)
+    turns = _unwrapped_turns()
+    left = errors - errors @ turns @ np.linalg.inv(turns.T @ turns) @ turns.T
+    found = float(np.mean([scatter(z, np.ones(120), turns) for z in left]))
+    assert low < found < high
+
+
+def test_a_lamp_in_a_sector_is_seen_in_what_the_model_leaves() -> None:
+    """Noise of 1 %; one sector of 24 has a step of 30 % across it: it and two on each side lose their trust."""
+    rng = np.random.default_rng(15)
+    turn = np.repeat(np.linspace(-np.pi, np.pi, 24, endpoint=False) + 0.1, 60)
+    where = Sectors.of(np.zeros(turn.size, int), turn, 24)
+    y = 1.0 + 0.01 * rng.standard_normal(turn.size)
+    residual = y - 1.0
+    residual[(where.sector == 10) & (np.arange(turn.size) % 2 == 0)] += 0.3
+    trust = where.described(y, residual)
+    assert np.flatnonzero(trust == 0.0).tolist() == [8, 9, 10, 11, 12]
+    # the rms of 60 values is good to 9 %: 1.4 of the median is 4 standard deviations away
+    assert np.all(trust[[*range(8), *range(13, 24)]] == 1.0)

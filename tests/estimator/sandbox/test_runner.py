@@ -1,0 +1,368 @@
+"""A method in a process of its own: what it may do to itself, what it may not see, and that the run goes on."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.seat_pairs import GOOD, HEADER, SHAPE, SmallPairs, method_file
+
+from phibench.estimator.interface import FAILURES, Answer, Outcome, Pair, Spot
+from phibench.estimator.pair_set import PairTruth, SpotTruth
+from phibench.estimator.sandbox.answers import AnswerError, answer_text, checked
+from phibench.estimator.sandbox.process import environment
+from phibench.estimator.sandbox.resolve import Limits, MethodError
+from phibench.estimator.sandbox.runner import outcomes, run_method
+from phibench.estimator.sandbox.transport import MemoryFile, SharedPages, pack, unpack
+
+LIMITS = Limits(seconds=3.0, memory_mb=1000.0)
+
+# what the method does to each pair by its number; every second pair is answered, so that each failure is survived
+MISDEEDS = {
+    1: ("error", "raise KeyError('no such thing')"),
+    3: ("timeout", "while True: pass"),
+    5: ("crash", "os._exit(3)"),
+    7: ("crash", "ctypes.string_at(0)"),
+    9: ("memory", "np.ones(500_000_000)"),  # 4 GB; the limit is 1 GB above what was there
+    11: ("mutated", "pair.down[0, 0] = 0"),
+    13: ("mutated", "ctypes.memset(pair.down.ctypes.data, 0, 8)"),
+    15: ("invalid", "return 'nonsense'"),
+    17: ("invalid", "return Answer(Spot((float('nan'), 2.0)), Spot.missing('x'))"),
+    19: ("error", "sys.exit()"),
+}
+LAST = 21
+
+
+def misbehaving(folder: Path) -> str:
+    lines = ["import ctypes, os, sys", "print('chatter ' * 25_000)", "print('on stderr', file=sys.stderr)"]
+    lines += [f"if pair.number == {number}:\n    {deed}" for number, (_, deed) in MISDEEDS.items()]
+    return method_file(folder, "\n".join([*lines, f"return {GOOD}"]))
+
+
+@pytest.fixture(scope="module")
+def survived(tmp_path_factory: pytest.TempPathFactory) -> list[Outcome]:
+    return run_method(misbehaving(tmp_path_factory.mktemp("method")), SmallPairs(LAST), LIMITS)
+
+
+def test_every_misdeed_costs_its_own_pair_alone(survived: list[Outcome]) -> None:
+    assert [outcome.number for outcome in survived] == list(range(LAST))
+    found = {outcome.number: outcome.failure for outcome in survived if outcome.failure}
+    assert found == {number: failure for number, (failure, _) in MISDEEDS.items()}
+    assert set(found.values()) == set(FAILURES)  # every kind there is was provoked
+    good = [outcome for outcome in survived if not outcome.failure]
+    assert len(good) == LAST - len(MISDEEDS)
+    for outcome in good:
+        assert outcome.answer is not None
+        assert outcome.answer.down.uv_px == (outcome.number + 100.0, 2.0)
+        assert 0.0 <= outcome.seconds < LIMITS.seconds
+
+
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [
+        (1, "KeyError: 'no such thing' (my_phi.py, line 10, in extract)"),
+        (3, "no answer after 3 s, at my_phi.py, line 12, in extract"),
+        (5, "the process left with exit code 3, without an answer"),
+        (7, "the process died of SIGSEGV (a fault in compiled code) at my_phi.py, line 16, in extract"),
+        (9, "more memory than the limit"),
+        (11, "my_phi.py, line 20, in extract); the pair's images are read-only: work on a copy"),
+        (13, "the method wrote into the pair's images: work on a copy"),
+        (15, "the method returned a str: an Answer(down, up) is needed"),
+        (17, "down.uv_px is (nan, 2) with status 'ok': give finite numbers, or Spot.missing('why')"),
+        (19, "SystemExit (my_phi.py, line 28, in extract)"),
+    ],
+)
+def test_the_message_says_what_happened_and_where(survived: list[Outcome], number: int, words: str) -> None:
+    assert words in survived[number].message
+    assert "\n" not in survived[number].message
+    assert "Traceback" not in survived[number].message
+    assert survived[number].answer is None
+
+
+def test_seconds_are_nan_where_the_method_did_not_come_back(survived: list[Outcome]) -> None:
+    assert {n for n in range(LAST) if math.isnan(survived[n].seconds)} == {3, 5, 7}
+
+
+def test_several_workers_give_the_same_in_the_same_order(tmp_path: Path) -> None:
+    body = f"import time\ntime.sleep(0.2 if pair.number == 0 else 0.0)\nif pair.number == 2: 1 / 0\nreturn {GOOD}"
+    reference = method_file(tmp_path, body)
+    one, three = (run_method(reference, SmallPairs(6), LIMITS, workers) for workers in (1, 3))
+    assert [outcome.number for outcome in three] == list(range(6))
+    assert [(o.answer, o.failure, o.message) for o in one] == [(o.answer, o.failure, o.message) for o in three]
+    assert [o.failure for o in one] == ["", "", "error", "", "", ""]
+
+
+def test_a_process_stays_warm_until_it_fails(tmp_path: Path) -> None:
+    body = "import os\nif pair.number == 2: 1 / 0\nreturn Answer(Spot((float(os.getpid()), 0.0)), Spot.missing('x'))"
+    done = run_method(method_file(tmp_path, body), SmallPairs(5), LIMITS)
+    pids = [o.answer.down.uv_px[0] if o.answer and o.answer.down.uv_px else None for o in done]
+    assert pids[0] == pids[1] != pids[3] == pids[4]
+    assert pids[2] is None
+    assert float(os.getpid()) not in pids
+
+
+def test_what_a_method_starts_dies_with_it(tmp_path: Path) -> None:
+    """The hang is in a process that the method started: it must not outlive the pair."""
+    mark = tmp_path / "alive"
+    grandchild = f"import time, pathlib\nwhile True:\n    pathlib.Path({str(mark)!r}).touch()\n    time.sleep(0.05)"
+    body = f"import subprocess, sys\nsubprocess.run([sys.executable, '-c', {grandchild!r}])"
+    (outcome,) = run_method(method_file(tmp_path, body), SmallPairs(1), Limits(seconds=3.0))
+    assert outcome.failure == "timeout"
+    assert mark.exists()  # it did run
+    mark.unlink()
+    time.sleep(0.5)
+    assert not mark.exists()
+
+
+def test_leaving_the_loop_ends_the_process(tmp_path: Path) -> None:
+    body = "import os\nreturn Answer(Spot((float(os.getpid()), 0.0)), Spot.missing('x'))"
+    run = outcomes(method_file(tmp_path, body), SmallPairs(50), LIMITS, workers=2)
+    first = next(run)
+    run.close()
+    assert first.answer is not None
+    assert first.answer.down.uv_px is not None
+    assert not is_alive(int(first.answer.down.uv_px[0]))
+
+
+INTERRUPTED = """
+import sys
+from helpers.seat_pairs import SmallPairs
+from phibench.estimator.sandbox.runner import outcomes
+try:
+    for outcome in outcomes(sys.argv[1], SmallPairs(3)):
+        print(int(outcome.answer.down.uv_px[0]), flush=True)
+except KeyboardInterrupt:
+    sys.exit(130)
+"""
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)])
+def test_the_end_of_the_parent_leaves_nothing_behind(tmp_path: Path, number: signal.Signals, code: int) -> None:
+    """Ctrl-C while the method sleeps: no traceback, its process is gone; after kill -9 it leaves by itself in 2 s."""
+    body = (
+        "import os, time\nif pair.number == 1: time.sleep(60)\n"
+        "return Answer(Spot((float(os.getpid()), 0.0)), Spot.missing('x'))"
+    )
+    paths = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
+    command = [sys.executable, "-c", INTERRUPTED, method_file(tmp_path, body)]
+    with subprocess.Popen(
+        command, env={**os.environ, "PYTHONPATH": paths}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as parent:
+        assert parent.stdout is not None
+        assert parent.stderr is not None
+        method = int(parent.stdout.readline())
+        time.sleep(0.3)
+        parent.send_signal(number)
+        assert parent.wait(30) == code
+        assert parent.stderr.read() == ""
+    end = time.monotonic() + (0.0 if number == signal.SIGINT else 20.0)
+    while is_alive(method) and time.monotonic() < end:
+        time.sleep(0.1)
+    assert not is_alive(method)
+
+
+def is_alive(pid: int) -> bool:
+    """Whether a process is there; one that has ended and that nobody has asked after is not."""
+    try:
+        return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+# -- what a method sees ----------------------------------------------------------------------------------------------
+
+LOOK_AROUND = """
+import gc, json, os, sys
+seen, names = [repr(sys.argv), repr(dict(os.environ)), os.getcwd(), repr(os.listdir())], set()
+waiting, known = [pair], set()
+while waiting:
+    thing = waiting.pop()
+    if id(thing) in known or isinstance(thing, np.ndarray):
+        continue
+    known.add(id(thing))
+    seen.append(repr(thing))
+    if hasattr(thing, '__dict__'):
+        names |= set(vars(thing))
+        waiting += list(vars(thing).values())
+    if isinstance(thing, (tuple, list)):
+        waiting += list(thing)
+bad = [name for name in FORBIDDEN if name in names]
+bad += [name for name in sys.modules if 'bench.truth' in name or 'mitsuba' in name]
+bad += [type(thing).__name__ for thing in gc.get_objects() if type(thing).__name__ in ('PairTruth', 'SpotTruth')]
+bad += [word for word in ('/data/set', 'secret') if word in ' '.join(seen)]
+return Answer(Spot.missing('bad: ' + ' '.join(bad)), Spot((float(len(names)), 0.0)))
+"""
+
+
+@dataclass(frozen=True)
+class SecretPairs(SmallPairs):
+    """Pairs that carry more than a pair should, as a subclass with the data set's path."""
+
+    def pair(self, number: int) -> Pair:
+        plain = super().pair(number)
+        return WithSecret(**{field.name: getattr(plain, field.name) for field in fields(Pair)}, secret="/data/set")
+
+
+@dataclass(frozen=True)
+class WithSecret(Pair):
+    secret: str = ""
+
+
+@pytest.mark.parametrize("planted", ["", "focus_distance_m"])  # the second is there: the search finds what there is
+def test_a_method_sees_nothing_of_the_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, planted: str) -> None:
+    """Names that a pair shares with the truth (number, stroke_m, ...) are the nominal ones; no other is there."""
+    monkeypatch.setenv("OUT", "/data/set")
+    monkeypatch.setenv("PHIBENCH_TRUTH", "/data/set")
+    monkeypatch.chdir(tmp_path)
+    header = f"{HEADER}FORBIDDEN = {[*sorted(forbidden()), planted]!r}\n"
+    (outcome,) = run_method(method_file(tmp_path, LOOK_AROUND, header=header), SecretPairs(1), LIMITS)
+    assert outcome.failure == "", outcome.message
+    assert outcome.answer is not None
+    assert outcome.answer.down.status == f"bad: {planted}"
+    assert outcome.answer.up.uv_px is not None
+    assert outcome.answer.up.uv_px[0] > 40  # names: the walk reached rig, camera, mirror, card
+    assert len(forbidden()) > 15
+
+
+def forbidden() -> set[str]:
+    """Fields of the truth that a pair does not have under the same name."""
+    truth = {field.name for kind in (PairTruth, SpotTruth) for field in fields(kind)}
+    return truth - {"number", "stroke_m", "down", "up", "jpeg_quality", "calibration_covariance"}
+
+
+def test_the_working_directory_is_fresh_and_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    body = "import os\nreturn Answer(Spot.missing(os.getcwd() + ' ' + str(os.listdir())), Spot.missing('x'))"
+    (outcome,) = run_method(method_file(tmp_path, body), SmallPairs(1), LIMITS)
+    assert outcome.answer is not None
+    folder, listing = outcome.answer.down.status.split(" ", 1)
+    assert listing == "[]"
+    assert not folder.startswith(str(tmp_path))
+    assert not Path(folder).exists()  # removed with the process
+
+
+def test_environment_keeps_what_libraries_need_and_nothing_else() -> None:
+    inherited = {"PATH": "/bin", "OMP_NUM_THREADS": "2", "OUT": "out/paper", "OLDPWD": "/data", "PYTHONPATH": "a"}
+    kept = environment("/fresh", inherited)
+    assert kept["PATH"] == "/bin"
+    assert kept["OMP_NUM_THREADS"] == "2"
+    assert kept["PWD"] == kept["TMPDIR"] == "/fresh"
+    assert kept["PYTHONPATH"] == str(Path("a").absolute())
+    assert not {"OUT", "OLDPWD"} & set(kept)
+
+
+def test_images_arrive_as_they_were_and_cannot_be_written() -> None:
+    sent, memory = SmallPairs().pair(3), MemoryFile()
+    pages = SharedPages(memory.reader)
+    rng = np.random.default_rng(0)
+    images = [rng.integers(0, 1024, (5, 7), np.uint16), rng.integers(0, 255, (4, 3, 3), np.uint8)[:, ::-1]]
+    images.append(rng.integers(0, 1024, (500, 70), np.uint16))
+    for image in images:  # the second is not contiguous; they become smaller and larger than what the file held before
+        parcel = unpack(pack(type(sent)(3, image, image, sent.rig, 0.5, sent.card), memory), pages)
+        np.testing.assert_array_equal(parcel.pair.down, image)
+        assert parcel.pair.down.dtype == image.dtype
+        assert parcel.pair.down_off is None
+        assert parcel.pair.card == sent.card
+        with pytest.raises(ValueError, match="read-only"):
+            parcel.pair.down[0, 0] = 1
+        with pytest.raises(ValueError, match="WRITEABLE"):
+            parcel.pair.down.setflags(write=True)
+        assert parcel.unchanged()
+    memory.close()
+
+
+def test_a_kept_image_does_not_change_under_the_method(tmp_path: Path) -> None:
+    header = f"{HEADER}KEPT = []\n"
+    body = "KEPT.append(pair.down)\nreturn Answer(Spot((float(KEPT[0][0, 0]), 0.0)), Spot.missing('x'))"
+    done = run_method(method_file(tmp_path, body, header=header), SmallPairs(3), LIMITS)
+    assert [o.answer.down.uv_px[0] for o in done if o.answer and o.answer.down.uv_px] == [100.0, 100.0, 100.0]
+
+
+# -- limits and answers ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", [{"seconds": 0.0}, {"memory_mb": -1.0}, {"start_seconds": math.nan}])
+def test_limits_that_cannot_be(bad: dict[str, float]) -> None:
+    with pytest.raises(MethodError, match="must be a finite number above 0"):
+        Limits(**bad)
+    with pytest.raises(MethodError, match="workers = 0"):
+        outcomes("red_centroid", SmallPairs(1), workers=0)
+
+
+def test_an_import_that_hangs_or_dies_is_said_before_the_first_pair(tmp_path: Path) -> None:
+    hang = method_file(tmp_path, f"return {GOOD}", header="import time\ntime.sleep(60)\n")
+    with pytest.raises(MethodError, match=r"not imported after 3 s, at my_phi\.py, line 2"):
+        run_method(hang, SmallPairs(1), Limits(start_seconds=3.0))
+    dead = method_file(tmp_path, f"return {GOOD}", header="import os\nprint('farewell', flush=True)\nos._exit(4)\n")
+    with pytest.raises(MethodError, match=r"exit code 4.*last words: farewell"):
+        run_method(dead, SmallPairs(1), LIMITS)
+
+
+def through(answer: object) -> Answer:
+    """An answer on its way to the parent."""
+    return checked(json.loads(json.dumps(answer_text(answer))))
+
+
+MISSING = Spot.missing("x")
+
+
+def test_sound_answers_arrive_as_they_were() -> None:
+    spot = Spot((1.5, -0.5), ((0.04, 0.01), (0.01, 0.09)), 0.7, "normal")
+    whole = Answer(spot, MISSING, 2.5, 0.1)
+    assert through(whole) == whole
+    numpy_like = Answer(Spot(np.array([1.5, -0.5]), np.eye(2), np.float64(0.7)), MISSING, np.float32(2.5))  # type: ignore[arg-type]
+    assert through(numpy_like) == Answer(Spot((1.5, -0.5), ((1.0, 0.0), (0.0, 1.0)), 0.7), MISSING, 2.5)
+    assert through(Answer(Spot((np.nan, np.nan), status="too faint"), MISSING)).down == Spot.missing("too faint")
+
+
+@pytest.mark.parametrize(
+    ("answer", "sentence"),
+    [
+        (None, "the method returned None: an Answer(down, up) is needed"),
+        ((1.0, 2.0), "the method returned a tuple of 2"),
+        (np.zeros((2, 2)), "the method returned an array of shape (2, 2)"),
+        (Answer((1.0, 2.0), MISSING), "down is a tuple of 2: a Spot is needed"),  # type: ignore[arg-type]
+        (Answer(MISSING, Spot()), "up.uv_px is None with status 'ok': two numbers"),
+        (Answer(Spot((1.0, 2.0, 3.0)), MISSING), "down.uv_px is [1.0, 2.0, 3.0]"),  # type: ignore[arg-type]
+        (Answer(Spot(("1", "2")), MISSING), "down.uv_px is ['1', '2']"),  # type: ignore[arg-type]
+        (Answer(Spot(np.zeros((720, 1280))), MISSING), "down.uv_px is an array of shape (720, 1280)"),  # type: ignore[arg-type]
+        (Answer(Spot((1.0, math.inf)), MISSING), "down.uv_px is (1, inf)"),
+        (Answer(Spot((1.0, 2.0), phi_rad=43.0), MISSING), "These look like degrees: give radians"),
+        (Answer(Spot((1.0, 2.0), phi_rad=-0.1), MISSING), "allowed range is 0 to pi/2"),
+        (Answer(Spot((1.0, 2.0), phi_rad=math.nan), MISSING), "down.phi_rad is nan"),
+        (Answer(Spot((1.0, 2.0), phi_convention="rays"), MISSING), "did you mean 'ray'"),
+        (
+            Answer(Spot((1.0, 2.0), ((1.0, 2.0), (2.0, 1.0))), MISSING),
+            "not positive definite: its least eigenvalue is -1",
+        ),
+        (Answer(Spot((1.0, 2.0), ((0.0, 0.0), (0.0, 1.0))), MISSING), "not positive definite"),
+        (Answer(Spot((1.0, 2.0), ((1.0, 0.2), (0.0, 1.0))), MISSING), "not symmetric: 0.2 and 0"),
+        (Answer(Spot((1.0, 2.0), (0.1, 0.2)), MISSING), "2 x 2 numbers are needed"),  # type: ignore[arg-type]
+        (Answer(Spot((1.0, 2.0), ((math.nan, 0.0), (0.0, 1.0))), MISSING), "not finite: give None"),
+        (Answer(MISSING, MISSING, -2.0), "depth_m is -2.0: a finite number above 0"),
+        (Answer(MISSING, MISSING, math.nan), "depth_m is nan"),
+        (Answer(MISSING, MISSING, None, 0.1), "sigma_depth_m comes without depth_m"),
+        (Answer(Spot(status=""), MISSING), "down.status is ''"),
+        (Answer(Spot(status=3), MISSING), "down.status is 3"),  # type: ignore[arg-type]
+    ],
+)
+def test_what_is_no_answer_is_said_in_a_sentence(answer: object, sentence: str) -> None:
+    with pytest.raises(AnswerError) as caught:
+        through(answer)
+    assert sentence in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_images_of_small_pairs_differ() -> None:
+    """The tests above would see a pair taken for another."""
+    assert len({SmallPairs().pair(n).down[0, 0] for n in range(4)}) == 4
+    assert SmallPairs().pair(0).down.shape == SHAPE

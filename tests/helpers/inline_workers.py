@@ -1,0 +1,47 @@
+"""Workers that do their tasks in the process of the test."""
+
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+
+class InlineCrew:
+    """Does tasks in this process, one after the other: for tests of what is done, not of who does it."""
+
+    width = 1
+
+    def __init__(self, out: Path, *_: object) -> None:
+        self._out = out
+
+    def __enter__(self) -> "InlineCrew":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return None
+
+    def environment(self) -> dict[str, object]:
+        from phibench.datasets.build.workers import describe
+
+        return {key: value for key, value in describe().items() if key != "worker"}
+
+    def executor(self, _: int) -> "Inline":
+        return Inline(self._out)
+
+
+class Inline:
+    """Executor of `InlineCrew`."""
+
+    def __init__(self, out: Path) -> None:
+        self._out, self._waiting = out, deque[Any]()
+
+    def width(self) -> int:
+        return 1
+
+    def submit(self, task: Any) -> None:
+        self._waiting.append(task)
+
+    def next(self) -> Any:
+        from phibench.datasets.build.tasks import perform
+
+        task = self._waiting.popleft()
+        return task, perform(task, self._out)

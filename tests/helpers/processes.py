@@ -1,0 +1,37 @@
+"""Runs of `phibench dataset make` as processes, and what they say."""
+
+import contextlib
+import io
+import time
+from pathlib import Path
+
+from rich.console import Console
+
+TINY = Path(__file__).resolve().parents[1] / "tiny.toml"
+
+
+def quiet() -> Console:
+    return Console(file=io.StringIO(), width=200)
+
+
+def said(console: Console) -> str:
+    return console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def living(group: int) -> list[str]:
+    """Processes of a group that are not zombies waiting for somebody to collect them: pid, state, parent, group, ..."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):  # gone meanwhile
+            name, rest = path.read_text().rsplit(")", 1)
+            state, _, its_group = rest.split()[:3]
+            if its_group == str(group) and state != "Z":
+                found.append(name)
+    return found
+
+
+def wait_for(path: Path, seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not path.exists():
+        assert time.monotonic() < deadline, f"{path} did not appear"
+        time.sleep(0.05)
