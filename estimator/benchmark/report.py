@@ -30,7 +30,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.store.files import write_text
 from phibench.estimator.benchmark.compare import same_pairs
 from phibench.estimator.benchmark.document import ScoreDocument, StratumScore, Value, read_records, read_score
-from phibench.estimator.benchmark.tables import BOARD, cell_parts, rank_key
+from phibench.estimator.benchmark.score_tables import BOARD, cell_parts, rank_key
 from phibench.scenes.frames import Array
 
 # M. Okabe, K. Ito: told apart with every kind of colour vision; markers, lines and hatches repeat the distinction

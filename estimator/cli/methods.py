@@ -10,9 +10,6 @@ from typing import TYPE_CHECKING
 
 from cyclopts import App
 
-from phibench.datasets.store.files import write_text
-from phibench.estimator.sandbox.resolve import MethodError
-
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -116,6 +113,9 @@ def _write_example(path: Path) -> Path:
     MethodError
         If the name does not end in .py, or there is something of that name.
     """
+    from phibench.datasets.store.files import write_text
+    from phibench.estimator.sandbox.resolve import MethodError
+
     if path.suffix != ".py":
         raise MethodError(f"{path}: the file of a method must end in .py, such as my_phi.py")
     if path.exists():

@@ -86,7 +86,7 @@ def compare(first: Path, second: Path, *, seed: Whole = 0) -> int:
     from phibench.estimator.benchmark.compare import compare as compare_scores
     from phibench.estimator.benchmark.compare import note_on_code
     from phibench.estimator.benchmark.document import read_score
-    from phibench.estimator.benchmark.tables import comparison
+    from phibench.estimator.benchmark.score_tables import comparison
 
     differences = compare_scores(first, second, _seed(seed))
     a, b = read_score(first), read_score(second)
@@ -140,7 +140,7 @@ def _score_methods(
     from phibench.datasets.store.files import require_writable
     from phibench.estimator.benchmark.document import MethodCard, write_score
     from phibench.estimator.benchmark.score import run_and_score, wanted_pairs
-    from phibench.estimator.benchmark.tables import cause_table, depth_line, leaderboard, silences, strata_table
+    from phibench.estimator.benchmark.score_tables import cause_table, depth_line, leaderboard, silences, strata_table
     from phibench.estimator.sandbox.resolve import resolve
 
     files = _files(out, [MethodCard.of(name, **resolve(name).document()) for name in references])
@@ -359,8 +359,8 @@ def unseal(public: Path, *, truth: Path, submission: Path, out: Path | None = No
     from phibench.estimator.benchmark.answer_errors import Rules
     from phibench.estimator.benchmark.document import write_score
     from phibench.estimator.benchmark.score import score_outcomes
+    from phibench.estimator.benchmark.score_tables import cause_table, leaderboard
     from phibench.estimator.benchmark.submission import unseal as unseal_set
-    from phibench.estimator.benchmark.tables import cause_table, leaderboard
 
     if out is not None:
         if out.suffix != ".json":

@@ -35,6 +35,7 @@ from phibench.estimator.geometry.sensitivities import sensitivity
 from phibench.estimator.geometry.triangulate import depth_exact, exact_gradient
 from phibench.render.optics.reflection_point import reflection_points
 from phibench.render.optics.spot_layer import spot_layer
+from phibench.scenes import misalignment as rig_misalignment
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
@@ -354,8 +355,9 @@ class Bench:
 
 def nominal_sigmas(nominal: Rig) -> Array:
     """Priors, shape (p,): the study's magnitudes, or the calibration's own where they are larger."""
-    focal_px = nominal.camera.fx_px * PARAMETERS["focal_relative"].study
-    study = {name: PARAMETERS[_SAME.get(name, name)].study for name in PRIOR_SIGMA if name != "f_px"}
+    known = rig_misalignment.PARAMETERS
+    focal_px = nominal.camera.fx_px * known["focal_relative"].study
+    study = {name: known[_SAME.get(name, name)].study for name in PRIOR_SIGMA if name != "f_px"}
     return prior_sigmas({name: max(PRIOR_SIGMA[name], {**study, "f_px": focal_px}[name]) for name in PRIOR_SIGMA})
 
 

@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from phibench.datasets.errors import RecipeError
 from phibench.datasets.plan.plan import make_plan, shard_plan
 from phibench.datasets.read import open_finished
+from phibench.datasets.recipe import tables as recipes
 from phibench.datasets.recipe.load import check_recipe
-from phibench.datasets.recipe.tables import tables as recipes
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.layers import read_ambient, read_truth
 from phibench.datasets.verify import verify

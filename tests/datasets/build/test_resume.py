@@ -132,7 +132,7 @@ def test_a_key_covers_the_code_behind_a_task_and_no_other() -> None:
     )
     # the sensor's numbers, which the noise budget takes from a table beside the code
     assert "phibench.render.sensor.settings" in view - spot
-    assert [path.name for path in _tables("phibench.render.sensor.settings")] == ["sensor_presets.toml"]
+    assert [path.name for path in _tables("phibench.render.sensor.settings")] == ["settings_presets.toml"]
     assert code_behind("phibench.datasets.build.view_task") != code_behind("phibench.datasets.build.spot_task")
 
 

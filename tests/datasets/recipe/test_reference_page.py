@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
+from phibench.datasets.recipe import reference_page as recipe_page
 from phibench.datasets.recipe.build import build_rig
 from phibench.datasets.recipe.tables import RigTable
-from phibench.datasets.recipe.tables import reference_page as recipe_page
 from phibench.scenes.catalog import RIGS
 
-PAGE = Path(recipe_page.__file__).resolve().with_name("RECIPE.md").read_text(encoding="utf-8")
+PAGE = (Path(recipe_page.__file__).resolve().parents[1] / "RECIPE.md").read_text(encoding="utf-8")
 
 
 def test_the_page_is_the_generated_one() -> None:

@@ -14,7 +14,7 @@ from phibench.render.optics import truth as spot_truth
 from phibench.render.room.light_map import ARRAYS, LightMap
 from phibench.scenes.camera import FILTERS
 
-PAGE = (Path(schema.__file__).resolve().with_name("FORMAT.md")).read_text(encoding="utf-8")
+PAGE = (Path(schema.__file__).resolve().parents[1] / "FORMAT.md").read_text(encoding="utf-8")
 MODELS = (
     schema.ManifestRow,
     schema.SpotRow,

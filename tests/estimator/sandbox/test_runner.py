@@ -152,7 +152,7 @@ def test_the_end_of_the_parent_leaves_nothing_behind(tmp_path: Path, number: sig
         "import os, time\nif pair.number == 1: time.sleep(60)\n"
         "return Answer(Spot((float(os.getpid()), 0.0)), Spot.missing('x'))"
     )
-    paths = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
+    paths = os.pathsep.join([str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")])
     command = [sys.executable, "-c", INTERRUPTED, method_file(tmp_path, body)]
     with subprocess.Popen(
         command, env={**os.environ, "PYTHONPATH": paths}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -308,7 +308,9 @@ def test_senses_of_phi_are_told_apart_by_the_same_rule(settings: CauseSettings, 
 
 def _tiny() -> str:
     """Settings smaller than the reduced ones: three explanations, few points."""
-    text = (Path(__file__).resolve().parents[3] / "estimator" / "studies" / "cause.toml").read_text(encoding="utf-8")
+    text = (Path(__file__).resolve().parents[3] / "estimator" / "studies" / "cause" / "settings.toml").read_text(
+        encoding="utf-8"
+    )
     priors = text[text.index("[priors]") : text.index("[[explanations]]")]
     truth = text[
         text.index('[[validation.truths]]\nexplanation = "ray"') : text.index(

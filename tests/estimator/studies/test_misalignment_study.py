@@ -351,9 +351,7 @@ FEW = ("tilt_y_rad", "cx_px", "pitch_rad", "roughness_alpha")
 def test_tiny_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Four of the parameters, because every one of them costs two calibrations."""
     few = {name: PARAMETERS[name] for name in FEW}
-    for module in ("misaligned", "misalignment_table", "misalignment_tolerance", "misalignment_rendered"):
-        monkeypatch.setattr(f"phibench.estimator.studies.{module}.PARAMETERS", few)
-    for module in ("misalignment_interactions", "misalignment_words"):
+    for module in ("misaligned_rigs", "misalignment.tables", "misalignment.interactions"):
         monkeypatch.setattr(f"phibench.estimator.studies.{module}.PARAMETERS", few)
     file = tmp_path / "tiny.toml"
     file.write_text(TINY, encoding="utf-8")
