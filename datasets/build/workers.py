@@ -29,8 +29,9 @@ from phibench.datasets.build.scheduler import Executor, Outcome
 from phibench.datasets.build.tasks import Done, Failed, Task, fault_text, perform, worker_name
 from phibench.datasets.build.view_task import start_renderer
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.parallel import ONE_THREAD
 from phibench.datasets.store.files import write_text
-from phibench.datasets.store.provenance import ONE_THREAD, code_sha256, provenance
+from phibench.datasets.store.provenance import code_sha256, provenance
 
 CONNECT_S = 10.0
 WORKERS_S = 60.0

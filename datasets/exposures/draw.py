@@ -9,14 +9,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import signal
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib.metadata import version
-from multiprocessing import get_context
 from pathlib import Path
 
 from rich.console import Console
@@ -36,6 +33,7 @@ from phibench.datasets.frames.frame_files import (
 )
 from phibench.datasets.frames.request import FrameRequest, whole_number
 from phibench.datasets.frames.source import Frame, FrameSource, has_place
+from phibench.datasets.parallel import parallel_map
 from phibench.datasets.progress import Steps
 from phibench.datasets.read import Dataset, Sample, open_dataset, open_finished
 from phibench.datasets.store import schema as layout
@@ -168,7 +166,7 @@ def _draw(
     made, total, due = 0, 0, time.monotonic() + _SAVE_EVERY_S
     try:
         with Steps(console, "frames", len(jobs)) as steps:
-            for done, written in _results(jobs, count):
+            for done, written in parallel_map(perform, jobs, count, in_order=False):
                 rows |= {row.file: row for row in done}
                 made, total = made + written, total + len(done)
                 steps.advance()
@@ -189,25 +187,6 @@ def _parts(job: SampleJob) -> Iterator[SampleJob]:
 def _knowing(job: SampleJob, rows: Mapping[str, FrameRow]) -> SampleJob:
     names = (job.file(item) for item in job.items)
     return replace(job, known={name: rows[name] for name in names if name in rows})
-
-
-def _results(jobs: list[SampleJob], count: int) -> Iterator[tuple[list[FrameRow], int]]:
-    if count == 1 or len(jobs) == 1:
-        yield from map(perform, jobs)
-        return
-    # spawned, not forked: a fork copies the locks of other threads
-    pool = ProcessPoolExecutor(min(count, len(jobs)), get_context("spawn"), initializer=_end_quietly_on_ctrl_c)
-    try:
-        futures: list[Future[tuple[list[FrameRow], int]]] = [pool.submit(perform, job) for job in jobs]
-        for future in as_completed(futures):
-            yield future.result()
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _end_quietly_on_ctrl_c() -> None:
-    """End at once, without a traceback; what is half-written has a temporary name."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _written(job: SampleJob, source: FrameSource, item: Item, name: str, key: str) -> FrameRow:

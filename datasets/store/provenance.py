@@ -118,7 +118,3 @@ def _tables(module: str) -> list[Path]:
 
 def _file(module: str) -> Path:
     return _ROOT.joinpath(*module.split(".")[1:]).with_suffix(".py")
-
-
-ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-"""Environment variables, to be set before NumPy is loaded."""

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from cyclopts import App, CycloptsError
 
-from phibench.datasets.store.provenance import ONE_THREAD
+from phibench.datasets.parallel import ONE_THREAD
 from phibench.estimator.cli import methods as cli_methods
 from phibench.estimator.cli.calibration import align, calibrate
 from phibench.estimator.cli.dataset import dataset, panorama, sensitivities

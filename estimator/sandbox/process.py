@@ -24,7 +24,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
 
-from phibench.datasets.store.provenance import ONE_THREAD
+from phibench.datasets.parallel import ONE_THREAD
 from phibench.estimator.interface import Outcome, Pair
 from phibench.estimator.sandbox.answers import AnswerError, checked
 from phibench.estimator.sandbox.resolve import Limits, MethodError, Reference

@@ -9,11 +9,8 @@ The paper's experiments in one table: published estimate, ours with scatter, bou
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import warnings
 from collections.abc import Mapping
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,6 +20,7 @@ import polars as pl
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exposures.exposures import Take, takes
+from phibench.datasets.parallel import parallel_map
 from phibench.datasets.read import Dataset, open_finished
 from phibench.estimator.benchmark.dataset_pairs import DatasetPairs
 from phibench.estimator.geometry.mirror_image import image_of
@@ -214,12 +212,7 @@ def found_spots(
     """
     job = partial(_found, dataset.folder, preset, dict(draws))
     names = [sample.row.sample_id for sample in dataset]
-    count = min(workers or os.cpu_count() or 1, len(names))
-    if count <= 1:
-        return dict(zip(names, map(job, names), strict=True))
-    # spawned: forking a process that has threads (polars) can hang
-    with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return dict(zip(names, pool.map(job, names), strict=True))
+    return dict(zip(names, parallel_map(job, names, workers), strict=True))
 
 
 def auto_takes(dataset: Dataset, preset: str, draws: int) -> tuple[Take, ...]:

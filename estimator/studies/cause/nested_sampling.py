@@ -9,16 +9,14 @@ All nested samplings of the study, side by side in processes of their own.
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from pydantic import Field
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.parallel import parallel_map
 from phibench.estimator.studies.cause.model import (
     COMMON,
     GROUPS,
@@ -290,12 +288,7 @@ def made_up(settings: CauseSettings, truth: Truth, number: int, repeat: int) -> 
 
 def run_all(runs: Sequence[Run], workers: int | None) -> dict[tuple[Name, ...], Posterior]:
     """Posteriors by key; the number of workers changes no number, because each run has its own random stream."""
-    count = min(workers or os.cpu_count() or 1, len(runs))
-    if count <= 1:
-        return {run.key: _sampled(run) for run in runs}
-    # spawned: forking a process that has threads (polars) can hang
-    with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return dict(zip((run.key for run in runs), pool.map(_sampled, runs), strict=True))
+    return dict(zip((run.key for run in runs), parallel_map(_sampled, runs, workers), strict=True))
 
 
 def _sampled(run: Run) -> Posterior:

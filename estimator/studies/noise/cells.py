@@ -9,18 +9,16 @@ by place and draw, not by level: levels are compared on common draws.
 from __future__ import annotations
 
 import math
-import os
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 
+from phibench.datasets.parallel import parallel_map
 from phibench.datasets.progress import Steps
 from phibench.datasets.read import Dataset, open_dataset
 from phibench.estimator.benchmark.answer_errors import Rules
@@ -201,19 +199,10 @@ def all_records(cells: Sequence[Cell], material: Material) -> pl.DataFrame:
     """Records of many cells, computed by the material's workers."""
     with Steps(material.console, "noise", len(cells)) as steps:
         tables = []
-        for table in _results(cells, material.workers or os.cpu_count() or 1):
+        for table in parallel_map(cell_records, cells, material.workers):
             tables.append(table)
             steps.advance()
     return pl.concat(tables)
-
-
-def _results(cells: Sequence[Cell], workers: int) -> Iterator[pl.DataFrame]:
-    if workers == 1 or len(cells) == 1:
-        yield from map(cell_records, cells)
-        return
-    # spawned, not forked: a fork copies the locks of other threads
-    with ProcessPoolExecutor(min(workers, len(cells)), get_context("spawn")) as pool:
-        yield from pool.map(cell_records, cells)
 
 
 @lru_cache(maxsize=1)

@@ -8,15 +8,13 @@ What the numbers of the study `stroke` say, in sentences and small tables.
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from multiprocessing import get_context
 
 import numpy as np
 
+from phibench.datasets.parallel import parallel_map
 from phibench.datasets.progress import Steps
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.intervals import Clusters, estimates, rms_of
@@ -119,19 +117,10 @@ def run_checks(checks: Sequence[Check], material: Material) -> list[Checked]:
     """Measure, with the material's workers."""
     with Steps(material.console, "stroke, frames", len(checks)) as steps:
         found = []
-        for one in _results(checks, material.workers or os.cpu_count() or 1):
+        for one in parallel_map(measured, checks, material.workers):
             found.append(one)
             steps.advance()
     return found
-
-
-def _results(checks: Sequence[Check], workers: int) -> Iterator[Checked]:
-    if workers == 1 or len(checks) == 1:
-        yield from map(measured, checks)
-        return
-    # spawned, not forked: a fork copies the locks of other threads
-    with ProcessPoolExecutor(min(workers, len(checks)), get_context("spawn")) as pool:
-        yield from pool.map(measured, checks)
 
 
 def measured(check: Check) -> Checked:

@@ -1,0 +1,100 @@
+"""`map` over worker processes, for many independent items on one machine.
+
+Workers are spawned, never forked: a fork copies the locks of other threads and can hang. Each runs one BLAS thread, so
+that N workers keep N cores busy. The number of workers changes no result. Data sets are made by the cluster of
+`datasets.build.workers` instead, because its tasks depend on each other.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import reprlib
+import signal
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from typing import TypeVar
+
+from phibench.datasets.errors import DatasetError
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+"""Environment variables, to be set before NumPy is loaded."""
+
+
+def parallel_map(
+    function: Callable[[Item], Result], items: Iterable[Item], workers: int | None = None, *, in_order: bool = True
+) -> Iterator[Result]:
+    """Yield `function(item)` of every item; with one worker or one item in this process.
+
+    Parameters
+    ----------
+    function
+        Picklable: a module's function, or a `functools.partial` of one.
+    items
+        Picklable as well.
+    workers : int, optional
+        Processes; by default one per core.
+    in_order : bool
+        False yields results as they come.
+
+    Raises
+    ------
+    DatasetError
+        If a worker process dies.
+    Exception
+        Of the function, with a note that names the item. Items that have not begun are dropped.
+    """
+    listed = list(items)
+    count = min(workers or os.cpu_count() or 1, len(listed))
+    if count <= 1:
+        for item in listed:
+            with _naming(item):
+                result = function(item)
+            yield result
+        return
+    pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=_end_quietly_on_ctrl_c)
+    try:
+        with _environment(ONE_THREAD):  # processes start while items are handed over
+            asked: dict[Future[Result], Item] = {pool.submit(function, item): item for item in listed}
+        for future in asked if in_order else as_completed(asked):
+            with _naming(asked[future]):
+                result = future.result()
+            yield result
+    except BrokenProcessPool as error:
+        raise DatasetError(
+            f"a worker process died, one of {count}; most often memory has run out: take fewer workers"
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _naming(item: object) -> Iterator[None]:
+    """Add the item to whatever goes wrong with it."""
+    try:
+        yield
+    except Exception as error:
+        error.add_note(f"while working on {reprlib.repr(item)}")
+        raise
+
+
+@contextlib.contextmanager
+def _environment(added: dict[str, str]) -> Iterator[None]:
+    """Environment variables for child processes; variables that the user has set keep their values."""
+    new = [name for name in added if name not in os.environ]
+    os.environ.update({name: added[name] for name in new})
+    try:
+        yield
+    finally:
+        for name in new:
+            del os.environ[name]
+
+
+def _end_quietly_on_ctrl_c() -> None:
+    """End a worker at once on Ctrl-C, without a traceback; files that it was writing have temporary names."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -1,0 +1,113 @@
+"""Map over processes: order, errors with their item, one BLAS thread, clean ends."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.parallel import ONE_THREAD, parallel_map
+
+Python = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def late(item: int) -> tuple[int, int]:
+    """Early items take longest."""
+    time.sleep(0.2 * (3 - item) if item < 3 else 0.0)
+    return item, os.getpid()
+
+
+def inverse(item: int) -> float:
+    return 1.0 / item
+
+
+def threads(_item: int) -> list[str | None]:
+    return [os.environ.get(name) for name in ONE_THREAD]
+
+
+def begun(folder: Path, item: int) -> int:
+    (folder / str(item)).touch()
+    time.sleep(0.1)
+    return 1 // item
+
+
+def death(item: int) -> int:
+    if item == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return item
+
+
+def test_results_keep_the_order_and_come_from_workers() -> None:
+    found = list(parallel_map(late, range(5), 2))
+    assert [item for item, _ in found] == [0, 1, 2, 3, 4]
+    assert os.getpid() not in {pid for _, pid in found}
+
+
+def test_results_come_early_when_order_does_not_matter() -> None:
+    found = [item for item, _ in parallel_map(late, range(5), 2, in_order=False)]
+    assert sorted(found) == [0, 1, 2, 3, 4] != found
+
+
+@pytest.mark.parametrize(("workers", "items"), [(1, [3, 4]), (4, [3]), (4, [])])
+def test_one_worker_or_item_needs_no_process(workers: int, items: list[int]) -> None:
+    assert list(parallel_map(late, items, workers)) == [(item, os.getpid()) for item in items]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_error_names_its_item(workers: int) -> None:
+    results = parallel_map(inverse, [4, 0, 2], workers)
+    assert next(results) == 0.25
+    with pytest.raises(ZeroDivisionError) as caught:
+        next(results)
+    assert caught.value.__notes__ == ["while working on 0"]
+
+
+def test_after_an_error_the_rest_is_dropped(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError):
+        list(parallel_map(partial(begun, tmp_path), range(40), 2))
+    assert 0 < len(list(tmp_path.iterdir())) < 30
+
+
+def test_workers_run_one_thread_each_and_the_caller_keeps_its_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ONE_THREAD:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("MKL_NUM_THREADS", "3")  # who sets one keeps it
+    before = dict(os.environ)
+    assert list(parallel_map(threads, [1, 2], 2)) == [["1", "1", "3"]] * 2
+    assert dict(os.environ) == before
+
+
+def test_a_dead_worker_is_one_sentence() -> None:
+    with pytest.raises(DatasetError, match="worker process died"):
+        list(parallel_map(death, range(8), 2))
+
+
+def test_ctrl_c_ends_quietly(tmp_path: Path) -> None:
+    """An interrupt reaches all processes of the terminal's group, the workers too."""
+    script = tmp_path / "main.py"
+    script.write_text(
+        "import sys, time\nfrom phibench.datasets.parallel import parallel_map\n"
+        "if __name__ == '__main__':\n"
+        "    try:\n        print('ready', flush=True)\n"
+        "        list(parallel_map(time.sleep, [0.0, 0.0, 60.0, 60.0], 2))\n"
+        "    except KeyboardInterrupt:\n        sys.exit(130)\n"
+    )
+    child = subprocess.Popen(
+        [sys.executable, str(script)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert child.stdout is not None
+    assert child.stdout.readline() == "ready\n"
+    time.sleep(2.0)  # workers start
+    os.killpg(child.pid, signal.SIGINT)
+    _, errors = child.communicate(timeout=20.0)
+    assert (child.returncode, errors) == (130, "")
