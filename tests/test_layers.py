@@ -21,7 +21,8 @@ render/optics
 render/sensor
 render/setup
 render/room
-datasets/errors datasets/parallel datasets/progress
+datasets/errors
+datasets/parallel datasets/progress
 datasets/recipe
 datasets/plan
 datasets/store
