@@ -1,6 +1,6 @@
-"""Draw docs/geometry.png: what D and the three phi are. Run `python docs/draw_geometry.py`.
+"""Drawing of docs/geometry.png: lengths and angles of the paper. Run `python docs/draw_geometry.py`.
 
-The rays are solved, not sketched; mirror, lens distance and stroke are enlarged against the room: the angles show.
+The rays are solved, not sketched. Mirror, lens distance and stroke are enlarged against the room to show the angles.
 """
 
 from __future__ import annotations
@@ -40,26 +40,37 @@ def degrees(v: np.ndarray) -> float:
 
 
 def overview(ax: Axes) -> None:
-    """Both positions, h and D."""
+    """Both positions with h, z_c and D, and the triangle of eq. (1)."""
     for eye_z, colour, name in ((0.35, BLUE, "1 (down)"), (0.35 + STROKE, RED, "2 (up)")):
         eye, centre, mirror = reflection(eye_z)
         ax.add_patch(Circle(centre, RADIUS, fill=False, color=colour, lw=1.6))
         ax.plot(*np.stack([eye, mirror, SPOT]).T, color=colour, lw=1.2)
         ax.plot(*eye, "s", color=colour, ms=6)
         ax.plot(*centre, ".", color=colour)
-        ax.text(-0.52, centre[1], f"sphere\n{name}", color=colour, ha="right", va="center")
+        ax.text(0.52, centre[1] + 0.18, f"position {name}", color=colour, va="center")
         ax.text(-0.14, eye[1], "lens", color=colour, ha="right", va="center")
     ax.plot([0, 0], [0.0, 3.6], color=GREY, lw=0.8, ls="-.")
     ax.plot([SPOT[0] + 0.03] * 2, [0.0, 3.3], color="k", lw=3)
     ax.plot(*SPOT, "*", color=RED, ms=13)
-    ax.text(SPOT[0] + 0.12, SPOT[1] + 0.10, "laser\nspot")
-    ax.annotate("", (0.0, 0.08), (SPOT[0], 0.08), arrowprops={"arrowstyle": "<->"})
-    ax.text(2.1, 0.14, "D", ha="center", fontsize=13)
-    ax.annotate("", (-1.25, 0.35), (-1.25, 0.35 + STROKE), arrowprops={"arrowstyle": "<->"})
-    ax.text(-1.33, 0.35 + STROKE / 2, "h", ha="right", fontsize=13)
-    for z in (0.35, 0.35 + STROKE):
-        ax.plot([-1.35, -0.55], [z, z], color=GREY, lw=0.6)
-    ax.set(xlim=(-1.6, 4.9), ylim=(0.0, 3.7), title="D: from the vertical through the sphere centre (down) to the spot")
+    ax.text(SPOT[0] - 0.08, 3.1, "wall", ha="right")
+    ax.text(SPOT[0] - 0.08, SPOT[1] + 0.85, "laser spot", ha="right", color=RED)
+    dimension(ax, (0.0, 0.08), (SPOT[0], 0.08), "D", (2.9, 0.12))
+    _, centre, mirror = reflection(0.35)
+    dimension(ax, (mirror[0], SPOT[1]), (mirror[0], mirror[1]), "$H_1$", (mirror[0] + 0.08, 0.55))
+    dimension(ax, (mirror[0], SPOT[1]), (SPOT[0], SPOT[1]), "$D_1$", (1.6, SPOT[1] + 0.04))
+    dimension(ax, (-0.62, 0.35), (-0.62, centre[1]), "$z_c$", (-0.98, 0.75))
+    dimension(ax, (-1.15, 0.35), (-1.15, 0.35 + STROKE), "h", (-1.4, 1.5))
+    for z, out in ((0.35, -1.25), (centre[1], -0.7), (0.35 + STROKE, -1.25)):
+        ax.plot([out, -0.5 if z != centre[1] else 0.0], [z, z], color=GREY, lw=0.6)
+    ax.set(xlim=(-1.5, 4.4), ylim=(0.0, 3.7), title="lengths")
+
+
+def dimension(
+    ax: Axes, start: tuple[float, float], end: tuple[float, float], label: str, at: tuple[float, float]
+) -> None:
+    """Double arrow with its label."""
+    ax.annotate("", start, end, arrowprops={"arrowstyle": "<->", "lw": 0.9, "shrinkA": 0, "shrinkB": 0})
+    ax.text(*at, label, fontsize=12)
 
 
 def closeup(ax: Axes) -> None:
@@ -77,27 +88,28 @@ def closeup(ax: Axes) -> None:
     n, e, s = degrees(normal), degrees(to_eye), degrees(to_spot)
     arc(ax, mirror, 0.50, -90.0, s, "", RED, 0.5)
     ax.text(mirror[0] + 0.38, mirror[1] - 0.52, r"$\theta = 2\,\varphi_{ray}$", color=RED)
-    arc(ax, mirror, 0.36, -90.0, n, r"$\varphi_{normal}$", "k", 0.43)
+    arc(ax, mirror, 0.36, -90.0, n, "", "k", 0.43)
+    ax.text(mirror[0] - 0.02, mirror[1] - 0.40, r"$\varphi_{normal}$", ha="right")
     arc(ax, mirror, 0.16, n, s, "", "#2a8050", 0.16)
     ax.text(mirror[0] + 0.13, mirror[1] - 0.20, r"$\varphi_{incidence}$", color="#2a8050", va="center")
     arc(ax, mirror, 0.20, e, n, "", "#2a8050", 0.2)
     ax.plot(*centre, ".k")
-    ax.text(centre[0] - 0.03, centre[1], "sphere centre", ha="right", va="center", fontsize=9)
+    ax.text(centre[0], centre[1] + 0.04, "sphere centre", ha="center", va="bottom", fontsize=9)
     low, high = mirror - [0.62, 0.90], mirror + [0.86, 0.62]
-    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), title="the three angles called phi")
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), title="angles at the reflection point")
 
 
 def main() -> None:
     """Write the picture beside this file."""
     mpl.use("Agg")
-    figure = Figure(figsize=(11.5, 4.6), layout="constrained")
+    figure = Figure(figsize=(8.6, 3.9), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.45, 1.0))
     overview(left)
     closeup(right)
     for ax in (left, right):
         ax.set_aspect("equal")
         ax.axis("off")
-    figure.savefig(Path(__file__).with_name("geometry.png"), dpi=90, metadata={"Software": None})
+    figure.savefig(Path(__file__).with_name("geometry.png"), dpi=100, metadata={"Software": None})
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from phibench.scenes.rig import Rig
 BLUE, RED, GREY = "#1f5fa8", "#c03028", "0.55"
 DEPTHS_M, STROKE_M, Z_C_M, BELOW_SPHERE_M = (1.0, 2.5, 4.2), 0.5, 0.30, 0.20
 HALF_DEGREE, TENTH = math.radians(0.5), math.radians(0.1)
-# size of an error as DESIGN section 5 has it, in words, and its percent of D at the three depths
+# Size of an error, the same in words, and percent of D at the three depths by a prototype that shares no code.
 BUDGET: dict[str, tuple[float, str, str]] = {
     "tilt_y_rad": (HALF_DEGREE, "0.5 deg", "-5.1 / +0.9 / +2.8"),
     "decentre_x_m": (1e-3, "1 mm", "+1.4 / -1.2 / -2.0"),
@@ -94,14 +94,16 @@ def parameter_table() -> str:
 
 
 def budget_table() -> str:
-    """dD/dp of the exact estimator, and what an error of usual size does, beside DESIGN's numbers."""
+    """dD/dp of the exact estimator, and what an error of usual size does, beside the prototype's numbers."""
     rows = []
-    for name, (size, words, design) in BUDGET.items():
+    for name, (size, words, prototype) in BUDGET.items():
         slopes = " / ".join(number(slope("exact", name, depth)) for depth in DEPTHS_M)
         whole = " / ".join(percent(whole_change(name, size, depth)) for depth in DEPTHS_M)
         linear = " / ".join(percent(slope("exact", name, depth) * size / depth) for depth in DEPTHS_M)
-        rows.append((f"`{name}`", slopes, words, linear, whole, design))
-    return table(("parameter", "dD/dp, m per unit", "error", "slope x error, %", "whole change, %", "DESIGN, %"), rows)
+        rows.append((f"`{name}`", slopes, words, linear, whole, prototype))
+    return table(
+        ("parameter", "dD/dp, m per unit", "error", "slope x error, %", "whole change, %", "prototype, %"), rows
+    )
 
 
 def estimator_table() -> str:

@@ -3,7 +3,7 @@
 A layer holds one plane per colour filter. Ambient light is carried in three bands, one per filter, each with
 an effective wavelength and an efficiency (quantum efficiency times filter and lens transmission). The
 laser line is handled at its own wavelength. Nobody has published electron-level data of a C310: the numbers are
-DESIGN section 4's and marked there as assumed.
+assumed (docs/model.md).
 
 The camera: a thin lens with OpenCV intrinsics and Brown distortion.
 

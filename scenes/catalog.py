@@ -122,7 +122,7 @@ def _lamps() -> tuple[Rectangle, ...]:
 
 
 def default_rig() -> Rig:
-    """DESIGN section 4: aligned, no distortion, focused on the virtual image at z_c - R/2."""
+    """Aligned rig without distortion, focused on the virtual image at z_c - R/2; numbers in docs/model.md."""
     return Rig()
 
 

@@ -1,7 +1,7 @@
 """The paper's depth from two angles, its approximation, and its predicted errors.
 
 "Depth estimation for mobile robot using single omnidirectional camera system", section 3 and 4. Symbols are the
-paper's: phi_1 (down) and phi_2 (up), h stroke, R mirror radius, D depth, lambda, epsilon; errata in the docs.
+paper's: phi_1 (down) and phi_2 (up), h stroke, R mirror radius, D depth, lambda, epsilon; see docs/paper.md.
 Everything is vectorised over leading axes that broadcast together.
 
 The paper's published results, Tables 1 to 4, from `published.csv`.

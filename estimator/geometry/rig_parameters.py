@@ -136,7 +136,7 @@ _STEPS = {
     "stroke_tilt_y_rad": 1e-3,
     STROKE_SCALE: 1e-3,
 }
-# A rig put together with care and measured by hand: the errors that DESIGN's budget looks at.
+# A rig put together with care and measured by hand.
 PRIOR_SIGMA: Mapping[str, float] = {
     "stroke_m": 5e-4,
     "z_c_m": 2e-3,

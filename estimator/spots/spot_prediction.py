@@ -11,7 +11,7 @@ square pixel collects the etendue A cos(alpha) dOmega, alpha the chief ray's ang
 
     watts = rho(i) (a P / pi) |d(u, v) / d(wall)| A cos^4(alpha) |d(x, y) / d(u, v)|.
 
-The aperture is taken as a point; the spot layer's quadrature over it is the simulator's (DESIGN, section 5).
+The aperture is taken as a point; the spot layer's quadrature over it is the simulator's.
 """
 
 from __future__ import annotations

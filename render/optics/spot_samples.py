@@ -8,7 +8,7 @@ angle of incidence, Coddington's equations for a convex sphere give the distance
 
     1/s_t = 1/s + 2 / (R cos i)      1/s_s = 1/s + 2 cos(i) / R
 
-and dPhi = L rho(i) cos(theta_spot) cos(theta_lens) / (s^2 (1 + l/s_t) (1 + l/s_s)) dA_spot dA_lens (DESIGN section 5).
+and dPhi = L rho(i) cos(theta_spot) cos(theta_lens) / (s^2 (1 + l/s_t) (1 + l/s_s)) dA_spot dA_lens.
 With a form error the two factors become a determinant, that of the reflected bundle's curvature (`fermat`).
 """
 

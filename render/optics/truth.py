@@ -1,6 +1,6 @@
 """The three angles that the paper calls phi, and the azimuth, of rays leaving the mirror.
 
-All angles are measured against the world's vertical (DESIGN section 3, paper/errata).
+All angles are measured against the world's vertical: docs/paper.md.
 
 Exact answers for one laser spot in one view: the chief ray, by closed form (or Fermat's path) in float64.
 

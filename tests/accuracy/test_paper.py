@@ -76,7 +76,7 @@ def test_accuracy_of_the_papers_equation(scores: tuple[Score, ...]) -> None:
 
 
 def test_published_estimates_stand_beside_ours(scores: tuple[Score, ...]) -> None:
-    """25 published results with an rms of 5.79 % and a largest error of 13.9 % (errata)."""
+    """25 published results with an rms of 5.79 % and a largest error of 13.9 % (docs/paper.md)."""
     published = np.array([s.published_m / s.depth_m - 1.0 for s in _of(scores, "exact", "truth")])
     assert np.sqrt(np.mean(published**2)) == pytest.approx(0.0579, abs=5e-5)
     assert np.abs(published).max() == pytest.approx(0.1388, abs=1e-4)

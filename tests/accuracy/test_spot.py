@@ -107,7 +107,7 @@ def test_certificate_notices_a_wrong_chief_ray() -> None:
 
 
 def test_coma_is_small_in_focus_and_grows_out_of_focus() -> None:
-    """DESIGN's estimate: 0.0003 px in focus, 0.003 to 0.004 px at the factory focus with a wide spread of positions."""
+    """A prototype gave 0.0003 px in focus, 0.003 to 0.004 px at the factory focus."""
     rig, spot = default_rig(), LaserSpot((3.0, 0.0, 0.5), (-1, 0, 0), 6e-3)
     far = dataclasses.replace(rig, camera=dataclasses.replace(rig.camera, focus_distance_m=0.46))
     shifts = []
@@ -145,7 +145,7 @@ def _embed(layer, u0: int, v0: int, size: int) -> np.ndarray:
 
 
 def test_random_pairs_give_the_same_image() -> None:
-    """262 144 random pairs, as the plain reading of DESIGN section 5 has it: flux to 5 sigma of their scatter."""
+    """262 144 random pairs, the plain alternative to quadrature: flux to 5 sigma of their scatter."""
     view, spot = default_rig().at(0.3), LaserSpot((1.5, 1.0, 0.4), (-1, -0.6, 0.1), 5e-3, profile="uniform")
     rng, count = np.random.default_rng(5), 262144
     radius, turn = np.sqrt(rng.uniform(size=(2, count))), rng.uniform(0.0, 2.0 * np.pi, (2, count))
@@ -186,15 +186,17 @@ def test_layer_holds_all_flux_and_the_filters_ratio() -> None:
     assert layer.total_electrons_per_s / layer.total_electrons_per_s[0] == pytest.approx([1.0, 0.10, 0.03])
 
 
-def test_expected_signal_is_that_of_the_design() -> None:
-    """DESIGN: about 15 000 electrons at 2 m, 58 000 at 1 m, 3 300 at 4.2 m in 1/60 s, at z_c about 0.30 m."""
+def test_expected_signal_is_that_of_the_prototype() -> None:
+    """Prototype: about 15 000 electrons at 2 m, 58 000 at 1 m, 3 300 at 4.2 m in 1/60 s, at z_c about 0.30 m."""
     from phibench.scenes.frames import Pose
 
     rig = dataclasses.replace(default_rig(), T_camera_sphere=Pose("camera", "sphere", (0.0, 0.0, 0.30)))
     for depth, electrons in ((1.0, 58000.0), (2.0, 15000.0), (4.2, 3300.0)):
         spot = LaserSpot((depth, 0.0, 0.5), (-1, 0, 0), beam_diameter_m(depth))
         total = spot_layer(rig.at(0.0), spot, ()).total_electrons_per_s[0] / 60.0
-        assert total == pytest.approx(electrons, rel=0.15)  # the design's figures are rounded and for an unnamed height
+        assert total == pytest.approx(
+            electrons, rel=0.15
+        )  # the prototype's figures are rounded and for an unnamed height
 
 
 @pytest.mark.parametrize("profile", ["gaussian", "uniform"])

@@ -15,7 +15,7 @@ from phibench.estimator.geometry import paper_depth as published
 from phibench.scenes.random_streams import generator, seed_32, seed_sequence
 from phibench.scenes.rig import POSITIONS
 
-# Tables 1 to 4 of the paper: real depth, baselines (the last of table 1 is printed 1.04; see the errata).
+# Tables 1 to 4 of the paper: real depth, baselines (the last of table 1 is printed 1.04; see docs/paper.md).
 PAPER = {
     "table1": [(2.18, h) for h in (0.80, 0.90, 1.00, 1.10, 1.20, 1.30, 1.40)],
     "table2": [(3.18, h) for h in (0.30, 0.35, 0.40, 0.425, 0.45, 0.50, 0.60)],

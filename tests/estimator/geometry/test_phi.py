@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -74,10 +76,10 @@ def test_accuracy_bias_table_of_the_conventions(convention):
         assert bias == pytest.approx(expected, abs=1e-10)
 
 
-def test_accuracy_bias_range_of_the_errata():
-    """errata.md: eq. (4) with phi_normal, phi_incidence or asin(r / r_outline) is biased by -14 % to +8 %."""
+def test_accuracy_bias_range_below_the_mirror():
+    """docs/paper.md: eq. (4) with phi_normal, phi_incidence or asin(r / r_outline) is biased by -14 % to +8 %."""
     values = np.array([[biases(name, z) for name in ("normal", "incidence", "outline")] for z in (0.05, 0.50, 1.00)])
-    # the errata name no rig; "-14 % to +8 %" must hold to one percent for the default rig and points up to 1 m
+    # no rig is named there; "-14 % to +8 %" must hold to one percent for the default rig and points up to 1 m
     assert -0.15 < values.min() < -0.13
     assert 0.07 < values.max() < 0.09
     # the three wrong senses are wrong at every height, the right one by less than a millimetre
@@ -85,10 +87,21 @@ def test_accuracy_bias_range_of_the_errata():
     assert max(np.abs(biases("ray", z)).max() for z in (0.05, 0.50, 1.00)) < 5e-4
 
 
-def test_accuracy_bias_beyond_the_errata_for_points_above_the_mirror():
-    """The errata's range holds for points below the mirror only: at 2 m the same conventions fail by half the depth."""
+def test_accuracy_bias_of_points_above_the_mirror():
+    """That range holds for points below the mirror only: at 2 m the same conventions fail by half the depth."""
     assert biases("normal", 2.0).max() > 0.5
     assert biases("incidence", 2.0).min() < -0.45
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_the_page_states_these_biases(convention):
+    """docs/paper.md, rounded to the digits that it gives."""
+    page = (Path(__file__).parents[3] / "docs/paper.md").read_text(encoding="utf-8")
+    (row,) = re.findall(rf"^\| `phi_{convention}` \| (\S+) to (\S+) % \| (\S+) % \|$", page, re.M)
+    ours = 100 * biases(convention, 0.50)
+    for printed, value in zip(row, (ours.min(), ours.max(), np.sqrt(np.mean(ours**2))), strict=True):
+        digits = len(printed.split(".")[1])
+        assert float(printed) == pytest.approx(value, abs=0.51 * 10.0**-digits)
 
 
 def test_conventions_agree_for_a_far_camera():

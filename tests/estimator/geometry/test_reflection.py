@@ -56,7 +56,7 @@ def test_accuracy_reflection_point_and_ray_for_random_rigs():
 
 
 def test_accuracy_angles_obey_the_law_of_reflection():
-    """phi_i = phi_n + alpha and theta = 2 phi_n + alpha (errata), for aligned optics."""
+    """phi_i = phi_n + alpha and theta = 2 phi_n + alpha, for aligned optics."""
     uv = CENTRE + np.stack([np.linspace(1.0, 338.0, 500), np.zeros(500)], -1)
     result = reflect(Rig().at(0.0), uv)
     assert np.all(result.status == Status.OK)

@@ -289,7 +289,7 @@ def test_a_spot_that_is_not_seen_has_no_sensitivities() -> None:
     )
 
 
-# -- DESIGN's budget -----------------------------------------------------------------------------------------------
+# -- budget of a prototype ----------------------------------------------------------------------------------------
 
 BUDGET = {  # % of D at D = 1, 2.5, 4.2 m: spots along +x, 0.20 m below the sphere when down, z_c = 0.30 m, h = 0.5 m
     "tilt_y_rad": (math.radians(0.5), (-5.1, 0.9, 2.8)),

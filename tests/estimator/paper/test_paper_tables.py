@@ -181,7 +181,7 @@ def test_published_results_are_the_papers():
     assert [sum(row.experiment == f"table{i}" for row in rows) for i in (1, 2, 3, 4)] == [7, 7, 7, 4]
     assert len({row.baseline_m for row in rows}) == 17  # baselines, 18 poses with the one at the bottom
     percent = 100 * np.abs([row.error_m / row.real_depth_m for row in rows])
-    # errata.md: mean 4.67 %, rms 5.79 %, range 0.31 % to 13.9 %
+    # docs/paper.md: mean 4.67 %, rms 5.79 %, range 0.31 % to 13.9 %
     assert np.mean(percent) == pytest.approx(4.67, abs=0.005)
     assert np.sqrt(np.mean(percent**2)) == pytest.approx(5.79, abs=0.005)
     assert (percent.min(), percent.max()) == (pytest.approx(0.31, abs=0.005), pytest.approx(13.9, abs=0.05))

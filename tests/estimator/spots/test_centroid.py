@@ -33,7 +33,7 @@ def test_centroid_finds_the_position(u, v, sigma):
 
 
 def test_narrow_spot_keeps_the_bias_of_its_sampling():
-    """DESIGN section 6: at 0.3 px the centroid itself is biased; a test that saw 0 would not test pixels."""
+    """At 0.3 px the centroid itself is biased; a test that saw 0 would not test pixels."""
     spot = find_spot(gaussian(80.25, 60.0, 0.3, 0.3))
     # first harmonic of the box-integrated sampling, largest at 1/4 pixel; the second vanishes there
     assert spot.uv_px[0] - 80.25 == pytest.approx(-np.exp(-2 * np.pi**2 * 0.3**2) / np.pi, rel=1e-5)

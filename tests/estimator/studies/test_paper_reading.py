@@ -95,7 +95,7 @@ def test_centred_radii_and_the_outline() -> None:
 
 
 def test_h_against_d_cannot_make_the_error_rise() -> None:
-    """Eq. (4) with phi_ray is off by less than a millimetre (errata); eq. (5) is depth.depth_approx."""
+    """Eq. (4) with phi_ray is off by less than a millimetre; eq. (5) is depth.depth_approx."""
     short = short_stroke_table()
     assert short["eq4_error_m"].abs().max() < 1e-3
     world = {"z_c_m": np.asarray(0.26), **{name: np.asarray(-0.21) for name in HEIGHTS}}

@@ -30,9 +30,7 @@ def test_gradient_of_phi_is_that_of_the_closed_form() -> None:
     step = np.array([moved.u_px, moved.v_px]) - UV
     change = moved.phi_ray_rad - TRUTH.phi_ray_rad
     assert nb.phi_gradient(VIEW, UV) @ step == pytest.approx(change, rel=1e-3)
-    assert np.linalg.norm(nb.phi_gradient(VIEW, UV)) == pytest.approx(
-        7.6e-3 / 2.0, rel=0.1
-    )  # DESIGN: 7.6 mrad of theta
+    assert np.linalg.norm(nb.phi_gradient(VIEW, UV)) == pytest.approx(7.6e-3 / 2.0, rel=0.1)  # 7.6 mrad of theta
 
 
 def _blurred_noise(rng: np.random.Generator, draws: int, h: int, w: int) -> np.ndarray:

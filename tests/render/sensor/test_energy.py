@@ -126,7 +126,7 @@ def test_accuracy_energy_of_the_spot(depth_m: float, azimuth: float) -> None:
 
 
 def test_accuracy_energy_fresnel_at_normal_incidence() -> None:
-    """((n - 1)^2 + k^2) / ((n + 1)^2 + k^2), and DESIGN's 66.7 % and 66.0 %."""
+    """((n - 1)^2 + k^2) / ((n + 1)^2 + k^2), and the 66.7 % and 66.0 % of docs/model.md."""
     n, k = STEEL_650.real, STEEL_650.imag
     assert fresnel(STEEL_650, 0.0) == pytest.approx(((n - 1) ** 2 + k * k) / ((n + 1) ** 2 + k * k), rel=1e-12)
     assert fresnel(STEEL_650, 0.0) == pytest.approx(0.667, abs=5e-4)

@@ -1,0 +1,254 @@
+"""The pages: short sentences, short lines, live links, and paths, tests and commands that exist."""
+
+import ast
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from phibench.estimator.cli.main import app
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = sorted(
+    page.relative_to(ROOT).as_posix()
+    for pattern in ("*.md", "docs/**/*.md", "datasets/*.md")
+    for page in ROOT.glob(pattern)
+)
+# History is written once and describes commands and files of its time.
+HISTORY = {"CHANGELOG.md"}
+# Pages that still have long sentences or lines. Take a page out when it is mended; a new page is held from the start.
+NOT_YET = {
+    "CONTRIBUTING.md",
+    "README.md",
+    "docs/measurements.md",
+    "docs/model.md",
+    "datasets/FORMAT.md",
+    "datasets/RECIPE.md",
+    "docs/benchmark.md",
+    "docs/calibration.md",
+    "docs/cluster.md",
+    "docs/experiments.md",
+    "docs/limits.md",
+    "docs/method.md",
+    "docs/misalignment.md",
+    "docs/scoring.md",
+    "docs/sealed.md",
+    "docs/sensor.md",
+    "docs/studies.md",
+    "docs/studies/baseline.md",
+    "docs/studies/cause.md",
+    "docs/studies/isotropy.md",
+    "docs/studies/misalignment.md",
+    "docs/studies/noise.md",
+    "docs/studies/stroke.md",
+}
+PRESENT = [page for page in PAGES if page not in HISTORY]
+HELD = [page for page in PRESENT if page not in NOT_YET]
+# Commands that pages name and that the command line gets next.
+COMING = {"paper"}
+MAX_WORDS = 25
+MAX_COLUMNS = 120
+# Words of other places that no reader of the repository can look up.
+NOWHERE = re.compile(r"\b(DESIGN|HOUSE|BRIEF)\b|\berrata\.md\b")
+
+FENCE = re.compile(r"^\s*```.*?^\s*```\s*$", re.M | re.S)
+FORMULA = re.compile(r"\$\$.*?\$\$", re.S)
+CODE = re.compile(r"(?<!`)`([^`\n]+(?:\n[^`\n]+)?)`(?!`)")
+LINK = re.compile(r"!?\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)[^)]*\)")
+SOURCE = re.compile(r"""<(?:img|source)[^>]*?\b(?:src|srcset)="([^"]+)\"""")
+REPOSITORY_PATH = re.compile(
+    r"\b(?:scenes|render|datasets|estimator|tests|docs)/[\w./*-]*\w\.(?:py|md|toml|csv|png|json)\b"
+)
+ABBREVIATION = re.compile(
+    r"\b(eqs?|figs?|e\.g|i\.e|etc|vs|cf|et al|no|J|Appl|Phys|Opt|Lett|Nat|Soc|Am|Proc|Sec)\.(?=\s)"
+)
+
+
+def read(page: str) -> str:
+    return (ROOT / page).read_text(encoding="utf-8")
+
+
+def in_table(line: str) -> bool:
+    return line.lstrip().startswith("|")
+
+
+def blocks(text: str) -> Iterator[str]:
+    """Yield paragraphs and list items: no code, tables, headings, formulas."""
+    text = FORMULA.sub("\n\n", FENCE.sub("\n\n", re.sub(r"<!--.*?-->", "", text, flags=re.S)))
+    block: list[str] = []
+    for line in [*text.split("\n"), ""]:
+        item = re.match(r"\s*(?:[*+-]|\d+\.)\s+", line)
+        ends = not line.strip() or in_table(line) or line.startswith(("#", "<", "    ", "---"))
+        if (ends or item) and block:
+            yield " ".join(block)
+            block = []
+        if not ends or (item and not line.startswith("    ")):
+            block.append(line[item.end() :] if item else line.strip().lstrip("> "))
+
+
+def sentences(block: str) -> list[str]:
+    """Split a block; code, a formula and a link's address are one word or none."""
+    plain = re.sub(r"\$[^$]+\$", "formula", CODE.sub("code", LINK.sub(r"\1", block)))
+    plain = ABBREVIATION.sub(r"\1", plain)
+    return [part for part in re.split(r"(?<=[.!?])[)\"*]*\s+", plain) if part]
+
+
+def words(sentence: str) -> int:
+    return sum(any(c.isalnum() for c in word) for word in sentence.split())
+
+
+def slug(heading: str) -> str:
+    """GitHub's anchor of a heading."""
+    plain = re.sub(r"[`*]", "", LINK.sub(r"\1", heading)).strip().lower()
+    return re.sub(r"[^\w\- ]", "", plain).replace(" ", "-")
+
+
+def anchors(page: Path) -> set[str]:
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    return {slug(h) for h in re.findall(r"^#+\s+(.*)$", text, re.M)} | set(
+        re.findall(r'<a (?:id|name)="([^"]+)"', text)
+    )
+
+
+def code_pieces(text: str) -> Iterator[str]:
+    """Yield inline code, and the lines of code blocks."""
+    for fence in FENCE.findall(text):
+        yield from fence.split("\n")[1:-1]
+    rest = FENCE.sub("", text)
+    yield from (" ".join(piece.split()) for piece in CODE.findall(rest))
+    yield from (line.strip() for line in rest.split("\n") if line.startswith("    ") and not in_table(line))
+
+
+@cache
+def collected_tests() -> tuple[tuple[str, str], ...]:
+    """All tests: (file's source, "file name::function")."""
+    return tuple(
+        (source, f"{file.name}::{node.name}")
+        for file in sorted((ROOT / "tests").rglob("test_*.py"))
+        for source in (file.read_text(encoding="utf-8"),)
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")
+    )
+
+
+def selects(expression: str, source: str, name: str) -> bool:
+    """Whether a ``-k`` expression can select a test; parts of a parameter's name are looked up in the file."""
+
+    def holds(word: str) -> str:
+        inside = word.lower() in name.lower() or (not word.isidentifier() and all(p in source for p in word.split("-")))
+        return str(inside or f'"{word}"' in source)
+
+    python = re.sub(r"[^\s()]+", lambda m: m[0] if m[0] in ("and", "or", "not") else holds(m[0]), expression)
+    return bool(eval(python))  # True, False, and, or, not, brackets: nothing else is left
+
+
+@pytest.mark.parametrize("page", HELD)
+def test_sentences_are_short(page):
+    long = [(words(s), s) for block in blocks(read(page)) for s in sentences(block) if words(s) > MAX_WORDS]
+    assert not long, "\n".join(f"{n} words: {s}" for n, s in long)
+
+
+@pytest.mark.parametrize("page", HELD)
+def test_lines_are_short(page):
+    lines = enumerate(read(page).split("\n"), 1)
+    long = [n for n, line in lines if len(line) > MAX_COLUMNS and not in_table(line) and " " in line.strip()]
+    assert not long, f"lines beyond {MAX_COLUMNS} columns: {long}"
+
+
+@pytest.mark.parametrize("page", [*HELD, *sorted(HISTORY)])
+def test_links_are_alive(page):
+    text = CODE.sub("", FENCE.sub("", read(page)))
+    dead = []
+    for target in [target for _, target in LINK.findall(text)] + SOURCE.findall(text):
+        path, _, anchor = target.partition("#")
+        if re.match(r"\w+:", path):
+            continue
+        file = (ROOT / page).parent / path if path else ROOT / page
+        if not file.exists() or (anchor and file.suffix == ".md" and anchor not in anchors(file)):
+            dead.append(target)
+    assert not dead
+
+
+@pytest.mark.parametrize("page", HELD)
+def test_files_that_are_named_exist(page):
+    named = {path for piece in code_pieces(read(page)) for path in REPOSITORY_PATH.findall(piece)}
+    assert not [path for path in sorted(named) if "NAME" not in path and not list(ROOT.glob(path))]
+
+
+@pytest.mark.parametrize("page", HELD)
+def test_tests_that_are_named_exist(page):
+    missing = []
+    for piece in code_pieces(read(page)):
+        if not re.search(r"\bpytest\b", piece):
+            continue
+        files = re.findall(r"\btests/\S+\.py", piece)
+        sources = [
+            (s, n) for s, n in collected_tests() if not files or n.split("::")[0] in {Path(f).name for f in files}
+        ]
+        for quoted, bare in re.findall(r"""-k\s+(?:"([^"]+)"|(\S+))""", piece):
+            if not any(selects(quoted or bare, source, name) for source, name in sources):
+                missing.append(piece)
+    assert not missing
+
+
+@pytest.mark.parametrize("page", HELD)
+def test_commands_that_are_named_exist(page):
+    unknown = []
+    for piece in code_pieces(read(page)):
+        match = re.match(r"(?:time )?(?:\S*/)?phibench\s+([a-z][\w-]*)(?:\s+([a-z][\w-]*))?", piece)
+        if match and not is_command(match[1], match[2]):
+            unknown.append(piece)
+    assert not unknown
+
+
+def is_command(name: str, sub: str | None) -> bool:
+    """Whether the command line has this command; of a group, the subcommand too."""
+    if name in COMING:
+        return True
+    if name not in app:
+        return False
+    group = [key for key in app[name] if not key.startswith("-")]
+    return not group or sub is None or sub in group
+
+
+@pytest.mark.parametrize("page", HELD)
+def test_make_targets_that_are_named_exist(page):
+    targets = set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M))
+    named = {m[1] for piece in code_pieces(read(page)) if (m := re.match(r"(?:time )?make ([a-z][\w-]*)", piece))}
+    assert named <= targets
+
+
+def test_pages_that_are_excused_exist():
+    assert set(PAGES) >= NOT_YET
+
+
+def test_nothing_is_named_that_only_the_authors_have():
+    suffixes = {".py", ".md", ".toml", ".csv", ".json", ".ini", ".cff", ""}
+    folders = ("scenes", "render", "datasets", "estimator", "tests", "docs")
+    files = [f for folder in folders for f in (ROOT / folder).rglob("*") if f.is_file() and f.suffix in suffixes]
+    assert len(files) > 300
+    found = [
+        f.relative_to(ROOT).as_posix()
+        for f in [*files, *ROOT.glob("*.md"), ROOT / "Makefile"]
+        if f != Path(__file__) and "__pycache__" not in f.parts and NOWHERE.search(f.read_text(encoding="utf-8"))
+    ]
+    assert not found
+
+
+def test_the_checks_see_faults():
+    long = "One " + "word " * 24 + "more."
+    assert [words(s) for s in sentences(long + " Short one. See eq. (4) of `a b c` in [a page](x.md).")] == [26, 2, 8]
+    assert list(blocks("# A\n\none\ntwo\n* three\n  four\n\n| t |\n\n    code\n$$\nx\n$$\nend")) == [
+        "one two",
+        "three four",
+        "end",
+    ]
+    assert selects("pages and not links", "", "test_pages.py::test_lines")
+    assert not selects("pages and not links", "", "test_pages.py::test_links")
+    assert selects("chain and mjpeg-5000", "('mjpeg', 5000)", "t.py::test_chain")
+    assert is_command("dataset", "make")
+    assert not is_command("dataset", "bake")
+    assert not is_command("paint", None)
+    assert slug("What `make dataset` writes") == "what-make-dataset-writes"
