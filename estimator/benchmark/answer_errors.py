@@ -1,19 +1,23 @@
-"""Errors of answers, as arrays: position, phi, depth, and what the claimed covariance and the bound say of them.
+"""Rules of a score, and errors of answers as arrays: position, phi, claimed covariance.
 
-Kernels over n answers that share a nominal and a true rig. NaN where there is nothing to compare. Pixels as
-everywhere: integer (u, v) at pixel centres. Phi does not depend on the carriage, so that rigs are taken at the down
-position.
+Definitions, used by all metrics:
 
-The rules of a score: what counts as found, how a missed spot counts, how intervals are made.
+found
+    The spot is visible and a position is given within `match_px` of the chief ray's (u, v).
+missed
+    The spot is visible and not found.
+false detection
+    A position is given where no spot is visible, or further than `match_px` from it. An image can be missed and
+    falsely detected at once.
+depth found
+    Both spots of the pair are found, and a finite depth above 0 follows: the method's own, else that of the positions.
 
-* An image's spot is **detected** when a position is given within `match_px` of the chief ray's (u, v) and the spot is
-  visible. Visible and not detected: **missed**. A position given where the spot is not visible, or further than
-  `match_px` from it: **false detection**; an image can be missed and falsely detected at once.
-* Errors are over detected spots. Beside each rms stands a second one, "missed counted", over all visible spots, in
-  which a missed spot counts as an error of `match_px`, and a pair without a usable depth, or with one that is off by
-  more than `missed_relative` of D, as `missed_relative`: an answer is never worth less than none.
-* A pair's depth is **found** when both spots are visible and a finite depth above 0 follows from the answer: the
-  method's own, unless a position that it gave is a false detection, else the exact one of two detected spots.
+Errors are over found spots. "Missed counted" is over visible spots: a missed one counts as `match_px`, a missed depth
+as `missed_relative`. The ranks also count false detections: see `rank_squares`. No answer counts more than none, so
+that an error is cut off at what a missed spot costs.
+
+The kernels take n answers that share a nominal and a true rig; NaN where there is nothing to compare. Integer (u, v)
+are pixel centres. Phi does not depend on the carriage: rigs are taken at the down position.
 """
 
 from __future__ import annotations
@@ -27,6 +31,72 @@ from phibench.datasets.errors import DatasetError
 from phibench.estimator.geometry.phi import CONVENTIONS, GRADIENTS, estimate_phi, outline_circle
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
+
+MATCH_PX = 3.0
+"""A spot at 5 sigma, the faintest that counts as there, is placed to 0.3 to 0.5 px (blur 0.7 px; mono to Bayer), so
+that 3 px is six standard deviations or more and an answer beyond it belongs to something else. A blind guess in the
+mirror's disc (radius 339 px) is within 3 px of the spot with a chance of 8e-5."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """Numbers of a score.
+
+    Parameters
+    ----------
+    match_px : float
+        Largest distance of a position from the truth that counts as found.
+    missed_relative : float
+        Relative depth error as which a missed pair counts.
+    missed_phi_rad : float
+        Error of phi as which a missed spot counts, and a false detection in a rank. 3 px along the radius are 9 to
+        19 mrad on the rigs of the shipped recipes, so that every found spot counts less than a missed one.
+    confidence : float
+        Of every interval.
+    resamples : int
+        Bootstrap resamples of the samples.
+    least_samples : int
+        With fewer samples a metric has no interval.
+    """
+
+    match_px: float = MATCH_PX
+    missed_relative: float = 1.0
+    missed_phi_rad: float = 0.02
+    confidence: float = 0.95
+    resamples: int = 1999
+    least_samples: int = 5
+
+    def __post_init__(self) -> None:
+        _above("match_px", self.match_px, 0.0)
+        _above("missed_relative", self.missed_relative, 0.0)
+        _above("missed_phi_rad", self.missed_phi_rad, 0.0)
+        _above("resamples", self.resamples, 98)
+        _above("least_samples", self.least_samples, 1)
+        if not 0.5 <= self.confidence < 1.0:
+            raise DatasetError(f"Rules.confidence = {self.confidence:g}: allowed are 0.5 up to below 1")
+
+
+def _above(name: str, value: float, low: float) -> None:
+    if not value > low:
+        raise DatasetError(f"Rules.{name} = {value:g}: must be above {low:g}")
+
+
+def rank_squares(error: Array, found: Array, expected: Array, false: Array, missed: float) -> Array:
+    """Squared errors as the ranks count them, shape (n,).
+
+    A found spot counts with its error, at most `missed`; a missed one as `missed`; each false detection as `missed`
+    besides. A missed spot with a false detection so counts twice, and guessing costs more than silence.
+
+    Parameters
+    ----------
+    error : shape (n,), NaN where there is none
+    found, expected, false : shape (n,), bool
+        `expected` is whether there is something to find.
+    missed : float
+        In the unit of the error.
+    """
+    size = np.where(found & np.isfinite(error), np.minimum(np.abs(error), missed), missed)
+    return np.where(expected, size**2, 0.0) + np.where(false, missed**2, 0.0)
 
 
 @dataclass(frozen=True)
@@ -118,47 +188,3 @@ def in_ray_units(rig: Rig, uv_px: Array, conventions: Sequence[str]) -> Array:
             g, ray = (GRADIENTS[name](view, uv_px[chosen]) for name in (sense, "ray"))
             factor[chosen] = np.sum(g * ray, axis=-1) / np.sum(g * g, axis=-1)
     return factor
-
-
-MATCH_PX = 3.0
-"""A spot at 5 sigma, the faintest that counts as there, is placed to 0.3 to 0.5 px (blur 0.7 px; mono to Bayer), so
-that 3 px is six standard deviations or more and an answer beyond it belongs to something else. A blind guess in the
-mirror's disc (radius 339 px) is within 3 px of the spot with a chance of 8e-5."""
-
-
-@dataclass(frozen=True)
-class Rules:
-    """Numbers of a score.
-
-    Parameters
-    ----------
-    match_px : float
-        Largest distance of a position from the truth that counts as found.
-    missed_relative : float
-        Relative depth error for which a missed pair counts.
-    confidence : float
-        Of every interval.
-    resamples : int
-        Bootstrap resamples of the samples.
-    least_samples : int
-        With fewer samples a metric has no interval.
-    """
-
-    match_px: float = MATCH_PX
-    missed_relative: float = 1.0
-    confidence: float = 0.95
-    resamples: int = 1999
-    least_samples: int = 5
-
-    def __post_init__(self) -> None:
-        _above("match_px", self.match_px, 0.0)
-        _above("missed_relative", self.missed_relative, 0.0)
-        _above("resamples", self.resamples, 98)
-        _above("least_samples", self.least_samples, 1)
-        if not 0.5 <= self.confidence < 1.0:
-            raise DatasetError(f"Rules.confidence = {self.confidence:g}: allowed are 0.5 up to below 1")
-
-
-def _above(name: str, value: float, low: float) -> None:
-    if not value > low:
-        raise DatasetError(f"Rules.{name} = {value:g}: must be above {low:g}")

@@ -27,7 +27,7 @@ from phibench.estimator.interface import Pair
 from phibench.estimator.pair_set import Distraction, PairSet, PairTruth, SpotTruth
 from phibench.scenes.laser import Beam
 
-TASK_VERSION = 2
+TASK_VERSION = 3
 """Version of the task: what a method is given, what it must answer and what is counted. A change of any raises it."""
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import polars as pl
 from pydantic import Field, ValidationError, model_validator
@@ -18,7 +19,7 @@ from phibench.estimator.benchmark.intervals import Estimate
 from phibench.estimator.benchmark.metrics import Measured
 
 KIND: Literal["phibench score"] = "phibench score"
-VERSION = 1
+VERSION = 2
 
 
 class Value(Document):
@@ -32,23 +33,25 @@ class Value(Document):
     note: str
 
     @classmethod
-    def of(cls, measured: Measured) -> Value:
-        """From a measurement."""
+    def of(cls, measured: Measured, **fields: str) -> Self:
+        """From a measurement, and the fields that a subclass has besides."""
         e = measured.estimate
-        return cls(
-            value=finite(e.value),
-            low=finite(e.low),
-            high=finite(e.high),
-            n=measured.n,
-            samples=measured.samples,
-            note=e.note,
-        )
+        numbers = {"value": finite(e.value), "low": finite(e.low), "high": finite(e.high)}
+        return cls.model_validate({**numbers, **fields, "n": measured.n, "samples": measured.samples, "note": e.note})
 
     @property
     def estimate(self) -> Estimate:
         """The same with NaN for null."""
         value, low, high = (math.nan if x is None else x for x in (self.value, self.low, self.high))
         return Estimate(value, low, high, self.note)
+
+
+class Metric(Value):
+    """A metric of the whole, with what it is; the unit is also in the metric's name."""
+
+    unit: str
+    better: Literal["lower", "higher", "none"]
+    text: str
 
 
 class StratumScore(Document):
@@ -61,7 +64,7 @@ class StratumScore(Document):
     mean: float | None = Field(description="of what the stratum is by, over its images")
     images: int
     pairs: int
-    metrics: dict[str, Value]
+    metrics: Mapping[str, Value]
 
 
 class MethodCard(Document):
@@ -119,8 +122,8 @@ class ScoreDocument(Document):
     limits: dict[str, Any]
     provenance: dict[str, Any]
     code_sha256: str = Field(description="of everything behind the score")
-    metrics: dict[str, dict[str, str]] = Field(description="unit, direction and definition of every metric")
-    strata: list[StratumScore]
+    metrics: dict[str, Metric] = Field(description="of the whole: `jq .metrics.rms_px.value`")
+    strata: list[StratumScore] = Field(description="parts of the whole")
     causes: dict[str, dict[str, int]] = Field(description="images by cause and kind")
     failures: dict[str, int] = Field(description="pairs for which the method did not come back, by the harness's word")
     worst: list[Worst]
@@ -128,9 +131,18 @@ class ScoreDocument(Document):
     records_sha256: str
 
     @property
-    def overall(self) -> dict[str, Value]:
-        """Metrics of the whole."""
-        return self.strata[0].metrics
+    def whole(self) -> StratumScore:
+        """The whole as a stratum, for tables that begin with it."""
+        return StratumScore(
+            by="all",
+            label="all",
+            low=None,
+            high=None,
+            mean=None,
+            images=self.images,
+            pairs=self.pairs,
+            metrics=self.metrics,
+        )
 
 
 def finite(value: float | None) -> float | None:

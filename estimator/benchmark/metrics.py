@@ -37,7 +37,7 @@ WITHIN = 1.959963984540054
 LEAST_FOR_P95 = 50
 """Samples below which a 95th percentile has no interval."""
 Better = Literal["lower", "higher", "none"]
-Kind = Literal["rate", "mean", "rms", "rms of each", "median", "p95", "efficiency", "deviation"]
+Kind = Literal["rate", "mean", "rms", "rms of each", "median", "p95", "efficiency", "deviation", "rank"]
 _DOWN, _DETECTED = pl.col("image") == "down", pl.col("detected")
 _FOUND = _DOWN & pl.col("depth_found")
 # where the bound is not small against what counts as found, the cut at `match_px` makes errors smaller than the bound
@@ -54,6 +54,7 @@ FAMILIES: dict[str, pl.Expr] = {
     "bound": _DETECTED & pl.col("bound_px2").is_not_null() & _SHARP,
     "raw bound": _DETECTED & pl.col("raw_bound_px2").is_not_null() & _SHARP,
     "pull": _DETECTED & pl.col("pull_u").is_not_null(),
+    "any pair": _DOWN,
     "pair": _DOWN & pl.col("pair_visible"),
     "depth": _FOUND,
     "depth bound": _FOUND & pl.col("bound_depth_m2").is_not_null() & _DEEP,
@@ -62,7 +63,8 @@ FAMILIES: dict[str, pl.Expr] = {
 }
 """Which records enter a metric; those of pairs take each pair once, by its row "down"."""
 
-OF_PAIRS = ("pair", "depth", "depth bound", "depth pull", "timed")
+_RELATIVE = ("depth_relative", "depth_counted", "root_bound_depth", "rank_depth2")
+OF_PAIRS = ("any pair", "pair", "depth", "depth bound", "depth pull", "timed")
 
 WHY_EMPTY = {
     "detected": "no spot detected",
@@ -73,6 +75,7 @@ WHY_EMPTY = {
     "raw bound": "no bound for these images, or none below a third of 3 px",
     "pull": "no covariance claimed",
     "visible": "no visible spot",
+    "any pair": "no pair",
     "pair": "no pair with both spots visible",
     "depth": "no depth found",
     "depth bound": "no bound for these images, or none below a third of 3 px",
@@ -93,7 +96,7 @@ class Metric:
     kind : how the columns become a number
     columns : of the records; "mean" and "rate" take one, "median" and "p95" one by its absolute value, "rms" the root
         of the mean of the sum of squares, "rms of each" of the mean of all squares, "deviation" is about each column's
-        mean, "efficiency" divides: variances, then errors
+        mean, "efficiency" divides: variances, then errors; "rank" is the root of a sum of squares by a number of spots
     unit : str
     better : "lower", "higher" or "none"
     text : what it is
@@ -106,6 +109,13 @@ class Metric:
     better: Better
     text: str
 
+    @property
+    def shown(self) -> tuple[float, str]:
+        """Factor and unit of every table and figure: mrad for phi, % for rates and relative errors, else the unit."""
+        if self.unit == "rad":
+            return 1e3, "mrad"
+        return (100.0, "%") if self.kind == "rate" or self.columns[0] in _RELATIVE else (1.0, self.unit)
+
 
 def _errors(family: str, columns: tuple[str, ...], size: str, unit: str, stem: str, what: str) -> dict[str, Metric]:
     """Rms of columns, median and 95th percentile of their size."""
@@ -116,6 +126,10 @@ def _errors(family: str, columns: tuple[str, ...], size: str, unit: str, stem: s
     }
 
 
+RANKS = {"phi": "rank_phi_rad", "depth": "rank_depth"}
+"""What a rank can go by, and its metric."""
+
+# the order is that of the families' random streams: a new metric of a new family goes to the end
 METRICS: dict[str, Metric] = {
     "detection_rate": Metric("visible", "rate", ("detected",), "1", "higher", "visible spots found"),
     "false_rate": Metric("image", "rate", ("false_detection",), "1", "lower", "images with a false detection"),
@@ -167,6 +181,17 @@ METRICS: dict[str, Metric] = {
         "depth pull", "rate", ("depth_within",), "1", "none", "errors of D within 1.96 sigma; 0.95 is right"
     ),
     "seconds": Metric("timed", "mean", ("seconds",), "s", "lower", "mean time per pair"),
+    "rank_phi_rad": Metric(
+        "image", "rank", ("rank_phi2_rad2", "visible"), "rad", "lower", "rms error of phi, missed and false counted"
+    ),
+    "rank_depth": Metric(
+        "any pair",
+        "rank",
+        ("rank_depth2", "pair_visible"),
+        "1",
+        "lower",
+        "rms relative error of D, missed and false counted",
+    ),
 }
 
 
@@ -281,6 +306,7 @@ STATISTICS: dict[str, Callable[[Clusters, list[Array]], Statistic]] = {
     "p95": lambda clusters, x: quantile_of(clusters, np.abs(x[0]), Fraction(19, 20)),
     "efficiency": lambda clusters, x: rms_ratio_of(clusters, x[0], _square(x[1:])),
     "deviation": lambda clusters, x: deviation_of(clusters, *x),
+    "rank": lambda clusters, x: rms_ratio_of(clusters, x[0], x[1]),
 }
 
 

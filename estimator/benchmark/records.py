@@ -15,8 +15,17 @@ import numpy as np
 import polars as pl
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.benchmark import answer_errors as errors
-from phibench.estimator.benchmark.answer_errors import Rules
+from phibench.estimator.benchmark.answer_errors import (
+    Rules,
+    from_centre_px,
+    in_ray_units,
+    phi_of,
+    phi_variance,
+    pixel_errors,
+    rank_squares,
+    usable_covariance,
+    whitened,
+)
 from phibench.estimator.geometry.least_squares_depth import nominal_depth
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import OK, Answer, Outcome, Spot
@@ -69,14 +78,16 @@ COLUMNS: dict[str, str] = {
     "bound_px2": "trace of the Cramer-Rao bound: expected squared distance at the limit",
     "raw_bound_px2": "the same of the raw pixels behind the image",
     "bound_phi_rad2": "variance of phi at the bound",
+    "rank_phi2_rad2": "square that the rank by phi sums: error, missed and false detection",
     "pair_visible": "both spots are visible",
     "pair_electrons": "the fainter spot's electrons",
-    "depth_found": "see bench/rules.py",
+    "depth_found": "both spots are found, and a finite depth above 0 follows",
     "depth_from": "method or pixels",
     "depth_estimate_m": "D of the answer",
     "depth_error_m": "depth_estimate_m - depth_m",
     "depth_relative": "depth_error_m / depth_m",
     "depth_counted": "|depth_relative|, at most missed_relative; that too if not found; null unless pair_visible",
+    "rank_depth2": "square that the rank by D sums: relative error, missed and false detection",
     "depth_sigma_m": "claimed: the method's with its own depth, else from its covariances; with a calibration's part",
     "depth_pull": "depth_error_m / depth_sigma_m",
     "bound_depth_m2": "variance of D at the bounds of both spots; without calibration",
@@ -161,11 +172,12 @@ def _image_columns(
     spots: list[SpotTruth] = [getattr(truth, position) for truth in truths]
     answers = [_spot(outcome, position) for outcome in outcomes]
     xy, uv = _stack(spot.uv_px for spot in spots), _stack(map(_position, answers))
-    error = errors.pixel_errors(true, xy, uv)
+    error, phi = pixel_errors(true, xy, uv), _phi_columns(nominal, true, xy, uv, spots, answers)
     given, visible = np.isfinite(uv).all(axis=1), np.array([spot.visible for spot in spots])
     near = error.distance_px <= rules.match_px  # False for NaN
     detected = visible & near
-    pull = errors.whitened(np.stack([error.du_px, error.dv_px], -1), errors.usable_covariance(_claimed(answers)))
+    false = given & ~detected
+    pull = whitened(np.stack([error.du_px, error.dv_px], -1), usable_covariance(_claimed(answers)))
     bound, raw = (_bounds(spots, name) for name in ("bound_px2", "raw_bound_px2"))
     return {
         "image": [position] * len(spots),
@@ -177,7 +189,7 @@ def _image_columns(
         "unseen_because": [spot.cause for spot in spots],
         "u_true_px": xy[:, 0],
         "v_true_px": xy[:, 1],
-        "from_centre_px": errors.from_centre_px(true, xy),
+        "from_centre_px": from_centre_px(true, xy),
         "bayer": [_bayer(x) for x in xy],
         "status": [_status(*both, position) for both in zip(answers, outcomes, strict=True)],
         "u_px": uv[:, 0],
@@ -189,15 +201,16 @@ def _image_columns(
         "tangential_px": error.tangential_px,
         "detected": detected,
         "missed": visible & ~detected,
-        "false_detection": given & ~detected,
+        "false_detection": false,
         "counted_px": np.where(visible, np.where(detected, error.distance_px, rules.match_px), np.nan),
-        **_phi_columns(nominal, true, xy, uv, spots, answers),
+        **phi,
         "pull_u": pull[:, 0],
         "pull_v": pull[:, 1],
         "mahalanobis2": np.sum(pull**2, axis=-1),
         "bound_px2": np.trace(bound, axis1=1, axis2=2),
         "raw_bound_px2": np.trace(raw, axis1=1, axis2=2),
-        "bound_phi_rad2": errors.phi_variance(nominal, xy, bound),
+        "bound_phi_rad2": phi_variance(nominal, xy, bound),
+        "rank_phi2_rad2": rank_squares(phi["phi_error_rad"], detected, visible, false, rules.missed_phi_rad),
     }
 
 
@@ -208,14 +221,14 @@ def _phi_columns(
     convention = [
         a.phi_convention if a is not None and np.isfinite(x) else "ray" for a, x in zip(answers, own, strict=True)
     ]
-    phi = np.where(np.isfinite(own), own, errors.phi_of("ray", nominal, uv))
-    outline = errors.phi_of("outline", true, xy)
+    phi = np.where(np.isfinite(own), own, phi_of("ray", nominal, uv))
+    outline = phi_of("outline", true, xy)
     truth = np.array([s.phi_rad.get(c, o) for s, c, o in zip(spots, convention, outline, strict=True)])
     return {
         "phi_convention": [c if np.isfinite(x) else None for c, x in zip(convention, phi, strict=True)],
         "phi_rad": phi,
         "phi_true_rad": truth,
-        "phi_error_rad": (phi - truth) * errors.in_ray_units(true, xy, convention),
+        "phi_error_rad": (phi - truth) * in_ray_units(true, xy, convention),
     }
 
 
@@ -224,7 +237,7 @@ def _pair_columns(
 ) -> dict[str, Any]:
     down, up = (images[p] for p in POSITIONS)
     bounds = [_bounds([getattr(t, p) for t in truths], "bound_px2") for p in POSITIONS]
-    claims = [errors.usable_covariance(_claimed([_spot(o, p) for o in outcomes])) for p in POSITIONS]
+    claims = [usable_covariance(_claimed([_spot(o, p) for o in outcomes])) for p in POSITIONS]
     true_m, h = (np.array([getattr(t, name) for t in truths], float) for name in ("depth_m", "stroke_m"))
     nominal_h = np.array([t.stroke_m if t.nominal_stroke_m is None else t.nominal_stroke_m for t in truths], float)
     answers, truth = (
@@ -237,8 +250,8 @@ def _pair_columns(
     own_sigma = np.hypot(own_sigma, found_m.calibration_sigma_m)
     depth, sigma = np.where(has_own, own, found_m.depth_m), np.where(has_own, own_sigma, found_m.sigma_m)
     both = down["visible"] & up["visible"]
-    wrong = down["false_detection"] | up["false_detection"]
-    found = both & (depth > 0.0) & np.where(has_own, ~wrong, down["detected"] & up["detected"])
+    false = down["false_detection"] | up["false_detection"]
+    found = down["detected"] & up["detected"] & (depth > 0.0)  # False for NaN
     relative = depth / true_m - 1.0
     counted = np.where(found, np.minimum(np.abs(relative), rules.missed_relative), rules.missed_relative)
     return {
@@ -258,6 +271,7 @@ def _pair_columns(
         "depth_error_m": depth - true_m,
         "depth_relative": relative,
         "depth_counted": np.where(both, counted, np.nan),
+        "rank_depth2": rank_squares(relative, found, both, false, rules.missed_relative),
         "depth_sigma_m": sigma,
         "depth_pull": (depth - true_m) / np.where(sigma > 0.0, sigma, np.nan),
         "bound_depth_m2": depth_exact(nominal, nominal_h, *truth, *bounds).sigma_m ** 2,

@@ -282,7 +282,7 @@ def _names(named: Mapping[str, Any]) -> str:
 
 
 def _curves_in_words(scores: Named) -> str:
-    values = {name: score.overall["rms_px"].value for name, score in scores.items()}
+    values = {name: score.metrics["rms_px"].value for name, score in scores.items()}
     shown = ", ".join(f"{name} {'none' if x is None else f'{x:.3g} px'}" for name, x in values.items())
     return (
         "Rms distance (top) and rms relative error of D (bottom) against D, stroke and signal, with intervals and the "

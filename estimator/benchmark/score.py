@@ -35,6 +35,7 @@ from phibench.estimator.benchmark.document import (
     KIND,
     VERSION,
     MethodCard,
+    Metric,
     ScoreDocument,
     StratumScore,
     Value,
@@ -42,7 +43,7 @@ from phibench.estimator.benchmark.document import (
     finite,
     write_score,
 )
-from phibench.estimator.benchmark.metrics import METRICS
+from phibench.estimator.benchmark.metrics import METRICS, Measured
 from phibench.estimator.benchmark.records import in_order, record_table
 from phibench.estimator.benchmark.report import write_report
 from phibench.estimator.benchmark.strata import Stratum, count_pairs, measured, strata
@@ -221,6 +222,7 @@ def _scored(
     if not parts:
         raise DatasetError("the pair set is empty: there is nothing to score")
     table = pl.concat([part.records for part in parts])
+    whole, *others = strata(table)
     document = ScoreDocument(
         kind=KIND,
         version=VERSION,
@@ -234,8 +236,8 @@ def _scored(
         limits=dict(limits),
         provenance=dict(provenance()),
         code_sha256=code_behind(__name__),
-        metrics={n: {"unit": m.unit, "better": m.better, "text": m.text} for n, m in METRICS.items()},
-        strata=[_stratum(stratum, rules, seed) for stratum in strata(table)],
+        metrics={name: _metric(name, value) for name, value in measured(whole, rules, "score", seed).items()},
+        strata=[_stratum(stratum, rules, seed) for stratum in others],
         causes=count(table),
         failures=count_failures(table),
         worst=worst_of(table, [entry for part in parts for entry in part.worst]),
@@ -243,6 +245,11 @@ def _scored(
         records_sha256="",
     )
     return Scored(document, table)
+
+
+def _metric(name: str, value: Measured) -> Metric:
+    metric = METRICS[name]
+    return Metric.of(value, unit=metric.unit, better=metric.better, text=metric.text)
 
 
 def _stratum(stratum: Stratum, rules: Rules, seed: int) -> StratumScore:

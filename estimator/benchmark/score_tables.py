@@ -12,7 +12,7 @@ from rich.text import Text
 from phibench.estimator.benchmark.compare import Difference
 from phibench.estimator.benchmark.document import ScoreDocument
 from phibench.estimator.benchmark.intervals import Estimate
-from phibench.estimator.benchmark.metrics import METRICS
+from phibench.estimator.benchmark.metrics import METRICS, RANKS
 
 # metric, head, factor from its unit, digits
 BOARD: tuple[tuple[str, str, float, int], ...] = (
@@ -29,14 +29,19 @@ BOARD: tuple[tuple[str, str, float, int], ...] = (
 )
 
 
-def ranked(documents: Sequence[ScoreDocument]) -> list[ScoreDocument]:
+def ranked(documents: Sequence[ScoreDocument], by: str = "phi") -> list[ScoreDocument]:
     """Best first."""
-    return sorted(documents, key=rank_key)
+    return sorted(documents, key=lambda document: rank_key(document, by))
 
 
-def rank_key(document: ScoreDocument) -> float:
-    """What ranks go by: the rms distance in which missed spots count; lower is better."""
-    value = document.overall["rms_counted_px"].value
+def rank_key(document: ScoreDocument, by: str = "phi") -> float:
+    """Rms error of phi or of D with missed spots and false detections counted; lower is better.
+
+    Parameters
+    ----------
+    by : "phi" or "depth"
+    """
+    value = document.metrics[RANKS[by]].value
     return math.inf if value is None else value
 
 
@@ -49,14 +54,14 @@ def leaderboard(documents: Sequence[ScoreDocument]) -> Table:
     for _, head, _, _ in BOARD:
         grid.add_column(head, justify="right")
     for document in ranked(documents):
-        cells = (cell(document.overall[name].estimate, factor, digits) for name, _, factor, digits in BOARD)
+        cells = (cell(document.metrics[name].estimate, factor, digits) for name, _, factor, digits in BOARD)
         grid.add_row(document.method.name, str(document.pairs), *cells)
     return grid
 
 
 def depth_line(document: ScoreDocument) -> str:
     """Whether the predicted error of D, the calibration's part included, is that of the errors."""
-    pull, within = (document.overall[name].estimate for name in ("pull_depth", "coverage_depth"))
+    pull, within = (document.metrics[name].estimate for name in ("pull_depth", "coverage_depth"))
     share = one_line(within, 100.0, 1)
     return f"{document.method.name}: pull of D {one_line(pull, 1.0, 3)}; within 1.96 sigma of D {share} %, 95 is right"
 
@@ -68,7 +73,7 @@ def strata_table(document: ScoreDocument) -> Table:
     grid = Table(title=title, caption=f"*: fewer than {least} samples, no interval")
     for head in ("by", "stratum", "images", "found %", "rms px", "median px", "rms phi mrad", "rms D %", "efficiency"):
         grid.add_column(head, justify="left" if head in ("by", "stratum") else "right", no_wrap=True)
-    for stratum in document.strata:
+    for stratum in (document.whole, *document.strata):
         shown = (
             ("detection_rate", 100.0, 1),
             ("rms_px", 1.0, 4),

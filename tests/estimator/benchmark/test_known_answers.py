@@ -7,7 +7,9 @@ import polars as pl
 import pytest
 from helpers.bench_cases import (
     RIG,
+    Cases,
     cases,
+    change,
     constant,
     outcomes,
     sampler,
@@ -22,6 +24,7 @@ from phibench.estimator.benchmark.answer_errors import MATCH_PX, Rules
 from phibench.estimator.benchmark.metrics import METRICS, measure, prepared
 from phibench.estimator.benchmark.records import COLUMNS, records
 from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.interface import Answer, Spot
 
 RULES = Rules(resamples=999)
 
@@ -131,6 +134,110 @@ def test_a_missed_spot_counts_three_pixels():
     assert value(m, "detection_rate") == 0.5
     # a silent pair counts 100 % of its depth
     assert value(m, "rms_depth_counted") == pytest.approx(np.sqrt(0.5), rel=1e-3)
+
+
+# -- what a rank counts --------------------------------------------------------------------------------------------
+
+
+def blind_depth(t):
+    """No position, and the mean depth of a room."""
+    return Answer(*(Spot.missing("not looked for") for _ in "12"), depth_m=2.9)
+
+
+def turned(px, quarter):
+    """Positions moved by `px` outwards (quarter 0) or across (quarter 1)."""
+
+    def answer(t):
+        spots = []
+        for s in (t.down, t.up):
+            outward = np.array(s.uv_px) - [RIG.camera.cx_px, RIG.camera.cy_px]
+            a = outward / np.linalg.norm(outward)
+            moved = np.array(s.uv_px) + px * (np.array([-a[1], a[0]]) if quarter else a)
+            spots.append(Spot(tuple(moved)))
+        return Answer(*spots)
+
+    return answer
+
+
+def test_a_depth_without_positions_is_no_depth():
+    """A guess of 2.9 m is within 50 % of most true depths; it has found nothing, and so counts as silence does."""
+    table, guess = score(cases(), blind_depth)
+    _, nothing = score(cases(), silent)
+    assert (np.abs(table["depth_relative"]) < 0.5).mean() > 0.5
+    assert value(guess, "depth_rate") == 0.0
+    assert np.isnan(value(guess, "rms_depth_relative"))
+    for name in ("rms_depth_counted", "rank_depth"):
+        assert value(guess, name) == value(nothing, name) == 1.0
+
+
+@pytest.mark.parametrize("wrong", [silent, constant])
+def test_a_depth_counts_only_with_two_right_positions(wrong):
+    """Down found, up missed or wrong: the exact depth that comes with them does not count."""
+    _, m = score(cases(), lambda t: Answer(Spot(t.down.uv_px), wrong(t).up, depth_m=t.depth_m))
+    assert (value(m, "detection_rate"), value(m, "depth_rate")) == (0.5, 0.0)
+    assert value(m, "rms_depth_counted") == 1.0
+    # with both, it does
+    _, m = score(cases(), lambda t: Answer(Spot(t.down.uv_px), Spot(t.up.uv_px), depth_m=t.depth_m))
+    assert (value(m, "depth_rate"), value(m, "rank_depth")) == (1.0, 0.0)
+
+
+def test_the_rank_tells_radial_from_tangential_errors():
+    """Both are half a pixel off: the distance in the image ties, phi and D do not."""
+    (_, radial), (_, across) = (score(cases(), turned(0.5, quarter)) for quarter in (0, 1))
+    for name in ("rms_px", "rms_counted_px"):
+        assert value(radial, name) == pytest.approx(value(across, name), abs=1e-12)
+    # a tangential error reaches the radius at second order: 0.5^2 / (2 x 100 px), 1/400 of 0.5 px
+    assert value(across, "rank_phi_rad") < 0.01 * value(radial, "rank_phi_rad")
+    assert value(across, "rank_depth") < 0.1 * value(radial, "rank_depth")
+
+
+def test_without_missed_and_false_ones_the_rank_is_the_rms():
+    _, m = score(cases(), shifted(0.5))
+    assert value(m, "rank_phi_rad") == pytest.approx(value(m, "rms_phi_rad"), rel=1e-12)
+    assert value(m, "rank_depth") == pytest.approx(value(m, "rms_depth_relative"), rel=1e-12)
+
+
+def test_a_false_detection_counts_beside_the_missed_spot():
+    """A guess costs sqrt(2) times what silence costs; by the distance with missed spots counted they tie."""
+    (_, quiet), (_, guess) = (score(cases(), oracle) for oracle in (silent, constant))
+    assert value(quiet, "rms_counted_px") == value(guess, "rms_counted_px") == MATCH_PX
+    assert value(quiet, "rank_phi_rad") == pytest.approx(RULES.missed_phi_rad, rel=1e-12)
+    assert value(guess, "rank_phi_rad") == pytest.approx(np.sqrt(2.0) * RULES.missed_phi_rad, rel=1e-12)
+    assert value(guess, "rank_depth") == pytest.approx(np.sqrt(2.0), rel=1e-12)
+
+
+def test_an_answer_where_nothing_is_to_be_seen_counts():
+    """Every second pair hidden in both images: its answers are false, its silences cost nothing.
+
+    Per visible spot one false detection: sqrt(0 + m^2) = m.
+    """
+    hidden = [
+        change(change(t, "down", visible=False, cause="occluded"), "up", visible=False, cause="occluded")
+        if t.number % 2
+        else t
+        for t in cases().truths
+    ]
+    pairs = Cases(tuple(hidden))
+    _, eager = score(pairs, truth_itself)
+    _, careful = score(pairs, lambda t: truth_itself(t) if t.down.visible else silent(t))
+    assert value(eager, "rank_phi_rad") == pytest.approx(RULES.missed_phi_rad, rel=1e-9)
+    assert value(eager, "rank_depth") == pytest.approx(1.0, rel=1e-9)
+    assert value(careful, "rank_phi_rad") < 1e-12
+    assert value(careful, "rank_depth") < 1e-11
+
+
+def test_no_answer_counts_more_than_none():
+    """Right positions with an absurd phi of their own cost what missed spots cost, not more."""
+    _, m = score(cases(20), lambda t: Answer(*(Spot(s.uv_px, phi_rad=1.5) for s in (t.down, t.up))))
+    assert value(m, "rms_phi_rad") > 10 * RULES.missed_phi_rad
+    assert value(m, "rank_phi_rad") == pytest.approx(RULES.missed_phi_rad, rel=1e-12)
+
+
+def test_every_error_within_three_pixels_counts_less_than_a_missed_spot():
+    """3 px outwards, the worst that is still found, on rigs and depths of the shipped recipes: below 20 mrad."""
+    table, m = score(cases(), turned(0.999 * MATCH_PX, 0))
+    assert value(m, "detection_rate") == 1.0
+    assert table["phi_error_rad"].abs().max() < RULES.missed_phi_rad
 
 
 # -- the ideal sampler ---------------------------------------------------------------------------------------------

@@ -93,10 +93,17 @@ def test_the_method_s_own_depth_counts_before_the_pixels():
     assert down["depth_relative"] == pytest.approx(0.1)
     assert down["depth_pull"] == pytest.approx(2.0)
     assert up["depth_error_m"] == down["depth_error_m"]
-    alone, _ = one(Answer(NOTHING, NOTHING, depth_m=0.9 * t.depth_m))
-    assert alone["depth_found"]
+    alone, _ = one(Answer(Spot(t.down.uv_px), Spot(t.up.uv_px), depth_m=0.9 * t.depth_m))
+    assert (alone["depth_found"], alone["depth_from"]) == (True, "method")
     assert alone["depth_counted"] == pytest.approx(0.1)
     assert alone["depth_sigma_m"] is None
+
+
+def test_a_depth_without_two_found_spots_is_not_found():
+    t = cases(1).truths[0]
+    for down, up in ((NOTHING, NOTHING), (Spot(t.down.uv_px), NOTHING), (NOTHING, Spot(t.up.uv_px))):
+        row, _ = one(Answer(down, up, depth_m=0.9 * t.depth_m))
+        assert (row["depth_found"], row["depth_counted"], row["rank_depth2"]) == (False, 1.0, 1.0)
 
 
 def test_a_depth_beside_a_false_detection_is_not_found():
@@ -232,7 +239,14 @@ def test_outcomes_that_belong_to_no_pair_are_refused(numbers, words):
 
 @pytest.mark.parametrize(
     "changes",
-    [{"match_px": 0.0}, {"confidence": 1.0}, {"resamples": 10}, {"least_samples": 1}, {"missed_relative": -1.0}],
+    [
+        {"match_px": 0.0},
+        {"confidence": 1.0},
+        {"resamples": 10},
+        {"least_samples": 1},
+        {"missed_relative": -1.0},
+        {"missed_phi_rad": 0},
+    ],
 )
 def test_rules_without_sense_are_refused(changes):
     with pytest.raises(DatasetError, match=next(iter(changes))):

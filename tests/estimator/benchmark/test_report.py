@@ -109,7 +109,7 @@ def test_methods_are_in_the_order_of_their_ranks(html):
 
 def test_the_leaderboard_has_its_numbers(html, scores):
     assert "0.5000" in html
-    rate = scores[1][0].overall["detection_rate"]
+    rate = scores[1][0].metrics["detection_rate"]
     assert f"[{100 * rate.low:.1f}, {100 * rate.high:.1f}]" in html
 
 

@@ -25,7 +25,7 @@ def test_the_benchmark_runs_what_accepts_each_preset(bench_dataset: Path, tmp_pa
     # one method alone on the same pairs answers the same: the harness keeps them apart
     alone = bench(bench_dataset, tmp_path / "alone", names[:1], console=quiet())
     one, other = read_score(alone.scores[0]), documents[0]
-    assert one.strata[0].metrics["rms_px"] == other.strata[0].metrics["rms_px"]
+    assert one.metrics["rms_px"] == other.metrics["rms_px"]
     assert one.worst == other.worst
 
 

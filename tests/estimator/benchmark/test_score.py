@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import polars as pl
 import pytest
@@ -36,12 +37,14 @@ def test_a_score_says_where_it_comes_from(mine):
     d = mine.document
     assert (d.pairs, d.images, d.samples, d.seed) == (40, 80, 40, 0)
     assert d.pair_set == cases(40).document()
-    assert d.rules == {"match_px": 3, "missed_relative": 1, "confidence": 0.95, "resamples": 199, "least_samples": 5}
+    counted = {"match_px": 3, "missed_relative": 1, "missed_phi_rad": 0.02}
+    assert d.rules == {**counted, "confidence": 0.95, "resamples": 199, "least_samples": 5}
     assert d.limits == {"seconds": 30.0}
     assert "numpy" in d.provenance["packages"]
     assert len(d.code_sha256) == 64
     assert set(d.metrics) == set(METRICS)
-    assert d.strata[0].by == "all"
+    assert (d.metrics["rms_px"].unit, d.metrics["rms_px"].better) == ("px", "lower")
+    assert "all" not in {stratum.by for stratum in d.strata}
 
 
 def test_a_score_and_its_records_are_read_back(mine, tmp_path):
@@ -58,14 +61,14 @@ def test_the_same_run_gives_the_same_bytes(mine):
     again = scored(limits={"seconds": 30.0})
     assert again.document.model_dump_json() == mine.document.model_dump_json()
     other = scored(limits={"seconds": 30.0}, seed=1)
-    assert other.document.overall["rms_px"].value == mine.document.overall["rms_px"].value
-    assert other.document.overall["rms_px"].low != mine.document.overall["rms_px"].low
+    assert other.document.metrics["rms_px"].value == mine.document.metrics["rms_px"].value
+    assert other.document.metrics["rms_px"].low != mine.document.metrics["rms_px"].low
 
 
 def test_strata_part_the_whole(mine):
     """Images of the strata of one kind add up to all; the whole's rms is that of its parts."""
     by = {}
-    for stratum in mine.document.strata:
+    for stratum in (mine.document.whole, *mine.document.strata):
         by.setdefault(stratum.by, []).append(stratum)
     # one preset, no hints, and one class of signal to noise: these strata are the whole again
     assert set(by) == set(STRATA) - {"preset", "hint", "sigmas"}
@@ -88,13 +91,15 @@ def test_a_stratum_holds_its_own_errors():
     assert rms == {"60": pytest.approx(0.5), "75": 0.0, "85": 0.0}
 
 
-def test_ranks_go_by_the_error_with_missed_spots():
+def test_ranks_go_by_phi_with_missed_spots_and_by_depth_where_asked():
     """The one that answers only easy pairs has the smaller rms, and the lower rank."""
     good, half = sampler(spread=0.5), shifted(0.2)
     easy = scored(lambda t: good(t) if t.number % 2 else silent(t), name="easy").document
     every = scored(half, name="every").document
-    assert easy.overall["rms_px"].value < every.overall["rms_px"].value
+    assert easy.metrics["rms_px"].value < every.metrics["rms_px"].value
     assert [d.method.name for d in ranked([easy, every])] == ["every", "easy"]
+    deep = scored(lambda t: replace(half(t), depth_m=t.depth_m), name="deep").document  # phi as `every`, D exact
+    assert [d.method.name for d in ranked([easy, every, deep], "depth")] == ["deep", "every", "easy"]
     assert leaderboard([easy, every]).row_count == 2
 
 
@@ -141,7 +146,8 @@ def test_crops_hold_the_spot_and_end_with_the_image():
         ("[]", "is no score"),
         ('{"kind": "other"}', "is no score"),
         ('{"kind": "phibench score", "version": 99}', "has version 99"),
-        ('{"kind": "phibench score", "version": 1}', "method"),
+        ('{"kind": "phibench score", "version": 1}', "has version 1, this program reads 2: score again"),
+        ('{"kind": "phibench score", "version": 2}', "method"),
     ],
 )
 def test_a_file_that_is_no_score(tmp_path, text, words):

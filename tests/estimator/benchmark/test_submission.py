@@ -63,7 +63,7 @@ def test_the_truths_file_written_again_is_the_same(sealed: Sealed, submitted: Pa
     ("change", "words"),
     [
         (lambda d: d.update(seal="0" * 16), "answers the seal 0000000000000000, not"),
-        (lambda d: d.update(task_version=9), "of task version 9, the seal of 2"),
+        (lambda d: d.update(task_version=9), "of task version 9, the seal of 3"),
         (lambda d: d["answers"].pop(5), "lacks pair 5 (1 of 9 are missing)"),
         (lambda d: d["answers"].append(d["answers"][5]), "answers pair 5 twice"),
         (lambda d: d["answers"][8].update(number=7), "answers pair 7 twice"),
