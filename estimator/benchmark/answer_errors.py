@@ -26,11 +26,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.geometry.phi import CONVENTIONS, GRADIENTS, estimate_phi, outline_circle
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
+
+Flags = NDArray[np.bool_]
 
 MATCH_PX = 3.0
 """A spot at 5 sigma, the faintest that counts as there, is placed to 0.3 to 0.5 px (blur 0.7 px; mono to Bayer), so
@@ -81,7 +84,7 @@ def _above(name: str, value: float, low: float) -> None:
         raise DatasetError(f"Rules.{name} = {value:g}: must be above {low:g}")
 
 
-def rank_squares(error: Array, found: Array, expected: Array, false: Array, missed: float) -> Array:
+def rank_squares(error: Array, found: Flags, expected: Flags, false: Flags, missed: float) -> Array:
     """Squared errors as the ranks count them, shape (n,).
 
     A found spot counts with its error, at most `missed`; a missed one as `missed`; each false detection as `missed`
