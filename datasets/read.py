@@ -2,16 +2,17 @@
 
 >>> from phibench.datasets.read import open_dataset  # doctest: +SKIP
 >>> sample = open_dataset("out/paper")["table2-d3.180-h0.425"]  # doctest: +SKIP
->>> sample.row.depth_m, sample.row.down.phi_ray_rad, sample.frame("down").shape  # doctest: +SKIP
+>>> sample.row.depth_m, sample.row.down.phi_ray_rad, sample.expected_image("down").shape  # doctest: +SKIP
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +20,18 @@ from numpy.typing import NDArray
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.source import Frames, FrameSource
 from phibench.datasets.recipe.tables import Recipe
-from phibench.datasets.store import schema as layout
 from phibench.datasets.store.checksums import check_documents
-from phibench.datasets.store.documents import Rigs, from_json, read_info, read_manifest, read_rigs, read_sensitivities
+from phibench.datasets.store.documents import (
+    Rigs,
+    from_json,
+    read_info,
+    read_manifest,
+    read_rigs,
+    read_sensitivities,
+    to_frame,
+)
 from phibench.datasets.store.layers import SpotWindow, read_ambient, read_ambient_variance, read_spot, read_truth
-from phibench.datasets.store.schema import DatasetInfo, ManifestRow, SpotRow
+from phibench.datasets.store.schema import RIGS, DatasetInfo, ManifestRow, SpotRow
 from phibench.scenes.laser import Beam, LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, View
 from phibench.scenes.room import Room
@@ -35,7 +43,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Dataset:
-    """An opened data set: iterate over its samples, or take one by its id.
+    """An opened data set: iterate over its samples, take one by id or place, or a part of them as a slice.
 
     Attributes
     ----------
@@ -44,7 +52,9 @@ class Dataset:
     rigs : Rigs
         By id: `dataset.rigs[row.rig]`; a sample's own is `sample.rig`.
     room : Room
-    samples : tuple of Sample, in the order of the manifest
+    rows : tuple of ManifestRow
+        Exact numbers of the samples, in the order of the manifest.
+    samples : tuple of Sample, in the same order
     """
 
     folder: Path
@@ -101,11 +111,78 @@ class Dataset:
     def __iter__(self) -> Iterator[Sample]:
         return iter(self.samples)
 
-    def __getitem__(self, sample_id: str) -> Sample:
+    @overload
+    def __getitem__(self, key: str | int) -> Sample: ...
+
+    @overload
+    def __getitem__(self, key: slice) -> Dataset: ...
+
+    def __getitem__(self, key: str | int | slice) -> Sample | Dataset:
+        """Sample of an id or a place (negative ones count from the end); of a slice a data set of these samples.
+
+        Raises
+        ------
+        DatasetError
+            If no sample has the id.
+        IndexError
+            If there is no such place.
+        """
+        if isinstance(key, slice):
+            return replace(self, rows=self.rows[key])
+        if isinstance(key, str):
+            return self._of_id(key)
+        try:
+            return self.samples[key]
+        except IndexError:
+            raise IndexError(f"sample {key}: {self.folder} has {len(self)}, numbered from 0") from None
+
+    def _of_id(self, sample_id: str) -> Sample:
         found = next((sample for sample in self.samples if sample.row.sample_id == sample_id), None)
         if found is None:
             raise DatasetError(f"no sample '{sample_id}'; {nearest(sample_id, [row.sample_id for row in self.rows])}")
         return found
+
+    def to_polars(self) -> DataFrame:
+        """Truth of all samples as a polars table, one row each: columns as in `manifest.parquet` (see FORMAT.md)."""
+        return to_frame(self.rows)
+
+    def __repr__(self) -> str:
+        spots = [row.position(position) for row in self.rows for position in POSITIONS]
+        poses, rigs = len({spot.pose for spot in spots}), len({row.rig for row in self.rows})
+        counts = _count(len(self), "stroke pair"), _count(poses, "mirror pose"), _count(rigs, "rig")
+        lines = {
+            "samples": ", ".join(counts),
+            "ids": _ends([row.sample_id for row in self.rows]),
+            "depth D": _range([row.depth_m for row in self.rows]),
+            "stroke h": _range([row.stroke_m for row in self.rows]),
+            "spots": f"{sum(spot.visible for spot in spots)} of {len(spots)} visible",
+            "image": self._image_size(),
+            "presets": "none named by the recipe"
+            if self.recipe.frames is None
+            else ", ".join(self.recipe.frames.presets),
+            "room": f"{self.info.recipe['room']['name']}, {len(self.info.object_names)} objects",
+            "format": f"version {self.info.schema_version}" + (f", part {self.info.shard}" if self.info.shard else ""),
+        }
+        return "\n".join([f"Dataset '{self.info.name}' in {self.folder}", *(f"  {k:9}{v}" for k, v in lines.items())])
+
+    def _image_size(self) -> str:
+        if not self.rows:
+            return "-"
+        camera = self.rigs[self.rows[0].rig].camera
+        return f"{camera.width_px} x {camera.height_px} px"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def _range(values: Sequence[float]) -> str:
+    return f"{min(values):.3f} to {max(values):.3f} m" if values else "-"
+
+
+def _ends(names: Sequence[str]) -> str:
+    """First and last of some names."""
+    return ", ".join(names) if len(names) < 3 else f"{names[0]}, ..., {names[-1]}"
 
 
 @dataclass(frozen=True)
@@ -114,6 +191,11 @@ class Sample:
 
     dataset: Dataset = field(repr=False)
     row: ManifestRow
+
+    def __repr__(self) -> str:
+        places = (f"{p} {_place(self.row.position(p))}" for p in POSITIONS)
+        numbers = (f"D = {self.row.depth_m:.3f} m", f"h = {self.row.stroke_m:.3f} m", *places)
+        return f"Sample('{self.row.sample_id}': {', '.join(numbers)})"
 
     def truth_row(self, position: str) -> SpotRow:
         """Exact answer for the spot."""
@@ -167,14 +249,14 @@ class Sample:
         owner = {"dataset": self.dataset.info.name, "sample_id": self.row.sample_id, "position": position}
         return read_spot(self.dataset.folder / name, **owner)
 
-    def frame(self, position: str, laser: bool = True) -> NDArray[np.float64]:
-        """Noise-free frame, shape (3, H, W), electrons per second: ambient, plus the spot if `laser`."""
+    def expected_image(self, position: str, laser: bool = True) -> NDArray[np.float64]:
+        """Image without noise, shape (3, H, W), expected electrons per second: ambient, plus the spot if `laser`."""
         image = self.ambient(position).astype(float)
         if laser:
             self.spot(position).add_to(image)
         return image
 
-    def frames(self, preset: str = "mjpeg", draw: int = 0, *, laser_off: bool = False, **options: Any) -> Frames:
+    def camera_frames(self, preset: str = "mjpeg", draw: int = 0, *, laser_off: bool = False, **options: Any) -> Frames:
         """Draw the pair as the C310 delivers it: `frames.down`, `frames.up`, for MJPEG also `frames.jpeg`.
 
         A pure function of data set, its seed, sample, position, laser on or off, draw and request. The layers are read
@@ -198,12 +280,22 @@ class Sample:
         return self.frame_source(preset, **options).frames(draw, laser_off=laser_off)
 
     def frame_source(self, preset: str = "mjpeg", **options: Any) -> FrameSource:
-        """Layers read once, for many draws: `source.frames(k)`; options as for `frames`."""
+        """Layers read once, for many draws: `source.frames(k)`; options as for `camera_frames`."""
         return FrameSource.of(self, preset, **options)
 
     def region_frames(self, preset: str = "mjpeg", side_px: int = 64, **options: Any) -> FrameSource:
         """Return the source of squares around each spot: the pixels of the whole frames, to the bit."""
         return FrameSource.of(self, preset, region=side_px, **options)
+
+    def frame(self, position: str, laser: bool = True) -> NDArray[np.float64]:
+        """Old name of `expected_image`, kept for one version."""
+        _renamed("Sample.frame", "Sample.expected_image")
+        return self.expected_image(position, laser)
+
+    def frames(self, preset: str = "mjpeg", draw: int = 0, *, laser_off: bool = False, **options: Any) -> Frames:
+        """Old name of `camera_frames`, kept for one version."""
+        _renamed("Sample.frames", "Sample.camera_frames")
+        return self.camera_frames(preset, draw, laser_off=laser_off, **options)
 
     @property
     def stream_names(self) -> tuple[str, int, str]:
@@ -214,6 +306,15 @@ class Sample:
     def _view(self, position: str) -> dict[str, str]:
         """Return what the headers of the view's layers must say."""
         return {"dataset": self.dataset.info.name, "pose": self.truth_row(position).pose}
+
+
+def _place(spot: SpotRow) -> str:
+    """Position of a spot in its image, or why there is none."""
+    return f"({spot.u_px:.2f}, {spot.v_px:.2f}) px" if spot.visible else f"not visible: {spot.cause}"
+
+
+def _renamed(old: str, new: str) -> None:
+    warnings.warn(f"{old} is now {new}; the old name goes with the next version", DeprecationWarning, stacklevel=3)
 
 
 def open_dataset(folder: str | Path) -> Dataset:
@@ -231,7 +332,7 @@ def open_dataset(folder: str | Path) -> Dataset:
         raise DatasetError(f"{folder}: the manifest has {len(rows)} rows instead of {info.samples}")
     rigs = read_rigs(folder)
     if len(rigs) != info.rigs:
-        raise DatasetError(f"{folder}: {layout.RIGS} has {len(rigs)} rigs instead of {info.rigs}")
+        raise DatasetError(f"{folder}: {RIGS} has {len(rigs)} rigs instead of {info.rigs}")
     return Dataset(folder, info, rigs, from_json(Room, info.room), rows)
 
 

@@ -165,7 +165,7 @@ def _height(parts: list[Picture]) -> int:
 
 def _pictures(sample: Sample, position: str) -> tuple[Picture, Picture]:
     detector, spot = sample.rig.camera.detector, sample.truth_row(position)
-    frame = sample.frame(position)
+    frame = sample.expected_image(position)
     exposure = exposure_s(halved(sample.ambient(position)), detector)
     overview = marked(to_srgb(halved(halved(frame)), detector, exposure), spot, 4)
     window = crop(frame, spot)

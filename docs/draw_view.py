@@ -16,7 +16,7 @@ _HALF, _ZOOM, _POSITION = 14, 12, "down"  # enlarged part, in image pixels eithe
 
 def draw(sample: Sample) -> Image.Image:
     """Full frame, with the part around the spot's true position enlarged in the lower left corner."""
-    frame = sample.frame(_POSITION, laser=True)
+    frame = sample.expected_image(_POSITION, laser=True)
     detector = sample.rig.camera.detector
     picture = to_srgb(frame, detector, exposure_s(sample.ambient(_POSITION), detector))
     row = sample.row.position(_POSITION)

@@ -1,4 +1,7 @@
-"""The architecture: data flows scenes -> render -> datasets -> estimator, and only render knows Mitsuba."""
+"""The architecture: data flows scenes -> render -> datasets -> estimator, and only render knows Mitsuba.
+
+The package's own two files, in `phibench/`, stand last: they may import everything, and nothing imports them.
+"""
 
 import ast
 import graphlib
@@ -14,6 +17,7 @@ Python = Callable[..., subprocess.CompletedProcess[str]]
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("scenes", "render", "datasets", "estimator")
+PACKAGE = "phibench"
 # Every unit may import itself and the units on the lines above its own; a single file counts as a unit.
 ORDER = """
 scenes
@@ -44,20 +48,24 @@ estimator/benchmark
 estimator/paper
 estimator/studies
 estimator/cli
+estimator/seat
+phibench
 """
 LEVEL = {unit: level for level, line in enumerate(ORDER.split("\n")) for unit in line.split()}
 RENDERERS = {"mitsuba", "drjit"}
 MAY_IMPORT_RENDERERS = ("render/room", "render/setup")
 # The simulator and the estimator share numbers, not mathematics; only studies render.
-RENDERS = ("render", "datasets", "estimator/studies")
+RENDERS = ("render", "datasets", "estimator/studies", PACKAGE)
 
 
 def sources(root: Path) -> list[Path]:
-    return sorted(file for folder in FOLDERS for file in (root / folder).rglob("*.py"))
+    return sorted(file for folder in (*FOLDERS, PACKAGE) for file in (root / folder).rglob("*.py"))
 
 
 def module_name(root: Path, file: Path) -> str:
-    return ".".join(("phibench", *file.relative_to(root).with_suffix("").parts))
+    parts = file.relative_to(root).with_suffix("").parts
+    own = parts[1:] if parts[0] == PACKAGE else parts
+    return ".".join((PACKAGE, *(part for part in own if part != "__init__")))
 
 
 def imports(file: Path) -> Iterator[tuple[int, str]]:
@@ -95,7 +103,7 @@ def faults_of(root: Path, file: Path) -> Iterator[str]:
             yield f"{here}: imports the tests"
         elif parts[0] in RENDERERS and unit_of(own) not in MAY_IMPORT_RENDERERS:
             yield f"{here}: imports {parts[0]} outside {' and '.join(MAY_IMPORT_RENDERERS)}"
-        elif parts[0] == "phibench" and (len(parts) < 3 or not may_import(own, parts[1:])):
+        elif parts[0] == PACKAGE and (len(parts) < 3 or not may_import(own, parts[1:])):
             yield f"{here}: may not import {name}"
 
 
@@ -120,7 +128,10 @@ def nearest(imported: str, files: dict[str, Path]) -> str:
 
 def faults(root: Path) -> list[str]:
     found = [fault for file in sources(root) for fault in faults_of(root, file)]
-    found += [f"{file.relative_to(root)}: no __init__.py here" for file in sources(root) if file.name == "__init__.py"]
+    paths = [file.relative_to(root) for file in sources(root)]
+    found += [
+        f"{path}: no __init__.py here" for path in paths if path.name == "__init__.py" and path.parts[0] in FOLDERS
+    ]
     if loop := cycle(root):
         found.append(f"cycle: {loop}")
     return found
@@ -169,6 +180,10 @@ def test_the_tree_obeys_every_rule() -> None:
         ("datasets/shed.py", "", "has no place in the order"),
         ("estimator/shed/a.py", "", "has no place in the order"),
         ("datasets/store/__init__.py", "", "no __init__.py here"),
+        ("estimator/cli/a.py", "from phibench import open_dataset", "may not import phibench.open_dataset"),
+        ("estimator/cli/a.py", "import phibench.__main__", "may not import phibench.__main__"),
+        ("estimator/studies/a.py", "from phibench.estimator.seat import pair", "may not import phibench.estimator"),
+        ("phibench/__init__.py", "import mitsuba", "imports mitsuba outside"),
         ("estimator/methods/__init__.py", "", "no __init__.py here"),
     ],
 )
@@ -186,6 +201,10 @@ def test_each_rule_catches_what_it_forbids(tmp_path: Path, path: str, source: st
         ("datasets/build/a.py", "from phibench.render.optics.truth import truth\nfrom phibench.scenes import rig"),
         ("estimator/interface.py", "import numpy\nfrom phibench.datasets.read import read\nimport phibench.scenes.rig"),
         ("estimator/studies/a.py", "from phibench.render.optics.truth import truth"),
+        (
+            "phibench/__init__.py",
+            "from phibench.estimator.cli.main import main\nfrom phibench.datasets.read import read",
+        ),
     ],
 )
 def test_what_is_allowed_passes(tmp_path: Path, path: str, source: str) -> None:
@@ -214,6 +233,7 @@ def test_the_tree_has_few_large_rooms() -> None:
     folders = Counter(file.parent for file in files)
     assert {str(folder): n for folder, n in folders.items() if n > 16} == {}
     stems = Counter(file.stem for file in files if file.parts[1] not in ("studies", "cli"))
+    assert {file.stem for file in files if file.parts[0] == PACKAGE} == {"__init__", "__main__"}
     assert [stem for stem, n in stems.items() if n > 1] == []
 
 
@@ -248,9 +268,12 @@ def test_our_folders_shadow_nobody_from_the_checkout(folder: str, tmp_path: Path
 
 def test_every_folder_with_code_is_packaged() -> None:
     listed = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["packages"]
-    needed = {module_name(ROOT, file).rpartition(".")[0] for file in sources(ROOT)}
+    folders = {file.relative_to(ROOT).parent.parts for file in sources(ROOT)}
+    needed = {".".join(parts if parts == (PACKAGE,) else (PACKAGE, *parts)) for parts in folders}
     assert needed - set(listed) == set()
     assert [name for name in listed if not (ROOT / name.removeprefix("phibench.").replace(".", "/")).is_dir()] == []
+    needed_links = {*FOLDERS, "__init__.py", "__main__.py"}  # for tools that cannot see the mapping
+    assert {path.name for path in (ROOT / ".paths" / PACKAGE).iterdir()} == needed_links
 
 
 def test_the_pins_name_no_place() -> None:

@@ -48,11 +48,11 @@ from phibench.estimator.benchmark.records import in_order, record_table
 from phibench.estimator.benchmark.report import write_report
 from phibench.estimator.benchmark.strata import Stratum, count_pairs, measured, strata
 from phibench.estimator.calibration.file import read_calibration
-from phibench.estimator.interface import Box, Outcome, Pair
+from phibench.estimator.interface import Box, Method, Outcome, Pair
 from phibench.estimator.methods.registry import METHODS, BuiltIn
 from phibench.estimator.pair_set import HeldPairs, PairSet
-from phibench.estimator.sandbox.resolve import Limits, resolve
-from phibench.estimator.sandbox.runner import Harness
+from phibench.estimator.sandbox.resolve import Limits, MethodError, resolve
+from phibench.estimator.sandbox.runner import Harness, asked_here, function_name
 from phibench.scenes.frames import Array
 
 CROP_PX = 48
@@ -265,6 +265,74 @@ def _stratum(stratum: Stratum, rules: Rules, seed: int) -> StratumScore:
         pairs=count_pairs(stratum),
         metrics={name: Value.of(value) for name, value in values.items()},
     )
+
+
+def score(
+    dataset: str | Path | Dataset,
+    method: str | Method,
+    preset: str | None = None,
+    *,
+    draws: int | None = None,
+    pairs: int | None = None,
+    hints: bool = True,
+    calibration: str | Path | None = None,
+    limits: Limits | None = None,
+    workers: int = 1,
+    seed: int = 0,
+    out: str | Path | None = None,
+    console: Console | None = None,
+) -> Scored:
+    """Score one method on the pairs of a data set: `phibench.score`.
+
+    Parameters
+    ----------
+    dataset : folder of a finished data set, or an opened one (also a slice of one)
+    method : str or function
+        Name of a built-in method, or "FILE.py:FUNCTION": it runs in a process of its own, with limits. A function runs
+        in this process: no limits, and it can be stopped with a debugger.
+    preset : str, optional
+        Preset of the sensor; by default those of the recipe's `[frames]`.
+    draws, pairs, hints, calibration
+        As for `wanted_pairs`.
+    limits : Limits, optional
+        Of time and memory; not for a function.
+    workers : int
+        Pairs that are worked on at a time; 1 for a function.
+    seed : int
+        Of the bootstrap; 0 or above.
+    out : path, optional
+        JSON file to write, with its Parquet file beside it.
+    console : Console, optional
+        Where progress goes; by default the standard error.
+
+    Returns
+    -------
+    Scored
+        `document` as in the JSON file, `records` as a polars table: one row per image.
+
+    Raises
+    ------
+    DatasetError
+        If data set, preset or calibration will not do.
+    MethodError
+        If the method cannot be found or imported.
+    """
+    console = console or Console(stderr=True)
+    opened = dataset if isinstance(dataset, Dataset) else open_finished(dataset)
+    if out is not None:
+        require_writable(Path(out))
+    chosen = wanted_pairs(opened, preset, draws, pairs, hints, calibration)
+    if isinstance(method, str):
+        (scored,) = run_and_score([method], chosen, workers, console, "pairs", seed, limits)
+    else:
+        if limits is not None or workers != 1:
+            raise MethodError("limits and workers are for methods in a process of their own: give FILE.py:FUNCTION")
+        with Steps(console, "pairs", len(chosen)) as steps:
+            card = MethodCard.of(function_name(method), kind="function")
+            (scored,) = score_methods([card], chosen, asked_here(method), None, seed, None, steps.reach)
+    if out is None:
+        return scored
+    return replace(scored, document=write_score(Path(out), scored.document, scored.records))
 
 
 PRESETS = ("bayer-raw", "srgb8", "mjpeg")

@@ -149,7 +149,9 @@ def _one_rig(samples: Sequence[Sample]) -> Rig:
 
 
 def _known_in_layers(sample: Sample, ruler: Ruler) -> KnownSpot:
-    found = {p: find_spot(sample.frame(p, laser=True), sample.frame(p, laser=False)) for p in POSITIONS}
+    found = {
+        p: find_spot(sample.expected_image(p, laser=True), sample.expected_image(p, laser=False)) for p in POSITIONS
+    }
     for position, spot in found.items():
         if spot.status is not Status.OK:
             raise DatasetError(f"{sample.row.sample_id} {position}: no spot to calibrate with: {describe(spot.status)}")

@@ -408,6 +408,6 @@ def frame(sample: Sample, position: str, preset: str = LAYERS) -> NDArray[Any]:
     if preset not in COLOUR_PRESETS:
         raise DatasetError(f"no colour picture of preset '{preset}'; {nearest(preset, COLOUR_PRESETS)}")
     if preset == LAYERS:
-        planes, detector = sample.frame(position), sample.rig.camera.detector
+        planes, detector = sample.expected_image(position), sample.rig.camera.detector
         return to_srgb(planes, detector, exposure_s(sample.ambient(position), detector))
     return np.asarray(sample.frame_source(preset).frame(position, 0, True).image)

@@ -42,8 +42,8 @@ class Sample(Protocol):
     def nominal_rig(self) -> Rig:
         """The rig that an estimator believes, at the down position."""
 
-    def frame(self, position: str, laser: bool = True) -> Array:
-        """Noise-free frame, shape (3, H, W), electrons per second."""
+    def expected_image(self, position: str, laser: bool = True) -> Array:
+        """Image without noise, shape (3, H, W), electrons per second."""
 
 
 class Dataset(Protocol):
@@ -201,7 +201,9 @@ def _pixels(sample: Sample, source: str) -> _Pixels:
     if source == "truth":
         row = sample.row
         return _Pixels(np.array([row.down.u_px, row.down.v_px]), np.array([row.up.u_px, row.up.v_px]))
-    spots = {p: find_spot(sample.frame(p, laser=True), sample.frame(p, laser=False)) for p in POSITIONS}
+    spots = {
+        p: find_spot(sample.expected_image(p, laser=True), sample.expected_image(p, laser=False)) for p in POSITIONS
+    }
     faults = (f"{p}: {describe(spot.status)}" for p, spot in spots.items() if spot.status is not Status.OK)
     return _Pixels(spots["down"].uv_px, spots["up"].uv_px, ", ".join(faults))
 

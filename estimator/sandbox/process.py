@@ -219,7 +219,7 @@ class _Running:
             )
         except (ChannelError, ValueError):
             return self._dead(pair, file)
-        return _outcome(pair, reply)
+        return outcome_of(pair, reply)
 
     def kill(self) -> None:
         """Kill the whole group and give back what it held."""
@@ -260,7 +260,8 @@ class _Running:
         return f"; its last words: {lines[-1]}" if lines else ""
 
 
-def _outcome(pair: Pair, reply: dict[str, Any]) -> Outcome:
+def outcome_of(pair: Pair, reply: dict[str, Any]) -> Outcome:
+    """Outcome of a pair from the reply of `worker.reply_of`; what is no answer is the failure "invalid"."""
     seconds = float(reply["seconds"])
     if reply["failure"]:
         return Outcome(pair.number, None, seconds, reply["failure"], reply["message"])

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from types import TracebackType
 
-from phibench.estimator.interface import Outcome, Pair
+from phibench.estimator.interface import Method, Outcome, Pair
 from phibench.estimator.pair_set import PairSet
-from phibench.estimator.sandbox.process import MethodProcess
+from phibench.estimator.sandbox.process import MethodProcess, outcome_of
 from phibench.estimator.sandbox.resolve import Limits, MethodError, Reference, resolve
+from phibench.estimator.sandbox.worker import reply_of, require_method
 
 
 class Harness:
@@ -150,3 +151,26 @@ def _outcomes(harness: Harness, pairs: PairSet, numbers: Sequence[int]) -> Itera
     with harness:
         for (outcome,) in harness.outcomes(pairs, numbers):
             yield outcome
+
+
+def asked_here(method: Method) -> Callable[[PairSet, Sequence[int]], Iterator[tuple[Outcome]]]:
+    """Ask a function in this process, without limits: `Harness.outcomes` for one method in a notebook or debugger.
+
+    What it raises is the failure of that pair; Ctrl-C ends the run.
+
+    Raises
+    ------
+    MethodError
+        If the function cannot be called with one pair.
+    """
+    require_method(method, function_name(method))
+
+    def one(pair: Pair) -> tuple[Outcome]:
+        return (outcome_of(pair, reply_of(lambda: method(pair))),)
+
+    return lambda pairs, numbers: (one(pairs.pair(number)) for number in numbers)
+
+
+def function_name(method: Method) -> str:
+    """Name under which a function is scored."""
+    return str(getattr(method, "__name__", type(method).__name__))

@@ -23,14 +23,14 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from phibench.datasets.store.files import sha256
-from phibench.estimator.interface import Method
+from phibench.estimator.interface import Answer, Method
 from phibench.estimator.sandbox.answers import answer_text, to_bytes
 from phibench.estimator.sandbox.resolve import MethodError, Reference
 from phibench.estimator.sandbox.transport import Channel, ChannelError, Parcel, SharedPages, unpack
@@ -77,7 +77,7 @@ def load(reference: Reference) -> Method:
 
         return KNOWN[reference.name]
     function = _from_file(reference) if reference.kind == "file" else _from_package(reference)
-    _require_method(function, _title(reference))
+    require_method(function, _title(reference))
     return function
 
 
@@ -144,7 +144,14 @@ def _from_package(reference: Reference) -> Any:
     return found
 
 
-def _require_method(function: Any, title: str) -> None:
+def require_method(function: Any, title: str) -> None:
+    """Refuse what cannot be called with one pair.
+
+    Raises
+    ------
+    MethodError
+        In one sentence.
+    """
     if not callable(function):
         raise MethodError(f"{title} is of type {type(function).__name__}, not a function: write def extract(pair): ...")
     if inspect.isclass(function):
@@ -192,19 +199,33 @@ def main() -> None:
 
 
 def _reply(method: Method, parcel: Parcel, limit: int, file: str) -> dict[str, Any]:
-    start = time.perf_counter()
-    try:
+    def ask() -> Answer:
         with limited(limit):
-            answer = method(parcel.pair)
-        reply: dict[str, Any] = {"failure": "", "answer": answer_text(answer)}
-    except MemoryError as error:
-        reply = {"failure": "memory", "message": f"more memory than the limit: {sentence_of(error, file)}"}
-    except BaseException as error:
-        reply = _of_exception(error, file)
-    reply["seconds"] = time.perf_counter() - start
+            return method(parcel.pair)
+
+    reply = reply_of(ask, file, BaseException)
     if not parcel.unchanged():
         return {**reply, "failure": "mutated", "message": "the method wrote into the pair's images: work on a copy"}
     return reply
+
+
+def reply_of(ask: Callable[[], Answer], file: str = "", caught: type[BaseException] = Exception) -> dict[str, Any]:
+    """Answer or failure of one pair, with its time, as a document.
+
+    Parameters
+    ----------
+    ask : calls the method
+    file : file of the method, whose line an error names
+    caught : what counts as the method's error; anything else passes
+    """
+    start = time.perf_counter()
+    try:
+        reply: dict[str, Any] = {"failure": "", "answer": answer_text(ask())}
+    except MemoryError as error:
+        reply = {"failure": "memory", "message": f"more memory than the limit: {sentence_of(error, file)}"}
+    except caught as error:
+        reply = _of_exception(error, file)
+    return {**reply, "seconds": time.perf_counter() - start}
 
 
 def _of_exception(error: BaseException, file: str) -> dict[str, Any]:

@@ -88,7 +88,7 @@ def test_frame_is_ambient_plus_spot_at_the_true_place(paper: Dataset) -> None:
     for sample in paper.samples:
         for position in ("down", "up"):
             row = sample.row.position(position)
-            difference = (sample.frame(position, laser=True) - sample.frame(position, laser=False))[0]
+            difference = (sample.expected_image(position, laser=True) - sample.expected_image(position, laser=False))[0]
             v, u = np.unravel_index(difference.argmax(), difference.shape)
             assert abs(u - row.u_px) <= 0.5 + 0.01
             assert abs(v - row.v_px) <= 0.5 + 0.01

@@ -68,7 +68,7 @@ def test_the_pixel_truth_at_the_spot_is_the_spots_truth(dataset: Dataset) -> Non
 
 def test_a_frame_is_ambient_plus_spot(dataset: Dataset) -> None:
     sample = dataset["seen-near-h0.500"]
-    off, on = sample.frame("up", laser=False), sample.frame("up")
+    off, on = sample.expected_image("up", laser=False), sample.expected_image("up")
     assert on.shape == (3, 180, 320)
     assert on.dtype == np.float64
     assert np.array_equal(off, sample.ambient("up").astype(float))
@@ -92,7 +92,7 @@ def test_the_ambient_layer_states_its_noise(dataset: Dataset) -> None:
 def test_a_hidden_spot_has_an_empty_window(dataset: Dataset) -> None:
     sample = dataset["half-hidden-h1.400"]
     assert sample.spot("down").electrons_per_s.shape == (3, 0, 0)
-    assert np.array_equal(sample.frame("down"), sample.frame("down", laser=False))
+    assert np.array_equal(sample.expected_image("down"), sample.expected_image("down", laser=False))
     assert sample.spot("up").electrons_per_s.sum() > 0.0
 
 
@@ -113,11 +113,11 @@ def test_errors_are_clear(dataset: Dataset, tiny_dataset: Path, tmp_path: Path) 
     with pytest.raises(DatasetError, match=r"did you mean 'seen-near-h0\.500'"):
         dataset["seen-near-h0.5"]
     with pytest.raises(DatasetError, match="'down' or 'up'"):
-        dataset.samples[0].frame("left")
+        dataset.samples[0].expected_image("left")
     copy = Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
     (copy / layout.view_file("h0.500", "ambient")).unlink()
     with pytest.raises(DatasetError, match=r"ambient\.exr is missing"):
-        open_dataset(copy).samples[0].frame("up")
+        open_dataset(copy).samples[0].expected_image("up")
 
 
 @pytest.mark.parametrize(
@@ -162,7 +162,7 @@ SPOTS = ("spots/seen-near-h0.500-down.exr", "spots/seen-near-h0.500-up.exr")
 )
 def test_swapped_layers_are_refused(copy: Path, pair: tuple[str, str]) -> None:
     before = open_dataset(copy)["seen-near-h0.500"]
-    assert before.frame("down").any()
+    assert before.expected_image("down").any()
     assert before.truth("up")
     a, b = (copy / name for name in pair)
     a.rename(copy / "aside")
@@ -171,7 +171,7 @@ def test_swapped_layers_are_refused(copy: Path, pair: tuple[str, str]) -> None:
     sample = open_dataset(copy)["seen-near-h0.500"]
     for position in ("down", "up"):
         with pytest.raises(DatasetError, match=r"is the \w+ layer of .*, not of"):
-            (sample.truth if "truth" in pair[0] else sample.frame)(position)
+            (sample.truth if "truth" in pair[0] else sample.expected_image)(position)
 
 
 def test_a_layer_of_another_data_set_is_refused(copy: Path, smoke_dataset: Path) -> None:
@@ -196,6 +196,38 @@ def test_an_unfinished_or_changed_data_set_is_not_opened_as_finished(copy: Path)
 def test_a_sample_prints_short(dataset: Dataset) -> None:
     assert "dataset" not in repr(dataset.samples[0]).split("(", 1)[1].split("row=")[0]
     assert len(repr(dataset.samples[0])) < 5000
+
+
+def test_a_data_set_prints_in_ten_lines(dataset: Dataset) -> None:
+    lines = repr(dataset).splitlines()
+    assert len(lines) == 10
+    assert max(map(len, lines[1:])) <= 80
+    assert lines[0] == f"Dataset 'tiny' in {dataset.folder}"
+    assert "2 stroke pairs" in lines[1]
+    assert "3 of 4 visible" in repr(dataset)
+    assert len(repr(dataset[:0]).splitlines()) == 10
+    assert repr(dataset[0]).startswith(f"Sample('{dataset.rows[0].sample_id}': D = ")
+
+
+def test_samples_are_taken_by_place_and_parts_as_slices(dataset: Dataset) -> None:
+    first, last = dataset.samples
+    assert dataset[0] is first
+    assert dataset[-1] is last
+    assert dataset[np.int64(1)] is last  # type: ignore[call-overload]
+    assert dataset[first.row.sample_id] is first
+    part = dataset[1:]
+    assert [sample.row for sample in part] == [last.row]
+    assert part.folder == dataset.folder
+    assert len(dataset) == 2
+    assert len(dataset[5:]) == 0
+    with pytest.raises(IndexError, match=r"sample 2: .* has 2, numbered from 0"):
+        dataset[2]
+
+
+def test_the_table_of_a_data_set_is_its_parquet_file(dataset: Dataset) -> None:
+    polars = pytest.importorskip("polars")
+    assert dataset.to_polars().equals(polars.read_parquet(dataset.folder / layout.TABLE))
+    assert dataset[1:].to_polars()["sample_id"].to_list() == [dataset[1].row.sample_id]
 
 
 def test_a_data_set_of_version_4_is_read_as_perfect_spheres(tiny_dataset: Path, tmp_path: Path) -> None:

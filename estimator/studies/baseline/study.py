@@ -275,7 +275,12 @@ def _rendered(recipe: str, material: Material) -> pl.DataFrame:
     points, strokes = np.array([row.spot_world_m for row in rows]), np.array([row.nominal_stroke_m for row in rows])
     down, up, true = seen(rig, wrong, points, strokes)
     found = [
-        np.array([find_spot(sample.frame(p, laser=True), sample.frame(p, laser=False)).uv_px for sample in samples])
+        np.array(
+            [
+                find_spot(sample.expected_image(p, laser=True), sample.expected_image(p, laser=False)).uv_px
+                for sample in samples
+            ]
+        )
         for p in POSITIONS
     ]
     return pl.DataFrame(

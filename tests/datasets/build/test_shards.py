@@ -37,7 +37,7 @@ def test_a_shard_is_a_data_set(shards: list[Path]) -> None:
     for i, shard in enumerate(shards, 1):
         dataset = open_dataset(shard)
         assert (len(dataset), len(dataset.info.poses), dataset.info.shard) == (1, 2, f"{i}/2")
-        assert dataset.samples[0].frame("up").shape == (3, 180, 320)
+        assert dataset.samples[0].expected_image("up").shape == (3, 180, 320)
         assert verify(shard, console=quiet()).faults == ()
 
 

@@ -50,7 +50,7 @@ def sample(dataset: Dataset) -> Sample:
     ],
 )
 def test_every_preset_gives_its_arrays(sample: Sample, preset: str, shape: tuple[int, ...], dtype: type) -> None:
-    frames = sample.frames(preset, draw=0, laser_off=True)
+    frames = sample.camera_frames(preset, draw=0, laser_off=True)
     assert tuple(frames.by_name) == NAMES
     for name in NAMES:
         image = getattr(frames, name)
@@ -59,7 +59,7 @@ def test_every_preset_gives_its_arrays(sample: Sample, preset: str, shape: tuple
 
 
 def test_ideal_frames_are_the_layers_times_the_exposure(sample: Sample) -> None:
-    frames = sample.frames("ideal", exposure=0.01, lamp_level=0.5, laser_level=3.0, laser_off=True)
+    frames = sample.camera_frames("ideal", exposure=0.01, lamp_level=0.5, laser_level=3.0, laser_off=True)
     spot = np.zeros((3, 180, 320))
     sample.spot("up").add_to(spot)
     # sums and products of doubles
@@ -68,18 +68,18 @@ def test_ideal_frames_are_the_layers_times_the_exposure(sample: Sample) -> None:
 
 
 def test_the_jpeg_is_what_pillow_reads(sample: Sample) -> None:
-    frames = sample.frames("mjpeg", draw=3, laser_off=True)
+    frames = sample.camera_frames("mjpeg", draw=3, laser_off=True)
     for name in NAMES:
         with Image.open(io.BytesIO(frames.jpeg[name])) as picture:
             assert (picture.format, picture.mode, picture.size) == ("JPEG", "RGB", (320, 180))
             np.testing.assert_array_equal(np.asarray(picture), getattr(frames, name))
-    better = sample.frames("mjpeg", draw=3, jpeg_quality=95)
+    better = sample.camera_frames("mjpeg", draw=3, jpeg_quality=95)
     assert len(better.jpeg["down"]) > len(frames.jpeg["down"])
 
 
 @pytest.mark.parametrize("preset", ["ideal", "mono-raw", "bayer-raw", "srgb8", "mjpeg"])
 def test_a_region_is_a_crop_of_the_frame(sample: Sample, preset: str) -> None:
-    whole = sample.frames(preset, draw=2, laser_off=True)
+    whole = sample.camera_frames(preset, draw=2, laser_off=True)
     source = sample.region_frames(preset, 64)
     part = source.frames(2, laser_off=True)
     for name in NAMES:
@@ -94,14 +94,14 @@ def test_a_region_is_a_crop_of_the_frame(sample: Sample, preset: str) -> None:
 
 def test_a_moving_carriage_moves_the_spot(sample: Sample) -> None:
     """0.2 m/s: the spot's rows are read at their own times; regions and frames agree to the bit."""
-    still, moving = (sample.frames("ideal", carriage_speed_m_s=speed, laser_off=True) for speed in (0.0, 0.2))
+    still, moving = (sample.camera_frames("ideal", carriage_speed_m_s=speed, laser_off=True) for speed in (0.0, 0.2))
     flux = [(f.up - f.up_off)[0].sum() for f in (still, moving)]
     assert flux[1] == pytest.approx(flux[0], rel=1e-3)  # rows that see it at other times trade with each other
     centres = [_centroid((f.up - f.up_off)[0]) for f in (still, moving)]
     assert np.hypot(*(centres[1] - centres[0])) > 0.01
     np.testing.assert_array_equal(still.up_off, moving.up_off)
     part = sample.region_frames("bayer-raw", 48, carriage_speed_m_s=0.2).frames(1).by_name["up"]
-    whole = sample.frames("bayer-raw", draw=1, carriage_speed_m_s=0.2)
+    whole = sample.camera_frames("bayer-raw", draw=1, carriage_speed_m_s=0.2)
     np.testing.assert_array_equal(part.image, whole.up[part.region.slices()])
 
 
@@ -123,7 +123,7 @@ def test_auto_exposure_looks_at_the_room_alone(sample: Sample) -> None:
 
 
 def test_a_hidden_spot_gives_frames_of_the_room(dataset: Dataset) -> None:
-    frames = dataset[HALF].frames("ideal", laser_off=True)
+    frames = dataset[HALF].camera_frames("ideal", laser_off=True)
     np.testing.assert_array_equal(frames.down, frames.down_off)
     assert (frames.up != frames.up_off).any()
 
@@ -132,11 +132,11 @@ def test_a_hidden_spot_gives_frames_of_the_room(dataset: Dataset) -> None:
 
 
 def test_order_and_company_do_not_matter(dataset: Dataset, sample: Sample) -> None:
-    expected = sample.frames("mjpeg", draw=4, laser_off=True)
+    expected = sample.camera_frames("mjpeg", draw=4, laser_off=True)
     source = sample.frame_source("mjpeg")
     for position, draw in (("up", 9), ("down", 4), ("down", 0)):
         source.frame(position, draw)
-    dataset[HALF].frames("mjpeg", draw=4)
+    dataset[HALF].camera_frames("mjpeg", draw=4)
     for name, laser in (("up_off", False), ("down", True), ("up", True)):
         again = source.frame(name.removesuffix("_off"), 4, laser)
         np.testing.assert_array_equal(again.image, getattr(expected, name))
@@ -148,7 +148,7 @@ CHILD = """
 import hashlib, sys
 from phibench.datasets.read import open_dataset
 for sample in list(open_dataset(sys.argv[1]))[:: int(sys.argv[2])]:
-    frames = sample.frames("mjpeg", draw=0, laser_off=True)
+    frames = sample.camera_frames("mjpeg", draw=0, laser_off=True)
     for name in frames.by_name:
         print(sample.row.sample_id, name, hashlib.sha256(getattr(frames, name).tobytes()).hexdigest())
 assert "mitsuba" not in sys.modules
@@ -302,12 +302,12 @@ def _two_sided(law: object, value: float) -> float:
 )
 def test_a_mistake_is_one_sentence(sample: Sample, options: dict[str, object], words: str) -> None:
     with pytest.raises(DatasetError, match=re.escape(words)) as caught:
-        sample.frames(**options)  # type: ignore[arg-type]
+        sample.camera_frames(**options)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
 
 
 def test_what_was_not_drawn_is_refused(sample: Sample) -> None:
-    frames = sample.frames("bayer-raw", region=8)
+    frames = sample.camera_frames("bayer-raw", region=8)
     with pytest.raises(DatasetError, match=r"'up_off' was not drawn: ask for frames\(laser_off=True\)"):
         _ = frames.up_off
     with pytest.raises(DatasetError, match="'down' or 'up'"):
@@ -318,4 +318,4 @@ def test_a_missing_layer_is_named(tiny_dataset: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
     (copy / "views/h0.500/ambient.exr").unlink()
     with pytest.raises(DatasetError, match=r"ambient\.exr is missing"):
-        open_dataset(copy)[SEEN].frames()
+        open_dataset(copy)[SEEN].camera_frames()

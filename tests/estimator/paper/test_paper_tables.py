@@ -44,7 +44,9 @@ def make_sample(published, spot, *, shift_px=0.0, frame=draw, **hidden):
     )
     ambient = np.full((3, 720, 1280), 123.25)
     return SimpleNamespace(
-        row=row, nominal_rig=RIG, frame=lambda position, laser=True: ambient + frame(uv[position]) if laser else ambient
+        row=row,
+        nominal_rig=RIG,
+        expected_image=lambda position, laser=True: ambient + frame(uv[position]) if laser else ambient,
     )
 
 

@@ -1,0 +1,1 @@
+../../phibench/__init__.py

@@ -1,0 +1,1 @@
+../../phibench/__main__.py

@@ -1,0 +1,64 @@
+"""Public interface of phibench: what a user's own program needs.
+
+>>> import phibench
+>>> dataset = phibench.open_dataset("out/paper")  # doctest: +SKIP
+>>> phibench.score(dataset, "my_phi.py:extract", preset="bayer-raw")  # doctest: +SKIP
+
+Names are imported when they are first used, so that ``import phibench`` loads nothing else. All other modules are
+imported by their full names, ``from phibench.scenes.rig import Rig``.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from phibench.datasets.read import open_dataset
+    from phibench.estimator.benchmark.score import score
+    from phibench.estimator.interface import Answer, Pair, Spot
+
+    __version__: str
+
+__all__ = ["Answer", "Pair", "Spot", "__version__", "open_dataset", "score"]
+
+_HOMES = {
+    "Answer": "phibench.estimator.interface",
+    "Pair": "phibench.estimator.interface",
+    "Spot": "phibench.estimator.interface",
+    "open_dataset": "phibench.datasets.read",
+    "score": "phibench.estimator.benchmark.score",
+}
+
+# In a checkout the four folders lie beside this one, in an installed package inside it. Python looks for
+# `phibench.scenes` in every folder of `__path__`.
+_FOLDER = Path(__file__).parent
+if not (_FOLDER / "scenes").is_dir():
+    __path__.append(str(_FOLDER.parent))
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name on its first use."""
+    if name in _HOMES:
+        value: Any = getattr(import_module(_HOMES[name]), name)
+    elif name == "__version__":
+        value = _version()
+    else:
+        raise AttributeError(f"module 'phibench' has no attribute '{name}'; it has {', '.join(__all__)}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+def _version() -> str:
+    """Version of the installed distribution; "0+unknown" where only the files are on the path."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("phibench")
+    except PackageNotFoundError:
+        return "0+unknown"

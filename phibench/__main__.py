@@ -1,0 +1,8 @@
+"""The command line as ``python -m phibench``."""
+
+import sys
+
+from phibench.estimator.cli.main import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,117 @@
+"""The public interface: what `import phibench` gives, at which price, and the old names of one version."""
+
+import inspect
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import phibench
+from phibench.datasets.errors import DatasetError
+from phibench.estimator import interface
+from phibench.estimator.sandbox.resolve import MethodError
+from phibench.estimator.sandbox.runner import asked_here
+
+Python = Callable[..., subprocess.CompletedProcess[str]]
+METHOD = """
+import numpy as np
+from phibench import Answer, Pair, Spot
+
+def extract(pair: Pair) -> Answer:
+    v, u = np.unravel_index(int(pair.down.argmax()), pair.down.shape)
+    return Answer(Spot((float(u), float(v))), Spot.missing("not looked for"))
+"""
+
+
+def extract(pair: phibench.Pair) -> phibench.Answer:
+    v, u = np.unravel_index(int(pair.down.argmax()), pair.down.shape)
+    return phibench.Answer(phibench.Spot((float(u), float(v))), phibench.Spot.missing("not looked for"))
+
+
+def test_the_public_names_are_there() -> None:
+    assert {name: getattr(phibench, name) for name in ("Pair", "Answer", "Spot")} == {
+        name: getattr(interface, name) for name in ("Pair", "Answer", "Spot")
+    }
+    assert set(phibench.__all__) == {"Answer", "Pair", "Spot", "__version__", "open_dataset", "score"}
+    assert set(phibench.__all__) <= set(dir(phibench))
+    assert callable(phibench.open_dataset)
+    assert phibench.__version__[0].isdigit()
+    with pytest.raises(AttributeError, match="no attribute 'open'; it has Answer"):
+        phibench.open  # noqa: B018
+    assert list(inspect.signature(phibench.score).parameters)[:3] == ["dataset", "method", "preset"]
+
+
+def test_the_import_loads_nothing_else(python: Python) -> None:
+    child = python("import sys, phibench; print({'numpy', 'pydantic', 'phibench.datasets'} & set(sys.modules))")
+    assert child.stdout.strip() == "set()", child.stderr
+    # The set is not empty because nothing could be in it.
+    child = python("import sys, phibench; phibench.Pair; print('numpy' in sys.modules)")
+    assert child.stdout.strip() == "True", child.stderr
+
+
+def test_the_module_is_the_command_line(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "phibench", "--help"]
+    child = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert (child.returncode, child.stdout.split()[:3]) == (0, ["Usage:", "phibench", "COMMAND"]), child.stderr
+
+
+def test_a_method_file_with_the_old_import_works_and_warns(python: Python) -> None:
+    code = "from phibench.estimator.seat.pair import Answer, Pair, Spot\nimport phibench; print(Pair is phibench.Pair)"
+    child = python(f"import warnings; warnings.simplefilter('always')\n{code}")
+    assert child.stdout.strip() == "True", child.stderr
+    assert "<string>:2: DeprecationWarning: phibench.estimator.seat.pair is now" in child.stderr
+    assert python("from phibench.estimator.seat import pair; pair.Answer").returncode == 0
+
+
+def test_the_old_names_of_a_sample_work_and_warn(tiny_dataset: Path) -> None:
+    sample = phibench.open_dataset(tiny_dataset)[0]
+    with pytest.warns(DeprecationWarning, match=r"Sample\.frame is now Sample\.expected_image") as caught:
+        old = sample.frame("up", laser=False)
+    assert caught[0].filename == __file__
+    assert np.array_equal(old, sample.expected_image("up", laser=False))
+    with pytest.warns(DeprecationWarning, match=r"Sample\.frames is now Sample\.camera_frames"):
+        frames = sample.frames("bayer-raw", 2, exposure=0.01)
+    assert np.array_equal(frames.up, sample.camera_frames("bayer-raw", 2, exposure=0.01).up)
+
+
+def test_a_function_and_its_file_get_the_same_score(bench_dataset: Path, tmp_path: Path) -> None:
+    file, out = tmp_path / "mine.py", tmp_path / "mine.json"
+    file.write_text(METHOD)
+    theirs = phibench.score(bench_dataset, f"{file}:extract", "mono-raw", draws=1, out=out)
+    ours = phibench.score(phibench.open_dataset(bench_dataset), extract, "mono-raw", draws=1)
+    columns = [name for name in ours.records.columns if not name.startswith("seconds")]
+    assert len(columns) > 10
+    assert ours.records.select(columns).equals(theirs.records.select(columns))
+    assert len(ours.records) == len(theirs.records) > 0
+    assert (ours.document.method.name, ours.document.method.kind) == ("extract", "function")
+    assert out.is_file()
+    assert theirs.document.records == "mine.parquet"
+
+
+def test_a_part_of_a_data_set_is_scored(bench_dataset: Path) -> None:
+    dataset = phibench.open_dataset(bench_dataset)
+    scored = phibench.score(dataset[:1], extract, "mono-raw", draws=1)
+    assert set(scored.records["sample_id"]) == {dataset[0].row.sample_id}
+
+
+def test_mistakes_of_a_function_are_failures_of_its_pairs(bench_dataset: Path) -> None:
+    def wrong(pair: phibench.Pair) -> phibench.Answer:
+        raise ValueError("no spot")
+
+    def writes(pair: phibench.Pair) -> phibench.Answer:
+        pair.down[0, 0] = 1
+        return extract(pair)
+
+    dataset = phibench.open_dataset(bench_dataset)[:1]
+    for method, failure in ((wrong, "error"), (writes, "mutated"), (lambda pair: 3, "invalid")):
+        document = phibench.score(dataset, method, "mono-raw", draws=1).document
+        assert document.failures[failure] == document.pairs > 0
+    with pytest.raises(MethodError, match="FILE"):
+        phibench.score(dataset, extract, "mono-raw", workers=2)
+    with pytest.raises(MethodError, match="must take one pair"):
+        asked_here(lambda: extract)  # type: ignore[arg-type, misc]
+    with pytest.raises(DatasetError, match="there is no folder"):
+        phibench.score("nowhere", extract)
