@@ -9,8 +9,9 @@ The rigs of a data set: `rigs.jsonl`, one line each, rebuilt when they are asked
 `sensitivities.parquet`: dD/d(parameter) per sample and estimator, beside the data set that it was computed from.
 
 The estimators are not this folder's business: the command line has the table written after the data set is finished
-(`phibench dataset make`, `phibench sensitivities`). It is therefore not listed in SHA256SUMS, whose bytes follow from
-the recipe alone; instead the table's metadata hold the SHA-256 of SHA256SUMS, which tells what it belongs to.
+(`phibench dataset make`, `phibench dataset sensitivities`). It is therefore not listed in SHA256SUMS, whose bytes
+follow from the recipe alone; instead the table's metadata hold the SHA-256 of SHA256SUMS, which tells what it
+belongs to.
 """
 
 from __future__ import annotations
@@ -317,9 +318,12 @@ def sensitivity_fault(folder: Path) -> str | None:
         polars.scan_parquet(path).select(polars.all().count()).collect()
     except (polars.exceptions.PolarsError, OSError) as error:
         why = str(error).splitlines()[0]
-        return f"{layout.SENSITIVITIES} cannot be read: {why}; run `phibench sensitivities` again"
+        return f"{layout.SENSITIVITIES} cannot be read: {why}; run `phibench dataset sensitivities` again"
     if digest != metadata_of(folder)[DIGEST]:
-        return f"{layout.SENSITIVITIES} belongs to another state of this data set; run `phibench sensitivities` again"
+        return (
+            f"{layout.SENSITIVITIES} belongs to another state of this data set; "
+            "run `phibench dataset sensitivities` again"
+        )
     return None
 
 
@@ -334,7 +338,7 @@ def read_sensitivities(folder: Path) -> DataFrame:
     import polars
 
     if not (folder / layout.SENSITIVITIES).is_file():
-        raise DatasetError(f"{folder} has no {layout.SENSITIVITIES}; run `phibench sensitivities {folder}`")
+        raise DatasetError(f"{folder} has no {layout.SENSITIVITIES}; run `phibench dataset sensitivities {folder}`")
     if fault := sensitivity_fault(folder):
         raise DatasetError(f"{folder}: {fault}")
     return polars.read_parquet(folder / layout.SENSITIVITIES)

@@ -51,7 +51,7 @@ from phibench.estimator.calibration.file import read_calibration
 from phibench.estimator.interface import Box, Method, Outcome, Pair
 from phibench.estimator.methods.registry import METHODS, BuiltIn
 from phibench.estimator.pair_set import HeldPairs, PairSet
-from phibench.estimator.sandbox.resolve import Limits, MethodError, resolve
+from phibench.estimator.sandbox.resolve import MethodError, RunLimits, resolve
 from phibench.estimator.sandbox.runner import Harness, asked_here, function_name
 from phibench.scenes.frames import Array
 
@@ -124,7 +124,7 @@ def _png(pixels: NDArray[np.uint8]) -> str:
 
 
 Ask = Callable[[PairSet, Sequence[int]], Iterable[tuple[Outcome, ...]]]
-"""Pairs and numbers to the outcomes of every method: `estimator.seat.harness.Harness.outcomes`."""
+"""Pairs and numbers to the outcomes of every method: `sandbox.runner.Harness.outcomes`."""
 AT_ONCE = 16
 """Pairs in memory at a time; one of MJPEG frames with the laser on and off takes 11 MB."""
 
@@ -276,7 +276,7 @@ def score(
     pairs: int | None = None,
     hints: bool = True,
     calibration: str | Path | None = None,
-    limits: Limits | None = None,
+    limits: RunLimits | None = None,
     workers: int = 1,
     seed: int = 0,
     out: str | Path | None = None,
@@ -294,7 +294,7 @@ def score(
         Preset of the sensor; by default those of the recipe's `[frames]`.
     draws, pairs, hints, calibration
         As for `wanted_pairs`.
-    limits : Limits, optional
+    limits : RunLimits, optional
         Of time and memory; not for a function.
     workers : int
         Pairs that are worked on at a time; 1 for a function.
@@ -358,6 +358,7 @@ def bench(
     pairs: int | None = None,
     console: Console | None = None,
     calibration: str | Path | None = None,
+    limits: RunLimits | None = None,
 ) -> Benched:
     """Run built-in methods on all presets of a data set and write scores and a report.
 
@@ -370,6 +371,7 @@ def bench(
     pairs : the first so many of each preset; all by default
     console : where progress goes; by default the standard error
     calibration : file of `phibench calibrate`; the pairs are then those of its rig, with its numbers
+    limits : limits of every method for one pair
 
     Raises
     ------
@@ -387,12 +389,13 @@ def bench(
         refusals = {name: refusal(METHODS[name], taken) for name in chosen}
         notes += [f"{name} is left out on {preset}: {why}" for name, why in refusals.items() if why]
         names = [name for name, why in refusals.items() if not why]
-        for name, scored in zip(names, run_and_score(names, taken, workers, console, preset), strict=True):
+        done = run_and_score(names, taken, workers, console, preset, limits=limits)
+        for name, scored in zip(names, done, strict=True):
             path = out / f"{preset}-{name}.json"
             write_score(path, scored.document, scored.records)
             scores.append(path)
     if not scores:
-        raise DatasetError(f"none of {', '.join(chosen)} takes a preset of {folder}: give other --methods")
+        raise DatasetError(f"none of {', '.join(chosen)} takes a preset of {folder}: give another --method")
     return Benched(write_report(scores, out / REPORT), tuple(scores), tuple(notes))
 
 
@@ -403,7 +406,7 @@ def run_and_score(
     console: Console,
     title: str,
     seed: int = 0,
-    limits: Limits | None = None,
+    limits: RunLimits | None = None,
 ) -> list[Scored]:
     """Score methods on the same pairs, each in a process of its own; parameters as for `bench`.
 
@@ -412,7 +415,7 @@ def run_and_score(
     MethodError
         If a method cannot be found or imported.
     """
-    found, limits = [resolve(reference) for reference in references], limits or Limits()
+    found, limits = [resolve(reference) for reference in references], limits or RunLimits()
     cards = [MethodCard.of(name, **method.document()) for name, method in zip(references, found, strict=True)]
     if not cards:
         return []

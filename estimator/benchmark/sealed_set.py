@@ -68,7 +68,7 @@ class Seal(Document):
 
 
 class PublicBox(Document):
-    """A region hint, as `estimator.seat.pair.Box`."""
+    """A region hint, as `interface.Box`."""
 
     u0_px: int
     v0_px: int
@@ -110,7 +110,7 @@ def read_seal(folder: Path) -> Seal:
     """
     path = folder / SEAL
     if not path.is_file():
-        raise DatasetError(f"{folder} is no sealed set: it has no {SEAL}; give what `phibench dataset seal` wrote")
+        raise DatasetError(f"{folder} is no sealed set: it has no {SEAL}; give what `phibench seal make` wrote")
     if not (folder / SUMS).is_file():
         raise DatasetError(f"{folder / SUMS} is missing; download the set again")
     try:
@@ -162,7 +162,7 @@ def read_truth_file(path: Path, sha256: str) -> list[PairTruth]:
     if found != sha256:
         raise DatasetError(
             f"{path} is not the truth that was sealed: its SHA-256 begins with {found[:12]}, the seal says "
-            f"{sha256[:12]}; give the file that `phibench dataset seal` wrote for this set"
+            f"{sha256[:12]}; give the file that `phibench seal make` wrote for this set"
         )
     return [truth_of(document) for document in json.loads(data)["truths"]]
 

@@ -25,7 +25,7 @@ from phibench.estimator.benchmark.sealed_set import Seal, read_truth_file
 from phibench.estimator.interface import FAILURES, Outcome, Pair, Spot
 from phibench.estimator.pair_set import PairTruth
 from phibench.estimator.sandbox.answers import AnswerError, checked
-from phibench.estimator.sandbox.resolve import Reference, resolve
+from phibench.estimator.sandbox.resolve import Reference, RunLimits, resolve
 from phibench.estimator.sandbox.runner import run_method
 
 FORMAT = "phibench submission 1"
@@ -33,7 +33,7 @@ Matrix = Annotated[tuple[Vector2, Vector2], Field(strict=False)]
 
 
 class SpotLine(Document):
-    """`estimator.seat.pair.Spot`."""
+    """`interface.Spot`."""
 
     uv_px: Vector2 | None
     covariance_px2: Matrix | None
@@ -77,16 +77,19 @@ class Submitted:
     silence: str
 
 
-def submit(public: str | Path, method: str, out: str | Path, workers: int = 1) -> Submitted:
+def submit(
+    public: str | Path, method: str, out: str | Path, workers: int = 1, limits: RunLimits | None = None
+) -> Submitted:
     """Run a method on a sealed set and write its answers.
 
     Parameters
     ----------
     public : folder of the sealed set
     method : str
-        As for `seat.harness.Harness`.
+        As for `sandbox.runner.Harness`.
     out : JSON file to write
     workers : pairs that are worked on at a time
+    limits : limits of the method for one pair
 
     Raises
     ------
@@ -98,7 +101,7 @@ def submit(public: str | Path, method: str, out: str | Path, workers: int = 1) -
         raise DatasetError(f"{out} is a folder; give a file such as submission.json, --out")
     pairs.check()
     found = resolve(method)
-    outcomes = run_method(found, pairs, workers=workers)
+    outcomes = run_method(found, pairs, limits, workers)
     document = submission(pairs.seal, found, outcomes)
     check_complete(document, pairs.seal, "the run")
     write_text(out, json.dumps(document.model_dump(mode="json"), indent=1, allow_nan=False) + "\n")
@@ -138,10 +141,10 @@ def read_submission(path: Path) -> Submission:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         raise DatasetError(
-            f"{path} is no submission: {where}: {first['msg']}; write it with `phibench submit`"
+            f"{path} is no submission: {where}: {first['msg']}; write it with `phibench seal submit`"
         ) from error
     except ValueError as error:
-        raise DatasetError(f"{path} is no submission: it is not JSON; write it with `phibench submit`") from error
+        raise DatasetError(f"{path} is no submission: it is not JSON; write it with `phibench seal submit`") from error
     if document.format != FORMAT:
         raise DatasetError(f"{path} has the format '{document.format}', not '{FORMAT}'; write it with this phibench")
     return document
@@ -212,12 +215,12 @@ def _finite(value: float | None) -> float | None:
 
 
 def _outcome(line: AnswerLine) -> Outcome:
-    """Outcome of a line, by the rules of the seat: what is no answer there is none here."""
+    """Outcome of a line, by the rules of the sandbox: what is no answer there is none here."""
     has_answer = line.down is not None and line.up is not None
     if line.failure not in ("", *FAILURES) or has_answer == bool(line.failure) or line.seconds < 0.0:
         raise DatasetError(
-            f"the submission's pair {line.number} is not one that `phibench submit` writes: an answer or a failure of "
-            f"{', '.join(FAILURES)}, and seconds of 0 or above; submit again"
+            f"the submission's pair {line.number} is not one that `phibench seal submit` writes: "
+            f"an answer or a failure of {', '.join(FAILURES)}, and seconds of 0 or above; submit again"
         )
     if line.down is None or line.up is None:
         return Outcome(line.number, None, line.seconds, line.failure, line.message)

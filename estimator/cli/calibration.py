@@ -9,13 +9,15 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from phibench.estimator.cli.options import DEFAULT_PRESET
+
 
 def calibrate(
     directory: Path,
     *,
     out: Path,
     sample: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
-    preset: str = "layers",
+    preset: str = DEFAULT_PRESET,
     spots: bool = False,
     vertical: Annotated[bool, Parameter(negative="")] = False,
     distance_sigma_m: float = 1e-3,
@@ -33,7 +35,7 @@ def calibrate(
     sample
         Ids of samples; the first one by default.
     preset
-        "layers" (noise-free), or the preset of the frames to draw: "bayer-raw", "mono-raw", "srgb8", "mjpeg".
+        Preset of the frames to draw: "mjpeg", "srgb8", "bayer-raw" or "mono-raw"; "layers" is noise-free.
     spots
         Also use the laser spots at their known distances.
     vertical

@@ -1,26 +1,21 @@
-"""`phibench dataset ...`: making, checking and showing data sets, and drawing frames.
-
-`phibench panorama`.
-
-`phibench sensitivities`: what misalignments of the rig do to the estimates of a data set.
-"""
+"""Commands `phibench dataset ...`: make, check and show data sets, and what follows from one without a method."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from cyclopts import App
+from cyclopts import App, Parameter
 
-from phibench.estimator.cli.options import Whole
+from phibench.estimator.cli.options import DATA, DEFAULT_PRESET, Whole
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from phibench.datasets.read import Sample
 
-dataset = App(name="dataset", help="Make, verify, repair, merge and show data sets, and draw camera frames.")
+dataset = App(name="dataset", group=DATA, help="Make, check and show data sets; draw frames and panoramas.")
 
 
 @dataset.command
@@ -85,15 +80,15 @@ def repair(directory: Path, *, workers: Whole | None = None, scheduler: str | No
 
 
 @dataset.command
-def merge(out: Path, *shards: Path) -> int:
+def merge(*shards: Path, out: Path) -> int:
     """Put the shards of a data set together.
 
     Parameters
     ----------
-    out
-        Folder to write.
     shards
         Folders of all shards.
+    out
+        Folder to write.
     """
     from phibench.datasets.merge_repair import merge as merge_shards
     from phibench.estimator.paper.sensitivity_table import keep_sensitivities
@@ -144,10 +139,10 @@ def show(directory: Path, *, out: Path | None = None) -> int:
 def frames(
     directory: Path,
     *,
-    preset: str = "mjpeg",
+    preset: str = DEFAULT_PRESET,
     draws: Whole = 1,
     out: Path | None = None,
-    samples: str | None = None,
+    sample: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
     laser_off: bool = False,
     exposure: str | None = None,
     region: Whole | None = None,
@@ -167,8 +162,8 @@ def frames(
         Draws of every image.
     out
         Folder to write; by default beside the data set, with "-frames" added to its name.
-    samples
-        Sample ids, joined by commas; all by default.
+    sample
+        Ids of samples; all by default.
     laser_off
         Also every image without the spot.
     exposure
@@ -185,14 +180,14 @@ def frames(
 
     seconds = None if exposure is None else exposure_of(exposure)
     request = FrameRequest(preset, seconds, region=region, camera_seed=camera_seed)
-    names = None if samples is None else samples.split(",")
-    done = draw_frames(directory, request, draws, out=out, samples=names, laser_off=laser_off, workers=workers)
+    done = draw_frames(directory, request, draws, out=out, samples=sample or None, laser_off=laser_off, workers=workers)
     for note in done.notes:
         print(f"note: {note}")
     print(f"{done.folder}: {done.made} files written, {done.kept} kept, index frames.jsonl")
     return 0
 
 
+@dataset.command
 def panorama(
     directory: Path,
     *,
@@ -202,7 +197,7 @@ def panorama(
     by: Literal["model", "truth"] = "model",
     width: Whole = 1440,
     elevation_deg: tuple[float, float] = (-60.0, 30.0),
-    preset: str = "layers",
+    preset: str = DEFAULT_PRESET,
     image: Path | None = None,
     distance_m: float | None = None,
 ) -> int:
@@ -228,7 +223,7 @@ def panorama(
     elevation_deg
         Lower and upper edge, degrees above the horizon.
     preset
-        "layers" (noise-free), or the preset of a frame to draw: "srgb8", "mjpeg".
+        "layers" (noise-free), or the preset of a frame to draw: "mjpeg" or "srgb8".
     image
         PNG or JPEG to unroll in place of the sample's frame, taken with the same rig.
     distance_m
@@ -257,6 +252,7 @@ def panorama(
     return 0
 
 
+@dataset.command
 def sensitivities(directory: Path, *, out: Path | None = None) -> int:
     """Write dD/d(parameter) of every sample and estimator as a Parquet table.
 

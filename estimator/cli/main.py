@@ -14,12 +14,13 @@ from collections.abc import Sequence
 from cyclopts import App, CycloptsError
 
 from phibench.datasets.parallel import ONE_THREAD
-from phibench.estimator.cli import methods as cli_methods
 from phibench.estimator.cli.calibration import align, calibrate
-from phibench.estimator.cli.dataset import dataset, panorama, sensitivities
+from phibench.estimator.cli.dataset import dataset
+from phibench.estimator.cli.methods import method
+from phibench.estimator.cli.options import INSTALLATION, METHODS, SENSOR, answer_to_old_spelling
 from phibench.estimator.cli.score import bench, compare, report, score
-from phibench.estimator.cli.score import register as register_sealed
-from phibench.estimator.cli.studies import experiments, study
+from phibench.estimator.cli.seal import seal
+from phibench.estimator.cli.studies import paper, study
 
 app = App(
     name="phibench",
@@ -27,22 +28,18 @@ app = App(
     suppress_keyboard_interrupt=False,
     result_action="return_value",
 )
-app.command(dataset)
-cli_methods.register(app)
-app.command(score)
-app.command(compare)
-app.command(report)
-app.command(bench)
-register_sealed(app, dataset)
-app.command(sensitivities)
-app.command(experiments)
-app.command(calibrate)
-app.command(align)
-app.command(panorama)
-app.command(study)
+for _group in (dataset, method, seal, study):
+    app.command(_group)
+app.command(score, group=METHODS)
+app.command(bench, group=METHODS)
+app.command(compare, group=METHODS)
+app.command(report, group=METHODS)
+app.command(calibrate, group=SENSOR)
+app.command(align, group=SENSOR)
+app.command(paper, group=SENSOR)
 
 
-@app.command
+@app.command(group=INSTALLATION)
 def doctor() -> int:
     """Show Python, packages, LLVM, cores and disk, and render a test image.
 
@@ -54,6 +51,9 @@ def doctor() -> int:
 
 def main(tokens: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
+    if old := answer_to_old_spelling(sys.argv[1:] if tokens is None else tokens):
+        print(f"phibench: {old}", file=sys.stderr)
+        return 2
     for name, value in ONE_THREAD.items():  # of the processes that a command starts, too; who sets one has his way
         os.environ.setdefault(name, value)
     try:

@@ -1,14 +1,13 @@
-"""`phibench methods`, `phibench check` and `phibench new-method`: what there is, what is wrong, and how to begin.
-
-A file to begin with: the example method of `estimator.seat.example`, word for word.
-"""
+"""Commands `phibench method ...`: write a method, check it on easy pairs, list those that there are."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App
+from cyclopts import App, Parameter
+
+from phibench.estimator.cli.options import DEFAULT_PRESET, MEMORY_MB, METHODS, SECONDS, MemoryMb, Seconds, wide_console
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -18,54 +17,55 @@ _TABLE_WIDTH = 120
 _EXAMPLE = Path(__file__).parents[1] / "sandbox" / "example_method.py"
 
 
-def register(app: App) -> None:
-    """Add the commands to an application."""
-    app.command(methods)
-    app.command(check)
-    app.command(new_method, name="new-method")
+method = App(
+    name="method",
+    group=METHODS,
+    help="Write, check and list methods, which find the spot in images.",
+)
 
 
-def methods() -> int:
+@method.command(name="list")
+def list_() -> int:
     """List the methods: built in, optional, and of installed packages."""
-    from rich.console import Console
-
-    console = Console()
-    # as in `score`: a table cut off at the width of a pipe would lose words
-    console = console if console.width >= _TABLE_WIDTH else Console(width=_TABLE_WIDTH)
+    console = wide_console(_TABLE_WIDTH)
     console.print(_table())
     console.print(
-        "your own: a file and a function in it, my_phi.py:extract; `phibench new-method my_phi.py` writes one"
+        "your own: a file and a function in it, my_phi.py:extract; `phibench method new my_phi.py` writes one"
     )
     return 0
 
 
-def check(method: str, *, preset: str = "bayer-raw", seconds: float = 10.0, memory_mb: float = 4096.0) -> int:
+@method.command
+def check(
+    reference: Annotated[str, Parameter(name="--method")],
+    *,
+    preset: str = DEFAULT_PRESET,
+    seconds: Seconds = SECONDS,
+    memory_mb: MemoryMb = MEMORY_MB,
+) -> int:
     """Try a method on ten easy pairs and say what is wrong; exit code 1 if something is.
 
     Parameters
     ----------
-    method
-        File and function, my_phi.py:extract, or a name that `phibench methods` lists.
+    reference
+        File and function, my_phi.py:extract, or a name that `phibench method list` shows.
     preset
-        What the camera delivers: "bayer-raw", "mono-raw", "srgb8" or "mjpeg".
-    seconds
-        Time limit of a pair.
-    memory_mb
-        Memory limit, on top of what the imports take.
+        What the camera delivers: "mjpeg", "srgb8", "bayer-raw" or "mono-raw".
     """
     from phibench.estimator.sandbox.check import check_method
-    from phibench.estimator.sandbox.resolve import Limits
+    from phibench.estimator.sandbox.resolve import RunLimits
 
-    done = check_method(method, preset, Limits(seconds, memory_mb))
+    done = check_method(reference, preset, RunLimits(seconds, memory_mb))
     for note in done.notes:
         print(note)
     for fault in done.faults:
         print(f"wrong: {fault}")
-    print(f"{method}: " + ("nothing wrong on ten easy pairs" if done.ok else f"{len(done.faults)} wrong"))
+    print(f"{reference}: " + ("nothing wrong on ten easy pairs" if done.ok else f"{len(done.faults)} wrong"))
     return 0 if done.ok else 1
 
 
-def new_method(path: Path) -> int:
+@method.command
+def new(path: Path) -> int:
     """Write an example method that works, to begin with.
 
     Parameters
@@ -74,7 +74,7 @@ def new_method(path: Path) -> int:
         Python file to write; one that is there is not touched.
     """
     written = _write_example(path)
-    print(f"{written}: try it with `phibench check {written}:extract`")
+    print(f"{written}: try it with `phibench method check {written}:extract`")
     return 0
 
 

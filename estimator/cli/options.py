@@ -1,15 +1,29 @@
-"""Words of the command line that cyclopts reads otherwise than a user means them."""
+"""Options that mean the same in every command, and the old spellings of commands and options.
+
+`--method` is repeated, `--sample` names one sample by its id, `--samples` is a count, `--out` is the file or folder to
+write. Wherever a method runs, `--seconds` and `--memory-mb` limit it for each pair.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import Parameter, Token
+from cyclopts import Group, Parameter, Token
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+DATA, METHODS, SENSOR, INSTALLATION = (
+    Group.create_ordered(name) for name in ("Data sets", "Methods", "Sensor and paper", "Installation")
+)
+DEFAULT_PRESET = "mjpeg"  # what the C310 delivers; a data set's own presets go before it
+SECONDS = 30.0  # of one pair; the same numbers as in `sandbox.resolve.RunLimits`, whose module is slow to import
+MEMORY_MB = 4096.0
 
 
 def _whole(_kind: object, tokens: Sequence[Token]) -> int:
-    """A whole number as it is written: cyclopts would round 1.5 without a word."""
+    """Convert a whole number as it is written: cyclopts would round 1.5 without a word."""
     try:
         return int(tokens[0].value)
     except ValueError:
@@ -17,3 +31,77 @@ def _whole(_kind: object, tokens: Sequence[Token]) -> int:
 
 
 Whole = Annotated[int, Parameter(converter=_whole)]
+Methods = Annotated[
+    list[str] | None,
+    Parameter(
+        name="--method",
+        negative="",
+        help="A method: a name that `phibench method list` shows, or FILE.py:FUNCTION. May be given several times.",
+    ),
+]
+BuiltIn = Annotated[
+    list[str] | None,
+    Parameter(
+        name="--method",
+        negative="",
+        help="A built-in method, as `phibench method list` shows. May be given several times; all by default.",
+    ),
+]
+Seconds = Annotated[float, Parameter(help="Time limit of a method for one pair, seconds.")]
+MemoryMb = Annotated[
+    float,
+    Parameter(help="Limit of a method's address space on top of what its imports take, 1e6 bytes. Linux only."),
+]
+
+
+def wide_console(width: int) -> Console:
+    """A console at least as wide as a table, which would lose numbers if it were cut off at the width of a pipe."""
+    from rich.console import Console
+
+    console = Console()
+    return console if console.width >= width else Console(width=width)
+
+
+OLD_COMMANDS = {
+    "new-method": "method new",
+    "methods": "method list",
+    "check": "method check",
+    "dataset seal": "seal make",
+    "submit": "seal submit",
+    "unseal": "seal open",
+    "experiments": "paper --misaligned",
+    "panorama": "dataset panorama",
+    "sensitivities": "dataset sensitivities",
+}
+"""New spelling of every command that had another one."""
+
+OLD_OPTIONS = {
+    ("score", "--seed"): "--bootstrap-seed",
+    ("compare", "--seed"): "--bootstrap-seed",
+    ("bench", "--methods"): "--method, once for each method",
+    ("dataset frames", "--samples"): "--sample, once for each id",
+}
+"""New spelling of every option that had another one, by command and option."""
+
+OLD_POSITIONS = {("dataset merge", "--out"): "phibench dataset merge SHARD ... --out FOLDER"}
+"""Whole new spelling of every command in which an option was a position, by command and option."""
+
+
+def answer_to_old_spelling(tokens: Sequence[str]) -> str:
+    """One sentence with the new spelling of a command line; "" if nothing in it is old."""
+    for old, new in OLD_COMMANDS.items():
+        if _begins(tokens, old):
+            return f"`phibench {old}` is now `phibench {new}`; `phibench {new.split(' --')[0]} --help` has its options"
+    given = {token.partition("=")[0] for token in tokens}
+    for (command, option), new in OLD_OPTIONS.items():
+        if _begins(tokens, command) and option in given:
+            return f"`phibench {command} {option}` is now {new}"
+    for (command, option), new in OLD_POSITIONS.items():
+        if _begins(tokens, command) and not given & {option, "--help", "-h"}:
+            return f"`phibench {command}` needs {option}: `{new}`"
+    return ""
+
+
+def _begins(tokens: Sequence[str], command: str) -> bool:
+    words = command.split()
+    return list(tokens[: len(words)]) == words

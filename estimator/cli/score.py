@@ -1,27 +1,21 @@
-"""`phibench score`, `compare`, `report`: methods on pairs, and the depth estimators on the paper's tables.
-
-`phibench bench`: every built-in method on a data set, and one report.
-
-Sealed sets: `phibench dataset seal`, `phibench submit` and `phibench unseal`.
-"""
+"""Commands `phibench score`, `bench`, `compare` and `report`: methods on the pairs of a data set."""
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import Parameter
 
-from phibench.estimator.cli.options import Whole
+from phibench.estimator.cli.options import MEMORY_MB, SECONDS, BuiltIn, MemoryMb, Methods, Seconds, Whole
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from phibench.estimator.benchmark.document import MethodCard, ScoreDocument
-    from phibench.estimator.paper.paper_tables import Score
+    from phibench.estimator.sandbox.resolve import RunLimits
 
 
 _TABLE_WIDTH = 210
@@ -30,24 +24,24 @@ _TABLE_WIDTH = 210
 def score(
     directory: Path,
     *,
-    method: list[str] | None = None,
+    method: Methods = None,
     preset: str | None = None,
     draws: Whole | None = None,
     pairs: Whole | None = None,
     hints: bool = True,
-    seed: Whole = 0,
+    bootstrap_seed: Whole = 0,
     workers: Whole = 1,
     calibration: Path | None = None,
+    seconds: Seconds = SECONDS,
+    memory_mb: MemoryMb = MEMORY_MB,
     out: Path | None = None,
 ) -> int:
-    """Score methods on a data set's pairs; without --method, every depth estimator on the paper's tables.
+    """Score methods on the pairs of a data set.
 
     Parameters
     ----------
     directory
         Folder of a data set.
-    method
-        Method to score: the name of one that is built in, or FILE.py:FUNCTION. May be given several times.
     preset
         Preset of the sensor; by default those of the data set's recipe.
     draws
@@ -56,8 +50,8 @@ def score(
         Only so many pairs.
     hints
         Show the boxes that pairs have; --no-hints leaves the method to search the whole image.
-    seed
-        Of the bootstrap that makes the intervals.
+    bootstrap_seed
+        Seed of the bootstrap that makes the intervals.
     workers
         Pairs that are worked on at a time.
     calibration
@@ -65,13 +59,21 @@ def score(
     out
         JSON file for the score, records beside it as Parquet; with several methods their names are added to it.
     """
-    if method:
-        return _score_methods(directory, method, preset, draws, pairs, hints, seed, workers, calibration, out)
-    _refuse_without_method(preset=preset, draws=draws, pairs=pairs)
-    return _score_estimators(directory, calibration, out)
+    from phibench.datasets.errors import DatasetError
+    from phibench.estimator.sandbox.resolve import RunLimits
+
+    if not method:
+        raise DatasetError(
+            "`phibench score` scores methods: give --method, such as --method red_centroid. "
+            f"The paper's tables are `phibench paper {directory}`"
+        )
+    limits = RunLimits(seconds, memory_mb)
+    return _score_methods(
+        directory, method, preset, draws, pairs, hints, bootstrap_seed, workers, calibration, limits, out
+    )
 
 
-def compare(first: Path, second: Path, *, seed: Whole = 0) -> int:
+def compare(first: Path, second: Path, *, bootstrap_seed: Whole = 0) -> int:
     """Compare two scores of the same pairs, sample by sample.
 
     Parameters
@@ -80,15 +82,15 @@ def compare(first: Path, second: Path, *, seed: Whole = 0) -> int:
         JSON file that `score --method --out` wrote, with its Parquet file beside it.
     second
         Another one, of the same pairs.
-    seed
-        Of the bootstrap that makes the intervals.
+    bootstrap_seed
+        Seed of the bootstrap that makes the intervals.
     """
     from phibench.estimator.benchmark.compare import compare as compare_scores
     from phibench.estimator.benchmark.compare import note_on_code
     from phibench.estimator.benchmark.document import read_score
     from phibench.estimator.benchmark.score_tables import comparison
 
-    differences = compare_scores(first, second, _seed(seed))
+    differences = compare_scores(first, second, _seed(bootstrap_seed))
     a, b = read_score(first), read_score(second)
     console = _console()
     console.print(comparison(differences, _distinct(first, a), _distinct(second, b)))
@@ -132,6 +134,7 @@ def _score_methods(
     seed: int,
     workers: int,
     calibration: Path | None,
+    limits: RunLimits,
     out: Path | None,
 ) -> int:
     from rich.console import Console
@@ -147,7 +150,7 @@ def _score_methods(
     for target in filter(None, files):
         require_writable(target)
     pair_set = wanted_pairs(open_finished(directory), preset, draws, count, hints, calibration)
-    scored = run_and_score(references, pair_set, workers, Console(stderr=True), "pairs", _seed(seed))
+    scored = run_and_score(references, pair_set, workers, Console(stderr=True), "pairs", _seed(seed), limits)
     console, documents = _console(), []
     for one, file in zip(scored, files, strict=True):
         documents.append(one.document if file is None else write_score(file, one.document, one.records))
@@ -184,18 +187,11 @@ def _files(out: Path | None, cards: Sequence[MethodCard]) -> list[Path | None]:
     return [out.with_name(f"{out.stem}-{name}.json") for name in names]
 
 
-def _refuse_without_method(**given: object) -> None:
-    from phibench.datasets.errors import DatasetError
-
-    if wrong := [name for name, value in given.items() if value is not None]:
-        raise DatasetError(f"--{wrong[0]} is for methods: give --method too, or leave --{wrong[0]} out")
-
-
 def _seed(seed: int) -> int:
     from phibench.datasets.errors import DatasetError
 
     if seed < 0:
-        raise DatasetError(f"--seed {seed}: must be 0 or above")
+        raise DatasetError(f"--bootstrap-seed {seed}: must be 0 or above")
     return seed
 
 
@@ -211,47 +207,16 @@ def _console() -> Console:
     return console if console.width >= _TABLE_WIDTH else Console(width=_TABLE_WIDTH)
 
 
-def _score_estimators(directory: Path, calibration: Path | None, out: Path | None) -> int:
-    from phibench.datasets.read import open_finished
-    from phibench.estimator.benchmark.dataset_pairs import of_calibration
-    from phibench.estimator.calibration.file import read_calibration
-    from phibench.estimator.paper.paper_tables import bias_table, table
-    from phibench.estimator.paper.paper_tables import score as score_dataset
-
-    dataset = open_finished(directory)
-    calibrated = None if calibration is None else read_calibration(calibration)
-    scores = score_dataset(dataset if calibrated is None else of_calibration(dataset, calibrated), calibrated)
-    console = _console()
-    for grid in (table(scores, "truth"), table(scores, "frame"), bias_table(scores)):
-        console.print(grid)
-    if out is not None:
-        _write_scores(out, directory, scores)
-    return 0
-
-
-def _write_scores(out: Path, directory: Path, scores: Sequence[Score]) -> None:
-    from phibench.datasets.store.files import write_text
-    from phibench.datasets.store.provenance import provenance
-    from phibench.estimator.paper.paper_tables import as_records, summarise
-
-    document = {
-        "dataset": str(directory),
-        "provenance": provenance(),
-        "unit": "metre; relative errors are fractions of the true depth; null where there is no estimate",
-        "summary": as_records(summarise(scores)),
-        "scores": as_records(scores),
-    }
-    write_text(out, json.dumps(document, indent=1, allow_nan=False) + "\n")
-
-
 def bench(
     directory: Path,
     *,
     out: Path,
-    methods: str | None = None,
+    method: BuiltIn = None,
     pairs: Whole | None = None,
     workers: Whole = 1,
     calibration: Path | None = None,
+    seconds: Seconds = SECONDS,
+    memory_mb: MemoryMb = MEMORY_MB,
 ) -> int:
     """Run the built-in methods on every preset of a data set and write scores and a report.
 
@@ -261,8 +226,6 @@ def bench(
         Folder of a finished data set.
     out
         Folder for the scores and report.html.
-    methods
-        Names of methods, joined by commas; all that are installed by default.
     pairs
         Only the first so many of each preset.
     workers
@@ -272,107 +235,12 @@ def bench(
     """
     from phibench.estimator.benchmark.score import bench as run_bench
     from phibench.estimator.benchmark.score import show
+    from phibench.estimator.sandbox.resolve import RunLimits
 
-    names = None if methods is None else methods.split(",")
-    done = run_bench(directory, out, names, workers, pairs, calibration=calibration)
+    limits = RunLimits(seconds, memory_mb)
+    done = run_bench(directory, out, method, workers, pairs, calibration=calibration, limits=limits)
     for note in done.notes:
         print(f"note: {note}", file=sys.stderr)
     print(f"{done.report}: the report on {len(done.scores)} scores")
     show(done.report)
-    return 0
-
-
-def register(app: App, dataset: App) -> None:
-    """Add the commands to the command line."""
-    dataset.command(seal)
-    app.command(submit)
-    app.command(unseal)
-
-
-def seal(directory: Path, *, out: Path, preset: str | None = None) -> int:
-    """Write the frames of a data set without the truth, and a seal that says by hash which truth it was.
-
-    The truth goes into the data set's folder, as `seal_ID.truth.json`: keep both to yourself until the end.
-
-    Parameters
-    ----------
-    directory
-        Folder of a finished data set whose seed is a secret.
-    out
-        Folder to write and to publish; new or empty.
-    preset
-        One sensor preset, instead of those of the recipe's [frames].
-    """
-    from phibench.estimator.benchmark.sealed_set import seal as seal_dataset
-
-    sealed = seal_dataset(directory, out, preset)
-    for warning in sealed.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
-    print(f"{sealed.public}: {sealed.seal.pairs} pairs, seal {sealed.seal.id}; to be published")
-    print(f"{sealed.truth_file}: the truth; not to be published before `phibench unseal`")
-    return 0
-
-
-def submit(public: Path, *, method: str, out: Path, workers: Whole = 1) -> int:
-    """Run a method on a sealed set and write its answers for who holds the truth.
-
-    Parameters
-    ----------
-    public
-        Folder of the sealed set.
-    method
-        Name of a method, or a file and its function, such as mine.py:extract.
-    out
-        JSON file to write.
-    workers
-        Pairs that are worked on at a time.
-    """
-    from phibench.estimator.benchmark.submission import submit as submit_method
-
-    done = submit_method(public, method, out, workers)
-    print(
-        f"{done.path}: {done.answered} of {done.pairs} pairs answered, {done.positions} of {2 * done.pairs} positions"
-    )
-    if done.silence:
-        print(f"most often without a position: {done.silence}")
-    return 0
-
-
-def unseal(public: Path, *, truth: Path, submission: Path, out: Path | None = None) -> int:
-    """Prove that truth and submission belong to a sealed set, and score the submission.
-
-    Parameters
-    ----------
-    public
-        Folder of the sealed set.
-    truth
-        File that `phibench dataset seal` wrote into the data set's folder.
-    submission
-        File that `phibench submit` wrote.
-    out
-        JSON file for the score.
-    """
-    from rich.console import Console
-
-    from phibench.datasets.errors import DatasetError
-    from phibench.datasets.store.files import require_writable
-    from phibench.estimator.benchmark.answer_errors import Rules
-    from phibench.estimator.benchmark.document import write_score
-    from phibench.estimator.benchmark.score import score_outcomes
-    from phibench.estimator.benchmark.score_tables import cause_table, leaderboard
-    from phibench.estimator.benchmark.submission import unseal as unseal_set
-
-    if out is not None:
-        if out.suffix != ".json":
-            raise DatasetError(f"--out {out}: a score is a JSON file; give a name that ends in .json")
-        require_writable(out)
-    opened = unseal_set(public, truth, submission)
-    print(f"seal {opened.seal.id}: the truth is the sealed one, the submission has each of {opened.seal.pairs} pairs")
-    scored = score_outcomes(opened.submission.method, opened.pairs, opened.outcomes, Rules())
-    document = scored.document if out is None else write_score(out, scored.document, scored.records)
-    console = Console() if Console().width >= _TABLE_WIDTH else Console(width=_TABLE_WIDTH)
-    console.print(leaderboard([document]))
-    console.print(cause_table([document]))
-    if out is not None:
-        print(f"written: {out}")
     return 0

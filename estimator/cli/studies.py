@@ -1,82 +1,112 @@
-"""`phibench study`.
-
-`phibench experiments`: rigs calibrated from their own frames, what they measure, and whether the budget closes.
-"""
+"""Commands `phibench paper` and `phibench study ...`: the tables of the paper, its experiments, and six studies."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import Parameter
+from cyclopts import App, Parameter
 
-from phibench.estimator.cli.options import Whole
+from phibench.estimator.cli.options import DEFAULT_PRESET, SENSOR, Whole, wide_console
 
+if TYPE_CHECKING:
+    from phibench.estimator.paper.paper_tables import Score
 
-def study(
-    name: str,
-    *,
-    out: Path,
-    quick: Annotated[bool, Parameter(negative="")] = False,
-    settings: Path | None = None,
-    data: Path | None = None,
-    workers: Whole | None = None,
-) -> int:
-    """Run a study: its data sets, a table in Parquet, drawings, and findings made from the numbers.
-
-    Parameters
-    ----------
-    name
-        noise, misalignment, baseline, cause, isotropy or stroke.
-    out
-        Folder to write.
-    quick
-        The reduced version, some minutes.
-    settings
-        TOML file in place of the study's own.
-    data
-        Folder of the data sets that it renders or finds there; by default "data" in the folder to write.
-    workers
-        Processes that render; by default one per core.
-    """
-    from phibench.estimator.studies.run import FINDINGS, run_study
-
-    result = run_study(name, out, quick, settings, data, workers)
-    print("\n".join(result.findings))
-    for note in result.notes:
-        print(f"note: {note}")
-    print(f"{out / FINDINGS}: the findings; beside it {len(result.tables)} tables and {len(result.drawings)} drawings")
-    return 0
+_TABLE_WIDTH, _BUDGET_WIDTH = 210, 150
 
 
-def experiments(
+def paper(
     directory: Path,
     *,
-    preset: str = "mjpeg",
-    draws: Whole = 1,
-    laser_off: bool = True,
+    misaligned: Annotated[bool, Parameter(negative="")] = False,
+    calibration: Path | None = None,
+    preset: str | None = None,
+    draws: Whole | None = None,
+    laser_off: bool | None = None,
     rig: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
     out: Path | None = None,
 ) -> int:
-    """Calibrate every rig of a data set from its frames, measure D with it, and compare errors with their prediction.
+    """Print the tables of the paper beside those of every depth estimator; no method runs.
 
-    The data set needs an experiment "calibration", whose spots stand at known distances: the recipe paper-misaligned.
+    With --misaligned every rig is calibrated from its own frames, measures D, and its errors are compared with their
+    prediction. That data set needs an experiment "calibration" with spots at known distances: paper-misaligned.
 
     Parameters
     ----------
     directory
         Folder of a data set.
+    misaligned
+        The misaligned experiments instead of the tables.
+    calibration
+        File of `phibench calibrate`: its rig's samples, with the calibrated rig and stroke. Not with --misaligned.
     preset
-        Preset of the sensor: "mjpeg", "bayer-raw", "srgb8" or "mono-raw".
+        With --misaligned: preset of the sensor, "mjpeg" (default), "bayer-raw", "srgb8" or "mono-raw".
     draws
-        Draws of the noise per sample.
+        With --misaligned: draws of the noise per sample; 1 by default.
     laser_off
-        Take a frame with the laser off beside each; --no-laser-off does without.
+        With --misaligned: also a frame with the laser off beside each (default); --no-laser-off does without.
     rig
-        Ids of rigs; all by default.
+        With --misaligned: ids of rigs; all by default.
     out
-        Parquet file for the rows, one per sample and draw.
+        JSON file for the scores; with --misaligned a Parquet file, one row per sample and draw.
     """
+    if not misaligned:
+        _refuse("is for the misaligned experiments: give --misaligned too", preset, draws, laser_off, rig or None)
+        return _tables(directory, calibration, out)
+    if calibration is not None:
+        from phibench.datasets.errors import DatasetError
+
+        raise DatasetError("--calibration does not go with --misaligned, which calibrates every rig itself")
+    with_off = True if laser_off is None else laser_off
+    return _experiments(directory, preset or DEFAULT_PRESET, 1 if draws is None else draws, with_off, rig, out)
+
+
+def _refuse(why: str, *values: object) -> None:
+    from phibench.datasets.errors import DatasetError
+
+    for name, value in zip(("preset", "draws", "laser-off", "rig"), values, strict=True):
+        if value is not None:
+            raise DatasetError(f"--{name} {why}")
+
+
+def _tables(directory: Path, calibration: Path | None, out: Path | None) -> int:
+    from phibench.datasets.read import open_finished
+    from phibench.estimator.benchmark.dataset_pairs import of_calibration
+    from phibench.estimator.calibration.file import read_calibration
+    from phibench.estimator.paper.paper_tables import bias_table, table
+    from phibench.estimator.paper.paper_tables import score as score_dataset
+
+    dataset = open_finished(directory)
+    calibrated = None if calibration is None else read_calibration(calibration)
+    scores = score_dataset(dataset if calibrated is None else of_calibration(dataset, calibrated), calibrated)
+    console = wide_console(_TABLE_WIDTH)
+    for grid in (table(scores, "truth"), table(scores, "frame"), bias_table(scores)):
+        console.print(grid)
+    if out is not None:
+        _write_scores(out, directory, scores)
+    return 0
+
+
+def _write_scores(out: Path, directory: Path, scores: Sequence[Score]) -> None:
+    from phibench.datasets.store.files import write_text
+    from phibench.datasets.store.provenance import provenance
+    from phibench.estimator.paper.paper_tables import as_records, summarise
+
+    document = {
+        "dataset": str(directory),
+        "provenance": provenance(),
+        "unit": "metre; relative errors are fractions of the true depth; null where there is no estimate",
+        "summary": as_records(summarise(scores)),
+        "scores": as_records(scores),
+    }
+    write_text(out, json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+def _experiments(
+    directory: Path, preset: str, draws: int, laser_off: bool, rig: tuple[str, ...], out: Path | None
+) -> int:
     from phibench.datasets.read import open_finished
     from phibench.datasets.store.files import require_writable
     from phibench.estimator.paper.experiment_bounds import budget_table, write_rows
@@ -88,8 +118,59 @@ def experiments(
     rows = run_experiments(open_finished(directory), procedure, rig or None, lambda name: print(f"{name} is measured"))
     if out is not None:
         write_rows(rows, out)
-    from rich.console import Console
-
-    console = Console(width=150)
-    console.print(budget_table(rows))
+    wide_console(_BUDGET_WIDTH).print(budget_table(rows))
     return 0
+
+
+STUDIES = {
+    "noise": "Error of phi and D against light, distance and stroke, and how near methods come to the bound.",
+    "misalignment": "Error of D that each misalignment of the rig makes, predicted and rendered.",
+    "baseline": "The tables of the paper, with the errors that this camera would make.",
+    "cause": "What makes the error curves that the paper has published.",
+    "isotropy": "Error of D against azimuth, and what panoramas keep.",
+    "stroke": "The stroke that measures a distance best.",
+}
+"""Every study in one sentence; the names are those of `studies.run`."""
+
+study = App(name="study", group=SENSOR, help="Run a study: its data sets, tables in Parquet, drawings, and findings.")
+
+
+def _command(name: str, sentence: str) -> None:
+    def run(
+        *,
+        out: Path,
+        quick: Annotated[bool, Parameter(negative="")] = False,
+        settings: Path | None = None,
+        data: Path | None = None,
+        workers: Whole | None = None,
+    ) -> int:
+        """Run a study.
+
+        Parameters
+        ----------
+        out
+            Folder to write.
+        quick
+            The reduced version, some minutes.
+        settings
+            TOML file in place of the study's own.
+        data
+            Folder of the data sets that it renders or finds there; by default "data" in the folder to write.
+        workers
+            Processes that render; by default one per core.
+        """
+        from phibench.estimator.studies.run import FINDINGS, run_study
+
+        result = run_study(name, out, quick, settings, data, workers)
+        print("\n".join(result.findings))
+        for note in result.notes:
+            print(f"note: {note}")
+        tables, drawings = len(result.tables), len(result.drawings)
+        print(f"{out / FINDINGS}: the findings; beside it {tables} tables and {drawings} drawings")
+        return 0
+
+    study.command(run, name=name, help=sentence)
+
+
+for _name, _sentence in STUDIES.items():
+    _command(_name, _sentence)

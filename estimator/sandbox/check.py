@@ -19,7 +19,7 @@ import numpy as np
 from phibench.estimator.interface import OK, Outcome, Spot
 from phibench.estimator.pair_set import PairTruth, SpotTruth
 from phibench.estimator.sandbox.easy_pairs import EasyPairs
-from phibench.estimator.sandbox.resolve import Limits
+from phibench.estimator.sandbox.resolve import RunLimits
 from phibench.estimator.sandbox.runner import outcomes
 from phibench.scenes.frames import Array
 
@@ -184,7 +184,7 @@ def depth_fault(depths: Sequence[tuple[float, float]]) -> str:
 
 
 PAIRS = 10
-LIMITS = Limits(seconds=10.0)
+LIMITS = RunLimits(seconds=10.0)
 _GIVE_UP = 3  # pairs in a row without an answer in time
 
 
@@ -209,7 +209,7 @@ class Check:
         return not self.faults
 
 
-def check_method(reference: str, preset: str = "bayer-raw", limits: Limits = LIMITS, count: int = PAIRS) -> Check:
+def check_method(reference: str, preset: str = "bayer-raw", limits: RunLimits = LIMITS, count: int = PAIRS) -> Check:
     """Run a method on easy pairs.
 
     Parameters
@@ -217,7 +217,7 @@ def check_method(reference: str, preset: str = "bayer-raw", limits: Limits = LIM
     reference : str
         As for `harness.run_method`.
     preset : "bayer-raw", "mono-raw", "srgb8" or "mjpeg"
-    limits : Limits
+    limits : RunLimits
     count : int
         How many pairs.
 

@@ -1,4 +1,4 @@
-"""A method for phibench; try it with `phibench check my_phi.py:extract`.
+"""A method for phibench; try it with `phibench method check my_phi.py:extract`.
 
 It gets a Pair (two images of one laser spot in a mirror, taken at both ends of a stroke) and returns an Answer. This
 one takes the centroid of what is red; make it better.

@@ -27,7 +27,7 @@ from typing import IO, Any
 from phibench.datasets.parallel import ONE_THREAD
 from phibench.estimator.interface import Outcome, Pair
 from phibench.estimator.sandbox.answers import AnswerError, checked
-from phibench.estimator.sandbox.resolve import Limits, MethodError, Reference
+from phibench.estimator.sandbox.resolve import MethodError, Reference, RunLimits
 from phibench.estimator.sandbox.transport import Channel, ChannelError, MemoryFile, pack
 
 _KEPT_BYTES = 65536
@@ -107,10 +107,10 @@ class MethodProcess:
     Parameters
     ----------
     reference : Reference
-    limits : Limits
+    limits : RunLimits
     """
 
-    def __init__(self, reference: Reference, limits: Limits) -> None:
+    def __init__(self, reference: Reference, limits: RunLimits) -> None:
         self._reference, self._limits = reference, limits
         self._lock, self._closed = threading.Lock(), False
         self._process: _Running | None = None
@@ -188,7 +188,7 @@ class _Running:
         assert self._process.stdout is not None
         self._printed = Printed(self._process.stdout)
 
-    def load(self, reference: Reference, limits: Limits) -> None:
+    def load(self, reference: Reference, limits: RunLimits) -> None:
         """Let the process import the method."""
         order = {"reference": asdict(reference), "memory_bytes": limits.memory_mb * 1e6}
         try:
@@ -207,7 +207,7 @@ class _Running:
         if fault:
             raise MethodError(fault)
 
-    def ask(self, pair: Pair, limits: Limits, file: str) -> Outcome:
+    def ask(self, pair: Pair, limits: RunLimits, file: str) -> Outcome:
         """Answer or failure for one pair."""
         start = time.monotonic()
         try:

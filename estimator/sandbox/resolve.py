@@ -105,7 +105,7 @@ def _of_file(reference: str) -> Reference:
         raise MethodError(f"method '{reference}': say which function is meant, such as {file}:extract")
     path = Path(text).absolute()
     if not path.is_file():
-        advice = f"`phibench new-method {text}` writes an example"
+        advice = f"`phibench method new {text}` writes an example"
         what = "is a folder" if path.is_dir() else "is not there"
         raise MethodError(f"method '{reference}': the file {path} {what}; {advice}")
     _require_python(path)
@@ -130,13 +130,13 @@ def _owner(point: EntryPoint) -> str:
 def _unknown(name: str) -> str:
     known = [*KNOWN, *(point.name for point in installed())]
     guess = close_names(name, known)
-    advice = f"did you mean '{guess[0]}'?" if guess else "`phibench methods` lists what there is."
+    advice = f"did you mean '{guess[0]}'?" if guess else "`phibench method list` lists what there is."
     return f"no method '{name}': {advice} A method of your own is given as file and function, my_phi.py:extract"
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Limits of one method.
+class RunLimits:
+    """RunLimits of one method.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ from types import TracebackType
 from phibench.estimator.interface import Method, Outcome, Pair
 from phibench.estimator.pair_set import PairSet
 from phibench.estimator.sandbox.process import MethodProcess, outcome_of
-from phibench.estimator.sandbox.resolve import Limits, MethodError, Reference, resolve
+from phibench.estimator.sandbox.resolve import MethodError, Reference, RunLimits, resolve
 from phibench.estimator.sandbox.worker import reply_of, require_method
 
 
@@ -29,7 +29,7 @@ class Harness:
     ----------
     methods : sequence of str or Reference
         ``my_phi.py:extract``, a built-in name, or that of an installed package's method.
-    limits : Limits, optional
+    limits : RunLimits, optional
     workers : int
         Pairs that are worked on at a time. One method alone has as many processes, several have one each.
 
@@ -39,11 +39,11 @@ class Harness:
         If a method cannot be found; on entering, if one cannot be imported.
     """
 
-    def __init__(self, methods: Sequence[str | Reference], limits: Limits | None = None, workers: int = 1) -> None:
+    def __init__(self, methods: Sequence[str | Reference], limits: RunLimits | None = None, workers: int = 1) -> None:
         if workers < 1:
             raise MethodError(f"workers = {workers}: must be 1 or more")
         self._references = [resolve(method) if isinstance(method, str) else method for method in methods]
-        self._limits, self._workers = limits or Limits(), workers
+        self._limits, self._workers = limits or RunLimits(), workers
 
     def __enter__(self) -> Harness:
         copies = self._workers if len(self._references) == 1 else 1
@@ -129,7 +129,7 @@ class _Crew:
 
 
 def run_method(
-    reference: str | Reference, pairs: PairSet, limits: Limits | None = None, workers: int = 1
+    reference: str | Reference, pairs: PairSet, limits: RunLimits | None = None, workers: int = 1
 ) -> list[Outcome]:
     """Outcomes of one method on all pairs, in number order; parameters and errors as for `Harness`."""
     return list(outcomes(reference, pairs, limits, workers))
@@ -138,7 +138,7 @@ def run_method(
 def outcomes(
     reference: str | Reference,
     pairs: PairSet,
-    limits: Limits | None = None,
+    limits: RunLimits | None = None,
     workers: int = 1,
     numbers: Sequence[int] | None = None,
 ) -> Iterator[Outcome]:

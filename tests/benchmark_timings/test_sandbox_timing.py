@@ -13,7 +13,7 @@ from helpers.seat_pairs import GOOD, SmallPairs, method_file
 
 from phibench.estimator.interface import Pair
 from phibench.estimator.sandbox.process import MethodProcess
-from phibench.estimator.sandbox.resolve import Limits, resolve
+from phibench.estimator.sandbox.resolve import RunLimits, resolve
 from phibench.estimator.sandbox.transport import Channel, MemoryFile, SharedPages, pack, unpack
 
 
@@ -52,7 +52,7 @@ def test_benchmark_socket(benchmark) -> None:
 @pytest.mark.benchmark(group="the seat")
 def test_benchmark_empty_method_on_full_frames(benchmark, tmp_path: Path) -> None:
     """Target: <= 30 ms a pair."""
-    process = MethodProcess(resolve(method_file(tmp_path, f"return {GOOD.replace('0, 0', '0, 0, 0')}")), Limits())
+    process = MethodProcess(resolve(method_file(tmp_path, f"return {GOOD.replace('0, 0', '0, 0, 0')}")), RunLimits())
     pair = large()
     try:
         assert benchmark(lambda: process.ask(pair)).failure == ""
@@ -63,7 +63,7 @@ def test_benchmark_empty_method_on_full_frames(benchmark, tmp_path: Path) -> Non
 @pytest.mark.benchmark(group="the seat")
 def test_benchmark_restart(benchmark, tmp_path: Path) -> None:
     """What a failure costs besides its pair: a new process. Target: <= 1 s."""
-    process = MethodProcess(resolve(method_file(tmp_path, "1 / 0")), Limits())
+    process = MethodProcess(resolve(method_file(tmp_path, "1 / 0")), RunLimits())
     pair = SmallPairs().pair(0)
     assert benchmark.pedantic(lambda: process.ask(pair), rounds=5).failure == "error"
     process.close()

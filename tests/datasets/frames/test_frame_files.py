@@ -78,7 +78,7 @@ def test_a_rerun_makes_what_is_missing_or_damaged(
     tiny_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "f"
-    options = (tiny_dataset, "--region", 32, "--samples", SEEN, "--out", out, "--draws")
+    options = (tiny_dataset, "--region", 32, "--sample", SEEN, "--out", out, "--draws")
     assert run(*options, 3) == 0
     assert "6 files written, 0 kept" in capsys.readouterr().out
     before = {path.name: path.read_bytes() for path in out.glob("*.*")}
@@ -120,7 +120,7 @@ def test_changed_layers_are_drawn_again(tiny_dataset: Path, tmp_path: Path) -> N
 
 def test_the_default_folder_is_beside_the_data_set(tiny_dataset: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
-    assert run(copy, "--region", 8, "--samples", SEEN) == 0
+    assert run(copy, "--region", 8, "--sample", SEEN) == 0
     assert (tmp_path / "copy-frames" / INDEX).is_file()
     assert damaged(copy) == strays(copy) == []
 
@@ -144,7 +144,7 @@ def test_samples_without_a_place_for_a_region_are_named(
         (["--draws", "0"], "draws = 0: must be an integer, 1 or above"),
         (["--region", "0"], "region = 0: must be an integer, 1 or above"),
         (["--region", "500", "--workers", "1"], "allowed sides are 1 to 180"),
-        (["--samples", "seen"], "no sample 'seen'"),
+        (["--sample", "seen"], "no sample 'seen'"),
         (["--workers", "0"], "workers = 0"),
     ],
 )
@@ -188,7 +188,7 @@ def test_previews_of_parts_keep_the_colours(tiny_dataset: Path, corner: tuple[in
 @pytest.mark.parametrize("preset", ["mono-raw", "bayer-raw"])
 def test_previews_have_the_size_of_their_frames(tiny_dataset: Path, tmp_path: Path, preset: str, side: int) -> None:
     out = tmp_path / "f"
-    request = ("--preset", preset, "--region", side, "--samples", SEEN, "--out", out, "--workers", 1)
+    request = ("--preset", preset, "--region", side, "--sample", SEEN, "--out", out, "--workers", 1)
     assert run(tiny_dataset, *request) == 0
     rows = read_index(out).values()
     assert {row.kind for row in rows} == {"frame", "preview"}
@@ -199,7 +199,7 @@ def test_previews_have_the_size_of_their_frames(tiny_dataset: Path, tmp_path: Pa
 def test_a_folder_is_claimed_before_its_first_frame(tiny_dataset: Path, tmp_path: Path) -> None:
     """After a kill there are files and no index: the folder is still for the first request alone."""
     out = tmp_path / "f"
-    assert run(tiny_dataset, "--samples", SEEN, "--region", 16, "--exposure", 0.01, "--out", out, "--workers", 1) == 0
+    assert run(tiny_dataset, "--sample", SEEN, "--region", 16, "--exposure", 0.01, "--out", out, "--workers", 1) == 0
     (out / INDEX).unlink()
     claimed = (out / REQUEST).read_bytes()
     with pytest.raises(DatasetError, match=r"exposure .*give another folder"):
@@ -209,8 +209,8 @@ def test_a_folder_is_claimed_before_its_first_frame(tiny_dataset: Path, tmp_path
 
 def test_a_refused_request_claims_nothing(tiny_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "f"
-    assert run(tiny_dataset, "--samples", SEEN, "--region", 181, "--out", out, "--workers", 1) == 2
-    assert run(tiny_dataset, "--samples", SEEN, "--region", 16, "--out", out, "--workers", 1) == 0
+    assert run(tiny_dataset, "--sample", SEEN, "--region", 181, "--out", out, "--workers", 1) == 2
+    assert run(tiny_dataset, "--sample", SEEN, "--region", 16, "--out", out, "--workers", 1) == 0
     (tmp_path / "file").write_text("")
     assert run(tiny_dataset, "--out", tmp_path / "file") == 2
 

@@ -60,6 +60,6 @@ def test_a_damaged_table_is_noticed(copy: Path) -> None:
 
 
 def test_a_data_set_without_one_says_how_to_get_it(copy: Path) -> None:
-    with pytest.raises(DatasetError, match=r"has no sensitivities\.parquet; run `phibench sensitivities"):
+    with pytest.raises(DatasetError, match=r"has no sensitivities\.parquet; run `phibench dataset sensitivities"):
         open_finished(copy).sensitivities()
     assert faults(copy) == ()

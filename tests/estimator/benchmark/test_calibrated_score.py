@@ -196,7 +196,7 @@ def test_score_prints_the_general_row(misaligned: Dataset, tmp_path: Path, capsy
     nominal = misaligned.samples[0].nominal_rig
     file = written(tmp_path / "c.json", truth_of_rig(misaligned), nominal)
     out = tmp_path / "s.json"
-    assert run("score", misaligned.folder, "--calibration", file, "--out", out) == 0
+    assert run("paper", misaligned.folder, "--calibration", file, "--out", out) == 0
     printed = capsys.readouterr().out
     assert "general" in printed
     assert "±" in printed
@@ -217,7 +217,7 @@ def test_methods_are_scored_with_a_calibration(misaligned: Dataset, tmp_path: Pa
     assert with_it["pair_set"]["calibration"] == read_calibration(file).sha256
     assert "calibration" not in without["pair_set"]
     assert run("compare", tmp_path / "with.json", tmp_path / "without.json") == 2
-    assert run("bench", misaligned.folder, "--methods", "detect", "--calibration", file, "--out", tmp_path / "b") == 0
+    assert run("bench", misaligned.folder, "--method", "detect", "--calibration", file, "--out", tmp_path / "b") == 0
     assert json.loads((tmp_path / "b" / "mjpeg-detect.json").read_text())["pair_set"]["calibration"]
 
 
@@ -272,14 +272,14 @@ def test_a_file_with_numbers_that_no_calibration_gives(
         read_calibration(file)
 
 
-@pytest.mark.parametrize("command", ["score", "method", "bench"])
+@pytest.mark.parametrize("command", ["paper", "method", "bench"])
 def test_every_command_refuses_a_wrong_file_in_one_sentence(
     misaligned: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture, command: str
 ) -> None:
     more = {
-        "score": ("score", misaligned.folder),
+        "paper": ("paper", misaligned.folder),
         "method": ("score", misaligned.folder, "--method", "detect", "--preset", "mjpeg"),
-        "bench": ("bench", misaligned.folder, "--methods", "detect", "--out", tmp_path / "b"),
+        "bench": ("bench", misaligned.folder, "--method", "detect", "--out", tmp_path / "b"),
     }[command]
     changed_file = written(tmp_path / "c.json", np.zeros(len(PARAMETERS)), misaligned.samples[0].nominal_rig)
     changed_file.write_text(changed_file.read_text().replace('"chi2": 0.0', '"chi2": 1.0'))

@@ -252,10 +252,9 @@ def test_score_with_methods_compare_and_report(bench_dataset, half, tmp_path, ca
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--preset", "mjpeg"], "--preset is for methods"),
-        (["--draws", "2"], "--draws is for methods"),
-        (["--pairs", "2"], "--pairs is for methods"),
-        (["--method", "red_centroid", "--seed", "-1"], "--seed -1: must be 0 or above"),
+        (["--preset", "mjpeg"], "give --method"),
+        (["--method", "red_centroid", "--bootstrap-seed", "-1"], "--bootstrap-seed -1: must be 0 or above"),
+        (["--method", "red_centroid", "--seconds", "0"], "limit seconds = 0.0"),
         (["--method", "red_centroid", "--out", "a.txt"], "ends in .json"),
         (["--method", "red_centroid", "--method", "red_centroid", "--out", "a.json"], "two methods"),
         (["--method", "red_centriod"], "no method 'red_centriod': did you mean 'red_centroid'?"),

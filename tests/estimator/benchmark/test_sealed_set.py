@@ -268,8 +268,8 @@ def test_the_commands_say_what_they_did(
     sealed: Sealed, method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, score = tmp_path / "s.json", tmp_path / "score.json"
-    assert cli.main(["submit", str(sealed.public), "--method", method, "--out", str(out)]) == 0
-    words = ["unseal", str(sealed.public), "--truth", str(sealed.truth_file), "--submission", str(out)]
+    assert cli.main(["seal", "submit", str(sealed.public), "--method", method, "--out", str(out)]) == 0
+    words = ["seal", "open", str(sealed.public), "--truth", str(sealed.truth_file), "--submission", str(out)]
     assert cli.main([*words, "--out", str(score)]) == 0
     said = capsys.readouterr().out
     assert "8 of 9 pairs answered" in said
@@ -284,7 +284,7 @@ def test_seal_on_the_command_line_warns_of_its_seed(
     bench_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     copy = shutil.copytree(bench_dataset, tmp_path / "set")
-    tokens = ["dataset", "seal", str(copy), "--out", str(tmp_path / "public"), "--preset", "mjpeg"]
+    tokens = ["seal", "make", str(copy), "--out", str(tmp_path / "public"), "--preset", "mjpeg"]
     assert cli.main(tokens) == 0
     said = capsys.readouterr()
     assert "warning: seed 0 is short" in said.err

@@ -91,7 +91,7 @@ def test_a_line_that_submit_does_not_write_is_refused(
     sealed: Sealed, submitted: Path, tmp_path: Path, change: dict[str, Any]
 ) -> None:
     forged = tampered(lambda d: d["answers"][0].update(change), submitted, tmp_path / "s.json")
-    assert "is not one that `phibench submit` writes" in refusal(sealed.public, sealed.truth_file, forged)
+    assert "is not one that `phibench seal submit` writes" in refusal(sealed.public, sealed.truth_file, forged)
 
 
 @pytest.mark.parametrize(

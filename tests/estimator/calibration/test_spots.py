@@ -173,7 +173,7 @@ def test_upright_edges_give_the_tilt(smoke: Dataset, tmp_path: Path, capsys: pyt
     """
     plain, upright = tmp_path / "plain.json", tmp_path / "upright.json"
     without = calibrate_dataset(smoke.folder, plain)
-    assert main(["calibrate", str(smoke.folder), "--vertical", "--out", str(upright)]) == 0
+    assert main(["calibrate", str(smoke.folder), "--preset", "layers", "--vertical", "--out", str(upright)]) == 0
     assert "tilt_x_rad" in capsys.readouterr().out
     rig = smoke.samples[0].nominal_rig
     found = read_calibration(upright, rig)

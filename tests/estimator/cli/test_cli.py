@@ -68,7 +68,7 @@ def test_unknown_words_are_2(tokens, capsys):
 
 
 def test_score_of_a_folder_that_is_not_there(tmp_path, capsys):
-    assert cli.main(["score", str(tmp_path / "nothing")]) == 2
+    assert cli.main(["score", str(tmp_path / "nothing"), "--method", "detect"]) == 2
     assert "nothing" in capsys.readouterr().err
 
 
@@ -76,7 +76,7 @@ def test_scores_are_written_to_a_file(monkeypatch, tmp_path, capsys):
     scores = (Score("a", "mine", 2.0, 0.5, "exact", "truth", 2.1, 0.1, 0.05, math.nan, "ok"),)
     monkeypatch.setattr("phibench.datasets.read.open_finished", lambda directory: None)
     monkeypatch.setattr("phibench.estimator.paper.paper_tables.score", lambda dataset, calibration: scores)
-    assert cli.main(["score", "x", "--out", str(tmp_path / "scores.json")]) == 0
+    assert cli.main(["paper", "x", "--out", str(tmp_path / "scores.json")]) == 0
     document = json.loads((tmp_path / "scores.json").read_text())
     assert document["scores"][0]["estimate_m"] == 2.1
     assert document["scores"][0]["published_m"] is None
@@ -107,7 +107,8 @@ from phibench.estimator.cli import main as cli
 cli.main(["--help"])
 heavy = {"numpy", "scipy", "pydantic", "mitsuba"} & set(sys.modules)
 assert not heavy, heavy
-cli.main(["score", "nowhere"])
+cli.main(["score", "nowhere", "--method", "detect"])
+cli.main(["paper", "nowhere"])
 assert not {"mitsuba", "drjit"} & set(sys.modules)
 """
     done = python(code)
@@ -150,7 +151,7 @@ def test_merge_takes_any_number_of_shards(monkeypatch, tmp_path):
     calls = []
     monkeypatch.setattr("phibench.datasets.merge_repair.merge", lambda out, shards: calls.append((out, list(shards))))
     kept = sensitivities_kept(monkeypatch)
-    assert cli.main(["dataset", "merge", str(tmp_path / "o"), str(tmp_path / "a"), str(tmp_path / "b")]) == 0
+    assert cli.main(["dataset", "merge", str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(tmp_path / "o")]) == 0
     assert calls == [(tmp_path / "o", [tmp_path / "a", tmp_path / "b"])]
     assert kept == [tmp_path / "o"]
 

@@ -151,7 +151,7 @@ def test_faces_of_a_solid_look_at_the_axis() -> None:
 def test_command_writes_a_panorama(tiny_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "p.png"
     for by in ("model", "truth"):
-        assert main(["panorama", str(tiny_dataset), "--out", str(out), "--width", "180", "--by", by]) == 0
+        assert main(["dataset", "panorama", str(tiny_dataset), "--out", str(out), "--width", "180", "--by", by]) == 0
         with Image.open(out) as picture:
             assert picture.size == (180, 45)
             assert np.asarray(picture).max() > 0
@@ -167,7 +167,7 @@ def test_command_unrolls_a_picture_file(tiny_dataset: Path, tmp_path: Path) -> N
     Image.fromarray(image).save(tmp_path / "half.png")
     out = tmp_path / "p.png"
     picture = ["--image", str(tmp_path / "half.png"), "--width", "90"]
-    assert main(["panorama", str(tiny_dataset), "--out", str(out), *picture]) == 0
+    assert main(["dataset", "panorama", str(tiny_dataset), "--out", str(out), *picture]) == 0
     with Image.open(out) as found:
         share = float(np.mean(np.asarray(found) == 255))
     assert 0.4 < share < 0.6
@@ -190,7 +190,7 @@ def test_command_unrolls_a_picture_file(tiny_dataset: Path, tmp_path: Path) -> N
 def test_mistakes_end_in_a_sentence(
     tiny_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], words: str
 ) -> None:
-    assert main(["panorama", str(tiny_dataset), "--out", str(tmp_path / "p.png"), *options]) == 2
+    assert main(["dataset", "panorama", str(tiny_dataset), "--out", str(tmp_path / "p.png"), *options]) == 2
     assert words in capsys.readouterr().err
     assert not (tmp_path / "p.png").exists()
 

@@ -328,7 +328,7 @@ def test_accuracy_the_published_budget_is_met(name: str) -> None:
 
 def test_the_table_of_a_data_set(misaligned_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "sensitivities.parquet"
-    assert main(["sensitivities", str(misaligned_dataset), "--out", str(out)]) == 0
+    assert main(["dataset", "sensitivities", str(misaligned_dataset), "--out", str(out)]) == 0
     table, dataset = polars.read_parquet(out), open_finished(misaligned_dataset)
     assert f"{len(dataset)} samples" in capsys.readouterr().out
     assert tuple(table.columns) == columns()
@@ -360,7 +360,7 @@ def test_a_hidden_spot_is_a_row_of_nulls_with_its_cause(misaligned_dataset: Path
 
 
 def test_a_folder_that_is_no_data_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["sensitivities", str(tmp_path), "--out", str(tmp_path / "x.parquet")]) == 2
+    assert main(["dataset", "sensitivities", str(tmp_path), "--out", str(tmp_path / "x.parquet")]) == 2
     assert capsys.readouterr().err.startswith("phibench: ")
     assert not (tmp_path / "x.parquet").exists()
 

@@ -1,4 +1,4 @@
-"""`phibench check`: each mistake that a method can make is made here, and the message must name it."""
+"""`phibench method check`: each mistake that a method can make is made here, and the message must name it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from phibench.estimator.methods.registry import METHODS
 from phibench.estimator.sandbox.answers import AnswerError, answer_text, checked
 from phibench.estimator.sandbox.check import PAIRS, Check, Views, check_method, covariance_fault, judged, position_fault
 from phibench.estimator.sandbox.easy_pairs import EasyPairs
-from phibench.estimator.sandbox.resolve import Limits, MethodError
+from phibench.estimator.sandbox.resolve import MethodError, RunLimits
 from phibench.scenes.random_streams import generator
 
 Change = Callable[[Pair, Spot, str], Spot]
@@ -218,7 +218,7 @@ def test_noise_alone_is_not_taken_for_a_mistake() -> None:
     ],
 )
 def test_failures_name_the_users_own_line(tmp_path: Path, body: str, words: str) -> None:
-    check = check_method(method_file(tmp_path, body), limits=Limits(seconds=2.0), count=2)
+    check = check_method(method_file(tmp_path, body), limits=RunLimits(seconds=2.0), count=2)
     assert len(check.faults) == 1
     assert words in check.faults[0]
     assert check.notes == ("0 of 2 pairs answered",)
@@ -226,16 +226,16 @@ def test_failures_name_the_users_own_line(tmp_path: Path, body: str, words: str)
 
 def test_check_gives_up_on_a_method_that_never_answers(tmp_path: Path) -> None:
     reference = method_file(tmp_path, "while True: pass")
-    check = check_method(reference, limits=Limits(seconds=0.5))
+    check = check_method(reference, limits=RunLimits(seconds=0.5))
     assert check.faults[0].startswith("3 of 3 pairs: too slow")
 
 
 @pytest.mark.parametrize("preset", ["bayer-raw", "mono-raw", "srgb8", pytest.param("mjpeg", marks=pytest.mark.slow)])
 def test_the_written_example_passes(tmp_path: Path, monkeypatch, capsys, preset: str) -> None:
     monkeypatch.chdir(tmp_path)
-    assert cli.main(["new-method", "mine.py"]) == 0
-    assert "phibench check mine.py:extract" in capsys.readouterr().out
-    assert cli.main(["check", "mine.py:extract", "--preset", preset]) == 0
+    assert cli.main(["method", "new", "mine.py"]) == 0
+    assert "phibench method check mine.py:extract" in capsys.readouterr().out
+    assert cli.main(["method", "check", "mine.py:extract", "--preset", preset]) == 0
     out = capsys.readouterr().out
     assert "10 of 10 pairs answered" in out
     assert "nothing wrong" in out
@@ -244,31 +244,31 @@ def test_the_written_example_passes(tmp_path: Path, monkeypatch, capsys, preset:
 
 def test_check_exits_with_1_and_says_what_is_wrong(tmp_path: Path, capsys) -> None:
     reference = method_file(tmp_path, "return 5", header=HEADER)
-    assert cli.main(["check", reference]) == 1
+    assert cli.main(["method", "check", reference]) == 1
     assert "wrong: 10 of 10 pairs: the answer is none: the method returned an int" in capsys.readouterr().out
 
 
 def test_new_method_overwrites_nothing(tmp_path: Path, capsys) -> None:
     (tmp_path / "mine.py").write_text("precious")
-    assert cli.main(["new-method", str(tmp_path / "mine.py")]) == 2
+    assert cli.main(["method", "new", str(tmp_path / "mine.py")]) == 2
     assert "is there already and is not overwritten" in capsys.readouterr().err
     assert (tmp_path / "mine.py").read_text() == "precious"
-    assert cli.main(["new-method", str(tmp_path / "mine.txt")]) == 2
+    assert cli.main(["method", "new", str(tmp_path / "mine.txt")]) == 2
     assert "must end in .py" in capsys.readouterr().err
 
 
 def test_mistakes_of_the_command_line_are_2(capsys) -> None:
-    assert cli.main(["check", "nowhere.py:extract"]) == 2
+    assert cli.main(["method", "check", "nowhere.py:extract"]) == 2
     assert "is not there" in capsys.readouterr().err
-    assert cli.main(["check", "red_centroid", "--preset", "bayer"]) == 2
+    assert cli.main(["method", "check", "red_centroid", "--preset", "bayer"]) == 2
     assert "did you mean 'bayer-raw'" in capsys.readouterr().err
-    assert cli.main(["check", "red_centroid", "--seconds", "0"]) == 2
+    assert cli.main(["method", "check", "red_centroid", "--seconds", "0"]) == 2
     assert "limit seconds = 0.0" in capsys.readouterr().err
 
 
 def test_methods_lists_all_and_what_is_not_installed(monkeypatch, capsys) -> None:
     monkeypatch.setattr("phibench.estimator.methods.registry.find_spec", lambda name: None)
-    assert cli.main(["methods"]) == 0
+    assert cli.main(["method", "list"]) == 0
     out = capsys.readouterr().out
     for name in ("brightest_pixel", "raw_maximum_likelihood", "photutils: not installed", "off frames", "my_phi.py"):
         assert name in out

@@ -20,11 +20,11 @@ from phibench.estimator.interface import FAILURES, Answer, Outcome, Pair, Spot
 from phibench.estimator.pair_set import PairTruth, SpotTruth
 from phibench.estimator.sandbox.answers import AnswerError, answer_text, checked
 from phibench.estimator.sandbox.process import environment
-from phibench.estimator.sandbox.resolve import Limits, MethodError
+from phibench.estimator.sandbox.resolve import MethodError, RunLimits
 from phibench.estimator.sandbox.runner import outcomes, run_method
 from phibench.estimator.sandbox.transport import MemoryFile, SharedPages, pack, unpack
 
-LIMITS = Limits(seconds=3.0, memory_mb=1000.0)
+LIMITS = RunLimits(seconds=3.0, memory_mb=1000.0)
 
 # what the method does to each pair by its number; every second pair is answered, so that each failure is survived
 MISDEEDS = {
@@ -115,7 +115,7 @@ def test_what_a_method_starts_dies_with_it(tmp_path: Path) -> None:
     mark = tmp_path / "alive"
     grandchild = f"import time, pathlib\nwhile True:\n    pathlib.Path({str(mark)!r}).touch()\n    time.sleep(0.05)"
     body = f"import subprocess, sys\nsubprocess.run([sys.executable, '-c', {grandchild!r}])"
-    (outcome,) = run_method(method_file(tmp_path, body), SmallPairs(1), Limits(seconds=3.0))
+    (outcome,) = run_method(method_file(tmp_path, body), SmallPairs(1), RunLimits(seconds=3.0))
     assert outcome.failure == "timeout"
     assert mark.exists()  # it did run
     mark.unlink()
@@ -293,7 +293,7 @@ def test_a_kept_image_does_not_change_under_the_method(tmp_path: Path) -> None:
 @pytest.mark.parametrize("bad", [{"seconds": 0.0}, {"memory_mb": -1.0}, {"start_seconds": math.nan}])
 def test_limits_that_cannot_be(bad: dict[str, float]) -> None:
     with pytest.raises(MethodError, match="must be a finite number above 0"):
-        Limits(**bad)
+        RunLimits(**bad)
     with pytest.raises(MethodError, match="workers = 0"):
         outcomes("red_centroid", SmallPairs(1), workers=0)
 
@@ -301,7 +301,7 @@ def test_limits_that_cannot_be(bad: dict[str, float]) -> None:
 def test_an_import_that_hangs_or_dies_is_said_before_the_first_pair(tmp_path: Path) -> None:
     hang = method_file(tmp_path, f"return {GOOD}", header="import time\ntime.sleep(60)\n")
     with pytest.raises(MethodError, match=r"not imported after 3 s, at my_phi\.py, line 2"):
-        run_method(hang, SmallPairs(1), Limits(start_seconds=3.0))
+        run_method(hang, SmallPairs(1), RunLimits(start_seconds=3.0))
     dead = method_file(tmp_path, f"return {GOOD}", header="import os\nprint('farewell', flush=True)\nos._exit(4)\n")
     with pytest.raises(MethodError, match=r"exit code 4.*last words: farewell"):
         run_method(dead, SmallPairs(1), LIMITS)

@@ -66,12 +66,12 @@ def test_a_file_may_import_its_neighbour_and_define_a_dataclass(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("my_fi.py:extract", "my_fi.py is not there; `phibench new-method my_fi.py` writes an example"),
+        ("my_fi.py:extract", "my_fi.py is not there; `phibench method new my_fi.py` writes an example"),
         ("my_phi.py", "say which function is meant, such as my_phi.py:extract"),
         ("my_phi.py:", "say which function is meant, such as my_phi.py:extract"),
         ("folder.py:extract", "folder.py is a folder"),
         ("red_centriod", "no method 'red_centriod': did you mean 'red_centroid'?"),
-        ("zzz", "no method 'zzz': `phibench methods` lists what there is"),
+        ("zzz", "no method 'zzz': `phibench method list` lists what there is"),
         ("", "no method ''"),
     ],
 )

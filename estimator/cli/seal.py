@@ -1,0 +1,117 @@
+"""Commands `phibench seal ...`: publish frames without their truth, answer them, and open the seal."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from cyclopts import App
+
+from phibench.estimator.cli.options import MEMORY_MB, METHODS, SECONDS, MemoryMb, Seconds, Whole, wide_console
+
+_TABLE_WIDTH = 210
+
+seal = App(
+    name="seal",
+    group=METHODS,
+    help="Seal a data set, answer a sealed one, and score the answers.",
+)
+
+
+@seal.command
+def make(directory: Path, *, out: Path, preset: str | None = None) -> int:
+    """Write the frames of a data set without the truth, and a seal that says by hash which truth it was.
+
+    The truth goes into the data set's folder, as `seal_ID.truth.json`: keep both to yourself until the end.
+
+    Parameters
+    ----------
+    directory
+        Folder of a finished data set whose seed is a secret.
+    out
+        Folder to write and to publish; new or empty.
+    preset
+        One sensor preset, instead of those of the recipe's [frames].
+    """
+    from phibench.estimator.benchmark.sealed_set import seal as seal_dataset
+
+    sealed = seal_dataset(directory, out, preset)
+    for warning in sealed.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    print(f"{sealed.public}: {sealed.seal.pairs} pairs, seal {sealed.seal.id}; to be published")
+    print(f"{sealed.truth_file}: the truth; not to be published before `phibench seal open`")
+    return 0
+
+
+@seal.command
+def submit(
+    public: Path,
+    *,
+    method: str,
+    out: Path,
+    workers: Whole = 1,
+    seconds: Seconds = SECONDS,
+    memory_mb: MemoryMb = MEMORY_MB,
+) -> int:
+    """Run a method on a sealed set and write its answers for who holds the truth.
+
+    Parameters
+    ----------
+    public
+        Folder of the sealed set.
+    method
+        A method: a name that `phibench method list` shows, or FILE.py:FUNCTION.
+    out
+        JSON file to write.
+    workers
+        Pairs that are worked on at a time.
+    """
+    from phibench.estimator.benchmark.submission import submit as submit_method
+    from phibench.estimator.sandbox.resolve import RunLimits
+
+    done = submit_method(public, method, out, workers, RunLimits(seconds, memory_mb))
+    print(
+        f"{done.path}: {done.answered} of {done.pairs} pairs answered, {done.positions} of {2 * done.pairs} positions"
+    )
+    if done.silence:
+        print(f"most often without a position: {done.silence}")
+    return 0
+
+
+@seal.command(name="open")
+def open_(public: Path, *, truth: Path, submission: Path, out: Path | None = None) -> int:
+    """Prove that truth and submission belong to a sealed set, and score the submission.
+
+    Parameters
+    ----------
+    public
+        Folder of the sealed set.
+    truth
+        File that `phibench seal make` wrote into the data set's folder.
+    submission
+        File that `phibench seal submit` wrote.
+    out
+        JSON file for the score.
+    """
+    from phibench.datasets.errors import DatasetError
+    from phibench.datasets.store.files import require_writable
+    from phibench.estimator.benchmark.answer_errors import Rules
+    from phibench.estimator.benchmark.document import write_score
+    from phibench.estimator.benchmark.score import score_outcomes
+    from phibench.estimator.benchmark.score_tables import cause_table, leaderboard
+    from phibench.estimator.benchmark.submission import unseal as unseal_set
+
+    if out is not None:
+        if out.suffix != ".json":
+            raise DatasetError(f"--out {out}: a score is a JSON file; give a name that ends in .json")
+        require_writable(out)
+    opened = unseal_set(public, truth, submission)
+    print(f"seal {opened.seal.id}: the truth is the sealed one, the submission has each of {opened.seal.pairs} pairs")
+    scored = score_outcomes(opened.submission.method, opened.pairs, opened.outcomes, Rules())
+    document = scored.document if out is None else write_score(out, scored.document, scored.records)
+    console = wide_console(_TABLE_WIDTH)
+    console.print(leaderboard([document]))
+    console.print(cause_table([document]))
+    if out is not None:
+        print(f"written: {out}")
+    return 0
