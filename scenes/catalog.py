@@ -16,7 +16,7 @@ from phibench.scenes.validation import finite, positive
 X_LOW, X_HIGH, Y_LOW, Y_HIGH, HEIGHT = -4.8, 5.2, -4.6, 4.4, 3.0
 BOARD_THICKNESS_M = 0.02
 BOARD_SIZE_M = (0.40, 0.30)  # width, height
-_LAMP_RADIANCE = (3.6, 3.2, 2.4)  # W/m^2/sr per band: about 300 lx on the floor, warm white
+_LAMP_RADIANCE = (3.6, 3.2, 2.4)  # W/m^2/sr per band: on the floor about 300 lx directly, warm white
 
 
 @dataclass(frozen=True)

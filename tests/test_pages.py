@@ -23,7 +23,6 @@ NOT_YET = {
     "CONTRIBUTING.md",
     "README.md",
     "docs/measurements.md",
-    "docs/model.md",
     "datasets/FORMAT.md",
     "datasets/RECIPE.md",
     "docs/benchmark.md",
