@@ -1,13 +1,12 @@
-"""The exact answer for one pair, with what a score sorts by. Never shown to a method.
+"""Sets of pairs to score on: two protocols, `Pairs` and `Truths`, the types of a truth, and one cache.
 
-A set of pairs to score on, wherever it comes from.
-
-Pairs that are drawn once and held while everything that looks at them does so.
+A truth is never shown to a method. Positions are pixels (u, v), integers at pixel centres; NaN where there is none.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Protocol
 
 from phibench.estimator.interface import Pair
@@ -17,7 +16,7 @@ from phibench.scenes.rig import Rig
 
 @dataclass(frozen=True)
 class Distraction:
-    """Another light that a method may take for the spot, in one image."""
+    """Another light in one image, which a method may take for the spot."""
 
     kind: str
     uv_px: tuple[float, float]
@@ -26,7 +25,7 @@ class Distraction:
 
 @dataclass(frozen=True)
 class SpotTruth:
-    """One image of a pair.
+    """Exact answer for one image of a pair.
 
     Attributes
     ----------
@@ -35,19 +34,19 @@ class SpotTruth:
     azimuth_rad : float
     visible : bool
     cause : str
-        Why not: as in the manifest; "none" if visible.
+        Reason why it is not visible, as in the manifest; "none" if it is.
     electrons : float
         Expected electrons of the whole spot behind the red filter (all filters of a mono sensor) in this exposure.
     peak_e : float
         Largest expected electrons of a pixel, room included.
     snr : float
-        Flux over its standard deviation at the limit of this image, after all processing; position known, the room's
-        levels not: "so many sigma".
+        Flux over its standard deviation at the bound of this image, after all processing. The position counts as known,
+        the room's levels do not.
     saturated : bool
-        Whether a pixel of the spot is expected above the sensor's saturation.
+        A pixel of the spot is expected above the sensor's saturation.
     bound_px2 : array, shape (2, 2), or None
-        Cramer-Rao bound of (u, v) from this image: `estimator.limits` for raw outputs, `estimator.chain_limit` for
-        processed ones; None where there is none.
+        Cramer-Rao bound of (u, v) from this image: `limits.position_bound` for raw outputs, `limits.processed_bound`
+        for processed ones; None where there is none.
     raw_bound_px2 : array, shape (2, 2), or None
         Bound of the raw pixels behind this image, whatever the output.
     distractions : tuple of Distraction
@@ -69,7 +68,7 @@ class SpotTruth:
 
 @dataclass(frozen=True)
 class PairTruth:
-    """One pair.
+    """Exact answer for one pair, with what a score sorts by.
 
     Attributes
     ----------
@@ -81,7 +80,7 @@ class PairTruth:
     jpeg_quality : int or None
         None unless the output is MJPEG.
     hinted : bool
-        Whether the method got boxes.
+        The method got search boxes.
     depth_m, stroke_m : float
     true_rig, nominal_rig : Rig
         The rig that was rendered, and the one in `Pair.rig`.
@@ -108,17 +107,21 @@ class PairTruth:
     calibration_covariance: Array | None = None
 
 
-class PairSet(Protocol):
-    """Pairs by number, 0 to len - 1; each is drawn or read when it is asked for."""
+class Pairs(Protocol):
+    """What methods see, by number from 0 to len - 1; each pair is drawn or read when it is asked for."""
 
     def __len__(self) -> int:
-        """How many."""
+        """Return the number of pairs."""
 
     def pair(self, number: int) -> Pair:
-        """What a method sees."""
+        """Images of a pair, with what a user knows of the rig."""
+
+
+class Truths(Protocol):
+    """Exact answers, by the same numbers."""
 
     def truth(self, number: int) -> PairTruth:
-        """The exact answer.
+        """Exact answer for a pair.
 
         Raises
         ------
@@ -126,12 +129,16 @@ class PairSet(Protocol):
             If the set is sealed.
         """
 
+
+class PairSet(Pairs, Truths, Protocol):
+    """Pairs with their truth: what a score needs."""
+
     def document(self) -> dict[str, Any]:
-        """Provenance: name, task version, hashes, seeds, as JSON can hold it."""
+        """Provenance as JSON can hold it: name, task version, hashes, seeds."""
 
 
-class HeldPairs:
-    """A part of a pair set in memory; make another for the next part.
+class CachedPairs:
+    """Pairs and truths of another set, each asked for once and kept; make a new one for the next part of a set.
 
     Parameters
     ----------
@@ -140,23 +147,11 @@ class HeldPairs:
 
     def __init__(self, pairs: PairSet) -> None:
         self._pairs = pairs
-        self._images: dict[int, Pair] = {}
-        self._truths: dict[int, PairTruth] = {}
+        self.pair = cache(pairs.pair)
+        self.truth = cache(pairs.truth)
 
     def __len__(self) -> int:
         return len(self._pairs)
-
-    def pair(self, number: int) -> Pair:
-        """What a method sees."""
-        if number not in self._images:
-            self._images[number] = self._pairs.pair(number)
-        return self._images[number]
-
-    def truth(self, number: int) -> PairTruth:
-        """The exact answer."""
-        if number not in self._truths:
-            self._truths[number] = self._pairs.truth(number)
-        return self._truths[number]
 
     def document(self) -> dict[str, Any]:
         """Provenance of the set."""

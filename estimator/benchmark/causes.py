@@ -28,7 +28,7 @@ So a crash on an image without a spot counts as ``occluded``; how often the meth
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -38,7 +38,7 @@ import polars as pl
 
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.interface import FAILURES, Pair
-from phibench.estimator.pair_set import PairTruth, SpotTruth
+from phibench.estimator.pair_set import PairSet, PairTruth, SpotTruth
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
@@ -96,22 +96,20 @@ def cause_of(case: Case) -> str:
     return next((name for name, holds in _RULES.items() if holds(case)), case.failure or "method")
 
 
-def with_causes(
-    records: pl.DataFrame, truths: Mapping[int, PairTruth], draw: Callable[[int], Pair], rules: Rules
-) -> pl.DataFrame:
+def with_causes(records: pl.DataFrame, pairs: PairSet, rules: Rules) -> pl.DataFrame:
     """Records with `kind` and `cause`, both null where the spot was detected.
 
     Parameters
     ----------
-    records : as of `bench.records`
-    truths : by number
-    draw : gives a pair's images; asked only where a rule looks at them
+    records : as of `records.records`
+    pairs : PairSet
+        Images are asked for only where a rule looks at them, those of a pair twice at most: give `CachedPairs`.
     rules : Rules
     """
-    causes, kinds, held = [], [], _Held(draw)
+    causes, kinds = [], []
     for row in records.iter_rows(named=True):
         found = row["detected"]
-        causes.append(None if found else cause_of(_case(row, truths[row["number"]], rules, held)))
+        causes.append(None if found else cause_of(_case(row, pairs, rules)))
         kinds.append(None if found else _kind(row))
     return records.with_columns(pl.Series("kind", kinds, pl.String), pl.Series("cause", causes, pl.String))
 
@@ -129,23 +127,9 @@ def count_failures(records: pl.DataFrame) -> dict[str, int]:
     return {name: numbers[name] for name in FAILURES}
 
 
-@dataclass
-class _Held:
-    """The pair drawn last: both images of a pair follow each other."""
-
-    draw: Callable[[int], Pair]
-    number: int = -1
-    pair: Pair | None = None
-
-    def __call__(self, number: int) -> Pair:
-        if self.pair is None or number != self.number:
-            self.number, self.pair = number, self.draw(number)
-        return self.pair
-
-
-def _case(row: dict[str, Any], truth: PairTruth, rules: Rules, draw: Callable[[int], Pair]) -> Case:
+def _case(row: dict[str, Any], pairs: PairSet, rules: Rules) -> Case:
     answer = None if row["u_px"] is None else np.array([row["u_px"], row["v_px"]])
-    return Case(row["image"], truth, answer, row["failure"], draw, rules)
+    return Case(row["image"], pairs.truth(row["number"]), answer, row["failure"], pairs.pair, rules)
 
 
 def _kind(row: dict[str, Any]) -> str:

@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import polars as pl
 from pydantic import Field, ValidationError, model_validator
@@ -90,8 +90,27 @@ class MethodCard(Document):
         return {**fields, "name": fields["reference"].rsplit("/", 1)[-1]} if known else fields
 
 
+class EncodedPicture(Document):
+    """Part of a frame as a picture: (u, v) lies at ((u - first_u + 0.5) / step, ...) from its upper left corner."""
+
+    kind: Literal["png", "jpeg"]
+    first_px: Annotated[tuple[int, int], Field(strict=False)]
+    step_px: int = Field(description="pixels of the frame along a side of one of the picture")
+    size: Annotated[tuple[int, int], Field(strict=False)]
+    base64: str
+
+    def place(self, uv_px: tuple[float, float]) -> tuple[float, float]:
+        """Position in the picture, from its upper left corner."""
+        u, v = ((x - first + 0.5) / self.step_px for x, first in zip(uv_px, self.first_px, strict=True))
+        return u, v
+
+    def holds(self, uv_px: tuple[float, float]) -> bool:
+        """Whether a position of the frame lies in the picture."""
+        return all(0.0 <= x <= size for x, size in zip(self.place(uv_px), self.size, strict=True))
+
+
 class Worst(Document):
-    """One of the worst images."""
+    """One of the worst images; positions are those of the whole frame."""
 
     number: int
     sample_id: str
@@ -101,10 +120,10 @@ class Worst(Document):
     distance_px: float | None
     status: str
     cause: str | None
-    true_in_crop_px: tuple[float, float] = Field(strict=False, description="pixel centres are integers")
-    answer_in_crop_px: tuple[float, float] | None = Field(strict=False)
-    size_px: tuple[int, int] = Field(strict=False, description="width, height")
-    png_base64: str | None
+    true_px: Annotated[tuple[float, float], Field(strict=False)]
+    answer_px: Annotated[tuple[float, float] | None, Field(strict=False)]
+    crop: EncodedPicture | None = Field(description="around the spot, stretched to its own range")
+    frame: EncodedPicture | None = Field(description="the whole; of the first ones only")
 
 
 class ScoreDocument(Document):

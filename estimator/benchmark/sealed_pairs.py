@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import io
+from collections.abc import Sequence
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +48,7 @@ class SealedPairs:
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._seal, self._listed = folder, read_seal(folder), read_sums(folder)
+        self._truths: tuple[PairTruth, ...] | None = None
         for name in (SEAL, PAIRS):
             self._read(name)
         self._rows = read_pairs(folder)
@@ -80,9 +83,23 @@ class SealedPairs:
             beam=None if row.beam is None else from_json(Beam, row.beam),
         )
 
+    def with_truths(self, truths: Sequence[PairTruth]) -> SealedPairs:
+        """The same set with the truths of all its pairs, by number."""
+        opened = copy(self)
+        opened._truths = tuple(truths)
+        return opened
+
     def truth(self, number: int) -> PairTruth:
-        """Refuse: nobody who has this folder has the truth."""
+        """Exact answer for a pair, once the set is unsealed.
+
+        Raises
+        ------
+        DatasetError
+            If it is sealed: nobody who has only this folder has the truth.
+        """
         self._row(number)
+        if self._truths is not None:
+            return self._truths[number]
         raise DatasetError(
             f"{self._folder} is sealed, the truth of pair {number} is not in it; send a submission to who sealed it"
         )

@@ -22,8 +22,7 @@ from phibench.datasets.store.schema import Document, Number, Vector2
 from phibench.estimator.benchmark.document import MethodCard
 from phibench.estimator.benchmark.sealed_pairs import SealedPairs
 from phibench.estimator.benchmark.sealed_set import Seal, read_truth_file
-from phibench.estimator.interface import FAILURES, Outcome, Pair, Spot
-from phibench.estimator.pair_set import PairTruth
+from phibench.estimator.interface import FAILURES, Outcome, Spot
 from phibench.estimator.sandbox.answers import AnswerError, checked
 from phibench.estimator.sandbox.resolve import Reference, RunLimits, resolve
 from phibench.estimator.sandbox.runner import run_method
@@ -243,36 +242,8 @@ class Unsealed:
 
     seal: Seal
     submission: Submission
-    pairs: UnsealedPairs
+    pairs: SealedPairs
     outcomes: tuple[Outcome, ...]
-
-
-class UnsealedPairs:
-    """A sealed set with its truth.
-
-    Parameters
-    ----------
-    pairs : SealedPairs
-    truths : tuple of PairTruth, by number
-    """
-
-    def __init__(self, pairs: SealedPairs, truths: tuple[PairTruth, ...]) -> None:
-        self._pairs, self._truths = pairs, truths
-
-    def __len__(self) -> int:
-        return len(self._pairs)
-
-    def pair(self, number: int) -> Pair:
-        """What a method saw."""
-        return self._pairs.pair(number)
-
-    def truth(self, number: int) -> PairTruth:
-        """The exact answer."""
-        return self._truths[number]
-
-    def document(self) -> dict[str, Any]:
-        """Provenance of the set."""
-        return self._pairs.document()
 
 
 def unseal(public: str | Path, truth: str | Path, submission: str | Path) -> Unsealed:
@@ -297,4 +268,4 @@ def unseal(public: str | Path, truth: str | Path, submission: str | Path) -> Uns
         raise DatasetError(f"{truth} does not hold the truth of each pair once; seal the data set again")
     document = read_submission(Path(submission))
     check_complete(document, pairs.seal, str(submission))
-    return Unsealed(pairs.seal, document, UnsealedPairs(pairs, tuple(truths)), tuple(outcomes_of(document)))
+    return Unsealed(pairs.seal, document, pairs.with_truths(truths), tuple(outcomes_of(document)))

@@ -25,9 +25,9 @@ from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.store.files import write_bytes
 from phibench.estimator.benchmark.answer_errors import Rules
+from phibench.estimator.benchmark.dataset_pairs import spot_bounds as bounds_of_spot
 from phibench.estimator.benchmark.intervals import Clusters, Estimate, estimates, rate, rms_of, rms_ratio_of
 from phibench.estimator.benchmark.score_tables import one_line
-from phibench.estimator.benchmark.spot_bounds import spot_bounds as bounds_of_spot
 from phibench.estimator.draw_pairs import pairs_of
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.scenes.frames import Array

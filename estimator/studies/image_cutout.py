@@ -13,7 +13,7 @@ import numpy as np
 
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.frames.source import Side
-from phibench.estimator.benchmark.spot_bounds import SpotBounds, spot_bounds
+from phibench.estimator.benchmark.dataset_pairs import SpotBounds, spot_bounds
 from phibench.estimator.interface import Box, Image, Pair
 from phibench.estimator.pair_set import PairTruth
 from phibench.estimator.pair_set import SpotTruth as Answer

@@ -13,7 +13,7 @@ from phibench.estimator.benchmark.answer_errors import MATCH_PX, Rules
 from phibench.estimator.benchmark.causes import CAUSES, KINDS, Case, cause_of, count, count_failures, with_causes
 from phibench.estimator.benchmark.records import record_table
 from phibench.estimator.interface import FAILURES, Answer, Outcome, Pair, Spot
-from phibench.estimator.pair_set import Distraction
+from phibench.estimator.pair_set import CachedPairs, Distraction
 
 RULES = Rules()
 TRUTH = cases(20).truths[0]
@@ -148,7 +148,7 @@ def test_every_image_that_is_not_detected_has_one_cause():
     answers[5] = Outcome(5, constant(truths[5]), 0.1)
     answers[0] = Outcome(0, Answer(Spot((600.0, 300.0)), Spot(truths[0].up.uv_px)), 0.1)
     pairs = Cases(tuple(truths))
-    table = with_causes(record_table(truths, answers, RULES), dict(enumerate(truths)), pairs.pair, RULES)
+    table = with_causes(record_table(truths, answers, RULES), pairs, RULES)
     assert table["cause"].is_null().to_list() == table["detected"].to_list() == table["kind"].is_null().to_list()
     down = table.filter(image="down")
     assert down["cause"].to_list()[:6] == ["occluded", "saturated", "below_noise", "timeout", None, "method"]
@@ -163,7 +163,7 @@ def test_every_image_that_is_not_detected_has_one_cause():
 def test_a_hidden_spot_that_is_not_answered_is_no_fault():
     truth = change(TRUTH, "down", visible=False, cause="occluded:table")
     table = record_table([truth], [Outcome(0, silent(truth), 0.1)], RULES)
-    table = with_causes(table, {0: truth}, Cases((truth,)).pair, RULES)
+    table = with_causes(table, Cases((truth,)), RULES)
     assert table["kind"].to_list() == ["unseen", "missed"]
     assert set(table["kind"]) <= set(KINDS)
 
@@ -171,12 +171,13 @@ def test_a_hidden_spot_that_is_not_answered_is_no_fault():
 def test_images_are_drawn_only_where_a_rule_looks_at_them():
     asked = []
 
-    def draw(number):
-        asked.append(number)
-        return pairs.pair(number)
+    class Watched(Cases):
+        def pair(self, number):
+            asked.append(number)
+            return super().pair(number)
 
     pairs = cases(20)
-    truths = dict(enumerate(pairs.truths))
     for oracle, times in ((truth_itself, 0), (constant, 20)):  # down and up of a pair are drawn together
-        with_causes(record_table(pairs.truths, outcomes(pairs, oracle), RULES), truths, draw, RULES)
+        held = CachedPairs(Watched(pairs.truths))
+        with_causes(record_table(pairs.truths, outcomes(pairs, oracle), RULES), held, RULES)
         assert len(asked) == times

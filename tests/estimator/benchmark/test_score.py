@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import math
 from dataclasses import replace
 
+import numpy as np
 import polars as pl
 import pytest
 from helpers.bench_cases import Cases, cases, change, constant, outcomes, sampler, shifted, silent, truth_itself
+from PIL import Image
 
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.document import MethodCard, ScoreDocument, read_records, read_score, write_score
-from phibench.estimator.benchmark.metrics import METRICS
-from phibench.estimator.benchmark.score import crop, score_methods, score_outcomes
+from phibench.estimator.benchmark.metrics import METRICS, STRATA
+from phibench.estimator.benchmark.score import score_methods, score_outcomes
 from phibench.estimator.benchmark.score_tables import leaderboard, number, ranked
-from phibench.estimator.benchmark.strata import STRATA
+from phibench.estimator.benchmark.worst_images import crop
 from phibench.estimator.cli import main as cli
 from phibench.estimator.interface import Outcome
 
@@ -117,16 +121,27 @@ def test_worst_images_first_one_of_a_sample():
     assert [w.sample_id for w in worst[:3]] == ["s0003", "s0005", "s0013"]
     assert len(worst) == len({w.sample_id for w in worst}) == 10
     assert "s0014" not in {w.sample_id for w in worst}  # nothing to see
-    assert (worst[1].distance_px, worst[1].answer_in_crop_px, worst[1].cause) == (None, None, "method")
+    assert (worst[1].distance_px, worst[1].answer_px, worst[1].cause) == (None, None, "method")
     shown = worst[2]
-    offset = shown.answer_in_crop_px[0] - shown.true_in_crop_px[0]
-    assert offset == pytest.approx(0.13, abs=1e-9)
-    assert all(max(w.size_px) <= 64 for w in worst)
+    assert shown.answer_px[0] - shown.true_px[0] == pytest.approx(0.13, abs=1e-9)
+    assert all(max(w.crop.size) <= 64 and w.crop.holds(w.true_px) for w in worst)
+    assert [w.frame is not None for w in worst] == [True] * 3 + [False] * 7
+    assert shown.frame.size == (640, 360)
+
+
+def test_a_position_is_marked_where_the_spot_is_in_crop_and_frame():
+    """The brightest pixel holds the true position; in the frame at half size, whose cells share a spot, a neighbour."""
+    worst = scored(silent, cases(12)).document.worst[:3]
+    for one in worst:
+        for picture, off in ((one.crop, 0), (one.frame, 1)):
+            image = np.asarray(Image.open(io.BytesIO(base64.b64decode(picture.base64))).convert("L"), int)
+            y, x = np.unravel_index(int(image.argmax()), image.shape)
+            place = np.floor(picture.place(one.true_px))
+            assert np.abs(place - [x, y]).max() <= off
+            assert image[y, x] > np.median(image) + 10
 
 
 def test_crops_hold_the_spot_and_end_with_the_image():
-    import numpy as np
-
     image = np.zeros((100, 200), np.uint16)
     image[60, 50] = 700
     part, (u0, v0) = crop(image, np.array([50.2, 59.8]))
