@@ -138,10 +138,8 @@ def draw_samples(recipe: Recipe, table: RandomTable, room: Room) -> tuple[Random
 
 
 def rig_table(table: RigTable, values: Mapping[str, Value]) -> RigTable:
-    """`[rig]` with drawn numbers, by parameter; a drawn `fx_px` is `fy_px` as well where nothing else gives it."""
+    """`[rig]` with drawn numbers, by parameter."""
     drawn = {key.removeprefix("rig."): value for key, value in values.items() if key.startswith("rig.")}
-    if "fx_px" in drawn and table.fy_px is None:
-        drawn.setdefault("fy_px", drawn["fx_px"])
     return table.model_copy(update=drawn)
 
 

@@ -129,8 +129,10 @@ def _given(table: RigTable, keys: Iterable[str]) -> dict[str, Any]:
 
 
 def _camera(base: Camera, table: RigTable, z_c_m: float, mirror: SphereMirror) -> Camera:
-    """Camera with the recipe's numbers; focus and principal point follow what they depend on unless they are set."""
+    """Camera with the recipe's numbers; focus, principal point and second focal length follow unless they are set."""
     implied: dict[str, Any] = {}
+    if table.fx_px is not None or table.fy_px is not None:  # square pixels: the one that is given holds for both
+        implied["fx_px"], implied["fy_px"] = table.fx_px or table.fy_px, table.fy_px or table.fx_px
     if table.z_c_m is not None or table.radius_m is not None:
         implied["focus_distance_m"] = z_c_m - mirror.radius_m / 2.0  # on the virtual image
     if table.width_px is not None:

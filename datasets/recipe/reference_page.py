@@ -76,10 +76,14 @@ shipped one (`paper`, `paper-misaligned`, `random`, `smoke`, `bench-dev`, `bench
 one go, before anything is rendered.
 """
 _NOTES = {
-    "[rig]": """A key that is left out keeps the preset's value, with three exceptions: `focus_distance_m`
-follows `z_c_m` and `radius_m` (z_c - R/2, on the virtual image), `cx_px` follows
-`width_px`, and `cy_px` follows `height_px` (the image centre), where those are given.
-`z_c_m` must exceed `radius_m`.
+    "[rig]": """A key that is left out keeps the preset's value. Three follow other keys, where those are given:
+
+* `focus_distance_m` follows `z_c_m` and `radius_m`: z_c - R/2, on the virtual image.
+* `cx_px` follows `width_px`, and `cy_px` follows `height_px`: the centre of the image.
+* `fx_px` and `fy_px` follow each other: pixels are square unless both are given.
+
+`z_c_m` must exceed `radius_m`. A smaller `width_px` alone keeps the focal length, and so cuts the image.
+Divide `fx_px` by the same factor to see as much as before.
 """,
     "[misalignment]": """What the true rig deviates by from `[rig]`, which then is the nominal one: what an estimator
 believes. Images and truth are those of the true rig. Signs, axes and figures: `docs/misalignment.md`.
@@ -122,7 +126,7 @@ not depend on which others are there.
 """,
     "[random.rig]": """Any number of `[rig]` but the size of the image, within the range that `[rig]` allows. What is
 not drawn is as in `[rig]`, which must be a possible rig itself. A drawn `fx_px` is `fy_px` too
-(square pixels) unless `fy_px` is drawn or set in `[rig]`.
+(square pixels) unless `fy_px` is drawn or set in `[rig]`, and the other way round.
 """,
     "[random.misalignment]": """Any key of `[misalignment]`, within its range, in place of the value there. The rig
 that `[random.rig]` gives is the nominal one.

@@ -134,8 +134,8 @@ class RigTable(Table):
     width_px: int | None = Field(default=None, ge=16, le=8192, description="image width")
     height_px: int | None = Field(default=None, ge=16, le=8192, description="image height")
     pixel_pitch_um: float | None = Field(default=None, gt=0.0, le=100.0, description="pixel pitch")
-    fx_px: FocalPx | None = Field(default=None, description="focal length along u")
-    fy_px: FocalPx | None = Field(default=None, description="focal length along v")
+    fx_px: FocalPx | None = Field(default=None, description="focal length along u; fy_px if only that is given")
+    fy_px: FocalPx | None = Field(default=None, description="focal length along v; fx_px if only that is given")
     cx_px: float | None = Field(
         default=None, ge=-8192.0, le=16384.0, description="principal point u; the image centre if width_px is given"
     )

@@ -45,6 +45,14 @@ def test_what_is_implied_follows_what_is_given() -> None:
     assert given.camera.focus_distance_m == 0.46
 
 
+@pytest.mark.parametrize("given", ["fx_px", "fy_px"])
+def test_pixels_are_square_unless_both_focal_lengths_are_given(given: str) -> None:
+    camera = build_rig(check_recipe(changed(rig={given: 700.0, "width_px": 640})).rig).camera
+    assert (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px) == (700.0, 700.0, 319.5, 359.5)
+    both = build_rig(check_recipe(changed(rig={"fx_px": 700.0, "fy_px": 710.0})).rig).camera
+    assert (both.fx_px, both.fy_px) == (700.0, 710.0)
+
+
 def test_a_tilted_camera_leaves_the_mirror_where_it_is() -> None:
     rig = build_rig(check_recipe(changed(rig={"tilt_x_rad": 0.02, "tilt_y_rad": -0.03, "decentre_x_m": 0.001})).rig)
     assert rig.at(0.0).sphere_centre_m == pytest.approx([0.001, 0.0, 0.71], abs=1e-15)
