@@ -107,9 +107,14 @@ def structural_faults(model: type[BaseModel], raw: object) -> list[Fault]:
         model.model_validate(raw)
     except ValidationError as error:
         schema = model.model_json_schema()
-        found = _merged(schema, [details for details in error.errors() if not _follows(details)])
-        return [_fault(schema, details["type"], details["loc"], details["input"]) for details in found]
+        found = [_untagged(details) for details in error.errors() if not _follows(details)]
+        return [_fault(schema, details) for details in _merged(schema, found)]
     return []
+
+
+def _untagged(details: ErrorDetails) -> ErrorDetails:
+    """Return the same without the tags of unions in the location; they stand in angle brackets."""
+    return {**details, "loc": tuple(part for part in details["loc"] if not str(part).startswith("<"))}
 
 
 def _follows(details: ErrorDetails) -> bool:
@@ -134,8 +139,11 @@ def path_text(location: Sequence[str | int]) -> str:
     return "".join(parts).removeprefix(".") or "recipe"
 
 
-def _fault(schema: Schema, kind: str, location: Location, given: object) -> Fault:
+def _fault(schema: Schema, details: ErrorDetails) -> Fault:
+    kind, location, given = details["type"], details["loc"], details["input"]
     path = path_text(location)
+    if kind == "value_error":  # of a validator of ours, which says all
+        return Fault(path, str(details["ctx"]["error"]))
     if kind == "extra_forbidden":
         known = schema_node(schema, location[:-1]).get("properties", {})
         return Fault(path, f"unknown key; {nearest(str(location[-1]), known)}", unknown=True)
@@ -160,9 +168,9 @@ def schema_node(schema: Schema, location: Location) -> Schema:
 
 
 def _resolve(schema: Schema, node: Schema) -> Schema:
-    options = [option for option in node.get("anyOf", ()) if option.get("type") != "null"]
+    options = [option for key in ("anyOf", "oneOf") for option in node.get(key, ()) if option.get("type") != "null"]
     if options:
-        return _resolve(schema, {**node, **options[0], "anyOf": ()})
+        return _resolve(schema, {**node, "anyOf": (), "oneOf": (), **options[0]})
     if "$ref" in node:
         return _resolve(schema, schema["$defs"][node["$ref"].rsplit("/", 1)[-1]])
     return node

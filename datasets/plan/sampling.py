@@ -195,6 +195,8 @@ class _Makers:
     ) -> RandomSample | str:
         if isinstance(placed, str):
             return placed
+        if (solid := self._room.solid_around(placed[1].position_world_m)) is not None:
+            return f"the spot lies inside {solid}"
         values = dict(drawn)
         nominal_stroke_m = float(values["stroke_m"])
         try:

@@ -1,7 +1,4 @@
-"""From the tables of a recipe to the descriptions of `scenes`.
-
-A rig that is in the ceiling before it makes a stroke: the fault of its height, not of the strokes.
-"""
+"""Builders: rig, room, targets and spots of `scenes` from the tables of a recipe."""
 
 from __future__ import annotations
 
@@ -10,10 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from phibench.datasets.recipe.tables import (
-    MIN_STROKE_M,
     LaserTable,
     MisalignmentTable,
     Recipe,
@@ -29,7 +24,7 @@ from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
-from phibench.scenes.validation import Fault, SceneError
+from phibench.scenes.validation import SceneError
 
 CAMERA_KEYS = (
     *("width_px", "height_px", "pixel_pitch_um", "fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "p1", "p2"),
@@ -142,23 +137,3 @@ def _camera(base: Camera, table: RigTable, z_c_m: float, mirror: SphereMirror) -
     if table.laser_filter_response is not None:
         implied["detector"] = replace(base.detector, laser_filter_response=table.laser_filter_response)
     return replace(base, **{**implied, **_given(table, CAMERA_KEYS)})
-
-
-def height_faults(raw: dict[str, Any]) -> list[Fault]:
-    """Fault of a rig that leaves no room for the shortest stroke; none if rig or room are faulty themselves."""
-    try:
-        table = RigTable.model_validate(raw.get("rig", {}))
-        room = build_room(RoomTable.model_validate(raw.get("room", {})), ())
-        rig = build_rig(table)
-    except (ValidationError, SceneError):
-        return []
-    limit_m = ceiling_m(room)
-    top_m = rig.at(MIN_STROKE_M).sphere_centre_m[2] + rig.mirror.radius_m
-    if top_m < limit_m:
-        return []
-    key = "z_c_m" if table.camera_height_m is None else "camera_height_m"
-    value = getattr(table, key)
-    if value is None:
-        key, value = "radius_m", rig.mirror.radius_m
-    text = f"{value} puts the mirror's top at {top_m:.3f} m when it is down, through the ceiling at {limit_m:.2f} m"
-    return [Fault(f"rig.{key}", f"{text}; give less than {value - (top_m - limit_m):.3f}")]

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from phibench.datasets.errors import RecipeError
-from phibench.datasets.recipe.build import height_faults
 from phibench.datasets.recipe.checks import semantic_faults
 from phibench.datasets.recipe.tables import Recipe
 from phibench.scenes.validation import nearest, structural_faults
@@ -60,28 +59,13 @@ def parse_recipe(text: str, source: str = "recipe") -> Recipe:
 
 def check_recipe(raw: dict[str, Any], source: str = "recipe") -> Recipe:
     """Check a recipe that is a dict already."""
-    height = height_faults(raw)
-    found = [*height, *semantic_faults(_judgeable(raw, strokes=not height))]
+    found = semantic_faults(raw)
     explained = {fault.path for fault in found}  # better than that the key is unknown
     faults = [*(f for f in structural_faults(Recipe, raw) if not (f.unknown and f.path in explained)), *found]
     if faults:
         count = f"{len(faults)} fault" + "s" * (len(faults) > 1)
         raise RecipeError("\n".join([f"{source} has {count}:", *(f"  {fault}" for fault in faults)]))
     return Recipe.model_validate(raw)
-
-
-def _judgeable(raw: dict[str, Any], strokes: bool) -> dict[str, Any]:
-    """Recipe without the keys about which only faults that follow from others could be found.
-
-    Experiments cannot name targets that have no names, and no stroke is short enough for a rig in the ceiling.
-    """
-    entries, targets = raw.get("experiments"), raw.get("targets")
-    if not isinstance(entries, list):
-        return raw
-    named = isinstance(targets, list) and all(isinstance(t, dict) and isinstance(t.get("name"), str) for t in targets)
-    dropped = {key for key, kept in (("targets", named), ("strokes_m", strokes)) if not kept}
-    kept = [{k: v for k, v in e.items() if k not in dropped} if isinstance(e, dict) else e for e in entries]
-    return {**raw, "experiments": kept}
 
 
 def _text(path: Path) -> str:

@@ -6,12 +6,12 @@ Laser spots that are drawn: on the boards of the recipe, or on what a horizontal
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from phibench.datasets.recipe.build import build_spot, build_target, grown_diameter_m, make_spot
+from phibench.datasets.recipe.build import build_spot, grown_diameter_m, make_spot
 from phibench.datasets.recipe.tables import LaserTable, TargetTable
 from phibench.render.optics.ray_tracer import IntArray, first_hit
 from phibench.scenes.catalog import BOARD_SIZE_M, Target, board
@@ -19,32 +19,8 @@ from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.room import Cuboid, Rectangle, Room, Shape, carriage
-from phibench.scenes.validation import Fault
 
-Targets = Sequence[tuple[int, TargetTable]]
 _HOUSING_REACH_M = 0.1  # housing and mast stay within this of the lens
-
-
-def boards_in_the_way(rig: Rig, strokes_m: Sequence[float], targets: Targets) -> Iterator[Fault]:
-    """Boards that cut the mirror, the camera's housing or the mast at an end of a stroke."""
-    for i, target in targets:
-        for offset_m in (0.0, *sorted(set(strokes_m))):
-            if hit := _hit(rig, offset_m, target):
-                text = f"the board (0.40 m wide, 0.30 m high) cuts the {hit} at stroke {offset_m:g} m"
-                yield Fault(f"targets[{i}].depth_m", f"{text}; move it away from the axis or to another height")
-                break
-
-
-def spots_on_boards(laser: LaserTable | None, targets: Targets) -> Iterator[Fault]:
-    """Spots that are larger than the board that carries them."""
-    if laser is None:
-        return
-    limit_m = min(BOARD_SIZE_M)
-    for i, target in targets:
-        diameter_m = build_spot(laser, target).diameter_m
-        if diameter_m > limit_m:
-            text = f"the spot's diameter is {diameter_m:g} m, its board measures {limit_m:g} m"
-            yield Fault(f"targets[{i}]", f"{text}; make laser.diameter_m (or its growth) smaller")
 
 
 class Boards:
@@ -64,7 +40,7 @@ class Boards:
         near = np.hypot(*(self._centres_m - lens_m)[:, :2].T) < reach_m + math.hypot(*BOARD_SIZE_M)
         for k in np.flatnonzero(near):
             for offset_m in (0.0, stroke_m):
-                if hit := _cut(rig.at(offset_m), self._plates[k]):
+                if hit := cut_part(rig.at(offset_m), self._plates[k]):
                     return f"the {self._plates[k].name} cuts the {hit} at stroke {offset_m:g} m"
         return None
 
@@ -74,12 +50,8 @@ def _tilt(rig: Rig) -> float:
     return math.hypot(*rig.T_world_camera.R[:2, 2])
 
 
-def _hit(rig: Rig, offset_m: float, target: TargetTable) -> str | None:
-    """What a board cuts with the carriage at an offset; None if nothing."""
-    return _cut(rig.at(offset_m), board(build_target(target)))
-
-
-def _cut(view: View, plate: Cuboid) -> str | None:
+def cut_part(view: View, plate: Cuboid) -> str | None:
+    """Name the part of the carriage (mirror, housing, mast) that a board cuts; None if none."""
     if plate.distance_m(view.sphere_centre_m) <= view.rig.mirror.bound_m:
         return "mirror"
     return next((part.name.replace("_", " ") for part in carriage(view) if plate.meets(part)), None)

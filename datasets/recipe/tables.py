@@ -1,103 +1,25 @@
-"""The part of a recipe that is not rendered: how frames of a benchmark are taken, and lights that mislead.
+"""Recipes: what a data set is made of, as strict tables that TOML files fill.
 
-`[misalignment]` and `[random.misalignment]`: the deviations of the true rig, with names and ranges of `scenes`.
-
-Recipes: what a data set is made of, as strict tables that TOML files fill.
-
-Lengths in metres, angles in radians unless the key says degrees. Every key says its unit. `load_recipe` reports all
-faults of a file in one go (`render/model_faults`, `recipe_checks`).
+Lengths are in metres, angles in radians unless the key says degrees; every key names its unit. Types and ranges stand
+here and nowhere else. `recipe/checks` knows what lies between the keys, and `recipe/load` reports all faults in one go.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field, create_model
+from pydantic import AfterValidator, Discriminator, Field, Tag, create_model
 
-from phibench.datasets.recipe.distributions import Distribution, DistributionTable, Name, Table, Targets
+from phibench.datasets.recipe.distributions import (
+    Distribution,
+    DistributionTable,
+    Name,
+    Table,
+    Targets,
+    values_of,
+)
+from phibench.scenes.catalog import BOARD_SIZE_M
 from phibench.scenes.misalignment import PARAMETERS
-
-Preset = Literal["mono-raw", "bayer-raw", "srgb8", "mjpeg"]
-Probability = Annotated[float, Field(ge=0.0, le=1.0)]
-LEVELS = ("laser_level", "lamp_level")
-SENSOR_KEYS = ("jpeg_quality", "sharpen_amount", "analogue_gain", "read_noise_e", "prnu")
-"""Keys of `[frames]` that are numbers of the sensor's preset."""
-
-_ONE = DistributionTable(choice=(1.0,))
-_HALF = DistributionTable(log_uniform=(0.05, 0.5))
-
-
-class FramesTable(Table):
-    """`[frames]`: how frames are taken; every number is drawn per sample and is the same in all presets."""
-
-    presets: Annotated[tuple[Preset, ...], Field(strict=False, min_length=1)] = Field(
-        default=("bayer-raw",), description="sensor presets; every sample is taken in each"
-    )
-    draws: int = Field(default=1, ge=1, le=10_000, description="draws of the noise, per sample and preset")
-    exposure_s: Distribution | Literal["auto"] | None = Field(
-        default=None, description="exposure time; 'auto' is the camera's for the down image, kept for the others"
-    )
-    laser_level: Distribution = Field(default=_ONE, description="factor of the laser's light")
-    lamp_level: Distribution = Field(default=_ONE, description="factor of the room's light")
-    jpeg_quality: Distribution | None = Field(default=None, description="libjpeg's quality; whole numbers")
-    sharpen_amount: Distribution | None = Field(default=None, description="gain of the unsharp mask")
-    analogue_gain: Distribution | None = Field(default=None, description="gain before the converter")
-    read_noise_e: Distribution | None = Field(default=None, description="read noise, rms electrons per pixel")
-    prnu: Distribution | None = Field(default=None, description="relative spread of the pixels' responsivity")
-    laser_off: bool = Field(default=True, description="whether frames with the laser off are given too")
-    hint: Probability = Field(default=0.0, description="probability that a pair comes with boxes that hold its spots")
-    hint_box_px: int = Field(default=64, ge=16, le=8192, description="side of such a box")
-    camera: Literal["per_sample", "one"] = Field(
-        default="per_sample", description="whether each sample has a camera, hence a fixed pattern, of its own"
-    )
-
-
-class DistractorTable(Table):
-    """`[[distractors]]`: another light; on a board, where a ray ends, or free in the room."""
-
-    kind: Literal["spot", "glow", "led"] = Field(
-        description="'spot' a reflection of the laser, 'glow' the laser itself, 'led' a lamp that stays on"
-    )
-    probability: Probability = Field(default=1.0, description="part of the samples that have it")
-    flux_ratio: Distribution = Field(
-        default=_HALF, description="its electrons relative to the spot's, in the image where that is more"
-    )
-    diameter_m: Distribution = Field(default=DistributionTable(choice=(0.005,)), description="diameter of the disc")
-    target: Targets = Field(default=None, description="boards; all but the sample's own where no place is given")
-    azimuth_deg: Distribution | None = Field(
-        default=None, description="of a horizontal ray from the world's z axis, from x towards y; instead of a board"
-    )
-    height_m: Distribution | None = Field(default=None, description="of the ray above the floor; with azimuth_deg")
-    distance_m: Distribution | None = Field(
-        default=None, description="along the ray to a disc that hangs free; where the ray ends if not given"
-    )
-
-    @property
-    def follows_laser(self) -> bool:
-        """Whether it goes out with the laser."""
-        return self.kind != "led"
-
-
-if TYPE_CHECKING:
-    MisalignmentTable = Table
-    RandomMisalignmentTable = Table
-else:
-    MisalignmentTable = create_model(
-        "MisalignmentTable",
-        __base__=Table,
-        __doc__="`[misalignment]`: what the true rig deviates by from `[rig]`, which is the nominal one.",
-        **{
-            key: (float, Field(default=0.0, ge=-one.limit, le=one.limit, description=one.meaning))
-            for key, one in PARAMETERS.items()
-        },
-    )
-    RandomMisalignmentTable = create_model(
-        "RandomMisalignmentTable",
-        __base__=Table,
-        __doc__="`[random.misalignment]`: distributions of keys of `[misalignment]`.",
-        **{key: (Distribution | None, Field(default=None, description=one.meaning)) for key, one in PARAMETERS.items()},
-    )
-
 
 MIN_STROKE_M, MAX_STROKE_M = 1e-3, 10.0
 DatasetName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
@@ -108,6 +30,37 @@ Distortion = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 FocalPx = Annotated[float, Field(ge=50.0, le=50000.0)]
 Unit = Annotated[float, Field(ge=0.0, le=1.0)]
 Response = Annotated[tuple[Unit, ...], Field(strict=False, min_length=3, max_length=3)]
+Preset = Literal["mono-raw", "bayer-raw", "srgb8", "mjpeg"]
+Probability = Annotated[float, Field(ge=0.0, le=1.0)]
+LEVELS = ("laser_level", "lamp_level")
+SENSOR_KEYS = ("jpeg_quality", "sharpen_amount", "analogue_gain", "read_noise_e", "prnu")
+"""Keys of `[frames]` that are numbers of the sensor's preset."""
+
+_ONE = DistributionTable(choice=(1.0,))
+_HALF = DistributionTable(log_uniform=(0.05, 0.5))
+
+
+def _is_whole(table: DistributionTable) -> DistributionTable:
+    if table.choice is None or any(value != int(value) for value in table.choice):
+        raise ValueError("must be a whole number or a choice of whole numbers, such as { choice = [60, 75, 90] }")
+    return table
+
+
+def _exposure_tag(given: object) -> str:
+    return "<auto>" if isinstance(given, str) else "<distribution>"
+
+
+Stroke = Annotated[Distribution, values_of(StrokeM)]
+Level = Annotated[Distribution, values_of(Annotated[float, Field(ge=0.0, le=1e6)])]
+FluxRatio = Annotated[Distribution, values_of(Annotated[float, Field(ge=1e-6, le=0.5)])]
+Diameter = Annotated[Distribution, values_of(Annotated[float, Field(ge=1e-6, le=min(BOARD_SIZE_M) / 2.0)])]
+Distance = Annotated[Distribution, values_of(Annotated[float, Field(ge=0.1, le=100.0)])]
+WholeNumbers = Annotated[Distribution, AfterValidator(_is_whole)]
+Exposure = Annotated[
+    Annotated[Distribution, Tag("<distribution>")] | Annotated[Literal["auto"], Tag("<auto>")],
+    Discriminator(_exposure_tag),
+]
+"""The tags keep pydantic from trying both; `validation` leaves what stands in angle brackets out of a path."""
 
 
 class DatasetTable(Table):
@@ -163,6 +116,33 @@ class RigTable(Table):
     tilt_y_rad: Tilt = Field(default=0.0, description="camera turned about world y, the mirror stays")
     stroke_tilt_x_rad: Tilt = Field(default=0.0, description="stroke axis turned about world x")
     stroke_tilt_y_rad: Tilt = Field(default=0.0, description="stroke axis turned about world y")
+
+
+if TYPE_CHECKING:
+    MisalignmentTable = Table
+    RandomMisalignmentTable = Table
+else:
+    MisalignmentTable = create_model(
+        "MisalignmentTable",
+        __base__=Table,
+        __doc__="`[misalignment]`: what the true rig deviates by from `[rig]`, which is the nominal one.",
+        **{
+            key: (float, Field(default=0.0, ge=-one.limit, le=one.limit, description=one.meaning))
+            for key, one in PARAMETERS.items()
+        },
+    )
+    RandomMisalignmentTable = create_model(
+        "RandomMisalignmentTable",
+        __base__=Table,
+        __doc__="`[random.misalignment]`: distributions of keys of `[misalignment]`.",
+        **{
+            key: (
+                Annotated[Distribution, values_of(Annotated[float, Field(ge=-one.limit, le=one.limit)])] | None,
+                Field(default=None, description=one.meaning),
+            )
+            for key, one in PARAMETERS.items()
+        },
+    )
 
 
 class RoomTable(Table):
@@ -241,8 +221,12 @@ else:
         __base__=Table,
         __doc__="`[random.rig]`: distributions of keys of `[rig]`.",
         **{
-            key: (Distribution | None, Field(default=None, description=RigTable.model_fields[key].description))
-            for key in DRAWABLE
+            key: (
+                Annotated[Distribution, values_of(Annotated[field.annotation, Field(), *field.metadata])] | None,
+                Field(default=None, description=field.description),
+            )
+            for key, field in RigTable.model_fields.items()
+            if key in DRAWABLE
         },
     )
 
@@ -273,7 +257,7 @@ class RandomTable(Table):
     sequence: Literal["sobol", "independent"] = Field(
         default="sobol", description="points that fill the space evenly, or independent ones"
     )
-    stroke_m: Distribution = Field(description="distribution of the stroke; drawn ones are rounded to 1 nm")
+    stroke_m: Stroke = Field(description="distribution of the stroke; drawn ones are rounded to 1 nm")
     rig: RandomRigTable = Field(default=RandomRigTable(), description="distributions of keys of [rig]")
     misalignment: RandomMisalignmentTable = Field(
         default=RandomMisalignmentTable(), description="distributions of keys of [misalignment]"
@@ -288,6 +272,57 @@ class RigsTable(Table):
     misalignment: RandomMisalignmentTable = Field(
         default=RandomMisalignmentTable(), description="distributions of keys of [misalignment]"
     )
+
+
+class FramesTable(Table):
+    """`[frames]`: how frames are taken; every number is drawn per sample and is the same in all presets."""
+
+    presets: Annotated[tuple[Preset, ...], Field(strict=False, min_length=1)] = Field(
+        default=("bayer-raw",), description="sensor presets; every sample is taken in each"
+    )
+    draws: int = Field(default=1, ge=1, le=10_000, description="draws of the noise, per sample and preset")
+    exposure_s: Exposure | None = Field(
+        default=None, description="exposure time; 'auto' is the camera's for the down image, kept for the others"
+    )
+    laser_level: Level = Field(default=_ONE, description="factor of the laser's light")
+    lamp_level: Level = Field(default=_ONE, description="factor of the room's light")
+    jpeg_quality: WholeNumbers | None = Field(default=None, description="libjpeg's quality; whole numbers")
+    sharpen_amount: Distribution | None = Field(default=None, description="gain of the unsharp mask")
+    analogue_gain: Distribution | None = Field(default=None, description="gain before the converter")
+    read_noise_e: Distribution | None = Field(default=None, description="read noise, rms electrons per pixel")
+    prnu: Distribution | None = Field(default=None, description="relative spread of the pixels' responsivity")
+    laser_off: bool = Field(default=True, description="whether frames with the laser off are given too")
+    hint: Probability = Field(default=0.0, description="probability that a pair comes with boxes that hold its spots")
+    hint_box_px: int = Field(default=64, ge=16, le=8192, description="side of such a box")
+    camera: Literal["per_sample", "one"] = Field(
+        default="per_sample", description="whether each sample has a camera, hence a fixed pattern, of its own"
+    )
+
+
+class DistractorTable(Table):
+    """`[[distractors]]`: another light; on a board, where a ray ends, or free in the room."""
+
+    kind: Literal["spot", "glow", "led"] = Field(
+        description="'spot' a reflection of the laser, 'glow' the laser itself, 'led' a lamp that stays on"
+    )
+    probability: Probability = Field(default=1.0, description="part of the samples that have it")
+    flux_ratio: FluxRatio = Field(
+        default=_HALF, description="its electrons relative to the spot's, in the image where that is more"
+    )
+    diameter_m: Diameter = Field(default=DistributionTable(choice=(0.005,)), description="diameter of the disc")
+    target: Targets = Field(default=None, description="boards; all but the sample's own where no place is given")
+    azimuth_deg: Distribution | None = Field(
+        default=None, description="of a horizontal ray from the world's z axis, from x towards y; instead of a board"
+    )
+    height_m: Distribution | None = Field(default=None, description="of the ray above the floor; with azimuth_deg")
+    distance_m: Distance | None = Field(
+        default=None, description="along the ray to a disc that hangs free; where the ray ends if not given"
+    )
+
+    @property
+    def follows_laser(self) -> bool:
+        """Whether it goes out with the laser."""
+        return self.kind != "led"
 
 
 class Recipe(Table):

@@ -279,7 +279,7 @@ SPOT = {"kind": "spot"}
         ({"frames": {"jpeg_quality": {"uniform": [60, 90]}}}, "frames.jpeg_quality", ("whole number",)),
         ({"frames": {"jpeg_quality": {"choice": [60.5]}}}, "frames.jpeg_quality", ("whole number",)),
         ({"frames": {"jpeg_quality": 101}}, "frames.jpeg_quality", ("reaches 101",)),
-        ({"frames": {"laser_level": {"uniform": [-1, 1]}}}, "frames.laser_level", ("reaches -1", "0 to 1e+06")),
+        ({"frames": {"laser_level": {"uniform": [-1, 1]}}}, "frames.laser_level", ("reaches -1", "0 up to 1e+06")),
         ({"frames": {"analogue_gain": 0.5}}, "frames.analogue_gain", ("reaches 0.5",)),
         ({"frames": {"hint": 1.5}}, "frames.hint", ("1.5", "from 0 up to 1")),
         ({"frames": {"hnt": 1.0}}, "frames.hnt", ("unknown", "'hint'")),

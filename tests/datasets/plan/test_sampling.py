@@ -16,7 +16,7 @@ from phibench.datasets.errors import RecipeError
 from phibench.datasets.plan.plan import Plan, make_plan
 from phibench.datasets.plan.sampling import PARAMETERS, drawn_parameters, first_points
 from phibench.datasets.recipe.checks import warnings
-from phibench.datasets.recipe.distributions import DistributionTable, quantile, support
+from phibench.datasets.recipe.distributions import DistributionTable, quantile
 from phibench.datasets.recipe.load import check_recipe, load_recipe
 from phibench.render.optics.ray_tracer import blocked_by
 from phibench.render.optics.truth import spot_truth
@@ -83,7 +83,7 @@ def test_independent_draws_follow_their_distribution(k: int) -> None:
     assert stats.kstest(values, DISTRIBUTIONS[k][1].cdf).pvalue > 1e-5
     for other in range(3):  # a wrong distribution with the same ends does not pass
         if other != k:
-            low, high = support(table)
+            low, high = table.support
             wrong = DISTRIBUTIONS[other][1]
             ends = wrong.ppf([0.0, 1.0])
             moved = ends[0] + (values - low) / (high - low) * (ends[1] - ends[0])

@@ -35,7 +35,7 @@ UNIFORM = {"uniform": [0.1, 1.4]}
             "random.stroke_m.normal",
             ("sigma = -0.1", "above 0"),
         ),
-        ({"stroke_m": {"normal": [0.5, 0.1]}}, "random.stroke_m", ("needs clip",)),
+        ({"stroke_m": {"normal": [0.5, 0.1]}}, "random.stroke_m.clip", ("needs clip",)),
         ({"stroke_m": {"normal": [0.5, 0.1], "clip": [1, 0]}}, "random.stroke_m.clip", ("below the high",)),
         ({"stroke_m": {"normal": [0.5, 0.1], "clip": [0.6, 1]}}, "random.stroke_m.clip", ("leaves out the mean",)),
         ({"stroke_m": {**UNIFORM, "clip": [0.2, 1]}}, "random.stroke_m.clip", ("normal distribution only",)),

@@ -182,7 +182,27 @@ def test_the_schema_for_editors_knows_every_table() -> None:
 
 @pytest.mark.parametrize(
     ("place", "part"),
-    [((0.01, 0.71), "mirror"), ((0.05, 0.71), "mirror"), ((0.02, 0.40), "camera housing"), ((0.02, 1.11), "mirror")],
+    [
+        ((0.1, 0.0, 0.05), "robot_body"),  # below the body
+        ((0.16, 90.0, 0.15), "robot_track"),  # in the gap between body and track
+        ((0.35, 0.0, 0.25), "robot_flipper"),  # in front, between the flippers
+        ((0.52, 180.0, 0.1), None),
+    ],
+)
+def test_a_board_that_cuts_the_robot_is_refused(place: tuple[float, float, float], part: str | None) -> None:
+    depth_m, azimuth_deg, height_m = place
+    raw = changed(targets=[target(depth_m=depth_m, azimuth_deg=azimuth_deg, height_m=height_m)])
+    if part is None:
+        check_recipe(raw)
+    else:
+        [line] = complaints(raw)
+        assert line.startswith("targets[0]: ")
+        assert part in line
+
+
+@pytest.mark.parametrize(
+    ("place", "part"),
+    [((0.01, 0.71), "mirror"), ((0.05, 0.71), "mirror"), ((0.02, 0.46), "camera housing"), ((0.02, 1.11), "mirror")],
 )
 def test_board_that_cuts_the_carriage_is_refused(place: tuple[float, float], part: str) -> None:
     depth_m, height_m = place
