@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.exposures.exposures import Take, TakenSample, takes
+from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, pair_draws
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.datasets.frames.source import Frames, FrameSource
 from phibench.datasets.read import Dataset, Sample
@@ -22,23 +22,23 @@ class DrawnPairs:
     Parameters
     ----------
     dataset : Dataset
-    taken : tuple of Take
+    pair_draws : tuple of PairDraw
         Numbered from 0.
     """
 
-    def __init__(self, dataset: Dataset, taken: tuple[Take, ...]) -> None:
-        self._dataset, self._takes = dataset, taken
+    def __init__(self, dataset: Dataset, pair_draws: tuple[PairDraw, ...]) -> None:
+        self._dataset, self._pair_draws = dataset, pair_draws
         self._samples = {sample.row.sample_id: sample for sample in dataset}
-        self._kept: TakenSample | None = None
+        self._kept: CachedSample | None = None
         self._source: tuple[int, FrameSource] | None = None
 
     def __len__(self) -> int:
-        return len(self._takes)
+        return len(self._pair_draws)
 
     @property
-    def takes(self) -> tuple[Take, ...]:
+    def pair_draws(self) -> tuple[PairDraw, ...]:
         """What is drawn, by number; it tells the sample, so it is not for methods."""
-        return self._takes
+        return self._pair_draws
 
     @property
     def dataset(self) -> Dataset:
@@ -51,10 +51,10 @@ class DrawnPairs:
 
     def pair_and_frames(self, number: int) -> tuple[Pair, Frames]:
         """What a method sees, and the frames behind it, with the camera's JPEG files."""
-        take, sample, source = self.drawn_from(number)
-        frames = source.frames(take.exposure_number, laser_off=take.laser_off)
+        pair_draw, sample, source = self.drawn_from(number)
+        frames = source.frames(pair_draw.noise_draw, laser_off=pair_draw.laser_off)
         images = {name: _sealed(frame.image) for name, frame in frames.by_name.items()}
-        box_down, box_up = (None, None) if take.boxes is None else tuple(map(_box, take.boxes))
+        box_down, box_up = (None, None) if pair_draw.boxes is None else tuple(map(_box, pair_draw.boxes))
         pair = Pair(
             number,
             **images,
@@ -69,24 +69,26 @@ class DrawnPairs:
 
     def image(self, number: int, position: str, laser: bool) -> Image:
         """One image of a pair, alone; the same bytes as in `pair`."""
-        take, _, source = self.drawn_from(number)
-        return source.frame(position, take.exposure_number, laser).image
+        pair_draw, _, source = self.drawn_from(number)
+        return source.frame(position, pair_draw.noise_draw, laser).image
 
     def card(self, number: int) -> SensorCard:
         """Numbers of the sensor, with the exposure that was chosen; no frame is drawn."""
         return card_of(self.drawn_from(number)[2].sides["down"].chain.sensor)
 
-    def drawn_from(self, number: int) -> tuple[Take, TakenSample, FrameSource]:
+    def drawn_from(self, number: int) -> tuple[PairDraw, CachedSample, FrameSource]:
         """What is drawn, the sample with its layers, and the source of its frames."""
-        if not 0 <= number < len(self._takes):
-            raise DatasetError(f"pair {number}: there are {len(self._takes)}, numbered from 0; ask for one of them")
-        take = self._takes[number]
+        if not 0 <= number < len(self._pair_draws):
+            raise DatasetError(
+                f"pair {number}: there are {len(self._pair_draws)}, numbered from 0; ask for one of them"
+            )
+        pair_draw = self._pair_draws[number]
         kept = self._kept
-        if kept is None or kept.row.sample_id != take.sample_id:
-            kept = self._kept = TakenSample(self._samples[take.sample_id])
+        if kept is None or kept.row.sample_id != pair_draw.sample_id:
+            kept = self._kept = CachedSample(self._samples[pair_draw.sample_id])
         if self._source is None or self._source[0] != number:
-            self._source = number, kept.source(take)
-        return take, kept, self._source[1]
+            self._source = number, kept.source(pair_draw)
+        return pair_draw, kept, self._source[1]
 
 
 def pairs_of(
@@ -105,8 +107,8 @@ def pairs_of(
     """
     order = {sample.row.sample_id: place for place, sample in enumerate(samples)}
     few = replace(dataset, rows=tuple(sample.row for sample in samples))
-    taken = sorted(takes(few, preset, draws), key=lambda take: (order[take.sample_id], take.draw))
-    numbered = (replace(take, number=number, laser_off=laser_off) for number, take in enumerate(taken))
+    chosen = sorted(pair_draws(few, preset, draws), key=lambda pair_draw: (order[pair_draw.sample_id], pair_draw.draw))
+    numbered = (replace(pair_draw, number=number, laser_off=laser_off) for number, pair_draw in enumerate(chosen))
     return DrawnPairs(few, tuple(numbered))
 
 

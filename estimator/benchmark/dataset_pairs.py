@@ -13,7 +13,7 @@ import numpy as np
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exposures.expected import ExpectedRegion, expected_of_light
-from phibench.datasets.exposures.exposures import TakenSample, takes
+from phibench.datasets.exposures.pair_draws import CachedSample, pair_draws
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.datasets.frames.source import FrameSource, Side
 from phibench.datasets.read import Dataset, Sample
@@ -48,21 +48,21 @@ class DatasetPairs(DrawnPairs):
     Parameters
     ----------
     dataset : Dataset
-    taken : tuple of Take
+    pair_draws : tuple of PairDraw
         Numbered from 0.
     """
 
     def truth(self, number: int) -> PairTruth:
         """The exact answer, with the bounds of the image and of the raw pixels behind it."""
-        take, sample, source = self.drawn_from(number)
+        pair_draw, sample, source = self.drawn_from(number)
         sensor = source.sides["down"].chain.sensor
         return PairTruth(
             number=number,
-            sample_id=take.sample_id,
-            draw=take.draw,
-            preset=take.preset,
+            sample_id=pair_draw.sample_id,
+            draw=pair_draw.draw,
+            preset=pair_draw.preset,
             jpeg_quality=sensor.jpeg_quality if sensor.output == "mjpeg" else None,
-            hinted=take.boxes is not None,
+            hinted=pair_draw.boxes is not None,
             depth_m=sample.row.depth_m,
             stroke_m=sample.row.stroke_m,
             true_rig=sample.rig,
@@ -80,9 +80,9 @@ class DatasetPairs(DrawnPairs):
             "task_version": TASK_VERSION,
             "sealed": False,
             "pairs": len(self),
-            "samples": len({take.sample_id for take in self.takes}),
-            "presets": sorted({take.preset for take in self.takes}),
-            "hinted": sum(take.boxes is not None for take in self.takes),
+            "samples": len({pair_draw.sample_id for pair_draw in self.pair_draws}),
+            "presets": sorted({pair_draw.preset for pair_draw in self.pair_draws}),
+            "hinted": sum(pair_draw.boxes is not None for pair_draw in self.pair_draws),
             "seed": info.recipe["dataset"]["seed"],
             "recipe_sha256": info.recipe_sha256,
             "dataset_sha256": sha256(listed) if listed.is_file() else None,
@@ -116,14 +116,14 @@ def dataset_pairs(
     DatasetError
         If neither recipe nor caller names a preset, or `pairs` is not a number from 1 up.
     """
-    taken = takes(dataset, preset, draws)
+    chosen = pair_draws(dataset, preset, draws)
     if pairs is not None and pairs < 1:
         raise DatasetError(f"pairs = {pairs}: must be 1 or above")
-    shown = taken if hints else tuple(replace(take, boxes=None) for take in taken)
+    shown = chosen if hints else tuple(replace(pair_draw, boxes=None) for pair_draw in chosen)
     return DatasetPairs(dataset, shown[:pairs])
 
 
-def _spot_truth(sample: TakenSample, source: FrameSource, position: str) -> SpotTruth:
+def _spot_truth(sample: CachedSample, source: FrameSource, position: str) -> SpotTruth:
     row, side = sample.row.position(position), source.sides[position]
     uv_px = (row.u_px, row.v_px)
     beam, depth_m = Beam(sample.row.spot_diameter_m, 0.0), sample.row.depth_m
@@ -139,7 +139,7 @@ def _spot_truth(sample: TakenSample, source: FrameSource, position: str) -> Spot
     )
 
 
-def _distractions(sample: TakenSample, side: Side, position: str) -> tuple[Distraction, ...]:
+def _distractions(sample: CachedSample, side: Side, position: str) -> tuple[Distraction, ...]:
     """Lights beside the spot that this image shows."""
     return tuple(
         Distraction(

@@ -332,7 +332,7 @@ def _seal(pairs: DatasetPairs, folder: Path, work: Path, public: Path, console: 
 
 def _by_sample(pairs: DatasetPairs) -> list[int]:
     """Numbers in the order in which layers are read once; the files' names and times do not show it."""
-    return sorted(range(len(pairs)), key=lambda number: pairs.takes[number].sample_id)
+    return sorted(range(len(pairs)), key=lambda number: pairs.pair_draws[number].sample_id)
 
 
 def _write_pair(work: Path, pair: Pair, frames: Frames) -> PublicPair:

@@ -19,7 +19,7 @@ import polars as pl
 from rich.table import Table
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.exposures.exposures import TakenSample
+from phibench.datasets.exposures.pair_draws import CachedSample
 from phibench.datasets.frames.request import Exposure
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, Sample
@@ -124,23 +124,23 @@ def frames_needed(bounds: pl.DataFrame, target: float, pattern_known: bool = Fal
 
 def _sources(
     dataset: Dataset, preset: str, samples: Sequence[Sample], laser_level: float, exposure: Exposure
-) -> Iterator[tuple[TakenSample, FrameSource]]:
+) -> Iterator[tuple[CachedSample, FrameSource]]:
     """Each sample with what draws its frames."""
     by_id = {sample.row.sample_id: sample for sample in samples}
-    for take in pairs_of(dataset, samples, preset).takes:
-        sample = TakenSample(by_id[take.sample_id])
-        request = replace(take.request, exposure=exposure, laser_level=laser_level)
-        yield sample, sample.source(replace(take, request=request))
+    for pair_draw in pairs_of(dataset, samples, preset).pair_draws:
+        sample = CachedSample(by_id[pair_draw.sample_id])
+        request = replace(pair_draw.request, exposure=exposure, laser_level=laser_level)
+        yield sample, sample.source(replace(pair_draw, request=request))
 
 
-def _bound_m(sample: TakenSample, source: FrameSource, pattern_known: bool) -> float:
+def _bound_m(sample: CachedSample, source: FrameSource, pattern_known: bool) -> float:
     rows = [sample.row.position(position) for position in POSITIONS]
     C_down, C_up = (_bound_px2(sample, source, position, pattern_known) for position in POSITIONS)
     down, up = (np.array([row.u_px, row.v_px]) for row in rows)
     return float(depth_general(sample.rig, sample.row.stroke_m, down, up, C_down, C_up).sigma_m)
 
 
-def _bound_px2(sample: TakenSample, source: FrameSource, position: str, pattern_known: bool) -> Array:
+def _bound_px2(sample: CachedSample, source: FrameSource, position: str, pattern_known: bool) -> Array:
     """Bound of (u, v), shape (2, 2), pixels squared; NaN where there is none."""
     row = sample.row.position(position)
     uv_px, rates = (row.u_px, row.v_px), row.electrons_per_s

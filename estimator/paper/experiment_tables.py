@@ -163,16 +163,16 @@ def calibrate_rig(dataset: Dataset, rig: str, procedure: Procedure) -> Bundle:
 def measure(dataset: Dataset, samples: Sequence[Sample], bundle: Bundle, procedure: Procedure) -> list[dict[str, Any]]:
     """Rows of `COLUMNS` for samples of one rig, by its calibration."""
     pairs, rows = _pairs(dataset, samples, procedure, procedure.draws), []
-    for number, take in enumerate(pairs.takes):
-        sample, seen, truth = dataset[take.sample_id], pairs.pair(number), pairs.truth(number)
+    for number, pair_draw in enumerate(pairs.pair_draws):
+        sample, seen, truth = dataset[pair_draw.sample_id], pairs.pair(number), pairs.truth(number)
         pair = replace(seen, rig=bundle.rig, stroke_m=float(bundle.stroke(np.array(seen.stroke_m))))
         answer = method_for(pair.card)(pair)
         rows.append(
             {
-                "sample_id": take.sample_id,
+                "sample_id": pair_draw.sample_id,
                 "experiment": sample.row.experiment,
                 "rig": sample.row.rig,
-                "draw": take.draw,
+                "draw": pair_draw.draw,
                 "depth_m": truth.depth_m,
                 "stroke_m": sample.row.nominal_stroke_m,
                 **_estimate(pair, answer, bundle, truth.depth_m),
@@ -238,7 +238,7 @@ def _bound(truth: PairTruth, bundle: Bundle) -> dict[str, float]:
 
 def _pairs(dataset: Dataset, samples: Sequence[Sample], procedure: Procedure, draws: int = 1) -> DatasetPairs:
     drawn = pairs_of(dataset, samples, procedure.preset, draws, procedure.laser_off)
-    return DatasetPairs(drawn.dataset, drawn.takes)
+    return DatasetPairs(drawn.dataset, drawn.pair_draws)
 
 
 def _of_rig(dataset: Dataset, rig: str) -> list[Sample]:

@@ -19,7 +19,7 @@ import numpy as np
 import polars as pl
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.exposures.exposures import Take, takes
+from phibench.datasets.exposures.pair_draws import PairDraw, pair_draws
 from phibench.datasets.parallel import parallel_map
 from phibench.datasets.read import Dataset, open_finished
 from phibench.estimator.benchmark.dataset_pairs import DatasetPairs
@@ -215,18 +215,23 @@ def found_spots(
     return dict(zip(names, parallel_map(job, names, workers), strict=True))
 
 
-def auto_takes(dataset: Dataset, preset: str, draws: int) -> tuple[Take, ...]:
-    """Takes at the exposure that the camera chooses, by sample and draw."""
-    ordered = sorted(takes(dataset, preset, draws), key=lambda take: (take.sample_id, take.draw))
+def auto_exposed_draws(dataset: Dataset, preset: str, draws: int) -> tuple[PairDraw, ...]:
+    """Draws at the exposure that the camera chooses, by sample and draw."""
+    ordered = sorted(pair_draws(dataset, preset, draws), key=lambda pair_draw: (pair_draw.sample_id, pair_draw.draw))
     return tuple(
-        replace(take, number=i, request=replace(take.request, exposure="auto")) for i, take in enumerate(ordered)
+        replace(pair_draw, number=i, request=replace(pair_draw.request, exposure="auto"))
+        for i, pair_draw in enumerate(ordered)
     )
 
 
 def _found(folder: Path, preset: str, draws: dict[str, int], sample_id: str) -> FoundSpots:
     dataset = open_finished(folder)
-    taken = [take for take in auto_takes(dataset, preset, max(draws.values())) if take.sample_id == sample_id]
-    pairs = DatasetPairs(dataset, tuple(replace(take, number=i) for i, take in enumerate(taken)))
+    chosen = [
+        pair_draw
+        for pair_draw in auto_exposed_draws(dataset, preset, max(draws.values()))
+        if pair_draw.sample_id == sample_id
+    ]
+    pairs = DatasetPairs(dataset, tuple(replace(pair_draw, number=i) for i, pair_draw in enumerate(chosen)))
     found: dict[str, list[Array]] = {name: [] for name in draws}
     for number in range(len(pairs)):
         pair = pairs.pair(number)

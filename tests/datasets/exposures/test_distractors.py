@@ -14,7 +14,7 @@ from helpers.sensor_light import room, spot_at
 
 from phibench.datasets.exposures.distractors import MIN_APART_PX, Distractor, distractors, present
 from phibench.datasets.exposures.expected import expected_of_light
-from phibench.datasets.exposures.exposures import TakenSample, takes
+from phibench.datasets.exposures.pair_draws import CachedSample, pair_draws
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import expected_electrons
@@ -219,10 +219,10 @@ def test_without_a_spot_there_is_nothing_to_be_compared_with(dataset: Dataset) -
 
 def test_frames_of_a_take_hold_them(dataset: Dataset) -> None:
     """Mean of the difference with and without, over the pixels of one distractor, laser on and off."""
-    take = next(t for t in takes(dataset, "mono-raw"))
-    kept = TakenSample(dataset[take.sample_id])
-    bare = with_tables(dataset, distractors=[])[take.sample_id]
-    source, plain = kept.source(take), TakenSample(bare).source(take)
+    pair_draw = next(t for t in pair_draws(dataset, "mono-raw"))
+    kept = CachedSample(dataset[pair_draw.sample_id])
+    bare = with_tables(dataset, distractors=[])[pair_draw.sample_id]
+    source, plain = kept.source(pair_draw), CachedSample(bare).source(pair_draw)
     checked = 0
     for laser in (True, False):
         frames = [s.frame("down", 0, laser).image.astype(float) for s in (source, plain)]
@@ -232,7 +232,7 @@ def test_frames_of_a_take_hold_them(dataset: Dataset) -> None:
             box = Region.around(truth.u_px, truth.v_px, frames[0].shape, 13)
             difference = (frames[0] - frames[1])[box.slices()].sum() / side.dn_per_e
             rate = float(one.layers["down"].total_electrons_per_s.sum())
-            wanted = rate * side.exposure_s * take.request.laser_level * (laser or not one.follows_laser)
+            wanted = rate * side.exposure_s * pair_draw.request.laser_level * (laser or not one.follows_laser)
             ambient = source.sides["down"].light.ambient_electrons_per_s[:, *box.slices()].sum() * side.exposure_s
             # shot and read noise of 169 pixels in two frames, PRNU of the light; 5 sigma, false alarms 6e-7
             sigma = math.sqrt(2.0 * (ambient + wanted + 169 * (side.read_noise_e**2 + 1.0)))

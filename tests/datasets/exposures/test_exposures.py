@@ -19,7 +19,7 @@ from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.errors import DatasetError, RecipeError
 from phibench.datasets.exposures import exposures as takes_module
-from phibench.datasets.exposures.exposures import BOX_MARGIN_PX, Take, TakenSample, takes
+from phibench.datasets.exposures.pair_draws import BOX_MARGIN_PX, CachedSample, PairDraw, pair_draws
 from phibench.datasets.make import make, make_from_plan
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.read import Dataset, open_dataset, open_finished
@@ -39,47 +39,55 @@ def dataset(bench_dataset: Path) -> Dataset:
 
 
 def test_every_sample_is_taken_in_every_preset_and_draw_once(dataset: Dataset) -> None:
-    found = takes(dataset, draws=2)
-    assert [take.number for take in found] == list(range(len(found)))
-    keys = {(take.sample_id, take.preset, take.draw) for take in found}
+    found = pair_draws(dataset, draws=2)
+    assert [pair_draw.number for pair_draw in found] == list(range(len(found)))
+    keys = {(pair_draw.sample_id, pair_draw.preset, pair_draw.draw) for pair_draw in found}
     presets = ("bayer-raw", "srgb8", "mjpeg")
     assert keys == {(row.sample_id, p, d) for row in dataset.rows for p in presets for d in (0, 1)}
     assert len(found) == len(keys) == 18
 
 
 def test_takes_are_a_pure_function_of_the_documents(bench_dataset: Path, dataset: Dataset) -> None:
-    assert takes(dataset) == takes(open_dataset(bench_dataset))
-    fewer = takes(replace(dataset, rows=dataset.rows[:2]))
-    by_key = {(take.sample_id, take.preset): take for take in takes(dataset)}
+    assert pair_draws(dataset) == pair_draws(open_dataset(bench_dataset))
+    fewer = pair_draws(replace(dataset, rows=dataset.rows[:2]))
+    by_key = {(pair_draw.sample_id, pair_draw.preset): pair_draw for pair_draw in pair_draws(dataset)}
     assert len(fewer) == 6
-    for take in fewer:  # what is drawn for a sample does not depend on which others there are
-        assert replace(take, number=0) == replace(by_key[take.sample_id, take.preset], number=0)
+    for pair_draw in fewer:  # what is drawn for a sample does not depend on which others there are
+        assert replace(pair_draw, number=0) == replace(by_key[pair_draw.sample_id, pair_draw.preset], number=0)
 
 
 def test_another_seed_draws_other_numbers(dataset: Dataset) -> None:
     other = with_tables(dataset, dataset={"name": "tinybench", "seed": 1})
-    exposures = [{take.sample_id: take.request.exposure for take in takes(d)} for d in (dataset, other)]
+    exposures = [
+        {pair_draw.sample_id: pair_draw.request.exposure for pair_draw in pair_draws(d)} for d in (dataset, other)
+    ]
     assert all(exposures[0][name] != exposures[1][name] for name in exposures[0])
 
 
-def rank_correlation(found: tuple[Take, ...]) -> float:
-    return float(stats.spearmanr([take.number for take in found], [int(take.sample_id[-6:]) for take in found])[0])
+def rank_correlation(found: tuple[PairDraw, ...]) -> float:
+    return float(
+        stats.spearmanr(
+            [pair_draw.number for pair_draw in found], [int(pair_draw.sample_id[-6:]) for pair_draw in found]
+        )[0]
+    )
 
 
 def test_numbers_do_not_follow_depth(bench_dataset: Path) -> None:
-    found = takes(many(bench_dataset, 400), "bayer-raw")
+    found = pair_draws(many(bench_dataset, 400), "bayer-raw")
     # Spearman's rho of 400 independent ranks has the standard deviation 1 / sqrt(399) = 0.05; 4 of them: 6e-5
     assert abs(rank_correlation(found)) < 0.2
-    in_order = tuple(replace(take, number=i) for i, take in enumerate(sorted(found, key=lambda t: t.sample_id)))
+    in_order = tuple(
+        replace(pair_draw, number=i) for i, pair_draw in enumerate(sorted(found, key=lambda t: t.sample_id))
+    )
     assert rank_correlation(in_order) > 0.99
 
 
 def test_numbers_are_drawn_per_sample_and_shared_by_presets(dataset: Dataset) -> None:
     per_sample: dict[str, set[tuple[Any, ...]]] = {}
-    for take in takes(dataset):
-        request = take.request
+    for pair_draw in pair_draws(dataset):
+        request = pair_draw.request
         numbers = (request.exposure, request.laser_level, request.camera_seed, *sorted(request.overrides.items()))
-        per_sample.setdefault(take.sample_id, set()).add(numbers)
+        per_sample.setdefault(pair_draw.sample_id, set()).add(numbers)
         assert type(request.overrides["jpeg_quality"]) is int
         assert request.overrides["jpeg_quality"] in (60, 85)
         assert 0.5 <= request.laser_level <= 1.0
@@ -89,25 +97,27 @@ def test_numbers_are_drawn_per_sample_and_shared_by_presets(dataset: Dataset) ->
 
 
 def test_exposures_have_the_recipes_distribution(bench_dataset: Path) -> None:
-    found = takes(many(bench_dataset, 500), "mjpeg")
-    u = np.log(np.array([take.request.exposure for take in found]) / 0.004) / np.log(4.0)
+    found = pair_draws(many(bench_dataset, 500), "mjpeg")
+    u = np.log(np.array([pair_draw.request.exposure for pair_draw in found]) / 0.004) / np.log(4.0)
     assert stats.kstest(u, "uniform").pvalue > FALSE_ALARM
     assert stats.kstest(u**1.3, "uniform").pvalue < FALSE_ALARM  # another law is noticed
-    levels = np.array([take.request.laser_level for take in found])
+    levels = np.array([pair_draw.request.laser_level for pair_draw in found])
     # two independent columns of 500: correlation 1 / sqrt(500) = 0.045; 4 sigma, false alarms 6e-5
     assert abs(np.corrcoef(u, levels)[0, 1]) < 0.18
 
 
 def test_cameras_are_per_sample_or_one(dataset: Dataset) -> None:
     frames = dataset.info.recipe["frames"]
-    assert len({take.request.camera_seed for take in takes(dataset)}) == 3
-    assert len({t.request.camera_seed for t in takes(with_tables(dataset, frames={**frames, "camera": "one"}))}) == 1
+    assert len({pair_draw.request.camera_seed for pair_draw in pair_draws(dataset)}) == 3
+    assert (
+        len({t.request.camera_seed for t in pair_draws(with_tables(dataset, frames={**frames, "camera": "one"}))}) == 1
+    )
 
 
 def boxes(bench_dataset: Path, count: int = 1500) -> tuple[np.ndarray, Dataset, list[Region]]:
     """Place of the spot in its box along u, down; data set; boxes."""
     dataset = many(bench_dataset, count, frames={"hint": 1.0, "hint_box_px": 32})
-    found = [take.boxes[0] for take in takes(dataset, "bayer-raw") if take.boxes is not None]
+    found = [pair_draw.boxes[0] for pair_draw in pair_draws(dataset, "bayer-raw") if pair_draw.boxes is not None]
     assert len(found) == count
     u_px = dataset.rows[0].down.u_px
     return np.array([u_px - (box.u0_px - 0.5) for box in found]), dataset, found
@@ -145,13 +155,13 @@ def test_without_a_place_of_the_spot_the_box_is_anywhere(bench_dataset: Path) ->
         update={"u_px": float("nan"), "v_px": float("nan"), "visible": False, "cause": "no_reflection"}
     )
     dataset = replace(dataset, rows=tuple(row.model_copy(update={"down": nowhere}) for row in dataset.rows))
-    starts = [take.boxes[0].u0_px for take in takes(dataset, "bayer-raw") if take.boxes is not None]
+    starts = [pair_draw.boxes[0].u0_px for pair_draw in pair_draws(dataset, "bayer-raw") if pair_draw.boxes is not None]
     assert stats.kstest(np.array(starts) / 288.0, "uniform").pvalue > FALSE_ALARM
     assert len(starts) == 600
 
 
 def test_hints_come_as_often_as_the_recipe_says(bench_dataset: Path) -> None:
-    hinted = sum(take.boxes is not None for take in takes(many(bench_dataset, 1000), "bayer-raw"))
+    hinted = sum(pair_draw.boxes is not None for pair_draw in pair_draws(many(bench_dataset, 1000), "bayer-raw"))
     # binomial, n = 1000, p = 0.5: sigma 16; 4 sigma, false alarms 6e-5
     assert abs(hinted - 500) < 64
 
@@ -159,22 +169,22 @@ def test_hints_come_as_often_as_the_recipe_says(bench_dataset: Path) -> None:
 def test_a_data_set_without_the_table_needs_a_preset(tiny_dataset: Path) -> None:
     dataset = open_dataset(tiny_dataset)
     with pytest.raises(DatasetError, match=r"no \[frames\] that names presets; give one"):
-        takes(dataset)
-    [first, *_] = takes(dataset, "mjpeg")
+        pair_draws(dataset)
+    [first, *_] = pair_draws(dataset, "mjpeg")
     assert (first.preset, first.boxes, first.laser_off, first.distractors) == ("mjpeg", None, True, ())
     with pytest.raises(DatasetError, match="'ideal' ends before the pixels"):
-        takes(dataset, "ideal")
+        pair_draws(dataset, "ideal")
     with pytest.raises(DatasetError, match="draws = 0"):
-        takes(dataset, "mjpeg", 0)
+        pair_draws(dataset, "mjpeg", 0)
 
 
 def test_automatic_exposure_is_the_down_images_and_kept(dataset: Dataset) -> None:
     dataset = with_tables(dataset, frames={"exposure_s": "auto"})
-    [take, *_] = takes(dataset, "srgb8")
-    assert take.request.exposure == "auto"
-    kept = TakenSample(dataset[take.sample_id])
-    sensors = [kept.source(take).sides[position].chain.sensor for position in ("down", "up")]
-    alone = dataset[take.sample_id].frame_source("srgb8", exposure="auto").sides
+    [pair_draw, *_] = pair_draws(dataset, "srgb8")
+    assert pair_draw.request.exposure == "auto"
+    kept = CachedSample(dataset[pair_draw.sample_id])
+    sensors = [kept.source(pair_draw).sides[position].chain.sensor for position in ("down", "up")]
+    alone = dataset[pair_draw.sample_id].frame_source("srgb8", exposure="auto").sides
     assert sensors[0] == sensors[1] == alone["down"].chain.sensor
     assert alone["up"].chain.sensor != sensors[1]  # the camera by itself would have chosen another
 
@@ -320,16 +330,18 @@ def test_the_filters_of_the_recipe_are_the_detectors() -> None:
     assert build_rig(RigTable()).camera.detector.laser_filter_response == (1.0, 0.10, 0.03)
 
 
-def test_no_two_takes_of_a_sample_share_their_noise(dataset: Dataset) -> None:
+def test_no_two_pair_draws_of_a_sample_share_their_noise(dataset: Dataset) -> None:
     """A raw frame with the noise of an MJPEG one would tell the JPEG's spot better than the JPEG itself."""
-    found = takes(with_tables(dataset, frames={"presets": ["mono-raw", "bayer-raw", "srgb8", "mjpeg"], "draws": 3}))
-    keys = {(take.sample_id, take.exposure_number) for take in found}
+    found = pair_draws(
+        with_tables(dataset, frames={"presets": ["mono-raw", "bayer-raw", "srgb8", "mjpeg"], "draws": 3})
+    )
+    keys = {(pair_draw.sample_id, pair_draw.noise_draw) for pair_draw in found}
     assert len(keys) == len(found) == 12 * len(dataset)
 
 
-def test_all_takes_of_a_sample_have_one_pair_of_boxes(dataset: Dataset) -> None:
+def test_all_pair_draws_of_a_sample_have_one_pair_of_boxes(dataset: Dataset) -> None:
     """Of several boxes the overlap would tell where the spot is."""
-    found = takes(with_tables(dataset, frames={"presets": ["bayer-raw", "mjpeg"], "draws": 5, "hint": 1.0}))
-    boxes = {(take.sample_id, take.boxes) for take in found}
+    found = pair_draws(with_tables(dataset, frames={"presets": ["bayer-raw", "mjpeg"], "draws": 5, "hint": 1.0}))
+    boxes = {(pair_draw.sample_id, pair_draw.boxes) for pair_draw in found}
     assert len(boxes) == len(dataset)
     assert None not in {box for _, box in boxes}

@@ -13,7 +13,7 @@ from helpers.bench_samples import hidden, with_tables
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exposures.expected import expected_of_light, expected_region
-from phibench.datasets.exposures.exposures import TakenSample
+from phibench.datasets.exposures.pair_draws import CachedSample
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import Dataset, open_dataset
 from phibench.estimator.benchmark.dataset_pairs import DatasetPairs, dataset_pairs
@@ -49,15 +49,17 @@ def every(pairs: DatasetPairs) -> list[tuple[Pair, PairTruth]]:
 
 def test_pairs_are_the_frames_of_their_takes(dataset: Dataset, pairs: DatasetPairs) -> None:
     assert len(pairs) == 9
-    for take in pairs.takes:
-        pair = pairs.pair(take.number)
-        frames = TakenSample(dataset[take.sample_id]).source(take).frames(take.exposure_number, laser_off=True)
+    for pair_draw in pairs.pair_draws:
+        pair = pairs.pair(pair_draw.number)
+        frames = (
+            CachedSample(dataset[pair_draw.sample_id]).source(pair_draw).frames(pair_draw.noise_draw, laser_off=True)
+        )
         assert set(pair.images) == {"down", "up", "down_off", "up_off"}
         for name, image in pair.images.items():
             assert np.array_equal(image, frames.by_name[name].image)
         assert pair.card == card_of(frames.by_name["up"].sensor)
-        assert (pair.card.output == "mjpeg") == (take.preset == "mjpeg")
-        assert pair.stroke_m == dataset[take.sample_id].row.stroke_m
+        assert (pair.card.output == "mjpeg") == (pair_draw.preset == "mjpeg")
+        assert pair.stroke_m == dataset[pair_draw.sample_id].row.stroke_m
 
 
 @pytest.mark.parametrize("preset", SHAPES)
@@ -85,17 +87,19 @@ def test_a_pair_knows_nothing_of_the_scene(pairs: DatasetPairs) -> None:
 
 
 def test_the_truth_is_the_manifests(dataset: Dataset, pairs: DatasetPairs) -> None:
-    for take, (pair, truth) in zip(pairs.takes, every(pairs), strict=True):
-        row = dataset[take.sample_id].row
+    for pair_draw, (pair, truth) in zip(pairs.pair_draws, every(pairs), strict=True):
+        row = dataset[pair_draw.sample_id].row
         assert (truth.number, truth.sample_id, truth.preset, truth.draw) == (
             pair.number,
-            take.sample_id,
-            take.preset,
-            take.draw,
+            pair_draw.sample_id,
+            pair_draw.preset,
+            pair_draw.draw,
         )
         assert (truth.depth_m, truth.stroke_m, truth.hinted) == (row.depth_m, row.stroke_m, pair.box_down is not None)
-        assert truth.true_rig == truth.nominal_rig == pair.rig == dataset[take.sample_id].rig
-        assert truth.jpeg_quality == (take.request.overrides["jpeg_quality"] if take.preset == "mjpeg" else None)
+        assert truth.true_rig == truth.nominal_rig == pair.rig == dataset[pair_draw.sample_id].rig
+        assert truth.jpeg_quality == (
+            pair_draw.request.overrides["jpeg_quality"] if pair_draw.preset == "mjpeg" else None
+        )
         for position in POSITIONS:
             spot, known = getattr(truth, position), row.position(position)
             assert spot.uv_px == (known.u_px, known.v_px)
@@ -164,8 +168,8 @@ def test_snr_is_that_of_a_fit_of_flux_and_background(dataset: Dataset) -> None:
     """Draws of the chain, flux and one level per filter by weighted least squares: its scatter is the bound."""
     plain = with_tables(dataset, distractors=[])
     found = dataset_pairs(plain, "bayer-raw")
-    take = found.takes[0]
-    side = TakenSample(plain[take.sample_id]).source(take).sides["down"]
+    pair_draw = found.pair_draws[0]
+    side = CachedSample(plain[pair_draw.sample_id]).source(pair_draw).sides["down"]
     card, region = card_of(side.chain.sensor), expected_of_light(side.light, side.chain.sensor, side.chain.camera)
     design = np.stack([region.spot_e, *((region.filters == c).astype(float) for c in range(3))]).reshape(4, -1)
     variance = region.mean_e + card.read_noise_e**2 + card.dsnu_e**2 + 1 / (12 * card.dn_per_e**2)
@@ -188,14 +192,14 @@ def test_snr_is_that_of_a_fit_of_flux_and_background(dataset: Dataset) -> None:
 def test_electrons_are_those_of_the_whole_spot(dataset: Dataset, pairs: DatasetPairs) -> None:
     mono = dataset_pairs(dataset, "mono-raw")
     for found, planes in ((mono, (1.0, 1.0, 1.0)), (pairs, (1.0, 0.0, 0.0))):
-        take = found.takes[0]
-        source, truth = TakenSample(dataset[take.sample_id]).source(take), found.truth(0)
+        pair_draw = found.pair_draws[0]
+        source, truth = CachedSample(dataset[pair_draw.sample_id]).source(pair_draw), found.truth(0)
         side = source.sides["down"]
         assert side.light.spot is not None
         rate = side.light.spot.electrons_per_s.sum(axis=(1, 2)) @ planes
         # the window leaves out 8e-11 of the flux
         assert truth.down.electrons == pytest.approx(
-            rate * side.chain.sensor.exposure_s * take.request.laser_level, rel=1e-8
+            rate * side.chain.sensor.exposure_s * pair_draw.request.laser_level, rel=1e-8
         )
         assert 0.0 < truth.down.peak_e < truth.down.electrons + 1e4
 
@@ -211,7 +215,9 @@ def test_a_long_exposure_saturates_and_is_said_to(dataset: Dataset) -> None:
 
 def test_a_hidden_spot_has_no_bounds(dataset: Dataset) -> None:
     found = dataset_pairs(hidden(dataset, "up"), "bayer-raw")
-    truth = next(found.truth(i) for i in range(len(found)) if found.takes[i].sample_id == dataset.rows[0].sample_id)
+    truth = next(
+        found.truth(i) for i in range(len(found)) if found.pair_draws[i].sample_id == dataset.rows[0].sample_id
+    )
     assert (truth.up.visible, truth.up.cause, truth.up.snr, truth.up.saturated) == (False, "occluded:crate", 0.0, False)
     assert truth.up.bound_px2 is truth.up.raw_bound_px2 is None
     assert truth.down.visible
@@ -230,7 +236,7 @@ def test_order_and_subsets(dataset: Dataset, pairs: DatasetPairs) -> None:
 def test_draws_are_independent(dataset: Dataset) -> None:
     """Differences of on and off frames of one pattern, of two draws: their noise is uncorrelated."""
     found = dataset_pairs(dataset, "bayer-raw", draws=2)
-    first, second = (t.number for t in found.takes if t.sample_id == dataset.rows[0].sample_id)
+    first, second = (t.number for t in found.pair_draws if t.sample_id == dataset.rows[0].sample_id)
     noise = []
     for number in (first, second):
         pair = found.pair(number)

@@ -134,7 +134,9 @@ def test_every_pose_gives_one_outline(tiny: Dataset) -> None:
 def test_pairs_of_samples_keep_their_order(tiny: Dataset) -> None:
     backwards = tiny.samples[::-1]
     pairs = pairs_of(tiny, backwards, "mjpeg", draws=2, laser_off=False)
-    assert [(t.sample_id, t.draw) for t in pairs.takes] == [(s.row.sample_id, k) for s in backwards for k in (0, 1)]
+    assert [(t.sample_id, t.draw) for t in pairs.pair_draws] == [
+        (s.row.sample_id, k) for s in backwards for k in (0, 1)
+    ]
     assert [pairs.pair(n).number for n in range(len(pairs))] == list(range(len(pairs)))
     assert pairs.pair(0).down_off is None
     assert np.array_equal(pairs.image(1, "up", True), pairs.pair(1).up)

@@ -18,7 +18,7 @@ from phibench.estimator.studies.baseline.study import STUDY
 from phibench.estimator.studies.baseline.tables import (
     SENSES,
     LawFit,
-    auto_takes,
+    auto_exposed_draws,
     drawn_errors,
     drawn_misalignment,
     estimates,
@@ -222,7 +222,7 @@ def test_the_whole_study_in_small(data: Path) -> None:
     assert {drawing.name for drawing in result.drawings} == {"curves", "laws"}
     assert len(result.findings) == 6
     dataset = open_dataset(data / "small")
-    assert len(auto_takes(dataset, "mjpeg", 2)) == 10
+    assert len(auto_exposed_draws(dataset, "mjpeg", 2)) == 10
     assert len(experiments_of(dataset)) == 5
     with pytest.raises(DatasetError, match="none of the paper's experiments"):
         experiments_of(type(dataset)(dataset.folder, dataset.info, dataset.rigs, dataset.room, ()))

@@ -1,9 +1,10 @@
-"""Takes: which frames of which samples a benchmark consists of. A pure function of a data set's documents.
+"""Draws of stroke pairs: the frames that a benchmark consists of, as a pure function of a data set's documents.
 
-All numbers of `[frames]` are drawn per sample, each from a stream of its own; the order of the takes is drawn, too, so
-that a take's number says nothing about the scene.
+A pair draw is one draw of the noise of one sample in one preset. All numbers of `[frames]` are drawn per sample, each
+from a random stream of its own. The order of the pair draws is drawn, too, so that a number says nothing about the
+scene.
 
-Frames of takes: a sample's layers and distractors, read and computed once, and the camera of each take.
+`pair_draws` lists them, `CachedSample` reads a sample's layers once and makes the frame source of each.
 """
 
 from __future__ import annotations
@@ -33,11 +34,12 @@ BOX_MARGIN_PX = 4
 """A hinted spot is at least this far from the edges of its box."""
 PRESETS = ("mono-raw", "bayer-raw", "srgb8", "mjpeg")
 _CAMERAS = 2**31
+_STREAM, _ORDER_STREAM = "take", "takes"  # names of random streams: another name would draw other numbers
 
 
 @dataclass(frozen=True)
-class Take:
-    """One draw of one sample in one preset.
+class PairDraw:
+    """One draw of the noise of one sample in one preset; its frames are drawn by `CachedSample.source`.
 
     Attributes
     ----------
@@ -47,7 +49,7 @@ class Take:
     preset : str
     draw : int
     request : FrameRequest
-        With exposure "auto" where the camera chooses it: see `taken.TakenSample`.
+        With exposure "auto" where the camera chooses it.
     laser_off : bool
         Whether frames with the laser off belong to it.
     boxes : (down, up) or None
@@ -66,13 +68,13 @@ class Take:
     distractors: tuple[int, ...]
 
     @property
-    def exposure_number(self) -> int:
+    def noise_draw(self) -> int:
         """Draw of `FrameSource.frames`: another one in each preset, or JPEG frames would have a raw twin's noise."""
         return self.draw * len(PRESETS) + PRESETS.index(self.preset)
 
 
-def takes(dataset: Dataset, preset: str | None = None, draws: int | None = None) -> tuple[Take, ...]:
-    """All takes of a data set, by number.
+def pair_draws(dataset: Dataset, preset: str | None = None, draws: int | None = None) -> tuple[PairDraw, ...]:
+    """All pair draws of a data set, by number.
 
     Parameters
     ----------
@@ -95,19 +97,19 @@ def takes(dataset: Dataset, preset: str | None = None, draws: int | None = None)
     frames = frames or FramesTable()
     presets = frames.presets if preset is None else (preset,)
     count = frames.draws if draws is None else whole_number("draws", draws, 1)
-    found = [take for sample in dataset for take in _of_sample(sample, frames, presets, count)]
+    found = [pair_draw for sample in dataset for pair_draw in _of_sample(sample, frames, presets, count)]
     name, seed = dataset.info.name, dataset.info.recipe["dataset"]["seed"]
-    order = generator(name, seed, "takes", "order", *presets, count).permutation(len(found))
+    order = generator(name, seed, _ORDER_STREAM, "order", *presets, count).permutation(len(found))
     return tuple(replace(found[k], number=number) for number, k in enumerate(order))
 
 
-def _of_sample(sample: Sample, frames: FramesTable, presets: tuple[str, ...], draws: int) -> Iterator[Take]:
+def _of_sample(sample: Sample, frames: FramesTable, presets: tuple[str, ...], draws: int) -> Iterator[PairDraw]:
     lights = present(sample.stream_names, sample.dataset.recipe.distractors)
     requests = {preset: _request(sample, frames, preset) for preset in presets}
     boxes = _boxes(sample, frames)
     for draw in range(draws):
         for preset, request in requests.items():
-            yield Take(0, sample.row.sample_id, preset, draw, request, frames.laser_off, boxes, lights)
+            yield PairDraw(0, sample.row.sample_id, preset, draw, request, frames.laser_off, boxes, lights)
 
 
 def _request(sample: Sample, frames: FramesTable, preset: str) -> FrameRequest:
@@ -133,11 +135,11 @@ def _exposure(sample: Sample, frames: FramesTable) -> Exposure:
 def _camera_seed(sample: Sample, frames: FramesTable) -> int:
     name, seed, sample_id = sample.stream_names
     owner = (sample_id,) if frames.camera == "per_sample" else ()
-    return int(generator(name, seed, "take", "camera", *owner).integers(_CAMERAS))
+    return int(generator(name, seed, _STREAM, "camera", *owner).integers(_CAMERAS))
 
 
 def _boxes(sample: Sample, frames: FramesTable) -> tuple[Region, Region] | None:
-    """One pair of boxes for all takes of a sample: of several, the overlap would tell where the spot is."""
+    """One pair of boxes for all draws of a sample: the overlap of several would tell where the spot is."""
     if _generator(sample, "hint").random() >= frames.hint:
         return None
     down, up = (_box(sample, position, frames.hint_box_px) for position in POSITIONS)
@@ -171,11 +173,11 @@ def _value(sample: Sample, key: str, table: DistributionTable) -> float:
 
 
 def _generator(sample: Sample, *key: Name) -> np.random.Generator:
-    return generator(*sample.stream_names, "take", *key)
+    return generator(*sample.stream_names, _STREAM, *key)
 
 
 @dataclass(frozen=True)
-class TakenSample:
+class CachedSample:
     """A sample that keeps its layers; it is what `FrameSource` needs of one."""
 
     sample: Sample = field(repr=False)
@@ -192,7 +194,7 @@ class TakenSample:
 
     @property
     def nominal_rig(self) -> Rig:
-        """The rig that the user believes in."""
+        """The nominal rig: the one that estimators are given."""
         return self.sample.nominal_rig
 
     @property
@@ -226,15 +228,15 @@ class TakenSample:
     def _layers(self) -> dict[str, tuple[NDArray[np.float32], SpotWindow]]:
         return {position: (self.sample.ambient(position), self.sample.spot(position)) for position in POSITIONS}
 
-    def source(self, take: Take) -> FrameSource:
-        """Return what draws the frames of a take, distractors included.
+    def source(self, pair_draw: PairDraw) -> FrameSource:
+        """Source of the frames of a pair draw, distractors included.
 
         Raises
         ------
         DatasetError
             If a layer cannot be read; in one sentence.
         """
-        request = self._locked(take.request)
+        request = self._locked(pair_draw.request)
         lights = {p: tuple(one.other(p, request.laser_level) for one in self.distractors) for p in POSITIONS}
         return FrameSource.from_request(self, request, lights)
 
