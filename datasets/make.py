@@ -20,7 +20,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan.plan import Plan, make_plan, shard_plan
 from phibench.datasets.recipe.checks import warnings
 from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_text, with_numbers
-from phibench.datasets.store import schema as layout
+from phibench.datasets.store import schema
 from phibench.datasets.store.documents import dataset_info, info_text, parse_info, read_manifest, same_content
 from phibench.datasets.store.files import WriteError, only_run, remove_temporary, write_text
 from phibench.datasets.store.schema import DatasetInfo
@@ -106,7 +106,7 @@ def _make(plan: Plan, recipe: str, out: Path, crew: Crew, journal: Journal, cons
         console.print(f"{out} is complete, nothing to do", highlight=False)
         return []
     if todo:
-        (out / layout.SUMS).unlink(missing_ok=True)
+        (out / schema.CHECKSUMS).unlink(missing_ok=True)
         finish_tasks(plan, tasks, todo, journal, head, out, crew, console)
         faults = _loose_ends(plan, head, journal, tasks, out)
     journal.begin(head, tasks)
@@ -144,4 +144,4 @@ def _write_run(out: Path, count: int, began: datetime, seconds: float) -> None:
         "workers": count,
         "cores": os.cpu_count(),
     }
-    write_text(out / layout.RUN, json.dumps(document, indent=1) + "\n")
+    write_text(out / schema.RUN, json.dumps(document, indent=1) + "\n")

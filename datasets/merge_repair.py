@@ -22,11 +22,11 @@ from phibench.datasets.plan.plan import make_plan, parse_shard, shard_plan
 from phibench.datasets.progress import Steps
 from phibench.datasets.recipe.load import parse_recipe
 from phibench.datasets.recipe.tables import Recipe
-from phibench.datasets.store import schema as layout
+from phibench.datasets.store import schema
 from phibench.datasets.store.documents import dataset_info, info_text, parse_info, recipe_sha256, same_content
 from phibench.datasets.store.files import WriteError, only_run, remove_temporary, sha256, write_atomic
 from phibench.datasets.store.provenance import provenance
-from phibench.datasets.store.schema import SUMS, DatasetInfo
+from phibench.datasets.store.schema import CHECKSUMS, DatasetInfo
 
 
 def merge(out: str | Path, shards: Sequence[str | Path], console: Console | None = None) -> Path:
@@ -47,7 +47,7 @@ def merge(out: str | Path, shards: Sequence[str | Path], console: Console | None
     with only_run(out), Journal(out) as journal:
         claim(out, info.name)
         remove_temporary(out)
-        (out / SUMS).unlink(missing_ok=True)
+        (out / CHECKSUMS).unlink(missing_ok=True)
         journal.begin(head, [])  # says what the folder is, should this be interrupted
         _copy(out, [entries[name] for name in names], console)
         journal.entries = {name: entries[name][0] for name in names}
@@ -79,7 +79,7 @@ def _collect(folders: list[Path]) -> tuple[Head, DatasetInfo, dict[str, tuple[En
 
 def _finished(folder: Path) -> Head:
     head = Journal(folder).head
-    if head is None or not (folder / SUMS).is_file():
+    if head is None or not (folder / CHECKSUMS).is_file():
         raise DatasetError(f"{folder} is not a finished shard; run its `phibench dataset make` again")
     return head
 
@@ -154,11 +154,11 @@ def repair(
 
 def _recipe(folder: Path, head: Head, info: dict[str, object]) -> Recipe:
     if not head.recipe:
-        raise DatasetError(f"{folder / layout.RECIPE} is missing; put the right one back")
-    recipe = parse_recipe(head.recipe, f"{folder / layout.RECIPE}")
+        raise DatasetError(f"{folder / schema.RECIPE} is missing; put the right one back")
+    recipe = parse_recipe(head.recipe, f"{folder / schema.RECIPE}")
     if recipe_sha256(recipe) != info["recipe_sha256"]:
         raise DatasetError(
-            f"{folder / layout.RECIPE} is not the recipe that {layout.INFO} names; put the right one back"
+            f"{folder / schema.RECIPE} is not the recipe that {schema.INFO} names; put the right one back"
         )
     return recipe
 

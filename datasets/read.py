@@ -269,8 +269,9 @@ class Sample:
         laser_off : bool
             Also `frames.down_off` and `frames.up_off`.
         **options
-            Of `frame_request.FrameRequest`: exposure (seconds or "auto"), lamp_level, laser_level, carriage_speed_m_s,
-            region, camera_seed, and any number of the preset, such as ``jpeg_quality=60``.
+            Of `FrameRequest`: exposure (seconds, "auto", or None for the preset's time; by default "auto" for srgb8 and
+            mjpeg, as the camera would, and the preset's time for the others), lamp_level, laser_level,
+            carriage_speed_m_s, region, camera_seed, and any number of the preset, such as ``jpeg_quality=60``.
 
         Raises
         ------

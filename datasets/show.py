@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from rich.table import Table
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.progress import Steps
 from phibench.datasets.read import Dataset, Sample, open_finished
-from phibench.datasets.store import schema as layout
+from phibench.datasets.store import schema
 from phibench.datasets.store.pictures import (
     TEXT,
     Picture,
@@ -35,7 +36,7 @@ _CAPTION_PX = 16
 
 
 def show(folder: str | Path, console: Console | None = None, out: str | Path | None = None) -> Path:
-    """Print the table of a data set and write its contact sheet; return the path of the sheet.
+    """Write the contact sheet of a data set and print its table; return the path of the sheet.
 
     Parameters
     ----------
@@ -50,21 +51,33 @@ def show(folder: str | Path, console: Console | None = None, out: str | Path | N
         If the data set is damaged or unfinished, or, after the table, if the sheet cannot be written.
     """
     console, dataset = console or _console(), open_finished(folder)
-    _print_table(dataset, console)
-    path = dataset.folder / layout.CONTACT_SHEET if out is None else Path(out)
-    sheet = contact_sheet(dataset, console)
+    path = dataset.folder / schema.CONTACT_SHEET if out is None else Path(out)
+    # the sheet comes first: who reads the table may leave before its end, as `head` does
+    sheet, fault = contact_sheet(dataset, Console(stderr=True)), None
     try:
         save_png(path, sheet)
     except OSError as error:
-        raise DatasetError(f"the contact sheet was not written: {error}, for example `--out sheet.png`") from error
+        fault = error
+    _print_table(dataset, console)
+    if fault is not None:
+        raise DatasetError(f"the contact sheet was not written: {fault}, for example `--out sheet.png`") from fault
     console.print(f"contact sheet: {path}", highlight=False, soft_wrap=True)
     return path
 
 
+class _PatientConsole(Console):
+    """Console that goes on without output when its reader has left."""
+
+    def on_broken_pipe(self) -> None:
+        """Be quiet from now on; rich's own method ends the program."""
+        with contextlib.suppress(SystemExit):
+            super().on_broken_pipe()
+
+
 def _console() -> Console:
     """Terminal as it is; wide enough for the table where the output goes to a file."""
-    console = Console()
-    return console if console.is_terminal else Console(width=170)
+    console = _PatientConsole()
+    return console if console.is_terminal else _PatientConsole(width=170)
 
 
 def table(dataset: Dataset) -> Table:

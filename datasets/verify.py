@@ -22,8 +22,8 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan.plan import PairPlan, Plan, make_plan, shard_plan
 from phibench.datasets.progress import Steps
 from phibench.datasets.read import Dataset, Sample, open_dataset
-from phibench.datasets.store import schema as layout
-from phibench.datasets.store.checksums import damaged, read_sums, strays
+from phibench.datasets.store import schema
+from phibench.datasets.store.checksums import damaged, read_checksums, strays
 from phibench.datasets.store.documents import differences, same_number, sensitivity_fault, to_json
 from phibench.datasets.store.layers import (
     SPOT_STACKS,
@@ -46,20 +46,20 @@ def plan_faults(dataset: Dataset) -> Iterator[str]:
     try:
         plan = shard_plan(make_plan(dataset.recipe), dataset.info.shard)
     except DatasetError as error:
-        yield f"{layout.INFO}: its recipe cannot be followed: {error}"
+        yield f"{schema.INFO}: its recipe cannot be followed: {error}"
         return
     rows, pairs = {row.sample_id: row for row in dataset.rows}, {pair.sample_id: pair for pair in plan.pairs}
     for name in sorted(set(pairs) - set(rows)):
-        yield f"{layout.MANIFEST}: sample {name} of the recipe is missing"
+        yield f"{schema.MANIFEST}: sample {name} of the recipe is missing"
     for name in sorted(set(rows) - set(pairs)):
-        yield f"{layout.MANIFEST}: sample {name} is not in the recipe"
+        yield f"{schema.MANIFEST}: sample {name} is not in the recipe"
     if len(rows) != len(dataset.rows):
-        yield f"{layout.MANIFEST}: a sample is listed twice"
+        yield f"{schema.MANIFEST}: a sample is listed twice"
     for name in (name for name in pairs if name in rows):
         yield from _row_faults(plan, pairs[name], rows[name])
     yield from _rig_faults(plan, dataset)
     if [(pose.pose, pose.rig) for pose in dataset.info.poses] != [(pose.pose_id, pose.rig) for pose in plan.poses]:
-        yield f"{layout.INFO}: the poses are not those of the recipe"
+        yield f"{schema.INFO}: the poses are not those of the recipe"
 
 
 def _row_faults(plan: Plan, pair: PairPlan, row: ManifestRow) -> Iterator[str]:
@@ -80,10 +80,10 @@ def _row_faults(plan: Plan, pair: PairPlan, row: ManifestRow) -> Iterator[str]:
 def _rig_faults(plan: Plan, dataset: Dataset) -> Iterator[str]:
     held = dataset.rigs.documents
     if set(held) != set(plan.rigs):
-        yield f"{layout.RIGS}: the rigs are not those of the recipe"
+        yield f"{schema.RIGS}: the rigs are not those of the recipe"
     for name in (name for name in plan.rigs if name in held):
         if not alike(_with_form(held[name]), json.loads(json.dumps(to_json(plan.rigs[name])))):
-            yield f"{layout.RIGS}: {name} is not the rig that the recipe gives"
+            yield f"{schema.RIGS}: {name} is not the rig that the recipe gives"
 
 
 def _with_form(rig: dict[str, Any]) -> dict[str, Any]:
@@ -150,10 +150,10 @@ def verify(folder: str | Path, truth_layers: bool = True, console: Console | Non
     folder, console = Path(folder), console or Console(stderr=True)
     if not folder.is_dir():
         raise DatasetError(f"there is no folder {folder}")
-    if not (folder / layout.INFO).is_file():
-        raise DatasetError(f"{folder} is not a data set: it has no {layout.INFO}")
+    if not (folder / schema.INFO).is_file():
+        raise DatasetError(f"{folder} is not a data set: it has no {schema.INFO}")
     try:
-        faults, files = damaged(folder), len(read_sums(folder))
+        faults, files = damaged(folder), len(read_checksums(folder))
         notes = tuple(f"{name} is not part of the data set" for name in strays(folder))
     except DatasetError as error:
         faults, files, notes = [str(error)], 0, ()
@@ -177,7 +177,7 @@ def _content_faults(dataset: Dataset, bad: set[str], truth_layers: bool, console
             for position in POSITIONS:
                 faults += _guarded(_spot_faults(sample, position, answer, bad))
             steps.advance()
-        if dataset.room.lit and layout.LIGHT_MAP not in bad:
+        if dataset.room.lit and schema.LIGHT_MAP not in bad:
             faults += _guarded(_light_map_faults(dataset))
         for pose in dataset.info.poses:
             faults += _guarded(_view_faults(dataset, pose, bad, truth_layers))
@@ -283,9 +283,9 @@ def _light_map_faults(dataset: Dataset) -> Iterator[str]:
     for name, shape in shapes.items():
         array = getattr(light, name)
         if array.shape != shape:
-            yield f"{layout.LIGHT_MAP}: {name} has the shape {array.shape} instead of {shape}"
+            yield f"{schema.LIGHT_MAP}: {name} has the shape {array.shape} instead of {shape}"
         if not np.all(np.isfinite(array) & (array >= 0)):
-            yield f"{layout.LIGHT_MAP}: {name} has negative or non-finite values"
+            yield f"{schema.LIGHT_MAP}: {name} has negative or non-finite values"
 
 
 def _truth_faults(dataset: Dataset, pose: PoseInfo, shape: tuple[int, int]) -> Iterator[str]:

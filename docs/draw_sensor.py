@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Sample, open_dataset
 from phibench.datasets.store.files import write_bytes
-from phibench.render.sensor import processing as isp
+from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import collected, expected_electrons, mean_charge
 from phibench.render.sensor.light import Light, Region
@@ -52,7 +52,7 @@ def steps(source: FrameSource) -> list[tuple[str, Picture]]:
     box = chain.raw_region(region, size)
     raw = chain.raw(light, stream, box)
     linear = linear_rgb(linear_signal(raw, s, np.float32), s)
-    unbalanced = isp.demosaic(linear_signal(raw, s, np.float32))
+    unbalanced = processing.demosaic(linear_signal(raw, s, np.float32))
     inner = (..., *region.slices(box))
     whole = chain.jpeg_region(region, size)
     eight = chain.developed(light, stream, whole)
@@ -74,7 +74,7 @@ def steps(source: FrameSource) -> list[tuple[str, Picture]]:
 
 def shown(planes: NDArray[np.floating]) -> Picture:
     """Linear planes, full scale 1, as a screen shows them."""
-    return isp.eight_bit(srgb_encoded(np.asarray(planes, float)))
+    return processing.eight_bit(srgb_encoded(np.asarray(planes, float)))
 
 
 def grey(values: NDArray[np.floating]) -> Picture:
@@ -84,7 +84,7 @@ def grey(values: NDArray[np.floating]) -> Picture:
 
 def draw_steps(sample: Sample, path: Path) -> None:
     """Ten panels of the same pixels."""
-    panels = steps(sample.region_frames("mjpeg", _SIDE_PX))
+    panels = steps(sample.region_frames("mjpeg", _SIDE_PX, exposure=None))
     figure, axes = plt.subplots(2, 5, figsize=(10.0, 4.6), layout="constrained")
     for number, (axis, (caption, picture)) in enumerate(zip(axes.flat, panels, strict=True), 1):
         axis.imshow(np.kron(picture, np.ones((_ZOOM, _ZOOM, 1), np.uint8)), interpolation="none")

@@ -14,8 +14,8 @@ from pathlib import Path
 from phibench.datasets.build.journal import Entry, Head
 from phibench.datasets.build.task_list import sample_task_name, spot_task_name
 from phibench.datasets.plan.plan import PairPlan, Plan
-from phibench.datasets.store import schema as layout
-from phibench.datasets.store.checksums import sums_text
+from phibench.datasets.store import schema
+from phibench.datasets.store.checksums import checksums_text
 from phibench.datasets.store.documents import manifest_documents, rigs_text
 from phibench.datasets.store.files import write_bytes
 from phibench.datasets.store.schema import ManifestRow
@@ -26,14 +26,14 @@ def documents(plan: Plan, head: Head, entries: Mapping[str, Entry]) -> dict[str,
     """All small files of a finished data set by name, SHA256SUMS last."""
     rows = [_row(pair, entries) for pair in plan.pairs]
     small = {
-        layout.INFO: head.info.encode(),
-        layout.RECIPE: head.recipe.encode(),
-        layout.RIGS: rigs_text(plan.rigs).encode(),
+        schema.INFO: head.info.encode(),
+        schema.RECIPE: head.recipe.encode(),
+        schema.RIGS: rigs_text(plan.rigs).encode(),
         **manifest_documents(rows),
     }
     hashes = {name: digest for entry in entries.values() for name, digest in entry.files.items()}
     hashes |= {name: hashlib.sha256(data).hexdigest() for name, data in small.items()}
-    return {**small, layout.SUMS: sums_text(hashes).encode()}
+    return {**small, schema.CHECKSUMS: checksums_text(hashes).encode()}
 
 
 def _row(pair: PairPlan, entries: Mapping[str, Entry]) -> ManifestRow:
@@ -52,8 +52,8 @@ def write_documents(out: Path, wanted: Mapping[str, bytes], names: Iterable[str]
     """Write some of them, in their order. Without SHA256SUMS the folder does not pass for finished."""
     names = set(names)
     if names:
-        (out / layout.SUMS).unlink(missing_ok=True)
-        names.add(layout.SUMS)
+        (out / schema.CHECKSUMS).unlink(missing_ok=True)
+        names.add(schema.CHECKSUMS)
     for name, data in wanted.items():
         if name in names:
             write_bytes(out / name, data)

@@ -9,7 +9,7 @@ from pathlib import Path
 from phibench.datasets.build.tasks import Made
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.recipe.tables import AmbientTable
-from phibench.datasets.store import schema as layout
+from phibench.datasets.store import schema
 from phibench.datasets.store.files import write_bytes
 from phibench.render.room.light_map import BakeSettings, LightMap, decoded, encoded, light_map
 from phibench.scenes.rig import Rig
@@ -23,8 +23,8 @@ def bake_settings(ambient: AmbientTable) -> BakeSettings:
 
 def bake_room(out: Path, rig: Rig, room: Room, ambient: AmbientTable) -> Made:
     """Task: write the room's light map below `out`."""
-    write_bytes(out / layout.LIGHT_MAP, encoded(light_map(rig.at(0.0), room, bake_settings(ambient))))
-    return Made((layout.LIGHT_MAP,))
+    write_bytes(out / schema.LIGHT_MAP, encoded(light_map(rig.at(0.0), room, bake_settings(ambient))))
+    return Made((schema.LIGHT_MAP,))
 
 
 def read_light_map(out: Path) -> LightMap:
@@ -35,7 +35,7 @@ def read_light_map(out: Path) -> LightMap:
     DatasetError
         If the file is missing or not a light map.
     """
-    path = out / layout.LIGHT_MAP
+    path = out / schema.LIGHT_MAP
     try:
         return decoded(path.read_bytes())
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:

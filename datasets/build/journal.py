@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from phibench.datasets.store import schema as layout
+from phibench.datasets.store import schema
 from phibench.datasets.store.files import write_bytes
 
 
@@ -46,7 +46,7 @@ class Journal:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._path = folder / layout.JOURNAL
+        self._path = folder / schema.JOURNAL
         self._file: IO[bytes] | None = None
         self.head: Head | None = None
         self.entries: dict[str, Entry] = {}

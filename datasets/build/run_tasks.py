@@ -28,7 +28,7 @@ from phibench.datasets.build.workers import Crew
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan.plan import Plan
 from phibench.datasets.progress import Steps
-from phibench.datasets.store import schema as layout
+from phibench.datasets.store import schema
 from phibench.datasets.store.documents import read_info
 from phibench.datasets.store.files import TEMPORARY_PREFIX, sha256, write_bytes
 from phibench.render.room.light_map import fixed_shapes
@@ -146,9 +146,9 @@ def check_disk(out: Path, needed: int, replaced: Collection[str]) -> None:
 def stale_files(out: Path, expected: Collection[str]) -> list[str]:
     """Files that are called like a task's and that no task of now writes: of removed samples and poses."""
     below = (path for top in ("views", "spots", "previews") for path in (out / top).rglob("*"))
-    names = [path.relative_to(out).as_posix() for path in (*out.glob(layout.LIGHT_MAP), *below)]
+    names = [path.relative_to(out).as_posix() for path in (*out.glob(schema.LIGHT_MAP), *below)]
     wanted = set(expected)
-    return sorted(name for name in names if layout.is_task_file(name) and name not in wanted)
+    return sorted(name for name in names if schema.is_task_file(name) and name not in wanted)
 
 
 def remove_files(out: Path, names: Collection[str]) -> None:
@@ -173,11 +173,11 @@ def held_head(out: Path) -> Head | None:
     head = Journal(out).head
     if head is not None:
         return head
-    if not (out / layout.INFO).is_file():
+    if not (out / schema.INFO).is_file():
         raise DatasetError(f"{out} is not empty and holds no data set; give an empty or a new folder")
     read_info(out)
-    recipe = (out / layout.RECIPE).read_text(encoding="utf-8") if (out / layout.RECIPE).is_file() else ""
-    return Head((out / layout.INFO).read_text(encoding="utf-8"), recipe)
+    recipe = (out / schema.RECIPE).read_text(encoding="utf-8") if (out / schema.RECIPE).is_file() else ""
+    return Head((out / schema.INFO).read_text(encoding="utf-8"), recipe)
 
 
 def _refuse_other(out: Path, name: str) -> None:
@@ -236,7 +236,7 @@ def finish_tasks(
 
 def _run(tasks: list[Task], journal: Journal, out: Path, crew: Crew, console: Console) -> dict[str, Failed]:
     failures: dict[str, Failed] = {}
-    with Steps(console, "tasks", len(tasks)) as steps, (out / layout.LOG).open("a", encoding="utf-8") as log:
+    with Steps(console, "tasks", len(tasks)) as steps, (out / schema.LOG).open("a", encoding="utf-8") as log:
         for task, outcome in dispatch(tasks, crew.executor(len(tasks))):
             if isinstance(outcome, Done):
                 journal.add(Entry(task.name, task.key, outcome.files, outcome.result))
@@ -250,7 +250,7 @@ def _run(tasks: list[Task], journal: Journal, out: Path, crew: Crew, console: Co
 
 def _report(failures: dict[str, Failed], count: int) -> str:
     lines = [f"  {name}: {failed.cause}" for name, failed in list(failures.items())[:_TOLD]]
-    more = [f"  and {len(failures) - _TOLD} more, see {layout.LOG}"] if len(failures) > _TOLD else []
+    more = [f"  and {len(failures) - _TOLD} more, see {schema.LOG}"] if len(failures) > _TOLD else []
     first = (
         f"{len(failures)} of {count} tasks failed; what is finished is kept, run the same command again for the rest:"
     )

@@ -9,7 +9,7 @@ import numpy as np
 from phibench.datasets.build.spot_task import RefusedSampleError
 from phibench.datasets.build.tasks import Made
 from phibench.datasets.plan.plan import PairPlan
-from phibench.datasets.store import schema as layout
+from phibench.datasets.store import schema
 from phibench.datasets.store.layers import SpotWindow, read_ambient, read_ambient_variance, read_spot
 from phibench.datasets.store.pictures import Side, sample_picture, save_png
 from phibench.datasets.store.schema import NoiseRow
@@ -32,7 +32,7 @@ def finish_sample(out: Path, pair: PairPlan, rig: Rig, room: Room, spot: LaserSp
     for position in POSITIONS:
         view = rig.at(Stroke(pair.stroke_m).offset_m(position))
         truth = spot_truth(view, spot, room.shapes(view))
-        ambient = out / layout.view_file(pair.pose_id(position), "ambient")
+        ambient = out / schema.view_file(pair.pose_id(position), "ambient")
         planes, window = read_ambient(ambient), _window(out, pair, position)
         budget = spot_noise(view, truth, window, planes, read_ambient_variance(ambient))
         _check(f"{pair.sample_id} {position}", budget)
@@ -40,7 +40,7 @@ def finish_sample(out: Path, pair: PairPlan, rig: Rig, room: Room, spot: LaserSp
         frame = planes.astype(float)
         window.add_to(frame)
         sides.append(Side(position, truth, frame, planes))
-    file = layout.preview_file(pair.sample_id)
+    file = schema.preview_file(pair.sample_id)
     save_png(out / file, sample_picture(sides, rig.camera.detector))
     return Made((file,), rows)
 
@@ -69,5 +69,5 @@ def _check(name: str, budget: NoiseBudget | None) -> None:
 
 def _window(out: Path, pair: PairPlan, position: str) -> SpotWindow:
     """Spot layer; the spot's task has made sure that there is a file exactly if light reaches the image."""
-    path = out / layout.spot_file(pair.sample_id, position)
+    path = out / schema.spot_file(pair.sample_id, position)
     return read_spot(path) if path.is_file() else SpotWindow.empty()

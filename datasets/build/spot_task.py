@@ -11,7 +11,7 @@ import numpy as np
 from phibench.datasets.build.tasks import Made
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan.plan import PairPlan
-from phibench.datasets.store import schema as layout
+from phibench.datasets.store import schema
 from phibench.datasets.store.layers import SpotWindow, write_spot
 from phibench.datasets.store.schema import CertificateRow, ManifestRow, SpotRow
 from phibench.render.optics.certificate import Certificate, certify
@@ -72,7 +72,7 @@ def make_spot(out: Path, dataset: str, rig: Rig, room: Room, spot: LaserSpot, pa
 
 def _write_layer(out: Path, dataset: str, pair: PairPlan, position: str, answer: SpotAnswer) -> str | None:
     """Write a spot layer, or make sure that there is none where no light reaches the image."""
-    file = layout.spot_file(pair.sample_id, position)
+    file = schema.spot_file(pair.sample_id, position)
     if not answer.on_image:
         (out / file).unlink(missing_ok=True)
         return None
@@ -113,8 +113,8 @@ def _spot_row(pose_id: str, view: View, answer: SpotAnswer, file: str | None) ->
         **asdict(answer.truth),
         coma_shift_px=answer.coma_shift_px,
         electrons_per_s=_triple(answer.layer.total_electrons_per_s),
-        view_ambient_file=layout.view_file(pose_id, "ambient"),
-        view_truth_file=layout.view_file(pose_id, "truth"),
+        view_ambient_file=schema.view_file(pose_id, "ambient"),
+        view_truth_file=schema.view_file(pose_id, "truth"),
         spot_file=file,
         certificate=None if certificate is None else CertificateRow(**asdict(certificate)),
         noise=None,  # known when the views are there: `sample_task`

@@ -9,7 +9,7 @@ from phibench.datasets.build.bake_task import bake_settings, read_light_map
 from phibench.datasets.build.tasks import Made
 from phibench.datasets.plan.plan import PosePlan
 from phibench.datasets.recipe.tables import AmbientTable
-from phibench.datasets.store import schema as layout
+from phibench.datasets.store import schema
 from phibench.datasets.store.layers import write_ambient, write_truth
 from phibench.datasets.store.pictures import exposure_s, save_png, to_srgb
 from phibench.scenes.rig import Rig
@@ -42,9 +42,9 @@ def render_view(out: Path, dataset: str, rig: Rig, room: Room, pose: PosePlan, a
         layer = dark_layer(rig.camera)
     planes = layer.electrons_per_s
     header_ambient = {**header, **ambient.model_dump(), "seed": pose.seed}
-    write_ambient(out / layout.view_file(pose.pose_id, "ambient"), planes, layer.variance_per_s2, header_ambient)
-    write_truth(out / layout.view_file(pose.pose_id, "truth"), truth_layer(view, room.shapes(view)), header)
+    write_ambient(out / schema.view_file(pose.pose_id, "ambient"), planes, layer.variance_per_s2, header_ambient)
+    write_truth(out / schema.view_file(pose.pose_id, "truth"), truth_layer(view, room.shapes(view)), header)
     detector = rig.camera.detector
     picture = to_srgb(planes, detector, exposure_s(planes, detector))
-    save_png(out / layout.view_file(pose.pose_id, "preview"), picture)
-    return Made(tuple(layout.view_file(pose.pose_id, name) for name in ("ambient", "truth", "preview")))
+    save_png(out / schema.view_file(pose.pose_id, "preview"), picture)
+    return Made(tuple(schema.view_file(pose.pose_id, name) for name in ("ambient", "truth", "preview")))

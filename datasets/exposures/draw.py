@@ -21,6 +21,7 @@ from rich.console import Console
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.frame_files import (
     PREVIEW,
+    TRUTH,
     VALUES,
     FrameRow,
     claim,
@@ -36,11 +37,11 @@ from phibench.datasets.frames.source import Frame, FrameSource, has_place
 from phibench.datasets.parallel import parallel_map
 from phibench.datasets.progress import Steps
 from phibench.datasets.read import Dataset, Sample, open_dataset, open_finished
-from phibench.datasets.store import schema as layout
-from phibench.datasets.store.checksums import read_sums
+from phibench.datasets.store import schema
+from phibench.datasets.store.checksums import read_checksums
 from phibench.datasets.store.files import WriteError, only_run, remove_temporary, sha256, working
 from phibench.datasets.store.provenance import code_behind
-from phibench.datasets.store.schema import row_line
+from phibench.datasets.store.schema import ManifestRow, row_line
 from phibench.scenes.rig import POSITIONS
 
 _FILES_PER_JOB = 16  # a few seconds of work; reading the layers again takes half a second
@@ -136,7 +137,7 @@ def draw_frames(
 
 def perform(job: SampleJob) -> tuple[list[FrameRow], int]:
     """Do a job: rows of all its files, and how many were written."""
-    sample = _opened(job.dataset, sha256(job.dataset / layout.SUMS))[job.sample_id]
+    sample = _opened(job.dataset, sha256(job.dataset / schema.CHECKSUMS))[job.sample_id]
     base, source = _key_base(sample, job.request), None
     rows, made = [], 0
     with working(job.out):
@@ -145,14 +146,14 @@ def perform(job: SampleJob) -> tuple[list[FrameRow], int]:
             row = job.known.get(name)
             if row is None or row.key != key or not _is_whole(job.out / name, row.sha256):
                 source = source or FrameSource.from_request(sample, job.request)
-                row = _written(job, source, item, name, key)
+                row = _written(job, sample.row, source, item, name, key)
                 made += 1
             rows.append(row)
     return rows, made
 
 
 @lru_cache(maxsize=1)
-def _opened(folder: Path, _sums_sha256: str) -> Dataset:
+def _opened(folder: Path, _checksums_sha256: str) -> Dataset:
     """Data set of the next jobs, too: reading a long manifest takes longer than a small frame."""
     return open_dataset(folder)
 
@@ -189,18 +190,21 @@ def _knowing(job: SampleJob, rows: Mapping[str, FrameRow]) -> SampleJob:
     return replace(job, known={name: rows[name] for name in names if name in rows})
 
 
-def _written(job: SampleJob, source: FrameSource, item: Item, name: str, key: str) -> FrameRow:
+def _written(job: SampleJob, sample: ManifestRow, source: FrameSource, item: Item, name: str, key: str) -> FrameRow:
     frame, path = source.frame(item.position, item.draw, item.laser), job.out / name
     if item.preview:
         write_preview(path, frame)
     else:
         write_frame(path, frame, source.names)
-    return _row(job, source, item, frame, name, key)
+    return _row(job, sample, source, item, frame, name, key)
 
 
-def _row(job: SampleJob, source: FrameSource, item: Item, frame: Frame, name: str, key: str) -> FrameRow:
+def _row(
+    job: SampleJob, sample: ManifestRow, source: FrameSource, item: Item, frame: Frame, name: str, key: str
+) -> FrameRow:
     height, width = frame.region.shape
     dataset, seed, sample_id = source.names
+    spot = sample.position(item.position)
     return FrameRow(
         file=name,
         sha256=sha256(job.out / name),
@@ -219,6 +223,9 @@ def _row(job: SampleJob, source: FrameSource, item: Item, frame: Frame, name: st
         v0_px=frame.region.v0_px,
         width_px=width,
         height_px=height,
+        depth_m=sample.depth_m,
+        stroke_m=sample.stroke_m,
+        **{name: getattr(spot, name) for name in TRUTH},
         sensor=frame.sensor.model_dump(mode="json"),
         request=_document(job.request),
         key=key,
@@ -254,7 +261,7 @@ def _check_folder(out: Path, dataset: Path) -> None:
         raise DatasetError(f"{out} is a file: give a folder, `--out`")
     if where == dataset.resolve() or dataset.resolve() in where.parents:
         raise DatasetError(f"{out} lies inside the data set, whose files are signed: give a folder outside, `--out`")
-    if (out / layout.INFO).exists():
+    if (out / schema.INFO).exists():
         raise DatasetError(f"{out} is a data set: give a folder of its own for the frames, `--out`")
 
 
@@ -270,8 +277,8 @@ def _document(request: FrameRequest) -> dict[str, object]:
 
 def _key_base(sample: Sample, request: FrameRequest) -> str:
     """Hash of what all files of a sample depend on."""
-    listed = read_sums(sample.dataset.folder)
-    layers = [listed.get(layout.RIGS)]
+    listed = read_checksums(sample.dataset.folder)
+    layers = [listed.get(schema.RIGS)]
     for position in POSITIONS:
         row = sample.truth_row(position)
         layers += [listed.get(row.view_ambient_file), listed.get(row.spot_file or "")]

@@ -1,6 +1,8 @@
-"""A frame as a file that other programs read: PNG, the camera's own JPEG, or EXR; and a picture of it for people.
+"""Files of drawn frames, and their index.
 
-`frames.jsonl`: one line per file of drawn frames, with every number that it depends on and its SHA-256.
+A frame is written as PNG, as the camera's own JPEG, or as EXR; a frame that a viewer shows dark gets a preview for
+people. The index has one row per file: its SHA-256, every number that it depends on, and the truth of its image. It is
+written twice, as `frames.jsonl` and as `frames.parquet`.
 """
 
 from __future__ import annotations
@@ -17,10 +19,11 @@ from PIL import Image
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.source import Frame
+from phibench.datasets.store.documents import model_table, parquet_bytes
 from phibench.datasets.store.files import read_rows, write_bytes, write_text
 from phibench.datasets.store.layers import write_exr
-from phibench.datasets.store.schema import Document, Position
-from phibench.render.sensor import processing as isp
+from phibench.datasets.store.schema import Document, Number, Position, described
+from phibench.render.sensor import processing
 from phibench.render.sensor.settings import Sensor
 from phibench.scenes.camera import FILTERS
 
@@ -79,49 +82,59 @@ def preview(frame: Frame) -> NDArray[np.uint8]:
             width = [(0, 0), (0, 0)]
             width[axis] = (first, 1)
             padded = np.pad(padded, width, mode="reflect" if length > 1 else "edge")
-        linear = isp.linear_rgb(isp.linear_signal(padded, sensor, np.float32), sensor)
+        linear = processing.linear_rgb(processing.linear_signal(padded, sensor, np.float32), sensor)
         height, length = frame.image.shape
         linear = linear[..., before[0] : before[0] + height, before[1] : before[1] + length]
     else:
         full_scale_e = (sensor.top_dn - sensor.black_level_dn) / sensor.dn_per_e
-        linear = isp.white_balanced(frame.image / full_scale_e, sensor.white_balance)
-        linear = isp.colour_corrected(linear, sensor.colour_matrix)
-    return isp.eight_bit(isp.rendered(linear, sensor))
+        linear = processing.white_balanced(frame.image / full_scale_e, sensor.white_balance)
+        linear = processing.colour_corrected(linear, sensor.colour_matrix)
+    return processing.eight_bit(processing.rendered(linear, sensor))
 
 
 INDEX = "frames.jsonl"
+INDEX_TABLE = "frames.parquet"
 REQUEST = "request.json"
+TRUTH = ("visible", "cause", "u_px", "v_px", "phi_ray_rad", "phi_normal_rad", "phi_incidence_rad", "azimuth_rad")
+"""Fields of a row that are those of the manifest's `down` or `up`."""
 _IMAGES = (".exr", ".jpg", ".png")
 
 
 class FrameRow(Document):
-    """One file.
+    """One file: one line of `frames.jsonl`, one row of `frames.parquet`. FORMAT.md describes it; a test compares."""
 
-    `values` says what a number in the file means; `sensor` has the exposure and gain that were used, `request` what was
-    asked for. The image's pixel (0, 0) is pixel (u0_px, v0_px) of the sensor. `key` is a hash of all that the file
-    depends on, layers and code included.
-    """
-
-    file: str
-    sha256: str
-    kind: Literal["frame", "preview"]
-    values: str
-    dataset: str
-    dataset_seed: int
-    sample_id: str
-    position: Position
-    laser: Literal["on", "off"]
-    draw: int
-    preset: str
-    exposure_s: float
-    analogue_gain: float
-    u0_px: int
-    v0_px: int
-    width_px: int
-    height_px: int
-    sensor: dict[str, Any]
-    request: dict[str, Any]
-    key: str
+    file: str = described("-", "name of the file, relative to the folder")
+    sha256: str = described("-", "SHA-256 of the file")
+    kind: Literal["frame", "preview"] = described("-", "'frame', or 'preview': a picture for people")
+    values: str = described("-", "meaning of the numbers in the file")
+    dataset: str = described("-", "name of the data set")
+    dataset_seed: int = described("-", "its seed")
+    sample_id: str = described("-", "id of the sample, in the data set's manifest")
+    position: Position = described("-", "stroke position, 'down' or 'up'")
+    laser: Literal["on", "off"] = described("-", "'on' or 'off'")
+    draw: int = described("-", "draw of the noise, from 0")
+    preset: str = described("-", "preset of the sensor")
+    exposure_s: float = described("s", "exposure time that was used")
+    analogue_gain: float = described("1", "gain before the converter that was used")
+    u0_px: int = described("px", "column of the sensor that is the file's first column")
+    v0_px: int = described("px", "row of the sensor that is the file's first row")
+    width_px: int = described("px", "columns of the file")
+    height_px: int = described("px", "rows of the file")
+    depth_m: float = described("m", "D of the spot")
+    stroke_m: float = described("m", "stroke h of the pair, the true one")
+    visible: bool = described(
+        "-", "whether the chief ray of the spot reaches the sensor; of the position, laser on or off"
+    )
+    cause: str = described("-", "why not; 'none' if visible")
+    u_px: Number = described("px", "true image of the spot's centre on the sensor; in the file at u_px - u0_px")
+    v_px: Number = described("px", "true image of the spot's centre on the sensor; in the file at v_px - v0_px")
+    phi_ray_rad: Number = described("rad", "as in the manifest")
+    phi_normal_rad: Number = described("rad", "as in the manifest")
+    phi_incidence_rad: Number = described("rad", "as in the manifest")
+    azimuth_rad: Number = described("rad", "as in the manifest")
+    sensor: dict[str, Any] = described("-", "all numbers of the sensor, after auto exposure")
+    request: dict[str, Any] = described("-", "what was asked for")
+    key: str = described("-", "hash of all that the file depends on, layers and code included")
 
 
 def read_index(folder: Path) -> dict[str, FrameRow]:
@@ -142,8 +155,9 @@ def read_index(folder: Path) -> dict[str, FrameRow]:
 
 
 def write_index(folder: Path, rows: Iterable[FrameRow]) -> Path:
-    """Write all rows, sorted by file name, atomically."""
+    """Write all rows in both forms, sorted by file name; each file is complete or not there."""
     ordered = sorted(rows, key=lambda row: row.file)
+    write_bytes(folder / INDEX_TABLE, parquet_bytes(model_table(FrameRow, ordered)))
     lines = (json.dumps(row.model_dump(mode="json"), allow_nan=False) + "\n" for row in ordered)
     return write_text(folder / INDEX, "".join(lines))
 

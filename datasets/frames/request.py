@@ -15,7 +15,8 @@ from phibench.render.sensor.light import Region
 from phibench.render.sensor.settings import Sensor, SensorError, sensor
 
 Exposure = float | Literal["auto"] | None
-
+AUTO_EXPOSED = ("srgb8", "mjpeg")
+"""Presets that deliver what the camera has processed: exposed as it would, unless an exposure is given."""
 
 _RANGES = {"lamp_level": (0.0, 1e6), "laser_level": (0.0, 1e6), "carriage_speed_m_s": (-1e3, 1e3)}
 
@@ -30,6 +31,7 @@ class FrameRequest:
         Sensor preset: "ideal", "mono-raw", "bayer-raw", "srgb8" or "mjpeg".
     exposure : float, "auto" or None
         Seconds; "auto" is the camera's auto exposure, for each position by itself; None is the preset's time.
+        `FrameRequest.of` and the command line choose it where none is given: `default_exposure`.
     lamp_level, laser_level : float
         Factors of the room's light and of the spot.
     carriage_speed_m_s : float
@@ -71,10 +73,12 @@ class FrameRequest:
 
     @classmethod
     def of(cls, preset: str, options: Mapping[str, Any]) -> FrameRequest:
-        """Request from keywords: those that are not ours are numbers of the preset."""
+        """Request from keywords: those that are not ours are numbers of the preset; see `default_exposure`."""
         if "overrides" in options:
             raise DatasetError("overrides: give the numbers of the preset by name, such as jpeg_quality=60")
         ours = {key: value for key, value in options.items() if key in cls.__dataclass_fields__}
+        if "exposure" not in options and "exposure_s" not in options:
+            ours["exposure"] = default_exposure(preset)
         return cls(preset, overrides={key: options[key] for key in options if key not in ours}, **ours)
 
     def sensor(self) -> Sensor:
@@ -87,18 +91,25 @@ class FrameRequest:
         return {**asdict(self), "overrides": dict(self.overrides)}
 
 
+def default_exposure(preset: str) -> Exposure:
+    """Exposure where none is given: "auto" for `AUTO_EXPOSED`, otherwise the preset's time."""
+    return "auto" if preset in AUTO_EXPOSED else None
+
+
 def exposure_of(text: str) -> Exposure:
-    """Exposure from a word: "auto" or seconds.
+    """Exposure from a word: "auto", "preset" (the preset's time) or seconds.
 
     Raises
     ------
     DatasetError
         If it is neither.
     """
+    if text in ("auto", "preset"):
+        return "auto" if text == "auto" else None
     try:
-        return "auto" if text == "auto" else float(text)
+        return float(text)
     except ValueError as error:
-        raise DatasetError(f"exposure = '{text}': give seconds above 0, or 'auto'") from error
+        raise DatasetError(f"exposure = '{text}': give seconds above 0, 'auto', or 'preset'") from error
 
 
 def _number(name: str, value: Any, low: float, high: float) -> float:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.store import schema as layout
+from phibench.datasets.store import schema
 from phibench.datasets.store.documents import from_json, read_info, read_manifest
 from phibench.datasets.store.files import TEMPORARY_PREFIX, sha256, write_text
 from phibench.scenes.rig import POSITIONS
@@ -23,12 +23,12 @@ def data_files(folder: Path) -> list[str]:
         If `dataset.json` or the manifest, which name them, cannot be read.
     """
     rows = read_manifest(folder)
-    names = {layout.INFO, layout.MANIFEST, layout.TABLE, layout.RECIPE, layout.RIGS}
+    names = {schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.RIGS}
     info = read_info(folder)
     if from_json(Room, info.room).lit:
-        names.add(layout.LIGHT_MAP)
+        names.add(schema.LIGHT_MAP)
     names.update(name for pose in info.poses for name in pose.files.values())
-    names.update(layout.preview_file(row.sample_id) for row in rows)
+    names.update(schema.preview_file(row.sample_id) for row in rows)
     spots = (row.position(position) for row in rows for position in POSITIONS)
     names.update(spot.spot_file for spot in spots if spot.spot_file is not None)
     return sorted(names)
@@ -36,22 +36,24 @@ def data_files(folder: Path) -> list[str]:
 
 def strays(folder: Path) -> list[str]:
     """Relative names of files in a folder that are neither listed nor ours otherwise (notes, scores), sorted."""
-    known = {*read_sums(folder), *layout.NOT_DATA}
+    known = {*read_checksums(folder), *schema.NOT_DATA}
     names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     return sorted(name for name in names if name not in known and TEMPORARY_PREFIX not in name)
 
 
-def write_sums(folder: Path) -> Path:
+def write_checksums(folder: Path) -> Path:
     """Hash all data files."""
-    return write_text(folder / layout.SUMS, sums_text({name: sha256(folder / name) for name in data_files(folder)}))
+    return write_text(
+        folder / schema.CHECKSUMS, checksums_text({name: sha256(folder / name) for name in data_files(folder)})
+    )
 
 
-def sums_text(hashes: Mapping[str, str]) -> str:
+def checksums_text(hashes: Mapping[str, str]) -> str:
     """Text of the list, sorted by name."""
     return "".join(f"{hashes[name]}  {name}\n" for name in sorted(hashes))
 
 
-def read_sums(folder: Path) -> dict[str, str]:
+def read_checksums(folder: Path) -> dict[str, str]:
     """Hash by relative name.
 
     Raises
@@ -59,9 +61,11 @@ def read_sums(folder: Path) -> dict[str, str]:
     DatasetError
         If the list is missing (the data set is not complete) or not one.
     """
-    path = folder / layout.SUMS
+    path = folder / schema.CHECKSUMS
     if not path.is_file():
-        raise DatasetError(f"{folder} has no {layout.SUMS}: it was not finished; run `phibench dataset make` again")
+        raise DatasetError(
+            f"{folder} has no {schema.CHECKSUMS}: it was not finished; run `phibench dataset make` again"
+        )
     entries = [line.split("  ", 1) for line in path.read_text(encoding="utf-8", errors="replace").splitlines()]
     if any(len(entry) != 2 or len(entry[0]) != 64 for entry in entries):
         raise DatasetError(f"{path} is damaged: a line is not '<SHA-256>  <file>'")
@@ -70,11 +74,11 @@ def read_sums(folder: Path) -> dict[str, str]:
 
 def damaged(folder: Path) -> list[str]:
     """One sentence per file that is missing, cannot be read, was changed or is not listed although it belongs here."""
-    listed, planned = read_sums(folder), set()
+    listed, planned = read_checksums(folder), set()
     with contextlib.suppress(DatasetError):  # a manifest that cannot be read is reported as what it is, below
         planned = set(data_files(folder))
     faults = [fault for name, digest in listed.items() if (fault := _fault(folder, name, digest))]
-    return faults + [f"{name} is not listed in {layout.SUMS}" for name in sorted(planned - set(listed))]
+    return faults + [f"{name} is not listed in {schema.CHECKSUMS}" for name in sorted(planned - set(listed))]
 
 
 def check_documents(folder: Path) -> None:
@@ -85,8 +89,8 @@ def check_documents(folder: Path) -> None:
     DatasetError
         In one sentence.
     """
-    listed = read_sums(folder)
-    for name in (layout.INFO, layout.MANIFEST, layout.RIGS):
+    listed = read_checksums(folder)
+    for name in (schema.INFO, schema.MANIFEST, schema.RIGS):
         if fault := _fault(folder, name, listed.get(name, "")):
             raise DatasetError(f"{folder}: {fault}; run `phibench dataset verify` to see all faults")
 

@@ -24,20 +24,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, get_args, get_origin
 
 from pydantic import TypeAdapter, ValidationError
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan.plan import Plan, PosePlan
 from phibench.datasets.recipe.tables import Recipe
-from phibench.datasets.store import schema as layout
+from phibench.datasets.store import schema
 from phibench.datasets.store.files import read_rows, sha256, write_bytes
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import (
     READABLE_VERSIONS,
     SCHEMA_VERSION,
     DatasetInfo,
+    Document,
     ManifestRow,
     PoseInfo,
     RigInfo,
@@ -146,11 +147,11 @@ def read_info(folder: Path) -> DatasetInfo:
     DatasetError
         If the folder is missing, not a data set, of another schema version, or the file damaged.
     """
-    path = folder / layout.INFO
+    path = folder / schema.INFO
     if not folder.is_dir():
         raise DatasetError(f"there is no folder {folder}")
     if not path.is_file():
-        raise DatasetError(f"{folder} is not a data set: it has no {layout.INFO}")
+        raise DatasetError(f"{folder} is not a data set: it has no {schema.INFO}")
     document = _json(path)
     version = document.get("schema_version")
     if version not in READABLE_VERSIONS:
@@ -182,7 +183,7 @@ def _without_commit(info: DatasetInfo) -> str:
 
 
 def _pose_info(pose: PosePlan) -> PoseInfo:
-    files = {name: layout.view_file(pose.pose_id, name) for name in ("ambient", "truth", "preview")}
+    files = {name: schema.view_file(pose.pose_id, name) for name in ("ambient", "truth", "preview")}
     return PoseInfo(pose=pose.pose_id, rig=pose.rig, offset_m=pose.offset_m, ambient_seed=pose.seed, files=files)
 
 
@@ -194,11 +195,9 @@ def write_manifest(folder: Path, rows: Sequence[ManifestRow]) -> None:
 
 def manifest_documents(rows: Sequence[ManifestRow]) -> dict[str, bytes]:
     """Both forms as bytes, by file name."""
-    buffer = io.BytesIO()
-    to_frame(rows).write_parquet(buffer, compression="zstd", statistics=False)
     return {
-        layout.MANIFEST: "".join(row_line(row) + "\n" for row in rows).encode(),
-        layout.TABLE: buffer.getvalue(),
+        schema.MANIFEST: "".join(row_line(row) + "\n" for row in rows).encode(),
+        schema.TABLE: parquet_bytes(to_frame(rows)),
     }
 
 
@@ -210,26 +209,51 @@ def read_manifest(folder: Path) -> list[ManifestRow]:
     DatasetError
         If it is missing, or with the number of the first line that is not a row.
     """
-    return read_rows(folder / layout.MANIFEST, ManifestRow)
+    return read_rows(folder / schema.MANIFEST, ManifestRow)
 
 
-def to_frame(rows: Sequence[ManifestRow]) -> Any:
-    """Rows as a polars DataFrame: one column per leaf, names joined by dots, null where a number does not exist."""
+def to_frame(rows: Sequence[ManifestRow]) -> DataFrame:
+    """Rows as a polars table: one column per leaf, names joined by dots, null where a number does not exist."""
     import polars
 
-    types = {str: polars.String, float: polars.Float64, bool: polars.Boolean, int: polars.Int64}
+    drawn = [
+        polars.Series(name, [row.drawn.get(name.removeprefix("drawn.")) for row in rows], _column_type(kind))
+        for name, kind in drawn_columns(rows).items()
+    ]
+    return model_table(ManifestRow, rows).with_columns(drawn)
+
+
+def model_table(model: type[Document], rows: Sequence[Document]) -> DataFrame:
+    """Documents of one model as a polars table; free-form objects, such as a sensor's numbers, are JSON texts."""
+    import polars
+
     documents = [row.model_dump(mode="json") for row in rows]
-    data, schema = {}, {}
-    for name, field in columns():
-        kind = field.annotation
-        base = next((known for known in types if known in (kind, *getattr(kind, "__args__", ()))), float)
-        is_list = getattr(kind, "__origin__", None) is tuple
-        data[name] = [_leaf(document, name) for document in documents]
-        schema[name] = polars.List(polars.Float64) if is_list else types[base]
-    for name, drawn in drawn_columns(rows).items():
-        data[name] = [row.drawn.get(name.removeprefix("drawn.")) for row in rows]
-        schema[name] = types[drawn]
-    return polars.DataFrame(data, schema=schema)
+    data, types = {}, {}
+    for name, field in columns(model):
+        types[name] = _column_type(field.annotation)
+        values = [_leaf(document, name) for document in documents]
+        data[name] = [json.dumps(value) if isinstance(value, dict) else value for value in values]
+    return polars.DataFrame(data, schema=types)
+
+
+def parquet_bytes(table: DataFrame) -> bytes:
+    """Parquet file of a table."""
+    buffer = io.BytesIO()
+    table.write_parquet(buffer, compression="zstd", statistics=False)
+    return buffer.getvalue()
+
+
+def _column_type(annotation: Any) -> Any:
+    """Column type of a field: of a union its known member, of a tuple a list of doubles."""
+    import polars
+
+    kinds = {str: polars.String, float: polars.Float64, bool: polars.Boolean, int: polars.Int64}
+    origin = get_origin(annotation)
+    if origin is tuple:
+        return polars.List(polars.Float64)
+    if origin in (dict, Literal):
+        return polars.String
+    return next((kinds[known] for known in kinds if known in (annotation, *get_args(annotation))), polars.Float64)
 
 
 def differences(folder: Path, rows: Sequence[ManifestRow]) -> list[str]:
@@ -238,13 +262,13 @@ def differences(folder: Path, rows: Sequence[ManifestRow]) -> list[str]:
 
     expected = to_frame(rows)
     try:
-        table = polars.read_parquet(folder / layout.TABLE)
+        table = polars.read_parquet(folder / schema.TABLE)
     except (OSError, polars.exceptions.PolarsError) as error:
-        return [f"{layout.TABLE} cannot be read: {error}"]
+        return [f"{schema.TABLE} cannot be read: {error}"]
     if table.schema != expected.schema or table.height != expected.height:
-        return [f"{layout.TABLE} has other columns or rows than {layout.MANIFEST}"]
+        return [f"{schema.TABLE} has other columns or rows than {schema.MANIFEST}"]
     changed = [name for name in table.columns if not table[name].equals(expected[name], null_equal=True)]
-    return [f"{layout.TABLE} differs from {layout.MANIFEST} in column {name}" for name in changed]
+    return [f"{schema.TABLE} differs from {schema.MANIFEST} in column {name}" for name in changed]
 
 
 def _leaf(document: dict[str, Any], name: str) -> Any:
@@ -270,7 +294,7 @@ class Rigs:
 
     def __getitem__(self, name: str) -> Rig:
         if name not in self.documents:
-            raise DatasetError(f"{layout.RIGS} has no rig '{name}'; {nearest(name, list(self.documents)[:20])}")
+            raise DatasetError(f"{schema.RIGS} has no rig '{name}'; {nearest(name, list(self.documents)[:20])}")
         if name not in self._built:
             self._built[name] = from_json(Rig, self.documents[name])
         return self._built[name]
@@ -294,7 +318,7 @@ def read_rigs(folder: Path) -> Rigs:
     DatasetError
         If the file is missing, or with the number of the first line that is not a rig.
     """
-    return Rigs({info.rig: info.resolved for info in read_rows(folder / layout.RIGS, RigInfo)})
+    return Rigs({info.rig: info.resolved for info in read_rows(folder / schema.RIGS, RigInfo)})
 
 
 DIGEST = "phibench.dataset_sha256"
@@ -303,14 +327,14 @@ DIGEST = "phibench.dataset_sha256"
 
 def metadata_of(folder: Path) -> dict[str, str]:
     """Metadata of a table for the data set in a folder as it is now."""
-    return {DIGEST: sha256(folder / layout.SUMS)}
+    return {DIGEST: sha256(folder / schema.CHECKSUMS)}
 
 
 def sensitivity_fault(folder: Path) -> str | None:
     """One sentence on a table that is damaged or of another state of the data set; None if there is no fault."""
     import polars
 
-    path = folder / layout.SENSITIVITIES
+    path = folder / schema.SENSITIVITIES
     if not path.is_file():
         return None
     try:
@@ -318,10 +342,10 @@ def sensitivity_fault(folder: Path) -> str | None:
         polars.scan_parquet(path).select(polars.all().count()).collect()
     except (polars.exceptions.PolarsError, OSError) as error:
         why = str(error).splitlines()[0]
-        return f"{layout.SENSITIVITIES} cannot be read: {why}; run `phibench dataset sensitivities` again"
+        return f"{schema.SENSITIVITIES} cannot be read: {why}; run `phibench dataset sensitivities` again"
     if digest != metadata_of(folder)[DIGEST]:
         return (
-            f"{layout.SENSITIVITIES} belongs to another state of this data set; "
+            f"{schema.SENSITIVITIES} belongs to another state of this data set; "
             "run `phibench dataset sensitivities` again"
         )
     return None
@@ -337,8 +361,8 @@ def read_sensitivities(folder: Path) -> DataFrame:
     """
     import polars
 
-    if not (folder / layout.SENSITIVITIES).is_file():
-        raise DatasetError(f"{folder} has no {layout.SENSITIVITIES}; run `phibench dataset sensitivities {folder}`")
+    if not (folder / schema.SENSITIVITIES).is_file():
+        raise DatasetError(f"{folder} has no {schema.SENSITIVITIES}; run `phibench dataset sensitivities {folder}`")
     if fault := sensitivity_fault(folder):
         raise DatasetError(f"{folder}: {fault}")
-    return polars.read_parquet(folder / layout.SENSITIVITIES)
+    return polars.read_parquet(folder / schema.SENSITIVITIES)

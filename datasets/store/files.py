@@ -1,11 +1,10 @@
 """Files that are either complete under their final name or not there at all.
 
-One run at a time in a folder. Locks belong to processes: they vanish with them, and no clock is asked.
+A file is written under a temporary name, flushed to the disk, then renamed.
 
-The run holds `layout.LOCK`. A task in a worker shares `layout.WORKING`, and a new run waits until nobody does: what a
-killed run's workers are still writing is then on the disk before anybody looks.
-
-Reading files of one JSON document a line.
+One run at a time writes to a folder: it holds a lock on `schema.LOCK`. Every task of a worker holds a lock on a file of
+its own, and a new run waits until these are free: what a killed run's workers are still writing is then on the disk.
+Locks belong to processes and vanish with them; no clock is asked. Lock files are removed when they are given back.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ import hashlib
 import os
 import tempfile
 import time
+import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypeVar
@@ -24,7 +24,7 @@ from typing import TypeVar
 from pydantic import ValidationError
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.store import schema as layout
+from phibench.datasets.store import schema
 from phibench.datasets.store.schema import Document
 
 TEMPORARY_PREFIX = ".phibench-tmp-"
@@ -150,8 +150,11 @@ def require_writable(path: Path) -> None:
         raise DatasetError(f"{path} cannot be written: {reason}; give another path") from error
 
 
+# Locks: one run at a time in a folder, and none beside the workers of a killed one.
+
 PATIENCE_S = 60.0
 _POLL_S = 0.05
+_WORKING_PREFIX = f"{TEMPORARY_PREFIX}working-"
 
 
 @contextlib.contextmanager
@@ -163,49 +166,90 @@ def only_run(out: Path) -> Iterator[None]:
     DatasetError
         With one sentence.
     """
-    with _open(out / layout.LOCK) as lock:
-        if not _try(lock, fcntl.LOCK_EX):
-            holder = os.pread(lock, 32, 0).decode(errors="replace").strip()
-            raise DatasetError(f"another run (process {holder or '?'}) is writing to {out}; wait until it has ended")
+    path = out / schema.LOCK
+    with _locked(path) as lock:
+        if lock is None:
+            raise DatasetError(f"another run (process {_holder(path)}) is writing to {out}; wait until it has ended")
         os.ftruncate(lock, 0)
         os.pwrite(lock, str(os.getpid()).encode(), 0)
-        _await_workers(out)
-        yield
+        try:
+            _await_workers(out)
+            yield
+        finally:
+            for left in _working_files(out):  # of workers that were killed
+                _remove_if_free(left)
+            _unlink(path)
 
 
 @contextlib.contextmanager
 def working(out: Path) -> Iterator[None]:
-    """Say that this process writes into a folder."""
-    with _open(out / layout.WORKING) as lock:
-        fcntl.flock(lock, fcntl.LOCK_SH)
-        yield
+    """Say that this process writes into a folder, by a locked file of its own."""
+    path = out / f"{_WORKING_PREFIX}{uuid.uuid4().hex}"
+    with _locked(path):
+        try:
+            yield
+        finally:
+            _unlink(path)
+
+
+def _holder(path: Path) -> str:
+    """Process that holds a lock file, as far as the file tells."""
+    with contextlib.suppress(OSError):
+        return path.read_text(errors="replace").strip() or "?"
+    return "?"
 
 
 def _await_workers(out: Path) -> None:
     deadline = time.monotonic() + PATIENCE_S
-    with _open(out / layout.WORKING) as lock:
-        while not _try(lock, fcntl.LOCK_EX):
+    for path in _working_files(out):
+        while not _remove_if_free(path):
             if time.monotonic() > deadline:
                 raise DatasetError(f"workers of an earlier run are still writing to {out}; end them and try again")
             time.sleep(_POLL_S)
 
 
-def _try(lock: int, kind: int) -> bool:
-    try:
-        fcntl.flock(lock, kind | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
+def _working_files(out: Path) -> list[Path]:
+    """Files that workers hold or have left; versions before 0.2 left a common one."""
+    return sorted(path for path in (*out.glob(f"{_WORKING_PREFIX}*"), out / schema.WORKING) if path.exists())
+
+
+def _remove_if_free(path: Path) -> bool:
+    """Remove a lock file unless a process holds it."""
+    with _locked(path) as lock:
+        if lock is None:
+            return False
+        _unlink(path)
+        return True
+
+
+def _unlink(path: Path) -> None:
+    """Remove a lock file that this process holds; a folder that has become read-only keeps it."""
+    with contextlib.suppress(OSError):
+        path.unlink()
 
 
 @contextlib.contextmanager
-def _open(path: Path) -> Iterator[int]:
-    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+def _locked(path: Path) -> Iterator[int | None]:
+    """Open and lock a file, which is made if need be; give its number, or None if another process holds it."""
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(handle)
+            yield None
+            return
+        # its last holder may have removed the file between our two steps: a lock on it would be no obstacle to others
+        if os.fstat(handle).st_nlink > 0:
+            break
+        os.close(handle)
     try:
         yield handle
     finally:
         os.close(handle)
 
+
+# Files of one JSON document a line.
 
 Row = TypeVar("Row", bound=Document)
 

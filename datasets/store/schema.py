@@ -42,54 +42,55 @@ class Document(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
 
-def _field(unit: str, text: str) -> Any:
+def described(unit: str, text: str) -> Any:
+    """Field of a document with its unit ("-": none, "1": a pure number) and its meaning."""
     return Field(description=text, json_schema_extra={"unit": unit})
 
 
 class CertificateRow(Document):
     """Differences of two independent answers for one spot in one view, and the tolerances they were held to."""
 
-    chief_difference_px: float = _field("px", "chief ray: closed form against ray tracer")
-    chief_tolerance_px: float = _field("px", "largest allowed chief_difference_px")
-    centroid_difference_px: float = _field("px", "centroid of the spot layer against rays over aperture and spot")
-    centroid_tolerance_px: float = _field("px", "largest allowed centroid_difference_px")
-    flux_difference: float = _field("1", "relative difference of the spot's electrons per second, same two")
-    flux_tolerance: float = _field("1", "largest allowed flux_difference")
-    passed: bool = _field("-", "all three differences are within their tolerances; false is never shipped")
+    chief_difference_px: float = described("px", "chief ray: closed form against ray tracer")
+    chief_tolerance_px: float = described("px", "largest allowed chief_difference_px")
+    centroid_difference_px: float = described("px", "centroid of the spot layer against rays over aperture and spot")
+    centroid_tolerance_px: float = described("px", "largest allowed centroid_difference_px")
+    flux_difference: float = described("1", "relative difference of the spot's electrons per second, same two")
+    flux_tolerance: float = described("1", "largest allowed flux_difference")
+    passed: bool = described("-", "all three differences are within their tolerances; false is never shipped")
 
 
 class NoiseRow(Document):
     """Errors of phi_ray of one spot in one raw Bayer frame, preset `webcam`, 1/60 s (`render/noise_budget.py`)."""
 
-    phi_sensor_rad: Number = _field("rad", "standard deviation from photons and read noise, known shape and blur")
-    phi_render_rad: Number = _field("rad", "what the ambient layer's own noise adds; at most a quarter of the above")
+    phi_sensor_rad: Number = described("rad", "standard deviation from photons and read noise, known shape and blur")
+    phi_render_rad: Number = described("rad", "what the ambient layer's own noise adds; at most a quarter of the above")
 
 
 class SpotRow(Document):
     """The exact answer for one spot in one view, and where its layers are."""
 
-    pose: str = _field("-", "id of the mirror pose")
-    offset_m: float = _field("m", "carriage offset along the stroke axis")
-    u_px: Number = _field("px", "image of the spot's centre through the lens centre, to the right")
-    v_px: Number = _field("px", "image of the spot's centre through the lens centre, downwards")
-    phi_ray_rad: Number = _field("rad", "theta / 2, theta between the mirror-to-spot ray and straight down")
-    phi_normal_rad: Number = _field("rad", "polar angle of the outward mirror normal from straight down")
-    phi_incidence_rad: Number = _field("rad", "angle of incidence on the mirror")
-    azimuth_rad: Number = _field("rad", "azimuth of the outward mirror normal, from world x towards world y")
-    reflection_point_world_m: Vector3 = _field("m", "where the chief ray meets the mirror")
-    camera_centre_world_m: Vector3 = _field("m", "lens centre")
-    sphere_centre_world_m: Vector3 = _field("m", "sphere centre")
-    path_spot_mirror_m: Number = _field("m", "spot centre to reflection point")
-    path_mirror_camera_m: Number = _field("m", "reflection point to lens centre")
-    visible: bool = _field("-", "whether the chief ray reaches the sensor")
-    cause: str = _field("-", "why not; 'none' if visible")
-    coma_shift_px: Vector2 = _field("px", "energy centroid of the spot minus (u_px, v_px)")
-    electrons_per_s: Vector3 = _field("1/s", "electrons per second of the whole spot behind R, G, B")
-    view_ambient_file: str = _field("-", "ambient layer of the view")
-    view_truth_file: str = _field("-", "truth layer of the view")
-    spot_file: str | None = _field("-", "spot layer; null where no light of the spot reaches the image")
-    certificate: CertificateRow | None = _field("-", "null where the spot is not visible")
-    noise: NoiseRow | None = _field("-", "null where the spot is not visible")
+    pose: str = described("-", "id of the mirror pose")
+    offset_m: float = described("m", "carriage offset along the stroke axis")
+    u_px: Number = described("px", "image of the spot's centre through the lens centre, to the right")
+    v_px: Number = described("px", "image of the spot's centre through the lens centre, downwards")
+    phi_ray_rad: Number = described("rad", "theta / 2, theta between the mirror-to-spot ray and straight down")
+    phi_normal_rad: Number = described("rad", "polar angle of the outward mirror normal from straight down")
+    phi_incidence_rad: Number = described("rad", "angle of incidence on the mirror")
+    azimuth_rad: Number = described("rad", "azimuth of the outward mirror normal, from world x towards world y")
+    reflection_point_world_m: Vector3 = described("m", "where the chief ray meets the mirror")
+    camera_centre_world_m: Vector3 = described("m", "lens centre")
+    sphere_centre_world_m: Vector3 = described("m", "sphere centre")
+    path_spot_mirror_m: Number = described("m", "spot centre to reflection point")
+    path_mirror_camera_m: Number = described("m", "reflection point to lens centre")
+    visible: bool = described("-", "whether the chief ray reaches the sensor")
+    cause: str = described("-", "why not; 'none' if visible")
+    coma_shift_px: Vector2 = described("px", "energy centroid of the spot minus (u_px, v_px)")
+    electrons_per_s: Vector3 = described("1/s", "electrons per second of the whole spot behind R, G, B")
+    view_ambient_file: str = described("-", "ambient layer of the view")
+    view_truth_file: str = described("-", "truth layer of the view")
+    spot_file: str | None = described("-", "spot layer; null where no light of the spot reaches the image")
+    certificate: CertificateRow | None = described("-", "null where the spot is not visible")
+    noise: NoiseRow | None = described("-", "null where the spot is not visible")
 
     @model_validator(mode="after")
     def _complete_if_visible(self) -> SpotRow:
@@ -106,21 +107,25 @@ class SpotRow(Document):
 class ManifestRow(Document):
     """One stroke pair: one line of `manifest.jsonl`."""
 
-    sample_id: str = _field("-", "<experiment>-<target>-h<stroke>, with -<rig> if rigs are drawn; or random-<number>")
-    experiment: str = _field("-", "name of the experiment in the recipe, or 'random'")
-    target: str = _field("-", "name of the target in the recipe, or of what carries the spot")
-    rig: str = _field("-", "id of the true rig, in `rigs.jsonl`")
-    nominal_rig: str = _field("-", "id of the rig that an estimator believes, in `rigs.jsonl`")
-    depth_m: float = _field("m", "D: horizontal distance of the spot from the vertical through the sphere centre, down")
-    stroke_m: float = _field("m", "stroke (baseline) h, the true one")
-    nominal_stroke_m: float = _field("m", "stroke that an estimator believes")
-    spot_world_m: Vector3 = _field("m", "centre of the laser spot")
-    spot_normal_world: Vector3 = _field("1", "unit normal of the wall at the spot")
-    spot_diameter_m: float = _field("m", "diameter of the spot: 4 sigma if gaussian, of the disc if uniform")
-    down: SpotRow = _field("-", "stroke position 1, offset 0")
-    up: SpotRow = _field("-", "stroke position 2, offset stroke_m")
-    tries: int = _field("-", "which draw was the first possible one; 1 is the sequence's own; 0 if nothing is drawn")
-    drawn: dict[str, float | str] = _field("-", "what was drawn, by parameter; empty if nothing is")
+    sample_id: str = described(
+        "-", "<experiment>-<target>-h<stroke>, with -<rig> if rigs are drawn; or random-<number>"
+    )
+    experiment: str = described("-", "name of the experiment in the recipe, or 'random'")
+    target: str = described("-", "name of the target in the recipe, or of what carries the spot")
+    rig: str = described("-", "id of the true rig, in `rigs.jsonl`")
+    nominal_rig: str = described("-", "id of the rig that an estimator believes, in `rigs.jsonl`")
+    depth_m: float = described(
+        "m", "D: horizontal distance of the spot from the vertical through the sphere centre, down"
+    )
+    stroke_m: float = described("m", "stroke (baseline) h, the true one")
+    nominal_stroke_m: float = described("m", "stroke that an estimator believes")
+    spot_world_m: Vector3 = described("m", "centre of the laser spot")
+    spot_normal_world: Vector3 = described("1", "unit normal of the wall at the spot")
+    spot_diameter_m: float = described("m", "diameter of the spot: 4 sigma if gaussian, of the disc if uniform")
+    down: SpotRow = described("-", "stroke position 1, offset 0")
+    up: SpotRow = described("-", "stroke position 2, offset stroke_m")
+    tries: int = described("-", "which draw was the first possible one; 1 is the sequence's own; 0 if nothing is drawn")
+    drawn: dict[str, float | str] = described("-", "what was drawn, by parameter; empty if nothing is")
 
     def position(self, name: str) -> SpotRow:
         """Truth of the stroke position "down" or "up"."""
@@ -130,35 +135,37 @@ class ManifestRow(Document):
 class PoseInfo(Document):
     """One mirror pose in `dataset.json`."""
 
-    pose: str = _field("-", "id")
-    rig: str = _field("-", "id of the rig")
-    offset_m: float = _field("m", "carriage offset along the stroke axis")
-    ambient_seed: int = _field("-", "32-bit seed of the ambient layer")
-    files: dict[str, str] = _field("-", "ambient, truth, preview")
+    pose: str = described("-", "id")
+    rig: str = described("-", "id of the rig")
+    offset_m: float = described("m", "carriage offset along the stroke axis")
+    ambient_seed: int = described("-", "32-bit seed of the ambient layer")
+    files: dict[str, str] = described("-", "ambient, truth, preview")
 
 
 class RigInfo(Document):
     """One rig: one line of `rigs.jsonl`."""
 
-    rig: str = _field("-", "id: `rig` is that of the recipe's `[rig]`, others are called after their first sample")
-    resolved: dict[str, Any] = _field("-", "the rig, field by field")
+    rig: str = described("-", "id: `rig` is that of the recipe's `[rig]`, others are called after their first sample")
+    resolved: dict[str, Any] = described("-", "the rig, field by field")
 
 
 class DatasetInfo(Document):
     """`dataset.json`."""
 
-    schema_version: int = _field("-", "version of this format")
-    name: str = _field("-", "name of the data set")
-    recipe: dict[str, Any] = _field("-", "the recipe, defaults filled in")
-    recipe_sha256: str = _field("-", "SHA-256 of the recipe's values as canonical JSON")
-    rigs: int = _field("-", "number of rigs, the lines of `rigs.jsonl`")
-    room: dict[str, Any] = _field("-", "resolved room, all shapes")
-    object_names: Annotated[tuple[str, ...], Field(strict=False)] = _field("-", "name by object_id of the truth layers")
-    poses: Annotated[tuple[PoseInfo, ...], Field(strict=False)] = _field("-", "all mirror poses")
-    samples: int = _field("-", "number of rows of the manifest")
-    shard: str | None = _field("-", "which part of the recipe this is, such as 1/4; null for all of it")
-    conventions: dict[str, str] = _field("-", "frames, pixels, phi, units in one sentence each")
-    provenance: dict[str, Any] = _field("-", "versions, commit, code hash, variant, LLVM, threads")
+    schema_version: int = described("-", "version of this format")
+    name: str = described("-", "name of the data set")
+    recipe: dict[str, Any] = described("-", "the recipe, defaults filled in")
+    recipe_sha256: str = described("-", "SHA-256 of the recipe's values as canonical JSON")
+    rigs: int = described("-", "number of rigs, the lines of `rigs.jsonl`")
+    room: dict[str, Any] = described("-", "resolved room, all shapes")
+    object_names: Annotated[tuple[str, ...], Field(strict=False)] = described(
+        "-", "name by object_id of the truth layers"
+    )
+    poses: Annotated[tuple[PoseInfo, ...], Field(strict=False)] = described("-", "all mirror poses")
+    samples: int = described("-", "number of rows of the manifest")
+    shard: str | None = described("-", "which part of the recipe this is, such as 1/4; null for all of it")
+    conventions: dict[str, str] = described("-", "frames, pixels, phi, units in one sentence each")
+    provenance: dict[str, Any] = described("-", "versions, commit, code hash, variant, LLVM, threads")
 
 
 def row_line(row: ManifestRow) -> str:
@@ -212,7 +219,7 @@ MANIFEST = "manifest.jsonl"
 TABLE = "manifest.parquet"
 RECIPE = "recipe.toml"
 RIGS = "rigs.jsonl"
-SUMS = "SHA256SUMS"
+CHECKSUMS = "SHA256SUMS"
 LIGHT_MAP = "lightmap.npz"
 RUN = "run.json"
 LOG = "log.jsonl"
@@ -221,7 +228,7 @@ LOCK = ".phibench-lock"
 WORKING = ".phibench-working"
 CONTACT_SHEET = "contact_sheet.png"
 SENSITIVITIES = "sensitivities.parquet"
-NOT_DATA = (SUMS, RUN, LOG, JOURNAL, LOCK, WORKING, CONTACT_SHEET, SENSITIVITIES)
+NOT_DATA = (CHECKSUMS, RUN, LOG, JOURNAL, LOCK, WORKING, CONTACT_SHEET, SENSITIVITIES)
 """Files that SHA256SUMS does not list: itself, the diaries of the run, locks, and what is computed from it all."""
 
 _TASK_FILE = re.compile(

@@ -17,7 +17,7 @@ from phibench.datasets.exposures.pair_draws import CachedSample, pair_draws
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.datasets.frames.source import FrameSource, Side
 from phibench.datasets.read import Dataset, Sample
-from phibench.datasets.store import schema as layout
+from phibench.datasets.store import schema
 from phibench.datasets.store.files import sha256
 from phibench.datasets.store.provenance import provenance
 from phibench.estimator.calibration.file import Calibration, CalibrationError
@@ -74,7 +74,7 @@ class DatasetPairs(DrawnPairs):
 
     def document(self) -> dict[str, Any]:
         """Provenance of the set."""
-        info, listed = self.dataset.info, self.dataset.folder / layout.SUMS
+        info, listed = self.dataset.info, self.dataset.folder / schema.CHECKSUMS
         return {
             "name": info.name,
             "task_version": TASK_VERSION,

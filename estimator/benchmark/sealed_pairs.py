@@ -14,13 +14,13 @@ from PIL import Image as Picture
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.datasets.store.checksums import read_sums
+from phibench.datasets.store.checksums import read_checksums
 from phibench.datasets.store.documents import from_json
 from phibench.estimator.benchmark.sealed_set import (
+    CHECKSUMS,
     FRAMES,
     PAIRS,
     SEAL,
-    SUMS,
     PublicBox,
     PublicPair,
     Seal,
@@ -47,7 +47,7 @@ class SealedPairs:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._seal, self._listed = folder, read_seal(folder), read_sums(folder)
+        self._folder, self._seal, self._listed = folder, read_seal(folder), read_checksums(folder)
         self._truths: tuple[PairTruth, ...] | None = None
         for name in (SEAL, PAIRS):
             self._read(name)
@@ -130,7 +130,7 @@ class SealedPairs:
     def _read(self, name: str) -> bytes:
         """Bytes of a file of the set."""
         if name not in self._listed:
-            raise DatasetError(f"{self._folder / name} is not listed in {SUMS}; download the set again")
+            raise DatasetError(f"{self._folder / name} is not listed in {CHECKSUMS}; download the set again")
         try:
             data = (self._folder / name).read_bytes()
         except OSError as error:

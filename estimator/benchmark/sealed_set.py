@@ -36,7 +36,7 @@ from phibench.datasets.progress import Steps
 from phibench.datasets.read import open_finished
 from phibench.datasets.recipe.load import RECIPES, load_recipe
 from phibench.datasets.recipe.tables import Recipe
-from phibench.datasets.store.checksums import read_sums, sums_text
+from phibench.datasets.store.checksums import checksums_text, read_checksums
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.files import TEMPORARY_PREFIX, WriteError, read_rows, sha256, write_bytes, write_text
 from phibench.datasets.store.schema import Document
@@ -46,7 +46,7 @@ from phibench.estimator.pair_set import Distraction, PairTruth, SpotTruth
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
-SEAL, PAIRS, FRAMES, SUMS = "seal.json", "pairs.jsonl", "frames", "SHA256SUMS"
+SEAL, PAIRS, FRAMES, CHECKSUMS = "seal.json", "pairs.jsonl", "frames", "SHA256SUMS"
 FORMAT = "phibench sealed set 1"
 
 
@@ -97,7 +97,7 @@ def seal_id(public_sha256: str, truth_sha256: str) -> str:
 def public_sha256(hashes: Mapping[str, str]) -> str:
     """Hash of what a method may see: pairs and frames, by relative name."""
     content = {name: digest for name, digest in hashes.items() if name == PAIRS or name.startswith(f"{FRAMES}/")}
-    return hashlib.sha256(sums_text(content).encode()).hexdigest()
+    return hashlib.sha256(checksums_text(content).encode()).hexdigest()
 
 
 def read_seal(folder: Path) -> Seal:
@@ -111,16 +111,16 @@ def read_seal(folder: Path) -> Seal:
     path = folder / SEAL
     if not path.is_file():
         raise DatasetError(f"{folder} is no sealed set: it has no {SEAL}; give what `phibench seal make` wrote")
-    if not (folder / SUMS).is_file():
-        raise DatasetError(f"{folder / SUMS} is missing; download the set again")
+    if not (folder / CHECKSUMS).is_file():
+        raise DatasetError(f"{folder / CHECKSUMS} is missing; download the set again")
     try:
         seal = Seal.model_validate(json.loads(path.read_text(encoding="utf-8")))
     except (ValidationError, ValueError) as error:
         raise DatasetError(f"{path} is damaged: it is not a seal; download the set again") from error
-    listed = public_sha256(read_sums(folder))
+    listed = public_sha256(read_checksums(folder))
     if seal.format != FORMAT or listed != seal.public_sha256 or seal.id != seal_id(listed, seal.truth_sha256):
         raise DatasetError(
-            f"{folder}: {SEAL} and {SUMS} do not belong together, one was changed; download the set again"
+            f"{folder}: {SEAL} and {CHECKSUMS} do not belong together, one was changed; download the set again"
         )
     return seal
 
@@ -322,7 +322,7 @@ def _seal(pairs: DatasetPairs, folder: Path, work: Path, public: Path, console: 
         phibench=version("phibench"),
     )
     write_text(work / SEAL, json.dumps(document.model_dump(mode="json"), indent=1) + "\n")
-    write_text(work / SUMS, sums_text(_hashes(work)))
+    write_text(work / CHECKSUMS, checksums_text(_hashes(work)))
     truth_file = write_text(folder / f"seal_{document.id}.truth.json", text)  # first: no seal without its truth
     _publish(work, public)
     recipe = pairs.dataset.info.recipe["dataset"]

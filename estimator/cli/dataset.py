@@ -167,7 +167,7 @@ def frames(
     laser_off
         Also every image without the spot.
     exposure
-        Seconds, or "auto"; by default the preset's.
+        Seconds, "auto", or "preset" for the preset's time; by default "auto" for srgb8 and mjpeg, else "preset".
     region
         Side in pixels of a square around the spot, instead of the whole image.
     camera_seed
@@ -176,14 +176,14 @@ def frames(
         Number of processes; one for each core by default.
     """
     from phibench.datasets.exposures.draw import draw_frames
-    from phibench.datasets.frames.request import FrameRequest, exposure_of
+    from phibench.datasets.frames.request import FrameRequest, default_exposure, exposure_of
 
-    seconds = None if exposure is None else exposure_of(exposure)
+    seconds = default_exposure(preset) if exposure is None else exposure_of(exposure)
     request = FrameRequest(preset, seconds, region=region, camera_seed=camera_seed)
     done = draw_frames(directory, request, draws, out=out, samples=sample or None, laser_off=laser_off, workers=workers)
     for note in done.notes:
         print(f"note: {note}")
-    print(f"{done.folder}: {done.made} files written, {done.kept} kept, index frames.jsonl")
+    print(f"{done.folder}: {done.made} files written, {done.kept} kept, index frames.jsonl and frames.parquet")
     return 0
 
 
@@ -266,12 +266,12 @@ def sensitivities(directory: Path, *, out: Path | None = None) -> int:
         Parquet file to write; by default sensitivities.parquet in the folder, as `dataset make` does.
     """
     from phibench.datasets.read import open_finished
-    from phibench.datasets.store import schema as layout
+    from phibench.datasets.store import schema
     from phibench.estimator.geometry.estimators import ESTIMATORS
     from phibench.estimator.paper.sensitivity_table import columns, write_sensitivities
 
     dataset = open_finished(directory)
-    out = directory / layout.SENSITIVITIES if out is None else out
+    out = directory / schema.SENSITIVITIES if out is None else out
     write_sensitivities(dataset, out)
     print(f"{out}: {len(dataset)} samples x {len(ESTIMATORS)} estimators, {len(columns())} columns")
     return 0

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from phibench.datasets.read import Dataset, Sample, open_finished
-from phibench.datasets.store import schema as layout
+from phibench.datasets.store import schema
 from phibench.datasets.store.documents import metadata_of, sensitivity_fault
 from phibench.datasets.store.files import write_bytes
 from phibench.estimator.geometry.estimators import ESTIMATORS
@@ -46,16 +46,16 @@ def write_sensitivities(dataset: Dataset, out: Path) -> Path:
     """Write the table of a data set as Parquet; its metadata say of which state of the data set."""
     import polars
 
-    schema = dict.fromkeys(columns(), polars.Float64) | dict.fromkeys(_WORDS, polars.String)
+    types = dict.fromkeys(columns(), polars.Float64) | dict.fromkeys(_WORDS, polars.String)
     buffer = io.BytesIO()
-    table = polars.DataFrame(list(sensitivity_rows(dataset)), schema={name: schema[name] for name in columns()})
+    table = polars.DataFrame(list(sensitivity_rows(dataset)), schema={name: types[name] for name in columns()})
     table.write_parquet(buffer, compression="zstd", statistics=False, metadata=metadata_of(dataset.folder))
     return write_bytes(out, buffer.getvalue())
 
 
 def keep_sensitivities(folder: Path) -> Path:
     """Write the table into a finished data set's folder, unless the one there is good."""
-    path = folder / layout.SENSITIVITIES
+    path = folder / schema.SENSITIVITIES
     if path.is_file() and sensitivity_fault(folder) is None:
         return path
     return write_sensitivities(open_finished(folder), path)

@@ -7,7 +7,7 @@ import pytest
 from helpers.sensor_light import spot_at
 from scipy import stats
 
-from phibench.render.sensor import processing as isp
+from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.moments import QUANTISATION_DN2, drawn_moments, linear_moments, linear_operator, raw_moments
@@ -74,7 +74,7 @@ def test_linear_moments() -> None:
     closed = linear_moments(chain, LIGHT, region)
     box = chain.raw_region(region, LIGHT.size)
     raw = np.stack([chain.raw(LIGHT, STREAM.stage(k), box) for k in range(DRAWS)])
-    planes = isp.linear_rgb(isp.linear_signal(raw, s), s)[(..., *region.slices(box))].reshape(DRAWS, -1)
+    planes = processing.linear_rgb(processing.linear_signal(raw, s), s)[(..., *region.slices(box))].reshape(DRAWS, -1)
     covariance = np.cov(planes, rowvar=False)
     assert p_of_mean(planes.mean(axis=0), closed.mean.ravel(), closed.covariance) > FALSE_ALARM
     assert p_of_mean(planes.mean(axis=0), 1.03 * closed.mean.ravel(), closed.covariance) < FALSE_ALARM
@@ -89,7 +89,7 @@ def test_the_operator_is_the_code(shape: tuple[int, int], preset: str) -> None:
     image = np.random.default_rng(4).uniform(0.0, 1.0, shape)
     result = (linear_operator(s, shape) @ image.ravel()).reshape(3, *shape)
     # sums of at most 15 products below 2
-    np.testing.assert_allclose(result, isp.linear_rgb(image, s), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(result, processing.linear_rgb(image, s), rtol=0, atol=1e-14)
 
 
 def test_drawn_moments_of_the_whole_chain_agree_with_themselves() -> None:
@@ -112,7 +112,9 @@ def test_srgb_moments_are_the_linear_ones_times_the_slope() -> None:
     drawn = drawn_moments(Chain(s), light, region, STREAM, 1000)
     linear = linear_moments(Chain(s.replace(output="raw")), light, region)
     step = 1e-6
-    slope = (isp.srgb_encoded(linear.mean + step) - isp.srgb_encoded(linear.mean - step)) / (2 * step) * 255.0
+    slope = (
+        (processing.srgb_encoded(linear.mean + step) - processing.srgb_encoded(linear.mean - step)) / (2 * step) * 255.0
+    )
     expected = slope.ravel() ** 2 * np.diag(linear.covariance)
     rounding = QUANTISATION_DN2
     measured = np.diag(drawn.covariance).reshape(16, 16, 3).transpose(2, 0, 1).ravel()

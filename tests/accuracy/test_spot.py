@@ -120,11 +120,11 @@ def test_coma_is_small_in_focus_and_grows_out_of_focus() -> None:
 
 def test_node_count_is_sufficient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Doubling all node counts changes no pixel by more than 1e-4 of the peak and the flux by less than 1e-6."""
-    from phibench.render.optics import spot_samples as spot_cloud
+    from phibench.render.optics import spot_samples
 
     coarse = [(view, spot, spot_layer(view, spot, ())) for view, spot in _cases(3, 20)]
-    nodes = spot_cloud.disc_nodes
-    monkeypatch.setattr(spot_cloud, "disc_nodes", lambda profile, smoothness: nodes(profile, 2.0 * smoothness + 2.0))
+    nodes = spot_samples.disc_nodes
+    monkeypatch.setattr(spot_samples, "disc_nodes", lambda profile, smoothness: nodes(profile, 2.0 * smoothness + 2.0))
     checked = 0
     for view, spot, layer in coarse:
         fine = spot_layer(view, spot, ())
@@ -150,12 +150,12 @@ def test_random_pairs_give_the_same_image() -> None:
     rng, count = np.random.default_rng(5), 262144
     radius, turn = np.sqrt(rng.uniform(size=(2, count))), rng.uniform(0.0, 2.0 * np.pi, (2, count))
     disc = radius[..., None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    from phibench.render.optics import spot_samples as spot_cloud
+    from phibench.render.optics import spot_samples
 
-    points, eyes = spot_cloud._spot_points(spot, disc[0]), spot_cloud._lens_points(view, disc[1])
+    points, eyes = spot_samples._spot_points(spot, disc[0]), spot_samples._lens_points(view, disc[1])
     area = math.pi * view.rig.camera.aperture_radius_m**2
     weight = np.full(count, spot.albedo * spot.power_w / math.pi * area)
-    pairs = spot_cloud._connect(view, spot, (), points, eyes, weight)
+    pairs = spot_samples._connect(view, spot, (), points, eyes, weight)
     nodes = specular_cloud(view, spot, ())
     error = pairs.watts.std() / math.sqrt(count)
     assert abs(pairs.watts.mean() - nodes.watts.sum()) < 5.0 * error  # false alarm 6e-7
@@ -231,23 +231,23 @@ def test_accuracy_of_a_spot_cut_by_an_edge() -> None:
 
     Pairs scatter like sqrt(f (1 - f) / N) < 1e-3 of the flux even if they were random.
     """
-    from phibench.render.optics import spot_samples as spot_cloud
+    from phibench.render.optics import spot_samples
     from phibench.scenes.room import cuboid
 
     view, spot = default_rig().at(0.4), LaserSpot((2.0, 0.0, 0.5), (-1, 0, 0), 5e-3)
     rng, count, shares = np.random.default_rng(8), 2**19, []
     disc, lens = rng.normal(size=(count, 2)), rng.uniform(size=(count, 2))
     radius, turn = np.sqrt(lens[:, 0]), 2.0 * np.pi * lens[:, 1]
-    eyes = spot_cloud._lens_points(view, radius[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1))
+    eyes = spot_samples._lens_points(view, radius[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1))
     free = specular_cloud(view, spot, ())
     for edge_m in (-2e-3, -5e-4, 0.0, 7e-4, 1.5e-3):
         screen = (cuboid("screen", (1.9, edge_m - 0.5, 0.5), (0.01, 1.0, 1.0), (0.5, 0.5, 0.5)),)
         layer = spot_layer(view, spot, screen)
-        pairs = spot_cloud._connect(
-            view, spot, screen, spot_cloud._spot_points(spot, disc), eyes, np.full(count, 1.0 / count)
+        pairs = spot_samples._connect(
+            view, spot, screen, spot_samples._spot_points(spot, disc), eyes, np.full(count, 1.0 / count)
         )
-        open_pairs = spot_cloud._connect(
-            view, spot, (), spot_cloud._spot_points(spot, disc), eyes, np.full(count, 1.0 / count)
+        open_pairs = spot_samples._connect(
+            view, spot, (), spot_samples._spot_points(spot, disc), eyes, np.full(count, 1.0 / count)
         )
         share = pairs.watts.sum() / open_pairs.watts.sum()
         ours = layer.total_electrons_per_s[0] / spot_layer(view, spot, ()).total_electrons_per_s[0]
@@ -282,12 +282,12 @@ def test_a_wide_spot_has_the_right_shape() -> None:
 
     2^17 points over about 2 pi 7^2 blur areas are 400 per area; Sobol points do better than their 5 %.
     """
-    from phibench.render.optics import spot_samples as spot_cloud
+    from phibench.render.optics import spot_samples
 
     view, spot = default_rig().at(0.0), LaserSpot((1.0, 0.0, 0.5), (-1, 0, 0), 0.1)
     gain = np.ones(3)
     layer = splat(specular_cloud(view, spot, ()), 0.7, gain)
-    dense = splat(spot_cloud._dense_cloud(view, spot, ()), 0.7, gain)
+    dense = splat(spot_samples._dense_cloud(view, spot, ()), 0.7, gain)
     low = (min(layer.u0_px, dense.u0_px), min(layer.v0_px, dense.v0_px))
     a, b = (_embed(x, low[0], low[1], 160) for x in (layer, dense))
     assert np.abs(a - b).max() <= 0.02 * b.max()

@@ -17,16 +17,15 @@ import pytest
 from helpers.processes import TINY, living, quiet, said, wait_for
 
 from phibench.datasets import make
-from phibench.datasets.build import run_tasks as output
-from phibench.datasets.build import spot_task
+from phibench.datasets.build import run_tasks, spot_task
 from phibench.datasets.build.run_tasks import estimate
 from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.progress import Steps
 from phibench.datasets.recipe.load import load_recipe
-from phibench.datasets.store import schema as layout
-from phibench.datasets.store.checksums import damaged, data_files, read_sums
+from phibench.datasets.store import schema
+from phibench.datasets.store.checksums import damaged, data_files, read_checksums
 from phibench.datasets.store.documents import read_manifest
 from phibench.datasets.store.files import TEMPORARY_PREFIX
 from phibench.datasets.store.layers import read_exr
@@ -40,43 +39,43 @@ Usage = namedtuple("Usage", "total used free")
 
 def test_everything_is_there(tiny_dataset: Path) -> None:
     plan = make_plan(load_recipe(TINY))
-    views = {layout.view_file(p.pose_id, name) for p in plan.poses for name in ("ambient", "truth", "preview")}
-    spots = {layout.spot_file(pair.sample_id, position) for pair in plan.pairs for position in ("down", "up")}
+    views = {schema.view_file(p.pose_id, name) for p in plan.poses for name in ("ambient", "truth", "preview")}
+    spots = {schema.spot_file(pair.sample_id, position) for pair in plan.pairs for position in ("down", "up")}
     spots.remove("spots/half-hidden-h1.400-down.exr")  # a crate hides it
-    previews = {layout.preview_file(pair.sample_id) for pair in plan.pairs}
-    single = {layout.INFO, layout.MANIFEST, layout.TABLE, layout.RECIPE, layout.RIGS, layout.LIGHT_MAP}
-    assert set(read_sums(tiny_dataset)) == views | spots | previews | single == set(data_files(tiny_dataset))
+    previews = {schema.preview_file(pair.sample_id) for pair in plan.pairs}
+    single = {schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.RIGS, schema.LIGHT_MAP}
+    assert set(read_checksums(tiny_dataset)) == views | spots | previews | single == set(data_files(tiny_dataset))
     assert damaged(tiny_dataset) == []
-    assert (tiny_dataset / layout.RECIPE).read_bytes() == TINY.read_bytes()
+    assert (tiny_dataset / schema.RECIPE).read_bytes() == TINY.read_bytes()
 
 
 def test_the_sums_are_those_of_sha256sum(tiny_dataset: Path) -> None:
-    child = subprocess.run(["sha256sum", "--quiet", "-c", layout.SUMS], cwd=tiny_dataset, capture_output=True)
+    child = subprocess.run(["sha256sum", "--quiet", "-c", schema.CHECKSUMS], cwd=tiny_dataset, capture_output=True)
     assert child.returncode == 0, child.stdout
 
 
 def test_the_info_says_what_made_it(tiny_dataset: Path) -> None:
-    info = json.loads((tiny_dataset / layout.INFO).read_text())
+    info = json.loads((tiny_dataset / schema.INFO).read_text())
     provenance = info["provenance"]
     assert provenance["variant"] == default_variant()
     assert int(provenance["llvm"].split(".")[0]) >= 17
     assert provenance["threads_per_process"] == 1
     assert provenance["packages"]["mitsuba"]
     assert len(provenance["code_sha256"]) == 64
-    assert json.loads((tiny_dataset / layout.RUN).read_text())["seconds"] > 0.0
+    assert json.loads((tiny_dataset / schema.RUN).read_text())["seconds"] > 0.0
 
 
 def test_two_runs_are_byte_identical_whatever_the_number_of_workers(tiny_dataset: Path, tmp_path: Path) -> None:
     again = make.make(TINY, tmp_path / "again", workers=1, console=quiet())
-    assert (again / layout.SUMS).read_text() == (tiny_dataset / layout.SUMS).read_text()
-    assert len(read_sums(again)) >= 15
+    assert (again / schema.CHECKSUMS).read_text() == (tiny_dataset / schema.CHECKSUMS).read_text()
+    assert len(read_checksums(again)) >= 15
     # The comparison can fail: another seed gives other ambient light and the same truth.
     text = TINY.read_text().replace("seed = 0", "seed = 1")
     (tmp_path / "other.toml").write_text(text)
     other = make.make(tmp_path / "other.toml", tmp_path / "other", workers=2, console=quiet())
-    changed = {name for name, digest in read_sums(other).items() if digest != read_sums(again)[name]}
-    assert layout.view_file("h0.000", "ambient") in changed
-    assert layout.view_file("h0.000", "truth") not in changed
+    changed = {name for name, digest in read_checksums(other).items() if digest != read_checksums(again)[name]}
+    assert schema.view_file("h0.000", "ambient") in changed
+    assert schema.view_file("h0.000", "truth") not in changed
     assert [_without_noise(row) for row in read_manifest(other)] == [
         _without_noise(row) for row in read_manifest(again)
     ]
@@ -92,15 +91,15 @@ def test_a_finished_data_set_is_left_alone_and_a_damaged_one_made_again(tiny_dat
     (copy / "scores.json").write_text("{}")  # somebody's file is no reason to start over
     make.make(TINY, copy, workers=1, console=console)
     assert "nothing to do" in said(console)
-    (copy / layout.MANIFEST).unlink()
-    (copy / layout.view_file("h0.500", "truth")).write_bytes(b"")
+    (copy / schema.MANIFEST).unlink()
+    (copy / schema.view_file("h0.500", "truth")).write_bytes(b"")
     (copy / f"{TEMPORARY_PREFIX}left.exr").write_bytes(b"")
     console = quiet()
     make.make(TINY, copy, workers=2, console=console)
     assert "to make: 1 view; about 3 MB" in said(console)
     assert "7 of 8 tasks are done" in said(console)
     assert "tasks: 1/1" in said(console)
-    assert (copy / layout.SUMS).read_text() == (tiny_dataset / layout.SUMS).read_text()
+    assert (copy / schema.CHECKSUMS).read_text() == (tiny_dataset / schema.CHECKSUMS).read_text()
     assert list(copy.rglob(TEMPORARY_PREFIX + "*")) == []
 
 
@@ -121,9 +120,9 @@ def test_a_folder_with_other_things_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_folder_with_another_data_set_is_refused(tiny_dataset: Path) -> None:
-    before = (tiny_dataset / layout.SUMS).read_text()
+    before = (tiny_dataset / schema.CHECKSUMS).read_text()
     assert "holds another data set ('tiny')" in refusal(tiny_dataset, Path("smoke"))
-    assert (tiny_dataset / layout.SUMS).read_text() == before
+    assert (tiny_dataset / schema.CHECKSUMS).read_text() == before
     assert damaged(tiny_dataset) == []
 
 
@@ -131,7 +130,7 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path, monkeypatch:
     def denied(*_: object) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
-    monkeypatch.setattr(output, "write_bytes", denied)
+    monkeypatch.setattr(run_tasks, "write_bytes", denied)
     text = refusal(tmp_path / "out")
     assert "Permission denied" in text
     assert "\n" not in text
@@ -139,7 +138,7 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path, monkeypatch:
 
 @pytest.mark.usefixtures("inline")
 def test_no_room_on_the_disk_is_refused_with_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(output.shutil, "disk_usage", lambda _: Usage(10**9, 10**9 - 2_000_000, 2_000_000))
+    monkeypatch.setattr(run_tasks.shutil, "disk_usage", lambda _: Usage(10**9, 10**9 - 2_000_000, 2_000_000))
     text = refusal(tmp_path / "out")
     assert "are needed and 2 MB are free" in text
 
@@ -164,8 +163,8 @@ def test_a_sample_out_of_tolerance_is_refused_with_its_numbers(tmp_path: Path, m
     text = refusal(tmp_path / "out")
     assert "seen-near-h0.500 down: chief ray 0.01 px (tolerance 1e-06)" in text
     assert "4 of 8 tasks failed" in text  # two spots and the previews that wait for them; the views were finished
-    assert not (tmp_path / "out" / layout.SUMS).exists()
-    assert not (tmp_path / "out" / layout.MANIFEST).exists()
+    assert not (tmp_path / "out" / schema.CHECKSUMS).exists()
+    assert not (tmp_path / "out" / schema.MANIFEST).exists()
 
 
 def test_a_spot_that_no_mirror_point_reflects_is_flagged() -> None:
@@ -212,7 +211,7 @@ def test_control_c_in_the_middle_loses_nothing(tmp_path: Path) -> None:
 
 def complete_but_unfinished(out: Path) -> int:
     """What is there is whole, no temporary file is left, the folder does not pass for finished. Number of layers."""
-    assert not (out / layout.SUMS).exists()
+    assert not (out / schema.CHECKSUMS).exists()
     assert [path.name for path in out.rglob(TEMPORARY_PREFIX + "*")] == []
     layers = list(out.rglob("*.exr"))
     for path in layers:

@@ -11,7 +11,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.read import Dataset, open_dataset, open_finished
 from phibench.datasets.recipe.load import load_recipe
-from phibench.datasets.store import schema as layout
+from phibench.datasets.store import schema
 from phibench.datasets.store.layers import TRUTH_PLANES, SpotWindow
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import truth_layer
@@ -115,7 +115,7 @@ def test_errors_are_clear(dataset: Dataset, tiny_dataset: Path, tmp_path: Path) 
     with pytest.raises(DatasetError, match="'down' or 'up'"):
         dataset.samples[0].expected_image("left")
     copy = Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
-    (copy / layout.view_file("h0.500", "ambient")).unlink()
+    (copy / schema.view_file("h0.500", "ambient")).unlink()
     with pytest.raises(DatasetError, match=r"ambient\.exr is missing"):
         open_dataset(copy).samples[0].expected_image("up")
 
@@ -129,16 +129,16 @@ def test_errors_are_clear(dataset: Dataset, tiny_dataset: Path, tmp_path: Path) 
     ],
 )
 def test_a_foreign_info_is_refused(tiny_dataset: Path, tmp_path: Path, change: dict[str, object], words: str) -> None:
-    for name in (layout.INFO, layout.MANIFEST, layout.RIGS):
+    for name in (schema.INFO, schema.MANIFEST, schema.RIGS):
         shutil.copy(tiny_dataset / name, tmp_path / name)
-    info = json.loads((tmp_path / layout.INFO).read_text())
-    (tmp_path / layout.INFO).write_text(json.dumps({**info, **change}))
+    info = json.loads((tmp_path / schema.INFO).read_text())
+    (tmp_path / schema.INFO).write_text(json.dumps({**info, **change}))
     with pytest.raises(DatasetError, match=words):
         open_dataset(tmp_path)
 
 
 def test_damaged_json_is_refused(tmp_path: Path) -> None:
-    (tmp_path / layout.INFO).write_text('{"schema_version": 1,')
+    (tmp_path / schema.INFO).write_text('{"schema_version": 1,')
     with pytest.raises(DatasetError, match="is damaged"):
         open_dataset(tmp_path)
 
@@ -149,7 +149,7 @@ def copy(tiny_dataset: Path, tmp_path: Path) -> Path:
 
 
 def view(name: str, pose: str = "h0.500") -> str:
-    return layout.view_file(pose, name)
+    return schema.view_file(pose, name)
 
 
 SPOTS = ("spots/seen-near-h0.500-down.exr", "spots/seen-near-h0.500-up.exr")
@@ -182,13 +182,13 @@ def test_a_layer_of_another_data_set_is_refused(copy: Path, smoke_dataset: Path)
 
 def test_an_unfinished_or_changed_data_set_is_not_opened_as_finished(copy: Path) -> None:
     assert len(open_finished(copy)) == 2
-    (copy / layout.RECIPE).write_text("")  # not read, so not hashed here
+    (copy / schema.RECIPE).write_text("")  # not read, so not hashed here
     assert len(open_finished(copy)) == 2
-    manifest = (copy / layout.MANIFEST).read_text()
-    (copy / layout.MANIFEST).write_text(manifest + " ")
+    manifest = (copy / schema.MANIFEST).read_text()
+    (copy / schema.MANIFEST).write_text(manifest + " ")
     with pytest.raises(DatasetError, match=r"manifest\.jsonl is damaged"):
         open_finished(copy)
-    (copy / layout.SUMS).unlink()
+    (copy / schema.CHECKSUMS).unlink()
     with pytest.raises(DatasetError, match="not finished"):
         open_finished(copy)
 
@@ -226,7 +226,7 @@ def test_samples_are_taken_by_place_and_parts_as_slices(dataset: Dataset) -> Non
 
 def test_the_table_of_a_data_set_is_its_parquet_file(dataset: Dataset) -> None:
     polars = pytest.importorskip("polars")
-    assert dataset.to_polars().equals(polars.read_parquet(dataset.folder / layout.TABLE))
+    assert dataset.to_polars().equals(polars.read_parquet(dataset.folder / schema.TABLE))
     assert dataset[1:].to_polars()["sample_id"].to_list() == [dataset[1].row.sample_id]
 
 
@@ -235,11 +235,11 @@ def test_a_data_set_of_version_4_is_read_as_perfect_spheres(tiny_dataset: Path, 
     from phibench.datasets.verify import plan_faults
 
     copy = Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
-    info = json.loads((copy / layout.INFO).read_text())
-    (copy / layout.INFO).write_text(json.dumps({**info, "schema_version": 4}))
-    lines = [json.loads(line) for line in (copy / layout.RIGS).read_text().splitlines()]
+    info = json.loads((copy / schema.INFO).read_text())
+    (copy / schema.INFO).write_text(json.dumps({**info, "schema_version": 4}))
+    lines = [json.loads(line) for line in (copy / schema.RIGS).read_text().splitlines()]
     assert [line["resolved"]["mirror"].pop("form") for line in lines] == [None] * len(lines)
-    (copy / layout.RIGS).write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (copy / schema.RIGS).write_text("".join(json.dumps(line) + "\n" for line in lines))
     old, new = open_dataset(copy), open_dataset(tiny_dataset)
     assert old.rigs["rig"] == new.rigs["rig"]
     assert old.rigs["rig"].mirror.form is None

@@ -6,6 +6,8 @@ import json
 import os
 import re
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,10 +22,8 @@ from phibench.datasets.build.assemble import visibility_line
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_dataset
 from phibench.datasets.show import show
-from phibench.datasets.store import checksums as sums
-from phibench.datasets.store import pictures as spot_picture
-from phibench.datasets.store import schema as layout
-from phibench.datasets.store.checksums import write_sums
+from phibench.datasets.store import checksums, pictures, schema
+from phibench.datasets.store.checksums import write_checksums
 from phibench.datasets.store.documents import read_manifest, write_manifest
 from phibench.datasets.store.layers import (
     read_ambient,
@@ -36,7 +36,7 @@ from phibench.datasets.store.layers import (
 from phibench.datasets.store.pictures import Picture
 from phibench.datasets.verify import Report, verify
 
-PREVIEW = layout.preview_file("seen-near-h0.500")
+PREVIEW = schema.preview_file("seen-near-h0.500")
 
 
 def check(folder: Path, truth_layers: bool = False) -> Report:
@@ -64,12 +64,12 @@ def test_a_fresh_data_set_is_in_order(name: str, request: pytest.FixtureRequest)
         AMBIENT,
         TRUTH,
         SPOT,
-        layout.LIGHT_MAP,
-        layout.TABLE,
-        layout.RECIPE,
-        layout.RIGS,
-        layout.preview_file("seen-near-h0.500"),
-        layout.MANIFEST,
+        schema.LIGHT_MAP,
+        schema.TABLE,
+        schema.RECIPE,
+        schema.RIGS,
+        schema.preview_file("seen-near-h0.500"),
+        schema.MANIFEST,
     ],
 )
 def test_a_damaged_file_is_named(copy: Path, name: str, damage: Callable[[Path], None]) -> None:
@@ -77,55 +77,55 @@ def test_a_damaged_file_is_named(copy: Path, name: str, damage: Callable[[Path],
     report = check(copy)
     assert not report.ok
     assert [fault for fault in report.faults if name in fault]
-    if name != layout.RIGS or damage is not flip_a_bit:  # another digit there is another rig: its spots do not fit it
-        assert not [fault for fault in report.faults if name not in fault and layout.MANIFEST not in fault]
+    if name != schema.RIGS or damage is not flip_a_bit:  # another digit there is another rig: its spots do not fit it
+        assert not [fault for fault in report.faults if name not in fault and schema.MANIFEST not in fault]
 
 
-@pytest.mark.parametrize(("a", "b"), [(SPOT, OTHER_SPOT), (AMBIENT, layout.view_file("h0.500", "ambient"))])
+@pytest.mark.parametrize(("a", "b"), [(SPOT, OTHER_SPOT), (AMBIENT, schema.view_file("h0.500", "ambient"))])
 @pytest.mark.parametrize("hide", [False, True], ids=["sums as they were", "sums made anew"])
 def test_swapped_files_are_found(copy: Path, a: str, b: str, hide: bool) -> None:
     swap(copy, a, b)
     if hide:
-        write_sums(copy)
+        write_checksums(copy)
     faults = check(copy).faults
     assert {name for name in (a, b) if any(name in fault for fault in faults)} == {a, b}
 
 
 def test_a_stray_file_is_a_note_and_neither_a_fault_nor_signed(copy: Path) -> None:
-    before = (copy / layout.SUMS).read_text()
+    before = (copy / schema.CHECKSUMS).read_text()
     (copy / "spots" / "extra.exr").write_bytes(b"")
     (copy / "scores.json").write_text("{}")
     report = check(copy)
     assert report.ok
     assert ["scores.json" in report.notes[0], "spots/extra.exr" in report.notes[1]] == [True, True]
-    write_sums(copy)
-    assert (copy / layout.SUMS).read_text() == before
+    write_checksums(copy)
+    assert (copy / schema.CHECKSUMS).read_text() == before
 
 
 def test_a_file_of_the_data_set_that_is_not_listed_is_a_fault(copy: Path) -> None:
-    lines = (copy / layout.SUMS).read_text().splitlines(keepends=True)
-    (copy / layout.SUMS).write_text("".join(line for line in lines if SPOT not in line))
+    lines = (copy / schema.CHECKSUMS).read_text().splitlines(keepends=True)
+    (copy / schema.CHECKSUMS).write_text("".join(line for line in lines if SPOT not in line))
     assert check(copy).faults == (f"{SPOT} is not listed in SHA256SUMS",)
 
 
 def test_a_missing_folder_and_an_unreadable_file_are_called_so(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(DatasetError, match="there is no folder"):
         check(copy / "nowhere")
-    sha256 = sums.sha256
+    sha256 = checksums.sha256
 
     def denied(path: Path) -> str:
-        if path.name == layout.TABLE:
+        if path.name == schema.TABLE:
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
         return sha256(path)
 
-    monkeypatch.setattr(sums, "sha256", denied)
-    assert check(copy).faults == (f"{layout.TABLE} is not readable: Permission denied",)
+    monkeypatch.setattr(checksums, "sha256", denied)
+    assert check(copy).faults == (f"{schema.TABLE} is not readable: Permission denied",)
 
 
 @pytest.mark.parametrize("name", ["irradiance_w_m2", "sigma_w_m2", "covered"])
 @pytest.mark.parametrize("spoil", ["negative", "nan", "short", "gone"])
 def test_a_spoilt_light_map_is_found_though_signed(copy: Path, name: str, spoil: str) -> None:
-    with np.load(copy / layout.LIGHT_MAP) as file:
+    with np.load(copy / schema.LIGHT_MAP) as file:
         arrays = dict(file)
     if spoil == "short":
         arrays[name] = arrays[name][:-1]
@@ -135,10 +135,10 @@ def test_a_spoilt_light_map_is_found_though_signed(copy: Path, name: str, spoil:
         arrays[name][5] = -1.0 if spoil == "negative" else np.nan
     else:
         return
-    np.savez(copy / layout.LIGHT_MAP, **arrays)
-    write_sums(copy)
+    np.savez(copy / schema.LIGHT_MAP, **arrays)
+    write_checksums(copy)
     [fault] = check(copy).faults
-    assert layout.LIGHT_MAP in fault
+    assert schema.LIGHT_MAP in fault
     assert name in fault
 
 
@@ -148,12 +148,12 @@ def test_a_variance_that_is_none_is_found_though_signed(copy: Path, value: float
     planes, variance, header = read_ambient(path), read_ambient_variance(path), read_exr(path).header
     variance[1, 2, 3] = value
     write_ambient(path, planes, variance, header)
-    write_sums(copy)
+    write_checksums(copy)
     assert check(copy).faults == (f"{AMBIENT} has negative or non-finite variances",)
 
 
 def test_an_unfinished_data_set_is_found(copy: Path) -> None:
-    (copy / layout.SUMS).unlink()
+    (copy / schema.CHECKSUMS).unlink()
     [fault] = check(copy).faults
     assert "was not finished" in fault
 
@@ -163,16 +163,16 @@ def test_a_truth_that_the_parameters_do_not_give_is_found(copy: Path) -> None:
     rows = read_manifest(copy)
     up = rows[0].up.model_copy(update={"u_px": rows[0].up.u_px + 1e-7})
     write_manifest(copy, [rows[0].model_copy(update={"up": up}), *rows[1:]])
-    write_sums(copy)
+    write_checksums(copy)
     [fault] = check(copy).faults
     assert fault.startswith("seen-near-h0.500 up: u_px is")
 
 
 def test_a_changed_rig_is_found(copy: Path) -> None:
-    rig = json.loads((copy / layout.RIGS).read_text())
+    rig = json.loads((copy / schema.RIGS).read_text())
     rig["resolved"]["mirror"]["radius_m"] += 1e-6
-    (copy / layout.RIGS).write_text(json.dumps(rig))
-    write_sums(copy)
+    (copy / schema.RIGS).write_text(json.dumps(rig))
+    write_checksums(copy)
     faults = check(copy).faults
     assert any("u_px" in fault for fault in faults)
     assert any("phi_ray_rad" in fault for fault in faults)
@@ -180,11 +180,11 @@ def test_a_changed_rig_is_found(copy: Path) -> None:
 
 
 def test_a_missing_row_is_found(copy: Path) -> None:
-    info = json.loads((copy / layout.INFO).read_text())
+    info = json.loads((copy / schema.INFO).read_text())
     info["samples"] = 1
-    (copy / layout.INFO).write_text(json.dumps(info))
+    (copy / schema.INFO).write_text(json.dumps(info))
     write_manifest(copy, read_manifest(copy)[:1])
-    write_sums(copy)
+    write_checksums(copy)
     assert "manifest.jsonl: sample half-hidden-h1.400 of the recipe is missing" in check(copy).faults
 
 
@@ -192,7 +192,7 @@ def test_a_changed_pixel_truth_is_found_when_asked_for(copy: Path) -> None:
     planes = read_truth(copy / TRUTH)
     planes["depth_m"][60:120, 100:200] *= 1.0 + 1e-5
     write_truth(copy / TRUTH, planes, {"dataset": "tiny", "pose": "h0.500", "offset_m": 0.5})
-    write_sums(copy)
+    write_checksums(copy)
     assert check(copy).ok
     [fault] = check(copy, truth_layers=True).faults
     assert "depth_m is not what the parameters give" in fault
@@ -205,7 +205,7 @@ def test_what_is_no_data_set_raises(tmp_path: Path) -> None:
 
 
 def test_a_damaged_info_is_a_fault(copy: Path) -> None:
-    truncate(copy / layout.INFO)
+    truncate(copy / schema.INFO)
     assert len(check(copy).faults) == 2  # its hash, and that it cannot be read
 
 
@@ -247,12 +247,25 @@ def test_a_sheet_that_cannot_be_written_is_said_after_the_table(tiny_dataset: Pa
     assert "seen-near-h0.500" in console.file.getvalue()  # type: ignore[attr-defined]
 
 
+def test_the_sheet_is_written_when_the_reader_of_the_table_leaves(copy: Path) -> None:
+    """As in `phibench dataset show DIR | head`."""
+    command = [sys.executable, "-m", "phibench", "dataset", "show", str(copy)]
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "wb") as closed:
+        child = subprocess.run(command, stdout=closed, stderr=subprocess.PIPE, text=True, timeout=120, check=False)
+    assert child.returncode == 0, child.stderr
+    assert "Traceback" not in child.stderr
+    assert "Broken" not in child.stderr
+    assert (copy / schema.CONTACT_SHEET).stat().st_size > 1000
+
+
 def test_a_sheet_says_why_a_spot_is_hidden(tiny_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     said = []
 
     def captioned(picture: Picture, text: str) -> Picture:
         said.append(text)
-        changed = spot_picture.captioned(picture, text)
+        changed = pictures.captioned(picture, text)
         assert np.count_nonzero(changed != picture) > 100
         return changed
 
@@ -263,7 +276,7 @@ def test_a_sheet_says_why_a_spot_is_hidden(tiny_dataset: Path, monkeypatch: pyte
 
 
 def test_previews_mark_the_spot(tiny_dataset: Path) -> None:
-    with Image.open(tiny_dataset / layout.preview_file("seen-near-h0.500")) as image:
+    with Image.open(tiny_dataset / schema.preview_file("seen-near-h0.500")) as image:
         picture = np.asarray(image)
     for half in np.split(picture, 2, axis=1):
         marks = np.all(half == (0, 255, 80), axis=2)

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from phibench.datasets.store import schema as layout
+from phibench.datasets.store import schema
 
-AMBIENT, TRUTH = layout.view_file("h0.000", "ambient"), layout.view_file("h0.500", "truth")
+AMBIENT, TRUTH = schema.view_file("h0.000", "ambient"), schema.view_file("h0.500", "truth")
 
 
 SPOT, OTHER_SPOT = "spots/seen-near-h0.500-down.exr", "spots/seen-near-h0.500-up.exr"

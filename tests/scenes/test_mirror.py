@@ -219,7 +219,7 @@ def test_rays_from_values_against_newtons_method() -> None:
 
 def test_rays_inside_a_kernel_against_those_in_float64() -> None:
     """The ambient layer's rays start 200 to 300 mm off, in float32: 1.5e-5 mm, over cos i >= 0.05."""
-    from phibench.render.room import shading as form_kernel
+    from phibench.render.room import shading
     from phibench.render.setup.variant import activate
 
     mi, rng = activate(), np.random.default_rng(6)
@@ -229,7 +229,7 @@ def test_rays_inside_a_kernel_against_those_in_float64() -> None:
     expected = reflect(view, origins, ways)
     origins = 1e3 * (origins - view.sphere_centre_m)
     ray = mi.Ray3f(*(kind(*v.T.astype(np.float32)) for kind, v in ((mi.Point3f, origins), (mi.Vector3f, ways))))
-    points, normals, found = (np.array(x).T for x in form_kernel.meet(mi, view, ray))
+    points, normals, found = (np.array(x).T for x in shading.meet(mi, view, ray))
     sure = expected.cos_incidence > 0.05
     assert sure.sum() > 5000
     assert found[sure].all()

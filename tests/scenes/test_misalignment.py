@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from phibench.datasets.errors import RecipeError
 from phibench.datasets.plan.plan import make_plan, shard_plan
 from phibench.datasets.read import open_finished
-from phibench.datasets.recipe import tables as recipes
+from phibench.datasets.recipe import tables
 from phibench.datasets.recipe.load import check_recipe
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.layers import read_ambient, read_truth
@@ -186,7 +186,7 @@ def test_the_motion_is_no_part_of_the_carriages_speed() -> None:
 
 
 def test_a_recipe_knows_the_parameters_of_scenes() -> None:
-    for table in (recipes.MisalignmentTable, recipes.RandomMisalignmentTable):
+    for table in (tables.MisalignmentTable, tables.RandomMisalignmentTable):
         assert list(table.model_fields) == list(PARAMETERS)
 
 

@@ -17,7 +17,7 @@ from phibench.datasets.build.journal import Entry, Head, Journal
 from phibench.datasets.build.run_tasks import claim
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import make
-from phibench.datasets.store import schema as layout
+from phibench.datasets.store import schema
 from phibench.datasets.store.files import TEMPORARY_PREFIX, only_run
 from phibench.datasets.store.provenance import _tables, closure, code_behind
 
@@ -40,7 +40,7 @@ def again(out: Path, *changes: tuple[str, str]) -> list[str]:
         text = text.replace(old, new)
     recipe = out.parent / "changed.toml"
     recipe.write_text(text)
-    (out / layout.LOG).write_text("")
+    (out / schema.LOG).write_text("")
     make(recipe, out, workers=1, console=quiet())
     return done(out)
 
@@ -79,13 +79,13 @@ def test_only_what_a_change_changes_is_made_again(copy: Path, old: str, new: str
 @pytest.mark.usefixtures("inline")
 def test_a_room_whose_lamps_go_out_loses_its_light_map(copy: Path) -> None:
     assert "bake room" not in again(copy, ("[ambient]", '[room]\nname = "dark"\n\n[ambient]'))
-    assert not (copy / layout.LIGHT_MAP).exists()
-    assert layout.LIGHT_MAP not in (copy / layout.SUMS).read_text()
+    assert not (copy / schema.LIGHT_MAP).exists()
+    assert schema.LIGHT_MAP not in (copy / schema.CHECKSUMS).read_text()
 
 
 @pytest.mark.usefixtures("inline")
 def test_names_and_times_of_files_prove_nothing(copy: Path) -> None:
-    spot = copy / layout.spot_file("seen-near-h0.500", "up")
+    spot = copy / schema.spot_file("seen-near-h0.500", "up")
     for when in (0.0, time.time() + 1e8):
         for path in copy.rglob("*"):
             os.utime(path, (when, when))
@@ -100,10 +100,10 @@ def test_names_and_times_of_files_prove_nothing(copy: Path) -> None:
 @pytest.mark.usefixtures("inline")
 @pytest.mark.parametrize("line", range(1, 9))
 def test_a_damaged_line_of_the_journal_costs_its_task_only(copy: Path, tiny_dataset: Path, line: int) -> None:
-    lines = (copy / layout.JOURNAL).read_bytes().splitlines(keepends=True)
+    lines = (copy / schema.JOURNAL).read_bytes().splitlines(keepends=True)
     assert len(lines) == 9
     lines[line] = lines[line].replace(b'"', b"'", 1)
-    (copy / layout.JOURNAL).write_bytes(b"".join(lines))
+    (copy / schema.JOURNAL).write_bytes(b"".join(lines))
     assert len(again(copy)) == 1
     assert contents(copy) == contents(tiny_dataset)
 
@@ -113,12 +113,12 @@ def test_a_torn_last_line_is_as_if_it_were_not_there(tmp_path: Path) -> None:
         journal.begin(Head("{}", ""), [])
         journal.add(Entry("view a", "k", {"f": "0"}))
         journal.add(Entry("view b", "k", {"g": "0"}, [1.5, None]))
-    whole = (tmp_path / layout.JOURNAL).read_bytes()
+    whole = (tmp_path / schema.JOURNAL).read_bytes()
     start = whole.index(b"view b")
     for end in range(start, len(whole) - 1):
-        (tmp_path / layout.JOURNAL).write_bytes(whole[:end])
+        (tmp_path / schema.JOURNAL).write_bytes(whole[:end])
         assert list(Journal(tmp_path).entries) == ["view a"]
-    (tmp_path / layout.JOURNAL).write_bytes(whole)
+    (tmp_path / schema.JOURNAL).write_bytes(whole)
     assert Journal(tmp_path).entries["view b"] == Entry("view b", "k", {"g": "0"}, [1.5, None])
 
 
@@ -161,7 +161,7 @@ def test_a_second_run_is_refused_and_a_killed_one_holds_nothing(tmp_path: Path) 
 
 
 def test_what_a_run_leaves_that_is_killed_at_once_is_no_obstacle(tmp_path: Path) -> None:
-    for name in (layout.LOCK, layout.WORKING, f"{TEMPORARY_PREFIX}probe", f"{TEMPORARY_PREFIX}abc.txt"):
+    for name in (schema.LOCK, schema.WORKING, f"{TEMPORARY_PREFIX}probe", f"{TEMPORARY_PREFIX}abc.txt"):
         (tmp_path / name).write_bytes(b"")
     claim(tmp_path, "tiny")
     (tmp_path / "mine.txt").write_bytes(b"")

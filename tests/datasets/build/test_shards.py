@@ -14,7 +14,7 @@ from phibench.datasets.merge_repair import merge
 from phibench.datasets.plan.plan import make_plan, shard_plan
 from phibench.datasets.read import open_dataset
 from phibench.datasets.recipe.load import load_recipe
-from phibench.datasets.store import schema as layout
+from phibench.datasets.store import schema
 from phibench.datasets.verify import verify
 from phibench.scenes.rig import POSITIONS
 
@@ -74,7 +74,7 @@ def test_an_empty_shard_is_refused() -> None:
 def refusal(out: Path, shards: Sequence[Path]) -> str:
     with pytest.raises(DatasetError) as caught:
         merge(out, shards, quiet())
-    assert not (out / layout.SUMS).exists()
+    assert not (out / schema.CHECKSUMS).exists()
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
@@ -92,10 +92,10 @@ def test_what_does_not_fit_is_refused(shards: list[Path], tmp_path: Path) -> Non
     make(other, tmp_path / "s4", workers=1, console=quiet(), shard="2/2")
     assert "are of different recipes" in refusal(out, [first, tmp_path / "s4"])
     assert "is not a finished shard" in refusal(out, [first, tmp_path / "none"])
-    file = second / layout.spot_file("half-hidden-h1.400", "up")
+    file = second / schema.spot_file("half-hidden-h1.400", "up")
     file.write_bytes(file.read_bytes()[:-1])
     assert "is damaged; run `phibench dataset repair`" in refusal(out, shards)
     file.unlink()
     assert "is missing; run `phibench dataset repair`" in refusal(out, shards)
-    (second / layout.SUMS).unlink()
+    (second / schema.CHECKSUMS).unlink()
     assert "is not a finished shard" in refusal(out, shards)

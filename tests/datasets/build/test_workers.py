@@ -16,13 +16,13 @@ import pytest
 from helpers.folders import contents
 from helpers.processes import TINY, living, quiet, said, wait_for
 
-from phibench.datasets.build import workers as cluster
+from phibench.datasets.build import workers
 from phibench.datasets.build.scheduler import dispatch
 from phibench.datasets.build.tasks import Done, Failed, Made, Task
 from phibench.datasets.build.workers import _checked, describe, local_environment, local_workers
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import make
-from phibench.datasets.store import schema as layout
+from phibench.datasets.store import schema
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGE = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
@@ -63,8 +63,8 @@ def tasks() -> list[Task]:
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_who_kills_workers_is_named_and_all_others_finish(tmp_path: Path, count: int) -> None:
-    with local_workers(count, tmp_path) as workers:
-        outcomes = {task.name: outcome for task, outcome in dispatch(tasks(), workers)}
+    with local_workers(count, tmp_path) as pool:
+        outcomes = {task.name: outcome for task, outcome in dispatch(tasks(), pool)}
     good = {name: outcome.result for name, outcome in outcomes.items() if isinstance(outcome, Done)}
     assert good == {f"square {i}": i * i for i in range(12)}
     causes = {name: outcome.cause for name, outcome in outcomes.items() if isinstance(outcome, Failed)}
@@ -147,12 +147,12 @@ def test_the_documented_shards_give_the_same_bytes(tiny_dataset: Path, tmp_path:
 def refusal(out: Path, scheduler: str) -> str:
     with pytest.raises(DatasetError) as caught:
         make(TINY, out, console=quiet(), scheduler=scheduler)
-    assert not (out / layout.MANIFEST).exists()
+    assert not (out / schema.MANIFEST).exists()
     return str(caught.value)
 
 
 def test_a_scheduler_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "CONNECT_S", 1.0)
+    monkeypatch.setattr(workers, "CONNECT_S", 1.0)
     assert "no dask scheduler answers at tcp://127.0.0.1:9 within 1 s" in refusal(tmp_path, "tcp://127.0.0.1:9")
     assert "no dask scheduler answers at nonsense://x" in refusal(tmp_path, "nonsense://x")
     assert "there is no scheduler file" in refusal(tmp_path, str(tmp_path / "none.json"))
@@ -165,10 +165,10 @@ def test_a_scheduler_that_is_not_there(tmp_path: Path, monkeypatch: pytest.Monke
 def test_workers_that_are_missing_or_do_not_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scheduler, worker, _ = commands("loopback", tmp_path)
     file = scheduler[-1]
-    monkeypatch.setattr(cluster, "WORKERS_S", 1.0)
+    monkeypatch.setattr(workers, "WORKERS_S", 1.0)
     with running(scheduler):
         assert "has no workers after 1 s" in refusal(tmp_path / "out", file)
-        monkeypatch.setattr(cluster, "WORKERS_S", 60.0)
+        monkeypatch.setattr(workers, "WORKERS_S", 60.0)
         with running([word if word != "1" else "2" for word in worker]):
             assert "has more than one thread" in refusal(tmp_path / "out", file)
         blocked = tmp_path / "blocked"
@@ -185,15 +185,15 @@ def test_workers_that_are_missing_or_do_not_fit(tmp_path: Path, monkeypatch: pyt
 def test_workers_that_all_go_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A task that waits for workers that never come back ends in a sentence, not in waiting."""
     scheduler, worker, _ = commands("loopback", tmp_path)
-    monkeypatch.setattr(cluster, "LOST_S", 5.0)
+    monkeypatch.setattr(workers, "LOST_S", 5.0)
     with running(scheduler), contextlib.ExitStack() as stack:
         first = stack.enter_context(contextlib.ExitStack())
         first.enter_context(running(worker))
-        workers = stack.enter_context(cluster.remote_workers(scheduler[-1], tmp_path / "out"))
+        pool = stack.enter_context(workers.remote_workers(scheduler[-1], tmp_path / "out"))
         first.close()
-        workers.submit(Task("view x", "", dict))
+        pool.submit(Task("view x", "", dict))
         with pytest.raises(DatasetError, match="no workers for 5 s; start some and run the same command again"):
-            workers.next()
+            pool.next()
 
 
 def test_environments_that_differ_are_refused() -> None:
@@ -217,7 +217,7 @@ def test_this_machine_is_asked_in_another_process() -> None:
 
 
 def test_every_task_is_logged(tiny_dataset: Path) -> None:
-    entries = [json.loads(line) for line in (tiny_dataset / layout.LOG).read_text().splitlines()]
+    entries = [json.loads(line) for line in (tiny_dataset / schema.LOG).read_text().splitlines()]
     assert len(entries) == 8
     for entry in entries:
         assert entry["ok"]

@@ -18,7 +18,7 @@ from scipy import stats
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.errors import DatasetError, RecipeError
-from phibench.datasets.exposures import exposures as takes_module
+from phibench.datasets.exposures import pair_draws as module
 from phibench.datasets.exposures.pair_draws import BOX_MARGIN_PX, CachedSample, PairDraw, pair_draws
 from phibench.datasets.make import make, make_from_plan
 from phibench.datasets.plan.plan import make_plan
@@ -139,14 +139,14 @@ def test_a_spot_is_anywhere_in_its_box(bench_dataset: Path) -> None:
 
 def test_a_box_at_the_border_stays_in_the_image() -> None:
     random = np.random.default_rng(3)
-    starts = [takes_module._start(random, centre, 32, 320) for centre in (-0.5, 2.0, 160.0, 318.0, 319.5) * 100]
+    starts = [module._start(random, centre, 32, 320) for centre in (-0.5, 2.0, 160.0, 318.0, 319.5) * 100]
     checked = 0
     for centre, start in zip((-0.5, 2.0, 160.0, 318.0, 319.5) * 100, starts, strict=True):
         assert 0 <= start <= 288
         assert start - 0.5 <= centre <= start + 31.5
         checked += 1
     assert checked == 500
-    assert takes_module._start(random, 5.0, 64, 48) == 0  # a box larger than the image is the image
+    assert module._start(random, 5.0, 64, 48) == 0  # a box larger than the image is the image
 
 
 def test_without_a_place_of_the_spot_the_box_is_anywhere(bench_dataset: Path) -> None:

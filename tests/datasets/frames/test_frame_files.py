@@ -8,12 +8,13 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import polars
 import pytest
 from PIL import Image
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exposures.draw import draw_frames
-from phibench.datasets.frames.frame_files import INDEX, REQUEST, preview, read_index
+from phibench.datasets.frames.frame_files import INDEX, INDEX_TABLE, REQUEST, TRUTH, FrameRow, preview, read_index
 from phibench.datasets.frames.request import FrameRequest
 from phibench.datasets.frames.source import Frame
 from phibench.datasets.read import open_dataset
@@ -57,11 +58,43 @@ def test_files_are_what_the_api_gives(tiny_dataset: Path, tmp_path: Path, preset
         assert hashlib.sha256((out / name).read_bytes()).hexdigest() == row.sha256
         assert row.sensor == json.loads(frame.sensor.model_dump_json())
         assert (row.width_px, row.height_px, row.exposure_s) == (320, 180, frame.sensor.exposure_s)
+        spot = dataset[row.sample_id].truth_row(row.position)
+        for field in TRUTH:
+            np.testing.assert_equal(getattr(row, field), getattr(spot, field))
+        manifest = dataset[row.sample_id].row
+        assert (row.depth_m, row.stroke_m) == (manifest.depth_m, manifest.stroke_m)
         if mode:
             with Image.open(out / name) as picture:
                 assert picture.mode == mode
         if preset == "mjpeg":
             assert (out / name).read_bytes() == frame.jpeg
+
+
+def test_the_index_as_a_table_says_the_same(tiny_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "f"
+    draw_frames(tiny_dataset, FrameRequest.of("mjpeg", {"jpeg_quality": 60}), 2, out=out, laser_off=True, workers=1)
+    lines = [json.loads(line) for line in (out / INDEX).read_text().splitlines()]
+    table = polars.read_parquet(out / INDEX_TABLE)
+    assert table.columns == list(FrameRow.model_fields)
+    rows = [{**row, **{name: json.loads(row[name]) for name in ("sensor", "request")}} for row in table.to_dicts()]
+    assert rows == lines
+    hidden = table.filter(~polars.col("visible"))
+    assert 0 < hidden.height < table.height == 16
+    assert hidden["cause"].str.starts_with("occluded:").all()
+
+
+def test_an_exposure_that_is_not_given_is_the_cameras(tiny_dataset: Path, tmp_path: Path) -> None:
+    """Processed presets are auto exposed; the others keep the preset's time."""
+    options = ("--samples", SEEN, "--region", 16, "--workers", 1)
+    for preset, exposure in (("mjpeg", "auto"), ("srgb8", "auto"), ("bayer-raw", None)):
+        assert run(tiny_dataset, "--preset", preset, *options, "--out", tmp_path / preset) == 0
+        rows = [row for row in read_index(tmp_path / preset).values() if row.kind == "frame"]
+        assert {row.request["exposure"] for row in rows} == {exposure}
+        for row in rows:
+            sensor = open_dataset(tiny_dataset)[SEEN].frame_source(preset, exposure=exposure).sides[row.position]
+            assert row.exposure_s == sensor.chain.sensor.exposure_s
+    assert run(tiny_dataset, *options, "--exposure", "preset", "--out", tmp_path / "p") == 0
+    assert {row.exposure_s for row in read_index(tmp_path / "p").values()} == {1.0 / 60.0}
 
 
 def test_raw_files_hold_ten_bits_unscaled(tiny_dataset: Path, tmp_path: Path) -> None:
@@ -103,7 +136,7 @@ def test_workers_give_the_same_bytes(tiny_dataset: Path, tmp_path: Path) -> None
     one, two = ({p.name: p.read_bytes() for p in (tmp_path / n).glob("*.*") if p.is_file()} for n in ("1", "2"))
     one, two = ({name: data for name, data in x.items() if not name.startswith(".")} for x in (one, two))
     assert one == two
-    assert len(one) == 2 * 2 * 2 + 2  # the index and the request
+    assert len(one) == 2 * 2 * 2 + 3  # the index in two forms and the request
 
 
 def test_changed_layers_are_drawn_again(tiny_dataset: Path, tmp_path: Path) -> None:
@@ -139,7 +172,7 @@ def test_samples_without_a_place_for_a_region_are_named(
     ("tokens", "words"),
     [
         (["--preset", "mjpg"], "did you mean 'mjpeg'"),
-        (["--exposure", "long"], "give seconds above 0, or 'auto'"),
+        (["--exposure", "long"], "give seconds above 0, 'auto'"),
         (["--exposure", "0"], "give a number above 0 up to 10"),
         (["--draws", "0"], "draws = 0: must be an integer, 1 or above"),
         (["--region", "0"], "region = 0: must be an integer, 1 or above"),

@@ -24,8 +24,8 @@ from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.read import open_dataset, open_finished
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.show import contact_sheet
-from phibench.datasets.store import schema as layout
-from phibench.datasets.store.checksums import write_sums
+from phibench.datasets.store import schema
+from phibench.datasets.store.checksums import write_checksums
 from phibench.datasets.store.documents import read_manifest, write_manifest
 from phibench.datasets.store.layers import read_exr
 from phibench.datasets.verify import verify
@@ -60,18 +60,18 @@ def copy(made: Path, tmp_path: Path) -> Path:
 
 @pytest.mark.usefixtures("inline")
 def test_more_samples_keep_every_byte_and_render_only_the_new_ones(made: Path, copy: Path, tmp_path: Path) -> None:
-    (copy / layout.LOG).write_text("")
+    (copy / schema.LOG).write_text("")
     make(with_samples(5, tmp_path), copy, workers=1, console=quiet())
     new = ("000003", "000004")
     views = [f"view {pose.pose}" for pose in open_dataset(copy).info.poses if pose.rig.endswith(new)]
     assert len(views) == 4
     assert done(copy) == sorted([*views, *(f"{kind} random-{number}" for kind in ("spot", "sample") for number in new)])
-    of_all = {layout.INFO, layout.MANIFEST, layout.TABLE, layout.RECIPE, layout.RIGS, layout.SUMS, layout.JOURNAL}
+    of_all = {schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.RIGS, schema.CHECKSUMS, schema.JOURNAL}
     before, after = contents(made), contents(copy)
     kept = set(before) - of_all
     assert len(kept) == 1 + 6 * 3 + 6 + 3  # light map; ambient, truth, preview of six poses; spots; previews
     assert {name for name in kept if after[name] != before[name]} == set()
-    for name in (layout.MANIFEST, layout.RIGS):
+    for name in (schema.MANIFEST, schema.RIGS):
         assert after[name].startswith(before[name])
     fresh = make(tmp_path / "5.toml", tmp_path / "fresh", workers=1, console=quiet())
     assert contents(fresh) == after
@@ -117,7 +117,7 @@ def test_spots_of_rays_are_rendered_and_verified(tmp_path: Path) -> None:
 
 
 def test_what_was_drawn_has_columns(made: Path) -> None:
-    table = polars.read_parquet(made / layout.TABLE)
+    table = polars.read_parquet(made / schema.TABLE)
     rows = read_manifest(made)
     names = [name for name in table.columns if name.startswith("drawn.")]
     assert names == [f"drawn.{key}" for key in rows[0].drawn]
@@ -142,27 +142,27 @@ def test_a_row_that_the_recipe_does_not_draw_is_found_though_signed(copy: Path, 
         "spot_world_m": (*rows[1].spot_world_m[:2], rows[1].spot_world_m[2] + 1e-9),
     }[change]
     write_manifest(copy, [rows[0], rows[1].model_copy(update={change: value}), rows[2]])
-    write_sums(copy)
+    write_checksums(copy)
     faults = verify(copy, truth_layers=False, console=quiet()).faults
     assert [fault for fault in faults if fault.startswith(f"random-000001: {change} is")]
 
 
 def test_a_changed_or_missing_rig_is_found(copy: Path) -> None:
-    lines = (copy / layout.RIGS).read_text().splitlines(keepends=True)
+    lines = (copy / schema.RIGS).read_text().splitlines(keepends=True)
     other = json.loads(lines[1])
     other["resolved"]["camera"]["cx_px"] += 1e-6
-    (copy / layout.RIGS).write_text(lines[0] + json.dumps(other) + "\n" + lines[2])
+    (copy / schema.RIGS).write_text(lines[0] + json.dumps(other) + "\n" + lines[2])
     with pytest.raises(DatasetError, match=r"rigs\.jsonl is damaged"):
         open_finished(copy)
-    write_sums(copy)
+    write_checksums(copy)
     faults = verify(copy, truth_layers=False, console=quiet()).faults
     assert "rigs.jsonl: r000001 is not the rig that the recipe gives" in faults
     assert [fault for fault in faults if fault.startswith("random-000001 down: u_px")]
     assert not [fault for fault in faults if fault.startswith("random-000000")]
-    (copy / layout.RIGS).write_text(lines[0])
+    (copy / schema.RIGS).write_text(lines[0])
     with pytest.raises(DatasetError, match="1 rigs instead of 3"):
         open_dataset(copy)
-    (copy / layout.RIGS).write_text("{}\n")
+    (copy / schema.RIGS).write_text("{}\n")
     with pytest.raises(DatasetError, match="line 1 is damaged"):
         open_dataset(copy)
 
@@ -179,8 +179,8 @@ def test_shards_give_the_same_bytes(made: Path, tmp_path: Path) -> None:
 def test_what_is_damaged_is_made_again(made: Path, copy: Path) -> None:
     pose = open_dataset(copy).info.poses[3]
     (copy / pose.files["truth"]).write_bytes(b"")
-    (copy / layout.RIGS).unlink()
-    assert repair(copy, 1, quiet()) == [f"view {pose.pose}", layout.RIGS, layout.SUMS]
+    (copy / schema.RIGS).unlink()
+    assert repair(copy, 1, quiet()) == [f"view {pose.pose}", schema.RIGS, schema.CHECKSUMS]
     assert contents(copy) == contents(made)
 
 

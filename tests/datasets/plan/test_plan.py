@@ -11,7 +11,7 @@ from phibench.datasets.build.spot_task import answer_spot
 from phibench.datasets.errors import RecipeError
 from phibench.datasets.plan.plan import make_plan, pose_name
 from phibench.datasets.recipe.load import check_recipe, load_recipe
-from phibench.estimator.geometry import paper_depth as published
+from phibench.estimator.geometry import paper_depth
 from phibench.scenes.random_streams import generator, seed_32, seed_sequence
 from phibench.scenes.rig import POSITIONS
 
@@ -34,7 +34,7 @@ def test_the_paper_recipe_is_the_papers_tables() -> None:
 
 
 def test_the_tables_here_are_the_published_ones() -> None:
-    path = Path(published.__file__).with_name("published.csv")
+    path = Path(paper_depth.__file__).with_name("published.csv")
     lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
     rows = [(f"table{r['table']}", float(r["real_depth_m"]), float(r["baseline_m"])) for r in csv.DictReader(lines)]
     assert rows == [(table, depth_m, h) for table, pairs in PAPER.items() for depth_m, h in pairs]

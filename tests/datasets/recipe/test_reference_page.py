@@ -5,24 +5,26 @@ from pathlib import Path
 
 import pytest
 
-from phibench.datasets.recipe import reference_page as recipe_page
+from phibench.datasets.recipe import reference_page
 from phibench.datasets.recipe.build import build_rig
 from phibench.datasets.recipe.tables import RigTable
 from phibench.scenes.catalog import RIGS
 
-PAGE = (Path(recipe_page.__file__).resolve().parents[1] / "RECIPE.md").read_text(encoding="utf-8")
+PAGE = (Path(reference_page.__file__).resolve().parents[1] / "RECIPE.md").read_text(encoding="utf-8")
 
 
 def test_the_page_is_the_generated_one() -> None:
-    assert recipe_page.recipe_page() == PAGE, (
+    assert reference_page.recipe_page() == PAGE, (
         "run python -m phibench.datasets.recipe.reference_page > datasets/RECIPE.md"
     )
 
 
-@pytest.mark.parametrize("heading", recipe_page.TABLES)
+@pytest.mark.parametrize("heading", reference_page.TABLES)
 def test_every_key_has_its_line(heading: str) -> None:
     section = PAGE.split(f"## `{heading}`\n")[1].split("\n## ")[0]
-    assert re.findall(r"^\| `(\w+)` \|", section, flags=re.MULTILINE) == list(recipe_page.TABLES[heading].model_fields)
+    assert re.findall(r"^\| `(\w+)` \|", section, flags=re.MULTILINE) == list(
+        reference_page.TABLES[heading].model_fields
+    )
 
 
 def test_units_ranges_and_defaults_are_there() -> None:
@@ -36,7 +38,7 @@ def test_units_ranges_and_defaults_are_there() -> None:
 def test_a_recipe_that_writes_the_presets_values_gets_the_preset(name: str) -> None:
     """The column can be typed in: it gives the same rig, from either preset."""
     rig = RIGS[name]()
-    values = {key: recipe_page.preset_value(rig, key) for key in RigTable.model_fields}
+    values = {key: reference_page.preset_value(rig, key) for key in RigTable.model_fields}
     table = {key: value for key, value in values.items() if value is not None}
     table |= {key: int(table[key]) for key in ("width_px", "height_px")}
     assert len(table) == len(RigTable.model_fields) - 1  # all but `preset` itself

@@ -1,21 +1,27 @@
 """Nothing half-written ever stands under a final name."""
 
+import contextlib
 import errno
 import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from phibench.datasets.store import files
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.store import files, schema
 from phibench.datasets.store.files import (
     TEMPORARY_PREFIX,
+    only_run,
     remove_temporary,
     sha256,
+    working,
     write_atomic,
     write_bytes,
     write_text,
@@ -132,3 +138,59 @@ def test_a_folder_that_is_a_file_is_a_write_error(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"")
     with pytest.raises(files.WriteError, match=r"could not write .*a/b/c\.txt"):
         write_bytes(tmp_path / "a" / "b" / "c.txt", b"")
+
+
+HOLD = (
+    "import sys, time\nfrom pathlib import Path\nfrom phibench.datasets.store.files import working\n"
+    "with working(Path(sys.argv[1])):\n    print('works', flush=True)\n    time.sleep(60)"
+)
+
+
+def test_locks_leave_nothing_behind(tmp_path: Path) -> None:
+    with only_run(tmp_path), working(tmp_path), working(tmp_path):
+        assert len(list(tmp_path.iterdir())) == 3
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(ZeroDivisionError), only_run(tmp_path), working(tmp_path):
+        1 / 0  # noqa: B018
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / schema.WORKING).write_bytes(b"")  # of a version before 0.2
+    with only_run(tmp_path):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_new_run_waits_for_the_workers_of_a_killed_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "PATIENCE_S", 0.2)
+    with subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True) as worker:
+        assert worker.stdout is not None
+        assert worker.stdout.readline() == "works\n"
+        with pytest.raises(DatasetError, match="workers of an earlier run are still writing"), only_run(tmp_path):
+            pass
+        assert len(list(tmp_path.iterdir())) == 1
+        worker.kill()
+    assert len(list(tmp_path.iterdir())) == 1  # killed: nobody removed it
+    with only_run(tmp_path):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_one_of_many_that_come_together_gets_the_lock(tmp_path: Path) -> None:
+    """The holder removes the file when it leaves: a lock on the removed file must not count."""
+    inside, most = [], []
+
+    def come() -> None:
+        for _ in range(200):
+            with contextlib.suppress(DatasetError), only_run(tmp_path):
+                inside.append(1)
+                most.append(len(inside))
+                time.sleep(1e-5)
+                inside.pop()
+
+    threads = [threading.Thread(target=come) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(most) >= 20
+    assert max(most) == 1
+    assert list(tmp_path.iterdir()) == []

@@ -7,10 +7,9 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
+from phibench.datasets.frames.frame_files import TRUTH, FrameRow
 from phibench.datasets.store import layers, schema
-from phibench.datasets.store import schema as layout
 from phibench.render.optics import truth
-from phibench.render.optics import truth as spot_truth
 from phibench.render.room.light_map import ARRAYS, LightMap
 from phibench.scenes.camera import FILTERS
 
@@ -23,6 +22,7 @@ MODELS = (
     schema.DatasetInfo,
     schema.PoseInfo,
     schema.RigInfo,
+    FrameRow,
 )
 
 
@@ -61,7 +61,7 @@ def test_fields_and_units(index: int) -> None:
 @pytest.mark.parametrize("index", range(len(MODELS)), ids=lambda i: MODELS[i].__name__)
 def test_types(index: int) -> None:
     kinds = {
-        "string": "str",
+        "string": "str|Literal",
         "double": "float",
         "3 doubles": "tuple",
         "2 doubles": "tuple",
@@ -70,17 +70,25 @@ def test_types(index: int) -> None:
     }
     for name, kind, *_ in field_tables()[index]:
         annotation = str(MODELS[index].model_fields[names(name)[0]].annotation)
-        assert kinds.get(kind.removesuffix(" or null"), "") in annotation
+        assert re.search(kinds.get(kind.removesuffix(" or null"), ""), annotation), name
         assert ("None" in annotation) == ("null" in kind), name
 
 
 def test_files() -> None:
     said = {name for row in table_with("file", "content") for name in names(row[0])}
-    views = {layout.view_file("POSE", name) for name in ("ambient", "truth", "preview")}
-    spots = {layout.spot_file("SAMPLE", position) for position in ("down", "up")}
-    single = {layout.INFO, layout.MANIFEST, layout.TABLE, layout.RECIPE, layout.SUMS, layout.RUN, layout.CONTACT_SHEET}
-    single |= {layout.LOG, layout.JOURNAL, layout.LIGHT_MAP, layout.RIGS, layout.SENSITIVITIES}
-    assert said == views | spots | single | {layout.preview_file("SAMPLE")}
+    views = {schema.view_file("POSE", name) for name in ("ambient", "truth", "preview")}
+    spots = {schema.spot_file("SAMPLE", position) for position in ("down", "up")}
+    single = {
+        schema.INFO,
+        schema.MANIFEST,
+        schema.TABLE,
+        schema.RECIPE,
+        schema.CHECKSUMS,
+        schema.RUN,
+        schema.CONTACT_SHEET,
+    }
+    single |= {schema.LOG, schema.JOURNAL, schema.LIGHT_MAP, schema.RIGS, schema.SENSITIVITIES}
+    assert said == views | spots | single | {schema.preview_file("SAMPLE")}
 
 
 def test_planes() -> None:
@@ -100,8 +108,13 @@ def test_arrays_of_the_light_map() -> None:
 
 def test_causes() -> None:
     said = {name for row in table_with("cause", "meaning") for name in names(row[0])}
-    meant = {spot_truth.VISIBLE, spot_truth.NO_REFLECTION, spot_truth.FACES_AWAY, spot_truth.OUTSIDE, spot_truth.EDGE}
-    assert said == meant | {spot_truth.OCCLUDED + "OBJECT"}
+    meant = {truth.VISIBLE, truth.NO_REFLECTION, truth.FACES_AWAY, truth.OUTSIDE, truth.EDGE}
+    assert said == meant | {truth.OCCLUDED + "OBJECT"}
+
+
+def test_the_truth_of_a_frame_is_that_of_the_manifest() -> None:
+    for name in TRUTH:
+        assert FrameRow.model_fields[name].annotation == schema.SpotRow.model_fields[name].annotation
 
 
 def test_version() -> None:

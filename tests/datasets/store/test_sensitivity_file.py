@@ -11,7 +11,7 @@ from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_finished
-from phibench.datasets.store import schema as layout
+from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import strays
 from phibench.datasets.verify import verify
 from phibench.estimator.geometry.estimators import ESTIMATORS
@@ -29,7 +29,7 @@ def faults(folder: Path) -> tuple[str, ...]:
 
 def test_it_is_written_once_read_and_in_order(copy: Path) -> None:
     path = keep_sensitivities(copy)
-    assert path == copy / layout.SENSITIVITIES
+    assert path == copy / schema.SENSITIVITIES
     table = open_finished(copy).sensitivities()
     assert tuple(table.columns) == columns()
     assert len(table) == len(open_finished(copy)) * len(ESTIMATORS)
@@ -42,7 +42,7 @@ def test_it_is_written_once_read_and_in_order(copy: Path) -> None:
 
 def test_a_table_of_another_state_is_noticed_and_made_again(copy: Path) -> None:
     keep_sensitivities(copy)
-    sums = copy / layout.SUMS
+    sums = copy / schema.CHECKSUMS
     sums.write_text(sums.read_text() + f"{'0' * 64}  more.txt\n")
     with pytest.raises(DatasetError, match="belongs to another state of this data set"):
         open_finished(copy).sensitivities()

@@ -28,7 +28,7 @@ from phibench.estimator.spots.image_planes import (
 )
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.render.optics.spot_layer import spot_layer
-from phibench.render.sensor import processing as isp
+from phibench.render.sensor import processing
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.random_streams import generator
@@ -236,7 +236,7 @@ def test_interpolation_is_the_cameras_inside_of_a_border(origin: tuple[int, int]
     raw = generator("demosaic").uniform(0.0, 1.0, (14, 16))
     u0, v0 = origin
     ours = demosaiced(raw[v0:, u0:], origin)
-    theirs = isp.demosaic(raw)[:, v0:, u0:]
+    theirs = processing.demosaic(raw)[:, v0:, u0:]
     np.testing.assert_allclose(ours[:, 1:-1, 1:-1], theirs[:, 1:-1, 1:-1], rtol=0, atol=1e-14)
     if origin == (0, 0):
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-14)
@@ -247,7 +247,7 @@ def test_linear_light_of_raw_and_of_8_bits_agree() -> None:
     card, s = sensor_card("bayer-raw"), sensor("bayer-raw")
     dn = np.full((8, 8), 300, np.uint16)
     planes = linear_planes(dn, card)
-    image = isp.eight_bit(isp.srgb_encoded(isp.linear_rgb(isp.linear_signal(dn, s), s)))
+    image = processing.eight_bit(processing.srgb_encoded(processing.linear_rgb(processing.linear_signal(dn, s), s)))
     eight = linear_planes(image, sensor_card("srgb8"))
     np.testing.assert_allclose(eight[:, 4, 4], planes[:, 4, 4], rtol=0, atol=1.3 * 0.5 / 255.0 + 1e-9)
     assert planes.shape == eight.shape == (3, 8, 8)
@@ -256,7 +256,7 @@ def test_linear_light_of_raw_and_of_8_bits_agree() -> None:
 
 def test_srgb_curve_both_ways_and_against_the_cameras() -> None:
     x = np.linspace(0.0, 1.0, 1001)
-    np.testing.assert_allclose(linear_to_srgb(x), isp.srgb_encoded(x), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(linear_to_srgb(x), processing.srgb_encoded(x), rtol=0, atol=1e-12)
     np.testing.assert_allclose(srgb_to_linear(linear_to_srgb(x)), x, rtol=0, atol=1e-7)  # the two knees' digits
 
 

@@ -14,7 +14,7 @@ from scipy import integrate, stats
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.processed_bound import chain_limit
-from phibench.estimator.spots import image_planes as tone_curve
+from phibench.estimator.spots import image_planes
 from phibench.estimator.spots.chain_model import chain_model, codes
 from phibench.estimator.spots.code_statistics import code_law, code_table
 from phibench.estimator.spots.fit_chain import fit_jpeg, fit_srgb, undone, unrounded
@@ -23,7 +23,7 @@ from phibench.estimator.spots.gaussian_spot import SpotMeans
 from phibench.estimator.spots.jpeg_coefficients import coefficients, quantisation, quantised, recovered, steps
 from phibench.estimator.spots.raw_pixels import GaussLaw, PixelNoise, around, base_of, bayer_filters
 from phibench.estimator.spots.spot_prediction import SpotBlur
-from phibench.render.sensor import processing as isp
+from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import sensor
@@ -44,12 +44,12 @@ def test_an_image_that_compression_has_emptied_has_no_spot() -> None:
 
 def test_tone_curve_against_the_simulators() -> None:
     x = np.concatenate([[-0.1, 0.0, 0.0031308, 1.0, 1.2], np.linspace(0.0, 1.0, 501)])
-    np.testing.assert_allclose(tone_curve.encoded(x), isp.srgb_encoded(x), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(tone_curve.decoded(isp.srgb_encoded(x)), np.clip(x, 0, 1), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(image_planes.encoded(x), processing.srgb_encoded(x), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(image_planes.decoded(processing.srgb_encoded(x)), np.clip(x, 0, 1), rtol=0, atol=1e-6)
     inside = np.linspace(0.01, 0.99, 99)
     h = 1e-6
-    slope = (isp.srgb_encoded(inside + h) - isp.srgb_encoded(inside - h)) / (2 * h)
-    np.testing.assert_allclose(tone_curve.slope(inside), slope, rtol=1e-6)
+    slope = (processing.srgb_encoded(inside + h) - processing.srgb_encoded(inside - h)) / (2 * h)
+    np.testing.assert_allclose(image_planes.slope(inside), slope, rtol=1e-6)
 
 
 def test_noisy_curve_against_quadrature() -> None:
@@ -57,20 +57,22 @@ def test_noisy_curve_against_quadrature() -> None:
     for mean, sigma, tolerance in ((0.3, 0.02, 1e-6), (0.0005, 0.0006, 0.03 * 12.92 * 0.0006)):
         wide = [mean + k * sigma for k in (-9.0, 9.0)]
         exact, _ = integrate.quad(
-            lambda x, m=mean, s=sigma: float(isp.srgb_encoded(np.array(x))) * stats.norm.pdf(x, m, s),
+            lambda x, m=mean, s=sigma: float(processing.srgb_encoded(np.array(x))) * stats.norm.pdf(x, m, s),
             *wide,
             points=[0.0, 0.0031308] if wide[0] < 0 else None,
             limit=400,
         )
-        assert tone_curve.noisy(np.array([mean]), np.array([sigma])).mean[0] == pytest.approx(exact, abs=tolerance)
+        assert image_planes.noisy(np.array([mean]), np.array([sigma])).mean[0] == pytest.approx(exact, abs=tolerance)
 
 
 def test_every_raw_code_lies_in_the_interval_of_its_8_bit_code() -> None:
     """All DN of the converter, sent through the simulator's stages, three colours."""
     card = card_of(SRGB)
     table, dn = code_table(card), np.arange(card.top_dn + 1)
-    planes = isp.white_balanced(np.repeat(isp.linear_signal(dn, SRGB)[None, None], 3, axis=0), card.white_balance)
-    eight = isp.eight_bit(isp.srgb_encoded(planes))[0]  # (dn, 3)
+    planes = processing.white_balanced(
+        np.repeat(processing.linear_signal(dn, SRGB)[None, None], 3, axis=0), card.white_balance
+    )
+    eight = processing.eight_bit(processing.srgb_encoded(planes))[0]  # (dn, 3)
     electrons = (dn - card.black_level_dn) / card.dn_per_e
     for colour in range(3):
         low, high = table.low_e[colour, eight[:, colour]], table.high_e[colour, eight[:, colour]]

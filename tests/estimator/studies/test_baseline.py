@@ -13,7 +13,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_dataset
 from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.paper_depth import load_published
-from phibench.estimator.studies.baseline import study as say
+from phibench.estimator.studies.baseline import study
 from phibench.estimator.studies.baseline.study import STUDY
 from phibench.estimator.studies.baseline.tables import (
     SENSES,
@@ -115,10 +115,10 @@ def test_published_errors_are_no_noise_law() -> None:
     assert law.signs == 0
     assert law.inverse_m < 1e-12
     assert law.law.holds(0, -1.0)
-    assert "keep one sign" in say._curve(law)
-    assert "an interval that holds -1" in say._curve(law)
-    assert "change sign once" in say._curve(curve)
-    assert "a + b h fits best" in say._curve(curve)
+    assert "keep one sign" in study._curve(law)
+    assert "an interval that holds -1" in study._curve(law)
+    assert "change sign once" in study._curve(curve)
+    assert "a + b h fits best" in study._curve(curve)
 
 
 def _law(low: tuple[float, float], high: tuple[float, float]) -> LawFit:
@@ -127,9 +127,9 @@ def _law(low: tuple[float, float], high: tuple[float, float]) -> LawFit:
 
 
 def test_sentences_of_laws_follow_the_intervals() -> None:
-    both = say._law(_law((1.9, -1.1), (2.1, -0.9)))
+    both = study._law(_law((1.9, -1.1), (2.1, -0.9)))
     assert both.count("agrees with") == 2
-    none = say._law(_law((3.0, -0.8), (4.0, -0.5)))
+    none = study._law(_law((3.0, -0.8), (4.0, -0.5)))
     assert none.count("does not agree with") == 2
 
 
@@ -160,20 +160,20 @@ def _table(published: Array) -> tuple[pl.DataFrame, pl.DataFrame]:
 
 def test_sentences_of_errors_follow_the_numbers() -> None:
     table, bands = _table(np.array([2.2, 2.2, 2.2, 2.2]))
-    words = say.findings(table, bands, [], [], pl.DataFrame())
+    words = study.findings(table, bands, [], [], pl.DataFrame())
     assert "4 published estimates err by 10.00 %" in words[0]
     assert "4 of the published errors are more" in words[0]
     assert "phi_normal comes nearest, and leaves 0 %" in words[1]
     assert "phi_ray 0" in words[2]
     table, bands = _table(np.array([2.0, 2.0, 2.0, 2.01]))
-    words = say.findings(table, bands, [], [], pl.DataFrame())
+    words = study.findings(table, bands, [], [], pl.DataFrame())
     assert "no sense of phi comes nearer" in words[1]
     assert "phi_ray 4" in words[2]
-    notes = " ".join(say.notes([], 1, table))
+    notes = " ".join(study.notes([], 1, table))
     assert "closed form alone" in notes
     assert "one draw" in notes
     assert "1 readings" in notes
-    assert not [note for note in say.notes(["x"], 2, table) if "draw" in note]
+    assert not [note for note in study.notes(["x"], 2, table) if "draw" in note]
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from rich.console import Console
 from scipy.stats import norm
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.studies.cause import study as say
+from phibench.estimator.studies.cause import study
 from phibench.estimator.studies.cause.model import COMMON, NOISE, Explanation, Model, Prior, simulate, without_table
 from phibench.estimator.studies.cause.nested_sampling import CauseSettings, Posterior, all_runs, pooled, sample
 from phibench.estimator.studies.cause.paper_reading import Reader, published_experiments, read
@@ -255,28 +255,28 @@ def _rows(**changes: list[float]) -> pl.DataFrame:
 
 def test_sentences_follow_the_numbers() -> None:
     table = _rows()
-    assert "'tilt' has the largest evidence" in say.best_sentence(table)
-    assert "favoured over every other" in say.best_sentence(table)
+    assert "'tilt' has the largest evidence" in study.best_sentence(table)
+    assert "favoured over every other" in study.best_sentence(table)
     near = _rows(log_evidence=[9.0, 10.0, -9.0], against=[0.0, 1.0, -18.0])
-    assert "Undecided against it: noise (decided is" in say.best_sentence(near)
-    words = " ".join(say.rival_sentences(table))
+    assert "Undecided against it: noise (decided is" in study.best_sentence(near)
+    words = " ".join(study.rival_sentences(table))
     assert "favoured: tilt (+10.0" in words
     assert "disfavoured: wrong (-9.0" in words
     assert "too large" in words
     assert "run in trends" in words
     calm = _rows(chi2_p=[0.5] * 3, trend_p=[0.5] * 3, against=[0.0, 1.0, -1.0])
-    words = " ".join(say.rival_sentences(calm))
+    words = " ".join(study.rival_sentences(calm))
     assert "undecided: tilt" in words
     assert "trends" not in words
-    assert "more than rounding" in say.noise_sentence(table)
-    assert "reaches down" in say.noise_sentence(_rows(noise_low_px=[0.8, 0.2, 0.8]))
-    assert "'tilt' predicts best" in say.left_out_sentence(table)
-    assert say.scale_sentence(pl.DataFrame({"explanation": ["a"], "scale": [1.0], "against": [0.0]})) == ""
+    assert "more than rounding" in study.noise_sentence(table)
+    assert "reaches down" in study.noise_sentence(_rows(noise_low_px=[0.8, 0.2, 0.8]))
+    assert "'tilt' predicts best" in study.left_out_sentence(table)
+    assert study.scale_sentence(pl.DataFrame({"explanation": ["a"], "scale": [1.0], "against": [0.0]})) == ""
     offsets = {"explanation": ["tilted"], "mean_px": [20.0], "low_px": [15.0], "high_px": [30.0]}
     prior = {"prior_mean_px": [20.0], "prior_low_px": [4.0], "prior_high_px": [50.0]}
-    assert "is above the prior's" in say.offset_sentence(table, pl.DataFrame({**offsets, **prior}))
+    assert "is above the prior's" in study.offset_sentence(table, pl.DataFrame({**offsets, **prior}))
     wide = pl.DataFrame({**offsets, **prior, "low_px": [4.0]})
-    assert "is not above the prior's" in say.offset_sentence(table, wide)
+    assert "is not above the prior's" in study.offset_sentence(table, wide)
 
 
 def test_the_same_difference_is_decided_or_not_by_its_error() -> None:
@@ -286,14 +286,14 @@ def test_the_same_difference_is_decided_or_not_by_its_error() -> None:
     unsure = _rows(
         log_evidence=evidence, log_evidence_error=[FLOOR] * 3, against=evidence, against_error=[0.0, 2.1, 2.1]
     )
-    words = say.rival_sentences(sure)[0]
+    words = study.rival_sentences(sure)[0]
     assert "favoured: tilt (+5.0 +- 0.7); disfavoured: wrong (-5.0 +- 0.7)" in words
     assert "undecided" not in words
-    words = say.rival_sentences(unsure)[0]
+    words = study.rival_sentences(unsure)[0]
     assert "undecided: tilt (+5.0 +- 2.1), wrong (-5.0 +- 2.1)" in words
     assert "favoured:" not in words
-    assert "favoured over every other" in say.best_sentence(sure)
-    assert "Undecided against it: noise (decided" in say.best_sentence(unsure)
+    assert "favoured over every other" in study.best_sentence(sure)
+    assert "Undecided against it: noise (decided" in study.best_sentence(unsure)
 
 
 @pytest.mark.parametrize(("error", "word"), [(0.5, "disfavoured"), (FLOOR, "undecided")])
@@ -302,7 +302,7 @@ def test_senses_of_phi_are_told_apart_by_the_same_rule(settings: CauseSettings, 
     table = pl.DataFrame(
         {"explanation": ["ray", "normal"], "log_evidence": [-6.2, 0.0], "log_evidence_error": [error] * 2}
     )
-    words = say.convention_sentence(chosen, table)
+    words = study.convention_sentence(chosen, table)
     assert f"noise alone: phi_normal has most, then phi_ray -6.2 +- {error * 2.0**0.5:.1f} ({word})" in words
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from phibench.estimator.studies.cause import study as say
+from phibench.estimator.studies.cause import study
 from phibench.estimator.studies.cause.tables import ENOUGH, FLOOR, evidence_error, verdict
 
 
@@ -39,11 +39,11 @@ def test_made_up_data_decide_by_the_same_rule(error: float, lost: int) -> None:
             "parameters": [6, 0],
         }
     )
-    words = say.made_up_sentence(made_up)
+    words = study.made_up_sentence(made_up)
     assert f"largest evidence in 0 of 1 draws and decided against it in {lost}" in words
     assert "6 of 6 true values" in words
 
 
 def test_wider_priors_come_with_errors() -> None:
     rows = {"explanation": ["a", "a"], "scale": [1.0, 2.0], "against": [11.9, 13.9], "error": [1.6, 2.1]}
-    assert "1 / 2 times as wide: a +11.9 +- 1.6 / +13.9 +- 2.1." in say.scale_sentence(pl.DataFrame(rows))
+    assert "1 / 2 times as wide: a +11.9 +- 1.6 / +13.9 +- 2.1." in study.scale_sentence(pl.DataFrame(rows))

@@ -13,7 +13,7 @@ from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.paper_depth import depth_approx
 from phibench.estimator.geometry.phi import outline_circle, phi_outline
-from phibench.estimator.studies.cause import study as say
+from phibench.estimator.studies.cause import study
 from phibench.estimator.studies.cause.model import NOISE, Model, brute_force, simulate
 from phibench.estimator.studies.cause.nested_sampling import CauseSettings
 from phibench.estimator.studies.cause.paper_reading import (
@@ -105,12 +105,12 @@ def test_h_against_d_cannot_make_the_error_rise() -> None:
     assert float(depth_approx(0.7, 0.5, 1.0).depth_m) == pytest.approx(np.sin(1.4) * np.sin(1.0) / np.sin(0.4))
     own = short.filter(pl.col("table") == 1).sort("stroke_m")["eq5_error_m"].abs()
     assert own[-1] < own[0]
-    sentence = say.short_stroke_sentence(short)
+    sentence = study.short_stroke_sentence(short)
     assert "falls from" in sentence
     grown = short.with_columns(
         pl.when(pl.col("stroke_m") > 1.35).then(1.0).otherwise(pl.col("eq5_error_m")).alias("eq5_error_m")
     )
-    assert "grows from" in say.short_stroke_sentence(grown)
+    assert "grows from" in study.short_stroke_sentence(grown)
 
 
 def test_readings_of_many_rigs_are_those_of_each(settings: CauseSettings) -> None:

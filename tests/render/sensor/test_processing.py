@@ -12,7 +12,7 @@ from PIL import Image
 from scipy.ndimage import convolve
 
 from phibench.datasets.store.files import write_bytes
-from phibench.render.sensor import processing as isp
+from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain, auto_exposed, mean_level
 from phibench.render.sensor.electrons import mosaic
 from phibench.render.sensor.light import Light
@@ -34,47 +34,49 @@ def test_demosaic_is_the_convolution_of_each_colour(size: tuple[int, int]) -> No
     cross, square = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]]) / 4.0, np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]]) / 4.0
     planes = [convolve(raw * (of == c), k, mode="mirror") for c, k in ((0, square), (1, cross), (2, square))]
     # sums of four numbers below 1
-    np.testing.assert_allclose(isp.demosaic(raw), planes, rtol=0, atol=1e-15)
-    stack = isp.demosaic(np.stack([raw, 2.0 * raw]))
-    np.testing.assert_array_equal(stack[1], 2.0 * isp.demosaic(raw))
+    np.testing.assert_allclose(processing.demosaic(raw), planes, rtol=0, atol=1e-15)
+    stack = processing.demosaic(np.stack([raw, 2.0 * raw]))
+    np.testing.assert_array_equal(stack[1], 2.0 * processing.demosaic(raw))
 
 
 def test_demosaic_keeps_flat_and_sloping_colours() -> None:
     v, u = np.mgrid[:12, :14]
     planes = np.stack([3.0 + 0.5 * u, 7.0 - 0.25 * v, 1.0 + 0.0 * u])
-    again = isp.demosaic(mosaic(planes))
+    again = processing.demosaic(mosaic(planes))
     np.testing.assert_allclose(again[:, 1:-1, 1:-1], planes[:, 1:-1, 1:-1], rtol=1e-14)
     assert np.abs(again - planes).max() > 0.1  # at the border the mirror image is not the slope
 
 
 def test_colours_are_what_a_matrix_product_gives() -> None:
     planes = RANDOM.uniform(0.0, 1.0, (4, 3, 5, 6))
-    balanced = isp.white_balanced(planes, (1.5, 1.0, 2.0))
+    balanced = processing.white_balanced(planes, (1.5, 1.0, 2.0))
     by_einsum = np.einsum("ij,nj...->ni...", np.array(MATRIX) * [1.5, 1.0, 2.0], planes)
-    np.testing.assert_allclose(isp.colour_corrected(balanced, MATRIX), by_einsum, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(processing.colour_corrected(balanced, MATRIX), by_einsum, rtol=0, atol=1e-14)
 
 
 def test_srgb_against_published_values() -> None:
     """IEC 61966-2-1: 18 % grey is 0.4614 (117.6 of 255), 50 % is 0.7354; forward and back agree."""
-    np.testing.assert_allclose(isp.srgb_encoded(np.array([0.0, 0.18, 0.5, 1.0])), [0, 0.46136, 0.73536, 1], atol=1e-5)
+    np.testing.assert_allclose(
+        processing.srgb_encoded(np.array([0.0, 0.18, 0.5, 1.0])), [0, 0.46136, 0.73536, 1], atol=1e-5
+    )
     x = np.linspace(0.0, 1.0, 1001)
     # the two pieces meet to 2e-8 at the published knee
-    np.testing.assert_allclose(isp.srgb_decoded(isp.srgb_encoded(x)), x, rtol=0, atol=1e-7)
-    np.testing.assert_allclose(isp.srgb_encoded(np.array([-3.0, 7.0])), [0.0, 1.0], rtol=1e-15)
-    assert isp.srgb_encoded(x.astype(np.float32)).dtype == np.float32
+    np.testing.assert_allclose(processing.srgb_decoded(processing.srgb_encoded(x)), x, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(processing.srgb_encoded(np.array([-3.0, 7.0])), [0.0, 1.0], rtol=1e-15)
+    assert processing.srgb_encoded(x.astype(np.float32)).dtype == np.float32
 
 
 def test_sharpening_against_a_convolution() -> None:
     planes = RANDOM.uniform(0.0, 1.0, (3, 9, 12))
     blur = np.outer([1, 2, 1], [1, 2, 1]) / 16.0
     by_hand = np.stack([p + 0.7 * (p - convolve(p, blur, mode="mirror")) for p in planes])
-    np.testing.assert_allclose(isp.sharpened(planes, 0.7), by_hand, rtol=0, atol=1e-15)
-    np.testing.assert_allclose(isp.sharpened(np.full((3, 8, 8), 0.3), 2.0), 0.3, rtol=1e-15)
+    np.testing.assert_allclose(processing.sharpened(planes, 0.7), by_hand, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(processing.sharpened(np.full((3, 8, 8), 0.3), 2.0), 0.3, rtol=1e-15)
 
 
 def test_eight_bits_are_rounded_and_cut() -> None:
     planes = np.array([-0.1, 0.49 / 255, 0.51 / 255, 254.6 / 255, 1.2]).reshape(1, 1, 5).repeat(3, 0)
-    np.testing.assert_array_equal(isp.eight_bit(planes)[0, :, 1], [0, 0, 1, 255, 255])
+    np.testing.assert_array_equal(processing.eight_bit(planes)[0, :, 1], [0, 0, 1, 255, 255])
 
 
 @pytest.mark.parametrize("subsampling", ["4:2:2", "4:2:0", "4:4:4"])
@@ -100,22 +102,22 @@ def test_a_stack_of_images_is_compressed_one_by_one() -> None:
     assert encoded(SMALL, 70, "4:2:2") == reference.getvalue()
 
 
-@pytest.mark.parametrize("matrix", [isp.IDENTITY, MATRIX])
+@pytest.mark.parametrize("matrix", [processing.IDENTITY, MATRIX])
 @pytest.mark.parametrize("preset", ["srgb8", "mjpeg"])
 def test_a_flat_field_is_recovered_within_the_noise(preset: str, matrix) -> None:
     """Chain and inverse on flat light, mean over 256 x 256 pixels."""
     electrons, size = np.array([3000.0, 4000.0, 2500.0]), (256, 256)
     s = sensor(preset, colour_matrix=matrix, jpeg_quality=95)
     frame = Chain(s).frame(Light.flat(tuple(electrons / s.exposure_s), size), STREAM)
-    found = isp.electrons_from_srgb(frame, s).mean(axis=(1, 2))
+    found = processing.electrons_from_srgb(frame, s).mean(axis=(1, 2))
     usual = Chain(s.replace(jpeg_quality=85)).frame(Light.flat(tuple(electrons / s.exposure_s), size), STREAM)
-    off = isp.electrons_from_srgb(usual, s).mean(axis=(1, 2)) / electrons - 1.0
+    off = processing.electrons_from_srgb(usual, s).mean(axis=(1, 2)) / electrons - 1.0
     print(f"{preset}: {100 * (found / electrons - 1.0)} %; quality 85: {100 * off} %")
     # noise per pixel below 150 e-, so 0.6 e- of the mean; the curve bends by 4 % of its slope per noise of 4 %: 0.1 %;
     # a rounding of 8 bits is dithered by 2 codes of noise. JPEG rounds the mean of a block's chroma to its table, and
     # colour by colour to 8 bits, undithered: half a code of 255, which is 1/255 of the slope's 0.45: 0.5 %
     np.testing.assert_allclose(found, electrons, rtol=0.002 if preset == "srgb8" else 0.006)
-    wrong = isp.electrons_from_srgb(frame, s.replace(white_balance=(1.0117, 1.03, 1.3416))).mean(axis=(1, 2))
+    wrong = processing.electrons_from_srgb(frame, s.replace(white_balance=(1.0117, 1.03, 1.3416))).mean(axis=(1, 2))
     assert np.abs(wrong / electrons - 1.0).max() > 0.006
 
 

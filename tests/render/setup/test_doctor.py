@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from phibench.render.setup import doctor
-from phibench.render.setup import selftest as known_image
+from phibench.render.setup import doctor, selftest
 from phibench.render.setup.doctor import Finding
 from phibench.render.setup.llvm_library import fault_of
 
@@ -149,7 +148,7 @@ def test_the_status_is_that_of_the_worst_finding(
     ],
 )
 def test_a_wrong_image_is_noticed(ball: float, sky: float, complaint: str) -> None:
-    image = np.full((known_image.SIZE_PX,) * 2, known_image.SKY * sky, dtype=np.float32)
-    image[5:11, 5:11] = known_image.ALBEDO * known_image.SKY * ball
-    fault = known_image.compare(image)
+    image = np.full((selftest.SIZE_PX,) * 2, selftest.SKY * sky, dtype=np.float32)
+    image[5:11, 5:11] = selftest.ALBEDO * selftest.SKY * ball
+    fault = selftest.compare(image)
     assert fault.startswith(complaint) if complaint else fault == ""

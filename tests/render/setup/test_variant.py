@@ -11,7 +11,7 @@ from phibench.render.setup.variant import CUDA, LLVM
 
 Python = Callable[..., subprocess.CompletedProcess[str]]
 ACTIVATE = "from phibench.render.setup.variant import LLVM, activate; mi = activate(LLVM)\n"
-SUMS = """
+CHECKSUMS = """
 import sys, drjit as dr
 from drjit.llvm import Float, PCG32
 if len(sys.argv) > 1: dr.set_thread_count(int(sys.argv[1]))
@@ -24,7 +24,7 @@ print(*(float(x).hex() for x in cells), float(dr.sum(value, axis=None)[0]).hex()
 
 
 def test_one_thread_and_no_helpers(python: Python) -> None:
-    code = ACTIVATE + SUMS + "import os\nprint(dr.thread_count(), mi.variant())"
+    code = ACTIVATE + CHECKSUMS + "import os\nprint(dr.thread_count(), mi.variant())"
     child = python(code)
     assert child.returncode == 0, child.stderr
     assert child.stdout.splitlines()[-1] == "1 llvm_ad_rgb"
@@ -32,14 +32,14 @@ def test_one_thread_and_no_helpers(python: Python) -> None:
 
 def test_two_processes_agree_to_the_last_bit(python: Python) -> None:
     """A million float32 terms per cell: any other order of adding shows in the last bits."""
-    outputs = {python(ACTIVATE + SUMS).stdout for _ in range(3)}
+    outputs = {python(ACTIVATE + CHECKSUMS).stdout for _ in range(3)}
     assert len(outputs) == 1
     assert len(outputs.pop().split()) == 4
 
 
 def test_the_sums_depend_on_the_order(python: Python) -> None:
     """The opposite: with helpers the same code gives other bits, so that the test above could have failed."""
-    assert python(ACTIVATE + SUMS, "4").stdout != python(ACTIVATE + SUMS).stdout
+    assert python(ACTIVATE + CHECKSUMS, "4").stdout != python(ACTIVATE + CHECKSUMS).stdout
 
 
 def test_again_is_nothing_and_another_is_refused(python: Python) -> None:
