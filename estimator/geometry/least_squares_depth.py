@@ -21,19 +21,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from phibench.estimator.geometry.paper_depth import PARALLEL_SINE
-from phibench.estimator.geometry.reflection import reflect, reflect_jacobian
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, steps, stroke_of
 from phibench.estimator.geometry.status import (
     DepthEstimate,
-    Status,
-    StatusArray,
     first_fault,
-    flag,
     keep,
     stroke_status,
 )
-from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.geometry.triangulate import Meeting, depth_exact, meeting, meeting_gradients
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
@@ -61,16 +56,6 @@ class GeneralDepth(DepthEstimate):
     gap_m: Array
     chi2: Array
     p_value: Array
-
-
-@dataclass(frozen=True)
-class _Meeting:
-    """Depth, gap and point for some z; gradients by z, last axis (u1, v1, u2, v2, parameters, stroke)."""
-
-    depth: Array
-    gap: Array
-    point: Array
-    status: StatusArray
 
 
 def depth_general(
@@ -114,11 +99,11 @@ def depth_general(
         z, first = z0, _meet(rig, h, z0)
         e_z, D_z = _gradients(rig, h, z)
         variance = np.einsum("...i,...ij,...j->...", e_z, C, e_z)
-        chi2 = first.gap**2 / variance
+        chi2 = first.gap_m**2 / variance
         # the parameters' move is used to first order: rigs differ from one element to the next
         for _ in range(_ROUNDS):
             at = _meet(rig, h, z)
-            remaining = at.gap + np.einsum("...i,...i->...", e_z, z0 - z)
+            remaining = at.gap_m + np.einsum("...i,...i->...", e_z, z0 - z)
             variance = np.einsum("...i,...ij,...j->...", e_z, C, e_z)
             z = z0 - np.einsum("...ij,...j->...i", C, e_z) * (remaining / variance)[..., None]
             if not np.any(np.isfinite(remaining)):
@@ -135,14 +120,14 @@ def depth_general(
     spot, calibration, stroke = (keep(np.sqrt(part), status) for part in parts)
     p_value = special.erfc(np.sqrt(chi2 / 2.0))
     return GeneralDepth(
-        keep(at.depth, status),
+        keep(at.depth_m, status),
         keep(sigma, status),
         status,
         spot,
         calibration,
         stroke,
-        keep(at.point, status),
-        keep(first.gap, status),
+        keep(at.point_world_m, status),
+        keep(first.gap_m, status),
         keep(chi2, status),
         keep(p_value, status),
     )
@@ -164,97 +149,40 @@ def _part(g: Array, C: Array, part: slice) -> Array:
     return np.asarray(np.einsum("...i,...ij,...j->...", g[..., part], C[..., part, part], g[..., part]))
 
 
-def _meet(rig: Rig, h: Array, z: Array) -> _Meeting:
-    """Depth and gap for pixels z[:4]; a parameter that is not 0 enters by its gradient, see `_rig_gradients`."""
+def _meet(rig: Rig, h: Array, z: Array) -> Meeting:
+    """Meeting for pixels z[:4]; a parameter that is not 0 enters by its gradient, see `_rig_gradients`."""
     offsets = z[..., 4:]
-    base = _meet_exact(rig, h, z[..., :4])
+    base = meeting(rig, h, z[..., :2], z[..., 2:4])
     if not np.any(offsets):
         return base
-    e_p, D_p, X_p = _rig_gradients(rig, h, z[..., :4])
-    return _Meeting(
-        base.depth + np.sum(D_p * offsets, axis=-1),
-        base.gap + np.sum(e_p * offsets, axis=-1),
-        base.point + np.einsum("...pi,...p->...i", X_p, offsets),
+    e_p, D_p, X_p = _rig_gradients(rig, h, z)
+    return Meeting(
+        base.depth_m + np.sum(D_p * offsets, axis=-1),
+        base.gap_m + np.sum(e_p * offsets, axis=-1),
+        base.point_world_m + np.einsum("...pi,...p->...i", X_p, offsets),
         base.status,
     )
 
 
 def _gradients(rig: Rig, h: Array, z: Array) -> tuple[Array, Array]:
     """Derivatives of gap and depth by z, shape (..., n) each."""
-    e_y, D_y = _pixel_gradients(rig, h, z[..., :4])
-    e_p, D_p, _ = _rig_gradients(rig, h, z[..., :4])
+    e_y, D_y = meeting_gradients(rig, h, z[..., :2], z[..., 2:4])
+    e_p, D_p, _ = _rig_gradients(rig, h, z)
     return np.concatenate([e_y, e_p], axis=-1), np.concatenate([D_y, D_p], axis=-1)
 
 
-def _meet_exact(rig: Rig, h: Array, y: Array) -> _Meeting:
-    view = rig.at(0.0)
-    down, up = reflect(view, y[..., :2]), reflect(view, y[..., 2:4])
-    P1, r1, r2 = down.origin_world_m, down.direction_world, up.direction_world
-    P2 = up.origin_world_m + h[..., None] * np.array(rig.stroke_axis_world)
-    t1, t2, gap, m, nn = _common_perpendicular(P2 - P1, r1, r2)
-    X = P1 + t1[..., None] * r1 + 0.5 * gap[..., None] * m
-    radial = X[..., :2] - view.sphere_centre_m[:2]
-    meet = flag((nn < PARALLEL_SINE**2, Status.PARALLEL), (~((t1 > 0.0) & (t2 > 0.0)), Status.DIVERGING))
-    status = first_fault(down.status, up.status, meet)
-    return _Meeting(np.hypot(radial[..., 0], radial[..., 1]), gap, X, status)
-
-
-def _common_perpendicular(w: Array, r1: Array, r2: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """t1, t2, e, unit m and |r1 x r2|^2 with t1 r1 + e m = w + t2 r2, w = P2 - P1."""
-    n = np.cross(r1, r2)
-    nn = np.sum(n * n, axis=-1)
-    t1, t2 = (np.sum(np.cross(w, r) * n, axis=-1) / nn for r in (r2, r1))
-    m = n / np.sqrt(nn)[..., None]
-    return t1, t2, np.sum(w * m, axis=-1), m, nn
-
-
-def _pixel_gradients(rig: Rig, h: Array, y: Array) -> tuple[Array, Array]:
-    """Derivatives of e and D by (u1, v1, u2, v2), closed form.
-
-    From t1 r1 + e m = w + t2 r2 by implicit differentiation: m . (dw + t2 dr2 - t1 dr1) = de, because m . dm = 0 and m
-    stands on both rays; the two other components give dt1 and dt2.
-    """
-    view = rig.at(0.0)
-    down, up = reflect(view, y[..., :2]), reflect(view, y[..., 2:4])
-    J1, J2 = reflect_jacobian(view, y[..., :2]), reflect_jacobian(view, y[..., 2:4])
-    r1, r2 = down.direction_world, up.direction_world
-    w = up.origin_world_m + h[..., None] * np.array(rig.stroke_axis_world) - down.origin_world_m
-    t1, t2, e, m, nn = _common_perpendicular(w, r1, r2)
-    dP1, dr1 = (_padded(J, 0) for J in (J1.origin_m_per_px, J1.direction_per_px))
-    dP2, dr2 = (_padded(J, 2) for J in (J2.origin_m_per_px, J2.direction_per_px))
-    r1, r2, m, e = r1[..., None, :], r2[..., None, :], m[..., None, :], e[..., None]
-    t1, t2, nn = t1[..., None], t2[..., None], nn[..., None]
-    dn = np.cross(dr1, r2) + np.cross(r1, dr2)
-    dm = (dn - np.sum(dn * m, axis=-1)[..., None] * m) / np.sqrt(nn)[..., None]
-    rest = dP2 - dP1 + t2[..., None] * dr2 - t1[..., None] * dr1 - e[..., None] * dm  # = dt1 r1 - dt2 r2 + de m
-    de = np.sum(rest * m, axis=-1)
-    dt1 = np.sum(np.cross(rest, r2) * m, axis=-1) / np.sqrt(nn)
-    dX = dP1 + dt1[..., None] * r1 + t1[..., None] * dr1 + 0.5 * (de[..., None] * m + e[..., None] * dm)
-    X = down.origin_world_m + t1 * down.direction_world + 0.5 * e * m[..., 0, :]
-    radial = X[..., :2] - view.sphere_centre_m[:2]
-    D = np.hypot(radial[..., 0], radial[..., 1])
-    return de, np.sum(dX[..., :2] * radial[..., None, :], axis=-1) / D[..., None]
-
-
-def _rig_gradients(rig: Rig, h: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Derivatives of e, D and the point by the parameters and this pair's stroke, by central differences."""
-    slopes: dict[str, list[Array]] = {"gap": [], "depth": [], "point": []}
+def _rig_gradients(rig: Rig, h: Array, z: Array) -> tuple[Array, Array, Array]:
+    """Derivatives of gap, D and point by the parameters and this pair's stroke, by central differences."""
+    slopes: dict[str, list[Array]] = {"gap_m": [], "depth_m": [], "point_world_m": []}
     for i, size in enumerate(steps()):
         values = np.zeros(len(PARAMETERS))
         values[i] = size
-        plus, minus = (_meet_exact(changed(rig, v), stroke_of(h, v), y) for v in (values, -values))
+        plus, minus = (meeting(changed(rig, v), stroke_of(h, v), z[..., :2], z[..., 2:4]) for v in (values, -values))
         for name, found in slopes.items():
             found.append((getattr(plus, name) - getattr(minus, name)) / (2.0 * size))
     own = PARAMETERS.index("stroke_m")
     gap, depth, point = (found + [found[own]] for found in slopes.values())
     return np.stack(gap, axis=-1), np.stack(depth, axis=-1), np.stack(point, axis=-2)
-
-
-def _padded(jacobian: Array, start: int) -> Array:
-    """Jacobian (..., 3, 2) as tangents (..., 4, 3) by (u1, v1, u2, v2)."""
-    tangents = np.zeros((*jacobian.shape[:-2], 4, 3))
-    tangents[..., start : start + 2, :] = np.swapaxes(jacobian, -1, -2)
-    return tangents
 
 
 _ROUND_PX2 = 0.1**2

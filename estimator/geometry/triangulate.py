@@ -1,7 +1,8 @@
-"""Exact depth: where the two rays that leave the mirror meet.
+"""Depth from two reflected rays: the midpoint of their common perpendicular.
 
-Ray k (1 down, 2 up): X = P_k + t_k r_k, world frame, metres. D is the horizontal distance of the point from the
-vertical line through the sphere centre at the down position. Vectorised over leading axes that broadcast together.
+Ray k (1 down, 2 up) leaves the mirror at P_k with the direction r_k: X = P_k + t_k r_k, world frame, metres. D is the
+horizontal distance of the point from the vertical line through the sphere centre at the down position. Leading axes of
+all arguments broadcast together. `least_squares_depth` takes the same rays and weighs them.
 """
 
 from __future__ import annotations
@@ -45,18 +46,53 @@ class PointEstimate(DepthEstimate):
 
 
 @dataclass(frozen=True)
+class Meeting:
+    """Midpoint of the common perpendicular of two rays.
+
+    Parameters
+    ----------
+    depth_m : shape (...), D
+    gap_m : shape (...), signed length of the perpendicular
+    point_world_m : shape (..., 3)
+    status : shape (...), of the rays and of their meeting
+    """
+
+    depth_m: Array
+    gap_m: Array
+    point_world_m: Array
+    status: StatusArray
+
+
+@dataclass(frozen=True)
 class _Rays:
-    """P, r of both rays, shape (..., 3), and their derivatives by (u1, v1, u2, v2), shape (..., 4, 3)."""
+    """Both rays, world frame, shape (..., 3)."""
 
     P1: Array
     r1: Array
     P2: Array
     r2: Array
-    dP1: Array
-    dr1: Array
-    dP2: Array
-    dr2: Array
     status: StatusArray
+
+
+@dataclass(frozen=True)
+class _Tangents:
+    """Derivatives of `_Rays` by (u1, v1, u2, v2), shape (..., 4, 3)."""
+
+    P1: Array
+    r1: Array
+    P2: Array
+    r2: Array
+
+
+@dataclass(frozen=True)
+class _Perpendicular:
+    """Common perpendicular: w = P2 - P1, n = r1 x r2, nn = n . n, and where on the rays its ends are."""
+
+    w: Array
+    n: Array
+    nn: Array
+    t1: Array
+    t2: Array
 
 
 def depth_exact(
@@ -72,7 +108,7 @@ def depth_exact(
     Parameters
     ----------
     rig : Rig
-        One for both images, the one that is nominal: a motion between them (`rig.motion`) is not used.
+        The nominal rig, one for both images: a motion between them (`rig.motion`) is not used.
     stroke_m : shape (...), h
     uv_down_px, uv_up_px : shape (..., 2), pixels
     covariance_down_px2, covariance_up_px2 : shape (..., 2, 2), of (u, v), independent of each other, both or none
@@ -82,16 +118,48 @@ def depth_exact(
     PointEstimate
         sigma by the analytic derivatives of the point. The midpoint is the least-squares point for equal weights.
     """
-    D, gradient, X, gap, status = _midpoint(rig, stroke_m, uv_down_px, uv_up_px)
+    at = meeting(rig, stroke_m, uv_down_px, uv_up_px)
     with np.errstate(all="ignore"):
+        _, gradient = meeting_gradients(rig, stroke_m, uv_down_px, uv_up_px)
         sigma = propagate(gradient, _joint_covariance(covariance_down_px2, covariance_up_px2))
-    return PointEstimate(keep(D, status), keep(sigma, status), status, keep(X, status), keep(gap, status))
+    depth, point, gap = (keep(x, at.status) for x in (at.depth_m, at.point_world_m, np.abs(at.gap_m)))
+    return PointEstimate(depth, keep(sigma, at.status), at.status, point, gap)
 
 
 def exact_gradient(rig: Rig, stroke_m: ArrayLike, uv_down_px: Array, uv_up_px: Array) -> Array:
     """dD/d(u1, v1, u2, v2) of `depth_exact`, shape (..., 4), metres per pixel, analytic; NaN where D is."""
-    _, gradient, _, _, status = _midpoint(rig, stroke_m, uv_down_px, uv_up_px)
-    return keep(gradient, status)
+    _, gradient = meeting_gradients(rig, stroke_m, uv_down_px, uv_up_px)
+    return keep(gradient, meeting(rig, stroke_m, uv_down_px, uv_up_px).status)
+
+
+def meeting(rig: Rig, stroke_m: ArrayLike, uv_down_px: Array, uv_up_px: Array) -> Meeting:
+    """Midpoint of the two rays, with values where the status is not OK, too."""
+    rays = _rays(rig, stroke_m, uv_down_px, uv_up_px)
+    with np.errstate(all="ignore"):
+        at = _perpendicular(rays)
+        X = _midpoint(rays, at)
+        radial = X[..., :2] - rig.at(0.0).sphere_centre_m[:2]
+        D = np.hypot(radial[..., 0], radial[..., 1])
+        gap = np.sum(at.w * at.n, axis=-1) / np.sqrt(at.nn)
+        behind = ~((at.t1 > 0.0) & (at.t2 > 0.0))
+        fault = flag((at.nn < PARALLEL_SINE**2, Status.PARALLEL), (behind, Status.DIVERGING))
+    return Meeting(D, gap, X, first_fault(rays.status, fault))
+
+
+def meeting_gradients(rig: Rig, stroke_m: ArrayLike, uv_down_px: Array, uv_up_px: Array) -> tuple[Array, Array]:
+    """Derivatives of the signed gap and of D by (u1, v1, u2, v2), shape (..., 4) each, metres per pixel, analytic."""
+    rays, d = _rays(rig, stroke_m, uv_down_px, uv_up_px), _tangents(rig, uv_down_px, uv_up_px)
+    with np.errstate(all="ignore"):
+        at = _perpendicular(rays)
+        radial = _midpoint(rays, at)[..., :2] - rig.at(0.0).sphere_centre_m[:2]
+        D = np.hypot(radial[..., 0], radial[..., 1])
+        dX = _midpoint_tangent(rays, d, at)
+        by_depth = np.sum(dX[..., :2] * radial[..., None, :], axis=-1) / D[..., None]
+        # P2 + t2 r2 - P1 - t1 r1 = e m; m is a unit vector across both rays: m . dm = m . r1 = m . r2 = 0
+        m = (at.n / np.sqrt(at.nn)[..., None])[..., None, :]
+        t1, t2 = at.t1[..., None, None], at.t2[..., None, None]
+        by_gap = np.sum((d.P2 - d.P1 + t2 * d.r2 - t1 * d.r1) * m, axis=-1)
+    return by_gap, by_depth
 
 
 def depth_in_plane(
@@ -116,43 +184,23 @@ def depth_in_plane(
         If camera centre, sphere centre and stroke axis do not lie on one vertical.
     """
     _require_aligned(rig)
-    rays = _rays(rig, stroke_m, uv_down_px, uv_up_px)
+    rays, tangents = _rays(rig, stroke_m, uv_down_px, uv_up_px), _tangents(rig, uv_down_px, uv_up_px)
     with np.errstate(all="ignore"):
-        D, gradient, q, rho = _meet_in_plane(rays, rig.at(0.0).sphere_centre_m[:2])
+        D, gradient, q, rho = _meet_in_plane(rays, tangents, rig.at(0.0).sphere_centre_m[:2])
         meet = flag((np.abs(q) < PARALLEL_SINE, Status.PARALLEL), (~(rho < D), Status.DIVERGING))
         status = first_fault(rays.status, meet)
         sigma = propagate(gradient, _joint_covariance(covariance_down_px2, covariance_up_px2))
     return DepthEstimate(keep(D, status), keep(sigma, status), status)
 
 
-def _midpoint(
-    rig: Rig, stroke_m: ArrayLike, uv_down_px: Array, uv_up_px: Array
-) -> tuple[Array, Array, Array, Array, StatusArray]:
-    """D, its gradient by the pixels, the midpoint, the gap, and the status."""
-    rays = _rays(rig, stroke_m, uv_down_px, uv_up_px)
-    with np.errstate(all="ignore"):
-        w = rays.P2 - rays.P1
-        n = np.cross(rays.r1, rays.r2)
-        nn = np.sum(n * n, axis=-1)
-        t1, t2 = (np.sum(np.cross(w, r) * n, axis=-1) / nn for r in (rays.r2, rays.r1))
-        X = 0.5 * (rays.P1 + t1[..., None] * rays.r1 + rays.P2 + t2[..., None] * rays.r2)
-        gap = np.abs(np.sum(w * n, axis=-1)) / np.sqrt(nn)
-        radial = X[..., :2] - rig.at(0.0).sphere_centre_m[:2]
-        D = np.hypot(radial[..., 0], radial[..., 1])
-        dX = _midpoint_tangent(rays, w, n, nn, t1, t2)
-        gradient = np.sum(dX[..., :2] * radial[..., None, :], axis=-1) / D[..., None]
-        meet = flag((nn < PARALLEL_SINE**2, Status.PARALLEL), (~((t1 > 0.0) & (t2 > 0.0)), Status.DIVERGING))
-    return D, gradient, X, gap, first_fault(rays.status, meet)
-
-
-def _meet_in_plane(rays: _Rays, centre: Array) -> tuple[Array, Array, Array, Array]:
+def _meet_in_plane(rays: _Rays, d: _Tangents, centre: Array) -> tuple[Array, Array, Array, Array]:
     """D = N / q, its gradient (..., 4) by the pixels, q, and the larger of the two rho."""
-    rho1, drho1 = _length(rays.P1[..., :2] - centre, rays.dP1[..., :2])
-    rho2, drho2 = _length(rays.P2[..., :2] - centre, rays.dP2[..., :2])
-    S1, dS1 = _length(rays.r1[..., :2], rays.dr1[..., :2])
-    S2, dS2 = _length(rays.r2[..., :2], rays.dr2[..., :2])
-    C1, C2, dC1, dC2 = -rays.r1[..., 2], -rays.r2[..., 2], -rays.dr1[..., 2], -rays.dr2[..., 2]
-    rise, drise = (rays.P2 - rays.P1)[..., 2], (rays.dP2 - rays.dP1)[..., 2]
+    rho1, drho1 = _length(rays.P1[..., :2] - centre, d.P1[..., :2])
+    rho2, drho2 = _length(rays.P2[..., :2] - centre, d.P2[..., :2])
+    S1, dS1 = _length(rays.r1[..., :2], d.r1[..., :2])
+    S2, dS2 = _length(rays.r2[..., :2], d.r2[..., :2])
+    C1, C2, dC1, dC2 = -rays.r1[..., 2], -rays.r2[..., 2], -d.r1[..., 2], -d.r2[..., 2]
+    rise, drise = (rays.P2 - rays.P1)[..., 2], (d.P2 - d.P1)[..., 2]
     q = S1 * C2 - C1 * S2
     D = (rise * S1 * S2 + rho2 * C2 * S1 - rho1 * C1 * S2) / q
     # -- product rule, with an axis for the four pixel coordinates
@@ -165,21 +213,20 @@ def _meet_in_plane(rays: _Rays, centre: Array) -> tuple[Array, Array, Array, Arr
 
 def _rays(rig: Rig, stroke_m: ArrayLike, uv_down_px: Array, uv_up_px: Array) -> _Rays:
     """Both reflected rays; a stroke moves origins along the axis and turns nothing."""
-    view = rig.at(0.0)
+    view, h = rig.at(0.0), np.asarray(stroke_m, float)
     down, up = reflect(view, uv_down_px), reflect(view, uv_up_px)
-    h = np.asarray(stroke_m, float)
-    shift = h[..., None] * np.array(rig.stroke_axis_world)
-    J1, J2 = reflect_jacobian(view, uv_down_px), reflect_jacobian(view, uv_up_px)
-    return _Rays(
-        down.origin_world_m,
-        down.direction_world,
-        up.origin_world_m + shift,
-        up.direction_world,
+    raised = up.origin_world_m + h[..., None] * np.array(rig.stroke_axis_world)
+    status = first_fault(down.status, up.status, stroke_status(h))
+    return _Rays(down.origin_world_m, down.direction_world, raised, up.direction_world, status)
+
+
+def _tangents(rig: Rig, uv_down_px: Array, uv_up_px: Array) -> _Tangents:
+    J1, J2 = (reflect_jacobian(rig.at(0.0), uv) for uv in (uv_down_px, uv_up_px))
+    return _Tangents(
         _columns(J1.origin_m_per_px, 0),
         _columns(J1.direction_per_px, 0),
         _columns(J2.origin_m_per_px, 2),
         _columns(J2.direction_per_px, 2),
-        first_fault(down.status, up.status, stroke_status(h)),
     )
 
 
@@ -190,17 +237,28 @@ def _columns(jacobian: Array, start: int) -> Array:
     return tangents
 
 
-def _midpoint_tangent(rays: _Rays, w: Array, n: Array, nn: Array, t1: Array, t2: Array) -> Array:
+def _perpendicular(rays: _Rays) -> _Perpendicular:
+    w, n = rays.P2 - rays.P1, np.cross(rays.r1, rays.r2)
+    nn = np.sum(n * n, axis=-1)
+    t1, t2 = (np.sum(np.cross(w, r) * n, axis=-1) / nn for r in (rays.r2, rays.r1))
+    return _Perpendicular(w, n, nn, t1, t2)
+
+
+def _midpoint(rays: _Rays, at: _Perpendicular) -> Array:
+    return 0.5 * (rays.P1 + at.t1[..., None] * rays.r1 + rays.P2 + at.t2[..., None] * rays.r2)
+
+
+def _midpoint_tangent(rays: _Rays, d: _Tangents, at: _Perpendicular) -> Array:
     """Derivative of the midpoint by (u1, v1, u2, v2), shape (..., 4, 3): product rule, line by line."""
-    r1, r2, w, n = (x[..., None, :] for x in (rays.r1, rays.r2, w, n))
-    t1, t2, nn = (x[..., None] for x in (t1, t2, nn))
-    dw = rays.dP2 - rays.dP1
-    dn = np.cross(rays.dr1, r2) + np.cross(r1, rays.dr2)
+    r1, r2, w, n = (x[..., None, :] for x in (rays.r1, rays.r2, at.w, at.n))
+    t1, t2, nn = (x[..., None] for x in (at.t1, at.t2, at.nn))
+    dw = d.P2 - d.P1
+    dn = np.cross(d.r1, r2) + np.cross(r1, d.r2)
     dnn = 2.0 * np.sum(n * dn, axis=-1)
-    dt1 = (_triple(dw, r2, n) + _triple(w, rays.dr2, n) + _triple(w, r2, dn) - t1 * dnn) / nn
-    dt2 = (_triple(dw, r1, n) + _triple(w, rays.dr1, n) + _triple(w, r1, dn) - t2 * dnn) / nn
-    first = rays.dP1 + dt1[..., None] * r1 + t1[..., None] * rays.dr1
-    second = rays.dP2 + dt2[..., None] * r2 + t2[..., None] * rays.dr2
+    dt1 = (_triple(dw, r2, n) + _triple(w, d.r2, n) + _triple(w, r2, dn) - t1 * dnn) / nn
+    dt2 = (_triple(dw, r1, n) + _triple(w, d.r1, n) + _triple(w, r1, dn) - t2 * dnn) / nn
+    first = d.P1 + dt1[..., None] * r1 + t1[..., None] * d.r1
+    second = d.P2 + dt2[..., None] * r2 + t2[..., None] * d.r2
     return 0.5 * (first + second)
 
 

@@ -10,6 +10,7 @@ from scipy import optimize, stats
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas, stroke_of
 from phibench.estimator.geometry.status import Status
+from phibench.estimator.geometry.triangulate import meeting, meeting_gradients
 from phibench.scenes.rig import Rig
 
 RIG, SPOT, STROKE = Rig(), np.array([1.9, 1.1, 0.5]), 0.5
@@ -62,16 +63,14 @@ def test_against_minimisation_in_pixels() -> None:
 
 def test_pixel_gradient_against_differences() -> None:
     """Five-point differences; the closed form is exact, the differences are good to 1e-8."""
-    from phibench.estimator.geometry.least_squares_depth import _meet_exact, _pixel_gradients
-
     y = np.concatenate([true_pixel(RIG, 0.0, SPOT), true_pixel(RIG, STROKE, SPOT) + [0.3, -0.2]])
-    e_y, D_y = _pixel_gradients(RIG, np.array(STROKE), y)
+    e_y, D_y = meeting_gradients(RIG, STROKE, y[:2], y[2:])
     for i in range(4):
         step = 1e-3 * np.eye(4)[i]
 
         def values(k, step=step):
-            at = _meet_exact(RIG, np.array(STROKE), y + k * step)
-            return np.array([at.gap, at.depth])
+            at = meeting(RIG, STROKE, *np.split(y + k * step, 2))
+            return np.array([at.gap_m, at.depth_m])
 
         slope = (8.0 * (values(1) - values(-1)) - (values(2) - values(-2))) / (12.0 * 1e-3)
         assert [e_y[i], D_y[i]] == pytest.approx(slope, rel=1e-7, abs=1e-9)
