@@ -64,7 +64,7 @@ class Pair:
     box_down, box_up : Box or None
         Region hints; both or none.
     calibration_covariance : array, shape (p, p), or None
-        Of the rig's parameters, `estimator.calibration.parameters.PARAMETERS`, where rig and stroke come from a
+        Of the rig's parameters, `estimator.geometry.rig_parameters.PARAMETERS`, where rig and stroke come from a
         calibration file; read-only.
     beam : Beam or None
         What the user knows of the laser's spot: its diameter by the distance.

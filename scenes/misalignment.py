@@ -1,17 +1,19 @@
-"""Rigid motion of the whole rig between the two images of a pair: the robot rolls, pitches, yaws or slips a little.
+"""Deviations of a real rig from the nominal one, and the table of their names, units, sizes and effects.
 
-What is wrong with a real rig: signed deviations of the true rig from the nominal one, which the estimator believes.
+`Misalignment` holds one number for every `RigParameter` of `PARAMETERS`; all are 0 by default. Recipes, calibrations,
+sensitivities and studies use these names. `Motion` is what moves the whole rig between the two images of a pair.
 
-All are 0 by default. World axes (z up; the robot's front is world +x); angles turn right-handed. The form's x, y, z are
-the world's at the down position, about the sphere centre; from there the form goes with the rig. Of several at once:
-the sphere moves first, then the camera turns about its lens and leaves sphere and lens where they are. What a recipe
-calls `decentre`, `tilt` and `stroke_tilt` in `[rig]` means the same here.
+Conventions: world axes (z up; the robot's front is world +x); angles turn right-handed. The form's x, y, z are the
+world's at the down position, about the sphere centre; from there the form goes with the rig. Of several deviations at
+once: the sphere moves first, then the camera turns about its lens and leaves sphere and lens where they are. A recipe's
+`decentre`, `tilt` and `stroke_tilt` in `[rig]` mean the same as here.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -55,9 +57,56 @@ class Motion:
         return Motion(as_vector(shift), as_matrix(np.array(other.rotation) @ np.array(self.rotation)))
 
 
-def _number(unit: str, limit: float, study: float, meaning: str) -> Any:
-    """Field of one parameter: unit, largest allowed and usual study magnitude, meaning."""
-    return field(default=0.0, metadata={"unit": unit, "limit": limit, "study": study, "meaning": meaning})
+class _Perturbed(Protocol):
+    """A `Rig`, which imports this module."""
+
+    def perturbed(self, misalignment: Misalignment) -> Self: ...
+
+
+_Rig = TypeVar("_Rig", bound=_Perturbed)
+_FOCAL_PX = 1430.0  # of the C310, for which a focal length's step and prior were set in pixels
+
+
+@dataclass(frozen=True)
+class RigParameter:
+    """One deviation of a rig.
+
+    Attributes
+    ----------
+    name : str
+        As in a recipe's `[misalignment]`.
+    unit : str
+        "m", "rad", "px" or "1".
+    limit : float
+        Largest allowed magnitude.
+    study : float
+        Magnitude that a study takes unless told otherwise: what is left after careful mounting.
+    meaning : str
+    step : float
+        For differences, about the size of a real error; NaN for a parameter that no calibration fits.
+    prior_sigma : float
+        Standard deviation for a rig whose numbers were read off a drawing and a ruler; NaN as for `step`.
+    """
+
+    name: str
+    unit: str
+    limit: float
+    study: float
+    meaning: str
+    step: float = math.nan
+    prior_sigma: float = math.nan
+
+    def apply(self, rig: _Rig, by: float) -> _Rig:
+        """Rig with this parameter larger by `by`; strokes are no part of a rig, see `Misalignment.stroke_m`."""
+        return rig.perturbed(Misalignment(**{self.name: by}))
+
+
+def _number(
+    unit: str, limit: float, study: float, meaning: str, *, step: float = math.nan, sigma: float = math.nan
+) -> Any:
+    """Field of one parameter: all of its `RigParameter` but the name."""
+    entry = {"unit": unit, "limit": limit, "study": study, "meaning": meaning, "step": step, "prior_sigma": sigma}
+    return field(default=0.0, metadata=entry)
 
 
 @dataclass(frozen=True)
@@ -70,25 +119,58 @@ class Misalignment:
         If a number is beyond its range.
     """
 
-    decentre_x_m: float = _number("m", 0.1, 1e-3, "sphere centre moved along world +x, at the down position")
-    decentre_y_m: float = _number("m", 0.1, 1e-3, "sphere centre moved along world +y, at the down position")
-    axial_m: float = _number("m", 0.1, 1e-3, "sphere centre moved along world +z, away from the lens")
-    tilt_x_rad: float = _number("rad", 0.5, 8.7e-3, "camera turned about world x through its lens; the sphere stays")
-    tilt_y_rad: float = _number("rad", 0.5, 8.7e-3, "camera turned about world y through its lens; the sphere stays")
-    radius_m: float = _number("m", 0.1, 6e-4, "added to the mirror's radius")
-    focal_relative: float = _number("1", 0.5, 0.01, "added to fx and fy, relative to them; the aperture follows fx")
-    cx_px: float = _number("px", 2000.0, 15.0, "added to the principal point u")
-    cy_px: float = _number("px", 2000.0, 15.0, "added to the principal point v")
+    decentre_x_m: float = _number(
+        "m", 0.1, 1e-3, "sphere centre moved along world +x, at the down position", step=1e-4, sigma=1e-3
+    )
+    decentre_y_m: float = _number(
+        "m", 0.1, 1e-3, "sphere centre moved along world +y, at the down position", step=1e-4, sigma=1e-3
+    )
+    axial_m: float = _number(
+        "m", 0.1, 1e-3, "sphere centre moved along world +z, away from the lens", step=2e-4, sigma=2e-3
+    )
+    tilt_x_rad: float = _number(
+        "rad",
+        0.5,
+        8.7e-3,
+        "camera turned about world x through its lens; the sphere stays",
+        step=5e-4,
+        sigma=math.radians(0.5),
+    )
+    tilt_y_rad: float = _number(
+        "rad",
+        0.5,
+        8.7e-3,
+        "camera turned about world y through its lens; the sphere stays",
+        step=5e-4,
+        sigma=math.radians(0.5),
+    )
+    radius_m: float = _number("m", 0.1, 6e-4, "added to the mirror's radius", step=1e-4, sigma=2.5e-4)
+    focal_relative: float = _number(
+        "1",
+        0.5,
+        0.01,
+        "added to fx and fy, relative to them; the aperture follows fx",
+        step=2.0 / _FOCAL_PX,
+        sigma=4.3 / _FOCAL_PX,
+    )
+    cx_px: float = _number("px", 2000.0, 15.0, "added to the principal point u", step=0.5, sigma=5.0)
+    cy_px: float = _number("px", 2000.0, 15.0, "added to the principal point v", step=0.5, sigma=5.0)
     k1: float = _number("1", 1000.0, 0.03, "added to the radial distortion k1")
     k2: float = _number("1", 1000.0, 0.3, "added to the radial distortion k2")
     k3: float = _number("1", 1000.0, 1.0, "added to the radial distortion k3")
     p1: float = _number("1", 1000.0, 1e-3, "added to the tangential distortion p1")
     p2: float = _number("1", 1000.0, 1e-3, "added to the tangential distortion p2")
     focus_distance_m: float = _number("m", 100.0, 0.05, "added to the distance of the plane of focus")
-    stroke_relative: float = _number("1", 0.5, 2e-3, "true stroke is (1 + this) x nominal stroke + stroke_offset_m")
-    stroke_offset_m: float = _number("m", 1.0, 1e-3, "added to the stroke")
-    stroke_tilt_x_rad: float = _number("rad", 0.5, 8.7e-3, "stroke axis turned about world x")
-    stroke_tilt_y_rad: float = _number("rad", 0.5, 8.7e-3, "stroke axis turned about world y, after x")
+    stroke_relative: float = _number(
+        "1", 0.5, 2e-3, "true stroke is (1 + this) x nominal stroke + stroke_offset_m", step=1e-3, sigma=5e-4
+    )
+    stroke_offset_m: float = _number("m", 1.0, 1e-3, "added to the stroke", step=1e-3, sigma=5e-4)
+    stroke_tilt_x_rad: float = _number(
+        "rad", 0.5, 8.7e-3, "stroke axis turned about world x", step=1e-3, sigma=math.radians(0.2)
+    )
+    stroke_tilt_y_rad: float = _number(
+        "rad", 0.5, 8.7e-3, "stroke axis turned about world y, after x", step=1e-3, sigma=math.radians(0.2)
+    )
     roll_rad: float = _number("rad", 0.5, 1.7e-3, "rig turned about world x between the images, left side up")
     pitch_rad: float = _number("rad", 0.5, 1.7e-3, "rig turned about world y between the images, front down")
     yaw_rad: float = _number("rad", 0.5, 1.7e-3, "rig turned about world z between the images, front to the left")
@@ -172,28 +254,7 @@ class Misalignment:
         return true_m
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """One parameter of `Misalignment`.
-
-    Attributes
-    ----------
-    unit : str
-        "m", "rad", "px" or "1".
-    limit : float
-        Largest allowed magnitude.
-    study : float
-        Magnitude that a study takes unless told otherwise: what is left after careful mounting.
-    meaning : str
-    """
-
-    unit: str
-    limit: float
-    study: float
-    meaning: str
-
-
-PARAMETERS = {entry.name: Parameter(**entry.metadata) for entry in fields(Misalignment)}
+PARAMETERS = {entry.name: RigParameter(entry.name, **entry.metadata) for entry in fields(Misalignment)}
 """All parameters of `Misalignment` by name, in order."""
 
 _ADDED_TO_CAMERA = ("cx_px", "cy_px", "k1", "k2", "k3", "p1", "p2", "focus_distance_m")

@@ -132,13 +132,15 @@ def read_pairs(folder: Path) -> list[PublicPair]:
 
 _MATRICES = ("bound_px2", "raw_bound_px2")
 _RIGS = ("true_rig", "nominal_rig")
+# keys of "phibench truth 1"
+_RENAMED = {"believed_rig": "nominal_rig", "believed_stroke_m": "nominal_stroke_m"}
 _NOT_SEALED = ("calibration_covariance",)  # a calibration comes with the score, never with the set
 
 
 def truth_text(truths: Sequence[PairTruth], salt: str, public_sha256: str) -> str:
     """Text of the truth's file: sorted keys, no blanks, doubles that read back to the same bits."""
     document = {
-        "format": "phibench truth 1",
+        "format": "phibench truth 2",
         "public_sha256": public_sha256,
         "salt": salt,
         "truths": [truth_document(truth) for truth in truths],
@@ -181,7 +183,8 @@ def truth_document(truth: PairTruth) -> dict[str, Any]:
 
 
 def truth_of(document: dict[str, Any]) -> PairTruth:
-    """A pair's truth from its document."""
+    """A pair's truth from its document, of version 1 or 2 of the file."""
+    document = {_RENAMED.get(name, name): value for name, value in document.items()}
     rigs = {name: from_json(Rig, document[name]) for name in _RIGS}
     return PairTruth(**{**document, **rigs, "down": _spot(document["down"]), "up": _spot(document["up"])})
 

@@ -1,11 +1,15 @@
-"""Calibration files: a rig's numbers with their covariance, and what they were made from. JSON, strict, versioned."""
+"""Calibration files: corrections of a rig with their covariance and their source, as strict, versioned JSON.
+
+Version 2 is written. Version 1 is read: it says `believed_rig` for `nominal_rig`, has four other names of parameters
+(`rig_parameters.RENAMED`), and gives the focal length in pixels.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,12 +20,13 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.files import write_text
 from phibench.estimator.calibration.bundle import Bundle
-from phibench.estimator.geometry.rig_parameters import LIMITS, PARAMETERS, changed
-from phibench.scenes.frames import Array
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, RENAMED, changed
+from phibench.scenes.frames import IDENTITY, Array
+from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError
 
-VERSION = 1
+VERSION = 2
 
 
 class CalibrationError(DatasetError):
@@ -53,7 +58,7 @@ class Calibration:
     Attributes
     ----------
     rig : Rig
-        Corrected; strokes are corrected by `parameters.stroke_of(stroke_m, values)`.
+        Corrected; strokes are corrected by `rig_parameters.stroke_of(stroke_m, values)`.
     nominal : Rig
         What it was before.
     parameters : tuple of str
@@ -108,12 +113,12 @@ def read_calibration(path: str | Path, nominal: Rig | None = None) -> Calibratio
     raw = _raw(path)
     if raw.get("kind") != "phibench calibration":
         raise CalibrationError(f"{path} is not a calibration: make one with `phibench calibrate`")
-    if raw.get("version") != VERSION:
+    if raw.get("version") not in (1, VERSION):
         raise CalibrationError(
-            f"{path} is a calibration of version {raw.get('version')}; this program reads version {VERSION}: "
+            f"{path} is a calibration of version {raw.get('version')}; this program reads versions 1 and {VERSION}: "
             "make it again with `phibench calibrate`"
         )
-    document = _validated(path, raw)
+    document = _validated(path, _of_version_2(raw) if raw["version"] == 1 else raw)
     p = len(PARAMETERS)
     covariance, values = np.array(document.covariance), np.array(document.values)
     if tuple(document.parameters) != PARAMETERS or covariance.shape != (p, p) or values.shape != (p,):
@@ -121,6 +126,8 @@ def read_calibration(path: str | Path, nominal: Rig | None = None) -> Calibratio
     if document.sha256 != _digest({k: v for k, v in raw.items() if k != "sha256"}):
         raise CalibrationError(f"{path} was changed after it was written: its hash does not fit; make it again")
     start = from_json(Rig, document.nominal_rig)
+    if document.version == 1:
+        values, covariance = _relative_focal(path, start, values, covariance)
     if nominal is not None and to_json(nominal) != to_json(start):
         raise CalibrationError(f"{path} is the calibration of another rig than the one that it shall correct")
     rig = from_json(Rig, document.rig)
@@ -131,7 +138,7 @@ def read_calibration(path: str | Path, nominal: Rig | None = None) -> Calibratio
 def _require_sound(path: Path, nominal: Rig, rig: Rig, values: Array, covariance: Array) -> None:
     """Refuse numbers that no calibration gives, whoever has put them into the file."""
     for name, value in zip(PARAMETERS, values.tolist(), strict=True):
-        if not abs(value) <= (limit := LIMITS[name]):
+        if not abs(value) <= (limit := MISALIGNMENT[name].limit):
             raise CalibrationError(
                 f"{path} corrects {name} by {value:g}: allowed is -{limit:g} to {limit:g}; make it again"
             )
@@ -143,11 +150,38 @@ def _require_sound(path: Path, nominal: Rig, rig: Rig, values: Array, covariance
             f"{path} has no covariance: its matrix is not symmetric with eigenvalues of 0 or above; make it again"
         )
     try:
-        same = _close(to_json(changed(nominal, values)), to_json(rig))
+        same = _close(_document(changed(nominal, values)), _document(rig))
     except SceneError as error:
         raise CalibrationError(f"{path} corrects the rig to one that cannot be: {error}; make it again") from error
     if not same:
         raise CalibrationError(f"{path} has a rig that is not the nominal one with its corrections; make it again")
+
+
+def _of_version_2(raw: dict[str, Any]) -> dict[str, Any]:
+    """Version 1 with the keys and names of version 2; anything else is left for the checks."""
+    new = dict(raw)
+    if "believed_rig" in new:
+        new["nominal_rig"] = new.pop("believed_rig")
+    if isinstance(names := new.get("parameters"), list):
+        new["parameters"] = [RENAMED.get(name, name) if isinstance(name, str) else name for name in names]
+    return new
+
+
+def _relative_focal(path: Path, nominal: Rig, values: Array, covariance: Array) -> tuple[Array, Array]:
+    """Values and covariance with the focal length relative to the nominal one instead of in pixels."""
+    camera = nominal.camera
+    if camera.fx_px != camera.fy_px:
+        raise CalibrationError(f"{path} is of version 1 and of a camera with fx_px other than fy_px: make it again")
+    scale = np.ones(len(PARAMETERS))
+    scale[PARAMETERS.index("focal_relative")] = 1.0 / camera.fx_px
+    return values * scale, covariance * np.outer(scale, scale)
+
+
+def _document(rig: Rig) -> dict[str, Any]:
+    """Rig as JSON; the rotation of a perfect sphere means nothing, and version 1 left it out."""
+    if rig.mirror.form is None:
+        rig = replace(rig, T_camera_sphere=replace(rig.T_camera_sphere, rotation=IDENTITY))
+    return dict(to_json(rig))
 
 
 def _close(a: Any, b: Any) -> bool:

@@ -77,7 +77,7 @@ def depth_general(
     uv_down_px, uv_up_px : shape (..., 2)
     covariance_down_px2, covariance_up_px2 : shape (..., 2, 2)
     covariance_rig : shape (p, p), optional
-        Of `calibration.parameters.PARAMETERS`; none for an exact rig.
+        Of `rig_parameters.PARAMETERS`; none for an exact rig.
     stroke_sigma_m : shape (...)
         Of this pair's stroke, besides what the parameters say of all strokes.
 
@@ -180,7 +180,7 @@ def _rig_gradients(rig: Rig, h: Array, z: Array) -> tuple[Array, Array, Array]:
         plus, minus = (meeting(changed(rig, v), stroke_of(h, v), z[..., :2], z[..., 2:4]) for v in (values, -values))
         for name, found in slopes.items():
             found.append((getattr(plus, name) - getattr(minus, name)) / (2.0 * size))
-    own = PARAMETERS.index("stroke_m")
+    own = PARAMETERS.index("stroke_offset_m")
     gap, depth, point = (found + [found[own]] for found in slopes.values())
     return np.stack(gap, axis=-1), np.stack(depth, axis=-1), np.stack(point, axis=-2)
 

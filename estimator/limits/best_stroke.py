@@ -105,7 +105,7 @@ def best_stroke(
     rig : Rig
         The default rig if not given.
     covariance_rig : shape (p, p)
-        Of `calibration.parameters.PARAMETERS`: a calibration's covariance, zeros for the pixels' noise alone. By
+        Of `rig_parameters.PARAMETERS`: a calibration's covariance, zeros for the pixels' noise alone. By
         default what a rig put together by hand is good for (`PRIOR_SIGMA`).
     stroke_sigma_m : float
         Error of the single stroke, besides what the parameters say of all strokes.

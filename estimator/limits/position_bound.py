@@ -158,7 +158,7 @@ class DepthLimit:
     sigma_calibration_m : shape (...)
         From what is not known of the rig: sqrt(g_c^T Sigma_c g_c).
     gradient : shape (..., p)
-        g_c, dD by each of `rig_errors.RIG_PARAMETERS`, metres per its unit.
+        g_c, dD by each of `rig_parameters.RIG_PARAMETERS`, metres per its unit.
     status : shape (...), values of `Status`
     """
 
@@ -238,7 +238,7 @@ def depth_limit(
     rig, stroke_m, uv_down_px, uv_up_px, covariance_down_px2, covariance_up_px2
         As for `triangulate.depth_exact`; the covariances are bounds of (u, v).
     covariance_rig : shape (p, p)
-        Of the calibration's parameters, see `rig_errors.rig_covariance`.
+        Of the calibration's parameters, see `rig_parameters.rig_covariance`.
     """
     spot = depth_exact(rig, stroke_m, uv_down_px, uv_up_px, covariance_down_px2, covariance_up_px2)
     g = rig_gradient(rig, stroke_m, uv_down_px, uv_up_px)

@@ -35,7 +35,6 @@ from phibench.estimator.geometry.sensitivities import sensitivity
 from phibench.estimator.geometry.triangulate import depth_exact, exact_gradient
 from phibench.render.optics.reflection_point import reflection_points
 from phibench.render.optics.spot_layer import spot_layer
-from phibench.scenes import misalignment as rig_misalignment
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
@@ -299,13 +298,6 @@ def centroid_px(view: View, point_m: Array) -> tuple[float, float]:
     )
 
 
-_SAME = {  # names of the calibration's parameters that a study's misalignment calls otherwise
-    "stroke_m": "stroke_offset_m",
-    "stroke_scale": "stroke_relative",
-    "z_c_m": "axial_m",
-}
-
-
 @dataclass(frozen=True)
 class Bench:
     """How a rig is calibrated.
@@ -350,15 +342,12 @@ class Bench:
             for d, u, each in zip(down, up, D, strict=True)
         ]
         measured = Measured(outline, np.diag(np.square(self.outline_sigma_m)))
-        return calibrate(nominal, measured, spots, sigmas=nominal_sigmas(nominal))
+        return calibrate(nominal, measured, spots, sigmas=nominal_sigmas())
 
 
-def nominal_sigmas(nominal: Rig) -> Array:
+def nominal_sigmas() -> Array:
     """Priors, shape (p,): the study's magnitudes, or the calibration's own where they are larger."""
-    known = rig_misalignment.PARAMETERS
-    focal_px = nominal.camera.fx_px * known["focal_relative"].study
-    study = {name: known[_SAME.get(name, name)].study for name in PRIOR_SIGMA if name != "f_px"}
-    return prior_sigmas({name: max(PRIOR_SIGMA[name], {**study, "f_px": focal_px}[name]) for name in PRIOR_SIGMA})
+    return prior_sigmas({name: max(sigma, PARAMETERS[name].study) for name, sigma in PRIOR_SIGMA.items()})
 
 
 def _noise(rng: np.random.Generator | None, sigma: Array) -> Array:

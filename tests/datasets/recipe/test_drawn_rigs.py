@@ -72,18 +72,16 @@ def test_a_shard_keeps_only_its_rigs() -> None:
 def test_what_is_drawn_is_what_the_estimator_takes_as_prior() -> None:
     """400 rigs: every parameter's sum of squares over the prior's variance is chi-square, false alarm rate 1e-3 in all.
 
-    The prior has z_c, f and the strokes under other names. Truncation at 4 sigma takes 0.1 % of the variance, far below
+    Truncation at 4 sigma takes 0.1 % of the variance, far below
     the 7 % that 400 draws can tell; a sigma that is off by a factor of 1.3 is noticed.
     """
-    names = {"axial_m": "z_c_m", "stroke_offset_m": "stroke_m", "stroke_relative": "stroke_scale"}
     plan = make_plan(shipped(count=400))
     rows = [dict(next(p for p in plan.pairs[29 * k : 29 * k + 1]).drawn) for k in range(400)]
     low, high = stats.chi2.ppf([5e-4 / 13, 1.0 - 5e-4 / 13], 400)
     checked = 0
     for key in rows[0]:
         name = key.removeprefix("misalignment.")
-        sigma = 4.3 / 1430.0 if name == "focal_relative" else PRIOR_SIGMA[names.get(name, name)]
-        total = float(np.sum(np.square([row[key] for row in rows]))) / sigma**2
+        total = float(np.sum(np.square([row[key] for row in rows]))) / PRIOR_SIGMA[name] ** 2
         assert low < total < high, name
         assert not low < total * 1.3**2 < high
         assert not low < total / 1.3**2 < high

@@ -20,7 +20,7 @@ from phibench.estimator.benchmark.records import records
 from phibench.estimator.calibration.bundle import Bundle
 from phibench.estimator.calibration.file import Calibration, CalibrationError, read_calibration, write_calibration
 from phibench.estimator.cli.main import main
-from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, RENAMED, changed, prior_sigmas
 from phibench.estimator.interface import Answer, Outcome, Spot
 from phibench.estimator.paper.paper_tables import GENERAL, score
 from phibench.scenes.misalignment import Misalignment
@@ -45,7 +45,7 @@ def corrections(misalignment: Misalignment) -> np.ndarray:
     """What a perfect calibration finds for a misalignment of tilt, decentre and stroke."""
     values = dict.fromkeys(PARAMETERS, 0.0)
     values |= {name: getattr(misalignment, name) for name in ("tilt_x_rad", "decentre_y_m")}
-    values["stroke_scale"] = misalignment.stroke_relative
+    values["stroke_relative"] = misalignment.stroke_relative
     return np.array([values[name] for name in PARAMETERS])
 
 
@@ -93,7 +93,8 @@ def test_the_predicted_error_of_depth_holds_the_calibration() -> None:
 
 
 def test_pairs_carry_rig_stroke_and_covariance() -> None:
-    values = np.array([{"stroke_m": 2e-3, "stroke_scale": 1e-2, "z_c_m": 1e-3}.get(name, 0.0) for name in PARAMETERS])
+    given = {"stroke_offset_m": 2e-3, "stroke_relative": 1e-2, "axial_m": 1e-3}
+    values = np.array([given.get(name, 0.0) for name in PARAMETERS])
     base = cases(3)
     seen = CalibratedPairs(base, calibration(values, dataset="x"))
     for number in range(3):
@@ -231,6 +232,36 @@ def rewritten(file: Path, change: Callable[[dict], None]) -> None:
     file.write_text(json.dumps(raw))
 
 
+def as_version_1(raw: dict) -> None:
+    """Keys, names and the focal length in pixels, as version 1 wrote them; it gave a perfect sphere no rotation."""
+    focal = PARAMETERS.index("focal_relative")
+    raw["version"] = 1
+    raw["believed_rig"] = raw.pop("nominal_rig")
+    raw["parameters"] = [{new: old for old, new in RENAMED.items()}.get(name, name) for name in raw["parameters"]]
+    raw["values"][focal] *= RIG.camera.fx_px
+    for k in range(len(PARAMETERS)):
+        raw["covariance"][focal][k] *= RIG.camera.fx_px
+        raw["covariance"][k][focal] *= RIG.camera.fx_px
+    raw["rig"]["T_camera_sphere"]["rotation"] = raw["believed_rig"]["T_camera_sphere"]["rotation"]
+
+
+def test_files_of_version_1_are_read(tmp_path: Path) -> None:
+    values = 0.5 * prior_sigmas()
+    file = written(tmp_path / "c.json", values, RIG, dataset="x")
+    new = read_calibration(file, RIG)
+    rewritten(file, as_version_1)
+    assert '"f_px"' in file.read_text()
+    old = read_calibration(file, RIG)
+    assert old.values == pytest.approx(values, rel=1e-12)
+    assert old.covariance == pytest.approx(COVARIANCE, rel=1e-12)
+    assert (old.nominal, old.made_from, old.parameters) == (RIG, {"dataset": "x"}, PARAMETERS)
+    assert old.rig.camera == new.rig.camera
+    assert old.rig.outline_px(9) == pytest.approx(new.rig.outline_px(9), abs=1e-9)
+    file.write_text(file.read_text().replace('"dataset": "x"', '"dataset": "y"'))
+    with pytest.raises(CalibrationError, match="was changed"):
+        read_calibration(file, RIG)
+
+
 def far(raw: dict) -> None:
     raw["values"][PARAMETERS.index("tilt_x_rad")] = 0.9
 
@@ -248,7 +279,7 @@ def other_rig(raw: dict) -> None:
 
 
 def impossible(raw: dict) -> None:
-    raw["values"][PARAMETERS.index("z_c_m")] = -0.1
+    raw["values"][PARAMETERS.index("axial_m")] = -0.1
     raw["values"][PARAMETERS.index("radius_m")] = 0.1
 
 
@@ -284,7 +315,7 @@ def test_every_command_refuses_a_wrong_file_in_one_sentence(
     changed_file = written(tmp_path / "c.json", np.zeros(len(PARAMETERS)), misaligned.samples[0].nominal_rig)
     changed_file.write_text(changed_file.read_text().replace('"chi2": 0.0', '"chi2": 1.0'))
     old = written(tmp_path / "o.json", np.zeros(len(PARAMETERS)), RIG)
-    old.write_text(old.read_text().replace('"version": 1', '"version": 0'))
+    old.write_text(old.read_text().replace('"version": 2', '"version": 0'))
     other = written(tmp_path / "r.json", np.zeros(len(PARAMETERS)), RIG)
     for file, word in ((changed_file, "was changed"), (old, "version 0"), (other, "another rig"), (tmp_path, "cannot")):
         assert run(*more, "--calibration", file) == 2

@@ -170,6 +170,15 @@ def test_truth_survives_its_file_to_the_bit(bench_dataset: Path) -> None:
             assert np.array_equal(np.array(spot.raw_bound_px2), np.array(other.raw_bound_px2))
 
 
+def test_truth_of_version_1_is_read(bench_dataset: Path) -> None:
+    """Version 1 said "believed" for "nominal"."""
+    truth = dataset_pairs(open_dataset(bench_dataset)).truth(0)
+    document = truth_document(truth)
+    old = {name.replace("nominal", "believed"): value for name, value in document.items()}
+    assert {"believed_rig", "believed_stroke_m"} <= set(old)
+    assert truth_document(truth_of(old)) == document
+
+
 def test_seeds_that_can_be_found_are_warned_of() -> None:
     [known] = seed_warnings("bench-test", 1)
     assert "seed 1 is that of the shipped recipe 'bench-test'" in known

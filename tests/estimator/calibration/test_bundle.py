@@ -81,8 +81,8 @@ def test_what_cannot_be_told_apart_is_named() -> None:
     """From the outline alone: R with z_c, and tilt with decentre, are each one direction that stays."""
     bundle = calibrate(RIG, apparent(RIG))
     named = [set(direction.parts) for direction in bundle.undetermined]
-    assert any({"radius_m", "z_c_m"} & parts for parts in named)
-    assert any({"stroke_scale"} & parts for parts in named)
+    assert any({"radius_m", "axial_m"} & parts for parts in named)
+    assert any({"stroke_relative"} & parts for parts in named)
     with_spots = calibrate(RIG, apparent(RIG), spots_of(RIG, np.zeros(len(PARAMETERS)), None))
     assert len(with_spots.undetermined) < len(bundle.undetermined)
 
@@ -97,7 +97,7 @@ def test_unknown_priors_are_refused() -> None:
     with pytest.raises(DatasetError, match="tilt_x_rad"):
         prior_sigmas({"tilt_x": 0.1})
     with pytest.raises(DatasetError, match="0 or above"):
-        prior_sigmas({"f_px": -1.0})
+        prior_sigmas({"focal_relative": -1.0})
 
 
 def outline_at(centre: np.ndarray, sigma_m: float) -> Outline:

@@ -8,15 +8,23 @@ from helpers.oracles import alhazen_quartic, paper_cases, random_rig, random_spo
 from scipy import stats
 
 from phibench.estimator.geometry.phi import estimate_phi
-from phibench.estimator.geometry.rig_parameters import RIG_PARAMETERS, changed_rig, rig_covariance, rig_gradient
+from phibench.estimator.geometry.rig_parameters import RIG_PARAMETERS, rig_covariance, rig_gradient
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.limits.position_bound import SpotLimit, depth_limit, phi_limit
+from phibench.scenes.misalignment import PARAMETERS
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
 
 RIG = Rig()
 SIGMAS = {
-    **{"stroke_m": 5e-4, "z_c_m": 2e-4, "radius_m": 2e-5, "f_px": 2.0, "cx_px": 0.5, "cy_px": 0.5},
+    **{
+        "stroke_offset_m": 5e-4,
+        "axial_m": 2e-4,
+        "radius_m": 2e-5,
+        "focal_relative": 1.4e-3,
+        "cx_px": 0.5,
+        "cy_px": 0.5,
+    },
     **{"decentre_x_m": 5e-5, "decentre_y_m": 5e-5, "tilt_x_rad": 3e-4, "tilt_y_rad": 3e-4},
     **{"stroke_tilt_x_rad": 1e-3, "stroke_tilt_y_rad": 1e-3},
 }
@@ -40,7 +48,7 @@ def test_accuracy_depth_limit_against_draws() -> None:
     for k in range(n):
         rig = RIG
         for name, values in zip(RIG_PARAMETERS[1:], draws[1:], strict=True):
-            rig = changed_rig(rig, name, values[k])
+            rig = PARAMETERS[name].apply(rig, values[k])
         depths[k] = depth_exact(rig, h + draws[0][k], uv[0][k], uv[1][k]).depth_m
     variance = depths.var(ddof=1)
     # false alarm 1e-6: +-11 % of the variance; sigma / D is 0.4 %, second order 1e-3 of it
@@ -59,8 +67,8 @@ def test_parts_stay_apart() -> None:
     assert exact.sigma_calibration_m == 0.0
     direct = depth_exact(RIG, row.baseline_m, down, up, C_DOWN, C_UP).sigma_m
     assert exact.sigma_m == pytest.approx(float(direct), rel=1e-12)
-    one = depth_limit(RIG, row.baseline_m, down, up, C_DOWN, C_UP, rig_covariance({"f_px": 2.0}))
-    assert one.sigma_calibration_m == pytest.approx(2.0 * abs(one.gradient[RIG_PARAMETERS.index("f_px")]), rel=1e-12)
+    one = depth_limit(RIG, row.baseline_m, down, up, C_DOWN, C_UP, rig_covariance({"cx_px": 2.0}))
+    assert one.sigma_calibration_m == pytest.approx(2.0 * abs(one.gradient[RIG_PARAMETERS.index("cx_px")]), rel=1e-12)
 
 
 def test_rig_gradient_does_not_depend_on_its_steps() -> None:
@@ -81,10 +89,10 @@ def test_rig_gradient_predicts_what_a_wrong_rig_gives() -> None:
     """Pixels of a true rig, estimated with the nominal one: D is off by minus the gradient times the error."""
     row, spot = paper_cases()[12]
     h = row.baseline_m
-    steps = {name: 0.02 * sigma for name, sigma in SIGMAS.items() if name != "stroke_m"}
+    steps = {name: 0.02 * sigma for name, sigma in SIGMAS.items() if name != "stroke_offset_m"}
     g = rig_gradient(RIG, h, *pixels(RIG, spot, h))
     for name, step in steps.items():
-        true_rig = changed_rig(RIG, name, step)
+        true_rig = PARAMETERS[name].apply(RIG, step)
         true_depth = np.linalg.norm((spot - true_rig.at(0.0).sphere_centre_m)[:2])
         error = depth_exact(RIG, h, *pixels(true_rig, spot, h)).depth_m - true_depth
         # D's second derivative: 1e-2 of the first for 2 % of a sigma; a decentred sphere moves the reference of D
@@ -116,9 +124,9 @@ def test_phi_limit_against_differences() -> None:
 
 
 def test_messages() -> None:
-    with pytest.raises(ValueError, match=r"no rig parameter 'zc_m'.*z_c_m"):
-        rig_covariance({"zc_m": 1e-3})
+    with pytest.raises(ValueError, match=r"no rig parameter 'axial'.*axial_m"):
+        rig_covariance({"axial": 1e-3})
+    with pytest.raises(ValueError, match="'z_c_m' is now called 'axial_m'"):
+        rig_covariance({"z_c_m": 1e-3})
     with pytest.raises(ValueError, match="sigma of radius_m = -1"):
         rig_covariance({"radius_m": -1.0})
-    with pytest.raises(ValueError, match="stroke_m"):
-        changed_rig(RIG, "stroke_m", 1e-3)

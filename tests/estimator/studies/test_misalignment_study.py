@@ -220,10 +220,10 @@ def test_calibration_takes_out_what_it_fits() -> None:
 
 
 def test_beliefs_are_as_wide_as_the_study() -> None:
-    sigmas = dict(zip(CALIBRATION, nominal_sigmas(RIG), strict=True))
+    sigmas = dict(zip(CALIBRATION, nominal_sigmas(), strict=True))
     assert sigmas["cx_px"] == PARAMETERS["cx_px"].study
-    assert sigmas["f_px"] == pytest.approx(0.01 * RIG.camera.fx_px)
-    assert sigmas["z_c_m"] == 2e-3  # the calibration's own, which is wider
+    assert sigmas["focal_relative"] == PARAMETERS["focal_relative"].study
+    assert sigmas["axial_m"] == 2e-3  # the calibration's own, which is wider
 
 
 def test_calibration_needs_its_spots_in_the_image() -> None:
