@@ -32,6 +32,7 @@ from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prio
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.rig import Rig, View
+from phibench.scenes.validation import SceneError
 
 _STEP_PX = 2.0
 _EDGES, _POINTS = 12, 8
@@ -197,7 +198,10 @@ def calibrate(
     turned = np.zeros((2, 2)) if vertical is None else vertical_by_principal_point(nominal)
     problem = _Problem(nominal, outline, tuple(spots), vertical, prior, free, turned)
     start = np.concatenate([np.zeros(free.size), *(_start(nominal, spot) for spot in spots)])
-    found = optimize.least_squares(problem.residuals, start, x_scale="jac", xtol=1e-12, ftol=1e-12)
+    try:
+        found = optimize.least_squares(problem.residuals, start, x_scale="jac", xtol=1e-12, ftol=1e-12)
+    except SceneError as error:  # a step led to a rig that cannot be
+        raise DatasetError(f"the calibration does not come to rest: {error}") from error
     if not found.success or not np.isfinite(found.cost):
         raise DatasetError(f"the calibration does not come to rest: {found.message}")
     normal = found.jac.T @ found.jac

@@ -131,7 +131,7 @@ def test_the_file_keeps_every_number(tmp_path, bundle) -> None:
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ({"version": 2}, "version 2"),
+        ({"version": 3}, "version 3"),
         ({"kind": "shopping list"}, "not a calibration"),
         ({"chi2": 5.0}, "was changed"),
         ({"extra": 1}, "damaged at extra"),
