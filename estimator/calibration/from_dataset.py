@@ -19,8 +19,10 @@ from phibench.estimator.calibration.file import write_calibration
 from phibench.estimator.calibration.limb_image import Measured
 from phibench.estimator.calibration.outline import Outline, find_outline, mean_measured, mean_outline
 from phibench.estimator.calibration.spots import Ruler, known_spot, measured_spot, method_for, one_per_pose
+from phibench.estimator.calibration.verdict import Verdict, verdict_of, write_overlay
 from phibench.estimator.calibration.vertical_edges import find_vertical
 from phibench.estimator.draw_pairs import pairs_of
+from phibench.estimator.geometry.rig_parameters import prior_sigmas
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.spots.simple_spots import find_spot
 from phibench.scenes.rig import POSITIONS, Rig
@@ -38,6 +40,33 @@ class Photograph:
     card: SensorCard | None = None
 
 
+@dataclass(frozen=True)
+class DatasetCalibration:
+    """A calibration and the images that it was made from.
+
+    Attributes
+    ----------
+    bundle : Bundle
+    nominal : Rig
+    images, outlines : tuples that belong together
+    names : of the images
+    verdict : Verdict
+    """
+
+    bundle: Bundle
+    nominal: Rig
+    images: tuple[Photograph, ...]
+    outlines: tuple[Outline, ...]
+    names: tuple[str, ...]
+    verdict: Verdict
+
+    def write_picture(self, path: Path) -> Path:
+        """Overlay of the image whose outline fits worst, see `verdict.write_overlay`."""
+        worst = int(np.argmax([one.shift_rms_px for one in self.outlines]))
+        image, title = self.images[worst], self.names[worst]
+        return write_overlay(path, image.pixels, image.card, self.nominal, self.outlines[worst], title)
+
+
 def calibrate_dataset(
     folder: Path,
     out: Path,
@@ -46,7 +75,8 @@ def calibrate_dataset(
     spots: bool = False,
     ruler: Ruler | None = None,
     vertical: bool = False,
-) -> Bundle:
+    outline_sigma_factor: float = 1.0,
+) -> DatasetCalibration:
     """Calibrate the rig of some samples and write the file.
 
     Parameters
@@ -64,6 +94,8 @@ def calibrate_dataset(
         By default D is measured to 1 mm, height and azimuth not at all.
     vertical : bool
         Also use the room's vertical edges, see `find_vertical`; the room is to have some.
+    outline_sigma_factor : float
+        Widens the outlines' standard deviations, which were checked in the room `lab` and in rooms like it.
 
     Raises
     ------
@@ -80,12 +112,15 @@ def calibrate_dataset(
     else:
         images = [photograph(dataset, sample, position, preset) for sample, position in one_per_pose(chosen)]
         known = frame_spots(dataset, chosen, preset, ruler) if spots else []
-    outlines = [find_outline(image.pixels, rig, image.card) for image in images]
+    found = [find_outline(image.pixels, rig, image.card) for image in images]
+    outlines = [one.widened(outline_sigma_factor) for one in found]
     upright = _vertical(images, outlines, rig) if vertical else None
     bundle = calibrate(rig, mean_outline(outlines), known, upright)
     made_from = _made_from(dataset, chosen, preset, outlines, known, upright)
     write_calibration(out, bundle, rig, made_from)
-    return bundle
+    names = tuple(f"{sample.row.sample_id} {position}" for sample, position in one_per_pose(chosen))
+    verdict = verdict_of(bundle, prior_sigmas(), outlines)
+    return DatasetCalibration(bundle, rig, tuple(images), tuple(outlines), names, verdict)
 
 
 def frame_outline(dataset: Dataset, sample: Sample, position: str, preset: str, laser_off: bool = True) -> Outline:

@@ -66,6 +66,9 @@ class Outline:
     residual : float
         Robust standard deviation of the residuals over the light.
     pixels, steps : int
+    shifts_px : shape (SECTORS,)
+        Shift of the limb that the fit leaves in each sector, outwards positive, pixels; NaN where it is not used.
+        Sector k begins at the angle -pi + 2 pi k / SECTORS about the sphere's direction, from the camera's x to y.
     """
 
     sphere_in_camera_m: Array
@@ -76,11 +79,29 @@ class Outline:
     residual: float
     pixels: int
     steps: int
+    shifts_px: Array = field(default_factory=lambda: np.zeros(SECTORS), repr=False)
 
     @property
     def sigma_m(self) -> Array:
         """Standard deviations of s, shape (3,)."""
         return np.sqrt(np.diag(self.covariance_m2))
+
+    @property
+    def shift_rms_px(self) -> float:
+        """Root mean square of the sectors' shifts."""
+        return float(np.sqrt(np.nanmean(np.square(self.shifts_px))))
+
+    def widened(self, factor: float) -> Outline:
+        """The same with a standard deviation `factor` times as large.
+
+        Raises
+        ------
+        ImageError
+            If the factor is not above 0.
+        """
+        if not 0.0 < factor < np.inf:
+            raise ImageError(f"the factor of the outline's standard deviation is {factor:g}: it must be above 0")
+        return replace(self, covariance_m2=self.covariance_m2 * factor**2)
 
     def rig(self, nominal: Rig) -> Rig:
         """The nominal rig with the sphere where its outline is."""
@@ -200,7 +221,8 @@ def _settle(
     arc = step.sectors_used / SECTORS
     change, covariance = (step.move, step.covariance) if again is None else without_jpeg(pixels, step, *again)
     s, blur = _moved(s, change[:3], rig), float(np.clip(blur + change[3], *_BLUR_RANGE_PX2))
-    return Outline(s, covariance[:3, :3], arc, step.contrast, blur**0.5, step.residual, len(pixels.y), count)
+    shifts = step.solution.sector_shifts(pixels.y - step.model)
+    return Outline(s, covariance[:3, :3], arc, step.contrast, blur**0.5, step.residual, len(pixels.y), count, shifts)
 
 
 def without_jpeg(pixels: OutlinePixels, step: Step, frame: NDArray[Any], card: SensorCard) -> tuple[Array, Array]:

@@ -383,6 +383,14 @@ class Solution:
         """Step of the parameters, shape (4,), for residuals (N,)."""
         return np.asarray(np.linalg.lstsq(self.normal(), self.J.T @ (self.weight * residual), rcond=1e-14)[0])
 
+    def sector_shifts(self, residual: Array) -> Array:
+        """Shift of the limb, outwards, that each sector has left, shape (count,), px; NaN where it is not used."""
+        where, weight = self.where, self.weight
+        left = where.summed((weight * self.shift * (residual - self.J @ self.move(residual)))[:, None])[:, 0]
+        information = where.summed((weight * self.shift**2)[:, None])[:, 0]
+        # light moves with the distance from the limb: a limb further out is light from further in
+        return np.where(information > 0.0, -left / np.where(information > 0.0, information, 1.0), np.nan)
+
     def covariance(self, residual: Array) -> Array:
         """Covariance of the step, shape (4, 4), from the scatter of the residuals (N,) that it leaves."""
         where, own, trust = self.where, self.own, self.trust

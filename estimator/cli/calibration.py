@@ -1,4 +1,4 @@
-"""`phibench calibrate` and `phibench align`."""
+"""Commands `phibench calibrate` and `phibench align`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,11 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from phibench.estimator.cli.options import DEFAULT_PRESET
+
+_LAB = (
+    "sigma of the outline: checked in the room `lab`; in a room with more lamps or edges widen it with "
+    "--outline-sigma-factor 2"
+)
 
 
 def calibrate(
@@ -23,8 +28,10 @@ def calibrate(
     distance_sigma_m: float = 1e-3,
     height_sigma_m: float = math.inf,
     azimuth_sigma_deg: float = math.inf,
+    outline_sigma_factor: float = 1.0,
+    picture: Path | None = None,
 ) -> int:
-    """Calibrate a rig from the images of a data set and write a calibration file.
+    """Calibrate a rig from the images of a data set; write a calibration file and a picture.
 
     Parameters
     ----------
@@ -46,25 +53,36 @@ def calibrate(
         The same of its height above the floor; not measured by default.
     azimuth_sigma_deg
         The same of its azimuth, degrees; not measured by default.
+    outline_sigma_factor
+        Widens the outline's standard deviation. 1 holds in the room `lab`; take 1.5 to 2 in a room with more lamps,
+        edges or patterns.
+    picture
+        PNG to write: the outline on the frame, with its residuals enlarged; by default beside the calibration.
     """
     from phibench.datasets.errors import DatasetError
     from phibench.estimator.calibration.from_dataset import calibrate_dataset
     from phibench.estimator.calibration.spots import Ruler
-    from phibench.estimator.geometry.rig_parameters import PARAMETERS
+    from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
+    from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 
     if not spots and (math.isfinite(height_sigma_m) or math.isfinite(azimuth_sigma_deg)):
         raise DatasetError("--height-sigma-m and --azimuth-sigma-deg are about calibration spots: give --spots too")
     ruler = Ruler(distance_sigma_m, height_sigma_m, math.radians(azimuth_sigma_deg))
-    bundle = calibrate_dataset(directory, out, sample, preset, spots, ruler, vertical)
-    print("correction of the nominal rig, metres, radians, pixels or relative, and its standard deviation:")
-    for name, value in zip(PARAMETERS, bundle.values, strict=True):
-        print(f"{name:18s} {value:+.3e} +- {bundle.sigmas[name]:.1e}")
-    if bundle.undetermined:
-        print("combinations that the data say little about (shares over what was nominal of each):")
-    for weak in bundle.undetermined:
-        parts = ", ".join(f"{name} {share:+.2f}" for name, share in weak.parts.items())
-        print(f"  {parts} ({100.0 * weak.remaining:.0f} % of what was nominal is left)")
-    print(f"{out}: chi2 {bundle.chi2:.2f} for {bundle.degrees} degrees of freedom")
+    picture = out.with_suffix(".png") if picture is None else picture
+    found = calibrate_dataset(directory, out, sample, preset, spots, ruler, vertical, outline_sigma_factor)
+    print(f"{found.verdict}.")
+    print(f"{found.write_picture(picture)}: the outline on the frame that fits worst, residuals enlarged")
+    print(_LAB)
+    print(f"\n{'parameter':18s} {'unit':4s} {'correction':>11s} {'sigma':>8s} {'prior sigma':>11s}")
+    for name, value, prior in zip(PARAMETERS, found.bundle.values, prior_sigmas(), strict=True):
+        unit = MISALIGNMENT[name].unit
+        print(f"{name:18s} {unit:4s} {value:+11.3e} {found.bundle.sigmas[name]:8.1e} {prior:11.1e}")
+    if found.bundle.undetermined:
+        print("\ncombinations that the data say little about (shares in prior sigmas):")
+        for weak in found.bundle.undetermined:
+            parts = ", ".join(f"{name} {share:+.2f}" for name, share in weak.parts.items())
+            print(f"  {parts} ({100.0 * weak.remaining:.0f} % of the prior sigma is left)")
+    print(f"\n{out}: calibration; use it with `phibench score --calibration {out}`")
     return 0
 
 
@@ -80,15 +98,17 @@ def align(
     focus_mm: float | None = None,
     tilt_sigma_deg: float = 0.1,
     principal_point_sigma_px: float = 5.0,
+    outline_sigma_factor: float = 1.0,
 ) -> int:
-    """Say how far and in which direction to move the mirror so that it is centred.
+    """Print by how far and in which direction the mirror must move to be centred.
 
     Parameters
     ----------
     image
         PNG or JPEG frame of the camera.
     out
-        PNG to write: the outline and an arrow, 20 times as long as the move.
+        PNG to write: the outline and an arrow, 20 times as long as the move; by default `<image>-align.png` in
+        the current folder.
     radius_mm, distance_mm
         Of the mirror: its radius, and its centre from the lens, roughly.
     focal_px, cx_px, cy_px
@@ -100,12 +120,15 @@ def align(
         How well the camera is known to be vertical.
     principal_point_sigma_px
         How well the principal point is known.
+    outline_sigma_factor
+        As in `phibench calibrate`.
     """
     from phibench.datasets.errors import DatasetError
     from phibench.estimator.calibration.align import (
         alignment,
         in_words,
         nominal_centre,
+        verdict,
         write_alignment_picture,
     )
     from phibench.estimator.spots.image_planes import read_picture
@@ -133,9 +156,11 @@ def align(
     )
     pose = replace(rig.T_camera_sphere, translation_m=(0.0, 0.0, 1e-3 * distance_mm))
     rig = Rig(camera=camera, mirror=SphereMirror(radius_m=1e-3 * radius_mm), T_camera_sphere=pose)
-    found = alignment(pixels, rig, card, math.radians(tilt_sigma_deg), principal_point_sigma_px)
+    doubts = math.radians(tilt_sigma_deg), principal_point_sigma_px, outline_sigma_factor
+    found = alignment(pixels, rig, card, *doubts)
+    out = Path(f"{image.stem}-align.png") if out is None else out
+    print(verdict(found))
+    print(f"{write_alignment_picture(out, pixels, rig, found)}: outline, and the move drawn 20 times as long")
     print(in_words(found))
-    if out is not None:
-        write_alignment_picture(out, pixels, rig, found)
-        print(f"{out}: outline and arrow")
+    print(_LAB)
     return 0

@@ -59,6 +59,8 @@ def test_command_reads_the_cameras_jpeg_and_draws(light, tmp_path, capsys) -> No
     file.write_bytes(Chain(sensor("mjpeg")).jpeg_bytes(Light(light), NoiseStream(("align",))))
     assert cli.main(["align", str(file), "--out", str(out)]) == 0
     said = capsys.readouterr().out
+    assert said.index("centred, as far as") < said.index("arrow.png") < said.index("1.70 mm")
+    assert "--outline-sigma-factor" in said
     assert "1.70 mm" in said  # |(1.5, 0.8)|
     assert "left" in said
     assert "down" in said

@@ -48,7 +48,7 @@ def test_frames_of_every_preset_calibrate(smoke: Dataset, tmp_path: Path, preset
     """
     ids = [row.sample_id for row in smoke.rows]
     out = tmp_path / "c.json"
-    bundle = calibrate_dataset(smoke.folder, out, ids, preset, spots=True, ruler=Ruler(height_m=5e-3))
+    bundle = calibrate_dataset(smoke.folder, out, ids, preset, spots=True, ruler=Ruler(height_m=5e-3)).bundle
     sigma = np.sqrt(np.diag(bundle.covariance))
     assert np.all(np.abs(bundle.values) < 5.0 * sigma)
     assert np.all(sigma <= prior_sigmas() * (1.0 + 1e-9))
@@ -174,7 +174,7 @@ def test_upright_edges_give_the_tilt(smoke: Dataset, tmp_path: Path, capsys: pyt
     than that, and together with 5.8e-4 rad/px of the principal point it is known to some 4e-4 rad an image.
     """
     plain, upright = tmp_path / "plain.json", tmp_path / "upright.json"
-    without = calibrate_dataset(smoke.folder, plain)
+    without = calibrate_dataset(smoke.folder, plain).bundle
     assert main(["calibrate", str(smoke.folder), "--preset", "layers", "--vertical", "--out", str(upright)]) == 0
     assert "tilt_x_rad" in capsys.readouterr().out
     rig = smoke.samples[0].nominal_rig
