@@ -1,4 +1,4 @@
-"""Draw docs/misalignment.png and print the tables of docs/misalignment.md. Run `python docs/draw_misalignment.py`.
+"""Drawing of docs/misalignment.png, and the tables of docs/misalignment.md. Run `python docs/draw_misalignment.py`.
 
 A test compares the tables with the page.
 """
@@ -162,7 +162,7 @@ def panel(ax: Axes, title: str) -> None:
 
 def sphere_panel(ax: Axes) -> None:
     """The sphere moves."""
-    panel(ax, "decentre_x_m, axial_m")
+    panel(ax, "decentre_x_m,\naxial_m")
     rig(ax, (0.0, 0.0), 0.0, (0.0, 1.6), GREY)
     rig(ax, (0.0, 0.0), 0.0, (0.45, 2.0), BLUE)
     arrow(ax, (0.0, 1.6), (0.45, 1.6))
@@ -172,7 +172,7 @@ def sphere_panel(ax: Axes) -> None:
 
 def tilt_panel(ax: Axes) -> None:
     """The camera turns about its lens."""
-    panel(ax, "tilt_y_rad (tilt_x_rad: towards -y)")
+    panel(ax, "tilt_y_rad\n(tilt_x_rad: towards -y)")
     rig(ax, (0.0, 0.0), 0.0, (0.0, 1.6), GREY)
     rig(ax, (0.0, 0.0), 0.35, (0.0, 1.6), BLUE)
     arrow(ax, (0.0, 1.1), (0.38, 1.03), -0.15)
@@ -181,7 +181,7 @@ def tilt_panel(ax: Axes) -> None:
 
 def stroke_panel(ax: Axes) -> None:
     """The stroke axis leans."""
-    panel(ax, "stroke_tilt_y_rad (stroke_tilt_x_rad: towards -y)")
+    panel(ax, "stroke_tilt_y_rad\n(stroke_tilt_x_rad: to -y)")
     rig(ax, (-0.3, 0.0), 0.0, (-0.3, 1.0), GREY)
     rig(ax, (0.35, 1.9), 0.0, (0.35, 2.9), BLUE)
     ax.plot([-0.3, -0.3], [0.0, 2.0], color=GREY, ls=":")
@@ -192,7 +192,7 @@ def stroke_panel(ax: Axes) -> None:
 
 def motion_panel(ax: Axes) -> None:
     """The whole rig turns about the lens, and shifts, when up."""
-    panel(ax, "pitch_rad, shift_x_m (up image only)")
+    panel(ax, "pitch_rad, shift_x_m\n(up image only)")
     rig(ax, (-0.3, 0.4), 0.0, (-0.3, 2.0), GREY)
     rig(ax, (0.3, 0.4), 0.3, (0.3 + 1.6 * math.sin(0.3), 0.4 + 1.6 * math.cos(0.3)), BLUE)
     arrow(ax, (-0.3, 0.4), (0.3, 0.4))
@@ -203,12 +203,12 @@ def motion_panel(ax: Axes) -> None:
 def draw(file: Path) -> None:
     """Write the figure."""
     mpl.use("agg")
-    figure = Figure(figsize=(11.5, 3.7))
+    figure = Figure(figsize=(8.0, 3.2))
     panels = (sphere_panel, tilt_panel, stroke_panel, motion_panel)
     for ax, paint in zip(figure.subplots(1, len(panels)), panels, strict=True):
         paint(ax)
     figure.tight_layout()
-    figure.savefig(file, dpi=90, metadata={"Software": None})
+    figure.savefig(file, dpi=100, metadata={"Software": None})
 
 
 def main() -> None:

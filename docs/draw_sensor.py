@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/sensor.md from a data set: `python docs/draw_sensor.py DATASET SAMPLE`.
+"""Drawings of docs/sensor.md from a data set. Run `PYTHONPATH=tests python docs/draw_sensor.py DATASET SAMPLE`.
 
 `sensor_steps.png` shows the same spot at every step of the chain, `sensor_frame.jpg` is a frame as the camera sends it,
 `photon_transfer.png` is the photon-transfer curve of the preset `mono-raw`.
@@ -85,12 +85,12 @@ def grey(values: NDArray[np.floating]) -> Picture:
 def draw_steps(sample: Sample, path: Path) -> None:
     """Ten panels of the same pixels."""
     panels = steps(sample.region_frames("mjpeg", _SIDE_PX, exposure=None))
-    figure, axes = plt.subplots(2, 5, figsize=(10.0, 4.6), layout="constrained")
+    figure, axes = plt.subplots(2, 5, figsize=(8.0, 3.9), layout="constrained")
     for number, (axis, (caption, picture)) in enumerate(zip(axes.flat, panels, strict=True), 1):
         axis.imshow(np.kron(picture, np.ones((_ZOOM, _ZOOM, 1), np.uint8)), interpolation="none")
-        axis.set_title(f"{number}  {caption}", fontsize=8.5, loc="left")
+        axis.set_title(f"{number}  {caption}", fontsize=8, loc="left")
         axis.set_axis_off()
-    figure.savefig(path, dpi=96, metadata={"Software": None})
+    figure.savefig(path, dpi=100, metadata={"Software": None})
 
 
 def curve(base: Sensor, levels_e: NDArray[np.floating], seed: int = 0) -> list[Stack]:
@@ -123,6 +123,8 @@ def draw_transfer(path: Path) -> None:
     axis.axvline(K * s.full_well_e, color="0.5", lw=1)
     _label_well(axis, K * s.full_well_e, s.full_well_e)
     axis.set(xlabel="signal: mean - black level (DN)", ylabel="variance (DN$^2$)", xlim=(0.2, 1300), ylim=(0.03, 300))
+    for each in (axis.xaxis, axis.yaxis):
+        each.set_major_formatter("{x:g}")
     axis.legend(fontsize=8, loc="upper left")
     axis.grid(which="both", lw=0.3)
     figure.savefig(path, dpi=96, metadata={"Software": None})

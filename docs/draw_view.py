@@ -1,4 +1,4 @@
-"""Draw docs/view.jpg: one view with the laser on, its spot enlarged. Run `python docs/draw_view.py DATASET SAMPLE`."""
+"""Drawing of docs/view.jpg: a view, its spot enlarged. Run `python docs/draw_view.py DATASET SAMPLE`."""
 
 from __future__ import annotations
 
