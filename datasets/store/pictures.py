@@ -20,6 +20,7 @@ from PIL import Image, ImageDraw
 from phibench.datasets.store.files import write_bytes
 from phibench.datasets.store.schema import SpotRow
 from phibench.render.optics.truth import SpotTruth
+from phibench.render.sensor.processing import eight_bit, srgb_encoded
 from phibench.scenes.camera import Detector
 
 Picture = NDArray[np.uint8]
@@ -36,9 +37,7 @@ def exposure_s(planes: NDArray[Any], detector: Detector) -> float:
 
 def to_srgb(planes: NDArray[Any], detector: Detector, exposure: float) -> Picture:
     """8-bit sRGB picture, shape (H, W, 3), of a layer, shape (3, H, W), electrons per second."""
-    linear = np.clip(_balanced(planes, detector) * exposure, 0.0, 1.0)
-    coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
-    return np.ascontiguousarray(np.rint(255.0 * coded).astype(np.uint8).transpose(1, 2, 0))
+    return eight_bit(srgb_encoded(_balanced(planes, detector) * exposure))
 
 
 def halved(planes: NDArray[Any]) -> NDArray[Any]:

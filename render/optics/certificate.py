@@ -1,10 +1,12 @@
-"""The certificate of a spot in one view: the world-side closed form against a camera-side ray tracer.
+"""Certificate of a spot in one view: agreement of two independent solutions and of the spot layer.
 
-`spot_truth` and `spot_cloud` go from the spot to the lens (Alhazen's problem, Coddington's equations; Fermat's path and
-its second derivatives where the mirror has a form error). Here rays go from the film through the aperture to the mirror
-(for a form from values of its radius alone, `form_trace`) and on to the wall, and the film position that meets a given
-wall point is found by Newton's method. Power is radiance times etendue. A rough mirror reflects each ray at a facet
-with a drawn slope, where `rough_cloud` evaluates the BRDF at given pairs. Only the scene's numbers are shared.
+The world-side solution (`truth.spot_truth`, `spot_samples`) goes from the spot to the lens: Alhazen's problem and
+Coddington's equations, or Fermat's path and its second derivatives where the mirror has a form error. The camera-side
+solution is here. Rays go from the film through the aperture to the mirror (`ray_tracer`) and on to the wall. Newton's
+method finds the film position that meets a given wall point; power is radiance times etendue. A rough mirror reflects
+each ray at a facet with a drawn slope. The two sides share the scene's numbers, no mathematics.
+
+Film positions are pixels (u, v), shape (N, 2); points are world coordinates in metres, shape (N, 3).
 """
 
 from __future__ import annotations
@@ -248,7 +250,7 @@ def _tangents(view: View, spot: LaserSpot, rays: MirrorRays) -> Array:
 
 
 def _on_wall(view: View, spot: LaserSpot, uv: Array, bundle: _Bundle) -> Array:
-    """Where rays of film positions land in the spot's plane, metres along its tangents, shape (N, 2)."""
+    """Landing points in the spot's plane of rays from film positions, metres along its tangents, shape (N, 2)."""
     rays = _reflect(view, spot, uv, bundle)
     return _meet(spot, rays.mirror_points_m, rays.directions)[0]
 

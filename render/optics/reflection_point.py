@@ -1,32 +1,27 @@
-"""Alhazen's problem: the point of a sphere that reflects one given point to another.
+"""Reflection points: the place on the mirror where light from a world point goes to a point of the lens.
 
-In the plane of the two points and the sphere centre one angle gamma is unknown. With c and p the distances of the two
-points from the centre and beta the angle between them, the path length is stationary where
+**Perfect sphere: Alhazen's problem.** In the plane of the two points and the sphere centre one angle gamma is unknown.
+With c and p the distances of the points from the centre, beta the angle between them, and l_c and l_p the two path
+lengths, the total length is stationary where
 
-    f(gamma) = c sin(gamma) / l_c - p sin(beta - gamma) / l_p = 0,
+    f(gamma) = c sin(gamma) / l_c - p sin(beta - gamma) / l_p = 0.
 
-l_c and l_p being the two path lengths. Both points see the mirror point for gamma between beta - acos(R / p) and
-acos(R / c); there f rises from a value <= 0 to a value >= 0, so the root is single and Newton's method inside the
-shrinking bracket cannot fail. An empty interval means that there is no reflection.
+Both points see the mirror point for gamma between beta - acos(R / p) and acos(R / c). There f rises from a value <= 0
+to a value >= 0: the root is single, and Newton's method inside the shrinking bracket cannot fail. An empty interval
+means that there is no reflection.
 
-The point of a mirror with a form error that reflects one given point to another: Fermat's path.
-
-With u and v the unit vectors from the two points a, b to a surface point P, l and m the distances, N the outward
-normal and K the curvature matrix of the surface (positive where convex), the path |a P| + |P b| has on the surface the
-gradient (u + v), taken tangentially, and the second derivatives
+**Form error: Fermat's path.** Let u and v be the unit vectors from the points a, b to a surface point P, l and m the
+distances, N the outward normal and K the curvature matrix of the surface (positive where convex). On the surface the
+path |a P| + |P b| has the gradient (u + v), taken tangentially, and the second derivatives
 
     M = (I - u u^T) / l + (I - v v^T) / m - ((u + v) . N) K,    tangentially.
 
 Newton's method takes P to where the gradient vanishes. It starts from Alhazen's point of the largest sphere about the
 centre that is certainly inside: where that sphere is in the way, so is the mirror. The mirror is convex (`SphereMirror`
-sees to that), and the tangent plane at a point that both ends see has the straight line between them on one side and
-the mirror on the other, so that there is one such point at most. M is the optics of the reflected bundle as well: with
-a the source, l^2 m^2 det(M) / cos^2 i is its spread from steradians to square metres at b, which is Coddington's
-(1 + m / s_t) (1 + m / s_s) l^2 for any curvature matrix.
-
-Where a view's mirror reflects points of the world to points of the lens, and how far the bundle spreads.
-
-A perfect sphere takes Alhazen's closed problem and Coddington's equations, a form error Fermat's path (`fermat`).
+checks it). The tangent plane at a point that both ends see has the straight line between them on one side and the
+mirror on the other, so that there is at most one such point. With a the source, l^2 m^2 det(M) / cos^2 i is the spread
+of the reflected bundle from steradians to square metres at b: Coddington's (1 + m / s_t) (1 + m / s_s) l^2 for any
+curvature matrix.
 """
 
 from __future__ import annotations
@@ -39,6 +34,55 @@ from numpy.typing import NDArray
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.mirror import Form, deviation, level
 from phibench.scenes.rig import View
+
+
+@dataclass(frozen=True)
+class MirrorPoints:
+    """Reflection points, world frame; NaN where there is none.
+
+    Attributes
+    ----------
+    points_m, normals : arrays, shape (N, 3)
+    lit : bool array, shape (N,)
+        Whether both ends see the point.
+    """
+
+    points_m: Array
+    normals: Array
+    lit: BoolArray
+
+
+def mirror_points(view: View, points_m: Array, eyes_m: Array) -> MirrorPoints:
+    """Reflection points for pairs of world points, shape (N, 3) each."""
+    centre, mirror = view.sphere_centre_m, view.rig.mirror
+    if mirror.form is None:
+        found, lit = reflection_points(points_m - centre, eyes_m - centre, mirror.radius_m)
+        found = found + centre
+        return MirrorPoints(found, (found - centre) / mirror.radius_m, lit)
+    axes = view.T_world_sphere.R
+    ends = ((points_m - centre) @ axes, (eyes_m - centre) @ axes)
+    found, normals, lit = fermat_points(*ends, mirror.radius_m, mirror.form)
+    return MirrorPoints(found @ axes.T + centre, normals @ axes.T, lit)
+
+
+def bundle_spread(view: View, mirror_m: Array, points_m: Array, eyes_m: Array, cos_i: Array) -> Array:
+    """Square metres at the eye per steradian at the point, shape (N,), of the bundle that is reflected there.
+
+    With s the distance point to mirror, l mirror to eye and i the angle of incidence, on a sphere
+    s^2 (1 + l/s_t) (1 + l/s_s); otherwise s^2 l^2 det(M) / cos^2 i.
+    """
+    mirror = view.rig.mirror
+    s, far = (np.linalg.norm(end - mirror_m, axis=-1) for end in (points_m, eyes_m))
+    if mirror.form is None:
+        spread = s**2 * (1.0 + far * (1.0 / s + 2.0 / (mirror.radius_m * cos_i)))
+        return spread * (1.0 + far * (1.0 / s + 2.0 * cos_i / mirror.radius_m))
+    axes, centre = view.T_world_sphere.R, view.sphere_centre_m
+    P, a, b = ((place - centre) @ axes for place in (mirror_m, points_m, eyes_m))
+    return (s * far / cos_i) ** 2 * path_determinant(P, a, b, mirror.radius_m, mirror.form)
+
+
+# Alhazen's problem.
+
 
 _ALHAZEN_STEPS = 60  # bisection alone would need 53; Newton takes 4 to 7
 
@@ -101,6 +145,9 @@ def _tangential(distance: Array, angle: Array, radius: float) -> tuple[Array, Ar
     length = np.sqrt((distance - radius) ** 2 + 4.0 * distance * radius * np.sin(0.5 * angle) ** 2)
     value = distance * np.sin(angle) / length
     return value, (distance * np.cos(angle) - radius * value**2) / length
+
+
+# Fermat's path.
 
 
 _FERMAT_STEPS = 30  # 4 to 6 do, but at grazing incidence
@@ -204,48 +251,3 @@ def _split(vectors: Array) -> tuple[Array, Array]:
     """Lengths (N,) and unit vectors (N, 3)."""
     length = np.linalg.norm(vectors, axis=-1)
     return length, vectors / length[:, None]
-
-
-@dataclass(frozen=True)
-class MirrorPoints:
-    """Reflection points, world frame; NaN where there is none.
-
-    Attributes
-    ----------
-    points_m, normals : arrays, shape (N, 3)
-    lit : bool array, shape (N,)
-        Whether both ends see the point.
-    """
-
-    points_m: Array
-    normals: Array
-    lit: BoolArray
-
-
-def mirror_points(view: View, points_m: Array, eyes_m: Array) -> MirrorPoints:
-    """Reflection points for pairs of world points, shape (N, 3) each."""
-    centre, mirror = view.sphere_centre_m, view.rig.mirror
-    if mirror.form is None:
-        found, lit = reflection_points(points_m - centre, eyes_m - centre, mirror.radius_m)
-        found = found + centre
-        return MirrorPoints(found, (found - centre) / mirror.radius_m, lit)
-    axes = view.T_world_sphere.R
-    ends = ((points_m - centre) @ axes, (eyes_m - centre) @ axes)
-    found, normals, lit = fermat_points(*ends, mirror.radius_m, mirror.form)
-    return MirrorPoints(found @ axes.T + centre, normals @ axes.T, lit)
-
-
-def bundle_spread(view: View, mirror_m: Array, points_m: Array, eyes_m: Array, cos_i: Array) -> Array:
-    """Square metres at the eye per steradian at the point, shape (N,), of the bundle that is reflected there.
-
-    With s the distance point to mirror, l mirror to eye and i the angle of incidence, on a sphere
-    s^2 (1 + l/s_t) (1 + l/s_s); otherwise s^2 l^2 det(M) / cos^2 i.
-    """
-    mirror = view.rig.mirror
-    s, far = (np.linalg.norm(end - mirror_m, axis=-1) for end in (points_m, eyes_m))
-    if mirror.form is None:
-        spread = s**2 * (1.0 + far * (1.0 / s + 2.0 / (mirror.radius_m * cos_i)))
-        return spread * (1.0 + far * (1.0 / s + 2.0 * cos_i / mirror.radius_m))
-    axes, centre = view.T_world_sphere.R, view.sphere_centre_m
-    P, a, b = ((place - centre) @ axes for place in (mirror_m, points_m, eyes_m))
-    return (s * far / cos_i) ** 2 * path_determinant(P, a, b, mirror.radius_m, mirror.form)

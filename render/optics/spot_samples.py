@@ -1,15 +1,14 @@
-"""Product quadrature on discs: nodes and weights whose sums replace random samples of spot and aperture.
+"""Light of the laser spot on the film as weighted points: specular connections from spot to mirror to lens.
 
-The laser spot's light on the film, as weighted points: specular connections spot -> mirror -> lens.
-
-Pairs of a point on the spot and a point on the aperture are joined by the reflection law (`mirror_points`); each pair's
-power follows from the geometry of the reflected bundle. With s the distance spot to mirror, l mirror to lens and i the
-angle of incidence, Coddington's equations for a convex sphere give the distances of the virtual image behind the mirror
+Pairs of a point on the spot and a point on the aperture are joined by the reflection law (`mirror_points`). Product
+quadrature on the two discs gives nodes and weights; their sums replace random samples. The power of a pair follows from
+the geometry of the reflected bundle. With s the distance spot to mirror, l mirror to lens and i the angle of incidence,
+Coddington's equations for a convex sphere give the distances of the virtual image behind the mirror
 
     1/s_t = 1/s + 2 / (R cos i)      1/s_s = 1/s + 2 cos(i) / R
 
 and dPhi = L rho(i) cos(theta_spot) cos(theta_lens) / (s^2 (1 + l/s_t) (1 + l/s_s)) dA_spot dA_lens.
-With a form error the two factors become a determinant, that of the reflected bundle's curvature (`fermat`).
+With a form error the two factors become a determinant, that of the reflected bundle's curvature (`reflection_point`).
 """
 
 from __future__ import annotations
@@ -146,7 +145,7 @@ def _dense_cloud(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> FilmCl
 
 
 def _is_cut(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> bool:
-    """Whether part of the light is blocked and part is not: pairs of spot and aperture, centre to rim (4 sigma)."""
+    """True if a part of the light is blocked and a part is not: pairs of spot and aperture, centre to rim (4 sigma)."""
     rim = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
     reach = (4.0, 2.0, 1.0) if spot.profile == "gaussian" else (1.0, 0.8, 0.4)
     disc = np.concatenate([np.zeros((1, 2)), *(scale * rim for scale in reach)])

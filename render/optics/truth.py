@@ -1,10 +1,9 @@
-"""The three angles that the paper calls phi, and the azimuth, of rays leaving the mirror.
+"""Exact truth in float64: the chief ray of one spot, and of every pixel centre, through the mirror.
 
-All angles are measured against the world's vertical: docs/paper.md.
-
-Exact answers for one laser spot in one view: the chief ray, by closed form (or Fermat's path) in float64.
-
-The truth layer: what every pixel centre's chief ray sees through the mirror, exact and unfiltered.
+`spot_truth` solves for the chief ray of a spot in closed form, or by Fermat's path. `truth_layer` traces the chief ray
+of every pixel centre: exact and unfiltered. Both give the three angles that the paper calls phi, and the azimuth
+(docs/paper.md). All angles are measured against the world's vertical, in radians; points are world coordinates in
+metres. NaN marks what does not exist.
 """
 
 from __future__ import annotations
@@ -76,7 +75,7 @@ EDGE_PX = 1.0  # nearer to the outline part of the aperture sees no reflection, 
 
 @dataclass(frozen=True)
 class SpotTruth:
-    """Where the spot's chief ray goes. All numbers are NaN where no reflection point exists.
+    """Chief ray of a spot. All numbers are NaN where no reflection point exists.
 
     Attributes
     ----------

@@ -1,9 +1,11 @@
-"""The ambient layer: the room seen directly and through the mirror, from its light map; no laser.
+"""Ambient layer: the room without the laser, seen directly and through the mirror, from its light map.
 
-Camera -> (mirror) -> surface: radiance is albedo x irradiance / pi, plus what a lamp emits. The film is cut into cells
-(`film_grid`); every cell gets two independent samples, whose difference is the noise estimate. Where that noise is
-above the budget of `noise_budget`, the cells around are sampled again, more finely, until it is kept. The light map's
-own noise is the same in every view.
+The radiance of a surface is albedo x irradiance / pi, plus what a lamp emits. The film is cut into cells (`film`).
+Every cell gets two independent samples, whose difference is the noise estimate. Where that noise is above the budget of
+`noise_budget`, the cells around are sampled again, more finely, until the budget is kept (`refinement`). The light
+map's own noise is the same in every view.
+
+Layers have the shape (3, H, W), planes R, G, B, expected electrons per second and pixel.
 """
 
 from __future__ import annotations

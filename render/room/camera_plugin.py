@@ -1,8 +1,8 @@
-"""The C310 as one Mitsuba sensor: thin lens, focus, Brown distortion, principal point, Gaussian blur, electrons.
+"""Mitsuba sensor plugin of the camera: thin lens, focus, Brown distortion, principal point, Gaussian blur, electrons.
 
-Mitsuba's film coordinate is u + 0.5 (pixel centres at half integers); the scene is in millimetres with the origin at
-the sphere centre. Each ray's weight is its etendue times electrons per joule, so that an image of radiance in
-W/(m^2 sr) comes out in expected photo-electrons per second per pixel.
+Mitsuba's film coordinate is u + 0.5: its pixel centres are half integers. The scene is in millimetres, with the origin
+at the sphere centre. The weight of a ray is its etendue times electrons per joule: an image of radiance in W/(m^2 sr)
+comes out in expected photo-electrons per second and pixel.
 """
 
 from __future__ import annotations

@@ -1,18 +1,14 @@
-"""The film as square cells, finer than pixels, and the blur that turns cells into pixels.
+"""Film of one view: square cells finer than pixels, the blur that turns cells into pixels, and the sampling of cells.
 
 A cell holds the mean radiance over its area; a pixel is the sum of cells times weights. The weight of a cell is the
-pixel's square, blurred by a Gaussian of variance sigma^2 - h^2/12 and taken at the cell's centre: with the cell's own
-square of side h this has the variance of the camera's blur. An edge is kept in place to h^2/4 (0.02 px for two cells a
-pixel, in the worst phase; 0 on average over phases). Every sample serves all pixels within the blur, which is what
-keeps edges quiet.
+pixel's square, blurred by a Gaussian of variance sigma^2 - h^2/12, at the cell's centre: with the cell's own square of
+side h this has the variance of the camera's blur. An edge keeps its place to h^2/4: 0.02 px for two cells a pixel in
+the worst phase, 0 on average over phases. Every sample serves all pixels within the blur, which keeps edges quiet.
 
-Quasi-random numbers inside Dr.Jit kernels: Kronecker sequences, one hashed shift per lane and dimension.
-
-Point s of lane n in dimension d is frac(shift(n, d) + s alpha_d) with alpha_d the powers of the inverse of the root of
+Samples are stratified over the cell and quasi-random over the aperture. Point s of lane n in dimension d of the
+Kronecker sequence is frac(shift(n, d) + s alpha_d), with alpha_d the powers of the inverse of the root of
 x^(D+1) = x + 1 (the D-dimensional golden ratio): a few points already fill the cube evenly. The shifts are hashed from
-the lane, the dimension and a seed, so that lanes are independent.
-
-Sampling the cells of one view's film: stratified over the cell, quasi-random over the aperture.
+lane, dimension and seed, so that lanes are independent.
 """
 
 from __future__ import annotations
@@ -111,7 +107,7 @@ class FilmGrid:
         return np.stack([(across @ np.ascontiguousarray((down @ plane).T)).T for plane in cells])
 
     def inner(self, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Whether any cell inside a pixel's own square is true, shape (height, width)."""
+        """True where any cell inside a pixel's own square is true, shape (height, width)."""
         edge, n = self.margin_px * self.cells, self.cells
         core = cells[edge : cells.shape[0] - edge, edge : cells.shape[1] - edge]
         return np.asarray(core.reshape(core.shape[0] // n, n, core.shape[1] // n, n).any(axis=(1, 3)))
@@ -137,6 +133,9 @@ def _fold(grid: FilmGrid, cells: int, power: int) -> Any:
     columns = (np.arange(pixels)[:, None] * step + np.arange(len(taps))).ravel()
     starts = np.arange(pixels + 1) * len(taps)
     return sparse.csr_array((np.tile(taps, pixels), columns, starts), shape=(pixels, cells))
+
+
+# Kronecker sequences inside Dr.Jit kernels.
 
 
 def golden_steps(dimensions: int) -> tuple[float, ...]:
@@ -169,9 +168,12 @@ def _uniform(mi: ModuleType, word: Any) -> Any:
     return mi.Float(word >> 8) * (1.0 / 16777216.0)
 
 
+# Sampling.
+
+
 @dataclass(frozen=True)
 class Samples:
-    """What n cells see.
+    """Samples of n cells.
 
     Attributes
     ----------

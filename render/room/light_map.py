@@ -1,14 +1,14 @@
-"""Light maps: the irradiance of every texel of a room, direct and by all bounces, once per room.
+"""Light map of a room: the irradiance of every texel, direct and by all bounces, baked once and kept on disk.
 
 Direct light is integrated over the lamps with shadow rays. Bounced light is gathered over the hemisphere from the map
 itself, again and again: pass k adds bounce k, and the error left after k passes falls as albedo^k. A last gather with
-many rays sets the noise; its two independent halves give the noise estimate. Robot included; mirror ball, camera
-housing and mast are not in the map: they move with the carriage.
+many rays sets the noise; its two independent halves give the noise estimate. The robot's body is in the map. Mirror,
+camera housing and mast are not: they move with the carriage.
 
-Light maps on disk, under the hash of everything that enters: room, settings, code, renderer.
+A file of the cache is named after the hash of everything that enters: room, settings, code, renderer. It holds the
+SHA-256 of its payload, then the payload; one that does not match is baked again. Nothing is changed in place.
 
-An entry is the SHA-256 of its payload followed by the payload; one that does not match is baked again. Nothing is ever
-changed in place: temporary name, fsync, rename.
+Arrays have one row per texel and three bands, W/m^2.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class LightMap:
 
 
 def fixed_shapes(room: Room) -> tuple[Shape, ...]:
-    """What stands still in a room: everything but the carriage and the mirror."""
+    """Shapes of a room that stand still: everything but the carriage and the mirror."""
     return (*room.surfaces, *room.furniture, *(chassis() if room.robot else ()))
 
 
@@ -223,6 +223,9 @@ def _loop(mi: ModuleType, body: Any, count: int, lanes: int) -> Array:
     start = (mi.UInt32(0), dr.zeros(mi.Color3f, lanes))
     _, total = dr.while_loop(start, lambda i, _: i < count, body)
     return np.stack([np.array(total[k], dtype=float) for k in range(3)], axis=-1)
+
+
+# Light maps on disk.
 
 
 _DAY_S = 86400.0

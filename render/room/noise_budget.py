@@ -1,11 +1,11 @@
-"""The renderer's noise as an error of phi, beside the sensor's own.
+"""Noise budget: the renderer's noise as an error of phi, beside the sensor's own.
 
-A spot at (u, v) is located from raw Bayer pixels with the Fisher weights of a known shape: with mu the expected
-electrons of a pixel, r the read noise, w = 1/(mu + r^2) and d = dmu/d(u, v), F = sum d d^T w (Huang 2013) and the
-estimate is F^-1 sum d w (x - mu). The sensor's noise gives it the covariance F^-1. Rendering noise of mu with the
-covariance C gives F^-1 [sum d_p w_p C_pq w_q d_q^T] F^-1. Pixels within the blur share samples: C_pq =
-sqrt(V_p V_q) rho(p - q) with rho the autocorrelation of a pixel's weights (`film_grid`). Both become errors of phi_ray
-by its gradient. NumPy only.
+A spot at (u, v) is located from raw Bayer pixels with the Fisher weights of a known shape (Huang 2013). Let mu be the
+expected electrons of a pixel, r the read noise, w = 1/(mu + r^2), d = dmu/d(u, v) and F = sum d d^T w. The estimate is
+F^-1 sum d w (x - mu), and the sensor's noise gives it the covariance F^-1. Rendering noise of mu with the covariance C
+gives F^-1 [sum d_p w_p C_pq w_q d_q^T] F^-1. Pixels within the blur share samples: C_pq = sqrt(V_p V_q) rho(p - q),
+with rho the autocorrelation of a pixel's weights (`film`). The gradient of phi_ray turns both into errors of phi_ray.
+NumPy only.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class NoiseBudget:
 
     @property
     def kept(self) -> bool:
-        """Whether the rendering noise stays below a quarter of the sensor's; true where there is nothing to keep."""
+        """True if the rendering noise stays below a quarter of the sensor's, and where there is nothing to keep."""
         return not self.phi_render_rad > BUDGET * self.phi_sensor_rad
 
 
@@ -82,7 +82,7 @@ def excess(
 
 
 def is_full(electrons_per_s: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Whether a pixel behind each filter is full at the nominal exposure, of the shape of the layer."""
+    """True where a pixel behind a filter is full at the nominal exposure; of the shape of the layer."""
     return np.asarray(electrons_per_s * np.float32(webcam().exposure_s) > webcam().full_well_e)
 
 
@@ -168,7 +168,7 @@ def _on_image(layer: SpotImage, size: tuple[int, ...]) -> tuple[tuple[slice, sli
 
 
 def _bayer(image: tuple[slice, slice]) -> Array:
-    """Which filter, axis 0 (R, G, B), each pixel of a part of the image has: RGGB, red at even row and column."""
+    """Filter of each pixel of a part of the image, axis 0 (R, G, B): RGGB, red at even row and column."""
     v, u = np.mgrid[image]
     red, blue = (v % 2 == 0) & (u % 2 == 0), (v % 2 == 1) & (u % 2 == 1)
     return np.stack([red, ~(red | blue), blue])

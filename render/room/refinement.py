@@ -1,8 +1,8 @@
-"""Which cells of the film are sampled further, and how finely.
+"""Adaptive refinement of the film: the choice of cells that are sampled again, and their number of strata.
 
 A cell is sampled on n x n strata, twice; half the difference, squared, is its variance. An edge through the cell leaves
 spread / (2 n^3), with `spread` the variance of single samples: about n strata are crossed, and each counts for 1/n^2.
-Once cells are refined, the larger of the two is taken: what is stopped by its own estimate would else be flattered.
+Once cells are refined, the larger of the two is taken: stopping by a cell's own estimate alone would flatter it.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
-"""A mirror with a form error as a triangle mesh, for the reference by path tracing alone.
+"""Mitsuba scene of a view: shapes, textures, lamps and the mirror as a scene dictionary.
 
-Facets 0.4 degrees wide lie within R (0.4 degrees)^2 / 8 = 0.4 micrometres of the surface; the normals, which steer the
-reflection, are those of the surface at the corners and interpolated between.
+Units are millimetres, with the sphere centre at the origin: in metres with the origin on the floor Mitsuba's ray offset
+moves the spot by 0.01 px. Colours are three bands, one for each colour filter of the detector, in Mitsuba's rgb mode.
+Layers are per filter, no measured spectra of the room's materials exist, and the laser is handled at its own wavelength
+elsewhere: a spectral variant would add colour noise for no gain in truth. The steel's n and k are taken at each band's
+wavelength.
 
-scenes -> Mitsuba: shapes, textures, lamps and the mirror as a scene dictionary.
-
-Millimetres, sphere centre at the origin: in metres with the origin on the floor Mitsuba's ray offset moves the spot by
-0.01 px. Colours are three bands, one per colour filter of the detector, in Mitsuba's rgb mode: layers are per filter,
-no measured spectra of the room's materials exist, and the laser is handled at its own wavelength elsewhere; a spectral
-variant would add colour noise for no gain in truth. The steel's n and k are taken at each band's wavelength.
+A mirror with a form error is a triangle mesh, for the reference by path tracing alone. Facets 0.4 degrees wide lie
+within R (0.4 degrees)^2 / 8 = 0.4 micrometres of the surface. The normals, which steer the reflection, are those of the
+surface at the corners and interpolated between.
 """
 
 from __future__ import annotations

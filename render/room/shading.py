@@ -1,20 +1,13 @@
-"""Surfaces of a scene cut into texels: where light maps live.
+"""Shading kernels (Dr.Jit): the camera's look into a room of texel patches, directly or by the mirror.
 
-A patch is one rectangle; its texels form a grid of about `texel_m`, at least 2 x 2. All patches' texels lie one after
-the other in flat arrays, row by row (local y): a light map is an array of shape (N, 3).
+A patch is one rectangle; its texels form a grid of about `texel_m`, at least 2 x 2. The texels of all patches lie one
+after the other in flat arrays, row by row (local y): a light map is an array of shape (N, 3). Albedo is kept out of the
+map and multiplied in exactly, at the point of the hit. The map's irradiance is bilinear between texel centres and
+linear beyond the outermost ones.
 
-Patches and their light map inside a Dr.Jit kernel: radiance of the surface that a ray hits.
-
-Albedo is kept out of the map and multiplied in exactly, at the very point; the map's irradiance is bilinear between
-texel centres and linear beyond the outermost ones.
-
-Rays that meet a mirror with a form error, inside a Dr.Jit kernel, in float64.
-
-Newton's method on q(t) = |P|^2 - r(P / |P|)^2 along the ray, first to its least value, which tells hit from miss, then
-from the parabola's zero to that of q. `form_trace` answers the same question from values alone, `fermat` from the other
-side; tests hold the three against each other.
-
-One look of the camera into a room of patches: film position and lens point -> electrons, inside a Dr.Jit kernel.
+Rays that meet a mirror with a form error are solved in float64 by Newton's method on q(t) = |P|^2 - r(P / |P|)^2 along
+the ray: first to its least value, which tells hit from miss, then from the parabola's zero to that of q. `ray_tracer`
+answers the same question from values alone, `reflection_point` from the other side; tests compare the three.
 """
 
 from __future__ import annotations
@@ -33,6 +26,8 @@ from phibench.render.room.scene import load_scene, mirror_dict, shape_dict
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import View
 from phibench.scenes.room import MIRROR_NAME, Checker, Rectangle, Shape, faces
+
+# Patches and their light map.
 
 
 @dataclass(frozen=True)
@@ -207,6 +202,9 @@ def _texture(surface: Any) -> tuple[Any, Any, Any, Any]:
     return texture.albedo, texture.albedo, (_ENDLESS_M, _ENDLESS_M), (0.0, 0.0)
 
 
+# Mirror with a form error.
+
+
 _LEAST_STEPS = 3
 _STEPS = 5
 
@@ -275,6 +273,9 @@ def _turned(V: Any, matrix: Array, vector: Any) -> Any:
     return V(*(row[0] * vector.x + row[1] * vector.y + row[2] * vector.z for row in rows))
 
 
+# From film position and lens point to electrons.
+
+
 _LIFT_MM = 0.01
 
 
@@ -304,7 +305,7 @@ def look(mi: ModuleType, surfaces: Surfaces, u: Any, v: Any, x: list[Any]) -> tu
 
 
 def _meet_sphere(mi: ModuleType, surfaces: Surfaces, ray: Any, t: Any, turned: Any, x: list[Any]) -> tuple[Any, ...]:
-    """Whether rays see the mirror, where and whereto they go on, and what the mirror leaves of their light.
+    """Rays at a sphere: hit or not, where and whereto they go on, and the part of their light that the mirror leaves.
 
     `t` is the distance to the scene's sphere for those rays that are `turned` there.
     """

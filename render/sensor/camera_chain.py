@@ -1,13 +1,12 @@
-"""The sensor chain: expected electrons per second in, a frame of the C310 out.
+"""Sensor chain: expected electrons per second in, a frame of the camera out; and auto exposure.
 
-A frame is a pure function of the light, the sensor, the camera's seed and the names of its noise stream. A region of
-it has the same pixels as the whole frame, to the bit, and costs what its pixels cost: stages that look at neighbours
-are given a margin, noise comes in tiles that are drawn whole, and JPEG works on whole units plus one around.
+A frame is a pure function of the light, the sensor, the camera's seed and the names of its noise stream. A region of it
+has the same pixels as the whole frame, to the bit, and costs what its pixels cost. Stages that look at neighbours get a
+margin, noise comes in tiles that are drawn whole, and JPEG works on whole units plus one around.
 
-Auto exposure: the exposure time and gain at which the expected image has the level that the camera aims at.
-
-It looks at the expectation, never at a draw, so that two draws, or laser on and off, have the same exposure. The light
-of the room alone decides: the spot is too small to count.
+Auto exposure chooses the time and the gain at which the expected image has the level that the camera aims at. It looks
+at the expectation, never at a draw, so that all draws have the same exposure, with the laser on or off. The light of
+the room alone decides: the spot is too small to count.
 """
 
 from __future__ import annotations
@@ -141,6 +140,9 @@ class Chain:
         """Pixels that the JPEG's pixels of `region` depend on: whole units, and one more on each side."""
         unit = MCU_PX[self.sensor.jpeg_subsampling]
         return region.grown(size, unit, unit)
+
+
+# Auto exposure.
 
 
 LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601, the Y of JPEG

@@ -1,7 +1,9 @@
-"""From light to collected electrons to DN: the stages in front of and in the converter. NumPy only.
+"""Stages of the sensor from light to electrons to DN. NumPy only.
 
-Order: mosaic, exposure, vignetting, PRNU, shot noise of light and dark current together (a sum of Poisson numbers is a
-Poisson number), full well, DSNU and read noise, gain, black level, rounding, clipping.
+Order: mosaic, exposure, vignetting, PRNU, shot noise, full well, DSNU and read noise, gain, black level, rounding,
+clipping. Shot noise is that of light and dark current together: a sum of Poisson numbers is a Poisson number.
+
+Planes R, G, B have the shape (3, h, w); a pixel's electrons and DN have the shape (h, w).
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ def mono(planes: Array, weights: tuple[float, float, float]) -> Array:
 
 
 def sampled(planes: Array, sensor: Sensor, phase: tuple[int, int]) -> Array:
-    """What the sensor's pixels see of planes R, G, B; all three planes if its output is electrons."""
+    """Planes R, G, B as the sensor's pixels sample them; all three planes if its output is electrons."""
     if sensor.output == "electrons":
         return planes
     return mosaic(planes, phase) if sensor.mosaic == "bayer" else mono(planes, sensor.mono_weights)
@@ -107,7 +109,7 @@ def _add_spot(
 
 @dataclass(frozen=True)
 class FixedPattern:
-    """What differs from pixel to pixel and stays: the same in all frames of one camera.
+    """Fixed pattern of one camera: the same in all its frames.
 
     Attributes
     ----------

@@ -1,6 +1,6 @@
-"""What falls on the sensor: layers with the level of the lamps, of the laser, and the spot's motion.
+"""Light on the sensor: layers with the levels of lamps and laser, the spot's motion, and regions of the image.
 
-A rectangle of whole pixels, and what it needs around itself.
+Layers have the shape (3, H, W), planes R, G, B; a region is a rectangle of whole pixels.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Light:
     lamp_level, laser_level : float
         Factors of the ambient and of the spot layer; `laser_level` 0 is laser off.
     velocity_px_per_s : 2 floats
-        Velocity (u, v) of the spot's image; see `render/motion.py`. The room is taken to stand still.
+        Velocity (u, v) of the spot's image; see `rolling_shutter`. The room is taken to stand still.
     f_number : float
         Lens stop at which the layers were rendered.
     others : tuple of OtherSpot
@@ -131,7 +131,7 @@ class Region:
 
     @classmethod
     def whole(cls, size: tuple[int, int]) -> Region:
-        """All of an image of size (height, width)."""
+        """Region of a whole image of size (height, width)."""
         return cls(0, 0, size[1], size[0])
 
     @classmethod

@@ -1,16 +1,16 @@
-"""Mean and covariance of what the chain puts out, over draws of the noise, for one camera.
+"""Mean and covariance of the chain's output over draws of the noise, for one camera.
 
-Raw stages in closed form; demosaicing, white balance and colour matrix by a sparse matrix; the rest (clipping, sRGB
-curve, sharpening, 8 bits, JPEG) by drawing. The fixed pattern of the camera is part of the mean.
+Raw stages have a closed form; demosaicing, white balance and colour matrix are a sparse matrix. The rest (clipping,
+sRGB curve, sharpening, 8 bits, JPEG) is drawn. The fixed pattern of the camera is part of the mean.
 
-Closed form of a pixel with mean charge m (light x PRNU + dark current), system gain K:
+Closed form of a pixel with mean charge m (light x PRNU + dark current) and system gain K:
 
     mean      black level + K (m + DSNU)
     variance  K^2 (m + read noise^2) + 1/12 DN^2, and K^2 row noise^2 common to a row
 
 1/12 DN^2 is the rounding's, once per pixel. For a noise of s DN before rounding it is off by up to
 (4 s^2 + 1/pi^2) exp(-2 pi^2 s^2) DN^2 (Sheppard's correction, first harmonic): 1e-8 at 1 DN, but 0.07 at the 0.32 DN of
-a dark pixel at gain 1, whose moments are better drawn. Full well and converter's ends are taken as out of reach.
+a dark pixel at gain 1, whose moments are better drawn. Full well and the converter's ends are assumed out of reach.
 Speckle flicker adds the outer product of the spot's DN with itself, over M.
 """
 

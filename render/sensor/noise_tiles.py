@@ -1,9 +1,9 @@
-"""Noise in tiles: a pixel's draw depends on names and on its place, not on what else is drawn.
+"""Noise in tiles: the draw of a pixel depends on names and on its place, not on what else is drawn.
 
-The image is cut into tiles of 32 x 32 pixels. A stage's names give the key of a Philox generator, the tile's row and
-column two words of its counter (J. K. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC11, 2011).
-Changing the counter is cheap, and every tile has 2^64 draws of its own, so that the Poisson draws, which take a
-variable number of them, disturb no other tile. A tile is drawn row by row from its first one, over its whole width.
+The image is cut into tiles of 32 x 32 pixels. The names of a stage give the key of a Philox generator, the tile's row
+and column two words of its counter (J. K. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC11, 2011).
+Changing the counter is cheap, and every tile has 2^64 draws of its own. Poisson draws, which use a variable number of
+them, therefore disturb no other tile. A tile is drawn row by row from its first one, over its whole width.
 """
 
 from __future__ import annotations

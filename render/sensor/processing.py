@@ -1,10 +1,10 @@
-"""Image processing of the camera, from DN to 8 bits: pure functions on stacks of images. NumPy only.
+"""Image processing of the camera, from DN to 8 bits and JPEG: pure functions on stacks of images. NumPy and Pillow.
 
 Planes R, G, B stand in the third axis from the end, shape (..., 3, H, W); the 8-bit image has them last. Every function
-takes any number of leading axes and keeps float32 as it is, so that a fit can send many model images through at once.
-What a function reads beyond the border is mirrored about the border pixel, which keeps the mosaic's colours in order.
+takes any number of leading axes and keeps float32, so that a fit can send many model images through at once. Pixels
+beyond the border are mirrored about the border pixel, which keeps the order of the mosaic's colours.
 
-The JPEG in MJPEG: encoding and decoding by Pillow (libjpeg-turbo), and the grid on which it works.
+The simulator's only sRGB curve, demosaicing and JPEG are here; the estimator has its own, in `spots/image_planes`.
 """
 
 from __future__ import annotations
@@ -128,6 +128,9 @@ def electrons_from_srgb(image: NDArray[np.uint8], sensor: Sensor) -> Array:
 
 def _inverse(matrix: Matrix) -> Matrix:
     return matrix if matrix == IDENTITY else tuple(map(tuple, np.linalg.inv(matrix)))  # type: ignore[return-value]
+
+
+# JPEG: Pillow (libjpeg-turbo), and the grid on which it works.
 
 
 MCU_PX = {"4:4:4": (8, 8), "4:2:2": (8, 16), "4:2:0": (16, 16)}

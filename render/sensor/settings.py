@@ -1,9 +1,9 @@
-"""The sensor's numbers: one strict, frozen table per preset, from `settings_presets.toml`.
+"""Settings of a sensor: one strict, frozen table per preset, from `settings_presets.toml`.
 
-EMVA 1288 terms: the layers already are photo-electrons, so the quantum efficiency sits before them (in
-`scenes/detector.py`) and a photon count cannot be told from here; K = `gain_dn_per_e` x `analogue_gain` is the overall
-system gain in DN/e-; the dark signal is `black_level_dn` + K x (dark electrons + DSNU). PRNU is a spread of the
-responsivity from pixel to pixel: it multiplies the mean of the photo-electrons, before the Poisson draw.
+Terms of EMVA 1288. The layers are photo-electrons: the quantum efficiency comes before them (`scenes/camera.py`), and a
+photon count cannot be told from here. K = `gain_dn_per_e` x `analogue_gain` is the overall system gain in DN/e-. The
+dark signal is `black_level_dn` + K x (dark electrons + DSNU). PRNU is a spread of the responsivity from pixel to pixel:
+it multiplies the mean of the photo-electrons, before the Poisson draw.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def _checked(name: str, raw: dict[str, Any]) -> Sensor:
 
 
 def _faults(s: Sensor) -> list[str]:
-    """What no single key shows."""
+    """Faults that no single key shows."""
     faults = []
     if s.black_level_dn >= s.top_dn:
         faults.append(

@@ -1,10 +1,10 @@
-"""What this machine can do: versions, LLVM, space, and one rendered image whose values are known.
+"""Check of the installation: Python, packages, LLVM, cores, disk, and one rendered image whose values are known.
 
-Run ``python -m phibench.render.setup.doctor``. Every fault comes with one line that says what to do.
-Nothing is changed.
+Run ``python -m phibench.render.setup.doctor``. Every fault comes with one line that says what to do. Nothing is
+changed.
 
-The exit code is 1 if something is broken, and 0 otherwise: also where neither mitsuba nor drjit is installed, since
-scoring needs neither (one line then says what rendering needs). One of the two without the other is broken.
+The exit code is 1 if something is broken. It is 0 where neither mitsuba nor drjit is installed: scoring needs neither,
+and one line says what rendering needs. One of the two without the other is broken.
 """
 
 from __future__ import annotations

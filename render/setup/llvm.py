@@ -1,12 +1,11 @@
-"""LLVM from Debian's or Ubuntu's own packages: installed with root, unpacked into our cache without.
+"""LLVM for Dr.Jit: found on the system, fetched if there is none, proven, and made known to Dr.Jit.
 
-Every step goes through the ordinary ``apt-get``, so mirrors, proxies and signatures are what the machine is set up for.
+Dr.Jit 1.5 looks for an LLVM by file name and uses the first that it meets. It refuses 14 and older; 15 and 16 abort the
+whole process on machines with AVX-512. So an LLVM is chosen here, by the version that the library itself reports,
+before Dr.Jit is imported. This module imports neither Dr.Jit nor Mitsuba.
 
-The LLVM that Dr.Jit compiles with: found, fetched if there is none, proven, and made known to Dr.Jit.
-
-Dr.Jit 1.5 looks for an LLVM by file name and takes what it meets: 14 and older are refused, 15 and 16 abort the whole
-process on machines with AVX-512. So one is chosen here, by the version that the library itself reports, before Dr.Jit
-is imported. This module imports neither Dr.Jit nor Mitsuba.
+Where none is found, one is fetched from Debian's or Ubuntu's own packages: installed with root, unpacked into our cache
+without. Every step goes through the ordinary ``apt-get``, so that mirrors, proxies and signatures are the machine's.
 
 Run ``python -m phibench.render.setup.llvm`` to make sure of one.
 """
@@ -135,7 +134,7 @@ def _first_offered(options: list[str]) -> str:
 
 
 def _missing(package: str, options: list[str]) -> list[str]:
-    """Return what `package` needs and the system does not have."""
+    """Packages that `package` needs and the system does not have."""
     plan = _apt(["-s", "install", "--no-install-recommends", package], options)
     steps = [line.split() for line in plan.splitlines() if line.startswith("Inst ")]
     # "Inst NAME [INSTALLED] (NEW ...)" is an upgrade: a second libc in one process would be worse than an old one.

@@ -1,11 +1,9 @@
-"""The user's cache: what can be made again at any time.
+"""One LLVM shared library: its version, how it is loaded, and the proof that Dr.Jit can compile with it.
 
-A Python module run in a process of its own, because what it does may abort or hang.
-
-One LLVM shared library: what version it is, how it is loaded, whether Dr.Jit can compile with it.
-
-A version is read out of the library itself, in a child process: a file name proves nothing (``libLLVM.so``), and a
+The version is read out of the library itself, in a child process. A file name proves nothing (``libLLVM.so``), and a
 library that crashes while it is loaded must not take this process with it. Only the standard library is used here.
+
+Also the user's cache folder, and programs that run in a process of their own because they may abort or hang.
 """
 
 from __future__ import annotations
@@ -120,12 +118,12 @@ class Llvm:
 
     @property
     def is_proven(self) -> bool:
-        """Whether this version is known to work with Dr.Jit 1.5."""
+        """True if this version is known to work with Dr.Jit 1.5."""
         return self.version[0] >= OLDEST_PROVEN
 
     @property
     def is_candidate(self) -> bool:
-        """Whether this version may work: the proof decides."""
+        """True if this version may work: the proof decides."""
         return self.version[0] >= OLDEST_UNPROVEN
 
 

@@ -1,12 +1,11 @@
-"""An image whose every value is known beforehand: a grey ball in the middle of an evenly bright sky.
+"""Self-tests of the renderer: an image with known values, and a kernel that an LLVM must compile and run.
 
-A convex diffuse body of albedo a in a sky of radiance L has the radiance a L everywhere, whatever its shape and
-wherever one looks from; beside it one sees L itself. Run as a program it exits with 0 if the rendered image agrees.
+The image shows a grey ball in the middle of an evenly bright sky. A convex diffuse body of albedo a in a sky of
+radiance L has the radiance a L everywhere, whatever its shape and wherever one looks from. Beside it one sees L itself.
 
-The kernel that an LLVM must compile and run before it is used. Runs in a process of its own, which it may abort.
-
-It holds the instruction that LLVM 15 and 16 cannot select on AVX-512 machines (a floating-point minimum), a loop over
-lanes, a gather, a scatter-add and a sum, and compares with plain arithmetic.
+The kernel holds the instruction that LLVM 15 and 16 cannot select on AVX-512 machines (a floating-point minimum), a
+loop over lanes, a gather, a scatter-add and a sum, and compares with plain arithmetic. It runs in a process of its own,
+which it may abort. Run as a program, the module exits with 0 if the test passes.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ def render(mitsuba: ModuleType) -> npt.NDArray[np.float32]:
 
 
 def compare(image: npt.NDArray[np.float32]) -> str:
-    """Return what is wrong with the image in one line; empty if nothing is."""
+    """Fault of the image in one line; empty if there is none."""
     middle = slice(SIZE_PX // 2 - 2, SIZE_PX // 2 + 2)
     ball, sky = float(image[middle, middle].mean()), float(image[0, 0])
     if not abs(ball / (ALBEDO * SKY) - 1) <= TOLERANCE:

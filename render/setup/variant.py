@@ -1,9 +1,8 @@
-"""Whether Mitsuba can render on a CUDA GPU here: asks the driver, creates nothing on the device.
+"""Mitsuba, activated once per process: the variant (CUDA where there is a GPU, else LLVM), then one Dr.Jit thread.
 
-Mitsuba, switched on once per process: the variant (CUDA where there is a GPU, else LLVM), then one Dr.Jit thread.
-
-Dr.Jit adds floating-point numbers with atomics, in whatever order its threads come, so two runs agree to the last bit
-only with one thread. Work is spread over processes instead, and the variant, global to the process, is never changed.
+Dr.Jit adds floating-point numbers with atomics, in whatever order its threads come, so that two runs agree to the last
+bit only with one thread. Work is spread over processes instead. The variant is global to the process and never changed.
+The search for a GPU asks the driver and creates nothing on the device.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ _PLACES = {  # Dr.Jit's own variables for libraries in odd places
 
 
 def has_gpu() -> bool:
-    """Whether a CUDA device, its driver and OptiX (which traces Mitsuba's rays there) are at hand."""
+    """True if a CUDA device, its driver and OptiX (which traces Mitsuba's rays there) are at hand."""
     libraries = [_load(os.environ.get(name) or names.get(sys.platform)) for name, names in _PLACES.items()]
     return all(libraries) and _devices(libraries[0]) > 0
 
