@@ -1,7 +1,8 @@
-"""Reading a data set. Needs neither Mitsuba nor a recipe: everything comes out of the folder.
+"""Reader of data sets. It needs neither Mitsuba nor a recipe: everything comes out of the folder.
 
->>> from phibench.datasets.read import open_dataset  # doctest: +SKIP
->>> sample = open_dataset("out/paper")["table2-d3.180-h0.425"]  # doctest: +SKIP
+>>> import phibench
+>>> dataset = phibench.open_dataset("out/paper")  # doctest: +SKIP
+>>> sample = dataset["table2-d3.180-h0.425"]  # doctest: +SKIP
 >>> sample.row.depth_m, sample.row.down.phi_ray_rad, sample.expected_image("down").shape  # doctest: +SKIP
 """
 
@@ -99,7 +100,7 @@ class Dataset:
 
     @property
     def beam(self) -> Beam:
-        """What the recipe says of the laser's spots; single targets may differ."""
+        """Diameter of the laser's spots by the recipe; single targets may differ."""
         laser = self.info.recipe["laser"]
         if laser["diameter_m"] is not None:
             return Beam(laser["diameter_m"], 0.0)
@@ -210,7 +211,7 @@ class Sample:
 
     @property
     def nominal_rig(self) -> Rig:
-        """The rig that an estimator believes, with `row.nominal_stroke_m`; the true one where nothing is misaligned."""
+        """Nominal rig, which estimators are given with `row.nominal_stroke_m`; the true one without misalignment."""
         return self.dataset.rigs[self.row.nominal_rig]
 
     def view(self, position: str) -> View:
@@ -300,12 +301,12 @@ class Sample:
 
     @property
     def stream_names(self) -> tuple[str, int, str]:
-        """What names the noise of this sample: data set, its seed, sample id."""
+        """Names of this sample's noise streams: data set, its seed, sample id."""
         info = self.dataset.info
         return info.name, info.recipe["dataset"]["seed"], self.row.sample_id
 
     def _view(self, position: str) -> dict[str, str]:
-        """Return what the headers of the view's layers must say."""
+        """Fields that the headers of the view's layers must have."""
         return {"dataset": self.dataset.info.name, "pose": self.truth_row(position).pose}
 
 

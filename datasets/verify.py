@@ -1,6 +1,7 @@
-"""Whether a data set holds what its recipe means: samples, poses, and for each sample its rig, spot and stroke.
+"""Verification of a data set: every file is opened, every truth is computed again from the parameters.
 
-Is a data set what it says it is: every file opened, every truth computed again from the parameters.
+`plan_faults` compares manifest, rigs and poses with the plan of the recipe. `verify` does this, checks all hashes, and
+compares spots, certificates, noise budgets, layers and light map with what the parameters give.
 """
 
 from __future__ import annotations
@@ -40,67 +41,6 @@ from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import POSITIONS, View
 from phibench.scenes.room import Room
 
-
-def plan_faults(dataset: Dataset) -> Iterator[str]:
-    """Faults of manifest, rigs and poses against the plan of the recipe."""
-    try:
-        plan = shard_plan(make_plan(dataset.recipe), dataset.info.shard)
-    except DatasetError as error:
-        yield f"{schema.INFO}: its recipe cannot be followed: {error}"
-        return
-    rows, pairs = {row.sample_id: row for row in dataset.rows}, {pair.sample_id: pair for pair in plan.pairs}
-    for name in sorted(set(pairs) - set(rows)):
-        yield f"{schema.MANIFEST}: sample {name} of the recipe is missing"
-    for name in sorted(set(rows) - set(pairs)):
-        yield f"{schema.MANIFEST}: sample {name} is not in the recipe"
-    if len(rows) != len(dataset.rows):
-        yield f"{schema.MANIFEST}: a sample is listed twice"
-    for name in (name for name in pairs if name in rows):
-        yield from _row_faults(plan, pairs[name], rows[name])
-    yield from _rig_faults(plan, dataset)
-    if [(pose.pose, pose.rig) for pose in dataset.info.poses] != [(pose.pose_id, pose.rig) for pose in plan.poses]:
-        yield f"{schema.INFO}: the poses are not those of the recipe"
-
-
-def _row_faults(plan: Plan, pair: PairPlan, row: ManifestRow) -> Iterator[str]:
-    spot = plan.spots[pair.spot]
-    expected = {
-        **{name: getattr(pair, name) for name in ("experiment", "target", "rig", "nominal_rig", "tries")},
-        **{name: getattr(pair, name) for name in ("stroke_m", "nominal_stroke_m")},
-        "drawn": dict(pair.drawn),
-        "spot_world_m": spot.position_world_m,
-        "spot_normal_world": spot.normal_world,
-        "spot_diameter_m": spot.diameter_m,
-    }
-    for name, value in expected.items():
-        if not alike(getattr(row, name), value):
-            yield f"{row.sample_id}: {name} is {getattr(row, name)}, the recipe gives {value}"
-
-
-def _rig_faults(plan: Plan, dataset: Dataset) -> Iterator[str]:
-    held = dataset.rigs.documents
-    if set(held) != set(plan.rigs):
-        yield f"{schema.RIGS}: the rigs are not those of the recipe"
-    for name in (name for name in plan.rigs if name in held):
-        if not alike(_with_form(held[name]), json.loads(json.dumps(to_json(plan.rigs[name])))):
-            yield f"{schema.RIGS}: {name} is not the rig that the recipe gives"
-
-
-def _with_form(rig: dict[str, Any]) -> dict[str, Any]:
-    """Document of a rig; one of schema version 4 knows no form, and its mirror has none."""
-    mirror = rig.get("mirror")
-    return {**rig, "mirror": {"form": None, **mirror}} if isinstance(mirror, dict) else rig
-
-
-def alike(a: Any, b: Any) -> bool:
-    """Equality of nested documents, of their numbers to rounding."""
-    if isinstance(a, dict) and isinstance(b, dict):
-        return a.keys() == b.keys() and all(alike(a[key], b[key]) for key in a)
-    if isinstance(a, list | tuple) and isinstance(b, list | tuple):
-        return len(a) == len(b) and all(alike(x, y) for x, y in zip(a, b, strict=True))
-    return same_number(a, b) if isinstance(a, float) and isinstance(b, float | int) else bool(a == b)
-
-
 _FLOAT32 = 1e-6  # float32 rounds by 6e-8; other machines' libm adds a little
 _ANSWERS = 64  # of 0.1 MB each
 _EDGE_PIXELS = 8  # pixels whose ray grazes an edge may see another object on another machine
@@ -127,7 +67,7 @@ class Report:
 
     @property
     def ok(self) -> bool:
-        """Whether there is no fault."""
+        """True if there is no fault."""
         return not self.faults
 
 
@@ -166,6 +106,9 @@ def verify(folder: str | Path, truth_layers: bool = True, console: Console | Non
     faults += filter(None, [sensitivity_fault(folder)])
     faults += _content_faults(dataset, bad, truth_layers, console)
     return Report(tuple(dict.fromkeys(faults)), files, len(dataset), notes)
+
+
+# Contents of spots and views.
 
 
 def _content_faults(dataset: Dataset, bad: set[str], truth_layers: bool, console: Console) -> list[str]:
@@ -308,3 +251,66 @@ def _guarded(faults: Iterator[str]) -> Iterator[str]:
         yield from faults
     except DatasetError as error:
         yield str(error)
+
+
+# Manifest, rigs and poses against the plan.
+
+
+def plan_faults(dataset: Dataset) -> Iterator[str]:
+    """Faults of manifest, rigs and poses against the plan of the recipe."""
+    try:
+        plan = shard_plan(make_plan(dataset.recipe), dataset.info.shard)
+    except DatasetError as error:
+        yield f"{schema.INFO}: its recipe cannot be followed: {error}"
+        return
+    rows, pairs = {row.sample_id: row for row in dataset.rows}, {pair.sample_id: pair for pair in plan.pairs}
+    for name in sorted(set(pairs) - set(rows)):
+        yield f"{schema.MANIFEST}: sample {name} of the recipe is missing"
+    for name in sorted(set(rows) - set(pairs)):
+        yield f"{schema.MANIFEST}: sample {name} is not in the recipe"
+    if len(rows) != len(dataset.rows):
+        yield f"{schema.MANIFEST}: a sample is listed twice"
+    for name in (name for name in pairs if name in rows):
+        yield from _row_faults(plan, pairs[name], rows[name])
+    yield from _rig_faults(plan, dataset)
+    if [(pose.pose, pose.rig) for pose in dataset.info.poses] != [(pose.pose_id, pose.rig) for pose in plan.poses]:
+        yield f"{schema.INFO}: the poses are not those of the recipe"
+
+
+def _row_faults(plan: Plan, pair: PairPlan, row: ManifestRow) -> Iterator[str]:
+    spot = plan.spots[pair.spot]
+    expected = {
+        **{name: getattr(pair, name) for name in ("experiment", "target", "rig", "nominal_rig", "tries")},
+        **{name: getattr(pair, name) for name in ("stroke_m", "nominal_stroke_m")},
+        "drawn": dict(pair.drawn),
+        "spot_world_m": spot.position_world_m,
+        "spot_normal_world": spot.normal_world,
+        "spot_diameter_m": spot.diameter_m,
+    }
+    for name, value in expected.items():
+        if not alike(getattr(row, name), value):
+            yield f"{row.sample_id}: {name} is {getattr(row, name)}, the recipe gives {value}"
+
+
+def _rig_faults(plan: Plan, dataset: Dataset) -> Iterator[str]:
+    held = dataset.rigs.documents
+    if set(held) != set(plan.rigs):
+        yield f"{schema.RIGS}: the rigs are not those of the recipe"
+    for name in (name for name in plan.rigs if name in held):
+        if not alike(_with_form(held[name]), json.loads(json.dumps(to_json(plan.rigs[name])))):
+            yield f"{schema.RIGS}: {name} is not the rig that the recipe gives"
+
+
+def _with_form(rig: dict[str, Any]) -> dict[str, Any]:
+    """Document of a rig; one of schema version 4 knows no form, and its mirror has none."""
+    mirror = rig.get("mirror")
+    return {**rig, "mirror": {"form": None, **mirror}} if isinstance(mirror, dict) else rig
+
+
+def alike(a: Any, b: Any) -> bool:
+    """Equality of nested documents, of their numbers to rounding."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(alike(a[key], b[key]) for key in a)
+    if isinstance(a, list | tuple) and isinstance(b, list | tuple):
+        return len(a) == len(b) and all(alike(x, y) for x, y in zip(a, b, strict=True))
+    return same_number(a, b) if isinstance(a, float) and isinstance(b, float | int) else bool(a == b)

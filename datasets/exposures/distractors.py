@@ -1,7 +1,8 @@
-"""Lights that a method may take for the spot: drawn per sample, computed when frames are, never on disk.
+"""Distractors: lights that a method may take for the spot, drawn per sample.
 
-They are flat Lambertian discs at the laser's wavelength and have an exact place in both images, as the spot has.
-A sample's distractors are a pure function of the recipe, the sample's names and its row of the manifest.
+They are flat Lambertian discs at the laser's wavelength, with an exact place in both images, as the spot has. A
+sample's distractors are a pure function of the recipe, the sample's names and its row of the manifest. They are
+computed when frames are, and never stored.
 """
 
 from __future__ import annotations

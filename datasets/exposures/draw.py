@@ -1,7 +1,7 @@
 """Frames as files: all draws of all samples of a data set in one folder, with an index.
 
-What is there with the right bytes is kept. A file is known by the hash of all that it depends on: names, request,
-layers, code, and the versions of the libraries that draw and compress.
+Files that are there with the right bytes are kept. A file is known by the hash of all that it depends on: names,
+request, layers, code, and the versions of the libraries that draw and compress.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _SAVE_EVERY_S = 2.0  # or twenty times what saving takes
 
 @dataclass(frozen=True)
 class Drawn:
-    """What a run did: the folder, how many files it wrote and kept, and sentences on what was left out."""
+    """Outcome of a run: the folder, the numbers of files written and kept, and notes on what was left out."""
 
     folder: Path
     made: int

@@ -1,4 +1,4 @@
-"""Expected electrons around one spot, as the sensor's pixels collect them: what a limit or a fit is computed from.
+"""Expected electrons around one spot, as the sensor's pixels collect them: the input of limits and fits.
 
 Integer (u, v) are pixel centres; a region's origin is the image pixel of its first column and row.
 """

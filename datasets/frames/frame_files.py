@@ -44,7 +44,7 @@ def suffix(sensor: Sensor, whole: bool) -> str:
 
 
 def has_preview(sensor: Sensor) -> bool:
-    """Whether a picture for people is wanted, because the frame itself is dark or unreadable to a viewer."""
+    """True if a picture for people is wanted, because the frame itself is dark or unreadable to a viewer."""
     return sensor.output in ("electrons", "raw")
 
 
@@ -90,6 +90,9 @@ def preview(frame: Frame) -> NDArray[np.uint8]:
         linear = processing.white_balanced(frame.image / full_scale_e, sensor.white_balance)
         linear = processing.colour_corrected(linear, sensor.colour_matrix)
     return processing.eight_bit(processing.rendered(linear, sensor))
+
+
+# The index.
 
 
 INDEX = "frames.jsonl"
@@ -185,5 +188,5 @@ def claim(folder: Path, dataset: tuple[str, int], wanted: dict[str, Any]) -> Non
 
 
 def _has_frames(folder: Path) -> bool:
-    """Whether a frame is there, in the index or not."""
+    """True if a frame is there, in the index or not."""
     return any(path.suffix in _IMAGES for path in folder.iterdir())

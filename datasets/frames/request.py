@@ -1,4 +1,4 @@
-"""What frames are asked for: preset, exposure, levels, motion and region, checked and frozen."""
+"""Request for frames: preset, exposure, levels, motion and region, checked and frozen."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _RANGES = {"lamp_level": (0.0, 1e6), "laser_level": (0.0, 1e6), "carriage_speed_
 
 @dataclass(frozen=True)
 class FrameRequest:
-    """How frames are taken; everything but the draw.
+    """Everything that frames depend on besides the sample and the draw.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What an estimator may know of the sensor: the numbers of its preset, and none of the simulator's mathematics."""
+"""Sensor card: the numbers of a sensor that an estimator may know, without the simulator's mathematics."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
-"""Frames of a stroke pair: what the C310 delivers for one draw of its noise, as arrays and as JPEG files.
+"""Source of the frames of a stroke sample: its layers, read once and kept, and the camera that looks at them.
 
-Where frames of a stroke pair come from: its layers, read once and kept, and the camera that looks at them.
-
-A frame is a pure function of (data set, seed, sample, position, laser on or off, draw) and of the request: neither the
-order of the draws, nor processes, nor what else is drawn enters. NumPy only.
+A frame is what the camera delivers for one draw of its noise, as an array and, for MJPEG, as the file. It is a pure
+function of (data set, seed, sample, position, laser on or off, draw) and of the request. The order of draws, processes
+and other draws do not enter. NumPy only.
 """
 
 from __future__ import annotations
@@ -117,8 +116,8 @@ class Frames:
 NO_OTHERS: Mapping[str, tuple[OtherSpot, ...]] = MappingProxyType({})
 
 
-class Pair(Protocol):
-    """What is needed of a sample: see `phibench.datasets.read.Sample`."""
+class SampleLayers(Protocol):
+    """Layers and numbers of a sample, as `phibench.datasets.read.Sample` has them."""
 
     @property
     def row(self) -> ManifestRow:
@@ -176,7 +175,7 @@ class FrameSource:
     sides: Mapping[str, Side]
 
     @classmethod
-    def of(cls, pair: Pair, preset: str = "mjpeg", **options: Any) -> FrameSource:
+    def of(cls, sample: SampleLayers, preset: str = "mjpeg", **options: Any) -> FrameSource:
         """Read the layers of a sample; options as in `FrameRequest`.
 
         Raises
@@ -184,16 +183,16 @@ class FrameSource:
         DatasetError
             If the request cannot be met or a layer cannot be read; in one sentence.
         """
-        return cls.from_request(pair, FrameRequest.of(preset, options))
+        return cls.from_request(sample, FrameRequest.of(preset, options))
 
     @classmethod
     def from_request(
-        cls, pair: Pair, request: FrameRequest, others: Mapping[str, tuple[OtherSpot, ...]] = NO_OTHERS
+        cls, sample: SampleLayers, request: FrameRequest, others: Mapping[str, tuple[OtherSpot, ...]] = NO_OTHERS
     ) -> FrameSource:
         """As `of`, for a request that was checked before; `others` are further lights by position, standing still."""
         with in_one_sentence():
-            sides = {position: _side(pair, position, request, others.get(position, ())) for position in POSITIONS}
-        return cls(request, pair.stream_names, sides)
+            sides = {position: _side(sample, position, request, others.get(position, ())) for position in POSITIONS}
+        return cls(request, sample.stream_names, sides)
 
     def frames(self, draw: int = 0, *, laser_off: bool = False) -> Frames:
         """Both positions with the laser on, and, if asked for, both with the laser off."""
@@ -223,11 +222,11 @@ class FrameSource:
         return Frame(image, jpeg, position, laser, draw, side.chain.sensor, side.region)
 
 
-def _side(pair: Pair, position: str, request: FrameRequest, others: tuple[OtherSpot, ...]) -> Side:
-    camera = pair.rig.camera
-    spot = pair.spot(position)
+def _side(sample: SampleLayers, position: str, request: FrameRequest, others: tuple[OtherSpot, ...]) -> Side:
+    camera = sample.rig.camera
+    spot = sample.spot(position)
     light = Light(
-        pair.ambient(position),
+        sample.ambient(position),
         spot,
         lamp_level=request.lamp_level,
         laser_level=request.laser_level,
@@ -235,17 +234,17 @@ def _side(pair: Pair, position: str, request: FrameRequest, others: tuple[OtherS
         others=others,
     )
     sensor = auto_exposed(request.sensor(), light) if request.exposure == "auto" else request.sensor()
-    moving = _moving(pair, position, spot, sensor, request.carriage_speed_m_s)
-    region = _region(pair.row, position, request.region, light.size)
+    moving = _moving(sample, position, spot, sensor, request.carriage_speed_m_s)
+    region = _region(sample.row, position, request.region, light.size)
     return Side(Chain(sensor, request.camera_seed, camera), replace(light, spot=moving), region)
 
 
-def _moving(pair: Pair, position: str, spot: SpotWindow, sensor: Sensor, speed_m_s: float) -> SpotWindow:
+def _moving(sample: SampleLayers, position: str, spot: SpotWindow, sensor: Sensor, speed_m_s: float) -> SpotWindow:
     """Spot as the rolling shutter sees it; its mean is the same in all draws, so it is moved once."""
     if speed_m_s == 0.0 or spot.electrons_per_s.size == 0:
         return spot
-    velocity = spot_velocity_px_per_s(pair.view(position), pair.laser_spot, speed_m_s)
-    height = pair.rig.camera.height_px
+    velocity = spot_velocity_px_per_s(sample.view(position), sample.laser_spot, speed_m_s)
+    height = sample.rig.camera.height_px
     u0, v0, planes = moved_spot(spot, velocity, sensor.exposure_s, sensor.readout_s, height)
     nothing = np.zeros_like(planes)
     return SpotWindow(u0, v0, planes, nothing, nothing)
@@ -266,5 +265,5 @@ def _region(row: ManifestRow, position: str, wanted: int | Region | None, size: 
 
 
 def has_place(spot: SpotRow, size: tuple[int, int]) -> bool:
-    """Whether the spot, seen or hidden, has a place on an image of (height, width)."""
+    """True if the spot, seen or hidden, has a place on an image of (height, width)."""
     return -0.5 <= spot.u_px <= size[1] - 0.5 and -0.5 <= spot.v_px <= size[0] - 0.5

@@ -1,4 +1,7 @@
-"""SHA256SUMS, for ``sha256sum -c``. It is written last: where it is, the data set is complete."""
+"""SHA256SUMS of a data set, for ``sha256sum -c``: written last, read first.
+
+A folder that has the file is complete. Names are relative to the folder, with forward slashes.
+"""
 
 from __future__ import annotations
 

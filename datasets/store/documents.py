@@ -1,17 +1,10 @@
-"""Frozen descriptions of `scenes` to JSON and back; doubles survive exactly.
+"""Text documents of a data set: JSON of frozen descriptions, `dataset.json`, the manifest, the rigs, the sensitivities.
 
-`dataset.json`: what is in the folder, in which conventions, made by what.
+Doubles survive exactly. Numbers that do not exist are NaN in Python and null in JSON and Parquet.
 
-The manifest: `manifest.jsonl`, and the same as a flat Parquet table.
-
-The rigs of a data set: `rigs.jsonl`, one line each, rebuilt when they are asked for.
-
-`sensitivities.parquet`: dD/d(parameter) per sample and estimator, beside the data set that it was computed from.
-
-The estimators are not this folder's business: the command line has the table written after the data set is finished
-(`phibench dataset make`, `phibench dataset sensitivities`). It is therefore not listed in SHA256SUMS, whose bytes
-follow from the recipe alone; instead the table's metadata hold the SHA-256 of SHA256SUMS, which tells what it
-belongs to.
+`sensitivities.parquet` (dD/d(parameter) per sample and estimator) is written by the estimator's side when a data set is
+finished. SHA256SUMS, whose bytes follow from the recipe alone, does not list it. Its metadata hold the SHA-256 of
+SHA256SUMS instead, which tells the state of the data set that it belongs to.
 """
 
 from __future__ import annotations
@@ -53,6 +46,9 @@ if TYPE_CHECKING:
     from polars import DataFrame
 
 
+# Frozen descriptions as JSON.
+
+
 T = TypeVar("T")
 
 
@@ -81,6 +77,9 @@ def from_json(kind: type[T], document: Any) -> T:
 def _adapter(kind: Any) -> TypeAdapter[Any]:
     """Adapter of a type; making one takes longer than using it a hundred times."""
     return TypeAdapter(kind)
+
+
+# dataset.json.
 
 
 CONVENTIONS = {
@@ -124,7 +123,7 @@ def info_text(info: DatasetInfo) -> str:
 
 
 def same_content(a: DatasetInfo, b: DatasetInfo) -> bool:
-    """Whether two descriptions mean the same bytes; the commit does not count."""
+    """True if two descriptions mean the same bytes; the commit does not count."""
     return _without_commit(a) == _without_commit(b)
 
 
@@ -185,6 +184,9 @@ def _without_commit(info: DatasetInfo) -> str:
 def _pose_info(pose: PosePlan) -> PoseInfo:
     files = {name: schema.view_file(pose.pose_id, name) for name in ("ambient", "truth", "preview")}
     return PoseInfo(pose=pose.pose_id, rig=pose.rig, offset_m=pose.offset_m, ambient_seed=pose.seed, files=files)
+
+
+# The manifest, as lines of JSON and as a flat table.
 
 
 def write_manifest(folder: Path, rows: Sequence[ManifestRow]) -> None:
@@ -279,13 +281,16 @@ def _leaf(document: dict[str, Any], name: str) -> Any:
 
 
 def same_number(a: float, b: float, relative: float = 1e-11, absolute: float = 1e-12) -> bool:
-    """Whether two doubles agree to rounding; two NaN do."""
+    """True if two doubles agree to rounding; two NaN do."""
     return (math.isnan(a) and math.isnan(b)) or math.isclose(a, b, rel_tol=relative, abs_tol=absolute)
+
+
+# rigs.jsonl.
 
 
 @dataclass(frozen=True)
 class Rigs:
-    """Rigs by id, as JSON documents: a large data set has as many as samples, and few are looked at."""
+    """Rigs by id, kept as JSON documents and built when they are asked for: a large data set has many."""
 
     documents: dict[str, dict[str, Any]]
 
@@ -319,6 +324,9 @@ def read_rigs(folder: Path) -> Rigs:
         If the file is missing, or with the number of the first line that is not a rig.
     """
     return Rigs({info.rig: info.resolved for info in read_rows(folder / schema.RIGS, RigInfo)})
+
+
+# sensitivities.parquet.
 
 
 DIGEST = "phibench.dataset_sha256"

@@ -1,4 +1,4 @@
-"""Files that are either complete under their final name or not there at all.
+"""Atomic files and locks: a file is complete under its final name, or not there at all.
 
 A file is written under a temporary name, flushed to the disk, then renamed.
 

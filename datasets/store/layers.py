@@ -1,11 +1,11 @@
-"""The one writer and the one reader of EXR files.
+"""EXR files: the one writer and the one reader, and the three kinds of layers (ambient, truth, spot).
 
-OpenEXR's Python module writes wrong pixels for arrays that are not C-contiguous, reads truncated files without
-raising, and keeps header floats as float32 (all of 3.5). So: planes are forced to C-contiguous native float32, the
-compression is lossless ZIP, exact parameters travel in one JSON string (attribute `phibench`), and that string carries
-a CRC-32 per plane which is checked on reading.
+OpenEXR's Python module (3.5) writes wrong pixels for arrays that are not C-contiguous, reads truncated files without
+raising, and keeps header floats as float32. Therefore planes are forced to C-contiguous native float32, and the
+compression is lossless ZIP. Exact parameters travel in one JSON string (attribute `phibench`), with a CRC-32 per plane
+which is checked on reading.
 
-The three kinds of layers as EXR files: which planes they have and what their headers say.
+Planes have the shape (H, W); stacks (3, h, w) hold R, G, B. FORMAT.md lists names and units.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.store.files import write_atomic
 from phibench.scenes.camera import FILTERS
+from phibench.scenes.frames import Array
 
 ATTRIBUTE = "phibench"
 Plane = NDArray[np.float32]
@@ -184,7 +185,8 @@ def _check_shapes(arrays: dict[str, Plane]) -> None:
         raise DatasetError(f"planes of shape (H, W), both above 0, are needed, not {shape}")
 
 
-Array = NDArray[np.float64]
+# Layers: their planes, and what their headers say.
+
 TRUTH_PLANES = (
     *("x_m", "y_m", "z_m", "depth_m", "path_m"),
     *("phi_ray_rad", "phi_normal_rad", "phi_incidence_rad", "azimuth_rad", "object_id"),

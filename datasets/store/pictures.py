@@ -1,8 +1,7 @@
-"""Layers to pictures for people. No camera model: neither noise nor mosaic, and an exposure that suits the eye.
+"""Pictures for people: layers as sRGB, spots marked and enlarged, both positions of a sample side by side.
 
-Pictures that show people where a spot is: a cross that leaves it free, and its surroundings enlarged.
-
-Picture of a sample: down and up side by side at half size, laser on, the spot marked and enlarged in a corner.
+There is no camera model here: no noise, no mosaic, and an exposure that suits the eye. Layers have the shape (3, H, W),
+electrons per second; pictures (H, W, 3), 8 bits.
 """
 
 from __future__ import annotations
@@ -22,6 +21,9 @@ from phibench.datasets.store.schema import SpotRow
 from phibench.render.optics.truth import SpotTruth
 from phibench.render.sensor.processing import eight_bit, srgb_encoded
 from phibench.scenes.camera import Detector
+
+# Layers as sRGB.
+
 
 Picture = NDArray[np.uint8]
 _WHITE_PERCENTILE = 98.0
@@ -61,6 +63,9 @@ def _balanced(planes: NDArray[Any], detector: Detector) -> NDArray[Any]:
         np.asarray(planes, float)
         * np.where(gains > 0.0, gains[1] / np.where(gains > 0.0, gains, 1.0), 0.0)[:, None, None]
     )
+
+
+# Marked spots.
 
 
 CROP_PX = 24  # the enlarged window measures 24 x 24 pixels
@@ -119,6 +124,9 @@ def _corner(spot: SpotPlace) -> tuple[int, int] | None:
 def _cross(draw: ImageDraw.ImageDraw, u: float, v: float, inner: float, outer: float) -> None:
     for du, dv in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         draw.line((u + du * inner, v + dv * inner, u + du * outer, v + dv * outer), fill=MARK)
+
+
+# Picture of a sample.
 
 
 _LARGEST_ZOOM = 6

@@ -1,15 +1,8 @@
-"""Where a data set comes from: versions, commit, hash of the code. Nothing that changes between two equal runs.
+"""Provenance of a data set: versions, commit, and hashes of code. Nothing here differs between two equal runs.
 
-Hash of the code behind a function: its module and every module of phibench that it imports, near or far.
-
-The tables that a module keeps beside itself count as code: `sensor_presets.toml` belongs to `sensor.py`.
-
-Editing the progress bar then changes no key, editing the lens changes the keys of all that is seen through it.
-
-One thread for the linear algebra of every process: its small matrices gain nothing from more.
-
-Where several processes share the cores, the threads of OpenBLAS wait for each other: a fit through the camera's chain
-took 0.5 s instead of 0.15 s on two cores.
+`code_behind` hashes a module and every module of phibench that it imports, near or far. The tables that a module keeps
+beside itself count as code: `settings_presets.toml` belongs to `settings.py`. Editing the progress bar then changes no
+key; editing the lens changes the keys of all that is seen through it.
 """
 
 from __future__ import annotations
@@ -66,6 +59,9 @@ def _commit() -> str | None:
     except (OSError, subprocess.TimeoutExpired):
         return None
     return result.stdout.strip() or None
+
+
+# Code behind a module.
 
 
 _ROOT = Path(__file__).resolve().parents[2]

@@ -1,8 +1,7 @@
-"""The on-disk documents: one row of the manifest, and `dataset.json`. FORMAT.md describes them; a test compares.
+"""Schema of the files on disk: documents as pydantic models, and file names. FORMAT.md describes them; a test compares.
 
-A number is NaN in Python and null in JSON where it does not exist (a spot without a reflection point).
-
-Where the files of a data set are, relative to its folder, with forward slashes.
+A number that does not exist (a spot without a reflection point) is NaN in Python and null in JSON. File names are
+relative to the folder of the data set, with forward slashes.
 """
 
 from __future__ import annotations
@@ -47,6 +46,9 @@ def described(unit: str, text: str) -> Any:
     return Field(description=text, json_schema_extra={"unit": unit})
 
 
+# Documents.
+
+
 class CertificateRow(Document):
     """Differences of two independent answers for one spot in one view, and the tolerances they were held to."""
 
@@ -60,7 +62,7 @@ class CertificateRow(Document):
 
 
 class NoiseRow(Document):
-    """Errors of phi_ray of one spot in one raw Bayer frame, preset `webcam`, 1/60 s (`render/noise_budget.py`)."""
+    """Errors of phi_ray of one spot in one raw Bayer frame, preset `webcam`, 1/60 s (`render/room/noise_budget.py`)."""
 
     phi_sensor_rad: Number = described("rad", "standard deviation from photons and read noise, known shape and blur")
     phi_render_rad: Number = described("rad", "what the ambient layer's own noise adds; at most a quarter of the above")
@@ -113,12 +115,12 @@ class ManifestRow(Document):
     experiment: str = described("-", "name of the experiment in the recipe, or 'random'")
     target: str = described("-", "name of the target in the recipe, or of what carries the spot")
     rig: str = described("-", "id of the true rig, in `rigs.jsonl`")
-    nominal_rig: str = described("-", "id of the rig that an estimator believes, in `rigs.jsonl`")
+    nominal_rig: str = described("-", "id of the nominal rig, which estimators are given, in `rigs.jsonl`")
     depth_m: float = described(
         "m", "D: horizontal distance of the spot from the vertical through the sphere centre, down"
     )
     stroke_m: float = described("m", "stroke (baseline) h, the true one")
-    nominal_stroke_m: float = described("m", "stroke that an estimator believes")
+    nominal_stroke_m: float = described("m", "nominal stroke, which estimators are given")
     spot_world_m: Vector3 = described("m", "centre of the laser spot")
     spot_normal_world: Vector3 = described("1", "unit normal of the wall at the spot")
     spot_diameter_m: float = described("m", "diameter of the spot: 4 sigma if gaussian, of the disc if uniform")
@@ -168,6 +170,9 @@ class DatasetInfo(Document):
     provenance: dict[str, Any] = described("-", "versions, commit, code hash, variant, LLVM, threads")
 
 
+# Lines and columns.
+
+
 def row_line(row: ManifestRow) -> str:
     """One line of `manifest.jsonl`; doubles are written so that reading gives the same bits."""
     return json.dumps(row.model_dump(mode="json"), allow_nan=False)
@@ -214,6 +219,9 @@ def _is_finite(value: object) -> bool:
     return value is not None and not (isinstance(value, float) and not math.isfinite(value))
 
 
+# File names.
+
+
 INFO = "dataset.json"
 MANIFEST = "manifest.jsonl"
 TABLE = "manifest.parquet"
@@ -252,5 +260,5 @@ def preview_file(sample_id: str) -> str:
 
 
 def is_task_file(name: str) -> bool:
-    """Whether a file is called as what tasks write: the light map, a view's, a spot's or a preview's."""
+    """True for names of files that tasks write: the light map, a view's, a spot's or a preview's."""
     return _TASK_FILE.fullmatch(name) is not None
