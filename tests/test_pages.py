@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from phibench.estimator.cli.main import app
+from phibench.scenes.catalog import default_rig
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted(
@@ -218,6 +219,26 @@ def test_make_targets_that_are_named_exist(page):
 def test_the_citation_has_the_version_of_the_package():
     (cited,) = re.findall(r"^version: (\S+)$", read("CITATION.cff"), re.M)
     assert cited == tomllib.loads(read("pyproject.toml"))["project"]["version"]
+
+
+def test_the_default_rig_is_that_of_the_page():
+    camera, mirror = default_rig().camera, default_rig().mirror
+    index, z_c_m = mirror.refractive_index(650.0), default_rig().T_camera_sphere.t[2]
+    stated = (
+        ("mirror radius", f"{1e3 * mirror.radius_m:.0f} mm"),
+        ("mirror index", f"{index.real:.3f} + {index.imag:.3f} i"),
+        ("image, pixel pitch", f"{camera.width_px} x {camera.height_px}, {camera.pixel_pitch_um} um"),
+        ("focal length", f"{camera.fx_px:.0f} px"),
+        ("principal point", f"({camera.cx_px}, {camera.cy_px}) px"),
+        ("distortion", "-0.026, 1.06, -3.40"),
+        ("f-number", f"{camera.f_number} (2.0 to 2.8), aperture radius {1e3 * camera.aperture_radius_m:.3f} mm"),
+        ("lens centre to sphere centre", f"{z_c_m} m"),
+        ("optical blur", f"sigma {camera.blur_sigma_px} px"),
+    )
+    rows = [line for line in read("docs/model.md").split("\n") if in_table(line)]
+    for name, value in stated:
+        (row,) = [row for row in rows if row.startswith(f"| {name}")]
+        assert value in row
 
 
 def test_pages_that_are_excused_exist():

@@ -321,7 +321,7 @@ def test_solid_in_the_way_is_seen_by_both(mi: ModuleType) -> None:
     assert spot_truth(view, spot, ()).visible
 
 
-def test_camera_default_is_the_designs() -> None:
+def test_aperture_of_the_default_camera() -> None:
     camera = Camera()
     assert camera.aperture_radius_m == pytest.approx(0.833e-3, rel=2e-3)
 

@@ -191,9 +191,9 @@ def test_reflectance_against_real_arithmetic(wavelength_nm):
 
 
 @pytest.mark.parametrize(("degrees", "percent"), [(0, 66.7), (45, 66.0)])
-def test_reflectance_of_the_design_table(degrees, percent):
+def test_reflectance_of_the_steel(degrees, percent):
     reflectance = SphereMirror().reflectance(np.cos(np.radians(degrees)), 650.0)
-    assert 100 * reflectance == pytest.approx(percent, abs=0.05)  # the table has one decimal
+    assert 100 * reflectance == pytest.approx(percent, abs=0.05)  # docs/model.md has one decimal
 
 
 def test_index_is_the_table_and_linear_between():

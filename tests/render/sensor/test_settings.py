@@ -1,4 +1,4 @@
-"""Presets: the numbers of the design, prefixes of one chain, and one sentence for each fault."""
+"""Presets: their numbers, prefixes of one chain, and one sentence for each fault."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SHAPES = {
 }
 
 
-def test_the_presets_are_those_of_the_design() -> None:
+def test_numbers_of_the_presets() -> None:
     assert preset_names() == tuple(SHAPES)
     s = sensor()
     assert s.name == "mjpeg"
