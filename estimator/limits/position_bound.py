@@ -1,16 +1,16 @@
-"""Fisher information of one pixel about its mean mu, per electron squared: what a Cramer-Rao bound sums up.
+"""Cramer-Rao bound of one spot on raw pixels: position, phi, and D of a pair.
 
-Three models of the noise:
+The bound sums the Fisher information of the pixels about their means mu, in electrons^-2. Three models of the noise:
 
-* approximate: 1 / variance, F. Huang et al., Nature Methods 10, 653 (2013), with mu + r^2 for Poisson plus Gauss;
-* exact: of the convolution of a Poisson with a normal distribution;
-* quantised: of the converter's codes, with full well and both ends of the converter.
+* approximate: 1 / variance, with mu + r^2 for Poisson plus Gauss (F. Huang et al., Nature Methods 10, 653, 2013);
+* exact: the convolution of a Poisson with a normal distribution, integrated;
+* quantised: the converter's codes, summed, with full well and both ends of the converter.
 
-The theoretical limit: how well u, v, phi and D of one spot can be known.
+The first two hold for pixels that nothing cuts. Both are multiplied by `censored_share`, what saturation leaves.
 
-Unknowns besides u, v: the spot's flux (laser, albedo and speckle are not known to a per cent), and the background, one
-level per colour filter, because the colour of the room's light behind the spot is not known; with the laser-off frame
-in hand it may count as known. Speckle flicker scales the whole spot and is covered by the unknown flux.
+Unknowns besides u and v: the spot's flux, because laser, albedo and speckle are not known to a per cent; and one
+background level per colour filter, because the colour of the room behind the spot is not known. With a laser-off frame
+the levels may count as known. Speckle flicker scales the whole spot, so that the unknown flux covers it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
-from scipy.special import ndtr
+from scipy.special import log_ndtr, ndtr
 from scipy.stats import norm, poisson
 
 from phibench.datasets.exposures.expected import ExpectedRegion
@@ -40,11 +40,73 @@ _SIGMAS = 9.0  # tails of 1e-19 are left out
 _NODES = 48  # of the spline; see the test of its error
 _GAUSSIAN_FROM_E = 3000.0  # there the exact value is within 1e-4 of the approximate one
 _PURE_POISSON_E = 0.1  # below this read noise counts are resolved: 1 / mu
+_FREE_SIGMAS = 8.0  # below saturation, from where on nothing is lost: z phi(z) = 4e-14
+_FULL_SIGMAS = 4.0  # above saturation, from where on a pixel counts as full: one reading in 30 000 is not
+
+Unknown = Literal["position", "flux", "flux+background"]
+NoiseModel = Literal["approximate", "exact", "quantised"]
+UNKNOWNS: tuple[Unknown, ...] = ("position", "flux", "flux+background")
+NOISE_MODELS: tuple[NoiseModel, ...] = ("approximate", "exact", "quantised")
+
+
+# -- information of one pixel ------------------------------------------------------------------------------------------
+
+
+def raw_information(
+    mean_e: Array, card: SensorCard, model: NoiseModel = "approximate", pattern_known: bool = False
+) -> Array:
+    """Information of a sensor's raw pixels about their means, shape of `mean_e`, electrons^-2.
+
+    Parameters
+    ----------
+    mean_e : array of any shape, electrons
+    card : SensorCard
+    model, pattern_known
+        As for `spot_limit`.
+
+    Raises
+    ------
+    ValueError
+        If there is no such model, or the sensor's pixels are not independent (`noise_of`).
+    """
+    if model not in NOISE_MODELS:
+        raise ValueError(f"noise model '{model}': {nearest(model, NOISE_MODELS)}")
+    noise = noise_of(card, pattern_known)
+    if model == "quantised":
+        return quantised_information(mean_e, card, pattern_known)
+    variance = noise.variance_e2(mean_e)
+    uncut = 1.0 / variance if model == "approximate" else exact_information(mean_e, noise.gaussian_e2)
+    return uncut * censored_share(mean_e, variance, card.saturation_e)
 
 
 def approximate_information(mean_e: Array, noise: PixelNoise) -> Array:
     """1 / variance, shape of `mean_e`; electrons and electrons^-2."""
     return 1.0 / noise.variance_e2(mean_e)
+
+
+def censored_share(mean_e: Array, variance_e2: Array, saturation_e: float) -> Array:
+    """Part of a pixel's information that censoring at saturation leaves, 0 to 1, shape of `mean_e`.
+
+    A reading is a Gaussian X with the score (X - mu) / V, or it says only that X >= W. With z = (W - mu) / sqrt(V) the
+    mean square of the score is, in units of 1 / V,
+
+        Phi(z) - z phi(z) + phi(z)^2 / (1 - Phi(z)).
+
+    Its first two terms are the readings below W, the third is what the chance of a full pixel says. A pixel keeps 99.7 %
+    if its mean lies 2 deviations below W, 82 % at W, 14 % and 1.7 % at 2 and 3 above it, and nothing from 4 on.
+
+    Parameters
+    ----------
+    mean_e : array of any shape, electrons
+    variance_e2 : shape of `mean_e`
+    saturation_e : float
+        W, `SensorCard.saturation_e`.
+    """
+    # a full well may be infinite
+    z = np.clip((saturation_e - mean_e) / np.sqrt(variance_e2), -2.0 * _FULL_SIGMAS, 2.0 * _FREE_SIGMAS)
+    log_density = -0.5 * (z * z + np.log(2.0 * np.pi))
+    share = ndtr(z) - z * np.exp(log_density) + np.exp(2.0 * log_density - log_ndtr(-z))
+    return np.where(z > _FREE_SIGMAS, 1.0, np.where(z < -_FULL_SIGMAS, 0.0, np.minimum(share, 1.0)))
 
 
 def exact_information(mean_e: Array, gaussian_e2: float) -> Array:
@@ -121,10 +183,7 @@ def _of_codes(mu: float, r: float, card: SensorCard) -> float:
     return float(np.sum(dP[seen] ** 2 / P[seen]))
 
 
-Unknown = Literal["position", "flux", "flux+background"]
-NoiseModel = Literal["approximate", "exact", "quantised"]
-UNKNOWNS: tuple[Unknown, ...] = ("position", "flux", "flux+background")
-NOISE_MODELS: tuple[NoiseModel, ...] = ("approximate", "exact", "quantised")
+# -- bounds of a spot --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -181,7 +240,7 @@ def spot_limit(
     model: NoiseModel = "approximate",
     pattern_known: bool = False,
 ) -> SpotLimit:
-    """Cramer-Rao bound of a spot's position on raw pixels.
+    """Cramer-Rao bound of a spot's position on raw pixels; full pixels carry nothing.
 
     Parameters
     ----------
@@ -195,7 +254,7 @@ def spot_limit(
     pattern_known : bool
         Whether the camera's PRNU and DSNU are calibrated.
     """
-    information = _information(region.mean_e, card, model, pattern_known)
+    information = raw_information(region.mean_e, card, model, pattern_known)
     return limit_of(derivative_images(region, unknown), information)
 
 
@@ -244,14 +303,3 @@ def depth_limit(
     g = rig_gradient(rig, stroke_m, uv_down_px, uv_up_px)
     calibration = np.sqrt(np.einsum("...i,ij,...j->...", g, covariance_rig, g))
     return DepthLimit(spot.depth_m, spot.sigma_m, calibration, g, spot.status)
-
-
-def _information(mean_e: Array, card: SensorCard, model: NoiseModel, pattern_known: bool) -> Array:
-    if model not in NOISE_MODELS:
-        raise ValueError(f"noise model '{model}': {nearest(model, NOISE_MODELS)}")
-    noise = noise_of(card, pattern_known)
-    if model == "approximate":
-        return approximate_information(mean_e, noise)
-    if model == "exact":
-        return exact_information(mean_e, noise.gaussian_e2)
-    return quantised_information(mean_e, card, pattern_known)

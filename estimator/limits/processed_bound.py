@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.limits.position_bound import SpotLimit, approximate_information, limit_of
+from phibench.estimator.limits.position_bound import SpotLimit, limit_of, raw_information
 from phibench.estimator.spots.chain_model import chain_model
 from phibench.estimator.spots.code_statistics import code_law, code_table
 from phibench.estimator.spots.fit_chain import unrounded
@@ -28,7 +28,7 @@ from phibench.estimator.spots.fit_jpeg import Window
 from phibench.estimator.spots.fit_raw import LASER_RESPONSE, covariance_bound, fisher_matrix
 from phibench.estimator.spots.gaussian_spot import SpotMeans
 from phibench.estimator.spots.jpeg_coefficients import mcu_px
-from phibench.estimator.spots.raw_pixels import bayer_filters, noise_of
+from phibench.estimator.spots.raw_pixels import bayer_filters
 from phibench.scenes.frames import Array
 
 _REACH_PX = 10  # around the spot, for "srgb8"
@@ -197,12 +197,10 @@ def _raw_covariance(
     background_e: Sequence[float],
     response: tuple[float, float, float],
 ) -> Array:
-    """Bound on raw Bayer pixels; a pixel expected within three deviations of saturation tells nothing."""
+    """Bound on raw Bayer pixels; full pixels carry nothing."""
     corner = np.floor(uv_px).astype(np.int64) - _SIDE_PX // 2
     filters = bayer_filters(corner[None], (_SIDE_PX, _SIDE_PX))[0]
     means = SpotMeans(filters, response, np.zeros(filters.size), sigma_px)
     mean, derivatives = means.at(np.array([[*(uv_px - corner), flux_e, *background_e]]))
     mean_e = mean.reshape(filters.shape)
-    information = approximate_information(mean_e, noise_of(card))
-    information = np.where(mean_e + 3.0 * np.sqrt(mean_e) < card.saturation_e, information, 0.0)
-    return limit_of(derivatives[0].reshape(-1, *filters.shape), information).covariance_px2
+    return limit_of(derivatives[0].reshape(-1, *filters.shape), raw_information(mean_e, card)).covariance_px2
