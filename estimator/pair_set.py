@@ -45,8 +45,8 @@ class SpotTruth:
     saturated : bool
         A pixel of the spot is expected above the sensor's saturation.
     bound_px2 : array, shape (2, 2), or None
-        Cramer-Rao bound of (u, v) from this image: `limits.position_bound` for raw outputs, `limits.processed_bound`
-        for processed ones; None where there is none.
+        Bound of (u, v) from this image; None where there is none. Raw outputs: Cramer-Rao (`spot_limit`). Processed
+        ones: that of the estimator's model (`chain_limit`), which counts a part of the information only.
     raw_bound_px2 : array, shape (2, 2), or None
         Bound of the raw pixels behind this image, whatever the output.
     distractions : tuple of Distraction

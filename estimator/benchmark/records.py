@@ -75,7 +75,7 @@ COLUMNS: dict[str, str] = {
     "pull_u": "first component of L^-1 e, C = L L^T the claimed covariance",
     "pull_v": "second component",
     "mahalanobis2": "e^T C^-1 e",
-    "bound_px2": "trace of the Cramer-Rao bound: expected squared distance at the limit",
+    "bound_px2": "trace of the bound (docs/limits.md): expected squared distance at it",
     "raw_bound_px2": "the same of the raw pixels behind the image",
     "bound_phi_rad2": "variance of phi at the bound",
     "rank_phi2_rad2": "square that the rank by phi sums: error, missed and false detection",

@@ -89,7 +89,7 @@ def calibrate_dataset(
         "layers" for the noise-free layers, or a preset of the sensor whose frames are drawn, with the laser on and off.
     spots : bool
         Also use the samples' laser spots, at places that the ruler measures. In frames they are found by the built-in
-        method that reaches the limit there, which gives their covariance, too.
+        method that comes closest to the bound there, which gives their covariance, too.
     ruler : Ruler, optional
         By default D is measured to 1 mm, height and azimuth not at all.
     vertical : bool

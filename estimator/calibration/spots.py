@@ -58,7 +58,7 @@ class Ruler:
 
 
 def method_for(card: SensorCard) -> BuiltIn:
-    """The built-in method that reaches the limit of this kind of image and claims a covariance."""
+    """The built-in method that comes closest to the bound of this kind of image and claims a covariance."""
     return METHODS["raw_maximum_likelihood" if kind_of(card) in RAW else "chain_fit"]
 
 

@@ -92,8 +92,8 @@ def censored_share(mean_e: Array, variance_e2: Array, saturation_e: float) -> Ar
 
         Phi(z) - z phi(z) + phi(z)^2 / (1 - Phi(z)).
 
-    Its first two terms are the readings below W, the third is what the chance of a full pixel says. A pixel keeps 99.7 %
-    if its mean lies 2 deviations below W, 82 % at W, 14 % and 1.7 % at 2 and 3 above it, and nothing from 4 on.
+    Its first two terms are the readings below W, the third is what the chance of a full pixel says. With its mean 2
+    deviations below W a pixel keeps 99.7 %, at W 82 %, at 2 and 3 deviations above W 14 % and 1.7 %, from 4 on nothing.
 
     Parameters
     ----------

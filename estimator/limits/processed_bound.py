@@ -1,13 +1,14 @@
-"""Bound of a spot's position behind the camera's processing, from the estimator's own model: no frame is drawn.
+"""Bound of a spot's position behind the camera's processing, from the estimator's own model; no frame is drawn.
 
-For "srgb8" the information of each pixel's own code (`code_law`), for "mjpeg" the bound J^T C^-1 J of Stein, Mezghani
-and Nossek (2014) with the mean and covariance of the quantised coefficients (`jpeg_fit`). The coefficients carry all
-that the decoded image does, as long as the decoder cuts nothing.
+"srgb8": the information of each pixel's own code (`code_statistics`); interpolated colours are left out. "mjpeg":
+J^T C^-1 J of the quantised coefficients' mean and covariance (M. Stein, A. Mezghani, J. A. Nossek, IEEE Signal Process.
+Lett. 21, 796, 2014; `fit_jpeg`). The coefficients carry all that the decoded image does, unless the decoder cuts.
 
-What a spot of so many electrons can be known to: the bound of one coordinate, mean over the sub-pixel places.
+Both are lower bounds of the information. Their inverse is the smallest covariance of estimates that use no more than
+the model does; it is no theorem for every method. The Cramer-Rao bound lies between that of the raw pixels
+(`position_bound`) and this one.
 
-A round spot of the lens's blur over flat levels: what the strength of the light alone says, for planning. The bound of
-one given spot is `limits.spot_limit` or `chain_limit.chain_limit`.
+`spot_sigma` tabulates the bound by the electrons of a round spot over flat levels, for planning.
 """
 
 from __future__ import annotations

@@ -166,7 +166,7 @@ class Budget:
     closure : Estimate
         predicted / measured; 1 is a budget that closes.
     over_bound : Estimate
-        measured / bound; 1 is the limit.
+        measured / bound; 1 is the bound.
     within_95 : Estimate
         Share of errors within the predicted interval.
     nominal : float

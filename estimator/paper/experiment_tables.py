@@ -4,9 +4,9 @@ For every rig of a data set (recipe `paper-misaligned`, or any with experiments 
 
 1. outlines of the mirror in the frames, one for each of some mirror poses, and the spots of the experiment
    "calibration", whose distances were measured with a ruler, give the rig with its covariance (`calibration.bundle`);
-2. every other pair gives D with its standard deviation (`depth_general`), from the method that reaches the limit of
+2. every other pair gives D with its standard deviation (`depth_general`), from the method closest to the bound of
    such frames, with the calibrated rig;
-3. beside it stands the bound: the pixels' Cramer-Rao bound and the same calibration, at the true pixels.
+3. beside it stands the bound: the pixels' bound and the same calibration, at the true pixels.
 
 One row per sample and draw. `experiment_budget` makes the error budget of it.
 """

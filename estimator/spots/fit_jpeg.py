@@ -1,8 +1,8 @@
 """Fit of a spot to the quantised coefficients of one JPEG window: a quasi-score through the processing.
 
 With m the mean and C the covariance of the quantiser's output, the estimating equation J^T C^-1 (z - m) = 0 is unbiased
-whatever the law of the output (R. W. M. Wedderburn, Biometrika 61, 439, 1974); its covariance (J^T C^-1 J)^-1 is the
-bound of M. Stein, A. Mezghani, J. A. Nossek (IEEE Signal Process. Lett. 21, 796, 2014). The quantiser of a Gaussian
+whatever the law of the output (R. W. M. Wedderburn, Biometrika 61, 439, 1974). Its covariance (J^T C^-1 J)^-1 is the
+smallest of estimates that know m and C only (`limits.processed_bound`). The quantiser of a Gaussian
 input gives m, and C_ij = g_i g_j C'_ij off the diagonal, g its mean slope and C' the input's covariance (J. J.
 Bussgang, 1952); a coefficient that is 0 whatever the noise has no slope and is left out.
 

@@ -59,7 +59,8 @@ def processed_fisher(slopes: ArrayLike, covariance: Array, draws: int = 0) -> Ar
     """Lower bound of the Fisher matrix of any output from its mean and covariance, shape (k, k).
 
     J >= (dm/dt)^T C^-1 (dm/dt): M. Stein, A. Mezghani, J. A. Nossek, IEEE Signal Process. Lett. 21, 796 (2014).
-    Any loss is in the output's higher moments; with the raw pixels' matrix it brackets the truth.
+    What is left out is in the output's higher moments, so that the inverse is no bound for every method: it is that of
+    methods that know the output by its mean and covariance. The truth lies between it and the raw pixels' bound.
 
     Parameters
     ----------
