@@ -27,9 +27,10 @@ from phibench.estimator.interface import Pair
 from phibench.estimator.limits.position_bound import SpotLimit, spot_limit
 from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.pair_set import Distraction, PairSet, PairTruth, SpotTruth
-from phibench.estimator.spots.fit_raw import covariance_bound
+from phibench.estimator.spots.fisher import covariance_bound
+from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import PROCESSED
-from phibench.estimator.spots.spot_prediction import SpotBlur, spot_blur
+from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
@@ -235,7 +236,7 @@ def _processed_limit(
         for c in range(3)
     ]
     r, g, b = rig.camera.detector.laser_filter_response
-    return chain_limit(card, uv_px, blur.sigma_px, electrons, levels, (r, g, b), blur.ratio, pattern_known)
+    return chain_limit(card, uv_px, blur, electrons, levels, (r, g, b), pattern_known)
 
 
 def _bound(limit: SpotLimit | None) -> Array | None:

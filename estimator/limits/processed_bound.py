@@ -24,10 +24,10 @@ from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.limits.position_bound import SpotLimit, limit_of, raw_information
 from phibench.estimator.spots.chain_model import chain_model
 from phibench.estimator.spots.code_statistics import code_law, code_table
+from phibench.estimator.spots.fisher import covariance_bound, fisher_matrix
 from phibench.estimator.spots.fit_chain import unrounded
 from phibench.estimator.spots.fit_jpeg import Window
-from phibench.estimator.spots.fit_raw import LASER_RESPONSE, covariance_bound, fisher_matrix
-from phibench.estimator.spots.gaussian_spot import SpotMeans
+from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel, SpotPixels
 from phibench.estimator.spots.jpeg_coefficients import mcu_px
 from phibench.estimator.spots.raw_pixels import bayer_filters
 from phibench.scenes.frames import Array
@@ -38,11 +38,10 @@ _REACH_PX = 10  # around the spot, for "srgb8"
 def chain_limit(
     card: SensorCard,
     uv_px: ArrayLike,
-    sigma_px: float,
+    blur: SpotBlur,
     flux_e: float,
     background_e: ArrayLike,
     response: tuple[float, float, float] = LASER_RESPONSE,
-    ratio: float = 1.0,
     pattern_known: bool = False,
 ) -> SpotLimit:
     """Bound of (u, v) with the flux and one background level per colour filter unknown.
@@ -52,8 +51,7 @@ def chain_limit(
     card : SensorCard
         Of the output "srgb8" or "mjpeg".
     uv_px : shape (2,), in the image
-    sigma_px, ratio : float
-        Blur along u, and that along v over it.
+    blur : SpotBlur
     flux_e : float
         Electrons of the whole spot in pixels of response 1, as `SpotFit.flux_e`.
     background_e : shape (3,)
@@ -71,38 +69,34 @@ def chain_limit(
     uv = np.asarray(uv_px, float)
     theta = np.array([*uv, flux_e, *np.asarray(background_e, float)])
     if card.output == "srgb8":
-        return _of_codes(card, theta, sigma_px, response, ratio, pattern_known)
+        return _of_codes(card, theta, blur, response, pattern_known)
     if card.output == "mjpeg":
-        return _of_coefficients(card, theta, sigma_px, response, ratio, pattern_known)
-    raise ValueError(
-        f"output '{card.output}': chain_limit knows 'srgb8' and 'mjpeg'; take limits.spot_limit for raw pixels"
-    )
+        return _of_coefficients(card, theta, blur, response, pattern_known)
+    raise ValueError(f"output '{card.output}': chain_limit knows 'srgb8' and 'mjpeg'; take spot_limit for raw pixels")
 
 
 def _of_codes(
-    card: SensorCard, theta: Array, sigma_px: float, response: tuple[float, float, float], ratio: float, known: bool
+    card: SensorCard, theta: Array, blur: SpotBlur, response: tuple[float, float, float], known: bool
 ) -> SpotLimit:
     corner = np.floor(theta[:2]).astype(np.int64) - _REACH_PX
     filters = bayer_filters(corner[None], (2 * _REACH_PX + 2, 2 * _REACH_PX + 2))
     theta = theta - np.array([*corner, 0, 0, 0, 0])
-    means = SpotMeans(filters[0], response, np.zeros(filters.size), sigma_px, ratio)
-    mean, derivatives = means.at(theta[None])
+    mean, derivatives = SpotPixels.of(filters, blur, SpotModel(response)).at(theta[None])
     law = code_law(np.zeros(filters.shape, np.uint8), filters, card, unrounded(card, known), code_table(card))
-    information = law.information(mean.reshape(filters.shape))[0]
-    fisher = fisher_matrix(derivatives[0].reshape(-1, *information.shape), information)
+    fisher = fisher_matrix(derivatives[0], law.information(mean)[0])
     return SpotLimit(covariance_bound(fisher), fisher)
 
 
 def _of_coefficients(
-    card: SensorCard, theta: Array, sigma_px: float, response: tuple[float, float, float], ratio: float, known: bool
+    card: SensorCard, theta: Array, blur: SpotBlur, response: tuple[float, float, float], known: bool
 ) -> SpotLimit:
     model = chain_model(card, unrounded(card, known))
     down, across = mcu_px(card.jpeg_subsampling)
     units = np.array([across, down])
     corner = (np.rint((theta[:2] + 0.5) / units) - 1.0) * units - model.margin
     theta = theta - np.array([*corner, 0, 0, 0, 0])
-    means = SpotMeans(model.filters, response, np.zeros(model.filters.size), sigma_px, ratio)
-    fisher = Window(np.zeros(len(model.step)), model, means).fisher(theta)
+    pixels = SpotPixels.of(model.filters[None], blur, SpotModel(response))
+    fisher = Window(np.zeros(len(model.step)), model, pixels).fisher(theta)
     return SpotLimit(covariance_bound(fisher), fisher)
 
 
@@ -185,7 +179,7 @@ def _variance_px2(
     if card.output == "raw":
         covariance = _raw_covariance(card, uv_px, sigma_px, flux_e, background_e, response)
     else:
-        covariance = chain_limit(card, uv_px, sigma_px, flux_e, np.asarray(background_e), response).covariance_px2
+        covariance = chain_limit(card, uv_px, SpotBlur(sigma_px), flux_e, background_e, response).covariance_px2
     variance = float(np.trace(covariance)) / 2.0
     return variance if math.isfinite(variance) else math.inf
 
@@ -200,8 +194,7 @@ def _raw_covariance(
 ) -> Array:
     """Bound on raw Bayer pixels; full pixels carry nothing."""
     corner = np.floor(uv_px).astype(np.int64) - _SIDE_PX // 2
-    filters = bayer_filters(corner[None], (_SIDE_PX, _SIDE_PX))[0]
-    means = SpotMeans(filters, response, np.zeros(filters.size), sigma_px)
-    mean, derivatives = means.at(np.array([[*(uv_px - corner), flux_e, *background_e]]))
-    mean_e = mean.reshape(filters.shape)
-    return limit_of(derivatives[0].reshape(-1, *filters.shape), raw_information(mean_e, card)).covariance_px2
+    filters = bayer_filters(corner[None], (_SIDE_PX, _SIDE_PX))
+    pixels = SpotPixels.of(filters, SpotBlur(sigma_px), SpotModel(response))
+    mean, derivatives = pixels.at(np.array([[*(uv_px - corner), flux_e, *background_e]]))
+    return limit_of(derivatives[0], raw_information(mean[0], card)).covariance_px2

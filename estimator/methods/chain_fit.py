@@ -15,9 +15,9 @@ from phibench.estimator.methods.locate import box_around, measured_twice, pair_b
 from phibench.estimator.spots.detect import Detection, detect
 from phibench.estimator.spots.fit_chain import first_fit, fit_jpeg, fit_srgb, undone, unrounded
 from phibench.estimator.spots.fit_raw import SpotFit
+from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
 from phibench.estimator.spots.jpeg_coefficients import mcu_px
-from phibench.estimator.spots.raw_pixels import BaseImage, around, base_of, bayer_filters
-from phibench.estimator.spots.spot_prediction import SpotBlur
+from phibench.estimator.spots.raw_pixels import Background, around, background_of, bayer_filters
 from phibench.scenes.frames import Array
 
 _HALF_PX = 8
@@ -68,32 +68,20 @@ def _spot(pair: Pair, image: NDArray[Any], off: NDArray[Any] | None, box: Box | 
     region = _region(box, pair.card, image.shape)
     origin = np.array([[region.u0_px, region.v0_px]])
     on = image[region.slices][None]
-    base = (
-        None
-        if off is None
-        else replace(_base(off[region.slices][None], None, origin, pair.card), image=off[region.slices][None])
-    )
-    sigma = np.array([pair.rig.camera.blur_sigma_px])
-    start = first_fit(on, origin, pair.card, sigma, _response(pair), base)[0, :2] + origin[0]
+    background = None
+    if off is not None:
+        dark = off[region.slices][None]
+        background = replace(_background(dark, None, origin, pair.card), image=dark)
+    lens, model = SpotBlur(pair.rig.camera.blur_sigma_px), SpotModel(_response(pair))
+    start = first_fit(on, origin, pair.card, lens, model.response, background)[0, :2] + origin[0]
     blur = pair_blur(pair, start, depth_m)
     if pair.card.output == "srgb8":
-        return _answer(_srgb(image, off, start, pair.card, blur, _response(pair)))
-    if base is None:
-        base = _base(on, around(start[None], origin, (region.height_px, region.width_px)), origin, pair.card)
+        return _answer(_srgb(image, off, start, pair.card, blur, model))
+    if background is None:
+        known = around(start[None], origin, (region.height_px, region.width_px))
+        background = _background(on, known, origin, pair.card)
     size = (image.shape[1], image.shape[0])
-    return _answer(
-        fit_jpeg(
-            on,
-            origin,
-            pair.card,
-            blur.sigma_px,
-            _response(pair),
-            base,
-            ratio=blur.ratio,
-            mixed_px2=blur.mixed_px2,
-            size_px=size,
-        )
-    )
+    return _answer(fit_jpeg(on, origin, pair.card, blur, model, background, size_px=size))
 
 
 def _region(box: Box, card: SensorCard, shape: tuple[int, ...]) -> Box:
@@ -114,7 +102,7 @@ def _srgb(
     start: Array,
     card: SensorCard,
     blur: SpotBlur,
-    response: tuple[float, float, float],
+    model: SpotModel,
 ) -> SpotFit:
     """Fit a square of 17 x 17 pixels about the start."""
     u0, v0 = (
@@ -124,33 +112,23 @@ def _srgb(
     square, origin = Box(u0, v0, 2 * _HALF_PX + 1, 2 * _HALF_PX + 1), np.array([[u0, v0]])
     on = image[square.slices][None]
 
-    def fit(background_e: Array | None, extra_e2: float) -> SpotFit:
-        return fit_srgb(
-            on,
-            origin,
-            card,
-            blur.sigma_px,
-            response,
-            background_e,
-            extra_e2=extra_e2,
-            ratio=blur.ratio,
-            mixed_px2=blur.mixed_px2,
-        )
-
     if off is None:
-        flat = fit(None, 0.0)
+        flat = fit_srgb(on, origin, card, blur, model)
         if flat.chi2[0] < _FLAT_CHI2:
             return flat
-        base = _base(on, around(start[None], origin, (2 * _HALF_PX + 1, 2 * _HALF_PX + 1)), origin, card)
+        known = around(start[None], origin, (2 * _HALF_PX + 1, 2 * _HALF_PX + 1))
+        background = _background(on, known, origin, card)
     else:
-        base = _base(off[square.slices][None], None, origin, card)
-    return fit(base.mean_e, float(np.median(base.variance_e2)))
+        background = _background(off[square.slices][None], None, origin, card)
+    behind = replace(model, background_e=background.mean_e)
+    return fit_srgb(on, origin, card, blur, behind, extra_e2=float(np.median(background.variance_e2)))
 
 
-def _base(image: NDArray[Any], known: Array | None, origin: NDArray[np.int64], card: SensorCard) -> BaseImage:
+def _background(image: NDArray[Any], known: Array | None, origin: NDArray[np.int64], card: SensorCard) -> Background:
+    """Room in a region: of the laser-off frame, or of what is `known` of the laser-on frame."""
     x, rounding = undone(image, bayer_filters(origin, image.shape[1:3]), card)
     variance = unrounded(card).variance_e2(x) + 1.0 / (12.0 * card.dn_per_e**2) + rounding
-    return base_of(x, variance, np.ones(x.shape) if known is None else known)
+    return background_of(x, variance, np.ones(x.shape) if known is None else known)
 
 
 def _response(pair: Pair) -> tuple[float, float, float]:

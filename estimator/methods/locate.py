@@ -25,9 +25,10 @@ from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Box, Image, Method, Pair, Spot
 from phibench.estimator.spots.detect import Detection, detect
+from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import demosaiced, kind_of, linear_planes, redness
 from phibench.estimator.spots.simple_spots import SpotPositions
-from phibench.estimator.spots.spot_prediction import SpotBlur, spot_blur
+from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.scenes.frames import Array, BoolArray
 
 _REACH_M = (0.3, 20.0)  # distances to which a beam is nominal

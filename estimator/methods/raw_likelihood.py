@@ -1,18 +1,16 @@
-"""The likelihood fit of `estimator.fit_raw` as a method, on raw pixels with or without colour filters.
+"""Built-in methods on likelihoods: each spot by itself on raw pixels, and both spots as images of one point.
 
-What it takes as known: the card's noise (PRNU and DSNU count as noise), the rig's detector for the filters' response
-at the laser line, and the oblique blur that the rig predicts at the pixel (`spot_blur`), with the beam's size once the
-pair's distance is known. A rough mirror's blur is not predicted: there the width is fitted as well. The room behind is
-the laser-off frame, smoothed as far as it is flat (`base_image`); without one it is a level per filter, or, where that
-does not describe it, what surrounds the spot. A misfit that is left widens the covariance.
+`raw_maximum_likelihood` takes as known the card's noise (PRNU and DSNU count as noise), the rig's detector for the
+filters' response at the laser line, and the oblique blur that the rig predicts at the pixel (`spot_blur`), with the
+beam's size once the pair's distance is known. A rough mirror's blur is not predicted: there the width is fitted as
+well. The room behind is the laser-off frame, smoothed as far as it is flat (`background_of`). Without one it is a level
+per filter, or, where that does not describe it, what surrounds the spot. A misfit that is left widens the covariance.
 
-Built-in method: both spots as images of one point of the room.
-
-Each image is first fitted by itself: raw pixels by `raw_maximum_likelihood`, processed ones by `chain_fit`. Raw pixels
-are then fitted together (`fit_joint`): with laser-off frames the fit sees on - off + the usual level of off, and the
-off frame's noise is added to the on frame's; without them a level per filter is fitted. Of processed pixels the two
-positions are combined by their covariances (`combine`), which is the same where both are Gaussian. Where the two are
-not one point, the separate answer stands, without a depth of its own.
+`joint_fit` first fits each image by itself: raw pixels by `raw_maximum_likelihood`, processed ones by `chain_fit`. Raw
+pixels are then fitted together (`spots.fit_joint`): with laser-off frames the fit sees on - off + the usual level of
+off, and the off frame's noise is added to the on frame's; without them a level per filter is fitted. Of processed
+pixels the two positions are combined by their covariances (`combine`), which is the same where both are Gaussian. Where
+the two are not one point, the separate answer stands, without a depth of its own.
 """
 
 from __future__ import annotations
@@ -27,16 +25,18 @@ from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Image, Matrix2, Pair, Spot
 from phibench.estimator.methods.chain_fit import chain_fit
 from phibench.estimator.methods.locate import Sight, each_spot_twice, pair_blur, seen_depth_m
-from phibench.estimator.spots.fit_joint import JointFit, SpotRegions, fit_joint, spot_regions
-from phibench.estimator.spots.fit_raw import SpotFit, fit_law
+from phibench.estimator.spots.fit_joint import JointFit, fit_joint
+from phibench.estimator.spots.fit_raw import SpotData, SpotFit, fit_law, spot_data
+from phibench.estimator.spots.gaussian_spot import SpotModel
 from phibench.estimator.spots.raw_pixels import (
-    BaseImage,
+    Background,
     GaussLaw,
     PixelNoise,
     around,
-    base_of,
+    background_of,
     noise_of,
     raw_electrons,
+    spot_regions,
 )
 from phibench.scenes.frames import Array
 
@@ -61,40 +61,37 @@ def raw_maximum_likelihood(sight: Sight) -> Spot:
         and flat.chi2[0] < 1.0 + _FLAT_SIGMAS * math.sqrt(2.0 / x.size)
     ):
         return _fitted_spot(flat, x.size)
-    based = _fit(near, x, noise, _base(near, x, noise, flat))
-    return _fitted_spot(based if based.status[0] == Status.OK else flat, x.size)
+    structured = _fit(near, x, noise, _background(near, x, noise, flat))
+    return _fitted_spot(structured if structured.status[0] == Status.OK else flat, x.size)
 
 
-def _fit(near: Sight, x: Array, noise: PixelNoise, base: BaseImage | None) -> SpotFit:
+def _fit(near: Sight, x: Array, noise: PixelNoise, background: Background | None) -> SpotFit:
     """Fit with a known background, or with a level per filter."""
     card, rig = near.pair.card, near.pair.rig
     u0, v0 = near.origin_px
     blur = pair_blur(near.pair, (u0 + near.box.width_px // 2, v0 + near.box.height_px // 2), near.depth_m)
-    r, g, b = rig.camera.detector.laser_filter_response
-    return fit_law(
-        x,
-        near.origin_px,
-        GaussLaw(noise, 0.0 if base is None else base.variance_e2),
-        blur.sigma_px,
-        (r, g, b) if card.mosaic == "bayer" else None,
-        None if base is None else base.mean_e,
-        rig.mirror.roughness_alpha > 0.0,
-        x < card.full_from_e,
-        blur.ratio,
-        blur.mixed_px2,
-    )
+    rough = rig.mirror.roughness_alpha > 0.0
+    model = SpotModel(_response(near.pair), None if background is None else background.mean_e, rough)
+    law = GaussLaw(noise, 0.0 if background is None else background.variance_e2)
+    return fit_law(spot_regions(x, near.origin_px, x < card.full_from_e), law, blur, model)
 
 
-def _base(near: Sight, x: Array, noise: PixelNoise, flat: SpotFit) -> BaseImage:
+def _response(pair: Pair) -> tuple[float, float, float] | None:
+    """Response of the filters at the laser line; None without filters."""
+    r, g, b = pair.rig.camera.detector.laser_filter_response
+    return (r, g, b) if pair.card.mosaic == "bayer" else None
+
+
+def _background(near: Sight, x: Array, noise: PixelNoise, flat: SpotFit) -> Background:
     """Room of the laser-off frame; without one, of the pixels around the spot."""
     off = near.off_pixels
     if off is not None:
         electrons = raw_electrons(off, near.pair.card)[None]
-        return base_of(electrons, noise.variance_e2(electrons), np.ones(x.shape))
+        return background_of(electrons, noise.variance_e2(electrons), np.ones(x.shape))
     origin = np.array([near.origin_px], float)
     middle = origin + (np.array([x.shape[2], x.shape[1]]) - 1.0) / 2.0
     uv = np.where(np.isfinite(flat.uv_px), flat.uv_px, middle)
-    return base_of(x, noise.variance_e2(x), around(uv, origin, (x.shape[1], x.shape[2])))
+    return background_of(x, noise.variance_e2(x), around(uv, origin, (x.shape[1], x.shape[2])))
 
 
 def _fitted_spot(fit: SpotFit, count: int) -> Spot:
@@ -154,7 +151,7 @@ def _answer(found: JointFit | CombinedEstimate, separate: Answer) -> Answer:
     )
 
 
-def _region(image: Image, dark: Image | None, pair: Pair, start: Array, depth_m: float | None) -> SpotRegions:
+def _region(image: Image, dark: Image | None, pair: Pair, start: Array, depth_m: float | None) -> SpotData:
     """Square around a start, moved inside the image."""
     height, width = image.shape
     side = _SIDE_PX[dark is not None]
@@ -166,11 +163,8 @@ def _region(image: Image, dark: Image | None, pair: Pair, start: Array, depth_m:
     if dark is not None:
         off = raw_electrons(dark[window], pair.card)
         x, extra = x - off + float(np.median(off)), _variance(off, pair.card)[None]
-    r, g, b = pair.rig.camera.detector.laser_filter_response
-    response = (r, g, b) if pair.card.mosaic == "bayer" else None
-    blur, noise = pair_blur(pair, start, depth_m), noise_of(pair.card)
-    shape = {"ratio": blur.ratio, "mixed_px2": blur.mixed_px2}
-    return spot_regions(x[None], (u0, v0), noise, blur.sigma_px, response, extra_e2=extra, **shape)
+    law, blur = GaussLaw(noise_of(pair.card), extra), pair_blur(pair, start, depth_m)
+    return spot_data(spot_regions(x[None], (u0, v0)), law, blur, SpotModel(_response(pair)))
 
 
 def _variance(off_e: Array, card: SensorCard) -> Array:

@@ -17,12 +17,20 @@ from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.status import Status, flag, keep
 from phibench.estimator.spots.chain_model import UNIT_MATRIX, chain_model
 from phibench.estimator.spots.code_statistics import code_law, code_table
+from phibench.estimator.spots.fisher import covariance_bound
 from phibench.estimator.spots.fit_jpeg import JpegFit, Region, fit_region
-from phibench.estimator.spots.fit_raw import LASER_RESPONSE, LEAST_SNR, SpotFit, covariance_bound, fit_law
+from phibench.estimator.spots.fit_raw import LEAST_SNR, SpotFit, fit_law
+from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
 from phibench.estimator.spots.image_planes import decoded, slope
 from phibench.estimator.spots.jpeg_coefficients import mcu_px
-from phibench.estimator.spots.raw_pixels import BaseImage, GaussLaw, PixelNoise, bayer_filters, noise_of
-from phibench.estimator.spots.spot_prediction import SpotBlur
+from phibench.estimator.spots.raw_pixels import (
+    Background,
+    GaussLaw,
+    PixelNoise,
+    bayer_filters,
+    noise_of,
+    spot_regions,
+)
 from phibench.scenes.frames import Array
 
 _CUT_PX = 15
@@ -35,19 +43,16 @@ def fit_srgb(
     images: NDArray[Any],
     origin_px: ArrayLike,
     card: SensorCard,
-    sigma_px: ArrayLike,
-    response: tuple[float, float, float] = LASER_RESPONSE,
-    background_e: Array | None = None,
-    free_width: bool = False,
+    blur: SpotBlur,
+    model: SpotModel | None = None,
     pattern_known: bool = False,
     extra_e2: float = 0.0,
-    ratio: ArrayLike = 1.0,
-    mixed_px2: ArrayLike = 0.0,
 ) -> SpotFit:
     """Fit one spot in each region of processed 8-bit images.
 
     Without sharpening and with the unit colour matrix each pixel's own colour is an interval of electrons, and the
-    likelihood is exact (`code_law`). Otherwise sharpening and matrix are undone, and the codes' widths count as noise.
+    likelihood is exact (`code_statistics`). Otherwise sharpening and matrix are undone, and the codes' widths count as
+    noise.
 
     Parameters
     ----------
@@ -55,14 +60,12 @@ def fit_srgb(
     origin_px : shape (2,) or (n, 2)
         Image pixel (u, v) of the first column and row.
     card : SensorCard
-    sigma_px, response, background_e, free_width
-        As for `fit_raw`.
+    blur, model
+        As for `fit_law`.
     pattern_known : bool
         Whether PRNU and DSNU were calibrated; otherwise they count as noise.
     extra_e2 : float
         Variance of the known background's error, electrons squared.
-    ratio, mixed_px2
-        As for `fit_law`.
 
     Raises
     ------
@@ -79,24 +82,21 @@ def fit_srgb(
         codes = np.take_along_axis(planes, filters[..., None], axis=3)[..., 0]
         law = code_law(codes, filters, card, noise, table)
         x = table.middle_e[filters, codes]
-        return fit_law(x, origin, law, sigma_px, response, background_e, free_width, True, ratio, mixed_px2)
+        return fit_law(spot_regions(x, origin), law, blur, model)
     x, extra = undone(planes, filters, card)
     used = (planes < 255).all(axis=3)
     gauss = GaussLaw(PixelNoise(noise.gaussian_e2 + 1.0 / (12.0 * card.dn_per_e**2), noise.prnu), extra)
-    return fit_law(x, origin, gauss, sigma_px, response, background_e, free_width, used, ratio, mixed_px2)
+    return fit_law(spot_regions(x, origin, used), gauss, blur, model)
 
 
 def fit_jpeg(
     images: NDArray[Any],
     origin_px: ArrayLike,
     card: SensorCard,
-    sigma_px: ArrayLike,
-    response: tuple[float, float, float] = LASER_RESPONSE,
-    base: BaseImage | None = None,
-    free_width: bool = False,
+    blur: SpotBlur,
+    model: SpotModel | None = None,
+    background: Background | None = None,
     pattern_known: bool = False,
-    ratio: ArrayLike = 1.0,
-    mixed_px2: ArrayLike = 0.0,
     size_px: tuple[int, int] = (1280, 720),
 ) -> SpotFit:
     """Fit one spot in each region of decoded MJPEG images.
@@ -109,18 +109,12 @@ def fit_jpeg(
         Image pixel (u, v) of the first column and row, on the grid of units.
     card : SensorCard
         With the quality and the subsampling of the JPEG.
-    sigma_px : float or shape (n,)
-        Blur along u; the start of it with `free_width`.
-    response, free_width
-        As for `fit_raw`.
-    base : BaseImage, optional
+    blur, model
+        As for `fit_law`; the model's background is not looked at, `background` is.
+    background : Background, optional
         Room behind the spot; flat if it is not given. Levels per filter are fitted on top of it.
     pattern_known : bool
         Whether PRNU and DSNU were calibrated; otherwise they count as noise.
-    ratio : float or shape (n,)
-        Blur along v over blur along u.
-    mixed_px2 : float or shape (n,)
-        Mixed second moment of u and v of an oblique spot, to first order.
     size_px : (width, height) of the image
 
     Returns
@@ -135,42 +129,43 @@ def fit_jpeg(
     """
     planes = _checked(images, card)
     n, (h, w) = len(planes), planes.shape[1:3]
-    origin = np.broadcast_to(np.asarray(origin_px, np.int64), (n, 2))
+    origin, model = np.broadcast_to(np.asarray(origin_px, np.int64), (n, 2)), model or SpotModel()
     _on_grid(origin, (h, w), card)
     if n == 0:
-        return _collected([], origin, np.zeros(0), free_width)
-    model = chain_model(card, unrounded(card, pattern_known))
-    first = first_fit(planes, origin, card, np.broadcast_to(np.asarray(sigma_px, float), n), response, base)
+        return _collected([], origin, np.zeros(0), model.free_width)
+    chain, blurs = chain_model(card, unrounded(card, pattern_known)), blur.each(n)
+    widths = np.asarray(blurs.sigma_px)
+    first = first_fit(planes, origin, card, SpotBlur(widths), model.response, background)
     zero = np.zeros((h, w))
-    widths, ratios, mixed = (np.broadcast_to(np.asarray(x, float), n) for x in (sigma_px, ratio, mixed_px2))
     rows = []
     for i in range(n):
         u0, v0 = origin[i]
         ends = (bool(v0 == 0), bool(v0 + h == size_px[1]), bool(u0 == 0), bool(u0 + w == size_px[0]))
-        known = (zero, zero) if base is None else (base.mean_e[i], base.variance_e2[i])
-        room = None if base is None or base.image is None else base.image[i]
-        start = first[i] if not free_width else np.append(first[i], widths[i])
+        known = (zero, zero) if background is None else (background.mean_e[i], background.variance_e2[i])
+        room = None if background is None or background.image is None else background.image[i]
+        start = first[i] if not model.free_width else np.append(first[i], widths[i])
         region = Region(planes[i], ends, known[0], known[1], room)
-        blur = SpotBlur(float(widths[i]), float(ratios[i]), float(mixed[i]))
-        rows.append(fit_region(region, model, start[None], blur, free_width, response))
-    return _collected(rows, origin, widths, free_width)
+        rows.append(fit_region(region, chain, start[None], blurs.rows(np.array([i])), model))
+    return _collected(rows, origin, widths, model.free_width)
 
 
 def first_fit(
     images: NDArray[Any],
     origin: NDArray[np.int64],
     card: SensorCard,
-    sigma_px: Array,
-    response: tuple[float, float, float] = LASER_RESPONSE,
-    base: BaseImage | None = None,
+    blur: SpotBlur,
+    response: tuple[float, float, float] | None,
+    background: Background | None = None,
 ) -> Array:
-    """Where to begin, shape (n, 6): u, v in the region, flux, levels; a Gaussian fit of each pixel's own colour."""
+    """Start of a fit, shape (n, 6): u, v in the region, flux, levels; a Gaussian fit of each pixel's own colour."""
+    if response is None:
+        raise ValueError("the fit through the chain needs the response of the filters: SpotModel(response=...)")
     filters = bayer_filters(origin, images.shape[1:3])
     x, extra = undone(images, filters, card)
-    x = x - (0.0 if base is None else base.mean_e)
+    x = x - (0.0 if background is None else background.mean_e)
     rough, spread = _ROUGH_CODES2 * 12.0 * extra, unrounded(card)
     x, rough, corner = _cut(x, rough, filters, response)
-    fit = fit_law(x, origin + corner, GaussLaw(spread, rough), sigma_px, response)
+    fit = fit_law(spot_regions(x, origin + corner), GaussLaw(spread, rough), blur, SpotModel(response))
     middle = np.array([x.shape[2] - 1.0, x.shape[1] - 1.0]) / 2.0
     good = fit.status == Status.OK
     uv = np.where(good[:, None], fit.uv_px - origin, middle + corner)

@@ -1,19 +1,16 @@
-"""Score, Fisher matrix and misfit of one spot per region on raw pixels: the model and the noise law of `fit_raw`.
+"""Joint maximum likelihood of both images of a stroke pair on raw pixels: one point of the room behind two spots.
 
-mu = flux x response x (Gaussian blur integrated over the pixel) + background of the pixel's filter; unknowns
-theta = u, v (of the image), flux, backgrounds. Axes of regions are spot, row, column.
+Unknowns psi: u, v in the down image, 1 / D, then of the down and of the up image the flux and the background levels.
+The fluxes are free, because speckle makes those of two exposures differ. The up position follows from `up_image`.
+Fisher scoring is of the sum of both images' log likelihoods. Each image offers the minima that nine starts lead to, and
+the constraint picks among the pairs of them: on a Bayer grid a faint spot has several.
 
-Joint maximum likelihood of both images of a stroke pair on raw pixels: one point of the room behind two spots.
-
-Unknowns: u, v in the down image, 1 / D, and of each image its flux and its background levels, all free: speckle makes
-the fluxes of two exposures differ, so that their ratio is not taken as known. The up position follows from
-`epipolar.up_image`. Fisher scoring of the sum of both images' log likelihoods; each image offers the minima that nine
-starts lead to, and the constraint picks among the pairs of them: on a Bayer grid a faint spot has several.
+Unknowns theta of one image: u, v of the whole image, flux, levels.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,131 +18,15 @@ from numpy.typing import ArrayLike, NDArray
 from phibench.estimator.geometry.combine import combine
 from phibench.estimator.geometry.mirror_image import up_image
 from phibench.estimator.geometry.status import DepthEstimate, Status, StatusArray, first_fault, flag, keep
-from phibench.estimator.spots.fit_raw import covariance_bound
-from phibench.estimator.spots.gaussian_spot import spot_images
-from phibench.estimator.spots.raw_pixels import PixelNoise, bayer_filters
+from phibench.estimator.spots.fisher import covariance_bound, limited, scoring_step
+from phibench.estimator.spots.fit_raw import AT_ONCE, DAMPING, DECREMENT, LEAST_SNR, START_PX, SpotData
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig
 
-
-@dataclass(frozen=True)
-class SpotRegions:
-    """Regions of one image position.
-
-    Attributes
-    ----------
-    x : shape (n, h, w), electrons
-    used : shape (n, h, w), bool
-    response : shape (n, h, w), of each pixel's filter at the laser's wavelength
-    levels : shape (n, c, h, w), 1 where a pixel has that background level
-    origin_px : shape (n, 2), image pixel (u, v) of the first column and row
-    noise : PixelNoise
-    extra_e2 : shape (n, h, w)
-        Variance besides that of `noise`, such as a subtracted frame's.
-    sigma_px, ratio, mixed_px2 : shape (n,)
-        Blur along u, that along v over it, and its mixed second moment.
-    """
-
-    x: Array
-    used: BoolArray
-    response: Array
-    levels: Array
-    origin_px: NDArray[np.int64]
-    noise: PixelNoise
-    extra_e2: Array
-    sigma_px: Array
-    ratio: Array
-    mixed_px2: Array
-
-    def __len__(self) -> int:
-        return len(self.x)
-
-    def rows(self, index: NDArray[np.int64]) -> SpotRegions:
-        """Regions of some of the spots."""
-        names = ("x", "used", "response", "levels", "origin_px", "extra_e2", "sigma_px", "ratio", "mixed_px2")
-        return replace(self, **{name: getattr(self, name)[index] for name in names})
-
-    @property
-    def unknowns(self) -> int:
-        """How many unknowns a region has: 3 + c."""
-        return 3 + self.levels.shape[1]
-
-
-def spot_regions(
-    x: Array,
-    origin_px: ArrayLike,
-    noise: PixelNoise,
-    sigma_px: ArrayLike,
-    response: tuple[float, float, float] | None,
-    saturation_e: float = np.inf,
-    extra_e2: ArrayLike = 0.0,
-    ratio: ArrayLike = 1.0,
-    mixed_px2: ArrayLike = 0.0,
-) -> SpotRegions:
-    """Regions as `fit_raw` takes them; pixels that are not finite or from `saturation_e` on are left out.
-
-    Raises
-    ------
-    ValueError
-        If the regions have no shape (n, h, w) of 3 x 3 pixels or more.
-    """
-    data = np.asarray(x, float)
-    if data.ndim != 3 or min(data.shape[1:]) < 3:
-        raise ValueError(f"regions have the shape {data.shape}: (n, h, w) of 3 x 3 pixels or more is needed")
-    n = len(data)
-    origin = np.broadcast_to(np.asarray(origin_px, np.int64), (n, 2))
-    filters = np.zeros(data.shape, np.int64) if response is None else bayer_filters(origin, data.shape[1:])
-    weights = np.ones(1) if response is None else np.array(response)
-    levels = (filters[:, None] == np.arange(len(weights))[:, None, None]).astype(float)
-    used = np.isfinite(data) & (np.nan_to_num(data, nan=np.inf) < saturation_e)
-    extra = np.broadcast_to(np.asarray(extra_e2, float), data.shape)
-    blur = (np.broadcast_to(np.asarray(value, float), n) for value in (sigma_px, ratio, mixed_px2))
-    return SpotRegions(np.where(used, data, 0.0), used, weights[filters], levels, origin, noise, extra, *blur)
-
-
-def scores(data: SpotRegions, theta: Array) -> tuple[Array, Array]:
-    """Score, shape (n, k), and Fisher matrix, shape (n, k, k), at unknowns of shape (n, k)."""
-    mean, derivatives = _model(data, theta)
-    n, k = theta.shape
-    weight = data.used / _variance(data, mean)
-    flat = derivatives.reshape(n, k, -1)
-    weighted = flat * weight.reshape(n, 1, -1)
-    score = (weighted @ (data.x - mean).reshape(n, -1, 1))[..., 0]
-    return score, weighted @ np.swapaxes(flat, 1, 2)
-
-
-def misfit(data: SpotRegions, theta: Array) -> Array:
-    """-2 log likelihood with a Gaussian of variance V(mu), shape (n,); infinite where it is not finite."""
-    mean, _ = _model(data, theta)
-    variance = _variance(data, mean)
-    value = np.sum(data.used * ((data.x - mean) ** 2 / variance + np.log(variance)), axis=(1, 2))
-    return np.where(np.isfinite(value), value, np.inf)
-
-
-def _model(data: SpotRegions, theta: Array) -> tuple[Array, Array]:
-    """Mean, shape (n, h, w), and its derivatives, shape (n, k, h, w)."""
-    shape, place = data.x.shape[1:], theta[:, :2] - data.origin_px
-    derivatives = np.empty((*theta.shape, *shape))
-    derivatives[:, :3] = spot_images(place, theta[:, 2], data.sigma_px, data.ratio, data.mixed_px2, shape)
-    derivatives[:, :3] *= data.response[:, None]
-    derivatives[:, 3:] = data.levels
-    mean = theta[:, 2, None, None] * derivatives[:, 2] + np.einsum("nc,nchw->nhw", theta[:, 3:], data.levels)
-    return mean, derivatives
-
-
-def _variance(data: SpotRegions, mean: Array) -> Array:
-    return data.noise.variance_e2(mean) + data.extra_e2
-
-
-START_PX = 0.6  # half width of the 3 x 3 grid of starts of each image
-LEAST_SNR = 3.0  # flux over its standard deviation below which there is no spot
 _SCREENING_STEPS = 8
 _BEST_MINIMA = 3  # of each image, whose pairs are tried
 _PAIRS = 2  # that are followed to the end
-_DAMPING = (1.0,) * 12 + (0.5,) * 16 + (0.25,) * 24
-_DECREMENT = 1e-8  # squared distance from the minimum in standard deviations
-_STEP_PX = 0.5
-_AT_ONCE = 64
+_INVERSE_DEPTH_CHANGE = (0.5, 2.0)  # of 1 / D in one step
 
 
 @dataclass(frozen=True)
@@ -181,7 +62,7 @@ class _Minima:
 
 
 def fit_joint(
-    rig: Rig, stroke_m: ArrayLike, down: SpotRegions, up: SpotRegions, start_down_px: Array, start_up_px: Array
+    rig: Rig, stroke_m: ArrayLike, down: SpotData, up: SpotData, start_down_px: Array, start_up_px: Array
 ) -> JointFit:
     """Fit both images of each pair together.
 
@@ -189,8 +70,8 @@ def fit_joint(
     ----------
     rig : Rig
     stroke_m : float or shape (n,), h
-    down, up : SpotRegions, n each
-        Of `spot_likelihood.spot_regions`.
+    down, up : SpotData, n each
+        Of `spot_data`, with Gaussian laws, unknown levels and known widths.
     start_down_px, start_up_px : shape (n, 2)
         Positions within about a pixel, of a detection or of `fit_raw`.
 
@@ -210,13 +91,13 @@ def fit_joint(
         raise ValueError(f"{n} regions of the down images and {len(up)} of the up images: one of each is needed a pair")
     h = np.broadcast_to(np.asarray(stroke_m, float), (n,))
     starts = [np.broadcast_to(np.asarray(start, float), (n, 2)) for start in (start_down_px, start_up_px)]
-    parts = [np.arange(i, min(i + _AT_ONCE, n)) for i in range(0, max(n, 1), _AT_ONCE)]
+    parts = [np.arange(i, min(i + AT_ONCE, n)) for i in range(0, max(n, 1), AT_ONCE)]
     with np.errstate(all="ignore"):
         fits = [_fit(rig, h[p], down.rows(p), up.rows(p), starts[0][p], starts[1][p]) for p in parts]
     return JointFit(*(np.concatenate([getattr(fit, f.name) for fit in fits]) for f in fields(JointFit)))
 
 
-def _fit(rig: Rig, h: Array, down: SpotRegions, up: SpotRegions, start_down: Array, start_up: Array) -> JointFit:
+def _fit(rig: Rig, h: Array, down: SpotData, up: SpotData, start_down: Array, start_up: Array) -> JointFit:
     first, second = _minima(down, start_down), _minima(up, start_up)
     best: Array | None = None
     for psi in _pairs(rig, h, first, second):
@@ -231,7 +112,7 @@ def _fit(rig: Rig, h: Array, down: SpotRegions, up: SpotRegions, start_down: Arr
 # -- one image -------------------------------------------------------------------------------------------------------
 
 
-def _minima(data: SpotRegions, start_px: Array) -> _Minima:
+def _minima(data: SpotData, start_px: Array) -> _Minima:
     """Where nine starts lead, the deepest first; several may be the same."""
     n, k = len(data), data.unknowns
     grid = START_PX * np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), -1).reshape(-1, 2)
@@ -239,55 +120,67 @@ def _minima(data: SpotRegions, start_px: Array) -> _Minima:
     theta = np.repeat(_guess(data, start_px), len(grid), axis=0)
     theta[:, :2] += np.tile(grid, (n, 1))
     for _ in range(_SCREENING_STEPS):
-        theta = _step(theta, *scores(many, theta))
-    value = misfit(many, theta).reshape(n, -1)
+        theta = _step(theta, *_scores(many, theta))
+    value = _misfit(many, theta).reshape(n, -1)
     order = np.argsort(value, axis=1)[:, :_BEST_MINIMA]
     each = np.arange(n)[:, None]
     best = theta.reshape(n, -1, k)[each, order]
     flat = data.rows(np.repeat(np.arange(n), order.shape[1]))
     polished = best.reshape(-1, k)
     for _ in range(_SCREENING_STEPS):
-        polished = _step(polished, *scores(flat, polished))
-    _, fisher = scores(flat, polished)
+        polished = _step(polished, *_scores(flat, polished))
+    _, fisher = _scores(flat, polished)
     shape = (n, order.shape[1])
     covariance = covariance_bound(fisher).reshape(*shape, 2, 2)
-    values = misfit(flat, polished).reshape(shape)
+    values = _misfit(flat, polished).reshape(shape)
     again = np.argsort(values, axis=1)
     return _Minima(polished.reshape(*shape, k)[each, again], covariance[each, again], values[each, again])
 
 
-def _guess(data: SpotRegions, start_px: Array) -> Array:
+def _guess(data: SpotData, start_px: Array) -> Array:
     """Position as given; background: median per level; flux: what is above it, three standard deviations at least."""
-    above, levels = data.x.copy(), []
-    for i in range(data.levels.shape[1]):
-        mask = data.used & (data.levels[:, i] > 0.0)
-        level = np.nanmedian(np.where(mask, data.x, np.nan), axis=(1, 2))
+    regions, pixels = data.regions, data.pixels
+    above, levels = regions.x_e.copy(), []
+    for i in range(pixels.levels.shape[1]):
+        mask = regions.used & (pixels.levels[:, i] > 0.0)
+        level = np.nanmedian(np.where(mask, regions.x_e, np.nan), axis=(1, 2))
         levels.append(np.nan_to_num(level))
-        above -= levels[-1][:, None, None] * data.levels[:, i]
-    share = np.sum(data.used * data.response, axis=(1, 2)) / np.maximum(np.sum(data.used, axis=(1, 2)), 1)
-    flux = np.maximum(np.sum(data.used * above * data.response, axis=(1, 2)) / np.maximum(share, 1e-6), 100.0)
+        above -= levels[-1][:, None, None] * pixels.levels[:, i]
+    seen = regions.used * pixels.response
+    share = np.sum(seen, axis=(1, 2)) / np.maximum(np.sum(regions.used, axis=(1, 2)), 1)
+    flux = np.maximum(np.sum(regions.used * above * pixels.response, axis=(1, 2)) / np.maximum(share, 1e-6), 100.0)
     return np.column_stack([start_px, flux, *levels])
+
+
+def _scores(data: SpotData, theta: Array) -> tuple[Array, Array]:
+    """Score, shape (n, k), and Fisher matrix, shape (n, k, k)."""
+    mean, derivatives = data.pixels.at(_in_region(data, theta))
+    n, k = theta.shape
+    weight = data.regions.used * data.law.information(mean)
+    flat = derivatives.reshape(n, k, -1)
+    weighted = flat * weight.reshape(n, 1, -1)
+    score = (weighted @ (data.regions.x_e - mean).reshape(n, -1, 1))[..., 0]
+    return score, weighted @ np.swapaxes(flat, 1, 2)
+
+
+def _misfit(data: SpotData, theta: Array) -> Array:
+    """-2 log likelihood, shape (n,); infinite where it is not finite."""
+    mean, _ = data.pixels.at(_in_region(data, theta))
+    value = np.sum(data.regions.used * data.law.misfit(data.regions.x_e, mean), axis=(1, 2))
+    return np.where(np.isfinite(value), value, np.inf)
+
+
+def _in_region(data: SpotData, theta: Array) -> Array:
+    """Unknowns with the position from the region's first pixel."""
+    return np.column_stack([theta[:, :2] - data.regions.origin_px, theta[:, 2:]])
 
 
 def _step(theta: Array, score: Array, fisher: Array) -> Array:
     """One limited step of Fisher scoring."""
-    step = _solved(fisher, score)
-    limit = np.minimum(1.0, _STEP_PX / np.maximum(np.abs(step[:, :2]).max(axis=1), 1e-300))
-    new = theta + limit[:, None] * step
-    new[:, 2] = np.maximum(new[:, 2], 0.1 * np.maximum(theta[:, 2], 1.0))
-    return np.where(np.isfinite(new), new, theta)
+    return limited(theta, scoring_step(fisher, score))
 
 
-def _solved(fisher: Array, score: Array) -> Array:
-    """Step of Fisher scoring; the diagonal a little larger, so that unknowns that nothing tells apart stop none."""
-    matrix = np.where(np.isfinite(fisher), fisher, 0.0)
-    diagonal = np.einsum("nkk->nk", matrix)
-    diagonal *= 1.0 + 1e-9
-    diagonal += 1e-12
-    return np.asarray(np.linalg.solve(matrix, np.nan_to_num(score)[..., None])[..., 0])
-
-
-# -- both images: psi = u, v, 1 / D, flux and levels of the down image, flux and levels of the up image ----------------
+# -- both images: psi = u, v, 1 / D, flux and levels of the down image, flux and levels of the up image --------------
 
 
 def _pairs(rig: Rig, h: Array, down: _Minima, up: _Minima) -> list[Array]:
@@ -315,12 +208,12 @@ def _split(rig: Rig, h: Array, psi: Array, k: int) -> tuple[Array, Array, Array,
     return down, np.column_stack([image.uv_px, psi[:, k + 1 :]]), image.jacobian, image.status
 
 
-def _joint_scores(rig: Rig, h: Array, down: SpotRegions, up: SpotRegions, psi: Array) -> tuple[Array, Array, Array]:
+def _joint_scores(rig: Rig, h: Array, down: SpotData, up: SpotData, psi: Array) -> tuple[Array, Array, Array]:
     """Score and Fisher matrix of psi by the chain rule, and the up position's derivatives."""
     k = down.unknowns
     theta_down, theta_up, G, _ = _split(rig, h, psi, k)
-    s1, F1 = scores(down, theta_down)
-    s2, F2 = scores(up, theta_up)
+    s1, F1 = _scores(down, theta_down)
+    s2, F2 = _scores(up, theta_up)
     A, B = np.zeros((len(psi), k, psi.shape[1])), np.zeros((len(psi), up.unknowns, psi.shape[1]))
     A[:, [0, 1], [0, 1]] = 1.0
     A[:, np.arange(2, k), np.arange(3, k + 1)] = 1.0
@@ -331,23 +224,22 @@ def _joint_scores(rig: Rig, h: Array, down: SpotRegions, up: SpotRegions, psi: A
     return score, At @ F1 @ A + Bt @ F2 @ B, G
 
 
-def _joint_misfit(rig: Rig, h: Array, down: SpotRegions, up: SpotRegions, psi: Array) -> Array:
+def _joint_misfit(rig: Rig, h: Array, down: SpotData, up: SpotData, psi: Array) -> Array:
     theta_down, theta_up, _, _ = _split(rig, h, psi, down.unknowns)
-    return misfit(down, theta_down) + misfit(up, theta_up)
+    return _misfit(down, theta_down) + _misfit(up, theta_up)
 
 
-def _polished(rig: Rig, h: Array, down: SpotRegions, up: SpotRegions, psi: Array) -> tuple[Array, BoolArray, Array]:
+def _polished(rig: Rig, h: Array, down: SpotData, up: SpotData, psi: Array) -> tuple[Array, BoolArray, Array]:
     """Go on until the step is small against the standard deviation; psi, whether it is, and the misfit."""
     psi, moving = psi.copy(), np.flatnonzero(np.isfinite(psi).all(axis=1))
     done = np.zeros(len(psi), bool)
-    for damping in _DAMPING:
+    for damping in DAMPING:
         if moving.size == 0:
             break
         score, fisher, G = _joint_scores(rig, h[moving], down.rows(moving), up.rows(moving), psi[moving])
-        step = _solved(fisher, score)
-        new = _limited(psi[moving], step, G, damping, down.unknowns)
-        small = np.sum(step * score, axis=1) < _DECREMENT
-        psi[moving] = np.where(np.isfinite(new), new, psi[moving])
+        step = scoring_step(fisher, score)
+        small = np.sum(step * score, axis=1) < DECREMENT
+        psi[moving] = _limited(psi[moving], step, G, damping, down.unknowns)
         done[moving[small]] = True
         moving = moving[~small]
     return psi, done, _joint_misfit(rig, h, down, up, psi)
@@ -355,17 +247,16 @@ def _polished(rig: Rig, h: Array, down: SpotRegions, up: SpotRegions, psi: Array
 
 def _limited(psi: Array, step: Array, G: Array, damping: float, k: int) -> Array:
     """Psi after a step that moves neither spot by more than half a pixel."""
-    moved = np.einsum("nij,nj->ni", np.nan_to_num(G), step[:, :3])
-    largest = np.maximum(np.abs(step[:, :2]).max(axis=1), np.abs(moved).max(axis=1))
-    new = psi + np.minimum(damping, _STEP_PX / np.maximum(largest, 1e-300))[:, None] * step
-    new[:, 2] = np.clip(new[:, 2], 0.5 * psi[:, 2], 2.0 * psi[:, 2])
-    for flux in (3, k + 1):
-        new[:, flux] = np.maximum(new[:, flux], 0.1 * np.maximum(psi[:, flux], 1.0))
+    up_px = np.einsum("nij,nj->ni", np.nan_to_num(G), step[:, :3])
+    largest = np.maximum(np.abs(step[:, :2]).max(axis=1), np.abs(up_px).max(axis=1))
+    new = limited(psi, step, damping, moved_px=largest, fluxes=(3, k + 1))
+    low, high = (change * psi[:, 2] for change in _INVERSE_DEPTH_CHANGE)
+    new[:, 2] = np.clip(new[:, 2], low, high)
     return new
 
 
 def _result(
-    rig: Rig, h: Array, down: SpotRegions, up: SpotRegions, psi: Array, converged: BoolArray, chi2: Array
+    rig: Rig, h: Array, down: SpotData, up: SpotData, psi: Array, converged: BoolArray, chi2: Array
 ) -> JointFit:
     k = down.unknowns
     theta_down, theta_up, G, geometry = _split(rig, h, psi, k)
@@ -389,7 +280,8 @@ def _result(
     return JointFit(depth, sigma, status, *rest)
 
 
-def _inside(data: SpotRegions, theta: Array) -> NDArray[np.bool_]:
-    h, w = data.x.shape[1:]
-    middle = data.origin_px + np.array([(w - 1) / 2, (h - 1) / 2])
+def _inside(data: SpotData, theta: Array) -> NDArray[np.bool_]:
+    """Whether the positions lie in their regions, shape (n,)."""
+    h, w = data.regions.x_e.shape[1:]
+    middle = data.regions.origin_px + np.array([(w - 1) / 2, (h - 1) / 2])
     return np.asarray((np.abs(theta[:, :2] - middle) <= np.array([w, h]) / 2).all(axis=1))

@@ -1,12 +1,12 @@
-"""Fit of a spot to the quantised coefficients of one JPEG window: a quasi-score through the processing.
+"""Fit of a spot to the quantised coefficients of a JPEG window, by a quasi-score through the processing.
 
 With m the mean and C the covariance of the quantiser's output, the estimating equation J^T C^-1 (z - m) = 0 is unbiased
 whatever the law of the output (R. W. M. Wedderburn, Biometrika 61, 439, 1974). Its covariance (J^T C^-1 J)^-1 is the
 smallest of estimates that know m and C only (`limits.processed_bound`). The quantiser of a Gaussian
 input gives m, and C_ij = g_i g_j C'_ij off the diagonal, g its mean slope and C' the input's covariance (J. J.
-Bussgang, 1952); a coefficient that is 0 whatever the noise has no slope and is left out.
+Bussgang, 1952). A coefficient that is 0 whatever the noise has no slope and is left out.
 
-Windows of decoded MJPEG images around spots: where they lie, what is in them, and the fit of each.
+A window is 2 x 2 JPEG units of a decoded region, with the spot nearest to its middle.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from scipy.linalg import solve_triangular
 
 from phibench.estimator.spots.chain_model import ChainModel, code_slopes, codes, noise_factor, raw_variance_e2
 from phibench.estimator.spots.code_statistics import CutPixels, cut_pixels
-from phibench.estimator.spots.gaussian_spot import SpotMeans
+from phibench.estimator.spots.fisher import limited, scoring_step
+from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
 from phibench.estimator.spots.jpeg_coefficients import mcu_px, quantised, recovered, room_variance
-from phibench.estimator.spots.spot_prediction import SpotBlur
 from phibench.scenes.frames import Array
 
 _LIVE = 2e-3  # variance of the output, in steps squared, from which a coefficient counts as one that changes
@@ -30,7 +30,7 @@ _LEAST = 1e-3  # and that is taken for one whose variance falls below it
 _FRESH = 5  # times that the covariance is computed
 _STEPS = 24  # of the fit in all; the covariance stays after `_FRESH` of them, so that the misfit can only fall
 _SCREENING_STEPS = 3
-_STEP_PX = 0.4
+_STEP_PX = 0.4  # shorter than on raw pixels: a coarse quantiser has plateaus
 _HALVINGS = 3
 _SMALL = 1e-4  # squared step in standard deviations at which the fit ends
 _REST = 1e-2  # and at which it has come to rest, if it ends for its number of steps
@@ -89,7 +89,7 @@ class JpegFit:
 
     Attributes
     ----------
-    theta : shape (k,), as `SpotMeans`
+    theta : shape (k,), as `SpotPixels`
     fisher : shape (k, k), J^T C^-1 J
     chi2 : float, r^T C^-1 r per degree of freedom
     converged : bool
@@ -107,18 +107,19 @@ class Window:
 
     Attributes
     ----------
-    z : shape (n,), quantised coefficients in the order of `jpeg_tables.coefficients`
+    z : shape (n,), quantised coefficients in the order of `jpeg_coefficients.coefficients`
     model : ChainModel
-    means : SpotMeans
+    pixels : SpotPixels
+        Of the one window and the raw pixels around it, r in all.
     extra_e2 : shape (r,) or float
-        Variance of the base image, electrons squared, which counts as noise of the raw pixels.
+        Variance of the background, electrons squared, which counts as noise of the raw pixels.
     room : shape (n,) or float
-        Variance of the base's coefficients by quantisation (`room_coefficients`).
+        Variance of the background's coefficients by quantisation (`room_variance`).
     """
 
     z: Array
     model: ChainModel
-    means: SpotMeans
+    pixels: SpotPixels
     extra_e2: Array | float = 0.0
     room: Array | float = 0.0
 
@@ -158,7 +159,8 @@ class Window:
 
     def _raw(self, theta: Array) -> tuple[CutPixels, Array]:
         """Raw pixels, shape (m, r), with full ones cut, and derivatives of their means, shape (m, k, r)."""
-        mean, derivatives = self.means.at(theta)
+        mean, derivatives = self.pixels.at(theta)
+        mean, derivatives = mean.reshape(len(theta), -1), derivatives.reshape(*theta.shape, -1)
         cut = cut_pixels(mean, raw_variance_e2(self.model, mean), self.model.card.saturation_e)
         return cut, derivatives * cut.slope[:, None, :]
 
@@ -195,7 +197,7 @@ def _best(window: Window, noise: Noise, starts: Array) -> Array:
     theta = starts
     if len(starts) > 1:
         for _ in range(_SCREENING_STEPS):
-            theta = _moved(theta, _newton(*window.residual(noise, theta)))
+            theta = _moved(window, theta, _newton(*window.residual(noise, theta)))
     r, _ = window.residual(noise, theta)
     return np.asarray(theta[np.argmin(np.einsum("ml,ml->m", r, r))])
 
@@ -205,7 +207,7 @@ def _descended(window: Window, noise: Noise, theta: Array, r: Array, J: Array) -
     step = _newton(r, J)
     length = float(np.sum((step[0] @ J[0]) ** 2))
     for halving in range(_HALVINGS + 1):
-        tried = _moved(theta[None], 0.5**halving * step)
+        tried = _moved(window, theta[None], 0.5**halving * step)
         new_r, new_J = window.residual(noise, tried)
         if new_r[0] @ new_r[0] <= r[0] @ r[0] * (1.0 + 1e-12):
             return tried[0], new_r, new_J, length
@@ -214,21 +216,15 @@ def _descended(window: Window, noise: Noise, theta: Array, r: Array, J: Array) -
 
 def _newton(r: Array, J: Array) -> Array:
     """Gauss-Newton steps, shape (m, k)."""
-    fisher = J @ np.swapaxes(J, 1, 2)
-    diagonal = np.einsum("mkk->mk", fisher)
-    diagonal *= 1.0 + 1e-9
-    diagonal += 1e-12
-    return np.asarray(np.linalg.solve(fisher, np.einsum("mkl,ml->mk", J, r)[..., None])[..., 0])
+    return scoring_step(J @ np.swapaxes(J, 1, 2), np.einsum("mkl,ml->mk", J, r))
 
 
-def _moved(theta: Array, step: Array) -> Array:
-    """Hypotheses after limited steps: positions by `_STEP_PX`, the flux not below a tenth, the width by a third."""
-    limit = np.minimum(1.0, _STEP_PX / np.maximum(np.abs(step[:, :2]).max(axis=1), 1e-300))
-    new = theta + limit[:, None] * step
-    new[:, 2] = np.maximum(new[:, 2], 0.1 * np.maximum(theta[:, 2], 1.0))
-    if theta.shape[1] > 6:
-        new[:, 6] = np.clip(new[:, 6], 0.7 * theta[:, 6], 1.4 * theta[:, 6]).clip(0.15, 6.0)
-    return np.where(np.isfinite(new), new, theta)
+def _moved(window: Window, theta: Array, step: Array) -> Array:
+    """Hypotheses after limited steps."""
+    return limited(theta, step, most_px=_STEP_PX, free_width=window.pixels.free_width)
+
+
+# -- windows of decoded images ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -240,22 +236,22 @@ class Region:
     image : shape (h, w, 3), uint8
     ends : 4 booleans
         Whether top, bottom, left and right side are the image's own.
-    base_e, extra_e2 : shape (h, w)
-        Base of the raw pixels, and the variance of its error.
+    background_e, extra_e2 : shape (h, w)
+        Background of the raw pixels, and the variance of its error.
     room : shape (h, w, 3), uint8, optional
-        Decoded frame without the laser that the base was taken from.
+        Decoded frame without the laser that the background was taken from.
     """
 
     image: NDArray[Any]
     ends: tuple[bool, bool, bool, bool]
-    base_e: Array
+    background_e: Array
     extra_e2: Array
     room: NDArray[Any] | None = None
 
 
-def window_at(region: Region, model: ChainModel, uv: Array) -> tuple[int, int]:
+def window_at(region: Region, chain: ChainModel, uv: Array) -> tuple[int, int]:
     """First row and column, in the region, of the 2 x 2 units that have (u, v) nearest to their middle."""
-    sides = mcu_px(model.card.jpeg_subsampling)
+    sides = mcu_px(chain.card.jpeg_subsampling)
     places = []
     for centre, unit, size in zip((uv[1], uv[0]), sides, region.image.shape[:2], strict=True):
         first = int(np.clip(np.rint((centre + 0.5) / unit) - 1, 0, size // unit - 2))
@@ -264,17 +260,19 @@ def window_at(region: Region, model: ChainModel, uv: Array) -> tuple[int, int]:
 
 
 def fit_region(
-    region: Region, model: ChainModel, starts: Array, blur: SpotBlur, free_width: bool, response: Any
+    region: Region, chain: ChainModel, starts: Array, blur: SpotBlur, model: SpotModel
 ) -> tuple[JpegFit, Array]:
     """Fit the spot of one region.
 
     Parameters
     ----------
+    region : Region
+    chain : ChainModel
     starts : shape (s, 6) or (s, 7)
-        u, v in the region, flux, levels on top of the base, width if it is free.
+        u, v in the region, flux, levels on top of the background, width if it is free.
     blur : SpotBlur
-    free_width, response
-        As `SpotMeans`.
+    model : SpotModel
+        Its background is not looked at; the region's is.
 
     Returns
     -------
@@ -283,18 +281,21 @@ def fit_region(
     shape (2,)
         Distance of (u, v) from the window's middle, in half windows: above 1 it lies outside.
     """
-    row, column = window_at(region, model, starts[0, :2])
-    (h, w), m = model.shape, model.margin
+    row, column = window_at(region, chain, starts[0, :2])
+    (h, w), m = chain.shape, chain.margin
     raw = (slice(row, row + h + 2 * m), slice(column, column + w + 2 * m))
-    base, extra = (np.pad(x, m, mode="reflect")[raw].ravel() for x in (region.base_e, region.extra_e2))
-    means = SpotMeans(model.filters, response, base, blur.sigma_px, blur.ratio, blur.mixed_px2, free_width)
+    background, extra = (np.pad(x, m, mode="reflect")[raw] for x in (region.background_e, region.extra_e2))
+    # the levels are fitted on top of the background
+    pixels = replace(
+        SpotPixels.of(chain.filters[None], blur, replace(model, background_e=None)), background_e=background[None]
+    )
     corner = np.array([column - m, row - m], float)
     shifted = starts.copy()
     shifted[:, :2] -= corner
     room: Array | float = 0.0
     if region.room is not None:
-        room = room_variance(coefficients_at(replace(region, image=region.room), model, row, column), model.step)
-    fit = fit_window(Window(coefficients_at(region, model, row, column), model, means, extra, room), shifted)
+        room = room_variance(coefficients_at(replace(region, image=region.room), chain, row, column), chain.step)
+    fit = fit_window(Window(coefficients_at(region, chain, row, column), chain, pixels, extra.ravel(), room), shifted)
     middle = np.array([(w - 1) / 2.0 + m, (h - 1) / 2.0 + m])
     off = np.abs(fit.theta[:2] - middle) / np.array([w / 2.0, h / 2.0])
     theta = fit.theta.copy()
@@ -302,9 +303,9 @@ def fit_region(
     return JpegFit(theta, fit.fisher, fit.chi2, fit.converged), off
 
 
-def coefficients_at(region: Region, model: ChainModel, row: int, column: int) -> Array:
+def coefficients_at(region: Region, chain: ChainModel, row: int, column: int) -> Array:
     """Quantised coefficients, shape (n,), of the window that begins at (row, column) of the region."""
-    card, (h, w) = model.card, model.shape
+    card, (h, w) = chain.card, chain.shape
     down, across = mcu_px(card.jpeg_subsampling)
     height, width = region.image.shape[:2]
     top, left = max(row - down, 0), max(column - across, 0)

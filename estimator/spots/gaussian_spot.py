@@ -1,15 +1,13 @@
-"""A Gaussian integrated over pixels, with its derivatives: one axis at a time, and oblique images of spots from them.
+"""Pixel model of a spot: Gaussians integrated over pixels, with derivatives by position, flux and width.
 
-Point-sampled Gaussians are biased below a blur of 0.5 px (27 mpx at 0.3 px), integrated ones are not.
-
-Mean electrons of raw pixels under a spot over a base: the model that goes through the processing.
-
-Unknowns: u, v, flux, one background level per colour filter, and, if it is free, the blur's sigma.
+A spot is an upright Gaussian, sigma along u and another along v, with a mixed second moment to first order. Pixels are
+integrated: point-sampled Gaussians are biased below a blur of 0.5 px (27 mpx at 0.3 px). Positions (u, v) count from
+the centre of a window's first pixel. Fluxes and levels are in electrons.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +15,66 @@ from scipy.special import ndtr
 
 from phibench.scenes.frames import Array
 
+LASER_RESPONSE = (1.0, 0.10, 0.03)  # of R, G, B at 650 nm, assumed: `scenes.camera.Detector`
 _ROOT_2PI = np.sqrt(2.0 * np.pi)
+
+
+@dataclass(frozen=True)
+class SpotBlur:
+    """Second moments of a spot's image, or of n spots' images.
+
+    Attributes
+    ----------
+    sigma_px : float or shape (n,), along u
+    ratio : float or shape (n,), sigma along v over it
+    mixed_px2 : float or shape (n,), mixed moment of u and v
+    """
+
+    sigma_px: float | Array
+    ratio: float | Array = 1.0
+    mixed_px2: float | Array = 0.0
+
+    @classmethod
+    def of(cls, moments_px2: Array) -> SpotBlur:
+        """From a covariance matrix, shape (2, 2)."""
+        sigma = np.sqrt(np.diag(moments_px2))
+        return cls(float(sigma[0]), float(sigma[1] / sigma[0]), float(moments_px2[0, 1]))
+
+    @property
+    def round_px(self) -> float:
+        """Sigma of a round spot with the same variance: root mean square of both axes; of one spot."""
+        return float(self.sigma_px * np.sqrt(0.5 * (1.0 + self.ratio**2)))
+
+    def each(self, n: int) -> SpotBlur:
+        """Blur of n spots, all attributes of shape (n,)."""
+        sigma, ratio, mixed = (
+            np.broadcast_to(np.asarray(value, float), n) for value in (self.sigma_px, self.ratio, self.mixed_px2)
+        )
+        return SpotBlur(sigma, ratio, mixed)
+
+    def rows(self, index: NDArray[np.int64]) -> SpotBlur:
+        """Blur of some of n spots."""
+        sigma, ratio, mixed = (np.asarray(value)[index] for value in (self.sigma_px, self.ratio, self.mixed_px2))
+        return SpotBlur(sigma, ratio, mixed)
+
+
+@dataclass(frozen=True)
+class SpotModel:
+    """What a fit knows of a spot besides its blur.
+
+    Attributes
+    ----------
+    response : 3 floats or None
+        Of the filters R, G, B at the laser's wavelength; None for pixels without filters.
+    background_e : shape (n, h, w) or (h, w), optional
+        Known background, dark current included; without it one level per filter is fitted.
+    free_width : bool
+        Fit the blur's sigma as well, from that of the `SpotBlur`.
+    """
+
+    response: tuple[float, float, float] | None = LASER_RESPONSE
+    background_e: Array | None = None
+    free_width: bool = False
 
 
 @dataclass(frozen=True)
@@ -56,15 +113,7 @@ def outer(down: Array, across: Array) -> Array:
     return down[:, :, None] * across[:, None, :]
 
 
-def spot_images(
-    place_px: Array,
-    flux: Array,
-    sigma_px: Array,
-    ratio: Array,
-    mixed_px2: Array,
-    shape: tuple[int, int],
-    by_width: bool = False,
-) -> Array:
+def spot_images(place_px: Array, flux: Array, blur: SpotBlur, shape: tuple[int, int], by_width: bool = False) -> Array:
     """Derivatives of spots' images by u, v, flux and, if asked for, sigma; shape (m, 3, h, w) or (m, 4, h, w).
 
     The image itself is the flux times its derivative by the flux.
@@ -73,15 +122,14 @@ def spot_images(
     ----------
     place_px : shape (m, 2), (u, v) from the first pixel's centre
     flux : shape (m,)
-    sigma_px : shape (m,), blur along u
-    ratio : shape (m,), sigma along v over it
-    mixed_px2 : shape (m,)
-        Mixed second moment of u and v, to first order: kappa d^2/du dv of the upright Gaussian.
+    blur : SpotBlur
+        Of m spots; the mixed moment kappa enters as kappa d^2/du dv of the upright Gaussian.
     shape : (h, w)
     by_width : bool
     """
     h, w = shape
-    across, down = profile(place_px[:, 0], sigma_px, w), profile(place_px[:, 1], ratio * sigma_px, h)
+    sigma, ratio, mixed = (np.asarray(value) for value in (blur.sigma_px, blur.ratio, blur.mixed_px2))
+    across, down = profile(place_px[:, 0], sigma, w), profile(place_px[:, 1], ratio * sigma, h)
     flux = flux[:, None]
     images = np.empty((len(place_px), 4 if by_width else 3, h, w))
     images[:, 0] = outer(flux * down.share, across.by_centre)
@@ -90,58 +138,81 @@ def spot_images(
     if by_width:
         images[:, 3] = outer(flux * ratio[:, None] * down.by_sigma, across.share)
         images[:, 3] += outer(flux * down.share, across.by_sigma)
-    if mixed_px2.any():
+    if mixed.any():
         # a second derivative by the centre is by_sigma / sigma (heat equation)
-        kappa, sigma, tall = mixed_px2[:, None], sigma_px[:, None], (ratio * sigma_px)[:, None]
-        images[:, 0] += outer(kappa * flux * down.by_centre, across.by_sigma / sigma)
+        kappa, wide, tall = mixed[:, None], sigma[:, None], (ratio * sigma)[:, None]
+        images[:, 0] += outer(kappa * flux * down.by_centre, across.by_sigma / wide)
         images[:, 1] += outer(kappa * flux * down.by_sigma / tall, across.by_centre)
         images[:, 2] += outer(kappa * down.by_centre, across.by_centre)
     return images
 
 
 @dataclass(frozen=True)
-class SpotMeans:
-    """A window of raw pixels, (h, w), r = h w.
+class SpotPixels:
+    """Mean electrons of the raw pixels of n windows with one spot each: flux x response x spot + background + level.
+
+    Unknowns theta, shape (m, k): u, v, flux, c levels and, if it is free, sigma. There is a row for each of the n
+    windows; of one window (n = 1) there may be any number m of hypotheses.
 
     Attributes
     ----------
-    filters : shape (h, w), 0, 1, 2 for R, G, B
-    response : 3 floats, of the filters at the laser's wavelength
-    base_e : shape (r,), what the levels add to
-    ratio : float
-        Sigma along v over sigma along u.
-    mixed_px2 : float
-        Mixed second moment of u and v, to first order: kappa d^2/du dv of the upright Gaussian.
-    sigma_px : float
-        Blur along u; where it is not free.
+    response : shape (n, h, w), of each pixel's filter
+    background_e : shape (n, h, w), known
+    levels : shape (n, c, h, w), 1 where a pixel has that level
+    blur : SpotBlur, of n spots
     free_width : bool
     """
 
-    filters: NDArray[np.int64]
-    response: tuple[float, float, float]
-    base_e: Array
-    sigma_px: float
-    ratio: float = 1.0
-    mixed_px2: float = 0.0
+    response: Array
+    background_e: Array
+    levels: Array
+    blur: SpotBlur
     free_width: bool = False
+
+    @classmethod
+    def of(cls, filters: NDArray[np.int64], blur: SpotBlur, model: SpotModel) -> SpotPixels:
+        """Model of windows whose pixels have these filters, shape (n, h, w), 0, 1, 2 for R, G, B.
+
+        Without filters (`model.response` None) there is one level. A known background leaves no level to fit.
+        """
+        n, *shape = filters.shape
+        weights = np.ones(1) if model.response is None else np.array(model.response)
+        kinds = filters if model.response is not None else np.zeros(filters.shape, np.int64)
+        known = np.zeros(filters.shape) if model.background_e is None else np.asarray(model.background_e, float)
+        levels = (kinds[:, None] == np.arange(len(weights))[:, None, None]).astype(float)
+        if model.background_e is not None:
+            levels = np.zeros((n, 0, *shape))
+        background = np.broadcast_to(known, filters.shape)
+        return cls(weights[kinds], background, levels, blur.each(n), model.free_width)
 
     @property
     def unknowns(self) -> int:
-        """How many."""
-        return 7 if self.free_width else 6
+        """Number of unknowns, 3 + c or 4 + c."""
+        return 3 + self.levels.shape[1] + int(self.free_width)
+
+    def rows(self, index: NDArray[np.int64]) -> SpotPixels:
+        """Model of some of the windows."""
+        return replace(
+            self,
+            response=self.response[index],
+            background_e=self.background_e[index],
+            levels=self.levels[index],
+            blur=self.blur.rows(index),
+        )
 
     def at(self, theta: Array) -> tuple[Array, Array]:
-        """Mean, shape (m, r), and derivatives, shape (m, k, r), for hypotheses, shape (m, k)."""
-        shape = (self.filters.shape[0], self.filters.shape[1])
-        sigma = theta[:, 6] if self.free_width else np.full(len(theta), self.sigma_px)
-        ratio, mixed = (np.full(len(theta), value) for value in (self.ratio, self.mixed_px2))
-        spots = spot_images(theta[:, :2], theta[:, 2], sigma, ratio, mixed, shape, self.free_width)
-        spots *= np.asarray(self.response)[self.filters]
-        derivatives = np.empty((len(theta), self.unknowns, *shape))
+        """Mean, shape (m, h, w), and its derivatives, shape (m, k, h, w)."""
+        h, w = self.response.shape[1:]
+        c = self.levels.shape[1]
+        blur = replace(self.blur, sigma_px=theta[:, -1]) if self.free_width else self.blur
+        spots = spot_images(theta[:, :2], theta[:, 2], blur, (h, w), self.free_width)
+        spots *= self.response[:, None]
+        derivatives = np.empty((*theta.shape, h, w))
         derivatives[:, :3] = spots[:, :3]
-        derivatives[:, 3:6] = self.filters == np.arange(3)[:, None, None]
+        derivatives[:, 3 : 3 + c] = self.levels
         if self.free_width:
-            derivatives[:, 6] = spots[:, 3]
-        flat = derivatives.reshape(len(theta), self.unknowns, -1)
-        levels = np.einsum("mc,mcr->mr", theta[:, 3:6], flat[:, 3:6])
-        return self.base_e + levels + theta[:, 2, None] * flat[:, 2], flat
+            derivatives[:, -1] = spots[:, 3]
+        below = self.background_e
+        for i in range(c):
+            below = below + theta[:, 3 + i, None, None] * self.levels[:, i]
+        return below + theta[:, 2, None, None] * spots[:, 2], derivatives

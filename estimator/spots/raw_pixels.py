@@ -1,16 +1,7 @@
-"""Raw pixels as an estimator sees them: electrons from DN, the filter of each pixel, the noise of each pixel.
+"""Raw pixels as an estimator sees them: electrons, filters, noise, the law of a reading, and the background of a spot.
 
-Integer (u, v) are pixel centres. RGGB: red at even row and even column of the image.
-
-Laws of one pixel's reading x, given its mean mu: what a likelihood fit needs to know of them.
-
-All values are in electrons; arrays are of shape (n, h, w): spot, row, column.
-
-Base image: the room behind a spot, in electrons of the raw pixels, with the variance of what is not known of it.
-
-Each of the mosaic's four phases is smoothed as strongly as its local variance allows (adaptive Wiener filter: J. S.
-Lim, "Two-Dimensional Signal and Image Processing", 1990, section 9.2): where the room is flat, the base has next to no
-noise.
+Conventions: integer (u, v) are pixel centres; RGGB, red at even row and even column of the image; values in electrons;
+arrays of regions have the shape (n, h, w): spot, row, column.
 """
 
 from __future__ import annotations
@@ -23,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.scenes.frames import Array
+from phibench.scenes.frames import Array, BoolArray
 
 
 @dataclass(frozen=True)
@@ -97,8 +88,67 @@ def bayer_filters(origin_px: ArrayLike, shape: tuple[int, int]) -> NDArray[np.in
     return v[:, :, None] + u[:, None, :]
 
 
+# -- regions and the law of their pixels -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SpotRegions:
+    """Raw pixels around n spots.
+
+    Attributes
+    ----------
+    x_e : shape (n, h, w), electrons; 0 where a reading is not finite
+    origin_px : shape (n, 2), image pixel (u, v) of the first column and row
+    used : shape (n, h, w), bool
+    finite : shape (n,), bool; whether all readings are
+    """
+
+    x_e: Array
+    origin_px: NDArray[np.int64]
+    used: BoolArray
+    finite: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.x_e)
+
+    def rows(self, index: NDArray[np.int64]) -> SpotRegions:
+        """Some of the regions."""
+        return SpotRegions(self.x_e[index], self.origin_px[index], self.used[index], self.finite[index])
+
+    @property
+    def filters(self) -> NDArray[np.int64]:
+        """Filter of each pixel of a mosaic, shape (n, h, w)."""
+        return bayer_filters(self.origin_px, (self.x_e.shape[1], self.x_e.shape[2]))
+
+
+def spot_regions(x_e: ArrayLike, origin_px: ArrayLike, used: ArrayLike = True) -> SpotRegions:
+    """Regions of some readings; what is not finite is left out.
+
+    Parameters
+    ----------
+    x_e : shape (n, h, w), electrons, black level off (`raw_electrons`)
+    origin_px : shape (2,) or (n, 2)
+        Image pixel (u, v) of the first column and row: where the mosaic's red pixels are.
+    used : bool, shape (n, h, w) or one that broadcasts to it
+        Pixels that are not left out, such as those below saturation.
+
+    Raises
+    ------
+    ValueError
+        If the readings have no shape (n, h, w) of 3 x 3 pixels or more.
+    """
+    x = np.asarray(x_e, float)
+    if x.ndim != 3 or min(x.shape[1:]) < 3:
+        raise ValueError(f"regions have the shape {x.shape}: (n, h, w) of 3 x 3 pixels or more is needed")
+    finite = np.isfinite(x)
+    origin = np.broadcast_to(np.asarray(origin_px, np.int64), (len(x), 2))
+    return SpotRegions(
+        np.where(finite, x, 0.0), origin, finite & np.asarray(used, bool), np.asarray(finite.all(axis=(1, 2)))
+    )
+
+
 class PixelLaw(Protocol):
-    """Score, information and misfit of pixels."""
+    """Law of one pixel's reading x, given its mean: score, information and misfit."""
 
     def rows(self, index: NDArray[np.int64]) -> PixelLaw:
         """Law of some of the spots."""
@@ -121,7 +171,7 @@ class GaussLaw:
     ----------
     noise : PixelNoise
     extra_e2 : float or shape (n, h, w)
-        Variance that does not depend on the mean, such as that of a base image.
+        Variance that does not depend on the mean, such as that of a background.
     """
 
     noise: PixelNoise
@@ -146,14 +196,16 @@ class GaussLaw:
         return np.asarray((x - mean) ** 2 * information - np.log(information))
 
 
+# -- background ------------------------------------------------------------------------------------------------------
+
 _SIGMA_PX = 2.5  # of the local mean, pixels of one phase: 5 pixels of the image
 _HIDDEN_PX = 5.0  # radius around the spot that the laser-on frame says nothing about
 _LEAST_WEIGHT = 1e-6
 
 
 @dataclass(frozen=True)
-class BaseImage:
-    """Base of n regions.
+class Background:
+    """Background of n regions: the room behind a spot, and what is not known of it.
 
     Attributes
     ----------
@@ -169,23 +221,27 @@ class BaseImage:
     image: NDArray[Any] | None = None
 
 
-def base_of(x_e: Array, variance_e2: Array, known: Array) -> BaseImage:
+def background_of(x_e: Array, variance_e2: Array, known: Array) -> Background:
     """Smooth images without the spot, or around it.
+
+    Each of the mosaic's four phases is smoothed as strongly as its local variance allows (adaptive Wiener filter: J. S.
+    Lim, "Two-Dimensional Signal and Image Processing", 1990, section 9.2). Where the room is flat, the background has
+    next to no noise.
 
     Parameters
     ----------
     x_e : shape (n, h, w), electrons of each pixel's own colour
     variance_e2 : shape (n, h, w), of its noise
     known : shape (n, h, w), 0 or 1
-        0 where the image says nothing about the base: what surrounds it is carried on, and its structure counts as
-        variance.
+        0 where the image says nothing about the background. What surrounds it is carried on, and its structure counts
+        as variance.
     """
     mean, variance = np.empty(x_e.shape), np.empty(x_e.shape)
     for row in (0, 1):
         for column in (0, 1):
             at = (slice(None), slice(row, None, 2), slice(column, None, 2))
             mean[at], variance[at] = _of_phase(x_e[at], variance_e2[at], np.asarray(known, float)[at])
-    return BaseImage(mean, variance)
+    return Background(mean, variance)
 
 
 def around(uv_px: Array, origin_px: Array, shape: tuple[int, int]) -> Array:

@@ -1,17 +1,17 @@
-"""Blur of a spot's image along u and along v, as the rig predicts it: lens, defocus with astigmatism, the beam's size.
+"""Prediction of a spot's image from the rig: its blur, and its electrons per second.
 
-The size matters: a spot of 4 mm at 1 m adds 0.02 to 0.05 px^2 to 0.5 px^2. A fit that leaves it out is off by up to
-0.04 px there, and by 0.01 px at 2 m, wherever a Bayer mosaic lets one or two pixels see most of the spot.
+Blur: second moments of lens, defocus with the mirror's astigmatism, and the beam's size. The size matters: a spot of
+4 mm at 1 m adds 0.02 to 0.05 px^2 to 0.5 px^2. A fit that leaves it out is off by up to 0.04 px there, and by 0.01 px
+at 2 m, wherever a Bayer mosaic lets one or two pixels see most of the spot.
 
-Electrons per second of a laser spot's image in the mirror, in closed form: radiance times etendue.
-
-A mirror keeps radiance but for its reflectance rho. A Lambertian spot of power P on a wall of albedo a has the
-radiance integral a P / pi over its area; its image covers |d(u, v) / d(wall)| square pixels per square metre, and a
-square pixel collects the etendue A cos(alpha) dOmega, alpha the chief ray's angle to the axis and A the aperture:
+Electrons: radiance times etendue, in closed form. A mirror keeps radiance but for its reflectance rho. A Lambertian
+spot of power P on a wall of albedo a has the radiance integral a P / pi over its area. Its image covers
+|d(u, v) / d(wall)| square pixels per square metre, and a square pixel collects the etendue A cos(alpha) dOmega, alpha
+the chief ray's angle to the axis and A the aperture:
 
     watts = rho(i) (a P / pi) |d(u, v) / d(wall)| A cos^4(alpha) |d(x, y) / d(u, v)|.
 
-The aperture is taken as a point; the spot layer's quadrature over it is the simulator's.
+The aperture is taken as a point; the quadrature over it is the simulator's (`render.optics.spot_layer`).
 """
 
 from __future__ import annotations
@@ -24,40 +24,14 @@ from numpy.typing import ArrayLike
 
 from phibench.estimator.geometry.mirror_image import MirrorImage, image_of
 from phibench.estimator.geometry.reflection import reflect
+from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig, View
 
 
-@dataclass(frozen=True)
-class SpotBlur:
-    """Second moments of a spot's image.
-
-    Attributes
-    ----------
-    sigma_px : float, along u
-    ratio : float, sigma along v over it
-    mixed_px2 : float, mixed moment of u and v
-    """
-
-    sigma_px: float
-    ratio: float = 1.0
-    mixed_px2: float = 0.0
-
-    @classmethod
-    def of(cls, moments_px2: Array) -> SpotBlur:
-        """From a covariance matrix."""
-        sigma = np.sqrt(np.diag(moments_px2))
-        return cls(float(sigma[0]), float(sigma[1] / sigma[0]), float(moments_px2[0, 1]))
-
-    @property
-    def round_px(self) -> float:
-        """Sigma of a round spot with the same variance: root mean square of both axes."""
-        return self.sigma_px * float(np.sqrt(0.5 * (1.0 + self.ratio**2)))
-
-
 def spot_blur(rig: Rig, uv_px: ArrayLike, depth_m: float | None = None, beam: Beam | None = None) -> SpotBlur:
-    """Blur that the rig predicts; the lens's alone where the pixel does not see the mirror.
+    """Blur of a spot's image by the rig; the lens's alone where the pixel does not see the mirror.
 
     The virtual images of a point at the distance s from the mirror lie 1 / (1/s + 2/(R cos i)) (tangential: along the
     radius from the mirror's centre) and 1 / (1/s + 2 cos(i)/R) (sagittal) behind it (Coddington's equations). A point
@@ -82,7 +56,7 @@ def spot_blur(rig: Rig, uv_px: ArrayLike, depth_m: float | None = None, beam: Be
 
 
 def _point_m(view: View, uv_px: Array, depth_m: float) -> Array | None:
-    """Where the ray of a pixel is so far from the mirror's axis, shape (3,); None where it never is."""
+    """Point at which the ray of a pixel is so far from the mirror's axis, shape (3,); None where it never is."""
     ray, axis = reflect(view, uv_px), view.sphere_centre_m[:2]
     start, along = ray.origin_world_m[:2] - axis, ray.direction_world[:2]
     a, b, c = along @ along, start @ along, start @ start - depth_m**2

@@ -13,7 +13,8 @@ from scipy import stats
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.limits.position_bound import limit_of
 from phibench.estimator.limits.processed_bound import chain_limit
-from phibench.estimator.spots.fit_raw import processed_fisher
+from phibench.estimator.spots.fisher import processed_fisher
+from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Region
 from phibench.render.sensor.moments import drawn_moments
@@ -92,7 +93,7 @@ def test_accuracy_of_the_chain_limit_against_drawn_moments() -> None:
         for half in ("a", "b")
     ]
     direct = np.sqrt(np.trace(np.linalg.inv(processed_fisher(slopes, C, draws))) / 2.0)
-    limit = chain_limit(card_of(s), uv, 0.7, flux_e, background_e * ROOM, pattern_known=True)
+    limit = chain_limit(card_of(s), uv, SpotBlur(0.7), flux_e, background_e * ROOM, pattern_known=True)
     model = np.sqrt(np.trace(np.linalg.inv(limit.fisher[:2, :2])) / 2.0)
     print(f"sRGB 8 bit, position alone: drawn {1e3 * direct:.2f} mpx, model {1e3 * model:.2f} mpx")
     assert 0.93 < model / direct < 1.07
@@ -109,6 +110,6 @@ def test_accuracy_of_the_srgb_limit_lies_above_the_raw_one() -> None:
     region = expected_of_light(scene(MIDDLE, 0.7, flux_e, 100.0, s), s.replace(output="raw"))
     fine = limit_of(derivative_images(region), exact_information(region.mean_e, raw.read_noise_e**2)).rms_px
     dark = s.dark_e_per_s * s.exposure_s
-    coded = chain_limit(card_of(s), MIDDLE, 0.7, flux_e, 100.0 * ROOM + dark).rms_px
+    coded = chain_limit(card_of(s), MIDDLE, SpotBlur(0.7), flux_e, 100.0 * ROOM + dark).rms_px
     assert SQUARE.shape == (17, 17)
     assert 1.0 < coded / fine < 1.15

@@ -13,7 +13,8 @@ from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.position_bound import NOISE_MODELS, spot_limit
 from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.spots.fit_chain import fit_jpeg, fit_srgb
-from phibench.estimator.spots.fit_raw import LASER_RESPONSE, fit_raw
+from phibench.estimator.spots.fit_raw import fit_raw
+from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel
 from phibench.estimator.spots.raw_pixels import PixelNoise
 from phibench.estimator.spots.simple_spots import SIMPLE_METHODS
 from phibench.render.sensor.camera_chain import Chain
@@ -41,7 +42,8 @@ def test_benchmark_fit_of_256_spots(benchmark, case: str) -> None:
     response = None if case == "mono" else LASER_RESPONSE
     background = np.full((13, 13), 100.0) if "known" in case else None
     x, noise = noisy(), PixelNoise(16.0)
-    fit = benchmark(lambda: fit_raw(x, (18, 18), noise, 0.7, response, background, free_width="free" in case))
+    model = SpotModel(response, background, "free" in case)
+    fit = benchmark(lambda: fit_raw(x, (18, 18), noise, SpotBlur(0.7), model))
     assert (fit.status == Status.OK).mean() > 0.99
 
 
@@ -68,8 +70,8 @@ def test_benchmark_fit_through_the_chain_of_a_pair(benchmark, preset: str) -> No
     light = scene(MIDDLE, 0.7, 5000.0 / COLLECTED, 100.0, s)
     frames = np.stack([Chain(s).frame(light, NoiseStream(("benchmark", k)), box) for k in range(2)])
     fit = fit_jpeg if preset == "mjpeg" else fit_srgb
-    fit(frames, (box.u0_px, box.v0_px), card_of(s), 0.7)  # tables of the card are computed once
-    assert (benchmark(lambda: fit(frames, (box.u0_px, box.v0_px), card_of(s), 0.7).status) == Status.OK).all()
+    fit(frames, (box.u0_px, box.v0_px), card_of(s), SpotBlur(0.7))  # tables of the card are computed once
+    assert (benchmark(lambda: fit(frames, (box.u0_px, box.v0_px), card_of(s), SpotBlur(0.7)).status) == Status.OK).all()
 
 
 @pytest.mark.benchmark(group="chain")
@@ -77,4 +79,4 @@ def test_benchmark_fit_through_the_chain_of_a_pair(benchmark, preset: str) -> No
 def test_benchmark_chain_limit(benchmark, preset: str) -> None:
     card = card_of(sensor(preset))
     levels = (100.0, 90.0, 60.0)
-    assert benchmark(lambda: chain_limit(card, (48.3, 32.2), 0.7, 5000.0 / COLLECTED, levels).rms_px) > 0
+    assert benchmark(lambda: chain_limit(card, (48.3, 32.2), SpotBlur(0.7), 5000.0 / COLLECTED, levels).rms_px) > 0

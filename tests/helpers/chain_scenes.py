@@ -11,6 +11,7 @@ from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.spots.fit_chain import fit_jpeg, fit_srgb
+from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.noise_tiles import NoiseStream
@@ -54,11 +55,11 @@ def drawn(s: Sensor, sigma_px: float, collected_e: float, background_e: float, p
         light = scene(uv, sigma_px, flux_e, background_e, s)
         chains = [Chain(s, cameras * k + j) for j in range(cameras)]
         frames = np.stack([c.frame(light, NoiseStream(("chain", k, j)), box) for j, c in enumerate(chains)])
-        fit = (fit_jpeg if s.output == "mjpeg" else fit_srgb)(frames, (box.u0_px, box.v0_px), card, sigma_px)
+        fit = (fit_jpeg if s.output == "mjpeg" else fit_srgb)(frames, (box.u0_px, box.v0_px), card, SpotBlur(sigma_px))
         good = fit.status == Status.OK
         failed += int((~good).sum())
         dark = s.dark_e_per_s * s.exposure_s
-        bound = chain_limit(card, uv, sigma_px, flux_e, background_e * ROOM + dark).covariance_px2
+        bound = chain_limit(card, uv, SpotBlur(sigma_px), flux_e, background_e * ROOM + dark).covariance_px2
         errors.append(fit.uv_px[good] - uv)
         bounds.append(np.tile(np.diag(bound), (int(good.sum()), 1)))
         pulls.append(errors[-1] / np.sqrt(np.diagonal(fit.covariance_px2[good], axis1=1, axis2=2)))

@@ -11,9 +11,10 @@ from phibench.datasets.exposures.expected import expected_of_light
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.limits.position_bound import spot_limit
-from phibench.estimator.spots.fit_joint import JointFit, SpotRegions, fit_joint, spot_regions
-from phibench.estimator.spots.fit_raw import LASER_RESPONSE, SpotFit, fit_raw
-from phibench.estimator.spots.raw_pixels import noise_of, raw_electrons
+from phibench.estimator.spots.fit_joint import JointFit, fit_joint
+from phibench.estimator.spots.fit_raw import SpotData, SpotFit, fit_raw, spot_data
+from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel
+from phibench.estimator.spots.raw_pixels import GaussLaw, noise_of, raw_electrons, spot_regions
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.noise_tiles import NoiseStream
@@ -24,6 +25,7 @@ from phibench.scenes.rig import Rig
 RIG = Rig()
 SIZE, BOX = (48, 48), Region.around(24.0, 24.0, (48, 48), 15)
 SIGMA_PX = 0.7
+BLUR = SpotBlur(SIGMA_PX)
 MONO = sensor("mono-raw", mono_weights=(1.0, 0.0, 0.0))
 BAYER = sensor("bayer-raw")
 COLLECTED = float(FILTERS @ (0.25, 0.5, 0.25))
@@ -49,12 +51,10 @@ class Pairs:
     down: Side
     up: Side
 
-    def regions(self, side: Side) -> SpotRegions:
-        card = card_of(self.sensor)
-        noise = noise_of(card)
-        return spot_regions(
-            side.electrons, side.origin_px, noise, SIGMA_PX, response_of(self.sensor), card.saturation_e
-        )
+    def regions(self, side: Side) -> SpotData:
+        card, x = card_of(self.sensor), side.electrons
+        regions = spot_regions(x, side.origin_px, x < card.saturation_e)
+        return spot_data(regions, GaussLaw(noise_of(card)), BLUR, SpotModel(response_of(self.sensor)))
 
     def separate(self, side: Side) -> SpotFit:
         card = card_of(self.sensor)
@@ -62,8 +62,8 @@ class Pairs:
             side.electrons,
             side.origin_px,
             noise_of(card),
-            SIGMA_PX,
-            response_of(self.sensor),
+            BLUR,
+            SpotModel(response_of(self.sensor)),
             saturation_e=card.saturation_e,
         )
 

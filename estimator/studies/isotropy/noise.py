@@ -22,7 +22,8 @@ from phibench.estimator.geometry.status import Status
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.limits.position_bound import spot_limit
 from phibench.estimator.spots.fit_raw import fit_law
-from phibench.estimator.spots.raw_pixels import GaussLaw, noise_of, raw_electrons
+from phibench.estimator.spots.gaussian_spot import SpotModel
+from phibench.estimator.spots.raw_pixels import GaussLaw, noise_of, raw_electrons, spot_regions
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.estimator.studies.misaligned_rigs import spot_of
 from phibench.render.optics.spot_layer import spot_layer
@@ -145,16 +146,8 @@ def _fitted(pair: Pair, i: int, sensor: Sensor, draws: int, names: tuple[str, ..
     )
     x, blur = raw_electrons(dn, card), spot_blur(pair.rig, (u, v), pair.depth_m, Beam())
     r, g, b = pair.rig.camera.detector.laser_filter_response
-    fit = fit_law(
-        x,
-        (region.u0_px, region.v0_px),
-        GaussLaw(noise_of(card)),
-        blur.sigma_px,
-        (r, g, b),
-        used=x < card.full_from_e,
-        ratio=blur.ratio,
-        mixed_px2=blur.mixed_px2,
-    )
+    regions = spot_regions(x, (region.u0_px, region.v0_px), x < card.full_from_e)
+    fit = fit_law(regions, GaussLaw(noise_of(card)), blur, SpotModel((r, g, b)))
     return np.where((fit.status == Status.OK)[:, None], fit.uv_px, np.nan)
 
 

@@ -25,13 +25,9 @@ from phibench.estimator.limits.position_bound import (
     raw_information,
     spot_limit,
 )
-from phibench.estimator.spots.fit_raw import (
-    covariance_bound,
-    fisher_matrix,
-    fit_raw,
-    hartlap_factor,
-    processed_fisher,
-)
+from phibench.estimator.spots.fisher import covariance_bound, fisher_matrix, hartlap_factor, processed_fisher
+from phibench.estimator.spots.fit_raw import fit_raw
+from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
 from phibench.estimator.spots.raw_pixels import PixelNoise, noise_of, raw_electrons
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light, Region
@@ -223,7 +219,7 @@ def test_accuracy_bound_of_a_saturated_spot_against_fits(s: Sensor, u: float, v:
     x = raw_electrons(dn, card)
     response = (1.0, 0.10, 0.03) if s.mosaic == "bayer" else None
     origin = (region.u0_px, region.v0_px)
-    fit = fit_raw(x, origin, noise_of(card), 0.7, response, saturation_e=card.full_from_e)
+    fit = fit_raw(x, origin, noise_of(card), SpotBlur(0.7), SpotModel(response), card.full_from_e)
     assert (fit.status == Status.OK).all()
     rms = np.sqrt(np.mean((fit.uv_px - [u, v]) ** 2))
     bound = spot_limit(region, card).rms_px

@@ -10,7 +10,8 @@ from helpers.sensor_light import spot_at
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.interface import Box, Pair
 from phibench.estimator.methods.chain_fit import chain_fit
-from phibench.estimator.spots.spot_prediction import SpotBlur, spot_blur
+from phibench.estimator.spots.gaussian_spot import SpotBlur
+from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light
 from phibench.render.sensor.noise_tiles import NoiseStream

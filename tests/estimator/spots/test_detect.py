@@ -34,7 +34,7 @@ from phibench.estimator.spots.detect import (
     mirror_box,
     outline_mask,
 )
-from phibench.estimator.spots.fit_raw import covariance_bound
+from phibench.estimator.spots.fisher import covariance_bound
 from phibench.estimator.spots.image_planes import colour_planes
 from phibench.render.optics.spot_layer import SpotLayer
 from phibench.render.sensor.camera_chain import Chain

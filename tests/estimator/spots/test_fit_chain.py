@@ -19,10 +19,9 @@ from phibench.estimator.spots.chain_model import chain_model, codes
 from phibench.estimator.spots.code_statistics import code_law, code_table
 from phibench.estimator.spots.fit_chain import fit_jpeg, fit_srgb, undone, unrounded
 from phibench.estimator.spots.fit_raw import fit_law
-from phibench.estimator.spots.gaussian_spot import SpotMeans
+from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
 from phibench.estimator.spots.jpeg_coefficients import coefficients, quantisation, quantised, recovered, steps
-from phibench.estimator.spots.raw_pixels import GaussLaw, PixelNoise, around, base_of, bayer_filters
-from phibench.estimator.spots.spot_prediction import SpotBlur
+from phibench.estimator.spots.raw_pixels import GaussLaw, PixelNoise, around, background_of, bayer_filters, spot_regions
 from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.noise_tiles import NoiseStream
@@ -37,9 +36,9 @@ def test_an_image_that_compression_has_emptied_has_no_spot() -> None:
     """Hardly any noise and coarse steps: no coefficient changes, so that there is nothing to fit; no error either."""
     card = card_of(sensor("mjpeg", jpeg_quality=1, read_noise_e=0.01, prnu=0.0, dsnu_e=0.0))
     flat = np.full((1, 48, 64, 3), 20, np.uint8)
-    fit = fit_jpeg(flat, (0, 0), card, 0.7)
+    fit = fit_jpeg(flat, (0, 0), card, SpotBlur(0.7))
     assert fit.status[0] == Status.NO_SPOT
-    assert not np.isfinite(chain_limit(card, (30.2, 22.7), 0.7, 50.0, (1.0, 1.0, 1.0)).covariance_px2).any()
+    assert not np.isfinite(chain_limit(card, (30.2, 22.7), SpotBlur(0.7), 50.0, (1.0, 1.0, 1.0)).covariance_px2).any()
 
 
 def test_tone_curve_against_the_simulators() -> None:
@@ -180,13 +179,13 @@ def test_fit_of_a_bright_spot(preset: str) -> None:
     uv = MIDDLE + [0.3, -0.4]
     light, box = scene(uv, 0.7, FLUX_E, 100.0, s), UNITS if preset == "mjpeg" else SQUARE
     frames = np.stack([Chain(s, k).frame(light, NoiseStream(("bright", k)), box) for k in range(4)])
-    fit = (fit_jpeg if preset == "mjpeg" else fit_srgb)(frames, (box.u0_px, box.v0_px), card_of(s), 0.7)
+    fit = (fit_jpeg if preset == "mjpeg" else fit_srgb)(frames, (box.u0_px, box.v0_px), card_of(s), SpotBlur(0.7))
     assert (fit.status == Status.OK).all()
     sd = np.sqrt(np.diagonal(fit.covariance_px2, axis1=1, axis2=2))
     assert (np.abs(fit.uv_px - uv) < 6.0 * sd).all()
     assert (sd < 0.06).all()
     np.testing.assert_allclose(fit.flux_e, FLUX_E, rtol=0.1)
-    limit = chain_limit(card_of(s), uv, 0.7, FLUX_E, 100.0 * ROOM)
+    limit = chain_limit(card_of(s), uv, SpotBlur(0.7), FLUX_E, 100.0 * ROOM)
     np.testing.assert_allclose(sd.mean(axis=0), np.sqrt(np.diag(limit.covariance_px2)), rtol=0.15)
 
 
@@ -204,12 +203,12 @@ def test_sharpening_and_matrix_are_undone() -> None:
     assert (np.abs(x[0] - photo)[inner] < 5.0 * np.sqrt(extra[0][inner]) + 0.5 / s.dn_per_e + 1.0).all()
 
 
-def test_base_of_a_flat_room_is_quiet_and_of_an_edge_is_kept() -> None:
+def test_background_of_a_flat_room_is_quiet_and_of_an_edge_is_kept() -> None:
     rng = generator("chain", "base")
     room = np.full((1, 48, 64), 400.0)
     room[:, :, 40:] = 1600.0
     variance = room + 16.0
-    base = base_of(room + rng.normal(size=room.shape) * np.sqrt(variance), variance, np.ones(room.shape))
+    base = background_of(room + rng.normal(size=room.shape) * np.sqrt(variance), variance, np.ones(room.shape))
     flat = (slice(None), slice(8, 40), slice(4, 24))
     assert np.std(base.mean_e[flat] - room[flat]) < 0.4 * np.sqrt(416.0)
     edge = (slice(None), slice(8, 40), slice(38, 42))
@@ -223,13 +222,13 @@ def test_base_of_a_flat_room_is_quiet_and_of_an_edge_is_kept() -> None:
 def test_messages() -> None:
     card, image = card_of(MJPEG), np.zeros((1, 32, 64, 3), np.uint8)
     with pytest.raises(ValueError, match="uint8 is needed"):
-        fit_srgb(image.astype(float), (0, 0), card, 0.7)
+        fit_srgb(image.astype(float), (0, 0), card, SpotBlur(0.7))
     with pytest.raises(ValueError, match="multiples of 16 x 8"):
-        fit_jpeg(image, (8, 8), card, 0.7)
+        fit_jpeg(image, (8, 8), card, SpotBlur(0.7))
     with pytest.raises(ValueError, match="needs 'bayer'"):
-        fit_srgb(image, (0, 0), card_of(sensor("srgb8", mosaic="mono")), 0.7)
+        fit_srgb(image, (0, 0), card_of(sensor("srgb8", mosaic="mono")), SpotBlur(0.7))
     with pytest.raises(ValueError, match="knows 'srgb8' and 'mjpeg'"):
-        chain_limit(card_of(sensor("bayer-raw")), (10.0, 10.0), 0.7, 1e4, (1.0, 1.0, 1.0))
+        chain_limit(card_of(sensor("bayer-raw")), (10.0, 10.0), SpotBlur(0.7), 1e4, (1.0, 1.0, 1.0))
     with pytest.raises(ValueError, match="1 to 100"):
         quantisation(0)
 
@@ -237,11 +236,11 @@ def test_messages() -> None:
 def test_nothing_there() -> None:
     light = scene(MIDDLE, 0.7, 1.0, 100.0, MJPEG)
     frame = Chain(MJPEG).frame(light, NoiseStream(("nothing",)), UNITS)
-    fit = fit_jpeg(frame[None], (UNITS.u0_px, UNITS.v0_px), card_of(MJPEG), 0.7)
+    fit = fit_jpeg(frame[None], (UNITS.u0_px, UNITS.v0_px), card_of(MJPEG), SpotBlur(0.7))
     assert fit.status[0] != Status.OK
     assert np.isnan(fit.uv_px).all()
-    assert fit_srgb(np.zeros((0, 17, 17, 3), np.uint8), (0, 0), card_of(SRGB), 0.7).uv_px.shape == (0, 2)
-    assert fit_jpeg(np.zeros((0, 16, 32, 3), np.uint8), (0, 0), card_of(MJPEG), 0.7).uv_px.shape == (0, 2)
+    assert fit_srgb(np.zeros((0, 17, 17, 3), np.uint8), (0, 0), card_of(SRGB), SpotBlur(0.7)).uv_px.shape == (0, 2)
+    assert fit_jpeg(np.zeros((0, 16, 32, 3), np.uint8), (0, 0), card_of(MJPEG), SpotBlur(0.7)).uv_px.shape == (0, 2)
 
 
 def oblique(centre: np.ndarray, moments: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
@@ -257,24 +256,22 @@ def test_means_and_derivatives_of_an_oblique_spot() -> None:
     """Mixed moment of 0.035 px^2 on 0.5: its second order is 0.5 (0.07)^2 = 0.25 % of the peak; the first is 7 %."""
     blur = SpotBlur.of(np.array([[0.515, 0.035], [0.035, 0.56]]))
     filters = bayer_filters(np.array([[0, 0]]), (14, 16))[0]
-    means = SpotMeans(
-        filters, (1.0, 0.1, 0.03), np.zeros(filters.size), blur.sigma_px, blur.ratio, blur.mixed_px2, True
-    )
+    pixels = SpotPixels.of(filters[None], blur, SpotModel((1.0, 0.1, 0.03), free_width=True))
     theta = np.array([[7.3, 6.6, 1e4, 100.0, 90.0, 60.0, blur.sigma_px]])
-    mean, derivatives = means.at(theta)
+    mean, derivatives = pixels.at(theta)
     exact = (
         1e4
         * np.array([1.0, 0.1, 0.03])[filters]
         * oblique(theta[0, :2], np.array([[0.515, 0.035], [0.035, 0.56]]), filters.shape)
     )
     level = np.array([100.0, 90.0, 60.0])[filters]
-    np.testing.assert_allclose(mean[0], (exact + level).ravel(), rtol=0, atol=0.004 * exact.max())
-    upright = replace(means, mixed_px2=0.0).at(theta)[0]
-    assert np.abs(upright[0] - (exact + level).ravel()).max() > 0.008 * exact.max()
+    np.testing.assert_allclose(mean[0], exact + level, rtol=0, atol=0.004 * exact.max())
+    upright = replace(pixels, blur=replace(pixels.blur, mixed_px2=np.zeros(1))).at(theta)[0]
+    assert np.abs(upright[0] - exact - level).max() > 0.008 * exact.max()
     for k, h in enumerate((1e-5, 1e-5, 1.0, 1.0, 1.0, 1.0)):  # the mixed term's change with the width is left out
         step = np.zeros(7)
         step[k] = h
-        difference = (means.at(theta + step)[0] - means.at(theta - step)[0])[0] / (2.0 * h)
+        difference = (pixels.at(theta + step)[0] - pixels.at(theta - step)[0])[0] / (2.0 * h)
         np.testing.assert_allclose(derivatives[0, k], difference, rtol=0, atol=1e-6 * np.abs(difference).max() + 1e-6)
 
 
@@ -286,8 +283,8 @@ def test_an_oblique_spot_is_not_biased() -> None:
         filters = bayer_filters(np.array([origin]), (15, 15))
         x = 1e4 * np.array([1.0, 0.1, 0.03])[filters] * oblique(np.array([7.2, 6.9]), moments, (15, 15)) + 100.0
         for share in worst:
-            law, kappa = GaussLaw(PixelNoise(18.0)), share * blur.mixed_px2
-            fit = fit_law(x, origin, law, blur.sigma_px, ratio=blur.ratio, mixed_px2=kappa)
+            shape = replace(blur, mixed_px2=share * blur.mixed_px2)
+            fit = fit_law(spot_regions(x, origin), GaussLaw(PixelNoise(18.0)), shape)
             worst[share] = max(worst[share], float(np.abs(fit.uv_px[0] - origin - [7.2, 6.9]).max()))
     print(worst)
     assert worst[1.0] < 0.003

@@ -16,8 +16,10 @@ from phibench.estimator.geometry.combine import combine, joint_sigma_m
 from phibench.estimator.geometry.mirror_image import image_of, up_image
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.estimator.spots.fit_joint import fit_joint, spot_regions
-from phibench.estimator.spots.raw_pixels import PixelNoise
+from phibench.estimator.spots.fit_joint import fit_joint
+from phibench.estimator.spots.fit_raw import spot_data
+from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
+from phibench.estimator.spots.raw_pixels import GaussLaw, PixelNoise, spot_regions
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 
@@ -214,7 +216,8 @@ def test_bad_regions_get_nan_and_a_status() -> None:
     origin = [np.rint(uv).astype(int) - 7 for uv in (down, up)]
     empty = rng.poisson(100.0, (2, 3, 15, 15)).astype(float)
     empty[0, 1, 4, 4] = np.nan  # one pixel is missing: it is left out
-    regions = [spot_regions(x, o, PixelNoise(16.0), 0.7, None) for x, o in zip(empty, origin, strict=True)]
+    law, blur, model = GaussLaw(PixelNoise(16.0)), SpotBlur(0.7), SpotModel(None)
+    regions = [spot_data(spot_regions(x, o), law, blur, model) for x, o in zip(empty, origin, strict=True)]
     fit = fit_joint(RIG, h, regions[0], regions[1], down, up)
     assert (fit.status != Status.OK).all()
     for values in (fit.depth_m, fit.sigma_m, fit.uv_down_px, fit.covariance_up_px2, fit.chi2):
@@ -227,4 +230,4 @@ def test_shapes_that_do_not_go_together_are_refused() -> None:
     with pytest.raises(ValueError, match="one of each is needed"):
         fit_joint(RIG, 0.5, down, up.rows(np.arange(3)), pairs.down.uv_px, pairs.up.uv_px)
     with pytest.raises(ValueError, match="3 x 3 pixels"):
-        spot_regions(np.zeros((2, 2)), (0, 0), PixelNoise(16.0), 0.7, None)
+        spot_regions(np.zeros((2, 2)), (0, 0))

@@ -17,8 +17,8 @@ from phibench.datasets.exposures.expected import expected_of_light
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.position_bound import spot_limit
-from phibench.estimator.spots.fit_raw import LASER_RESPONSE, SpotFit, fit_raw
-from phibench.estimator.spots.gaussian_spot import outer, profile
+from phibench.estimator.spots.fit_raw import SpotFit, fit_raw
+from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel, outer, profile
 from phibench.estimator.spots.raw_pixels import PixelNoise, bayer_filters, noise_of, raw_electrons
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light, Region
@@ -72,7 +72,9 @@ def fitted(dn: np.ndarray, s: Sensor, sigma_px: float) -> SpotFit:
     card = card_of(s)
     response = LASER_RESPONSE if s.mosaic == "bayer" else None
     origin = (BOX.u0_px, BOX.v0_px)
-    return fit_raw(raw_electrons(dn, card), origin, noise_of(card), sigma_px, response, saturation_e=card.saturation_e)
+    return fit_raw(
+        raw_electrons(dn, card), origin, noise_of(card), SpotBlur(sigma_px), SpotModel(response), card.saturation_e
+    )
 
 
 @pytest.mark.parametrize(
@@ -164,7 +166,13 @@ def phases() -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("free_width", [False, True])
 def test_perfect_regions_of_every_phase(free_width: bool) -> None:
     origin, uv = phases()
-    fit = fit_raw(perfect(uv, 0.8, 5000.0, 60.0, origin), origin, PixelNoise(16.0), 0.8, free_width=free_width)
+    fit = fit_raw(
+        perfect(uv, 0.8, 5000.0, 60.0, origin),
+        origin,
+        PixelNoise(16.0),
+        SpotBlur(0.8),
+        SpotModel(free_width=free_width),
+    )
     assert (fit.status == Status.OK).all()
     # the fit stops 1e-4 sd from the minimum, sd is about 0.03 px
     np.testing.assert_allclose(fit.uv_px, uv, rtol=0, atol=1e-5)
@@ -176,7 +184,7 @@ def test_perfect_regions_of_every_phase(free_width: bool) -> None:
 
 def test_a_wrong_phase_is_noticed() -> None:
     origin, uv = phases()
-    fit = fit_raw(perfect(uv, 0.8, 5000.0, 60.0, origin), origin + [1, 0], PixelNoise(16.0), 0.8)
+    fit = fit_raw(perfect(uv, 0.8, 5000.0, 60.0, origin), origin + [1, 0], PixelNoise(16.0), SpotBlur(0.8))
     good = fit.status == Status.OK
     assert (np.abs(fit.uv_px[good] - uv[good] - [1, 0]).max(axis=1) > 0.01).all()
     assert (fit.chi2[good] > 1.5).all()
@@ -184,7 +192,9 @@ def test_a_wrong_phase_is_noticed() -> None:
 
 def test_the_width_can_be_fitted_from_a_wrong_start() -> None:
     origin, uv = phases()
-    fit = fit_raw(perfect(uv, 1.1, 5000.0, 60.0, origin), origin, PixelNoise(16.0), 0.7, free_width=True)
+    fit = fit_raw(
+        perfect(uv, 1.1, 5000.0, 60.0, origin), origin, PixelNoise(16.0), SpotBlur(0.7), SpotModel(free_width=True)
+    )
     good = fit.status == Status.OK
     assert good.mean() > 0.95
     np.testing.assert_allclose(fit.sigma_px[good], 1.1, rtol=1e-3)
@@ -193,8 +203,8 @@ def test_the_width_can_be_fitted_from_a_wrong_start() -> None:
 def test_known_background() -> None:
     origin, uv = phases()
     x = perfect(uv, 0.8, 5000.0, 60.0, origin)
-    free = fit_raw(x, origin, PixelNoise(16.0), 0.8)
-    known = fit_raw(x, origin, PixelNoise(16.0), 0.8, background_e=np.full((13, 13), 60.0))
+    free = fit_raw(x, origin, PixelNoise(16.0), SpotBlur(0.8))
+    known = fit_raw(x, origin, PixelNoise(16.0), SpotBlur(0.8), SpotModel(background_e=np.full((13, 13), 60.0)))
     np.testing.assert_allclose(known.uv_px, uv, rtol=0, atol=1e-5)
     assert np.isnan(known.background_e).all()
     areas = (np.linalg.det(fit.covariance_px2) for fit in (known, free))
@@ -206,8 +216,8 @@ def test_saturated_pixels_are_left_out() -> None:
     x = perfect(uv, 0.8, 60_000.0, 60.0, origin)
     cut = np.minimum(x, 4000.0)
     assert (x > 4000.0).any(axis=(1, 2)).mean() > 0.9
-    aware = fit_raw(cut, origin, PixelNoise(16.0), 0.8, saturation_e=4000.0)
-    unaware = fit_raw(cut, origin, PixelNoise(16.0), 0.8)
+    aware = fit_raw(cut, origin, PixelNoise(16.0), SpotBlur(0.8), saturation_e=4000.0)
+    unaware = fit_raw(cut, origin, PixelNoise(16.0), SpotBlur(0.8))
     good = aware.status == Status.OK
     assert good.mean() > 0.9
     np.testing.assert_allclose(aware.uv_px[good], uv[good], rtol=0, atol=1e-4)
@@ -218,21 +228,21 @@ def test_bad_regions_get_nan_and_a_status() -> None:
     origin = np.zeros((4, 2), int)
     x = np.repeat(perfect(np.array([[6.2, 6.1]]), 0.8, 5000.0, 60.0, origin[:1]), 4, axis=0)
     x[1, 3, 3], x[2] = np.nan, 60.0
-    saturated = fit_raw(x[:1] + 1e6, origin[0], PixelNoise(16.0), 0.8, saturation_e=1e6)
-    fit = fit_raw(x, origin, PixelNoise(16.0), 0.8)
+    saturated = fit_raw(x[:1] + 1e6, origin[0], PixelNoise(16.0), SpotBlur(0.8), saturation_e=1e6)
+    fit = fit_raw(x, origin, PixelNoise(16.0), SpotBlur(0.8))
     assert [Status(k) for k in fit.status] == [Status.OK, Status.NOT_FINITE, Status.NO_SPOT, Status.OK]
     assert Status(saturated.status[0]) is Status.SATURATED
     for values in (fit.uv_px, fit.covariance_px2, fit.flux_e, fit.chi2):
         assert np.isnan(values[1:3]).all()
         assert np.isfinite(values[[0, 3]]).all()
-    assert fit_raw(x[:0], origin[:0], PixelNoise(16.0), 0.8).uv_px.shape == (0, 2)
+    assert fit_raw(x[:0], origin[:0], PixelNoise(16.0), SpotBlur(0.8)).uv_px.shape == (0, 2)
     with pytest.raises(ValueError, match="3 x 3 pixels"):
-        fit_raw(np.zeros((13, 13)), (0, 0), PixelNoise(16.0), 0.8)
+        fit_raw(np.zeros((13, 13)), (0, 0), PixelNoise(16.0), SpotBlur(0.8))
 
 
 def test_a_fit_does_not_depend_on_its_neighbours() -> None:
     origin, uv = phases()
     x = generator("fit", "alone").poisson(perfect(uv, 0.8, 2000.0, 60.0, origin)).astype(float)
-    together = fit_raw(x, origin, PixelNoise(16.0), 0.8)
-    alone = [fit_raw(x[i : i + 1], origin[i], PixelNoise(16.0), 0.8).uv_px[0] for i in range(0, 64, 9)]
+    together = fit_raw(x, origin, PixelNoise(16.0), SpotBlur(0.8))
+    alone = [fit_raw(x[i : i + 1], origin[i], PixelNoise(16.0), SpotBlur(0.8)).uv_px[0] for i in range(0, 64, 9)]
     np.testing.assert_allclose(together.uv_px[::9], alone, rtol=0, atol=1e-9)

@@ -15,8 +15,9 @@ from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Pair
 from phibench.estimator.methods.registry import METHODS
 from phibench.estimator.spots.fit_raw import fit_law
-from phibench.estimator.spots.raw_pixels import GaussLaw, bayer_filters, noise_of
-from phibench.estimator.spots.spot_prediction import SpotBlur, spot_blur
+from phibench.estimator.spots.gaussian_spot import SpotBlur
+from phibench.estimator.spots.raw_pixels import GaussLaw, bayer_filters, noise_of, spot_regions
+from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.estimator.studies.image_cutout import Shot, SpotPair, cut_region, cut_rig, taken, without_off
 from phibench.render.optics.spot_layer import SpotLayer, spot_layer
 from phibench.render.sensor.settings import sensor
@@ -70,9 +71,7 @@ def test_fit_of_noise_free_spots(depth_m: float, without_mpx: float) -> None:
         x = np.take_along_axis(light, filters, axis=0) + room
         for known, errors in (((depth_m, beam), with_size), ((), without)):
             blur = spot_blur(rig, uv, *known)
-            fit = fit_law(
-                x, corner, GaussLaw(noise_of(card)), blur.sigma_px, ratio=blur.ratio, mixed_px2=blur.mixed_px2
-            )
+            fit = fit_law(spot_regions(x, corner), GaussLaw(noise_of(card)), blur)
             errors.append(1e3 * np.abs(fit.uv_px[0] - uv).max())
     assert max(with_size) < 3.0
     assert max(without) > without_mpx
