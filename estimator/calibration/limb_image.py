@@ -29,7 +29,7 @@ from scipy import ndimage
 from scipy.signal import fftconvolve
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.spots.image_planes import ImageError
+from phibench.estimator.spots.image_planes import ImageError, srgb_to_linear
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig
@@ -37,7 +37,6 @@ from phibench.scenes.rig import Rig
 JPEG_LUMA = (0.299, 0.587, 0.114)  # JPEG's (ITU-R BT.601): errors of its coarse chroma cancel in this sum
 _CLIPPED = 250  # of 255: JPEG moves clipped pixels by some codes
 _NEAR_FULL = 0.97
-_SRGB_KNEE, _SRGB_SLOPE = 0.04045, 12.92  # IEC 61966-2-1
 
 
 @dataclass(frozen=True)
@@ -121,7 +120,7 @@ def _raw(image: NDArray[Any], card: SensorCard) -> tuple[Plane, ...]:
 
 def _luma(image: NDArray[Any], card: SensorCard) -> Plane:
     """Luma of the linear, white-balanced planes. It is a filter's own light only where the colour matrix is one."""
-    linear = srgb_decoded(np.asarray(image, float) / 255.0)
+    linear = srgb_to_linear(np.asarray(image, float) / 255.0)
     values = linear @ np.array(JPEG_LUMA)
     clipped = ndimage.binary_dilation((image >= _CLIPPED).any(axis=-1), iterations=2)
     level = np.median(linear.reshape(-1, 3), axis=0) * np.array(JPEG_LUMA)
@@ -129,18 +128,6 @@ def _luma(image: NDArray[Any], card: SensorCard) -> Plane:
     share = level / level.sum() if level.sum() > 0.0 else np.array(JPEG_LUMA)
     taps = [_merged(_luma_taps(parity, share, card)) for parity in range(4)]
     return Plane(values, ~clipped, (taps[0], taps[1], taps[2], taps[3]))
-
-
-def srgb_decoded(encoded: Array) -> Array:
-    """Linear values in [0, 1] of sRGB values in [0, 1] (IEC 61966-2-1)."""
-    x = np.clip(np.asarray(encoded, float), 0.0, 1.0)
-    return np.where(x <= _SRGB_KNEE, x / _SRGB_SLOPE, ((x + 0.055) / 1.055) ** 2.4)
-
-
-def srgb_encoded(linear: Array) -> Array:
-    """sRGB curve of linear values, cut to [0, 1]; the inverse of `srgb_decoded`."""
-    x = np.clip(np.asarray(linear, float), 0.0, 1.0)
-    return np.where(x <= _SRGB_KNEE / _SRGB_SLOPE, x * _SRGB_SLOPE, 1.055 * x ** (1.0 / 2.4) - 0.055)
 
 
 _CROSS = tuple((0.25, du, dv) for du, dv in ((-1, 0), (1, 0), (0, -1), (0, 1)))

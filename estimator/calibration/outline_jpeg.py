@@ -8,24 +8,21 @@ Luma blocks are independent of each other: only the units that the pixels lie in
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.calibration.limb_image import JPEG_LUMA, srgb_decoded, srgb_encoded
+from phibench.estimator.calibration.limb_image import JPEG_LUMA
 from phibench.estimator.calibration.outline_fit import OutlinePixels
-from phibench.estimator.spots.chain_model import full_scale_e
+from phibench.estimator.spots.image_planes import full_scale_e, linear_to_srgb, srgb_to_linear, through_jpeg
 from phibench.estimator.spots.jpeg_coefficients import mcu_px
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 
 _ROW = 40  # units side by side in the picture that is compressed
-_SUBSAMPLING = {"4:4:4": 0, "4:2:2": 1, "4:2:0": 2}  # Pillow's numbers
 
 
 @dataclass(frozen=True)
@@ -81,14 +78,15 @@ class JpegAgain:
         factor = np.ones(self.frame.shape[:2])
         with np.errstate(all="ignore"):
             factor[self.pixels.v, self.pixels.u] = np.clip(np.nan_to_num(model / self.pixels.y, nan=1.0), 0.25, 4.0)
-        linear = srgb_decoded(self.frame[units.v, units.u] / 255.0) * factor[units.v, units.u][..., None]
+        linear = srgb_to_linear(self.frame[units.v, units.u] / 255.0) * factor[units.v, units.u][..., None]
         return np.array([self._seen(units, linear, k) for k in range(draws)])
 
     def _seen(self, units: Units, linear: Array, draw: int) -> Array:
         rng = generator("calibration", "outline_jpeg", draw)
         light = linear[:, 1:-1, 1:-1] + _noise(linear, units, self.card, rng)
-        codes = np.rint(255.0 * srgb_encoded(light)).astype(np.uint8)
-        decoded = srgb_decoded(_compressed(_packed(codes, units.rows), self.card).reshape(-1, 3)[units.place] / 255.0)
+        codes = np.rint(255.0 * linear_to_srgb(light)).astype(np.uint8)
+        image = through_jpeg(_packed(codes, units.rows), self.card)
+        decoded = srgb_to_linear(image.reshape(-1, 3)[units.place] / 255.0)
         return np.asarray(decoded @ np.array(JPEG_LUMA) / self.pixels.ray[:, 2] ** 4)
 
 
@@ -116,11 +114,3 @@ def _packed(codes: NDArray[np.uint8], rows: int) -> NDArray[np.uint8]:
     whole = np.full((rows * _ROW, h, w, 3), 128, np.uint8)
     whole[:T] = codes
     return whole.reshape(rows, _ROW, h, w, 3).transpose(0, 2, 1, 3, 4).reshape(rows * h, _ROW * w, 3)
-
-
-def _compressed(image: NDArray[np.uint8], card: SensorCard) -> NDArray[np.uint8]:
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(
-        buffer, "JPEG", quality=card.jpeg_quality, subsampling=_SUBSAMPLING[card.jpeg_subsampling]
-    )
-    return np.asarray(Image.open(buffer))

@@ -12,7 +12,6 @@ For trying a method, not for ranking it: no lamp, no stripe, no shadow, and the 
 
 from __future__ import annotations
 
-import io
 import math
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, lru_cache
@@ -20,7 +19,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image as Pillow
 
 from phibench.datasets.exposures.expected import ExpectedRegion
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
@@ -32,7 +30,7 @@ from phibench.estimator.methods.locate import around, clipped
 from phibench.estimator.pair_set import PairTruth, SpotTruth
 from phibench.estimator.sandbox.resolve import MethodError
 from phibench.estimator.spots.gaussian_spot import outer, profile
-from phibench.estimator.spots.image_planes import KINDS, linear_planes, linear_to_srgb
+from phibench.estimator.spots.image_planes import KINDS, linear_planes, linear_to_srgb, through_jpeg
 from phibench.estimator.spots.raw_pixels import bayer_filters
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.scenes.camera import Camera
@@ -172,7 +170,7 @@ class EasyCamera:
         planes = linear_planes(dn, _raw(self.card)).astype(np.float32)  # a power of half the bytes takes half the time
         planes = np.repeat(planes, 3, axis=0) if len(planes) == 1 else planes
         image = np.rint(255.0 * np.moveaxis(linear_to_srgb(planes), 0, -1)).astype(np.uint8)
-        return _through_jpeg(image, self.card) if self.card.output == "mjpeg" else image
+        return through_jpeg(image, self.card) if self.card.output == "mjpeg" else image
 
 
 @lru_cache(maxsize=2)
@@ -196,12 +194,6 @@ def _pattern(shape: tuple[int, int]) -> NDArray[np.float32]:
 
 def _raw(card: SensorCard) -> SensorCard:
     return replace(card, output="raw")
-
-
-def _through_jpeg(image: NDArray[np.uint8], card: SensorCard) -> NDArray[np.uint8]:
-    file = io.BytesIO()
-    Pillow.fromarray(image).save(file, "JPEG", quality=card.jpeg_quality, subsampling=card.jpeg_subsampling)
-    return np.array(Pillow.open(file))
 
 
 BOX_PX = 64

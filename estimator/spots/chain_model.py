@@ -4,8 +4,8 @@ The stages, for a window of whole JPEG units and the raw pixels around it:
 
 * raw pixels: independent, mean and variance in electrons, cut at saturation;
 * bilinear demosaicing, white balance, colour matrix: a sparse matrix A on electrons;
-* sRGB curve and 8 bits: mean and slope under the noise, from the converter's law (`code_means`), or, where a colour
-  matrix or sharpening mixes the pixels, of a Gaussian value (`tone_curve.noisy`);
+* sRGB curve and 8 bits: mean and slope under the noise, from the converter's law (`mean_codes`), or, where a colour
+  matrix or sharpening mixes the pixels, of a Gaussian value (`noisy_srgb`);
 * sharpening, Y Cb Cr, chroma averages, DCT: a matrix T.
 
 Covariance of the coefficients: (T D A) V (T D A)^T with the slopes D, plus what rounding adds.
@@ -22,7 +22,7 @@ from scipy import sparse
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.spots.code_statistics import COUNTS, MeanCodes, mean_codes
-from phibench.estimator.spots.image_planes import noisy
+from phibench.estimator.spots.image_planes import full_scale_e, noisy_srgb
 from phibench.estimator.spots.jpeg_coefficients import CHROMA_STEP, YCC_FROM_RGB, coefficients, mcu_px, steps, transform
 from phibench.estimator.spots.raw_pixels import PixelNoise, bayer_filters
 from phibench.scenes.frames import Array
@@ -133,7 +133,7 @@ def codes(model: ChainModel, mean_e: Array) -> Codes:
     linear = _apply(model.linear, mean_e)
     if model.tables is None:
         sigma = np.sqrt(_apply(model.squared, raw_variance_e2(model, mean_e)))
-        n = noisy(linear, sigma)
+        n = noisy_srgb(linear, sigma)
         excess = np.maximum(n.variance - (n.by_mean * sigma) ** 2, 0.0)
         return Codes(255.0 * n.mean, 255.0 * n.by_mean, 255.0 * n.by_mean, 255.0**2 * excess + _ROUNDING)
     gain = np.repeat(full_scale_e(model.card) / np.asarray(model.card.white_balance), linear.shape[-1] // 3)
@@ -163,11 +163,6 @@ def noise_factor(model: ChainModel, at: Codes, variance_e2: Array, transform: Ar
     """
     spread = sparse.diags_array(at.regression) @ model.linear @ sparse.diags_array(np.sqrt(variance_e2))
     return np.asarray(sparse.csr_array(spread.T) @ transform)
-
-
-def full_scale_e(card: SensorCard) -> float:
-    """Electrons of linear light 1."""
-    return (card.top_dn - card.black_level_dn) / card.dn_per_e
 
 
 def _apply(matrix: sparse.csr_array, values: Array) -> Array:

@@ -32,7 +32,7 @@ from scipy.special import log_ndtr, ndtr
 from scipy.stats import poisson
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.spots.image_planes import encoded
+from phibench.estimator.spots.image_planes import linear_to_srgb
 from phibench.estimator.spots.raw_pixels import PixelNoise
 from phibench.scenes.frames import Array
 
@@ -69,7 +69,9 @@ def code_table(card: SensorCard) -> CodeTable:
     """
     dn = np.arange(card.top_dn + 1)
     linear = np.asarray((dn - card.black_level_dn) / (card.top_dn - card.black_level_dn), float)
-    rows = [_ends(np.rint(255.0 * encoded(gain * linear)).astype(int), card.top_dn) for gain in card.white_balance]
+    rows = [
+        _ends(np.rint(255.0 * linear_to_srgb(gain * linear)).astype(int), card.top_dn) for gain in card.white_balance
+    ]
     low, high = ((np.array(x) - card.black_level_dn) / card.dn_per_e for x in zip(*rows, strict=True))
     well = card.saturation_e - _WELL_SIGMAS * np.sqrt(card.read_noise_e**2 + card.dsnu_e**2)
     full = high > well
@@ -272,7 +274,7 @@ def _moments(mu: float, card: SensorCard, noise: PixelNoise) -> Array:
         x = first + np.arange(len(chance)) / count - card.black_level_dn  # DN above black
         p = chance / chance.sum()
         linear = x / (card.top_dn - card.black_level_dn)
-        y = np.stack([np.rint(255.0 * encoded(gain * linear)) for gain in card.white_balance])
+        y = np.stack([np.rint(255.0 * linear_to_srgb(gain * linear)) for gain in card.white_balance])
         mean = y @ p
         dx = x - x @ p
         variance = dx**2 @ p

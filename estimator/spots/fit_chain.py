@@ -21,7 +21,7 @@ from phibench.estimator.spots.fisher import covariance_bound
 from phibench.estimator.spots.fit_jpeg import JpegFit, Region, fit_region
 from phibench.estimator.spots.fit_raw import LEAST_SNR, SpotFit, fit_law
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
-from phibench.estimator.spots.image_planes import decoded, slope
+from phibench.estimator.spots.image_planes import full_scale_e, srgb_slope, srgb_to_linear
 from phibench.estimator.spots.jpeg_coefficients import mcu_px
 from phibench.estimator.spots.raw_pixels import (
     Background,
@@ -235,11 +235,10 @@ def undone(images: NDArray[Any], filters: NDArray[np.int64], card: SensorCard) -
     card : SensorCard
     """
     code = _unsharpened(np.asarray(images, float), card.sharpen_amount) / 255.0
-    linear = decoded(code)
-    width = 1.0 / (255.0 * np.maximum(slope(np.clip(linear, 0.0, 1.0)), 1e-3))
+    linear = srgb_to_linear(code)
+    width = 1.0 / (255.0 * np.maximum(srgb_slope(np.clip(linear, 0.0, 1.0)), 1e-3))
     inverse = np.linalg.inv(np.asarray(card.colour_matrix)) / np.asarray(card.white_balance)[:, None]
-    full_scale_e = (card.top_dn - card.black_level_dn) / card.dn_per_e
-    own = inverse[filters] * full_scale_e  # (n, h, w, 3): row of the inverse for the pixel's filter
+    own = inverse[filters] * full_scale_e(card)  # (n, h, w, 3): row of the inverse for the pixel's filter
     return np.sum(own * linear, axis=3), np.sum((own * width) ** 2, axis=3) / 12.0
 
 

@@ -1,26 +1,27 @@
-"""An image of any output as planes of linear electrons, one per colour filter, for what looks for a spot in it.
+"""Linear light of camera images: the sRGB curve, demosaicing, JPEG and colour planes on the estimator's side.
 
-Raw pixels stay where they are: a mosaic's plane holds values at its own sites and zeros elsewhere. 8-bit images go back
-through the sRGB curve, the colour matrix and the white balance; their pixels are interpolated, so that their noise is
-correlated and only roughly what `variance` says: what uses it calibrates it on the image.
+Images are as a camera delivers them: raw DN of a mosaic or of pixels without filters, or 8-bit R, G, B.
 
-Linear light of an image as a camera delivers it, raw or 8 bits; and which kind of image it is.
+* `linear_planes`: linear sRGB, shape (3, h, w), full scale 1 before gains. A grey room under the camera's own white
+  balance has three equal planes. A sensor without filters has one plane, shape (1, h, w).
+* `colour_planes`: electrons behind each filter, for the search of spots. Raw pixels stay where they are: a mosaic's
+  plane holds values at its own sites and zeros elsewhere. 8-bit images go back through the sRGB curve, the colour
+  matrix and the white balance. Their pixels are interpolated, so that their noise is correlated and only roughly what
+  `variance_e2` says: what uses it calibrates it on the image.
 
-Planes stand first, shape (3, h, w): linear sRGB, in which a grey room under the camera's own white balance has three
-equal planes. A sensor without filters has one plane, shape (1, h, w).
-
-The sRGB curve (IEC 61966-2-1) as an estimator needs it: forwards, backwards, and of a noisy value.
+The simulator has its own curve, demosaicing and JPEG (`render.sensor.processing`); tests compare the two.
 """
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image as PillowImage
+from PIL import Image as Picture
 from PIL import UnidentifiedImageError
 
 from phibench.datasets.errors import DatasetError
@@ -29,12 +30,171 @@ from phibench.estimator.interface import Box, Image
 from phibench.estimator.spots.raw_pixels import bayer_filters, raw_electrons
 from phibench.scenes.frames import Array, BoolArray
 
+KINDS = ("bayer-raw", "mono-raw", "srgb8", "mjpeg")
+RAW = KINDS[:2]
+PROCESSED = KINDS[2:]
+
 _TOP_CODE = 254  # of 8 bits: from here on a pixel may be cut
 _DEMOSAIC_VARIANCE_PX2 = 0.5  # of bilinear interpolation's kernel (1/2, 1, 1/2), per axis
+_KNEE, _SLOPE = 0.0031308, 12.92  # of the sRGB curve's straight part
+_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
+_WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
 
 
 class ImageError(DatasetError):
     """An image that cannot be used; the message is one sentence for the person at the terminal."""
+
+
+# -- kinds and files -------------------------------------------------------------------------------------------------
+
+
+def kind_of(card: SensorCard) -> str:
+    """One of `KINDS`, or the card's output if it is none of them."""
+    return f"{card.mosaic}-raw" if card.output == "raw" else card.output
+
+
+def read_picture(path: Path) -> tuple[NDArray[np.uint8], SensorCard]:
+    """Image, shape (H, W, 3), of a PNG or JPEG file, with the card of its kind.
+
+    Raises
+    ------
+    ImageError
+        If the file is no colour picture of 8 bits.
+    """
+    try:
+        with Picture.open(path) as picture:
+            kind, mode = picture.format, picture.mode
+            pixels = np.asarray(picture.convert("RGB"))
+    except (UnidentifiedImageError, SyntaxError, EOFError) as error:
+        raise ImageError(f"{path} is not a picture: give a PNG or JPEG file of the camera") from error
+    if mode not in ("RGB", "RGBA") or kind not in ("PNG", "JPEG"):
+        raise ImageError(f"{path} is a {kind} file of mode {mode}: give the camera's colour frame as PNG or JPEG")
+    return pixels, sensor_card("mjpeg" if kind == "JPEG" else "srgb8")
+
+
+def through_jpeg(image: NDArray[np.uint8], card: SensorCard) -> NDArray[np.uint8]:
+    """Image, shape (H, W, 3), after the card's JPEG, by libjpeg."""
+    file = io.BytesIO()
+    Picture.fromarray(image).save(file, "JPEG", quality=card.jpeg_quality, subsampling=card.jpeg_subsampling)
+    return np.array(Picture.open(file))
+
+
+# -- sRGB curve, IEC 61966-2-1 ---------------------------------------------------------------------------------------
+
+
+def linear_to_srgb(linear: NDArray[Any]) -> NDArray[Any]:
+    """sRGB values in [0, 1] of linear light, cut to [0, 1]; any shape."""
+    x = np.clip(linear, 0.0, 1.0)
+    return np.asarray(np.where(x <= _KNEE, _SLOPE * x, 1.055 * x ** (1.0 / 2.4) - 0.055))
+
+
+def srgb_to_linear(encoded: Array) -> Array:
+    """Linear light of sRGB values in [0, 1]; any shape."""
+    y = np.asarray(encoded, float)
+    return np.asarray(np.where(y <= _SLOPE * _KNEE, y / _SLOPE, ((np.maximum(y, 0.0) + 0.055) / 1.055) ** 2.4))
+
+
+def srgb_slope(linear: Array) -> Array:
+    """Derivative of `linear_to_srgb`, any shape; 0 outside [0, 1]."""
+    x = np.asarray(linear, float)
+    inside = (x >= 0.0) & (x <= 1.0)
+    power = 1.055 / 2.4 * np.maximum(x, _KNEE) ** (1.0 / 2.4 - 1.0)
+    return np.asarray(np.where(inside, np.where(x <= _KNEE, _SLOPE, power), 0.0))
+
+
+@dataclass(frozen=True)
+class NoisyCode:
+    """Encoded value of a Gaussian, arrays of the shape of its mean.
+
+    Attributes
+    ----------
+    mean : E f(x)
+    by_mean : its derivative by the mean of x, E f'(x)
+    by_sigma : its derivative by the standard deviation of x
+    variance : of f(x)
+    """
+
+    mean: Array
+    by_mean: Array
+    by_sigma: Array
+    variance: Array
+
+
+def noisy_srgb(mean: Array, sigma: Array) -> NoisyCode:
+    """Encoded value of linear light with a Gaussian error, by Gauss-Hermite quadrature with 9 nodes.
+
+    Derivatives by Stein's lemma: E f' = E f z / s, d E f / ds = E f (z^2 - 1) / s, z the standardised error. Where the
+    curve is cut within the error, at 0 and 1, the quadrature is good to some per cent of the error.
+
+    Parameters
+    ----------
+    mean, sigma : arrays of the same shape, full scale 1; sigma above 0
+    """
+    f = linear_to_srgb(mean[..., None] + sigma[..., None] * _NODES)
+    first = f @ _WEIGHTS
+    by_mean = f @ (_WEIGHTS * _NODES) / sigma
+    by_sigma = f @ (_WEIGHTS * (_NODES**2 - 1.0)) / sigma
+    return NoisyCode(first, by_mean, by_sigma, (f - first[..., None]) ** 2 @ _WEIGHTS)
+
+
+# -- linear planes and demosaicing -----------------------------------------------------------------------------------
+
+
+def full_scale_e(card: SensorCard) -> float:
+    """Electrons of linear light 1."""
+    return (card.top_dn - card.black_level_dn) / card.dn_per_e
+
+
+def linear_planes(image: NDArray[Any], card: SensorCard, origin_px: tuple[int, int] = (0, 0)) -> Array:
+    """Linear light, shape (3, h, w) or, without filters, (1, h, w); full scale is 1 before gains.
+
+    Parameters
+    ----------
+    image : shape (h, w) DN or (h, w, 3) 8-bit R, G, B
+        An image or a part of one.
+    card : SensorCard
+    origin_px : (u, v)
+        Image pixel of the first column and row: where the mosaic's red pixels are.
+    """
+    if card.output != "raw":
+        return srgb_to_linear(np.moveaxis(np.asarray(image, float) / 255.0, -1, 0))
+    signal = raw_electrons(image, card) / full_scale_e(card)
+    if card.mosaic == "mono":
+        return signal[None]
+    balanced = demosaiced(signal, origin_px) * np.array(card.white_balance)[:, None, None]
+    return np.einsum("ij,jhw->ihw", np.array(card.colour_matrix), balanced)
+
+
+def demosaiced(signal: Array, origin_px: tuple[int, int] = (0, 0)) -> Array:
+    """Bilinear interpolation of an RGGB mosaic, shape (h, w), to planes, shape (3, h, w).
+
+    Beyond the border stands what is mirrored about the border pixel, which keeps the mosaic's colours in order.
+    """
+    u0, v0 = origin_px
+    padded = np.pad(signal, 1, mode="reflect")
+    filters = bayer_filters(np.array([(u0 - 1, v0 - 1)]), (padded.shape[0], padded.shape[1]))[0]
+    red, green, blue = (np.where(filters == colour, padded, 0.0) for colour in range(3))
+    return np.stack([_of_quarter(red), _of_half(green), _of_quarter(blue)])
+
+
+def _of_quarter(sites: Array) -> Array:
+    """Plane of a filter on every fourth pixel: its own value, the mean of two neighbours, or of four corners."""
+    down = 0.5 * sites[:-2] + sites[1:-1] + 0.5 * sites[2:]
+    return 0.5 * down[:, :-2] + down[:, 1:-1] + 0.5 * down[:, 2:]
+
+
+def _of_half(sites: Array) -> Array:
+    """Plane of a filter on every second pixel: its own value, or the mean of four neighbours."""
+    beside = sites[1:-1, :-2] + sites[1:-1, 2:] + sites[:-2, 1:-1] + sites[2:, 1:-1]
+    return sites[1:-1, 1:-1] + 0.25 * beside
+
+
+def redness(planes: Array) -> Array:
+    """R - max(G, B), shape (h, w), of planes (3, h, w); the plane itself where there is one."""
+    return planes[0] if len(planes) == 1 else planes[0] - np.maximum(planes[1], planes[2])
+
+
+# -- colour planes in electrons --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -70,7 +230,7 @@ class ColourPlanes:
 
 
 def colour_planes(image: Image, card: SensorCard, box: Box) -> ColourPlanes:
-    """Planes of the part `box` of an image; see `seat.pair.Pair` for the outputs.
+    """Planes of the part `box` of an image; see `interface.Pair` for the outputs.
 
     Raises
     ------
@@ -136,7 +296,7 @@ def _raw(part: Image, card: SensorCard, box: Box) -> ColourPlanes:
 
 def _developed(part: Image, card: SensorCard, box: Box) -> ColourPlanes:
     planes = [np.ascontiguousarray(part[..., c]) for c in range(3 if card.mosaic == "bayer" else 1)]
-    curve = (_decoded(np.arange(256) / 255.0) * _full_scale_e(card)).astype(np.float32)
+    curve = (srgb_to_linear(np.arange(256) / 255.0) * full_scale_e(card)).astype(np.float32)
     linear = np.stack([curve[plane] for plane in planes])
     if card.mosaic == "bayer":
         linear = np.einsum("ij,jhw->ihw", _to_sensor(card).astype(np.float32), linear, optimize=True)
@@ -149,167 +309,8 @@ def _to_sensor(card: SensorCard) -> Array:
     return np.linalg.inv(np.array(card.colour_matrix)) / np.array(card.white_balance)[:, None]
 
 
-def _full_scale_e(card: SensorCard) -> float:
-    return (card.top_dn - card.black_level_dn) / card.dn_per_e
-
-
 def _code_step_e(mean_e: Array, card: SensorCard) -> Array:
     """Electrons per 8-bit code at a level: the slope of the sRGB curve."""
-    x = np.clip(mean_e / _full_scale_e(card), 0.0, 1.0)
-    slope = np.where(x <= 0.0031308, 1.0 / 12.92, 2.4 / 1.055 * np.maximum(x, 1e-6) ** (1.4 / 2.4))
-    return np.asarray(slope * _full_scale_e(card) / 255.0)
-
-
-def _decoded(encoded: Array) -> Array:
-    """Linear values of the sRGB curve, both in [0, 1] (IEC 61966-2-1)."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-
-
-KINDS = ("bayer-raw", "mono-raw", "srgb8", "mjpeg")
-RAW = KINDS[:2]
-PROCESSED = KINDS[2:]
-
-
-def kind_of(card: SensorCard) -> str:
-    """One of `KINDS`, or the card's output if it is none of them."""
-    return f"{card.mosaic}-raw" if card.output == "raw" else card.output
-
-
-def linear_planes(image: NDArray[Any], card: SensorCard, origin_px: tuple[int, int] = (0, 0)) -> Array:
-    """Linear light, shape (3, h, w) or, without filters, (1, h, w); full scale is 1 before gains.
-
-    Parameters
-    ----------
-    image : shape (h, w) DN or (h, w, 3) 8-bit R, G, B
-        An image or a part of one.
-    card : SensorCard
-    origin_px : (u, v)
-        Image pixel of the first column and row: where the mosaic's red pixels are.
-    """
-    if card.output != "raw":
-        return srgb_to_linear(np.moveaxis(np.asarray(image, float) / 255.0, -1, 0))
-    full_scale_e = (card.top_dn - card.black_level_dn) / card.dn_per_e
-    signal = raw_electrons(image, card) / full_scale_e
-    if card.mosaic == "mono":
-        return signal[None]
-    balanced = demosaiced(signal, origin_px) * np.array(card.white_balance)[:, None, None]
-    return np.einsum("ij,jhw->ihw", np.array(card.colour_matrix), balanced)
-
-
-def demosaiced(signal: Array, origin_px: tuple[int, int] = (0, 0)) -> Array:
-    """Bilinear interpolation of an RGGB mosaic, shape (h, w), to planes, shape (3, h, w).
-
-    Beyond the border stands what is mirrored about the border pixel, which keeps the mosaic's colours in order.
-    """
-    u0, v0 = origin_px
-    padded = np.pad(signal, 1, mode="reflect")
-    filters = bayer_filters(np.array([(u0 - 1, v0 - 1)]), (padded.shape[0], padded.shape[1]))[0]
-    red, green, blue = (np.where(filters == colour, padded, 0.0) for colour in range(3))
-    return np.stack([_of_quarter(red), _of_half(green), _of_quarter(blue)])
-
-
-def _of_quarter(sites: Array) -> Array:
-    """Plane of a filter on every fourth pixel: its own value, the mean of two neighbours, or of four corners."""
-    down = 0.5 * sites[:-2] + sites[1:-1] + 0.5 * sites[2:]
-    return 0.5 * down[:, :-2] + down[:, 1:-1] + 0.5 * down[:, 2:]
-
-
-def _of_half(sites: Array) -> Array:
-    """Plane of a filter on every second pixel: its own value, or the mean of four neighbours."""
-    beside = sites[1:-1, :-2] + sites[1:-1, 2:] + sites[:-2, 1:-1] + sites[2:, 1:-1]
-    return sites[1:-1, 1:-1] + 0.25 * beside
-
-
-def srgb_to_linear(encoded: Array) -> Array:
-    """Linear values of the sRGB curve, both in [0, 1] (IEC 61966-2-1)."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-
-
-def linear_to_srgb(linear: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """sRGB curve of values cut to [0, 1] (IEC 61966-2-1)."""
-    x = np.clip(linear, 0.0, 1.0)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1.0 / 2.4) - 0.055)
-
-
-def redness(planes: Array) -> Array:
-    """R - max(G, B), shape (h, w), of planes (3, h, w); the plane itself where there is one."""
-    return planes[0] if len(planes) == 1 else planes[0] - np.maximum(planes[1], planes[2])
-
-
-_KNEE, _SLOPE = 0.0031308, 12.92
-_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
-_WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
-
-
-def encoded(linear: Array) -> Array:
-    """Values in [0, 1] of linear light, cut to [0, 1]; any shape."""
-    x = np.clip(linear, 0.0, 1.0)
-    return np.asarray(np.where(x <= _KNEE, _SLOPE * x, 1.055 * x ** (1.0 / 2.4) - 0.055))
-
-
-def decoded(code: Array) -> Array:
-    """Linear light of values in [0, 1]; any shape."""
-    y = np.asarray(code, float)
-    return np.asarray(np.where(y <= _SLOPE * _KNEE, y / _SLOPE, ((np.maximum(y, 0.0) + 0.055) / 1.055) ** 2.4))
-
-
-def slope(linear: Array) -> Array:
-    """Derivative of `encoded`, any shape; 0 outside [0, 1]."""
-    x = np.asarray(linear, float)
-    inside = (x >= 0.0) & (x <= 1.0)
-    power = 1.055 / 2.4 * np.maximum(x, _KNEE) ** (1.0 / 2.4 - 1.0)
-    return np.asarray(np.where(inside, np.where(x <= _KNEE, _SLOPE, power), 0.0))
-
-
-@dataclass(frozen=True)
-class NoisyCode:
-    """Encoded value of a Gaussian, arrays of the shape of its mean.
-
-    Attributes
-    ----------
-    mean : E f(x)
-    by_mean : its derivative by the mean of x, E f'(x)
-    by_sigma : its derivative by the standard deviation of x
-    variance : of f(x)
-    """
-
-    mean: Array
-    by_mean: Array
-    by_sigma: Array
-    variance: Array
-
-
-def noisy(mean: Array, sigma: Array) -> NoisyCode:
-    """Encoded value of linear light with a Gaussian error, by Gauss-Hermite quadrature with 9 nodes.
-
-    Derivatives by Stein's lemma: E f' = E f z / s, d E f / ds = E f (z^2 - 1) / s, z the standardised error. Where the
-    curve is cut within the error, at 0 and 1, the quadrature is good to some per cent of the error.
-
-    Parameters
-    ----------
-    mean, sigma : arrays of the same shape, full scale 1; sigma above 0
-    """
-    f = encoded(mean[..., None] + sigma[..., None] * _NODES)
-    first = f @ _WEIGHTS
-    by_mean = f @ (_WEIGHTS * _NODES) / sigma
-    by_sigma = f @ (_WEIGHTS * (_NODES**2 - 1.0)) / sigma
-    return NoisyCode(first, by_mean, by_sigma, (f - first[..., None]) ** 2 @ _WEIGHTS)
-
-
-def read_picture(path: Path) -> tuple[NDArray[np.uint8], SensorCard]:
-    """Image, shape (H, W, 3), of a PNG or JPEG file, with the card of its kind.
-
-    Raises
-    ------
-    ImageError
-        If the file is no colour picture of 8 bits.
-    """
-    try:
-        with PillowImage.open(path) as picture:
-            kind, mode = picture.format, picture.mode
-            pixels = np.asarray(picture.convert("RGB"))
-    except (UnidentifiedImageError, SyntaxError, EOFError) as error:
-        raise ImageError(f"{path} is not a picture: give a PNG or JPEG file of the camera") from error
-    if mode not in ("RGB", "RGBA") or kind not in ("PNG", "JPEG"):
-        raise ImageError(f"{path} is a {kind} file of mode {mode}: give the camera's colour frame as PNG or JPEG")
-    return pixels, sensor_card("mjpeg" if kind == "JPEG" else "srgb8")
+    x = np.clip(mean_e / full_scale_e(card), 0.0, 1.0)
+    slope = np.where(x <= _KNEE, 1.0 / _SLOPE, 2.4 / 1.055 * np.maximum(x, 1e-6) ** (1.4 / 2.4))
+    return np.asarray(slope * full_scale_e(card) / 255.0)

@@ -10,7 +10,7 @@ from helpers.limb_frames import drawn_rig, limb_light
 from scipy import stats
 
 from phibench.datasets.frames.sensor_card import sensor_card
-from phibench.estimator.calibration.limb_image import planes_of, srgb_decoded, srgb_encoded
+from phibench.estimator.calibration.limb_image import planes_of
 from phibench.estimator.calibration.outline import find_outline, fit_outline, visible_arc
 from phibench.estimator.calibration.outline_fit import Sectors, scatter
 from phibench.estimator.calibration.outline_start import (
@@ -22,7 +22,7 @@ from phibench.estimator.calibration.outline_start import (
     sphere_from_ellipse,
     sphere_from_rays,
 )
-from phibench.estimator.spots.image_planes import ImageError
+from phibench.estimator.spots.image_planes import ImageError, linear_to_srgb, srgb_to_linear
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light
 from phibench.render.sensor.noise_tiles import NoiseStream
@@ -159,8 +159,8 @@ def ndimage_smooth(image: np.ndarray) -> np.ndarray:
 
 def test_srgb_curve_and_its_inverse() -> None:
     x = np.linspace(0.0, 1.0, 1001)
-    assert srgb_decoded(srgb_encoded(x)) == pytest.approx(x, abs=1e-7)  # the standard's two branches meet to 1e-8
-    assert srgb_encoded(x) == pytest.approx(srgb_of_the_camera(x), abs=1e-7)
+    assert srgb_to_linear(linear_to_srgb(x)) == pytest.approx(x, abs=1e-7)  # the standard's two branches meet to 1e-8
+    assert linear_to_srgb(x) == pytest.approx(srgb_of_the_camera(x), abs=1e-7)
 
 
 def _unwrapped_turns() -> np.ndarray:

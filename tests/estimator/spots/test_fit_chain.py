@@ -14,12 +14,12 @@ from scipy import integrate, stats
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.processed_bound import chain_limit
-from phibench.estimator.spots import image_planes
 from phibench.estimator.spots.chain_model import chain_model, codes
 from phibench.estimator.spots.code_statistics import code_law, code_table
 from phibench.estimator.spots.fit_chain import fit_jpeg, fit_srgb, undone, unrounded
 from phibench.estimator.spots.fit_raw import fit_law
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
+from phibench.estimator.spots.image_planes import linear_to_srgb, noisy_srgb, srgb_slope, srgb_to_linear
 from phibench.estimator.spots.jpeg_coefficients import coefficients, quantisation, quantised, recovered, steps
 from phibench.estimator.spots.raw_pixels import GaussLaw, PixelNoise, around, background_of, bayer_filters, spot_regions
 from phibench.render.sensor import processing
@@ -43,12 +43,12 @@ def test_an_image_that_compression_has_emptied_has_no_spot() -> None:
 
 def test_tone_curve_against_the_simulators() -> None:
     x = np.concatenate([[-0.1, 0.0, 0.0031308, 1.0, 1.2], np.linspace(0.0, 1.0, 501)])
-    np.testing.assert_allclose(image_planes.encoded(x), processing.srgb_encoded(x), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(image_planes.decoded(processing.srgb_encoded(x)), np.clip(x, 0, 1), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(linear_to_srgb(x), processing.srgb_encoded(x), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(srgb_to_linear(processing.srgb_encoded(x)), np.clip(x, 0, 1), rtol=0, atol=1e-6)
     inside = np.linspace(0.01, 0.99, 99)
     h = 1e-6
     slope = (processing.srgb_encoded(inside + h) - processing.srgb_encoded(inside - h)) / (2 * h)
-    np.testing.assert_allclose(image_planes.slope(inside), slope, rtol=1e-6)
+    np.testing.assert_allclose(srgb_slope(inside), slope, rtol=1e-6)
 
 
 def test_noisy_curve_against_quadrature() -> None:
@@ -61,7 +61,7 @@ def test_noisy_curve_against_quadrature() -> None:
             points=[0.0, 0.0031308] if wide[0] < 0 else None,
             limit=400,
         )
-        assert image_planes.noisy(np.array([mean]), np.array([sigma])).mean[0] == pytest.approx(exact, abs=tolerance)
+        assert noisy_srgb(np.array([mean]), np.array([sigma])).mean[0] == pytest.approx(exact, abs=tolerance)
 
 
 def test_every_raw_code_lies_in_the_interval_of_its_8_bit_code() -> None:
