@@ -1,12 +1,11 @@
-"""What a method sees of a stroke pair, and what it answers. Nothing of the truth is in here.
+"""Interface of a method: the stroke pair that it sees, the answer that it gives, and the outcome of asking it.
 
 >>> from phibench.estimator.interface import Answer, Pair, Spot
 >>> def extract(pair: Pair) -> Answer:
 ...     return Answer(Spot((640.0, 120.0)), Spot.missing("not looked for"))
 
-Pixels: integer (u, v) are pixel centres, u to the right, v downwards, whole image: it spans [-0.5, W - 0.5].
-
-What became of one pair in the hands of a method.
+Nothing of the truth is in a pair. Pixels: integer (u, v) are pixel centres of the whole image, u to the right, v
+downwards, so that the image spans [-0.5, W - 0.5].
 """
 
 from __future__ import annotations
@@ -56,9 +55,9 @@ class Pair:
     down_off, up_off : array or None
         The same with the laser off, from another exposure.
     rig : Rig
-        What the user believes of camera, mirror and stroke axis, at the down position.
+        Nominal camera, mirror and stroke axis, at the down position.
     stroke_m : float
-        h, as the user believes it.
+        Nominal h.
     card : SensorCard
         Numbers of the sensor and of its processing.
     box_down, box_up : Box or None
@@ -121,7 +120,7 @@ class Spot:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a method answers for a pair; the depth is computed from the positions unless it gives one itself.
+    """Answer for a pair; the depth is computed from the positions unless the method gives one itself.
 
     Parameters
     ----------
@@ -145,7 +144,7 @@ FAILURES = ("error", "timeout", "crash", "memory", "invalid", "mutated")
 
 @dataclass(frozen=True)
 class Outcome:
-    """One pair.
+    """Outcome of asking a method for one pair.
 
     Attributes
     ----------

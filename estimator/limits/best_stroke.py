@@ -1,4 +1,4 @@
-"""The stroke that makes the predicted error of D smallest, and what limits it.
+"""Stroke with the smallest predicted error of D, and its limits.
 
 For a camera at infinity the rays to a spot at (D, z) leave the mirror at theta_k with tan(theta_k) = D / (z_k - z),
 z_k the mirror's height at the down and the up position, so that an error s of both theta gives
@@ -9,7 +9,7 @@ It falls as D^2 / h while h << D and rises as h^3 / D^2 beyond: for x_1 = 0 it i
 half way up (x_1 = -x_2) at h = 2 D. `best_stroke` takes the same from the exact rays, with the spot's bound where it
 appears in the mirror and with the covariance of the rig's parameters:
 
-    sigma_D^2 = g_y C_y g_y + g_p C_p g_p + g_h^2 sigma_h^2 + higher orders    (`depth_general`, `rig_draws`).
+    sigma_D^2 = g_y C_y g_y + g_p C_p g_p + g_h^2 sigma_h^2 + higher orders    (`depth_general`, `stroke_curve`).
 
 The last is what a rig's tolerance does beyond first order; a stroke at which the first order vanishes is no better than
 that. sigma_D is a root mean square error: for a rig as built it contains the mean of the second order, a bias of
@@ -61,7 +61,7 @@ class BestStroke:
         NaN where no stroke can be taken.
     sigma_m, sigma_spot_m, sigma_calibration_m, sigma_stroke_m, sigma_higher_order_m : float
         Predicted root mean square error of D and its parts, whose squares add up. The first three parts are standard
-        deviations; the last contains a bias, see `rig_draws`.
+        deviations; the last contains a bias, see `stroke_curve`.
     limits : tuple of str
         What keeps the stroke from being better: "shortest stroke", "longest stroke", or the cause beside it, such as
         "ceiling"; empty at a minimum of the error. Where no stroke can be taken, all causes.
@@ -199,7 +199,7 @@ def without_limits(around: Surroundings) -> Surroundings:
 
 
 def _limits(curve: StrokeCurve, index: int) -> tuple[str, ...]:
-    """What stands beside the best element of a curve on the side where the error would fall further."""
+    """Causes beside the best element of a curve on the side where the error would fall further."""
     last, sigma = len(curve.strokes_m) - 1, curve.sigma_m
     found = []
     if index == 0 and sigma[0] < sigma[1]:

@@ -1,13 +1,12 @@
-"""What the tolerance of a rig does to D beyond first order: rigs drawn in pairs of opposite deviations.
+"""Predicted error of D against the stroke h, its parts, and what is in the way of a stroke.
 
-The error of D of a rig that deviates by p is e(p) = g p + p H p / 2 + third order + ... Of the pair p, -p, half the sum
-of both errors is the even part, to which the linear prediction is blind, and half the difference is the odd part: the
-linear one with the third order. The even part matters where the linear part passes through 0: a tilt of half a degree
-does so near h = 0.3 D; the third order adds 28 % to the linear part at D = 2.18 m, h = 0.45 m and takes 14 % off at
-1.4 m. The even part is no scatter about 0: its mean, some -40 mm for a rig as built at D = 2.18 m and h = 0.9 m, is a
-bias of `depth_general`, which takes D at the nominal rig.
-
-Predicted error of D against the stroke h, and what stands in the way of a stroke.
+Beyond first order, rigs are drawn in pairs of opposite deviations. The error of D of a rig that deviates by p is
+e(p) = g p + p H p / 2 + third order + ... Of the pair p, -p, half the sum of both errors is the even part, to which the
+linear prediction is blind, and half the difference is the odd part: the linear one with the third order. The even part
+matters where the linear part passes through 0: a tilt of half a degree does so near h = 0.3 D. The third order adds
+28 % to the linear part at D = 2.18 m, h = 0.45 m and takes 14 % off at 1.4 m. The even part is no scatter about 0: its
+mean, some -40 mm for a rig as built at D = 2.18 m and h = 0.9 m, is a bias of `depth_general`, which takes D at the
+nominal rig.
 
 A rig raised by h sees a point as a rig that stays sees the point lowered by h, so that all strokes are one array.
 """
@@ -41,6 +40,202 @@ _SEED = 0  # the scramble is part of the rule, not a noise draw
 _LOG_STEP = 0.35  # the part is smooth in the logarithm of the stroke: interpolated between
 
 
+# -- curve -----------------------------------------------------------------------------------------------------------
+
+FREE = ""
+"""Cause of a stroke that nothing stands in the way of."""
+CEILING, NO_IMAGE, MIRROR_EDGE, IMAGE_EDGE, OCCLUDED = (
+    "ceiling",
+    "no image in the mirror",
+    "mirror's edge",
+    "image's edge",
+    "occluded by",  # and the name of the solid
+)
+TOO_BRIGHT, TOO_FAINT, NO_BOUND = (
+    "the spot is brighter than the bound is known for",
+    "the spot is fainter than the bound is known for",
+    "no finite error of D",
+)
+"""Causes of strokes that nothing stands in the way of, but whose error is not known."""
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Places of the spots, and what bounds the strokes besides the carriage.
+
+    Parameters
+    ----------
+    heights_m : tuple of float
+        Heights of the spots above the floor; the error is the root mean square over them.
+    azimuths_rad : tuple of float
+        Directions of the spots, as a tilt or a decentre matters along the spot's azimuth only; likewise.
+    room_height_m : float
+        The mirror's top stays below it.
+    robot : bool
+        Whether the robot, its mast and the camera's housing may stand in the way.
+    edge_px : float
+        Least distance of a spot from the edge of the mirror and of the image: the blur's skirt and the fit's window.
+    """
+
+    heights_m: tuple[float, ...] = (0.5,)
+    azimuths_rad: tuple[float, ...] = tuple(2.0 * math.pi * k / 8.0 for k in range(8))
+    room_height_m: float = 3.0
+    robot: bool = True
+    edge_px: float = 4.0
+
+    def points_m(self, rig: Rig, depth_m: float) -> Array:
+        """Places of the spots, shape (m, 3), about the vertical line through the sphere centre when down."""
+        axis = rig.at(0.0).sphere_centre_m
+        return np.array(
+            [
+                (axis[0] + depth_m * math.cos(a), axis[1] + depth_m * math.sin(a), z)
+                for z in self.heights_m
+                for a in self.azimuths_rad
+            ]
+        )
+
+    def wall_normals(self) -> Array:
+        """Normals of upright walls that face the axis, shape (m, 3)."""
+        return np.array([(-math.cos(a), -math.sin(a), 0.0) for _ in self.heights_m for a in self.azimuths_rad])
+
+
+@dataclass(frozen=True)
+class StrokeCurve:
+    """Predicted error of D by stroke, shape (n,), metres; root mean square over the places of the spot.
+
+    Attributes
+    ----------
+    strokes_m
+    sigma_spot_m, sigma_calibration_m, sigma_stroke_m
+        From the pixels' noise, the rig's parameters and the single stroke, to first order; NaN where the spot has no
+        image.
+    sigma_higher_order_m
+        What the rig's parameters do beyond, a mean error (bias) included: `beyond_first_order_m`.
+    causes : tuple of str
+        Cause that a stroke cannot be taken, or that its error is not known; `FREE` where neither.
+    """
+
+    strokes_m: Array
+    sigma_spot_m: Array = field(repr=False)
+    sigma_calibration_m: Array = field(repr=False)
+    sigma_stroke_m: Array = field(repr=False)
+    sigma_higher_order_m: Array = field(repr=False)
+    causes: tuple[str, ...] = field(repr=False)
+
+    @property
+    def sigma_m(self) -> Array:
+        """All parts together: their squares add up."""
+        parts = (self.sigma_spot_m, self.sigma_calibration_m, self.sigma_stroke_m, self.sigma_higher_order_m)
+        return np.asarray(np.sqrt(sum(part**2 for part in parts)))
+
+    @property
+    def allowed_sigma_m(self) -> Array:
+        """The same, infinite where the stroke cannot be taken."""
+        free = np.array([cause == FREE for cause in self.causes])
+        return np.where(free & np.isfinite(self.sigma_m), self.sigma_m, np.inf)
+
+
+def stroke_curve(
+    rig: Rig,
+    depth_m: float,
+    strokes_m: Array,
+    spot: SpotSigma,
+    covariance_rig: Array,
+    around: Surroundings,
+    laser: Laser,
+    exposure_s: float,
+    stroke_sigma_m: float,
+) -> StrokeCurve:
+    """Predicted error of D for strokes, shape (n,); parameters as for `best_stroke.best_stroke`."""
+    h, points = np.asarray(strokes_m, float), around.points_m(rig, depth_m)
+    images = [_images(rig, points, offset) for offset in (np.zeros(1), h)]
+    electrons = [spot_electrons_per_s(rig, laser, image, around.wall_normals()) * exposure_s for image in images]
+    C_down, C_up = (_covariance(image, spot, light) for image, light in zip(images, electrons, strict=True))
+    down, up = (image.uv_px for image in images)
+    found = depth_general(rig, h[:, None], down, up, C_down, C_up, covariance_rig, np.asarray(stroke_sigma_m))
+    parts = (found.sigma_spot_m, found.sigma_calibration_m, found.sigma_stroke_m)
+    of_spot, of_rig, of_stroke = (np.sqrt(np.mean(part**2, axis=-1)) for part in parts)
+    even = beyond_first_order_m(rig, h, points, C_down, C_up, covariance_rig, stroke_sigma_m)
+    curve = StrokeCurve(h, of_spot, of_rig, of_stroke, even, causes(rig, points, images[0], images[1], h, around))
+    return replace(curve, causes=_with_unknown(curve, spot, electrons[0], electrons[1]))
+
+
+def causes(
+    rig: Rig, points_m: Array, down: MirrorImage, up: MirrorImage, strokes_m: Array, around: Surroundings
+) -> tuple[str, ...]:
+    """Cause that each stroke, shape (n,), cannot be taken for spots at all of the points, shape (m, 3)."""
+    first = _fault(rig, points_m, down.uv_px[0], 0.0, around)
+    return tuple(
+        first or _fault(rig, points_m, uv, float(h), around) for uv, h in zip(up.uv_px, strokes_m, strict=True)
+    )
+
+
+def _fault(rig: Rig, points_m: Array, uv_px: Array, offset_m: float, around: Surroundings) -> str:
+    """Cause that the rig at one offset does not see all of the points, which it has at pixels (m, 2)."""
+    view = rig.at(offset_m)
+    if view.sphere_centre_m[2] + rig.mirror.radius_m > around.room_height_m:
+        return CEILING
+    if not np.isfinite(uv_px).all():
+        return NO_IMAGE
+    if np.any(_outline_distance_px(rig, uv_px) < around.edge_px):
+        return MIRROR_EDGE
+    if not np.all(rig.camera.contains(uv_px - around.edge_px) & rig.camera.contains(uv_px + around.edge_px)):
+        return IMAGE_EDGE
+    if not around.robot:
+        return FREE
+    mirror = reflect(view, uv_px).origin_world_m
+    eye = np.broadcast_to(view.camera_centre_m, mirror.shape)
+    name = first_blocker(escalade360(view), ((mirror, points_m), (eye, mirror)))
+    return FREE if name is None else f"{OCCLUDED} {name}"
+
+
+def _images(rig: Rig, points_m: Array, offsets_m: Array) -> MirrorImage:
+    """Images of points, shape (m, 3), from offsets, shape (n,), of the carriage: shape (n, m)."""
+    lowered = points_m - offsets_m[:, None, None] * np.array(rig.stroke_axis_world)
+    return image_of(rig.at(0.0), lowered)
+
+
+def _with_unknown(curve: StrokeCurve, spot: SpotSigma, down_e: Array, up_e: Array) -> tuple[str, ...]:
+    """Causes, with those of free strokes whose error is not known; spots' electrons (1, m) and (n, m)."""
+    light_e = np.concatenate([np.broadcast_to(down_e, up_e.shape), up_e], axis=-1)
+    unknown = np.select(
+        [(light_e > spot.flux_e[-1]).any(axis=-1), (light_e < spot.flux_e[0]).any(axis=-1)],
+        [TOO_BRIGHT, TOO_FAINT],
+        NO_BOUND,
+    )
+    known = np.isfinite(curve.sigma_m)
+    return tuple(
+        str(why) if cause == FREE and not fine else cause
+        for cause, fine, why in zip(curve.causes, known, unknown, strict=True)
+    )
+
+
+def _covariance(image: MirrorImage, spot: SpotSigma, electrons: Array) -> Array:
+    variance = np.where(image.status == Status.OK, spot.at(electrons) ** 2, np.nan)
+    return np.asarray(np.where(np.isfinite(variance), variance, np.nan)[..., None, None] * np.eye(2))
+
+
+def _outline_distance_px(rig: Rig, uv_px: Array) -> Array:
+    """Distance of pixels, shape (m, 2), from the mirror's outline, inwards: angle times focal length."""
+    centre = rig.sphere_in_camera_m
+    away = np.arccos(np.clip(rig.camera.rays(uv_px) @ centre / np.linalg.norm(centre), -1.0, 1.0))
+    rim = math.asin(rig.mirror.radius_m / float(np.linalg.norm(centre)))
+    return np.asarray((rim - away) * rig.camera.fx_px)
+
+
+def stroke_grid(low_m: float, high_m: float, count: int = 81) -> Array:
+    """Strokes from low to high, evenly in their logarithm."""
+    return np.geomspace(low_m, high_m, count)
+
+
+def grid_neighbours(grid: Sequence[float], index: int) -> tuple[float, float]:
+    """Values before and after an element."""
+    return grid[max(index - 1, 0)], grid[min(index + 1, len(grid) - 1)]
+
+
+# -- beyond first order ----------------------------------------------------------------------------------------------
+
+
 def covariance_root(covariance: Array) -> Array:
     """Matrix A with A A^T = C, shape (p, p), of a covariance that may be singular and has mixed units."""
     scale = np.sqrt(np.diag(covariance))
@@ -58,7 +253,7 @@ def beyond_first_order_m(
     covariance_rig: Array,
     stroke_sigma_m: float,
 ) -> Array:
-    """What the mean square error of D over rigs and points has beyond first order, shape (n,); its root, metres.
+    """Root of the mean square error of D beyond first order, over rigs and points, shape (n,), metres.
 
     Even part squared, bias included, plus odd part squared less linear part squared of the same rigs; 0 where the
     higher orders make the error smaller than the linear one.
@@ -129,194 +324,3 @@ def _normals(count: int) -> Array:
     p = len(PARAMETERS)
     engine = qmc.Sobol(p, scramble=True, rng=_SEED)
     return np.asarray(qmc.MultivariateNormalQMC(np.zeros(p), engine=engine, rng=_SEED).random(count))
-
-
-FREE = ""
-"""Cause of a stroke that nothing stands in the way of."""
-CEILING, NO_IMAGE, MIRROR_EDGE, IMAGE_EDGE, OCCLUDED = (
-    "ceiling",
-    "no image in the mirror",
-    "mirror's edge",
-    "image's edge",
-    "occluded by",  # and the name of the solid
-)
-TOO_BRIGHT, TOO_FAINT, NO_BOUND = (
-    "the spot is brighter than the bound is known for",
-    "the spot is fainter than the bound is known for",
-    "no finite error of D",
-)
-"""Causes of strokes that nothing stands in the way of, but whose error is not known."""
-
-
-@dataclass(frozen=True)
-class Surroundings:
-    """Where spots are, and what bounds the strokes besides the carriage.
-
-    Parameters
-    ----------
-    heights_m : tuple of float
-        Heights of the spots above the floor; the error is the root mean square over them.
-    azimuths_rad : tuple of float
-        Directions of the spots, as a tilt or a decentre matters along the spot's azimuth only; likewise.
-    room_height_m : float
-        The mirror's top stays below it.
-    robot : bool
-        Whether the robot, its mast and the camera's housing may stand in the way.
-    edge_px : float
-        Least distance of a spot from the edge of the mirror and of the image: the blur's skirt and the fit's window.
-    """
-
-    heights_m: tuple[float, ...] = (0.5,)
-    azimuths_rad: tuple[float, ...] = tuple(2.0 * math.pi * k / 8.0 for k in range(8))
-    room_height_m: float = 3.0
-    robot: bool = True
-    edge_px: float = 4.0
-
-    def points_m(self, rig: Rig, depth_m: float) -> Array:
-        """Places of the spots, shape (m, 3), about the vertical line through the sphere centre when down."""
-        axis = rig.at(0.0).sphere_centre_m
-        return np.array(
-            [
-                (axis[0] + depth_m * math.cos(a), axis[1] + depth_m * math.sin(a), z)
-                for z in self.heights_m
-                for a in self.azimuths_rad
-            ]
-        )
-
-    def wall_normals(self) -> Array:
-        """Normals of upright walls that face the axis, shape (m, 3)."""
-        return np.array([(-math.cos(a), -math.sin(a), 0.0) for _ in self.heights_m for a in self.azimuths_rad])
-
-
-@dataclass(frozen=True)
-class StrokeCurve:
-    """Predicted error of D by stroke, shape (n,), metres; root mean square over the places of the spot.
-
-    Attributes
-    ----------
-    strokes_m
-    sigma_spot_m, sigma_calibration_m, sigma_stroke_m
-        From the pixels' noise, the rig's parameters and the single stroke, to first order; NaN where the spot has no
-        image.
-    sigma_higher_order_m
-        What the rig's parameters do beyond, a mean error (bias) included: `rig_draws.beyond_first_order_m`.
-    causes : tuple of str
-        Why a stroke cannot be taken, or why its error is not known; `FREE` where neither.
-    """
-
-    strokes_m: Array
-    sigma_spot_m: Array = field(repr=False)
-    sigma_calibration_m: Array = field(repr=False)
-    sigma_stroke_m: Array = field(repr=False)
-    sigma_higher_order_m: Array = field(repr=False)
-    causes: tuple[str, ...] = field(repr=False)
-
-    @property
-    def sigma_m(self) -> Array:
-        """All parts together: their squares add up."""
-        parts = (self.sigma_spot_m, self.sigma_calibration_m, self.sigma_stroke_m, self.sigma_higher_order_m)
-        return np.asarray(np.sqrt(sum(part**2 for part in parts)))
-
-    @property
-    def allowed_sigma_m(self) -> Array:
-        """The same, infinite where the stroke cannot be taken."""
-        free = np.array([cause == FREE for cause in self.causes])
-        return np.where(free & np.isfinite(self.sigma_m), self.sigma_m, np.inf)
-
-
-def stroke_curve(
-    rig: Rig,
-    depth_m: float,
-    strokes_m: Array,
-    spot: SpotSigma,
-    covariance_rig: Array,
-    around: Surroundings,
-    laser: Laser,
-    exposure_s: float,
-    stroke_sigma_m: float,
-) -> StrokeCurve:
-    """Predicted error of D for strokes, shape (n,); parameters as for `best_stroke.best_stroke`."""
-    h, points = np.asarray(strokes_m, float), around.points_m(rig, depth_m)
-    images = [_images(rig, points, offset) for offset in (np.zeros(1), h)]
-    electrons = [spot_electrons_per_s(rig, laser, image, around.wall_normals()) * exposure_s for image in images]
-    C_down, C_up = (_covariance(image, spot, light) for image, light in zip(images, electrons, strict=True))
-    down, up = (image.uv_px for image in images)
-    found = depth_general(rig, h[:, None], down, up, C_down, C_up, covariance_rig, np.asarray(stroke_sigma_m))
-    parts = (found.sigma_spot_m, found.sigma_calibration_m, found.sigma_stroke_m)
-    of_spot, of_rig, of_stroke = (np.sqrt(np.mean(part**2, axis=-1)) for part in parts)
-    even = beyond_first_order_m(rig, h, points, C_down, C_up, covariance_rig, stroke_sigma_m)
-    curve = StrokeCurve(h, of_spot, of_rig, of_stroke, even, causes(rig, points, images[0], images[1], h, around))
-    return replace(curve, causes=_with_unknown(curve, spot, electrons[0], electrons[1]))
-
-
-def causes(
-    rig: Rig, points_m: Array, down: MirrorImage, up: MirrorImage, strokes_m: Array, around: Surroundings
-) -> tuple[str, ...]:
-    """Why each stroke, shape (n,), cannot be taken for spots at all of the points, shape (m, 3)."""
-    first = _fault(rig, points_m, down.uv_px[0], 0.0, around)
-    return tuple(
-        first or _fault(rig, points_m, uv, float(h), around) for uv, h in zip(up.uv_px, strokes_m, strict=True)
-    )
-
-
-def _fault(rig: Rig, points_m: Array, uv_px: Array, offset_m: float, around: Surroundings) -> str:
-    """Why the rig at one offset does not see all of the points, which it has at pixels (m, 2)."""
-    view = rig.at(offset_m)
-    if view.sphere_centre_m[2] + rig.mirror.radius_m > around.room_height_m:
-        return CEILING
-    if not np.isfinite(uv_px).all():
-        return NO_IMAGE
-    if np.any(_outline_distance_px(rig, uv_px) < around.edge_px):
-        return MIRROR_EDGE
-    if not np.all(rig.camera.contains(uv_px - around.edge_px) & rig.camera.contains(uv_px + around.edge_px)):
-        return IMAGE_EDGE
-    if not around.robot:
-        return FREE
-    mirror = reflect(view, uv_px).origin_world_m
-    eye = np.broadcast_to(view.camera_centre_m, mirror.shape)
-    name = first_blocker(escalade360(view), ((mirror, points_m), (eye, mirror)))
-    return FREE if name is None else f"{OCCLUDED} {name}"
-
-
-def _images(rig: Rig, points_m: Array, offsets_m: Array) -> MirrorImage:
-    """Images of points, shape (m, 3), from offsets, shape (n,), of the carriage: shape (n, m)."""
-    lowered = points_m - offsets_m[:, None, None] * np.array(rig.stroke_axis_world)
-    return image_of(rig.at(0.0), lowered)
-
-
-def _with_unknown(curve: StrokeCurve, spot: SpotSigma, down_e: Array, up_e: Array) -> tuple[str, ...]:
-    """Causes, and why the error of a stroke that is free is not known; spots' electrons (1, m) and (n, m)."""
-    light_e = np.concatenate([np.broadcast_to(down_e, up_e.shape), up_e], axis=-1)
-    unknown = np.select(
-        [(light_e > spot.flux_e[-1]).any(axis=-1), (light_e < spot.flux_e[0]).any(axis=-1)],
-        [TOO_BRIGHT, TOO_FAINT],
-        NO_BOUND,
-    )
-    known = np.isfinite(curve.sigma_m)
-    return tuple(
-        str(why) if cause == FREE and not fine else cause
-        for cause, fine, why in zip(curve.causes, known, unknown, strict=True)
-    )
-
-
-def _covariance(image: MirrorImage, spot: SpotSigma, electrons: Array) -> Array:
-    variance = np.where(image.status == Status.OK, spot.at(electrons) ** 2, np.nan)
-    return np.asarray(np.where(np.isfinite(variance), variance, np.nan)[..., None, None] * np.eye(2))
-
-
-def _outline_distance_px(rig: Rig, uv_px: Array) -> Array:
-    """Distance of pixels, shape (m, 2), from the mirror's outline, inwards: angle times focal length."""
-    centre = rig.sphere_in_camera_m
-    away = np.arccos(np.clip(rig.camera.rays(uv_px) @ centre / np.linalg.norm(centre), -1.0, 1.0))
-    rim = math.asin(rig.mirror.radius_m / float(np.linalg.norm(centre)))
-    return np.asarray((rim - away) * rig.camera.fx_px)
-
-
-def stroke_grid(low_m: float, high_m: float, count: int = 81) -> Array:
-    """Strokes from low to high, evenly in their logarithm."""
-    return np.geomspace(low_m, high_m, count)
-
-
-def grid_neighbours(grid: Sequence[float], index: int) -> tuple[float, float]:
-    """Values before and after an element."""
-    return grid[max(index - 1, 0)], grid[min(index + 1, len(grid) - 1)]

@@ -1,4 +1,4 @@
-"""Built-in method: fit of both spots through the camera's own processing, for "srgb8" and "mjpeg" images."""
+"""Built-in method `chain_fit`: both spots through the camera's own processing, for "srgb8" and "mjpeg" images."""
 
 from __future__ import annotations
 

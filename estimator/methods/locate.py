@@ -1,14 +1,19 @@
-"""The beam's size in a spot's image: it needs the distance, which both images of a pair tell once they are measured.
+"""Search for a spot: mirror mask, laser light, boxes around detections, search regions, and its distance.
 
-Where to look: a box around the spot in each image of a pair.
+A method that is written from scratch needs the first half only:
 
-The place in a box that looks most like a small red spot, to a pixel: where a finer method starts.
-
-Windows of an image: boxes around a position, and what is cut out by them.
+>>> import numpy as np
+>>> from phibench.estimator.interface import Answer, Pair, Spot
+>>> from phibench.estimator.methods.locate import laser_light, mirror_mask
+>>> def extract(pair: Pair) -> Answer:
+...     spots = []
+...     for position in ("down", "up"):
+...         light = np.where(mirror_mask(pair), laser_light(pair, position), 0.0)
+...         v, u = np.unravel_index(np.argmax(light), light.shape)
+...         spots.append(Spot((float(u), float(v))))
+...     return Answer(*spots)
 
 Integer (u, v) are pixel centres, u along the columns, v along the rows.
-
-One image of a pair with the box in which its spot is: what the built-in methods look at.
 """
 
 from __future__ import annotations
@@ -24,48 +29,50 @@ from scipy.ndimage import gaussian_filter
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Box, Image, Method, Pair, Spot
-from phibench.estimator.spots.detect import Detection, detect
+from phibench.estimator.spots.detect import Detection, detect, outline_mask
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import demosaiced, kind_of, linear_planes, redness
 from phibench.estimator.spots.simple_spots import SpotPositions
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.scenes.frames import Array, BoolArray
 
-_REACH_M = (0.3, 20.0)  # distances to which a beam is nominal
+SIDE_PX = 15  # of a window: holds 99.9 % of a spot with a blur of up to 2 px, and a border to take the background from
+_DETECTED_SIDE_PX = 21  # of a box around a detection: room for a fit's surroundings
+LEAST_PX = 5  # side of a box below which there is nothing to measure
+CORE_PX, AROUND_PX = 0.9, 3.0  # of the two Gaussians of a spot's likeness
+_SIGMA_OF_MAD = 1.4826  # standard deviation of a normal law over its median absolute deviation
+_BEAM_RANGE_M = (0.3, 20.0)  # distances at which a beam's size is taken into account
 
 
-def measured_twice(measure: Callable[[float | None], Answer], pair: Pair) -> Answer:
-    """Answer of `measure`, which takes the spot's distance: once without it, once with the one found.
+# -- whole images ----------------------------------------------------------------------------------------------------
 
-    A spot that the second look does not find keeps the first one's answer.
+
+def mirror_mask(pair: Pair) -> BoolArray:
+    """Pixels inside the mirror's outline, shape (H, W), of either image: camera and mirror move together.
+
+    Outside of it there is the room itself, in which a lamp may be redder than the spot.
     """
-    first = measure(None)
-    depth_m = seen_depth_m(pair, first)
-    if depth_m is None:
-        return first
-    second = measure(depth_m)
-    down, up = (
-        one if two.uv_px is None or two.covariance_px2 is None else two
-        for one, two in ((first.down, second.down), (first.up, second.up))
-    )
-    return Answer(down, up)
+    height, width = pair.down.shape[:2]
+    return outline_mask(pair.rig, Box(0, 0, width, height))
 
 
-def seen_depth_m(pair: Pair, answer: Answer) -> float | None:
-    """Distance at which the rays through two positions meet; None if they do not, or the beam is not known."""
-    if pair.beam is None or answer.down.uv_px is None or answer.up.uv_px is None:
-        return None
-    found = depth_exact(pair.rig, pair.stroke_m, np.array(answer.down.uv_px), np.array(answer.up.uv_px))
-    depth_m = float(found.depth_m)
-    return depth_m if found.status == Status.OK and _REACH_M[0] <= depth_m <= _REACH_M[1] else None
+def laser_light(pair: Pair, position: str) -> Array:
+    """Red light that the laser adds to an image, shape (H, W), in linear units of full scale 1.
+
+    With a laser-off frame it is on - off of the red plane. Without one it is the redness R - max(G, B), or, of pixels
+    without colour filters, the image itself.
+
+    Parameters
+    ----------
+    pair : Pair
+    position : "down" or "up"
+    """
+    off = pair.images.get(f"{position}_off")
+    on = linear_planes(pair.images[position], pair.card)
+    return redness(on) if off is None else np.asarray(on[0] - linear_planes(off, pair.card)[0])
 
 
-def pair_blur(pair: Pair, uv_px: ArrayLike, depth_m: float | None) -> SpotBlur:
-    """Blur of a spot of the pair's laser at a distance; None leaves the beam's size out."""
-    return spot_blur(pair.rig, uv_px, depth_m, pair.beam)
-
-
-_SIDE_PX = 21  # room for a fit's surroundings
+# -- boxes -----------------------------------------------------------------------------------------------------------
 
 
 def locate(pair: Pair) -> tuple[Box | None, Box | None]:
@@ -85,16 +92,35 @@ def box_around(found: Detection | None, image: Image) -> Box | None:
     if found is None:
         return None
     height, width = image.shape[:2]
-    side = (min(_SIDE_PX, width), min(_SIDE_PX, height))
+    side = (min(_DETECTED_SIDE_PX, width), min(_DETECTED_SIDE_PX, height))
     u0, v0 = (
         min(max(round(x) - s // 2, 0), size - s) for x, s, size in zip(found.uv_px, side, (width, height), strict=True)
     )
     return Box(u0, v0, side[0], side[1])
 
 
-CORE_PX, AROUND_PX = 0.9, 3.0
-_SIGMA_OF_MAD = 1.4826  # standard deviation of a normal law over its median absolute deviation
-EDGE_PX = 2  # of a box, where the surroundings are not seen
+def around(uv_px: tuple[float, float], shape: tuple[int, ...], side_px: int = SIDE_PX) -> Box:
+    """Square box with the nearest pixel of a position in its middle, cut at the image's border.
+
+    Parameters
+    ----------
+    uv_px : (u, v), pixels
+    shape : (H, W, ...) of the image
+    side_px : int, odd
+    """
+    half = side_px // 2
+    u, v = (round(x) for x in uv_px)
+    return clipped(Box(u - half, v - half, 2 * half + 1, 2 * half + 1), shape)
+
+
+def clipped(box: Box, shape: tuple[int, ...]) -> Box:
+    """Part of a box that lies in an image of the shape (H, W, ...)."""
+    u0, v0 = max(box.u0_px, 0), max(box.v0_px, 0)
+    u1, v1 = min(box.u0_px + box.width_px, shape[1]), min(box.v0_px + box.height_px, shape[0])
+    return Box(u0, v0, max(u1 - u0, 0), max(v1 - v0, 0))
+
+
+# -- spot-like places ------------------------------------------------------------------------------------------------
 
 
 def spot_likeness(red: Array) -> Array:
@@ -129,41 +155,12 @@ def red_peak(red: Array, inside: BoolArray | None = None, least_sigmas: float = 
     return float(u), float(v)
 
 
-SIDE_PX = 15  # holds 99.9 % of a spot with a blur of up to 2 px, and a border to take the background from
-
-
-def around(uv_px: tuple[float, float], shape: tuple[int, ...], side_px: int = SIDE_PX) -> Box:
-    """Square box with the nearest pixel of a position in its middle, cut at the image's border.
-
-    Parameters
-    ----------
-    uv_px : (u, v), pixels
-    shape : (H, W, ...) of the image
-    side_px : int, odd
-    """
-    half = side_px // 2
-    u, v = (round(x) for x in uv_px)
-    return clipped(Box(u - half, v - half, 2 * half + 1, 2 * half + 1), shape)
-
-
-def clipped(box: Box, shape: tuple[int, ...]) -> Box:
-    """Part of a box that lies in an image of the shape (H, W, ...)."""
-    u0, v0 = max(box.u0_px, 0), max(box.v0_px, 0)
-    u1, v1 = min(box.u0_px + box.width_px, shape[1]), min(box.v0_px + box.height_px, shape[0])
-    return Box(u0, v0, max(u1 - u0, 0), max(v1 - v0, 0))
-
-
-def cut(image: NDArray[Any], box: Box) -> NDArray[Any]:
-    """Pixels of a box, shape (height, width, ...)."""
-    return image[box.slices]
-
-
-LEAST_PX = 5  # side of a box below which there is nothing to measure
+# -- search regions --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Sight:
-    """One image.
+class SearchRegion:
+    """Part of one image of a pair that holds its spot, as the built-in methods see it.
 
     Attributes
     ----------
@@ -188,17 +185,17 @@ class Sight:
     @property
     def pixels(self) -> NDArray[Any]:
         """Pixels of the box, as the camera delivers them."""
-        return cut(self.pair.images[self.position], self.box)
+        return self.pair.images[self.position][self.box.slices]
 
     @property
     def off_pixels(self) -> NDArray[Any] | None:
         """Pixels of the box with the laser off."""
         off = self.pair.images.get(f"{self.position}_off")
-        return None if off is None else cut(off, self.box)
+        return None if off is None else off[self.box.slices]
 
     @property
     def planes(self) -> Array:
-        """Linear light of the box: `linear.linear_planes`."""
+        """Linear light of the box: `image_planes.linear_planes`."""
         return linear_planes(self.pixels, self.pair.card, self.origin_px)
 
     @property
@@ -215,24 +212,27 @@ class Sight:
         red, off = redness(self.planes), self.off_pixels
         return red if off is None else red - redness(linear_planes(off, self.pair.card, self.origin_px))
 
-    def narrowed(self) -> Sight | None:
-        """Sight of 15 x 15 pixels around the reddest spot-like place in the box; None if there is none."""
+    def narrowed(self) -> SearchRegion | None:
+        """Region of 15 x 15 pixels around the reddest spot-like place in the box; None if there is none."""
         return self.window_at(red_peak(self.red))
 
-    def window_at(self, peak: tuple[float, float] | None) -> Sight | None:
-        """Sight of 15 x 15 pixels around a place (u, v) in the coordinates of the box."""
+    def window_at(self, peak: tuple[float, float] | None) -> SearchRegion | None:
+        """Region of 15 x 15 pixels around a place (u, v) in the coordinates of the box."""
         if peak is None:
             return None
         uv = (peak[0] + self.box.u0_px, peak[1] + self.box.v0_px)
         return replace(self, box=around(uv, self.pair.images[self.position].shape))
 
 
-def each_spot(find: Callable[[Sight], Spot]) -> Method:
+# -- methods on search regions ---------------------------------------------------------------------------------------
+
+
+def each_spot(find: Callable[[SearchRegion], Spot]) -> Method:
     """Method that looks at each image by itself, where `locate` sees a spot."""
     return lambda pair: _both(find, pair, locate(pair), None)
 
 
-def each_spot_twice(find: Callable[[Sight], Spot]) -> Method:
+def each_spot_twice(find: Callable[[SearchRegion], Spot]) -> Method:
     """The same, and once more with the distance that the first answer gives, for methods that use the beam's size."""
 
     def method(pair: Pair) -> Answer:
@@ -243,19 +243,21 @@ def each_spot_twice(find: Callable[[Sight], Spot]) -> Method:
 
 
 def _both(
-    find: Callable[[Sight], Spot], pair: Pair, boxes: tuple[Box | None, Box | None], depth_m: float | None
+    find: Callable[[SearchRegion], Spot], pair: Pair, boxes: tuple[Box | None, Box | None], depth_m: float | None
 ) -> Answer:
     down, up = (_seen(find, pair, name, box, depth_m) for name, box in zip(("down", "up"), boxes, strict=True))
     return Answer(down, up)
 
 
-def _seen(find: Callable[[Sight], Spot], pair: Pair, position: str, box: Box | None, depth_m: float | None) -> Spot:
+def _seen(
+    find: Callable[[SearchRegion], Spot], pair: Pair, position: str, box: Box | None, depth_m: float | None
+) -> Spot:
     if box is None:
         return Spot.missing("nothing spot-like in the mirror")
     inside = clipped(box, pair.images[position].shape)
     if min(inside.width_px, inside.height_px) < LEAST_PX:
         return Spot.missing("the box lies outside the image")
-    return find(Sight(pair, position, inside, depth_m))
+    return find(SearchRegion(pair, position, inside, depth_m))
 
 
 def spot_of(found: SpotPositions) -> Spot:
@@ -264,3 +266,38 @@ def spot_of(found: SpotPositions) -> Spot:
     if status is not Status.OK:
         return Spot.missing(describe(status))
     return Spot((float(found.uv_px[0, 0]), float(found.uv_px[0, 1])))
+
+
+# -- the spot's distance and blur ------------------------------------------------------------------------------------
+
+
+def measured_twice(measure: Callable[[float | None], Answer], pair: Pair) -> Answer:
+    """Answer of `measure`, which takes the spot's distance: once without it, once with the one found.
+
+    The beam's size in a spot's image needs the distance, which both images of a pair tell once they are measured. A
+    spot that the second measurement does not find keeps the first one's answer.
+    """
+    first = measure(None)
+    depth_m = seen_depth_m(pair, first)
+    if depth_m is None:
+        return first
+    second = measure(depth_m)
+    down, up = (
+        one if two.uv_px is None or two.covariance_px2 is None else two
+        for one, two in ((first.down, second.down), (first.up, second.up))
+    )
+    return Answer(down, up)
+
+
+def seen_depth_m(pair: Pair, answer: Answer) -> float | None:
+    """Distance at which the rays through two positions meet; None if they do not, or the beam is not known."""
+    if pair.beam is None or answer.down.uv_px is None or answer.up.uv_px is None:
+        return None
+    found = depth_exact(pair.rig, pair.stroke_m, np.array(answer.down.uv_px), np.array(answer.up.uv_px))
+    depth_m = float(found.depth_m)
+    return depth_m if found.status == Status.OK and _BEAM_RANGE_M[0] <= depth_m <= _BEAM_RANGE_M[1] else None
+
+
+def pair_blur(pair: Pair, uv_px: ArrayLike, depth_m: float | None) -> SpotBlur:
+    """Blur of a spot of the pair's laser at a distance; None leaves the beam's size out."""
+    return spot_blur(pair.rig, uv_px, depth_m, pair.beam)

@@ -24,7 +24,7 @@ from phibench.estimator.geometry.combine import CombinedEstimate, combine
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Image, Matrix2, Pair, Spot
 from phibench.estimator.methods.chain_fit import chain_fit
-from phibench.estimator.methods.locate import Sight, each_spot_twice, pair_blur, seen_depth_m
+from phibench.estimator.methods.locate import SearchRegion, each_spot_twice, pair_blur, seen_depth_m
 from phibench.estimator.spots.fit_joint import JointFit, fit_joint
 from phibench.estimator.spots.fit_raw import SpotData, SpotFit, fit_law, spot_data
 from phibench.estimator.spots.gaussian_spot import SpotModel
@@ -44,16 +44,16 @@ _FLAT_SIGMAS = 4.0  # by which the chi2 of a fit with flat levels must exceed 1 
 _MISFIT_SIGMAS = 3.0  # by which the fit's chi2 must exceed 1 before its covariance is widened
 
 
-def raw_maximum_likelihood(sight: Sight) -> Spot:
+def raw_maximum_likelihood(region: SearchRegion) -> Spot:
     """Position and covariance by maximum likelihood on 15 x 15 raw pixels around the red peak."""
     try:
-        noise = noise_of(sight.pair.card)
+        noise = noise_of(region.pair.card)
     except ValueError:
         return Spot.missing("the fit needs shot noise and no row noise")
-    near = sight.narrowed()
+    near = region.narrowed()
     if near is None:
         return Spot.missing("no spot")
-    x = raw_electrons(near.pixels, sight.pair.card)[None]
+    x = raw_electrons(near.pixels, region.pair.card)[None]
     flat = _fit(near, x, noise, None)
     if (
         near.off_pixels is None
@@ -65,7 +65,7 @@ def raw_maximum_likelihood(sight: Sight) -> Spot:
     return _fitted_spot(structured if structured.status[0] == Status.OK else flat, x.size)
 
 
-def _fit(near: Sight, x: Array, noise: PixelNoise, background: Background | None) -> SpotFit:
+def _fit(near: SearchRegion, x: Array, noise: PixelNoise, background: Background | None) -> SpotFit:
     """Fit with a known background, or with a level per filter."""
     card, rig = near.pair.card, near.pair.rig
     u0, v0 = near.origin_px
@@ -82,7 +82,7 @@ def _response(pair: Pair) -> tuple[float, float, float] | None:
     return (r, g, b) if pair.card.mosaic == "bayer" else None
 
 
-def _background(near: Sight, x: Array, noise: PixelNoise, flat: SpotFit) -> Background:
+def _background(near: SearchRegion, x: Array, noise: PixelNoise, flat: SpotFit) -> Background:
     """Room of the laser-off frame; without one, of the pixels around the spot."""
     off = near.off_pixels
     if off is not None:

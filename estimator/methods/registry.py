@@ -1,7 +1,4 @@
-"""A method that comes with phibench, and what it can be asked.
-
-The methods that come with phibench, by name. One entry adds one.
-"""
+"""Registry of the built-in methods, by name: `METHODS` holds those that can run here. One entry adds one."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from phibench.estimator.methods.locate import each_spot, each_spot_twice
 from phibench.estimator.methods.raw_likelihood import joint_fit, raw_maximum_likelihood
 from phibench.estimator.methods.simple import (
     at_the_red_peak,
-    detect,
+    detected_spots,
     in_the_box,
     off_difference,
     photutils_centroid_2dg,
@@ -37,7 +34,7 @@ class BuiltIn:
     source : str
         Where the idea comes from.
     accepts : tuple of str
-        Kinds of images, of `linear.KINDS`.
+        Kinds of images, of `image_planes.KINDS`.
     needs_off : bool
         Whether it cannot do without laser-off frames.
     needs_boxes : bool
@@ -139,7 +136,7 @@ _ALL = (
     ),
     BuiltIn(
         "detect",
-        detect,
+        detected_spots,
         "peak of a matched filter over the whole mirror, boxes or not, refined by parabolas",
         "estimator/spots/detect.py",
     ),

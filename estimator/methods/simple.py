@@ -1,12 +1,7 @@
-"""The simple extractors of `estimator.simple_spots` as methods: on the picture as a viewer shows it.
+"""Built-in methods without a noise model: simple extractors, colour and difference centroids, other packages, `detect`.
 
-Centroid of the redness R - max(G, B) in linear light, above 30 % of its peak.
-
-Centroid of the red light that the laser adds: on minus off, formed in linear light.
-
-Extractors of other packages, as rows to compare with; each package is imported when its method runs.
-
-Seat method `detect`: the peak of the matched filter, without covariance.
+The extractors of `simple_spots` work on the picture as a viewer shows it. Extractors of other packages are rows to
+compare with; each package is imported when its method runs.
 """
 
 from __future__ import annotations
@@ -16,14 +11,13 @@ from collections.abc import Callable
 import numpy as np
 
 from phibench.estimator.interface import Answer, Pair, Spot
-from phibench.estimator.methods.locate import Sight, red_peak, spot_of
-from phibench.estimator.spots.detect import Detection
-from phibench.estimator.spots.detect import detect as detect_spots
+from phibench.estimator.methods.locate import SearchRegion, red_peak, spot_of
+from phibench.estimator.spots.detect import Detection, detect
 from phibench.estimator.spots.image_planes import linear_planes, redness
 from phibench.estimator.spots.simple_spots import SIMPLE_METHODS, thresholded_centroid
 from phibench.scenes.frames import Array
 
-Finder = Callable[[Sight], Spot]
+Finder = Callable[[SearchRegion], Spot]
 
 
 def in_the_box(name: str) -> Finder:
@@ -34,8 +28,8 @@ def in_the_box(name: str) -> Finder:
     name : key of `simple_spots.SIMPLE_METHODS`
     """
 
-    def find(sight: Sight) -> Spot:
-        return spot_of(SIMPLE_METHODS[name](sight.picture[None], sight.origin_px))
+    def find(region: SearchRegion) -> Spot:
+        return spot_of(SIMPLE_METHODS[name](region.picture[None], region.origin_px))
 
     return find
 
@@ -48,59 +42,59 @@ def at_the_red_peak(name: str) -> Finder:
     name : key of `simple_spots.SIMPLE_METHODS`
     """
 
-    def find(sight: Sight) -> Spot:
-        near = sight.narrowed()
+    def find(region: SearchRegion) -> Spot:
+        near = region.narrowed()
         return Spot.missing("no spot") if near is None else in_the_box(name)(near)
 
     return find
 
 
-def red_centroid(sight: Sight) -> Spot:
+def red_centroid(region: SearchRegion) -> Spot:
     """Thresholded centroid of the redness on 15 x 15 pixels around its peak; of the signal without colour filters."""
-    near = sight.narrowed()
+    near = region.narrowed()
     if near is None:
         return Spot.missing("no spot")
     return spot_of(thresholded_centroid(redness(near.planes)[None], near.origin_px))
 
 
-def off_difference(sight: Sight) -> Spot:
+def off_difference(region: SearchRegion) -> Spot:
     """Thresholded centroid of the difference's red plane, on 15 x 15 pixels around its peak."""
-    near = sight.window_at(red_peak(_added(sight)))
+    near = region.window_at(red_peak(_added(region)))
     if near is None:
         return Spot.missing("no spot in the difference")
     return spot_of(thresholded_centroid(_added(near)[None], near.origin_px))
 
 
-def _added(sight: Sight) -> Array:
+def _added(region: SearchRegion) -> Array:
     """Red plane of on - off, shape (h, w); differences of encoded values would depend on the room's level."""
-    off = sight.off_pixels
+    off = region.off_pixels
     if off is None:
         raise ValueError("off_difference: the pair has no laser-off frames")
-    return sight.planes[0] - linear_planes(off, sight.pair.card, sight.origin_px)[0]
+    return region.planes[0] - linear_planes(off, region.pair.card, region.origin_px)[0]
 
 
 TRACKPY_DIAMETER_PX = 7
 
 
-def photutils_centroid_2dg(sight: Sight) -> Spot:
+def photutils_centroid_2dg(region: SearchRegion) -> Spot:
     """`photutils.centroids.centroid_2dg` on the redness of 15 x 15 pixels: an elliptical Gaussian by least squares."""
     from photutils.centroids import centroid_2dg
 
-    near = sight.narrowed()
+    near = region.narrowed()
     if near is None:
         return Spot.missing("no spot")
     u, v = (float(x) for x in centroid_2dg(_above(near)))
     return _spot_in_window(near, u, v)
 
 
-def trackpy_refine(sight: Sight) -> Spot:
+def trackpy_refine(region: SearchRegion) -> Spot:
     """`trackpy.refine_com` on the redness of 15 x 15 pixels: centroid in a disc of 7 pixels, moved until it is central.
 
     Trackpy's own search wants whole numbers; the start is the red peak.
     """
     from trackpy import refine_com
 
-    near = sight.narrowed()
+    near = region.narrowed()
     if near is None:
         return Spot.missing("no spot")
     image = np.maximum(_above(near), 0.0)
@@ -109,7 +103,7 @@ def trackpy_refine(sight: Sight) -> Spot:
     return _spot_in_window(near, float(table["u"].iloc[0]), float(table["v"].iloc[0]))
 
 
-def _above(near: Sight) -> Array:
+def _above(near: SearchRegion) -> Array:
     """Redness over the median of the window's border; scaled, because a fit's tolerances are absolute."""
     red = redness(near.planes)
     edge = np.concatenate([red[0], red[-1], red[1:-1, 0], red[1:-1, -1]])
@@ -117,16 +111,16 @@ def _above(near: Sight) -> Array:
     return np.asarray(above / max(float(above.max()), 1e-12))
 
 
-def _spot_in_window(near: Sight, u: float, v: float) -> Spot:
+def _spot_in_window(near: SearchRegion, u: float, v: float) -> Spot:
     """Answer for a position in the window."""
     if not (0.0 <= u <= near.box.width_px - 1.0 and 0.0 <= v <= near.box.height_px - 1.0):
         return Spot.missing("spot cut")
     return Spot((u + near.box.u0_px, v + near.box.v0_px))
 
 
-def detect(pair: Pair) -> Answer:
+def detected_spots(pair: Pair) -> Answer:
     """Position of the matched filter's peak, refined by a parabola, in both images."""
-    found = detect_spots(pair)
+    found = detect(pair)
     return Answer(_detected_spot(found.down), _detected_spot(found.up))
 
 

@@ -1,17 +1,15 @@
-"""Map of how much every half pixel looks like a spot: a matched filter, normalised by the noise.
+"""Candidates for a spot in one image: a matched-filter map of every half pixel, and a test of its peaks.
 
-Amplitude of a spot of the profile k (pixel-integrated Gaussian) at a place: A = sum(k d) / sum(k^2), its variance
-V / sum(k^2), over the sites of the red plane; d is the light above the background. The background is
-the laser-off frame where there is one; otherwise green, scaled to the local ratio of red and green, because the room's
-light is not as red as the laser; without filters the mean of the surroundings.
+Map. Amplitude of a spot of the profile k (pixel-integrated Gaussian) at a place: A = sum(k d) / sum(k^2), its variance
+V / sum(k^2), over the sites of the red plane; d is the light above the background. The background is the laser-off
+frame where there is one. Otherwise it is green, scaled to the local ratio of red and green, because the room's light is
+not as red as the laser; without filters it is the mean of the surroundings.
 
-Test of candidates: how significant a spot at a place is, and whether it is red.
-
-At each place and for each plane: least squares of a spot's profile on a tilted background, over a patch. The
-significance is amplitude over standard deviation, less where the model does not fit: divided by sqrt(chi^2), so that
-edges, lines and corners of the room, which match a spot a little and its surroundings not at all, stay below any
-threshold: with p pixels and correlation c between structure and profile it cannot pass c sqrt(p / (1 - c^2)) by what
-lies beside the profile. In chi^2 a pixel of the spot has its shot noise and a tenth of its light as further noise.
+Test. At each place and for each plane: least squares of a spot's profile on a tilted background, over a patch. The
+significance is amplitude over standard deviation, divided by sqrt(chi^2) where the model does not fit. Edges, lines and
+corners of the room match a spot a little and its surroundings not at all: with p pixels and a correlation c between
+structure and profile, the significance cannot pass c sqrt(p / (1 - c^2)) by what lies beside the profile. In chi^2 a
+pixel of the spot has its shot noise and a tenth of its light as further noise.
 """
 
 from __future__ import annotations
@@ -28,6 +26,8 @@ from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.spots.gaussian_spot import outer, profile
 from phibench.estimator.spots.image_planes import ColourPlanes, green_at_red, variance_e2
 from phibench.scenes.frames import Array, BoolArray
+
+# -- map of a matched filter -----------------------------------------------------------------------------------------
 
 _KERNEL_REACH_PX = 4
 _PHASES = (0.0, 0.5)
@@ -152,10 +152,10 @@ def _map_spread(z: NDArray[Any], inside: BoolArray) -> float:
     return float(max(spread / _NOISE, 0.5))
 
 
-_PATCH_REACH_PX = {
-    True: 6,
-    False: 4,
-}  # of a patch: of a mosaic, where a quarter of the pixels are red, and of whole planes
+# -- test of places --------------------------------------------------------------------------------------------------
+
+# of a patch: of a mosaic, where a quarter of the pixels are red, and of whole planes
+_PATCH_REACH_PX = {True: 6, False: 4}
 # of white light's green: where red ends; the laser's is 0.1, but for JPEG's coarse chroma
 _GREEN_SHARE = {"raw": 0.5, "srgb8": 0.5, "mjpeg": 0.75}
 _FULLER = 0.5
@@ -167,8 +167,8 @@ _FULL_PX = 3  # a saturated spot is not wider
 
 
 @dataclass(frozen=True)
-class Verdicts:
-    """Verdicts of n places.
+class Candidates:
+    """Tested places, n of them.
 
     Attributes
     ----------
@@ -189,8 +189,8 @@ class Verdicts:
 
 
 @dataclass(frozen=True)
-class VerdictNoise:
-    """What tests of places without a spot give: for pixels that are correlated by processing it is not 1.
+class CandidateNoise:
+    """Result of tests at places without a spot: not 1 for pixels that processing correlates.
 
     Attributes
     ----------
@@ -213,14 +213,14 @@ class _Fit:
     chi2: Array
 
 
-def judged(
+def candidates_at(
     on: ColourPlanes,
     off: ColourPlanes | None,
     card: SensorCard,
     uv_px: Array,
     sigma_px: float,
-    noise: VerdictNoise = VerdictNoise(),
-) -> Verdicts:
+    noise: CandidateNoise = CandidateNoise(),
+) -> Candidates:
     """Test places.
 
     Parameters
@@ -230,7 +230,7 @@ def judged(
     uv_px : shape (n, 2), relative to the part
     sigma_px : float
         Blur in the planes.
-    noise : VerdictNoise
+    noise : CandidateNoise
     """
     reach = _PATCH_REACH_PX[on.mosaic]
     corner = np.rint(uv_px).astype(int) - reach
@@ -243,20 +243,20 @@ def judged(
         red = _bright_or(red, on, card, corner, template)
     z = red.amplitude / np.sqrt(red.variance * np.maximum(red.chi2 / noise.chi2, 1.0)) / noise.spread
     colour = _red([red, *fits[1:]], card) | _fuller(on, uv_px) if len(fits) > 1 else np.ones(len(z), bool)
-    return Verdicts(uv_px, z, red.amplitude, np.sqrt(red.variance) * noise.spread, red.chi2, colour)
+    return Candidates(uv_px, z, red.amplitude, np.sqrt(red.variance) * noise.spread, red.chi2, colour)
 
 
-def noise_of_verdicts(
+def candidate_noise(
     on: ColourPlanes, off: ColourPlanes | None, card: SensorCard, sigma_px: float, inside: BoolArray
-) -> VerdictNoise:
-    """What places all over the part give without a spot; (1, 1) for raw pixels, whose noise is known."""
+) -> CandidateNoise:
+    """Result of tests all over the part, where there is no spot; (1, 1) for raw pixels, whose noise is known."""
     places = lattice(inside, _LATTICE_PX)
     if card.output == "raw" or not len(places):
-        return VerdictNoise()
-    tests = judged(on, off, card, places, sigma_px)
+        return CandidateNoise()
+    tests = candidates_at(on, off, card, places, sigma_px)
     chi2 = float(max(np.quantile(tests.chi2, _CHI2_SHARE), 0.1))
     z = tests.z * np.sqrt(np.maximum(tests.chi2, 1.0) / np.maximum(tests.chi2 / chi2, 1.0))
-    return VerdictNoise(max(_tail_spread(z), 0.5), chi2)
+    return CandidateNoise(max(_tail_spread(z), 0.5), chi2)
 
 
 def _tail_spread(z: Array) -> float:

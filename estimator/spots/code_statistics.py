@@ -1,20 +1,17 @@
-"""Law of an 8-bit code at a pixel's own colour: each code is an interval of the raw signal.
+"""Statistics of pixels behind converter, full well, demosaicing and 8 bits, in closed form or from exact sums.
 
-Bilinear demosaicing keeps the value of a pixel behind its own filter. White balance, sRGB curve and both roundings are
-then a monotonic map from the converter's DN to the code, so that a code stands for a range of DN, and a range of DN for
-an interval [low, high) of electrons before the converter: the likelihood is Phi((high - mu) / s) - Phi((low - mu) / s),
-s^2 = V(mu). Rounding and clipping at both ends are in it exactly. The Poisson law is taken as a Gaussian.
-
-Mean and spread of the 8-bit codes of interpolated pixels, from the exact law of the converter's DN.
-
-A demosaiced value is the mean of 1, 2 or 4 pixels, so it stands on a lattice of 1, 1/2 or 1/4 DN. A webcam's converter
-and the sRGB curve are coarse against the noise (12.5 electrons a DN, up to 3 codes a DN): the code's rounding does not
-average out, and smooth expansions are off by up to half a code. The sums over the lattice are done once, on nodes of
-the mean, as for pixels of equal means; along the slope of a spot the variances add up to the same, V being affine.
-
-Pixels that the full well cuts: mean, slope and variance of min(X, W) for a Gaussian X.
-
-With z = (W - mu) / s, Phi and phi of the normal law, and T = W - min(X, W):
+* `code_law`: likelihood of the code at a pixel's own colour. Bilinear demosaicing keeps the value of a pixel behind its
+  own filter, and white balance, sRGB curve and both roundings are a monotonic map from the converter's DN to the code.
+  A code is therefore an interval [low, high) of electrons before the converter, with the probability
+  Phi((high - mu) / s) - Phi((low - mu) / s), s^2 = V(mu). Rounding and clipping at both ends are in it exactly. The
+  Poisson law is taken as a Gaussian.
+* `mean_codes`: mean and spread of the codes of interpolated pixels, from the exact law of the converter's DN. A
+  demosaiced value is the mean of 1, 2 or 4 pixels, on a lattice of 1, 1/2 or 1/4 DN. A webcam's converter and the sRGB
+  curve are coarse against the noise (12.5 electrons a DN, up to 3 codes a DN), so that the code's rounding does not
+  average out and smooth expansions are off by up to half a code. The sums over the lattice are done once, on nodes of
+  the mean, for pixels of equal means; along the slope of a spot the variances add up to the same, V being affine.
+* `cut_pixels`: pixels that the full well cuts, min(X, W) for a Gaussian X. With z = (W - mu) / s, Phi and phi of the
+  normal law, and T = W - min(X, W):
 
     E[T] = s (z Phi(z) + phi(z)),    E[T^2] = s^2 ((z^2 + 1) Phi(z) + z phi(z)),    dE[min(X, W)] / dmu = Phi(z).
 """
@@ -41,6 +38,9 @@ _BELOW = 8.0  # square root of the electrons below 0 that a fit may try
 _FAR = 6.0  # standard deviations beyond which an interval's score is that of its nearer end
 _WELL_SIGMAS = 4.0  # of read noise: what is this near to saturation only says "at least"
 _ROOT_2PI = np.sqrt(2.0 * np.pi)
+
+
+# -- codes of a pixel's own colour -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -206,6 +206,8 @@ def _finite(x: Array) -> Array:
     return np.where(np.isfinite(x), x, 0.0)
 
 
+# -- codes of interpolated pixels ------------------------------------------------------------------------------------
+
 COUNTS = (1, 2, 4)
 """Pixels in a mean."""
 
@@ -300,9 +302,12 @@ def _law(mu: float, card: SensorCard, noise: PixelNoise) -> tuple[float, Array]:
     return float(low), np.diff(np.concatenate([[0.0], below, [1.0]]))
 
 
+# -- full well -------------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class CutPixels:
-    """What is left of pixels, shapes as the means.
+    """Pixels that the full well has cut, shapes as the means.
 
     Attributes
     ----------

@@ -1,19 +1,12 @@
-"""Where lamps are in an image: large bright areas, around which an edge, clipping or JPEG's ringing look like anything.
+"""Detection of the laser spot in both whole frames of a pair, without a hint.
 
-Bright is a multiple of the usual level; a spot, however strong, is small.
-
-Which candidates of both images are the spot: they must show one point of the room.
-
-The ray of a pixel of the down image passes points at distances D; their images sweep a curve in the up image, for
-tilted rigs too. A candidate of the up image belongs to it if it lies near the curve.
-
-Detection of the laser spot in both whole frames of a pair, without a hint.
-
-Per image: the strongest places of a matched filter (`spot_map`) inside the mirror's outline, each tested for shape and
-colour (`spot_verdict`). Then both images together (`spot_pair`): the spot's images belong to one point of the room.
+Per image: the strongest places of a matched filter inside the mirror's outline and away from lamps, each tested for
+shape and colour (`candidates`). Then both images together: the ray of a pixel of the down image passes points at
+distances D, whose images sweep a curve in the up image. The spot's images belong to one point, so that the candidate of
+the up image lies near the curve.
 
 False alarms. The mirror's disc has 3.6e5 pixels and each is asked at 4 half-pixel places, so that a frame has at most
-N = 1.44e6 trials; on raw pixels whose background is known the significance is never larger than a unit normal's,
+N = 1.44e6 trials. On raw pixels whose background is known the significance is never larger than a unit normal's,
 because chi^2 only lowers it. A candidate alone: N Q(6.2) = 4e-4 a frame. A pair: the partner lies within 4 px of a
 curve at most 340 px long, n = 4 x 2700 trials, and both pass 4.8: N n Q(4.8)^2 = 0.01 with all places taken for
 independent. Those within a blur's area (7 px, 4 places each) share their noise, in both images, which leaves about
@@ -33,10 +26,12 @@ from scipy.ndimage import label, maximum_filter
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.mirror_image import up_image
 from phibench.estimator.interface import Box, Image, Pair
-from phibench.estimator.spots.candidates import Verdicts, judged, noise_of_verdicts, peaks
+from phibench.estimator.spots.candidates import Candidates, candidate_noise, candidates_at, peaks
 from phibench.estimator.spots.image_planes import ColourPlanes, blur_of, colour_planes
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig
+
+# -- lamps -----------------------------------------------------------------------------------------------------------
 
 _BRIGHT = 3.0  # times the median inside the mirror
 _LEAST_AREA_PX = 80
@@ -44,7 +39,11 @@ _HALO_PX = {True: 5, False: 12}  # of raw pixels; of processed ones, a JPEG's bl
 
 
 def lamp_halo(planes: ColourPlanes, inside: BoolArray, card: SensorCard) -> BoolArray:
-    """Lamps and what is near to them, shape (h, w)."""
+    """Lamps and what is near to them, shape (h, w): large bright areas.
+
+    Around them an edge, clipping or JPEG's ringing look like anything. Bright is a multiple of the usual level; a spot,
+    however strong, is small.
+    """
     step = 2 if planes.mosaic else 1
     red = planes.values_e[0][::step, ::step]
     bright = (red > _BRIGHT * np.median(red[inside[::step, ::step]])) | planes.full[0][::step, ::step]
@@ -54,6 +53,8 @@ def lamp_halo(planes: ColourPlanes, inside: BoolArray, card: SensorCard) -> Bool
     lamps = np.repeat(np.repeat(large[areas], step, axis=0), step, axis=1)[: planes.shape[0], : planes.shape[1]]
     return np.asarray(maximum_filter(lamps, 2 * _HALO_PX[card.output == "raw"] + 1))
 
+
+# -- both images together --------------------------------------------------------------------------------------------
 
 NEAREST_M, FARTHEST_M = 0.3, 12.0  # of D
 NEAR_CURVE_PX = 4.0  # what a rig that is not quite as nominal moves the curve by
@@ -80,14 +81,14 @@ class Choice:
     up: int | None = None
 
 
-def choose(rig: Rig, stroke_m: float, down: Verdicts, up: Verdicts, least: Thresholds, sure: bool) -> Choice:
+def choose(rig: Rig, stroke_m: float, down: Candidates, up: Candidates, least: Thresholds, sure: bool) -> Choice:
     """Choose the strongest consistent pair, or one candidate alone.
 
     Parameters
     ----------
     rig : Rig
     stroke_m : float
-    down, up : Verdicts
+    down, up : Candidates
         Candidates, pixels of the whole image, strongest first.
     least : Thresholds
     sure : bool
@@ -135,13 +136,15 @@ def _distance(curve: Array, points: Array) -> Array:
     return np.min(np.where(np.isfinite(distance), distance, np.inf), axis=-1)
 
 
-def _single(down: Verdicts, up: Verdicts, alone: float) -> Choice:
+def _single(down: Candidates, up: Candidates, alone: float) -> Choice:
     """The more significant one of the strongest candidates that pass alone; both could not be one point."""
     rows = [int(np.flatnonzero(side.z >= alone)[0]) if (side.z >= alone).any() else None for side in (down, up)]
     if rows[0] is None or rows[1] is None:
         return Choice(rows[0], rows[1])
     return Choice(rows[0]) if down.z[rows[0]] >= up.z[rows[1]] else Choice(None, rows[1])
 
+
+# -- detection -------------------------------------------------------------------------------------------------------
 
 RAW = Thresholds(alone=6.2, each=4.8, together=4.8)
 PROCESSED = Thresholds(alone=7.5, each=4.6, together=5.5)
@@ -189,19 +192,28 @@ class _Searched:
     on: ColourPlanes
     off: ColourPlanes | None
     sigma_px: float
-    found: Verdicts
+    found: Candidates
 
 
 def detect(pair: Pair) -> PairDetection:
     """Find the strongest red laser light that both images agree on.
 
-    A spot in one image only must be more significant than one in both. Boxes of the pair, if
-    there are any, restrict the search.
+    A spot in one image only must be more significant than one in both. Boxes of the pair, if there are any, restrict
+    the search.
 
     Raises
     ------
     ValueError
         If an image does not fit the card's output.
+
+    Examples
+    --------
+    >>> from phibench.estimator.interface import Answer, Pair, Spot
+    >>> from phibench.estimator.spots.detect import detect
+    >>> def extract(pair: Pair) -> Answer:
+    ...     found = detect(pair)
+    ...     down, up = (Spot.missing("not seen") if d is None else Spot(d.uv_px) for d in (found.down, found.up))
+    ...     return Answer(down, up)  # about a tenth of a pixel; measure finer in a box around d.uv_px
     """
     off = pair.down_off is not None and pair.up_off is not None
     sure = off or pair.card.mosaic == "bayer"
@@ -253,12 +265,12 @@ def _searched(image: Image, dark: Image | None, pair: Pair, hint: Box | None, le
     inside = outline_mask(pair.rig, box)
     inside = inside & ~lamp_halo(off or on, inside, card)
     sigma = blur_of(card, pair.rig.camera.blur_sigma_px)
-    noise = noise_of_verdicts(on, off, card, sigma, inside)
+    noise = candidate_noise(on, off, card, sigma, inside)
     where = inside if hint is None else inside & _hinted(hint, box)
     places = peaks(on, off, card, sigma, where, _LEAST_PEAK, _MOST_PEAKS).uv_px
-    first = judged(on, off, card, places, sigma, noise)
+    first = candidates_at(on, off, card, places, sigma, noise)
     first = _rows(first, first.z >= np.sort(first.z)[-_MOST_TESTED:][:1].sum())
-    best = _better(first, judged(on, off, card, first.uv_px, _WIDER * sigma, noise))
+    best = _better(first, candidates_at(on, off, card, first.uv_px, _WIDER * sigma, noise))
     keep = best.red & (best.z >= least_z)
     return _Searched(on, off, sigma, _moved(_rows(best, keep), box))
 
@@ -271,10 +283,10 @@ def _hinted(hint: Box, box: Box) -> BoolArray:
     return mask
 
 
-def _better(a: Verdicts, b: Verdicts) -> Verdicts:
+def _better(a: Candidates, b: Candidates) -> Candidates:
     """At each place the test of the scale that fits better."""
     first = a.z >= b.z
-    return Verdicts(
+    return Candidates(
         a.uv_px,
         np.where(first, a.z, b.z),
         a.electrons,  # of one scale everywhere, so that spots can be compared
@@ -284,15 +296,15 @@ def _better(a: Verdicts, b: Verdicts) -> Verdicts:
     )
 
 
-def _rows(tests: Verdicts, keep: BoolArray) -> Verdicts:
+def _rows(tests: Candidates, keep: BoolArray) -> Candidates:
     order = np.flatnonzero(keep)[np.argsort(-tests.electrons[keep], kind="stable")]
-    return Verdicts(*(getattr(tests, name)[order] for name in tests.__dataclass_fields__))
+    return Candidates(*(getattr(tests, name)[order] for name in tests.__dataclass_fields__))
 
 
-def _moved(tests: Verdicts, box: Box) -> Verdicts:
+def _moved(tests: Candidates, box: Box) -> Candidates:
     origin = np.array([box.u0_px, box.v0_px], float)
     values = {name: getattr(tests, name) for name in tests.__dataclass_fields__}
-    return Verdicts(**{**values, "uv_px": tests.uv_px + origin})
+    return Candidates(**{**values, "uv_px": tests.uv_px + origin})
 
 
 def _refined(choice: Choice, down: _Searched, up: _Searched, card: SensorCard) -> PairDetection:
@@ -315,7 +327,7 @@ def parabola_peak(searched: _Searched, card: SensorCard, uv_px: Array, step_px: 
     """
     offsets = step_px * np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), -1).reshape(-1, 2)
     for _ in range(3):
-        test = judged(searched.on, searched.off, card, uv_px + offsets, searched.sigma_px)
+        test = candidates_at(searched.on, searched.off, card, uv_px + offsets, searched.sigma_px)
         gain = (np.maximum(test.electrons, 0.0) / test.sigma_e) ** 2
         best = int(np.argmax(gain))
         if best == len(offsets) // 2:

@@ -1,8 +1,8 @@
-"""Fit of a spot through the camera's own processing: mosaic, demosaicing, white balance, sRGB curve, 8 bits, JPEG.
+"""Fit of spots through the camera's own processing: mosaic, demosaicing, white balance, sRGB curve, 8 bits, JPEG.
 
-`fit_srgb` takes processed 8-bit images, `fit_jpeg` decoded MJPEG ones. Fits to luminance have a floor of 0.1 to 0.25 px
-that does not fall with the signal, because a demosaiced, gamma-encoded spot is no Gaussian; a fit of the raw pixels'
-model through the same processing has none.
+`fit_srgb` takes processed 8-bit images, `fit_jpeg` decoded MJPEG ones. Fits to the luminance have a floor of 0.1 to
+0.25 px that does not fall with the signal, because a demosaiced, gamma-encoded spot is no Gaussian. A fit of the raw
+pixels' model through the same processing has none.
 """
 
 from __future__ import annotations

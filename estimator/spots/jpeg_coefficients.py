@@ -1,21 +1,17 @@
-"""Numbers of baseline JPEG: quantisation tables, units, colour conversion, and the linear part of the encoder.
+"""Baseline JPEG as linear algebra: tables, transform, recovered coefficients, and the quantiser's statistics.
 
-ITU-T T.81 (1992), annex K for the tables; libjpeg's scaling of them by the quality; JFIF 1.02 for the colours.
-
-Quantised coefficients behind a decoded JPEG image.
-
-The decoder interpolates the chroma samples (libjpeg's triangle filter, 3/4 and 1/4 of the two nearest), converts to
-R, G, B and cuts to 0 to 255. Interpolation is undone by least squares, and each coefficient is one of the quantiser's
-multiples, which takes out the decoder's rounding. Where a pixel was cut, the value that the coefficients found so far
-would give takes its place, and the search goes on until the image comes out again.
-
-What the JPEG frame with the laser off does not say of the room: each coefficient is known to a quantiser's step.
-
-A coefficient c of the room that was quantised lies anywhere in its step s, with the variance s^2 / 12. Where the room
-is flat, the high frequencies are 0 and their step says nothing: of a coefficient whose neighbours have the mean square
-P the error is taken to have the variance (s^2 / 12) P / (P + s^2 / 12), Wiener's for two Gaussian laws.
-
-What a uniform quantiser makes of a Gaussian: mean, its slopes, and variance. Steps and values in the same unit.
+* Numbers: ITU-T T.81 (1992), annex K, for the quantisation tables; libjpeg's scaling of them by the quality; JFIF 1.02
+  for the colours. `coefficients` is the linear part of the encoder, without rounding.
+* `recovered`: quantised coefficients behind a decoded image. The decoder interpolates the chroma samples (libjpeg's
+  triangle filter, 3/4 and 1/4 of the two nearest), converts to R, G, B and cuts to 0 to 255. Interpolation is undone by
+  least squares, and each coefficient is a multiple of the quantiser's step, which takes out the decoder's rounding.
+  Where a pixel was cut, the value that the coefficients found so far would give takes its place, and the search goes on
+  until the image comes out again.
+* `room_variance`: error of the room's coefficients, known from the laser-off frame to a quantiser's step only. A
+  coefficient c lies anywhere in its step s, with the variance s^2 / 12. Where the room is flat, the high frequencies
+  are 0 and their step says nothing: of a coefficient whose neighbours have the mean square P the error has the variance
+  (s^2 / 12) P / (P + s^2 / 12), Wiener's for two Gaussian laws.
+* `quantised`: mean, slope and variance of a Gaussian behind a uniform quantiser. Steps and values in the same unit.
 """
 
 from __future__ import annotations
@@ -111,6 +107,8 @@ def steps(shape: tuple[int, int], subsampling: str, quality: int) -> Array:
     count = shape[0] * shape[1] // 64
     return np.concatenate([np.tile(luma.ravel(), count), np.tile(chroma.ravel(), 2 * count // (down * across))])
 
+
+# -- recovery from decoded images ------------------------------------------------------------------------------------
 
 _SHIFT = 128.0
 _SAME_CODES = 3.5  # of the decoder's own rounding, between our decoder in floating point and libjpeg's integers
@@ -219,6 +217,8 @@ def _plane(coefficients: Array) -> Array:
     return cut.reshape(*lead, 8 * rows, 8 * columns)
 
 
+# -- room behind a spot ----------------------------------------------------------------------------------------------
+
 _SIDE = 8
 _NEAR = 3  # frequencies on a side of the square that the mean is taken over
 
@@ -250,6 +250,8 @@ def _counts() -> Array:
     there[0, 0] = 0.0
     return np.asarray(np.maximum(uniform_filter(there, _NEAR, mode="constant") * _NEAR**2, 1.0))
 
+
+# -- statistics of a quantiser ---------------------------------------------------------------------------------------
 
 _FINE = 0.9  # standard deviations per step from which the output is input plus rounding: off by 2e-7 steps
 _THRESHOLDS = np.arange(-5, 6) + 0.5  # about the nearest multiple: 5 steps are 5.5 of the coarsest deviation

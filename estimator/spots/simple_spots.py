@@ -4,9 +4,7 @@ Regions are images of one spot, shape (n, h, w), or (n, h, w, 3) R, G, B, of whi
 pixel centres; `origin_px`, shape (2,) or (n, 2), is the image pixel of a region's first column and row. The background
 is the median of the region's border. NaN and a `Status` where there is no position.
 
-First extractor: background-subtracted centroid of the spot, for noise-free frames.
-
-Frames are expected electrons per second, shape (3, H, W), filters R, G, B; integer (u, v) are pixel centres.
+`find_spot` is the centroid of a noise-free frame of expected electrons per second, shape (3, H, W), filters R, G, B.
 """
 
 from __future__ import annotations
@@ -184,6 +182,8 @@ def _positions(signal: Array, uv: Array, origin_px: ArrayLike, converged: BoolAr
     return SpotPositions(keep(uv + np.asarray(origin_px, float), status), status)
 
 
+# -- noise-free frames -----------------------------------------------------------------------------------------------
+
 EMPTY = 1e-9  # of the peak: a border below this holds no flux; 1e-9 at 10 px distance moves a centroid by about 1e-7 px
 MAX_WIDTH_PX = 201
 
@@ -192,7 +192,7 @@ Region = tuple[int, int, int, int]  # u0, v0, u1, v1: first column and row, last
 
 @dataclass(frozen=True)
 class SpotPosition:
-    """Where the spot is.
+    """Position of a spot in a noise-free frame.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ import pytest
 
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.estimator.interface import Answer, Box, Pair, Spot
-from phibench.estimator.methods.locate import around, clipped, locate, red_peak
+from phibench.estimator.methods.locate import around, clipped, laser_light, locate, mirror_mask, red_peak
 from phibench.estimator.methods.registry import KNOWN, METHODS, BuiltIn
 from phibench.estimator.sandbox.easy_pairs import EasyPairs
 from phibench.estimator.spots.image_planes import (
@@ -101,6 +101,27 @@ def test_accuracy_of_the_built_in_methods(preset: str, name: str) -> None:
     # half a pixel off would be seen by all but the coarsest
     if WORST_PX[preset][name] < 0.5:
         assert np.median(np.linalg.norm(error + 0.5, axis=1)) > WORST_PX[preset][name]
+
+
+@pytest.mark.parametrize("laser_off", [True, False])
+@pytest.mark.parametrize("preset", ["bayer-raw", "mono-raw", "srgb8"])
+def test_laser_light_in_the_mirror_is_brightest_at_the_spot(preset: str, laser_off: bool) -> None:
+    """The five lines of `locate`'s docstring, two pixels: a mosaic's neighbours share a spot."""
+    pair, truth = easy(preset, 0, laser_off), EasyPairs(preset).truth(0)
+    mask = mirror_mask(pair)
+    assert mask.shape == pair.down.shape[:2]
+    outline = pair.rig.outline_px()
+    middle = outline.mean(axis=0)
+    for share, inside in ((0.97, True), (1.03, False)):
+        v, u = np.rint(middle + share * (outline - middle)).astype(int).T[::-1]
+        seen = (u >= 0) & (u < mask.shape[1]) & (v >= 0) & (v < mask.shape[0])
+        assert seen.sum() > 10
+        assert (mask[v[seen], u[seen]] == inside).all()
+    for position, true in (("down", truth.down), ("up", truth.up)):
+        light = laser_light(pair, position)
+        assert light.shape == mask.shape
+        v, u = np.unravel_index(np.argmax(np.where(mask, light, -np.inf)), light.shape)
+        assert math.hypot(u - true.uv_px[0], v - true.uv_px[1]) < 2.0
 
 
 def test_every_built_in_method_has_its_row() -> None:

@@ -23,8 +23,8 @@ from phibench.estimator.interface import Box, Pair
 from phibench.estimator.limits.position_bound import spot_limit
 from phibench.estimator.methods.locate import box_around, locate
 from phibench.estimator.methods.raw_likelihood import joint_fit
-from phibench.estimator.methods.simple import detect as detect_method
-from phibench.estimator.spots.candidates import judged, lattice
+from phibench.estimator.methods.simple import detected_spots
+from phibench.estimator.spots.candidates import candidates_at, lattice
 from phibench.estimator.spots.detect import (
     RAW,
     PairDetection,
@@ -171,7 +171,7 @@ def test_significance_of_noise_is_normal_or_less() -> None:
         pair = Scene(BAYER, (0.0, 0.0)).pair(200 + k)
         box = mirror_box(RIG)
         planes = [colour_planes(image, pair.card, box) for image in (pair.down, pair.down_off) if image is not None]
-        z.append(judged(planes[0], planes[1], pair.card, lattice(outline_mask(RIG, box), 7), 0.7).z)
+        z.append(candidates_at(planes[0], planes[1], pair.card, lattice(outline_mask(RIG, box), 7), 0.7).z)
     values = np.concatenate(z)
     assert len(values) > 1500
     assert abs(values.mean()) < 0.15
@@ -303,11 +303,11 @@ def test_hints_are_kept_and_restrict_the_search() -> None:
 
 def test_the_method_answers_positions_or_why_not() -> None:
     scene = Scene(BAYER)
-    answer = detect_method(scene.pair())
+    answer = detected_spots(scene.pair())
     assert answer.down.uv_px is not None
     assert answer.down.covariance_px2 is None
     assert np.hypot(*(np.array(answer.down.uv_px) - scene.uv("down"))) < 0.5
-    none = detect_method(Scene(BAYER, (0.0, 0.0)).pair())
+    none = detected_spots(Scene(BAYER, (0.0, 0.0)).pair())
     assert none.down.uv_px is None
     assert none.down.status == "no spot found"
 
