@@ -45,6 +45,14 @@ def tiny_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def smallest_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Data set of `tests/smallest.toml`, rendered once by two workers. Read only: copy it to change it."""
+    from phibench.datasets.make import make
+
+    return make(ROOT / "tests" / "smallest.toml", tmp_path_factory.mktemp("smallest") / "out", workers=2)
+
+
+@pytest.fixture(scope="session")
 def misaligned_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Data set of `tests/tiny.toml` with a tilt, a decentre, a form, a stroke too long and a yaw between the images."""
     from phibench.datasets.make import make

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.processes import TINY, living, quiet, said, wait_for
+from helpers.processes import SMALLEST, living, quiet, said, wait_for
 
 from phibench.datasets import make
 from phibench.datasets.build import run_tasks, spot_task
@@ -37,40 +37,40 @@ from phibench.scenes.laser import LaserSpot
 Usage = namedtuple("Usage", "total used free")
 
 
-def test_everything_is_there(tiny_dataset: Path) -> None:
-    plan = make_plan(load_recipe(TINY))
+def test_everything_is_there(smallest_dataset: Path) -> None:
+    plan = make_plan(load_recipe(SMALLEST))
     views = {schema.view_file(p.pose_id, name) for p in plan.poses for name in ("ambient", "truth", "preview")}
     spots = {schema.spot_file(pair.sample_id, position) for pair in plan.pairs for position in ("down", "up")}
     spots.remove("spots/half-hidden-h1.400-down.exr")  # a crate hides it
     previews = {schema.preview_file(pair.sample_id) for pair in plan.pairs}
     single = {schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.RIGS, schema.LIGHT_MAP}
-    assert set(read_checksums(tiny_dataset)) == views | spots | previews | single == set(data_files(tiny_dataset))
-    assert damaged(tiny_dataset) == []
-    assert (tiny_dataset / schema.RECIPE).read_bytes() == TINY.read_bytes()
+    assert set(read_checksums(smallest_dataset)) == views | spots | previews | single == set(data_files(smallest_dataset))
+    assert damaged(smallest_dataset) == []
+    assert (smallest_dataset / schema.RECIPE).read_bytes() == SMALLEST.read_bytes()
 
 
-def test_the_sums_are_those_of_sha256sum(tiny_dataset: Path) -> None:
-    child = subprocess.run(["sha256sum", "--quiet", "-c", schema.CHECKSUMS], cwd=tiny_dataset, capture_output=True)
+def test_the_sums_are_those_of_sha256sum(smallest_dataset: Path) -> None:
+    child = subprocess.run(["sha256sum", "--quiet", "-c", schema.CHECKSUMS], cwd=smallest_dataset, capture_output=True)
     assert child.returncode == 0, child.stdout
 
 
-def test_the_info_says_what_made_it(tiny_dataset: Path) -> None:
-    info = json.loads((tiny_dataset / schema.INFO).read_text())
+def test_the_info_says_what_made_it(smallest_dataset: Path) -> None:
+    info = json.loads((smallest_dataset / schema.INFO).read_text())
     provenance = info["provenance"]
     assert provenance["variant"] == default_variant()
     assert int(provenance["llvm"].split(".")[0]) >= 17
     assert provenance["threads_per_process"] == 1
     assert provenance["packages"]["mitsuba"]
     assert len(provenance["code_sha256"]) == 64
-    assert json.loads((tiny_dataset / schema.RUN).read_text())["seconds"] > 0.0
+    assert json.loads((smallest_dataset / schema.RUN).read_text())["seconds"] > 0.0
 
 
-def test_two_runs_are_byte_identical_whatever_the_number_of_workers(tiny_dataset: Path, tmp_path: Path) -> None:
-    again = make.make(TINY, tmp_path / "again", workers=1, console=quiet())
-    assert (again / schema.CHECKSUMS).read_text() == (tiny_dataset / schema.CHECKSUMS).read_text()
+def test_two_runs_are_byte_identical_whatever_the_number_of_workers(smallest_dataset: Path, tmp_path: Path) -> None:
+    again = make.make(SMALLEST, tmp_path / "again", workers=1, console=quiet())
+    assert (again / schema.CHECKSUMS).read_text() == (smallest_dataset / schema.CHECKSUMS).read_text()
     assert len(read_checksums(again)) >= 15
     # The comparison can fail: another seed gives other ambient light and the same truth.
-    text = TINY.read_text().replace("seed = 0", "seed = 1")
+    text = SMALLEST.read_text().replace("seed = 0", "seed = 1")
     (tmp_path / "other.toml").write_text(text)
     other = make.make(tmp_path / "other.toml", tmp_path / "other", workers=2, console=quiet())
     changed = {name for name, digest in read_checksums(other).items() if digest != read_checksums(again)[name]}
@@ -85,28 +85,28 @@ def _without_noise(row: ManifestRow) -> dict[str, object]:
     return row.model_dump(exclude={"down": {"noise"}, "up": {"noise"}})
 
 
-def test_a_finished_data_set_is_left_alone_and_a_damaged_one_made_again(tiny_dataset: Path, tmp_path: Path) -> None:
-    copy = Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
+def test_a_finished_data_set_is_left_alone_and_a_damaged_one_made_again(smallest_dataset: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(smallest_dataset, tmp_path / "copy"))
     console = quiet()
     (copy / "scores.json").write_text("{}")  # somebody's file is no reason to start over
-    make.make(TINY, copy, workers=1, console=console)
+    make.make(SMALLEST, copy, workers=1, console=console)
     assert "nothing to do" in said(console)
     (copy / schema.MANIFEST).unlink()
     (copy / schema.view_file("h0.500", "truth")).write_bytes(b"")
     (copy / f"{TEMPORARY_PREFIX}left.exr").write_bytes(b"")
     console = quiet()
-    make.make(TINY, copy, workers=2, console=console)
+    make.make(SMALLEST, copy, workers=2, console=console)
     assert "to make: 1 view; about 3 MB" in said(console)
     assert "7 of 8 tasks are done" in said(console)
     assert "tasks: 1/1" in said(console)
-    assert (copy / schema.CHECKSUMS).read_text() == (tiny_dataset / schema.CHECKSUMS).read_text()
+    assert (copy / schema.CHECKSUMS).read_text() == (smallest_dataset / schema.CHECKSUMS).read_text()
     assert list(copy.rglob(TEMPORARY_PREFIX + "*")) == []
 
 
 # Refusals: one sentence, before anything is rendered.
 
 
-def refusal(out: Path, recipe: Path = TINY, workers: int | None = 1) -> str:
+def refusal(out: Path, recipe: Path = SMALLEST, workers: int | None = 1) -> str:
     with pytest.raises(DatasetError) as caught:
         make.make(recipe, out, workers=workers, console=quiet())
     return str(caught.value)
@@ -119,11 +119,11 @@ def test_a_folder_with_other_things_is_refused(tmp_path: Path) -> None:
     assert "is a file" in refusal(tmp_path / "thesis.tex")
 
 
-def test_a_folder_with_another_data_set_is_refused(tiny_dataset: Path) -> None:
-    before = (tiny_dataset / schema.CHECKSUMS).read_text()
-    assert "holds another data set ('tiny')" in refusal(tiny_dataset, Path("smoke"))
-    assert (tiny_dataset / schema.CHECKSUMS).read_text() == before
-    assert damaged(tiny_dataset) == []
+def test_a_folder_with_another_data_set_is_refused(smallest_dataset: Path) -> None:
+    before = (smallest_dataset / schema.CHECKSUMS).read_text()
+    assert "holds another data set ('smallest')" in refusal(smallest_dataset, Path("smoke"))
+    assert (smallest_dataset / schema.CHECKSUMS).read_text() == before
+    assert damaged(smallest_dataset) == []
 
 
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,8 +147,8 @@ def test_no_workers_is_refused(tmp_path: Path) -> None:
     assert "workers = 0" in refusal(tmp_path / "out", workers=0)
 
 
-def test_the_estimate_of_the_size_is_honest(tiny_dataset: Path, smoke_dataset: Path) -> None:
-    for folder, recipe in ((tiny_dataset, TINY), (smoke_dataset, Path("smoke"))):
+def test_the_estimate_of_the_size_is_honest(smallest_dataset: Path, smoke_dataset: Path) -> None:
+    for folder, recipe in ((smallest_dataset, SMALLEST), (smoke_dataset, Path("smoke"))):
         size = sum((folder / name).stat().st_size for name in data_files(folder))
         plan = make_plan(load_recipe(recipe))
         assert 1.0 <= estimate(plan, plan_tasks(plan, {}).values()).size / size < 1.5
@@ -168,7 +168,7 @@ def test_a_sample_out_of_tolerance_is_refused_with_its_numbers(tmp_path: Path, m
 
 
 def test_a_spot_that_no_mirror_point_reflects_is_flagged() -> None:
-    plan = make_plan(load_recipe(TINY))
+    plan = make_plan(load_recipe(SMALLEST))
     above = LaserSpot((0.0, 0.0, 2.5), (0.0, 0.0, -1.0), 3e-3)
     answer = spot_task.answer_spot(plan.rig.at(0.0), above, plan.room)
     assert answer.truth.cause == "no_reflection"
@@ -190,7 +190,7 @@ def test_a_full_disk_in_the_middle_loses_nothing(tmp_path: Path, monkeypatch: py
 def test_control_c_in_the_middle_loses_nothing(tmp_path: Path) -> None:
     """SIGINT to the whole process group, as a terminal does, while two workers render."""
     recipe, out = tmp_path / "slow.toml", tmp_path / "out"
-    recipe.write_text(TINY.read_text().replace("cells_per_pixel = 2", "cells_per_pixel = 32"))
+    recipe.write_text(SMALLEST.read_text().replace("cells_per_pixel = 2", "cells_per_pixel = 32"))
     code = (
         "import sys\nfrom phibench.datasets.make import make\n"
         "if __name__ == '__main__':\n    make(sys.argv[1], sys.argv[2], workers=2)"

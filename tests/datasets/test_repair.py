@@ -30,8 +30,8 @@ pytestmark = pytest.mark.usefixtures("inline")
 
 
 @pytest.fixture
-def copy(tiny_dataset: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
+def copy(smallest_dataset: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(smallest_dataset, tmp_path / "copy"))
 
 
 def sign_what_is_there(folder: Path) -> None:
@@ -48,7 +48,7 @@ def mend(folder: Path) -> list[str]:
 @pytest.mark.parametrize("name", MADE_BY)
 @pytest.mark.parametrize("hide", [False, True], ids=["sums as they were", "sums made anew"])
 def test_a_damaged_file_is_made_again(
-    copy: Path, tiny_dataset: Path, name: str, damage: Callable[[Path], None], hide: bool
+    copy: Path, smallest_dataset: Path, name: str, damage: Callable[[Path], None], hide: bool
 ) -> None:
     damage(copy / name)
     if hide and name != schema.CHECKSUMS:
@@ -56,30 +56,30 @@ def test_a_damaged_file_is_made_again(
     found = mend(copy)
     assert found[0] == MADE_BY[name]
     assert set(found) <= {MADE_BY[name], schema.CHECKSUMS}
-    assert contents(copy) == contents(tiny_dataset)
+    assert contents(copy) == contents(smallest_dataset)
     assert mend(copy) == []
 
 
-def test_swapped_files_are_put_right(copy: Path, tiny_dataset: Path) -> None:
+def test_swapped_files_are_put_right(copy: Path, smallest_dataset: Path) -> None:
     swap(copy, SPOT, OTHER_SPOT)
     swap(copy, AMBIENT, schema.view_file("h0.500", "ambient"))
     write_checksums(copy)
     assert mend(copy)[:3] == ["spot seen-near-h0.500", "view h0.000", "view h0.500"]
-    assert contents(copy) == contents(tiny_dataset)
+    assert contents(copy) == contents(smallest_dataset)
     assert verify(copy, console=quiet()).ok
 
 
-def test_everything_at_once(copy: Path, tiny_dataset: Path) -> None:
+def test_everything_at_once(copy: Path, smallest_dataset: Path) -> None:
     for number, path in enumerate(sorted(path for path in copy.rglob("*.*") if path.name != schema.JOURNAL)):
         (truncate, flip_a_bit, Path.unlink)[number % 3](path) if path.is_file() and path.stat().st_size > 4 else None
     mend(copy)
-    assert contents(copy) == contents(tiny_dataset)
+    assert contents(copy) == contents(smallest_dataset)
 
 
-def test_without_a_journal_all_is_done_again(copy: Path, tiny_dataset: Path) -> None:
+def test_without_a_journal_all_is_done_again(copy: Path, smallest_dataset: Path) -> None:
     (copy / schema.JOURNAL).unlink()
     assert len(mend(copy)) >= 8
-    assert contents(copy) == contents(tiny_dataset)
+    assert contents(copy) == contents(smallest_dataset)
 
 
 def refusal(folder: Path) -> str:

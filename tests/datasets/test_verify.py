@@ -44,11 +44,11 @@ def check(folder: Path, truth_layers: bool = False) -> Report:
 
 
 @pytest.fixture
-def copy(tiny_dataset: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
+def copy(smallest_dataset: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(smallest_dataset, tmp_path / "copy"))
 
 
-@pytest.mark.parametrize("name", ["tiny_dataset", "smoke_dataset"])
+@pytest.mark.parametrize("name", ["smallest_dataset", "smoke_dataset"])
 def test_a_fresh_data_set_is_in_order(name: str, request: pytest.FixtureRequest) -> None:
     report = check(request.getfixturevalue(name), truth_layers=True)
     assert report.faults == ()
@@ -191,7 +191,7 @@ def test_a_missing_row_is_found(copy: Path) -> None:
 def test_a_changed_pixel_truth_is_found_when_asked_for(copy: Path) -> None:
     planes = read_truth(copy / TRUTH)
     planes["depth_m"][60:120, 100:200] *= 1.0 + 1e-5
-    write_truth(copy / TRUTH, planes, {"dataset": "tiny", "pose": "h0.500", "offset_m": 0.5})
+    write_truth(copy / TRUTH, planes, {"dataset": "smallest", "pose": "h0.500", "offset_m": 0.5})
     write_checksums(copy)
     assert check(copy).ok
     [fault] = check(copy, truth_layers=True).faults
@@ -224,12 +224,12 @@ def test_show_prints_a_table_and_draws_the_spots(copy: Path) -> None:
 
 
 @pytest.mark.parametrize("width", [60, 80, 100, 170])
-def test_show_never_cuts_a_number_or_a_name(tiny_dataset: Path, tmp_path: Path, width: int) -> None:
+def test_show_never_cuts_a_number_or_a_name(smallest_dataset: Path, tmp_path: Path, width: int) -> None:
     console = Console(file=io.StringIO(), width=width)
-    show(tiny_dataset, console, out=tmp_path / "sheet.png")
+    show(smallest_dataset, console, out=tmp_path / "sheet.png")
     text = console.file.getvalue()  # type: ignore[attr-defined]
     shown = set(re.split(r"[\s,]+", text))
-    for row in read_manifest(tiny_dataset):
+    for row in read_manifest(smallest_dataset):
         numbers = {f"{row.up.u_px:.2f}", f"{row.up.v_px:.2f}"}
         assert {row.sample_id, f"{row.depth_m:.3f}", f"{row.stroke_m:.3f}"} | numbers <= shown
     assert "occluded:crate_red" in shown
@@ -238,11 +238,11 @@ def test_show_never_cuts_a_number_or_a_name(tiny_dataset: Path, tmp_path: Path, 
     assert (tmp_path / "sheet.png").stat().st_size > 1000
 
 
-def test_a_sheet_that_cannot_be_written_is_said_after_the_table(tiny_dataset: Path, tmp_path: Path) -> None:
+def test_a_sheet_that_cannot_be_written_is_said_after_the_table(smallest_dataset: Path, tmp_path: Path) -> None:
     console = Console(file=io.StringIO(), width=170)
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(DatasetError, match=r"contact sheet was not written.*--out") as caught:
-        show(tiny_dataset, console, out=tmp_path / "file" / "sheet.png")
+        show(smallest_dataset, console, out=tmp_path / "file" / "sheet.png")
     assert "\n" not in str(caught.value)
     assert "seen-near-h0.500" in console.file.getvalue()  # type: ignore[attr-defined]
 
@@ -260,7 +260,7 @@ def test_the_sheet_is_written_when_the_reader_of_the_table_leaves(copy: Path) ->
     assert (copy / schema.CONTACT_SHEET).stat().st_size > 1000
 
 
-def test_a_sheet_says_why_a_spot_is_hidden(tiny_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sheet_says_why_a_spot_is_hidden(smallest_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     said = []
 
     def captioned(picture: Picture, text: str) -> Picture:
@@ -270,21 +270,21 @@ def test_a_sheet_says_why_a_spot_is_hidden(tiny_dataset: Path, monkeypatch: pyte
         return changed
 
     monkeypatch.setattr(show_module, "captioned", captioned)
-    show_module.contact_sheet(open_dataset(tiny_dataset), Console(file=io.StringIO()))
+    show_module.contact_sheet(open_dataset(smallest_dataset), Console(file=io.StringIO()))
     [text] = said  # the other three spots are seen
     assert "occluded:crate_red" in text
 
 
-def test_previews_mark_the_spot(tiny_dataset: Path) -> None:
-    with Image.open(tiny_dataset / schema.preview_file("seen-near-h0.500")) as image:
+def test_previews_mark_the_spot(smallest_dataset: Path) -> None:
+    with Image.open(smallest_dataset / schema.preview_file("seen-near-h0.500")) as image:
         picture = np.asarray(image)
     for half in np.split(picture, 2, axis=1):
         marks = np.all(half == (0, 255, 80), axis=2)
         assert np.count_nonzero(marks) > 4 * 24  # the inset's frame and the crosses
 
 
-def test_the_last_line_of_make_counts_what_can_be_used(tiny_dataset: Path) -> None:
-    rows = read_manifest(tiny_dataset)
+def test_the_last_line_of_make_counts_what_can_be_used(smallest_dataset: Path) -> None:
+    rows = read_manifest(smallest_dataset)
     assert visibility_line(rows) == (
         "1 of 2 pairs are visible in both images; not visible: down occluded:crate_red (1)"
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-TINY = Path(__file__).resolve().parents[1] / "tiny.toml"
+SMALLEST = Path(__file__).resolve().parents[1] / "smallest.toml"
 
 
 def quiet() -> Console:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from helpers.folders import contents, done
-from helpers.processes import TINY, living, quiet, said
+from helpers.processes import SMALLEST, living, quiet, said
 
 from phibench.datasets.build.journal import Entry, Head, Journal
 from phibench.datasets.build.run_tasks import claim
@@ -28,13 +28,13 @@ RUN = (
 
 
 @pytest.fixture
-def copy(tiny_dataset: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
+def copy(smallest_dataset: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(smallest_dataset, tmp_path / "copy"))
 
 
 def again(out: Path, *changes: tuple[str, str]) -> list[str]:
     """Make with a changed recipe; the tasks that were done."""
-    text = TINY.read_text()
+    text = SMALLEST.read_text()
     for old, new in changes:
         assert text.count(old) == 1
         text = text.replace(old, new)
@@ -46,8 +46,8 @@ def again(out: Path, *changes: tuple[str, str]) -> list[str]:
 
 
 @pytest.mark.usefixtures("inline")
-def test_bytes_do_not_depend_on_who_does_the_work(tiny_dataset: Path, tmp_path: Path) -> None:
-    assert contents(make(TINY, tmp_path / "out", workers=1, console=quiet())) == contents(tiny_dataset)
+def test_bytes_do_not_depend_on_who_does_the_work(smallest_dataset: Path, tmp_path: Path) -> None:
+    assert contents(make(SMALLEST, tmp_path / "out", workers=1, console=quiet())) == contents(smallest_dataset)
 
 
 SAMPLES = ["sample half-hidden-h1.400", "sample seen-near-h0.500"]
@@ -99,13 +99,13 @@ def test_names_and_times_of_files_prove_nothing(copy: Path) -> None:
 
 @pytest.mark.usefixtures("inline")
 @pytest.mark.parametrize("line", range(1, 9))
-def test_a_damaged_line_of_the_journal_costs_its_task_only(copy: Path, tiny_dataset: Path, line: int) -> None:
+def test_a_damaged_line_of_the_journal_costs_its_task_only(copy: Path, smallest_dataset: Path, line: int) -> None:
     lines = (copy / schema.JOURNAL).read_bytes().splitlines(keepends=True)
     assert len(lines) == 9
     lines[line] = lines[line].replace(b'"', b"'", 1)
     (copy / schema.JOURNAL).write_bytes(b"".join(lines))
     assert len(again(copy)) == 1
-    assert contents(copy) == contents(tiny_dataset)
+    assert contents(copy) == contents(smallest_dataset)
 
 
 def test_a_torn_last_line_is_as_if_it_were_not_there(tmp_path: Path) -> None:
@@ -139,7 +139,7 @@ def test_a_key_covers_the_code_behind_a_task_and_no_other() -> None:
 # Two runs into one folder, and runs that are killed.
 
 
-def start(out: Path, recipe: Path = TINY) -> "subprocess.Popen[str]":
+def start(out: Path, recipe: Path = SMALLEST) -> "subprocess.Popen[str]":
     command = [sys.executable, "-c", RUN, str(recipe), str(out)]
     return subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True, text=True)
 
@@ -153,7 +153,7 @@ def test_a_second_run_is_refused_and_a_killed_one_holds_nothing(tmp_path: Path) 
         assert holder.stdout is not None
         assert holder.stdout.readline() == "held\n"
         with pytest.raises(DatasetError, match=rf"another run \(process {holder.pid}\) is writing") as caught:
-            make(TINY, tmp_path, workers=1, console=quiet())
+            make(SMALLEST, tmp_path, workers=1, console=quiet())
         assert "\n" not in str(caught.value)
         holder.kill()
     with only_run(tmp_path):
@@ -163,10 +163,10 @@ def test_a_second_run_is_refused_and_a_killed_one_holds_nothing(tmp_path: Path) 
 def test_what_a_run_leaves_that_is_killed_at_once_is_no_obstacle(tmp_path: Path) -> None:
     for name in (schema.LOCK, schema.WORKING, f"{TEMPORARY_PREFIX}probe", f"{TEMPORARY_PREFIX}abc.txt"):
         (tmp_path / name).write_bytes(b"")
-    claim(tmp_path, "tiny")
+    claim(tmp_path, "smallest")
     (tmp_path / "mine.txt").write_bytes(b"")
     with pytest.raises(DatasetError, match="holds no data set"):
-        claim(tmp_path, "tiny")
+        claim(tmp_path, "smallest")
 
 
 def kill_and_repeat(out: Path, kills: int, seed: int) -> int:
@@ -190,16 +190,16 @@ def kill_and_repeat(out: Path, kills: int, seed: int) -> int:
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs /proc")
 @pytest.mark.parametrize("kills", [3, pytest.param(24, marks=pytest.mark.slow)])
-def test_killed_runs_end_in_the_same_bytes(tiny_dataset: Path, tmp_path: Path, kills: int) -> None:
+def test_killed_runs_end_in_the_same_bytes(smallest_dataset: Path, tmp_path: Path, kills: int) -> None:
     out = tmp_path / "out"
     killed = kill_and_repeat(out, kills, seed=kills)
     assert killed >= max(1, kills // 4)  # a quick machine may end a run before its moment comes
-    assert contents(out) == contents(tiny_dataset)
+    assert contents(out) == contents(smallest_dataset)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
-def test_runs_killed_one_by_one_from_the_start_lose_nothing(tiny_dataset: Path, tmp_path: Path, seed: int) -> None:
+def test_runs_killed_one_by_one_from_the_start_lose_nothing(smallest_dataset: Path, tmp_path: Path, seed: int) -> None:
     """Each kill, of the whole process group, meets a folder that was begun anew: early and late moments are met."""
     moments = random.Random(seed)
     for attempt in range(7):
@@ -208,5 +208,5 @@ def test_runs_killed_one_by_one_from_the_start_lose_nothing(tiny_dataset: Path, 
             time.sleep(moments.uniform(3.0, 12.0))
             os.killpg(child.pid, signal.SIGKILL)
             child.communicate(timeout=60)
-        make(TINY, out, workers=2, console=(console := quiet()))
-        assert contents(out) == contents(tiny_dataset), said(console)
+        make(SMALLEST, out, workers=2, console=(console := quiet()))
+        assert contents(out) == contents(smallest_dataset), said(console)

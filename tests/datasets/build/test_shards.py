@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from helpers.folders import contents
-from helpers.processes import TINY, quiet
+from helpers.processes import SMALLEST, quiet
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import make
@@ -20,16 +20,16 @@ from phibench.scenes.rig import POSITIONS
 
 
 @pytest.fixture
-def shards(tiny_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, inline: None) -> list[Path]:
-    return [make(TINY, tmp_path / f"s{i}", workers=1, console=quiet(), shard=f"{i}/2") for i in (1, 2)]
+def shards(smallest_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, inline: None) -> list[Path]:
+    return [make(SMALLEST, tmp_path / f"s{i}", workers=1, console=quiet(), shard=f"{i}/2") for i in (1, 2)]
 
 
-def test_merged_shards_are_the_undivided_run(shards: list[Path], tiny_dataset: Path, tmp_path: Path) -> None:
+def test_merged_shards_are_the_undivided_run(shards: list[Path], smallest_dataset: Path, tmp_path: Path) -> None:
     for order in (shards, shards[::-1]):
         out = merge(tmp_path / order[0].name / "merged", order, quiet())
-        assert contents(out) == contents(tiny_dataset)
+        assert contents(out) == contents(smallest_dataset)
         merge(out, order, quiet())  # again, into the same folder
-        assert contents(out) == contents(tiny_dataset)
+        assert contents(out) == contents(smallest_dataset)
         shutil.rmtree(out)
 
 
@@ -37,14 +37,14 @@ def test_a_shard_is_a_data_set(shards: list[Path]) -> None:
     for i, shard in enumerate(shards, 1):
         dataset = open_dataset(shard)
         assert (len(dataset), len(dataset.info.poses), dataset.info.shard) == (1, 2, f"{i}/2")
-        assert dataset.samples[0].expected_image("up").shape == (3, 180, 320)
+        assert dataset.samples[0].expected_image("up").shape == (3, 90, 160)
         assert verify(shard, console=quiet()).faults == ()
 
 
 def test_a_merged_folder_goes_on_as_a_made_one(shards: list[Path], tmp_path: Path) -> None:
     out = merge(tmp_path / "merged", shards, quiet())
     console = quiet()
-    make(TINY, out, workers=1, console=console)
+    make(SMALLEST, out, workers=1, console=console)
     assert "nothing to do" in console.file.getvalue()  # type: ignore[attr-defined]
 
 
@@ -85,10 +85,10 @@ def test_what_does_not_fit_is_refused(shards: list[Path], tmp_path: Path) -> Non
     assert "give the folders" in refusal(out, [])
     assert "shard 2/2 is missing" in refusal(out, [first])
     assert "shard 1/2 is given more than once" in refusal(out, [first, first, second])
-    third = make(TINY, tmp_path / "s3", workers=1, console=quiet(), shard="1/1")
+    third = make(SMALLEST, tmp_path / "s3", workers=1, console=quiet(), shard="1/1")
     assert "different divisions" in refusal(out, [first, second, third])
     other = tmp_path / "other.toml"
-    other.write_text(TINY.read_text().replace("bounces = 2", "bounces = 1"))
+    other.write_text(SMALLEST.read_text().replace("bounces = 2", "bounces = 1"))
     make(other, tmp_path / "s4", workers=1, console=quiet(), shard="2/2")
     assert "are of different recipes" in refusal(out, [first, tmp_path / "s4"])
     assert "is not a finished shard" in refusal(out, [first, tmp_path / "none"])

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from helpers.folders import contents
-from helpers.processes import TINY, living, quiet, said, wait_for
+from helpers.processes import SMALLEST, living, quiet, said, wait_for
 
 from phibench.datasets.build import workers
 from phibench.datasets.build.scheduler import dispatch
@@ -104,7 +104,7 @@ def commands(mark: str, folder: Path) -> list[list[str]]:
     block = re.search(rf"<!-- {mark} -->\n((?:    .*\n)+)", PAGE)
     assert block is not None
     lines = [shlex.split(line) for line in block[1].splitlines()]
-    words = {"smoke": str(TINY), "dask": str(BIN / "dask")}
+    words = {"smoke": str(SMALLEST), "dask": str(BIN / "dask")}
     found = []
     for line in lines:
         program = [sys.executable, "-m", "phibench.estimator.cli.main"] if line[0] == "phibench" else [words[line[0]]]
@@ -126,27 +126,27 @@ def running(*commands: list[str], **environment: str) -> Iterator[None]:
 
 
 @pytest.mark.slow
-def test_the_documented_scheduler_gives_the_same_bytes(tiny_dataset: Path, tmp_path: Path) -> None:
+def test_the_documented_scheduler_gives_the_same_bytes(smallest_dataset: Path, tmp_path: Path) -> None:
     scheduler, worker, run = commands("loopback", tmp_path)
     with running(scheduler, worker):
         done = subprocess.run(run, capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, done.stderr
-        assert contents(tmp_path / "smoke") == contents(tiny_dataset)
+        assert contents(tmp_path / "smoke") == contents(smallest_dataset)
         again = subprocess.run(run, capture_output=True, text=True, timeout=300)
         assert "nothing to do" in again.stderr
 
 
 @pytest.mark.slow
-def test_the_documented_shards_give_the_same_bytes(tiny_dataset: Path, tmp_path: Path) -> None:
+def test_the_documented_shards_give_the_same_bytes(smallest_dataset: Path, tmp_path: Path) -> None:
     for command in commands("loopback shards", tmp_path):
         done = subprocess.run(command, capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, done.stderr
-    assert contents(tmp_path / "smoke") == contents(tiny_dataset)
+    assert contents(tmp_path / "smoke") == contents(smallest_dataset)
 
 
 def refusal(out: Path, scheduler: str) -> str:
     with pytest.raises(DatasetError) as caught:
-        make(TINY, out, console=quiet(), scheduler=scheduler)
+        make(SMALLEST, out, console=quiet(), scheduler=scheduler)
     assert not (out / schema.MANIFEST).exists()
     return str(caught.value)
 
@@ -216,8 +216,8 @@ def test_this_machine_is_asked_in_another_process() -> None:
     assert local_environment()["code_sha256"] == describe()["code_sha256"]
 
 
-def test_every_task_is_logged(tiny_dataset: Path) -> None:
-    entries = [json.loads(line) for line in (tiny_dataset / schema.LOG).read_text().splitlines()]
+def test_every_task_is_logged(smallest_dataset: Path) -> None:
+    entries = [json.loads(line) for line in (smallest_dataset / schema.LOG).read_text().splitlines()]
     assert len(entries) == 8
     for entry in entries:
         assert entry["ok"]
@@ -233,8 +233,8 @@ def test_a_worker_that_fails_half_way_leaves_the_rest_done(tmp_path: Path, monke
         "phibench.datasets.build.sample_task.save_png", lambda *_: (_ for _ in ()).throw(OSError(28, "full"))
     )
     with pytest.raises(DatasetError, match="2 of 8 tasks failed"):
-        make(TINY, tmp_path / "out", workers=1, console=quiet())
+        make(SMALLEST, tmp_path / "out", workers=1, console=quiet())
     monkeypatch.undo()
     console = quiet()
-    make(TINY, tmp_path / "out", workers=2, console=console)
+    make(SMALLEST, tmp_path / "out", workers=2, console=console)
     assert "to make: 2 samples" in said(console)
