@@ -16,7 +16,7 @@ PARALLEL ?= --numprocesses 2 --dist loadfile
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup dataset bench studies test test-slow proof test-all benchmark lint clean
+.PHONY: help setup dataset bench studies test test-slow proof test-all mutants benchmark lint clean
 
 help:
 	@echo "make setup      make .venv with everything in it, and make sure of LLVM"
@@ -27,6 +27,7 @@ help:
 	@echo "make test-slow  the slow tests"
 	@echo "make proof      the slow tests of accuracy, but those of many minutes"
 	@echo "make test-all   all tests"
+	@echo "make mutants    proof that the tests see faults: 44 of them, one at a time, in copies of the checkout"
 	@echo "make benchmark  timings of what must be fast"
 	@echo "make lint       ruff and mypy"
 	@echo "make clean      remove caches and builds; .venv and out/ stay"
@@ -69,16 +70,19 @@ studies: $(READY)
 	$(BIN)/phibench report --study $(addprefix $(STUDIES)/,$(STUDIES_ALL)) --out $(STUDIES)/report.html
 
 test: $(READY)
-	$(BIN)/python -m pytest -m "not slow" $(PARALLEL)
+	$(BIN)/python -m pytest $(PARALLEL)
 
 test-slow: $(READY)
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest --slow --study -m "slow or study"
 
 proof: $(READY)
-	$(BIN)/python -m pytest -m "slow and not study" -k accuracy
+	$(BIN)/python -m pytest --slow -m slow -k accuracy
 
 test-all: $(READY)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --slow --study
+
+mutants: $(READY)
+	$(BIN)/python tests/mutants/run.py
 
 benchmark: $(READY)
 	$(BIN)/python -m pytest --benchmark-enable --benchmark-only

@@ -13,9 +13,30 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import pytest  # noqa: E402
+from filelock import FileLock  # noqa: E402
 from helpers.inline_workers import InlineCrew  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the options that ask for more than the quick tests."""
+    parser.addoption("--slow", action="store_true", help="run the tests marked slow too, but those of many minutes")
+    parser.addoption("--study", action="store_true", help="run the tests of many minutes too (marked study)")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the slow tests unless they are asked for: by an option, or by their full name."""
+    named = [argument for argument in config.args if "::" in argument]
+    wanted, left_out = [], []
+    for item in items:
+        asked = any(item.nodeid.startswith(name.removeprefix("./")) for name in named)
+        slow = item.get_closest_marker("slow") and not config.getoption("slow")
+        study = item.get_closest_marker("study") and not config.getoption("study")
+        (left_out if (slow or study) and not asked else wanted).append(item)
+    if left_out:
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = wanted
 
 
 @pytest.fixture
@@ -36,27 +57,51 @@ def inline(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("phibench.datasets.make.Crew", InlineCrew)
 
 
+class SharedFolder:
+    """Folder of one test run for what several test processes use, each thing made by the first that wants it."""
+
+    def __init__(self, factory: pytest.TempPathFactory) -> None:
+        base = factory.getbasetemp()
+        self._folder = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def made(self, name: str, make: Callable[[Path], object]) -> Path:
+        """Folder `name`, filled by `make`, which gets a path that is not there yet."""
+        out = self._folder / f"shared-{name}"
+        with FileLock(out.with_suffix(".lock")):
+            if not out.exists():
+                make(out.with_suffix(".part"))
+                out.with_suffix(".part").rename(out)
+        return out
+
+
 @pytest.fixture(scope="session")
-def tiny_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Data set of `tests/tiny.toml`, rendered once by two workers. Read only: copy it to change it."""
+def shared(tmp_path_factory: pytest.TempPathFactory) -> SharedFolder:
+    """What test processes share."""
+    return SharedFolder(tmp_path_factory)
+
+
+def rendered(shared: SharedFolder, name: str, recipe: str | Path) -> Path:
+    """Data set of a recipe, rendered once for all test processes. Read only: copy it to change it."""
     from phibench.datasets.make import make
 
-    return make(ROOT / "tests" / "tiny.toml", tmp_path_factory.mktemp("tiny") / "out", workers=2)
+    return shared.made(name, lambda out: make(recipe, out, workers=2))
 
 
 @pytest.fixture(scope="session")
-def smallest_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Data set of `tests/smallest.toml`, rendered once by two workers. Read only: copy it to change it."""
-    from phibench.datasets.make import make
-
-    return make(ROOT / "tests" / "smallest.toml", tmp_path_factory.mktemp("smallest") / "out", workers=2)
+def tiny_dataset(shared: SharedFolder) -> Path:
+    """Data set of `tests/tiny.toml`. Read only."""
+    return rendered(shared, "tiny", ROOT / "tests" / "tiny.toml")
 
 
 @pytest.fixture(scope="session")
-def misaligned_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def smallest_dataset(shared: SharedFolder) -> Path:
+    """Data set of `tests/smallest.toml`. Read only."""
+    return rendered(shared, "smallest", ROOT / "tests" / "smallest.toml")
+
+
+@pytest.fixture(scope="session")
+def misaligned_dataset(shared: SharedFolder, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Data set of `tests/tiny.toml` with a tilt, a decentre, a form, a stroke too long and a yaw between the images."""
-    from phibench.datasets.make import make
-
     folder, text = tmp_path_factory.mktemp("misaligned"), (ROOT / "tests" / "tiny.toml").read_text(encoding="utf-8")
     wrong = (
         "tilt_x_rad = 0.01",
@@ -67,23 +112,19 @@ def misaligned_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     table = "\n".join(("[misalignment]", *wrong, "", ""))
     (folder / "recipe.toml").write_text(text.replace("[[targets]]", f"{table}[[targets]]", 1), encoding="utf-8")
-    return make(folder / "recipe.toml", folder / "out", workers=2)
+    return rendered(shared, "misaligned", folder / "recipe.toml")
 
 
 @pytest.fixture(scope="session")
-def smoke_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Data set of the shipped recipe `smoke`, rendered once. Read only: copy it to change it."""
-    from phibench.datasets.make import make
-
-    return make("smoke", tmp_path_factory.mktemp("smoke") / "out", workers=2)
+def smoke_dataset(shared: SharedFolder) -> Path:
+    """Data set of the shipped recipe `smoke`. Read only."""
+    return rendered(shared, "smoke", "smoke")
 
 
 @pytest.fixture(scope="session")
-def bench_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Data set of `tests/tiny_bench.toml`, rendered once. Read only: copy it to change it."""
-    from phibench.datasets.make import make
-
-    return make(ROOT / "tests" / "tiny_bench.toml", tmp_path_factory.mktemp("bench") / "out", workers=2)
+def bench_dataset(shared: SharedFolder) -> Path:
+    """Data set of `tests/tiny_bench.toml`. Read only."""
+    return rendered(shared, "bench", ROOT / "tests" / "tiny_bench.toml")
 
 
 @pytest.fixture(scope="session")

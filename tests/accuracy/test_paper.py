@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,22 +17,13 @@ from phibench.estimator.paper.paper_tables import Score, score, summarise
 
 
 @pytest.fixture(scope="module")
-def paper(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    """The recipe `paper` with a coarse light map: spots, truth and geometry are the full recipe's."""
+def paper(shared: Any, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """The recipe `paper` with its lamps off: spots, truth and geometry are the full recipe's."""
+    recipe = tmp_path_factory.mktemp("paper") / "paper.toml"
     text = find_recipe("paper").read_text()
-    coarse = {
-        "texel_m": 0.25,
-        "lamp_rays": 8,
-        "bounces": 3,
-        "bounce_rays": 16,
-        "final_rays": 32,
-    }
-    lines = [f"{key} = {coarse[key]}" if (key := line.split(" ")[0]) in coarse else line for line in text.splitlines()]
-    assert sum(a != b for a, b in zip(lines, text.splitlines(), strict=True)) == len(coarse)
-    folder = tmp_path_factory.mktemp("paper")
-    recipe = folder / "paper.toml"
-    recipe.write_text("\n".join(lines))
-    return open_dataset(make(recipe, folder / "out"))
+    assert text.count('name = "lab"') == 1
+    recipe.write_text(text.replace('name = "lab"', 'name = "dark"'))
+    return open_dataset(shared.made("paper", lambda out: make(recipe, out, workers=2)))
 
 
 @pytest.fixture(scope="module")
@@ -82,20 +74,22 @@ def test_published_estimates_stand_beside_ours(scores: tuple[Score, ...]) -> Non
     assert np.abs(published).max() == pytest.approx(0.1388, abs=1e-4)
 
 
-def test_frame_is_ambient_plus_spot_at_the_true_place(paper: Dataset) -> None:
-    """Brightest pixel of laser on - laser off is the pixel of the truth, in every image."""
-    checked = 0
-    for sample in paper.samples:
+def test_frame_is_ambient_plus_spot_at_the_true_place(paper: Dataset, tiny_dataset: Path) -> None:
+    """Brightest pixel of laser on - laser off is the pixel of the truth, in every image, dark or lit."""
+    checked = lit = 0
+    for sample in (*paper.samples, open_dataset(tiny_dataset)["seen-near-h0.500"]):
         for position in ("down", "up"):
             row = sample.row.position(position)
-            difference = (sample.expected_image(position, laser=True) - sample.expected_image(position, laser=False))[0]
+            off = sample.expected_image(position, laser=False)
+            difference = (sample.expected_image(position, laser=True) - off)[0]
             v, u = np.unravel_index(difference.argmax(), difference.shape)
             assert abs(u - row.u_px) <= 0.5 + 0.01
             assert abs(v - row.v_px) <= 0.5 + 0.01
             # float32 ambient of up to 2e6 electrons/s, added in float64: exact to 1e-9
             assert difference.sum() == pytest.approx(row.electrons_per_s[0], rel=1e-6)
             checked += 1
-    assert checked == 50
+            lit += bool(off.max() > 1e5)
+    assert (checked, lit) == (52, 2)
 
 
 def test_truth_layer_at_the_spot_is_the_spots_truth(paper: Dataset) -> None:
