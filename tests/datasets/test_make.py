@@ -44,7 +44,8 @@ def test_everything_is_there(smallest_dataset: Path) -> None:
     spots.remove("spots/half-hidden-h1.400-down.exr")  # a crate hides it
     previews = {schema.preview_file(pair.sample_id) for pair in plan.pairs}
     single = {schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.RIGS, schema.LIGHT_MAP}
-    assert set(read_checksums(smallest_dataset)) == views | spots | previews | single == set(data_files(smallest_dataset))
+    listed = set(read_checksums(smallest_dataset))
+    assert listed == views | spots | previews | single == set(data_files(smallest_dataset))
     assert damaged(smallest_dataset) == []
     assert (smallest_dataset / schema.RECIPE).read_bytes() == SMALLEST.read_bytes()
 
