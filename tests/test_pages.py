@@ -28,7 +28,6 @@ NOT_YET = {
     "docs/calibration.md",
     "docs/cluster.md",
     "docs/experiments.md",
-    "docs/limits.md",
     "docs/method.md",
     "docs/misalignment.md",
     "docs/scoring.md",
