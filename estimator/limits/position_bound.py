@@ -252,7 +252,7 @@ def spot_limit(
         Noise: 1 / variance with all terms; Poisson and Gauss exactly, the rounding as Gaussian; the converter's codes.
         The last two leave PRNU out.
     pattern_known : bool
-        Whether the camera's PRNU and DSNU are calibrated.
+        The camera's PRNU and DSNU are calibrated.
     """
     information = raw_information(region.mean_e, card, model, pattern_known)
     return limit_of(derivative_images(region, unknown), information)

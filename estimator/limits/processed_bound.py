@@ -59,7 +59,7 @@ def chain_limit(
     response : 3 floats
         Of the filters at the laser's wavelength.
     pattern_known : bool
-        Whether PRNU and DSNU are calibrated.
+        PRNU and DSNU are calibrated; otherwise they count as noise.
 
     Raises
     ------

@@ -72,7 +72,7 @@ class Surroundings:
     room_height_m : float
         The mirror's top stays below it.
     robot : bool
-        Whether the robot, its mast and the camera's housing may stand in the way.
+        The robot, its mast and the camera's housing may stand in the way.
     edge_px : float
         Least distance of a spot from the edge of the mirror and of the image: the blur's skirt and the fit's window.
     """
@@ -130,7 +130,7 @@ class StrokeCurve:
 
     @property
     def allowed_sigma_m(self) -> Array:
-        """The same, infinite where the stroke cannot be taken."""
+        """All parts together, infinite where the stroke cannot be taken."""
         free = np.array([cause == FREE for cause in self.causes])
         return np.where(free & np.isfinite(self.sigma_m), self.sigma_m, np.inf)
 

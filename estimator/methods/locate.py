@@ -233,7 +233,7 @@ def each_spot(find: Callable[[SearchRegion], Spot]) -> Method:
 
 
 def each_spot_twice(find: Callable[[SearchRegion], Spot]) -> Method:
-    """The same, and once more with the distance that the first answer gives, for methods that use the beam's size."""
+    """Method as of `each_spot`, then once more with the distance found, for methods that use the beam's size."""
 
     def method(pair: Pair) -> Answer:
         boxes = locate(pair)

@@ -36,9 +36,9 @@ class BuiltIn:
     accepts : tuple of str
         Kinds of images, of `image_planes.KINDS`.
     needs_off : bool
-        Whether it cannot do without laser-off frames.
+        It cannot do without laser-off frames.
     needs_boxes : bool
-        Whether it cannot do without region hints.
+        It cannot do without region hints.
     package : str
         What must be installed besides phibench; "" for nothing.
     """
@@ -54,11 +54,11 @@ class BuiltIn:
 
     @property
     def installed(self) -> bool:
-        """Whether its package can be imported."""
+        """Its package can be imported."""
         return not self.package or find_spec(self.package) is not None
 
     def refusal(self, pair: Pair) -> str:
-        """Why this pair cannot be taken; "" if it can."""
+        """Reason that this pair cannot be taken; "" if it can."""
         kind = kind_of(pair.card)
         if not self.installed:
             return f"install {self.package}"

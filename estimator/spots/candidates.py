@@ -54,7 +54,7 @@ def peaks(
     least_z: float,
     most: int,
 ) -> Peaks:
-    """The strongest local maxima of the map.
+    """Strongest local maxima of the map.
 
     Parameters
     ----------
@@ -361,7 +361,7 @@ def _middle(y: Array, used: Array) -> Array:
 
 
 def _red(fits: list[_Fit], card: SensorCard) -> BoolArray:
-    """Whether green is below half of what white light of this red would have, within one standard deviation."""
+    """Places whose green is below half of what white light of this red would have, within one standard deviation."""
     share = _GREEN_SHARE[card.output] * card.white_balance[0] / card.white_balance[1]
     red, green = fits[0], fits[1]
     sigma = np.sqrt(green.variance * np.maximum(green.chi2, 1.0) + share**2 * red.variance * np.maximum(red.chi2, 1.0))
@@ -369,7 +369,7 @@ def _red(fits: list[_Fit], card: SensorCard) -> BoolArray:
 
 
 def _fuller(on: ColourPlanes, uv_px: Array) -> BoolArray:
-    """Whether far more red than green pixels are full: a spot too bright for its amplitude to tell its colour."""
+    """Places where far more red than green pixels are full: too bright for the amplitude to tell the colour."""
     corner, size = np.rint(uv_px).astype(int) - _FULL_PX, 2 * _FULL_PX + 1
     shares = []
     for c in (0, 1):

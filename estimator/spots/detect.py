@@ -92,7 +92,7 @@ def choose(rig: Rig, stroke_m: float, down: Candidates, up: Candidates, least: T
         Candidates, pixels of the whole image, strongest first.
     least : Thresholds
     sure : bool
-        Whether the candidates are known to be red or the laser's; otherwise a pair is always preferred.
+        The candidates are known to be red or the laser's; otherwise a pair is always preferred.
     """
     fits = consistent(rig, stroke_m, down.uv_px[:_MOST], up.uv_px[:_MOST])
     ratio = up.electrons[None, :_MOST] / np.maximum(down.electrons[:_MOST, None], 1e-9)
@@ -110,7 +110,7 @@ def choose(rig: Rig, stroke_m: float, down: Candidates, up: Candidates, least: T
 
 
 def consistent(rig: Rig, stroke_m: float, uv_down_px: Array, uv_up_px: Array) -> BoolArray:
-    """Whether pixels of both images can show one point, shape (n, m), for pixels (n, 2) and (m, 2)."""
+    """Pairs of pixels, (n, 2) and (m, 2), that can show one point, shape (n, m), bool."""
     if len(uv_down_px) == 0 or len(uv_up_px) == 0:
         return np.zeros((len(uv_down_px), len(uv_up_px)), bool)
     curve = epipolar_curve(rig, stroke_m, uv_down_px)
@@ -137,7 +137,7 @@ def _distance(curve: Array, points: Array) -> Array:
 
 
 def _single(down: Candidates, up: Candidates, alone: float) -> Choice:
-    """The more significant one of the strongest candidates that pass alone; both could not be one point."""
+    """More significant one of the strongest candidates that pass alone; both could not be one point."""
     rows = [int(np.flatnonzero(side.z >= alone)[0]) if (side.z >= alone).any() else None for side in (down, up)]
     if rows[0] is None or rows[1] is None:
         return Choice(rows[0], rows[1])

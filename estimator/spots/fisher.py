@@ -137,7 +137,7 @@ def limited(
         The step is shortened so that no spot moves further.
     fluxes : columns of fluxes, which may fall to a tenth
     free_width : bool
-        Whether the last column is a width; it changes by at most 40 % and stays within 0.15 to 10 px.
+        The last column is a width; it changes by at most 40 % and stays within 0.15 to 10 px.
     """
     moved = np.abs(step[:, :2]).max(axis=1) if moved_px is None else moved_px
     new = theta + np.minimum(damping, most_px / np.maximum(moved, _TINY))[:, None] * step

@@ -63,7 +63,7 @@ def fit_srgb(
     blur, model
         As for `fit_law`.
     pattern_known : bool
-        Whether PRNU and DSNU were calibrated; otherwise they count as noise.
+        PRNU and DSNU were calibrated; otherwise they count as noise.
     extra_e2 : float
         Variance of the known background's error, electrons squared.
 
@@ -114,7 +114,7 @@ def fit_jpeg(
     background : Background, optional
         Room behind the spot; flat if it is not given. Levels per filter are fitted on top of it.
     pattern_known : bool
-        Whether PRNU and DSNU were calibrated; otherwise they count as noise.
+        PRNU and DSNU were calibrated; otherwise they count as noise.
     size_px : (width, height) of the image
 
     Returns

@@ -54,7 +54,7 @@ class JointFit(DepthEstimate):
 
 @dataclass(frozen=True)
 class _Minima:
-    """The best minima of one image's misfit: theta (n, m, k), covariance (n, m, 2, 2), misfit (n, m)."""
+    """Best minima of one image's misfit: theta (n, m, k), covariance (n, m, 2, 2), misfit (n, m)."""
 
     theta: Array
     covariance: Array
@@ -113,7 +113,7 @@ def _fit(rig: Rig, h: Array, down: SpotData, up: SpotData, start_down: Array, st
 
 
 def _minima(data: SpotData, start_px: Array) -> _Minima:
-    """Where nine starts lead, the deepest first; several may be the same."""
+    """Minima that nine starts lead to, the deepest first; several may be the same."""
     n, k = len(data), data.unknowns
     grid = START_PX * np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), -1).reshape(-1, 2)
     many = data.rows(np.repeat(np.arange(n), len(grid)))
@@ -281,7 +281,7 @@ def _result(
 
 
 def _inside(data: SpotData, theta: Array) -> NDArray[np.bool_]:
-    """Whether the positions lie in their regions, shape (n,)."""
+    """Positions that lie in their regions, shape (n,), bool."""
     h, w = data.regions.x_e.shape[1:]
     middle = data.regions.origin_px + np.array([(w - 1) / 2, (h - 1) / 2])
     return np.asarray((np.abs(theta[:, :2] - middle) <= np.array([w, h]) / 2).all(axis=1))

@@ -75,7 +75,7 @@ class Noise:
 
     @property
     def dead(self) -> bool:
-        """Whether no coefficient changes with the noise: the quantiser's output says nothing."""
+        """No coefficient changes with the noise: the quantiser's output says nothing."""
         return len(self.sigma) == 0
 
     def whitened(self, values: Array) -> Array:
@@ -103,7 +103,7 @@ class JpegFit:
 
 @dataclass(frozen=True)
 class Window:
-    """What is fitted.
+    """Coefficients of one window with the model that is fitted to them.
 
     Attributes
     ----------
@@ -193,7 +193,7 @@ def fit_window(window: Window, starts: Array) -> JpegFit:
 
 
 def _best(window: Window, noise: Noise, starts: Array) -> Array:
-    """The start with the smallest misfit after some steps."""
+    """Start with the smallest misfit after some steps."""
     theta = starts
     if len(starts) > 1:
         for _ in range(_SCREENING_STEPS):
@@ -235,7 +235,7 @@ class Region:
     ----------
     image : shape (h, w, 3), uint8
     ends : 4 booleans
-        Whether top, bottom, left and right side are the image's own.
+        Top, bottom, left and right side are the image's own.
     background_e, extra_e2 : shape (h, w)
         Background of the raw pixels, and the variance of its error.
     room : shape (h, w, 3), uint8, optional

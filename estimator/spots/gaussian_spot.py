@@ -60,7 +60,7 @@ class SpotBlur:
 
 @dataclass(frozen=True)
 class SpotModel:
-    """What a fit knows of a spot besides its blur.
+    """Knowledge that a fit has of a spot besides its blur.
 
     Attributes
     ----------

@@ -220,7 +220,7 @@ class ColourPlanes:
 
     @property
     def mosaic(self) -> bool:
-        """Whether each pixel has one colour only."""
+        """Each pixel has one colour only."""
         return len(self.values_e) > 1 and not bool(self.sites[0, 0, 1])
 
     @property
@@ -275,7 +275,7 @@ def variance_e2(mean_e: Array, card: SensorCard, alike: bool) -> Array:
     mean_e : array of any shape
     card : SensorCard
     alike : bool
-        Whether the fixed pattern cancels: in the difference of two frames of one camera.
+        The fixed pattern cancels, as in the difference of two frames of one camera.
     """
     mean = np.maximum(mean_e, 0.0)
     constant = card.read_noise_e**2 + card.row_noise_e**2 + 1.0 / (12.0 * card.dn_per_e**2)

@@ -145,7 +145,7 @@ def recovered(
     quality : int
     subsampling : "4:4:4", "4:2:2" or "4:2:0"
     ends : 4 booleans
-        Whether top, bottom, left and right side are the image's own.
+        Top, bottom, left and right side are the image's own.
     """
     rgb = np.moveaxis(np.asarray(images, float), -1, 1)
     tables = quantisation(quality)

@@ -51,7 +51,7 @@ def noise_of(card: SensorCard, pattern_known: bool = False) -> PixelNoise:
     ----------
     card : SensorCard
     pattern_known : bool
-        Whether PRNU and DSNU of the camera were calibrated and taken out; otherwise they count as noise.
+        PRNU and DSNU of the camera were calibrated and taken out; otherwise they count as noise.
 
     Raises
     ------

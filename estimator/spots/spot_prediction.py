@@ -90,7 +90,7 @@ def _beam_px2(view: View, point_m: Array, diameter_m: float) -> Array:
 
 @dataclass(frozen=True)
 class Laser:
-    """The laser and the wall that it hits.
+    """Laser and the wall that it hits.
 
     Parameters
     ----------

@@ -41,7 +41,7 @@ def test_an_image_that_compression_has_emptied_has_no_spot() -> None:
     assert not np.isfinite(chain_limit(card, (30.2, 22.7), SpotBlur(0.7), 50.0, (1.0, 1.0, 1.0)).covariance_px2).any()
 
 
-def test_tone_curve_against_the_simulators() -> None:
+def test_srgb_curve_against_the_simulators() -> None:
     x = np.concatenate([[-0.1, 0.0, 0.0031308, 1.0, 1.2], np.linspace(0.0, 1.0, 501)])
     np.testing.assert_allclose(linear_to_srgb(x), processing.srgb_encoded(x), rtol=0, atol=1e-12)
     np.testing.assert_allclose(srgb_to_linear(processing.srgb_encoded(x)), np.clip(x, 0, 1), rtol=0, atol=1e-6)
