@@ -33,6 +33,13 @@ from phibench.estimator.spots.raw_pixels import bayer_filters
 from phibench.scenes.frames import Array
 
 _REACH_PX = 10  # around the spot, for "srgb8"
+_SIDE_PX = 16  # of the window of raw pixels
+_MCU_PX = (16, 8)  # of 4:2:2; an even number of Bayer cells
+_PLASTIC = 1.324717957244746  # root of x^3 = x + 1: steps of 1 / x and 1 / x^2 fill the square most evenly
+_FLUXES_E = tuple(float(x) for x in np.geomspace(100.0, 3e6, 19))
+
+
+# -- bound of one spot -----------------------------------------------------------------------------------------------
 
 
 def chain_limit(
@@ -100,10 +107,7 @@ def _of_coefficients(
     return SpotLimit(covariance_bound(fisher), fisher)
 
 
-_SIDE_PX = 16
-_MCU_PX = (16, 8)  # of 4:2:2; an even number of Bayer cells
-_PLASTIC = 1.324717957244746  # root of x^3 = x + 1
-_FLUXES_E = tuple(float(x) for x in np.geomspace(100.0, 3e6, 19))
+# -- bound by the electrons of a spot --------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -132,7 +136,7 @@ def spot_sigma(
     card: SensorCard,
     blur_sigma_px: float,
     background_e: Sequence[float],
-    response: tuple[float, float, float] = (1.0, 0.10, 0.03),
+    response: tuple[float, float, float] = LASER_RESPONSE,
     places: int = 16,
     flux_e: Sequence[float] = _FLUXES_E,
 ) -> SpotSigma:
