@@ -86,11 +86,12 @@ def slope(estimator: str, name: str, depth_m: float) -> float:
 
 
 def parameter_table() -> str:
-    """Every parameter with unit, range, study magnitude and meaning."""
-    rows = [
-        (f"`{name}`", one.unit, f"{one.limit:g}", f"{one.study:g}", one.meaning) for name, one in PARAMETERS.items()
-    ]
-    return table(("parameter", "unit", "largest", "study", "meaning"), rows)
+    """Every parameter with unit, range, study magnitude, prior of a calibration, and meaning."""
+    rows = []
+    for name, one in PARAMETERS.items():
+        prior = "-" if math.isnan(one.prior_sigma) else f"{one.prior_sigma:.2g}"
+        rows.append((f"`{name}`", one.unit, f"{one.limit:g}", f"{one.study:g}", prior, one.meaning))
+    return table(("parameter", "unit", "largest", "study", "prior", "meaning"), rows)
 
 
 def budget_table() -> str:
