@@ -44,7 +44,7 @@ STROKES_M = (0.10, 1.40)
 """Of the paper's carriage."""
 LEAST, LARGEST = "shortest stroke", "longest stroke"
 ROOM_E_PER_S = (5.8e4, 4.9e4, 2.5e4)
-"""Electrons per second and pixel behind R, G, B of a white wall of the default lab, whose floor receives about 460 lx."""
+"""Electrons per second and pixel behind R, G, B of a white wall of the lab, whose floor receives about 460 lx."""
 _DEPTH_M = (0.05, 100.0)
 _STROKE_M = (1e-3, 20.0)
 _FINE = 21  # strokes between two of the grid: 0.3 % apart, and the minimum is flat
