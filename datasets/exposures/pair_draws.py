@@ -140,9 +140,12 @@ def _camera_seed(sample: Sample, frames: FramesTable) -> int:
 
 def _boxes(sample: Sample, frames: FramesTable) -> tuple[Region, Region] | None:
     """One pair of boxes for all draws of a sample: the overlap of several would tell where the spot is."""
-    if _generator(sample, "hint").random() >= frames.hint:
-        return None
-    down, up = (_box(sample, position, frames.hint_box_px) for position in POSITIONS)
+    return None if _generator(sample, "hint").random() >= frames.hint else search_boxes(sample, frames.hint_box_px)
+
+
+def search_boxes(sample: Sample, side_px: int) -> tuple[Region, Region]:
+    """Boxes for both images of a sample, drawn from streams of its own: their centres tell nothing of the spot."""
+    down, up = (_box(sample, position, side_px) for position in POSITIONS)
     return down, up
 
 

@@ -1,28 +1,22 @@
-"""Why an image has no right position: exactly one cause for each, the first that holds along the path of the light.
+"""Causes of images without a right position: exactly one for each, the first that holds along the path of the light.
 
-An image that is not detected is **unseen** (not visible, and no position was given: rightly), **missed** (visible, no
-position) or **false** (a position where there is no spot, or too far from it). Whatever it is, it has one cause:
+An image that is not found is of one kind: *unseen* (no spot visible, and rightly no position), *missed* (a spot, no
+position) or *false* (a position where there is no spot, or too far from it). Its cause is one of `CAUSES`, in this
+order; the numbers of the rules:
 
-1. ``occluded``: not visible, and the scene is why: an object in the way, or the wall that carries the spot.
-2. ``mirror_edge``: not visible because no point of the mirror reflects it, or its image touches the mirror's outline;
-   or visible and nearer to the outline than 3 blurs, where part of its light is cut off.
-3. ``image_edge``: the same with the edge of the sensor.
-4. ``saturated``: a pixel of the spot is expected above saturation: its shape is lost.
-5. ``confused``: the position is within `match_px` of another light of the scene, or of a region that is brighter than
-   the spot, in the image as it is or less the laser-off image if there is one: mean of 4 x 4 pixels (two Bayer cells).
-   A lamp that the laser-off image would have ruled out is still what the method was confused by.
-6. ``below_noise``: flux below 5 standard deviations. In 1280 x 720 pixels of Gaussian noise the largest is at 4.9
-   standard deviations on average, so that a fainter spot cannot be told from noise in the whole image (A. Rose, J.
-   Opt. Soc. Am. 38, 196, 1948, found the same 5 for the eye).
-7. ``compression``: the raw pixels would have been good enough (bound below 1 px along each axis), but nothing is left
-   at the spot's place in the 8-bit image: in every colour the mean of its 3 x 3 pixels is less than one code, or less
-   than 3 standard errors, above the median of the ring 4 to 8 px around. The standard error is that of 9 pixels with
-   the ring's robust deviation (1.4826 MAD).
-8. the harness's word, if the method did not come back: ``error``, ``timeout``, ``crash``, ``memory``, ``invalid``,
-   ``mutated``.
-9. ``method``: none of these. The light was there.
+edge          the spot's image is nearer than 3 blurs to the mirror's outline or to the sensor's edge
+confused      the answer is within `match_px` of another light, or its 4 x 4 pixels (two Bayer cells) are brighter than
+              the spot's: in the image as it is, or less the laser-off image. A lamp that the laser-off image would have
+              ruled out is still what the method was confused by
+below_noise   flux below 5 standard deviations. The largest of 1280 x 720 Gaussian numbers is 4.9 deviations on
+              average: a fainter spot cannot be told from noise (A. Rose, J. Opt. Soc. Am. 38, 196, 1948, has 5 for
+              the eye)
+compression   the raw pixels are good enough (bound below 1 px along each axis), but the spot is lost in the 8-bit
+              image: in every colour the mean of its 3 x 3 pixels is less than one code, or less than 3 standard
+              errors, above the median of the ring 4 to 8 px around. The error is that of 9 pixels with the ring's
+              deviation (1.4826 MAD)
 
-So a crash on an image without a spot counts as ``occluded``; how often the method failed is counted apart (`failures`).
+A crash on an image without a spot counts as `occluded`; failures of the method are counted apart, `count_failures`.
 """
 
 from __future__ import annotations
@@ -48,6 +42,8 @@ GOOD_RAW_PX = 1.0
 LEAST_CODES = 1.0
 LEAST_CONTRAST = 3.0
 _RING = (4, 8)
+_CLIPPED = 0.95  # of the largest code: the mean of 4 x 4 pixels in a lamp's reflection
+_LAMP_TO_SPOT = 3.0
 KINDS = ("unseen", "missed", "false")
 _PIXEL_SIGMA2 = 1.0 / 12.0
 _OF_THE_MIRROR = ("no_reflection", "mirror_edge")
@@ -55,7 +51,7 @@ _OF_THE_MIRROR = ("no_reflection", "mirror_edge")
 
 @dataclass(frozen=True)
 class Case:
-    """One image without a right position, with what the rules ask; the images are drawn when a rule needs them."""
+    """One image without a right position; the images are drawn when a rule needs them."""
 
     position: str
     truth: PairTruth
@@ -97,7 +93,7 @@ def cause_of(case: Case) -> str:
 
 
 def with_causes(records: pl.DataFrame, pairs: PairSet, rules: Rules) -> pl.DataFrame:
-    """Records with `kind` and `cause`, both null where the spot was detected.
+    """Records with `kind`, `cause` and, of false detections, `taken_for`; null where the spot was detected.
 
     Parameters
     ----------
@@ -106,12 +102,16 @@ def with_causes(records: pl.DataFrame, pairs: PairSet, rules: Rules) -> pl.DataF
         Images are asked for only where a rule looks at them, those of a pair twice at most: give `CachedPairs`.
     rules : Rules
     """
-    causes, kinds = [], []
+    columns: dict[str, list[str | None]] = {"kind": [], "cause": [], "taken_for": []}
     for row in records.iter_rows(named=True):
-        found = row["detected"]
-        causes.append(None if found else cause_of(_case(row, pairs, rules)))
-        kinds.append(None if found else _kind(row))
-    return records.with_columns(pl.Series("kind", kinds, pl.String), pl.Series("cause", causes, pl.String))
+        if row["detected"]:
+            values: tuple[str | None, ...] = (None, None, None)
+        else:
+            case, kind = _case(row, pairs, rules), _kind(row)
+            values = kind, cause_of(case), taken_for(case) if kind == "false" else None
+        for name, value in zip(columns, values, strict=True):
+            columns[name].append(value)
+    return records.with_columns(*(pl.Series(name, values, pl.String) for name, values in columns.items()))
 
 
 def count(records: pl.DataFrame) -> dict[str, dict[str, int]]:
@@ -168,11 +168,15 @@ def _saturated(case: Case) -> bool:
 def _confused(case: Case) -> bool:
     if case.answer_px is None:
         return False
-    others = (np.array(other.uv_px) for other in case.spot.distractions)
-    if any(np.linalg.norm(case.answer_px - other) <= case.rules.match_px for other in others):
+    if _on_other_light(case, case.answer_px):
         return True
     true_px = np.array(case.spot.uv_px)
     return any(_level(case, case.answer_px, off) > _level(case, true_px, off) for off in (False, True))
+
+
+def _on_other_light(case: Case, uv_px: Array) -> bool:
+    others = (np.array(other.uv_px) for other in case.spot.distractions)
+    return any(bool(np.linalg.norm(uv_px - other) <= case.rules.match_px) for other in others)
 
 
 def _below_noise(case: Case) -> bool:
@@ -195,7 +199,61 @@ _RULES: dict[str, Callable[[Case], bool]] = {
     "below_noise": _below_noise,
     "compression": _compression,
 }
-CAUSES = (*_RULES, *FAILURES, "method")
+CAUSES: dict[str, str] = {
+    "occluded": "spot not visible: an object in the way, or the wall that carries it faces away",
+    "mirror_edge": "spot not reflected, or cut off at the mirror's outline",
+    "image_edge": "spot outside the image, or cut off at its edge",
+    "saturated": "a pixel of the spot is expected above saturation: its shape is lost",
+    "confused": "the answer is another light, or a region brighter than the spot",
+    "below_noise": "flux of the spot below 5 standard deviations",
+    "compression": "spot good enough in the raw pixels, lost in the 8-bit image",
+    "error": "the method raised an exception",
+    "timeout": "the method took longer than --seconds",
+    "crash": "the method's process died",
+    "memory": "the method needed more than --memory-mb",
+    "invalid": "the method's answer breaks the rules of the interface",
+    "mutated": "the method wrote into its input",
+    "method": "none of these: the light was there",
+}
+"""Causes in the order in which they are tried, with their definitions."""
+
+
+TAKEN_FOR: dict[str, tuple[str, str]] = {
+    "lamp": (
+        "a lamp or its reflection in the mirror",
+        "mask the mirror's outer ring, subtract the laser-off image, or use --boxes 64",
+    ),
+    "light": ("another light of the scene", "tell it by the laser-off image and its size, or use --boxes 64"),
+    "region": ("a region that is brighter than the spot", "subtract the laser-off image, or use --boxes 64"),
+    "nothing": (
+        "false, on nothing brighter than the spot",
+        "`phibench method check` tells mistakes of convention, --boxes 64 narrows the search",
+    ),
+}
+"""Kinds of places that false detections lie on, in words, with advice."""
+
+
+def taken_for(case: Case) -> str:
+    """Kind of the place that a false detection lies on: key of `TAKEN_FOR`."""
+    if case.answer_px is None:
+        raise ValueError("no position, nothing that it could be taken for")
+    if _on_other_light(case, case.answer_px):
+        return "light"
+    spot = _level(case, np.array(case.spot.uv_px), False) if case.spot.visible else np.inf
+    if _is_lamp(case, case.answer_px, spot):
+        return "lamp"
+    return "region" if _level(case, case.answer_px, False) > spot else "nothing"
+
+
+def _is_lamp(case: Case, uv_px: Array, spot_level: float) -> bool:
+    """Whether the light at a position is clipped, or in raw pixels thrice the spot's, black level included."""
+    part, card = case.region(uv_px, 1, 2), case.pair.card
+    if not part.size:
+        return False
+    top = float(card.top_dn) if card.output == "raw" else 255.0
+    if part.max(axis=-1).mean() >= _CLIPPED * top:
+        return True
+    return card.output == "raw" and float(part.sum(axis=-1).mean()) > _LAMP_TO_SPOT * spot_level > 0.0
 
 
 def _margin_px(rig: Rig) -> float:

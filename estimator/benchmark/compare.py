@@ -23,6 +23,8 @@ from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import Name, generator
 
 COMPARED = (
+    "rank_phi_rad",
+    "rank_depth",
     "rms_counted_px",
     "rms_px",
     "median_px",

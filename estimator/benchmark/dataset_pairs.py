@@ -13,7 +13,7 @@ import numpy as np
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exposures.expected import ExpectedRegion, expected_of_light
-from phibench.datasets.exposures.pair_draws import CachedSample, pair_draws
+from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, pair_draws, search_boxes
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.datasets.frames.source import FrameSource, Side
 from phibench.datasets.read import Dataset, Sample
@@ -43,6 +43,10 @@ _OF_THE_SPOT = 0.01  # of its brightest pixel: dimmer pixels are not the spot's
 _POSITION = 2  # unknowns of a position, the first ones of a Fisher matrix
 
 
+LEAST_BOX_PX = 16
+"""Side of the smallest box, as in a recipe."""
+
+
 class DatasetPairs(DrawnPairs):
     """Pairs of a data set by number, with their truth; the layers of the last sample are kept.
 
@@ -51,7 +55,13 @@ class DatasetPairs(DrawnPairs):
     dataset : Dataset
     pair_draws : tuple of PairDraw
         Numbered from 0.
+    boxes_px : int, optional
+        Side of the boxes of all pairs, if they are not the recipe's.
     """
+
+    def __init__(self, dataset: Dataset, pair_draws: tuple[PairDraw, ...], boxes_px: int | None = None) -> None:
+        super().__init__(dataset, pair_draws)
+        self._boxes_px = boxes_px
 
     def truth(self, number: int) -> PairTruth:
         """The exact answer, with the bounds of the image and of the raw pixels behind it."""
@@ -81,9 +91,10 @@ class DatasetPairs(DrawnPairs):
             "task_version": TASK_VERSION,
             "sealed": False,
             "pairs": len(self),
-            "samples": len({pair_draw.sample_id for pair_draw in self.pair_draws}),
-            "presets": sorted({pair_draw.preset for pair_draw in self.pair_draws}),
-            "hinted": sum(pair_draw.boxes is not None for pair_draw in self.pair_draws),
+            "samples": len({draw.sample_id for draw in self.pair_draws}),
+            "presets": sorted({draw.preset for draw in self.pair_draws}),
+            "hinted": sum(draw.boxes is not None for draw in self.pair_draws),
+            "boxes_px": self._boxes_px,
             "seed": info.recipe["dataset"]["seed"],
             "recipe_sha256": info.recipe_sha256,
             "dataset_sha256": sha256(listed) if listed.is_file() else None,
@@ -97,6 +108,7 @@ def dataset_pairs(
     draws: int | None = None,
     pairs: int | None = None,
     hints: bool = True,
+    boxes_px: int | None = None,
 ) -> DatasetPairs:
     """Pairs of a data set in an order that is drawn.
 
@@ -110,18 +122,32 @@ def dataset_pairs(
     pairs : int, optional
         Only the first so many.
     hints : bool
-        Whether pairs that have boxes show them.
+        Show the boxes of pairs that have some.
+    boxes_px : int, optional
+        Side of a box for every pair, instead of those of the recipe's `[frames]`.
 
     Raises
     ------
     DatasetError
-        If neither recipe nor caller names a preset, or `pairs` is not a number from 1 up.
+        If neither recipe nor caller names a preset, or a number is out of its range.
     """
     chosen = pair_draws(dataset, preset, draws)
     if pairs is not None and pairs < 1:
         raise DatasetError(f"pairs = {pairs}: must be 1 or above")
-    shown = chosen if hints else tuple(replace(pair_draw, boxes=None) for pair_draw in chosen)
-    return DatasetPairs(dataset, shown[:pairs])
+    if boxes_px is not None:
+        chosen = _with_boxes(dataset, chosen, boxes_px, hints)
+    elif not hints:
+        chosen = tuple(replace(draw, boxes=None) for draw in chosen)
+    return DatasetPairs(dataset, chosen[:pairs], boxes_px)
+
+
+def _with_boxes(dataset: Dataset, chosen: tuple[PairDraw, ...], side_px: int, hints: bool) -> tuple[PairDraw, ...]:
+    if not hints:
+        raise DatasetError("--boxes gives every pair a box, --no-hints takes all boxes away: give one of them")
+    if side_px < LEAST_BOX_PX:
+        raise DatasetError(f"boxes = {side_px} px: must be {LEAST_BOX_PX} or above, such as 64")
+    boxes = {sample.row.sample_id: search_boxes(sample, side_px) for sample in dataset}
+    return tuple(replace(draw, boxes=boxes[draw.sample_id]) for draw in chosen)
 
 
 def _spot_truth(sample: CachedSample, source: FrameSource, position: str) -> SpotTruth:

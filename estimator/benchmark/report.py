@@ -30,7 +30,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.store.files import write_text
 from phibench.estimator.benchmark.compare import same_pairs
 from phibench.estimator.benchmark.document import ScoreDocument, StratumScore, Value, read_records, read_score
-from phibench.estimator.benchmark.score_tables import BOARD, cell_parts, rank_key
+from phibench.estimator.benchmark.score_tables import HEADS, head, rank_key, rank_words, shown_parts
 from phibench.scenes.frames import Array
 
 # M. Okabe, K. Ito: told apart with every kind of colour vision; markers, lines and hatches repeat the distinction
@@ -341,14 +341,15 @@ class Ranking:
     pulls: Picture | None
 
 
-def write_report(files: Sequence[Path], out: Path, sections: Sequence[Section] = ()) -> Path:
+def write_report(files: Sequence[Path], out: Path, sections: Sequence[Section] = (), by: str = "phi") -> Path:
     """Write a report about scores on disk.
 
     Parameters
     ----------
     files : JSON files of `score --method`, their Parquet files beside them
     out : HTML file
-    sections : what follows the scores
+    sections : further sections after the scores
+    by : "phi" or "depth", for the rank
 
     Raises
     ------
@@ -361,18 +362,24 @@ def write_report(files: Sequence[Path], out: Path, sections: Sequence[Section] =
             "study (--study)"
         )
     read = [(path, read_score(path)) for path in files]
-    return write_text(out, report_html([(document, read_records(path, document)) for path, document in read], sections))
+    return write_text(
+        out, report_html([(document, read_records(path, document)) for path, document in read], sections, by)
+    )
 
 
-def report_html(scores: Sequence[tuple[ScoreDocument, pl.DataFrame]], sections: Sequence[Section] = ()) -> str:
+def report_html(
+    scores: Sequence[tuple[ScoreDocument, pl.DataFrame]], sections: Sequence[Section] = (), by: str = "phi"
+) -> str:
     """The page as text; the same scores give the same text."""
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True,
     )  # fmt: skip
-    environment.globals.update(board=BOARD, parts=cell_parts, strata_metrics=(*_STRATA, *_STRATA_TOO))
+    environment.globals.update(
+        board=HEADS, head=head, parts=shown_parts, ranked_by=rank_words(by), strata_metrics=(*_STRATA, *_STRATA_TOO)
+    )
     environment.filters["json"] = lambda value: json.dumps(value, indent=1)
-    rankings = [_ranking(group) for group in _groups(scores)]
+    rankings = [_ranking(group, by) for group in _groups(scores)]
     return environment.get_template(_TEMPLATE).render(rankings=rankings, sections=sections)
 
 
@@ -385,8 +392,8 @@ def _groups(scores: Sequence[tuple[ScoreDocument, pl.DataFrame]]) -> list[list[t
     return list(groups.values())
 
 
-def _ranking(group: list[tuple[ScoreDocument, pl.DataFrame]]) -> Ranking:
-    order = sorted(group, key=lambda item: rank_key(item[0]))
+def _ranking(group: list[tuple[ScoreDocument, pl.DataFrame]], by: str) -> Ranking:
+    order = sorted(group, key=lambda item: rank_key(item[0], by))
     names = _distinct([document.method.name for document, _ in order])
     scores = {name: document for name, (document, _) in zip(names, order, strict=True)}
     tables = {name: table for name, (_, table) in zip(names, order, strict=True)}

@@ -201,6 +201,7 @@ def score(
     pairs: int | None = None,
     hints: bool = True,
     calibration: str | Path | None = None,
+    boxes_px: int | None = None,
     limits: RunLimits | None = None,
     workers: int = 1,
     seed: int = 0,
@@ -217,7 +218,7 @@ def score(
         in this process: no limits, and it can be stopped with a debugger.
     preset : str, optional
         Preset of the sensor; by default those of the recipe's `[frames]`.
-    draws, pairs, hints, calibration
+    draws, pairs, hints, calibration, boxes_px
         As for `wanted_pairs`.
     limits : RunLimits, optional
         Of time and memory; not for a function.
@@ -246,7 +247,7 @@ def score(
     opened = dataset if isinstance(dataset, Dataset) else open_finished(dataset)
     if out is not None:
         require_writable(Path(out))
-    chosen = wanted_pairs(opened, preset, draws, pairs, hints, calibration)
+    chosen = wanted_pairs(opened, preset, draws, pairs, hints, calibration, boxes_px)
     if isinstance(method, str):
         (scored,) = run_and_score([method], chosen, workers, console, "pairs", seed, limits)
     else:
@@ -255,9 +256,12 @@ def score(
         with Steps(console, "pairs", len(chosen)) as steps:
             card = MethodCard.of(function_name(method), kind="function")
             (scored,) = score_methods([card], chosen, asked_here(method), None, seed, None, steps.reach)
-    if out is None:
-        return scored
-    return replace(scored, document=write_score(Path(out), scored.document, scored.records))
+    return scored if out is None else saved(scored, Path(out))
+
+
+def saved(scored: Scored, file: Path) -> Scored:
+    """The score, written with its records; its document then names their hash."""
+    return replace(scored, document=write_score(file, scored.document, scored.records))
 
 
 PRESETS = ("bayer-raw", "srgb8", "mjpeg")
@@ -355,8 +359,9 @@ def wanted_pairs(
     pairs: int | None = None,
     hints: bool = True,
     calibration: str | Path | None = None,
+    boxes_px: int | None = None,
 ) -> PairSet:
-    """As `dataset_pairs`; with a calibration file its rig's pairs, with the calibrated rig, stroke and covariance.
+    """Pairs as of `dataset_pairs`; with a calibration file its rig's, with calibrated rig, stroke and covariance.
 
     Raises
     ------
@@ -364,9 +369,9 @@ def wanted_pairs(
         As `dataset_pairs`, or if the calibration cannot be read or is that of another rig.
     """
     if calibration is None:
-        return dataset_pairs(dataset, preset, draws, pairs, hints)
+        return dataset_pairs(dataset, preset, draws, pairs, hints, boxes_px)
     read = read_calibration(calibration)
-    return CalibratedPairs(dataset_pairs(of_calibration(dataset, read), preset, draws, pairs, hints), read)
+    return CalibratedPairs(dataset_pairs(of_calibration(dataset, read), preset, draws, pairs, hints, boxes_px), read)
 
 
 def refusal(method: BuiltIn, pairs: PairSet) -> str:

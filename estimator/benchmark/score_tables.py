@@ -1,36 +1,88 @@
-"""Scores as tables for a terminal, with intervals."""
+"""Tables of scores: for a terminal of 80 columns, or as CSV, Markdown, LaTeX and JSON.
+
+A `Grid` holds the cells of a table as text; `written` gives it one of the forms. Units are those of `Metric.shown`:
+mrad for phi, per cent for rates and relative errors. CSV and JSON hold the numbers of the files instead: SI, in full.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
+import json
 import math
-from collections.abc import Sequence
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
 
 import polars as pl
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from phibench.estimator.benchmark.causes import CAUSES, TAKEN_FOR
 from phibench.estimator.benchmark.compare import Difference
-from phibench.estimator.benchmark.document import ScoreDocument
+from phibench.estimator.benchmark.document import ScoreDocument, Value
 from phibench.estimator.benchmark.intervals import Estimate
 from phibench.estimator.benchmark.metrics import METRICS, RANKS
 
-# metric, head, factor from its unit, digits
-BOARD: tuple[tuple[str, str, float, int], ...] = (
-    ("detection_rate", "found %", 100.0, 1),
-    ("false_rate", "false %", 100.0, 1),
-    ("rms_counted_px", "rms px, missed counted", 1.0, 4),
-    ("rms_px", "rms px", 1.0, 4),
-    ("rms_phi_rad", "rms phi mrad", 1e3, 4),
-    ("rms_depth_counted", "rms D %, missed counted", 100.0, 3),
-    ("rms_depth_relative", "rms D %", 100.0, 3),
-    ("efficiency_px", "efficiency", 1.0, 3),
-    ("pull_deviation", "pull", 1.0, 3),
-    ("seconds", "s/pair", 1.0, 3),
-)
+Form = Literal["terminal", "csv", "markdown", "latex", "json"]
+
+HEADS = {
+    "rank_phi_rad": "rank phi",
+    "rank_depth": "rank D",
+    "detection_rate": "found",
+    "false_rate": "false",
+    "rms_px": "rms",
+    "rms_phi_rad": "rms phi",
+    "rms_depth_relative": "rms D",
+    "seconds": "time",
+    "rms_counted_px": "rms, missed counted",
+    "rms_depth_counted": "rms D, missed counted",
+    "efficiency_px": "efficiency",
+    "pull_deviation": "pull",
+}
+"""Metrics of a ranking with their heads; a narrow table has the first `NARROW` of them."""
+NARROW = 8
+DIGITS = 3
+"""Significant digits of a value in a table."""
+WIDE = 210
+"""Columns of a terminal for tables with every interval."""
+FULL_OF_FALSE = 0.2
+"""Share of false answers from which a line says what they are."""
+_STRATA = ("detection_rate", "rms_px", "rms_phi_rad", "rms_depth_relative", "efficiency_px")
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table as text.
+
+    Attributes
+    ----------
+    title : str
+    heads : tuple of str
+        A line break parts a head from its unit.
+    rows : tuple of rows, each a tuple of str
+    columns : str
+        A letter each: "r" is a number, "l" a word, "L" a text that may go on on the next line.
+    note : str
+        A line below the table.
+    """
+
+    title: str
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    columns: str
+    note: str = ""
+
+
+# -- scores --------------------------------------------------------------------------------------------------------
 
 
 def ranked(documents: Sequence[ScoreDocument], by: str = "phi") -> list[ScoreDocument]:
-    """Best first."""
+    """Scores, the best first."""
     return sorted(documents, key=lambda document: rank_key(document, by))
 
 
@@ -45,109 +97,334 @@ def rank_key(document: ScoreDocument, by: str = "phi") -> float:
     return math.inf if value is None else value
 
 
-def leaderboard(documents: Sequence[ScoreDocument]) -> Table:
-    """One line per method, best first; below each value its interval."""
-    confidence = documents[0].rules["confidence"]
-    grid = Table(title=f"Scores with {100 * confidence:g} % intervals over samples", show_lines=True)
-    grid.add_column("method", no_wrap=True)
-    grid.add_column("pairs", justify="right")
-    for _, head, _, _ in BOARD:
-        grid.add_column(head, justify="right")
-    for document in ranked(documents):
-        cells = (cell(document.metrics[name].estimate, factor, digits) for name, _, factor, digits in BOARD)
-        grid.add_row(document.method.name, str(document.pairs), *cells)
-    return grid
+def rank_words(by: str) -> str:
+    """Name of the rank that a table goes by, with its definition."""
+    what = {"phi": "phi: rms error of phi", "depth": "D: rms relative error of D"}[by]
+    return f"ranked by {what}, missed spots and false detections counted"
 
 
-def depth_line(document: ScoreDocument) -> str:
-    """Whether the predicted error of D, the calibration's part included, is that of the errors."""
-    pull, within = (document.metrics[name].estimate for name in ("pull_depth", "coverage_depth"))
-    share = one_line(within, 100.0, 1)
-    return f"{document.method.name}: pull of D {one_line(pull, 1.0, 3)}; within 1.96 sigma of D {share} %, 95 is right"
+def leaderboard(documents: Sequence[ScoreDocument], by: str = "phi", wide: bool = False) -> Grid:
+    """One row per method, the best first; `wide` adds intervals and the last columns."""
+    first, names = documents[0], tuple(HEADS)[: None if wide else NARROW]
+    rows = []
+    for document in ranked(documents, by):
+        cells = (_cell(name, document.metrics[name], wide) for name in names)
+        rows.append((document.method.name, *cells))
+    interval = f" {100 * first.rules['confidence']:g} % intervals over samples below the values." if wide else ""
+    title = f"{_pairs_in_words(first)}, {rank_words(by)}"
+    return Grid(title, ("method", *map(head, names)), tuple(rows), "L" + "r" * len(names), interval.strip())
 
 
-def strata_table(document: ScoreDocument) -> Table:
-    """One line per stratum of one method."""
-    least = round(document.rules["least_samples"])
-    title = Text(f"{document.method.name}: strata")  # a string would be searched for emoji
-    grid = Table(title=title, caption=f"*: fewer than {least} samples, no interval")
-    for head in ("by", "stratum", "images", "found %", "rms px", "median px", "rms phi mrad", "rms D %", "efficiency"):
-        grid.add_column(head, justify="left" if head in ("by", "stratum") else "right", no_wrap=True)
+def score_table(document: ScoreDocument, by: str = "phi") -> Grid:
+    """One row per metric of one method, with its interval."""
+    title = f"{document.method.name}: {_pairs_in_words(document)}, {rank_words(by)}"
+    order = sorted(HEADS, key=lambda name: name != RANKS[by])
+    rows = ((METRICS[name].text, METRICS[name].shown[1], *_parts(name, document.metrics[name])) for name in order)
+    interval = f"{100 * document.rules['confidence']:g} % interval"
+    return Grid(title, ("metric", "unit", "value", interval), tuple(rows), "LlrL")
+
+
+def strata_table(document: ScoreDocument, wide: bool = False) -> Grid:
+    """One row per stratum of one method."""
+    rows = []
     for stratum in (document.whole, *document.strata):
-        shown = (
-            ("detection_rate", 100.0, 1),
-            ("rms_px", 1.0, 4),
-            ("median_px", 1.0, 4),
-            ("rms_phi_rad", 1e3, 4),
-            ("rms_depth_relative", 100.0, 3),
-            ("efficiency_px", 1.0, 3),
-        )
-        there = ((stratum.metrics.get(name), factor, digits) for name, factor, digits in shown)
-        cells = ("" if value is None else _starred(value.estimate, f, d) for value, f, d in there)
-        grid.add_row(stratum.by, stratum.label, str(stratum.images), *cells)
-    return grid
+        there = ((name, stratum.metrics.get(name)) for name in _STRATA)
+        cells = ("" if value is None else _starred(name, value, wide) for name, value in there)
+        rows.append((stratum.by, stratum.label, str(stratum.images), *cells))
+    note = f"*: fewer than {document.rules['least_samples']:g} samples, no interval"
+    heads = ("by", "stratum", "images", *map(head, _STRATA))
+    return Grid(f"{document.method.name}: strata", heads, tuple(rows), "ll" + "r" * (1 + len(_STRATA)), note)
 
 
-def _starred(estimate: Estimate, factor: float, digits: int) -> str:
-    """As `one_line`, with a star where there are too few samples for an interval."""
-    value, rest = cell_parts(estimate, factor, digits)
-    return f"{value} *" if rest.startswith("(") else f"{value} {rest}".strip()
+def cause_table(documents: Sequence[ScoreDocument]) -> Grid:
+    """Images without a right position: of one method by cause, of several one row per method."""
+    title = "Images without a right position"
+    kinds = ("missed", "false", "rightly none")
+    if len(documents) > 1:
+        rows = tuple((d.method.name, *_kind_totals(d), ", ".join(_most_frequent(d))) for d in documents)
+        return Grid(title, ("method", *kinds, "most frequent causes"), rows, "LrrrL")
+    (document,) = documents
+    counts = ((cause, document.causes[cause]) for cause in CAUSES)
+    rows = tuple(
+        (cause, *(str(kind[k]) for k in _ORDER), CAUSES[cause]) for cause, kind in counts if any(kind.values())
+    )
+    return Grid(title, ("cause", *kinds, "definition"), rows, "lrrrL")
 
 
-def cause_table(documents: Sequence[ScoreDocument]) -> Table:
-    """Images without a right position by cause, one column per method: missed + false (+ unseen)."""
-    grid = Table(title="Images without a right position: missed / false / rightly not answered")
-    grid.add_column("cause")
-    for document in documents:
-        grid.add_column(document.method.name, justify="right")
-    for cause in documents[0].causes:
-        kinds = [document.causes[cause] for document in documents]
-        if any(any(kind.values()) for kind in kinds):
-            grid.add_row(cause, *(f"{kind['missed']} / {kind['false']} / {kind['unseen']}" for kind in kinds))
-    return grid
+_ORDER = ("missed", "false", "unseen")
+
+
+def _kind_totals(document: ScoreDocument) -> Iterator[str]:
+    return (str(sum(kinds[kind] for kinds in document.causes.values())) for kind in _ORDER)
+
+
+def _most_frequent(document: ScoreDocument, count: int = 3) -> list[str]:
+    wrong = Counter({cause: kinds["missed"] + kinds["false"] for cause, kinds in document.causes.items()})
+    return [f"{cause} {number}" for cause, number in wrong.most_common(count) if number]
+
+
+def _pairs_in_words(document: ScoreDocument) -> str:
+    presets = ", ".join(document.pair_set.get("presets", ()))
+    return " ".join(filter(None, (f"{document.pairs} pairs", presets)))
+
+
+# -- lines beside the tables ---------------------------------------------------------------------------------------
+
+
+def false_line(records: pl.DataFrame) -> str:
+    """Sentence on what the false answers are, with advice; "" unless a fifth of the answers are false.
+
+    Parameters
+    ----------
+    records : with causes
+    """
+    answers = records.filter(pl.col("u_px").is_not_null())
+    false = answers.filter("false_detection")
+    if not len(false) or len(false) < FULL_OF_FALSE * len(answers):
+        return ""
+    ((kind, number),) = Counter(false["taken_for"].to_list()).most_common(1)
+    what, advice = TAKEN_FOR[kind]
+    return f"{100 * number / len(answers):.0f} % of the answers are {what}: {advice}"
 
 
 def silences(records: pl.DataFrame, count: int = 3) -> list[str]:
-    """What a method or the harness said most often where there is no position, one line each."""
+    """What a method or the sandbox said most often where there is no position, one line each."""
     words = pl.when(pl.col("message") != "").then(pl.col("failure") + ": " + pl.col("message"))
     said = records.filter(pl.col("u_px").is_null()).with_columns(words=words.otherwise(pl.col("status")))
     most = said.group_by("words").len().sort("len", "words", descending=[True, False]).head(count)
     return [f"{number} of {len(records)} images without a position: {text}" for text, number in most.rows()]
 
 
-def comparison(differences: Sequence[Difference], first: str, second: str) -> Table:
-    """One line per metric: both values, the difference with its interval, and which is better if that is shown."""
-    grid = Table(title=Text(f"second - first, over what both have; first: {first}, second: {second}"))
-    for head in ("metric", "unit", "first", "second", "difference", "n", "samples", "better"):
-        grid.add_column(head, justify="left" if head in ("metric", "better") else "right")
+def depth_line(document: ScoreDocument) -> str:
+    """Pull and coverage of D, the calibration's part included."""
+    pull, within = (document.metrics[name].estimate for name in ("pull_depth", "coverage_depth"))
+    share = one_line(within, 100.0, 1)
+    return f"{document.method.name}: pull of D {one_line(pull, 1.0, 3)}; within 1.96 sigma of D {share} %, 95 is right"
+
+
+# -- comparisons ---------------------------------------------------------------------------------------------------
+
+
+_BETTER = {"no difference shown": "not shown", "too few samples": ""}
+
+
+def comparison(differences: Sequence[Difference], first: str, second: str, wide: bool = False) -> Grid:
+    """One row per metric: both values, second minus first with its interval, and which is better if that is shown."""
+    rows = []
     for item in differences:
-        names = {"first": first, "second": second}
         metric = METRICS[item.name]
-        values = (number(x, 4, significant=True) for x in (item.first, item.second))
-        shown = one_line(item.difference, 1.0, 3, significant=True)
-        counts = (str(item.n), str(item.samples))
-        grid.add_row(metric.text, metric.unit, *values, shown, *counts, names.get(item.better, item.better))
-    return grid
+        factor, unit = metric.shown
+        values = (number(factor * x, DIGITS, significant=True) for x in (item.first, item.second))
+        change = cell_parts(item.difference, factor, DIGITS, significant=True)
+        counts = (str(item.n), str(item.samples)) if wide else ()
+        rows.append((metric.text, unit, *values, *change, *counts, _BETTER.get(item.better, item.better)))
+    counted = ("n", "samples") if wide else ()
+    heads = ("metric", "unit", "first", "second", "second\n- first", "interval", *counted, "better")
+    columns = "LlrrrL" + "r" * len(counted) + "L"
+    return Grid(f"Over what both have. First: {first}. Second: {second}", heads, tuple(rows), columns)
 
 
-def cell(estimate: Estimate, factor: float = 1.0, digits: int = 3) -> str:
-    """Value, and its interval on a second line."""
-    value, interval = cell_parts(estimate, factor, digits)
-    return f"{value}\n{interval}" if interval else value
+# -- output --------------------------------------------------------------------------------------------------------
+
+
+class HasScore(Protocol):
+    """A score with its records, as `score.Scored`."""
+
+    @property
+    def document(self) -> ScoreDocument:
+        """The score."""
+
+    @property
+    def records(self) -> pl.DataFrame:
+        """One row per image."""
+
+
+def print_scores(scored: Sequence[HasScore], form: str, by: str, wide: bool, calibrated: bool = False) -> None:
+    """Print scores of methods on the same pairs.
+
+    Parameters
+    ----------
+    scored : sequence of Scored
+    form : Form
+        "terminal" has further tables and lines; the others are one table, or one JSON object a line.
+    by : "phi" or "depth"
+    wide : bool
+        Show every interval.
+    calibrated : bool
+        Say how well the predicted error of D holds.
+    """
+    documents = [one.document for one in scored]
+    board = leaderboard(documents, by, wide)
+    if form != "terminal":
+        table = {"markdown": markdown, "latex": latex}
+        whole = {"csv": scores_csv, "json": scores_json}
+        sys.stdout.write(table[form](board) if form in table else whole[form](documents, by))
+        return
+    console = _console(wide)
+    show_grid(console, board if wide or len(documents) > 1 else score_table(documents[0], by))
+    for one in scored:
+        if line := false_line(one.records):
+            _line(console, f"{one.document.method.name}: {line}")
+    if any(any(kind.values()) for document in documents for kind in document.causes.values()):
+        show_grid(console, cause_table(documents))
+    for one in scored:
+        for line in [*([depth_line(one.document)] if calibrated else []), *silences(one.records)]:
+            _line(console, f"{one.document.method.name}: {line}")
+    if len(documents) == 1:
+        show_grid(console, strata_table(documents[0], wide))
+
+
+def print_comparison(differences: Sequence[Difference], first: str, second: str, form: str, wide: bool) -> None:
+    """Print a comparison; parameters as for `print_scores`."""
+    grid = comparison(differences, first, second, wide)
+    if form == "terminal":
+        show_grid(_console(wide), grid)
+    else:
+        texts = {"csv": lambda: differences_csv(differences), "json": lambda: differences_json(differences)}
+        texts |= {"markdown": lambda: markdown(grid), "latex": lambda: latex(grid)}
+        sys.stdout.write(texts[form]())
+
+
+def _console(wide: bool) -> Console:
+    """A console at least 80 columns wide; a wide one does not lose numbers in a narrow terminal or a pipe."""
+    console, least = Console(), WIDE if wide else 80
+    return console if console.width >= least else Console(width=least)
+
+
+def _line(console: Console, text: str) -> None:
+    console.print(text, emoji=False, highlight=False, markup=False)
+
+
+# -- forms ---------------------------------------------------------------------------------------------------------
+
+
+def show_grid(console: Console, grid: Grid) -> None:
+    """Print a table to a terminal; text that is too long for it goes on below."""
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
+    for name, kind in zip(grid.heads, grid.columns, strict=True):
+        table.add_column(name, justify="right" if kind == "r" else "left", overflow="fold", no_wrap=kind != "L")
+    for row in grid.rows:
+        table.add_row(*map(Text, row))  # as it is: a string would be searched for markup and emoji
+    for part in (Text(grid.title, style="bold"), table, *([Text(grid.note)] if grid.note else [])):
+        console.print(part)
+    console.print()
+
+
+def markdown(grid: Grid) -> str:
+    """Table in Markdown, a line of text before it."""
+    marks = ["--:" if kind == "r" else ":--" for kind in grid.columns]
+    lines = [_row(grid.heads), _row(marks), *map(_row, grid.rows)]
+    return "\n".join((f"{grid.title}\n", *lines, *(("", grid.note) if grid.note else ()))) + "\n"
+
+
+def latex(grid: Grid) -> str:
+    """Table in LaTeX, for the package booktabs."""
+    lines = [" & ".join(map(_escaped, row)) + r" \\" for row in (grid.heads, *grid.rows)]
+    body = [
+        rf"\begin{{tabular}}{{{grid.columns.lower()}}}",
+        r"\toprule",
+        lines[0],
+        r"\midrule",
+        *lines[1:],
+        r"\bottomrule",
+    ]
+    return "\n".join((f"% {grid.title}", *body, r"\end{tabular}")) + "\n"
+
+
+def scores_csv(documents: Sequence[ScoreDocument], by: str = "phi") -> str:
+    """One row per method: every metric with its interval, in the units of the files, in full."""
+    names = [f"{name}{end}" for name in METRICS for end in ("", "_low", "_high")]
+    rows = []
+    for document in ranked(documents, by):
+        values = (document.metrics[name] for name in METRICS)
+        numbers = [x for value in values for x in (value.value, value.low, value.high)]
+        rows.append([document.method.name, document.pairs, document.images, document.samples, *numbers])
+    return _csv(["method", "pairs", "images", "samples", *names], rows)
+
+
+def scores_json(documents: Sequence[ScoreDocument], by: str = "phi") -> str:
+    """One JSON object a line: a score without its pictures."""
+    bare = (d.model_copy(update={"worst": []}) for d in ranked(documents, by))
+    return "".join(json.dumps(d.model_dump(mode="json"), allow_nan=False) + "\n" for d in bare)
+
+
+def differences_csv(differences: Sequence[Difference]) -> str:
+    """One row per metric, in the units of the files, in full."""
+    return _csv(list(_difference_fields(differences[0])), [list(_difference_fields(d).values()) for d in differences])
+
+
+def differences_json(differences: Sequence[Difference]) -> str:
+    """One JSON object: metric to values and difference."""
+    found = {d.name: {key: x for key, x in _difference_fields(d).items() if key != "metric"} for d in differences}
+    return json.dumps(found, indent=1, allow_nan=False) + "\n"
+
+
+def _difference_fields(d: Difference) -> dict[str, str | float | int | None]:
+    numbers = {"first": d.first, "second": d.second, "difference": d.difference.value}
+    numbers |= {"low": d.difference.low, "high": d.difference.high}
+    finite = {name: x if math.isfinite(x) else None for name, x in numbers.items()}
+    return {
+        "metric": d.name,
+        "unit": METRICS[d.name].unit,
+        **finite,
+        "n": d.n,
+        "samples": d.samples,
+        "better": d.better,
+    }
+
+
+def _csv(heads: list[str], rows: Sequence[Sequence[object]]) -> str:
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerows([heads, *(["" if x is None else x for x in row] for row in rows)])
+    return buffer.getvalue()
+
+
+def _row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
+
+
+def _escaped(text: str) -> str:
+    for mark in "\\&%$#_{}":
+        text = text.replace(mark, r"\textbackslash " if mark == "\\" else f"\\{mark}")
+    return text.replace("\n", " ")
+
+
+# -- numbers -------------------------------------------------------------------------------------------------------
+
+
+def head(name: str) -> str:
+    """Head of a metric's column, its unit on the second line."""
+    unit = METRICS[name].shown[1]
+    return HEADS[name] if unit == "1" else f"{HEADS[name]}\n{unit}"
+
+
+def shown_parts(name: str, value: Value) -> tuple[str, str]:
+    """Value and interval of a metric in the unit of tables."""
+    return cell_parts(value.estimate, METRICS[name].shown[0], DIGITS, significant=True)
+
+
+def _parts(name: str, value: Value) -> tuple[str, str]:
+    shown, interval = shown_parts(name, value)
+    return shown, interval or value.note
+
+
+def _cell(name: str, value: Value, wide: bool) -> str:
+    shown, interval = shown_parts(name, value)
+    return f"{shown}\n{interval}" if wide and interval else shown
+
+
+def _starred(name: str, value: Value, wide: bool) -> str:
+    """Value with a star where there are too few samples for an interval."""
+    shown, rest = shown_parts(name, value)
+    if rest.startswith("("):
+        return f"{shown} *"
+    return f"{shown} {rest}".strip() if wide else shown
 
 
 def one_line(estimate: Estimate, factor: float = 1.0, digits: int = 3, significant: bool = False) -> str:
     """Value and interval on one line."""
     return " ".join(part for part in cell_parts(estimate, factor, digits, significant) if part)
-
-
-def number(value: float, digits: int, significant: bool = False) -> str:
-    """A number, "-" where there is none; one below its last digit as a power of ten, not as 0."""
-    if not math.isfinite(value):
-        return "-"
-    if significant or 0.0 < abs(value) < 0.5 * 10.0**-digits:
-        return f"{value:.{max(digits - 1, 0)}e}" if 0.0 < abs(value) < 1e-3 else f"{value:.{digits}g}"
-    return f"{value:.{digits}f}"
 
 
 def cell_parts(estimate: Estimate, factor: float, digits: int, significant: bool = False) -> tuple[str, str]:
@@ -159,3 +436,14 @@ def cell_parts(estimate: Estimate, factor: float, digits: int, significant: bool
         return value, f"({estimate.note})" if estimate.note else ""
     low, high = (number(factor * x, digits, significant) for x in (estimate.low, estimate.high))
     return value, f"[{low}, {high}]"
+
+
+def number(value: float, digits: int, significant: bool = False) -> str:
+    """A number, "-" where there is none; one below its last digit as a power of ten, not as 0."""
+    if not math.isfinite(value):
+        return "-"
+    if significant or 0.0 < abs(value) < 0.5 * 10.0**-digits:
+        if abs(value) >= 10.0**digits:
+            return f"{value:.0f}"
+        return f"{value:.{max(digits - 1, 0)}e}" if 0.0 < abs(value) < 1e-3 else f"{value:.{digits}g}"
+    return f"{value:.{digits}f}"

@@ -4,21 +4,53 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
 from phibench.estimator.cli.options import MEMORY_MB, SECONDS, BuiltIn, MemoryMb, Methods, Seconds, Whole
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from phibench.estimator.benchmark.document import MethodCard, ScoreDocument
-    from phibench.estimator.sandbox.resolve import RunLimits
+
+Rank = Literal["phi", "depth"]
 
 
-_TABLE_WIDTH = 210
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Output:
+    """Form of the tables on the standard output."""
+
+    wide: Annotated[bool, Parameter(negative="", help="Every interval and metric, in 210 columns instead of 80.")] = (
+        False
+    )
+    csv: Annotated[bool, Parameter(negative="", help="Numbers as CSV: every metric with its interval, in full.")] = (
+        False
+    )
+    markdown: Annotated[bool, Parameter(negative="", help="The table in Markdown.")] = False
+    latex: Annotated[bool, Parameter(negative="", help="The table in LaTeX, for the package booktabs.")] = False
+    json: Annotated[bool, Parameter(negative="", help="The whole as JSON, one score a line: for jq.")] = False
+
+    @property
+    def form(self) -> str:
+        """Chosen form, "terminal" by default.
+
+        Raises
+        ------
+        DatasetError
+            If several are chosen.
+        """
+        from phibench.datasets.errors import DatasetError
+
+        chosen = [name for name in ("csv", "markdown", "latex", "json") if getattr(self, name)]
+        if len(chosen) > 1:
+            raise DatasetError(f"--{chosen[0]} and --{chosen[1]}: give one of them")
+        return chosen[0] if chosen else "terminal"
+
+
+_TABLES = Output()
 
 
 def score(
@@ -29,12 +61,15 @@ def score(
     draws: Whole | None = None,
     pairs: Whole | None = None,
     hints: bool = True,
+    boxes: Whole | None = None,
+    rank: Rank = "phi",
     bootstrap_seed: Whole = 0,
     workers: Whole = 1,
     calibration: Path | None = None,
     seconds: Seconds = SECONDS,
     memory_mb: MemoryMb = MEMORY_MB,
     out: Path | None = None,
+    output: Output = _TABLES,
 ) -> int:
     """Score methods on the pairs of a data set.
 
@@ -50,6 +85,10 @@ def score(
         Only so many pairs.
     hints
         Show the boxes that pairs have; --no-hints leaves the method to search the whole image.
+    boxes
+        Give every pair boxes of so many pixels a side. The spot is anywhere in them: their centre tells nothing.
+    rank
+        Error that methods are ranked by, missed spots and false detections counted: phi, or depth for D.
     bootstrap_seed
         Seed of the bootstrap that makes the intervals.
     workers
@@ -59,21 +98,35 @@ def score(
     out
         JSON file for the score, records beside it as Parquet; with several methods their names are added to it.
     """
+    from rich.console import Console
+
     from phibench.datasets.errors import DatasetError
-    from phibench.estimator.sandbox.resolve import RunLimits
+    from phibench.datasets.read import open_finished
+    from phibench.datasets.store.files import require_writable
+    from phibench.estimator.benchmark.document import MethodCard
+    from phibench.estimator.benchmark.score import run_and_score, saved, wanted_pairs
+    from phibench.estimator.benchmark.score_tables import print_scores
+    from phibench.estimator.sandbox.resolve import RunLimits, resolve
 
     if not method:
         raise DatasetError(
             "`phibench score` scores methods: give --method, such as --method red_centroid. "
             f"The paper's tables are `phibench paper {directory}`"
         )
-    limits = RunLimits(seconds, memory_mb)
-    return _score_methods(
-        directory, method, preset, draws, pairs, hints, bootstrap_seed, workers, calibration, limits, out
-    )
+    limits, form = RunLimits(seconds, memory_mb), output.form
+    files = _files(out, [MethodCard.of(name, **resolve(name).document()) for name in method])
+    for target in filter(None, files):
+        require_writable(target)
+    pair_set = wanted_pairs(open_finished(directory), preset, draws, pairs, hints, calibration, boxes)
+    scored = run_and_score(method, pair_set, workers, Console(stderr=True), "pairs", _seed(bootstrap_seed), limits)
+    scored = [one if file is None else saved(one, file) for one, file in zip(scored, files, strict=True)]
+    print_scores(scored, form, rank, output.wide, calibration is not None)
+    for file in filter(None, files):
+        print(f"written: {file}", file=sys.stdout if form == "terminal" else sys.stderr)
+    return 0
 
 
-def compare(first: Path, second: Path, *, bootstrap_seed: Whole = 0) -> int:
+def compare(first: Path, second: Path, *, bootstrap_seed: Whole = 0, output: Output = _TABLES) -> int:
     """Compare two scores of the same pairs, sample by sample.
 
     Parameters
@@ -88,23 +141,26 @@ def compare(first: Path, second: Path, *, bootstrap_seed: Whole = 0) -> int:
     from phibench.estimator.benchmark.compare import compare as compare_scores
     from phibench.estimator.benchmark.compare import note_on_code
     from phibench.estimator.benchmark.document import read_score
-    from phibench.estimator.benchmark.score_tables import comparison
+    from phibench.estimator.benchmark.score_tables import print_comparison
 
-    differences = compare_scores(first, second, _seed(bootstrap_seed))
+    form, differences = output.form, compare_scores(first, second, _seed(bootstrap_seed))
     a, b = read_score(first), read_score(second)
-    console = _console()
-    console.print(comparison(differences, _distinct(first, a), _distinct(second, b)))
+    print_comparison(differences, _distinct(first, a), _distinct(second, b), form, output.wide)
+    lines = sys.stdout if form == "terminal" else sys.stderr
     if note := note_on_code(a, b):
-        console.print(f"note: {note}", soft_wrap=True)
+        print(f"note: {note}", file=lines)
     if all(item.better == "too few samples" for item in differences):
-        console.print(f"Too few samples for any interval: {a.rules['least_samples']:g} are the least.")
+        print(f"Too few samples for any interval: {a.rules['least_samples']:g} are the least.", file=lines)
     elif all(item.better in ("no difference shown", "too few samples") for item in differences):
-        console.print("No metric shows a difference: every interval that there is holds 0.")
+        print("No metric shows a difference: every interval that there is holds 0.", file=lines)
     return 0
 
 
 def report(
-    *files: Path, out: Path, study: Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative="")] = ()
+    *files: Path,
+    out: Path,
+    rank: Rank = "phi",
+    study: Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative="")] = (),
 ) -> int:
     """Write one HTML page about scores (ranking, errors, causes, the worst images) and studies. It needs no network.
 
@@ -114,59 +170,15 @@ def report(
         JSON files that `score --method --out` wrote, with their Parquet files beside them.
     out
         HTML file to write.
+    rank
+        Error that methods are ranked by, missed spots and false detections counted: phi, or depth for D.
     study
         Folders that `phibench study` wrote.
     """
     from phibench.estimator.benchmark.report import write_report
     from phibench.estimator.studies.run import section
 
-    print(write_report(files, out, [section(folder) for folder in study]))
-    return 0
-
-
-def _score_methods(
-    directory: Path,
-    references: Sequence[str],
-    preset: str | None,
-    draws: int | None,
-    count: int | None,
-    hints: bool,
-    seed: int,
-    workers: int,
-    calibration: Path | None,
-    limits: RunLimits,
-    out: Path | None,
-) -> int:
-    from rich.console import Console
-
-    from phibench.datasets.read import open_finished
-    from phibench.datasets.store.files import require_writable
-    from phibench.estimator.benchmark.document import MethodCard, write_score
-    from phibench.estimator.benchmark.score import run_and_score, wanted_pairs
-    from phibench.estimator.benchmark.score_tables import cause_table, depth_line, leaderboard, silences, strata_table
-    from phibench.estimator.sandbox.resolve import resolve
-
-    files = _files(out, [MethodCard.of(name, **resolve(name).document()) for name in references])
-    for target in filter(None, files):
-        require_writable(target)
-    pair_set = wanted_pairs(open_finished(directory), preset, draws, count, hints, calibration)
-    scored = run_and_score(references, pair_set, workers, Console(stderr=True), "pairs", _seed(seed), limits)
-    console, documents = _console(), []
-    for one, file in zip(scored, files, strict=True):
-        documents.append(one.document if file is None else write_score(file, one.document, one.records))
-    console.print(leaderboard(documents))
-    if calibration is not None:
-        for document in documents:
-            console.print(depth_line(document), soft_wrap=True, emoji=False, highlight=False)
-    if any(any(kind.values()) for document in documents for kind in document.causes.values()):
-        console.print(cause_table(documents))
-    for one in scored:
-        for line in silences(one.records):
-            console.print(f"{one.document.method.name}: {line}", soft_wrap=True, emoji=False, highlight=False)
-    if len(documents) == 1:
-        console.print(strata_table(documents[0]))
-    for file in filter(None, files):
-        console.print(f"written: {file}", soft_wrap=True)
+    print(write_report(files, out, [section(folder) for folder in study], rank))
     return 0
 
 
@@ -197,14 +209,6 @@ def _seed(seed: int) -> int:
 
 def _distinct(path: Path, document: ScoreDocument) -> str:
     return f"{document.method.name} ({path.name})"
-
-
-def _console() -> Console:
-    """A console as wide as the tables: cut off at the width of a pipe or a narrow terminal they would lose numbers."""
-    from rich.console import Console
-
-    console = Console()
-    return console if console.width >= _TABLE_WIDTH else Console(width=_TABLE_WIDTH)
 
 
 def bench(

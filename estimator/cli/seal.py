@@ -7,9 +7,7 @@ from pathlib import Path
 
 from cyclopts import App
 
-from phibench.estimator.cli.options import MEMORY_MB, METHODS, SECONDS, MemoryMb, Seconds, Whole, wide_console
-
-_TABLE_WIDTH = 210
+from phibench.estimator.cli.options import MEMORY_MB, METHODS, SECONDS, MemoryMb, Seconds, Whole
 
 seal = App(
     name="seal",
@@ -96,9 +94,8 @@ def open_(public: Path, *, truth: Path, submission: Path, out: Path | None = Non
     from phibench.datasets.errors import DatasetError
     from phibench.datasets.store.files import require_writable
     from phibench.estimator.benchmark.answer_errors import Rules
-    from phibench.estimator.benchmark.document import write_score
-    from phibench.estimator.benchmark.score import score_outcomes
-    from phibench.estimator.benchmark.score_tables import cause_table, leaderboard
+    from phibench.estimator.benchmark.score import saved, score_outcomes
+    from phibench.estimator.benchmark.score_tables import print_scores
     from phibench.estimator.benchmark.submission import unseal as unseal_set
 
     if out is not None:
@@ -108,10 +105,7 @@ def open_(public: Path, *, truth: Path, submission: Path, out: Path | None = Non
     opened = unseal_set(public, truth, submission)
     print(f"seal {opened.seal.id}: the truth is the sealed one, the submission has each of {opened.seal.pairs} pairs")
     scored = score_outcomes(opened.submission.method, opened.pairs, opened.outcomes, Rules())
-    document = scored.document if out is None else write_score(out, scored.document, scored.records)
-    console = wide_console(_TABLE_WIDTH)
-    console.print(leaderboard([document]))
-    console.print(cause_table([document]))
+    print_scores([scored if out is None else saved(scored, out)], "terminal", "phi", wide=False)
     if out is not None:
         print(f"written: {out}")
     return 0

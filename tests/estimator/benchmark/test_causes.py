@@ -10,8 +10,19 @@ from helpers.bench_cases import RIG, Cases, cases, change, constant, image_of, o
 
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.benchmark.answer_errors import MATCH_PX, Rules
-from phibench.estimator.benchmark.causes import CAUSES, KINDS, Case, cause_of, count, count_failures, with_causes
+from phibench.estimator.benchmark.causes import (
+    _RULES,
+    CAUSES,
+    KINDS,
+    Case,
+    cause_of,
+    count,
+    count_failures,
+    taken_for,
+    with_causes,
+)
 from phibench.estimator.benchmark.records import record_table
+from phibench.estimator.benchmark.score_tables import false_line
 from phibench.estimator.interface import FAILURES, Answer, Outcome, Pair, Spot
 from phibench.estimator.pair_set import CachedPairs, Distraction
 
@@ -158,6 +169,40 @@ def test_every_image_that_is_not_detected_has_one_cause():
     assert sum(sum(kinds.values()) for kinds in numbers.values()) == int((~table["detected"]).sum())
     assert numbers["timeout"] == {"unseen": 0, "missed": 2, "false": 0}
     assert count_failures(table) == dict.fromkeys(FAILURES, 0) | {"timeout": 1}
+
+
+def test_every_cause_has_a_rule_or_is_a_word_of_the_sandbox():
+    assert tuple(CAUSES) == (*_RULES, *FAILURES, "method")
+    assert all(CAUSES.values())
+
+
+def place(answer, image=None, truth=TRUTH, **spot):
+    truth = change(truth, "down", **spot) if spot else truth
+    asked = pair_of(truth, image)
+    return taken_for(Case("down", truth, np.array(answer), "", lambda _: asked, RULES))
+
+
+def test_a_false_detection_lies_on_a_lamp_a_light_a_region_or_nothing():
+    """Codes 255 (clipped), 240 and 60 against a spot whose 4 x 4 pixels have (8 x 120 + 230) / 16 = 74 on average."""
+    u, v = (round(x) for x in (UV[0] + 60.0, UV[1]))
+    for code, expected in ((255, "lamp"), (240, "region"), (60, "nothing"), (0, "nothing")):
+        image = image_of(TRUTH.down)
+        image[v - 6 : v + 7, u - 6 : u + 7, 0] = code
+        assert place((u, v), image) == expected
+    other = Distraction("glow", (float(u), float(v)), 100.0)
+    assert place((u + 1.0, v), distractions=(other,)) == "light"
+    assert place((u, v), visible=False, uv_px=(np.nan, np.nan)) == "nothing"
+
+
+def test_a_table_full_of_false_detections_says_what_they_are():
+    pairs = cases(20)
+    truths = [change(t, "down", distractions=(Distraction("glow", (640.0, 360.0), 50.0),)) for t in pairs.truths]
+    truths = [change(t, "up", distractions=(Distraction("glow", (640.0, 360.0), 50.0),)) for t in truths]
+    for share, expected in ((0.9, "90 % of the answers are another light"), (0.1, "")):
+        answers = [Outcome(t.number, (constant if t.number < 20 * share else truth_itself)(t), 0.1) for t in truths]
+        table = with_causes(record_table(truths, answers, RULES), Cases(tuple(truths)), RULES)
+        assert false_line(table).startswith(expected)
+        assert ("--boxes 64" in false_line(table)) == bool(expected)
 
 
 def test_a_hidden_spot_that_is_not_answered_is_no_fault():

@@ -73,6 +73,32 @@ def test_images_have_the_shapes_of_their_preset_and_cannot_be_written(dataset: D
             image[0, 0] = 0
 
 
+def test_boxes_for_every_pair_are_those_of_a_recipe_that_has_them(dataset: Dataset) -> None:
+    """64 pixels a side, the spot 4 px from their edges or more, from the recipe's own streams."""
+    boxed = dataset_pairs(dataset, boxes_px=64)
+    hinting = with_tables(dataset, frames={**dataset.info.recipe["frames"], "hint": 1.0, "hint_box_px": 64})
+    by_recipe, checked = dataset_pairs(hinting), 0
+    for number in range(len(boxed)):
+        pair, other, truth = boxed.pair(number), by_recipe.pair(number), boxed.truth(number)
+        assert (pair.box_down, pair.box_up) == (other.box_down, other.box_up)
+        assert truth.hinted
+        for position in POSITIONS:
+            box, spot = getattr(pair, f"box_{position}"), getattr(truth, position)
+            assert box is not None
+            assert (box.width_px, box.height_px) == (64, 64)
+            if spot.visible:
+                u, v = spot.uv_px
+                assert 4 <= u + 0.5 - box.u0_px <= 60
+                assert 4 <= v + 0.5 - box.v0_px <= 60
+                checked += 1
+    assert checked > 10
+    assert boxed.document()["boxes_px"] == 64
+    assert dataset_pairs(dataset).document()["boxes_px"] is None
+    for given, words in (({"boxes_px": 8}, "must be 16 or above"), ({"boxes_px": 64, "hints": False}, "--no-hints")):
+        with pytest.raises(DatasetError, match=words):
+            dataset_pairs(dataset, **given)
+
+
 def test_a_pair_knows_nothing_of_the_scene(pairs: DatasetPairs) -> None:
     """All that a pair has besides images: number, rig, stroke, card, boxes; none of them a number of the truth."""
     names = {field.name for field in fields(Pair)}

@@ -104,7 +104,9 @@ def test_ranks_go_by_phi_with_missed_spots_and_by_depth_where_asked():
     assert [d.method.name for d in ranked([easy, every])] == ["every", "easy"]
     deep = scored(lambda t: replace(half(t), depth_m=t.depth_m), name="deep").document  # phi as `every`, D exact
     assert [d.method.name for d in ranked([easy, every, deep], "depth")] == ["deep", "every", "easy"]
-    assert leaderboard([easy, every]).row_count == 2
+    assert [row[0] for row in leaderboard([easy, every]).rows] == ["every", "easy"]
+    assert "ranked by phi" in leaderboard([easy, every]).title
+    assert "ranked by D" in leaderboard([easy, every], "depth").title
 
 
 def test_worst_images_first_one_of_a_sample():

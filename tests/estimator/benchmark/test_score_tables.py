@@ -1,0 +1,111 @@
+"""Tables of scores: their width, their units, and what machines read of them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+
+import pytest
+from helpers.bench_cases import cases, constant, outcomes, sampler, shifted, silent
+
+from phibench.estimator.benchmark.answer_errors import Rules
+from phibench.estimator.benchmark.compare import compare_records
+from phibench.estimator.benchmark.document import MethodCard
+from phibench.estimator.benchmark.metrics import METRICS
+from phibench.estimator.benchmark.score import score_outcomes
+from phibench.estimator.benchmark.score_tables import HEADS, number, print_comparison, print_scores
+
+RULES = Rules(resamples=199)
+NAMES = ("gaussian_least_squares", "raw_maximum_likelihood", "a_method_of_my_own.py:extract")
+
+
+@pytest.fixture(scope="module")
+def scored():
+    oracles = (sampler(), shifted(0.5), lambda t: constant(t) if t.number % 2 else silent(t))
+    pairs = cases(20)
+    return [
+        score_outcomes(MethodCard.of(name), pairs, outcomes(pairs, oracle), RULES)
+        for name, oracle in zip(NAMES, oracles, strict=True)
+    ]
+
+
+def widths(text):
+    return [len(line) for line in text.splitlines()]
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_tables_fit_eighty_columns_and_wide_ones_have_all(scored, capsys, monkeypatch, count):
+    monkeypatch.setenv("COLUMNS", "80")
+    print_scores(scored[:count], "terminal", "phi", wide=False)
+    narrow = capsys.readouterr().out
+    assert max(widths(narrow)) <= 80
+    assert all(name in narrow for name in NAMES[:count])
+    assert "ranked by phi" in narrow
+    print_scores(scored[:count], "terminal", "depth", wide=True)
+    wide = capsys.readouterr().out
+    assert 80 < max(widths(wide)) <= 210
+    assert "ranked by D" in wide
+    assert "pull" in wide
+
+
+def test_a_comparison_fits_eighty_columns(scored, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    differences = compare_records(scored[0].records, scored[1].records, RULES, "tests")
+    print_comparison(differences, "one (a.json)", "other (b.json)", "terminal", wide=False)
+    assert max(widths(capsys.readouterr().out)) <= 80
+    print_comparison(differences, "one", "other", "json", wide=False)
+    read = json.loads(capsys.readouterr().out)
+    assert (
+        read["rank_phi_rad"]["difference"] == next(d for d in differences if d.name == "rank_phi_rad").difference.value
+    )
+    print_comparison(differences, "one", "other", "csv", wide=False)
+    assert len(list(csv.DictReader(io.StringIO(capsys.readouterr().out)))) == len(differences)
+
+
+def test_csv_and_json_hold_the_doubles_of_the_score(scored, capsys):
+    print_scores(scored, "csv", "phi", wide=False)
+    rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+    print_scores(scored, "json", "phi", wide=False)
+    documents = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [row["method"] for row in rows] == [document["method"]["name"] for document in documents]
+    known = {one.document.method.name: one.document.metrics for one in scored}
+    checked = 0
+    for row, document in zip(rows, documents, strict=True):
+        for name in METRICS:
+            expected = known[row["method"]][name]
+            assert document["metrics"][name]["value"] == expected.value  # jq .metrics.rms_px.value
+            for end in ("value", "low", "high"):
+                text, x = row[name if end == "value" else f"{name}_{end}"], getattr(expected, end)
+                assert text == "" if x is None else float(text) == x
+                checked += 1
+    assert checked == 3 * 3 * len(METRICS)
+
+
+def test_markdown_and_latex_have_the_table(scored, capsys):
+    print_scores(scored, "markdown", "phi", wide=False)
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
+    assert len(lines) == 5
+    assert {line.count("|") for line in lines} == {lines[0].count("|")}
+    assert "| rank phi mrad |" in lines[0]
+    print_scores(scored, "latex", "phi", wide=False)
+    text = capsys.readouterr().out
+    assert r"gaussian\_least\_squares" in text
+    assert r"rank D \%" in text
+    assert text.count(r"\\") == 4
+
+
+def test_one_unit_per_quantity():
+    units = {name: METRICS[name].shown[1] for name in METRICS}
+    assert {unit for name, unit in units.items() if "phi_rad" in name} == {"mrad"}
+    assert {unit for name, unit in units.items() if name.endswith("_rate") or "relative" in name} == {"%"}
+    assert {unit for name, unit in units.items() if name.endswith("_px") and not name.startswith("eff")} == {"px"}
+    assert set(HEADS) <= set(METRICS)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.00001, "1.00e-05"), (0.0123456, "0.0123"), (123.456, "123"), (1234.56, "1235"), (0.0, "0"), (-0.5, "-0.5")],
+)
+def test_three_digits(value, text):
+    assert number(value, 3, significant=True) == text
