@@ -9,6 +9,7 @@ import pytest
 from helpers.sensor_light import room
 
 from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.electrons import speckle_gain
 from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.noise_tiles import TILE_PX, NoiseStream, frame_stream, normal, poisson
 from phibench.render.sensor.settings import sensor
@@ -52,6 +53,14 @@ def test_the_same_names_give_the_same_frame() -> None:
     residual(names(draw=5))
     np.testing.assert_array_equal(residual(names()), first)
     assert correlation(residual(names()), first) > LIMIT  # the measure itself sees dependence
+
+
+def test_the_same_names_give_the_same_flicker() -> None:
+    """Speckle is drawn once per frame, from the frame's own stream."""
+    chosen = sensor("mono-raw", speckle_m=4.0)
+    gains = [speckle_gain(chosen, names(draw=draw)) for draw in range(8)]
+    assert gains == [speckle_gain(chosen, names(draw=draw)) for draw in range(8)]
+    assert len(set(gains)) == 8
 
 
 def test_another_process_draws_the_same(python) -> None:
