@@ -338,8 +338,8 @@ def of_calibration(dataset: Dataset, calibration: Calibration) -> Dataset:
     Raises
     ------
     CalibrationError
-        If a sample believes in another rig than the calibration started from, or the samples have several true rigs
-        and the calibration was made from none of them.
+        If the nominal rig of a sample is not the one that the calibration started from, or the samples have several
+        true rigs and the calibration was made from none of them.
     """
     for sample in dataset:
         if sample.nominal_rig != calibration.nominal:

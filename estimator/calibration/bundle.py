@@ -1,17 +1,16 @@
-"""What outline and upright edges of a true rig look like to who believes another camera and radius.
+"""Bundle: one least-squares fit of a rig to priors, outline, vertical, and spots at known places.
 
-All that is known of a rig in one least-squares fit: priors, the outline, the vertical, and spots at known places.
+The unknowns are the parameters of `rig_parameters.PARAMETERS`, as deviations from the nominal rig, and the world point
+of every calibration spot. The data:
 
-The unknowns are the parameters of `parameters.PARAMETERS`, as deviations from the nominal rig, and the world point of
-every calibration spot. The data:
-
-* the prior of every parameter (what the nominal numbers are worth);
-* the sphere centre from an outline, 3 numbers. It was found with the nominal camera and radius: a camera or radius
-  off by some per cent moves it, and the fit knows by how much (`apparent_centre`);
+* the prior of every parameter: the accuracy of the nominal numbers;
+* the sphere centre from an outline, 3 numbers. It was found with the nominal camera and radius. A camera or radius off
+  by some per cent moves it, and the fit accounts for that (`apparent_centre`);
+* the vertical from upright edges, 2 numbers, with the effect of the principal point (`apparent_vertical`);
 * for every spot, 4 pixel coordinates, its distance D, and its azimuth and height where they were measured.
 
-Which are needed: a spot has 4 pixel coordinates for 3 unknowns, so that one of unknown azimuth and height and exact D
-leaves two conditions on the rig, D itself and the meeting of the rays.
+A spot has 4 pixel coordinates for 3 unknowns. With exact D, and without azimuth and height, it leaves two conditions on
+the rig: D itself and the meeting of the rays.
 """
 
 from __future__ import annotations
@@ -33,58 +32,6 @@ from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.validation import SceneError
-
-_STEP_PX = 2.0
-_EDGES, _POINTS = 12, 8
-_DISTANCE_M = 2.5
-_ELEVATIONS_RAD = (-0.35, 0.5)  # walls of a room
-
-
-def apparent_centre(nominal: Rig, true: Rig) -> Array:
-    """Sphere centre, camera frame, shape (3,), that the true rig's outline gives with the nominal camera and radius.
-
-    The true outline's pixels, as the nominal camera sees them, are a cone: its axis and its opening give the centre.
-    """
-    uv = true.outline_px(90)
-    rays = nominal.camera.rays(uv)
-    x = np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0]  # n / cos a0
-    cosine = 1.0 / np.linalg.norm(x)
-    return np.asarray(x * cosine * nominal.mirror.radius_m / np.sqrt((1.0 - cosine) * (1.0 + cosine)))
-
-
-def apparent_vertical(nominal: Rig, true: Rig) -> Array:
-    """The vertical, x and y in the camera frame, that upright edges all around the true rig give with the nominal one.
-
-    The sphere is where the outline puts it, as `find_vertical` wants it.
-    """
-    pose = replace(nominal.T_camera_sphere, translation_m=as_vector(apparent_centre(nominal, true)))
-    edges = [image_of(true.at(0.0), line).uv_px for line in _lines(true)]
-    return np.asarray(vertical_of(edges, replace(nominal, T_camera_sphere=pose)).up[:2])
-
-
-def vertical_by_principal_point(nominal: Rig) -> Array:
-    """Derivative of the apparent vertical by the true principal point, shape (2, 2), rad/px.
-
-    Tilt, focal length, radius and distance leave the apparent vertical at the true one, a decentre of 1 mm turns it by
-    some 5e-6 rad: only the principal point matters.
-    """
-    columns = []
-    for name in ("cx_px", "cy_px"):
-        both = []
-        for step in (_STEP_PX, -_STEP_PX):
-            camera = replace(nominal.camera, **{name: getattr(nominal.camera, name) + step})
-            both.append(apparent_vertical(nominal, replace(nominal, camera=camera)))
-        columns.append((both[0] - both[1]) / (2.0 * _STEP_PX))
-    return np.stack(columns, axis=-1)
-
-
-def _lines(rig: Rig) -> Array:
-    """Points on upright lines about the sphere, shape (edges, points, 3), world."""
-    azimuth = 2.0 * np.pi * np.arange(_EDGES)[:, None] / _EDGES
-    height = _DISTANCE_M * np.tan(np.linspace(*_ELEVATIONS_RAD, _POINTS)) + 0.0 * azimuth
-    flat = [_DISTANCE_M * f(azimuth) + 0.0 * height for f in (np.cos, np.sin)]
-    return np.asarray(np.stack([*flat, height], axis=-1) + rig.at(0.0).sphere_centre_m)
-
 
 _NEWTON = 3
 _WEAK = 0.9  # of the prior's variance: a direction that keeps so much was not measured
@@ -315,3 +262,57 @@ def with_radius(measured: Measured, nominal_m: float, other_m: float) -> Measure
     """An outline's centre for another radius: R and |s| scale together."""
     factor = other_m / nominal_m
     return replace(measured, value=measured.value * factor, covariance=measured.covariance * factor**2)
+
+
+# -- outline and vertical of a true rig, as the nominal one gives them -------------------------------------------------
+
+_STEP_PX = 2.0
+_EDGES, _POINTS = 12, 8
+_DISTANCE_M = 2.5
+_ELEVATIONS_RAD = (-0.35, 0.5)  # walls of a room
+
+
+def apparent_centre(nominal: Rig, true: Rig) -> Array:
+    """Sphere centre, camera frame, shape (3,), that the true rig's outline gives with the nominal camera and radius.
+
+    The true outline's pixels, as the nominal camera sees them, are a cone: its axis and its opening give the centre.
+    """
+    uv = true.outline_px(90)
+    rays = nominal.camera.rays(uv)
+    x = np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0]  # n / cos a0
+    cosine = 1.0 / np.linalg.norm(x)
+    return np.asarray(x * cosine * nominal.mirror.radius_m / np.sqrt((1.0 - cosine) * (1.0 + cosine)))
+
+
+def apparent_vertical(nominal: Rig, true: Rig) -> Array:
+    """The vertical, x and y in the camera frame, that upright edges all around the true rig give with the nominal one.
+
+    The sphere is where the outline puts it, as `find_vertical` wants it.
+    """
+    pose = replace(nominal.T_camera_sphere, translation_m=as_vector(apparent_centre(nominal, true)))
+    edges = [image_of(true.at(0.0), line).uv_px for line in _lines(true)]
+    return np.asarray(vertical_of(edges, replace(nominal, T_camera_sphere=pose)).up[:2])
+
+
+def vertical_by_principal_point(nominal: Rig) -> Array:
+    """Derivative of the apparent vertical by the true principal point, shape (2, 2), rad/px.
+
+    Tilt, focal length, radius and distance leave the apparent vertical at the true one, a decentre of 1 mm turns it by
+    some 5e-6 rad: only the principal point matters.
+    """
+    columns = []
+    for name in ("cx_px", "cy_px"):
+        both = []
+        for step in (_STEP_PX, -_STEP_PX):
+            camera = replace(nominal.camera, **{name: getattr(nominal.camera, name) + step})
+            both.append(apparent_vertical(nominal, replace(nominal, camera=camera)))
+        columns.append((both[0] - both[1]) / (2.0 * _STEP_PX))
+    return np.stack(columns, axis=-1)
+
+
+def _lines(rig: Rig) -> Array:
+    """Points on upright lines about the sphere, shape (edges, points, 3), world."""
+    azimuth = 2.0 * np.pi * np.arange(_EDGES)[:, None] / _EDGES
+    height = _DISTANCE_M * np.tan(np.linspace(*_ELEVATIONS_RAD, _POINTS)) + 0.0 * azimuth
+    flat = [_DISTANCE_M * f(azimuth) + 0.0 * height for f in (np.cos, np.sin)]
+    return np.asarray(np.stack([*flat, height], axis=-1) + rig.at(0.0).sphere_centre_m)

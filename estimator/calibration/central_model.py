@@ -1,11 +1,11 @@
-"""The central model of an omnidirectional camera, as a comparison: one viewpoint for all rays.
+"""Central model of an omnidirectional camera, for comparison: one viewpoint for all rays.
 
 C. Mei and P. Rives, "Single view point omnidirectional camera calibration from planar grids", ICRA 2007, as in
 OpenCV's omnidir: a point is put on the unit sphere, moved by xi along the axis, projected, distorted by k1 and k2, and
-scaled. (p1 and p2 are left at 0: the rig that it is fitted to is round.) A camera under a sphere has no single
-viewpoint: its rays touch a caustic. How much that costs in depth is what this module is for.
+scaled. p1 and p2 stay 0, because the fitted rig is round. A camera under a sphere has no single viewpoint: its rays
+touch a caustic. This module measures the cost in depth.
 
-Frame: z points from the mirror down to the camera, x and y as in the image. What is above the mirror has z < 0 and is
+Frame: z points from the mirror down to the camera, x and y as in the image. A point above the mirror has z < 0 and is
 imaged far from the centre.
 """
 

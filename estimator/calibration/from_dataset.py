@@ -1,4 +1,4 @@
-"""A calibration from the images of a data set: outlines, and if wanted the spots at their known distances."""
+"""Calibration from the images of a data set: outlines, and on request upright edges and spots at known distances."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def calibrate_dataset(
     Parameters
     ----------
     folder : Path
-        Data set; its rig is what is nominal.
+        Data set; its nominal rig is corrected.
     out : Path
     samples : ids; the first of the data set by default
     preset : str
@@ -176,7 +176,7 @@ def _vertical(images: Sequence[Photograph], outlines: Sequence[Outline], nominal
 
 
 def _one_rig(samples: Sequence[Sample]) -> Rig:
-    """The rig that is nominal in; all samples must have one true rig."""
+    """Nominal rig of the samples; all must have one true rig."""
     names = sorted({sample.row.rig for sample in samples})
     if len(names) != 1:
         raise DatasetError(f"the samples have {len(names)} rigs ({', '.join(names[:4])}, ...): calibrate one at a time")

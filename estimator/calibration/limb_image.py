@@ -1,19 +1,15 @@
-"""An image as planes of linear light, with what the camera's processing did to each pixel.
+"""Images as planes of linear light, and the model of the light across the limb of a polished sphere.
 
-A pixel of a demosaiced image is a weighted sum of mosaic pixels around it. Such a sum is kept as taps, so that a model
-of the light can be sent through the same sum instead of undoing it. Integer (u, v) are pixel centres; RGGB mosaic, red
-at even row and even column. Filters are numbered 0, 1, 2 for R, G, B.
+Planes: a pixel of a demosaiced image is a weighted sum of mosaic pixels around it. The sum is kept as taps. So a model
+of the light goes through the same sum, and nothing has to be inverted. Integer (u, v) are pixel centres; RGGB mosaic,
+red at even row and even column. Filters are numbered 0, 1, 2 for R, G, B.
 
-The light across the limb of a polished sphere, seen by a pinhole.
+Limb: there a ray grazes the sphere and goes on undeviated. Radiance is continuous over the limb except for the steel's
+reflectance, which rises to 1 at grazing incidence. The light across the limb is the room's, a smooth function of the
+angle by which the mirror turns the ray, x the Fresnel reflectance (1 outside), blurred by lens, defocus and pixel.
 
-At the limb a ray grazes the sphere and goes on undeviated: radiance is continuous over the limb but for the steel's
-reflectance, which rises to 1 at grazing incidence. Across the limb the light is therefore the room's, a smooth
-function of the angle by which the mirror turns the ray, x the Fresnel reflectance, 1 outside, blurred by lens, defocus
-and pixel. d is the distance from the limb across it, pixels, outwards positive.
-
-Symbols: s sphere centre in the camera frame, R radius, a angle of a ray from s, a0 = asin(R / |s|) that of the limb.
-
-A vector that was measured.
+Symbols: s sphere centre in the camera frame, R radius, a angle of a ray from s, a0 = asin(R / |s|) that of the limb, d
+distance from the limb across it, pixels, outwards positive.
 """
 
 from __future__ import annotations
@@ -168,6 +164,8 @@ def _merged(taps: Iterable[Tap]) -> Taps:
         sums[key] = sums.get(key, 0.0) + tap.weight
     return tuple(Tap(weight, *key) for key, weight in sums.items())
 
+
+# -- light across the limb ---------------------------------------------------------------------------------------------
 
 _STEP_PX = 0.01
 _REACH_PX = 30.0

@@ -1,16 +1,16 @@
-"""Where the sphere is, from the image of its outline.
+"""Sphere centre from the image of the mirror's outline.
 
-The outline of a sphere under a pinhole is the cone of pixels with the angle a0 = asin(R / |s|) from s. `limb` gives
-the light across it; its level, and its slope along and across the limb, are free in every sector of the outline, and
-so is the blur. What is left is the centre s: Gauss-Newton with robust weights. Sectors whose light the model does not
-describe (lamps, edges of the room) are left out, with their neighbours. The covariance is taken from the scatter of
-the sectors' shifts, with the correlation of neighbours, because the room and JPEG's blocks err over many pixels
-together. What JPEG does to the limb is drawn from the frame itself (`outline_jpeg`).
+The outline of a sphere under a pinhole is the cone of pixels with the angle a0 = asin(R / |s|) from s. `limb_image`
+gives the light across it. Its level, its slopes along and across the limb, and the blur are free in the fit. What is
+left is the centre s: Gauss-Newton with robust weights, sector by sector.
 
-R and |s| scale together: the outline is that of every sphere with the same R / |s|. s is as wrong as R is:
-ds / s = dR / R. The camera's numbers are taken as exact, too; `bundle` puts their errors in.
+* Sectors whose light the model does not describe (lamps, edges of the room) are left out, with their neighbours.
+* The covariance comes from the scatter of the sectors' shifts, with the correlation of neighbours: the room and JPEG's
+  blocks err over many pixels together.
+* The effect of JPEG on the limb is simulated from the frame itself (`outline_jpeg`).
 
-The mean of what several images say of the sphere's centre, or of the vertical.
+R and |s| scale together: the outline is that of every sphere with the same R / |s|, so that ds / s = dR / R. Radius and
+camera count as exact here; `bundle` adds their errors.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ _BLUR_RANGE_PX2 = (0.02, 9.0)
 
 @dataclass(frozen=True)
 class Outline:
-    """What the outline says.
+    """Sphere centre from an outline, with its quality.
 
     Attributes
     ----------
     sphere_in_camera_m : shape (3,), s
     covariance_m2 : shape (3, 3)
-        For radius and camera as nominal.
+        For exact radius and camera.
     arc : float
         Part of the outline that was used.
     contrast : float

@@ -1,11 +1,8 @@
-"""The pixels around an outline: their rays, their distance from the limb, and the light a model puts on them.
+"""Least squares of the outline: pixels and rays around it, sectors with free coefficients, one Gauss-Newton step.
 
-s is the sphere centre in the camera frame, a0 = asin(R / |s|) the angle of the limb from it; d is the distance of a
-pixel from the limb, across it, outwards positive, pixels.
-
-Least squares with free coefficients in every sector of an outline, robust weights, and an honest covariance.
-
-One Gauss-Newton step of the outline's fit: sphere centre and blur.
+s is the sphere centre in the camera frame, a0 = asin(R / |s|) the angle of the limb from it. d is the distance of a
+pixel from the limb, across it, outwards positive, pixels. `step_from` is the entry: it gives the step of s and blur
+with a covariance from the scatter of the sectors.
 """
 
 from __future__ import annotations
@@ -96,12 +93,15 @@ def _ring(camera: Camera, s: Array, radius_m: float, half_px: float) -> tuple[ND
 
 
 def place_of(rays: OutlinePixels, s: Array, radius_m: float) -> Place:
-    """Where pixels are from the limb of a sphere at `s`."""
+    """Place of pixels relative to the limb of a sphere at `s`."""
     return place_of_rays(rays.ray, rays.by_pixel, s, radius_m)
 
 
 def place_of_rays(ray: Array, by_pixel: Array, s: Array, radius_m: float) -> Place:
-    """With n = s / |s|, cos a = ray . n: d a = -n . d ray / sin a, and d a / d s = -(ray - n cos a) / (|s| sin a)."""
+    """Place of rays.
+
+    n = s / |s|, cos a = ray . n: d a = -n . d ray / sin a, and d a / d s = -(ray - n cos a) / (|s| sin a).
+    """
     distance = float(np.linalg.norm(s))
     n, a0 = s / distance, limb_angle_rad(s, radius_m)
     across = ray - (ray @ n)[:, None] * n
@@ -129,6 +129,8 @@ def through_taps(
     light, slope, curvature, turned, squared = sums.T
     return light, slope, curvature, turned, squared
 
+
+# -- sectors -----------------------------------------------------------------------------------------------------------
 
 MIN_PIXELS = 12
 """Pixels that a sector needs to count: four times its coefficients."""
@@ -175,7 +177,7 @@ class SectorFit:
 
 @dataclass(frozen=True)
 class Sectors:
-    """Which sector each pixel is in: `group` for one plane's, `sector` for all planes' together."""
+    """Sector of each pixel: `group` counts each plane's apart, `sector` all planes' together."""
 
     group: NDArray[np.int64]
     sector: NDArray[np.int64]
@@ -315,6 +317,8 @@ def _solve(normal: Array, right: Array) -> Array:
     ridge = np.where(size > 0.0, 1e-10 * size, 1.0) * np.eye(normal.shape[-1])
     return np.asarray(np.linalg.solve(normal + ridge, right))
 
+
+# -- one step ----------------------------------------------------------------------------------------------------------
 
 _MIN_SLACK = 0.5
 

@@ -1,9 +1,9 @@
-"""What JPEG does to an outline, from the image itself: the fitted light goes through noise and JPEG again.
+"""Effect of JPEG on an outline, from the image itself: the fitted light goes through noise and JPEG again.
 
-JPEG cuts away the limb's fine waves. The limb becomes wider and moves, by an amount that depends on the quality, on
-how the limb lies in the blocks and on the noise. No table has it; but the fit's own model, known exactly, can be sent
-through the camera's noise and the same compression, in the same blocks, and the fit then errs by about the same.
-Luma blocks are independent of each other: only the units that the pixels lie in are compressed.
+JPEG removes the limb's fine waves. The limb becomes wider and moves, by an amount that depends on the quality, on the
+limb's place in the blocks, and on the noise. The fit's own model is known exactly. It goes through the camera's noise
+and the same compression, in the same blocks; the fit then errs by about the same. Luma blocks are independent of each
+other, so that only the units around the outline are compressed.
 """
 
 from __future__ import annotations

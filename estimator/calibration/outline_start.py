@@ -1,7 +1,7 @@
-"""A first circle of the mirror in an image, from scratch: edges, Hough's transform, RANSAC, and the plain fits.
+"""First circle of the mirror in an image: edges, Hough's transform, RANSAC, and the plain fits.
 
 The plain fits are biased: the steepest place of the light is not the limb, because light falls inside it and not
-outside. They are where the fit of the light across the limb starts, and what it is compared with.
+outside. They are the start of the fit of the light across the limb, and a comparison for it.
 """
 
 from __future__ import annotations

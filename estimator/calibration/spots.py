@@ -1,6 +1,6 @@
-"""Calibration spots from camera frames: pixels by a built-in method, distance, height and azimuth as if measured.
+"""Calibration spots from camera frames: pixels by a built-in method; distance, height and azimuth as if measured.
 
-What is measured is the truth plus an error drawn from the sample's own stream: the stated sigma is the real one.
+A "measured" place is the truth plus an error drawn from the sample's own stream. The stated sigma is the real one.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MAX_SIGMA = 1e3
 
 @dataclass(frozen=True)
 class Ruler:
-    """How well the place of a calibration spot is measured, one standard deviation each.
+    """Precision with which the place of a calibration spot is measured, one standard deviation each.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def measured_spot(
 
 
 def _read(sample: Sample, what: str, value: float, sigma: float) -> float:
-    """What a ruler reads; 0 where it is not used."""
+    """Reading of a ruler; 0 where it is not used."""
     if not math.isfinite(sigma):
         return 0.0
     return float(value + sigma * generator(*sample.stream_names, "calibration", what).standard_normal())

@@ -132,7 +132,7 @@ def write_overlay(
 
 
 def _level(value: float, *limits: float) -> int:
-    """How many limits a value is above."""
+    """Number of limits that a value is above."""
     return sum(bool(value > limit) for limit in limits)
 
 

@@ -1,19 +1,17 @@
-"""Long, nearly radial edges in the mirror, as sub-pixel points.
+"""Vertical of the world in the camera frame, from upright edges of the room in the mirror.
 
-The image is unwrapped about the middle of the outline: columns are azimuth, half a pixel at the middle radius, rows
-radius, one pixel. There a vertical edge of the room is an upright line. Canny's edges and a probabilistic Hough
-transform find it; its points are then taken anew, at every radius, where the gradient across the edge is largest.
+1. Edges. The image is unwrapped about the middle of the outline: columns are azimuth, half a pixel at the middle
+   radius, rows radius, one pixel. A vertical edge of the room is an upright line there. Canny's edges and a
+   probabilistic Hough transform find it. Its points are then taken anew, at every radius, where the gradient across the
+   edge is largest.
+2. Vertical. The paper's check of the alignment (section 5), that all vertical edges go through the image's centre,
+   becomes a measurement. Every pixel on an edge has a reflected ray (o, r), and o differs from ray to ray. The rays are
+   taken to the edge's distance from the vertical n. If n is right, the points' place across the edge does not change
+   with height. An n that is wrong by the tilt t gives the edge at azimuth a the slope t . (-sin a, cos a).
 
-The world's vertical in the camera frame, from vertical edges of the room in the mirror.
-
-The paper's own check of the alignment is that all vertical edges go through the image's centre (section 5). Here the
-check becomes a measurement. Every pixel on an edge's image has a reflected ray (o, r): a sphere has no single
-viewpoint, so that o differs from ray to ray. The rays are taken to the edge's distance from the vertical n, and there
-the points' place across the edge is a straight line of their height: if n is right, it does not change with height.
-An n that is wrong by the tilt t gives the edge at azimuth a the slope t . (-sin a, cos a), so that edges of two
-azimuths give n, and more of them say how well. The distance hardly matters, since o and r lie nearly in one vertical
-plane; it is taken as 1 / 0.35 m, and what other distances would change is in the edge's variance. Frames: everything
-in the camera frame.
+So edges of two azimuths give n, and more of them its error. The distance hardly matters, since o and r lie nearly in
+one vertical plane. It is taken as 1 / 0.35 m; the effect of other distances is in the edge's variance. Frames:
+everything in the camera frame.
 """
 
 from __future__ import annotations
@@ -130,7 +128,7 @@ def _segments(polar: Unwrapped, least: float) -> list[tuple[tuple[int, int], tup
 
 
 def _is_block_border(uv_px: Array) -> bool:
-    """Whether an edge runs along the border of JPEG's blocks, pixels 7.5 mod 8: such an edge may be JPEG's own."""
+    """Tell an edge along the border of JPEG's blocks, pixels 7.5 mod 8: it may be JPEG's own."""
     off = np.abs((uv_px - 7.5 + 4.0) % 8.0 - 4.0)
     return bool(np.any((np.ptp(uv_px, axis=0) < 2.5) & (np.median(off, axis=0) < 1.0)))
 
@@ -172,6 +170,8 @@ def _steepest(across: Array, row: Rows, near: Array, reach_px: float) -> tuple[A
     return column, b
 
 
+# -- vertical ----------------------------------------------------------------------------------------------------------
+
 MIN_EDGES = 3
 MAX_TILT_RAD = 0.05
 """How far the vertical may be from the nominal one; farther ones are other lines of the room."""
@@ -185,7 +185,7 @@ _ROUNDS = 12
 
 @dataclass(frozen=True)
 class Vertical:
-    """The vertical that edges give.
+    """Vertical from edges.
 
     Attributes
     ----------
@@ -215,7 +215,7 @@ def find_vertical(
     image : array
         See `limb_image.planes_of`.
     rig : Rig
-        Camera as nominal and the sphere where its outline is (`Outline.rig`): a sphere that is 4 um off across the
+        Nominal camera, and the sphere where its outline is (`Outline.rig`): a sphere that is 4 um off across the
         axis turns the vertical by 0.008 degrees.
     card : SensorCard, optional
         Of the image's preset; none for a layer.

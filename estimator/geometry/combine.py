@@ -1,8 +1,8 @@
 """Depth from a position and its covariance in each image, by generalised least squares under the epipolar constraint.
 
-Four coordinates, three unknowns (u and v of the down image, 1 / D): one degree of freedom is left, whose chi^2 says
-whether the two positions can belong to one point. `triangulate.depth_exact` takes the midpoint of the rays instead, in
-which the four coordinates have the weights of the geometry, not those of their errors.
+Four coordinates stand against three unknowns: u and v of the down image, and 1 / D. The chi^2 of the one degree of
+freedom tests for one common point. `triangulate.depth_exact` takes the midpoint of the rays instead, where geometry
+weighs the coordinates, not their errors.
 """
 
 from __future__ import annotations

@@ -1,16 +1,14 @@
-"""Depth from two rays that need not meet, with everything that is uncertain, and a test whether they should meet.
+"""Depth from two rays that need not meet, by weighted least squares, with a test for one common point.
 
 Ray k (1 down, 2 up): X = P_k + t_k r_k, world frame. Pixels and rig parameters together, z, have a covariance C. The
 two rays of the true z meet: the gap e(z), the signed length of their common perpendicular, is 0. The least-squares
 solution moves z onto e = 0 by as little as C allows (condition equations; E. M. Mikhail, Observations and Least
 Squares, 1976, ch. 9):
 
-    z' = z - C e_z^T (e + e_z (z0 - z)) / (e_z C e_z^T),    chi^2 = e^2 / (e_z C e_z^T), one degree of freedom,
+    z' = z - C e_z^T (e + e_z (z0 - z)) / (e_z C e_z^T),    chi^2 = e^2 / (e_z C e_z^T), one degree of freedom.
 
-which is the weighted least-squares point in pixels, calibration included. D is then that of the meeting rays.
-Everything is vectorised over leading axes that broadcast together.
-
-D of two positions through the nominal rig, with its predicted error: of the pixels, and of a calibration.
+This is the weighted least-squares point in pixels, calibration included. D is that of the meeting rays. Leading axes of
+all arguments broadcast together.
 """
 
 from __future__ import annotations
@@ -133,58 +131,6 @@ def depth_general(
     )
 
 
-def _joint(down_px2: Array, up_px2: Array, rig: Array, stroke_sigma_m: Array, lead: tuple[int, ...]) -> Array:
-    """Block-diagonal covariance (..., n, n) of z."""
-    p = len(rig)
-    C = np.zeros((*lead, p + 5, p + 5))
-    for start, block in ((0, down_px2), (2, up_px2), (4, rig)):
-        block = np.asarray(block, float)
-        stop = start + block.shape[-1]
-        C[..., start:stop, start:stop] = block
-    C[..., -1, -1] = stroke_sigma_m**2
-    return C
-
-
-def _part(g: Array, C: Array, part: slice) -> Array:
-    return np.asarray(np.einsum("...i,...ij,...j->...", g[..., part], C[..., part, part], g[..., part]))
-
-
-def _meet(rig: Rig, h: Array, z: Array) -> Meeting:
-    """Meeting for pixels z[:4]; a parameter that is not 0 enters by its gradient, see `_rig_gradients`."""
-    offsets = z[..., 4:]
-    base = meeting(rig, h, z[..., :2], z[..., 2:4])
-    if not np.any(offsets):
-        return base
-    e_p, D_p, X_p = _rig_gradients(rig, h, z)
-    return Meeting(
-        base.depth_m + np.sum(D_p * offsets, axis=-1),
-        base.gap_m + np.sum(e_p * offsets, axis=-1),
-        base.point_world_m + np.einsum("...pi,...p->...i", X_p, offsets),
-        base.status,
-    )
-
-
-def _gradients(rig: Rig, h: Array, z: Array) -> tuple[Array, Array]:
-    """Derivatives of gap and depth by z, shape (..., n) each."""
-    e_y, D_y = meeting_gradients(rig, h, z[..., :2], z[..., 2:4])
-    e_p, D_p, _ = _rig_gradients(rig, h, z)
-    return np.concatenate([e_y, e_p], axis=-1), np.concatenate([D_y, D_p], axis=-1)
-
-
-def _rig_gradients(rig: Rig, h: Array, z: Array) -> tuple[Array, Array, Array]:
-    """Derivatives of gap, D and point by the parameters and this pair's stroke, by central differences."""
-    slopes: dict[str, list[Array]] = {"gap_m": [], "depth_m": [], "point_world_m": []}
-    for i, size in enumerate(steps()):
-        values = np.zeros(len(PARAMETERS))
-        values[i] = size
-        plus, minus = (meeting(changed(rig, v), stroke_of(h, v), z[..., :2], z[..., 2:4]) for v in (values, -values))
-        for name, found in slopes.items():
-            found.append((getattr(plus, name) - getattr(minus, name)) / (2.0 * size))
-    own = PARAMETERS.index("stroke_offset_m")
-    gap, depth, point = (found + [found[own]] for found in slopes.values())
-    return np.stack(gap, axis=-1), np.stack(depth, axis=-1), np.stack(point, axis=-2)
-
-
 _ROUND_PX2 = 0.1**2
 
 
@@ -235,3 +181,55 @@ def _calibration_sigma_m(rig: Rig, stroke_m: Array, uv_px: tuple[Array, Array], 
     round_px2 = np.broadcast_to(_ROUND_PX2 * np.eye(2), (len(uv_px[0]), 2, 2))
     at = depth_general(rig, stroke_m, *uv_px, round_px2, round_px2, calibration)
     return np.hypot(at.sigma_calibration_m, at.sigma_stroke_m)
+
+
+def _joint(down_px2: Array, up_px2: Array, rig: Array, stroke_sigma_m: Array, lead: tuple[int, ...]) -> Array:
+    """Block-diagonal covariance (..., n, n) of z."""
+    p = len(rig)
+    C = np.zeros((*lead, p + 5, p + 5))
+    for start, block in ((0, down_px2), (2, up_px2), (4, rig)):
+        block = np.asarray(block, float)
+        stop = start + block.shape[-1]
+        C[..., start:stop, start:stop] = block
+    C[..., -1, -1] = stroke_sigma_m**2
+    return C
+
+
+def _part(g: Array, C: Array, part: slice) -> Array:
+    return np.asarray(np.einsum("...i,...ij,...j->...", g[..., part], C[..., part, part], g[..., part]))
+
+
+def _meet(rig: Rig, h: Array, z: Array) -> Meeting:
+    """Meeting for pixels z[:4]; a parameter that is not 0 enters by its gradient, see `_rig_gradients`."""
+    offsets = z[..., 4:]
+    base = meeting(rig, h, z[..., :2], z[..., 2:4])
+    if not np.any(offsets):
+        return base
+    e_p, D_p, X_p = _rig_gradients(rig, h, z)
+    return Meeting(
+        base.depth_m + np.sum(D_p * offsets, axis=-1),
+        base.gap_m + np.sum(e_p * offsets, axis=-1),
+        base.point_world_m + np.einsum("...pi,...p->...i", X_p, offsets),
+        base.status,
+    )
+
+
+def _gradients(rig: Rig, h: Array, z: Array) -> tuple[Array, Array]:
+    """Derivatives of gap and depth by z, shape (..., n) each."""
+    e_y, D_y = meeting_gradients(rig, h, z[..., :2], z[..., 2:4])
+    e_p, D_p, _ = _rig_gradients(rig, h, z)
+    return np.concatenate([e_y, e_p], axis=-1), np.concatenate([D_y, D_p], axis=-1)
+
+
+def _rig_gradients(rig: Rig, h: Array, z: Array) -> tuple[Array, Array, Array]:
+    """Derivatives of gap, D and point by the parameters and this pair's stroke, by central differences."""
+    slopes: dict[str, list[Array]] = {"gap_m": [], "depth_m": [], "point_world_m": []}
+    for i, size in enumerate(steps()):
+        values = np.zeros(len(PARAMETERS))
+        values[i] = size
+        plus, minus = (meeting(changed(rig, v), stroke_of(h, v), z[..., :2], z[..., 2:4]) for v in (values, -values))
+        for name, found in slopes.items():
+            found.append((getattr(plus, name) - getattr(minus, name)) / (2.0 * size))
+    own = PARAMETERS.index("stroke_offset_m")
+    gap, depth, point = (found + [found[own]] for found in slopes.values())
+    return np.stack(gap, axis=-1), np.stack(depth, axis=-1), np.stack(point, axis=-2)

@@ -1,14 +1,12 @@
-"""Where the mirror shows a point of the world: the inverse of `reflection.reflect`.
+"""Image of a world point in the mirror: the inverse of `reflection.reflect`; and the epipolar line of a pixel.
 
-The pixel whose reflected ray goes through the point, by Newton's method on the ray's miss
-e = w - (w . r) r, w = X - P, with the analytic derivatives of `reflect_jacobian`.
+The pixel is the one whose reflected ray P + t r goes through the point X. Newton's method brings the ray's miss
+e = w - (w . r) r, w = X - P, to 0, with the analytic derivatives of `reflect_jacobian`.
 
-Where a point seen in the down image at distance D is seen in the up image, with derivatives: the epipolar line.
+Epipolar line: the down pixel's ray is X(t) = P + t r. t follows from |X_h - S_h| = D, h the horizontal part and S the
+sphere centre at the down position. `up_image` gives the pixel of X in the up image, with derivatives.
 
-The down pixel's ray is X(t) = P + t r; t follows from |X_h - S_h| = D, h the horizontal part and S the sphere centre at
-the down position; X is seen in the up image at `mirror_image.image_of`.
-
-Whether solids stand between two points: segments against boxes, by clipping. The estimator's own mathematics.
+Line of sight: segments against boxes, by clipping (`blocked`).
 """
 
 from __future__ import annotations
@@ -107,6 +105,9 @@ def _unit(vector: Array) -> Array:
     return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
 
 
+# -- epipolar line -----------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class UpImage:
     """Pixels of the up image, shape (...).
@@ -177,11 +178,13 @@ def _tangents(radial: Array, r: Array, t: Array, D: Array, dP: Array, dr: Array)
     return np.concatenate([pixel, (r * dt_q[..., None])[..., None]], axis=-1)
 
 
+# -- line of sight -----------------------------------------------------------------------------------------------------
+
 _END_M = 1e-6  # a segment may touch the surface that it ends on
 
 
 def blocked(solid: Cuboid, start_m: Array, end_m: Array) -> BoolArray:
-    """Whether segments, shape (..., 3), pass through a box, shape (...).
+    """Segments, shape (..., 3), that pass through a box: bool, shape (...).
 
     The part of the segment inside each pair of planes is an interval of its parameter; the box is hit where the three
     have more than a point in common.

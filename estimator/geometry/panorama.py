@@ -1,19 +1,11 @@
-"""A view unrolled: columns are azimuths and rows elevations of the rays that leave the mirror.
+"""Panorama: a view unrolled into azimuth (columns) and elevation (rows) of the rays that leave the mirror.
 
-A sphere has no single viewpoint: rays of one azimuth and elevation leave it from a place that only they have. A grid
-point therefore stands for a direction (a scene far away, exactly one pixel), or for a point at a stated distance from
-the sphere centre. Elevation is spaced evenly, in steps of the columns' angle: squares at the horizon.
+A sphere has no single viewpoint: every ray leaves it from another place. So a grid point stands for a direction (a
+scene far away, exactly one pixel), or for a point at a stated distance from the sphere centre. Elevation is spaced
+evenly, in steps of the columns' angle: squares at the horizon.
 
-Vertical edges of a room in a panorama: where they are in each row, and how far they lean.
-
-The same panorama without any model of the mirror: directions from a data set's truth layer, inverted by search.
-
-The truth has, for every pixel, the outward normal and the world point that it sees. The ray leaves at
-P = S + R n and goes to X, so that its direction is (X - P) / |X - P|. Of every grid point the pixel with the nearest
-direction is looked up; the step to the place between pixels comes from differences over its 3 x 3 neighbours. A mirror
-with an error of form is taken for its sphere here: at a peak of 50 um P is off by as much, and the place by 0.014 px.
-
-Panorama of a sample's view as a picture.
+Two ways lead to the pixels of a grid. `pixels_by_model` uses the closed form. `pixels_by_truth` uses no model of the
+mirror: it searches the directions of a data set's truth layer. Upright edges of the room measure the panorama.
 """
 
 from __future__ import annotations
@@ -118,7 +110,7 @@ def pixels_by_model(view: View, grid: Grid, distance_m: float = FAR_M) -> Array:
     Parameters
     ----------
     view : View
-        Of the rig that is nominal.
+        Of the nominal rig.
     grid : Grid
     distance_m : float
         Of the scene from the sphere centre.
@@ -155,6 +147,8 @@ def unrolled(image: NDArray[np.generic], uv_px: Array) -> Array:
     result = np.where(seen[..., None], np.stack(each, axis=-1), np.nan)
     return result[..., 0] if planes.ndim == 2 else result
 
+
+# -- upright edges of a room -------------------------------------------------------------------------------------------
 
 _HALF_WIDTH_PX = 6
 _LEVEL_PX = 2  # columns at each end of a row's window that give the levels beside the edge
@@ -287,6 +281,13 @@ def _line(rows: Array, places: Array) -> tuple[float, float, float]:
     return slope * height, scatter / float(np.sqrt(np.sum(x * x))) * height, scatter
 
 
+# -- pixels by the truth layer -----------------------------------------------------------------------------------------
+#
+# The truth has, for every pixel, the outward normal and the world point that it sees. The ray leaves at P = S + R n and
+# goes to X: its direction is (X - P) / |X - P|. For every grid point the pixel with the nearest direction is looked up.
+# Differences over its 3 x 3 neighbours give the step to the place between pixels. A mirror with an error of form counts
+# as its sphere here: at a peak of 50 um P is off by as much, and the place by 0.014 px.
+
 _ROUNDS = 4
 _REACH_PX = 1.5  # the place must be within reach of the nearest pixel's neighbours
 
@@ -339,6 +340,8 @@ def _steps(r: Array, v: NDArray[np.intp], u: NDArray[np.intp], wanted: Array) ->
     return step
 
 
+# -- panorama of a sample ----------------------------------------------------------------------------------------------
+
 LAYERS = "layers"
 COLOUR_PRESETS = (LAYERS, "srgb8", "mjpeg")
 By = Literal["model", "truth"]
@@ -385,7 +388,7 @@ def places(sample: Sample, position: str, grid: Grid, by: By = "model", distance
 
 
 def nominal_view(sample: Sample, position: str) -> View:
-    """View of the rig that is nominal."""
+    """View of the nominal rig."""
     return sample.nominal_rig.at(0.0 if position == "down" else sample.row.nominal_stroke_m)
 
 

@@ -1,10 +1,8 @@
-"""The paper's depth from two angles, its approximation, and its predicted errors.
+"""Depth of the paper from two angles, its approximation, its predicted errors, and its published results.
 
-"Depth estimation for mobile robot using single omnidirectional camera system", section 3 and 4. Symbols are the
-paper's: phi_1 (down) and phi_2 (up), h stroke, R mirror radius, D depth, lambda, epsilon; see docs/paper.md.
-Everything is vectorised over leading axes that broadcast together.
-
-The paper's published results, Tables 1 to 4, from `published.csv`.
+"Depth estimation for mobile robot using single omnidirectional camera system", sections 3 and 4. Symbols are the
+paper's: phi_1 (down) and phi_2 (up), h stroke, R mirror radius, D depth, lambda, epsilon; see docs/paper.md. Leading
+axes of all arguments broadcast together. `published.csv` has Tables 1 to 4.
 """
 
 from __future__ import annotations
@@ -168,6 +166,8 @@ def _depth_and_hs(
     phi1, phi2, h = _inputs(phi1_rad, phi2_rad, stroke_m)
     return np.asarray(depth_m, float), h * np.sin(2.0 * phi1) * np.sin(2.0 * phi2)
 
+
+# -- published results -------------------------------------------------------------------------------------------------
 
 PUBLISHED_CSV = Path(__file__).with_name("published.csv")
 _SAME_M = 1e-6

@@ -1,4 +1,4 @@
-"""Pixel -> phi, in the three senses that the paper does not tell apart, and as the paper's user would take it.
+"""Angles phi of pixels, in the three senses that the paper does not tell apart, and in that of a user of the paper.
 
 * ``ray``: theta / 2, theta between the ray that leaves the mirror and the downward vertical (eqs. 1 and 2 are exact);
 * ``normal``: between the outward normal at the reflection point and the downward vertical;

@@ -1,14 +1,10 @@
-"""Where a ray meets a mirror with a form error, by Newton's method on the level function of `scenes.form`.
+"""Camera rays reflected at the mirror: in closed form for a sphere, by Newton's method for one with a form error.
 
-Estimators believe in a perfect sphere; this is for the true rig, whose errors `sensitivities` predicts.
-
-Camera rays reflected at the sphere, in closed form; at one with a form error, by Newton's method.
+Estimators assume a perfect sphere. The form error serves the true rig, whose errors `sensitivities` predicts.
 
 Symbols: d unit camera ray, s sphere centre in the camera frame, P reflection point relative to the sphere centre,
 n outward normal, i angle of incidence, r unit ray that leaves the mirror. Frames, poses and pixels as in
 `phibench.scenes.frames`. Every kernel takes leading axes and never raises for one bad ray: NaN and a `Status`.
-
-How the reflected ray of a pixel moves at a point of the world when the pixel moves.
 """
 
 from __future__ import annotations
@@ -22,57 +18,6 @@ from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
 from phibench.scenes.mirror import Form, Level, level
 from phibench.scenes.rig import View
-
-_NEAREST_STEPS = 4  # Newton's, from the foot of the perpendicular: the form's slope, 1e-3, falls to its square in each
-_STEPS = 12
-_CLOSE_M = 1e-12  # the step after such a one is below rounding
-
-
-def first_meeting(origin_m: Array, directions: Array, radius_m: float, form: Form) -> Array:
-    """Distance to the mirror along unit directions (..., 3) from one point (3,), shape (...), sphere's frame.
-
-    NaN where the mirror is missed. The first place is looked for before that where g is least, which tells hit from
-    miss: a sphere of the radius that the mirror has there gives the start.
-    """
-    foot = -np.sum(origin_m * directions, axis=-1)
-    off_centre = np.linalg.norm(origin_m + foot[..., None] * directions, axis=-1)
-    central = off_centre < 0.5 * radius_m  # such a ray hits, and near the centre g has no use for Newton's method
-    with np.errstate(invalid="ignore", divide="ignore"):
-        t = foot
-        for _ in range(_NEAREST_STEPS):
-            _, slope, curvature = _along(origin_m, directions, t, radius_m, form)
-            t = np.where(central, foot, t - slope / curvature)
-        g, _, _ = _along(origin_m, directions, t, radius_m, form)
-        rho = np.linalg.norm(origin_m + t[..., None] * directions, axis=-1)
-        t = t - np.sqrt(np.where(central, radius_m**2 - off_centre**2, -g * (2.0 * rho - g)))  # (rho - g)^2 - rho^2
-        for _ in range(_STEPS):
-            g, slope, _ = _along(origin_m, directions, t, radius_m, form)
-            step = g / slope
-            t = t - step
-            if not np.any(np.abs(step) > _CLOSE_M):
-                break
-    return t
-
-
-def unit_normal(surface: Level) -> Array:
-    """Outward unit normals, shape (..., 3)."""
-    return np.asarray(surface.gradient / np.linalg.norm(surface.gradient, axis=-1, keepdims=True))
-
-
-def normal_slope(surface: Level) -> Array:
-    """Derivative of the unit normal by the place, shape (..., 3, 3), 1/m: (I - n n^T) Hess g / |grad g|."""
-    n = unit_normal(surface)
-    length = np.linalg.norm(surface.gradient, axis=-1)[..., None, None]
-    return np.asarray((np.eye(3) - n[..., :, None] * n[..., None, :]) @ surface.hessian_per_m / length)
-
-
-def _along(origin_m: Array, directions: Array, t: Array, radius_m: float, form: Form) -> tuple[Array, Array, Array]:
-    """g and its first two derivatives along the ray, shape (...)."""
-    at = level(origin_m + t[..., None] * directions, radius_m, form)
-    slope = np.sum(at.gradient * directions, axis=-1)
-    curvature = np.einsum("...i,...ij,...j->...", directions, at.hessian_per_m, directions)
-    return at.value_m, slope, curvature
-
 
 # cos i = 1e-3 is 2e-4 px inside the outline of the default rig; the error of theta per pixel grows as 1 / cos i.
 GRAZING_COSINE = 1e-3
@@ -238,6 +183,9 @@ def _dot(a: Array, b: Array) -> Array:
     return np.sum(a * b, axis=-2, keepdims=True)
 
 
+# -- motion of a ray with its pixel ------------------------------------------------------------------------------------
+
+
 def ray_slope(view: View, uv_px: Array, points_world_m: Array) -> Array:
     """Motion across the ray, at the point, per pixel: shape (..., 2, 2), metres per pixel, NaN where there is no ray.
 
@@ -254,3 +202,56 @@ def ray_basis(directions: Array) -> Array:
     first = np.cross(directions, least)
     first = first / np.linalg.norm(first, axis=-1, keepdims=True)
     return np.stack([first, np.cross(directions, first)], axis=-2)
+
+
+# -- hit on a mirror with a form error ---------------------------------------------------------------------------------
+
+_NEAREST_STEPS = 4  # Newton's, from the foot of the perpendicular: the form's slope, 1e-3, falls to its square in each
+_STEPS = 12
+_CLOSE_M = 1e-12  # the step after such a one is below rounding
+
+
+def first_meeting(origin_m: Array, directions: Array, radius_m: float, form: Form) -> Array:
+    """Distance to the mirror along unit directions (..., 3) from one point (3,), shape (...), sphere's frame.
+
+    NaN where the mirror is missed. The first place is looked for before that where g is least, which tells hit from
+    miss: a sphere of the radius that the mirror has there gives the start.
+    """
+    foot = -np.sum(origin_m * directions, axis=-1)
+    off_centre = np.linalg.norm(origin_m + foot[..., None] * directions, axis=-1)
+    central = off_centre < 0.5 * radius_m  # such a ray hits, and near the centre g has no use for Newton's method
+    with np.errstate(invalid="ignore", divide="ignore"):
+        t = foot
+        for _ in range(_NEAREST_STEPS):
+            _, slope, curvature = _along(origin_m, directions, t, radius_m, form)
+            t = np.where(central, foot, t - slope / curvature)
+        g, _, _ = _along(origin_m, directions, t, radius_m, form)
+        rho = np.linalg.norm(origin_m + t[..., None] * directions, axis=-1)
+        t = t - np.sqrt(np.where(central, radius_m**2 - off_centre**2, -g * (2.0 * rho - g)))  # (rho - g)^2 - rho^2
+        for _ in range(_STEPS):
+            g, slope, _ = _along(origin_m, directions, t, radius_m, form)
+            step = g / slope
+            t = t - step
+            if not np.any(np.abs(step) > _CLOSE_M):
+                break
+    return t
+
+
+def unit_normal(surface: Level) -> Array:
+    """Outward unit normals, shape (..., 3)."""
+    return np.asarray(surface.gradient / np.linalg.norm(surface.gradient, axis=-1, keepdims=True))
+
+
+def normal_slope(surface: Level) -> Array:
+    """Derivative of the unit normal by the place, shape (..., 3, 3), 1/m: (I - n n^T) Hess g / |grad g|."""
+    n = unit_normal(surface)
+    length = np.linalg.norm(surface.gradient, axis=-1)[..., None, None]
+    return np.asarray((np.eye(3) - n[..., :, None] * n[..., None, :]) @ surface.hessian_per_m / length)
+
+
+def _along(origin_m: Array, directions: Array, t: Array, radius_m: float, form: Form) -> tuple[Array, Array, Array]:
+    """g and its first two derivatives along the ray, shape (...)."""
+    at = level(origin_m + t[..., None] * directions, radius_m, form)
+    slope = np.sum(at.gradient * directions, axis=-1)
+    curvature = np.einsum("...i,...ij,...j->...", directions, at.hessian_per_m, directions)
+    return at.value_m, slope, curvature

@@ -1,9 +1,9 @@
-"""dD/dp: what a misalignment of the true rig does to an estimate of D made with the nominal rig.
+"""Derivatives dD/dp: effect of a misalignment of the true rig on an estimate of D made with the nominal rig.
 
-An estimate depends on the true rig through the pixels alone: dD/dp = dD/d(u1, v1, u2, v2) . d(u1, v1, u2, v2)/dp.
-The first factor is the estimator's own gradient at the nominal rig; the second follows from the reflected ray through
-the spot by implicit differentiation, at the true rig. p are the parameters of `Misalignment`, of a further misalignment
-of the true rig: `true_rig.perturbed(...)`. The plane of focus and roughness move no chief ray and are left out.
+An estimate depends on the true rig through the pixels alone: dD/dp = dD/d(u1, v1, u2, v2) . d(u1, v1, u2, v2)/dp. The
+first factor is the estimator's own gradient at the nominal rig. The second follows from the reflected ray through the
+spot by implicit differentiation, at the true rig. p are the parameters of `Misalignment`, of a further misalignment of
+the true rig: `true_rig.perturbed(...)`. The plane of focus and roughness move no chief ray and are left out.
 """
 
 from __future__ import annotations

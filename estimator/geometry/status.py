@@ -1,6 +1,6 @@
-"""What can be wrong with one ray, one angle or one depth.
+"""Status codes of array kernels, and depths with their standard deviation.
 
-A depth with its uncertainty.
+A kernel never raises for one bad element: it gives NaN and the first `Status` that is not OK.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
-"""What single frames of experiments give at best: the bound of D from the pixels alone, and what would improve it.
+"""Bounds of D for single frames of experiments, and the error budget: predicted against measured errors.
 
 The bound counts PRNU and DSNU as noise. They are a camera's own, the same in all of its frames, so that a mean of n
-frames keeps their part; the rest (photons, read noise, rounding) falls as 1 / n.
-
-Error budget of experiments: predicted against measured errors of D, and both against the bound.
+frames keeps their part. The rest (photons, read noise, rounding) falls as 1 / n.
 """
 
 from __future__ import annotations
@@ -149,6 +147,9 @@ def _bound_px2(sample: CachedSample, source: FrameSource, position: str, pattern
     return _NO_MATRIX if found is None else found
 
 
+# -- error budget ------------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class Budget:
     """Predicted against measured errors of D over some rows; every estimate has a 95 % interval over samples.
@@ -170,7 +171,7 @@ class Budget:
     within_95 : Estimate
         Share of errors within the predicted interval.
     nominal : float
-        Rms relative error with the rigs as nominal.
+        Rms relative error with the nominal rigs.
     """
 
     n: int
@@ -221,7 +222,7 @@ def budget_table(rows: pl.DataFrame) -> Table:
     """Budgets per experiment and per distance, of all rows, and of those whose bound is at most 1 % of D."""
     grid = Table(title="Relative errors of D in %; 95 % intervals over samples")
     heads = ("rows", "n", "missing", "measured", "predicted", "bound", "predicted / measured", "measured / bound")
-    for head in (*heads, "within 95 %", "as nominal"):
+    for head in (*heads, "within 95 %", "nominal rig"):
         grid.add_column(head, justify="left" if head == "rows" else "right")
     for name, part in _parts(rows):
         grid.add_row(name, *_cells(budget(part)))

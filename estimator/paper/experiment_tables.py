@@ -1,4 +1,4 @@
-"""Experiments with misaligned rigs: each rig is calibrated from its own frames, then measures, and is judged.
+"""Experiments with misaligned rigs: each is calibrated from its own frames, measures, and is judged.
 
 For every rig of a data set (recipe `paper-misaligned`, or any with experiments and calibration spots):
 
@@ -8,7 +8,7 @@ For every rig of a data set (recipe `paper-misaligned`, or any with experiments 
    such frames, with the calibrated rig;
 3. beside it stands the bound: the pixels' bound and the same calibration, at the true pixels.
 
-One row per sample and draw. `experiment_budget` makes the error budget of it.
+One row per sample and draw. `experiment_bounds` makes the error budget of it.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ COLUMNS: dict[str, str] = {
     "rig": "id of the true rig",
     "draw": "draw of the noise",
     "depth_m": "D",
-    "stroke_m": "stroke as nominal before calibration",
+    "stroke_m": "nominal stroke, before calibration",
     "estimate_m": "D from the frames and the calibrated rig",
     "error_m": "estimate_m - depth_m",
     "relative_error": "error_m / depth_m",
@@ -61,7 +61,7 @@ COLUMNS: dict[str, str] = {
     "chi2": "of the two rays' meeting, one degree of freedom",
     "p_value": "probability of a larger chi2",
     "within_95": "whether the error is within 1.96 sigma_m",
-    "nominal_error": "relative error with the rig as nominal before calibration, same pixels",
+    "nominal_error": "relative error with the nominal rig, before calibration, same pixels",
     "status": "ok, or why there is no estimate",
 }
 
@@ -74,7 +74,7 @@ _SCHEMA = {
 
 @dataclass(frozen=True)
 class Procedure:
-    """How the experiments are made.
+    """Settings of the experiments.
 
     Parameters
     ----------
@@ -202,7 +202,7 @@ def _estimate(pair: Pair, answer: Answer, bundle: Bundle, depth_m: float) -> dic
 
 
 def _answer_fault(answer: Answer) -> str:
-    """Why an answer gives no depth with a standard deviation; empty if it does."""
+    """Reason for which an answer gives no depth with a standard deviation; empty if it gives one."""
     for position in POSITIONS:
         spot = getattr(answer, position)
         if spot.status != OK or spot.uv_px is None:

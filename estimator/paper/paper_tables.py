@@ -1,6 +1,6 @@
-"""Every estimator on every sample of a dataset, and the paper's tables beside ours.
+"""Scores of every estimator on every sample of a data set, and the paper's tables beside ours.
 
-An estimator takes (rig, stroke, pixel down, pixel up) and returns a `DepthEstimate`; the pixels are the true ones
+An estimator takes (rig, stroke, pixel down, pixel up) and returns a `DepthEstimate`. The pixels are the true ones
 ("truth") or those that the centroid finds on the noise-free frames ("frame").
 """
 
@@ -32,7 +32,7 @@ CENTROID_SIGMA_PX = 0.02
 
 
 class Sample(Protocol):
-    """What scoring needs of a sample of `phibench.datasets.read`."""
+    """Part of a sample of `phibench.datasets.read` that scoring needs."""
 
     @property
     def row(self) -> Any:
@@ -40,14 +40,14 @@ class Sample(Protocol):
 
     @property
     def nominal_rig(self) -> Rig:
-        """The rig that an estimator believes, at the down position."""
+        """Nominal rig, at the down position."""
 
     def expected_image(self, position: str, laser: bool = True) -> Array:
         """Image without noise, shape (3, H, W), electrons per second."""
 
 
 class Dataset(Protocol):
-    """What scoring needs of a dataset of `phibench.datasets.read`."""
+    """Part of a data set of `phibench.datasets.read` that scoring needs."""
 
     @property
     def samples(self) -> Sequence[Any]:
@@ -109,7 +109,7 @@ class _Pixels:
 
 @dataclass(frozen=True)
 class _Nominal:
-    """What an estimator is given besides pixels."""
+    """Input of an estimator besides pixels."""
 
     rig: Rig
     stroke_m: float

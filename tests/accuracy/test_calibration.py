@@ -1,4 +1,4 @@
-"""Depth with drawn misalignments: as nominal, after an outline, and after an outline and four spots."""
+"""Depth with drawn misalignments: with the nominal rig, after an outline, and after an outline and four spots."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ DEPTHS = (1.0, 1.8, 2.6, 3.4, 4.2)
 
 
 def errors_of(k: int, names: Sequence[str]) -> np.ndarray:
-    """Relative errors of D of rig k, as nominal and after each calibration, shape (1 + names, depths); exact pixels."""
+    """Relative errors of D of rig k, nominal and after each calibration, shape (1 + names, depths); exact pixels."""
     rng = generator("test", "calibration", k)
     true = changed(NOMINAL, rng.normal(0.0, prior_sigmas(DRAWN)))
     rigs = [NOMINAL, *(DATA[name].calibrated(true, generator("test", "calibration", k, name)) for name in names)]

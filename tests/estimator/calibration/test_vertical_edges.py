@@ -24,7 +24,7 @@ def tilted(x_deg: float, y_deg: float) -> Rig:
 
 
 def upright(rig: Rig) -> Rig:
-    """What is nominal: the same, not tilted."""
+    """The nominal rig: the same, not tilted."""
     level = replace(rig.T_world_camera, rotation=as_matrix(np.eye(3)))
     return replace(rig, T_world_camera=level)
 

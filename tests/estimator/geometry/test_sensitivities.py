@@ -225,8 +225,8 @@ def test_the_error_is_estimate_minus_truth() -> None:
     assert found.truth_gradient[PARAMETERS.index("decentre_x_m")] == -1.0
 
 
-def test_accuracy_what_is_nominal_and_what_is_true_cancel() -> None:
-    """An estimator that believes the truth finds D: dD/d(nominal) + dD/d(true) = d(true D)/dp, whatever the rig.
+def test_accuracy_nominal_and_true_derivatives_cancel() -> None:
+    """An estimator with the true rig finds D: dD/d(nominal) + dD/d(true) = d(true D)/dp, whatever the rig.
 
     `rig_gradient` differentiates by differences, good to 1e-7, with the pixels as they are; here the pixels move.
     """
