@@ -22,14 +22,12 @@ PAGES = sorted(
 HISTORY = {"CHANGELOG.md"}
 # Pages that still have long sentences or lines. Take a page out when it is mended; a new page is held from the start.
 NOT_YET = {
-    "datasets/FORMAT.md",
     "datasets/RECIPE.md",
     "docs/benchmark.md",
     "docs/cluster.md",
     "docs/method.md",
     "docs/scoring.md",
     "docs/sealed.md",
-    "docs/sensor.md",
     "docs/studies.md",
     "docs/studies/baseline.md",
     "docs/studies/cause.md",
