@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from phibench.datasets.read import open_dataset
 from phibench.estimator.cli.main import app
 from phibench.scenes.catalog import default_rig
 
@@ -233,6 +234,23 @@ def test_the_default_rig_is_that_of_the_page():
     for name, value in stated:
         (row,) = [row for row in rows if row.startswith(f"| {name}")]
         assert value in row
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/python.md"])
+def test_the_examples_of_the_page_run(page, tiny_dataset, tmp_path, monkeypatch):
+    """On a small data set in place of `paper`, with one pair to score."""
+    monkeypatch.chdir(tmp_path)
+    first, names = open_dataset(tiny_dataset)[0].sample_id, {}
+    examples = re.findall(r"^```python\n(.*?)^```", read(page), re.M | re.S)
+    assert examples
+    for example in examples:
+        for old, new in (
+            ("table2-d3.180-h0.425", first),
+            ("out/paper", str(tiny_dataset)),
+            (".score(dataset", ".score(dataset[:1]"),
+        ):
+            example = example.replace(old, new)
+        exec(example, names)
 
 
 def test_pages_that_are_excused_exist():
