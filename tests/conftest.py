@@ -31,9 +31,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     wanted, left_out = [], []
     for item in items:
         asked = any(item.nodeid.startswith(name.removeprefix("./")) for name in named)
-        slow = item.get_closest_marker("slow") and not config.getoption("slow")
-        study = item.get_closest_marker("study") and not config.getoption("study")
-        (left_out if (slow or study) and not asked else wanted).append(item)
+        # a test marked study may be marked slow as well: --study runs it
+        mark = next((name for name in ("study", "slow") if item.get_closest_marker(name)), None)
+        (left_out if mark and not config.getoption(mark) and not asked else wanted).append(item)
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = wanted
