@@ -39,8 +39,6 @@ NOT_YET = {
 }
 PRESENT = [page for page in PAGES if page not in HISTORY]
 HELD = [page for page in PRESENT if page not in NOT_YET]
-# Make targets that pages name and that the Makefile gets next.
-COMING = {"mutants"}
 MAX_WORDS = 25
 MAX_COLUMNS = 120
 # Words of other places that no reader of the repository can look up.
@@ -208,7 +206,7 @@ def is_command(name: str, sub: str | None) -> bool:
 def test_make_targets_that_are_named_exist(page):
     targets = set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M))
     named = {m[1] for piece in code_pieces(read(page)) if (m := re.match(r"(?:time )?make ([a-z][\w-]*)", piece))}
-    assert named <= targets | COMING
+    assert named <= targets
 
 
 def test_the_citation_has_the_version_of_the_package():
