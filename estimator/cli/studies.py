@@ -143,6 +143,7 @@ def _command(name: str, sentence: str) -> None:
         settings: Path | None = None,
         data: Path | None = None,
         workers: Whole | None = None,
+        publish: Path | None = None,
     ) -> int:
         """Run a study.
 
@@ -158,11 +159,14 @@ def _command(name: str, sentence: str) -> None:
             Folder of the data sets that it renders or finds there; by default "data" in the folder to write.
         workers
             Processes that render; by default one per core.
+        publish
+            Folder of the pages of the studies (docs/studies): NAME.json there is replaced. Full studies only.
         """
+        from phibench.estimator.studies.findings import findings_table, print_table
         from phibench.estimator.studies.run import FINDINGS, run_study
 
-        result = run_study(name, out, quick, settings, data, workers)
-        print("\n".join(result.findings))
+        result = run_study(name, out, quick, settings, data, workers, publish=publish)
+        print_table(findings_table(result.findings))
         for note in result.notes:
             print(f"note: {note}")
         tables, drawings = len(result.tables), len(result.drawings)

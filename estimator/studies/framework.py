@@ -1,12 +1,8 @@
-"""What a study works on: data sets rendered from recipes, kept between runs and shared between studies.
+"""Frame of the studies: data sets, drawings, the result, and the settings in a TOML file.
 
-Drawings of a study: SVG, or PNG where there are many marks, each with its text alternative.
-
-What a study finds: tables, drawings, and sentences made from the numbers.
-
-What a study is: a question, settings that a TOML file fills, and a function from data sets to a result.
-
-Settings of a study from its TOML file: the top level is the full study, `[quick]` what a reduced one changes.
+A study is a question, settings, and a function from settings and data sets to a result. Data sets are rendered from
+recipes, kept between runs and shared between studies. The top level of `settings.toml` is the full study; its table
+`[quick]` holds what the reduced one changes. Drawings are SVG, or PNG where there are many marks.
 """
 
 from __future__ import annotations
@@ -29,12 +25,13 @@ from phibench.datasets.read import Dataset, open_finished
 from phibench.datasets.recipe.load import find_recipe
 from phibench.estimator.benchmark import report as picture
 from phibench.estimator.benchmark.report import Picture
+from phibench.estimator.studies.findings import Finding, Row
 from phibench.scenes.validation import structural_faults
 
 
 @dataclass(frozen=True)
-class Material:
-    """Where data sets are, and how many processes render them.
+class StudyDatasets:
+    """Data sets of a study in their folder, and the number of processes that render them.
 
     Parameters
     ----------
@@ -94,7 +91,7 @@ class Drawing:
         File name without its ending.
     data : bytes
     alt : str
-        What it shows, in words, with its main numbers.
+        Text alternative with the main numbers.
     kind : "svg" or "png"
     """
 
@@ -125,9 +122,6 @@ def drawn(name: str, figure: Figure, alt: str, kind: str = "svg") -> Drawing:
     return Drawing(name, picture.encoded(figure, kind), alt, kind)
 
 
-Row = tuple[str, ...]
-
-
 @dataclass(frozen=True)
 class Result:
     """Result of a study.
@@ -137,20 +131,25 @@ class Result:
     tables : dict of str to DataFrame
         By name; "table" is the main one, one row per measured case, units in the column names. Each is written as
         `NAME.parquet`.
-    findings : tuple of str
-        Sentences of a paragraph, every number in them computed; an uncertain number carries its interval.
+    findings : tuple of Finding
+        Numbers that the study states, no label twice.
     drawings : tuple of Drawing
     shown : dict of str to rows
         Small tables of text for the report, by caption, the first row being heads.
     notes : tuple of str
-        What this run leaves out or could not do: few samples, missing packages, targets missed.
+        Limits of this run: few samples, missing packages, targets missed.
     """
 
     tables: dict[str, pl.DataFrame]
-    findings: tuple[str, ...]
+    findings: tuple[Finding, ...]
     drawings: tuple[Drawing, ...] = ()
     shown: dict[str, tuple[Row, ...]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        labels = [finding.label for finding in self.findings]
+        if twice := sorted({label for label in labels if labels.count(label) > 1}):
+            raise ValueError(f"findings with the same label: {'; '.join(twice)}")
 
 
 class Settings(BaseModel):
@@ -173,17 +172,17 @@ class Study(Generic[S]):
     title : str
         Heading of its section in the report.
     question : str
-        What it answers, one sentence.
+        One sentence.
     settings : type
     run : callable
-        From settings and material to the result; the same settings and data sets give the same result.
+        From settings and data sets to the result; the same settings and data sets give the same result.
     """
 
     name: str
     title: str
     question: str
     settings: type[S]
-    run: Callable[[S, Material], Result]
+    run: Callable[[S, StudyDatasets], Result]
 
 
 QUICK = "quick"

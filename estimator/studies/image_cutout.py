@@ -142,7 +142,7 @@ class Shot:
         return Side(Chain(self.sensor, camera_seed, camera), light, Region.whole(light.size))
 
 
-def taken(
+def drawn_pair(
     number: int, shot: Shot, pair: SpotPair, nominal: tuple[Rig, float], names: tuple[Name, ...], box_px: int
 ) -> Pair:
     """One draw of a pair with laser-off frames and boxes, as a method sees it.
@@ -152,7 +152,7 @@ def taken(
     number : int
     shot : Shot
     pair : SpotPair
-    nominal : rig, cut, and stroke that the user believes in
+    nominal : nominal rig, cut, and nominal stroke
     names : of the noise's stream, the draw last; the camera's pattern is that of the draw, too
     box_px : side of the boxes around the spots
     """

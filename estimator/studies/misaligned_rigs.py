@@ -1,20 +1,13 @@
-"""Errors of D where the rig is misaligned and the estimator does not know it.
+"""Errors of D where the rig is misaligned and the estimator takes the nominal one.
 
-A spot's place in both images is that of the true rig's chief ray; a place outside of the image is none. The error is
-(estimate - D) / D, with D from the true sphere, as everywhere; its *change* is the error less that of the aligned rig,
-so that what an estimator has wrong anyway (a convention of phi) is no cost of the misalignment.
+A spot's pixel in either image is that of the true rig's chief ray; a pixel outside of the image counts as none. The
+error is (estimate - D) / D, with D from the true sphere. Its *change* is the error less that of the aligned rig. So an
+error of the estimator itself (a convention of phi) is no cost of the misalignment.
 
-Errors of D of many misaligned rigs at once, for studies that draw thousands: numbers of rigs as arrays.
-
-The chief rays come from the simulator's solution of Alhazen's problem, scaled to a sphere of radius 1, so that this is
-also a check of `misaligned.errors`, which takes the estimator's. Spherical mirrors only.
-
-The prediction against rendered spots: D from the centroids of noise-free spot layers of the misaligned rig.
-
-What a calibration makes of a misaligned rig: simulated measurements in, `bundle.calibrate` out.
-
-Measured are the outline of the mirror, and a few laser spots at known distances with the study's own stroke. What is
-nominal beforehand is the nominal rig, each number as good as the study's magnitude says.
+Four parts follow each other: one rig at a time (`errors`, `slopes`); thousands of rigs as arrays (`errors_of_many`);
+rendered spots, whose centroids confirm the chief rays (`rendered`); and a simulated calibration (`CalibrationSetup`).
+The second part takes spheres only, and chief rays from the simulator's solution of Alhazen's problem. So it is also a
+check of the first, which takes the estimator's.
 """
 
 from __future__ import annotations
@@ -43,6 +36,7 @@ from phibench.scenes.validation import SceneError
 
 NOMINAL = ("paper_ray", "paper_normal", "paper_incidence", "paper_outline", "exact")
 CALIBRATED = "exact_calibrated"
+ALL = tuple(PARAMETERS)
 _SMALL = 0.01  # of the study's magnitude: step of a slope that nothing gives in closed form
 
 Calibrate = Callable[[Misalignment], Bundle]
@@ -90,7 +84,7 @@ def pixels(nominal: Rig, misalignment: Misalignment, places: Places) -> tuple[Ar
 
 
 def errors(nominal: Rig, misalignment: Misalignment, places: Places, names: tuple[str, ...] = NOMINAL) -> Array:
-    """Relative errors of D, shape (estimators, d, a), by estimators that believe the nominal rig; NaN without one."""
+    """Relative errors of D, shape (estimators, d, a), by estimators with the nominal rig; NaN without one."""
     down, up = pixels(nominal, misalignment, places)
     D = true_depth_m(nominal, misalignment, places)
     return np.stack([ESTIMATORS[name](nominal, places.stroke_m, down, up).depth_m / D - 1.0 for name in names])
@@ -113,19 +107,21 @@ def true_depth_m(nominal: Rig, misalignment: Misalignment, places: Places) -> Ar
     return np.hypot(*np.moveaxis(places.points_m - centre, -1, 0)[:2])
 
 
-def slopes(nominal: Rig, places: Places, names: tuple[str, ...] = NOMINAL) -> dict[str, Array]:
-    """Derivatives of the relative error by every parameter at the aligned rig, shape (estimators, d, a) each.
+def slopes(
+    nominal: Rig, places: Places, names: tuple[str, ...] = NOMINAL, parameters: Sequence[str] = ALL
+) -> dict[str, Array]:
+    """Derivatives of the relative error by parameters at the aligned rig, shape (estimators, d, a) each.
 
     Analytic where `sensitivities` has them, else differences of the whole change.
     """
     found = np.array([[_gradients(name, nominal, places, p) for p in _flat(places)] for name in names])
     shape = (len(names), *places.points_m.shape[:-1])
     result = {}
-    for name, one in PARAMETERS.items():
+    for name in parameters:
         if name in ANALYTIC:
             result[name] = found[..., ANALYTIC.index(name)].reshape(shape)
         else:
-            step = _SMALL * one.study
+            step = _SMALL * PARAMETERS[name].study
             both = [errors(nominal, Misalignment(**{name: s * step}), places, names) for s in (1.0, -1.0)]
             result[name] = (both[0] - both[1]) / (2.0 * step)
     return result
@@ -150,6 +146,8 @@ def _flat(places: Places) -> Array:
     return places.points_m.reshape(-1, 3)
 
 
+# -- many rigs at once -----------------------------------------------------------------------------------------------
+
 _BROWN = ("k1", "k2", "k3", "p1", "p2")
 _LENS = ("fx_px", "fy_px", "cx_px", "cy_px")
 
@@ -166,7 +164,7 @@ class _Views:
 
 
 def errors_of_many(nominal: Rig, drawn: Sequence[Misalignment], places: Places, names: tuple[str, ...]) -> Array:
-    """Relative errors of D, shape (m, estimators, d, a), as `misaligned.errors` has them for one rig.
+    """Relative errors of D, shape (m, estimators, d, a), as `errors` has them for one rig.
 
     A distortion that folds the image is not refused here: check the largest coefficients beforehand.
 
@@ -220,6 +218,9 @@ def _seen_px(views: _Views, points_m: Array, nominal: Rig) -> Array:
     return np.where(nominal.camera.contains(uv)[..., None], uv, np.nan).reshape(m, *points_m.shape[:-1], 2)
 
 
+# -- rendered spots --------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class Rendered:
     """One parameter at one value.
@@ -244,18 +245,20 @@ class Rendered:
     explained: Array
 
 
-def rendered(nominal: Rig, places: Places) -> Iterator[Rendered]:
-    """Every parameter at its study's magnitude."""
+def rendered(nominal: Rig, places: Places, parameters: Sequence[str] = ALL) -> Iterator[Rendered]:
+    """Parameters at the study's magnitude, one at a time."""
     aligned = _errors(nominal, Misalignment(), places)
     before = errors(nominal, Misalignment(), places)
     down, up = pixels(nominal, Misalignment(), places)
     per_px = np.abs(exact_gradient(nominal, places.stroke_m, down, up)).sum(axis=-1) / places.depths_m[:, None]
-    for name, one in PARAMETERS.items():
-        m = Misalignment(**{name: one.study})
+    for name in parameters:
+        m = Misalignment(**{name: PARAMETERS[name].study})
         found = _errors(nominal, m, places)
         moved = [np.abs(a - b).max() for a, b in zip(found.beside_px, aligned.beside_px, strict=True)]
         predicted = errors(nominal, m, places) - before
-        yield Rendered(name, one.study, found.errors - aligned.errors, predicted, max(map(float, moved)), per_px)
+        yield Rendered(
+            name, PARAMETERS[name].study, found.errors - aligned.errors, predicted, max(map(float, moved)), per_px
+        )
 
 
 @dataclass(frozen=True)
@@ -298,9 +301,13 @@ def centroid_px(view: View, point_m: Array) -> tuple[float, float]:
     )
 
 
+# -- a simulated calibration -----------------------------------------------------------------------------------------
+
 @dataclass(frozen=True)
-class Bench:
-    """How a rig is calibrated.
+class CalibrationSetup:
+    """Simulated calibration: the mirror's outline, and a few laser spots at known distances.
+
+    Each number of the nominal rig counts as good as the study's magnitude says.
 
     Parameters
     ----------

@@ -1,8 +1,7 @@
-"""A study on disk: `study.json`, `findings.md`, the settings, a Parquet file per table and a file per drawing.
+"""Running a study, and its folder: `study.json`, `findings.md`, settings, Parquet tables, drawings.
 
-The studies by name, in the order in which they are read.
-
-Running a study: settings and data sets in, a folder out.
+`run_study` is `phibench study`; `section` reads a folder back for the report. A full study can also be published: its
+document goes beside the page of the study, whose numbers a test holds against it.
 """
 
 from __future__ import annotations
@@ -23,12 +22,15 @@ from phibench.datasets.store.files import require_writable, sha256, write_bytes,
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import Document
 from phibench.estimator.benchmark.report import Section
-from phibench.estimator.studies.framework import Drawing, Material, Result, Settings, Study, read_settings
+from phibench.estimator.studies.findings import Finding, findings_table, markdown_table
+from phibench.estimator.studies.framework import Drawing, Result, Settings, Study, StudyDatasets, read_settings
 from phibench.scenes.validation import nearest
 
 KIND: Literal["phibench study"] = "phibench study"
 DOCUMENT = "study.json"
 FINDINGS = "findings.md"
+DATA = "data"
+NAMES = ("noise", "misalignment", "baseline", "cause", "isotropy", "stroke")
 
 
 class DrawingEntry(Document):
@@ -40,16 +42,16 @@ class DrawingEntry(Document):
 
 
 class StudyDocument(Document):
-    """What `study.json` holds."""
+    """Content of `study.json`, and of the published document of a study."""
 
     kind: Literal["phibench study"] = KIND
-    version: Literal[1] = 1
+    version: Literal[2] = 2
     name: str
     title: str
     question: str
     quick: bool
     settings: dict[str, Any]
-    findings: tuple[str, ...]
+    findings: tuple[Finding, ...]
     notes: tuple[str, ...]
     drawings: tuple[DrawingEntry, ...]
     shown: dict[str, tuple[tuple[str, ...], ...]] = Field(description="tables of text by caption, heads first")
@@ -70,7 +72,23 @@ def write_study(out: Path, study: Study[Any], settings: Settings, quick: bool, r
     for name, data in _files(study, settings, result).items():
         write_bytes(out / name, data)
         files[name] = hashlib.sha256(data).hexdigest()
-    document = StudyDocument(
+    drawings = tuple(DrawingEntry(name=d.name, kind=d.kind, alt=d.alt) for d in result.drawings)  # type: ignore[arg-type]
+    document = _document(study, settings, quick, result).model_copy(update={"drawings": drawings, "files": files})
+    return _written(out / DOCUMENT, document)
+
+
+def publish_study(folder: Path, study: Study[Any], settings: Settings, result: Result) -> Path:
+    """Write the document of a full study as `NAME.json`, beside the page of the study.
+
+    Returns
+    -------
+    path : Path of `NAME.json`; it names no other files
+    """
+    return _written(folder / f"{study.name}.json", _document(study, settings, False, result))
+
+
+def _document(study: Study[Any], settings: Settings, quick: bool, result: Result) -> StudyDocument:
+    return StudyDocument(
         name=study.name,
         title=study.title,
         question=study.question,
@@ -78,12 +96,15 @@ def write_study(out: Path, study: Study[Any], settings: Settings, quick: bool, r
         settings=settings.model_dump(mode="json"),
         findings=result.findings,
         notes=result.notes,
-        drawings=tuple(DrawingEntry(name=d.name, kind=d.kind, alt=d.alt) for d in result.drawings),  # type: ignore[arg-type]
+        drawings=(),
         shown=result.shown,
-        files=files,
+        files={},
         provenance=dict(provenance()),
     )
-    return write_text(out / DOCUMENT, document.model_dump_json(indent=1) + "\n")
+
+
+def _written(path: Path, document: StudyDocument) -> Path:
+    return write_text(path, document.model_dump_json(indent=1) + "\n")
 
 
 def read_study(folder: Path) -> StudyDocument:
@@ -120,19 +141,19 @@ def section(folder: Path) -> Section:
     notes = tuple(f"Note: {note}" for note in document.notes)
     return Section(
         title=f"Study: {document.title}",
-        paragraphs=tuple(filter(None, (document.question, *document.findings, *notes, size))),
+        paragraphs=tuple(filter(None, (document.question, *notes, size))),
         pictures=tuple(pictures),
-        tables=tuple(document.shown.values()),
-        captions=tuple(document.shown),
+        tables=(findings_table(document.findings), *document.shown.values()),
+        captions=("Findings", *document.shown),
     )
 
 
 def findings_text(study: Study[Any], result: Result) -> str:
-    """The findings as Markdown: question, findings, notes, tables, drawings."""
-    lines = [f"# {study.title}", "", study.question, "", *(f"* {finding}" for finding in result.findings), ""]
+    """The findings as Markdown: question, table, notes, further tables, drawings."""
+    lines = [f"# {study.title}", "", study.question, "", markdown_table(findings_table(result.findings)), ""]
     lines += [f"* Note: {note}" for note in result.notes] + [""] * bool(result.notes)
     for caption, rows in result.shown.items():
-        lines += [caption, "", *_markdown(rows), ""]
+        lines += [caption, "", markdown_table(rows), ""]
     for drawing in result.drawings:
         lines += [f"![{drawing.alt}]({drawing.file_name})", ""]
     return "\n".join(lines)
@@ -156,20 +177,8 @@ def _parquet(table: pl.DataFrame) -> bytes:
     return buffer.getvalue()
 
 
-def _markdown(rows: tuple[tuple[str, ...], ...]) -> list[str]:
-    head, *body = rows
-    return [_line(head), _line(("---",) * len(head)), *map(_line, body)]
-
-
-def _line(cells: tuple[str, ...]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
-
-
-NAMES = ("noise", "misalignment", "baseline", "cause", "isotropy", "stroke")
-
-
 def find_study(name: str) -> Study[Any]:
-    """Study of a name; each module `studies/NAME.py` has its `STUDY`.
+    """Study of a name; each module `studies/NAME/study.py` has its `STUDY`.
 
     Raises
     ------
@@ -183,9 +192,6 @@ def find_study(name: str) -> Study[Any]:
     return found
 
 
-DATA = "data"
-
-
 def run_study(
     name: str,
     out: Path,
@@ -194,6 +200,7 @@ def run_study(
     data: Path | None = None,
     workers: int | None = None,
     console: Console | None = None,
+    publish: Path | None = None,
 ) -> Result:
     """Run a study and write its folder.
 
@@ -206,6 +213,7 @@ def run_study(
     data : folder of the data sets; by default `data` in `out`
     workers : processes that render
     console : where progress goes; by default the standard error
+    publish : folder of the pages, for the document of a full study
 
     Raises
     ------
@@ -213,12 +221,17 @@ def run_study(
         If there is no such study, its settings have faults, or its data sets cannot be had or lack what it needs.
     """
     study = find_study(name)
+    if publish is not None and quick:
+        raise DatasetError("--publish goes without --quick: the pages state the numbers of the full study")
     chosen = read_settings(study, quick, settings)
     if workers is not None and workers < 1:
         raise DatasetError(f"--workers {workers}: at least 1 is needed")
     if data is not None and data.exists() and not data.is_dir():
         raise DatasetError(f"--data {data} is a file; give the folder of the data sets")
-    require_writable(out / DOCUMENT)
-    result = study.run(chosen, Material(data or out / DATA, console or Console(stderr=True), workers))
+    for document in (out / DOCUMENT, *((publish / f"{name}.json",) if publish else ())):
+        require_writable(document)
+    result = study.run(chosen, StudyDatasets(data or out / DATA, console or Console(stderr=True), workers))
     write_study(out, study, chosen, quick, result)
+    if publish is not None:
+        publish_study(publish, study, chosen, result)
     return result

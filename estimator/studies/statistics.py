@@ -1,8 +1,7 @@
-"""Exponents of y = c D^p h^q with intervals.
+"""Statistics that several studies use: power laws, root mean squares, and first crossings.
 
-Root mean squares with intervals, in words.
-
-The value of a number at which a cost that grows with it reaches a given size: first crossing, not a slope.
+Power laws y = c D^p h^q are fitted to logarithms, with intervals of the exponents. A first crossing is the value of a
+number at which a cost that grows with it reaches a given size; it takes the whole cost, not its slope.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import bootstrap
 
+from phibench.estimator.studies.findings import Finding
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 
@@ -103,12 +103,11 @@ def rms_interval(values: Array, *names: str) -> tuple[float, float]:
     return float(found.confidence_interval.low), float(found.confidence_interval.high)
 
 
-def rms_percent(values: Array, *names: str) -> str:
-    """Such as "5.79 % (4.31 to 7.21)", of relative values; those that are not finite are left out."""
+def rms_finding(label: str, values: Array, *names: str) -> Finding:
+    """Rms of relative values in per cent, with its interval; values that are not finite are left out."""
     good = values[np.isfinite(values)]
     low, high = rms_interval(good, *names)
-    interval = f" ({100.0 * low:.2f} to {100.0 * high:.2f})" if np.isfinite(low) else ""
-    return f"{100.0 * rms(good):.2f} %{interval}"
+    return Finding(label, 100.0 * rms(good), 100.0 * low, 100.0 * high, "%")
 
 
 Cost = Callable[[float], Array]

@@ -1,11 +1,11 @@
-"""Sentences of the study `baseline`, made from its tables.
+"""Study `baseline`: the paper's tables and figures from rendered frames.
 
-Study `baseline`: the paper's tables and figures from rendered frames.
+The settings and the run come first, then the findings and the small tables of the report.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Literal
 
 import numpy as np
@@ -28,193 +28,18 @@ from phibench.estimator.studies.baseline.tables import (
     published_curve,
     seen,
 )
-from phibench.estimator.studies.framework import Material, Result, Row, Settings, Study
-from phibench.estimator.studies.statistics import rms, rms_percent
+from phibench.estimator.studies.findings import Finding, Row
+from phibench.estimator.studies.framework import Result, Settings, Study, StudyDatasets
+from phibench.estimator.studies.statistics import rms, rms_finding
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import POSITIONS
 
-
-def findings(
-    table: pl.DataFrame, bands: pl.DataFrame, laws: Sequence[LawFit], curves: Sequence[Curve], rendered: pl.DataFrame
-) -> tuple[str, ...]:
-    """Sentences: published and ours, senses of phi, misalignment, laws, published curves, rendered misalignment."""
-    return (
-        _noise(table),
-        _senses(table),
-        _misaligned(table, bands),
-        " ".join(map(_law, laws)),
-        *map(_curve, curves),
-        *([_rendered_words(rendered)] if len(rendered) else []),
-    )
-
-
-def notes(rendered: Sequence[str], fit_draws: int, table: pl.DataFrame) -> tuple[str, ...]:
-    """What this run leaves out."""
-    missing = int(table.filter(pl.col("sense") == "exact")["missing"].sum())
-    return tuple(
-        text
-        for text, holds in (
-            ("no misaligned rig was rendered: drawn misalignments are in closed form alone", not rendered),
-            ("chain_fit read one draw per experiment: it has no error bars", fit_draws == 1),
-            (f"{missing} readings gave no estimate and are left out", missing > 0),
-        )
-        if holds
-    )
-
-
-def senses_shown(table: pl.DataFrame, bands: pl.DataFrame) -> tuple[Row, ...]:
-    """Relative errors by sense of phi: rms and extremes, and how many published points lie in the misaligned band."""
-    rows: list[Row] = [("phi", "rms, %", "smallest, %", "largest, %", "rms to published, %", "published in the band")]
-    for sense in table["sense"].unique(maintain_order=True):
-        own, inside = _own(table, sense), _inside(table, bands, sense)
-        error = own["noise_free_m"].to_numpy() / own["depth_m"].to_numpy() - 1.0
-        apart = (own["published_m"].to_numpy() - own["noise_free_m"].to_numpy()) / own["depth_m"].to_numpy()
-        cells = (f"{100.0 * x:.3f}" for x in (rms(error), error.min(), error.max()))
-        rows.append((sense, *cells, f"{100.0 * rms(apart):.2f}", f"{inside.sum()} of {len(inside)}"))
-    return tuple(rows)
-
-
-def laws_shown(laws: Sequence[LawFit]) -> tuple[Row, ...]:
-    """Exponents with intervals."""
-    head = ("standard deviation of D from", "exponent of D", "95 %", "exponent of h", "95 %", "residual, %")
-    return (head, *(_law_row(law) for law in laws))
-
-
-def _noise(table: pl.DataFrame) -> str:
-    parts = []
-    for method in table["method"].unique(maintain_order=True):
-        own = _own(table, "exact", method)
-        error, sd = ((own[name] / own["depth_m"]).to_numpy() for name in ("mean_m", "sd_m"))
-        scatter = f", scatter of a draw {rms_percent(sd, 'scatter', method)}" if np.isfinite(sd).any() else ""
-        parts.append(f"{method} {rms_percent(error - 1.0, 'error', method)}{scatter}")
-    own = _own(table, "exact")
-    published, bound = (
-        (own["published_m"] / own["depth_m"] - 1.0).to_numpy(),
-        (own["bound_m"] / own["depth_m"]).to_numpy(),
-    )
-    return (
-        f"The {len(own)} published estimates err by {rms_percent(published, 'published')} rms; rendered on an aligned "
-        f"rig and read with exact geometry, the errors of the means are, rms, {'; '.join(parts)}. The bound of a pair "
-        f"is {rms_percent(bound, 'bound')} rms, and {int((np.abs(published) > 2.0 * bound).sum())} of the published "
-        f"errors are more than twice the bound of their experiment. Intervals are 95 %, over the experiments. "
-        f"{_by_table(table)}"
-    )
-
-
-def _by_table(table: pl.DataFrame) -> str:
-    """Where the published errors are larger than ours: a mean over all tables is ruled by the shortest strokes."""
-    parts = []
-    for name in sorted(table["experiment"].unique()):
-        own = table.filter((pl.col("experiment") == name) & (pl.col("sense") == "exact"))
-        first = own.filter(pl.col("method") == own["method"][0])
-        published = (first["published_m"] / first["depth_m"] - 1.0).to_numpy()
-        ours = []
-        for method in own["method"].unique(maintain_order=True):
-            rows = own.filter(pl.col("method") == method)
-            error = (rows["mean_m"] / rows["depth_m"] - 1.0).to_numpy()
-            ours.append(f"{method} {100.0 * rms(error[np.isfinite(error)]):.2f} %")
-        number = name.removeprefix("table")
-        parts.append(f"Table {number} {100.0 * rms(published):.2f} % against {', '.join(ours)}")
-    return f"By table, published against ours, rms: {'; '.join(parts)}."
-
-
-def _senses(table: pl.DataFrame) -> str:
-    apart = {}
-    for sense in ("ray", "normal", "incidence", "outline"):
-        own = _own(table, sense)
-        apart[sense] = ((own["published_m"] - own["noise_free_m"]) / own["depth_m"]).to_numpy()
-    own = _own(table, "ray")
-    alone = rms(((own["published_m"] - own["depth_m"]) / own["depth_m"]).to_numpy())
-    best = min(apart, key=lambda sense: rms(apart[sense]))
-    words = ", ".join(f"phi_{sense} {rms_percent(value, 'sense', sense)}" for sense, value in apart.items())
-    verdict = (
-        f"phi_{best} comes nearest, and leaves {100.0 * (rms(apart[best]) / alone) ** 2:.0f} % of the sum of squares"
-        if rms(apart[best]) < alone and best != "ray"
-        else "no sense of phi comes nearer to them than phi_ray, which is exact"
-    )
-    return f"Published minus noise-free estimate of the recipe's aligned rig, relative rms: {words}; {verdict}."
-
-
-def _misaligned(table: pl.DataFrame, bands: pl.DataFrame) -> str:
-    inside = {sense: _inside(table, bands, sense) for sense in ("ray", "normal", "incidence", "outline")}
-    counts = ", ".join(f"phi_{sense} {int(flags.sum())}" for sense, flags in inside.items())
-    n = len(inside["ray"])
-    return (
-        f"With misalignments drawn at the study magnitudes, the central 95 % of the errors hold, of {n} published "
-        f"points, {counts}; the points of one table share a rig, so that these counts are no test."
-    )
-
-
-def _law(law: LawFit) -> str:
-    (p, q), low, high = law.law.exponents, law.law.low, law.law.high
-    verdicts = " and ".join(
-        f"{'agrees' if holds else 'does not agree'} with {expected:g}"
-        for holds, expected in zip(law.holds, EXPECTED, strict=True)
-    )
-    first, second = verdicts.split(" and ")
-    return (
-        f"{law.name[0].upper()}{law.name[1:]}: sigma of D goes as D^{p:.2f} ({low[0]:.2f} to {high[0]:.2f}), which "
-        f"{first}, and h^{q:.2f} ({low[1]:.2f} to {high[1]:.2f}), which {second}."
-    )
-
-
-def _curve(curve: Curve) -> str:
-    number = curve.experiment.removeprefix("table")
-    q, low, high = (float(x[0]) for x in (curve.law.exponents, curve.law.low, curve.law.high))
-    left = {"c/h": curve.inverse_m, "a + b h": curve.line_m, "a + b/h": curve.offset_m}
-    best = min(left, key=lambda name: left[name])
-    words = ", ".join(f"{name} {value:.3f} m" for name, value in left.items())
-    crossing = f"change sign {_times(curve.signs)}" if curve.signs else "keep one sign"
-    agrees = "an interval that holds -1" if curve.law.holds(0, -1.0) else "an interval without -1"
-    return (
-        f"The published errors of Table {number} {crossing} along h (rms {curve.rms_m:.3f} m); their magnitude goes as "
-        f"h^{q:.2f} ({low:.2f} to {high:.2f}, {agrees}). Signed laws leave, per degree of freedom, {words}: {best} "
-        "fits best."
-    )
-
-
-def _rendered_words(rendered: pl.DataFrame) -> str:
-    gap = (rendered["rendered_error_m"] - rendered["closed_form_error_m"]).to_numpy()
-    largest = np.abs(rendered["closed_form_error_m"].to_numpy()).max()
-    worst = float(np.nanmax(np.abs(gap)))
-    return (
-        f"A misaligned rig that was rendered errs by up to {1e3 * largest:.0f} mm; its noise-free frames and the "
-        f"closed form differ by at most {1e3 * worst:.2g} mm over {len(rendered)} estimates."
-    )
-
-
-def _times(count: int) -> str:
-    return "once" if count == 1 else f"{count} times"
-
-
-def _own(table: pl.DataFrame, sense: str, method: str | None = None) -> pl.DataFrame:
-    """Rows of one sense and one method, the first if none is named."""
-    return table.filter((pl.col("sense") == sense) & (pl.col("method") == (method or table["method"][0])))
-
-
-def _inside(table: pl.DataFrame, bands: pl.DataFrame, sense: str) -> Array:
-    own = _own(table, sense).join(bands, on=["sample_id", "sense"])
-    error = own["published_m"] - own["depth_m"]
-    return ((error >= own["low_m"]) & (error <= own["high_m"])).to_numpy()
-
-
-def _law_row(law: LawFit) -> Row:
-    (p, q), low, high = law.law.exponents, law.law.low, law.law.high
-    return (
-        law.name,
-        f"{p:.2f}",
-        f"{low[0]:.2f} to {high[0]:.2f}",
-        f"{q:.2f}",
-        f"{low[1]:.2f} to {high[1]:.2f}",
-        f"{100.0 * law.law.rms_log:.0f}",
-    )
-
-
 METHODS = ("red_centroid", "chain_fit")
 TABLES = ("table1", "table2", "table3")
-_LEAST = 3
+NAMED = ("ray", "normal", "incidence", "outline")
+_LEAST = 3  # strokes for two constants and a residual
 
 
 class BaselineSettings(Settings):
@@ -229,29 +54,40 @@ class BaselineSettings(Settings):
     rendered: list[str] = Field(description="recipes of misaligned rigs that are rendered too")
 
 
-def run(settings: BaselineSettings, material: Material) -> Result:
+def run(settings: BaselineSettings, datasets: StudyDatasets) -> Result:
     """Run the study."""
-    dataset = material.dataset(settings.recipe)
+    dataset = datasets.dataset(settings.recipe)
     experiments, rig = experiments_of(dataset), dataset.samples[0].nominal_rig
     draws = dict(zip(METHODS, (settings.draws, settings.fit_draws), strict=True))
-    table = experiment_table(experiments, rig, found_spots(dataset, settings.preset, draws, material.workers))
+    table = experiment_table(experiments, rig, found_spots(dataset, settings.preset, draws, datasets.workers))
     bands = band_table(experiments, rig, settings.rigs, generator("study", "baseline", "rigs"))
     laws = laws_of_noise(table, METHODS[0], settings.resamples)
     curves = [
         published_curve(name, *_published(table, name), settings.resamples) for name in TABLES if _long(table, name)
     ]
-    rendered = pl.concat([_rendered(name, material) for name in settings.rendered] or [_NONE])
-    words = findings(table, bands, laws, curves, rendered)
+    rendered = pl.concat([_rendered(name, datasets) for name in settings.rendered] or [_NONE])
+    found = findings(table, bands, laws, curves, rendered)
     return Result(
         {"table": table, "misaligned": bands, "laws": _law_table(laws), "rendered": rendered},
-        words,
+        found,
         (
-            curves_drawing(table, bands, METHODS[1], words[0] + " " + words[1]),
-            laws_drawing(table, laws, words[3]),
+            curves_drawing(table, bands, METHODS[1], _curves_alt(found)),
+            laws_drawing(table, laws, _laws_alt(laws)),
         ),
         {"Errors over the published experiments": senses_shown(table, bands), "Exponents": laws_shown(laws)},
         notes(settings.rendered, settings.fit_draws, table),
     )
+
+
+def _curves_alt(found: Sequence[Finding]) -> str:
+    wanted = ("error of the published", "error of the mean reading", "published minus noise-free")
+    parts = "; ".join(finding.text for finding in found if finding.label.startswith(wanted))
+    return f"Error of D against stroke and distance, by table of the paper. {parts}."
+
+
+def _laws_alt(laws: Sequence[LawFit]) -> str:
+    parts = "; ".join(finding.text for law in laws for finding in _law_findings(law))
+    return f"Standard deviation of D against eq. (7), and exponents of D and h. {parts}."
 
 
 _NONE = pl.DataFrame(
@@ -265,9 +101,9 @@ _NONE = pl.DataFrame(
 )
 
 
-def _rendered(recipe: str, material: Material) -> pl.DataFrame:
+def _rendered(recipe: str, datasets: StudyDatasets) -> pl.DataFrame:
     """Errors of a rendered misaligned rig from its noise-free frames, and by the closed form of `drawn_rigs`."""
-    dataset = material.dataset(recipe)
+    dataset = datasets.dataset(recipe)
     samples = [sample for sample in dataset if sample.row.down.visible and sample.row.up.visible]
     rows = [sample.row for sample in samples]
     rig = dataset.samples[0].nominal_rig
@@ -323,6 +159,165 @@ def _law_table(laws: list[LawFit]) -> pl.DataFrame:
             for i, name in enumerate(("D", "h"))
         ]
     )
+
+
+def findings(
+    table: pl.DataFrame, bands: pl.DataFrame, laws: Sequence[LawFit], curves: Sequence[Curve], rendered: pl.DataFrame
+) -> tuple[Finding, ...]:
+    """Findings: published and ours, senses of phi, misalignment, laws, published curves, rendered misalignment."""
+    return (
+        *_error_findings(table),
+        *_table_findings(table),
+        *_sense_findings(table),
+        *_band_findings(table, bands),
+        *(row for law in laws for row in _law_findings(law)),
+        *(row for curve in curves for row in _curve_findings(curve)),
+        *(_rendered_findings(rendered) if len(rendered) else ()),
+    )
+
+
+def notes(rendered: Sequence[str], fit_draws: int, table: pl.DataFrame) -> tuple[str, ...]:
+    """Parts that this run leaves out."""
+    missing = int(table.filter(pl.col("sense") == "exact")["missing"].sum())
+    return tuple(
+        text
+        for text, holds in (
+            ("no misaligned rig was rendered: drawn misalignments are in closed form alone", not rendered),
+            ("chain_fit read one draw per experiment: it has no error bars", fit_draws == 1),
+            (f"{missing} readings gave no estimate and are left out", missing > 0),
+            ("the points of one table share a rig: counts of points in the band are no test", True),
+        )
+        if holds
+    )
+
+
+def _error_findings(table: pl.DataFrame) -> Iterator[Finding]:
+    """Relative errors of D, rms over the experiments, with exact geometry."""
+    own = _own(table, "exact")
+    published = (own["published_m"] / own["depth_m"] - 1.0).to_numpy()
+    bound = (own["bound_m"] / own["depth_m"]).to_numpy()
+    yield rms_finding("error of the published estimates, rms", published, "published")
+    for method in table["method"].unique(maintain_order=True):
+        rows = _own(table, "exact", method)
+        error, sd = ((rows[name] / rows["depth_m"]).to_numpy() for name in ("mean_m", "sd_m"))
+        yield rms_finding(f"error of the mean reading, {method}, rms", error - 1.0, "error", method)
+        if np.isfinite(sd).any():
+            yield rms_finding(f"scatter of a draw, {method}, rms", sd, "scatter", method)
+    yield rms_finding("bound of a pair, rms", bound, "bound")
+    above = int((np.abs(published) > 2.0 * bound).sum())
+    yield Finding("published errors above twice the bound of their experiment", above, unit=f"of {len(own)}")
+
+
+def _table_findings(table: pl.DataFrame) -> Iterator[Finding]:
+    """Errors by table of the paper: a mean over all of them is ruled by the shortest strokes."""
+    for name in sorted(table["experiment"].unique()):
+        own = table.filter((pl.col("experiment") == name) & (pl.col("sense") == "exact"))
+        first = own.filter(pl.col("method") == own["method"][0])
+        published = (first["published_m"] / first["depth_m"] - 1.0).to_numpy()
+        title = _title(name)
+        yield Finding(f"{title}, error of the published estimates, rms", 100.0 * rms(published), unit="%")
+        for method in own["method"].unique(maintain_order=True):
+            rows = own.filter(pl.col("method") == method)
+            error = (rows["mean_m"] / rows["depth_m"] - 1.0).to_numpy()
+            value = 100.0 * rms(error[np.isfinite(error)])
+            yield Finding(f"{title}, error of the mean reading, {method}, rms", value, unit="%")
+
+
+def _sense_findings(table: pl.DataFrame) -> Iterator[Finding]:
+    """Published minus noise-free estimate in each sense of phi, and the sum of squares that the sense leaves."""
+    own = _own(table, "ray")
+    alone = rms(((own["published_m"] - own["depth_m"]) / own["depth_m"]).to_numpy())
+    for sense in NAMED:
+        rows = _own(table, sense)
+        apart = ((rows["published_m"] - rows["noise_free_m"]) / rows["depth_m"]).to_numpy()
+        yield rms_finding(f"published minus noise-free estimate, phi_{sense}, rms", apart, "sense", sense)
+        share = Finding(
+            f"sum of squares that phi_{sense} leaves of the published errors",
+            100.0 * (rms(apart) / alone) ** 2,
+            unit="%",
+        )
+        yield share if sense == "ray" else share.judged("<=", 100.0)
+
+
+def _band_findings(table: pl.DataFrame, bands: pl.DataFrame) -> Iterator[Finding]:
+    for sense in NAMED:
+        inside = _inside(table, bands, sense)
+        label = f"published points in the central 95 % of misaligned rigs, phi_{sense}"
+        yield Finding(label, int(inside.sum()), unit=f"of {len(inside)}")
+
+
+def _law_findings(law: LawFit) -> Iterator[Finding]:
+    """Exponents of D and h against those of eq. (7)."""
+    for name, value, low, high, expected in zip(
+        "Dh", law.law.exponents, law.law.low, law.law.high, EXPECTED, strict=True
+    ):
+        yield Finding(f"{law.name}: exponent of {name}", value, low, high).judged("=", expected)
+
+
+def _curve_findings(curve: Curve) -> Iterator[Finding]:
+    """Signs, exponent and residuals of the published errors of one table; 1/h is the law of noise."""
+    title, law = f"published errors of {_title(curve.experiment)}", curve.law
+    yield Finding(f"{title}: changes of sign along h", curve.signs)
+    yield Finding(f"{title}: rms", curve.rms_m, unit="m")
+    exponent = Finding(f"{title}: exponent of h", law.exponents[0], law.low[0], law.high[0])
+    yield exponent.judged("=", EXPECTED[1])
+    residuals = {"c/h": curve.inverse_m, "a + b h": curve.line_m, "a + b/h": curve.offset_m}
+    for name, value in residuals.items():
+        yield Finding(f"{title}: residual of {name}, per degree of freedom", value, unit="m")
+
+
+def _rendered_findings(rendered: pl.DataFrame) -> Iterator[Finding]:
+    closed = rendered["closed_form_error_m"].to_numpy()
+    gap = rendered["rendered_error_m"].to_numpy() - closed
+    yield Finding("rendered misaligned rig: estimates", len(rendered))
+    yield Finding("rendered misaligned rig: largest error of D", 1e3 * float(np.abs(closed).max()), unit="mm")
+    largest = 1e3 * float(np.nanmax(np.abs(gap)))
+    yield Finding("rendered misaligned rig: largest difference of frames and closed form", largest, unit="mm")
+
+
+def _title(experiment: str) -> str:
+    return f"Table {experiment.removeprefix('table')}"
+
+
+def senses_shown(table: pl.DataFrame, bands: pl.DataFrame) -> tuple[Row, ...]:
+    """Relative errors by sense of phi: rms and extremes, and how many published points lie in the misaligned band."""
+    rows: list[Row] = [("phi", "rms, %", "smallest, %", "largest, %", "rms to published, %", "published in the band")]
+    for sense in table["sense"].unique(maintain_order=True):
+        own, inside = _own(table, sense), _inside(table, bands, sense)
+        error = own["noise_free_m"].to_numpy() / own["depth_m"].to_numpy() - 1.0
+        apart = (own["published_m"].to_numpy() - own["noise_free_m"].to_numpy()) / own["depth_m"].to_numpy()
+        cells = (f"{100.0 * x:.3f}" for x in (rms(error), error.min(), error.max()))
+        rows.append((sense, *cells, f"{100.0 * rms(apart):.2f}", f"{inside.sum()} of {len(inside)}"))
+    return tuple(rows)
+
+
+def laws_shown(laws: Sequence[LawFit]) -> tuple[Row, ...]:
+    """Exponents with intervals."""
+    head = ("standard deviation of D from", "exponent of D", "95 %", "exponent of h", "95 %", "residual, %")
+    return (head, *(_law_row(law) for law in laws))
+
+
+def _law_row(law: LawFit) -> Row:
+    (p, q), low, high = law.law.exponents, law.law.low, law.law.high
+    return (
+        law.name,
+        f"{p:.2f}",
+        f"{low[0]:.2f} to {high[0]:.2f}",
+        f"{q:.2f}",
+        f"{low[1]:.2f} to {high[1]:.2f}",
+        f"{100.0 * law.law.rms_log:.0f}",
+    )
+
+
+def _own(table: pl.DataFrame, sense: str, method: str | None = None) -> pl.DataFrame:
+    """Rows of one sense and one method, the first if none is named."""
+    return table.filter((pl.col("sense") == sense) & (pl.col("method") == (method or table["method"][0])))
+
+
+def _inside(table: pl.DataFrame, bands: pl.DataFrame, sense: str) -> Array:
+    own = _own(table, sense).join(bands, on=["sample_id", "sense"])
+    error = own["published_m"] - own["depth_m"]
+    return ((error >= own["low_m"]) & (error <= own["high_m"])).to_numpy()
 
 
 STUDY = Study(

@@ -147,7 +147,7 @@ class Model:
     priors : Prior by parameter
     experiments : Experiments
     rig : Rig
-        Focal length and mirror that the paper's user believes.
+        Focal length and mirror that the paper's user takes as nominal.
     depth_sigma_m : float
         Of the paper's real depth of a target.
     """

@@ -133,7 +133,7 @@ def read(parameters: Parameters, experiments: Experiments, reader: Reader, rig: 
     experiments : Experiments
     reader : Reader
     rig : Rig
-        Focal length and radius that the reader believes.
+        Focal length and radius that the reader takes as nominal.
 
     Returns
     -------
@@ -201,7 +201,7 @@ def inverse_depth(
 
 
 def phi_of(parameters: Parameters, reader: Reader, rig: Rig, radius_px: Array) -> Array:
-    """Angle of a reader who believes an aligned rig, from radii in the image.
+    """Angle of a reader who takes the rig as aligned, from radii in the image.
 
     sin i = z_c / R sin(alpha), phi_n = i - alpha. NaN where the pixel misses the mirror.
     """
@@ -232,7 +232,7 @@ def _outline_px(parameters: Parameters, rig: Rig) -> Array:
 
 
 def _axis(parameters: Parameters) -> tuple[Array, Array, Array]:
-    """Lens to true sphere centre; an aligned reader believes (0, 0, z_c)."""
+    """Lens to true sphere centre; an aligned reader takes (0, 0, z_c)."""
     z = _get(parameters, "z_c_m") + _get(parameters, "axial_m")
     return _get(parameters, "decentre_x_m"), _get(parameters, "decentre_y_m"), z
 

@@ -1,18 +1,15 @@
-"""Settings of the study `isotropy`.
-
-What the study `isotropy` says: sentences from numbers.
-
-Study: the error of D against the azimuth, for the vertical stroke and for a horizontal baseline; epipolar lines.
+"""Study `isotropy`: the error of D against the azimuth, for the vertical stroke and for a horizontal baseline.
 
 The horizontal baseline is the competitor that the paper names: the same sensor moved sideways by the same length, or
-two of them. D counts from the vertical through the first position, in both cases.
+two of them. D counts from the vertical through the first position, in both cases. Epipolar lines and upright edges of
+the room are followed in the image and in the panorama. The run comes first, then findings, then tables of the report.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -32,7 +29,8 @@ from phibench.estimator.geometry.panorama import (
     vertical_edges,
 )
 from phibench.estimator.geometry.phi import outline_circle
-from phibench.estimator.studies.framework import Material, Result, Row, Settings, Study
+from phibench.estimator.studies.findings import Finding, Row
+from phibench.estimator.studies.framework import Result, Settings, Study, StudyDatasets
 from phibench.estimator.studies.isotropy.drawings import lines_drawing, misaligned_drawing, noise_drawing
 from phibench.estimator.studies.isotropy.lines import Line, epipolar_line, half_width_rad, hidden_share
 from phibench.estimator.studies.isotropy.noise import (
@@ -80,183 +78,11 @@ class IsotropySettings(Settings):
     resamples: int = Field(ge=100, le=100000, description="of the bootstrap")
 
 
-_LEAST_P = 1e-9  # smaller ones say no more
-_STRAIGHT_PX = 0.1  # a tenth of a pixel matters, less does not
-
-
-def noise_sentence(name: str, noise: Sequence[AzimuthNoise], test: Isotropy) -> str:
-    """Scatter of one baseline, and whether it depends on the azimuth."""
-    least = min(noise, key=lambda one: one.scatter_m.value)
-    most = max(noise, key=lambda one: one.scatter_m.value)
-    if not test.tested:
-        return f"{name}: too few azimuths for a test of isotropy; the scatter of D is {_scatter(least)}."
-    verdict = "isotropic" if test.isotropic else "not isotropic"
-    follows = "is the same everywhere" if test.explained else "still differs"
-    over_bound = _probability(test.p_value_over_bound)
-    return (
-        f"{name}: at D = {least.depth_m:.3g} m the noise of D is {verdict} ({_probability(test.p_value)}, "
-        f"false alarms {100.0 * test.false_alarm:g} %): {_scatter(least)} to {_scatter(most)}, a factor of "
-        f"{test.ratio:.2g}; as a multiple of each spot's own bound it {follows} ({over_bound})."
-    )
-
-
-def bias_sentence(name: str, noise: Sequence[AzimuthNoise]) -> str:
-    """Largest systematic error of the likelihood fits."""
-    usable = [one for one in noise if one.errors_m.size > 1]
-    if not usable:
-        return f"{name}: too few estimates for a mean error."
-    worst = max(usable, key=lambda one: abs(one.bias_m))
-    share = abs(worst.bias_m) / worst.scatter_m.value
-    return (
-        f"{name}: the mean error is at most {1e3 * abs(worst.bias_m):.2g} +- {1e3 * worst.bias_sigma_m:.1g} mm, "
-        f"{share:.2g} of the scatter there (azimuth {worst.azimuth_deg:.0f} degrees)."
-    )
-
-
-def grid_sentence(single: Array, averaged: Array) -> str:
-    """What the mosaic does to the isotropy of the vertical stroke."""
-    one, mean = ratio(single), ratio(averaged)
-    cause = "the mosaic's grid makes the difference" if mean - 1.0 < 0.5 * (one - 1.0) else "the grid is not the cause"
-    return (
-        f"On an even background the vertical stroke's bound varies by a factor of {one:.2f} with the azimuth, and of "
-        f"{mean:.3f} once averaged over places in a Bayer cell: {cause}."
-    )
-
-
-def baseline_sentence(
-    azimuths_deg: Array, vertical: Array, horizontal: Array, depth_m: float, baseline_m: float
-) -> str:
-    """Where each baseline is better."""
-    seen = np.isfinite(horizontal) & np.isfinite(vertical)
-    better = float(np.mean(horizontal[seen] < vertical[seen]))
-    from_it = np.degrees(np.arcsin(np.abs(np.sin(np.radians(azimuths_deg)))))
-    near, across = (int(np.argmin(np.where(seen, each, np.inf))) for each in (from_it, -from_it))
-    return (
-        f"At the same length ({baseline_m:.3g} m) and D = {depth_m:.3g} m the horizontal baseline's bound is "
-        f"{1e3 * horizontal[across]:.2g} mm at {from_it[across]:.2g} degrees from its direction and "
-        f"{1e3 * horizontal[near]:.2g} mm at {from_it[near]:.2g} degrees, against "
-        f"{1e3 * np.sqrt(np.mean(vertical[seen] ** 2)):.2g} mm (rms) of the vertical stroke; it is the smaller one at "
-        f"{100.0 * better:.0f} % of the azimuths."
-    )
-
-
-def misaligned_sentence(vertical: Array, horizontal: Array, words: str) -> str:
-    """What a misalignment does to isotropy; relative errors over azimuths."""
-    return (
-        f"With {words} the exact estimator's error with nominal numbers runs from {_percent(np.nanmin(vertical))} to "
-        f"{_percent(np.nanmax(vertical))} % of D around the vertical stroke, and from "
-        f"{_percent(np.nanmin(horizontal))} to {_percent(np.nanmax(horizontal))} % around the horizontal baseline "
-        f"({np.count_nonzero(np.isfinite(horizontal))} of {horizontal.size} azimuths have an estimate)."
-    )
-
-
-def occlusion_sentence(heights_m: Sequence[float], pair: Sequence[float], own: Sequence[float], apart_m: float) -> str:
-    """Who hides whom."""
-    parts = ", ".join(f"{100.0 * share:.2g} % at {height:g} m" for height, share in zip(heights_m, pair, strict=True))
-    single = max(own)
-    moving = "nothing" if single == 0.0 else f"up to {100.0 * single:.2g} %"
-    return (
-        f"Two fixed sensors {apart_m:.3g} m apart hide from each other these shares of all azimuths, by height of the "
-        f"spot: {parts}; one sensor that moves hides {moving} from itself."
-    )
-
-
-def line_sentence(aligned: Sequence[Line], tilted: Sequence[Line]) -> str:
-    """Whether epipolar lines are radial, and vertical in the panorama."""
-    exact = max(line.beside_radius_px for line in aligned)
-    rendered = max(line.rendered_beside_px for line in aligned)
-    bend = max(line.bend_px for line in aligned)
-    verdict = "radial" if max(exact, rendered) < _STRAIGHT_PX else "not radial"
-    off, straight = max(line.beside_radius_px for line in tilted), max(line.beside_line_px for line in tilted)
-    column = max(line.bend_px for line in tilted)
-    return (
-        f"Epipolar lines of the aligned rig are {verdict} in the image: exact points lie within {exact:.1e} px and "
-        f"rendered spots within {rendered:.1e} px of the down pixel's radius, and in the panorama within {bend:.1e} "
-        f"columns; of the misaligned rig they leave it by up to {off:.2g} px and {column:.2g} columns, and lie within "
-        f"{straight:.2g} px of a straight line."
-    )
-
-
-def edge_sentence(name: str, edges: Sequence[SeenEdge]) -> str:
-    """Whether upright edges of the room are vertical in the panorama."""
-    if not edges:
-        return f"No upright edge was measured in the panorama of the {name} rig."
-    worst = max(edges, key=lambda edge: abs(edge.lean_px))
-    miss = max(abs(edge.lean_px - edge.expected_lean_px) for edge in edges)
-    upright = "vertical" if abs(worst.lean_px) < _STRAIGHT_PX else "not vertical"
-    return (
-        f"In the panorama of the {name} rig upright edges are {upright}: the largest lean is "
-        f"{worst.lean_px:+.2f} +- {1.96 * worst.lean_sigma_px:.2f} columns over {worst.rows} rows ({worst.name}), "
-        f"and the leans differ from the predicted ones by at most {miss:.2f}."
-    )
-
-
-def noise_rows(noise: Mapping[str, Sequence[AzimuthNoise]]) -> tuple[Row, ...]:
-    """Table: scatter, interval, bound and bias per baseline and azimuth."""
-    heads = ("baseline", "azimuth, degrees", "bound, mm", "scatter, mm (95 %)", "bias, mm", "fits missing")
-    return (
-        heads,
-        *(
-            (
-                name,
-                f"{one.azimuth_deg:.0f}",
-                f"{1e3 * one.bound_m:.2f}",
-                _interval(one),
-                f"{1e3 * one.bias_m:+.2f} +- {1e3 * one.bias_sigma_m:.2f}",
-                str(one.missing),
-            )
-            for name, rows in noise.items()
-            for one in rows
-        ),
-    )
-
-
-def edge_rows(edges: Mapping[str, Sequence[SeenEdge]]) -> tuple[Row, ...]:
-    """Table: upright edges in the panorama."""
-    heads = ("rig", "edge", "azimuth, degrees", "rows", "lean, columns", "predicted", "offset, columns")
-    return (
-        heads,
-        *(
-            (
-                name,
-                edge.name,
-                f"{edge.azimuth_deg:.1f}",
-                str(edge.rows),
-                f"{edge.lean_px:+.3f} +- {edge.lean_sigma_px:.3f}",
-                f"{edge.expected_lean_px:+.3f}",
-                f"{edge.offset_px:+.3f}",
-            )
-            for name, rows in edges.items()
-            for edge in rows
-        ),
-    )
-
-
-def ratio(values: Array) -> float:
-    """Largest over smallest; NaN without any."""
-    known = values[np.isfinite(values)]
-    return float(known.max() / known.min()) if known.size else math.nan
-
-
-def _probability(p: float) -> str:
-    return f"p = {p:.2g}" if p >= _LEAST_P else f"p below {_LEAST_P:g}"
-
-
-def _scatter(one: AzimuthNoise) -> str:
-    return f"{_interval(one)} mm at {one.azimuth_deg:.0f} degrees"
-
-
-def _interval(one: AzimuthNoise) -> str:
-    s = one.scatter_m
-    return f"{1e3 * s.value:.2f} ({1e3 * s.low:.2f} to {1e3 * s.high:.2f})"
-
-
-def _percent(relative: float) -> str:
-    return f"{100.0 * relative:+.2g}"
-
-
 VERTICAL, HORIZONTAL = "vertical stroke", "horizontal baseline"
 _LOW_RAD, _HIGH_RAD = math.radians(-20.0), math.radians(20.0)
+_LEAST_P = 1e-9  # smaller ones say no more
+_NORMAL_95 = 1.96  # standard errors on both sides of an interval of 95 %
+_STRAIGHT_PX = 0.1  # a tenth of a pixel matters, less does not
 
 
 @dataclass(frozen=True)
@@ -270,10 +96,10 @@ class _Scene:
     background: Array
 
 
-def run(settings: IsotropySettings, material: Material) -> Result:
+def run(settings: IsotropySettings, datasets: StudyDatasets) -> Result:
     """Run the study."""
     upright, moved, tilted = (
-        material.dataset(name) for name in ("study-isotropy", "study-isotropy-sideways", "study-isotropy-tilted")
+        datasets.dataset(name) for name in ("study-isotropy", "study-isotropy-sideways", "study-isotropy-tilted")
     )
     pairs = {VERTICAL: tuple(pairs_of(upright)), HORIZONTAL: tuple(pairs_of(moved))}
     for name, each in pairs.items():
@@ -292,16 +118,14 @@ def run(settings: IsotropySettings, material: Material) -> Result:
     edges = {"aligned": _edges(settings, upright), "misaligned": _edges(settings, tilted)}
     words = f"tilt_y {math.degrees(true.tilt_y_rad):.2g} deg and decentre_y {1e3 * true.decentre_y_m:.2g} mm"
     findings = (
-        *(noise_sentence(name, noise[name], tests[name]) for name in noise),
-        *(bias_sentence(name, noise[name]) for name in noise),
-        grid_sentence(curves[VERTICAL], grid),
-        baseline_sentence(azimuths, curves[VERTICAL], curves[HORIZONTAL], scene.depth_m, scene.baseline_m),
-        misaligned_sentence(wrong[VERTICAL], wrong[HORIZONTAL], words),
-        occlusion_sentence(
-            settings.occlusion_heights_m, hidden["pair"].to_list(), hidden["own"].to_list(), scene.baseline_m
-        ),
-        line_sentence(*lines),
-        *(edge_sentence(name, found) for name, found in edges.items()),
+        *(row for name in noise for row in scatter_findings(name, noise[name], tests[name])),
+        *(row for name in noise for row in bias_findings(name, noise[name])),
+        *grid_findings(curves[VERTICAL], grid),
+        *baseline_findings(azimuths, curves[VERTICAL], curves[HORIZONTAL], scene.baseline_m),
+        *misaligned_findings(wrong, words),
+        *occlusion_findings(hidden, scene.baseline_m),
+        *line_findings(*lines),
+        *(row for name, found in edges.items() for row in edge_findings(name, found)),
     )
     return Result(
         {
@@ -366,7 +190,7 @@ def _misalignment(dataset: Dataset) -> Misalignment:
 
 
 def _misaligned(scene: _Scene, true: Misalignment, azimuths_deg: Array) -> dict[str, Array]:
-    """Relative errors of the exact estimator that believes the aligned rig."""
+    """Relative errors of the exact estimator with the aligned rig as nominal."""
     spots = Places(np.array([scene.depth_m]), np.radians(azimuths_deg), scene.height_m, scene.baseline_m)
     rigs = {VERTICAL: scene.rig, HORIZONTAL: sideways(scene.rig)}
     return {name: errors(rig, true, spots, ("exact",))[0, 0] for name, rig in rigs.items()}
@@ -457,6 +281,162 @@ def _notes(noise: dict[str, tuple[AzimuthNoise, ...]]) -> tuple[str, ...]:
         "the horizontal data set keeps 1 mm of stroke, which the estimator knows; no board lies nearer than 15 degrees "
         "to the baseline's direction",
     )
+
+
+# -- findings ------------------------------------------------------------------------------------------------------
+
+
+def scatter_findings(name: str, noise: Sequence[AzimuthNoise], test: Isotropy) -> Iterator[Finding]:
+    """Smallest and largest scatter of one baseline, and the tests of isotropy; none with too few azimuths."""
+    for word, pick in (("smallest", min), ("largest", max)):
+        one = pick(noise, key=lambda each: each.scatter_m.value)
+        ends = (one.scatter_m.value, one.scatter_m.low, one.scatter_m.high)
+        yield Finding.ranged(f"{name}: {word} scatter of D", ends, "mm", 1e3)
+        yield Finding(f"{name}: azimuth of the {word} scatter", one.azimuth_deg, unit="deg")
+    yield Finding(f"{name}: D", noise[0].depth_m, unit="m")
+    if test.tested:
+        yield Finding(f"{name}: largest over smallest scatter", test.ratio)
+        for word, p in (
+            ("the same scatter", test.p_value),
+            ("the same multiple of the bound", test.p_value_over_bound),
+        ):
+            yield Finding(f"{name}: p of {word} at all azimuths", max(p, _LEAST_P)).judged(">=", test.false_alarm)
+
+
+def bias_findings(name: str, noise: Sequence[AzimuthNoise]) -> Iterator[Finding]:
+    """Largest systematic error of the likelihood fits; none with too few estimates."""
+    usable = [one for one in noise if one.errors_m.size > 1]
+    if usable:
+        worst = max(usable, key=lambda one: abs(one.bias_m))
+        value, half = 1e3 * abs(worst.bias_m), 1e3 * _NORMAL_95 * worst.bias_sigma_m
+        yield Finding(f"{name}: largest mean error", value, value - half, value + half, "mm")
+        yield Finding(f"{name}: largest mean error over the scatter there", abs(worst.bias_m) / worst.scatter_m.value)
+        yield Finding(f"{name}: azimuth of the largest mean error", worst.azimuth_deg, unit="deg")
+
+
+def grid_findings(single: Array, averaged: Array) -> Iterator[Finding]:
+    """Largest over smallest bound of the vertical stroke, for one place in a Bayer cell and averaged over places.
+
+    The mosaic's grid makes the difference where averaging takes away more than half of the excess over 1.
+    """
+    one, mean = ratio(single), ratio(averaged)
+    yield Finding("even background: largest over smallest bound", one)
+    yield Finding("even background: the same, averaged over places in a Bayer cell", mean).judged(
+        "<=", 1.0 + 0.5 * (one - 1.0)
+    )
+
+
+def baseline_findings(azimuths_deg: Array, vertical: Array, horizontal: Array, baseline_m: float) -> Iterator[Finding]:
+    """Bounds of both baselines at the same length, and the share of azimuths at which the horizontal one is smaller."""
+    seen = np.isfinite(horizontal) & np.isfinite(vertical)
+    from_it = np.degrees(np.arcsin(np.abs(np.sin(np.radians(azimuths_deg)))))
+    yield Finding("length of both baselines", baseline_m, unit="m")
+    yield Finding(f"bound, {VERTICAL}, rms over azimuths", 1e3 * np.sqrt(np.mean(vertical[seen] ** 2)), unit="mm")
+    for word, each in (("across it", -from_it), ("nearest to its direction", from_it)):
+        i = int(np.argmin(np.where(seen, each, np.inf)))
+        yield Finding(f"bound, {HORIZONTAL}, {word}", 1e3 * horizontal[i], unit="mm")
+        yield Finding(f"bound, {HORIZONTAL}, {word}: angle from its direction", from_it[i], unit="deg")
+    better = 100.0 * float(np.mean(horizontal[seen] < vertical[seen]))
+    yield Finding("azimuths at which the horizontal baseline has the smaller bound", better, unit="%")
+
+
+def misaligned_findings(errors_by_baseline: Mapping[str, Array], words: str) -> Iterator[Finding]:
+    """Ends of the relative error over azimuths, with nominal numbers of a misaligned rig."""
+    for name, values in errors_by_baseline.items():
+        for word, value in (("smallest", np.nanmin(values)), ("largest", np.nanmax(values))):
+            yield Finding(f"{name}, {words}: {word} error of D", 100.0 * value, unit="%")
+        count = int(np.count_nonzero(np.isfinite(values)))
+        yield Finding(f"{name}, {words}: azimuths with an estimate", count, unit=f"of {values.size}")
+
+
+def occlusion_findings(hidden: pl.DataFrame, apart_m: float) -> Iterator[Finding]:
+    """Shares of all azimuths that two fixed sensors hide from each other, and one moving sensor from itself."""
+    for row in hidden.iter_rows(named=True):
+        label = f"hidden from each other, two sensors {apart_m:.3g} m apart, spot at {row['height_m']:g} m"
+        yield Finding(label, 100.0 * row["pair"], unit="%")
+    largest = 100.0 * float(np.max(hidden["own"].to_numpy()))
+    yield Finding("hidden from itself, one sensor that moves, largest", largest, unit="%").judged("<=", 0.0)
+
+
+def line_findings(aligned: Sequence[Line], tilted: Sequence[Line]) -> Iterator[Finding]:
+    """Distances of epipolar lines from the radius, the panorama's column, and their best straight line."""
+    for name, lines in (("aligned rig", aligned), ("misaligned rig", tilted)):
+        for word, key, unit in (
+            ("exact points beside the radius", "beside_radius_px", "px"),
+            ("rendered spots beside the radius", "rendered_beside_px", "px"),
+            ("panorama, beside the column", "bend_px", "columns"),
+            ("exact points beside a straight line", "beside_line_px", "px"),
+        ):
+            largest = max(getattr(line, key) for line in lines)
+            yield Finding(f"epipolar lines, {name}: {word}", largest, unit=unit).judged("<=", _STRAIGHT_PX)
+
+
+def edge_findings(name: str, edges: Sequence[SeenEdge]) -> Iterator[Finding]:
+    """Largest lean of the room's upright edges in the panorama, and its largest difference from the prediction."""
+    if edges:
+        worst = max(edges, key=lambda edge: abs(edge.lean_px))
+        lean, half = worst.lean_px, _NORMAL_95 * worst.lean_sigma_px
+        size = Finding("", abs(lean), max(abs(lean) - half, 0.0), abs(lean) + half).judged("<=", _STRAIGHT_PX)
+        label = f"upright edges, {name} rig: largest lean (threshold: of its size)"
+        yield replace(size, label=label, value=lean, low=lean - half, high=lean + half, unit="columns")
+        yield Finding(f"upright edges, {name} rig: rows of the edge with the largest lean", worst.rows)
+        miss = max(abs(edge.lean_px - edge.expected_lean_px) for edge in edges)
+        yield Finding(f"upright edges, {name} rig: largest difference from the prediction", miss, unit="columns")
+
+
+# -- small tables of the report ----------------------------------------------------------------------------------------
+
+
+def noise_rows(noise: Mapping[str, Sequence[AzimuthNoise]]) -> tuple[Row, ...]:
+    """Table: scatter, interval, bound and bias per baseline and azimuth."""
+    heads = ("baseline", "azimuth, degrees", "bound, mm", "scatter, mm (95 %)", "bias, mm", "fits missing")
+    return (
+        heads,
+        *(
+            (
+                name,
+                f"{one.azimuth_deg:.0f}",
+                f"{1e3 * one.bound_m:.2f}",
+                _interval(one),
+                f"{1e3 * one.bias_m:+.2f} +- {1e3 * one.bias_sigma_m:.2f}",
+                str(one.missing),
+            )
+            for name, rows in noise.items()
+            for one in rows
+        ),
+    )
+
+
+def edge_rows(edges: Mapping[str, Sequence[SeenEdge]]) -> tuple[Row, ...]:
+    """Table: upright edges in the panorama."""
+    heads = ("rig", "edge", "azimuth, degrees", "rows", "lean, columns", "predicted", "offset, columns")
+    return (
+        heads,
+        *(
+            (
+                name,
+                edge.name,
+                f"{edge.azimuth_deg:.1f}",
+                str(edge.rows),
+                f"{edge.lean_px:+.3f} +- {edge.lean_sigma_px:.3f}",
+                f"{edge.expected_lean_px:+.3f}",
+                f"{edge.offset_px:+.3f}",
+            )
+            for name, rows in edges.items()
+            for edge in rows
+        ),
+    )
+
+
+def ratio(values: Array) -> float:
+    """Largest over smallest; NaN without any."""
+    known = values[np.isfinite(values)]
+    return float(known.max() / known.min()) if known.size else math.nan
+
+
+def _interval(one: AzimuthNoise) -> str:
+    s = one.scatter_m
+    return f"{1e3 * s.value:.2f} ({1e3 * s.low:.2f} to {1e3 * s.high:.2f})"
 
 
 STUDY = Study(

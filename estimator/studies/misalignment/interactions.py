@@ -1,4 +1,4 @@
-"""Do misalignments add up? First-order and total Sobol indices of the relative error of D.
+"""Interactions of misalignments: first-order and total Sobol indices of the relative error of D.
 
 I. M. Sobol, Math. Comput. Simul. 55, 271 (2001); estimators of A. Saltelli et al., Comput. Phys. Commun. 181, 259
 (2010), as scipy has them. The parameters are uniform from minus to plus the study's magnitude, independent of each
@@ -7,7 +7,7 @@ other. First-order indices that sum to 1 mean errors that add; what is missing i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,11 +17,13 @@ from scipy import stats
 
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.geometry.sensitivities import PARAMETERS as ANALYTIC
-from phibench.estimator.studies.misaligned_rigs import Places, errors, errors_of_many
+from phibench.estimator.studies.findings import Finding
+from phibench.estimator.studies.misaligned_rigs import ALL, Places, errors, errors_of_many
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
 from phibench.scenes.rig import Rig
 
+_ADDITIVE = 0.9  # sum of the first-order indices from which errors add
 OUTPUTS = (("error", 2), ("square", 1))
 """Outputs, and the power whose mean is the mean square error."""
 
@@ -58,7 +60,9 @@ class Interactions:
         return self.indices[len(self.parameters) : -2]
 
 
-def moving(nominal: Rig, places: Places, estimators: tuple[str, ...]) -> tuple[str, ...]:
+def moving(
+    nominal: Rig, places: Places, estimators: tuple[str, ...], parameters: Sequence[str] = ALL
+) -> tuple[str, ...]:
     """Parameters of a spherical mirror that change any estimate at all, at the study's magnitude.
 
     Errors of form are left out: `errors_of_many` takes spheres.
@@ -66,15 +70,21 @@ def moving(nominal: Rig, places: Places, estimators: tuple[str, ...]) -> tuple[s
     aligned = errors(nominal, Misalignment(), places, estimators)
     return tuple(
         name
-        for name, one in PARAMETERS.items()
+        for name in parameters
         if name in ANALYTIC
-        and nominal.perturbed(Misalignment(**{name: one.study})).mirror.form is None
-        and np.max(np.abs(errors(nominal, Misalignment(**{name: one.study}), places, estimators) - aligned)) > 0.0
+        and nominal.perturbed(usual := Misalignment(**{name: PARAMETERS[name].study})).mirror.form is None
+        and np.max(np.abs(errors(nominal, usual, places, estimators) - aligned)) > 0.0
     )
 
 
 def interactions(
-    nominal: Rig, places: Places, estimator: str, n: int, resamples: int, rng: np.random.Generator
+    nominal: Rig,
+    places: Places,
+    estimator: str,
+    n: int,
+    resamples: int,
+    rng: np.random.Generator,
+    parameters: Sequence[str] = ALL,
 ) -> tuple[Interactions, ...]:
     """Indices for every D: of the relative error at the first azimuth, and of its square, averaged over azimuths.
 
@@ -88,13 +98,14 @@ def interactions(
     resamples : int
         Of the bootstrap.
     rng : Generator
+    parameters : names; those that move no chief ray are left out
 
     Raises
     ------
     DatasetError
         If a drawn rig has no estimate.
     """
-    names = moving(nominal, places, (estimator,))
+    names = moving(nominal, places, (estimator,), parameters)
     aligned = errors(nominal, Misalignment(), places, (estimator,))[0]
 
     size = np.array([PARAMETERS[name].study for name in names])
@@ -183,3 +194,22 @@ def rows(found: Sequence[Interactions], estimator: str, places: Places) -> list[
 def _cells(name: str, one: Interactions, i: int) -> dict[str, float]:
     low, high = float(one.low[i]), float(one.high[i])
     return {name: float(one.indices[i]), f"{name}_low": low, f"{name}_high": high}
+
+
+def interaction_findings(found: Sequence[Interactions]) -> Iterator[Finding]:
+    """All parameters drawn at once: rms change of D, sum of the first-order indices, largest total index."""
+    signed = [one for one in found if one.output == "error"]
+    for one in signed:
+        together = (one.indices[-1], one.low[-1], one.high[-1])
+        yield Finding.ranged(f"all drawn at once, rms change of D, D = {one.depth_m:g} m", together, "%", 100.0)
+    for one in signed:
+        first = (one.indices[-2], one.low[-2], one.high[-2])
+        total = Finding.ranged(f"sum of the first-order Sobol indices, D = {one.depth_m:g} m", first)
+        yield total.judged(">=", _ADDITIVE)
+        rest = (1.0 - first[0], 1.0 - first[2], 1.0 - first[1])
+        yield Finding.ranged(f"variance by interaction, D = {one.depth_m:g} m", rest, "%", 100.0)
+    one = max(signed, key=lambda each: float(np.max(each.total)))
+    top = int(np.argmax(one.total))
+    i = len(one.parameters) + top
+    label = f"largest total Sobol index ({one.parameters[top]}, D = {one.depth_m:g} m)"
+    yield Finding(label, one.total[top], one.low[i], one.high[i])

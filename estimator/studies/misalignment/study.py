@@ -1,6 +1,6 @@
-"""Settings of the study `misalignment`.
+"""Study `misalignment`: the cost of each misalignment for each estimator, predicted and rendered.
 
-Study: what each misalignment costs each estimator, predicted and rendered; tolerances, ranking, interactions.
+Tolerances, a ranking, the effect of a calibration, and interactions follow from the same closed forms.
 """
 
 from __future__ import annotations
@@ -13,15 +13,17 @@ import numpy as np
 import polars as pl
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
+from phibench.datasets.errors import DatasetError
 from phibench.datasets.progress import Steps
 from phibench.estimator.calibration.bundle import Bundle
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.estimator.studies.framework import Drawing, Material, Result, Settings, Study
+from phibench.estimator.studies.findings import Finding
+from phibench.estimator.studies.framework import Drawing, Result, Settings, Study, StudyDatasets
 from phibench.estimator.studies.misaligned_rigs import (
     CALIBRATED,
     NOMINAL,
-    Bench,
     Calibrate,
+    CalibrationSetup,
     Places,
     Rendered,
     pixels,
@@ -29,31 +31,32 @@ from phibench.estimator.studies.misaligned_rigs import (
     true_depth_m,
 )
 from phibench.estimator.studies.misalignment.drawings import azimuth_drawing, interaction_drawing, ranking_drawing
-from phibench.estimator.studies.misalignment.interactions import Interactions, interactions, rows
+from phibench.estimator.studies.misalignment.interactions import Interactions, interaction_findings, interactions, rows
 from phibench.estimator.studies.misalignment.tables import (
     Rank,
     Search,
-    calibrated_sentence,
-    interaction_sentence,
-    noise_sentence,
-    ranked,
+    calibrated_findings,
+    cost_findings,
+    noise_findings,
     ranking,
     ranking_rows,
-    rendered_sentence,
+    rendered_findings,
     rendered_table,
+    slope_findings,
     slope_misses,
-    slope_sentence,
     study_table,
+    tightest_table,
+    tolerance_findings,
     tolerance_rows,
-    tolerance_sentence,
     tolerance_table,
     worst_disagreement,
 )
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Array
-from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.misalignment import PARAMETERS, Misalignment
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
+from phibench.scenes.validation import nearest
 
 
 def _tuples(value: object) -> object:
@@ -67,7 +70,7 @@ Spot = tuple[Distance, Annotated[float, Field(ge=-360.0, le=360.0)]]
 
 
 class SearchSettings(BaseModel):
-    """Values of a parameter that are tried, in units of the study's magnitude."""
+    """Values of a parameter that are tried, in units of its usual size."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
@@ -95,6 +98,9 @@ class MisalignmentSettings(Settings):
     noise_draws: int = Field(ge=2, le=10000, description="calibrations of the aligned rig from noisy measurements")
     sobol_log2: int = Field(ge=3, le=16, description="base sample of the Sobol indices: 2 to this power")
     resamples: int = Field(ge=20, le=100000, description="of the bootstrap")
+    parameters: Annotated[tuple[str, ...], BeforeValidator(_tuples)] = Field(
+        default=(), description="misalignments; all if empty"
+    )
 
     @property
     def azimuths_rad(self) -> Array:
@@ -107,13 +113,27 @@ class MisalignmentSettings(Settings):
         return Places(np.array(self.depths_m), azimuths, self.height_m, stroke_m)
 
     @property
-    def bench(self) -> Bench:
-        """How a rig is calibrated."""
+    def chosen(self) -> tuple[str, ...]:
+        """Names of the misalignments.
+
+        Raises
+        ------
+        DatasetError
+            If there is none of such a name.
+        """
+        for name in self.parameters:
+            if name not in PARAMETERS:
+                raise DatasetError(f"parameters: no misalignment '{name}'; {nearest(name, tuple(PARAMETERS))}")
+        return self.parameters or tuple(PARAMETERS)
+
+    @property
+    def calibration_setup(self) -> CalibrationSetup:
+        """Simulated calibration of a rig."""
         spots = [
             (D * math.cos(math.radians(a)), D * math.sin(math.radians(a)), self.height_m)
             for D, a in self.calibration_spots
         ]
-        return Bench(
+        return CalibrationSetup(
             np.array(spots),
             self.calibration_pixel_sigma_px,
             self.calibration_distance_sigma_m,
@@ -121,7 +141,7 @@ class MisalignmentSettings(Settings):
         )
 
     def tolerance_search(self, calibrated: bool = False) -> Search:
-        """How a tolerance is looked for."""
+        """Search for a tolerance."""
         how = self.search_calibrated if calibrated else self.search
         return Search(self.cost, how.start, how.largest, how.factor)
 
@@ -130,20 +150,20 @@ _PARTS = 5  # table, rendered spots, tolerances, interactions, calibrations with
 _SLOPE_TARGET = 1e-3  # of D: a slope that misses by more is said to be not enough
 
 
-def run(settings: MisalignmentSettings, material: Material) -> Result:
+def run(settings: MisalignmentSettings, datasets: StudyDatasets) -> Result:
     """Run the study; it renders spots itself and needs no data set."""
     nominal = default_rig()
     strokes = [settings.places(stroke) for stroke in settings.strokes_m]
-    places = strokes[0]
+    places, names = strokes[0], settings.chosen
     calibrate = _calibration(settings, nominal, places.stroke_m)
-    with Steps(material.console, "misalignment, parts", _PARTS) as steps:
-        table = study_table(nominal, strokes, calibrate)
+    with Steps(datasets.console, "misalignment, parts", _PARTS) as steps:
+        table = study_table(nominal, strokes, calibrate, names)
         steps.advance()
         some = settings.places(places.stroke_m, settings.azimuths_rad[1 :: settings.rendered_every])
-        seen = tuple(rendered(nominal, some))
+        seen = tuple(rendered(nominal, some, names))
         steps.advance()
         fine, coarse = settings.tolerance_search(), settings.tolerance_search(calibrated=True)
-        tolerances = list(tolerance_rows(nominal, places, fine, coarse, calibrate))
+        tolerances = list(tolerance_rows(nominal, places, fine, coarse, calibrate, names))
         steps.advance()
         drawn = _interactions(settings, nominal, places.stroke_m)
         steps.advance()
@@ -151,6 +171,7 @@ def run(settings: MisalignmentSettings, material: Material) -> Result:
         steps.advance()
     ranks = {name: ranking(table, name, places.stroke_m) for name in (*NOMINAL, CALIBRATED)}
     pictures = rendered_table(seen, some)
+    middle = float(places.depths_m[len(places.depths_m) // 2])
     return Result(
         {
             "table": table.join(pictures.drop("whole_relative"), on=_KEYS, how="left"),
@@ -162,6 +183,9 @@ def run(settings: MisalignmentSettings, material: Material) -> Result:
         {
             "Change of D by a misalignment of the usual size, %, rms over azimuths and signs; exact estimator, nominal "
             "numbers and calibrated": ranking_rows(ranks["exact"], ranks[CALIBRATED]),
+            f"Tolerances at D = {middle:g} m, exact estimator with nominal numbers": (
+                tightest_table(tolerances, "exact", middle, settings.cost)
+            ),
             f"Value that costs {100.0 * settings.cost:g} % of D, rms over azimuths and signs; - is never reached": (
                 tolerance_table(tolerances, "rms", ("exact", "paper_normal", CALIBRATED))
             ),
@@ -178,11 +202,11 @@ _KEYS = ["parameter", "unit", "value", "estimator", "stroke_m", "height_m", "dep
 
 def _calibration(settings: MisalignmentSettings, nominal: Rig, stroke_m: float) -> Calibrate:
     """Calibrations of a run, each done once: the table and the tolerances ask for the same."""
-    bench = settings.bench
+    setup = settings.calibration_setup
 
     @cache
     def calibrated(misalignment: Misalignment) -> Bundle:
-        return bench.calibrated(nominal, stroke_m, misalignment)
+        return setup.calibrated(nominal, stroke_m, misalignment)
 
     return calibrated
 
@@ -191,17 +215,17 @@ def _interactions(settings: MisalignmentSettings, nominal: Rig, stroke_m: float)
     # four azimuths give the mean of all terms up to the third harmonic, and the first one is world x
     places = settings.places(stroke_m, np.radians([0.0, 90.0, 180.0, 270.0]))
     rng = generator("study", "misalignment", "sobol")
-    return interactions(nominal, places, "exact", 2**settings.sobol_log2, settings.resamples, rng)
+    return interactions(nominal, places, "exact", 2**settings.sobol_log2, settings.resamples, rng, settings.chosen)
 
 
 def _noise(settings: MisalignmentSettings, nominal: Rig, places: Places) -> Array:
     """Relative errors of an aligned rig that was calibrated with noise, shape (draws, d, a)."""
     down, up = pixels(nominal, Misalignment(), places)
-    D, bench = true_depth_m(nominal, Misalignment(), places), settings.bench
+    D, setup = true_depth_m(nominal, Misalignment(), places), settings.calibration_setup
     errors = []
     for draw in range(settings.noise_draws):
         rng = generator("study", "misalignment", "calibration", draw)
-        found = bench.calibrated(nominal, places.stroke_m, Misalignment(), rng)
+        found = setup.calibrated(nominal, places.stroke_m, Misalignment(), rng)
         errors.append(depth_exact(found.rig, found.stroke(np.asarray(places.stroke_m)), down, up).depth_m / D - 1.0)
     return np.stack(errors)
 
@@ -215,17 +239,17 @@ def _findings(
     noise: Array,
     ranks: dict[str, list[Rank]],
     places: Places,
-) -> tuple[str, ...]:
+) -> tuple[Finding, ...]:
     middle = float(places.depths_m[len(places.depths_m) // 2])
     return (
-        ranked(ranks["exact"], "the exact estimator with nominal numbers"),
-        ranked(ranks["paper_normal"], "eq. (4) with phi_normal"),
-        slope_sentence(slope_misses(table, "exact"), _SLOPE_TARGET),
-        rendered_sentence(seen, settings.agreement),
-        tolerance_sentence(tolerances, "exact", middle, settings.cost),
-        calibrated_sentence(ranks[CALIBRATED], ranks["exact"]),
-        noise_sentence(noise, places.depths_m),
-        interaction_sentence(drawn),
+        *cost_findings(ranks["exact"]),
+        *cost_findings(ranks["paper_normal"]),
+        *slope_findings(slope_misses(table, "exact"), _SLOPE_TARGET),
+        *rendered_findings(seen, settings.agreement),
+        *tolerance_findings(tolerances, "exact", middle, settings.cost),
+        *calibrated_findings(ranks[CALIBRATED], ranks["exact"]),
+        *noise_findings(noise, places.depths_m),
+        *interaction_findings(drawn),
     )
 
 

@@ -1,8 +1,7 @@
-"""Tolerance table: which value of each parameter costs a given part of D.
+"""Tables and findings of the study `misalignment`.
 
-Main table of the study `misalignment`: a row per parameter, value, spot and estimator.
-
-What the study `misalignment` says: sentences from numbers.
+Main table: a row per parameter, value, spot and estimator. Tolerance table: the value of each parameter that costs a
+given part of D. Findings and the small tables of the report are made from both.
 """
 
 from __future__ import annotations
@@ -17,8 +16,9 @@ import polars as pl
 from scipy import stats
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.studies.framework import Row
+from phibench.estimator.studies.findings import Finding, Row
 from phibench.estimator.studies.misaligned_rigs import (
+    ALL,
     CALIBRATED,
     NOMINAL,
     Calibrate,
@@ -28,7 +28,6 @@ from phibench.estimator.studies.misaligned_rigs import (
     errors,
     slopes,
 )
-from phibench.estimator.studies.misalignment.interactions import Interactions
 from phibench.estimator.studies.statistics import first_crossing
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
@@ -60,15 +59,21 @@ class Search:
 
 
 def tolerance_rows(
-    nominal: Rig, places: Places, search: Search, coarse: Search, calibrate: Calibrate
+    nominal: Rig,
+    places: Places,
+    search: Search,
+    coarse: Search,
+    calibrate: Calibrate,
+    parameters: Sequence[str] = ALL,
 ) -> Iterator[dict[str, Any]]:
     """One row per parameter, estimator, D and statistic over azimuths and signs; value None where it is never reached.
 
     Parameters
     ----------
     nominal, places, calibrate
-    search : for the estimators that believe the nominal rig
+    search : for the estimators with the nominal rig
     coarse : for the calibrated one, which takes a second a value
+    parameters : names
     """
 
     def by_nominal(m: Misalignment) -> Array:
@@ -79,7 +84,7 @@ def tolerance_rows(
 
     for names, of, how in ((NOMINAL, by_nominal, search), ((CALIBRATED,), by_calibrated, coarse)):
         aligned = of(Misalignment())
-        for parameter in PARAMETERS:
+        for parameter in parameters:
             values = tolerance(nominal, parameter, of, aligned, how)
             for i, estimator in enumerate(names):
                 for j, depth in enumerate(places.depths_m):
@@ -147,8 +152,10 @@ def _row(
 PLACE = ("depth_m", "azimuth_deg")
 
 
-def study_table(nominal: Rig, strokes: Sequence[Places], calibrate: Calibrate) -> pl.DataFrame:
-    """Every parameter at plus and minus its study's magnitude; the calibrated estimator at the first stroke only.
+def study_table(
+    nominal: Rig, strokes: Sequence[Places], calibrate: Calibrate, parameters: Sequence[str] = ALL
+) -> pl.DataFrame:
+    """Each parameter at plus and minus its study's magnitude; the calibrated estimator at the first stroke only.
 
     Columns
     -------
@@ -157,8 +164,9 @@ def study_table(nominal: Rig, strokes: Sequence[Places], calibrate: Calibrate) -
     whole_relative : change of it by the misalignment
     first_order_relative : slope times value; null for the calibrated estimator
     """
-    parts = [_nominal(nominal, places) for places in strokes]
-    return pl.concat([*parts, _calibrated(nominal, strokes[0], calibrate)])
+    values = _values(nominal, parameters)
+    parts = [_nominal(nominal, places, values) for places in strokes]
+    return pl.concat([*parts, _calibrated(nominal, strokes[0], calibrate, values)])
 
 
 def rendered_table(found: Sequence[Rendered], places: Places) -> pl.DataFrame:
@@ -174,10 +182,14 @@ def rendered_table(found: Sequence[Rendered], places: Places) -> pl.DataFrame:
     return pl.concat(frames)
 
 
-def _nominal(nominal: Rig, places: Places) -> pl.DataFrame:
-    slope, aligned = slopes(nominal, places), errors(nominal, Misalignment(), places)
+Values = Sequence[tuple[str, float]]
+
+
+def _nominal(nominal: Rig, places: Places, values: Values) -> pl.DataFrame:
+    names = list(dict.fromkeys(name for name, _ in values))
+    slope, aligned = slopes(nominal, places, parameters=names), errors(nominal, Misalignment(), places)
     frames = []
-    for parameter, value in _values(nominal):
+    for parameter, value in values:
         found = errors(nominal, Misalignment(**{parameter: value}), places)
         for i, name in enumerate(NOMINAL):
             columns = {
@@ -189,10 +201,10 @@ def _nominal(nominal: Rig, places: Places) -> pl.DataFrame:
     return pl.concat(frames)
 
 
-def _calibrated(nominal: Rig, places: Places, calibrate: Calibrate) -> pl.DataFrame:
+def _calibrated(nominal: Rig, places: Places, calibrate: Calibrate, values: Values) -> pl.DataFrame:
     aligned = calibrated_or_lost(nominal, Misalignment(), places, calibrate)
     frames = []
-    for parameter, value in _values(nominal):
+    for parameter, value in values:
         found = calibrated_or_lost(nominal, Misalignment(**{parameter: value}), places, calibrate)
         columns = {
             "error_relative": found,
@@ -203,8 +215,10 @@ def _calibrated(nominal: Rig, places: Places, calibrate: Calibrate) -> pl.DataFr
     return pl.concat(frames)
 
 
-def _values(nominal: Rig) -> list[tuple[str, float]]:
-    return [(name, sign * one.study) for name, one in PARAMETERS.items() for sign in signs(nominal, name, one.study)]
+def _values(nominal: Rig, parameters: Sequence[str]) -> list[tuple[str, float]]:
+    """Parameters at plus and minus their usual size, as far as such a rig can be."""
+    usual = {name: PARAMETERS[name].study for name in parameters}
+    return [(name, sign * size) for name, size in usual.items() for sign in signs(nominal, name, size)]
 
 
 def _frame(parameter: str, value: float, estimator: str, places: Places, columns: dict[str, Array]) -> pl.DataFrame:
@@ -237,7 +251,7 @@ def ranking(table: pl.DataFrame, estimator: str, stroke_m: float) -> list[Rank]:
     """Parameters by their largest rms over all D, the costliest first; over azimuths and both signs."""
     mine = table.filter((pl.col("estimator") == estimator) & (pl.col("stroke_m") == stroke_m))
     ranks = []
-    for parameter in PARAMETERS:
+    for parameter in mine["parameter"].unique(maintain_order=True):
         rows = mine.filter(pl.col("parameter") == parameter).sort("depth_m", "azimuth_deg", "value")
         depths = rows["depth_m"].unique(maintain_order=True).to_numpy()
         changes = rows["whole_relative"].fill_null(np.nan).to_numpy().reshape(len(depths), -1)
@@ -254,45 +268,38 @@ def slope_misses(table: pl.DataFrame, estimator: str) -> tuple[str, float, float
     return str(last["parameter"]), float(last["depth_m"]), float(last["off"])
 
 
-_LISTED = 5
-_ADDITIVE = 0.9
-_NOTABLE = 1e-3  # of D: a change of less is not worth a word
+# -- findings ------------------------------------------------------------------------------------------------------
+
+_LISTED = 5  # costliest parameters
+_LEFT = 3  # of them after a calibration
+_NOTABLE = 1e-3  # of D: a smaller change counts as none
 _SCALES = {"m": (1e3, "mm"), "rad": (math.degrees(1.0), "deg"), "px": (1.0, "px"), "1": (1.0, "")}
 
 
-def ranked(ranks: Sequence[Rank], estimator_words: str) -> str:
-    """Which parameters cost most, at the nearest and the farthest D."""
-    first, last = ranks[0].depths_m[0], ranks[0].depths_m[-1]
-    parts = [
-        f"{one.parameter} ({shown(one.parameter, PARAMETERS[one.parameter].study)}) "
-        f"{percent(one.rms[0])} and {percent(one.rms[-1])}"
-        for one in ranks[:_LISTED]
-    ]
-    return (
-        f"With misalignments of the usual size, one at a time, {estimator_words} changes most (rms over azimuths and "
-        f"signs, % of D at D = {first:g} and {last:g} m) by {'; '.join(parts)}."
-    )
+def cost_findings(ranks: Sequence[Rank]) -> Iterator[Finding]:
+    """Costliest parameters of one estimator at the usual size, at the nearest and the farthest D."""
+    for one in ranks[:_LISTED]:
+        for i in (0, -1):
+            size = shown(one.parameter, PARAMETERS[one.parameter].study)
+            label = f"change of D, {one.estimator}: {one.parameter} {size}, D = {one.depths_m[i]:g} m"
+            yield Finding(label, 100.0 * one.rms[i], unit="%")
 
 
-def slope_sentence(miss: tuple[str, float, float], target: float) -> str:
-    """How far the sensitivities alone lead."""
+def slope_findings(miss: tuple[str, float, float], target: float) -> Iterator[Finding]:
+    """Largest difference of slope times error and whole change: the reach of the sensitivities alone."""
     name, depth, off = miss
-    verdict = "slopes do" if off <= target else "slopes are not enough for errors of this size"
-    size = f"{percent(off)} % of D ({name}, D = {depth:g} m)"
-    return f"Slope times error misses the whole change by at most {size}: {verdict}."
+    label = f"slope times error against the whole change, largest difference ({name}, D = {depth:g} m)"
+    yield Finding(label, 100.0 * off, unit="% of D").judged("<=", 100.0 * target)
 
 
-def rendered_sentence(found: Sequence[Rendered], tolerance: float) -> str:
-    """Whether rendered spots move D as predicted."""
+def rendered_findings(found: Sequence[Rendered], tolerance: float) -> Iterator[Finding]:
+    """Rendered against predicted changes of D, from centroids of noise-free layers."""
     off, name = worst_disagreement(found)
-    count = sum(one.change.size for one in found)
-    shift = max(one.centroid_px for one in found)
-    verdict = "as predicted" if off <= tolerance else "not as predicted"
-    return (
-        f"Rendered spots (centroids of noise-free layers, {count} estimates) move D {verdict}: the largest difference "
-        f"is {off:.1e} of D ({name}), {tolerance:.0e} are allowed; centroid and chief ray drift apart by at most "
-        f"{1e3 * shift:.2f} mpx."
-    )
+    worst = Finding(f"rendered against predicted change of D, largest difference ({name})", off, unit="of D")
+    yield worst.judged("<=", tolerance)
+    yield Finding("rendered estimates", sum(one.change.size for one in found))
+    drift = 1e3 * max(one.centroid_px for one in found)
+    yield Finding("centroid against chief ray, largest drift by a misalignment", drift, unit="mpx")
 
 
 def worst_disagreement(found: Sequence[Rendered]) -> tuple[float, str]:
@@ -304,48 +311,46 @@ def worst_disagreement(found: Sequence[Rendered]) -> tuple[float, str]:
     return max(sizes)
 
 
-def tolerance_sentence(rows: Sequence[dict[str, Any]], estimator: str, depth_m: float, cost: float) -> str:
-    """Which values cost that part of D, the tightest against the study's magnitude first."""
-    mine = [
-        row for row in rows if row["estimator"] == estimator and row["statistic"] == "rms" and row["depth_m"] == depth_m
-    ]
-    reached = sorted((row for row in mine if row["value"] is not None), key=lambda row: float(row["value_over_study"]))
-    tight = [row for row in reached if row["value_over_study"] < 1.0]
-    parts = ", ".join(f"{row['parameter']} {shown(row['parameter'], row['value'])}" for row in reached[:_LISTED])
-    never = [row["parameter"] for row in mine if row["value"] is None]
-    rest = f"; within the range searched {_list(never)} never {'does' if len(never) == 1 else 'do'}" if never else ""
-    head = (
-        f"{percent(cost)} % of D at D = {depth_m:g} m (rms over azimuths, exact estimator, nominal numbers) is cost by"
-    )
-    return f"{head} {parts or 'none'}; {len(tight)} of {len(mine)} parameters do so below their usual size{rest}."
+def tolerance_findings(
+    rows: Sequence[dict[str, Any]], estimator: str, depth_m: float, cost: float
+) -> Iterator[Finding]:
+    """Tightest tolerances against the usual sizes, and the number of parameters that exceed theirs."""
+    mine = _tolerances(rows, estimator, depth_m)
+    reached = [row for row in mine if row["value"] is not None]
+    head = f"tolerance for {100.0 * cost:g} % of D, {estimator}, D = {depth_m:g} m"
+    for row in reached[:_LISTED]:
+        scale, unit = _SCALES[PARAMETERS[row["parameter"]].unit]
+        yield Finding(f"{head}: {row['parameter']}", scale * row["value"], unit=unit)
+    tight = sum(row["value_over_study"] < 1.0 for row in reached)
+    yield Finding(f"{head}: parameters below their usual size", tight, unit=f"of {len(mine)}")
+    never = ", ".join(row["parameter"] for row in mine if row["value"] is None)
+    yield Finding(f"{head}: parameters that never reach it ({never or 'none'})", len(mine) - len(reached))
 
 
-def calibrated_sentence(ranks: Sequence[Rank], before: Sequence[Rank]) -> str:
-    """What is left after a calibration."""
-    far = max(float(np.max(one.rms)) for one in before)
-    left = [f"{one.parameter} {percent(one.rms[0])} and {percent(one.rms[-1])}" for one in ranks[:3]]
-    largest = float(np.max(ranks[0].rms))
-    size = "less" if largest < far else "no less"
+def calibrated_findings(ranks: Sequence[Rank], before: Sequence[Rank]) -> Iterator[Finding]:
+    """Change of D that a calibration leaves, and the parameters that it makes worse."""
+    far = 100.0 * max(float(np.max(one.rms)) for one in before)
+    yield Finding("largest change of D before a calibration", far, unit="%")
+    left = Finding("largest change of D after a calibration", 100.0 * float(np.max(ranks[0].rms)), unit="%")
+    yield left.judged("<=", far)
+    for one in ranks[:_LEFT]:
+        for i in (0, -1):
+            label = f"change of D after a calibration: {one.parameter}, D = {one.depths_m[i]:g} m"
+            yield Finding(label, 100.0 * one.rms[i], unit="%")
     untouched = {one.parameter: one for one in before}
-    worse = [one.parameter for one in ranks if bool(np.any(one.rms > untouched[one.parameter].rms + _NOTABLE))]
-    harm = f"; it makes {_list(worse)} worse" if worse else ""
-    return (
-        f"After a calibration from the outline and a few spots {size} is left: at most {percent(largest)} % of D "
-        f"against {percent(far)} %; the largest, at D = {ranks[0].depths_m[0]:g} and {ranks[0].depths_m[-1]:g} m, "
-        f"are {'; '.join(left)}{harm}."
-    )
+    for one in ranks:
+        excess = 100.0 * float(np.max(one.rms - untouched[one.parameter].rms))
+        if not excess <= 100.0 * _NOTABLE:
+            worse = Finding(f"change of D that a calibration adds: {one.parameter}", excess, unit="%")
+            yield worse.judged("<=", 100.0 * _NOTABLE)
 
 
-def noise_sentence(noise: Array, depths_m: Array) -> str:
+def noise_findings(noise: Array, depths_m: Array) -> Iterator[Finding]:
     """Noise of the calibration's own measurements, shape (draws, d, a)."""
     low, rms, high = noise_intervals(noise)
-    parts = [
-        f"{percent(r)} ({percent(a)} to {percent(b)}) % at {D:g} m"
-        for D, a, r, b in zip(depths_m, low, rms, high, strict=True)
-    ]
-    return (
-        f"The calibration's own noise, an aligned rig calibrated {len(noise)} times, costs {', '.join(parts)} (95 %)."
-    )
+    for D, *ends in zip(depths_m, rms, low, high, strict=True):
+        label = f"noise of the calibration, {len(noise)} calibrations of an aligned rig, D = {D:g} m"
+        yield Finding.ranged(label, ends, "%", 100.0)
 
 
 def noise_intervals(noise: Array) -> tuple[Array, Array, Array]:
@@ -361,23 +366,30 @@ def noise_intervals(noise: Array) -> tuple[Array, Array, Array]:
     return rms / half, rms, rms * half
 
 
-def interaction_sentence(found: Sequence[Interactions]) -> str:
-    """Whether errors add up."""
-    signed = [one for one in found if one.output == "error"]
-    sums = [f"{one.indices[-2]:.2f} ({one.low[-2]:.2f} to {one.high[-2]:.2f}) at {one.depth_m:g} m" for one in signed]
-    all_high, any_low = all(one.low[-2] >= _ADDITIVE for one in signed), any(one.high[-2] < _ADDITIVE for one in signed)
-    verdict = "they add" if all_high else "they do not simply add" if any_low else "whether they add is not decided"
-    biggest = max(signed, key=lambda one: float(np.max(one.total)))
-    top = int(np.argmax(biggest.total))
-    together = ", ".join(
-        f"{percent(one.indices[-1])} ({percent(one.low[-1])} to {percent(one.high[-1])}) % at {one.depth_m:g} m"
-        for one in signed
-    )
+def _tolerances(rows: Sequence[dict[str, Any]], estimator: str, depth_m: float) -> list[dict[str, Any]]:
+    """Rms tolerances of an estimator at one D, the tightest against the usual size first, those never reached last."""
+    mine = [r for r in rows if (r["estimator"], r["statistic"], r["depth_m"]) == (estimator, "rms", depth_m)]
+    return sorted(mine, key=lambda r: math.inf if r["value_over_study"] is None else float(r["value_over_study"]))
+
+
+# -- small tables of the report ----------------------------------------------------------------------------------------
+
+
+def tightest_table(rows: Sequence[dict[str, Any]], estimator: str, depth_m: float, cost: float) -> tuple[Row, ...]:
+    """Table: tolerance of every parameter at one D beside the expected deviation, and their ratio."""
+    heads = ("parameter", f"tolerance for {100.0 * cost:g} % of D", "expected deviation", "ratio")
     return (
-        f"All drawn at once, uniform up to their usual size, they cost {together} of D (rms, 95 %, spots along x); "
-        f"the first-order Sobol indices sum to {', '.join(sums)}: {verdict}; the largest total index is "
-        f"{biggest.total[top]:.2f} ({biggest.low[len(biggest.parameters) + top]:.2f} to "
-        f"{biggest.high[len(biggest.parameters) + top]:.2f}), {biggest.parameters[top]} at {biggest.depth_m:g} m."
+        heads,
+        *(
+            (
+                row["parameter"],
+                shown(row["parameter"], row["value"]),
+                shown(row["parameter"], PARAMETERS[row["parameter"]].study),
+                f"{row['value_over_study']:.2g}",
+            )
+            for row in _tolerances(rows, estimator, depth_m)
+            if row["value"] is not None
+        ),
     )
 
 
@@ -409,7 +421,7 @@ def tolerance_table(rows: Sequence[dict[str, Any]], statistic: str, estimators: 
         heads,
         *(
             (p, *(_cell(p, mine[p, name, D]) for name in estimators for D in depths))
-            for p in PARAMETERS
+            for p in dict.fromkeys(parameter for parameter, _, _ in mine)
             if any(mine[p, name, D] is not None for name in estimators for D in depths)
         ),
     )
@@ -428,7 +440,3 @@ def percent(relative: float) -> str:
 
 def _cell(parameter: str, value: float | None) -> str:
     return "-" if value is None else shown(parameter, value)
-
-
-def _list(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -26,14 +26,14 @@ from phibench.estimator.benchmark.records import record_table
 from phibench.estimator.interface import Answer, Outcome, Pair
 from phibench.estimator.methods.raw_likelihood import joint_of
 from phibench.estimator.methods.registry import METHODS
-from phibench.estimator.studies.framework import Material
+from phibench.estimator.studies.framework import StudyDatasets
 from phibench.estimator.studies.image_cutout import (
     Shot,
     SpotPair,
     bounds_of,
     cut_region,
     cut_rig,
-    taken,
+    drawn_pair,
     truth_of,
     without_off,
 )
@@ -168,7 +168,7 @@ def cell_records(cell: Cell) -> pl.DataFrame:
             number, nominal = k * cell.draws + draw, (spot.rig, spot.stroke_m)
             bounds = steady or bounds_of(shot, spot, names)
             truths.append(truth_of(number, shot, spot, nominal, bounds, draw))
-            pairs.append(taken(number, shot, spot, nominal, names, cell.box_px))
+            pairs.append(drawn_pair(number, shot, spot, nominal, names, cell.box_px))
     answers = [answered(pair, cell.methods) for pair in pairs]
     tables = []
     for name in answers[0]:
@@ -195,11 +195,11 @@ def answered(pair: Pair, methods: Sequence[str]) -> dict[str, tuple[Answer, floa
     return found
 
 
-def all_records(cells: Sequence[Cell], material: Material) -> pl.DataFrame:
-    """Records of many cells, computed by the material's workers."""
-    with Steps(material.console, "noise", len(cells)) as steps:
+def all_records(cells: Sequence[Cell], datasets: StudyDatasets) -> pl.DataFrame:
+    """Records of many cells, computed by the workers of the data sets."""
+    with Steps(datasets.console, "noise", len(cells)) as steps:
         tables = []
-        for table in parallel_map(cell_records, cells, material.workers):
+        for table in parallel_map(cell_records, cells, datasets.workers):
             tables.append(table)
             steps.advance()
     return pl.concat(tables)

@@ -15,20 +15,20 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import Dataset
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.methods.registry import METHODS
-from phibench.estimator.studies.framework import Drawing, Material, Result, Row, Settings, Study
+from phibench.estimator.studies.findings import Finding, Row
+from phibench.estimator.studies.framework import Drawing, Result, Settings, Study, StudyDatasets
 from phibench.estimator.studies.noise.cells import BASE, FACTORS, Cell, all_records, applied
 from phibench.estimator.studies.noise.drawings import error_drawing, ranking_drawing
 from phibench.estimator.studies.noise.tables import (
     REFERENCE,
-    base_sentence,
+    base_findings,
     base_table,
     elasticities,
-    floor_sentence,
-    leaving_sentence,
-    ranking_sentence,
+    floor_findings,
+    limit_findings,
+    ranking_findings,
     ranking_table,
     table_of,
-    useless_sentence,
     with_levels,
 )
 from phibench.render.sensor.settings import SensorError
@@ -73,11 +73,11 @@ class NoiseSettings(Settings):
     levels: LevelSettings = Field(description="levels by factor; the base is added")
 
 
-def run(settings: NoiseSettings, material: Material) -> Result:
+def run(settings: NoiseSettings, datasets: StudyDatasets) -> Result:
     """Run the study."""
-    dataset = material.dataset(settings.recipe)
+    dataset = datasets.dataset(settings.recipe)
     planned = cells(settings, dataset)
-    records = with_levels(all_records(planned, material), settings.levels.given)
+    records = with_levels(all_records(planned, datasets), settings.levels.given)
     rules = Rules(resamples=settings.resamples)
     table = table_of(records, rules)
     slopes = elasticities(records, rules)
@@ -87,14 +87,13 @@ def run(settings: NoiseSettings, material: Material) -> Result:
         for e in slopes
     ]
     shown: dict[str, tuple[Row, ...]] = {}
-    findings, pictures = [], list[Drawing]()
+    findings, pictures = list[Finding](), list[Drawing]()
     for preset in settings.presets:
         for sample in settings.samples:
-            findings.append(base_sentence(table, sample, preset))
-            findings.append(floor_sentence(table, sample, preset))
-            findings.append(leaving_sentence(table, sample, preset))
-            findings.append(useless_sentence(table, sample, preset))
-            findings.append(ranking_sentence(slopes, sample, preset))
+            findings += base_findings(table, sample, preset)
+            findings += floor_findings(table, sample, preset)
+            findings += limit_findings(table, sample, preset)
+            findings += ranking_findings(slopes, sample, preset)
             shown[f"{preset}, {sample}: base case, 95 % intervals over places"] = base_table(table, sample, preset)
             shown[f"{preset}, {sample}: elasticities of {REFERENCE[preset]}"] = ranking_table(slopes, sample, preset)
         pictures.append(error_drawing(table, settings.samples[0], preset))

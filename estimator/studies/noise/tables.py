@@ -1,13 +1,13 @@
-"""Numbers of the study `noise`: a row per base case, preset, factor, level and method, and elasticities.
+"""Numbers of the study `noise`: rows per base case, preset, factor, level and method, elasticities, findings.
 
-What the numbers of the study `noise` say, in sentences and small tables.
+The bound is that of one image. The reference method fits each image by itself with the model of its noise.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ import polars as pl
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.intervals import Estimate, Statistic, estimates
 from phibench.estimator.benchmark.metrics import Measured, measure, prepared
-from phibench.estimator.studies.framework import Row
+from phibench.estimator.studies.findings import Finding, Row
 from phibench.estimator.studies.noise.cells import BASE, FACTORS, NAMES, rms_by_place, within_place_px
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
@@ -153,7 +153,7 @@ def _slope_of(sums: list[tuple[Array, Array]], width: float) -> Statistic:
 
 
 REFERENCE = {"bayer-raw": "raw_maximum_likelihood", "srgb8": "chain_fit", "mjpeg": "chain_fit"}
-"""The method that fits each image by itself with the model of its noise: what the bound of one image is for."""
+"""Reference method by preset."""
 FLOOR = 2.0
 """A method has a floor where its error is surely above so many times the bound with the strongest signal."""
 FEW = 0.9
@@ -164,104 +164,72 @@ ABOVE = 1.25
 """The reference method leaves the bound where it is surely so many times above it."""
 
 
-def base_sentence(table: pl.DataFrame, sample: str, preset: str) -> str:
+def base_findings(table: pl.DataFrame, sample: str, preset: str) -> Iterator[Finding]:
     """Error of the reference method in the base case beside the bound."""
-    row = _one(table, sample, preset, BASE, REFERENCE[preset])
+    lead, method = f"{preset}, {sample}", REFERENCE[preset]
+    row = _one(table, sample, preset, BASE, method)
     if row is None or not _is_number(row["rms_px"]):
-        return f"{preset}, {sample}: {REFERENCE[preset]} finds no spot in the base case."
-    return (
-        f"{preset}, {sample}: {REFERENCE[preset]} places the spot to {_with(row, 'rms_px', 1e3, 'mpx rms')}, the bound "
-        f"being {1e3 * row['bound_px']:.3g} mpx (rms / bound {_ratio(row)}); phi to "
-        f"{_with(row, 'rms_phi_rad', 1e3, 'mrad')}, D to {_with(row, 'rms_depth_relative', 100.0, '%')} "
-        f"(bound {_percent(row['bound_depth_relative'])})."
-    )
+        yield Finding(f"{lead}: {method}, rms distance", None, unit="mpx")
+        return
+    yield Finding(f"{lead}: {method}, rms distance", *_ends(row, "rms_px", 1e3), "mpx")
+    yield Finding(f"{lead}: bound of the distance", 1e3 * row["bound_px"], unit="mpx")
+    yield Finding(f"{lead}: {method}, rms / bound", *ratio_of(row))
+    yield Finding(f"{lead}: {method}, error of phi, rms", *_ends(row, "rms_phi_rad", 1e3), "mrad")
+    yield Finding(f"{lead}: {method}, error of D, rms", *_ends(row, "rms_depth_relative", 100.0), "%")
+    bound = row["bound_depth_relative"]
+    yield Finding(f"{lead}: bound of D", 100.0 * bound if _is_number(bound) else None, unit="%")
 
 
-def floor_sentence(table: pl.DataFrame, sample: str, preset: str) -> str:
-    """Which methods leave the bound with the strongest signal."""
-    strong = table.filter(_case(sample, preset), pl.col("factor") == "power_mw")
-    if strong.is_empty():
-        return f"{preset}, {sample}: the laser's power was not changed, so that nothing is said of floors."
-    strong = strong.filter(pl.col("saturated") == 0.0)
-    if strong.is_empty():
-        return f"{preset}, {sample}: pixels are full at every power tried, so that nothing is said of floors."
-    top = strong.filter(pl.col("level") == strong["level"].max())
-    left, kept, unsure = [], [], []
+def floor_findings(table: pl.DataFrame, sample: str, preset: str) -> Iterator[Finding]:
+    """Every method with the strongest laser that fills no pixel: a floor is an error that light does not lower.
+
+    Nothing is found where the power was not changed, or pixels are full at every power.
+    """
+    strong = table.filter(_case(sample, preset), pl.col("factor") == "power_mw", pl.col("saturated") == 0.0)
+    top = strong.filter(pl.col("level") == pl.col("level").max())
     for row in top.sort("rms_px").iter_rows(named=True):
-        ratio, low, high = ratio_of(row)
-        text = f"{row['method']} {_count(ratio)}"
-        if not math.isfinite(ratio):
-            continue
-        if math.isfinite(low) and low > FLOOR:
-            left.append(f"{row['method']} {1e3 * row['rms_px']:.3g} mpx")
-        elif math.isfinite(high) and high < FLOOR:
-            kept.append(text)
-        else:
-            unsure.append(text)
-    power = f"{top['level'][0]:g} mW (the strongest without full pixels)"
-    parts = []
-    if left:
-        parts.append(f"a floor above {FLOOR:g} times the bound have {', '.join(left)}")
-    if kept:
-        parts.append(f"within {FLOOR:g} times the bound stay {', '.join(kept)}")
-    if unsure:
-        parts.append(f"undecided with these draws are {', '.join(unsure)} (rms / bound)")
-    return f"{preset}, {sample}, {power}: " + ("; ".join(parts) if parts else "no method finds the spot") + "."
+        if math.isfinite(ratio_of(row)[0]):
+            lead = f"{preset}, {sample}, {row['level']:g} mW: {row['method']}"
+            yield Finding(f"{lead}, rms distance", *_ends(row, "rms_px", 1e3), "mpx")
+            yield Finding(f"{lead}, rms / bound", *ratio_of(row)).judged("<=", FLOOR)
 
 
-def useless_sentence(table: pl.DataFrame, sample: str, preset: str) -> str:
-    """Where the bound stops to say anything: pixels are full, spots are missed, or errors surely fall below it."""
-    rows = _levels(table, sample, preset)
-    full = [r for r in rows if r["saturated"] > 0.0]
-    missed = [r for r in rows if r["detection_rate"] < FEW]
-    below = [r for r in rows if r not in missed and r not in full and ratio_of(r)[2] < BELOW]
-    text = []
-    if full:
-        text.append("pixels are full, which the bound leaves out, at " + ", ".join(map(_with_ratio, full)))
-    if missed:
-        text.append("spots are missed, so that the local bound means little, at " + ", ".join(map(_missed, missed)))
-    if below:
-        text.append(
-            f"errors are by their intervals below {BELOW:g} times the bound, which is then no bound of the frames, at "
-            + ", ".join(map(_with_ratio, below))
-            + " (levels share their draws and go together)"
-        )
-    if not text:
-        return (
-            f"{preset}, {sample}: at every level {REFERENCE[preset]} finds {100 * FEW:g} % of the spots or more in "
-            f"their boxes and is nowhere by its interval below {BELOW:g} times the bound, which therefore holds over "
-            "all ranges tried."
-        )
-    return f"{preset}, {sample}: " + "; ".join(text) + "."
+def limit_findings(table: pl.DataFrame, sample: str, preset: str) -> Iterator[Finding]:
+    """Levels at which the bound says little: pixels are full, spots are missed, errors surely lie below it."""
+    rows, lead = _levels(table, sample, preset), f"{preset}, {sample}: {REFERENCE[preset]}"
+    held = 0
+    for row in rows:
+        where, ratio = _where(row), Finding("", *ratio_of(row))
+        if row["saturated"] > 0.0:
+            yield replace(ratio, label=f"{lead}, rms / bound with full pixels, {where}")
+        if row["detection_rate"] < FEW:
+            share = Finding(f"{lead}, spots found, {where}", 100.0 * row["detection_rate"], unit="%")
+            yield share.judged(">=", 100.0 * FEW)
+        elif row["saturated"] == 0.0:
+            low = replace(ratio, label=f"{lead}, rms / bound, {where}").judged(">=", BELOW)
+            high = replace(ratio, label=f"{lead}, rms / bound, {where}").judged("<=", ABOVE)
+            if "missed" in (low.verdict, high.verdict):
+                yield low if low.verdict == "missed" else high
+            else:
+                held += 1
+            if high.verdict == "missed":
+                yield Finding(f"{lead}, scatter, {where}", 1e3 * row["scatter_px"], unit="mpx")
+                yield Finding(f"{lead}, bias, {where}", 1e3 * row["bias_px"], unit="mpx")
+    yield Finding(f"{lead}, levels not surely off the bound", held, unit=f"of {len(rows)}")
 
 
-def leaving_sentence(table: pl.DataFrame, sample: str, preset: str) -> str:
-    """Where the reference method itself leaves the bound while the spot is seen and no pixel is full."""
-    rows = [r for r in _levels(table, sample, preset) if r["saturated"] == 0.0 and r["detection_rate"] >= FEW]
-    lead = f"{preset}, {sample}: {REFERENCE[preset]}"
-    left = [r for r in rows if ratio_of(r)[1] > ABOVE]
-    if not left:
-        return f"{lead} is at no level by its interval above {ABOVE:g} times the bound."
-    listed = ", ".join(
-        f"{_with_ratio(r)}, scatter {1e3 * r['scatter_px']:.3g} and bias {1e3 * r['bias_px']:.3g} mpx" for r in left
-    )
-    return f"{lead} leaves the bound (by its interval above {ABOVE:g} times) at {listed}."
-
-
-def ranking_sentence(found: Sequence[Elasticity], sample: str, preset: str) -> str:
-    """Which factor matters most about the base: elasticities of the reference method, largest first."""
-    mine = ranked(found, sample, preset, REFERENCE[preset])
-    if not mine:
-        return f"{preset}, {sample}: no factor has two levels at which {REFERENCE[preset]} finds the spot."
-    listed = ", ".join(f"{name_of(e)} {_signed(e)}" for e in mine)
-    first = mine[0]
-    sure = [e for e in mine if _sure(e)]
-    tail = f" Only {len(sure)} of {len(mine)} are surely not 0." if len(sure) < len(mine) else ""
-    second = mine[1] if len(mine) > 1 else None
-    lead = f"{name_of(first)} matters most" + (
-        "" if second is None or _apart(first, second) else f", though not surely more than {name_of(second)}"
-    )
-    return f"{preset}, {sample}: {lead}; d ln rms / d ln factor about the base: {listed}.{tail}"
+def ranking_findings(found: Sequence[Elasticity], sample: str, preset: str) -> Iterator[Finding]:
+    """Elasticities of the reference method about the base, largest first, and the lead of the first factor."""
+    lead, mine = f"{preset}, {sample}", ranked(found, sample, preset, REFERENCE[preset])
+    for e in mine:
+        value = e.estimate
+        elasticity = Finding(f"{lead}: d ln rms / d ln {name_of(e)}", value.value, value.low, value.high)
+        yield elasticity.judged("!=", 0.0)
+    if len(mine) > 1:
+        first, second = mine[:2]
+        label = f"{lead}: size of the slope for {name_of(first)} less that for {name_of(second)}"
+        ahead = Finding(label, abs(first.estimate.value) - abs(second.estimate.value), relation=">=", threshold=0.0)
+        yield replace(ahead, verdict="met" if _apart(first, second) else "undecided")
 
 
 def ranked(found: Sequence[Elasticity], sample: str, preset: str, method: str) -> list[Elasticity]:
@@ -309,16 +277,14 @@ def _base_row(row: dict[str, Any]) -> Row:
     )
 
 
-def _missed(row: dict[str, Any]) -> str:
-    return f"{_where(row)} ({100 * row['detection_rate']:.0f} % found)"
+def _ends(row: dict[str, Any], name: str, scale: float) -> tuple[float, float, float]:
+    """Value and ends of the interval, scaled; NaN where there is none."""
+    value, low, high = (row[f"{name}{end}"] for end in ("", "_low", "_high"))
+    return tuple(scale * x if _is_number(x) else math.nan for x in (value, low, high))  # type: ignore[return-value]
 
 
 def _where(row: dict[str, Any]) -> str:
     return "the base case" if row["factor"] == BASE else f"{FACTORS[row['factor']].label} {row['level']:.3g}"
-
-
-def _with_ratio(row: dict[str, Any]) -> str:
-    return f"{_where(row)} (rms / bound {_ratio(row)})"
 
 
 def _levels(table: pl.DataFrame, sample: str, preset: str) -> list[dict[str, Any]]:
@@ -367,10 +333,6 @@ def _ratio(row: dict[str, Any]) -> str:
     if not math.isfinite(value):
         return "-"
     return f"{_count(value)} ({_count(low)} to {_count(high)})" if math.isfinite(low) else _count(value)
-
-
-def _percent(value: Any) -> str:
-    return f"{100.0 * value:.3g} %" if _is_number(value) else "none"
 
 
 def _count(value: float) -> str:

@@ -1,8 +1,7 @@
-"""Frames of a spot at a distance and a stroke, taken by rigs that are not what is nominal, and the error of D.
+"""Frames of the study `stroke`, drawn for rigs other than the nominal one, and the findings of the study.
 
-The spot's light is rendered for every rig; the wall behind it is flat light, as strong as the lab's.
-
-What the numbers of the study `stroke` say, in sentences and small tables.
+The spot's light is rendered for every rig; the wall behind it is flat light, as strong as the lab's. A check is one
+distance, stroke and tolerance; its measured error of D is held against the predicted one.
 """
 
 from __future__ import annotations
@@ -31,8 +30,9 @@ from phibench.estimator.geometry.rig_parameters import (
 from phibench.estimator.limits.best_stroke import ROOM_E_PER_S, BestStroke
 from phibench.estimator.limits.stroke_curve import FREE, StrokeCurve, covariance_root
 from phibench.estimator.methods.registry import METHODS
-from phibench.estimator.studies.framework import Material, Row
-from phibench.estimator.studies.image_cutout import Shot, SpotPair, cut_region, cut_rig, taken, without_off
+from phibench.estimator.studies.findings import Finding, Row
+from phibench.estimator.studies.framework import StudyDatasets
+from phibench.estimator.studies.image_cutout import Shot, SpotPair, cut_region, cut_rig, drawn_pair, without_off
 from phibench.render.optics.truth import spot_truth
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.frames import Array
@@ -113,11 +113,11 @@ class Checked:
         return low <= self.check.predicted_m <= high
 
 
-def run_checks(checks: Sequence[Check], material: Material) -> list[Checked]:
-    """Measure, with the material's workers."""
-    with Steps(material.console, "stroke, frames", len(checks)) as steps:
+def run_checks(checks: Sequence[Check], datasets: StudyDatasets) -> list[Checked]:
+    """Measure, with the workers of the data sets."""
+    with Steps(datasets.console, "stroke, frames", len(checks)) as steps:
         found = []
-        for one in parallel_map(measured, checks, material.workers):
+        for one in parallel_map(measured, checks, datasets.workers):
             found.append(one)
             steps.advance()
     return found
@@ -147,7 +147,9 @@ def _answer(check: Check, nominal: Rig, draw: int) -> tuple[float, Array, Array,
     region = cut_region(uv, (camera.height_px, camera.width_px), _MARGIN_PX)
     flat = np.broadcast_to(np.array(ROOM_E_PER_S)[:, None, None], (3, *region.shape))
     pair = SpotPair.of(cut_rig(true, region), stroke_m, spot, _ROOM, dict.fromkeys(POSITIONS, flat), str(draw))
-    seen = taken(draw, Shot(sensor(check.preset)), pair, (cut_rig(nominal, region), check.stroke_m), names, _BOX_PX)
+    seen = drawn_pair(
+        draw, Shot(sensor(check.preset)), pair, (cut_rig(nominal, region), check.stroke_m), names, _BOX_PX
+    )
     answer = METHODS[METHOD[check.preset]](without_off(seen))
     spots = (answer.down, answer.up)
     if any(one.uv_px is None or one.covariance_px2 is None for one in spots):
@@ -176,27 +178,35 @@ def _pixel(rig: Rig, stroke_m: float, spot: LaserSpot, position: str) -> tuple[f
     return truth.u_px, truth.v_px
 
 
+# -- findings ------------------------------------------------------------------------------------------------------
+
 GROWS = 1.05
 """An error grows again where that of the longest stroke is so many times the smallest."""
+NEAR = 0.05  # of the smallest error: strokes within it are as good
 Found = Mapping[tuple[str, float], BestStroke]
 
 
-def best_sentence(found: Found, tolerance: str, depths_m: Sequence[float]) -> str:
-    """Best strokes of one tolerance."""
-    return f"{tolerance}: " + "; ".join(_best(found[tolerance, depth]) for depth in depths_m) + "."
+def best_findings(found: Found, tolerance: str, depths_m: Sequence[float]) -> Iterator[Finding]:
+    """Best strokes of one tolerance; the range of the stroke is that within 5 % of the smallest error."""
+    for depth in depths_m:
+        best, lead = found[tolerance, depth], f"{tolerance}, D = {depth:g} m"
+        if not math.isfinite(best.stroke_m):
+            yield Finding(f"{lead}: no stroke, {', '.join(best.limits)}", None, unit="m")
+            continue
+        limit = f", limit: {', '.join(best.limits)}" if best.limits else ""
+        yield Finding(f"{lead}: best stroke{limit}", best.stroke_m, unit="m")
+        for end, value in zip(("shortest", "longest"), best.near(NEAR), strict=True):
+            yield Finding(f"{lead}: {end} stroke within {100.0 * NEAR:g} % of the smallest error", value, unit="m")
+        yield Finding(f"{lead}: sigma of D", 1e3 * best.sigma_m, unit="mm")
+        yield Finding(f"{lead}: relative sigma of D", 100.0 * best.sigma_m / depth, unit="%")
+        yield Finding(f"{lead}: part of sigma beyond first order", 1e3 * best.sigma_higher_order_m, unit="mm")
 
 
-def growth_sentence(found: Found, depth_m: float, tolerances: Sequence[str], longest_m: float) -> str:
-    """Whether an error that grows again at long strokes can occur at a distance, and for whom."""
-    ratios = {t: growth(found[t, depth_m], longest_m) for t in tolerances}
-    grows = [f"{t} ({ratio:.2f} times the smallest at {longest_m:g} m)" for t, ratio in ratios.items() if ratio > GROWS]
-    falls = [t for t, ratio in ratios.items() if ratio <= GROWS]
-    text = f"D = {depth_m:g} m, strokes up to {longest_m:g} m: "
-    if grows:
-        text += f"the error grows again for {', '.join(grows)}"
-    if falls:
-        text += ("; it does not for " if grows else "the error does not grow again for ") + ", ".join(falls)
-    return text + "."
+def growth_findings(found: Found, depth_m: float, tolerances: Sequence[str], longest_m: float) -> Iterator[Finding]:
+    """Error at the longest stroke over the smallest one: whether it can grow again."""
+    for tolerance in tolerances:
+        label = f"{tolerance}, D = {depth_m:g} m: error at h = {longest_m:g} m over the smallest"
+        yield Finding(label, growth(found[tolerance, depth_m], longest_m)).judged("<=", GROWS)
 
 
 def growth(best: BestStroke, longest_m: float) -> float:
@@ -207,35 +217,51 @@ def growth(best: BestStroke, longest_m: float) -> float:
     return float(sigma[-1] / sigma.min()) if sigma.size else math.nan
 
 
-def reason_sentence(rig: Rig, depth_m: float, height_m: float, strokes_m: tuple[float, float]) -> str:
-    """Which parameter of a rig as built costs most at two strokes, and where the up image is."""
-    parts = [_worst(rig, depth_m, height_m, h) for h in strokes_m]
-    turned = [math.degrees(theta_rad(rig, depth_m, height_m, h)) for h in (0.0, *strokes_m)]
-    return (
-        f"D = {depth_m:g} m: the ray to the spot leaves the mirror at {turned[0]:.0f} deg from straight down at the "
-        f"lower position, at {turned[1]:.0f} deg at h = {strokes_m[0]:.2f} m and at {turned[2]:.0f} deg at "
-        f"{strokes_m[1]:.2f} m; to first order, of the parameters of a rig as built {parts[0][0]} costs most at the "
-        f"first stroke ({1e3 * parts[0][1]:.1f} mm), {parts[1][0]} at the second ({1e3 * parts[1][1]:.1f} mm)."
-    )
+def reason_findings(rig: Rig, depth_m: float, height_m: float, strokes_m: tuple[float, float]) -> Iterator[Finding]:
+    """Angle of the ray to the spot, and the costliest parameter of a rig as built, at two strokes."""
+    for h in (0.0, *strokes_m):
+        angle = math.degrees(theta_rad(rig, depth_m, height_m, h))
+        yield Finding(f"D = {depth_m:g} m, h = {h:.2f} m: ray to the spot, from straight down", angle, unit="deg")
+    for h in strokes_m:
+        name, size = _worst(rig, depth_m, height_m, h)
+        label = f"D = {depth_m:g} m, h = {h:.2f} m: costliest parameter to first order ({name})"
+        yield Finding(label, 1e3 * size, unit="mm")
 
 
-def limits_sentence(curves: Mapping[float, StrokeCurve]) -> str:
-    """What stands in the way when strokes are not bounded by the carriage."""
+def limit_findings(curves: Mapping[float, StrokeCurve]) -> Iterator[Finding]:
+    """Shortest stroke that each cause forbids, where no carriage bounds the stroke."""
     first: dict[str, tuple[float, float]] = {}
     for depth, curve in curves.items():
         for h, cause in zip(curve.strokes_m.tolist(), curve.causes, strict=True):
             if cause != FREE and h < first.get(cause, (math.inf, 0.0))[0]:
                 first[cause] = (h, depth)
-    longest = max(float(curve.strokes_m[-1]) for curve in curves.values())
+    for cause, (h, depth) in first.items():
+        yield Finding(f"without the carriage's limit: {cause}, first at D = {depth:g} m, from h", h, unit="m")
     if not first:
-        return f"Nothing stands in the way of strokes up to {longest:g} m at the distances of the chart."
-    listed = ", ".join(f"{cause} from {h:.2f} m (D = {depth:g} m)" for cause, (h, depth) in first.items())
-    return f"Without the carriage's limit, what first stands in the way: {listed}."
+        longest = max(float(curve.strokes_m[-1]) for curve in curves.values())
+        yield Finding("without the carriage's limit: nothing forbids a stroke up to h", longest, unit="m")
 
 
-def check_sentences(checks: Sequence[Checked]) -> tuple[str, ...]:
-    """Measured against predicted, and whether the best stroke is the best, by tolerance."""
-    return tuple(_checked(name, [c for c in checks if c.check.tolerance == name]) for name in _tolerances(checks))
+def check_findings(checks: Sequence[Checked]) -> Iterator[Finding]:
+    """Measured against predicted error by tolerance, and strokes surely better or worse than the best."""
+    for name in dict.fromkeys(c.check.tolerance for c in checks):
+        yield from _checked(name, [c for c in checks if c.check.tolerance == name])
+
+
+def _checked(name: str, checks: Sequence[Checked]) -> Iterator[Finding]:
+    lead, cells = f"frames, {name}", f"of {len(checks)} cells"
+    ratios = [c.rms_m / c.check.predicted_m for c in checks]
+    yield Finding(f"{lead}: measured rms over predicted sigma, mean", math.exp(float(np.mean(np.log(ratios)))))
+    for word, value in (("smallest", min(ratios)), ("largest", max(ratios))):
+        yield Finding(f"{lead}: measured rms over predicted sigma, {word}", value)
+    yield Finding(f"{lead}: pairs of a cell, least", min(len(c.errors_m) for c in checks))
+    yield Finding(f"{lead}: predictions in the 95 % interval", sum(c.fits for c in checks), unit=cells)
+    others = [c for c in checks if c.check.factor != 1.0]
+    beaten = sum(_surely_better(c, _best_of(c, checks)) for c in others)
+    worse = sum(_surely_better(_best_of(c, checks), c) for c in others)
+    of = f"of {len(others)}"
+    yield Finding(f"{lead}: strokes surely better than the best", beaten, unit=of).judged("<=", 0.0)
+    yield Finding(f"{lead}: strokes surely worse than the best", worse, unit=of)
 
 
 def best_table(found: Found, tolerances: Sequence[str], depths_m: Sequence[float]) -> tuple[Row, ...]:
@@ -255,17 +281,6 @@ def theta_rad(rig: Rig, depth_m: float, height_m: float, stroke_m: float) -> flo
     return math.atan2(depth_m, float(rig.at(stroke_m).sphere_centre_m[2]) - height_m)
 
 
-def _best(best: BestStroke) -> str:
-    if not math.isfinite(best.stroke_m):
-        return f"D = {best.depth_m:g} m: no stroke, {', '.join(best.limits)}"
-    low, high = best.near()
-    text = f"D = {best.depth_m:g} m best h {best.stroke_m:.2f} m, sigma {1e3 * best.sigma_m:.3g} mm"
-    text += f" ({100 * best.sigma_m / best.depth_m:.2g} %; within 5 % from {low:.2f} to {high:.2f} m"
-    if best.sigma_higher_order_m > best.sigma_calibration_m:
-        text += ", most of it beyond first order"
-    return text + (f"; limit: {', '.join(best.limits)})" if best.limits else ")")
-
-
 def _worst(rig: Rig, depth_m: float, height_m: float, stroke_m: float) -> tuple[str, float]:
     """Parameter with the largest error of D, root mean square over azimuths, and that error."""
     turn = 2.0 * math.pi * np.arange(8) / 8.0
@@ -279,32 +294,12 @@ def _worst(rig: Rig, depth_m: float, height_m: float, stroke_m: float) -> tuple[
     return PARAMETERS[k], float(size[k])
 
 
-def _checked(name: str, checks: Sequence[Checked]) -> str:
-    fits = sum(c.fits for c in checks)
-    ratio = math.exp(float(np.mean([math.log(c.rms_m / c.check.predicted_m) for c in checks])))
-    text = (
-        f"Frames, {name}: measured rms over predicted sigma is {ratio:.2f} on average of {len(checks)} cells of "
-        f"{min(len(c.errors_m) for c in checks)} pairs or more; the prediction lies in the 95 % interval of {fits}."
-    )
-    beaten = [c for c in checks if c.check.factor != 1.0 and _surely_better(c, _best_of(c, checks))]
-    if beaten:
-        where = ", ".join(f"D = {c.check.depth_m:g} m, {c.check.factor:g} times" for c in beaten)
-        return f"{text} The best stroke is surely not the best at {where}."
-    worse = [c for c in checks if c.check.factor != 1.0 and _surely_better(_best_of(c, checks), c)]
-    others = sum(c.check.factor != 1.0 for c in checks)
-    return f"{text} No other stroke is surely better than the best; {len(worse)} of {others} are surely worse."
-
-
 def _best_of(check: Checked, checks: Sequence[Checked]) -> Checked:
     return next(c for c in checks if c.check.depth_m == check.check.depth_m and c.check.factor == 1.0)
 
 
 def _surely_better(a: Checked, b: Checked) -> bool:
     return a.interval_m[1] < b.interval_m[0]
-
-
-def _tolerances(checks: Sequence[Checked]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(c.check.tolerance for c in checks))
 
 
 def _cells(best: BestStroke) -> tuple[str, str, str]:

@@ -20,18 +20,18 @@ from phibench.estimator.limits.best_stroke import BestStroke, best_stroke, spot_
 from phibench.estimator.limits.processed_bound import SpotSigma
 from phibench.estimator.limits.stroke_curve import StrokeCurve, Surroundings, stroke_curve, stroke_grid
 from phibench.estimator.spots.spot_prediction import Laser
-from phibench.estimator.studies.framework import Material, Result, Settings, Study
+from phibench.estimator.studies.framework import Result, Settings, Study, StudyDatasets
 from phibench.estimator.studies.stroke.drawings import best_drawing, check_drawing, curves_drawing
 from phibench.estimator.studies.stroke.rendered_checks import (
     Check,
     Checked,
-    best_sentence,
+    best_findings,
     best_table,
-    check_sentences,
+    check_findings,
     check_table,
-    growth_sentence,
-    limits_sentence,
-    reason_sentence,
+    growth_findings,
+    limit_findings,
+    reason_findings,
     run_checks,
 )
 from phibench.scenes.frames import Array
@@ -70,7 +70,7 @@ class StrokeSettings(Settings):
     check: CheckSettings
 
 
-def run(settings: StrokeSettings, material: Material) -> Result:
+def run(settings: StrokeSettings, datasets: StudyDatasets) -> Result:
     """Run the study."""
     rig, card = Rig(), sensor_card(settings.preset)
     around = Surroundings(heights_m=(settings.spot_height_m,))
@@ -78,22 +78,22 @@ def run(settings: StrokeSettings, material: Material) -> Result:
     longest = _paper(settings)
     depths = sorted({*settings.depths_m, *longest})
     found = {}
-    with Steps(material.console, "stroke, curves", len(rigs) * len(depths)) as steps:
+    with Steps(datasets.console, "stroke, curves", len(rigs) * len(depths)) as steps:
         for name, C in rigs.items():
             for d in depths:
                 found[name, d] = best_stroke(
                     d, rig, covariance_rig=C, strokes_m=settings.strokes_m, around=around, card=card, spot=spot
                 )
                 steps.advance()
-    checks = run_checks(planned(settings, rig, {k: rigs[k] for k in (AS_BUILT, EXACT)}), material)
+    checks = run_checks(planned(settings, rig, {k: rigs[k] for k in (AS_BUILT, EXACT)}), datasets)
     names, top = tuple(rigs), settings.strokes_m[1]
-    findings = [best_sentence(found, name, tuple(longest)) for name in names]
-    findings += [growth_sentence(found, d, names, top) for d in longest]
+    findings = [row for name in names for row in best_findings(found, name, tuple(longest))]
+    findings += [row for d in longest for row in growth_findings(found, d, names, top)]
     built = found[AS_BUILT, next(iter(longest))]
     if math.isfinite(built.stroke_m):
-        findings.append(reason_sentence(rig, built.depth_m, settings.spot_height_m, (built.stroke_m, top)))
-    findings.append(limits_sentence(_free_curves(rig, settings.depths_m, spot, card, around)))
-    findings += check_sentences(checks)
+        findings += reason_findings(rig, built.depth_m, settings.spot_height_m, (built.stroke_m, top))
+    findings += limit_findings(_free_curves(rig, settings.depths_m, spot, card, around))
+    findings += check_findings(checks)
     return Result(
         {"table": best_frame(found), "curves": curve_frame(found), "checks": check_frame(checks)},
         tuple(findings),

@@ -18,7 +18,7 @@ from phibench.estimator.spots.fit_raw import fit_law
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.raw_pixels import GaussLaw, bayer_filters, noise_of, spot_regions
 from phibench.estimator.spots.spot_prediction import spot_blur
-from phibench.estimator.studies.image_cutout import Shot, SpotPair, cut_region, cut_rig, taken, without_off
+from phibench.estimator.studies.image_cutout import Shot, SpotPair, cut_region, cut_rig, drawn_pair, without_off
 from phibench.render.optics.spot_layer import SpotLayer, spot_layer
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.laser import Beam, LaserSpot, beam_diameter_m
@@ -160,7 +160,7 @@ def drawn_pairs(
         light = np.broadcast_to(np.array([[[7e4]], [[6.3e4]], [[3.3e4]]]), (3, *region.shape))
         pair = SpotPair.of(cut_rig(rig, region), stroke_m, spot, Room("dark", ()), {"down": light, "up": light}, "")
         shot, nominal = Shot(sensor(preset)), (cut_rig(rig, region), stroke_m)
-        seen = replace(without_off(taken(k, shot, pair, nominal, ("test", "blur", k), 48)), beam=beam)
+        seen = replace(without_off(drawn_pair(k, shot, pair, nominal, ("test", "blur", k), 48)), beam=beam)
         yield seen, uv - [region.u0_px, region.v0_px], pair.depth_m
 
 

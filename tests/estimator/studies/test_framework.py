@@ -13,7 +13,7 @@ from rich.console import Console
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.benchmark.report import write_report
 from phibench.estimator.cli.main import main
-from phibench.estimator.studies.framework import Material, Result, Settings, Study, canvas, drawn, read_settings
+from phibench.estimator.studies.framework import StudyDatasets, Result, Settings, Study, canvas, drawn, read_settings
 from phibench.estimator.studies.run import find_study, read_study, section, write_study
 
 
@@ -25,7 +25,7 @@ class Counting(Settings):
     ends: tuple[float, float] | None = Field(default=None, strict=False)
 
 
-def _count(settings: Counting, material: Material) -> Result:
+def _count(settings: Counting, datasets: StudyDatasets) -> Result:
     numbers = list(range(0, settings.upto, settings.step))
     with canvas() as figure:
         figure.subplots().plot(numbers, numbers)
@@ -43,13 +43,13 @@ COUNT = Study("count", "Counting", "How many numbers are there?", Counting, _cou
 
 
 @pytest.fixture
-def material(tmp_path: Path) -> Material:
-    return Material(tmp_path / "data", Console(quiet=True))
+def datasets(tmp_path: Path) -> StudyDatasets:
+    return StudyDatasets(tmp_path / "data", Console(quiet=True))
 
 
-def _written(folder: Path, material: Material) -> Path:
+def _written(folder: Path, datasets: StudyDatasets) -> Path:
     settings = Counting(upto=5)
-    write_study(folder, COUNT, settings, True, COUNT.run(settings, material))
+    write_study(folder, COUNT, settings, True, COUNT.run(settings, datasets))
     return folder
 
 
@@ -81,15 +81,15 @@ def test_bad_settings_end_in_a_sentence(tmp_path: Path, text: str, words: tuple[
     assert all(word in said for word in words), said
 
 
-def test_same_study_same_bytes(tmp_path: Path, material: Material) -> None:
-    first, second = (_written(tmp_path / name, material) for name in "ab")
+def test_same_study_same_bytes(tmp_path: Path, datasets: StudyDatasets) -> None:
+    first, second = (_written(tmp_path / name, datasets) for name in "ab")
     names = sorted(path.name for path in first.iterdir())
     assert names == ["findings.md", "line.svg", "settings.json", "study.json", "table.parquet"]
     assert all((first / name).read_bytes() == (second / name).read_bytes() for name in names)
 
 
-def test_read_back_and_in_a_report(tmp_path: Path, material: Material) -> None:
-    folder = _written(tmp_path / "study", material)
+def test_read_back_and_in_a_report(tmp_path: Path, datasets: StudyDatasets) -> None:
+    folder = _written(tmp_path / "study", datasets)
     assert read_study(folder).findings == ("There are 5 numbers.",)
     page = write_report([], tmp_path / "report.html", [section(folder)]).read_text(encoding="utf-8")
     for words in (
@@ -103,8 +103,8 @@ def test_read_back_and_in_a_report(tmp_path: Path, material: Material) -> None:
     assert "<caption>Numbers</caption>" in page
 
 
-def test_changed_or_missing_files_are_refused(tmp_path: Path, material: Material) -> None:
-    folder = _written(tmp_path / "study", material)
+def test_changed_or_missing_files_are_refused(tmp_path: Path, datasets: StudyDatasets) -> None:
+    folder = _written(tmp_path / "study", datasets)
     (folder / "line.svg").write_text("other", encoding="utf-8")
     with pytest.raises(DatasetError, match=r"line\.svg is missing or was changed"):
         read_study(folder)

@@ -18,7 +18,7 @@ from phibench.datasets.recipe.load import find_recipe, load_recipe
 from phibench.estimator.benchmark.intervals import Estimate
 from phibench.estimator.geometry.mirror_image import up_image
 from phibench.estimator.geometry.panorama import Grid, SeenEdge
-from phibench.estimator.studies.framework import Material, read_settings
+from phibench.estimator.studies.framework import StudyDatasets, read_settings
 from phibench.estimator.studies.isotropy.lines import (
     beside,
     beside_best,
@@ -213,7 +213,7 @@ def test_recipes_are_valid_and_share_boards_and_light(name: str) -> None:
 
 
 class _Held:
-    """Material that has three data sets already."""
+    """StudyDatasets that has three data sets already."""
 
     def __init__(self, held: dict[str, Dataset]) -> None:
         self._held = held
@@ -256,4 +256,4 @@ def test_data_sets_come_from_the_shipped_recipes(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         STUDY.run(read_settings(STUDY, True), SimpleNamespace(dataset=dataset))  # type: ignore[arg-type]
     assert asked == ["study-isotropy", "study-isotropy-sideways", "study-isotropy-tilted"]
-    assert Material(tmp_path, Console(quiet=True)).folder == tmp_path
+    assert StudyDatasets(tmp_path, Console(quiet=True)).folder == tmp_path

@@ -15,10 +15,10 @@ from scipy.optimize import brentq
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.geometry.paper_depth import depth_paper
 from phibench.estimator.geometry.rig_parameters import PARAMETERS as CALIBRATION
-from phibench.estimator.studies.framework import Material, read_settings
+from phibench.estimator.studies.framework import StudyDatasets, read_settings
 from phibench.estimator.studies.misaligned_rigs import (
     NOMINAL,
-    Bench,
+    CalibrationSetup,
     Places,
     Rendered,
     calibrated_errors,
@@ -56,7 +56,7 @@ RIG = default_rig()
 PLACES = Places(np.array([1.0, 3.18]), np.radians([0.0, 90.0, 200.0]), 0.5, 0.425)
 GEOMETRIC = tuple(name for name in PARAMETERS if name not in ("focus_distance_m", "roughness_alpha"))
 SPHERICAL = tuple(name for name in GEOMETRIC if not name.startswith("form_"))
-BENCH = Bench(
+SETUP = CalibrationSetup(
     np.array([[1.2, 0.3, 0.5], [-1.0, 1.8, 0.5], [-2.0, -2.1, 0.5], [2.6, -3.0, 0.5]]), 0.02, 1e-3, (8e-6, 8e-6, 24e-6)
 )
 
@@ -213,7 +213,7 @@ def test_calibration_takes_out_what_it_fits() -> None:
     for name in ("tilt_y_rad", "pitch_rad"):
         m = Misalignment(**{name: PARAMETERS[name].study})
         before = np.abs(errors(RIG, m, PLACES, ("exact",))).max()
-        after = np.abs(calibrated_errors(RIG, m, PLACES, lambda m: BENCH.calibrated(RIG, 0.425, m))).max()
+        after = np.abs(calibrated_errors(RIG, m, PLACES, lambda m: SETUP.calibrated(RIG, 0.425, m))).max()
         cost[name] = after / before
     assert cost["tilt_y_rad"] < 0.05
     assert cost["pitch_rad"] > 0.2
@@ -228,7 +228,7 @@ def test_beliefs_are_as_wide_as_the_study() -> None:
 
 def test_calibration_needs_its_spots_in_the_image() -> None:
     with pytest.raises(DatasetError, match="not in the image"):
-        BENCH.calibrated(RIG, 0.425, Misalignment(cx_px=900.0))
+        SETUP.calibrated(RIG, 0.425, Misalignment(cx_px=900.0))
 
 
 def test_rendered_spots_move_as_predicted() -> None:
@@ -355,7 +355,7 @@ def test_tiny_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"phibench.estimator.studies.{module}.PARAMETERS", few)
     file = tmp_path / "tiny.toml"
     file.write_text(TINY, encoding="utf-8")
-    result = STUDY.run(read_settings(STUDY, path=file), Material(tmp_path, Console(quiet=True)))
+    result = STUDY.run(read_settings(STUDY, path=file), StudyDatasets(tmp_path, Console(quiet=True)))
     table = result.tables["table"]
     assert set(table["estimator"].unique()) == {*NOMINAL, "exact_calibrated"}
     assert set(table["parameter"].unique()) == set(FEW)

@@ -19,8 +19,8 @@ from phibench.datasets.read import Sample, open_dataset
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.intervals import Estimate
 from phibench.estimator.limits.position_bound import spot_limit
-from phibench.estimator.studies.framework import Material, read_settings
-from phibench.estimator.studies.image_cutout import Shot, SpotPair, bounds_of, cut_region, cut_rig, taken
+from phibench.estimator.studies.framework import StudyDatasets, read_settings
+from phibench.estimator.studies.image_cutout import Shot, SpotPair, bounds_of, cut_region, cut_rig, drawn_pair
 from phibench.estimator.studies.noise.cells import BASE, FACTORS, OFF, applied
 from phibench.estimator.studies.noise.study import STUDY
 from phibench.estimator.studies.noise.tables import (
@@ -130,12 +130,12 @@ def test_cut_sensor_sees_the_pixels_of_the_whole_one(tiny_dataset: Path) -> None
 def test_draws_are_named_and_boxes_hold_their_spots(tiny_dataset: Path) -> None:
     _, pair, _ = _pair(tiny_dataset)
     shot, nominal = Shot(sensor("bayer-raw")), (pair.rig, pair.stroke_m)
-    first, again, other = (taken(0, shot, pair, nominal, ("test", k), 40) for k in (0, 0, 1))
+    first, again, other = (drawn_pair(0, shot, pair, nominal, ("test", k), 40) for k in (0, 0, 1))
     assert np.array_equal(first.down, again.down)
     assert not np.array_equal(first.down, other.down)
     assert not np.array_equal(first.down_off, first.up_off)
     for k in range(20):
-        drawn = taken(0, shot, pair, nominal, ("test", k), 40)
+        drawn = drawn_pair(0, shot, pair, nominal, ("test", k), 40)
         for p, box in (("down", drawn.box_down), ("up", drawn.box_up)):
             assert box is not None
             truth = pair.views[p].truth
@@ -327,7 +327,7 @@ def _run(tmp_path: Path, dataset: Path, text: str = TINY) -> Any:
     file.write_text(text, encoding="utf-8")
     if not data.exists():
         shutil.copytree(dataset, data / "tiny")
-    return STUDY.run(read_settings(STUDY, False, file), Material(data, Console(quiet=True), 1))
+    return STUDY.run(read_settings(STUDY, False, file), StudyDatasets(data, Console(quiet=True), 1))
 
 
 def test_tiny_study(tmp_path: Path, tiny_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, prior_sigmas
 from phibench.estimator.limits.best_stroke import LARGEST, BestStroke
 from phibench.estimator.limits.stroke_curve import CEILING, FREE, StrokeCurve
-from phibench.estimator.studies.framework import Material, read_settings
+from phibench.estimator.studies.framework import StudyDatasets, read_settings
 from phibench.estimator.studies.stroke.rendered_checks import (
     Check,
     Checked,
@@ -164,7 +164,7 @@ def test_bad_settings(tmp_path: Path, old: str, new: str, words: tuple[str, ...]
     file = tmp_path / "stroke.toml"
     file.write_text(TINY.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(DatasetError) as caught:
-        STUDY.run(read_settings(STUDY, False, file), Material(tmp_path, Console(quiet=True), 1))
+        STUDY.run(read_settings(STUDY, False, file), StudyDatasets(tmp_path, Console(quiet=True), 1))
     assert all(word in str(caught.value) for word in words)
 
 
@@ -178,7 +178,7 @@ def test_tiny_study(tmp_path: Path) -> None:
     file = tmp_path / "stroke.toml"
     file.write_text(TINY, encoding="utf-8")
     settings: Any = read_settings(STUDY, False, file)
-    result = STUDY.run(settings, Material(tmp_path, Console(quiet=True), 1))
+    result = STUDY.run(settings, StudyDatasets(tmp_path, Console(quiet=True), 1))
     table = result.tables["table"]
     assert table["tolerance"].unique(maintain_order=True).to_list() == [AS_BUILT, CALIBRATED, EXACT]
     sigma = {name: part["sigma_m"].to_list() for (name,), part in table.group_by("tolerance", maintain_order=True)}
