@@ -7,7 +7,7 @@ distance, stroke and tolerance; its measured error of D is held against the pred
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -1,8 +1,9 @@
-"""The study `baseline`: power laws, drawn rigs, sentences, the whole in small."""
+"""The study `baseline`: power laws, drawn rigs, findings, the whole in small."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -13,8 +14,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_dataset
 from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.paper_depth import load_published
-from phibench.estimator.studies.baseline import study
-from phibench.estimator.studies.baseline.study import STUDY
+from phibench.estimator.studies.baseline.study import STUDY, findings, notes
 from phibench.estimator.studies.baseline.tables import (
     SENSES,
     LawFit,
@@ -26,6 +26,7 @@ from phibench.estimator.studies.baseline.tables import (
     published_curve,
     seen,
 )
+from phibench.estimator.studies.findings import Finding
 from phibench.estimator.studies.framework import read_settings
 from phibench.estimator.studies.run import run_study
 from phibench.estimator.studies.statistics import PowerLaw, fit_power_law
@@ -115,10 +116,11 @@ def test_published_errors_are_no_noise_law() -> None:
     assert law.signs == 0
     assert law.inverse_m < 1e-12
     assert law.law.holds(0, -1.0)
-    assert "keep one sign" in study._curve(law)
-    assert "an interval that holds -1" in study._curve(law)
-    assert "change sign once" in study._curve(curve)
-    assert "a + b h fits best" in study._curve(curve)
+    found = {f.label: f for f in _findings(curves=[curve, law])}
+    assert found["published errors of Table 1: changes of sign along h"].value == 1
+    assert found["published errors of Table 1: exponent of h"].verdict == "missed"
+    assert found["published errors of Table made-up: exponent of h"].verdict == "met"
+    assert found["published errors of Table 1: residual of a + b h, per degree of freedom"].value == curve.line_m
 
 
 def _law(low: tuple[float, float], high: tuple[float, float]) -> LawFit:
@@ -126,11 +128,11 @@ def _law(low: tuple[float, float], high: tuple[float, float]) -> LawFit:
     return LawFit("bound", PowerLaw(middle, np.array(low), np.array(high), 0.1), 25)
 
 
-def test_sentences_of_laws_follow_the_intervals() -> None:
-    both = study._law(_law((1.9, -1.1), (2.1, -0.9)))
-    assert both.count("agrees with") == 2
-    none = study._law(_law((3.0, -0.8), (4.0, -0.5)))
-    assert none.count("does not agree with") == 2
+def test_laws_are_judged_by_their_intervals() -> None:
+    both = [f.verdict for f in _findings(laws=[_law((1.9, -1.1), (2.1, -0.9))]) if "exponent" in f.label]
+    assert both == ["met", "met"]
+    none = [f.verdict for f in _findings(laws=[_law((3.0, -0.8), (4.0, -0.5))]) if "exponent" in f.label]
+    assert none == ["missed", "missed"]
 
 
 def _table(published: Array) -> tuple[pl.DataFrame, pl.DataFrame]:
@@ -158,22 +160,34 @@ def _table(published: Array) -> tuple[pl.DataFrame, pl.DataFrame]:
     return table, bands
 
 
-def test_sentences_of_errors_follow_the_numbers() -> None:
-    table, bands = _table(np.array([2.2, 2.2, 2.2, 2.2]))
-    words = study.findings(table, bands, [], [], pl.DataFrame())
-    assert "4 published estimates err by 10.00 %" in words[0]
-    assert "4 of the published errors are more" in words[0]
-    assert "phi_normal comes nearest, and leaves 0 %" in words[1]
-    assert "phi_ray 0" in words[2]
-    table, bands = _table(np.array([2.0, 2.0, 2.0, 2.01]))
-    words = study.findings(table, bands, [], [], pl.DataFrame())
-    assert "no sense of phi comes nearer" in words[1]
-    assert "phi_ray 4" in words[2]
-    notes = " ".join(study.notes([], 1, table))
-    assert "closed form alone" in notes
-    assert "one draw" in notes
-    assert "1 readings" in notes
-    assert not [note for note in study.notes(["x"], 2, table) if "draw" in note]
+def _findings(published: float = 2.2, **more: Any) -> tuple[Finding, ...]:
+    table, bands = _table(np.array([published] * 3 + [2.2 if published == 2.2 else 2.01]))
+    given = {"laws": [], "curves": [], "rendered": pl.DataFrame(), **more}
+    return findings(table, bands, *given.values())
+
+
+def test_findings_of_errors_follow_the_numbers() -> None:
+    found = {f.label: f for f in _findings()}
+    assert found["error of the published estimates, rms"].value == pytest.approx(10.0)
+    above = found["published errors above twice the bound of their experiment"]
+    assert (above.value, above.unit) == (4, "of 4")
+    share = found["sum of squares that phi_normal leaves of the published errors"]
+    assert (share.value, share.verdict) == (pytest.approx(0.0, abs=1e-9), "met")
+    inside = "published points in the central 95 % of misaligned rigs, phi_ray"
+    assert found[inside].value == 0
+    assert found["Table 1, error of the mean reading, red_centroid, rms"].value == pytest.approx(0.5)
+    found = {f.label: f for f in _findings(2.0)}
+    assert found["sum of squares that phi_normal leaves of the published errors"].verdict == "missed"
+    assert found[inside].value == 4
+
+
+def test_notes_name_what_is_left_out() -> None:
+    table, _ = _table(np.full(4, 2.2))
+    text = " ".join(notes([], 1, table))
+    assert "closed form alone" in text
+    assert "one draw" in text
+    assert "1 readings" in text
+    assert not [note for note in notes(["x"], 2, table) if "draw" in note]
 
 
 @pytest.fixture(scope="module")
@@ -220,7 +234,7 @@ def test_the_whole_study_in_small(data: Path) -> None:
     # the centroid of a noise-free frame is within 0.02 px of the chief ray, some 0.3 m per px of these images
     assert (rendered["rendered_error_m"] - rendered["closed_form_error_m"]).abs().max() < 0.02
     assert {drawing.name for drawing in result.drawings} == {"curves", "laws"}
-    assert len(result.findings) == 6
+    assert len(result.findings) == 43
     dataset = open_dataset(data / "small")
     assert len(auto_exposed_draws(dataset, "mjpeg", 2)) == 10
     assert len(experiments_of(dataset)) == 5

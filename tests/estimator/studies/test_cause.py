@@ -1,8 +1,9 @@
-"""The study `cause`: sampler, made-up data, sentences."""
+"""The study `cause`: sampler, made-up data, findings."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,21 @@ from rich.console import Console
 from scipy.stats import norm
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.studies.cause import study
 from phibench.estimator.studies.cause.model import COMMON, NOISE, Explanation, Model, Prior, simulate, without_table
 from phibench.estimator.studies.cause.nested_sampling import CauseSettings, Posterior, all_runs, pooled, sample
 from phibench.estimator.studies.cause.paper_reading import Reader, published_experiments, read
-from phibench.estimator.studies.cause.study import STUDY
+from phibench.estimator.studies.cause.study import (
+    STUDY,
+    convention_findings,
+    evidence_findings,
+    left_out_findings,
+    noise_findings,
+    offset_findings,
+    residual_findings,
+    scale_findings,
+)
 from phibench.estimator.studies.cause.tables import DECIDED, FLOOR, alike, coverage, fit_of, left_out_score
+from phibench.estimator.studies.findings import Finding
 from phibench.estimator.studies.framework import read_settings
 from phibench.estimator.studies.run import run_study
 from phibench.scenes.frames import Array
@@ -111,8 +121,8 @@ def test_evidence_and_posterior_of_a_closed_form(settings: CauseSettings) -> Non
     assert found.log_evidence == pytest.approx(expected, abs=4.0 * max(found.log_evidence_error, 0.13))
     assert found.points.mean(axis=0) == pytest.approx(np.array([0.5, -1.0]) / 1.09, abs=0.1)
     assert found.points.std(axis=0) == pytest.approx([0.287, 0.287], rel=0.25)
-    again = sample(line, 200, 0.05, "line")
-    assert np.array_equal(found.points, again.points)
+    small, again = (sample(line, 30, 1.0, "line") for _ in range(2))
+    assert np.array_equal(small.points, again.points)
 
 
 def test_pooled_runs() -> None:
@@ -253,30 +263,47 @@ def _rows(**changes: list[float]) -> pl.DataFrame:
     return pl.DataFrame({**columns, **changes})
 
 
-def test_sentences_follow_the_numbers() -> None:
-    table = _rows()
-    assert "'tilt' has the largest evidence" in study.best_sentence(table)
-    assert "favoured over every other" in study.best_sentence(table)
+def _verdicts(rows: Iterable[Finding]) -> dict[str, str]:
+    return {row.label: row.verdict for row in rows}
+
+
+def test_evidences_are_judged_against_the_first_and_the_best() -> None:
+    found = _verdicts(evidence_findings(_rows()))
+    assert found == {
+        "log evidence against 'noise': tilt": "favoured",
+        "log evidence against 'noise': wrong": "disfavoured",
+        "log evidence against the best, 'tilt': noise": "disfavoured",
+        "log evidence against the best, 'tilt': wrong": "disfavoured",
+    }
     near = _rows(log_evidence=[9.0, 10.0, -9.0], against=[0.0, 1.0, -18.0])
-    assert "Undecided against it: noise (decided is" in study.best_sentence(near)
-    words = " ".join(study.rival_sentences(table))
-    assert "favoured: tilt (+10.0" in words
-    assert "disfavoured: wrong (-9.0" in words
-    assert "too large" in words
-    assert "run in trends" in words
-    calm = _rows(chi2_p=[0.5] * 3, trend_p=[0.5] * 3, against=[0.0, 1.0, -1.0])
-    words = " ".join(study.rival_sentences(calm))
-    assert "undecided: tilt" in words
-    assert "trends" not in words
-    assert "more than rounding" in study.noise_sentence(table)
-    assert "reaches down" in study.noise_sentence(_rows(noise_low_px=[0.8, 0.2, 0.8]))
-    assert "'tilt' predicts best" in study.left_out_sentence(table)
-    assert study.scale_sentence(pl.DataFrame({"explanation": ["a"], "scale": [1.0], "against": [0.0]})) == ""
+    found = _verdicts(evidence_findings(near))
+    assert found["log evidence against the best, 'tilt': noise"] == "undecided"
+    assert found["log evidence against the best, 'tilt': wrong"] == "disfavoured"
+
+
+def test_findings_follow_the_numbers() -> None:
+    table = _rows()
+    assert _verdicts(residual_findings(table)) == {
+        "posterior predictive p, size of the residuals: noise": "met",
+        "posterior predictive p, size of the residuals: tilt": "met",
+        "posterior predictive p, size of the residuals: wrong": "missed",
+        "posterior predictive p, trend of the residuals: noise": "missed",
+        "posterior predictive p, trend of the residuals: tilt": "met",
+        "posterior predictive p, trend of the residuals: wrong": "met",
+    }
+    assert _verdicts(noise_findings(table))["reading noise of a radius: tilt"] == "met"
+    wide = _rows(noise_low_px=[0.8, 0.2, 0.8])
+    assert _verdicts(noise_findings(wide))["reading noise of a radius: tilt"] == "undecided"
+    best, other = left_out_findings(table)
+    assert (best.label, best.value, best.low) == ("log density of left-out tables: tilt", 2.0, 1.8)
+    assert other.value == -5.0
+    assert list(scale_findings(pl.DataFrame(schema=dict.fromkeys(("explanation", "scale", "against", "error"))))) == []
     offsets = {"explanation": ["tilted"], "mean_px": [20.0], "low_px": [15.0], "high_px": [30.0]}
     prior = {"prior_mean_px": [20.0], "prior_low_px": [4.0], "prior_high_px": [50.0]}
-    assert "is above the prior's" in study.offset_sentence(table, pl.DataFrame({**offsets, **prior}))
-    wide = pl.DataFrame({**offsets, **prior, "low_px": [4.0]})
-    assert "is not above the prior's" in study.offset_sentence(table, wide)
+    above, _ = offset_findings(table, pl.DataFrame({**offsets, **prior}))
+    assert (above.threshold, above.verdict) == (6.0, "met")
+    reaching, _ = offset_findings(table, pl.DataFrame({**offsets, **prior, "low_px": [4.0]}))
+    assert reaching.verdict == "undecided"
 
 
 def test_the_same_difference_is_decided_or_not_by_its_error() -> None:
@@ -286,14 +313,12 @@ def test_the_same_difference_is_decided_or_not_by_its_error() -> None:
     unsure = _rows(
         log_evidence=evidence, log_evidence_error=[FLOOR] * 3, against=evidence, against_error=[0.0, 2.1, 2.1]
     )
-    words = study.rival_sentences(sure)[0]
-    assert "favoured: tilt (+5.0 +- 0.7); disfavoured: wrong (-5.0 +- 0.7)" in words
-    assert "undecided" not in words
-    words = study.rival_sentences(unsure)[0]
-    assert "undecided: tilt (+5.0 +- 2.1), wrong (-5.0 +- 2.1)" in words
-    assert "favoured:" not in words
-    assert "favoured over every other" in study.best_sentence(sure)
-    assert "Undecided against it: noise (decided" in study.best_sentence(unsure)
+    tilt, wrong, noise, _ = evidence_findings(sure)
+    assert (tilt.value, tilt.low, tilt.high) == pytest.approx((5.0, 3.6, 6.4))
+    assert (tilt.verdict, wrong.verdict, noise.verdict) == ("favoured", "disfavoured", "disfavoured")
+    tilt, wrong, noise, _ = evidence_findings(unsure)
+    assert (tilt.verdict, wrong.verdict, noise.verdict) == ("undecided",) * 3
+    assert (wrong.low, wrong.high) == pytest.approx((-9.2, -0.8))
 
 
 @pytest.mark.parametrize(("error", "word"), [(0.5, "disfavoured"), (FLOOR, "undecided")])
@@ -302,8 +327,11 @@ def test_senses_of_phi_are_told_apart_by_the_same_rule(settings: CauseSettings, 
     table = pl.DataFrame(
         {"explanation": ["ray", "normal"], "log_evidence": [-6.2, 0.0], "log_evidence_error": [error] * 2}
     )
-    words = study.convention_sentence(chosen, table)
-    assert f"noise alone: phi_normal has most, then phi_ray -6.2 +- {error * 2.0**0.5:.1f} ({word})" in words
+    (found,) = convention_findings(chosen, table)
+    assert found.label == "sense of phi, noise alone: phi_ray against phi_normal"
+    assert found.value == -6.2
+    assert found.high == pytest.approx(-6.2 + 2.0 * error * 2.0**0.5)
+    assert found.verdict == word
 
 
 def _tiny() -> str:
@@ -367,8 +395,18 @@ def test_the_whole_study_in_small(tmp_path: Path) -> None:
     assert result.tables["left_out"].height == 4
     assert result.tables["made_up"].height == 1
     assert {drawing.name for drawing in result.drawings} == {"predictive", "evidence", "posterior"}
-    text = " ".join(result.findings)
-    for words in ("explanations", "Reading noise", "Made-up data", "section 6", "brute-force", "times as wide"):
+    text = " ".join(finding.label for finding in result.findings)
+    for words in (
+        "log evidence against the best",
+        "reading noise",
+        "made-up data of 'ray'",
+        "eq. (5) with exact phi_ray",
+        "likelihood against simulation",
+        "2 times as wide",
+        "sense of phi, noise alone: phi_",
+        "size of the cosine",
+        "left-out tables",
+    ):
         assert words in text
     assert (tmp_path / "out" / "findings.md").stat().st_size > 1000
 

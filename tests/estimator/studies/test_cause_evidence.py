@@ -5,7 +5,7 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from phibench.estimator.studies.cause import study
+from phibench.estimator.studies.cause.study import made_up_findings, scale_findings
 from phibench.estimator.studies.cause.tables import ENOUGH, FLOOR, evidence_error, verdict
 
 
@@ -39,11 +39,15 @@ def test_made_up_data_decide_by_the_same_rule(error: float, lost: int) -> None:
             "parameters": [6, 0],
         }
     )
-    words = study.made_up_sentence(made_up)
-    assert f"largest evidence in 0 of 1 draws and decided against it in {lost}" in words
-    assert "6 of 6 true values" in words
+    best, against, held = made_up_findings(made_up)
+    assert (best.value, best.unit) == (0, "of 1")
+    assert (against.value, against.unit) == (lost, "of 1")
+    assert (held.value, held.unit) == (6, "of 6")
 
 
 def test_wider_priors_come_with_errors() -> None:
     rows = {"explanation": ["a", "a"], "scale": [1.0, 2.0], "against": [11.9, 13.9], "error": [1.6, 2.1]}
-    assert "1 / 2 times as wide: a +11.9 +- 1.6 / +13.9 +- 2.1." in study.scale_sentence(pl.DataFrame(rows))
+    plain, wide = scale_findings(pl.DataFrame(rows))
+    assert plain.label == "log evidence with priors 1 times as wide: a"
+    assert (wide.value, wide.low, wide.high) == pytest.approx((13.9, 9.7, 18.1))
+    assert wide.verdict == "favoured"

@@ -1,9 +1,11 @@
-"""The frame of the studies: settings, folders, reports; each study has a test file of its own."""
+"""The frame of the studies: settings, findings, folders, reports; each study has a test file of its own."""
 
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 import pytest
@@ -13,8 +15,9 @@ from rich.console import Console
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.benchmark.report import write_report
 from phibench.estimator.cli.main import main
-from phibench.estimator.studies.framework import StudyDatasets, Result, Settings, Study, canvas, drawn, read_settings
-from phibench.estimator.studies.run import find_study, read_study, section, write_study
+from phibench.estimator.studies.findings import Finding, findings_table, markdown_table, number
+from phibench.estimator.studies.framework import Result, Settings, Study, StudyDatasets, canvas, drawn, read_settings
+from phibench.estimator.studies.run import find_study, publish_study, read_study, section, write_study
 
 
 class Counting(Settings):
@@ -32,7 +35,7 @@ def _count(settings: Counting, datasets: StudyDatasets) -> Result:
         drawing = drawn("line", figure, f"A line up to {numbers[-1]}.")
     return Result(
         {"table": pl.DataFrame({"number": numbers})},
-        (f"There are {len(numbers)} numbers.",),
+        (Finding("count of numbers", len(numbers)).judged(">=", 3),),
         (drawing,),
         {"Numbers": (("number",), *((str(n),) for n in numbers))},
         ("nothing is left out",),
@@ -40,6 +43,57 @@ def _count(settings: Counting, datasets: StudyDatasets) -> Result:
 
 
 COUNT = Study("count", "Counting", "How many numbers are there?", Counting, _count)
+
+
+@pytest.mark.parametrize(
+    ("ends", "relation", "threshold", "verdict"),
+    [
+        ((1.0, 0.5, 1.5), "<=", 2.0, "met"),
+        ((1.0, 0.5, 1.5), "<=", 1.2, "undecided"),
+        ((1.0, 0.5, 1.5), "<=", 0.4, "missed"),
+        ((1.0, 0.5, 1.5), ">=", 0.4, "met"),
+        ((1.0, 0.5, 1.5), ">=", 1.2, "undecided"),
+        ((1.0, 0.5, 1.5), ">=", 2.0, "missed"),
+        ((1.0, 0.5, 1.5), "=", 1.2, "met"),
+        ((1.0, 0.5, 1.5), "=", 2.0, "missed"),
+        ((1.0, 0.5, 1.5), "!=", 1.2, "undecided"),
+        ((1.0, 0.5, 1.5), "!=", 2.0, "met"),
+        ((1.0, None, None), "<=", 1.0, "met"),
+        ((1.1, None, None), "<=", 1.0, "missed"),
+        ((1.0, math.nan, math.nan), ">=", 1.5, "missed"),
+        ((None, None, None), "<=", 1.0, "undecided"),
+        ((math.inf, None, None), "<=", 1.0, "undecided"),
+    ],
+)
+def test_the_whole_interval_decides(ends: Any, relation: Any, threshold: float, verdict: str) -> None:
+    found = Finding("x", *ends).judged(relation, threshold)
+    assert found.verdict == verdict
+    assert found.threshold == threshold
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(2.0, "2"), (0.73251, "0.733"), (123.4, "123"), (6240.0, "6240"), (1234.5, "1234"), (5.4e-6, "5.40e-06")]
+    + [(-0.98, "-0.980"), (None, "-"), (math.nan, "-")],
+)
+def test_numbers_have_three_digits(value: float | None, text: str) -> None:
+    assert number(value) == text
+
+
+def test_tables_leave_empty_columns_out() -> None:
+    plain = Finding("a|b", 1.5)
+    assert findings_table([plain]) == (("finding", "value"), ("a|b", "1.50"))
+    assert markdown_table(findings_table([plain])).splitlines()[-1] == "| a\\|b | 1.50 |"
+    ranged = Finding.ranged("c", (0.01, 0.005, 0.015), "%", 100.0)
+    rows = findings_table([plain, ranged.judged("<=", 2.0)])
+    assert rows[0] == ("finding", "value", "95 %", "unit", "threshold", "verdict")
+    assert rows[1] == ("a|b", "1.50", "", "", "", "")
+    assert rows[2] == ("c", "1", "0.500 to 1.50", "%", "<= 2", "met")
+
+
+def test_a_label_stands_once() -> None:
+    with pytest.raises(ValueError, match="same label: a"):
+        Result({}, (Finding("a", 1.0), Finding("a", 2.0)))
 
 
 @pytest.fixture
@@ -90,17 +144,29 @@ def test_same_study_same_bytes(tmp_path: Path, datasets: StudyDatasets) -> None:
 
 def test_read_back_and_in_a_report(tmp_path: Path, datasets: StudyDatasets) -> None:
     folder = _written(tmp_path / "study", datasets)
-    assert read_study(folder).findings == ("There are 5 numbers.",)
+    assert read_study(folder).findings == (Finding("count of numbers", 5.0, None, None, "", ">=", 3.0, "met"),)
     page = write_report([], tmp_path / "report.html", [section(folder)]).read_text(encoding="utf-8")
     for words in (
         "Study: Counting",
         "How many numbers",
-        "There are 5 numbers.",
+        "count of numbers",
         "data:image/svg",
         "nothing is left out",
     ):
         assert words in page
     assert "<caption>Numbers</caption>" in page
+    assert "<caption>Findings</caption>" in page
+    text = (folder / "findings.md").read_text(encoding="utf-8")
+    assert "| count of numbers | 5 | >= 3 | met |" in text
+
+
+def test_the_published_document_names_no_files(tmp_path: Path, datasets: StudyDatasets) -> None:
+    settings = Counting(upto=5)
+    path = publish_study(tmp_path, COUNT, settings, COUNT.run(settings, datasets))
+    assert path == tmp_path / "count.json"
+    document = json.loads(path.read_text(encoding="utf-8"))
+    assert (document["files"], document["drawings"], document["quick"]) == ({}, [], False)
+    assert document["findings"][0]["value"] == 5.0
 
 
 def test_changed_or_missing_files_are_refused(tmp_path: Path, datasets: StudyDatasets) -> None:
@@ -109,7 +175,7 @@ def test_changed_or_missing_files_are_refused(tmp_path: Path, datasets: StudyDat
     with pytest.raises(DatasetError, match=r"line\.svg is missing or was changed"):
         read_study(folder)
     document = json.loads((folder / "study.json").read_text(encoding="utf-8"))
-    (folder / "study.json").write_text(json.dumps({**document, "version": 2}), encoding="utf-8")
+    (folder / "study.json").write_text(json.dumps({**document, "version": 1}), encoding="utf-8")
     with pytest.raises(DatasetError, match="not the document of a study"):
         read_study(folder)
     (folder / "study.json").unlink()
@@ -128,3 +194,5 @@ def test_mistakes_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "a report of nothing" in capsys.readouterr().err
     assert main(["study", "noise", "--workers", "0", "--out", str(tmp_path)]) == 2
     assert "--workers 0" in capsys.readouterr().err
+    assert main(["study", "noise", "--quick", "--publish", str(tmp_path), "--out", str(tmp_path)]) == 2
+    assert "--publish goes without --quick" in capsys.readouterr().err

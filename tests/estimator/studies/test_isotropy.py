@@ -1,4 +1,4 @@
-"""Study isotropy: occlusion, lines, noise and words against independent expectations; a tiny run of the whole."""
+"""Study isotropy: occlusion, lines, noise and findings against independent expectations; a tiny run of the whole."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import polars as pl
 import pytest
 from rich.console import Console
 from scipy.optimize import brentq
@@ -31,10 +32,10 @@ from phibench.estimator.studies.isotropy.lines import (
 from phibench.estimator.studies.isotropy.noise import AzimuthNoise, bound_m, circle, flat_pair, isotropy, sideways
 from phibench.estimator.studies.isotropy.study import (
     STUDY,
-    edge_sentence,
-    grid_sentence,
-    noise_sentence,
-    occlusion_sentence,
+    edge_findings,
+    grid_findings,
+    occlusion_findings,
+    scatter_findings,
 )
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.catalog import default_rig
@@ -163,42 +164,51 @@ def test_a_spot_that_an_image_does_not_show_has_no_pair() -> None:
     assert flat_pair(RIG, 0.425, np.array([0.0, 0.0, 8.0]), LIGHT) is None
 
 
-# -- words ---------------------------------------------------------------------------------------------------------
+# -- findings ------------------------------------------------------------------------------------------------------
 
 
-def test_isotropy_is_said_as_tested() -> None:
+def test_isotropy_is_judged_as_tested() -> None:
     rng = generator("test", "isotropy", "words")
     noise = _noise(rng, np.ones(6), np.ones(6))
     test = isotropy(noise, 0.01)
-    assert "is isotropic" in noise_sentence("A", noise, replace(test, p_value=0.5, p_value_over_bound=0.5))
-    text = noise_sentence("A", noise, replace(test, p_value=1e-5, p_value_over_bound=1e-5))
-    assert "is not isotropic" in text
-    assert "still differs" in text
+    label, bound = (f"A: p of the same {x} at all azimuths" for x in ("scatter", "multiple of the bound"))
+    found = {f.label: f for f in scatter_findings("A", noise, replace(test, p_value=0.5, p_value_over_bound=0.5))}
+    assert (found[label].verdict, found[bound].verdict) == ("met", "met")
+    assert found["A: smallest scatter of D"].value == pytest.approx(1e3)
+    found = {f.label: f for f in scatter_findings("A", noise, replace(test, p_value=1e-12, p_value_over_bound=1e-5))}
+    assert (found[label].verdict, found[bound].verdict) == ("missed", "missed")
+    assert found[label].value == 1e-9  # smaller ones say no more
 
 
 def test_too_few_azimuths_are_no_verdict() -> None:
     rng = generator("test", "isotropy", "few")
     noise = _noise(rng, np.ones(1), np.ones(1))
-    text = noise_sentence("A", noise, isotropy(noise, 0.01))
-    assert "too few azimuths" in text
-    assert "isotropic" not in text
+    found = list(scatter_findings("A", noise, isotropy(noise, 0.01)))
+    assert not any(f.verdict for f in found)
+    assert not any("p of" in f.label for f in found)
 
 
 def test_the_grid_is_blamed_only_where_averaging_helps() -> None:
-    assert "makes the difference" in grid_sentence(np.array([1.0, 2.0]), np.array([1.0, 1.1]))
-    assert "not the cause" in grid_sentence(np.array([1.0, 2.0]), np.array([1.0, 1.9]))
+    single = np.array([1.0, 2.0])
+    assert list(grid_findings(single, np.array([1.0, 1.1])))[1].verdict == "met"
+    assert list(grid_findings(single, np.array([1.0, 1.9])))[1].verdict == "missed"
 
 
-def test_occlusion_is_said_with_its_shares() -> None:
-    assert "hides nothing" in occlusion_sentence([0.5], [0.07], [0.0], 0.4)
-    assert "hides up to 2 %" in occlusion_sentence([0.5], [0.07], [0.02], 0.4)
+def test_occlusion_has_its_shares() -> None:
+    hidden = pl.DataFrame({"height_m": [0.5], "pair": [0.07], "own": [0.0]})
+    pair, own = occlusion_findings(hidden, 0.4)
+    assert pair.label == "hidden from each other, two sensors 0.4 m apart, spot at 0.5 m"
+    assert (pair.value, own.verdict) == (pytest.approx(7.0), "met")
+    assert list(occlusion_findings(hidden.with_columns(own=0.02), 0.4))[1].verdict == "missed"
 
 
-def test_edges_are_called_vertical_below_a_tenth_of_a_column() -> None:
+def test_edges_are_vertical_below_a_tenth_of_a_column() -> None:
     edge = SeenEdge("door", 10.0, 30, 0.02, 0.01, 0.0, 0.0, 0.02)
-    assert "are vertical" in edge_sentence("aligned", [edge])
-    assert "not vertical" in edge_sentence("aligned", [replace(edge, lean_px=-0.4)])
-    assert "No upright edge" in edge_sentence("aligned", [])
+    lean = next(edge_findings("aligned", [edge]))
+    assert (lean.value, lean.verdict) == (0.02, "met")
+    lean = next(edge_findings("aligned", [replace(edge, lean_px=-0.4)]))
+    assert (lean.value, lean.verdict) == (-0.4, "missed")
+    assert not list(edge_findings("aligned", []))
 
 
 # -- the whole -----------------------------------------------------------------------------------------------------
@@ -213,7 +223,7 @@ def test_recipes_are_valid_and_share_boards_and_light(name: str) -> None:
 
 
 class _Held:
-    """StudyDatasets that has three data sets already."""
+    """Three data sets that are there already."""
 
     def __init__(self, held: dict[str, Dataset]) -> None:
         self._held = held
@@ -240,8 +250,10 @@ def test_tiny_study(tiny_dataset: Path, misaligned_dataset: Path, tmp_path: Path
     assert set(result.tables) == {"table", "bounds", "occlusion", "edges", "lines"}
     assert result.tables["lines"].height == 4
     assert len(result.drawings) == 3
-    assert any("Epipolar lines of the aligned rig are radial" in text for text in result.findings)
-    assert len(result.findings) == 11
+    found = {finding.label: finding for finding in result.findings}
+    for words in ("exact points beside the radius", "rendered spots beside the radius"):
+        assert found[f"epipolar lines, aligned rig: {words}"].verdict == "met"
+        assert found[f"epipolar lines, misaligned rig: {words}"].verdict == "missed"
 
 
 def test_data_sets_come_from_the_shipped_recipes(tmp_path: Path) -> None:

@@ -1,9 +1,10 @@
-"""Study misalignment: numbers against other mathematics, words with made-up numbers, a tiny run of the whole."""
+"""Study misalignment: numbers against other mathematics, findings of made-up numbers, a tiny run of the whole."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -30,20 +31,25 @@ from phibench.estimator.studies.misaligned_rigs import (
     seen_px,
     slopes,
 )
-from phibench.estimator.studies.misalignment.interactions import Interactions, evaluated, with_intervals
+from phibench.estimator.studies.misalignment.interactions import (
+    Interactions,
+    evaluated,
+    interaction_findings,
+    with_intervals,
+)
 from phibench.estimator.studies.misalignment.study import STUDY
 from phibench.estimator.studies.misalignment.tables import (
     Rank,
     Search,
-    calibrated_sentence,
-    interaction_sentence,
+    calibrated_findings,
     noise_intervals,
     over_azimuths,
-    rendered_sentence,
+    rendered_findings,
     signs,
-    slope_sentence,
+    slope_findings,
+    tightest_table,
     tolerance,
-    tolerance_sentence,
+    tolerance_findings,
 )
 from phibench.estimator.studies.statistics import first_crossing
 from phibench.render.optics.truth import spot_truth
@@ -146,19 +152,23 @@ def test_tolerance_solves_the_whole_change() -> None:
     assert checked == 8
 
 
-def _brent(name: str, statistic: int, depth: int) -> float:
-    aligned = errors(RIG, Misalignment(), PLACES, ("exact",))[0, depth]
+@cache
+def _changes(name: str, value: float) -> np.ndarray:
+    """Changes of D's relative error at both signs, shape (d, 2 a): all statistics and distances share them."""
+    aligned = errors(RIG, Misalignment(), PLACES, ("exact",))[0]
+    both = [errors(RIG, Misalignment(**{name: s * value}), PLACES, ("exact",))[0] - aligned for s in (1.0, -1.0)]
+    return np.abs(np.concatenate(both, axis=-1))
 
+
+def _brent(name: str, statistic: int, depth: int) -> float:
     def above(value: float) -> float:
-        both = [errors(RIG, Misalignment(**{name: s * value}), PLACES, ("exact",))[0, depth] for s in (1.0, -1.0)]
-        changes = np.abs(np.concatenate(both) - np.tile(aligned, 2))
+        changes = _changes(name, value)[depth]
         return float((np.sqrt(np.mean(changes**2)), np.max(changes))[statistic]) - 0.01
 
-    start = 1e-3 * PARAMETERS[name].study
-    end = start
+    end = start = 0.02 * PARAMETERS[name].study
     while above(end) < 0.0:
         end *= 1.2
-    return float(brentq(above, start, end, rtol=1e-5))
+    return float(brentq(above, max(start, end / 1.2), end, rtol=1e-4))
 
 
 def test_first_crossing_of_known_costs() -> None:
@@ -219,7 +229,7 @@ def test_calibration_takes_out_what_it_fits() -> None:
     assert cost["pitch_rad"] > 0.2
 
 
-def test_beliefs_are_as_wide_as_the_study() -> None:
+def test_priors_are_as_wide_as_the_usual_sizes() -> None:
     sigmas = dict(zip(CALIBRATION, nominal_sigmas(), strict=True))
     assert sigmas["cx_px"] == PARAMETERS["cx_px"].study
     assert sigmas["focal_relative"] == PARAMETERS["focal_relative"].study
@@ -243,7 +253,7 @@ def test_rendered_spots_move_as_predicted() -> None:
     assert moved["tilt_y_rad"] > 10.0 * 1e-3 * float(found[0].explained.max())  # the tolerance is far below the effect
 
 
-# -- words ---------------------------------------------------------------------------------------------------------
+# -- findings ------------------------------------------------------------------------------------------------------
 
 
 def _rank(parameter: str, *rms: float) -> Rank:
@@ -265,51 +275,68 @@ def _indices(low: float, high: float) -> Interactions:
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "words"),
-    [(0.92, 1.02, ": they add;"), (0.5, 0.8, "do not simply add"), (0.85, 1.0, "not decided")],
+    ("low", "high", "verdict"), [(0.92, 1.02, "met"), (0.5, 0.8, "missed"), (0.85, 1.0, "undecided")]
 )
-def test_additivity_is_said_only_where_the_interval_decides(low: float, high: float, words: str) -> None:
-    text = interaction_sentence([_indices(low, high)])
-    assert words in text
-    assert f"({low:.2f} to {high:.2f})" in text
+def test_additivity_is_decided_by_the_interval(low: float, high: float, verdict: str) -> None:
+    found = {f.label: f for f in interaction_findings([_indices(low, high)])}
+    total = found["sum of the first-order Sobol indices, D = 1 m"]
+    assert (total.low, total.high, total.verdict) == (low, high, verdict)
+    share = found["variance by interaction, D = 1 m"]
+    assert (share.low, share.high) == pytest.approx((100.0 * (1.0 - high), 100.0 * (1.0 - low)))
+    assert found["largest total Sobol index (cx_px, D = 1 m)"].value == 0.65
 
 
-def test_slopes_are_praised_only_where_they_hold() -> None:
-    assert "not enough" in slope_sentence(("tilt_y_rad", 1.0, 0.02), 1e-3)
-    assert "not enough" not in slope_sentence(("tilt_y_rad", 1.0, 1e-4), 1e-3)
+def test_slopes_are_judged_by_their_misses() -> None:
+    assert next(slope_findings(("tilt_y_rad", 1.0, 0.02), 1e-3)).verdict == "missed"
+    assert next(slope_findings(("tilt_y_rad", 1.0, 1e-4), 1e-3)).verdict == "met"
 
 
 def test_rendered_agreement_is_judged_by_the_tolerance() -> None:
     one = Rendered("k1", 0.03, np.full((5, 1, 1), 0.011), np.full((5, 1, 1), 0.01), 1e-4, np.ones((1, 1)))
-    assert "not as predicted" in rendered_sentence([one], 1e-4)
-    assert "not" not in rendered_sentence([one], 1e-2)
+    assert next(rendered_findings([one], 1e-4)).verdict == "missed"
+    assert next(rendered_findings([one], 1e-2)).verdict == "met"
     lost = replace(one, change=np.full((5, 1, 1), np.nan))
-    assert "not as predicted" in rendered_sentence([lost], 1e-2)
+    assert next(rendered_findings([lost], 1e-2)).verdict == "undecided"
 
 
-def test_tolerances_name_the_tightest_and_those_never_reached() -> None:
+def test_tolerances_start_with_the_tightest_and_count_those_never_reached() -> None:
     def row(parameter: str, value: float | None) -> dict[str, object]:
         over = None if value is None else value / PARAMETERS[parameter].study
         words = {"estimator": "exact", "statistic": "rms", "depth_m": 3.18}
         return {"parameter": parameter, "value": value, "value_over_study": over, **words}
 
-    text = tolerance_sentence([row("cx_px", 30.0), row("tilt_y_rad", 0.001), row("k3", None)], "exact", 3.18, 0.01)
-    assert text.index("tilt_y_rad 0.0573 deg") < text.index("cx_px 30 px")
-    assert "1 of 3 parameters" in text
-    assert "k3 never does" in text
+    rows = [row("cx_px", 30.0), row("tilt_y_rad", 0.001), row("k3", None)]
+    first, second, below, never = tolerance_findings(rows, "exact", 3.18, 0.01)
+    assert first.label == "tolerance for 1 % of D, exact, D = 3.18 m: tilt_y_rad"
+    assert (first.value, first.unit) == (pytest.approx(0.0573, abs=5e-5), "deg")
+    assert (second.value, second.unit) == (30.0, "px")
+    assert (below.value, below.unit) == (1, "of 3")
+    assert never.value == 1
+    assert "(k3)" in never.label
+    assert tightest_table(rows, "exact", 3.18, 0.01) == (
+        ("parameter", "tolerance for 1 % of D", "expected deviation", "ratio"),
+        ("tilt_y_rad", "0.0573 deg", "0.498 deg", "0.11"),
+        ("cx_px", "30 px", "15 px", "2"),
+    )
 
 
-def test_calibration_is_praised_only_where_it_helps() -> None:
+def _left(ranks: list[Rank], before: list[Rank]) -> dict[str, str]:
+    return {f.label: f.verdict for f in calibrated_findings(ranks, before)}
+
+
+def test_calibration_is_judged_by_what_it_leaves() -> None:
     before = [_rank("cx_px", 0.02, 0.03)]
-    assert "spots less is left" in calibrated_sentence([_rank("cx_px", 0.002, 0.008)], before)
-    assert "no less is left" in calibrated_sentence([_rank("cx_px", 0.02, 0.08)], before)
+    label = "largest change of D after a calibration"
+    assert _left([_rank("cx_px", 0.002, 0.008)], before)[label] == "met"
+    assert _left([_rank("cx_px", 0.02, 0.08)], before)[label] == "missed"
 
 
-def test_harm_by_a_calibration_is_said() -> None:
+def test_harm_by_a_calibration_is_a_finding() -> None:
     before = [_rank("cx_px", 0.02, 0.03), _rank("yaw_rad", 1e-5, 1e-4)]
     after = [_rank("yaw_rad", 0.003, 0.002), _rank("cx_px", 1e-4, 1e-4)]
-    assert "it makes yaw_rad worse" in calibrated_sentence(after, before)
-    assert "worse" not in calibrated_sentence([_rank("yaw_rad", 1e-5, 1e-4), after[1]], before)
+    label = "change of D that a calibration adds: yaw_rad"
+    assert _left(after, before)[label] == "missed"
+    assert label not in _left([_rank("yaw_rad", 1e-5, 1e-4), after[1]], before)
 
 
 def test_noise_interval_covers_as_often_as_it_says() -> None:
@@ -342,26 +369,26 @@ calibration_outline_sigma_m = [8e-6, 8e-6, 24e-6]
 noise_draws = 2
 sobol_log2 = 4
 resamples = 20
+parameters = ["tilt_y_rad", "cx_px", "pitch_rad", "roughness_alpha"]
 """
 
 
-FEW = ("tilt_y_rad", "cx_px", "pitch_rad", "roughness_alpha")
-
-
-def test_tiny_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tiny_study(tmp_path: Path) -> None:
     """Four of the parameters, because every one of them costs two calibrations."""
-    few = {name: PARAMETERS[name] for name in FEW}
-    for module in ("misaligned_rigs", "misalignment.tables", "misalignment.interactions"):
-        monkeypatch.setattr(f"phibench.estimator.studies.{module}.PARAMETERS", few)
     file = tmp_path / "tiny.toml"
     file.write_text(TINY, encoding="utf-8")
-    result = STUDY.run(read_settings(STUDY, path=file), StudyDatasets(tmp_path, Console(quiet=True)))
+    settings = read_settings(STUDY, path=file)
+    result = STUDY.run(settings, StudyDatasets(tmp_path, Console(quiet=True)))
     table = result.tables["table"]
     assert set(table["estimator"].unique()) == {*NOMINAL, "exact_calibrated"}
-    assert set(table["parameter"].unique()) == set(FEW)
+    assert set(table["parameter"].unique()) == set(settings.chosen)
     assert table.filter(pl.col("rendered_relative").is_not_null()).height > 0
-    assert result.tables["tolerance"].height == len(FEW) * 6 * 2 * 2
-    assert len(result.findings) == 8
+    assert result.tables["tolerance"].height == 4 * 6 * 2 * 2
+    labels = " ".join(finding.label for finding in result.findings)
+    for words in ("change of D, exact: ", "change of D, paper_normal: ", "slope times error", "rendered against"):
+        assert words in labels
+    for words in ("tolerance for 1 % of D", "after a calibration", "noise of the calibration", "all drawn at once"):
+        assert words in labels
     assert len(result.drawings) == 3
     assert not (tmp_path / "data").exists()  # it needs no data set
 
@@ -377,3 +404,6 @@ def test_bad_settings_end_in_a_sentence(tmp_path: Path) -> None:
     file.write_text(TINY.replace("sobol_log2 = 4", "sobol_log2 = 40"), encoding="utf-8")
     with pytest.raises(DatasetError, match="sobol_log2"):
         read_settings(STUDY, path=file)
+    file.write_text(TINY.replace("tilt_y_rad", "tilt_z_rad"), encoding="utf-8")
+    with pytest.raises(DatasetError, match="no misalignment 'tilt_z_rad'; did you mean"):
+        STUDY.run(read_settings(STUDY, path=file), StudyDatasets(tmp_path, Console(quiet=True)))

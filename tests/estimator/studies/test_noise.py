@@ -1,4 +1,4 @@
-"""Study `noise`: factors, cut sensor, elasticities, sentences with made-up numbers, and a tiny run."""
+"""Study `noise`: factors, cut sensor, elasticities, findings of made-up numbers, and a tiny run."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from phibench.datasets.read import Sample, open_dataset
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.intervals import Estimate
 from phibench.estimator.limits.position_bound import spot_limit
+from phibench.estimator.studies.findings import Finding
 from phibench.estimator.studies.framework import StudyDatasets, read_settings
 from phibench.estimator.studies.image_cutout import Shot, SpotPair, bounds_of, cut_region, cut_rig, drawn_pair
 from phibench.estimator.studies.noise.cells import BASE, FACTORS, OFF, applied
@@ -26,13 +27,12 @@ from phibench.estimator.studies.noise.study import STUDY
 from phibench.estimator.studies.noise.tables import (
     Elasticity,
     around_base,
-    base_sentence,
+    base_findings,
     elasticities,
-    floor_sentence,
-    leaving_sentence,
-    ranking_sentence,
+    floor_findings,
+    limit_findings,
+    ranking_findings,
     scatter_and_bias_px,
-    useless_sentence,
 )
 from phibench.render.sensor.electrons import expected_electrons
 from phibench.render.sensor.light import Region
@@ -213,7 +213,7 @@ def test_scatter_and_bias_are_told_apart() -> None:
     assert bias == pytest.approx(0.3, rel=0.03)
 
 
-# -- sentences ----------------------------------------------------------------------------------------------------
+# -- findings -----------------------------------------------------------------------------------------------------
 
 
 def _row(factor: str, level: float, method: str = REF, **changes: float) -> dict[str, Any]:
@@ -233,45 +233,48 @@ def _row(factor: str, level: float, method: str = REF, **changes: float) -> dict
     return {**row, "bound_px": 0.03, "bound_depth_relative": 1e-3, "saturated": changes.get("saturated", 0.0)}
 
 
-def test_floors_are_named_only_where_they_are_sure() -> None:
+def _limits(*rows: dict[str, Any]) -> dict[str, Finding]:
+    lead = f"bayer-raw, s: {REF}, "
+    return {f.label.removeprefix(lead): f for f in limit_findings(pl.DataFrame(rows), "s", "bayer-raw")}
+
+
+def test_floors_are_decided_by_the_interval() -> None:
     rows = [
         _row("power_mw", 1.5),
         _row("power_mw", 1.5, "red_centroid", efficiency_px=0.05, rms_px=0.6),
         _row("power_mw", 1.5, "detect", efficiency_px=0.5),
         _row("power_mw", 9.0, "detect", saturated=1.0),
     ]
-    text = floor_sentence(pl.DataFrame(rows), "s", "bayer-raw")
-    assert "1.5 mW (the strongest without full pixels)" in text
-    assert "floor above 2 times the bound have red_centroid 600 mpx;" in text
-    assert f"stay {REF} 1;" in text
-    assert "undecided with these draws are detect 2" in text
-    assert "pixels are full at every power" in floor_sentence(pl.DataFrame(rows[3:]), "s", "bayer-raw")
-    assert "was not changed" in floor_sentence(pl.DataFrame([_row("adc_bits", 8.0)]), "s", "bayer-raw")
+    found = {f.label: f for f in floor_findings(pl.DataFrame(rows), "s", "bayer-raw")}
+    lead = "bayer-raw, s, 1.5 mW: "  # the strongest without full pixels
+    assert found[f"{lead}red_centroid, rms distance"].value == pytest.approx(600.0)
+    words = {"red_centroid": "missed", REF: "met", "detect": "undecided"}
+    assert {name: found[f"{lead}{name}, rms / bound"].verdict for name in words} == words
+    assert not list(floor_findings(pl.DataFrame(rows[3:]), "s", "bayer-raw"))  # full at every power
+    assert not list(floor_findings(pl.DataFrame([_row("adc_bits", 8.0)]), "s", "bayer-raw"))  # power not changed
 
 
 def test_where_the_bound_is_useless() -> None:
     good = [_row("power_mw", 0.3), _row(BASE, 0.0)]
-    assert "holds over all ranges tried" in useless_sentence(pl.DataFrame(good), "s", "bayer-raw")
-    faint = [*good, _row("power_mw", 0.1, detection_rate=0.4)]
-    assert "means little, at laser power, mW 0.1 (40 % found)" in useless_sentence(
-        pl.DataFrame(faint), "s", "bayer-raw"
-    )
-    below = [*good, _row("read_noise_e", 16.0, efficiency_px=1.5)]
-    assert "by their intervals below 0.9 times the bound" in useless_sentence(pl.DataFrame(below), "s", "bayer-raw")
-    full = [*good, _row("power_mw", 3.0, saturated=0.5, efficiency_px=0.4)]
-    assert "pixels are full, which the bound leaves out, at laser power, mW 3 (rms / bound 2.5" in useless_sentence(
-        pl.DataFrame(full), "s", "bayer-raw"
-    )
+    assert {k: (f.value, f.unit) for k, f in _limits(*good).items()} == {"levels not surely off the bound": (2, "of 2")}
+    faint = _limits(*good, _row("power_mw", 0.1, detection_rate=0.4))["spots found, laser power, mW 0.1"]
+    assert (faint.value, faint.verdict) == (40.0, "missed")
+    below = _limits(*good, _row("read_noise_e", 16.0, efficiency_px=1.5))["rms / bound, read noise, e- 16"]
+    assert (below.relation, below.threshold, below.verdict) == (">=", 0.9, "missed")
+    full = _limits(*good, _row("power_mw", 3.0, saturated=0.5, efficiency_px=0.4))
+    assert full["rms / bound with full pixels, laser power, mW 3"].value == pytest.approx(2.5)
+    assert full["levels not surely off the bound"].unit == "of 3"
 
 
 def test_where_the_reference_leaves_the_bound() -> None:
-    rows = [_row(BASE, 0.0), _row("focus_distance_m", 0.19, efficiency_px=0.5, scatter_px=0.04, bias_px=0.05)]
-    text = leaving_sentence(pl.DataFrame(rows), "s", "bayer-raw")
-    assert "leaves the bound (by its interval above 1.25 times) at focus distance, m 0.19 (rms / bound 2" in text
-    assert "scatter 40 and bias 50 mpx" in text
-    assert "at no level by its interval above" in leaving_sentence(pl.DataFrame(rows[:1]), "s", "bayer-raw")
-    full = [rows[0], _row("power_mw", 3.0, efficiency_px=0.3, saturated=1.0)]
-    assert "at no level" in leaving_sentence(pl.DataFrame(full), "s", "bayer-raw")
+    away = _row("focus_distance_m", 0.19, efficiency_px=0.5, scatter_px=0.04, bias_px=0.05)
+    found = _limits(_row(BASE, 0.0), away)
+    left = found["rms / bound, focus distance, m 0.19"]
+    assert (left.relation, left.threshold, left.verdict) == ("<=", 1.25, "missed")
+    assert found["scatter, focus distance, m 0.19"].value == pytest.approx(40.0)
+    assert found["bias, focus distance, m 0.19"].value == pytest.approx(50.0)
+    full = _limits(_row(BASE, 0.0), _row("power_mw", 3.0, efficiency_px=0.3, saturated=1.0))
+    assert not any(f.verdict for f in full.values())  # full pixels are no reason to leave it
 
 
 def _elasticity(factor: str, value: float, half: float) -> Elasticity:
@@ -279,23 +282,34 @@ def _elasticity(factor: str, value: float, half: float) -> Elasticity:
     return Elasticity("s", "bayer-raw", factor, REF, 0.5, 2.0, estimate, value)
 
 
-def test_ranking_says_what_is_sure() -> None:
+def _ranking(*found: Elasticity) -> list[Finding]:
+    return list(ranking_findings(found, "s", "bayer-raw"))
+
+
+def test_ranking_starts_with_the_largest_and_tells_what_is_sure() -> None:
     strong, weak = _elasticity("power_mw", -0.9, 0.1), _elasticity("read_noise_e", 0.2, 0.1)
-    none = _elasticity("adc_bits", 0.01, 0.1)
-    text = ranking_sentence([none, weak, strong], "s", "bayer-raw")
-    assert "laser power matters most; d ln rms" in text
-    assert text.index("laser power -0.90") < text.index("read noise +0.20") < text.index("converter +0.01")
-    assert "Only 2 of 3 are surely not 0." in text
-    close = ranking_sentence([strong, _elasticity("exposure_s", -0.85, 0.1)], "s", "bayer-raw")
-    assert "laser power matters most, though not surely more than exposure" in close
-    assert "Only" not in close
-    assert "no factor" in ranking_sentence([_elasticity("focus_distance_m", 1.0, 0.1)], "s", "bayer-raw")
+    found = _ranking(_elasticity("adc_bits", 0.01, 0.1), weak, strong)
+    assert [f.label.removeprefix("bayer-raw, s: d ln rms / d ln ") for f in found[:3]] == [
+        "laser power",
+        "read noise",
+        "converter",
+    ]
+    assert [f.verdict for f in found[:3]] == ["met", "met", "undecided"]
+    assert (found[3].value, found[3].verdict) == (pytest.approx(0.7), "met")
+    close = _ranking(strong, _elasticity("exposure_s", -0.85, 0.1))[-1]
+    assert close.label == "bayer-raw, s: size of the slope for laser power less that for exposure"
+    assert close.verdict == "undecided"
+    assert not _ranking(_elasticity("focus_distance_m", 1.0, 0.1))
 
 
-def test_base_case_in_a_sentence() -> None:
-    text = base_sentence(pl.DataFrame([_row(BASE, 0.0)]), "s", "bayer-raw")
-    assert "30 mpx rms (27 to 33), the bound being 30 mpx (rms / bound 1 (0.909 to 1.11))" in text
-    assert "finds no spot" in base_sentence(pl.DataFrame([_row(BASE, 0.0, rms_px=math.nan)]), "s", "bayer-raw")
+def test_base_case_as_findings() -> None:
+    found = {f.label: f for f in base_findings(pl.DataFrame([_row(BASE, 0.0)]), "s", "bayer-raw")}
+    rms = found[f"bayer-raw, s: {REF}, rms distance"]
+    assert (rms.value, rms.low, rms.high) == pytest.approx((30.0, 27.0, 33.0))
+    assert found["bayer-raw, s: bound of the distance"].value == 30.0
+    assert found[f"bayer-raw, s: {REF}, rms / bound"].low == pytest.approx(0.909, abs=5e-4)
+    (none,) = base_findings(pl.DataFrame([_row(BASE, 0.0, rms_px=math.nan)]), "s", "bayer-raw")
+    assert none.value is None
 
 
 # -- settings and a run -------------------------------------------------------------------------------------------
@@ -344,7 +358,8 @@ def test_tiny_study(tmp_path: Path, tiny_dataset: Path, monkeypatch: pytest.Monk
     base = table.filter(preset="bayer-raw", factor=BASE).sort("method")
     red = base.filter(method="red_centroid")
     assert red["bias_px"][0] > red["scatter_px"][0]  # the mosaic's floor is bias
-    assert len(result.findings) == 2 * 5
+    leads = {finding.label.split(":")[0] for finding in result.findings}
+    assert {f"{preset}, seen-near-h0.500" for preset in ("bayer-raw", "srgb8")} <= leads
     assert [d.name for d in result.drawings][-1] == "ranking-seen-near-h0.500"
 
 

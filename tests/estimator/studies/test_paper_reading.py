@@ -13,7 +13,6 @@ from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.paper_depth import depth_approx
 from phibench.estimator.geometry.phi import outline_circle, phi_outline
-from phibench.estimator.studies.cause import study
 from phibench.estimator.studies.cause.model import NOISE, Model, brute_force, simulate
 from phibench.estimator.studies.cause.nested_sampling import CauseSettings
 from phibench.estimator.studies.cause.paper_reading import (
@@ -24,7 +23,7 @@ from phibench.estimator.studies.cause.paper_reading import (
     radii_px,
     read,
 )
-from phibench.estimator.studies.cause.study import STUDY
+from phibench.estimator.studies.cause.study import STUDY, short_stroke_findings
 from phibench.estimator.studies.cause.tables import short_stroke_table
 from phibench.estimator.studies.framework import read_settings
 from phibench.scenes.frames import Array, Pose
@@ -105,12 +104,14 @@ def test_h_against_d_cannot_make_the_error_rise() -> None:
     assert float(depth_approx(0.7, 0.5, 1.0).depth_m) == pytest.approx(np.sin(1.4) * np.sin(1.0) / np.sin(0.4))
     own = short.filter(pl.col("table") == 1).sort("stroke_m")["eq5_error_m"].abs()
     assert own[-1] < own[0]
-    sentence = study.short_stroke_sentence(short)
-    assert "falls from" in sentence
+    label = "eq. (5) with exact phi_ray: growth of the size of the error along Table 1"
+    growth = {f.label: f for f in short_stroke_findings(short)}[label]
+    assert growth.value == pytest.approx(1e3 * float(own[-1] - own[0]))
+    assert growth.verdict == "met"
     grown = short.with_columns(
         pl.when(pl.col("stroke_m") > 1.35).then(1.0).otherwise(pl.col("eq5_error_m")).alias("eq5_error_m")
     )
-    assert "grows from" in study.short_stroke_sentence(grown)
+    assert {f.label: f for f in short_stroke_findings(grown)}[label].verdict == "missed"
 
 
 def test_readings_of_many_rigs_are_those_of_each(settings: CauseSettings) -> None:

@@ -1,4 +1,4 @@
-"""Study `stroke`: the drawn rigs, intervals of an rms, sentences with made-up numbers, and a tiny run."""
+"""Study `stroke`: the drawn rigs, intervals of an rms, findings of made-up numbers, and a tiny run."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from phibench.datasets.errors import DatasetError
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, prior_sigmas
 from phibench.estimator.limits.best_stroke import LARGEST, BestStroke
 from phibench.estimator.limits.stroke_curve import CEILING, FREE, StrokeCurve
+from phibench.estimator.studies.findings import Finding
 from phibench.estimator.studies.framework import StudyDatasets, read_settings
 from phibench.estimator.studies.stroke.rendered_checks import (
     Check,
     Checked,
-    best_sentence,
-    check_sentences,
+    best_findings,
+    check_findings,
     deviations,
     growth,
-    growth_sentence,
-    limits_sentence,
-    reason_sentence,
+    growth_findings,
+    limit_findings,
+    reason_findings,
     theta_rad,
 )
 from phibench.estimator.studies.stroke.study import AS_BUILT, CALIBRATED, EXACT, STUDY, tolerances
@@ -105,50 +106,72 @@ def test_growth_is_told_from_a_limit() -> None:
     assert growth(falls, 1.4) == 1.0
     assert growth(grows, 1.4) == pytest.approx(1.5)
     assert growth(grows, 0.8) == 1.0  # up to there it has only fallen
-    found = {("a", 2.0): falls, ("b", 2.0): grows}
-    both = growth_sentence(found, 2.0, ("a", "b"), 1.4)
-    assert "grows again for b (1.50 times the smallest at 1.4 m); it does not for a." in both
-    assert "does not grow again for a." in growth_sentence(found, 2.0, ("a",), 1.4)
-    assert "it does not" not in growth_sentence(found, 2.0, ("b",), 1.4)
+    falling, growing = growth_findings({("a", 2.0): falls, ("b", 2.0): grows}, 2.0, ("a", "b"), 1.4)
+    assert (falling.value, falling.verdict) == (1.0, "met")
+    assert (growing.value, growing.verdict) == (pytest.approx(1.5), "missed")
+    assert growing.label == "b, D = 2 m: error at h = 1.4 m over the smallest"
+
+
+def _of_best(best: BestStroke) -> dict[str, float | None]:
+    return {f.label: f.value for f in best_findings({("a", 2.0): best}, "a", (2.0,))}
 
 
 def test_best_strokes_with_and_without_limit_or_stroke() -> None:
-    assert best_sentence({("a", 2.0): _best([4e-3, 3e-3, 2e-3], (LARGEST,))}, "a", (2.0,)) == (
-        "a: D = 2 m best h 1.40 m, sigma 2 mm (0.1 %; within 5 % from 1.40 to 1.40 m; limit: longest stroke)."
-    )
-    assert "limit" not in best_sentence({("a", 2.0): _best([4e-3, 2e-3, 3e-3])}, "a", (2.0,))
+    assert _of_best(_best([4e-3, 3e-3, 2e-3], (LARGEST,))) == {
+        "a, D = 2 m: best stroke, limit: longest stroke": pytest.approx(1.4),
+        "a, D = 2 m: shortest stroke within 5 % of the smallest error": pytest.approx(1.4),
+        "a, D = 2 m: longest stroke within 5 % of the smallest error": pytest.approx(1.4),
+        "a, D = 2 m: sigma of D": 2.0,
+        "a, D = 2 m: relative sigma of D": pytest.approx(0.1),
+        "a, D = 2 m: part of sigma beyond first order": 0.0,
+    }
+    assert "a, D = 2 m: best stroke" in _of_best(_best([4e-3, 2e-3, 3e-3]))
     nan = (math.nan,) * 6
     none = BestStroke(2.0, *nan, (CEILING,), _best([1.0, 1.0]).curve)
-    assert best_sentence({("a", 2.0): none}, "a", (2.0,)) == "a: D = 2 m: no stroke, ceiling."
+    assert _of_best(none) == {"a, D = 2 m: no stroke, ceiling": None}
 
 
 def test_what_stands_in_the_way_first() -> None:
     near, far = (
         _best([1.0, 1.0, 1.0], (), causes).curve for causes in ((FREE, FREE, CEILING), (FREE, CEILING, CEILING))
     )
-    assert "ceiling from 0.80 m (D = 4 m)" in limits_sentence({1.0: near, 4.0: far})
-    assert "Nothing stands in the way" in limits_sentence({1.0: _best([1.0, 1.0]).curve})
+    (found,) = limit_findings({1.0: near, 4.0: far})
+    assert (found.label, found.value) == (
+        "without the carriage's limit: ceiling, first at D = 4 m, from h",
+        pytest.approx(0.8),
+    )
+    (nothing,) = limit_findings({1.0: _best([1.0, 1.0]).curve})
+    assert "nothing forbids" in nothing.label
 
 
 def test_reason_names_the_costliest_parameter() -> None:
     rig = Rig()
     # the sphere is at 0.71 m, the spot 0.21 m below it
     assert theta_rad(rig, 2.18, 0.5, 0.0) == pytest.approx(math.atan2(2.18, 0.21))
-    text = reason_sentence(rig, 2.18, 0.5, (0.8, 1.4))
-    assert "84 deg" in text
-    assert any(name in text for name in PARAMETERS)
+    found = list(reason_findings(rig, 2.18, 0.5, (0.8, 1.4)))
+    assert found[0].value == pytest.approx(84.5, abs=0.05)
+    assert len(found) == 5
+    assert all(any(f"({name})" in f.label for name in PARAMETERS) for f in found[3:])
+
+
+def _of_checks(checks: list[Checked]) -> dict[str, Finding]:
+    return {f.label.removeprefix(f"frames, {AS_BUILT}: "): f for f in check_findings(checks)}
 
 
 def test_checks_are_judged_by_their_intervals() -> None:
     good = [_checked(0.5, 2.0, 2.0), _checked(1.0, 1.0, 1.0), _checked(2.0, 1.5, 1.5)]
-    (text,) = check_sentences(good)
-    assert "1.00 on average of 3 cells of 400 pairs" in text
-    assert "interval of 3" in text
-    assert "No other stroke is surely better than the best; 2 of 2 are surely worse." in text
-    (beaten,) = check_sentences([*good[:2], _checked(2.0, 1.5, 0.5)])
-    assert "surely not the best at D = 1 m, 2 times" in beaten
-    assert "interval of 2" in beaten
-    assert len(check_sentences([*good, _checked(1.0, 1.0, 1.0, name=EXACT)])) == 2
+    found = _of_checks(good)
+    assert found["measured rms over predicted sigma, mean"].value == pytest.approx(1.0)
+    assert found["pairs of a cell, least"].value == 400
+    inside = found["predictions in the 95 % interval"]
+    assert (inside.value, inside.unit) == (3, "of 3 cells")
+    assert found["strokes surely better than the best"].verdict == "met"
+    worse = found["strokes surely worse than the best"]
+    assert (worse.value, worse.unit) == (2, "of 2")
+    beaten = _of_checks([*good[:2], _checked(2.0, 1.5, 0.5)])
+    assert beaten["strokes surely better than the best"].verdict == "missed"
+    assert beaten["predictions in the 95 % interval"].value == 2
+    assert len(list(check_findings([*good, _checked(1.0, 1.0, 1.0, name=EXACT)]))) == 14
 
 
 @pytest.mark.parametrize(
@@ -190,4 +213,4 @@ def test_tiny_study(tmp_path: Path) -> None:
     ratio = (exact["rms_m"] / exact["predicted_m"]).to_numpy()
     assert np.all((ratio > 0.3) & (ratio < 2.0))
     assert [d.name for d in result.drawings] == ["best", "curves", "checks"]
-    assert any("grow" in sentence for sentence in result.findings)
+    assert any("over the smallest" in finding.label for finding in result.findings)
