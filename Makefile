@@ -16,13 +16,14 @@ PARALLEL ?= --numprocesses 2 --dist loadfile
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup dataset bench studies test test-slow proof test-all mutants benchmark lint clean
+.PHONY: help setup dataset bench studies studies-full test test-slow proof test-all mutants benchmark lint clean
 
 help:
 	@echo "make setup      make .venv with everything in it, and make sure of LLVM"
 	@echo "make dataset    render $(RECIPE) into $(OUT)"
 	@echo "make bench      $(SAMPLES) samples of bench-dev, all built-in methods on them, a report, in out/"
 	@echo "make studies    the six studies, reduced, and a report on them, in out/studies"
+	@echo "make studies-full  the same in full (hours), published to docs/studies"
 	@echo "make test       the tests, without the slow ones"
 	@echo "make test-slow  the slow tests"
 	@echo "make proof      the slow tests of accuracy, but those of many minutes"
@@ -68,6 +69,14 @@ studies: $(READY)
 	    echo "== $$name"; $(BIN)/phibench study $$name --quick --out $(STUDIES)/$$name --data $(STUDIES)/data; \
 	done
 	$(BIN)/phibench report --study $(addprefix $(STUDIES)/,$(STUDIES_ALL)) --out $(STUDIES)/report.html
+
+# Hours. The documents beside the pages are replaced; tests/estimator/studies/test_study_pages.py then names every
+# number of a page that has to be edited.
+studies-full: $(READY)
+	@set -e; for name in $(STUDIES_ALL); do \
+	    echo "== $$name"; \
+	    $(BIN)/phibench study $$name --out $(STUDIES)-full/$$name --data $(STUDIES)/data --publish docs/studies; \
+	done
 
 test: $(READY)
 	$(BIN)/python -m pytest $(PARALLEL)

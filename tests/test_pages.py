@@ -29,13 +29,6 @@ NOT_YET = {
     "docs/method.md",
     "docs/scoring.md",
     "docs/sealed.md",
-    "docs/studies.md",
-    "docs/studies/baseline.md",
-    "docs/studies/cause.md",
-    "docs/studies/isotropy.md",
-    "docs/studies/misalignment.md",
-    "docs/studies/noise.md",
-    "docs/studies/stroke.md",
 }
 PRESENT = [page for page in PAGES if page not in HISTORY]
 HELD = [page for page in PRESENT if page not in NOT_YET]

@@ -10,6 +10,8 @@ import hashlib
 import importlib
 import io
 import json
+import time
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -77,14 +79,19 @@ def write_study(out: Path, study: Study[Any], settings: Settings, quick: bool, r
     return _written(out / DOCUMENT, document)
 
 
-def publish_study(folder: Path, study: Study[Any], settings: Settings, result: Result) -> Path:
+def publish_study(folder: Path, study: Study[Any], settings: Settings, result: Result, seconds: float) -> Path:
     """Write the document of a full study as `NAME.json`, beside the page of the study.
 
     Returns
     -------
-    path : Path of `NAME.json`; it names no other files
+    path : Path of `NAME.json`; it names no other files, and tells when the study ran and for how long
     """
-    return _written(folder / f"{study.name}.json", _document(study, settings, False, result))
+    document = _document(study, settings, False, result)
+    date = datetime.now(UTC).strftime("%d %B %Y").removeprefix("0")
+    run = {"date": date, "duration": f"{seconds // 60:.0f} min {seconds % 60:.0f} s"}
+    return _written(
+        folder / f"{study.name}.json", document.model_copy(update={"provenance": run | document.provenance})
+    )
 
 
 def _document(study: Study[Any], settings: Settings, quick: bool, result: Result) -> StudyDocument:
@@ -230,8 +237,9 @@ def run_study(
         raise DatasetError(f"--data {data} is a file; give the folder of the data sets")
     for document in (out / DOCUMENT, *((publish / f"{name}.json",) if publish else ())):
         require_writable(document)
+    start = time.monotonic()
     result = study.run(chosen, StudyDatasets(data or out / DATA, console or Console(stderr=True), workers))
     write_study(out, study, chosen, quick, result)
     if publish is not None:
-        publish_study(publish, study, chosen, result)
+        publish_study(publish, study, chosen, result, time.monotonic() - start)
     return result

@@ -172,6 +172,8 @@ def base_findings(table: pl.DataFrame, sample: str, preset: str) -> Iterator[Fin
         yield Finding(f"{lead}: {method}, rms distance", None, unit="mpx")
         return
     yield Finding(f"{lead}: {method}, rms distance", *_ends(row, "rms_px", 1e3), "mpx")
+    yield Finding(f"{lead}: {method}, scatter", 1e3 * row["scatter_px"], unit="mpx")
+    yield Finding(f"{lead}: {method}, bias", 1e3 * row["bias_px"], unit="mpx")
     yield Finding(f"{lead}: bound of the distance", 1e3 * row["bound_px"], unit="mpx")
     yield Finding(f"{lead}: {method}, rms / bound", *ratio_of(row))
     yield Finding(f"{lead}: {method}, error of phi, rms", *_ends(row, "rms_phi_rad", 1e3), "mrad")

@@ -193,8 +193,9 @@ def best_findings(found: Found, tolerance: str, depths_m: Sequence[float]) -> It
         if not math.isfinite(best.stroke_m):
             yield Finding(f"{lead}: no stroke, {', '.join(best.limits)}", None, unit="m")
             continue
-        limit = f", limit: {', '.join(best.limits)}" if best.limits else ""
-        yield Finding(f"{lead}: best stroke{limit}", best.stroke_m, unit="m")
+        yield Finding(f"{lead}: best stroke", best.stroke_m, unit="m")
+        if best.limits:
+            yield Finding(f"{lead}: limit of the stroke ({', '.join(best.limits)})", best.stroke_m, unit="m")
         for end, value in zip(("shortest", "longest"), best.near(NEAR), strict=True):
             yield Finding(f"{lead}: {end} stroke within {100.0 * NEAR:g} % of the smallest error", value, unit="m")
         yield Finding(f"{lead}: sigma of D", 1e3 * best.sigma_m, unit="mm")

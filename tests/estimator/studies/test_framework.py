@@ -162,11 +162,12 @@ def test_read_back_and_in_a_report(tmp_path: Path, datasets: StudyDatasets) -> N
 
 def test_the_published_document_names_no_files(tmp_path: Path, datasets: StudyDatasets) -> None:
     settings = Counting(upto=5)
-    path = publish_study(tmp_path, COUNT, settings, COUNT.run(settings, datasets))
+    path = publish_study(tmp_path, COUNT, settings, COUNT.run(settings, datasets), 75.0)
     assert path == tmp_path / "count.json"
     document = json.loads(path.read_text(encoding="utf-8"))
     assert (document["files"], document["drawings"], document["quick"]) == ({}, [], False)
     assert document["findings"][0]["value"] == 5.0
+    assert document["provenance"]["duration"] == "1 min 15 s"
 
 
 def test_changed_or_missing_files_are_refused(tmp_path: Path, datasets: StudyDatasets) -> None:
