@@ -303,6 +303,7 @@ def centroid_px(view: View, point_m: Array) -> tuple[float, float]:
 
 # -- a simulated calibration -----------------------------------------------------------------------------------------
 
+
 @dataclass(frozen=True)
 class CalibrationSetup:
     """Simulated calibration: the mirror's outline, and a few laser spots at known distances.

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 import polars as pl
 from pydantic import Field
+from scipy.stats import bootstrap
 
 from phibench.estimator.spots.simple_spots import find_spot
 from phibench.estimator.studies.baseline.drawings import curves_drawing, laws_drawing
@@ -30,7 +31,6 @@ from phibench.estimator.studies.baseline.tables import (
 )
 from phibench.estimator.studies.findings import Finding, Row
 from phibench.estimator.studies.framework import Result, Settings, Study, StudyDatasets
-from phibench.estimator.studies.statistics import rms, rms_finding
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import generator
@@ -39,6 +39,8 @@ from phibench.scenes.rig import POSITIONS
 METHODS = ("red_centroid", "chain_fit")
 TABLES = ("table1", "table2", "table3")
 NAMED = ("ray", "normal", "incidence", "outline")
+RESAMPLES = 2000  # of the bootstrap of an rms
+CONFIDENCE = 0.95
 _LEAST = 3  # strokes for two constants and a residual
 
 
@@ -307,6 +309,37 @@ def _law_row(law: LawFit) -> Row:
         f"{low[1]:.2f} to {high[1]:.2f}",
         f"{100.0 * law.law.rms_log:.0f}",
     )
+
+
+def rms(values: Array) -> float:
+    """Root mean square; NaN of nothing."""
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
+
+
+def rms_interval(values: Array, *names: str) -> tuple[float, float]:
+    """Percentile bootstrap interval, 95 %, of a root mean square over independent cases; NaN for less than three.
+
+    `names` are those of the random stream.
+    """
+    if len(values) < 3:
+        return float("nan"), float("nan")
+    found = bootstrap(
+        (np.square(values),),
+        lambda squares, axis: np.sqrt(np.mean(squares, axis=axis)),
+        n_resamples=RESAMPLES,
+        confidence_level=CONFIDENCE,
+        method="percentile",
+        vectorized=True,
+        rng=generator("study", "spread", *names),
+    )
+    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+
+
+def rms_finding(label: str, values: Array, *names: str) -> Finding:
+    """Rms of relative values in per cent, with its interval; values that are not finite are left out."""
+    good = values[np.isfinite(values)]
+    low, high = rms_interval(good, *names)
+    return Finding(label, 100.0 * rms(good), 100.0 * low, 100.0 * high, "%")
 
 
 def _own(table: pl.DataFrame, sense: str, method: str | None = None) -> pl.DataFrame:

@@ -1,10 +1,7 @@
-"""The laws of eq. (7): a noise error that grows as D^2 and falls as 1/h; and what the published errors do instead.
+"""Tables of the study `baseline`: spots of drawn frames, estimates of D, drawn misalignments, and laws of errors.
 
-Rigs with drawn misalignments, in closed form: where they show spots, and what an aligned reader makes of them.
-
-Spots that methods find in drawn frames of a data set, with the bounds of their positions; a process per core.
-
-The paper's experiments in one table: published estimate, ours with scatter, bounds, drawn misalignments.
+The paper's experiments are in one table: published estimate, our estimates with scatter, and bounds. Drawn rigs are in
+closed form; an aligned reader makes estimates of what they show. Power laws y = c D^p h^q are fitted to logarithms.
 """
 
 from __future__ import annotations
@@ -17,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
+from scipy.stats import bootstrap
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import PairDraw, pair_draws
@@ -30,7 +28,6 @@ from phibench.estimator.geometry.sensitivities import PARAMETERS
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Spot
 from phibench.estimator.methods.registry import METHODS
-from phibench.estimator.studies.statistics import PowerLaw, fit_power_law
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.misalignment import Misalignment
@@ -39,6 +36,64 @@ from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError
 
 EXPECTED = (2.0, -1.0)  # eq. (7): exponents of D and of h
+
+
+@dataclass(frozen=True)
+class PowerLaw:
+    """Exponents with their intervals.
+
+    Attributes
+    ----------
+    exponents : shape (k,)
+    low, high : shape (k,)
+    rms_log : float
+        Root mean square residual of log y: by how much, relatively, the law misses.
+    """
+
+    exponents: Array
+    low: Array
+    high: Array
+    rms_log: float
+
+    def holds(self, i: int, exponent: float) -> bool:
+        """Whether an exponent lies in the i-th interval."""
+        return bool(self.low[i] <= exponent <= self.high[i])
+
+
+def fit_power_law(
+    y: Array, bases: Array, random: np.random.Generator, resamples: int = 2000, confidence: float = 0.95
+) -> PowerLaw:
+    """Least squares on logarithms; intervals by the percentile bootstrap over cases.
+
+    Parameters
+    ----------
+    y : shape (n,), above 0; other values are left out
+    bases : shape (k, n), above 0
+    random : Generator
+    resamples, confidence
+    """
+    good = np.isfinite(y) & (y > 0.0)
+    logs = [np.log(x[good]) for x in (*bases, y)]
+    found = bootstrap(
+        logs,
+        lambda *rows: _exponents(rows),
+        paired=True,
+        vectorized=False,
+        n_resamples=resamples,
+        confidence_level=confidence,
+        method="percentile",
+        rng=random,
+    )
+    design = np.stack([np.ones(good.sum()), *logs[:-1]], axis=-1)
+    fitted = np.linalg.lstsq(design, logs[-1], rcond=None)[0]
+    rms = float(np.sqrt(np.mean((logs[-1] - design @ fitted) ** 2)))
+    interval = found.confidence_interval
+    return PowerLaw(fitted[1:], np.atleast_1d(interval.low), np.atleast_1d(interval.high), rms)
+
+
+def _exponents(rows: tuple[Array, ...]) -> Array:
+    design = np.stack([np.ones(len(rows[0])), *rows[:-1]], axis=-1)
+    return np.asarray(np.linalg.lstsq(design, rows[-1], rcond=None)[0][1:])
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,9 @@ Tolerances, a ranking, the effect of a calibration, and interactions follow from
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cache
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import polars as pl
@@ -17,7 +18,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.progress import Steps
 from phibench.estimator.calibration.bundle import Bundle
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.estimator.studies.findings import Finding
+from phibench.estimator.studies.findings import Finding, Row
 from phibench.estimator.studies.framework import Drawing, Result, Settings, Study, StudyDatasets
 from phibench.estimator.studies.misaligned_rigs import (
     CALIBRATED,
@@ -38,17 +39,17 @@ from phibench.estimator.studies.misalignment.tables import (
     calibrated_findings,
     cost_findings,
     noise_findings,
+    percent,
     ranking,
-    ranking_rows,
     rendered_findings,
     rendered_table,
+    shown,
     slope_findings,
     slope_misses,
     study_table,
-    tightest_table,
     tolerance_findings,
     tolerance_rows,
-    tolerance_table,
+    tolerances_of,
     worst_disagreement,
 )
 from phibench.scenes.catalog import default_rig
@@ -279,6 +280,65 @@ def _notes(settings: MisalignmentSettings, seen: tuple[Rendered, ...]) -> tuple[
         f"{coarse.factor:g}"
     ]
     return (*missed[: off > settings.agreement], *limited)
+
+
+# -- small tables of the report ----------------------------------------------------------------------------------------
+
+
+def tightest_table(rows: Sequence[dict[str, Any]], estimator: str, depth_m: float, cost: float) -> tuple[Row, ...]:
+    """Table: tolerance of every parameter at one D beside the expected deviation, and their ratio."""
+    heads = ("parameter", f"tolerance for {100.0 * cost:g} % of D", "expected deviation", "ratio")
+    return (
+        heads,
+        *(
+            (
+                row["parameter"],
+                shown(row["parameter"], row["value"]),
+                shown(row["parameter"], PARAMETERS[row["parameter"]].study),
+                f"{row['value_over_study']:.2g}",
+            )
+            for row in tolerances_of(rows, estimator, depth_m)
+            if row["value"] is not None
+        ),
+    )
+
+
+def ranking_rows(ranks: Sequence[Rank], calibrated: Sequence[Rank]) -> tuple[Row, ...]:
+    """Table: what every parameter costs, % of D, rms over azimuths."""
+    after = {one.parameter: one for one in calibrated}
+    depths = [f"{D:g} m" for D in ranks[0].depths_m]
+    heads = ("parameter", "size", *depths, *(f"calibrated, {D}" for D in depths))
+    return (
+        heads,
+        *(
+            (
+                one.parameter,
+                shown(one.parameter, PARAMETERS[one.parameter].study),
+                *map(percent, one.rms),
+                *map(percent, after[one.parameter].rms),
+            )
+            for one in ranks
+        ),
+    )
+
+
+def tolerance_table(rows: Sequence[dict[str, Any]], statistic: str, estimators: Sequence[str]) -> tuple[Row, ...]:
+    """Table: the value of every parameter that costs 1 % of D, per estimator and D."""
+    mine = {(r["parameter"], r["estimator"], r["depth_m"]): r["value"] for r in rows if r["statistic"] == statistic}
+    depths = sorted({depth for _, _, depth in mine})
+    heads = ("parameter", *(f"{name}, {D:g} m" for name in estimators for D in depths))
+    return (
+        heads,
+        *(
+            (p, *(_cell(p, mine[p, name, D]) for name in estimators for D in depths))
+            for p in dict.fromkeys(parameter for parameter, _, _ in mine)
+            if any(mine[p, name, D] is not None for name in estimators for D in depths)
+        ),
+    )
+
+
+def _cell(parameter: str, value: float | None) -> str:
+    return "-" if value is None else shown(parameter, value)
 
 
 STUDY = Study(

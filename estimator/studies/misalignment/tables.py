@@ -16,7 +16,7 @@ import polars as pl
 from scipy import stats
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.studies.findings import Finding, Row
+from phibench.estimator.studies.findings import Finding
 from phibench.estimator.studies.misaligned_rigs import (
     ALL,
     CALIBRATED,
@@ -28,7 +28,6 @@ from phibench.estimator.studies.misaligned_rigs import (
     errors,
     slopes,
 )
-from phibench.estimator.studies.statistics import first_crossing
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import PARAMETERS, Misalignment
 from phibench.scenes.rig import Rig
@@ -116,6 +115,44 @@ def tolerance(nominal: Rig, parameter: str, of: Errors, aligned: Array, search: 
 
     limit = min(search.largest * one.study, one.limit)
     return first_crossing(cost, search.cost, search.start * one.study, limit, search.factor)
+
+
+Cost = Callable[[float], Array]
+"""Value above 0 to costs, any shape; infinite where the value cannot be."""
+
+
+def first_crossing(cost: Cost, target: float, start: float, limit: float, factor: float) -> Array:
+    """Smallest value up to `limit` whose cost is `target`, in the shape of the costs; NaN where there is none.
+
+    Costs are taken at start, start factor, start factor^2, ...; between two of them a power law is interpolated, and
+    below `start` the cost counts as proportional to the value. The error of the power law is at most
+    (ln factor)^2 / 8 times the curvature of ln(cost) over ln(value). Before a value that cannot be, the last one that
+    can be is given.
+
+    Parameters
+    ----------
+    cost : callable
+    target, start, limit : float, above 0
+    factor : float, above 1
+    """
+    before, low = start, np.asarray(cost(start), float)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = np.where(low >= target, start * target / low, np.nan)
+    while np.isnan(found).any() and before < limit:
+        value = min(before * factor, limit)
+        high = np.asarray(cost(value), float)
+        new = np.isnan(found) & (high >= target)
+        found = np.where(new, _between(before, value, low, high, target), found)
+        before, low = value, high
+    return found
+
+
+def _between(a: float, b: float, low: Array, high: Array, target: float) -> Array:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.log(target / low) / np.log(high / low)
+    # no cost at all before: the crossing is anywhere in between, the upper end is taken
+    share = np.where(np.isinf(high), 0.0, np.where(low > 0.0, share, 1.0))
+    return a * (b / a) ** np.clip(share, 0.0, 1.0)
 
 
 def over_azimuths(changes: Array) -> Array:
@@ -315,7 +352,7 @@ def tolerance_findings(
     rows: Sequence[dict[str, Any]], estimator: str, depth_m: float, cost: float
 ) -> Iterator[Finding]:
     """Tightest tolerances against the usual sizes, and the number of parameters that exceed theirs."""
-    mine = _tolerances(rows, estimator, depth_m)
+    mine = tolerances_of(rows, estimator, depth_m)
     reached = [row for row in mine if row["value"] is not None]
     head = f"tolerance for {100.0 * cost:g} % of D, {estimator}, D = {depth_m:g} m"
     for row in reached[:_LISTED]:
@@ -366,65 +403,10 @@ def noise_intervals(noise: Array) -> tuple[Array, Array, Array]:
     return rms / half, rms, rms * half
 
 
-def _tolerances(rows: Sequence[dict[str, Any]], estimator: str, depth_m: float) -> list[dict[str, Any]]:
+def tolerances_of(rows: Sequence[dict[str, Any]], estimator: str, depth_m: float) -> list[dict[str, Any]]:
     """Rms tolerances of an estimator at one D, the tightest against the usual size first, those never reached last."""
     mine = [r for r in rows if (r["estimator"], r["statistic"], r["depth_m"]) == (estimator, "rms", depth_m)]
     return sorted(mine, key=lambda r: math.inf if r["value_over_study"] is None else float(r["value_over_study"]))
-
-
-# -- small tables of the report ----------------------------------------------------------------------------------------
-
-
-def tightest_table(rows: Sequence[dict[str, Any]], estimator: str, depth_m: float, cost: float) -> tuple[Row, ...]:
-    """Table: tolerance of every parameter at one D beside the expected deviation, and their ratio."""
-    heads = ("parameter", f"tolerance for {100.0 * cost:g} % of D", "expected deviation", "ratio")
-    return (
-        heads,
-        *(
-            (
-                row["parameter"],
-                shown(row["parameter"], row["value"]),
-                shown(row["parameter"], PARAMETERS[row["parameter"]].study),
-                f"{row['value_over_study']:.2g}",
-            )
-            for row in _tolerances(rows, estimator, depth_m)
-            if row["value"] is not None
-        ),
-    )
-
-
-def ranking_rows(ranks: Sequence[Rank], calibrated: Sequence[Rank]) -> tuple[Row, ...]:
-    """Table: what every parameter costs, % of D, rms over azimuths."""
-    after = {one.parameter: one for one in calibrated}
-    depths = [f"{D:g} m" for D in ranks[0].depths_m]
-    heads = ("parameter", "size", *depths, *(f"calibrated, {D}" for D in depths))
-    return (
-        heads,
-        *(
-            (
-                one.parameter,
-                shown(one.parameter, PARAMETERS[one.parameter].study),
-                *map(percent, one.rms),
-                *map(percent, after[one.parameter].rms),
-            )
-            for one in ranks
-        ),
-    )
-
-
-def tolerance_table(rows: Sequence[dict[str, Any]], statistic: str, estimators: Sequence[str]) -> tuple[Row, ...]:
-    """Table: the value of every parameter that costs 1 % of D, per estimator and D."""
-    mine = {(r["parameter"], r["estimator"], r["depth_m"]): r["value"] for r in rows if r["statistic"] == statistic}
-    depths = sorted({depth for _, _, depth in mine})
-    heads = ("parameter", *(f"{name}, {D:g} m" for name in estimators for D in depths))
-    return (
-        heads,
-        *(
-            (p, *(_cell(p, mine[p, name, D]) for name in estimators for D in depths))
-            for p in dict.fromkeys(parameter for parameter, _, _ in mine)
-            if any(mine[p, name, D] is not None for name in estimators for D in depths)
-        ),
-    )
 
 
 def shown(parameter: str, value: float) -> str:
@@ -436,7 +418,3 @@ def shown(parameter: str, value: float) -> str:
 def percent(relative: float) -> str:
     """Two digits of a per cent; "lost" where there is no estimate."""
     return f"{100.0 * relative:.2g}" if math.isfinite(relative) else "lost"
-
-
-def _cell(parameter: str, value: float | None) -> str:
-    return "-" if value is None else shown(parameter, value)

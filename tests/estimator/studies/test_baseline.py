@@ -18,18 +18,19 @@ from phibench.estimator.studies.baseline.study import STUDY, findings, notes
 from phibench.estimator.studies.baseline.tables import (
     SENSES,
     LawFit,
+    PowerLaw,
     auto_exposed_draws,
     drawn_errors,
     drawn_misalignment,
     estimates,
     experiments_of,
+    fit_power_law,
     published_curve,
     seen,
 )
 from phibench.estimator.studies.findings import Finding
 from phibench.estimator.studies.framework import read_settings
 from phibench.estimator.studies.run import run_study
-from phibench.estimator.studies.statistics import PowerLaw, fit_power_law
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import generator

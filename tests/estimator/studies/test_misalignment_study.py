@@ -37,21 +37,20 @@ from phibench.estimator.studies.misalignment.interactions import (
     interaction_findings,
     with_intervals,
 )
-from phibench.estimator.studies.misalignment.study import STUDY
+from phibench.estimator.studies.misalignment.study import STUDY, tightest_table
 from phibench.estimator.studies.misalignment.tables import (
     Rank,
     Search,
     calibrated_findings,
+    first_crossing,
     noise_intervals,
     over_azimuths,
     rendered_findings,
     signs,
     slope_findings,
-    tightest_table,
     tolerance,
     tolerance_findings,
 )
-from phibench.estimator.studies.statistics import first_crossing
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.laser import LaserSpot
