@@ -161,24 +161,28 @@ def test_bounds_are_of_the_image_and_of_the_raw_pixels_behind_it(pairs: DatasetP
 
 
 def test_without_other_lights_and_levels_the_bound_is_that_of_the_sample(dataset: Dataset) -> None:
-    plain = with_tables(dataset, frames={"camera": "one"}, distractors=[])
-    checked = 0
-    for preset in ("mono-raw", "bayer-raw"):
-        found = dataset_pairs(plain, preset)
-        for i in range(len(found)):
-            truth = found.truth(i)
-            for position in POSITIONS:
-                sample = dataset[truth.sample_id]
-                sensor = sample.frame_source(preset).sides[position].chain.sensor
-                limit = spot_limit(expected_region(sample, position, sensor), card_of(sensor))
-                bound = getattr(truth, position).bound_px2
-                if np.isfinite(limit.covariance_px2).all():
-                    assert np.array_equal(bound, limit.covariance_px2)
-                    checked += 1
-                else:  # the room alone fills all pixels
-                    assert bound is None
-                    assert getattr(truth, position).saturated
-    assert checked >= 10
+    """At the preset's exposure the room alone fills pixels without filters: there they carry nothing."""
+    checked = {"short": 0, "mono-raw": 0, "bayer-raw": 0}
+    for exposure_s in (None, 1 / 500):
+        exposed = {} if exposure_s is None else {"exposure_s": exposure_s}
+        plain = with_tables(dataset, frames={"camera": "one", **exposed}, distractors=[])
+        for preset in ("mono-raw", "bayer-raw"):
+            found = dataset_pairs(plain, preset)
+            for i in range(len(found)):
+                truth = found.truth(i)
+                for position in POSITIONS:
+                    sample = dataset[truth.sample_id]
+                    sensor = sample.frame_source(preset, exposure=exposure_s).sides[position].chain.sensor
+                    limit = spot_limit(expected_region(sample, position, sensor), card_of(sensor))
+                    bound, saturated = getattr(truth, position).bound_px2, getattr(truth, position).saturated
+                    if exposure_s is None and preset == "mono-raw":
+                        assert bound is None
+                        assert np.isnan(limit.covariance_px2).all()
+                        assert saturated
+                    else:
+                        assert np.array_equal(bound, limit.covariance_px2)
+                    checked[preset if exposure_s is None else "short"] += 1
+    assert checked == {"short": 12, "mono-raw": 6, "bayer-raw": 6}
 
 
 def test_a_distractor_is_background_in_the_bound(dataset: Dataset) -> None:
