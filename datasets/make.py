@@ -1,4 +1,4 @@
-"""Making a data set: recipe in, folder out. One function; every step is in a module of its own."""
+"""Making a data set: recipe in, folder out. `preview` says beforehand what that means."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from pathlib import Path
 
 from rich.console import Console
 
-from phibench.datasets.build.assemble import documents, unlike, visibility_line, write_documents
+from phibench.datasets.build.assemble import assemble, unlike, visibility_line, write_documents
+from phibench.datasets.build.forecast import PairForecast, forecast, pair_forecasts, pair_table, slowdown
 from phibench.datasets.build.journal import Head, Journal
-from phibench.datasets.build.run_tasks import claim, finish_tasks, remove_files, stale_files, unfinished
+from phibench.datasets.build.run_tasks import claim, refuse_other, remove_files, run_tasks, stale_files, unfinished
 from phibench.datasets.build.task_list import plan_tasks
-from phibench.datasets.build.workers import Crew, versions
+from phibench.datasets.build.workers import Environment, NoRendererError, WorkerPool, versions
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan.plan import Plan, make_plan, shard_plan
 from phibench.datasets.recipe.checks import warnings
@@ -23,6 +24,7 @@ from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_text
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import dataset_info, info_text, parse_info, read_manifest, same_content
 from phibench.datasets.store.files import WriteError, only_run, remove_temporary, write_text
+from phibench.datasets.store.provenance import code_sha256, provenance
 from phibench.datasets.store.schema import DatasetInfo
 
 
@@ -61,10 +63,61 @@ def make(
     console, out = console or Console(stderr=True), Path(out)
     text = _recipe_text(recipe, samples, seed)
     plan = shard_plan(make_plan(parse_recipe(text, str(find_recipe(recipe)))), shard)
-    for warning in warnings(plan.recipe):
+    for warning in [*warnings(plan.recipe), *_hidden(pair_forecasts(plan))]:
         console.print(f"warning: {warning}", highlight=False, soft_wrap=True)
     make_from_plan(plan, text, out, workers, console, scheduler)
     return out
+
+
+def preview(
+    recipe: str | Path,
+    out: str | Path,
+    workers: int | None = None,
+    shard: str | None = None,
+    samples: int | None = None,
+    seed: int | None = None,
+) -> str:
+    """Say what `make` would do, and render and write nothing: what will be seen, how many tasks, bytes, seconds.
+
+    Raises
+    ------
+    DatasetError
+        If recipe or folder will not do.
+    """
+    out, count = Path(out), _count(workers)
+    text = _recipe_text(recipe, samples, seed)
+    plan = shard_plan(make_plan(parse_recipe(text, str(find_recipe(recipe)))), shard)
+    refuse_other(out, plan.recipe.dataset.name)
+    pairs, journal = list(pair_forecasts(plan)), Journal(out)
+    tasks, todo = plan_tasks(plan, {}), []
+    if journal.entries:
+        environment, _ = _environment(WorkerPool(out, count), journal)
+        tasks = plan_tasks(plan, versions(environment))
+        todo = unfinished(tasks, journal, out)
+    chosen = [tasks[name] for name in (todo if journal.entries else tasks)]
+    cost = forecast(plan, chosen).text(count, slowdown(count)) if chosen else "to make: nothing"
+    seen = f"{sum(pair.visible for pair in pairs)} of {len(pairs)} pairs will be visible in both images"
+    told = [f"warning: {warning}" for warning in warnings(plan.recipe)]
+    return "\n".join([*pair_table(pairs), seen, *told, f"{cost}, {len(tasks)} tasks in all; nothing was rendered"])
+
+
+def _hidden(pairs: Iterable[PairForecast]) -> list[str]:
+    """Warn of pairs that will not be visible in both images."""
+    listed = list(pairs)
+    hidden = [pair for pair in listed if not pair.visible]
+    if not hidden:
+        return []
+    first = hidden[0]
+    causes = " and ".join(f"{n} {t.cause}" for n, t in (("down", first.down), ("up", first.up)) if not t.visible)
+    text = f"{len(hidden)} of {len(listed)} pairs will not be visible in both images, such as {first.pair.sample_id}"
+    return [f"{text} ({causes}); --dry-run lists them all"]
+
+
+def _count(workers: int | None) -> int:
+    count = workers if workers is not None else os.cpu_count() or 1
+    if count < 1:
+        raise DatasetError(f"--workers: workers = {count}, at least 1 is needed")
+    return count
 
 
 def _recipe_text(recipe: str | Path, samples: int | None, seed: int | None) -> str:
@@ -78,17 +131,15 @@ def make_from_plan(
     plan: Plan, recipe: str, out: Path, workers: int | None, console: Console, scheduler: str | None = None
 ) -> list[str]:
     """Make what is unfinished or damaged of a plan; return the names of the tasks done and documents written."""
-    count = workers if workers is not None else os.cpu_count() or 1
-    if count < 1:
-        raise DatasetError(f"--workers: workers = {count}, at least 1 is needed")
+    count = _count(workers)
     claim(out, plan.recipe.dataset.name)
     try:
         with only_run(out):
             claim(out, plan.recipe.dataset.name)  # again: now nobody else can
             remove_temporary(out)
             try:
-                with Crew(out, count, scheduler) as crew, Journal(out) as journal:
-                    return _make(plan, recipe, out, crew, journal, console)
+                with WorkerPool(out, count, scheduler) as pool, Journal(out) as journal:
+                    return _make(plan, recipe, out, pool, journal, console)
             finally:
                 remove_temporary(out)
     except OSError as error:
@@ -96,33 +147,53 @@ def make_from_plan(
         raise DatasetError(f"{text}; then run the same command again") from error
 
 
-def _make(plan: Plan, recipe: str, out: Path, crew: Crew, journal: Journal, console: Console) -> list[str]:
+def _make(plan: Plan, recipe: str, out: Path, pool: WorkerPool, journal: Journal, console: Console) -> list[str]:
     started, began = time.monotonic(), datetime.now(UTC)
-    environment = crew.environment()
+    environment, no_renderer = _environment(pool, journal)
     head = Head(_info_text(dataset_info(plan, environment), journal), recipe)
     tasks = plan_tasks(plan, versions(environment))
     todo = unfinished(tasks, journal, out)
+    if todo and no_renderer is not None:
+        what = f"{len(todo)} of {len(tasks)} tasks are to be done, such as '{todo[0]}'"
+        raise DatasetError(f"{what}, and {no_renderer}") from no_renderer
     if not todo and not (faults := _loose_ends(plan, head, journal, tasks, out)):
         console.print(f"{out} is complete, nothing to do", highlight=False)
         return []
     if todo:
-        (out / schema.CHECKSUMS).unlink(missing_ok=True)
-        finish_tasks(plan, tasks, todo, journal, head, out, crew, console)
+        (out / schema.SUMS).unlink(missing_ok=True)
+        run_tasks(plan, tasks, todo, journal, head, out, pool, console)
         faults = _loose_ends(plan, head, journal, tasks, out)
     journal.begin(head, tasks)
-    wanted = documents(plan, head, journal.entries)
+    wanted = assemble(plan, head, journal.entries)
     remove_files(out, [name for name in faults if name not in wanted])
     write_documents(out, wanted, [name for name in faults if name in wanted])
-    _write_run(out, crew.width, began, time.monotonic() - started)
+    _write_run(out, pool.width, began, time.monotonic() - started)
     console.print(f"{out}: {visibility_line(read_manifest(out))}", highlight=False, soft_wrap=True)
     return [*todo, *faults]
+
+
+def _environment(pool: WorkerPool, journal: Journal) -> tuple[Environment, NoRendererError | None]:
+    """What the workers render with, or, where they cannot render, what the folder was rendered with, and why.
+
+    Nothing can be rendered then, but `[frames]` may be changed, and small files written anew.
+    """
+    try:
+        return pool.environment(), None
+    except NoRendererError as error:
+        if journal.head is None:
+            raise
+        try:
+            held = parse_info(journal.head.info).provenance
+        except ValueError:  # of another version
+            raise error from None
+        return {**held, "commit": provenance()["commit"], "code_sha256": code_sha256()}, error
 
 
 def _loose_ends(plan: Plan, head: Head, journal: Journal, tasks: Iterable[str], out: Path) -> list[str]:
     """Documents to be written, and files to be removed, when every task is done."""
     entries = {name: journal.entries[name] for name in tasks}
     files = [name for entry in entries.values() for name in entry.files]
-    return [*unlike(out, documents(plan, head, entries)), *stale_files(out, files)]
+    return [*unlike(out, assemble(plan, head, entries)), *stale_files(out, files)]
 
 
 def _info_text(info: DatasetInfo, journal: Journal) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from phibench.datasets.build.assemble import documents, write_documents
+from phibench.datasets.build.assemble import assemble, write_documents
 from phibench.datasets.build.journal import Entry, Head, Journal
 from phibench.datasets.build.run_tasks import claim, held_head, is_intact, remove_files, stale_files
 from phibench.datasets.build.task_list import task_names
@@ -52,7 +52,7 @@ def merge(out: str | Path, shards: Sequence[str | Path], console: Console | None
         _copy(out, [entries[name] for name in names], console)
         journal.entries = {name: entries[name][0] for name in names}
         journal.begin(head, names)
-        wanted = documents(plan, head, journal.entries)
+        wanted = assemble(plan, head, journal.entries)
         remove_files(out, stale_files(out, [file for entry in journal.entries.values() for file in entry.files]))
         write_documents(out, wanted, wanted)
     return out

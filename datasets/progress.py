@@ -1,39 +1,58 @@
-"""Progress for people: a bar with the time left on a terminal, a line now and then elsewhere."""
+"""Progress for people: a bar with the time left on a terminal, a line every 30 s elsewhere."""
 
 from __future__ import annotations
 
+import threading
 import time
+from collections.abc import Callable
 from types import TracebackType
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 LINE_EVERY_S = 30.0
+_BAR_EVERY_S = 1.0
 
 
 class Steps:
-    """A count of equal steps, as a context manager.
+    """Count of steps, as a context manager. A thread tells how far they are, even while a single step takes long.
 
     Parameters
     ----------
     console : Console
     title : str
     total : int
+    left_s : callable, optional
+        Seconds left; by default the steps are taken to be equal.
+    running : callable, optional
+        What is being done, in words.
     """
 
-    def __init__(self, console: Console, title: str, total: int) -> None:
+    def __init__(
+        self,
+        console: Console,
+        title: str,
+        total: int,
+        left_s: Callable[[], float] | None = None,
+        running: Callable[[], str] | None = None,
+    ) -> None:
         self._console, self._title, self._total = console, title, total
+        self._forecast_s, self._running = left_s, running
         self._done, self._started = 0, time.monotonic()
-        self._told = self._started
         self._bar = _bar(console) if console.is_terminal else None
+        self._end = threading.Event()
+        self._teller = threading.Thread(target=self._keep_telling, daemon=True)
 
     def __enter__(self) -> Steps:
         if self._bar is not None:
             self._bar.start()
-            self._task = self._bar.add_task(self._title, total=self._total)
+            self._task = self._bar.add_task(self._title, total=self._total, left="")
+        self._teller.start()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: object, trace: TracebackType | None) -> None:
+        self._end.set()
+        self._teller.join()
         if self._bar is not None:
             self._bar.stop()
         elif kind is None:
@@ -48,15 +67,30 @@ class Steps:
         self._done = done
         if self._bar is not None:
             self._bar.update(self._task, completed=done)
-        elif self._done < self._total and time.monotonic() - self._told >= LINE_EVERY_S:
+
+    def _keep_telling(self) -> None:
+        while not self._end.wait(LINE_EVERY_S if self._bar is None else _BAR_EVERY_S):
             self._tell()
 
     def _tell(self) -> None:
-        self._told = time.monotonic()
-        seconds = self._told - self._started
-        left = f", about {seconds / self._done * (self._total - self._done):.0f} s left" if self._done else ""
-        done = f"{self._done}/{self._total} after {seconds:.0f} s"
-        self._console.print(f"{self._title}: {done}{left if self._done < self._total else ''}", highlight=False)
+        left = self._left()
+        if self._bar is not None:
+            self._bar.update(self._task, left=left)
+            return
+        running = self._running() if self._running is not None and self._done < self._total else ""
+        parts = [f"{self._done}/{self._total} after {time.monotonic() - self._started:.0f} s", left]
+        parts.append(f"running: {running}" if running else "")
+        self._console.print(f"{self._title}: {', '.join(filter(None, parts))}", highlight=False, soft_wrap=True)
+
+    def _left(self) -> str:
+        """Say how long the rest will take."""
+        if self._done >= self._total or (self._forecast_s is None and not self._done):
+            return ""
+        if self._forecast_s is not None:
+            seconds = self._forecast_s()
+        else:
+            seconds = (time.monotonic() - self._started) / self._done * (self._total - self._done)
+        return f"about {seconds:.0f} s left"
 
 
 def _bar(console: Console) -> Progress:
@@ -65,7 +99,6 @@ def _bar(console: Console) -> Progress:
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
+        TextColumn("{task.fields[left]}"),
         console=console,
     )

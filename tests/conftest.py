@@ -14,7 +14,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import pytest  # noqa: E402
 from filelock import FileLock  # noqa: E402
-from helpers.inline_workers import InlineCrew  # noqa: E402
+from helpers.inline_workers import InlineWorkerPool  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -54,7 +54,7 @@ def python() -> Callable[..., subprocess.CompletedProcess[str]]:
 @pytest.fixture
 def inline(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let `make` do its tasks in this process."""
-    monkeypatch.setattr("phibench.datasets.make.Crew", InlineCrew)
+    monkeypatch.setattr("phibench.datasets.make.WorkerPool", InlineWorkerPool)
 
 
 class SharedFolder:

@@ -47,6 +47,7 @@ estimator/calibration
 estimator/sandbox
 estimator/benchmark
 estimator/paper
+estimator/make_dataset
 estimator/studies
 estimator/cli
 estimator/seat

@@ -22,7 +22,7 @@ from phibench.datasets.store.schema import ManifestRow
 from phibench.scenes.rig import POSITIONS
 
 
-def documents(plan: Plan, head: Head, entries: Mapping[str, Entry]) -> dict[str, bytes]:
+def assemble(plan: Plan, head: Head, entries: Mapping[str, Entry]) -> dict[str, bytes]:
     """All small files of a finished data set by name, SHA256SUMS last."""
     rows = [_row(pair, entries) for pair in plan.pairs]
     small = {

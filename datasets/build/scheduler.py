@@ -32,7 +32,7 @@ class Executor(Protocol):
         """Wait for any submitted task; `Failed.lethal` means that its worker died."""
 
 
-def dispatch(tasks: Iterable[Task], executor: Executor) -> Iterator[Outcome]:
+def schedule(tasks: Iterable[Task], executor: Executor) -> Iterator[Outcome]:
     """Yield every task with its outcome, as they end. Needs that are not among `tasks` count as done."""
     queue, suspects, flying = _Queue(tasks), deque[Task](), 0
     while True:

@@ -1,11 +1,8 @@
 """Worker processes by dask.distributed: our own on this machine, or those of a running scheduler.
 
 One process and one Dr.Jit thread per worker, under a nanny that replaces it when it dies. Our own listen on the
-loopback device only and end with this process. The same code serves both; only the opening differs.
-
-What renders: versions, variant, LLVM, asked of the processes that will do the work.
-
-Who does the work: processes of our own, or a running scheduler's. Opened only when it is needed.
+loopback device only and end with this process. `python -m phibench.datasets.build.workers` prints what this Python
+renders with: versions, variant, LLVM.
 """
 
 from __future__ import annotations
@@ -43,7 +40,7 @@ _MEMORY = {"MALLOC_TRIM_THRESHOLD_": 2**31, "MALLOC_MMAP_THRESHOLD_": 2**30, "MA
 _MISSING = "dask.distributed is not installed: run `pip install 'phibench[cluster]'`"
 
 
-class Workers:
+class DaskExecutor:
     """Connected workers; an `Executor` of tasks whose files go to `out`."""
 
     def __init__(self, client: Any, out: Path, deaths: _Deaths | None = None) -> None:
@@ -105,12 +102,12 @@ class Workers:
 
 
 @contextlib.contextmanager
-def local_workers(count: int, out: Path) -> Iterator[Workers]:
+def local_workers(count: int, out: Path) -> Iterator[DaskExecutor]:
     """Start worker processes on this machine; leaving ends them, however it is left."""
     dask, distributed = _libraries()
     deaths = _Deaths()
     settings = {
-        "distributed.scheduler.allowed-failures": 0,  # who is to blame is found out in `dispatch`
+        "distributed.scheduler.allowed-failures": 0,  # who is to blame is found out in `scheduler`
         "distributed.worker.memory.target": False,
         "distributed.worker.memory.spill": False,
         "distributed.worker.memory.pause": False,
@@ -133,11 +130,11 @@ def local_workers(count: int, out: Path) -> Iterator[Workers]:
         with cluster, distributed.Client(cluster, set_as_default=False) as client:
             client.run(_hear_no_interrupt)
             client.register_plugin(_deaf_plugin())
-            yield Workers(client, out, deaths)
+            yield DaskExecutor(client, out, deaths)
 
 
 @contextlib.contextmanager
-def remote_workers(scheduler: str, out: Path) -> Iterator[Workers]:
+def remote_workers(scheduler: str, out: Path) -> Iterator[DaskExecutor]:
     """Connect to a running scheduler, by its address or its scheduler file.
 
     Raises
@@ -153,7 +150,7 @@ def remote_workers(scheduler: str, out: Path) -> Iterator[Workers]:
             raise DatasetError(
                 f"the scheduler at {scheduler} has no workers after {WORKERS_S:g} s; start some"
             ) from None
-        yield Workers(client, out)
+        yield DaskExecutor(client, out)
 
 
 def _connect(distributed: Any, scheduler: str) -> Any:
@@ -226,23 +223,27 @@ _UNLIKE = ("commit",)  # may differ between two equal runs
 _IN_KEYS = ("numpy", "scipy", "mitsuba", "drjit", "OpenEXR", "pillow")
 
 
+class NoRendererError(DatasetError):
+    """Mitsuba cannot be used on this machine."""
+
+
 def local_environment() -> Environment:
     """Environment of a fresh process on this machine.
 
     Raises
     ------
-    DatasetError
+    NoRendererError
         If Mitsuba cannot be used.
     """
     command = [sys.executable, "-m", "phibench.datasets.build.workers"]
     child = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
     if child.returncode != 0:
         last = (child.stderr.strip().splitlines() or [f"exit status {child.returncode}"])[-1]
-        raise DatasetError(f"Mitsuba does not start on this machine ({last}); ask `phibench doctor`")
+        raise NoRendererError(f"Mitsuba does not start on this machine ({last}); ask `phibench doctor`")
     return _checked({"this machine": json.loads(child.stdout.splitlines()[-1])})
 
 
-def remote_environment(workers: Workers, out: Path) -> Environment:
+def remote_environment(workers: DaskExecutor, out: Path) -> Environment:
     """Environment of all workers of a scheduler, which must be one and the same.
 
     Raises
@@ -289,7 +290,7 @@ def _checked(found: dict[str, Any]) -> Environment:
         if isinstance(environment, BaseException):
             raise DatasetError(f"worker {name} failed: {environment}")
         if "fault" in environment:
-            raise DatasetError(f"{name} cannot render: {environment['fault']}")
+            raise NoRendererError(f"{name} cannot render: {environment['fault']}")
         if environment["code_sha256"] != code_sha256():
             raise DatasetError(f"worker {name} runs other code than this process: install the same version on both")
     bare = {name: {k: v for k, v in e.items() if k != "worker"} for name, e in found.items()}
@@ -301,7 +302,7 @@ def _checked(found: dict[str, Any]) -> Environment:
     return bare[first]
 
 
-class Crew:
+class WorkerPool:
     """Workers for one folder, as a context manager; leaving it ends our own and lets others' go.
 
     Parameters
@@ -314,9 +315,9 @@ class Crew:
     def __init__(self, out: Path, count: int, scheduler: str | None = None) -> None:
         self._out, self._count, self._scheduler = out, count, scheduler
         self._stack = ExitStack()
-        self._remote: Workers | None = None
+        self._remote: DaskExecutor | None = None
 
-    def __enter__(self) -> Crew:
+    def __enter__(self) -> WorkerPool:
         return self
 
     def __exit__(

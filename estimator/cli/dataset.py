@@ -28,6 +28,7 @@ def make(
     shard: str | None = None,
     samples: Whole | None = None,
     seed: Whole | None = None,
+    dry_run: bool = False,
 ) -> int:
     """Render a data set; what is finished already is kept. Sensitivities of D come last, sensitivities.parquet.
 
@@ -47,13 +48,17 @@ def make(
         How many samples to draw, instead of the recipe's number.
     seed
         Root of all random streams, instead of the recipe's; a secret one for a set that is to be sealed.
+    dry_run
+        Say what will be seen, where and why not, how many tasks, bytes and seconds it takes; render nothing.
     """
-    from phibench.datasets.make import make as make_dataset
-    from phibench.estimator.paper.sensitivity_table import keep_sensitivities
+    if dry_run:
+        from phibench.datasets.make import preview
+
+        print(preview(recipe, out, workers, shard=shard, samples=samples, seed=seed))
+        return 0
+    from phibench.estimator.make_dataset import make as make_dataset
 
     make_dataset(recipe, out, workers, scheduler=scheduler, shard=shard, samples=samples, seed=seed)
-    if shard is None:  # the table of a merged set is made by `merge`
-        keep_sensitivities(out)
     return 0
 
 
@@ -70,12 +75,10 @@ def repair(directory: Path, *, workers: Whole | None = None, scheduler: str | No
     scheduler
         Address or scheduler file of a running dask scheduler, to use its workers instead.
     """
-    from phibench.datasets.merge_repair import repair as repair_dataset
-    from phibench.estimator.paper.sensitivity_table import keep_sensitivities
+    from phibench.estimator.make_dataset import repair as repair_dataset
 
     for name in repair_dataset(directory, workers, scheduler=scheduler):
         print(f"made again: {name}")
-    keep_sensitivities(directory)
     return 0
 
 
@@ -90,11 +93,9 @@ def merge(*shards: Path, out: Path) -> int:
     out
         Folder to write.
     """
-    from phibench.datasets.merge_repair import merge as merge_shards
-    from phibench.estimator.paper.sensitivity_table import keep_sensitivities
+    from phibench.estimator.make_dataset import merge as merge_shards
 
     merge_shards(out, shards)
-    keep_sensitivities(out)
     return 0
 
 

@@ -21,7 +21,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -243,13 +243,25 @@ def light_map(view: View, room: Room, settings: BakeSettings, folder: Path | Non
         Any view of the rig; only the origin of coordinates is taken from it.
     folder : Path, or None for the user's cache
     """
-    path = (folder or cache_root() / "lightmaps") / f"{key(view, room, settings)}.lightmap"
+    path = _entry(view, room, settings, folder)
     cached = _read(path)
     if cached is None:
         cached = bake(view, room, settings)
         with contextlib.suppress(OSError):  # a cache that cannot be written costs time, not the light map
             _write(path, cached)
     return cached
+
+
+def is_cached(view: View, room: Room, settings: BakeSettings, folder: Path | None = None) -> bool:
+    """Whether the cache holds the light map, so that `light_map` takes no time."""
+    try:
+        return _entry(view, room, settings, folder).is_file()
+    except PackageNotFoundError:  # without Mitsuba nothing has been baked
+        return False
+
+
+def _entry(view: View, room: Room, settings: BakeSettings, folder: Path | None) -> Path:
+    return (folder or cache_root() / "lightmaps") / f"{key(view, room, settings)}.lightmap"
 
 
 def key(view: View, room: Room, settings: BakeSettings) -> str:

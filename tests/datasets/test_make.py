@@ -18,7 +18,7 @@ from helpers.processes import SMALLEST, living, quiet, said, wait_for
 
 from phibench.datasets import make
 from phibench.datasets.build import run_tasks, spot_task
-from phibench.datasets.build.run_tasks import estimate
+from phibench.datasets.build.forecast import forecast
 from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan.plan import make_plan
@@ -152,7 +152,7 @@ def test_the_estimate_of_the_size_is_honest(smallest_dataset: Path, smoke_datase
     for folder, recipe in ((smallest_dataset, SMALLEST), (smoke_dataset, Path("smoke"))):
         size = sum((folder / name).stat().st_size for name in data_files(folder))
         plan = make_plan(load_recipe(recipe))
-        assert 1.0 <= estimate(plan, plan_tasks(plan, {}).values()).size / size < 1.5
+        assert 1.0 <= forecast(plan, plan_tasks(plan, {}).values()).size / size < 1.5
 
 
 @pytest.mark.usefixtures("inline")
@@ -220,13 +220,102 @@ def complete_but_unfinished(out: Path) -> int:
     return len(layers)
 
 
+# Before and while it runs.
+
+
 def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("phibench.datasets.progress.LINE_EVERY_S", 0.0)
+    monkeypatch.setattr("phibench.datasets.progress.LINE_EVERY_S", 0.1)
     console = quiet()
-    with Steps(console, "views", 3) as steps:
+    with Steps(console, "views", 3, running=lambda: "view h0.500 (1 s)") as steps:
+        time.sleep(0.35)  # a line is told while nothing ends
+        assert said(console).startswith("views: 0/3 after 0 s, running: view h0.500")
         for _ in range(3):
             steps.advance()
+            time.sleep(0.15)
     lines = said(console).splitlines()
-    assert len(lines) == 3
-    assert lines[0].startswith("views: 1/3 after 0 s, about 0 s left")
-    assert lines[-1].startswith("views: 3/3")
+    assert any(line.startswith("views: 1/3 after 0 s, about 1 s left, running: view") for line in lines)
+    assert lines[-1] == "views: 3/3 after 1 s"
+
+
+@pytest.mark.usefixtures("inline")
+def test_a_long_bake_is_not_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def slow(*_: object) -> None:
+        time.sleep(0.5)
+        raise DatasetError("that is all")
+
+    monkeypatch.setattr("phibench.datasets.progress.LINE_EVERY_S", 0.1)
+    monkeypatch.setattr("phibench.datasets.build.bake_task.light_map", slow)
+    console = quiet()
+    with pytest.raises(DatasetError, match="that is all"):
+        make.make(TINY, tmp_path / "out", workers=1, console=console)
+    assert "s left, running: bake room (0 s)" in said(console)
+
+
+def test_the_preview_says_what_the_data_set_will_be(tiny_dataset: Path, tmp_path: Path) -> None:
+    rows, text = read_manifest(tiny_dataset), make.preview(TINY, tmp_path / "out", workers=2)
+    assert list(tmp_path.iterdir()) == []
+    lines = {line.split()[0]: line for line in text.splitlines()}
+    hidden = 0
+    for row in rows:
+        for spot in (row.down, row.up):
+            place = f"{spot.u_px:.1f}, {spot.v_px:.1f}" if spot.visible else spot.cause
+            assert f"  {place}" in lines[row.sample_id]
+            hidden += not spot.visible
+        assert f" {row.depth_m:.3f} " in lines[row.sample_id]
+    assert hidden == 1
+    assert "1 of 2 pairs will be visible" in text
+    assert "to make: 2 spots, 1 bake, 3 views, 2 samples; about" in text
+    assert "a first guess" in text
+    console = quiet()
+    make.make(TINY, shutil.copytree(tiny_dataset, tmp_path / "copy"), console=console)
+    assert "1 of 2 pairs will not be visible in both images, such as half-hidden-h1.400 (down occluded" in said(console)
+
+
+@pytest.mark.usefixtures("inline")
+def test_the_preview_of_a_folder_with_a_data_set(tiny_dataset: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
+    before = sorted((path, path.stat().st_mtime_ns) for path in copy.rglob("*"))
+    assert "to make: nothing, 8 tasks in all" in make.preview(TINY, copy)
+    assert "to make: 1 spot, 1 view, 1 sample;" in make.preview(_changed(tmp_path, "[0.5]", "[0.6]"), copy)
+    assert sorted((path, path.stat().st_mtime_ns) for path in copy.rglob("*")) == before
+    with pytest.raises(DatasetError, match="holds another data set"):
+        make.preview("smoke", copy)
+
+
+def _changed(folder: Path, old: str, new: str) -> Path:
+    text = TINY.read_text()
+    assert old in text
+    (folder / "changed.toml").write_text(text.replace(old, new))
+    return folder / "changed.toml"
+
+
+def test_without_mitsuba_frames_may_change_and_nothing_may_be_rendered(tiny_dataset: Path, tmp_path: Path) -> None:
+    copy, blocked = Path(shutil.copytree(tiny_dataset, tmp_path / "copy")), tmp_path / "blocked"
+    for name in ("mitsuba", "drjit"):
+        (blocked / name).mkdir(parents=True)
+        (blocked / name / "__init__.py").write_text(f"raise ModuleNotFoundError('none', name='{name}')")
+    path = os.pathsep.join([str(blocked), os.environ.get("PYTHONPATH", "")])
+
+    def run(recipe: Path, out: Path) -> "subprocess.CompletedProcess[str]":
+        code = (
+            "import sys\nfrom phibench.datasets.make import make\nfrom phibench.datasets.errors import DatasetError\n"
+            "try: make(sys.argv[1], sys.argv[2])\nexcept DatasetError as error: sys.exit(str(error))"
+        )
+        command = [sys.executable, "-c", code, str(recipe), str(out)]
+        return subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path})
+
+    frames = _changed(tmp_path, "[ambient]", '[frames]\npresets = ["mjpeg"]\n\n[ambient]')
+    child = run(frames, copy)
+    assert child.returncode == 0, child.stderr
+    assert json.loads((copy / schema.INFO).read_text())["recipe"]["frames"]["presets"] == ["mjpeg"]
+    assert damaged(copy) == []
+    make.make(frames, copy, workers=1, console=(console := quiet()))  # with Mitsuba it is the same
+    assert "nothing to do" in said(console)
+    child = run(frames, tmp_path / "new")
+    assert child.returncode == 1
+    assert "Mitsuba is not installed" in child.stderr
+    child = run(_changed(tmp_path, "bounces = 2", "bounces = 1"), copy)
+    assert child.returncode == 1
+    assert "6 of 8 tasks are to be done, such as 'bake room', and" in child.stderr
+    assert "Mitsuba is not installed" in child.stderr
+    assert damaged(copy) == []

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 
-class InlineCrew:
+class InlineWorkerPool:
     """Does tasks in this process, one after the other: for tests of what is done, not of who does it."""
 
     width = 1
@@ -13,7 +13,7 @@ class InlineCrew:
     def __init__(self, out: Path, *_: object) -> None:
         self._out = out
 
-    def __enter__(self) -> "InlineCrew":
+    def __enter__(self) -> "InlineWorkerPool":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -24,12 +24,12 @@ class InlineCrew:
 
         return {key: value for key, value in describe().items() if key != "worker"}
 
-    def executor(self, _: int) -> "Inline":
-        return Inline(self._out)
+    def executor(self, _: int) -> "InlineExecutor":
+        return InlineExecutor(self._out)
 
 
-class Inline:
-    """Executor of `InlineCrew`."""
+class InlineExecutor:
+    """Executor of `InlineWorkerPool`."""
 
     def __init__(self, out: Path) -> None:
         self._out, self._waiting = out, deque[Any]()

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from phibench.datasets.build.journal import Entry, Head, Journal
-from phibench.datasets.build.scheduler import AHEAD, TRIALS, dispatch
+from phibench.datasets.build.scheduler import AHEAD, TRIALS, schedule
 from phibench.datasets.build.tasks import Done, Failed, Made, Task
 
 
@@ -72,21 +72,21 @@ class Simulated:
 
 def test_all_are_done_once_and_needs_come_first() -> None:
     tasks = [task(f"c{i}", f"b{i}", "a") for i in range(20)] + [task(f"b{i}", "a") for i in range(20)] + [task("a")]
-    names = [done.name for done, _ in dispatch(tasks, Simulated(3))]
+    names = [done.name for done, _ in schedule(tasks, Simulated(3))]
     assert sorted(names) == sorted(one.name for one in tasks)
     position = {name: i for i, name in enumerate(names)}
     assert all(position[need] < position[one.name] for one in tasks for need in one.needs)
 
 
 def test_needs_that_are_not_to_be_done_are_done() -> None:
-    assert [one.name for one, _ in dispatch([task("preview", "view")], Simulated(1))] == ["preview"]
+    assert [one.name for one, _ in schedule([task("preview", "view")], Simulated(1))] == ["preview"]
 
 
 @pytest.mark.parametrize("workers", [1, 4])
 def test_a_poisoned_task_takes_no_innocent_with_it(workers: int) -> None:
     tasks = [task(f"t{i}") for i in range(40)] + [task("reader", "t7"), task("reader of the reader", "reader")]
     executor = Simulated(workers, poison=("t7", "t9"))
-    outcomes = {one.name: outcome for one, outcome in dispatch(tasks, executor)}
+    outcomes = {one.name: outcome for one, outcome in schedule(tasks, executor)}
     failed = {name: outcome.cause for name, outcome in outcomes.items() if isinstance(outcome, Failed)}
     assert set(failed) == {"t7", "t9", "reader", "reader of the reader"}
     assert f"died every time, {TRIALS} in all (killed)" in failed["t7"]
@@ -98,7 +98,7 @@ def test_a_poisoned_task_takes_no_innocent_with_it(workers: int) -> None:
 
 def test_a_bug_is_not_repeated_and_the_others_go_on() -> None:
     executor = Simulated(2, bugs=("t3",))
-    outcomes = {one.name: outcome for one, outcome in dispatch([task(f"t{i}") for i in range(9)], executor)}
+    outcomes = {one.name: outcome for one, outcome in schedule([task(f"t{i}") for i in range(9)], executor)}
     assert [name for name, outcome in outcomes.items() if isinstance(outcome, Failed)] == ["t3"]
     assert executor.runs["t3"] == 1
 
@@ -112,7 +112,7 @@ def simulate(samples: int, workers: int, folder: Path) -> tuple[int, float, floa
     executor = Simulated(workers)
     with Journal(folder) as journal:
         journal.begin(Head("{}", ""), [])
-        for one, outcome in dispatch(tasks, executor):
+        for one, outcome in schedule(tasks, executor):
             assert isinstance(outcome, Done)
             files = {f"{one.kind}s/{one.name}.exr": "0" * 64}
             journal.add(Entry(one.name, "0" * 64, files, row if one.kind == "spot" else None))

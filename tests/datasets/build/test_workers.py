@@ -17,7 +17,7 @@ from helpers.folders import contents
 from helpers.processes import SMALLEST, living, quiet, said, wait_for
 
 from phibench.datasets.build import workers
-from phibench.datasets.build.scheduler import dispatch
+from phibench.datasets.build.scheduler import schedule
 from phibench.datasets.build.tasks import Done, Failed, Made, Task
 from phibench.datasets.build.workers import _checked, describe, local_environment, local_workers
 from phibench.datasets.errors import DatasetError
@@ -64,7 +64,7 @@ def tasks() -> list[Task]:
 @pytest.mark.parametrize("count", [1, 2])
 def test_who_kills_workers_is_named_and_all_others_finish(tmp_path: Path, count: int) -> None:
     with local_workers(count, tmp_path) as pool:
-        outcomes = {task.name: outcome for task, outcome in dispatch(tasks(), pool)}
+        outcomes = {task.name: outcome for task, outcome in schedule(tasks(), pool)}
     good = {name: outcome.result for name, outcome in outcomes.items() if isinstance(outcome, Done)}
     assert good == {f"square {i}": i * i for i in range(12)}
     causes = {name: outcome.cause for name, outcome in outcomes.items() if isinstance(outcome, Failed)}

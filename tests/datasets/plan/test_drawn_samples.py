@@ -12,10 +12,10 @@ import polars
 import pytest
 from helpers.drawn_values import shipped
 from helpers.folders import contents, done
-from helpers.inline_workers import InlineCrew
+from helpers.inline_workers import InlineWorkerPool
 from helpers.processes import quiet
 
-from phibench.datasets.build.run_tasks import estimate
+from phibench.datasets.build.forecast import forecast
 from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import make
@@ -46,7 +46,7 @@ def with_samples(count: int, folder: Path, text: str | None = None) -> Path:
 def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Three drawn samples. Read only: copy it to change it."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("phibench.datasets.make.Crew", InlineCrew)
+        patch.setattr("phibench.datasets.make.WorkerPool", InlineWorkerPool)
         yield make(TINY, tmp_path_factory.mktemp("random") / "out", workers=1, console=quiet())
 
 
@@ -186,7 +186,7 @@ def test_what_is_damaged_is_made_again(made: Path, copy: Path) -> None:
 
 def test_the_forecast_counts_every_view(made: Path) -> None:
     drawn = make_plan(load_recipe(TINY))
-    cost = estimate(drawn, plan_tasks(drawn, {}).values())
+    cost = forecast(drawn, plan_tasks(drawn, {}).values())
     assert cost.counts == {"spot": 3, "bake": 1, "view": 6, "sample": 3}
     size = sum(len(data) for data in contents(made).values())
     assert 0.8 < cost.size / size < 1.6

@@ -1,0 +1,292 @@
+"""Forecast of a run: which spots will be seen, bytes on the disk, and seconds that every finished task corrects.
+
+The constants are wall-clock seconds of one process on an idle core of a 2-core AMD EPYC virtual machine (`llvm_ad_rgb`,
+room `lab`). A first guess scales them by a short probe of this machine and its load; `make benchmark` shows how good it
+is. Afterwards the tasks of the run itself say how long their kind takes.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import threading
+import time
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from phibench.datasets.build.bake_task import bake_settings
+from phibench.datasets.build.scheduler import Executor, Outcome
+from phibench.datasets.build.tasks import Done, Task
+from phibench.datasets.plan.plan import PairPlan, Plan
+from phibench.render.optics.truth import SpotTruth, depth_m, spot_truth
+from phibench.render.room.light_map import fixed_shapes, is_cached
+from phibench.render.room.shading import cut, texel_count
+from phibench.scenes.rig import POSITIONS
+
+# Seconds.
+START_S = 7.0  # workers, Mitsuba in each, first kernels, hashes
+VIEW_S = 0.5
+VIEW_S_PER_MEGAPIXEL = 3.5  # refinement, truth, encoding, fsync
+VIEW_S_PER_MEGASAMPLE = 0.1  # look-ups in the light map, a million of them
+BAKE_S_PER_MEGARAY = 0.13
+CACHED_BAKE_S = 0.5
+SPOT_S = 0.2  # two positions with their certificates
+SAMPLE_S_PER_MEGAPIXEL = 0.45  # picture, noise budget
+_PROBE_CPU_S = 0.080  # of `_probe` on the machine above
+_TRUST_S = 2.0  # the first guess weighs as much as tasks that should take this long
+
+# Bytes.
+_AMBIENT_BYTES_PX = 24.0  # six noisy float32 planes do not compress
+_TRUTH_BYTES_PX = 13.5  # ten float32 planes; what is outside the mirror compresses to nothing
+_PREVIEW_BYTES_PX = 2.8
+_SPOT_BYTES = 8192
+_TEXEL_BYTES = 25.0  # six float32 and a bool
+_RESERVE = 1.1
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Cost of some tasks.
+
+    Attributes
+    ----------
+    counts : dict
+        Number of tasks of each kind.
+    size : int
+        Bytes on the disk.
+    seconds : dict
+        Seconds of one task of each kind, on an idle core of the machine of the constants.
+    """
+
+    counts: dict[str, int]
+    size: int
+    seconds: dict[str, float]
+
+    def text(self, workers: int, slowdown: float) -> str:
+        """One sentence for the terminal."""
+        counts = ", ".join(f"{n} {kind}{'s' * (n != 1)}" for kind, n in self.counts.items() if n)
+        width = max(min(workers, sum(self.counts.values())), 1)
+        seconds = START_S * slowdown + Pace(self.seconds, slowdown).left_s(self.counts, [], width)
+        took = f"{duration(seconds)} with {workers} worker{'s' * (workers != 1)} (a first guess)"
+        return f"to make: {counts}; about {megabytes(self.size)}, {took}"
+
+
+def forecast(plan: Plan, tasks: Collection[Task]) -> Forecast:
+    """Cost of these tasks of a plan."""
+    counts = Counter(task.kind for task in tasks)
+    pixels = plan.rig.camera.width_px * plan.rig.camera.height_px
+    size = {
+        "bake": _TEXEL_BYTES * _texels(plan),
+        "view": pixels * (_AMBIENT_BYTES_PX + _TRUTH_BYTES_PX + _PREVIEW_BYTES_PX),
+        "spot": 2.0 * _SPOT_BYTES,
+        "sample": 0.5 * pixels * _PREVIEW_BYTES_PX,
+    }
+    total = sum(count * size.get(kind, 0.0) for kind, count in counts.items())
+    return Forecast(dict(counts), int(_RESERVE * total), _seconds(plan, pixels / 1e6, "bake" in counts))
+
+
+def _seconds(plan: Plan, megapixels: float, bakes: bool) -> dict[str, float]:
+    samples = megapixels * 2 * plan.recipe.ambient.cells_per_pixel**2 * VIEW_S_PER_MEGASAMPLE
+    return {
+        "bake": _bake_s(plan) if bakes else 0.0,
+        "view": VIEW_S + megapixels * VIEW_S_PER_MEGAPIXEL + samples,
+        "spot": SPOT_S,
+        "sample": megapixels * SAMPLE_S_PER_MEGAPIXEL,
+    }
+
+
+def _bake_s(plan: Plan) -> float:
+    """Seconds of the light map: rays are texels times rays per texel."""
+    ambient, lamps = plan.recipe.ambient, sum(surface.emits for surface in plan.room.surfaces)
+    if is_cached(plan.rig.at(0.0), plan.room, bake_settings(ambient)):
+        return CACHED_BAKE_S
+    rays = ambient.bounces * ambient.bounce_rays + 2 * (lamps * ambient.lamp_rays + ambient.final_rays)
+    return rays * _texels(plan) / 1e6 * BAKE_S_PER_MEGARAY
+
+
+def _texels(plan: Plan) -> int:
+    return texel_count(cut(fixed_shapes(plan.room), plan.recipe.ambient.texel_m))
+
+
+def megabytes(count: int) -> str:
+    """Bytes for people."""
+    return f"{count / 1e6:.0f} MB" if count < 5e9 else f"{count / 1e9:.0f} GB"
+
+
+def duration(seconds: float) -> str:
+    """Seconds for people."""
+    return f"{seconds:.0f} s" if seconds < 90.0 else f"{seconds / 60.0:.0f} min"
+
+
+# Seconds while the tasks run.
+
+
+def slowdown(workers: int) -> float:
+    """How much longer a task takes here and now than on the idle machine of the constants, with so many workers.
+
+    A fixed piece of work is timed. Its CPU time is this machine's speed; wall-clock over CPU time r says how many other
+    processes want the cores: r = (others + 1) / cores where that is above 1, and else the load average says it.
+    """
+    cores, wall_s, cpu_s = os.cpu_count() or 1, time.perf_counter(), time.process_time()
+    _probe()
+    cpu_s = max(time.process_time() - cpu_s, 1e-3)
+    waiting = (time.perf_counter() - wall_s) / cpu_s
+    others = max(waiting * cores - 1.0, 0.0) if waiting > 1.2 else min(os.getloadavg()[0], cores - 1.0)
+    return cpu_s / _PROBE_CPU_S * max((others + workers) / cores, 1.0)
+
+
+def _probe() -> None:
+    values = np.linspace(0.0, 1.0, 200_000)
+    for _ in range(20):
+        values = np.sin(np.sort(values[::-1]) + 1e-3)
+
+
+class Pace:
+    """Seconds of a task by kind: the first guess, corrected by the tasks that have ended."""
+
+    def __init__(self, expected: Mapping[str, float], slowdown: float) -> None:
+        self._expected, self._slowdown = dict(expected), slowdown
+        self._measured: dict[str, list[float]] = {}
+
+    def add(self, kind: str, seconds: float) -> None:
+        """Count a task that has ended."""
+        self._measured.setdefault(kind, []).append(seconds)
+
+    def seconds(self, kind: str) -> float:
+        """Expect this of a task: the median of the last ones of its kind, or else the guess times what others took."""
+        if measured := self._measured.get(kind):
+            return statistics.median(measured[-15:])
+        told = {one: len(measured) * self._expected.get(one, 0.0) for one, measured in self._measured.items()}
+        took = sum(sum(self._measured[one]) for one, expected in told.items() if expected)
+        factor = (_TRUST_S * self._slowdown + took) / (_TRUST_S + sum(told.values()))
+        return self._expected.get(kind, 0.0) * factor
+
+    def left_s(self, waiting: Mapping[str, int], running: Iterable[tuple[str, float]], width: int) -> float:
+        """Seconds until all have ended: tasks that wait by kind, and kind and age of those that run.
+
+        Views and samples wait for the light map, which is one task.
+        """
+        left = {kind: count * self.seconds(kind) for kind, count in waiting.items()}
+        for kind, age_s in running:
+            # a task that takes longer than expected is likely to go on for a while
+            left[kind] = left.get(kind, 0.0) + max(self.seconds(kind) - age_s, 0.2 * age_s)
+        bake_s, total_s = left.get("bake", 0.0), sum(left.values())
+        after_bake_s = total_s - bake_s - left.get("spot", 0.0)
+        return max(total_s / width, bake_s + after_bake_s / width)
+
+
+class TaskProgress:
+    """Account of a run: which tasks are running, since when, and how long the rest will take.
+
+    It is an `Executor` that passes everything on to another one. Tasks run in the order in which they are submitted,
+    as many at a time as there are workers: a good approximation of what dask does. One thread submits and waits;
+    another one may ask for the rest.
+    """
+
+    def __init__(self, tasks: Iterable[Task], pace: Pace) -> None:
+        self._executor: Executor | None = None
+        self._pace, self._lock, self._width = pace, threading.Lock(), 1
+        self._left = {task.name: task.kind for task in tasks}
+        self._submitted: dict[str, float | None] = {}  # when they began
+
+    def watch(self, executor: Executor) -> TaskProgress:
+        """Pass tasks on to an executor from now on."""
+        self._executor = executor
+        return self
+
+    def width(self) -> int:
+        """How many tasks run at a time."""
+        self._width = max(self._workers.width(), 1)
+        return self._width
+
+    @property
+    def _workers(self) -> Executor:
+        assert self._executor is not None, "watch an executor first"
+        return self._executor
+
+    def submit(self, task: Task) -> None:
+        """Begin a task, or queue it."""
+        with self._lock:
+            self._submitted[task.name] = None
+            self._begin()
+        self._workers.submit(task)
+
+    def next(self) -> Outcome:
+        """Wait for any submitted task."""
+        task, outcome = self._workers.next()
+        with self._lock:
+            self._submitted.pop(task.name, None)
+            self._begin()
+            if isinstance(outcome, Done):
+                self._pace.add(task.kind, outcome.seconds)
+        return task, outcome
+
+    def settle(self, task: Task) -> None:
+        """Count a task that will not be done again."""
+        with self._lock:
+            self._left.pop(task.name, None)
+
+    def running(self) -> list[tuple[str, float]]:
+        """Name and age in seconds of the tasks that run."""
+        now = time.monotonic()
+        with self._lock:
+            return [(name, now - began) for name, began in self._submitted.items() if began is not None]
+
+    def running_text(self) -> str:
+        """Say the same in words."""
+        return ", ".join(f"{name} ({age_s:.0f} s)" for name, age_s in self.running()[:4])
+
+    def left_s(self) -> float:
+        """Seconds until all tasks have ended."""
+        running = self.running()
+        with self._lock:
+            waiting = Counter(self._left.values())
+            ages = [(self._left[name], age_s) for name, age_s in running if name in self._left]
+            waiting.subtract(Counter(kind for kind, _ in ages))
+            return self._pace.left_s(waiting, ages, self._width)
+
+    def _begin(self) -> None:
+        for name in list(self._submitted)[: self._width]:
+            if self._submitted[name] is None:
+                self._submitted[name] = time.monotonic()
+
+
+# What will be seen.
+
+
+@dataclass(frozen=True)
+class PairForecast:
+    """A pair as it will be seen; D in metres."""
+
+    pair: PairPlan
+    depth_m: float
+    down: SpotTruth
+    up: SpotTruth
+
+    @property
+    def visible(self) -> bool:
+        """Whether both images show the spot."""
+        return self.down.visible and self.up.visible
+
+
+def pair_forecasts(plan: Plan) -> Iterator[PairForecast]:
+    """Trace the chief rays of all pairs of a plan; nothing is rendered."""
+    for pair in plan.pairs:
+        spot, rig = plan.spots[pair.spot], plan.rigs[pair.rig]
+        views = [plan.view(pair, position) for position in POSITIONS]
+        down, up = (spot_truth(view, spot, plan.room.shapes(view)) for view in views)
+        distance_m = depth_m(np.array(spot.position_world_m), rig.at(0.0).sphere_centre_m)
+        yield PairForecast(pair, float(distance_m), down, up)
+
+
+def pair_table(pairs: Iterable[PairForecast]) -> list[str]:
+    """Lines of a table: sample, D, stroke, and the pixel of the spot in both images or why it is not seen."""
+    rows = [("sample", "D m", "stroke m", "down u, v px", "up u, v px")]
+    for one in pairs:
+        places = [f"{t.u_px:.1f}, {t.v_px:.1f}" if t.visible else t.cause for t in (one.down, one.up)]
+        rows.append((one.pair.sample_id, f"{one.depth_m:.3f}", f"{one.pair.stroke_m:.3f}", places[0], places[1]))
+    widths = [max(len(row[k]) for row in rows) for k in range(5)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
