@@ -11,7 +11,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from phibench.datasets.build.assemble import assemble, unlike, visibility_line, write_documents
+from phibench.datasets.build.assemble import assemble, differing, visibility_line, write_documents
 from phibench.datasets.build.forecast import PairForecast, forecast, pair_forecasts, pair_table, slowdown
 from phibench.datasets.build.journal import Head, Journal
 from phibench.datasets.build.run_tasks import claim, refuse_other, remove_files, run_tasks, stale_files, unfinished
@@ -173,9 +173,9 @@ def _make(plan: Plan, recipe: str, out: Path, pool: WorkerPool, journal: Journal
 
 
 def _environment(pool: WorkerPool, journal: Journal) -> tuple[Environment, NoRendererError | None]:
-    """What the workers render with, or, where they cannot render, what the folder was rendered with, and why.
+    """Environment of the workers; where they cannot render, that of the folder, and the reason.
 
-    Nothing can be rendered then, but `[frames]` may be changed, and small files written anew.
+    Nothing can be rendered then. `[frames]` may be changed all the same, and small files are written anew.
     """
     try:
         return pool.environment(), None
@@ -193,7 +193,7 @@ def _loose_ends(plan: Plan, head: Head, journal: Journal, tasks: Iterable[str], 
     """Documents to be written, and files to be removed, when every task is done."""
     entries = {name: journal.entries[name] for name in tasks}
     files = [name for entry in entries.values() for name in entry.files]
-    return [*unlike(out, assemble(plan, head, entries)), *stale_files(out, files)]
+    return [*differing(out, assemble(plan, head, entries)), *stale_files(out, files)]
 
 
 def _info_text(info: DatasetInfo, journal: Journal) -> str:

@@ -1,6 +1,7 @@
-"""Shards to one data set, with the bytes of a run that was never divided.
+"""Merging of shards into one data set, and repair of a damaged one.
 
-Repair: what is damaged or missing is rendered again, nothing else.
+A merged data set has the bytes of a run that was never divided. A repair renders what is damaged or missing, and
+nothing else.
 """
 
 from __future__ import annotations
@@ -34,8 +35,9 @@ def merge(out: str | Path, shards: Sequence[str | Path], console: Console | None
 
     Raises
     ------
-        DatasetError If a shard is missing, given twice, unfinished, damaged, or of another recipe, code or
-        environment than the rest.
+    DatasetError
+        If a shard is missing, given twice, unfinished, damaged, or of another recipe, code or environment than the
+        rest.
     """
     out, folders, console = Path(out), [Path(shard) for shard in shards], console or Console(stderr=True)
     head, info, entries = _collect(folders)
@@ -138,7 +140,8 @@ def repair(
 
     Raises
     ------
-        DatasetError If the folder holds no data set, if neither its journal nor its other files say what it should
+    DatasetError
+        If the folder holds no data set, if neither its journal nor its other files say what it should
         hold, or if this code or these packages are not those that made it: the parts would not fit together.
     """
     folder, console = Path(folder), console or Console(stderr=True)

@@ -1,15 +1,13 @@
-"""The detector's colour filters and quantum efficiency: light to expected photo-electrons.
-
-A layer holds one plane per colour filter. Ambient light is carried in three bands, one per filter, each with
-an effective wavelength and an efficiency (quantum efficiency times filter and lens transmission). The
-laser line is handled at its own wavelength. Nobody has published electron-level data of a C310: the numbers are
-assumed (docs/model.md).
-
-The camera: a thin lens with OpenCV intrinsics and Brown distortion.
+"""Camera and detector: a thin lens with OpenCV intrinsics and Brown distortion, and the sensor's colour filters.
 
 A point of the plane of focus has one image for the whole aperture, at the pixel that `Camera.project` gives for it.
 The chief ray goes through the lens centre undeviated. The natural (cos^4) fall-off follows from this geometry and is
 part of every layer.
+
+A layer holds one plane per colour filter. Ambient light is carried in three bands, one per filter. Each band has an
+effective wavelength and an efficiency: quantum efficiency times transmission of filter and lens. The laser line is
+handled at its own wavelength. Nobody has published electron-level data of a C310: the numbers are assumed
+(docs/model.md).
 """
 
 from __future__ import annotations
@@ -75,8 +73,8 @@ def photons_per_joule(wavelength_nm: float) -> float:
     return wavelength_nm * 1e-9 / (PLANCK_J_S * LIGHT_M_S)
 
 
-_NEWTON_STEPS = 30
-_FOLD_MARGIN_PX = 10.0
+_NEWTON_STEPS = 30  # at most: the loop ends with steps below the tolerance
+_FOLD_MARGIN_PX = 10.0  # the blur reaches so far beyond the image
 _NEWTON_TOLERANCE = 1e-14  # normalised image coordinates; 1.4e-11 px
 
 
@@ -217,7 +215,7 @@ class Camera:
             )
 
     def contains(self, uv_px: Array) -> BoolArray:
-        """Whether pixels (u, v), shape (..., 2), lie inside the image [-0.5, W - 0.5] x [-0.5, H - 0.5]."""
+        """Mask of the pixels (u, v), shape (..., 2), inside the image [-0.5, W - 0.5] x [-0.5, H - 0.5]."""
         uv = np.asarray(uv_px, float)
         inside_u = (uv[..., 0] >= -0.5) & (uv[..., 0] <= self.width_px - 0.5)
         return inside_u & (uv[..., 1] >= -0.5) & (uv[..., 1] <= self.height_px - 0.5)

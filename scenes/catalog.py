@@ -1,4 +1,4 @@
-"""The rooms and rigs that recipes name."""
+"""Catalogue of rooms and rigs by the names that recipes use, and the target boards."""
 
 from __future__ import annotations
 

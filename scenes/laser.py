@@ -82,7 +82,7 @@ class LaserSpot:
 
 @dataclass(frozen=True)
 class Beam:
-    """What a data sheet says of a laser's beam: the diameter of the spot, D4sigma, grows with the distance.
+    """Laser beam of a data sheet: the diameter of the spot, D4sigma, grows with the distance.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
-"""Form error of the mirror: low-order harmonics that are added to the sphere's radius.
+"""Spherical mirror: radius, form error, roughness, and reflectance of its steel.
 
-The surface is r(n) = R + sum of c_k h_k(n), with n = (x, y, z) a unit direction in the sphere's own frame
-(`T_camera_sphere`; `Rig.perturbed` lays its axes along the world's at the down position: z up, so that -z faces the
-camera). The real harmonics h_k of degree 2 and 3 are scaled to a largest magnitude of 1: a coefficient is the peak of
-what it adds, in metres, and not its rms. Degree 0 is the radius and degree 1, to first order, a decentre: both are
-parameters already.
+The form error adds low-order harmonics to the sphere's radius. The surface is r(n) = R + sum of c_k h_k(n), with
+n = (x, y, z) a unit direction in the sphere's own frame (`T_camera_sphere`). `Rig.perturbed` lays its axes along the
+world's at the down position: z up, so that -z faces the camera. The real harmonics h_k of degree 2 and 3 are scaled to
+a largest magnitude of 1: a coefficient is the peak of what it adds, in metres, and not its rms. Degree 0 is the radius
+and degree 1, to first order, a decentre: both are parameters already.
 
     20    (3 z^2 - 1) / 2        +1 at the poles (top and bottom), -1/2 around the equator
     21c   2 x z                  21s  2 y z
@@ -18,9 +18,7 @@ On the unit sphere a harmonic of degree l is a homogeneous polynomial H of degre
 equal in degree). Off the surface it is continued as H(P) / |P|^l, and the surface is the zero of the level function
 g(P) = |P| - R - H2(P) / |P|^2 - H3(P) / |P|^3.
 
-The spherical mirror, its form error, and the optical constants of its steel.
-
-Source of the table: austenitic stainless steel (about 316), B. Karlsson and C. G. Ribbing,
+Source of the steel's constants: austenitic stainless steel (about 316), B. Karlsson and C. G. Ribbing,
 "Optical constants and spectral selectivity of stainless steel and its oxides", J. Appl. Phys. 53, 6340 (1982),
 read from a figure, good to 1 to 2 %.
 """
@@ -38,7 +36,7 @@ from phibench.scenes.frames import Array
 from phibench.scenes.validation import SceneError, finite, positive, within
 
 _A, _B = 3.0 * math.sqrt(15.0) / 16.0, 3.0 * math.sqrt(3.0) / 2.0
-# homogeneous polynomials: monomial -> coefficient
+# Homogeneous polynomials: monomial -> coefficient. _A and _B scale the largest magnitude on the sphere to 1.
 _POLYNOMIALS: dict[str, dict[str, float]] = {
     "form_20_m": {"zz": 1.0, "xx": -0.5, "yy": -0.5},
     "form_21c_m": {"xz": 2.0},
@@ -194,7 +192,7 @@ def _symmetric(monomial: str, coefficient: float) -> Array:
     return result
 
 
-# wavelength in nm, n, k
+# The mirror and its steel: wavelength in nm, n, k.
 STEEL = np.array(
     [
         [400, 1.5249, 2.7925],

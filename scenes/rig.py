@@ -1,10 +1,10 @@
-"""The occluding contour of a mirror with a form error: where lines of sight touch it.
+"""Rig: camera and mirror on one carriage that moves along the stroke axis.
 
-A mirror point P shows itself to the eye E as an edge where g(P) = 0 and grad g . (P - E) = 0 (`form`). In the
-half-plane of the eye, the centre and a direction across there is one such point, because the mirror is convex and holds
-the centre.
+`Rig` describes the down position; `Rig.at(offset_m)` gives the `View` that one image is taken from.
 
-The rig: camera and mirror on one carriage that moves along the stroke axis.
+The mirror's outline is where lines of sight touch it. For a mirror with a form error, g(P) = 0 on the surface
+(`mirror.level`), and a point P of the outline as seen from the eye E has grad g . (P - E) = 0. In the half-plane of the
+eye, the centre and a direction across there is one such point, because the mirror is convex and holds the centre.
 """
 
 from __future__ import annotations
@@ -176,12 +176,12 @@ class Rig:
         return self.camera.project(math.sqrt(1.0 - sine * sine) * axis + sine * rim)
 
     def in_image(self) -> bool:
-        """Whether the mirror's middle or any of its outline lies inside the image."""
+        """Return True if the mirror's middle or any of its outline lies inside the image."""
         places = np.vstack([self.camera.project(self.sphere_in_camera_m), self.outline_px(24)])
         return bool(np.any(self.camera.contains(places)))
 
     def fits_image(self) -> bool:
-        """Whether the whole outline of the mirror lies inside the image."""
+        """Return True if the whole outline of the mirror lies inside the image."""
         return bool(np.all(self.camera.contains(self.outline_px())))
 
 

@@ -1,16 +1,12 @@
-"""Diffuse albedo as an exact function of the position on a surface.
+"""Room and robot: shapes with diffuse albedos, everything that light can hit except the mirror.
 
-Albedo has three values, one per ambient band (R, G, B). Positions are metres from the surface's centre.
+Shapes are rectangles and cuboids. An albedo is an exact function of the position on a surface and has three values,
+one per ambient band (R, G, B); positions are metres from the surface's centre.
 
-The two shapes rooms and robots are built of: rectangles and cuboids.
-
-The robot ESCALADE360 as simple solids, with the mast and the camera's housing.
-
-The paper gives the overall dimensions 0.90 x 0.53 x 0.30 m and tracks with flippers after the PackBot; the split into
-body, tracks and flippers is ours. The mast that lifts the sensor and the housing are not in the paper either; they are
-there so that the middle of the mirror shows a camera on a robot. The holder of the mirror is not modelled.
-
-A room: everything that can be hit by light except the mirror.
+The robot is the ESCALADE360 as simple solids. The paper gives its overall dimensions, 0.90 x 0.53 x 0.30 m, and tracks
+with flippers after the PackBot; the split into body, tracks and flippers is ours. So are the mast that lifts the sensor
+and the camera's housing, which make the middle of the mirror show a camera on a robot. The holder of the mirror is not
+modelled.
 """
 
 from __future__ import annotations
@@ -77,6 +73,8 @@ def check_albedo(owner: str, name: str, albedo: Vector) -> Vector:
     return values
 
 
+# Shapes.
+
 _WHITE = Uniform((0.7, 0.7, 0.7))
 
 
@@ -109,7 +107,7 @@ class Rectangle:
 
     @property
     def emits(self) -> bool:
-        """Whether the rectangle is a lamp that is switched on."""
+        """True for a lamp that is switched on."""
         return any(value > 0.0 for value in self.radiance_w_m2_sr)
 
 
@@ -126,7 +124,7 @@ class Cuboid:
         _check_size(self, 3)
 
     def contains(self, point_world_m: Vector) -> bool:
-        """Whether a world point lies strictly inside."""
+        """Return True for a world point strictly inside."""
         local = self.T_world_shape.inverse().points(np.asarray(point_world_m, float))
         return bool(np.all(np.abs(local) < 0.5 * np.array(self.size_m) - 1e-9))
 
@@ -136,7 +134,7 @@ class Cuboid:
         return float(np.linalg.norm(np.maximum(local - 0.5 * np.array(self.size_m), 0.0)))
 
     def meets(self, other: Cuboid) -> bool:
-        """Whether two boxes overlap: no axis separates them (of the faces, and the products of the edges)."""
+        """Return True if two boxes overlap: no axis separates them (of the faces, and the products of the edges)."""
         a, b = self.T_world_shape.R, other.T_world_shape.R
         axes = np.concatenate([a.T, b.T, np.cross(a.T[:, None], b.T[None]).reshape(-1, 3)])
         reach = (np.abs(axes @ a) @ np.array(self.size_m) + np.abs(axes @ b) @ np.array(other.size_m)) / 2.0
@@ -183,6 +181,8 @@ def _side(box: Cuboid, axis: int, sign: float) -> Rectangle:
     return Rectangle(name, pose, (float(lengths[0]), float(lengths[1])), box.texture)
 
 
+# The robot.
+
 BODY_TOP_M = 0.30
 _HOUSING_M = (0.072, 0.030, 0.032)  # the C310's bar, lying on its back
 _LENS_CLEARANCE_M = 1e-3  # the housing's top stays below the lens centre so that it shades no aperture
@@ -220,6 +220,8 @@ def escalade360(view: View) -> tuple[Cuboid, ...]:
     return (*chassis(), *carriage(view))
 
 
+# The room.
+
 MIRROR_NAME = "mirror"
 
 
@@ -250,7 +252,7 @@ class Room:
 
     @property
     def lit(self) -> bool:
-        """Whether any lamp is on."""
+        """True if any lamp is on."""
         return any(surface.emits for surface in self.surfaces)
 
     def shapes(self, view: View) -> tuple[Shape, ...]:

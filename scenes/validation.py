@@ -1,8 +1,7 @@
-"""Validation shared by every description in ``scenes``: one clear sentence per fault.
+"""Validation: one clear sentence per fault, with path, value, allowed range and advice.
 
-Advice for a misspelt name.
-
-Faults of a table that a file fills: one line each, with path, value, allowed range and what to do.
+The first half checks numbers of the descriptions in `scenes` and raises `SceneError`. The second half words the faults
+that pydantic finds in a table that a file fills, such as a recipe.
 """
 
 from __future__ import annotations
@@ -76,6 +75,8 @@ def close_names(name: str, known: Iterable[str]) -> list[str]:
     return difflib.get_close_matches(name, list(known), 1, 0.5)
 
 
+# Tables that a file fills.
+
 Schema = dict[str, Any]
 Location = tuple[str | int, ...]
 _LIMITS = {"exclusiveMinimum": "above {}", "minimum": "from {}", "exclusiveMaximum": "below {}", "maximum": "up to {}"}
@@ -118,7 +119,7 @@ def _untagged(details: ErrorDetails) -> ErrorDetails:
 
 
 def _follows(details: ErrorDetails) -> bool:
-    """Whether a list is called too short only because its faulty entries were not counted."""
+    """Return True for a list that is too short only because its faulty entries were not counted."""
     return details["type"] == "too_short" and len(details["input"]) >= details["ctx"]["min_length"]
 
 

@@ -1,7 +1,4 @@
-"""The small files of a data set as bytes, known from plan and journal: each can be checked and written anew.
-
-How many pairs of a data set can be used, and why the others cannot, in one line.
-"""
+"""Assembly of a data set: its small files as bytes, from plan and journal. Each can be checked and written anew."""
 
 from __future__ import annotations
 
@@ -37,19 +34,19 @@ def assemble(plan: Plan, head: Head, entries: Mapping[str, Entry]) -> dict[str, 
 
 
 def _row(pair: PairPlan, entries: Mapping[str, Entry]) -> ManifestRow:
-    """Row of a sample: what its spot's task found, and the noise that was known when its views were there."""
+    """Row of a sample: the result of its spot's task, and the noise from its sample's task."""
     row, noise = dict(entries[spot_task_name(pair)].result), entries[sample_task_name(pair)].result
     row |= {position: {**row[position], "noise": noise[position]} for position in POSITIONS}
     return ManifestRow.model_validate_json(json.dumps(row))
 
 
-def unlike(out: Path, wanted: Mapping[str, bytes]) -> list[str]:
+def differing(out: Path, wanted: Mapping[str, bytes]) -> list[str]:
     """Names of files that are missing or have other bytes."""
     return [name for name, data in wanted.items() if not (out / name).is_file() or (out / name).read_bytes() != data]
 
 
 def write_documents(out: Path, wanted: Mapping[str, bytes], names: Iterable[str]) -> None:
-    """Write some of them, in their order. Without SHA256SUMS the folder does not pass for finished."""
+    """Write some of the small files, in their order. Without SHA256SUMS the folder does not pass for finished."""
     names = set(names)
     if names:
         (out / schema.CHECKSUMS).unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""The light map of a data set's room: baked once, or taken from the user's cache, and kept with the data set."""
+"""Task that bakes the light map of a data set's room, or takes it from the user's cache."""
 
 from __future__ import annotations
 

@@ -125,7 +125,7 @@ def duration(seconds: float) -> str:
 
 
 def slowdown(workers: int) -> float:
-    """How much longer a task takes here and now than on the idle machine of the constants, with so many workers.
+    """Factor by which a task takes longer here and now than on the idle machine of the constants.
 
     A fixed piece of work is timed. Its CPU time is this machine's speed; wall-clock over CPU time r says how many other
     processes want the cores: r = (others + 1) / cores where that is above 1, and else the load average says it.
@@ -198,7 +198,7 @@ class TaskProgress:
         return self
 
     def width(self) -> int:
-        """How many tasks run at a time."""
+        """Return the number of tasks that run at a time."""
         self._width = max(self._workers.width(), 1)
         return self._width
 
@@ -268,7 +268,7 @@ class PairForecast:
 
     @property
     def visible(self) -> bool:
-        """Whether both images show the spot."""
+        """True if both images show the spot."""
         return self.down.visible and self.up.visible
 
 

@@ -1,8 +1,10 @@
-"""The journal of a folder: which task made which bytes. It decides what is finished; names and times of files do not.
+"""Journal of a folder: the finished tasks with the hashes of their files.
 
-One line per entry, a CRC-32 and a JSON object: first the head (the texts of `dataset.json` and `recipe.toml`, so that
-these can be repaired), then one entry per finished task; the last one of a name counts. A line that a killed run left
-half-written, or that was damaged, fails its CRC and is as if it were not there: its task is done again.
+It decides what is finished; names and times of files do not.
+
+Each line is one entry: a CRC-32 and a JSON object. The first is the head, with the texts of `dataset.json` and
+`recipe.toml`, so that these can be repaired. One entry per finished task follows; the last one of a name counts. A line
+that was half-written or damaged fails its CRC and is ignored: its task is done again.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Head:
-    """What the folder holds: the text of `dataset.json`, and of the recipe."""
+    """Description of the folder: the text of `dataset.json`, and of the recipe."""
 
     info: str
     recipe: str

@@ -81,7 +81,7 @@ def refuse_other(out: Path, name: str) -> None:
 
 
 def held_head(out: Path) -> Head | None:
-    """What the folder says it holds: by its journal, else by its `dataset.json`; None for an empty one.
+    """Description that a folder has of itself, by its journal or its `dataset.json`; None for an empty one.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def unfinished(tasks: Mapping[str, Task], journal: Journal, out: Path) -> list[s
 
 
 def is_intact(entry: Entry, out: Path) -> bool:
-    """Whether all files of an entry are there with their bytes."""
+    """Return True if all files of an entry are there with their bytes."""
     return all((out / name).is_file() and sha256(out / name) == digest for name, digest in entry.files.items())
 
 

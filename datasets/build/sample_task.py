@@ -1,4 +1,4 @@
-"""What needs a sample's spot layers and its views: the picture of the sample, and its noise budget."""
+"""Task that finishes a sample from its spot layers and views: its picture, and its noise budget."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
-"""In which order tasks go to workers: a sliding window, needs before their readers, killers of workers by themselves.
+"""Task scheduler: submits a few tasks per worker at a time, dependencies first.
 
-Only a few tasks per worker are submitted ahead, so that nothing grows with the number of tasks. When a worker dies,
-all that it had been given comes back: one task is to blame, the others were near. All of them become suspects and are
-done again at the end, each alone, so that a poisoned task takes no innocent one with it. One that kills its worker
-every time is reported.
+Nothing grows with the number of tasks. When a worker dies, one of the tasks that it had been given is to blame. All of
+them are retried last, each alone, so that a task that kills its worker takes no other one with it. A task that kills
+its worker every time is reported.
 """
 
 from __future__ import annotations
@@ -14,16 +13,16 @@ from typing import Protocol
 
 from phibench.datasets.build.tasks import Done, Failed, Task
 
-AHEAD = 3
-TRIALS = 3
+AHEAD = 3  # tasks submitted per worker: one runs, two wait, so that no worker is idle
+TRIALS = 3  # of a task whose worker died
 Outcome = tuple[Task, Done | Failed]
 
 
 class Executor(Protocol):
-    """Whoever does tasks."""
+    """Anything that runs tasks."""
 
     def width(self) -> int:
-        """How many tasks run at a time."""
+        """Return the number of tasks that run at a time."""
 
     def submit(self, task: Task) -> None:
         """Begin a task, or queue it."""

@@ -1,4 +1,4 @@
-"""One spot in one view: exact answer, layer, certificate. Needs NumPy only."""
+"""Task of one sample's spot in both views: exact answer, layer, certificate. Needs NumPy only."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def _window(layer: SpotLayer) -> SpotWindow:
 
 
 def _reaches(view: View, window: SpotWindow) -> bool:
-    """Whether any light of the spot falls on the image."""
+    """Return True if any light of the spot falls on the image."""
     camera = view.rig.camera
     image = np.zeros((3, camera.height_px, camera.width_px))
     window.add_to(image)

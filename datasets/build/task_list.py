@@ -1,4 +1,4 @@
-"""The tasks of a plan, in the order of the recipe, each with its key.
+"""List of the tasks of a plan, in the order of the recipe, each with its key.
 
 The light map depends on the room and its settings; a view on rig, room, pose, settings and light map; a spot on rig,
 room, laser and stroke; a sample (picture, noise budget) on its two views and its spot. A task stands before those that

@@ -1,4 +1,4 @@
-"""A task: a pure function whose outputs are files, known by the hash of all that enters it."""
+"""Tasks: pure functions whose outputs are files, known by the hash of all that enters them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from phibench.datasets.store.provenance import code_sha256
 
 @dataclass(frozen=True)
 class Made:
-    """What a task's function returns: the files it wrote, relative to the folder, and a JSON document."""
+    """Result of a task's function: the files it wrote, relative to the folder, and a JSON document."""
 
     files: tuple[str, ...]
     result: Any = None

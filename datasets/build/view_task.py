@@ -1,4 +1,4 @@
-"""One mirror pose, rendered in a worker process: ambient layer, truth layer, preview."""
+"""Task of one mirror pose, rendered in a worker process: ambient layer, truth layer, preview."""
 
 from __future__ import annotations
 

@@ -128,8 +128,8 @@ def local_workers(count: int, out: Path) -> Iterator[DaskExecutor]:
             local_directory=folder,
         )
         with cluster, distributed.Client(cluster, set_as_default=False) as client:
-            client.run(_hear_no_interrupt)
-            client.register_plugin(_deaf_plugin())
+            client.run(_ignore_interrupt)
+            client.register_plugin(_ignoring_plugin())
             yield DaskExecutor(client, out, deaths)
 
 
@@ -176,24 +176,24 @@ def _libraries() -> tuple[Any, Any]:
     return dask, distributed
 
 
-def _hear_no_interrupt() -> None:
+def _ignore_interrupt() -> None:
     """Leave Ctrl-C to the parent, which then ends its workers."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _deaf_plugin() -> Any:
+def _ignoring_plugin() -> Any:
     """Make a plugin that does the same in the workers that come later."""
     from distributed import WorkerPlugin
 
-    class Deaf(WorkerPlugin):
+    class IgnoreInterrupt(WorkerPlugin):
         def setup(self, worker: Any) -> None:
-            _hear_no_interrupt()
+            _ignore_interrupt()
 
-    return Deaf()
+    return IgnoreInterrupt()
 
 
 class _Deaths(logging.Handler):
-    """Hears from the nannies how a worker died."""
+    """Log handler that keeps how a worker died, as its nanny says."""
 
     def __init__(self) -> None:
         super().__init__(logging.INFO)
@@ -248,7 +248,8 @@ def remote_environment(workers: DaskExecutor, out: Path) -> Environment:
 
     Raises
     ------
-        DatasetError If a worker lacks phibench or Mitsuba, has other versions than the rest, other code than this
+    DatasetError
+        If a worker lacks phibench or Mitsuba, has other versions than the rest, other code than this
         process, more than one thread, or does not see the folder.
     """
     if threaded := [name for name, count in workers.client.nthreads().items() if count != 1]:
@@ -261,7 +262,7 @@ def remote_environment(workers: DaskExecutor, out: Path) -> Environment:
 
 
 def versions(environment: Environment) -> Environment:
-    """What of an environment enters the keys of tasks."""
+    """Part of an environment that enters the keys of tasks."""
     packages = {name: environment["packages"][name] for name in _IN_KEYS}
     kept = {key: environment[key] for key in ("python", "machine", "variant", "llvm", "threads_per_process")}
     return {**kept, "packages": packages}
@@ -327,11 +328,11 @@ class WorkerPool:
 
     @property
     def width(self) -> int:
-        """How many tasks run at a time."""
+        """Number of tasks that run at a time."""
         return self._count if self._remote is None else self._remote.width()
 
     def environment(self) -> Environment:
-        """What the workers render with."""
+        """Environment of the workers: versions, variant, LLVM."""
         if self._scheduler is None:
             return local_environment()
         self._remote = self._stack.enter_context(remote_workers(self._scheduler, self._out))

@@ -1,9 +1,8 @@
-"""The plan of a data set: which poses, spots and pairs a recipe means. Pure, nothing is rendered or written.
+"""Plan of a data set: the poses, spots and pairs that a recipe stands for. Nothing is rendered or written.
 
-Parts of a data set for job arrays: shard i of n, by position in the recipe, so that nobody has to agree on anything.
-
-A shard owns a contiguous run of samples (neighbours share views) and renders every view that these need; a view that
-two shards need is rendered by both, to the same bytes. A shard is a data set of its own, complete and readable.
+Shard i of n is a contiguous run of samples, by position in the recipe: machines need not agree on anything. Neighbours
+share views. A view that two shards need is rendered by both, to the same bytes. A shard is a data set of its own,
+complete and readable.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
 from phibench.scenes.room import Room
 
 RECIPE_RIG = "rig"
-"""Id of the rig of `[rig]`; a drawn one is called after the first sample that has it, such as ``r000042``, and one that
-no sample has but that an estimator believes in ``n000042``."""
+"""Id of the rig of `[rig]`. A drawn one is called after the first sample that has it, such as ``r000042``, and one that
+only an estimator is given ``n000042``."""
 TRUE_RIG = "true"
 """Id of the rig of `[rig]` with `[misalignment]`, for experiments."""
 
@@ -61,15 +60,15 @@ class PairPlan:
     target : str
         Name of the target, or of what a ray met.
     stroke_m, nominal_stroke_m : float
-        The true stroke, and the one that an estimator believes.
+        The true stroke, and the one that an estimator is given.
     spot : str
         Key of the spot in `Plan.spots`.
     rig, nominal_rig : str
-        Id of the true rig, and of the one that an estimator believes.
+        Id of the true rig, and of the one that an estimator is given.
     drawn : tuple of (parameter, value)
         What was drawn; empty for an experiment without drawn rigs.
     tries : int
-        Which draw was the first possible one; 0 where nothing is drawn.
+        Number of the first draw that was possible; 0 where nothing is drawn.
     """
 
     sample_id: str
@@ -90,7 +89,7 @@ class PairPlan:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a recipe means.
+    """Rigs, spots, poses and pairs of a recipe.
 
     Attributes
     ----------
@@ -105,7 +104,7 @@ class Plan:
     pairs : tuple of PairPlan
         In the order of the recipe.
     shard : str or None
-        "i/n" where this is a part of the recipe (`shard.py`).
+        "i/n" where this is a part of the recipe (`shard_plan`).
     """
 
     recipe: Recipe

@@ -1,18 +1,12 @@
-"""Which part of the probability each parameter of each drawn sample takes: numbers in [0, 1).
+"""Sampling of drawn recipes: rigs, spots and strokes of `[random]`, and the misalignments of `[rigs]`.
 
-The number of sample i for parameter p is a function of (data set, seed, sequence, p, i) and of nothing else: neither of
-how many samples there are nor of which other parameters are drawn. A sample that turns out to be impossible is tried
-again with numbers of its own streams, so that no other sample moves.
+The number of sample i for parameter p, in [0, 1), is a function of (data set, seed, sequence, p, i) and of nothing
+else. It depends neither on how many samples there are nor on which other parameters are drawn. The distributions turn
+it into a value (`distributions.quantile`).
 
-The samples of `[random]`: a rig, a spot and a stroke for each.
-
-Sample i is a function of the recipe without its number of samples, and of i. Where rig, spot and stroke do not go
-together (or with the room), the sample is drawn again from streams of its own (`sampling.further_points`).
-
-The rigs of `[rigs]`: misalignments that are drawn once per rig, and seen by all experiments.
-
-Rig k is a function of the recipe's seed and distributions, and of k: more rigs change none. A rig that is impossible,
-or cannot make one of the strokes, is drawn again from streams of its own (`sampling.further_points`).
+A sample may be impossible: rig, spot and stroke do not go together, or not with the room. It is then drawn again, with
+numbers of streams of its own (`further_points`), so that no other sample moves. The same holds for a rig of `[rigs]`
+that cannot exist or cannot make one of the strokes.
 """
 
 from __future__ import annotations
@@ -84,6 +78,8 @@ def further_points(
     return {name: np.array([one(name, i) for i in numbers]) for name in names}
 
 
+# Samples of `[random]`.
+
 TRIES = 100
 _PILOT = 8  # samples
 _NANOMETRE = 9  # decimals of a stroke: a pose's name then says its offset exactly
@@ -102,15 +98,15 @@ class RandomSample:
     number : int
         Place in the sequence, from 0.
     tries : int
-        Which draw was the first possible one; 1 is the sequence's own.
+        Number of the first draw that was possible; 1 is the sequence's own.
     drawn : tuple of (parameter, value)
-        In the order of `sampling.PARAMETERS`.
+        In the order of `PARAMETERS`.
     surface : str
         Name of the target, or of what carries the spot.
     rig, stroke_m
         The true ones.
     nominal_rig, nominal_stroke_m
-        Those that an estimator believes.
+        Those that an estimator is given.
     """
 
     number: int
@@ -150,7 +146,7 @@ def drawn_misalignment(table: MisalignmentTable, values: Mapping[str, Value]) ->
 
 
 class _Makers:
-    """What all draws of a recipe share."""
+    """Drawing of samples, with all that the draws of a recipe share."""
 
     def __init__(self, recipe: Recipe, table: RandomTable, room: Room) -> None:
         self._recipe, self._table, self._room = recipe, table, room
@@ -211,7 +207,7 @@ class _Makers:
 
 
 def rig_fault(rig: Rig, stroke_m: float, ceiling_m: float, boards: Boards) -> str | None:
-    """Why a rig cannot make a stroke in its room: the ceiling's lamps or a board are in the way; None if it can."""
+    """Say why a rig cannot make a stroke in its room: lamps or a board are in the way; None if it can."""
     if not rig.in_image():
         return "the mirror is outside of the image"
     sphere_m = rig.T_world_camera.points(rig.sphere_in_camera_m)  # `rig.at` takes ten times as long
@@ -225,7 +221,7 @@ def rig_fault(rig: Rig, stroke_m: float, ceiling_m: float, boards: Boards) -> st
 
 
 def drawn_parameters(table: RandomTable) -> list[str]:
-    """What a recipe draws, in the order of `sampling.PARAMETERS`."""
+    """Names of the parameters that a recipe draws, in the order of `PARAMETERS`."""
     chosen = dict(_sample_distributions(table))
     return [name for name in PARAMETERS if name in chosen or (name == "spot.target" and not table.spot.by_ray)]
 
@@ -254,6 +250,9 @@ def _plain(value: Any) -> Value:
     return value if isinstance(value, str) else float(value)
 
 
+# Rigs of `[rigs]`.
+
+
 @dataclass(frozen=True)
 class DrawnRig:
     """A drawn rig.
@@ -263,9 +262,9 @@ class DrawnRig:
     rig_id : str
         Such as ``r000002``, the third one.
     tries : int
-        Which draw was the first possible one.
+        Number of the first draw that was possible.
     drawn : tuple of (parameter, value)
-        Parameters as in `sampling.PARAMETERS`.
+        Parameters as in `PARAMETERS`.
     misalignment : Misalignment
     rig : Rig, the true one
     """

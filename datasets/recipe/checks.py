@@ -61,7 +61,7 @@ def semantic_faults(raw: Raw) -> list[Fault]:
 
 
 def warnings(recipe: Recipe) -> list[str]:
-    """What is legal but probably not meant."""
+    """Warnings of what is legal but probably not meant."""
     result = []
     if not build_true_rig(recipe).fits_image():
         result.append("rig: the mirror's outline does not fit the image; spots near its rim may fall outside")

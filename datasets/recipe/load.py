@@ -1,6 +1,6 @@
-"""Reading recipe files.
+"""Reading of recipe files: TOML text, all faults in one go, and the same text with other numbers in it.
 
-The text of a recipe with other numbers in it: the file that a data set keeps must say what it was made from.
+A data set keeps the text of its recipe, so a number that the command line changes is changed in the text as well.
 """
 
 from __future__ import annotations

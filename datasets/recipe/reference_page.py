@@ -1,4 +1,4 @@
-"""RECIPE.md: every key of a recipe with unit, range, default and meaning, written from the models themselves.
+"""Reference page of recipes, RECIPE.md: every key with unit, range, default and meaning, written from the models.
 
 Run ``python -m phibench.datasets.recipe.reference_page > datasets/RECIPE.md``; a test compares.
 """
@@ -86,7 +86,7 @@ _NOTES = {
 Divide `fx_px` by the same factor to see as much as before.
 """,
     "[misalignment]": """What the true rig deviates by from `[rig]`, which then is the nominal one: what an estimator
-believes. Images and truth are those of the true rig. Signs, axes and figures: `docs/misalignment.md`.
+is given. Images and truth are those of the true rig. Signs, axes and figures: `docs/misalignment.md`.
 Motions between the images hold at every carriage position but down. The light of the room stays
 that of the nominal rig, and the robot's body where it is. `form_...` are harmonics with their peaks in
 metres, (x, y, z) the direction from the sphere centre in the world's axes at the down position.

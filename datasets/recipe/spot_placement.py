@@ -1,6 +1,6 @@
-"""Whether a recipe's target boards leave the carriage room to move, and are large enough for their spots.
+"""Placement of drawn spots, on the boards of the recipe or where a horizontal ray from the axis ends.
 
-Laser spots that are drawn: on the boards of the recipe, or on what a horizontal ray from the axis meets.
+The other half finds boards that are in the carriage's way.
 """
 
 from __future__ import annotations

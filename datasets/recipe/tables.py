@@ -246,7 +246,7 @@ class RandomSpotTable(Table):
 
     @property
     def by_ray(self) -> bool:
-        """Whether a ray finds the spot, instead of a board that is drawn."""
+        """True where a ray finds the spot, instead of a board that is drawn."""
         return self.azimuth_deg is not None
 
 
@@ -321,7 +321,7 @@ class DistractorTable(Table):
 
     @property
     def follows_laser(self) -> bool:
-        """Whether it goes out with the laser."""
+        """True if it goes out with the laser."""
         return self.kind != "led"
 
 
