@@ -160,7 +160,7 @@ def _make(plan: Plan, recipe: str, out: Path, pool: WorkerPool, journal: Journal
         console.print(f"{out} is complete, nothing to do", highlight=False)
         return []
     if todo:
-        (out / schema.SUMS).unlink(missing_ok=True)
+        (out / schema.CHECKSUMS).unlink(missing_ok=True)
         run_tasks(plan, tasks, todo, journal, head, out, pool, console)
         faults = _loose_ends(plan, head, journal, tasks, out)
     journal.begin(head, tasks)

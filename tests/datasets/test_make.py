@@ -247,12 +247,12 @@ def test_a_long_bake_is_not_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("phibench.datasets.build.bake_task.light_map", slow)
     console = quiet()
     with pytest.raises(DatasetError, match="that is all"):
-        make.make(TINY, tmp_path / "out", workers=1, console=console)
+        make.make(SMALLEST, tmp_path / "out", workers=1, console=console)
     assert "s left, running: bake room (0 s)" in said(console)
 
 
-def test_the_preview_says_what_the_data_set_will_be(tiny_dataset: Path, tmp_path: Path) -> None:
-    rows, text = read_manifest(tiny_dataset), make.preview(TINY, tmp_path / "out", workers=2)
+def test_the_preview_says_what_the_data_set_will_be(smallest_dataset: Path, tmp_path: Path) -> None:
+    rows, text = read_manifest(smallest_dataset), make.preview(SMALLEST, tmp_path / "out", workers=2)
     assert list(tmp_path.iterdir()) == []
     lines = {line.split()[0]: line for line in text.splitlines()}
     hidden = 0
@@ -267,15 +267,15 @@ def test_the_preview_says_what_the_data_set_will_be(tiny_dataset: Path, tmp_path
     assert "to make: 2 spots, 1 bake, 3 views, 2 samples; about" in text
     assert "a first guess" in text
     console = quiet()
-    make.make(TINY, shutil.copytree(tiny_dataset, tmp_path / "copy"), console=console)
+    make.make(SMALLEST, shutil.copytree(smallest_dataset, tmp_path / "copy"), console=console)
     assert "1 of 2 pairs will not be visible in both images, such as half-hidden-h1.400 (down occluded" in said(console)
 
 
 @pytest.mark.usefixtures("inline")
-def test_the_preview_of_a_folder_with_a_data_set(tiny_dataset: Path, tmp_path: Path) -> None:
-    copy = Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
+def test_the_preview_of_a_folder_with_a_data_set(smallest_dataset: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(smallest_dataset, tmp_path / "copy"))
     before = sorted((path, path.stat().st_mtime_ns) for path in copy.rglob("*"))
-    assert "to make: nothing, 8 tasks in all" in make.preview(TINY, copy)
+    assert "to make: nothing, 8 tasks in all" in make.preview(SMALLEST, copy)
     assert "to make: 1 spot, 1 view, 1 sample;" in make.preview(_changed(tmp_path, "[0.5]", "[0.6]"), copy)
     assert sorted((path, path.stat().st_mtime_ns) for path in copy.rglob("*")) == before
     with pytest.raises(DatasetError, match="holds another data set"):
@@ -283,14 +283,14 @@ def test_the_preview_of_a_folder_with_a_data_set(tiny_dataset: Path, tmp_path: P
 
 
 def _changed(folder: Path, old: str, new: str) -> Path:
-    text = TINY.read_text()
+    text = SMALLEST.read_text()
     assert old in text
     (folder / "changed.toml").write_text(text.replace(old, new))
     return folder / "changed.toml"
 
 
-def test_without_mitsuba_frames_may_change_and_nothing_may_be_rendered(tiny_dataset: Path, tmp_path: Path) -> None:
-    copy, blocked = Path(shutil.copytree(tiny_dataset, tmp_path / "copy")), tmp_path / "blocked"
+def test_without_mitsuba_frames_may_change_and_nothing_may_be_rendered(smallest_dataset: Path, tmp_path: Path) -> None:
+    copy, blocked = Path(shutil.copytree(smallest_dataset, tmp_path / "copy")), tmp_path / "blocked"
     for name in ("mitsuba", "drjit"):
         (blocked / name).mkdir(parents=True)
         (blocked / name / "__init__.py").write_text(f"raise ModuleNotFoundError('none', name='{name}')")
