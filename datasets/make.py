@@ -11,10 +11,20 @@ from pathlib import Path
 
 from rich.console import Console
 
-from phibench.datasets.build.assemble import assemble, differing, visibility_line, write_documents
 from phibench.datasets.build.forecast import PairForecast, forecast, pair_forecasts, pair_table, slowdown
 from phibench.datasets.build.journal import Head, Journal
-from phibench.datasets.build.run_tasks import claim, refuse_other, remove_files, run_tasks, stale_files, unfinished
+from phibench.datasets.build.run_tasks import (
+    assemble,
+    claim,
+    differing,
+    refuse_other,
+    remove_files,
+    run_tasks,
+    stale_files,
+    unfinished,
+    visibility_line,
+    write_documents,
+)
 from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.build.workers import Environment, NoRendererError, WorkerPool, versions
 from phibench.datasets.errors import DatasetError

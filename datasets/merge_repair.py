@@ -13,9 +13,16 @@ from pathlib import Path
 
 from rich.console import Console
 
-from phibench.datasets.build.assemble import assemble, write_documents
 from phibench.datasets.build.journal import Entry, Head, Journal
-from phibench.datasets.build.run_tasks import claim, held_head, is_intact, remove_files, stale_files
+from phibench.datasets.build.run_tasks import (
+    assemble,
+    claim,
+    held_head,
+    is_intact,
+    remove_files,
+    stale_files,
+    write_documents,
+)
 from phibench.datasets.build.task_list import task_names
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import make_from_plan

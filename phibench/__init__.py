@@ -18,15 +18,17 @@ if TYPE_CHECKING:
     from phibench.datasets.read import open_dataset
     from phibench.estimator.benchmark.score import score
     from phibench.estimator.interface import Answer, Pair, Spot
+    from phibench.estimator.paper.sensitivity_table import make
 
     __version__: str
 
-__all__ = ["Answer", "Pair", "Spot", "__version__", "open_dataset", "score"]
+__all__ = ["Answer", "Pair", "Spot", "__version__", "make", "open_dataset", "score"]
 
 _HOMES = {
     "Answer": "phibench.estimator.interface",
     "Pair": "phibench.estimator.interface",
     "Spot": "phibench.estimator.interface",
+    "make": "phibench.estimator.paper.sensitivity_table",
     "open_dataset": "phibench.datasets.read",
     "score": "phibench.estimator.benchmark.score",
 }

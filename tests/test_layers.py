@@ -47,7 +47,6 @@ estimator/calibration
 estimator/sandbox
 estimator/benchmark
 estimator/paper
-estimator/make_dataset
 estimator/studies
 estimator/cli
 estimator/seat

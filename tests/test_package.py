@@ -35,7 +35,7 @@ def test_the_public_names_are_there() -> None:
     assert {name: getattr(phibench, name) for name in ("Pair", "Answer", "Spot")} == {
         name: getattr(interface, name) for name in ("Pair", "Answer", "Spot")
     }
-    assert set(phibench.__all__) == {"Answer", "Pair", "Spot", "__version__", "open_dataset", "score"}
+    assert set(phibench.__all__) == {"Answer", "Pair", "Spot", "__version__", "make", "open_dataset", "score"}
     assert set(phibench.__all__) <= set(dir(phibench))
     assert callable(phibench.open_dataset)
     assert phibench.__version__[0].isdigit()

@@ -1,13 +1,16 @@
-"""Runs the unfinished tasks of a folder, with a journal entry and a log line for each.
+"""Runs the unfinished tasks of a folder, with a journal entry and a log line for each, and assembles its small files.
 
-The first half guards the output folder: it must be writable, hold no other data set, and have room on its disk.
+The first part guards the output folder: it must be writable, hold no other data set, and have room on its disk. The
+last part gives the small files as bytes, from plan and journal, so that each can be checked and written anew.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
-from collections.abc import Collection, Mapping
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,14 +20,18 @@ from rich.console import Console
 from phibench.datasets.build.forecast import Pace, TaskProgress, forecast, megabytes, slowdown
 from phibench.datasets.build.journal import Entry, Head, Journal
 from phibench.datasets.build.scheduler import schedule
+from phibench.datasets.build.task_list import sample_task_name, spot_task_name
 from phibench.datasets.build.tasks import Done, Failed, Task, log_entry
 from phibench.datasets.build.workers import WorkerPool
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.plan.plan import Plan
+from phibench.datasets.plan.plan import PairPlan, Plan
 from phibench.datasets.progress import Steps
 from phibench.datasets.store import schema
-from phibench.datasets.store.documents import read_info
+from phibench.datasets.store.checksums import checksums_text
+from phibench.datasets.store.documents import manifest_documents, read_info, rigs_text
 from phibench.datasets.store.files import TEMPORARY_PREFIX, sha256, write_bytes
+from phibench.datasets.store.schema import ManifestRow
+from phibench.scenes.rig import POSITIONS
 
 _OWN = ".phibench-"  # locks, and temporary files that a killed run left
 
@@ -175,3 +182,54 @@ def _report(failures: dict[str, Failed], count: int) -> str:
         f"{len(failures)} of {count} tasks failed; what is finished is kept, run the same command again for the rest:"
     )
     return "\n".join([first, *lines, *more])
+
+
+# The small files, when all tasks are done.
+
+
+def assemble(plan: Plan, head: Head, entries: Mapping[str, Entry]) -> dict[str, bytes]:
+    """All small files of a finished data set by name, SHA256SUMS last."""
+    rows = [_row(pair, entries) for pair in plan.pairs]
+    small = {
+        schema.INFO: head.info.encode(),
+        schema.RECIPE: head.recipe.encode(),
+        schema.RIGS: rigs_text(plan.rigs).encode(),
+        **manifest_documents(rows),
+    }
+    hashes = {name: digest for entry in entries.values() for name, digest in entry.files.items()}
+    hashes |= {name: hashlib.sha256(data).hexdigest() for name, data in small.items()}
+    return {**small, schema.CHECKSUMS: checksums_text(hashes).encode()}
+
+
+def _row(pair: PairPlan, entries: Mapping[str, Entry]) -> ManifestRow:
+    """Row of a sample: the result of its spot's task, and the noise from its sample's task."""
+    row, noise = dict(entries[spot_task_name(pair)].result), entries[sample_task_name(pair)].result
+    row |= {position: {**row[position], "noise": noise[position]} for position in POSITIONS}
+    return ManifestRow.model_validate_json(json.dumps(row))
+
+
+def differing(out: Path, wanted: Mapping[str, bytes]) -> list[str]:
+    """Names of files that are missing or have other bytes."""
+    return [name for name, data in wanted.items() if not (out / name).is_file() or (out / name).read_bytes() != data]
+
+
+def write_documents(out: Path, wanted: Mapping[str, bytes], names: Iterable[str]) -> None:
+    """Write some of the small files, in their order. Without SHA256SUMS the folder does not pass for finished."""
+    names = set(names)
+    if names:
+        (out / schema.CHECKSUMS).unlink(missing_ok=True)
+        names.add(schema.CHECKSUMS)
+    for name, data in wanted.items():
+        if name in names:
+            write_bytes(out / name, data)
+
+
+def visibility_line(rows: Sequence[ManifestRow]) -> str:
+    """Say how many pairs are visible in both images, and the causes for the others with their numbers."""
+    hidden = [row for row in rows if not (row.down.visible and row.up.visible)]
+    text = f"{len(rows) - len(hidden)} of {len(rows)} pairs are visible in both images"
+    if not hidden:
+        return text
+    spots = ((position, row.position(position)) for row in hidden for position in POSITIONS)
+    causes = Counter(f"{position} {spot.cause}" for position, spot in spots if not spot.visible)
+    return f"{text}; not visible: " + ", ".join(f"{cause} ({count})" for cause, count in causes.items())

@@ -56,7 +56,7 @@ def make(
 
         print(preview(recipe, out, workers, shard=shard, samples=samples, seed=seed))
         return 0
-    from phibench.estimator.make_dataset import make as make_dataset
+    from phibench.estimator.paper.sensitivity_table import make as make_dataset
 
     make_dataset(recipe, out, workers, scheduler=scheduler, shard=shard, samples=samples, seed=seed)
     return 0
@@ -75,7 +75,7 @@ def repair(directory: Path, *, workers: Whole | None = None, scheduler: str | No
     scheduler
         Address or scheduler file of a running dask scheduler, to use its workers instead.
     """
-    from phibench.estimator.make_dataset import repair as repair_dataset
+    from phibench.estimator.paper.sensitivity_table import repair as repair_dataset
 
     for name in repair_dataset(directory, workers, scheduler=scheduler):
         print(f"made again: {name}")
@@ -93,7 +93,7 @@ def merge(*shards: Path, out: Path) -> int:
     out
         Folder to write.
     """
-    from phibench.estimator.make_dataset import merge as merge_shards
+    from phibench.estimator.paper.sensitivity_table import merge as merge_shards
 
     merge_shards(out, shards)
     return 0

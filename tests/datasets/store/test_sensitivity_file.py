@@ -7,13 +7,17 @@ import shutil
 from pathlib import Path
 
 import pytest
+from helpers.folders import contents
+from helpers.processes import TINY
 from rich.console import Console
 
+import phibench
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import strays
 from phibench.datasets.verify import verify
+from phibench.estimator.cli.main import main
 from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.paper.sensitivity_table import columns, keep_sensitivities
 
@@ -38,6 +42,15 @@ def test_it_is_written_once_read_and_in_order(copy: Path) -> None:
     before = path.stat().st_mtime_ns
     assert keep_sensitivities(copy) == path
     assert path.stat().st_mtime_ns == before
+
+
+@pytest.mark.usefixtures("inline")
+def test_python_and_the_command_line_give_the_same_folder(tiny_dataset: Path, tmp_path: Path) -> None:
+    one, other = (Path(shutil.copytree(tiny_dataset, tmp_path / name)) for name in ("python", "command"))
+    assert phibench.make(TINY, one, console=Console(file=io.StringIO())) == one
+    assert main(["dataset", "make", str(TINY), "--out", str(other)]) == 0
+    assert (one / schema.SENSITIVITIES).read_bytes() == (other / schema.SENSITIVITIES).read_bytes()
+    assert contents(one) == contents(other)
 
 
 def test_a_table_of_another_state_is_noticed_and_made_again(copy: Path) -> None:
