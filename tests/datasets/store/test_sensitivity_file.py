@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 from helpers.folders import contents
-from helpers.processes import TINY
 from rich.console import Console
 
 import phibench
@@ -47,8 +46,9 @@ def test_it_is_written_once_read_and_in_order(copy: Path) -> None:
 @pytest.mark.usefixtures("inline")
 def test_python_and_the_command_line_give_the_same_folder(tiny_dataset: Path, tmp_path: Path) -> None:
     one, other = (Path(shutil.copytree(tiny_dataset, tmp_path / name)) for name in ("python", "command"))
-    assert phibench.make(TINY, one, console=Console(file=io.StringIO())) == one
-    assert main(["dataset", "make", str(TINY), "--out", str(other)]) == 0
+    recipe = one / schema.RECIPE
+    assert phibench.make(recipe, one, console=Console(file=io.StringIO())) == one
+    assert main(["dataset", "make", str(recipe), "--out", str(other)]) == 0
     assert (one / schema.SENSITIVITIES).read_bytes() == (other / schema.SENSITIVITIES).read_bytes()
     assert contents(one) == contents(other)
 
