@@ -97,7 +97,7 @@ def test_a_finished_data_set_is_left_alone_and_a_damaged_one_made_again(smallest
     (copy / f"{TEMPORARY_PREFIX}left.exr").write_bytes(b"")
     console = quiet()
     make.make(SMALLEST, copy, workers=2, console=console)
-    assert "to make: 1 view; about 3 MB" in said(console)
+    assert "to make: 1 view; about 1 MB" in said(console)
     assert "7 of 8 tasks are done" in said(console)
     assert "tasks: 1/1" in said(console)
     assert (copy / schema.CHECKSUMS).read_text() == (smallest_dataset / schema.CHECKSUMS).read_text()
