@@ -101,6 +101,7 @@ def verify(folder: str | Path, truth_layers: bool = True, console: Console | Non
         dataset = open_dataset(folder)
     except DatasetError as error:
         return Report((*faults, str(error)), files, 0, notes)
+    # files that are reported already are not opened below: one fault, one sentence
     bad = {fault.split(" is ", 1)[0] for fault in faults}
     faults += [*plan_faults(dataset), *differences(folder, dataset.rows)]
     faults += filter(None, [sensitivity_fault(folder)])

@@ -218,6 +218,7 @@ def to_frame(rows: Sequence[ManifestRow]) -> DataFrame:
     """Rows as a polars table: one column per leaf, names joined by dots, null where a number does not exist."""
     import polars
 
+    # keys of `drawn` depend on the recipe: a column for each that any row has
     drawn = [
         polars.Series(name, [row.drawn.get(name.removeprefix("drawn.")) for row in rows], _column_type(kind))
         for name, kind in drawn_columns(rows).items()

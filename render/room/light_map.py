@@ -92,6 +92,7 @@ def bake(view: View, room: Room, settings: BakeSettings) -> LightMap:
     for bounce in range(settings.bounces):
         bounced = _gather(mi, surfaces, texels, settings.bounce_rays, 10 + bounce)
         surfaces.set_irradiance(_filled(lit + bounced, covered, surfaces.patches))
+    # two independent halves: half their difference is the standard error of their mean
     halves = [d + _gather(mi, surfaces, texels, settings.final_rays, 2 + i) for i, d in enumerate(direct)]
     total = _filled(0.5 * (halves[0] + halves[1]), covered, surfaces.patches)
     sigma = 0.5 * np.abs(halves[0] - halves[1])
@@ -140,6 +141,7 @@ def _covered(mi: ModuleType, surfaces: Surfaces, texels: _Texels, texel_m: float
 
     hit = surfaces.scene.ray_intersect(mi.Ray3f(texels.points, texels.normals))
     outward = dr.dot(hit.n, texels.normals) > 0.0
+    # what is nearer than half a texel stands against this one
     hidden = ~hit.is_valid() | outward | (hit.t < 0.5 * MM_PER_M * texel_m)
     return np.array(hidden, dtype=bool)
 

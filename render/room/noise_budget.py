@@ -125,6 +125,7 @@ def noise_budget(view: View, uv_px: Array, layer: SpotImage, ambient: Array, var
     information = np.einsum("ihw,jhw,hw->ij", slopes, slopes, weight)
     if np.linalg.matrix_rank(information) < 2:
         return NoiseBudget(float("nan"), float("nan"))
+    # the estimate is linear in the pixels: rendering noise goes through the same weights
     part = slopes * weight * noise
     rows, columns = (_correlation(view, length) for length in room.shape)
     spread = np.einsum("ihw,jhw->ij", part, rows @ part @ columns)

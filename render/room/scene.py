@@ -25,7 +25,7 @@ from phibench.scenes.mirror import SphereMirror, deviation, level
 from phibench.scenes.rig import View
 from phibench.scenes.room import MIRROR_NAME, Checker, Cuboid, Rectangle, Room, Shape, Texture
 
-_RINGS, _SPOKES = 450, 900
+_RINGS, _SPOKES = 450, 900  # 0.4 degrees apart
 
 
 def form_mesh(mi: ModuleType, view: View, name: str, bsdf: Any) -> Any:
@@ -96,6 +96,7 @@ def shape_dict(mi: ModuleType, view: View, shape: Shape) -> dict[str, Any]:
     kind = "cube" if isinstance(shape, Cuboid) else "rectangle"
     entry: dict[str, Any] = {"type": kind, "to_world": to_world}
     if isinstance(shape, Rectangle) and shape.emits:
+        # without a material an emitter would reflect: Mitsuba's default has the albedo 0.5
         entry["emitter"] = {"type": "area", "radiance": _rgb(shape.radiance_w_m2_sr)}
         entry["bsdf"] = {"type": "diffuse", "reflectance": _rgb((0.0, 0.0, 0.0))}
     else:
@@ -129,6 +130,7 @@ def texture_dict(mi: ModuleType, texture: Texture, size_m: Vector) -> dict[str, 
     """Albedo as Mitsuba's rgb or checkerboard; a period of the latter is two cells."""
     if not isinstance(texture, Checker):
         return _rgb(texture.albedo)
+    # uv runs from 0 to 1 over the face, Mitsuba's pattern has the period 1
     scale = [0.5 * size_m[i] / texture.cell_m[i] for i in (0, 1)]
     shift = [-0.5 * (0.5 * size_m[i] + texture.origin_m[i]) / texture.cell_m[i] for i in (0, 1)]
     to_uv = mi.ScalarTransform4f().translate([*shift, 0.0]) @ mi.ScalarTransform4f().scale([*scale, 1.0])

@@ -146,7 +146,7 @@ class Chain:
 
 
 LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601, the Y of JPEG
-_STEP_PX = 8
+_STEP_PX = 8  # every eighth row and column are enough for a mean
 
 
 def auto_exposed(sensor: Sensor, light: Light) -> Sensor:
@@ -167,7 +167,7 @@ def auto_exposed(sensor: Sensor, light: Light) -> Sensor:
     elif excess(high) <= 0.0:
         product = sensor.exposure_max_s * sensor.gain_max
     else:
-        product = float(np.exp(brentq(excess, low, high, xtol=1e-6)))
+        product = float(np.exp(brentq(excess, low, high, xtol=1e-6)))  # of a logarithm: 1e-6 of the product
     seconds = min(product, sensor.exposure_max_s)
     return sensor.replace(exposure_s=seconds, analogue_gain=min(max(product / seconds, 1.0), sensor.gain_max))
 

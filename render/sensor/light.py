@@ -151,6 +151,7 @@ class Region:
             )
         if not 1 <= side_px <= min(size):
             raise SensorError(f"region of {side_px} px: allowed sides are 1 to {min(size)}, the image's shorter side")
+        # pixel centres are integers: the middle pixel is the nearest one
         u0, v0 = (
             min(max(math.floor(centre + 0.5) - side_px // 2, 0), limit - side_px)
             for centre, limit in ((u_px, width), (v_px, height))

@@ -89,6 +89,7 @@ def raw_moments(chain: Chain, light: Light, region: Region) -> RawMoments:
     variance = np.broadcast_to(sensor.dn_per_e**2 * (shot + sensor.read_noise_e**2) + QUANTISATION_DN2, photo.shape)
     flicker = np.zeros(photo.shape)
     if sensor.speckle_m is not None:
+        # the spot alone flickers, and all its pixels together
         spot = (photo - chain.photo_electrons(light.without_spot(), tiles)) * pattern.responsivity
         flicker = sensor.dn_per_e * spot / np.sqrt(sensor.speckle_m)
     return RawMoments(mean[part], variance[part], (sensor.dn_per_e * sensor.row_noise_e) ** 2, flicker[part])
@@ -122,6 +123,7 @@ def linear_moments(chain: Chain, light: Light, region: Region) -> Moments:
     keep[(slice(None), *region.slices(box))] = True
     operator = linear_operator(chain.sensor, box.shape)[np.flatnonzero(keep)]
     mean = operator @ linear_signal(raw.mean_dn, chain.sensor).ravel()
+    # operator C operator^T, with C symmetric
     scale = 1.0 / (chain.sensor.top_dn - chain.sensor.black_level_dn)
     covariance = operator @ (operator @ raw.covariance_dn2()).T * scale**2
     return Moments(mean.reshape(3, *region.shape), covariance)

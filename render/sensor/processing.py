@@ -45,12 +45,13 @@ def demosaic(raw: Array) -> Array:
 
             site = (slice(row, None, 2), slice(column, None, 2))
             beside, above = at(0, -1) + at(0, 1), at(-1, 0) + at(1, 0)
+            # red (0, 0) and blue (1, 1): green from four neighbours, the opposite colour from four corners
             if row == column:
                 corners = (at(-1, -1) + at(-1, 1)) + (at(1, -1) + at(1, 1))
                 planes[(..., 2 * row, *site)] = at(0, 0)
                 planes[(..., 1, *site)] = (beside + above) * quarter
                 planes[(..., 2 - 2 * row, *site)] = corners * quarter
-            else:
+            else:  # green: one colour lies in its row, the other in its column
                 planes[(..., 1, *site)] = at(0, 0)
                 planes[(..., 2 * row, *site)] = beside * half
                 planes[(..., 2 * column, *site)] = above * half
@@ -74,6 +75,7 @@ def colour_corrected(planes: Array, matrix: Matrix) -> Array:
 def srgb_encoded(linear: Array) -> Array:
     """sRGB curve of values cut to [0, 1] (IEC 61966-2-1)."""
     x = np.clip(linear, 0.0, 1.0)
+    # constants in the input's own type: float32 stays float32
     curve = x.dtype.type(1.055) * np.power(x, x.dtype.type(1.0 / 2.4)) - x.dtype.type(0.055)
     return np.where(x <= _SRGB_KNEE, x * x.dtype.type(_SRGB_SLOPE), curve)
 

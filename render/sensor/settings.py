@@ -114,6 +114,7 @@ def sensor(preset: str = "mjpeg", **changes: Any) -> Sensor:
     tables = _tables()
     if preset not in tables["presets"]:
         raise SensorError(f"no sensor preset '{preset}'; {nearest(preset, tables['presets'])}")
+    # what comes later wins: the camera's numbers, the preset's, the caller's
     return _checked(preset, {"name": preset, **tables["webcam"], **tables["presets"][preset], **changes})
 
 
