@@ -19,12 +19,14 @@ from PIL import Image, ImageDraw
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.store.files import write_bytes
 from phibench.estimator.calibration.outline import Outline, find_outline
+from phibench.estimator.calibration.verdict import draw_legend, draw_outline
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
 _SIGNIFICANT = 2.5  # of a distance in two axes: 4 % of aligned mirrors are further off
+_CENTRE, _MOVE = (0, 255, 0), (255, 60, 60)
 _ARROW_TIMES = 20.0  # the move is a few pixels: the picture draws it larger
 
 
@@ -111,22 +113,19 @@ def alignment(
 
 
 def write_alignment_picture(path: Path, image: NDArray[np.uint8], rig: Rig, found: Alignment) -> Path:
-    """Draw the outline, its centre, and the move, enlarged, into a copy of the image; PNG, written atomically."""
+    """Draw the outline with its residuals, its centre and the move, both enlarged, into a copy of the image; PNG."""
     picture = Image.fromarray(np.ascontiguousarray(image))
+    legend = draw_outline(picture, found.outline.rig(rig), found.outline)
     draw = ImageDraw.Draw(picture)
-    rim = found.outline.rig(rig).outline_px(720)
-    draw.line([tuple(p) for p in np.vstack([rim, rim[:1]])], fill=(0, 255, 0), width=1)
     u, v = rig.camera.project(found.outline.sphere_in_camera_m)
     du, dv = _ARROW_TIMES * found.move_px
-    draw.ellipse((u - 3, v - 3, u + 3, v + 3), outline=(0, 255, 0))
-    draw.line((u, v, u + du, v + dv), fill=(255, 255, 0), width=2)
-    turn = math.atan2(dv, du)
+    draw.ellipse((u - 3, v - 3, u + 3, v + 3), outline=_CENTRE)
+    draw.line((u, v, u + du, v + dv), fill=_MOVE, width=2)
+    turn, head = math.atan2(dv, du), min(10.0, 0.5 * math.hypot(du, dv))
     for side in (-0.4, 0.4):
-        draw.line(
-            (u + du, v + dv, u + du - 10 * math.cos(turn + side), v + dv - 10 * math.sin(turn + side)),
-            fill=(255, 255, 0),
-            width=2,
-        )
+        back = (u + du - head * math.cos(turn + side), v + dv - head * math.sin(turn + side))
+        draw.line((u + du, v + dv, *back), fill=_MOVE, width=2)
+    draw_legend(picture, (*legend, f"red: move x {_ARROW_TIMES:g}"))
     buffer = io.BytesIO()
     picture.save(buffer, format="PNG")
     return write_bytes(path, buffer.getvalue())

@@ -7,6 +7,7 @@ person should look at. "good": neither. Parameters that only the prior knows are
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -111,8 +112,22 @@ def write_overlay(
         First line of the legend.
     """
     picture = Image.fromarray(_visible(image, card)).convert("RGB")
+    legend = draw_outline(picture, outline.rig(nominal), outline)
+    draw_legend(picture, (title, *legend) if title else legend)
+    buffer = io.BytesIO()
+    picture.save(buffer, format="PNG")
+    return write_bytes(path, buffer.getvalue())
+
+
+def draw_outline(picture: Image.Image, rig: Rig, outline: Outline) -> tuple[str, ...]:
+    """Draw an outline and its residuals into an RGB picture; `rig` has the sphere where the outline is.
+
+    Returns
+    -------
+    tuple of str
+        Lines of the legend.
+    """
     draw = ImageDraw.Draw(picture)
-    rig = outline.rig(nominal)
     rim = rig.outline_px(6 * SECTORS)
     shift = outline.shifts_px[_sector_of(rig, rim)]
     gain = _gain(shift)
@@ -121,14 +136,15 @@ def write_overlay(
     _line(draw, rim, np.full(len(rim), True), _FOUND)
     _line(draw, rim, np.isnan(shift), _UNUSED, width=3)
     _line(draw, rim + gain * np.nan_to_num(shift)[:, None] * outwards, np.isfinite(shift), _RESIDUAL, width=2)
-    legend = ("green: outline found", f"yellow: residual x {gain:g}", "grey: not used")
-    text, font = "\n".join((title, *legend) if title else legend), ImageFont.load_default(_FONT_PX)
-    corner = (8, picture.height - 8)
+    return ("green: outline found", f"yellow: residual x {gain:g}", "grey: not used")
+
+
+def draw_legend(picture: Image.Image, lines: Sequence[str]) -> None:
+    """Write lines into the lower left corner of an RGB picture."""
+    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(_FONT_PX)
+    corner, text = (8, picture.height - 8), "\n".join(lines)
     draw.rectangle(draw.multiline_textbbox(corner, text, font, anchor="ld", spacing=6), fill=(0, 0, 0))
     draw.multiline_text(corner, text, (255, 255, 255), font, anchor="ld", spacing=6)
-    buffer = io.BytesIO()
-    picture.save(buffer, format="PNG")
-    return write_bytes(path, buffer.getvalue())
 
 
 def _level(value: float, *limits: float) -> int:
