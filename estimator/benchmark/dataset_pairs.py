@@ -344,7 +344,7 @@ def of_calibration(dataset: Dataset, calibration: Calibration) -> Dataset:
     for sample in dataset:
         if sample.nominal_rig != calibration.nominal:
             raise CalibrationError(
-                f"the calibration is that of another rig than the one that sample {sample.row.sample_id} believes in; "
+                f"the calibration did not start from the nominal rig of sample {sample.row.sample_id}; "
                 "calibrate with samples of this data set"
             )
     rigs = {row.rig for row in dataset.rows}

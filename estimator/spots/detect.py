@@ -57,7 +57,7 @@ def lamp_halo(planes: ColourPlanes, inside: BoolArray, card: SensorCard) -> Bool
 # -- both images together --------------------------------------------------------------------------------------------
 
 NEAREST_M, FARTHEST_M = 0.3, 12.0  # of D
-NEAR_CURVE_PX = 4.0  # what a rig that is not quite as nominal moves the curve by
+NEAR_CURVE_PX = 4.0  # shift of the curve for a rig that differs a little from the nominal one
 _POINTS = 48
 _FLUX_RATIO = 6.0  # of one spot in both images, at most
 _STRONGER = 1.5  # a single candidate over a pair's: others have half the spot's light at most

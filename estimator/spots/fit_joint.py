@@ -40,7 +40,7 @@ class JointFit(DepthEstimate):
     flux_down_e, flux_up_e : shape (n,)
     chi2 : shape (n,)
         By how much -2 log L exceeds that of the images fitted separately: one degree of freedom; large where the two
-        spots are not one point, or the rig is not as nominal.
+        spots are not one point, or the rig differs from the nominal one.
     """
 
     uv_down_px: Array

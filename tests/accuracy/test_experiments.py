@@ -59,7 +59,7 @@ def test_accuracy_of_calibrated_experiments(paper: Dataset, preset: str) -> None
     assert len(within) >= 2 * DRAWS
     judged = budget(within)
     print(
-        f"{preset}: rms {100 * judged.measured.value:.3f} %, bound {100 * judged.bound:.3f} %, as nominal "
+        f"{preset}: rms {100 * judged.measured.value:.3f} %, bound {100 * judged.bound:.3f} %, nominal rig "
         f"{100 * judged.nominal:.2f} %"
     )
     assert judged.measured.value <= TARGET[preset]

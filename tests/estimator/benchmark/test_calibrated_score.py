@@ -150,7 +150,7 @@ def truth_of_rig(dataset: Dataset) -> np.ndarray:
 
 def test_a_calibration_of_another_rig_is_refused(misaligned: Dataset) -> None:
     zero = np.zeros(len(PARAMETERS))
-    with pytest.raises(CalibrationError, match="another rig than the one that sample seen-near"):
+    with pytest.raises(CalibrationError, match="did not start from the nominal rig of sample seen-near"):
         of_calibration(misaligned, calibration(zero, RIG))
     nominal = misaligned.samples[0].nominal_rig
     assert of_calibration(misaligned, calibration(zero, nominal)) is misaligned
