@@ -396,7 +396,8 @@ def _escaped(text: str) -> str:
 def head(name: str) -> str:
     """Head of a metric's column, its unit on the second line."""
     unit = METRICS[name].shown[1]
-    return HEADS[name] if unit == "1" else f"{HEADS[name]}\n{unit}"
+    text = HEADS.get(name, METRICS[name].text)
+    return text if unit == "1" else f"{text}\n{unit}"
 
 
 def shown_parts(name: str, value: Value) -> tuple[str, str]:

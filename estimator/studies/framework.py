@@ -23,8 +23,8 @@ from rich.console import Console
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import Dataset, open_finished
 from phibench.datasets.recipe.load import find_recipe
-from phibench.estimator.benchmark import report as picture
-from phibench.estimator.benchmark.report import Picture
+from phibench.estimator.benchmark import figures
+from phibench.estimator.benchmark.figures import Picture
 from phibench.estimator.studies.findings import Finding, Row
 from phibench.scenes.validation import structural_faults
 
@@ -77,8 +77,8 @@ class StudyDatasets:
         return open_finished(target)
 
 
-COLOURS = (*picture.COLOURS, "#000000")
-MARKERS, LINES, line_style = picture.MARKERS, picture.LINES, picture.line_style
+COLOURS = (*figures.COLOURS, "#000000")
+MARKERS, LINES, line_style = figures.MARKERS, figures.LINES, figures.line_style
 
 
 @dataclass(frozen=True)
@@ -107,19 +107,19 @@ class Drawing:
 
     def picture(self) -> Picture:
         """The drawing as a data address, for a report."""
-        return picture.picture(self.data, self.kind, self.alt)
+        return figures.picture(self.data, self.kind, self.alt)
 
 
 @contextmanager
 def canvas(width_in: float = 9.0, height_in: float = 4.0) -> Iterator[Figure]:
     """A figure in the style of all studies; draw and call `drawn` inside of the block."""
-    with mpl.rc_context(picture.STYLE):
+    with mpl.rc_context(figures.STYLE):
         yield Figure(figsize=(width_in, height_in), layout="constrained", dpi=130)
 
 
 def drawn(name: str, figure: Figure, alt: str, kind: str = "svg") -> Drawing:
     """The finished drawing; the same marks give the same bytes."""
-    return Drawing(name, picture.encoded(figure, kind), alt, kind)
+    return Drawing(name, figures.encoded(figure, kind), alt, kind)
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,10 @@ from PIL import Image
 
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.benchmark.answer_errors import Rules
+from phibench.estimator.benchmark.causes import CAUSES
 from phibench.estimator.benchmark.document import MethodCard
-from phibench.estimator.benchmark.report import Picture, Section, pull_histogram, report_html, write_report
+from phibench.estimator.benchmark.figures import Picture, plain_number, pull_histogram
+from phibench.estimator.benchmark.report import Section, report_html, verdict, write_report
 from phibench.estimator.benchmark.score import score_outcomes
 
 RULES = Rules(resamples=199)
@@ -23,7 +25,7 @@ RULES = Rules(resamples=199)
 class Page(HTMLParser):
     """Tags with their attributes, headings, and whether tags are closed in their order."""
 
-    VOID = ("meta", "img", "br", "image", "circle", "path", "link", "hr", "input")
+    VOID = ("meta", "img", "br", "image", "circle", "path", "link", "hr", "input", "use")
 
     def __init__(self, text):
         super().__init__()
@@ -85,16 +87,50 @@ def test_the_page_fetches_nothing_and_runs_nothing(html):
 
 def test_pictures_have_words_and_tables_have_heads(html):
     page = Page(html)
-    assert len(page.of("img")) == 5
-    assert all(len(attributes["alt"]) > 60 for attributes in page.of("img"))
-    assert all(attributes.get("role") == "img" and attributes.get("aria-label") for attributes in page.of("svg"))
-    assert len(page.of("svg")) == 30  # ten of each method
+    keys = [attributes for attributes in page.of("img") if attributes.get("class") == "key"]
+    assert len(keys) == 6  # beside the names, which say it
+    assert {attributes["alt"] for attributes in keys} == {""}
+    figures = [attributes for attributes in page.of("img") if attributes.get("class") != "key"]
+    assert len(figures) == 9 + 3 + 2 + 1 + 1  # curves, maps, radius, causes, pulls
+    assert all(len(attributes["alt"]) > 60 for attributes in figures)
+    shown = [attributes for attributes in page.of("svg") if "aria-hidden" not in attributes]
+    assert all(attributes.get("role") == "img" and attributes.get("aria-label") for attributes in shown)
+    assert len(shown) == 30 + 9  # ten crops and three frames of each method
     assert len(page.of("caption")) == len(page.of("table")) >= 5
     assert all(attributes.get("scope") in ("row", "col") for attributes in page.of("th"))
     assert page.of("html")[0]["lang"] == "en-GB"
     ids = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
     assert len(ids) == len(set(ids))
     assert {a["href"][1:] for a in page.of("a")} <= set(ids)
+
+
+def test_the_page_begins_with_who_is_best_and_what_fails(html, scores):
+    text = " ".join(Page(html[html.index("<main>") : html.index("</main>") + 7]).text.split())
+    phi = scores[0][0].metrics["rank_phi_rad"]
+    assert text.startswith("phibench report cases.")
+    assert f"ideal is best by phi: {1000 * phi.value:.3g} mrad" in text[:120]
+    guesses = {"ideal": scores[0][0], "guess": scored("guess", constant)[0]}
+    assert "Less than half of the spots: guess." in verdict(guesses, "phi")
+    assert "False detections in 20 % of the images or more: guess." in verdict(guesses, "depth")
+    assert verdict({"guess": guesses["guess"]}, "phi") == "No method finds a spot on these pairs."
+
+
+def test_a_dark_page_and_a_narrow_one_have_their_rules(html):
+    assert "prefers-color-scheme: dark" in html
+    assert "@media (max-width: 700px)" in html
+    page = Page(html)
+    assert len(page.of("details")) == len(page.of("summary")) == 3 + 3 + 3  # worst, strata, failures + metrics + JSON
+
+
+def test_causes_are_defined(html):
+    assert all(text in Page(html).text for text in CAUSES.values())
+
+
+@pytest.mark.parametrize(
+    ("x", "text"), [(0.002, "0.002"), (0.5, "0.5"), (20.0, "20"), (50000.0, "50\u202f000"), (1e-5, "0.00001")]
+)
+def test_ticks_are_plain_numbers(x, text):
+    assert plain_number(x) == text
 
 
 def test_names_are_text_not_markup(html):
@@ -108,9 +144,11 @@ def test_methods_are_in_the_order_of_their_ranks(html):
 
 
 def test_the_leaderboard_has_its_numbers(html, scores):
-    assert "0.5000" in html
+    text = " ".join(Page(html).text.split())
     rate = scores[1][0].metrics["detection_rate"]
-    assert f"[{100 * rate.low:.1f}, {100 * rate.high:.1f}]" in html
+    assert f"[{100 * rate.low:.3g}, {100 * rate.high:.3g}]" in html
+    phi = scores[2][0].metrics["rank_phi_rad"]
+    assert f"{1000 * phi.value:.3g}" in text  # mrad, as everywhere on the page
 
 
 def test_pictures_are_pictures(html):
