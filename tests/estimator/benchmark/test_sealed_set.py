@@ -23,7 +23,6 @@ from phibench.datasets.recipe.tables import Recipe
 from phibench.estimator.benchmark.dataset_pairs import dataset_pairs
 from phibench.estimator.benchmark.document import read_score
 from phibench.estimator.benchmark.score import show
-from phibench.estimator.benchmark.sealed_pairs import SealedPairs
 from phibench.estimator.benchmark.sealed_set import (
     Sealed,
     seal,
@@ -32,7 +31,7 @@ from phibench.estimator.benchmark.sealed_set import (
     truth_document,
     truth_of,
 )
-from phibench.estimator.benchmark.submission import submit
+from phibench.estimator.benchmark.submission import SealedPairs, submit
 from phibench.estimator.cli import main as cli
 from phibench.estimator.pair_set import PairTruth
 from phibench.scenes.laser import Beam

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from helpers.sealed_sets import METHOD, refusal, tampered
 
-from phibench.estimator.benchmark.sealed_pairs import SealedPairs
 from phibench.estimator.benchmark.sealed_set import Sealed
-from phibench.estimator.benchmark.submission import outcomes_of, read_submission, unseal
+from phibench.estimator.benchmark.submission import SealedPairs, outcomes_of, read_submission, unseal
 from phibench.estimator.sandbox.runner import run_method
 
 
