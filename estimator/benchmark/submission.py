@@ -23,12 +23,14 @@ from pydantic import Field, ValidationError
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.datasets.store.checksums import read_checksums
 from phibench.datasets.store.documents import from_json
 from phibench.datasets.store.files import write_text
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import Document, Number, Vector2
 from phibench.estimator.benchmark.document import MethodCard
 from phibench.estimator.benchmark.sealed_set import (
+    CHECKSUMS,
     FRAMES,
     PAIRS,
     SEAL,
