@@ -231,7 +231,7 @@ def test_the_default_rig_is_that_of_the_page():
 def test_the_examples_of_the_page_run(page, tiny_dataset, tmp_path, monkeypatch):
     """On a small data set in place of `paper`, with one pair to score."""
     monkeypatch.chdir(tmp_path)
-    first, names = open_dataset(tiny_dataset)[0].sample_id, {}
+    first, names = open_dataset(tiny_dataset)[0].row.sample_id, {}
     examples = re.findall(r"^```python\n(.*?)^```", read(page), re.M | re.S)
     assert examples
     for example in examples:
