@@ -26,14 +26,16 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the slow tests unless they are asked for: by an option, or by their full name."""
-    named = [argument for argument in config.args if "::" in argument]
+    """Leave out slow tests and benchmarks unless they are asked for: by an option, or by their full name."""
+    named = [argument.removeprefix("./") for argument in config.args if "::" in argument]
+    timed = config.getoption("benchmark_enable") or config.getoption("slow")
     wanted, left_out = [], []
     for item in items:
-        asked = any(item.nodeid.startswith(name.removeprefix("./")) for name in named)
         # a test marked study may be marked slow as well: --study runs it
         mark = next((name for name in ("study", "slow") if item.get_closest_marker(name)), None)
-        (left_out if mark and not config.getoption(mark) and not asked else wanted).append(item)
+        timing = "benchmark" in getattr(item, "fixturenames", ()) and not timed
+        asked = any(item.nodeid.startswith(name) for name in named)
+        (left_out if ((mark and not config.getoption(mark)) or timing) and not asked else wanted).append(item)
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = wanted

@@ -96,8 +96,9 @@ def test_independent_draws_follow_their_distribution(k: int) -> None:
 def test_sobols_draws_follow_more_closely_than_chance(k: int) -> None:
     """1024 points put one into each 1024th: the distance is at most 2 / 1024, where chance has 0.03."""
     table, law = DISTRIBUTIONS[k]
+    points = first_points("sobol", "ks", 0, 1024)
     for name in PARAMETERS:
-        values = quantile(DistributionTable.model_validate(table), first_points("sobol", "ks", 0, 1024)[name])
+        values = quantile(DistributionTable.model_validate(table), points[name])
         assert stats.kstest(values, law.cdf).statistic < 2.0 / 1024.0 + 1e-9
     chance = quantile(DistributionTable.model_validate(table), first_points("independent", "ks", 0, 1024)["stroke_m"])
     assert stats.kstest(chance, law.cdf).statistic > 2.0 / 1024.0
