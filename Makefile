@@ -103,4 +103,4 @@ lint: $(READY)
 
 clean:
 	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks
-	find scenes render datasets estimator tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find phibench .paths scenes render datasets estimator tests -name __pycache__ -type d -prune -exec rm -rf {} +
