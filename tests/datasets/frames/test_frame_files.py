@@ -85,7 +85,7 @@ def test_the_index_as_a_table_says_the_same(tiny_dataset: Path, tmp_path: Path) 
 
 def test_an_exposure_that_is_not_given_is_the_cameras(tiny_dataset: Path, tmp_path: Path) -> None:
     """Processed presets are auto exposed; the others keep the preset's time."""
-    options = ("--samples", SEEN, "--region", 16, "--workers", 1)
+    options = ("--sample", SEEN, "--region", 16, "--workers", 1)
     for preset, exposure in (("mjpeg", "auto"), ("srgb8", "auto"), ("bayer-raw", None)):
         assert run(tiny_dataset, "--preset", preset, *options, "--out", tmp_path / preset) == 0
         rows = [row for row in read_index(tmp_path / preset).values() if row.kind == "frame"]
