@@ -79,6 +79,21 @@ def test_each_parameter_changes_the_rig_or_the_stroke(name: str) -> None:
         assert one.stroke_m(0.5) == 0.5
 
 
+def test_the_table_has_what_a_calibration_needs() -> None:
+    """A parameter has a step and a prior, or neither; both are far inside the limit; `apply` changes it alone."""
+    fitted = [one for one in PARAMETERS.values() if math.isfinite(one.prior_sigma)]
+    assert len(fitted) == 13
+    for name, one in PARAMETERS.items():
+        assert one.name == name
+        assert math.isfinite(one.step) == math.isfinite(one.prior_sigma)
+    for one in fitted:
+        assert 0.0 < 2.0 * one.step < one.limit  # five-point differences take two steps
+        assert 0.0 < 4.0 * one.prior_sigma < one.limit
+        assert one.apply(default_rig(), one.step) == default_rig().perturbed(Misalignment(**{one.name: one.step}))
+    camera = PARAMETERS["focal_relative"].apply(default_rig(), 0.01).camera
+    assert camera.fx_px == pytest.approx(1.01 * default_rig().camera.fx_px)
+
+
 def test_poses_against_scipy() -> None:
     """All at once, on rigs that are tilted already: lens, axes and sphere centre at both ends of the stroke."""
     rng, checked = np.random.default_rng(1), 0
