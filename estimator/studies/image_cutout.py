@@ -1,7 +1,7 @@
-"""A small sensor cut out of the large one: the pixels around the spot's two images, and what falls on them.
+"""Cutout of the sensor around the spot's two images: rig, light, frames and bounds of these pixels alone.
 
-Everything is drawn and looked at as if the camera had no other pixels, which saves the time of a whole frame. The
-corner lies on whole JPEG units, so that mosaic and compression are those of the whole image.
+Frames are drawn as if the camera had no other pixels, which saves the time of a whole frame. The corner lies on whole
+JPEG units, so that mosaic and compression are those of the whole image.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class SpotView:
         return cls(spot_truth(view, spot, shapes), spot_layer(view, spot, shapes), ambient)
 
     def light(self, laser_level: float, f_number: float) -> Light:
-        """What falls on the sensor."""
+        """Light on the sensor."""
         return Light(self.ambient_electrons_per_s, self.layer, laser_level=laser_level, f_number=f_number)
 
 
@@ -117,13 +117,13 @@ class SpotPair:
 
     @property
     def visible(self) -> bool:
-        """Whether both images show the spot."""
+        """Both images show the spot."""
         return all(view.truth.visible for view in self.views.values())
 
 
 @dataclass(frozen=True)
 class Shot:
-    """How pairs are taken.
+    """Sensor and laser level of a pair of frames.
 
     Attributes
     ----------

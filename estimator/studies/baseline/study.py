@@ -137,7 +137,7 @@ def _rendered(recipe: str, datasets: StudyDatasets) -> pl.DataFrame:
 
 
 def _long(table: pl.DataFrame, experiment: str) -> bool:
-    """Whether enough strokes of a table are there for two constants and a residual."""
+    """Check that a table has strokes enough for two constants and a residual."""
     return len(_published(table, experiment)[0]) >= _LEAST
 
 

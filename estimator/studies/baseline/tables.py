@@ -56,7 +56,7 @@ class PowerLaw:
     rms_log: float
 
     def holds(self, i: int, exponent: float) -> bool:
-        """Whether an exponent lies in the i-th interval."""
+        """Check that an exponent lies in the i-th interval."""
         return bool(self.low[i] <= exponent <= self.high[i])
 
 
@@ -106,13 +106,13 @@ class LawFit:
 
     @property
     def holds(self) -> tuple[bool, bool]:
-        """Whether 2 and -1 lie in the intervals."""
+        """Flags of 2 and -1: inside of the intervals."""
         return self.law.holds(0, EXPECTED[0]), self.law.holds(1, EXPECTED[1])
 
 
 @dataclass(frozen=True)
 class Curve:
-    """What the published errors of one table do with h: rms of what a law leaves, metres.
+    """Published errors of one table against h: rms residuals of simple laws, metres.
 
     Attributes
     ----------
@@ -235,7 +235,7 @@ _NOWHERE = (float("nan"), float("nan"))
 
 @dataclass(frozen=True)
 class FoundSpots:
-    """What was found in the draws of one sample.
+    """Spots found in the draws of one sample.
 
     Attributes
     ----------

@@ -1,11 +1,9 @@
-"""Explanations of the published estimates: what is unknown, with which priors, and the likelihood.
+"""Explanations of the published estimates: unknowns, priors, likelihood, and simulated estimates.
 
-The reading noise is Gaussian in the radius in the image; the inverse of an estimate is nearly linear in it
-(`cause_checks.brute_force` measures how nearly), so that the density of a published value is a Gaussian in 1/D times
-the Jacobian 1/D^2. Two errors add to it: the printed estimate is rounded (uniform, taken as a Gaussian of the same
-variance), and the paper's real depth of a target is measured (common to all experiments with that target).
-
-Estimates drawn from an explanation: noise in the pixels, errors of the real depth, rounding, nothing linearised.
+The reading noise is Gaussian in the radius in the image. The inverse of an estimate is nearly linear in it, which
+`brute_force` measures. So the density of a published value is a Gaussian in 1/D times the Jacobian 1/D^2. Two errors
+add to it: the printed estimate is rounded (uniform, taken as a Gaussian of the same variance), and the paper's real
+depth of a target is measured (common to all experiments with that target). Simulation linearises nothing.
 """
 
 from __future__ import annotations
@@ -45,7 +43,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "stroke": ("stroke_relative", "stroke_offset_m"),
     "scale": ("focal_relative", "axial_m", "radius_m"),
 }
-"""What an explanation can leave free besides lens distance, spot heights and noise.
+"""Parameters that an explanation can leave free besides lens distance, spot heights and noise.
 
 World x is the direction of the tilt (of the turn), so that its size is not negative and the other component is 0; the
 decentre has its component along it alone. Then a spot and its mirror image about that direction are seen alike, and
@@ -71,7 +69,7 @@ class Prior(Settings):
 
     @property
     def fault(self) -> str:
-        """What is wrong with it, "" if nothing."""
+        """Fault in a few words, "" if there is none."""
         given = [name for name in ("normal", "uniform", "log_uniform", "rayleigh") if getattr(self, name) is not None]
         if len(given) != 1:
             return "must have exactly one of normal, uniform, log_uniform, rayleigh"
@@ -125,7 +123,7 @@ class Explanation(Settings):
 
     @property
     def reader(self) -> Reader:
-        """What its reader does with pixels."""
+        """Reader of its pixels."""
         return Reader(self.convention, self.equation, self.centred)
 
     @property
@@ -232,7 +230,7 @@ class Model:
 
     @cached_property
     def _targets(self) -> NDArray[np.int64]:
-        """Where the experiments of a target begin: those of one target follow each other."""
+        """First experiment of every target; those of one target follow each other."""
         changes = np.diagonal(self.experiments.same_target, 1)
         return np.concatenate([[0], np.flatnonzero(~changes) + 1])
 

@@ -1,10 +1,7 @@
-"""Posterior and evidence of a model by nested sampling, with dynesty.
+"""Nested sampling for the study `cause`: the study's settings, and posterior and evidence of every model.
 
-J. S. Speagle, Mon. Not. R. Astron. Soc. 493, 3132 (2020); J. Skilling, Bayesian Analysis 1, 833 (2006).
-
-Settings of the study `cause`.
-
-All nested samplings of the study, side by side in processes of their own.
+J. S. Speagle, Mon. Not. R. Astron. Soc. 493, 3132 (2020), dynesty; J. Skilling, Bayesian Analysis 1, 833 (2006). The
+samplings of a study run side by side in processes of their own; each has its own random stream.
 """
 
 from __future__ import annotations
@@ -37,7 +34,7 @@ from phibench.scenes.validation import nearest
 
 @dataclass(frozen=True)
 class Posterior:
-    """What nested sampling says of a model.
+    """Posterior and evidence of a model, from nested sampling.
 
     Attributes
     ----------
@@ -155,7 +152,7 @@ class CauseSettings(Settings):
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """What does not fit together, a sentence each."""
+        """Settings that do not fit together, a sentence each."""
         return tuple(filter(None, (*_faults_of_names(self), *_faults_of_priors(self), *_faults_of_truths(self))))
 
     def explanation(self, name: str) -> Explanation:
@@ -273,7 +270,7 @@ def pooled_runs(
 
 
 def _again(repeats: int) -> list[tuple[Name, ...]]:
-    """What is added to the key of each repetition; nothing for the first."""
+    """Additions to the key of each repetition; none for the first."""
     return [(), *((repeat,) for repeat in range(1, repeats))]
 
 

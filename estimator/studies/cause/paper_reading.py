@@ -1,8 +1,8 @@
-"""What the paper's user would have read off a real rig: true rig -> two pixels -> phi -> equation (4) or (5).
+"""Readings of the paper's user from a real rig: true rig -> two pixels -> phi -> equation (4) or (5).
 
 Everything is closed form and vectorised, so that a sampler can afford a hundred thousand rigs. The mirror image is
-Alhazen's problem in the plane of lens, sphere centre and spot (no Newton step in pixels, unlike
-`estimator.mirror_image`, which the tests hold it against). Coordinates: origin at the true sphere centre, down; z up;
+Alhazen's problem in the plane of lens, sphere centre and spot. It takes no Newton step in pixels, unlike
+`geometry.mirror_image`, which the tests hold it against. Coordinates: origin at the true sphere centre, down; z up;
 D counts from there. The last axis is experiments (n); parameters are scalars, or (m, 1) for m rigs at once.
 """
 
@@ -66,7 +66,7 @@ class Experiments:
 
     @property
     def same_target(self) -> BoolArray:
-        """Whether two experiments look at the same spot, shape (n, n): same table and same depth."""
+        """Pairs of experiments with the same spot, shape (n, n): same table and same depth."""
         return (self.table[:, None] == self.table) & (self.depth_m[:, None] == self.depth_m)
 
 
@@ -82,7 +82,7 @@ def published_experiments(rounding_m: float = 0.01, rounding_table4_m: float = 0
 
 @dataclass(frozen=True)
 class Reader:
-    """How pixels become an estimate.
+    """Way from pixels to an estimate.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ PARAMETERS = (
     "cx_px",
     "cy_px",
 )
-"""What may be wrong, in the sense of `scenes.misalignment`."""
+"""Errors of the rig, in the sense of `scenes.misalignment`."""
 AZIMUTHS = ("azimuth_1_rad", "azimuth_2_rad", "azimuth_3_rad", "azimuth_4_rad")
 """Azimuths of the tables' spots, from world x."""
 

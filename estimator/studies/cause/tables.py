@@ -1,13 +1,9 @@
-"""How well an explanation does, by measures that do not depend on the width of its priors, and what looks alike.
+"""Tables of the study `cause` from its posteriors, with fits of explanations and verdicts on log evidences.
 
-When two log evidences of the study `cause` differ by enough to say so.
-
-A sampler's own error leaves out modes that it lost. Five pairs of samplings of explanations with a free tilt differ by
-2.0, 1.6, 2.6, 2.1 and 1.8 in log evidence, a scatter of 1.45 for one sampling (95 % of 0.9 to 3.6, five degrees of
-freedom), where the sampler states 0.6 to 0.7; with fourteen more at 60 live points it is 1.76 (1.3 to 2.6), so that the
-floor is no upper limit. Two samplings say next to nothing of their scatter, three a little.
-
-Tables of the study `cause` from its posteriors.
+Measures of a fit do not depend on the width of its priors: posterior predictive p-values, and left-out tables.
+A sampler's own error of a log evidence leaves out modes that it lost. Five pairs of samplings with a free tilt differ
+by 2.0, 1.6, 2.6, 2.1 and 1.8: a scatter of 1.45 for one (95 %: 0.9 to 3.6), where the sampler states 0.6 to 0.7.
+With fourteen more at 60 live points it is 1.76 (1.3 to 2.6), so that the floor is no upper limit.
 """
 
 from __future__ import annotations
@@ -60,7 +56,7 @@ STEPS = {
 
 @dataclass(frozen=True)
 class Fit:
-    """How an explanation fits what it was fitted to.
+    """Fit of an explanation to its own data.
 
     Attributes
     ----------
@@ -122,7 +118,7 @@ def left_out_score(model: Model, points: Array, table: int) -> tuple[float, floa
 
 
 def coverage(model: Model, points: Array, truth: dict[str, float], level: float) -> dict[str, bool]:
-    """Whether the central interval of each parameter holds its true value."""
+    """Flags of parameters whose central interval holds the true value."""
     tail = (1.0 - level) / 2.0
     low, high = np.quantile(points, [tail, 1.0 - tail], axis=0)
     return {name: bool(low[i] <= truth[name] <= high[i]) for i, name in enumerate(model.names) if name in truth}
@@ -175,7 +171,7 @@ def evidence_error(measured: float, repeats: int) -> float:
     Parameters
     ----------
     measured : float
-        Larger of the sampler's own error and of the scatter of repeats, of their mean (`cause_sampler.pooled`).
+        Larger of the sampler's own error and of the scatter of repeats, of their mean (`nested_sampling.pooled`).
     repeats : int
         Independent samplings; of fewer than `ENOUGH` the error is at least `FLOOR`.
     """
@@ -183,7 +179,7 @@ def evidence_error(measured: float, repeats: int) -> float:
 
 
 def verdict(difference: float, error: float) -> Verdict:
-    """What a difference of log evidences with an error of one sigma says of the first of the two."""
+    """Verdict on the first of two, from the difference of log evidences and its error of one sigma."""
     if abs(difference) <= DECIDED + SIGMAS * error:
         return "undecided"
     return "favoured" if difference > 0.0 else "disfavoured"
@@ -273,7 +269,7 @@ def posterior_table(settings: CauseSettings, posteriors: Posteriors) -> pl.DataF
 
 
 def offset_table(settings: CauseSettings, posteriors: Posteriors) -> pl.DataFrame:
-    """How far the image of the sphere lies from where radii were counted, mean and central 95 %, and by the prior."""
+    """Distance of the sphere's image from the origin of the radii: mean and central 95 %, posterior and prior."""
     rows = []
     for explanation in settings.explanations:
         if "misalignment" in explanation.free and not explanation.centred:

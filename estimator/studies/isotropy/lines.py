@@ -1,8 +1,7 @@
-"""Epipolar lines: where the up image shows the points that lie on the ray of one down pixel (Figure 1 of the paper).
+"""Epipolar lines (Figure 1 of the paper), and the azimuths that two sensors side by side hide from each other.
 
-What two sensors side by side hide from each other; one sensor that moves hides nothing from itself.
-
-A spot counts only if both see it. Sensor A at the first place loses the spots behind sensor B at the second, and the
+An epipolar line holds the pixels of the up image that show the points on the ray of one down pixel. A spot counts as
+seen only if both sensors see it. Sensor A at the first place loses the spots behind sensor B at the second, and the
 other way round. Hiding bodies are the mirror, the camera's housing and the mast; the chassis is common to both.
 """
 
@@ -117,7 +116,7 @@ def _columns(nominal: Rig, stroke_m: float, down_px: Array, uv: Array, grid: Gri
 
 
 def hidden_by(seeing: View, other: View, points_m: Array) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Whether the other sensor cuts the ray from a point (n, 3) to the seeing sensor's mirror, shape (n,)."""
+    """Flags of points (n, 3) whose ray to the seeing sensor's mirror the other sensor cuts, shape (n,)."""
     P = reflect(seeing, image_of(seeing, points_m).uv_px).origin_world_m
     along = points_m - P
     length = np.linalg.norm(along, axis=-1)

@@ -1,6 +1,7 @@
-"""The two baselines, the rig lifted or moved sideways: pairs of views with what an estimator knows.
+"""Error of D against azimuth for one baseline: bound, measured scatter and bias, and a test of isotropy.
 
-Error of D against azimuth for one baseline: bound, measured scatter and bias, and a test of isotropy.
+A pair is a spot in the views from both ends of a baseline, with the rig that the estimator knows. The baseline is
+vertical (the rig lifted) or horizontal (the rig moved sideways).
 """
 
 from __future__ import annotations
@@ -205,17 +206,17 @@ class Isotropy:
 
     @property
     def tested(self) -> bool:
-        """Whether there were azimuths enough for a test."""
+        """There were azimuths enough for a test."""
         return math.isfinite(self.p_value) and math.isfinite(self.p_value_over_bound)
 
     @property
     def isotropic(self) -> bool:
-        """Whether nothing speaks against equal scatter."""
+        """Nothing speaks against equal scatter."""
         return self.p_value >= self.false_alarm
 
     @property
     def explained(self) -> bool:
-        """Whether nothing speaks against a scatter that follows the bound."""
+        """Nothing speaks against a scatter that follows the bound."""
         return self.p_value_over_bound >= self.false_alarm
 
 

@@ -87,7 +87,7 @@ _STRAIGHT_PX = 0.1  # a tenth of a pixel matters, less does not
 
 @dataclass(frozen=True)
 class _Scene:
-    """What all parts share: the aligned rig, the spots' circle, the light under the spots."""
+    """Shared by all parts: the aligned rig, the spots' circle, the light under the spots."""
 
     rig: Rig
     baseline_m: float

@@ -39,7 +39,7 @@ Errors = Callable[[Misalignment], Array]
 
 @dataclass(frozen=True)
 class Search:
-    """How a tolerance is looked for.
+    """Search for a tolerance.
 
     Parameters
     ----------
@@ -275,7 +275,7 @@ def _frame(parameter: str, value: float, estimator: str, places: Places, columns
 
 @dataclass(frozen=True)
 class Rank:
-    """What a parameter of the study's magnitude costs one estimator: rms and worst relative change of D, shape (d,)."""
+    """Rms and worst relative change of D by a parameter of its usual size, for one estimator, shape (d,)."""
 
     parameter: str
     estimator: str

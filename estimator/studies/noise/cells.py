@@ -1,9 +1,9 @@
-"""What the study `noise` changes, one at a time: a number of the sensor, of the laser, or of the lens.
+"""Factors and cells of the study `noise`.
 
-Cells of the study `noise`: one base case, preset, factor and level, in which all methods see the same draws.
-
-A cell's spots lie at several places of the board, some pixels apart, so that all sub-pixel phases occur. Noise is named
-by place and draw, not by level: levels are compared on common draws.
+A factor is a number of the sensor, of the laser, or of the lens; one is changed at a time. A cell is one base case,
+preset, factor and level, in which all methods see the same draws. Its spots lie at several places of the board, some
+pixels apart, so that all sub-pixel phases occur. Noise is named by place and draw, not by level: levels are compared on
+common draws.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ class Cell:
 
 
 def cell_records(cell: Cell) -> pl.DataFrame:
-    """Records of all methods of a cell: `bench.records.COLUMNS` with method, factor and level."""
+    """Records of all methods of a cell: `benchmark.records.COLUMNS` with method, factor and level."""
     rig, places = _places(cell)
     shot = applied(cell.factor, cell.preset, rig, cell.level)[0]
     truths, pairs = [], []

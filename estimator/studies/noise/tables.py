@@ -310,7 +310,7 @@ def _sure(e: Elasticity) -> bool:
 
 
 def _apart(first: Elasticity, second: Elasticity) -> bool:
-    """Whether the interval of the first's size lies above that of the second's."""
+    """Decide if the interval of the first's size lies above that of the second's."""
     ends = [sorted((abs(e.estimate.low), abs(e.estimate.high))) for e in (first, second)]
     return _sure(first) and all(map(math.isfinite, (*ends[0], *ends[1]))) and ends[0][0] > ends[1][1]
 

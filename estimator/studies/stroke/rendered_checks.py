@@ -108,7 +108,7 @@ class Checked:
 
     @property
     def fits(self) -> bool:
-        """Whether the predicted error lies in the interval of the measured one."""
+        """The predicted error lies in the interval of the measured one."""
         low, high = self.interval_m
         return low <= self.check.predicted_m <= high
 

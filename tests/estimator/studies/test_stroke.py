@@ -36,16 +36,16 @@ TINY = """
 preset = "bayer-raw"
 depths_m = [1.0]
 spot_height_m = 0.5
-strokes_m = [0.1, 1.4]
+strokes_m = [0.4, 1.4]
 outline_sigma_um = [8.0, 8.0, 24.0]
-paper_depths_m = [2.18]
+paper_depths_m = [1.0]
 paper_strokes_m = [1.4]
 [check]
 preset = "bayer-raw"
 depths_m = [1.0]
 power_mw = 0.3
 factors = [0.3, 1.0]
-strokes_m = [0.1, 2.1]
+strokes_m = [0.4, 1.6]
 draws = 8
 """
 
