@@ -227,7 +227,7 @@ TAKEN_FOR: dict[str, tuple[str, str]] = {
     "region": ("a region that is brighter than the spot", "subtract the laser-off image, or use --boxes 64"),
     "nothing": (
         "false, on nothing brighter than the spot",
-        "`phibench method check` tells mistakes of convention, --boxes 64 narrows the search",
+        "phibench method check tells mistakes of convention, --boxes 64 narrows the search",
     ),
 }
 """Kinds of places that false detections lie on, in words, with advice."""

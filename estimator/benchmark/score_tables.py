@@ -52,6 +52,7 @@ WIDE = 210
 """Columns of a terminal for tables with every interval."""
 FULL_OF_FALSE = 0.2
 """Share of false answers from which a line says what they are."""
+_MANY = 9  # columns that stand close together
 _STRATA = ("detection_rate", "rms_px", "rms_phi_rad", "rms_depth_relative", "efficiency_px")
 
 
@@ -300,7 +301,8 @@ def _line(console: Console, text: str) -> None:
 
 def show_grid(console: Console, grid: Grid) -> None:
     """Print a table to a terminal; text that is too long for it goes on below."""
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
+    gap = int(len(grid.heads) < _MANY)
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, gap, 0, 0), show_edge=False)
     for name, kind in zip(grid.heads, grid.columns, strict=True):
         table.add_column(name, justify="right" if kind == "r" else "left", overflow="fold", no_wrap=kind != "L")
     for row in grid.rows:
