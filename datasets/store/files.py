@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import hashlib
 import os
 import tempfile
@@ -21,6 +20,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypeVar
 
+from filelock import FileLock, Timeout
 from pydantic import ValidationError
 
 from phibench.datasets.errors import DatasetError
@@ -153,7 +153,7 @@ def require_writable(path: Path) -> None:
 # Locks: one run at a time in a folder, and none beside the workers of a killed one.
 
 PATIENCE_S = 60.0
-_POLL_S = 0.05
+_AT_ONCE_S, _POLL_S = 0.2, 0.05
 _WORKING_PREFIX = f"{TEMPORARY_PREFIX}working-"
 
 
@@ -167,11 +167,10 @@ def only_run(out: Path) -> Iterator[None]:
         With one sentence.
     """
     path = out / schema.LOCK
-    with _locked(path) as lock:
-        if lock is None:
+    with _locked(path) as held:
+        if not held:
             raise DatasetError(f"another run (process {_holder(path)}) is writing to {out}; wait until it has ended")
-        os.ftruncate(lock, 0)
-        os.pwrite(lock, str(os.getpid()).encode(), 0)
+        path.write_text(str(os.getpid()))
         try:
             _await_workers(out)
             yield
@@ -215,11 +214,10 @@ def _working_files(out: Path) -> list[Path]:
 
 def _remove_if_free(path: Path) -> bool:
     """Remove a lock file unless a process holds it."""
-    with _locked(path) as lock:
-        if lock is None:
-            return False
-        _unlink(path)
-        return True
+    with _locked(path) as held:
+        if held:
+            _unlink(path)
+        return held
 
 
 def _unlink(path: Path) -> None:
@@ -229,24 +227,19 @@ def _unlink(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def _locked(path: Path) -> Iterator[int | None]:
-    """Open and lock a file, which is made if need be; give its number, or None if another process holds it."""
-    while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(handle)
-            yield None
-            return
-        # its last holder may have removed the file between our two steps: a lock on it would be no obstacle to others
-        if os.fstat(handle).st_nlink > 0:
-            break
-        os.close(handle)
+def _locked(path: Path) -> Iterator[bool]:
+    """Lock a file, which is made if need be; False if another process holds it."""
+    # not at once: the library looks again where the last holder has just removed the file
+    lock = FileLock(path, timeout=_AT_ONCE_S, poll_interval=_POLL_S)
     try:
-        yield handle
+        lock.acquire()
+    except Timeout:
+        yield False
+        return
+    try:
+        yield True
     finally:
-        os.close(handle)
+        lock.release()
 
 
 # Files of one JSON document a line.

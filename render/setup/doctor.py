@@ -27,6 +27,7 @@ State = Literal["ok", "warning", "fault"]
 
 CORE = (
     "cyclopts",
+    "filelock",
     "Jinja2",
     "matplotlib",
     "numpy",
