@@ -145,10 +145,19 @@ def _probe() -> None:
 
 
 class Pace:
-    """Seconds of a task by kind: the first guess, corrected by the tasks that have ended."""
+    """Seconds of a task by kind: the first guess, corrected by the tasks that have ended.
 
-    def __init__(self, expected: Mapping[str, float], slowdown: float) -> None:
-        self._expected, self._slowdown = dict(expected), slowdown
+    Parameters
+    ----------
+    expected : dict
+        Seconds by kind, on the idle machine of the constants.
+    slowdown : float
+    workers : int
+        The first task of a kind compiles kernels in every worker, and counts only until there are others.
+    """
+
+    def __init__(self, expected: Mapping[str, float], slowdown: float, workers: int = 1) -> None:
+        self._expected, self._slowdown, self._workers = dict(expected), slowdown, workers
         self._measured: dict[str, list[float]] = {}
 
     def add(self, kind: str, seconds: float) -> None:
@@ -157,12 +166,16 @@ class Pace:
 
     def seconds(self, kind: str) -> float:
         """Expect this of a task: the median of the last ones of its kind, or else the guess times what others took."""
-        if measured := self._measured.get(kind):
-            return statistics.median(measured[-15:])
-        told = {one: len(measured) * self._expected.get(one, 0.0) for one, measured in self._measured.items()}
-        took = sum(sum(self._measured[one]) for one, expected in told.items() if expected)
+        if self._measured.get(kind):
+            return self._median_s(kind)
+        told = {one: len(taken) * self._expected.get(one, 0.0) for one, taken in self._measured.items()}
+        took = sum(len(self._measured[one]) * self._median_s(one) for one, expected in told.items() if expected)
         factor = (_TRUST_S * self._slowdown + took) / (_TRUST_S + sum(told.values()))
         return self._expected.get(kind, 0.0) * factor
+
+    def _median_s(self, kind: str) -> float:
+        taken = self._measured[kind]
+        return statistics.median((taken[self._workers :] or taken)[-8:])
 
     def left_s(self, waiting: Mapping[str, int], running: Iterable[tuple[str, float]], width: int) -> float:
         """Seconds until all have ended: tasks that wait by kind, and kind and age of those that run.

@@ -148,7 +148,7 @@ def run_tasks(
     console.print(cost.text(pool.width, factor) + kept, highlight=False, soft_wrap=True)
     left = set(todo)
     journal.begin(head, [name for name in tasks if name not in left])
-    failures = _run(chosen, Pace(cost.seconds, factor), journal, out, pool, console)
+    failures = _run(chosen, Pace(cost.seconds, factor, pool.width), journal, out, pool, console)
     for name, entry in before.items():
         if name in journal.entries and journal.entries[name] != entry and journal.entries[name].key == entry.key:
             console.print(f"warning: {name} came out with other bytes than the first time", highlight=False)

@@ -1,4 +1,4 @@
-"""Dispatching: needs first, a window that does not grow, killers of workers found out, no bottleneck for many."""
+"""Scheduling: needs first, a window that does not grow, killers of workers found out; the forecast of the time left."""
 
 import heapq
 import resource
@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from phibench.datasets.build.forecast import Pace, TaskProgress
 from phibench.datasets.build.journal import Entry, Head, Journal
 from phibench.datasets.build.scheduler import AHEAD, TRIALS, schedule
 from phibench.datasets.build.tasks import Done, Failed, Made, Task
@@ -133,3 +134,46 @@ def test_a_thousand_workers_do_not_wait_for_us(tmp_path: Path, samples: int) -> 
     assert count / seconds > 1000.0
     assert executor.most <= AHEAD * 1000
     assert executor.now < ideal + 5.0
+
+
+# The forecast of the seconds that are left.
+
+SECONDS = {"spot": 0.2, "bake": 80.0, "view": 4.5, "sample": 0.4}
+
+
+def test_the_forecast_learns_from_the_tasks_of_the_run() -> None:
+    """A machine four times slower than the first guess; kernels are compiled in the first view of both workers."""
+    pace = Pace(SECONDS, 1.0, workers=2)
+    assert pace.left_s({"bake": 1, "view": 10, "spot": 5}, [], 2) == pytest.approx(80.0 + 22.5)
+    for _ in range(25):
+        pace.add("spot", 0.8)
+    assert pace.seconds("view") == pytest.approx(4.0 * 4.5, rel=0.3)
+    pace.add("bake", 320.0)
+    assert pace.seconds("view") == pytest.approx(4.0 * 4.5, rel=0.05)
+    for seconds in (40.0, 41.0):
+        pace.add("view", seconds)
+    assert pace.seconds("view") == 40.5
+    for _ in range(3):
+        pace.add("view", 18.0)
+    assert pace.seconds("view") == 18.0
+    assert pace.left_s({"view": 4}, [("view", 9.0), ("view", 9.0)], 2) == pytest.approx(45.0)
+    for _ in range(8):
+        pace.add("view", 4.5)  # the other load has gone
+    assert pace.seconds("view") == 4.5
+
+
+def test_a_task_that_takes_longer_than_expected_is_expected_to_go_on() -> None:
+    pace = Pace(SECONDS, 1.0)
+    assert pace.left_s({}, [("bake", 60.0)], 1) == pytest.approx(20.0)
+    assert pace.left_s({}, [("bake", 200.0)], 1) == pytest.approx(40.0)
+
+
+def test_the_account_of_a_run_knows_what_is_running() -> None:
+    tasks = [*(task(f"spot {i}") for i in range(4)), task("bake room"), task("view 0", "bake room")]
+    progress, seen = TaskProgress(tasks, Pace(SECONDS, 1.0, 2)), []
+    for done, _ in schedule(tasks, progress.watch(Simulated(2))):
+        progress.settle(done)
+        seen.append([name for name, _ in progress.running()])
+    assert seen[0] == ["spot 1", "spot 2"]
+    assert seen[-1] == []
+    assert progress.left_s() == 0.0
