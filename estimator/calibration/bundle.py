@@ -151,7 +151,7 @@ def calibrate(
         raise DatasetError(f"the calibration does not come to rest: {error}") from error
     if not found.success or not np.isfinite(found.cost):
         raise DatasetError(f"the calibration does not come to rest: {found.message}")
-    normal = found.jac.T @ found.jac
+    normal = found.jac.T @ found.jac  # residuals are over their sigmas: the inverse is the covariance
     whole = np.linalg.inv(normal)
     values, covariance = np.zeros(len(PARAMETERS)), np.zeros((len(PARAMETERS),) * 2)
     values[free] = found.x[: free.size] * prior[free]
@@ -280,7 +280,7 @@ def apparent_centre(nominal: Rig, true: Rig) -> Array:
     uv = true.outline_px(90)
     rays = nominal.camera.rays(uv)
     x = np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0]  # n / cos a0
-    cosine = 1.0 / np.linalg.norm(x)
+    cosine = 1.0 / np.linalg.norm(x)  # of the limb's angle a0; |s| = R / sin a0
     return np.asarray(x * cosine * nominal.mirror.radius_m / np.sqrt((1.0 - cosine) * (1.0 + cosine)))
 
 

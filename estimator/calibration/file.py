@@ -123,6 +123,7 @@ def read_calibration(path: str | Path, nominal: Rig | None = None) -> Calibratio
     covariance, values = np.array(document.covariance), np.array(document.values)
     if tuple(document.parameters) != PARAMETERS or covariance.shape != (p, p) or values.shape != (p,):
         raise CalibrationError(f"{path} has other parameters than this program's {p}: make it again")
+    # of what the file says, before any translation of names
     if document.sha256 != _digest({k: v for k, v in raw.items() if k != "sha256"}):
         raise CalibrationError(f"{path} was changed after it was written: its hash does not fit; make it again")
     start = from_json(Rig, document.nominal_rig)
@@ -142,6 +143,7 @@ def _require_sound(path: Path, nominal: Rig, rig: Rig, values: Array, covariance
             raise CalibrationError(
                 f"{path} corrects {name} by {value:g}: allowed is -{limit:g} to {limit:g}; make it again"
             )
+    # in units of its own sigmas: metres and pixels differ by 1e4, and eigenvalues would only see the pixels
     scale = np.sqrt(np.abs(np.diag(covariance)))
     whole = np.where(scale > 0.0, scale, 1.0)
     unit = covariance / np.outer(whole, whole)

@@ -118,6 +118,7 @@ def calibrate_dataset(
     bundle = calibrate(rig, mean_outline(outlines), known, upright)
     made_from = _made_from(dataset, chosen, preset, outlines, known, upright)
     write_calibration(out, bundle, rig, made_from)
+    # in the order of the images, one per pose
     names = tuple(f"{sample.row.sample_id} {position}" for sample, position in one_per_pose(chosen))
     verdict = verdict_of(bundle, prior_sigmas(), outlines)
     return DatasetCalibration(bundle, rig, tuple(images), tuple(outlines), names, verdict)
@@ -157,7 +158,7 @@ def frame_spots(
         If too few spots were found; what it says is about the last one that was not.
     """
     pairs, found = pairs_of(dataset, samples, preset, laser_off=laser_off), []
-    fault: DatasetError | None = None
+    fault: DatasetError | None = None  # the last one; raised if too few spots remain
     for number, sample in enumerate(samples):
         pair = pairs.pair(number)
         try:

@@ -100,6 +100,7 @@ def measured_spot(
     """Calibration spot with its place as a ruler of that precision would give it; arguments by position."""
     spot = np.array(sample.row.spot_world_m)
     flat = spot[:2] - np.array(sample.row.down.sphere_centre_world_m)[:2]
+    # the azimuth is about the true sphere centre when down, as a person at the rig would measure it
     truth = {"distance": sample.row.depth_m, "height": spot[2], "azimuth": math.atan2(flat[1], flat[0])}
     sigma = {"distance": ruler.distance_m, "height": ruler.height_m, "azimuth": ruler.azimuth_rad}
     read = {name: _read(sample, name, value, sigma[name]) for name, value in truth.items()}
@@ -122,6 +123,7 @@ def _read(sample: Sample, what: str, value: float, sigma: float) -> float:
     """Reading of a ruler; 0 where it is not used."""
     if not math.isfinite(sigma):
         return 0.0
+    # a stream of its own for each quantity: measuring one more changes no other
     return float(value + sigma * generator(*sample.stream_names, "calibration", what).standard_normal())
 
 

@@ -59,6 +59,7 @@ def changed(rig: Rig, values: Array) -> Rig:
     SceneError
         If a value is beyond its limit, or the rig cannot exist.
     """
+    # all at once: `Misalignment` defines the order in which they act
     given = zip(PARAMETERS, np.asarray(values, float).tolist(), strict=True)
     return rig.perturbed(Misalignment(**{name: value for name, value in given if name not in STROKE_PARAMETERS}))
 
@@ -121,6 +122,7 @@ def rig_gradient(rig: Rig, stroke_m: ArrayLike, uv_down_px: Array, uv_up_px: Arr
             return depth_exact(rig, h + by, uv_down_px, uv_up_px).depth_m
         return depth_exact(MISALIGNMENT[name].apply(rig, by), h, uv_down_px, uv_up_px).depth_m
 
+    # f' = (8 (f1 - f-1) - (f2 - f-2)) / 12 step
     slopes = []
     for name in RIG_PARAMETERS:
         f, size = partial(depth, name), step * MISALIGNMENT[name].step

@@ -142,6 +142,7 @@ def meeting(rig: Rig, stroke_m: ArrayLike, uv_down_px: Array, uv_up_px: Array) -
         D = np.hypot(radial[..., 0], radial[..., 1])
         gap = np.sum(at.w * at.n, axis=-1) / np.sqrt(at.nn)
         behind = ~((at.t1 > 0.0) & (at.t2 > 0.0))
+        # |r1 x r2| is the sine of the angle between the rays
         fault = flag((at.nn < PARALLEL_SINE**2, Status.PARALLEL), (behind, Status.DIVERGING))
     return Meeting(D, gap, X, first_fault(rays.status, fault))
 
@@ -240,6 +241,7 @@ def _columns(jacobian: Array, start: int) -> Array:
 def _perpendicular(rays: _Rays) -> _Perpendicular:
     w, n = rays.P2 - rays.P1, np.cross(rays.r1, rays.r2)
     nn = np.sum(n * n, axis=-1)
+    # w x r_2 . n and w x r_1 . n over n . n: Cramer's rule for P1 + t1 r1 + e m = P2 + t2 r2
     t1, t2 = (np.sum(np.cross(w, r) * n, axis=-1) / nn for r in (rays.r2, rays.r1))
     return _Perpendicular(w, n, nn, t1, t2)
 

@@ -154,6 +154,7 @@ def calibrate_rig(dataset: Dataset, rig: str, procedure: Procedure) -> Bundle:
         )
     preset, off = procedure.preset, procedure.laser_off
     poses = one_per_pose(samples)
+    # poses spread evenly over the strokes: their outlines share neither lamps nor JPEG blocks
     chosen = sorted({round(place) for place in np.linspace(0, len(poses) - 1, max(procedure.outlines, 1))})
     outlines = [frame_outline(dataset, s, p, preset, off) for s, p in (poses[place] for place in chosen)]
     spots = frame_spots(dataset, known, preset, procedure.ruler, off, LEAST_SPOTS)
@@ -166,7 +167,7 @@ def measure(dataset: Dataset, samples: Sequence[Sample], bundle: Bundle, procedu
     for number, pair_draw in enumerate(pairs.pair_draws):
         sample, seen, truth = dataset[pair_draw.sample_id], pairs.pair(number), pairs.truth(number)
         pair = replace(seen, rig=bundle.rig, stroke_m=float(bundle.stroke(np.array(seen.stroke_m))))
-        answer = method_for(pair.card)(pair)
+        answer = method_for(pair.card)(pair)  # may use the calibrated rig, never the truth
         rows.append(
             {
                 "sample_id": pair_draw.sample_id,
@@ -228,6 +229,7 @@ def _bound(truth: PairTruth, bundle: Bundle) -> dict[str, float]:
     """Bound at the true pixels of the true rig, with the calibration's covariance."""
     C1, C2 = (_NO_MATRIX if b is None else b for b in (truth.down.bound_px2, truth.up.bound_px2))
     down, up = (np.array(spot.uv_px) for spot in (truth.down, truth.up))
+    # the calibration's covariance is that of the fitted rig: gradients at the true rig differ in second order
     at = depth_general(truth.true_rig, truth.stroke_m, down, up, C1, C2, bundle.covariance)
     return {
         "bound_m": float(at.sigma_m),

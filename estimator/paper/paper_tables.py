@@ -181,6 +181,7 @@ def bias_table(scores: Sequence[Score]) -> Table:
     for head in ("phi", "n", "min", "max", "mean", "rms"):
         grid.add_column(head, justify="left" if head == "phi" else "right")
     for item in summarise(scores):
+        # true pixels: what is left is the bias of the formula
         if item.source == "truth" and item.estimator.startswith("paper_"):
             values = (_percent(value) for value in (item.minimum, item.maximum, item.mean))
             grid.add_row(item.estimator.removeprefix("paper_"), str(item.n), *values, _rms(item.rms))
@@ -193,7 +194,7 @@ def as_records(items: Iterable[Score | Summary]) -> list[dict[str, object]]:
 
 
 def _pixels(sample: Sample, source: str) -> _Pixels:
-    nowhere = np.full(2, np.nan)
+    nowhere = np.full(2, np.nan)  # estimators then give NaN, and the fault says why
     for position in POSITIONS:
         spot = getattr(sample.row, position)
         if not spot.visible:
@@ -211,6 +212,7 @@ def _pixels(sample: Sample, source: str) -> _Pixels:
 def _score_one(nominal: _Nominal, row: Any, name: str, source: str, pixels: _Pixels) -> Score:
     estimate = _estimate(nominal, name, source, pixels)
     depth = float(estimate.depth_m)
+    # published results are those of a nominal stroke: the paper knew no other
     published = find_published(row.experiment, row.depth_m, row.nominal_stroke_m)
     return Score(
         sample_id=row.sample_id,
