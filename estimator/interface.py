@@ -157,6 +157,8 @@ class Outcome:
     failure : "" or one of `FAILURES`
     message : str
         One sentence about the failure, with the method's own line where there is one.
+    output : str
+        Last lines of what the method printed for this pair.
     """
 
     number: int
@@ -164,3 +166,4 @@ class Outcome:
     seconds: float
     failure: str = ""
     message: str = ""
+    output: str = ""

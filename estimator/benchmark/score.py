@@ -56,10 +56,11 @@ AT_ONCE = 16
 
 @dataclass(frozen=True)
 class Scored:
-    """A score with the records that it was computed from."""
+    """A score, the records that it was computed from, and what the method printed where it first failed."""
 
     document: ScoreDocument
     records: pl.DataFrame
+    output: str = ""
 
 
 @dataclass(frozen=True)
@@ -349,7 +350,8 @@ def run_and_score(
     if not cards:
         return []
     with Harness(found, limits, workers) as harness, Steps(console, title, len(pairs)) as steps:
-        return score_methods(cards, pairs, harness.outcomes, None, seed, asdict(limits), steps.reach)
+        scored = score_methods(cards, pairs, harness.outcomes, None, seed, asdict(limits), steps.reach)
+    return [replace(one, output=output) for one, output in zip(scored, harness.failed_outputs, strict=True)]
 
 
 def wanted_pairs(

@@ -188,6 +188,11 @@ def false_line(records: pl.DataFrame) -> str:
     return f"{100 * number / len(answers):.0f} % of the answers are {what}: {advice}"
 
 
+def _printed(one: Scored) -> list[str]:
+    """Last lines that the method printed before it first failed; empty if there are none."""
+    return [f"printed for the first pair that failed:\n{one.output}"] if one.output else []
+
+
 def silences(records: pl.DataFrame, count: int = 3) -> list[str]:
     """What a method or the sandbox said most often where there is no position, one line each."""
     words = pl.when(pl.col("message") != "").then(pl.col("failure") + ": " + pl.col("message"))
@@ -269,7 +274,8 @@ def print_scores(scored: Sequence[HasScore], form: str, by: str, wide: bool, cal
     if any(any(kind.values()) for document in documents for kind in document.causes.values()):
         show_grid(console, cause_table(documents))
     for one in scored:
-        for line in [*([depth_line(one.document)] if calibrated else []), *silences(one.records)]:
+        lines = [*([depth_line(one.document)] if calibrated else []), *silences(one.records), *_printed(one)]
+        for line in lines:
             _line(console, f"{one.document.method.name}: {line}")
     if len(documents) == 1:
         show_grid(console, strata_table(documents[0], wide))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from textwrap import indent
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
@@ -42,6 +43,7 @@ def check(
     preset: str = DEFAULT_PRESET,
     seconds: Seconds = SECONDS,
     memory_mb: MemoryMb = MEMORY_MB,
+    show_output: Annotated[bool, Parameter(negative="")] = False,
 ) -> int:
     """Try a method on ten easy pairs and say what is wrong; exit code 1 if something is.
 
@@ -51,11 +53,22 @@ def check(
         File and function, my_phi.py:extract, or a name that `phibench method list` shows.
     preset
         What the camera delivers: "mjpeg", "srgb8", "bayer-raw" or "mono-raw".
+    show_output
+        Also show what the method prints: the last 20 lines of every pair.
     """
-    from phibench.estimator.sandbox.check import check_method
+    from rich.console import Console
+
+    from phibench.datasets.progress import Steps
+    from phibench.estimator.sandbox.check import PAIRS, check_method
     from phibench.estimator.sandbox.resolve import RunLimits
 
-    done = check_method(reference, preset, RunLimits(seconds, memory_mb))
+    limits = RunLimits(seconds, memory_mb)
+    with Steps(Console(stderr=True), "easy pairs", PAIRS) as steps:
+        done = check_method(reference, preset, limits, told=steps.reach)
+    for number, text in done.printed if show_output else ():
+        print(f"printed for pair {number}:\n{indent(text, '    ')}")
+    if done.printed and not show_output:
+        print("the method prints something: --show-output shows it")
     for note in done.notes:
         print(note)
     for fault in done.faults:

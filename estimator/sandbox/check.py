@@ -1,11 +1,7 @@
-"""What is wrong with positions, angles and covariances whose truth is known, in plain words.
+"""Check of a method on ten easy pairs: each mistake of convention is named in plain words.
 
-A mistake of convention moves every spot by a rule; each rule is tried on the truth, and one that predicts the answers
-is named. Positions have the shape (n, 2, 2): pair, (down, up), (u, v); NaN where there is none.
-
-What is wrong with angles and depths whose truth is known, in plain words.
-
-Try a method on ten easy pairs and say in plain words what is wrong with it.
+A mistake of convention moves every spot by a rule. Each rule is tried on the truth, and one that predicts the answers
+is named. Positions have the shape (n, 2, 2): pair, (down, up), (u, v), pixels; NaN where there is none.
 """
 
 from __future__ import annotations
@@ -23,203 +19,53 @@ from phibench.estimator.sandbox.resolve import RunLimits
 from phibench.estimator.sandbox.runner import outcomes
 from phibench.scenes.frames import Array
 
-NEAR_PX = 2.0  # median error up to which a method sees the spot; the worst built-in has 0.7 on these pairs
-_EXPLAINED = 0.2  # of the median error may remain under a rule that is named
-_OFFSET_PX = 0.25  # mean offset that is no accident of a coarse method, if it is also significant
-_OFFSET_SIGMAS = 5.0  # false alarm below 1e-5 for 20 spots, 2 axes
-_HALF_PX = 0.2  # by which a half-pixel offset may miss a half
-_PULL = (0.5, 2.0)  # of 40 numbers: outside by chance 3e-8 (chi squared)
-_LEAST_PULLS = 10
-
-
-@dataclass(frozen=True)
-class Views:
-    """What the rules need besides the true positions.
-
-    Attributes
-    ----------
-    shape : (H, W)
-    origin_px : shape (n, 2, 2)
-        First pixel (u, v) of the boxes.
-    """
-
-    shape: tuple[int, int]
-    origin_px: Array
-
-
-Rule = Callable[[Array, Views], Array]
-
-RULES: dict[str, Rule] = {
-    "the axes are swapped: these are (v, u), row first; give (u, v), column first": lambda uv, _: uv[..., ::-1],
-    "v runs upwards: it must run downwards, row 0 at the top": lambda uv, s: _mirrored(uv, 1, s.shape[0]),
-    "u runs to the left: it must run to the right, column 0 at the left": lambda uv, s: _mirrored(uv, 0, s.shape[1]),
-    "the frames are swapped: 'down' holds the spot of the up image and the other way round": lambda uv, _: uv[:, ::-1],
-    "positions are relative to the box: add (box.u0_px, box.v0_px)": lambda uv, s: uv - s.origin_px,
-    "positions are halved, as in an image binned 2 x 2: give pixels of the whole image": lambda uv, _: (uv - 0.5) / 2.0,
-}
-
-
-def position_fault(answer_px: Array, truth_px: Array, views: Views) -> str:
-    """What is wrong with positions; "" if nothing is.
-
-    Parameters
-    ----------
-    answer_px, truth_px : shape (n, 2, 2)
-    views : Views
-    """
-    error = _median_distance(answer_px, truth_px)
-    if not np.isfinite(error):
-        return ""
-    if error <= NEAR_PX:
-        return _offset_fault((answer_px - truth_px).reshape(-1, 2))
-    left = {text: _median_distance(answer_px, rule(truth_px, views)) for text, rule in RULES.items()}
-    text = min(left, key=lambda name: left[name])
-    if left[text] < min(NEAR_PX, _EXPLAINED * error):
-        return text
-    return (
-        f"the positions are {error:.1f} px from the spot (median); a coarse method comes within 1 px on these pairs: "
-        "is something else than the laser spot found?"
-    )
-
-
-def _mirrored(uv_px: Array, axis: int, size: int) -> Array:
-    mirrored = uv_px.copy()
-    mirrored[..., axis] = size - 1 - uv_px[..., axis]
-    return mirrored
-
-
-def _offset_fault(error_px: Array) -> str:
-    seen = error_px[np.isfinite(error_px).all(axis=1)]
-    near = seen[np.linalg.norm(seen, axis=1) < 2.0 * NEAR_PX]
-    mean, se = near.mean(axis=0), near.std(axis=0) / np.sqrt(len(near))
-    for size, text in ((0.5, "half a pixel"), (1.0, "one pixel")):
-        for sign, direction in ((1.0, "large"), (-1.0, "small")):
-            if (np.abs(mean - sign * size) < _HALF_PX).all() and (np.abs(mean) > 3.0 * se).all():
-                return (
-                    f"the positions are {text} too {direction} in u and v: the centre of the first pixel is (0, 0), "
-                    f"the image begins at -0.5 (mean error {mean[0]:+.2f}, {mean[1]:+.2f} px)"
-                )
-    if ((np.abs(mean) > _OFFSET_PX) & (np.abs(mean) > _OFFSET_SIGMAS * se)).any():
-        return (
-            f"the positions are off by ({mean[0]:+.2f}, {mean[1]:+.2f}) px on average: the centre of the first pixel "
-            "is (0, 0)"
-        )
-    return ""
-
-
-def covariance_fault(error_px: Array, covariance_px2: Array) -> str:
-    """What is wrong with the size of claimed covariances; "" if nothing is, or if there are too few to tell.
-
-    Parameters
-    ----------
-    error_px : shape (n, 2)
-    covariance_px2 : shape (n, 2, 2)
-    """
-    pull = rms_pull(error_px, covariance_px2)
-    if 2 * len(error_px) < _LEAST_PULLS or _PULL[0] <= pull <= _PULL[1]:
-        return ""
-    deviations = np.sqrt(np.mean((error_px / np.diagonal(covariance_px2, axis1=1, axis2=2)) ** 2))
-    if _PULL[0] <= deviations <= _PULL[1]:
-        return (
-            "covariance_px2 holds standard deviations: variances are needed, px^2 "
-            f"(the errors are {pull:.2g} times what it says)"
-        )
-    size = "small" if pull > 1.0 else "large"
-    return f"covariance_px2 is too {size}: the errors are {pull:.2g} times what it says (rms of error / deviation)"
-
-
-def rms_pull(error_px: Array, covariance_px2: Array) -> float:
-    """Root mean square of errors in units of their claimed deviation; NaN without any."""
-    if len(error_px) == 0:
-        return float("nan")
-    squares = np.einsum("ni,ni->n", error_px, np.linalg.solve(covariance_px2, error_px[..., None])[..., 0])
-    return float(np.sqrt(squares.mean() / 2.0))
-
-
-def _median_distance(a_px: Array, b_px: Array) -> float:
-    distance = np.linalg.norm(a_px - b_px, axis=-1)
-    seen = distance[np.isfinite(distance)]
-    return float(np.median(seen)) if seen.size else float("nan")
-
-
-_NEAR_RAD = 0.02  # 3 px of the default rig; the senses of phi differ by 0.08 on easy pairs
-_NEAR_DEPTH = 0.5  # relative: a spot that is off by some pixels stays within
-_UNITS = {1000.0: "millimetres", 100.0: "centimetres"}
-
-
-def phi_fault(angles: Sequence[tuple[float, str, dict[str, float]]]) -> str:
-    """What is wrong with angles (phi in radians, its convention, the true angles by convention); "" if nothing is.
-
-    The convention "outline" is none of the truth's and is left alone.
-    """
-    known = [(phi, convention, truth) for phi, convention, truth in angles if convention in truth]
-    if not known:
-        return ""
-    off = {
-        name: float(np.median([abs(phi - truth[name]) for phi, _, truth in known]))
-        for name in ("ray", "normal", "incidence")
-    }
-    said = float(np.median([abs(phi - truth[convention]) for phi, convention, truth in known]))
-    if said <= _NEAR_RAD:
-        return ""
-    best, convention = min(off, key=lambda name: off[name]), known[0][1]
-    if off[best] <= _NEAR_RAD:
-        return f"phi_rad is the angle '{best}', not '{convention}': set phi_convention='{best}'"
-    if float(np.median([abs(phi - 2.0 * truth["ray"]) for phi, _, truth in known])) <= 2.0 * _NEAR_RAD:
-        return "phi_rad is theta, the ray's angle from the downward vertical: phi is half of it"
-    return f"phi_rad is off by {said:.2g} rad (median) from the angle '{convention}'"
-
-
-def depth_fault(depths: Sequence[tuple[float, float]]) -> str:
-    """What is wrong with pairs (depth, true depth), metres; "" if nothing is."""
-    if not depths:
-        return ""
-    ratio = float(np.median([depth / truth for depth, truth in depths]))
-    if abs(ratio - 1.0) <= _NEAR_DEPTH:
-        return ""
-    for factor, unit in _UNITS.items():
-        if abs(ratio / factor - 1.0) <= _NEAR_DEPTH:
-            return f"depth_m is in {unit}: metres are needed"
-    return f"depth_m is {ratio:.2g} times the true depth (median)"
-
-
 PAIRS = 10
-LIMITS = RunLimits(seconds=10.0)
 _GIVE_UP = 3  # pairs in a row without an answer in time
 
 
 @dataclass(frozen=True)
 class Check:
-    """What a trial showed.
+    """Result of a check.
 
     Attributes
     ----------
     faults : tuple of str
         Sentences; empty if the method is sound.
     notes : tuple of str
-        What is worth knowing.
+        Counts, errors and times.
+    printed : tuple of (pair, text)
+        Last lines that the method printed for a pair, where it printed anything.
     """
 
     faults: tuple[str, ...]
     notes: tuple[str, ...]
+    printed: tuple[tuple[int, str], ...] = ()
 
     @property
     def ok(self) -> bool:
-        """Whether there is no fault."""
+        """True if there is no fault."""
         return not self.faults
 
 
-def check_method(reference: str, preset: str = "bayer-raw", limits: RunLimits = LIMITS, count: int = PAIRS) -> Check:
+def check_method(
+    reference: str,
+    preset: str = "mjpeg",
+    limits: RunLimits | None = None,
+    count: int = PAIRS,
+    told: Callable[[int], None] = lambda done: None,
+) -> Check:
     """Run a method on easy pairs.
 
     Parameters
     ----------
     reference : str
-        As for `harness.run_method`.
+        As for `runner.run_method`.
     preset : "bayer-raw", "mono-raw", "srgb8" or "mjpeg"
-    limits : RunLimits
+    limits : RunLimits, optional
     count : int
         How many pairs.
+    told : callable
+        Given the number of pairs that are done.
 
     Raises
     ------
@@ -227,14 +73,18 @@ def check_method(reference: str, preset: str = "bayer-raw", limits: RunLimits = 
         If the method cannot be found or imported, or there is no such preset.
     """
     pairs = EasyPairs(preset, count)
-    done = list(_until_hopeless(outcomes(reference, pairs, limits)))
+    done: list[Outcome] = []
+    for outcome in _until_hopeless(outcomes(reference, pairs, limits)):
+        done.append(outcome)
+        told(len(done))
     return judged(done, pairs)
 
 
 def judged(done: Sequence[Outcome], pairs: EasyPairs) -> Check:
     """Faults and notes of outcomes on easy pairs."""
     faults = [*_failures(done), *_missing(done), *_wrong(done, pairs)]
-    return Check(tuple(faults), tuple(_notes(done, pairs)))
+    printed = tuple((outcome.number, outcome.output) for outcome in done if outcome.output)
+    return Check(tuple(faults), tuple(_notes(done, pairs)), printed)
 
 
 def _until_hopeless(run: Iterator[Outcome]) -> Iterator[Outcome]:
@@ -260,7 +110,7 @@ _IN_WORDS = {
     "timeout": "too slow",
     "crash": "the method's process died",
     "memory": "too much memory",
-    "invalid": "the answer is none",
+    "invalid": "the answer is not valid",
     "mutated": "the input was written to",
 }
 
@@ -358,3 +208,167 @@ def _depths(answered: Sequence[Outcome], truths: dict[int, PairTruth]) -> Iterat
     for outcome in answered:
         if outcome.answer is not None and outcome.answer.depth_m is not None:
             yield outcome.answer.depth_m, truths[outcome.number].depth_m
+
+
+# -- positions and covariances -------------------------------------------------------------------------------------
+
+NEAR_PX = 2.0  # median error up to which a method sees the spot; the worst built-in has 0.7 on these pairs
+_EXPLAINED = 0.2  # of the median error may remain under a rule that is named
+_OFFSET_PX = 0.25  # mean offset that is no accident of a coarse method, if it is also significant
+_OFFSET_SIGMAS = 5.0  # false alarm below 1e-5 for 20 spots, 2 axes
+_HALF_PX = 0.2  # by which a half-pixel offset may miss a half
+_PULL = (0.5, 2.0)  # of 40 numbers: outside by chance 3e-8 (chi squared)
+_LEAST_PULLS = 10
+
+
+@dataclass(frozen=True)
+class Views:
+    """Geometry that the rules need besides the true positions.
+
+    Attributes
+    ----------
+    shape : (H, W)
+    origin_px : shape (n, 2, 2)
+        First pixel (u, v) of the boxes.
+    """
+
+    shape: tuple[int, int]
+    origin_px: Array
+
+
+Rule = Callable[[Array, Views], Array]
+
+RULES: dict[str, Rule] = {
+    "the axes are swapped: these are (v, u), row first; give (u, v), column first": lambda uv, _: uv[..., ::-1],
+    "v runs upwards: it must run downwards, row 0 at the top": lambda uv, s: _mirrored(uv, 1, s.shape[0]),
+    "u runs to the left: it must run to the right, column 0 at the left": lambda uv, s: _mirrored(uv, 0, s.shape[1]),
+    "the frames are swapped: 'down' holds the spot of the up image and the other way round": lambda uv, _: uv[:, ::-1],
+    "positions are relative to the box: add (box.u0_px, box.v0_px)": lambda uv, s: uv - s.origin_px,
+    "positions are halved, as in an image binned 2 x 2: give pixels of the whole image": lambda uv, _: (uv - 0.5) / 2.0,
+}
+
+
+def position_fault(answer_px: Array, truth_px: Array, views: Views) -> str:
+    """Sentence on the fault of positions; "" if there is none.
+
+    Parameters
+    ----------
+    answer_px, truth_px : shape (n, 2, 2)
+    views : Views
+    """
+    error = _median_distance(answer_px, truth_px)
+    if not np.isfinite(error):
+        return ""
+    if error <= NEAR_PX:
+        return _offset_fault((answer_px - truth_px).reshape(-1, 2))
+    left = {text: _median_distance(answer_px, rule(truth_px, views)) for text, rule in RULES.items()}
+    text = min(left, key=lambda name: left[name])
+    if left[text] < min(NEAR_PX, _EXPLAINED * error):
+        return text
+    return (
+        f"the positions are {error:.1f} px from the spot (median); a coarse method comes within 1 px on these pairs: "
+        "is something else than the laser spot found?"
+    )
+
+
+def _mirrored(uv_px: Array, axis: int, size: int) -> Array:
+    mirrored = uv_px.copy()
+    mirrored[..., axis] = size - 1 - uv_px[..., axis]
+    return mirrored
+
+
+def _offset_fault(error_px: Array) -> str:
+    seen = error_px[np.isfinite(error_px).all(axis=1)]
+    near = seen[np.linalg.norm(seen, axis=1) < 2.0 * NEAR_PX]
+    mean, se = near.mean(axis=0), near.std(axis=0) / np.sqrt(len(near))
+    for size, text in ((0.5, "half a pixel"), (1.0, "one pixel")):
+        for sign, direction in ((1.0, "large"), (-1.0, "small")):
+            if (np.abs(mean - sign * size) < _HALF_PX).all() and (np.abs(mean) > 3.0 * se).all():
+                return (
+                    f"the positions are {text} too {direction} in u and v: the centre of the first pixel is (0, 0), "
+                    f"the image begins at -0.5 (mean error {mean[0]:+.2f}, {mean[1]:+.2f} px)"
+                )
+    if ((np.abs(mean) > _OFFSET_PX) & (np.abs(mean) > _OFFSET_SIGMAS * se)).any():
+        return (
+            f"the positions are off by ({mean[0]:+.2f}, {mean[1]:+.2f}) px on average: the centre of the first pixel "
+            "is (0, 0)"
+        )
+    return ""
+
+
+def covariance_fault(error_px: Array, covariance_px2: Array) -> str:
+    """Sentence on the size of claimed covariances; "" if it is right, or if there are too few to tell.
+
+    Parameters
+    ----------
+    error_px : shape (n, 2)
+    covariance_px2 : shape (n, 2, 2)
+    """
+    pull = rms_pull(error_px, covariance_px2)
+    if 2 * len(error_px) < _LEAST_PULLS or _PULL[0] <= pull <= _PULL[1]:
+        return ""
+    deviations = np.sqrt(np.mean((error_px / np.diagonal(covariance_px2, axis1=1, axis2=2)) ** 2))
+    if _PULL[0] <= deviations <= _PULL[1]:
+        return (
+            "covariance_px2 holds standard deviations: variances are needed, px^2 "
+            f"(the errors are {pull:.2g} times what it says)"
+        )
+    size = "small" if pull > 1.0 else "large"
+    return f"covariance_px2 is too {size}: the errors are {pull:.2g} times what it says (rms of error / deviation)"
+
+
+def rms_pull(error_px: Array, covariance_px2: Array) -> float:
+    """Root mean square of errors in units of their claimed deviation; NaN without any."""
+    if len(error_px) == 0:
+        return float("nan")
+    squares = np.einsum("ni,ni->n", error_px, np.linalg.solve(covariance_px2, error_px[..., None])[..., 0])
+    return float(np.sqrt(squares.mean() / 2.0))
+
+
+def _median_distance(a_px: Array, b_px: Array) -> float:
+    distance = np.linalg.norm(a_px - b_px, axis=-1)
+    seen = distance[np.isfinite(distance)]
+    return float(np.median(seen)) if seen.size else float("nan")
+
+
+# -- angles and depths ------------------------------------------------------------------------------------------------
+
+_NEAR_RAD = 0.02  # 3 px of the default rig; the senses of phi differ by 0.08 on easy pairs
+_NEAR_DEPTH = 0.5  # relative: a spot that is off by some pixels stays within
+_UNITS = {1000.0: "millimetres", 100.0: "centimetres"}
+
+
+def phi_fault(angles: Sequence[tuple[float, str, dict[str, float]]]) -> str:
+    """Sentence on the fault of angles (phi in radians, its convention, the true angles); "" if there is none.
+
+    The convention "outline" is none of the truth's and is left alone.
+    """
+    known = [(phi, convention, truth) for phi, convention, truth in angles if convention in truth]
+    if not known:
+        return ""
+    off = {
+        name: float(np.median([abs(phi - truth[name]) for phi, _, truth in known]))
+        for name in ("ray", "normal", "incidence")
+    }
+    said = float(np.median([abs(phi - truth[convention]) for phi, convention, truth in known]))
+    if said <= _NEAR_RAD:
+        return ""
+    best, convention = min(off, key=lambda name: off[name]), known[0][1]
+    if off[best] <= _NEAR_RAD:
+        return f"phi_rad is the angle '{best}', not '{convention}': set phi_convention='{best}'"
+    if float(np.median([abs(phi - 2.0 * truth["ray"]) for phi, _, truth in known])) <= 2.0 * _NEAR_RAD:
+        return "phi_rad is theta, the ray's angle from the downward vertical: phi is half of it"
+    return f"phi_rad is off by {said:.2g} rad (median) from the angle '{convention}'"
+
+
+def depth_fault(depths: Sequence[tuple[float, float]]) -> str:
+    """Sentence on the fault of pairs (depth, true depth), metres; "" if there is none."""
+    if not depths:
+        return ""
+    ratio = float(np.median([depth / truth for depth, truth in depths]))
+    if abs(ratio - 1.0) <= _NEAR_DEPTH:
+        return ""
+    for factor, unit in _UNITS.items():
+        if abs(ratio / factor - 1.0) <= _NEAR_DEPTH:
+            return f"depth_m is in {unit}: metres are needed"
+    return f"depth_m is {ratio:.2g} times the true depth (median)"

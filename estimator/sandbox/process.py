@@ -1,8 +1,7 @@
-"""What a method prints: read all the time, so that it never has to wait, and only the end kept.
+"""Process of one method: started, asked for pairs, ended; and what it prints.
 
-What a method's process is given of the machine: a short environment, in which no data set's path stands.
-
-One method in a process of its own: started, asked, ended.
+The process gets a short environment, in which no data set's path stands, and an empty working directory. It stays warm
+from pair to pair. After a failure it is killed with all that it started, and the next pair gets a new one.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ import json
 import math
 import os
 import re
+import select
 import signal
 import socket
 import subprocess
@@ -20,7 +20,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -28,35 +28,70 @@ from phibench.datasets.parallel import ONE_THREAD
 from phibench.estimator.interface import Outcome, Pair
 from phibench.estimator.sandbox.answers import AnswerError, checked
 from phibench.estimator.sandbox.resolve import MethodError, Reference, RunLimits
-from phibench.estimator.sandbox.transport import Channel, ChannelError, MemoryFile, pack
+from phibench.estimator.sandbox.transport import Connection, MemoryFile, TransportError, pack
+from phibench.estimator.sandbox.worker import lacks_memory
 
 _KEPT_BYTES = 65536
+_READS = 16  # of 64 kB at a time
+_LINES, _LINE_LENGTH = 20, 200  # of the output that an outcome keeps
 _FRAME = re.compile(r'^  File "(.+)", line (\d+) in (.+)$')
 
 
-class Printed:
-    """Drains a pipe.
+class OutputTail:
+    """The end of what a process prints; its pipe is emptied all the time, so that the process never waits.
 
     Parameters
     ----------
     pipe : binary file
-        What the process writes to its standard output and error.
+        Standard output and error of the process.
     """
 
     def __init__(self, pipe: IO[bytes]) -> None:
-        self._pipe, self._tail = pipe, b""
+        self._pipe, self._tail, self._count, self._ended = pipe, b"", 0, False
+        self._lock = threading.Lock()
+        os.set_blocking(pipe.fileno(), False)
         self._thread = threading.Thread(target=self._drain, daemon=True)
         self._thread.start()
 
-    def text(self, wait_s: float = 0.0) -> str:
-        """The last 64 kB; waits so long for the pipe to end."""
+    def text(self, wait_s: float = 0.0, since: int = 0) -> str:
+        """Text after the first `since` bytes, 64 kB at most; waits so long for the pipe to end."""
         self._thread.join(wait_s)
-        return self._tail.decode(errors="replace")
+        with self._lock:
+            self._take()
+            new = min(self._count - since, len(self._tail))
+            return self._tail[len(self._tail) - new :].decode(errors="replace")
+
+    def count(self) -> int:
+        """Bytes that were printed so far."""
+        with self._lock:
+            self._take()
+            return self._count
 
     def _drain(self) -> None:
         with self._pipe:
-            while part := self._pipe.read1(_KEPT_BYTES):  # type: ignore[attr-defined]
-                self._tail = (self._tail + part)[-_KEPT_BYTES:]
+            while not self._ended:
+                select.select([self._pipe], [], [])
+                with self._lock:
+                    self._take()
+
+    def _take(self) -> None:
+        """Read what is in the pipe; not for ever from a process that prints without end."""
+        for _ in range(_READS):
+            if self._ended:
+                return
+            try:
+                part = os.read(self._pipe.fileno(), _KEPT_BYTES)
+            except BlockingIOError:
+                return
+            self._ended = not part
+            self._count += len(part)
+            self._tail = (self._tail + part)[-_KEPT_BYTES:]
+
+
+def last_lines(text: str) -> str:
+    """Last lines of an output, without the stack that a fatal signal prints."""
+    own = text.partition("Fatal Python error:")[0].rstrip()
+    return "\n".join(line[:_LINE_LENGTH] for line in own.splitlines()[-_LINES:])
 
 
 def stack_place(text: str, file: str = "") -> str:
@@ -93,10 +128,11 @@ def environment(folder: str, inherited: Mapping[str, str]) -> dict[str, str]:
     paths = [str(Path(part).absolute()) for part in inherited.get("PYTHONPATH", "").split(os.pathsep) if part]
     if paths:
         kept["PYTHONPATH"] = os.pathsep.join(paths)
-    return {**ONE_THREAD, **kept, "PWD": folder, "TMPDIR": folder, "PYTHONDONTWRITEBYTECODE": "1"}
+    python = {"PYTHONDONTWRITEBYTECODE": "1", "PYTHONUNBUFFERED": "1"}  # what it prints is read before it dies
+    return {**ONE_THREAD, **kept, "PWD": folder, "TMPDIR": folder, **python}
 
 
-_CHILD = "phibench.estimator.sandbox.worker"
+_WORKER = "phibench.estimator.sandbox.worker"
 _STACK_SECONDS = 0.3  # for a stack to be printed, and for the pipe to end
 _NOT_RESTARTED = ("", "invalid")  # the process is as sound as before
 
@@ -171,12 +207,12 @@ class _Running:
         if os.name != "posix":
             raise MethodError("methods run in processes of their own on Linux and macOS only")
         ours, theirs = socket.socketpair()
-        self._channel, self._memory = Channel(ours), MemoryFile()
+        self._connection, self._memory = Connection(ours), MemoryFile()
         self._folder = tempfile.TemporaryDirectory(prefix="phibench-method-", ignore_cleanup_errors=True)
         handles = (theirs.fileno(), self._memory.reader)
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", _CHILD, *map(str, handles)],
+                [sys.executable, "-m", _WORKER, *map(str, handles)],
                 pass_fds=handles,
                 cwd=self._folder.name,
                 env=environment(self._folder.name, os.environ),
@@ -186,21 +222,21 @@ class _Running:
                 start_new_session=True,  # a group of its own: killed as a whole, and not hit by Ctrl-C
             )
         assert self._process.stdout is not None
-        self._printed = Printed(self._process.stdout)
+        self._output = OutputTail(self._process.stdout)
 
     def load(self, reference: Reference, limits: RunLimits) -> None:
         """Let the process import the method."""
-        order = {"reference": asdict(reference), "memory_bytes": limits.memory_mb * 1e6}
+        order = {"reference": asdict(reference), "memory_mb": limits.memory_mb}
         try:
-            self._channel.send(json.dumps(order).encode(), limits.start_seconds)
-            fault = json.loads(self._channel.receive(limits.start_seconds))["fault"]
+            self._connection.send(json.dumps(order).encode(), limits.start_seconds)
+            fault = json.loads(self._connection.receive(limits.start_seconds))["fault"]
         except TimeoutError:
             place = self._place(reference.place)
             raise MethodError(
                 f"method '{reference.name}' is not imported after {limits.start_seconds:g} s{place}: "
                 "do the work in the function, not at import"
             ) from None
-        except (ChannelError, ValueError):
+        except (TransportError, ValueError):
             raise MethodError(
                 f"method '{reference.name}' cannot be imported: {self._death(reference.place)}{self._last_line()}"
             ) from None
@@ -209,54 +245,56 @@ class _Running:
 
     def ask(self, pair: Pair, limits: RunLimits, file: str) -> Outcome:
         """Answer or failure for one pair."""
-        start = time.monotonic()
+        start, before = time.monotonic(), self._output.count()
         try:
-            self._channel.send(pack(pair, self._memory), limits.seconds)
-            reply = json.loads(self._channel.receive(max(limits.seconds - (time.monotonic() - start), 1e-3)))
+            self._connection.send(pack(pair, self._memory), limits.seconds)
+            reply = json.loads(self._connection.receive(max(limits.seconds - (time.monotonic() - start), 1e-3)))
         except TimeoutError:
-            return Outcome(
-                pair.number, None, math.nan, "timeout", f"no answer after {limits.seconds:g} s{self._place(file)}"
-            )
-        except (ChannelError, ValueError):
-            return self._dead(pair, file)
-        return outcome_of(pair, reply)
+            output = last_lines(self._output.text(since=before))  # before the stack is printed, too
+            message = f"no answer after {limits.seconds:g} s{self._place(file)}"
+            return Outcome(pair.number, None, math.nan, "timeout", message, output)
+        except (TransportError, ValueError):
+            return self._dead(pair, limits, file, before)
+        return replace(outcome_of(pair, reply), output=last_lines(self._output.text(since=before)))
 
     def kill(self) -> None:
         """Kill the whole group and give back what it held."""
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
-        self._channel.close()
+        self._connection.close()
         self._memory.close()
         self._folder.cleanup()
 
-    def _dead(self, pair: Pair, file: str) -> Outcome:
-        message = self._death(file)
-        failure = "memory" if "bad_alloc" in self._printed.text() else "crash"
-        return Outcome(pair.number, None, math.nan, failure, message)
+    def _dead(self, pair: Pair, limits: RunLimits, file: str, before: int) -> Outcome:
+        failure, message = "crash", self._death(file)
+        text = self._output.text(since=before)
+        if lacks_memory(text):
+            failure, message = "memory", limits.memory_sentence(message)
+        return Outcome(pair.number, None, math.nan, failure, message, last_lines(text))
 
     def _death(self, file: str) -> str:
-        """How the process ended."""
-        text = self._printed.text(_STACK_SECONDS)
+        """The end of the process in a few words."""
+        text = self._output.text(_STACK_SECONDS)
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_STACK_SECONDS)
         code = self._process.poll()
         if code is None:
-            return "the process broke its line to the harness"
+            return "the process broke its connection to the runner"
         if code >= 0:
             return f"the process left with exit code {code}, without an answer"
         place = stack_place(text, file)
         return f"the process died of {_signal_name(-code)}" + (f" at {place}" if place else "")
 
     def _place(self, file: str) -> str:
-        """Where a process is that still runs."""
+        """The line at which a process is that still runs."""
         with contextlib.suppress(ProcessLookupError):
             self._process.send_signal(signal.SIGUSR1)
-        place = stack_place(self._printed.text(_STACK_SECONDS), file)
+        place = stack_place(self._output.text(_STACK_SECONDS), file)
         return f", at {place}" if place else ""
 
     def _last_line(self) -> str:
-        lines = self._printed.text().strip().splitlines()
+        lines = self._output.text().strip().splitlines()
         return f"; its last words: {lines[-1]}" if lines else ""
 
 

@@ -1,13 +1,8 @@
-"""What goes wrong with a method before its first pair; every message is for the person at the terminal.
-
-A method that was found: what it is called, where it is, and which version of it.
-
-Find the method that a user names, without running any of its code: this is done in the process that knows the truth.
+"""References to methods, and the limits under which methods run.
 
 A reference is ``my_phi.py:extract`` (a file and a function in it), the name of a built-in method, or the name under
-which an installed package registers a method (entry-point group ``phibench.methods``).
-
-What a method may take.
+which an installed package registers a method (entry-point group ``phibench.methods``). It is resolved without running
+any code of the method, because the process that resolves it knows the truth.
 """
 
 from __future__ import annotations
@@ -136,7 +131,7 @@ def _unknown(name: str) -> str:
 
 @dataclass(frozen=True)
 class RunLimits:
-    """RunLimits of one method.
+    """Limits of one method; the same wherever methods run.
 
     Parameters
     ----------
@@ -158,3 +153,8 @@ class RunLimits:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise MethodError(f"limit {name} = {value}: must be a finite number above 0")
+
+    def memory_sentence(self, detail: str) -> str:
+        """A failure for want of memory in one sentence, with the limit."""
+        limit = f"the limit of {self.memory_mb:g} MB of address space on top of the imports (--memory-mb)"
+        return f"more memory than {limit}: {detail}"

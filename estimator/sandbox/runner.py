@@ -1,7 +1,8 @@
-"""Run methods over a set of pairs. What one does to its own process costs the pair at hand, and the run goes on.
+"""Runner: methods over a set of pairs, each in processes of its own.
 
-The truth stays in this process: the methods' get the fields of `Pair` and nothing else. That keeps honest code honest;
-it is no sandbox. A method that wants to cheat can read any file that its user can.
+What a method does to its process costs the pair at hand, and the run goes on. The truth stays in this process: a
+method's process gets the fields of `Pair` and nothing else. This keeps honest code honest and is no security boundary:
+a method can read any file that its user can.
 """
 
 from __future__ import annotations
@@ -44,24 +45,30 @@ class Harness:
             raise MethodError(f"workers = {workers}: must be 1 or more")
         self._references = [resolve(method) if isinstance(method, str) else method for method in methods]
         self._limits, self._workers = limits or RunLimits(), workers
+        self._failed: list[dict[int, str]] = [{} for _ in self._references]
 
     def __enter__(self) -> Harness:
         copies = self._workers if len(self._references) == 1 else 1
-        self._crews = [_Crew([MethodProcess(r, self._limits) for _ in range(copies)]) for r in self._references]
+        self._pools = [_MethodPool([MethodProcess(r, self._limits) for _ in range(copies)]) for r in self._references]
         # one more than processes, so that a pair is made while the others are looked at
-        self._pool = ThreadPoolExecutor(self._workers + 1, thread_name_prefix="phibench-method")
+        self._threads = ThreadPoolExecutor(self._workers + 1, thread_name_prefix="phibench-method")
         try:
-            for crew in self._crews:
-                crew.start()  # a method that cannot be imported ends the run before it begins
+            for pool in self._pools:
+                pool.start()  # a method that cannot be imported ends the run before it begins
         except BaseException:
             self.__exit__(None, None, None)
             raise
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: object, trace: TracebackType | None) -> None:
-        for crew in self._crews:
-            crew.close()
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        for pool in self._pools:
+            pool.close()
+        self._threads.shutdown(wait=True, cancel_futures=True)
+
+    @property
+    def failed_outputs(self) -> list[str]:
+        """Output of each method for the first pair on which it failed and printed something; "" if there is none."""
+        return [found[min(found)] if found else "" for found in self._failed]
 
     def outcomes(self, pairs: PairSet, numbers: Sequence[int]) -> Iterator[tuple[Outcome, ...]]:
         """Outcomes of every method for some pairs, in the order of `numbers`.
@@ -69,7 +76,7 @@ class Harness:
         Pairs are made one at a time and given out in this order, whatever the number of workers: a set need not be
         safe for threads, and one process alone sees the same pairs in the same order in every run.
         """
-        making, turns = _Turns(), [_Turns() for _ in self._crews]
+        making, turns = _Turns(), [_Turns() for _ in self._pools]
 
         def one(place: int, number: int) -> tuple[Outcome, ...]:
             try:
@@ -80,13 +87,17 @@ class Harness:
                     with skipped.turn(place):
                         pass
                 raise
-            return tuple(crew.ask(pair, turn, place) for crew, turn in zip(self._crews, turns, strict=True))
+            done = tuple(pool.ask(pair, turn, place) for pool, turn in zip(self._pools, turns, strict=True))
+            for failed, outcome in zip(self._failed, done, strict=True):
+                if outcome.failure and outcome.output:
+                    failed[number] = outcome.output
+            return done
 
-        return self._pool.map(one, range(len(numbers)), numbers)
+        return self._threads.map(one, range(len(numbers)), numbers)
 
 
 class _Turns:
-    """Lets threads through one after the other, in the order of their places."""
+    """Order of threads: they pass one after the other, by their places."""
 
     def __init__(self) -> None:
         self._condition, self._now = threading.Condition(), 0
@@ -104,7 +115,7 @@ class _Turns:
                 self._condition.notify_all()
 
 
-class _Crew:
+class _MethodPool:
     """Processes of one method, of which each looks at one pair at a time."""
 
     def __init__(self, processes: list[MethodProcess]) -> None:

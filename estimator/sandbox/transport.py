@@ -1,10 +1,11 @@
-"""Messages between a method's process and its parent: a length and so many bytes over a socket, with a deadline.
+"""Transport of pairs and answers between the runner and a method's process.
 
-A pair on its way into the method's process: images through a shared file in memory, the rest as a short message.
+Messages go over a socket: 8 bytes of length (big-endian), then so many bytes, with a deadline. Images go through a
+shared file in memory, the rest of a pair in a short message.
 
-Chosen by measurement (`tests/test_harness_benchmark.py`): four frames of 1280 x 720 x 3, 11 MB, take 14 ms this way,
-private copy and comparison included, and 85 ms as a pickle through a socket. A short message also fits into the
-socket's buffer, so that a process that no longer reads cannot hold its parent up. The method's process takes a private
+Four frames of 1280 x 720 x 3 bytes, 11 MB, take 14 ms this way, private copy and comparison included. As a pickle
+through a socket they take 85 ms (`tests/benchmark_timings/test_sandbox_timing.py`). A short message fits into the
+socket's buffer, so that a process that no longer reads cannot hold the runner up. The method's process takes a private
 copy, because a method may keep an image after its pair.
 """
 
@@ -29,21 +30,21 @@ _LENGTH = struct.Struct("!Q")
 LARGEST = 1 << 24  # bytes; images do not go this way
 
 
-class ChannelError(Exception):
+class TransportError(Exception):
     """The other side is gone or does not keep to the protocol."""
 
 
-class Channel:
-    """One end of the line.
+class Connection:
+    """One end of a socket pair.
 
     Parameters
     ----------
-    line : socket.socket
+    end : socket.socket
         Of a connected pair.
     """
 
-    def __init__(self, line: socket.socket) -> None:
-        self._line = line
+    def __init__(self, end: socket.socket) -> None:
+        self._socket = end
 
     def send(self, message: bytes, seconds: float | None = None) -> None:
         """Send a message.
@@ -52,41 +53,41 @@ class Channel:
         ------
         TimeoutError
             If the other side does not take it in so many seconds; None waits for ever.
-        ChannelError
+        TransportError
             If the other side is gone.
         """
-        self._line.settimeout(seconds)
+        self._socket.settimeout(seconds)
         try:
-            self._line.sendall(_LENGTH.pack(len(message)) + message)
+            self._socket.sendall(_LENGTH.pack(len(message)) + message)
         except TimeoutError:
             raise
         except OSError as error:
-            raise ChannelError(str(error)) from error
+            raise TransportError(str(error)) from error
 
     def receive(self, seconds: float | None = None) -> bytes:
         """Wait for a message; raises as `send`."""
         end = None if seconds is None else time.monotonic() + seconds
         (length,) = _LENGTH.unpack(self._exactly(_LENGTH.size, end))
         if length > LARGEST:
-            raise ChannelError("a message that is none")
+            raise TransportError(f"message of {length} bytes exceeds the limit of {LARGEST}")
         return self._exactly(length, end)
 
     def close(self) -> None:
         """Close this end."""
-        self._line.close()
+        self._socket.close()
 
     def _exactly(self, count: int, end: float | None) -> bytes:
         parts, missing = [], count
         while missing:
-            self._line.settimeout(None if end is None else max(end - time.monotonic(), 1e-6))
+            self._socket.settimeout(None if end is None else max(end - time.monotonic(), 1e-6))
             try:
-                part = self._line.recv(missing)
+                part = self._socket.recv(missing)
             except TimeoutError:
                 raise
             except OSError as error:
-                raise ChannelError(str(error)) from error
+                raise TransportError(str(error)) from error
             if not part:
-                raise ChannelError("the other side is gone")
+                raise TransportError("the other side is gone")
             parts.append(part)
             missing -= len(part)
         return b"".join(parts)
@@ -151,8 +152,8 @@ class SharedPages:
 
 
 @dataclass(frozen=True)
-class Parcel:
-    """What a method's process unpacked.
+class ReceivedPair:
+    """A pair as a method's process has it.
 
     Attributes
     ----------
@@ -169,7 +170,7 @@ class Parcel:
     original: mmap.mmap
 
     def unchanged(self) -> bool:
-        """Whether the images are what the parent sent, byte for byte."""
+        """Compare the images with what the runner sent, byte for byte."""
         count = len(self.data) // 8
         here, there = (np.frombuffer(x, np.uint64, count) for x in (self.data, self.original))
         return bool(np.array_equal(here, there))
@@ -186,7 +187,7 @@ def pack(pair: Pair, memory: MemoryFile) -> bytes:
     return pickle.dumps((rest, layout, memory.write(views)), protocol=5)
 
 
-def unpack(message: bytes, shared: SharedPages) -> Parcel:
+def unpack(message: bytes, shared: SharedPages) -> ReceivedPair:
     """Pair of a message, with images that cannot be written to."""
     rest, layout, starts = pickle.loads(message)
     original = shared.first(starts[-1])
@@ -195,4 +196,4 @@ def unpack(message: bytes, shared: SharedPages) -> Parcel:
         name: np.frombuffer(data, dtype, int(np.prod(shape)), start).reshape(shape)
         for (name, dtype, shape), start in zip(layout, starts, strict=False)
     }
-    return Parcel(replace(rest, **images), data, original)
+    return ReceivedPair(replace(rest, **images), data, original)

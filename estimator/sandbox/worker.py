@@ -1,21 +1,22 @@
-"""Limit of the address space of this process, for a while (POSIX; kept by Linux).
+"""Worker: the process in which a method runs, ``python -m phibench.estimator.sandbox.worker SOCKET MEMORY``.
 
-Import a method, in the process that will run it.
+The arguments are the numbers of two open files. The worker gets a reference, imports the method, gets pairs, and
+answers with JSON. Standard output and error are the method's alone.
 
-The process in which a method runs: ``python -m phibench.estimator.sandbox.worker SOCKET MEMORY``.
-
-It gets numbers of two open files, a reference and pairs, and answers with JSON. What the method prints goes elsewhere.
-The fatal signals print Python's stack, and SIGUSR1 does so at any time: the parent reads the method's line from it.
+The address space is limited while the method runs (RLIMIT_AS; kept by Linux). Fatal signals print Python's stack, and
+SIGUSR1 prints it at any time: the runner reads the method's line from it.
 """
 
 from __future__ import annotations
 
+import errno
 import faulthandler
 import importlib
 import importlib.util
 import inspect
 import json
 import os
+import re
 import resource
 import signal
 import socket
@@ -24,7 +25,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -32,8 +33,8 @@ from typing import Any
 from phibench.datasets.store.files import sha256
 from phibench.estimator.interface import Answer, Method
 from phibench.estimator.sandbox.answers import answer_text, to_bytes
-from phibench.estimator.sandbox.resolve import MethodError, Reference
-from phibench.estimator.sandbox.transport import Channel, ChannelError, Parcel, SharedPages, unpack
+from phibench.estimator.sandbox.resolve import MethodError, Reference, RunLimits
+from phibench.estimator.sandbox.transport import Connection, ReceivedPair, SharedPages, TransportError, unpack
 from phibench.scenes.validation import close_names
 
 _STATM = Path("/proc/self/statm")
@@ -176,40 +177,49 @@ def main() -> None:
     """Load one method and answer pairs until the parent hangs up."""
     line, reader = (int(text) for text in sys.argv[1:])
     sys.argv[1:] = []
-    channel, pages = Channel(socket.socket(fileno=line)), SharedPages(reader)
+    connection, pages = Connection(socket.socket(fileno=line)), SharedPages(reader)
     faulthandler.enable(all_threads=False)
     faulthandler.register(signal.SIGUSR1, all_threads=False)
     threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
-    order = json.loads(channel.receive())
+    order = json.loads(connection.receive())
     reference = Reference(**order["reference"])
     try:
         method = load(reference)
     except MethodError as error:
-        channel.send(to_bytes({"fault": str(error)}))
+        connection.send(to_bytes({"fault": str(error)}))
         return
     file = reference.place if reference.kind == "file" else ""
-    limit = size_bytes() + int(order["memory_bytes"])
-    channel.send(to_bytes({"fault": ""}))
+    limits = RunLimits(memory_mb=order["memory_mb"])
+    limit_bytes = size_bytes() + int(1e6 * limits.memory_mb)
+    connection.send(to_bytes({"fault": ""}))
     try:
         while True:
-            parcel = unpack(channel.receive(), pages)
-            channel.send(to_bytes(_reply(method, parcel, limit, file)))
-    except ChannelError:
+            received = unpack(connection.receive(), pages)
+            connection.send(to_bytes(_reply(method, received, limits, limit_bytes, file)))
+    except TransportError:
         return
 
 
-def _reply(method: Method, parcel: Parcel, limit: int, file: str) -> dict[str, Any]:
+def _reply(method: Method, received: ReceivedPair, limits: RunLimits, limit_bytes: int, file: str) -> dict[str, Any]:
     def ask() -> Answer:
-        with limited(limit):
-            return method(parcel.pair)
+        with limited(limit_bytes):
+            return method(received.pair)
 
-    reply = reply_of(ask, file, BaseException)
-    if not parcel.unchanged():
+    reply = reply_of(ask, file, BaseException, limits)
+    for stream in (sys.stdout, sys.stderr):  # what belongs to this pair must be in the pipe before the reply
+        with suppress(Exception):
+            stream.flush()
+    if not received.unchanged():
         return {**reply, "failure": "mutated", "message": "the method wrote into the pair's images: work on a copy"}
     return reply
 
 
-def reply_of(ask: Callable[[], Answer], file: str = "", caught: type[BaseException] = Exception) -> dict[str, Any]:
+def reply_of(
+    ask: Callable[[], Answer],
+    file: str = "",
+    caught: type[BaseException] = Exception,
+    limits: RunLimits | None = None,
+) -> dict[str, Any]:
     """Answer or failure of one pair, with its time, as a document.
 
     Parameters
@@ -217,18 +227,42 @@ def reply_of(ask: Callable[[], Answer], file: str = "", caught: type[BaseExcepti
     ask : calls the method
     file : file of the method, whose line an error names
     caught : what counts as the method's error; anything else passes
+    limits : under which the method runs; None if there are none
     """
     start = time.perf_counter()
     try:
         reply: dict[str, Any] = {"failure": "", "answer": answer_text(ask())}
-    except MemoryError as error:
-        reply = {"failure": "memory", "message": f"more memory than the limit: {sentence_of(error, file)}"}
     except caught as error:
-        reply = _of_exception(error, file)
+        reply = _of_exception(error, file, limits)
     return {**reply, "seconds": time.perf_counter() - start}
 
 
-def _of_exception(error: BaseException, file: str) -> dict[str, Any]:
+_NO_MEMORY = re.compile(
+    "cannot allocate memory|can't allocate memory|bad_alloc|can't start new thread|failed to map segment", re.IGNORECASE
+)
+"""Words of libraries that want memory: C's ENOMEM, C++, a thread's stack, a shared library that cannot be mapped."""
+
+
+def is_out_of_memory(error: BaseException | None) -> bool:
+    """Tell an error for want of memory, or one that was raised because of such an error."""
+    while error is not None:
+        if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+            return True
+        if lacks_memory(str(error)):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def lacks_memory(text: str) -> bool:
+    """Tell a message for want of memory, of a library or of a dying process."""
+    return _NO_MEMORY.search(text) is not None
+
+
+def _of_exception(error: BaseException, file: str, limits: RunLimits | None) -> dict[str, Any]:
+    if is_out_of_memory(error):
+        text = sentence_of(error, file)
+        return {"failure": "memory", "message": limits.memory_sentence(text) if limits else f"out of memory: {text}"}
     if isinstance(error, ValueError) and _READ_ONLY in str(error):
         advice = "the pair's images are read-only: work on a copy, such as pair.down.astype(float)"
         return {"failure": "mutated", "message": f"{sentence_of(error, file)}; {advice}"}

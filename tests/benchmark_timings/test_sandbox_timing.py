@@ -1,4 +1,4 @@
-"""Time that the seat adds to a pair, `pytest --benchmark-enable --benchmark-only`; targets are stated, not asserted."""
+"""Time that the sandbox adds to a pair, `pytest --benchmark-enable --benchmark-only`; targets are stated only."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.seat_pairs import GOOD, SmallPairs, method_file
+from helpers.sandbox_pairs import GOOD, SmallPairs, method_file
 
 from phibench.estimator.interface import Pair
 from phibench.estimator.sandbox.process import MethodProcess
 from phibench.estimator.sandbox.resolve import RunLimits, resolve
-from phibench.estimator.sandbox.transport import Channel, MemoryFile, SharedPages, pack, unpack
+from phibench.estimator.sandbox.transport import Connection, MemoryFile, SharedPages, pack, unpack
 
 
 def large() -> Pair:
@@ -36,7 +36,7 @@ def test_benchmark_shared_memory(benchmark) -> None:
 def test_benchmark_socket(benchmark) -> None:
     """The alternative: the pair as a pickle through a socket, without any comparison."""
     pair = large()
-    near, far = (Channel(end) for end in socket.socketpair())
+    near, far = (Connection(end) for end in socket.socketpair())
 
     def there() -> object:
         message = pickle.dumps(pair, protocol=5)
@@ -49,7 +49,7 @@ def test_benchmark_socket(benchmark) -> None:
     assert benchmark(there) is not None
 
 
-@pytest.mark.benchmark(group="the seat")
+@pytest.mark.benchmark(group="the sandbox")
 def test_benchmark_empty_method_on_full_frames(benchmark, tmp_path: Path) -> None:
     """Target: <= 30 ms a pair."""
     process = MethodProcess(resolve(method_file(tmp_path, f"return {GOOD.replace('0, 0', '0, 0, 0')}")), RunLimits())
@@ -60,7 +60,7 @@ def test_benchmark_empty_method_on_full_frames(benchmark, tmp_path: Path) -> Non
         process.close()
 
 
-@pytest.mark.benchmark(group="the seat")
+@pytest.mark.benchmark(group="the sandbox")
 def test_benchmark_restart(benchmark, tmp_path: Path) -> None:
     """What a failure costs besides its pair: a new process. Target: <= 1 s."""
     process = MethodProcess(resolve(method_file(tmp_path, "1 / 0")), RunLimits())

@@ -54,7 +54,7 @@ def run(_: str, pairs: PairSet) -> Sequence[Outcome]:
 
 
 def describe(reference: str) -> dict[str, str | None]:
-    """What the seat says of a method in a file."""
+    """Outcomes of a method in a file."""
     place, _, function = reference.rpartition(":")
     digest = hashlib.sha256(Path(place).read_bytes()).hexdigest() if place else None
     return {"name": Path(place).stem, "kind": "file", "place": place, "function": function, "sha256": digest}

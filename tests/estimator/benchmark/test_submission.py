@@ -102,7 +102,7 @@ def test_a_line_that_submit_does_not_write_is_refused(
         ({"uv_px": None}, "uv_px"),
     ],
 )
-def test_an_answer_that_is_none_in_the_seat_is_none_in_a_submission(
+def test_an_answer_that_is_none_in_the_sandbox_is_none_in_a_submission(
     sealed: Sealed, submitted: Path, tmp_path: Path, change: dict[str, Any], words: str
 ) -> None:
     forged = tampered(lambda d: d["answers"][0]["down"].update(change), submitted, tmp_path / "s.json")

@@ -1,4 +1,4 @@
-"""The seat method `chain_fit` on whole frames of a default rig, and the blur that it takes."""
+"""The method `chain_fit` on whole frames of a default rig, and the blur that it takes."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.seat_pairs import HEADER, method_file
+from helpers.sandbox_pairs import HEADER, method_file
 
 from phibench.estimator.cli import main as cli
 from phibench.estimator.geometry.phi import phi_normal, phi_ray
@@ -111,7 +111,10 @@ def depth(factor: float) -> Method:
 
 
 MISTAKES: dict[str, tuple[Method, str]] = {
-    "wrong type": (lambda pair: (1.0, 2.0), "10 of 10 pairs: the answer is none: the method returned a tuple of 2"),  # type: ignore[dict-item, return-value]
+    "wrong type": (
+        lambda pair: (1.0, 2.0),
+        "10 of 10 pairs: the answer is not valid: the method returned a tuple of 2",
+    ),  # type: ignore[dict-item, return-value]
     "nothing returned": (lambda pair: None, "the method returned None: an Answer(down, up) is needed"),  # type: ignore[dict-item, return-value]
     "wrong shape": (each(moved(lambda u, v, *_: (u, v, 1.0))), "down.uv_px is ["),  # type: ignore[arg-type, return-value]
     "swapped axes": (each(moved(lambda u, v, *_: (v, u))), "the axes are swapped"),
@@ -245,7 +248,19 @@ def test_the_written_example_passes(tmp_path: Path, monkeypatch, capsys, preset:
 def test_check_exits_with_1_and_says_what_is_wrong(tmp_path: Path, capsys) -> None:
     reference = method_file(tmp_path, "return 5", header=HEADER)
     assert cli.main(["method", "check", reference]) == 1
-    assert "wrong: 10 of 10 pairs: the answer is none: the method returned an int" in capsys.readouterr().out
+    assert "wrong: 10 of 10 pairs: the answer is not valid: the method returned an int" in capsys.readouterr().out
+
+
+def test_check_shows_what_the_method_prints(tmp_path: Path, capsys) -> None:
+    reference = method_file(tmp_path, "print('number', pair.number)\nreturn 5", header=HEADER)
+    assert cli.main(["method", "check", reference]) == 1
+    out = capsys.readouterr().out
+    assert "--show-output shows it" in out
+    assert "number 3" not in out
+    assert cli.main(["method", "check", reference, "--show-output"]) == 1
+    shown = capsys.readouterr()
+    assert "printed for pair 3:\n    number 3\n" in shown.out
+    assert "easy pairs: 10/10" in shown.err
 
 
 def test_new_method_overwrites_nothing(tmp_path: Path, capsys) -> None:

@@ -6,6 +6,8 @@ import json
 import math
 import os
 import signal
+import socket
+import struct
 import subprocess
 import sys
 import time
@@ -14,15 +16,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.seat_pairs import GOOD, HEADER, SHAPE, SmallPairs, method_file
+from helpers.sandbox_pairs import GOOD, HEADER, SHAPE, SmallPairs, method_file
 
 from phibench.estimator.interface import FAILURES, Answer, Outcome, Pair, Spot
 from phibench.estimator.pair_set import PairTruth, SpotTruth
 from phibench.estimator.sandbox.answers import AnswerError, answer_text, checked
 from phibench.estimator.sandbox.process import environment
 from phibench.estimator.sandbox.resolve import MethodError, RunLimits
-from phibench.estimator.sandbox.runner import outcomes, run_method
-from phibench.estimator.sandbox.transport import MemoryFile, SharedPages, pack, unpack
+from phibench.estimator.sandbox.runner import Harness, outcomes, run_method
+from phibench.estimator.sandbox.transport import (
+    LARGEST,
+    Connection,
+    MemoryFile,
+    SharedPages,
+    TransportError,
+    pack,
+    unpack,
+)
 
 LIMITS = RunLimits(seconds=3.0, memory_mb=1000.0)
 
@@ -73,7 +83,7 @@ def test_every_misdeed_costs_its_own_pair_alone(survived: list[Outcome]) -> None
         (3, "no answer after 3 s, at my_phi.py, line 12, in extract"),
         (5, "the process left with exit code 3, without an answer"),
         (7, "the process died of SIGSEGV (a fault in compiled code) at my_phi.py, line 16, in extract"),
-        (9, "more memory than the limit"),
+        (9, "more memory than the limit of 1000 MB of address space on top of the imports (--memory-mb)"),
         (11, "my_phi.py, line 20, in extract); the pair's images are read-only: work on a copy"),
         (13, "the method wrote into the pair's images: work on a copy"),
         (15, "the method returned a str: an Answer(down, up) is needed"),
@@ -86,6 +96,52 @@ def test_the_message_says_what_happened_and_where(survived: list[Outcome], numbe
     assert "\n" not in survived[number].message
     assert "Traceback" not in survived[number].message
     assert survived[number].answer is None
+
+
+def test_an_outcome_keeps_the_last_lines_that_the_method_printed(survived: list[Outcome]) -> None:
+    for outcome in survived:
+        assert "on stderr" in outcome.output
+        assert "Fatal Python error" not in outcome.output
+        assert all(len(line) <= 200 for line in outcome.output.splitlines())
+
+
+NO_MEMORY = {
+    "mmap": "import mmap; mmap.mmap(-1, 4_000_000_000)",
+    "an errno": "import errno, os; raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))",
+    "a thread": "import threading; threading.stack_size(2_000_000_000); threading.Thread(target=print).start()",
+    "a cause": "try: bytes(4_000_000_000)\nexcept MemoryError as error: raise RuntimeError('no model') from error",
+    "a library": "raise ImportError('libx.so: failed to map segment from shared object')",
+}
+
+
+@pytest.mark.parametrize("deed", NO_MEMORY.values(), ids=NO_MEMORY)
+def test_every_want_of_memory_is_memory_and_names_the_limit(tmp_path: Path, deed: str) -> None:
+    reference = method_file(tmp_path, f"{deed}\nreturn {GOOD}")
+    (outcome,) = run_method(reference, SmallPairs(1), LIMITS)
+    assert outcome.failure == "memory"
+    assert "the limit of 1000 MB" in outcome.message
+    assert "my_phi.py, line" in outcome.message
+
+
+def test_what_needs_more_passes_with_a_higher_limit(tmp_path: Path) -> None:
+    reference = method_file(tmp_path, f"import mmap\nmmap.mmap(-1, 4_000_000_000).close()\nreturn {GOOD}")
+    (outcome,) = run_method(reference, SmallPairs(1), RunLimits(seconds=3.0, memory_mb=20_000.0))
+    assert outcome.failure == ""
+
+
+def test_a_message_that_is_too_long_is_refused() -> None:
+    near, far = socket.socketpair()
+    near.sendall(struct.pack("!Q", LARGEST + 1))
+    with near, far, pytest.raises(TransportError, match=f"of {LARGEST + 1} bytes exceeds the limit of {LARGEST}"):
+        Connection(far).receive(1.0)
+
+
+def test_the_harness_keeps_the_output_of_the_first_failure(tmp_path: Path) -> None:
+    body = f"print('pair', pair.number)\nif pair.number in (2, 3): 1 / 0\nreturn {GOOD}"
+    with Harness([method_file(tmp_path, body)], LIMITS, workers=2) as harness:
+        done = [outcome for (outcome,) in harness.outcomes(SmallPairs(5), range(5))]
+        assert harness.failed_outputs == ["pair 2"]
+    assert [outcome.output for outcome in done] == [f"pair {number}" for number in range(5)]
 
 
 def test_seconds_are_nan_where_the_method_did_not_come_back(survived: list[Outcome]) -> None:
@@ -135,7 +191,7 @@ def test_leaving_the_loop_ends_the_process(tmp_path: Path) -> None:
 
 INTERRUPTED = """
 import sys
-from helpers.seat_pairs import SmallPairs
+from helpers.sandbox_pairs import SmallPairs
 from phibench.estimator.sandbox.runner import outcomes
 try:
     for outcome in outcomes(sys.argv[1], SmallPairs(3)):

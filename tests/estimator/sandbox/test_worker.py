@@ -8,7 +8,7 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
-from helpers.seat_pairs import GOOD, SmallPairs, method_file
+from helpers.sandbox_pairs import GOOD, SmallPairs, method_file
 
 from phibench.estimator.sandbox import resolve as resolving
 from phibench.estimator.sandbox.resolve import MethodError, resolve

@@ -1,4 +1,4 @@
-"""Small pairs for the tests of the seat: images of a few pixels that say which pair they are, and a secret truth."""
+"""Small pairs for the tests of the sandbox: images of a few pixels that say which pair they are, and a secret truth."""
 
 from __future__ import annotations
 
