@@ -188,7 +188,7 @@ def false_line(records: pl.DataFrame) -> str:
     return f"{100 * number / len(answers):.0f} % of the answers are {what}: {advice}"
 
 
-def _printed(one: Scored) -> list[str]:
+def _printed(one: HasScore) -> list[str]:
     """Last lines that the method printed before it first failed; empty if there are none."""
     return [f"printed for the first pair that failed:\n{one.output}"] if one.output else []
 
@@ -239,6 +239,10 @@ class HasScore(Protocol):
     @property
     def document(self) -> ScoreDocument:
         """The score."""
+
+    @property
+    def output(self) -> str:
+        """Last lines that the method printed before it first failed."""
 
     @property
     def records(self) -> pl.DataFrame:

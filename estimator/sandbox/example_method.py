@@ -14,7 +14,7 @@ from scipy.ndimage import center_of_mass, gaussian_filter, maximum_filter
 
 from phibench import Answer, Pair, Spot
 from phibench.estimator.interface import Box, Image
-from phibench.estimator.methods.simple import detect
+from phibench.estimator.methods.simple import detected_spots
 
 HALF_PX = 3  # of the window of the centroid
 LEAST_SIGMAS = 6.0  # of the noise that a spot must exceed
@@ -24,7 +24,7 @@ LAMP = 1.8  # times the median light: brighter areas are lamps, whose noise and 
 def extract(pair: Pair) -> Answer:
     """Find the spot in both images; the depth follows from the positions."""
     if pair.down_off is None or pair.up_off is None:
-        return detect(pair)  # nothing to subtract: the built-in search
+        return detected_spots(pair)  # nothing to subtract: the built-in search
     down = find(pair, pair.down, pair.down_off, pair.box_down)
     up = find(pair, pair.up, pair.up_off, pair.box_up)
     return Answer(down, up)

@@ -12,7 +12,7 @@ from phibench.datasets.read import open_finished
 from phibench.estimator.benchmark.answer_errors import MATCH_PX
 from phibench.estimator.benchmark.dataset_pairs import dataset_pairs
 from phibench.estimator.interface import Pair
-from phibench.estimator.methods.simple import detect
+from phibench.estimator.methods.simple import detected_spots
 from phibench.estimator.sandbox import example_method
 from phibench.estimator.sandbox.example_method import extract
 
@@ -37,7 +37,7 @@ def test_the_example_finds_the_spots_of_a_rendered_room(smoke_dataset: Path, pre
 
 def test_the_example_answers_without_laser_off_frames_and_without_a_spot(easy: Pair) -> None:
     without = replace(easy, down_off=None, up_off=None)
-    assert extract(without) == detect(without)
+    assert extract(without) == detected_spots(without)
     assert easy.down_off is not None
     dark = replace(easy, down=easy.down_off)
     assert extract(dark).down.uv_px is None
