@@ -12,8 +12,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import center_of_mass, gaussian_filter, maximum_filter
 
-from phibench import Answer, Pair, Spot
-from phibench.estimator.interface import Box, Image
+from phibench.estimator.interface import Answer, Box, Image, Pair, Spot
 from phibench.estimator.methods.simple import detected_spots
 
 HALF_PX = 3  # of the window of the centroid
