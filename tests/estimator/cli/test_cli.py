@@ -149,7 +149,12 @@ def test_repair_prints_what_it_made(monkeypatch, capsys):
 
 def test_merge_takes_any_number_of_shards(monkeypatch, tmp_path):
     calls = []
-    monkeypatch.setattr("phibench.datasets.merge_repair.merge", lambda out, shards: calls.append((out, list(shards))))
+
+    def merge(out: Path, shards: tuple[Path, ...], console: object) -> Path:
+        calls.append((out, list(shards)))
+        return out
+
+    monkeypatch.setattr("phibench.datasets.merge_repair.merge", merge)
     kept = sensitivities_kept(monkeypatch)
     assert cli.main(["dataset", "merge", str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(tmp_path / "o")]) == 0
     assert calls == [(tmp_path / "o", [tmp_path / "a", tmp_path / "b"])]
@@ -175,5 +180,4 @@ def test_make_passes_shard_and_scheduler_on(monkeypatch, tmp_path):
     kept = sensitivities_kept(monkeypatch)
     assert cli.main(tokens) == 0
     assert kept == []  # a shard's are made when it is merged
-    others = {"samples": None, "seed": None}
-    assert calls == [(("smoke", tmp_path, 3), {"scheduler": "s", "shard": "2/5", **others})]
+    assert calls == [(("smoke", tmp_path, 3, None, "s", "2/5", None, None), {})]  # console, ..., samples, seed
