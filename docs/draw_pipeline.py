@@ -42,7 +42,7 @@ def arrow(ax: Axes, start: tuple[float, float], end: tuple[float, float]) -> Non
 
 
 def outside(ax: Axes, number: float, text: str, down: bool) -> None:
-    """What a user puts in or takes out, below a box."""
+    """Draw the label and arrow below a box: the input or output of a user."""
     x = number * (WIDTH + GAP) + WIDTH / 2
     ends = ((x, 0.44), (x, BOTTOM)) if not down else ((x, BOTTOM), (x, 0.44))
     arrow(ax, *ends)

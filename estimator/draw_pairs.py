@@ -1,4 +1,7 @@
-"""Pairs that are drawn from a data set, as a method sees them; their truth is in `benchmark.dataset_pairs`."""
+"""Pairs of images (down, up) of a data set, with random sensor noise, as a method sees them.
+
+A pair is simulated when it is asked for: the same bytes every time. Its truth is in `benchmark.dataset_pairs`.
+"""
 
 from __future__ import annotations
 
@@ -37,20 +40,20 @@ class DrawnPairs:
 
     @property
     def pair_draws(self) -> tuple[PairDraw, ...]:
-        """What is drawn, by number; it tells the sample, so it is not for methods."""
+        """Sample and noise realisation of every pair, by number; methods must not see it."""
         return self._pair_draws
 
     @property
     def dataset(self) -> Dataset:
-        """Where they come from."""
+        """Data set that the pairs come from."""
         return self._dataset
 
     def pair(self, number: int) -> Pair:
-        """What a method sees; its arrays are read-only."""
+        """Pair of images (down, up) as a method sees it; the arrays are read-only."""
         return self.pair_and_frames(number)[0]
 
     def pair_and_frames(self, number: int) -> tuple[Pair, Frames]:
-        """What a method sees, and the frames behind it, with the camera's JPEG files."""
+        """Pair as a method sees it, and the frames behind it, with the camera's JPEG files."""
         pair_draw, sample, source = self.drawn_from(number)
         frames = source.frames(pair_draw.noise_draw, laser_off=pair_draw.laser_off)
         images = {name: _sealed(frame.image) for name, frame in frames.by_name.items()}
@@ -73,11 +76,11 @@ class DrawnPairs:
         return source.frame(position, pair_draw.noise_draw, laser).image
 
     def card(self, number: int) -> SensorCard:
-        """Numbers of the sensor, with the exposure that was chosen; no frame is drawn."""
+        """Numbers of the sensor, with the exposure that was chosen; no frame is simulated."""
         return card_of(self.drawn_from(number)[2].sides["down"].chain.sensor)
 
     def drawn_from(self, number: int) -> tuple[PairDraw, CachedSample, FrameSource]:
-        """What is drawn, the sample with its layers, and the source of its frames."""
+        """Description of a pair, its sample with the layers, and the source of its frames."""
         if not 0 <= number < len(self._pair_draws):
             raise DatasetError(
                 f"pair {number}: there are {len(self._pair_draws)}, numbered from 0; ask for one of them"
@@ -94,7 +97,7 @@ class DrawnPairs:
 def pairs_of(
     dataset: Dataset, samples: Sequence[Sample], preset: str, draws: int = 1, laser_off: bool = True
 ) -> DrawnPairs:
-    """Pairs of some samples in one preset, in the order of the samples, then of the draws.
+    """Pairs of some samples in one preset, in the order of the samples, then of the noise realisations.
 
     Parameters
     ----------
@@ -102,6 +105,7 @@ def pairs_of(
     samples : of the data set
     preset : str
     draws : int
+        Noise realisations of each sample.
     laser_off : bool
         Whether frames with the laser off belong to them, whatever the recipe says.
     """

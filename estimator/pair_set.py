@@ -108,7 +108,7 @@ class PairTruth:
 
 
 class Pairs(Protocol):
-    """What methods see, by number from 0 to len - 1; each pair is drawn or read when it is asked for."""
+    """Pairs as methods see them, by number from 0 to len - 1; each is simulated or read on request."""
 
     def __len__(self) -> int:
         """Return the number of pairs."""

@@ -246,7 +246,7 @@ def taken_for(case: Case) -> str:
 
 
 def _is_lamp(case: Case, uv_px: Array, spot_level: float) -> bool:
-    """Whether the light at a position is clipped, or in raw pixels thrice the spot's, black level included."""
+    """Tell whether the light at a position is clipped, or in raw pixels thrice the spot's, black level included."""
     part, card = case.region(uv_px, 1, 2), case.pair.card
     if not part.size:
         return False
@@ -272,7 +272,7 @@ def _level(case: Case, uv_px: Array, less_off: bool) -> float:
 
 
 def _stands_out(case: Case) -> bool:
-    """Whether the 3 x 3 pixels of the spot rise above the ring around them in any colour; see rule 7."""
+    """Tell whether the 3 x 3 pixels of the spot rise above the ring around them in any colour (`compression`)."""
     middle = np.floor(np.array(case.spot.uv_px) + 0.5)
     around = case.region(middle, _RING[1], _RING[1])
     inside = np.minimum(middle, _RING[1]).astype(int)  # of the pixel in the region: less where the image begins

@@ -1,8 +1,10 @@
-"""Two scores of the same pairs: paired differences, with intervals over the samples that both have.
+"""Comparison of two scores of the same pairs: paired differences with intervals over the samples that both have.
 
-Errors are compared over the images (or pairs) that both found, so that the one that skips the hard ones gains
-nothing; rates and the figures that count missed spots over all visible ones. Both are resampled together. Every
-metric has its own interval: of two equal methods, one metric in twenty calls one of them better at 95 %.
+Errors are compared over the images (or pairs) that both methods found. A method that skips the hard ones gains nothing
+from it. Rates, and figures that count missed spots, are compared over all visible spots.
+
+Both scores are resampled together, and every metric has its own interval. The intervals are not corrected for the
+number of metrics: at 95 %, one metric in twenty favours one of two equal methods.
 """
 
 from __future__ import annotations
@@ -122,7 +124,7 @@ def note_on_code(first: ScoreDocument, second: ScoreDocument) -> str:
 
 
 def same_pairs(document: ScoreDocument) -> dict[str, Any]:
-    """What must be equal for two scores to be of the same pairs."""
+    """Entries of a score's pair set that must be equal for two scores to be of the same pairs."""
     return {key: value for key, value in document.pair_set.items() if key not in _MAY_DIFFER}
 
 

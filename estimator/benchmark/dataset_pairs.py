@@ -303,7 +303,7 @@ class CalibratedPairs:
         return len(self._pairs)
 
     def pair(self, number: int) -> Pair:
-        """What a method sees."""
+        """Images of a pair, with the calibrated rig and its covariance."""
         seen = self._pairs.pair(number)
         return replace(
             seen,
@@ -360,7 +360,7 @@ def of_calibration(dataset: Dataset, calibration: Calibration) -> Dataset:
 
 
 def _of_another(dataset: Dataset, calibration: Calibration) -> bool:
-    """Whether the calibration says that it was made from another data set."""
+    """Tell whether the calibration names another data set as its source."""
     return calibration.made_from.get("dataset", dataset.info.name) != dataset.info.name
 
 

@@ -1,4 +1,7 @@
-"""A score on disk: one JSON document per run of one method, and its records beside it as Parquet with the same stem."""
+"""Score document: one JSON file per run of one method, with its records beside it as Parquet under the same stem.
+
+The document names the SHA-256 of the records. Numbers are in SI units; null stands where there is no number.
+"""
 
 from __future__ import annotations
 
@@ -68,7 +71,7 @@ class StratumScore(Document):
 
 
 class MethodCard(Document):
-    """Which method: the reference it was called by, where it is, the hash of its code (null if it cannot be told)."""
+    """Identity of a method: its reference, its place, and the hash of its code (null if it cannot be told)."""
 
     reference: str
     name: str = Field(default="", description="by default what follows the last slash of the reference")
@@ -105,7 +108,7 @@ class EncodedPicture(Document):
         return u, v
 
     def holds(self, uv_px: tuple[float, float]) -> bool:
-        """Whether a position of the frame lies in the picture."""
+        """Tell whether a position of the frame lies in the picture."""
         return all(0.0 <= x <= size for x, size in zip(self.place(uv_px), self.size, strict=True))
 
 
@@ -170,7 +173,7 @@ def finite(value: float | None) -> float | None:
 
 
 def parquet_path(path: Path) -> Path:
-    """Where the records of a score lie."""
+    """Path of the records of a score."""
     return path.with_suffix(".parquet")
 
 

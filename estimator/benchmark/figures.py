@@ -110,7 +110,7 @@ def error_panels(scores: Named) -> list[Picture]:
 
 
 def error_maps(tables: Tables) -> dict[str, Picture]:
-    """Where in the image errors happen: every image at its true position, its mark as large as its error."""
+    """Maps of errors over the frame: a mark at every true position, as large as the error."""
     scale, maps = _scale(tables), {}
     for name, table in tables.items():
         with mpl.rc_context(_PANEL):

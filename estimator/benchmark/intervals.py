@@ -1,22 +1,20 @@
-"""BCa intervals over samples: all draws and both images of a sample are resampled together.
+"""Confidence intervals over samples: BCa bootstrap for metrics, Clopper-Pearson for rates.
 
-A resample is a weight per sample: how often it was drawn. Statistics take weights, shape (b, n), so that one matrix
-product gives b resampled sums. The intervals are those of `scipy.stats.bootstrap` (B. Efron, J. Am. Stat. Assoc. 82,
-171, 1987).
+Images of one sample share its errors. All noise realisations and both images of a sample are therefore resampled
+together. A resample is a weight per sample, its number of occurrences. Statistics take weights, shape (b, n), so that
+one matrix product gives b resampled sums. The BCa intervals are those of `scipy.stats.bootstrap` (B. Efron, J. Am.
+Stat. Assoc. 82, 171, 1987).
 
-Where BCa is not defined:
+BCa has no value in three cases:
 
 * fewer than `least_samples` samples: no interval;
 * no spread among the resamples (all errors equal): the interval is the value itself, and the note says so;
-* all resamples on one side of the value (then the bias correction is infinite): the percentile interval, noted.
+* all resamples on one side of the value, which makes the bias correction infinite: the percentile interval, noted.
 
-Rates with intervals: a rate over images, an interval over samples.
-
-Images of one sample succeed and fail together, so that the n of a binomial interval is an effective one: that of a
-simple random sample whose rate would vary as the clustered one does (E. L. Korn, B. I. Graubard, Survey Methodology 24,
-193, 1998), at most the number of images, and reduced for the degrees of freedom. Then the exact interval of
-C. J. Clopper and E. S. Pearson, Biometrika 26, 404 (1934), with beta quantiles. At a rate of 0 or 1 the spread cannot
-be seen: the samples are counted as if the images of one sample were always alike.
+A rate over images has the exact interval of C. J. Clopper and E. S. Pearson, Biometrika 26, 404 (1934), with beta
+quantiles. Its n is an effective one: that of a simple random sample whose rate would vary as the clustered one does
+(E. L. Korn, B. I. Graubard, Survey Methodology 24, 193, 1998). It is at most the number of images, and is reduced for
+the degrees of freedom. A rate of 0 or 1 shows no spread: images of one sample then count as always alike.
 """
 
 from __future__ import annotations
@@ -58,7 +56,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Clusters:
-    """Which sample each of some records belongs to: `index`, shape (r,), values 0 to n - 1, each at least once.
+    """Sample that each of r records belongs to: `index`, shape (r,), values 0 to n - 1, each at least once.
 
     `key` is equal for records of the same samples.
     """
@@ -180,7 +178,7 @@ def _estimate(value: float, low: float, high: float, drawn: Array, confidence: f
 
 
 def _weights(index: NDArray[np.int64], n: int) -> Array:
-    """How often each sample occurs in each row of indices, shape (b, n); float, for the matrix products."""
+    """Counts of each sample in each row of indices, shape (b, n); float, for the matrix products."""
     rows = np.arange(len(index))[:, None] * n
     return np.bincount((index + rows).ravel(), minlength=len(index) * n).reshape(-1, n).astype(float)
 

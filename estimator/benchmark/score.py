@@ -273,7 +273,7 @@ _PROBE_BOX = Box(0, 0, 16, 16)  # a method that needs boxes takes the pairs that
 
 @dataclass(frozen=True)
 class Benched:
-    """What a run wrote: the report, the score files, and which methods were left out, why."""
+    """Files of a run: the report and the scores. `notes` says which methods were left out, and why."""
 
     report: Path
     scores: tuple[Path, ...]
@@ -377,7 +377,7 @@ def wanted_pairs(
 
 
 def refusal(method: BuiltIn, pairs: PairSet) -> str:
-    """Why a built-in method cannot take the pairs of a preset; "" if it can."""
+    """Reason for which a built-in method cannot take the pairs of a preset; "" if it can."""
     return method.refusal(replace(pairs.pair(0), box_down=_PROBE_BOX, box_up=_PROBE_BOX))
 
 

@@ -1,13 +1,12 @@
-"""What is where in a sealed set, and the documents in it.
+"""Sealed set: a folder of frames without truth, the hidden truth file, and the command that makes both.
 
-seal.json       what was sealed, and the SHA-256 that the truth must have
+seal.json       settings of the set, and the SHA-256 that the truth must have
 pairs.jsonl     per pair what a user knows: rig, stroke, sensor, boxes, files
 frames/         images: PNG of 8 or 16 bits, or the camera's JPEG
 SHA256SUMS      of everything above
 
-The truth of a set as one canonical JSON file: same truth and salt, same bytes. NaN is null.
-
-Sealing a data set: frames and what a user knows go out, the truth stays, and its hash says which truth it was.
+The truth is one canonical JSON file: same truth and salt, same bytes. NaN is written as null. It stays with the
+organiser, and its hash in the seal proves later which truth it was.
 """
 
 from __future__ import annotations
@@ -237,7 +236,7 @@ _SEED_BITS = 56
 
 @dataclass(frozen=True)
 class Sealed:
-    """What sealing wrote: the public folder, the truth's file, the seal, and sentences to heed."""
+    """Result of sealing: the public folder, the truth's file, the seal, and warnings."""
 
     public: Path
     truth_file: Path

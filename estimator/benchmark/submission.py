@@ -85,11 +85,11 @@ class SealedPairs:
 
     @property
     def seal(self) -> Seal:
-        """What was sealed."""
+        """Seal of the set."""
         return self._seal
 
     def pair(self, number: int) -> Pair:
-        """What a method sees."""
+        """Images of a pair, with what a user knows of the rig."""
         row = self._row(number)
         images = {name: self._image(file) for name, file in row.files.items()}
         return Pair(
@@ -218,7 +218,7 @@ class Submission(Document):
 
 @dataclass(frozen=True)
 class Submitted:
-    """What `submit` wrote; pairs with an answer, images with a position, and what most of the others have instead."""
+    """Result of `submit`: the file, the counts of answers and positions, and the commonest reason for no position."""
 
     path: Path
     pairs: int

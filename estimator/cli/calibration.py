@@ -1,4 +1,4 @@
-"""Commands `phibench calibrate` and `phibench align`."""
+"""Commands `phibench calibrate` and `phibench align`: fit a rig's corrections, or align the mirror under the camera."""
 
 from __future__ import annotations
 

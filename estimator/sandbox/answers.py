@@ -1,6 +1,6 @@
-"""An answer as JSON can hold it, whatever a method returned: made in the method's process, judged in its parent.
+"""Answers of a method as JSON: encoded in the method's process, checked in its parent.
 
-Whether what came back is an answer; one plain sentence if not.
+A method may return anything. Encoding keeps what JSON can hold; the check gives one plain sentence if it is no answer.
 """
 
 from __future__ import annotations

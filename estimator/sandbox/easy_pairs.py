@@ -1,13 +1,10 @@
-"""Spots that are easy to see: where they are in the world and in both images. No rendering, no file.
+"""Easy pairs of images (down, up), made in NumPy without rendering: bright spots on a smooth room, an aligned rig.
 
-Pixels of an easy spot: expected electrons, noise, the converter, and a plain processing to 8 bits.
+They serve to try a method, not to rank it. There is no lamp, no stripe and no shadow, and the nominal rig is exact.
 
-The spot is a Gaussian integrated over the pixels, the room a smooth slope. Noise is Gaussian with the variance of
-Poisson's law, which no easy spot can tell from it; PRNU and DSNU belong to the camera and stay.
-
-A small set of easy pairs, made in NumPy without rendering: bright spots on a smooth room, seen by an aligned rig.
-
-For trying a method, not for ranking it: no lamp, no stripe, no shadow, and the rig is what the method believes it is.
+A spot is a Gaussian integrated over the pixels; the room is a smooth slope. The noise is Gaussian with the variance of
+Poisson's law: no easy spot is faint enough to tell the two apart. PRNU and DSNU belong to the camera and are the same
+in every frame. Expected electrons go through noise, converter and a plain processing to 8 bits.
 """
 
 from __future__ import annotations
@@ -230,11 +227,11 @@ class EasyPairs:
             raise MethodError(f"no easy pairs for preset '{self.preset}': {nearest(self.preset, KINDS)}")
 
     def __len__(self) -> int:
-        """How many."""
+        """Return the number of pairs."""
         return self.count
 
     def pair(self, number: int) -> Pair:
-        """What a method sees."""
+        """Images of a pair, with its exact rig."""
         scene, camera = _scene(self.rig, number), self._camera()
         images: dict[str, Any] = {
             f"{name}{'' if on else '_off'}": camera.image(

@@ -158,7 +158,7 @@ def meet(origins_m: Array, directions: Array, radius_m: float, form: Form) -> tu
     foot2 = np.einsum("ni,ni->n", foot, foot)
 
     def q(x: Array) -> Array:
-        """How far beyond the surface the ray is at a distance x from the foot, in squares of metres."""
+        """Excess of the ray over the surface at a distance x from the foot, in squares of metres."""
         rho2 = foot2 + x * x
         with np.errstate(invalid="ignore"):
             return rho2 - (radius_m + added((foot + x[:, None] * directions) / np.sqrt(rho2)[:, None])) ** 2
@@ -183,7 +183,7 @@ def _added(form: Form) -> Radius:
 
 
 def _lowest(q: Radius, radius_m: float, count: int) -> Array:
-    """Where a function that is nearly a parabola x^2 + c is least, shape (N,)."""
+    """Minimiser of a function that is nearly a parabola x^2 + c, shape (N,)."""
     lowest = np.zeros(count)
     with np.errstate(invalid="ignore", divide="ignore"):
         for width in _NARROWING:

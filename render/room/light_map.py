@@ -255,7 +255,7 @@ def light_map(view: View, room: Room, settings: BakeSettings, folder: Path | Non
 
 
 def is_cached(view: View, room: Room, settings: BakeSettings, folder: Path | None = None) -> bool:
-    """Whether the cache holds the light map, so that `light_map` takes no time."""
+    """Tell whether the cache holds the light map, so that `light_map` takes no time."""
     try:
         return _entry(view, room, settings, folder).is_file()
     except PackageNotFoundError:  # without Mitsuba nothing has been baked
