@@ -90,7 +90,7 @@ def test_a_drawn_data_set_is_what_its_recipe_means(made: Path) -> None:
         assert sample.laser_spot == drawn.spots[pair.spot]
         assert sample.row.drawn == dict(pair.drawn)
         assert (sample.row.tries, sample.row.rig) == (1, sample.row.sample_id.replace("random-", "r"))
-        assert sample.expected_image("up").shape == (3, 180, 320)
+        assert sample.expected_image("up").shape == (3, 90, 160)
         distance = math.dist(sample.row.spot_world_m[:2], sample.rig.at(0.0).sphere_centre_m[:2])
         assert sample.row.depth_m == pytest.approx(distance, rel=1e-14)
     with pytest.raises(DatasetError, match=r"has 3 rigs; take each sample's own"):
