@@ -1,4 +1,4 @@
-"""Making a data set: recipe in, folder out. `preview` says beforehand what that means."""
+"""Rendering of a data set: `make` turns a recipe into a folder, `dry_run` only tells tasks, bytes and seconds."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 from rich.console import Console
 
 from phibench.datasets.build.forecast import PairForecast, forecast, pair_forecasts, pair_table, slowdown
-from phibench.datasets.build.journal import Head, Journal
+from phibench.datasets.build.journal import FolderHead, Journal
 from phibench.datasets.build.run_tasks import (
     assemble,
     claim,
@@ -79,7 +79,7 @@ def make(
     return out
 
 
-def preview(
+def dry_run(
     recipe: str | Path,
     out: str | Path,
     workers: int | None = None,
@@ -160,7 +160,7 @@ def make_from_plan(
 def _make(plan: Plan, recipe: str, out: Path, pool: WorkerPool, journal: Journal, console: Console) -> list[str]:
     started, began = time.monotonic(), datetime.now(UTC)
     environment, no_renderer = _environment(pool, journal)
-    head = Head(_info_text(dataset_info(plan, environment), journal), recipe)
+    head = FolderHead(_info_text(dataset_info(plan, environment), journal), recipe)
     tasks = plan_tasks(plan, versions(environment))
     todo = unfinished(tasks, journal, out)
     if todo and no_renderer is not None:
@@ -199,7 +199,7 @@ def _environment(pool: WorkerPool, journal: Journal) -> tuple[Environment, NoRen
         return {**held, "commit": provenance()["commit"], "code_sha256": code_sha256()}, error
 
 
-def _loose_ends(plan: Plan, head: Head, journal: Journal, tasks: Iterable[str], out: Path) -> list[str]:
+def _loose_ends(plan: Plan, head: FolderHead, journal: Journal, tasks: Iterable[str], out: Path) -> list[str]:
     """Documents to be written, and files to be removed, when every task is done."""
     entries = {name: journal.entries[name] for name in tasks}
     files = [name for entry in entries.values() for name in entry.files]

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from phibench.datasets.build.journal import Entry, Head, Journal
+from phibench.datasets.build.journal import Entry, FolderHead, Journal
 from phibench.datasets.build.run_tasks import (
     assemble,
     claim,
@@ -67,7 +67,7 @@ def merge(out: str | Path, shards: Sequence[str | Path], console: Console | None
     return out
 
 
-def _collect(folders: list[Path]) -> tuple[Head, DatasetInfo, dict[str, tuple[Entry, Path]]]:
+def _collect(folders: list[Path]) -> tuple[FolderHead, DatasetInfo, dict[str, tuple[Entry, Path]]]:
     """Head and info of the whole, and every task's entry with the folder that has its files."""
     if not folders:
         raise DatasetError("give the folders of the shards")
@@ -83,17 +83,17 @@ def _collect(folders: list[Path]) -> tuple[Head, DatasetInfo, dict[str, tuple[En
         for name, entry in Journal(folder).entries.items():
             if entries.setdefault(name, (entry, folder))[0].files != entry.files:
                 raise DatasetError(f"{name} has other bytes in {folder} than in {entries[name][1]}; repair one of them")
-    return Head(info_text(whole[0]), heads[0].recipe), whole[0], entries
+    return FolderHead(info_text(whole[0]), heads[0].recipe), whole[0], entries
 
 
-def _finished(folder: Path) -> Head:
+def _finished(folder: Path) -> FolderHead:
     head = Journal(folder).head
     if head is None or not (folder / CHECKSUMS).is_file():
         raise DatasetError(f"{folder} is not a finished shard; run its `phibench dataset make` again")
     return head
 
 
-def _whole(info: DatasetInfo, head: Head) -> DatasetInfo:
+def _whole(info: DatasetInfo, head: FolderHead) -> DatasetInfo:
     """Description of the data set that a shard is a part of."""
     plan = make_plan(parse_recipe(head.recipe))
     if recipe_sha256(plan.recipe) != info.recipe_sha256:
@@ -162,7 +162,7 @@ def repair(
     return make_from_plan(plan, head.recipe, folder, workers, console, scheduler)
 
 
-def _recipe(folder: Path, head: Head, info: dict[str, object]) -> Recipe:
+def _recipe(folder: Path, head: FolderHead, info: dict[str, object]) -> Recipe:
     if not head.recipe:
         raise DatasetError(f"{folder / schema.RECIPE} is missing; put the right one back")
     recipe = parse_recipe(head.recipe, f"{folder / schema.RECIPE}")

@@ -29,7 +29,7 @@ from phibench.datasets.store.documents import (
     read_manifest,
     read_rigs,
     read_sensitivities,
-    to_frame,
+    to_table,
 )
 from phibench.datasets.store.layers import SpotWindow, read_ambient, read_ambient_variance, read_spot, read_truth
 from phibench.datasets.store.schema import RIGS, DatasetInfo, ManifestRow, SpotRow
@@ -145,7 +145,7 @@ class Dataset:
 
     def to_polars(self) -> DataFrame:
         """Truth of all samples as a polars table, one row each: columns as in `manifest.parquet` (see FORMAT.md)."""
-        return to_frame(self.rows)
+        return to_table(self.rows)
 
     def __repr__(self) -> str:
         spots = [row.position(position) for row in self.rows for position in POSITIONS]

@@ -20,8 +20,8 @@ from phibench.datasets.store.pictures import (
     Picture,
     captioned,
     crop,
+    display_exposure_s,
     enlarged,
-    exposure_s,
     halved,
     marked,
     save_png,
@@ -179,7 +179,7 @@ def _height(parts: list[Picture]) -> int:
 def _pictures(sample: Sample, position: str) -> tuple[Picture, Picture]:
     detector, spot = sample.rig.camera.detector, sample.truth_row(position)
     frame = sample.expected_image(position)
-    exposure = exposure_s(halved(sample.ambient(position)), detector)
+    exposure = display_exposure_s(halved(sample.ambient(position)), detector)
     overview = marked(to_srgb(halved(halved(frame)), detector, exposure), spot, 4)
     window = crop(frame, spot)
     peak = float(window[1].max(initial=1.0))

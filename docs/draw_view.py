@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from phibench.datasets.read import Sample, open_dataset
-from phibench.datasets.store.pictures import exposure_s, to_srgb
+from phibench.datasets.store.pictures import display_exposure_s, to_srgb
 
 _HALF, _ZOOM, _POSITION = 14, 12, "down"  # enlarged part, in image pixels either side
 
@@ -18,7 +18,7 @@ def draw(sample: Sample) -> Image.Image:
     """Full frame, with the part around the spot's true position enlarged in the lower left corner."""
     frame = sample.expected_image(_POSITION, laser=True)
     detector = sample.rig.camera.detector
-    picture = to_srgb(frame, detector, exposure_s(sample.ambient(_POSITION), detector))
+    picture = to_srgb(frame, detector, display_exposure_s(sample.ambient(_POSITION), detector))
     row = sample.row.position(_POSITION)
     u, v = round(row.u_px), round(row.v_px)
     crop = np.s_[v - _HALF : v + _HALF + 1, u - _HALF : u + _HALF + 1]

@@ -1,7 +1,7 @@
-"""Validation: one clear sentence per fault, with path, value, allowed range and advice.
+"""Range checks for scene descriptions, and readable messages for pydantic errors in recipe tables.
 
-The first half checks numbers of the descriptions in `scenes` and raises `SceneError`. The second half words the faults
-that pydantic finds in a table that a file fills, such as a recipe.
+Each message is one sentence: path, value, allowed range and advice. The first half checks numbers of the descriptions
+in `scenes` and raises `SceneError`. The second half words pydantic's errors in a table that a file fills.
 """
 
 from __future__ import annotations

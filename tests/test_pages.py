@@ -21,12 +21,7 @@ PAGES = sorted(
 )
 # History is written once and describes commands and files of its time.
 HISTORY = {"CHANGELOG.md"}
-# Pages that still have long sentences or lines. Take a page out when it is mended; a new page is held from the start.
-NOT_YET = {
-    "datasets/RECIPE.md",
-}
 PRESENT = [page for page in PAGES if page not in HISTORY]
-HELD = [page for page in PRESENT if page not in NOT_YET]
 MAX_WORDS = 25
 MAX_COLUMNS = 120
 # Words of other places that no reader of the repository can look up.
@@ -123,20 +118,20 @@ def selects(expression: str, source: str, name: str) -> bool:
     return bool(eval(python))  # True, False, and, or, not, brackets: nothing else is left
 
 
-@pytest.mark.parametrize("page", HELD)
+@pytest.mark.parametrize("page", PRESENT)
 def test_sentences_are_short(page):
     long = [(words(s), s) for block in blocks(read(page)) for s in sentences(block) if words(s) > MAX_WORDS]
     assert not long, "\n".join(f"{n} words: {s}" for n, s in long)
 
 
-@pytest.mark.parametrize("page", HELD)
+@pytest.mark.parametrize("page", PRESENT)
 def test_lines_are_short(page):
     lines = enumerate(read(page).split("\n"), 1)
     long = [n for n, line in lines if len(line) > MAX_COLUMNS and not in_table(line) and " " in line.strip()]
     assert not long, f"lines beyond {MAX_COLUMNS} columns: {long}"
 
 
-@pytest.mark.parametrize("page", [*HELD, *sorted(HISTORY)])
+@pytest.mark.parametrize("page", [*PRESENT, *sorted(HISTORY)])
 def test_links_are_alive(page):
     text = CODE.sub("", FENCE.sub("", read(page)))
     dead = []
@@ -150,13 +145,13 @@ def test_links_are_alive(page):
     assert not dead
 
 
-@pytest.mark.parametrize("page", HELD)
+@pytest.mark.parametrize("page", PRESENT)
 def test_files_that_are_named_exist(page):
     named = {path for piece in code_pieces(read(page)) for path in REPOSITORY_PATH.findall(piece)}
     assert not [path for path in sorted(named) if "NAME" not in path and not list(ROOT.glob(path))]
 
 
-@pytest.mark.parametrize("page", HELD)
+@pytest.mark.parametrize("page", PRESENT)
 def test_tests_that_are_named_exist(page):
     missing = []
     for piece in code_pieces(read(page)):
@@ -172,7 +167,7 @@ def test_tests_that_are_named_exist(page):
     assert not missing
 
 
-@pytest.mark.parametrize("page", HELD)
+@pytest.mark.parametrize("page", PRESENT)
 def test_commands_that_are_named_exist(page):
     unknown = []
     for piece in code_pieces(read(page)):
@@ -190,7 +185,7 @@ def is_command(name: str, sub: str | None) -> bool:
     return not group or sub is None or sub in group
 
 
-@pytest.mark.parametrize("page", HELD)
+@pytest.mark.parametrize("page", PRESENT)
 def test_make_targets_that_are_named_exist(page):
     targets = set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M))
     named = {m[1] for piece in code_pieces(read(page)) if (m := re.match(r"(?:time )?make ([a-z][\w-]*)", piece))}
@@ -240,7 +235,7 @@ def test_the_examples_of_the_page_run(page, tiny_dataset, tmp_path, monkeypatch)
 
 
 def test_pages_that_are_excused_exist():
-    assert set(PAGES) >= NOT_YET
+    assert set(PAGES) >= HISTORY
 
 
 def test_nothing_is_named_that_only_the_authors_have():

@@ -1,4 +1,4 @@
-"""Task that bakes the light map of a data set's room, or takes it from the user's cache."""
+"""Task of the light map: the irradiance of a data set's room, computed once or taken from the user's cache."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Journal of a folder: the finished tasks with the hashes of their files.
+"""Log of the finished tasks of a folder, for resuming: the journal.
 
-It decides what is finished; names and times of files do not.
+It alone decides what is finished; names and times of files do not.
 
-Each line is one entry: a CRC-32 and a JSON object. The first is the head, with the texts of `dataset.json` and
+Each line is one entry: a CRC-32 and a JSON object. The first is the folder's head, with the texts of `dataset.json` and
 `recipe.toml`, so that these can be repaired. One entry per finished task follows; the last one of a name counts. A line
 that was half-written or damaged fails its CRC and is ignored: its task is done again.
 """
@@ -31,7 +31,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Head:
+class FolderHead:
     """Description of the folder: the text of `dataset.json`, and of the recipe."""
 
     info: str
@@ -43,18 +43,18 @@ class Journal:
 
     Attributes
     ----------
-    head : Head or None
+    head : FolderHead or None
     entries : dict of Entry by task
     """
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / schema.JOURNAL
         self._file: IO[bytes] | None = None
-        self.head: Head | None = None
+        self.head: FolderHead | None = None
         self.entries: dict[str, Entry] = {}
         for document in _documents(self._path):
             if "info" in document:
-                self.head = Head(**document)
+                self.head = FolderHead(**document)
             else:
                 self.entries[document["task"]] = Entry(**document)
 
@@ -66,7 +66,7 @@ class Journal:
             self._file.close()
             self._file = None
 
-    def begin(self, head: Head, tasks: Iterable[str]) -> None:
+    def begin(self, head: FolderHead, tasks: Iterable[str]) -> None:
         """Write the journal anew, atomically: this head, and the entries of these tasks in this order."""
         self.__exit__()
         self.head = head

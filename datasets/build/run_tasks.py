@@ -18,7 +18,7 @@ from pathlib import Path
 from rich.console import Console
 
 from phibench.datasets.build.forecast import Pace, TaskProgress, forecast, megabytes, slowdown
-from phibench.datasets.build.journal import Entry, Head, Journal
+from phibench.datasets.build.journal import Entry, FolderHead, Journal
 from phibench.datasets.build.scheduler import schedule
 from phibench.datasets.build.task_list import sample_task_name, spot_task_name
 from phibench.datasets.build.tasks import Done, Failed, Task, log_entry
@@ -87,7 +87,7 @@ def refuse_other(out: Path, name: str) -> None:
         raise DatasetError(f"{out} holds another data set ('{held}'); give another folder or delete it")
 
 
-def held_head(out: Path) -> Head | None:
+def held_head(out: Path) -> FolderHead | None:
     """Description that a folder has of itself, by its journal or its `dataset.json`; None for an empty one.
 
     Raises
@@ -104,7 +104,7 @@ def held_head(out: Path) -> Head | None:
         raise DatasetError(f"{out} is not empty and holds no data set; give an empty or a new folder")
     read_info(out)
     recipe = (out / schema.RECIPE).read_text(encoding="utf-8") if (out / schema.RECIPE).is_file() else ""
-    return Head((out / schema.INFO).read_text(encoding="utf-8"), recipe)
+    return FolderHead((out / schema.INFO).read_text(encoding="utf-8"), recipe)
 
 
 _TOLD = 20  # failures that are told in full
@@ -128,7 +128,7 @@ def run_tasks(
     tasks: Mapping[str, Task],
     todo: list[str],
     journal: Journal,
-    head: Head,
+    head: FolderHead,
     out: Path,
     pool: WorkerPool,
     console: Console,
@@ -187,7 +187,7 @@ def _report(failures: dict[str, Failed], count: int) -> str:
 # The small files, when all tasks are done.
 
 
-def assemble(plan: Plan, head: Head, entries: Mapping[str, Entry]) -> dict[str, bytes]:
+def assemble(plan: Plan, head: FolderHead, entries: Mapping[str, Entry]) -> dict[str, bytes]:
     """All small files of a finished data set by name, SHA256SUMS last."""
     rows = [_row(pair, entries) for pair in plan.pairs]
     small = {

@@ -1,4 +1,7 @@
-"""Task that finishes a sample from its spot layers and views: its picture, and its noise budget."""
+"""Last task of a sample: its preview picture, and the error of phi that sensor noise and rendering noise cause.
+
+It reads the files of the sample's spot and of its two views.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Tasks: pure functions whose outputs are files, known by the hash of all that enters them."""
+"""Task record, its cache key (a hash of its inputs), and `perform`, which runs one task.
+
+A task is a pure function whose outputs are files.
+"""
 
 from __future__ import annotations
 

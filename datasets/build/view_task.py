@@ -11,7 +11,7 @@ from phibench.datasets.plan.plan import PosePlan
 from phibench.datasets.recipe.tables import AmbientTable
 from phibench.datasets.store import schema
 from phibench.datasets.store.layers import write_ambient, write_truth
-from phibench.datasets.store.pictures import exposure_s, save_png, to_srgb
+from phibench.datasets.store.pictures import display_exposure_s, save_png, to_srgb
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
 
@@ -45,6 +45,6 @@ def render_view(out: Path, dataset: str, rig: Rig, room: Room, pose: PosePlan, a
     write_ambient(out / schema.view_file(pose.pose_id, "ambient"), planes, layer.variance_per_s2, header_ambient)
     write_truth(out / schema.view_file(pose.pose_id, "truth"), truth_layer(view, room.shapes(view)), header)
     detector = rig.camera.detector
-    picture = to_srgb(planes, detector, exposure_s(planes, detector))
+    picture = to_srgb(planes, detector, display_exposure_s(planes, detector))
     save_png(out / schema.view_file(pose.pose_id, "preview"), picture)
     return Made(tuple(schema.view_file(pose.pose_id, name) for name in ("ambient", "truth", "preview")))

@@ -1,4 +1,4 @@
-"""Frames as files: all draws of all samples of a data set in one folder, with an index.
+"""Camera frames with noise for every sample of a data set, written as image files with an index.
 
 Files that are there with the right bytes are kept. A file is known by the hash of all that it depends on: names,
 request, layers, code, and the versions of the libraries that draw and compress.

@@ -1,8 +1,8 @@
-"""Draws of stroke pairs: the frames that a benchmark consists of, as a pure function of a data set's documents.
+"""A benchmark's image pairs: sample, sensor preset, noise seed, exposure, search boxes and order of each.
 
-A pair draw is one draw of the noise of one sample in one preset. All numbers of `[frames]` are drawn per sample, each
-from a random stream of its own. The order of the pair draws is drawn, too, so that a number says nothing about the
-scene.
+A pair draw is one draw of the noise of one sample in one preset. It is a pure function of the data set's documents. All
+numbers of `[frames]` are drawn per sample, each from a random stream of its own. The order is drawn, too, so that the
+number of a pair says nothing about the scene.
 
 `pair_draws` lists them, `CachedSample` reads a sample's layers once and makes the frame source of each.
 """

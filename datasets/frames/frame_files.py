@@ -1,4 +1,4 @@
-"""Files of drawn frames, and their index.
+"""One frame on disk (PNG, JPEG or EXR), and the index of a folder of frames.
 
 A frame is written as PNG, as the camera's own JPEG, or as EXR; a frame that a viewer shows dark gets a preview for
 people. The index has one row per file: its SHA-256, every number that it depends on, and the truth of its image. It is

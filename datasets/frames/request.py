@@ -1,4 +1,7 @@
-"""Request for frames: preset, exposure, levels, motion and region, checked and frozen."""
+"""FrameRequest: preset, exposure, brightness of lamps and laser, carriage speed, crop and camera seed of a frame.
+
+A request is checked and frozen. The preset is one of the sensor's.
+"""
 
 from __future__ import annotations
 

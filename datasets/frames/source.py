@@ -1,8 +1,8 @@
-"""Source of the frames of a stroke sample: its layers, read once and kept, and the camera that looks at them.
+"""FrameSource: the camera simulated on the stored layers of one sample.
 
-A frame is what the camera delivers for one draw of its noise, as an array and, for MJPEG, as the file. It is a pure
-function of (data set, seed, sample, position, laser on or off, draw) and of the request. The order of draws, processes
-and other draws do not enter. NumPy only.
+The layers are read once and kept. A frame is what the camera delivers for one draw of its noise, as an array and, for
+MJPEG, as the file. It is a pure function of (data set, seed, sample, position, laser on or off, draw) and of the
+request. The order of draws, processes and other draws do not enter. NumPy only.
 """
 
 from __future__ import annotations

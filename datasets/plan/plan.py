@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from phibench.datasets.errors import DatasetError, RecipeError
 from phibench.datasets.plan.sampling import RandomSample, draw_rigs, draw_samples
 from phibench.datasets.recipe.build import build_misalignment, build_rig, build_room, build_spot, true_stroke_m
-from phibench.datasets.recipe.tables import RandomTable, Recipe, RigsTable
+from phibench.datasets.recipe.tables import DrawnRigsTable, RandomTable, Recipe
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import seed_32
@@ -142,7 +142,7 @@ def make_plan(recipe: Recipe) -> Plan:
     return _experiment_plan(recipe, {RECIPE_RIG: rig, true_id: true_rig}, room, pairs)
 
 
-def _rigs_plan(recipe: Recipe, table: RigsTable, rig: Rig, room: Room) -> Plan:
+def _rigs_plan(recipe: Recipe, table: DrawnRigsTable, rig: Rig, room: Room) -> Plan:
     """Every experiment with every drawn rig; samples are called after both."""
     drawn = draw_rigs(recipe, table, rig, room)
     pairs = tuple(

@@ -1,4 +1,6 @@
-"""Sampling of drawn recipes: rigs, spots and strokes of `[random]`, and the misalignments of `[rigs]`.
+"""Random rigs, spots and strokes of a recipe, drawn again where the geometry is impossible.
+
+They come from `[random]`; the misalignments of `[rigs]` are drawn here, too.
 
 The number of sample i for parameter p, in [0, 1), is a function of (data set, seed, sequence, p, i) and of nothing
 else. It depends neither on how many samples there are nor on which other parameters are drawn. The distributions turn
@@ -21,7 +23,7 @@ from phibench.datasets.errors import RecipeError
 from phibench.datasets.recipe.build import build_misalignment, build_rig, build_target, ceiling_m, true_stroke_m
 from phibench.datasets.recipe.distributions import DistributionTable, pick, quantile
 from phibench.datasets.recipe.spot_placement import Boards, Placed, place
-from phibench.datasets.recipe.tables import DRAWABLE, MisalignmentTable, RandomTable, Recipe, RigsTable, RigTable
+from phibench.datasets.recipe.tables import DRAWABLE, DrawnRigsTable, MisalignmentTable, RandomTable, Recipe, RigTable
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
@@ -276,7 +278,7 @@ class DrawnRig:
     rig: Rig
 
 
-def draw_rigs(recipe: Recipe, table: RigsTable, nominal: Rig, room: Room) -> tuple[DrawnRig, ...]:
+def draw_rigs(recipe: Recipe, table: DrawnRigsTable, nominal: Rig, room: Room) -> tuple[DrawnRig, ...]:
     """All rigs of a recipe with `[rigs]`.
 
     Raises
@@ -326,7 +328,7 @@ def _made(
     return why or DrawnRig(f"r{number:06d}", tries, tuple(drawn.items()), misalignment, rig)
 
 
-def _rig_distributions(table: RigsTable) -> dict[str, DistributionTable]:
+def _rig_distributions(table: DrawnRigsTable) -> dict[str, DistributionTable]:
     """Distribution by parameter, in the order of `[misalignment]`."""
     given = ((key, getattr(table.misalignment, key)) for key in type(table.misalignment).model_fields)
     return {_PREFIX + key: one for key, one in given if isinstance(one, DistributionTable)}

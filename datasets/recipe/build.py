@@ -1,4 +1,4 @@
-"""Builders: rig, room, targets and spots of `scenes` from the tables of a recipe."""
+"""Rig, room, targets and spots of `scenes`, made from a recipe."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Faults that lie between the keys of a recipe: names, places, strokes, and the rig as a whole.
+"""Checks across several keys of a recipe: names, places, strokes, and the rig as a whole.
 
-Types and ranges are the business of the tables. The checks here work on the raw document, so that their faults are
+The tables check types and ranges. The checks here work on the raw document, so that their faults are
 reported together with those. A faulty key is left out of what they look at: one mistake gives one line.
 """
 
@@ -23,7 +23,7 @@ from phibench.datasets.recipe.build import (
     true_stroke_m,
 )
 from phibench.datasets.recipe.distributions import DistributionTable, Table, one_number
-from phibench.datasets.recipe.spot_placement import cut_part, room_left_m
+from phibench.datasets.recipe.spot_placement import cut_part, free_margin_m
 from phibench.datasets.recipe.tables import (
     DRAWABLE,
     MAX_STROKE_M,
@@ -231,7 +231,7 @@ def _off_board(spot: Raw, laser: LaserTable, targets: Sequence[TargetTable]) -> 
         if table is None:
             continue
         farthest = max(map(abs, table.support))
-        left, name = min((room_left_m(laser, target)[axis], target.name) for target in drawn)
+        left, name = min((free_margin_m(laser, target)[axis], target.name) for target in drawn)
         if left < 0.0:
             text = f"a spot at the centre of the board '{name}' already reaches {-left:.3f} m beyond its edge"
             yield Fault(f"random.spot.{key}", f"{text}; make the spot smaller (see laser.diameter_m)")

@@ -1,7 +1,6 @@
-"""Distributions of a recipe: tables that say what is drawn, and their quantile functions.
+"""Probability distributions of a recipe's numbers, and `Table`, the strict base class of all recipe tables.
 
 A value is the quantile of a number u in [0, 1), so any sequence of points in the unit interval can be used.
-`Table` is the base class of every table of a recipe.
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ from phibench.datasets.recipe.tables import (
     AmbientTable,
     DatasetTable,
     DistractorTable,
+    DrawnRigsTable,
     ExperimentTable,
     FramesTable,
     LaserTable,
@@ -25,7 +26,6 @@ from phibench.datasets.recipe.tables import (
     RandomRigTable,
     RandomSpotTable,
     RandomTable,
-    RigsTable,
     RigTable,
     RoomTable,
     TargetTable,
@@ -43,7 +43,7 @@ TABLES: dict[str, type[BaseModel]] = {
     "[ambient]": AmbientTable,
     "[[targets]]": TargetTable,
     "[[experiments]]": ExperimentTable,
-    "[rigs]": RigsTable,
+    "[rigs]": DrawnRigsTable,
     "[rigs.misalignment]": RandomMisalignmentTable,
     "[random]": RandomTable,
     "[random.rig]": RandomRigTable,
@@ -95,30 +95,35 @@ metres, (x, y, z) the direction from the sphere centre in the world's axes at th
 `depth_m` of its target. For a Gaussian profile that is 4 sigma (the 1/e^2 diameter).
 """,
     "[[targets]]": """At least one. A board that faces the world's z axis, with the laser spot at its centre.
-**`depth_m` here is measured from the world's z axis; `depth_m` of the manifest is D,
+**`depth_m` here is measured from the world's z axis. `depth_m` of the manifest is D,
 measured from the vertical through the sphere centre at the down position.** They are the
-same number as long as the sphere is on the z axis, and differ where `rig.decentre_x_m` or
+same number as long as the sphere is on the z axis. They differ where `rig.decentre_x_m` or
 `rig.decentre_y_m` is not 0. Scores use the manifest's.
 """,
     "[[experiments]]": """At least one, or `[random]` instead. Every one of its targets is seen with every one of
 its strokes.
 """,
     "[rigs]": """Optional, with `[[experiments]]`: so many rigs are drawn, and every experiment is made with each
-of them. Rig k depends on the seed, on the distributions and on k, not on `count`: make the same folder again
-with more, and only the new ones are rendered. `[rig]` is the nominal rig of all of them. Where a rig is
-impossible or one of the strokes would lead into a board or a lamp, it is drawn again, at most 100 times.
+of them. Rig k depends on the seed, on the distributions and on k, not on `count`. Make the same folder again
+with more, and only the new ones are rendered. `[rig]` is the nominal rig of all of them. A rig is drawn again,
+at most 100 times, if it is impossible or a stroke would lead into a board or a lamp.
 Samples are called `<experiment>-<target>-h<stroke>-r<rig>`, rigs `r000000` and so on.
 """,
     "[rigs.misalignment]": """Any key of `[misalignment]`, within its range, in place of the value there; at least one.
 Independent random streams, one per parameter.
 """,
     "[random]": """Instead of `[[experiments]]`: `samples` stroke pairs, each with a rig, a spot and a stroke that are
-drawn. Sample i depends on the rest of the recipe and on i, not on `samples`: make the same
-folder again with more, and only the new ones are rendered. Where rig, spot and stroke do not
-go together (the mirror would not be before the lens, the distortion would fold the image, the
-carriage would cut a board or reach the lamps, a spot found by a ray would not lie wholly on
-one face), the sample alone is drawn again, at most 100 times; the manifest counts `tries`.
-Spots that the mirror does not show are kept, with the cause.
+drawn. Sample i depends on the rest of the recipe and on i, not on `samples`. Make the same
+folder again with more, and only the new ones are rendered. Spots that the mirror does not show are kept,
+with the cause.
+
+A sample alone is drawn again, at most 100 times, where rig, spot and stroke do not go together. The manifest
+counts `tries`. The reasons:
+
+* The mirror would not be before the lens.
+* The distortion would fold the image.
+* The carriage would cut a board or reach the lamps.
+* A spot found by a ray would not lie wholly on one face.
 
 `sobol` takes Sobol's points, each dimension scrambled by a random stream of its own;
 `independent` takes a random stream per parameter. Every distribution draws on its own: the value of one does
@@ -134,23 +139,27 @@ that `[random.rig]` gives is the nominal one.
     "[random.spot]": """Either on a board: `target`, `across_m`, `up_m`; a Gaussian spot needs 4 sigma (its diameter) to
 every edge, a uniform one its radius. The boards themselves stand still: all samples share the
 light of the room. Or by a ray: `azimuth_deg` and `height_m`. The spot is then where a horizontal
-ray from the world's z axis first meets a wall, furniture or a board; the robot does not stop
-it; lamps carry no spots. Its diameter grows with that distance, its albedo is
+ray from the world's z axis first meets a wall, furniture or a board. The robot does not stop
+it. Lamps carry no spots. Its diameter grows with that distance, its albedo is
 `laser.albedo` whatever it lies on.
 """,
     "[frames]": """Optional. How the frames of a benchmark are taken. **Nothing of it is rendered**: it may be changed
 in a finished data set, and making it again writes `dataset.json` anew and nothing else. Each number is drawn
-per sample from a random stream of its own, is the same in all presets, and keeps the preset's value where it is
-not given; what a preset does not use (`jpeg_quality` before MJPEG) does nothing. Down and up share all of it.
-A box holds its spot anywhere, at least 4 px from its edges, so that its centre tells nothing; it stays in the
-image; where the image has no place of the spot, the box is anywhere. `hint` gives both boxes or none.
+per sample from a random stream of its own, and is the same in all presets. It keeps the preset's value where it is
+not given. A number that a preset does not use (`jpeg_quality` before MJPEG) does nothing. Down and up share all of
+it. A box holds its spot anywhere, at least 4 px from its edges, so that its centre tells nothing. It stays in the
+image. Where the image has no place of the spot, the box is anywhere. `hint` gives both boxes or none.
 """,
     "[[distractors]]": """Optional. Each is a flat Lambertian disc of the laser's wavelength, not rendered but computed
-when frames are drawn, like the spot. Places, in this order: with `distance_m`, free in the room on the ray of
-`azimuth_deg` and `height_m`, facing the axis; with those two alone, where that ray ends; else anywhere on a board
-that is drawn from `target`, but not the sample's own. A distractor that the down image does not show, or whose image
-is nearer than 12 px to the spot's in either, is placed again, at most 20 times, and then left out; so is every
-distractor of a sample whose spot is seen in neither image. `flux_ratio` is at most 0.5: the spot stays the
+when frames are drawn, like the spot. The keys that are given decide its place:
+
+* With `distance_m`: free in the room on the ray of `azimuth_deg` and `height_m`, facing the axis.
+* With those two alone: where that ray ends.
+* Else: anywhere on a board that is drawn from `target`, but not the sample's own.
+
+A distractor is placed again, at most 20 times, if the down image does not show it. The same holds if its image is
+nearer than 12 px to the spot's in either image. After that it is left out. A sample whose spot is seen in neither
+image has no distractors. `flux_ratio` is at most 0.5: the spot stays the
 strongest light that goes out with the laser.
 """,
     "a distribution": """A plain number, or a table with one of these, such as `{ uniform = [0.2, 0.3] }` or

@@ -1,6 +1,6 @@
-"""Placement of drawn spots, on the boards of the recipe or where a horizontal ray from the axis ends.
+"""Positions of drawn laser spots: on a target board, or where a horizontal ray from the axis meets the room.
 
-The other half finds boards that are in the carriage's way.
+The first part finds boards that the carriage would hit.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def reach_m(spot: LaserSpot) -> float:
     return spot.diameter_m if spot.profile == "gaussian" else spot.diameter_m / 2.0
 
 
-def room_left_m(laser: LaserTable, target: TargetTable) -> tuple[float, float]:
+def free_margin_m(laser: LaserTable, target: TargetTable) -> tuple[float, float]:
     """Largest |across_m| and |up_m| with which a spot lies wholly on its board; negative where none does."""
     reach = reach_m(build_spot(laser, target))
     return BOARD_SIZE_M[0] / 2.0 - reach, BOARD_SIZE_M[1] / 2.0 - reach

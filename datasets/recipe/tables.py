@@ -1,7 +1,7 @@
-"""Recipes: what a data set is made of, as strict tables that TOML files fill.
+"""Recipe of a data set as pydantic models, one per TOML table: keys, types, ranges, defaults, meanings.
 
 Lengths are in metres, angles in radians unless the key says degrees; every key names its unit. Types and ranges stand
-here and nowhere else. `recipe/checks` knows what lies between the keys, and `recipe/load` reports all faults in one go.
+here and nowhere else. `recipe/checks` checks several keys together. `recipe/load` reports all faults in one go.
 """
 
 from __future__ import annotations
@@ -265,7 +265,7 @@ class RandomTable(Table):
     spot: RandomSpotTable = Field(default=RandomSpotTable(), description="distribution of the laser spot")
 
 
-class RigsTable(Table):
+class DrawnRigsTable(Table):
     """`[rigs]`: drawn rigs, each of which sees all `[[experiments]]`."""
 
     count: int = Field(default=1, ge=1, le=100_000, description="how many; more keep those that are there")
@@ -340,7 +340,7 @@ class Recipe(Table):
     experiments: Annotated[tuple[ExperimentTable, ...], Field(strict=False)] = Field(
         default=(), description="which targets with which strokes"
     )
-    rigs: RigsTable | None = Field(default=None, description="drawn rigs, each of which sees all experiments")
+    rigs: DrawnRigsTable | None = Field(default=None, description="drawn rigs, each of which sees all experiments")
     random: RandomTable | None = Field(default=None, description="samples that are drawn, instead of experiments")
     frames: FramesTable | None = Field(default=None, description="how frames of the samples are taken")
     distractors: Annotated[tuple[DistractorTable, ...], Field(strict=False)] = Field(

@@ -1,4 +1,4 @@
-"""Text documents of a data set: JSON of frozen descriptions, `dataset.json`, the manifest, the rigs, the sensitivities.
+"""Metadata files of a data set, as JSON, JSON lines and Parquet: info, manifest, rigs, sensitivities.
 
 Doubles survive exactly. Numbers that do not exist are NaN in Python and null in JSON and Parquet.
 
@@ -199,7 +199,7 @@ def manifest_documents(rows: Sequence[ManifestRow]) -> dict[str, bytes]:
     """Both forms as bytes, by file name."""
     return {
         schema.MANIFEST: "".join(row_line(row) + "\n" for row in rows).encode(),
-        schema.TABLE: parquet_bytes(to_frame(rows)),
+        schema.TABLE: parquet_bytes(to_table(rows)),
     }
 
 
@@ -214,7 +214,7 @@ def read_manifest(folder: Path) -> list[ManifestRow]:
     return read_rows(folder / schema.MANIFEST, ManifestRow)
 
 
-def to_frame(rows: Sequence[ManifestRow]) -> DataFrame:
+def to_table(rows: Sequence[ManifestRow]) -> DataFrame:
     """Rows as a polars table: one column per leaf, names joined by dots, null where a number does not exist."""
     import polars
 
@@ -263,7 +263,7 @@ def differences(folder: Path, rows: Sequence[ManifestRow]) -> list[str]:
     """One sentence per column in which the Parquet table differs from the rows."""
     import polars
 
-    expected = to_frame(rows)
+    expected = to_table(rows)
     try:
         table = polars.read_parquet(folder / schema.TABLE)
     except (OSError, polars.exceptions.PolarsError) as error:

@@ -31,8 +31,8 @@ _WHITE_LEVEL = 0.8
 _DARK_ROOM_ELECTRONS_PER_S = 1e5  # a room below this is shown black, the spot at its own exposure
 
 
-def exposure_s(planes: NDArray[Any], detector: Detector) -> float:
-    """Factor that brings the brighter parts of a layer, shape (3, H, W), electrons/s, to near white."""
+def display_exposure_s(planes: NDArray[Any], detector: Detector) -> float:
+    """Exposure for display: it brings the brighter parts of a layer, shape (3, H, W), electrons/s, to near white."""
     bright = float(np.percentile(_balanced(planes, detector), _WHITE_PERCENTILE))
     return _WHITE_LEVEL / max(bright, _DARK_ROOM_ELECTRONS_PER_S)
 
@@ -144,7 +144,7 @@ class Side:
 
 def sample_picture(sides: Sequence[Side], detector: Detector) -> Picture:
     """Both positions side by side, exposed for the first."""
-    exposure = exposure_s(halved(sides[0].ambient), detector)
+    exposure = display_exposure_s(halved(sides[0].ambient), detector)
     return np.concatenate([_picture(s.frame, s.position, s.spot, detector, exposure) for s in sides], axis=1)
 
 

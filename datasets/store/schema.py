@@ -1,4 +1,7 @@
-"""Schema of the files on disk: documents as pydantic models, and file names. FORMAT.md describes them; a test compares.
+"""Schema of the files of a data set: metadata as pydantic models, and file names.
+
+FORMAT.md describes them; a test compares. A certificate records that two independent computations agree: closed form
+and ray tracer, on position and flux of a spot.
 
 A number that does not exist (a spot without a reflection point) is NaN in Python and null in JSON. File names are
 relative to the folder of the data set, with forward slashes.

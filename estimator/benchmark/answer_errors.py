@@ -1,4 +1,4 @@
-"""Rules of a score, and errors of answers as arrays: position, phi, claimed covariance.
+"""Found, missed and false detections, and errors of answers: pixel, phi, whitened by their own covariance.
 
 Definitions, used by all metrics:
 

@@ -1,8 +1,8 @@
-"""Figures of a report, each a picture with its text alternative: the same scores give the same bytes.
+"""Figures of a benchmark report as SVG or PNG, each with its text alternative, and the style of all figures.
 
-A figure is one panel of about 400 px, so that it stays legible on a narrow screen; its background is transparent, so
-that a page can invert it on a dark one. Markers, lines and hatches differ, not colours alone. Also the style of all
-figures of the project.
+The same scores give the same bytes. A figure is one panel of about 400 px, so that it stays legible on a narrow screen.
+Its background is transparent, so that a page can invert it on a dark one. Markers, lines and hatches differ,
+not colours alone.
 """
 
 from __future__ import annotations

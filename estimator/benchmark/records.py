@@ -1,6 +1,6 @@
-"""One record per pair and image: answer, truth, errors, bound. The table that every score is computed from.
+"""Table that every score is computed from, one row per image: answer, truth, errors, bound.
 
-Two rows per pair, "down" and "up"; columns of the pair are in both. Null where there is nothing: no answer, no
+A pair has two rows, "down" and "up"; columns of the pair are in both. Null where there is nothing: no answer, no
 truth (a spot without an image), no claimed covariance, no bound, or a ray that does not reach. Never NaN.
 `COLUMNS` says what each column is.
 """

@@ -1,4 +1,4 @@
-"""Scores of methods on a pair set: run methods, join answers and truth, measure, name causes, keep the worst images.
+"""Benchmark of methods on a pair set: run them, compare with the truth, name causes, keep the worst images.
 
 `score_methods` is for methods that are run, `score_outcomes` for answers that are there. `bench` runs every built-in
 method on every preset of a data set that it takes, and writes one report.

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import Sample
-from phibench.datasets.store.pictures import exposure_s, to_srgb
+from phibench.datasets.store.pictures import display_exposure_s, to_srgb
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.reflection import reflect
 from phibench.scenes.frames import Array
@@ -412,5 +412,5 @@ def frame(sample: Sample, position: str, preset: str = LAYERS) -> NDArray[Any]:
         raise DatasetError(f"no colour picture of preset '{preset}'; {nearest(preset, COLOUR_PRESETS)}")
     if preset == LAYERS:
         planes, detector = sample.expected_image(position), sample.rig.camera.detector
-        return to_srgb(planes, detector, exposure_s(sample.ambient(position), detector))
+        return to_srgb(planes, detector, display_exposure_s(sample.ambient(position), detector))
     return np.asarray(sample.frame_source(preset).frame(position, 0, True).image)

@@ -252,7 +252,7 @@ def test_a_long_bake_is_not_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_the_preview_says_what_the_data_set_will_be(smallest_dataset: Path, tmp_path: Path) -> None:
-    rows, text = read_manifest(smallest_dataset), make.preview(SMALLEST, tmp_path / "out", workers=2)
+    rows, text = read_manifest(smallest_dataset), make.dry_run(SMALLEST, tmp_path / "out", workers=2)
     assert list(tmp_path.iterdir()) == []
     lines = {line.split()[0]: line for line in text.splitlines()}
     hidden = 0
@@ -275,11 +275,11 @@ def test_the_preview_says_what_the_data_set_will_be(smallest_dataset: Path, tmp_
 def test_the_preview_of_a_folder_with_a_data_set(smallest_dataset: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(smallest_dataset, tmp_path / "copy"))
     before = sorted((path, path.stat().st_mtime_ns) for path in copy.rglob("*"))
-    assert "to make: nothing, 8 tasks in all" in make.preview(SMALLEST, copy)
-    assert "to make: 1 spot, 1 view, 1 sample;" in make.preview(_changed(tmp_path, "[0.5]", "[0.6]"), copy)
+    assert "to make: nothing, 8 tasks in all" in make.dry_run(SMALLEST, copy)
+    assert "to make: 1 spot, 1 view, 1 sample;" in make.dry_run(_changed(tmp_path, "[0.5]", "[0.6]"), copy)
     assert sorted((path, path.stat().st_mtime_ns) for path in copy.rglob("*")) == before
     with pytest.raises(DatasetError, match="holds another data set"):
-        make.preview("smoke", copy)
+        make.dry_run("smoke", copy)
 
 
 def _changed(folder: Path, old: str, new: str) -> Path:

@@ -13,7 +13,7 @@ import pytest
 from helpers.folders import contents, done
 from helpers.processes import SMALLEST, living, quiet, said
 
-from phibench.datasets.build.journal import Entry, Head, Journal
+from phibench.datasets.build.journal import Entry, FolderHead, Journal
 from phibench.datasets.build.run_tasks import claim
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import make
@@ -110,7 +110,7 @@ def test_a_damaged_line_of_the_journal_costs_its_task_only(copy: Path, smallest_
 
 def test_a_torn_last_line_is_as_if_it_were_not_there(tmp_path: Path) -> None:
     with Journal(tmp_path) as journal:
-        journal.begin(Head("{}", ""), [])
+        journal.begin(FolderHead("{}", ""), [])
         journal.add(Entry("view a", "k", {"f": "0"}))
         journal.add(Entry("view b", "k", {"g": "0"}, [1.5, None]))
     whole = (tmp_path / schema.JOURNAL).read_bytes()

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from phibench.datasets.build.forecast import Pace, TaskProgress
-from phibench.datasets.build.journal import Entry, Head, Journal
+from phibench.datasets.build.journal import Entry, FolderHead, Journal
 from phibench.datasets.build.scheduler import AHEAD, TRIALS, schedule
 from phibench.datasets.build.tasks import Done, Failed, Made, Task
 
@@ -112,12 +112,12 @@ def simulate(samples: int, workers: int, folder: Path) -> tuple[int, float, floa
     before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter()
     executor = Simulated(workers)
     with Journal(folder) as journal:
-        journal.begin(Head("{}", ""), [])
+        journal.begin(FolderHead("{}", ""), [])
         for one, outcome in schedule(tasks, executor):
             assert isinstance(outcome, Done)
             files = {f"{one.kind}s/{one.name}.exr": "0" * 64}
             journal.add(Entry(one.name, "0" * 64, files, row if one.kind == "spot" else None))
-        journal.begin(Head("{}", ""), [one.name for one in tasks])
+        journal.begin(FolderHead("{}", ""), [one.name for one in tasks])
     seconds = time.perf_counter() - began
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1e3
     return len(tasks), seconds, grown, executor

@@ -15,7 +15,7 @@ from phibench.datasets.build.spot_task import make_spot
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import load_recipe
-from phibench.datasets.store.documents import differences, from_json, read_manifest, to_frame, to_json, write_manifest
+from phibench.datasets.store.documents import differences, from_json, read_manifest, to_json, to_table, write_manifest
 from phibench.datasets.store.schema import ManifestRow, columns, flat, row_line
 from phibench.scenes.catalog import c310_rig, lab
 from phibench.scenes.rig import Rig
@@ -101,7 +101,7 @@ def test_a_failed_certificate_is_refused(document: dict[str, Any]) -> None:
 def test_the_table_has_the_leaves_of_the_rows(rows: list[ManifestRow], tmp_path: Path) -> None:
     leaves = dict(flat(rows[0].model_dump(mode="json")))
     assert list(leaves) == [name for name, _ in columns()]
-    frame = to_frame(rows)
+    frame = to_table(rows)
     assert frame.columns == list(leaves)
     assert frame["down.u_px"].to_list() == [row.down.u_px for row in rows]
     assert frame["down.certificate.passed"].to_list() == [True, None]
