@@ -52,9 +52,9 @@ def make(
         Say what will be seen, where and why not, how many tasks, bytes and seconds it takes; render nothing.
     """
     if dry_run:
-        from phibench.datasets.make import dry_run
+        from phibench.datasets.make import dry_run as dry_run_text
 
-        print(dry_run(recipe, out, workers, shard=shard, samples=samples, seed=seed))
+        print(dry_run_text(recipe, out, workers, shard=shard, samples=samples, seed=seed))
         return 0
     from phibench.estimator.paper.sensitivity_table import make as make_dataset
 
