@@ -30,11 +30,12 @@ from phibench.datasets.parallel import ONE_THREAD
 from phibench.datasets.store.files import write_text
 from phibench.datasets.store.provenance import code_sha256, provenance
 
-CONNECT_S = 10.0
+CONNECT_S = 10.0  # a scheduler that is up answers at once: a longer wait would only hide a wrong address
 WORKERS_S = 60.0
+# The queue of a cluster may replace a lost worker only after minutes. Finished work is on disk either way.
 LOST_S = 300.0
 _POLL_S = 0.005
-_CENSUS_S = 2.0
+_CENSUS_S = 2.0  # counting the workers is a call to the scheduler: not before every task
 # dask lets glibc return memory at once; a view's arrays of 45 MB would then fault every page anew, 1 s a view
 _MEMORY = {"MALLOC_TRIM_THRESHOLD_": 2**31, "MALLOC_MMAP_THRESHOLD_": 2**30, "MALLOC_TOP_PAD_": 2**26}
 _MISSING = "dask.distributed is not installed: run `pip install 'phibench[cluster]'`"
@@ -60,6 +61,7 @@ class DaskExecutor:
     def submit(self, task: Task) -> None:
         """Send a task; it is not repeated by dask."""
         self._number += 1
+        # dask takes tasks of one key for one task: a task that is sent again needs a key of its own
         key = f"{task.name} #{self._number}"
         self._tasks[key] = task
         self._ended.add(self.client.submit(perform, task, self._out, self._code, key=key, pure=False, retries=0))

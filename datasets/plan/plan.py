@@ -137,6 +137,7 @@ def make_plan(recipe: Recipe) -> Plan:
         return _rigs_plan(recipe, recipe.rigs, rig, room)
     misalignment = build_misalignment(recipe.misalignment)
     true_rig = rig.perturbed(misalignment)
+    # a misalignment of zeros makes no second rig, and with it no second set of views to render
     true_id = RECIPE_RIG if true_rig == rig else TRUE_RIG
     pairs = _experiment_pairs(recipe, misalignment, true_id)
     return _experiment_plan(recipe, {RECIPE_RIG: rig, true_id: true_rig}, room, pairs)
@@ -220,6 +221,7 @@ def _offsets(pairs: Sequence[PairPlan]) -> list[tuple[str, float]]:
 
 
 def _poses(recipe: Recipe, places: Iterable[tuple[str, float]]) -> tuple[PosePlan, ...]:
+    # names have nine decimals: offsets that agree to the nanometre would write the same files
     poses = [(pose_of(*place), *place) for place in places]
     if twice := [name for name, count in Counter(pose[0] for pose in poses).items() if count > 1]:
         raise RecipeError(f"experiments: two strokes near {twice[0][1:]} m differ by less than 1 nm; make them equal")
@@ -241,6 +243,7 @@ def shard_plan(plan: Plan, shard: str | None) -> Plan:
     if shard is None:
         return plan
     i, n = parse_shard(shard)
+    # shards in a row, without a gap; their sizes differ by one sample at most
     first, end = (k * len(plan.pairs) // n for k in (i - 1, i))
     if first == end:
         raise DatasetError(f"shard {shard} is empty: there are {len(plan.pairs)} samples; use at most as many shards")

@@ -36,16 +36,17 @@ from phibench.estimator.pair_set import PairSet, PairTruth, SpotTruth
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
+# Thresholds of the rules, derived in the text above.
 LEAST_SNR = 5.0
 EDGE_BLURS = 3.0
 GOOD_RAW_PX = 1.0
 LEAST_CODES = 1.0
 LEAST_CONTRAST = 3.0
-_RING = (4, 8)
+_RING = (4, 8)  # px from the spot: 4 px are 5 blurs of the default rig, so that no light of the spot is in it
 _CLIPPED = 0.95  # of the largest code: the mean of 4 x 4 pixels in a lamp's reflection
 _LAMP_TO_SPOT = 3.0
 KINDS = ("unseen", "missed", "false")
-_PIXEL_SIGMA2 = 1.0 / 12.0
+_PIXEL_SIGMA2 = 1.0 / 12.0  # px^2: the integration over a pixel widens the optical blur by the variance of a unit box
 _OF_THE_MIRROR = ("no_reflection", "mirror_edge")
 
 
@@ -280,6 +281,7 @@ def _stands_out(case: Case) -> bool:
     distance = np.maximum(abs(rows - inside[1]), abs(columns - inside[0]))
     spot, ring = around[distance <= 1], around[distance >= _RING[0]]
     level = np.median(ring, axis=0)
+    # 1.4826 MAD is the deviation of a normal law; the mean of 3 x 3 pixels has a third of it
     error = 1.4826 * np.median(abs(ring - level), axis=0) / 3.0
     contrast = spot.mean(axis=0) - level
     return bool(np.any((contrast >= LEAST_CODES) & (contrast >= LEAST_CONTRAST * error)))

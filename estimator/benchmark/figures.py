@@ -32,13 +32,14 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7
 MARKERS = "osD^vP*X<>"
 LINES = ("-", "--", "-.", ":")
 STYLE: Any = {
-    "svg.hashsalt": "phibench",
+    "svg.hashsalt": "phibench",  # without it Matplotlib names the parts of an SVG at random
     "font.size": 9.0,
     "axes.grid": True,
     "grid.alpha": 0.35,
     "hatch.linewidth": 0.6,
 }
 _MIME = {"svg": "image/svg+xml", "png": "image/png"}
+# the date and the version of Matplotlib would change the bytes of equal figures
 _METADATA: dict[str, dict[str, Any]] = {"svg": {"Date": None}, "png": {"Software": None}}
 
 
@@ -71,7 +72,7 @@ _PANEL: Any = {**STYLE, "font.size": 10.0, "svg.fonttype": "none"}
 _SIZE = (4.2, 3.1)  # inches of 96 px
 _HATCHES = ("", "///", "...", "xx", "\\\\\\", "++", "oo", "--", "**", "||", "//", "O.", "xx..", "+++")
 _BINS = 12
-_LEAST_IN_BIN = 3
+_LEAST_IN_BIN = 3  # errors: the rms of fewer is noise
 _ROWS = (
     ("rms_phi_rad", None, "rms error of phi"),
     ("rms_px", "bound_px", "rms distance"),
@@ -263,6 +264,7 @@ def _binned(table: pl.DataFrame, column: str) -> tuple[Array, Array]:
     if not len(found):
         return np.empty(0), np.empty(0)
     radius, error = found["from_centre_px"].to_numpy(), found[column].to_numpy()
+    # a little beyond the largest radius, which would otherwise fall out of the last bin
     edges = np.linspace(0.0, radius.max() * (1.0 + 1e-9), _BINS + 1)
     index = np.clip(np.digitize(radius, edges) - 1, 0, _BINS - 1)
     n, squares = np.bincount(index, minlength=_BINS), np.bincount(index, error**2, _BINS)

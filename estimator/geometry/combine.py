@@ -18,7 +18,7 @@ from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig
 
-_STEPS = 30
+_STEPS = 30  # of Gauss-Newton: a start of D that is off by a factor 2^n takes n of them
 _DECREMENT = 1e-16  # squared distance from the minimum in standard deviations
 _FACTOR = 2.0  # by which 1 / D may change in a step
 
@@ -134,9 +134,11 @@ def _minimised(
         b[..., :2] += _apply(W1, down - uv)
         step = np.linalg.solve(_invertible(A), b[..., None])[..., 0]
         uv, q = uv + step[..., :2], np.clip(q + step[..., 2], q / _FACTOR, q * _FACTOR)
+        # -2 b is the gradient of chi^2: step . b is the squared distance from the minimum in standard deviations
         decrement = np.sum(step * b, axis=-1)
         if not np.any(decrement > _DECREMENT):
             break
+    # rounding may hold the last step above `_DECREMENT`; 1e-12 is still a millionth of a standard deviation
     return uv, q, np.asarray(decrement < 1e4 * _DECREMENT)
 
 

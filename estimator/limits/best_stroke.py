@@ -189,6 +189,7 @@ def spot_bound(rig: Rig, card: SensorCard, room_e_per_s: tuple[float, float, flo
     blur = spot_blur(rig, 0.4 * centre + 0.6 * rim)
     r, g, b = rig.camera.detector.laser_filter_response
     room = [rate * card.exposure_s for rate in room_e_per_s]
+    # behind the processing every flux costs a covariance of the codes; the bound is smooth enough for 9 of them
     fluxes = np.geomspace(100.0, 1e6, 25 if card.output == "raw" else 9)
     return spot_sigma(card, blur.round_px, room, (r, g, b), flux_e=tuple(fluxes.tolist()))
 
@@ -200,6 +201,7 @@ def without_limits(around: Surroundings) -> Surroundings:
 
 def _limits(curve: StrokeCurve, index: int) -> tuple[str, ...]:
     """Causes beside the best element of a curve on the side where the error would fall further."""
+    # "not a >= b" holds for NaN too: a stroke without any error, such as one behind the rim, limits as well
     last, sigma = len(curve.strokes_m) - 1, curve.sigma_m
     found = []
     if index == 0 and sigma[0] < sigma[1]:
@@ -229,5 +231,6 @@ def _check_covariance(covariance: Array) -> None:
     p = len(PARAMETERS)
     if covariance.shape != (p, p):
         raise DatasetError(f"covariance_rig has the shape {covariance.shape}: must be ({p}, {p}), see PARAMETERS")
+    # a singular covariance has eigenvalues 0, which rounding may make negative
     if not np.isfinite(covariance).all() or np.linalg.eigvalsh(0.5 * (covariance + covariance.T)).min() < -1e-12:
         raise DatasetError("covariance_rig is no covariance: it must be finite and positive semi-definite")

@@ -95,7 +95,7 @@ def _spot(rig: Rig, offset_m: float, point: np.ndarray[tuple[int], np.dtype[np.f
 
 ROOM_E = np.array([200.0, 180.0, 90.0])  # behind R, G, B in the middle of the image
 _SLOPE = (0.25, 0.15)  # of the room's light, relative, from the middle to the border, along u and v
-_WINDOW_PX = 41
+_WINDOW_PX = 41  # side of the window that a spot is computed in: its edges are more than 20 blurs away
 
 
 @dataclass(frozen=True)
@@ -175,6 +175,7 @@ def _room(shape: tuple[int, int], bayer: bool, dark_e: float) -> Array:
     """Smooth light, kept for the next frame."""
     across, down = np.linspace(-1.0, 1.0, shape[1]), np.linspace(-1.0, 1.0, shape[0])
     light = 1.0 + _SLOPE[0] * across + (_SLOPE[1] * down)[:, None]
+    # without filters a pixel gathers the light of all three bands
     level = ROOM_E[bayer_filters(np.array([(0, 0)]), shape)[0]] if bayer else ROOM_E.sum()
     room: Array = light * level + dark_e
     room.setflags(write=False)

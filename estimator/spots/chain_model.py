@@ -28,7 +28,7 @@ from phibench.estimator.spots.raw_pixels import PixelNoise, bayer_filters
 from phibench.scenes.frames import Array
 
 _UNITS = 2  # a window holds 2 x 2 units: the spot is at least half a unit from its sides
-_ROUNDING = 1.0 / 12.0
+_ROUNDING = 1.0 / 12.0  # variance of rounding to whole codes: uniform over one code
 UNIT_MATRIX = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -134,6 +134,7 @@ def codes(model: ChainModel, mean_e: Array) -> Codes:
     if model.tables is None:
         sigma = np.sqrt(_apply(model.squared, raw_variance_e2(model, mean_e)))
         n = noisy_srgb(linear, sigma)
+        # the slope carries (by_mean sigma)^2 through the matrices: only what is left of the variance is added as white
         excess = np.maximum(n.variance - (n.by_mean * sigma) ** 2, 0.0)
         return Codes(255.0 * n.mean, 255.0 * n.by_mean, 255.0 * n.by_mean, 255.0**2 * excess + _ROUNDING)
     gain = np.repeat(full_scale_e(model.card) / np.asarray(model.card.white_balance), linear.shape[-1] // 3)
@@ -239,6 +240,7 @@ def _rounding(shape: tuple[int, int], subsampling: str) -> Array:
     down, across = CHROMA_STEP[subsampling]
     count, n = shape[0] * shape[1], down * across
     of_codes = _ROUNDING * np.sum(YCC_FROM_RGB**2, axis=1)
-    average = {1: 0.0, 2: 0.125, 4: 0.094}[n]  # rounding of whole, half and quarter numbers
+    # mean square of rounding to whole numbers: halves err by 0, 1/2; quarters by 0, 1/4, 1/2, 1/4
+    average = {1: 0.0, 2: 0.125, 4: 0.094}[n]
     chroma = [(part + _ROUNDING) / n + average for part in of_codes[1:]]
     return np.concatenate([np.full(count, of_codes[0] + _ROUNDING), *(np.full(count // n, part) for part in chroma)])

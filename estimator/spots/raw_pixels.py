@@ -200,7 +200,7 @@ class GaussLaw:
 
 _SIGMA_PX = 2.5  # of the local mean, pixels of one phase: 5 pixels of the image
 _HIDDEN_PX = 5.0  # radius around the spot that the laser-on frame says nothing about
-_LEAST_WEIGHT = 1e-6
+_LEAST_WEIGHT = 1e-6  # keeps quotients finite where nothing around is known
 
 
 @dataclass(frozen=True)
@@ -258,6 +258,8 @@ def _of_phase(x: Array, noise: Array, known: Array) -> tuple[Array, Array]:
     typical = _smooth(known * noise) / weight
     structure = np.maximum(spread - typical, 0.0)
     gain = known * structure / np.maximum(spread, _LEAST_WEIGHT)
+    # local + gain (x - local) errs by the pixel's own noise times the gain; the rest is a Gaussian mean, whose variance
+    # falls by 4 pi sigma^2. A pixel that is not known has the structure itself as its error.
     left = np.where(known > 0.0, (gain + (1.0 - gain) / (4.0 * np.pi * _SIGMA_PX**2)) * typical, structure)
     return local + gain * (x - local), left
 

@@ -63,6 +63,7 @@ class StudyDatasets:
         name = find_recipe(recipe).stem if samples is None else f"{find_recipe(recipe).stem}-{samples}"
         target = self.folder / name
         try:
+            # imported here, so that a study of data sets that are there already runs without Mitsuba
             from phibench.datasets.make import make
 
             make(recipe, target, workers=self.workers, console=self.console, samples=samples)
@@ -211,12 +212,14 @@ def read_settings(study: Study[S], quick: bool = False, path: Path | None = None
     """
     path = path or settings_file(study.name)
     try:
+        # some editors begin UTF-8 files with a byte-order mark, which TOML does not allow
         raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise DatasetError(f"{path} is not valid TOML: {error}") from error
     reduced = raw.pop(QUICK, {})
     if not isinstance(reduced, dict):
         raise DatasetError(f"{path}: [quick] is {reduced!r}; must be a table of settings")
+    # the full settings are checked in a quick run, too: a fault must not wait for the long one
     checked = _checked(study, raw, str(path))
     return _checked(study, {**raw, **reduced}, f"{path} with its [quick]") if quick else checked
 

@@ -62,6 +62,7 @@ def vignetting(exponent: float, camera: Camera, region: Region) -> Array | float
         return 1.0
     x = (np.arange(region.u0_px, region.u1_px) - camera.cx_px) / camera.fx_px
     y = (np.arange(region.v0_px, region.v1_px) - camera.cy_px) / camera.fy_px
+    # 1 / sqrt(1 + x^2 + y^2) is the cosine of the angle from the optical axis
     return (1.0 + x * x + (y * y)[:, None]) ** (-0.5 * exponent)
 
 

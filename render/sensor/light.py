@@ -174,6 +174,7 @@ class Region:
         It ends where the image of size (height, width) ends.
         """
         (down, across), (height, width) = step, size
+        # -(-a // b) rounds up
         return Region(
             max((self.u0_px - margin[1]) // across * across, 0),
             max((self.v0_px - margin[0]) // down * down, 0),

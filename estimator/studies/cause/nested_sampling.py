@@ -65,7 +65,9 @@ def pooled(runs: Sequence[Posterior], *names: Name) -> Posterior:
     if len(runs) == 1:
         return runs[0]
     logs, own = (np.array([getattr(run, name) for run in runs]) for name in ("log_evidence", "log_evidence_error"))
+    # relative to the largest: the exponential of a log evidence itself may leave the range of doubles
     weights = np.exp(logs - logs.max())
+    # the sampler only estimates its own error: where repeated samplings scatter more, their scatter counts
     error = max(float(np.sqrt(np.mean(own**2))), float(logs.std(ddof=1))) / np.sqrt(len(runs))
     random, count = generator("study", "cause", "pooled", *names), max(len(run.points) for run in runs)
     chosen = random.multinomial(count, weights / weights.sum())
@@ -98,6 +100,7 @@ def sample(model: Model, live_points: int, stop: float, *names: Name) -> Posteri
     from dynesty import NestedSampler
 
     random = generator("study", "cause", "sampler", *names)
+    # random walks, unlike uniform draws, need no bound that holds the whole contour of the likelihood
     sampler = NestedSampler(
         model.log_likelihood,
         model.point,
@@ -271,6 +274,7 @@ def pooled_runs(
 
 def _again(repeats: int) -> list[tuple[Name, ...]]:
     """Additions to the key of each repetition; none for the first."""
+    # the first keeps the bare key: more repeats add random streams and change none
     return [(), *((repeat,) for repeat in range(1, repeats))]
 
 

@@ -104,6 +104,7 @@ def beside(points_px: Array, a_px: Array, b_px: Array) -> Array:
 def beside_best(points_px: Array) -> Array:
     """Distances, shape (n,), of points (n, 2) from their best straight line (total least squares)."""
     off = points_px - points_px.mean(axis=0)
+    # the direction of least scatter is the normal of the best line
     across = np.linalg.svd(off, full_matrices=False)[2][-1]
     return np.abs(off @ across)
 
@@ -122,6 +123,7 @@ def hidden_by(seeing: View, other: View, points_m: Array) -> np.ndarray[tuple[in
     length = np.linalg.norm(along, axis=-1)
     r = along / length[:, None]
     to_sphere = other.sphere_centre_m - P
+    # the place nearest to the other centre, on the way to the point and not beyond it
     t = np.clip(np.sum(to_sphere * r, axis=-1), 0.0, length)
     by_mirror = np.linalg.norm(to_sphere - t[:, None] * r, axis=-1) < other.rig.mirror.radius_m
     return by_mirror | (blocked_by(carriage(other), P, points_m) >= 0)
@@ -161,6 +163,7 @@ def half_width_rad(rig: Rig, apart_m: float, depth_m: float, height_m: float) ->
     start, r = ray.origin_world_m - view.sphere_centre_m, ray.direction_world
     m, cosine2, b = float(r[2] / np.hypot(*r[:2])), float(np.sum(r[:2] ** 2)), apart_m
     level = float(start[2] - m * np.hypot(*start[:2]))
+    # A cos(a)^2 + B cos(a) + C = d^2 - R^2; below 0 at a = 0 where the other mirror hides anything
     A = b * b * (cosine2 * m * m - 1.0)
     B = 2.0 * cosine2 * level * m * b
     C = b * b + cosine2 * level * level - rig.mirror.radius_m**2

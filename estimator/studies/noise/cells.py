@@ -86,6 +86,7 @@ def _bits(preset: str, rig: Rig, bits: float) -> tuple[Shot, Rig]:
 
 
 def _speckle(preset: str, rig: Rig, contrast: float) -> tuple[Shot, Rig]:
+    # M independent speckle patterns have the contrast 1 / sqrt(M); without speckle there is no M
     return Shot(sensor(preset) if contrast == OFF else sensor(preset, speckle_m=contrast**-2)), rig
 
 

@@ -34,7 +34,7 @@ from phibench.estimator.studies.noise.tables import (
 from phibench.render.sensor.settings import SensorError
 from phibench.scenes.validation import nearest
 
-FEW_PLACES = 20
+FEW_PLACES = 20  # the bootstrap resamples places: its intervals of few places are too narrow
 _Words = Annotated[tuple[str, ...], Field(strict=False)]
 _Levels = Annotated[tuple[float, ...], Field(strict=False)]
 

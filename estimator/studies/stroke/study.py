@@ -41,7 +41,7 @@ AS_BUILT, CALIBRATED, EXACT = "as built", "calibrated by the outline", "pixels a
 _Depths = Annotated[tuple[Annotated[float, Field(ge=0.2, le=20.0)], ...], Field(strict=False, min_length=1)]
 _Preset = Literal["bayer-raw", "srgb8", "mjpeg"]
 _Range = Annotated[tuple[float, float], Field(strict=False)]
-_FREE_STROKES_M = (0.1, 6.0)
+_FREE_STROKES_M = (0.1, 6.0)  # beyond every carriage: by geometry alone the best stroke is 1.2 to 2 D
 
 
 class CheckSettings(Settings):
