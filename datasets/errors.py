@@ -1,4 +1,4 @@
-"""What goes wrong with recipes and data sets; every message is for the person at the terminal."""
+"""Errors of recipes and data sets; every message is for the person at the terminal."""
 
 from __future__ import annotations
 

@@ -188,7 +188,7 @@ def _ends(names: Sequence[str]) -> str:
 
 @dataclass(frozen=True)
 class Sample:
-    """One stroke pair. `position` is "down" or "up" everywhere."""
+    """Sample: pair of images (down, up) of one spot. `position` is "down" or "up" everywhere."""
 
     dataset: Dataset = field(repr=False)
     row: ManifestRow

@@ -1,4 +1,4 @@
-"""Interface of a method: the stroke pair that it sees, the answer that it gives, and the outcome of asking it.
+"""Interface of a method: the pair of images (down, up) that it gets, its answer, and the outcome of asking it.
 
 >>> from phibench.estimator.interface import Answer, Pair, Spot
 >>> def extract(pair: Pair) -> Answer:
@@ -43,7 +43,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Pair:
-    """One draw of a stroke pair, as a camera and a user deliver it.
+    """Pair of images (down, up) of one spot in one noise realisation, as a camera and a user deliver it.
 
     Attributes
     ----------

@@ -53,6 +53,7 @@ estimator/seat
 phibench
 """
 LEVEL = {unit: level for level, line in enumerate(ORDER.split("\n")) for unit in line.split()}
+QUESTION_WORDS = {"What", "Where", "How", "Whether", "Which", "That"}
 RENDERERS = {"mitsuba", "drjit"}
 MAY_IMPORT_RENDERERS = ("render/room", "render/setup")
 # The simulator and the estimator share numbers, not mathematics; only studies render.
@@ -244,6 +245,19 @@ def test_the_tree_has_few_large_rooms() -> None:
     stems = Counter(file.stem for file in files if file.parts[1] not in ("studies", "cli"))
     assert {file.stem for file in files if file.parts[0] == PACKAGE} == {"__init__", "__main__"}
     assert [stem for stem, n in stems.items() if n > 1] == []
+
+
+def test_docstrings_begin_with_a_noun_or_a_verb() -> None:
+    """A docstring names its subject first; a question word hides it."""
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    texts = [
+        (file.relative_to(ROOT), text)
+        for file in sources(ROOT)
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, documented) and (text := ast.get_docstring(node))
+    ]
+    assert len(texts) > 1000
+    assert [f"{path}: {text.splitlines()[0]}" for path, text in texts if text.split()[0] in QUESTION_WORDS] == []
 
 
 def test_reading_and_scoring_import_without_mitsuba(python: Python) -> None:

@@ -67,7 +67,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Frames:
-    """One draw of a stroke pair; images as `Frame.image`.
+    """Frames of one pair of images (down, up) in one noise realisation; images as `Frame.image`.
 
     Attributes
     ----------
@@ -156,7 +156,7 @@ class Side:
 
 @dataclass(frozen=True)
 class FrameSource:
-    """Draws frames of one stroke pair; holds its layers, so keep it to draw many.
+    """Simulates frames of one pair of images (down, up); it holds the layers, so keep it to simulate many.
 
     Examples
     --------

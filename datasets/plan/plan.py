@@ -53,7 +53,7 @@ class PosePlan:
 
 @dataclass(frozen=True)
 class PairPlan:
-    """One stroke pair: a spot seen from down and from up.
+    """Pair of images (down, up): one spot seen from both stroke positions.
 
     Attributes
     ----------

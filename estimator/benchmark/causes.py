@@ -52,7 +52,7 @@ _OF_THE_MIRROR = ("no_reflection", "mirror_edge")
 
 @dataclass(frozen=True)
 class Case:
-    """One image without a right position; the images are drawn when a rule needs them."""
+    """One image without a right position; its images are simulated when a rule needs them."""
 
     position: str
     truth: PairTruth

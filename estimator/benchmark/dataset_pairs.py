@@ -110,7 +110,7 @@ def dataset_pairs(
     hints: bool = True,
     boxes_px: int | None = None,
 ) -> DatasetPairs:
-    """Pairs of a data set in an order that is drawn.
+    """Pairs of a data set in random order.
 
     Parameters
     ----------

@@ -80,7 +80,7 @@ def score_methods(
     limits: Mapping[str, Any] | None = None,
     told: Callable[[int], None] = lambda done: None,
 ) -> list[Scored]:
-    """Run methods on all pairs of a set and score them; each pair is drawn once for all of them.
+    """Run methods on all pairs of a set and score them; each pair is simulated once for all of them.
 
     Parameters
     ----------

@@ -125,13 +125,13 @@ def calibrate_dataset(
 
 
 def frame_outline(dataset: Dataset, sample: Sample, position: str, preset: str, laser_off: bool = True) -> Outline:
-    """Outline in one drawn frame of a sample, with the nominal rig."""
+    """Outline in one simulated frame of a sample, with the nominal rig."""
     image = photograph(dataset, sample, position, preset, laser_off)
     return find_outline(image.pixels, sample.nominal_rig, image.card)
 
 
 def photograph(dataset: Dataset, sample: Sample, position: str, preset: str, laser_off: bool = True) -> Photograph:
-    """One drawn frame of a sample."""
+    """One simulated frame of a sample, in one noise realisation."""
     pairs = pairs_of(dataset, [sample], preset, laser_off=laser_off)
     return Photograph(pairs.image(0, position, not laser_off), pairs.card(0))
 
@@ -144,7 +144,7 @@ def frame_spots(
     laser_off: bool = True,
     least: int | None = None,
 ) -> list[KnownSpot]:
-    """Calibration spots of drawn frames.
+    """Calibration spots of simulated frames.
 
     Parameters
     ----------

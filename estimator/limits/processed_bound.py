@@ -1,4 +1,4 @@
-"""Bound of a spot's position behind the camera's processing, from the estimator's own model; no frame is drawn.
+"""Bound of a spot's position behind the camera's processing, from the estimator's own model; no frame is simulated.
 
 "srgb8": the information of each pixel's own code (`code_statistics`); interpolated colours are left out. "mjpeg":
 J^T C^-1 J of the quantised coefficients' mean and covariance (M. Stein, A. Mezghani, J. A. Nossek, IEEE Signal Process.

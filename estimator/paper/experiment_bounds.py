@@ -241,6 +241,7 @@ def _parts(rows: pl.DataFrame) -> Iterator[tuple[str, pl.DataFrame]]:
     found = pl.col("status") == "ok"
     parts = [(str(key[0]), part) for key, part in rows.partition_by("experiment", as_dict=True).items()]
     parts.append(("all", rows))
+    # the few pairs with a large bound decide every rms over all rows
     parts.append(("bound at most 1 %", rows.filter(pl.col("bound_m") <= 0.01 * pl.col("depth_m"))))
     yield from ((name, part) for name, part in parts if not part.filter(found).is_empty())
 

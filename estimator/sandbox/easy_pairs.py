@@ -52,7 +52,7 @@ class EasySpot:
 
 @dataclass(frozen=True)
 class EasyScene:
-    """One stroke pair.
+    """Scene of one pair of images (down, up).
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class EasyScene:
 
 
 def easy_rig() -> Rig:
-    """The default rig, stopped down to f/16: without astigmatism from defocus a spot is round, as it is drawn here."""
+    """Default rig, stopped down to f/16: without astigmatism from defocus a spot is round, as it is modelled here."""
     rig = Rig()
     return replace(rig, camera=replace(rig.camera, f_number=16.0))
 

@@ -93,7 +93,7 @@ class Connection:
         return b"".join(parts)
 
 
-_ALIGNED = 64  # bytes
+_ALIGNED = 64  # bytes of a cache line; any type of pixel may begin there
 _IMAGES = ("down", "up", "down_off", "up_off")
 _IN_MEMORY = Path("/dev/shm")
 
@@ -105,6 +105,7 @@ class MemoryFile:
         folder = _IN_MEMORY if os.access(_IN_MEMORY, os.W_OK) else None
         self._handle, name = tempfile.mkstemp(prefix="phibench-pair-", dir=folder)
         self.reader = os.open(name, os.O_RDONLY)
+        # both processes hold it open: without a name it is gone with the last of them, even after a crash
         Path(name).unlink()
         self._space: mmap.mmap | None = None
 
@@ -171,7 +172,7 @@ class ReceivedPair:
 
     def unchanged(self) -> bool:
         """Compare the images with what the runner sent, byte for byte."""
-        count = len(self.data) // 8
+        count = len(self.data) // 8  # whole words are compared faster; the size is a multiple of `_ALIGNED`
         here, there = (np.frombuffer(x, np.uint64, count) for x in (self.data, self.original))
         return bool(np.array_equal(here, there))
 

@@ -1,4 +1,4 @@
-"""Joint maximum likelihood of both images of a stroke pair on raw pixels: one point of the room behind two spots.
+"""Joint maximum likelihood of both images (down, up) of a pair on raw pixels: one point of the room behind two spots.
 
 Unknowns psi: u, v in the down image, 1 / D, then of the down and of the up image the flux and the background levels.
 The fluxes are free, because speckle makes those of two exposures differ. The up position follows from `up_image`.

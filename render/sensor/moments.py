@@ -1,7 +1,7 @@
-"""Mean and covariance of the chain's output over draws of the noise, for one camera.
+"""Mean and covariance of the chain's output over noise realisations of one camera.
 
 Raw stages have a closed form; demosaicing, white balance and colour matrix are a sparse matrix. The rest (clipping,
-sRGB curve, sharpening, 8 bits, JPEG) is drawn. The fixed pattern of the camera is part of the mean.
+sRGB curve, sharpening, 8 bits, JPEG) is simulated. The fixed pattern of the camera is part of the mean.
 
 Closed form of a pixel with mean charge m (light x PRNU + dark current) and system gain K:
 
@@ -10,7 +10,7 @@ Closed form of a pixel with mean charge m (light x PRNU + dark current) and syst
 
 1/12 DN^2 is the rounding's, once per pixel. For a noise of s DN before rounding it is off by up to
 (4 s^2 + 1/pi^2) exp(-2 pi^2 s^2) DN^2 (Sheppard's correction, first harmonic): 1e-8 at 1 DN, but 0.07 at the 0.32 DN of
-a dark pixel at gain 1, whose moments are better drawn. Full well and the converter's ends are assumed out of reach.
+a dark pixel at gain 1, whose moments are better simulated. Full well and the converter's ends are assumed out of reach.
 Speckle flicker adds the outer product of the spot's DN with itself, over M.
 """
 

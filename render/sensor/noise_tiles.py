@@ -1,4 +1,4 @@
-"""Noise in tiles: the draw of a pixel depends on names and on its place, not on what else is drawn.
+"""Noise in tiles: the random numbers of a pixel depend on names and on its place alone.
 
 The image is cut into tiles of 32 x 32 pixels. The names of a stage give the key of a Philox generator, the tile's row
 and column two words of its counter (J. K. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC11, 2011).

@@ -179,7 +179,7 @@ def _left(y: Array, design: Array) -> float:
 
 EXACT = "exact"
 SENSES = (*CONVENTIONS, EXACT)
-_TRIES = 1000
+_TRIES = 1000  # so many impossible ones in a row: the rig itself is about to fold the image
 
 
 def drawn_misalignment(rig: Rig, random: np.random.Generator) -> Misalignment:

@@ -190,6 +190,7 @@ def floor_findings(table: pl.DataFrame, sample: str, preset: str) -> Iterator[Fi
     strong = table.filter(_case(sample, preset), pl.col("factor") == "power_mw", pl.col("saturated") == 0.0)
     top = strong.filter(pl.col("level") == pl.col("level").max())
     for row in top.sort("rms_px").iter_rows(named=True):
+        # a method without a detection, or a spot without a bound, has no ratio
         if math.isfinite(ratio_of(row)[0]):
             lead = f"{preset}, {sample}, {row['level']:g} mW: {row['method']}"
             yield Finding(f"{lead}, rms distance", *_ends(row, "rms_px", 1e3), "mpx")
