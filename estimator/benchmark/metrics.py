@@ -305,6 +305,7 @@ def _square(columns: list[Array]) -> Array:
     return np.sum(np.square(columns), axis=0)
 
 
+# Shares of quantiles are fractions, because the rank share x n must be exact where it is a whole number.
 STATISTICS: dict[str, Callable[[Clusters, list[Array]], Statistic]] = {
     "rate": lambda clusters, x: mean_of(clusters, x[0]),
     "mean": lambda clusters, x: mean_of(clusters, x[0]),

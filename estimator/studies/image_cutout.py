@@ -113,6 +113,7 @@ class SpotPair:
         at = {p: rig.at(Stroke(stroke_m).offset_m(p)) for p in POSITIONS}
         views = {p: SpotView.of(view, spot, room, ambient[p]) for p, view in at.items()}
         depth = float(depth_m(np.array(spot.position_world_m), at["down"].sphere_centre_m))
+        # no divergence: the beam needs to be right at this distance only
         return cls(rig, stroke_m, depth, views, name, Beam(spot.diameter_m, 0.0))
 
     @property

@@ -66,6 +66,7 @@ def with_levels(records: pl.DataFrame, levels: Mapping[str, Sequence[float]]) ->
     for name in levels:
         of = base.filter(pl.col("preset").is_in(FACTORS[name].presets))
         copies.append(of.with_columns(factor=pl.lit(name), level=pl.lit(float(FACTORS[name].base))))
+    # a place of the spot is called SAMPLE-k: intervals resample the places of a sample
     return pl.concat([records, *copies]).with_columns(sample=pl.col("sample_id").str.replace(r"-\d+$", ""))
 
 

@@ -139,6 +139,7 @@ def measured(check: Check) -> Checked:
 def _answer(check: Check, nominal: Rig, draw: int) -> tuple[float, Array, Array, Array, Array] | None:
     """True D, positions in the whole image and claimed covariances of one draw; None if a spot is not found."""
     names = (*_NAMES, check.tolerance, f"{check.depth_m:.6f}", f"{check.stroke_m:.6f}", draw)
+    # named without the stroke: all strokes of a distance are compared on the same random rigs
     values = deviations(np.array(check.covariance), (*_NAMES, check.tolerance, f"{check.depth_m:.6f}", draw))
     true, stroke_m = changed(nominal, values), float(stroke_of(np.array(check.stroke_m), values))
     spot = _spot(check, nominal, 2.0 * math.pi * (draw * _TURN % 1.0))
@@ -154,6 +155,7 @@ def _answer(check: Check, nominal: Rig, draw: int) -> tuple[float, Array, Array,
     spots = (answer.down, answer.up)
     if any(one.uv_px is None or one.covariance_px2 is None for one in spots):
         return None
+    # the method saw the cutout alone: back to pixels of the whole image, for the uncut nominal rig
     corner = np.array([region.u0_px, region.v0_px], float)
     down, up = (np.array(one.uv_px) + corner for one in spots)
     C_down, C_up = (np.array(one.covariance_px2) for one in spots)
