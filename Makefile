@@ -28,7 +28,7 @@ help:
 	@echo "make test-slow  the slow tests"
 	@echo "make proof      the slow tests of accuracy, but those of many minutes"
 	@echo "make test-all   all tests"
-	@echo "make mutants    proof that the tests see faults: 45 of them, one at a time, in copies of the checkout"
+	@echo "make mutants    proof that the tests see faults: one fault at a time, in copies of the checkout"
 	@echo "make benchmark  timings of what must be fast"
 	@echo "make lint       ruff and mypy"
 	@echo "make clean      remove caches and builds; .venv and out/ stay"

@@ -21,7 +21,7 @@ from phibench.estimator.sandbox.example_method import extract
 def test_the_example_finds_the_spots_of_a_rendered_room(smoke_dataset: Path, preset: str) -> None:
     """The recipe `smoke` has the room of `paper`, its lamps and two of its distances: at 1.975 m and at 3.18 m.
 
-    `paper` itself, by `phibench score`: at least 95 % of 50 images in each preset (docs/method.md).
+    `paper` itself, by `phibench score`: the aim is 95 % of 50 images in each preset.
     """
     pairs = dataset_pairs(open_finished(smoke_dataset), preset)
     found = visible = 0
