@@ -11,12 +11,14 @@ import math
 from dataclasses import asdict, dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from phibench.datasets.store.files import sha256
 from phibench.datasets.store.provenance import code_behind
-from phibench.estimator.methods.registry import KNOWN
 from phibench.scenes.validation import close_names
+
+if TYPE_CHECKING:
+    from phibench.estimator.methods.registry import BuiltIn
 
 
 class MethodError(ValueError):
@@ -68,15 +70,17 @@ def resolve(reference: str) -> Reference:
     """
     if reference.endswith(".py") or ".py:" in reference:
         return _of_file(reference)
+    from phibench.estimator.methods.registry import KNOWN  # a second of imports that a method in a file does not need
+
     found = [point for point in installed() if point.name == reference]
     if reference in KNOWN:
         if found:
             raise MethodError(f"method '{reference}' is built in, and {_owner(found[0])} registers another")
-        return _built_in(reference)
+        return _built_in(KNOWN[reference])
     if len(found) > 1:
         raise MethodError(f"method '{reference}' is registered by {' and by '.join(map(_owner, found))}: remove one")
     if not found:
-        raise MethodError(_unknown(reference))
+        raise MethodError(_unknown(reference, list(KNOWN)))
     return Reference(reference, "package", found[0].value, version=_owner(found[0]))
 
 
@@ -85,12 +89,11 @@ def installed() -> tuple[EntryPoint, ...]:
     return tuple(sorted(entry_points(group=GROUP), key=lambda point: point.name))
 
 
-def _built_in(name: str) -> Reference:
-    method = KNOWN[name]
+def _built_in(method: BuiltIn) -> Reference:
     if not method.installed:
-        raise MethodError(f"method '{name}' needs {method.package}: pip install {method.package}")
+        raise MethodError(f"method '{method.name}' needs {method.package}: pip install {method.package}")
     module = "phibench.estimator.methods.registry"
-    return Reference(name, "built-in", module, sha256=code_behind(module))
+    return Reference(method.name, "built-in", module, sha256=code_behind(module))
 
 
 def _of_file(reference: str) -> Reference:
@@ -122,8 +125,8 @@ def _owner(point: EntryPoint) -> str:
     return "an unknown package" if point.dist is None else f"{point.dist.name} {point.dist.version}"
 
 
-def _unknown(name: str) -> str:
-    known = [*KNOWN, *(point.name for point in installed())]
+def _unknown(name: str, built_in: list[str]) -> str:
+    known = [*built_in, *(point.name for point in installed())]
     guess = close_names(name, known)
     advice = f"did you mean '{guess[0]}'?" if guess else "`phibench method list` lists what there is."
     return f"no method '{name}': {advice} A method of your own is given as file and function, my_phi.py:extract"
