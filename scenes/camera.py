@@ -73,6 +73,7 @@ def photons_per_joule(wavelength_nm: float) -> float:
     return wavelength_nm * 1e-9 / (PLANCK_J_S * LIGHT_M_S)
 
 
+LARGEST_SIDE_PX = 20_000  # of an image: a layer of that square would take 10 GB
 _NEWTON_STEPS = 30  # at most: the loop ends with steps below the tolerance
 _FOLD_MARGIN_PX = 10.0  # the blur reaches so far beyond the image
 _NEWTON_TOLERANCE = 1e-14  # normalised image coordinates; 1.4e-11 px
@@ -119,6 +120,8 @@ class Camera:
     def __post_init__(self) -> None:
         for name in ("width_px", "height_px", "pixel_pitch_um", "fx_px", "fy_px", "f_number", "focus_distance_m"):
             positive("Camera", name, getattr(self, name))
+        for name in ("width_px", "height_px"):
+            within("Camera", name, getattr(self, name), 1, LARGEST_SIDE_PX)
         for name in ("cx_px", "cy_px", "k1", "k2", "k3", "p1", "p2"):
             finite("Camera", name, getattr(self, name))
         within("Camera", "blur_sigma_px", self.blur_sigma_px, 0.05, 20.0)

@@ -27,7 +27,7 @@ render/sensor
 render/setup
 render/room
 datasets/errors
-datasets/parallel datasets/progress
+datasets/parallel datasets/progress datasets/input_files
 datasets/recipe
 datasets/plan
 datasets/store

@@ -13,6 +13,7 @@ import hashlib
 import io
 import json
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -22,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, get_args, get_ori
 from pydantic import TypeAdapter, ValidationError
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import InputFile, first_fault, printable
 from phibench.datasets.plan.plan import Plan, PosePlan
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store import schema
@@ -60,17 +62,51 @@ def to_json(value: object) -> Any:
 def from_json(kind: type[T], document: Any) -> T:
     """Rebuild a frozen dataclass of type `kind` from its JSON document.
 
+    No field of a stored description has a default: one that is left out would silently be another rig's.
+
     Raises
     ------
     DatasetError
-        If the document does not describe one.
+        If the document does not describe one, lacks a field or has one too many.
     """
     try:
-        return cast(T, _adapter(cast(Any, kind)).validate_python(document))
+        value = cast(T, _adapter(cast(Any, kind)).validate_python(document))
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise DatasetError(f"not a valid {kind.__name__} at {where or 'its root'}: {first['msg']}") from error
+        raise DatasetError(f"not a valid {kind.__name__}: {first_fault(error)}") from error
+    except (OverflowError, TypeError, RecursionError) as error:
+        raise DatasetError(f"not a valid {kind.__name__}: {printable(str(error), 200)}") from error
+    if fault := _difference(document, to_json(value)):
+        raise DatasetError(f"not a valid {kind.__name__}: {fault}")
+    return value
+
+
+_LATER = {"form"}
+"""Fields that older versions do not have, whose default is what these versions meant: `mirror.form` in version 4."""
+_LARGEST = 1e12
+
+
+def _difference(given: Any, whole: Any, place: str = "its root") -> str:
+    """First place in which a document is not of the form of the whole description; empty if there is none."""
+    if isinstance(whole, dict) and isinstance(given, dict):
+        if missing := sorted(whole.keys() - given.keys() - _LATER):
+            return f"{place} lacks the field {missing[0]}"
+        if strange := sorted(map(str, given.keys() - whole.keys())):
+            return f"{place} has the field {printable(strange[0], 60)}, which is none of it"
+        inner = ((str(key), value, whole[key]) for key, value in given.items())
+    elif isinstance(whole, list) and isinstance(given, list | tuple) and len(whole) == len(given):
+        inner = ((str(number), *pair) for number, pair in enumerate(zip(given, whole, strict=True)))
+    else:
+        return "" if _same_kind(given, whole) else f"{place} is {printable(repr(given), 60)}: not allowed"
+    faults = (
+        _difference(value, known, key if place == "its root" else f"{place}.{key}") for key, value, known in inner
+    )
+    return next(filter(None, faults), "")
+
+
+def _same_kind(given: Any, whole: Any) -> bool:
+    """True for two numbers of any sensible size, and for two other values of one type."""
+    numbers = [isinstance(value, int | float) and not isinstance(value, bool) for value in (given, whole)]
+    return abs(given) <= _LARGEST if all(numbers) else type(given) is type(whole)
 
 
 @cache
@@ -128,8 +164,14 @@ def same_content(a: DatasetInfo, b: DatasetInfo) -> bool:
 
 
 def parse_info(text: str) -> DatasetInfo:
-    """Read the text of a `dataset.json` that this version wrote."""
-    return DatasetInfo.model_validate(json.loads(text))
+    """Read the text of a `dataset.json` that this version wrote.
+
+    Raises
+    ------
+    DatasetError
+        If it is not one.
+    """
+    return _info_file(Path(schema.INFO)).document(DatasetInfo, text.encode())
 
 
 def recipe_sha256(recipe: Recipe) -> str:
@@ -151,29 +193,17 @@ def read_info(folder: Path) -> DatasetInfo:
         raise DatasetError(f"there is no folder {folder}")
     if not path.is_file():
         raise DatasetError(f"{folder} is not a data set: it has no {schema.INFO}")
-    document = _json(path)
+    file = _info_file(path)
+    document = file.json()
     version = document.get("schema_version")
     if version not in READABLE_VERSIONS:
-        known = " and ".join(map(str, READABLE_VERSIONS))
-        raise DatasetError(f"{path} has schema version {version}; this phibench reads versions {known}")
-    try:
-        return DatasetInfo.model_validate(document)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        raise DatasetError(f"{path}: {where}: {first['msg']}" if where else f"{path}: {first['msg']}") from error
+        known, found = " and ".join(map(str, READABLE_VERSIONS)), printable(str(version), 60)
+        raise DatasetError(f"{path} has schema version {found}; this phibench reads versions {known}")
+    return file.validated(DatasetInfo, document)
 
 
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DatasetError(f"{path} is not readable: {error.strerror or error}") from error
-    except ValueError as error:
-        raise DatasetError(f"{path} is damaged: {error}") from error
-    if not isinstance(document, dict):
-        raise DatasetError(f"{path} is damaged: it does not hold a JSON object")
-    return document
+def _info_file(path: Path) -> InputFile:
+    return InputFile(path, "run `phibench dataset verify` to see all faults, `phibench dataset repair` to mend them")
 
 
 def _without_commit(info: DatasetInfo) -> str:
@@ -261,13 +291,11 @@ def _column_type(annotation: Any) -> Any:
 
 def differences(folder: Path, rows: Sequence[ManifestRow]) -> list[str]:
     """One sentence per column in which the Parquet table differs from the rows."""
-    import polars
-
     expected = to_table(rows)
     try:
-        table = polars.read_parquet(folder / schema.TABLE)
-    except (OSError, polars.exceptions.PolarsError) as error:
-        return [f"{schema.TABLE} cannot be read: {error}"]
+        table = InputFile(folder / schema.TABLE, "run `phibench dataset repair`").table()
+    except DatasetError as error:
+        return [str(error).removeprefix(f"{folder}{os.sep}")]
     if table.schema != expected.schema or table.height != expected.height:
         return [f"{schema.TABLE} has other columns or rows than {schema.MANIFEST}"]
     changed = [name for name in table.columns if not table[name].equals(expected[name], null_equal=True)]

@@ -12,7 +12,9 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import json
 import os
+import re
 import tempfile
 import time
 import uuid
@@ -24,6 +26,7 @@ from filelock import FileLock, Timeout
 from pydantic import ValidationError
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import DIGITS, InputFile, bounds_fault, first_fault, printable
 from phibench.datasets.store import schema
 from phibench.datasets.store.schema import Document
 
@@ -255,20 +258,23 @@ def read_rows(path: Path, model: type[Row]) -> list[Row]:
     DatasetError
         If it is missing or not readable, or with the number of the first line that is not such a document.
     """
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except FileNotFoundError as error:
-        raise DatasetError(f"{path} is missing") from error
-    except OSError as error:
-        raise DatasetError(f"{path} is not readable: {error.strerror or error}") from error
-    return [_row(path, model, number, line) for number, line in enumerate(lines, 1)]
+    data = InputFile(path, "run `phibench dataset verify` to see all faults").read()
+    checked = _BEYOND_BOUNDS.search(data) is None  # the model alone would take 1e999, and a number of 300 digits
+    lines = data.decode("utf-8", errors="replace").splitlines()
+    return [_row(path, model, number, line, checked) for number, line in enumerate(lines, 1)]
 
 
-def _row(path: Path, model: type[Row], number: int, line: str) -> Row:
+_BEYOND_BOUNDS = re.compile(rb"NaN|Infinity|[0-9]{%d}|[eE]\+?[0-9]{3}" % DIGITS)
+
+
+def _row(path: Path, model: type[Row], number: int, line: str, checked: bool) -> Row:
     try:
+        if not checked and (fault := bounds_fault(json.loads(line))):
+            raise DatasetError(f"{path} line {number} is damaged: {fault}")
         return model.model_validate_json(line)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        text = f"{where}: {first['msg']}" if where else first["msg"]
-        raise DatasetError(f"{path} line {number} is damaged: {text}") from error
+        raise DatasetError(f"{path} line {number} is damaged: {first_fault(error)}") from error
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, DatasetError):
+            raise
+        raise DatasetError(f"{path} line {number} is damaged: {printable(str(error), 200)}") from error

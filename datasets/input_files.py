@@ -1,0 +1,300 @@
+"""Input files read within bounds: bytes, text, JSON, TOML, Parquet tables and pictures.
+
+Every file that somebody else may have written goes through `InputFile`. It looks at the kind and the size of a file
+before it reads, bounds depth, numbers and texts of a document, and compares it with a model. A fault is one sentence:
+the file, the place in it, and what to do.
+
+A name in a document that leads to another file is a `FileName`: relative, below the folder, without "..".
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import re
+import stat
+import tomllib
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast
+
+from pydantic import BaseModel, Field, ValidationError
+
+from phibench.datasets.errors import DatasetError
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+    from polars import DataFrame, DataType
+
+MIB = 1 << 20
+DOCUMENT_BYTES = 512 * MIB  # a submission of 1e6 pairs has 400 MiB
+SETTINGS_BYTES = 1 * MIB  # TOML and other files that people write
+TABLE_ROWS = 20_000_000
+PICTURE_PIXELS = 50_000_000
+DEPTH = 64  # of lists and tables in each other
+DIGITS = 40  # of a whole number; a seed of 128 bits has 39
+NAME_LENGTH = 200  # of a key, and of a name of ours
+KEY_PARTS = 32  # of a dotted key of TOML
+
+FileName = Annotated[str, Field(max_length=NAME_LENGTH, pattern=r"^[A-Za-z0-9_][\w.+-]*(/[A-Za-z0-9_][\w.+-]*)*$")]
+"""Name of a file relative to the folder of its document: no absolute path, and no part that begins with a dot."""
+
+_PART = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
+_LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*\.[ \t]*{_PART}){{{KEY_PARTS},}}")
+
+M = TypeVar("M", bound=BaseModel)
+
+
+def printable(text: str, length: int = 2000) -> str:
+    """Text for a terminal: control characters and lone surrogates as escapes, cut to a length; lines stay lines."""
+    cut = text if len(text) <= length else f"{text[: length - 3]}..."
+    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in cut)
+
+
+def first_fault(error: ValidationError) -> str:
+    """Place and message of the first fault that pydantic found."""
+    first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+    where = ".".join(map(str, first["loc"]))
+    return printable(f"{where}: {first['msg']}" if where else first["msg"], 300)
+
+
+@dataclass(frozen=True)
+class InputFile:
+    """A file that is to be read.
+
+    Parameters
+    ----------
+    path : Path
+    remedy : str
+        End of every sentence about a fault: what to do.
+    error : type of the error
+    limit_bytes : int
+        Largest size that is read.
+    """
+
+    path: Path
+    remedy: str
+    error: type[DatasetError] = DatasetError
+    limit_bytes: int = DOCUMENT_BYTES
+
+    def fault(self, text: str) -> DatasetError:
+        """Error with one sentence about the file."""
+        return self.error(f"{self.path} {text}; {self.remedy}")
+
+    def read(self) -> bytes:
+        """All bytes.
+
+        Raises
+        ------
+        DatasetError
+            If there is no such file, it is a folder, a pipe or a device, too large, or cannot be read.
+        """
+        try:
+            # a pipe without a writer would be waited for
+            handle = os.open(self.path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+            with os.fdopen(handle, "rb") as file:
+                return self._bounded(file)
+        except FileNotFoundError as error:
+            raise self.fault("is missing") from error
+        except (OSError, ValueError) as error:
+            if isinstance(error, DatasetError):
+                raise
+            raise self.fault(f"is not readable: {getattr(error, 'strerror', None) or error}") from error
+
+    def _bounded(self, file: io.BufferedReader) -> bytes:
+        found = os.fstat(file.fileno())
+        if stat.S_ISDIR(found.st_mode):
+            raise self.fault("is not readable: it is a folder")
+        if not stat.S_ISREG(found.st_mode):
+            raise self.fault("is not readable: it is no ordinary file")
+        data = b"" if found.st_size > self.limit_bytes else file.read(self.limit_bytes + 1)
+        if max(found.st_size, len(data)) > self.limit_bytes:
+            raise self.fault(f"is larger than {self.limit_bytes / MIB:.0f} MiB, the most that is read of its kind")
+        return data
+
+    # Documents.
+
+    def text(self, data: bytes | None = None, encoding: str = "utf-8") -> str:
+        """Text of the file, or of bytes that are already read from it."""
+        try:
+            return (self.read() if data is None else data).decode(encoding)
+        except UnicodeDecodeError as error:
+            raise self.fault(f"cannot be read: byte {error.start} is not UTF-8") from error
+
+    def json(self, data: bytes | None = None) -> dict[str, Any]:
+        """JSON object, bounded.
+
+        Raises
+        ------
+        DatasetError
+            If it is not JSON or no object, holds a key twice, or is beyond the bounds.
+        """
+        try:
+            document = json.loads(self.text(data), object_pairs_hook=_without_twins)
+        except RecursionError as error:
+            raise self.fault(f"is damaged: it is nested deeper than {DEPTH} levels") from error
+        except ValueError as error:
+            if isinstance(error, DatasetError):
+                raise
+            raise self.fault(f"is damaged: it is not JSON ({printable(str(error), 200)})") from error
+        if not isinstance(document, dict):
+            raise self.fault("is damaged: it does not hold a JSON object")
+        if found := bounds_fault(document):
+            raise self.fault(f"is damaged: {found}")
+        return document
+
+    def toml(self, data: bytes | None = None) -> dict[str, Any]:
+        """Tables of a TOML file, bounded; numbers may be infinite or NaN, which a model refuses by name."""
+        return self.toml_of(self.text(data, "utf-8-sig"))  # some editors put a byte order mark first
+
+    def toml_of(self, text: str) -> dict[str, Any]:
+        """Tables of a TOML text."""
+        if len(text) > self.limit_bytes:
+            raise self.fault(f"is larger than {self.limit_bytes / MIB:.0f} MiB, the most that is read of its kind")
+        if _LONG_KEY.search(text):  # tomllib takes the square of its length in time and memory
+            raise self.fault(f"is not valid here: a key has more than {KEY_PARTS} parts")
+        try:
+            document = tomllib.loads(text)
+        except RecursionError as error:
+            raise self.fault(f"is not valid TOML: it is nested deeper than {DEPTH} levels") from error
+        except ValueError as error:  # tomllib lets a number of 5000 digits end in Python's own words
+            raise self.fault(f"is not valid TOML: {printable(str(error), 200)}") from error
+        if found := bounds_fault(document, finite=False):
+            raise self.fault(f"is not valid here: {found}")
+        return document
+
+    def document(self, model: type[M], data: bytes | None = None) -> M:
+        """Document of a strict model."""
+        return self.validated(model, self.json(data))
+
+    def validated(self, model: type[M], document: dict[str, Any]) -> M:
+        """Document of a strict model, of JSON that is read already; lists do for tuples."""
+        try:
+            return model.model_validate_json(json.dumps(document))
+        except (ValidationError, ValueError, RecursionError) as error:
+            text = first_fault(error) if isinstance(error, ValidationError) else printable(str(error), 200)
+            raise self.fault(f"is damaged: {text}") from error
+
+    # Tables and pictures.
+
+    def table(self, columns: Mapping[str, DataType | type[DataType]] | None = None) -> DataFrame:
+        """Parquet table; `columns` are the names and types that it must have, in any order.
+
+        Raises
+        ------
+        DatasetError
+            If it cannot be read, has too many rows, or other columns or types.
+        """
+        import polars
+
+        data = self.read()
+        try:
+            found = polars.read_parquet_schema(io.BytesIO(data))
+            if columns is not None and (fault := _columns_fault(found, dict(columns))):
+                raise self.fault(f"has {fault}")
+            rows = polars.scan_parquet(io.BytesIO(data)).select(polars.len()).collect().item()
+            if rows > TABLE_ROWS:
+                raise self.fault(f"has {rows} rows: at most {TABLE_ROWS} are read")
+            return polars.read_parquet(io.BytesIO(data))
+        except DatasetError:
+            raise
+        except (Exception, polars.exceptions.PanicException) as error:  # a decoder's faults are of many kinds
+            reason = printable(str(error).partition("\n")[0], 200) or type(error).__name__
+            raise self.fault(f"cannot be read: {reason}") from error
+
+    def picture(self, formats: tuple[str, ...] = ("PNG", "JPEG"), data: bytes | None = None) -> Image:
+        """Decoded picture; its declared size is looked at before a pixel is decoded.
+
+        Raises
+        ------
+        DatasetError
+            If it is none of the formats, damaged, or of more than 50 million pixels.
+        """
+        from PIL import Image, UnidentifiedImageError
+
+        content = self.read() if data is None else data
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+                with Image.open(io.BytesIO(content), formats=formats) as picture:
+                    width, height = picture.size
+                    if width * height > PICTURE_PIXELS:
+                        raise self.fault(f"has {width} x {height} pixels: at most {PICTURE_PIXELS:.0e} are read")
+                    picture.load()
+                    return picture
+        except DatasetError:
+            raise
+        except Image.DecompressionBombError as error:
+            raise self.fault(f"has too many pixels: at most {PICTURE_PIXELS:.0e} are read") from error
+        except UnidentifiedImageError as error:
+            raise self.fault(f"is not a picture of the format {' or '.join(formats)}") from error
+        except Exception as error:  # a decoder's faults are of many kinds
+            raise self.fault(f"is a damaged picture: {printable(str(error), 200)}") from error
+
+
+def _without_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Object of its pairs: readers that take the first and the last of two would see two documents."""
+    document = dict(pairs)
+    if len(document) != len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"it has the key {next(key for key in keys if keys.count(key) > 1)!r} twice")
+    return document
+
+
+def bounds_fault(document: object, finite: bool = True) -> str:
+    """First value of a document of dicts and lists that is beyond the bounds, with its place; empty if none is."""
+    left: list[tuple[object, int, Any]] = [(document, 1, None)]
+    while left:
+        value, depth, place = left.pop()
+        if fault := _value_fault(value, depth, finite):
+            return f"{_place(place)} {fault}"
+        if isinstance(value, dict):
+            left += [(inner, depth + 1, (place, key)) for key, inner in value.items()]
+        elif isinstance(value, list):
+            left += [(inner, depth + 1, (place, number)) for number, inner in enumerate(value)]
+    return ""
+
+
+_LARGEST = 10**DIGITS
+_SURROGATE = re.compile("[\ud800-\udfff]")
+
+
+def _value_fault(value: object, depth: int, finite: bool) -> str:
+    if isinstance(value, dict):
+        if any(len(key) > NAME_LENGTH or _SURROGATE.search(key) for key in value):
+            return f"has a key of more than {NAME_LENGTH} characters or with a lone surrogate"
+        return f"is nested deeper than {DEPTH} levels" if depth > DEPTH else ""
+    if isinstance(value, list):
+        return f"is nested deeper than {DEPTH} levels" if depth > DEPTH else ""
+    if isinstance(value, str):
+        return "has a lone surrogate" if not value.isascii() and _SURROGATE.search(value) else ""
+    if isinstance(value, int):
+        return f"is a number of more than {DIGITS} digits" if abs(value) >= _LARGEST else ""
+    if finite and isinstance(value, float) and not math.isfinite(value):
+        return "is not a finite number"
+    return ""
+
+
+def _place(place: Any) -> str:
+    """Path of a value as people write it, of the nested pairs (path of its parent, key), cut in the middle."""
+    parts: list[str] = []
+    while place is not None:
+        place, key = cast("tuple[Any, str | int]", place)
+        parts.append(str(key))
+    parts.reverse()
+    shown = parts if len(parts) <= 6 else [*parts[:3], "...", *parts[-2:]]
+    return printable(".".join(shown), 120) or "its root"
+
+
+def _columns_fault(found: Mapping[str, Any], wanted: dict[str, Any]) -> str:
+    """Difference of a table's columns from those that it must have; empty if there is none."""
+    if missing := [name for name in wanted if name not in found]:
+        return f"no column '{missing[0]}'"
+    if strange := [name for name in found if name not in wanted]:
+        return f"a column '{printable(strange[0], 60)}' that does not belong there"
+    wrong = next((name for name in wanted if found[name] != wanted[name]), None)
+    return "" if wrong is None else f"a column '{wrong}' of type {found[wrong]}, not {wanted[wrong]}"
