@@ -15,7 +15,7 @@ from phibench.datasets.build.forecast import PairForecast, forecast, pair_foreca
 from phibench.datasets.build.journal import FolderHead, Journal
 from phibench.datasets.build.run_tasks import (
     assemble,
-    claim,
+    claimed,
     differing,
     refuse_other,
     remove_files,
@@ -33,7 +33,7 @@ from phibench.datasets.recipe.checks import warnings
 from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_text, with_numbers
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import dataset_info, info_text, parse_info, read_manifest, same_content
-from phibench.datasets.store.files import WriteError, only_run, remove_temporary, write_text
+from phibench.datasets.store.files import WriteError, write_text
 from phibench.datasets.store.provenance import code_sha256, provenance
 from phibench.datasets.store.schema import DatasetInfo
 
@@ -142,16 +142,13 @@ def make_from_plan(
 ) -> list[str]:
     """Make what is unfinished or damaged of a plan; return the names of the tasks done and documents written."""
     count = _count(workers)
-    claim(out, plan.recipe.dataset.name)
     try:
-        with only_run(out):
-            claim(out, plan.recipe.dataset.name)  # again: now nobody else can
-            remove_temporary(out)
-            try:
-                with WorkerPool(out, count, scheduler) as pool, Journal(out) as journal:
-                    return _make(plan, recipe, out, pool, journal, console)
-            finally:
-                remove_temporary(out)
+        with (
+            claimed(out, plan.recipe.dataset.name),
+            WorkerPool(out, count, scheduler) as pool,
+            Journal(out) as journal,
+        ):
+            return _make(plan, recipe, out, pool, journal, console)
     except OSError as error:
         text = str(error) if isinstance(error, WriteError) else f"could not write to {out}: {error}"
         raise DatasetError(f"{text}; then run the same command again") from error

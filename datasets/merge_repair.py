@@ -16,7 +16,7 @@ from rich.console import Console
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
 from phibench.datasets.build.run_tasks import (
     assemble,
-    claim,
+    claimed,
     held_head,
     is_intact,
     remove_files,
@@ -32,7 +32,7 @@ from phibench.datasets.recipe.load import parse_recipe
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import dataset_info, info_text, parse_info, recipe_sha256, same_content
-from phibench.datasets.store.files import WriteError, only_run, remove_temporary, sha256, write_atomic
+from phibench.datasets.store.files import WriteError, sha256, write_atomic
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import CHECKSUMS, DatasetInfo
 
@@ -52,10 +52,7 @@ def merge(out: str | Path, shards: Sequence[str | Path], console: Console | None
     names = task_names(plan)
     if missing := [name for name in names if name not in entries]:
         raise DatasetError(f"the shards lack {len(missing)} tasks, such as {missing[0]}; finish or add their shards")
-    claim(out, info.name)
-    with only_run(out), Journal(out) as journal:
-        claim(out, info.name)
-        remove_temporary(out)
+    with claimed(out, info.name), Journal(out) as journal:
         (out / CHECKSUMS).unlink(missing_ok=True)
         journal.begin(head, [])  # says what the folder is, should this be interrupted
         _copy(out, [entries[name] for name in names], console)

@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any
 
+from phibench.datasets.errors import DatasetError
 from phibench.datasets.store import schema
 from phibench.datasets.store.files import write_bytes
 
@@ -50,6 +51,7 @@ class Journal:
     def __init__(self, folder: Path) -> None:
         self._path = folder / schema.JOURNAL
         self._file: IO[bytes] | None = None
+        self._size = 0
         self.head: FolderHead | None = None
         self.entries: dict[str, Entry] = {}
         for document in _documents(self._path):
@@ -72,13 +74,33 @@ class Journal:
         self.head = head
         self.entries = {name: self.entries[name] for name in tasks if name in self.entries}
         lines = [_line(asdict(head)), *(_line(asdict(entry)) for entry in self.entries.values())]
-        write_bytes(self._path, b"".join(lines))
+        data = b"".join(lines)
+        write_bytes(self._path, data)
+        self._size = len(data)
+
+    def require(self) -> None:
+        """Make sure that the journal lies where it was begun, and holds what was written.
+
+        Raises
+        ------
+        DatasetError
+            If not: somebody has removed or moved the folder.
+        """
+        try:
+            same = self._path.stat().st_size == self._size  # not by its inode: some network drives change it
+        except FileNotFoundError:
+            same = False
+        if not same:
+            text = f"{self._path.parent} was removed or moved while this run wrote to it"
+            raise DatasetError(f"{text}; delete what is left of it and run the same command again")
 
     def add(self, entry: Entry) -> None:
         """Append one entry. The operating system has it before this returns, so that kill -9 cannot take it."""
         if self._file is None:
             self._file = self._path.open("ab", buffering=0)
-        self._file.write(_line(asdict(entry)))
+        line = _line(asdict(entry))
+        self._file.write(line)
+        self._size += len(line)
         self.entries[entry.task] = entry
 
 

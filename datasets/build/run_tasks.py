@@ -6,11 +6,12 @@ last part gives the small files as bytes, from plan and journal, so that each ca
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import shutil
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
@@ -29,29 +30,42 @@ from phibench.datasets.progress import Steps
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import checksums_text
 from phibench.datasets.store.documents import manifest_documents, read_info, rigs_text
-from phibench.datasets.store.files import TEMPORARY_PREFIX, sha256, write_bytes
+from phibench.datasets.store.files import TEMPORARY_PREFIX, only_run, remove_temporary, sha256, write_bytes
 from phibench.datasets.store.schema import ManifestRow
 from phibench.scenes.rig import POSITIONS
 
 _OWN = ".phibench-"  # locks, and temporary files that a killed run left
 
 
-def claim(out: Path, name: str) -> None:
-    """Make the folder, refuse one that holds something else, try to write to it.
+@contextlib.contextmanager
+def claimed(out: Path, name: str) -> Iterator[None]:
+    """Make the folder, refuse one that holds something else, and hold it: of two that start together one is refused.
 
     Raises
     ------
     DatasetError
         With one sentence that says what to do.
     """
-    if out.exists() and not out.is_dir():
-        raise DatasetError(f"{out} is a file; give a folder")
     refuse_other(out, name)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        write_bytes(out / f"{TEMPORARY_PREFIX}probe", b"").unlink()
     except OSError as error:
-        raise DatasetError(f"cannot write to {out}: {error.strerror or error}; give another folder") from error
+        raise _not_writable(out, error) from error
+    with only_run(out):
+        refuse_other(out, name)  # again: now nobody else can write
+        try:
+            write_bytes(out / f"{TEMPORARY_PREFIX}probe", b"").unlink()
+        except OSError as error:
+            raise _not_writable(out, error) from error
+        remove_temporary(out)
+        try:
+            yield
+        finally:
+            remove_temporary(out)
+
+
+def _not_writable(out: Path, error: OSError) -> DatasetError:
+    return DatasetError(f"cannot write to {out}: {error.strerror or error}; give another folder")
 
 
 def check_disk(out: Path, needed: int, replaced: Collection[str]) -> None:
@@ -81,7 +95,9 @@ def remove_files(out: Path, names: Collection[str]) -> None:
 
 
 def refuse_other(out: Path, name: str) -> None:
-    """Raise `DatasetError` if a folder holds another data set or something else."""
+    """Raise `DatasetError` if a folder is a file, or holds another data set or something else."""
+    if out.exists() and not out.is_dir():
+        raise DatasetError(f"{out} is a file; give a folder")
     head = held_head(out)
     if head is not None and (held := json.loads(head.info)["name"]) != name:
         raise DatasetError(f"{out} holds another data set ('{held}'); give another folder or delete it")
@@ -164,6 +180,7 @@ def _run(
     steps = Steps(console, "tasks", len(tasks), progress.left_s, progress.running_text)
     with steps, (out / schema.LOG).open("a", encoding="utf-8") as log:
         for task, outcome in schedule(tasks, progress.watch(pool.executor(len(tasks)))):
+            journal.require()  # what tasks write to a folder that is gone is lost, whatever they return
             if isinstance(outcome, Done):
                 journal.add(Entry(task.name, task.key, outcome.files, outcome.result))
             else:
@@ -214,14 +231,35 @@ def differing(out: Path, wanted: Mapping[str, bytes]) -> list[str]:
 
 
 def write_documents(out: Path, wanted: Mapping[str, bytes], names: Iterable[str]) -> None:
-    """Write some of the small files, in their order. Without SHA256SUMS the folder does not pass for finished."""
+    """Write some of the small files, in their order. Without SHA256SUMS the folder does not pass for finished.
+
+    Raises
+    ------
+    DatasetError
+        If a file that SHA256SUMS names is not there: it is then not written, or removed.
+    """
     names = set(names)
     if names:
         (out / schema.CHECKSUMS).unlink(missing_ok=True)
         names.add(schema.CHECKSUMS)
     for name, data in wanted.items():
         if name in names:
+            if name == schema.CHECKSUMS:
+                _require_all(out, data)
             write_bytes(out / name, data)
+    try:
+        _require_all(out, wanted[schema.CHECKSUMS])  # again: a folder may go while its last file is written
+    except DatasetError:
+        (out / schema.CHECKSUMS).unlink(missing_ok=True)
+        raise
+
+
+def _require_all(out: Path, checksums: bytes) -> None:
+    """Look for every file that the text of SHA256SUMS names."""
+    listed = [line.split("  ", 1)[1] for line in checksums.decode().splitlines()]
+    if missing := [name for name in listed if not (out / name).is_file()]:
+        what = f"{len(missing)} of {len(listed)} files are gone from {out}, such as {missing[0]}"
+        raise DatasetError(f"{what}: something else removed them during the run; run the same command again")
 
 
 def visibility_line(rows: Sequence[ManifestRow]) -> str:

@@ -176,6 +176,10 @@ def _draw(
                     due = now + max(_SAVE_EVERY_S, 20.0 * (time.monotonic() - now))
     finally:  # what an interrupted run has drawn is found by the next one
         write_index(out, rows.values())
+    names = [job.file(item) for job in jobs for item in job.items]
+    if missing := [name for name in names if not (out / name).is_file()]:
+        what = f"{len(missing)} of {len(names)} files are gone from {out}, such as {missing[0]}"
+        raise DatasetError(f"{what}: something else removed them during the run; run the same command again")
     return made, total - made
 
 

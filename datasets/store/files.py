@@ -14,6 +14,7 @@ import errno
 import hashlib
 import json
 import os
+import platform
 import re
 import tempfile
 import time
@@ -156,6 +157,7 @@ def require_writable(path: Path) -> None:
 # Locks: one run at a time in a folder, and none beside the workers of a killed one.
 
 PATIENCE_S = 60.0
+_NAMED_S = 1.0  # the holder writes its number at once; a machine that swaps may take longer
 _AT_ONCE_S, _POLL_S = 0.2, 0.05
 _WORKING_PREFIX = f"{TEMPORARY_PREFIX}working-"
 
@@ -163,6 +165,8 @@ _WORKING_PREFIX = f"{TEMPORARY_PREFIX}working-"
 @contextlib.contextmanager
 def only_run(out: Path) -> Iterator[None]:
     """Hold a folder; refuse when another process does, or when a killed run's worker does not end.
+
+    Who is refused has written nothing into the folder.
 
     Raises
     ------
@@ -172,8 +176,8 @@ def only_run(out: Path) -> Iterator[None]:
     path = out / schema.LOCK
     with _locked(path) as held:
         if not held:
-            raise DatasetError(f"another run (process {_holder(path)}) is writing to {out}; wait until it has ended")
-        path.write_text(str(os.getpid()))
+            raise DatasetError(f"another run{_holder(path)} is writing to {out}; wait until it has ended")
+        path.write_text(f"{os.getpid()} {platform.node()}")
         try:
             _await_workers(out)
             yield
@@ -195,10 +199,27 @@ def working(out: Path) -> Iterator[None]:
 
 
 def _holder(path: Path) -> str:
-    """Process that holds a lock file, as far as the file tells."""
-    with contextlib.suppress(OSError):
-        return path.read_text(errors="replace").strip() or "?"
-    return "?"
+    """Process that holds a lock file, in brackets; nothing if the file does not tell within a second."""
+    deadline = time.monotonic() + _NAMED_S
+    while time.monotonic() < deadline:
+        with contextlib.suppress(OSError):
+            process, _, node = path.read_text(errors="replace").partition(" ")
+            if node and node != platform.node():
+                return f" (process {process} on {node})"
+            if process.isdecimal() and _is_alive(int(process)):  # not that of a killed run, from before
+                return f" (process {process})"
+        time.sleep(_POLL_S)
+    return ""
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except PermissionError:  # somebody else's
+        return True
+    except (OSError, OverflowError):
+        return False
+    return True
 
 
 def _await_workers(out: Path) -> None:

@@ -14,7 +14,7 @@ from helpers.folders import contents, done
 from helpers.processes import SMALLEST, living, quiet, said
 
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
-from phibench.datasets.build.run_tasks import claim
+from phibench.datasets.build.run_tasks import claimed
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import make
 from phibench.datasets.store import schema
@@ -163,10 +163,11 @@ def test_a_second_run_is_refused_and_a_killed_one_holds_nothing(tmp_path: Path) 
 def test_what_a_run_leaves_that_is_killed_at_once_is_no_obstacle(tmp_path: Path) -> None:
     for name in (schema.LOCK, schema.WORKING, f"{TEMPORARY_PREFIX}probe", f"{TEMPORARY_PREFIX}abc.txt"):
         (tmp_path / name).write_bytes(b"")
-    claim(tmp_path, "smallest")
+    with claimed(tmp_path, "smallest"):
+        pass
     (tmp_path / "mine.txt").write_bytes(b"")
-    with pytest.raises(DatasetError, match="holds no data set"):
-        claim(tmp_path, "smallest")
+    with pytest.raises(DatasetError, match="holds no data set"), claimed(tmp_path, "smallest"):
+        pass
 
 
 def kill_and_repeat(out: Path, kills: int, seed: int) -> int:

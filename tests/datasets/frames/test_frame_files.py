@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,17 @@ import pytest
 from PIL import Image
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.exposures.draw import draw_frames
-from phibench.datasets.frames.frame_files import INDEX, INDEX_TABLE, REQUEST, TRUTH, FrameRow, preview, read_index
+from phibench.datasets.exposures.draw import Drawn, draw_frames
+from phibench.datasets.frames.frame_files import (
+    INDEX,
+    INDEX_TABLE,
+    REQUEST,
+    TRUTH,
+    FrameRow,
+    preview,
+    read_index,
+    write_index,
+)
 from phibench.datasets.frames.request import FrameRequest
 from phibench.datasets.frames.source import Frame
 from phibench.datasets.read import open_dataset
@@ -254,3 +264,23 @@ def test_fractions_are_not_rounded(
 ) -> None:
     assert run(tiny_dataset, "--out", tmp_path / "f", option, "1.5") == 2
     assert "'1.5' is not a whole number" in capsys.readouterr().err
+
+
+def test_a_frame_that_goes_while_others_are_drawn_ends_the_run(
+    smallest_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def removing(folder: Path, rows: Iterable[FrameRow]) -> Path:
+        (folder / f"{SEEN}-down-on-0000.jpg").unlink()
+        return write_index(folder, rows)
+
+    def again() -> Drawn:
+        return draw_frames(smallest_dataset, FrameRequest.of("mjpeg", {}), out=tmp_path, samples=[SEEN], workers=1)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("phibench.datasets.exposures.draw.write_index", removing)
+        with pytest.raises(
+            DatasetError, match=r"1 of 2 files are gone from .*-down-on-0000\.jpg.*run the same"
+        ) as caught:
+            again()
+    assert "\n" not in str(caught.value)
+    assert (again().made, again().kept) == (1, 2)
