@@ -6,8 +6,9 @@ compares spots, certificates, noise budgets, layers and light map with what the 
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -17,6 +18,7 @@ import numpy as np
 from rich.console import Console
 
 from phibench.datasets.build.bake_task import read_light_map
+from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.sample_task import noise_row, spot_noise
 from phibench.datasets.build.spot_task import SpotAnswer, answer_spot
 from phibench.datasets.errors import DatasetError
@@ -24,7 +26,7 @@ from phibench.datasets.plan.plan import PairPlan, Plan, make_plan, shard_plan
 from phibench.datasets.progress import Steps
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import damaged, read_checksums, strays
+from phibench.datasets.store.checksums import damaged, differing_files, misplaced, read_checksums, strays
 from phibench.datasets.store.documents import differences, same_number, sensitivity_fault, to_json
 from phibench.datasets.store.layers import (
     SPOT_STACKS,
@@ -90,23 +92,79 @@ def verify(folder: str | Path, truth_layers: bool = True, console: Console | Non
     folder, console = Path(folder), console or Console(stderr=True)
     if not folder.is_dir():
         raise DatasetError(f"there is no folder {folder}")
-    if not (folder / schema.INFO).is_file():
+    if not any((folder / name).is_file() for name in _SIGNS):
         raise DatasetError(f"{folder} is not a data set: it has no {schema.INFO}")
-    try:
-        faults, files = damaged(folder), len(read_checksums(folder))
-        notes = tuple(f"{name} is not part of the data set" for name in strays(folder))
-    except DatasetError as error:
-        faults, files, notes = [str(error)], 0, ()
+    faults, files, notes = file_faults(folder)
+    if not (folder / schema.INFO).is_file():
+        lost = f"{schema.INFO} is missing; `phibench dataset repair` writes it anew"
+        return Report(_once([lost, *faults]), files, 0, notes)
     try:
         dataset = open_dataset(folder)
     except DatasetError as error:
-        return Report((*faults, str(error)), files, 0, notes)
+        return Report(_once([*faults, str(error)]), files, 0, notes)
     # files that are reported already are not opened below: one fault, one sentence
     bad = {fault.split(" is ", 1)[0] for fault in faults}
-    faults += [*plan_faults(dataset), *differences(folder, dataset.rows)]
-    faults += filter(None, [sensitivity_fault(folder)])
+    faults += plan_faults(dataset)
+    if not bad & {schema.MANIFEST, schema.TABLE}:
+        faults += differences(folder, dataset.rows)
     faults += _content_faults(dataset, bad, truth_layers, console)
-    return Report(tuple(dict.fromkeys(faults)), files, len(dataset), notes)
+    return Report(_once(faults), files, len(dataset), notes)
+
+
+_SIGNS = (schema.INFO, schema.JOURNAL, schema.CHECKSUMS, schema.MANIFEST)  # any of them tells a data set
+
+
+def _once(faults: Iterable[str]) -> tuple[str, ...]:
+    """Each fault once; of several sentences on one file being missing or unreadable, the first."""
+    told: dict[str, str] = {}
+    for fault in faults:
+        name, verb, rest = fault.partition(" is ")
+        told.setdefault(name + verb if rest.startswith(("missing", "not readable")) else fault, fault)
+    return tuple(told.values())
+
+
+# Files: their kind, and the hashes of SHA256SUMS and journal.
+
+
+def file_faults(folder: Path) -> tuple[list[str], int, tuple[str, ...]]:
+    """Faults of the files as such, their number, and notes on what is odd.
+
+    Every bit of every file counts, but of the diaries and pictures that `schema.NOT_DATA` names: `run.json`,
+    `log.jsonl`, `contact_sheet.png`. Without SHA256SUMS the journal's hashes stand in.
+    """
+    faults, journal = misplaced(folder), Journal(folder)
+    held = {name: digest for entry in journal.entries.values() for name, digest in entry.files.items()}
+    if journal.head is not None:
+        texts = {schema.INFO: journal.head.info, schema.RECIPE: journal.head.recipe}
+        held |= {name: hashlib.sha256(text.encode()).hexdigest() for name, text in texts.items()}
+    try:
+        faults += damaged(folder)
+        listed = read_checksums(folder)
+    except DatasetError as error:
+        faults += [str(error), *differing_files(folder, held), *_journal_faults(folder, journal)]
+        return faults + list(filter(None, [sensitivity_fault(folder)])), len(held), ()
+    # what has been signed anew after a change is told by the journal
+    faults += [
+        f"{name} is damaged: its SHA-256 is not that of {schema.JOURNAL}"
+        for name in held
+        if held[name] != listed.get(name, held[name])
+    ]
+    faults += _journal_faults(folder, journal)
+    if journal.entries:
+        unknown = (name for name in listed if schema.is_task_file(name) and name not in held)
+        faults += [f"{schema.JOURNAL} is damaged: it has no entry for {name}" for name in unknown]
+    faults += filter(None, [sensitivity_fault(folder)])
+    return faults, len(listed), tuple(f"{name} is not part of the data set" for name in strays(folder))
+
+
+def _journal_faults(folder: Path, journal: Journal) -> Iterator[str]:
+    again = "`phibench dataset repair` writes it anew"
+    if not (folder / schema.JOURNAL).exists():
+        yield f"{schema.JOURNAL} is missing; {again}"
+    elif journal.damaged:
+        yield f"{schema.JOURNAL} is damaged: line {journal.damaged[0]} does not have its CRC-32; {again}"
+    elif journal.head is None:
+        yield f"{schema.JOURNAL} is damaged: its first line is missing; {again}"
 
 
 # Contents of spots and views.

@@ -10,7 +10,7 @@ from phibench.datasets.build.tasks import Made
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.recipe.tables import AmbientTable
 from phibench.datasets.store import schema
-from phibench.datasets.store.files import write_bytes
+from phibench.datasets.store.files import require_file, write_bytes
 from phibench.render.room.light_map import BakeSettings, LightMap, decoded, encoded, light_map
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
@@ -37,6 +37,6 @@ def read_light_map(out: Path) -> LightMap:
     """
     path = out / schema.LIGHT_MAP
     try:
-        return decoded(path.read_bytes())
+        return decoded(require_file(path).read_bytes())
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
         raise DatasetError(f"{path} is not readable as a light map: {error}") from error

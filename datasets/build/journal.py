@@ -46,6 +46,8 @@ class Journal:
     ----------
     head : FolderHead or None
     entries : dict of Entry by task
+    damaged : list of int
+        Numbers of the lines that are ignored, from 1.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -54,8 +56,11 @@ class Journal:
         self._size = 0
         self.head: FolderHead | None = None
         self.entries: dict[str, Entry] = {}
-        for document in _documents(self._path):
-            if "info" in document:
+        self.damaged: list[int] = []
+        for number, document in enumerate(_documents(self._path), 1):
+            if document is None:
+                self.damaged.append(number)
+            elif "info" in document:
                 self.head = FolderHead(**document)
             else:
                 self.entries[document["task"]] = Entry(**document)
@@ -73,8 +78,7 @@ class Journal:
         self.__exit__()
         self.head = head
         self.entries = {name: self.entries[name] for name in tasks if name in self.entries}
-        lines = [_line(asdict(head)), *(_line(asdict(entry)) for entry in self.entries.values())]
-        data = b"".join(lines)
+        data = self._bytes(head, self.entries)
         write_bytes(self._path, data)
         self._size = len(data)
 
@@ -94,6 +98,15 @@ class Journal:
             text = f"{self._path.parent} was removed or moved while this run wrote to it"
             raise DatasetError(f"{text}; delete what is left of it and run the same command again")
 
+    def is_written(self, head: FolderHead, tasks: Iterable[str]) -> bool:
+        """Tell whether the file has the bytes that `begin` would write."""
+        wanted = self._bytes(head, tasks)
+        return self._path.is_file() and self._path.read_bytes() == wanted
+
+    def _bytes(self, head: FolderHead, tasks: Iterable[str]) -> bytes:
+        entries = (self.entries[name] for name in tasks if name in self.entries)
+        return b"".join([_line(asdict(head)), *(_line(asdict(entry)) for entry in entries)])
+
     def add(self, entry: Entry) -> None:
         """Append one entry. The operating system has it before this returns, so that kill -9 cannot take it."""
         if self._file is None:
@@ -109,11 +122,11 @@ def _line(document: dict[str, Any]) -> bytes:
     return b"%08x %b\n" % (zlib.crc32(text), text)
 
 
-def _documents(path: Path) -> Iterator[dict[str, Any]]:
+def _documents(path: Path) -> Iterator[dict[str, Any] | None]:
+    """Documents of a journal, line by line; None for a line that is damaged."""
     if not path.is_file():
         return
     with path.open("rb") as file:
         for line in file:
             check, _, text = line.rstrip(b"\n").partition(b" ")
-            if check == b"%08x" % zlib.crc32(text):
-                yield json.loads(text)
+            yield json.loads(text) if check == b"%08x" % zlib.crc32(text) else None

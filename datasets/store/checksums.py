@@ -12,9 +12,11 @@ from pathlib import Path
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import from_json, read_info, read_manifest
-from phibench.datasets.store.files import TEMPORARY_PREFIX, sha256, write_text
+from phibench.datasets.store.files import TEMPORARY_PREFIX, require_file, sha256, write_text
 from phibench.scenes.rig import POSITIONS
 from phibench.scenes.room import Room
+
+_FILES = {schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.RIGS, *schema.NOT_DATA}
 
 
 def data_files(folder: Path) -> list[str]:
@@ -75,13 +77,36 @@ def read_checksums(folder: Path) -> dict[str, str]:
     return {name: digest for digest, name in entries}
 
 
+def misplaced(folder: Path) -> list[str]:
+    """One sentence per FIFO, socket, device or circular link in a folder, and per folder in place of a file of ours."""
+    found = []
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        try:
+            if not path.is_dir() or name in _FILES or schema.is_task_file(name):
+                require_file(path)
+        except OSError as error:
+            found.append(f"{name} is not readable: {error.strerror or error}")
+    return found
+
+
 def damaged(folder: Path) -> list[str]:
-    """One sentence per file that is missing, cannot be read, was changed or is not listed although it belongs here."""
-    listed, planned = read_checksums(folder), set()
+    """One sentence per file that is missing, cannot be read, was changed or is not listed although it belongs here.
+
+    The list itself must have the bytes that `checksums_text` gives: sorted lines, each name once.
+    """
+    listed, planned = read_checksums(folder), set[str]()
+    spoilt = checksums_text(listed).encode() != (folder / schema.CHECKSUMS).read_bytes()
+    faults = [f"{schema.CHECKSUMS} is damaged: it is not a sorted list of files, each named once"] if spoilt else []
     with contextlib.suppress(DatasetError):  # a manifest that cannot be read is reported as what it is, below
         planned = set(data_files(folder))
-    faults = [fault for name, digest in listed.items() if (fault := _fault(folder, name, digest))]
+    faults += differing_files(folder, listed)
     return faults + [f"{name} is not listed in {schema.CHECKSUMS}" for name in sorted(planned - set(listed))]
+
+
+def differing_files(folder: Path, hashes: Mapping[str, str]) -> list[str]:
+    """One sentence per file that is missing, cannot be read or has another SHA-256."""
+    return [fault for name, digest in hashes.items() if (fault := _fault(folder, name, digest))]
 
 
 def check_documents(folder: Path) -> None:

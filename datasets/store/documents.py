@@ -3,8 +3,8 @@
 Doubles survive exactly. Numbers that do not exist are NaN in Python and null in JSON and Parquet.
 
 `sensitivities.parquet` (dD/d(parameter) per sample and estimator) is written by the estimator's side when a data set is
-finished. SHA256SUMS, whose bytes follow from the recipe alone, does not list it. Its metadata hold the SHA-256 of
-SHA256SUMS instead, which tells the state of the data set that it belongs to.
+finished. SHA256SUMS, whose bytes follow from the recipe alone, does not list it. Its metadata hold two hashes instead:
+that of SHA256SUMS, which tells the state of the data set that it belongs to, and that of the table's own file.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import io
 import json
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -27,7 +28,7 @@ from phibench.datasets.input_files import InputFile, first_fault, printable
 from phibench.datasets.plan.plan import Plan, PosePlan
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store import schema
-from phibench.datasets.store.files import read_rows, sha256, write_bytes
+from phibench.datasets.store.files import read_rows, require_file, sha256, write_bytes
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import (
     READABLE_VERSIONS,
@@ -358,13 +359,23 @@ def read_rigs(folder: Path) -> Rigs:
 # sensitivities.parquet.
 
 
-DIGEST = "phibench.dataset_sha256"
-"""Key of the metadata."""
+DIGEST, FILE_DIGEST = "phibench.dataset_sha256", "phibench.file_sha256"
+"""Keys of the metadata: of the data set's SHA256SUMS, and of the table's own file."""
+_PLACE = hashlib.sha256(FILE_DIGEST.encode()).hexdigest().encode()  # occurs nowhere else in the file
+_OWN = re.compile(re.escape(FILE_DIGEST.encode()) + rb".{1,4}?([0-9a-f]{64})", re.DOTALL)  # two bytes of Thrift between
+_AGAIN = "run `phibench dataset sensitivities` again"
 
 
-def metadata_of(folder: Path) -> dict[str, str]:
-    """Metadata of a table for the data set in a folder as it is now."""
-    return {DIGEST: sha256(folder / schema.CHECKSUMS)}
+def sensitivity_bytes(table: DataFrame, folder: Path) -> bytes:
+    """Parquet file of a table for the data set in a folder as it is now, with both hashes.
+
+    The file's own hash is taken with a constant in its place, so that every bit of the file counts.
+    """
+    buffer = io.BytesIO()
+    metadata = {DIGEST: sha256(folder / schema.CHECKSUMS), FILE_DIGEST: _PLACE.decode()}
+    table.write_parquet(buffer, compression="zstd", statistics=False, metadata=metadata)
+    data = buffer.getvalue()
+    return data.replace(_PLACE, hashlib.sha256(data).hexdigest().encode())
 
 
 def sensitivity_fault(folder: Path) -> str | None:
@@ -372,20 +383,28 @@ def sensitivity_fault(folder: Path) -> str | None:
     import polars
 
     path = folder / schema.SENSITIVITIES
-    if not path.is_file():
+    if not os.path.lexists(path):
         return None
     try:
+        data = require_file(path).read_bytes()
+        own = _OWN.search(data)
+        if own is None:
+            return f"{schema.SENSITIVITIES} is damaged or of an earlier version: it has no SHA-256 of its own; {_AGAIN}"
+        if hashlib.sha256(data.replace(own[1], _PLACE)).hexdigest().encode() != own[1]:
+            return f"{schema.SENSITIVITIES} is damaged: its SHA-256 is not the one that it holds; {_AGAIN}"
         digest = polars.read_parquet_metadata(path).get(DIGEST)
-        polars.scan_parquet(path).select(polars.all().count()).collect()
-    except (polars.exceptions.PolarsError, OSError) as error:
-        why = str(error).splitlines()[0]
-        return f"{schema.SENSITIVITIES} cannot be read: {why}; run `phibench dataset sensitivities` again"
-    if digest != metadata_of(folder)[DIGEST]:
-        return (
-            f"{schema.SENSITIVITIES} belongs to another state of this data set; "
-            "run `phibench dataset sensitivities` again"
-        )
+    except (polars.exceptions.PolarsError, polars.exceptions.PanicException, OSError) as error:
+        return f"{schema.SENSITIVITIES} cannot be read: {_first_line(error)}; {_AGAIN}"
+    sums = folder / schema.CHECKSUMS
+    if sums.is_file() and digest != sha256(sums):  # without SHA256SUMS the data set itself is unfinished
+        return f"{schema.SENSITIVITIES} belongs to another state of this data set; {_AGAIN}"
     return None
+
+
+def _first_line(error: BaseException) -> str:
+    """Reason of an error in one line, without the path that an operating system's error names."""
+    text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    return text.splitlines()[0] if text else type(error).__name__
 
 
 def read_sensitivities(folder: Path) -> DataFrame:

@@ -16,6 +16,8 @@ import json
 import os
 import platform
 import re
+import shutil
+import stat
 import tempfile
 import time
 import uuid
@@ -84,16 +86,36 @@ def write_text(path: Path, text: str) -> Path:
     return write_bytes(path, text.encode())
 
 
+_KINDS = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket"}
+
+
+def require_file(path: Path) -> Path:
+    """Path of a regular file, or of a link to one; reading anything else may wait for ever.
+
+    Raises
+    ------
+    OSError
+        If it is missing, a link that leads in a circle, a folder, FIFO, socket or device.
+    """
+    mode = path.stat().st_mode
+    if not stat.S_ISREG(mode):
+        raise OSError(errno.EINVAL, f"it is {_KINDS.get(stat.S_IFMT(mode), 'a device')}, not a file", str(path))
+    return path
+
+
 def sha256(path: Path) -> str:
-    """SHA-256 of a file, hexadecimal."""
-    with path.open("rb") as file:
+    """SHA-256 of a regular file, hexadecimal."""
+    with require_file(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def remove_temporary(folder: Path) -> None:
     """Remove what a killed run left under temporary names, in `folder` and below."""
     for path in folder.rglob(TEMPORARY_PREFIX + "*"):
-        path.unlink(missing_ok=True)
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def _write_and_rename(path: Path, write: Callable[[Path], None]) -> None:

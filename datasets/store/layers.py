@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.store.files import write_atomic
+from phibench.datasets.store.files import require_file, write_atomic
 from phibench.scenes.camera import FILTERS
 from phibench.scenes.frames import Array
 
@@ -134,7 +134,7 @@ def _write(path: Path, planes: dict[str, Plane], text: str, origin_px: tuple[int
 
 def _check_readable(path: Path) -> None:
     try:
-        path.open("rb").close()
+        require_file(path).open("rb").close()
     except FileNotFoundError as error:
         raise DatasetError(f"{path} is missing") from error
     except OSError as error:

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from phibench.datasets import make as rendering
 from phibench.datasets import merge_repair
 from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.datasets.store import schema
-from phibench.datasets.store.documents import metadata_of, sensitivity_fault
+from phibench.datasets.store.documents import sensitivity_bytes, sensitivity_fault
 from phibench.datasets.store.files import write_bytes
 from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.sensitivities import PARAMETERS, sensitivity
@@ -50,14 +49,12 @@ def sensitivity_rows(samples: Iterable[Sample]) -> Iterator[Row]:
 
 
 def write_sensitivities(dataset: Dataset, out: Path) -> Path:
-    """Write the table of a data set as Parquet; its metadata say of which state of the data set."""
+    """Write the table of a data set as Parquet; its metadata say of which state of the data set it is."""
     import polars
 
     types = dict.fromkeys(columns(), polars.Float64) | dict.fromkeys(_WORDS, polars.String)
-    buffer = io.BytesIO()
     table = polars.DataFrame(list(sensitivity_rows(dataset)), schema={name: types[name] for name in columns()})
-    table.write_parquet(buffer, compression="zstd", statistics=False, metadata=metadata_of(dataset.folder))
-    return write_bytes(out, buffer.getvalue())
+    return write_bytes(out, sensitivity_bytes(table, dataset.folder))
 
 
 def keep_sensitivities(folder: Path) -> Path:

@@ -1,11 +1,13 @@
 """Verification finds every kind of damage, and nothing where there is none."""
 
+import contextlib
 import errno
 import io
 import json
 import os
 import re
 import shutil
+import socket
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.damage import AMBIENT, OTHER_SPOT, SPOT, TRUTH, flip_a_bit, swap, truncate
+from helpers.damage import AMBIENT, OTHER_SPOT, SPOT, TRUTH, flip_a_bit, sign, swap, truncate, unseen_flips
+from helpers.processes import within
 from PIL import Image
 from rich.console import Console
 
@@ -34,7 +37,8 @@ from phibench.datasets.store.layers import (
     write_truth,
 )
 from phibench.datasets.store.pictures import Picture
-from phibench.datasets.verify import Report, verify
+from phibench.datasets.verify import Report, file_faults, verify
+from phibench.estimator.paper.sensitivity_table import keep_sensitivities
 
 PREVIEW = schema.preview_file("seen-near-h0.500")
 
@@ -86,7 +90,7 @@ def test_a_damaged_file_is_named(copy: Path, name: str, damage: Callable[[Path],
 def test_swapped_files_are_found(copy: Path, a: str, b: str, hide: bool) -> None:
     swap(copy, a, b)
     if hide:
-        write_checksums(copy)
+        sign(copy)
     faults = check(copy).faults
     assert {name for name in (a, b) if any(name in fault for fault in faults)} == {a, b}
 
@@ -136,7 +140,7 @@ def test_a_spoilt_light_map_is_found_though_signed(copy: Path, name: str, spoil:
     else:
         return
     np.savez(copy / schema.LIGHT_MAP, **arrays)
-    write_checksums(copy)
+    sign(copy)
     [fault] = check(copy).faults
     assert schema.LIGHT_MAP in fault
     assert name in fault
@@ -148,8 +152,93 @@ def test_a_variance_that_is_none_is_found_though_signed(copy: Path, value: float
     planes, variance, header = read_ambient(path), read_ambient_variance(path), read_exr(path).header
     variance[1, 2, 3] = value
     write_ambient(path, planes, variance, header)
-    write_checksums(copy)
+    sign(copy)
     assert check(copy).faults == (f"{AMBIENT} has negative or non-finite variances",)
+
+
+def place(kind: str, path: Path) -> None:
+    """Something that is no file, under the name of a file."""
+    path.unlink(missing_ok=True)
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "FIFO":
+        os.mkfifo(path)
+    elif kind == "socket":
+        with socket.socket(socket.AF_UNIX) as server, contextlib.chdir(path.parent):  # a socket's path has 108 bytes
+            server.bind(path.name)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    else:
+        path.symlink_to(path.name)
+
+
+KINDS = ["folder", "FIFO", "socket", "device", "circle"]
+NAMES = [
+    *(schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.RIGS, schema.CHECKSUMS, schema.LIGHT_MAP),
+    *(schema.JOURNAL, schema.RUN, schema.LOG, schema.CONTACT_SHEET, schema.SENSITIVITIES),
+    *(AMBIENT, TRUTH, SPOT, PREVIEW, schema.view_file("h0.000", "preview")),
+]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX files")
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_no_file_is_a_fault_and_keeps_nobody_waiting(copy: Path, kind: str) -> None:
+    """All names at once, then each by itself: file by file costs little, contents are looked at once."""
+    for name in NAMES:
+        aside = copy.parent / "aside"
+        (copy / name).rename(aside) if (copy / name).is_file() else None
+        place(kind, copy / name)
+        with within(20):
+            assert [fault for fault in file_faults(copy)[0] if name in fault], name
+        (copy / name).rmdir() if kind == "folder" else (copy / name).unlink()
+        aside.rename(copy / name) if aside.is_file() else None
+    assert file_faults(copy)[0] == []
+    for name in set(NAMES) - {schema.INFO, schema.MANIFEST}:  # by which a data set is known
+        place(kind, copy / name)
+    with within(60):
+        faults = check(copy).faults
+    told = [name for name in NAMES if any(fault.startswith(f"{name} is ") for fault in faults)]
+    assert told == [name for name in NAMES if name not in (schema.INFO, schema.MANIFEST)]
+
+
+def test_without_its_sums_the_other_faults_are_told_too(copy: Path) -> None:
+    """The journal's hashes stand in; a table of sensitivities is no system error."""
+    keep_sensitivities(copy)
+    (copy / schema.CHECKSUMS).unlink()
+    flip_a_bit(copy / PREVIEW)
+    (copy / SPOT).unlink()
+    faults = check(copy).faults
+    assert len(faults) == 3
+    assert "was not finished" in faults[0]
+    assert {f"{SPOT} is missing", f"{PREVIEW} is damaged: its SHA-256 is not the listed one"} == set(faults[1:])
+
+
+@pytest.mark.parametrize("line", [0, 3, -1])
+def test_a_journal_that_is_missing_or_damaged_is_a_fault(copy: Path, line: int) -> None:
+    path = copy / schema.JOURNAL
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join([*lines[:line], *lines[line:][1:]]))
+    assert [fault for fault in file_faults(copy)[0] if fault.startswith("journal.txt is damaged")]
+    path.unlink()
+    assert tuple(file_faults(copy)[0]) == ("journal.txt is missing; `phibench dataset repair` writes it anew",)
+
+
+def test_a_file_that_is_signed_anew_is_told_by_the_journal(copy: Path) -> None:
+    flip_a_bit(copy / PREVIEW)
+    write_checksums(copy)
+    assert check(copy).faults == (f"{PREVIEW} is damaged: its SHA-256 is not that of journal.txt",)
+
+
+def test_lost_info_is_a_fault_with_its_remedy(copy: Path) -> None:
+    (copy / schema.INFO).unlink()
+    [fault] = check(copy).faults
+    assert fault == "dataset.json is missing; `phibench dataset repair` writes it anew"
+
+
+def test_no_flipped_bit_goes_unseen(copy: Path) -> None:
+    """Four bits of every kind of file, at random; tests/attack has the large sweep."""
+    keep_sensitivities(copy)
+    assert unseen_flips(copy, 4) == {}
 
 
 def test_an_unfinished_data_set_is_found(copy: Path) -> None:
@@ -163,7 +252,7 @@ def test_a_truth_that_the_parameters_do_not_give_is_found(copy: Path) -> None:
     rows = read_manifest(copy)
     up = rows[0].up.model_copy(update={"u_px": rows[0].up.u_px + 1e-7})
     write_manifest(copy, [rows[0].model_copy(update={"up": up}), *rows[1:]])
-    write_checksums(copy)
+    sign(copy)
     [fault] = check(copy).faults
     assert fault.startswith("seen-near-h0.500 up: u_px is")
 
@@ -172,7 +261,7 @@ def test_a_changed_rig_is_found(copy: Path) -> None:
     rig = json.loads((copy / schema.RIGS).read_text())
     rig["resolved"]["mirror"]["radius_m"] += 1e-6
     (copy / schema.RIGS).write_text(json.dumps(rig))
-    write_checksums(copy)
+    sign(copy)
     faults = check(copy).faults
     assert any("u_px" in fault for fault in faults)
     assert any("phi_ray_rad" in fault for fault in faults)
@@ -184,7 +273,7 @@ def test_a_missing_row_is_found(copy: Path) -> None:
     info["samples"] = 1
     (copy / schema.INFO).write_text(json.dumps(info))
     write_manifest(copy, read_manifest(copy)[:1])
-    write_checksums(copy)
+    sign(copy)
     assert "manifest.jsonl: sample half-hidden-h1.400 of the recipe is missing" in check(copy).faults
 
 
@@ -192,7 +281,7 @@ def test_a_changed_pixel_truth_is_found_when_asked_for(copy: Path) -> None:
     planes = read_truth(copy / TRUTH)
     planes["depth_m"][60:120, 100:200] *= 1.0 + 1e-5
     write_truth(copy / TRUTH, planes, {"dataset": "smallest", "pose": "h0.500", "offset_m": 0.5})
-    write_checksums(copy)
+    sign(copy)
     assert check(copy).ok
     [fault] = check(copy, truth_layers=True).faults
     assert "depth_m is not what the parameters give" in fault
