@@ -6,7 +6,9 @@ import io
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+from helpers.damage import flip_bit
 from helpers.folders import contents
 from rich.console import Console
 
@@ -15,6 +17,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import strays
+from phibench.datasets.store.documents import sensitivity_fault
 from phibench.datasets.verify import verify
 from phibench.estimator.cli.main import main
 from phibench.estimator.geometry.estimators import ESTIMATORS
@@ -68,8 +71,19 @@ def test_a_damaged_table_is_noticed(copy: Path) -> None:
     path = keep_sensitivities(copy)
     path.write_bytes(path.read_bytes()[:200])
     [fault] = faults(copy)
-    assert fault.startswith("sensitivities.parquet cannot be read: ")
+    assert fault.startswith("sensitivities.parquet is damaged")
     assert "\n" not in fault
+
+
+def test_no_flipped_bit_of_the_table_goes_unseen(copy: Path) -> None:
+    """Neither in numbers, whose pages have no checksum in Parquet, nor in names, types and hashes."""
+    path = keep_sensitivities(copy)
+    bits = np.random.default_rng(0).integers(0, 8 * path.stat().st_size, 300)
+    for bit in map(int, bits):
+        flip_bit(path, bit)
+        assert sensitivity_fault(copy) is not None, bit
+        flip_bit(path, bit)
+    assert sensitivity_fault(copy) is None
 
 
 def test_a_data_set_without_one_says_how_to_get_it(copy: Path) -> None:
