@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import time
@@ -33,7 +34,7 @@ from phibench.datasets.recipe.checks import warnings
 from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_text, with_numbers
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import dataset_info, info_text, parse_info, read_manifest, same_content
-from phibench.datasets.store.files import WriteError, write_text
+from phibench.datasets.store.files import WriteError, require_file, write_text
 from phibench.datasets.store.provenance import code_sha256, provenance
 from phibench.datasets.store.schema import DatasetInfo
 
@@ -157,15 +158,19 @@ def make_from_plan(
 def _make(plan: Plan, recipe: str, out: Path, pool: WorkerPool, journal: Journal, console: Console) -> list[str]:
     started, began = time.monotonic(), datetime.now(UTC)
     environment, no_renderer = _environment(pool, journal)
-    head = FolderHead(_info_text(dataset_info(plan, environment), journal), recipe)
+    head = FolderHead(_info_text(dataset_info(plan, environment), journal, out), recipe)
     tasks = plan_tasks(plan, versions(environment))
     todo = unfinished(tasks, journal, out)
     if todo and no_renderer is not None:
         what = f"{len(todo)} of {len(tasks)} tasks are to be done, such as '{todo[0]}'"
         raise DatasetError(f"{what}, and {no_renderer}") from no_renderer
     if not todo and not (faults := _loose_ends(plan, head, journal, tasks, out)):
-        console.print(f"{out} is complete, nothing to do", highlight=False)
-        return []
+        if journal.is_written(head, tasks):
+            console.print(f"{out} is complete, nothing to do", highlight=False)
+            return []
+        journal.begin(head, tasks)
+        console.print(f"{out} is complete, its journal is written anew", highlight=False)
+        return [schema.JOURNAL]
     if todo:
         (out / schema.CHECKSUMS).unlink(missing_ok=True)
         run_tasks(plan, tasks, todo, journal, head, out, pool, console)
@@ -203,14 +208,15 @@ def _loose_ends(plan: Plan, head: FolderHead, journal: Journal, tasks: Iterable[
     return [*differing(out, assemble(plan, head, entries)), *stale_files(out, files)]
 
 
-def _info_text(info: DatasetInfo, journal: Journal) -> str:
-    """Text of `dataset.json`: the one that is there if it means the same."""
-    if journal.head is not None:
-        try:
-            if same_content(parse_info(journal.head.info), info):
-                return journal.head.info
-        except ValueError:
-            pass  # of another version
+def _info_text(info: DatasetInfo, journal: Journal, out: Path) -> str:
+    """Text of `dataset.json`: the journal's, or the one that is there, if it means the same."""
+    held = [] if journal.head is None else [journal.head.info]
+    with contextlib.suppress(OSError, ValueError):
+        held.append(require_file(out / schema.INFO).read_text(encoding="utf-8"))
+    for text in held:
+        with contextlib.suppress(ValueError):  # of another version, or damaged
+            if same_content(parse_info(text), info):
+                return text
     return info_text(info)
 
 

@@ -7,9 +7,12 @@ nothing else.
 from __future__ import annotations
 
 import json
+import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import count
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -26,15 +29,24 @@ from phibench.datasets.build.run_tasks import (
 from phibench.datasets.build.task_list import task_names
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import make_from_plan
-from phibench.datasets.plan.plan import make_plan, parse_shard, shard_plan
+from phibench.datasets.plan.plan import Plan, make_plan, parse_shard, shard_plan
 from phibench.datasets.progress import Steps
 from phibench.datasets.recipe.load import parse_recipe
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store import schema
-from phibench.datasets.store.documents import dataset_info, info_text, parse_info, recipe_sha256, same_content
-from phibench.datasets.store.files import WriteError, sha256, write_atomic
+from phibench.datasets.store.documents import (
+    dataset_info,
+    info_text,
+    parse_info,
+    read_manifest,
+    recipe_sha256,
+    same_content,
+)
+from phibench.datasets.store.files import WriteError, only_run, sha256, write_atomic
+from phibench.datasets.store.layers import read_exr
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import CHECKSUMS, DatasetInfo
+from phibench.scenes.rig import POSITIONS
 
 
 def merge(out: str | Path, shards: Sequence[str | Path], console: Console | None = None) -> Path:
@@ -140,7 +152,11 @@ def repair(
     """Make a data set whole again; return what was done: tasks by name, small files by theirs.
 
     Damage is found by the hashes of the journal, which `SHA256SUMS` cannot belie. Without a journal, or with lines of
-    it damaged, the tasks that it does not vouch for are done again.
+    it damaged, the tasks that it does not vouch for are done again. A `dataset.json` that is lost together with the
+    journal's first line follows from `recipe.toml`, if the layers are of that recipe.
+
+    Folders, FIFOs, sockets, devices and circular links in place of files give way; a folder that holds something is
+    kept under another name.
 
     Raises
     ------
@@ -149,14 +165,97 @@ def repair(
         hold, or if this code or these packages are not those that made it: the parts would not fit together.
     """
     folder, console = Path(folder), console or Console(stderr=True)
-    head = held_head(folder) if folder.is_dir() else None
+    plan, recipe = _held_plan(folder)
+    _clear(folder, [schema.LOCK], console)  # without it nobody can hold the folder
+    with only_run(folder):
+        _clear(folder, _places(plan), console)
+    return make_from_plan(plan, recipe, folder, workers, console, scheduler)
+
+
+def _held_plan(folder: Path) -> tuple[Plan, str]:
+    """Plan of what a folder should hold, and the text of its recipe."""
+    try:
+        head = held_head(folder) if folder.is_dir() else None
+    except DatasetError as error:
+        if (head := _lost_head(folder)) is None:
+            raise error from None
+        with only_run(folder), Journal(folder) as journal:
+            journal.begin(head, list(journal.entries))
+        return make_plan(parse_recipe(head.recipe)), head.recipe
     if head is None:
         raise DatasetError(f"{folder} is not a data set: there is nothing to repair")
     info = json.loads(head.info)
     _refuse_other_code(folder, info["provenance"])
-    recipe = _recipe(folder, head, info)
-    plan = shard_plan(make_plan(recipe), info["shard"])
-    return make_from_plan(plan, head.recipe, folder, workers, console, scheduler)
+    return shard_plan(make_plan(_recipe(folder, head, info)), info["shard"]), head.recipe
+
+
+def _lost_head(folder: Path) -> FolderHead | None:
+    """Description that follows from `recipe.toml`; None where it or the layers are missing.
+
+    Raises
+    ------
+    DatasetError
+        If the layers are not those of the recipe, or only a part of them.
+    """
+    path, layers = folder / schema.RECIPE, sorted(folder.glob(schema.view_file("*", "ambient")))
+    if not (path.is_file() and layers):
+        return None
+    text = path.read_text(encoding="utf-8")
+    plan = make_plan(parse_recipe(text, f"{path}"))
+    expected = {pose.pose_id: pose.seed for pose in plan.poses}
+    headers = [_header(layer) for layer in layers]
+    held = {header["pose"]: header["seed"] for header in headers if header.get("dataset") == plan.recipe.dataset.name}
+    if not held or not held.items() <= expected.items():
+        raise DatasetError(f"{path} is not the recipe of the layers in {folder}; put the right one back")
+    if (folder / schema.MANIFEST).is_file() and len(read_manifest(folder)) != len(plan.pairs):
+        text = f"{folder} holds a shard, and which one is lost with {schema.INFO}"
+        raise DatasetError(f"{text}; put {schema.INFO} back, or render the shard into a new folder")
+    return FolderHead(info_text(dataset_info(plan, {})), text)
+
+
+def _header(layer: Path) -> dict[str, Any]:
+    """Header of a layer; empty if the file is damaged."""
+    try:
+        return read_exr(layer).header
+    except DatasetError:
+        return {}
+
+
+def _places(plan: Plan) -> list[str]:
+    """Relative names of all files of a plan, those included that need not be there."""
+    samples = [pair.sample_id for pair in plan.pairs]
+    return [
+        *(schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.RIGS, schema.LIGHT_MAP, *schema.NOT_DATA),
+        *(schema.view_file(pose.pose_id, kind) for pose in plan.poses for kind in ("ambient", "truth", "preview")),
+        *(schema.spot_file(sample, position) for sample in samples for position in POSITIONS),
+        *(schema.preview_file(sample) for sample in samples),
+    ]
+
+
+def _clear(folder: Path, names: Iterable[str], console: Console) -> None:
+    """Take away what is no file in the place of a file, and what is no folder in the place of a folder."""
+    folders = {parent for name in names for parent in Path(name).parents if parent.name}
+    for parent in sorted(folders):
+        if os.path.lexists(folder / parent) and not (folder / parent).is_dir():
+            _set_aside(folder / parent, console)
+    for name in names:
+        path = folder / name
+        if path.is_symlink() and not path.is_file():
+            path.unlink()  # dangling, in a circle, or to something else: the link only
+        elif path.is_dir():
+            _set_aside(path, console)
+        elif path.exists() and not path.is_file():
+            path.unlink()  # a FIFO, socket or device holds nothing
+
+
+def _set_aside(path: Path, console: Console) -> None:
+    """Remove an empty folder; give anything else another name."""
+    if path.is_dir() and not any(path.iterdir()):
+        path.rmdir()
+        return
+    kept = next(other for k in count(1) if not os.path.lexists(other := path.with_name(f"{path.name}.aside-{k}")))
+    path.rename(kept)
+    console.print(f"{path} was no {'file' if kept.is_dir() else 'folder'}; it is kept as {kept.name}", highlight=False)
 
 
 def _recipe(folder: Path, head: FolderHead, info: dict[str, object]) -> Recipe:

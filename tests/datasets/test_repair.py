@@ -1,6 +1,7 @@
 """Repair makes again exactly what is damaged, and the data set has its old bytes."""
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -8,7 +9,7 @@ from pathlib import Path
 import pytest
 from helpers.damage import AMBIENT, OTHER_SPOT, SPOT, TRUTH, flip_a_bit, swap, truncate
 from helpers.folders import contents
-from helpers.processes import quiet
+from helpers.processes import quiet, within
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.merge_repair import repair
@@ -80,6 +81,83 @@ def test_without_a_journal_all_is_done_again(copy: Path, smallest_dataset: Path)
     (copy / schema.JOURNAL).unlink()
     assert len(mend(copy)) >= 8
     assert contents(copy) == contents(smallest_dataset)
+
+
+@pytest.mark.parametrize("damage", ["first line", "another line", "more at the end"])
+def test_a_damaged_journal_is_written_anew(copy: Path, smallest_dataset: Path, damage: str) -> None:
+    path = copy / schema.JOURNAL
+    head, *rest = path.read_bytes().splitlines(keepends=True)
+    if damage == "first line":
+        head = head.replace(b'"', b"'", 1)
+    elif damage == "another line":
+        rest[0] = rest[0].replace(b'"', b"'", 1)
+    elif damage == "more at the end":
+        rest.append(b"not a line")
+    path.write_bytes(b"".join([head, *rest]))
+    assert mend(copy)
+    assert contents(copy) == contents(smallest_dataset)
+    assert mend(copy) == []
+
+
+@pytest.mark.parametrize("content", [False, True], ids=["empty", "with content"])
+def test_folders_in_place_of_files_give_way(copy: Path, smallest_dataset: Path, content: bool) -> None:
+    """A folder that holds something is kept under another name."""
+    names = sorted(contents(copy)) if content else [SPOT, PREVIEW, schema.MANIFEST, schema.CHECKSUMS]
+    for name in names:
+        (copy / name).unlink()
+        (copy / name).mkdir()
+        if content:
+            (copy / name / "note.txt").write_text("mine")
+    lost = {schema.INFO, schema.JOURNAL} & set(names)
+    for name in lost:  # one of them and the recipe must be left
+        (copy / name / "note.txt").unlink()
+        (copy / name).rmdir()
+        (copy / name).write_bytes((smallest_dataset / name).read_bytes())
+    for name in (schema.LOG, schema.RUN, schema.LOCK):
+        (copy / name).unlink(missing_ok=True)
+        (copy / name).mkdir()
+    mend(copy)
+    assert contents(copy) == contents(smallest_dataset)
+    kept = [path for path in copy.rglob("note.txt") if path.read_text() == "mine"]
+    assert len(kept) == (len(names) - len(lost) if content else 0)
+
+
+def test_fifos_circles_and_files_in_place_of_folders_give_way(copy: Path, smallest_dataset: Path) -> None:
+    for name in (SPOT, schema.MANIFEST, schema.LOG):
+        (copy / name).unlink()
+        os.mkfifo(copy / name)
+    for name in (AMBIENT, schema.TABLE):
+        (copy / name).unlink()
+        (copy / name).symlink_to(Path(name).name)
+    shutil.rmtree(copy / "previews")
+    (copy / "previews").write_text("mine")
+    with within(100):
+        mend(copy)
+    assert contents(copy) == contents(smallest_dataset)
+    assert (copy / "previews.aside-1").read_text() == "mine"
+
+
+@pytest.mark.parametrize("journal", ["first line", "whole"])
+def test_a_lost_info_follows_from_recipe_and_layers(copy: Path, smallest_dataset: Path, journal: str) -> None:
+    (copy / schema.INFO).unlink()
+    _, *rest = (copy / schema.JOURNAL).read_bytes().splitlines(keepends=True)
+    (copy / schema.JOURNAL).write_bytes(b"".join(rest) if journal == "first line" else b"")
+    done = mend(copy)
+    assert (len(done) <= 3) == (journal == "first line"), done
+    assert contents(copy) == contents(smallest_dataset)
+
+
+def test_a_lost_info_does_not_follow_from_another_recipe(copy: Path) -> None:
+    (copy / schema.INFO).unlink()
+    (copy / schema.JOURNAL).unlink()
+    text = (copy / schema.RECIPE).read_text()
+    (copy / schema.RECIPE).write_text(text.replace("seed = 0", "seed = 1"))
+    assert "is not the recipe of the layers" in refusal(copy)
+    (copy / schema.RECIPE).write_text(text)
+    (copy / schema.MANIFEST).write_text((copy / schema.MANIFEST).read_text().splitlines(keepends=True)[0])
+    assert "holds a shard" in refusal(copy)
+    shutil.rmtree(copy / "views")
+    assert "holds no data set" in refusal(copy)
 
 
 def refusal(folder: Path) -> str:
