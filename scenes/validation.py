@@ -70,6 +70,17 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f"{guess}known: {', '.join(names)}"
 
 
+def printable_line(text: str, most: int = 200) -> str:
+    """Text from outside as one line that any terminal, file or page takes.
+
+    Blanks and line ends become one blank. What cannot be printed (control characters, lone surrogates, marks that turn
+    the direction) becomes its escape. What is longer than `most` characters is cut.
+    """
+    line = " ".join(text[: 8 * most].split())  # 8: enough for what is cut below, and no gigabyte is looked through
+    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line[: most + 1])
+    return shown if len(shown) <= most else f"{shown[: most - 3]}..."
+
+
 def close_names(name: str, known: Iterable[str]) -> list[str]:
     """Nearest known name, if one is near: a list of one or none."""
     return difflib.get_close_matches(name, list(known), 1, 0.5)

@@ -68,7 +68,8 @@ def picture(data: bytes, kind: str, alt: str) -> Picture:
     return Picture(f"data:{_MIME[kind]};base64,{base64.b64encode(data).decode('ascii')}", alt)
 
 
-_PANEL: Any = {**STYLE, "font.size": 10.0, "svg.fonttype": "none"}
+# names of methods are text: a "$" in one is no formula
+_PANEL: Any = {**STYLE, "font.size": 10.0, "svg.fonttype": "none", "text.parse_math": False}
 _SIZE = (4.2, 3.1)  # inches of 96 px
 _HATCHES = ("", "///", "...", "xx", "\\\\\\", "++", "oo", "--", "**", "||", "//", "O.", "xx..", "+++")
 _BINS = 12

@@ -1,15 +1,21 @@
 """The command line ``phibench``: a thin layer over the packages.
 
-Exit codes: 0 done, 1 checked and found wanting, 2 a mistake of the user or the machine in one sentence, 130 Ctrl-C.
+Exit codes: 0 done, 1 checked and found wanting, 2 a mistake of the user or the machine in one sentence, 130 Ctrl-C,
+129 SIGHUP, 143 SIGTERM.
 Every command imports what it needs itself, so that ``--help`` is quick and scoring runs without Mitsuba.
 """
 
 from __future__ import annotations
 
+import io
 import os
+import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
 
 from cyclopts import App, CycloptsError
 
@@ -54,12 +60,19 @@ def main(tokens: Sequence[str] | None = None) -> int:
     if old := answer_to_old_spelling(sys.argv[1:] if tokens is None else tokens):
         print(f"phibench: {old}", file=sys.stderr)
         return 2
+    for stream in (sys.stdout, sys.stderr):  # a letter that the terminal lacks is no reason to stop
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     for name, value in ONE_THREAD.items():  # of the processes that a command starts, too; who sets one has his way
         os.environ.setdefault(name, value)
     try:
-        return int(app(tokens, exit_on_error=False) or 0)
+        with _orderly_stop():
+            return int(app(tokens, exit_on_error=False) or 0)
     except CycloptsError:
         return 2  # cyclopts has said what is wrong
+    except _Stopped as stop:
+        print(f"Stopped by {stop.number.name}.", file=sys.stderr)
+        return 128 + stop.number
     except KeyboardInterrupt:
         print("Interrupted: stopped at your request.", file=sys.stderr)
         return 130
@@ -68,6 +81,33 @@ def main(tokens: Sequence[str] | None = None) -> int:
             raise
         print(f"phibench: {_sentence(error)}", file=sys.stderr)
         return 2
+
+
+class _Stopped(KeyboardInterrupt):
+    """SIGTERM or SIGHUP: whatever cleans up after Ctrl-C cleans up after these."""
+
+    def __init__(self, number: signal.Signals) -> None:
+        self.number = number
+
+
+@contextmanager
+def _orderly_stop() -> Iterator[None]:
+    """SIGTERM and SIGHUP end the command as Ctrl-C does; a second one ends it at once."""
+    numbers = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is signal.SIG_DFL]  # nohup ignores one
+    if threading.current_thread() is not threading.main_thread():
+        numbers = []  # Python hears signals in the main thread alone
+    for number in numbers:
+        signal.signal(number, _stop)
+    try:
+        yield
+    finally:
+        for number in numbers:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def _stop(number: int, frame: FrameType | None) -> None:
+    signal.signal(number, signal.SIG_DFL)
+    raise _Stopped(signal.Signals(number))
 
 
 def _is_users(error: Exception) -> bool:

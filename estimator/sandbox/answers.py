@@ -13,9 +13,11 @@ import numpy as np
 
 from phibench.estimator.geometry.phi import CONVENTIONS
 from phibench.estimator.interface import OK, Answer, Matrix2, Spot
-from phibench.scenes.validation import nearest
+from phibench.scenes.validation import nearest, printable_line
 
 _MOST = 64  # numbers or letters of a value that is none of ours
+_DEEPEST = 4  # lists in each other: a covariance has two
+_LARGEST_INTEGER = 10**300  # a float holds it; a longer one does not fit into any number of an answer
 
 
 def answer_text(value: object) -> dict[str, Any]:
@@ -33,17 +35,41 @@ def _spot_document(spot: Spot) -> dict[str, Any]:
     return {name: plain(getattr(spot, name)) for name in Spot.__dataclass_fields__}
 
 
-def plain(value: Any) -> Any:
-    """Numbers, texts and lists of them as they are, arrays as lists; {"type": ...} of what is neither."""
-    if value is None or isinstance(value, (bool, int, float)):
+def plain(value: Any, depth: int = 0) -> Any:
+    """Numbers, texts and lists of them as they are, arrays as lists; {"type": ...} of what is neither.
+
+    Arrays and tensors of any library that NumPy reads are taken, and every kind of float.
+    """
+    if value is None or isinstance(value, bool):
         return value
+    if isinstance(value, int):
+        return int(value) if abs(value) < _LARGEST_INTEGER else {"type": f"an integer of {value.bit_length()} bits"}
+    if isinstance(value, float):
+        return float(value)
     if isinstance(value, str):
         return value[: 8 * _MOST]
-    if hasattr(value, "tolist") and getattr(value, "size", _MOST + 1) <= _MOST:
-        return plain(value.tolist())
-    if isinstance(value, (list, tuple)) and len(value) <= _MOST:
-        return [plain(part) for part in value]
-    return {"type": described(value)}
+    if isinstance(value, (list, tuple)):
+        return [plain(part, depth + 1) for part in value] if _is_small(value, depth) else {"type": described(value)}
+    shape = getattr(value, "shape", ())
+    if not isinstance(shape, tuple) or len(shape) > _DEEPEST or math.prod(shape) > _MOST:
+        return {"type": described(value)}
+    listed = value.tolist() if hasattr(value, "tolist") else value
+    # NumPy's longdouble lists itself
+    return plain(listed, depth) if isinstance(listed, (int, float, str, list)) else _converted(value)
+
+
+def _is_small(value: list[Any] | tuple[Any, ...], depth: int) -> bool:
+    return len(value) <= _MOST and depth < _DEEPEST
+
+
+def _converted(value: Any) -> Any:
+    """Floats of what has none of Python's, such as `np.longdouble`."""
+    try:
+        array = np.asarray(value)
+        kind, listed = array.dtype.kind, np.asarray(array, float).tolist()
+    except (TypeError, ValueError, OverflowError):
+        return {"type": described(value)}
+    return listed if kind in "fiu" else {"type": described(value)}
 
 
 def described(value: object) -> str:
@@ -63,6 +89,14 @@ def to_bytes(document: dict[str, Any]) -> bytes:
 
 
 _SYMMETRIC = 1e-6  # relative: a covariance in single precision passes
+_STATUS_LENGTH = 120
+
+# What is beyond these comes from a fit that diverged. Squares, and errors in units of claimed deviations, stay finite.
+_FAR_PX = 1e6
+_VARIANCE_PX2 = (1e-18, 1e12)
+_ELONGATION = 1e12  # largest over least eigenvalue: beyond it the least one is a rounding error
+_DEPTH_M = (1e-6, 1e6)
+_SIGMA_DEPTH_M = (1e-9, 1e9)
 
 
 class AnswerError(ValueError):
@@ -72,7 +106,8 @@ class AnswerError(ValueError):
 def checked(document: dict[str, Any]) -> Answer:
     """Answer of a document of `answer_text`.
 
-    Where a status is not "ok" whatever position comes with it is dropped.
+    Where a status is not "ok" whatever position comes with it is dropped. The document may be forged: any JSON ends in
+    an answer or in an `AnswerError` of one line.
 
     Raises
     ------
@@ -80,10 +115,20 @@ def checked(document: dict[str, Any]) -> Answer:
         If a number is missing, not finite or out of its range, a covariance is not symmetric and positive definite, or
         a convention is unknown.
     """
+    try:
+        return _checked(document)
+    except AnswerError as error:
+        raise AnswerError(printable_line(str(error), 400)) from None
+    except Exception as error:  # a fault in the checks must cost this answer alone
+        raise AnswerError(f"the answer cannot be read: {type(error).__name__}") from error
+
+
+def _checked(document: dict[str, Any]) -> Answer:
     if "wrong" in document:
-        raise AnswerError(document["wrong"])
+        raise AnswerError(str(document["wrong"]))
     down, up = _checked_spot("down", document["down"]), _checked_spot("up", document["up"])
-    depth, sigma = (_positive(name, document[name]) for name in ("depth_m", "sigma_depth_m"))
+    depth = _positive("depth_m", document["depth_m"], _DEPTH_M)
+    sigma = _positive("sigma_depth_m", document["sigma_depth_m"], _SIGMA_DEPTH_M)
     if sigma is not None and depth is None:
         raise AnswerError("sigma_depth_m comes without depth_m: give both or neither")
     return Answer(down, up, depth, sigma)
@@ -91,70 +136,92 @@ def checked(document: dict[str, Any]) -> Answer:
 
 def _checked_spot(name: str, document: dict[str, Any]) -> Spot:
     status = document["status"]
-    if not isinstance(status, str) or not status:
+    if not isinstance(status, str) or not status.strip():
         raise AnswerError(f"{name}.status is {_shown(status)}: 'ok', or in a few words why there is no position")
+    status = printable_line(status, _STATUS_LENGTH)
     if status != OK:
         return Spot.missing(status)
     phi = _phi(name, document["phi_rad"])
     convention = document["phi_convention"]
-    if convention not in CONVENTIONS:
+    if not isinstance(convention, str) or convention not in CONVENTIONS:
         raise AnswerError(f"{name}.phi_convention is {_shown(convention)}: {nearest(str(convention), CONVENTIONS)}")
     covariance = _covariance(name, document["covariance_px2"])
     return Spot(_position(name, document["uv_px"]), covariance, phi, convention)
 
 
 def _position(name: str, value: Any) -> tuple[float, float]:
-    if not (isinstance(value, list) and len(value) == 2 and all(_is_number(x) for x in value)):
+    numbers = [_number(x) for x in value] if isinstance(value, list) and len(value) == 2 else [None, None]
+    u, v = numbers
+    if u is None or v is None:
         raise AnswerError(
             f"{name}.uv_px is {_shown(value)} with status 'ok': two numbers (u, v) in pixels are needed, "
             "or Spot.missing('why')"
         )
-    u, v = (float(x) for x in value)
     if not (math.isfinite(u) and math.isfinite(v)):
         raise AnswerError(
             f"{name}.uv_px is ({u:g}, {v:g}) with status 'ok': give finite numbers, or Spot.missing('why')"
         )
+    if max(abs(u), abs(v)) > _FAR_PX:
+        raise AnswerError(f"{name}.uv_px is ({u:g}, {v:g}): the allowed range is -{_FAR_PX:g} to {_FAR_PX:g} px")
     return u, v
 
 
 def _phi(name: str, value: Any) -> float | None:
     if value is None:
         return None
-    if not _is_number(value) or not math.isfinite(value):
+    phi = _number(value)
+    if phi is None or not math.isfinite(phi):
         raise AnswerError(f"{name}.phi_rad is {_shown(value)}: a finite number is needed, or None")
-    if not 0.0 <= value <= math.pi / 2.0:
-        degrees = " These look like degrees: give radians." if math.pi / 2.0 < value <= 90.0 else ""
-        raise AnswerError(f"{name}.phi_rad is {value:g}: the allowed range is 0 to pi/2, radians.{degrees}")
-    return float(value)
+    if not 0.0 <= phi <= math.pi / 2.0:
+        degrees = " These look like degrees: give radians." if math.pi / 2.0 < phi <= 90.0 else ""
+        raise AnswerError(f"{name}.phi_rad is {phi:g}: the allowed range is 0 to pi/2, radians.{degrees}")
+    return phi
 
 
 def _covariance(name: str, value: Any) -> Matrix2 | None:
     if value is None:
         return None
     rows = value if isinstance(value, list) else []
-    if len(rows) != 2 or not all(isinstance(row, list) and len(row) == 2 and all(map(_is_number, row)) for row in rows):
+    numbers = [_number(x) for row in rows if isinstance(row, list) and len(row) == 2 for x in row]
+    if len(rows) != 2 or len(numbers) != 4 or None in numbers:
         raise AnswerError(f"{name}.covariance_px2 is {_shown(value)}: 2 x 2 numbers are needed, or None")
-    C = np.array(rows, float)
+    C = np.array(numbers, float).reshape(2, 2)
     if not np.isfinite(C).all():
         raise AnswerError(f"{name}.covariance_px2 holds numbers that are not finite: give None if it is not known")
+    if np.abs(C).max() > _VARIANCE_PX2[1]:
+        raise AnswerError(f"{name}.covariance_px2 holds {np.abs(C).max():.3g}: {_VARIANCE_PX2[1]:g} px^2 is the most")
     if abs(C[0, 1] - C[1, 0]) > _SYMMETRIC * max(abs(C[0, 1]), abs(C[1, 0])):
         raise AnswerError(f"{name}.covariance_px2 is not symmetric: {C[0, 1]:g} and {C[1, 0]:g} must be the same")
-    least = float(np.linalg.eigvalsh((C + C.T) / 2.0)[0])
+    least, largest = (float(x) for x in np.linalg.eigvalsh((C + C.T) / 2.0))
     if not least > 0.0:
         raise AnswerError(f"{name}.covariance_px2 is not positive definite: its least eigenvalue is {least:.3g} px^2")
+    if least < max(_VARIANCE_PX2[0], largest / _ELONGATION):
+        raise AnswerError(
+            f"{name}.covariance_px2 has the eigenvalues {least:.3g} and {largest:.3g} px^2: {_VARIANCE_PX2[0]:g} is "
+            f"the least, and their ratio may be {_ELONGATION:g}"
+        )
     return (float(C[0, 0]), float(C[0, 1])), (float(C[1, 0]), float(C[1, 1]))
 
 
-def _positive(name: str, value: Any) -> float | None:
+def _positive(name: str, value: Any, allowed: tuple[float, float]) -> float | None:
     if value is None:
         return None
-    if not _is_number(value) or not math.isfinite(value) or not value > 0.0:
+    number, (low, high) = _number(value), allowed
+    if number is None or not math.isfinite(number) or not number > 0.0:
         raise AnswerError(f"{name} is {_shown(value)}: a finite number above 0 is needed, metres, or None")
-    return float(value)
+    if not low <= number <= high:
+        raise AnswerError(f"{name} is {number:g}: the allowed range is {low:g} to {high:g} m")
+    return number
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+def _number(value: Any) -> float | None:
+    """Float of a JSON number, infinite where none holds it; None of what is no number."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return None
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf
 
 
 def _shown(value: Any) -> str:

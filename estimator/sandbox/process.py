@@ -2,6 +2,8 @@
 
 The process gets a short environment, in which no data set's path stands, and an empty working directory. It stays warm
 from pair to pair. After a failure it is killed with all that it started, and the next pair gets a new one.
+
+Nothing that comes back is trusted: replies that repeat another nonce are dropped, texts are escaped and cut.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ import json
 import math
 import os
 import re
+import secrets
 import select
 import signal
 import socket
@@ -25,14 +28,24 @@ from pathlib import Path
 from typing import IO, Any
 
 from phibench.datasets.parallel import ONE_THREAD
-from phibench.estimator.interface import Outcome, Pair
+from phibench.estimator.interface import FAILURES, Outcome, Pair
 from phibench.estimator.sandbox.answers import AnswerError, checked
 from phibench.estimator.sandbox.resolve import MethodError, Reference, RunLimits
-from phibench.estimator.sandbox.transport import Connection, MemoryFile, TransportError, pack
+from phibench.estimator.sandbox.supervisor import HUNG_UP, KILL_SECONDS, processes_in, remove_tree
+from phibench.estimator.sandbox.transport import (
+    LEAST_BYTES,
+    Connection,
+    MemoryFile,
+    TransportError,
+    needed_bytes,
+    pack,
+)
 from phibench.estimator.sandbox.worker import lacks_memory
+from phibench.scenes.validation import printable_line
 
 _KEPT_BYTES = 65536
 _READS = 16  # of 64 kB at a time
+_LOOK_MS = 500  # between looks at whether anybody listens
 _LINES, _LINE_LENGTH = 20, 200  # of the output that an outcome keeps
 _FRAME = re.compile(r'^  File "(.+)", line (\d+) in (.+)$')
 
@@ -67,10 +80,17 @@ class OutputTail:
             self._take()
             return self._count
 
+    def close(self) -> None:
+        """Listen no more, even if a process that could not be ended holds the pipe."""
+        with self._lock:
+            self._ended = True
+
     def _drain(self) -> None:
         with self._pipe:
+            events = select.poll()  # `select.select` knows the first 1024 files only
+            events.register(self._pipe, select.POLLIN)
             while not self._ended:
-                select.select([self._pipe], [], [])
+                events.poll(_LOOK_MS)
                 with self._lock:
                     self._take()
 
@@ -91,7 +111,13 @@ class OutputTail:
 def last_lines(text: str) -> str:
     """Last lines of an output, without the stack that a fatal signal prints."""
     own = text.partition("Fatal Python error:")[0].rstrip()
-    return "\n".join(line[:_LINE_LENGTH] for line in own.splitlines()[-_LINES:])
+    return "\n".join(_cleaned(line) for line in own.splitlines()[-_LINES:])
+
+
+def _cleaned(line: str) -> str:
+    """A line with its indentation, and without what a terminal would obey."""
+    text = line.replace("\t", "    ")
+    return " " * (min(len(text) - len(text.lstrip(" ")), 40)) + printable_line(text, _LINE_LENGTH - 40)
 
 
 def stack_place(text: str, file: str = "") -> str:
@@ -132,7 +158,11 @@ def environment(folder: str, inherited: Mapping[str, str]) -> dict[str, str]:
     return {**ONE_THREAD, **kept, "PWD": folder, "TMPDIR": folder, **python}
 
 
-_WORKER = "phibench.estimator.sandbox.worker"
+_SUPERVISOR = "phibench.estimator.sandbox.supervisor"
+_REPLY_BYTES = 1 << 20
+_MOST_STALE = 64  # replies to other questions that are dropped before the process is given up
+_END_SECONDS = KILL_SECONDS + 1.0
+_MESSAGE_LENGTH = 400
 _STACK_SECONDS = 0.3  # for a stack to be printed, and for the pipe to end
 _NOT_RESTARTED = ("", "invalid")  # the process is as sound as before
 
@@ -151,8 +181,13 @@ class MethodProcess:
         self._lock, self._closed = threading.Lock(), False
         self._process: _Running | None = None
 
-    def start(self) -> None:
+    def start(self, size: int = 0) -> None:
         """Start the process and import the method, unless it is there already.
+
+        Parameters
+        ----------
+        size : int
+            Bytes that the images of a pair take.
 
         Raises
         ------
@@ -164,27 +199,37 @@ class MethodProcess:
         with self._lock:
             if self._closed:
                 raise MethodError(f"method '{self._reference.name}' was stopped")
-            self._process = _Running()
+            process = self._process = _Running(max(2 * size, LEAST_BYTES))
         try:
-            self._process.load(self._reference, self._limits)
-        except MethodError:
+            process.load(self._reference, self._limits)
+        except BaseException:
             self.end()
             raise
 
     def ask(self, pair: Pair) -> Outcome:
         """Give the method one pair; never raises for what the method does."""
         try:
-            self.start()
+            outcome = self._asked(pair)
+        except Exception as error:  # one pair must never end a run, whatever was not thought of
+            text = f"{type(error).__name__}: {error}"
+            outcome = Outcome(pair.number, None, math.nan, "crash", f"the method's process cannot be used: {text}")
+        if outcome.failure not in _NOT_RESTARTED:
+            self.end()
+        return replace(outcome, message=printable_line(outcome.message, _MESSAGE_LENGTH))
+
+    def _asked(self, pair: Pair) -> Outcome:
+        size = needed_bytes(pair)
+        if self._process is not None and not self._process.is_ready(size):
+            self.end()
+        try:
+            self.start(size)
         except MethodError as error:
             return Outcome(pair.number, None, math.nan, "crash", f"the method's process did not start again: {error}")
         process = self._process
         if process is None:  # ended by `close` in between
             return Outcome(pair.number, None, math.nan, "crash", "the run was stopped")
         file = self._reference.place if self._reference.kind == "file" else ""
-        outcome = process.ask(pair, self._limits, file)
-        if outcome.failure not in _NOT_RESTARTED:
-            self.end()
-        return outcome
+        return process.ask(pair, self._limits, file)
 
     def end(self) -> None:
         """Kill the process with all that it started; the next question starts another."""
@@ -201,70 +246,120 @@ class MethodProcess:
 
 
 class _Running:
-    """A process that runs."""
+    """A process that runs.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    size : int
+        Bytes for the images of a pair.
+    """
+
+    def __init__(self, size: int) -> None:
         if os.name != "posix":
             raise MethodError("methods run in processes of their own on Linux and macOS only")
         ours, theirs = socket.socketpair()
-        self._connection, self._memory = Connection(ours), MemoryFile()
-        self._folder = tempfile.TemporaryDirectory(prefix="phibench-method-", ignore_cleanup_errors=True)
-        handles = (theirs.fileno(), self._memory.reader)
-        with theirs:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", _WORKER, *map(str, handles)],
-                pass_fds=handles,
-                cwd=self._folder.name,
-                env=environment(self._folder.name, os.environ),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,  # a group of its own: killed as a whole, and not hit by Ctrl-C
-            )
+        self._connection, self._memory = Connection(ours), MemoryFile(size)
+        self._folder = tempfile.mkdtemp(prefix="phibench-method-")
+        try:
+            with theirs:
+                self._process = self._started(theirs.fileno(), self._memory.reader)
+        except OSError as error:
+            self._give_back()
+            raise MethodError(f"no process can be started for a method: {error.strerror or error}") from error
         assert self._process.stdout is not None
         self._output = OutputTail(self._process.stdout)
 
+    def _started(self, *handles: int) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(
+            [sys.executable, "-m", _SUPERVISOR, *map(str, handles)],
+            pass_fds=handles,
+            cwd=self._folder,
+            env=environment(self._folder, os.environ),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,  # not hit by Ctrl-C
+        )
+
+    def _give_back(self) -> None:
+        self._connection.close()
+        self._memory.close()
+        remove_tree(Path(self._folder))
+
     def load(self, reference: Reference, limits: RunLimits) -> None:
         """Let the process import the method."""
-        order = {"reference": asdict(reference), "memory_mb": limits.memory_mb}
+        nonce, end = secrets.token_hex(8), time.monotonic() + limits.start_seconds
+        order = {"nonce": nonce, "reference": asdict(reference), "memory_mb": limits.memory_mb}
         try:
             self._connection.send(json.dumps(order).encode(), limits.start_seconds)
-            fault = json.loads(self._connection.receive(limits.start_seconds))["fault"]
+            fault = self._reply(nonce, end).get("fault")
         except TimeoutError:
             place = self._place(reference.place)
             raise MethodError(
                 f"method '{reference.name}' is not imported after {limits.start_seconds:g} s{place}: "
                 "do the work in the function, not at import"
             ) from None
-        except (TransportError, ValueError):
-            raise MethodError(
-                f"method '{reference.name}' cannot be imported: {self._death(reference.place)}{self._last_line()}"
-            ) from None
-        if fault:
-            raise MethodError(fault)
+        except TransportError:
+            why = f"{self._death(reference.place)}{self._last_line()}"
+            raise MethodError(f"method '{reference.name}' cannot be imported: {why}") from None
+        if fault != "":
+            raise MethodError(printable_line(str(fault), _MESSAGE_LENGTH))
+
+    def is_ready(self, size: int) -> bool:
+        """Tell that a pair of so many bytes can be asked, and that nothing is left of the one before."""
+        return size <= self._memory.size and self._connection.is_silent()
 
     def ask(self, pair: Pair, limits: RunLimits, file: str) -> Outcome:
         """Answer or failure for one pair."""
-        start, before = time.monotonic(), self._output.count()
+        nonce, before = secrets.token_hex(8), self._output.count()
+        message = pack(pair, self._memory, nonce)
+        start = time.monotonic()  # by this clock alone: the method's process could tell any time
         try:
-            self._connection.send(pack(pair, self._memory), limits.seconds)
-            reply = json.loads(self._connection.receive(max(limits.seconds - (time.monotonic() - start), 1e-3)))
+            self._connection.send(message, limits.seconds)
+            reply = self._reply(nonce, start + limits.seconds, pair.number)
         except TimeoutError:
             output = last_lines(self._output.text(since=before))  # before the stack is printed, too
-            message = f"no answer after {limits.seconds:g} s{self._place(file)}"
-            return Outcome(pair.number, None, math.nan, "timeout", message, output)
-        except (TransportError, ValueError):
+            late = f"no answer after {limits.seconds:g} s{self._place(file)}"
+            return Outcome(pair.number, None, math.nan, "timeout", late, output)
+        except TransportError:
             return self._dead(pair, limits, file, before)
-        return replace(outcome_of(pair, reply), output=last_lines(self._output.text(since=before)))
+        outcome = outcome_of(pair, reply, time.monotonic() - start)
+        return replace(outcome, output=last_lines(self._output.text(since=before)))
 
     def kill(self) -> None:
-        """Kill the whole group and give back what it held."""
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.wait()
-        self._connection.close()
-        self._memory.close()
-        self._folder.cleanup()
+        """End the process with all that it started and give back what it held; never raises."""
+        self._connection.hang_up()  # the supervisor then kills what there is
+        try:
+            self._process.wait(_END_SECONDS)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        if self._process.returncode == -signal.SIGKILL:  # perhaps before it had killed what was below it
+            for pid in processes_in(self._folder):
+                with contextlib.suppress(OSError):
+                    os.kill(pid, signal.SIGKILL)
+        self._output.close()
+        self._give_back()
+
+    def _reply(self, nonce: str, end: float, number: int | None = None) -> dict[str, Any]:
+        """Reply to a question; what else comes on the line is dropped.
+
+        Raises
+        ------
+        TimeoutError
+            If there is none at `end`, a time of the monotonic clock.
+        TransportError
+            If the other side is gone or sends anything but the reply.
+        """
+        for _ in range(_MOST_STALE):
+            left = max(end - time.monotonic(), 1e-3)
+            try:
+                reply = json.loads(self._connection.receive(left, _REPLY_BYTES))
+            except (ValueError, RecursionError):  # no JSON, or brackets without end
+                continue
+            if isinstance(reply, dict) and (reply.get("nonce"), reply.get("number")) == (nonce, number):
+                return reply
+        raise TransportError("too many replies that belong to no question")
 
     def _dead(self, pair: Pair, limits: RunLimits, file: str, before: int) -> Outcome:
         failure, message = "crash", self._death(file)
@@ -280,6 +375,8 @@ class _Running:
             self._process.wait(_STACK_SECONDS)
         code = self._process.poll()
         if code is None:
+            return "the process broke its connection to the runner"
+        if code == HUNG_UP:
             return "the process broke its connection to the runner"
         if code >= 0:
             return f"the process left with exit code {code}, without an answer"
@@ -298,19 +395,23 @@ class _Running:
         return f"; its last words: {lines[-1]}" if lines else ""
 
 
-def outcome_of(pair: Pair, reply: dict[str, Any]) -> Outcome:
+def outcome_of(pair: Pair, reply: dict[str, Any], seconds: float) -> Outcome:
     """Outcome of a pair from the reply of `worker.reply_of`; what is no answer is the failure "invalid"."""
-    seconds = float(reply["seconds"])
-    if reply["failure"]:
-        return Outcome(pair.number, None, seconds, reply["failure"], reply["message"])
+    failure, message = reply.get("failure"), reply.get("message", "")
+    if failure in FAILURES and isinstance(message, str):
+        return Outcome(pair.number, None, seconds, failure, printable_line(message, _MESSAGE_LENGTH))
     try:
         return Outcome(pair.number, checked(reply["answer"]), seconds)
-    except AnswerError as error:
-        return Outcome(pair.number, None, seconds, "invalid", str(error))
+    except (AnswerError, KeyError) as error:
+        text = str(error) if isinstance(error, AnswerError) else "the reply holds neither answer nor failure"
+        return Outcome(pair.number, None, seconds, "invalid", text)
 
 
 def _signal_name(number: int) -> str:
-    name = signal.Signals(number).name
+    try:
+        name = signal.Signals(number).name
+    except ValueError:  # a real-time signal between the first and the last has no name
+        return f"signal {number}"
     meaning = {
         "SIGSEGV": "a fault in compiled code",
         "SIGABRT": "compiled code gave up",

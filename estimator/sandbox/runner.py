@@ -10,7 +10,7 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from types import TracebackType
 
@@ -46,6 +46,7 @@ class Harness:
         self._references = [resolve(method) if isinstance(method, str) else method for method in methods]
         self._limits, self._workers = limits or RunLimits(), workers
         self._failed: list[dict[int, str]] = [{} for _ in self._references]
+        self._turns: list[_Turns] = []
 
     def __enter__(self) -> Harness:
         copies = self._workers if len(self._references) == 1 else 1
@@ -61,6 +62,8 @@ class Harness:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: object, trace: TracebackType | None) -> None:
+        for turns in self._turns:
+            turns.stop()
         for pool in self._pools:
             pool.close()
         self._threads.shutdown(wait=True, cancel_futures=True)
@@ -77,6 +80,7 @@ class Harness:
         safe for threads, and one process alone sees the same pairs in the same order in every run.
         """
         making, turns = _Turns(), [_Turns() for _ in self._pools]
+        self._turns += [making, *turns]
 
         def one(place: int, number: int) -> tuple[Outcome, ...]:
             try:
@@ -93,26 +97,49 @@ class Harness:
                     failed[number] = outcome.output
             return done
 
-        return self._threads.map(one, range(len(numbers)), numbers)
+        return _in_order([self._threads.submit(one, *item) for item in enumerate(numbers)])
+
+
+_WAKE_SECONDS = 0.2
+
+
+def _in_order(asked: list[Future[tuple[Outcome, ...]]]) -> Iterator[tuple[Outcome, ...]]:
+    """Results in order; Ctrl-C is heard while one is waited for.
+
+    Polars, once imported, has waits on locks restarted after SIGINT (SA_RESTART), and a wait without end would not
+    return to Python before the method does.
+    """
+    for future in asked:
+        while not future.done():
+            wait([future], _WAKE_SECONDS)
+        yield future.result()
 
 
 class _Turns:
     """Order of threads: they pass one after the other, by their places."""
 
     def __init__(self) -> None:
-        self._condition, self._now = threading.Condition(), 0
+        self._condition, self._now, self._stopped = threading.Condition(), 0, False
 
     @contextmanager
     def turn(self, place: int) -> Iterator[None]:
         """Wait for all places before this one."""
         with self._condition:
-            self._condition.wait_for(lambda: self._now == place)
+            self._condition.wait_for(lambda: self._now == place or self._stopped)
+            if self._stopped:
+                raise CancelledError
         try:
             yield
         finally:
             with self._condition:
                 self._now += 1
                 self._condition.notify_all()
+
+    def stop(self) -> None:
+        """Let nobody pass any more: those before may never come."""
+        with self._condition:
+            self._stopped = True
+            self._condition.notify_all()
 
 
 class _MethodPool:
@@ -177,7 +204,8 @@ def asked_here(method: Method) -> Callable[[PairSet, Sequence[int]], Iterator[tu
     require_method(method, function_name(method))
 
     def one(pair: Pair) -> tuple[Outcome]:
-        return (outcome_of(pair, reply_of(lambda: method(pair))),)
+        reply = reply_of(lambda: method(pair))
+        return (outcome_of(pair, reply, reply["seconds"]),)
 
     return lambda pairs, numbers: (one(pairs.pair(number)) for number in numbers)
 

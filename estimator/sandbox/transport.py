@@ -1,21 +1,28 @@
 """Transport of pairs and answers between the runner and a method's process.
 
-Messages go over a socket: 8 bytes of length (big-endian), then so many bytes, with a deadline. Images go through a
-shared file in memory, the rest of a pair in a short message.
+Messages go over a socket: 8 bytes of length (big-endian), then so many bytes, with a deadline. Images go through
+shared memory, the rest of a pair in a short message with a nonce, which the reply repeats.
 
 Four frames of 1280 x 720 x 3 bytes, 11 MB, take 14 ms this way, private copy and comparison included. As a pickle
 through a socket they take 85 ms (`tests/benchmark_timings/test_sandbox_timing.py`). A short message fits into the
 socket's buffer, so that a process that no longer reads cannot hold the runner up. The method's process takes a private
 copy, because a method may keep an image after its pair.
+
+On Linux the memory is sealed: the method's process can neither cut it short, which would kill the runner with SIGBUS,
+nor write to it.
 """
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import mmap
 import os
 import pickle
+import select
 import socket
 import struct
+import sys
 import tempfile
 import time
 from dataclasses import dataclass, fields, replace
@@ -64,13 +71,24 @@ class Connection:
         except OSError as error:
             raise TransportError(str(error)) from error
 
-    def receive(self, seconds: float | None = None) -> bytes:
-        """Wait for a message; raises as `send`."""
+    def receive(self, seconds: float | None = None, most: int = LARGEST) -> bytes:
+        """Wait for a message of `most` bytes or less; raises as `send`."""
         end = None if seconds is None else time.monotonic() + seconds
         (length,) = _LENGTH.unpack(self._exactly(_LENGTH.size, end))
-        if length > LARGEST:
-            raise TransportError(f"message of {length} bytes exceeds the limit of {LARGEST}")
+        if length > most:
+            raise TransportError(f"message of {length} bytes exceeds the limit of {most}")
         return self._exactly(length, end)
+
+    def is_silent(self) -> bool:
+        """Tell that the other side is there and has said nothing since the last message."""
+        events = select.poll()
+        events.register(self._socket, select.POLLIN)
+        return not events.poll(0)
+
+    def hang_up(self) -> None:
+        """Tell the other side that it is over; a thread that waits for a message is woken."""
+        with contextlib.suppress(OSError):  # it is over already
+            self._socket.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
         """Close this end."""
@@ -96,40 +114,75 @@ class Connection:
 _ALIGNED = 64  # bytes of a cache line; any type of pixel may begin there
 _IMAGES = ("down", "up", "down_off", "up_off")
 _IN_MEMORY = Path("/dev/shm")
+LEAST_BYTES = 1 << 26
+"""Memory for a pair, as address space: pages that nothing is written to take none."""
+_SEALS = 0x1 | 0x2 | 0x4 | 0x10  # F_SEAL_SEAL, SHRINK, GROW, FUTURE_WRITE (Linux 5.1) of linux/fcntl.h
+_OLD_SEALS = 0x1 | 0x2 | 0x4
 
 
 class MemoryFile:
-    """A nameless file that both processes have open: the parent writes it, the method's process reads it."""
+    """A nameless file in memory: the runner writes it, the method's process has it open for reading.
 
-    def __init__(self) -> None:
-        folder = _IN_MEMORY if os.access(_IN_MEMORY, os.W_OK) else None
-        self._handle, name = tempfile.mkstemp(prefix="phibench-pair-", dir=folder)
-        self.reader = os.open(name, os.O_RDONLY)
-        # both processes hold it open: without a name it is gone with the last of them, even after a crash
-        Path(name).unlink()
-        self._space: mmap.mmap | None = None
+    On Linux it is a memfd, sealed once it is mapped: its size stays, and nobody else can map it for writing.
+
+    Parameters
+    ----------
+    size : int
+        Bytes.
+    """
+
+    def __init__(self, size: int = LEAST_BYTES) -> None:
+        self.size = size
+        self._handle, self.reader = _memory_handles(size)
+        self._space = mmap.mmap(self._handle, size)
+        if sys.platform == "linux" and hasattr(fcntl, "F_ADD_SEALS"):
+            with contextlib.suppress(OSError):  # a file in /dev/shm cannot be sealed
+                _seal(self._handle)
 
     def write(self, parts: list[memoryview]) -> list[int]:
         """Write parts one after the other; where each begins, and where the last ends."""
-        starts = np.cumsum([0] + [-(-part.nbytes // _ALIGNED) * _ALIGNED for part in parts]).tolist()
-        space = self._at_least(max(starts[-1], _ALIGNED))
+        starts = np.cumsum([0] + [aligned(part.nbytes) for part in parts]).tolist()
         for part, start in zip(parts, starts, strict=False):
-            space[start : start + part.nbytes] = part
+            self._space[start : start + part.nbytes] = part
         return list(starts)
-
-    def _at_least(self, size: int) -> mmap.mmap:
-        """Mapped memory, kept from pair to pair: new pages cost more than the copy."""
-        if self._space is None or len(self._space) < size:
-            os.ftruncate(self._handle, size)
-            self._space = mmap.mmap(self._handle, size)
-        return self._space
 
     def close(self) -> None:
         """Give the memory back."""
-        if self._space is not None:
-            self._space.close()
+        self._space.close()
         os.close(self._handle)
         os.close(self.reader)
+
+
+def _memory_handles(size: int) -> tuple[int, int]:
+    """File for reading and writing, and the same for reading alone."""
+    if hasattr(os, "memfd_create"):
+        handle = os.memfd_create("phibench-pair", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        os.ftruncate(handle, size)
+        return handle, os.open(f"/proc/self/fd/{handle}", os.O_RDONLY)
+    folder = _IN_MEMORY if os.access(_IN_MEMORY, os.W_OK) else None
+    handle, name = tempfile.mkstemp(prefix="phibench-pair-", dir=folder)
+    reader = os.open(name, os.O_RDONLY)
+    # both processes hold it open: without a name it is gone with the last of them, even after a crash
+    Path(name).unlink()
+    os.ftruncate(handle, size)
+    return handle, reader
+
+
+def _seal(handle: int) -> None:
+    try:
+        fcntl.fcntl(handle, fcntl.F_ADD_SEALS, _SEALS)
+    except OSError:
+        fcntl.fcntl(handle, fcntl.F_ADD_SEALS, _OLD_SEALS)
+
+
+def aligned(count: int) -> int:
+    """Bytes that a part takes in the memory, at least."""
+    return -(-max(count, 1) // _ALIGNED) * _ALIGNED
+
+
+def needed_bytes(pair: Pair) -> int:
+    """Memory that the images of a pair take."""
+    return sum(aligned(image.nbytes) for image in pair.images.values())
 
 
 class SharedPages:
@@ -148,7 +201,8 @@ class SharedPages:
     def first(self, size: int) -> mmap.mmap:
         """Pages that hold so many bytes, or more."""
         if self._pages is None or len(self._pages) < size:
-            self._pages = mmap.mmap(self._reader, 0, prot=mmap.PROT_READ)
+            # no more than a pair takes: mapped memory counts against the method's limit
+            self._pages = mmap.mmap(self._reader, size, prot=mmap.PROT_READ)
         return self._pages
 
 
@@ -164,11 +218,14 @@ class ReceivedPair:
         That memory.
     original : mmap.mmap
         The parent's, read-only.
+    nonce : str
+        Of the question; the reply repeats it.
     """
 
     pair: Pair
     data: bytes
     original: mmap.mmap
+    nonce: str = ""
 
     def unchanged(self) -> bool:
         """Compare the images with what the runner sent, byte for byte."""
@@ -177,7 +234,7 @@ class ReceivedPair:
         return bool(np.array_equal(here, there))
 
 
-def pack(pair: Pair, memory: MemoryFile) -> bytes:
+def pack(pair: Pair, memory: MemoryFile, nonce: str = "") -> bytes:
     """Images into the memory file, all else into the message; nothing but the fields of `Pair` goes along."""
     plain = Pair(**{field.name: getattr(pair, field.name) for field in fields(Pair)})
     images = {name: np.ascontiguousarray(image) for name, image in plain.images.items()}
@@ -185,16 +242,16 @@ def pack(pair: Pair, memory: MemoryFile) -> bytes:
     layout = [(name, image.dtype.str, image.shape) for name, image in images.items()]
     nothing: dict[str, Any] = dict.fromkeys(_IMAGES)
     rest = replace(plain, **nothing)
-    return pickle.dumps((rest, layout, memory.write(views)), protocol=5)
+    return pickle.dumps((rest, layout, memory.write(views), nonce), protocol=5)
 
 
 def unpack(message: bytes, shared: SharedPages) -> ReceivedPair:
     """Pair of a message, with images that cannot be written to."""
-    rest, layout, starts = pickle.loads(message)
+    rest, layout, starts, nonce = pickle.loads(message)
     original = shared.first(starts[-1])
     data = original[: starts[-1]]
     images = {
         name: np.frombuffer(data, dtype, int(np.prod(shape)), start).reshape(shape)
         for (name, dtype, shape), start in zip(layout, starts, strict=False)
     }
-    return ReceivedPair(replace(rest, **images), data, original)
+    return ReceivedPair(replace(rest, **images), data, original, nonce)

@@ -1,7 +1,7 @@
-"""Worker: the process in which a method runs, ``python -m phibench.estimator.sandbox.worker SOCKET MEMORY``.
+"""Worker: the process in which a method runs, started by `sandbox.supervisor`.
 
-The arguments are the numbers of two open files. The worker gets a reference, imports the method, gets pairs, and
-answers with JSON. Standard output and error are the method's alone.
+The worker gets a reference, imports the method, gets pairs, and answers with JSON. Every reply repeats number and nonce
+of its pair. Standard output and error are the method's alone.
 
 The address space is limited while the method runs (RLIMIT_AS; kept by Linux). Fatal signals print Python's stack, and
 SIGUSR1 prints it at any time: the runner reads the method's line from it.
@@ -21,7 +21,6 @@ import resource
 import signal
 import socket
 import sys
-import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -94,10 +93,17 @@ def place_in(error: BaseException, file: str = "") -> str:
 
 def sentence_of(error: BaseException, file: str = "") -> str:
     """An exception in one sentence, with the method's own line."""
-    text = " ".join(str(error).split())
+    text = " ".join(_text_of(error).split())[:_LONGEST_MESSAGE]
     what = f"{type(error).__name__}: {text}" if text else type(error).__name__
     place = place_in(error, file)
     return f"{what} ({place})" if place else what
+
+
+def _text_of(error: BaseException) -> str:
+    try:
+        return str(error)
+    except Exception:  # an exception that cannot say what it is
+        return ""
 
 
 def _title(reference: Reference) -> str:
@@ -170,34 +176,47 @@ def require_method(function: Any, title: str) -> None:
 
 
 _READ_ONLY = "read-only"  # in numpy's words: "assignment destination is read-only", "output array is read-only"
-_ORPHAN_SECONDS = 2.0
+_LONGEST_MESSAGE = 2000
+_MOST_CAUSES = 32  # a chain of causes may be a circle
 
 
-def main() -> None:
-    """Load one method and answer pairs until the parent hangs up."""
-    line, reader = (int(text) for text in sys.argv[1:])
+def main(line: int, reader: int) -> None:
+    """Load one method and answer pairs until the runner hangs up.
+
+    Parameters
+    ----------
+    line, reader : int
+        Open files: the socket to the runner, and the memory that pairs come in.
+    """
     sys.argv[1:] = []
     connection, pages = Connection(socket.socket(fileno=line)), SharedPages(reader)
     faulthandler.enable(all_threads=False)
     faulthandler.register(signal.SIGUSR1, all_threads=False)
-    threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
     order = json.loads(connection.receive())
-    reference = Reference(**order["reference"])
+    nonce, reference = order["nonce"], Reference(**order["reference"])
     try:
         method = load(reference)
     except MethodError as error:
-        connection.send(to_bytes({"fault": str(error)}))
+        connection.send(to_bytes({"nonce": nonce, "fault": str(error)[:_LONGEST_MESSAGE]}))
         return
     file = reference.place if reference.kind == "file" else ""
     limits = RunLimits(memory_mb=order["memory_mb"])
     limit_bytes = size_bytes() + int(1e6 * limits.memory_mb)
-    connection.send(to_bytes({"fault": ""}))
-    try:
+    connection.send(to_bytes({"nonce": nonce, "fault": ""}))
+    with suppress(TransportError):
         while True:
-            received = unpack(connection.receive(), pages)
-            connection.send(to_bytes(_reply(method, received, limits, limit_bytes, file)))
-    except TransportError:
-        return
+            _answer(connection, pages, lambda received: _reply(method, received, limits, limit_bytes, file))
+
+
+def _answer(connection: Connection, pages: SharedPages, reply: Callable[[ReceivedPair], dict[str, Any]]) -> None:
+    """Answer one pair, in the process that was asked alone."""
+    received = unpack(connection.receive(), pages)
+    asked = {"number": received.pair.number, "nonce": received.nonce}
+    process = os.getpid()
+    answer = to_bytes({**reply(received), **asked})
+    if os.getpid() != process:  # a copy that the method has forked and let return: one answer is enough
+        os._exit(0)
+    connection.send(answer)
 
 
 def _reply(method: Method, received: ReceivedPair, limits: RunLimits, limit_bytes: int, file: str) -> dict[str, Any]:
@@ -245,10 +264,12 @@ _NO_MEMORY = re.compile(
 
 def is_out_of_memory(error: BaseException | None) -> bool:
     """Tell an error for want of memory, or one that was raised because of such an error."""
-    while error is not None:
+    for _ in range(_MOST_CAUSES):
+        if error is None:
+            return False
         if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
             return True
-        if lacks_memory(str(error)):
+        if lacks_memory(_text_of(error)):
             return True
         error = error.__cause__ or error.__context__
     return False
@@ -263,18 +284,7 @@ def _of_exception(error: BaseException, file: str, limits: RunLimits | None) -> 
     if is_out_of_memory(error):
         text = sentence_of(error, file)
         return {"failure": "memory", "message": limits.memory_sentence(text) if limits else f"out of memory: {text}"}
-    if isinstance(error, ValueError) and _READ_ONLY in str(error):
+    if isinstance(error, ValueError) and _READ_ONLY in _text_of(error):
         advice = "the pair's images are read-only: work on a copy, such as pair.down.astype(float)"
         return {"failure": "mutated", "message": f"{sentence_of(error, file)}; {advice}"}
     return {"failure": "error", "message": sentence_of(error, file)}
-
-
-def _end_with_parent(parent: int) -> None:
-    """Leave when the parent has died: nobody else would end a method that hangs."""
-    while os.getppid() == parent:
-        time.sleep(_ORPHAN_SECONDS)
-    os._exit(1)
-
-
-if __name__ == "__main__":
-    main()

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import os
 import signal
 import time
 from collections.abc import Iterator
@@ -30,6 +31,16 @@ def living(group: int) -> list[str]:
             if its_group == str(group) and state != "Z":
                 found.append(name)
     return found
+
+
+def processes_under(folder: Path) -> Iterator[int]:
+    """Processes whose folder for temporary files lies in a folder, as that of every method's process does."""
+    mark = os.fsencode(f"TMPDIR={folder}{os.sep}")
+    for entry in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # gone meanwhile, or another user's
+            variables = (entry / "environ").read_bytes().split(b"\0")
+            if int(entry.name) != os.getpid() and any(x.startswith(mark) for x in variables):
+                yield int(entry.name)
 
 
 def wait_for(path: Path, seconds: float = 60.0) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import mmap
 import os
 import signal
 import socket
@@ -16,20 +17,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.processes import processes_under
 from helpers.sandbox_pairs import GOOD, HEADER, SHAPE, SmallPairs, method_file
 
 from phibench.estimator.interface import FAILURES, Answer, Outcome, Pair, Spot
 from phibench.estimator.pair_set import PairTruth, SpotTruth
 from phibench.estimator.sandbox.answers import AnswerError, answer_text, checked
-from phibench.estimator.sandbox.process import environment
-from phibench.estimator.sandbox.resolve import MethodError, RunLimits
+from phibench.estimator.sandbox.process import MethodProcess, environment
+from phibench.estimator.sandbox.resolve import MethodError, RunLimits, resolve
 from phibench.estimator.sandbox.runner import Harness, outcomes, run_method
 from phibench.estimator.sandbox.transport import (
     LARGEST,
+    LEAST_BYTES,
     Connection,
     MemoryFile,
     SharedPages,
     TransportError,
+    needed_bytes,
     pack,
     unpack,
 )
@@ -191,39 +195,52 @@ def test_leaving_the_loop_ends_the_process(tmp_path: Path) -> None:
 
 INTERRUPTED = """
 import sys
+import polars  # its SIGINT handler restarts waits
 from helpers.sandbox_pairs import SmallPairs
+from phibench.estimator.cli import main
 from phibench.estimator.sandbox.runner import outcomes
-try:
-    for outcome in outcomes(sys.argv[1], SmallPairs(3)):
+
+def score(tokens, **_):
+    for outcome in outcomes(tokens[0], SmallPairs(3)):
         print(int(outcome.answer.down.uv_px[0]), flush=True)
-except KeyboardInterrupt:
-    sys.exit(130)
+
+main.app = score
+sys.exit(main.main(sys.argv[1:]))
 """
+SAID = {signal.SIGINT: "Interrupted: stopped at your request.\n", signal.SIGTERM: "Stopped by SIGTERM.\n"}
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)])
 def test_the_end_of_the_parent_leaves_nothing_behind(tmp_path: Path, number: signal.Signals, code: int) -> None:
-    """Ctrl-C while the method sleeps: no traceback, its process is gone; after kill -9 it leaves by itself in 2 s."""
+    """The method is in C code and has Python's lock, and a daemon of its own session: nothing that it hears helps."""
     body = (
-        "import os, time\nif pair.number == 1: time.sleep(60)\n"
+        "import ctypes, os, time\nif pair.number == 1:\n    if os.fork() == 0:\n        os.setsid()\n"
+        "    ctypes.PyDLL(None).sleep(60)\n"
         "return Answer(Spot((float(os.getpid()), 0.0)), Spot.missing('x'))"
     )
+    (tmp_path / "temporary").mkdir()
     paths = os.pathsep.join([str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": paths, "TMPDIR": str(tmp_path / "temporary")}
     command = [sys.executable, "-c", INTERRUPTED, method_file(tmp_path, body)]
     with subprocess.Popen(
-        command, env={**os.environ, "PYTHONPATH": paths}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as parent:
         assert parent.stdout is not None
         assert parent.stderr is not None
         method = int(parent.stdout.readline())
         time.sleep(0.3)
+        start = time.monotonic()
         parent.send_signal(number)
         assert parent.wait(30) == code
-        assert parent.stderr.read() == ""
-    end = time.monotonic() + (0.0 if number == signal.SIGINT else 20.0)
-    while is_alive(method) and time.monotonic() < end:
+        took_s = time.monotonic() - start
+        assert parent.stderr.read() == SAID.get(number, "")
+    assert took_s < 5.0  # 0.1 s on an idle machine; a wait that is restarted takes the method's 30 s
+    end = time.monotonic() + (0.0 if number != signal.SIGKILL else 20.0)
+    while (is_alive(method) or list(processes_under(tmp_path))) and time.monotonic() < end:
         time.sleep(0.1)
     assert not is_alive(method)
+    assert not list(processes_under(tmp_path))
+    assert not list((tmp_path / "temporary").iterdir())
 
 
 def is_alive(pid: int) -> bool:
@@ -283,7 +300,7 @@ def test_a_method_sees_nothing_of_the_truth(tmp_path: Path, monkeypatch: pytest.
     (outcome,) = run_method(method_file(tmp_path, LOOK_AROUND, header=header), SecretPairs(1), LIMITS)
     assert outcome.failure == "", outcome.message
     assert outcome.answer is not None
-    assert outcome.answer.down.status == f"bad: {planted}"
+    assert outcome.answer.down.status == f"bad: {planted}".rstrip()
     assert outcome.answer.up.uv_px is not None
     assert outcome.answer.up.uv_px[0] > 40  # names: the walk reached rig, camera, mirror, card
     assert len(forbidden()) > 15
@@ -316,7 +333,11 @@ def test_environment_keeps_what_libraries_need_and_nothing_else() -> None:
     assert not {"OUT", "OLDPWD"} & set(kept)
 
 
-def test_images_arrive_as_they_were_and_cannot_be_written() -> None:
+@pytest.mark.parametrize("sealed", [True, False])
+def test_images_arrive_as_they_were_and_cannot_be_written(sealed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not sealed:  # as on macOS
+        monkeypatch.delattr(os, "memfd_create", raising=False)
+
     sent, memory = SmallPairs().pair(3), MemoryFile()
     pages = SharedPages(memory.reader)
     rng = np.random.default_rng(0)
@@ -334,6 +355,36 @@ def test_images_arrive_as_they_were_and_cannot_be_written() -> None:
             parcel.pair.down.setflags(write=True)
         assert parcel.unchanged()
     memory.close()
+
+
+@pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="Linux alone has sealed memory")
+def test_shared_memory_is_sealed() -> None:
+    """Cut short, it would kill the runner with SIGBUS at its next pair."""
+    memory = MemoryFile()
+    handle = os.open(f"/proc/self/fd/{memory.reader}", os.O_RDWR)  # as a method can
+    for change in (
+        lambda: os.ftruncate(handle, 0),
+        lambda: os.ftruncate(handle, 1 << 40),
+        lambda: os.write(handle, b"x"),
+    ):
+        with pytest.raises(PermissionError):
+            change()
+    with pytest.raises(PermissionError):
+        mmap.mmap(handle, 4096)
+    os.close(handle)
+    assert unpack(pack(SmallPairs().pair(0), memory), SharedPages(memory.reader)).unchanged()
+    memory.close()
+
+
+def test_a_pair_that_is_larger_than_the_memory_gets_a_process_with_more(tmp_path: Path) -> None:
+    reference = method_file(tmp_path, "return Answer(Spot(pair.down.shape), Spot.missing('x'))")
+    process = MethodProcess(resolve(reference), LIMITS)
+    small, shape = SmallPairs().pair(0), (4000, 5000)
+    large = Pair(0, np.zeros(shape, np.uint16), np.zeros(shape, np.uint16), small.rig, 0.5, small.card)
+    assert needed_bytes(large) > LEAST_BYTES
+    answers = [process.ask(pair).answer for pair in (small, large, small)]
+    process.close()
+    assert [answer.down.uv_px for answer in answers if answer] == [(48.0, 64.0), (4000.0, 5000.0), (48.0, 64.0)]
 
 
 def test_a_kept_image_does_not_change_under_the_method(tmp_path: Path) -> None:
@@ -378,6 +429,43 @@ def test_sound_answers_arrive_as_they_were() -> None:
     numpy_like = Answer(Spot(np.array([1.5, -0.5]), np.eye(2), np.float64(0.7)), MISSING, np.float32(2.5))  # type: ignore[arg-type]
     assert through(numpy_like) == Answer(Spot((1.5, -0.5), ((1.0, 0.0), (0.0, 1.0)), 0.7), MISSING, 2.5)
     assert through(Answer(Spot((np.nan, np.nan), status="too faint"), MISSING)).down == Spot.missing("too faint")
+    long = Answer(Spot(tuple(np.array([1.5, 2.5], np.longdouble))), MISSING, np.longdouble(2.5))  # type: ignore[arg-type]
+    assert through(long) == Answer(Spot((1.5, 2.5)), MISSING, 2.5)
+    assert through(Answer(Spot(np.array([3, 4], np.uint8)), MISSING)).down.uv_px == (3.0, 4.0)  # type: ignore[arg-type]
+
+
+class Tensor:
+    """A tensor as torch has it: `size` is a function, and conversion by NumPy is refused where a gradient is kept."""
+
+    def __init__(self, values: object) -> None:
+        self._values = np.array(values)
+        self.shape = self._values.shape
+
+    def size(self) -> tuple[int, ...]:
+        return self.shape
+
+    def tolist(self) -> object:
+        return self._values.tolist()
+
+    def __array__(self, *_: object, **__: object) -> np.ndarray:
+        raise RuntimeError("Can't call numpy() on Tensor that requires grad.")
+
+
+class Buffer:
+    """An array of a library that has nothing but `__array__`."""
+
+    def __array__(self, *_: object, **__: object) -> np.ndarray:
+        return np.array([1.5, 2.5], np.float32)
+
+
+def test_tensors_are_numbers() -> None:
+    tensors = Answer(
+        Spot(Tensor([1.5, 2.5]), Tensor(np.eye(2)), Tensor(0.5)), Spot((Tensor(1), Tensor(2.0))), Tensor(3)
+    )  # type: ignore[arg-type]
+    assert through(tensors) == Answer(Spot((1.5, 2.5), ((1.0, 0.0), (0.0, 1.0)), 0.5), Spot((1.0, 2.0)), 3.0)
+    assert through(Answer(Spot(Buffer()), MISSING)).down.uv_px == (1.5, 2.5)  # type: ignore[arg-type]
+    with pytest.raises(AnswerError, match=r"down\.uv_px is an array of shape"):
+        through(Answer(Spot(Tensor(np.zeros((720, 1280)))), MISSING))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
