@@ -14,7 +14,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import pytest  # noqa: E402
 from filelock import FileLock  # noqa: E402
-from helpers.inline_workers import InlineWorkerPool  # noqa: E402
+from helpers.inline_workers import InlineWorkerPool, make_inline  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -84,9 +84,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> SharedFolder:
 
 def rendered(shared: SharedFolder, name: str, recipe: str | Path) -> Path:
     """Data set of a recipe, rendered once for all test processes. Read only: copy it to change it."""
-    from phibench.datasets.make import make
-
-    return shared.made(name, lambda out: make(recipe, out, workers=2))
+    return shared.made(name, lambda out: make_inline(recipe, out))
 
 
 @pytest.fixture(scope="session")

@@ -7,9 +7,9 @@ import tomllib
 import numpy as np
 import polars as pl
 import pytest
+from helpers.inline_workers import make_inline
 from scipy import stats
 
-from phibench.datasets.make import make
 from phibench.datasets.read import Dataset, open_finished
 from phibench.datasets.recipe.load import RECIPES
 from phibench.estimator.paper.experiment_bounds import budget
@@ -37,7 +37,7 @@ def paper(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     body = "".join(f'[[experiments]]\nname = "{n}"\ntargets = {t}\nstrokes_m = {s}\n' for n, t, s in tables)
     folder = tmp_path_factory.mktemp("experiments")
     (folder / "recipe.toml").write_text(head + body.replace("'", '"'), encoding="utf-8")
-    return open_finished(make(folder / "recipe.toml", folder / "out", workers=2))
+    return open_finished(make_inline(folder / "recipe.toml", folder / "out"))
 
 
 @pytest.mark.slow

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.inline_workers import make_inline
 
-from phibench.datasets.make import make
 from phibench.datasets.read import Dataset, open_dataset
 from phibench.datasets.recipe.load import find_recipe
 from phibench.datasets.verify import verify
@@ -23,7 +23,7 @@ def paper(shared: Any, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     text = find_recipe("paper").read_text()
     assert text.count('name = "lab"') == 1
     recipe.write_text(text.replace('name = "lab"', 'name = "dark"'))
-    return open_dataset(shared.made("paper", lambda out: make(recipe, out, workers=2)))
+    return open_dataset(shared.made("paper", lambda out: make_inline(recipe, out)))
 
 
 @pytest.fixture(scope="module")

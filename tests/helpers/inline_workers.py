@@ -3,6 +3,7 @@
 from collections import deque
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 
 class InlineWorkerPool:
@@ -26,6 +27,14 @@ class InlineWorkerPool:
 
     def executor(self, _: int) -> "InlineExecutor":
         return InlineExecutor(self._out)
+
+
+def make_inline(recipe: str | Path, out: Path) -> Path:
+    """Data set, rendered in this process: the same bytes as by workers, without starting them."""
+    from phibench.datasets.make import make
+
+    with patch("phibench.datasets.make.WorkerPool", InlineWorkerPool):
+        return make(recipe, out, workers=1)
 
 
 class InlineExecutor:

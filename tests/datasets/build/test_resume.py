@@ -23,7 +23,7 @@ from phibench.datasets.store.provenance import _tables, closure, code_behind
 
 RUN = (
     "import sys\nfrom phibench.datasets.make import make\n"
-    "if __name__ == '__main__':\n    make(sys.argv[1], sys.argv[2], workers=2)"
+    "if __name__ == '__main__':\n    make(sys.argv[1], sys.argv[2], workers=int(sys.argv[3]))"
 )
 
 
@@ -56,20 +56,32 @@ BAKE = ["bake room"]
 VIEWS = ["view h0.000", "view h0.500", "view h1.400"]
 
 
-@pytest.mark.usefixtures("inline")
-@pytest.mark.parametrize(
-    ("old", "new", "expected"),
-    [
-        ("seed = 0", "seed = 0  # a comment", []),
-        ("depth_m = 1.975", "depth_m = 1.975\ndiameter_m = 6e-3", [SAMPLES[1], SPOTS[1]]),
-        ("bounces = 2", "bounces = 1", BAKE + SAMPLES + VIEWS),
-        ("cells_per_pixel = 2", "cells_per_pixel = 3", SAMPLES + VIEWS),
-        ("seed = 0", "seed = 1", SAMPLES + VIEWS),
-        ("[ambient]", "[laser]\npower_w = 2e-3\n\n[ambient]", SAMPLES + SPOTS),
-        ("[0.5]", "[0.6]", ["sample seen-near-h0.600", "spot seen-near-h0.600", "view h0.600"]),
-        ("[0.5]", "[0.5, 1.4]", ["sample seen-near-h1.400", "spot seen-near-h1.400"]),
-    ],
+CHANGES = (
+    ("seed = 0", "seed = 0  # a comment", []),
+    ("depth_m = 1.975", "depth_m = 1.975\ndiameter_m = 6e-3", [SAMPLES[1], SPOTS[1]]),
+    ("bounces = 2", "bounces = 1", BAKE + SAMPLES + VIEWS),
+    ("cells_per_pixel = 2", "cells_per_pixel = 3", SAMPLES + VIEWS),
+    ("seed = 0", "seed = 1", SAMPLES + VIEWS),
+    ("[ambient]", "[laser]\npower_w = 2e-3\n\n[ambient]", SAMPLES + SPOTS),
+    ("[0.5]", "[0.5, 1.4]", ["sample seen-near-h1.400", "spot seen-near-h1.400"]),
+    ("[0.5", "[0.6", ["sample seen-near-h0.600", "spot seen-near-h0.600", "view h0.600"]),
 )
+
+
+@pytest.mark.usefixtures("inline")
+def test_only_what_changes_one_after_the_other_change_is_made_again(copy: Path) -> None:
+    made = []
+    for count, (_, _, expected) in enumerate(CHANGES, 1):
+        assert again(copy, *((old, new) for old, new, _ in CHANGES[:count])) == expected
+        made += expected
+    fresh = make(copy.parent / "changed.toml", copy.parent / "fresh", workers=1, console=quiet())
+    assert contents(copy) == contents(fresh)  # also: nothing of what was removed is left
+    assert set(made) >= {*BAKE, *SAMPLES, *SPOTS, *VIEWS}
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("inline")
+@pytest.mark.parametrize(("old", "new", "expected"), CHANGES)
 def test_only_what_a_change_changes_is_made_again(copy: Path, old: str, new: str, expected: list[str]) -> None:
     assert again(copy, (old, new)) == expected
     fresh = make(copy.parent / "changed.toml", copy.parent / "fresh", workers=1, console=quiet())
@@ -139,8 +151,8 @@ def test_a_key_covers_the_code_behind_a_task_and_no_other() -> None:
 # Two runs into one folder, and runs that are killed.
 
 
-def start(out: Path, recipe: Path = SMALLEST) -> "subprocess.Popen[str]":
-    command = [sys.executable, "-c", RUN, str(recipe), str(out)]
+def start(out: Path, workers: int = 2) -> "subprocess.Popen[str]":
+    command = [sys.executable, "-c", RUN, str(SMALLEST), str(out), str(workers)]
     return subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True, text=True)
 
 
@@ -170,16 +182,16 @@ def test_what_a_run_leaves_that_is_killed_at_once_is_no_obstacle(tmp_path: Path)
         pass
 
 
-def kill_and_repeat(out: Path, kills: int, seed: int) -> int:
+def kill_and_repeat(out: Path, kills: int, workers: int) -> int:
     """Kill runs at random moments, then let one end; the number that were killed before their end."""
-    moments, killed = random.Random(seed), 0
+    moments, killed = random.Random(kills), 0
     for _ in range(kills):
-        with start(out) as child:
+        with start(out, workers) as child:
             time.sleep(moments.uniform(0.5, 5.0))
             killed += child.poll() is None
             child.kill()  # the parent only: its workers must leave by themselves
             child.communicate(timeout=60)
-    with start(out) as child:
+    with start(out, workers) as child:
         _, errors = child.communicate(timeout=300)
         assert child.returncode == 0, errors
     deadline = time.monotonic() + 20.0
@@ -190,10 +202,10 @@ def kill_and_repeat(out: Path, kills: int, seed: int) -> int:
 
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs /proc")
-@pytest.mark.parametrize("kills", [3, pytest.param(24, marks=pytest.mark.slow)])
-def test_killed_runs_end_in_the_same_bytes(smallest_dataset: Path, tmp_path: Path, kills: int) -> None:
+@pytest.mark.parametrize(("kills", "workers"), [(2, 1), pytest.param(24, 2, marks=pytest.mark.slow)])
+def test_killed_runs_end_in_the_same_bytes(smallest_dataset: Path, tmp_path: Path, kills: int, workers: int) -> None:
     out = tmp_path / "out"
-    killed = kill_and_repeat(out, kills, seed=kills)
+    killed = kill_and_repeat(out, kills, workers)
     assert killed >= max(1, kills // 4)  # a quick machine may end a run before its moment comes
     assert contents(out) == contents(smallest_dataset)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +67,9 @@ def views(case: Case, more: Misalignment) -> tuple[View, View]:
     return rig.at(0.0), rig.at(more.stroke_m(true_stroke(case)))
 
 
+@cache
 def chief_pixels(case: Case, more: Misalignment) -> Pixels:
+    """Kept, as all estimators are tried on the same rigs."""
     down, up = (chief_pixel(view, case.spot) for view in views(case, more))
     return down, up
 
