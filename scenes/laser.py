@@ -1,4 +1,4 @@
-"""The laser spot on a wall."""
+"""The laser spot on a wall: place, size, power, profile; the beam's diameter against the distance."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Last task of a sample: its preview picture, and the error of phi that sensor noise and rendering noise cause.
 
-It reads the files of the sample's spot and of its two views.
+A sample whose rendering noise disturbs phi too much is refused. The task reads the files of the sample's spot and of its two views.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Task of one mirror pose, rendered in a worker process: ambient layer, truth layer, preview."""
+"""Task that renders one view: the room's light without the laser, the exact geometry of every pixel, a preview.
+
+A view is what the camera sees at one position of the mirror; it runs in a worker process.
+"""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ from phibench.datasets.recipe.tables import (
     RoomTable,
     TargetTable,
 )
-from phibench.render.room.film import FilmGrid
+from phibench.render.room.subpixel_grid import FilmGrid
 from phibench.render.sensor.settings import SensorError, sensor
 from phibench.scenes.catalog import BOARD_SIZE_M, board
 from phibench.scenes.misalignment import Misalignment

@@ -1,4 +1,4 @@
-"""Effect of JPEG on an outline, from the image itself: the fitted light goes through noise and JPEG again.
+"""Simulation of noise and JPEG on the fitted mirror outline: the shift by JPEG is measured and taken off.
 
 JPEG removes the limb's fine waves. The limb becomes wider and moves, by an amount that depends on the quality, on the
 limb's place in the blocks, and on the noise. The fit's own model is known exactly. It goes through the camera's noise

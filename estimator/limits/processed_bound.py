@@ -1,6 +1,6 @@
 """Bound of a spot's position behind the camera's processing, from the estimator's own model; no frame is simulated.
 
-"srgb8": the information of each pixel's own code (`code_statistics`); interpolated colours are left out. "mjpeg":
+"srgb8": the information of each pixel's own code (`pixel_statistics`); interpolated colours are left out. "mjpeg":
 J^T C^-1 J of the quantised coefficients' mean and covariance (M. Stein, A. Mezghani, J. A. Nossek, IEEE Signal Process.
 Lett. 21, 796, 2014; `fit_jpeg`). The coefficients carry all that the decoded image does, unless the decoder cuts.
 
@@ -23,12 +23,12 @@ from numpy.typing import ArrayLike
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.limits.position_bound import SpotLimit, limit_of, raw_information
 from phibench.estimator.spots.chain_model import chain_model
-from phibench.estimator.spots.code_statistics import code_law, code_table
 from phibench.estimator.spots.fisher import covariance_bound, fisher_matrix
 from phibench.estimator.spots.fit_chain import unrounded
 from phibench.estimator.spots.fit_jpeg import Window
 from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel, SpotPixels
 from phibench.estimator.spots.jpeg_coefficients import mcu_px
+from phibench.estimator.spots.pixel_statistics import code_law, code_table
 from phibench.estimator.spots.raw_pixels import bayer_filters
 from phibench.scenes.frames import Array
 

@@ -1,4 +1,7 @@
-"""Registry of the built-in methods, by name: `METHODS` holds those that can run here. One entry adds one."""
+"""Built-in methods that find the spot, by name; `METHODS` holds those whose packages are installed.
+
+To add a method, add one entry to `_ALL`.
+"""
 
 from __future__ import annotations
 

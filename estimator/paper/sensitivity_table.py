@@ -1,4 +1,4 @@
-"""Sensitivities of every sample of a data set and every estimator, as one table; data sets that are made with it.
+"""Table of how D reacts to each error of the rig, per sample and estimator; data sets made with this table in them.
 
 `datasets` may not import the estimators. `make`, `repair` and `merge` therefore stand here: they render through
 `datasets` and write the table beside the result. The command line and Python programs get the same folder.

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.spots.code_statistics import COUNTS, MeanCodes, mean_codes
 from phibench.estimator.spots.image_planes import full_scale_e, noisy_srgb
 from phibench.estimator.spots.jpeg_coefficients import CHROMA_STEP, YCC_FROM_RGB, coefficients, mcu_px, steps, transform
+from phibench.estimator.spots.pixel_statistics import COUNTS, MeanCodes, mean_codes
 from phibench.estimator.spots.raw_pixels import PixelNoise, bayer_filters
 from phibench.scenes.frames import Array
 

@@ -16,13 +16,13 @@ from scipy.ndimage import convolve1d, gaussian_filter
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.status import Status, flag, keep
 from phibench.estimator.spots.chain_model import UNIT_MATRIX, chain_model
-from phibench.estimator.spots.code_statistics import code_law, code_table
 from phibench.estimator.spots.fisher import covariance_bound
 from phibench.estimator.spots.fit_jpeg import JpegFit, Region, fit_region
 from phibench.estimator.spots.fit_raw import LEAST_SNR, SpotFit, fit_law
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
 from phibench.estimator.spots.image_planes import full_scale_e, srgb_slope, srgb_to_linear
 from phibench.estimator.spots.jpeg_coefficients import mcu_px
+from phibench.estimator.spots.pixel_statistics import code_law, code_table
 from phibench.estimator.spots.raw_pixels import (
     Background,
     GaussLaw,
@@ -51,7 +51,7 @@ def fit_srgb(
     """Fit one spot in each region of processed 8-bit images.
 
     Without sharpening and with the unit colour matrix each pixel's own colour is an interval of electrons, and the
-    likelihood is exact (`code_statistics`). Otherwise sharpening and matrix are undone, and the codes' widths count as
+    likelihood is exact (`pixel_statistics`). Otherwise sharpening and matrix are undone, and the codes' widths count as
     noise.
 
     Parameters

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from phibench.estimator.spots.chain_model import ChainModel, code_slopes, codes, noise_factor, raw_variance_e2
-from phibench.estimator.spots.code_statistics import CutPixels, cut_pixels
 from phibench.estimator.spots.fisher import limited, scoring_step
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
 from phibench.estimator.spots.jpeg_coefficients import mcu_px, quantised, recovered, room_variance
+from phibench.estimator.spots.pixel_statistics import CutPixels, cut_pixels
 from phibench.scenes.frames import Array
 
 _LIVE = 2e-3  # variance of the output, in steps squared, from which a coefficient counts as one that changes

@@ -1,4 +1,6 @@
-"""Light of the laser spot on the film as weighted points: specular connections from spot to mirror to lens.
+"""Rays from the laser spot over the mirror to the lens: place on the image and light power of each.
+
+Where an edge cuts the light, a fixed set of quasi-random rays is taken; else nodes of a quadrature.
 
 Pairs of a point on the spot and a point on the aperture are joined by the reflection law (`mirror_points`). Product
 quadrature on the two discs gives nodes and weights; their sums replace random samples. The power of a pair follows from

@@ -1,6 +1,6 @@
 """Ambient layer: the room without the laser, seen directly and through the mirror, from its light map.
 
-The radiance of a surface is albedo x irradiance / pi, plus what a lamp emits. The film is cut into cells (`film`).
+The radiance of a surface is albedo x irradiance / pi, plus what a lamp emits. The film is cut into cells (`subpixel_grid`).
 Every cell gets two independent samples, whose difference is the noise estimate. Where that noise is above the budget of
 `noise_budget`, the cells around are sampled again, more finely, until the budget is kept (`refinement`). The light
 map's own noise is the same in every view.
@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.render.room.film import Crop, Film, FilmGrid, Stack
 from phibench.render.room.light_map import BakeSettings, LightMap, fixed_shapes, light_carriage
 from phibench.render.room.refinement import first_pass, refine
 from phibench.render.room.shading import Surfaces, cut, texel_count
+from phibench.render.room.subpixel_grid import Crop, Film, FilmGrid, Stack
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera
 from phibench.scenes.rig import View

@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from phibench.render.room.camera_plugin import MM_PER_M
-from phibench.render.room.film import points, shifts
 from phibench.render.room.shading import Patch, Surfaces, cut
+from phibench.render.room.subpixel_grid import points, shifts
 from phibench.render.setup.llvm_library import cache_root
 from phibench.render.setup.variant import activate
 from phibench.scenes.frames import Array, BoolArray
@@ -232,7 +232,7 @@ def _loop(mi: ModuleType, body: Any, count: int, lanes: int) -> Array:
 
 _DAY_S = 86400.0
 _DIGEST = 64  # hexadecimal characters
-_CODE = ("light_map.py", "shading.py", "film.py", "scene.py")
+_CODE = ("light_map.py", "shading.py", "subpixel_grid.py", "scene.py")
 ARRAYS = ("irradiance_w_m2", "sigma_w_m2", "covered")
 
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from phibench.render.room.film import Crop, Film, FilmGrid, Samples, Stack
 from phibench.render.room.noise_budget import allowed_per_s2, excess, is_full
+from phibench.render.room.subpixel_grid import Crop, Film, FilmGrid, Samples, Stack
 
 _TILE_PX = 48
 _SIDES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # strata along a cell; few values, few kernel launches

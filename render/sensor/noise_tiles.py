@@ -1,4 +1,4 @@
-"""Noise in tiles: the random numbers of a pixel depend on names and on its place alone.
+"""Repeatable noise, drawn in tiles: a pixel's numbers depend on its place and on the names of frame and stage.
 
 The image is cut into tiles of 32 x 32 pixels. The names of a stage give the key of a Philox generator, the tile's row
 and column two words of its counter (J. K. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC11, 2011).

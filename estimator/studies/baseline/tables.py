@@ -1,4 +1,4 @@
-"""Tables of the study `baseline`: spots of drawn frames, estimates of D, drawn misalignments, and laws of errors.
+"""Tables of the study `baseline`: D from simulated frames beside the paper's, and how errors follow D and h.
 
 The paper's experiments are in one table: published estimate, our estimates with scatter, and bounds. Drawn rigs are in
 closed form; an aligned reader makes estimates of what they show. Power laws y = c D^p h^q are fitted to logarithms.

@@ -1,4 +1,4 @@
-"""Drawings of the study `cause`."""
+"""Figures of the study `cause`: predicted errors, evidence of each explanation, posterior of noise and tilt."""
 
 from __future__ import annotations
 

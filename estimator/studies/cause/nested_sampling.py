@@ -1,4 +1,6 @@
-"""Nested sampling for the study `cause`: the study's settings, and posterior and evidence of every model.
+"""Bayesian comparison of the models of study `cause`: settings, and nested sampling of posterior and evidence.
+
+Data made from known causes test the comparison.
 
 J. S. Speagle, Mon. Not. R. Astron. Soc. 493, 3132 (2020), dynesty; J. Skilling, Bayesian Analysis 1, 833 (2006). The
 samplings of a study run side by side in processes of their own; each has its own random stream.

@@ -1,4 +1,4 @@
-"""Drawings of the study `isotropy`."""
+"""Figures of the study `isotropy`: noise and error of D against azimuth, and epipolar lines."""
 
 from __future__ import annotations
 

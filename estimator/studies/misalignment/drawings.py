@@ -1,4 +1,4 @@
-"""Drawings of the study `misalignment`."""
+"""Figures of the study `misalignment`: change of D by azimuth, cost of each parameter, interactions."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from phibench.estimator.studies.framework import COLOURS, Drawing, canvas, drawn, line_style
-from phibench.estimator.studies.noise.cells import FACTORS
+from phibench.estimator.studies.noise.conditions import FACTORS
 from phibench.estimator.studies.noise.tables import REFERENCE, Elasticity, name_of, ranked
 
 _COLUMNS = 4

@@ -17,7 +17,7 @@ from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.methods.registry import METHODS
 from phibench.estimator.studies.findings import Finding, Row
 from phibench.estimator.studies.framework import Drawing, Result, Settings, Study, StudyDatasets
-from phibench.estimator.studies.noise.cells import BASE, FACTORS, Cell, all_records, applied
+from phibench.estimator.studies.noise.conditions import BASE, FACTORS, Cell, all_records, applied
 from phibench.estimator.studies.noise.drawings import error_drawing, ranking_drawing
 from phibench.estimator.studies.noise.tables import (
     REFERENCE,

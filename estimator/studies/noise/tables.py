@@ -17,7 +17,7 @@ from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.intervals import Estimate, Statistic, estimates
 from phibench.estimator.benchmark.metrics import Measured, measure, prepared
 from phibench.estimator.studies.findings import Finding, Row
-from phibench.estimator.studies.noise.cells import BASE, FACTORS, NAMES, rms_by_place, within_place_px
+from phibench.estimator.studies.noise.conditions import BASE, FACTORS, NAMES, rms_by_place, within_place_px
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 

@@ -1,4 +1,4 @@
-"""Drawings of the study `stroke`."""
+"""Figures of the study `stroke`: the best stroke by distance, error by stroke, measured beside predicted."""
 
 from __future__ import annotations
 

@@ -15,12 +15,12 @@ from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.spots.chain_model import chain_model, codes
-from phibench.estimator.spots.code_statistics import code_law, code_table
 from phibench.estimator.spots.fit_chain import fit_jpeg, fit_srgb, undone, unrounded
 from phibench.estimator.spots.fit_raw import fit_law
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
 from phibench.estimator.spots.image_planes import linear_to_srgb, noisy_srgb, srgb_slope, srgb_to_linear
 from phibench.estimator.spots.jpeg_coefficients import coefficients, quantisation, quantised, recovered, steps
+from phibench.estimator.spots.pixel_statistics import code_law, code_table
 from phibench.estimator.spots.raw_pixels import GaussLaw, PixelNoise, around, background_of, bayer_filters, spot_regions
 from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain

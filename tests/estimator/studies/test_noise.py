@@ -22,7 +22,7 @@ from phibench.estimator.limits.position_bound import spot_limit
 from phibench.estimator.studies.findings import Finding
 from phibench.estimator.studies.framework import StudyDatasets, read_settings
 from phibench.estimator.studies.image_cutout import Shot, SpotPair, bounds_of, cut_region, cut_rig, drawn_pair
-from phibench.estimator.studies.noise.cells import BASE, FACTORS, OFF, applied
+from phibench.estimator.studies.noise.conditions import BASE, FACTORS, OFF, applied
 from phibench.estimator.studies.noise.study import STUDY
 from phibench.estimator.studies.noise.tables import (
     Elasticity,

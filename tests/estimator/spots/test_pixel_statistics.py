@@ -7,8 +7,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from phibench.estimator.spots.code_statistics import cut_pixels
 from phibench.estimator.spots.jpeg_coefficients import room_variance, steps
+from phibench.estimator.spots.pixel_statistics import cut_pixels
 
 
 @pytest.mark.parametrize("mean", [8e3, 11_600.0, 11_950.0, 12_000.0, 12_300.0, 40e3])

@@ -1,4 +1,6 @@
-"""Statistics of pixels behind converter, full well, demosaicing and 8 bits, in closed form or from exact sums.
+"""Probability, mean and variance of pixel values after full well, converter, demosaicing and 8-bit rounding.
+
+A code is a pixel's 8-bit value. All is in closed form or from exact sums.
 
 * `code_law`: likelihood of the code at a pixel's own colour. Bilinear demosaicing keeps the value of a pixel behind its
   own filter, and white balance, sRGB curve and both roundings are a monotonic map from the converter's DN to the code.

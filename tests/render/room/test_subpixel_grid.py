@@ -14,9 +14,9 @@ from scipy.special import ndtr
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
 from phibench.render.room.ambient import render_ambient
-from phibench.render.room.film import FilmGrid, golden_steps, shifts
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
 from phibench.render.room.noise_budget import BUDGET, _bayer, excess, noise_budget, phi_gradient, webcam
+from phibench.render.room.subpixel_grid import FilmGrid, golden_steps, shifts
 from phibench.render.setup.variant import activate
 from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.laser import LaserSpot, beam_diameter_m

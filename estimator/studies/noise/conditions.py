@@ -1,4 +1,4 @@
-"""Factors and cells of the study `noise`.
+"""Conditions of the study `noise`: the factors that vary, each combination tried, and every method's errors in it.
 
 A factor is a number of the sensor, of the laser, or of the lens; one is changed at a time. A cell is one base case,
 preset, factor and level, in which all methods see the same draws. Its spots lie at several places of the board, some
