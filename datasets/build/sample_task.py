@@ -1,6 +1,7 @@
 """Last task of a sample: its preview picture, and the error of phi that sensor noise and rendering noise cause.
 
-A sample whose rendering noise disturbs phi too much is refused. The task reads the files of the sample's spot and of its two views.
+A sample whose rendering noise disturbs phi too much is refused. The task reads the files of the
+sample's spot and of its two views.
 """
 
 from __future__ import annotations

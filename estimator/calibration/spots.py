@@ -1,6 +1,7 @@
 """Laser spots at known places, for calibration: found pixels, and simulated measurements of where each spot is.
 
-Pixels are found by a built-in method; distance, height and azimuth are as if a person had measured them. A "measured" place is the truth plus an error drawn from the sample's own stream. The stated sigma is the real one.
+Pixels are found by a built-in method; distance, height and azimuth are as if a person had measured them.
+A "measured" place is the truth plus an error drawn from the sample's own stream. The stated sigma is the real one.
 """
 
 from __future__ import annotations

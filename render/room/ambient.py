@@ -1,9 +1,9 @@
 """Ambient layer: the room without the laser, seen directly and through the mirror, from its light map.
 
-The radiance of a surface is albedo x irradiance / pi, plus what a lamp emits. The film is cut into cells (`subpixel_grid`).
-Every cell gets two independent samples, whose difference is the noise estimate. Where that noise is above the budget of
-`noise_budget`, the cells around are sampled again, more finely, until the budget is kept (`refinement`). The light
-map's own noise is the same in every view.
+The radiance of a surface is albedo x irradiance / pi, plus what a lamp emits. The image is cut into cells
+(`subpixel_grid`). Every cell gets two independent samples, whose difference is the noise estimate. Where that noise is
+above the budget of `noise_budget`, the cells around are sampled again, more finely, until the budget is kept
+(`refinement`). The light map's own noise is the same in every view.
 
 Layers have the shape (3, H, W), planes R, G, B, expected electrons per second and pixel.
 """

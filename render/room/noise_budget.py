@@ -4,7 +4,8 @@ A spot at (u, v) is located from raw Bayer pixels with the Fisher weights of a k
 expected electrons of a pixel, r the read noise, w = 1/(mu + r^2), d = dmu/d(u, v) and F = sum d d^T w. The estimate is
 F^-1 sum d w (x - mu), and the sensor's noise gives it the covariance F^-1. Rendering noise of mu with the covariance C
 gives F^-1 [sum d_p w_p C_pq w_q d_q^T] F^-1. Pixels within the blur share samples: C_pq = sqrt(V_p V_q) rho(p - q),
-with rho the autocorrelation of a pixel's weights (`subpixel_grid`). The gradient of phi_ray turns both into errors of phi_ray.
+with rho the autocorrelation of a pixel's weights (`subpixel_grid`). The gradient of phi_ray turns both into errors
+of phi_ray.
 NumPy only.
 """
 
