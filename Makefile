@@ -12,7 +12,7 @@ STUDIES_ALL := noise misalignment baseline cause isotropy stroke
 # Which Python makes the environment: `make setup PYTHON=python3.13`. Without it the first that is new enough.
 PYTHON ?=
 # Test files are shared between two processes; `make test PARALLEL=` runs them one after the other.
-PARALLEL ?= --numprocesses 2 --dist loadfile
+PARALLEL ?= --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -85,7 +85,7 @@ test-slow: $(READY)
 	$(BIN)/python -m pytest --slow --study -m "slow or study"
 
 proof: $(READY)
-	$(BIN)/python -m pytest --slow -m slow -k accuracy
+	$(BIN)/python -m pytest $(PARALLEL) --slow -m slow -k accuracy
 
 test-all: $(READY)
 	$(BIN)/python -m pytest --slow --study

@@ -61,17 +61,18 @@ def test_accuracy_chief_ray_against_quartic_and_fermat_path() -> None:
     assert checked > 190
 
 
-def test_accuracy_centroid_and_flux_of_random_rigs() -> None:
-    """<= 0.002 px and 0.3 % for 200 random rigs, spots and strokes, distorted, off axis, in and out of focus."""
+@pytest.mark.parametrize("count", [60, pytest.param(200, marks=pytest.mark.slow)])
+def test_accuracy_centroid_and_flux_of_random_rigs(count: int) -> None:
+    """<= 0.002 px and 0.3 % for random rigs, spots and strokes, distorted, off axis, in and out of focus."""
     checked = 0
-    for view, spot in _cases(2, 200):
+    for view, spot in _cases(2, count):
         truth = spot_truth(view, spot, ())
         if not truth.visible:
             continue
         certificate = certify(view, spot, (), truth, spot_layer(view, spot, ()))
         assert certificate.passed, (view, spot, certificate)
         checked += 1
-    assert checked > 150
+    assert checked > 0.75 * count
 
 
 def test_accuracy_centroid_and_flux_of_the_paper() -> None:
