@@ -62,6 +62,7 @@ def test_of_two_runs_that_start_together_one_wins(tmp_path: Path, monkeypatch: p
         ("", ""),
         ("-1 ", ""),
     ],
+    ids=("this process", "elsewhere", "too large", "far too large", "empty", "negative"),  # the same in every process
 )
 def test_a_lock_that_does_not_tell_its_holder_is_no_wrong_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, told: str
