@@ -33,6 +33,7 @@ def check(found: list[Case], count: int) -> None:
     assert np.all(2.0 * pull > high)
 
 
+@pytest.mark.slow
 def test_accuracy_of_the_sigma_of_mjpeg_outlines_short() -> None:
     check(list(cases(range(1000, 1020), ("mjpeg", {}))), 20)
 

@@ -75,9 +75,9 @@ def test_published_estimates_stand_beside_ours(scores: tuple[Score, ...]) -> Non
 
 
 def test_frame_is_ambient_plus_spot_at_the_true_place(paper: Dataset, tiny_dataset: Path) -> None:
-    """Brightest pixel of laser on - laser off is the pixel of the truth, in every image, dark or lit."""
+    """Brightest pixel of laser on - laser off is the pixel of the truth, every third sample, dark, and one lit."""
     checked = lit = 0
-    for sample in (*paper.samples, open_dataset(tiny_dataset)["seen-near-h0.500"]):
+    for sample in (*paper.samples[::3], open_dataset(tiny_dataset)["seen-near-h0.500"]):
         for position in ("down", "up"):
             row = sample.row.position(position)
             off = sample.expected_image(position, laser=False)
@@ -89,7 +89,7 @@ def test_frame_is_ambient_plus_spot_at_the_true_place(paper: Dataset, tiny_datas
             assert difference.sum() == pytest.approx(row.electrons_per_s[0], rel=1e-6)
             checked += 1
             lit += bool(off.max() > 1e5)
-    assert (checked, lit) == (52, 2)
+    assert (checked, lit) == (20, 2)
 
 
 def test_truth_layer_at_the_spot_is_the_spots_truth(paper: Dataset) -> None:
