@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
 from phibench.datasets.errors import DatasetError
 
@@ -40,7 +40,8 @@ DIGITS = 40  # of a whole number; a seed of 128 bits has 39
 NAME_LENGTH = 200  # of a key, and of a name of ours
 KEY_PARTS = 32  # of a dotted key of TOML
 
-FileName = Annotated[str, Field(max_length=NAME_LENGTH, pattern=r"^[A-Za-z0-9_][\w.+-]*(/[A-Za-z0-9_][\w.+-]*)*$")]
+FILE_NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.+-]*(/[A-Za-z0-9_][A-Za-z0-9_.+-]*)*$"
+FileName = Annotated[str, Field(max_length=NAME_LENGTH, pattern=FILE_NAME)]
 """Name of a file relative to the folder of its document: no absolute path, and no part that begins with a dot."""
 
 _PART = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
@@ -53,6 +54,20 @@ def printable(text: str, length: int = 2000) -> str:
     """Text for a terminal: control characters and lone surrogates as escapes, cut to a length; lines stay lines."""
     cut = text if len(text) <= length else f"{text[: length - 3]}..."
     return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in cut)
+
+
+Text = Annotated[str, AfterValidator(printable)]
+"""Text of somebody else in a document: escaped and cut, never refused."""
+
+
+def _plain(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("a control character or a line break in a name")
+    return text
+
+
+Name = Annotated[str, Field(max_length=NAME_LENGTH), AfterValidator(_plain)]
+"""Name in a document: one line of at most 200 characters; one with control characters is refused."""
 
 
 def first_fault(error: ValidationError) -> str:
@@ -182,12 +197,12 @@ class InputFile:
     # Tables and pictures.
 
     def table(self, columns: Mapping[str, DataType | type[DataType]] | None = None) -> DataFrame:
-        """Parquet table; `columns` are the names and types that it must have, in any order.
+        """Parquet table; `columns` are the names and types that it must have, in any order; others are allowed.
 
         Raises
         ------
         DatasetError
-            If it cannot be read, has too many rows, or other columns or types.
+            If it cannot be read, has too many rows, or lacks a column of its type.
         """
         import polars
 
@@ -291,10 +306,8 @@ def _place(place: Any) -> str:
 
 
 def _columns_fault(found: Mapping[str, Any], wanted: dict[str, Any]) -> str:
-    """Difference of a table's columns from those that it must have; empty if there is none."""
+    """First column that a table lacks or has of another type; empty if there is none."""
     if missing := [name for name in wanted if name not in found]:
         return f"no column '{missing[0]}'"
-    if strange := [name for name in found if name not in wanted]:
-        return f"a column '{printable(strange[0], 60)}' that does not belong there"
     wrong = next((name for name in wanted if found[name] != wanted[name]), None)
     return "" if wrong is None else f"a column '{wrong}' of type {found[wrong]}, not {wanted[wrong]}"

@@ -6,7 +6,6 @@ nothing else.
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Iterable, Sequence
@@ -31,7 +30,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import make_from_plan
 from phibench.datasets.plan.plan import Plan, make_plan, parse_shard, shard_plan
 from phibench.datasets.progress import Steps
-from phibench.datasets.recipe.load import parse_recipe
+from phibench.datasets.recipe.load import parse_recipe, recipe_text
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import (
@@ -184,9 +183,9 @@ def _held_plan(folder: Path) -> tuple[Plan, str]:
         return make_plan(parse_recipe(head.recipe)), head.recipe
     if head is None:
         raise DatasetError(f"{folder} is not a data set: there is nothing to repair")
-    info = json.loads(head.info)
-    _refuse_other_code(folder, info["provenance"])
-    return shard_plan(make_plan(_recipe(folder, head, info)), info["shard"]), head.recipe
+    info = parse_info(head.info)
+    _refuse_other_code(folder, info.provenance)
+    return shard_plan(make_plan(_recipe(folder, head, info)), info.shard), head.recipe
 
 
 def _lost_head(folder: Path) -> FolderHead | None:
@@ -200,7 +199,7 @@ def _lost_head(folder: Path) -> FolderHead | None:
     path, layers = folder / schema.RECIPE, sorted(folder.glob(schema.view_file("*", "ambient")))
     if not (path.is_file() and layers):
         return None
-    text = path.read_text(encoding="utf-8")
+    text = recipe_text(path)
     plan = make_plan(parse_recipe(text, f"{path}"))
     expected = {pose.pose_id: pose.seed for pose in plan.poses}
     headers = [_header(layer) for layer in layers]
@@ -258,11 +257,11 @@ def _set_aside(path: Path, console: Console) -> None:
     console.print(f"{path} was no {'file' if kept.is_dir() else 'folder'}; it is kept as {kept.name}", highlight=False)
 
 
-def _recipe(folder: Path, head: FolderHead, info: dict[str, object]) -> Recipe:
+def _recipe(folder: Path, head: FolderHead, info: DatasetInfo) -> Recipe:
     if not head.recipe:
         raise DatasetError(f"{folder / schema.RECIPE} is missing; put the right one back")
     recipe = parse_recipe(head.recipe, f"{folder / schema.RECIPE}")
-    if recipe_sha256(recipe) != info["recipe_sha256"]:
+    if recipe_sha256(recipe) != info.recipe_sha256:
         raise DatasetError(
             f"{folder / schema.RECIPE} is not the recipe that {schema.INFO} names; put the right one back"
         )
@@ -272,7 +271,7 @@ def _recipe(folder: Path, head: FolderHead, info: dict[str, object]) -> Recipe:
 def _refuse_other_code(folder: Path, made_by: dict[str, object]) -> None:
     here = provenance()
     for key in ("code_sha256", "packages", "python", "machine"):
-        if here[key] != made_by[key]:
+        if here[key] != made_by.get(key):
             what = key.removesuffix("_sha256")
             text = f"{folder} was made with other {what}: what is repaired here would not fit the rest"
             raise DatasetError(f"{text}; use that one, or `phibench dataset make` to make all of it again")

@@ -17,9 +17,11 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.source import Frames, FrameSource
+from phibench.datasets.input_files import first_fault
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store.checksums import check_documents
 from phibench.datasets.store.documents import (
@@ -32,7 +34,7 @@ from phibench.datasets.store.documents import (
     to_table,
 )
 from phibench.datasets.store.layers import SpotWindow, read_ambient, read_ambient_variance, read_spot, read_truth
-from phibench.datasets.store.schema import RIGS, DatasetInfo, ManifestRow, SpotRow
+from phibench.datasets.store.schema import INFO, RIGS, DatasetInfo, ManifestRow, SpotRow
 from phibench.scenes.laser import Beam, LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, View
 from phibench.scenes.room import Room
@@ -86,7 +88,7 @@ class Dataset:
     @cached_property
     def recipe(self) -> Recipe:
         """The recipe, defaults filled in."""
-        return Recipe.model_validate(self.info.recipe)
+        return stored_recipe(self.folder, self.info)
 
     def sensitivities(self) -> DataFrame:
         """dD/d(parameter) per sample and estimator, a polars table; docs/misalignment.md has its columns.
@@ -335,7 +337,27 @@ def open_dataset(folder: str | Path) -> Dataset:
     rigs = read_rigs(folder)
     if len(rigs) != info.rigs:
         raise DatasetError(f"{folder}: {RIGS} has {len(rigs)} rigs instead of {info.rigs}")
-    return Dataset(folder, info, rigs, from_json(Room, info.room), rows)
+    stored_recipe(folder, info)
+    try:
+        room = from_json(Room, info.room)
+    except DatasetError as error:
+        raise DatasetError(f"{folder / INFO}: {error}; run `phibench dataset repair`") from error
+    return Dataset(folder, info, rigs, room, rows)
+
+
+def stored_recipe(folder: Path, info: DatasetInfo) -> Recipe:
+    """Recipe in a `dataset.json`, defaults filled in.
+
+    Raises
+    ------
+    DatasetError
+        If it is none.
+    """
+    try:
+        return Recipe.model_validate(info.recipe)
+    except ValidationError as error:
+        text = f"{folder / INFO} is damaged: recipe.{first_fault(error)}"
+        raise DatasetError(f"{text}; run `phibench dataset repair`") from error
 
 
 def open_finished(folder: str | Path) -> Dataset:

@@ -16,7 +16,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any
 
+from pydantic import TypeAdapter, ValidationError
+
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import FileName, InputFile
 from phibench.datasets.store import schema
 from phibench.datasets.store.files import write_bytes
 
@@ -27,7 +30,7 @@ class Entry:
 
     task: str
     key: str
-    files: dict[str, str]
+    files: dict[FileName, str]
     result: Any = None
 
 
@@ -60,10 +63,10 @@ class Journal:
         for number, document in enumerate(_documents(self._path), 1):
             if document is None:
                 self.damaged.append(number)
-            elif "info" in document:
-                self.head = FolderHead(**document)
+            elif isinstance(document, FolderHead):
+                self.head = document
             else:
-                self.entries[document["task"]] = Entry(**document)
+                self.entries[document.task] = document
 
     def __enter__(self) -> Journal:
         return self
@@ -122,11 +125,17 @@ def _line(document: dict[str, Any]) -> bytes:
     return b"%08x %b\n" % (zlib.crc32(text), text)
 
 
-def _documents(path: Path) -> Iterator[dict[str, Any] | None]:
-    """Documents of a journal, line by line; None for a line that is damaged."""
+def _documents(path: Path) -> Iterator[FolderHead | Entry | None]:
+    """Head and entries of a journal, line by line; None for a line that is damaged or of another form."""
     if not path.is_file():
         return
-    with path.open("rb") as file:
-        for line in file:
-            check, _, text = line.rstrip(b"\n").partition(b" ")
-            yield json.loads(text) if check == b"%08x" % zlib.crc32(text) else None
+    data = InputFile(path, "remove it, and run `phibench dataset make` again").read()
+    for line in data.removesuffix(b"\n").split(b"\n") if data else ():
+        check, _, text = line.partition(b" ")
+        try:
+            yield _LINES.validate_json(text, strict=True) if check == b"%08x" % zlib.crc32(text) else None
+        except ValidationError:
+            yield None
+
+
+_LINES: TypeAdapter[FolderHead | Entry] = TypeAdapter(FolderHead | Entry)

@@ -25,11 +25,12 @@ from phibench.datasets.build.task_list import sample_task_name, spot_task_name
 from phibench.datasets.build.tasks import Done, Failed, Task, log_entry
 from phibench.datasets.build.workers import WorkerPool
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import InputFile
 from phibench.datasets.plan.plan import PairPlan, Plan
 from phibench.datasets.progress import Steps
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import checksums_text
-from phibench.datasets.store.documents import manifest_documents, read_info, rigs_text
+from phibench.datasets.store.documents import manifest_documents, parse_info, read_info, rigs_text
 from phibench.datasets.store.files import TEMPORARY_PREFIX, only_run, remove_temporary, sha256, write_bytes
 from phibench.datasets.store.schema import ManifestRow
 from phibench.scenes.rig import POSITIONS
@@ -99,7 +100,7 @@ def refuse_other(out: Path, name: str) -> None:
     if out.exists() and not out.is_dir():
         raise DatasetError(f"{out} is a file; give a folder")
     head = held_head(out)
-    if head is not None and (held := json.loads(head.info)["name"]) != name:
+    if head is not None and (held := parse_info(head.info).name) != name:
         raise DatasetError(f"{out} holds another data set ('{held}'); give another folder or delete it")
 
 
@@ -119,8 +120,8 @@ def held_head(out: Path) -> FolderHead | None:
     if not (out / schema.INFO).is_file():
         raise DatasetError(f"{out} is not empty and holds no data set; give an empty or a new folder")
     read_info(out)
-    recipe = (out / schema.RECIPE).read_text(encoding="utf-8") if (out / schema.RECIPE).is_file() else ""
-    return FolderHead((out / schema.INFO).read_text(encoding="utf-8"), recipe)
+    info, recipe = (InputFile(out / name, "put the right one back") for name in (schema.INFO, schema.RECIPE))
+    return FolderHead(info.text(), recipe.text() if recipe.path.is_file() else "")
 
 
 _TOLD = 20  # failures that are told in full
@@ -220,9 +221,13 @@ def assemble(plan: Plan, head: FolderHead, entries: Mapping[str, Entry]) -> dict
 
 def _row(pair: PairPlan, entries: Mapping[str, Entry]) -> ManifestRow:
     """Row of a sample: the result of its spot's task, and the noise from its sample's task."""
-    row, noise = dict(entries[spot_task_name(pair)].result), entries[sample_task_name(pair)].result
-    row |= {position: {**row[position], "noise": noise[position]} for position in POSITIONS}
-    return ManifestRow.model_validate_json(json.dumps(row))
+    try:
+        row, noise = dict(entries[spot_task_name(pair)].result), entries[sample_task_name(pair)].result
+        row |= {position: {**row[position], "noise": noise[position]} for position in POSITIONS}
+        return ManifestRow.model_validate_json(json.dumps(row))
+    except (TypeError, LookupError, ValueError) as error:
+        text = f"{schema.JOURNAL} has a damaged result of sample {pair.sample_id}"
+        raise DatasetError(f"{text}; remove the file and run `phibench dataset make` again") from error
 
 
 def differing(out: Path, wanted: Mapping[str, bytes]) -> list[str]:

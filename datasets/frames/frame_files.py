@@ -19,6 +19,7 @@ from PIL import Image
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.source import Frame
+from phibench.datasets.input_files import FileName, InputFile, printable
 from phibench.datasets.store.documents import model_table, parquet_bytes
 from phibench.datasets.store.files import read_rows, write_bytes, write_text
 from phibench.datasets.store.layers import write_exr
@@ -106,7 +107,7 @@ _IMAGES = (".exr", ".jpg", ".png")
 class FrameRow(Document):
     """One file: one line of `frames.jsonl`, one row of `frames.parquet`. FORMAT.md describes it; a test compares."""
 
-    file: str = described("-", "name of the file, relative to the folder")
+    file: FileName = described("-", "name of the file, relative to the folder")
     sha256: str = described("-", "SHA-256 of the file")
     kind: Literal["frame", "preview"] = described("-", "'frame', or 'preview': a picture for people")
     values: str = described("-", "meaning of the numbers in the file")
@@ -178,12 +179,9 @@ def claim(folder: Path, dataset: tuple[str, int], wanted: dict[str, Any]) -> Non
     if not path.exists() or not _has_frames(folder):
         write_text(path, json.dumps(meant, indent=1, allow_nan=False) + "\n")
         return
-    try:
-        held = dict(json.loads(path.read_text(encoding="utf-8")))
-    except (ValueError, TypeError) as error:
-        raise DatasetError(f"{path} is damaged: give another folder, `--out FOLDER`") from error
+    held = InputFile(path, "give another folder, `--out FOLDER`").json()
     if other := [name for name in meant if held.get(name) != meant[name]]:
-        texts = ", ".join(f"{name} {held.get(name)}, not {meant[name]}" for name in other)
+        texts = ", ".join(f"{name} {printable(str(held.get(name)), 60)}, not {meant[name]}" for name in other)
         raise DatasetError(f"{folder} holds frames with {texts}: give another folder, `--out FOLDER`")
 
 

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from phibench.datasets.errors import DatasetError, RecipeError
+from phibench.datasets.input_files import printable
 from phibench.datasets.plan.sampling import RandomSample, draw_rigs, draw_samples
 from phibench.datasets.recipe.build import build_misalignment, build_rig, build_room, build_spot, true_stroke_m
 from phibench.datasets.recipe.tables import DrawnRigsTable, RandomTable, Recipe
@@ -263,6 +264,9 @@ def shard_plan(plan: Plan, shard: str | None) -> Plan:
 def parse_shard(shard: str) -> tuple[int, int]:
     """Return i and n of "i/n"."""
     i, slash, n = shard.partition("/")
-    if not (slash and i.isdecimal() and n.isdecimal() and 1 <= int(i) <= int(n)):
-        raise DatasetError(f"shard '{shard}': must be i/n with i from 1 to n, such as 1/4")
+    short = len(shard) <= 13 and i.isascii() and n.isascii()  # int("9" * 5000) raises an error of its own
+    if not (slash and short and i.isdecimal() and n.isdecimal() and 1 <= int(i) <= int(n)):
+        raise DatasetError(
+            f"shard '{printable(shard, 40)}': must be i/n with i from 1 to n, n of at most 6 digits, such as 1/4"
+        )
     return int(i), int(n)

@@ -6,11 +6,11 @@ A data set keeps the text of its recipe, so a number that the command line chang
 from __future__ import annotations
 
 import re
-import tomllib
 from pathlib import Path
 from typing import Any
 
 from phibench.datasets.errors import RecipeError
+from phibench.datasets.input_files import SETTINGS_BYTES, InputFile
 from phibench.datasets.recipe.checks import semantic_faults
 from phibench.datasets.recipe.tables import Recipe
 from phibench.scenes.validation import nearest, structural_faults
@@ -50,11 +50,7 @@ def recipe_text(path: str | Path) -> str:
 
 def parse_recipe(text: str, source: str = "recipe") -> Recipe:
     """Check the TOML text of a recipe; `source` is what the error calls it."""
-    try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise RecipeError(f"{source} is not valid TOML: {error}") from error
-    return check_recipe(raw, source)
+    return check_recipe(_input_file(Path(source)).toml_of(text), source)
 
 
 def check_recipe(raw: dict[str, Any], source: str = "recipe") -> Recipe:
@@ -74,12 +70,11 @@ def _text(path: Path) -> str:
     if not path.is_file():
         shipped = nearest(path.name, sorted(file.stem for file in RECIPES.glob("*.toml")))
         raise RecipeError(f"there is no recipe {path}; give a TOML file or the name of a shipped recipe ({shipped})")
-    try:
-        return path.read_text(encoding="utf-8-sig")  # some editors put a byte order mark first
-    except UnicodeDecodeError as error:
-        raise RecipeError(f"{path} cannot be read: byte {error.start} is not UTF-8; save it as UTF-8") from error
-    except OSError as error:
-        raise RecipeError(f"{path} cannot be read: {error.strerror or error}") from error
+    return _input_file(path).text(encoding="utf-8-sig")  # some editors put a byte order mark first
+
+
+def _input_file(path: Path) -> InputFile:
+    return InputFile(path, "mend it, and save it as UTF-8", RecipeError, SETTINGS_BYTES)
 
 
 def with_numbers(text: str, source: str, samples: int | None, seed: int | None) -> str:

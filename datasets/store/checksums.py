@@ -6,10 +6,12 @@ A folder that has the file is complete. Names are relative to the folder, with f
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import FILE_NAME, InputFile
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import from_json, read_info, read_manifest
 from phibench.datasets.store.files import TEMPORARY_PREFIX, require_file, sha256, write_text
@@ -71,10 +73,15 @@ def read_checksums(folder: Path) -> dict[str, str]:
         raise DatasetError(
             f"{folder} has no {schema.CHECKSUMS}: it was not finished; run `phibench dataset make` again"
         )
-    entries = [line.split("  ", 1) for line in path.read_text(encoding="utf-8", errors="replace").splitlines()]
-    if any(len(entry) != 2 or len(entry[0]) != 64 for entry in entries):
-        raise DatasetError(f"{path} is damaged: a line is not '<SHA-256>  <file>'")
-    return {name: digest for digest, name in entries}
+    lines = InputFile(path, "run `phibench dataset repair`").read().decode("utf-8", errors="replace").splitlines()
+    for number, line in enumerate(lines, 1):
+        if _LINE.fullmatch(line) is None:  # a name that leads out of the folder is none either
+            raise DatasetError(f"{path} line {number} is damaged: it is not '<SHA-256>  <file>'")
+    return {line[_NAME:]: line[: _NAME - 2] for line in lines}
+
+
+_NAME = 66  # place of the name in a line
+_LINE = re.compile(r"[0-9a-f]{64}  " + FILE_NAME.removeprefix("^").removesuffix("$"))
 
 
 def misplaced(folder: Path) -> list[str]:

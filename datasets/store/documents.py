@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -287,7 +287,8 @@ def _column_type(annotation: Any) -> Any:
         return polars.List(polars.Float64)
     if origin in (dict, Literal):
         return polars.String
-    return next((kinds[known] for known in kinds if known in (annotation, *get_args(annotation))), polars.Float64)
+    known = [get_args(option)[0] if get_origin(option) is Annotated else option for option in get_args(annotation)]
+    return next((kinds[kind] for kind in kinds if kind in (annotation, *known)), polars.Float64)
 
 
 def differences(folder: Path, rows: Sequence[ManifestRow]) -> list[str]:

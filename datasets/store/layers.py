@@ -28,8 +28,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import PICTURE_PIXELS, InputFile, printable
 from phibench.datasets.store.files import require_file, write_atomic
-from phibench.scenes.camera import FILTERS
+from phibench.scenes.camera import FILTERS, LARGEST_SIDE_PX
 from phibench.scenes.frames import Array
 
 ATTRIBUTE = "phibench"
@@ -101,12 +102,26 @@ def read_exr(path: Path) -> Exr:
 
     _check_readable(path)
     try:
+        with _quiet(), OpenEXR.File(str(path), header_only=True) as file:
+            _check_size(path, file.header() if file.parts else {})
         with _quiet(), OpenEXR.File(str(path), separate_channels=True) as file:
             if not file.parts:
                 raise DatasetError(f"{path} is damaged or truncated")
             return _content(path, file.header(), {name: c.pixels for name, c in file.channels().items()})
-    except (RuntimeError, ValueError, TypeError) as error:
-        raise error if isinstance(error, DatasetError) else DatasetError(f"{path} is damaged: {error}") from error
+    except (RuntimeError, ValueError, TypeError, LookupError, AttributeError, OverflowError, MemoryError) as error:
+        if isinstance(error, DatasetError):
+            raise
+        raise DatasetError(f"{path} is damaged: {printable(str(error), 300)}") from error
+
+
+def _check_size(path: Path, header: dict[str, Any]) -> None:
+    """Refuse a file that declares more pixels than any layer has, before they are decoded."""
+    if "dataWindow" not in header:
+        raise DatasetError(f"{path} is damaged or truncated")
+    low, high = (np.asarray(corner, dtype=np.int64) for corner in header["dataWindow"])
+    width, height = (high - low + 1).tolist()
+    if not (0 < width <= LARGEST_SIDE_PX and 0 < height <= LARGEST_SIDE_PX and width * height <= PICTURE_PIXELS):
+        raise DatasetError(f"{path} is damaged: it says that it has {width} x {height} pixels")
 
 
 def _write(path: Path, planes: dict[str, Plane], text: str, origin_px: tuple[int, int]) -> None:
@@ -133,6 +148,7 @@ def _write(path: Path, planes: dict[str, Plane], text: str, origin_px: tuple[int
 
 
 def _check_readable(path: Path) -> None:
+    """Refuse what is missing, a folder or a pipe; the library opens it by name."""
     try:
         require_file(path).open("rb").close()
     except FileNotFoundError as error:
@@ -161,8 +177,10 @@ def _quiet() -> Iterator[None]:
 def _content(path: Path, header: dict[str, Any], planes: dict[str, Plane]) -> Exr:
     if ATTRIBUTE not in header:
         raise DatasetError(f"{path} was not written by phibench: it has no attribute '{ATTRIBUTE}'")
-    document = json.loads(header[ATTRIBUTE])
-    if {name: zlib.crc32(plane.tobytes()) for name, plane in planes.items()} != document["crc32"]:
+    document = InputFile(path, "render it again").json(header[ATTRIBUTE].encode())
+    if not isinstance(document.get("header"), dict):
+        raise DatasetError(f"{path} is damaged: its attribute '{ATTRIBUTE}' has no header")
+    if {name: zlib.crc32(plane.tobytes()) for name, plane in planes.items()} != document.get("crc32"):
         raise DatasetError(f"{path} is damaged: its pixels do not have the checksums of its header")
     u0, v0 = (int(x) for x in header["dataWindow"][0])
     return Exr(planes, document["header"], (u0, v0))

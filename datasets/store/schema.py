@@ -15,7 +15,9 @@ import re
 from collections.abc import Iterable, Iterator
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, field_validator, model_validator
+
+from phibench.datasets.input_files import FileName
 
 SCHEMA_VERSION = 5
 READABLE_VERSIONS = (4, 5)
@@ -91,9 +93,9 @@ class SpotRow(Document):
     cause: str = described("-", "why not; 'none' if visible")
     coma_shift_px: Vector2 = described("px", "energy centroid of the spot minus (u_px, v_px)")
     electrons_per_s: Vector3 = described("1/s", "electrons per second of the whole spot behind R, G, B")
-    view_ambient_file: str = described("-", "ambient layer of the view")
-    view_truth_file: str = described("-", "truth layer of the view")
-    spot_file: str | None = described("-", "spot layer; null where no light of the spot reaches the image")
+    view_ambient_file: FileName = described("-", "ambient layer of the view")
+    view_truth_file: FileName = described("-", "truth layer of the view")
+    spot_file: FileName | None = described("-", "spot layer; null where no light of the spot reaches the image")
     certificate: CertificateRow | None = described("-", "null where the spot is not visible")
     noise: NoiseRow | None = described("-", "null where the spot is not visible")
 
@@ -144,7 +146,14 @@ class PoseInfo(Document):
     rig: str = described("-", "id of the rig")
     offset_m: float = described("m", "carriage offset along the stroke axis")
     ambient_seed: int = described("-", "32-bit seed of the ambient layer")
-    files: dict[str, str] = described("-", "ambient, truth, preview")
+    files: dict[str, FileName] = described("-", "ambient, truth, preview")
+
+    @field_validator("files")
+    @classmethod
+    def _all_three(cls, files: dict[str, str]) -> dict[str, str]:
+        if set(files) != {"ambient", "truth", "preview"}:
+            raise ValueError("the files ambient, truth and preview are needed, and no other")
+        return files
 
 
 class RigInfo(Document):

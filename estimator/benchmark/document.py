@@ -13,13 +13,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import polars as pl
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import FileName, InputFile, Name, printable
 from phibench.datasets.store.files import sha256, write_bytes, write_text
 from phibench.datasets.store.schema import Document
 from phibench.estimator.benchmark.intervals import Estimate
 from phibench.estimator.benchmark.metrics import Measured
+from phibench.estimator.benchmark.records import COLUMN_TYPES
 
 KIND: Literal["phibench score"] = "phibench score"
 VERSION = 2
@@ -73,13 +75,13 @@ class StratumScore(Document):
 class MethodCard(Document):
     """Identity of a method: its reference, its place, and the hash of its code (null if it cannot be told)."""
 
-    reference: str
-    name: str = Field(default="", description="by default what follows the last slash of the reference")
-    kind: str = ""
-    place: str = ""
-    function: str = ""
-    sha256: str | None = None
-    version: str | None = None
+    reference: Name
+    name: Name = Field(default="", description="by default what follows the last slash of the reference")
+    kind: Name = ""
+    place: Name = ""
+    function: Name = ""
+    sha256: Name | None = None
+    version: Name | None = None
 
     @classmethod
     def of(cls, reference: str, **fields: str | None) -> MethodCard:
@@ -89,7 +91,8 @@ class MethodCard(Document):
     @model_validator(mode="before")
     @classmethod
     def _name(cls, fields: Any) -> Any:
-        known = isinstance(fields, dict) and fields.get("reference") and not fields.get("name")
+        reference = fields.get("reference") if isinstance(fields, dict) else None
+        known = isinstance(reference, str) and reference and not fields.get("name")
         return {**fields, "name": fields["reference"].rsplit("/", 1)[-1]} if known else fields
 
 
@@ -149,7 +152,7 @@ class ScoreDocument(Document):
     causes: dict[str, dict[str, int]] = Field(description="images by cause and kind")
     failures: dict[str, int] = Field(description="pairs for which the method did not come back, by the harness's word")
     worst: list[Worst]
-    records: str = Field(description="name of the Parquet file")
+    records: FileName = Field(description="name of the Parquet file")
     records_sha256: str
 
     @property
@@ -197,20 +200,15 @@ def read_score(path: Path) -> ScoreDocument:
     DatasetError
         If the file is no score, or one of another version; in one sentence.
     """
-    try:
-        raw = json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise DatasetError(f"{path} is not JSON ({error}): give a file that `phibench score --method` wrote") from None
-    if not isinstance(raw, dict) or raw.get("kind") != KIND:
+    file = InputFile(path, "give a file that `phibench score --method ... --out` wrote")
+    raw = file.json()
+    if raw.get("kind") != KIND:
         raise DatasetError(f"{path} is no score: give a JSON file that `phibench score --method ... --out` wrote")
     if raw.get("version") != VERSION:
-        raise DatasetError(f"{path} has version {raw.get('version')}, this program reads {VERSION}: score again")
-    try:
-        return ScoreDocument.model_validate_json(json.dumps(raw))
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise DatasetError(f"{path}: {where}: {first['msg']}; the file was changed: score again") from None
+        raise DatasetError(
+            f"{path} has version {printable(str(raw.get('version')), 60)}, this program reads {VERSION}: score again"
+        )
+    return file.validated(ScoreDocument, raw)
 
 
 def read_records(path: Path, document: ScoreDocument) -> pl.DataFrame:
@@ -226,4 +224,4 @@ def read_records(path: Path, document: ScoreDocument) -> pl.DataFrame:
         raise DatasetError(f"{target} is missing: it belongs to {path.name}; keep both together, or score again")
     if sha256(target) != document.records_sha256:
         raise DatasetError(f"{target} is not the file that {path.name} was written with: score again")
-    return pl.read_parquet(target)
+    return InputFile(target, "score again").table(COLUMN_TYPES)

@@ -97,6 +97,24 @@ COLUMNS: dict[str, str] = {
 }
 
 
+_WHOLE = ("number", "draw", "jpeg_quality")
+_TEXTS = (
+    *("sample_id", "image", "preset", "unseen_because", "bayer"),
+    *("status", "phi_convention", "depth_from", "failure", "message"),
+)
+_TRUTH_VALUES = (
+    *("hinted", "saturated", "visible", "detected", "missed"),
+    *("false_detection", "pair_visible", "depth_found"),
+)
+_TYPES = {
+    **dict.fromkeys(_WHOLE, pl.Int64()),
+    **dict.fromkeys(_TEXTS, pl.String()),
+    **dict.fromkeys(_TRUTH_VALUES, pl.Boolean()),
+}
+COLUMN_TYPES: dict[str, pl.DataType] = {name: _TYPES.get(name, pl.Float64()) for name in COLUMNS}
+"""Type of every column."""
+
+
 def records(pairs: PairSet, outcomes: Iterable[Outcome], rules: Rules) -> pl.DataFrame:
     """Records of a run, `COLUMNS`, two rows per pair in the order of their numbers.
 
@@ -155,15 +173,6 @@ def _of_rigs(nominal: Rig, true: Rig, truths: list[PairTruth], outcomes: list[Ou
     images = {p: _image_columns(p, nominal, true, truths, outcomes, rules) for p in POSITIONS}
     pair = _pair_columns(nominal, truths, outcomes, images, rules)
     return pl.concat([pl.DataFrame({**images[p], **pair}, schema_overrides=_TYPES) for p in POSITIONS])
-
-
-_TYPES = {
-    "jpeg_quality": pl.Int64,
-    "status": pl.String,
-    "phi_convention": pl.String,
-    "depth_from": pl.String,
-    "bayer": pl.String,
-}
 
 
 def _image_columns(

@@ -22,15 +22,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import Field, field_validator
 from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.frame_files import png_bytes
 from phibench.datasets.frames.source import Frames
+from phibench.datasets.input_files import SETTINGS_BYTES, FileName, InputFile, Name, printable
 from phibench.datasets.progress import Steps
 from phibench.datasets.read import open_finished
 from phibench.datasets.recipe.load import RECIPES, load_recipe
@@ -42,11 +43,19 @@ from phibench.datasets.store.schema import Document
 from phibench.estimator.benchmark.dataset_pairs import TASK_VERSION, DatasetPairs, dataset_pairs
 from phibench.estimator.interface import Box, Pair
 from phibench.estimator.pair_set import Distraction, PairTruth, SpotTruth
+from phibench.scenes.camera import LARGEST_SIDE_PX
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
 SEAL, PAIRS, FRAMES, CHECKSUMS = "seal.json", "pairs.jsonl", "frames", "SHA256SUMS"
 FORMAT = "phibench sealed set 1"
+IMAGES = {"down", "up"}
+
+
+MOST_PAIRS = 1_000_000
+Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+_Pixel = Annotated[int, Field(ge=-LARGEST_SIDE_PX, le=LARGEST_SIDE_PX)]
+_Side = Annotated[int, Field(ge=1, le=LARGEST_SIDE_PX)]
 
 
 class Seal(Document):
@@ -57,35 +66,44 @@ class Seal(Document):
     from both.
     """
 
-    format: str
-    id: str
-    task_version: int
-    pairs: int
-    public_sha256: str
-    truth_sha256: str
-    phibench: str | None
+    format: Name
+    id: Annotated[str, Field(pattern="^[0-9a-f]{16}$")]
+    task_version: Annotated[int, Field(ge=1, le=1000)]
+    pairs: Annotated[int, Field(ge=1, le=MOST_PAIRS)]
+    public_sha256: Digest
+    truth_sha256: Digest
+    phibench: Name | None
 
 
 class PublicBox(Document):
     """A region hint, as `interface.Box`."""
 
-    u0_px: int
-    v0_px: int
-    width_px: int
-    height_px: int
+    u0_px: _Pixel
+    v0_px: _Pixel
+    width_px: _Side
+    height_px: _Side
 
 
 class PublicPair(Document):
     """One line of `pairs.jsonl`; `files` by image name: "down", "up", and "down_off", "up_off" where they are."""
 
-    number: int
-    files: dict[str, str]
-    stroke_m: float
+    number: Annotated[int, Field(ge=0, lt=MOST_PAIRS)]
+    files: dict[str, FileName]
+    stroke_m: Annotated[float, Field(gt=0.0, le=1000.0)]
     rig: dict[str, Any]
     card: dict[str, Any]
     box_down: PublicBox | None
     box_up: PublicBox | None
     beam: dict[str, Any] | None = None
+
+    @field_validator("files")
+    @classmethod
+    def _both_images(cls, files: dict[str, str]) -> dict[str, str]:
+        if set(files) not in (IMAGES, IMAGES | {"down_off", "up_off"}):
+            raise ValueError("the images down and up are needed, and down_off and up_off both or neither")
+        if strange := [name for name in files.values() if not name.startswith(f"{FRAMES}/")]:
+            raise ValueError(f"the image {strange[0]} does not lie in {FRAMES}/")
+        return files
 
 
 def seal_id(public_sha256: str, truth_sha256: str) -> str:
@@ -112,10 +130,7 @@ def read_seal(folder: Path) -> Seal:
         raise DatasetError(f"{folder} is no sealed set: it has no {SEAL}; give what `phibench seal make` wrote")
     if not (folder / CHECKSUMS).is_file():
         raise DatasetError(f"{folder / CHECKSUMS} is missing; download the set again")
-    try:
-        seal = Seal.model_validate(json.loads(path.read_text(encoding="utf-8")))
-    except (ValidationError, ValueError) as error:
-        raise DatasetError(f"{path} is damaged: it is not a seal; download the set again") from error
+    seal = InputFile(path, "download the set again", limit_bytes=SETTINGS_BYTES).document(Seal)
     listed = public_sha256(read_checksums(folder))
     if seal.format != FORMAT or listed != seal.public_sha256 or seal.id != seal_id(listed, seal.truth_sha256):
         raise DatasetError(
@@ -155,17 +170,20 @@ def read_truth_file(path: Path, sha256: str) -> list[PairTruth]:
     DatasetError
         If the file is missing or its bytes are others.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise DatasetError(f"{path} is not readable: {error.strerror or error}; give the truth's file") from error
+    file = InputFile(path, "give the truth's file")
+    data = file.read()
     found = hashlib.sha256(data).hexdigest()
     if found != sha256:
         raise DatasetError(
             f"{path} is not the truth that was sealed: its SHA-256 begins with {found[:12]}, the seal says "
             f"{sha256[:12]}; give the file that `phibench seal make` wrote for this set"
         )
-    return [truth_of(document) for document in json.loads(data)["truths"]]
+    try:
+        return [truth_of(document) for document in file.json(data)["truths"]]
+    except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
+        if isinstance(error, DatasetError):
+            raise
+        raise file.fault(f"is damaged: {printable(repr(error), 200)}") from error
 
 
 def truth_document(truth: PairTruth) -> dict[str, Any]:

@@ -7,9 +7,9 @@ Unsealing proves that truth and submission belong to the seal, and gives truths 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import math
+import re
 from collections import Counter
 from collections.abc import Sequence
 from copy import copy
@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from PIL import Image as Picture
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.datasets.input_files import InputFile, Name, Text
 from phibench.datasets.store.checksums import read_checksums
 from phibench.datasets.store.documents import from_json
 from phibench.datasets.store.files import write_text
@@ -32,6 +32,7 @@ from phibench.estimator.benchmark.document import MethodCard
 from phibench.estimator.benchmark.sealed_set import (
     CHECKSUMS,
     FRAMES,
+    MOST_PAIRS,
     PAIRS,
     SEAL,
     PublicBox,
@@ -46,11 +47,13 @@ from phibench.estimator.pair_set import PairTruth
 from phibench.estimator.sandbox.answers import AnswerError, checked
 from phibench.estimator.sandbox.resolve import Reference, RunLimits, resolve
 from phibench.estimator.sandbox.runner import run_method
+from phibench.scenes.camera import Camera
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
 
 FORMAT = "phibench submission 1"
 Matrix = Annotated[tuple[Vector2, Vector2], Field(strict=False)]
+_MODES = ("RGB", "I;16", "L")  # of PNG and JPEG as `phibench seal make` writes them
 
 
 # -- pairs ---------------------------------------------------------------------------------------------------------
@@ -91,12 +94,21 @@ class SealedPairs:
     def pair(self, number: int) -> Pair:
         """Images of a pair, with what a user knows of the rig."""
         row = self._row(number)
-        images = {name: self._image(file) for name, file in row.files.items()}
+        try:
+            return self._pair(row)
+        except DatasetError as error:
+            if str(error).startswith(str(self._folder)):
+                raise
+            raise DatasetError(f"{self._folder / PAIRS} line {number + 1}: {error}; download the set again") from error
+
+    def _pair(self, row: PublicPair) -> Pair:
+        number, rig = row.number, from_json(Rig, row.rig)
+        images = {name: self._image(file, rig.camera) for name, file in row.files.items()}
         return Pair(
             number,
             images["down"],
             images["up"],
-            rig=from_json(Rig, row.rig),
+            rig=rig,
             stroke_m=row.stroke_m,
             card=from_json(SensorCard, row.card),
             down_off=images.get("down_off"),
@@ -154,22 +166,22 @@ class SealedPairs:
         """Bytes of a file of the set."""
         if name not in self._listed:
             raise DatasetError(f"{self._folder / name} is not listed in {CHECKSUMS}; download the set again")
-        try:
-            data = (self._folder / name).read_bytes()
-        except OSError as error:
-            text = f"{self._folder / name} is not readable: {error.strerror or error}"
-            raise DatasetError(f"{text}; download the set again") from error
+        data = InputFile(self._folder / name, "download the set again").read()
         if hashlib.sha256(data).hexdigest() != self._listed[name]:
             raise DatasetError(
                 f"{self._folder / name} was changed, its SHA-256 is not the listed one; download it again"
             )
         return data
 
-    def _image(self, name: str) -> Image:
-        """Image of a file, read-only: 16 bits with one channel, or 8 bits R, G, B."""
-        data = self._read(name)
-        with Picture.open(io.BytesIO(data), formats=("PNG", "JPEG")) as picture:
-            image = np.array(picture)
+    def _image(self, name: str, camera: Camera) -> Image:
+        """Image of a file, of the camera's size, read-only: 16 bits with one channel, or 8 bits R, G, B."""
+        file = InputFile(self._folder / name, "download the set again")
+        picture = file.picture(data=self._read(name))
+        if picture.size != (camera.width_px, camera.height_px):
+            raise file.fault(f"has {picture.width} x {picture.height} pixels, not those of the pair's camera")
+        if picture.mode not in _MODES:
+            raise file.fault(f"is a picture of mode {picture.mode}: allowed are {', '.join(_MODES)}")
+        image = np.array(picture)
         result = image.astype(np.uint16) if image.ndim == 2 else image
         result.flags.writeable = False
         return result
@@ -188,28 +200,28 @@ class SpotLine(Document):
     uv_px: Vector2 | None
     covariance_px2: Matrix | None
     phi_rad: Number | None
-    phi_convention: str
-    status: str
+    phi_convention: Text
+    status: Text
 
 
 class AnswerLine(Document):
     """One pair: an answer, or the failure that was instead of it."""
 
-    number: int
+    number: Annotated[int, Field(ge=0, lt=MOST_PAIRS)]
     down: SpotLine | None
     up: SpotLine | None
     depth_m: Number | None
     sigma_depth_m: Number | None
     seconds: Number
-    failure: str
-    message: str
+    failure: Name
+    message: Text
 
 
 class Submission(Document):
     """`submission.json`; `seal` is the id of the sealed set."""
 
-    format: str
-    seal: str
+    format: Name
+    seal: Name
     task_version: int
     method: MethodCard
     provenance: dict[str, Any]
@@ -283,18 +295,8 @@ def read_submission(path: Path) -> Submission:
     DatasetError
         If it is not readable or no submission; in one sentence.
     """
-    try:
-        document = Submission.model_validate(json.loads(path.read_text(encoding="utf-8")))
-    except OSError as error:
-        raise DatasetError(f"{path} is not readable: {error.strerror or error}; give a submission") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        raise DatasetError(
-            f"{path} is no submission: {where}: {first['msg']}; write it with `phibench seal submit`"
-        ) from error
-    except ValueError as error:
-        raise DatasetError(f"{path} is no submission: it is not JSON; write it with `phibench seal submit`") from error
+    file = InputFile(path, "give a submission, as `phibench seal submit` writes it")
+    document = file.document(Submission)
     if document.format != FORMAT:
         raise DatasetError(f"{path} has the format '{document.format}', not '{FORMAT}'; write it with this phibench")
     return document
@@ -340,8 +342,18 @@ def _line(outcome: Outcome) -> AnswerLine:
         sigma_depth_m=None if answer is None else _finite(answer.sigma_depth_m),
         seconds=math.nan if _finite(outcome.seconds) is None else float(outcome.seconds),
         failure=outcome.failure,
-        message=outcome.message,
+        message=_without_folders(outcome.message),
     )
+
+
+_FOLDERS = re.compile(r"""(?<![\w.:/\\])(?:~|[A-Za-z]:)?[\\/](?:[^\\/\s'"<>|:]+[\\/])+""")
+
+
+def _without_folders(text: str) -> str:
+    """Message without the folders of the paths in it: a submission is published, a user's folders are his."""
+    for folder in (Path.cwd(), Path.home()):
+        text = text.replace(f"{folder}/", "") if len(folder.parts) > 1 else text
+    return _FOLDERS.sub("", text)
 
 
 def _spot_line(spot: Spot) -> SpotLine:

@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import MIB, InputFile, printable
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.files import write_text
 from phibench.estimator.calibration.bundle import Bundle
@@ -110,22 +111,36 @@ def read_calibration(path: str | Path, nominal: Rig | None = None) -> Calibratio
         If the file is missing, of another version, damaged, or of another rig.
     """
     path = Path(path)
-    raw = _raw(path)
+    raw = _file(path).json()
     if raw.get("kind") != "phibench calibration":
         raise CalibrationError(f"{path} is not a calibration: make one with `phibench calibrate`")
     if raw.get("version") not in (1, VERSION):
+        found = printable(str(raw.get("version")), 60)
         raise CalibrationError(
-            f"{path} is a calibration of version {raw.get('version')}; this program reads versions 1 and {VERSION}: "
+            f"{path} is a calibration of version {found}; this program reads versions 1 and {VERSION}: "
             "make it again with `phibench calibrate`"
         )
-    document = _validated(path, _of_version_2(raw) if raw["version"] == 1 else raw)
-    p = len(PARAMETERS)
-    covariance, values = np.array(document.covariance), np.array(document.values)
-    if tuple(document.parameters) != PARAMETERS or covariance.shape != (p, p) or values.shape != (p,):
-        raise CalibrationError(f"{path} has other parameters than this program's {p}: make it again")
-    # of what the file says, before any translation of names
-    if document.sha256 != _digest({k: v for k, v in raw.items() if k != "sha256"}):
+    # of what the file says, before any translation of names, and before any of it is looked at
+    if raw.get("sha256") != _digest({k: v for k, v in raw.items() if k != "sha256"}):
         raise CalibrationError(f"{path} was changed after it was written: its hash does not fit; make it again")
+    document = _file(path).validated(CalibrationDocument, _of_version_2(raw) if raw["version"] == 1 else raw)
+    p = len(PARAMETERS)
+    sizes = {len(document.values), len(document.covariance), *map(len, document.covariance)}
+    if tuple(document.parameters) != PARAMETERS or sizes != {p}:
+        raise CalibrationError(f"{path} has other parameters than this program's {p}: make it again")
+    covariance, values = np.array(document.covariance), np.array(document.values)
+    try:
+        return _calibration(path, document, values, covariance, nominal)
+    except CalibrationError:
+        raise
+    except DatasetError as error:  # of a rig in it
+        raise CalibrationError(f"{path}: {error}; make it again") from error
+
+
+def _calibration(
+    path: Path, document: CalibrationDocument, values: Array, covariance: Array, nominal: Rig | None
+) -> Calibration:
+    """Calibration of a document with the right hash and sizes."""
     start = from_json(Rig, document.nominal_rig)
     if document.version == 1:
         values, covariance = _relative_focal(path, start, values, covariance)
@@ -197,25 +212,8 @@ def _close(a: Any, b: Any) -> bool:
     return bool(a == b)
 
 
-def _raw(path: Path) -> dict[str, Any]:
-    try:
-        raw = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CalibrationError(f"cannot read the calibration {path}: {error.strerror}") from error
-    except ValueError as error:
-        raise CalibrationError(f"{path} is not JSON: {error}") from error
-    if not isinstance(raw, dict):
-        raise CalibrationError(f"{path} is not a calibration: make one with `phibench calibrate`")
-    return raw
-
-
-def _validated(path: Path, raw: dict[str, Any]) -> CalibrationDocument:
-    try:
-        return CalibrationDocument.model_validate(raw)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise CalibrationError(f"{path} is damaged at {where}: {first['msg']}") from error
+def _file(path: Path) -> InputFile:
+    return InputFile(path, "make it again with `phibench calibrate`", CalibrationError, 16 * MIB)
 
 
 def _digest(content: dict[str, Any]) -> str:

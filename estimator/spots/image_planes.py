@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as Picture
-from PIL import UnidentifiedImageError
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
+from phibench.datasets.input_files import InputFile
 from phibench.estimator.interface import Box, Image
 from phibench.estimator.spots.raw_pixels import bayer_filters, raw_electrons
 from phibench.scenes.frames import Array, BoolArray
@@ -61,12 +61,9 @@ def read_picture(path: Path) -> tuple[NDArray[np.uint8], SensorCard]:
     ImageError
         If the file is no colour picture of 8 bits.
     """
-    try:
-        with Picture.open(path) as picture:
-            kind, mode = picture.format, picture.mode
-            pixels = np.asarray(picture.convert("RGB"))
-    except (UnidentifiedImageError, SyntaxError, EOFError) as error:
-        raise ImageError(f"{path} is not a picture: give a PNG or JPEG file of the camera") from error
+    picture = InputFile(path, "give a PNG or JPEG file of the camera", ImageError).picture()
+    kind, mode = picture.format, picture.mode
+    pixels = np.asarray(picture.convert("RGB"))
     if mode not in ("RGB", "RGBA") or kind not in ("PNG", "JPEG"):
         raise ImageError(f"{path} is a {kind} file of mode {mode}: give the camera's colour frame as PNG or JPEG")
     return pixels, sensor_card("mjpeg" if kind == "JPEG" else "srgb8")

@@ -7,7 +7,6 @@ recipes, kept between runs and shared between studies. The top level of `setting
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -21,6 +20,7 @@ from pydantic import BaseModel, ConfigDict
 from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import SETTINGS_BYTES, InputFile
 from phibench.datasets.read import Dataset, open_finished
 from phibench.datasets.recipe.load import find_recipe
 from phibench.estimator.benchmark import figures
@@ -211,11 +211,7 @@ def read_settings(study: Study[S], quick: bool = False, path: Path | None = None
         If the file cannot be read or has faults: all of them, a line each.
     """
     path = path or settings_file(study.name)
-    try:
-        # some editors begin UTF-8 files with a byte-order mark, which TOML does not allow
-        raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise DatasetError(f"{path} is not valid TOML: {error}") from error
+    raw = InputFile(path, "mend it, and save it as UTF-8", limit_bytes=SETTINGS_BYTES).toml()
     reduced = raw.pop(QUICK, {})
     if not isinstance(reduced, dict):
         raise DatasetError(f"{path}: [quick] is {reduced!r}; must be a table of settings")

@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import polars as pl
-from pydantic import Field, ValidationError
+from pydantic import Field
 from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import FileName, InputFile
 from phibench.datasets.store.files import require_writable, sha256, write_bytes, write_text
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import Document
@@ -38,7 +39,7 @@ NAMES = ("noise", "misalignment", "baseline", "cause", "isotropy", "stroke")
 class DrawingEntry(Document):
     """A drawing in the folder."""
 
-    name: str
+    name: FileName
     kind: Literal["svg", "png"]
     alt: str
 
@@ -57,7 +58,7 @@ class StudyDocument(Document):
     notes: tuple[str, ...]
     drawings: tuple[DrawingEntry, ...]
     shown: dict[str, tuple[tuple[str, ...], ...]] = Field(description="tables of text by caption, heads first")
-    files: dict[str, str] = Field(description="SHA-256 of every other file by name")
+    files: dict[FileName, str] = Field(description="SHA-256 of every other file by name")
     provenance: dict[str, Any]
 
 
@@ -125,12 +126,7 @@ def read_study(folder: Path) -> StudyDocument:
     path = folder / DOCUMENT
     if not path.is_file():
         raise DatasetError(f"{folder} holds no study: {DOCUMENT} is missing; make one with `phibench study`")
-    try:
-        document = StudyDocument.model_validate_json(path.read_text(encoding="utf-8"))
-    except (ValidationError, UnicodeDecodeError) as error:
-        raise DatasetError(
-            f"{path} is not the document of a study of this version; run `phibench study` again"
-        ) from error
+    document = InputFile(path, "run `phibench study` again").document(StudyDocument)
     for name, digest in document.files.items():
         if not (folder / name).is_file() or sha256(folder / name) != digest:
             raise DatasetError(f"{folder / name} is missing or was changed after the study; run `phibench study` again")
