@@ -40,8 +40,16 @@ DIGITS = 40  # of a whole number; a seed of 128 bits has 39
 NAME_LENGTH = 200  # of a key, and of a name of ours
 KEY_PARTS = 32  # of a dotted key of TOML
 
-FILE_NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.+-]*(/[A-Za-z0-9_][A-Za-z0-9_.+-]*)*$"
-FileName = Annotated[str, Field(max_length=NAME_LENGTH, pattern=FILE_NAME)]
+FILE_NAME = r"[A-Za-z0-9_][A-Za-z0-9_.+-]*(?:/[A-Za-z0-9_][A-Za-z0-9_.+-]*)*"
+
+
+def _below(name: str) -> str:
+    if len(name) > NAME_LENGTH or not re.fullmatch(FILE_NAME, name):
+        raise ValueError(f"{printable(name, 60)!r} is no name of a file below the folder")
+    return name
+
+
+FileName = Annotated[str, AfterValidator(_below)]
 """Name of a file relative to the folder of its document: no absolute path, and no part that begins with a dot."""
 
 _PART = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""

@@ -81,7 +81,7 @@ def read_checksums(folder: Path) -> dict[str, str]:
 
 
 _NAME = 66  # place of the name in a line
-_LINE = re.compile(r"[0-9a-f]{64}  " + FILE_NAME.removeprefix("^").removesuffix("$"))
+_LINE = re.compile(r"[0-9a-f]{64}  " + FILE_NAME)
 
 
 def misplaced(folder: Path) -> list[str]:

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import polars as pl
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import FileName, InputFile, Name, printable
+from phibench.datasets.input_files import InputFile, Name, printable
 from phibench.datasets.store.files import sha256, write_bytes, write_text
 from phibench.datasets.store.schema import Document
 from phibench.estimator.benchmark.intervals import Estimate
@@ -132,6 +132,12 @@ class Worst(Document):
     frame: EncodedPicture | None = Field(description="the whole; of the first ones only")
 
 
+def _beside(name: str) -> str:
+    if name != Path(name).name or not name.isprintable() or name.startswith(".."):
+        raise ValueError("the records lie beside the document: no folder in their name")
+    return name
+
+
 class ScoreDocument(Document):
     """One run of one method on one pair set."""
 
@@ -152,7 +158,7 @@ class ScoreDocument(Document):
     causes: dict[str, dict[str, int]] = Field(description="images by cause and kind")
     failures: dict[str, int] = Field(description="pairs for which the method did not come back, by the harness's word")
     worst: list[Worst]
-    records: FileName = Field(description="name of the Parquet file")
+    records: Annotated[str, AfterValidator(_beside)] = Field(description="name of the Parquet file")
     records_sha256: str
 
     @property
@@ -219,7 +225,7 @@ def read_records(path: Path, document: ScoreDocument) -> pl.DataFrame:
     DatasetError
         If the Parquet file is not there or not the one that belongs to the score.
     """
-    target = path.with_name(document.records)
+    target = path.parent / document.records
     if not target.is_file():
         raise DatasetError(f"{target} is missing: it belongs to {path.name}; keep both together, or score again")
     if sha256(target) != document.records_sha256:

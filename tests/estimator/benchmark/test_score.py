@@ -160,7 +160,7 @@ def test_crops_hold_the_spot_and_end_with_the_image():
     ("text", "words"),
     [
         ("{", "is not JSON"),
-        ("[]", "is no score"),
+        ("[]", "does not hold a JSON object"),
         ('{"kind": "other"}', "is no score"),
         ('{"kind": "phibench score", "version": 99}', "has version 99"),
         ('{"kind": "phibench score", "version": 1}', "has version 1, this program reads 2: score again"),
