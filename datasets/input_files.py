@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast
 from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
 from phibench.datasets.errors import DatasetError
+from phibench.scenes.validation import printable_line
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -43,13 +44,17 @@ KEY_PARTS = 32  # of a dotted key of TOML
 FILE_NAME = r"[A-Za-z0-9_][A-Za-z0-9_.+-]*(?:/[A-Za-z0-9_][A-Za-z0-9_.+-]*)*"
 
 
-def _below(name: str) -> str:
-    if len(name) > NAME_LENGTH or not re.fullmatch(FILE_NAME, name):
-        raise ValueError(f"{printable(name, 60)!r} is no name of a file below the folder")
+N = TypeVar("N", str, str | None)
+
+
+def _below(name: N) -> N:
+    if name is not None and (len(name) > NAME_LENGTH or not re.fullmatch(FILE_NAME, name)):
+        raise ValueError(f"{printable_line(name, 60)!r} is no name of a file below the folder")
     return name
 
 
 FileName = Annotated[str, AfterValidator(_below)]
+NoFileName = Annotated[str | None, AfterValidator(_below)]
 """Name of a file relative to the folder of its document: no absolute path, and no part that begins with a dot."""
 
 _PART = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
@@ -58,13 +63,11 @@ _LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*\.[ \t]*{_PART}){{{KEY_PARTS
 M = TypeVar("M", bound=BaseModel)
 
 
-def printable(text: str, length: int = 2000) -> str:
-    """Text for a terminal: control characters and lone surrogates as escapes, cut to a length; lines stay lines."""
-    cut = text if len(text) <= length else f"{text[: length - 3]}..."
-    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in cut)
+def _shown(text: str) -> str:
+    return printable_line(text, 2000)
 
 
-Text = Annotated[str, AfterValidator(printable)]
+Text = Annotated[str, AfterValidator(_shown)]
 """Text of somebody else in a document: escaped and cut, never refused."""
 
 
@@ -82,7 +85,7 @@ def first_fault(error: ValidationError) -> str:
     """Place and message of the first fault that pydantic found."""
     first = error.errors(include_url=False, include_context=False, include_input=False)[0]
     where = ".".join(map(str, first["loc"]))
-    return printable(f"{where}: {first['msg']}" if where else first["msg"], 300)
+    return printable_line(f"{where}: {first['msg']}" if where else first["msg"], 300)
 
 
 @dataclass(frozen=True)
@@ -163,7 +166,7 @@ class InputFile:
         except ValueError as error:
             if isinstance(error, DatasetError):
                 raise
-            raise self.fault(f"is damaged: it is not JSON ({printable(str(error), 200)})") from error
+            raise self.fault(f"is damaged: it is not JSON ({printable_line(str(error), 200)})") from error
         if not isinstance(document, dict):
             raise self.fault("is damaged: it does not hold a JSON object")
         if found := bounds_fault(document):
@@ -185,7 +188,7 @@ class InputFile:
         except RecursionError as error:
             raise self.fault(f"is not valid TOML: it is nested deeper than {DEPTH} levels") from error
         except ValueError as error:  # tomllib lets a number of 5000 digits end in Python's own words
-            raise self.fault(f"is not valid TOML: {printable(str(error), 200)}") from error
+            raise self.fault(f"is not valid TOML: {printable_line(str(error), 200)}") from error
         if found := bounds_fault(document, finite=False):
             raise self.fault(f"is not valid here: {found}")
         return document
@@ -199,7 +202,7 @@ class InputFile:
         try:
             return model.model_validate_json(json.dumps(document))
         except (ValidationError, ValueError, RecursionError) as error:
-            text = first_fault(error) if isinstance(error, ValidationError) else printable(str(error), 200)
+            text = first_fault(error) if isinstance(error, ValidationError) else printable_line(str(error), 200)
             raise self.fault(f"is damaged: {text}") from error
 
     # Tables and pictures.
@@ -226,7 +229,7 @@ class InputFile:
         except DatasetError:
             raise
         except (Exception, polars.exceptions.PanicException) as error:  # a decoder's faults are of many kinds
-            reason = printable(str(error).partition("\n")[0], 200) or type(error).__name__
+            reason = printable_line(str(error).partition("\n")[0], 200) or type(error).__name__
             raise self.fault(f"cannot be read: {reason}") from error
 
     def picture(self, formats: tuple[str, ...] = ("PNG", "JPEG"), data: bytes | None = None) -> Image:
@@ -256,7 +259,7 @@ class InputFile:
         except UnidentifiedImageError as error:
             raise self.fault(f"is not a picture of the format {' or '.join(formats)}") from error
         except Exception as error:  # a decoder's faults are of many kinds
-            raise self.fault(f"is a damaged picture: {printable(str(error), 200)}") from error
+            raise self.fault(f"is a damaged picture: {printable_line(str(error), 200)}") from error
 
 
 def _without_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -310,7 +313,7 @@ def _place(place: Any) -> str:
         parts.append(str(key))
     parts.reverse()
     shown = parts if len(parts) <= 6 else [*parts[:3], "...", *parts[-2:]]
-    return printable(".".join(shown), 120) or "its root"
+    return printable_line(".".join(shown), 120) or "its root"
 
 
 def _columns_fault(found: Mapping[str, Any], wanted: dict[str, Any]) -> str:

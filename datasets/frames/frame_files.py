@@ -19,7 +19,7 @@ from PIL import Image
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.source import Frame
-from phibench.datasets.input_files import FileName, InputFile, printable
+from phibench.datasets.input_files import FileName, InputFile
 from phibench.datasets.store.documents import model_table, parquet_bytes
 from phibench.datasets.store.files import read_rows, write_bytes, write_text
 from phibench.datasets.store.layers import write_exr
@@ -27,6 +27,7 @@ from phibench.datasets.store.schema import Document, Number, Position, described
 from phibench.render.sensor import processing
 from phibench.render.sensor.settings import Sensor
 from phibench.scenes.camera import FILTERS
+from phibench.scenes.validation import printable_line
 
 VALUES = {
     "electrons": "expected electrons in one exposure behind R, G, B, float32",
@@ -181,7 +182,7 @@ def claim(folder: Path, dataset: tuple[str, int], wanted: dict[str, Any]) -> Non
         return
     held = InputFile(path, "give another folder, `--out FOLDER`").json()
     if other := [name for name in meant if held.get(name) != meant[name]]:
-        texts = ", ".join(f"{name} {printable(str(held.get(name)), 60)}, not {meant[name]}" for name in other)
+        texts = ", ".join(f"{name} {printable_line(str(held.get(name)), 60)}, not {meant[name]}" for name in other)
         raise DatasetError(f"{folder} holds frames with {texts}: give another folder, `--out FOLDER`")
 
 

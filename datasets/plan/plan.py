@@ -12,7 +12,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from phibench.datasets.errors import DatasetError, RecipeError
-from phibench.datasets.input_files import printable
 from phibench.datasets.plan.sampling import RandomSample, draw_rigs, draw_samples
 from phibench.datasets.recipe.build import build_misalignment, build_rig, build_room, build_spot, true_stroke_m
 from phibench.datasets.recipe.tables import DrawnRigsTable, RandomTable, Recipe
@@ -21,6 +20,7 @@ from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import seed_32
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
 from phibench.scenes.room import Room
+from phibench.scenes.validation import printable_line
 
 RECIPE_RIG = "rig"
 """Id of the rig of `[rig]`. A drawn one is called after the first sample that has it, such as ``r000042``, and one that
@@ -267,6 +267,6 @@ def parse_shard(shard: str) -> tuple[int, int]:
     short = len(shard) <= 13 and i.isascii() and n.isascii()  # int("9" * 5000) raises an error of its own
     if not (slash and short and i.isdecimal() and n.isdecimal() and 1 <= int(i) <= int(n)):
         raise DatasetError(
-            f"shard '{printable(shard, 40)}': must be i/n with i from 1 to n, n of at most 6 digits, such as 1/4"
+            f"shard '{printable_line(shard, 40)}': must be i/n with i from 1 to n, n of at most 6 digits, such as 1/4"
         )
     return int(i), int(n)

@@ -19,12 +19,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, get_args, get_origin
 
 from pydantic import TypeAdapter, ValidationError
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import InputFile, first_fault, printable
+from phibench.datasets.input_files import InputFile, first_fault
 from phibench.datasets.plan.plan import Plan, PosePlan
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store import schema
@@ -43,7 +43,7 @@ from phibench.datasets.store.schema import (
     row_line,
 )
 from phibench.scenes.rig import Rig
-from phibench.scenes.validation import nearest
+from phibench.scenes.validation import nearest, printable_line
 
 if TYPE_CHECKING:
     from polars import DataFrame
@@ -75,7 +75,7 @@ def from_json(kind: type[T], document: Any) -> T:
     except ValidationError as error:
         raise DatasetError(f"not a valid {kind.__name__}: {first_fault(error)}") from error
     except (OverflowError, TypeError, RecursionError) as error:
-        raise DatasetError(f"not a valid {kind.__name__}: {printable(str(error), 200)}") from error
+        raise DatasetError(f"not a valid {kind.__name__}: {printable_line(str(error), 200)}") from error
     if fault := _difference(document, to_json(value)):
         raise DatasetError(f"not a valid {kind.__name__}: {fault}")
     return value
@@ -92,12 +92,12 @@ def _difference(given: Any, whole: Any, place: str = "its root") -> str:
         if missing := sorted(whole.keys() - given.keys() - _LATER):
             return f"{place} lacks the field {missing[0]}"
         if strange := sorted(map(str, given.keys() - whole.keys())):
-            return f"{place} has the field {printable(strange[0], 60)}, which is none of it"
+            return f"{place} has the field {printable_line(strange[0], 60)}, which is none of it"
         inner = ((str(key), value, whole[key]) for key, value in given.items())
     elif isinstance(whole, list) and isinstance(given, list | tuple) and len(whole) == len(given):
         inner = ((str(number), *pair) for number, pair in enumerate(zip(given, whole, strict=True)))
     else:
-        return "" if _same_kind(given, whole) else f"{place} is {printable(repr(given), 60)}: not allowed"
+        return "" if _same_kind(given, whole) else f"{place} is {printable_line(repr(given), 60)}: not allowed"
     faults = (
         _difference(value, known, key if place == "its root" else f"{place}.{key}") for key, value, known in inner
     )
@@ -198,7 +198,7 @@ def read_info(folder: Path) -> DatasetInfo:
     document = file.json()
     version = document.get("schema_version")
     if version not in READABLE_VERSIONS:
-        known, found = " and ".join(map(str, READABLE_VERSIONS)), printable(str(version), 60)
+        known, found = " and ".join(map(str, READABLE_VERSIONS)), printable_line(str(version), 60)
         raise DatasetError(f"{path} has schema version {found}; this phibench reads versions {known}")
     return file.validated(DatasetInfo, document)
 
@@ -287,8 +287,7 @@ def _column_type(annotation: Any) -> Any:
         return polars.List(polars.Float64)
     if origin in (dict, Literal):
         return polars.String
-    known = [get_args(option)[0] if get_origin(option) is Annotated else option for option in get_args(annotation)]
-    return next((kinds[kind] for kind in kinds if kind in (annotation, *known)), polars.Float64)
+    return next((kinds[known] for known in kinds if known in (annotation, *get_args(annotation))), polars.Float64)
 
 
 def differences(folder: Path, rows: Sequence[ManifestRow]) -> list[str]:

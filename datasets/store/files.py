@@ -29,9 +29,10 @@ from filelock import FileLock, Timeout
 from pydantic import ValidationError
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import DIGITS, InputFile, bounds_fault, first_fault, printable
+from phibench.datasets.input_files import DIGITS, InputFile, bounds_fault, first_fault
 from phibench.datasets.store import schema
 from phibench.datasets.store.schema import Document
+from phibench.scenes.validation import printable_line
 
 TEMPORARY_PREFIX = ".phibench-tmp-"
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -320,4 +321,4 @@ def _row(path: Path, model: type[Row], number: int, line: str, checked: bool) ->
     except (ValueError, RecursionError) as error:
         if isinstance(error, DatasetError):
             raise
-        raise DatasetError(f"{path} line {number} is damaged: {printable(str(error), 200)}") from error
+        raise DatasetError(f"{path} line {number} is damaged: {printable_line(str(error), 200)}") from error

@@ -28,10 +28,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import PICTURE_PIXELS, InputFile, printable
+from phibench.datasets.input_files import PICTURE_PIXELS, InputFile
 from phibench.datasets.store.files import require_file, write_atomic
 from phibench.scenes.camera import FILTERS, LARGEST_SIDE_PX
 from phibench.scenes.frames import Array
+from phibench.scenes.validation import printable_line
 
 ATTRIBUTE = "phibench"
 Plane = NDArray[np.float32]
@@ -111,7 +112,7 @@ def read_exr(path: Path) -> Exr:
     except (RuntimeError, ValueError, TypeError, LookupError, AttributeError, OverflowError, MemoryError) as error:
         if isinstance(error, DatasetError):
             raise
-        raise DatasetError(f"{path} is damaged: {printable(str(error), 300)}") from error
+        raise DatasetError(f"{path} is damaged: {printable_line(str(error), 300)}") from error
 
 
 def _check_size(path: Path, header: dict[str, Any]) -> None:

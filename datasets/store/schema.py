@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, field_validator, model_validator
 
-from phibench.datasets.input_files import FileName
+from phibench.datasets.input_files import FileName, NoFileName
 
 SCHEMA_VERSION = 5
 READABLE_VERSIONS = (4, 5)
@@ -95,7 +95,7 @@ class SpotRow(Document):
     electrons_per_s: Vector3 = described("1/s", "electrons per second of the whole spot behind R, G, B")
     view_ambient_file: FileName = described("-", "ambient layer of the view")
     view_truth_file: FileName = described("-", "truth layer of the view")
-    spot_file: FileName | None = described("-", "spot layer; null where no light of the spot reaches the image")
+    spot_file: NoFileName = described("-", "spot layer; null where no light of the spot reaches the image")
     certificate: CertificateRow | None = described("-", "null where the spot is not visible")
     noise: NoiseRow | None = described("-", "null where the spot is not visible")
 

@@ -16,12 +16,13 @@ import polars as pl
 from pydantic import AfterValidator, Field, model_validator
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import InputFile, Name, printable
+from phibench.datasets.input_files import InputFile, Name
 from phibench.datasets.store.files import sha256, write_bytes, write_text
 from phibench.datasets.store.schema import Document
 from phibench.estimator.benchmark.intervals import Estimate
 from phibench.estimator.benchmark.metrics import Measured
 from phibench.estimator.benchmark.records import COLUMN_TYPES
+from phibench.scenes.validation import printable_line
 
 KIND: Literal["phibench score"] = "phibench score"
 VERSION = 2
@@ -211,9 +212,8 @@ def read_score(path: Path) -> ScoreDocument:
     if raw.get("kind") != KIND:
         raise DatasetError(f"{path} is no score: give a JSON file that `phibench score --method ... --out` wrote")
     if raw.get("version") != VERSION:
-        raise DatasetError(
-            f"{path} has version {printable(str(raw.get('version')), 60)}, this program reads {VERSION}: score again"
-        )
+        found = printable_line(str(raw.get("version")), 60)
+        raise DatasetError(f"{path} has version {found}, this program reads {VERSION}: score again")
     return file.validated(ScoreDocument, raw)
 
 

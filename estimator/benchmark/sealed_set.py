@@ -31,7 +31,7 @@ from rich.console import Console
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.frame_files import png_bytes
 from phibench.datasets.frames.source import Frames
-from phibench.datasets.input_files import SETTINGS_BYTES, FileName, InputFile, Name, printable
+from phibench.datasets.input_files import SETTINGS_BYTES, FileName, InputFile, Name
 from phibench.datasets.progress import Steps
 from phibench.datasets.read import open_finished
 from phibench.datasets.recipe.load import RECIPES, load_recipe
@@ -46,6 +46,7 @@ from phibench.estimator.pair_set import Distraction, PairTruth, SpotTruth
 from phibench.scenes.camera import LARGEST_SIDE_PX
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
+from phibench.scenes.validation import printable_line
 
 SEAL, PAIRS, FRAMES, CHECKSUMS = "seal.json", "pairs.jsonl", "frames", "SHA256SUMS"
 FORMAT = "phibench sealed set 1"
@@ -183,7 +184,7 @@ def read_truth_file(path: Path, sha256: str) -> list[PairTruth]:
     except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
         if isinstance(error, DatasetError):
             raise
-        raise file.fault(f"is damaged: {printable(repr(error), 200)}") from error
+        raise file.fault(f"is damaged: {printable_line(repr(error), 200)}") from error
 
 
 def truth_document(truth: PairTruth) -> dict[str, Any]:

@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import MIB, InputFile, printable
+from phibench.datasets.input_files import MIB, InputFile
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.store.files import write_text
 from phibench.estimator.calibration.bundle import Bundle
@@ -25,7 +25,7 @@ from phibench.estimator.geometry.rig_parameters import PARAMETERS, RENAMED, chan
 from phibench.scenes.frames import IDENTITY, Array
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.rig import Rig
-from phibench.scenes.validation import SceneError
+from phibench.scenes.validation import SceneError, printable_line
 
 VERSION = 2
 
@@ -115,7 +115,7 @@ def read_calibration(path: str | Path, nominal: Rig | None = None) -> Calibratio
     if raw.get("kind") != "phibench calibration":
         raise CalibrationError(f"{path} is not a calibration: make one with `phibench calibrate`")
     if raw.get("version") not in (1, VERSION):
-        found = printable(str(raw.get("version")), 60)
+        found = printable_line(str(raw.get("version")), 60)
         raise CalibrationError(
             f"{path} is a calibration of version {found}; this program reads versions 1 and {VERSION}: "
             "make it again with `phibench calibrate`"
