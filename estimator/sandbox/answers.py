@@ -66,7 +66,8 @@ def _converted(value: Any) -> Any:
     """Floats of what has none of Python's, such as `np.longdouble`."""
     try:
         array = np.asarray(value)
-        kind, listed = array.dtype.kind, np.asarray(array, float).tolist()
+        with np.errstate(over="ignore"):  # infinity, which is refused later
+            kind, listed = array.dtype.kind, np.asarray(array, float).tolist()
     except (TypeError, ValueError, OverflowError):
         return {"type": described(value)}
     return listed if kind in "fiu" else {"type": described(value)}

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Literal
 
 from phibench.datasets.store.files import sha256
 from phibench.datasets.store.provenance import code_behind
-from phibench.scenes.validation import close_names
+from phibench.scenes.validation import close_names, printable_line
 
 if TYPE_CHECKING:
     from phibench.estimator.methods.registry import BuiltIn
@@ -53,7 +53,7 @@ class Reference:
 
     def document(self) -> dict[str, str | None]:
         """Provenance, as JSON can hold it; of a file its name alone, not where it lies."""
-        place = Path(self.place).name if self.kind == "file" else self.place
+        place = printable_line(Path(self.place).name) if self.kind == "file" else self.place
         return {**asdict(self), "place": place}
 
 
@@ -107,7 +107,8 @@ def _of_file(reference: str) -> Reference:
         what = "is a folder" if path.is_dir() else "is not there"
         raise MethodError(f"method '{reference}': the file {path} {what}; {advice}")
     _require_python(path)
-    return Reference(f"{path.stem}:{function}", "file", str(path), function, sha256=sha256(path))
+    # names of files may hold bytes that are no text, and what a terminal obeys
+    return Reference(f"{printable_line(path.stem)}:{function}", "file", str(path), function, sha256=sha256(path))
 
 
 def _require_python(path: Path) -> None:

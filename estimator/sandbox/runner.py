@@ -66,7 +66,8 @@ class Harness:
             turns.stop()
         for pool in self._pools:
             pool.close()
-        self._threads.shutdown(wait=True, cancel_futures=True)
+        # Ctrl-C does not wait for a pair that is being made, 1 s or more; nobody will be asked for it
+        self._threads.shutdown(wait=kind is None, cancel_futures=True)
 
     @property
     def failed_outputs(self) -> list[str]:

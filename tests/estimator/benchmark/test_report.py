@@ -15,7 +15,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.causes import CAUSES
 from phibench.estimator.benchmark.document import MethodCard
-from phibench.estimator.benchmark.figures import Picture, plain_number, pull_histogram
+from phibench.estimator.benchmark.figures import Picture, cause_bars, plain_number, pull_histogram
 from phibench.estimator.benchmark.report import Section, report_html, verdict, write_report
 from phibench.estimator.benchmark.score import score_outcomes
 
@@ -136,6 +136,12 @@ def test_ticks_are_plain_numbers(x, text):
 def test_names_are_text_not_markup(html):
     assert "mixed <b>&amp;" not in html
     assert "mixed &lt;b&gt;&amp;" in html
+
+
+def test_a_name_is_no_formula(scores):
+    """Matplotlib takes text between two dollar signs for TeX, and refuses what is none."""
+    name = "$\\frac{1}$"
+    assert name in base64.b64decode(cause_bars({name: scores[1][0]}).source.split(",")[1]).decode()
 
 
 def test_methods_are_in_the_order_of_their_ranks(html):

@@ -38,6 +38,15 @@ def test_a_file_is_found_hashed_and_not_run(tmp_path: Path) -> None:
     assert (tmp_path / "ran").exists()
 
 
+def test_a_file_with_a_strange_name_has_a_printable_one(tmp_path: Path) -> None:
+    name = "[b]\x1b[2J\udcff.py"
+    (tmp_path / name).write_text("def extract(pair):\n    return 1\n")
+    found = resolve(f"{tmp_path / name}:extract")
+    assert found.name == "[b]\\x1b[2J\\udcff:extract"
+    assert str(found.document()["place"]).isprintable()
+    assert load(found)(None) == 1  # type: ignore[arg-type, comparison-overlap]
+
+
 def test_a_file_that_was_edited_in_the_meantime_is_refused(tmp_path: Path) -> None:
     found = resolve(written(tmp_path, "def extract(pair):\n    return 1\n"))
     written(tmp_path, "def extract(pair):\n    return 2\n")
