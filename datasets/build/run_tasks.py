@@ -31,7 +31,8 @@ from phibench.datasets.progress import Steps
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import checksums_text
 from phibench.datasets.store.documents import manifest_documents, parse_info, read_info, rigs_text
-from phibench.datasets.store.files import TEMPORARY_PREFIX, only_run, remove_temporary, sha256, write_bytes
+from phibench.datasets.store.files import only_run, remove_temporary, sha256, write_bytes
+from phibench.datasets.store.leftovers import TEMPORARY_PREFIX
 from phibench.datasets.store.schema import ManifestRow
 from phibench.scenes.rig import POSITIONS
 

@@ -13,7 +13,6 @@ import logging
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 import uuid
 from collections.abc import Iterator
@@ -28,6 +27,7 @@ from phibench.datasets.build.view_task import start_renderer
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.parallel import ONE_THREAD
 from phibench.datasets.store.files import write_text
+from phibench.datasets.store.leftovers import OwnedFolder
 from phibench.datasets.store.provenance import code_sha256, provenance
 
 CONNECT_S = 10.0  # a scheduler that is up answers at once: a longer wait would only hide a wrong address
@@ -118,7 +118,7 @@ def local_workers(count: int, out: Path) -> Iterator[DaskExecutor]:
         "distributed.worker.profile.enabled": False,
         "distributed.nanny.pre-spawn-environ": {**_MEMORY, **ONE_THREAD},
     }
-    with tempfile.TemporaryDirectory(prefix="phibench-") as folder, dask.config.set(settings), deaths.listening():
+    with OwnedFolder("workers") as folder, dask.config.set(settings), deaths.listening():
         cluster = distributed.LocalCluster(
             n_workers=count,
             threads_per_worker=1,
@@ -127,7 +127,7 @@ def local_workers(count: int, out: Path) -> Iterator[DaskExecutor]:
             scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
             memory_limit=0,
             silence_logs=logging.CRITICAL,
-            local_directory=folder,
+            local_directory=str(folder),
         )
         with cluster, distributed.Client(cluster, set_as_default=False) as client:
             client.run(_ignore_interrupt)

@@ -14,7 +14,8 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import FILE_NAME, InputFile
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import from_json, read_info, read_manifest
-from phibench.datasets.store.files import TEMPORARY_PREFIX, require_file, sha256, write_text
+from phibench.datasets.store.files import require_file, sha256, write_text
+from phibench.datasets.store.leftovers import TEMPORARY_PREFIX
 from phibench.scenes.rig import POSITIONS
 from phibench.scenes.room import Room
 

@@ -16,7 +16,6 @@ import json
 import os
 import platform
 import re
-import shutil
 import stat
 import tempfile
 import time
@@ -31,10 +30,10 @@ from pydantic import ValidationError
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import DIGITS, InputFile, bounds_fault, first_fault
 from phibench.datasets.store import schema
+from phibench.datasets.store.leftovers import TEMPORARY_PREFIX, owned, remove_leftovers, remove_tree
 from phibench.datasets.store.schema import Document
 from phibench.scenes.validation import printable_line
 
-TEMPORARY_PREFIX = ".phibench-tmp-"
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _NOT_ALLOWED = {errno.EACCES, errno.EPERM, errno.EROFS}
 
@@ -114,7 +113,7 @@ def remove_temporary(folder: Path) -> None:
     """Remove what a killed run left under temporary names, in `folder` and below."""
     for path in folder.rglob(TEMPORARY_PREFIX + "*"):
         if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path, ignore_errors=True)
+            remove_tree(path)
         else:
             path.unlink(missing_ok=True)
 
@@ -122,9 +121,10 @@ def remove_temporary(folder: Path) -> None:
 def _write_and_rename(path: Path, write: Callable[[Path], None]) -> None:
     temporary = _temporary(path)
     try:
-        write(temporary)
-        _flush(temporary)
-        temporary.replace(path)
+        with owned(temporary):
+            write(temporary)
+            _flush(temporary)
+            temporary.replace(path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
@@ -161,7 +161,7 @@ def _flush_folder(folder: Path) -> None:
 
 
 def require_writable(path: Path) -> None:
-    """Find out before long work whether a file can be written; its folder is made.
+    """Find out before long work whether a file can be written; its folder is made, and cleared of leftovers.
 
     Raises
     ------
@@ -170,6 +170,7 @@ def require_writable(path: Path) -> None:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(path.parent)
         with tempfile.TemporaryFile(dir=path.parent):
             pass
     except OSError as error:

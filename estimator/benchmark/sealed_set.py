@@ -16,8 +16,6 @@ import json
 import math
 import os
 import secrets
-import shutil
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
@@ -38,7 +36,8 @@ from phibench.datasets.recipe.load import RECIPES, load_recipe
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store.checksums import checksums_text, read_checksums
 from phibench.datasets.store.documents import from_json, to_json
-from phibench.datasets.store.files import TEMPORARY_PREFIX, WriteError, read_rows, sha256, write_bytes, write_text
+from phibench.datasets.store.files import WriteError, read_rows, sha256, write_bytes, write_text
+from phibench.datasets.store.leftovers import OwnedFolder
 from phibench.datasets.store.schema import Document
 from phibench.estimator.benchmark.dataset_pairs import TASK_VERSION, DatasetPairs, dataset_pairs
 from phibench.estimator.interface import Box, Pair
@@ -285,11 +284,8 @@ def seal(folder: str | Path, public: str | Path, preset: str | None = None, cons
     _check_folder(public, Path(folder))
     try:
         public.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=TEMPORARY_PREFIX, dir=public.parent))
-        try:
+        with OwnedFolder("seal", public.parent) as work:
             return _seal(pairs, Path(folder), work, public, console)
-        finally:
-            shutil.rmtree(work, ignore_errors=True)
     except OSError as error:
         text = str(error) if isinstance(error, WriteError) else f"could not write to {public}: {error}"
         raise DatasetError(f"{text}; then run the same command again") from error

@@ -8,13 +8,14 @@ Also the user's cache folder, and programs that run in a process of their own be
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -213,7 +214,21 @@ def prove(llvm: Llvm) -> str:
     str
         Empty if it works, otherwise the reason in a few words.
     """
-    with tempfile.TemporaryDirectory(prefix="phibench-proof-") as home:
+    with tempfile.TemporaryDirectory(prefix="phibench-tmp-proof-") as home, _held(home):
         # Dr.Jit keeps compiled kernels under HOME: with a fresh one the kernel is really compiled by this library.
         environment = {"HOME": home, "DRJIT_LIBLLVM_PATH": str(llvm.path)}
         return fault_of("phibench.render.setup.selftest", str(llvm.path), timeout_s=_PROVE_S, environment=environment)
+
+
+@contextlib.contextmanager
+def _held(folder: str) -> Iterator[None]:
+    """Lock a temporary folder: `datasets/store/leftovers.py` removes one that nobody holds."""
+    import fcntl
+
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):  # where locks do not work, nobody removes anything
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)

@@ -28,8 +28,8 @@ from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import damaged, data_files, read_checksums
 from phibench.datasets.store.documents import read_manifest
-from phibench.datasets.store.files import TEMPORARY_PREFIX
 from phibench.datasets.store.layers import read_exr
+from phibench.datasets.store.leftovers import TEMPORARY_PREFIX
 from phibench.datasets.store.schema import ManifestRow
 from phibench.render.optics.certificate import Certificate, certify
 from phibench.render.setup.variant import default_variant

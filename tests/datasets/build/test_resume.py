@@ -18,7 +18,8 @@ from phibench.datasets.build.run_tasks import claimed
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import make
 from phibench.datasets.store import schema
-from phibench.datasets.store.files import TEMPORARY_PREFIX, only_run
+from phibench.datasets.store.files import only_run
+from phibench.datasets.store.leftovers import TEMPORARY_PREFIX
 from phibench.datasets.store.provenance import _tables, closure, code_behind
 
 RUN = (

@@ -17,7 +17,6 @@ import pytest
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.store import files, schema
 from phibench.datasets.store.files import (
-    TEMPORARY_PREFIX,
     only_run,
     remove_temporary,
     sha256,
@@ -27,6 +26,7 @@ from phibench.datasets.store.files import (
     write_text,
 )
 from phibench.datasets.store.layers import write_exr
+from phibench.datasets.store.leftovers import TEMPORARY_PREFIX
 
 
 def test_bytes_text_and_hash(tmp_path: Path) -> None:

@@ -1,0 +1,139 @@
+"""Temporary folders and files with an owner, so that what a killed process left is told from what a running one uses.
+
+The owner holds a lock (`flock`) on the folder or file itself. It vanishes with the process, whatever ended it: no
+process number and no clock is asked, and nothing is written into the folder. Where locks do not work, nothing is
+removed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import stat
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+TEMPORARY_PREFIX = ".phibench-tmp-"
+_NAME = re.compile(r"\.?phibench-tmp-([a-z]+-)?[a-z0-9_]{8}(\.\w+)?")  # eight random characters, as `tempfile` has them
+
+
+class OwnedFolder:
+    """New empty folder, removed when it is closed, or by the next one beside it if this process is killed.
+
+    Parameters
+    ----------
+    kind : str
+        Lower-case word for the folder's name.
+    parent : Path, optional
+        By default the system's folder for temporary files. Elsewhere the name begins with a dot.
+
+    Attributes
+    ----------
+    path : Path
+    """
+
+    def __init__(self, kind: str, parent: Path | None = None) -> None:
+        where, dot = (Path(tempfile.gettempdir()), "") if parent is None else (parent, ".")
+        remove_leftovers(where)
+        self.path, self._handle = _made(where, f"{dot}phibench-tmp-{kind}-")
+
+    def close(self) -> None:
+        """Remove the folder with all that it holds; never raises. One that was given another name stays."""
+        remove_tree(self.path)
+        if self._handle is not None:
+            os.close(self._handle)
+            self._handle = None
+
+    def __enter__(self) -> Path:
+        return self.path
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+@contextlib.contextmanager
+def owned(path: Path) -> Iterator[None]:
+    """Hold a temporary file while it is written and renamed."""
+    handle = None if os.name == "nt" else _held(path)  # Windows renames no open file
+    try:
+        yield
+    finally:
+        if handle is not None:
+            os.close(handle)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove temporary folders and files of this user whose owner is gone, in a folder but not below; never raises."""
+    if os.name == "nt":  # no such locks
+        return
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        names = [entry.path for entry in entries if _NAME.fullmatch(entry.name)]
+        for path in map(Path, names):
+            with contextlib.suppress(OSError):
+                _remove_if_free(path)
+
+
+def _locked(handle: int, wait: bool = False) -> bool:
+    """Lock an open file or folder until it is closed; False if another process holds it, or locks do not work."""
+    if sys.platform == "win32":
+        return False
+    import fcntl
+
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except OSError:
+        return False
+    return True
+
+
+def remove_tree(path: Path) -> None:
+    """Remove a folder with all that it holds; never raises, and what cannot be removed stays."""
+    with contextlib.suppress(OSError, RecursionError):  # as deep as nobody makes folders by accident
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def _made(where: Path, prefix: str) -> tuple[Path, int | None]:
+    """New folder and its handle; again if another process took it for a leftover before it was locked."""
+    while True:
+        path = Path(tempfile.mkdtemp(prefix=prefix, dir=where))
+        handle = _held(path)
+        if path.is_dir() if handle is None else _is_at(handle, path):
+            return path, handle
+        if handle is not None:
+            os.close(handle)
+
+
+def _held(path: Path) -> int | None:
+    """Handle of a file or folder that is locked; None where it cannot be opened or locked."""
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except OSError:
+        return None
+    if _locked(handle, wait=True):
+        return handle
+    os.close(handle)
+    return None
+
+
+def _is_at(handle: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(handle), path.lstat())
+    except OSError:
+        return False
+
+
+def _remove_if_free(path: Path) -> None:
+    found = path.lstat()
+    is_folder = stat.S_ISDIR(found.st_mode)
+    if found.st_uid != os.geteuid() or not (is_folder or stat.S_ISREG(found.st_mode)):
+        return
+    handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    try:
+        if _locked(handle) and _is_at(handle, path):
+            remove_tree(path) if is_folder else path.unlink()
+    finally:
+        os.close(handle)
