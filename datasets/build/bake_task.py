@@ -6,12 +6,13 @@ import zipfile
 import zlib
 from pathlib import Path
 
+from phibench.datasets.build.light_map_cache import light_map
 from phibench.datasets.build.tasks import Made
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.recipe.tables import AmbientTable
 from phibench.datasets.store import schema
 from phibench.datasets.store.files import require_file, write_bytes
-from phibench.render.room.light_map import BakeSettings, LightMap, decoded, encoded, light_map
+from phibench.render.room.light_map import BakeSettings, LightMap, decoded, encoded
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
 

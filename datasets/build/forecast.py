@@ -18,11 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from phibench.datasets.build.bake_task import bake_settings
+from phibench.datasets.build.light_map_cache import is_cached
 from phibench.datasets.build.scheduler import Executor, Outcome
 from phibench.datasets.build.tasks import Done, Task
 from phibench.datasets.plan.plan import PairPlan, Plan
 from phibench.render.optics.truth import SpotTruth, depth_m, spot_truth
-from phibench.render.room.light_map import fixed_shapes, is_cached
+from phibench.render.room.light_map import fixed_shapes
 from phibench.render.room.shading import cut, texel_count
 from phibench.scenes.rig import POSITIONS
 

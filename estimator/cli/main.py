@@ -45,6 +45,55 @@ app.command(align, group=SENSOR)
 app.command(paper, group=SENSOR)
 
 
+cache = App(name="cache", group=INSTALLATION, help="Show, clear and limit the cache of baked rooms.")
+app.command(cache)
+
+
+@cache.command
+def show() -> int:
+    """List the light maps that are kept for all data sets, with their size and last use."""
+    from datetime import datetime
+
+    from phibench.datasets.build.light_map_cache import cache_entries, cache_folder, cache_limit_mb
+
+    entries = cache_entries()
+    for entry in entries:
+        used = datetime.fromtimestamp(entry.used_s).isoformat(" ", "minutes")
+        print(f"{entry.path.stem[:12]}  {entry.size_bytes / 1e6:8.1f} MB  last used {used}")
+    total = sum(entry.size_bytes for entry in entries) / 1e6
+    print(f"{cache_folder()}: {_maps(len(entries))}, {total:.1f} MB of at most {cache_limit_mb():g} MB")
+    return 0
+
+
+@cache.command
+def clear() -> int:
+    """Remove all light maps; a room is baked again when a data set needs it."""
+    from phibench.datasets.build.light_map_cache import cache_folder, clear_cache
+
+    print(f"{cache_folder()}: {_maps(clear_cache())} removed")
+    return 0
+
+
+@cache.command
+def limit(megabytes: float) -> int:
+    """Limit the light maps' size, from now on; those that were not used for longest go first.
+
+    Parameters
+    ----------
+    megabytes
+        Limit in 1e6 bytes; 0 keeps none.
+    """
+    from phibench.datasets.build.light_map_cache import cache_folder, limit_cache
+
+    gone = limit_cache(megabytes)
+    print(f"{cache_folder()}: at most {megabytes:g} MB from now on, {_maps(gone)} removed")
+    return 0
+
+
+def _maps(count: int) -> str:
+    return f"{count} light map{'' if count == 1 else 's'}"
+
+
 @app.command(group=INSTALLATION)
 def doctor() -> int:
     """Show Python, packages, LLVM, cores and disk, and render a test image.

@@ -1,28 +1,18 @@
-"""Light map of a room: the irradiance of every texel, direct and by all bounces, baked once and kept on disk.
+"""Light map of a room: the irradiance of every texel, direct and by all bounces.
 
 Direct light is integrated over the lamps with shadow rays. Bounced light is gathered over the hemisphere from the map
 itself, again and again: pass k adds bounce k, and the error left after k passes falls as albedo^k. A last gather with
 many rays sets the noise; its two independent halves give the noise estimate. The robot's body is in the map. Mirror,
 camera housing and mast are not: they move with the carriage.
 
-A file of the cache is named after the hash of everything that enters: room, settings, code, renderer. It holds the
-SHA-256 of its payload, then the payload; one that does not match is baked again. Nothing is changed in place.
-
 Arrays have one row per texel and three bands, W/m^2.
 """
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
 import io
-import os
-import tempfile
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -33,7 +23,6 @@ from scipy import ndimage
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.render.room.shading import Patch, Surfaces, cut
 from phibench.render.room.subpixel_grid import points, shifts
-from phibench.render.setup.llvm_library import cache_root
 from phibench.render.setup.variant import activate
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import View
@@ -227,51 +216,9 @@ def _loop(mi: ModuleType, body: Any, count: int, lanes: int) -> Array:
     return np.stack([np.array(total[k], dtype=float) for k in range(3)], axis=-1)
 
 
-# Light maps on disk.
+# Light maps as files.
 
-
-_DAY_S = 86400.0
-_DIGEST = 64  # hexadecimal characters
-_CODE = ("light_map.py", "shading.py", "subpixel_grid.py", "scene.py")
 ARRAYS = ("irradiance_w_m2", "sigma_w_m2", "covered")
-
-
-def light_map(view: View, room: Room, settings: BakeSettings, folder: Path | None = None) -> LightMap:
-    """Light map of a room, from the cache or baked now and put there.
-
-    Parameters
-    ----------
-    view : View
-        Any view of the rig; only the origin of coordinates is taken from it.
-    folder : Path, or None for the user's cache
-    """
-    path = _entry(view, room, settings, folder)
-    cached = _read(path)
-    if cached is None:
-        cached = bake(view, room, settings)
-        with contextlib.suppress(OSError):  # a cache that cannot be written costs time, not the light map
-            _write(path, cached)
-    return cached
-
-
-def is_cached(view: View, room: Room, settings: BakeSettings, folder: Path | None = None) -> bool:
-    """Tell whether the cache holds the light map, so that `light_map` takes no time."""
-    try:
-        return _entry(view, room, settings, folder).is_file()
-    except PackageNotFoundError:  # without Mitsuba nothing has been baked
-        return False
-
-
-def _entry(view: View, room: Room, settings: BakeSettings, folder: Path | None) -> Path:
-    return (folder or cache_root() / "lightmaps") / f"{key(view, room, settings)}.lightmap"
-
-
-def key(view: View, room: Room, settings: BakeSettings) -> str:
-    """SHA-256 of all that a light map depends on."""
-    parts = [repr(fixed_shapes(room)), repr(tuple(view.sphere_centre_m)), repr(settings)]
-    parts += [f"{name} {version(name)}" for name in ("mitsuba", "drjit", "numpy", "scipy")]
-    parts += [hashlib.sha256(Path(__file__).with_name(name).read_bytes()).hexdigest() for name in _CODE]
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
 def encoded(light: LightMap) -> bytes:
@@ -285,39 +232,3 @@ def decoded(data: bytes) -> LightMap:
     """Light map of the bytes of an `.npz` file."""
     with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
         return LightMap(*(arrays[name] for name in ARRAYS))
-
-
-def _read(path: Path) -> LightMap | None:
-    """The entry, or None if there is none or its bytes are not those that were written."""
-    try:
-        content = path.read_bytes()
-    except OSError:
-        return None
-    payload = content[_DIGEST:]
-    if hashlib.sha256(payload).hexdigest().encode() != content[:_DIGEST]:
-        return None
-    return decoded(payload)
-
-
-def _sweep(folder: Path) -> None:
-    """Remove what killed processes left a day ago or earlier."""
-    for left in folder.glob(".*.tmp"):
-        with contextlib.suppress(OSError):
-            if time.time() - left.stat().st_mtime > _DAY_S:
-                left.unlink()
-
-
-def _write(path: Path, light: LightMap) -> None:
-    payload = encoded(light)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _sweep(path.parent)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(hashlib.sha256(payload).hexdigest().encode() + payload)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from helpers.limb_frames import drawn_rig
 
+from phibench.datasets.build.light_map_cache import light_map
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.calibration.vertical_edges import find_vertical
 from phibench.render.room.ambient import render_ambient
-from phibench.render.room.light_map import BakeSettings, light_map
+from phibench.render.room.light_map import BakeSettings
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light
 from phibench.render.sensor.noise_tiles import NoiseStream

@@ -11,7 +11,7 @@ from helpers.oracles import TARGETS
 from helpers.path_ambient import path_trace
 
 from phibench.render.room.ambient import AmbientLayer, render_ambient
-from phibench.render.room.light_map import BakeSettings, LightMap, bake, light_map
+from phibench.render.room.light_map import BakeSettings, LightMap, bake
 from phibench.render.room.shading import cut, texel_count
 from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.room import Room, Uniform, cuboid, faces, rectangle
@@ -152,22 +152,6 @@ def test_noise_is_what_two_bakes_differ_by(coarse_light: LightMap) -> None:
     seen = ~coarse_light.covered[part]
     relative = coarse_light.sigma_w_m2[part][seen] / coarse_light.irradiance_w_m2[part][seen]
     assert 0.0 < np.sqrt(np.mean(relative**2)) < 0.02
-
-
-def test_light_map_cache_returns_the_same_and_repairs_itself(tmp_path) -> None:
-    room = Room("small", (rectangle("floor", (0, 0, 0), (0, 0, 1), (1, 1)), *ROOM.surfaces[8:9]), (), robot=False)
-    settings = BakeSettings(texel_m=0.25, lamp_rays=8, bounces=1, bounce_rays=8, final_rays=8)
-    first = light_map(RIG.at(0.0), room, settings, tmp_path)
-    (entry,) = tmp_path.iterdir()
-    written = entry.read_bytes()
-    assert light_map(RIG.at(0.0), room, settings, tmp_path).irradiance_w_m2.tobytes() == first.irradiance_w_m2.tobytes()
-    for damaged in (written[:-10], written[:-1] + bytes([written[-1] ^ 1]), b""):
-        entry.write_bytes(damaged)
-        again = light_map(RIG.at(0.0), room, settings, tmp_path)
-        assert again.irradiance_w_m2.tobytes() == first.irradiance_w_m2.tobytes()
-        assert entry.read_bytes() == written
-    light_map(RIG.at(0.0), room, dataclasses.replace(settings, lamp_rays=9), tmp_path)
-    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_faces_of_a_cuboid_enclose_it() -> None:

@@ -1,0 +1,232 @@
+"""Cache of light maps: rooms that were baked once, in the user's cache folder, for all data sets.
+
+An entry is named after the hash of its recipe: all that enters, which is room, settings, code and packages. It holds
+the recipe in full, the arrays, and the SHA-256 of both. It is taken if hash and recipe are right, and if the arrays
+have the shapes of the room and values that its lamps can give. Else the room is baked again.
+
+The cache has a limit; entries that were not used for longest go first. Who writes or removes holds a lock.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import zipfile
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import numpy as np
+from filelock import FileLock, Timeout
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import InputFile
+from phibench.datasets.store.files import write_bytes, write_text
+from phibench.datasets.store.leftovers import remove_leftovers
+from phibench.datasets.store.provenance import code_behind
+from phibench.render.room.light_map import BakeSettings, LightMap, bake, decoded, encoded, fixed_shapes
+from phibench.render.room.shading import cut, texel_count
+from phibench.render.setup.llvm_library import cache_root
+from phibench.scenes.rig import View
+from phibench.scenes.room import Rectangle, Room
+
+LIMIT_MB = 1000.0
+"""Limit of a cache that was given none; a room of the default settings has 2 MB."""
+_FORM = b"phibench light map 2"
+_SUFFIX = ".lightmap"
+_LOCK, _LIMIT = ".lock", "limit.txt"
+_PATIENCE_S = 10.0
+_ENTRY_MB = 1000
+# a quadrature point on a lamp may stand nearer to a texel than to the next point, and then counts for too much
+_GLARE = 1e3
+
+
+def cache_folder() -> Path:
+    """Folder of the user's light maps."""
+    return cache_root() / "lightmaps"
+
+
+def light_map(view: View, room: Room, settings: BakeSettings, folder: Path | None = None) -> LightMap:
+    """Light map of a room, from the cache or baked now and put there.
+
+    Parameters
+    ----------
+    view : View
+        Any view of the rig; only the origin of coordinates is taken from it.
+    folder : Path, or None for the user's cache
+    """
+    recipe = _recipe(view, room, settings)
+    path = _path(recipe, folder)
+    cached = _read(path, recipe)
+    if cached is not None and is_sound(cached, room, settings):
+        with contextlib.suppress(OSError):  # a cache of somebody else's may be read all the same
+            os.utime(path)
+        return cached
+    baked = bake(view, room, settings)
+    with contextlib.suppress(OSError, Timeout):  # a cache that cannot be written costs time, not the light map
+        _write(path, recipe, baked)
+    return baked
+
+
+def is_cached(view: View, room: Room, settings: BakeSettings, folder: Path | None = None) -> bool:
+    """Tell whether the cache holds the light map, so that `light_map` takes no time."""
+    try:
+        return _path(_recipe(view, room, settings), folder).is_file()
+    except PackageNotFoundError:  # without Mitsuba nothing has been baked
+        return False
+
+
+def is_sound(light: LightMap, room: Room, settings: BakeSettings) -> bool:
+    """Tell whether a light map has the texels of a room, and irradiances that its lamps can give."""
+    texels = texel_count(cut(fixed_shapes(room), settings.texel_m))
+    shapes = [array.shape for array in (light.irradiance_w_m2, light.sigma_w_m2, light.covered)]
+    types = [array.dtype for array in (light.irradiance_w_m2, light.sigma_w_m2, light.covered)]
+    if shapes != [(texels, 3), (texels, 3), (texels,)] or types != [np.float32, np.float32, np.bool_]:
+        return False
+    lamps = [max(lamp.radiance_w_m2_sr) for lamp in fixed_shapes(room) if isinstance(lamp, Rectangle)]
+    # no hemisphere gives more than pi times the radiance, and no bounce more than the light before it
+    largest = _GLARE * math.pi * max(lamps, default=0.0) * (settings.bounces + 2)
+    values = np.stack([light.irradiance_w_m2, light.sigma_w_m2])
+    return bool(np.all(np.isfinite(values)) and np.all(values >= 0.0) and np.all(values <= largest))
+
+
+def _recipe(view: View, room: Room, settings: BakeSettings) -> bytes:
+    """All that a light map depends on, as one line of JSON."""
+    document = {
+        "room": repr(fixed_shapes(room)),
+        "origin_m": repr(tuple(view.sphere_centre_m)),
+        "settings": repr(settings),
+        "packages": {name: version(name) for name in ("mitsuba", "drjit", "numpy", "scipy")},
+        "code": code_behind(LightMap.__module__),
+    }
+    return json.dumps(document, sort_keys=True).encode()
+
+
+def _path(recipe: bytes, folder: Path | None) -> Path:
+    return (folder or cache_folder()) / f"{hashlib.sha256(recipe).hexdigest()}{_SUFFIX}"
+
+
+def _read(path: Path, recipe: bytes) -> LightMap | None:
+    """The entry, or None if there is none, or one that was not written for this recipe."""
+    try:
+        content = InputFile(path, "clear the cache", limit_bytes=_ENTRY_MB << 20).read()
+        form, digest, body = content.split(b"\n", 2)
+        held, payload = body.split(b"\n", 1)
+        if (form, held) != (_FORM, recipe) or hashlib.sha256(body).hexdigest().encode() != digest:
+            return None
+        return decoded(payload)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):  # no entry, or a damaged one
+        return None
+
+
+def _write(path: Path, recipe: bytes, light: LightMap) -> None:
+    body = recipe + b"\n" + encoded(light)
+    with _held(path.parent):
+        write_bytes(path, b"\n".join([_FORM, hashlib.sha256(body).hexdigest().encode(), body]))
+        _shrink(path.parent)
+
+
+# Size of the cache.
+
+
+@dataclass(frozen=True)
+class CacheEntry:
+    """One light map of the cache; `used_s` is the time of its last use, seconds since 1970."""
+
+    path: Path
+    size_bytes: int
+    used_s: float
+
+
+def cache_entries(folder: Path | None = None) -> list[CacheEntry]:
+    """Light maps of the cache, those last used first."""
+    found = []
+    for path in (folder or cache_folder()).glob(f"*{_SUFFIX}"):
+        with contextlib.suppress(OSError):  # gone meanwhile
+            status = path.stat()
+            found.append(CacheEntry(path, status.st_size, status.st_mtime))
+    return sorted(found, key=lambda entry: (-entry.used_s, entry.path.name))
+
+
+def cache_limit_mb(folder: Path | None = None) -> float:
+    """Limit of the cache, 1e6 bytes."""
+    with contextlib.suppress(OSError, ValueError):
+        text = InputFile((folder or cache_folder()) / _LIMIT, "set it anew", limit_bytes=100).text()
+        if math.isfinite(limit := float(text)) and limit >= 0.0:
+            return limit
+    return LIMIT_MB
+
+
+def limit_cache(limit_mb: float, folder: Path | None = None) -> int:
+    """Set the limit, 1e6 bytes, for this and all later runs; return how many entries had to go.
+
+    Raises
+    ------
+    DatasetError
+        If that is no limit, or the cache cannot be written.
+    """
+    if not (math.isfinite(limit_mb) and limit_mb >= 0.0):
+        raise DatasetError(f"limit of the cache = {limit_mb} MB: must be 0 or more")
+    with _for_user(folder or cache_folder()) as where:
+        write_text(where / _LIMIT, f"{limit_mb!r}\n")
+        return _shrink(where)
+
+
+def clear_cache(folder: Path | None = None) -> int:
+    """Remove all entries; return how many.
+
+    Raises
+    ------
+    DatasetError
+        If the cache cannot be written.
+    """
+    where = folder or cache_folder()
+    if not where.is_dir():
+        return 0
+    with _for_user(where):
+        return _remove(cache_entries(where))
+
+
+@contextlib.contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """Hold the cache; then nobody else writes, and what is half-written was left by the dead."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with FileLock(folder / _LOCK, timeout=_PATIENCE_S):
+        remove_leftovers(folder)
+        for left in folder.glob(".*.tmp"):  # of versions before 0.3
+            left.unlink(missing_ok=True)
+        yield
+
+
+@contextlib.contextmanager
+def _for_user(folder: Path) -> Iterator[Path]:
+    """Hold the cache; errors are sentences."""
+    try:
+        with _held(folder):
+            yield folder
+    except Timeout:
+        raise DatasetError(f"another process holds the cache {folder}; try again when it has ended") from None
+    except OSError as error:
+        text = f"the cache {folder} cannot be written: {error.strerror or error}"
+        raise DatasetError(f"{text}; set PHIBENCH_CACHE to a folder of yours") from error
+
+
+def _shrink(folder: Path) -> int:
+    """Remove the entries beyond the limit, those that were not used for longest first; return how many."""
+    left, beyond = cache_limit_mb(folder) * 1e6, list[CacheEntry]()
+    for entry in cache_entries(folder):
+        left -= entry.size_bytes
+        if left < 0.0:
+            beyond.append(entry)
+    return _remove(beyond)
+
+
+def _remove(entries: list[CacheEntry]) -> int:
+    for entry in entries:
+        entry.path.unlink(missing_ok=True)
+    return len(entries)
