@@ -19,7 +19,6 @@ import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -28,6 +27,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from phibench.datasets.parallel import ONE_THREAD
+from phibench.datasets.store.leftovers import OwnedFolder
 from phibench.estimator.interface import FAILURES, Outcome, Pair
 from phibench.estimator.sandbox.answers import AnswerError, checked
 from phibench.estimator.sandbox.resolve import MethodError, Reference, RunLimits
@@ -259,7 +259,8 @@ class _Running:
             raise MethodError("methods run in processes of their own on Linux and macOS only")
         ours, theirs = socket.socketpair()
         self._connection, self._memory = Connection(ours), MemoryFile(size)
-        self._folder = tempfile.mkdtemp(prefix="phibench-method-")
+        self._owned = OwnedFolder("method")
+        self._folder = str(self._owned.path)
         try:
             with theirs:
                 self._process = self._started(theirs.fileno(), self._memory.reader)
@@ -284,7 +285,8 @@ class _Running:
     def _give_back(self) -> None:
         self._connection.close()
         self._memory.close()
-        remove_tree(Path(self._folder))
+        remove_tree(self._owned.path)  # of any depth
+        self._owned.close()
 
     def load(self, reference: Reference, limits: RunLimits) -> None:
         """Let the process import the method."""
