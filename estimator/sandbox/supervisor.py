@@ -107,6 +107,8 @@ def end_descendants(worker: int, seconds: float = KILL_SECONDS) -> None:
         for pid in tree:
             _send(pid, signal.SIGKILL)
         list(_ended())
+        if sys.platform != "linux":  # without a subreaper there is no more to be known
+            return
         try:
             os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
         except ChildProcessError:  # orphans become children of this process: without a child there is no descendant

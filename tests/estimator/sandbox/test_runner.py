@@ -234,6 +234,7 @@ def test_the_end_of_the_parent_leaves_nothing_behind(tmp_path: Path, number: sig
         assert parent.wait(30) == code
         took_s = time.monotonic() - start
         assert parent.stderr.read() == SAID.get(number, "")
+    print(f"{number.name}: ended after {took_s:.2f} s")
     assert took_s < 5.0  # 0.1 s on an idle machine; a wait that is restarted takes the method's 30 s
     end = time.monotonic() + (0.0 if number != signal.SIGKILL else 20.0)
     while (is_alive(method) or list(processes_under(tmp_path))) and time.monotonic() < end:
