@@ -109,7 +109,8 @@ class InputFile:
 
     def fault(self, text: str) -> DatasetError:
         """Error with one sentence about the file."""
-        return self.error(f"{self.path} {text}; {self.remedy}")
+        path = str(self.path)
+        return self.error(f"{path if path.isprintable() else printable_line(path)} {text}; {self.remedy}")
 
     def read(self) -> bytes:
         """All bytes.

@@ -30,6 +30,7 @@ from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.build.workers import Environment, NoRendererError, WorkerPool, versions
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan.plan import Plan, make_plan, shard_plan
+from phibench.datasets.progress import progress_console
 from phibench.datasets.recipe.checks import warnings
 from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_text, with_numbers
 from phibench.datasets.store import schema
@@ -71,7 +72,7 @@ def make(
         If recipe, folder or disk will not do, or a task fails (the others are finished first). Nothing is then
         half-written under a final name, and `SHA256SUMS` is missing.
     """
-    console, out = console or Console(stderr=True), Path(out)
+    console, out = console or progress_console(), Path(out)
     text = _recipe_text(recipe, samples, seed)
     plan = shard_plan(make_plan(parse_recipe(text, str(find_recipe(recipe)))), shard)
     for warning in [*warnings(plan.recipe), *_hidden(pair_forecasts(plan))]:

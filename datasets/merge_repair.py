@@ -29,7 +29,7 @@ from phibench.datasets.build.task_list import task_names
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import make_from_plan
 from phibench.datasets.plan.plan import Plan, make_plan, parse_shard, shard_plan
-from phibench.datasets.progress import Steps
+from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.recipe.load import parse_recipe, recipe_text
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store import schema
@@ -57,7 +57,11 @@ def merge(out: str | Path, shards: Sequence[str | Path], console: Console | None
         If a shard is missing, given twice, unfinished, damaged, or of another recipe, code or environment than the
         rest.
     """
-    out, folders, console = Path(out), [Path(shard) for shard in shards], console or Console(stderr=True)
+    out, folders, console = (
+        Path(out),
+        [Path(shard) for shard in shards],
+        console or progress_console(),
+    )
     head, info, entries = _collect(folders)
     plan = make_plan(parse_recipe(head.recipe))
     names = task_names(plan)
@@ -163,7 +167,7 @@ def repair(
         If the folder holds no data set, if neither its journal nor its other files say what it should
         hold, or if this code or these packages are not those that made it: the parts would not fit together.
     """
-    folder, console = Path(folder), console or Console(stderr=True)
+    folder, console = Path(folder), console or progress_console()
     plan, recipe = _held_plan(folder)
     _clear(folder, [schema.LOCK], console)  # without it nobody can hold the folder
     with only_run(folder):

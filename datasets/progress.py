@@ -14,6 +14,11 @@ LINE_EVERY_S = 30.0
 _BAR_EVERY_S = 1.0
 
 
+def progress_console() -> Console:
+    """Console for progress, the standard error; brackets and colons in a path are no markup."""
+    return Console(stderr=True, markup=False, emoji=False)
+
+
 class Steps:
     """Count of steps, as a context manager. A thread tells how far they are, even while a single step takes long.
 

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.progress import Steps
+from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.pictures import (
@@ -53,7 +53,7 @@ def show(folder: str | Path, console: Console | None = None, out: str | Path | N
     console, dataset = console or _console(), open_finished(folder)
     path = dataset.folder / schema.CONTACT_SHEET if out is None else Path(out)
     # the sheet comes first: who reads the table may leave before its end, as `head` does
-    sheet, fault = contact_sheet(dataset, Console(stderr=True)), None
+    sheet, fault = contact_sheet(dataset, progress_console()), None
     try:
         save_png(path, sheet)
     except OSError as error:
@@ -76,8 +76,8 @@ class _PatientConsole(Console):
 
 def _console() -> Console:
     """Terminal as it is; wide enough for the table where the output goes to a file."""
-    console = _PatientConsole()
-    return console if console.is_terminal else _PatientConsole(width=170)
+    console = _PatientConsole(markup=False, emoji=False)
+    return console if console.is_terminal else _PatientConsole(width=170, markup=False, emoji=False)
 
 
 def table(dataset: Dataset) -> Table:

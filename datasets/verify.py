@@ -23,7 +23,7 @@ from phibench.datasets.build.sample_task import noise_row, spot_noise
 from phibench.datasets.build.spot_task import SpotAnswer, answer_spot
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan.plan import PairPlan, Plan, make_plan, shard_plan
-from phibench.datasets.progress import Steps
+from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import damaged, differing_files, misplaced, read_checksums, strays
@@ -89,7 +89,7 @@ def verify(folder: str | Path, truth_layers: bool = True, console: Console | Non
     DatasetError
         If the folder is not a data set at all.
     """
-    folder, console = Path(folder), console or Console(stderr=True)
+    folder, console = Path(folder), console or progress_console()
     if not folder.is_dir():
         raise DatasetError(f"there is no folder {folder}")
     if not any((folder / name).is_file() for name in _SIGNS):

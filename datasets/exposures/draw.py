@@ -35,7 +35,7 @@ from phibench.datasets.frames.frame_files import (
 from phibench.datasets.frames.request import FrameRequest, whole_number
 from phibench.datasets.frames.source import Frame, FrameSource, has_place
 from phibench.datasets.parallel import parallel_map
-from phibench.datasets.progress import Steps
+from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import Dataset, Sample, open_dataset, open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import read_checksums
@@ -118,7 +118,7 @@ def draw_frames(
     DatasetError
         If the data set, the request or the folder will not do; in one sentence.
     """
-    dataset, console = open_finished(folder), console or Console(stderr=True)
+    dataset, console = open_finished(folder), console or progress_console()
     target = Path(out) if out is not None else Path(f"{Path(folder).resolve()}-frames")
     whole_number("draws", draws, 1)
     count = whole_number("workers", os.cpu_count() or 1 if workers is None else workers, 1)

@@ -18,7 +18,7 @@ import polars as pl
 from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.progress import Steps
+from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import Dataset, open_finished
 from phibench.datasets.store.files import require_writable
 from phibench.datasets.store.provenance import code_behind, provenance
@@ -244,7 +244,7 @@ def score(
     MethodError
         If the method cannot be found or imported.
     """
-    console = console or Console(stderr=True)
+    console = console or progress_console()
     opened = dataset if isinstance(dataset, Dataset) else open_finished(dataset)
     if out is not None:
         require_writable(Path(out))
@@ -309,7 +309,7 @@ def bench(
         If the data set will not do, or a method is unknown.
     """
     dataset, out = open_finished(folder), Path(out)
-    console, chosen = console or Console(stderr=True), _chosen(METHODS, methods)
+    console, chosen = console or progress_console(), _chosen(METHODS, methods)
     if out.resolve() == dataset.folder.resolve() or dataset.folder.resolve() in out.resolve().parents:
         raise DatasetError(f"{out} lies inside the data set, whose files are signed; give a folder outside, --out")
     require_writable(out / REPORT)

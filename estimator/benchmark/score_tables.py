@@ -298,8 +298,8 @@ def print_comparison(differences: Sequence[Difference], first: str, second: str,
 
 def _console(wide: bool) -> Console:
     """A console at least 80 columns wide; a wide one does not lose numbers in a narrow terminal or a pipe."""
-    console, least = Console(), WIDE if wide else 80
-    return console if console.width >= least else Console(width=least)
+    console, least = Console(markup=False, emoji=False), WIDE if wide else 80
+    return console if console.width >= least else Console(width=least, markup=False, emoji=False)
 
 
 def _line(console: Console, text: str) -> None:

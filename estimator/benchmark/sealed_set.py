@@ -30,7 +30,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.frame_files import png_bytes
 from phibench.datasets.frames.source import Frames
 from phibench.datasets.input_files import SETTINGS_BYTES, FileName, InputFile, Name
-from phibench.datasets.progress import Steps
+from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import open_finished
 from phibench.datasets.recipe.load import RECIPES, load_recipe
 from phibench.datasets.recipe.tables import Recipe
@@ -279,7 +279,7 @@ def seal(folder: str | Path, public: str | Path, preset: str | None = None, cons
     DatasetError
         If the data set or the folder will not do; then nothing is left behind.
     """
-    public, console = Path(public), console or Console(stderr=True)
+    public, console = Path(public), console or progress_console()
     pairs = dataset_pairs(open_finished(folder), preset)
     _check_folder(public, Path(folder))
     try:

@@ -1,7 +1,7 @@
 """The command line ``phibench``: a thin layer over the packages.
 
-Exit codes: 0 done, 1 checked and found wanting, 2 a mistake of the user or the machine in one sentence, 130 Ctrl-C,
-129 SIGHUP, 143 SIGTERM.
+Exit codes: 0 done, 1 checked and found wanting, 2 a mistake of the user or the machine in one sentence, 3 a fault of
+phibench, 130 Ctrl-C, 129 SIGHUP, 143 SIGTERM.
 Every command imports what it needs itself, so that ``--help`` is quick and scoring runs without Mitsuba.
 """
 
@@ -13,8 +13,10 @@ import signal
 import subprocess
 import sys
 import threading
+import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 
 from cyclopts import App, CycloptsError
@@ -115,6 +117,7 @@ def main(tokens: Sequence[str] | None = None) -> int:
     for name, value in ONE_THREAD.items():  # of the processes that a command starts, too; who sets one has his way
         os.environ.setdefault(name, value)
     try:
+        _refuse_strange(sys.argv[1:] if tokens is None else tokens)
         with _orderly_stop():
             return int(app(tokens, exit_on_error=False) or 0)
     except CycloptsError:
@@ -125,11 +128,14 @@ def main(tokens: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("Interrupted: stopped at your request.", file=sys.stderr)
         return 130
-    except (ValueError, OSError) as error:
-        if not _is_users(error):
+    except Exception as error:  # the last resort: a fault in a file that no reader has seen
+        if _is_users(error):
+            print(f"phibench: {_sentence(error)}", file=sys.stderr)
+            return 2
+        if os.environ.get(TRACEBACK):
             raise
-        print(f"phibench: {_sentence(error)}", file=sys.stderr)
-        return 2
+        print(f"phibench: {_confession(error)}", file=sys.stderr)
+        return 3
 
 
 class _Stopped(KeyboardInterrupt):
@@ -159,19 +165,56 @@ def _stop(number: int, frame: FrameType | None) -> None:
     raise _Stopped(signal.Signals(number))
 
 
+TRACEBACK = "PHIBENCH_TRACEBACK"
+"""Environment variable; if it is set, a fault of phibench ends in Python's traceback."""
+
+
+def _refuse_strange(tokens: Sequence[str]) -> None:
+    """Refuse arguments that no file can be called, or that no text file can hold."""
+    from phibench.datasets.errors import DatasetError
+
+    for token in tokens:
+        if "\0" in token or any("\ud800" <= c <= "\udfff" for c in token):
+            raise DatasetError(f"the argument {token!r} is not UTF-8, or has a zero byte; give another name")
+
+
 def _is_users(error: Exception) -> bool:
     from phibench.datasets.errors import DatasetError
     from phibench.estimator.sandbox.resolve import MethodError
+    from phibench.render.sensor.settings import SensorError
+    from phibench.render.setup.llvm_library import LlvmError
+    from phibench.render.setup.variant import VariantError
     from phibench.scenes.validation import SceneError
 
-    return isinstance(error, (SceneError, DatasetError, MethodError, OSError))
+    known = (SceneError, SensorError, DatasetError, MethodError, VariantError, LlvmError, OSError, MemoryError)
+    return isinstance(error, known)
 
 
 def _sentence(error: Exception) -> str:
-    """Return the message of an error; an operating system's without its number."""
+    """Message of an error, which any terminal can show; an operating system's without its number."""
+    text = str(error)
     if isinstance(error, OSError) and error.strerror and type(error).__module__ == "builtins":
-        return f"{error.strerror}: {error.filename}" if error.filename else str(error.strerror)
-    return str(error)
+        text = f"{error.strerror}: {error.filename}" if error.filename else str(error.strerror)
+    if isinstance(error, MemoryError):
+        text = f"out of memory; free some, or take less at a time {f'({text})' if text else ''}".rstrip()
+    lines = text[:_MOST].splitlines()
+    return "\n".join("".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in x) for x in lines)
+
+
+_MOST = 10_000  # characters of a message: a recipe may have many faults, a line each
+
+
+def _confession(error: Exception) -> str:
+    """Sentence about an error that nobody has thought of: the kind, the message, the place in the code."""
+    from phibench.scenes.validation import printable_line
+
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f"{Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else "?"
+    text = printable_line(f"{type(error).__name__}: {error}", 300)
+    return (
+        f"{text} ({place}). This is a fault of phibench: please report it with the file that you gave; "
+        f"{TRACEBACK}=1 shows where"
+    )
 
 
 if __name__ == "__main__":

@@ -56,14 +56,12 @@ def check(
     show_output
         Also show what the method prints: the last 20 lines of every pair.
     """
-    from rich.console import Console
-
-    from phibench.datasets.progress import Steps
+    from phibench.datasets.progress import Steps, progress_console
     from phibench.estimator.sandbox.check import PAIRS, check_method
     from phibench.estimator.sandbox.resolve import RunLimits
 
     limits = RunLimits(seconds, memory_mb)
-    with Steps(Console(stderr=True), "easy pairs", PAIRS) as steps:
+    with Steps(progress_console(), "easy pairs", PAIRS) as steps:
         done = check_method(reference, preset, limits, told=steps.reach)
     for number, text in done.printed if show_output else ():
         print(f"printed for pair {number}:\n{indent(text, '    ')}")

@@ -58,8 +58,8 @@ def wide_console(width: int) -> Console:
     """A console at least as wide as a table, which would lose numbers if it were cut off at the width of a pipe."""
     from rich.console import Console
 
-    console = Console()
-    return console if console.width >= width else Console(width=width)
+    console = Console(markup=False, emoji=False)
+    return console if console.width >= width else Console(width=width, markup=False, emoji=False)
 
 
 OLD_COMMANDS = {

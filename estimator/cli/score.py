@@ -98,9 +98,8 @@ def score(
     out
         JSON file for the score, records beside it as Parquet; with several methods their names are added to it.
     """
-    from rich.console import Console
-
     from phibench.datasets.errors import DatasetError
+    from phibench.datasets.progress import progress_console
     from phibench.datasets.read import open_finished
     from phibench.datasets.store.files import require_writable
     from phibench.estimator.benchmark.document import MethodCard
@@ -118,7 +117,15 @@ def score(
     for target in filter(None, files):
         require_writable(target)
     pair_set = wanted_pairs(open_finished(directory), preset, draws, pairs, hints, calibration, boxes)
-    scored = run_and_score(method, pair_set, workers, Console(stderr=True), "pairs", _seed(bootstrap_seed), limits)
+    scored = run_and_score(
+        method,
+        pair_set,
+        workers,
+        progress_console(),
+        "pairs",
+        _seed(bootstrap_seed),
+        limits,
+    )
     scored = [one if file is None else saved(one, file) for one, file in zip(scored, files, strict=True)]
     print_scores(scored, form, rank, output.wide, calibration is not None)
     for file in filter(None, files):

@@ -13,6 +13,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from phibench.datasets.input_files import MIB, InputFile
 from phibench.datasets.store.files import sha256
 from phibench.datasets.store.provenance import code_behind
 from phibench.scenes.validation import close_names, printable_line
@@ -106,19 +107,26 @@ def _of_file(reference: str) -> Reference:
         advice = f"`phibench method new {text}` writes an example"
         what = "is a folder" if path.is_dir() else "is not there"
         raise MethodError(f"method '{reference}': the file {path} {what}; {advice}")
+    if path.name != printable_line(path.name):
+        raise MethodError(f"method '{printable_line(path.name)}': give the file a name of at most 200 printable signs")
     _require_python(path)
     # names of files may hold bytes that are no text, and what a terminal obeys
     return Reference(f"{printable_line(path.stem)}:{function}", "file", str(path), function, sha256=sha256(path))
 
 
+_MOST_BYTES = 16 * MIB  # of a method's file
+
+
 def _require_python(path: Path) -> None:
     """Compile the file, which runs nothing of it."""
     try:
-        compile(path.read_bytes(), str(path), "exec", dont_inherit=True)
+        compile(InputFile(path, "give a Python file", limit_bytes=_MOST_BYTES).read(), str(path), "exec", 0, True)
     except SyntaxError as error:
         line = "" if error.lineno is None else f", line {error.lineno}"
         raise MethodError(f"{path.name}{line}: {error.msg}: Python cannot read the file") from error
-    except (ValueError, UnicodeDecodeError) as error:
+    except (RecursionError, MemoryError) as error:
+        raise MethodError(f"{path.name}: an expression is nested too deeply: Python cannot read the file") from error
+    except ValueError as error:
         raise MethodError(f"{path.name}: {error}: Python cannot read the file") from error
 
 

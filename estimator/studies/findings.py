@@ -129,7 +129,7 @@ def print_table(rows: Sequence[Row]) -> None:
         column.no_wrap = True
     for row in body:
         table.add_row(*row)
-    Console().print(table)
+    Console(markup=False, emoji=False).print(table)
 
 
 def _markdown_line(cells: Row) -> str:

@@ -21,6 +21,7 @@ from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import FileName, InputFile
+from phibench.datasets.progress import progress_console
 from phibench.datasets.store.files import require_writable, sha256, write_bytes, write_text
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import Document
@@ -234,7 +235,7 @@ def run_study(
     for document in (out / DOCUMENT, *((publish / f"{name}.json",) if publish else ())):
         require_writable(document)
     start = time.monotonic()
-    result = study.run(chosen, StudyDatasets(data or out / DATA, console or Console(stderr=True), workers))
+    result = study.run(chosen, StudyDatasets(data or out / DATA, console or progress_console(), workers))
     write_study(out, study, chosen, quick, result)
     if publish is not None:
         publish_study(publish, study, chosen, result, time.monotonic() - start)

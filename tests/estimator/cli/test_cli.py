@@ -54,7 +54,13 @@ def test_interrupt_is_130(monkeypatch, capsys):
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_a_fault_of_ours_is_not_hidden(monkeypatch):
+def test_a_fault_of_ours_is_called_one(monkeypatch, capsys):
+    assert run_with(monkeypatch, ValueError("ours")) == 3
+    err = capsys.readouterr().err
+    assert err.startswith("phibench: ValueError: ours (test_cli.py:")
+    assert "fault of phibench: please report" in err
+    assert err.count("\n") == 1
+    monkeypatch.setenv("PHIBENCH_TRACEBACK", "1")
     with pytest.raises(ValueError, match="ours"):
         run_with(monkeypatch, ValueError("ours"))
 
