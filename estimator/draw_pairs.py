@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,11 @@ class DrawnPairs:
     def pair_draws(self) -> tuple[PairDraw, ...]:
         """Sample and noise realisation of every pair, by number; methods must not see it."""
         return self._pair_draws
+
+    @property
+    def folders(self) -> tuple[Path, ...]:
+        """Folder of the data set, with the truth."""
+        return (self._dataset.folder,)
 
     @property
     def dataset(self) -> Dataset:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any, Protocol
 
 from phibench.estimator.interface import Pair
@@ -137,6 +138,11 @@ class PairSet(Pairs, Truths, Protocol):
         """Provenance as JSON can hold it: name, task version, hashes, seeds."""
 
 
+def truth_folders(pairs: object) -> tuple[Path, ...]:
+    """Folders of the files behind a set, which a method must not read; none for pairs that are made in memory."""
+    return tuple(getattr(pairs, "folders", ()))
+
+
 class CachedPairs:
     """Pairs and truths of another set, each asked for once and kept; make a new one for the next part of a set.
 
@@ -147,6 +153,7 @@ class CachedPairs:
 
     def __init__(self, pairs: PairSet) -> None:
         self._pairs = pairs
+        self.folders = truth_folders(pairs)
         self.pair = cache(pairs.pair)
         self.truth = cache(pairs.truth)
 

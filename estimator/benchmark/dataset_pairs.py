@@ -26,7 +26,7 @@ from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.interface import Pair
 from phibench.estimator.limits.position_bound import SpotLimit, spot_limit
 from phibench.estimator.limits.processed_bound import chain_limit
-from phibench.estimator.pair_set import Distraction, PairSet, PairTruth, SpotTruth
+from phibench.estimator.pair_set import Distraction, PairSet, PairTruth, SpotTruth, truth_folders
 from phibench.estimator.spots.fisher import covariance_bound
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import PROCESSED
@@ -296,6 +296,7 @@ class CalibratedPairs:
 
     def __init__(self, pairs: PairSet, calibration: Calibration) -> None:
         self._pairs, self._calibration = pairs, calibration
+        self.folders = truth_folders(pairs)
         self._covariance = np.array(calibration.covariance)
         self._covariance.flags.writeable = False
 

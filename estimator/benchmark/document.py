@@ -83,9 +83,12 @@ class MethodCard(Document):
     function: Name = ""
     sha256: Name | None = None
     version: Name | None = None
+    modules: dict[Name, Name] = Field(
+        default={}, description="SHA-256 of the files beside the method's that it imports"
+    )
 
     @classmethod
-    def of(cls, reference: str, **fields: str | None) -> MethodCard:
+    def of(cls, reference: str, **fields: Any) -> MethodCard:
         """Of a reference and what is known of it."""
         return cls.model_validate({**fields, "reference": reference})
 
@@ -152,6 +155,7 @@ class ScoreDocument(Document):
     seed: int
     rules: dict[str, float]
     limits: dict[str, Any]
+    isolation: Name = Field(default="", description="what the method could reach: `Isolation.sentence`")
     provenance: dict[str, Any]
     code_sha256: str = Field(description="of everything behind the score")
     metrics: dict[str, Metric] = Field(description="of the whole: `jq .metrics.rms_px.value`")

@@ -44,7 +44,7 @@ from phibench.estimator.benchmark.worst_images import worst, worst_of
 from phibench.estimator.calibration.file import read_calibration
 from phibench.estimator.interface import Box, Method, Outcome
 from phibench.estimator.methods.registry import METHODS, BuiltIn
-from phibench.estimator.pair_set import CachedPairs, PairSet
+from phibench.estimator.pair_set import CachedPairs, PairSet, truth_folders
 from phibench.estimator.sandbox.resolve import MethodError, RunLimits, resolve
 from phibench.estimator.sandbox.runner import Harness, asked_here, function_name
 
@@ -257,6 +257,7 @@ def score(
         with Steps(console, "pairs", len(chosen)) as steps:
             card = MethodCard.of(function_name(method), kind="function")
             (scored,) = score_methods([card], chosen, asked_here(method), None, seed, None, steps.reach)
+        scored = isolated(scored, "not isolated: a function runs in this process")
     return scored if out is None else saved(scored, Path(out))
 
 
@@ -349,9 +350,15 @@ def run_and_score(
     cards = [MethodCard.of(name, **method.document()) for name, method in zip(references, found, strict=True)]
     if not cards:
         return []
-    with Harness(found, limits, workers) as harness, Steps(console, title, len(pairs)) as steps:
-        scored = score_methods(cards, pairs, harness.outcomes, None, seed, asdict(limits), steps.reach)
-    return [replace(one, output=output) for one, output in zip(scored, harness.failed_outputs, strict=True)]
+    with Harness(found, limits, workers, truth_folders(pairs)) as harness, Steps(console, title, len(pairs)) as steps:
+        scored = score_methods(cards, pairs, harness.outcomes, None, seed, limits.document(), steps.reach)
+    told = zip(scored, harness.failed_outputs, harness.isolations, strict=True)
+    return [replace(isolated(one, isolation), output=output) for one, output, isolation in told]
+
+
+def isolated(scored: Scored, isolation: str) -> Scored:
+    """The score with how its method was isolated."""
+    return replace(scored, document=scored.document.model_copy(update={"isolation": isolation}))
 
 
 def wanted_pairs(

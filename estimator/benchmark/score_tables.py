@@ -279,6 +279,7 @@ def print_scores(scored: Sequence[HasScore], form: str, by: str, wide: bool, cal
         show_grid(console, cause_table(documents))
     for one in scored:
         lines = [*([depth_line(one.document)] if calibrated else []), *silences(one.records), *_printed(one)]
+        lines += [one.document.isolation] if one.document.isolation.startswith("not isolated") else []
         for line in lines:
             _line(console, f"{one.document.method.name}: {line}")
     if len(documents) == 1:

@@ -43,10 +43,10 @@ from phibench.estimator.benchmark.sealed_set import (
     read_truth_file,
 )
 from phibench.estimator.interface import FAILURES, Box, Image, Outcome, Pair, Spot
-from phibench.estimator.pair_set import PairTruth
+from phibench.estimator.pair_set import PairTruth, truth_folders
 from phibench.estimator.sandbox.answers import AnswerError, checked
 from phibench.estimator.sandbox.resolve import Reference, RunLimits, resolve
-from phibench.estimator.sandbox.runner import run_method
+from phibench.estimator.sandbox.runner import Harness
 from phibench.scenes.camera import Camera
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
@@ -85,6 +85,11 @@ class SealedPairs:
 
     def __len__(self) -> int:
         return len(self._rows)
+
+    @property
+    def folders(self) -> tuple[Path, ...]:
+        """Folder of the set: the other pairs of a sample help."""
+        return (self._folder,)
 
     @property
     def seal(self) -> Seal:
@@ -224,6 +229,7 @@ class Submission(Document):
     seal: Name
     task_version: int
     method: MethodCard
+    isolation: Name = Field(default="", description="what the method could reach, by the word of who ran it")
     provenance: dict[str, Any]
     answers: Annotated[tuple[AnswerLine, ...], Field(strict=False)]
 
@@ -263,8 +269,9 @@ def submit(
         raise DatasetError(f"{out} is a folder; give a file such as submission.json, --out")
     pairs.check()
     found = resolve(method)
-    outcomes = run_method(found, pairs, limits, workers)
-    document = submission(pairs.seal, found, outcomes)
+    with Harness([found], limits, workers, truth_folders(pairs)) as harness:
+        outcomes = [outcome for (outcome,) in harness.outcomes(pairs, range(len(pairs)))]
+        document = submission(pairs.seal, found, outcomes, harness.isolations[0])
     check_complete(document, pairs.seal, "the run")
     write_text(out, json.dumps(document.model_dump(mode="json"), indent=1, allow_nan=False) + "\n")
     spots = [spot for o in outcomes if o.answer is not None for spot in (o.answer.down, o.answer.up)]
@@ -275,13 +282,14 @@ def submit(
     return Submitted(out, len(outcomes), answered, positions, "".join(text for text, _ in silent.most_common(1)))
 
 
-def submission(seal: Seal, method: Reference, outcomes: Sequence[Outcome]) -> Submission:
+def submission(seal: Seal, method: Reference, outcomes: Sequence[Outcome], isolation: str = "") -> Submission:
     """Document of a method's outcomes on a sealed set, by number."""
     return Submission(
         format=FORMAT,
         seal=seal.id,
         task_version=seal.task_version,
         method=MethodCard.of(method.name, **method.document()),
+        isolation=isolation,
         provenance=provenance(),
         answers=tuple(_line(outcome) for outcome in sorted(outcomes, key=lambda outcome: outcome.number)),
     )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from phibench.estimator.cli.options import DEFAULT_PRESET, MEMORY_MB, METHODS, SECONDS, MemoryMb, Seconds, wide_console
+from phibench.estimator.cli.options import DEFAULT_PRESET, LIMITS, METHODS, Limits, wide_console
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -41,8 +41,7 @@ def check(
     reference: Annotated[str, Parameter(name="--method")],
     *,
     preset: str = DEFAULT_PRESET,
-    seconds: Seconds = SECONDS,
-    memory_mb: MemoryMb = MEMORY_MB,
+    limits: Limits = LIMITS,
     show_output: Annotated[bool, Parameter(negative="")] = False,
 ) -> int:
     """Try a method on ten easy pairs and say what is wrong; exit code 1 if something is.
@@ -58,11 +57,9 @@ def check(
     """
     from phibench.datasets.progress import Steps, progress_console
     from phibench.estimator.sandbox.check import PAIRS, check_method
-    from phibench.estimator.sandbox.resolve import RunLimits
 
-    limits = RunLimits(seconds, memory_mb)
     with Steps(progress_console(), "easy pairs", PAIRS) as steps:
-        done = check_method(reference, preset, limits, told=steps.reach)
+        done = check_method(reference, preset, limits.of_run, told=steps.reach)
     for number, text in done.printed if show_output else ():
         print(f"printed for pair {number}:\n{indent(text, '    ')}")
     if done.printed and not show_output:

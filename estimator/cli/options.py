@@ -1,18 +1,21 @@
 """Options that mean the same in every command, and the old spellings of commands and options.
 
 `--method` is repeated, `--sample` names one sample by its id, `--samples` is a count, `--out` is the file or folder to
-write. Wherever a method runs, `--seconds` and `--memory-mb` limit it for each pair.
+write. Wherever a method runs, `Limits` are its options.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Group, Parameter, Token
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from phibench.estimator.sandbox.resolve import RunLimits
 
 DATA, METHODS, SENSOR, INSTALLATION = (
     Group.create_ordered(name) for name in ("Data sets", "Methods", "Sensor and paper", "Installation")
@@ -47,11 +50,41 @@ BuiltIn = Annotated[
         help="A built-in method, as `phibench method list` shows. May be given several times; all by default.",
     ),
 ]
-Seconds = Annotated[float, Parameter(help="Time limit of a method for one pair, seconds.")]
-MemoryMb = Annotated[
-    float,
-    Parameter(help="Limit of a method's address space on top of what its imports take, 1e6 bytes. Linux only."),
-]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Limits:
+    """Limits under which methods run."""
+
+    seconds: Annotated[float, Parameter(help="Time limit of a method for one pair, seconds.")] = SECONDS
+    memory_mb: Annotated[
+        float,
+        Parameter(help="Limit of a method's address space on top of what its imports take, 1e6 bytes. Linux only."),
+    ] = MEMORY_MB
+    fresh: Annotated[
+        bool, Parameter(negative="", help="A process for each pair: what a method keeps between pairs is lost.")
+    ] = False
+    allow: Annotated[
+        tuple[str, ...],
+        Parameter(negative="", help="A file or folder that methods may read, besides their own. May be given again."),
+    ] = ()
+
+    @property
+    def of_run(self) -> RunLimits:
+        """The same for the harness.
+
+        Raises
+        ------
+        MethodError
+            If a number is out of its range.
+        """
+        from phibench.estimator.sandbox.resolve import RunLimits
+
+        return RunLimits(self.seconds, self.memory_mb, fresh=self.fresh, allow=self.allow)
+
+
+LIMITS = Limits()
 
 
 def wide_console(width: int) -> Console:

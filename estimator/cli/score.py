@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from phibench.estimator.cli.options import MEMORY_MB, SECONDS, BuiltIn, MemoryMb, Methods, Seconds, Whole
+from phibench.estimator.cli.options import LIMITS, BuiltIn, Limits, Methods, Whole
 
 if TYPE_CHECKING:
     from phibench.estimator.benchmark.document import MethodCard, ScoreDocument
@@ -66,8 +66,7 @@ def score(
     bootstrap_seed: Whole = 0,
     workers: Whole = 1,
     calibration: Path | None = None,
-    seconds: Seconds = SECONDS,
-    memory_mb: MemoryMb = MEMORY_MB,
+    limits: Limits = LIMITS,
     out: Path | None = None,
     output: Output = _TABLES,
 ) -> int:
@@ -105,27 +104,19 @@ def score(
     from phibench.estimator.benchmark.document import MethodCard
     from phibench.estimator.benchmark.score import run_and_score, saved, wanted_pairs
     from phibench.estimator.benchmark.score_tables import print_scores
-    from phibench.estimator.sandbox.resolve import RunLimits, resolve
+    from phibench.estimator.sandbox.resolve import resolve
 
     if not method:
         raise DatasetError(
             "`phibench score` scores methods: give --method, such as --method red_centroid. "
             f"The paper's tables are `phibench paper {directory}`"
         )
-    limits, form = RunLimits(seconds, memory_mb), output.form
+    run_limits, form = limits.of_run, output.form
     files = _files(out, [MethodCard.of(name, **resolve(name).document()) for name in method])
     for target in filter(None, files):
         require_writable(target)
     pair_set = wanted_pairs(open_finished(directory), preset, draws, pairs, hints, calibration, boxes)
-    scored = run_and_score(
-        method,
-        pair_set,
-        workers,
-        progress_console(),
-        "pairs",
-        _seed(bootstrap_seed),
-        limits,
-    )
+    scored = run_and_score(method, pair_set, workers, progress_console(), "pairs", _seed(bootstrap_seed), run_limits)
     scored = [one if file is None else saved(one, file) for one, file in zip(scored, files, strict=True)]
     print_scores(scored, form, rank, output.wide, calibration is not None)
     for file in filter(None, files):
@@ -226,8 +217,7 @@ def bench(
     pairs: Whole | None = None,
     workers: Whole = 1,
     calibration: Path | None = None,
-    seconds: Seconds = SECONDS,
-    memory_mb: MemoryMb = MEMORY_MB,
+    limits: Limits = LIMITS,
 ) -> int:
     """Run the built-in methods on every preset of a data set and write scores and a report.
 
@@ -246,10 +236,8 @@ def bench(
     """
     from phibench.estimator.benchmark.score import bench as run_bench
     from phibench.estimator.benchmark.score import show
-    from phibench.estimator.sandbox.resolve import RunLimits
 
-    limits = RunLimits(seconds, memory_mb)
-    done = run_bench(directory, out, method, workers, pairs, calibration=calibration, limits=limits)
+    done = run_bench(directory, out, method, workers, pairs, calibration=calibration, limits=limits.of_run)
     for note in done.notes:
         print(f"note: {note}", file=sys.stderr)
     print(f"{done.report}: the report on {len(done.scores)} scores")

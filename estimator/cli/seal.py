@@ -7,7 +7,7 @@ from pathlib import Path
 
 from cyclopts import App
 
-from phibench.estimator.cli.options import MEMORY_MB, METHODS, SECONDS, MemoryMb, Seconds, Whole
+from phibench.estimator.cli.options import LIMITS, METHODS, Limits, Whole
 
 seal = App(
     name="seal",
@@ -48,8 +48,7 @@ def submit(
     method: str,
     out: Path,
     workers: Whole = 1,
-    seconds: Seconds = SECONDS,
-    memory_mb: MemoryMb = MEMORY_MB,
+    limits: Limits = LIMITS,
 ) -> int:
     """Run a method on a sealed set and write its answers for who holds the truth.
 
@@ -65,9 +64,8 @@ def submit(
         Pairs that are worked on at a time.
     """
     from phibench.estimator.benchmark.submission import submit as submit_method
-    from phibench.estimator.sandbox.resolve import RunLimits
 
-    done = submit_method(public, method, out, workers, RunLimits(seconds, memory_mb))
+    done = submit_method(public, method, out, workers, limits.of_run)
     print(
         f"{done.path}: {done.answered} of {done.pairs} pairs answered, {done.positions} of {2 * done.pairs} positions"
     )
@@ -94,7 +92,7 @@ def open_(public: Path, *, truth: Path, submission: Path, out: Path | None = Non
     from phibench.datasets.errors import DatasetError
     from phibench.datasets.store.files import require_writable
     from phibench.estimator.benchmark.answer_errors import Rules
-    from phibench.estimator.benchmark.score import saved, score_outcomes
+    from phibench.estimator.benchmark.score import isolated, saved, score_outcomes
     from phibench.estimator.benchmark.score_tables import print_scores
     from phibench.estimator.benchmark.submission import unseal as unseal_set
 
@@ -105,6 +103,7 @@ def open_(public: Path, *, truth: Path, submission: Path, out: Path | None = Non
     opened = unseal_set(public, truth, submission)
     print(f"seal {opened.seal.id}: the truth is the sealed one, the submission has each of {opened.seal.pairs} pairs")
     scored = score_outcomes(opened.submission.method, opened.pairs, opened.outcomes, Rules())
+    scored = isolated(scored, opened.submission.isolation)
     print_scores([scored if out is None else saved(scored, out)], "terminal", "phi", wide=False)
     if out is not None:
         print(f"written: {out}")

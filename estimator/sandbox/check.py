@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from phibench.estimator.interface import OK, Outcome, Spot
 from phibench.estimator.pair_set import PairTruth, SpotTruth
 from phibench.estimator.sandbox.easy_pairs import EasyPairs
 from phibench.estimator.sandbox.resolve import RunLimits
-from phibench.estimator.sandbox.runner import outcomes
+from phibench.estimator.sandbox.runner import Harness
 from phibench.scenes.frames import Array
 
 PAIRS = 10
@@ -74,10 +74,13 @@ def check_method(
     """
     pairs = EasyPairs(preset, count)
     done: list[Outcome] = []
-    for outcome in _until_hopeless(outcomes(reference, pairs, limits)):
-        done.append(outcome)
-        told(len(done))
-    return judged(done, pairs)
+    with Harness([reference], limits) as harness:
+        for outcome in _until_hopeless(outcome for (outcome,) in harness.outcomes(pairs, range(len(pairs)))):
+            done.append(outcome)
+            told(len(done))
+        isolation = harness.isolations[0]
+    check = judged(done, pairs)
+    return check if isolation.startswith("isolated") else replace(check, notes=(*check.notes, isolation))
 
 
 def judged(done: Sequence[Outcome], pairs: EasyPairs) -> Check:

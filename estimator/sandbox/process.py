@@ -21,7 +21,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import IO, Any
@@ -30,6 +30,8 @@ from phibench.datasets.parallel import ONE_THREAD
 from phibench.datasets.store.leftovers import OwnedFolder
 from phibench.estimator.interface import FAILURES, Outcome, Pair
 from phibench.estimator.sandbox.answers import AnswerError, checked
+from phibench.estimator.sandbox.isolation import Access, Isolation
+from phibench.estimator.sandbox.readable_files import access_of
 from phibench.estimator.sandbox.resolve import MethodError, Reference, RunLimits
 from phibench.estimator.sandbox.supervisor import HUNG_UP, KILL_SECONDS, processes_in, remove_tree
 from phibench.estimator.sandbox.transport import (
@@ -155,7 +157,8 @@ def environment(folder: str, inherited: Mapping[str, str]) -> dict[str, str]:
     if paths:
         kept["PYTHONPATH"] = os.pathsep.join(paths)
     python = {"PYTHONDONTWRITEBYTECODE": "1", "PYTHONUNBUFFERED": "1"}  # what it prints is read before it dies
-    return {**ONE_THREAD, **kept, "PWD": folder, "TMPDIR": folder, **python}
+    caches = {"MPLCONFIGDIR": folder, "NUMBA_CACHE_DIR": folder}  # Matplotlib and Numba raise if they cannot write
+    return {**ONE_THREAD, **kept, "PWD": folder, "TMPDIR": folder, **caches, **python}
 
 
 _SUPERVISOR = "phibench.estimator.sandbox.supervisor"
@@ -174,12 +177,25 @@ class MethodProcess:
     ----------
     reference : Reference
     limits : RunLimits
+    hidden : sequence of Path
+        Folders with the truth, which the method cannot read.
+
+    Raises
+    ------
+    MethodError
+        If the method lies in one of them, or a path that is allowed does.
     """
 
-    def __init__(self, reference: Reference, limits: RunLimits) -> None:
+    def __init__(self, reference: Reference, limits: RunLimits, hidden: Sequence[Path] = ()) -> None:
         self._reference, self._limits = reference, limits
+        self._access, self._isolation = access_of(reference, limits, hidden), Isolation(reason="it did not start")
         self._lock, self._closed = threading.Lock(), False
         self._process: _Running | None = None
+
+    @property
+    def isolation(self) -> Isolation:
+        """Isolation of the process that was started last."""
+        return self._isolation
 
     def start(self, size: int = 0) -> None:
         """Start the process and import the method, unless it is there already.
@@ -199,9 +215,9 @@ class MethodProcess:
         with self._lock:
             if self._closed:
                 raise MethodError(f"method '{self._reference.name}' was stopped")
-            process = self._process = _Running(max(2 * size, LEAST_BYTES))
+            process = self._process = _Running(max(2 * size, LEAST_BYTES), self._access)
         try:
-            process.load(self._reference, self._limits)
+            self._isolation = process.load(self._reference, self._limits)
         except BaseException:
             self.end()
             raise
@@ -213,7 +229,7 @@ class MethodProcess:
         except Exception as error:  # one pair must never end a run, whatever was not thought of
             text = f"{type(error).__name__}: {error}"
             outcome = Outcome(pair.number, None, math.nan, "crash", f"the method's process cannot be used: {text}")
-        if outcome.failure not in _NOT_RESTARTED:
+        if self._limits.fresh or outcome.failure not in _NOT_RESTARTED:
             self.end()
         return replace(outcome, message=printable_line(outcome.message, _MESSAGE_LENGTH))
 
@@ -252,9 +268,11 @@ class _Running:
     ----------
     size : int
         Bytes for the images of a pair.
+    access : Access
+        Files that it may read.
     """
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, access: Access) -> None:
         if os.name != "posix":
             raise MethodError("methods run in processes of their own on Linux and macOS only")
         ours, theirs = socket.socketpair()
@@ -263,24 +281,28 @@ class _Running:
         self._folder = str(self._owned.path)
         try:
             with theirs:
-                self._process = self._started(theirs.fileno(), self._memory.reader)
+                self._process = self._started(access, theirs.fileno(), self._memory.reader)
         except OSError as error:
             self._give_back()
             raise MethodError(f"no process can be started for a method: {error.strerror or error}") from error
         assert self._process.stdout is not None
         self._output = OutputTail(self._process.stdout)
 
-    def _started(self, *handles: int) -> subprocess.Popen[bytes]:
-        return subprocess.Popen(
+    def _started(self, access: Access, *handles: int) -> subprocess.Popen[bytes]:
+        process = subprocess.Popen(
             [sys.executable, "-m", _SUPERVISOR, *map(str, handles)],
             pass_fds=handles,
             cwd=self._folder,
             env=environment(self._folder, os.environ),
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             start_new_session=True,  # not hit by Ctrl-C
         )
+        assert process.stdin is not None
+        with contextlib.suppress(BrokenPipeError), process.stdin as pipe:
+            pipe.write(access.text().encode())
+        return process
 
     def _give_back(self) -> None:
         self._connection.close()
@@ -288,11 +310,12 @@ class _Running:
         remove_tree(self._owned.path)  # of any depth
         self._owned.close()
 
-    def load(self, reference: Reference, limits: RunLimits) -> None:
-        """Let the process import the method."""
+    def load(self, reference: Reference, limits: RunLimits) -> Isolation:
+        """Let the process import the method; its isolation, which it tells before any code of the method runs."""
         nonce, end = secrets.token_hex(8), time.monotonic() + limits.start_seconds
         order = {"nonce": nonce, "reference": asdict(reference), "memory_mb": limits.memory_mb}
         try:
+            isolation = Isolation(**json.loads(self._connection.receive(limits.start_seconds)))
             self._connection.send(json.dumps(order).encode(), limits.start_seconds)
             fault = self._reply(nonce, end).get("fault")
         except TimeoutError:
@@ -306,6 +329,7 @@ class _Running:
             raise MethodError(f"method '{reference.name}' cannot be imported: {why}") from None
         if fault != "":
             raise MethodError(printable_line(str(fault), _MESSAGE_LENGTH))
+        return isolation
 
     def is_ready(self, size: int) -> bool:
         """Tell that a pair of so many bytes can be asked, and that nothing is left of the one before."""

@@ -3,15 +3,20 @@
 A reference is ``my_phi.py:extract`` (a file and a function in it), the name of a built-in method, or the name under
 which an installed package registers a method (entry-point group ``phibench.methods``). It is resolved without running
 any code of the method, because the process that resolves it knows the truth.
+
+A method's file comes with the modules beside it that it imports, as the source says: what is imported by a name that
+is computed is not among them.
 """
 
 from __future__ import annotations
 
+import ast
 import math
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from phibench.datasets.input_files import MIB, InputFile
 from phibench.datasets.store.files import sha256
@@ -43,6 +48,8 @@ class Reference:
         Of the file, or of the code behind the built-in methods; None for packages.
     version : str or None
         Distribution and version of a package.
+    modules : tuple of (path, SHA-256)
+        Files beside the method's that it imports, relative to its folder.
     """
 
     name: str
@@ -51,11 +58,25 @@ class Reference:
     function: str = ""
     sha256: str | None = None
     version: str | None = None
+    modules: tuple[tuple[str, str], ...] = ()
 
-    def document(self) -> dict[str, str | None]:
+    def document(self) -> dict[str, Any]:
         """Provenance, as JSON can hold it; of a file its name alone, not where it lies."""
         place = printable_line(Path(self.place).name) if self.kind == "file" else self.place
-        return {**asdict(self), "place": place}
+        return {**asdict(self), "place": place, "modules": dict(self.modules)}
+
+    @classmethod
+    def of(cls, fields: dict[str, Any]) -> Reference:
+        """From its fields as JSON has them."""
+        return cls(**{**fields, "modules": tuple((name, hashed) for name, hashed in fields["modules"])})
+
+    def changed(self) -> str:
+        """Name of the first file of the method that is not as it was when it was looked up; "" if all are."""
+        if self.kind != "file":
+            return ""
+        path = Path(self.place)
+        files = [(path, self.sha256), *((path.parent / name, hashed) for name, hashed in self.modules)]
+        return next((file.name for file, hashed in files if not file.is_file() or sha256(file) != hashed), "")
 
 
 GROUP = "phibench.methods"
@@ -110,8 +131,50 @@ def _of_file(reference: str) -> Reference:
     if path.name != printable_line(path.name):
         raise MethodError(f"method '{printable_line(path.name)}': give the file a name of at most 200 printable signs")
     _require_python(path)
+    hashed, modules = sha256(path), tuple((name, sha256(path.parent / name)) for name in modules_beside(path))
     # names of files may hold bytes that are no text, and what a terminal obeys
-    return Reference(f"{printable_line(path.stem)}:{function}", "file", str(path), function, sha256=sha256(path))
+    return Reference(f"{printable_line(path.stem)}:{function}", "file", str(path), function, hashed, modules=modules)
+
+
+def modules_beside(path: Path) -> list[str]:
+    """Files in the folder of a Python file that it imports, and that these import: paths from there, sorted."""
+    folder, found, waiting = path.parent, set[Path](), [path]
+    while waiting:
+        for file in _imported(waiting.pop(), folder):
+            if file != path and file not in found:
+                found.add(file)
+                waiting.append(file)
+    return sorted(file.relative_to(folder).as_posix() for file in found)
+
+
+def _imported(file: Path, folder: Path) -> Iterator[Path]:
+    """Files below a folder that a file imports, packages with their `__init__.py`."""
+    try:
+        nodes = list(ast.walk(ast.parse(file.read_bytes())))
+    except (SyntaxError, ValueError, RecursionError, MemoryError, OSError):
+        return  # the worker says what is wrong with it
+    package = file.parent.relative_to(folder).parts
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            names = [tuple(alias.name.split(".")) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: max(len(package) + 1 - node.level, 0)] if node.level else ()
+            base = (*above, *(node.module.split(".") if node.module else ()))
+            names = [(*base, alias.name) for alias in node.names] or [base]
+        else:
+            continue
+        for name in names:
+            yield from _files_of(name, folder)
+
+
+def _files_of(name: tuple[str, ...], folder: Path) -> Iterator[Path]:
+    """Files that an import of a dotted name runs; the last part may be a name in a module."""
+    for count in range(1, len(name) + 1):
+        place = folder.joinpath(*name[:count])
+        for file in (place / "__init__.py", place.parent / f"{place.name}.py"):
+            if file.is_file():
+                yield file
+                break
 
 
 _MOST_BYTES = 16 * MIB  # of a method's file
@@ -154,17 +217,27 @@ class RunLimits:
         that the method starts has its own. Linux only: elsewhere the system does not keep it.
     start_seconds : float
         Wall clock for starting Python and importing the method.
+    fresh : bool
+        A process for each pair, instead of one for all.
+    allow : tuple of str
+        Files and folders that the method may read, besides the folder of its file.
     """
 
     seconds: float = 30.0
     memory_mb: float = 4096.0
     start_seconds: float = 120.0
+    fresh: bool = False
+    allow: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("seconds", "memory_mb", "start_seconds"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise MethodError(f"limit {name} = {value}: must be a finite number above 0")
+
+    def document(self) -> dict[str, Any]:
+        """For the record; of what is allowed the last part of the path, not where it lies."""
+        return {**asdict(self), "allow": [Path(path).absolute().name for path in self.allow]}
 
     def memory_sentence(self, detail: str) -> str:
         """A failure for want of memory in one sentence, with the limit."""

@@ -1,8 +1,8 @@
 """Runner: methods over a set of pairs, each in processes of its own.
 
 What a method does to its process costs the pair at hand, and the run goes on. The truth stays in this process: a
-method's process gets the fields of `Pair` and nothing else. This keeps honest code honest and is no security boundary:
-a method can read any file that its user can.
+method's process gets the fields of `Pair` and nothing else. Where the system can do it, the process reads neither the
+data set nor other files of the user, see `isolation`; elsewhere the score says that it was not isolated.
 """
 
 from __future__ import annotations
@@ -12,10 +12,12 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from pathlib import Path
 from types import TracebackType
 
 from phibench.estimator.interface import Method, Outcome, Pair
-from phibench.estimator.pair_set import PairSet
+from phibench.estimator.pair_set import PairSet, truth_folders
+from phibench.estimator.sandbox.isolation import Isolation
 from phibench.estimator.sandbox.process import MethodProcess, outcome_of
 from phibench.estimator.sandbox.resolve import MethodError, Reference, RunLimits, resolve
 from phibench.estimator.sandbox.worker import reply_of, require_method
@@ -33,6 +35,8 @@ class Harness:
     limits : RunLimits, optional
     workers : int
         Pairs that are worked on at a time. One method alone has as many processes, several have one each.
+    hidden : sequence of Path
+        Folders with the truth, which no method can read: `pair_set.truth_folders`.
 
     Raises
     ------
@@ -40,17 +44,26 @@ class Harness:
         If a method cannot be found; on entering, if one cannot be imported.
     """
 
-    def __init__(self, methods: Sequence[str | Reference], limits: RunLimits | None = None, workers: int = 1) -> None:
+    def __init__(
+        self,
+        methods: Sequence[str | Reference],
+        limits: RunLimits | None = None,
+        workers: int = 1,
+        hidden: Sequence[Path] = (),
+    ) -> None:
         if workers < 1:
             raise MethodError(f"workers = {workers}: must be 1 or more")
         self._references = [resolve(method) if isinstance(method, str) else method for method in methods]
-        self._limits, self._workers = limits or RunLimits(), workers
+        self._limits, self._workers, self._hidden = limits or RunLimits(), workers, hidden
         self._failed: list[dict[int, str]] = [{} for _ in self._references]
         self._turns: list[_Turns] = []
 
     def __enter__(self) -> Harness:
         copies = self._workers if len(self._references) == 1 else 1
-        self._pools = [_MethodPool([MethodProcess(r, self._limits) for _ in range(copies)]) for r in self._references]
+        self._pools = [
+            _MethodPool([MethodProcess(reference, self._limits, self._hidden) for _ in range(copies)])
+            for reference in self._references
+        ]
         # one more than processes, so that a pair is made while the others are looked at
         self._threads = ThreadPoolExecutor(self._workers + 1, thread_name_prefix="phibench-method")
         try:
@@ -68,6 +81,11 @@ class Harness:
             pool.close()
         # Ctrl-C does not wait for a pair that is being made, 1 s or more; nobody will be asked for it
         self._threads.shutdown(wait=kind is None, cancel_futures=True)
+
+    @property
+    def isolations(self) -> list[str]:
+        """Isolation of each method in a sentence; after entering."""
+        return [pool.isolation.sentence() for pool in self._pools]
 
     @property
     def failed_outputs(self) -> list[str]:
@@ -154,6 +172,10 @@ class _MethodPool:
     def start(self) -> None:
         self._processes[0].start()
 
+    @property
+    def isolation(self) -> Isolation:
+        return self._processes[0].isolation
+
     def ask(self, pair: Pair, turns: _Turns, place: int) -> Outcome:
         with turns.turn(place):
             process = self._free.get()
@@ -183,7 +205,8 @@ def outcomes(
 ) -> Iterator[Outcome]:
     """As `run_method`, one at a time, for some pairs or all of them; leaving the loop ends the processes."""
     wanted = range(len(pairs)) if numbers is None else numbers
-    return _outcomes(Harness([reference], limits, min(workers, max(len(wanted), 1))), pairs, wanted)
+    harness = Harness([reference], limits, min(workers, max(len(wanted), 1)), truth_folders(pairs))
+    return _outcomes(harness, pairs, wanted)
 
 
 def _outcomes(harness: Harness, pairs: PairSet, numbers: Sequence[int]) -> Iterator[Outcome]:

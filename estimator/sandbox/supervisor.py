@@ -52,9 +52,12 @@ def _be_worker(supervisor: int, line: int, reader: int) -> None:
     _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != supervisor:  # it died before it could have told
         os._exit(1)
-    from phibench.estimator.sandbox.worker import main as work  # after the fork: the supervisor stays small
+    from phibench.estimator.sandbox.isolation import isolated_by  # after the fork: the supervisor stays small
 
-    work(line, reader)
+    isolation = isolated_by(sys.stdin)
+    from phibench.estimator.sandbox.worker import main as work  # its libraries may start threads: after the isolation
+
+    work(line, reader, isolation)
 
 
 def _wait(worker: int, line: int, runner: int) -> int | None:

@@ -1,7 +1,7 @@
 """Worker: the process in which a method runs, started by `sandbox.supervisor`.
 
-The worker gets a reference, imports the method, gets pairs, and answers with JSON. Every reply repeats number and nonce
-of its pair. Standard output and error are the method's alone.
+The worker tells how it is isolated, gets a reference, imports the method, gets pairs, and answers with JSON. Every
+reply repeats number and nonce of its pair. Standard output and error are the method's alone.
 
 The address space is limited while the method runs (RLIMIT_AS; kept by Linux). Fatal signals print Python's stack, and
 SIGUSR1 prints it at any time: the runner reads the method's line from it.
@@ -29,7 +29,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from phibench.datasets.store.files import sha256
 from phibench.estimator.interface import Answer, Method
 from phibench.estimator.sandbox.answers import answer_text, to_bytes
 from phibench.estimator.sandbox.resolve import MethodError, Reference, RunLimits
@@ -113,8 +112,8 @@ def _title(reference: Reference) -> str:
 def _from_file(reference: Reference) -> Any:
     path = Path(reference.place)
     # a process that is started anew in the middle of a run must not take up an edited file
-    if not path.is_file() or sha256(path) != reference.sha256:
-        raise MethodError(f"{path.name} was changed or removed after it was looked up: run it again")
+    if name := reference.changed():
+        raise MethodError(f"{name} was changed or removed after it was looked up: run it again")
     sys.path.insert(0, str(path.parent))  # a method may import what lies beside it
     spec = importlib.util.spec_from_file_location(_MODULE, path)
     if spec is None or spec.loader is None:
@@ -180,20 +179,23 @@ _LONGEST_MESSAGE = 2000
 _MOST_CAUSES = 32  # a chain of causes may be a circle
 
 
-def main(line: int, reader: int) -> None:
+def main(line: int, reader: int, isolation: dict[str, Any]) -> None:
     """Load one method and answer pairs until the runner hangs up.
 
     Parameters
     ----------
     line, reader : int
         Open files: the socket to the runner, and the memory that pairs come in.
+    isolation : dict
+        Fields of `Isolation`: what this process has, for the runner.
     """
     sys.argv[1:] = []
     connection, pages = Connection(socket.socket(fileno=line)), SharedPages(reader)
+    connection.send(to_bytes(isolation))
     faulthandler.enable(all_threads=False)
     faulthandler.register(signal.SIGUSR1, all_threads=False)
     order = json.loads(connection.receive())
-    nonce, reference = order["nonce"], Reference(**order["reference"])
+    nonce, reference = order["nonce"], Reference.of(order["reference"])
     try:
         method = load(reference)
     except MethodError as error:

@@ -13,7 +13,8 @@ from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.compare import compare_records
 from phibench.estimator.benchmark.document import MethodCard
 from phibench.estimator.benchmark.metrics import METRICS
-from phibench.estimator.benchmark.score import score_outcomes
+from phibench.estimator.benchmark.report import report_html
+from phibench.estimator.benchmark.score import isolated, score_outcomes
 from phibench.estimator.benchmark.score_tables import HEADS, number, print_comparison, print_scores
 
 RULES = Rules(resamples=199)
@@ -47,6 +48,18 @@ def test_tables_fit_eighty_columns_and_wide_ones_have_all(scored, capsys, monkey
     assert 80 < max(widths(wide)) <= 210
     assert "ranked by D" in wide
     assert "pull" in wide
+
+
+@pytest.mark.parametrize("sentence", ["not isolated: this kernel has no Landlock", "isolated: read ...", ""])
+def test_a_score_without_isolation_says_so(scored, capsys, sentence):
+    one = isolated(scored[0], sentence)
+    print_scores([one], "terminal", "phi", wide=True)
+    assert ("isolated" in capsys.readouterr().out) == sentence.startswith("not")
+    print_scores([one], "json", "phi", wide=False)
+    assert json.loads(capsys.readouterr().out)["isolation"] == sentence
+    page = report_html([(one.document, one.records)])
+    assert f"<p>{one.document.method.name}: {sentence}.</p>" in page or not sentence.startswith("not")
+    assert page.count("<p>" + one.document.method.name) == sentence.startswith("not")
 
 
 def test_a_comparison_fits_eighty_columns(scored, capsys, monkeypatch):

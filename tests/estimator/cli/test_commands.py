@@ -10,7 +10,7 @@ import pytest
 from cyclopts import App
 
 from phibench.estimator.cli import main as cli
-from phibench.estimator.cli.options import MEMORY_MB, OLD_COMMANDS, OLD_OPTIONS, OLD_POSITIONS, SECONDS
+from phibench.estimator.cli.options import LIMITS, MEMORY_MB, OLD_COMMANDS, OLD_OPTIONS, OLD_POSITIONS, SECONDS
 from phibench.estimator.cli.studies import STUDIES
 from phibench.estimator.sandbox.resolve import RunLimits
 from phibench.estimator.studies.run import NAMES
@@ -120,8 +120,10 @@ def test_limits_wherever_methods_run(command: str, capsys: pytest.CaptureFixture
     said = capsys.readouterr().out
     assert "--seconds" in said
     assert "--memory-mb" in said
+    assert "--fresh" in said
+    assert "--allow" in said
     assert "default: 30.0" in " ".join(said.split())
-    assert RunLimits(SECONDS, MEMORY_MB) == RunLimits()
+    assert RunLimits(SECONDS, MEMORY_MB) == LIMITS.of_run == RunLimits()
 
 
 def test_every_study_is_a_command() -> None:

@@ -1,0 +1,334 @@
+"""Isolation of a method's process: the files that it can read and write, and no network.
+
+The process reads an `Access` from its standard input and gives up all other rights for good, before it imports the
+worker. No thread and no code of the method may come before: Landlock limits the thread that asks for it and what that
+thread starts.
+
+Linux 5.13 and later have Landlock, see landlock(7): rules allow folders, the rest is denied. A seccomp filter denies
+sockets other than those between a process and its children. Nothing here needs privileges or imports NumPy.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import json
+import os
+import struct
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, TextIO
+
+_NOT_LINUX = "only Linux isolates a process"
+_NO_LANDLOCK = "this kernel has no Landlock, which Linux has from 5.13 on"
+
+
+@dataclass(frozen=True)
+class Access:
+    """Files of a method's process, besides its own folder, the interpreter and the packages.
+
+    Attributes
+    ----------
+    readable : tuple of str
+        Files and folders, absolute.
+    hidden : tuple of str
+        Never readable, wherever they lie: the data set, and truth that lies near the method.
+    fresh : bool
+        The process looks at one pair: it gets no memory that outlives it.
+    """
+
+    readable: tuple[str, ...] = ()
+    hidden: tuple[str, ...] = ()
+    fresh: bool = False
+
+    def text(self) -> str:
+        """One line of JSON, for the standard input of the process."""
+        return json.dumps(asdict(self)) + "\n"
+
+    @classmethod
+    def of(cls, text: str) -> Access:
+        """From such a line."""
+        fields = json.loads(text)
+        return cls(tuple(fields["readable"]), tuple(fields["hidden"]), bool(fields["fresh"]))
+
+
+@dataclass(frozen=True)
+class Isolation:
+    """Isolation that a process has.
+
+    Attributes
+    ----------
+    files, network : bool
+        Limited to what the method may have; to nothing.
+    memory : bool
+        /dev/shm is its own or denied, so that nothing in it outlives the process.
+    """
+
+    files: bool = False
+    network: bool = False
+    memory: bool = False
+    reason: str = ""
+
+    @property
+    def complete(self) -> bool:
+        """Neither files of others nor the network can be reached."""
+        return self.files and self.network
+
+    def sentence(self) -> str:
+        """In words, for a score."""
+        if not self.complete:
+            return f"not isolated: {self.reason}"
+        return "isolated: read its own folder and the packages only, without network"
+
+
+def isolate(access: Access) -> Isolation:
+    """Give up the rights of this process, for good and for all that it starts; the working directory stays its own.
+
+    Where the system cannot do it the process goes on, and the result says why.
+    """
+    if not sys.platform.startswith("linux"):
+        return Isolation(reason=_NOT_LINUX)
+    kernel = _Kernel()
+    if len(list(Path("/proc/self/task").iterdir())) > 1:
+        return Isolation(reason="threads were started before the method")
+    own_memory = kernel.own_shared_memory()
+    kernel.drop_privileges()
+    shared = () if access.fresh and not own_memory else (_SHARED_MEMORY,)
+    files = _limit_files(kernel, access, shared)
+    network = kernel.filter_calls() or (files and kernel.abi >= _ABI_NETWORK)
+    reason = "" if files else _NO_LANDLOCK if kernel.abi < 1 else "the kernel refused the rules"
+    if files and not network:
+        reason = f"the network is open: no filter for {os.uname().machine}, and this kernel's Landlock has no rule"
+    return Isolation(files, network, files and (own_memory or not shared), reason)
+
+
+# -- files ---------------------------------------------------------------------------------------------------------
+
+_EXECUTE, _WRITE, _READ, _LIST = 1, 2, 4, 8
+_DEVICES = 1 << 6 | 1 << 11  # making character and block devices
+_TRUNCATE, _IOCTL = 1 << 14, 1 << 15
+_RIGHTS = {1: 13, 2: 14, 3: 15, 5: 16}  # bits of rights to files, by the first ABI that knows them
+_ABI_NETWORK, _ABI_SCOPE = 4, 6
+_LOOK = _EXECUTE | _READ | _LIST
+_ON_FILES = _EXECUTE | _WRITE | _READ | _TRUNCATE | _IOCTL  # others are refused in the rule of a file
+_SHARED_MEMORY = Path("/dev/shm")  # where locks of multiprocessing are
+
+_SYSTEM = """
+/usr /lib /lib32 /lib64 /bin /sbin /nix/store /gnu/store /run/opengl-driver
+/etc/ld.so.cache /etc/ld.so.conf /etc/ld.so.conf.d /etc/alternatives /etc/fonts /etc/localtime /etc/timezone /etc/passwd
+/etc/group /etc/nsswitch.conf /etc/hosts /etc/host.conf /etc/resolv.conf /etc/os-release /etc/mime.types /etc/ssl
+/etc/OpenCL /etc/vulkan /etc/glvnd /etc/python3 /etc/locale.alias
+/sys/devices /sys/bus /sys/class /sys/module /sys/fs/cgroup /sys/kernel/mm
+"""
+_PROC = """
+/proc/self /proc/cpuinfo /proc/meminfo /proc/stat /proc/version /proc/uptime /proc/loadavg /proc/filesystems /proc/sys
+/proc/driver /proc/devices /proc/modules
+"""
+_DEVICE_FILES = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom")
+_GPU = ("/dev/dri", "/dev/kfd", "/dev/dxg")  # and /dev/nvidia*
+
+
+def _limit_files(kernel: _Kernel, access: Access, shared: Sequence[Path]) -> bool:
+    """Rules for all that may be read and written; False if the kernel has none."""
+    if kernel.abi < 1:
+        return False
+    every = (1 << max(bits for abi, bits in _RIGHTS.items() if abi <= kernel.abi)) - 1
+    ruleset = kernel.ruleset(every)
+    hidden = [Path(path) for path in access.hidden]
+    for name in _PROC.split():
+        # /proc makes a new file object when it forgets one, and a rule is about the object: one that is open stays
+        kernel.allow(ruleset, Path(name), _LOOK, keep=True)
+    readable = [*map(Path, _SYSTEM.split()), *interpreter_paths(), *map(Path, access.readable)]
+    for path in {path.resolve() for path in readable}:
+        for part, rights in _without(path, hidden):
+            kernel.allow(ruleset, part, rights)
+    for path in (*map(Path, (*_DEVICE_FILES, *_GPU)), *Path("/dev").glob("nvidia*")):
+        kernel.allow(ruleset, path, (_LOOK | _WRITE | _IOCTL) & every)
+    for path in (Path.cwd(), *shared):
+        kernel.allow(ruleset, path, every & ~_DEVICES)
+    return kernel.restrict(ruleset)
+
+
+def _without(path: Path, hidden: Sequence[Path]) -> Iterator[tuple[Path, int]]:
+    """Parts of a folder that hold nothing hidden, with their rights; rules cannot take a part out of a whole."""
+    if any(path.is_relative_to(other) for other in hidden):
+        return
+    if not any(other.is_relative_to(path) for other in hidden):
+        yield path, _LOOK
+        return
+    yield path, _LIST  # Python imports nothing from a folder that it cannot list
+    with suppress(OSError):
+        for entry in path.iterdir():
+            if not entry.is_symlink():
+                yield from _without(entry, hidden)
+
+
+def interpreter_paths() -> list[Path]:
+    """Folders of this interpreter, its packages and its libraries."""
+    package, python = sys.modules["phibench"], Path(sys.executable)
+    own = {Path(path).resolve() for path in package.__path__}
+    found = [Path(path) for path in (sys.prefix, sys.exec_prefix, sys.base_prefix, sys.base_exec_prefix)]
+    found += [python.parent, python.resolve().parent, *_library_folders()]
+    # the root of a checkout is one of phibench's own: the other folders in it are not
+    found += [path / name for path in own for name in ("phibench", "scenes", "render", "datasets", "estimator")]
+    found.append(Path(package.__file__ or python).resolve().parent)
+    for path in [Path(path) for path in sys.path if path.startswith("/")]:
+        if path.resolve() not in own:
+            found.append(path)
+        with suppress(OSError):
+            found += [Path(entry.path) for entry in os.scandir(path) if entry.is_symlink()]
+    for finder in sys.meta_path:  # packages that setuptools installed as editable
+        mapping = getattr(sys.modules.get(getattr(finder, "__module__", "")), "MAPPING", {})
+        found += [Path(place) for place in dict(mapping).values()]
+    return found
+
+
+def _library_folders() -> list[Path]:
+    """Folders of shared libraries, by the environment and the linker's settings."""
+    lines = os.environ.get("LD_LIBRARY_PATH", "").split(":")
+    for file in Path("/etc/ld.so.conf.d").glob("*.conf"):
+        with suppress(OSError, ValueError):
+            lines += file.read_text().splitlines()
+    return [Path(line.strip()) for line in lines if line.startswith("/")]
+
+
+# -- kernel --------------------------------------------------------------------------------------------------------
+
+_CREATE, _ADD, _RESTRICT = 444, 445, 446  # Landlock's system calls, the same on every machine
+_BENEATH = 1  # a rule about a path and what is beneath it
+_TCP, _SCOPES = 3, 3  # bind and connect; abstract sockets and signals
+_SET_NO_NEW_PRIVS, _SET_SECCOMP, _DROP_BOUND = 38, 22, 24  # of prctl(2)
+_NEW_USER, _NEW_MOUNTS = 0x10000000, 0x00020000
+_REC_PRIVATE = 16384 | 1 << 18
+_NOSUID_NODEV = 2 | 4
+_KEPT_CAPABILITIES = 1 << 0 | 1 << 1 | 1 << 3  # of root: owners and permissions of files, within the rules
+_CAPABILITIES_3 = 0x20080522  # version of capset(2)
+
+
+class _Kernel:
+    """System calls of Linux that limit this process."""
+
+    def __init__(self) -> None:
+        self._library = ctypes.CDLL(None, use_errno=True)
+        self._call = self._library.syscall
+        self._call.restype = ctypes.c_long
+        self.abi = int(self._call(_CREATE, None, ctypes.c_size_t(0), 1))  # -1 where there is no Landlock
+
+    def ruleset(self, rights: int) -> int:
+        """Set of rules that denies these rights, TCP, and signals to other processes; an open file, or -1."""
+        fields = [rights, *([_TCP] if self.abi >= _ABI_NETWORK else []), *([_SCOPES] if self.abi >= _ABI_SCOPE else [])]
+        attributes = struct.pack(f"={len(fields)}Q", *fields)
+        return int(self._call(_CREATE, attributes, ctypes.c_size_t(len(attributes)), 0))
+
+    def allow(self, ruleset: int, path: Path, rights: int, keep: bool = False) -> None:
+        """Allow rights to a file, or to a folder and all in it; no rule for what is not there."""
+        try:
+            handle = os.open(path, os.O_PATH | os.O_CLOEXEC)
+        except OSError:
+            return
+        if not path.is_dir():
+            rights &= _ON_FILES
+        self._call(_ADD, ruleset, _BENEATH, struct.pack("=Qi", rights, handle), 0)
+        if not keep:
+            os.close(handle)
+
+    def restrict(self, ruleset: int) -> bool:
+        """Enforce a set of rules, for good."""
+        self._library.prctl(_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
+        done = int(self._call(_RESTRICT, ruleset, 0)) == 0
+        if ruleset >= 0:
+            os.close(ruleset)
+        return done
+
+    def own_shared_memory(self) -> bool:
+        """Put an empty /dev/shm in place of the machine's, for this process; False where the system does not allow."""
+        user, group = os.geteuid(), os.getegid()
+        if self._library.unshare(_NEW_MOUNTS) != 0:
+            if self._library.unshare(_NEW_USER | _NEW_MOUNTS) != 0:
+                return False
+            try:
+                Path("/proc/self/setgroups").write_text("deny")
+                Path("/proc/self/uid_map").write_text(f"{user} {user} 1")
+                Path("/proc/self/gid_map").write_text(f"{group} {group} 1")
+            except OSError:
+                return False
+        mount = self._library.mount
+        mount(b"none", b"/", None, ctypes.c_ulong(_REC_PRIVATE), None)
+        options = ctypes.c_ulong(_NOSUID_NODEV)
+        return int(mount(b"phibench", bytes(_SHARED_MEMORY), b"tmpfs", options, b"mode=1777")) == 0
+
+    def drop_privileges(self) -> None:
+        """Take root's powers off, those of a new user namespace included: rules are for who cannot mount or trace."""
+        for capability in range(64):
+            if not _KEPT_CAPABILITIES >> capability & 1:
+                self._library.prctl(_DROP_BOUND, capability, 0, 0, 0)
+        kept = _KEPT_CAPABILITIES if os.geteuid() == 0 else 0
+        self._library.capset(struct.pack("=Ii", _CAPABILITIES_3, 0), struct.pack("=6I", kept, kept, 0, 0, 0, 0))
+
+    def filter_calls(self) -> bool:
+        """Deny sockets to anywhere but the process's own children; False on a machine whose calls are not listed."""
+        numbers = _NUMBERS.get(os.uname().machine)
+        if numbers is None:
+            return False
+        program = b"".join(struct.pack("=HBBI", *line) for line in _filter(numbers))
+        buffer = ctypes.create_string_buffer(program, len(program))
+        header = struct.pack("@HP", len(program) // 8, ctypes.addressof(buffer))
+        self._library.prctl(_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
+        return int(self._library.prctl(_SET_SECCOMP, 2, header, 0, 0)) == 0
+
+
+# -- system calls that are denied ----------------------------------------------------------------------------------
+
+_DENIED = (
+    *("connect", "listen", "io_uring_setup", "shmget", "semget", "msgget", "mq_open"),
+    *("add_key", "request_key", "keyctl", "bpf", "perf_event_open", "open_by_handle_at"),
+)
+"""Ways to other processes, by sockets or by memory that outlives a process, and past the rules for files."""
+_NUMBERS = {
+    "x86_64": {
+        **dict(zip(_DENIED, (42, 50, 425, 29, 64, 68, 240, 248, 249, 250, 321, 298, 304), strict=True)),
+        **{"machine": 0xC000003E, "socket": 41, "socketpair": 53, "sendto": 44},
+    },
+    "aarch64": {
+        **dict(zip(_DENIED, (203, 201, 425, 194, 190, 186, 180, 217, 218, 219, 280, 241, 265), strict=True)),
+        **{"machine": 0xC00000B7, "socket": 198, "socketpair": 199, "sendto": 206},
+    },
+}
+_LOAD, _EQUAL, _AT_LEAST, _AND, _RETURN = 0x20, 0x15, 0x35, 0x54, 0x06
+_ALLOW, _DENY = (0, 0, 0x7FFF0000), (0, 0, 0x00050000 | errno.EACCES)
+_NUMBER, _MACHINE, _ARGUMENT = 0, 4, 16  # places in seccomp_data; an argument has 8 bytes, the lower half first
+_X32 = 0x40000000
+_AF_UNIX, _SOCK_DGRAM, _TYPE = 1, 2, 0xF
+
+
+def _filter(numbers: dict[str, int]) -> list[tuple[int, int, int, int]]:
+    """Program of (code, jump if true, jump if false, value) that denies calls with EACCES, see seccomp(2)."""
+    deny, allow = (_RETURN, *_DENY), (_RETURN, *_ALLOW)
+    lines = [(_LOAD, 0, 0, _MACHINE), (_EQUAL, 1, 0, numbers["machine"]), deny, (_LOAD, 0, 0, _NUMBER)]
+    if numbers["machine"] == 0xC000003E:
+        lines += [(_AT_LEAST, 0, 1, _X32), deny]
+    for name in _DENIED:
+        lines += [(_EQUAL, 0, 1, numbers[name]), deny]
+    # local sockets that are connected in pairs; a datagram socket could be sent from to any address
+    local = [(_LOAD, 0, 0, _ARGUMENT), (_EQUAL, 1, 0, _AF_UNIX), deny]
+    local += [(_LOAD, 0, 0, _ARGUMENT + 8), (_AND, 0, 0, _TYPE), (_EQUAL, 0, 1, _SOCK_DGRAM), deny, allow]
+    for name in ("socket", "socketpair"):
+        lines += [(_EQUAL, 0, len(local), numbers[name]), *local]
+    address = _ARGUMENT + 4 * 8
+    plain = [(_LOAD, 0, 0, address), (_EQUAL, 1, 0, 0), deny, (_LOAD, 0, 0, address + 4), (_EQUAL, 1, 0, 0), deny]
+    return [*lines, (_EQUAL, 0, len(plain), numbers["sendto"]), *plain, allow]
+
+
+def isolated_by(stream: TextIO) -> dict[str, Any]:
+    """Isolate this process by the line of `Access.text` in its standard input; the fields of its `Isolation`."""
+    access = Access.of(stream.readline())
+    os.dup2(os.open(os.devnull, os.O_RDONLY), stream.fileno())
+    isolation = isolate(access)
+    if sys.version_info >= (3, 14):  # its start method, a server of processes, is reached by a socket
+        import multiprocessing
+
+        multiprocessing.set_start_method("fork")
+    return asdict(isolation)

@@ -1,0 +1,444 @@
+"""A method in its own room: what it cannot reach by any way that was tried, and what honest methods go on doing."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from helpers.sandbox_pairs import GOOD, HEADER, SmallPairs, method_file
+
+from phibench.estimator.benchmark.score import score
+from phibench.estimator.interface import Answer, Spot
+from phibench.estimator.sandbox.isolation import Access, Isolation
+from phibench.estimator.sandbox.readable_files import access_of, truth_near
+from phibench.estimator.sandbox.resolve import MethodError, RunLimits, resolve
+from phibench.estimator.sandbox.runner import Harness, run_method
+
+LIMITS = RunLimits(seconds=60.0)  # the machine may do other things: no test here is about time
+
+
+def landlock() -> bool:
+    """Tell whether this kernel has Landlock, by its own word."""
+    return sys.platform.startswith("linux") and ctypes.CDLL(None).syscall(444, None, 0, 1) > 0
+
+
+needs_landlock = pytest.mark.skipif(
+    not landlock(), reason="this kernel has no Landlock: methods are not isolated here, and the score says so"
+)
+
+
+@dataclass(frozen=True)
+class FilePairs(SmallPairs):
+    """Small pairs that are said to come from folders."""
+
+    folders: tuple[Path, ...] = ()
+
+
+# Each is an expression in the method; TRUTH is the path of the truth. What it gives is printed.
+ATTACKS = {
+    "path": "open(TRUTH).read()",
+    "descriptor of the folder": "os.open('truth.txt', os.O_RDONLY, dir_fd=os.open(DATA, os.O_RDONLY))",
+    "inherited descriptors": "[n for n in os.listdir('/proc/self/fd') if linked(n).startswith(DATA)][0]",
+    "symlink beside": "open(HERE / 'link.txt').read()",
+    "own symlink": "(os.symlink(TRUTH, 'mine'), open('mine').read())",
+    "hard link beside": "open(HERE / 'hard.txt').read()",
+    "new hard link": "(os.link(TRUTH, 'hard'), open('hard').read())",
+    "set below the method": "open(HERE / 'copy' / 'truth.txt').read()",
+    "score beside": "open(HERE / 'earlier.parquet').read()",
+    "parent's root": "open(f'/proc/{os.getppid()}/root{TRUTH}').read()",
+    "parent's folder": "os.listdir(f'/proc/{os.getppid()}/cwd/')",
+    "parent's descriptors": "os.listdir(f'/proc/{os.getppid()}/fd')",
+    "parent's memory": "open(f'/proc/{os.getppid()}/mem', 'rb').read(1)",
+    "parent's environment": "open(f'/proc/{os.getppid()}/environ').read()",
+    "first process": "open(f'/proc/1/root{TRUTH}').read()",
+    "own root": "open(f'/proc/self/root{TRUTH}').read()",
+    "trace the parent": "called('ptrace', 16, os.getppid(), 0, 0)",
+    "signal the parent": "os.kill(os.getppid(), 0)",
+    "mount": "called('mount', DATA.encode(), os.getcwd().encode(), b'none', 4096, None)",
+    "namespace": "in_child(mount_in_a_namespace)",
+    "chroot": "(os.chroot(DATA), open('/truth.txt').read())",
+    "subprocess": "subprocess.run(['cat', TRUTH], capture_output=True, check=True)",
+    "shell in a session": "subprocess.run('cat ' + TRUTH, shell=True, check=True, start_new_session=True)",
+    "forked child": "forked()",
+    "socket": "socket.create_connection(('127.0.0.1', PORT), 1.0)",
+    "datagram": "socket.socket(type=socket.SOCK_DGRAM)",
+    "raw socket": "socket.socket(socket.AF_PACKET, socket.SOCK_RAW)",
+    "local socket": "socket.socket(socket.AF_UNIX).connect(SERVER)",
+    "local datagram": "socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)",
+    "shared memory of System V": "called('shmget', 4711, 4096, 0o1666)",
+    "move": "(os.rename(TRUTH, 'moved'), open('moved').read())",
+    "write into the set": "open(TRUTH, 'a')",
+    "cut the truth": "os.truncate(TRUTH, 0)",
+    "delete the truth": "os.remove(TRUTH)",
+    "write beside the method": "open(HERE / 'new.txt', 'w')",
+    "write into the packages": "open(np.__file__, 'a')",
+    "write elsewhere": "open('/var/tmp/phibench-was-here', 'w')",
+    "home": "os.listdir(os.path.expanduser('~'))",
+}
+HELPERS = """
+import ctypes, multiprocessing, os, socket, subprocess
+from pathlib import Path
+
+HERE = Path(__file__).parent
+
+def called(name, *arguments):
+    if getattr(ctypes.CDLL(None, use_errno=True), name)(*arguments) == -1:
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+
+def linked(number):
+    return os.readlink(f'/proc/self/fd/{number}') if os.path.lexists(f'/proc/self/fd/{number}') else ''
+
+def forked():
+    context = multiprocessing.get_context('fork')
+    with context.Pool(1) as pool:
+        return pool.apply(Path(TRUTH).read_text)
+
+def mount_in_a_namespace():
+    called('unshare', 0x10020000)
+    called('mount', DATA.encode(), os.getcwd().encode(), b'none', 4096, None)
+
+def in_child(deed):
+    # a fork has one thread, which the kernel wants for a namespace
+    child = os.fork()
+    if child == 0:
+        try:
+            deed()
+            os._exit(0)
+        except OSError as error:
+            os._exit(error.errno)
+    if code := os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]):
+        raise OSError(code, os.strerror(code))
+
+def attack(text):
+    try:
+        return f'reached {eval(text)!r}'
+    except BaseException as error:
+        return f'denied {type(error).__name__} {error}'
+"""
+
+
+@pytest.fixture(scope="module")
+def attacked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    """What came of every attack, by its name."""
+    base = tmp_path_factory.mktemp("attacked")
+    data, method = base / "data", base / "method"
+    copy = method / "copy"
+    for folder in (data, method, copy):
+        folder.mkdir()
+    truth = data / "truth.txt"
+    for file in (truth, copy / "truth.txt", copy / "dataset.json", method / "earlier.parquet"):
+        file.write_text("secret")
+    (method / "earlier.json").write_text('{\n "kind": "phibench score"}')
+    (method / "link.txt").symlink_to(truth)
+    (method / "hard.txt").hardlink_to(truth)
+    with socket.create_server(("127.0.0.1", 0)) as server, socket.socket(socket.AF_UNIX) as local:
+        local.bind(str(base / "server"))
+        local.listen()
+        names = {
+            "TRUTH": str(truth),
+            "DATA": str(data),
+            "PORT": server.getsockname()[1],
+            "SERVER": str(base / "server"),
+        }
+        header = HEADER + HELPERS + "".join(f"{name} = {value!r}\n" for name, value in names.items())
+        # a line of output for each pair: an outcome keeps the last lines only
+        body = f"print(attack({list(ATTACKS.values())!r}[pair.number]))\nreturn {GOOD}"
+        pairs = FilePairs(len(ATTACKS), folders=(data,))
+        done = run_method(method_file(method, body, header=header), pairs, LIMITS)
+    yield {name: outcome.output or outcome.message for name, outcome in zip(ATTACKS, done, strict=True)}
+    assert truth.read_text() == "secret"
+    assert not Path("/var/tmp/phibench-was-here").exists()
+
+
+@needs_landlock
+@pytest.mark.parametrize("name", ATTACKS)
+def test_an_attack_is_denied(attacked: dict[str, str], name: str) -> None:
+    """For want of a right, that is, and not because the attack is wrong: the same attack reaches its aim outside."""
+    assert attacked[name].splitlines()[-1].startswith("denied")
+    # the parent's descriptors are closed; a tool that fails; a path in a child's sandbox
+    expected = ("PermissionError", "IndexError", "CalledProcessError", "Invalid cross-device link")
+    assert any(word in attacked[name] for word in expected), attacked[name]
+
+
+# What honest methods do; each is an expression as above.
+HONEST = {
+    "numpy": "np.linalg.svd(np.eye(3))[1].sum()",
+    "scipy": "__import__('scipy.optimize').optimize.brentq(lambda x: x - 1.0, 0.0, 3.0)",
+    "opencv": "__import__('cv2').GaussianBlur(pair.down, (3, 3), 1.0).shape",
+    "scikit-image": "__import__('skimage.feature').feature.blob_log(np.eye(9)).shape",
+    "pillow": "__import__('PIL.Image').Image.fromarray(np.zeros((2, 2), np.uint8)).save('x.png')",
+    "weights beside": "(HERE / 'weights.txt').read_text()",
+    "weights that are allowed": "open(WEIGHTS).read()",
+    "own file": "(open('x', 'w').write('1'), open('x').read(), os.rename('x', 'y'), os.mkdir('z'), os.listdir('.'))",
+    "temporary files": "[tempfile.mkdtemp(), tempfile.NamedTemporaryFile().name]",
+    "processes": "pooled()",
+    "lock": "multiprocessing.Lock().acquire()",
+    "shared memory": "shared()",
+    "executor": "list(concurrent.futures.ThreadPoolExecutor(2).map(abs, [-1, 2]))",
+    "python": "subprocess.run([sys.executable, '-c', 'import numpy'], check=True)",
+    "tool": "subprocess.run('ls /usr | sort', shell=True, check=True, capture_output=True).stdout",
+    "event loop": "asyncio.run(asyncio.sleep(0))",
+    "clock": "datetime.datetime.now().astimezone().tzname()",
+    "machine": "(os.cpu_count(), os.getloadavg(), open('/proc/self/status').read(), open('/proc/meminfo').read())",
+    "random": "os.urandom(4)",
+    "user": "os.path.expanduser('~')",
+}
+USUAL = """
+import asyncio, concurrent.futures, datetime, multiprocessing, os, subprocess, sys, tempfile
+from multiprocessing.shared_memory import SharedMemory
+from pathlib import Path
+
+HERE = Path(__file__).parent
+
+def pooled():
+    with multiprocessing.Pool(2) as pool:
+        return pool.map(abs, [-1, 2])
+
+def shared():
+    memory = SharedMemory(create=True, size=16)
+    memory.close()
+    memory.unlink()
+"""
+
+
+@pytest.mark.parametrize("fresh", [False, True])
+def test_honest_methods_go_on_working(tmp_path: Path, fresh: bool) -> None:
+    (tmp_path / "method").mkdir()
+    (tmp_path / "method" / "weights.txt").write_text("1")
+    (tmp_path / "allowed.txt").write_text("2")
+    header = f"{HEADER}{USUAL}WEIGHTS = {str(tmp_path / 'allowed.txt')!r}\n"
+    each = "    print(name, flush=True)\n    eval(text, globals(), dict(pair=pair))\n"
+    body = f"for name, text in {HONEST!r}.items():\n{each}"
+    reference = method_file(tmp_path / "method", f"{body}print('done')\nreturn {GOOD}", header=header)
+    limits = RunLimits(seconds=120.0, fresh=fresh, allow=(str(tmp_path / "allowed.txt"),))
+    (outcome,) = run_method(reference, SmallPairs(1), limits)
+    assert (outcome.failure, outcome.message) == ("", "")
+    assert outcome.output.splitlines()[-1] == "done"
+
+
+KEEPER = """
+import os
+from pathlib import Path
+COUNT = 0
+
+def counted():
+    global COUNT
+    COUNT += 1
+    seen = [COUNT, len(os.listdir('.'))]
+    for place in ('/dev/shm', '.', '/tmp', '/var/tmp'):
+        file = Path(place) / f'phibench-test-{os.stat(__file__).st_ino}'
+        seen.append(0)
+        try:
+            seen[-1] = int(file.exists() and file.read_text() == 'kept')
+            file.write_text('kept')
+        except OSError:
+            pass
+    return seen
+"""
+
+
+@pytest.mark.parametrize(("fresh", "count"), [(True, 1), (False, 3)])
+def test_fresh_is_a_process_and_a_folder_for_each_pair(tmp_path: Path, fresh: bool, count: int) -> None:
+    """What is kept in memory, in the folder, in shared memory and in temporary folders is lost."""
+    if fresh and not landlock():
+        pytest.skip("this kernel has no Landlock: a method can write files that outlive it")
+    reference = method_file(tmp_path, f"print(counted())\nreturn {GOOD}", header=HEADER + KEEPER)
+    done = run_method(reference, SmallPairs(3), RunLimits(seconds=60.0, fresh=fresh))
+    lists = [json.loads(outcome.output) for outcome in done]
+    assert [one[0] for one in lists] == ([1, 1, 1] if fresh else [1, 2, 3])
+    if fresh:
+        assert lists == [[1, 0, 0, 0, 0, 0]] * 3
+    else:
+        assert lists[-1][3] == 1  # the probe sees what is kept
+    assert lists[-1][0] == count
+
+
+@needs_landlock
+def test_the_truth_of_a_data_set_is_not_read_while_it_is_scored(smallest_dataset: Path, tmp_path: Path) -> None:
+    """What was measured before: rms 0.001 px, efficiency 374, and no word of it."""
+    (tmp_path / "beside.py").write_text("")
+    manifest = next(smallest_dataset.glob("*.parquet"))
+    header = f"{HEADER}import beside\nfrom pathlib import Path\n"
+    method = method_file(tmp_path, f"Path({str(manifest)!r}).read_bytes()\nreturn {GOOD}", header=header)
+    scored = score(smallest_dataset, method, "mono-raw", pairs=1, limits=LIMITS)
+    assert scored.document.failures["error"] == 1
+    assert scored.document.isolation == Isolation(True, True, True).sentence()
+    assert list(scored.document.method.modules) == ["beside.py"]
+    here = score(smallest_dataset, lambda pair: Answer(Spot.missing("x"), Spot.missing("x")), "mono-raw", pairs=1)
+    assert here.document.isolation == "not isolated: a function runs in this process"
+
+
+# -- what may be read ----------------------------------------------------------------------------------------------
+
+
+def test_a_method_inside_the_data_set_is_refused(tmp_path: Path) -> None:
+    inner = tmp_path / "data" / "mine"
+    inner.mkdir(parents=True)
+    method = method_file(inner, f"return {GOOD}")
+    with pytest.raises(
+        MethodError, match=r"the file of method 'my_phi:extract' lies in .*/data, which holds the truth"
+    ):
+        Harness([method], hidden=(tmp_path / "data",)).__enter__()
+    elsewhere = tmp_path / "linked"
+    elsewhere.symlink_to(inner)  # by another name, too
+    with pytest.raises(MethodError, match="move it out"):
+        access_of(resolve(f"{elsewhere}/my_phi.py:extract"), RunLimits(), (tmp_path / "data",))
+
+
+@needs_landlock
+def test_of_a_folder_around_the_data_set_the_rest_is_read(tmp_path: Path) -> None:
+    data = tmp_path / "out" / "data"
+    data.mkdir(parents=True)
+    for file in (data / "truth.txt", tmp_path / "out" / "weights.txt", tmp_path / "beside.py"):
+        file.write_text("WORD = 1")
+    header = f"{HEADER}import os\nfrom pathlib import Path\nimport beside\nOUT = Path({str(tmp_path / 'out')!r})\n"
+    body = f"""
+assert (OUT / 'weights.txt').read_text() == 'WORD = 1'
+try:
+    print(open(OUT / 'data' / 'truth.txt').read())
+except PermissionError:
+    print('denied')
+return {GOOD}
+"""
+    for allow in ((), (str(tmp_path),)):  # an ancestor that is allowed does not allow the data set
+        pairs = FilePairs(1, folders=(data,))
+        (outcome,) = run_method(method_file(tmp_path, body, header=header), pairs, RunLimits(60.0, allow=allow))
+        assert (outcome.output, outcome.failure) == ("denied", "")
+
+
+@pytest.mark.parametrize(("name", "words"), [("data/x", "lies in .*/data, which"), ("none", "no such file or folder")])
+def test_what_may_not_be_allowed_is_refused(tmp_path: Path, name: str, words: str) -> None:
+    (tmp_path / "data" / "x").mkdir(parents=True)
+    method = resolve("red_centroid")
+    with pytest.raises(MethodError, match=words) as caught:
+        access_of(method, RunLimits(allow=(str(tmp_path / name),)), (tmp_path / "data",))
+    assert str(caught.value).startswith("--allow ")
+
+
+def test_truth_near_a_method_is_found(tmp_path: Path) -> None:
+    for name in ("a/b/set/x", "a/plain", "deep/deep/deep", "f", "g"):
+        (tmp_path / name).mkdir(parents=True)
+    for name in (
+        "a/b/set/dataset.json",
+        "weights.parquet",
+        "config.json",
+        "a/seal_1.truth.json",
+        "a/one.parquet",
+        "f/frames.jsonl",
+        "f/frames.parquet",
+        "g/frames.jsonl",
+    ):
+        (tmp_path / name).write_text("{}")
+    (tmp_path / "a" / "one.json").write_text('{\n "kind": "phibench score"')
+    (tmp_path / "config.parquet").write_text("not a score's: its JSON says nothing of one")
+    found = {path.relative_to(tmp_path).as_posix() for path in truth_near(tmp_path)}
+    frames = {"f/frames.jsonl", "f/frames.parquet"}
+    assert found == {"a/b/set", "a/seal_1.truth.json", "a/one.json", "a/one.parquet"} | frames
+
+
+# -- what a method consists of -------------------------------------------------------------------------------------
+
+
+def package(folder: Path) -> str:
+    """A method that imports what lies beside it, some of it by way of others; the reference to it."""
+    files = {
+        "fits.py": "import numpy\nfrom shapes import gauss\n",
+        "shapes/__init__.py": "",
+        "shapes/gauss.py": "from . import width\nfrom .units import mm\n",
+        "shapes/width.py": "",
+        "shapes/units.py": "import fits\nmm = 1\n",  # a circle
+        "shapes/unused.py": "",
+        "later.py": "",
+        "other.py": "",
+        "broken.py": "def (",
+    }
+    for name, text in files.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text(text)
+    return method_file(folder, f"import later\nreturn {GOOD}", header=f"{HEADER}import os, json, fits\n")
+
+
+def test_the_modules_beside_a_method_are_hashed_with_it(tmp_path: Path) -> None:
+    found = resolve(package(tmp_path))
+    assert [name for name, _ in found.modules] == [
+        "fits.py",
+        "later.py",
+        "shapes/__init__.py",
+        "shapes/gauss.py",
+        "shapes/units.py",
+        "shapes/width.py",
+    ]
+    document = found.document()
+    assert document["modules"]["later.py"] == resolve(f"{tmp_path}/later.py:x").sha256
+    assert str(tmp_path) not in str(document)
+    broken = method_file(tmp_path, f"return {GOOD}", "uses.py", f"{HEADER}import broken\n")
+    assert [name for name, _ in resolve(broken).modules] == ["broken.py"]
+
+
+@pytest.mark.parametrize("change", ["edit", "remove"])
+def test_a_changed_module_beside_a_method_is_refused(tmp_path: Path, change: str) -> None:
+    found = resolve(package(tmp_path))
+    assert found.changed() == ""
+    file = tmp_path / "shapes" / "width.py"
+    if change == "edit":
+        file.write_text("WIDTH = 2")
+    else:
+        file.unlink()
+    assert found.changed() == "width.py"
+    with pytest.raises(MethodError, match=r"width\.py was changed or removed after it was looked up"):
+        run_method(found, SmallPairs(1), LIMITS)
+
+
+# -- what is said --------------------------------------------------------------------------------------------------
+
+WITHOUT = """
+import sys, os
+from phibench.estimator.sandbox import isolation
+{change}
+result = isolation.isolate(isolation.Access())
+print(result.complete, result.sentence())
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("isolation._CREATE = 9999", "False not isolated: this kernel has no Landlock"),  # no such system call
+        ("sys.platform = 'darwin'", "False not isolated: only Linux isolates a process"),
+        (
+            "import threading, time; threading.Thread(target=time.sleep, args=(9,), daemon=True).start()",
+            "False not isolated: threads were started",
+        ),
+        ("isolation._RIGHTS = {1: 40}", "False not isolated: the kernel refused the rules"),  # unknown rights
+    ],
+)
+def test_a_process_that_is_not_isolated_says_so(tmp_path: Path, change: str, words: str) -> None:
+    text = WITHOUT.format(change=change)
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, cwd=tmp_path, input="")
+    if landlock() or "Landlock" in words:
+        assert done.stdout.startswith(words), done.stderr
+
+
+@needs_landlock
+def test_the_harness_says_that_a_method_is_isolated(tmp_path: Path) -> None:
+    with Harness([method_file(tmp_path, f"return {GOOD}")], LIMITS) as harness:
+        assert harness.isolations == [Isolation(True, True, True).sentence()]
+
+
+def test_limits_go_into_the_record_without_paths(tmp_path: Path) -> None:
+    document = RunLimits(fresh=True, allow=(str(tmp_path / "weights"),)).document()
+    assert document["fresh"] is True
+    assert document["allow"] == ["weights"]
+
+
+def test_a_path_that_is_not_utf8_reaches_the_process() -> None:
+    access = Access((os.fsdecode(b"/tmp/\xff"),), ("/data",), True)
+    assert Access.of(access.text()) == access
