@@ -172,15 +172,11 @@ def test_a_process_stays_warm_until_it_fails(tmp_path: Path) -> None:
 
 def test_what_a_method_starts_dies_with_it(tmp_path: Path) -> None:
     """The hang is in a process that the method started: it must not outlive the pair."""
-    mark = tmp_path / "alive"
-    grandchild = f"import time, pathlib\nwhile True:\n    pathlib.Path({str(mark)!r}).touch()\n    time.sleep(0.05)"
-    body = f"import subprocess, sys\nsubprocess.run([sys.executable, '-c', {grandchild!r}])"
+    child = "subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(600)'])"
+    body = f"import subprocess, sys\nchild = {child}\nprint(child.pid, flush=True)\nchild.wait()"
     (outcome,) = run_method(method_file(tmp_path, body), SmallPairs(1), RunLimits(seconds=3.0))
     assert outcome.failure == "timeout"
-    assert mark.exists()  # it did run
-    mark.unlink()
-    time.sleep(0.5)
-    assert not mark.exists()
+    assert not is_alive(int(outcome.output))  # it did run: it has told its number
 
 
 def test_leaving_the_loop_ends_the_process(tmp_path: Path) -> None:
