@@ -181,13 +181,11 @@ def _refuse_strange(tokens: Sequence[str]) -> None:
 def _is_users(error: Exception) -> bool:
     from phibench.datasets.errors import DatasetError
     from phibench.estimator.sandbox.resolve import MethodError
-    from phibench.render.sensor.settings import SensorError
-    from phibench.render.setup.llvm_library import LlvmError
-    from phibench.render.setup.variant import VariantError
     from phibench.scenes.validation import SceneError
 
-    known = (SceneError, SensorError, DatasetError, MethodError, VariantError, LlvmError, OSError, MemoryError)
-    return isinstance(error, known)
+    known = (SceneError, DatasetError, MethodError, OSError, MemoryError)
+    # errors of the renderer's own (sensor, variant, LLVM) are sentences too; scoring does not import the renderer
+    return isinstance(error, known) or type(error).__module__.startswith("phibench.render.")
 
 
 def _sentence(error: Exception) -> str:
