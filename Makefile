@@ -58,7 +58,8 @@ $(READY): pyproject.toml constraints.txt
 dataset: $(READY)
 	$(BIN)/phibench dataset make $(RECIPE) --out $(OUT)
 
-# Samples that are there already are kept: a larger number renders only the new ones.
+# Samples that are there already are kept: a larger number renders only the new ones, a smaller one deletes none, and
+# all are scored.
 bench: $(READY)
 	$(BIN)/phibench dataset make bench-dev --samples $(SAMPLES) --out $(BENCH)
 	$(BIN)/phibench bench $(BENCH) --out $(BENCH)-report

@@ -6,12 +6,13 @@ import contextlib
 import json
 import os
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
 from rich.console import Console
 
+from phibench.datasets.build.finished_work import OR_REPLACE, kept_samples, lost_work
 from phibench.datasets.build.forecast import PairForecast, forecast, pair_forecasts, pair_table, slowdown
 from phibench.datasets.build.journal import FolderHead, Journal
 from phibench.datasets.build.run_tasks import (
@@ -27,6 +28,7 @@ from phibench.datasets.build.run_tasks import (
     write_documents,
 )
 from phibench.datasets.build.task_list import plan_tasks
+from phibench.datasets.build.tasks import Task
 from phibench.datasets.build.workers import Environment, NoRendererError, WorkerPool, versions
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan.plan import Plan, make_plan, shard_plan
@@ -49,18 +51,23 @@ def make(
     shard: str | None = None,
     samples: int | None = None,
     seed: int | None = None,
+    replace: bool = False,
 ) -> Path:
     """Render the data set of a recipe into a folder; what is finished there is kept, whatever ended the last run.
+
+    Finished work is never deleted: a finished data set with more samples than are asked for is kept whole, and what
+    would make finished work invalid is refused.
 
     Parameters
     ----------
     recipe : path of a TOML file, or the name of a shipped recipe
-    out : folder; made if need be. It may hold this data set, made from other values: what these change is made again.
+    out : folder; made if need be. It may hold this data set, unfinished or with fewer samples.
     workers : processes; by default one per core
     console : where progress goes; by default the standard error
     scheduler : address or scheduler file of a running dask scheduler, whose workers are used instead
     shard : part of the recipe, "i/n"
     samples, seed : numbers instead of the recipe's `[random].samples` and `[dataset].seed`
+    replace : whether finished work that does not fit may be deleted or made again; what fits is kept
 
     Returns
     -------
@@ -69,15 +76,18 @@ def make(
     Raises
     ------
     DatasetError
+        If finished work would be lost; the folder is then as it was.
+    DatasetError
         If recipe, folder or disk will not do, or a task fails (the others are finished first). Nothing is then
         half-written under a final name, and `SHA256SUMS` is missing.
     """
     console, out = console or progress_console(), Path(out)
-    text = _recipe_text(recipe, samples, seed)
-    plan = shard_plan(make_plan(parse_recipe(text, str(find_recipe(recipe)))), shard)
+    plan, text, note = _planned(recipe, out, shard, samples, seed, replace)
     for warning in [*warnings(plan.recipe), *_hidden(pair_forecasts(plan))]:
         console.print(f"warning: {warning}", highlight=False, soft_wrap=True)
-    make_from_plan(plan, text, out, workers, console, scheduler)
+    make_from_plan(plan, text, out, workers, console, scheduler, replace)
+    if note:
+        console.print(note, highlight=False, soft_wrap=True)
     return out
 
 
@@ -88,6 +98,7 @@ def dry_run(
     shard: str | None = None,
     samples: int | None = None,
     seed: int | None = None,
+    replace: bool = False,
 ) -> str:
     """Say what `make` would do, and render and write nothing: what will be seen, how many tasks, bytes, seconds.
 
@@ -97,19 +108,20 @@ def dry_run(
         If recipe or folder will not do.
     """
     out, count = Path(out), _count(workers)
-    text = _recipe_text(recipe, samples, seed)
-    plan = shard_plan(make_plan(parse_recipe(text, str(find_recipe(recipe)))), shard)
-    refuse_other(out, plan.recipe.dataset.name)
+    plan, _, note = _planned(recipe, out, shard, samples, seed, replace)
+    refuse_other(out, None if replace else plan.recipe.dataset.name)
     pairs, journal = list(pair_forecasts(plan)), Journal(out)
-    tasks, todo = plan_tasks(plan, {}), []
+    tasks, todo, told = plan_tasks(plan, {}), [], [note] if note else []
     if journal.entries:
         environment, _ = _environment(WorkerPool(out, count), journal)
         tasks = plan_tasks(plan, versions(environment))
         todo = unfinished(tasks, journal, out)
+        lost = None if replace else lost_work(out, _keys(tasks), journal, dataset_info(plan, environment))
+        told += [f"will be refused: {lost}; {OR_REPLACE}"] if lost else []
     chosen = [tasks[name] for name in (todo if journal.entries else tasks)]
     cost = forecast(plan, chosen).text(count, slowdown(count)) if chosen else "to make: nothing"
     seen = f"{sum(pair.visible for pair in pairs)} of {len(pairs)} pairs will be visible in both images"
-    told = [f"warning: {warning}" for warning in warnings(plan.recipe)]
+    told += [f"warning: {warning}" for warning in warnings(plan.recipe)]
     return "\n".join([*pair_table(pairs), seen, *told, f"{cost}, {len(tasks)} tasks in all; nothing was rendered"])
 
 
@@ -132,35 +144,57 @@ def _count(workers: int | None) -> int:
     return count
 
 
-def _recipe_text(recipe: str | Path, samples: int | None, seed: int | None) -> str:
-    text = recipe_text(recipe)
-    if samples is None and seed is None:
-        return text
-    return with_numbers(text, str(find_recipe(recipe)), samples, seed)
+def _planned(
+    recipe: str | Path, out: Path, shard: str | None, samples: int | None, seed: int | None, replace: bool
+) -> tuple[Plan, str, str]:
+    """Plan, text of its recipe, and a line on samples that are kept although fewer are asked for."""
+    text, source, note = recipe_text(recipe), str(find_recipe(recipe)), ""
+    if samples is not None or seed is not None:
+        text = with_numbers(text, source, samples, seed)
+    asked = parse_recipe(text, source)
+    held = None if replace or shard is not None else kept_samples(out, asked)
+    if held is not None and asked.random is not None:
+        text, count = with_numbers(text, source, held, None), asked.random.samples
+        note = f"{out} keeps its {held} samples; the first {count} of them are those that were asked for"
+    return shard_plan(make_plan(parse_recipe(text, source)), shard), text, note
+
+
+def _keys(tasks: Mapping[str, Task]) -> dict[str, str]:
+    return {name: task.key for name, task in tasks.items()}
 
 
 def make_from_plan(
-    plan: Plan, recipe: str, out: Path, workers: int | None, console: Console, scheduler: str | None = None
+    plan: Plan,
+    recipe: str,
+    out: Path,
+    workers: int | None,
+    console: Console,
+    scheduler: str | None = None,
+    replace: bool = False,
 ) -> list[str]:
     """Make what is unfinished or damaged of a plan; return the names of the tasks done and documents written."""
     count = _count(workers)
     try:
         with (
-            claimed(out, plan.recipe.dataset.name),
+            claimed(out, None if replace else plan.recipe.dataset.name),
             WorkerPool(out, count, scheduler) as pool,
             Journal(out) as journal,
         ):
-            return _make(plan, recipe, out, pool, journal, console)
+            return _make(plan, recipe, out, pool, journal, console, replace)
     except OSError as error:
         text = str(error) if isinstance(error, WriteError) else f"could not write to {out}: {error}"
         raise DatasetError(f"{text}; then run the same command again") from error
 
 
-def _make(plan: Plan, recipe: str, out: Path, pool: WorkerPool, journal: Journal, console: Console) -> list[str]:
+def _make(
+    plan: Plan, recipe: str, out: Path, pool: WorkerPool, journal: Journal, console: Console, replace: bool
+) -> list[str]:
     started, began = time.monotonic(), datetime.now(UTC)
     environment, no_renderer = _environment(pool, journal)
-    head = FolderHead(_info_text(dataset_info(plan, environment), journal, out), recipe)
-    tasks = plan_tasks(plan, versions(environment))
+    info, tasks = dataset_info(plan, environment), plan_tasks(plan, versions(environment))
+    if not replace and (lost := lost_work(out, _keys(tasks), journal, info)):
+        raise DatasetError(f"{lost}; {OR_REPLACE}")
+    head = FolderHead(_info_text(info, journal, out), recipe)
     todo = unfinished(tasks, journal, out)
     if todo and no_renderer is not None:
         what = f"{len(todo)} of {len(tasks)} tasks are to be done, such as '{todo[0]}'"

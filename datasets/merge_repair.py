@@ -15,6 +15,7 @@ from typing import Any
 
 from rich.console import Console
 
+from phibench.datasets.build.finished_work import lost_work
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
 from phibench.datasets.build.run_tasks import (
     assemble,
@@ -68,6 +69,8 @@ def merge(out: str | Path, shards: Sequence[str | Path], console: Console | None
     if missing := [name for name in names if name not in entries]:
         raise DatasetError(f"the shards lack {len(missing)} tasks, such as {missing[0]}; finish or add their shards")
     with claimed(out, info.name), Journal(out) as journal:
+        if lost := lost_work(out, {name: entries[name][0].key for name in names}, journal, info):
+            raise DatasetError(f"{lost}; give another folder")
         (out / CHECKSUMS).unlink(missing_ok=True)
         journal.begin(head, [])  # says what the folder is, should this be interrupted
         _copy(out, [entries[name] for name in names], console)
@@ -278,4 +281,4 @@ def _refuse_other_code(folder: Path, made_by: dict[str, object]) -> None:
         if here[key] != made_by.get(key):
             what = key.removesuffix("_sha256")
             text = f"{folder} was made with other {what}: what is repaired here would not fit the rest"
-            raise DatasetError(f"{text}; use that one, or `phibench dataset make` to make all of it again")
+            raise DatasetError(f"{text}; use that one, or `phibench dataset make --replace` to make all of it again")

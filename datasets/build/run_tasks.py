@@ -40,8 +40,13 @@ _OWN = ".phibench-"  # locks, and temporary files that a killed run left
 
 
 @contextlib.contextmanager
-def claimed(out: Path, name: str) -> Iterator[None]:
+def claimed(out: Path, name: str | None) -> Iterator[None]:
     """Make the folder, refuse one that holds something else, and hold it: of two that start together one is refused.
+
+    Parameters
+    ----------
+    out : folder
+    name : that of the data set that the folder may hold; None for any
 
     Raises
     ------
@@ -96,13 +101,15 @@ def remove_files(out: Path, names: Collection[str]) -> None:
             path.parent.rmdir()
 
 
-def refuse_other(out: Path, name: str) -> None:
+def refuse_other(out: Path, name: str | None) -> None:
     """Raise `DatasetError` if a folder is a file, or holds another data set or something else."""
     if out.exists() and not out.is_dir():
         raise DatasetError(f"{out} is a file; give a folder")
     head = held_head(out)
-    if head is not None and (held := parse_info(head.info).name) != name:
-        raise DatasetError(f"{out} holds another data set ('{held}'); give another folder or delete it")
+    if name is not None and head is not None and (held := parse_info(head.info).name) != name:
+        count = f"{len(Journal(out).entries)} finished tasks of" if Journal(out).entries else ""
+        remedy = "give another folder, or `phibench dataset make --replace` to delete it"
+        raise DatasetError(f"{out} holds {count} another data set ('{held}'); {remedy}".replace("  ", " "))
 
 
 def held_head(out: Path) -> FolderHead | None:

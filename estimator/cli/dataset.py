@@ -28,6 +28,7 @@ def make(
     shard: str | None = None,
     samples: Whole | None = None,
     seed: Whole | None = None,
+    replace: Annotated[bool, Parameter(negative="")] = False,
     dry_run: bool = False,
 ) -> int:
     """Render a data set; what is finished already is kept. Sensitivities of D come last, sensitivities.parquet.
@@ -37,7 +38,7 @@ def make(
     recipe
         TOML file, or the name of a shipped recipe ("paper", "paper-misaligned", "random", "smoke", ...).
     out
-        Folder to write; one that holds another data set is refused.
+        Folder to write; one with finished work that would be lost is refused, and one with more samples keeps them.
     workers
         Number of processes; one for each core by default.
     scheduler
@@ -48,17 +49,19 @@ def make(
         How many samples to draw, instead of the recipe's number.
     seed
         Root of all random streams, instead of the recipe's; a secret one for a set that is to be sealed.
+    replace
+        Delete or make again finished work that does not fit, of another seed or recipe; what fits is kept.
     dry_run
         Say what will be seen, where and why not, how many tasks, bytes and seconds it takes; render nothing.
     """
     if dry_run:
         from phibench.datasets.make import dry_run as dry_run_text
 
-        print(dry_run_text(recipe, out, workers, shard=shard, samples=samples, seed=seed))
+        print(dry_run_text(recipe, out, workers, shard=shard, samples=samples, seed=seed, replace=replace))
         return 0
     from phibench.estimator.paper.sensitivity_table import make as make_dataset
 
-    make_dataset(recipe, out, workers, scheduler=scheduler, shard=shard, samples=samples, seed=seed)
+    make_dataset(recipe, out, workers, scheduler=scheduler, shard=shard, samples=samples, seed=seed, replace=replace)
     return 0
 
 

@@ -108,12 +108,13 @@ def make(
     shard: str | None = None,
     samples: int | None = None,
     seed: int | None = None,
+    replace: bool = False,
 ) -> Path:
     """Make the data set of a recipe; parameters and errors are those of `phibench.datasets.make.make`.
 
     A shard has no table of sensitivities: `merge` writes that of the whole.
     """
-    folder = rendering.make(recipe, out, workers, console, scheduler, shard, samples, seed)
+    folder = rendering.make(recipe, out, workers, console, scheduler, shard, samples, seed, replace)
     if shard is None:
         keep_sensitivities(folder)
     return folder

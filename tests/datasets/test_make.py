@@ -123,7 +123,9 @@ def test_a_folder_with_other_things_is_refused(tmp_path: Path) -> None:
 
 def test_a_folder_with_another_data_set_is_refused(smallest_dataset: Path) -> None:
     before = (smallest_dataset / schema.CHECKSUMS).read_text()
-    assert "holds another data set ('smallest')" in refusal(smallest_dataset, Path("smoke"))
+    text = refusal(smallest_dataset, Path("smoke"))
+    assert "holds 8 finished tasks of another data set ('smallest')" in text
+    assert "--replace" in text
     assert (smallest_dataset / schema.CHECKSUMS).read_text() == before
     assert damaged(smallest_dataset) == []
 
@@ -277,9 +279,12 @@ def test_the_preview_of_a_folder_with_a_data_set(smallest_dataset: Path, tmp_pat
     copy = Path(shutil.copytree(smallest_dataset, tmp_path / "copy"))
     before = sorted((path, path.stat().st_mtime_ns) for path in copy.rglob("*"))
     assert "to make: nothing, 8 tasks in all" in make.dry_run(SMALLEST, copy)
-    assert "to make: 1 spot, 1 view, 1 sample;" in make.dry_run(_changed(tmp_path, "[0.5]", "[0.6]"), copy)
+    told = make.dry_run(_changed(tmp_path, "[0.5]", "[0.6]"), copy)
+    assert "to make: 1 spot, 1 view, 1 sample;" in told
+    assert f"will be refused: {copy} holds 3 finished tasks (1 spot, 1 view, 1 sample) that" in told
+    assert "will be refused" not in make.dry_run(tmp_path / "changed.toml", copy, replace=True)
     assert sorted((path, path.stat().st_mtime_ns) for path in copy.rglob("*")) == before
-    with pytest.raises(DatasetError, match="holds another data set"):
+    with pytest.raises(DatasetError, match="of another data set"):
         make.dry_run("smoke", copy)
 
 
@@ -297,12 +302,13 @@ def test_without_mitsuba_frames_may_change_and_nothing_may_be_rendered(smallest_
         (blocked / name / "__init__.py").write_text(f"raise ModuleNotFoundError('none', name='{name}')")
     path = os.pathsep.join([str(blocked), os.environ.get("PYTHONPATH", "")])
 
-    def run(recipe: Path, out: Path) -> "subprocess.CompletedProcess[str]":
+    def run(recipe: Path, out: Path, replace: str = "") -> "subprocess.CompletedProcess[str]":
         code = (
             "import sys\nfrom phibench.datasets.make import make\nfrom phibench.datasets.errors import DatasetError\n"
-            "try: make(sys.argv[1], sys.argv[2])\nexcept DatasetError as error: sys.exit(str(error))"
+            "try: make(*sys.argv[1:3], replace=bool(sys.argv[3]))\n"
+            "except DatasetError as error: sys.exit(str(error))"
         )
-        command = [sys.executable, "-c", code, str(recipe), str(out)]
+        command = [sys.executable, "-c", code, str(recipe), str(out), replace]
         return subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path})
 
     frames = _changed(tmp_path, "[ambient]", '[frames]\npresets = ["mjpeg"]\n\n[ambient]')
@@ -315,7 +321,7 @@ def test_without_mitsuba_frames_may_change_and_nothing_may_be_rendered(smallest_
     child = run(frames, tmp_path / "new")
     assert child.returncode == 1
     assert "Mitsuba is not installed" in child.stderr
-    child = run(_changed(tmp_path, "bounces = 2", "bounces = 1"), copy)
+    child = run(_changed(tmp_path, "bounces = 2", "bounces = 1"), copy, "--replace")
     assert child.returncode == 1
     assert "6 of 8 tasks are to be done, such as 'bake room', and" in child.stderr
     assert "Mitsuba is not installed" in child.stderr

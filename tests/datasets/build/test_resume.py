@@ -33,7 +33,7 @@ def copy(smallest_dataset: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(smallest_dataset, tmp_path / "copy"))
 
 
-def again(out: Path, *changes: tuple[str, str]) -> list[str]:
+def again(out: Path, *changes: tuple[str, str], replace: bool = False) -> list[str]:
     """Make with a changed recipe; the tasks that were done."""
     text = SMALLEST.read_text()
     for old, new in changes:
@@ -42,7 +42,7 @@ def again(out: Path, *changes: tuple[str, str]) -> list[str]:
     recipe = out.parent / "changed.toml"
     recipe.write_text(text)
     (out / schema.LOG).write_text("")
-    make(recipe, out, workers=1, console=quiet())
+    make(recipe, out, workers=1, console=quiet(), replace=replace)
     return done(out)
 
 
@@ -57,23 +57,58 @@ BAKE = ["bake room"]
 VIEWS = ["view h0.000", "view h0.500", "view h1.400"]
 
 
+LOST = "that this run would delete or make again, they were made with another"
 CHANGES = (
-    ("seed = 0", "seed = 0  # a comment", []),
-    ("depth_m = 1.975", "depth_m = 1.975\ndiameter_m = 6e-3", [SAMPLES[1], SPOTS[1]]),
-    ("bounces = 2", "bounces = 1", BAKE + SAMPLES + VIEWS),
-    ("cells_per_pixel = 2", "cells_per_pixel = 3", SAMPLES + VIEWS),
-    ("seed = 0", "seed = 1", SAMPLES + VIEWS),
-    ("[ambient]", "[laser]\npower_w = 2e-3\n\n[ambient]", SAMPLES + SPOTS),
-    ("[0.5]", "[0.5, 1.4]", ["sample seen-near-h1.400", "spot seen-near-h1.400"]),
-    ("[0.5", "[0.6", ["sample seen-near-h0.600", "spot seen-near-h0.600", "view h0.600"]),
+    ("seed = 0", "seed = 0  # a comment", [], ""),
+    (
+        "depth_m = 1.975",
+        "depth_m = 1.975\ndiameter_m = 6e-3",
+        [SAMPLES[1], SPOTS[1]],
+        f"2 finished tasks (1 spot, 1 sample) {LOST} [targets];",
+    ),
+    (
+        "bounces = 2",
+        "bounces = 1",
+        BAKE + SAMPLES + VIEWS,
+        f"6 finished tasks (1 bake, 3 views, 2 samples) {LOST} [ambient];",
+    ),
+    ("cells_per_pixel = 2", "cells_per_pixel = 3", SAMPLES + VIEWS, "5 finished tasks (3 views, 2 samples)"),
+    (
+        "seed = 0",
+        "seed = 8231",  # which may be a secret
+        SAMPLES + VIEWS,
+        f"5 finished tasks (3 views, 2 samples) {LOST} seed; "
+        "give another folder, or `phibench dataset make --replace` to lose them",
+    ),
+    ("[ambient]", "[laser]\npower_w = 2e-3\n\n[ambient]", SAMPLES + SPOTS, "4 finished tasks (2 spots, 2 samples)"),
+    ("[0.5]", "[0.5, 1.4]", ["sample seen-near-h1.400", "spot seen-near-h1.400"], ""),
+    (
+        "[0.5",
+        "[0.6",
+        ["sample seen-near-h0.600", "spot seen-near-h0.600", "view h0.600"],
+        f"3 finished tasks (1 spot, 1 view, 1 sample) {LOST} [experiments];",
+    ),
 )
+"""Old text, new text, tasks that are made again, and what a run without --replace says would be lost."""
+
+
+def allowed(copy: Path, lost: str, *changes: tuple[str, str]) -> list[str]:
+    """Tasks that are done; where finished work would be lost, it is counted first, and nothing is touched."""
+    if lost:
+        before = contents(copy)
+        with pytest.raises(DatasetError) as caught:
+            again(copy, *changes)
+        assert f"{copy} holds {lost}" in str(caught.value)
+        assert [word for word in ("\n", "8231", "[dataset]") if word in str(caught.value)] == []
+        assert contents(copy) == before
+    return again(copy, *changes, replace=bool(lost))
 
 
 @pytest.mark.usefixtures("inline")
 def test_only_what_changes_one_after_the_other_change_is_made_again(copy: Path) -> None:
     made = []
-    for count, (_, _, expected) in enumerate(CHANGES, 1):
-        assert again(copy, *((old, new) for old, new, _ in CHANGES[:count])) == expected
+    for count, (_, _, expected, lost) in enumerate(CHANGES, 1):
+        assert allowed(copy, lost, *((old, new) for old, new, *_ in CHANGES[:count])) == expected
         made += expected
     fresh = make(copy.parent / "changed.toml", copy.parent / "fresh", workers=1, console=quiet())
     assert contents(copy) == contents(fresh)  # also: nothing of what was removed is left
@@ -82,16 +117,19 @@ def test_only_what_changes_one_after_the_other_change_is_made_again(copy: Path) 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("inline")
-@pytest.mark.parametrize(("old", "new", "expected"), CHANGES)
-def test_only_what_a_change_changes_is_made_again(copy: Path, old: str, new: str, expected: list[str]) -> None:
-    assert again(copy, (old, new)) == expected
+@pytest.mark.parametrize(("old", "new", "expected", "lost"), CHANGES)
+def test_only_what_a_change_changes_is_made_again(
+    copy: Path, old: str, new: str, expected: list[str], lost: str
+) -> None:
+    assert allowed(copy, lost, (old, new)) == expected
     fresh = make(copy.parent / "changed.toml", copy.parent / "fresh", workers=1, console=quiet())
     assert contents(copy) == contents(fresh)  # also: nothing of what was removed is left
 
 
 @pytest.mark.usefixtures("inline")
 def test_a_room_whose_lamps_go_out_loses_its_light_map(copy: Path) -> None:
-    assert "bake room" not in again(copy, ("[ambient]", '[room]\nname = "dark"\n\n[ambient]'))
+    dark = ("[ambient]", '[room]\nname = "dark"\n\n[ambient]')
+    assert "bake room" not in again(copy, dark, replace=True)
     assert not (copy / schema.LIGHT_MAP).exists()
     assert schema.LIGHT_MAP not in (copy / schema.CHECKSUMS).read_text()
 

@@ -48,6 +48,37 @@ def test_a_merged_folder_goes_on_as_a_made_one(shards: list[Path], tmp_path: Pat
     assert "nothing to do" in console.file.getvalue()  # type: ignore[attr-defined]
 
 
+def test_a_job_array_with_one_folder_does_not_eat_itself(
+    shards: list[Path], smallest_dataset: Path, tmp_path: Path
+) -> None:
+    one, whole = shards[0], Path(shutil.copytree(smallest_dataset, tmp_path / "whole"))
+    for out, count, cause in (
+        (one, "4 finished tasks (1 spot, 2 views, 1 sample)", "shard 1/2"),
+        (whole, "3 finished tasks (1 spot, 1 view, 1 sample)", "no shard"),
+    ):
+        before = contents(out)
+        with pytest.raises(DatasetError, match="--replace") as caught:
+            make(SMALLEST, out, workers=1, console=quiet(), shard="2/2")
+        assert f"holds {count} that this run would delete or make again, they were made with {cause};" in str(
+            caught.value
+        )
+        assert contents(out) == before
+    make(SMALLEST, one, workers=1, console=quiet())  # a shard may grow to the whole
+    assert contents(one) == contents(smallest_dataset)
+    make(SMALLEST, whole, workers=1, console=quiet(), shard="2/2", replace=True)
+    assert contents(whole) == contents(shards[1])
+
+
+def test_a_merge_deletes_no_finished_work(shards: list[Path], tmp_path: Path) -> None:
+    other = tmp_path / "other.toml"
+    other.write_text(SMALLEST.read_text().replace("[0.5]", "[0.6]"))
+    out = make(other, tmp_path / "other", workers=1, console=quiet(), shard="1/2")
+    before = contents(out)
+    with pytest.raises(DatasetError, match=r"holds \d finished tasks .* give another folder$"):
+        merge(out, shards, quiet())
+    assert contents(out) == before
+
+
 @pytest.mark.parametrize("n", [1, 2, 3, 7, 25])
 def test_every_sample_has_one_owner(n: int) -> None:
     whole = make_plan(load_recipe("paper"))

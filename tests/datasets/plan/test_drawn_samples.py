@@ -13,12 +13,12 @@ import pytest
 from helpers.drawn_values import shipped
 from helpers.folders import contents, done
 from helpers.inline_workers import InlineWorkerPool
-from helpers.processes import quiet
+from helpers.processes import quiet, said
 
 from phibench.datasets.build.forecast import forecast
 from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.make import make
+from phibench.datasets.make import dry_run, make
 from phibench.datasets.merge_repair import merge, repair
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.read import open_dataset, open_finished
@@ -75,9 +75,36 @@ def test_more_samples_keep_every_byte_and_render_only_the_new_ones(made: Path, c
         assert after[name].startswith(before[name])
     fresh = make(tmp_path / "5.toml", tmp_path / "fresh", workers=1, console=quiet())
     assert contents(fresh) == after
-    # And back: what is no longer wanted goes, the rest is as it was.
-    make(TINY, copy, workers=1, console=quiet())
+    _fewer_samples(copy, before, after)
+
+
+def _fewer_samples(copy: Path, before: dict[str, bytes], after: dict[str, bytes]) -> None:
+    """Fewer samples into a finished folder of five: all five stay, the first three are those of three."""
+    for options in ({}, {"samples": 3}, {"samples": 4}):
+        make(TINY, copy, workers=1, console=(console := quiet()), **options)  # type: ignore[arg-type]
+        assert f"keeps its 5 samples; the first {options.get('samples', 3)} of them are those" in said(console)
+        assert contents(copy) == after
+    assert "keeps its 5 samples" in dry_run(TINY, copy)
+    assert after[schema.MANIFEST].splitlines()[:3] == before[schema.MANIFEST].splitlines()
+    kept = "holds 15 finished tasks (10 views, 5 samples) that"
+    assert kept in refusal(copy, seed=7)
+    # an unfinished one is not finished by the way, and what there is of it not deleted
+    (copy / schema.CHECKSUMS).rename(copy.parent / "aside")
+    text = refusal(copy, samples=3)
+    assert "holds 8 finished tasks (2 spots, 4 views, 2 samples) that" in text
+    assert "made with 5 samples; give" in text
+    (copy.parent / "aside").rename(copy / schema.CHECKSUMS)
+    assert contents(copy) == after
+    make(TINY, copy, workers=1, console=(console := quiet()), replace=True)
+    assert "keeps" not in said(console)
     assert contents(copy) == before
+
+
+def refusal(out: Path, **options: int) -> str:
+    with pytest.raises(DatasetError) as caught:
+        make(TINY, out, workers=1, console=quiet(), **options)  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
 
 
 def test_a_drawn_data_set_is_what_its_recipe_means(made: Path) -> None:

@@ -1,0 +1,143 @@
+"""Finished work of a folder that a run with other values would lose: it is counted, and the run is refused.
+
+Work is finished when the journal has its line and its files have the bytes that the line tells. Where lines of the
+journal are lost, SHA256SUMS of a finished data set vouches for files. Camera frames are no such work: they are drawn
+from the layers in seconds, in folders of their own.
+
+A finished data set of more samples than a run asks for is kept whole: its first samples are those that are asked for.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from phibench.datasets.build.journal import Entry, FolderHead, Journal
+from phibench.datasets.build.run_tasks import held_head, is_intact
+from phibench.datasets.build.task_list import plan_tasks
+from phibench.datasets.build.workers import versions
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.plan.plan import make_plan, shard_plan
+from phibench.datasets.recipe.load import parse_recipe
+from phibench.datasets.recipe.tables import Recipe
+from phibench.datasets.store import schema
+from phibench.datasets.store.checksums import read_checksums
+from phibench.datasets.store.documents import parse_info
+from phibench.datasets.store.provenance import code_sha256
+from phibench.datasets.store.schema import DatasetInfo
+
+OR_REPLACE = "give another folder, or `phibench dataset make --replace` to lose them"
+_NOT_IN_KEYS = ("dataset", "frames", "distractors")
+"""Tables of a recipe: the first is told by itself, on the others no task depends."""
+_ENVIRONMENT = ("python", "machine", "packages", "variant", "llvm", "threads_per_process")
+
+
+def lost_work(out: Path, keys: Mapping[str, str], journal: Journal, wanted: DatasetInfo) -> str | None:
+    """Finished work that a run would delete or make again, as the beginning of a sentence; None if there is none.
+
+    Parameters
+    ----------
+    out : folder
+    keys : key of every task of the run, by name
+    journal : that of the folder
+    wanted : description of the data set that the run makes
+    """
+    tasks = _lost_tasks(out, keys, journal)
+    files = [] if tasks else _lost_files(out, keys, journal)
+    if not tasks and not files:
+        return None
+    counts = Counter(name.split(" ", 1)[0] for name in tasks)
+    parts = ", ".join(f"{count} {kind}{'s' * (count != 1)}" for kind, count in counts.items())
+    what = f"{len(tasks)} finished tasks ({parts})" if tasks else f"{len(files)} finished files, such as {files[0]},"
+    causes = " and ".join(_causes(_held_info(out, journal), wanted))
+    return f"{out} holds {what} that this run would delete or make again, they were made with {causes}"
+
+
+def _lost_tasks(out: Path, keys: Mapping[str, str], journal: Journal) -> list[str]:
+    """Tasks whose files are good, and which the run does not have or makes from other values."""
+    other = [name for name, entry in journal.entries.items() if entry.files and keys.get(name) != entry.key]
+    with ThreadPoolExecutor(2) as pool:  # hashing lets go of the interpreter
+        good = list(pool.map(lambda name: is_intact(journal.entries[name], out), other))
+    return [name for name, intact in zip(other, good, strict=True) if intact]
+
+
+def _lost_files(out: Path, keys: Mapping[str, str], journal: Journal) -> list[str]:
+    """Files that SHA256SUMS vouches for and the journal does not know, where the run's tasks are not the folder's."""
+    try:
+        listed = read_checksums(out)
+    except DatasetError:  # not finished, or nobody can tell
+        return []
+    known = {name for entry in journal.entries.values() for name in entry.files}
+    unknown = {name: digest for name, digest in listed.items() if schema.is_task_file(name) and name not in known}
+    if not unknown or _held_keys(out, journal).items() <= keys.items():
+        return []
+    return [name for name, digest in unknown.items() if is_intact(Entry("", "", {name: digest}), out)]
+
+
+def _held_keys(out: Path, journal: Journal) -> dict[str, str]:
+    """Keys of the tasks that made a folder, by its own description; one that nothing has if that does not tell."""
+    unlike = {"": ""}
+    head, info = _held_head(out, journal), _held_info(out, journal)
+    if head is None or info is None or info.provenance.get("code_sha256") != code_sha256():
+        return unlike
+    try:
+        plan = shard_plan(make_plan(parse_recipe(head.recipe)), info.shard)
+        return {name: task.key for name, task in plan_tasks(plan, versions(info.provenance)).items()}
+    except (DatasetError, KeyError, TypeError):  # a description that somebody changed
+        return unlike
+
+
+def _held_head(out: Path, journal: Journal) -> FolderHead | None:
+    return journal.head or held_head(out)
+
+
+def _held_info(out: Path, journal: Journal) -> DatasetInfo | None:
+    head = _held_head(out, journal)
+    try:
+        return None if head is None else parse_info(head.info)
+    except ValueError:  # of another version
+        return None
+
+
+def _causes(held: DatasetInfo | None, wanted: DatasetInfo) -> list[str]:
+    """Differences of two descriptions, in words; a seed may be a secret and is not told."""
+    if held is None:
+        return ["another version of phibench"]
+    causes = [f"the name '{held.name}'"] if held.name != wanted.name else []
+    old, new = held.recipe, wanted.recipe
+    table = old.get("dataset")
+    if not isinstance(table, dict) or table.get("seed") != new["dataset"]["seed"]:
+        causes.append("another seed")
+    if held.shard != wanted.shard:
+        causes.append(f"shard {held.shard}" if held.shard else "no shard")
+    for name in new:
+        if name not in _NOT_IN_KEYS and old.get(name) != new[name]:
+            causes.append(_table_cause(name, old.get(name), new[name]))
+    if held.provenance.get("code_sha256") != wanted.provenance["code_sha256"]:
+        causes.append("other code")
+    unlike = (name for name in _ENVIRONMENT if held.provenance.get(name) != wanted.provenance.get(name))
+    return [*causes, *(f"another {name}" for name in unlike)] or ["other values"]
+
+
+def _table_cause(name: str, old: Any, new: Any) -> str:
+    drawn = name == "random" and isinstance(old, dict) and isinstance(new, dict)
+    return f"{old['samples']} samples" if drawn and {**old, "samples": new["samples"]} == new else f"another [{name}]"
+
+
+def kept_samples(out: Path, recipe: Recipe) -> int | None:
+    """Number of samples of the finished data set in a folder, if it has more of the same than a recipe asks for."""
+    if recipe.random is None or not (out / schema.CHECKSUMS).is_file():
+        return None
+    head = held_head(out)
+    try:
+        if head is None or parse_info(head.info).shard is not None:
+            return None
+        held = parse_recipe(head.recipe)
+    except ValueError:  # of another version
+        return None
+    if held.random is None or held.dataset != recipe.dataset or held.random.samples <= recipe.random.samples:
+        return None
+    return held.random.samples
