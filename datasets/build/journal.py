@@ -4,7 +4,8 @@ It alone decides what is finished; names and times of files do not.
 
 Each line is one entry: a CRC-32 and a JSON object. The first is the folder's head, with the texts of `dataset.json` and
 `recipe.toml`, so that these can be repaired. One entry per finished task follows; the last one of a name counts. A line
-that was half-written or damaged fails its CRC and is ignored: its task is done again.
+that was half-written or damaged fails its CRC and is ignored: its task is done again. So is one whose files are not
+those of its task: nobody follows a name that leads elsewhere.
 """
 
 from __future__ import annotations
@@ -65,8 +66,10 @@ class Journal:
                 self.damaged.append(number)
             elif isinstance(document, FolderHead):
                 self.head = document
-            else:
+            elif set(document.files) <= schema.task_files(document.task):
                 self.entries[document.task] = document
+            else:
+                self.damaged.append(number)
 
     def __enter__(self) -> Journal:
         return self

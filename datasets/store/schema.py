@@ -251,8 +251,12 @@ SENSITIVITIES = "sensitivities.parquet"
 NOT_DATA = (CHECKSUMS, RUN, LOG, JOURNAL, LOCK, WORKING, CONTACT_SHEET, SENSITIVITIES)
 """Files that SHA256SUMS does not list: itself, the diaries of the run, locks, and what is computed from it all."""
 
+_ID = r"[A-Za-z0-9][A-Za-z0-9_.-]*"
+"""Ids of poses and samples: no separator, and no dot in front, so that no file leaves its folder."""
+_TASK = re.compile(rf"(bake|view|spot|sample) ({_ID})")
 _TASK_FILE = re.compile(
-    r"lightmap\.npz|views/[^/]+/(ambient|truth)\.exr|views/[^/]+/preview\.png|spots/[^/]+-(down|up)\.exr|previews/[^/]+\.png"
+    rf"lightmap\.npz|views/{_ID}/(ambient|truth)\.exr|views/{_ID}/preview\.png|"
+    rf"spots/{_ID}-(down|up)\.exr|previews/{_ID}\.png"
 )
 
 
@@ -269,6 +273,21 @@ def spot_file(sample_id: str, position: str) -> str:
 def preview_file(sample_id: str) -> str:
     """Picture of a sample: down and up side by side, laser on."""
     return f"previews/{sample_id}.png"
+
+
+def task_files(task: str) -> frozenset[str]:
+    """Files that a task may write, by its name; none for what is no task."""
+    found = _TASK.fullmatch(task)
+    if found is None:
+        return frozenset()
+    kind, name = found.groups()
+    files = {
+        "bake": (LIGHT_MAP,),
+        "view": tuple(view_file(name, which) for which in ("ambient", "truth", "preview")),
+        "spot": tuple(spot_file(name, position) for position in ("down", "up")),
+        "sample": (preview_file(name),),
+    }
+    return frozenset(files[kind])
 
 
 def is_task_file(name: str) -> bool:

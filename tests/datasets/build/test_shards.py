@@ -1,13 +1,17 @@
 """Shards: any division gives the bytes of an undivided run, and a merge of what does not fit is refused."""
 
+import json
 import shutil
-from collections.abc import Sequence
+import zlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
 from helpers.folders import contents
+from helpers.inline_workers import InlineWorkerPool
 from helpers.processes import SMALLEST, quiet
 
+from phibench.datasets.build.journal import Journal
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import make
 from phibench.datasets.merge_repair import merge
@@ -19,9 +23,18 @@ from phibench.datasets.verify import verify
 from phibench.scenes.rig import POSITIONS
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Path]]:
+    """Both halves. Read only: copy them to change them."""
+    folder = tmp_path_factory.mktemp("shards")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("phibench.datasets.make.WorkerPool", InlineWorkerPool)
+        yield [make(SMALLEST, folder / f"s{i}", workers=1, console=quiet(), shard=f"{i}/2") for i in (1, 2)]
+
+
 @pytest.fixture
-def shards(smallest_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, inline: None) -> list[Path]:
-    return [make(SMALLEST, tmp_path / f"s{i}", workers=1, console=quiet(), shard=f"{i}/2") for i in (1, 2)]
+def shards(made: list[Path], tmp_path: Path, inline: None) -> list[Path]:
+    return [Path(shutil.copytree(shard, tmp_path / shard.name)) for shard in made]
 
 
 def test_merged_shards_are_the_undivided_run(shards: list[Path], smallest_dataset: Path, tmp_path: Path) -> None:
@@ -53,7 +66,7 @@ def test_a_job_array_with_one_folder_does_not_eat_itself(
 ) -> None:
     one, whole = shards[0], Path(shutil.copytree(smallest_dataset, tmp_path / "whole"))
     for out, count, cause in (
-        (one, "4 finished tasks (1 spot, 2 views, 1 sample)", "shard 1/2"),
+        (one, "3 finished tasks (1 spot, 1 view, 1 sample)", "shard 1/2"),
         (whole, "3 finished tasks (1 spot, 1 view, 1 sample)", "no shard"),
     ):
         before = contents(out)
@@ -63,7 +76,8 @@ def test_a_job_array_with_one_folder_does_not_eat_itself(
             caught.value
         )
         assert contents(out) == before
-    make(SMALLEST, one, workers=1, console=quiet())  # a shard may grow to the whole
+    # what both shards have is no loss, and a shard may grow to the whole
+    make(SMALLEST, one, workers=1, console=quiet())
     assert contents(one) == contents(smallest_dataset)
     make(SMALLEST, whole, workers=1, console=quiet(), shard="2/2", replace=True)
     assert contents(whole) == contents(shards[1])
@@ -77,6 +91,37 @@ def test_a_merge_deletes_no_finished_work(shards: list[Path], tmp_path: Path) ->
     with pytest.raises(DatasetError, match=r"holds \d finished tasks .* give another folder$"):
         merge(out, shards, quiet())
     assert contents(out) == before
+
+
+def forged(journal: Path, task: str, name: str) -> None:
+    """Let the journal's line of a task, with a good CRC, name another file in place of its first one."""
+    lines = []
+    for line in journal.read_bytes().splitlines():
+        document = json.loads(line.partition(b" ")[2])
+        if document.get("task") == task:
+            digests = list(document["files"].values())
+            document["files"] = dict(zip([name, *list(document["files"])[1:]], digests, strict=True))
+        text = json.dumps(document).encode()
+        lines.append(b"%08x %b\n" % (zlib.crc32(text), text))
+    journal.write_bytes(b"".join(lines))
+
+
+def test_a_merge_writes_nothing_but_the_files_of_its_tasks(shards: list[Path], tmp_path: Path) -> None:
+    """Whatever a shard's journal says: attack with a file that lies where the name leads, with the right hash."""
+    out, journal = tmp_path / "deep" / "er" / "merged", shards[0] / schema.JOURNAL
+    honest, file = journal.read_bytes(), schema.view_file("h0.500", "ambient")
+    for leads in ("../../x.exr", "../x.exr", str(tmp_path / "x.exr"), "views/../../x.exr", "views/../x.exr"):
+        (shards[0] / leads).write_bytes((shards[0] / file).read_bytes())
+    others = (schema.CHECKSUMS, schema.INFO, schema.JOURNAL, schema.view_file("h0.000", "ambient"), "", "views", "x\0")
+    before = sorted(tmp_path.parent.rglob("*"))
+    for name in ("../../x.exr", "../x.exr", str(tmp_path / "x.exr"), "views/../../x.exr", "views/../x.exr", *others):
+        forged(journal, "view h0.500", name)
+        assert "view h0.500" not in Journal(shards[0]).entries
+        assert refusal(out, shards).startswith("the shards lack 1 tasks, such as view h0.500;")
+        assert sorted(tmp_path.parent.rglob("*")) == before
+    forged(journal, "view h0.500", file)  # the forgery as such is not what is refused
+    assert journal.read_bytes() == honest
+    merge(out, shards, quiet())
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 7, 25])
