@@ -46,12 +46,14 @@ def lost_work(out: Path, keys: Mapping[str, str], journal: Journal, wanted: Data
     wanted : description of the data set that the run makes
     """
     tasks = _lost_tasks(out, keys, journal)
-    files = [] if tasks else _lost_files(out, keys, journal)
+    files = [] if tasks else _lost_files(out, keys, journal, wanted)
     if not tasks and not files:
         return None
     counts = Counter(name.split(" ", 1)[0] for name in tasks)
     parts = ", ".join(f"{count} {kind}{'s' * (count != 1)}" for kind, count in counts.items())
-    what = f"{len(tasks)} finished tasks ({parts})" if tasks else f"{len(files)} finished files, such as {files[0]},"
+    what = f"{len(tasks)} finished task{'s' * (len(tasks) != 1)} ({parts})"
+    if files:
+        what = f"{len(files)} finished file{'s' * (len(files) != 1)}, such as {files[0]},"
     causes = " and ".join(_causes(_held_info(out, journal), wanted))
     return f"{out} holds {what} that this run would delete or make again, they were made with {causes}"
 
@@ -64,7 +66,7 @@ def _lost_tasks(out: Path, keys: Mapping[str, str], journal: Journal) -> list[st
     return [name for name, intact in zip(other, good, strict=True) if intact]
 
 
-def _lost_files(out: Path, keys: Mapping[str, str], journal: Journal) -> list[str]:
+def _lost_files(out: Path, keys: Mapping[str, str], journal: Journal, wanted: DatasetInfo) -> list[str]:
     """Files that SHA256SUMS vouches for and the journal does not know, where the run's tasks are not the folder's."""
     try:
         listed = read_checksums(out)
@@ -72,12 +74,12 @@ def _lost_files(out: Path, keys: Mapping[str, str], journal: Journal) -> list[st
         return []
     known = {name for entry in journal.entries.values() for name in entry.files}
     unknown = {name: digest for name, digest in listed.items() if schema.is_task_file(name) and name not in known}
-    if not unknown or _held_keys(out, journal).items() <= keys.items():
+    if not unknown or _held_keys(out, journal, wanted).items() <= keys.items():
         return []
     return [name for name, digest in unknown.items() if is_intact(Entry("", "", {name: digest}), out)]
 
 
-def _held_keys(out: Path, journal: Journal) -> dict[str, str]:
+def _held_keys(out: Path, journal: Journal, wanted: DatasetInfo) -> dict[str, str]:
     """Keys of the tasks that made a folder, by its own description; one that nothing has if that does not tell."""
     unlike = {"": ""}
     head, info = _held_head(out, journal), _held_info(out, journal)
@@ -85,7 +87,9 @@ def _held_keys(out: Path, journal: Journal) -> dict[str, str]:
         return unlike
     try:
         plan = shard_plan(make_plan(parse_recipe(head.recipe)), info.shard)
-        return {name: task.key for name, task in plan_tasks(plan, versions(info.provenance)).items()}
+        # a description that `repair` has recovered does not know the renderer
+        environment = versions({**wanted.provenance, **info.provenance})
+        return {name: task.key for name, task in plan_tasks(plan, environment).items()}
     except (DatasetError, KeyError, TypeError):  # a description that somebody changed
         return unlike
 

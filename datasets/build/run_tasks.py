@@ -107,9 +107,10 @@ def refuse_other(out: Path, name: str | None) -> None:
         raise DatasetError(f"{out} is a file; give a folder")
     head = held_head(out)
     if name is not None and head is not None and (held := parse_info(head.info).name) != name:
-        count = f"{len(Journal(out).entries)} finished tasks of" if Journal(out).entries else ""
+        count = len(Journal(out).entries)
+        what = f"{count} finished task{'s' * (count != 1)} of another data set" if count else "another data set"
         remedy = "give another folder, or `phibench dataset make --replace` to delete it"
-        raise DatasetError(f"{out} holds {count} another data set ('{held}'); {remedy}".replace("  ", " "))
+        raise DatasetError(f"{out} holds {what} ('{held}'); {remedy}")
 
 
 def held_head(out: Path) -> FolderHead | None:

@@ -3,8 +3,9 @@
 import json
 import shutil
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 from helpers.folders import contents
@@ -84,26 +85,32 @@ def test_a_job_array_with_one_folder_does_not_eat_itself(
 
 
 def test_a_merge_deletes_no_finished_work(shards: list[Path], tmp_path: Path) -> None:
-    other = tmp_path / "other.toml"
-    other.write_text(SMALLEST.read_text().replace("[0.5]", "[0.6]"))
-    out = make(other, tmp_path / "other", workers=1, console=quiet(), shard="1/2")
+    out = Path(shutil.copytree(shards[0], tmp_path / "other"))
+    rewritten(out / schema.JOURNAL, "view h0.500", lambda line: {**line, "key": "of another recipe"})
     before = contents(out)
-    with pytest.raises(DatasetError, match=r"holds \d finished tasks .* give another folder$"):
+    with pytest.raises(DatasetError, match=r"holds 1 finished task \(1 view\) .*; give another folder$"):
         merge(out, shards, quiet())
     assert contents(out) == before
 
 
-def forged(journal: Path, task: str, name: str) -> None:
-    """Let the journal's line of a task, with a good CRC, name another file in place of its first one."""
+def rewritten(journal: Path, task: str, change: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
+    """Change the journal's line of a task, with a good CRC."""
     lines = []
     for line in journal.read_bytes().splitlines():
         document = json.loads(line.partition(b" ")[2])
-        if document.get("task") == task:
-            digests = list(document["files"].values())
-            document["files"] = dict(zip([name, *list(document["files"])[1:]], digests, strict=True))
-        text = json.dumps(document).encode()
+        text = json.dumps(change(document) if document.get("task") == task else document).encode()
         lines.append(b"%08x %b\n" % (zlib.crc32(text), text))
     journal.write_bytes(b"".join(lines))
+
+
+def forged(journal: Path, task: str, name: str) -> None:
+    """Let the journal's line of a task name another file in place of its first one."""
+
+    def change(line: dict[str, Any]) -> dict[str, Any]:
+        names = [name, *list(line["files"])[1:]]
+        return {**line, "files": dict(zip(names, line["files"].values(), strict=True))}
+
+    rewritten(journal, task, change)
 
 
 def test_a_merge_writes_nothing_but_the_files_of_its_tasks(shards: list[Path], tmp_path: Path) -> None:
