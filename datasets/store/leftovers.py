@@ -91,9 +91,58 @@ def _locked(handle: int, wait: bool = False) -> bool:
 
 
 def remove_tree(path: Path) -> None:
-    """Remove a folder with all that it holds; never raises, and what cannot be removed stays."""
-    with contextlib.suppress(OSError, RecursionError):  # as deep as nobody makes folders by accident
+    """Remove a folder with all that it holds; never raises, follows no link, and what cannot be removed stays.
+
+    Subfolders are moved up and emptied one by one, so that neither their depth nor the length of their paths matters.
+    """
+    if os.name == "nt":  # no files relative to a folder
         shutil.rmtree(path, ignore_errors=True)
+        return
+    with contextlib.suppress(OSError):
+        if path.is_symlink():  # put in the folder's place
+            path.unlink()
+            return
+        top = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        try:
+            _empty(top)
+        finally:
+            os.close(top)
+        path.rmdir()
+
+
+def _empty(top: int) -> None:
+    os.fchmod(top, stat.S_IRWXU)
+    name_of_moved, moved, failed = os.urandom(8).hex(), 0, False  # a name that nothing in there has
+    while not failed:
+        folders = list(_without_files(top))
+        if not folders:
+            return
+        for name in folders:
+            with contextlib.suppress(OSError):  # one that cannot be written can be neither moved nor emptied
+                os.chmod(name, stat.S_IRWXU, dir_fd=top)
+            try:
+                inner = os.open(name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=top)
+                try:
+                    for below in list(_without_files(inner)):
+                        os.chmod(below, stat.S_IRWXU, dir_fd=inner)
+                        moved += 1
+                        os.rename(below, f"{name_of_moved}-{moved}", src_dir_fd=inner, dst_dir_fd=top)
+                finally:
+                    os.close(inner)
+                os.rmdir(name, dir_fd=top)
+            except OSError:
+                failed = True  # of another user, or a mount point: it stays
+
+
+def _without_files(folder: int) -> Iterator[str]:
+    """Names of the folders in an open folder; all else in it is removed."""
+    with os.scandir(folder) as entries:
+        for entry in list(entries):
+            if entry.is_dir(follow_symlinks=False):
+                yield entry.name
+            else:
+                with contextlib.suppress(OSError):
+                    os.unlink(entry.name, dir_fd=folder)
 
 
 def _made(where: Path, prefix: str) -> tuple[Path, int | None]:

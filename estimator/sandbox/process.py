@@ -33,7 +33,7 @@ from phibench.estimator.sandbox.answers import AnswerError, checked
 from phibench.estimator.sandbox.isolation import Access, Isolation
 from phibench.estimator.sandbox.readable_files import access_of
 from phibench.estimator.sandbox.resolve import MethodError, Reference, RunLimits
-from phibench.estimator.sandbox.supervisor import HUNG_UP, KILL_SECONDS, processes_in, remove_tree
+from phibench.estimator.sandbox.supervisor import HUNG_UP, KILL_SECONDS, processes_in
 from phibench.estimator.sandbox.transport import (
     LEAST_BYTES,
     Connection,
@@ -307,7 +307,6 @@ class _Running:
     def _give_back(self) -> None:
         self._connection.close()
         self._memory.close()
-        remove_tree(self._owned.path)  # of any depth
         self._owned.close()
 
     def load(self, reference: Reference, limits: RunLimits) -> Isolation:

@@ -5,7 +5,7 @@ the worker has started and removes the working folder. On Linux it is a child su
 own (setsid) becomes its child when its parent dies. The worker is killed if its supervisor dies (parent-death signal).
 It ends as the worker did: with the same exit code, or of the same signal.
 
-Nothing but the standard library is imported here, so that the process is small and the worker starts from it quickly.
+Little but the standard library is imported here, so that the process is small and the worker starts from it quickly.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ import os
 import resource
 import select
 import signal
-import stat
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+
+from phibench.datasets.store.leftovers import remove_tree
 
 HUNG_UP = 97
 """Exit code of a supervisor whose runner hung up before the worker ended."""
@@ -166,58 +167,6 @@ def _prctl(option: int, value: int) -> None:
     if sys.platform == "linux":
         with contextlib.suppress(OSError, AttributeError):
             ctypes.CDLL(None).prctl(option, value, 0, 0, 0)
-
-
-def remove_tree(folder: Path) -> None:
-    """Remove a folder with all that is in it; never raises, and follows no link.
-
-    Subfolders are moved up and emptied one by one, so that neither their depth nor the length of their paths matters.
-    """
-    with contextlib.suppress(OSError):
-        if folder.is_symlink():  # put in the folder's place
-            folder.unlink()
-            return
-        top = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-        try:
-            _empty(top)
-        finally:
-            os.close(top)
-        folder.rmdir()
-
-
-def _empty(top: int) -> None:
-    os.fchmod(top, stat.S_IRWXU)
-    moved, failed = 0, False
-    while not failed:
-        folders = list(_without_files(top))
-        if not folders:
-            return
-        for name in folders:
-            with contextlib.suppress(OSError):  # one that cannot be written can be neither moved nor emptied
-                os.chmod(name, stat.S_IRWXU, dir_fd=top)
-            try:
-                inner = os.open(name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=top)
-                try:
-                    for below in list(_without_files(inner)):
-                        os.chmod(below, stat.S_IRWXU, dir_fd=inner)
-                        moved += 1
-                        os.rename(below, f".phibench-{os.getpid()}-{moved}", src_dir_fd=inner, dst_dir_fd=top)
-                finally:
-                    os.close(inner)
-                os.rmdir(name, dir_fd=top)
-            except OSError:
-                failed = True  # of another user, or a mount point: it stays
-
-
-def _without_files(folder: int) -> Iterator[str]:
-    """Names of the folders in an open folder; all else in it is removed."""
-    with os.scandir(folder) as entries:
-        for entry in list(entries):
-            if entry.is_dir(follow_symlinks=False):
-                yield entry.name
-            else:
-                with contextlib.suppress(OSError):
-                    os.unlink(entry.name, dir_fd=folder)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from phibench.datasets.store.files import require_writable
-from phibench.datasets.store.leftovers import OwnedFolder, remove_leftovers
+from phibench.datasets.store.leftovers import OwnedFolder, remove_leftovers, remove_tree
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs flock")
 
@@ -122,3 +122,27 @@ def test_a_folder_that_got_another_name_stays(tmp_path: Path) -> None:
         (folder / "file").write_bytes(b"1")
         folder.replace(tmp_path / "public")
     assert [path.name for path in tmp_path.rglob("*")] == ["public", "file"]
+
+
+def test_removing_a_folder_follows_no_link_and_needs_no_permission(tmp_path: Path) -> None:
+    precious, folder = tmp_path / "precious", tmp_path / "folder"
+    (folder / "closed" / "below").mkdir(parents=True)
+    precious.mkdir()
+    (precious / "file").touch()
+    (folder / "link").symlink_to(precious)
+    (folder / "closed" / "below" / "link").symlink_to(precious)
+    os.mkfifo(folder / "pipe")
+    (folder / "closed").chmod(0)
+    inner = os.open(folder, os.O_RDONLY)
+    for _ in range(1500):  # deeper than Python recurses and than a path may be long
+        os.mkdir("deep", dir_fd=inner)
+        outer, inner = inner, os.open("deep", os.O_RDONLY, dir_fd=inner)
+        os.close(outer)
+    os.close(inner)
+    remove_tree(folder)
+    assert not folder.exists()
+    assert (precious / "file").exists()
+    remove_tree(folder)  # gone already
+    folder.symlink_to(precious)
+    remove_tree(folder)
+    assert (precious / "file").exists()
