@@ -13,8 +13,8 @@ depth found
     Both spots of the pair are found, and a finite depth above 0 follows: the method's own, else that of the positions.
 
 Errors are over found spots. "Missed counted" is over visible spots: a missed one counts as `match_px`, a missed depth
-as `missed_relative`. The ranks also count false detections: see `rank_squares`. No answer counts more than none, so
-that an error is cut off at what a missed spot costs.
+as the best constant answer for the set would (`best_constant`). The ranks also count false detections: see
+`rank_squares`. No answer counts more than none, so that an error is cut off at what a missed spot costs.
 
 The kernels take n answers that share a nominal and a true rig; NaN where there is nothing to compare. Integer (u, v)
 are pixel centres. Phi does not depend on the carriage: rigs are taken at the down position.
@@ -49,8 +49,9 @@ class Rules:
     ----------
     match_px : float
         Largest distance of a position from the truth that counts as found.
-    missed_relative : float
-        Relative depth error as which a missed pair counts.
+    missed_relative, least_missed_relative : float
+        Largest and smallest relative depth error as which a missed pair counts; between them the best constant's. Below
+        10 % all pairs are at nearly one depth, and a constant that is made of their truth tells nothing.
     missed_phi_rad : float
         Error of phi as which a missed spot counts, and a false detection in a rank. 3 px along the radius are 9 to
         19 mrad on the rigs of the shipped recipes, so that every found spot counts less than a missed one.
@@ -60,21 +61,31 @@ class Rules:
         Bootstrap resamples of the samples.
     least_samples : int
         With fewer samples a metric has no interval.
+    least_compared : int
+        With fewer samples a comparison has no verdict.
     """
 
     match_px: float = MATCH_PX
     missed_relative: float = 1.0
+    least_missed_relative: float = 0.1
     missed_phi_rad: float = 0.02
     confidence: float = 0.95
     resamples: int = 1999
     least_samples: int = 5
+    least_compared: int = 30
 
     def __post_init__(self) -> None:
         _above("match_px", self.match_px, 0.0)
-        _above("missed_relative", self.missed_relative, 0.0)
+        _above("least_missed_relative", self.least_missed_relative, 0.0)
+        if not self.missed_relative >= self.least_missed_relative:
+            raise DatasetError(
+                f"Rules.missed_relative = {self.missed_relative:g}: must be least_missed_relative, "
+                f"{self.least_missed_relative:g}, or above"
+            )
         _above("missed_phi_rad", self.missed_phi_rad, 0.0)
         _above("resamples", self.resamples, 98)
         _above("least_samples", self.least_samples, 1)
+        _above("least_compared", self.least_compared, 1)
         if not 0.5 <= self.confidence < 1.0:
             raise DatasetError(f"Rules.confidence = {self.confidence:g}: allowed are 0.5 up to below 1")
 
@@ -82,6 +93,22 @@ class Rules:
 def _above(name: str, value: float, low: float) -> None:
     if not value > low:
         raise DatasetError(f"Rules.{name} = {value:g}: must be above {low:g}")
+
+
+def best_constant(depths_m: Array) -> float:
+    """Relative rms error of the constant that is best for some true depths; NaN for none.
+
+    Of c / D - 1 over n pairs the mean square is smallest for c = sum(1 / D) / sum(1 / D^2), where it is
+    1 - sum(1 / D)^2 / (n sum(1 / D^2)).
+
+    Parameters
+    ----------
+    depths_m : shape (n,), above 0
+    """
+    if not len(depths_m):
+        return float("nan")
+    q = 1.0 / np.asarray(depths_m, float)
+    return float(np.sqrt(max(0.0, 1.0 - q.sum() ** 2 / (len(q) * np.sum(q * q)))))
 
 
 def rank_squares(error: Array, found: Flags, expected: Flags, false: Flags, missed: float) -> Array:

@@ -3,13 +3,14 @@
 Errors are compared over the images (or pairs) that both methods found. A method that skips the hard ones gains nothing
 from it. Rates, and figures that count missed spots, are compared over all visible spots.
 
-Both scores are resampled together, and every metric has its own interval. The intervals are not corrected for the
-number of metrics: at 95 %, one metric in twenty favours one of two equal methods.
+Both scores are resampled together, and every metric has its own interval. The verdict does not come from the intervals.
+It comes from an exact test (`intervals.exchange_chance`), corrected for the number of metrics (`intervals.holm`). Of
+two methods of the same law, any metric at all is called different in at most 1 - `confidence` of the comparisons.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,8 +20,17 @@ import polars as pl
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.document import ScoreDocument, read_records, read_score
-from phibench.estimator.benchmark.intervals import Clusters, Estimate, Statistic, estimates
+from phibench.estimator.benchmark.intervals import (
+    Clusters,
+    Estimate,
+    Statistic,
+    estimates,
+    exchange_chance,
+    holm,
+    mean_of,
+)
 from phibench.estimator.benchmark.metrics import FAMILIES, METRICS, Metric, prepared, statistic_of, trusted
+from phibench.estimator.benchmark.records import missed_relative, with_missed
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import Name, generator
 
@@ -63,8 +73,10 @@ class Difference:
         Values over the records that count for both.
     difference : Estimate
     n, samples : int
+    chance : float
+        Of a difference as large between two methods of the same law; not corrected for the number of metrics.
     better : "first", "second", "no difference shown" or "too few samples"
-        Which is better, only if the interval of the difference excludes 0; or that there is no interval.
+        Which is better, only if `chance` is small enough beside those of all metrics.
     """
 
     name: str
@@ -73,6 +85,7 @@ class Difference:
     difference: Estimate
     n: int
     samples: int
+    chance: float
     better: Verdict
 
 
@@ -97,8 +110,12 @@ def compare_records(first: pl.DataFrame, second: pl.DataFrame, rules: Rules, *st
     DatasetError
         If they share no pair, or a pair's truth differs.
     """
-    a, b = _common(first, second)
-    return [_difference(name, a, b, rules, *stream) for name in COMPARED]
+    a, b = _common(first, second, rules)
+    found = [_difference(name, a, b, rules, *stream) for name in COMPARED]
+    shown = holm([item.chance for item in found], 1.0 - rules.confidence)
+    return [
+        replace(item, better=_verdict(item)) if is_shown else item for item, is_shown in zip(found, shown, strict=True)
+    ]
 
 
 def refuse_different(first: ScoreDocument, second: ScoreDocument, first_name: str, second_name: str) -> None:
@@ -134,18 +151,19 @@ def _short(value: Any) -> str:
 
 
 def _rules(numbers: dict[str, float]) -> Rules:
-    whole = {name: int(numbers[name]) for name in ("resamples", "least_samples")}
+    whole = {name: int(numbers[name]) for name in ("resamples", "least_samples", "least_compared")}
     return Rules(**{**numbers, **whole})  # type: ignore[arg-type]
 
 
-def _common(first: pl.DataFrame, second: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Both tables with the rows that both have, in the same order."""
+def _common(first: pl.DataFrame, second: pl.DataFrame, rules: Rules) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Both tables with the rows that both have, in the same order; a miss costs what these rows make of it."""
     a, b = (x.join(y, on=_KEY, how="semi").sort(*_KEY) for x, y in ((first, second), (second, first)))
     if not len(a):
         raise DatasetError("the two scores have no pair in common: score both methods on the same pairs")
     if not a.select(_TRUTH).equals(b.select(_TRUTH), null_equal=True):
         raise DatasetError("the two scores have other truths for the same pairs: score both methods on the same pairs")
-    return prepared(a), prepared(b)
+    missed = missed_relative(a, rules)
+    return prepared(with_missed(a, missed)), prepared(with_missed(b, missed))
 
 
 def _difference(name: str, a: pl.DataFrame, b: pl.DataFrame, rules: Rules, *stream: Name) -> Difference:
@@ -154,13 +172,31 @@ def _difference(name: str, a: pl.DataFrame, b: pl.DataFrame, rules: Rules, *stre
     a, b = a.filter(both), b.filter(both)
     clusters = Clusters.of(a["sample_code"].to_numpy())
     if clusters.n == 0:
-        return Difference(name, np.nan, np.nan, _NOTHING, 0, 0, "too few samples")
+        return Difference(name, np.nan, np.nan, _NOTHING, 0, 0, np.nan, "too few samples")
     ours, theirs = (statistic_of(metric, clusters, table) for table in (a, b))
     everything = np.ones((1, clusters.n))
     (drawn,) = estimates([_minus(theirs, ours)], clusters.n, rules, generator(*stream, name))
     difference = trusted(metric, drawn, clusters.n)
     first, second = (float(statistic(everything)[0]) for statistic in (ours, theirs))
-    return Difference(name, first, second, difference, len(a), clusters.n, _verdict(metric, difference))
+    if clusters.n < rules.least_compared:
+        return Difference(name, first, second, difference, len(a), clusters.n, np.nan, "too few samples")
+    tested = _tested(metric, clusters, pl.concat([a, b], how="vertical_relaxed"))
+    chance = exchange_chance(tested, clusters.n, rules, generator(*stream, name, "exchange"))
+    return Difference(name, first, second, difference, len(a), clusters.n, chance, "no difference shown")
+
+
+def _tested(metric: Metric, clusters: Clusters, joined: pl.DataFrame) -> Statistic:
+    """What `exchange_chance` tests: the metric itself, of a quantile the share of records above that of both methods.
+
+    Where two methods differ much, a quantile of exchanged answers is either method's by chance, and tells nothing. The
+    quantile of all answers stays as it is (A. M. Mood, Introduction to the Theory of Statistics, 1950, 16.5).
+    """
+    both = Clusters(np.concatenate([clusters.index, clusters.n + clusters.index]), 2 * clusters.n)
+    if metric.kind not in ("median", "p95"):
+        return statistic_of(metric, both, joined)
+    values = joined[metric.columns[0]].abs().to_numpy()
+    pooled = statistic_of(metric, both, joined)(np.ones((1, both.n)))[0]
+    return mean_of(both, np.heaviside(values - pooled, 0.5))
 
 
 def _flag(table: pl.DataFrame, family: str) -> pl.Series:
@@ -174,10 +210,5 @@ def _minus(second: Statistic, first: Statistic) -> Statistic:
     return difference
 
 
-def _verdict(metric: Metric, difference: Estimate) -> Verdict:
-    if not (np.isfinite(difference.low) and np.isfinite(difference.high)):
-        return "too few samples"
-    if metric.better == "none" or not (difference.low > 0.0 or difference.high < 0.0):
-        return "no difference shown"
-    second_is_lower = difference.high < 0.0
-    return "second" if second_is_lower == (metric.better == "lower") else "first"
+def _verdict(item: Difference) -> Verdict:
+    return "second" if (item.second < item.first) == (METRICS[item.name].better == "lower") else "first"

@@ -25,7 +25,7 @@ from phibench.estimator.benchmark.records import COLUMN_TYPES
 from phibench.scenes.validation import printable_line
 
 KIND: Literal["phibench score"] = "phibench score"
-VERSION = 2
+VERSION = 3
 
 
 class Value(Document):
@@ -86,6 +86,9 @@ class MethodCard(Document):
     modules: dict[Name, Name] = Field(
         default={}, description="SHA-256 of the files beside the method's that it imports"
     )
+    sees: Literal["image", "pair", ""] = Field(
+        default="", description="each image by itself, or both as one point; empty if that is not known"
+    )
 
     @classmethod
     def of(cls, reference: str, **fields: Any) -> MethodCard:
@@ -98,6 +101,22 @@ class MethodCard(Document):
         reference = fields.get("reference") if isinstance(fields, dict) else None
         known = isinstance(reference, str) and reference and not fields.get("name")
         return {**fields, "name": fields["reference"].rsplit("/", 1)[-1]} if known else fields
+
+
+class Flag(Document):
+    """A quantity that is better than the images allow, as `pair_bounds.Excess`; null is an infinite ratio."""
+
+    quantity: str
+    ratio: float | None
+    pairs: int
+    chance: float
+
+    @property
+    def text(self) -> str:
+        """Sentence about it."""
+        times = "without error" if self.ratio is None else f"{self.ratio:.3g} times better than the images allow"
+        chance = f"below {1e-6:g}" if self.chance < 1e-6 else f"{self.chance:.1g}"
+        return f"knows more than the images: {self.quantity} {times} ({self.pairs} pairs, by chance {chance})"
 
 
 class EncodedPicture(Document):
@@ -158,6 +177,8 @@ class ScoreDocument(Document):
     isolation: Name = Field(default="", description="what the method could reach: `Isolation.sentence`")
     provenance: dict[str, Any]
     code_sha256: str = Field(description="of everything behind the score")
+    missed_relative: float = Field(description="relative error of D as which a missed pair counts")
+    flags: list[Flag] = Field(description="what the images cannot tell so well")
     metrics: dict[str, Metric] = Field(description="of the whole: `jq .metrics.rms_px.value`")
     strata: list[StratumScore] = Field(description="parts of the whole")
     causes: dict[str, dict[str, int]] = Field(description="images by cause and kind")

@@ -94,6 +94,18 @@ def rms_ratio_of(clusters: Clusters, above: Array, below: Array) -> Statistic:
     return lambda weights: np.sqrt(_ratio(weights @ table))
 
 
+def best_constant_of(clusters: Clusters, inverse: Array) -> Statistic:
+    """Relative rms error of the constant that is best for some values, from their inverses."""
+    table = clusters.sums(inverse, inverse**2, np.ones_like(inverse))
+
+    def error(weights: Array) -> Array:
+        first, second, n = np.moveaxis(weights @ table, -1, 0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.sqrt(np.maximum(1.0 - first**2 / (n * second), 0.0))
+
+    return error
+
+
 def deviation_of(clusters: Clusters, *columns: Array) -> Statistic:
     """Standard deviation about each column's own mean, pooled over columns (division by the number of records)."""
     table = clusters.sums(*columns, np.sum(np.square(columns), axis=0), np.ones_like(columns[0]))
@@ -123,6 +135,55 @@ def quantile_of(clusters: Clusters, values: Array, share: Fraction) -> Statistic
         return np.concatenate(parts)
 
     return quantile
+
+
+def exchange_chance(statistic: Statistic, n: int, rules: Rules, rng: np.random.Generator) -> float:
+    """Chance of a difference as large as that of two methods if nothing tells them apart; NaN where there is none.
+
+    The methods' answers on each of n samples are exchanged with a chance of one half, `Rules.resamples` times. The
+    share of differences at least as large, the observed one included, is the p-value of an exact test of the hypothesis
+    that both methods have the same law. It is below alpha with a chance of at most alpha, for every n and statistic
+    (E. J. G. Pitman, Suppl. J. R. Stat. Soc. 4, 119, 1937).
+
+    Parameters
+    ----------
+    statistic : of 2 n samples, the first method's n, then the second's
+    n : int
+    rules : Rules
+    """
+    stay = np.zeros((1, n))
+    first, second = _exchanged(statistic, stay)
+    observed = abs(float(second[0] - first[0]))
+    if not math.isfinite(observed):
+        return math.nan
+    # what differs by the rounding of sums alone is as large
+    least = observed - _NO_SPREAD * max(abs(float(first[0])), abs(float(second[0])))
+    rows, larger = max(1, _AT_ONCE // (2 * n)), 0
+    for start in range(0, rules.resamples, rows):
+        flips = rng.integers(0, 2, (min(rows, rules.resamples - start), n)).astype(float)
+        one, other = _exchanged(statistic, flips)
+        larger += int(np.count_nonzero(~(np.abs(other - one) < least)))  # one without a value counts as larger
+    return (1.0 + larger) / (1.0 + rules.resamples)
+
+
+def _exchanged(statistic: Statistic, flips: Array) -> tuple[Array, Array]:
+    """Values of both methods where the answers of samples, `flips` of shape (b, n), are exchanged."""
+    return statistic(np.hstack([1.0 - flips, flips])), statistic(np.hstack([flips, 1.0 - flips]))
+
+
+def holm(chances: Sequence[float], alpha: float) -> list[bool]:
+    """Which of several hypotheses are rejected, with a chance of at most alpha that any true one is; never NaN.
+
+    S. Holm, Scand. J. Stat. 6, 65 (1979): the smallest p-value against alpha / m, the next against alpha / (m - 1), and
+    so on until one is larger. The tests may depend on each other.
+    """
+    order = sorted((k for k, chance in enumerate(chances) if not math.isnan(chance)), key=lambda k: chances[k])
+    rejected = [False] * len(chances)
+    for left, k in zip(range(len(order), 0, -1), order, strict=True):
+        if chances[k] > alpha / left:
+            break
+        rejected[k] = True
+    return rejected
 
 
 def estimates(statistics: Sequence[Statistic], n: int, rules: Rules, rng: np.random.Generator) -> list[Estimate]:

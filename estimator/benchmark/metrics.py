@@ -29,6 +29,7 @@ from phibench.estimator.benchmark.intervals import (
     Clusters,
     Estimate,
     Statistic,
+    best_constant_of,
     deviation_of,
     estimates,
     mean_of,
@@ -45,7 +46,7 @@ WITHIN = 1.959963984540054
 LEAST_FOR_P95 = 50
 """Samples below which a 95th percentile has no interval."""
 Better = Literal["lower", "higher", "none"]
-Kind = Literal["rate", "mean", "rms", "rms of each", "median", "p95", "efficiency", "deviation", "rank"]
+Kind = Literal["rate", "mean", "rms", "rms of each", "median", "p95", "efficiency", "deviation", "rank", "constant"]
 _DOWN, _DETECTED = pl.col("image") == "down", pl.col("detected")
 _FOUND = _DOWN & pl.col("depth_found")
 # where the bound is not small against what counts as found, the cut at `match_px` makes errors smaller than the bound
@@ -68,11 +69,17 @@ FAMILIES: dict[str, pl.Expr] = {
     "depth bound": _FOUND & pl.col("bound_depth_m2").is_not_null() & _DEEP,
     "depth pull": _FOUND & pl.col("depth_pull").is_not_null(),
     "timed": _DOWN & pl.col("seconds").is_not_null(),
+    "pair bound": _DETECTED & pl.col("pair_bound_px2").is_not_null() & _SHARP,
+    "pair phi bound": _DETECTED
+    & pl.col("phi_error_rad").is_not_null()
+    & pl.col("pair_bound_phi_rad2").is_not_null()
+    & _SHARP,
+    "pair depth bound": _FOUND & pl.col("pair_bound_depth_m2").is_not_null() & _DEEP,
 }
 """Which records enter a metric; those of pairs take each pair once, by its row "down"."""
 
-_RELATIVE = ("depth_relative", "depth_counted", "root_bound_depth", "rank_depth2")
-OF_PAIRS = ("any pair", "pair", "depth", "depth bound", "depth pull", "timed")
+_RELATIVE = ("depth_relative", "depth_counted", "root_bound_depth", "rank_depth2", "inverse_depth", "root_pair_depth")
+OF_PAIRS = ("any pair", "pair", "depth", "depth bound", "depth pull", "timed", "pair depth bound")
 
 WHY_EMPTY = {
     "detected": "no spot detected",
@@ -86,10 +93,13 @@ WHY_EMPTY = {
     "any pair": "no pair",
     "pair": "no pair with both spots visible",
     "depth": "no depth found",
-    "depth bound": "no bound for these images, or none below a third of 3 px",
+    "depth bound": "no bound for these images, or none below 10 % of D",
     "depth pull": "no uncertainty of depth claimed",
     "timed": "no pair came back",
     "image": "no image",
+    "pair bound": "no bound for these pairs, or none below a third of 3 px",
+    "pair phi bound": "no bound for these pairs, or none below a third of 3 px",
+    "pair depth bound": "no bound for these pairs, or none below 10 % of D",
 }
 """Why a metric has no value, by family."""
 
@@ -104,7 +114,8 @@ class Metric:
     kind : how the columns become a number
     columns : of the records; "mean" and "rate" take one, "median" and "p95" one by its absolute value, "rms" the root
         of the mean of the sum of squares, "rms of each" of the mean of all squares, "deviation" is about each column's
-        mean, "efficiency" divides: variances, then errors; "rank" is the root of a sum of squares by a number of spots
+        mean, "efficiency" divides: variances, then errors; "rank" is the root of a sum of squares by a number of spots;
+        "constant" is the relative rms error of the best constant, of inverse values
     unit : str
     better : "lower", "higher" or "none"
     text : what it is
@@ -200,7 +211,57 @@ METRICS: dict[str, Metric] = {
         "lower",
         "rms relative error of D, missed and false counted",
     ),
+    "constant_depth": Metric(
+        "pair", "constant", ("inverse_depth",), "1", "none", "rms relative error of D of the best constant answer"
+    ),
+    "bound_pair_px": Metric("pair bound", "rms", ("root_pair_px",), "px", "none", "rms distance at the pair's bound"),
+    "efficiency_pair_px": Metric(
+        "pair bound",
+        "efficiency",
+        ("pair_bound_px2", "du_px", "dv_px"),
+        "1",
+        "higher",
+        "rms at the pair's bound / rms distance",
+    ),
+    "efficiency_pair_phi": Metric(
+        "pair phi bound",
+        "efficiency",
+        ("pair_bound_phi_rad2", "phi_error_rad"),
+        "1",
+        "higher",
+        "phi: rms at the pair's bound / rms",
+    ),
+    "bound_pair_depth_relative": Metric(
+        "pair depth bound", "rms", ("root_pair_depth",), "1", "none", "D: relative rms at the pair's bound"
+    ),
+    "efficiency_pair_depth": Metric(
+        "pair depth bound",
+        "efficiency",
+        ("pair_bound_depth_m2", "depth_error_m"),
+        "1",
+        "higher",
+        "D: rms at the pair's bound / rms",
+    ),
 }
+
+PAIR_TWINS = {
+    "efficiency_px": "efficiency_pair_px",
+    "efficiency_phi": "efficiency_pair_phi",
+    "efficiency_depth": "efficiency_pair_depth",
+}
+"""Efficiencies against the bound of each image, and the same against that of both images together."""
+
+
+def applies(name: str, sees: str) -> bool:
+    """Tell whether an efficiency is against the bound that holds for a method.
+
+    Parameters
+    ----------
+    name : key of `METRICS`
+    sees : "image", "pair" or ""
+        Whether the method takes each image by itself, or both as one point of the room; "" if that is not known: both.
+    """
+    return not (sees == "pair" and name in PAIR_TWINS) and not (sees == "image" and name in PAIR_TWINS.values())
 
 
 @dataclass(frozen=True)
@@ -213,10 +274,15 @@ class Measured:
 
 
 def prepared(records: pl.DataFrame) -> pl.DataFrame:
-    """Records with what the metrics take besides: roots of the bounds, and a number for each sample."""
+    """Records with what the metrics take besides: roots of the bounds, samples as numbers, which bounds are sharp."""
     return records.with_columns(
         root_bound_px=pl.col("bound_px2").sqrt(),
         root_bound_depth=pl.col("bound_depth_m2").sqrt() / pl.col("depth_m"),
+        root_pair_px=pl.col("pair_bound_px2").sqrt(),
+        root_pair_depth=pl.col("pair_bound_depth_m2").sqrt() / pl.col("depth_m"),
+        inverse_depth=1.0 / pl.col("depth_m"),
+        sharp_pair=(_DETECTED & _SHARP).fill_null(value=False).min().over("number"),
+        sharp_depth=(pl.col("depth_found") & _DEEP).fill_null(value=False),
         depth_within=pl.col("depth_pull").abs() <= WITHIN,
         sample_code=pl.col("sample_id").rank("dense").cast(pl.Int64),
     )
@@ -316,6 +382,7 @@ STATISTICS: dict[str, Callable[[Clusters, list[Array]], Statistic]] = {
     "efficiency": lambda clusters, x: rms_ratio_of(clusters, x[0], _square(x[1:])),
     "deviation": lambda clusters, x: deviation_of(clusters, *x),
     "rank": lambda clusters, x: rms_ratio_of(clusters, x[0], x[1]),
+    "constant": lambda clusters, x: best_constant_of(clusters, x[0]),
 }
 
 

@@ -17,6 +17,7 @@ import polars as pl
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.benchmark.answer_errors import (
     Rules,
+    best_constant,
     from_centre_px,
     in_ray_units,
     phi_of,
@@ -26,6 +27,7 @@ from phibench.estimator.benchmark.answer_errors import (
     usable_covariance,
     whitened,
 )
+from phibench.estimator.benchmark.pair_bounds import SpotBoundsOfImages, pair_bounds
 from phibench.estimator.geometry.least_squares_depth import nominal_depth
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import OK, Answer, Outcome, Spot
@@ -78,23 +80,33 @@ COLUMNS: dict[str, str] = {
     "bound_px2": "trace of the bound (docs/limits.md): expected squared distance at it",
     "raw_bound_px2": "the same of the raw pixels behind the image",
     "bound_phi_rad2": "variance of phi at the bound",
+    "pair_bound_px2": "as bound_px2, of both images together: one point of the room",
+    "pair_bound_phi_rad2": "variance of phi at that bound",
     "rank_phi2_rad2": "square that the rank by phi sums: error, missed and false detection",
     "pair_visible": "both spots are visible",
+    "pair_false": "a false detection in either image",
     "pair_electrons": "the fainter spot's electrons",
     "depth_found": "both spots are found, and a finite depth above 0 follows",
     "depth_from": "method or pixels",
     "depth_estimate_m": "D of the answer",
     "depth_error_m": "depth_estimate_m - depth_m",
     "depth_relative": "depth_error_m / depth_m",
-    "depth_counted": "|depth_relative|, at most missed_relative; that too if not found; null unless pair_visible",
-    "rank_depth2": "square that the rank by D sums: relative error, missed and false detection",
     "depth_sigma_m": "claimed: the method's with its own depth, else from its covariances; with a calibration's part",
     "depth_pull": "depth_error_m / depth_sigma_m",
-    "bound_depth_m2": "variance of D at the bounds of both spots; without calibration",
+    "bound_depth_m2": "variance of D at the bounds of both spots, each by itself; without calibration",
+    "pair_bound_depth_m2": "the same of both images together",
+    "possible_position_chi2": "errors of the pair's positions over what is possible, squared; 3 degrees of freedom",
+    "possible_phi_chi2": "the same of phi, mean of both images; 1 degree",
+    "possible_depth_chi2": "the same of D; 1 degree",
     "seconds": "inside the method",
     "failure": "of the harness; empty if none",
     "message": "about the failure",
 }
+COUNTED: dict[str, str] = {
+    "depth_counted": "|depth_relative|, at most what a miss costs; that too if not found; null unless pair_visible",
+    "rank_depth2": "square that the rank by D sums: relative error, missed and false detection",
+}
+"""Columns that follow from all pairs together: `with_missed`."""
 
 
 _WHOLE = ("number", "draw", "jpeg_quality")
@@ -116,7 +128,7 @@ COLUMN_TYPES: dict[str, pl.DataType] = {name: _TYPES.get(name, pl.Float64()) for
 
 
 def records(pairs: PairSet, outcomes: Iterable[Outcome], rules: Rules) -> pl.DataFrame:
-    """Records of a run, `COLUMNS`, two rows per pair in the order of their numbers.
+    """Records of a run, `COLUMNS` and `COUNTED`, two rows per pair in the order of their numbers.
 
     Parameters
     ----------
@@ -131,11 +143,29 @@ def records(pairs: PairSet, outcomes: Iterable[Outcome], rules: Rules) -> pl.Dat
         If a pair has several outcomes, a number is none of the set, or the set is sealed.
     """
     ordered = in_order(outcomes, len(pairs))
-    return record_table([pairs.truth(outcome.number) for outcome in ordered], ordered, rules)
+    table = record_table([pairs.truth(outcome.number) for outcome in ordered], ordered, rules)
+    return with_missed(table, missed_relative(table, rules))
+
+
+def missed_relative(table: pl.DataFrame, rules: Rules) -> float:
+    """Relative error of D as which a missed pair counts: that of the best constant answer, within the rules' limits."""
+    depths = table.filter((pl.col("image") == "down") & pl.col("pair_visible"))["depth_m"].to_numpy()
+    return min(rules.missed_relative, max(rules.least_missed_relative, best_constant(depths)))
+
+
+def with_missed(table: pl.DataFrame, missed: float) -> pl.DataFrame:
+    """Records with `COUNTED`, a missed pair counting as `missed`."""
+    relative = table["depth_relative"].fill_null(np.nan).to_numpy()
+    found, visible = (table[name].to_numpy() for name in ("depth_found", "pair_visible"))
+    counted = np.where(found, np.minimum(np.abs(relative), missed), missed)
+    squares = rank_squares(relative, found, visible, table["pair_false"].to_numpy(), missed)
+    return table.with_columns(
+        depth_counted=pl.Series(np.where(visible, counted, np.nan)).fill_nan(None), rank_depth2=pl.Series(squares)
+    )
 
 
 def record_table(truths: Sequence[PairTruth], outcomes: Sequence[Outcome], rules: Rules) -> pl.DataFrame:
-    """As `records`, from truths and outcomes side by side."""
+    """`COLUMNS` of truths and outcomes side by side."""
     if not truths:
         raise DatasetError("a score of no pairs: give at least one")
     index: dict[tuple[Rig, Rig, int], list[int]] = {}
@@ -171,7 +201,8 @@ def in_order(outcomes: Iterable[Outcome], count: int) -> list[Outcome]:
 def _of_rigs(nominal: Rig, true: Rig, truths: list[PairTruth], outcomes: list[Outcome], rules: Rules) -> pl.DataFrame:
     """Records of pairs that share their rigs, image by image, then the pairs' own columns."""
     images = {p: _image_columns(p, nominal, true, truths, outcomes, rules) for p in POSITIONS}
-    pair = _pair_columns(nominal, truths, outcomes, images, rules)
+    pair = _pair_columns(nominal, truths, outcomes, images)
+    pair |= _joint_columns(nominal, truths, images, pair)
     return pl.concat([pl.DataFrame({**images[p], **pair}, schema_overrides=_TYPES) for p in POSITIONS])
 
 
@@ -241,14 +272,53 @@ def _phi_columns(
     }
 
 
+def _joint_columns(
+    nominal: Rig, truths: list[PairTruth], images: dict[str, dict[str, Any]], pair: dict[str, Any]
+) -> dict[str, Any]:
+    """Columns of the bounds of both images together; those of single images are added to `images`."""
+    spots = {p: [getattr(t, p) for t in truths] for p in POSITIONS}
+    singles = [SpotBoundsOfImages(*(_bounds(spots[p], name) for name in _BOUND_NAMES)) for p in POSITIONS]
+    (xy1, e1, phi1), (xy2, e2, phi2) = (
+        (*(np.stack([i[u], i[v]], -1) for u, v in (_TRUE_PX, _ERROR_PX)), i["phi_error_rad"])
+        for i in (images[p] for p in POSITIONS)
+    )
+    joint = pair_bounds(
+        nominal,
+        _nominal_stroke_m(truths),
+        pair["depth_m"],
+        (xy1, xy2),
+        (singles[0], singles[1]),
+        (e1, e2),
+        (phi1, phi2),
+        pair["depth_error_m"],
+    )
+    for position, uv, C in zip(POSITIONS, (xy1, xy2), (joint.down_px2, joint.up_px2), strict=True):
+        images[position]["pair_bound_px2"] = np.trace(C, axis1=1, axis2=2)
+        images[position]["pair_bound_phi_rad2"] = phi_variance(nominal, uv, C)
+    return {
+        "pair_bound_depth_m2": joint.depth_m2,
+        "possible_position_chi2": joint.position_chi2,
+        "possible_phi_chi2": joint.phi_chi2,
+        "possible_depth_chi2": joint.depth_chi2,
+    }
+
+
+_BOUND_NAMES = ("bound_px2", "raw_bound_px2")
+_TRUE_PX, _ERROR_PX = ("u_true_px", "v_true_px"), ("du_px", "dv_px")
+
+
+def _nominal_stroke_m(truths: list[PairTruth]) -> Array:
+    return np.array([t.stroke_m if t.nominal_stroke_m is None else t.nominal_stroke_m for t in truths], float)
+
+
 def _pair_columns(
-    nominal: Rig, truths: list[PairTruth], outcomes: list[Outcome], images: dict[str, dict[str, Any]], rules: Rules
+    nominal: Rig, truths: list[PairTruth], outcomes: list[Outcome], images: dict[str, dict[str, Any]]
 ) -> dict[str, Any]:
     down, up = (images[p] for p in POSITIONS)
     bounds = [_bounds([getattr(t, p) for t in truths], "bound_px2") for p in POSITIONS]
     claims = [usable_covariance(_claimed([_spot(o, p) for o in outcomes])) for p in POSITIONS]
     true_m, h = (np.array([getattr(t, name) for t in truths], float) for name in ("depth_m", "stroke_m"))
-    nominal_h = np.array([t.stroke_m if t.nominal_stroke_m is None else t.nominal_stroke_m for t in truths], float)
+    nominal_h = _nominal_stroke_m(truths)
     answers, truth = (
         [np.stack([i[u], i[v]], -1) for i in (down, up)] for u, v in (("u_px", "v_px"), ("u_true_px", "v_true_px"))
     )
@@ -261,8 +331,6 @@ def _pair_columns(
     both = down["visible"] & up["visible"]
     false = down["false_detection"] | up["false_detection"]
     found = down["detected"] & up["detected"] & (depth > 0.0)  # False for NaN
-    relative = depth / true_m - 1.0
-    counted = np.where(found, np.minimum(np.abs(relative), rules.missed_relative), rules.missed_relative)
     return {
         "number": [t.number for t in truths],
         "sample_id": [t.sample_id for t in truths],
@@ -273,14 +341,13 @@ def _pair_columns(
         "depth_m": true_m,
         "stroke_m": h,
         "pair_visible": both,
+        "pair_false": false,
         "pair_electrons": np.minimum(down["electrons"], up["electrons"]),
         "depth_found": found,
         "depth_from": [_depth_from(*x) for x in zip(has_own, np.isfinite(depth), strict=True)],
         "depth_estimate_m": depth,
         "depth_error_m": depth - true_m,
-        "depth_relative": relative,
-        "depth_counted": np.where(both, counted, np.nan),
-        "rank_depth2": rank_squares(relative, found, both, false, rules.missed_relative),
+        "depth_relative": depth / true_m - 1.0,
         "depth_sigma_m": sigma,
         "depth_pull": (depth - true_m) / np.where(sigma > 0.0, sigma, np.nan),
         "bound_depth_m2": depth_exact(nominal, nominal_h, *truth, *bounds).sigma_m ** 2,

@@ -29,7 +29,7 @@ from phibench.estimator.benchmark.figures import (
     pull_histogram,
     radius_panels,
 )
-from phibench.estimator.benchmark.metrics import METRICS, RANKS
+from phibench.estimator.benchmark.metrics import METRICS, RANKS, applies
 from phibench.estimator.benchmark.score_tables import (
     FULL_OF_FALSE,
     HEADS,
@@ -50,6 +50,7 @@ _STRATA = (
     "rms_phi_rad",
     "rms_depth_relative",
     "efficiency_px",
+    "efficiency_pair_px",
     "pull_deviation",
 )
 _LEAST_FOUND = 0.5
@@ -143,7 +144,13 @@ def report_html(
         lstrip_blocks=True,
     )  # fmt: skip
     environment.globals.update(
-        board=HEADS, head=head, parts=shown_parts, ranked_by=rank_words(by), strata_metrics=_STRATA, definitions=CAUSES
+        applies=applies,
+        board=HEADS,
+        head=head,
+        parts=shown_parts,
+        ranked_by=rank_words(by),
+        strata_metrics=_STRATA,
+        definitions=CAUSES,
     )
     environment.filters["json"] = lambda value: json.dumps(value, indent=1)
     rankings = [_ranking(number, group, by) for number, group in enumerate(_groups(scores), 1)]
@@ -205,7 +212,8 @@ def verdict(scores: Mapping[str, ScoreDocument], by: str) -> str:
     cause = max(missing, key=lambda name: missing[name])
     why = f", the others are mostly {cause}" if missing[cause] else ""
     alone = "is best by" if len(scores) > 1 else "has, by the rank of"
-    parts = [
+    parts = [f"{best}: {flag.text}." for flag in first.flags]
+    parts += [
         f"{best} {alone} {quantity}: {number} {METRICS[metric].shown[1]} {interval}; "
         f"it finds {100 * found:.3g} % of the spots{why}."
     ]

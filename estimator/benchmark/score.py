@@ -28,6 +28,7 @@ from phibench.estimator.benchmark.dataset_pairs import CalibratedPairs, dataset_
 from phibench.estimator.benchmark.document import (
     KIND,
     VERSION,
+    Flag,
     MethodCard,
     Metric,
     ScoreDocument,
@@ -38,7 +39,8 @@ from phibench.estimator.benchmark.document import (
     write_score,
 )
 from phibench.estimator.benchmark.metrics import METRICS, Measured, Stratum, count_pairs, measured, strata
-from phibench.estimator.benchmark.records import in_order, record_table
+from phibench.estimator.benchmark.pair_bounds import excesses
+from phibench.estimator.benchmark.records import in_order, missed_relative, record_table, with_missed
 from phibench.estimator.benchmark.report import write_report
 from phibench.estimator.benchmark.worst_images import worst, worst_of
 from phibench.estimator.calibration.file import read_calibration
@@ -148,6 +150,8 @@ def _scored(
     if not parts:
         raise DatasetError("the pair set is empty: there is nothing to score")
     table = pl.concat([part.records for part in parts])
+    missed = missed_relative(table, rules)
+    table = with_missed(table, missed)
     whole, *others = strata(table)
     document = ScoreDocument(
         kind=KIND,
@@ -162,6 +166,8 @@ def _scored(
         limits=dict(limits),
         provenance=dict(provenance()),
         code_sha256=code_behind(__name__),
+        missed_relative=missed,
+        flags=[Flag(**{**asdict(one), "ratio": finite(one.ratio)}) for one in excesses(whole.images)],
         metrics={name: _metric(name, value) for name, value in measured(whole, rules, "score", seed).items()},
         strata=[_stratum(stratum, rules, seed) for stratum in others],
         causes=count(table),

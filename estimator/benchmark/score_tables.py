@@ -26,7 +26,7 @@ from phibench.estimator.benchmark.causes import CAUSES, TAKEN_FOR
 from phibench.estimator.benchmark.compare import Difference
 from phibench.estimator.benchmark.document import ScoreDocument, Value
 from phibench.estimator.benchmark.intervals import Estimate
-from phibench.estimator.benchmark.metrics import METRICS, RANKS
+from phibench.estimator.benchmark.metrics import METRICS, RANKS, applies
 
 Form = Literal["terminal", "csv", "markdown", "latex", "json"]
 
@@ -42,6 +42,7 @@ HEADS = {
     "rms_counted_px": "rms, missed counted",
     "rms_depth_counted": "rms D, missed counted",
     "efficiency_px": "efficiency",
+    "efficiency_pair_px": "efficiency, pair",
     "pull_deviation": "pull",
 }
 """Metrics of a ranking with their heads; a narrow table has the first `NARROW` of them."""
@@ -52,6 +53,9 @@ WIDE = 210
 """Columns of a terminal for tables with every interval."""
 FULL_OF_FALSE = 0.2
 """Share of false answers from which a line says what they are."""
+FLAGGED = " !"
+"""Mark behind the name of a method whose answers are better than the images allow."""
+_FLAG_NOTE = "!: knows more than the images"
 _MANY = 9  # columns that stand close together
 _STRATA = ("detection_rate", "rms_px", "rms_phi_rad", "rms_depth_relative", "efficiency_px")
 
@@ -109,17 +113,21 @@ def leaderboard(documents: Sequence[ScoreDocument], by: str = "phi", wide: bool 
     first, names = documents[0], tuple(HEADS)[: None if wide else NARROW]
     rows = []
     for document in ranked(documents, by):
-        cells = (_cell(name, document.metrics[name], wide) for name in names)
-        rows.append((document.method.name, *cells))
+        sees = document.method.sees
+        cells = (_cell(name, document.metrics[name], wide) if applies(name, sees) else "" for name in names)
+        rows.append((f"{document.method.name}{FLAGGED if document.flags else ''}", *cells))
     interval = f" {100 * first.rules['confidence']:g} % intervals over samples below the values." if wide else ""
     title = f"{_pairs_in_words(first)}, {rank_words(by)}"
-    return Grid(title, ("method", *map(head, names)), tuple(rows), "L" + "r" * len(names), interval.strip())
+    flagged = _FLAG_NOTE if any(document.flags for document in documents) else ""
+    note = " ".join(filter(None, (interval.strip(), flagged)))
+    return Grid(title, ("method", *map(head, names)), tuple(rows), "L" + "r" * len(names), note)
 
 
 def score_table(document: ScoreDocument, by: str = "phi") -> Grid:
     """One row per metric of one method, with its interval."""
     title = f"{document.method.name}: {_pairs_in_words(document)}, {rank_words(by)}"
-    order = sorted(HEADS, key=lambda name: name != RANKS[by])
+    there = [name for name in HEADS if applies(name, document.method.sees)]
+    order = sorted(there, key=lambda name: name != RANKS[by])
     rows = ((METRICS[name].text, METRICS[name].shown[1], *_parts(name, document.metrics[name])) for name in order)
     interval = f"{100 * document.rules['confidence']:g} % interval"
     return Grid(title, ("metric", "unit", "value", interval), tuple(rows), "LlrL")
@@ -222,9 +230,9 @@ def comparison(differences: Sequence[Difference], first: str, second: str, wide:
         factor, unit = metric.shown
         values = (number(factor * x, DIGITS, significant=True) for x in (item.first, item.second))
         change = cell_parts(item.difference, factor, DIGITS, significant=True)
-        counts = (str(item.n), str(item.samples)) if wide else ()
+        counts = (str(item.n), str(item.samples), number(item.chance, 4)) if wide else ()
         rows.append((metric.text, unit, *values, *change, *counts, _BETTER.get(item.better, item.better)))
-    counted = ("n", "samples") if wide else ()
+    counted = ("n", "samples", "chance") if wide else ()
     heads = ("metric", "unit", "first", "second", "second\n- first", "interval", *counted, "better")
     columns = "LlrrrL" + "r" * len(counted) + "L"
     return Grid(f"Over what both have. First: {first}. Second: {second}", heads, tuple(rows), columns)
@@ -273,7 +281,8 @@ def print_scores(scored: Sequence[HasScore], form: str, by: str, wide: bool, cal
     console = _console(wide)
     show_grid(console, board if wide or len(documents) > 1 else score_table(documents[0], by))
     for one in scored:
-        if line := false_line(one.records):
+        lines = [flag.text for flag in one.document.flags]
+        for line in filter(None, (*lines, false_line(one.records))):
             _line(console, f"{one.document.method.name}: {line}")
     if any(any(kind.values()) for document in documents for kind in document.causes.values()):
         show_grid(console, cause_table(documents))
@@ -351,8 +360,9 @@ def scores_csv(documents: Sequence[ScoreDocument], by: str = "phi") -> str:
     for document in ranked(documents, by):
         values = (document.metrics[name] for name in METRICS)
         numbers = [x for value in values for x in (value.value, value.low, value.high)]
-        rows.append([document.method.name, document.pairs, document.images, document.samples, *numbers])
-    return _csv(["method", "pairs", "images", "samples", *names], rows)
+        flags = ", ".join(flag.quantity for flag in document.flags)
+        rows.append([document.method.name, document.pairs, document.images, document.samples, flags, *numbers])
+    return _csv(["method", "pairs", "images", "samples", "knows_more", *names], rows)
 
 
 def scores_json(documents: Sequence[ScoreDocument], by: str = "phi") -> str:
@@ -382,6 +392,7 @@ def _difference_fields(d: Difference) -> dict[str, str | float | int | None]:
         **finite,
         "n": d.n,
         "samples": d.samples,
+        "chance": d.chance if math.isfinite(d.chance) else None,
         "better": d.better,
     }
 

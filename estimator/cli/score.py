@@ -148,9 +148,9 @@ def compare(first: Path, second: Path, *, bootstrap_seed: Whole = 0, output: Out
     if note := note_on_code(a, b):
         print(f"note: {note}", file=lines)
     if all(item.better == "too few samples" for item in differences):
-        print(f"Too few samples for any interval: {a.rules['least_samples']:g} are the least.", file=lines)
+        print(f"Too few samples for a verdict: {a.rules['least_compared']:g} are the least.", file=lines)
     elif all(item.better in ("no difference shown", "too few samples") for item in differences):
-        print("No metric shows a difference: every interval that there is holds 0.", file=lines)
+        print("No metric shows a difference: see docs/scoring.md, Paired comparison, for the test.", file=lines)
     return 0
 
 

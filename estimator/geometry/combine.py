@@ -84,6 +84,48 @@ def combine(
     return CombinedEstimate(depth, sigma, status, uv1, uv2, C1, C2, misfit)
 
 
+@dataclass(frozen=True)
+class JointBound:
+    """Bound of a pair whose two spots are one point of the room: three unknowns, (u, v) of the down image and 1 / D.
+
+    Attributes
+    ----------
+    covariance_down_px2, covariance_up_px2 : shape (..., 2, 2), of (u, v)
+    variance_depth_m2 : shape (...), of D
+    information : shape (..., 3, 3), of (u, v, 1 / D): W1 + G^T W2 G
+    jacobian : shape (..., 2, 3), G: derivatives of the up position by the three
+    """
+
+    covariance_down_px2: Array
+    covariance_up_px2: Array
+    variance_depth_m2: Array
+    information: Array
+    jacobian: Array
+
+
+def joint_bound(
+    rig: Rig,
+    stroke_m: ArrayLike,
+    uv_down_px: Array,
+    depth_m: ArrayLike,
+    covariance_down_px2: Array,
+    covariance_up_px2: Array,
+) -> JointBound:
+    """Bound of both positions and of D when the epipolar constraint is used; NaN where there is none.
+
+    The covariances are bounds of (u, v) with flux and background unknown; these are the images' own, so that the
+    information of both about (u, v, 1 / D) adds. No part is above the bound of `limits.depth_limit` and of the single
+    images, which takes the four coordinates for four unknowns.
+    """
+    q = 1.0 / np.asarray(depth_m, float)
+    G = up_image(rig, stroke_m, uv_down_px, q).jacobian
+    W1, W2 = information(covariance_down_px2), information(covariance_up_px2)
+    A = _invertible(joint_information(W1, W2, G))
+    C = np.linalg.inv(A)
+    down, up, variance = (np.asarray(x, float) for x in (C[..., :2, :2], G @ C @ _t(G), C[..., 2, 2] / q**4))
+    return JointBound(down, up, variance, A, G)
+
+
 def joint_sigma_m(
     rig: Rig,
     stroke_m: ArrayLike,
@@ -92,17 +134,9 @@ def joint_sigma_m(
     covariance_down_px2: Array,
     covariance_up_px2: Array,
 ) -> Array:
-    """Standard deviation of D at the bound when the epipolar constraint is used, shape (...), metres.
-
-    The covariances are bounds of (u, v) with flux and background unknown; these are the images' own, so that the
-    information of both about (u, v, 1 / D) adds: W1 + G^T W2 G. Never above the bound of `limits.depth_limit`, which
-    propagates the four coordinates through the midpoint.
-    """
-    q = 1.0 / np.asarray(depth_m, float)
-    G = up_image(rig, stroke_m, uv_down_px, q).jacobian
-    W1, W2 = information(covariance_down_px2), information(covariance_up_px2)
-    C = np.linalg.inv(_invertible(joint_information(W1, W2, G)))
-    return np.asarray(np.sqrt(C[..., 2, 2]) / (q * q))
+    """Standard deviation of D at `joint_bound`, shape (...), metres."""
+    bound = joint_bound(rig, stroke_m, uv_down_px, depth_m, covariance_down_px2, covariance_up_px2)
+    return np.asarray(np.sqrt(bound.variance_depth_m2))
 
 
 def information(covariance: Array) -> Array:

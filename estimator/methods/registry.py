@@ -44,6 +44,8 @@ class BuiltIn:
         It cannot do without region hints.
     package : str
         What must be installed besides phibench; "" for nothing.
+    joint : bool
+        It takes both spots as one point of the room: its efficiency is against the pair's bound, not each image's.
     """
 
     name: str
@@ -54,6 +56,7 @@ class BuiltIn:
     needs_off: bool = False
     needs_boxes: bool = False
     package: str = ""
+    joint: bool = False
 
     @property
     def installed(self) -> bool:
@@ -136,6 +139,7 @@ _ALL = (
         joint_fit,
         "both images as one point of the room: likelihood on raw pixels, chain_fit's positions combined on others",
         "docs/limits.md",
+        joint=True,
     ),
     BuiltIn(
         "detect",

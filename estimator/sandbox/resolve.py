@@ -50,6 +50,8 @@ class Reference:
         Distribution and version of a package.
     modules : tuple of (path, SHA-256)
         Files beside the method's that it imports, relative to its folder.
+    sees : "image", "pair" or ""
+        Whether a built-in method takes each image by itself or both as one point; "" of others: nobody knows.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Reference:
     sha256: str | None = None
     version: str | None = None
     modules: tuple[tuple[str, str], ...] = ()
+    sees: Literal["image", "pair", ""] = ""
 
     def document(self) -> dict[str, Any]:
         """Provenance, as JSON can hold it; of a file its name alone, not where it lies."""
@@ -115,7 +118,9 @@ def _built_in(method: BuiltIn) -> Reference:
     if not method.installed:
         raise MethodError(f"method '{method.name}' needs {method.package}: pip install {method.package}")
     module = "phibench.estimator.methods.registry"
-    return Reference(method.name, "built-in", module, sha256=code_behind(module))
+    return Reference(
+        method.name, "built-in", module, sha256=code_behind(module), sees="pair" if method.joint else "image"
+    )
 
 
 def _of_file(reference: str) -> Reference:

@@ -12,8 +12,10 @@ from functools import cache
 
 import numpy as np
 from helpers.oracles import alhazen_quartic, true_pixel, true_reflection
+from scipy.linalg import block_diag
 
 from phibench.datasets.frames.sensor_card import sensor_card
+from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Outcome, Pair, Spot
 from phibench.estimator.pair_set import PairTruth, SpotTruth
 from phibench.scenes.random_streams import generator
@@ -158,3 +160,51 @@ def sampler(seed: int = 0, claim: float = 1.0, spread: float = 1.0) -> Oracle:
         return Spot((s.uv_px[0] + e[0], s.uv_px[1] + e[1]), ((C[0, 0], C[0, 1]), (C[1, 0], C[1, 1])))
 
     return answer
+
+
+def at_the_pairs_bound(seed: int = 0, spread: float = 1.0) -> Oracle:
+    """Truth and a draw of the bound of both images together: errors of one point of the room, by least squares."""
+    return lambda t: _of_the_point(t, seed, np.eye(3), spread)
+
+
+def knows_boards(seed: int = 0) -> Oracle:
+    """Noise of the bound, fitted by a point on the board's plane, which is known: two unknowns instead of four."""
+
+    def answer(t: PairTruth) -> Answer:
+        X = point_of(t)
+        towards = np.append(X[:2], 0.0) / np.hypot(*X[:2])
+        across = np.array([-towards[1], towards[0], 0.0])
+        return _of_the_point(t, seed, np.stack([across, [0.0, 0.0, 1.0]], axis=-1), 1.0)
+
+    return answer
+
+
+def point_of(t: PairTruth) -> np.ndarray:
+    """The spot in the room."""
+    return _place(t.stroke_m, t.down.uv_px, t.up.uv_px)[0]
+
+
+def slopes_of(t: PairTruth) -> np.ndarray:
+    """Derivatives of the four coordinates by the spot's place, shape (4, 3), by differences of the quartic's pixels."""
+    return _place(t.stroke_m, t.down.uv_px, t.up.uv_px)[1]
+
+
+@cache
+def _place(stroke_m: float, *uv_px: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    def pixels(point: np.ndarray) -> np.ndarray:
+        return np.concatenate([true_pixel(RIG, h, point) for h in (0.0, stroke_m)])
+
+    X, step_m = np.asarray(depth_exact(RIG, stroke_m, *map(np.array, uv_px)).point_world_m), 1e-5
+    return X, np.stack([(pixels(X + step_m * e) - pixels(X - step_m * e)) / (2.0 * step_m) for e in np.eye(3)], -1)
+
+
+def _of_the_point(t: PairTruth, seed: int, directions: np.ndarray, spread: float) -> Answer:
+    """Least squares over places of the spot along `directions`, shape (3, k), of a draw of the images' bounds."""
+    rng = generator("tests", "point sampler", seed, t.sample_id, t.draw)
+    C = block_diag(t.down.bound_px2, t.up.bound_px2)
+    M, W = slopes_of(t) @ directions, np.linalg.inv(C)
+    e = spread * np.linalg.cholesky(C) @ rng.standard_normal(4)
+    move = np.linalg.solve(M.T @ W @ M, M.T @ W @ e)
+    uv = np.concatenate([t.down.uv_px, t.up.uv_px]) + M @ move
+    D = np.linalg.norm((point_of(t) + directions @ move)[:2] - RIG.at(0.0).sphere_centre_m[:2])
+    return Answer(Spot((uv[0], uv[1])), Spot((uv[2], uv[3])), float(D))

@@ -61,19 +61,56 @@ def test_pairing_sees_what_two_intervals_do_not():
 
 
 def test_equal_methods_are_seldom_told_apart_and_unequal_ones_always():
-    """Two samplers with the same law, 40 times: a false verdict of rms_px in 8 % (measured at 60 samples; 5 % at 200).
+    """Two samplers with the same law, 40 times 16 metrics: any metric at all is called different in at most 5 %.
 
-    Binomial(40, 0.08) is above 11 in one run of 10^4. Half as much noise again is seen every time.
+    Binomial(40, 0.05) is above 8 in one run of 10^4. Half as much noise again is seen nearly every time: the rms of 60
+    samples scatters by a tenth, and Holm's first limit is 3 standard deviations.
     """
     pairs, wrong, seen = cases(60), 0, 0
     for trial in range(40):
         first, second, worse = (
             table(sampler(seed=100 * trial + k, spread=spread), pairs) for k, spread in ((1, 1.0), (2, 1.0), (3, 1.5))
         )
-        wrong += differences(first, second, trial)["rms_px"].better != "no difference shown"
+        wrong += any(item.better != "no difference shown" for item in differences(first, second, trial).values())
         seen += differences(first, worse, trial)["rms_px"].better == "first"
-    assert wrong <= 11
-    assert seen >= 38
+    assert wrong <= 8
+    assert seen >= 34
+
+
+def test_below_thirty_samples_there_is_no_verdict():
+    """The attack of issue 13: at 5 samples intervals call equal methods different in 18 % of the cases."""
+    for samples, better in ((5, "too few samples"), (29, "too few samples"), (30, "first")):
+        pairs = cases(samples)
+        found = differences(table(shifted(0.1), pairs), table(shifted(1.5), pairs))
+        assert found["rms_px"].better == better
+        assert found["rms_px"].difference.value == pytest.approx(1.4)
+        assert np.isnan(found["rms_px"].chance) == (samples < 30)
+
+
+def test_a_constant_depth_without_positions_is_never_better():
+    """The attack of issue 13: a method that misses half of the pairs against the best constant depth."""
+    d = np.array([t.depth_m for t in cases().truths])
+    best = float(np.sum(1.0 / d) / np.sum(1.0 / d**2))
+    good = sampler()
+    half = table(lambda t: good(t) if t.number % 2 else silent(t))
+    for positions in (silent, shifted(20.0)):
+        constant = table(lambda t, at=positions: replace(at(t), depth_m=best))
+        found = differences(half, constant)
+        for name in ("rms_depth_counted", "rank_depth"):
+            assert found[name].better == "first", name
+    # and the positions that it has not found gain nothing over silence
+    found = differences(table(silent), table(lambda t: replace(silent(t), depth_m=best)))
+    assert {item.better for item in found.values()} <= {"no difference shown", "too few samples"}
+
+
+def test_a_miss_costs_in_a_comparison_what_the_common_pairs_make_of_it():
+    """One score is of all pairs, the other of the nearer half: both count a miss alike."""
+    pairs = cases()
+    near = [t for t in pairs.truths if t.depth_m < 2.5]
+    whole, part = table(silent), records(pairs, [Outcome(t.number, silent(t), 0.01) for t in near], RULES)
+    assert whole["depth_counted"].max() != pytest.approx(part["depth_counted"].max(), rel=1e-3)
+    found = differences(whole, part)["rms_depth_counted"]
+    assert found.first == found.second == pytest.approx(part["depth_counted"].max(), rel=1e-12)
 
 
 def test_errors_are_compared_over_what_both_found():
@@ -110,11 +147,11 @@ def write(folder, name, pairs, oracle, answers=None, rules=RULES):
 
 
 def test_scores_on_disk_are_compared_over_the_pairs_of_both(tmp_path):
-    pairs = cases(20)
+    pairs = cases(40)
     whole = write(tmp_path, "whole", pairs, shifted(0.1))
-    part = write(tmp_path, "part", pairs, None, [Outcome(t.number, scaled(1.0)(t), 0.1) for t in pairs.truths[:12]])
+    part = write(tmp_path, "part", pairs, None, [Outcome(t.number, scaled(1.0)(t), 0.1) for t in pairs.truths[:32]])
     found = {item.name: item for item in compare(whole, part)}
-    assert found["rms_px"].n == 24
+    assert found["rms_px"].n == 64
     assert found["rms_px"].better == "second"
 
 

@@ -19,10 +19,11 @@ from helpers.bench_cases import (
     swapped,
     truth_itself,
 )
+from scipy.optimize import minimize_scalar
 
 from phibench.estimator.benchmark.answer_errors import MATCH_PX, Rules
 from phibench.estimator.benchmark.metrics import METRICS, measure, prepared
-from phibench.estimator.benchmark.records import COLUMNS, records
+from phibench.estimator.benchmark.records import COLUMNS, COUNTED, records
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Spot
 
@@ -41,7 +42,7 @@ def value(measured, name):
 def test_truth_has_no_error():
     table, m = score(cases(), truth_itself)
     assert len(table) == 400
-    assert table.columns == list(COLUMNS)
+    assert table.columns == [*COLUMNS, *COUNTED]
     assert value(m, "detection_rate") == 1.0
     assert value(m, "false_rate") == 0.0
     # positions are copied, and phi and D of two closed forms agree: 1e-12 rad, 1e-11 of D (rays 0.1 rad apart amplify)
@@ -105,7 +106,7 @@ def test_swapped_frames_find_nothing():
     assert table["distance_px"].min() > MATCH_PX
     assert (value(m, "detection_rate"), value(m, "false_rate"), value(m, "depth_rate")) == (0.0, 1.0, 0.0)
     assert value(m, "rms_counted_px") == MATCH_PX
-    assert value(m, "rms_depth_counted") == 1.0
+    assert value(m, "rms_depth_counted") == pytest.approx(best_constant_error(), rel=1e-12)
     assert np.isnan(value(m, "rms_px"))
     assert m["rms_px"].estimate.note == "no spot detected"
     assert table["depth_estimate_m"].is_null().all()  # rays that diverge
@@ -132,8 +133,8 @@ def test_a_missed_spot_counts_three_pixels():
     assert value(m, "rms_px") == pytest.approx(0.5, abs=1e-12)
     assert value(m, "rms_counted_px") == pytest.approx(np.sqrt((0.25 + MATCH_PX**2) / 2), rel=1e-12)
     assert value(m, "detection_rate") == 0.5
-    # a silent pair counts 100 % of its depth
-    assert value(m, "rms_depth_counted") == pytest.approx(np.sqrt(0.5), rel=1e-3)
+    # a silent pair counts as the best constant; half a pixel is 1 % of D, 1e-3 of that square
+    assert value(m, "rms_depth_counted") == pytest.approx(np.sqrt(0.5) * best_constant_error(), rel=1e-2)
 
 
 # -- what a rank counts --------------------------------------------------------------------------------------------
@@ -142,6 +143,13 @@ def test_a_missed_spot_counts_three_pixels():
 def blind_depth(t):
     """No position, and the mean depth of a room."""
     return Answer(*(Spot.missing("not looked for") for _ in "12"), depth_m=2.9)
+
+
+def best_constant_error(depths=None):
+    """Relative rms error of the best constant, by search: the oracle of the closed form."""
+    d = np.array([t.depth_m for t in cases().truths] if depths is None else depths)
+    found = minimize_scalar(lambda c: np.mean((c / d - 1.0) ** 2), bounds=(0.5, 5.0), options={"xatol": 1e-9})
+    return float(np.sqrt(found.fun))
 
 
 def turned(px, quarter):
@@ -167,7 +175,7 @@ def test_a_depth_without_positions_is_no_depth():
     assert value(guess, "depth_rate") == 0.0
     assert np.isnan(value(guess, "rms_depth_relative"))
     for name in ("rms_depth_counted", "rank_depth"):
-        assert value(guess, name) == value(nothing, name) == 1.0
+        assert value(guess, name) == value(nothing, name) == pytest.approx(best_constant_error(), rel=1e-12)
 
 
 @pytest.mark.parametrize("wrong", [silent, constant])
@@ -175,7 +183,7 @@ def test_a_depth_counts_only_with_two_right_positions(wrong):
     """Down found, up missed or wrong: the exact depth that comes with them does not count."""
     _, m = score(cases(), lambda t: Answer(Spot(t.down.uv_px), wrong(t).up, depth_m=t.depth_m))
     assert (value(m, "detection_rate"), value(m, "depth_rate")) == (0.5, 0.0)
-    assert value(m, "rms_depth_counted") == 1.0
+    assert value(m, "rms_depth_counted") == pytest.approx(best_constant_error(), rel=1e-12)
     # with both, it does
     _, m = score(cases(), lambda t: Answer(Spot(t.down.uv_px), Spot(t.up.uv_px), depth_m=t.depth_m))
     assert (value(m, "depth_rate"), value(m, "rank_depth")) == (1.0, 0.0)
@@ -203,7 +211,7 @@ def test_a_false_detection_counts_beside_the_missed_spot():
     assert value(quiet, "rms_counted_px") == value(guess, "rms_counted_px") == MATCH_PX
     assert value(quiet, "rank_phi_rad") == pytest.approx(RULES.missed_phi_rad, rel=1e-12)
     assert value(guess, "rank_phi_rad") == pytest.approx(np.sqrt(2.0) * RULES.missed_phi_rad, rel=1e-12)
-    assert value(guess, "rank_depth") == pytest.approx(np.sqrt(2.0), rel=1e-12)
+    assert value(guess, "rank_depth") == pytest.approx(np.sqrt(2.0) * best_constant_error(), rel=1e-12)
 
 
 def test_an_answer_where_nothing_is_to_be_seen_counts():
@@ -221,7 +229,8 @@ def test_an_answer_where_nothing_is_to_be_seen_counts():
     _, eager = score(pairs, truth_itself)
     _, careful = score(pairs, lambda t: truth_itself(t) if t.down.visible else silent(t))
     assert value(eager, "rank_phi_rad") == pytest.approx(RULES.missed_phi_rad, rel=1e-9)
-    assert value(eager, "rank_depth") == pytest.approx(1.0, rel=1e-9)
+    seen = [t.depth_m for t in hidden if t.down.visible]
+    assert value(eager, "rank_depth") == pytest.approx(best_constant_error(seen), rel=1e-9)
     assert value(careful, "rank_phi_rad") < 1e-12
     assert value(careful, "rank_depth") < 1e-11
 

@@ -20,6 +20,8 @@ from phibench.estimator.interface import Answer, Outcome, Spot
 
 RULES = Rules()
 NOTHING = Spot.missing("no light")
+ALONE = RULES.least_missed_relative
+"""What a miss costs in a set of one depth, whose best constant has no error."""
 
 
 def one(answer, truth=None, **changes):
@@ -103,21 +105,22 @@ def test_a_depth_without_two_found_spots_is_not_found():
     t = cases(1).truths[0]
     for down, up in ((NOTHING, NOTHING), (Spot(t.down.uv_px), NOTHING), (NOTHING, Spot(t.up.uv_px))):
         row, _ = one(Answer(down, up, depth_m=0.9 * t.depth_m))
-        assert (row["depth_found"], row["depth_counted"], row["rank_depth2"]) == (False, 1.0, 1.0)
+        assert (row["depth_found"], row["depth_counted"]) == (False, ALONE)
+        assert row["rank_depth2"] == pytest.approx(ALONE**2)
 
 
 def test_a_depth_beside_a_false_detection_is_not_found():
     t = cases(1).truths[0]
     off = (t.up.uv_px[0] + 20.0, t.up.uv_px[1])
     down, up = one(Answer(Spot(t.down.uv_px), Spot(off), depth_m=t.depth_m))
-    assert (down["depth_found"], down["depth_counted"]) == (False, 1.0)
+    assert (down["depth_found"], down["depth_counted"]) == (False, ALONE)
     assert (up["false_detection"], up["missed"], up["counted_px"]) == (True, True, MATCH_PX)
 
 
 def test_a_depth_that_is_off_by_more_than_itself_counts_as_missed():
     t = cases(1).truths[0]
     down, _ = one(Answer(Spot(t.down.uv_px), Spot(t.up.uv_px), depth_m=5.0 * t.depth_m))
-    assert (down["depth_found"], down["depth_counted"]) == (True, 1.0)
+    assert (down["depth_found"], down["depth_counted"]) == (True, ALONE)
     assert down["depth_relative"] == pytest.approx(4.0)
     below, _ = one(Answer(Spot(t.down.uv_px), Spot(t.up.uv_px), depth_m=-1.0))
     assert not below["depth_found"]
@@ -245,6 +248,8 @@ def test_outcomes_that_belong_to_no_pair_are_refused(numbers, words):
         {"resamples": 10},
         {"least_samples": 1},
         {"missed_relative": -1.0},
+        {"missed_relative": 0.05},  # below the least
+        {"least_compared": 1},
         {"missed_phi_rad": 0},
     ],
 )

@@ -14,7 +14,7 @@ from PIL import Image
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.causes import CAUSES
-from phibench.estimator.benchmark.document import MethodCard
+from phibench.estimator.benchmark.document import Flag, MethodCard
 from phibench.estimator.benchmark.figures import Picture, cause_bars, plain_number, pull_histogram
 from phibench.estimator.benchmark.report import Section, report_html, verdict, write_report
 from phibench.estimator.benchmark.score import score_outcomes
@@ -65,7 +65,10 @@ def scored(name, oracle, pairs=None):
 
 @pytest.fixture(scope="module")
 def scores():
-    return [scored("ideal", sampler()), scored("mixed <b>&", mixed), scored("half", shifted(0.5))]
+    flag = Flag(quantity="D", ratio=924.0, pairs=40, chance=0.0)
+    half, records = scored("half", shifted(0.5))
+    flagged = half.model_copy(update={"flags": [flag]})
+    return [scored("ideal", sampler()), scored("mixed <b>&", mixed), (flagged, records)]
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +86,13 @@ def test_the_page_fetches_nothing_and_runs_nothing(html):
         assert all(place.startswith(("data:image/", "#")) for place in places)
     assert "url(" not in html
     assert "@import" not in html
+
+
+def test_a_method_that_knows_more_than_the_images_is_marked(html):
+    text = " ".join(Page(html).text.split())
+    assert "! half knows more than the images: D 924 times better than the images allow (40 pairs" in text
+    assert "half !" in text
+    assert "ideal !" not in text
 
 
 def test_pictures_have_words_and_tables_have_heads(html):

@@ -41,8 +41,8 @@ def test_a_score_says_where_it_comes_from(mine):
     d = mine.document
     assert (d.pairs, d.images, d.samples, d.seed) == (40, 80, 40, 0)
     assert d.pair_set == cases(40).document()
-    counted = {"match_px": 3, "missed_relative": 1, "missed_phi_rad": 0.02}
-    assert d.rules == {**counted, "confidence": 0.95, "resamples": 199, "least_samples": 5}
+    counted = {"match_px": 3, "missed_relative": 1, "least_missed_relative": 0.1, "missed_phi_rad": 0.02}
+    assert d.rules == {**counted, "confidence": 0.95, "resamples": 199, "least_samples": 5, "least_compared": 30}
     assert d.limits == {"seconds": 30.0}
     assert "numpy" in d.provenance["packages"]
     assert len(d.code_sha256) == 64
