@@ -35,8 +35,11 @@ from phibench.scenes.frames import Array
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
 
-TASK_VERSION = 3
-"""Version of the task: what a method is given, what it must answer and what is counted. A change of any raises it."""
+TASK_VERSION = 4
+"""Version of the task: what a method is given, what it must answer and what is counted. A change of any raises it.
+
+4: a missed pair counts as the best constant depth would; a sealed set shows each sample once.
+"""
 
 
 _OF_THE_SPOT = 0.01  # of its brightest pixel: dimmer pixels are not the spot's

@@ -96,8 +96,9 @@ COLUMNS: dict[str, str] = {
     "bound_depth_m2": "variance of D at the bounds of both spots, each by itself; without calibration",
     "pair_bound_depth_m2": "the same of both images together",
     "possible_position_chi2": "errors of the pair's positions over what is possible, squared; 3 degrees of freedom",
-    "possible_phi_chi2": "the same of phi, mean of both images; 1 degree",
-    "possible_depth_chi2": "the same of D; 1 degree",
+    "possible_phi_rad2": "smallest possible variance of phi, sum of both images",
+    "possible_depth_m2": "smallest possible variance of D",
+    "pair_phi_error_rad2": "squared errors of phi, sum of both images",
     "seconds": "inside the method",
     "failure": "of the harness; empty if none",
     "message": "about the failure",
@@ -116,14 +117,14 @@ _TEXTS = (
 )
 _TRUTH_VALUES = (
     *("hinted", "saturated", "visible", "detected", "missed"),
-    *("false_detection", "pair_visible", "depth_found"),
+    *("false_detection", "pair_visible", "pair_false", "depth_found"),
 )
 _TYPES = {
     **dict.fromkeys(_WHOLE, pl.Int64()),
     **dict.fromkeys(_TEXTS, pl.String()),
     **dict.fromkeys(_TRUTH_VALUES, pl.Boolean()),
 }
-COLUMN_TYPES: dict[str, pl.DataType] = {name: _TYPES.get(name, pl.Float64()) for name in COLUMNS}
+COLUMN_TYPES: dict[str, pl.DataType] = {name: _TYPES.get(name, pl.Float64()) for name in (*COLUMNS, *COUNTED)}
 """Type of every column."""
 
 
@@ -278,9 +279,8 @@ def _joint_columns(
     """Columns of the bounds of both images together; those of single images are added to `images`."""
     spots = {p: [getattr(t, p) for t in truths] for p in POSITIONS}
     singles = [SpotBoundsOfImages(*(_bounds(spots[p], name) for name in _BOUND_NAMES)) for p in POSITIONS]
-    (xy1, e1, phi1), (xy2, e2, phi2) = (
-        (*(np.stack([i[u], i[v]], -1) for u, v in (_TRUE_PX, _ERROR_PX)), i["phi_error_rad"])
-        for i in (images[p] for p in POSITIONS)
+    (xy1, e1), (xy2, e2) = (
+        [np.stack([images[p][u], images[p][v]], -1) for u, v in (_TRUE_PX, _ERROR_PX)] for p in POSITIONS
     )
     joint = pair_bounds(
         nominal,
@@ -289,17 +289,16 @@ def _joint_columns(
         (xy1, xy2),
         (singles[0], singles[1]),
         (e1, e2),
-        (phi1, phi2),
-        pair["depth_error_m"],
     )
     for position, uv, C in zip(POSITIONS, (xy1, xy2), (joint.down_px2, joint.up_px2), strict=True):
         images[position]["pair_bound_px2"] = np.trace(C, axis1=1, axis2=2)
         images[position]["pair_bound_phi_rad2"] = phi_variance(nominal, uv, C)
     return {
         "pair_bound_depth_m2": joint.depth_m2,
-        "possible_position_chi2": joint.position_chi2,
-        "possible_phi_chi2": joint.phi_chi2,
-        "possible_depth_chi2": joint.depth_chi2,
+        "possible_position_chi2": joint.possible_position_chi2,
+        "possible_phi_rad2": joint.possible_phi_rad2,
+        "possible_depth_m2": joint.possible_depth_m2,
+        "pair_phi_error_rad2": sum(images[p]["phi_error_rad"] ** 2 for p in POSITIONS),
     }
 
 

@@ -44,6 +44,7 @@ from phibench.estimator.interface import Box, Pair
 from phibench.estimator.pair_set import Distraction, PairTruth, SpotTruth
 from phibench.scenes.camera import LARGEST_SIDE_PX
 from phibench.scenes.frames import Array
+from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import printable_line
 
@@ -249,6 +250,7 @@ def _null_for_nan(value: Any) -> Any:
 
 _FILE_TIME_S = 315532800  # 1980-01-01: a file's own time would tell the order of the work
 _SALT_BYTES = 32
+_TRUTH_FILE = "seal_{}.truth.json"
 _SEED_BITS = 56
 
 
@@ -263,7 +265,10 @@ class Sealed:
 
 
 def seal(folder: str | Path, public: str | Path, preset: str | None = None, console: Console | None = None) -> Sealed:
-    """Seal the takes of a finished data set.
+    """Seal one pair of each sample of a finished data set.
+
+    Several pairs of a sample, in other presets or draws of the noise, would help each other: a method that sees all of
+    them averages. Presets are dealt out evenly over the samples (`single_pairs`).
 
     Parameters
     ----------
@@ -280,7 +285,7 @@ def seal(folder: str | Path, public: str | Path, preset: str | None = None, cons
         If the data set or the folder will not do; then nothing is left behind.
     """
     public, console = Path(public), console or progress_console()
-    pairs = dataset_pairs(open_finished(folder), preset)
+    pairs = single_pairs(dataset_pairs(open_finished(folder), preset))
     _check_folder(public, Path(folder))
     try:
         public.parent.mkdir(parents=True, exist_ok=True)
@@ -289,6 +294,38 @@ def seal(folder: str | Path, public: str | Path, preset: str | None = None, cons
     except OSError as error:
         text = str(error) if isinstance(error, WriteError) else f"could not write to {public}: {error}"
         raise DatasetError(f"{text}; then run the same command again") from error
+
+
+def single_pairs(pairs: DatasetPairs) -> DatasetPairs:
+    """One pair of each sample, in the drawn order: its first draw, in a preset that is drawn for the sample."""
+    dataset, draws = pairs.dataset, pairs.pair_draws
+    presets = sorted({draw.preset for draw in draws})
+    samples = sorted({draw.sample_id for draw in draws})
+    order = generator(dataset.info.name, dataset.info.recipe["dataset"]["seed"], "seal", "presets")
+    dealt = {samples[k]: presets[place % len(presets)] for place, k in enumerate(order.permutation(len(samples)))}
+    chosen = [draw for draw in draws if draw.draw == 0 and draw.preset == dealt[draw.sample_id]]
+    return DatasetPairs(dataset, tuple(replace(draw, number=number) for number, draw in enumerate(chosen)))
+
+
+def earlier_warnings(folder: Path) -> tuple[str, ...]:
+    """A sentence about earlier seals of a data set, whose pairs are of the same samples."""
+    earlier = sorted(path.name.split(".")[0] for path in folder.glob(_TRUTH_FILE.format("*")))
+    if not earlier:
+        return ()
+    return (
+        f"this data set was sealed before ({', '.join(earlier)}): pairs of the same samples in two published sets help "
+        "each other, so publish one of the sets, and make samples with another seed for a second one",
+    )
+
+
+def board_warnings(name: str, recipe: Recipe) -> tuple[str, ...]:
+    """A sentence about boards that everybody knows."""
+    if not (RECIPES / f"{name}.toml").is_file() or load_recipe(name).targets != recipe.targets:
+        return ()
+    return (
+        f"the boards stand where the shipped recipe '{name}' puts them: whoever knows them gets D from the azimuth, "
+        "and phi better than from the images, so seal a set whose boards were moved in a secret copy of the recipe",
+    )
 
 
 def sequence_warnings(recipe: Recipe) -> tuple[str, ...]:
@@ -340,10 +377,15 @@ def _seal(pairs: DatasetPairs, folder: Path, work: Path, public: Path, console: 
     )
     write_text(work / SEAL, json.dumps(document.model_dump(mode="json"), indent=1) + "\n")
     write_text(work / CHECKSUMS, checksums_text(_hashes(work)))
-    truth_file = write_text(folder / f"seal_{document.id}.truth.json", text)  # first: no seal without its truth
+    warnings = earlier_warnings(folder)
+    truth_file = write_text(folder / _TRUTH_FILE.format(document.id), text)  # first: no seal without its truth
     _publish(work, public)
-    recipe = pairs.dataset.info.recipe["dataset"]
-    warnings = (*seed_warnings(pairs.dataset.info.name, recipe["seed"]), *sequence_warnings(pairs.dataset.recipe))
+    name, recipe = pairs.dataset.info.name, pairs.dataset.recipe
+    warnings += (
+        *seed_warnings(name, recipe.dataset.seed),
+        *sequence_warnings(recipe),
+        *board_warnings(name, recipe),
+    )
     return Sealed(public, truth_file, document, warnings)
 
 

@@ -52,6 +52,8 @@ from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
 
 FORMAT = "phibench submission 1"
+SINGLE_PAIRS = 4
+"""Version of the task from which on a sealed set shows each sample once."""
 Matrix = Annotated[tuple[Vector2, Vector2], Field(strict=False)]
 _MODES = ("RGB", "I;16", "L")  # of PNG and JPEG as `phibench seal make` writes them
 
@@ -95,6 +97,16 @@ class SealedPairs:
     def seal(self) -> Seal:
         """Seal of the set."""
         return self._seal
+
+    @property
+    def note(self) -> str:
+        """Sentence on a set of the old kind; "" on others."""
+        if self._seal.task_version >= SINGLE_PAIRS:
+            return ""
+        return (
+            f"this set was sealed for task version {self._seal.task_version}, when a set could show a sample several "
+            "times: its pairs help each other, so that a method that remembers them scores better than the images allow"
+        )
 
     def pair(self, number: int) -> Pair:
         """Images of a pair, with what a user knows of the rig."""
@@ -236,13 +248,14 @@ class Submission(Document):
 
 @dataclass(frozen=True)
 class Submitted:
-    """Result of `submit`: the file, the counts of answers and positions, and the commonest reason for no position."""
+    """Result of `submit`: file, counts of answers and positions, commonest reason for no position, note on the set."""
 
     path: Path
     pairs: int
     answered: int
     positions: int
     silence: str
+    note: str = ""
 
 
 def submit(
@@ -279,7 +292,8 @@ def submit(
     silent.update(spot.status for spot in spots if spot.uv_px is None)
     positions = sum(spot.uv_px is not None for spot in spots)
     answered = sum(outcome.answer is not None for outcome in outcomes)
-    return Submitted(out, len(outcomes), answered, positions, "".join(text for text, _ in silent.most_common(1)))
+    silence = "".join(text for text, _ in silent.most_common(1))
+    return Submitted(out, len(outcomes), answered, positions, silence, pairs.note)
 
 
 def submission(seal: Seal, method: Reference, outcomes: Sequence[Outcome], isolation: str = "") -> Submission:

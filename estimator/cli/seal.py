@@ -18,9 +18,10 @@ seal = App(
 
 @seal.command
 def make(directory: Path, *, out: Path, preset: str | None = None) -> int:
-    """Write the frames of a data set without the truth, and a seal that says by hash which truth it was.
+    """Write one pair of each sample without the truth, and a seal that says by hash which truth it was.
 
-    The truth goes into the data set's folder, as `seal_ID.truth.json`: keep both to yourself until the end.
+    Presets are dealt out over the samples. The truth goes into the data set's folder, as `seal_ID.truth.json`: keep
+    both to yourself until the end.
 
     Parameters
     ----------
@@ -69,6 +70,8 @@ def submit(
     print(
         f"{done.path}: {done.answered} of {done.pairs} pairs answered, {done.positions} of {2 * done.pairs} positions"
     )
+    if done.note:
+        print(f"note: {done.note}", file=sys.stderr)
     if done.silence:
         print(f"most often without a position: {done.silence}")
     return 0
@@ -101,6 +104,8 @@ def open_(public: Path, *, truth: Path, submission: Path, out: Path | None = Non
             raise DatasetError(f"--out {out}: a score is a JSON file; give a name that ends in .json")
         require_writable(out)
     opened = unseal_set(public, truth, submission)
+    if opened.pairs.note:
+        print(f"note: {opened.pairs.note}", file=sys.stderr)
     print(f"seal {opened.seal.id}: the truth is the sealed one, the submission has each of {opened.seal.pairs} pairs")
     scored = score_outcomes(opened.submission.method, opened.pairs, opened.outcomes, Rules())
     scored = isolated(scored, opened.submission.isolation)

@@ -44,7 +44,7 @@ class Cases:
         return Pair(number, **images, rig=truth.nominal_rig, stroke_m=truth.stroke_m, card=sensor_card("mjpeg"))
 
     def document(self) -> dict[str, object]:
-        return {"name": self.name, "task_version": 3, "sha256": "0" * 64, "draws": 1}
+        return {"name": self.name, "task_version": 4, "sha256": "0" * 64, "draws": 1}
 
 
 @cache

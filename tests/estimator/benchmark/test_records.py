@@ -13,7 +13,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.benchmark.answer_errors import MATCH_PX, Rules
-from phibench.estimator.benchmark.records import COLUMNS, records
+from phibench.estimator.benchmark.records import COLUMNS, COUNTED, records
 from phibench.estimator.geometry.phi import CONVENTIONS, outline_circle
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Outcome, Spot
@@ -212,8 +212,8 @@ def test_the_bayer_cell_is_that_of_the_pixel_that_holds_the_spot(uv, name):
 def test_columns_are_as_described_and_hold_no_nan():
     pairs = cases(5)
     table = records(pairs, outcomes(pairs, truth_itself), RULES)
-    assert table.columns == list(COLUMNS)
-    assert all(COLUMNS.values())
+    assert table.columns == [*COLUMNS, *COUNTED]
+    assert all([*COLUMNS.values(), *COUNTED.values()])
     assert not any(table[name].is_nan().any() for name in table.columns if table.schema[name] == pl.Float64)
     assert table["jpeg_quality"].dtype == pl.Int64
     empty = records(Cases((replace(pairs.truths[0], jpeg_quality=None),)), [Outcome(0, None, 1.0, "crash")], RULES)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from helpers.bench_samples import hidden
 from helpers.processes import quiet
-from helpers.sealed_sets import refusal
+from helpers.sealed_sets import refusal, tampered
 from PIL import Image
 
 from phibench.datasets.errors import DatasetError
@@ -25,9 +25,12 @@ from phibench.estimator.benchmark.document import read_score
 from phibench.estimator.benchmark.score import show
 from phibench.estimator.benchmark.sealed_set import (
     Sealed,
+    board_warnings,
+    earlier_warnings,
     seal,
     seed_warnings,
     sequence_warnings,
+    single_pairs,
     truth_document,
     truth_of,
 )
@@ -46,9 +49,9 @@ def copy(sealed: Sealed, tmp_path: Path) -> Path:
 
 
 def test_the_public_pairs_are_the_pairs(bench_dataset: Path, sealed: Sealed) -> None:
-    here, there = dataset_pairs(open_dataset(bench_dataset)), SealedPairs(sealed.public)
-    assert len(here) == len(there) == 9
-    for i in range(9):
+    here, there = single_pairs(dataset_pairs(open_dataset(bench_dataset))), SealedPairs(sealed.public)
+    assert len(here) == len(there) == 3
+    for i in range(3):
         ours, theirs = here.pair(i), there.pair(i)
         assert set(ours.images) == set(theirs.images)
         for name, image in ours.images.items():
@@ -81,17 +84,17 @@ def secrets_of(truth: PairTruth) -> list[list[str]]:
 
 
 def test_no_public_file_holds_a_number_of_the_truth(bench_dataset: Path, sealed: Sealed) -> None:
-    """Chance: 7 digits of 130 numbers in the 150 hexadecimal digits that the salt makes random, 1e-4."""
-    pairs = dataset_pairs(open_dataset(bench_dataset))
-    secret = {tuple(texts) for i in range(9) for texts in secrets_of(pairs.truth(i))}
-    assert len(secret) > 100
+    """Chance: 7 digits of 100 numbers in the 150 hexadecimal digits that the salt makes random, 1e-4."""
+    pairs = single_pairs(dataset_pairs(open_dataset(bench_dataset)))
+    secret = {tuple(texts) for i in range(3) for texts in secrets_of(pairs.truth(i))}
+    assert len(secret) > 50
     checked = 0
     for path in sealed.public.rglob("*"):
         if path.is_file():
             content = path.read_bytes()
             assert [text for texts in secret for text in texts if text.encode() in content] == [], path.name
             checked += 1
-    assert checked == 39
+    assert checked == 15
     found = sealed.truth_file.read_text()
     assert [texts for texts in secret if not any(text in found for text in texts)] == []  # it finds them where they are
 
@@ -106,7 +109,7 @@ def test_no_name_says_what_it_is_of(bench_dataset: Path, sealed: Sealed) -> None
 
 def test_images_hold_pixels_and_nothing_else(sealed: Sealed) -> None:
     files = sorted((sealed.public / "frames").iterdir())
-    assert len(files) == 36
+    assert len(files) == 12
     assert {path.suffix for path in files} == {".png", ".jpg"}
     for path in files:
         with Image.open(path) as image:
@@ -150,10 +153,10 @@ def test_the_salt_makes_every_seal_another(bench_dataset: Path, sealed: Sealed, 
 
 
 def test_a_sealed_set_has_no_truth(sealed: Sealed) -> None:
-    with pytest.raises(DatasetError, match="is sealed, the truth of pair 3 is not in it"):
-        SealedPairs(sealed.public).truth(3)
-    with pytest.raises(DatasetError, match="pair 9: there are 9"):
-        SealedPairs(sealed.public).pair(9)
+    with pytest.raises(DatasetError, match="is sealed, the truth of pair 2 is not in it"):
+        SealedPairs(sealed.public).truth(2)
+    with pytest.raises(DatasetError, match="pair 3: there are 3"):
+        SealedPairs(sealed.public).pair(3)
 
 
 def test_truth_survives_its_file_to_the_bit(bench_dataset: Path) -> None:
@@ -185,6 +188,66 @@ def test_seeds_that_can_be_found_are_warned_of() -> None:
     assert "seed 123456 is short" in short
     assert seed_warnings("bench-test", 2**62 + 12345) == ()
     assert "short" in seed_warnings("mine", 0)[0]
+
+
+def test_a_sealed_set_shows_each_sample_once(bench_dataset: Path, sealed: Sealed) -> None:
+    """The attack of issue 13: a cache keyed by the rig averages over presets and draws. Here it never hits."""
+    public = SealedPairs(sealed.public)
+    keys = [(pair.rig, pair.stroke_m) for pair in map(public.pair, range(len(public)))]
+    assert len(set(keys)) == len(keys) == 3
+    dataset = open_dataset(bench_dataset)
+    for preset, draws in ((None, 1), (None, 4), ("mjpeg", 3)):
+        everything = dataset_pairs(dataset, preset, draws)
+        chosen = single_pairs(everything).pair_draws
+        assert len(everything) > len(chosen) == 3
+        assert len({one.sample_id for one in chosen}) == 3
+        # presets are dealt out evenly, and numbers say nothing of what was left out
+        assert len({one.preset for one in chosen}) == (3 if preset is None else 1)
+        assert [one.number for one in chosen] == [0, 1, 2]
+        places = {(d.sample_id, d.preset, d.draw): d.number for d in everything.pair_draws}
+        drawn = [places[one.sample_id, one.preset, one.draw] for one in chosen]
+        assert drawn == sorted(drawn)
+
+
+def test_a_second_seal_of_the_same_samples_is_warned_of(tmp_path: Path) -> None:
+    assert earlier_warnings(tmp_path) == ()
+    (tmp_path / "seal_0123456789abcdef.truth.json").write_text("{}")
+    [warning] = earlier_warnings(tmp_path)
+    assert "was sealed before (seal_0123456789abcdef)" in warning
+
+
+def test_boards_that_everybody_knows_are_warned_of() -> None:
+    shipped = load_recipe("bench-test")
+    [warning] = board_warnings("bench-test", shipped)
+    assert "where the shipped recipe 'bench-test' puts them" in warning
+    moved = tuple(one.model_copy(update={"depth_m": 1.01 * one.depth_m}) for one in shipped.targets)
+    assert board_warnings("bench-test", shipped.model_copy(update={"targets": moved})) == ()
+    assert board_warnings("mine", shipped) == ()
+
+
+def test_the_test_recipe_has_boards_of_its_own() -> None:
+    """Nearest in azimuth, no board of bench-test is that of bench-dev: 2 % of D or 2 degrees apart at least."""
+    dev, test = (load_recipe(name).targets for name in ("bench-dev", "bench-test"))
+    assert len(dev) == len(test) == 12
+    for one in test:
+        turned = [abs((one.azimuth_deg - other.azimuth_deg + 180.0) % 360.0 - 180.0) for other in dev]
+        near = [other for other, turn in zip(dev, turned, strict=True) if turn < 2.0]
+        assert all(abs(other.depth_m / one.depth_m - 1.0) > 0.02 for other in near)
+
+
+def test_a_set_of_the_old_kind_is_read_and_says_what_it_is(
+    sealed: Sealed, submitted: Path, copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert SealedPairs(sealed.public).note == ""
+    document = json.loads((copy / "seal.json").read_text())
+    before = hashlib.sha256((copy / "seal.json").read_bytes()).hexdigest()
+    (copy / "seal.json").write_text(json.dumps({**document, "task_version": 3}))
+    sums = copy / "SHA256SUMS"
+    sums.write_text(sums.read_text().replace(before, hashlib.sha256((copy / "seal.json").read_bytes()).hexdigest()))
+    old = tampered(lambda d: d.update(task_version=3), submitted, tmp_path / "old.json")
+    words = ["seal", "open", str(copy), "--truth", str(sealed.truth_file), "--submission", str(old)]
+    assert cli.main(words) == 0
+    assert "note: this set was sealed for task version 3, when a set could show" in capsys.readouterr().err
 
 
 def test_samples_of_a_sobol_sequence_are_warned_of(bench_dataset: Path) -> None:
@@ -280,11 +343,11 @@ def test_the_commands_say_what_they_did(
     words = ["seal", "open", str(sealed.public), "--truth", str(sealed.truth_file), "--submission", str(out)]
     assert cli.main([*words, "--out", str(score)]) == 0
     said = capsys.readouterr().out
-    assert "8 of 9 pairs answered" in said
+    assert "2 of 3 pairs answered" in said
     assert "the truth is the sealed one" in said
     assert "mine:extract" in said
     document = read_score(score)
-    assert (document.pairs, document.failures["error"], document.method.place) == (9, 1, "mine.py")
+    assert (document.pairs, document.failures["error"], document.method.place) == (3, 1, "mine.py")
     assert not show(score)  # no terminal here
 
 
@@ -297,6 +360,7 @@ def test_seal_on_the_command_line_warns_of_its_seed(
     said = capsys.readouterr()
     assert "warning: seed 0 is short" in said.err
     assert "3 pairs, seal" in said.out
+    assert "shipped recipe" not in said.err
     assert len(list(copy.glob("seal_*.truth.json"))) == 1
     assert cli.main(tokens) == 2
     assert "not an empty folder" in capsys.readouterr().err
