@@ -142,7 +142,7 @@ def _limit_files(kernel: _Kernel, access: Access, shared: Sequence[Path]) -> boo
         # /proc makes a new file object when it forgets one, and a rule is about the object: one that is open stays
         kernel.allow(ruleset, Path(name), _LOOK, keep=True)
     readable = [*map(Path, _SYSTEM.split()), *interpreter_paths(), *map(Path, access.readable)]
-    for path in {path.resolve() for path in readable}:
+    for path in set(filter(None, map(_real, dict.fromkeys(readable)))):
         for part, rights in _without(path, hidden):
             kernel.allow(ruleset, part, rights)
     for path in (*map(Path, (*_DEVICE_FILES, *_GPU)), *Path("/dev").glob("nvidia*")):
@@ -150,6 +150,18 @@ def _limit_files(kernel: _Kernel, access: Access, shared: Sequence[Path]) -> boo
     for path in (Path.cwd(), *shared):
         kernel.allow(ruleset, path, every & ~_DEVICES)
     return kernel.restrict(ruleset)
+
+
+def _real(path: Path) -> Path | None:
+    """The path without links, if it is there. The kernel says it in a tenth of the time of `Path.resolve`."""
+    try:
+        handle = os.open(path, os.O_PATH | os.O_CLOEXEC)
+    except OSError:
+        return None
+    try:
+        return Path(f"/proc/self/fd/{handle}").readlink()
+    finally:
+        os.close(handle)
 
 
 def _without(path: Path, hidden: Sequence[Path]) -> Iterator[tuple[Path, int]]:
@@ -169,14 +181,14 @@ def _without(path: Path, hidden: Sequence[Path]) -> Iterator[tuple[Path, int]]:
 def interpreter_paths() -> list[Path]:
     """Folders of this interpreter, its packages and its libraries."""
     package, python = sys.modules["phibench"], Path(sys.executable)
-    own = {Path(path).resolve() for path in package.__path__}
+    own = {path for path in map(_real, map(Path, package.__path__)) if path}
     found = [Path(path) for path in (sys.prefix, sys.exec_prefix, sys.base_prefix, sys.base_exec_prefix)]
-    found += [python.parent, python.resolve().parent, *_library_folders()]
+    found += [python.parent, (_real(python) or python).parent, *_library_folders()]
     # the root of a checkout is one of phibench's own: the other folders in it are not
     found += [path / name for path in own for name in ("phibench", "scenes", "render", "datasets", "estimator")]
-    found.append(Path(package.__file__ or python).resolve().parent)
+    found.append((_real(Path(package.__file__ or python)) or python).parent)
     for path in [Path(path) for path in sys.path if path.startswith("/")]:
-        if path.resolve() not in own:
+        if _real(path) not in own:
             found.append(path)
         with suppress(OSError):
             found += [Path(entry.path) for entry in os.scandir(path) if entry.is_symlink()]

@@ -170,6 +170,13 @@ _STACK_SECONDS = 0.3  # for a stack to be printed, and for the pipe to end
 _NOT_RESTARTED = ("", "invalid")  # the process is as sound as before
 
 
+def advised(message: str, isolation: Isolation) -> str:
+    """A message with what helps, if the rules of the isolation are what it may be about."""
+    if not isolation.files or "PermissionError" not in message:
+        return message
+    return f"{message}; a method reads its own folder and has no network: --allow PATH lets it read more"
+
+
 class MethodProcess:
     """A method that is kept warm between pairs, and started anew after a failure.
 
@@ -231,7 +238,8 @@ class MethodProcess:
             outcome = Outcome(pair.number, None, math.nan, "crash", f"the method's process cannot be used: {text}")
         if self._limits.fresh or outcome.failure not in _NOT_RESTARTED:
             self.end()
-        return replace(outcome, message=printable_line(outcome.message, _MESSAGE_LENGTH))
+        message = printable_line(outcome.message, _MESSAGE_LENGTH)
+        return replace(outcome, message=advised(message, self._isolation) if outcome.failure == "error" else message)
 
     def _asked(self, pair: Pair) -> Outcome:
         size = needed_bytes(pair)
@@ -327,7 +335,7 @@ class _Running:
             why = f"{self._death(reference.place)}{self._last_line()}"
             raise MethodError(f"method '{reference.name}' cannot be imported: {why}") from None
         if fault != "":
-            raise MethodError(printable_line(str(fault), _MESSAGE_LENGTH))
+            raise MethodError(advised(printable_line(str(fault), _MESSAGE_LENGTH), isolation))
         return isolation
 
     def is_ready(self, size: int) -> bool:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pickle
 import socket
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -58,6 +60,15 @@ def test_benchmark_empty_method_on_full_frames(benchmark, tmp_path: Path) -> Non
         assert benchmark(lambda: process.ask(pair)).failure == ""
     finally:
         process.close()
+
+
+@pytest.mark.parametrize("isolated", [False, True])
+@pytest.mark.benchmark(group="isolation")
+def test_benchmark_isolation(benchmark, tmp_path: Path, isolated: bool) -> None:
+    """A process that isolates itself and leaves, against one that leaves. Target: <= 10 ms more at each start."""
+    text = f"from phibench.estimator.sandbox.isolation import *\nif {isolated}: assert isolate(Access()).complete"
+    command = [sys.executable, "-c", text]
+    assert benchmark.pedantic(lambda: subprocess.run(command, cwd=tmp_path).returncode, rounds=10) == 0
 
 
 @pytest.mark.benchmark(group="the sandbox")

@@ -433,6 +433,18 @@ def test_the_harness_says_that_a_method_is_isolated(tmp_path: Path) -> None:
         assert harness.isolations == [Isolation(True, True, True).sentence()]
 
 
+@needs_landlock
+def test_a_missing_right_is_told_with_what_helps(tmp_path: Path) -> None:
+    (tmp_path / "method").mkdir()
+    (tmp_path / "weights.txt").write_text("1")
+    read = f"open({str(tmp_path / 'weights.txt')!r})"
+    (outcome,) = run_method(method_file(tmp_path / "method", f"{read}\nreturn {GOOD}"), SmallPairs(1), LIMITS)
+    assert outcome.message.endswith("--allow PATH lets it read more")
+    late = method_file(tmp_path / "method", f"return {GOOD}", "late.py", f"{HEADER}{read}\n")
+    with pytest.raises(MethodError, match=r"Permission denied: .*: --allow PATH lets it read more"):
+        run_method(late, SmallPairs(1), LIMITS)
+
+
 def test_limits_go_into_the_record_without_paths(tmp_path: Path) -> None:
     document = RunLimits(fresh=True, allow=(str(tmp_path / "weights"),)).document()
     assert document["fresh"] is True
