@@ -172,7 +172,7 @@ def _exchanged(statistic: Statistic, flips: Array) -> tuple[Array, Array]:
 
 
 def holm(chances: Sequence[float], alpha: float) -> list[bool]:
-    """Which of several hypotheses are rejected, with a chance of at most alpha that any true one is; never NaN.
+    """Rejections of several hypotheses, with a chance of at most alpha that any true one is rejected; NaN never is.
 
     S. Holm, Scand. J. Stat. 6, 65 (1979): the smallest p-value against alpha / m, the next against alpha / (m - 1), and
     so on until one is larger. The tests may depend on each other.
