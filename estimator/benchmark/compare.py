@@ -186,7 +186,7 @@ def _difference(name: str, a: pl.DataFrame, b: pl.DataFrame, rules: Rules, *stre
 
 
 def _tested(metric: Metric, clusters: Clusters, joined: pl.DataFrame) -> Statistic:
-    """Statistic that `exchange_chance` tests: the metric, or of a quantile the share of records above both methods' own.
+    """Statistic that `exchange_chance` tests: the metric, or the share of records above the quantile of both methods.
 
     Where two methods differ much, a quantile of exchanged answers is either method's by chance, and tells nothing. The
     quantile of all answers stays as it is (A. M. Mood, Introduction to the Theory of Statistics, 1950, 16.5).
