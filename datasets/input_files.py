@@ -123,8 +123,10 @@ class InputFile:
         try:
             # a pipe without a writer would be waited for
             handle = os.open(self.path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
-            with os.fdopen(handle, "rb") as file:
-                return self._bounded(file)
+            try:
+                return self._bounded(handle)
+            finally:
+                os.close(handle)
         except FileNotFoundError as error:
             raise self.fault("is missing") from error
         except (OSError, ValueError) as error:
@@ -132,13 +134,14 @@ class InputFile:
                 raise
             raise self.fault(f"is not readable: {getattr(error, 'strerror', None) or error}") from error
 
-    def _bounded(self, file: io.BufferedReader) -> bytes:
-        found = os.fstat(file.fileno())
+    def _bounded(self, handle: int) -> bytes:
+        found = os.fstat(handle)
         if stat.S_ISDIR(found.st_mode):
             raise self.fault("is not readable: it is a folder")
         if not stat.S_ISREG(found.st_mode):
             raise self.fault("is not readable: it is no ordinary file")
-        data = b"" if found.st_size > self.limit_bytes else file.read(self.limit_bytes + 1)
+        with os.fdopen(handle, "rb", closefd=False) as file:
+            data = b"" if found.st_size > self.limit_bytes else file.read(self.limit_bytes + 1)
         if max(found.st_size, len(data)) > self.limit_bytes:
             raise self.fault(f"is larger than {self.limit_bytes / MIB:.0f} MiB, the most that is read of its kind")
         return data

@@ -7,6 +7,7 @@ what nobody has thought of: here it is a failure.
 from __future__ import annotations
 
 import contextlib
+import json
 import random
 import signal
 from collections import Counter
@@ -14,11 +15,26 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from helpers.valid_files import NASTY_TEXTS, Kind, changed, hostile, kinds, public_rows, read_sealed, write_sealed
+from helpers.valid_files import (
+    NASTY_TEXTS,
+    Kind,
+    changed,
+    compact,
+    damaged,
+    digest,
+    hostile,
+    kinds,
+    public_rows,
+    read_sealed,
+    write_sealed,
+)
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.read import open_finished
+from phibench.datasets.store.checksums import checksums_text, read_checksums
+from phibench.datasets.store.documents import differences
 from phibench.estimator.cli.main import main
 
 PATIENCE_S = 60  # far above the slowest case, 0.3 s, on a machine with other work
@@ -26,7 +42,7 @@ KINDS = (
     *("recipe.toml", "settings.toml", "calibration.json", "score.json", "records.parquet", "layer.exr", "picture.png"),
     *("submission.json", "truth.json", "study.json", "frames.jsonl", "journal.txt"),
 )
-FEW, MANY = 8, 550  # cases of a kind: 14 x 8 and 2 000 command lines with 14 x 550 are above 100 and 10 000
+FEW, MANY = 8, 550  # cases of a kind: 15 x 8 and 2 500 command lines with 14 x 550 are above 100 and 10 000
 SEEDS = st.integers(0, 2**64 - 1)
 KEPT = {"database": None, "deadline": None, "derandomize": True, "suppress_health_check": list(HealthCheck)}
 
@@ -199,3 +215,58 @@ def test_thousands_of_strange_command_lines_end_in_a_sentence(
     monkeypatch.chdir(tmp_path)
     fuzz_the_command_line(valid, tmp_path, 2500)
     assert "Traceback" not in capsys.readouterr().err
+
+
+# -- data sets -----------------------------------------------------------------------------------------------------
+
+SMALL = ("dataset.json", "manifest.jsonl", "rigs.jsonl")
+
+
+def read_dataset(folder: Path) -> None:
+    """Everything that a reader does with the small files; layers are in other tests."""
+    dataset = open_finished(folder)
+    for sample in dataset:
+        assert sample.rig.at(0.0) is not None
+        assert sample.laser_spot.diameter_m > 0.0
+        assert sample.stream_names
+    assert repr(dataset)
+    assert dataset.to_polars().height == len(dataset)
+    assert differences(folder, dataset.rows) is not None
+    assert dataset.beam is not None
+
+
+def fuzz_a_dataset(source: Path, folder: Path, cases: int) -> None:
+    """Small files with faults under hashes that fit."""
+    found: Counter[str] = Counter()
+    valid = {path.name: path.read_bytes() for path in source.iterdir() if path.is_file()}
+    hashes = read_checksums(source)
+
+    @settings(max_examples=cases, **KEPT)
+    @given(SEEDS)
+    def one(seed: int) -> None:
+        rng = random.Random(seed)
+        name = rng.choice(SMALL)
+        lines = valid[name].splitlines() if name.endswith("l") else [valid[name]]
+        k = rng.randrange(len(lines))
+        lines[k] = compact(changed(json.loads(lines[k]), rng)) if rng.random() < 0.8 else damaged(lines[k], rng)
+        files = {**valid, name: b"\n".join(lines) + b"\n"}
+        for file in SMALL:
+            (folder / file).write_bytes(files[file])
+        listed = {**hashes, name: digest(files[name])}
+        (folder / "SHA256SUMS").write_text(checksums_text(listed))
+        found[outcome(read_dataset, folder)] += 1
+
+    for file, data in valid.items():
+        (folder / file).write_bytes(data)
+    assert outcome(read_dataset, folder) == "read"
+    one()
+    assert found["refused"] > cases // 10
+
+
+def test_a_data_set_with_strange_documents_is_refused(smallest_dataset: Path, tmp_path: Path) -> None:
+    fuzz_a_dataset(smallest_dataset, tmp_path, FEW)
+
+
+@pytest.mark.slow
+def test_hundreds_of_data_sets_with_strange_documents_are_refused(smallest_dataset: Path, tmp_path: Path) -> None:
+    fuzz_a_dataset(smallest_dataset, tmp_path, MANY)

@@ -102,7 +102,7 @@ def test_pipes_devices_folders_and_large_files_are_not_read(tmp_path: Path) -> N
     for path, words in ((tmp_path / "pipe", "no ordinary file"), (Path("/dev/zero"), "no ordinary file")):
         assert words in refusal(InputFile(path, "give a file").read)
     assert "larger than 512 MiB" in refusal(InputFile(large, "give a file").read)
-    assert "Is a directory" in refusal(InputFile(tmp_path, "give a file").read)
+    assert "it is a folder" in refusal(InputFile(tmp_path, "give a file").read)
     assert "null byte" in refusal(InputFile(Path("a\0b"), "give a file").read)
     assert "pipe" in refusal(lambda: read_picture(tmp_path / "pipe"))
 

@@ -317,7 +317,12 @@ def test_every_command_refuses_a_wrong_file_in_one_sentence(
     old = written(tmp_path / "o.json", np.zeros(len(PARAMETERS)), RIG)
     old.write_text(old.read_text().replace('"version": 2', '"version": 0'))
     other = written(tmp_path / "r.json", np.zeros(len(PARAMETERS)), RIG)
-    for file, word in ((changed_file, "was changed"), (old, "version 0"), (other, "nominal rig"), (tmp_path, "cannot")):
+    for file, word in (
+        (changed_file, "was changed"),
+        (old, "version 0"),
+        (other, "nominal rig"),
+        (tmp_path, "is a folder"),
+    ):
         assert run(*more, "--calibration", file) == 2
         said = capsys.readouterr().err
         assert said.count("\n") == 1, said

@@ -299,7 +299,7 @@ def test_a_frame_changed_with_its_hash_is_refused(sealed: Sealed, submitted: Pat
         (lambda c: (c / "SHA256SUMS").unlink(), "is missing"),
         (lambda c: (c / "seal.json").write_text("{"), "seal.json is damaged"),
         (lambda c: flip(c / "pairs.jsonl"), "pairs.jsonl was changed"),
-        (lambda c: next((c / "frames").iterdir()).unlink(), "not readable"),
+        (lambda c: next((c / "frames").iterdir()).unlink(), "is missing"),
         (lambda c: (c / "frames" / "note.png").write_bytes(b"x"), "is not of the sealed set"),
     ],
 )

@@ -67,7 +67,7 @@ def test_the_truths_file_written_again_is_the_same(sealed: Sealed, submitted: Pa
         (lambda d: d["answers"].append(d["answers"][1]), "answers pair 1 twice"),
         (lambda d: d["answers"][2].update(number=1), "answers pair 1 twice"),
         (lambda d: d["answers"].append({**d["answers"][1], "number": 3}), "answers pair 3, the seal has 0 to 2"),
-        (lambda d: d["answers"][0].update(depth="2"), "is no submission: answers.0.depth"),
+        (lambda d: d["answers"][0].update(depth="2"), "is damaged: answers.0.depth"),
         (lambda d: d.update(format="x"), "has the format 'x'"),
     ],
 )

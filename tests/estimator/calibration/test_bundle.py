@@ -134,8 +134,8 @@ def test_the_file_keeps_every_number(tmp_path, bundle) -> None:
         ({"version": 3}, "version 3"),
         ({"kind": "shopping list"}, "not a calibration"),
         ({"chi2": 5.0}, "was changed"),
-        ({"extra": 1}, "damaged at extra"),
-        ({"degrees": "three"}, "damaged at degrees"),
+        ({"extra": 1}, "was changed"),
+        ({"degrees": "three"}, "was changed"),
     ],
 )
 def test_a_file_that_is_not_right_is_refused(tmp_path, bundle, change, complaint) -> None:
@@ -150,7 +150,7 @@ def test_another_rig_a_missing_file_and_no_json_are_refused(tmp_path, bundle) ->
     other = replace(RIG, camera=replace(RIG.camera, fx_px=1431.0))
     with pytest.raises(CalibrationError, match="another rig"):
         read_calibration(path, other)
-    with pytest.raises(CalibrationError, match="cannot read"):
+    with pytest.raises(CalibrationError, match="is missing"):
         read_calibration(tmp_path / "none.json")
     path.write_text("{")
     with pytest.raises(CalibrationError, match="not JSON"):
