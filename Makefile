@@ -16,7 +16,7 @@ PARALLEL ?= --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup dataset bench studies studies-full test test-slow proof test-all mutants benchmark lint clean
+.PHONY: help setup dataset bench studies studies-full test test-slow proof test-all attack mutants benchmark lint clean
 
 help:
 	@echo "make setup      make .venv with everything in it, and make sure of LLVM"
@@ -28,6 +28,7 @@ help:
 	@echo "make test-slow  the slow tests"
 	@echo "make proof      the slow tests of accuracy, but those of many minutes"
 	@echo "make test-all   all tests"
+	@echo "make attack     hostile methods, files and moments: nothing is lost, and nobody is fooled (docs/trust.md)"
 	@echo "make mutants    proof that the tests see faults: one fault at a time, in copies of the checkout"
 	@echo "make benchmark  timings of what must be fast"
 	@echo "make lint       ruff and mypy"
@@ -90,6 +91,9 @@ proof: $(READY)
 
 test-all: $(READY)
 	$(BIN)/python -m pytest --slow --study
+
+attack: $(READY)
+	$(BIN)/python -m pytest $(PARALLEL) --slow tests/attack
 
 mutants: $(READY)
 	$(BIN)/python tests/mutants/run.py
