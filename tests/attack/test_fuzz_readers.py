@@ -108,7 +108,7 @@ def test_a_damaged_file_is_read_or_refused(name: str, valid: dict[str, Kind], tm
     fuzz_a_file(valid[name], tmp_path, FEW)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("name", KINDS)
 def test_hundreds_of_damaged_files_are_read_or_refused(name: str, valid: dict[str, Kind], tmp_path: Path) -> None:
     fuzz_a_file(valid[name], tmp_path, MANY)
@@ -137,7 +137,7 @@ def test_a_sealed_set_with_strange_pairs_is_refused(tmp_path: Path) -> None:
     fuzz_a_sealed_set(tmp_path, FEW)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_hundreds_of_sealed_sets_with_strange_pairs_are_refused(tmp_path: Path) -> None:
     fuzz_a_sealed_set(tmp_path, MANY)
 
@@ -208,7 +208,7 @@ def test_a_strange_command_line_ends_in_a_sentence(
     assert "Traceback" not in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_thousands_of_strange_command_lines_end_in_a_sentence(
     valid: dict[str, Kind], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -267,6 +267,6 @@ def test_a_data_set_with_strange_documents_is_refused(smallest_dataset: Path, tm
     fuzz_a_dataset(smallest_dataset, tmp_path, FEW)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_hundreds_of_data_sets_with_strange_documents_are_refused(smallest_dataset: Path, tmp_path: Path) -> None:
     fuzz_a_dataset(smallest_dataset, tmp_path, MANY)
