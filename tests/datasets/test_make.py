@@ -69,6 +69,8 @@ def test_the_info_says_what_made_it(smallest_dataset: Path) -> None:
 
 def test_two_runs_are_byte_identical_whatever_the_number_of_workers(smallest_dataset: Path, tmp_path: Path) -> None:
     again = make.make(SMALLEST, tmp_path / "again", workers=2, console=quiet())
+    entries = [json.loads(line) for line in (again / schema.LOG).read_text().splitlines()]
+    assert len({entry["worker"] for entry in entries}) == 2
     assert (again / schema.CHECKSUMS).read_text() == (smallest_dataset / schema.CHECKSUMS).read_text()
     assert len(read_checksums(again)) >= 15
     # The comparison can fail: another seed gives other ambient light and the same truth.

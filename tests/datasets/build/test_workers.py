@@ -224,7 +224,6 @@ def test_every_task_is_logged(smallest_dataset: Path) -> None:
         assert entry["seconds"] > 0.0
         assert 50.0 < entry["peak_mb"] < 5000.0
         assert {"time", "task", "key", "worker"} < set(entry)
-    assert len({entry["worker"] for entry in entries}) == 2
 
 
 @pytest.mark.usefixtures("inline")
