@@ -82,7 +82,7 @@ COLUMNS: dict[str, str] = {
     "bound_phi_rad2": "variance of phi at the bound",
     "pair_bound_px2": "as bound_px2, of both images together: one point of the room",
     "pair_bound_phi_rad2": "variance of phi at that bound",
-    "rank_phi2_rad2": "square that the rank by phi sums: error, missed and false detection",
+    "rank_phi2_rad2": "square that the rank by phi sums: error (of outline: of phi_ray), missed and false",
     "pair_visible": "both spots are visible",
     "pair_false": "a false detection in either image",
     "pair_electrons": "the fainter spot's electrons",
@@ -251,8 +251,20 @@ def _image_columns(
         "bound_px2": np.trace(bound, axis1=1, axis2=2),
         "raw_bound_px2": np.trace(raw, axis1=1, axis2=2),
         "bound_phi_rad2": phi_variance(nominal, xy, bound),
-        "rank_phi2_rad2": rank_squares(phi["phi_error_rad"], detected, visible, false, rules.missed_phi_rad),
+        "rank_phi2_rad2": rank_squares(
+            _ranked_phi_error(nominal, spots, uv, phi), detected, visible, false, rules.missed_phi_rad
+        ),
     }
+
+
+def _ranked_phi_error(nominal: Rig, spots: list[SpotTruth], uv: Array, phi: dict[str, Any]) -> Array:
+    """Error of phi that ranks; of "outline" that of phi_ray at the answered pixel.
+
+    "outline" is a formula in the image, true of any rig: no error of the nominal rig would count.
+    """
+    truth = np.array([s.phi_rad.get("ray", np.nan) for s in spots])
+    formula = np.array([convention == "outline" for convention in phi["phi_convention"]])
+    return np.where(formula, phi_of("ray", nominal, uv) - truth, phi["phi_error_rad"])
 
 
 def _phi_columns(

@@ -12,7 +12,7 @@ from helpers.oracles import random_rig, true_pixel
 from scipy.linalg import cholesky, solve_triangular
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.benchmark.answer_errors import MATCH_PX, Rules
+from phibench.estimator.benchmark.answer_errors import MATCH_PX, Rules, phi_of
 from phibench.estimator.benchmark.records import COLUMNS, COUNTED, records
 from phibench.estimator.geometry.phi import CONVENTIONS, outline_circle
 from phibench.estimator.geometry.triangulate import depth_exact
@@ -191,6 +191,21 @@ def test_each_pair_is_measured_with_its_own_rigs():
     for t, row in zip(truths, table.iter_rows(named=True), strict=True):
         centre = outline_circle(t.true_rig)[0]
         assert row["from_centre_px"] == pytest.approx(np.linalg.norm(np.array(t.down.uv_px) - centre), rel=1e-12)
+
+
+def test_no_sense_of_phi_hides_what_the_nominal_rig_gets_wrong():
+    """Attack: angles in the sense "outline", right through the true rig, while the nominal rig is 5 px off."""
+    t = cases(1).truths[0]
+    camera = replace(RIG.camera, cx_px=RIG.camera.cx_px + 5.0)
+    wrong = replace(t, nominal_rig=replace(RIG, camera=camera))
+    spots = [getattr(t, p) for p in ("down", "up")]
+    own = Answer(
+        *(Spot(s.uv_px, None, float(phi_of("outline", RIG, np.array([s.uv_px]))[0]), "outline") for s in spots)
+    )
+    for plain, cheating in zip(one(truth_itself(t), wrong), one(own, wrong), strict=True):
+        assert cheating["phi_convention"] == "outline"
+        assert cheating["phi_error_rad"] == pytest.approx(0.0, abs=1e-12)
+        assert cheating["rank_phi2_rad2"] == plain["rank_phi2_rad2"] > 1e-6
 
 
 @pytest.mark.parametrize(
