@@ -38,12 +38,15 @@ def test_a_file_is_found_hashed_and_not_run(tmp_path: Path) -> None:
     assert (tmp_path / "ran").exists()
 
 
-def test_a_file_with_a_strange_name_has_a_printable_one(tmp_path: Path) -> None:
+def test_a_file_with_a_strange_name_is_refused_by_a_printable_one(tmp_path: Path) -> None:
     name = "[b]\x1b[2J\udcff.py"
     (tmp_path / name).write_text("def extract(pair):\n    return 1\n")
-    found = resolve(f"{tmp_path / name}:extract")
-    assert found.name == "[b]\\x1b[2J\\udcff:extract"
-    assert str(found.document()["place"]).isprintable()
+    with pytest.raises(MethodError, match="printable signs") as caught:
+        resolve(f"{tmp_path / name}:extract")
+    assert str(caught.value).isprintable()
+    (tmp_path / "[b].py").write_text("def extract(pair):\n    return 1\n")
+    found = resolve(f"{tmp_path / '[b].py'}:extract")
+    assert found.name == "[b]:extract"
     assert load(found)(None) == 1  # type: ignore[arg-type, comparison-overlap]
 
 
