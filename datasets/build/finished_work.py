@@ -29,7 +29,7 @@ from phibench.datasets.store.documents import parse_info
 from phibench.datasets.store.provenance import code_sha256
 from phibench.datasets.store.schema import DatasetInfo
 
-OR_REPLACE = "give another folder, or `phibench dataset make --replace` to lose them"
+OR_REPLACE = "give another folder, or add `--replace` to delete them"
 _NOT_IN_KEYS = ("dataset", "frames", "distractors")
 """Tables of a recipe: the first is told by itself, on the others no task depends."""
 _ENVIRONMENT = ("python", "machine", "packages", "variant", "llvm", "threads_per_process")

@@ -109,7 +109,7 @@ def refuse_other(out: Path, name: str | None) -> None:
     if name is not None and head is not None and (held := parse_info(head.info).name) != name:
         count = len(Journal(out).entries)
         what = f"{count} finished task{'s' * (count != 1)} of another data set" if count else "another data set"
-        remedy = "give another folder, or `phibench dataset make --replace` to delete it"
+        remedy = "give another folder, or add `--replace` to delete it"
         raise DatasetError(f"{out} holds {what} ('{held}'); {remedy}")
 
 

@@ -193,6 +193,11 @@ def read_info(folder: Path) -> DatasetInfo:
     if not folder.is_dir():
         raise DatasetError(f"there is no folder {folder}")
     if not path.is_file():
+        if (folder / schema.JOURNAL).is_file():
+            raise DatasetError(
+                f"{folder} is not a finished data set: it has no {schema.INFO}; wait until `phibench dataset make` has "
+                "ended there, or give the same command again"
+            )
         raise DatasetError(f"{folder} is not a data set: it has no {schema.INFO}")
     file = _info_file(path)
     document = file.json()

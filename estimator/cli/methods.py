@@ -68,7 +68,8 @@ def check(
         print(note)
     for fault in done.faults:
         print(f"wrong: {fault}")
-    print(f"{reference}: " + ("nothing wrong on ten easy pairs" if done.ok else f"{len(done.faults)} wrong"))
+    sound = "nothing wrong on ten easy pairs (conventions only: no lamps, no faint spots)"
+    print(f"{reference}: {sound if done.ok else f'{len(done.faults)} wrong'}")
     return 0 if done.ok else 1
 
 

@@ -113,7 +113,7 @@ def _import_mitsuba(*, needs_llvm: bool) -> ModuleType:
     try:
         import mitsuba
     except ModuleNotFoundError as error:
-        raise VariantError("Mitsuba is not installed: run `pip install 'phibench[render]'`.") from error
+        raise VariantError("Mitsuba is not installed: run `pip install 'phibench[render,cluster]'`.") from error
     return mitsuba
 
 

@@ -77,8 +77,7 @@ CHANGES = (
         "seed = 0",
         "seed = 8231",  # which may be a secret
         SAMPLES + VIEWS,
-        f"5 finished tasks (3 views, 2 samples) {LOST} seed; "
-        "give another folder, or `phibench dataset make --replace` to lose them",
+        f"5 finished tasks (3 views, 2 samples) {LOST} seed; give another folder, or add `--replace` to delete them",
     ),
     ("[ambient]", "[laser]\npower_w = 2e-3\n\n[ambient]", SAMPLES + SPOTS, "4 finished tasks (2 spots, 2 samples)"),
     ("[0.5]", "[0.5, 1.4]", ["sample seen-near-h1.400", "spot seen-near-h1.400"], ""),
