@@ -126,19 +126,6 @@ def joint_bound(
     return JointBound(down, up, variance, A, G)
 
 
-def joint_sigma_m(
-    rig: Rig,
-    stroke_m: ArrayLike,
-    uv_down_px: Array,
-    depth_m: ArrayLike,
-    covariance_down_px2: Array,
-    covariance_up_px2: Array,
-) -> Array:
-    """Standard deviation of D at `joint_bound`, shape (...), metres."""
-    bound = joint_bound(rig, stroke_m, uv_down_px, depth_m, covariance_down_px2, covariance_up_px2)
-    return np.asarray(np.sqrt(bound.variance_depth_m2))
-
-
 def information(covariance: Array) -> Array:
     """Inverse of covariances, shape (..., 2, 2); NaN where there is none."""
     C = np.asarray(covariance, float)

@@ -11,7 +11,7 @@ import pytest
 from helpers.joint_pairs import BAYER, MONO, RIG, drawn_pairs
 from scipy import stats
 
-from phibench.estimator.geometry.combine import joint_sigma_m
+from phibench.estimator.geometry.combine import joint_bound
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.render.sensor.settings import Sensor
@@ -55,7 +55,7 @@ def checked(s: Sensor, depth_m: float, stroke_m: float, collected_e: float, came
     joint, one, two = pairs.joint(), pairs.separate(pairs.down), pairs.separate(pairs.up)
     apart = depth_exact(RIG, stroke_m, one.uv_px, two.uv_px)
     bounds = pairs.down.bound_px2, pairs.up.bound_px2
-    bound = joint_sigma_m(RIG, stroke_m, pairs.down.uv_px, pairs.depth_m, *bounds)
+    bound = np.sqrt(joint_bound(RIG, stroke_m, pairs.down.uv_px, pairs.depth_m, *bounds).variance_depth_m2)
     free = depth_exact(RIG, stroke_m, pairs.down.uv_px, pairs.up.uv_px, *bounds).sigma_m
     good = (joint.status == Status.OK) & (apart.status == Status.OK)
     n = int(good.sum())

@@ -74,10 +74,13 @@ def test_published_estimates_stand_beside_ours(scores: tuple[Score, ...]) -> Non
     assert np.abs(published).max() == pytest.approx(0.1388, abs=1e-4)
 
 
-def test_frame_is_ambient_plus_spot_at_the_true_place(paper: Dataset, tiny_dataset: Path) -> None:
-    """Brightest pixel of laser on - laser off is the pixel of the truth, every third sample, dark, and one lit."""
+@pytest.mark.parametrize(("every", "images"), [(3, 20), pytest.param(1, 52, marks=pytest.mark.slow)])
+def test_frame_is_ambient_plus_spot_at_the_true_place(
+    paper: Dataset, tiny_dataset: Path, every: int, images: int
+) -> None:
+    """Brightest pixel of laser on - laser off is the pixel of the truth, in every image, dark or lit."""
     checked = lit = 0
-    for sample in (*paper.samples[::3], open_dataset(tiny_dataset)["seen-near-h0.500"]):
+    for sample in (*paper.samples[::every], open_dataset(tiny_dataset)["seen-near-h0.500"]):
         for position in ("down", "up"):
             row = sample.row.position(position)
             off = sample.expected_image(position, laser=False)
@@ -89,7 +92,7 @@ def test_frame_is_ambient_plus_spot_at_the_true_place(paper: Dataset, tiny_datas
             assert difference.sum() == pytest.approx(row.electrons_per_s[0], rel=1e-6)
             checked += 1
             lit += bool(off.max() > 1e5)
-    assert (checked, lit) == (20, 2)
+    assert (checked, lit) == (images, 2)
 
 
 def test_truth_layer_at_the_spot_is_the_spots_truth(paper: Dataset) -> None:

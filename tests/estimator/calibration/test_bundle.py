@@ -54,14 +54,15 @@ def test_exact_data_of_the_nominal_rig_change_nothing() -> None:
     assert bundle.chi2 < 1e-4
 
 
-def test_covariance_by_simulation() -> None:
-    """20 drawn rigs: chi2 of all parameters against their covariance, and the fit's own chi2, both chi-square sums.
+@pytest.mark.parametrize("rigs", [20, pytest.param(40, marks=pytest.mark.slow)])
+def test_covariance_by_simulation(rigs: int) -> None:
+    """Drawn rigs: chi2 of all parameters against their covariance, and the fit's own chi2, both chi-square sums.
 
     False alarm rate 1e-4 each. A covariance 1.7 times too large or too small (a sigma 1.3 times) is noticed.
     """
     rng, sigmas = np.random.default_rng(21), 0.3 * prior_sigmas()
     pulls, misfits, degrees = [], [], 0
-    for _ in range(20):
+    for _ in range(rigs):
         values = rng.normal(0.0, sigmas)
         true = changed(RIG, values)
         bundle = calibrate(RIG, apparent(true, rng), spots_of(true, values, rng), sigmas=sigmas)
@@ -69,7 +70,7 @@ def test_covariance_by_simulation() -> None:
         pulls.append(off @ np.linalg.solve(bundle.covariance, off))
         misfits.append(bundle.chi2)
         degrees += bundle.degrees
-    n = 20 * len(PARAMETERS)
+    n = rigs * len(PARAMETERS)
     low, high = stats.chi2.ppf([5e-5, 1 - 5e-5], n)
     assert low < sum(pulls) < high
     assert not low < sum(pulls) * 1.7 < high

@@ -12,7 +12,7 @@ import pytest
 from helpers.joint_pairs import BAYER, MONO, RIG, Pairs, drawn_pairs
 from helpers.oracles import random_rig, random_spot, true_pixel
 
-from phibench.estimator.geometry.combine import combine, joint_sigma_m
+from phibench.estimator.geometry.combine import combine, joint_bound
 from phibench.estimator.geometry.mirror_image import image_of, up_image
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.geometry.triangulate import depth_exact
@@ -118,7 +118,7 @@ def test_combine_against_draws() -> None:
     rng = generator("combine", "draws")
     x, y = rng.multivariate_normal(down, C1, 20_000), rng.multivariate_normal(up, C2, 20_000)
     best, midpoint = combine(RIG, h, x, C1, y, C2), depth_exact(RIG, h, x, y, C1, C2)
-    sigma = joint_sigma_m(RIG, h, down, D, C1, C2)
+    sigma = np.sqrt(joint_bound(RIG, h, down, D, C1, C2).variance_depth_m2)
     assert best.depth_m.std() == pytest.approx(float(sigma), rel=0.025)
     # mean of a chi^2 of one degree: 1 +- sqrt(2 / n) = 0.01
     assert best.chi2.mean() == pytest.approx(1.0, abs=0.05)
@@ -135,7 +135,7 @@ def test_the_constraint_never_costs_information() -> None:
     for _ in range(20):
         A, B = rng.normal(0.0, 0.02, (2, 2, 2))
         C1, C2 = A @ A.T + 1e-6 * np.eye(2), B @ B.T + 1e-6 * np.eye(2)
-        joint = joint_sigma_m(RIG, h, down, D, C1, C2)
+        joint = np.sqrt(joint_bound(RIG, h, down, D, C1, C2).variance_depth_m2)
         free = depth_exact(RIG, h, down, up, C1, C2).sigma_m
         assert (joint <= free * (1.0 + 1e-9)).all()
         checked += int((joint < 0.99 * free).sum())
