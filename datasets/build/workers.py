@@ -110,6 +110,9 @@ def local_workers(count: int, out: Path) -> Iterator[DaskExecutor]:
     deaths = _Deaths()
     settings = {
         "distributed.scheduler.allowed-failures": 0,  # who is to blame is found out in `scheduler`
+        # dask looks 15 s after a death whether its nanny has a worker, and ends the nanny if not, also while the
+        # worker of a later death starts. A nanny that cannot replace its worker is met by LOST_S.
+        "distributed.deploy.lost-worker-timeout": "1000 hours",
         "distributed.worker.memory.target": False,
         "distributed.worker.memory.spill": False,
         "distributed.worker.memory.pause": False,
