@@ -1,8 +1,8 @@
 """Causes of images without a right position: exactly one for each, the first that holds along the path of the light.
 
 An image that is not found is of one kind: *unseen* (no spot visible, and rightly no position), *missed* (a spot, no
-position) or *false* (a position where there is no spot, or too far from it). Its cause is one of `CAUSES`, in this
-order; the numbers of the rules:
+position: "no answer" in tables) or *false* (a position where there is no spot, or too far from it). Its cause is one
+of `CAUSES`, in this order; the numbers of the rules:
 
 edge          the spot's image is nearer than 3 blurs to the mirror's outline or to the sensor's edge
 confused      the answer is within `match_px` of another light, or its 4 x 4 pixels (two Bayer cells) are brighter than
@@ -45,7 +45,8 @@ LEAST_CONTRAST = 3.0
 _RING = (4, 8)  # px from the spot: 4 px are 5 blurs of the default rig, so that no light of the spot is in it
 _CLIPPED = 0.95  # of the largest code: the mean of 4 x 4 pixels in a lamp's reflection
 _LAMP_TO_SPOT = 3.0
-KINDS = ("unseen", "missed", "false")
+KINDS: dict[str, str] = {"missed": "no answer", "false": "false", "unseen": "rightly none"}
+"""Kinds with their names in tables. The records' column `missed` holds for "false" at a visible spot, too."""
 _PIXEL_SIGMA2 = 1.0 / 12.0  # px^2: the integration over a pixel widens the optical blur by the variance of a unit box
 _OF_THE_MIRROR = ("no_reflection", "mirror_edge")
 

@@ -17,7 +17,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.store.files import write_text
-from phibench.estimator.benchmark.causes import CAUSES
+from phibench.estimator.benchmark.causes import CAUSES, KINDS
 from phibench.estimator.benchmark.compare import same_pairs
 from phibench.estimator.benchmark.document import EncodedPicture, ScoreDocument, read_records, read_score
 from phibench.estimator.benchmark.figures import (
@@ -151,6 +151,7 @@ def report_html(
         ranked_by=rank_words(by),
         strata_metrics=_STRATA,
         definitions=CAUSES,
+        kinds=KINDS,
     )
     environment.filters["json"] = lambda value: json.dumps(value, indent=1)
     rankings = [_ranking(number, group, by) for number, group in enumerate(_groups(scores), 1)]

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from phibench.estimator.benchmark.causes import CAUSES, TAKEN_FOR
+from phibench.estimator.benchmark.causes import CAUSES, KINDS, TAKEN_FOR
 from phibench.estimator.benchmark.compare import Difference
 from phibench.estimator.benchmark.document import ScoreDocument, Value
 from phibench.estimator.benchmark.intervals import Estimate
@@ -124,10 +124,12 @@ def leaderboard(documents: Sequence[ScoreDocument], by: str = "phi", wide: bool 
 
 
 def score_table(document: ScoreDocument, by: str = "phi") -> Grid:
-    """One row per metric of one method, with its interval."""
+    """One row per metric of one method, with its interval; of a method that finds nothing, rows with values alone."""
     title = f"{document.method.name}: {_pairs_in_words(document)}, {rank_words(by)}"
     there = [name for name in HEADS if applies(name, document.method.sees)]
     order = sorted(there, key=lambda name: name != RANKS[by])
+    if not _finds(document):
+        order = [name for name in order if document.metrics[name].value is not None]
     rows = ((METRICS[name].text, METRICS[name].shown[1], *_parts(name, document.metrics[name])) for name in order)
     interval = f"{100 * document.rules['confidence']:g} % interval"
     return Grid(title, ("metric", "unit", "value", interval), tuple(rows), "LlrL")
@@ -148,28 +150,28 @@ def strata_table(document: ScoreDocument, wide: bool = False) -> Grid:
 def cause_table(documents: Sequence[ScoreDocument]) -> Grid:
     """Images without a right position: of one method by cause, of several one row per method."""
     title = "Images without a right position"
-    kinds = ("missed", "false", "rightly none")
+    kinds = tuple(KINDS.values())
     if len(documents) > 1:
         rows = tuple((d.method.name, *_kind_totals(d), ", ".join(_most_frequent(d))) for d in documents)
         return Grid(title, ("method", *kinds, "most frequent causes"), rows, "LrrrL")
     (document,) = documents
     counts = ((cause, document.causes[cause]) for cause in CAUSES)
-    rows = tuple(
-        (cause, *(str(kind[k]) for k in _ORDER), CAUSES[cause]) for cause, kind in counts if any(kind.values())
-    )
+    rows = tuple((cause, *(str(kind[k]) for k in KINDS), CAUSES[cause]) for cause, kind in counts if any(kind.values()))
     return Grid(title, ("cause", *kinds, "definition"), rows, "lrrrL")
 
 
-_ORDER = ("missed", "false", "unseen")
-
-
 def _kind_totals(document: ScoreDocument) -> Iterator[str]:
-    return (str(sum(kinds[kind] for kinds in document.causes.values())) for kind in _ORDER)
+    return (str(sum(kinds[kind] for kinds in document.causes.values())) for kind in KINDS)
 
 
 def _most_frequent(document: ScoreDocument, count: int = 3) -> list[str]:
     wrong = Counter({cause: kinds["missed"] + kinds["false"] for cause, kinds in document.causes.items()})
     return [f"{cause} {number}" for cause, number in wrong.most_common(count) if number]
+
+
+def _finds(document: ScoreDocument) -> bool:
+    """Tell whether a method has found a spot, so that there are errors to show."""
+    return bool(document.metrics["detection_rate"].value)
 
 
 def _pairs_in_words(document: ScoreDocument) -> str:
@@ -194,6 +196,23 @@ def false_line(records: pl.DataFrame) -> str:
     ((kind, number),) = Counter(false["taken_for"].to_list()).most_common(1)
     what, advice = TAKEN_FOR[kind]
     return f"{100 * number / len(answers):.0f} % of the answers are {what}: {advice}"
+
+
+def failure_line(records: pl.DataFrame) -> str:
+    """Sentence on a method that failed on every pair, with its most frequent failure; "" where an answer came back.
+
+    Parameters
+    ----------
+    records : as of `records.records`
+    """
+    asked = records.filter(pl.col("image") == "down")
+    said = Counter(asked.select("failure", "message").rows())
+    if not said or any(failure == "" for failure, _ in said):
+        return ""
+    ((failure, message), number) = min(said.items(), key=lambda item: (-item[1], item[0]))
+    often = "for example" if number == 1 else "each time" if number == len(asked) else f"{number} times"
+    pairs = "the only pair" if len(asked) == 1 else f"all {len(asked)} pairs, {often}"
+    return f"failed on {pairs} with {': '.join(filter(None, (failure, message)))}"
 
 
 def _printed(one: HasScore) -> list[str]:
@@ -280,18 +299,21 @@ def print_scores(scored: Sequence[HasScore], form: str, by: str, wide: bool, cal
         return
     console = _console(wide)
     show_grid(console, board if wide or len(documents) > 1 else score_table(documents[0], by))
+    failed = {id(one): line for one in scored if (line := failure_line(one.records))}
     for one in scored:
-        lines = [flag.text for flag in one.document.flags]
-        for line in filter(None, (*lines, false_line(one.records))):
+        lines = [failed.get(id(one), ""), *(flag.text for flag in one.document.flags), false_line(one.records)]
+        for line in filter(None, lines):
             _line(console, f"{one.document.method.name}: {line}")
-    if any(any(kind.values()) for document in documents for kind in document.causes.values()):
+    missing = any(any(kind.values()) for document in documents for kind in document.causes.values())
+    if missing and (len(scored) > 1 or not failed):
         show_grid(console, cause_table(documents))
     for one in scored:
-        lines = [*([depth_line(one.document)] if calibrated else []), *silences(one.records), *_printed(one)]
+        said = [] if id(one) in failed else silences(one.records)
+        lines = [*([depth_line(one.document)] if calibrated and _finds(one.document) else []), *said, *_printed(one)]
         lines += [one.document.isolation] if one.document.isolation.startswith("not isolated") else []
         for line in lines:
             _line(console, f"{one.document.method.name}: {line}")
-    if len(documents) == 1:
+    if len(documents) == 1 and _finds(documents[0]):
         show_grid(console, strata_table(documents[0], wide))
 
 

@@ -23,7 +23,7 @@ from phibench.render.setup.llvm import find_llvm
 from phibench.render.setup.llvm_library import LlvmError, fault_of, prove
 from phibench.render.setup.variant import ENVIRONMENT, default_variant
 
-State = Literal["ok", "warning", "fault"]
+State = Literal["ok", "optional", "warning", "fault"]
 
 CORE = (
     "cyclopts",
@@ -43,7 +43,7 @@ RENDER = ("mitsuba", "drjit")
 OLDEST_PYTHON = (3, 11)
 LEAST_DISK_GIB = 2.0
 _RENDER_S = 180.0
-_COLOURS: dict[State, str] = {"ok": "green", "warning": "yellow", "fault": "red"}
+_COLOURS: dict[State, str] = {"ok": "green", "optional": "dim", "warning": "yellow", "fault": "red"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,8 @@ def package_findings(pinned: dict[str, str]) -> Iterator[Finding]:
     for name in CORE:
         yield package_finding(name, pinned.get(name))
     for name in RENDER:
-        yield Finding(name, "not installed") if is_scoring_only() else package_finding(name, pinned.get(name))
+        absent = is_scoring_only()
+        yield Finding(name, "not installed", "optional") if absent else package_finding(name, pinned.get(name))
     for name in sorted(set(pinned) - set(CORE) - set(RENDER)):
         finding = package_finding(name, pinned[name])
         # What the tests or the checks need may be absent; what is there should be what was tested.

@@ -10,12 +10,21 @@ import pytest
 from helpers.bench_cases import cases, constant, outcomes, sampler, shifted, silent
 
 from phibench.estimator.benchmark.answer_errors import Rules
+from phibench.estimator.benchmark.causes import KINDS
 from phibench.estimator.benchmark.compare import compare_records
 from phibench.estimator.benchmark.document import MethodCard
 from phibench.estimator.benchmark.metrics import METRICS
 from phibench.estimator.benchmark.report import report_html
 from phibench.estimator.benchmark.score import isolated, score_outcomes
-from phibench.estimator.benchmark.score_tables import HEADS, number, print_comparison, print_scores
+from phibench.estimator.benchmark.score_tables import (
+    HEADS,
+    cause_table,
+    failure_line,
+    number,
+    print_comparison,
+    print_scores,
+)
+from phibench.estimator.interface import Outcome
 
 RULES = Rules(resamples=199)
 NAMES = ("gaussian_least_squares", "raw_maximum_likelihood", "a_method_of_my_own.py:extract")
@@ -60,6 +69,54 @@ def test_a_score_without_isolation_says_so(scored, capsys, sentence):
     page = report_html([(one.document, one.records)])
     assert f"<p>{one.document.method.name}: {sentence}.</p>" in page or not sentence.startswith("not")
     assert page.count("<p>" + one.document.method.name) == sentence.startswith("not")
+
+
+def failed(messages):
+    """A score of a method that failed on every pair, with these messages in turn."""
+    pairs = cases(20)
+    said = [Outcome(t.number, None, float("nan"), "error", messages[t.number % len(messages)]) for t in pairs.truths]
+    return score_outcomes(MethodCard.of("broken"), pairs, said, RULES)
+
+
+def test_a_method_that_fails_on_every_pair_is_told_in_a_sentence(scored, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    one = failed(["KeyError: 'red'"])
+    print_scores([one], "terminal", "phi", wide=False)
+    shown = capsys.readouterr().out
+    assert shown.count("broken: failed on all 20 pairs, each time with error: KeyError: 'red'\n") == 1
+    assert shown.count("KeyError") == 1
+    assert "no spot detected" not in shown
+    rows = [line.split() for line in shown.splitlines()]
+    assert [row for row in rows if "-" in row] == []
+    # title, head, rule, both ranks, found, false, two with missed counted, and the sentence
+    assert 8 <= len([row for row in rows if row]) <= 12
+    print_scores([scored[0], one], "terminal", "phi", wide=False)
+    shown = capsys.readouterr().out
+    assert shown.count("KeyError") == 1
+    assert "most frequent causes" in shown
+
+
+@pytest.mark.parametrize(
+    ("messages", "words"),
+    [
+        (["a"], "all 20 pairs, each time with error: a"),
+        (["a", "b", "b"], "all 20 pairs, 13 times with error: b"),
+        ([str(i) for i in range(20)], "all 20 pairs, for example with error: 0"),
+        ([""], "all 20 pairs, each time with error"),
+    ],
+)
+def test_the_most_frequent_failure_is_named(scored, messages, words):
+    assert failure_line(failed(messages).records) == f"failed on {words}"
+    assert failure_line(scored[2].records) == ""
+
+
+def test_kinds_of_causes_are_named_by_what_they_are(scored):
+    """Half of the answers of the last are false, the others have no position: "missed" would be both."""
+    for documents in ([scored[2].document], [one.document for one in scored]):
+        grid = cause_table(documents)
+        assert [head for head in grid.heads if head in ("missed", *KINDS.values())] == list(KINDS.values())
+        place, row = grid.heads.index("no answer"), grid.rows[-1]
+        assert row[place : place + 3] == ("20", "20", "0")
 
 
 def test_a_comparison_fits_eighty_columns(scored, capsys, monkeypatch):

@@ -57,6 +57,10 @@ def test_an_installation_for_scoring_only_is_in_order(python: Python) -> None:
     assert lines_of(child.stdout, "fault") == []
     [line] = [line for line in child.stdout.splitlines() if "scoring works; rendering needs" in line]
     assert "pip install 'phibench[render,cluster]'" in line
+    rows = [line.split("│")[1:-1] for line in child.stdout.splitlines() if "not installed" in line]
+    assert [[cell.strip() for cell in row] for row in rows] == [
+        [name, "not installed", "optional"] for name in ("mitsuba", "drjit")
+    ]
     assert "Traceback" not in child.stderr
 
 
