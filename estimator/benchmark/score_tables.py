@@ -297,7 +297,7 @@ def print_scores(scored: Sequence[HasScore], form: str, by: str, wide: bool, cal
         whole = {"csv": scores_csv, "json": scores_json}
         sys.stdout.write(table[form](board) if form in table else whole[form](documents, by))
         return
-    console = _console(wide)
+    console = table_console(wide)
     show_grid(console, board if wide or len(documents) > 1 else score_table(documents[0], by))
     failed = {id(one): line for one in scored if (line := failure_line(one.records))}
     for one in scored:
@@ -321,14 +321,14 @@ def print_comparison(differences: Sequence[Difference], first: str, second: str,
     """Print a comparison; parameters as for `print_scores`."""
     grid = comparison(differences, first, second, wide)
     if form == "terminal":
-        show_grid(_console(wide), grid)
+        show_grid(table_console(wide), grid)
     else:
         texts = {"csv": lambda: differences_csv(differences), "json": lambda: differences_json(differences)}
         texts |= {"markdown": lambda: markdown(grid), "latex": lambda: latex(grid)}
         sys.stdout.write(texts[form]())
 
 
-def _console(wide: bool) -> Console:
+def table_console(wide: bool) -> Console:
     """A console at least 80 columns wide; a wide one does not lose numbers in a narrow terminal or a pipe."""
     console, least = Console(markup=False, emoji=False), WIDE if wide else 80
     return console if console.width >= least else Console(width=least, markup=False, emoji=False)

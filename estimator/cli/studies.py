@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from phibench.estimator.cli.options import DEFAULT_PRESET, SENSOR, Whole, wide_console
+from phibench.estimator.cli.options import DEFAULT_PRESET, SENSOR, Whole
 
 if TYPE_CHECKING:
     from phibench.estimator.paper.paper_tables import Score
-
-_TABLE_WIDTH, _BUDGET_WIDTH = 210, 150
 
 
 def paper(
@@ -26,6 +24,7 @@ def paper(
     draws: Whole | None = None,
     laser_off: bool | None = None,
     rig: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
+    wide: Annotated[bool, Parameter(negative="")] = False,
     out: Path | None = None,
 ) -> int:
     """Print the tables of the paper beside those of every depth estimator; no method runs.
@@ -49,18 +48,20 @@ def paper(
         With --misaligned: also a frame with the laser off beside each (default); --no-laser-off does without.
     rig
         With --misaligned: ids of rigs; all by default.
+    wide
+        Estimates in metres too, or with --misaligned every interval, in up to 210 columns instead of 80.
     out
         JSON file for the scores; with --misaligned a Parquet file, one row per sample and draw.
     """
     if not misaligned:
         _refuse("is for the misaligned experiments: give --misaligned too", preset, draws, laser_off, rig or None)
-        return _tables(directory, calibration, out)
+        return _tables(directory, calibration, wide, out)
     if calibration is not None:
         from phibench.datasets.errors import DatasetError
 
         raise DatasetError("--calibration does not go with --misaligned, which calibrates every rig itself")
     with_off = True if laser_off is None else laser_off
-    return _experiments(directory, preset or DEFAULT_PRESET, 1 if draws is None else draws, with_off, rig, out)
+    return _experiments(directory, preset or DEFAULT_PRESET, 1 if draws is None else draws, with_off, rig, wide, out)
 
 
 def _refuse(why: str, *values: object) -> None:
@@ -71,9 +72,10 @@ def _refuse(why: str, *values: object) -> None:
             raise DatasetError(f"--{name} {why}")
 
 
-def _tables(directory: Path, calibration: Path | None, out: Path | None) -> int:
+def _tables(directory: Path, calibration: Path | None, wide: bool, out: Path | None) -> int:
     from phibench.datasets.read import open_finished
     from phibench.estimator.benchmark.dataset_pairs import of_calibration
+    from phibench.estimator.benchmark.score_tables import show_grid, table_console
     from phibench.estimator.calibration.file import read_calibration
     from phibench.estimator.paper.paper_tables import bias_table, table
     from phibench.estimator.paper.paper_tables import score as score_dataset
@@ -81,9 +83,9 @@ def _tables(directory: Path, calibration: Path | None, out: Path | None) -> int:
     dataset = open_finished(directory)
     calibrated = None if calibration is None else read_calibration(calibration)
     scores = score_dataset(dataset if calibrated is None else of_calibration(dataset, calibrated), calibrated)
-    console = wide_console(_TABLE_WIDTH)
-    for grid in (table(scores, "truth"), table(scores, "frame"), bias_table(scores)):
-        console.print(grid)
+    console = table_console(wide)
+    for grid in (table(scores, "truth", wide), table(scores, "frame", wide), bias_table(scores)):
+        show_grid(console, grid)
     if out is not None:
         _write_scores(out, directory, scores)
     return 0
@@ -105,10 +107,11 @@ def _write_scores(out: Path, directory: Path, scores: Sequence[Score]) -> None:
 
 
 def _experiments(
-    directory: Path, preset: str, draws: int, laser_off: bool, rig: tuple[str, ...], out: Path | None
+    directory: Path, preset: str, draws: int, laser_off: bool, rig: tuple[str, ...], wide: bool, out: Path | None
 ) -> int:
     from phibench.datasets.read import open_finished
     from phibench.datasets.store.files import require_writable
+    from phibench.estimator.benchmark.score_tables import show_grid, table_console
     from phibench.estimator.paper.experiment_bounds import budget_table, write_rows
     from phibench.estimator.paper.experiment_tables import Procedure, run_experiments
 
@@ -118,7 +121,7 @@ def _experiments(
     rows = run_experiments(open_finished(directory), procedure, rig or None, lambda name: print(f"{name} is measured"))
     if out is not None:
         write_rows(rows, out)
-    wide_console(_BUDGET_WIDTH).print(budget_table(rows))
+    show_grid(table_console(wide), budget_table(rows, wide))
     return 0
 
 

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
-from rich.table import Table
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import CachedSample
@@ -25,7 +24,7 @@ from phibench.datasets.store.files import write_bytes
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.dataset_pairs import spot_bounds as bounds_of_spot
 from phibench.estimator.benchmark.intervals import Clusters, Estimate, estimates, rate, rms_of, rms_ratio_of
-from phibench.estimator.benchmark.score_tables import one_line
+from phibench.estimator.benchmark.score_tables import Grid, cell_parts
 from phibench.estimator.draw_pairs import pairs_of
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.scenes.frames import Array
@@ -218,15 +217,14 @@ def budgets(rows: pl.DataFrame, by: str, rules: Rules | None = None) -> dict[str
     return {str(key[0]): budget(group, rules) for key, group in groups.items()}
 
 
-def budget_table(rows: pl.DataFrame) -> Table:
-    """Budgets per experiment and per distance, of all rows, and of those whose bound is at most 1 % of D."""
-    grid = Table(title="Relative errors of D in %; 95 % intervals over samples")
-    heads = ("rows", "n", "missing", "measured", "predicted", "bound", "predicted / measured", "measured / bound")
-    for head in (*heads, "within 95 %", "nominal rig"):
-        grid.add_column(head, justify="left" if head == "rows" else "right")
-    for name, part in _parts(rows):
-        grid.add_row(name, *_cells(budget(part)))
-    return grid
+def budget_table(rows: pl.DataFrame, wide: bool = False) -> Grid:
+    """Budgets per experiment, of all rows, and of those whose bound is at most 1 % of D; `wide` adds the intervals."""
+    ratios = ("predicted\n/ measured", "measured\n/ bound", "within\n95 %", "nominal\nrig")
+    heads = ("rows", "n\nof all", "measured", "predicted", "bound", *ratios)
+    body = tuple((name, *_cells(budget(part), wide)) for name, part in _parts(rows))
+    confidence = "; 95 % intervals over samples" if wide else ""
+    note = "" if wide else "95 % intervals: --wide."
+    return Grid(f"Relative errors of D in %{confidence}", heads, body, "L" + "r" * (len(heads) - 1), note)
 
 
 def write_rows(rows: pl.DataFrame, path: Path) -> Path:
@@ -246,10 +244,21 @@ def _parts(rows: pl.DataFrame) -> Iterator[tuple[str, pl.DataFrame]]:
     yield from ((name, part) for name, part in parts if not part.filter(found).is_empty())
 
 
-def _cells(one: Budget) -> list[str]:
-    errors = [one_line(one.measured, 100.0, 3), *(f"{100.0 * x:.3f}" for x in (one.predicted, one.bound))]
-    ratios = [one_line(x, 1.0, 2) for x in (one.closure, one.over_bound)]
-    return [str(one.n), str(one.missing), *errors, *ratios, one_line(one.within_95, 100.0, 1), _percent(one.nominal)]
+def _cells(one: Budget, wide: bool) -> list[str]:
+    """Cells of a row; values alone unless it is `wide`."""
+    part = slice(None if wide else 1)
+    measured, closure, over_bound, within = (
+        " ".join(list(filter(None, cell_parts(estimate, factor, digits)))[part])
+        for estimate, factor, digits in (
+            (one.measured, 100.0, 3),
+            (one.closure, 1.0, 2),
+            (one.over_bound, 1.0, 2),
+            (one.within_95, 100.0, 1),
+        )
+    )
+    predicted, bound = (f"{100.0 * x:.3f}" for x in (one.predicted, one.bound))
+    counts = f"{one.n}/{one.n + one.missing}"
+    return [counts, measured, predicted, bound, closure, over_bound, within, _percent(one.nominal)]
 
 
 def _percent(share: float) -> str:

@@ -12,8 +12,8 @@ from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from rich.table import Table
 
+from phibench.estimator.benchmark.score_tables import Grid
 from phibench.estimator.calibration.file import Calibration
 from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
@@ -156,36 +156,83 @@ def summarise(scores: Iterable[Score]) -> tuple[Summary, ...]:
     return tuple(_summary(*key, items) for key, items in groups.items())
 
 
-def table(scores: Sequence[Score], source: str = "truth") -> Table:
-    """The paper's tables beside ours: one line per sample, one column per estimator (estimate and relative error)."""
-    grid = Table(title=f"Depth in metres, relative error in %; pixels: {source}")
-    for head in ("experiment", "h", "real D", "published", *dict.fromkeys(item.estimator for item in scores)):
-        grid.add_column(head, justify="left" if head == "experiment" else "right")
+def table(scores: Sequence[Score], source: str = "truth", wide: bool = False) -> Grid:
+    """The paper's tables beside ours: a row per sample, a column per estimator, relative errors.
+
+    `wide` adds the estimates, the cause where there is none, and the p values of `GENERAL`.
+    """
     rows: dict[str, list[Score]] = {}
     for item in scores:
         if item.source == source:
             rows.setdefault(item.sample_id, []).append(item)
-    for items in rows.values():
+    names = list(dict.fromkeys(item.estimator for item in scores))
+    return (_wide_table if wide else _narrow_table)(list(rows.values()), names, source)
+
+
+def _wide_table(rows: list[list[Score]], names: list[str], source: str) -> Grid:
+    heads = ("experiment", "h", "real D", "published", *names)
+    body = []
+    for items in rows:
         first = items[0]
         published = _cell(first.published_m, first.published_m / first.depth_m - 1.0, "")
         cells = (_cell(item.estimate_m, item.relative_error, item.status) + _doubt(item) for item in items)
-        grid.add_row(first.experiment, f"{first.stroke_m:.3f}", f"{first.depth_m:.3f}", published, *cells)
-    grid.add_section()
-    grid.add_row("rms relative error (n)", "", "", _published_rms(list(rows.values())), *_rms_cells(scores, source))
-    return grid
+        body.append((first.experiment, f"{first.stroke_m:.3f}", f"{first.depth_m:.3f}", published, *cells))
+    means = (f"{_rms(rms)} ({n})" if n else "- (0)" for rms, n in _means(rows, names))
+    published = "{} ({})".format(*_published_rms(rows))
+    body.append(("rms relative error (n)", "", "", published, *means))
+    title = f"Depth in metres, relative error in %; pixels: {source}"
+    return Grid(title, heads, tuple(body), "l" + "r" * (len(heads) - 1))
 
 
-def bias_table(scores: Sequence[Score]) -> Table:
+def _narrow_table(rows: list[list[Score]], names: list[str], source: str) -> Grid:
+    """Relative errors alone, for 80 columns; with a calibration the predicted error in place of the paper's estimate.
+
+    The approximation goes then, too.
+    """
+    calibrated = GENERAL in names
+    shown = [name for name in names if not (calibrated and name.startswith("approx"))]
+    means = dict(zip(names, _means(rows, names), strict=True))
+    body = []
+    for items in rows:
+        first, by_name = items[0], {item.estimator: item for item in items}
+        cells = [_short(by_name[name].relative_error) for name in shown]
+        published = _short(first.published_m / first.depth_m - 1.0)
+        sigma = _short(by_name[GENERAL].sigma_m / first.depth_m).removeprefix("+") if calibrated else ""
+        cells = [*cells, sigma] if calibrated else [published, *cells]
+        body.append((first.experiment, f"{first.stroke_m:.3f}", f"{first.depth_m:.3f}", *cells))
+    of_all = [(_short(means[name][0]).removeprefix("+"), str(means[name][1])) for name in shown]
+    of_all = [*of_all, ("", "")] if calibrated else [_published_rms(rows), *of_all]
+    body += [(name, "", "", *(pair[k] for pair in of_all)) for k, name in enumerate(("rms", "n"))]
+    heads = [name.replace("_", "\n") for name in shown]
+    heads = [*heads, "its\nsigma"] if calibrated else ["printed", *heads]
+    note = "" if calibrated else "printed: the paper's own estimates. "
+    return Grid(
+        f"Relative error of D in %; pixels: {source}",
+        ("experiment", "h\nm", "D\nm", *heads),
+        tuple(body),
+        "L" + "r" * (len(heads) + 2),
+        f"{note}{_without(rows)}Estimates in metres: --wide.",
+    )
+
+
+def _without(rows: list[list[Score]], most: int = 3) -> str:
+    """Sentence on the samples that have no estimate; "" if there are none."""
+    causes = [(items[0], next((x.status for x in items if x.status != "ok"), "")) for items in rows]
+    found = [f"{x.experiment}, h {x.stroke_m:.3f}, D {x.depth_m:.3f} ({cause})" for x, cause in causes if cause]
+    more = f"; and {len(found) - most} more" if len(found) > most else ""
+    return f"Without an estimate: {'; '.join(found[:most])}{more}. " if found else ""
+
+
+def bias_table(scores: Sequence[Score]) -> Grid:
     """Relative error of eq. (4) from true pixels per phi convention: smallest, largest, mean, rms."""
-    grid = Table(title="Bias of eq. (4) by what is taken for phi, true pixels, relative error in %")
-    for head in ("phi", "n", "min", "max", "mean", "rms"):
-        grid.add_column(head, justify="left" if head == "phi" else "right")
+    rows = []
     for item in summarise(scores):
         # true pixels: what is left is the bias of the formula
         if item.source == "truth" and item.estimator.startswith("paper_"):
             values = (_percent(value) for value in (item.minimum, item.maximum, item.mean))
-            grid.add_row(item.estimator.removeprefix("paper_"), str(item.n), *values, _rms(item.rms))
-    return grid
+            rows.append((item.estimator.removeprefix("paper_"), str(item.n), *values, _rms(item.rms)))
+    title = "Bias of eq. (4) by what is taken for phi, true pixels, relative error in %"
+    return Grid(title, ("phi", "n", "min", "max", "mean", "rms"), tuple(rows), "lrrrrr")
 
 
 def as_records(items: Iterable[Score | Summary]) -> list[dict[str, object]]:
@@ -270,14 +317,23 @@ def _rms(relative: float) -> str:
     return _percent(relative).removeprefix("+")
 
 
-def _rms_cells(scores: Sequence[Score], source: str) -> list[str]:
-    return [f"{_rms(s.rms)} ({s.n})" for s in summarise(scores) if s.source == source]
+def _short(relative: float) -> str:
+    """Relative error in % within 6 characters up to 100 %."""
+    percent = 100.0 * relative
+    return _percent(relative) if not abs(percent) >= 10.0 else f"{percent:+.2f}"
 
 
-def _published_rms(rows: list[list[Score]]) -> str:
+def _means(rows: list[list[Score]], names: list[str]) -> list[tuple[float, int]]:
+    """Rms relative error of each estimator, and number of samples that have one."""
+    by_name = {s.estimator: s for s in summarise(item for items in rows for item in items)}
+    return [(by_name[name].rms, by_name[name].n) if name in by_name else (math.nan, 0) for name in names]
+
+
+def _published_rms(rows: list[list[Score]]) -> tuple[str, str]:
+    """Rms relative error of the paper's estimates, and their number."""
     relative = np.array([items[0].published_m / items[0].depth_m - 1.0 for items in rows])
     relative = relative[np.isfinite(relative)]
-    return f"{_rms(float(np.sqrt(np.mean(relative**2))))} ({len(relative)})" if len(relative) else "-"
+    return _rms(float(np.sqrt(np.mean(relative**2)))) if len(relative) else "-", str(len(relative))
 
 
 def _json_value(value: object) -> object:

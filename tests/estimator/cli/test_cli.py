@@ -88,6 +88,10 @@ def test_scores_are_written_to_a_file(monkeypatch, tmp_path, capsys):
     assert document["scores"][0]["published_m"] is None
     assert document["summary"][0]["rms"] == pytest.approx(0.05)
     assert "numpy" in document["provenance"]["packages"]
+    narrow = capsys.readouterr().out
+    assert "+5.000" in narrow
+    assert max(map(len, narrow.splitlines())) <= 80
+    assert cli.main(["paper", "x", "--wide"]) == 0
     assert "2.1000" in capsys.readouterr().out
 
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 import polars as pl
 import pytest
+from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.paper.experiment_bounds import budget, budgets
+from phibench.estimator.benchmark.score_tables import show_grid
+from phibench.estimator.paper.experiment_bounds import budget, budget_table, budgets
 from phibench.estimator.paper.experiment_tables import COLUMNS, WITHIN
 from phibench.scenes.random_streams import generator
 
@@ -79,3 +83,19 @@ def test_budgets_by_a_column() -> None:
     assert found["near"].predicted == pytest.approx(0.01, rel=1e-12)
     assert found["far"].predicted == pytest.approx(0.03, rel=1e-12)
     assert sum(one.n for one in found.values()) == 240
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_the_table_of_budgets_fits_80_columns_and_a_wide_one_has_the_intervals(wide: bool) -> None:
+    table = rows().with_columns(
+        experiment=pl.when(pl.col("experiment") == "far").then(pl.lit("calibration")).otherwise("experiment"),
+        status=pl.when(pl.col("sample_id") == "s00").then(pl.lit("no spot")).otherwise("status"),
+    )
+    console = Console(width=210 if wide else 80, file=io.StringIO())
+    show_grid(console, budget_table(table, wide))
+    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert (max(map(len, lines)) <= 80) != wide
+    (row,) = [line for line in lines if line.startswith("calibration")]
+    assert row.count("[") == (4 if wide else 0)
+    assert "120/120" in row
+    assert any("236/240" in line for line in lines)

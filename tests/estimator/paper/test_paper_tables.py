@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,9 +14,10 @@ from helpers.oracles import paper_cases, true_pixel
 from rich.console import Console
 from scipy.special import ndtr
 
+from phibench.estimator.benchmark.score_tables import show_grid
 from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.paper_depth import find_published, load_published
-from phibench.estimator.paper.paper_tables import SOURCES, as_records, bias_table, score, summarise, table
+from phibench.estimator.paper.paper_tables import GENERAL, SOURCES, as_records, bias_table, score, summarise, table
 from phibench.scenes.rig import Rig
 
 RIG = Rig()
@@ -65,7 +67,7 @@ def three():
 
 def text(grid, width=300):
     console = Console(width=width, file=io.StringIO())
-    console.print(grid)
+    show_grid(console, grid)
     return console.file.getvalue()
 
 
@@ -135,14 +137,47 @@ def test_summary_is_over_the_estimates_alone(three):
 def test_summary_without_estimates():
     only = score(make_dataset(make_sample(*paper_cases()[0], down="outside image")))
     assert all(s.n == 0 and s.missing == 1 and math.isnan(s.rms) for s in summarise(only))
-    assert "outside image" in text(table(only))
-    for shown in (text(table(only)), text(bias_table(only))):
+    for shown in (text(table(only)), text(table(only, wide=True)), text(bias_table(only))):
         assert "nan" not in shown
-    assert "- (0)" in text(table(only))
+    assert "outside image" in text(table(only))
+    assert "outside image" in text(table(only, wide=True))
+    assert "- (0)" in text(table(only, wide=True))
+
+
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_tables_fit_80_columns_with_errors_as_large_as_misaligned_rigs_make(three, calibrated):
+    """Relative errors of -99.99 %, and samples without an estimate, whose causes stand below."""
+    scores = [replace(s, relative_error=-0.9999, sigma_m=0.3 * s.depth_m) if s.status == "ok" else s for s in three]
+    general = [replace(s, estimator=GENERAL) for s in scores if s.estimator == "exact"] if calibrated else []
+    scores = [replace(s, experiment="calibration") for s in (*scores, *general)]
+    shown = text(table(scores), width=80)
+    lines = [line.rstrip() for line in shown.splitlines()]
+    assert max(map(len, lines)) <= 80
+    heads = " ".join(lines[1:3]).split()
+    assert heads.count("paper") == 4
+    assert ("general" in heads, "sigma" in heads, "approx" in heads) == (calibrated, calibrated, not calibrated)
+    rows = [line.split() for line in lines if line.startswith("calibration")]
+    assert len(rows) == 3
+    assert rows[0].count("-99.99") == 6
+    assert rows[2].count("-") >= 6
+    assert "calibration, h 0.425, D 1.000 (up: behind robot)" in " ".join(shown.split())
+    (rms,) = [line.split() for line in lines if line.startswith("rms")]
+    assert len(rms) == (7 if calibrated else 8)
+
+
+def test_the_narrow_table_has_the_numbers_of_the_wide_one(three):
+    wide, narrow = text(table(three, wide=True)), text(table(three), width=80)
+    line, narrow_line = (next(x for x in shown.splitlines() if "2.180" in x) for shown in (wide, narrow))
+    errors = narrow_line.split()[3:]
+    assert len(errors) == 1 + len(ESTIMATORS)
+    assert [word for word in line.split() if word[0] in "+-"] == errors
+    last = next(x for x in wide.splitlines() if "rms" in x).split()[4:]
+    rms, n = (next(x for x in narrow.splitlines() if x.startswith(word)).split()[1:] for word in ("rms", "n "))
+    assert last == [word for pair in zip(rms, (f"({x})" for x in n), strict=True) for word in pair]
 
 
 def test_table_shows_the_paper_beside_ours(three):
-    shown = text(table(three))
+    shown = text(table(three, wide=True))
     line = next(line for line in shown.splitlines() if "2.180" in line)
     assert "table1" in line
     assert "2.3800" in line  # published
@@ -156,7 +191,7 @@ def test_table_shows_the_paper_beside_ours(three):
 
 def test_bias_table_has_one_line_per_convention(three):
     shown = text(bias_table(three))
-    assert [line.split()[1] for line in shown.splitlines() if line.startswith("│")] == [
+    assert [line.split()[0] for line in shown.splitlines() if line.strip()][3:] == [
         "ray",
         "normal",
         "incidence",
