@@ -1,4 +1,4 @@
-"""Input files read within bounds: bytes, text, JSON, TOML, Parquet tables and pictures.
+"""Input files read within bounds: bytes, text, JSON, TOML, Parquet tables, NumPy arrays and pictures.
 
 Every file that somebody else may have written goes through `InputFile`. It looks at the kind and the size of a file
 before it reads, bounds depth, numbers and texts of a document, and compares it with a model. A fault is one sentence:
@@ -17,6 +17,7 @@ import re
 import stat
 import tomllib
 import warnings
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.scenes.validation import printable_line
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
     from PIL.Image import Image
     from polars import DataFrame, DataType
 
@@ -35,6 +37,7 @@ MIB = 1 << 20
 DOCUMENT_BYTES = 512 * MIB  # a submission of 1e6 pairs has 400 MiB
 SETTINGS_BYTES = 1 * MIB  # TOML and other files that people write
 TABLE_ROWS = 20_000_000
+TABLE_VALUES = 500_000_000  # rows times columns; a column of one value takes no room in the file, but in memory
 PICTURE_PIXELS = 50_000_000
 DEPTH = 64  # of lists and tables in each other
 DIGITS = 40  # of a whole number; a seed of 128 bits has 39
@@ -211,7 +214,9 @@ class InputFile:
 
     # Tables and pictures.
 
-    def table(self, columns: Mapping[str, DataType | type[DataType]] | None = None) -> DataFrame:
+    def table(
+        self, columns: Mapping[str, DataType | type[DataType]] | None = None, data: bytes | None = None
+    ) -> DataFrame:
         """Parquet table; `columns` are the names and types that it must have, in any order; others are allowed.
 
         Raises
@@ -221,7 +226,7 @@ class InputFile:
         """
         import polars
 
-        data = self.read()
+        data = self.read() if data is None else data
         try:
             found = polars.read_parquet_schema(io.BytesIO(data))
             if columns is not None and (fault := _columns_fault(found, dict(columns))):
@@ -229,12 +234,64 @@ class InputFile:
             rows = polars.scan_parquet(io.BytesIO(data)).select(polars.len()).collect().item()
             if rows > TABLE_ROWS:
                 raise self.fault(f"has {rows} rows: at most {TABLE_ROWS} are read")
+            if rows * len(found) > TABLE_VALUES:
+                raise self.fault(f"has {rows} rows of {len(found)} columns: at most {TABLE_VALUES} values are read")
             return polars.read_parquet(io.BytesIO(data))
         except DatasetError:
             raise
         except (Exception, polars.exceptions.PanicException) as error:  # a decoder's faults are of many kinds
             reason = printable_line(str(error).partition("\n")[0], 200) or type(error).__name__
             raise self.fault(f"cannot be read: {reason}") from error
+
+    def arrays(self, forms: Mapping[str, tuple[str, int]], data: bytes | None = None) -> dict[str, NDArray[Any]]:
+        """Arrays of an uncompressed `.npz` file by name.
+
+        Parameters
+        ----------
+        forms : mapping
+            For each array its type as NumPy writes it, such as "<f4", and its number of axes. There must be no other.
+
+        Raises
+        ------
+        DatasetError
+            If it cannot be read, or holds other arrays, or an array of another type or number of axes.
+        """
+        content = self.read() if data is None else data
+        try:
+            with warnings.catch_warnings(), zipfile.ZipFile(io.BytesIO(content)) as archive:
+                warnings.simplefilter("ignore")  # of strange texts in a header
+                members = {entry.filename: entry for entry in archive.infolist()}
+                if missing := [name for name in forms if f"{name}.npy" not in members]:
+                    raise self.fault(f"has no array '{missing[0]}'")
+                if len(archive.infolist()) != len(forms):
+                    raise self.fault(f"holds more than {', '.join(forms)}")
+                # what is stored as it is cannot be larger than the file
+                if any(entry.compress_type != zipfile.ZIP_STORED for entry in members.values()):
+                    raise self.fault("is compressed: only plain arrays are read")
+                stored = {name: archive.read(f"{name}.npy") for name in forms}
+                return {name: self._array(name, stored[name], *forms[name]) for name in forms}
+        except DatasetError:
+            raise
+        except Exception as error:  # a decoder's faults are of many kinds
+            reason = printable_line(str(error), 200) or type(error).__name__
+            raise self.fault(f"cannot be read: {reason}") from error
+
+    def _array(self, name: str, data: bytes, kind: str, axes: int) -> NDArray[Any]:
+        """Array of the bytes of an `.npy` file; NumPy's reader would take memory for any shape that a header tells."""
+        import numpy as np
+
+        stream = io.BytesIO(data)
+        if np.lib.format.read_magic(stream) != (1, 0):
+            raise self.fault(f"has the array '{name}' in another version of NumPy's format")
+        shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+        if (dtype.str, len(shape), is_fortran) != (kind, axes, False):
+            raise self.fault(f"has the array '{name}' of type {dtype.str} and {len(shape)} axes, not {kind} and {axes}")
+        values = data[stream.tell() :]
+        if math.prod(shape) * dtype.itemsize != len(values):
+            raise self.fault(f"has the array '{name}' with {len(values)} bytes for the shape {shape}"[:200])
+        if dtype.kind == "b" and max(values, default=0) > 1:
+            raise self.fault(f"has the array '{name}' with truth values that are neither 0 nor 1")
+        return np.frombuffer(values, dtype).reshape(shape).copy()  # a view of bytes cannot be written
 
     def picture(self, formats: tuple[str, ...] = ("PNG", "JPEG"), data: bytes | None = None) -> Image:
         """Decoded picture; its declared size is looked at before a pixel is decoded.

@@ -31,13 +31,14 @@ from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.build.tasks import Task
 from phibench.datasets.build.workers import Environment, NoRendererError, WorkerPool, versions
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import InputFile
 from phibench.datasets.plan.plan import Plan, make_plan, shard_plan
 from phibench.datasets.progress import progress_console
 from phibench.datasets.recipe.checks import warnings
 from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_text, with_numbers
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import dataset_info, info_text, parse_info, read_manifest, same_content
-from phibench.datasets.store.files import WriteError, require_file, write_text
+from phibench.datasets.store.files import WriteError, write_text
 from phibench.datasets.store.provenance import code_sha256, provenance
 from phibench.datasets.store.schema import DatasetInfo
 
@@ -246,8 +247,8 @@ def _loose_ends(plan: Plan, head: FolderHead, journal: Journal, tasks: Iterable[
 def _info_text(info: DatasetInfo, journal: Journal, out: Path) -> str:
     """Text of `dataset.json`: the journal's, or the one that is there, if it means the same."""
     held = [] if journal.head is None else [journal.head.info]
-    with contextlib.suppress(OSError, ValueError):
-        held.append(require_file(out / schema.INFO).read_text(encoding="utf-8"))
+    with contextlib.suppress(DatasetError):
+        held.append(InputFile(out / schema.INFO, "run `phibench dataset repair`").text())
     for text in held:
         with contextlib.suppress(ValueError):  # of another version, or damaged
             if same_content(parse_info(text), info):

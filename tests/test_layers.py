@@ -39,6 +39,7 @@ datasets/make
 datasets/show datasets/verify datasets/merge_repair
 estimator/interface
 estimator/pair_set
+estimator/truth_file
 estimator/geometry
 estimator/spots
 estimator/limits estimator/methods

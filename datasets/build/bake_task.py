@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from pathlib import Path
 
 from phibench.datasets.build.light_map_cache import light_map
 from phibench.datasets.build.tasks import Made
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import InputFile
 from phibench.datasets.recipe.tables import AmbientTable
 from phibench.datasets.store import schema
-from phibench.datasets.store.files import require_file, write_bytes
-from phibench.render.room.light_map import BakeSettings, LightMap, decoded, encoded
+from phibench.datasets.store.files import write_bytes
+from phibench.render.room.light_map import ARRAYS, BakeSettings, LightMap, encoded
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
 
@@ -36,8 +34,4 @@ def read_light_map(out: Path) -> LightMap:
     DatasetError
         If the file is missing or not a light map.
     """
-    path = out / schema.LIGHT_MAP
-    try:
-        return decoded(require_file(path).read_bytes())
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-        raise DatasetError(f"{path} is not readable as a light map: {error}") from error
+    return LightMap(**InputFile(out / schema.LIGHT_MAP, "run `phibench dataset repair`").arrays(ARRAYS))

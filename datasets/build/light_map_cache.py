@@ -14,8 +14,6 @@ import hashlib
 import json
 import math
 import os
-import zipfile
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -29,7 +27,7 @@ from phibench.datasets.input_files import InputFile
 from phibench.datasets.store.files import write_bytes, write_text
 from phibench.datasets.store.leftovers import remove_leftovers
 from phibench.datasets.store.provenance import code_behind
-from phibench.render.room.light_map import BakeSettings, LightMap, bake, decoded, encoded, fixed_shapes
+from phibench.render.room.light_map import ARRAYS, BakeSettings, LightMap, bake, encoded, fixed_shapes
 from phibench.render.room.shading import cut, texel_count
 from phibench.render.setup.llvm_library import cache_root
 from phibench.scenes.rig import View
@@ -114,13 +112,14 @@ def _path(recipe: bytes, folder: Path | None) -> Path:
 def _read(path: Path, recipe: bytes) -> LightMap | None:
     """The entry, or None if there is none, or one that was not written for this recipe."""
     try:
-        content = InputFile(path, "clear the cache", limit_bytes=_ENTRY_MB << 20).read()
+        file = InputFile(path, "clear the cache", limit_bytes=_ENTRY_MB << 20)
+        content = file.read()
         form, digest, body = content.split(b"\n", 2)
         held, payload = body.split(b"\n", 1)
         if (form, held) != (_FORM, recipe) or hashlib.sha256(body).hexdigest().encode() != digest:
             return None
-        return decoded(payload)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):  # no entry, or a damaged one
+        return LightMap(**file.arrays(ARRAYS, payload))
+    except ValueError:  # no entry, or a damaged one
         return None
 
 

@@ -24,11 +24,11 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, get_args, get_ori
 from pydantic import TypeAdapter, ValidationError
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import InputFile, first_fault
+from phibench.datasets.input_files import NAME_LENGTH, InputFile, first_fault
 from phibench.datasets.plan.plan import Plan, PosePlan
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store import schema
-from phibench.datasets.store.files import read_rows, require_file, sha256, write_bytes
+from phibench.datasets.store.files import read_rows, sha256, write_bytes
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import (
     READABLE_VERSIONS,
@@ -385,31 +385,13 @@ def sensitivity_bytes(table: DataFrame, folder: Path) -> bytes:
 
 def sensitivity_fault(folder: Path) -> str | None:
     """One sentence on a table that is damaged or of another state of the data set; None if there is no fault."""
-    import polars
-
-    path = folder / schema.SENSITIVITIES
-    if not os.path.lexists(path):
+    if not os.path.lexists(folder / schema.SENSITIVITIES):
         return None
     try:
-        data = require_file(path).read_bytes()
-        own = _OWN.search(data)
-        if own is None:
-            return f"{schema.SENSITIVITIES} is damaged or of an earlier version: it has no SHA-256 of its own; {_AGAIN}"
-        if hashlib.sha256(data.replace(own[1], _PLACE)).hexdigest().encode() != own[1]:
-            return f"{schema.SENSITIVITIES} is damaged: its SHA-256 is not the one that it holds; {_AGAIN}"
-        digest = polars.read_parquet_metadata(path).get(DIGEST)
-    except (polars.exceptions.PolarsError, polars.exceptions.PanicException, OSError) as error:
-        return f"{schema.SENSITIVITIES} cannot be read: {_first_line(error)}; {_AGAIN}"
-    sums = folder / schema.CHECKSUMS
-    if sums.is_file() and digest != sha256(sums):  # without SHA256SUMS the data set itself is unfinished
-        return f"{schema.SENSITIVITIES} belongs to another state of this data set; {_AGAIN}"
+        _sensitivities(folder)
+    except DatasetError as error:
+        return str(error).removeprefix(f"{folder}{os.sep}")
     return None
-
-
-def _first_line(error: BaseException) -> str:
-    """Reason of an error in one line, without the path that an operating system's error names."""
-    text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-    return text.splitlines()[0] if text else type(error).__name__
 
 
 def read_sensitivities(folder: Path) -> DataFrame:
@@ -420,10 +402,49 @@ def read_sensitivities(folder: Path) -> DataFrame:
     DatasetError
         If there is none, or it is not that of this data set.
     """
-    import polars
-
     if not (folder / schema.SENSITIVITIES).is_file():
         raise DatasetError(f"{folder} has no {schema.SENSITIVITIES}; run `phibench dataset sensitivities {folder}`")
-    if fault := sensitivity_fault(folder):
-        raise DatasetError(f"{folder}: {fault}")
-    return polars.read_parquet(folder / schema.SENSITIVITIES)
+    return _sensitivities(folder)
+
+
+def _sensitivities(folder: Path) -> DataFrame:
+    """Table whose hash is its own, of this state of the data set, with the columns of such a table."""
+    import polars
+
+    file = InputFile(folder / schema.SENSITIVITIES, _AGAIN)
+    data = file.read()
+    own = _OWN.search(data)
+    if own is None:
+        raise file.fault("is damaged or of an earlier version: it has no SHA-256 of its own")
+    if hashlib.sha256(data.replace(own[1], _PLACE)).hexdigest().encode() != own[1]:
+        raise file.fault("is damaged: its SHA-256 is not the one that it holds")
+    words = dict.fromkeys(_WORDS, polars.String)
+    table = file.table(words | dict.fromkeys(_DEPTHS, polars.Float64), data)
+    sums = folder / schema.CHECKSUMS
+    state = polars.read_parquet_metadata(io.BytesIO(data)).get(DIGEST)
+    if sums.is_file() and state != sha256(sums):  # without SHA256SUMS the data set itself is unfinished
+        raise file.fault("belongs to another state of this data set")
+    if fault := _sensitivity_column_fault(table):
+        raise file.fault(f"is damaged: {fault}")
+    return table
+
+
+_WORDS, _DEPTHS = ("sample_id", "estimator", "cause"), ("depth_m", "estimate_m")
+_GRADIENT = re.compile(r"(estimate|truth)_m_per_[a-z0-9_]{1,60}")
+
+
+def _sensitivity_column_fault(table: DataFrame) -> str:
+    """First column that is none of such a table, or holds what is no name and no number; empty if there is none."""
+    import polars
+
+    printable = rf"^\P{{C}}{{1,{NAME_LENGTH}}}$"
+    for name, kind in table.schema.items():
+        column = table[name]
+        if name in _WORDS:
+            if column.null_count() or not column.str.contains(printable).all():
+                return f"column '{name}' holds what is no name of at most {NAME_LENGTH} characters"
+        elif kind != polars.Float64 or not (name in _DEPTHS or _GRADIENT.fullmatch(name)):
+            return f"column '{printable_line(name, 60)}' of type {kind} is none of this table"
+        elif not column.is_finite().all():
+            return f"column '{name}' holds a number that is not finite"
+    return ""

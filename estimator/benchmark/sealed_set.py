@@ -5,24 +5,21 @@ pairs.jsonl     per pair what a user knows: rig, stroke, sensor, boxes, files
 frames/         images: PNG of 8 or 16 bits, or the camera's JPEG
 SHA256SUMS      of everything above
 
-The truth is one canonical JSON file: same truth and salt, same bytes. NaN is written as null. It stays with the
-organiser, and its hash in the seal proves later which truth it was.
+The truth stays with the organiser (`estimator/truth_file.py`), and its hash in the seal proves later which it was.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import math
 import os
 import secrets
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 from pydantic import Field, field_validator
 from rich.console import Console
 
@@ -35,26 +32,21 @@ from phibench.datasets.read import open_finished
 from phibench.datasets.recipe.load import RECIPES, load_recipe
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store.checksums import checksums_text, read_checksums
-from phibench.datasets.store.documents import from_json, to_json
+from phibench.datasets.store.documents import to_json
 from phibench.datasets.store.files import WriteError, read_rows, sha256, write_bytes, write_text
 from phibench.datasets.store.leftovers import OwnedFolder
 from phibench.datasets.store.schema import Document
 from phibench.estimator.benchmark.dataset_pairs import TASK_VERSION, DatasetPairs, dataset_pairs
 from phibench.estimator.interface import Box, Pair
-from phibench.estimator.pair_set import Distraction, PairTruth, SpotTruth
+from phibench.estimator.truth_file import MOST_PAIRS, Digest, truth_text
 from phibench.scenes.camera import LARGEST_SIDE_PX
-from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
-from phibench.scenes.rig import Rig
-from phibench.scenes.validation import printable_line
 
 SEAL, PAIRS, FRAMES, CHECKSUMS = "seal.json", "pairs.jsonl", "frames", "SHA256SUMS"
 FORMAT = "phibench sealed set 1"
 IMAGES = {"down", "up"}
 
 
-MOST_PAIRS = 1_000_000
-Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 _Pixel = Annotated[int, Field(ge=-LARGEST_SIDE_PX, le=LARGEST_SIDE_PX)]
 _Side = Annotated[int, Field(ge=1, le=LARGEST_SIDE_PX)]
 
@@ -143,109 +135,6 @@ def read_seal(folder: Path) -> Seal:
 def read_pairs(folder: Path) -> list[PublicPair]:
     """Lines of `pairs.jsonl`, by number."""
     return read_rows(folder / PAIRS, PublicPair)
-
-
-_MATRICES = ("bound_px2", "raw_bound_px2")
-_RIGS = ("true_rig", "nominal_rig")
-# keys of "phibench truth 1"
-_RENAMED = {"believed_rig": "nominal_rig", "believed_stroke_m": "nominal_stroke_m"}
-_NOT_SEALED = ("calibration_covariance",)  # a calibration comes with the score, never with the set
-
-
-def truth_text(truths: Sequence[PairTruth], salt: str, public_sha256: str) -> str:
-    """Text of the truth's file: sorted keys, no blanks, doubles that read back to the same bits."""
-    document = {
-        "format": "phibench truth 2",
-        "public_sha256": public_sha256,
-        "salt": salt,
-        "truths": [truth_document(truth) for truth in truths],
-    }
-    return json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False) + "\n"
-
-
-def read_truth_file(path: Path, sha256: str) -> list[PairTruth]:
-    """Truths of a file whose bytes must have a hash.
-
-    Raises
-    ------
-    DatasetError
-        If the file is missing or its bytes are others.
-    """
-    file = InputFile(path, "give the truth's file")
-    data = file.read()
-    found = hashlib.sha256(data).hexdigest()
-    if found != sha256:
-        raise DatasetError(
-            f"{path} is not the truth that was sealed: its SHA-256 begins with {found[:12]}, the seal says "
-            f"{sha256[:12]}; give the file that `phibench seal make` wrote for this set"
-        )
-    try:
-        return [truth_of(document) for document in file.json(data)["truths"]]
-    except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
-        if isinstance(error, DatasetError):
-            raise
-        raise file.fault(f"is damaged: {printable_line(repr(error), 200)}") from error
-
-
-def truth_document(truth: PairTruth) -> dict[str, Any]:
-    """A pair's truth as JSON can hold it."""
-    bare = replace(truth, down=_without_arrays(truth.down), up=_without_arrays(truth.up))
-    document = {name: getattr(bare, name) for name in PairTruth.__dataclass_fields__ if name not in _NOT_SEALED}
-    document |= {name: to_json(document[name]) for name in _RIGS}
-    for position in ("down", "up"):
-        spot = getattr(truth, position)
-        matrices = {name: _lists(getattr(spot, name)) for name in _MATRICES}
-        document[position] = {**asdict(getattr(bare, position)), **matrices}
-    nulled: dict[str, Any] = _null_for_nan(document)
-    return nulled
-
-
-def truth_of(document: dict[str, Any]) -> PairTruth:
-    """A pair's truth from its document, of version 1 or 2 of the file."""
-    document = {_RENAMED.get(name, name): value for name, value in document.items()}
-    rigs = {name: from_json(Rig, document[name]) for name in _RIGS}
-    return PairTruth(**{**document, **rigs, "down": _spot(document["down"]), "up": _spot(document["up"])})
-
-
-def _spot(document: dict[str, Any]) -> SpotTruth:
-    u_px, v_px = map(_number, document["uv_px"])
-    found = {
-        "uv_px": (u_px, v_px),
-        "phi_rad": {name: _number(value) for name, value in document["phi_rad"].items()},
-        "distractions": tuple(
-            Distraction(one["kind"], (one["uv_px"][0], one["uv_px"][1]), one["electrons"])
-            for one in document["distractions"]
-        ),
-        **{name: _array(document[name]) for name in _MATRICES},
-        **{name: _number(document[name]) for name in ("azimuth_rad", "electrons", "peak_e", "snr")},
-    }
-    return SpotTruth(**{**document, **found})
-
-
-def _without_arrays(spot: SpotTruth) -> SpotTruth:
-    return replace(spot, bound_px2=None, raw_bound_px2=None)
-
-
-def _lists(matrix: Array | None) -> list[list[float]] | None:
-    return None if matrix is None else [[float(x) for x in row] for row in matrix]
-
-
-def _array(rows: list[list[float | None]] | None) -> Array | None:
-    return None if rows is None else np.array([[_number(x) for x in row] for row in rows])
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)
-
-
-def _null_for_nan(value: Any) -> Any:
-    if isinstance(value, float):
-        return None if math.isnan(value) else value
-    if isinstance(value, dict):
-        return {key: _null_for_nan(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_null_for_nan(item) for item in value]
-    return value
 
 
 _FILE_TIME_S = 315532800  # 1980-01-01: a file's own time would tell the order of the work

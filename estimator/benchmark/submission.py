@@ -32,7 +32,6 @@ from phibench.estimator.benchmark.document import MethodCard
 from phibench.estimator.benchmark.sealed_set import (
     CHECKSUMS,
     FRAMES,
-    MOST_PAIRS,
     PAIRS,
     SEAL,
     PublicBox,
@@ -40,13 +39,13 @@ from phibench.estimator.benchmark.sealed_set import (
     Seal,
     read_pairs,
     read_seal,
-    read_truth_file,
 )
 from phibench.estimator.interface import FAILURES, Box, Image, Outcome, Pair, Spot
 from phibench.estimator.pair_set import PairTruth, truth_folders
 from phibench.estimator.sandbox.answers import AnswerError, checked
 from phibench.estimator.sandbox.resolve import Reference, RunLimits, resolve
 from phibench.estimator.sandbox.runner import Harness
+from phibench.estimator.truth_file import MOST_PAIRS, read_truth_file
 from phibench.scenes.camera import Camera
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig

@@ -32,6 +32,7 @@ from phibench.scenes.validation import nearest
 
 KIND: Literal["phibench study"] = "phibench study"
 DOCUMENT = "study.json"
+_AGAIN = "run `phibench study` again"
 FINDINGS = "findings.md"
 DATA = "data"
 NAMES = ("noise", "misalignment", "baseline", "cause", "isotropy", "stroke")
@@ -127,7 +128,7 @@ def read_study(folder: Path) -> StudyDocument:
     path = folder / DOCUMENT
     if not path.is_file():
         raise DatasetError(f"{folder} holds no study: {DOCUMENT} is missing; make one with `phibench study`")
-    document = InputFile(path, "run `phibench study` again").document(StudyDocument)
+    document = InputFile(path, _AGAIN).document(StudyDocument)
     for name, digest in document.files.items():
         if not (folder / name).is_file() or sha256(folder / name) != digest:
             raise DatasetError(f"{folder / name} is missing or was changed after the study; run `phibench study` again")
@@ -137,9 +138,9 @@ def read_study(folder: Path) -> StudyDocument:
 def section(folder: Path) -> Section:
     """Section of a report about the study in a folder."""
     document = read_study(folder)
+    drawings = [(entry, folder / f"{entry.name}.{entry.kind}") for entry in document.drawings]
     pictures = [
-        Drawing(entry.name, (folder / f"{entry.name}.{entry.kind}").read_bytes(), entry.alt, entry.kind).picture()
-        for entry in document.drawings
+        Drawing(entry.name, InputFile(path, _AGAIN).read(), entry.alt, entry.kind).picture() for entry, path in drawings
     ]
     size = "Reduced version of the study (--quick)." if document.quick else ""
     notes = tuple(f"Note: {note}" for note in document.notes)

@@ -218,7 +218,8 @@ def _loop(mi: ModuleType, body: Any, count: int, lanes: int) -> Array:
 
 # Light maps as files.
 
-ARRAYS = ("irradiance_w_m2", "sigma_w_m2", "covered")
+ARRAYS = {"irradiance_w_m2": ("<f4", 2), "sigma_w_m2": ("<f4", 2), "covered": ("|b1", 1)}
+"""Type and number of axes of each array of a file."""
 
 
 def encoded(light: LightMap) -> bytes:
@@ -226,9 +227,3 @@ def encoded(light: LightMap) -> bytes:
     buffer = io.BytesIO()
     np.savez(buffer, **{name: getattr(light, name) for name in ARRAYS})
     return buffer.getvalue()
-
-
-def decoded(data: bytes) -> LightMap:
-    """Light map of the bytes of an `.npz` file."""
-    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-        return LightMap(*(arrays[name] for name in ARRAYS))

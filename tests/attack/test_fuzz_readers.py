@@ -41,8 +41,9 @@ PATIENCE_S = 60  # far above the slowest case, 0.3 s, on a machine with other wo
 KINDS = (
     *("recipe.toml", "settings.toml", "calibration.json", "score.json", "records.parquet", "layer.exr", "picture.png"),
     *("submission.json", "truth.json", "study.json", "frames.jsonl", "journal.txt"),
+    *("lightmap.npz", "entry.lightmap", "sensitivities.parquet"),
 )
-FEW, MANY = 8, 550  # cases of a kind: 15 x 8 and 2 500 command lines with 14 x 550 are above 100 and 10 000
+FEW, MANY = 8, 550  # cases of a kind: 18 x 8 and 2 500 command lines with 17 x 550 are above 100 and 10 000
 SEEDS = st.integers(0, 2**64 - 1)
 KEPT = {"database": None, "deadline": None, "derandomize": True, "suppress_health_check": list(HealthCheck)}
 

@@ -9,6 +9,8 @@ import hashlib
 import io
 import json
 import random
+import re
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -16,15 +18,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import polars as pl
 from helpers.bench_cases import cases, outcomes, truth_itself
 from PIL import Image
 
+from phibench.datasets.build import light_map_cache
+from phibench.datasets.build.bake_task import read_light_map
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
+from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.frame_files import read_index
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.datasets.recipe.load import load_recipe
+from phibench.datasets.store import documents, schema
 from phibench.datasets.store.checksums import checksums_text
-from phibench.datasets.store.documents import to_json
+from phibench.datasets.store.documents import read_sensitivities, to_json
 from phibench.datasets.store.layers import read_layer, write_exr
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.document import MethodCard, read_records, read_score, write_score
@@ -34,9 +41,7 @@ from phibench.estimator.benchmark.sealed_set import (
     PAIRS,
     SEAL,
     public_sha256,
-    read_truth_file,
     seal_id,
-    truth_text,
 )
 from phibench.estimator.benchmark.submission import SealedPairs, outcomes_of, read_submission, submission
 from phibench.estimator.calibration.bundle import Bundle
@@ -46,6 +51,8 @@ from phibench.estimator.sandbox.resolve import Reference
 from phibench.estimator.spots.image_planes import read_picture
 from phibench.estimator.studies.framework import read_settings
 from phibench.estimator.studies.run import find_study, read_study
+from phibench.estimator.truth_file import read_truth_file, truth_text
+from phibench.render.room.light_map import LightMap, encoded
 from phibench.scenes.rig import Rig
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -112,12 +119,14 @@ class Kind:
     data : valid bytes
     read : reads the file at a path, with what belongs to it beside it
     sign : new bytes of a changed document, so that its hash fits; None where there is no hash
+    forge : a file of faults under hashes that fit, where it is no JSON document
     """
 
     name: str
     data: bytes
     read: Callable[[Path], object]
     sign: Callable[[Any], bytes] | None = None
+    forge: Callable[[random.Random], bytes] | None = None
 
 
 def signed_calibration(document: Any) -> bytes:
@@ -164,6 +173,11 @@ def kinds(folder: Path) -> dict[str, Kind]:
         Kind("truth.json", truth, lambda path: read_truth_file(path, digest(path.read_bytes())), compact),
         Kind("study.json", compact({**study, "files": {}, "provenance": {}}), lambda path: read_study(path.parent)),
         Kind("frames.jsonl", compact(FRAME), lambda path: read_index(path.parent), compact),
+        Kind(schema.LIGHT_MAP, encoded(LIGHT), lambda path: read_light_map(path.parent), forge=forged_light),
+        Kind(
+            "entry.lightmap", entry_bytes(encoded(LIGHT)), read_entry, forge=lambda rng: entry_bytes(forged_light(rng))
+        ),
+        Kind(schema.SENSITIVITIES, *sensitivity_kind(folder)),
         Kind("journal.txt", journal_bytes(folder), lambda path: Journal(path.parent)),
     ]
     return {kind.name: kind for kind in every}
@@ -180,6 +194,93 @@ def _submission(path: Path) -> object:
 def _records(path: Path, score: Any) -> object:
     fitting = score.model_copy(update={"records": path.name, "records_sha256": digest(path.read_bytes())})
     return read_records(path.with_suffix(".json"), fitting).select("visible", "detected", "counted_px").sum()
+
+
+# -- light maps and the table of sensitivities ----------------------------------------------------------------------
+
+LIGHT = LightMap(np.ones((6, 3), np.float32), np.zeros((6, 3), np.float32), np.zeros(6, bool))
+BAKED = b'{"room": "small"}'
+
+
+def npz(members: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", compression) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    return buffer.getvalue()
+
+
+def npy_members() -> dict[str, bytes]:
+    with zipfile.ZipFile(io.BytesIO(encoded(LIGHT))) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def reshaped(data: bytes, shape: bytes) -> bytes:
+    """An `.npy` file whose header tells another shape, in as many bytes."""
+    return re.sub(rb"\(6,( 3)?\), \} *", lambda found: (shape + b", }").ljust(len(found[0])), data)
+
+
+def forged_light(rng: random.Random) -> bytes:
+    """A light map with a fault in one array, under CRCs that fit."""
+    members = npy_members()
+    name = rng.choice(list(members))
+    if rng.random() < 0.5:
+        members[name] = reshaped(
+            members[name], rng.choice((b"(-6, -3)", b"(10**99, 3)", b"(999999999999, 3)", b"(((("))
+        )
+    else:
+        members[name] = damaged(members[name], rng)
+    return npz(members)
+
+
+def entry_bytes(payload: bytes) -> bytes:
+    """Entry of the cache of light maps, with the hash of its content."""
+    body = BAKED + b"\n" + payload
+    return b"\n".join([light_map_cache._FORM, digest(body).encode(), body])
+
+
+def forged_entry(rng: random.Random) -> bytes:
+    return entry_bytes(forged_light(rng))
+
+
+def read_entry(path: Path) -> LightMap:
+    light = light_map_cache._read(path, BAKED)
+    if light is None:
+        raise DatasetError("baked again")
+    return light
+
+
+def sensitivity_table() -> pl.DataFrame:
+    words = {"sample_id": ["a", "b"], "estimator": ["paper"] * 2, "cause": ["none"] * 2}
+    return pl.DataFrame({**words, "depth_m": [1.0, 2.0], "estimate_m": [1.0, None], "truth_m_per_cx_px": [0.1, None]})
+
+
+def signed_table(data: bytes) -> bytes:
+    """A table with the hash that it must hold, if it still has a place for one."""
+    own = documents._OWN.search(data)
+    return data if own is None else data.replace(own[1], digest(data.replace(own[1], documents._PLACE)).encode())
+
+
+def sensitivity_kind(folder: Path) -> tuple[bytes, Callable[[Path], object], None, Callable[[random.Random], bytes]]:
+    (folder / schema.CHECKSUMS).write_bytes(b"")
+    written = documents.sensitivity_bytes(sensitivity_table(), folder)
+
+    def forge(rng: random.Random) -> bytes:
+        table = sensitivity_table()
+        name = rng.choice(table.columns)
+        act = rng.randrange(4)
+        if act == 0:
+            return signed_table(damaged(written, rng))
+        if act == 1:
+            table = table.rename({name: rng.choice(NASTY_TEXTS).encode("utf-8", "replace").decode()})
+        elif act == 2:
+            table = table.drop(name)
+        else:
+            nasty = [value for value in NASTY if isinstance(value, float | str | None) and value != "\ud800"]
+            table = table.with_columns(pl.Series(name, [rng.choice(nasty)] * 2, strict=False))
+        return documents.sensitivity_bytes(table, folder)
+
+    return written, lambda path: read_sensitivities(path.parent), None, forge
 
 
 FRAME: dict[str, Any] = {
@@ -263,6 +364,8 @@ def damaged(data: bytes, rng: random.Random) -> bytes:
 
 def hostile(kind: Kind, rng: random.Random) -> bytes:
     """A file of a kind with faults; of a signed one every other has a hash that fits."""
+    if kind.forge is not None and rng.random() < 0.7:
+        return kind.forge(rng)
     if kind.sign is not None and rng.random() < 0.7:
         return kind.sign(changed(json.loads(kind.data), rng))
     return damaged(kind.data, rng)

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import io
+import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 from helpers.damage import flip_bit
 from helpers.folders import contents
+from helpers.valid_files import sensitivity_table
 from rich.console import Console
 
 import phibench
@@ -17,7 +21,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import strays
-from phibench.datasets.store.documents import sensitivity_fault
+from phibench.datasets.store.documents import read_sensitivities, sensitivity_bytes, sensitivity_fault
 from phibench.datasets.verify import verify
 from phibench.estimator.cli.main import main
 from phibench.estimator.geometry.estimators import ESTIMATORS
@@ -90,3 +94,37 @@ def test_a_data_set_without_one_says_how_to_get_it(copy: Path) -> None:
     with pytest.raises(DatasetError, match=r"has no sensitivities\.parquet; run `phibench dataset sensitivities"):
         open_finished(copy).sensitivities()
     assert faults(copy) == ()
+
+
+TABLES: dict[str, tuple[Callable[[pl.DataFrame], pl.DataFrame], str]] = {
+    "no word": (lambda table: table.drop("cause"), "has no column 'cause'"),
+    "a number for a word": (lambda table: table.with_columns(cause=pl.lit(1.0)), "a column 'cause' of type Float64"),
+    "another column": (lambda table: table.with_columns(pl.lit(1.0).alias("\x1b[31m")), "is none of this table"),
+    "a text for a number": (lambda table: table.with_columns(truth_m_per_cx_px=pl.lit("1")), "of type String is none"),
+    "no name": (
+        lambda table: table.with_columns(sample_id=pl.lit(None, pl.String)),
+        "'sample_id' holds what is no",
+    ),
+    "an escape code": (lambda table: table.with_columns(cause=pl.lit("\x1b[31m")), "'cause' holds what is no name"),
+    "a long name": (lambda table: table.with_columns(estimator=pl.lit("a" * 201)), "'estimator' holds what is no name"),
+    "infinite": (lambda table: table.with_columns(depth_m=pl.lit(np.inf)), "'depth_m' holds a number that is not"),
+    "not a number": (lambda table: table.with_columns(estimate_m=pl.lit(np.nan)), "'estimate_m' holds a number"),
+    "many values": (lambda table: table.select(pl.all().repeat_by(9).explode()), "values are read"),
+}
+
+
+@pytest.mark.parametrize(("change", "words"), TABLES.values(), ids=TABLES)
+def test_a_strange_table_is_refused_though_signed(
+    tmp_path: Path, change: Callable[[pl.DataFrame], pl.DataFrame], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("phibench.datasets.input_files.TABLE_VALUES", 100)
+    (tmp_path / schema.CHECKSUMS).write_bytes(b"")
+    path = tmp_path / schema.SENSITIVITIES
+    path.write_bytes(sensitivity_bytes(sensitivity_table(), tmp_path))
+    assert read_sensitivities(tmp_path).equals(sensitivity_table())
+    path.write_bytes(sensitivity_bytes(change(sensitivity_table()), tmp_path))
+    with pytest.raises(DatasetError, match=re.escape(words)) as caught:
+        read_sensitivities(tmp_path)
+    assert str(caught.value).startswith(f"{path} ")
+    assert str(caught.value).endswith("; run `phibench dataset sensitivities` again")
+    assert sensitivity_fault(tmp_path) == str(caught.value).removeprefix(f"{tmp_path}/")

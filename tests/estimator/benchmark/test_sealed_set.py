@@ -31,12 +31,11 @@ from phibench.estimator.benchmark.sealed_set import (
     seed_warnings,
     sequence_warnings,
     single_pairs,
-    truth_document,
-    truth_of,
 )
 from phibench.estimator.benchmark.submission import SealedPairs, submit
 from phibench.estimator.cli import main as cli
 from phibench.estimator.pair_set import PairTruth
+from phibench.estimator.truth_file import TruthRow, truth_document, truth_of
 from phibench.scenes.laser import Beam
 
 
@@ -164,7 +163,7 @@ def test_truth_survives_its_file_to_the_bit(bench_dataset: Path) -> None:
     for i in range(len(pairs)):
         truth = pairs.truth(i)
         document = json.loads(json.dumps(truth_document(truth), allow_nan=False))
-        again = truth_of(document)
+        again = truth_of(TruthRow.model_validate(document))
         assert truth_document(again) == truth_document(truth)
         assert again.true_rig == truth.true_rig
         for spot, other in ((truth.down, again.down), (truth.up, again.up)):
@@ -178,7 +177,7 @@ def test_truth_of_version_1_is_read(bench_dataset: Path) -> None:
     document = truth_document(truth)
     old = {name.replace("nominal", "believed"): value for name, value in document.items()}
     assert {"believed_rig", "believed_stroke_m"} <= set(old)
-    assert truth_document(truth_of(old)) == document
+    assert truth_document(truth_of(TruthRow.model_validate(old))) == document
 
 
 def test_seeds_that_can_be_found_are_warned_of() -> None:

@@ -1,0 +1,205 @@
+"""Truth file of a sealed set: the exact answers of its pairs, with a secret number.
+
+It is canonical JSON: same truth and salt, same bytes. NaN is written as null. Version 1 had other names for the nominal
+rig and stroke.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator, Field, model_validator
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import InputFile, Name
+from phibench.datasets.store.documents import from_json, to_json
+from phibench.datasets.store.schema import Document, Number
+from phibench.estimator.pair_set import Distraction, PairTruth, SpotTruth
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import Rig
+
+MOST_PAIRS = 1_000_000
+Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+
+_MATRICES = ("bound_px2", "raw_bound_px2")
+_RIGS = ("true_rig", "nominal_rig")
+# keys of "phibench truth 1"
+_RENAMED = {"believed_rig": "nominal_rig", "believed_stroke_m": "nominal_stroke_m"}
+_NOT_SEALED = ("calibration_covariance",)  # a calibration comes with the score, never with the set
+_LARGEST = 1e100  # of a number of a truth: its square is a double, too
+
+
+def _sensible(value: float) -> float:
+    if abs(value) > _LARGEST:
+        raise ValueError(f"{value} is beyond +-{_LARGEST}")
+    return value
+
+
+_Real = Annotated[float, AfterValidator(_sensible)]
+_RealOrNan = Annotated[Number, AfterValidator(_sensible)]
+_Place = Annotated[tuple[_RealOrNan, _RealOrNan], Field(strict=False)]
+_Matrix = Annotated[tuple[_Place, _Place], Field(strict=False)]
+
+
+class DistractionRow(Document):
+    """A `Distraction` in the truth's file."""
+
+    kind: Name
+    uv_px: _Place
+    electrons: _RealOrNan
+
+
+class AnglesRow(Document):
+    """The three phi of a spot."""
+
+    ray: _RealOrNan
+    normal: _RealOrNan
+    incidence: _RealOrNan
+
+
+class SpotTruthRow(Document):
+    """A `SpotTruth` in the truth's file."""
+
+    uv_px: _Place
+    phi_rad: AnglesRow
+    azimuth_rad: _RealOrNan
+    visible: bool
+    cause: Name
+    electrons: _RealOrNan
+    peak_e: _RealOrNan
+    snr: _RealOrNan
+    saturated: bool
+    bound_px2: _Matrix | None
+    raw_bound_px2: _Matrix | None
+    distractions: Annotated[tuple[DistractionRow, ...], Field(strict=False, max_length=1000)]
+
+
+class TruthRow(Document):
+    """A `PairTruth` in the truth's file, of version 1 or 2."""
+
+    number: Annotated[int, Field(ge=0, lt=MOST_PAIRS)]
+    sample_id: Name
+    draw: Annotated[int, Field(ge=0, lt=MOST_PAIRS)]
+    preset: Name
+    jpeg_quality: Annotated[int, Field(ge=1, le=100)] | None
+    hinted: bool
+    depth_m: _Real
+    stroke_m: _Real
+    true_rig: dict[str, Any]
+    nominal_rig: dict[str, Any]
+    down: SpotTruthRow
+    up: SpotTruthRow
+    nominal_stroke_m: _Real | None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _names_of_version_1(cls, document: Any) -> Any:
+        if not isinstance(document, dict):
+            return document
+        renamed = {old: new for old, new in _RENAMED.items() if new not in document}
+        return {renamed.get(name, name): value for name, value in document.items()}
+
+
+class TruthFile(Document):
+    """The truth's file."""
+
+    format: Literal["phibench truth 1", "phibench truth 2"]
+    public_sha256: Digest
+    salt: Digest
+    truths: Annotated[tuple[TruthRow, ...], Field(strict=False, max_length=MOST_PAIRS)]
+
+
+def truth_text(truths: Sequence[PairTruth], salt: str, public_sha256: str) -> str:
+    """Text of the truth's file: sorted keys, no blanks, doubles that read back to the same bits."""
+    document = {
+        "format": "phibench truth 2",
+        "public_sha256": public_sha256,
+        "salt": salt,
+        "truths": [truth_document(truth) for truth in truths],
+    }
+    return json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False) + "\n"
+
+
+def read_truth_file(path: Path, sha256: str) -> list[PairTruth]:
+    """Truths of a file whose bytes must have a hash.
+
+    Raises
+    ------
+    DatasetError
+        If the file is missing, its bytes are others, or it holds what is no truth.
+    """
+    file = InputFile(path, "give the truth's file")
+    data = file.read()
+    found = hashlib.sha256(data).hexdigest()
+    if found != sha256:
+        raise DatasetError(
+            f"{path} is not the truth that was sealed: its SHA-256 begins with {found[:12]}, the seal says "
+            f"{sha256[:12]}; give the file that `phibench seal make` wrote for this set"
+        )
+    truths = []
+    for place, row in enumerate(file.document(TruthFile, data).truths):
+        try:
+            truths.append(truth_of(row))
+        except DatasetError as error:
+            raise file.fault(f"is damaged: truths.{place}: {error}") from error
+    return truths
+
+
+def truth_document(truth: PairTruth) -> dict[str, Any]:
+    """A pair's truth as JSON can hold it."""
+    bare = replace(truth, down=_without_arrays(truth.down), up=_without_arrays(truth.up))
+    document = {name: getattr(bare, name) for name in PairTruth.__dataclass_fields__ if name not in _NOT_SEALED}
+    document |= {name: to_json(document[name]) for name in _RIGS}
+    for position in ("down", "up"):
+        spot = getattr(truth, position)
+        matrices = {name: _lists(getattr(spot, name)) for name in _MATRICES}
+        document[position] = {**asdict(getattr(bare, position)), **matrices}
+    nulled: dict[str, Any] = _null_for_nan(document)
+    return nulled
+
+
+def truth_of(row: TruthRow) -> PairTruth:
+    """A pair's truth of its document.
+
+    Raises
+    ------
+    DatasetError
+        If one of its rigs is none.
+    """
+    rigs = {name: from_json(Rig, getattr(row, name)) for name in _RIGS}
+    return PairTruth(**{**dict(row), **rigs, "down": _spot(row.down), "up": _spot(row.up)})
+
+
+def _spot(row: SpotTruthRow) -> SpotTruth:
+    matrices = {name: _array(getattr(row, name)) for name in _MATRICES}
+    distractions = tuple(Distraction(**dict(one)) for one in row.distractions)
+    return SpotTruth(**{**dict(row), **matrices, "phi_rad": dict(row.phi_rad), "distractions": distractions})
+
+
+def _without_arrays(spot: SpotTruth) -> SpotTruth:
+    return replace(spot, bound_px2=None, raw_bound_px2=None)
+
+
+def _lists(matrix: Array | None) -> list[list[float]] | None:
+    return None if matrix is None else [[float(x) for x in row] for row in matrix]
+
+
+def _array(rows: tuple[tuple[float, float], tuple[float, float]] | None) -> Array | None:
+    return None if rows is None else np.array(rows)
+
+
+def _null_for_nan(value: Any) -> Any:
+    if isinstance(value, float):
+        return None if math.isnan(value) else value
+    if isinstance(value, dict):
+        return {key: _null_for_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_null_for_nan(item) for item in value]
+    return value
