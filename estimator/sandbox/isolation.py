@@ -5,7 +5,9 @@ worker. No thread and no code of the method may come before: Landlock limits the
 thread starts.
 
 Linux 5.13 and later have Landlock, see landlock(7): rules allow folders, the rest is denied. A seccomp filter denies
-sockets other than those between a process and its children. Nothing here needs privileges or imports NumPy.
+sockets other than those between a process and its children. Landlock keeps signals within from Linux 6.12 on only, and
+never limits: the filter denies signals to the parent, which is the supervisor, and limits (prlimit) of other processes.
+Nothing here needs privileges or imports NumPy.
 """
 
 from __future__ import annotations
@@ -281,11 +283,11 @@ class _Kernel:
         self._library.capset(struct.pack("=Ii", _CAPABILITIES_3, 0), struct.pack("=6I", kept, kept, 0, 0, 0, 0))
 
     def filter_calls(self) -> bool:
-        """Deny sockets to anywhere but the process's own children; False on a machine whose calls are not listed."""
+        """Deny calls that reach other processes; False on a machine whose calls are not listed."""
         numbers = _NUMBERS.get(os.uname().machine)
         if numbers is None:
             return False
-        program = b"".join(struct.pack("=HBBI", *line) for line in _filter(numbers))
+        program = b"".join(struct.pack("=HBBI", *line) for line in _filter(numbers, os.getppid()))
         buffer = ctypes.create_string_buffer(program, len(program))
         header = struct.pack("@HP", len(program) // 8, ctypes.addressof(buffer))
         self._library.prctl(_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
@@ -296,17 +298,22 @@ class _Kernel:
 
 _DENIED = (
     *("connect", "listen", "io_uring_setup", "shmget", "semget", "msgget", "mq_open"),
-    *("add_key", "request_key", "keyctl", "bpf", "perf_event_open", "open_by_handle_at"),
+    *("add_key", "request_key", "keyctl", "bpf", "perf_event_open", "open_by_handle_at", "pidfd_send_signal"),
 )
 """Ways to other processes, by sockets or by memory that outlives a process, and past the rules for files."""
+_SIGNALS = ("kill", "tkill", "tgkill", "rt_sigqueueinfo", "rt_tgsigqueueinfo")  # to their first argument
 _NUMBERS = {
     "x86_64": {
-        **dict(zip(_DENIED, (42, 50, 425, 29, 64, 68, 240, 248, 249, 250, 321, 298, 304), strict=True)),
+        **dict(zip(_DENIED, (42, 50, 425, 29, 64, 68, 240, 248, 249, 250, 321, 298, 304, 424), strict=True)),
+        **dict(zip(_SIGNALS, (62, 200, 234, 129, 297), strict=True)),
         **{"machine": 0xC000003E, "socket": 41, "socketpair": 53, "sendto": 44},
+        **{"prlimit64": 302, "fcntl": 72, "ioctl": 16},
     },
     "aarch64": {
-        **dict(zip(_DENIED, (203, 201, 425, 194, 190, 186, 180, 217, 218, 219, 280, 241, 265), strict=True)),
+        **dict(zip(_DENIED, (203, 201, 425, 194, 190, 186, 180, 217, 218, 219, 280, 241, 265, 424), strict=True)),
+        **dict(zip(_SIGNALS, (129, 130, 131, 138, 240), strict=True)),
         **{"machine": 0xC00000B7, "socket": 198, "socketpair": 199, "sendto": 206},
+        **{"prlimit64": 261, "fcntl": 25, "ioctl": 29},
     },
 }
 _LOAD, _EQUAL, _AT_LEAST, _AND, _RETURN = 0x20, 0x15, 0x35, 0x54, 0x06
@@ -314,9 +321,12 @@ _ALLOW, _DENY = (0, 0, 0x7FFF0000), (0, 0, 0x00050000 | errno.EACCES)
 _NUMBER, _MACHINE, _ARGUMENT = 0, 4, 16  # places in seccomp_data; an argument has 8 bytes, the lower half first
 _X32 = 0x40000000
 _AF_UNIX, _SOCK_DGRAM, _TYPE = 1, 2, 0xF
+_OWNERS = {"fcntl": (8, 15), "ioctl": (0x8901, 0x8902)}  # F_SETOWN(_EX), FIOSETOWN, SIOCSPGRP
+"""Requests that let the kernel signal any process when a file is ready; their second argument."""
+_Line = tuple[int, int, int, int]
 
 
-def _filter(numbers: dict[str, int]) -> list[tuple[int, int, int, int]]:
+def _filter(numbers: dict[str, int], supervisor: int) -> list[_Line]:
     """Program of (code, jump if true, jump if false, value) that denies calls with EACCES, see seccomp(2)."""
     deny, allow = (_RETURN, *_DENY), (_RETURN, *_ALLOW)
     lines = [(_LOAD, 0, 0, _MACHINE), (_EQUAL, 1, 0, numbers["machine"]), deny, (_LOAD, 0, 0, _NUMBER)]
@@ -330,8 +340,32 @@ def _filter(numbers: dict[str, int]) -> list[tuple[int, int, int, int]]:
     for name in ("socket", "socketpair"):
         lines += [(_EQUAL, 0, len(local), numbers[name]), *local]
     address = _ARGUMENT + 4 * 8
-    plain = [(_LOAD, 0, 0, address), (_EQUAL, 1, 0, 0), deny, (_LOAD, 0, 0, address + 4), (_EQUAL, 1, 0, 0), deny]
-    return [*lines, (_EQUAL, 0, len(plain), numbers["sendto"]), *plain, allow]
+    plain = [line for half in (0, 4) for line in ((_LOAD, 0, 0, address + half), (_EQUAL, 1, 0, 0), deny)]
+    lines += [(_EQUAL, 0, len(plain) + 1, numbers["sendto"]), *plain, allow]
+    return [*lines, *_outward(numbers, supervisor), allow]
+
+
+def _outward(numbers: dict[str, int], supervisor: int) -> list[_Line]:
+    """Part of the filter about signals to the supervisor, to its group and to all, and limits of other processes.
+
+    A process number has 32 bits: the kernel ignores the upper half of the argument, and so do these lines.
+    """
+    deny, allow = (_RETURN, *_DENY), (_RETURN, *_ALLOW)
+
+    def denied(name: str, place: int, values: Sequence[int]) -> list[_Line]:
+        """Deny a call if an argument has one of the values."""
+        tests = [line for value in values for line in ((_EQUAL, 0, 1, value & 0xFFFFFFFF), deny)]
+        body = [(_LOAD, 0, 0, _ARGUMENT + 8 * place), *tests, allow]
+        return [(_EQUAL, 0, len(body), numbers[name]), *body]
+
+    lines = [line for name in _SIGNALS for line in denied(name, 0, (supervisor, -os.getpgid(supervisor), -1))]
+    for name, requests in _OWNERS.items():
+        lines += denied(name, 1, requests)
+    # prlimit(pid, resource, new, old): one's own limits have pid 0
+    own = [(_LOAD, 0, 0, _ARGUMENT), (_EQUAL, 0, 1, 0), allow]
+    for half in (0, 4):  # limits may be read: there is no pointer to new ones
+        own += [(_LOAD, 0, 0, _ARGUMENT + 16 + half), (_EQUAL, 1, 0, 0), deny]
+    return [*lines, (_EQUAL, 0, len(own) + 1, numbers["prlimit64"]), *own, allow]
 
 
 def isolated_by(stream: TextIO) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from helpers.sandbox_pairs import GOOD, HEADER, SmallPairs, method_file
 
 from phibench.estimator.benchmark.score import score
 from phibench.estimator.interface import Answer, Spot
-from phibench.estimator.sandbox.isolation import Access, Isolation
+from phibench.estimator.sandbox.isolation import _NUMBERS, Access, Isolation
 from phibench.estimator.sandbox.readable_files import access_of, truth_near
 from phibench.estimator.sandbox.resolve import MethodError, RunLimits, resolve
 from phibench.estimator.sandbox.runner import Harness, run_method
@@ -62,6 +62,7 @@ ATTACKS = {
     "own root": "open(f'/proc/self/root{TRUTH}').read()",
     "trace the parent": "called('ptrace', 16, os.getppid(), 0, 0)",
     "signal the parent": "os.kill(os.getppid(), 0)",
+    "limits of the parent": "resource.prlimit(os.getppid(), resource.RLIMIT_NOFILE, (0, 0))",
     "mount": "called('mount', DATA.encode(), os.getcwd().encode(), b'none', 4096, None)",
     "namespace": "in_child(mount_in_a_namespace)",
     "chroot": "(os.chroot(DATA), open('/truth.txt').read())",
@@ -84,7 +85,7 @@ ATTACKS = {
     "home": "os.listdir(os.path.expanduser('~'))",
 }
 HELPERS = """
-import ctypes, multiprocessing, os, socket, subprocess
+import ctypes, multiprocessing, os, resource, socket, subprocess
 from pathlib import Path
 
 HERE = Path(__file__).parent
@@ -166,6 +167,83 @@ def test_an_attack_is_denied(attacked: dict[str, str], name: str) -> None:
     # the parent's descriptors are closed; a tool that fails; a path in a child's sandbox
     expected = ("PermissionError", "IndexError", "CalledProcessError", "Invalid cross-device link")
     assert any(word in attacked[name] for word in expected), attacked[name]
+
+
+# The same where Landlock lets signals out, before Linux 6.12; PARENT is what the supervisor is to a method.
+OUTWARD = {
+    "signal": "os.kill(PARENT, 9)",
+    "signal, upper half of the argument": "called('kill', PARENT | 1 << 32, 9)",
+    "signal to its group": "os.killpg(PARENT, 9)",
+    "signal to all": "os.kill(-1, 0)",
+    "signal to a thread": "called('tkill', PARENT, 9)",
+    "signal to a thread of a process": "called('tgkill', PARENT, PARENT, 9)",
+    "signal with a value": "called('rt_sigqueueinfo', PARENT, 10, INFORMATION)",
+    "signal with a value to a thread": "called('rt_tgsigqueueinfo', PARENT, PARENT, 10, INFORMATION)",
+    "signal by a descriptor": "signal.pidfd_send_signal(os.pidfd_open(PARENT), 9)",
+    "signal when a file is ready": "fcntl.fcntl(FILE, 8, PARENT)",
+    "the same with a kind of owner": "fcntl.fcntl(FILE, 15, struct.pack('ii', 1, PARENT))",
+    "the same of a socket": "fcntl.ioctl(FILE, 0x8901, struct.pack('i', PARENT))",
+    "its older name": "fcntl.ioctl(FILE, 0x8902, struct.pack('i', PARENT))",
+    "limits": "resource.prlimit(PARENT, resource.RLIMIT_NOFILE, (0, 0))",
+}
+INWARD = {
+    "terminate a program": "ended(subprocess.Popen(['sleep', '60']))",
+    "terminate a process": "forked()",
+    "signal to itself": "os.kill(os.getpid(), 0)",
+    "signal to its own group": "os.killpg(0, 0)",
+    "raise a signal": "signal.raise_signal(signal.SIGURG)",
+    "signal to its thread": "signal.pthread_kill(threading.get_ident(), 0)",
+    "own limits": "resource.setrlimit(resource.RLIMIT_CORE, (0, 0))",
+    "limits that are read": "resource.prlimit(os.getpid(), resource.RLIMIT_CORE)",
+    "flags of a file": "fcntl.fcntl(FILE, fcntl.F_SETFL, os.O_NONBLOCK)",
+}
+OLD_KERNEL = """
+import ctypes, fcntl, multiprocessing, os, resource, signal, socket, struct, subprocess, sys, threading, time
+from phibench.estimator.sandbox import isolation
+isolation._ABI_SCOPE = 99
+numbers = isolation._NUMBERS[os.uname().machine]
+PARENT, FILE, INFORMATION = os.getpid(), socket.socketpair()[0], struct.pack('iii', 10, 0, -1) + bytes(116)
+
+def called(name, *arguments):
+    call = ctypes.CDLL(None, use_errno=True).syscall
+    values = [ctypes.c_long(value) if isinstance(value, int) else value for value in arguments]
+    if call(ctypes.c_long(numbers[name]), *values) == -1:
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+
+def ended(child):
+    child.terminate()
+    assert child.wait(20) == -signal.SIGTERM
+
+def forked():
+    child = multiprocessing.get_context('fork').Process(target=time.sleep, args=(60,))
+    child.start()
+    child.terminate()
+    child.join(20)
+    assert child.exitcode == -signal.SIGTERM
+
+os.setpgid(0, 0)
+signal.signal(signal.SIGUSR1, signal.SIG_IGN)
+if os.fork() == 0:
+    os.setsid()
+    assert isolation.isolate(isolation.Access()).network
+    for name, text in eval(sys.argv[1]).items():
+        try:
+            eval(text)
+            print(name, 'reached', flush=True)
+        except OSError as error:
+            print(name, type(error).__name__, flush=True)
+    os._exit(0)
+print(os.wait()[1], resource.getrlimit(resource.RLIMIT_NOFILE)[0] > 0)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux" or os.uname().machine not in _NUMBERS, reason="no filter of calls here")
+def test_without_rules_for_signals_the_supervisor_is_out_of_reach() -> None:
+    """Signals of any kind, its limits of files; what honest methods do to themselves and to their own goes on."""
+    command = [sys.executable, "-c", OLD_KERNEL, repr(OUTWARD | INWARD)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    expected = [f"{name} PermissionError" for name in OUTWARD] + [f"{name} reached" for name in INWARD]
+    assert done.stdout.splitlines() == [*expected, "0 True"], done.stderr
 
 
 # What honest methods do; each is an expression as above.
