@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -62,13 +63,24 @@ def test_benchmark_empty_method_on_full_frames(benchmark, tmp_path: Path) -> Non
         process.close()
 
 
-@pytest.mark.parametrize("isolated", [False, True])
 @pytest.mark.benchmark(group="isolation")
-def test_benchmark_isolation(benchmark, tmp_path: Path, isolated: bool) -> None:
-    """A process that isolates itself and leaves, against one that leaves. Target: <= 10 ms more at each start."""
-    text = f"from phibench.estimator.sandbox.isolation import *\nif {isolated}: assert isolate(Access()).complete"
-    command = [sys.executable, "-c", text]
-    assert benchmark.pedantic(lambda: subprocess.run(command, cwd=tmp_path).returncode, rounds=10) == 0
+def test_benchmark_isolation(benchmark, tmp_path: Path) -> None:
+    """A process that isolates itself and leaves, against one that leaves. Target: <= 10 ms more at each start.
+
+    By turns, and the shortest of each is compared: what else the machine does is longer than the difference.
+    """
+    text = "from phibench.estimator.sandbox.isolation import *\nif {}: assert isolate(Access()).complete"
+    seconds: dict[bool, list[float]] = {False: [], True: []}
+
+    def start(isolated: bool) -> None:
+        began = time.perf_counter()
+        subprocess.run([sys.executable, "-c", text.format(isolated)], cwd=tmp_path, check=True)
+        seconds[isolated].append(time.perf_counter() - began)
+
+    benchmark.pedantic(start, args=(True,), setup=lambda: start(False), rounds=30)
+    plain, isolated = (1e3 * min(seconds[kind]) for kind in (False, True))
+    print(f"\n{plain:.1f} ms, isolated {isolated:.1f} ms: {isolated - plain:.1f} ms more, ratio {isolated / plain:.2f}")
+    benchmark.extra_info.update(more_ms=isolated - plain, ratio=isolated / plain)
 
 
 @pytest.mark.benchmark(group="the sandbox")

@@ -76,10 +76,15 @@ def test_only_what_a_dead_process_left_is_removed(running: subprocess.Popen[str]
 
 
 def test_what_is_not_ours_stays(temporary: Path) -> None:
-    """Folders that users call alike, links under our names, and what lies behind them."""
-    for name in ("phibench-smoke", "phibench-tmp-notes", "phibench-method-abcd1234", "phibench-tmp-method-abcd12345"):
+    """Folders that users call alike, links under our names, and what lies behind them.
+
+    Versions up to 0.2 left "phibench-" and "phibench-method-" with eight letters and no lock: so are data sets called.
+    """
+    alike = ("phibench-smoke", "phibench-tutorial", "phibench-method-gaussian", "phibench-proof-abcd1234")
+    for name in (*alike, "phibench-tmp-notes", "phibench-tmp-method-abcd12345"):
         (temporary / name).mkdir()
         (temporary / name / "mine").write_bytes(b"")
+        os.utime(temporary / name, (0.0, 0.0))  # age does not make it ours
     (temporary / "behind").mkdir()
     (temporary / "phibench-tmp-method-abcd1234").symlink_to(temporary / "behind")
     os.mkfifo(temporary / "phibench-tmp-method-abcd5678")
