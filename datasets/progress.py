@@ -8,10 +8,13 @@ from collections.abc import Callable
 from types import TracebackType
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
+from rich.progress_bar import ProgressBar
+from rich.table import Column
 
 LINE_EVERY_S = 30.0
 _BAR_EVERY_S = 1.0
+_BAR_COLUMNS = 16
 
 
 def progress_console() -> Console:
@@ -43,7 +46,7 @@ class Steps:
     ) -> None:
         self._console, self._title, self._total = console, title, total
         self._forecast_s, self._running = left_s, running
-        self._done, self._started = 0, time.monotonic()
+        self._done, self._started, self._share = 0, time.monotonic(), 0.0
         self._bar = _bar(console) if console.is_terminal else None
         self._end = threading.Event()
         self._teller = threading.Thread(target=self._keep_telling, daemon=True)
@@ -51,7 +54,7 @@ class Steps:
     def __enter__(self) -> Steps:
         if self._bar is not None:
             self._bar.start()
-            self._task = self._bar.add_task(self._title, total=self._total, left="")
+            self._task = self._bar.add_task(self._title, total=self._total, share=0.0, left="")
         self._teller.start()
         return self
 
@@ -59,6 +62,8 @@ class Steps:
         self._end.set()
         self._teller.join()
         if self._bar is not None:
+            if kind is None:
+                self._tell()
             self._bar.stop()
         elif kind is None:
             self._tell()
@@ -78,32 +83,42 @@ class Steps:
             self._tell()
 
     def _tell(self) -> None:
-        left = self._left()
-        if self._bar is not None:
-            self._bar.update(self._task, left=left)
-            return
+        left_s, elapsed_s = self._left_s(), time.monotonic() - self._started
+        left = f"about {left_s:.0f} s left" if left_s is not None else ""
         running = self._running() if self._running is not None and self._done < self._total else ""
-        parts = [f"{self._done}/{self._total} after {time.monotonic() - self._started:.0f} s", left]
+        if self._bar is not None:
+            # a step may take as long as all others together: the bar goes by time
+            share = elapsed_s / (elapsed_s + left_s) if left_s is not None else self._done / max(self._total, 1)
+            self._share = max(self._share, share)
+            self._bar.update(self._task, share=self._share, left=", ".join(filter(None, (left, running))))
+            return
+        parts = [f"{self._done}/{self._total} after {elapsed_s:.0f} s", left]
         parts.append(f"running: {running}" if running else "")
         self._console.print(f"{self._title}: {', '.join(filter(None, parts))}", highlight=False, soft_wrap=True)
 
-    def _left(self) -> str:
-        """Say how long the rest will take."""
+    def _left_s(self) -> float | None:
+        """Seconds that the rest will take; None at the end, and where nothing tells."""
         if self._done >= self._total or (self._forecast_s is None and not self._done):
-            return ""
+            return None
         if self._forecast_s is not None:
-            seconds = self._forecast_s()
-        else:
-            seconds = (time.monotonic() - self._started) / self._done * (self._total - self._done)
-        return f"about {seconds:.0f} s left"
+            return self._forecast_s()
+        return (time.monotonic() - self._started) / self._done * (self._total - self._done)
+
+
+class _ShareColumn(ProgressColumn):
+    """Bar of the share of the time that has passed."""
+
+    def render(self, task: Task) -> ProgressBar:
+        return ProgressBar(total=1.0, completed=task.fields["share"], width=_BAR_COLUMNS)
 
 
 def _bar(console: Console) -> Progress:
     return Progress(
         TextColumn("{task.description}"),
-        BarColumn(),
+        _ShareColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
-        TextColumn("{task.fields[left]}"),
+        TextColumn("{task.fields[left]}", table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1)),
         console=console,
+        expand=True,
     )

@@ -68,11 +68,18 @@ class Forecast:
 
     def text(self, workers: int, slowdown: float) -> str:
         """One sentence for the terminal."""
-        counts = ", ".join(f"{n} {kind}{'s' * (n != 1)}" for kind, n in self.counts.items() if n)
+        pace = Pace(self.seconds, slowdown)
+        counts = ", ".join(self._count(kind, n, pace) for kind, n in self.counts.items() if n)
         width = max(min(workers, sum(self.counts.values())), 1)
-        seconds = START_S * slowdown + Pace(self.seconds, slowdown).left_s(self.counts, [], width)
+        seconds = START_S * slowdown + pace.left_s(self.counts, [], width)
         took = f"{duration(seconds)} with {workers} worker{'s' * (workers != 1)} (a first guess)"
         return f"to make: {counts}; about {megabytes(self.size)}, {took}"
+
+    def _count(self, kind: str, number: int, pace: Pace) -> str:
+        if kind != "bake":
+            return f"{number} {kind}{'s' * (number != 1)}"
+        is_cached = self.seconds[kind] <= CACHED_BAKE_S
+        return f"{number} bake of the room's light ({'cached' if is_cached else duration(pace.seconds(kind))})"
 
 
 def forecast(plan: Plan, tasks: Collection[Task]) -> Forecast:
