@@ -7,6 +7,7 @@ renders with: versions, variant, LLVM.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import logging
@@ -17,6 +18,7 @@ import time
 import uuid
 from collections.abc import Iterator
 from contextlib import ExitStack
+from multiprocessing import resource_tracker
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -38,6 +40,7 @@ _POLL_S = 0.005
 _CENSUS_S = 2.0  # counting the workers is a call to the scheduler: not before every task
 # dask lets glibc return memory at once; a view's arrays of 45 MB would then fault every page anew, 1 s a view
 _MEMORY = {"MALLOC_TRIM_THRESHOLD_": 2**31, "MALLOC_MMAP_THRESHOLD_": 2**30, "MALLOC_TOP_PAD_": 2**26}
+_STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _MISSING = "dask.distributed is not installed: run `pip install 'phibench[cluster]'`"
 
 
@@ -121,21 +124,48 @@ def local_workers(count: int, out: Path) -> Iterator[DaskExecutor]:
         "distributed.worker.profile.enabled": False,
         "distributed.nanny.pre-spawn-environ": {**_MEMORY, **ONE_THREAD},
     }
-    with OwnedFolder("workers") as folder, dask.config.set(settings), deaths.listening():
-        cluster = distributed.LocalCluster(
-            n_workers=count,
-            threads_per_worker=1,
-            processes=True,
-            host="127.0.0.1",
-            scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
-            memory_limit=0,
-            silence_logs=logging.CRITICAL,
-            local_directory=str(folder),
-        )
-        with cluster, distributed.Client(cluster, set_as_default=False) as client:
-            client.run(_ignore_interrupt)
-            client.register_plugin(_ignoring_plugin())
-            yield DaskExecutor(client, out, deaths)
+    with OwnedFolder("workers") as folder, dask.config.set(settings), deaths.listening(), ExitStack() as stack:
+        with _signals_kept_from_children():
+            cluster = distributed.LocalCluster(
+                n_workers=0,
+                threads_per_worker=1,
+                processes=True,
+                host="127.0.0.1",
+                scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
+                memory_limit=0,
+                silence_logs=logging.CRITICAL,
+                local_directory=str(folder),
+            )
+            stack.enter_context(cluster)
+        cluster.sync(_grow, cluster, count)
+        client = stack.enter_context(distributed.Client(cluster, set_as_default=False))
+        yield DaskExecutor(client, out, deaths)
+
+
+async def _grow(cluster: Any, count: int) -> None:
+    """Start the workers of an empty cluster, as its constructor would.
+
+    An interrupted start goes on behind the shield, and leaving the cluster waits for it. A cancelled one would leave
+    workers of which the cluster does not know: its end is then a traceback.
+    """
+    while len(cluster.worker_spec) < count:
+        cluster.worker_spec.update(cluster.new_worker_spec())
+    await asyncio.shield(cluster._correct_state())
+
+
+@contextlib.contextmanager
+def _signals_kept_from_children() -> Iterator[None]:
+    """Hold signals that end a run back from this thread for now, and for ever from what begins in it.
+
+    Threads and processes inherit what is blocked. Dask's thread and the workers that it starts so leave Ctrl-C and a
+    signal to the whole group to this process, which then ends them. A signal that comes meanwhile is heard afterwards.
+    """
+    resource_tracker.ensure_running()  # it unblocks signals when it starts
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextlib.contextmanager
@@ -179,22 +209,6 @@ def _libraries() -> tuple[Any, Any]:
     except ModuleNotFoundError as error:
         raise DatasetError(_MISSING) from error
     return dask, distributed
-
-
-def _ignore_interrupt() -> None:
-    """Leave Ctrl-C to the parent, which then ends its workers."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _ignoring_plugin() -> Any:
-    """Make a plugin that does the same in the workers that come later."""
-    from distributed import WorkerPlugin
-
-    class IgnoreInterrupt(WorkerPlugin):
-        def setup(self, worker: Any) -> None:
-            _ignore_interrupt()
-
-    return IgnoreInterrupt()
 
 
 class _Deaths(logging.Handler):

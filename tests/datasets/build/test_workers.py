@@ -110,6 +110,64 @@ def test_workers_leave_when_their_parent_is_killed(tmp_path: Path) -> None:
     assert living(parent.pid) == []
 
 
+HELD = """
+import sys, time
+from pathlib import Path
+
+if "spawn_main" in " ".join(sys.orig_argv):
+    folder = Path(__file__).parent
+    (folder / "begun").touch()
+    while not (folder / "go").exists():
+        time.sleep(0.01)
+"""
+"""A `sitecustomize` that holds every worker at its start until it is let go."""
+
+START = """
+import sys
+from pathlib import Path
+from phibench.datasets.build.workers import local_workers
+from phibench.estimator.cli import main as cli
+
+def start() -> None:
+    with local_workers(2, Path(sys.argv[1])):
+        print("the workers are there")
+
+cli.app.command(start)
+sys.exit(cli.main(["start"]))
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs /proc")
+@pytest.mark.parametrize(
+    ("stop", "status", "sentence"),
+    [
+        (signal.SIGTERM, 143, "Stopped by SIGTERM.\n"),
+        (signal.SIGINT, 130, "Interrupted: stopped at your request.\n"),
+    ],
+)
+def test_a_signal_while_workers_start_ends_in_one_sentence(
+    tmp_path: Path, stop: signal.Signals, status: int, sentence: str
+) -> None:
+    """To the whole group, as a terminal does: dask would end in a traceback, and each worker in one of its own."""
+    (tmp_path / "sitecustomize.py").write_text(HELD)
+    path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
+    with subprocess.Popen(
+        [sys.executable, "-c", START, str(tmp_path)],
+        env={**os.environ, "PYTHONPATH": path},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        text=True,
+    ) as child:
+        wait_for(tmp_path / "begun")
+        os.killpg(child.pid, stop)
+        (tmp_path / "go").touch()
+        said, errors = child.communicate(timeout=60)
+    assert (said, errors) == ("", sentence)
+    assert child.returncode == status
+    assert living(child.pid) == []
+
+
 # A scheduler of others.
 
 
