@@ -89,7 +89,7 @@ def render_ambient(
     grid = FilmGrid.of(camera, cells_per_pixel)
     film = Film(mi, surfaces, grid, seed)
     layers = [_band(film, band, window, rounds) for band in _bands(grid, window)]
-    dr.flush_kernel_cache()  # every view is compiled anew, and Dr.Jit would keep them all
+    dr.flush_kernel_cache()  # other mirrors need other kernels; those of the next view are read from Dr.Jit's own cache
     return AmbientLayer(*(np.concatenate([pair[i] for pair in layers], axis=1) for i in (0, 1)))
 
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from phibench.render.room.camera_plugin import MM_PER_M
-from phibench.render.room.shading import Patch, Surfaces, cut
+from phibench.render.room.shading import Patch, Surfaces, aligned, cut
 from phibench.render.room.subpixel_grid import points, shifts
 from phibench.render.setup.variant import activate
 from phibench.scenes.frames import Array, BoolArray
@@ -118,9 +118,7 @@ class _Texels:
         normals = np.concatenate([np.repeat(patch.normal[None], patch.count, axis=0) for patch in patches])
         centres = np.concatenate([patch.centres_m() for patch in patches])
         starts = MM_PER_M * (centres - view.sphere_centre_m) + _LIFT_MM * normals
-        columns = [
-            [mi.Float(np.ascontiguousarray(a[:, i], dtype=np.float32)) for i in range(3)] for a in (starts, normals)
-        ]
+        columns = [[mi.Float(aligned(a[:, i])) for i in range(3)] for a in (starts, normals)]
         return _Texels(mi.Point3f(*columns[0]), mi.Vector3f(*columns[1]))
 
 
@@ -165,9 +163,10 @@ def _direct(mi: ModuleType, surfaces: Surfaces, texels: _Texels, lamps: Array, r
 
     if len(lamps) == 0:
         return np.zeros((dr.width(texels.points), 3))
-    table = mi.Float(np.ascontiguousarray(lamps, dtype=np.float32).ravel())
+    table = mi.Float(aligned(lamps))
     lanes = dr.arange(mi.UInt32, dr.width(texels.points))
-    shift = shifts(mi, lanes, 2, seed)
+    rays, key, count = (dr.opaque(mi.UInt32, value) for value in (rays, seed, len(lamps) * rays))
+    shift = shifts(mi, lanes, 2, key)
 
     def body(i: Any, total: Any) -> tuple[Any, Any]:
         lamp = i // rays
@@ -183,10 +182,10 @@ def _direct(mi: ModuleType, surfaces: Surfaces, texels: _Texels, lamps: Array, r
         ray = mi.Ray3f(texels.points, way)
         ray.maxt = r - _LAMP_GAP_MM
         seen = faces & ~surfaces.scene.ray_test(ray, faces)
-        weight = dr.select(seen, cos_here * cos_lamp / r2 * column[15] / rays, 0.0)
+        weight = dr.select(seen, cos_here * cos_lamp / r2 * column[15] / mi.Float(rays), 0.0)
         return i + 1, total + weight * mi.Color3f(*column[12:15])
 
-    return _loop(mi, body, len(lamps) * rays, len(lanes))
+    return _loop(mi, body, count, len(lanes))
 
 
 def _gather(mi: ModuleType, surfaces: Surfaces, texels: _Texels, rays: int, seed: int) -> Array:
@@ -194,7 +193,8 @@ def _gather(mi: ModuleType, surfaces: Surfaces, texels: _Texels, rays: int, seed
     import drjit as dr
 
     lanes = dr.arange(mi.UInt32, dr.width(texels.points))
-    shift, frame = shifts(mi, lanes, 2, seed), mi.Frame3f(texels.normals)
+    key, count = (dr.opaque(mi.UInt32, value) for value in (seed, rays))
+    shift, frame = shifts(mi, lanes, 2, key), mi.Frame3f(texels.normals)
 
     def body(i: Any, total: Any) -> tuple[Any, Any]:
         way = frame.to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(*points(mi, shift, i))))
@@ -204,10 +204,10 @@ def _gather(mi: ModuleType, surfaces: Surfaces, texels: _Texels, rays: int, seed
         patch = surfaces.patch_ids(dr.reinterpret_array(mi.UInt32, hit.shape), valid)
         return i + 1, total + surfaces.radiance(patch, ray(hit.t), way, valid, lamps=False)
 
-    return np.pi / rays * _loop(mi, body, rays, len(lanes))
+    return np.pi / rays * _loop(mi, body, count, len(lanes))
 
 
-def _loop(mi: ModuleType, body: Any, count: int, lanes: int) -> Array:
+def _loop(mi: ModuleType, body: Any, count: Any, lanes: int) -> Array:
     """Sum a colour over `count` turns, shape (lanes, 3)."""
     import drjit as dr
 

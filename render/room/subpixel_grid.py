@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.special import ndtr
 
-from phibench.render.room.shading import Surfaces, look
+from phibench.render.room.shading import Surfaces, aligned, look
 from phibench.scenes.camera import Camera
 from phibench.scenes.validation import SceneError
 
@@ -202,11 +202,13 @@ class Film:
         import drjit as dr
 
         mi, grid = self._mi, self.grid
-        lanes = mi.UInt32(numbers)
+        lanes = mi.UInt32(aligned(numbers, np.uint32))
         m, key = (dr.opaque(mi.UInt32, value) for value in (side, self._key(stream)))
         shift = shifts(mi, lanes, self._dimensions, key)
-        column, row = mi.Float64(lanes % grid.columns), mi.Float64(lanes // grid.columns)
-        h, start = 1.0 / grid.cells, -0.5 - grid.margin_px
+        # opaque: one kernel for all cameras
+        columns = dr.opaque(mi.UInt32, grid.columns)
+        h, start = (dr.opaque(mi.Float64, value) for value in (1.0 / grid.cells, -0.5 - grid.margin_px))
+        column, row = mi.Float64(lanes % columns), mi.Float64(lanes // columns)
 
         def body(i: Any, total: Any, square: Any, seen: Any) -> tuple[Any, Any, Any, Any]:
             x = points(mi, shift, i)
