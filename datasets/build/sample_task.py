@@ -18,19 +18,19 @@ from phibench.datasets.store.layers import SpotWindow, read_ambient, read_ambien
 from phibench.datasets.store.pictures import Side, sample_picture, save_png
 from phibench.datasets.store.schema import NoiseRow
 from phibench.render.optics.truth import SpotTruth, spot_truth
-from phibench.render.room.noise_budget import BUDGET, NoiseBudget, noise_budget
+from phibench.render.room.noise_budget import BUDGETS, NoiseBudget, noise_budget
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
 from phibench.scenes.room import Room
 
 
-def finish_sample(out: Path, pair: PairPlan, rig: Rig, room: Room, spot: LaserSpot) -> Made:
+def finish_sample(out: Path, pair: PairPlan, rig: Rig, room: Room, spot: LaserSpot, quality: str) -> Made:
     """Task: the picture of one sample, and as its result the `NoiseRow` of both positions.
 
     Raises
     ------
     RefusedSampleError
-        If a view's noise is more than a quarter of the sensor's at the spot, with the numbers.
+        If a view's noise is above the budget of this quality at the spot, with the numbers.
     """
     sides, rows = [], {}
     for position in POSITIONS:
@@ -39,7 +39,7 @@ def finish_sample(out: Path, pair: PairPlan, rig: Rig, room: Room, spot: LaserSp
         ambient = out / schema.view_file(pair.pose_id(position), "ambient")
         planes, window = read_ambient(ambient), _window(out, pair, position)
         budget = spot_noise(view, truth, window, planes, read_ambient_variance(ambient))
-        _check(f"{pair.sample_id} {position}", budget)
+        _check(f"{pair.sample_id} {position}", budget, BUDGETS[quality])
         rows[position] = None if budget is None else noise_row(budget).model_dump(mode="json")
         frame = planes.astype(float)
         window.add_to(frame)
@@ -63,11 +63,11 @@ def noise_row(budget: NoiseBudget) -> NoiseRow:
     return NoiseRow(phi_sensor_rad=budget.phi_sensor_rad, phi_render_rad=budget.phi_render_rad)
 
 
-def _check(name: str, budget: NoiseBudget | None) -> None:
-    if budget is not None and not budget.kept:
+def _check(name: str, budget: NoiseBudget | None, allowed: float) -> None:
+    if budget is not None and not budget.kept(allowed):
         raise RefusedSampleError(
             f"refused: the rendering noise of {name} is an error of phi of {budget.phi_render_rad:.2g} rad, more than "
-            f"{BUDGET:g} of the sensor's {budget.phi_sensor_rad:.2g} rad; give ambient.cells_per_pixel a larger value"
+            f"{allowed:g} of the sensor's {budget.phi_sensor_rad:.2g} rad; give ambient.cells_per_pixel a larger value"
         )
 
 

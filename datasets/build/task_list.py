@@ -89,7 +89,8 @@ class _Makers:
         keys = tuple(task.key for task in (spot, *needs))
         key = self._key(["sample", pair.sample_id], finish_sample, keys)
         names = tuple(task.name for task in (spot, *needs))
-        arguments = (pair, self._plan.rigs[pair.rig], self._plan.room, self._plan.spots[pair.spot])
+        quality = self._plan.recipe.ambient.quality
+        arguments = (pair, self._plan.rigs[pair.rig], self._plan.room, self._plan.spots[pair.spot], quality)
         return Task(sample_task_name(pair), key, finish_sample, arguments, names)
 
     def _key(self, inputs: Any, function: Any, needs: tuple[str, ...] = ()) -> str:

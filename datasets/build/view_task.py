@@ -33,6 +33,7 @@ def render_view(out: Path, dataset: str, rig: Rig, room: Room, pose: PosePlan, a
     """Task: render one pose and write its three files below `out`."""
     from phibench.render.optics.truth import truth_layer
     from phibench.render.room.ambient import dark_layer, render_ambient
+    from phibench.render.room.noise_budget import BUDGETS
     from phibench.render.setup.variant import activate
 
     activate()
@@ -40,7 +41,8 @@ def render_view(out: Path, dataset: str, rig: Rig, room: Room, pose: PosePlan, a
     header = {"dataset": dataset, "pose": pose.pose_id, "offset_m": pose.offset_m}
     if room.lit:
         light, settings = read_light_map(out), bake_settings(ambient)
-        layer = render_ambient(view, room, light, settings, ambient.cells_per_pixel, pose.seed)
+        budget = BUDGETS[ambient.quality]
+        layer = render_ambient(view, room, light, settings, ambient.cells_per_pixel, pose.seed, budget=budget)
     else:
         layer = dark_layer(rig.camera)
     planes = layer.electrons_per_s

@@ -170,6 +170,10 @@ class LaserTable(Table):
 class AmbientTable(Table):
     """`[ambient]`: how well the room is rendered."""
 
+    quality: Literal["reference", "training"] = Field(
+        default="reference",
+        description="noise of the room's light: below a quarter of the sensor's, or below a half, in less time",
+    )
     cells_per_pixel: int = Field(
         default=2, ge=2, le=32, description="cells along a pixel's side; two samples each, more where noise asks for it"
     )

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.render.room.light_map import BakeSettings, LightMap, fixed_shapes, light_carriage
+from phibench.render.room.noise_budget import BUDGET
 from phibench.render.room.refinement import first_pass, refine
 from phibench.render.room.shading import Surfaces, cut, texel_count
 from phibench.render.room.subpixel_grid import Crop, Film, FilmGrid, Stack
@@ -60,6 +61,7 @@ def render_ambient(
     seed: int,
     crop: Crop | None = None,
     rounds: int = ROUNDS,
+    budget: float = BUDGET,
 ) -> AmbientLayer:
     """Render one view from a room's light map.
 
@@ -76,6 +78,8 @@ def render_ambient(
         with it, those within some pixels of its border may differ by their noise.
     rounds : int
         Rounds of refinement at most; 0 leaves the first pass alone.
+    budget : float
+        Noise that refinement stops at, as a part of the sensor's: one of `noise_budget.BUDGETS`.
     """
     mi = activate()
     import drjit as dr
@@ -88,7 +92,7 @@ def render_ambient(
     light_carriage(surfaces, shapes, fixed, light.irradiance_w_m2, settings)
     grid = FilmGrid.of(camera, cells_per_pixel)
     film = Film(mi, surfaces, grid, seed)
-    layers = [_band(film, band, window, rounds) for band in _bands(grid, window)]
+    layers = [_band(film, band, window, rounds, budget) for band in _bands(grid, window)]
     dr.flush_kernel_cache()  # other mirrors need other kernels; those of the next view are read from Dr.Jit's own cache
     return AmbientLayer(*(np.concatenate([pair[i] for pair in layers], axis=1) for i in (0, 1)))
 
@@ -101,18 +105,18 @@ def _bands(grid: FilmGrid, window: Crop) -> list[Crop]:
     return [(u0, v, width, min(rows, v0 + height - v)) for v in range(v0, v0 + height, rows)]
 
 
-def _band(film: Film, band: Crop, window: Crop, rounds: int) -> tuple[Stack, Stack]:
+def _band(film: Film, band: Crop, window: Crop, rounds: int, budget: float) -> tuple[Stack, Stack]:
     """Pixels of a band, refined with its neighbourhood: what is beyond it reaches the band by less than the budget."""
     u0, v0, width, height = band
     top, bottom = max(v0 - _OVERLAP_PX, window[1]), min(v0 + height + _OVERLAP_PX, window[1] + window[3])
-    mean, variance = _render(film, (u0, top, width, bottom - top), rounds)
+    mean, variance = _render(film, (u0, top, width, bottom - top), rounds, budget)
     inner = slice(v0 - top, v0 - top + height)
     return mean[:, inner], variance[:, inner]
 
 
-def _render(film: Film, window: Crop, rounds: int) -> tuple[Stack, Stack]:
+def _render(film: Film, window: Crop, rounds: int, budget: float) -> tuple[Stack, Stack]:
     """Pixels of a window and their variance, shape (3, height, width) each."""
-    cells = first_pass(film, window)
+    cells = first_pass(film, window, budget)
     for turn in range(1, rounds + 1):
         if not refine(film, cells, turn):
             break

@@ -27,7 +27,9 @@ from phibench.render.sensor.settings import Sensor, sensor
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import View
 
-BUDGET = 0.25  # largest allowed render error, in units of the sensor's
+# Largest allowed render error by the quality that a recipe asks for, in units of the sensor's.
+BUDGETS = {"reference": 0.25, "training": 0.5}
+BUDGET = BUDGETS["reference"]
 _STEP_PX = 0.01
 
 
@@ -52,18 +54,20 @@ class NoiseBudget:
     phi_sensor_rad: float
     phi_render_rad: float
 
-    @property
-    def kept(self) -> bool:
-        """True if the rendering noise stays below a quarter of the sensor's, and where there is nothing to keep."""
-        return not self.phi_render_rad > BUDGET * self.phi_sensor_rad
+    def kept(self, budget: float = BUDGET) -> bool:
+        """True if the rendering noise stays below this part of the sensor's, and where there is nothing to keep."""
+        return not self.phi_render_rad > budget * self.phi_sensor_rad
 
 
 def excess(
-    electrons_per_s: NDArray[np.float32], variance_per_s2: NDArray[np.float32], blur_sigma_px: float
+    electrons_per_s: NDArray[np.float32],
+    variance_per_s2: NDArray[np.float32],
+    blur_sigma_px: float,
+    budget: float = BUDGET,
 ) -> NDArray[np.float32]:
     """By what factor a pixel's rendering variance is above its budget, largest of three colours, shape (H, W).
 
-    The budget of a pixel is b^2 (a + r^2) / kappa: the sensor's variance without any spot, times b = `BUDGET` squared.
+    The budget of a pixel is b^2 (a + r^2) / kappa: the sensor's variance without any spot, times b = `budget` squared.
     If all pixels keep it and their noise were independent (kappa = 1), every spot would: V <= b^2 (a + r^2) and
     w = 1/(s + a + r^2) give sum d d^T V w^2 <= b^2 sum d d^T w, hence F^-1 [..] F^-1 <= b^2 F^-1, whatever the spot's
     shape, brightness and place. Noise that shares the spot's own blur, of variance S, counts for more: its spectrum is
@@ -77,8 +81,10 @@ def excess(
         Ambient layer and its variance.
     blur_sigma_px : float
         The camera's, without the pixel's own square (1/12 px^2).
+    budget : float
+        One of `BUDGETS`.
     """
-    over = variance_per_s2 / allowed_per_s2(electrons_per_s, blur_sigma_px)
+    over = variance_per_s2 / allowed_per_s2(electrons_per_s, blur_sigma_px, budget)
     return np.asarray(np.where(is_full(electrons_per_s), np.float32(0.0), over).max(axis=0))
 
 
@@ -87,12 +93,14 @@ def is_full(electrons_per_s: NDArray[np.float32]) -> NDArray[np.bool_]:
     return np.asarray(electrons_per_s * np.float32(webcam().exposure_s) > webcam().full_well_e)
 
 
-def allowed_per_s2(electrons_per_s: NDArray[np.float32], blur_sigma_px: float) -> NDArray[np.float32]:
+def allowed_per_s2(
+    electrons_per_s: NDArray[np.float32], blur_sigma_px: float, budget: float = BUDGET
+) -> NDArray[np.float32]:
     """Largest rendering variance of a pixel within its budget, (electrons/s)^2, of the shape of the layer."""
     kappa = max(1.0, math.pi * (blur_sigma_px**2 + 1.0 / 12.0))
     seconds = webcam().exposure_s
     mean_e = electrons_per_s * np.float32(seconds)
-    return np.float32((BUDGET / seconds) ** 2 / kappa) * (mean_e + np.float32(webcam().read_noise_e ** 2))
+    return np.float32((budget / seconds) ** 2 / kappa) * (mean_e + np.float32(webcam().read_noise_e ** 2))
 
 
 def noise_budget(view: View, uv_px: Array, layer: SpotImage, ambient: Array, variance: Array) -> NoiseBudget:

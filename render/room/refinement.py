@@ -45,6 +45,8 @@ class Cells:
         Excess of the pixels by what may have been missed; 0 from the second round on.
     mirrored : bool array, shape (height, width)
         Pixels that see the mirror.
+    budget : float
+        Largest allowed error by noise, one of `noise_budget.BUDGETS`.
     """
 
     grid: FilmGrid
@@ -56,22 +58,23 @@ class Cells:
     tight: Stack
     suspected: Stack
     mirrored: NDArray[np.bool_]
+    budget: float
 
 
-def first_pass(film: Film, window: Crop) -> Cells:
+def first_pass(film: Film, window: Crop, budget: float) -> Cells:
     """All cells of a window, two samples each."""
     grid, numbers = film.grid, film.grid.numbers(window)
     a, b = (film.sample(numbers.ravel(), 1, half) for half in (0, 1))
     mean, variance = (plane.reshape(3, *numbers.shape) for plane in _estimate(a, b))
     pixels = grid.pixels(mean), grid.pixels(variance, power=2)
-    allowed = allowed_per_s2(pixels[0], grid.blur_sigma_px).sum(axis=0)
+    allowed = allowed_per_s2(pixels[0], grid.blur_sigma_px, budget).sum(axis=0)
     tight = ndimage.minimum_filter(allowed, size=_NEAR_PX, mode="nearest")
     halves = [half.electrons_per_s.sum(axis=0).reshape(numbers.shape) for half in (a, b)]
     full = is_full(pixels[0]).all(axis=0)
     suspected = np.where(full, np.float32(0.0), _suspected(grid, *halves) / allowed)
     mirrored = grid.inner((a.mirrored | b.mirrored).reshape(numbers.shape))
     side = np.ones(numbers.shape, dtype=np.int32)
-    return Cells(grid, numbers, side, mean, variance, pixels, tight, suspected, mirrored)
+    return Cells(grid, numbers, side, mean, variance, pixels, tight, suspected, mirrored, budget)
 
 
 def refine(film: Film, cells: Cells, turn: int) -> bool:
@@ -82,7 +85,7 @@ def refine(film: Film, cells: Cells, turn: int) -> bool:
     turn : int, from 1
         Which round this is: each has its own random streams.
     """
-    over = np.where(cells.mirrored, excess(*cells.pixels, cells.grid.blur_sigma_px), np.float32(0.0))
+    over = np.where(cells.mirrored, excess(*cells.pixels, cells.grid.blur_sigma_px, cells.budget), np.float32(0.0))
     near = ndimage.maximum_filter(over, size=_NEAR_PX, mode="nearest")
     near = np.where(cells.mirrored, np.maximum(near, cells.suspected), near)
     if not np.any(near > 1.0):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import tomllib
 
 import numpy as np
@@ -80,8 +81,13 @@ def test_predicted_errors_against_monte_carlo(source: str) -> None:
 def test_quiet_layers_keep_the_budget_and_noisy_ones_do_not() -> None:
     quiet = noise_budget.noise_budget(VIEW, UV, LAYER, ROOM, np.full(SIZE, (0.001 * 4e4) ** 2))
     noisy = noise_budget.noise_budget(VIEW, UV, LAYER, ROOM, np.full(SIZE, (0.2 * 4e4) ** 2))
-    assert quiet.kept
-    assert not noisy.kept
+    assert quiet.kept()
+    assert not noisy.kept()
+    between = dataclasses.replace(noisy, phi_render_rad=0.4 * noisy.phi_sensor_rad)
+    assert {name: between.kept(part) for name, part in noise_budget.BUDGETS.items()} == {
+        "reference": False,
+        "training": True,
+    }
     assert noisy.phi_render_rad == pytest.approx(200.0 * quiet.phi_render_rad)
     assert quiet.phi_sensor_rad == noisy.phi_sensor_rad
 
@@ -90,7 +96,7 @@ def test_a_spot_off_the_image_has_no_budget_to_keep() -> None:
     dark = spot_layer(VIEW, LaserSpot((0.0, 0.0, 2.9), (0, 0, -1), 5e-3), ())
     budget = noise_budget.noise_budget(VIEW, UV, dark, ROOM, ROOM)
     assert np.isnan(budget.phi_render_rad)
-    assert budget.kept
+    assert budget.kept()
 
 
 def test_the_measure_is_the_presets_own() -> None:
