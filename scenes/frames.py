@@ -50,8 +50,7 @@ class Pose:
         object.__setattr__(self, "translation_m", finite_vector("Pose", "translation_m", self.translation_m, 3))
         rows = tuple(finite_vector("Pose", "rotation", row, 3) for row in self.rotation)
         object.__setattr__(self, "rotation", rows)
-        R = self.R
-        if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=1e-9) or np.linalg.det(R) < 0.0:
+        if not _is_rotation(rows):
             raise SceneError(f"Pose T_{self.target}_{self.source}.rotation is not a rotation matrix (right-handed)")
 
     @property
@@ -85,6 +84,24 @@ class Pose:
                 f"frame '{self.source}' meets frame '{other.target}'; the inner frames must be the same"
             )
         return Pose(self.target, other.source, as_vector(self.points(other.t)), as_matrix(self.R @ other.R))
+
+
+_ORTHOGONAL = 1e-9
+
+
+def _is_rotation(rows: tuple[Vector, ...]) -> bool:
+    """True for a proper orthogonal 3 x 3 matrix; plain floats, because poses are made by the thousand."""
+    if len(rows) != 3:
+        return False
+    a, b, c = rows
+    lengths = all(abs(_dot(row, row) - 1.0) <= _ORTHOGONAL for row in rows)
+    angles = all(abs(_dot(*pair)) <= _ORTHOGONAL for pair in ((a, b), (b, c), (c, a)))
+    normal = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    return lengths and angles and _dot(normal, c) > 0.0
+
+
+def _dot(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def as_vector(values: Array) -> Vector:

@@ -362,6 +362,7 @@ def test_a_moved_view_is_the_view_of_a_rig_that_was_built_there(misaligned_datas
     from phibench.datasets.build.bake_task import bake_settings, read_light_map
     from phibench.render.optics.truth import truth_layer
     from phibench.render.room.ambient import render_ambient
+    from phibench.render.room.noise_budget import BUDGETS
     from phibench.render.setup.variant import activate
 
     activate()
@@ -370,9 +371,9 @@ def test_a_moved_view_is_the_view_of_a_rig_that_was_built_there(misaligned_datas
     view = sample.view("up")
     built = dataclasses.replace(sample.rig, T_world_camera=view.T_world_camera, motion=None).at(0.0)
     [pose] = [pose for pose in dataset.info.poses if pose.pose == sample.row.up.pose]
-    light = read_light_map(misaligned_dataset)
+    light, budget = read_light_map(misaligned_dataset), BUDGETS[settings.quality]
     layer = render_ambient(
-        built, dataset.room, light, bake_settings(settings), settings.cells_per_pixel, pose.ambient_seed
+        built, dataset.room, light, bake_settings(settings), settings.cells_per_pixel, pose.ambient_seed, budget=budget
     )
     stored = read_ambient(misaligned_dataset / sample.row.up.view_ambient_file)
     assert stored.max() > 0.0
@@ -386,7 +387,7 @@ def test_a_moved_view_is_the_view_of_a_rig_that_was_built_there(misaligned_datas
             assert np.array_equal(truth[name].astype(np.float32), plane.astype(np.float32), equal_nan=True), name
     still = dataclasses.replace(sample.rig, motion=None).at(view.offset_m)
     other = render_ambient(
-        still, dataset.room, light, bake_settings(settings), settings.cells_per_pixel, pose.ambient_seed
+        still, dataset.room, light, bake_settings(settings), settings.cells_per_pixel, pose.ambient_seed, budget=budget
     )
     assert not np.array_equal(other.electrons_per_s, stored)
 
