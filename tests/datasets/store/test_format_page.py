@@ -103,7 +103,7 @@ def test_planes() -> None:
 
 def test_arrays_of_the_light_map() -> None:
     said = [name for row in table_with("array", "unit", "meaning") for name in names(row[0])]
-    assert tuple(said) == ARRAYS == tuple(field.name for field in dataclasses.fields(LightMap))
+    assert tuple(said) == tuple(ARRAYS) == tuple(field.name for field in dataclasses.fields(LightMap))
 
 
 def test_causes() -> None:
