@@ -64,7 +64,7 @@ def unit_vector(owner: str, name: str, value: Sequence[float]) -> tuple[float, .
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """Advice for an unknown name: the nearest known one, and what is known."""
-    names = list(known)
+    names = [printable_line(one) for one in known]  # of a file of somebody else, perhaps
     guesses = close_names(name, names)
     guess = f"did you mean '{guesses[0]}'? " if guesses else ""
     return f"{guess}known: {', '.join(names)}"

@@ -168,6 +168,8 @@ def require_writable(path: Path) -> None:
     DatasetError
         If not.
     """
+    if path.is_dir():
+        raise DatasetError(f"{path} cannot be written: it is a folder; give the name of a file")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         remove_leftovers(path.parent)

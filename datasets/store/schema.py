@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, field_validator, model_validator
 
-from phibench.datasets.input_files import FileName, NoFileName
+from phibench.datasets.input_files import FileName, Name, NoFileName
 
 SCHEMA_VERSION = 5
 READABLE_VERSIONS = (4, 5)
@@ -161,7 +161,7 @@ class PoseInfo(Document):
 class RigInfo(Document):
     """One rig: one line of `rigs.jsonl`."""
 
-    rig: str = described("-", "id: `rig` is that of the recipe's `[rig]`, others are called after their first sample")
+    rig: Name = described("-", "id: `rig` is that of the recipe's `[rig]`, others are called after their first sample")
     resolved: dict[str, Any] = described("-", "the rig, field by field")
 
 

@@ -60,6 +60,7 @@ def calibrate(
         PNG to write: the outline on the frame, with its residuals enlarged; by default beside the calibration.
     """
     from phibench.datasets.errors import DatasetError
+    from phibench.datasets.store.files import require_writable
     from phibench.estimator.calibration.from_dataset import calibrate_dataset
     from phibench.estimator.calibration.spots import Ruler
     from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
@@ -68,6 +69,7 @@ def calibrate(
     if not spots and (math.isfinite(height_sigma_m) or math.isfinite(azimuth_sigma_deg)):
         raise DatasetError("--height-sigma-m and --azimuth-sigma-deg are about calibration spots: give --spots too")
     ruler = Ruler(distance_sigma_m, height_sigma_m, math.radians(azimuth_sigma_deg))
+    require_writable(out)  # a folder such as "." has no name to which an ending could be given
     picture = out.with_suffix(".png") if picture is None else picture
     found = calibrate_dataset(directory, out, sample, preset, spots, ruler, vertical, outline_sigma_factor)
     print(f"{found.verdict}.")

@@ -23,7 +23,7 @@ from phibench.datasets.input_files import DEPTH, InputFile
 from phibench.datasets.plan.plan import parse_shard
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.store.checksums import read_checksums
-from phibench.datasets.store.documents import from_json, to_json
+from phibench.datasets.store.documents import from_json, read_rigs, to_json
 from phibench.datasets.store.layers import read_exr, write_exr
 from phibench.estimator.benchmark.sealed_set import read_seal
 from phibench.estimator.benchmark.submission import SealedPairs, outcomes_of, read_submission, submission
@@ -35,6 +35,7 @@ from phibench.estimator.interface import Outcome
 from phibench.estimator.sandbox.resolve import MethodError, Reference, resolve
 from phibench.estimator.spots.image_planes import read_picture
 from phibench.scenes.rig import Rig
+from phibench.scenes.validation import nearest
 
 
 def refusal(read: Callable[[], object]) -> str:
@@ -303,6 +304,27 @@ def test_a_path_is_said_as_it_is_given(name: str, capsys: pytest.CaptureFixture[
     assert all(c.isprintable() or c == "\n" for c in err)
     if name == "[/b]":
         assert "nowhere/[/b]" in err
+
+
+@pytest.mark.parametrize("out", [".", "/", "folder", ".."])
+def test_a_file_to_write_that_is_a_folder(
+    out: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Found by the fuzzer: "." and "/" have no name to which the ending of a picture could be given."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    assert main(["calibrate", "nope", "--out", out]) == 2
+    assert "it is a folder; give the name of a file" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("name", ["\0", "\x1b[31m", "a" * 201])
+def test_a_rig_with_a_strange_name(name: str, tmp_path: Path) -> None:
+    """Found by the fuzzer: a list of the known rigs held it as it was."""
+    (tmp_path / "rigs.jsonl").write_text(json.dumps({"rig": name, "resolved": {}}) + "\n")
+    with pytest.raises(DatasetError, match=r"rigs\.jsonl line 1 is damaged: rig: ") as caught:
+        read_rigs(tmp_path)
+    assert str(caught.value).isprintable()
+    assert nearest("rig", [name]).isprintable()
 
 
 def test_an_output_that_is_no_utf_8(capsys: pytest.CaptureFixture[str]) -> None:
