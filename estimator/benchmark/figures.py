@@ -254,7 +254,8 @@ def _map(axes: Axes, table: pl.DataFrame, scale: LogNorm) -> Any:
     u, v = found["u_true_px"], found["v_true_px"]
     marks = axes.scatter(u, v, s=size, c=distance, cmap="cividis_r", norm=scale, linewidths=0.3, edgecolors="black")
     axes.scatter(lost["u_true_px"], lost["v_true_px"], s=18.0, marker="x", color="#d55e00", linewidths=0.9)
-    axes.set(xlabel="u / px", ylabel="v / px", aspect="equal")
+    axes.set(xlabel="u / px", ylabel="v / px")
+    axes.set_aspect("equal", adjustable="datalim")  # the panel is filled, however the spots lie
     axes.invert_yaxis()
     return marks
 

@@ -108,6 +108,11 @@ class Ranking:
     frame_of: Mapping[tuple[str, int], str]
     false_lines: Mapping[str, str]
 
+    @property
+    def occurring(self) -> list[str]:
+        """Causes that some method has an image of, in the order in which they are tried."""
+        return [cause for cause in CAUSES if any(any(s.causes[cause].values()) for s in self.scores.values())]
+
 
 def write_report(files: Sequence[Path], out: Path, sections: Sequence[Section] = (), by: str = "phi") -> Path:
     """Write a report about scores on disk.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 from html.parser import HTMLParser
 
 import numpy as np
@@ -129,7 +130,35 @@ def test_a_dark_page_and_a_narrow_one_have_their_rules(html):
     assert "prefers-color-scheme: dark" in html
     assert "@media (max-width: 700px)" in html
     page = Page(html)
-    assert len(page.of("details")) == len(page.of("summary")) == 3 + 3 + 3  # worst, strata, failures + metrics + JSON
+    assert (
+        len(page.of("details")) == len(page.of("summary")) == 3 + 3 + 4
+    )  # worst, strata, causes + failures + metrics + JSON
+
+
+def test_narrow_pages_name_every_number(html):
+    """There the tables of metrics have no heads: a row becomes a card, and each number has its head beside it."""
+    tables = re.findall(r'<table class="[^"]*cards[^"]*">.*?</table>', html, re.S)
+    assert len(tables) == 1 + 3
+    for table in tables:
+        cells = Page(table).of("td")
+        assert len(cells) > 10
+        assert all(attributes["data-head"] for attributes in cells)
+    assert len(re.findall("<caption>", html)) == len(re.findall("<caption><span>", html))
+
+
+def test_too_few_samples_for_an_interval_are_a_star(html):
+    few = report_html([scored("ideal", sampler(), cases(3))])
+    assert few.count('title="under 5 samples">*</span>') > 10
+    assert "(under 5 samples)" not in few[few.index("<h3") :]
+    assert "under 5 samples" not in html[html.index('<table class="cards">') :].split("</table>")[0]
+
+
+def test_causes_that_occur_are_counted(html):
+    """Of 80 images of the mixed method 12 have no answer and 6 a false one; all others have a right position."""
+    table = html[html.index("Images without a right position by cause") :].split("</table>")[0]
+    assert re.findall(r'<th scope="col">(\w+)</th>', table) == ["method"]
+    assert re.findall(r"<td[^>]*>(.*?)</td>", table) == ["0", "0", "12 / 6 / 0"]
+    assert "Every image has a right position." in report_html([scored("ideal", sampler())])
 
 
 def test_causes_are_defined(html):
