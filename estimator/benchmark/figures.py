@@ -180,7 +180,8 @@ def pull_histogram(tables: Tables) -> Picture | None:
         return None
     edges = np.linspace(-5.0, 5.0, 41)
     with mpl.rc_context(_PANEL):
-        figure = Figure(figsize=(1.4 * _SIZE[0], 1.2 * _SIZE[1]), layout="constrained")
+        legend = 0.2 * math.ceil((len(pulls) + 1) / 2)  # inches below the axes, where it covers no curve
+        figure = Figure(figsize=(1.4 * _SIZE[0], 1.2 * _SIZE[1] + legend), layout="constrained")
         axes = figure.subplots()
         for i, (name, values) in enumerate(pulls.items()):
             density = np.histogram(np.clip(values, -5.0, 5.0), edges, density=True)[0]
@@ -189,7 +190,7 @@ def pull_histogram(tables: Tables) -> Picture | None:
         x = np.linspace(-5.0, 5.0, 201)
         axes.plot(x, norm.pdf(x), color="black", linewidth=2.0, alpha=0.6, label="normal, deviation 1")
         axes.set(xlabel="whitened error L⁻¹e; beyond ±5 in the outer bins", ylabel="density")
-        axes.legend(fontsize=8)
+        figure.legend(loc="outside lower center", ncols=2, fontsize=8)
         shown = ", ".join(f"{name} {np.std(values):.2f}" for name, values in pulls.items())
         return _svg(
             figure, f"Histograms of the whitened errors with the normal distribution. Deviations: {shown}; 1 is right."
