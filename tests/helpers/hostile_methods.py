@@ -11,6 +11,7 @@ from helpers.sandbox_pairs import GOOD
 from helpers.sandbox_pairs import HEADER as NAMES
 
 BAD = 1
+DENIED = ("error", "crash")  # the first where the system denies signals to the supervisor
 HEADER = f"""{NAMES}import ctypes, gc, json, os, resource, signal, socket, struct, subprocess, sys, threading, time
 from pathlib import Path
 X = Spot.missing('not looked for')
@@ -199,12 +200,12 @@ PROCESS: dict[str, Hostile] = {
     "kills itself": Hostile("os.kill(os.getpid(), 9)", ("crash",)),
     "kills its group": Hostile("os.killpg(0, 9)", ("crash",)),
     "stops itself": Hostile("os.kill(os.getpid(), signal.SIGSTOP)", ("timeout",)),
-    "kills its supervisor": Hostile("os.kill(os.getppid(), 9)\ntime.sleep(9)", ("crash",)),
+    "kills its supervisor": Hostile("os.kill(os.getppid(), 9)\ntime.sleep(9)", DENIED),
     "kills its supervisor and lives on": Hostile(
         "ctypes.CDLL(None).prctl(1, 0, 0, 0, 0)\ndaemon()\nos.kill(os.getppid(), 9)\ntime.sleep(60)",
-        ("crash", "timeout"),
+        (*DENIED, "timeout"),
     ),
-    "stops its supervisor": Hostile("os.kill(os.getppid(), signal.SIGSTOP)\nos._exit(1)", ("timeout", "crash")),
+    "stops its supervisor": Hostile("os.kill(os.getppid(), signal.SIGSTOP)\nos._exit(1)", (*DENIED, "timeout")),
     "ignores every signal, in C": Hostile(
         "for n in range(1, 65):\n    try: signal.signal(n, signal.SIG_IGN)\n    except (OSError, ValueError): pass\n"
         "ctypes.PyDLL(None).sleep(60)",
