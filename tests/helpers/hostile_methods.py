@@ -336,10 +336,10 @@ FOLDER: dict[str, Hostile] = {
     "wide and deep": Hostile(
         "for a in range(20):\n    for b in range(20): os.makedirs(f'{a}/{b}/c')\n    open(f'{a}/f', 'w').close()", ("",)
     ),
-    "no folder any more": Hostile("os.rmdir(os.getcwd())", ("",)),
+    "no folder any more": Hostile("os.rmdir(os.getcwd())", ("", "error")),
     "a folder that is a link": Hostile(
         "here = os.getcwd()\nos.chdir('/')\nos.rmdir(here)\nos.symlink(os.path.dirname(here) + '/precious', here)",
-        ("",),
+        ("", "error"),
     ),
     "links to what is precious": Hostile(
         "os.symlink('../precious', 'a')\nos.symlink('/', 'b')\nos.symlink('c', 'c')", ("",)
