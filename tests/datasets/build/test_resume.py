@@ -79,7 +79,7 @@ CHANGES = (
         SAMPLES + VIEWS,
         f"5 finished tasks (3 views, 2 samples) {LOST} seed; give another folder, or add `--replace` to delete them",
     ),
-    ("[ambient]", "[laser]\npower_w = 2e-3\n\n[ambient]", SAMPLES + SPOTS, "4 finished tasks (2 spots, 2 samples)"),
+    ("power_w = 64e-3", "power_w = 2e-3", SAMPLES + SPOTS, "4 finished tasks (2 spots, 2 samples)"),
     ("[0.5]", "[0.5, 1.4]", ["sample seen-near-h1.400", "spot seen-near-h1.400"], ""),
     (
         "[0.5",
