@@ -112,7 +112,7 @@ def test_verify_finds_no_fault(paper: Dataset) -> None:
 
 
 def test_score_command_prints_the_tables(paper: Dataset, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert main(["paper", str(paper.folder), "--out", str(tmp_path / "scores.json")]) == 0
+    assert main(["paper", str(paper.folder), "--wide", "--out", str(tmp_path / "scores.json")]) == 0
     printed = capsys.readouterr().out
     assert sum(line.count("table") for line in printed.splitlines()) >= 50  # 25 rows each for true pixels and frames
     for word in ("published", "paper_ray", "exact", "incidence"):

@@ -197,7 +197,7 @@ def test_score_prints_the_general_row(misaligned: Dataset, tmp_path: Path, capsy
     nominal = misaligned.samples[0].nominal_rig
     file = written(tmp_path / "c.json", truth_of_rig(misaligned), nominal)
     out = tmp_path / "s.json"
-    assert run("paper", misaligned.folder, "--calibration", file, "--out", out) == 0
+    assert run("paper", misaligned.folder, "--calibration", file, "--wide", "--out", out) == 0
     printed = capsys.readouterr().out
     assert "general" in printed
     assert "±" in printed
