@@ -14,7 +14,8 @@ import signal
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
+from threading import Thread
 from typing import TypeVar
 
 from phibench.datasets.errors import DatasetError
@@ -57,7 +58,7 @@ def parallel_map(
                 result = function(item)
             yield result
         return
-    pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=_end_quietly_on_ctrl_c)
+    pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=_end_with_the_parent)
     try:
         with _environment(ONE_THREAD):  # processes start while items are handed over
             asked: dict[Future[Result], Item] = {pool.submit(function, item): item for item in listed}
@@ -95,6 +96,17 @@ def _environment(added: dict[str, str]) -> Iterator[None]:
             del os.environ[name]
 
 
-def _end_quietly_on_ctrl_c() -> None:
-    """End a worker at once on Ctrl-C, without a traceback; files that it was writing have temporary names."""
+def _end_with_the_parent() -> None:
+    """End a worker at once on Ctrl-C, without a traceback, and when its parent is gone, even killed.
+
+    Files that it was writing have temporary names. Workers of a killed parent would wait for work for ever.
+    """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    Thread(target=_follow_the_parent, daemon=True).start()
+
+
+def _follow_the_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

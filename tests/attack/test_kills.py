@@ -124,7 +124,8 @@ def test_killed_commands_end_in_the_same_bytes(name: str, bench_dataset: Path, t
                     os.killpg(child.pid, signal.SIGKILL) if whole else child.kill()
                     met += 1
                 child.communicate(timeout=60)
-        finished(job, given, out)
+        if name != "seal" or not (out / job.result).exists():  # a sealed set is never written again
+            finished(job, given, out)
         assert result(job, out) == expected
         assert {path.stem for path in out.iterdir()} == {Path(job.result).stem}
         shutil.rmtree(out)

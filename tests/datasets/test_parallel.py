@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from helpers.processes import living
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.parallel import ONE_THREAD, parallel_map
@@ -111,3 +112,28 @@ def test_ctrl_c_ends_quietly(tmp_path: Path) -> None:
     os.killpg(child.pid, signal.SIGINT)
     _, errors = child.communicate(timeout=20.0)
     assert (child.returncode, errors) == (130, "")
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs /proc")
+def test_workers_leave_when_their_parent_is_killed(tmp_path: Path) -> None:
+    """One works, the other has nothing to do; neither can be told."""
+    script = tmp_path / "main.py"
+    script.write_text(
+        "import time\nfrom phibench.datasets.parallel import parallel_map\n"
+        "if __name__ == '__main__':\n"
+        "    for _ in parallel_map(time.sleep, [0.0, 0.0, 0.0, 60.0], 2):\n        print('ready', flush=True)\n"
+    )
+    command = [sys.executable, str(script)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True) as parent:
+        assert parent.stdout is not None
+        assert [parent.stdout.readline() for _ in range(3)] == ["ready\n"] * 3
+        assert len(living(parent.pid)) >= 3
+        parent.kill()
+        parent.wait()
+        deadline = time.monotonic() + 20.0
+        while living(parent.pid) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        left = living(parent.pid)
+        if left:
+            os.killpg(parent.pid, signal.SIGKILL)
+    assert left == []

@@ -154,8 +154,8 @@ def test_read_back_and_in_a_report(tmp_path: Path, datasets: StudyDatasets) -> N
         "nothing is left out",
     ):
         assert words in page
-    assert "<caption>Numbers</caption>" in page
-    assert "<caption>Findings</caption>" in page
+    assert "<caption><span>Numbers</span></caption>" in page
+    assert "<caption><span>Findings</span></caption>" in page
     text = (folder / "findings.md").read_text(encoding="utf-8")
     assert "| count of numbers | 5 | >= 3 | met |" in text
 
