@@ -173,6 +173,18 @@ def test_a_torn_last_line_is_as_if_it_were_not_there(tmp_path: Path) -> None:
     assert Journal(tmp_path).entries["view b"] == last
 
 
+def test_a_line_with_another_number_is_damaged(tmp_path: Path) -> None:
+    """Its form is right, and only the check sum tells: the result would enter the manifest."""
+    with Journal(tmp_path) as journal:
+        journal.begin(FolderHead("{}", ""), [])
+        journal.add(Entry("view a", "k", {}))
+        journal.add(Entry("view b", "k", {}, [1.5, None]))
+    whole = (tmp_path / schema.JOURNAL).read_bytes()
+    assert whole.count(b"[1.5, null]") == 1
+    (tmp_path / schema.JOURNAL).write_bytes(whole.replace(b"[1.5, null]", b"[1.6, null]"))
+    assert list(Journal(tmp_path).entries) == ["view a"]
+
+
 def test_a_key_covers_the_code_behind_a_task_and_no_other() -> None:
     view, spot = closure("phibench.datasets.build.view_task"), closure("phibench.datasets.build.spot_task")
     assert {"phibench.render.room.ambient", "phibench.scenes.camera", "phibench.datasets.store.layers"} <= view
