@@ -25,8 +25,6 @@ PRESENT = [page for page in PAGES if page not in HISTORY]
 MAX_WORDS = 25
 MAX_COLUMNS = 120
 MAX_TABLE_COLUMNS = 160
-# Written by a command from the texts of the code.
-GENERATED = {"datasets/RECIPE.md"}
 # Words of other places that no reader of the repository can look up.
 NOWHERE = re.compile(r"\b(DESIGN|HOUSE|BRIEF)\b|\berrata\.md\b")
 
@@ -134,7 +132,7 @@ def test_lines_are_short(page):
     assert not long, f"lines beyond {MAX_COLUMNS} columns: {long}"
 
 
-@pytest.mark.parametrize("page", sorted(set(PRESENT) - GENERATED))
+@pytest.mark.parametrize("page", PRESENT)
 def test_rows_of_tables_are_short(page):
     lines = enumerate(read(page).split("\n"), 1)
     long = [n for n, line in lines if in_table(line) and len(line) > MAX_TABLE_COLUMNS]
@@ -245,7 +243,7 @@ def test_the_examples_of_the_page_run(page, tiny_dataset, tmp_path, monkeypatch)
 
 
 def test_pages_that_are_excused_exist():
-    assert set(PAGES) >= HISTORY | GENERATED
+    assert set(PAGES) >= HISTORY
 
 
 def test_nothing_is_named_that_only_the_authors_have():

@@ -107,9 +107,7 @@ class RigTable(Table):
     blur_sigma_px: float | None = Field(
         default=None, ge=0.05, le=20.0, description="Gaussian optical blur besides defocus"
     )
-    laser_filter_response: Response | None = Field(
-        default=None, description="response of the filters R, G, B at the laser's line, relative to red"
-    )
+    laser_filter_response: Response | None = Field(default=None, description="R, G, B at the laser's line, over red")
     decentre_x_m: Decentre = Field(default=0.0, description="sphere centre off the camera's vertical, world x")
     decentre_y_m: Decentre = Field(default=0.0, description="sphere centre off the camera's vertical, world y")
     tilt_x_rad: Tilt = Field(default=0.0, description="camera turned about world x, the mirror stays")

@@ -70,9 +70,7 @@ class NoiseRow(Document):
     """Errors of phi_ray of one spot in one raw Bayer frame, preset `webcam`, 1/60 s (`render/room/noise_budget.py`)."""
 
     phi_sensor_rad: Number = described("rad", "standard deviation from photons and read noise, known shape and blur")
-    phi_render_rad: Number = described(
-        "rad", "what the ambient layer's own noise adds; at most a quarter, or a half, of the above"
-    )
+    phi_render_rad: Number = described("rad", "what the ambient layer's own noise adds, within the budget of `quality`")
 
 
 class SpotRow(Document):

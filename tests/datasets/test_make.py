@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 from helpers.inline_workers import make_inline
-from helpers.processes import SMALLEST, living, quiet, said, wait_for
+from helpers.processes import SMALLEST, left_of, quiet, said, wait_for
 from rich.console import Console
 
 from phibench.datasets import make
@@ -211,10 +211,7 @@ def test_control_c_in_the_middle_loses_nothing(tmp_path: Path) -> None:
         os.killpg(child.pid, signal.SIGINT)
         _, errors = child.communicate(timeout=60)
     assert errors.count("KeyboardInterrupt") == 1  # the parent's, and none of a worker
-    deadline = time.monotonic() + 20.0
-    while (left := living(child.pid)) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert left == []
+    assert left_of(child.pid) == []
     assert complete_but_unfinished(out) >= 1
 
 

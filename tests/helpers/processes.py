@@ -33,6 +33,14 @@ def living(group: int) -> list[str]:
     return found
 
 
+def left_of(group: int, seconds: float = 20.0) -> list[str]:
+    """Processes of a group that live on, after some time to end in."""
+    deadline = time.monotonic() + seconds
+    while (left := living(group)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    return left
+
+
 def processes_under(folder: Path) -> Iterator[int]:
     """Processes whose folder for temporary files lies in a folder, as that of every method's process does."""
     mark = os.fsencode(f"TMPDIR={folder}{os.sep}")

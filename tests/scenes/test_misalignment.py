@@ -152,6 +152,10 @@ def test_motions_of_a_rig_add_up() -> None:
 def test_a_motion_is_a_rotation_and_finite() -> None:
     with pytest.raises(SceneError, match="not a rotation"):
         Motion(rotation=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0)))
+    with pytest.raises(SceneError, match="not a rotation"):  # lengths and angles to 1e-9
+        Motion(rotation=((1.0 + 1e-8, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+    with pytest.raises(SceneError, match="not a rotation"):
+        Motion(rotation=((1.0, 1e-8, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
     with pytest.raises(SceneError, match="finite"):
         Motion((math.nan, 0.0, 0.0))
 

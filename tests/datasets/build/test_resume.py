@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from helpers.folders import contents, done
-from helpers.processes import SMALLEST, living, quiet, said
+from helpers.processes import SMALLEST, left_of, quiet, said
 
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
 from phibench.datasets.build.run_tasks import claimed
@@ -245,10 +245,7 @@ def kill_and_repeat(out: Path, kills: int, workers: int) -> int:
     with start(out, workers) as child:
         _, errors = child.communicate(timeout=300)
         assert child.returncode == 0, errors
-    deadline = time.monotonic() + 20.0
-    while (left := living(child.pid)) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert left == []
+    assert left_of(child.pid) == []
     return killed
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from helpers.folders import contents
-from helpers.processes import SMALLEST, living, quiet, said, wait_for
+from helpers.processes import SMALLEST, left_of, living, quiet, said, wait_for
 
 from phibench.datasets.build import workers
 from phibench.datasets.build.scheduler import schedule
@@ -104,10 +104,7 @@ def test_workers_leave_when_their_parent_is_killed(tmp_path: Path) -> None:
         assert len(living(parent.pid)) >= 3
         parent.kill()
         parent.wait()
-    deadline = time.monotonic() + 20.0
-    while living(parent.pid) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert living(parent.pid) == []
+    assert left_of(parent.pid) == []
 
 
 HELD = """

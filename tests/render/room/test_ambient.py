@@ -14,6 +14,7 @@ from phibench.render.room.ambient import AmbientLayer, render_ambient
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
 from phibench.render.room.shading import cut, texel_count
 from phibench.scenes.catalog import default_rig, lab
+from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room, Uniform, cuboid, faces, rectangle
 
 ROOM, RIG = lab(TARGETS), default_rig()
@@ -182,3 +183,30 @@ def test_patches_tile_their_surfaces() -> None:
     assert centres.shape == (floor.count, 3)
     assert centres[0] == pytest.approx([-4.8 + 0.025, -4.6 + 0.025, 0.0])
     assert centres[1] - centres[0] == pytest.approx([0.05, 0.0, 0.0])  # rows run along local x
+
+
+def test_other_rooms_and_cameras_need_no_other_kernels() -> None:
+    """Compiling takes longer than a small view: kernels may depend on nothing that varies from view to view."""
+    few = BakeSettings(texel_m=0.5, lamp_rays=4, bounces=2, bounce_rays=8, final_rays=16)
+    bare = dataclasses.replace(ROOM, furniture=ROOM.furniture[:3])
+    camera = dataclasses.replace(RIG.camera, fx_px=1500.0, cx_px=600.0)
+    first = _kernels(few, ROOM, RIG)
+    assert len(first) >= 5
+    assert _kernels(dataclasses.replace(few, bounce_rays=12), bare, dataclasses.replace(RIG, camera=camera)) <= first
+    rough = dataclasses.replace(RIG, mirror=dataclasses.replace(RIG.mirror, roughness_alpha=0.01))
+    assert not _kernels(few, ROOM, rough) <= first  # the test can tell
+
+
+def _kernels(settings: BakeSettings, room: Room, rig: Rig) -> set[str]:
+    """Hashes of the kernels of a bake and of a part of a view."""
+    from phibench.render.setup.variant import activate
+
+    activate()
+    import drjit as dr
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        render_ambient(rig.at(0.3), room, bake(rig.at(0.0), room, settings), settings, 2, 1, (690, 430, 48, 48))
+        found = {str(kernel["hash"]) for kernel in dr.kernel_history([dr.KernelType.JIT])}
+        dr.kernel_history_clear()
+    return found

@@ -15,7 +15,7 @@ from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
-from phibench.render.room.noise_budget import BUDGET, _bayer, excess, noise_budget, phi_gradient, webcam
+from phibench.render.room.noise_budget import BUDGET, BUDGETS, _bayer, excess, noise_budget, phi_gradient, webcam
 from phibench.render.room.subpixel_grid import FilmGrid, golden_steps, shifts
 from phibench.render.setup.variant import activate
 from phibench.scenes.catalog import default_rig, lab
@@ -134,6 +134,15 @@ def test_every_pixel_in_the_mirror_keeps_its_budget(light: LightMap, repeated: t
 
 def _excess(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
     return excess(mean.astype(np.float32), variance.astype(np.float32), RIG.camera.blur_sigma_px)
+
+
+def test_training_quality_stops_at_its_own_budget(light: LightMap) -> None:
+    layer = render_ambient(VIEW, ROOM, light, SETTINGS, 2, 0, EDGES, budget=BUDGETS["training"])
+    worst = {
+        name: excess(layer.electrons_per_s, layer.variance_per_s2, RIG.camera.blur_sigma_px, budget).max()
+        for name, budget in BUDGETS.items()
+    }
+    assert worst["training"] <= 1.0 < worst["reference"]
 
 
 def test_refinement_does_not_shift_the_mean(light: LightMap, repeated: tuple[np.ndarray, np.ndarray]) -> None:
