@@ -1,7 +1,4 @@
-"""Room and robot: shapes with diffuse albedos, everything that light can hit except the mirror.
-
-Shapes are rectangles and cuboids. An albedo is an exact function of the position on a surface and has three values,
-one per ambient band (R, G, B); positions are metres from the surface's centre.
+"""Room and robot: everything that light can hit except the mirror.
 
 The robot is the ESCALADE360 as simple solids. The paper gives its overall dimensions, 0.90 x 0.53 x 0.30 m, and tracks
 with flippers after the PackBot; the split into body, tracks and flippers is ours. So are the mast that lifts the sensor
@@ -11,175 +8,18 @@ modelled.
 
 from __future__ import annotations
 
+import hashlib
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from phibench.scenes.frames import Array, Pose, Vector, as_vector, rotation_facing, rotation_xyz
+from phibench.scenes.frames import Pose, Vector, as_vector, rotation_xyz
 from phibench.scenes.rig import View
-from phibench.scenes.validation import SceneError, finite_vector, positive, within
-
-
-@dataclass(frozen=True)
-class Uniform:
-    """One albedo everywhere."""
-
-    albedo: Vector
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "albedo", check_albedo("Uniform", "albedo", self.albedo))
-
-    def evaluate(self, xy_m: Array) -> Array:
-        """Albedo, shape (..., 3), at positions (..., 2), metres."""
-        return np.broadcast_to(np.array(self.albedo), (*xy_m.shape[:-1], 3))
-
-
-@dataclass(frozen=True)
-class Checker:
-    """Checkerboard whose cells measure `cell_m` (x, y); a corner of four cells lies at the surface's corner (-x, -y).
-
-    A cell longer than the surface in one direction makes stripes.
-    """
-
-    albedo_even: Vector
-    albedo_odd: Vector
-    cell_m: Vector
-    origin_m: Vector
-
-    def __post_init__(self) -> None:
-        for name in ("albedo_even", "albedo_odd"):
-            object.__setattr__(self, name, check_albedo("Checker", name, getattr(self, name)))
-        for name in ("cell_m", "origin_m"):
-            object.__setattr__(self, name, finite_vector("Checker", name, getattr(self, name), 2))
-        for length in self.cell_m:
-            positive("Checker", "cell_m", length)
-
-    def evaluate(self, xy_m: Array) -> Array:
-        """Albedo, shape (..., 3), at positions (..., 2), metres."""
-        cells = np.floor((xy_m - np.array(self.origin_m)) / np.array(self.cell_m))
-        odd = np.mod(cells.sum(axis=-1), 2.0)[..., None] > 0.5
-        return np.where(odd, np.array(self.albedo_odd), np.array(self.albedo_even))
-
-
-Texture = Uniform | Checker
-
-
-def check_albedo(owner: str, name: str, albedo: Vector) -> Vector:
-    """Return three albedos in [0, 1], else raise `SceneError`."""
-    values = finite_vector(owner, name, albedo, 3)
-    for value in values:
-        within(owner, name, value, 0.0, 1.0)
-    return values
-
-
-# Shapes.
-
-_WHITE = Uniform((0.7, 0.7, 0.7))
-
-
-@dataclass(frozen=True)
-class Rectangle:
-    """One-sided-textured rectangle, centred at its pose; its z axis is the normal.
-
-    Parameters
-    ----------
-    name : str
-    T_world_shape : Pose
-    size_m : 2 floats
-        Full extent along the local x and y.
-    texture : Texture
-        Diffuse albedo.
-    radiance_w_m2_sr : 3 floats
-        Emitted radiance on the side of the normal, per ambient band; not 0 makes a lamp (its albedo is then 0).
-    """
-
-    name: str
-    T_world_shape: Pose
-    size_m: Vector
-    texture: Texture = _WHITE
-    radiance_w_m2_sr: Vector = (0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        _check_size(self, 2)
-        values = finite_vector(self.name, "radiance_w_m2_sr", self.radiance_w_m2_sr, 3)
-        object.__setattr__(self, "radiance_w_m2_sr", values)
-
-    @property
-    def emits(self) -> bool:
-        """True for a lamp that is switched on."""
-        return any(value > 0.0 for value in self.radiance_w_m2_sr)
-
-
-@dataclass(frozen=True)
-class Cuboid:
-    """Solid box, centred at its pose, full extents `size_m` along the local axes, one diffuse albedo."""
-
-    name: str
-    T_world_shape: Pose
-    size_m: Vector
-    texture: Uniform = field(default=_WHITE)
-
-    def __post_init__(self) -> None:
-        _check_size(self, 3)
-
-    def contains(self, point_world_m: Vector) -> bool:
-        """Return True for a world point strictly inside."""
-        local = self.T_world_shape.inverse().points(np.asarray(point_world_m, float))
-        return bool(np.all(np.abs(local) < 0.5 * np.array(self.size_m) - 1e-9))
-
-    def distance_m(self, point_world_m: Array) -> float:
-        """Distance of a world point from the solid, 0 inside."""
-        local = np.abs(self.T_world_shape.inverse().points(np.asarray(point_world_m, float)))
-        return float(np.linalg.norm(np.maximum(local - 0.5 * np.array(self.size_m), 0.0)))
-
-    def meets(self, other: Cuboid) -> bool:
-        """Return True if two boxes overlap: no axis separates them (of the faces, and the products of the edges)."""
-        a, b = self.T_world_shape.R, other.T_world_shape.R
-        axes = np.concatenate([a.T, b.T, np.cross(a.T[:, None], b.T[None]).reshape(-1, 3)])
-        reach = (np.abs(axes @ a) @ np.array(self.size_m) + np.abs(axes @ b) @ np.array(other.size_m)) / 2.0
-        return bool(np.all(np.abs(axes @ (self.T_world_shape.t - other.T_world_shape.t)) < reach + 1e-12))
-
-
-Shape = Rectangle | Cuboid
-
-
-def _check_size(shape: Rectangle | Cuboid, length: int) -> None:
-    size = finite_vector(shape.name, "size_m", shape.size_m, length)
-    for value in size:
-        positive(shape.name, "size_m", value)
-    object.__setattr__(shape, "size_m", size)
-
-
-def rectangle(name: str, centre_m: Vector, normal: Vector, size_m: Vector, **options: object) -> Rectangle:
-    """Rectangle at `centre_m` facing `normal`, its local y as near to world z as it can be."""
-    pose = Pose("world", "shape", centre_m, rotation_facing(normal))
-    return Rectangle(name, pose, size_m, **options)  # type: ignore[arg-type]
-
-
-def cuboid(name: str, centre_m: Vector, size_m: Vector, albedo: Vector, rotation: object = None) -> Cuboid:
-    """Cuboid at `centre_m` with one albedo; axis-aligned unless a rotation matrix is given."""
-    pose = Pose("world", "shape", centre_m) if rotation is None else Pose("world", "shape", centre_m, rotation)  # type: ignore[arg-type]
-    return Cuboid(name, pose, size_m, Uniform(albedo))
-
-
-def faces(shape: Shape) -> tuple[Rectangle, ...]:
-    """The shape's surface as rectangles: itself, or the six sides of a cuboid in the order +x -x +y -y +z -z."""
-    if isinstance(shape, Rectangle):
-        return (shape,)
-    return tuple(_side(shape, axis, sign) for axis in range(3) for sign in (1.0, -1.0))
-
-
-def _side(box: Cuboid, axis: int, sign: float) -> Rectangle:
-    normal = np.zeros(3)
-    normal[axis] = sign
-    local = Pose("shape", "side", as_vector(0.5 * box.size_m[axis] * normal), rotation_facing(as_vector(normal)))
-    lengths = np.abs(local.R.T) @ np.array(box.size_m)
-    pose = box.T_world_shape @ local
-    pose = Pose("world", "shape", pose.translation_m, pose.rotation)
-    name = f"{box.name}{'+-'[sign < 0.0]}{'xyz'[axis]}"
-    return Rectangle(name, pose, (float(lengths[0]), float(lengths[1])), box.texture)
-
+from phibench.scenes.shapes import Cuboid, Mesh, Rectangle, Shape, cuboid
+from phibench.scenes.textures import Uniform
+from phibench.scenes.validation import SceneError, finite_vector, unit_vector, within
 
 # The robot.
 
@@ -226,6 +66,33 @@ MIRROR_NAME = "mirror"
 
 
 @dataclass(frozen=True)
+class Sun:
+    """The sun, which shines through the windows (`Rectangle.window`) of a room.
+
+    Parameters
+    ----------
+    direction_world : 3 floats
+        Towards the sun; made a unit vector.
+    irradiance_w_m2 : 3 floats
+        Of a surface that faces the sun, per ambient band, behind the pane.
+    radius_rad : float
+        Angular radius of the disc.
+    """
+
+    direction_world: Vector
+    irradiance_w_m2: Vector
+    radius_rad: float = 0.00465
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "direction_world", unit_vector("Sun", "direction_world", self.direction_world))
+        values = finite_vector("Sun", "irradiance_w_m2", self.irradiance_w_m2, 3)
+        for value in values:
+            within("Sun", "irradiance_w_m2", value, 0.0, 1e6)
+        object.__setattr__(self, "irradiance_w_m2", values)
+        within("Sun", "radius_rad", self.radius_rad, 0.0, 0.1)
+
+
+@dataclass(frozen=True)
 class Room:
     """Surfaces, lamps and furniture, in the world frame, and whether the robot stands in it.
 
@@ -233,15 +100,17 @@ class Room:
     ----------
     name : str
     surfaces : rectangles; those that emit are the lamps
-    furniture : cuboids
+    furniture : shapes of any kind
     robot : bool
         Robot, mast and camera housing are part of the scene.
+    sun : Sun or None
     """
 
     name: str
     surfaces: tuple[Rectangle, ...]
-    furniture: tuple[Cuboid, ...] = ()
+    furniture: tuple[Shape, ...] = ()
     robot: bool = True
+    sun: Sun | None = None
 
     def __post_init__(self) -> None:
         shapes: tuple[Shape, ...] = (*self.surfaces, *self.furniture)
@@ -252,8 +121,13 @@ class Room:
 
     @property
     def lit(self) -> bool:
-        """True if any lamp is on."""
-        return any(surface.emits for surface in self.surfaces)
+        """True if any lamp or screen is on."""
+        return any(surface.shines for surface in (*self.surfaces, *self.furniture) if isinstance(surface, Rectangle))
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of all that the room is."""
+        return hashlib.sha256(repr(self).encode()).hexdigest()
 
     def shapes(self, view: View) -> tuple[Shape, ...]:
         """All shapes for one view; the index of a shape in this tuple is its object id, the same at every offset."""
@@ -271,4 +145,5 @@ class Room:
     def solid_around(self, point_world_m: tuple[float, ...]) -> str | None:
         """Name of the solid (furniture, robot) that a world point lies inside, or None."""
         solids = (*self.furniture, *(chassis() if self.robot else ()))
-        return next((solid.name for solid in solids if solid.contains(point_world_m)), None)
+        named = (solid for solid in solids if not isinstance(solid, Rectangle | Mesh))
+        return next((solid.name for solid in named if solid.contains(point_world_m)), None)

@@ -31,7 +31,8 @@ from phibench.render.room.light_map import ARRAYS, BakeSettings, LightMap, bake,
 from phibench.render.room.shading import cut, texel_count
 from phibench.render.setup.llvm_library import cache_root
 from phibench.scenes.rig import View
-from phibench.scenes.room import Rectangle, Room
+from phibench.scenes.room import Room
+from phibench.scenes.shapes import Rectangle
 
 LIMIT_MB = 1000.0
 """Limit of a cache that was given none; a room of the default settings has 2 MB."""

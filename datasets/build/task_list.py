@@ -56,7 +56,7 @@ class _Makers:
 
     def __init__(self, plan: Plan, versions: Mapping[str, Any]) -> None:
         self._plan, self._versions = plan, dict(versions)
-        self._room = _digest(to_json(plan.room))
+        self._room = plan.room.digest
         self._rigs = {name: _digest(to_json(rig)) for name, rig in plan.rigs.items()}
         self._spots = {name: to_json(spot) for name, spot in plan.spots.items()}
 

@@ -18,7 +18,8 @@ from phibench.scenes.catalog import BOARD_SIZE_M, Target, board
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import Rig, View
-from phibench.scenes.room import Cuboid, Rectangle, Room, Shape, carriage
+from phibench.scenes.room import Room, carriage
+from phibench.scenes.shapes import Cuboid, Rectangle, Shape
 
 _HOUSING_REACH_M = 0.1  # housing and mast stay within this of the lens
 
@@ -115,6 +116,7 @@ def _at(laser: LaserTable, shapes: Sequence[Shape], start: Array, direction: Arr
 
 def _normal(shape: Shape, point: Array) -> Array:
     """Outward normal of the face that a point on the surface lies on."""
+    assert isinstance(shape, Rectangle | Cuboid)
     pose = shape.T_world_shape
     if not isinstance(shape, Cuboid):
         return pose.R[:, 2]

@@ -81,7 +81,7 @@ def from_json(kind: type[T], document: Any) -> T:
     return value
 
 
-_LATER = {"form"}
+_LATER = {"form", "coat", "window", "sun"}
 """Fields that older versions do not have, whose default is what these versions meant: `mirror.form` in version 4."""
 _LARGEST = 1e12
 

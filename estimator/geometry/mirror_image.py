@@ -21,7 +21,7 @@ from phibench.estimator.geometry.reflection import reflect, reflect_jacobian
 from phibench.estimator.geometry.status import Status, StatusArray, first_fault, flag, keep, stroke_status
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig, View
-from phibench.scenes.room import Cuboid
+from phibench.scenes.shapes import Cuboid
 
 _BISECTIONS = 4  # the error of the start falls by R / distance in each
 _NEWTON_STEPS = 12

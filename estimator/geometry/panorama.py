@@ -27,7 +27,8 @@ from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.reflection import reflect
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, View
-from phibench.scenes.room import Room, Shape, faces
+from phibench.scenes.room import Room
+from phibench.scenes.shapes import Cuboid, Rectangle, Shape, faces
 from phibench.scenes.validation import nearest
 
 FAR_M = 1e9  # a far scene: 60 mm of mirror at this distance are 6e-11 rad
@@ -201,7 +202,7 @@ def vertical_edges(room: Room, names: tuple[str, ...]) -> Iterator[RoomEdge]:
     """Both upright edges of the faces of shapes, by name; of a solid, of the face that looks at the world's z axis."""
     shapes: tuple[Shape, ...] = (*room.surfaces, *room.furniture)
     for shape in shapes:
-        if shape.name not in names:
+        if shape.name not in names or not isinstance(shape, Rectangle | Cuboid):
             continue
         face = min(faces(shape), key=lambda each: float(np.dot(each.T_world_shape.R[:, 2], each.T_world_shape.t)))
         width, height = face.size_m

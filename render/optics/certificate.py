@@ -25,7 +25,7 @@ from phibench.render.optics.truth import SpotTruth
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
-from phibench.scenes.room import Shape
+from phibench.scenes.shapes import Shape
 
 # Both chief rays are exact up to rounding. Centroid and flux: five and six times what the fewest rays leave, below.
 CHIEF_TOLERANCE_PX = 1e-6

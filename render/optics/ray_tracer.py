@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from phibench.scenes.frames import Array
 from phibench.scenes.mirror import Form
 from phibench.scenes.rig import View
-from phibench.scenes.room import Cuboid, Shape
+from phibench.scenes.shapes import Cuboid, Rectangle, Shape
 
 Radius = Callable[[Array], Array]
 
@@ -281,6 +281,7 @@ def blocked_by(shapes: Sequence[Shape], starts_m: Array, ends_m: Array) -> IntAr
 
 def _hit(shape: Shape, origins: Array, directions: Array) -> Array:
     """Distance to one shape for rays of shape (3, N); inf where missed."""
+    assert isinstance(shape, Rectangle | Cuboid)
     pose = shape.T_world_shape
     offset = origins - pose.t[:, None]
     if shape.T_world_shape.rotation != _UPRIGHT:

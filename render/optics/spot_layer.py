@@ -25,7 +25,7 @@ from phibench.render.optics.spot_samples import FilmCloud, disc_points, film_pos
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
-from phibench.scenes.room import Shape
+from phibench.scenes.shapes import Shape
 
 _TAIL_SIGMAS = 6.5  # a Gaussian's flux beyond it is 8e-11
 _POINTS_AT_ONCE = 16384

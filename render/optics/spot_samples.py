@@ -31,7 +31,7 @@ from phibench.render.optics.reflection_point import bundle_spread, mirror_points
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
-from phibench.scenes.room import Shape
+from phibench.scenes.shapes import Shape
 
 Profile = Literal["uniform", "gaussian"]
 

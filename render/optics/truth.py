@@ -18,7 +18,7 @@ from phibench.render.optics.reflection_point import mirror_points
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View, limb_points
-from phibench.scenes.room import Shape
+from phibench.scenes.shapes import Shape
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,8 @@ from phibench.render.room.subpixel_grid import points, shifts
 from phibench.render.setup.variant import activate
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import View
-from phibench.scenes.room import Rectangle, Room, Shape, chassis
+from phibench.scenes.room import Room, chassis
+from phibench.scenes.shapes import Rectangle, Shape
 
 _LIFT_MM = 0.05  # rays start this far in front of their surface
 _LAMP_GAP_MM = 1.0  # and end this far in front of the lamp

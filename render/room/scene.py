@@ -23,7 +23,9 @@ from phibench.render.room.camera_plugin import MM_PER_M, sensor_dict
 from phibench.scenes.frames import Array, Vector
 from phibench.scenes.mirror import SphereMirror, deviation, level
 from phibench.scenes.rig import View
-from phibench.scenes.room import MIRROR_NAME, Checker, Cuboid, Rectangle, Room, Shape, Texture
+from phibench.scenes.room import MIRROR_NAME, Room
+from phibench.scenes.shapes import Cuboid, Rectangle, Shape
+from phibench.scenes.textures import Checker, Texture, Uniform
 
 _RINGS, _SPOKES = 450, 900  # 0.4 degrees apart
 
@@ -91,6 +93,7 @@ def shape_key(index: int) -> str:
 
 def shape_dict(mi: ModuleType, view: View, shape: Shape) -> dict[str, Any]:
     """One rectangle or cuboid with its diffuse material; lamps have albedo 0."""
+    assert isinstance(shape, Rectangle | Cuboid)
     half = [0.5 * MM_PER_M * length for length in shape.size_m]
     to_world = mi.ScalarTransform4f(_matrix(view, shape)) @ mi.ScalarTransform4f().scale([*half, 1.0][:3])
     kind = "cube" if isinstance(shape, Cuboid) else "rectangle"
@@ -128,8 +131,9 @@ def mirror_bsdf(mirror: SphereMirror, wavelengths_nm: Vector) -> dict[str, Any]:
 
 def texture_dict(mi: ModuleType, texture: Texture, size_m: Vector) -> dict[str, Any]:
     """Albedo as Mitsuba's rgb or checkerboard; a period of the latter is two cells."""
-    if not isinstance(texture, Checker):
+    if isinstance(texture, Uniform):
         return _rgb(texture.albedo)
+    assert isinstance(texture, Checker)
     # uv runs from 0 to 1 over the face, Mitsuba's pattern has the period 1
     scale = [0.5 * size_m[i] / texture.cell_m[i] for i in (0, 1)]
     shift = [-0.5 * (0.5 * size_m[i] + texture.origin_m[i]) / texture.cell_m[i] for i in (0, 1)]
@@ -143,7 +147,7 @@ def to_scene_mm(view: View, points_world_m: Array) -> Array:
     return MM_PER_M * (points_world_m - view.sphere_centre_m)
 
 
-def _matrix(view: View, shape: Shape) -> Array:
+def _matrix(view: View, shape: Rectangle | Cuboid) -> Array:
     matrix = np.eye(4)
     matrix[:3, :3] = shape.T_world_shape.R
     matrix[:3, 3] = to_scene_mm(view, shape.T_world_shape.t)

@@ -25,7 +25,9 @@ from phibench.render.room.camera_plugin import MM_PER_M, sensor_dict
 from phibench.render.room.scene import load_scene, mirror_dict, shape_dict
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import View
-from phibench.scenes.room import MIRROR_NAME, Checker, Rectangle, Shape, faces
+from phibench.scenes.room import MIRROR_NAME
+from phibench.scenes.shapes import Cuboid, Rectangle, Shape, faces
+from phibench.scenes.textures import Checker
 
 # Patches and their light map.
 
@@ -61,6 +63,7 @@ def cut(shapes: Sequence[Shape], texel_m: float) -> tuple[Patch, ...]:
     """Patches of all faces of the shapes, in order; the index of a patch is its id in the Mitsuba scene."""
     patches, start = [], 0
     for shape in shapes:
+        assert isinstance(shape, Rectangle | Cuboid)
         for surface in faces(shape):
             columns, rows = (max(2, math.ceil(length / texel_m)) for length in surface.size_m)
             patches.append(Patch(surface, columns, rows, start))

@@ -20,7 +20,9 @@ from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import HARMONICS, Form
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import POSITIONS, View
-from phibench.scenes.room import Room, Uniform, rectangle
+from phibench.scenes.room import Room
+from phibench.scenes.shapes import rectangle
+from phibench.scenes.textures import Uniform
 from phibench.scenes.validation import SceneError
 
 UNSEEN = ("no_reflection", "mirror_edge")

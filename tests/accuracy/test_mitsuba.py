@@ -26,7 +26,9 @@ from phibench.scenes.catalog import c310_camera, default_rig, lab
 from phibench.scenes.frames import Pose, rotation_facing, rotation_xyz
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import Rig, View
-from phibench.scenes.room import Checker, Room, Uniform, cuboid, rectangle
+from phibench.scenes.room import Room
+from phibench.scenes.shapes import cuboid, rectangle
+from phibench.scenes.textures import Checker, Uniform
 
 SHARP = 0.05  # px; the least blur that Camera allows
 TILTED = Rig(

@@ -233,7 +233,7 @@ def test_accuracy_of_a_spot_cut_by_an_edge() -> None:
     Pairs scatter like sqrt(f (1 - f) / N) < 1e-3 of the flux even if they were random.
     """
     from phibench.render.optics import spot_samples
-    from phibench.scenes.room import cuboid
+    from phibench.scenes.shapes import cuboid
 
     view, spot = default_rig().at(0.4), LaserSpot((2.0, 0.0, 0.5), (-1, 0, 0), 5e-3)
     rng, count, shares = np.random.default_rng(8), 2**19, []

@@ -317,7 +317,7 @@ def test_a_vanishing_form_is_the_sphere() -> None:
 
 def test_the_truth_layer_is_that_of_the_form() -> None:
     """Pixel by pixel the world point that the estimator's own ray through the pixel reaches; the sphere's is not."""
-    from phibench.scenes.room import cuboid
+    from phibench.scenes.shapes import cuboid
 
     rng = np.random.default_rng(9)
     view = random_view(rng, 3e-4)

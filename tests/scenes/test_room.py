@@ -12,7 +12,9 @@ from helpers.oracles import TARGETS, paper_cases, true_reflection
 from phibench.scenes.catalog import RIGS, ROOMS, Target, dark, lab
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.rig import Rig
-from phibench.scenes.room import Checker, Cuboid, Rectangle, Room, Uniform, chassis, cuboid, escalade360, rectangle
+from phibench.scenes.room import Room, chassis, escalade360
+from phibench.scenes.shapes import Cuboid, Rectangle, cuboid, rectangle
+from phibench.scenes.textures import Checker, Uniform
 from phibench.scenes.validation import SceneError
 
 NAN, INF = math.nan, math.inf

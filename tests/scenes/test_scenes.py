@@ -15,7 +15,7 @@ from phibench.scenes.frames import Pose, rotation_facing, rotation_xyz
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
 from phibench.scenes.mirror import STEEL, SphereMirror
 from phibench.scenes.rig import POSITIONS, Rig, Stroke
-from phibench.scenes.room import Uniform
+from phibench.scenes.textures import Uniform
 from phibench.scenes.validation import SceneError
 
 NAN, INF = math.nan, math.inf

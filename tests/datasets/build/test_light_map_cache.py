@@ -20,7 +20,8 @@ from phibench.estimator.cli.main import main
 from phibench.render.room.light_map import BakeSettings, LightMap, fixed_shapes
 from phibench.render.room.shading import cut, texel_count
 from phibench.scenes.catalog import default_rig
-from phibench.scenes.room import Room, rectangle
+from phibench.scenes.room import Room
+from phibench.scenes.shapes import rectangle
 
 VIEW = default_rig().at(0.0)
 LAMP = dataclasses.replace(rectangle("lamp", (0, 0, 2), (0, 0, -1), (0.5, 0.5)), radiance_w_m2_sr=(1.0, 1.0, 0.5))

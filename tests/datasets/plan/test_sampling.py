@@ -22,7 +22,7 @@ from phibench.render.optics.ray_tracer import blocked_by
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.catalog import X_HIGH, X_LOW, Y_HIGH, Y_LOW
 from phibench.scenes.rig import POSITIONS
-from phibench.scenes.room import Cuboid
+from phibench.scenes.shapes import Cuboid
 
 
 def plan(**values: Any) -> Plan:

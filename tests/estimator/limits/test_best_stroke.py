@@ -48,7 +48,8 @@ from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
-from phibench.scenes.room import Cuboid, escalade360
+from phibench.scenes.room import escalade360
+from phibench.scenes.shapes import Cuboid
 
 RIG = Rig()
 P = len(PARAMETERS)

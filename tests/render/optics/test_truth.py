@@ -11,7 +11,7 @@ from phibench.render.optics.truth import spot_truth, truth_layer
 from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import Misalignment
-from phibench.scenes.room import rectangle
+from phibench.scenes.shapes import rectangle
 
 
 def test_depth_counts_from_the_mirrors_place_when_down() -> None:

@@ -15,7 +15,9 @@ from phibench.render.room.light_map import BakeSettings, LightMap, bake
 from phibench.render.room.shading import cut, texel_count
 from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.rig import Rig
-from phibench.scenes.room import Room, Uniform, cuboid, faces, rectangle
+from phibench.scenes.room import Room
+from phibench.scenes.shapes import cuboid, faces, rectangle
+from phibench.scenes.textures import Uniform
 
 ROOM, RIG = lab(TARGETS), default_rig()
 SETTINGS = BakeSettings(lamp_rays=32, bounce_rays=16, final_rays=256)

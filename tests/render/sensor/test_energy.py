@@ -24,7 +24,8 @@ from phibench.render.sensor.settings import sensor
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
-from phibench.scenes.room import Room, cuboid, rectangle
+from phibench.scenes.room import Room
+from phibench.scenes.shapes import cuboid, rectangle
 
 STREAM = NoiseStream(("energy", 0))
 SEED_OF_PHOTONS = 650e-9 / (6.62607015e-34 * 299792458.0)  # photons in a joule at 650 nm

@@ -1,0 +1,268 @@
+"""Faces of shapes as arrays: planes with their own coordinates, and the triangles that fill them.
+
+A patch is a plane face: a rectangle, the end of a prism, a triangle of a mesh. Its local coordinates are metres from
+its centre along two unit axes; its size is that of the rectangle around it. Triangles name the patch that they lie on.
+Ray tracers, light maps and the renderer read this one table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.scenes.frames import Array
+from phibench.scenes.shapes import Cuboid, Mesh, Prism, Rectangle, Shape, faces
+from phibench.scenes.textures import Bitmap, Checker, Texture
+
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class FaceTable:
+    """P patches and T triangles of some shapes, world frame.
+
+    Attributes
+    ----------
+    centre_m, x_axis, y_axis : arrays, shape (P, 3)
+        Middle of the rectangle around a patch and its unit axes; the normal is their cross product.
+    size_m : array, shape (P, 2)
+    shape : int array, shape (P,)
+        Index of the shape.
+    texture : int array, shape (P,)
+        Index in `textures`.
+    textures : tuple of textures
+    texels : array, shape (P, 2, 3)
+        Place on the texture (column, row) of a local position (x, y, 1): cells of a checker, texels of a bitmap.
+    radiance_w_m2_sr : array, shape (P, 3)
+        Of lamps.
+    coat : array, shape (P,)
+    two_sided, window : bool arrays, shape (P,)
+    corners_m : array, shape (T, 3, 3)
+    patch : int array, shape (T,)
+        Patch of each triangle; the triangles of a patch follow each other, in the order of the patches.
+    """
+
+    centre_m: Array
+    x_axis: Array
+    y_axis: Array
+    size_m: Array
+    shape: IntArray
+    texture: IntArray
+    textures: tuple[Texture, ...]
+    texels: Array
+    radiance_w_m2_sr: Array
+    coat: Array
+    two_sided: NDArray[np.bool_]
+    window: NDArray[np.bool_]
+    corners_m: Array
+    patch: IntArray
+
+    @cached_property
+    def normal(self) -> Array:
+        """Unit normals of the patches, shape (P, 3)."""
+        return np.cross(self.x_axis, self.y_axis)
+
+    @property
+    def emits(self) -> NDArray[np.bool_]:
+        """Patches that are lamps, shape (P,)."""
+        return np.asarray((self.radiance_w_m2_sr > 0.0).any(axis=1))
+
+    @cached_property
+    def is_radiance(self) -> NDArray[np.bool_]:
+        """Patches whose texture is their own light, shape (P,)."""
+        shining = [isinstance(texture, Bitmap) and texture.is_radiance for texture in self.textures]
+        return np.array(shining, dtype=bool)[self.texture]
+
+    def local_m(self, patch: IntArray, points_m: Array) -> Array:
+        """Local coordinates, shape (N, 2), of world points (N, 3) on patches (N,)."""
+        offset = points_m - self.centre_m[patch]
+        return np.stack([np.einsum("ni,ni->n", offset, axis[patch]) for axis in (self.x_axis, self.y_axis)], axis=-1)
+
+    def laser_albedo(self, patch: IntArray, points_m: Array) -> Array:
+        """Albedo at the laser's wavelength, shape (N,), of world points (N, 3) on patches (N,)."""
+        local = np.concatenate([self.local_m(patch, points_m), np.ones((len(patch), 1))], axis=-1)
+        place = np.einsum("nij,nj->ni", self.texels[patch], local)
+        albedo = np.zeros(len(patch))
+        for number in np.unique(self.texture[patch]):
+            mine = self.texture[patch] == number
+            albedo[mine] = _laser_albedo(self.textures[number], place[mine])
+        return np.where(self.emits[patch] | self.is_radiance[patch], 0.0, albedo)
+
+
+def _laser_albedo(texture: Texture, place: Array) -> Array:
+    """Laser albedo at places in the texture's own units (cells or texels)."""
+    if isinstance(texture, Checker):
+        odd = np.mod(np.floor(place).sum(axis=-1), 2.0) > 0.5
+        return np.where(odd, texture.albedo_odd[0], texture.albedo_even[0])
+    if isinstance(texture, Bitmap):
+        return texture.laser_albedo(place * np.array(texture.texel_m) + np.array(texture.origin_m))
+    return texture.laser_albedo(place)
+
+
+def face_table(shapes: Sequence[Shape]) -> FaceTable:
+    """All faces of some shapes, in their order; the sides of a solid as in `shapes.faces`, those of a prism around."""
+    textures: dict[int, int] = {}
+    kept: list[Texture] = []
+    parts = []
+    for index, shape in enumerate(shapes):
+        key = id(shape.texture)  # comparing contents would take longer than it saves
+        if key not in textures:
+            textures[key] = len(kept)
+            kept.append(shape.texture)
+        parts.append(_part(shape, index, textures[key]))
+    if not parts:
+        parts.append(_Part.empty())
+    counts = np.cumsum([0, *(len(part.size_m) for part in parts[:-1])])
+    columns = [np.concatenate([getattr(part, name) for part in parts]) for name in _PATCH_COLUMNS]
+    corners = np.concatenate([part.corners_m for part in parts])
+    patch = np.concatenate([part.patch + first for part, first in zip(parts, counts, strict=True)])
+    centre, x, y, size, shape_index, texture, texels, radiance, coat, two_sided, window = columns
+    return FaceTable(
+        *(centre, x, y, size, shape_index, texture, tuple(kept), texels, radiance, coat, two_sided, window),
+        corners_m=corners,
+        patch=patch,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Patches and triangles of one shape, patches numbered from 0; attributes as in `FaceTable`."""
+
+    centre_m: Array
+    x_axis: Array
+    y_axis: Array
+    size_m: Array
+    shape: IntArray
+    texture: IntArray
+    texels: Array
+    radiance_w_m2_sr: Array
+    coat: Array
+    two_sided: NDArray[np.bool_]
+    window: NDArray[np.bool_]
+    corners_m: Array
+    patch: IntArray
+
+    @staticmethod
+    def empty() -> _Part:
+        n3, none = np.empty((0, 3)), np.empty(0, dtype=np.int64)
+        flags = np.empty(0, dtype=bool)
+        return _Part(
+            *(n3, n3, n3, np.empty((0, 2)), none, none, np.empty((0, 2, 3)), n3, np.empty(0), flags, flags),
+            np.empty((0, 3, 3)),
+            none,
+        )
+
+
+_PATCH_COLUMNS = tuple(_Part.__dataclass_fields__)[:-2]
+
+
+def _part(shape: Shape, index: int, texture: int) -> _Part:
+    if isinstance(shape, Mesh):
+        centre, x, y, size, texels, corners, patch = _mesh_faces(shape)
+    elif isinstance(shape, Prism):
+        centre, x, y, size, texels, corners, patch = _prism_faces(shape)
+    else:
+        centre, x, y, size, texels, corners, patch = _flat_faces(shape)
+    count = len(size)
+    radiance = shape.radiance_w_m2_sr if isinstance(shape, Rectangle) else (0.0, 0.0, 0.0)
+    return _Part(
+        *(centre, x, y, size, np.full(count, index), np.full(count, texture), texels),
+        radiance_w_m2_sr=np.tile(np.array(radiance, dtype=float), (count, 1)),
+        coat=np.full(count, shape.coat),
+        two_sided=np.full(count, isinstance(shape, Mesh) and shape.two_sided),
+        window=np.full(count, isinstance(shape, Rectangle) and shape.window),
+        corners_m=corners,
+        patch=patch,
+    )
+
+
+_Faces = tuple[Array, Array, Array, Array, Array, Array, IntArray]
+_SQUARE = 0.5 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+_HALVES = np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def _flat_faces(shape: Rectangle | Cuboid) -> _Faces:
+    sides = faces(shape)
+    frames = [(side.T_world_shape.t, side.T_world_shape.R) for side in sides]
+    centre, axes = np.array([t for t, _ in frames]), np.array([R for _, R in frames])
+    size = np.array([side.size_m for side in sides])
+    texels = np.tile(_metric(shape.texture), (len(sides), 1, 1))
+    return _rectangles(centre, axes[:, :, 0], axes[:, :, 1], size, texels)
+
+
+def _rectangles(centre: Array, x: Array, y: Array, size: Array, texels: Array) -> _Faces:
+    """Two triangles for each."""
+    place = _SQUARE * size[:, None]
+    corners = centre[:, None] + place[..., :1] * x[:, None] + place[..., 1:] * y[:, None]
+    return centre, x, y, size, texels, corners[:, _HALVES].reshape(-1, 3, 3), np.repeat(np.arange(len(size)), 2)
+
+
+def _metric(texture: Texture) -> Array:
+    """Place on a texture of local metres, shape (2, 3)."""
+    if isinstance(texture, Checker):
+        step, origin = np.array(texture.cell_m), np.array(texture.origin_m)
+    elif isinstance(texture, Bitmap):
+        step, origin = np.array(texture.texel_m), np.array(texture.origin_m)
+    else:
+        return np.zeros((2, 3))
+    return np.concatenate([np.diag(1.0 / step), (-origin / step)[:, None]], axis=1)
+
+
+def _prism_faces(shape: Prism) -> _Faces:
+    pose, base, n = shape.T_world_shape, shape.corners_m(), shape.sides
+    ends, half = np.roll(base, -1, axis=0), 0.5 * shape.height_m
+    chord = ends - base
+    width = np.linalg.norm(chord, axis=1)
+    middle = np.concatenate([0.5 * (base + ends), np.zeros((n, 1))], axis=1)
+    across = np.concatenate([chord / width[:, None], np.zeros((n, 1))], axis=1)
+    metric = _metric(shape.texture)
+    around = np.tile(metric, (n, 1, 1))  # x runs on from side to side
+    around[:, :, 2] += metric[:, 0] * (width * (np.arange(n) + 0.5))[:, None]
+    size = np.stack([width, np.full(n, shape.height_m)], axis=1)
+    up = np.tile([0.0, 0.0, 1.0], (n, 1))
+    sides = _rectangles(pose.points(middle), pose.directions(across), pose.directions(up), size, around)
+    corners, patches = [sides[5]], [sides[6]]
+    frames = []
+    for number, (sign, ring) in enumerate(((1.0, base), (-1.0, base[::-1]))):
+        rim = np.concatenate([ring, np.full((n, 1), sign * half)], axis=1)
+        centre = np.array([0.0, 0.0, sign * half])
+        fan = np.stack([np.broadcast_to(centre, rim.shape), rim, np.roll(rim, -1, axis=0)], axis=1)
+        corners.append(pose.points(fan.reshape(-1, 3)).reshape(-1, 3, 3))
+        patches.append(np.full(n, n + number))
+        frames.append((centre, np.array([1.0, 0.0, 0.0]), np.array([0.0, sign, 0.0])))
+    centres, x, y = (np.array([frame[i] for frame in frames]) for i in range(3))
+    return (
+        np.concatenate([sides[0], pose.points(centres)]),
+        np.concatenate([sides[1], pose.directions(x)]),
+        np.concatenate([sides[2], pose.directions(y)]),
+        np.concatenate([sides[3], np.full((2, 2), 2.0 * shape.radius_m)]),
+        np.concatenate([sides[4], np.tile(metric, (2, 1, 1))]),
+        np.concatenate(corners),
+        np.concatenate(patches),
+    )
+
+
+def _mesh_faces(shape: Mesh) -> _Faces:
+    """A patch for each triangle; x lies along its first side. Triangles without an area are left out."""
+    corners = shape.vertices_m[shape.triangles]
+    along, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(along, other)
+    double_area, length = np.linalg.norm(normal, axis=1), np.linalg.norm(along, axis=1)
+    whole = double_area > 1e-12 * np.maximum(length, np.linalg.norm(other, axis=1)) ** 2
+    corners, along, normal = corners[whole], along[whole], normal[whole]
+    x = along / length[whole, None]
+    y = np.cross(normal / double_area[whole, None], x)
+    local = np.stack([np.einsum("nki,ni->nk", corners - corners[:, :1], axis) for axis in (x, y)], axis=-1)
+    low, high = local.min(axis=1), local.max(axis=1)
+    middle = 0.5 * (low + high)
+    centre = corners[:, 0] + middle[:, :1] * x + middle[:, 1:] * y
+    texels = np.zeros((len(corners), 2, 3))
+    if isinstance(shape.texture, Bitmap):
+        place = np.concatenate([local - middle[:, None], np.ones((*local.shape[:2], 1))], axis=-1)
+        assert shape.corner_texels is not None
+        texels = np.swapaxes(np.linalg.solve(place, shape.corner_texels[whole]), 1, 2)
+    return centre, x, y, high - low, texels, corners, np.arange(len(corners))
