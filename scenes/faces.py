@@ -83,14 +83,17 @@ class FaceTable:
         return np.stack([np.einsum("ni,ni->n", offset, axis[patch]) for axis in (self.x_axis, self.y_axis)], axis=-1)
 
     def laser_albedo(self, patch: IntArray, points_m: Array) -> Array:
-        """Albedo at the laser's wavelength, shape (N,), of world points (N, 3) on patches (N,)."""
+        """Albedo at the laser's wavelength, shape (N,), of world points (N, 3) on patches (N,); 0 on a lamp.
+
+        A surface that shines by its texture has the albedo of its bitmap: a photographed wall carries a spot.
+        """
         local = np.concatenate([self.local_m(patch, points_m), np.ones((len(patch), 1))], axis=-1)
         place = np.einsum("nij,nj->ni", self.texels[patch], local)
         albedo = np.zeros(len(patch))
         for number in np.unique(self.texture[patch]):
             mine = self.texture[patch] == number
             albedo[mine] = _laser_albedo(self.textures[number], place[mine])
-        return np.where(self.emits[patch] | self.is_radiance[patch], 0.0, albedo)
+        return np.where(self.emits[patch], 0.0, albedo)
 
 
 def _laser_albedo(texture: Texture, place: Array) -> Array:

@@ -17,7 +17,7 @@ import numpy as np
 
 from phibench.scenes.frames import Pose, Vector, as_vector, rotation_xyz
 from phibench.scenes.rig import View
-from phibench.scenes.shapes import Cuboid, Mesh, Rectangle, Shape, cuboid
+from phibench.scenes.shapes import Cuboid, Mesh, Rectangle, Shape, cuboid, shines
 from phibench.scenes.textures import Uniform
 from phibench.scenes.validation import SceneError, finite_vector, unit_vector, within
 
@@ -122,7 +122,7 @@ class Room:
     @property
     def lit(self) -> bool:
         """True if any lamp or screen is on."""
-        return any(surface.shines for surface in (*self.surfaces, *self.furniture) if isinstance(surface, Rectangle))
+        return any(shines(shape) for shape in (*self.surfaces, *self.furniture))
 
     @cached_property
     def digest(self) -> str:

@@ -61,11 +61,6 @@ class Rectangle:
         """True for a lamp that is switched on."""
         return any(value > 0.0 for value in self.radiance_w_m2_sr)
 
-    @property
-    def shines(self) -> bool:
-        """True for what sends out light of its own: a lamp, a screen, a wall of a photographed room."""
-        return self.emits or (isinstance(self.texture, Bitmap) and self.texture.is_radiance)
-
 
 @dataclass(frozen=True)
 class Cuboid:
@@ -226,6 +221,12 @@ class Mesh:
 
 
 Shape = Rectangle | Cuboid | Prism | Mesh
+
+
+def shines(shape: Shape) -> bool:
+    """Return True for what sends out light of its own: a lamp, a screen, a wall of a photographed room."""
+    by_texture = isinstance(shape.texture, Bitmap) and shape.texture.is_radiance
+    return by_texture or (isinstance(shape, Rectangle) and shape.emits)
 
 
 def _check_size(shape: Rectangle | Cuboid, length: int) -> None:

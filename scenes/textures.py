@@ -84,13 +84,14 @@ class Bitmap:
     Parameters
     ----------
     values : array, shape (rows, columns, 4), float32
-        Bands R, G, B and the laser's wavelength. Albedo in [0, 1]; radiance in W/(m^2 sr) where `is_radiance`.
+        Albedo in the bands R, G, B and at the laser's wavelength, in [0, 1]. Where `is_radiance` the bands are radiance
+        in W/(m^2 sr); the fourth value stays an albedo: 0 on a screen, that of the wall in a photographed room.
     texel_m : 2 floats
         Size of a texel along the surface's x (columns) and y (rows, the first one at the bottom).
     origin_m : 2 floats
         Place of the first texel's lower left corner on the surface.
     is_radiance : bool
-        The surface sends this light out and reflects none: a screen, or a wall of a photographed room.
+        The surface sends this light out and reflects none but the laser's: a screen, or a wall of a photographed room.
     """
 
     values: NDArray[np.float32]
@@ -102,8 +103,9 @@ class Bitmap:
         values = np.ascontiguousarray(self.values, dtype=np.float32)
         if values.ndim != 3 or values.shape[2] != 4 or 0 in values.shape:
             raise SceneError(f"Bitmap.values: shape {values.shape}: must be (rows, columns, 4) with at least one texel")
-        if not np.isfinite(values).all() or values.min() < 0.0 or (not self.is_radiance and values.max() > 1.0):
-            limits = "0 or more" if self.is_radiance else "albedos from 0 to 1"
+        albedos = values[..., 3] if self.is_radiance else values
+        if not np.isfinite(values).all() or values.min() < 0.0 or albedos.max() > 1.0:
+            limits = "0 or more, the laser's albedo up to 1" if self.is_radiance else "albedos from 0 to 1"
             raise SceneError(f"Bitmap.values: must be finite, {limits}")
         values.flags.writeable = False
         object.__setattr__(self, "values", values)
@@ -149,7 +151,7 @@ class Bitmap:
         return self.sample(xy_m)[..., :3]
 
     def laser_albedo(self, xy_m: Array) -> Array:
-        """Albedo at the laser's wavelength, shape (...); of a surface that shines, what was given for it."""
+        """Albedo at the laser's wavelength, shape (...), at positions (..., 2)."""
         return self.sample(xy_m)[..., 3]
 
 

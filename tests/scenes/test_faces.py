@@ -83,6 +83,19 @@ def test_laser_albedo_is_that_of_the_texture():
     np.testing.assert_allclose(table.laser_albedo(patch, points), np.array(expected, float), atol=1e-12)
 
 
+def test_photographed_walls_carry_a_spot_and_lamps_do_not():
+    """The bitmap's fourth value decides on what shines: 0 makes a screen. A lamp has none, whatever its texture."""
+    values = np.ones((2, 2, 4)) * [3.0, 2.0, 1.0, 0.4]
+    photographed, screen = (Bitmap(values * [1, 1, 1, part], (0.1, 0.1), is_radiance=True) for part in (1.0, 0.0))
+    walls = [
+        rectangle("wall", (0.0, 0.0, 1.0), (0.0, 0.0, 1.0), (0.4, 0.4), texture=photographed),
+        rectangle("screen", (0.0, 0.0, 2.0), (0.0, 0.0, 1.0), (0.4, 0.4), texture=screen),
+        rectangle("lamp", (0.0, 0.0, 3.0), (0.0, 0.0, 1.0), (0.4, 0.4), radiance_w_m2_sr=(1.0, 1.0, 1.0)),
+    ]
+    table = face_table(walls)
+    np.testing.assert_allclose(table.laser_albedo(np.arange(3), table.centre_m), [0.4, 0.0, 0.0], atol=1e-7)
+
+
 def test_bitmap_repeats_and_meets_its_texels():
     values = np.random.default_rng(2).random((3, 4, 4)).astype(np.float32)
     bitmap = Bitmap(values, (0.1, 0.2), (0.05, 0.0))
@@ -98,3 +111,9 @@ def test_bitmap_repeats_and_meets_its_texels():
 def test_impossible_bitmaps_are_refused(values, word):
     with pytest.raises(SceneError, match=word):
         Bitmap(values, (0.1, 0.1))
+
+
+def test_radiance_may_be_above_1_and_the_lasers_albedo_not():
+    assert Bitmap([[[5.0, 5.0, 5.0, 1.0]]], (0.1, 0.1), is_radiance=True).values.max() == 5.0
+    with pytest.raises(SceneError, match="laser's albedo up to 1"):
+        Bitmap([[[5.0, 5.0, 5.0, 1.5]]], (0.1, 0.1), is_radiance=True)

@@ -14,7 +14,7 @@ from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room, chassis, escalade360
 from phibench.scenes.shapes import Cuboid, Rectangle, cuboid, rectangle
-from phibench.scenes.textures import Checker, Uniform
+from phibench.scenes.textures import Bitmap, Checker, Uniform
 from phibench.scenes.validation import SceneError
 
 NAN, INF = math.nan, math.inf
@@ -54,6 +54,14 @@ def test_dark_room_is_the_lab_without_light():
     assert any(surface.emits for surface in lab().surfaces)
     assert not any(surface.emits for surface in dark().surfaces)
     assert [s.name for s in dark().surfaces] == [s.name for s in lab().surfaces]
+
+
+def test_a_room_is_lit_by_lamps_and_by_textures_that_shine():
+    glow = Bitmap(np.ones((1, 1, 4)), (1.0, 1.0), is_radiance=True)
+    plain = cuboid("box", (2.0, 0.0, 0.5), (0.4, 0.4, 0.4), (0.5, 0.5, 0.5))
+    assert lab().lit
+    assert not Room("r", (), (plain,)).lit
+    assert Room("r", (), (plain, cuboid("sign", (0.0, 2.0, 0.5), (0.4, 0.4, 0.4), glow))).lit
 
 
 def test_board_faces_carry_the_spots():
