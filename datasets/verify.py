@@ -37,9 +37,8 @@ from phibench.datasets.store.layers import (
     read_truth,
 )
 from phibench.datasets.store.schema import ManifestRow, PoseInfo, SpotRow
-from phibench.render.room.light_map import fixed_shapes
+from phibench.render.room.light_map import texel_count
 from phibench.render.room.noise_budget import BUDGETS
-from phibench.render.room.shading import cut, texel_count
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import POSITIONS, View
 from phibench.scenes.room import Room
@@ -281,7 +280,7 @@ def _ambient_faults(dataset: Dataset, pose: PoseInfo, shape: tuple[int, int]) ->
 
 def _light_map_faults(dataset: Dataset) -> Iterator[str]:
     light = read_light_map(dataset.folder)
-    texels = texel_count(cut(fixed_shapes(dataset.room), dataset.recipe.ambient.texel_m))
+    texels = texel_count(dataset.room, dataset.recipe.ambient.texel_m)
     shapes = {"irradiance_w_m2": (texels, 3), "sigma_w_m2": (texels, 3), "covered": (texels,)}
     for name, shape in shapes.items():
         array = getattr(light, name)

@@ -23,8 +23,7 @@ from phibench.datasets.build.scheduler import Executor, Outcome
 from phibench.datasets.build.tasks import Done, Task
 from phibench.datasets.plan.plan import PairPlan, Plan
 from phibench.render.optics.truth import SpotTruth, depth_m, spot_truth
-from phibench.render.room.light_map import fixed_shapes
-from phibench.render.room.shading import cut, texel_count
+from phibench.render.room.light_map import texel_count
 from phibench.scenes.rig import POSITIONS
 
 # Seconds.
@@ -116,7 +115,7 @@ def _bake_s(plan: Plan) -> float:
 
 
 def _texels(plan: Plan) -> int:
-    return texel_count(cut(fixed_shapes(plan.room), plan.recipe.ambient.texel_m))
+    return texel_count(plan.room, plan.recipe.ambient.texel_m)
 
 
 def megabytes(count: int) -> str:

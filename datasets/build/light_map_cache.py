@@ -27,8 +27,7 @@ from phibench.datasets.input_files import InputFile
 from phibench.datasets.store.files import write_bytes, write_text
 from phibench.datasets.store.leftovers import remove_leftovers
 from phibench.datasets.store.provenance import code_behind
-from phibench.render.room.light_map import ARRAYS, BakeSettings, LightMap, bake, encoded, fixed_shapes
-from phibench.render.room.shading import cut, texel_count
+from phibench.render.room.light_map import ARRAYS, BakeSettings, LightMap, bake, encoded, fixed_shapes, texel_count
 from phibench.render.setup.llvm_library import cache_root
 from phibench.scenes.rig import View
 from phibench.scenes.room import Room
@@ -82,7 +81,7 @@ def is_cached(view: View, room: Room, settings: BakeSettings, folder: Path | Non
 
 def is_sound(light: LightMap, room: Room, settings: BakeSettings) -> bool:
     """Tell whether a light map has the texels of a room, and irradiances that its lamps can give."""
-    texels = texel_count(cut(fixed_shapes(room), settings.texel_m))
+    texels = texel_count(room, settings.texel_m)
     shapes = [array.shape for array in (light.irradiance_w_m2, light.sigma_w_m2, light.covered)]
     types = [array.dtype for array in (light.irradiance_w_m2, light.sigma_w_m2, light.covered)]
     if shapes != [(texels, 3), (texels, 3), (texels,)] or types != [np.float32, np.float32, np.bool_]:

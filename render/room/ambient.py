@@ -18,10 +18,13 @@ from numpy.typing import NDArray
 from phibench.render.room.light_map import BakeSettings, LightMap, fixed_shapes, light_carriage
 from phibench.render.room.noise_budget import BUDGET
 from phibench.render.room.refinement import first_pass, refine
-from phibench.render.room.shading import Surfaces, cut, texel_count
+from phibench.render.room.shading import Look
 from phibench.render.room.subpixel_grid import Crop, Film, FilmGrid, Stack
+from phibench.render.room.surfaces import Surfaces
+from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera
+from phibench.scenes.faces import face_table
 from phibench.scenes.rig import View
 from phibench.scenes.room import Room
 
@@ -86,12 +89,12 @@ def render_ambient(
 
     camera = view.rig.camera
     window = crop or (0, 0, camera.width_px, camera.height_px)
-    shapes = room.shapes(view)
-    surfaces = Surfaces(mi, view, cut(shapes, settings.texel_m), camera=True)
-    fixed = texel_count(cut(fixed_shapes(room), settings.texel_m))
-    light_carriage(surfaces, shapes, fixed, light.irradiance_w_m2, settings)
+    table = face_table(room.shapes(view))
+    surfaces = Surfaces(mi, view, table)
+    fixed = int(np.searchsorted(table.shape, len(fixed_shapes(room))))
+    light_carriage(surfaces, TexelGrid.of(table, settings.texel_m), fixed, light.irradiance_w_m2, settings)
     grid = FilmGrid.of(camera, cells_per_pixel)
-    film = Film(mi, surfaces, grid, seed)
+    film = Film(mi, Look(mi, surfaces), grid, seed)
     layers = [_band(film, band, window, rounds, budget) for band in _bands(grid, window)]
     dr.flush_kernel_cache()  # other mirrors need other kernels; those of the next view are read from Dr.Jit's own cache
     return AmbientLayer(*(np.concatenate([pair[i] for pair in layers], axis=1) for i in (0, 1)))

@@ -91,13 +91,13 @@ def _register(mi: ModuleType) -> None:
             u = mi.Float64(position_sample.x) * size.x + offset.x - 0.5 + mi.Float64(blur.x) * sigma
             v = mi.Float64(position_sample.y) * size.y + offset.y - 0.5 + mi.Float64(blur.y) * sigma
             lens = mi.warp.square_to_uniform_disk_concentric(aperture_sample)
-            ray, weight = self.film_ray(u, v, lens)  # type: ignore[no-untyped-call]
-            return mi.RayDifferential3f(ray.o, ray.d, time, mi.Color0f()), weight
+            origin, direction, weight = self.film_ray(u, v, lens)  # type: ignore[no-untyped-call]
+            return mi.RayDifferential3f(mi.Point3f(origin), mi.Vector3f(direction), time, mi.Color0f()), weight
 
         def film_ray(self, u, v, lens):  # type: ignore[no-untyped-def]
-            """Ray and weight (electrons/s per W/(m^2 sr)) of a film position, float64 pixels, and a lens point.
+            """Ray of a film position, float64 pixels, and a lens point: origin (mm), direction, weight.
 
-            `lens` lies on the unit disc. Optical blur is the caller's.
+            The weight is electrons/s per W/(m^2 sr). `lens` lies on the unit disc. Optical blur is the caller's.
             """
             n, F64 = self.number, mi.Float64
             xd, yd = (u - n["cx_px"]) / n["fx_px"], (v - n["cy_px"]) / n["fy_px"]
@@ -110,7 +110,7 @@ def _register(mi: ModuleType) -> None:
             direction = [cos * (dx * n[f"x_{i}"] + dy * n[f"y_{i}"] + n[f"z_{i}"]) for i in "xyz"]
             etendue = math.pi * n["aperture_radius_m"] ** 2 * cos2 * cos2 / (n["fx_px"] * n["fy_px"] * jacobian)
             weight = mi.Color3f(*(mi.Float(etendue * n[f"electrons_per_joule_{c}"]) for c in "RGB"))
-            return mi.Ray3f(mi.Point3f(*map(mi.Float, origin)), mi.Vector3f(*map(mi.Float, direction))), weight
+            return mi.Vector3d(*origin), mi.Vector3d(*direction), weight
 
         def bbox(self):  # type: ignore[no-untyped-def]
             return mi.ScalarBoundingBox3f()

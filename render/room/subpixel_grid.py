@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.special import ndtr
 
-from phibench.render.room.shading import Surfaces, aligned, look
+from phibench.render.room.shading import Look
+from phibench.render.room.surfaces import aligned
 from phibench.scenes.camera import Camera
 from phibench.scenes.validation import SceneError
 
@@ -193,9 +194,9 @@ class Samples:
 class Film:
     """Samples cells; what a cell gets depends on its number, the seed and the stream alone."""
 
-    def __init__(self, mi: ModuleType, surfaces: Surfaces, grid: FilmGrid, seed: int) -> None:
-        self._mi, self._surfaces, self.grid, self._seed = mi, surfaces, grid, seed
-        self._dimensions = 4 if surfaces.view.rig.mirror.roughness_alpha == 0.0 else 6
+    def __init__(self, mi: ModuleType, look: Look, grid: FilmGrid, seed: int) -> None:
+        self._mi, self._look, self.grid, self._seed = mi, look, grid, seed
+        self._dimensions = 4 if look.view.rig.mirror.roughness_alpha == 0.0 else 6
 
     def sample(self, numbers: NDArray[np.uint32], side: int, stream: int) -> Samples:
         """Sample cells, shape (n,), with side x side points each."""
@@ -214,7 +215,7 @@ class Film:
             x = points(mi, shift, i)
             u = (column + (mi.Float64(i % m) + mi.Float64(x[0])) / mi.Float64(m)) * h + start
             v = (row + (mi.Float64(i // m) + mi.Float64(x[1])) / mi.Float64(m)) * h + start
-            value, mirrored = look(mi, self._surfaces, u, v, x[2:])
+            value, mirrored = self._look.electrons(u, v, x[2:])
             return i + 1, total + value, square + value * value, seen | mirrored
 
         n = len(numbers)

@@ -165,11 +165,10 @@ def moments(image: np.ndarray) -> tuple[float, float, float]:
 def lamp_image(view: View, room: Room, crop: tuple[int, int, int, int] = CROP) -> np.ndarray:
     """Ambient layer, plane R, of a room with nothing in it but a lamp: its light map is dark."""
     from phibench.render.room.ambient import render_ambient
-    from phibench.render.room.light_map import BakeSettings, LightMap, fixed_shapes
-    from phibench.render.room.shading import cut, texel_count
+    from phibench.render.room.light_map import BakeSettings, LightMap, texel_count
 
     settings = BakeSettings(lamp_rays=4, bounce_rays=4, final_rays=4)
-    texels = texel_count(cut(fixed_shapes(room), settings.texel_m))
+    texels = texel_count(room, settings.texel_m)
     dark = np.zeros((texels, 3), dtype=np.float32)
     light = LightMap(dark, dark, np.zeros(texels, dtype=bool))
     return render_ambient(view, room, light, settings, 4, 0, crop).electrons_per_s[0]

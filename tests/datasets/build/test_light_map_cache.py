@@ -17,8 +17,7 @@ from helpers.processes import within
 from phibench.datasets.build import light_map_cache as cache
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.cli.main import main
-from phibench.render.room.light_map import BakeSettings, LightMap, fixed_shapes
-from phibench.render.room.shading import cut, texel_count
+from phibench.render.room.light_map import BakeSettings, LightMap, texel_count
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.room import Room
 from phibench.scenes.shapes import rectangle
@@ -37,7 +36,7 @@ class Oven:
 
     def bake(self, _: object, room: Room, settings: BakeSettings) -> LightMap:
         self.baked += 1
-        texels = texel_count(cut(fixed_shapes(room), settings.texel_m))
+        texels = texel_count(room, settings.texel_m)
         light = np.full((texels, 3), self.baked, dtype=np.float32)
         return LightMap(light, np.zeros_like(light), np.zeros(texels, dtype=bool))
 

@@ -12,11 +12,13 @@ from helpers.path_ambient import path_trace
 
 from phibench.render.room.ambient import AmbientLayer, render_ambient
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
-from phibench.render.room.shading import cut, texel_count
+from phibench.render.room.texel_grid import TexelGrid
 from phibench.scenes.catalog import default_rig, lab
+from phibench.scenes.faces import face_table
+from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
-from phibench.scenes.shapes import cuboid, faces, rectangle
+from phibench.scenes.shapes import Mesh, Prism, cuboid, faces, rectangle
 from phibench.scenes.textures import Uniform
 
 ROOM, RIG = lab(TARGETS), default_rig()
@@ -159,8 +161,8 @@ def test_integrating_box() -> None:
 
 def test_noise_is_what_two_bakes_differ_by(coarse_light: LightMap) -> None:
     """The stated standard error against the scatter of the halves' mean is honest over the floor, to 10 %."""
-    floor = cut(ROOM.surfaces, COARSE.texel_m)[0]
-    part = slice(0, floor.count)
+    grid = TexelGrid.of(face_table(ROOM.surfaces), COARSE.texel_m)
+    part = slice(0, grid.texels_of(1))
     seen = ~coarse_light.covered[part]
     relative = coarse_light.sigma_w_m2[part][seen] / coarse_light.irradiance_w_m2[part][seen]
     assert 0.0 < np.sqrt(np.mean(relative**2)) < 0.02
@@ -178,13 +180,36 @@ def test_faces_of_a_cuboid_enclose_it() -> None:
 
 
 def test_patches_tile_their_surfaces() -> None:
-    patches = cut(ROOM.shapes(VIEW), 0.05)
-    assert texel_count(patches) == patches[-1].start + patches[-1].count
-    floor = patches[0]
-    centres = floor.centres_m()
-    assert centres.shape == (floor.count, 3)
+    grid = TexelGrid.of(face_table(ROOM.shapes(VIEW)), 0.05)
+    parts = [part for part, _, _ in grid.grids()]
+    assert [part.start for part in parts] == [0, *(part.stop for part in parts[:-1])]
+    assert parts[-1].stop == grid.count
+    centres = grid.points()[0]
+    assert len(centres) == grid.count
     assert centres[0] == pytest.approx([-4.8 + 0.025, -4.6 + 0.025, 0.0])
     assert centres[1] - centres[0] == pytest.approx([0.05, 0.0, 0.0])  # rows run along local x
+
+
+def test_texels_lie_inside_their_faces() -> None:
+    """Also those of faces that are no rectangles: the ends of a prism, triangles of a mesh."""
+    rng = np.random.default_rng(0)
+    prism = Prism("p", Pose("world", "shape", (0.1, 0.2, 0.3), rotation_xyz(0.3, 0.2, 0.1)), 0.2, 0.4, 9)
+    mesh = Mesh("m", rng.normal(size=(9, 3)), np.arange(9).reshape(3, 3), two_sided=True)
+    grid = TexelGrid.of(face_table([prism, mesh]), 0.05)
+    points, normals = grid.points()
+    patch = grid.patch()[0]
+    table = grid.table
+    assert np.abs(np.einsum("ni,ni->n", points - table.centre_m[patch], table.normal[patch])).max() < 1e-12
+    inside = np.zeros(len(points), dtype=bool)
+    for corners, owner in zip(table.corners_m, table.patch, strict=True):
+        sides = [
+            np.cross(corners[(k + 1) % 3] - corners[k], points - corners[k]) @ table.normal[owner] for k in range(3)
+        ]
+        inside |= (patch == owner) & np.all(np.array(sides) >= -1e-12, axis=0)
+    assert inside.all()
+    back = np.arange(grid.count) >= grid.back[patch]
+    turned = np.where((back & table.two_sided[patch])[:, None], -1.0, 1.0) * table.normal[patch]
+    np.testing.assert_allclose(normals, turned)
 
 
 def test_other_rooms_and_cameras_need_no_other_kernels() -> None:

@@ -16,12 +16,13 @@ from scipy import optimize
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
-from phibench.render.room.shading import cut, texel_count
+from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light
 from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.catalog import default_rig
+from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Pose
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
 from phibench.scenes.room import Room
@@ -198,7 +199,7 @@ def expected_rates(window: str, radiance: float) -> np.ndarray:
 def test_accuracy_energy_of_the_light_map(baked: tuple[str, LightMap]) -> None:
     """The cube's irradiance is pi, mean to 0.3 %, every texel to 2 %: 1024 points per wall, 6 walls."""
     shapes = furnace(baked[0]).furniture
-    count = texel_count(cut(shapes, SETTINGS.texel_m))
+    count = TexelGrid.of(face_table(shapes), SETTINGS.texel_m).count
     assert count == 6 * 4 * 4
     ratio = baked[1].irradiance_w_m2[-count:] / math.pi
     print(f"mean {ratio.mean():.5f}, from {ratio.min():.4f} to {ratio.max():.4f}")

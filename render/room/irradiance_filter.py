@@ -1,0 +1,71 @@
+"""Smoothing of light maps where light changes slowly, decided by two independent halves.
+
+A texel's value may be replaced by a straight-line fit through its neighbours, along rows and along columns. Let S_r be
+the fit over r texels to each side, and a, b the halves. The expectation of (S_r a - b)^2 is bias^2 + var(S_r a) +
+var(b). The r with the least of it, averaged around a texel, is taken there. So shadows and edges stay as they are.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from scipy import ndimage
+
+from phibench.render.room.texel_grid import TexelGrid
+from phibench.scenes.frames import Array
+
+_REACHES = (1, 2, 4)  # texels to each side
+_AROUND = 5  # texels over which the choice is averaged
+_FEWEST = 12  # texels of a grid that is smoothed
+
+
+def smoothed(grid: TexelGrid, a: Array, b: Array) -> tuple[Array, Array]:
+    """Mean of two halves, shape (texels, 3), smoothed, and its standard error."""
+    mean, variance = 0.5 * (a + b), (0.5 * (a - b)) ** 2
+    for part, rows, columns in grid.grids():
+        if rows * columns >= _FEWEST:
+            images = [half[part].reshape(rows, columns, 3) for half in (a, b)]
+            best = _best(*images)
+            mean[part], variance[part] = (plane.reshape(-1, 3) for plane in best)
+    return mean, np.sqrt(variance)
+
+
+def _best(a: Array, b: Array) -> tuple[Array, Array]:
+    """Mean and variance of a grid, each texel with the reach that serves it best."""
+    noise = _around(0.5 * (a - b) ** 2)  # var(a) = var(b)
+    mean, variance, least = 0.5 * (a + b), (0.5 * (a - b)) ** 2, 4.0 * noise.sum(axis=-1)
+    for reach in _REACHES:
+        one, other = (_fit(half, reach) for half in (a, b))
+        error = _around((one - b) ** 2 + (other - a) ** 2)
+        bias = np.maximum(0.5 * error - noise - _around(0.5 * (one - other) ** 2), 0.0)
+        better = (error.sum(axis=-1) < least)[..., None]
+        mean = np.where(better, 0.5 * (one + other), mean)
+        variance = np.where(better, (0.5 * (one - other)) ** 2 + bias, variance)
+        least = np.minimum(least, error.sum(axis=-1))
+    return mean, variance
+
+
+def _around(image: Array) -> Array:
+    return np.asarray(ndimage.uniform_filter(image, size=(_AROUND, _AROUND, 1), mode="nearest"))
+
+
+def _fit(image: Array, reach: int) -> Array:
+    """Straight-line fits along both axes."""
+    rows, columns = (line_fit(length, reach) for length in image.shape[:2])
+    return np.einsum("ij,jkc->ikc", rows, np.einsum("kl,jlc->jkc", columns, image))
+
+
+@lru_cache(maxsize=512)
+def line_fit(length: int, reach: int) -> Array:
+    """Matrix (length, length) of straight-line fits over `reach` places to each side; the identity below 4 places."""
+    if length < 4:
+        return np.eye(length)
+    matrix = np.zeros((length, length))
+    for i in range(length):
+        low, high = max(i - reach, 0), min(i + reach + 1, length)
+        x = np.arange(low, high) - float(i)
+        centred = x - x.mean()
+        # value at x = 0 of the line through the window's points
+        matrix[i, low:high] = 1.0 / len(x) - x.mean() * centred / (centred @ centred)
+    return matrix

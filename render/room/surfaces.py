@@ -1,0 +1,244 @@
+"""Room in Mitsuba: one mesh of all faces, and tables by which kernels look up what a hit face sends out.
+
+All triangles are one mesh: Embree answers a query five times as fast as with a shape for every face. What a kernel
+needs of a face lies in one row of 32 numbers, read in groups of four. The albedo is looked up exactly, at the point of
+the hit; the irradiance is bilinear between texel centres and linear beyond the outermost ones.
+
+A coat is a smooth dielectric over a diffuse ground (Mitsuba's `plastic`, nonlinear). With F the Fresnel reflectance
+outside and f the diffuse one inside, the ground of albedo a sends out
+(1 - F(theta_o)) / n^2 a / (1 - a f) E' / pi, where E' is the irradiance weighted by 1 - F(theta_i). The coat itself
+mirrors F of what comes from the mirrored direction.
+"""
+
+from __future__ import annotations
+
+import math
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.render.room.camera_plugin import MM_PER_M
+from phibench.render.room.scene import load_scene
+from phibench.render.room.texel_grid import TexelGrid
+from phibench.scenes.faces import FaceTable
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import View
+from phibench.scenes.textures import Bitmap, Checker, Texture
+
+_ALIGNMENT = 64  # bytes
+_ROW = 8  # groups of four numbers
+_LARGEST = 1 << 24  # whole numbers that float32 holds exactly
+_LIFT_MM = 0.05  # mirrored rays start this far in front of a coat
+
+
+def aligned(values: Any, dtype: type[np.generic] = np.float32) -> NDArray[Any]:
+    """Flat copy of an array at an address that is a multiple of 64 bytes.
+
+    Dr.Jit takes NumPy's memory as it is, and its kernels depend on the alignment of what they read. NumPy's varies by
+    chance from array to array: kernels would be compiled anew for most of them, 0.03 to 0.13 s each.
+    """
+    flat = np.asarray(values, dtype=dtype).ravel()
+    memory = np.empty(flat.nbytes + _ALIGNMENT, dtype=np.uint8)
+    start = -memory.ctypes.data % _ALIGNMENT
+    copy = memory[start : start + flat.nbytes].view(dtype)
+    copy[:] = flat
+    return copy
+
+
+class Surfaces:
+    """A Mitsuba scene of faces, with tables that answer look-ups.
+
+    Parameters
+    ----------
+    mi : module
+        Mitsuba with its variant set.
+    view : View
+        The scene's origin is its sphere centre.
+    table : FaceTable
+    """
+
+    def __init__(self, mi: ModuleType, view: View, table: FaceTable) -> None:
+        self._mi, self.view, self.table = mi, view, table
+        self.has_coats = bool((table.coat > 0.0).any())
+        self.corners_mm = (MM_PER_M * (table.corners_m - view.sphere_centre_m)).astype(np.float32)
+        self.scene = load_scene(mi, {"type": "scene", "room": self._mesh()})
+        self._patch = mi.UInt32(aligned(table.patch, np.uint32))
+        self._texels, self._places = self._textures()
+        self._inside = mi.Float(aligned(_inside_reflectance(mi, table.coat))) if self.has_coats else None
+
+    def set_light(self, grid: TexelGrid, irradiance_w_m2: NDArray[np.floating]) -> None:
+        """Give the texels of a grid their irradiance, shape (texels, 3), W/m^2."""
+        # four more texels, of pi: with them a texture of radiance is what its surface sends out
+        padded = np.full((grid.count + 4, 4), math.pi, dtype=np.float32)
+        padded[: grid.count, :3] = irradiance_w_m2
+        self._irradiance = self._mi.Float(aligned(padded))
+        self._rows = self._mi.Float(aligned(self._row_table(grid)))
+
+    def hit(self, ray: Any, active: Any = True, *, coherent: bool = True) -> tuple[Any, Any, Any]:
+        """Distance (mm) and patch of the first face along rays, and whether there is one.
+
+        `coherent` lets Embree take 16 rays at a time: 4 times faster for a camera, 1.7 times slower for scattered rays.
+        """
+        import drjit as dr
+
+        found = self.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
+        valid = active & found.is_valid()
+        return found.t, dr.gather(self._mi.UInt32, self._patch, found.prim_index, valid), valid
+
+    def radiance(self, patch: Any, point: Any, direction: Any, active: Any, *, lamps: bool) -> Any:
+        """Radiance, W/(m^2 sr), that faces send against rays of `direction` that hit them at `point` (scene, mm).
+
+        With coats, what they mirror is part of it: one more bounce, to what the mirrored ray meets.
+        """
+        import drjit as dr
+
+        value, normal = self._ground(patch, point, direction, active, lamps=lamps)
+        if not self.has_coats:
+            return value
+        mi = self._mi
+        cos = -dr.dot(normal, direction)
+        coat = dr.gather(mi.Vector4f, self._rows, patch * _ROW, active).w
+        coated = active & (coat > 0.0) & (cos > 0.0)
+        onward = mi.Ray3f(point + _LIFT_MM * normal, direction + 2.0 * cos * normal)
+        t, other, valid = self.hit(onward, coated)
+        mirrored, _ = self._ground(other, onward(t), onward.d, valid, lamps=True)
+        return value + dr.select(coated, self.reflectance(cos, coat), 0.0) * mirrored
+
+    def reflectance(self, cos: Any, coat: Any) -> Any:
+        """Fresnel reflectance of a coat from outside, for the cosine of the angle to its normal."""
+        return self._mi.fresnel(cos, coat)[0]
+
+    def _ground(self, patch: Any, point: Any, direction: Any, active: Any, *, lamps: bool) -> tuple[Any, Any]:
+        """Radiance without what coats mirror, and the normal on the side of the ray."""
+        import drjit as dr
+
+        mi = self._mi
+        plane, grid, along_x, along_y, column, row, texture, light = (
+            dr.gather(mi.Vector4f, self._rows, patch * _ROW + k, active) for k in range(_ROW)
+        )
+        normal = mi.Vector3f(plane.x, plane.y, plane.z)
+        front = dr.dot(normal, direction) < 0.0
+        start = dr.select(front, grid.z, grid.w)
+        seen = active & (start >= 0.0)
+        fx, fy, s, t = (_affine(dr, group, point) for group in (along_x, along_y, column, row))
+        irradiance = self._bilinear(fx, fy, grid.x, grid.y, mi.UInt32(start), seen)
+        albedo = self._albedo(s, t, texture, seen)
+        if self.has_coats:
+            albedo = self._coated(patch, albedo, dr.abs(dr.dot(normal, direction)), plane.w, seen)
+        value = albedo * (dr.maximum(irradiance, 0.0) * (light.w / math.pi))
+        if lamps:
+            value += dr.select(front, mi.Color3f(light.x, light.y, light.z), 0.0)
+        return dr.select(seen, value, 0.0), dr.select(front, normal, -normal)
+
+    def _bilinear(self, fx: Any, fy: Any, columns: Any, rows: Any, start: Any, active: Any) -> Any:
+        import drjit as dr
+
+        mi = self._mi
+        low_x, low_y = dr.clip(dr.floor(fx), 0.0, columns - 2.0), dr.clip(dr.floor(fy), 0.0, rows - 2.0)
+        tx, ty = fx - low_x, fy - low_y
+        across = mi.UInt32(columns)
+        first = start + mi.UInt32(low_y) * across + mi.UInt32(low_x)
+        corners = (first, first + 1, first + across, first + across + 1)
+        return self._blend(self._irradiance, corners, tx, ty, active)
+
+    def _albedo(self, s: Any, t: Any, texture: Any, active: Any) -> Any:
+        """Value of a texture at a place in its own units; `texture` is width, height, start, and 0.5 if smooth."""
+        import drjit as dr
+
+        mi = self._mi
+        width, height, start, half = texture.x, texture.y, mi.UInt32(texture.z), texture.w
+        smooth = half > 0.0
+        s, t = s - half, t - half
+        low_s, low_t = dr.floor(s), dr.floor(t)
+        ts, tt = dr.select(smooth, s - low_s, 0.0), dr.select(smooth, t - low_t, 0.0)
+        i, j = low_s - width * dr.floor(low_s / width), low_t - height * dr.floor(low_t / height)
+        i, j = dr.clip(i, 0.0, width - 1.0), dr.clip(j, 0.0, height - 1.0)  # i = width by rounding
+        i1, j1 = dr.select(i + 1.0 < width, i + 1.0, 0.0), dr.select(j + 1.0 < height, j + 1.0, 0.0)
+        i, i1, j, j1, across = (mi.UInt32(value) for value in (i, i1, j, j1, width))
+        corners = (start + j * across + i, start + j * across + i1, start + j1 * across + i, start + j1 * across + i1)
+        return self._blend(self._texels, corners, ts, tt, active)
+
+    def _blend(self, table: Any, corners: tuple[Any, ...], tx: Any, ty: Any, active: Any) -> Any:
+        import drjit as dr
+
+        a, b, c, d = (dr.gather(self._mi.Vector4f, table, index, active) for index in corners)
+        mixed = (1.0 - ty) * ((1.0 - tx) * a + tx * b) + ty * ((1.0 - tx) * c + tx * d)
+        return self._mi.Color3f(mixed.x, mixed.y, mixed.z)
+
+    def _coated(self, patch: Any, albedo: Any, cos: Any, coat: Any, active: Any) -> Any:
+        """Albedo of a ground below its coat, seen at an angle; the albedo itself where there is none."""
+        import drjit as dr
+
+        inside = dr.gather(self._mi.Float, self._inside, patch, active)
+        below = albedo / (1.0 - albedo * inside) * ((1.0 - self.reflectance(cos, coat)) / dr.square(coat))
+        return dr.select(coat > 0.0, below, albedo)
+
+    def _mesh(self) -> Any:
+        mi, corners = self._mi, self.corners_mm
+        mesh = mi.Mesh("room", 3 * len(corners), len(corners))
+        buffers = mi.traverse(mesh)
+        buffers["vertex_positions"] = mi.Float(aligned(corners))
+        buffers["faces"] = mi.UInt32(aligned(np.arange(3 * len(corners)), np.uint32))
+        buffers.update()
+        return mesh
+
+    def _textures(self) -> tuple[Any, Array]:
+        """Texels of all textures, four numbers each; width, height, start and smoothness of each texture."""
+        images = [_image(texture) for texture in self.table.textures]
+        counts = [image.shape[0] * image.shape[1] for image, _ in images]
+        white = sum(counts)
+        if white + 1 >= _LARGEST:
+            raise ValueError(f"the room's textures have {white} texels, more than {_LARGEST}")
+        starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+        places = [(i.shape[1], i.shape[0], start, half) for (i, half), start in zip(images, starts, strict=True)]
+        texels = np.concatenate([*(image.reshape(-1, 4) for image, _ in images), np.ones((1, 4))])
+        return self._mi.Float(aligned(texels)), np.array([*places, (1, 1, white, 0.0)])
+
+    def _row_table(self, grid: TexelGrid) -> Array:
+        """Rows of all patches, shape (P, 8, 4); see `_ground`."""
+        table = self.table
+        count = len(table.size_m)
+        rows = np.zeros((count, _ROW, 4))
+        rows[:, 0] = np.concatenate([table.normal, table.coat[:, None]], axis=1)
+        own = grid.columns > 0
+        rows[:, 1] = np.where(
+            own[:, None], np.stack([grid.columns, grid.rows, grid.start, grid.back], axis=1), (2, 2, grid.count, -1)
+        )
+        assert grid.count + 4 < _LARGEST, "float32 must hold the texels' numbers"
+        centre = MM_PER_M * (table.centre_m - self.view.sphere_centre_m)
+        axes = np.stack([table.x_axis, table.y_axis], axis=1) / MM_PER_M
+        metres = np.concatenate([axes, -np.einsum("pij,pj->pi", axes, centre)[..., None]], axis=2)  # (P, 2, 4)
+        texels = np.where(own[:, None], np.stack([grid.columns, grid.rows], axis=1), 2) / table.size_m
+        rows[:, 2:4] = texels[..., None] * metres
+        rows[:, 2:4, 3] += 0.5 * np.where(own[:, None], np.stack([grid.columns, grid.rows], axis=1), 2) - 0.5
+        rows[:, 4:6] = np.einsum("pij,pjk->pik", table.texels[..., :2], metres)
+        rows[:, 4:6, 3] += table.texels[..., 2]
+        lamp = table.emits
+        rows[:, 6] = self._places[np.where(lamp, len(table.textures), table.texture)]
+        rows[:, 7, :3] = table.radiance_w_m2_sr
+        rows[:, 7, 3] = np.where(lamp, 0.0, 1.0)
+        return rows
+
+
+def _affine(dr: ModuleType, group: Any, point: Any) -> Any:
+    return dr.fma(group.x, point.x, dr.fma(group.y, point.y, dr.fma(group.z, point.z, group.w)))
+
+
+def _image(texture: Texture) -> tuple[Array, float]:
+    """Texels of a texture, shape (rows, columns, 4), and half a texel if it is smooth, 0 if its cells are plain."""
+    if isinstance(texture, Bitmap):
+        return texture.values.astype(float), 0.5
+    if isinstance(texture, Checker):
+        even, odd = (np.array([*albedo, albedo[0]]) for albedo in (texture.albedo_even, texture.albedo_odd))
+        return np.array([[even, odd], [odd, even]]), 0.0
+    return np.array([[[*texture.albedo, texture.albedo[0]]]]), 0.0
+
+
+def _inside_reflectance(mi: ModuleType, coats: Array) -> Array:
+    """Diffuse reflectance of coats from inside, by patch; 0 where there is none."""
+    values = {
+        coat: mi.fresnel_diffuse_reflectance(1.0 / coat) if coat > 0.0 else 0.0 for coat in set(map(float, coats))
+    }
+    return np.array([float(np.array(values[float(coat)]).ravel()[0]) if coat > 0.0 else 0.0 for coat in coats])

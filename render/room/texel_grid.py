@@ -1,0 +1,133 @@
+"""Texels of a room's faces: the grid of each patch, and the places where its irradiance is computed.
+
+The texels of all patches lie one after the other in flat arrays, row by row (local y): a light map is an array of shape
+(N, 3). A patch has at least 2 x 2 texels, spread over the rectangle around it. Two-sided patches have two grids, front
+and back. Lamps and faces that shine by their texture have none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from phibench.scenes.faces import FaceTable, IntArray
+from phibench.scenes.frames import Array
+
+_INSIDE = 1.0 - 1e-3  # texels beyond a patch's own outline are moved just inside it
+
+
+@dataclass(frozen=True, eq=False)
+class TexelGrid:
+    """Texel grids of the patches of a table.
+
+    Attributes
+    ----------
+    table : FaceTable
+    columns, rows : int arrays, shape (P,)
+        Along local x and y; 0 where there is no grid.
+    start : int array, shape (P,)
+        First texel of a patch's front.
+    """
+
+    table: FaceTable
+    columns: IntArray
+    rows: IntArray
+    start: IntArray
+
+    @classmethod
+    def of(cls, table: FaceTable, texel_m: float) -> TexelGrid:
+        """Grid with texels of at most `texel_m`."""
+        sides = np.maximum(np.ceil(table.size_m / texel_m - 1e-9), 2).astype(np.int64)
+        columns, rows = np.where(table.emits | table.is_radiance, 0, sides.T)
+        counts = columns * rows * np.where(table.two_sided, 2, 1)
+        return cls(table, columns, rows, np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64))
+
+    @property
+    def back(self) -> IntArray:
+        """First texel of a patch's back, shape (P,); -1 where it has none."""
+        return np.where(self.table.two_sided & (self.columns > 0), self.start + self.columns * self.rows, -1)
+
+    @cached_property
+    def count(self) -> int:
+        """Number of texels."""
+        return int(np.sum(self.columns * self.rows * np.where(self.table.two_sided, 2, 1)))
+
+    def texels_of(self, patches: int) -> int:
+        """Number of texels of the first so many patches."""
+        return int(self.start[patches]) if patches < len(self.start) else self.count
+
+    def grids(self) -> Iterator[tuple[slice, int, int]]:
+        """Texels, rows and columns of every grid."""
+        sides = zip(self.start.tolist(), self.back.tolist(), self.rows.tolist(), self.columns.tolist(), strict=True)
+        for start, back, rows, columns in sides:
+            for first in (start, back):
+                if columns and first >= 0:
+                    yield slice(first, first + rows * columns), rows, columns
+
+    def patch(self) -> tuple[IntArray, IntArray]:
+        """Patch and number within its grid of every texel, shape (N,) each."""
+        each = self.columns * self.rows
+        counts = np.stack([each, np.where(self.table.two_sided, each, 0)], axis=1).ravel()
+        grid = np.repeat(np.arange(len(counts)), counts)
+        first = np.cumsum(counts) - counts
+        return grid // 2, np.arange(len(grid)) - first[grid]
+
+    def points(self) -> tuple[Array, Array]:
+        """World points of the texels and the normals of their side, shape (N, 3) each.
+
+        They are the middles of the texels; those beyond the outline of a patch are moved towards its middle.
+        """
+        table, (patch, number) = self.table, self.patch()
+        column, row = number % self.columns[patch], number // self.columns[patch]
+        x = ((column + 0.5) / self.columns[patch] - 0.5) * table.size_m[patch, 0]
+        y = ((row + 0.5) / self.rows[patch] - 0.5) * table.size_m[patch, 1]
+        points = table.centre_m[patch] + x[:, None] * table.x_axis[patch] + y[:, None] * table.y_axis[patch]
+        points = self._inside(patch, points)
+        behind = np.arange(len(patch)) >= np.where(self.back >= 0, self.back, self.count + 1)[patch]
+        return points, np.where(behind[:, None], -1.0, 1.0) * table.normal[patch]
+
+    def _inside(self, patch: IntArray, points: Array) -> Array:
+        """Move points beyond the outlines of patches that are no rectangles."""
+        table = self.table
+        triangles = np.bincount(table.patch, minlength=len(table.size_m))
+        odd = np.flatnonzero(triangles[patch] != 2)
+        if len(odd) == 0:
+            return points
+        middle = np.zeros_like(table.centre_m)
+        np.add.at(middle, table.patch, table.corners_m.mean(axis=1))
+        middle /= np.maximum(triangles, 1)[:, None]
+        share = np.ones(len(points))
+        first = np.concatenate([[0], np.cumsum(triangles)])
+        rims = _rims(table)
+        for turn in range(int(triangles[patch[odd]].max())):
+            mine = odd[turn < triangles[patch[odd]]]
+            triangle = first[patch[mine]] + turn
+            start = middle[patch[mine]]
+            for a, outward in rims(triangle):
+                reach, height = (np.einsum("ni,ni->n", v - start, outward) for v in (a, points[mine]))
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    limit = np.where((reach > 0.0) & (height > reach), _INSIDE * reach / height, 1.0)
+                share[mine] = np.minimum(share[mine], limit)
+        moved = middle[patch] + share[:, None] * (points - middle[patch])
+        return np.where((share < 1.0)[:, None], moved, points)
+
+
+def _rims(table: FaceTable):  # type: ignore[no-untyped-def]
+    """Sides of triangles that are rims of their patch: a corner, and the direction outwards (0 for inner sides).
+
+    A patch of one triangle has three rims; the fan of a prism's end has one for each triangle, the second side.
+    """
+    single = np.bincount(table.patch, minlength=len(table.size_m)) == 1
+
+    def sides(triangle: IntArray) -> Iterator[tuple[Array, Array]]:
+        corners, normal = table.corners_m[triangle], table.normal[table.patch[triangle]]
+        for k in range(3):
+            a, b = corners[:, k], corners[:, (k + 1) % 3]
+            outward = np.cross(b - a, normal)
+            inner = ~single[table.patch[triangle]] & (k != 1)
+            yield a, np.where(inner[:, None], 0.0, outward)
+
+    return sides
