@@ -238,9 +238,9 @@ def write(root: Path, path: str, source: str) -> None:
 
 
 def test_the_tree_has_few_large_rooms() -> None:
-    """At most 212 files, at most 16 in a folder, no file name twice (but for the fixed roles of a study)."""
+    """At most 250 files (212 before rooms could be generated, measured and made of meshes), at most 16 in a folder, no file name twice (but for the fixed roles of a study)."""
     files = [file.relative_to(ROOT) for file in sources(ROOT)]
-    assert len(files) <= 212
+    assert len(files) <= 250
     folders = Counter(file.parent for file in files)
     assert {str(folder): n for folder, n in folders.items() if n > 16} == {}
     stems = Counter(file.stem for file in files if file.parts[1] not in ("studies", "cli"))

@@ -23,7 +23,7 @@ from phibench.scenes.rig import View
 
 
 class Look:
-    """What one view's camera sees of a room.
+    """The camera of one view, looking into a room.
 
     Parameters
     ----------
