@@ -238,7 +238,10 @@ def write(root: Path, path: str, source: str) -> None:
 
 
 def test_the_tree_has_few_large_rooms() -> None:
-    """At most 250 files (212 before rooms could be generated, measured and made of meshes), at most 16 in a folder, no file name twice (but for the fixed roles of a study)."""
+    """At most 250 files, at most 16 in a folder, no file name twice (but for the fixed roles of a study).
+
+    There were 212 before rooms could be generated, measured and made of meshes.
+    """
     files = [file.relative_to(ROOT) for file in sources(ROOT)]
     assert len(files) <= 250
     folders = Counter(file.parent for file in files)
