@@ -28,6 +28,7 @@ render/setup
 render/room
 datasets/errors
 datasets/parallel datasets/progress datasets/input_files
+datasets/rooms
 datasets/recipe
 datasets/plan
 datasets/store
