@@ -23,7 +23,7 @@ from phibench.scenes.validation import finite_vector, positive, unit_vector, wit
 
 EXTENT_M = (2.0, 100.0)
 FLOOR_REACH_M = 0.10
-"""How far the stated point may lie from the floor."""
+"""Largest distance of the stated point from the floor."""
 MIRROR_TOP_M = 0.80
 """Height of the mirror's upper end at the down position, with some room to spare."""
 _COLUMN_M = 0.12  # half width of what camera, mirror and mast need: the mirror's radius and as much again
@@ -62,7 +62,7 @@ class MeshLamp:
 
 @dataclass(frozen=True)
 class MeshSettings:
-    """How a mesh file becomes a room.
+    """Settings by which a mesh file becomes a room.
 
     Parameters
     ----------
