@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from phibench.render.room.light_map import BakeSettings, LightMap, fixed_shapes, light_carriage
 from phibench.render.room.noise_budget import BUDGET
-from phibench.render.room.refinement import first_pass, refine
+from phibench.render.room.refinement import render_refined
 from phibench.render.room.shading import Look
 from phibench.render.room.subpixel_grid import Crop, Film, FilmGrid, Stack
 from phibench.render.room.surfaces import Surfaces
@@ -112,15 +112,6 @@ def _band(film: Film, band: Crop, window: Crop, rounds: int, budget: float) -> t
     """Pixels of a band, refined with its neighbourhood: what is beyond it reaches the band by less than the budget."""
     u0, v0, width, height = band
     top, bottom = max(v0 - _OVERLAP_PX, window[1]), min(v0 + height + _OVERLAP_PX, window[1] + window[3])
-    mean, variance = _render(film, (u0, top, width, bottom - top), rounds, budget)
+    mean, variance = render_refined(film, (u0, top, width, bottom - top), rounds, budget)
     inner = slice(v0 - top, v0 - top + height)
     return mean[:, inner], variance[:, inner]
-
-
-def _render(film: Film, window: Crop, rounds: int, budget: float) -> tuple[Stack, Stack]:
-    """Pixels of a window and their variance, shape (3, height, width) each."""
-    cells = first_pass(film, window, budget)
-    for turn in range(1, rounds + 1):
-        if not refine(film, cells, turn):
-            break
-    return cells.pixels

@@ -61,18 +61,57 @@ class Cells:
     budget: float
 
 
-def first_pass(film: Film, window: Crop, budget: float) -> Cells:
-    """All cells of a window, two samples each."""
+def render_refined(film: Film, window: Crop, rounds: int, budget: float) -> tuple[Stack, Stack]:
+    """Pixels of a window and their variance, shape (3, height, width) each.
+
+    All cells get two samples. Those that see the mirror, and the few around them, are then refined.
+    """
     grid, numbers = film.grid, film.grid.numbers(window)
     a, b = (film.sample(numbers.ravel(), 1, half) for half in (0, 1))
     mean, variance = (plane.reshape(3, *numbers.shape) for plane in _estimate(a, b))
     pixels = grid.pixels(mean), grid.pixels(variance, power=2)
+    mirrored = grid.inner((a.mirrored | b.mirrored).reshape(numbers.shape))
+    if rounds and mirrored.any():
+        box = _around(mirrored)
+        part = tuple(slice(s.start * grid.cells, (s.stop + 2 * grid.margin_px) * grid.cells) for s in box)
+        halves = [half.electrons_per_s.sum(axis=0).reshape(numbers.shape)[part] for half in (a, b)]
+        own = [np.ascontiguousarray(plane[:, *part]) for plane in (mean, variance)]  # changed in place
+        inner = (np.ascontiguousarray(pixels[0][:, *box]), np.ascontiguousarray(pixels[1][:, *box]))
+        cells = _cells(grid, numbers[part].copy(), own, inner, halves, mirrored[box], budget)
+        for turn in range(1, rounds + 1):
+            if not refine(film, cells, turn):
+                break
+        for plane, refined in zip(pixels, cells.pixels, strict=True):
+            plane[:, *box] = refined
+    return pixels
+
+
+def _around(marked: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Rows and columns of the pixels that are marked, and of their neighbours."""
+    lines = (np.flatnonzero(marked.any(axis=axis)) for axis in (1, 0))
+    (top, bottom), (left, right) = ((line[0], line[-1] + 1) for line in lines)
+    height, width = marked.shape
+    return (
+        slice(max(top - _NEAR_PX, 0), min(bottom + _NEAR_PX, height)),
+        slice(max(left - _NEAR_PX, 0), min(right + _NEAR_PX, width)),
+    )
+
+
+def _cells(
+    grid: FilmGrid,
+    numbers: NDArray[np.uint32],
+    estimate: list[Stack],
+    pixels: tuple[Stack, Stack],
+    halves: list[Stack],
+    mirrored: NDArray[np.bool_],
+    budget: float,
+) -> Cells:
+    """Cells after their first two samples: mean and variance; `halves` are the samples' sums over the colours."""
+    mean, variance = estimate
     allowed = allowed_per_s2(pixels[0], grid.blur_sigma_px, budget).sum(axis=0)
     tight = ndimage.minimum_filter(allowed, size=_NEAR_PX, mode="nearest")
-    halves = [half.electrons_per_s.sum(axis=0).reshape(numbers.shape) for half in (a, b)]
     full = is_full(pixels[0]).all(axis=0)
     suspected = np.where(full, np.float32(0.0), _suspected(grid, *halves) / allowed)
-    mirrored = grid.inner((a.mirrored | b.mirrored).reshape(numbers.shape))
     side = np.ones(numbers.shape, dtype=np.int32)
     return Cells(grid, numbers, side, mean, variance, pixels, tight, suspected, mirrored, budget)
 
