@@ -291,10 +291,11 @@ def _light_map_faults(dataset: Dataset) -> Iterator[str]:
 
 
 def _truth_faults(dataset: Dataset, pose: PoseInfo, shape: tuple[int, int]) -> Iterator[str]:
+    from phibench.render.optics.room_tracer import room_geometry
     from phibench.render.optics.truth import truth_layer
 
     stored, view = read_truth(dataset.folder / pose.files["truth"]), dataset.rigs[pose.rig].at(pose.offset_m)
-    expected = truth_layer(view, dataset.room.shapes(view))
+    expected = truth_layer(view, room_geometry(dataset.room, view))
     for name, plane in stored.items():
         if plane.shape != shape:
             yield f"{pose.files['truth']} has {plane.shape} pixels instead of {shape}"

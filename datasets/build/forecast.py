@@ -22,6 +22,7 @@ from phibench.datasets.build.light_map_cache import is_cached
 from phibench.datasets.build.scheduler import Executor, Outcome
 from phibench.datasets.build.tasks import Done, Task
 from phibench.datasets.plan.plan import PairPlan, Plan
+from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import SpotTruth, depth_m, spot_truth
 from phibench.render.room.light_map import texel_count
 from phibench.scenes.rig import POSITIONS
@@ -297,7 +298,7 @@ def pair_forecasts(plan: Plan) -> Iterator[PairForecast]:
     for pair in plan.pairs:
         spot, rig = plan.spots[pair.spot], plan.rigs[pair.rig]
         views = [plan.view(pair, position) for position in POSITIONS]
-        down, up = (spot_truth(view, spot, plan.room.shapes(view)) for view in views)
+        down, up = (spot_truth(view, spot, room_geometry(plan.room, view)) for view in views)
         distance_m = depth_m(np.array(spot.position_world_m), rig.at(0.0).sphere_centre_m)
         yield PairForecast(pair, float(distance_m), down, up)
 

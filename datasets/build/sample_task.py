@@ -17,6 +17,7 @@ from phibench.datasets.store import schema
 from phibench.datasets.store.layers import SpotWindow, read_ambient, read_ambient_variance, read_spot
 from phibench.datasets.store.pictures import Side, sample_picture, save_png
 from phibench.datasets.store.schema import NoiseRow
+from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import SpotTruth, spot_truth
 from phibench.render.room.noise_budget import BUDGETS, NoiseBudget, noise_budget
 from phibench.scenes.laser import LaserSpot
@@ -35,7 +36,7 @@ def finish_sample(out: Path, pair: PairPlan, rig: Rig, room: Room, spot: LaserSp
     sides, rows = [], {}
     for position in POSITIONS:
         view = rig.at(Stroke(pair.stroke_m).offset_m(position))
-        truth = spot_truth(view, spot, room.shapes(view))
+        truth = spot_truth(view, spot, room_geometry(room, view))
         ambient = out / schema.view_file(pair.pose_id(position), "ambient")
         planes, window = read_ambient(ambient), _window(out, pair, position)
         budget = spot_noise(view, truth, window, planes, read_ambient_variance(ambient))

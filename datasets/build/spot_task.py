@@ -15,6 +15,7 @@ from phibench.datasets.store import schema
 from phibench.datasets.store.layers import SpotWindow, write_spot
 from phibench.datasets.store.schema import CertificateRow, ManifestRow, SpotRow
 from phibench.render.optics.certificate import Certificate, certify
+from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.spot_layer import SpotLayer, spot_layer
 from phibench.render.optics.truth import SpotTruth, depth_m, spot_truth
 from phibench.scenes.laser import LaserSpot
@@ -44,9 +45,9 @@ class RefusedSampleError(DatasetError):
 
 def answer_spot(view: View, spot: LaserSpot, room: Room) -> SpotAnswer:
     """Compute one spot in one view."""
-    shapes = room.shapes(view)
-    truth, layer = spot_truth(view, spot, shapes), spot_layer(view, spot, shapes)
-    certificate = certify(view, spot, shapes, truth, layer) if truth.visible else None
+    geometry = room_geometry(room, view)
+    truth, layer = spot_truth(view, spot, geometry), spot_layer(view, spot, geometry)
+    certificate = certify(view, spot, geometry, truth, layer) if truth.visible else None
     return SpotAnswer(truth, layer, certificate, _reaches(view, _window(layer)))
 
 

@@ -31,6 +31,7 @@ def start_renderer() -> dict[str, Any]:
 
 def render_view(out: Path, dataset: str, rig: Rig, room: Room, pose: PosePlan, ambient: AmbientTable) -> Made:
     """Task: render one pose and write its three files below `out`."""
+    from phibench.render.optics.room_tracer import room_geometry
     from phibench.render.optics.truth import truth_layer
     from phibench.render.room.ambient import dark_layer, render_ambient
     from phibench.render.room.noise_budget import BUDGETS
@@ -48,7 +49,7 @@ def render_view(out: Path, dataset: str, rig: Rig, room: Room, pose: PosePlan, a
     planes = layer.electrons_per_s
     header_ambient = {**header, **ambient.model_dump(), "seed": pose.seed}
     write_ambient(out / schema.view_file(pose.pose_id, "ambient"), planes, layer.variance_per_s2, header_ambient)
-    write_truth(out / schema.view_file(pose.pose_id, "truth"), truth_layer(view, room.shapes(view)), header)
+    write_truth(out / schema.view_file(pose.pose_id, "truth"), truth_layer(view, room_geometry(room, view)), header)
     detector = rig.camera.detector
     picture = to_srgb(planes, detector, display_exposure_s(planes, detector))
     save_png(out / schema.view_file(pose.pose_id, "preview"), picture)

@@ -18,6 +18,7 @@ from phibench.datasets.recipe.distributions import DistributionTable, quantile
 from phibench.datasets.recipe.spot_placement import by_ray, on_board
 from phibench.datasets.recipe.tables import DistractorTable
 from phibench.datasets.store.layers import SpotWindow
+from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.spot_layer import SpotLayer, spot_layer
 from phibench.render.optics.truth import SpotTruth, spot_truth
 from phibench.render.sensor.light import OtherSpot
@@ -86,11 +87,11 @@ def _placed(sample: Sample, number: int, table: DistractorTable) -> Distractor |
         if spot is None:
             continue
         views = {position: sample.view(position) for position in POSITIONS}
-        shapes = {position: sample.dataset.room.shapes(view) for position, view in views.items()}
-        truths = {position: spot_truth(view, spot, shapes[position]) for position, view in views.items()}
+        rooms = {position: room_geometry(sample.dataset.room, view) for position, view in views.items()}
+        truths = {position: spot_truth(view, spot, rooms[position]) for position, view in views.items()}
         if not truths["down"].visible or any(_too_near(sample, position, truths[position]) for position in POSITIONS):
             continue
-        layers = {position: spot_layer(view, spot, shapes[position]) for position, view in views.items()}
+        layers = {position: spot_layer(view, spot, rooms[position]) for position, view in views.items()}
         ratio = max(_ratio(sample, position, layers[position]) for position in POSITIONS)
         if ratio > 0.0:
             wanted = _value(sample.stream_names, number, "flux_ratio", table.flux_ratio)

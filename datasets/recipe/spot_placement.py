@@ -13,8 +13,9 @@ import numpy as np
 
 from phibench.datasets.recipe.build import build_spot, grown_diameter_m, make_spot
 from phibench.datasets.recipe.tables import LaserTable, TargetTable
-from phibench.render.optics.ray_tracer import IntArray, first_hit
+from phibench.render.optics.room_tracer import first_hit
 from phibench.scenes.catalog import BOARD_SIZE_M, Target, board
+from phibench.scenes.faces import IntArray
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import Rig, View
@@ -95,7 +96,8 @@ def by_ray(laser: LaserTable, room: Room, azimuth_deg: Array, height_m: Array) -
     turn = np.radians(azimuth_deg)
     starts = np.stack([np.zeros_like(turn), np.zeros_like(turn), height_m], axis=-1)
     directions = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=-1)
-    distance, found = first_hit(shapes, starts, directions)
+    hits = first_hit(shapes, starts, directions)
+    distance, found = hits.distance_m, hits.object_id
     spots = [_at(laser, shapes, *hit) for hit in zip(starts, directions, distance, found, strict=True)]
     return _whole(shapes, starts, found, spots)
 
@@ -134,7 +136,8 @@ def _whole(shapes: Sequence[Shape], starts: Array, found: IntArray, spots: list[
     to_ring = rings - starts[placed][:, None]
     length = np.linalg.norm(to_ring, axis=-1)
     origins = np.broadcast_to(starts[placed][:, None], rings.shape).reshape(-1, 3)
-    distance, hit = first_hit(shapes, origins, (to_ring / length[..., None]).reshape(-1, 3))
+    hits = first_hit(shapes, origins, (to_ring / length[..., None]).reshape(-1, 3))
+    distance, hit = hits.distance_m, hits.object_id
     same = hit.reshape(length.shape) == found[placed][:, None]
     same &= np.abs(distance.reshape(length.shape) - length) < _SAME_FACE_M
     for i, fits in zip(placed, same.all(axis=1), strict=True):

@@ -12,20 +12,19 @@ Film positions are pixels (u, v), shape (N, 2); points are world coordinates in 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import ndtri
 from scipy.stats import qmc
 
-from phibench.render.optics.ray_tracer import MirrorRays, blocked_by, lens_rays, reflect
+from phibench.render.optics.ray_tracer import MirrorRays, lens_rays, reflect
+from phibench.render.optics.room_tracer import GeometryLike, blocked_by
 from phibench.render.optics.spot_layer import SpotLayer
 from phibench.render.optics.truth import SpotTruth
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
-from phibench.scenes.shapes import Shape
 
 # Both chief rays are exact up to rounding. Centroid and flux: five and six times what the fewest rays leave, below.
 CHIEF_TOLERANCE_PX = 1e-6
@@ -62,7 +61,7 @@ class Certificate:
     passed: bool
 
 
-def certify(view: View, spot: LaserSpot, shapes: Sequence[Shape], truth: SpotTruth, layer: SpotLayer) -> Certificate:
+def certify(view: View, spot: LaserSpot, room: GeometryLike, truth: SpotTruth, layer: SpotLayer) -> Certificate:
     """Check one visible spot. Raises nothing: look at `passed`.
 
     More rays are traced before a difference counts: the first few may not be enough for a wide or a cut image.
@@ -71,7 +70,7 @@ def certify(view: View, spot: LaserSpot, shapes: Sequence[Shape], truth: SpotTru
     start = _through_chief_point(view, truth, np.zeros((1, 2)))
     chief_px = float(np.linalg.norm(aim(view, spot, _Bundle.chief(), np.zeros((1, 2)), start)[0] - chief))
     for log2_rays in _LOG2_RAYS:
-        centroid_px, flux = _differences(view, spot, shapes, truth, layer, log2_rays)
+        centroid_px, flux = _differences(view, spot, room, truth, layer, log2_rays)
         # a NaN does not pass
         passed = chief_px <= CHIEF_TOLERANCE_PX and centroid_px <= CENTROID_TOLERANCE_PX and flux <= FLUX_TOLERANCE
         if passed:
@@ -80,10 +79,10 @@ def certify(view: View, spot: LaserSpot, shapes: Sequence[Shape], truth: SpotTru
 
 
 def _differences(
-    view: View, spot: LaserSpot, shapes: Sequence[Shape], truth: SpotTruth, layer: SpotLayer, log2_rays: int
+    view: View, spot: LaserSpot, room: GeometryLike, truth: SpotTruth, layer: SpotLayer, log2_rays: int
 ) -> tuple[float, float]:
     """Centroid difference, pixels, and relative flux difference of layer and traced rays; 0 where both are dark."""
-    centroid, watts = trace_spot(view, spot, shapes, truth, log2_rays)
+    centroid, watts = trace_spot(view, spot, room, truth, log2_rays)
     plane = brightest(layer)
     gain = view.rig.camera.detector.laser_electrons_per_joule(spot.wavelength_nm)[plane]
     total = float(layer.electrons_per_s[plane].sum())
@@ -170,7 +169,7 @@ def _through_chief_point(view: View, truth: SpotTruth, lens_m: Array) -> Array:
 
 
 def trace_spot(
-    view: View, spot: LaserSpot, shapes: Sequence[Shape], truth: SpotTruth, log2_rays: int
+    view: View, spot: LaserSpot, room: GeometryLike, truth: SpotTruth, log2_rays: int
 ) -> tuple[Array, float]:
     """Centroid (2,) of the pixel-sampled image of the spot, and its power on the film, watts."""
     x = np.clip(qmc.Sobol(6, scramble=True, rng=_SEED).random_base2(log2_rays), 1e-12, 1.0 - 1e-12)
@@ -179,7 +178,7 @@ def trace_spot(
     uv, jacobian = _linear_aim(view, spot, bundle, wall, truth)
     with np.errstate(invalid="ignore"):
         area = density * np.abs(jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0])
-        watts = _watts(view, spot, shapes, uv, bundle) / area / len(x)
+        watts = _watts(view, spot, room, uv, bundle) / area / len(x)
         lost = ~np.isfinite(watts) | ~np.isfinite(uv).all(axis=-1)
         watts, uv = np.where(lost, 0.0, watts), np.where(lost[:, None], 0.0, uv)
         return watts @ _expected_pixel(uv, view.rig.camera.blur_sigma_px) / watts.sum(), float(watts.sum())
@@ -269,7 +268,7 @@ def _wall_jacobian(view: View, spot: LaserSpot, uv: Array, bundle: _Bundle) -> A
     return np.stack([(plus - minus) / (2.0 * _STEP_PX) for plus, minus in sides], axis=-1)
 
 
-def _watts(view: View, spot: LaserSpot, shapes: Sequence[Shape], uv: Array, bundle: _Bundle) -> Array:
+def _watts(view: View, spot: LaserSpot, room: GeometryLike, uv: Array, bundle: _Bundle) -> Array:
     """Radiance x etendue, watts per square pixel for the whole aperture, shape (N,)."""
     camera = view.rig.camera
     rays = _reflect(view, spot, uv, bundle)
@@ -281,7 +280,7 @@ def _watts(view: View, spot: LaserSpot, shapes: Sequence[Shape], uv: Array, bund
     watts = radiance * density * rays.cos_lens**4 * math.pi * camera.aperture_radius_m**2
     hit = np.isfinite(watts)
     legs = ((rays.mirror_points_m[hit], points[hit]), (rays.lens_points_m[hit], rays.mirror_points_m[hit]))
-    watts[hit] *= np.all([blocked_by(shapes, start, end) < 0 for start, end in legs], axis=0)
+    watts[hit] *= np.all([blocked_by(room, start, end) < 0 for start, end in legs], axis=0)
     return watts
 
 

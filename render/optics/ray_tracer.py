@@ -1,4 +1,4 @@
-"""Camera-side ray tracer in float64: pixel, mirror, room.
+"""Camera-side ray tracer in float64: from the pixel to the mirror and away; `room_tracer` goes on to the room.
 
 It shares no mathematics with the world-side solution (`reflection_point`), so that the two can certify each other. A
 form error enters by the values of the mirror's radius alone: neither its tensors nor its derivatives are used. The
@@ -6,24 +6,20 @@ harmonics are written out as in `scenes/mirror.py`. The ray's place is found by 
 q = |P|^2 - r(P / |P|)^2, which for a sphere is a parabola in the distance along the ray. The normal follows from
 differences of surface points.
 
-Rooms are intersected in closed form for each shape, as the exact counterpart of Mitsuba's float32 intersections.
-
 Rays are origins and unit directions, shape (N, 3), world frame, metres.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from phibench.scenes.frames import Array
 from phibench.scenes.mirror import Form
 from phibench.scenes.rig import View
-from phibench.scenes.shapes import Cuboid, Rectangle, Shape
 
 Radius = Callable[[Array], Array]
 
@@ -66,33 +62,39 @@ def lens_rays(view: View, uv_px: Array, lens_m: Array | None = None) -> tuple[Ar
         Points on the aperture, metres from the lens centre, camera x and y; None is the lens centre.
     """
     camera, pose = view.rig.camera, view.T_world_camera
-    xy = camera.normalised(uv_px)
-    focus = camera.focus_distance_m * np.concatenate([xy, np.ones((len(xy), 1))], axis=-1)
-    lens = np.zeros_like(focus)
-    if lens_m is not None:
-        lens[:, :2] = lens_m
-    direction = focus - lens
-    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-    return pose.points(lens), pose.directions(direction)
+    x, y = camera.focus_distance_m * camera.normalised(uv_px).T
+    if lens_m is None:
+        origins = np.broadcast_to(pose.t, (len(x), 3))
+    else:
+        x, y = x - lens_m[:, 0], y - lens_m[:, 1]
+        origins = lens_m @ pose.R[:, :2].T + pose.t
+    z = camera.focus_distance_m
+    directions = pose.R @ (np.stack([x, y, np.full_like(x, z)]) / np.sqrt(x * x + y * y + z * z))
+    return origins, directions.T  # rows of x, y, z lie together: whole images take half the time
 
 
 def reflect(view: View, origins_m: Array, directions: Array) -> MirrorRays:
     """Intersect world rays, shape (N, 3), with the mirror and reflect them."""
     if view.rig.mirror.form is not None:
         return _reflect_at_form(view, origins_m, directions)
-    radius = view.rig.mirror.radius_m
-    offset = origins_m - view.sphere_centre_m
-    approach = -_dot(offset, directions)
-    miss = offset + approach[:, None] * directions  # nearest point to the centre: no cancellation
+    radius, centre, d = view.rig.mirror.radius_m, view.sphere_centre_m[:, None], directions.T
+    offset = origins_m.T - centre
+    approach = -_inner(offset, d)
+    miss = offset + approach * d  # nearest point to the centre: no cancellation
     with np.errstate(invalid="ignore"):
-        root = np.sqrt(radius**2 - _dot(miss, miss))
-        t = (_dot(offset, offset) - radius**2) / (approach + root)
+        root = np.sqrt(radius**2 - _inner(miss, miss))
+        t = (_inner(offset, offset) - radius**2) / (approach + root)
         t = np.where(t > 0.0, t, np.nan)
-    normals = (offset + t[:, None] * directions) / radius
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    cos_i = -_dot(normals, directions)
-    out = directions + 2.0 * cos_i[:, None] * normals
-    return MirrorRays(view.sphere_centre_m + radius * normals, normals, out, cos_i, t)
+    normals = (offset + t * d) / radius
+    normals /= np.sqrt(_inner(normals, normals))
+    cos_i = -_inner(normals, d)
+    out = d + 2.0 * cos_i * normals
+    return MirrorRays((centre + radius * normals).T, normals.T, out.T, cos_i, t)
+
+
+def _inner(a: Array, b: Array) -> Array:
+    """Inner products, shape (N,), of vectors as rows of x, y, z, shape (3, N)."""
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def _reflect_at_form(view: View, origins_m: Array, directions: Array) -> MirrorRays:
@@ -230,80 +232,3 @@ def _slope(added: Radius, n: Array, e: Array) -> Array:
 def _difference(added: Radius, n: Array, e: Array, angle: float) -> Array:
     c, s = math.cos(angle), math.sin(angle)
     return added(c * n + s * e) - added(c * n - s * e)
-
-
-# Rooms.
-
-
-IntArray = NDArray[np.int64]
-
-SURFACE_GAP_M = 1e-7  # a segment may touch the surface it ends on by this much; far above float64 rounding
-_CHUNK = 8192  # rays at a time: the work arrays stay in the cache
-
-
-def first_hit(shapes: Sequence[Shape], origins_m: Array, directions: Array) -> tuple[Array, IntArray]:
-    """Distance to the first shape along each ray, and that shape's index.
-
-    Parameters
-    ----------
-    shapes : sequence of Rectangle or Cuboid
-    origins_m, directions : arrays, shape (N, 3); directions of unit length
-
-    Returns
-    -------
-    distance_m : array, shape (N,); inf where nothing is hit
-    object_id : int array, shape (N,); -1 where nothing is hit
-    """
-    count = len(directions)
-    distance, object_id = np.full(count, np.inf), np.full(count, -1, dtype=np.int64)
-    for start in range(0, count, _CHUNK):
-        part = slice(start, start + _CHUNK)
-        o, d = np.ascontiguousarray(origins_m[part].T), np.ascontiguousarray(directions[part].T)
-        for index, shape in enumerate(shapes):
-            t = _hit(shape, o, d)
-            nearer = t < distance[part]
-            distance[part][nearer] = t[nearer]
-            object_id[part][nearer] = index
-    return distance, object_id
-
-
-def blocked_by(shapes: Sequence[Shape], starts_m: Array, ends_m: Array) -> IntArray:
-    """Index of the first shape between two points, shape (N,), or -1 where the segment is free.
-
-    Shapes within `SURFACE_GAP_M` of either end do not count: the ends lie on surfaces themselves.
-    """
-    span = ends_m - starts_m
-    length = np.linalg.norm(span, axis=-1)
-    directions = span / length[:, None]
-    distance, object_id = first_hit(shapes, starts_m + SURFACE_GAP_M * directions, directions)
-    return np.where(distance < length - 2.0 * SURFACE_GAP_M, object_id, -1)
-
-
-def _hit(shape: Shape, origins: Array, directions: Array) -> Array:
-    """Distance to one shape for rays of shape (3, N); inf where missed."""
-    assert isinstance(shape, Rectangle | Cuboid)
-    pose = shape.T_world_shape
-    offset = origins - pose.t[:, None]
-    if shape.T_world_shape.rotation != _UPRIGHT:
-        offset, directions = pose.R.T @ offset, pose.R.T @ directions
-    half = 0.5 * np.array(shape.size_m)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return _slabs(half, offset, directions) if isinstance(shape, Cuboid) else _plane(half, offset, directions)
-
-
-_UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-
-
-def _plane(half: Array, o: Array, d: Array) -> Array:
-    t = -o[2] / d[2]
-    inside = (np.abs(o[0] + t * d[0]) <= half[0]) & (np.abs(o[1] + t * d[1]) <= half[1])
-    return np.where(inside & (t > 0.0), t, np.inf)
-
-
-def _slabs(half: Array, o: Array, d: Array) -> Array:
-    inverse = 1.0 / np.where(d == 0.0, 1e-300, d)  # 1 / 0 would make NaN for a ray in a face's plane
-    centre, reach = -o * inverse, half[:, None] * np.abs(inverse)
-    near = (centre - reach).max(axis=0)
-    far = (centre + reach).min(axis=0)
-    t = np.where(near > 0.0, near, far)  # from inside, the way out
-    return np.where((near <= far) & (far > 0.0), t, np.inf)

@@ -12,20 +12,19 @@ Windows have the shape (3, h, w), planes R, G, B; integer (u, v) are pixel centr
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import erf, ndtr
 from scipy.stats import qmc
 
-from phibench.render.optics.ray_tracer import MirrorRays, blocked_by, lens_rays, reflect
+from phibench.render.optics.ray_tracer import MirrorRays, lens_rays, reflect
 from phibench.render.optics.reflection_point import mirror_points
+from phibench.render.optics.room_tracer import GeometryLike, blocked_by
 from phibench.render.optics.spot_samples import FilmCloud, disc_points, film_position, slices, specular_cloud
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
-from phibench.scenes.shapes import Shape
 
 _TAIL_SIGMAS = 6.5  # a Gaussian's flux beyond it is 8e-11
 _POINTS_AT_ONCE = 16384
@@ -60,9 +59,9 @@ class SpotLayer:
     total_electrons_per_s: Array
 
 
-def spot_layer(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> SpotLayer:
+def spot_layer(view: View, spot: LaserSpot, room: GeometryLike) -> SpotLayer:
     """Render the spot by specular connection (ideal mirror) or microfacet sampling (rough mirror)."""
-    cloud = (rough_cloud if view.rig.mirror.roughness_alpha > 0.0 else specular_cloud)(view, spot, shapes)
+    cloud = (rough_cloud if view.rig.mirror.roughness_alpha > 0.0 else specular_cloud)(view, spot, room)
     gain = np.array(view.rig.camera.detector.laser_electrons_per_joule(spot.wavelength_nm))
     return splat(cloud, view.rig.camera.blur_sigma_px, gain)
 
@@ -124,7 +123,7 @@ class _Samples:
     film: Array
 
 
-def rough_cloud(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> FilmCloud:
+def rough_cloud(view: View, spot: LaserSpot, room: GeometryLike) -> FilmCloud:
     """Film points and powers for a mirror with roughness_alpha > 0; empty where the spot has no reflection point."""
     centre_uv = _specular(view, np.array([spot.position_world_m]), np.zeros((1, 2)))
     if not np.isfinite(centre_uv).all():
@@ -135,7 +134,7 @@ def rough_cloud(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> FilmClo
     lit = np.all(np.isfinite(uv), axis=1)
     uv, points, lens, film = uv[lit], samples.points_m[lit], samples.lens_m[lit], samples.film[lit]
     density = np.exp(-0.5 * (film**2).sum(axis=1)) / (2.0 * math.pi * _WIDER**2 * abs(np.linalg.det(spread)))
-    watts = _power(view, spot, shapes, uv, lens, points) / density / len(samples.film)
+    watts = _power(view, spot, room, uv, lens, points) / density / len(samples.film)
     seen = np.isfinite(watts)
     return FilmCloud(uv[seen], watts[seen])
 
@@ -189,7 +188,7 @@ def _half_vector(rays: MirrorRays, points: Array) -> Array:
     return half / np.linalg.norm(half, axis=-1, keepdims=True)
 
 
-def _power(view: View, spot: LaserSpot, shapes: Sequence[Shape], uv: Array, lens: Array, points: Array) -> Array:
+def _power(view: View, spot: LaserSpot, room: GeometryLike, uv: Array, lens: Array, points: Array) -> Array:
     """Watts per square pixel that reach the film at uv from the whole spot's power concentrated in each point."""
     camera = view.rig.camera
     origins, directions = lens_rays(view, uv, lens)
@@ -204,7 +203,7 @@ def _power(view: View, spot: LaserSpot, shapes: Sequence[Shape], uv: Array, lens
     free = np.ones(len(uv), dtype=bool)
     hit = np.isfinite(radiance)
     legs = ((rays.points_m[hit], points[hit]), (origins[hit], rays.points_m[hit]))
-    free[hit] = np.all([blocked_by(shapes, start, end) < 0 for start, end in legs], axis=0)
+    free[hit] = np.all([blocked_by(room, start, end) < 0 for start, end in legs], axis=0)
     return np.where(free, etendue * radiance, 0.0)
 
 

@@ -26,12 +26,11 @@ from numpy.polynomial.legendre import leggauss
 from scipy.special import ndtri
 from scipy.stats import qmc
 
-from phibench.render.optics.ray_tracer import blocked_by
 from phibench.render.optics.reflection_point import bundle_spread, mirror_points
+from phibench.render.optics.room_tracer import GeometryLike, blocked_by
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
-from phibench.scenes.shapes import Shape
 
 Profile = Literal["uniform", "gaussian"]
 
@@ -115,15 +114,15 @@ class FilmCloud:
             return self.watts @ self.uv_px / self.watts.sum()
 
 
-def specular_cloud(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> FilmCloud:
+def specular_cloud(view: View, spot: LaserSpot, room: GeometryLike) -> FilmCloud:
     """Quadrature over spot and aperture; occluded pairs keep their place with power 0.
 
     Where an edge cuts the light, nodes would sample a step: dense quasi-random pairs take over.
     """
-    return _dense_cloud(view, spot, shapes) if _is_cut(view, spot, shapes) else _node_cloud(view, spot, shapes)
+    return _dense_cloud(view, spot, room) if _is_cut(view, spot, room) else _node_cloud(view, spot, room)
 
 
-def _node_cloud(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> FilmCloud:
+def _node_cloud(view: View, spot: LaserSpot, room: GeometryLike) -> FilmCloud:
     spot_nodes, spot_weights, lens_nodes, lens_weights = _nodes(view, spot)
     lens_steps = max(1, _PAIRS_AT_ONCE // len(spot_nodes))
     parts = []
@@ -131,29 +130,29 @@ def _node_cloud(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> FilmClo
         lens = lens_nodes[start : start + lens_steps]
         points, eyes = _pairs(spot_nodes, lens)
         weight = np.outer(lens_weights[start : start + lens_steps], spot_weights).ravel()
-        parts.append(_connect(view, spot, shapes, points, eyes, weight))
+        parts.append(_connect(view, spot, room, points, eyes, weight))
     return _joined(parts)
 
 
-def _dense_cloud(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> FilmCloud:
+def _dense_cloud(view: View, spot: LaserSpot, room: GeometryLike) -> FilmCloud:
     """Sobol pairs of spot and aperture: steps are found to about 1e-3 of the flux."""
     x = qmc.Sobol(4, scramble=True, rng=_SEED).random_base2(_LOG2_DENSE)
     points = _spot_points(spot, disc_points(spot.profile, x[:, :2]))
     eyes = _lens_points(view, disc_points("uniform", x[:, 2:]))
     area = math.pi * view.rig.camera.aperture_radius_m**2
     weight = np.full(len(x), spot.albedo * spot.power_w / math.pi * area / len(x))
-    parts = [_connect(view, spot, shapes, points[s], eyes[s], weight[s]) for s in slices(len(x), _PAIRS_AT_ONCE)]
+    parts = [_connect(view, spot, room, points[s], eyes[s], weight[s]) for s in slices(len(x), _PAIRS_AT_ONCE)]
     return _joined(parts)
 
 
-def _is_cut(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> bool:
+def _is_cut(view: View, spot: LaserSpot, room: GeometryLike) -> bool:
     """True if a part of the light is blocked and a part is not: pairs of spot and aperture, centre to rim (4 sigma)."""
     rim = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
     reach = (4.0, 2.0, 1.0) if spot.profile == "gaussian" else (1.0, 0.8, 0.4)
     disc = np.concatenate([np.zeros((1, 2)), *(scale * rim for scale in reach)])
     lens = np.concatenate([np.zeros((1, 2)), rim])
     points, eyes = _pairs(_spot_points(spot, disc), _lens_points(view, lens))
-    cloud = _connect(view, spot, shapes, points, eyes, np.ones(len(points)))
+    cloud = _connect(view, spot, room, points, eyes, np.ones(len(points)))
     lit = cloud.watts > 0.0
     return bool(lit.any()) and not bool(lit.all() and len(lit) == len(points))
 
@@ -213,14 +212,12 @@ def _lens_points(view: View, disc: Array) -> Array:
 
 
 def _pairs(points: Array, eyes: Array) -> tuple[Array, Array]:
-    """Every eye with every point, shapes (len(eyes) * len(points), 3)."""
+    """Every eye with every point, room (len(eyes) * len(points), 3)."""
     return np.tile(points, (len(eyes), 1)), np.repeat(eyes, len(points), axis=0)
 
 
-def _connect(
-    view: View, spot: LaserSpot, shapes: Sequence[Shape], points: Array, eyes: Array, weight: Array
-) -> FilmCloud:
-    """Film positions and powers of pairs (spot point, aperture point), shapes (N, 3), with quadrature weights (N,)."""
+def _connect(view: View, spot: LaserSpot, room: GeometryLike, points: Array, eyes: Array, weight: Array) -> FilmCloud:
+    """Film positions and powers of pairs (spot point, aperture point), room (N, 3), with quadrature weights (N,)."""
     found = mirror_points(view, points, eyes)
     mirror, lit = found.points_m, found.lit
     from_spot, to_lens = _unit(mirror - points), _unit(eyes - mirror)
@@ -230,16 +227,16 @@ def _connect(
     spread = bundle_spread(view, mirror, points, eyes, cos_i)
     rho = view.rig.mirror.reflectance(cos_i, spot.wavelength_nm)
     watts = weight * rho * np.maximum(cos_spot, 0.0) * np.maximum(cos_lens, 0.0) / spread
-    free = lit & _unobstructed(shapes, points, mirror, eyes, lit)
+    free = lit & _unobstructed(room, points, mirror, eyes, lit)
     pose = view.T_world_camera.inverse()
     uv = film_position(view, pose.points(eyes), pose.points(mirror))
     return FilmCloud(uv[lit], np.where(free, watts, 0.0)[lit])
 
 
-def _unobstructed(shapes: Sequence[Shape], points: Array, mirror: Array, eyes: Array, lit: BoolArray) -> BoolArray:
+def _unobstructed(room: GeometryLike, points: Array, mirror: Array, eyes: Array, lit: BoolArray) -> BoolArray:
     free = np.zeros(len(points), dtype=bool)
     legs = ((mirror[lit], points[lit]), (eyes[lit], mirror[lit]))
-    free[lit] = np.all([blocked_by(shapes, start, end) < 0 for start, end in legs], axis=0)
+    free[lit] = np.all([blocked_by(room, start, end) < 0 for start, end in legs], axis=0)
     return free
 
 

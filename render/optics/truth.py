@@ -8,17 +8,24 @@ metres. NaN marks what does not exist.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from phibench.render.optics.ray_tracer import blocked_by, first_hit, trace_pixels
+from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.reflection_point import mirror_points
+from phibench.render.optics.room_tracer import (
+    Finder,
+    GeometryLike,
+    RoomGeometry,
+    as_geometry,
+    blocked_by,
+)
+from phibench.scenes.faces import IntArray
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View, limb_points
-from phibench.scenes.shapes import Shape
 
 
 @dataclass(frozen=True)
@@ -54,12 +61,14 @@ def mirror_angles(normals: Array, directions: Array) -> MirrorAngles:
 
 
 def _from_downward(v: Array) -> Array:
-    return np.arctan2(np.hypot(v[..., 0], v[..., 1]), -v[..., 2])
+    x, y, z = np.moveaxis(v, -1, 0)
+    return np.arctan2(np.sqrt(x * x + y * y), -z)
 
 
 def _between(a: Array, b: Array) -> Array:
     """Angle between unit vectors, accurate for small and large angles (Kahan)."""
-    return 2.0 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
+    apart, together = (np.moveaxis(v, -1, 0) for v in (a - b, a + b))
+    return 2.0 * np.arctan2(*(np.sqrt(x * x + y * y + z * z) for x, y, z in (apart, together)))
 
 
 VISIBLE, NO_REFLECTION, EDGE, FACES_AWAY, OUTSIDE = (
@@ -105,7 +114,7 @@ class SpotTruth:
     cause: str
 
 
-def spot_truth(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> SpotTruth:
+def spot_truth(view: View, spot: LaserSpot, room: GeometryLike) -> SpotTruth:
     """Trace the chief ray of a spot: position, angles, lengths, and why it is not seen where it is not."""
     point, eye, centre = np.array([spot.position_world_m]), view.camera_centre_m[None], view.sphere_centre_m
     found = mirror_points(view, point, eye)
@@ -114,7 +123,7 @@ def spot_truth(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> SpotTrut
     path = np.linalg.norm(leaving, axis=-1)
     uv = view.rig.camera.project(view.T_world_camera.inverse().points(mirror))[0]
     angles = mirror_angles(normals, leaving / path[:, None])
-    cause = _cause(view, spot, shapes, mirror, uv)
+    cause = _cause(view, spot, room, mirror, uv)
     return SpotTruth(
         u_px=float(uv[0]),
         v_px=float(uv[1]),
@@ -135,10 +144,11 @@ def spot_truth(view: View, spot: LaserSpot, shapes: Sequence[Shape]) -> SpotTrut
 def depth_m(point_world_m: Array, sphere_centre_down_m: Array) -> Array:
     """D: horizontal distance of points, shape (..., 3), from the vertical line through the sphere centre when down."""
     offset = np.asarray(point_world_m, float)[..., :2] - sphere_centre_down_m[:2]
-    return np.hypot(offset[..., 0], offset[..., 1])
+    x, y = offset[..., 0], offset[..., 1]
+    return np.sqrt(x * x + y * y)
 
 
-def _cause(view: View, spot: LaserSpot, shapes: Sequence[Shape], mirror: Array, uv: Array) -> str:
+def _cause(view: View, spot: LaserSpot, room: GeometryLike, mirror: Array, uv: Array) -> str:
     point, eye = np.array([spot.position_world_m]), view.camera_centre_m[None]
     if not np.isfinite(mirror).all():
         return NO_REFLECTION
@@ -148,10 +158,11 @@ def _cause(view: View, spot: LaserSpot, shapes: Sequence[Shape], mirror: Array, 
         return FACES_AWAY
     if not view.rig.camera.contains(uv):
         return OUTSIDE
+    geometry = as_geometry(room)
     for start, end in ((mirror, point), (eye, mirror)):
-        blocker = int(blocked_by(shapes, start, end)[0])
+        blocker = int(blocked_by(geometry, start, end)[0])
         if blocker >= 0:
-            return OCCLUDED + shapes[blocker].name
+            return OCCLUDED + geometry.shapes[blocker].name
     return VISIBLE
 
 
@@ -195,8 +206,16 @@ TRUTH_PLANES = (
 )
 
 
-def truth_layer(view: View, shapes: Sequence[Shape]) -> dict[str, Array]:
+def truth_layer(view: View, room: GeometryLike, finder: Finder | None = None) -> dict[str, Array]:
     """Trace every pixel centre through the mirror.
+
+    Parameters
+    ----------
+    view
+    room : RoomGeometry or sequence of shapes
+    finder : callable (origins, directions) -> faces, or None
+        Guesses the face of each ray: index in the geometry's `table`, -1 for none. `RoomGeometry.resolve` checks the
+        guesses; without a finder all rays are traced.
 
     Returns
     -------
@@ -204,32 +223,68 @@ def truth_layer(view: View, shapes: Sequence[Shape]) -> dict[str, Array]:
         Keys are `TRUTH_PLANES`: world point hit, D, path lens centre -> mirror -> point, the three phi, azimuth and
         object id. NaN (object id -1) where the ray misses the mirror or hits nothing.
     """
-    camera = view.rig.camera
-    planes = {name: np.full((camera.height_px, camera.width_px), np.nan) for name in TRUTH_PLANES}
+    camera, geometry = view.rig.camera, as_geometry(room)
+    planes = dict(
+        zip(TRUTH_PLANES, np.full((len(TRUTH_PLANES), camera.height_px, camera.width_px), np.nan), strict=True)
+    )
     planes["object_id"][:] = -1.0
+    blocks = [_traced_rows(view, rows, columns) for rows, columns in _disc_blocks(view)]
+    guesses: list[IntArray | None] = [None] * len(blocks)
+    if finder is not None:
+        ends = np.cumsum([len(block.pixel) for block in blocks])[:-1]
+        points, directions = (np.concatenate([getattr(b, name) for b in blocks]) for name in ("points_m", "directions"))
+        guesses = list(np.split(finder(points, directions), ends))
+    for block, guess in zip(blocks, guesses, strict=True):
+        _fill(planes, view, geometry, block, guess)
+    return planes
+
+
+_ROWS = 24  # of the image at a time: the work arrays stay in the cache
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Chief rays of N pixels after the mirror; `pixel` counts along the rows of the image."""
+
+    pixel: IntArray
+    points_m: Array
+    normals: Array
+    directions: Array
+    path_camera_mirror_m: Array
+
+
+def _disc_blocks(view: View) -> Iterator[tuple[range, range]]:
     rows, columns = _disc_window(view)
-    v, u = np.mgrid[rows, columns]
-    uv = np.stack([u.ravel(), v.ravel()], axis=-1).astype(float)
-    rays = trace_pixels(view, uv)
+    for first in range(rows.start, rows.stop, _ROWS):
+        yield range(first, min(first + _ROWS, rows.stop)), range(columns.start, columns.stop)
+
+
+def _traced_rows(view: View, rows: range, columns: range) -> _Block:
+    v, u = np.repeat(np.array(rows), len(columns)), np.tile(np.array(columns), len(rows))
+    rays = trace_pixels(view, np.stack([u, v]).T.astype(float))
     hit = np.flatnonzero(np.isfinite(rays.cos_incidence))
-    points, normals, directions = rays.points_m[hit], rays.normals[hit], rays.directions[hit]
-    distance, object_id = first_hit(shapes, points, directions)
-    seen = object_id >= 0
-    hit, world = hit[seen], (points + distance[:, None] * directions)[seen]
-    angles = mirror_angles(normals[seen], directions[seen])
+    points, normals, directions = (np.take(a.T, hit, axis=1).T for a in (rays.points_m, rays.normals, rays.directions))
+    pixel = (v * view.rig.camera.width_px + u)[hit]
+    return _Block(pixel, points, normals, directions, rays.path_camera_mirror_m[hit])
+
+
+def _fill(planes: dict[str, Array], view: View, room: RoomGeometry, block: _Block, guess: IntArray | None) -> None:
+    points, directions = block.points_m, block.directions
+    found = room.first_hit(points, directions) if guess is None else room.resolve(points, directions, guess)
+    seen = found.object_id >= 0
+    distance = np.where(seen, found.distance_m, np.nan)
+    world = points.T + distance * directions.T
+    angles = mirror_angles(block.normals, directions)
     values = (
-        *world.T,
-        depth_m(world, view.rig.at(0.0).sphere_centre_m),
-        rays.path_camera_mirror_m[hit] + distance[seen],
-        angles.phi_ray_rad,
-        angles.phi_normal_rad,
-        angles.phi_incidence_rad,
-        angles.azimuth_rad,
-        object_id[seen],
+        *world,
+        depth_m(world.T, view.rig.at(0.0).sphere_centre_m),
+        block.path_camera_mirror_m + distance,
+        *(np.where(seen, angle, np.nan) for angle in (angles.phi_ray_rad, angles.phi_normal_rad)),
+        *(np.where(seen, angle, np.nan) for angle in (angles.phi_incidence_rad, angles.azimuth_rad)),
+        found.object_id,
     )
     for name, value in zip(TRUTH_PLANES, values, strict=True):
-        planes[name][v.ravel()[hit], u.ravel()[hit]] = value
-    return planes
+        planes[name].reshape(-1)[block.pixel] = value
 
 
 def _disc_window(view: View) -> tuple[slice, slice]:

@@ -200,7 +200,8 @@ def traced_lamp(view: View, side: int = 5) -> np.ndarray:
 
     Rays go all over the lens: through its centre alone the centroid would be 0.02 px off, of a sphere's image as well.
     """
-    from phibench.render.optics.ray_tracer import first_hit, trace_pixels
+    from phibench.render.optics.ray_tracer import trace_pixels
+    from phibench.render.optics.room_tracer import first_hit
 
     u0, v0, width, height = CROP
     cell, rng = np.mgrid[0:side, 0:side].reshape(2, -1).T, np.random.default_rng(0)
@@ -212,7 +213,7 @@ def traced_lamp(view: View, side: int = 5) -> np.ndarray:
     rays = trace_pixels(view, uv, lens)
     seen = np.isfinite(rays.cos_incidence)
     lit = np.zeros(len(uv))
-    lit[seen] = first_hit((LAMP,), rays.points_m[seen], rays.directions[seen])[1] == 0
+    lit[seen] = first_hit((LAMP,), rays.points_m[seen], rays.directions[seen]).object_id == 0
     reflectance = view.rig.mirror.reflectance(rays.cos_incidence, view.rig.camera.detector.band_wavelength_nm[0])
     value = np.nan_to_num(lit * electrons(view.rig.camera, uv) * reflectance)
     return value.reshape(height, width, side * side).mean(axis=-1)

@@ -17,7 +17,7 @@ from phibench.estimator.geometry.panorama import Grid
 from phibench.estimator.geometry.phi import outline_circle
 from phibench.estimator.geometry.reflection import reflect
 from phibench.estimator.studies.misaligned_rigs import centroids_px, seen_px
-from phibench.render.optics.ray_tracer import blocked_by
+from phibench.render.optics.room_tracer import blocked_by
 from phibench.scenes.frames import Array, Pose, as_vector
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.room import carriage

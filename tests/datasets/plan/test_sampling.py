@@ -18,7 +18,7 @@ from phibench.datasets.plan.sampling import PARAMETERS, drawn_parameters, first_
 from phibench.datasets.recipe.checks import warnings
 from phibench.datasets.recipe.distributions import DistributionTable, quantile
 from phibench.datasets.recipe.load import check_recipe, load_recipe
-from phibench.render.optics.ray_tracer import blocked_by
+from phibench.render.optics.room_tracer import blocked_by
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.catalog import X_HIGH, X_LOW, Y_HIGH, Y_LOW
 from phibench.scenes.rig import POSITIONS

@@ -40,7 +40,7 @@ from phibench.estimator.limits.stroke_curve import (
     stroke_curve,
 )
 from phibench.estimator.spots.spot_prediction import Laser, spot_electrons_per_s
-from phibench.render.optics.ray_tracer import blocked_by
+from phibench.render.optics.room_tracer import blocked_by
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import EDGE, NO_REFLECTION, OUTSIDE, spot_truth
 from phibench.render.optics.truth import OCCLUDED as RENDERED_OCCLUDED
