@@ -116,7 +116,7 @@ class _Pieces:
         )
 
     def outside_m(self, piece: IntArray, points: Array) -> Array:
-        """How far points, shape (3, K), of the planes of pieces (K,) lie outside them; negative inside."""
+        """Distance outside pieces (K,) of points (3, K) in their planes, metres; negative inside."""
         x, y, z = points
         A, B = self.a, self.b
         a = A[0][piece] * x + A[1][piece] * y + A[2][piece] * z - A[3][piece]
@@ -125,14 +125,14 @@ class _Pieces:
 
 
 def _outside(a: Array, b: Array, slant: Array, scale: Array) -> Array:
-    """How far places (a, b) lie outside their pieces, metres."""
+    """Distance of places (a, b) outside their pieces, metres."""
     outside = np.maximum(-a * scale[0], -b * scale[1])
     np.maximum(outside, (a + slant * b - 1.0) * scale[2], out=outside)
     return np.maximum(outside, (b + slant * a - 1.0) * scale[3], out=outside)
 
 
 def _reach_m(cos: Array) -> Array:
-    """How far a face reaches beyond its border, for the cosine between a ray and its normal."""
+    """Reach of a face beyond its border, metres, for the cosine between a ray and its normal."""
     return _REACH_M / np.maximum(np.abs(cos), _FLATTEST)
 
 
