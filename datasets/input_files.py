@@ -9,6 +9,7 @@ A name in a document that leads to another file is a `FileName`: relative, below
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import math
@@ -18,7 +19,7 @@ import stat
 import tomllib
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast
@@ -383,3 +384,23 @@ def _columns_fault(found: Mapping[str, Any], wanted: dict[str, Any]) -> str:
         return f"no column '{missing[0]}'"
     wrong = next((name for name in wanted if found[name] != wanted[name]), None)
     return "" if wrong is None else f"a column '{wrong}' of type {found[wrong]}, not {wanted[wrong]}"
+
+
+# Libraries that print.
+
+
+@contextlib.contextmanager
+def quiet_terminal() -> Iterator[None]:
+    """Keep what a library prints about a damaged file off the terminal: it is said once, by the exception."""
+    try:
+        terminal = os.dup(2)
+    except OSError:  # closed by whoever started us: nothing can be printed there
+        yield
+        return
+    try:
+        with Path(os.devnull).open("w") as nowhere, contextlib.redirect_stdout(io.StringIO()):
+            os.dup2(nowhere.fileno(), 2)
+            yield
+    finally:
+        os.dup2(terminal, 2)
+        os.close(terminal)

@@ -63,7 +63,7 @@ def mesh_room(settings: MeshSettings) -> Room:
         )
     paints = [_paint(settings, part) for part in meshes]
     bitmaps = _bitmaps(settings, meshes, paints)
-    shapes = tuple(_mesh(part, *bitmaps[k]) for k, part in enumerate(meshes))
+    shapes = tuple(mesh_shape(part, *bitmaps[k]) for k, part in enumerate(meshes))
     return Room(settings.name, lamps, shapes)
 
 
@@ -287,7 +287,8 @@ def _plain(settings: MeshSettings, want: _Wanted) -> tuple[Texture, Array | None
 # Shapes.
 
 
-def _mesh(part: MeshPart, texture: Texture, texels: Array | None) -> Mesh:
+def mesh_shape(part: MeshPart, texture: Texture, texels: Array | None) -> Mesh:
+    """Shape of a part: without the vertices that it does not use, one-sided where it may be."""
     used, index = np.unique(part.triangles, return_inverse=True)
     triangles = index.reshape(-1, 3)
     if isinstance(texture, Bitmap) and texels is None:

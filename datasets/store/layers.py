@@ -13,13 +13,11 @@ Planes have the shape (H, W); stacks (3, h, w) hold R, G, B. FORMAT.md lists nam
 
 from __future__ import annotations
 
-import contextlib
 import errno
-import io
 import json
 import os
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import PICTURE_PIXELS, InputFile
+from phibench.datasets.input_files import PICTURE_PIXELS, InputFile, quiet_terminal
 from phibench.datasets.store.files import require_file, write_atomic
 from phibench.scenes.camera import FILTERS, LARGEST_SIDE_PX
 from phibench.scenes.frames import Array
@@ -103,9 +101,9 @@ def read_exr(path: Path) -> Exr:
 
     _check_readable(path)
     try:
-        with _quiet(), OpenEXR.File(str(path), header_only=True) as file:
+        with quiet_terminal(), OpenEXR.File(str(path), header_only=True) as file:
             _check_size(path, file.header() if file.parts else {})
-        with _quiet(), OpenEXR.File(str(path), separate_channels=True) as file:
+        with quiet_terminal(), OpenEXR.File(str(path), separate_channels=True) as file:
             if not file.parts:
                 raise DatasetError(f"{path} is damaged or truncated")
             return _content(path, file.header(), {name: c.pixels for name, c in file.channels().items()})
@@ -156,23 +154,6 @@ def _check_readable(path: Path) -> None:
         raise DatasetError(f"{path} is missing") from error
     except OSError as error:
         raise DatasetError(f"{path} is not readable: {error.strerror or error}") from error
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep what OpenEXR prints about a damaged file off the terminal: it is said once, by the exception."""
-    try:
-        terminal = os.dup(2)
-    except OSError:  # closed by whoever started us: nothing can be printed there
-        yield
-        return
-    try:
-        with Path(os.devnull).open("w") as nowhere, contextlib.redirect_stdout(io.StringIO()):
-            os.dup2(nowhere.fileno(), 2)
-            yield
-    finally:
-        os.dup2(terminal, 2)
-        os.close(terminal)
 
 
 def _content(path: Path, header: dict[str, Any], planes: dict[str, Plane]) -> Exr:

@@ -1,0 +1,160 @@
+"""Pictures with linear light: photographs (JPEG, PNG), OpenEXR and Radiance HDR, and equirectangular panoramas of them.
+
+Photographs of 8 bits count as sRGB and are turned upright as their EXIF data say. EXR and HDR files hold linear values.
+All give an array of bands R, G, B in any unit, upper row first.
+
+Radiance HDR: G. Ward, in Graphics Gems II (1991); a pixel holds three mantissas and an exponent e, and means
+mantissa x 2^(e - 136). Rows may be run-length coded, a byte plane at a time.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import ImageOps
+
+from phibench.datasets.errors import RoomError
+from phibench.datasets.input_files import PICTURE_PIXELS, InputFile, quiet_terminal
+from phibench.render.sensor.processing import srgb_decoded
+from phibench.scenes.validation import printable_line
+
+Light = NDArray[np.float32]
+"""Shape (rows, columns, 3), linear, 0 or more, finite."""
+
+ASPECT = 2.0
+_ASPECT_TOLERANCE = 0.01
+_LEAST_ROWS = 16
+_REMEDY = "give a JPEG, PNG, OpenEXR or Radiance HDR file"
+_HDR_MAGIC = (b"#?RADIANCE", b"#?RGBE")
+_EXR_MAGIC = b"\x76\x2f\x31\x01"
+
+
+def read_panorama(path: Path) -> Light:
+    """Linear light of an equirectangular picture.
+
+    Raises
+    ------
+    RoomError
+        If the file cannot be read, or its sides are not 2 : 1 within 1 %.
+    """
+    light = read_light(path)
+    rows, columns = light.shape[:2]
+    if rows < _LEAST_ROWS or abs(columns / rows - ASPECT) > ASPECT * _ASPECT_TOLERANCE:
+        raise RoomError(
+            f"{path} has {columns} x {rows} pixels: an equirectangular panorama is twice as wide as high, within 1 %, "
+            f"and has {_LEAST_ROWS} rows or more; give the whole sphere, uncut"
+        )
+    return light
+
+
+def read_light(path: Path) -> Light:
+    """Linear light of a picture.
+
+    Raises
+    ------
+    RoomError
+        If the file is missing, damaged, too large or of another kind, or holds values that are no light.
+    """
+    file = InputFile(path, _REMEDY, RoomError)
+    data = file.read()
+    if data[:4] == _EXR_MAGIC:
+        light = _exr(file)
+    elif data.startswith(_HDR_MAGIC):
+        light = _hdr(file, data)
+    else:
+        light = _photograph(file, data)
+    if not np.isfinite(light).all() or light.min() < 0.0:
+        raise file.fault("has pixels that are negative or no finite numbers")
+    return light
+
+
+def _photograph(file: InputFile, data: bytes) -> Light:
+    picture = file.picture(("PNG", "JPEG"), data)
+    if picture.mode.startswith(("I", "F")):
+        raise file.fault(f"has more than 8 bits a colour (mode {picture.mode}), whose curve is not known")
+    codes = np.asarray(ImageOps.exif_transpose(picture).convert("RGB"))
+    linear = srgb_decoded(np.arange(256) / 255.0).astype(np.float32)
+    return linear[codes]
+
+
+def _exr(file: InputFile) -> Light:
+    """Channels R, G and B, or Y alone, of an OpenEXR file."""
+    import OpenEXR
+
+    try:
+        with quiet_terminal(), OpenEXR.File(str(file.path), header_only=True) as opened:
+            low, high = (np.asarray(corner, dtype=np.int64) for corner in opened.header()["dataWindow"])
+        columns, rows = (high - low + 1).tolist()
+        if not 0 < columns * rows <= PICTURE_PIXELS:
+            raise file.fault(f"has {columns} x {rows} pixels: at most {PICTURE_PIXELS:.0e} are read")
+        with quiet_terminal(), OpenEXR.File(str(file.path), separate_channels=True) as opened:
+            planes = {name: np.asarray(channel.pixels) for name, channel in opened.channels().items()}
+    except RoomError:
+        raise
+    except Exception as error:  # the library's faults are of many kinds
+        raise file.fault(f"is a damaged OpenEXR file: {printable_line(str(error), 200)}") from error
+    names = ("R", "G", "B") if "R" in planes else ("Y", "Y", "Y")
+    if not all(name in planes and planes[name].shape == (rows, columns) for name in names):
+        raise file.fault("has no channels R, G and B of one size")
+    return np.stack([planes[name].astype(np.float32) for name in names], axis=-1)
+
+
+# Radiance HDR.
+
+
+def _hdr(file: InputFile, data: bytes) -> Light:
+    head, _, rest = data.partition(b"\n\n")
+    if b"FORMAT=32-bit_rle_rgbe" not in head:
+        raise file.fault("is no Radiance file of the format 32-bit_rle_rgbe")
+    line, _, pixels = rest.partition(b"\n")
+    size = re.fullmatch(rb"-Y (\d{1,6}) \+X (\d{1,6})\s*", line)
+    if size is None:
+        raise file.fault("is a Radiance file whose first row is not the upper one, from left to right")
+    rows, columns = int(size[1]), int(size[2])
+    if not 0 < rows * columns <= PICTURE_PIXELS:
+        raise file.fault(f"has {columns} x {rows} pixels: at most {PICTURE_PIXELS:.0e} are read")
+    try:
+        coded = _hdr_pixels(pixels, rows, columns)
+    except (IndexError, ValueError) as error:
+        raise file.fault("is a damaged Radiance file: its rows do not have the stated length") from error
+    exposures = [float(x) for x in re.findall(rb"^EXPOSURE=\s*([-+.\deE]+)\s*$", head, re.M)]
+    scale = np.exp2(coded[..., 3].astype(np.int32) - 136.0) * (coded[..., 3] > 0)
+    light = coded[..., :3] * (scale / np.prod(exposures, initial=1.0))[..., None]
+    return np.asarray(light, np.float32)
+
+
+def _hdr_pixels(data: bytes, rows: int, columns: int) -> NDArray[np.uint8]:
+    """Mantissas and exponents, shape (rows, columns, 4)."""
+    if data[:2] != b"\x02\x02" or not 8 <= columns < 32768:
+        if len(data) != 4 * rows * columns:
+            raise ValueError("neither plain nor of the newer run-length code")
+        return np.frombuffer(data, np.uint8).reshape(rows, columns, 4)
+    result = np.empty((rows, 4, columns), np.uint8)
+    at = 0
+    for row in result:
+        if data[at : at + 4] != bytes((2, 2, columns >> 8, columns & 255)):
+            raise ValueError("no head of a row")
+        at = _hdr_row(data, at + 4, row)
+    return result.transpose(0, 2, 1)
+
+
+def _hdr_row(data: bytes, at: int, row: NDArray[np.uint8]) -> int:
+    """Decode the four byte planes of a row; return the place after it."""
+    columns = row.shape[1]
+    for plane in row:
+        decoded = bytearray()
+        while len(decoded) < columns:
+            count = data[at]
+            if count > 128:
+                decoded += data[at + 1 : at + 2] * (count - 128)
+                at += 2
+            else:
+                decoded += data[at + 1 : at + 1 + count]
+                at += 1 + count
+                if count == 0:
+                    raise ValueError("a run of no length")
+        plane[:] = np.frombuffer(decoded, np.uint8)
+    return at

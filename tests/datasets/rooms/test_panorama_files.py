@@ -1,0 +1,128 @@
+"""Pictures with linear light: every format against another library's writer, and damaged ones in one sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+
+from phibench.datasets.rooms.panorama_files import read_light, read_panorama
+from phibench.scenes.validation import SceneError
+
+RNG = np.random.default_rng(7)
+LIGHT = (10.0 ** RNG.uniform(-3.0, 3.0, (32, 64, 1)) * RNG.uniform(0.2, 1.0, (32, 64, 3))).astype(np.float32)
+
+
+def write_exr(path: Path, planes: dict[str, np.ndarray]) -> Path:
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, planes) as file:
+        file.write(str(path))
+    return path
+
+
+def plain_hdr(light: np.ndarray, head: bytes = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n") -> bytes:
+    """Without run lengths: mantissas of 8 bits under the largest band's exponent."""
+    exponent = np.ceil(np.log2(light.max(axis=-1)))
+    mantissas = np.floor(light * 2.0 ** (8.0 - exponent[..., None])).clip(0, 255)
+    pixels = np.concatenate([mantissas, exponent[..., None] + 128.0], axis=-1).astype(np.uint8)
+    rows, columns = light.shape[:2]
+    return head + f"\n-Y {rows} +X {columns}\n".encode() + pixels.tobytes()
+
+
+def test_photograph_is_linear(tmp_path):
+    codes = RNG.integers(0, 256, (20, 40, 3), dtype=np.uint8)
+    Image.fromarray(codes).save(tmp_path / "a.png")
+    x = codes / 255.0
+    expected = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_allclose(read_panorama(tmp_path / "a.png"), expected, atol=1e-6)
+
+
+def test_photograph_is_turned_as_its_exif_data_say(tmp_path):
+    """Orientation 6: the stored picture is shown after a quarter turn with the clock."""
+    codes = RNG.integers(0, 256, (40, 20, 3), dtype=np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(codes).save(tmp_path / "turned.png", exif=exif)
+    Image.fromarray(np.rot90(codes, -1)).save(tmp_path / "upright.png")
+    np.testing.assert_array_equal(read_panorama(tmp_path / "turned.png"), read_panorama(tmp_path / "upright.png"))
+
+
+def test_exr_keeps_every_value(tmp_path):
+    for names in (("R", "G", "B"), ("R", "G", "B", "A")):
+        planes = {name: np.ascontiguousarray(LIGHT[..., min(k, 2)]) for k, name in enumerate(names)}
+        np.testing.assert_array_equal(read_panorama(write_exr(tmp_path / "a.exr", planes)), LIGHT)
+    grey = read_light(write_exr(tmp_path / "y.exr", {"Y": np.ascontiguousarray(LIGHT[..., 0])}))
+    np.testing.assert_array_equal(grey, np.repeat(LIGHT[..., :1], 3, axis=-1))
+
+
+def test_hdr_of_opencv_is_read(tmp_path):
+    """Run-length coded; 8-bit mantissas are good to half a step, 1/256 of the largest band."""
+    smooth = np.repeat(LIGHT, 5, axis=1)  # runs
+    for light in (LIGHT, smooth[:, : 2 * len(smooth)]):
+        cv2.imwrite(str(tmp_path / "a.hdr"), light[..., ::-1])
+        found = read_panorama(tmp_path / "a.hdr")
+        np.testing.assert_array_equal(found, cv2.imread(str(tmp_path / "a.hdr"), cv2.IMREAD_UNCHANGED)[..., ::-1])
+        assert np.max(np.abs(found - light) / light.max(axis=-1, keepdims=True)) < 1.0 / 128.0
+
+
+def test_hdr_without_run_lengths_and_with_an_exposure(tmp_path):
+    (tmp_path / "a.hdr").write_bytes(plain_hdr(LIGHT))
+    (tmp_path / "b.hdr").write_bytes(plain_hdr(LIGHT, b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=4.0\n"))
+    found = read_light(tmp_path / "a.hdr")
+    assert np.max(np.abs(found - LIGHT) / LIGHT.max(axis=-1, keepdims=True)) < 1.0 / 127.0
+    np.testing.assert_allclose(4.0 * read_light(tmp_path / "b.hdr"), found, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "word"),
+    [
+        ("a.hdr", b"#?RADIANCE\nFORMAT=32-bit_rle_xyze\n\n-Y 16 +X 32\n", "format 32-bit_rle_rgbe"),
+        ("a.hdr", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n+Y 16 +X 32\n", "first row is not the upper"),
+        ("a.hdr", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 16 +X 32\n\2\2\0\40\200", "do not have the stated length"),
+        ("a.hdr", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 16 +X 32\nabc", "do not have the stated length"),
+        ("a.hdr", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 99999 +X 99999\n", "pixels: at most"),
+        ("a.exr", b"\x76\x2f\x31\x01" + b"x" * 100, "damaged OpenEXR file"),
+        ("a.jpg", b"\xff\xd8\xff\xe0" + b"x" * 100, "picture"),
+        ("a.txt", b"no picture", "not a picture"),
+    ],
+)
+def test_damaged_pictures_end_in_one_sentence(tmp_path, name, data, word):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(SceneError, match=word) as caught:
+        read_light(tmp_path / name)
+    assert "\n" not in str(caught.value)
+
+
+def test_cut_hdr_files_are_refused(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.hdr"), LIGHT)
+    whole = (tmp_path / "a.hdr").read_bytes()
+    for kept in range(60, len(whole), 97):
+        (tmp_path / "cut.hdr").write_bytes(whole[:kept])
+        with pytest.raises(SceneError):
+            read_light(tmp_path / "cut.hdr")
+
+
+@pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
+def test_values_that_are_no_light_are_refused(tmp_path, value):
+    planes = {name: np.full((16, 32), value, np.float32) for name in "RGB"}
+    with pytest.raises(SceneError, match="negative or no finite numbers"):
+        read_light(write_exr(tmp_path / "a.exr", planes))
+
+
+@pytest.mark.parametrize("size", [(200, 90), (90, 200), (100, 100), (203, 100), (8, 4)])
+def test_pictures_that_are_no_panorama_are_refused(tmp_path, size):
+    Image.new("RGB", size, (90, 90, 90)).save(tmp_path / "a.png")
+    with pytest.raises(SceneError, match="twice as wide as high"):
+        read_panorama(tmp_path / "a.png")
+    Image.new("RGB", (201, 100)).save(tmp_path / "b.png")  # within 1 %
+    assert read_panorama(tmp_path / "b.png").shape == (100, 201, 3)
+
+
+def test_sixteen_bits_are_not_guessed_at(tmp_path):
+    Image.fromarray(np.full((16, 32), 40_000, np.uint16)).save(tmp_path / "a.png")
+    with pytest.raises(SceneError, match="8 bits"):
+        read_light(tmp_path / "a.png")
