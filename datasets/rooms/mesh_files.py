@@ -181,8 +181,10 @@ def _load(file: InputFile, data: bytes, kind: str, folder: _Folder, **options: A
     """Scene of `trimesh`; its faults are of many kinds."""
     import logging
 
-    import trimesh
-
+    try:
+        import trimesh
+    except ImportError as error:
+        raise RoomError("meshes are read by trimesh, which is not installed: pip install 'phibench[render]'") from error
     log = logging.getLogger("trimesh")
     level = log.level
     names: Any = folder  # trimesh takes what answers to `get`; its own class would have to be imported at the top

@@ -111,14 +111,17 @@ def _nominal(rig: Rig) -> Circle:
     return float(u), float(v), 0.5 * float(np.ptp(outline, axis=0).mean())
 
 
-def circle_edges(picture: Array, circle: Circle) -> Array:
-    """Steepest places of the light on rays from the circle's centre, shape (n, 2), those that RANSAC keeps."""
-    points = _steepest(picture, circle)
+def circle_edges(picture: Array, circle: Circle, either: bool = False) -> Array:
+    """Steepest places of the light on rays from the circle's centre, shape (n, 2), those that RANSAC keeps.
+
+    Light rises outwards at the limb of steel before its own room; with `either` it may fall as well.
+    """
+    points = _steepest(picture, circle, either=either)
     if len(points) >= _MIN_EDGES:
         model, inliers = ransac(points, CircleModel, 3, 2.0, max_trials=300, rng=np.random.default_rng(0))  # type: ignore[no-untyped-call]
         if model is not None and inliers is not None and inliers.sum() >= _MIN_EDGES:
             centre, radius = np.asarray(model.center, float), float(model.radius)
-            again = _steepest(picture, (centre[0], centre[1], radius), reach_px=5)
+            again = _steepest(picture, (centre[0], centre[1], radius), 5, either)
             off = np.abs(np.linalg.norm(again - centre, axis=-1) - radius)
             return np.asarray(again[off < 2.0]) if (off < 2.0).sum() >= _MIN_EDGES else points[inliers]
     raise ImageError("no circle has edges all around")
@@ -152,7 +155,7 @@ def sphere_from_rays(rays: Array, radius_m: float) -> Array:
     return np.asarray(x * cosine * radius_m / np.sqrt((1.0 - cosine) * (1.0 + cosine)))
 
 
-def _steepest(picture: Array, circle: Circle, reach_px: int = _SEARCH_PX) -> Array:
+def _steepest(picture: Array, circle: Circle, reach_px: int = _SEARCH_PX, either: bool = False) -> Array:
     u0, v0, radius = circle
     turn = np.linspace(0.0, 2.0 * np.pi, _TURNS, endpoint=False)
     r = radius + np.arange(-reach_px - 1.0, reach_px + 1.5, 0.5)
@@ -165,6 +168,7 @@ def _steepest(picture: Array, circle: Circle, reach_px: int = _SEARCH_PX) -> Arr
     with np.errstate(all="ignore"):
         rise = np.gradient(np.log(np.clip(light, 1e-3, None)), axis=-1)
     rise = ndimage.gaussian_filter1d(np.nan_to_num(rise), 1.5, axis=-1)
+    rise = np.abs(rise) if either else rise
     rise[~np.isfinite(light)] = 0.0
     best = np.argmax(rise, axis=-1)
     rows = np.arange(_TURNS)

@@ -26,6 +26,7 @@ from phibench.estimator.cli.calibration import align, calibrate
 from phibench.estimator.cli.dataset import dataset
 from phibench.estimator.cli.methods import method
 from phibench.estimator.cli.options import INSTALLATION, METHODS, SENSOR, answer_to_old_spelling
+from phibench.estimator.cli.room import room
 from phibench.estimator.cli.score import bench, compare, report, score
 from phibench.estimator.cli.seal import seal
 from phibench.estimator.cli.studies import paper, study
@@ -36,7 +37,7 @@ app = App(
     suppress_keyboard_interrupt=False,
     result_action="return_value",
 )
-for _group in (dataset, method, seal, study):
+for _group in (dataset, room, method, seal, study):
     app.command(_group)
 app.command(score, group=METHODS)
 app.command(bench, group=METHODS)

@@ -139,7 +139,7 @@ def unrolled(image: NDArray[np.generic], uv_px: Array) -> Array:
     """
     seen = np.asarray(np.isfinite(uv_px).all(axis=-1))
     where = np.where(seen[..., None], uv_px, 0.0)
-    planes = np.asarray(image, float)
+    planes = np.asarray(image) if image.dtype.kind == "f" else np.asarray(image, float)  # a large float32 stays one
     stacked = planes[..., None] if planes.ndim == 2 else planes
     each = [
         map_coordinates(stacked[..., k], (where[..., 1], where[..., 0]), order=1, mode="nearest")

@@ -1,0 +1,83 @@
+"""Commands `phibench room`: files of which a room can be made."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import App, Parameter
+
+from phibench.estimator.cli.options import DATA, Whole
+
+room = App(name="room", group=DATA, help="Make rooms of photographs.")
+
+
+@room.command
+def from_mirror_ball(
+    photo: Path,
+    *,
+    out: Path,
+    radius_m: float,
+    distance_m: float | None = None,
+    focal_px: float | None = None,
+    surroundings_m: float = 2.5,
+    circle: Annotated[tuple[float, float, float] | None, Parameter(negative="")] = None,
+    principal_point_px: Annotated[tuple[float, float] | None, Parameter(negative="")] = None,
+    camera_elevation_deg: float = 0.0,
+    width: Whole | None = None,
+) -> int:
+    """Unwrap a photograph of a mirror ball into a panorama of its surroundings.
+
+    The panorama's middle looks from the ball to the camera, which is seen there. It is taken at the ball's centre.
+
+    Parameters
+    ----------
+    photo
+        JPEG, PNG, OpenEXR or Radiance HDR file.
+    out
+        Panorama to write: .exr (linear light, and what is seen) or .png.
+    radius_m
+        Radius of the ball.
+    distance_m
+        From the lens to the ball's centre; this or --focal-px is needed.
+    focal_px
+        Focal length, pixels of the photograph.
+    surroundings_m
+        Distance of the surroundings from the ball's centre; a large number for a scene far away.
+    circle
+        Centre (u, v) and radius of the ball's outline, pixels; looked for by default.
+    principal_point_px
+        Pixel (u, v) on the camera's axis; the middle of the photograph by default.
+    camera_elevation_deg
+        Of the camera's axis above the horizon: 0 horizontal, 90 looking up at the ball.
+    width
+        Columns of the panorama, even; by default as fine as the photograph.
+    """
+    from phibench.datasets.rooms.panorama_files import read_light
+    from phibench.datasets.store.files import require_writable
+    from phibench.estimator.calibration.mirror_ball import (
+        BallPhoto,
+        find_ball,
+        require_suffix,
+        unwrap,
+        write_panorama,
+    )
+
+    stated = BallPhoto(radius_m, distance_m, focal_px, principal_point_px, circle, camera_elevation_deg)
+    require_suffix(out)
+    require_writable(out)
+    light = read_light(photo)
+    ball = find_ball(light, stated)
+    u, v, radius = ball.circle_px
+    found = "as stated" if circle else f"with edges on {100.0 * ball.edges:.0f} % of it; if it is wrong, give --circle"
+    print(f"outline: centre ({u:.1f}, {v:.1f}) px, radius {radius:.1f} px, {found}")
+    camera, s = ball.view.rig.camera, ball.view.rig.sphere_in_camera_m
+    print(f"focal length {camera.fx_px:.0f} px; ball's centre {sum(x * x for x in s) ** 0.5:.4g} m from the lens")
+    panorama = unwrap(light, ball, surroundings_m, width)
+    write_panorama(out, panorama)
+    rows, columns = panorama.seen.shape
+    print(
+        f"{out}: {columns} x {rows} pixels of {360.0 / columns:.2g} degrees, scene {surroundings_m:g} m away; "
+        f"{100.0 * float(panorama.seen.mean()):.1f} % is seen, the rest takes the nearest that is"
+    )
+    return 0
