@@ -54,7 +54,7 @@ _ROWS_AT_ONCE = 128
 
 @dataclass(frozen=True)
 class BallPhoto:
-    """What is known of a photograph of a mirror ball.
+    """Facts about a photograph of a mirror ball.
 
     Parameters
     ----------
