@@ -35,6 +35,7 @@ _REMEDY = "export it again as one .glb file with its textures inside"
 _PICTURES = ("PNG", "JPEG", "BMP", "TGA", "TIFF", "WEBP")
 _BLACK: Vector = (0.0, 0.0, 0.0)
 _WHITE: Vector = (1.0, 1.0, 1.0)
+_BRIGHTEST = 1e6  # of an emission, in units of the file
 
 Picture = NDArray[np.uint8]
 
@@ -102,10 +103,14 @@ def read_mesh(path: Path) -> tuple[MeshPart, ...]:
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise RoomError(f"{path} is no mesh: give a file that ends in {', '.join(SUFFIXES)}")
-    if suffix in (".glb", ".gltf"):
-        parts = _parts_of_gltf(file, _Gltf(file))
-    else:
-        parts = _parts_of_plain(file, suffix.removeprefix("."))
+    try:
+        with np.errstate(all="ignore"):
+            plain = suffix.removeprefix(".") if suffix in (".obj", ".ply") else ""
+            parts = _parts_of_plain(file, plain) if plain else _parts_of_gltf(file, _Gltf(file))
+    except DatasetError:
+        raise
+    except Exception as error:  # documents and arrays can contradict each other in any way
+        raise file.fault(f"is damaged: {printable_line(f'{type(error).__name__} {error}', 200)}") from error
     found = _named([part for part in parts if len(part.triangles)])
     count = sum(len(part.triangles) for part in found)
     if not 0 < count <= MOST_TRIANGLES:
@@ -116,13 +121,16 @@ def read_mesh(path: Path) -> tuple[MeshPart, ...]:
 
 
 def _check_numbers(file: InputFile, part: MeshPart) -> None:
+    if part.vertices.ndim != 2 or part.vertices.shape[1] != 3:
+        raise file.fault(f"has vertices that are not three numbers each, in the part '{part.name}'")
     if not np.isfinite(part.vertices).all():
         raise file.fault(f"has vertices that are not finite numbers, in the part '{part.name}'")
     if part.triangles.min() < 0 or part.triangles.max() >= len(part.vertices):
         raise file.fault(f"has triangles with vertices that are not there, in the part '{part.name}'")
     for paint in (part.paint, part.light):
-        if paint is not None and paint.uv is not None and not np.isfinite(paint.uv).all():
-            raise file.fault(f"has texture coordinates that are not finite numbers, in the part '{part.name}'")
+        uv = None if paint is None else paint.uv
+        if uv is not None and (uv.shape != (len(part.triangles), 3, 2) or not np.isfinite(uv).all()):
+            raise file.fault(f"has texture coordinates that are not pairs of finite numbers, in '{part.name}'")
 
 
 def _named(parts: list[MeshPart]) -> tuple[MeshPart, ...]:
@@ -274,7 +282,7 @@ def _plain_paint(geometry: Any, transform: Array, pictures: _Pictures) -> tuple[
     stated = material.kwargs or {}
     uv = _corner_values(getattr(visual, "uv", None), geometry, transform)
     picture = None if material.image is None or uv is None else pictures.of(material.image)
-    light = _numbers(stated.get("ke", ()))
+    light = tuple(min(x, _BRIGHTEST) for x in _numbers(stated.get("ke", ())))
     colour = srgb_decoded(np.clip(np.array(_numbers(stated.get("kd", ())) or _WHITE), 0.0, 1.0))
     named = picture is not None or "kd" in stated
     # a picture replaces Kd: most programs write both and mean the picture alone
@@ -369,11 +377,12 @@ class _Gltf:
         if glossy is not None:
             base = {"baseColorFactor": glossy.get("diffuseFactor"), "baseColorTexture": glossy.get("diffuseTexture")}
         strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
+        light = [float(x) * strength for x in material.get("emissiveFactor", _BLACK)]
         return {
             "name": str(material.get("name", "")),
-            "colour": _numbers((base.get("baseColorFactor") or _WHITE)[:3]) or _WHITE,
+            "colour": tuple(min(x, 1.0) for x in _numbers((base.get("baseColorFactor") or _WHITE)[:3]) or _WHITE),
             "picture": base.get("baseColorTexture"),
-            "light": _numbers([float(x) * strength for x in material.get("emissiveFactor", _BLACK)]) or _BLACK,
+            "light": tuple(min(x, _BRIGHTEST) for x in _numbers(light) or _BLACK),
             "light_picture": material.get("emissiveTexture"),
             "two_sided": bool(material.get("doubleSided", False)),
         }

@@ -142,7 +142,8 @@ def placed_parts(settings: MeshSettings) -> tuple[MeshPart, ...]:
     RoomError
         If the file cannot be read, the room's size is not plausible, there is no floor, or something is in the way.
     """
-    parts = [replace(part, vertices=_to_world(settings, part.vertices)) for part in read_mesh(settings.path)]
+    with np.errstate(all="ignore"):  # a number beyond all measure fails the check of the extent
+        parts = [replace(part, vertices=_to_world(settings, part.vertices)) for part in read_mesh(settings.path)]
     _check_extent(settings, parts)
     floor = _floor_height(settings, parts)
     parts = [replace(part, vertices=part.vertices - np.array([0.0, 0.0, floor])) for part in parts]
@@ -170,7 +171,7 @@ def _check_extent(settings: MeshSettings, parts: list[MeshPart]) -> None:
     low = np.min([corners_of(part).min(axis=(0, 1)) for part in parts], axis=0)
     high = np.max([corners_of(part).max(axis=(0, 1)) for part in parts], axis=0)
     extent = high - low
-    if extent.min() >= EXTENT_M[0] and extent.max() <= EXTENT_M[1]:
+    if np.isfinite(extent).all() and extent.min() >= EXTENT_M[0] and extent.max() <= EXTENT_M[1]:
         return
     assert settings.metres_per_unit is not None
     units = extent / settings.metres_per_unit

@@ -75,17 +75,25 @@ def write_glb(path: Path, room: trimesh.Scene) -> Path:
     return path
 
 
-def edited_glb(source: Path, path: Path, edit: Any) -> Path:
-    """Copy of a .glb whose document `edit` has changed."""
-    data = source.read_bytes()
+def glb_document(path: Path) -> tuple[Any, bytes]:
+    """Document of a .glb file, and the chunks after it."""
+    data = path.read_bytes()
     length = struct.unpack("<I", data[12:16])[0]
-    document = json.loads(data[20 : 20 + length])
-    edit(document)
+    return json.loads(data[20 : 20 + length]), data[20 + length :]
+
+
+def glb_of(document: Any, rest: bytes) -> bytes:
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
-    rest = data[20 + length :]
     head = struct.pack("<4sII", b"glTF", 2, 20 + len(text) + len(rest))
-    path.write_bytes(head + struct.pack("<I4s", len(text), b"JSON") + text + rest)
+    return head + struct.pack("<I4s", len(text), b"JSON") + text + rest
+
+
+def edited_glb(source: Path, path: Path, edit: Any) -> Path:
+    """Copy of a .glb whose document `edit` has changed."""
+    document, rest = glb_document(source)
+    edit(document)
+    path.write_bytes(glb_of(document, rest))
     return path
 
 
