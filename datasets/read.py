@@ -22,6 +22,7 @@ from pydantic import ValidationError
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.source import Frames, FrameSource
 from phibench.datasets.input_files import first_fault
+from phibench.datasets.recipe.build import spot_albedo
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store.checksums import check_documents
 from phibench.datasets.store.documents import (
@@ -228,7 +229,9 @@ class Sample:
             position_world_m=self.row.spot_world_m,
             normal_world=self.row.spot_normal_world,
             diameter_m=self.row.spot_diameter_m,
-            **{key: laser[key] for key in ("albedo", "power_w", "wavelength_nm", "profile")},
+            albedo=spot_albedo(laser["albedo"], self.row.spot_beam_world),
+            beam_direction_world=self.row.spot_beam_world,
+            **{key: laser[key] for key in ("power_w", "wavelength_nm", "profile")},
         )
 
     def ambient(self, position: str) -> NDArray[np.float32]:

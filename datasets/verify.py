@@ -345,6 +345,7 @@ def _row_faults(plan: Plan, pair: PairPlan, row: ManifestRow) -> Iterator[str]:
         "drawn": dict(pair.drawn),
         "spot_world_m": spot.position_world_m,
         "spot_normal_world": spot.normal_world,
+        "spot_beam_world": spot.beam_direction_world,
         "spot_diameter_m": spot.diameter_m,
     }
     for name, value in expected.items():

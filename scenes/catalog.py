@@ -18,6 +18,7 @@ from phibench.scenes.validation import finite, positive
 X_LOW, X_HIGH, Y_LOW, Y_HIGH, HEIGHT = -4.8, 5.2, -4.6, 4.4, 3.0
 BOARD_THICKNESS_M = 0.02
 BOARD_SIZE_M = (0.40, 0.30)  # width, height
+BOARD_ALBEDO = 0.70
 _LAMP_RADIANCE = (3.6, 3.2, 2.4)  # W/m^2/sr per band: on the floor about 300 lx directly, warm white
 
 
@@ -62,7 +63,7 @@ def board(target: Target) -> Cuboid:
     behind = target.depth_m + BOARD_THICKNESS_M / 2.0
     centre = (behind * math.cos(target.azimuth_rad), behind * math.sin(target.azimuth_rad), target.height_m)
     size = (BOARD_THICKNESS_M, *BOARD_SIZE_M)
-    return cuboid(f"board_{target.name}", centre, size, (0.70, 0.70, 0.70), rotation_xyz(z_rad=target.azimuth_rad))
+    return cuboid(f"board_{target.name}", centre, size, (BOARD_ALBEDO,) * 3, rotation_xyz(z_rad=target.azimuth_rad))
 
 
 def lab(targets: Sequence[Target] = ()) -> Room:

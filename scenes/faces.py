@@ -82,13 +82,17 @@ class FaceTable:
         offset = points_m - self.centre_m[patch]
         return np.stack([np.einsum("ni,ni->n", offset, axis[patch]) for axis in (self.x_axis, self.y_axis)], axis=-1)
 
+    def places(self, patch: IntArray, points_m: Array) -> Array:
+        """Places on the textures (column, row), shape (N, 2), of world points (N, 3) on patches (N,)."""
+        local = np.concatenate([self.local_m(patch, points_m), np.ones((len(patch), 1))], axis=-1)
+        return np.asarray(np.einsum("nij,nj->ni", self.texels[patch], local))
+
     def laser_albedo(self, patch: IntArray, points_m: Array) -> Array:
         """Albedo at the laser's wavelength, shape (N,), of world points (N, 3) on patches (N,); 0 on a lamp.
 
         A surface that shines by its texture has the albedo of its bitmap: a photographed wall carries a spot.
         """
-        local = np.concatenate([self.local_m(patch, points_m), np.ones((len(patch), 1))], axis=-1)
-        place = np.einsum("nij,nj->ni", self.texels[patch], local)
+        place = self.places(patch, points_m)
         albedo = np.zeros(len(patch))
         for number in np.unique(self.texture[patch]):
             mine = self.texture[patch] == number

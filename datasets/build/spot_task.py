@@ -98,6 +98,7 @@ def manifest_row(rig: Rig, spot: LaserSpot, pair: PairPlan, down: SpotRow, up: S
         nominal_stroke_m=pair.nominal_stroke_m,
         spot_world_m=_triple(spot.position_world_m),
         spot_normal_world=_triple(spot.normal_world),
+        spot_beam_world=None if spot.beam_direction_world is None else _triple(spot.beam_direction_world),
         spot_diameter_m=spot.diameter_m,
         down=down,
         up=up,

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from phibench.datasets.read import Sample
+from phibench.datasets.recipe.build import spot_albedo
 from phibench.datasets.recipe.distributions import DistributionTable, quantile
 from phibench.datasets.recipe.spot_placement import by_ray, on_board
 from phibench.datasets.recipe.tables import DistractorTable
@@ -132,7 +133,7 @@ def _drawn_spot(sample: Sample, number: int, table: DistractorTable, attempt: in
     return LaserSpot(
         *found,
         diameter_m=_value(sample.stream_names, number, "diameter_m", table.diameter_m),
-        albedo=max(recipe.laser.albedo, 0.01),  # its power is scaled to the flux ratio anyway
+        albedo=max(spot_albedo(recipe.laser.albedo, None) or 0.0, 0.01),  # its power is scaled to the flux ratio anyway
         power_w=recipe.laser.power_w,
         wavelength_nm=recipe.laser.wavelength_nm,
         profile=recipe.laser.profile if table.kind == "spot" else "uniform",

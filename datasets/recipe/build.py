@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from phibench.datasets.recipe.tables import (
+    OWN_ALBEDO,
     LaserTable,
     MisalignmentTable,
     Recipe,
@@ -17,7 +18,7 @@ from phibench.datasets.recipe.tables import (
     TargetTable,
 )
 from phibench.scenes.camera import Camera
-from phibench.scenes.catalog import RIGS, ROOMS, Target
+from phibench.scenes.catalog import BOARD_ALBEDO, RIGS, ROOMS, Target
 from phibench.scenes.frames import Pose, Vector, as_vector, rotation_xyz
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import SphereMirror
@@ -99,17 +100,31 @@ def grown_diameter_m(laser: LaserTable, depth_m: float) -> float:
     return growing if laser.diameter_m is None else laser.diameter_m
 
 
-def make_spot(laser: LaserTable, position_world_m: Vector, normal_world: Vector, diameter_m: float) -> LaserSpot:
-    """Spot of the recipe's laser somewhere."""
+def make_spot(
+    laser: LaserTable,
+    position_world_m: Vector,
+    normal_world: Vector,
+    diameter_m: float,
+    beam_direction_world: Vector | None = None,
+) -> LaserSpot:
+    """Spot of the recipe's laser somewhere; of a beam where its direction is given."""
     return LaserSpot(
         position_world_m=position_world_m,
         normal_world=normal_world,
         diameter_m=diameter_m,
-        albedo=laser.albedo,
+        albedo=spot_albedo(laser.albedo, beam_direction_world),
         power_w=laser.power_w,
         wavelength_nm=laser.wavelength_nm,
         profile=laser.profile,
+        beam_direction_world=beam_direction_world,
     )
+
+
+def spot_albedo(albedo: float | str, beam_direction_world: Vector | None) -> float | None:
+    """Albedo of a spot: None, each surface's own, for a beam; for a disc on a board, that of boards."""
+    if albedo != OWN_ALBEDO:
+        return float(albedo)
+    return BOARD_ALBEDO if beam_direction_world is None else None
 
 
 def ceiling_m(room: Room) -> float:

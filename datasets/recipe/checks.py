@@ -214,6 +214,8 @@ def _draws(draft: _Draft) -> Iterator[Fault]:
     if ray and on_board:
         text = f"{', '.join(on_board)} (on a board) and {', '.join(ray)} (by a ray) are both given"
         yield Fault("random.spot", f"{text}; give one or the other")
+    elif "elevation_deg" in spot and not ray:
+        yield Fault("random.spot.azimuth_deg", "missing; elevation_deg needs it, azimuth_deg and height_m make the ray")
     elif len(ray) == 1:
         [missing] = set(_BY_RAY) - set(ray)
         yield Fault(f"random.spot.{missing}", f"missing; {ray[0]} needs it, the two make the ray")

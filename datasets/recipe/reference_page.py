@@ -123,7 +123,8 @@ counts `tries`. The reasons:
 * The mirror would not be before the lens.
 * The distortion would fold the image.
 * The carriage would cut a board or reach the lamps.
-* A spot found by a ray would not lie wholly on one face.
+* A spot found by a ray would not lie wholly on one face; a beam's would be split between places far apart.
+* The ray would meet a lamp, a window, a screen, the back of a face, or something like a mirror.
 
 `sobol` takes Sobol's points, each dimension scrambled by a random stream of its own;
 `independent` takes a random stream per parameter. Every distribution draws on its own: the value of one does
@@ -138,10 +139,13 @@ that `[random.rig]` gives is the nominal one.
 """,
     "[random.spot]": """Either on a board: `target`, `across_m`, `up_m`; a Gaussian spot needs 4 sigma (its diameter) to
 every edge, a uniform one its radius. The boards themselves stand still: all samples share the
-light of the room. Or by a ray: `azimuth_deg` and `height_m`. The spot is then where a horizontal
-ray from the world's z axis first meets a wall, furniture or a board. The robot does not stop
-it. Lamps carry no spots. Its diameter grows with that distance, its albedo is
-`laser.albedo` whatever it lies on.
+light of the room. Or by a ray: `azimuth_deg` and `height_m`, and `elevation_deg` if it is not
+horizontal. The ray starts on the world's z axis. The spot is where it first meets a wall, furniture or
+a board, at least 0.3 m from that axis. The robot does not stop it. The diameter grows with the length of
+the ray. With a number as `laser.albedo` the spot is a flat disc of that albedo, wholly on one face.
+With `albedo = "surface"` it is what a beam along the ray leaves on the surfaces. Curved things and edges
+carry one, too, each with its own texture and coat. Places more than 0.25 m nearer or farther than the
+spot's centre must not be in the beam.
 """,
     "[frames]": """Optional. How the frames of a benchmark are taken. **Nothing of it is rendered**: it may be changed
 in a finished data set, and making it again writes `dataset.json` anew and nothing else. Each number is drawn

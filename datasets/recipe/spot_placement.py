@@ -1,4 +1,4 @@
-"""Positions of drawn laser spots: on a target board, or where a horizontal ray from the axis meets the room.
+"""Positions of drawn laser spots: on a target board, or where a ray from the axis meets the room.
 
 The first part finds boards that the carriage would hit.
 """
@@ -6,21 +6,23 @@ The first part finds boards that the carriage would hit.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from phibench.datasets.recipe.build import build_spot, grown_diameter_m, make_spot
-from phibench.datasets.recipe.tables import LaserTable, TargetTable
-from phibench.render.optics.room_tracer import first_hit
+from phibench.datasets.recipe.tables import OWN_ALBEDO, LaserTable, TargetTable
+from phibench.render.optics.beam_deposit import BEAM_REACH_M
+from phibench.render.optics.room_tracer import RoomGeometry, RoomHits, own_geometry
 from phibench.scenes.catalog import BOARD_SIZE_M, Target, board
-from phibench.scenes.faces import IntArray
-from phibench.scenes.frames import Array
+from phibench.scenes.faces import FaceTable
+from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.room import Room, carriage
-from phibench.scenes.shapes import Cuboid, Rectangle, Shape
+from phibench.scenes.shapes import Cuboid
 
 _HOUSING_REACH_M = 0.1  # housing and mast stay within this of the lens
 
@@ -62,8 +64,10 @@ def cut_part(view: View, plate: Cuboid) -> str | None:
 Placed = tuple[str, LaserSpot] | str
 """Name of what carries the spot, and the spot; or why there can be none."""
 
-_RING = 16  # points around a spot that must lie on the same face
+_RING = 16  # points around a spot that are looked at
 _SAME_FACE_M = 1e-9  # rounding over 10 m is 2e-15; a step between surfaces that matters is far above
+_LEAST_DISTANCE_M = 0.3  # of a spot from the axis: nearer ones lie on the robot's own ground
+_LEAST_COATED_ALBEDO = 0.05  # below it a glossy surface mirrors as much light as it scatters
 
 
 def reach_m(spot: LaserSpot) -> float:
@@ -86,64 +90,109 @@ def on_board(laser: LaserTable, target: TargetTable, across_m: float, up_m: floa
     return make_spot(laser, position, centre.normal_world, centre.diameter_m)
 
 
-def by_ray(laser: LaserTable, room: Room, azimuth_deg: Array, height_m: Array) -> list[Placed]:
-    """Spots where horizontal rays from the world's z axis first meet walls, furniture or boards.
+def by_ray(
+    laser: LaserTable, room: Room, azimuth_deg: Array, height_m: Array, elevation_deg: Array | None = None
+) -> list[Placed]:
+    """Spots where rays from the world's z axis first meet walls, furniture or boards.
 
-    The robot does not stop the rays. Each spot must lie wholly on one face, seen from the axis; its diameter follows
-    `[laser]` with the distance from the axis for depth_m.
+    The robot does not stop the rays. With the surfaces' own albedo the spot is what a beam along the ray leaves there,
+    over edges too, unless it is split between places far apart. With one albedo for all it is a disc, which must lie
+    wholly on one face, seen from the axis. The diameter follows `[laser]` with the length of the ray for depth_m.
     """
-    shapes: tuple[Shape, ...] = (*room.surfaces, *room.furniture)
-    turn = np.radians(azimuth_deg)
-    starts = np.stack([np.zeros_like(turn), np.zeros_like(turn), height_m], axis=-1)
-    directions = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=-1)
-    hits = first_hit(shapes, starts, directions)
-    distance, found = hits.distance_m, hits.object_id
-    spots = [_at(laser, shapes, *hit) for hit in zip(starts, directions, distance, found, strict=True)]
-    return _whole(shapes, starts, found, spots)
+    rays = _Rays.of(azimuth_deg, height_m, np.zeros_like(height_m) if elevation_deg is None else elevation_deg)
+    geometry = own_geometry(room)
+    hits = geometry.first_hit(rays.starts, rays.directions)
+    placed = [_at(laser, geometry, rays, hits, i) for i in range(len(hits.patch))]
+    split = _split if laser.albedo == OWN_ALBEDO else _cut
+    numbers = [i for i, spot in enumerate(placed) if not isinstance(spot, str)]
+    spots = [placed[i][1] for i in numbers]
+    if spots:
+        for i, fault in zip(numbers, split(geometry, rays[numbers], hits, numbers, spots), strict=True):  # type: ignore[arg-type]
+            placed[i] = placed[i] if fault is None else fault.format(placed[i][0])
+    return placed
 
 
-def _at(laser: LaserTable, shapes: Sequence[Shape], start: Array, direction: Array, distance: float, k: int) -> Placed:
-    if k < 0:
+@dataclass(frozen=True)
+class _Rays:
+    """Starts on the axis and unit directions, shape (N, 3)."""
+
+    starts: Array
+    directions: Array
+
+    @staticmethod
+    def of(azimuth_deg: Array, height_m: Array, elevation_deg: Array) -> _Rays:
+        turn, rise = np.radians(azimuth_deg), np.radians(elevation_deg)
+        still = np.zeros_like(turn)
+        flat = np.cos(rise)
+        directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), np.sin(rise)], axis=-1)
+        return _Rays(np.stack([still, still, height_m], axis=-1), directions)
+
+    def __getitem__(self, numbers: list[int]) -> _Rays:
+        return _Rays(self.starts[numbers], self.directions[numbers])
+
+
+def _at(laser: LaserTable, geometry: RoomGeometry, rays: _Rays, hits: RoomHits, i: int) -> Placed:
+    """Spot of one ray, or why there can be none."""
+    table, patch, direction = geometry.table, int(hits.patch[i]), rays.directions[i]
+    if patch < 0:
         return "the ray meets nothing"
-    shape = shapes[k]
-    if isinstance(shape, Rectangle) and shape.emits:
-        return f"the ray meets {shape.name}, a lamp"
-    point = start + distance * direction
-    normal = _normal(shape, point)
+    name = geometry.shapes[hits.object_id[i]].name
+    point, normal = rays.starts[i] + hits.distance_m[i] * direction, table.normal[patch]
+    if fault := _no_ground(table, patch, point):
+        return f"the ray meets {name}, {fault}"
     if np.dot(normal, direction) >= 0.0:
-        return f"the ray meets the back of {shape.name}"
-    diameter = grown_diameter_m(laser, float(distance))
-    return shape.name, make_spot(laser, tuple(map(float, point)), tuple(map(float, normal)), diameter)
+        if not table.two_sided[patch]:
+            return f"the ray meets the back of {name}"
+        normal = -normal
+    if math.hypot(*point[:2]) < _LEAST_DISTANCE_M:
+        return f"the ray meets {name} nearer than {_LEAST_DISTANCE_M:g} m to the axis"
+    diameter = grown_diameter_m(laser, float(hits.distance_m[i]))
+    beam = as_vector(direction) if laser.albedo == OWN_ALBEDO else None
+    return name, make_spot(laser, as_vector(point), as_vector(normal), diameter, beam)
 
 
-def _normal(shape: Shape, point: Array) -> Array:
-    """Outward normal of the face that a point on the surface lies on."""
-    assert isinstance(shape, Rectangle | Cuboid)
-    pose = shape.T_world_shape
-    if not isinstance(shape, Cuboid):
-        return pose.R[:, 2]
-    local = pose.R.T @ (point - pose.t) / (0.5 * np.array(shape.size_m))
-    axis = int(np.argmax(np.abs(local)))
-    return np.sign(local[axis]) * pose.R[:, axis]
+def _no_ground(table: FaceTable, patch: int, point: Array) -> str | None:
+    """Say why a face carries no spot; None if it does."""
+    if table.window[patch]:
+        return "a window"
+    if table.emits[patch]:
+        return "a lamp"
+    albedo = float(table.laser_albedo(np.array([patch]), point[None])[0])
+    if table.is_radiance[patch] and albedo <= 0.0:
+        return "a screen"
+    if table.coat[patch] > 0.0 and albedo < _LEAST_COATED_ALBEDO:
+        return "which is like a mirror"
+    return None
 
 
-def _whole(shapes: Sequence[Shape], starts: Array, found: IntArray, spots: list[Placed]) -> list[Placed]:
-    """Refuse spots of which some point around them is hidden from the axis, or on something else."""
-    placed = [i for i, spot in enumerate(spots) if not isinstance(spot, str)]
-    if not placed:
-        return spots
-    rings = np.stack([_ring(spots[i][1]) for i in placed])  # type: ignore[arg-type]
-    to_ring = rings - starts[placed][:, None]
+def _cut(
+    geometry: RoomGeometry, rays: _Rays, hits: RoomHits, numbers: list[int], spots: list[LaserSpot]
+) -> Iterator[str | None]:
+    """Faults of discs of which some point around them is hidden from the axis, or on something else."""
+    rings = np.stack([_ring(spot) for spot in spots])
+    to_ring = rings - rays.starts[:, None]
     length = np.linalg.norm(to_ring, axis=-1)
-    origins = np.broadcast_to(starts[placed][:, None], rings.shape).reshape(-1, 3)
-    hits = first_hit(shapes, origins, (to_ring / length[..., None]).reshape(-1, 3))
-    distance, hit = hits.distance_m, hits.object_id
-    same = hit.reshape(length.shape) == found[placed][:, None]
-    same &= np.abs(distance.reshape(length.shape) - length) < _SAME_FACE_M
-    for i, fits in zip(placed, same.all(axis=1), strict=True):
-        if not fits:
-            spots[i] = f"the spot would not lie wholly on {spots[i][0]}"
-    return spots
+    origins = np.broadcast_to(rays.starts[:, None], rings.shape).reshape(-1, 3)
+    around = geometry.first_hit(origins, (to_ring / length[..., None]).reshape(-1, 3))
+    same = around.object_id.reshape(length.shape) == hits.object_id[numbers][:, None]
+    same &= np.abs(around.distance_m.reshape(length.shape) - length) < _SAME_FACE_M
+    yield from (None if fits else "the spot would not lie wholly on {}" for fits in same.all(axis=1))
+
+
+def _split(
+    geometry: RoomGeometry, rays: _Rays, hits: RoomHits, numbers: list[int], spots: list[LaserSpot]
+) -> Iterator[str | None]:
+    """Faults of beams that also meet something farther from the spot, along the beam, than what counts as the spot."""
+    for start, direction, i, spot in zip(rays.starts, rays.directions, numbers, spots, strict=True):
+        ring = np.stack(spot.across_beam())
+        turn = 2.0 * np.pi * np.arange(_RING)[:, None] / _RING
+        circle = (np.cos(turn) * ring[0] + np.sin(turn) * ring[1]) * reach_m(spot)
+        starts = start + np.concatenate([circle, 0.5 * circle])
+        around = geometry.first_hit(starts, np.broadcast_to(direction, starts.shape))
+        apart = np.abs(around.distance_m - hits.distance_m[i]) >= BEAM_REACH_M
+        yield (
+            f"the beam would be split between {{}} and what is {BEAM_REACH_M:g} m or more away" if apart.any() else None
+        )
 
 
 def _ring(spot: LaserSpot) -> Array:
@@ -155,7 +204,9 @@ def _ring(spot: LaserSpot) -> Array:
 def place(laser: LaserTable, room: Room, targets: Mapping[str, TargetTable], values: Mapping[str, Any]) -> list[Placed]:
     """Spots of many samples; `values` holds, by parameter, one entry per sample (see `sampling.PARAMETERS`)."""
     if "spot.azimuth_deg" in values:
-        return by_ray(laser, room, values["spot.azimuth_deg"], values["spot.height_m"])
+        return by_ray(
+            *(laser, room, values["spot.azimuth_deg"], values["spot.height_m"]), values.get("spot.elevation_deg")
+        )
     names = values["spot.target"]
     still = np.zeros(len(names))
     offsets = zip(values.get("spot.across_m", still), values.get("spot.up_m", still), strict=True)

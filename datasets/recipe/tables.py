@@ -32,6 +32,8 @@ Unit = Annotated[float, Field(ge=0.0, le=1.0)]
 Response = Annotated[tuple[Unit, ...], Field(strict=False, min_length=3, max_length=3)]
 Preset = Literal["mono-raw", "bayer-raw", "srgb8", "mjpeg"]
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
+OWN_ALBEDO = "surface"
+"""Value of `laser.albedo`: that of each surface."""
 LEVELS = ("laser_level", "lamp_level")
 SENSOR_KEYS = ("jpeg_quality", "sharpen_amount", "analogue_gain", "read_noise_e", "prnu")
 """Keys of `[frames]` that are numbers of the sensor's preset."""
@@ -46,6 +48,10 @@ def _is_whole(table: DistributionTable) -> DistributionTable:
     return table
 
 
+def _albedo_tag(given: object) -> str:
+    return "<surface>" if isinstance(given, str) else "<number>"
+
+
 def _exposure_tag(given: object) -> str:
     return "<auto>" if isinstance(given, str) else "<distribution>"
 
@@ -55,10 +61,15 @@ Level = Annotated[Distribution, values_of(Annotated[float, Field(ge=0.0, le=1e6)
 FluxRatio = Annotated[Distribution, values_of(Annotated[float, Field(ge=1e-6, le=0.5)])]
 Diameter = Annotated[Distribution, values_of(Annotated[float, Field(ge=1e-6, le=min(BOARD_SIZE_M) / 2.0)])]
 Distance = Annotated[Distribution, values_of(Annotated[float, Field(ge=0.1, le=100.0)])]
+Elevation = Annotated[Distribution, values_of(Annotated[float, Field(ge=-89.0, le=89.0)])]
 WholeNumbers = Annotated[Distribution, AfterValidator(_is_whole)]
 Exposure = Annotated[
     Annotated[Distribution, Tag("<distribution>")] | Annotated[Literal["auto"], Tag("<auto>")],
     Discriminator(_exposure_tag),
+]
+Albedo = Annotated[
+    Annotated[Unit, Tag("<number>")] | Annotated[Literal["surface"], Tag("<surface>")],
+    Discriminator(_albedo_tag),
 ]
 """The tags keep pydantic from trying both; `validation` leaves what stands in angle brackets out of a path."""
 
@@ -155,7 +166,10 @@ class LaserTable(Table):
     power_w: float = Field(default=1e-3, gt=0.0, le=10.0, description="laser power on the wall")
     wavelength_nm: float = Field(default=650.0, ge=400.0, le=700.0, description="vacuum wavelength")
     profile: Literal["gaussian", "uniform"] = Field(default="gaussian", description="shape of the spot")
-    albedo: Unit = Field(default=0.7, description="diffuse albedo of the boards at the laser's wavelength")
+    albedo: Albedo = Field(
+        default=0.7,
+        description="albedo of what the spot lies on, at the laser's wavelength; 'surface' is each surface's own",
+    )
     diameter_m: float | None = Field(
         default=None, gt=0.0, le=1.0, description="one diameter for every spot, instead of base and growth"
     )
@@ -244,7 +258,12 @@ class RandomSpotTable(Table):
     azimuth_deg: Distribution | None = Field(
         default=None, description="of the ray, from world x towards world y; instead of a board"
     )
-    height_m: Distribution | None = Field(default=None, description="of the ray above the floor; with azimuth_deg")
+    height_m: Distribution | None = Field(
+        default=None, description="of the ray's start above the floor; with azimuth_deg"
+    )
+    elevation_deg: Elevation | None = Field(
+        default=None, description="of the ray above the horizontal; 0 where not given"
+    )
 
     @property
     def by_ray(self) -> bool:

@@ -128,6 +128,11 @@ class ManifestRow(Document):
     nominal_stroke_m: float = described("m", "nominal stroke, which estimators are given")
     spot_world_m: Vector3 = described("m", "centre of the laser spot")
     spot_normal_world: Vector3 = described("1", "unit normal of the wall at the spot")
+    spot_beam_world: Vector3 | None = Field(
+        default=None,
+        description="unit vector along the laser's beam; null for a disc in the wall's plane, and in older data sets",
+        json_schema_extra={"unit": "1"},
+    )
     spot_diameter_m: float = described("m", "diameter of the spot: 4 sigma if gaussian, of the disc if uniform")
     down: SpotRow = described("-", "stroke position 1, offset 0")
     up: SpotRow = described("-", "stroke position 2, offset stroke_m")

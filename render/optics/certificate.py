@@ -6,6 +6,10 @@ solution is here. Rays go from the film through the aperture to the mirror (`ray
 method finds the film position that meets a given wall point; power is radiance times etendue. A rough mirror reflects
 each ray at a facet with a drawn slope. The two sides share the scene's numbers, no mathematics.
 
+A spot of a beam is found the same way round: each ray goes on to the first surface of the room, from where the beam is
+looked for backwards, with a shadow test. Film positions are drawn from two Gaussians that cover the spot's image; the
+faces that the spot lies on play no part in that, so that edges and textures need nothing of their own.
+
 Film positions are pixels (u, v), shape (N, 2); points are world coordinates in metres, shape (N, 3).
 """
 
@@ -18,10 +22,13 @@ import numpy as np
 from scipy.special import ndtri
 from scipy.stats import qmc
 
+from phibench.render.optics.beam_deposit import BEAM_REACH_M, deposit
 from phibench.render.optics.ray_tracer import MirrorRays, lens_rays, reflect
-from phibench.render.optics.room_tracer import GeometryLike, blocked_by
+from phibench.render.optics.reflection_point import mirror_points
+from phibench.render.optics.room_tracer import GeometryLike, RoomGeometry, as_geometry, blocked_by
 from phibench.render.optics.spot_layer import SpotLayer
 from phibench.render.optics.truth import SpotTruth
+from phibench.scenes.faces import FaceTable, IntArray
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
@@ -66,11 +73,11 @@ def certify(view: View, spot: LaserSpot, room: GeometryLike, truth: SpotTruth, l
 
     More rays are traced before a difference counts: the first few may not be enough for a wide or a cut image.
     """
-    chief = np.array([truth.u_px, truth.v_px])
+    geometry, chief = as_geometry(room), np.array([truth.u_px, truth.v_px])
     start = _through_chief_point(view, truth, np.zeros((1, 2)))
     chief_px = float(np.linalg.norm(aim(view, spot, _Bundle.chief(), np.zeros((1, 2)), start)[0] - chief))
     for log2_rays in _LOG2_RAYS:
-        centroid_px, flux = _differences(view, spot, room, truth, layer, log2_rays)
+        centroid_px, flux = _differences(view, spot, geometry, truth, layer, log2_rays)
         # a NaN does not pass
         passed = chief_px <= CHIEF_TOLERANCE_PX and centroid_px <= CENTROID_TOLERANCE_PX and flux <= FLUX_TOLERANCE
         if passed:
@@ -79,7 +86,7 @@ def certify(view: View, spot: LaserSpot, room: GeometryLike, truth: SpotTruth, l
 
 
 def _differences(
-    view: View, spot: LaserSpot, room: GeometryLike, truth: SpotTruth, layer: SpotLayer, log2_rays: int
+    view: View, spot: LaserSpot, room: RoomGeometry, truth: SpotTruth, layer: SpotLayer, log2_rays: int
 ) -> tuple[float, float]:
     """Centroid difference, pixels, and relative flux difference of layer and traced rays; 0 where both are dark."""
     centroid, watts = trace_spot(view, spot, room, truth, log2_rays)
@@ -172,15 +179,23 @@ def trace_spot(
     view: View, spot: LaserSpot, room: GeometryLike, truth: SpotTruth, log2_rays: int
 ) -> tuple[Array, float]:
     """Centroid (2,) of the pixel-sampled image of the spot, and its power on the film, watts."""
+    if spot.beam_direction_world is not None:
+        return _trace_beam(view, spot, as_geometry(room), truth, log2_rays)
+    room = as_geometry(room)
     x = np.clip(qmc.Sobol(6, scramble=True, rng=_SEED).random_base2(log2_rays), 1e-12, 1.0 - 1e-12)
     bundle = _Bundle(view.rig.camera.aperture_radius_m * _disc(x[:, :2]), _facets(view, x[:, 4:]))
     wall, density = _wall_samples(spot, x[:, 2:4])
     uv, jacobian = _linear_aim(view, spot, bundle, wall, truth)
     with np.errstate(invalid="ignore"):
         area = density * np.abs(jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0])
-        watts = _watts(view, spot, room, uv, bundle) / area / len(x)
-        lost = ~np.isfinite(watts) | ~np.isfinite(uv).all(axis=-1)
-        watts, uv = np.where(lost, 0.0, watts), np.where(lost[:, None], 0.0, uv)
+        return _moments(view, uv, _watts(view, spot, room, uv, bundle) / area / len(x))
+
+
+def _moments(view: View, uv: Array, watts: Array) -> tuple[Array, float]:
+    """Centroid of the pixel-sampled image and power of rays; what is not finite got lost on its way."""
+    lost = ~np.isfinite(watts) | ~np.isfinite(uv).all(axis=-1)
+    watts, uv = np.where(lost, 0.0, watts), np.where(lost[:, None], 0.0, uv)
+    with np.errstate(invalid="ignore"):
         return watts @ _expected_pixel(uv, view.rig.camera.blur_sigma_px) / watts.sum(), float(watts.sum())
 
 
@@ -268,20 +283,127 @@ def _wall_jacobian(view: View, spot: LaserSpot, uv: Array, bundle: _Bundle) -> A
     return np.stack([(plus - minus) / (2.0 * _STEP_PX) for plus, minus in sides], axis=-1)
 
 
-def _watts(view: View, spot: LaserSpot, room: GeometryLike, uv: Array, bundle: _Bundle) -> Array:
+def _watts(view: View, spot: LaserSpot, room: RoomGeometry, uv: Array, bundle: _Bundle) -> Array:
     """Radiance x etendue, watts per square pixel for the whole aperture, shape (N,)."""
-    camera = view.rig.camera
     rays = _reflect(view, spot, uv, bundle)
     wall, points = _meet(spot, rays.mirror_points_m, rays.directions)
     facing = rays.directions @ np.array(spot.normal_world) < 0.0
-    radiance = spot.radiance_w_m2_sr(np.linalg.norm(wall, axis=-1)) * facing * rays.facet_weight
-    radiance *= view.rig.mirror.reflectance(rays.cos_facet, spot.wavelength_nm)
-    density = camera.solid_angle_density(camera.normalised(uv))
-    watts = radiance * density * rays.cos_lens**4 * math.pi * camera.aperture_radius_m**2
+    watts = _through_lens(view, spot, uv, rays, spot.radiance_w_m2_sr(np.linalg.norm(wall, axis=-1)) * facing)
     hit = np.isfinite(watts)
     legs = ((rays.mirror_points_m[hit], points[hit]), (rays.lens_points_m[hit], rays.mirror_points_m[hit]))
     watts[hit] *= np.all([blocked_by(room, start, end) < 0 for start, end in legs], axis=0)
     return watts
+
+
+def _through_lens(view: View, spot: LaserSpot, uv: Array, rays: _Reflected, radiance: Array) -> Array:
+    """Watts per square pixel for the whole aperture of a radiance that rays come from, shape (N,)."""
+    camera = view.rig.camera
+    reflectance = rays.facet_weight * view.rig.mirror.reflectance(rays.cos_facet, spot.wavelength_nm)
+    density = camera.solid_angle_density(camera.normalised(uv))
+    return radiance * reflectance * density * rays.cos_lens**4 * math.pi * camera.aperture_radius_m**2
+
+
+# Spots of a beam.
+
+
+_PILOTS = 256
+_WIDTHS = (1.3, 3.0)  # of the two Gaussians, relative to the image: bounded weights, and tails where it is no Gaussian
+
+
+def _trace_beam(
+    view: View, spot: LaserSpot, room: RoomGeometry, truth: SpotTruth, log2_rays: int
+) -> tuple[Array, float]:
+    """Centroid (2,) and power of the image of what a beam leaves on surfaces."""
+    x = np.clip(qmc.Sobol(7, scramble=True, rng=_SEED).random_base2(log2_rays), 1e-12, 1.0 - 1e-12)
+    bundle = _Bundle(view.rig.camera.aperture_radius_m * _disc(x[:, :2]), _facets(view, x[:, 4:6]))
+    centres = aim(view, spot, bundle, np.zeros((len(x), 2)), _through_chief_point(view, truth, bundle.lens_m))
+    mean, spread = _image_extent(view, spot, room, np.array([truth.u_px, truth.v_px]))
+    z = np.array(_WIDTHS)[(x[:, 6] < 0.5).astype(int), None] * ndtri(x[:, 2:4])
+    uv = centres + mean + z @ spread.T
+    r2 = (z**2).sum(axis=1)
+    density = sum(np.exp(-0.5 * r2 / w**2) / (4.0 * math.pi * w**2) for w in _WIDTHS) / abs(np.linalg.det(spread))
+    rays = _reflect(view, spot, uv, bundle)
+    seen = np.flatnonzero(np.isfinite(rays.directions).all(axis=1) & np.isfinite(uv).all(axis=1))
+    radiance = np.zeros(len(uv))
+    radiance[seen] = _beam_radiance(spot, room, rays.mirror_points_m[seen], rays.directions[seen])
+    lit = np.flatnonzero(radiance > 0.0)
+    radiance[lit] *= blocked_by(room, rays.lens_points_m[lit], rays.mirror_points_m[lit]) < 0
+    watts = np.zeros(len(uv))
+    watts[seen] = _through_lens(view, spot, uv, rays, radiance)[seen]
+    return _moments(view, uv, watts / density / len(x))
+
+
+def _image_extent(view: View, spot: LaserSpot, room: RoomGeometry, chief_px: Array) -> tuple[Array, Array]:
+    """Mean (2,) from the chief ray's pixel, and root (2, 2) of the covariance, of the spot's image, pixels.
+
+    Only how densely film positions are drawn follows from it, which is why the world-side solution may be used.
+    """
+    places = ndtri(np.clip(qmc.Sobol(2, scramble=True, rng=_SEED).random(_PILOTS), 1e-4, 1.0 - 1e-4))
+    light = deposit(spot, room, places if spot.profile == "gaussian" else 0.5 * places)
+    points = light.points_m[light.lit]
+    mirror = mirror_points(view, points, np.broadcast_to(view.camera_centre_m, points.shape)).points_m
+    uv = view.rig.camera.project(view.T_world_camera.inverse().points(mirror)) - chief_px
+    uv = np.concatenate([uv[np.isfinite(uv).all(axis=1)], np.zeros((1, 2))])
+    covariance = np.atleast_2d(np.cov(uv.T, bias=True)) + 1e-6 * np.eye(2)  # a spot of a point has an extent, too
+    return uv.mean(axis=0), np.asarray(np.linalg.cholesky(covariance), float)
+
+
+def _beam_radiance(spot: LaserSpot, room: RoomGeometry, origins: Array, directions: Array) -> Array:
+    """Radiance that rays from the mirror meet where the beam lights the room, shape (N,).
+
+    From the point that a ray meets, the place across the beam gives the irradiance; a ray against the beam finds what
+    stands in between.
+    """
+    hits, table = room.first_hit(origins, directions), room.table
+    met = np.flatnonzero(hits.patch >= 0)
+    patch, points = hits.patch[met], (origins + hits.distance_m[:, None] * directions)[met]
+    beam, offset = np.array(spot.beam_direction_world), points - np.array(spot.position_world_m)
+    along = offset @ beam
+    irradiance = spot.irradiance_w_m2(np.linalg.norm(offset - along[:, None] * beam, axis=1))
+    cos_in, cos_out = -table.normal[patch] @ beam, -np.einsum("ni,ni->n", table.normal[patch], directions[met])
+    lit = (irradiance > 0.0) & (np.abs(along) < BEAM_REACH_M) & (cos_in * cos_out > 0.0)
+    lit &= ((cos_in > 0.0) | table.two_sided[patch]) & ~table.emits[patch]
+    number = np.flatnonzero(lit)
+    back = points[number] - (along[number] + BEAM_REACH_M)[:, None] * beam
+    number = number[blocked_by(room.without_robot, back, points[number]) < 0]
+    # the robot stops none of the beam, but carries no spot either
+    number = number[table.shape[patch[number]] < len(room.without_robot.shapes)]
+    radiance = np.zeros(len(hits.patch))
+    scattered = _reflected_share(
+        spot, table, patch[number], points[number], np.abs(cos_in[number]), np.abs(cos_out[number])
+    )
+    radiance[met[number]] = irradiance[number] * np.abs(cos_in[number]) * scattered / math.pi
+    return radiance
+
+
+def _reflected_share(
+    spot: LaserSpot, table: FaceTable, patch: IntArray, points: Array, cos_in: Array, cos_out: Array
+) -> Array:
+    """Pi times the BRDF at points (N, 3) on faces (N,)."""
+    if spot.albedo is not None:
+        return np.full(len(patch), spot.albedo)
+    share, coat = table.laser_albedo(patch, points), table.coat[patch]
+    for n in np.unique(coat[coat > 0.0]):
+        below = coat == n
+        through = _entering(cos_in[below], float(n)) * _entering(cos_out[below], float(n)) / n**2
+        share[below] *= through / (1.0 - share[below] * _kept_inside(float(n)))
+    return share
+
+
+def _entering(cos: Array, n: float) -> Array:
+    """Transmittance of a coat by Fresnel's equations in their form with angles."""
+    outside = np.clip(np.arccos(cos), 1e-9, None)
+    inside = np.arcsin(np.sin(outside) / n)
+    apart, together = outside - inside, outside + inside
+    return 1.0 - 0.5 * (np.sin(apart) ** 2 / np.sin(together) ** 2 + np.tan(apart) ** 2 / np.tan(together) ** 2)
+
+
+def _kept_inside(n: float, steps: int = 4000) -> float:
+    """Reflectance of a coat for diffuse light from inside: total beyond the critical angle, Fresnel's below it."""
+    s2 = (np.arange(steps) + 0.5) / steps  # the square of the sine inside is uniform for diffuse light
+    below = s2 < 1.0 / n**2
+    passing = np.where(below, _entering(np.sqrt(np.clip(1.0 - s2 * n * n, 0.0, 1.0)), n), 0.0)
+    return float(1.0 - passing.mean())
 
 
 def _expected_pixel(uv: Array, sigma: float) -> Array:

@@ -148,7 +148,7 @@ class FaceTree:
 
     def __init__(self, table: FaceTable) -> None:
         self._pieces = _Pieces.of(table)
-        self._only = _only_pieces(self._pieces.patch, len(table.shape))
+        self._faces = len(table.shape)
         size = np.linalg.norm(self._pieces.high - self._pieces.low, axis=1)
         order = np.argsort(-size, kind="stable")
         large = len(order) if len(order) <= _FEW else _LARGE
@@ -170,6 +170,14 @@ class FaceTree:
         found[near[hit]], distance[near[hit]] = self._pieces.patch[best[hit]], limit[hit]
         return found
 
+    @cached_property
+    def _only(self) -> IntArray:
+        """Number of each face's only piece; -1 for faces of several."""
+        patch, only = self._pieces.patch, np.full(self._faces, -1, dtype=np.int64)
+        only[patch] = np.arange(len(patch))
+        only[np.bincount(patch, minlength=self._faces) > 1] = -1
+        return only
+
     def _reaches(self, rays: Rays, distance: Array) -> BoolArray:
         """Rays that meet the box around everything."""
         if not len(self._pieces.patch):
@@ -185,6 +193,21 @@ class FaceTree:
     def _box(self) -> Array:
         low, high = self._pieces.low.min(axis=0), self._pieces.high.max(axis=0)
         return np.stack([low - _BOX_MARGIN_M, high + _BOX_MARGIN_M])
+
+    def along(self, start_m: Array, end_m: Array, radius_m: float) -> FaceTree | None:
+        """Tree of what comes within a radius of a segment, or nearly so; None where that is much."""
+        span = end_m - start_m
+        inverse = 1.0 / np.where(np.abs(span) < 1e-300, 1e-300, span)
+        reach = radius_m + _BOX_MARGIN_M
+        low, high = (self._pieces.low - reach - start_m) * inverse, (self._pieces.high + reach - start_m) * inverse
+        enter, leave = np.minimum(low, high).max(axis=1), np.maximum(low, high).min(axis=1)
+        near = np.flatnonzero((enter <= leave) & (enter <= 1.0) & (leave >= 0.0))
+        if len(near) > _LARGE:
+            return None
+        tree = FaceTree.__new__(FaceTree)
+        tree._pieces, tree._faces, tree._large = self._pieces[near], self._faces, np.arange(len(near))
+        tree._leaves, tree._levels = _boxes(self._pieces, near[:0])
+        return tree
 
     def meet(self, origins_m: Array, directions: Array, ray: IntArray, face: IntArray) -> tuple[Array, BoolArray]:
         """Distance of rays to planes of faces, and whether they meet well inside the border of a face of one piece."""
@@ -266,14 +289,6 @@ def _not_flat(cos: Array) -> Array:
     """Cosines, NaN for rays in the plane."""
     cos[np.abs(cos) < _IN_PLANE] = np.nan
     return cos
-
-
-def _only_pieces(patch: IntArray, faces: int) -> IntArray:
-    """Number of each face's only piece; -1 for faces of several."""
-    only = np.full(faces, -1, dtype=np.int64)
-    only[patch] = np.arange(len(patch))
-    only[np.bincount(patch, minlength=faces) > 1] = -1
-    return only
 
 
 def _boxes(pieces: _Pieces, members: IntArray) -> tuple[IntArray, list[Array]]:

@@ -26,6 +26,8 @@ Finder = Callable[[Array, Array], IntArray]
 """Rays to the number of the face that each probably meets first, -1 for none; a guess, which is checked."""
 
 SURFACE_GAP_M = 1e-7  # a segment may touch the surface it ends on by this much; far above float64 rounding
+_BUNDLE = 512  # segments from which on it pays to leave out what is far from them
+_NARROW_M = 0.2
 _CHUNK = 1024  # rays at a time: the work arrays stay in the cache
 
 
@@ -97,6 +99,16 @@ class RoomGeometry:
                 faces_before += len(part.table.shape)
         return RoomHits(np.where(patch >= 0, distance, np.inf), object_id, patch)
 
+    def along(self, starts_m: Array, ends_m: Array) -> RoomGeometry:
+        """Geometry for segments that run side by side: without what is far from them; ids stay what they are."""
+        start, end = starts_m.mean(axis=0), ends_m.mean(axis=0)
+        radius = max(
+            float(np.sqrt(((at - of) ** 2).sum(axis=1).max())) for at, of in ((starts_m, start), (ends_m, end))
+        )
+        if not radius < _NARROW_M:
+            return self
+        return RoomGeometry._of(*(part.along(start, end, radius) for part in self._parts))
+
     def resolve(self, origins_m: Array, directions: Array, guess: IntArray) -> RoomHits:
         """First face along each ray, where nearly all are guessed right.
 
@@ -132,12 +144,18 @@ def as_geometry(room: GeometryLike) -> RoomGeometry:
     return room if isinstance(room, RoomGeometry) else RoomGeometry(room)
 
 
-def room_geometry(room: Room, view: View) -> RoomGeometry:
-    """Geometry of `room.shapes(view)`; the room's own part is built once and stays with the room, which is frozen."""
+def own_geometry(room: Room) -> RoomGeometry:
+    """Geometry of surfaces and furniture, built once: it stays with the room, which is frozen."""
     kept = vars(room)
     if _KEPT not in kept:
         kept[_KEPT] = _Part((*room.surfaces, *room.furniture))
-    return RoomGeometry._of(kept[_KEPT], _Part(escalade360(view) if room.robot else ()))
+    return RoomGeometry._of(kept[_KEPT])
+
+
+def room_geometry(room: Room, view: View) -> RoomGeometry:
+    """Geometry of `room.shapes(view)`: the room's own, with robot and carriage where it has them."""
+    own = own_geometry(room)
+    return RoomGeometry._of(*own._parts, _Part(escalade360(view))) if room.robot else own
 
 
 _KEPT = "_traced_part"
@@ -162,8 +180,10 @@ def blocked_by(room: GeometryLike, starts_m: Array, ends_m: Array) -> IntArray:
     span = ends_m - starts_m
     length = np.linalg.norm(span, axis=-1)
     directions = span / length[:, None]
-    limit = length - 2.0 * SURFACE_GAP_M
-    return as_geometry(room).first_hit(starts_m + SURFACE_GAP_M * directions, directions, limit).object_id
+    limit, geometry = length - 2.0 * SURFACE_GAP_M, as_geometry(room)
+    if len(span) >= _BUNDLE:
+        geometry = geometry.along(starts_m, ends_m)
+    return geometry.first_hit(starts_m + SURFACE_GAP_M * directions, directions, limit).object_id
 
 
 # Parts: shapes with their faces and tree.
@@ -185,6 +205,15 @@ class _Part:
     @cached_property
     def tree(self) -> FaceTree:
         return FaceTree(self.table)
+
+    def along(self, start_m: Array, end_m: Array, radius_m: float) -> _Part:
+        """Part with a smaller tree, where a bundle of segments comes near to few faces."""
+        tree = self.tree.along(start_m, end_m, radius_m)
+        if tree is None:
+            return self
+        part = _Part(self.shapes)
+        part.table, part.tree = self.table, tree
+        return part
 
 
 def _joined_tables(parts: Sequence[_Part]) -> FaceTable:

@@ -18,9 +18,10 @@ import numpy as np
 from scipy.special import erf, ndtr
 from scipy.stats import qmc
 
+from phibench.render.optics.beam_deposit import Deposit, deposit
 from phibench.render.optics.ray_tracer import MirrorRays, lens_rays, reflect
 from phibench.render.optics.reflection_point import mirror_points
-from phibench.render.optics.room_tracer import GeometryLike, blocked_by
+from phibench.render.optics.room_tracer import GeometryLike, RoomGeometry, as_geometry, blocked_by
 from phibench.render.optics.spot_samples import FilmCloud, disc_points, film_position, slices, specular_cloud
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
@@ -61,7 +62,7 @@ class SpotLayer:
 
 def spot_layer(view: View, spot: LaserSpot, room: GeometryLike) -> SpotLayer:
     """Render the spot by specular connection (ideal mirror) or microfacet sampling (rough mirror)."""
-    cloud = (rough_cloud if view.rig.mirror.roughness_alpha > 0.0 else specular_cloud)(view, spot, room)
+    cloud = (rough_cloud if view.rig.mirror.roughness_alpha > 0.0 else specular_cloud)(view, spot, as_geometry(room))
     gain = np.array(view.rig.camera.detector.laser_electrons_per_joule(spot.wavelength_nm))
     return splat(cloud, view.rig.camera.blur_sigma_px, gain)
 
@@ -116,25 +117,26 @@ _STEP_PX = 0.01
 
 @dataclass(frozen=True)
 class _Samples:
-    """Quasi-random points on spot and aperture (world, (N, 3)) and normal deviates for the film (N, 2)."""
+    """Quasi-random places on the spot, points of the aperture (N, 2) and normal deviates for the film (N, 2)."""
 
-    points_m: Array
+    light: Deposit
     lens_m: Array
     film: Array
 
 
-def rough_cloud(view: View, spot: LaserSpot, room: GeometryLike) -> FilmCloud:
+def rough_cloud(view: View, spot: LaserSpot, room: RoomGeometry) -> FilmCloud:
     """Film points and powers for a mirror with roughness_alpha > 0; empty where the spot has no reflection point."""
     centre_uv = _specular(view, np.array([spot.position_world_m]), np.zeros((1, 2)))
     if not np.isfinite(centre_uv).all():
         return FilmCloud(np.empty((0, 2)), np.empty(0))
     spread = _lobe_px(view, np.array(spot.position_world_m), centre_uv[0])
-    samples = _draw(view, spot, _log2_samples(spread, view.rig.camera.blur_sigma_px))
-    uv = _specular(view, samples.points_m, samples.lens_m) + samples.film @ (_WIDER * spread).T
-    lit = np.all(np.isfinite(uv), axis=1)
-    uv, points, lens, film = uv[lit], samples.points_m[lit], samples.lens_m[lit], samples.film[lit]
+    log2_samples = _log2_samples(spread, view.rig.camera.blur_sigma_px)
+    samples = _draw(view, spot, room, log2_samples)
+    uv = _specular(view, samples.light.points_m, samples.lens_m) + samples.film @ (_WIDER * spread).T
+    lit = np.flatnonzero(np.all(np.isfinite(uv), axis=1))
+    uv, light, lens, film = uv[lit], samples.light[lit], samples.lens_m[lit], samples.film[lit]
     density = np.exp(-0.5 * (film**2).sum(axis=1)) / (2.0 * math.pi * _WIDER**2 * abs(np.linalg.det(spread)))
-    watts = _power(view, spot, room, uv, lens, points) / density / len(samples.film)
+    watts = _power(view, spot, room, uv, lens, light) / density / 2**log2_samples
     seen = np.isfinite(watts)
     return FilmCloud(uv[seen], watts[seen])
 
@@ -145,13 +147,12 @@ def _log2_samples(spread_px: Array, blur_px: float) -> int:
     return min(_LOG2_SAMPLES + max(0, math.ceil(math.log2(max(area, 1.0)))), _LOG2_MOST)
 
 
-def _draw(view: View, spot: LaserSpot, log2_samples: int) -> _Samples:
+def _draw(view: View, spot: LaserSpot, room: RoomGeometry, log2_samples: int) -> _Samples:
     x = qmc.Sobol(6, scramble=True, rng=_SEED).random_base2(log2_samples)
-    scale = spot.sigma_m if spot.profile == "gaussian" else spot.diameter_m / 2.0
-    disc = scale * disc_points(spot.profile, x[:, :2])
-    points = np.array(spot.position_world_m) + disc @ np.stack(spot.tangents())
+    light = deposit(spot, room, disc_points(spot.profile, x[:, :2]))
     lens = view.rig.camera.aperture_radius_m * disc_points("uniform", x[:, 2:4])
-    return _Samples(points, lens, disc_points("gaussian", x[:, 4:]))
+    lit = light.lit
+    return _Samples(light[lit], lens[lit], disc_points("gaussian", x[lit, 4:]))
 
 
 def _specular(view: View, points: Array, lens: Array) -> Array:
@@ -188,18 +189,17 @@ def _half_vector(rays: MirrorRays, points: Array) -> Array:
     return half / np.linalg.norm(half, axis=-1, keepdims=True)
 
 
-def _power(view: View, spot: LaserSpot, room: GeometryLike, uv: Array, lens: Array, points: Array) -> Array:
-    """Watts per square pixel that reach the film at uv from the whole spot's power concentrated in each point."""
-    camera = view.rig.camera
+def _power(view: View, spot: LaserSpot, room: RoomGeometry, uv: Array, lens: Array, light: Deposit) -> Array:
+    """Watts per square pixel that reach the film at uv from the whole spot's power concentrated in each place."""
+    camera, points = view.rig.camera, light.points_m
     origins, directions = lens_rays(view, uv, lens)
     rays = reflect(view, origins, directions)
     to_point = points - rays.points_m
     s2 = np.einsum("ni,ni->n", to_point, to_point)
     leaving = to_point / np.sqrt(s2)[:, None]
-    cos_spot = np.maximum(-leaving @ np.array(spot.normal_world), 0.0)
     cos_lens = directions @ view.T_world_camera.R[:, 2]
     etendue = camera.solid_angle_density(camera.normalised(uv)) * cos_lens**4 * math.pi * camera.aperture_radius_m**2
-    radiance = spot.albedo * spot.power_w / math.pi * cos_spot / s2 * _reflection(view, spot, rays, points, leaving)
+    radiance = spot.power_w * light.scattered(-leaving) / s2 * _reflection(view, spot, rays, points, leaving)
     free = np.ones(len(uv), dtype=bool)
     hit = np.isfinite(radiance)
     legs = ((rays.points_m[hit], points[hit]), (origins[hit], rays.points_m[hit]))

@@ -1,6 +1,6 @@
 """Rays from the laser spot over the mirror to the lens: place on the image and light power of each.
 
-Where an edge cuts the light, a fixed set of quasi-random rays is taken; else nodes of a quadrature.
+Where an edge or a texture cuts the light, a fixed set of quasi-random rays is taken; else nodes of a quadrature.
 
 Pairs of a point on the spot and a point on the aperture are joined by the reflection law (`mirror_points`). Product
 quadrature on the two discs gives nodes and weights; their sums replace random samples. The power of a pair follows from
@@ -26,8 +26,9 @@ from numpy.polynomial.legendre import leggauss
 from scipy.special import ndtri
 from scipy.stats import qmc
 
+from phibench.render.optics.beam_deposit import Deposit, deposit, footprint, is_plain
 from phibench.render.optics.reflection_point import bundle_spread, mirror_points
-from phibench.render.optics.room_tracer import GeometryLike, blocked_by
+from phibench.render.optics.room_tracer import GeometryLike, RoomGeometry, as_geometry, blocked_by
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
@@ -91,7 +92,8 @@ def slices(total: int, size: int) -> Iterator[slice]:
 
 
 _PAIRS_AT_ONCE = 65536
-_LOG2_DENSE = 17
+_LOG2_DENSE = 17  # where edges cut the light on its way
+_LOG2_UNEVEN = 15  # where it is only uneven on the surfaces: steps in two of the four dimensions
 _SEED = 0  # the scramble is part of the quadrature rule, not a noise draw
 
 
@@ -117,47 +119,61 @@ class FilmCloud:
 def specular_cloud(view: View, spot: LaserSpot, room: GeometryLike) -> FilmCloud:
     """Quadrature over spot and aperture; occluded pairs keep their place with power 0.
 
-    Where an edge cuts the light, nodes would sample a step: dense quasi-random pairs take over.
+    Where an edge cuts the light, or faces and textures change below it, nodes would sample a step: quasi-random pairs
+    take over.
     """
-    return _dense_cloud(view, spot, room) if _is_cut(view, spot, room) else _node_cloud(view, spot, room)
+    geometry = as_geometry(room)
+    probes = deposit(spot, geometry, _probes(spot))
+    if _is_cut(view, spot, geometry, probes):
+        return _dense_cloud(view, spot, geometry, _LOG2_DENSE)
+    if not is_plain(spot, geometry, probes):
+        return _dense_cloud(view, spot, geometry, _LOG2_UNEVEN)
+    return _node_cloud(view, spot, geometry)
 
 
-def _node_cloud(view: View, spot: LaserSpot, room: GeometryLike) -> FilmCloud:
-    spot_nodes, spot_weights, lens_nodes, lens_weights = _nodes(view, spot)
-    lens_steps = max(1, _PAIRS_AT_ONCE // len(spot_nodes))
+def _probes(spot: LaserSpot) -> Array:
+    """Places across the spot, from its centre to its rim (4 sigma), shape (N, 2)."""
+    reach = (4.0, 2.0, 1.0) if spot.profile == "gaussian" else (1.0, 0.8, 0.4)
+    return np.concatenate([np.zeros((1, 2)), *(scale * _RIM for scale in reach)])
+
+
+def _node_cloud(view: View, spot: LaserSpot, room: RoomGeometry) -> FilmCloud:
+    disc, spot_weights, lens_nodes, lens_weights = _nodes(view, spot)
+    light = deposit(spot, room, disc)
+    lens_steps = max(1, _PAIRS_AT_ONCE // len(disc))
     parts = []
     for start in range(0, len(lens_nodes), lens_steps):
-        lens = lens_nodes[start : start + lens_steps]
-        points, eyes = _pairs(spot_nodes, lens)
+        pairs, eyes = _pairs(light, lens_nodes[start : start + lens_steps])
         weight = np.outer(lens_weights[start : start + lens_steps], spot_weights).ravel()
-        parts.append(_connect(view, spot, room, points, eyes, weight))
+        parts.append(_connect(view, spot, room, pairs, eyes, weight))
     return _joined(parts)
 
 
-def _dense_cloud(view: View, spot: LaserSpot, room: GeometryLike) -> FilmCloud:
+def _dense_cloud(view: View, spot: LaserSpot, room: RoomGeometry, log2_pairs: int) -> FilmCloud:
     """Sobol pairs of spot and aperture: steps are found to about 1e-3 of the flux."""
-    x = qmc.Sobol(4, scramble=True, rng=_SEED).random_base2(_LOG2_DENSE)
-    points = _spot_points(spot, disc_points(spot.profile, x[:, :2]))
-    eyes = _lens_points(view, disc_points("uniform", x[:, 2:]))
+    x = qmc.Sobol(4, scramble=True, rng=_SEED).random_base2(log2_pairs)
+    light = deposit(spot, room, disc_points(spot.profile, x[:, :2]))
+    lit = light.lit
+    light, eyes = light[lit], _lens_points(view, disc_points("uniform", x[lit, 2:]))
     area = math.pi * view.rig.camera.aperture_radius_m**2
-    weight = np.full(len(x), spot.albedo * spot.power_w / math.pi * area / len(x))
-    parts = [_connect(view, spot, room, points[s], eyes[s], weight[s]) for s in slices(len(x), _PAIRS_AT_ONCE)]
+    weight = np.full(len(lit), spot.power_w * area / len(x))
+    parts = [_connect(view, spot, room, light[s], eyes[s], weight[s]) for s in slices(len(lit), _PAIRS_AT_ONCE)]
     return _joined(parts)
 
 
-def _is_cut(view: View, spot: LaserSpot, room: GeometryLike) -> bool:
-    """True if a part of the light is blocked and a part is not: pairs of spot and aperture, centre to rim (4 sigma)."""
-    rim = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
-    reach = (4.0, 2.0, 1.0) if spot.profile == "gaussian" else (1.0, 0.8, 0.4)
-    disc = np.concatenate([np.zeros((1, 2)), *(scale * rim for scale in reach)])
-    lens = np.concatenate([np.zeros((1, 2)), rim])
-    points, eyes = _pairs(_spot_points(spot, disc), _lens_points(view, lens))
-    cloud = _connect(view, spot, room, points, eyes, np.ones(len(points)))
+def _is_cut(view: View, spot: LaserSpot, room: RoomGeometry, probes: Deposit) -> bool:
+    """True if a part of the scattered light is blocked and a part is not, of pairs of probes and lens points."""
+    pairs, eyes = _pairs(probes[probes.lit], _lens_points(view, np.concatenate([np.zeros((1, 2)), _RIM])))
+    if not len(eyes):
+        return False
+    cloud = _connect(view, spot, room, pairs, eyes, np.ones(len(eyes)))
     lit = cloud.watts > 0.0
-    return bool(lit.any()) and not bool(lit.all() and len(lit) == len(points))
+    return bool(lit.any()) and not bool(lit.all() and len(lit) == len(eyes))
 
 
 def _joined(parts: Sequence[FilmCloud]) -> FilmCloud:
+    if not parts:
+        return FilmCloud(np.empty((0, 2)), np.empty(0))
     return FilmCloud(np.concatenate([p.uv_px for p in parts]), np.concatenate([p.watts for p in parts]))
 
 
@@ -171,13 +187,13 @@ def film_position(view: View, lens_m: Array, mirror_m: Array) -> Array:
 
 def image_radii_px(view: View, spot: LaserSpot) -> tuple[float, float]:
     """Extent of the image, before blur, of the spot's rim (or sigma) and of the aperture's rim, pixels."""
-    rim = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
-    spot_uv = _film(view, _spot_points(spot, rim), _lens_points(view, np.zeros_like(rim)))
-    lens_uv = _film(view, np.broadcast_to(spot.position_world_m, (len(rim), 3)), _lens_points(view, rim))
+    spot_uv = _film(view, footprint(spot, _RIM), _lens_points(view, np.zeros_like(_RIM)))
+    lens_uv = _film(view, np.broadcast_to(spot.position_world_m, (len(_RIM), 3)), _lens_points(view, _RIM))
     return _reach(spot_uv), _reach(lens_uv)
 
 
 _TURN = 2.0 * np.pi * np.arange(8) / 8.0
+_RIM = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
 
 
 def _reach(uv: Array) -> float:
@@ -191,19 +207,13 @@ def _film(view: View, points: Array, eyes: Array) -> Array:
 
 
 def _nodes(view: View, spot: LaserSpot) -> tuple[Array, Array, Array, Array]:
-    """World points on the spot, their weights (W / sr if unobstructed), world points on the aperture, weights (m^2)."""
+    """Places across the spot, their weights (W), world points on the aperture, weights (m^2)."""
     blur = view.rig.camera.blur_sigma_px
     spot_px, lens_px = image_radii_px(view, spot)
     disc, share = disc_nodes(spot.profile, spot_px / blur)
     aperture, area = disc_nodes("uniform", lens_px / blur)
-    intensity = share * spot.albedo * spot.power_w / math.pi
     area = area * math.pi * view.rig.camera.aperture_radius_m**2
-    return _spot_points(spot, disc), intensity, _lens_points(view, aperture), area
-
-
-def _spot_points(spot: LaserSpot, disc: Array) -> Array:
-    scale = spot.sigma_m if spot.profile == "gaussian" else spot.diameter_m / 2.0
-    return np.array(spot.position_world_m) + scale * disc @ np.stack(spot.tangents())
+    return disc, share * spot.power_w, _lens_points(view, aperture), area
 
 
 def _lens_points(view: View, disc: Array) -> Array:
@@ -211,29 +221,30 @@ def _lens_points(view: View, disc: Array) -> Array:
     return view.T_world_camera.points(flat)
 
 
-def _pairs(points: Array, eyes: Array) -> tuple[Array, Array]:
-    """Every eye with every point, room (len(eyes) * len(points), 3)."""
-    return np.tile(points, (len(eyes), 1)), np.repeat(eyes, len(points), axis=0)
+def _pairs(light: Deposit, eyes: Array) -> tuple[Deposit, Array]:
+    """Every eye with every place of a deposit."""
+    count = len(light.points_m)
+    return light[np.tile(np.arange(count), len(eyes))], np.repeat(eyes, count, axis=0)
 
 
-def _connect(view: View, spot: LaserSpot, room: GeometryLike, points: Array, eyes: Array, weight: Array) -> FilmCloud:
-    """Film positions and powers of pairs (spot point, aperture point), room (N, 3), with quadrature weights (N,)."""
+def _connect(view: View, spot: LaserSpot, room: RoomGeometry, light: Deposit, eyes: Array, weight: Array) -> FilmCloud:
+    """Film positions and powers of pairs (spot point, aperture point (N, 3)), with quadrature weights (N,)."""
+    points = light.points_m
     found = mirror_points(view, points, eyes)
     mirror, lit = found.points_m, found.lit
     from_spot, to_lens = _unit(mirror - points), _unit(eyes - mirror)
     cos_i = np.einsum("ni,ni->n", to_lens, found.normals)
-    cos_spot = from_spot @ np.array(spot.normal_world)
     cos_lens = -to_lens @ view.T_world_camera.R[:, 2]
     spread = bundle_spread(view, mirror, points, eyes, cos_i)
     rho = view.rig.mirror.reflectance(cos_i, spot.wavelength_nm)
-    watts = weight * rho * np.maximum(cos_spot, 0.0) * np.maximum(cos_lens, 0.0) / spread
+    watts = weight * light.scattered(from_spot) * rho * np.maximum(cos_lens, 0.0) / spread
     free = lit & _unobstructed(room, points, mirror, eyes, lit)
     pose = view.T_world_camera.inverse()
     uv = film_position(view, pose.points(eyes), pose.points(mirror))
     return FilmCloud(uv[lit], np.where(free, watts, 0.0)[lit])
 
 
-def _unobstructed(room: GeometryLike, points: Array, mirror: Array, eyes: Array, lit: BoolArray) -> BoolArray:
+def _unobstructed(room: RoomGeometry, points: Array, mirror: Array, eyes: Array, lit: BoolArray) -> BoolArray:
     free = np.zeros(len(points), dtype=bool)
     legs = ((mirror[lit], points[lit]), (eyes[lit], mirror[lit]))
     free[lit] = np.all([blocked_by(room, start, end) < 0 for start, end in legs], axis=0)

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from helpers.oracles import TARGETS, alhazen_quartic, fermat_path, paper_cases, random_rig, random_spot, true_pixel
 
+from phibench.render.optics.beam_deposit import deposit
 from phibench.render.optics.certificate import CENTROID_TOLERANCE_PX, certify, pixel_centroid
 from phibench.render.optics.reflection_point import reflection_points
+from phibench.render.optics.room_tracer import RoomGeometry
 from phibench.render.optics.spot_layer import splat, spot_layer
 from phibench.render.optics.spot_samples import FilmCloud, specular_cloud
 from phibench.render.optics.truth import spot_truth
@@ -153,10 +155,9 @@ def test_random_pairs_give_the_same_image() -> None:
     disc = radius[..., None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     from phibench.render.optics import spot_samples
 
-    points, eyes = spot_samples._spot_points(spot, disc[0]), spot_samples._lens_points(view, disc[1])
+    light, eyes = deposit(spot, RoomGeometry(), disc[0]), spot_samples._lens_points(view, disc[1])
     area = math.pi * view.rig.camera.aperture_radius_m**2
-    weight = np.full(count, spot.albedo * spot.power_w / math.pi * area)
-    pairs = spot_samples._connect(view, spot, (), points, eyes, weight)
+    pairs = spot_samples._connect(view, spot, RoomGeometry(), light, eyes, np.full(count, spot.power_w * area))
     nodes = specular_cloud(view, spot, ())
     error = pairs.watts.std() / math.sqrt(count)
     assert abs(pairs.watts.mean() - nodes.watts.sum()) < 5.0 * error  # false alarm 6e-7
@@ -244,12 +245,9 @@ def test_accuracy_of_a_spot_cut_by_an_edge() -> None:
     for edge_m in (-2e-3, -5e-4, 0.0, 7e-4, 1.5e-3):
         screen = (cuboid("screen", (1.9, edge_m - 0.5, 0.5), (0.01, 1.0, 1.0), (0.5, 0.5, 0.5)),)
         layer = spot_layer(view, spot, screen)
-        pairs = spot_samples._connect(
-            view, spot, screen, spot_samples._spot_points(spot, disc), eyes, np.full(count, 1.0 / count)
-        )
-        open_pairs = spot_samples._connect(
-            view, spot, (), spot_samples._spot_points(spot, disc), eyes, np.full(count, 1.0 / count)
-        )
+        light, weight = deposit(spot, RoomGeometry(), disc), np.full(count, 1.0 / count)
+        pairs = spot_samples._connect(view, spot, RoomGeometry(screen), light, eyes, weight)
+        open_pairs = spot_samples._connect(view, spot, RoomGeometry(), light, eyes, weight)
         share = pairs.watts.sum() / open_pairs.watts.sum()
         ours = layer.total_electrons_per_s[0] / spot_layer(view, spot, ()).total_electrons_per_s[0]
         assert ours == pytest.approx(share, abs=4e-3)
@@ -288,7 +286,7 @@ def test_a_wide_spot_has_the_right_shape() -> None:
     view, spot = default_rig().at(0.0), LaserSpot((1.0, 0.0, 0.5), (-1, 0, 0), 0.1)
     gain = np.ones(3)
     layer = splat(specular_cloud(view, spot, ()), 0.7, gain)
-    dense = splat(spot_samples._dense_cloud(view, spot, ()), 0.7, gain)
+    dense = splat(spot_samples._dense_cloud(view, spot, RoomGeometry(), 17), 0.7, gain)
     low = (min(layer.u0_px, dense.u0_px), min(layer.v0_px, dense.v0_px))
     a, b = (_embed(x, low[0], low[1], 160) for x in (layer, dense))
     assert np.abs(a - b).max() <= 0.02 * b.max()

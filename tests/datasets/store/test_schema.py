@@ -49,6 +49,14 @@ def test_a_line_gives_back_the_very_row(rows: list[ManifestRow]) -> None:
     assert ManifestRow.model_validate_json(row_line(rows[0])) == rows[0]
 
 
+def test_rows_of_older_data_sets_know_no_beam(rows: list[ManifestRow], document: dict[str, Any]) -> None:
+    """Rows that were written before spots had beams are discs."""
+    assert document.pop("spot_beam_world") is None
+    assert ManifestRow.model_validate_json(json.dumps(document)) == rows[0]
+    beam = ManifestRow.model_validate_json(json.dumps(document | {"spot_beam_world": [0.6, 0.8, 0.0]}))
+    assert beam.spot_beam_world == (0.6, 0.8, 0.0)
+
+
 @given(number=st.floats(allow_nan=False, allow_infinity=False))
 def test_doubles_survive_json_bit_by_bit(number: float) -> None:
     row = ManifestRow.model_construct(depth_m=number)
