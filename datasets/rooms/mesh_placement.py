@@ -104,6 +104,7 @@ class MeshSettings:
     name: str = "mesh"
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "path", Path(self.path))
         self._check_placement()
         within("MeshSettings", "heading_deg", self.heading_deg, -360.0, 360.0)
         within("MeshSettings", "emission_w_m2_sr", self.emission_w_m2_sr, 0.0, 1e5)

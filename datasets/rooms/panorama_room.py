@@ -89,6 +89,7 @@ class PanoramaSettings:
     name: str = "panorama"
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "path", Path(self.path))
         object.__setattr__(self, "point_m", finite_vector("PanoramaSettings", "point_m", self.point_m, 3))
         within("PanoramaSettings", "heading_deg", self.heading_deg, -360.0, 360.0)
         within("PanoramaSettings", "texel_m", self.texel_m, 5e-4, 1.0)

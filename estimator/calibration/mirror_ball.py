@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw
 from skimage.measure import block_reduce
 
 from phibench.datasets.errors import DatasetError
@@ -340,3 +341,14 @@ def write_panorama(path: Path, panorama: BallPanorama) -> Path:
         "sphere_in_camera_m": [float(x) for x in view.rig.sphere_in_camera_m],
     }
     return write_exr(path, {**planes, "seen": panorama.seen.astype(np.float32)}, header)
+
+
+def write_outline(path: Path, light: NDArray[np.float32], ball: Ball) -> Path:
+    """Write a small copy of the photograph with the outline that was taken; PNG."""
+    block = max(1, math.ceil(max(light.shape[:2]) / _SEARCH_PX))
+    small = block_reduce(light, (block, block, 1), np.mean)  # type: ignore[no-untyped-call]
+    bright = max(1.0, float(np.percentile(small, 99.0)))
+    picture = Image.fromarray(np.rint(255.0 * linear_to_srgb(small / bright)).astype(np.uint8))
+    points = (ball.view.rig.outline_px() + 0.5) / block - 0.5
+    ImageDraw.Draw(picture).polygon([(float(u), float(v)) for u, v in points], outline=(255, 0, 0), width=2)
+    return save_png(path, np.asarray(picture))

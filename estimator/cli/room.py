@@ -28,7 +28,8 @@ def from_mirror_ball(
 ) -> int:
     """Unwrap a photograph of a mirror ball into a panorama of its surroundings.
 
-    The panorama's middle looks from the ball to the camera, which is seen there. It is taken at the ball's centre.
+    A copy of the photograph with the ball's outline is written beside it. The panorama's middle looks from the ball to
+    the camera, which is seen there. It is taken at the ball's centre.
 
     Parameters
     ----------
@@ -60,6 +61,7 @@ def from_mirror_ball(
         find_ball,
         require_suffix,
         unwrap,
+        write_outline,
         write_panorama,
     )
 
@@ -75,6 +77,8 @@ def from_mirror_ball(
     print(f"focal length {camera.fx_px:.0f} px; ball's centre {sum(x * x for x in s) ** 0.5:.4g} m from the lens")
     panorama = unwrap(light, ball, surroundings_m, width)
     write_panorama(out, panorama)
+    drawn = write_outline(out.with_name(f"{out.stem}-outline.png"), light, ball)
+    print(f"{drawn}: the outline on the photograph; look at it")
     rows, columns = panorama.seen.shape
     print(
         f"{out}: {columns} x {rows} pixels of {360.0 / columns:.2g} degrees, scene {surroundings_m:g} m away; "

@@ -150,6 +150,10 @@ def test_command_writes_a_panorama_that_makes_a_room(photo, tmp_path, capsys, na
     said = capsys.readouterr().out
     assert "outline: centre" in said
     assert "ball's centre 0.3" in said
+    drawn = np.asarray(Image.open(tmp_path / "room-outline.png")).astype(int)
+    red = np.argwhere((drawn == [255, 0, 0]).all(axis=-1))
+    middle = 0.5 * (np.array(SIZE) - 1.0) + FOCAL / 0.3 * CENTRE[1::-1]  # of the ball, (row, column), to some pixels
+    assert np.abs(np.linalg.norm(red - middle, axis=1) - OUTLINE_PX).max() < 6.0
     light = read_panorama(out)
     assert light.shape == (100, 200, 3)
     azimuth = np.abs(np.arctan2(directions(100)[..., 1], directions(100)[..., 0]))
@@ -184,7 +188,7 @@ def test_mistakes_end_in_one_sentence(photo, tmp_path, capsys, monkeypatch, chan
     assert word in err
     assert err.count("\n") == 1
     assert "Traceback" not in out + err
-    assert not (tmp_path / "room.exr").exists()
+    assert not list(tmp_path.glob("room*"))
 
 
 def test_a_picture_without_a_ball_is_refused(tmp_path):
