@@ -27,7 +27,6 @@ from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store.checksums import check_documents
 from phibench.datasets.store.documents import (
     Rigs,
-    from_json,
     read_info,
     read_manifest,
     read_rigs,
@@ -35,7 +34,8 @@ from phibench.datasets.store.documents import (
     to_table,
 )
 from phibench.datasets.store.layers import SpotWindow, read_ambient, read_ambient_variance, read_spot, read_truth
-from phibench.datasets.store.schema import INFO, RIGS, DatasetInfo, ManifestRow, SpotRow
+from phibench.datasets.store.schema import INFO, RIGS, ROOMS, DatasetInfo, ManifestRow, SpotRow
+from phibench.datasets.store.stored_rooms import Rooms, read_rooms
 from phibench.scenes.laser import Beam, LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, View
 from phibench.scenes.room import Room
@@ -55,7 +55,8 @@ class Dataset:
     info : DatasetInfo
     rigs : Rigs
         By id: `dataset.rigs[row.rig]`; a sample's own is `sample.rig`.
-    room : Room
+    rooms : Rooms
+        By id: `dataset.rooms[row.room]`; a sample's own is `sample.room`.
     rows : tuple of ManifestRow
         Exact numbers of the samples, in the order of the manifest.
     samples : tuple of Sample, in the same order
@@ -64,7 +65,7 @@ class Dataset:
     folder: Path
     info: DatasetInfo
     rigs: Rigs
-    room: Room
+    rooms: Rooms
     rows: tuple[ManifestRow, ...]
 
     @cached_property
@@ -85,6 +86,19 @@ class Dataset:
         if len(names) != 1:
             raise DatasetError(f"{self.folder} has {len(names)} rigs; take each sample's own, `sample.rig`")
         return self.rigs[names.pop()]
+
+    @property
+    def room(self) -> Room:
+        """The room of all samples, where they share one.
+
+        Raises
+        ------
+        DatasetError
+            If there are several.
+        """
+        if len(self.rooms) != 1:
+            raise DatasetError(f"{self.folder} has {len(self.rooms)} rooms; take each sample's own, `sample.room`")
+        return self.rooms[next(iter(self.rooms))]
 
     @cached_property
     def recipe(self) -> Recipe:
@@ -164,10 +178,16 @@ class Dataset:
             "presets": "none named by the recipe"
             if self.recipe.frames is None
             else ", ".join(self.recipe.frames.presets),
-            "room": f"{self.info.recipe['room']['name']}, {len(self.info.object_names)} objects",
+            "room": self._room_text(),
             "format": f"version {self.info.schema_version}" + (f", part {self.info.shard}" if self.info.shard else ""),
         }
         return "\n".join([f"Dataset '{self.info.name}' in {self.folder}", *(f"  {k:9}{v}" for k, v in lines.items())])
+
+    def _room_text(self) -> str:
+        infos = list(self.rooms.infos.values())
+        if len(infos) != 1:
+            return f"{len(infos)} rooms"
+        return f"{self.info.recipe['room']['name']}, {len(infos[0].object_names)} objects"
 
     def _image_size(self) -> str:
         if not self.rows:
@@ -216,6 +236,11 @@ class Sample:
     def nominal_rig(self) -> Rig:
         """Nominal rig, which estimators are given with `row.nominal_stroke_m`; the true one without misalignment."""
         return self.dataset.rigs[self.row.nominal_rig]
+
+    @property
+    def room(self) -> Room:
+        """The sample's room; built from its source when it is asked for."""
+        return self.dataset.rooms[self.row.room]
 
     def view(self, position: str) -> View:
         """Rig at that position."""
@@ -341,11 +366,10 @@ def open_dataset(folder: str | Path) -> Dataset:
     if len(rigs) != info.rigs:
         raise DatasetError(f"{folder}: {RIGS} has {len(rigs)} rigs instead of {info.rigs}")
     stored_recipe(folder, info)
-    try:
-        room = from_json(Room, info.room)
-    except DatasetError as error:
-        raise DatasetError(f"{folder / INFO}: {error}; run `phibench dataset repair`") from error
-    return Dataset(folder, info, rigs, room, rows)
+    rooms = read_rooms(folder, info)
+    if len(rooms) != info.rooms:
+        raise DatasetError(f"{folder}: {ROOMS} has {len(rooms)} rooms instead of {info.rooms}")
+    return Dataset(folder, info, rigs, rooms, rows)
 
 
 def stored_recipe(folder: Path, info: DatasetInfo) -> Recipe:

@@ -179,8 +179,9 @@ def _content_faults(dataset: Dataset, bad: set[str], truth_layers: bool, console
             for position in POSITIONS:
                 faults += _guarded(_spot_faults(sample, position, answer, bad))
             steps.advance()
-        if dataset.room.lit and schema.LIGHT_MAP not in bad:
-            faults += _guarded(_light_map_faults(dataset))
+        for info in dataset.rooms.infos.values():
+            if info.lit and schema.light_map_file(info.room) not in bad:
+                faults += _guarded(_light_map_faults(dataset, info.room))
         for pose in dataset.info.poses:
             faults += _guarded(_view_faults(dataset, pose, bad, truth_layers))
             steps.advance()
@@ -191,7 +192,7 @@ def _spot_faults(
     sample: Sample, position: str, solve: Callable[[View, LaserSpot, Room], SpotAnswer], bad: set[str]
 ) -> Iterator[str]:
     row, name = sample.truth_row(position), f"{sample.row.sample_id} {position}"
-    answer = solve(sample.view(position), sample.laser_spot, sample.dataset.room)
+    answer = solve(sample.view(position), sample.laser_spot, sample.room)
     for field, expected in _expected(answer):
         if not _same(getattr(row, field), expected):
             yield f"{name}: {field} is {getattr(row, field)}, the parameters give {expected}"
@@ -278,16 +279,16 @@ def _ambient_faults(dataset: Dataset, pose: PoseInfo, shape: tuple[int, int]) ->
         yield f"{pose.files['ambient']} has negative or non-finite variances"
 
 
-def _light_map_faults(dataset: Dataset) -> Iterator[str]:
-    light = read_light_map(dataset.folder)
-    texels = texel_count(dataset.room, dataset.recipe.ambient.texel_m)
+def _light_map_faults(dataset: Dataset, room_id: str) -> Iterator[str]:
+    light, file = read_light_map(dataset.folder, room_id), schema.light_map_file(room_id)
+    texels = texel_count(dataset.rooms[room_id], dataset.recipe.ambient.texel_m)
     shapes = {"irradiance_w_m2": (texels, 3), "sigma_w_m2": (texels, 3), "covered": (texels,)}
     for name, shape in shapes.items():
         array = getattr(light, name)
         if array.shape != shape:
-            yield f"{schema.LIGHT_MAP}: {name} has the shape {array.shape} instead of {shape}"
+            yield f"{file}: {name} has the shape {array.shape} instead of {shape}"
         if not np.all(np.isfinite(array) & (array >= 0)):
-            yield f"{schema.LIGHT_MAP}: {name} has negative or non-finite values"
+            yield f"{file}: {name} has negative or non-finite values"
 
 
 def _truth_faults(dataset: Dataset, pose: PoseInfo, shape: tuple[int, int]) -> Iterator[str]:
@@ -295,7 +296,7 @@ def _truth_faults(dataset: Dataset, pose: PoseInfo, shape: tuple[int, int]) -> I
     from phibench.render.optics.truth import truth_layer
 
     stored, view = read_truth(dataset.folder / pose.files["truth"]), dataset.rigs[pose.rig].at(pose.offset_m)
-    expected = truth_layer(view, room_geometry(dataset.room, view))
+    expected = truth_layer(view, room_geometry(dataset.rooms[pose.room], view))
     for name, plane in stored.items():
         if plane.shape != shape:
             yield f"{pose.files['truth']} has {plane.shape} pixels instead of {shape}"
@@ -333,6 +334,7 @@ def plan_faults(dataset: Dataset) -> Iterator[str]:
     for name in (name for name in pairs if name in rows):
         yield from _row_faults(plan, pairs[name], rows[name])
     yield from _rig_faults(plan, dataset)
+    yield from _room_faults(plan, dataset)
     if [(pose.pose, pose.rig) for pose in dataset.info.poses] != [(pose.pose_id, pose.rig) for pose in plan.poses]:
         yield f"{schema.INFO}: the poses are not those of the recipe"
 
@@ -340,7 +342,7 @@ def plan_faults(dataset: Dataset) -> Iterator[str]:
 def _row_faults(plan: Plan, pair: PairPlan, row: ManifestRow) -> Iterator[str]:
     spot = plan.spots[pair.spot]
     expected = {
-        **{name: getattr(pair, name) for name in ("experiment", "target", "rig", "nominal_rig", "tries")},
+        **{name: getattr(pair, name) for name in ("experiment", "target", "rig", "nominal_rig", "room", "tries")},
         **{name: getattr(pair, name) for name in ("stroke_m", "nominal_stroke_m")},
         "drawn": dict(pair.drawn),
         "spot_world_m": spot.position_world_m,
@@ -360,6 +362,14 @@ def _rig_faults(plan: Plan, dataset: Dataset) -> Iterator[str]:
     for name in (name for name in plan.rigs if name in held):
         if not alike(_with_form(held[name]), json.loads(json.dumps(to_json(plan.rigs[name])))):
             yield f"{schema.RIGS}: {name} is not the rig that the recipe gives"
+
+
+def _room_faults(plan: Plan, dataset: Dataset) -> Iterator[str]:
+    if set(dataset.rooms) != set(plan.rooms):
+        yield f"{schema.ROOMS}: the rooms are not those of the recipe"
+    for info in dataset.rooms.infos.values():
+        if info.source and info.room in plan.rooms and not alike(info.source, to_json(plan.rooms[info.room])):
+            yield f"{schema.ROOMS}: {info.room} is not the room that the recipe gives"
 
 
 def _with_form(rig: dict[str, Any]) -> dict[str, Any]:

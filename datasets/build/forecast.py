@@ -22,10 +22,12 @@ from phibench.datasets.build.light_map_cache import is_cached
 from phibench.datasets.build.scheduler import Executor, Outcome
 from phibench.datasets.build.tasks import Done, Task
 from phibench.datasets.plan.plan import PairPlan, Plan
+from phibench.datasets.rooms.room_sources import room_of
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import SpotTruth, depth_m, spot_truth
-from phibench.render.room.light_map import texel_count
+from phibench.render.room.light_map import BOUNCE_TEXEL_M, texel_count
 from phibench.scenes.rig import POSITIONS
+from phibench.scenes.room import Room
 
 # Seconds.
 START_S = 7.0  # workers, Mitsuba in each, first kernels, hashes
@@ -79,7 +81,9 @@ class Forecast:
         if kind != "bake":
             return f"{number} {kind}{'s' * (number != 1)}"
         is_cached = self.seconds[kind] <= CACHED_BAKE_S
-        return f"{number} bake of the room's light ({'cached' if is_cached else duration(pace.seconds(kind))})"
+        what = "bake of the room's light" if number == 1 else "bakes of rooms' light"
+        each = "" if number == 1 else " each"
+        return f"{number} {what} ({'cached' if is_cached else duration(pace.seconds(kind)) + each})"
 
 
 def forecast(plan: Plan, tasks: Collection[Task]) -> Forecast:
@@ -107,16 +111,22 @@ def _seconds(plan: Plan, megapixels: float, bakes: bool) -> dict[str, float]:
 
 
 def _bake_s(plan: Plan) -> float:
-    """Seconds of the light map: rays are texels times rays per texel."""
-    ambient, lamps = plan.recipe.ambient, sum(surface.emits for surface in plan.room.surfaces)
-    if is_cached(plan.rig.at(0.0), plan.room, bake_settings(ambient)):
+    """Seconds of a light map, that of the first room: rays are texels times rays per texel."""
+    ambient, room = plan.recipe.ambient, _first_room(plan)
+    if not room.lit or is_cached(plan.rig.at(0.0), room, bake_settings(ambient)):
         return CACHED_BAKE_S
-    rays = ambient.bounces * ambient.bounce_rays + 2 * (lamps * ambient.lamp_rays + ambient.final_rays)
-    return rays * _texels(plan) / 1e6 * BAKE_S_PER_MEGARAY
+    coarse = texel_count(room, max(BOUNCE_TEXEL_M, ambient.texel_m))
+    rays = 2 * ambient.final_rays * _texels(plan) + ambient.bounces * ambient.bounce_rays * coarse
+    return rays / 1e6 * BAKE_S_PER_MEGARAY
+
+
+def _first_room(plan: Plan) -> Room:
+    return room_of(next(iter(plan.rooms.values())))
 
 
 def _texels(plan: Plan) -> int:
-    return texel_count(plan.room, plan.recipe.ambient.texel_m)
+    room = _first_room(plan)
+    return texel_count(room, plan.recipe.ambient.texel_m) if room.lit else 0
 
 
 def megabytes(count: int) -> str:
@@ -298,7 +308,8 @@ def pair_forecasts(plan: Plan) -> Iterator[PairForecast]:
     for pair in plan.pairs:
         spot, rig = plan.spots[pair.spot], plan.rigs[pair.rig]
         views = [plan.view(pair, position) for position in POSITIONS]
-        down, up = (spot_truth(view, spot, room_geometry(plan.room, view)) for view in views)
+        room = room_of(plan.rooms[pair.room])
+        down, up = (spot_truth(view, spot, room_geometry(room, view)) for view in views)
         distance_m = depth_m(np.array(spot.position_world_m), rig.at(0.0).sphere_centre_m)
         yield PairForecast(pair, float(distance_m), down, up)
 

@@ -21,19 +21,20 @@ from rich.console import Console
 from phibench.datasets.build.forecast import Pace, TaskProgress, forecast, megabytes, slowdown
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
 from phibench.datasets.build.scheduler import schedule
-from phibench.datasets.build.task_list import sample_task_name, spot_task_name
+from phibench.datasets.build.task_list import bake_task_name, sample_task_name, spot_task_name
 from phibench.datasets.build.tasks import Done, Failed, Task, log_entry
 from phibench.datasets.build.workers import WorkerPool
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import InputFile
 from phibench.datasets.plan.plan import PairPlan, Plan
 from phibench.datasets.progress import Steps
+from phibench.datasets.rooms.room_sources import ONLY_ROOM
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import checksums_text
 from phibench.datasets.store.documents import manifest_documents, parse_info, read_info, rigs_text
 from phibench.datasets.store.files import only_run, remove_temporary, sha256, write_bytes
 from phibench.datasets.store.leftovers import TEMPORARY_PREFIX
-from phibench.datasets.store.schema import ManifestRow
+from phibench.datasets.store.schema import ManifestRow, RoomInfo
 from phibench.scenes.rig import POSITIONS
 
 _OWN = ".phibench-"  # locks, and temporary files that a killed run left
@@ -86,8 +87,8 @@ def check_disk(out: Path, needed: int, replaced: Collection[str]) -> None:
 
 def stale_files(out: Path, expected: Collection[str]) -> list[str]:
     """Files that are called like a task's and that no task of now writes: of removed samples and poses."""
-    below = (path for top in ("views", "spots", "previews") for path in (out / top).rglob("*"))
-    names = [path.relative_to(out).as_posix() for path in (*out.glob(schema.LIGHT_MAP), *below)]
+    below = (path for top in ("views", "spots", "previews", "lightmaps") for path in (out / top).rglob("*"))
+    names = [path.relative_to(out).as_posix() for path in (*out.glob(schema.light_map_file(ONLY_ROOM)), *below)]
     wanted = set(expected)
     return sorted(name for name in names if schema.is_task_file(name) and name not in wanted)
 
@@ -221,11 +222,22 @@ def assemble(plan: Plan, head: FolderHead, entries: Mapping[str, Entry]) -> dict
         schema.INFO: head.info.encode(),
         schema.RECIPE: head.recipe.encode(),
         schema.RIGS: rigs_text(plan.rigs).encode(),
+        schema.ROOMS: "".join(_room_line(name, entries) for name in plan.rooms).encode(),
         **manifest_documents(rows),
     }
     hashes = {name: digest for entry in entries.values() for name, digest in entry.files.items()}
     hashes |= {name: hashlib.sha256(data).hexdigest() for name, data in small.items()}
     return {**small, schema.CHECKSUMS: checksums_text(hashes).encode()}
+
+
+def _room_line(room_id: str, entries: Mapping[str, Entry]) -> str:
+    """Line of a room: the result of its light's task."""
+    try:
+        info = RoomInfo.model_validate_json(json.dumps(entries[bake_task_name(room_id)].result))
+    except (LookupError, ValueError) as error:
+        text = f"{schema.JOURNAL} has a damaged result of {room_id}"
+        raise DatasetError(f"{text}; remove the file and run `phibench dataset make` again") from error
+    return info.model_dump_json() + "\n"
 
 
 def _row(pair: PairPlan, entries: Mapping[str, Entry]) -> ManifestRow:

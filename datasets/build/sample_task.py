@@ -13,6 +13,7 @@ import numpy as np
 from phibench.datasets.build.spot_task import RefusedSampleError
 from phibench.datasets.build.tasks import Made
 from phibench.datasets.plan.plan import PairPlan
+from phibench.datasets.rooms.room_sources import RoomSource, room_of
 from phibench.datasets.store import schema
 from phibench.datasets.store.layers import SpotWindow, read_ambient, read_ambient_variance, read_spot
 from phibench.datasets.store.pictures import Side, sample_picture, save_png
@@ -22,10 +23,9 @@ from phibench.render.optics.truth import SpotTruth, spot_truth
 from phibench.render.room.noise_budget import BUDGETS, NoiseBudget, noise_budget
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
-from phibench.scenes.room import Room
 
 
-def finish_sample(out: Path, pair: PairPlan, rig: Rig, room: Room, spot: LaserSpot, quality: str) -> Made:
+def finish_sample(out: Path, pair: PairPlan, rig: Rig, source: RoomSource, spot: LaserSpot, quality: str) -> Made:
     """Task: the picture of one sample, and as its result the `NoiseRow` of both positions.
 
     Raises
@@ -33,7 +33,7 @@ def finish_sample(out: Path, pair: PairPlan, rig: Rig, room: Room, spot: LaserSp
     RefusedSampleError
         If a view's noise is above the budget of this quality at the spot, with the numbers.
     """
-    sides, rows = [], {}
+    sides, rows, room = [], {}, room_of(source)
     for position in POSITIONS:
         view = rig.at(Stroke(pair.stroke_m).offset_m(position))
         truth = spot_truth(view, spot, room_geometry(room, view))

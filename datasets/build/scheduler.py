@@ -82,6 +82,7 @@ class _Queue:
 
     def settle(self, task: Task, outcome: Done | Failed) -> Iterator[Outcome]:
         """Let those go that waited for a task; if it failed, yield them as failed, and what waits for them."""
+        released = list[Task]()
         for reader in self._readers.pop(task.name, ()):
             if isinstance(outcome, Failed):
                 if self._missing.pop(reader.name, None) is not None:
@@ -91,4 +92,5 @@ class _Queue:
             elif reader.name in self._missing:
                 self._missing[reader.name] -= 1
                 if not self._missing[reader.name]:
-                    self.ready.append(reader)
+                    released.append(reader)
+        self.ready.extendleft(reversed(released))  # a worker still holds what they need: the room

@@ -11,6 +11,7 @@ import numpy as np
 from phibench.datasets.build.tasks import Made
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan.plan import PairPlan
+from phibench.datasets.rooms.room_sources import RoomSource, room_of
 from phibench.datasets.store import schema
 from phibench.datasets.store.layers import SpotWindow, write_spot
 from phibench.datasets.store.schema import CertificateRow, ManifestRow, SpotRow
@@ -51,7 +52,7 @@ def answer_spot(view: View, spot: LaserSpot, room: Room) -> SpotAnswer:
     return SpotAnswer(truth, layer, certificate, _reaches(view, _window(layer)))
 
 
-def make_spot(out: Path, dataset: str, rig: Rig, room: Room, spot: LaserSpot, pair: PairPlan) -> Made:
+def make_spot(out: Path, dataset: str, rig: Rig, source: RoomSource, spot: LaserSpot, pair: PairPlan) -> Made:
     """Task: both spot layers of a sample and its row of the manifest.
 
     Raises
@@ -60,6 +61,7 @@ def make_spot(out: Path, dataset: str, rig: Rig, room: Room, spot: LaserSpot, pa
         If a certificate is out of tolerance, with its numbers.
     """
     views = {position: rig.at(Stroke(pair.stroke_m).offset_m(position)) for position in POSITIONS}
+    room = room_of(source)
     answers = {position: answer_spot(view, spot, room) for position, view in views.items()}
     if refused := [line for position in POSITIONS for line in _complaints(pair, position, answers[position])]:
         raise RefusedSampleError("\n".join(["refused, a certificate is out of tolerance:", *refused]))
@@ -93,6 +95,7 @@ def manifest_row(rig: Rig, spot: LaserSpot, pair: PairPlan, down: SpotRow, up: S
         target=pair.target,
         rig=pair.rig,
         nominal_rig=pair.nominal_rig,
+        room=pair.room,
         depth_m=float(depth_m(np.array(spot.position_world_m), rig.at(0.0).sphere_centre_m)),
         stroke_m=pair.stroke_m,
         nominal_stroke_m=pair.nominal_stroke_m,

@@ -12,11 +12,11 @@ from phibench.datasets.build.bake_task import bake_settings, read_light_map
 from phibench.datasets.build.tasks import Made
 from phibench.datasets.plan.plan import PosePlan
 from phibench.datasets.recipe.tables import AmbientTable
+from phibench.datasets.rooms.room_sources import RoomSource, room_of
 from phibench.datasets.store import schema
 from phibench.datasets.store.layers import write_ambient, write_truth
 from phibench.datasets.store.pictures import display_exposure_s, save_png, to_srgb
 from phibench.scenes.rig import Rig
-from phibench.scenes.room import Room
 
 
 def start_renderer() -> dict[str, Any]:
@@ -29,7 +29,7 @@ def start_renderer() -> dict[str, Any]:
     return {"variant": variant, "llvm": llvm, "threads_per_process": THREADS}
 
 
-def render_view(out: Path, dataset: str, rig: Rig, room: Room, pose: PosePlan, ambient: AmbientTable) -> Made:
+def render_view(out: Path, dataset: str, rig: Rig, source: RoomSource, pose: PosePlan, ambient: AmbientTable) -> Made:
     """Task: render one pose and write its three files below `out`."""
     from phibench.render.optics.room_tracer import room_geometry
     from phibench.render.optics.truth import truth_layer
@@ -38,10 +38,10 @@ def render_view(out: Path, dataset: str, rig: Rig, room: Room, pose: PosePlan, a
     from phibench.render.setup.variant import activate
 
     activate()
-    view = rig.at(pose.offset_m)
+    view, room = rig.at(pose.offset_m), room_of(source)
     header = {"dataset": dataset, "pose": pose.pose_id, "offset_m": pose.offset_m}
     if room.lit:
-        light, settings = read_light_map(out), bake_settings(ambient)
+        light, settings = read_light_map(out, pose.room), bake_settings(ambient)
         budget = BUDGETS[ambient.quality]
         layer = render_ambient(view, room, light, settings, ambient.cells_per_pixel, pose.seed, budget=budget)
     else:

@@ -88,7 +88,7 @@ def _placed(sample: Sample, number: int, table: DistractorTable) -> Distractor |
         if spot is None:
             continue
         views = {position: sample.view(position) for position in POSITIONS}
-        rooms = {position: room_geometry(sample.dataset.room, view) for position, view in views.items()}
+        rooms = {position: room_geometry(sample.room, view) for position, view in views.items()}
         truths = {position: spot_truth(view, spot, rooms[position]) for position, view in views.items()}
         if not truths["down"].visible or any(_too_near(sample, position, truths[position]) for position in POSITIONS):
             continue
@@ -142,7 +142,7 @@ def _drawn_spot(sample: Sample, number: int, table: DistractorTable, attempt: in
 
 def _ray_place(sample: Sample, number: int, table: DistractorTable, attempt: int) -> tuple[Vector, Vector] | None:
     """Position and normal on a horizontal ray from the axis: free in the room, or where it ends."""
-    names, room = sample.stream_names, sample.dataset.room
+    names, room = sample.stream_names, sample.room
     azimuth_deg, height_m, distance_m = (
         0.0 if given is None else _value(names, number, key, given, attempt)
         for key, given in (

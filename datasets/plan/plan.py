@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 
 from phibench.datasets.errors import DatasetError, RecipeError
 from phibench.datasets.plan.sampling import RandomSample, draw_rigs, draw_samples
-from phibench.datasets.recipe.build import build_misalignment, build_rig, build_room, build_spot, true_stroke_m
+from phibench.datasets.recipe.build import build_misalignment, build_rig, build_spot, room_source, true_stroke_m
 from phibench.datasets.recipe.tables import DrawnRigsTable, RandomTable, Recipe
+from phibench.datasets.rooms.room_sources import ONLY_ROOM, RoomSource, room_of
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import seed_32
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
-from phibench.scenes.room import Room
 from phibench.scenes.validation import printable_line
 
 RECIPE_RIG = "rig"
@@ -37,19 +37,20 @@ class PosePlan:
     ----------
     pose_id : str
         ``h`` and the carriage offset in metres, such as ``h0.425``; down is ``h0.000``. For any rig but that of
-        `[rig]`, its id and a hyphen come first: ``r000042-h0.425``.
+        `[rig]`, its id and a hyphen come first: ``r000042-h0.425``. Before them stands a room that is one of many.
     offset_m : float
         Carriage offset along the stroke axis.
     seed : int
         32-bit seed of the ambient layer, from the named stream (data set, seed, pose, "ambient").
-    rig : str
-        Id of the rig.
+    rig, room : str
+        Ids of rig and room.
     """
 
     pose_id: str
     offset_m: float
     seed: int
     rig: str = RECIPE_RIG
+    room: str = ONLY_ROOM
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,8 @@ class PairPlan:
         Key of the spot in `Plan.spots`.
     rig, nominal_rig : str
         Id of the true rig, and of the one that an estimator is given.
+    room : str
+        Id of the room.
     drawn : tuple of (parameter, value)
         What was drawn; empty for an experiment without drawn rigs.
     tries : int
@@ -82,22 +85,25 @@ class PairPlan:
     nominal_rig: str = RECIPE_RIG
     drawn: tuple[tuple[str, float | str], ...] = ()
     tries: int = 0
+    room: str = ONLY_ROOM
 
     def pose_id(self, position: str) -> str:
         """Id of the pose at a stroke position, "down" or "up"."""
-        return pose_of(self.rig, Stroke(self.stroke_m).offset_m(position))
+        return pose_of(self.rig, Stroke(self.stroke_m).offset_m(position), self.room)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Rigs, spots, poses and pairs of a recipe.
+    """Rigs, rooms, spots, poses and pairs of a recipe.
 
     Attributes
     ----------
     rig : Rig
-        That of `[rig]`: the light map takes its origin of coordinates from it. A sample's own is in `rigs`.
+        That of `[rig]`: light maps take their origin of coordinates from it. A sample's own is in `rigs`.
     rigs : dict
         True and nominal rigs of the samples, by id.
+    rooms : dict
+        Sources of the samples' rooms, by id.
     spots : dict
         Laser spots of the samples, by `PairPlan.spot`: an experiment's by target, a drawn one by sample.
     poses : tuple of PosePlan
@@ -111,7 +117,7 @@ class Plan:
     recipe: Recipe
     rig: Rig
     rigs: dict[str, Rig]
-    room: Room
+    rooms: dict[str, RoomSource]
     spots: dict[str, LaserSpot]
     poses: tuple[PosePlan, ...]
     pairs: tuple[PairPlan, ...]
@@ -131,7 +137,7 @@ def make_plan(recipe: Recipe) -> Plan:
         If two strokes differ by less than a nanometre, so that their poses would share a name, or if a sample of
         `[random]` stays impossible.
     """
-    rig, room = build_rig(recipe.rig), build_room(recipe.room, recipe.targets)
+    rig, room = build_rig(recipe.rig), room_source(recipe.room, recipe.targets)
     if recipe.random is not None:
         return _random_plan(recipe, recipe.random, rig, room)
     if recipe.rigs is not None:
@@ -144,9 +150,9 @@ def make_plan(recipe: Recipe) -> Plan:
     return _experiment_plan(recipe, {RECIPE_RIG: rig, true_id: true_rig}, room, pairs)
 
 
-def _rigs_plan(recipe: Recipe, table: DrawnRigsTable, rig: Rig, room: Room) -> Plan:
+def _rigs_plan(recipe: Recipe, table: DrawnRigsTable, rig: Rig, room: RoomSource) -> Plan:
     """Every experiment with every drawn rig; samples are called after both."""
-    drawn = draw_rigs(recipe, table, rig, room)
+    drawn = draw_rigs(recipe, table, rig, room_of(room))
     pairs = tuple(
         replace(pair, sample_id=f"{pair.sample_id}-{one.rig_id}", drawn=one.drawn, tries=one.tries)
         for one in drawn
@@ -172,13 +178,13 @@ def _experiment_pairs(recipe: Recipe, misalignment: Misalignment, rig_id: str) -
     )
 
 
-def _experiment_plan(recipe: Recipe, rigs: dict[str, Rig], room: Room, pairs: tuple[PairPlan, ...]) -> Plan:
+def _experiment_plan(recipe: Recipe, rigs: dict[str, Rig], room: RoomSource, pairs: tuple[PairPlan, ...]) -> Plan:
     """Poses in the order of the rigs, then of their offsets."""
     used = {pair.target for pair in pairs}
     spots = {table.name: build_spot(recipe.laser, table) for table in recipe.targets if table.name in used}
     order = {rig: number for number, rig in enumerate(rigs)}
-    places = sorted(set(_offsets(pairs)), key=lambda place: (order[place[0]], place[1]))
-    return Plan(recipe, rigs[RECIPE_RIG], rigs, room, spots, _poses(recipe, places), pairs)
+    places = sorted(set(_places(pairs)), key=lambda place: (order[place[0]], place[1]))
+    return Plan(recipe, rigs[RECIPE_RIG], rigs, {ONLY_ROOM: room}, spots, _poses(recipe, places), pairs)
 
 
 def pose_name(offset_m: float) -> str:
@@ -187,14 +193,15 @@ def pose_name(offset_m: float) -> str:
     return f"h{whole}.{decimals.rstrip('0').ljust(3, '0')}"
 
 
-def pose_of(rig: str, offset_m: float) -> str:
-    """Id of the pose of a rig at an offset."""
-    return pose_name(offset_m) if rig == RECIPE_RIG else f"{rig}-{pose_name(offset_m)}"
+def pose_of(rig: str, offset_m: float, room: str = ONLY_ROOM) -> str:
+    """Id of the pose of a rig at an offset in a room."""
+    parts = [*([] if room == ONLY_ROOM else [room]), *([] if rig == RECIPE_RIG else [rig]), pose_name(offset_m)]
+    return "-".join(parts)
 
 
-def _random_plan(recipe: Recipe, table: RandomTable, rig: Rig, room: Room) -> Plan:
+def _random_plan(recipe: Recipe, table: RandomTable, rig: Rig, room: RoomSource) -> Plan:
     """Equal rigs share an id, and so their views; the first sample that has one names it, so that more change none."""
-    samples = draw_samples(recipe, table, room)
+    samples = draw_samples(recipe, table, room_of(room))
     ids = {rig: RECIPE_RIG}
     for sample in samples:
         ids.setdefault(sample.rig, f"r{sample.number:06d}")
@@ -203,7 +210,7 @@ def _random_plan(recipe: Recipe, table: RandomTable, rig: Rig, room: Room) -> Pl
     used = {name for pair in pairs for name in (pair.rig, pair.nominal_rig)}
     rigs = {name: one for one, name in ids.items() if name in used}
     spots = {pair.spot: sample.spot for pair, sample in zip(pairs, samples, strict=True)}
-    return Plan(recipe, rig, rigs, room, spots, _poses(recipe, dict.fromkeys(_offsets(pairs))), pairs)
+    return Plan(recipe, rig, rigs, {ONLY_ROOM: room}, spots, _poses(recipe, dict.fromkeys(_places(pairs))), pairs)
 
 
 def _random_pair(sample: RandomSample, rig: str, nominal_rig: str) -> PairPlan:
@@ -216,20 +223,23 @@ def _sample_name(experiment: str, target: str, stroke_m: float) -> str:
     return f"{experiment}-{target}-{pose_name(stroke_m)}"
 
 
-def _offsets(pairs: Sequence[PairPlan]) -> list[tuple[str, float]]:
-    """Rig and offset of every view of every pair."""
-    return [(pair.rig, Stroke(pair.stroke_m).offset_m(position)) for pair in pairs for position in POSITIONS]
+_Place = tuple[str, float, str]
 
 
-def _poses(recipe: Recipe, places: Iterable[tuple[str, float]]) -> tuple[PosePlan, ...]:
+def _places(pairs: Sequence[PairPlan]) -> list[_Place]:
+    """Rig, offset and room of every view of every pair."""
+    return [(pair.rig, Stroke(pair.stroke_m).offset_m(position), pair.room) for pair in pairs for position in POSITIONS]
+
+
+def _poses(recipe: Recipe, places: Iterable[_Place]) -> tuple[PosePlan, ...]:
     # names have nine decimals: offsets that agree to the nanometre would write the same files
     poses = [(pose_of(*place), *place) for place in places]
     if twice := [name for name, count in Counter(pose[0] for pose in poses).items() if count > 1]:
         raise RecipeError(f"experiments: two strokes near {twice[0][1:]} m differ by less than 1 nm; make them equal")
     dataset = recipe.dataset
     return tuple(
-        PosePlan(name, offset_m, seed_32(dataset.name, dataset.seed, name, "ambient"), rig)
-        for name, rig, offset_m in poses
+        PosePlan(name, offset_m, seed_32(dataset.name, dataset.seed, name, "ambient"), rig, room)
+        for name, rig, offset_m, room in poses
     )
 
 
@@ -254,6 +264,7 @@ def shard_plan(plan: Plan, shard: str | None) -> Plan:
     return replace(
         plan,
         rigs={name: rig for name, rig in plan.rigs.items() if name in rigs},
+        rooms={name: room for name, room in plan.rooms.items() if name in {pair.room for pair in pairs}},
         spots={name: spot for name, spot in plan.spots.items() if name in spots},
         poses=tuple(pose for pose in plan.poses if pose.pose_id in poses),
         pairs=pairs,

@@ -17,8 +17,9 @@ from phibench.datasets.recipe.tables import (
     RoomTable,
     TargetTable,
 )
+from phibench.datasets.rooms.room_sources import NamedRoom, room_of
 from phibench.scenes.camera import Camera
-from phibench.scenes.catalog import BOARD_ALBEDO, RIGS, ROOMS, Target
+from phibench.scenes.catalog import BOARD_ALBEDO, RIGS, Target
 from phibench.scenes.frames import Pose, Vector, as_vector, rotation_xyz
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import SphereMirror
@@ -82,9 +83,14 @@ def build_target(table: TargetTable) -> Target:
     return Target(table.name, table.depth_m, float(np.radians(table.azimuth_deg)), table.height_m)
 
 
+def room_source(table: RoomTable, targets: Iterable[TargetTable]) -> NamedRoom:
+    """Source of the room of a recipe, with its target boards."""
+    return NamedRoom(table.name, tuple(build_target(target) for target in targets))
+
+
 def build_room(table: RoomTable, targets: Iterable[TargetTable]) -> Room:
     """Room of a recipe with its target boards."""
-    return ROOMS[table.name]([build_target(target) for target in targets])
+    return room_of(room_source(table, targets))
 
 
 def build_spot(laser: LaserTable, target: TargetTable) -> LaserSpot:

@@ -13,13 +13,16 @@ from pathlib import Path
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import FILE_NAME, InputFile
 from phibench.datasets.store import schema
-from phibench.datasets.store.documents import from_json, read_info, read_manifest
+from phibench.datasets.store.documents import read_info, read_manifest
 from phibench.datasets.store.files import require_file, sha256, write_text
 from phibench.datasets.store.leftovers import TEMPORARY_PREFIX
+from phibench.datasets.store.stored_rooms import read_rooms
 from phibench.scenes.rig import POSITIONS
-from phibench.scenes.room import Room
 
-_FILES = {schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.RIGS, *schema.NOT_DATA}
+_FILES = {
+    *(schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.RIGS, schema.ROOMS),
+    *schema.NOT_DATA,
+}
 
 
 def data_files(folder: Path) -> list[str]:
@@ -33,8 +36,9 @@ def data_files(folder: Path) -> list[str]:
     rows = read_manifest(folder)
     names = {schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.RIGS}
     info = read_info(folder)
-    if from_json(Room, info.room).lit:
-        names.add(schema.LIGHT_MAP)
+    if info.room is None:
+        names.add(schema.ROOMS)
+    names.update(schema.light_map_file(room.room) for room in read_rooms(folder, info).infos.values() if room.lit)
     names.update(name for pose in info.poses for name in pose.files.values())
     names.update(schema.preview_file(row.sample_id) for row in rows)
     spots = (row.position(position) for row in rows for position in POSITIONS)
@@ -126,7 +130,7 @@ def check_documents(folder: Path) -> None:
         In one sentence.
     """
     listed = read_checksums(folder)
-    for name in (schema.INFO, schema.MANIFEST, schema.RIGS):
+    for name in (schema.INFO, schema.MANIFEST, schema.RIGS, *([schema.ROOMS] if schema.ROOMS in listed else [])):
         if fault := _fault(folder, name, listed.get(name, "")):
             raise DatasetError(f"{folder}: {fault}; run `phibench dataset verify` to see all faults")
 

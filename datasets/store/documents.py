@@ -144,8 +144,7 @@ def dataset_info(plan: Plan, environment: dict[str, Any]) -> DatasetInfo:
         recipe=recipe.model_dump(mode="json"),
         recipe_sha256=recipe_sha256(recipe),
         rigs=len(plan.rigs),
-        room=to_json(plan.room),
-        object_names=plan.room.object_names(plan.rig.at(0.0)),
+        rooms=len(plan.rooms),
         poses=tuple(_pose_info(pose) for pose in plan.poses),
         samples=len(plan.pairs),
         shard=plan.shard,
@@ -219,7 +218,8 @@ def _without_commit(info: DatasetInfo) -> str:
 
 def _pose_info(pose: PosePlan) -> PoseInfo:
     files = {name: schema.view_file(pose.pose_id, name) for name in ("ambient", "truth", "preview")}
-    return PoseInfo(pose=pose.pose_id, rig=pose.rig, offset_m=pose.offset_m, ambient_seed=pose.seed, files=files)
+    ids = {"pose": pose.pose_id, "rig": pose.rig, "room": pose.room}
+    return PoseInfo(**ids, offset_m=pose.offset_m, ambient_seed=pose.seed, files=files)
 
 
 # The manifest, as lines of JSON and as a flat table.

@@ -18,10 +18,12 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, field_validator, model_validator
 
 from phibench.datasets.input_files import FileName, Name, NoFileName
+from phibench.datasets.rooms.room_sources import ONLY_ROOM
 
-SCHEMA_VERSION = 5
-READABLE_VERSIONS = (4, 5)
-"""Version 5 gave mirrors a form, `mirror.form` in `rigs.jsonl`; in version 4 every mirror is a perfect sphere."""
+SCHEMA_VERSION = 6
+READABLE_VERSIONS = (4, 5, 6)
+"""Version 5 gave mirrors a form, `mirror.form` in `rigs.jsonl`; in version 4 every mirror is a perfect sphere.
+Version 6 gave samples rooms of their own, `rooms.jsonl`; before, `dataset.json` held the only one, shape by shape."""
 Position = Literal["down", "up"]
 
 
@@ -46,9 +48,12 @@ class Document(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
 
-def described(unit: str, text: str) -> Any:
-    """Field of a document with its unit ("-": none, "1": a pure number) and its meaning."""
-    return Field(description=text, json_schema_extra={"unit": unit})
+def described(unit: str, text: str, **default: Any) -> Any:
+    """Field of a document with its unit ("-": none, "1": a pure number) and its meaning.
+
+    `default` is for fields that older versions do not have.
+    """
+    return Field(description=text, json_schema_extra={"unit": unit}, **default)
 
 
 # Documents.
@@ -121,6 +126,7 @@ class ManifestRow(Document):
     target: str = described("-", "name of the target in the recipe, or of what carries the spot")
     rig: str = described("-", "id of the true rig, in `rigs.jsonl`")
     nominal_rig: str = described("-", "id of the nominal rig, which estimators are given, in `rigs.jsonl`")
+    room: Name = described("-", "id of the room, in `rooms.jsonl`", default=ONLY_ROOM)
     depth_m: float = described(
         "m", "D: horizontal distance of the spot from the vertical through the sphere centre, down"
     )
@@ -149,6 +155,7 @@ class PoseInfo(Document):
 
     pose: str = described("-", "id")
     rig: str = described("-", "id of the rig")
+    room: Name = described("-", "id of the room", default=ONLY_ROOM)
     offset_m: float = described("m", "carriage offset along the stroke axis")
     ambient_seed: int = described("-", "32-bit seed of the ambient layer")
     files: dict[str, FileName] = described("-", "ambient, truth, preview")
@@ -168,6 +175,18 @@ class RigInfo(Document):
     resolved: dict[str, Any] = described("-", "the rig, field by field")
 
 
+class RoomInfo(Document):
+    """One room: one line of `rooms.jsonl`."""
+
+    room: Name = described("-", "id: `room` where all samples share one")
+    source: dict[str, Any] = described("-", "what the room is made from, field by field")
+    digest: str = described("-", "SHA-256 of all that the room is")
+    lit: bool = described("-", "whether any lamp or screen is on")
+    object_names: Annotated[tuple[str, ...], Field(strict=False)] = described(
+        "-", "name by object_id of the truth layers"
+    )
+
+
 class DatasetInfo(Document):
     """`dataset.json`."""
 
@@ -176,9 +195,10 @@ class DatasetInfo(Document):
     recipe: dict[str, Any] = described("-", "the recipe, defaults filled in")
     recipe_sha256: str = described("-", "SHA-256 of the recipe's values as canonical JSON")
     rigs: int = described("-", "number of rigs, the lines of `rigs.jsonl`")
-    room: dict[str, Any] = described("-", "resolved room, all shapes")
+    rooms: int = described("-", "number of rooms, the lines of `rooms.jsonl`", default=1)
+    room: dict[str, Any] | None = described("-", "the only room, all shapes; before version 6", default=None)
     object_names: Annotated[tuple[str, ...], Field(strict=False)] = described(
-        "-", "name by object_id of the truth layers"
+        "-", "name by object_id of the truth layers; before version 6", default=()
     )
     poses: Annotated[tuple[PoseInfo, ...], Field(strict=False)] = described("-", "all mirror poses")
     samples: int = described("-", "number of rows of the manifest")
@@ -244,8 +264,8 @@ MANIFEST = "manifest.jsonl"
 TABLE = "manifest.parquet"
 RECIPE = "recipe.toml"
 RIGS = "rigs.jsonl"
+ROOMS = "rooms.jsonl"
 CHECKSUMS = "SHA256SUMS"
-LIGHT_MAP = "lightmap.npz"
 RUN = "run.json"
 LOG = "log.jsonl"
 JOURNAL = "journal.txt"
@@ -260,9 +280,14 @@ _ID = r"[A-Za-z0-9][A-Za-z0-9_.-]*"
 """Ids of poses and samples: no separator, and no dot in front, so that no file leaves its folder."""
 _TASK = re.compile(rf"(bake|view|spot|sample) ({_ID})")
 _TASK_FILE = re.compile(
-    rf"lightmap\.npz|views/{_ID}/(ambient|truth)\.exr|views/{_ID}/preview\.png|"
+    rf"lightmaps/{_ID}\.npz|lightmap\.npz|views/{_ID}/(ambient|truth)\.exr|views/{_ID}/preview\.png|"
     rf"spots/{_ID}-(down|up)\.exr|previews/{_ID}\.png"
 )
+
+
+def light_map_file(room_id: str) -> str:
+    """Light map of a room."""
+    return "lightmap.npz" if room_id == ONLY_ROOM else f"lightmaps/{room_id}.npz"
 
 
 def view_file(pose_id: str, name: str) -> str:
@@ -287,7 +312,7 @@ def task_files(task: str) -> frozenset[str]:
         return frozenset()
     kind, name = found.groups()
     files = {
-        "bake": (LIGHT_MAP,),
+        "bake": (light_map_file(name),),
         "view": tuple(view_file(name, which) for which in ("ambient", "truth", "preview")),
         "spot": tuple(spot_file(name, position) for position in ("down", "up")),
         "sample": (preview_file(name),),

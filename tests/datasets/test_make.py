@@ -47,7 +47,15 @@ def test_everything_is_there(smallest_dataset: Path) -> None:
     spots = {schema.spot_file(pair.sample_id, position) for pair in plan.pairs for position in ("down", "up")}
     spots.remove("spots/half-hidden-h1.400-down.exr")  # a crate hides it
     previews = {schema.preview_file(pair.sample_id) for pair in plan.pairs}
-    single = {schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.RIGS, schema.LIGHT_MAP}
+    single = {
+        schema.INFO,
+        schema.MANIFEST,
+        schema.TABLE,
+        schema.RECIPE,
+        schema.RIGS,
+        schema.ROOMS,
+        schema.light_map_file("room"),
+    }
     listed = set(read_checksums(smallest_dataset))
     assert listed == views | spots | previews | single == set(data_files(smallest_dataset))
     assert damaged(smallest_dataset) == []

@@ -21,7 +21,7 @@ from phibench.datasets.verify import verify
 PREVIEW = schema.preview_file("seen-near-h0.500")
 MADE_BY = {
     AMBIENT: "view h0.000",
-    schema.LIGHT_MAP: "bake room",
+    schema.light_map_file("room"): "bake room",
     TRUTH: "view h0.500",
     SPOT: "spot seen-near-h0.500",
     PREVIEW: "sample seen-near-h0.500",

@@ -68,7 +68,7 @@ def test_a_fresh_data_set_is_in_order(name: str, request: pytest.FixtureRequest)
         AMBIENT,
         TRUTH,
         SPOT,
-        schema.LIGHT_MAP,
+        schema.light_map_file("room"),
         schema.TABLE,
         schema.RECIPE,
         schema.RIGS,
@@ -129,7 +129,7 @@ def test_a_missing_folder_and_an_unreadable_file_are_called_so(copy: Path, monke
 @pytest.mark.parametrize("name", ["irradiance_w_m2", "sigma_w_m2", "covered"])
 @pytest.mark.parametrize("spoil", ["negative", "nan", "short", "gone"])
 def test_a_spoilt_light_map_is_found_though_signed(copy: Path, name: str, spoil: str) -> None:
-    with np.load(copy / schema.LIGHT_MAP) as file:
+    with np.load(copy / schema.light_map_file("room")) as file:
         arrays = dict(file)
     if spoil == "short":
         arrays[name] = arrays[name][:-1]
@@ -139,10 +139,10 @@ def test_a_spoilt_light_map_is_found_though_signed(copy: Path, name: str, spoil:
         arrays[name][5] = -1.0 if spoil == "negative" else np.nan
     else:
         return
-    np.savez(copy / schema.LIGHT_MAP, **arrays)
+    np.savez(copy / schema.light_map_file("room"), **arrays)
     sign(copy)
     [fault] = check(copy).faults
-    assert schema.LIGHT_MAP in fault
+    assert schema.light_map_file("room") in fault
     assert name in fault
 
 
@@ -174,7 +174,15 @@ def place(kind: str, path: Path) -> None:
 
 KINDS = ["folder", "FIFO", "socket", "device", "circle"]
 NAMES = [
-    *(schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.RIGS, schema.CHECKSUMS, schema.LIGHT_MAP),
+    *(
+        schema.INFO,
+        schema.MANIFEST,
+        schema.TABLE,
+        schema.RECIPE,
+        schema.RIGS,
+        schema.CHECKSUMS,
+        schema.light_map_file("room"),
+    ),
     *(schema.JOURNAL, schema.RUN, schema.LOG, schema.CONTACT_SHEET, schema.SENSITIVITIES),
     *(AMBIENT, TRUTH, SPOT, PREVIEW, schema.view_file("h0.000", "preview")),
 ]

@@ -37,7 +37,7 @@ def twice() -> bytes:
 
 
 def test_a_light_map_is_read_to_the_bit_and_can_be_written(tmp_path: Path) -> None:
-    (tmp_path / schema.LIGHT_MAP).write_bytes(encoded(LIGHT))
+    (tmp_path / schema.light_map_file("room")).write_bytes(encoded(LIGHT))
     found = read_light_map(tmp_path)
     assert encoded(found) == encoded(LIGHT)
     assert found.irradiance_w_m2.flags.writeable
@@ -64,7 +64,7 @@ FILES = {
 
 @pytest.mark.parametrize(("data", "words"), FILES.values(), ids=FILES)
 def test_what_is_no_light_map_is_refused(tmp_path: Path, data: bytes, words: str) -> None:
-    path = tmp_path / schema.LIGHT_MAP
+    path = tmp_path / schema.light_map_file("room")
     path.write_bytes(data)
     with pytest.raises(DatasetError) as caught:
         read_light_map(tmp_path)

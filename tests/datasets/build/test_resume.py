@@ -129,8 +129,8 @@ def test_only_what_a_change_changes_is_made_again(
 def test_a_room_whose_lamps_go_out_loses_its_light_map(copy: Path) -> None:
     dark = ("[ambient]", '[room]\nname = "dark"\n\n[ambient]')
     assert "bake room" not in again(copy, dark, replace=True)
-    assert not (copy / schema.LIGHT_MAP).exists()
-    assert schema.LIGHT_MAP not in (copy / schema.CHECKSUMS).read_text()
+    assert not (copy / schema.light_map_file("room")).exists()
+    assert schema.light_map_file("room") not in (copy / schema.CHECKSUMS).read_text()
 
 
 @pytest.mark.usefixtures("inline")

@@ -87,7 +87,7 @@ def test_files() -> None:
         schema.RUN,
         schema.CONTACT_SHEET,
     }
-    single |= {schema.LOG, schema.JOURNAL, schema.LIGHT_MAP, schema.RIGS, schema.SENSITIVITIES}
+    single |= {schema.LOG, schema.JOURNAL, schema.light_map_file("room"), schema.RIGS, schema.SENSITIVITIES}
     assert said == views | spots | single | {schema.preview_file("SAMPLE")}
 
 

@@ -1,0 +1,40 @@
+"""Sources of rooms: what a room is made from, small enough for a task and a line of `rooms.jsonl`.
+
+A room of the catalogue is its name and its boards; a generated one its properties and the names of its random stream;
+a photographed room or a mesh its settings and the SHA-256 of its file. `room_of` builds the room, in any process.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+from phibench.scenes.catalog import ROOMS, Target
+from phibench.scenes.room import Room
+
+ONLY_ROOM = "room"
+"""Id of the room of a recipe that has one for all samples."""
+_KEPT = 3  # rooms of a process; one with many textures has 60 MB
+
+
+@dataclass(frozen=True)
+class NamedRoom:
+    """A room of the catalogue, with target boards."""
+
+    name: str
+    targets: tuple[Target, ...]
+    kind: Literal["named"] = "named"
+
+    def build(self) -> Room:
+        """The room itself."""
+        return ROOMS[self.name](self.targets)
+
+
+RoomSource = NamedRoom
+
+
+@lru_cache(maxsize=_KEPT)
+def room_of(source: RoomSource) -> Room:
+    """Room of a source; the last few are kept."""
+    return source.build()

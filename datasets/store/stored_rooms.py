@@ -1,0 +1,80 @@
+"""rooms.jsonl: the rooms of a data set, each built from its source when it is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.rooms.room_sources import ONLY_ROOM, RoomSource, room_of
+from phibench.datasets.store import schema
+from phibench.datasets.store.documents import from_json
+from phibench.datasets.store.files import read_rows
+from phibench.datasets.store.schema import DatasetInfo, RoomInfo
+from phibench.scenes.room import Room
+from phibench.scenes.validation import nearest
+
+
+@dataclass(frozen=True)
+class Rooms:
+    """Rooms by id; each is built from its source when it is asked for."""
+
+    infos: dict[str, RoomInfo]
+
+    def __len__(self) -> int:
+        return len(self.infos)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.infos)
+
+    def __getitem__(self, name: str) -> Room:
+        """Room of an id.
+
+        Raises
+        ------
+        DatasetError
+            If there is none, or this version or another file on this machine gives another room.
+        """
+        info = self.info(name)
+        room = room_of(from_json(RoomSource, info.source))
+        if room.digest != info.digest:
+            text = f"{schema.ROOMS}: {name} is another room here than where the data set was made"
+            raise DatasetError(f"{text}; install the version that made it, and give it the same files")
+        return room
+
+    def info(self, name: str) -> RoomInfo:
+        """Line of a room."""
+        if name not in self.infos:
+            raise DatasetError(f"{schema.ROOMS} has no room '{name}'; {nearest(name, list(self.infos)[:20])}")
+        return self.infos[name]
+
+
+@dataclass(frozen=True)
+class OldRooms(Rooms):
+    """The only room of a data set of version 4 or 5, whose description holds it shape by shape."""
+
+    room: Room
+
+    def __getitem__(self, name: str) -> Room:
+        self.info(name)
+        return self.room
+
+
+def read_rooms(folder: Path, info: DatasetInfo) -> Rooms:
+    """Rooms of a data set.
+
+    Raises
+    ------
+    DatasetError
+        If the file is missing, or with the number of the first line that is not a room.
+    """
+    if info.room is None:
+        return Rooms({row.room: row for row in read_rows(folder / schema.ROOMS, RoomInfo)})
+    try:
+        room = from_json(Room, info.room)
+    except DatasetError as error:
+        raise DatasetError(f"{folder / schema.INFO}: {error}; run `phibench dataset repair`") from error
+    name = ONLY_ROOM
+    row = RoomInfo(room=name, source={}, digest=room.digest, lit=room.lit, object_names=info.object_names)
+    return OldRooms({name: row}, room)
