@@ -96,9 +96,10 @@ class Dataset:
         DatasetError
             If there are several.
         """
-        if len(self.rooms) != 1:
-            raise DatasetError(f"{self.folder} has {len(self.rooms)} rooms; take each sample's own, `sample.room`")
-        return self.rooms[next(iter(self.rooms))]
+        names = {row.room for row in self.rows}
+        if len(names) != 1:
+            raise DatasetError(f"{self.folder} has {len(names)} rooms; take each sample's own, `sample.room`")
+        return self.rooms[names.pop()]
 
     @cached_property
     def recipe(self) -> Recipe:
@@ -187,7 +188,7 @@ class Dataset:
         infos = list(self.rooms.infos.values())
         if len(infos) != 1:
             return f"{len(infos)} rooms"
-        return f"{self.info.recipe['room']['name']}, {len(infos[0].object_names)} objects"
+        return f"{self.info.recipe['room']['name']}, {_count(len(infos[0].object_names), 'object')}"
 
     def _image_size(self) -> str:
         if not self.rows:

@@ -36,7 +36,7 @@ from phibench.datasets.store.layers import (
     read_spot,
     read_truth,
 )
-from phibench.datasets.store.schema import ManifestRow, PoseInfo, SpotRow
+from phibench.datasets.store.schema import ManifestRow, PoseInfo, RoomInfo, SpotRow
 from phibench.render.room.light_map import texel_count
 from phibench.render.room.noise_budget import BUDGETS
 from phibench.scenes.laser import LaserSpot
@@ -281,7 +281,9 @@ def _ambient_faults(dataset: Dataset, pose: PoseInfo, shape: tuple[int, int]) ->
 
 def _light_map_faults(dataset: Dataset, room_id: str) -> Iterator[str]:
     light, file = read_light_map(dataset.folder, room_id), schema.light_map_file(room_id)
-    texels = texel_count(dataset.rooms[room_id], dataset.recipe.ambient.texel_m)
+    texels = len(light.covered)  # before version 6 texels were cut in another way
+    if dataset.info.schema_version >= 6:
+        texels = texel_count(dataset.rooms[room_id], dataset.recipe.ambient.texel_m)
     shapes = {"irradiance_w_m2": (texels, 3), "sigma_w_m2": (texels, 3), "covered": (texels,)}
     for name, shape in shapes.items():
         array = getattr(light, name)
@@ -335,7 +337,8 @@ def plan_faults(dataset: Dataset) -> Iterator[str]:
         yield from _row_faults(plan, pairs[name], rows[name])
     yield from _rig_faults(plan, dataset)
     yield from _room_faults(plan, dataset)
-    if [(pose.pose, pose.rig) for pose in dataset.info.poses] != [(pose.pose_id, pose.rig) for pose in plan.poses]:
+    held = [(pose.pose, pose.rig, pose.room) for pose in dataset.info.poses]
+    if held != [(pose.pose_id, pose.rig, pose.room) for pose in plan.poses]:
         yield f"{schema.INFO}: the poses are not those of the recipe"
 
 
@@ -368,8 +371,18 @@ def _room_faults(plan: Plan, dataset: Dataset) -> Iterator[str]:
     if set(dataset.rooms) != set(plan.rooms):
         yield f"{schema.ROOMS}: the rooms are not those of the recipe"
     for info in dataset.rooms.infos.values():
-        if info.source and info.room in plan.rooms and not alike(info.source, to_json(plan.rooms[info.room])):
-            yield f"{schema.ROOMS}: {info.room} is not the room that the recipe gives"
+        if info.source and info.room in plan.rooms:
+            if not alike(info.source, to_json(plan.rooms[info.room])):
+                yield f"{schema.ROOMS}: {info.room} is not the room that the recipe gives"
+            yield from _guarded(_room_line_faults(plan, dataset, info))
+
+
+def _room_line_faults(plan: Plan, dataset: Dataset, info: RoomInfo) -> Iterator[str]:
+    """What a room's line says besides its source."""
+    room = dataset.rooms[info.room]
+    for name, value in (("lit", room.lit), ("object_names", room.object_names(plan.rig.at(0.0)))):
+        if getattr(info, name) != value:
+            yield f"{schema.ROOMS}: {name} of {info.room} is not that of its source"
 
 
 def _with_form(rig: dict[str, Any]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from typing import Literal
 
 from phibench.scenes.catalog import ROOMS, Target
 from phibench.scenes.room import Room
+from phibench.scenes.validation import SceneError, nearest, printable_line
 
 ONLY_ROOM = "room"
 """Id of the room of a recipe that has one for all samples."""
@@ -27,7 +28,15 @@ class NamedRoom:
     kind: Literal["named"] = "named"
 
     def build(self) -> Room:
-        """The room itself."""
+        """The room itself.
+
+        Raises
+        ------
+        SceneError
+            If the catalogue has no room of that name, or the boards do not fit together.
+        """
+        if self.name not in ROOMS:  # a file of another version, perhaps
+            raise SceneError(f"no room is called '{printable_line(self.name, 60)}'; {nearest(self.name, ROOMS)}")
         return ROOMS[self.name](self.targets)
 
 

@@ -38,6 +38,10 @@ def _null_from_nan(value: float) -> float | None:
 Number = Annotated[float, BeforeValidator(_nan_from_null), PlainSerializer(_null_from_nan, when_used="json")]
 """A double that may be NaN: null in JSON."""
 
+_ID = r"[A-Za-z0-9][A-Za-z0-9_.-]*"
+"""Ids of poses, samples and rooms: no separator, and no dot in front, so that no file leaves its folder."""
+RoomId = Annotated[Name, Field(pattern=f"^{_ID}$")]
+
 Vector2 = Annotated[tuple[Number, Number], Field(strict=False)]
 Vector3 = Annotated[tuple[Number, Number, Number], Field(strict=False)]
 
@@ -126,7 +130,7 @@ class ManifestRow(Document):
     target: str = described("-", "name of the target in the recipe, or of what carries the spot")
     rig: str = described("-", "id of the true rig, in `rigs.jsonl`")
     nominal_rig: str = described("-", "id of the nominal rig, which estimators are given, in `rigs.jsonl`")
-    room: Name = described("-", "id of the room, in `rooms.jsonl`", default=ONLY_ROOM)
+    room: RoomId = described("-", "id of the room, in `rooms.jsonl`", default=ONLY_ROOM)
     depth_m: float = described(
         "m", "D: horizontal distance of the spot from the vertical through the sphere centre, down"
     )
@@ -155,7 +159,7 @@ class PoseInfo(Document):
 
     pose: str = described("-", "id")
     rig: str = described("-", "id of the rig")
-    room: Name = described("-", "id of the room", default=ONLY_ROOM)
+    room: RoomId = described("-", "id of the room", default=ONLY_ROOM)
     offset_m: float = described("m", "carriage offset along the stroke axis")
     ambient_seed: int = described("-", "32-bit seed of the ambient layer")
     files: dict[str, FileName] = described("-", "ambient, truth, preview")
@@ -178,7 +182,7 @@ class RigInfo(Document):
 class RoomInfo(Document):
     """One room: one line of `rooms.jsonl`."""
 
-    room: Name = described("-", "id: `room` where all samples share one")
+    room: RoomId = described("-", "id: `room` where all samples share one")
     source: dict[str, Any] = described("-", "what the room is made from, field by field")
     digest: str = described("-", "SHA-256 of all that the room is")
     lit: bool = described("-", "whether any lamp or screen is on")
@@ -276,8 +280,6 @@ SENSITIVITIES = "sensitivities.parquet"
 NOT_DATA = (CHECKSUMS, RUN, LOG, JOURNAL, LOCK, WORKING, CONTACT_SHEET, SENSITIVITIES)
 """Files that SHA256SUMS does not list: itself, the diaries of the run, locks, and what is computed from it all."""
 
-_ID = r"[A-Za-z0-9][A-Za-z0-9_.-]*"
-"""Ids of poses and samples: no separator, and no dot in front, so that no file leaves its folder."""
 _TASK = re.compile(rf"(bake|view|spot|sample) ({_ID})")
 _TASK_FILE = re.compile(
     rf"lightmaps/{_ID}\.npz|lightmap\.npz|views/{_ID}/(ambient|truth)\.exr|views/{_ID}/preview\.png|"

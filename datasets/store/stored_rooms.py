@@ -13,7 +13,7 @@ from phibench.datasets.store.documents import from_json
 from phibench.datasets.store.files import read_rows
 from phibench.datasets.store.schema import DatasetInfo, RoomInfo
 from phibench.scenes.room import Room
-from phibench.scenes.validation import nearest
+from phibench.scenes.validation import SceneError, nearest
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,13 @@ class Rooms:
         Raises
         ------
         DatasetError
-            If there is none, or this version or another file on this machine gives another room.
+            If there is none, its source is none of a room, or this version or the files of this machine give another.
         """
         info = self.info(name)
-        room = room_of(from_json(RoomSource, info.source))
+        try:
+            room = room_of(from_json(RoomSource, info.source))
+        except (DatasetError, SceneError) as error:
+            raise DatasetError(f"{schema.ROOMS}: {name} cannot be built: {error}") from error
         if room.digest != info.digest:
             text = f"{schema.ROOMS}: {name} is another room here than where the data set was made"
             raise DatasetError(f"{text}; install the version that made it, and give it the same files")
@@ -67,10 +70,10 @@ def read_rooms(folder: Path, info: DatasetInfo) -> Rooms:
     Raises
     ------
     DatasetError
-        If the file is missing, or with the number of the first line that is not a room.
+        If the file is missing, or with the number of the first line that is not a room or names one again.
     """
     if info.room is None:
-        return Rooms({row.room: row for row in read_rows(folder / schema.ROOMS, RoomInfo)})
+        return Rooms(_once_each(folder / schema.ROOMS))
     try:
         room = from_json(Room, info.room)
     except DatasetError as error:
@@ -78,3 +81,12 @@ def read_rooms(folder: Path, info: DatasetInfo) -> Rooms:
     name = ONLY_ROOM
     row = RoomInfo(room=name, source={}, digest=room.digest, lit=room.lit, object_names=info.object_names)
     return OldRooms({name: row}, room)
+
+
+def _once_each(path: Path) -> dict[str, RoomInfo]:
+    infos: dict[str, RoomInfo] = {}
+    for number, row in enumerate(read_rows(path, RoomInfo), 1):
+        if row.room in infos:
+            raise DatasetError(f"{path} line {number} is damaged: room '{row.room}' is there already")
+        infos[row.room] = row
+    return infos

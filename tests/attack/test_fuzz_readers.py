@@ -220,7 +220,7 @@ def test_thousands_of_strange_command_lines_end_in_a_sentence(
 
 # -- data sets -----------------------------------------------------------------------------------------------------
 
-SMALL = ("dataset.json", "manifest.jsonl", "rigs.jsonl")
+SMALL = ("dataset.json", "manifest.jsonl", "rigs.jsonl", "rooms.jsonl")
 
 
 def read_dataset(folder: Path) -> None:
@@ -228,6 +228,7 @@ def read_dataset(folder: Path) -> None:
     dataset = open_finished(folder)
     for sample in dataset:
         assert sample.rig.at(0.0) is not None
+        assert sample.room.name
         assert sample.laser_spot.diameter_m > 0.0
         assert sample.stream_names
     assert repr(dataset)

@@ -28,6 +28,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.progress import Steps
 from phibench.datasets.recipe.load import load_recipe
+from phibench.datasets.rooms.room_sources import room_of
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import damaged, data_files, read_checksums
 from phibench.datasets.store.documents import read_manifest
@@ -187,7 +188,7 @@ def test_a_sample_out_of_tolerance_is_refused_with_its_numbers(tmp_path: Path, m
 def test_a_spot_that_no_mirror_point_reflects_is_flagged() -> None:
     plan = make_plan(load_recipe(SMALLEST))
     above = LaserSpot((0.0, 0.0, 2.5), (0.0, 0.0, -1.0), 3e-3)
-    answer = spot_task.answer_spot(plan.rig.at(0.0), above, plan.room)
+    answer = spot_task.answer_spot(plan.rig.at(0.0), above, room_of(plan.rooms["room"]))
     assert answer.truth.cause == "no_reflection"
     assert answer.certificate is None
     assert not answer.on_image

@@ -6,13 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.damage import sign
+from helpers.processes import quiet
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.read import Dataset, open_dataset, open_finished
 from phibench.datasets.recipe.load import load_recipe
+from phibench.datasets.rooms.room_sources import room_of
 from phibench.datasets.store import schema
+from phibench.datasets.store.documents import parquet_bytes, to_json
 from phibench.datasets.store.layers import TRUTH_PLANES, SpotWindow
+from phibench.datasets.verify import plan_faults, verify
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import truth_layer
 
@@ -26,7 +31,7 @@ def dataset(tiny_dataset: Path) -> Dataset:
 
 def test_rig_room_and_recipe_come_back(dataset: Dataset) -> None:
     plan = make_plan(load_recipe(TINY))
-    assert (dataset.rig, dataset.room, dataset.recipe) == (plan.rig, plan.room, plan.recipe)
+    assert (dataset.rig, dataset.room, dataset.recipe) == (plan.rig, room_of(plan.rooms["room"]), plan.recipe)
     assert [sample.rig for sample in dataset] == [plan.rig, plan.rig]
     assert [sample.laser_spot for sample in dataset] == [plan.spots[pair.target] for pair in plan.pairs]
     assert len(dataset) == 2
@@ -59,7 +64,7 @@ def test_the_pixel_truth_at_the_spot_is_the_spots_truth(dataset: Dataset) -> Non
         a, b = row.u_px - u0, row.v_px - v0
         weights = np.outer([1.0 - b, b], [1.0 - a, a])
         ids = truth["object_id"][v0 : v0 + 2, u0 : u0 + 2]
-        assert {dataset.info.object_names[i] for i in ids.ravel()} == {"board_near"}
+        assert {dataset.rooms.info("room").object_names[i] for i in ids.ravel()} == {"board_near"}
         point = [float((weights * truth[name][v0 : v0 + 2, u0 : u0 + 2]).sum()) for name in ("x_m", "y_m", "z_m")]
         assert np.linalg.norm(np.array(point) - sample.row.spot_world_m) < 3e-3  # one pixel spans 6 cm here
         phi = float((weights * truth["phi_ray_rad"][v0 : v0 + 2, u0 : u0 + 2]).sum())
@@ -127,10 +132,11 @@ def test_errors_are_clear(dataset: Dataset, tiny_dataset: Path, tmp_path: Path) 
         ({"schema_version": 99}, "schema version 99"),
         ({"samples": 3}, "2 rows instead of 3"),
         ({"rigs": 2}, "1 rigs instead of 2"),
+        ({"rooms": 2}, "1 rooms instead of 2"),
     ],
 )
 def test_a_foreign_info_is_refused(tiny_dataset: Path, tmp_path: Path, change: dict[str, object], words: str) -> None:
-    for name in (schema.INFO, schema.MANIFEST, schema.RIGS):
+    for name in (schema.INFO, schema.MANIFEST, schema.RIGS, schema.ROOMS):
         shutil.copy(tiny_dataset / name, tmp_path / name)
     info = json.loads((tmp_path / schema.INFO).read_text())
     (tmp_path / schema.INFO).write_text(json.dumps({**info, **change}))
@@ -231,11 +237,45 @@ def test_the_table_of_a_data_set_is_its_parquet_file(dataset: Dataset) -> None:
     assert dataset[1:].to_polars()["sample_id"].to_list() == [dataset[1].row.sample_id]
 
 
+def as_of_version_5(folder: Path) -> None:
+    """Write a folder's documents as version 5 did: its only room in `dataset.json`, and no id of a room anywhere."""
+    dataset, (table, manifest) = open_dataset(folder), (folder / schema.TABLE, folder / schema.MANIFEST)
+    info = json.loads((folder / schema.INFO).read_text())
+    for document in (info, *info["poses"]):
+        document.pop("rooms" if document is info else "room")
+    names = dataset.rooms.info("room").object_names
+    old = {"schema_version": 5, "room": to_json(dataset.room), "object_names": names}
+    (folder / schema.INFO).write_text(json.dumps({**info, **old}))
+    rows = [json.loads(line) for line in manifest.read_text().splitlines()]
+    assert [row.pop("room") for row in rows] == ["room"] * len(rows)
+    manifest.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    table.write_bytes(parquet_bytes(dataset.to_polars().drop("room")))
+    with np.load(folder / "lightmap.npz") as light:  # its faces had other texels
+        np.savez(folder / "lightmap.npz", **{name: light[name][:-7] for name in light})
+    (folder / schema.ROOMS).unlink()
+    sign(folder)
+
+
+def test_a_data_set_of_version_5_is_read_and_verified(copy: Path, tiny_dataset: Path) -> None:
+    as_of_version_5(copy)
+    old, new = open_finished(copy), open_dataset(tiny_dataset)
+    assert (old.info.schema_version, old.rows) == (5, new.rows)
+    assert old.room == new.room == old[0].room == old.rooms[old.rows[1].room]
+    assert old.rooms.info("room").object_names == new.rooms.info("room").object_names
+    assert np.array_equal(old[0].expected_image("up"), new[0].expected_image("up"))
+    assert repr(old).splitlines()[1:-1] == repr(new).splitlines()[1:-1]
+    assert verify(copy, truth_layers=False, console=quiet()).faults == ()
+    info = json.loads((copy / schema.INFO).read_text())
+    info["room"]["surfaces"][0].pop("name")
+    (copy / schema.INFO).write_text(json.dumps(info))
+    with pytest.raises(DatasetError, match=r"dataset\.json: not a valid Room: .*surfaces.*; run `phibench dataset rep"):
+        open_dataset(copy)
+
+
 def test_a_data_set_of_version_4_is_read_as_perfect_spheres(tiny_dataset: Path, tmp_path: Path) -> None:
     """Version 4 has no `mirror.form`: what was true then is true now, and verification agrees."""
-    from phibench.datasets.verify import plan_faults
-
     copy = Path(shutil.copytree(tiny_dataset, tmp_path / "copy"))
+    as_of_version_5(copy)
     info = json.loads((copy / schema.INFO).read_text())
     (copy / schema.INFO).write_text(json.dumps({**info, "schema_version": 4}))
     lines = [json.loads(line) for line in (copy / schema.RIGS).read_text().splitlines()]

@@ -25,7 +25,10 @@ MADE_BY = {
     TRUTH: "view h0.500",
     SPOT: "spot seen-near-h0.500",
     PREVIEW: "sample seen-near-h0.500",
-    **{name: name for name in (schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.CHECKSUMS)},
+    **{
+        name: name
+        for name in (schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.ROOMS, schema.CHECKSUMS)
+    },
 }
 pytestmark = pytest.mark.usefixtures("inline")
 

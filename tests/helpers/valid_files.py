@@ -174,7 +174,10 @@ def kinds(folder: Path) -> dict[str, Kind]:
         Kind("study.json", compact({**study, "files": {}, "provenance": {}}), lambda path: read_study(path.parent)),
         Kind("frames.jsonl", compact(FRAME), lambda path: read_index(path.parent), compact),
         Kind(
-            schema.light_map_file("room"), encoded(LIGHT), lambda path: read_light_map(path.parent), forge=forged_light
+            schema.light_map_file("room"),
+            encoded(LIGHT),
+            lambda path: read_light_map(path.parent, "room"),
+            forge=forged_light,
         ),
         Kind(
             "entry.lightmap", entry_bytes(encoded(LIGHT)), read_entry, forge=lambda rng: entry_bytes(forged_light(rng))

@@ -375,7 +375,7 @@ def test_a_moved_view_is_the_view_of_a_rig_that_was_built_there(misaligned_datas
     view = sample.view("up")
     built = dataclasses.replace(sample.rig, T_world_camera=view.T_world_camera, motion=None).at(0.0)
     [pose] = [pose for pose in dataset.info.poses if pose.pose == sample.row.up.pose]
-    light, budget = read_light_map(misaligned_dataset), BUDGETS[settings.quality]
+    light, budget = read_light_map(misaligned_dataset, "room"), BUDGETS[settings.quality]
     layer = render_ambient(
         built, dataset.room, light, bake_settings(settings), settings.cells_per_pixel, pose.ambient_seed, budget=budget
     )

@@ -38,7 +38,7 @@ def twice() -> bytes:
 
 def test_a_light_map_is_read_to_the_bit_and_can_be_written(tmp_path: Path) -> None:
     (tmp_path / schema.light_map_file("room")).write_bytes(encoded(LIGHT))
-    found = read_light_map(tmp_path)
+    found = read_light_map(tmp_path, "room")
     assert encoded(found) == encoded(LIGHT)
     assert found.irradiance_w_m2.flags.writeable
 
@@ -67,7 +67,7 @@ def test_what_is_no_light_map_is_refused(tmp_path: Path, data: bytes, words: str
     path = tmp_path / schema.light_map_file("room")
     path.write_bytes(data)
     with pytest.raises(DatasetError) as caught:
-        read_light_map(tmp_path)
+        read_light_map(tmp_path, "room")
     assert str(caught.value).startswith(f"{path} ")
     assert words in str(caught.value)
     assert str(caught.value).endswith("; run `phibench dataset repair`")

@@ -25,11 +25,11 @@ def resident_mb():
 plan, out, count = make_plan(load_recipe(sys.argv[1])), Path(sys.argv[2]), int(sys.argv[3])
 camera = replace(plan.rig.camera, width_px=64, height_px=36, fx_px=71.5, fy_px=71.5, cx_px=31.5, cy_px=17.5,
                  pixel_pitch_um=56.0, f_number=2.4)  # full pixels ask for no refinement
-rig = replace(plan.rig, camera=camera)
-assert isinstance(perform(Task("bake room", "", bake_room, (rig, plan.room, plan.recipe.ambient)), out), Done)
+rig, room = replace(plan.rig, camera=camera), plan.rooms["room"]
+assert isinstance(perform(Task("bake room", "", bake_room, (rig, "room", room, plan.recipe.ambient)), out), Done)
 for number in range(1, count + 1):
     pose = replace(plan.poses[0], pose_id="h0.000", offset_m=number / count, seed=number)
-    outcome = perform(Task("view", "", render_view, ("x", rig, plan.room, pose, plan.recipe.ambient)), out)
+    outcome = perform(Task("view", "", render_view, ("x", rig, room, pose, plan.recipe.ambient)), out)
     assert isinstance(outcome, Done), outcome
     if number in (50, count):
         print(resident_mb(), outcome.peak_mb)

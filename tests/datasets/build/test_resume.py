@@ -17,6 +17,7 @@ from phibench.datasets.build.journal import Entry, FolderHead, Journal
 from phibench.datasets.build.run_tasks import claimed
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import make
+from phibench.datasets.read import open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.files import only_run
 from phibench.datasets.store.leftovers import TEMPORARY_PREFIX
@@ -128,8 +129,9 @@ def test_only_what_a_change_changes_is_made_again(
 @pytest.mark.usefixtures("inline")
 def test_a_room_whose_lamps_go_out_loses_its_light_map(copy: Path) -> None:
     dark = ("[ambient]", '[room]\nname = "dark"\n\n[ambient]')
-    assert "bake room" not in again(copy, dark, replace=True)
+    assert "bake room" in again(copy, dark, replace=True)  # its line of rooms.jsonl, and no light
     assert not (copy / schema.light_map_file("room")).exists()
+    assert open_finished(copy).rooms.info("room").lit is False
     assert schema.light_map_file("room") not in (copy / schema.CHECKSUMS).read_text()
 
 

@@ -173,7 +173,7 @@ def test_the_power_is_that_of_the_layer(found: list[tuple[Sample, Distractor]]) 
 
     sample, one = found[0]
     view = sample.view("down")
-    again = spot_layer(view, one.spot, sample.dataset.room.shapes(view))
+    again = spot_layer(view, one.spot, sample.room.shapes(view))
     np.testing.assert_allclose(again.electrons_per_s, one.layers["down"].electrons_per_s, rtol=1e-12, atol=1e-12)
 
 

@@ -23,6 +23,7 @@ from phibench.datasets.merge_repair import merge, repair
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.read import open_dataset, open_finished
 from phibench.datasets.recipe.load import load_recipe
+from phibench.datasets.rooms.room_sources import room_of
 from phibench.datasets.show import contact_sheet
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import write_checksums
@@ -69,7 +70,7 @@ def test_more_samples_keep_every_byte_and_render_only_the_new_ones(made: Path, c
     of_all = {schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.RIGS, schema.CHECKSUMS, schema.JOURNAL}
     before, after = contents(made), contents(copy)
     kept = set(before) - of_all
-    assert len(kept) == 1 + 6 * 3 + 6 + 3  # light map; ambient, truth, preview of six poses; spots; previews
+    assert len(kept) == 2 + 6 * 3 + 6 + 3  # room, its light map; ambient, truth, preview of six poses; spots; previews
     assert {name for name in kept if after[name] != before[name]} == set()
     for name in (schema.MANIFEST, schema.RIGS):
         assert after[name].startswith(before[name])
@@ -139,7 +140,7 @@ def test_spots_of_rays_are_rendered_and_verified(tmp_path: Path) -> None:
             row, truth = sample.truth_row(position), sample.truth(position)
             if row.visible:  # the pixel's own ray meets the same thing
                 k = truth["object_id"][round(row.v_px), round(row.u_px)]
-                assert sample.dataset.info.object_names[k] == sample.row.target
+                assert sample.dataset.rooms.info(sample.row.room).object_names[k] == sample.row.target
 
 
 def test_what_was_drawn_has_columns(made: Path) -> None:
@@ -249,7 +250,8 @@ def test_the_exact_depth_comes_out_of_200_drawn_rigs() -> None:
     errors = []
     for pair in drawn.pairs:
         spot, rig = drawn.spots[pair.spot], drawn.rigs[pair.rig]
-        truths = [spot_truth(drawn.view(pair, p), spot, drawn.room.shapes(drawn.view(pair, p))) for p in POSITIONS]
+        room = room_of(drawn.rooms[pair.room])
+        truths = [spot_truth(drawn.view(pair, p), spot, room.shapes(drawn.view(pair, p))) for p in POSITIONS]
         pixels = [np.array([truth.u_px, truth.v_px]) for truth in truths]
         depth_m = math.dist(spot.position_world_m[:2], rig.at(0.0).sphere_centre_m[:2])
         errors.append(abs(float(depth_exact(rig, pair.stroke_m, *pixels).depth_m) / depth_m - 1.0))

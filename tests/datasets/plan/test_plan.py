@@ -11,6 +11,7 @@ from phibench.datasets.build.spot_task import answer_spot
 from phibench.datasets.errors import RecipeError
 from phibench.datasets.plan.plan import make_plan, pose_name
 from phibench.datasets.recipe.load import check_recipe, load_recipe
+from phibench.datasets.rooms.room_sources import room_of
 from phibench.estimator.geometry import paper_depth
 from phibench.scenes.random_streams import generator, seed_32, seed_sequence
 from phibench.scenes.rig import POSITIONS
@@ -46,7 +47,8 @@ def test_every_spot_of_the_paper_is_seen_and_certified_at_both_ends_of_its_strok
     assert len(ends) == 7
     for pair in ends.values():
         for position in POSITIONS:
-            answer = answer_spot(plan.view(pair, position), plan.spots[pair.target], plan.room)
+            room = room_of(plan.rooms[pair.room])
+            answer = answer_spot(plan.view(pair, position), plan.spots[pair.target], room)
             assert answer.truth.cause == "none", pair
             assert answer.certificate is not None
             assert answer.certificate.passed, pair

@@ -18,15 +18,23 @@ from phibench.datasets.plan.sampling import PARAMETERS, drawn_parameters, first_
 from phibench.datasets.recipe.checks import warnings
 from phibench.datasets.recipe.distributions import DistributionTable, quantile
 from phibench.datasets.recipe.load import check_recipe, load_recipe
+from phibench.datasets.rooms.room_sources import room_of
 from phibench.render.optics.room_tracer import blocked_by
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.catalog import X_HIGH, X_LOW, Y_HIGH, Y_LOW
 from phibench.scenes.rig import POSITIONS
+from phibench.scenes.room import Room
 from phibench.scenes.shapes import Cuboid
 
 
 def plan(**values: Any) -> Plan:
     return make_plan(check_recipe(drawing(**values)))
+
+
+def the_room(drawn: Plan) -> Room:
+    """Room of all samples."""
+    [source] = drawn.rooms.values()
+    return room_of(source)
 
 
 @pytest.mark.parametrize("sequence", ["sobol", "independent"])
@@ -178,7 +186,7 @@ def test_spots_on_boards_lie_wholly_on_them() -> None:
     room_left = 0.2 - 5e-3, 0.15 - 5e-3  # the spot's diameter at 2 m, 4 sigma, to the edges
     spot = {"across_m": {"uniform": [-room_left[0], room_left[0]]}, "up_m": {"uniform": [-room_left[1], room_left[1]]}}
     drawn = plan(samples=64, spot=spot)
-    [board] = [solid for solid in drawn.room.furniture if solid.name == "board_a"]
+    [board] = [solid for solid in the_room(drawn).furniture if solid.name == "board_a"]
     local = np.array([board.T_world_shape.inverse().points(np.array(s.position_world_m)) for s in drawn.spots.values()])
     # the board's x axis points away from the axis, its y axis to the left of who looks at it
     np.testing.assert_allclose(local[:, 0], -0.01, atol=1e-12)
@@ -191,7 +199,8 @@ def test_spots_on_boards_lie_wholly_on_them() -> None:
 def test_spots_of_rays_lie_on_the_first_thing_that_the_ray_meets() -> None:
     drawn, checked = plan(samples=300, spot=RAY), Counter[str]()
     walls = {"wall_east": (0, X_HIGH), "wall_west": (0, X_LOW), "wall_north": (1, Y_HIGH), "wall_south": (1, Y_LOW)}
-    shapes = (*drawn.room.surfaces, *drawn.room.furniture)
+    room = the_room(drawn)
+    shapes = (*room.surfaces, *room.furniture)
     by_name = {shape.name: shape for shape in shapes}
     for pair in drawn.pairs:
         spot, values = drawn.spots[pair.spot], dict(pair.drawn)
@@ -246,7 +255,7 @@ def test_the_shipped_recipe_shows_every_spot() -> None:
     for pair in drawn.pairs:
         for position in POSITIONS:
             view = drawn.view(pair, position)
-            seen += spot_truth(view, drawn.spots[pair.spot], drawn.room.shapes(view)).visible
+            seen += spot_truth(view, drawn.spots[pair.spot], the_room(drawn).shapes(view)).visible
     assert seen == 200
 
 

@@ -3,11 +3,13 @@
 import dataclasses
 import re
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from pydantic import BaseModel
 
 from phibench.datasets.frames.frame_files import TRUTH, FrameRow
+from phibench.datasets.rooms.room_sources import RoomSource
 from phibench.datasets.store import layers, schema
 from phibench.render.optics import truth
 from phibench.render.room.light_map import ARRAYS, LightMap
@@ -22,6 +24,7 @@ MODELS = (
     schema.DatasetInfo,
     schema.PoseInfo,
     schema.RigInfo,
+    schema.RoomInfo,
     FrameRow,
 )
 
@@ -87,8 +90,9 @@ def test_files() -> None:
         schema.RUN,
         schema.CONTACT_SHEET,
     }
-    single |= {schema.LOG, schema.JOURNAL, schema.light_map_file("room"), schema.RIGS, schema.SENSITIVITIES}
-    assert said == views | spots | single | {schema.preview_file("SAMPLE")}
+    single |= {schema.LOG, schema.JOURNAL, schema.RIGS, schema.SENSITIVITIES}
+    rooms = {schema.ROOMS, schema.light_map_file("room"), schema.light_map_file("ROOM")}
+    assert said == views | spots | single | rooms | {schema.preview_file("SAMPLE")}
 
 
 def test_planes() -> None:
@@ -115,6 +119,12 @@ def test_causes() -> None:
 def test_the_truth_of_a_frame_is_that_of_the_manifest() -> None:
     for name in TRUTH:
         assert FrameRow.model_fields[name].annotation == schema.SpotRow.model_fields[name].annotation
+
+
+def test_kinds_of_rooms() -> None:
+    said = {name for row in table_with("kind", "source") for name in names(row[0])}
+    sources = get_args(RoomSource) or (RoomSource,)
+    assert said == {source.__dataclass_fields__["kind"].default for source in sources}
 
 
 def test_version() -> None:

@@ -27,7 +27,9 @@ TINY = Path(__file__).resolve().parents[2] / "tiny.toml"
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory: pytest.TempPathFactory) -> list[ManifestRow]:
     plan, out = make_plan(load_recipe(TINY)), tmp_path_factory.mktemp("rows")
-    made = [make_spot(out, "tiny", plan.rig, plan.room, plan.spots[pair.target], pair) for pair in plan.pairs]
+    made = [
+        make_spot(out, "tiny", plan.rig, plan.rooms[pair.room], plan.spots[pair.target], pair) for pair in plan.pairs
+    ]
     return [ManifestRow.model_validate_json(json.dumps(_with_noise(one.result))) for one in made]
 
 

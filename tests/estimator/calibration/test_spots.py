@@ -69,7 +69,7 @@ def test_places_are_the_truth_plus_an_error_of_the_stated_size(tiny: Dataset) ->
     sigma = np.array([2e-3, 5e-3, 0.01])
     for k in range(400):
         info = tiny.info.model_copy(update={"name": f"n{k}"})
-        other = type(sample)(type(tiny)(tiny.folder, info, tiny.rigs, tiny.room, tiny.rows), sample.row)
+        other = type(sample)(type(tiny)(tiny.folder, info, tiny.rigs, tiny.rooms, tiny.rows), sample.row)
         spot = known_spot(other, pair, answer, EVERYTHING)
         assert (spot.depth_sigma_m, spot.height_sigma_m, spot.azimuth_sigma_rad) == tuple(sigma)
         errors.append((np.array([spot.depth_m, spot.height_m, spot.azimuth_rad]) - truth) / sigma)

@@ -240,7 +240,7 @@ def test_the_whole_study_in_small(data: Path, inline: None) -> None:
     assert len(auto_exposed_draws(dataset, "mjpeg", 2)) == 10
     assert len(experiments_of(dataset)) == 5
     with pytest.raises(DatasetError, match="none of the paper's experiments"):
-        experiments_of(type(dataset)(dataset.folder, dataset.info, dataset.rigs, dataset.room, ()))
+        experiments_of(type(dataset)(dataset.folder, dataset.info, dataset.rigs, dataset.rooms, ()))
 
 
 def test_settings_are_there_in_both_sizes() -> None:
