@@ -378,7 +378,7 @@ def _room_faults(plan: Plan, dataset: Dataset) -> Iterator[str]:
 
 
 def _room_line_faults(plan: Plan, dataset: Dataset, info: RoomInfo) -> Iterator[str]:
-    """What a room's line says besides its source."""
+    """Differences of a room's line from the room of its source."""
     room = dataset.rooms[info.room]
     for name, value in (("lit", room.lit), ("object_names", room.object_names(plan.rig.at(0.0)))):
         if getattr(info, name) != value:

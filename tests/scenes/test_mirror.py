@@ -218,7 +218,7 @@ def test_rays_from_values_against_newtons_method() -> None:
 
 
 def test_rays_inside_a_kernel_against_those_in_float64() -> None:
-    """The ambient layer's rays start 200 to 300 mm off, in float32: 1.5e-5 mm, over cos i >= 0.05."""
+    """The ambient layer's rays start 200 to 300 mm off, in float64: some ulp of 6e-14 mm, over cos i >= 0.05."""
     from phibench.render.room import shading
     from phibench.render.setup.variant import activate
 
@@ -228,14 +228,14 @@ def test_rays_inside_a_kernel_against_those_in_float64() -> None:
     origins, ways = lens_rays(view, uv)
     expected = reflect(view, origins, ways)
     origins = 1e3 * (origins - view.sphere_centre_m)
-    ray = mi.Ray3f(*(kind(*v.T.astype(np.float32)) for kind, v in ((mi.Point3f, origins), (mi.Vector3f, ways))))
-    points, normals, found = (np.array(x).T for x in shading.meet(mi, view, ray))
+    ray = mi.Point3d(*origins.T), mi.Vector3d(*ways.T)
+    points, normals, found = (np.array(x).T for x in shading.meet(mi, view, *ray))
     sure = expected.cos_incidence > 0.05
     assert sure.sum() > 5000
     assert found[sure].all()
     assert not found[_beyond(view, uv)].any()
-    assert np.abs(points - 1e3 * (expected.points_m - view.sphere_centre_m))[sure].max() < 3e-4
-    assert np.abs(normals - expected.normals)[sure].max() < 5e-6
+    assert np.abs(points - 1e3 * (expected.points_m - view.sphere_centre_m))[sure].max() < 1e-11
+    assert np.abs(normals - expected.normals)[sure].max() < 1e-12
 
 
 def _beyond(view: View, uv: np.ndarray) -> np.ndarray:
