@@ -27,7 +27,6 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import NAME_LENGTH, InputFile, first_fault
 from phibench.datasets.plan.plan import Plan, PosePlan
 from phibench.datasets.recipe.tables import Recipe
-from phibench.datasets.rooms.room_sources import ONLY_ROOM
 from phibench.datasets.store import schema
 from phibench.datasets.store.files import read_rows, sha256, write_bytes
 from phibench.datasets.store.provenance import provenance
@@ -304,12 +303,21 @@ def differences(folder: Path, rows: Sequence[ManifestRow]) -> list[str]:
         table = InputFile(folder / schema.TABLE, "run `phibench dataset repair`").table()
     except DatasetError as error:
         return [str(error).removeprefix(f"{folder}{os.sep}")]
-    if "room" not in table.columns and {row.room for row in rows} == {ONLY_ROOM}:
-        expected = expected.drop("room")  # of version 4 or 5
+    expected = expected.drop(_later_columns(table.columns, rows))
     if table.schema != expected.schema or table.height != expected.height:
         return [f"{schema.TABLE} has other columns or rows than {schema.MANIFEST}"]
     changed = [name for name in table.columns if not table[name].equals(expected[name], null_equal=True)]
     return [f"{schema.TABLE} differs from {schema.MANIFEST} in column {name}" for name in changed]
+
+
+def _later_columns(columns: Sequence[str], rows: Sequence[ManifestRow]) -> list[str]:
+    """Columns that a table of an older version does not have, where every row has what that version meant."""
+    later = {name: field.default for name, field in ManifestRow.model_fields.items() if not field.is_required()}
+    return [
+        name
+        for name, default in later.items()
+        if name not in columns and all(getattr(row, name) == default for row in rows)
+    ]
 
 
 def _leaf(document: dict[str, Any], name: str) -> Any:

@@ -247,9 +247,9 @@ def as_of_version_5(folder: Path) -> None:
     old = {"schema_version": 5, "room": to_json(dataset.room), "object_names": names}
     (folder / schema.INFO).write_text(json.dumps({**info, **old}))
     rows = [json.loads(line) for line in manifest.read_text().splitlines()]
-    assert [row.pop("room") for row in rows] == ["room"] * len(rows)
+    assert [(row.pop("room"), row.pop("spot_beam_world")) for row in rows] == [("room", None)] * len(rows)
     manifest.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    table.write_bytes(parquet_bytes(dataset.to_polars().drop("room")))
+    table.write_bytes(parquet_bytes(dataset.to_polars().drop("room", "spot_beam_world")))
     with np.load(folder / "lightmap.npz") as light:  # its faces had other texels
         np.savez(folder / "lightmap.npz", **{name: light[name][:-7] for name in light})
     (folder / schema.ROOMS).unlink()
