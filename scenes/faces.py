@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.scenes.frames import Array
+from phibench.scenes.frames import Array, Pose
 from phibench.scenes.shapes import Cuboid, Mesh, Prism, Rectangle, Shape, faces
 from phibench.scenes.textures import Bitmap, Checker, Texture
 
@@ -193,12 +193,21 @@ _HALVES = np.array([[0, 1, 2], [0, 2, 3]])
 
 
 def _flat_faces(shape: Rectangle | Cuboid) -> _Faces:
-    sides = faces(shape)
-    frames = [(side.T_world_shape.t, side.T_world_shape.R) for side in sides]
-    centre, axes = np.array([t for t, _ in frames]), np.array([R for _, R in frames])
-    size = np.array([side.size_m for side in sides])
-    texels = np.tile(_metric(shape.texture), (len(sides), 1, 1))
+    pose, size = shape.T_world_shape, np.array(shape.size_m)
+    if isinstance(shape, Rectangle):
+        centre, axes, size = pose.t[None], pose.R[None], size[None]
+    else:  # as in `shapes.faces`, which takes thirty times as long
+        turns = _side_turns()
+        centre, axes = pose.points(0.5 * turns[:, :, 2] * size), pose.R @ turns
+        size = (np.abs(np.swapaxes(turns, 1, 2)) @ size)[:, :2]
+    texels = np.tile(_metric(shape.texture), (len(centre), 1, 1))
     return _rectangles(centre, axes[:, :, 0], axes[:, :, 1], size, texels)
+
+
+@cache
+def _side_turns() -> Array:
+    """Axes of the sides of a cuboid as columns, shape (6, 3, 3); the last one is the normal."""
+    return np.array([side.T_world_shape.R for side in faces(Cuboid("", Pose("world", "shape"), (1.0, 1.0, 1.0)))])
 
 
 def _rectangles(centre: Array, x: Array, y: Array, size: Array, texels: Array) -> _Faces:

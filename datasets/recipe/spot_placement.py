@@ -64,7 +64,7 @@ def cut_part(view: View, plate: Cuboid) -> str | None:
 Placed = tuple[str, LaserSpot] | str
 """Name of what carries the spot, and the spot; or why there can be none."""
 
-_RING = 16  # points around a spot that are looked at
+_TURN = 2.0 * np.pi * np.arange(16) / 16  # points around a spot that are looked at
 _SAME_FACE_M = 1e-9  # rounding over 10 m is 2e-15; a step between surfaces that matters is far above
 _LEAST_DISTANCE_M = 0.3  # of a spot from the axis: nearer ones lie on the robot's own ground
 _LEAST_COATED_ALBEDO = 0.05  # below it a glossy surface mirrors as much light as it scatters
@@ -183,21 +183,19 @@ def _split(
     geometry: RoomGeometry, rays: _Rays, hits: RoomHits, numbers: list[int], spots: list[LaserSpot]
 ) -> Iterator[str | None]:
     """Faults of beams that also meet something farther from the spot, along the beam, than what counts as the spot."""
-    for start, direction, i, spot in zip(rays.starts, rays.directions, numbers, spots, strict=True):
-        ring = np.stack(spot.across_beam())
-        turn = 2.0 * np.pi * np.arange(_RING)[:, None] / _RING
-        circle = (np.cos(turn) * ring[0] + np.sin(turn) * ring[1]) * reach_m(spot)
-        starts = start + np.concatenate([circle, 0.5 * circle])
-        around = geometry.first_hit(starts, np.broadcast_to(direction, starts.shape))
-        apart = np.abs(around.distance_m - hits.distance_m[i]) >= BEAM_REACH_M
-        yield (
-            f"the beam would be split between {{}} and what is {BEAM_REACH_M:g} m or more away" if apart.any() else None
-        )
+    frames = np.array([spot.across_beam() for spot in spots])
+    rim = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
+    circles = np.array([reach_m(spot) for spot in spots])[:, None, None] * (np.concatenate([rim, 0.5 * rim]) @ frames)
+    starts = rays.starts[:, None] + circles
+    directions = np.broadcast_to(rays.directions[:, None], starts.shape)
+    around = geometry.first_hit(starts.reshape(-1, 3), directions.reshape(-1, 3)).distance_m.reshape(len(spots), -1)
+    apart = np.abs(around - hits.distance_m[numbers][:, None]) >= BEAM_REACH_M
+    fault = f"the beam would be split between {{}} and what is {BEAM_REACH_M:g} m or more away"
+    yield from (fault if np.any(far) else None for far in apart)
 
 
 def _ring(spot: LaserSpot) -> Array:
-    turn = 2.0 * np.pi * np.arange(_RING)[:, None] / _RING
-    a, b = spot.tangents()
+    turn, (a, b) = _TURN[:, None], spot.tangents()
     return np.array(spot.position_world_m) + reach_m(spot) * (np.cos(turn) * a + np.sin(turn) * b)
 
 

@@ -67,7 +67,7 @@ class RoomGeometry:
         geometry._parts = parts
         return geometry
 
-    @property
+    @cached_property
     def shapes(self) -> tuple[Shape, ...]:
         """All shapes in the order of their object ids."""
         return tuple(shape for part in self._parts for shape in part.shapes)

@@ -12,7 +12,7 @@ from phibench.scenes.catalog import lab
 from phibench.scenes.faces import FaceTable, face_table
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.rig import Rig
-from phibench.scenes.shapes import Cuboid, Mesh, Prism, rectangle
+from phibench.scenes.shapes import Cuboid, Mesh, Prism, faces, rectangle
 from phibench.scenes.textures import Bitmap, Checker, Uniform
 from phibench.scenes.validation import SceneError
 
@@ -39,6 +39,18 @@ def test_solids_are_closed_and_look_outwards(name):
     normal = np.cross(b - a, c - a)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     np.testing.assert_allclose(normal, table.normal[table.patch], atol=1e-12)
+
+
+def test_sides_of_a_cuboid_are_those_of_its_rectangles():
+    """The table takes a short cut past `shapes.faces`: the same frames and sizes, to rounding."""
+    for pose in (TURNED, Pose("world", "shape", (0.3, -0.2, 1.1))):
+        box = Cuboid("a", pose, (0.4, 0.7, 0.2))
+        table = face_table([box])
+        for k, side in enumerate(faces(box)):
+            np.testing.assert_allclose(table.centre_m[k], side.T_world_shape.t, atol=1e-15)
+            np.testing.assert_allclose(table.x_axis[k], side.T_world_shape.R[:, 0], atol=1e-15)
+            np.testing.assert_allclose(table.y_axis[k], side.T_world_shape.R[:, 1], atol=1e-15)
+            np.testing.assert_allclose(table.size_m[k], side.size_m, atol=1e-15)
 
 
 def test_triangles_lie_in_their_patches():
