@@ -17,6 +17,7 @@ from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.recipe.load import check_recipe
 from phibench.datasets.recipe.spot_placement import by_ray
 from phibench.datasets.recipe.tables import LaserTable
+from phibench.datasets.rooms.room_sources import room_of
 from phibench.datasets.store.schema import ManifestRow, SpotRow
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose, rotation_xyz
@@ -138,8 +139,9 @@ def test_beams_of_the_lab_are_certified() -> None:
     """Both views of drawn spots on the lab's textured surfaces: each visible one has a certificate that passes."""
     raw = {**drawing(samples=6, spot=RAY), "laser": {"albedo": "surface"}}
     plan, seen = make_plan(check_recipe(raw)), 0
+    [room] = (room_of(source) for source in plan.rooms.values())
     for pair in plan.pairs:
-        answer = answer_spot(plan.view(pair, "down"), plan.spots[pair.spot], plan.room)
+        answer = answer_spot(plan.view(pair, "down"), plan.spots[pair.spot], room)
         if answer.certificate is not None:
             assert answer.certificate.passed
             seen += 1
