@@ -289,7 +289,9 @@ def _column_type(annotation: Any) -> Any:
 
     kinds = {str: polars.String, float: polars.Float64, bool: polars.Boolean, int: polars.Int64}
     origin = get_origin(annotation)
-    if origin is tuple:
+    if origin is tuple or any(
+        get_origin(get_args(kind)[0]) is tuple for kind in get_args(annotation) if get_args(kind)
+    ):
         return polars.List(polars.Float64)
     if origin in (dict, Literal):
         return polars.String

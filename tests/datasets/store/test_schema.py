@@ -57,6 +57,8 @@ def test_rows_of_older_data_sets_know_no_beam(rows: list[ManifestRow], document:
     assert ManifestRow.model_validate_json(json.dumps(document)) == rows[0]
     beam = ManifestRow.model_validate_json(json.dumps(document | {"spot_beam_world": [0.6, 0.8, 0.0]}))
     assert beam.spot_beam_world == (0.6, 0.8, 0.0)
+    assert to_table([beam, rows[0]])["spot_beam_world"].to_list() == [[0.6, 0.8, 0.0], None]
+    assert to_table([rows[0]]).schema == to_table([beam]).schema
 
 
 @given(number=st.floats(allow_nan=False, allow_infinity=False))
