@@ -33,23 +33,26 @@ def render_view(out: Path, dataset: str, rig: Rig, source: RoomSource, pose: Pos
     """Task: render one pose and write its three files below `out`."""
     from phibench.render.optics.room_tracer import room_geometry
     from phibench.render.optics.truth import truth_layer
-    from phibench.render.room.ambient import dark_layer, render_ambient
+    from phibench.render.room.ambient import dark_layer, render_ambient, view_surfaces
     from phibench.render.room.noise_budget import BUDGETS
     from phibench.render.setup.variant import activate
 
     activate()
     view, room = rig.at(pose.offset_m), room_of(source)
+    surfaces = view_surfaces(view, room)
     header = {"dataset": dataset, "pose": pose.pose_id, "offset_m": pose.offset_m}
     if room.lit:
         light, settings = read_light_map(out, pose.room), bake_settings(ambient)
         budget = BUDGETS[ambient.quality]
-        layer = render_ambient(view, room, light, settings, ambient.cells_per_pixel, pose.seed, budget=budget)
+        numbers = (ambient.cells_per_pixel, pose.seed)
+        layer = render_ambient(view, room, light, settings, *numbers, budget=budget, surfaces=surfaces)
     else:
         layer = dark_layer(rig.camera)
     planes = layer.electrons_per_s
+    truth = truth_layer(view, room_geometry(room, view), surfaces.first_patch)
     header_ambient = {**header, **ambient.model_dump(), "seed": pose.seed}
     write_ambient(out / schema.view_file(pose.pose_id, "ambient"), planes, layer.variance_per_s2, header_ambient)
-    write_truth(out / schema.view_file(pose.pose_id, "truth"), truth_layer(view, room_geometry(room, view)), header)
+    write_truth(out / schema.view_file(pose.pose_id, "truth"), truth, header)
     detector = rig.camera.detector
     picture = to_srgb(planes, detector, display_exposure_s(planes, detector))
     save_png(out / schema.view_file(pose.pose_id, "preview"), picture)

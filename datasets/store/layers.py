@@ -55,9 +55,14 @@ class Exr:
 
 
 def write_exr(
-    path: Path, planes: Mapping[str, ArrayLike], header: Mapping[str, Any], origin_px: tuple[int, int] = (0, 0)
+    path: Path,
+    planes: Mapping[str, ArrayLike],
+    header: Mapping[str, Any],
+    origin_px: tuple[int, int] = (0, 0),
+    *,
+    compressed: bool = True,
 ) -> Path:
-    """Write named planes of one shape (H, W) as float32, losslessly compressed, atomically.
+    """Write named planes of one shape (H, W) as float32, without loss, atomically.
 
     Parameters
     ----------
@@ -68,6 +73,8 @@ def write_exr(
         Anything that JSON can hold; floats survive exactly.
     origin_px : (u0, v0)
         Image pixel of the first column and row.
+    compressed : bool
+        Noisy planes shrink by 4 % only, and ZIP takes as long as rendering them.
 
     Raises
     ------
@@ -80,7 +87,7 @@ def write_exr(
     text = json.dumps({"header": dict(header), "crc32": sums}, allow_nan=False)
 
     def write(temporary: Path) -> None:
-        _write(temporary, arrays, text, origin_px)
+        _write(temporary, arrays, text, origin_px, compressed)
         try:
             read_exr(temporary)  # checks every pixel before the file gets its name
         except DatasetError as error:
@@ -123,14 +130,14 @@ def _check_size(path: Path, header: dict[str, Any]) -> None:
         raise DatasetError(f"{path} is damaged: it says that it has {width} x {height} pixels")
 
 
-def _write(path: Path, planes: dict[str, Plane], text: str, origin_px: tuple[int, int]) -> None:
+def _write(path: Path, planes: dict[str, Plane], text: str, origin_px: tuple[int, int], compressed: bool) -> None:
     import OpenEXR
 
     height, width = next(iter(planes.values())).shape
     low = np.array(origin_px, np.int32)
     window = (low, low + np.array([width - 1, height - 1], np.int32))
     header = {
-        "compression": OpenEXR.ZIP_COMPRESSION,
+        "compression": OpenEXR.ZIP_COMPRESSION if compressed else OpenEXR.NO_COMPRESSION,
         "type": OpenEXR.scanlineimage,
         "dataWindow": window,
         "displayWindow": window,
@@ -240,7 +247,8 @@ class SpotWindow:
 def write_ambient(path: Path, planes: NDArray[Any], variance: NDArray[Any], header: Mapping[str, Any]) -> Path:
     """Write an ambient layer and its variance, shape (3, H, W) each: planes R, G, B, var.R, var.G, var.B."""
     header = {"kind": "ambient", "unit": "electrons/s", **header}
-    return write_exr(path, dict(zip(AMBIENT_PLANES, (*planes, *variance), strict=True)), header)
+    named = dict(zip(AMBIENT_PLANES, (*planes, *variance), strict=True))
+    return write_exr(path, named, header, compressed=not np.any(variance))
 
 
 def read_ambient(path: Path, **owner: str) -> NDArray[np.float32]:

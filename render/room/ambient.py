@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.room.light_map import BakeSettings, LightMap, fixed_shapes, light_carriage
 from phibench.render.room.noise_budget import BUDGET
 from phibench.render.room.refinement import render_refined
@@ -24,7 +25,6 @@ from phibench.render.room.surfaces import Surfaces
 from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera
-from phibench.scenes.faces import face_table
 from phibench.scenes.rig import View
 from phibench.scenes.room import Room
 
@@ -55,6 +55,11 @@ def dark_layer(camera: Camera) -> AmbientLayer:
     return AmbientLayer(zeros, zeros)
 
 
+def view_surfaces(view: View, room: Room) -> Surfaces:
+    """Faces of a room with robot and carriage in Mitsuba, for one view."""
+    return Surfaces(activate(), view, room_geometry(room, view).table)
+
+
 def render_ambient(
     view: View,
     room: Room,
@@ -65,6 +70,7 @@ def render_ambient(
     crop: Crop | None = None,
     rounds: int = ROUNDS,
     budget: float = BUDGET,
+    surfaces: Surfaces | None = None,
 ) -> AmbientLayer:
     """Render one view from a room's light map.
 
@@ -83,14 +89,16 @@ def render_ambient(
         Rounds of refinement at most; 0 leaves the first pass alone.
     budget : float
         Noise that refinement stops at, as a part of the sensor's: one of `noise_budget.BUDGETS`.
+    surfaces : Surfaces, or None
+        Of `view_surfaces`, if they are there already.
     """
     mi = activate()
     import drjit as dr
 
     camera = view.rig.camera
     window = crop or (0, 0, camera.width_px, camera.height_px)
-    table = face_table(room.shapes(view))
-    surfaces = Surfaces(mi, view, table)
+    surfaces = surfaces or view_surfaces(view, room)
+    table = surfaces.table
     fixed = int(np.searchsorted(table.shape, len(fixed_shapes(room))))
     light_carriage(surfaces, TexelGrid.of(table, settings.texel_m), fixed, light.irradiance_w_m2, settings)
     grid = FilmGrid.of(camera, cells_per_pixel)

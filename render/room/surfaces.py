@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.render.room.scene import load_scene
 from phibench.render.room.texel_grid import TexelGrid
-from phibench.scenes.faces import FaceTable
+from phibench.scenes.faces import FaceTable, IntArray
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import View
 from phibench.scenes.textures import Bitmap, Checker, Texture
@@ -86,6 +86,16 @@ class Surfaces:
         found = self.scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
         valid = active & found.is_valid()
         return found.t, dr.gather(self._mi.UInt32, self._patch, found.prim_index, valid), valid
+
+    def first_patch(self, origins_m: Array, directions: Array) -> IntArray:
+        """Patch that each ray meets first, to float32, -1 for none: world rays, shape (N, 3); a `Finder`."""
+        import drjit as dr
+
+        mi = self._mi
+        places = MM_PER_M * (origins_m - self.view.sphere_centre_m)
+        o, d = (mi.Vector3f(*(mi.Float(aligned(a[:, i])) for i in range(3))) for a in (places, directions))
+        _, patch, valid = self.hit(mi.Ray3f(mi.Point3f(o), d))
+        return np.array(dr.select(valid, mi.Int32(patch), -1), dtype=np.int64)
 
     def radiance(self, patch: Any, point: Any, direction: Any, active: Any, *, lamps: bool) -> Any:
         """Radiance, W/(m^2 sr), that faces send against rays of `direction` that hit them at `point` (scene, mm).
