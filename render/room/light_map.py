@@ -27,7 +27,7 @@ from phibench.render.room.subpixel_grid import points, shifts
 from phibench.render.room.surfaces import Surfaces, aligned
 from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.setup.variant import activate
-from phibench.scenes.faces import FaceTable, face_table
+from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import View
 from phibench.scenes.room import Room, Sun, chassis
@@ -88,6 +88,7 @@ def bake(view: View, room: Room, settings: BakeSettings) -> LightMap:
     surfaces = Surfaces(mi, view, face_table(fixed_shapes(room)))
     fine = _Texels.of(mi, surfaces, TexelGrid.of(surfaces.table, settings.texel_m))
     covered = _covered(mi, surfaces, fine, settings.texel_m)
+    surfaces.set_light(fine.grid, np.zeros((len(fine), 3)))
     direct = [_direct(mi, surfaces, fine, room.sun, settings.lamp_rays, seed) for seed in (_SEED, _SEED + 1)]
     lit = _filled(0.5 * (direct[0] + direct[1]), covered, fine.grid)
     lit += _bounced(mi, surfaces, fine.grid, lit, settings)
@@ -171,19 +172,19 @@ def _filled(values: Array, covered: BoolArray, grid: TexelGrid) -> Array:
 # Lamps and the sun.
 
 
-def _lamps(table: FaceTable, view: View) -> Array:
-    """Per lamp: centre, edges along x and y, normal (scene, mm), radiance, area in mm^2; shape (lamps, 16)."""
-    lamps = np.flatnonzero(table.emits)
+def _lamps(surfaces: Surfaces) -> Array:
+    """Per lamp: centre, edges along x and y, normal (scene, mm), area in mm^2, patch; shape (lamps, 14)."""
+    table, view, lamps = surfaces.table, surfaces.view, np.flatnonzero(surfaces.is_lamp)
     size = MM_PER_M * table.size_m[lamps]
     centre = MM_PER_M * (table.centre_m[lamps] - view.sphere_centre_m)
     edges = (size[:, :1] * table.x_axis[lamps], size[:, 1:] * table.y_axis[lamps], table.normal[lamps])
-    return np.concatenate([centre, *edges, table.radiance_w_m2_sr[lamps], size.prod(axis=1)[:, None]], axis=1)
+    return np.concatenate([centre, *edges, size.prod(axis=1)[:, None], lamps[:, None]], axis=1)
 
 
 def _direct(mi: ModuleType, surfaces: Surfaces, texels: _Texels, sun: Sun | None, rays: int, seed: int) -> Array:
     """Irradiance from lamps and sun, shape (texels, 3): L cos cos' V / r^2 dA with `rays` points per lamp at most."""
     total = np.zeros((len(texels), 3))
-    for number, lamp in enumerate(_lamps(surfaces.table, surfaces.view)):
+    for number, lamp in enumerate(_lamps(surfaces)):
         way = lamp[:3] - texels.points_mm
         diagonal = np.linalg.norm(lamp[3:9].reshape(2, 3).sum(axis=0))
         # the nearest corner's side decides whether any part of the lamp is above the texel's horizon
@@ -192,26 +193,27 @@ def _direct(mi: ModuleType, surfaces: Surfaces, texels: _Texels, sun: Sun | None
         chosen = np.flatnonzero(above & (way @ lamp[9:12] < 0.0))
         if len(chosen) == 0:
             continue
-        first = min(_FIRST_RAYS, rays)
+        # a screen's picture needs all rays: 8 leave 6 % of noise
+        first = rays if surfaces.table.is_radiance[int(lamp[13])] else min(_FIRST_RAYS, rays)
         value, share = _lamp_rays(mi, surfaces, texels, chosen, lamp, first, seed + 100 * number)
         distance = np.linalg.norm(way[chosen], axis=1)
         again = (share > 0.0) & (share < 1.0) | (distance < _NEAR * diagonal)
         if rays > first and again.any():
             value[again], _ = _lamp_rays(mi, surfaces, texels, chosen[again], lamp, rays, seed + 100 * number + 50)
-        total[chosen] += value[:, None] * lamp[12:15]
+        total[chosen] += value
     return total if sun is None else total + _sunlight(mi, surfaces, texels, sun, seed)
 
 
 def _lamp_rays(
     mi: ModuleType, surfaces: Surfaces, texels: _Texels, chosen: NDArray[np.intp], lamp: Array, rays: int, seed: int
 ) -> tuple[Array, Array]:
-    """Irradiance per radiance of a lamp, and the part of the rays that reach it, shape (n,) each."""
+    """Irradiance by a lamp, shape (n, 3), and the part of the rays that reach it, shape (n,)."""
     import drjit as dr
 
     lanes = mi.UInt32(aligned(chosen, np.uint32))
     point, normal, coat = _chosen(mi, texels, lanes)
     numbers = [dr.opaque(mi.Float, float(value)) for value in lamp]
-    count, key = dr.opaque(mi.UInt32, rays), dr.opaque(mi.UInt32, seed)
+    count, key, patch = (dr.opaque(mi.UInt32, value) for value in (rays, seed, int(lamp[13])))
     shift = shifts(mi, lanes, 2, key)
     dr.eval(shift)
 
@@ -230,11 +232,12 @@ def _lamp_rays(
         weight = dr.select(free, cos_here * cos_lamp / r2, 0.0)
         if coat is not None:
             weight *= _transmitted(surfaces, coat, cos_here)
-        return i + 1, total + weight, seen + dr.select(free | ~faces, 1.0, 0.0)
+        return i + 1, total + weight * surfaces.emission(patch, place), seen + dr.select(free | ~faces, 1.0, 0.0)
 
-    zero = dr.zeros(mi.Float, len(chosen))
-    _, total, seen = dr.while_loop((mi.UInt32(0), zero, zero), lambda i, *_: i < count, body)
-    return np.array(total, dtype=float) * lamp[15] / rays, np.array(seen, dtype=float) / rays
+    zero = (mi.UInt32(0), dr.zeros(mi.Color3f, len(chosen)), dr.zeros(mi.Float, len(chosen)))
+    _, total, seen = dr.while_loop(zero, lambda i, *_: i < count, body)
+    value = np.stack([np.array(total[k], dtype=float) for k in range(3)], axis=-1)
+    return value * (lamp[12] / rays), np.array(seen, dtype=float) / rays
 
 
 def _chosen(mi: ModuleType, texels: _Texels, lanes: Any) -> tuple[Any, Any, Any]:

@@ -20,12 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.render.room.camera_plugin import MM_PER_M, sensor_dict
+from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Array, Vector
 from phibench.scenes.mirror import SphereMirror, deviation, level
 from phibench.scenes.rig import View
 from phibench.scenes.room import MIRROR_NAME, Room
 from phibench.scenes.shapes import Cuboid, Rectangle, Shape
-from phibench.scenes.textures import Checker, Texture, Uniform
+from phibench.scenes.textures import Bitmap, Texture, Uniform
 
 _RINGS, _SPOKES = 450, 900  # 0.4 degrees apart
 
@@ -91,20 +92,69 @@ def shape_key(index: int) -> str:
     return f"shape_{index:04d}"
 
 
-def shape_dict(mi: ModuleType, view: View, shape: Shape) -> dict[str, Any]:
-    """One rectangle or cuboid with its diffuse material; lamps have albedo 0."""
-    assert isinstance(shape, Rectangle | Cuboid)
+def shape_dict(mi: ModuleType, view: View, shape: Shape) -> Any:
+    """One shape with its material; what shines has albedo 0.
+
+    Rectangles are Mitsuba's own, and cuboids without a bitmap. All others are meshes of their faces.
+    """
+    if not isinstance(shape, Rectangle | Cuboid) or (isinstance(shape, Cuboid) and isinstance(shape.texture, Bitmap)):
+        return _faces_mesh(mi, view, shape)
     half = [0.5 * MM_PER_M * length for length in shape.size_m]
     to_world = mi.ScalarTransform4f(_matrix(view, shape)) @ mi.ScalarTransform4f().scale([*half, 1.0][:3])
     kind = "cube" if isinstance(shape, Cuboid) else "rectangle"
     entry: dict[str, Any] = {"type": kind, "to_world": to_world}
-    if isinstance(shape, Rectangle) and shape.emits:
+    if isinstance(shape.texture, Bitmap) and shape.texture.is_radiance:
+        entry["emitter"] = {"type": "area", "radiance": texture_dict(mi, shape.texture, shape.size_m)}
+        entry["bsdf"] = {"type": "diffuse", "reflectance": _rgb((0.0, 0.0, 0.0))}
+    elif isinstance(shape, Rectangle) and shape.emits:
         # without a material an emitter would reflect: Mitsuba's default has the albedo 0.5
         entry["emitter"] = {"type": "area", "radiance": _rgb(shape.radiance_w_m2_sr)}
         entry["bsdf"] = {"type": "diffuse", "reflectance": _rgb((0.0, 0.0, 0.0))}
     else:
-        entry["bsdf"] = {"type": "diffuse", "reflectance": texture_dict(mi, shape.texture, shape.size_m)}
+        entry["bsdf"] = _material(shape.coat, texture_dict(mi, shape.texture, shape.size_m))
     return entry
+
+
+def _faces_mesh(mi: ModuleType, view: View, shape: Shape) -> Any:
+    """Mesh of a shape's faces, its corners placed on the texture as `scenes.faces` says."""
+    table = face_table([shape])
+    corners = table.corners_m.reshape(-1, 3)
+    props = mi.Properties()
+    texture = shape.texture
+    assert not (isinstance(texture, Bitmap) and texture.is_radiance), "Mitsuba takes a mesh's area before it has one"
+    albedo = _bitmap_dict(mi, texture) if isinstance(texture, Bitmap) else _rgb(_plain(texture))
+    material = _material(shape.coat, albedo)
+    two_sided = bool(table.two_sided.any())
+    props["bsdf"] = mi.load_dict({"type": "twosided", "material": material} if two_sided else material)
+    mesh = mi.Mesh(shape.name, len(corners), len(table.patch), has_vertex_texcoords=True, props=props)
+    patch = np.repeat(table.patch, 3)
+    local = np.concatenate([table.local_m(patch, corners), np.ones((len(patch), 1))], axis=1)
+    texels = texture.values.shape[1::-1] if isinstance(texture, Bitmap) else (1, 1)
+    uv = np.einsum("nij,nj->ni", table.texels[patch], local) / texels
+    buffers = mi.traverse(mesh)
+    buffers["vertex_positions"] = to_scene_mm(view, corners).ravel().astype(np.float32)
+    buffers["vertex_texcoords"] = uv.ravel().astype(np.float32)
+    buffers["faces"] = np.arange(len(corners), dtype=np.uint32)
+    buffers.update()
+    return mesh
+
+
+def _material(coat: float, albedo: dict[str, Any]) -> dict[str, Any]:
+    """Diffuse ground, below a smooth dielectric coat if that has a refractive index."""
+    if coat == 0.0:
+        return {"type": "diffuse", "reflectance": albedo}
+    return {"type": "plastic", "diffuse_reflectance": albedo, "int_ior": coat, "ext_ior": 1.0, "nonlinear": True}
+
+
+def _plain(texture: Texture) -> Vector:
+    assert isinstance(texture, Uniform)
+    return texture.albedo
+
+
+def _bitmap_dict(mi: ModuleType, texture: Bitmap) -> dict[str, Any]:
+    """Bitmap as Mitsuba's: linear values, repeated."""
+    image = mi.Bitmap(np.ascontiguousarray(texture.values[..., :3]))
+    return {"type": "bitmap", "bitmap": image, "raw": True, "filter_type": "bilinear", "wrap_mode": "repeat"}
 
 
 def mirror_dict(mi: ModuleType, view: View) -> dict[str, Any]:
@@ -130,10 +180,14 @@ def mirror_bsdf(mirror: SphereMirror, wavelengths_nm: Vector) -> dict[str, Any]:
 
 
 def texture_dict(mi: ModuleType, texture: Texture, size_m: Vector) -> dict[str, Any]:
-    """Albedo as Mitsuba's rgb or checkerboard; a period of the latter is two cells."""
+    """Texture as Mitsuba's rgb, bitmap or checkerboard; a period of the latter is two cells."""
     if isinstance(texture, Uniform):
         return _rgb(texture.albedo)
-    assert isinstance(texture, Checker)
+    if isinstance(texture, Bitmap):
+        period = [texture.texel_m[i] * texture.values.shape[1 - i] for i in (0, 1)]
+        shift = [-(0.5 * size_m[i] + texture.origin_m[i]) / period[i] for i in (0, 1)]
+        scaled = mi.ScalarTransform4f().scale([size_m[0] / period[0], size_m[1] / period[1], 1.0])
+        return {**_bitmap_dict(mi, texture), "to_uv": mi.ScalarTransform4f().translate([*shift, 0.0]) @ scaled}
     # uv runs from 0 to 1 over the face, Mitsuba's pattern has the period 1
     scale = [0.5 * size_m[i] / texture.cell_m[i] for i in (0, 1)]
     shift = [-0.5 * (0.5 * size_m[i] + texture.origin_m[i]) / texture.cell_m[i] for i in (0, 1)]

@@ -30,6 +30,7 @@ from phibench.scenes.textures import Bitmap, Checker, Texture
 _ALIGNMENT = 64  # bytes
 _ROW = 8  # groups of four numbers
 _LARGEST = 1 << 24  # whole numbers that float32 holds exactly
+_SCREEN_M2 = 4.0
 _LIFT_MM = 0.05  # mirrored rays start this far in front of a coat
 
 
@@ -57,10 +58,16 @@ class Surfaces:
     view : View
         The scene's origin is its sphere centre.
     table : FaceTable
+
+    Attributes
+    ----------
+    is_lamp : bool array, shape (patches,)
+        Lamps, and screens, which are sampled like them.
     """
 
     def __init__(self, mi: ModuleType, view: View, table: FaceTable) -> None:
         self._mi, self.view, self.table = mi, view, table
+        self.is_lamp = table.emits | _screens(table)
         self.has_coats = bool((table.coat > 0.0).any())
         self.corners_mm = (MM_PER_M * (table.corners_m - view.sphere_centre_m)).astype(np.float32)
         self.scene = load_scene(mi, {"type": "scene", "room": self._mesh()})
@@ -116,6 +123,15 @@ class Surfaces:
         mirrored, _ = self._ground(other, onward(t), onward.d, valid, lamps=True)
         return value + dr.select(coated, self.reflectance(cos, coat), 0.0) * mirrored
 
+    def emission(self, patch: Any, point: Any) -> Any:
+        """Radiance of lamps and screens at points on them (scene, mm)."""
+        import drjit as dr
+
+        mi = self._mi
+        column, row, texture, light = (dr.gather(mi.Vector4f, self._rows, patch * _ROW + k) for k in range(4, _ROW))
+        s, t = (_affine(dr, group, point) for group in (column, row))
+        return self._albedo(s, t, texture, mi.Bool(True)) * mi.Color3f(light.x, light.y, light.z)
+
     def reflectance(self, cos: Any, coat: Any) -> Any:
         """Fresnel reflectance of a coat from outside, for the cosine of the angle to its normal."""
         return self._mi.fresnel(cos, coat)[0]
@@ -139,7 +155,7 @@ class Surfaces:
             albedo = self._coated(patch, albedo, dr.abs(dr.dot(normal, direction)), plane.w, seen)
         value = albedo * (dr.maximum(irradiance, 0.0) * (light.w / math.pi))
         if lamps:
-            value += dr.select(front, mi.Color3f(light.x, light.y, light.z), 0.0)
+            value += dr.select(front, albedo * mi.Color3f(light.x, light.y, light.z), 0.0)
         return dr.select(seen, value, 0.0), dr.select(front, normal, -normal)
 
     def _bilinear(self, fx: Any, fy: Any, columns: Any, rows: Any, start: Any, active: Any) -> Any:
@@ -225,11 +241,16 @@ class Surfaces:
         rows[:, 2:4, 3] += 0.5 * np.where(own[:, None], np.stack([grid.columns, grid.rows], axis=1), 2) - 0.5
         rows[:, 4:6] = np.einsum("pij,pjk->pik", table.texels[..., :2], metres)
         rows[:, 4:6, 3] += table.texels[..., 2]
-        lamp = table.emits
-        rows[:, 6] = self._places[np.where(lamp, len(table.textures), table.texture)]
-        rows[:, 7, :3] = table.radiance_w_m2_sr
-        rows[:, 7, 3] = np.where(lamp, 0.0, 1.0)
+        rows[:, 6] = self._places[np.where(table.emits, len(table.textures), table.texture)]
+        rows[:, 7, :3] = np.where(table.emits[:, None], table.radiance_w_m2_sr, self.is_lamp[:, None])
+        rows[:, 7, 3] = np.where(self.is_lamp, 0.0, 1.0)
         return rows
+
+
+def _screens(table: FaceTable) -> NDArray[np.bool_]:
+    """Single faces that shine by their texture and are small: chance would rarely meet them."""
+    single = np.bincount(table.shape)[table.shape] == 1 if len(table.shape) else np.zeros(0, dtype=bool)
+    return np.asarray(table.is_radiance & single & (table.size_m.prod(axis=1) <= _SCREEN_M2))
 
 
 def _affine(dr: ModuleType, group: Any, point: Any) -> Any:

@@ -1,0 +1,125 @@
+"""Textures, prisms, meshes, coats, screens and the sun, against Mitsuba's path tracer or closed forms."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from helpers.path_ambient import path_trace
+
+from phibench.render.room.ambient import render_ambient
+from phibench.render.room.light_map import BakeSettings, LightMap, bake
+from phibench.scenes.catalog import default_rig
+from phibench.scenes.frames import Pose, rotation_xyz
+from phibench.scenes.room import Room, Sun
+from phibench.scenes.shapes import Mesh, Prism, cuboid, rectangle
+from phibench.scenes.textures import Bitmap, Uniform
+
+RIG = default_rig()
+VIEW = RIG.at(0.3)
+SETTINGS = BakeSettings(texel_m=0.1, lamp_rays=64, bounces=10, bounce_rays=64, final_rays=128)
+
+
+def noise_texture(seed: int, texel_m: float, low: float, high: float, *, radiance: bool = False) -> Bitmap:
+    """Random texels, so that a wrong place or orientation changes what is seen."""
+    values = np.random.default_rng(seed).uniform(low, high, (6, 8, 4))
+    values[..., 3] = 0.0 if radiance else 0.5
+    return Bitmap(values, (texel_m, 0.8 * texel_m), (0.13, -0.21), is_radiance=radiance)
+
+
+def room(coat: float) -> Room:
+    """4 x 4 x 2.6 m: textured floor and wall, a screen, a textured box, a prism and a two-sided mesh."""
+    x, h = 2.0, 2.6
+    grey = Uniform((0.6, 0.55, 0.5))
+    surfaces = (
+        rectangle("floor", (0, 0, 0), (0, 0, 1), (4, 4), texture=noise_texture(0, 0.3, 0.1, 0.7), coat=coat),
+        rectangle("ceiling", (0, 0, h), (0, 0, -1), (4, 4), texture=grey),
+        rectangle("west", (-x, 0, h / 2), (1, 0, 0), (4, h), texture=noise_texture(1, 0.25, 0.2, 0.8)),
+        rectangle("east", (x, 0, h / 2), (-1, 0, 0), (4, h), texture=grey, coat=coat),
+        rectangle("south", (0, -x, h / 2), (0, 1, 0), (4, h), texture=grey),
+        rectangle("north", (0, x, h / 2), (0, -1, 0), (4, h), texture=grey),
+        rectangle("lamp", (0.9, 0.6, h - 0.02), (0, 0, -1), (0.6, 0.6), radiance_w_m2_sr=(8.0, 7.0, 6.0)),
+    )
+    # one period on the screen: Mitsuba draws points on a shining texture from its first period
+    picture = noise_texture(2, 1.0 / 8, 0.2, 3.0, radiance=True)
+    screen = dataclasses.replace(picture, texel_m=(1.0 / 8, 0.7 / 6), origin_m=(-0.5, -0.35))
+    turned = rotation_xyz(z_rad=0.4)
+    corners = np.array([[-0.5, -1.4, 0.05], [0.5, -1.2, 0.05], [0.6, -1.3, 1.1], [-0.4, -1.5, 1.2]])
+    sail = noise_texture(3, 1.0, 0.2, 0.8)
+    texels = np.array([[[0, 0], [8, 0], [8, 6]], [[0, 0], [8, 6], [0, 6]]], dtype=float)
+    furniture = (
+        rectangle("screen", (0.0, 1.9, 1.2), (0, -1, 0), (1.0, 0.7), texture=screen),
+        cuboid("box", (-1.2, 0.9, 0.3), (0.5, 0.6, 0.6), noise_texture(4, 0.1, 0.1, 0.9), turned),
+        Prism(
+            "post",
+            Pose("world", "shape", (1.2, -0.7, 0.6), turned),
+            0.25,
+            1.18,
+            12,
+            noise_texture(5, 0.2, 0.1, 0.9),
+            coat,
+        ),
+        Mesh("sail", corners, np.array([[0, 1, 2], [0, 2, 3]]), sail, texels, two_sided=True),
+    )
+    return Room("worlds", surfaces, furniture)
+
+
+CROPS = {  # windows (u0, v0, width, height) in which the mirror shows mainly this
+    "floor": (560, 220, 24, 24),
+    "box": (468, 430, 20, 20),
+    "post": (790, 300, 16, 24),
+    "sail": (640, 150, 24, 20),
+    "screen": (630, 610, 24, 14),
+    "west wall": (380, 330, 16, 24),
+    "east wall": (905, 400, 14, 24),
+    "ceiling beside the mirror": (100, 100, 24, 24),
+}
+
+
+@pytest.fixture(scope="module", params=[0.0, 1.5], ids=["matt", "coated"])
+def lit(request: pytest.FixtureRequest) -> tuple[Room, LightMap]:
+    place = room(request.param)
+    return place, bake(RIG.at(0.0), place, SETTINGS)
+
+
+QUICK = ("floor", "post", "sail")
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in CROPS]
+)
+def test_means_against_path_tracing(lit: tuple[Room, LightMap], name: str) -> None:
+    """Mean of a window within 1 % plus 5 standard errors of the tracer's mean (false alarm 6e-7)."""
+    place, light = lit
+    traced = np.array([path_trace(VIEW, place, 128, 30, seed, CROPS[name]) for seed in range(4)]).mean(axis=(2, 3))
+    mean, error = traced.mean(axis=0), traced.std(axis=0, ddof=1) / 2.0
+    ours = render_ambient(VIEW, place, light, SETTINGS, 4, 0, CROPS[name]).electrons_per_s.mean(axis=(1, 2))
+    print(name, ours / mean - 1.0, "+-", error / mean)
+    assert np.all(error < 0.01 * mean)
+    assert np.all(np.abs(ours - mean) <= 0.01 * mean + 5.0 * error)
+
+
+def test_the_sun_lights_what_it_reaches_through_the_window() -> None:
+    """Its patch on the floor is the window's parallel projection, and its irradiance the sun's times the cosine.
+
+    A texel whose middle is farther from the patch's edge than the penumbra (0.00465 rad x 3 m = 14 mm) is lit wholly or
+    not at all. Over the disc the cosine varies by 0.00465 x 0.76 / 0.65 = 0.54 %, which is the tolerance. Everything is
+    black, so that nothing else gives light; the pane's own sky is 0.
+    """
+    black = Uniform((0.0, 0.0, 0.0))
+    direction = np.array([1.0, 0.3, 0.9]) / math.sqrt(1.9)
+    pane = rectangle("window", (2.0, 0.0, 1.5), (-1, 0, 0), (1.0, 0.8), texture=black, window=True)
+    floor = rectangle("floor", (0, 0, 0), (0, 0, 1), (4, 4), texture=black)
+    sun = Sun(tuple(direction), (10.0, 8.0, 6.0))
+    light = bake(VIEW, Room("sunny", (floor, pane), (), robot=False, sun=sun), SETTINGS)
+    x, y = (np.arange(40) + 0.5) * 0.1 - 2.0, (np.arange(40) + 0.5) * 0.1 - 2.0
+    steps = (2.0 - x) / direction[0]  # to the window's plane
+    up, side = steps * direction[2] - 1.5, y[:, None] + steps * direction[1]
+    beyond = np.maximum(np.abs(up) - 0.4, np.abs(side) - 0.5)
+    expected = np.array(sun.irradiance_w_m2) * direction[2]
+    got = light.irradiance_w_m2[:1600].reshape(40, 40, 3)
+    assert (beyond < -0.05).sum() > 20
+    np.testing.assert_allclose(got[beyond < -0.05], np.broadcast_to(expected, got[beyond < -0.05].shape), rtol=0.0054)
+    assert np.all(got[beyond > 0.05] == 0.0)
