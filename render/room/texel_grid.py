@@ -16,8 +16,6 @@ import numpy as np
 from phibench.scenes.faces import FaceTable, IntArray
 from phibench.scenes.frames import Array
 
-_INSIDE = 1.0 - 1e-3  # texels beyond a patch's own outline are moved just inside it
-
 
 @dataclass(frozen=True, eq=False)
 class TexelGrid:
@@ -76,58 +74,15 @@ class TexelGrid:
         return grid // 2, np.arange(len(grid)) - first[grid]
 
     def points(self) -> tuple[Array, Array]:
-        """World points of the texels and the normals of their side, shape (N, 3) each.
+        """World points of the texels' middles and the normals of their side, shape (N, 3) each.
 
-        They are the middles of the texels; those beyond the outline of a patch are moved towards its middle.
+        Those beyond the outline of a patch that is no rectangle lie in its plane all the same: the light there is what
+        goes on smoothly from the patch, or they are covered by what stands there.
         """
         table, (patch, number) = self.table, self.patch()
         column, row = number % self.columns[patch], number // self.columns[patch]
         x = ((column + 0.5) / self.columns[patch] - 0.5) * table.size_m[patch, 0]
         y = ((row + 0.5) / self.rows[patch] - 0.5) * table.size_m[patch, 1]
         points = table.centre_m[patch] + x[:, None] * table.x_axis[patch] + y[:, None] * table.y_axis[patch]
-        points = self._inside(patch, points)
         behind = np.arange(len(patch)) >= np.where(self.back >= 0, self.back, self.count + 1)[patch]
         return points, np.where(behind[:, None], -1.0, 1.0) * table.normal[patch]
-
-    def _inside(self, patch: IntArray, points: Array) -> Array:
-        """Move points beyond the outlines of patches that are no rectangles."""
-        table = self.table
-        triangles = np.bincount(table.patch, minlength=len(table.size_m))
-        odd = np.flatnonzero(triangles[patch] != 2)
-        if len(odd) == 0:
-            return points
-        middle = np.zeros_like(table.centre_m)
-        np.add.at(middle, table.patch, table.corners_m.mean(axis=1))
-        middle /= np.maximum(triangles, 1)[:, None]
-        share = np.ones(len(points))
-        first = np.concatenate([[0], np.cumsum(triangles)])
-        rims = _rims(table)
-        for turn in range(int(triangles[patch[odd]].max())):
-            mine = odd[turn < triangles[patch[odd]]]
-            triangle = first[patch[mine]] + turn
-            start = middle[patch[mine]]
-            for a, outward in rims(triangle):
-                reach, height = (np.einsum("ni,ni->n", v - start, outward) for v in (a, points[mine]))
-                with np.errstate(divide="ignore", invalid="ignore"):
-                    limit = np.where((reach > 0.0) & (height > reach), _INSIDE * reach / height, 1.0)
-                share[mine] = np.minimum(share[mine], limit)
-        moved = middle[patch] + share[:, None] * (points - middle[patch])
-        return np.where((share < 1.0)[:, None], moved, points)
-
-
-def _rims(table: FaceTable):  # type: ignore[no-untyped-def]
-    """Sides of triangles that are rims of their patch: a corner, and the direction outwards (0 for inner sides).
-
-    A patch of one triangle has three rims; the fan of a prism's end has one for each triangle, the second side.
-    """
-    single = np.bincount(table.patch, minlength=len(table.size_m)) == 1
-
-    def sides(triangle: IntArray) -> Iterator[tuple[Array, Array]]:
-        corners, normal = table.corners_m[triangle], table.normal[table.patch[triangle]]
-        for k in range(3):
-            a, b = corners[:, k], corners[:, (k + 1) % 3]
-            outward = np.cross(b - a, normal)
-            inner = ~single[table.patch[triangle]] & (k != 1)
-            yield a, np.where(inner[:, None], 0.0, outward)
-
-    return sides
