@@ -190,10 +190,15 @@ class AmbientTable(Table):
         default=2, ge=2, le=32, description="cells along a pixel's side; two samples each, more where noise asks for it"
     )
     texel_m: float = Field(default=0.05, ge=0.01, le=2.0, description="size of the light map's texels")
-    lamp_rays: int = Field(default=64, ge=1, le=65536, description="shadow rays per texel and lamp, twice")
+    indirect_texel_m: float = Field(
+        default=0.1, ge=0.01, le=2.0, description="texels for light that comes from surfaces; texel_m if that is more"
+    )
+    lamp_rays: int = Field(
+        default=64, ge=1, le=65536, description="shadow rays per texel and lamp, twice, where shadows end"
+    )
     bounces: int = Field(default=12, ge=0, le=100, description="passes of bounced light before the last one")
-    bounce_rays: int = Field(default=64, ge=1, le=65536, description="rays per texel in such a pass")
-    final_rays: int = Field(default=1024, ge=1, le=65536, description="rays per texel in the last pass, twice")
+    bounce_rays: int = Field(default=64, ge=1, le=65536, description="rays in such a pass, per texel of 0.2 m")
+    final_rays: int = Field(default=128, ge=1, le=65536, description="rays per texel in the last pass, twice")
 
 
 class TargetTable(Table):

@@ -45,9 +45,13 @@ _SUN_RAYS = 16
 
 @dataclass(frozen=True)
 class BakeSettings:
-    """Size of texels and numbers of rays per texel (defaults: 0.3 % noise in the furnished lab)."""
+    """Size of texels and numbers of rays per texel (defaults: 0.3 % noise in the furnished lab).
+
+    What comes from other surfaces than lamps changes slowly: it has texels of its own, `indirect_texel_m`.
+    """
 
     texel_m: float = 0.05
+    indirect_texel_m: float = 0.1
     lamp_rays: int = 64
     bounces: int = 12
     bounce_rays: int = 64
@@ -93,12 +97,26 @@ def bake(view: View, room: Room, settings: BakeSettings) -> LightMap:
     lit = _filled(0.5 * (direct[0] + direct[1]), covered, fine.grid)
     lit += _bounced(mi, surfaces, fine.grid, lit, settings)
     surfaces.set_light(fine.grid, lit)
-    # two independent halves: half their difference is the standard error of their mean
-    halves = [_filled(_gather(mi, surfaces, fine, settings.final_rays, 2 + i), covered, fine.grid) for i in (0, 1)]
-    mean, sigma = smoothed(fine.grid, halves[0], halves[1])
+    mean, sigma = _indirect(mi, surfaces, fine, covered, settings)
     direct_mean = _filled(0.5 * (direct[0] + direct[1]), covered, fine.grid)
     noise = np.hypot(sigma, 0.5 * np.abs(direct[0] - direct[1]))
     return LightMap((mean + direct_mean).astype(np.float32), noise.astype(np.float32), covered)
+
+
+def _indirect(
+    mi: ModuleType, surfaces: Surfaces, fine: _Texels, covered: BoolArray, settings: BakeSettings
+) -> tuple[Array, Array]:
+    """Irradiance by all surfaces, from the present map, and its standard error, shape (texels, 3) each."""
+    texels, hidden = fine, covered
+    if settings.indirect_texel_m > settings.texel_m:
+        texels = _Texels.of(mi, surfaces, TexelGrid.of(surfaces.table, settings.indirect_texel_m))
+        hidden = _covered(mi, surfaces, texels, settings.texel_m)
+    # two independent halves: half their difference is the standard error of their mean
+    halves = [_filled(_gather(mi, surfaces, texels, settings.final_rays, 2 + i), hidden, texels.grid) for i in (0, 1)]
+    mean, sigma = smoothed(texels.grid, halves[0], halves[1])
+    if texels is fine:
+        return mean, sigma
+    return _finer(texels.grid, fine.grid, mean), _finer(texels.grid, fine.grid, sigma)
 
 
 def light_carriage(
