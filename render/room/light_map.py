@@ -38,7 +38,8 @@ BOUNCE_TEXEL_M = 0.2
 _LIFT_MM = 0.05  # rays start this far in front of their surface
 _LAMP_GAP_MM = 1.0  # and end this far in front of the lamp
 _SEED = 0  # the shifts are part of the quadrature rule; the two halves use different streams
-_FIRST_RAYS = 8  # towards a lamp, in each half
+_FIRST_RAYS = 16  # towards a lamp, in each half
+_PENUMBRA_TEXELS = 2  # around those that see a part of a lamp
 _NEAR = 2.0  # lamps nearer than this many of their diagonals get all rays
 _SUN_RAYS = 16
 
@@ -215,11 +216,26 @@ def _direct(mi: ModuleType, surfaces: Surfaces, texels: _Texels, sun: Sun | None
         first = rays if surfaces.table.is_radiance[int(lamp[13])] else min(_FIRST_RAYS, rays)
         value, share = _lamp_rays(mi, surfaces, texels, chosen, lamp, first, seed + 100 * number)
         distance = np.linalg.norm(way[chosen], axis=1)
-        again = (share > 0.0) & (share < 1.0) | (distance < _NEAR * diagonal)
+        # what is asked for more must not depend on a texel's own luck: that would favour those that seem free
+        partly = np.zeros(len(texels), dtype=bool)
+        partly[chosen] = (share > 0.0) & (share < 1.0)
+        again = _around(texels, partly)[chosen] | (distance < _NEAR * diagonal)
         if rays > first and again.any():
             value[again], _ = _lamp_rays(mi, surfaces, texels, chosen[again], lamp, rays, seed + 100 * number + 50)
         total[chosen] += value
     return total if sun is None else total + _sunlight(mi, surfaces, texels, sun, seed)
+
+
+def _around(texels: _Texels, marked: BoolArray) -> BoolArray:
+    """Texels that are marked, and those within two of them on their grid."""
+    if len(texels) != texels.grid.count:  # those of the carriage: few
+        return np.ones_like(marked)
+    wide = marked.copy()
+    for part, rows, columns in texels.grid.grids():
+        if marked[part].any():
+            grid = marked[part].reshape(rows, columns)
+            wide[part] = ndimage.maximum_filter(grid, size=2 * _PENUMBRA_TEXELS + 1).ravel()
+    return wide
 
 
 def _lamp_rays(
