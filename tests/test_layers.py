@@ -22,6 +22,7 @@ PACKAGE = "phibench"
 # Every unit may import itself and the units on the lines above its own; a single file counts as a unit.
 ORDER = """
 scenes
+scenes/worlds
 render/optics
 render/sensor
 render/setup

@@ -20,7 +20,8 @@ from phibench.datasets.recipe.tables import (
 from phibench.datasets.rooms.room_sources import NamedRoom, room_of
 from phibench.scenes.camera import Camera
 from phibench.scenes.catalog import BOARD_ALBEDO, RIGS, Target
-from phibench.scenes.frames import Pose, Vector, as_vector, rotation_xyz
+from phibench.scenes.faces import face_table
+from phibench.scenes.frames import Array, Pose, Vector, as_vector, rotation_xyz
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.misalignment import Misalignment
@@ -133,10 +134,30 @@ def spot_albedo(albedo: float | str, beam_direction_world: Vector | None) -> flo
     return BOARD_ALBEDO if beam_direction_world is None else None
 
 
+AXIS_CLEARANCE_M = 0.20  # the mirror, its carriage and what a rig may be off
+_MIDDLE_M = 0.5  # between the robot's body and the lowest mirror
+
+
 def ceiling_m(room: Room) -> float:
-    """Height of the lowest thing that hangs from the ceiling: the lamps."""
-    places = (surface.T_world_shape for surface in room.surfaces)
-    return min(place.translation_m[2] for place in places if place.R[2, 2] < -0.5)  # those that face down
+    """Height of the lowest face above the robot: less than `AXIS_CLEARANCE_M` from the stroke axis, z = 0 excluded.
+
+    What reaches from below 0.5 m into that cylinder counts as 0.5 m, so that no stroke fits. Infinite in the open.
+    """
+    corners = face_table((*room.surfaces, *room.furniture)).corners_m
+    above = corners[..., 2].max(axis=1) > _MIDDLE_M
+    over = corners[above][_axis_distance_m(corners[above, :, :2]) < AXIS_CLEARANCE_M]
+    return max(float(over[..., 2].min(initial=np.inf)), _MIDDLE_M)
+
+
+def _axis_distance_m(triangles_m: Array) -> Array:
+    """Distances of the origin from triangles of the plane, shape (N,), for corners (N, 3, 2)."""
+    side = np.roll(triangles_m, -1, axis=1) - triangles_m
+    squared = np.maximum(np.einsum("nki,nki->nk", side, side), 1e-300)
+    part = np.clip(-np.einsum("nki,nki->nk", triangles_m, side) / squared, 0.0, 1.0)
+    nearest = np.linalg.norm(triangles_m + part[..., None] * side, axis=-1).min(axis=1)
+    turn = triangles_m[..., 0] * side[..., 1] - triangles_m[..., 1] * side[..., 0]
+    inside = ((turn > 0.0).all(axis=1)) | ((turn < 0.0).all(axis=1))
+    return np.where(inside, 0.0, nearest)
 
 
 def _given(table: RigTable, keys: Iterable[str]) -> dict[str, Any]:

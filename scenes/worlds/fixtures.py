@@ -1,0 +1,511 @@
+"""Fixtures and small things: doors, windows, pictures, pipes, what lies on the floor or stands near the robot.
+
+Frames are those of `furniture`: a thing on a wall has its back at y = 0, the wall, and z above the floor.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+import numpy as np
+
+from phibench.scenes.frames import rotation_xyz
+from phibench.scenes.worlds import furniture, graphics
+from phibench.scenes.worlds.assembly import Assembly
+from phibench.scenes.worlds.furniture import Piece, Rng, book_row, one_of, thing
+from phibench.scenes.worlds.materials import MaterialSet
+
+_FRONT = (0.0, -1.0, 0.0)
+_PAINTS = ("paint_red", "paint_blue", "paint_green", "paint_yellow", "paint_orange")
+_FRAMES = ("light_wood", "dark_wood", "red_wood", "white_lacquer", "dark_plastic", "steel")
+
+# Openings.
+
+
+def door(rng: Rng, materials: MaterialSet, angle_deg: float) -> Assembly:
+    """Door with a frame, ajar by an angle; behind it a dim corridor, a picture 5 mm in front of the wall."""
+    made = Assembly()
+    width, high = float(rng.uniform(0.8, 1.0)), float(rng.uniform(1.98, 2.1))
+    frame = one_of(rng, materials, _FRAMES, upright=True)
+    leaf = one_of(rng, materials, ("white_lacquer", "grey_lacquer", "light_wood", "dark_wood", *_PAINTS), upright=True)
+    if angle_deg > 3.0:
+        dim = materials.print(0.15 * graphics.photograph(rng, (48, 24)), (width, high))
+        made.panel("corridor", (0.0, -0.005, high / 2.0), _FRONT, (width, high - 0.002), dim)
+    half = width / 2.0
+    made.box("jamb_1", (-half - 0.07, -half), (-0.03, -0.001), (0.0, high), frame)
+    made.box("jamb_2", (half, half + 0.07), (-0.03, -0.001), (0.0, high), frame)
+    made.box("lintel", (-half - 0.07, half + 0.07), (-0.03, -0.001), (high, high + 0.07), frame)
+    turn = math.radians(angle_deg)
+    c, s = math.cos(turn), math.sin(turn)
+    hinge = (-half + 0.03, -0.04)
+
+    def at(along: float, off: float) -> tuple[float, float]:
+        return hinge[0] + along * c - off * s, hinge[1] - along * s - off * c
+
+    x, y = at(half - 0.035, 0.022)
+    made.tilted("leaf", (x, y, high / 2.0), (width - 0.07, 0.04, high - 0.02), leaf, rotation_xyz(z_rad=-turn))
+    x, y = at(width - 0.14, 0.065)
+    made.tilted("handle", (x, y, 1.05), (0.12, 0.03, 0.03), materials.surface("steel"), rotation_xyz(z_rad=-turn))
+    if rng.random() < 0.5:
+        x, y = at(half - 0.035, 0.044)
+        normal = (-s, -c, 0.0)
+        sign = materials.print(graphics.notice(rng, (30, 22)), (0.3, 0.4))
+        made.panel("notice", (x, y, 1.5), normal, (0.3, 0.4), sign)
+    return made
+
+
+def window(rng: Rng, materials: MaterialSet, width_m: float, height_m: float) -> Assembly:
+    """Window: sky above (role "sky"), the view below (role "view"), bars, a sill, curtains or a blind, a radiator."""
+    made, bar = Assembly(), one_of(rng, materials, ("white_lacquer", "dark_wood", "grey_lacquer", "light_wood"))
+    sill, top, half = float(rng.uniform(0.55, 1.0)), min(height_m - 0.12, float(rng.uniform(2.0, 2.6))), width_m / 2.0
+    horizon = float(np.clip(rng.uniform(0.9, 1.7), sill, top - 0.5))
+    made.panel("sky", (0.0, -0.005, 0.5 * (horizon + top)), _FRONT, (width_m, top - horizon - 0.002), bar, "sky")
+    if horizon > sill + 0.05:
+        size = (width_m, horizon - sill - 0.002)
+        columns, rows = int(np.clip(width_m / 0.03, 16, 80)), int(np.clip(size[1] / 0.03, 8, 40))
+        view = materials.print(graphics.outdoors(rng, (rows, columns)), size)
+        made.panel("view", (0.0, -0.005, 0.5 * (sill + horizon)), _FRONT, size, view, "view")
+    count = int(rng.integers(2, 5))
+    for k in range(count + 1):
+        x = -half + k * width_m / count
+        made.box(f"bar_{k + 1}", (x - 0.03, x + 0.03), (-0.06, -0.008), (sill, top), bar)
+    for k, z in enumerate((sill, horizon, top)):
+        if k != 1 or rng.random() < 0.5:
+            made.box(f"beam_{k + 1}", (-half - 0.03, half + 0.03), (-0.1, -0.062), (z - 0.03, z + 0.03), bar)
+    made.box("sill", (-half - 0.1, half + 0.1), (-0.18, -0.001), (sill - 0.07, sill - 0.031), bar)
+    kind = rng.integers(3)
+    if kind == 0:
+        cloth = materials.surface("curtain", int(rng.integers(2)))
+        for side, sign in enumerate((-1.0, 1.0)):
+            for k in range(3):
+                x = sign * (half - 0.04 + 0.1 * k)
+                made.box(
+                    f"curtain_{3 * side + k + 1}",
+                    (x - 0.045, x + 0.045),
+                    (-0.16 - 0.03 * (k % 2), -0.11),
+                    (0.05 + sill - 0.02, top + 0.05),
+                    cloth,
+                )
+    elif kind == 1:
+        drop = float(rng.uniform(0.05, 0.3)) * (top - sill)
+        made.box(
+            "blind",
+            (-half, half),
+            (-0.13, -0.105),
+            (top - drop, top - 0.031),
+            one_of(rng, materials, ("curtain", "white_lacquer")),
+        )
+    if sill > 0.6:
+        white = materials.surface("white_lacquer")
+        ribs = int(width_m * 0.7 / 0.09)
+        for k in range(ribs):
+            x = -0.35 * width_m + 0.09 * k
+            made.box(f"rib_{k + 1}", (x, x + 0.075), (-0.13, -0.04), (0.12, sill - 0.12), white)
+    return made
+
+
+# On walls.
+
+
+def _picture(
+    rng: Rng,
+    materials: MaterialSet,
+    made: Assembly,
+    draw: Callable[[Rng, tuple[int, int]], np.ndarray],
+    size: tuple[float, float],
+    z: float,
+    y: float,
+) -> None:
+    rows, columns = (int(np.clip(length / 0.010, 12, 110)) for length in (size[1], size[0]))
+    coat = 1.5 if rng.random() < 0.4 * materials.properties.gloss else 0.0
+    made.panel("print", (0.0, y, z), _FRONT, size, materials.print(draw(rng, (rows, columns)), size, coat))
+
+
+def poster(rng: Rng, materials: MaterialSet) -> Assembly:
+    """Poster, chart or notice without a frame, 5 mm in front of the wall."""
+    made = Assembly()
+    width = float(rng.uniform(0.3, 1.1))
+    draw = (graphics.poster, graphics.poster, graphics.notice, graphics.chart, graphics.photograph)[rng.integers(5)]
+    _picture(
+        rng,
+        materials,
+        made,
+        draw,
+        (width, width * float(rng.uniform(0.7, 1.45))),
+        float(rng.uniform(1.35, 1.75)),
+        -0.005,
+    )
+    return made
+
+
+def picture(rng: Rng, materials: MaterialSet) -> Assembly:
+    """Picture in a frame."""
+    made, frame = Assembly(), one_of(rng, materials, _FRAMES)
+    width = float(rng.uniform(0.25, 1.2))
+    high, z = width * float(rng.uniform(0.6, 1.3)), float(rng.uniform(1.4, 1.7))
+    made.box(
+        "frame",
+        (-width / 2 - 0.03, width / 2 + 0.03),
+        (-0.03, -0.003),
+        (z - high / 2 - 0.03, z + high / 2 + 0.03),
+        frame,
+    )
+    _picture(rng, materials, made, graphics.photograph, (width, high), z, -0.032)
+    return made
+
+
+def board(rng: Rng, materials: MaterialSet) -> Assembly:
+    """White board or cork board with notices."""
+    made, frame = Assembly(), materials.surface("steel")
+    width, high, z = float(rng.uniform(0.9, 2.0)), float(rng.uniform(0.7, 1.1)), 1.5
+    white = rng.random() < 0.6
+    ground = frame if white else materials.surface("cork")
+    made.box(
+        "board",
+        (-width / 2 - 0.02, width / 2 + 0.02),
+        (-0.03, -0.003),
+        (z - high / 2 - 0.02, z + high / 2 + 0.02),
+        ground,
+    )
+    if white:
+        _picture(rng, materials, made, graphics.whiteboard, (width, high), z, -0.032)
+        return made
+    for k in range(int(rng.integers(3, 9))):
+        draw = (graphics.notice, graphics.poster, graphics.chart)[rng.integers(3)]
+        size = (0.21, 0.297) if rng.random() < 0.7 else (0.148, 0.21)
+        surface = materials.print(draw(rng, (36, 26)), size)
+        x, y = float(rng.uniform(-width / 2 + 0.12, width / 2 - 0.12)), -0.033 - 0.002 * k
+        made.panel(f"notice_{k + 1}", (x, y, z + float(rng.uniform(-0.3, 0.3)) * (high - 0.3)), _FRONT, size, surface)
+    return made
+
+
+def wall_shelf(rng: Rng, materials: MaterialSet) -> Assembly:
+    """Shelf board on brackets with books and things."""
+    made, wood = Assembly(), one_of(rng, materials, _FRAMES)
+    width = float(rng.uniform(0.6, 1.4))
+    for row in range(int(rng.integers(1, 3))):
+        z = 1.25 + 0.4 * row
+        made.box(f"board_{row + 1}", (-width / 2, width / 2), (-0.24, -0.003), (z, z + 0.025), wood)
+        for k, sign in enumerate((-1.0, 1.0)):
+            x = sign * (width / 2 - 0.1)
+            made.box(
+                f"bracket_{2 * row + k + 1}",
+                (x - 0.012, x + 0.012),
+                (-0.2, -0.003),
+                (z - 0.1, z),
+                materials.surface("steel"),
+            )
+        made.add(
+            book_row(rng, materials, 0.6 * width, 0.18, 0.3), -0.18 * width, -0.12, z + 0.025, 0.0, f"row_{row + 1}"
+        )
+        made.add(thing(rng, materials, 0.18, 0.3), 0.32 * width, -0.12, z + 0.025, 0.0, f"thing_{row + 1}")
+    return made
+
+
+def device(rng: Rng, materials: MaterialSet) -> Assembly:
+    """Fuse box, control panel or first-aid box with a duct up to the ceiling."""
+    made = Assembly()
+    case = one_of(rng, materials, ("grey_lacquer", "white_lacquer", "grey_plastic", *_PAINTS))
+    width, high, z = float(rng.uniform(0.15, 0.6)), float(rng.uniform(0.2, 0.8)), float(rng.uniform(1.1, 1.5))
+    depth = float(rng.uniform(0.08, 0.2))
+    made.box("case", (-width / 2, width / 2), (-depth, -0.003), (z, z + high), case)
+    size = (0.8 * width, 0.7 * high)
+    draw = (
+        graphics.buttons(rng, (24, 20), graphics.ink_colours(rng, 3))
+        if rng.random() < 0.7
+        else graphics.hazard(rng, (24, 24))
+    )
+    made.panel("front", (0.0, -depth - 0.002, z + high / 2), _FRONT, size, materials.print(draw, size))
+    made.box(
+        "duct",
+        (-0.03, 0.03),
+        (-0.05, -0.003),
+        (z + high, materials.properties.height_m - 0.06),
+        materials.surface("grey_plastic"),
+    )
+    return made
+
+
+def extinguisher(rng: Rng, materials: MaterialSet) -> Assembly:
+    """Fire extinguisher with its sign."""
+    made, z = Assembly(), 0.75
+    made.post("bottle", 0.0, -0.1, (z, z + 0.45), 0.075, materials.surface("paint_red"), 14)
+    made.post("valve", 0.0, -0.1, (z + 0.45, z + 0.55), 0.03, materials.surface("dark_plastic"), 6)
+    made.panel("sign", (0.0, -0.005, z + 0.85), _FRONT, (0.2, 0.2), materials.surface("paint_red"))
+    return made
+
+
+def clock(rng: Rng, materials: MaterialSet) -> Assembly:
+    """Round clock with two hands."""
+    made, z, radius = Assembly(), float(rng.uniform(1.9, 2.1)), float(rng.uniform(0.1, 0.18))
+    made.rod("rim", (0.0, -0.003, z), (0.0, -0.04, z), radius, one_of(rng, materials, _FRAMES), 24)
+    made.rod("face", (0.0, -0.041, z), (0.0, -0.044, z), 0.9 * radius, materials.surface("paper"), 24)
+    for k, length in enumerate((0.5, 0.8)):
+        turn = float(rng.uniform(0.0, 2.0 * np.pi))
+        centre = (
+            0.45 * length * radius * math.sin(turn),
+            -0.047 - 0.003 * k,
+            z + 0.45 * length * radius * math.cos(turn),
+        )
+        made.tilted(
+            f"hand_{k + 1}",
+            centre,
+            (0.012, 0.002, length * radius),
+            materials.surface("dark_plastic"),
+            rotation_xyz(y_rad=turn),
+        )
+    return made
+
+
+def coats(rng: Rng, materials: MaterialSet) -> Assembly:
+    """Row of hooks with coats."""
+    made = Assembly()
+    made.box("rail", (-0.5, 0.5), (-0.03, -0.003), (1.62, 1.72), one_of(rng, materials, _FRAMES))
+    for k in range(4):
+        x = -0.4 + 0.26 * k
+        if rng.random() < 0.7:
+            cloth = one_of(
+                rng, materials, ("cloth_grey", "cloth_blue", "cloth_red", "cloth_green", "plaid", "leather"), 3
+            )
+            long = float(rng.uniform(0.6, 1.05))
+            made.box(f"coat_{k + 1}", (x - 0.11, x + 0.11), (-0.2, -0.04), (1.6 - long, 1.6), cloth)
+    return made
+
+
+def pipes(rng: Rng, materials: MaterialSet) -> Assembly:
+    """Upright pipes with a valve."""
+    made = Assembly()
+    top = materials.properties.height_m - 0.06
+    for k in range(int(rng.integers(1, 4))):
+        radius = float(rng.uniform(0.012, 0.055))
+        surface = one_of(rng, materials, ("copper", "galvanised", "white_lacquer", "steel", *_PAINTS))
+        made.post(f"pipe_{k + 1}", -0.15 + 0.15 * k, -0.08, (0.0, top), radius, surface, 10)
+    made.rod("valve", (-0.15, -0.15, 1.1), (-0.15, -0.2, 1.1), 0.06, materials.surface("paint_red"), 10)
+    return made
+
+
+def pegboard(rng: Rng, materials: MaterialSet) -> Assembly:
+    """Pegboard with tools."""
+    made = Assembly()
+    width, low = float(rng.uniform(0.8, 1.8)), 1.0
+    made.box("board", (-width / 2, width / 2), (-0.025, -0.003), (low, low + 0.9), materials.surface("pegboard"))
+    for k in range(int(rng.integers(3, 11))):
+        x, z = float(rng.uniform(-width / 2 + 0.06, width / 2 - 0.1)), float(rng.uniform(low + 0.35, low + 0.85))
+        surface = one_of(rng, materials, (*_PAINTS, "steel", "dark_plastic", "light_wood"))
+        near = -0.03 - 0.003 * k
+        made.box(
+            f"tool_{k + 1}",
+            (x, x + float(rng.uniform(0.02, 0.07))),
+            (near - 0.02, near),
+            (z - float(rng.uniform(0.1, 0.3)), z),
+            surface,
+        )
+    return made
+
+
+WALL_THINGS: Mapping[str, tuple[Piece, ...]] = MappingProxyType(
+    {
+        "office": (poster, poster, picture, board, board, wall_shelf, clock, coats, device),
+        "home": (picture, picture, poster, wall_shelf, wall_shelf, clock, coats),
+        "workshop": (pegboard, pegboard, device, extinguisher, pipes, poster, board),
+        "laboratory": (board, poster, device, pipes, wall_shelf, extinguisher, pegboard, clock),
+        "store": (poster, device, extinguisher, pipes, poster, clock),
+    }
+)
+
+
+# On ceilings.
+
+
+def ceiling_run(rng: Rng, materials: MaterialSet, length_m: float) -> Assembly:
+    """Pipe, duct or cable tray below the ceiling, along x, its back at y = 0."""
+    made, top = Assembly(), materials.properties.height_m - 0.03
+    half, kind = length_m / 2.0, rng.integers(3)
+    surface = one_of(rng, materials, ("galvanised", "copper", "white_lacquer", "grey_lacquer", *_PAINTS))
+    if kind == 0:
+        for k in range(int(rng.integers(1, 4))):
+            radius = float(rng.uniform(0.015, 0.05))
+            y, z = -0.1 - 0.13 * k, top - radius - 0.01
+            made.rod(f"pipe_{k + 1}", (-half, y, z), (half, y, z), radius, surface, 10)
+    elif kind == 1:
+        radius = float(rng.uniform(0.08, 0.14))
+        made.rod(
+            "duct",
+            (-half, -0.05 - radius, top - radius),
+            (half, -0.05 - radius, top - radius),
+            radius,
+            materials.surface("galvanised"),
+            16,
+        )
+    else:
+        made.box("tray", (-half, half), (-0.3, -0.1), (top - 0.1, top - 0.05), surface)
+        for k in range(4):
+            made.box(
+                f"hanger_{k + 1}",
+                (half * (-0.75 + 0.5 * k), half * (-0.75 + 0.5 * k) + 0.02),
+                (-0.21, -0.19),
+                (top - 0.05, top + 0.027),
+                surface,
+            )
+    return made
+
+
+# On the floor.
+
+
+def rug(rng: Rng, materials: MaterialSet) -> Assembly:
+    """Rug, 8 mm thick."""
+    made = Assembly()
+    half = (float(rng.uniform(0.3, 1.0)), float(rng.uniform(0.3, 0.6)))
+    made.box(
+        "rug",
+        (-half[0], half[0]),
+        (-half[1], half[1]),
+        (0.0, 0.008),
+        one_of(rng, materials, ("carpet", "plaid", "plain_carpet"), 2),
+    )
+    return made
+
+
+def ball(rng: Rng, materials: MaterialSet) -> Assembly:
+    """Ball as rings of a prism each."""
+    made, radius = Assembly(), float(rng.uniform(0.08, 0.16))
+    surface = one_of(rng, materials, (*_PAINTS, "leather", "white_plastic"))
+    for k in range(5):
+        low, high = (-1.0 + 0.4 * k) * radius, (-0.6 + 0.4 * k) * radius
+        wide = math.sqrt(radius**2 - (0.5 * (low + high)) ** 2)
+        made.post(f"ring_{k + 1}", 0.0, 0.0, (radius + low, radius + high), wide, surface, 12)
+    return made
+
+
+def bucket(rng: Rng, materials: MaterialSet) -> Assembly:
+    """Bucket or paper basket with something in it."""
+    made = Assembly()
+    radius, high = float(rng.uniform(0.1, 0.18)), float(rng.uniform(0.2, 0.4))
+    made.post(
+        "bucket", 0.0, 0.0, (0.0, high), radius, one_of(rng, materials, (*_PAINTS, "galvanised", "dark_plastic")), 16
+    )
+    made.post(
+        "contents",
+        0.0,
+        0.0,
+        (high, high + 0.02),
+        0.85 * radius,
+        one_of(rng, materials, ("paper", "soil", "rubber")),
+        10,
+    )
+    return made
+
+
+def cone(rng: Rng, materials: MaterialSet) -> Assembly:
+    """Traffic cone: rings that get smaller, and a foot."""
+    made = Assembly()
+    made.box("foot", (-0.14, 0.14), (-0.14, 0.14), (0.0, 0.03), materials.surface("rubber"))
+    for k in range(4):
+        surface = materials.surface("white_plastic" if k == 2 else "paint_orange")
+        made.post(f"ring_{k + 1}", 0.0, 0.0, (0.03 + 0.11 * k, 0.14 + 0.11 * k), 0.11 - 0.025 * k, surface, 12)
+    return made
+
+
+def shoes(rng: Rng, materials: MaterialSet) -> Assembly:
+    """Pair of shoes."""
+    made, surface = Assembly(), one_of(rng, materials, ("leather", "cloth_blue", "cloth_red", "dark_plastic"), 2)
+    for k, sign in enumerate((-1.0, 1.0)):
+        turn = float(rng.uniform(-0.4, 0.4))
+        made.box(f"sole_{k + 1}", (sign * 0.1 - 0.045, sign * 0.1 + 0.045), (-0.14, 0.14), (0.0, 0.05), surface, turn)
+        made.box(f"heel_{k + 1}", (sign * 0.1 - 0.04, sign * 0.1 + 0.04), (0.0, 0.1), (0.05, 0.11), surface, turn)
+    return made
+
+
+def sheets(rng: Rng, materials: MaterialSet) -> Assembly:
+    """Sheets of paper that dropped."""
+    made = Assembly()
+    for k in range(int(rng.integers(1, 4))):
+        surface = materials.print(graphics.notice(rng, (36, 26)), (0.21, 0.297))
+        turn = float(rng.uniform(-3.0, 3.0))
+        x, y = float(rng.uniform(-0.15, 0.15)), float(rng.uniform(-0.15, 0.15))
+        made.box(
+            f"sheet_{k + 1}",
+            (x - 0.105, x + 0.105),
+            (y - 0.148, y + 0.148),
+            (0.004 * k, 0.004 * k + 0.003),
+            surface,
+            turn,
+        )
+    return made
+
+
+def cable(rng: Rng, materials: MaterialSet) -> Assembly:
+    """Cable in a few straight pieces."""
+    made, colour = Assembly(), one_of(rng, materials, ("dark_plastic", "paint_orange", "white_plastic"))
+    place, turn = np.array([-0.4, 0.0, 0.008]), float(rng.uniform(-0.6, 0.6))
+    for k in range(5):
+        turn += float(rng.uniform(-0.7, 0.7))
+        after = place + float(rng.uniform(0.1, 0.3)) * np.array([math.cos(turn), math.sin(turn), 0.0])
+        made.rod(f"piece_{k + 1}", tuple(place), tuple(after), 0.007, colour, 5)
+        place = after
+    return made
+
+
+def small_thing(rng: Rng, materials: MaterialSet) -> Assembly:
+    """One of the things that also stand on tables."""
+    return thing(rng, materials, 0.35, 0.4)
+
+
+FLOOR_THINGS: tuple[Piece, ...] = (
+    rug,
+    ball,
+    bucket,
+    cone,
+    shoes,
+    sheets,
+    cable,
+    small_thing,
+    small_thing,
+    furniture.boxes,
+)
+
+
+# Near the robot.
+
+
+def hanging_cable(rng: Rng, materials: MaterialSet) -> Assembly:
+    """Cable that hangs from the ceiling, with a plug or a hook."""
+    made, top = Assembly(), materials.properties.height_m - 0.004
+    low = float(rng.uniform(0.5, 1.3))
+    colour = one_of(rng, materials, ("dark_plastic", "paint_orange", "paint_yellow", "steel"))
+    made.post("cable", 0.0, 0.0, (low, top), float(rng.uniform(0.008, 0.02)), colour, 8)
+    made.post("plug", 0.0, 0.0, (low - 0.1, low), 0.035, one_of(rng, materials, (*_PAINTS, "dark_plastic")), 10)
+    return made
+
+
+def arm(rng: Rng, materials: MaterialSet) -> Assembly:
+    """Post with an arm that reaches towards +y, and something at its end."""
+    made, frame = Assembly(), one_of(rng, materials, ("steel", "dark_plastic", *_PAINTS))
+    high, reach = float(rng.uniform(0.5, 1.5)), float(rng.uniform(0.25, 0.5))
+    made.post("foot", 0.0, 0.0, (0.0, 0.03), 0.14, frame, 14)
+    made.post("post", 0.0, 0.0, (0.03, high), 0.018, frame)
+    made.rod("arm", (0.0, 0.02, high - 0.04), (0.0, reach, high - 0.02), 0.014, frame)
+    made.box(
+        "end", (-0.05, 0.05), (reach + 0.002, reach + 0.06), (high - 0.1, high + 0.05), one_of(rng, materials, _PAINTS)
+    )
+    return made
+
+
+def side_table(rng: Rng, materials: MaterialSet) -> Assembly:
+    """Table whose top reaches towards +y over a foot that stands back."""
+    made, wood = Assembly(), one_of(rng, materials, ("light_wood", "dark_wood", "white_lacquer", "plywood"))
+    high, half = float(rng.uniform(0.5, 0.75)), float(rng.uniform(0.2, 0.35))
+    made.box("top", (-half, half), (-0.2, 0.3), (high - 0.03, high), wood)
+    made.box("post", (-0.03, 0.03), (-0.18, -0.12), (0.03, high - 0.03), materials.surface("steel"))
+    made.box("foot", (-half, half), (-0.2, -0.1), (0.0, 0.03), materials.surface("steel"))
+    made.add(thing(rng, materials, 0.25, 0.35), 0.0, 0.0, high, 0.0, "thing")
+    return made
+
+
+NEAR_THINGS: tuple[Piece, ...] = (
+    *(hanging_cable, hanging_cable, arm, arm, side_table, side_table),
+    *(furniture.stool, furniture.boxes, furniture.tripod, furniture.plant, furniture.chair, bucket, cone),
+)
