@@ -21,7 +21,7 @@ from phibench.scenes.worlds.properties import RoomProperties
 FREE_RADIUS_M = 0.20  # of the upright cylinder about the stroke axis that stays free up to the ceiling
 FREE_DISC_M = 0.55  # of the disc on the floor that the robot takes; its half diagonal is 0.522 m
 FREE_DISC_HEIGHT_M = 0.35  # the robot's flippers and body end below
-_MARGIN_M = 0.01
+_MARGIN_M = 0.02  # from the walls: skirting boards are 14 mm thick
 _ROBOT_MARGIN_M = 0.85  # from the walls: half a diagonal and 0.3 m
 
 
@@ -113,7 +113,7 @@ class FloorPlan:
         return Pose("world", "world", tuple(float(x) for x in moved), turn)
 
     def holds(self, thing: Footprint) -> bool:
-        """True if a footprint lies inside the outline, a centimetre from the walls."""
+        """True if a footprint lies inside the outline, two centimetres from the walls."""
         points = thing.corners()
         low, high = points.min(axis=0), points.max(axis=0)
         if low.min() < _MARGIN_M or high[0] > self.length_m - _MARGIN_M or high[1] > self.width_m - _MARGIN_M:

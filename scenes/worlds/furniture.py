@@ -141,7 +141,7 @@ def desk_lamp(rng: Rng, materials: MaterialSet) -> Assembly:
     made, metal = Assembly(), one_of(rng, materials, (*_PAINTS, "steel", "dark_plastic"))
     high = float(rng.uniform(0.32, 0.5))
     made.post("foot", 0.0, 0.0, (0.0, 0.02), 0.08, metal, 12)
-    made.rod("arm", (0.0, 0.0, 0.022), (0.10, -0.05, high - 0.001), 0.008, metal, 6)
+    made.rod("arm", (0.0, 0.0, 0.022), (0.068, -0.027, high - 0.002), 0.008, metal, 6)
     made.post("shade", 0.13, -0.08, (high, high + 0.09), 0.075, metal, 12)
     made.panel(
         "bulb", (0.13, -0.08, high - 0.001), (0.0, 0.0, -1.0), (0.09, 0.09), materials.surface("white_plastic"), "bulb"
@@ -257,8 +257,8 @@ def desk(rng: Rng, materials: MaterialSet) -> Assembly:
     width, depth, high = float(rng.uniform(1.2, 1.8)), float(rng.uniform(0.65, 0.8)), float(rng.uniform(0.71, 0.76))
     _top(rng, materials, made, width, depth, high)
     back = depth / 2
-    for k in range(int(rng.integers(1, 3))):
-        made.add(monitor(rng, materials), -0.25 + 0.72 * k - 0.1, back - 0.15, high, 0.0, f"monitor_{k + 1}")
+    for k in range(int(rng.integers(1, 3)) if width > 1.5 else 1):
+        made.add(monitor(rng, materials), -0.2 + 0.72 * k, back - 0.15, high, 0.0, f"monitor_{k + 1}")
     keys = materials.print(graphics.buttons(rng, (10, 30), graphics.ink_colours(rng, 3) * 0.3), (0.44, 0.14))
     made.box("keyboard", (-0.45, -0.01), (-0.2, -0.06), (high, high + 0.02), keys)
     clutter = materials.properties.clutter
@@ -266,8 +266,8 @@ def desk(rng: Rng, materials: MaterialSet) -> Assembly:
         scatter(
             rng, made, materials, (0.02, width / 2 - 0.02), (-back + 0.02, -back + 0.25), high, int(3 * clutter + 1)
         )
-    if width > 1.4 and rng.random() < 0.6:
-        made.add(desk_lamp(rng, materials), -width / 2 + 0.12, back - 0.12, high, 0.0, "lamp")
+    if width > 1.45 and rng.random() < 0.6:
+        made.add(desk_lamp(rng, materials), -width / 2 + 0.1, back - 0.12, high, -0.5 * np.pi, "lamp")
     if rng.random() < 0.6:
         case = one_of(rng, materials, _CASES)
         for k in range(3):

@@ -36,7 +36,7 @@ from phibench.scenes.worlds.properties import RoomProperties
 
 MOST_LIGHTS = 12  # emitting rectangles: each is sampled by itself
 _TRIES = 25
-_FURNITURE_PATCHES, _WALL_PATCHES, _NEAR_PATCHES, _FLOOR_PATCHES = 1350, 360, 240, 200  # below 3000 with the shell
+_FURNITURE_PATCHES, _WALL_PATCHES, _NEAR_PATCHES, _FLOOR_PATCHES = 1200, 330, 220, 180  # below 3000 with the shell
 _DAYLIGHT_K, _SUN_K, _SCREEN_K = 6500.0, 5500.0, 6500.0
 _DESK_LUMEN = 400.0
 _FLOORS = {
@@ -129,7 +129,7 @@ class _Generator:
         x, y = wall.place(float(rng.uniform(*room)), 0.0)
         whole = footprint_of(made, x, y, wall.yaw_rad)
         deep = max(-float(low[1]), depth_m)
-        off = 0.5 * deep + 0.0105  # the outline's margin; the thing itself is at the wall
+        off = 0.5 * deep + 0.0205  # the outline's margin; the thing itself is at the wall
         middle = 0.5 * float(low[0] + high[0])
         centre = (
             x + middle * -wall.along[0] + off * wall.normal[0],

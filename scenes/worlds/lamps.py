@@ -78,7 +78,7 @@ def ceiling_lamp(rng: np.random.Generator, materials: MaterialSet, kind: str, he
         drop = min(float(rng.uniform(0.3, 1.2)), height_m - _LOWEST_M)
         low, radius = height_m - drop, float(rng.uniform(0.12, 0.24))
         shade = one_of(rng, materials, ("dark_plastic", "white_plastic", "paint_red", "paint_green", "copper", "steel"))
-        made.post("shade", 0.0, 0.0, (low, low + min(0.16, drop - 0.02)), radius, shade, 20)
+        made.post("shade", 0.0, 0.0, (low, low + min(0.16, drop - 0.02)), radius, shade, 16)
         if drop > 0.2:
             made.post("cord", 0.0, 0.0, (low + 0.16, height_m - 0.003), 0.008, materials.surface("dark_plastic"), 6)
         made.panel("light", (0.0, 0.0, low - 0.002), down, (radius, radius), white, "lamp")
