@@ -219,7 +219,7 @@ def rig_fault(rig: Rig, stroke_m: float, ceiling_m: float, boards: Boards) -> st
     else:
         top_m = rig.at(stroke_m).sphere_centre_m[2] + rig.mirror.bound_m
     if top_m >= ceiling_m:
-        return f"the mirror's top at {top_m:.3f} m is above the ceiling's lamps at {ceiling_m:.2f} m"
+        return f"the mirror's top at {top_m:.3f} m is above the ceiling or what hangs from it, at {ceiling_m:.2f} m"
     return boards.cut_by(rig, stroke_m)
 
 

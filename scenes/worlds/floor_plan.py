@@ -171,7 +171,7 @@ def shell(plan: FloorPlan, floor: Surface, ceiling: Surface, walls: tuple[Surfac
 
 @dataclass
 class Layout:
-    """What stands in a room so far: parts in the plan frame, and what they take of the room."""
+    """Contents of a room so far: parts in the plan frame, and what they take of the room."""
 
     plan: FloorPlan
     parts: list[Part] = field(default_factory=list)

@@ -73,7 +73,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Surface:
-    """What a shape is made of: a texture and the refractive index of its coat, 0 for none."""
+    """Texture and coat of a shape: a texture and the refractive index of its coat, 0 for none."""
 
     texture: Texture
     coat: float = 0.0

@@ -99,7 +99,7 @@ def _name(choices: tuple[str, ...], meaning: str) -> Any:
 
 @dataclass(frozen=True)
 class RoomProperties:
-    """What a generated room is like; `PROPERTIES` has range, meaning and default distribution of each field.
+    """Description of a generated room; `PROPERTIES` has range, meaning and default distribution of each field.
 
     Raises
     ------

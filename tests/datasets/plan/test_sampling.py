@@ -237,7 +237,7 @@ def test_an_impossible_recipe_is_refused_with_the_reason() -> None:
     with pytest.raises(RecipeError, match=r"sample 0 has no possible .* inside the sphere; .*narrow") as caught:
         plan(rig={"z_c_m": 0.05})
     assert "\n" not in str(caught.value)
-    with pytest.raises(RecipeError, match=r"above the ceiling's lamps at 2\.98 m"):
+    with pytest.raises(RecipeError, match=r"hangs from it, at 3\.00 m"):
         plan(stroke_m={"uniform": [2.3, 2.4]})
     with pytest.raises(RecipeError, match=r"folds"):
         plan(rig={"k1": -0.12, "k2": 0.03, "k3": -3.4})
