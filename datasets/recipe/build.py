@@ -142,8 +142,10 @@ def ceiling_m(room: Room) -> float:
     """Height of the lowest face above the robot: less than `AXIS_CLEARANCE_M` from the stroke axis, z = 0 excluded.
 
     What reaches from below 0.5 m into that cylinder counts as 0.5 m, so that no stroke fits. Infinite in the open.
+    Target boards do not count: they may stand nearer, and are checked against the mirror itself.
     """
-    corners = face_table((*room.surfaces, *room.furniture)).corners_m
+    shapes = [shape for shape in (*room.surfaces, *room.furniture) if not shape.name.startswith("board_")]
+    corners = face_table(shapes).corners_m
     above = corners[..., 2].max(axis=1) > _MIDDLE_M
     over = corners[above][_axis_distance_m(corners[above, :, :2]) < AXIS_CLEARANCE_M]
     return max(float(over[..., 2].min(initial=np.inf)), _MIDDLE_M)

@@ -156,7 +156,7 @@ def picture(rng: Rng, materials: MaterialSet) -> Assembly:
     return made
 
 
-def board(rng: Rng, materials: MaterialSet) -> Assembly:
+def notice_board(rng: Rng, materials: MaterialSet) -> Assembly:
     """White board or cork board with notices."""
     made, frame = Assembly(), materials.surface("steel")
     width, high, z = float(rng.uniform(0.9, 2.0)), float(rng.uniform(0.7, 1.1)), 1.5
@@ -307,10 +307,10 @@ def pegboard(rng: Rng, materials: MaterialSet) -> Assembly:
 
 WALL_THINGS: Mapping[str, tuple[Piece, ...]] = MappingProxyType(
     {
-        "office": (poster, poster, picture, board, board, wall_shelf, clock, coats, device),
+        "office": (poster, poster, picture, notice_board, notice_board, wall_shelf, clock, coats, device),
         "home": (picture, picture, poster, wall_shelf, wall_shelf, clock, coats),
-        "workshop": (pegboard, pegboard, device, extinguisher, pipes, poster, board),
-        "laboratory": (board, poster, device, pipes, wall_shelf, extinguisher, pegboard, clock),
+        "workshop": (pegboard, pegboard, device, extinguisher, pipes, poster, notice_board),
+        "laboratory": (notice_board, poster, device, pipes, wall_shelf, extinguisher, pegboard, clock),
         "store": (poster, device, extinguisher, pipes, poster, clock),
     }
 )
