@@ -12,8 +12,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from phibench.datasets.errors import DatasetError, RecipeError
-from phibench.datasets.plan.sampling import RandomSample, draw_rigs, draw_samples
-from phibench.datasets.recipe.build import build_misalignment, build_rig, build_spot, room_source, true_stroke_m
+from phibench.datasets.plan.sampling import RandomSample, draw_rigs, draw_rooms, draw_samples
+from phibench.datasets.recipe.build import build_misalignment, build_rig, build_spot, true_stroke_m
 from phibench.datasets.recipe.tables import DrawnRigsTable, RandomTable, Recipe
 from phibench.datasets.rooms.room_sources import ONLY_ROOM, RoomSource, room_of
 from phibench.scenes.laser import LaserSpot
@@ -137,9 +137,10 @@ def make_plan(recipe: Recipe) -> Plan:
         If two strokes differ by less than a nanometre, so that their poses would share a name, or if a sample of
         `[random]` stays impossible.
     """
-    rig, room = build_rig(recipe.rig), room_source(recipe.room, recipe.targets)
+    rig, rooms = build_rig(recipe.rig), draw_rooms(recipe)
     if recipe.random is not None:
-        return _random_plan(recipe, recipe.random, rig, room)
+        return _random_plan(recipe, recipe.random, rig, rooms)
+    room = rooms[ONLY_ROOM]
     if recipe.rigs is not None:
         return _rigs_plan(recipe, recipe.rigs, rig, room)
     misalignment = build_misalignment(recipe.misalignment)
@@ -199,9 +200,9 @@ def pose_of(rig: str, offset_m: float, room: str = ONLY_ROOM) -> str:
     return "-".join(parts)
 
 
-def _random_plan(recipe: Recipe, table: RandomTable, rig: Rig, room: RoomSource) -> Plan:
+def _random_plan(recipe: Recipe, table: RandomTable, rig: Rig, rooms: dict[str, RoomSource]) -> Plan:
     """Equal rigs share an id, and so their views; the first sample that has one names it, so that more change none."""
-    samples = draw_samples(recipe, table, room_of(room))
+    samples = draw_samples(recipe, table, rooms)
     ids = {rig: RECIPE_RIG}
     for sample in samples:
         ids.setdefault(sample.rig, f"r{sample.number:06d}")
@@ -210,12 +211,14 @@ def _random_plan(recipe: Recipe, table: RandomTable, rig: Rig, room: RoomSource)
     used = {name for pair in pairs for name in (pair.rig, pair.nominal_rig)}
     rigs = {name: one for one, name in ids.items() if name in used}
     spots = {pair.spot: sample.spot for pair, sample in zip(pairs, samples, strict=True)}
-    return Plan(recipe, rig, rigs, {ONLY_ROOM: room}, spots, _poses(recipe, dict.fromkeys(_places(pairs))), pairs)
+    used_rooms = {name: rooms[name] for name in dict.fromkeys(pair.room for pair in pairs)}
+    return Plan(recipe, rig, rigs, used_rooms, spots, _poses(recipe, dict.fromkeys(_places(pairs))), pairs)
 
 
 def _random_pair(sample: RandomSample, rig: str, nominal_rig: str) -> PairPlan:
     name, strokes_m = f"random-{sample.number:06d}", (sample.stroke_m, sample.nominal_stroke_m)
-    return PairPlan(name, "random", sample.surface, *strokes_m, name, rig, nominal_rig, sample.drawn, sample.tries)
+    drawn = (sample.drawn, sample.tries, sample.room)
+    return PairPlan(name, "random", sample.surface, *strokes_m, name, rig, nominal_rig, *drawn)
 
 
 def _sample_name(experiment: str, target: str, stroke_m: float) -> str:

@@ -20,10 +20,18 @@ from typing import Any, Literal
 import numpy as np
 
 from phibench.datasets.errors import RecipeError
-from phibench.datasets.recipe.build import build_misalignment, build_rig, build_target, ceiling_m, true_stroke_m
+from phibench.datasets.recipe.build import (
+    build_misalignment,
+    build_rig,
+    build_target,
+    ceiling_m,
+    room_source,
+    true_stroke_m,
+)
 from phibench.datasets.recipe.distributions import DistributionTable, pick, quantile
 from phibench.datasets.recipe.spot_placement import Boards, Placed, place
-from phibench.datasets.recipe.tables import DRAWABLE, DrawnRigsTable, MisalignmentTable, RandomTable, Recipe, RigTable
+from phibench.datasets.recipe.tables import DRAWABLE, DrawnRigsTable, MisalignmentTable, RandomTable, Recipe, RigTable, RoomPropertiesTable
+from phibench.datasets.rooms.room_sources import ONLY_ROOM, GeneratedRoom, RoomSource, room_of
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
@@ -32,6 +40,7 @@ from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
 from phibench.scenes.validation import SceneError
+from phibench.scenes.worlds.properties import drawn_properties
 
 Sequence = Literal["sobol", "independent"]
 
@@ -104,6 +113,8 @@ class RandomSample:
         Number of the first draw that was possible; 1 is the sequence's own.
     drawn : tuple of (parameter, value)
         In the order of `PARAMETERS`.
+    room : str
+        Id of the room.
     surface : str
         Name of the target, or of what carries the spot.
     rig, stroke_m
@@ -115,6 +126,7 @@ class RandomSample:
     number: int
     tries: int
     drawn: tuple[tuple[str, Value], ...]
+    room: str
     rig: Rig
     surface: str
     spot: LaserSpot
@@ -123,17 +135,45 @@ class RandomSample:
     nominal_stroke_m: float
 
 
-def draw_samples(recipe: Recipe, table: RandomTable, room: Room) -> tuple[RandomSample, ...]:
-    """All samples of a recipe with `[random]`.
+def draw_rooms(recipe: Recipe) -> dict[str, RoomSource]:
+    """Sources of the rooms of a recipe, by id: the one of `[room]`, or those of `[rooms]`.
+
+    Each property has a random stream of its own, so that neither more rooms nor another property changes it.
+    """
+    table, dataset = recipe.rooms, recipe.dataset
+    if table is None:
+        return {ONLY_ROOM: room_source(recipe.room, recipe.targets)}
+    return {f"room{k:06d}": _generated(table.properties, (dataset.name, dataset.seed, "room", k)) for k in range(table.count)}
+
+
+def _generated(table: RoomPropertiesTable, stream: tuple[str | int, ...]) -> GeneratedRoom:
+    fixed: dict[str, Value] = {}
+    for name in type(table).model_fields:
+        if (chosen := getattr(table, name)) is not None:
+            u = np.array([generator(*stream, "property", name).random()])
+            named = not isinstance(chosen, DistributionTable)
+            value = chosen.choice[int(u[0] * len(chosen.choice))] if named else quantile(chosen, u)[0]
+            fixed[name] = value if isinstance(value, str) else float(value)
+    return GeneratedRoom(drawn_properties(*stream, **fixed), stream)
+
+
+def draw_samples(recipe: Recipe, table: RandomTable, rooms: Mapping[str, RoomSource]) -> tuple[RandomSample, ...]:
+    """All samples of a recipe with `[random]`, dealt to its rooms in turn.
 
     Raises
     ------
     RecipeError
         If a sample stays impossible after `TRIES` draws, with the reason of the last one.
     """
-    makers = _Makers(recipe, table, room)
-    pilot = min(_PILOT, table.samples)  # whether the recipe is possible at all is known after a few
-    return (*makers.draw(range(pilot)), *makers.draw(range(pilot, table.samples)))
+    dataset, found = recipe.dataset, dict[int, RandomSample]()
+    first = first_points(table.sequence, dataset.name, dataset.seed, table.samples, drawn_parameters(table))
+    for k, room_id in enumerate(rooms):  # a room is built once, and let go before the next
+        numbers = range(k, table.samples, len(rooms))
+        if numbers:
+            makers = _Makers(recipe, table, room_id, room_of(rooms[room_id]), first)
+            pilot = numbers[:_PILOT]  # whether the recipe is possible at all is known after a few
+            found |= {sample.number: sample for part in (pilot, numbers[_PILOT:]) for sample in makers.draw(part)}
+    return tuple(found[number] for number in range(table.samples))
 
 
 def rig_table(table: RigTable, values: Mapping[str, Value]) -> RigTable:
@@ -151,13 +191,13 @@ def drawn_misalignment(table: MisalignmentTable, values: Mapping[str, Value]) ->
 class _Makers:
     """Drawing of samples, with all that the draws of a recipe share."""
 
-    def __init__(self, recipe: Recipe, table: RandomTable, room: Room) -> None:
-        self._recipe, self._table, self._room = recipe, table, room
+    def __init__(
+        self, recipe: Recipe, table: RandomTable, room_id: str, room: Room, first: Mapping[str, Array]
+    ) -> None:
+        self._recipe, self._table, self._room_id, self._room, self._first = recipe, table, room_id, room, first
         self._targets = {target.name: target for target in recipe.targets}
         self._boards = Boards([build_target(target) for target in recipe.targets])
         self._ceiling_m = ceiling_m(room)
-        dataset = recipe.dataset
-        self._first = first_points(table.sequence, dataset.name, dataset.seed, table.samples, drawn_parameters(table))
 
     def draw(self, numbers: range) -> list[RandomSample]:
         """Draw some samples, those that are impossible again until they are not."""
@@ -206,7 +246,8 @@ class _Makers:
             return str(error)
         if fault := rig_fault(rig, stroke_m, self._ceiling_m, self._boards):
             return fault
-        return RandomSample(number, tries, drawn, rig, *placed, stroke_m, nominal_rig, nominal_stroke_m)
+        numbers = (stroke_m, nominal_rig, nominal_stroke_m)
+        return RandomSample(number, tries, drawn, self._room_id, rig, *placed, *numbers)
 
 
 def rig_fault(rig: Rig, stroke_m: float, ceiling_m: float, boards: Boards) -> str | None:

@@ -55,7 +55,7 @@ def semantic_faults(raw: Raw) -> list[Fault]:
     """Faults between keys; faulty keys are passed over."""
     draft = _Draft.of(raw)
     return [
-        *(*_purpose(raw), *_names(draft), *_repeats(raw), *_draws(draft), *_frames(raw), *_distractors(draft)),
+        *(*_purpose(raw), *_rooms(draft), *_names(draft), *_repeats(raw), *_draws(draft), *_frames(raw), *_distractors(draft)),
         *(*_laser(draft.laser), *_rig(draft)),
     ]
 
@@ -162,6 +162,22 @@ def _purpose(raw: Raw) -> Iterator[Fault]:
         yield Fault("rigs", "given together with [random], whose samples have rigs of their own; remove one")
     if _table(raw, "rigs") and not _table(raw, "rigs", "misalignment"):
         yield Fault("rigs.misalignment", "draws nothing; add distributions of keys of [misalignment] or remove [rigs]")
+
+
+def _rooms(draft: _Draft) -> Iterator[Fault]:
+    """A recipe has boards, or generated rooms with spots that rays find."""
+    if "rooms" not in draft.raw:
+        if draft.raw.get("targets") in (None, []):
+            yield Fault("targets", "missing; add [[targets]] (boards with a laser spot), or [rooms] for generated rooms")
+        return
+    if draft.raw.get("targets"):
+        yield Fault("targets", "given together with [rooms]; generated rooms have no boards, remove [[targets]]")
+    if "room" in draft.raw:
+        yield Fault("room", "given together with [rooms]; give one or the other")
+    if "random" not in draft.raw:
+        yield Fault("rooms", "given without [random]; generated rooms are for samples that are drawn")
+    elif "azimuth_deg" not in _table(draft.raw, "random", "spot"):
+        yield Fault("random.spot.azimuth_deg", "missing; in generated rooms a ray finds the spot, give its azimuth_deg")
 
 
 def _names(draft: _Draft) -> Iterator[Fault]:

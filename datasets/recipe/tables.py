@@ -16,10 +16,12 @@ from phibench.datasets.recipe.distributions import (
     Name,
     Table,
     Targets,
+    one_name,
     values_of,
 )
 from phibench.scenes.catalog import BOARD_SIZE_M
 from phibench.scenes.misalignment import PARAMETERS
+from phibench.scenes.worlds.properties import PROPERTIES, Property
 
 MIN_STROKE_M, MAX_STROKE_M = 1e-3, 10.0
 DatasetName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
@@ -158,6 +160,39 @@ class RoomTable(Table):
     """`[room]`."""
 
     name: Literal["lab", "dark"] = Field(default="lab", description="'dark' is the lab with every lamp off")
+
+
+def _property(entry: Property) -> Any:
+    """Field of a property's distribution, in its range or of its names."""
+    if entry.choices:
+        names = Annotated[tuple[Literal[entry.choices], ...], Field(strict=False, min_length=1)]  # type: ignore[valid-type]
+        choice = create_model(f"{entry.name}Choice", __base__=Table, choice=(names, Field(description="equally probable")))
+        kind = Annotated[choice | None, BeforeValidator(one_name)]  # type: ignore[valid-type]
+    else:
+        number = Annotated[float, Field(ge=entry.low, le=entry.high)]
+        drawn = Annotated[Distribution, values_of(number)]
+        kind = (Annotated[drawn, AfterValidator(_is_whole)] if entry.whole else drawn) | None  # type: ignore[assignment]
+    return kind, Field(default=None, description=entry.meaning)
+
+
+if TYPE_CHECKING:
+    RoomPropertiesTable = Table
+else:
+    RoomPropertiesTable = create_model(
+        "RoomPropertiesTable",
+        __base__=Table,
+        __doc__="`[rooms.properties]`: distributions of a generated room's properties.",
+        **{name: _property(entry) for name, entry in PROPERTIES.items()},
+    )
+
+
+class RoomsTable(Table):
+    """`[rooms]`: generated rooms for the samples of `[random]`, which are dealt to them in turn."""
+
+    count: int = Field(default=1, ge=1, le=1_000_000, description="how many; sample i stands in room i modulo count")
+    properties: RoomPropertiesTable = Field(
+        default=RoomPropertiesTable(), description="distributions; those left out are as in RECIPE.md"
+    )
 
 
 class LaserTable(Table):
@@ -360,8 +395,9 @@ class Recipe(Table):
     room: RoomTable = Field(default=RoomTable(), description="the room")
     laser: LaserTable = Field(default=LaserTable(), description="the laser")
     ambient: AmbientTable = Field(default=AmbientTable(), description="quality of the ambient layer")
-    targets: Annotated[tuple[TargetTable, ...], Field(strict=False, min_length=1)] = Field(
-        description="boards with a laser spot"
+    rooms: RoomsTable | None = Field(default=None, description="generated rooms, instead of the one of [room]")
+    targets: Annotated[tuple[TargetTable, ...], Field(strict=False)] = Field(
+        default=(), description="boards with a laser spot; generated rooms have none"
     )
     experiments: Annotated[tuple[ExperimentTable, ...], Field(strict=False)] = Field(
         default=(), description="which targets with which strokes"

@@ -13,6 +13,8 @@ from typing import Literal
 from phibench.scenes.catalog import ROOMS, Target
 from phibench.scenes.room import Room
 from phibench.scenes.validation import SceneError, nearest, printable_line
+from phibench.scenes.worlds.generated_room import generate_room
+from phibench.scenes.worlds.properties import RoomProperties
 
 ONLY_ROOM = "room"
 """Id of the room of a recipe that has one for all samples."""
@@ -40,7 +42,26 @@ class NamedRoom:
         return ROOMS[self.name](self.targets)
 
 
-RoomSource = NamedRoom
+@dataclass(frozen=True)
+class GeneratedRoom:
+    """A room that its properties and a named random stream make."""
+
+    properties: RoomProperties
+    stream: tuple[str | int, ...]
+    kind: Literal["generated"] = "generated"
+
+    def build(self) -> Room:
+        """The room itself.
+
+        Raises
+        ------
+        SceneError
+            If no lamp finds a place.
+        """
+        return generate_room(self.properties, *self.stream)
+
+
+RoomSource = NamedRoom | GeneratedRoom
 
 
 @lru_cache(maxsize=_KEPT)
