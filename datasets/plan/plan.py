@@ -217,8 +217,8 @@ def _random_plan(recipe: Recipe, table: RandomTable, rig: Rig, rooms: dict[str, 
 
 def _random_pair(sample: RandomSample, rig: str, nominal_rig: str) -> PairPlan:
     name, strokes_m = f"random-{sample.number:06d}", (sample.stroke_m, sample.nominal_stroke_m)
-    drawn = (sample.drawn, sample.tries, sample.room)
-    return PairPlan(name, "random", sample.surface, *strokes_m, name, rig, nominal_rig, *drawn)
+    numbers = (name, "random", sample.surface, *strokes_m, name, rig, nominal_rig)
+    return PairPlan(*numbers, drawn=sample.drawn, tries=sample.tries, room=sample.room)
 
 
 def _sample_name(experiment: str, target: str, stroke_m: float) -> str:

@@ -30,7 +30,15 @@ from phibench.datasets.recipe.build import (
 )
 from phibench.datasets.recipe.distributions import DistributionTable, pick, quantile
 from phibench.datasets.recipe.spot_placement import Boards, Placed, place
-from phibench.datasets.recipe.tables import DRAWABLE, DrawnRigsTable, MisalignmentTable, RandomTable, Recipe, RigTable, RoomPropertiesTable
+from phibench.datasets.recipe.tables import (
+    DRAWABLE,
+    DrawnRigsTable,
+    MisalignmentTable,
+    RandomTable,
+    Recipe,
+    RigTable,
+    RoomPropertiesTable,
+)
 from phibench.datasets.rooms.room_sources import ONLY_ROOM, GeneratedRoom, RoomSource, room_of
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
@@ -143,7 +151,10 @@ def draw_rooms(recipe: Recipe) -> dict[str, RoomSource]:
     table, dataset = recipe.rooms, recipe.dataset
     if table is None:
         return {ONLY_ROOM: room_source(recipe.room, recipe.targets)}
-    return {f"room{k:06d}": _generated(table.properties, (dataset.name, dataset.seed, "room", k)) for k in range(table.count)}
+    return {
+        f"room{k:06d}": _generated(table.properties, (dataset.name, dataset.seed, "room", k))
+        for k in range(table.count)
+    }
 
 
 def _generated(table: RoomPropertiesTable, stream: tuple[str | int, ...]) -> GeneratedRoom:
@@ -246,8 +257,8 @@ class _Makers:
             return str(error)
         if fault := rig_fault(rig, stroke_m, self._ceiling_m, self._boards):
             return fault
-        numbers = (stroke_m, nominal_rig, nominal_stroke_m)
-        return RandomSample(number, tries, drawn, self._room_id, rig, *placed, *numbers)
+        place = (self._room_id, rig, *placed)
+        return RandomSample(number, tries, drawn, *place, stroke_m, nominal_rig, nominal_stroke_m)
 
 
 def rig_fault(rig: Rig, stroke_m: float, ceiling_m: float, boards: Boards) -> str | None:

@@ -55,7 +55,15 @@ def semantic_faults(raw: Raw) -> list[Fault]:
     """Faults between keys; faulty keys are passed over."""
     draft = _Draft.of(raw)
     return [
-        *(*_purpose(raw), *_rooms(draft), *_names(draft), *_repeats(raw), *_draws(draft), *_frames(raw), *_distractors(draft)),
+        *(
+            *_purpose(raw),
+            *_rooms(draft),
+            *_names(draft),
+            *_repeats(raw),
+            *_draws(draft),
+            *_frames(raw),
+            *_distractors(draft),
+        ),
         *(*_laser(draft.laser), *_rig(draft)),
     ]
 
@@ -168,7 +176,9 @@ def _rooms(draft: _Draft) -> Iterator[Fault]:
     """A recipe has boards, or generated rooms with spots that rays find."""
     if "rooms" not in draft.raw:
         if draft.raw.get("targets") in (None, []):
-            yield Fault("targets", "missing; add [[targets]] (boards with a laser spot), or [rooms] for generated rooms")
+            yield Fault(
+                "targets", "missing; add [[targets]] (boards with a laser spot), or [rooms] for generated rooms"
+            )
         return
     if draft.raw.get("targets"):
         yield Fault("targets", "given together with [rooms]; generated rooms have no boards, remove [[targets]]")

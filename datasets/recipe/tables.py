@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, Discriminator, Field, Tag, create_model
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, create_model
 
 from phibench.datasets.recipe.distributions import (
     Distribution,
@@ -164,14 +164,14 @@ class RoomTable(Table):
 
 def _property(entry: Property) -> Any:
     """Field of a property's distribution, in its range or of its names."""
+    kind: Any
     if entry.choices:
-        names = Annotated[tuple[Literal[entry.choices], ...], Field(strict=False, min_length=1)]  # type: ignore[valid-type]
-        choice = create_model(f"{entry.name}Choice", __base__=Table, choice=(names, Field(description="equally probable")))
-        kind = Annotated[choice | None, BeforeValidator(one_name)]  # type: ignore[valid-type]
+        names: Any = Annotated[tuple[Literal[entry.choices], ...], Field(strict=False, min_length=1)]  # type: ignore[name-defined]
+        column: Any = (names, Field(description="names that are equally probable"))
+        kind = Annotated[create_model("NameChoice", __base__=Table, choice=column) | None, BeforeValidator(one_name)]
     else:
-        number = Annotated[float, Field(ge=entry.low, le=entry.high)]
-        drawn = Annotated[Distribution, values_of(number)]
-        kind = (Annotated[drawn, AfterValidator(_is_whole)] if entry.whole else drawn) | None  # type: ignore[assignment]
+        kind = Annotated[Distribution, values_of(Annotated[float, Field(ge=entry.low, le=entry.high)])]
+        kind = (Annotated[kind, AfterValidator(_is_whole)] if entry.whole else kind) | None
     return kind, Field(default=None, description=entry.meaning)
 
 

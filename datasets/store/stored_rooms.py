@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.rooms.room_sources import ONLY_ROOM, RoomSource, room_of
@@ -38,7 +39,7 @@ class Rooms:
         """
         info = self.info(name)
         try:
-            room = room_of(from_json(RoomSource, info.source))
+            room = room_of(from_json(cast(type[RoomSource], RoomSource), info.source))
         except (DatasetError, SceneError) as error:
             raise DatasetError(f"{schema.ROOMS}: {name} cannot be built: {error}") from error
         if room.digest != info.digest:

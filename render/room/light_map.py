@@ -101,7 +101,8 @@ def bake(view: View, room: Room, settings: BakeSettings) -> LightMap:
     mean, sigma = _indirect(mi, surfaces, fine, covered, settings)
     direct_mean = _filled(0.5 * (direct[0] + direct[1]), covered, fine.grid)
     noise = np.hypot(sigma, 0.5 * np.abs(direct[0] - direct[1]))
-    return LightMap((mean + direct_mean).astype(np.float32), noise.astype(np.float32), covered)
+    total = np.maximum(mean, 0.0) + direct_mean  # a straight line through noise may end below 0
+    return LightMap(total.astype(np.float32), noise.astype(np.float32), covered)
 
 
 def _indirect(

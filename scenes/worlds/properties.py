@@ -83,18 +83,21 @@ class Property:
         return float(rng.uniform(low, high))
 
 
+_ENTRY = "property"  # one key: pydantic reads those that it knows, such as `default`
+
+
 def _number(low: float, high: float, meaning: str, **default: tuple[float, ...]) -> Any:
-    return field(metadata={"low": low, "high": high, "meaning": meaning, "default": default})
+    return field(metadata={_ENTRY: {"low": low, "high": high, "meaning": meaning, "default": default}})
 
 
 def _count(low: int, high: int, meaning: str, *choice: int) -> Any:
     entry = {"low": low, "high": high, "meaning": meaning, "default": {"choice": choice}, "whole": True}
-    return field(metadata=entry)
+    return field(metadata={_ENTRY: entry})
 
 
 def _name(choices: tuple[str, ...], meaning: str) -> Any:
     entry = {"low": 0.0, "high": 0.0, "meaning": meaning, "default": {"choice": choices}, "choices": choices}
-    return field(metadata=entry)
+    return field(metadata={_ENTRY: entry})
 
 
 @dataclass(frozen=True)
@@ -163,7 +166,7 @@ class RoomProperties:
             object.__setattr__(self, name, entry.checked(getattr(self, name)))
 
 
-PROPERTIES = {entry.name: Property(entry.name, **entry.metadata) for entry in fields(RoomProperties)}
+PROPERTIES = {entry.name: Property(entry.name, **entry.metadata[_ENTRY]) for entry in fields(RoomProperties)}
 """All properties by name, in order."""
 
 
