@@ -172,7 +172,9 @@ def _property(entry: Property) -> Any:
     else:
         kind = Annotated[Distribution, values_of(Annotated[float, Field(ge=entry.low, le=entry.high)])]
         kind = (Annotated[kind, AfterValidator(_is_whole)] if entry.whole else kind) | None
-    return kind, Field(default=None, description=entry.meaning)
+    ((law, values),) = entry.default.items()
+    words = ", ".join(f"{value:g}" if isinstance(value, float | int) else value for value in values)
+    return kind, Field(default=None, description=f"{entry.meaning}; else {law} [{words}]")
 
 
 if TYPE_CHECKING:
@@ -191,7 +193,7 @@ class RoomsTable(Table):
 
     count: int = Field(default=1, ge=1, le=1_000_000, description="how many; sample i stands in room i modulo count")
     properties: RoomPropertiesTable = Field(
-        default=RoomPropertiesTable(), description="distributions; those left out are as in RECIPE.md"
+        default=RoomPropertiesTable(), description="distributions of what the rooms are like"
     )
 
 

@@ -28,12 +28,14 @@ from phibench.scenes.camera import Detector
 Picture = NDArray[np.uint8]
 _WHITE_PERCENTILE = 98.0
 _WHITE_LEVEL = 0.8
+_MIDDLE_PERCENTILE, _MOST_CONTRAST = 60.0, 4.0  # a lamp that fills a tenth of the picture does not make the rest dark
 _DARK_ROOM_ELECTRONS_PER_S = 1e5  # a room below this is shown black, the spot at its own exposure
 
 
 def display_exposure_s(planes: NDArray[Any], detector: Detector) -> float:
     """Exposure for display: it brings the brighter parts of a layer, shape (3, H, W), electrons/s, to near white."""
-    bright = float(np.percentile(_balanced(planes, detector), _WHITE_PERCENTILE))
+    middle, bright = np.percentile(_balanced(planes, detector), (_MIDDLE_PERCENTILE, _WHITE_PERCENTILE))
+    bright = min(float(bright), _MOST_CONTRAST * float(middle)) if middle > 0.0 else float(bright)
     return _WHITE_LEVEL / max(bright, _DARK_ROOM_ELECTRONS_PER_S)
 
 

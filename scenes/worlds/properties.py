@@ -154,7 +154,7 @@ class RoomProperties:
         2000.0, 8000.0, "colour temperature of the lamps, kelvin", log_uniform=(2500.0, 6700.0)
     )
     illuminance_lx: float = _number(
-        10.0, 3000.0, "mean direct illuminance of the empty floor by the lamps, lux", log_uniform=(60.0, 900.0)
+        10.0, 3000.0, "luminous flux of the lamps per area of the floor, lux", log_uniform=(60.0, 900.0)
     )
     desk_lamps: int = _count(0, 2, "desk lamps that are on", 0, 0, 1, 2)
     indicator_lamps: int = _count(0, 2, "small red lamps on the walls", 0, 1, 2)
