@@ -89,7 +89,7 @@ def test_the_spot_grows_with_distance_or_has_one_diameter() -> None:
             ("'name'",),
         ),
         (changed(room={"name": "kitchen"}), "room.name", ("'lab', 'dark'",)),
-        (changed(roooms={}), "roooms", ("unknown", "'room'")),
+        (changed(roomm={}), "roomm", ("unknown", "'room'")),
         (changed(laser={"diameter_m": 0.01, "diameter_base_m": 0.01}), "laser.diameter_m", ("one or the other",)),
         (changed(laser={"power_w": 0.0}), "laser.power_w", ("above 0",)),
         (changed(ambient={"cells_per_pixel": 1.5}), "ambient.cells_per_pixel", ("an integer from 2",)),
