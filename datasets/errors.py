@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from phibench.scenes.validation import SceneError
-
 
 class DatasetError(ValueError):
     """A data set that cannot be made, read or trusted."""
@@ -11,7 +9,3 @@ class DatasetError(ValueError):
 
 class RecipeError(DatasetError):
     """A recipe with faults; the message has one line per fault."""
-
-
-class RoomError(DatasetError, SceneError):
-    """A mesh, a panorama or settings of which no room can be made."""

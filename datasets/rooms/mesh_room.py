@@ -20,7 +20,6 @@ from PIL import Image
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from phibench.datasets.errors import RoomError
 from phibench.datasets.rooms.mesh_files import MeshPart, Paint, Picture
 from phibench.datasets.rooms.mesh_placement import (
     MIRROR_TOP_M,
@@ -29,6 +28,7 @@ from phibench.datasets.rooms.mesh_placement import (
     heights_on_vertical,
     placed_parts,
 )
+from phibench.datasets.rooms.room_errors import RoomError
 from phibench.render.sensor.processing import srgb_decoded
 from phibench.scenes.frames import Array, Pose, as_matrix, as_vector
 from phibench.scenes.room import Room

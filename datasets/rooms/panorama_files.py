@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ImageOps
 
-from phibench.datasets.errors import RoomError
 from phibench.datasets.input_files import PICTURE_PIXELS, InputFile, quiet_terminal
+from phibench.datasets.rooms.room_errors import RoomError
 from phibench.render.sensor.processing import srgb_decoded
 from phibench.scenes.validation import printable_line
 

@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from phibench.datasets.errors import RoomError
 from phibench.datasets.rooms.mesh_files import MeshPart
 from phibench.datasets.rooms.mesh_placement import (
     EXTENT_M,
@@ -35,6 +34,7 @@ from phibench.datasets.rooms.mesh_placement import (
 )
 from phibench.datasets.rooms.mesh_room import MOST_VALUES, mesh_shape
 from phibench.datasets.rooms.panorama_files import Light, read_panorama
+from phibench.datasets.rooms.room_errors import RoomError
 from phibench.scenes.frames import Array, Vector
 from phibench.scenes.room import Room
 from phibench.scenes.shapes import Rectangle, rectangle
