@@ -112,62 +112,41 @@ def _laser_albedo(texture: Texture, place: Array) -> Array:
 
 def face_table(shapes: Sequence[Shape]) -> FaceTable:
     """All faces of some shapes, in their order; the sides of a solid as in `shapes.faces`, those of a prism around."""
-    textures: dict[int, int] = {}
-    kept: list[Texture] = []
-    parts = []
-    for index, shape in enumerate(shapes):
-        key = id(shape.texture)  # comparing contents would take longer than it saves
-        if key not in textures:
-            textures[key] = len(kept)
-            kept.append(shape.texture)
-        parts.append(_part(shape, index, textures[key]))
-    if not parts:
-        parts.append(_Part.empty())
-    counts = np.cumsum([0, *(len(part.size_m) for part in parts[:-1])])
-    columns = [np.concatenate([getattr(part, name) for part in parts]) for name in _PATCH_COLUMNS]
-    corners = np.concatenate([part.corners_m for part in parts])
-    patch = np.concatenate([part.patch + first for part, first in zip(parts, counts, strict=True)])
-    centre, x, y, size, shape_index, texture, texels, radiance, coat, two_sided, window = columns
-    return FaceTable(
-        *(centre, x, y, size, shape_index, texture, tuple(kept), texels, radiance, coat, two_sided, window),
-        corners_m=corners,
-        patch=patch,
-    )
+    return joined([_table(shape) for shape in shapes], [1] * len(shapes))
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """Patches and triangles of one shape, patches numbered from 0; attributes as in `FaceTable`."""
-
-    centre_m: Array
-    x_axis: Array
-    y_axis: Array
-    size_m: Array
-    shape: IntArray
-    texture: IntArray
-    texels: Array
-    radiance_w_m2_sr: Array
-    coat: Array
-    two_sided: NDArray[np.bool_]
-    window: NDArray[np.bool_]
-    corners_m: Array
-    patch: IntArray
-
-    @staticmethod
-    def empty() -> _Part:
-        n3, none = np.empty((0, 3)), np.empty(0, dtype=np.int64)
-        flags = np.empty(0, dtype=bool)
-        return _Part(
-            *(n3, n3, n3, np.empty((0, 2)), none, none, np.empty((0, 2, 3)), n3, np.empty(0), flags, flags),
-            np.empty((0, 3, 3)),
-            none,
-        )
+def joined(tables: Sequence[FaceTable], shapes: Sequence[int]) -> FaceTable:
+    """One table of several, one after the other; `shapes` are the numbers of shapes that they stand for."""
+    if not tables:
+        return _empty()
+    # by identity: comparing contents would take longer than it saves
+    kept = {id(one): one for table in tables for one in table.textures}
+    places = {key: number for number, key in enumerate(kept)}
+    counts = [len(table.shape) for table in tables]
+    columns = {name: np.concatenate([getattr(table, name) for table in tables]) for name in _COLUMNS}
+    columns["shape"] = columns["shape"] + np.repeat(_firsts(shapes), counts)
+    own = [np.array([places[id(one)] for one in table.textures], dtype=np.int64)[table.texture] for table in tables]
+    firsts = np.repeat(_firsts(counts), [len(table.patch) for table in tables])
+    columns |= {"texture": np.concatenate(own), "patch": columns["patch"] + firsts}
+    return FaceTable(**columns, textures=tuple(kept.values()))
 
 
-_PATCH_COLUMNS = tuple(_Part.__dataclass_fields__)[:-2]
+def _firsts(counts: Sequence[int]) -> IntArray:
+    """Number of the first of each of some groups."""
+    return np.array([0, *np.cumsum(counts)[:-1]], dtype=np.int64)
 
 
-def _part(shape: Shape, index: int, texture: int) -> _Part:
+_COLUMNS = tuple(name for name in FaceTable.__dataclass_fields__ if name != "textures")
+
+
+def _empty() -> FaceTable:
+    n3, none, flags = np.empty((0, 3)), np.empty(0, dtype=np.int64), np.empty(0, dtype=bool)
+    places = (n3, n3, n3, np.empty((0, 2)), none, none, (), np.empty((0, 2, 3)))
+    return FaceTable(*places, n3, np.empty(0), flags, flags, np.empty((0, 3, 3)), none)
+
+
+def _table(shape: Shape) -> FaceTable:
+    """Table of one shape."""
     if isinstance(shape, Mesh):
         centre, x, y, size, texels, corners, patch = _mesh_faces(shape)
     elif isinstance(shape, Prism):
@@ -175,9 +154,10 @@ def _part(shape: Shape, index: int, texture: int) -> _Part:
     else:
         centre, x, y, size, texels, corners, patch = _flat_faces(shape)
     count = len(size)
+    still = np.zeros(count, dtype=np.int64)
     radiance = shape.radiance_w_m2_sr if isinstance(shape, Rectangle) else (0.0, 0.0, 0.0)
-    return _Part(
-        *(centre, x, y, size, np.full(count, index), np.full(count, texture), texels),
+    return FaceTable(
+        *(centre, x, y, size, still, still, (shape.texture,), texels),
         radiance_w_m2_sr=np.tile(np.array(radiance, dtype=float), (count, 1)),
         coat=np.full(count, shape.coat),
         two_sided=np.full(count, isinstance(shape, Mesh) and shape.two_sided),

@@ -304,8 +304,14 @@ class PairForecast:
 
 
 def pair_forecasts(plan: Plan) -> Iterator[PairForecast]:
-    """Trace the chief rays of all pairs of a plan; nothing is rendered."""
-    for pair in plan.pairs:
+    """Trace the chief rays of all pairs of a plan, room by room; nothing is rendered."""
+    rooms = {name: number for number, name in enumerate(plan.rooms)}
+    found = {one.pair.sample_id: one for one in _traced(plan, sorted(plan.pairs, key=lambda pair: rooms[pair.room]))}
+    return (found[pair.sample_id] for pair in plan.pairs)
+
+
+def _traced(plan: Plan, pairs: Iterable[PairPlan]) -> Iterator[PairForecast]:
+    for pair in pairs:
         spot, rig = plan.spots[pair.spot], plan.rigs[pair.rig]
         views = [plan.view(pair, position) for position in POSITIONS]
         room = room_of(plan.rooms[pair.room])

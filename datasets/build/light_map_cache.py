@@ -31,7 +31,8 @@ from phibench.render.room.light_map import ARRAYS, BakeSettings, LightMap, bake,
 from phibench.render.setup.llvm_library import cache_root
 from phibench.scenes.rig import View
 from phibench.scenes.room import Room
-from phibench.scenes.shapes import Rectangle
+from phibench.scenes.shapes import Rectangle, Shape
+from phibench.scenes.textures import Bitmap
 
 LIMIT_MB = 1000.0
 """Limit of a cache that was given none; a room of the default settings has 2 MB."""
@@ -86,17 +87,25 @@ def is_sound(light: LightMap, room: Room, settings: BakeSettings) -> bool:
     types = [array.dtype for array in (light.irradiance_w_m2, light.sigma_w_m2, light.covered)]
     if shapes != [(texels, 3), (texels, 3), (texels,)] or types != [np.float32, np.float32, np.bool_]:
         return False
-    lamps = [max(lamp.radiance_w_m2_sr) for lamp in fixed_shapes(room) if isinstance(lamp, Rectangle)]
+    sun = 0.0 if room.sun is None else max(room.sun.irradiance_w_m2)
     # no hemisphere gives more than pi times the radiance, and no bounce more than the light before it
-    largest = _GLARE * math.pi * max(lamps, default=0.0) * (settings.bounces + 2)
+    most = math.pi * max((_radiance(shape) for shape in fixed_shapes(room)), default=0.0) + sun
+    largest = _GLARE * most * (settings.bounces + 2)
     values = np.stack([light.irradiance_w_m2, light.sigma_w_m2])
     return bool(np.all(np.isfinite(values)) and np.all(values >= 0.0) and np.all(values <= largest))
+
+
+def _radiance(shape: Shape) -> float:
+    """Largest radiance that a shape sends out by itself, W/(m^2 sr)."""
+    texture = shape.texture
+    own = texture.values[..., :3].max() if isinstance(texture, Bitmap) and texture.is_radiance else 0.0
+    return float(max(own, *shape.radiance_w_m2_sr) if isinstance(shape, Rectangle) else own)
 
 
 def _recipe(view: View, room: Room, settings: BakeSettings) -> bytes:
     """All that a light map depends on, as one line of JSON."""
     document = {
-        "room": repr(fixed_shapes(room)),
+        "room": repr((fixed_shapes(room), room.sun)),
         "origin_m": repr(tuple(view.sphere_centre_m)),
         "settings": repr(settings),
         "packages": {name: version(name) for name in ("mitsuba", "drjit", "numpy", "scipy")},

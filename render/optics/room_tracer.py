@@ -9,14 +9,14 @@ Rays are origins and unit directions, shape (N, 3), world frame, metres.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from phibench.render.optics.face_tree import FaceTree, Rays
-from phibench.scenes.faces import FaceTable, IntArray, face_table
+from phibench.scenes.faces import FaceTable, IntArray, face_table, joined
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import View
 from phibench.scenes.room import Room, escalade360
@@ -80,7 +80,7 @@ class RoomGeometry:
     @cached_property
     def table(self) -> FaceTable:
         """Faces of all shapes."""
-        return _joined_tables(self._parts)
+        return joined([part.table for part in self._parts], [len(part.shapes) for part in self._parts])
 
     def first_hit(self, origins_m: Array, directions: Array, limit_m: Array | None = None) -> RoomHits:
         """First face along each ray; nothing at `limit_m`, shape (N,), or beyond it."""
@@ -214,20 +214,3 @@ class _Part:
         part = _Part(self.shapes)
         part.table, part.tree = self.table, tree
         return part
-
-
-def _joined_tables(parts: Sequence[_Part]) -> FaceTable:
-    tables = [part.table for part in parts]
-    if len(tables) == 1:
-        return tables[0]
-    moved, shapes, textures, patches = [], 0, 0, 0
-    for part, table in zip(parts, tables, strict=True):
-        moved.append(
-            replace(table, shape=table.shape + shapes, texture=table.texture + textures, patch=table.patch + patches)
-        )
-        shapes += len(part.shapes)
-        textures += len(table.textures)
-        patches += len(table.shape)
-    names = [field.name for field in fields(FaceTable) if field.name != "textures"]
-    columns = {name: np.concatenate([getattr(table, name) for table in moved]) for name in names}
-    return FaceTable(textures=tuple(one for table in tables for one in table.textures), **columns)

@@ -100,7 +100,7 @@ def render_ambient(
     surfaces = surfaces or view_surfaces(view, room)
     table = surfaces.table
     fixed = int(np.searchsorted(table.shape, len(fixed_shapes(room))))
-    light_carriage(surfaces, TexelGrid.of(table, settings.texel_m), fixed, light.irradiance_w_m2, settings)
+    light_carriage(surfaces, TexelGrid.of(table, settings.texel_m), fixed, light.irradiance_w_m2, settings, room.sun)
     grid = FilmGrid.of(camera, cells_per_pixel)
     film = Film(mi, Look(mi, surfaces), grid, seed)
     layers = [_band(film, band, window, rounds, budget) for band in _bands(grid, window)]

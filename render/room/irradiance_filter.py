@@ -3,6 +3,9 @@
 A texel's value may be replaced by a straight-line fit through its neighbours, along rows and along columns. Let S_r be
 the fit over r texels to each side, and a, b the halves. The expectation of (S_r a - b)^2 is bias^2 + var(S_r a) +
 var(b). The r with the least of it, averaged around a texel, is taken there. So shadows and edges stay as they are.
+
+The standard error is half the difference of the smoothed halves. What smoothing blurs is not in it: at a single texel
+it cannot be told from noise. docs/measurements/light.md has the true errors of the lab.
 """
 
 from __future__ import annotations
@@ -33,15 +36,14 @@ def smoothed(grid: TexelGrid, a: Array, b: Array) -> tuple[Array, Array]:
 
 def _best(a: Array, b: Array) -> tuple[Array, Array]:
     """Mean and variance of a grid, each texel with the reach that serves it best."""
-    noise = _around(0.5 * (a - b) ** 2)  # var(a) = var(b)
-    mean, variance, least = 0.5 * (a + b), (0.5 * (a - b)) ** 2, 4.0 * noise.sum(axis=-1)
+    # the reach 0, in which a itself is compared with b
+    mean, variance, least = 0.5 * (a + b), (0.5 * (a - b)) ** 2, _around(2.0 * (a - b) ** 2).sum(axis=-1)
     for reach in _REACHES:
         one, other = (_fit(half, reach) for half in (a, b))
         error = _around((one - b) ** 2 + (other - a) ** 2)
-        bias = np.maximum(0.5 * error - noise - _around(0.5 * (one - other) ** 2), 0.0)
         better = (error.sum(axis=-1) < least)[..., None]
         mean = np.where(better, 0.5 * (one + other), mean)
-        variance = np.where(better, (0.5 * (one - other)) ** 2 + bias, variance)
+        variance = np.where(better, (0.5 * (one - other)) ** 2, variance)
         least = np.minimum(least, error.sum(axis=-1))
     return mean, variance
 

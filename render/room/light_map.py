@@ -56,7 +56,7 @@ class BakeSettings:
     lamp_rays: int = 64
     bounces: int = 12
     bounce_rays: int = 64
-    final_rays: int = 128
+    final_rays: int = 384
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,12 @@ def _indirect(
 
 
 def light_carriage(
-    surfaces: Surfaces, grid: TexelGrid, fixed: int, irradiance: NDArray[np.float32], settings: BakeSettings
+    surfaces: Surfaces,
+    grid: TexelGrid,
+    fixed: int,
+    irradiance: NDArray[np.float32],
+    settings: BakeSettings,
+    sun: Sun | None = None,
 ) -> NDArray[np.float32]:
     """Irradiance of all texels of a view: the map for the `fixed` first patches, gathered now for the others."""
     mi = activate()
@@ -132,7 +137,7 @@ def light_carriage(
     surfaces.set_light(grid, full)
     if first < grid.count:
         texels = _Texels.of(mi, surfaces, grid, first)
-        light = _direct(mi, surfaces, texels, None, settings.lamp_rays, _SEED)
+        light = _direct(mi, surfaces, texels, sun, settings.lamp_rays, _SEED)
         full[first:] = light + _gather(mi, surfaces, texels, _CARRIAGE_RAYS, 2)
         surfaces.set_light(grid, full)
     return full

@@ -321,7 +321,7 @@ def test_drawn_motions_keep_clear_of_boards_and_the_ceiling() -> None:
     assert max(pair.tries for pair in plan.pairs) > 1
     assert not np.any((shifts > 0.44) & (shifts < 0.58))  # the mirror, 0.06 m, through the board, 0.02 m
     assert np.any(shifts > 0.58)
-    with pytest.raises(RecipeError, match="is above the ceiling or what hangs from it, at 3.00 m"):
+    with pytest.raises(RecipeError, match=r"is above the ceiling or what hangs from it, at 3\.00 m"):
         make_plan(check_recipe(drawing(misalignment={"shift_z_m": 1.0}, stroke_m={"uniform": [1.35, 1.4]})))
 
 

@@ -19,8 +19,9 @@ from phibench.datasets.errors import DatasetError
 from phibench.estimator.cli.main import main
 from phibench.render.room.light_map import BakeSettings, LightMap, texel_count
 from phibench.scenes.catalog import default_rig
-from phibench.scenes.room import Room
+from phibench.scenes.room import Room, Sun
 from phibench.scenes.shapes import rectangle
+from phibench.scenes.textures import Bitmap
 
 VIEW = default_rig().at(0.0)
 LAMP = dataclasses.replace(rectangle("lamp", (0, 0, 2), (0, 0, -1), (0.5, 0.5)), radiance_w_m2_sr=(1.0, 1.0, 0.5))
@@ -71,9 +72,28 @@ def test_other_rooms_and_settings_are_other_entries(tmp_path: Path, oven: Oven) 
     brighter = dataclasses.replace(
         ROOM, surfaces=(ROOM.surfaces[0], dataclasses.replace(LAMP, radiance_w_m2_sr=(2.0, 1.0, 0.5)))
     )
+    sunny = dataclasses.replace(ROOM, sun=Sun((1.0, 0.0, 1.0), (10.0, 8.0, 6.0)))
+    hotter = dataclasses.replace(ROOM, sun=Sun((1.0, 0.0, 1.0), (20.0, 8.0, 6.0)))
     numbers = [value(tmp_path), *(value(tmp_path, other) for other in others), value(tmp_path, room=brighter)]
-    assert numbers == [1.0, 2.0, 3.0, 4.0]
+    numbers += [value(tmp_path, room=room) for room in (sunny, hotter)]
+    assert numbers == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
     assert [value(tmp_path), *(value(tmp_path, other) for other in others)] == [1.0, 2.0, 3.0]
+
+
+def test_light_of_screens_and_of_the_sun_is_sound() -> None:
+    """Rooms without lamps: what a screen of radiance 3 or a sun of 10 W/m^2 gives, and not a million times as much."""
+    picture = Bitmap(np.array([[[1.0, 2.0, 3.0, 0.0]]]), (1.0, 1.0), is_radiance=True)
+    screen = rectangle("screen", (0.0, 0.0, 2.0), (0.0, 0.0, -1.0), (1.0, 1.0), texture=picture)
+    rooms = [
+        dataclasses.replace(ROOM, surfaces=(ROOM.surfaces[0], screen)),
+        dataclasses.replace(ROOM, surfaces=ROOM.surfaces[:1], sun=Sun((0.0, 0.0, 1.0), (10.0, 10.0, 10.0))),
+    ]
+    for room in rooms:
+        texels = texel_count(room, SETTINGS.texel_m)
+        light = np.full((texels, 3), 9.0, dtype=np.float32)
+        shut = np.zeros(texels, dtype=bool)
+        assert cache.is_sound(LightMap(light, np.zeros_like(light), shut), room, SETTINGS)
+        assert not cache.is_sound(LightMap(np.float32(1e6) * light, np.zeros_like(light), shut), room, SETTINGS)
 
 
 def test_no_flipped_bit_of_an_entry_is_taken(tmp_path: Path, oven: Oven) -> None:

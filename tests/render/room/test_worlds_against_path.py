@@ -1,4 +1,7 @@
-"""Textures, prisms, meshes, coats, screens and the sun, against Mitsuba's path tracer or closed forms."""
+"""Textures, prisms, meshes, coats, screens and the sun, against Mitsuba's path tracer or closed forms.
+
+No other test renders such a room: two bakes of 5 CPU-s and 24 traced windows are its price.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,9 @@ import numpy as np
 import pytest
 from helpers.path_ambient import path_trace
 
-from phibench.render.room.ambient import render_ambient
-from phibench.render.room.light_map import BakeSettings, LightMap, bake
+from phibench.render.room.ambient import render_ambient, view_surfaces
+from phibench.render.room.light_map import BakeSettings, LightMap, bake, fixed_shapes, light_carriage
+from phibench.render.room.texel_grid import TexelGrid
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.room import Room, Sun
@@ -126,3 +130,20 @@ def test_the_sun_lights_what_it_reaches_through_the_window() -> None:
     assert (beyond < -0.05).sum() > 20
     np.testing.assert_allclose(got[beyond < -0.05], np.broadcast_to(expected, got[beyond < -0.05].shape), rtol=0.0054)
     assert np.all(got[beyond > 0.05] == 0.0)
+
+
+def test_the_sun_lights_the_mast_of_the_robot() -> None:
+    """Everything else is black and nothing else shines: a face of the mast gets the sun's irradiance times a cosine."""
+    black = Uniform((0.0, 0.0, 0.0))
+    direction = np.array([1.0, 0.0, 0.5]) / math.sqrt(1.25)
+    pane = rectangle("window", (2.0, 0.0, 1.5), (-1, 0, 0), (2.0, 2.8), texture=black, window=True)
+    floor = rectangle("floor", (0, 0, 0), (0, 0, 1), (4, 4), texture=black)
+    room = Room("sunny", (floor, pane), (), sun=Sun(tuple(direction), (10.0, 8.0, 6.0)))
+    surfaces = view_surfaces(VIEW, room)
+    grid = TexelGrid.of(surfaces.table, SETTINGS.texel_m)
+    fixed = int(np.searchsorted(surfaces.table.shape, len(fixed_shapes(room))))
+    first = grid.texels_of(fixed)
+    dark = np.zeros((first, 3), dtype=np.float32)
+    brightest = [light_carriage(surfaces, grid, fixed, dark, SETTINGS, sun)[first:].max() for sun in (None, room.sun)]
+    assert brightest[0] == 0.0
+    assert brightest[1] == pytest.approx(10.0 * direction[0], rel=0.0054)  # over the disc, as above
