@@ -1,12 +1,11 @@
-"""Furniture that stands on the floor: tables, seats, shelves, cabinets, machines, plants, people-sized figures.
+"""Furniture that stands on the floor: seats, tables, shelves, cabinets, machines.
 
-Each piece is a function of a random generator and the room's materials that returns an `Assembly`.
 `AGAINST_WALLS` and `FREE` say which pieces suit which use of a room.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 
 import numpy as np
@@ -14,140 +13,22 @@ import numpy as np
 from phibench.scenes.frames import rotation_xyz
 from phibench.scenes.worlds import graphics
 from phibench.scenes.worlds.assembly import Assembly
-from phibench.scenes.worlds.materials import MaterialSet, Surface
-
-Rng = np.random.Generator
-Piece = Callable[[Rng, MaterialSet], Assembly]
-_WOODS = ("light_wood", "dark_wood", "red_wood", "plywood")
-_PAINTS = ("paint_red", "paint_blue", "paint_green", "paint_yellow", "paint_orange")
-_CLOTHS = ("cloth_grey", "cloth_blue", "cloth_red", "cloth_green", "plaid")
-_CASES = ("white_lacquer", "grey_lacquer", "light_wood", "dark_wood", "red_wood")
-_THINGS = (*_PAINTS, "cardboard", "white_plastic", "dark_plastic", "grey_plastic", "steel", "porcelain", "paper")
-
-
-def one_of(rng: Rng, materials: MaterialSet, names: tuple[str, ...], kinds: int = 1, upright: bool = False) -> Surface:
-    """Surface of one of some materials, in one of so many colours."""
-    return materials.surface(names[rng.integers(len(names))], int(rng.integers(kinds)), upright=upright)
-
-
-# Small things on boards and tables.
-
-
-def book_row(rng: Rng, materials: MaterialSet, width_m: float, depth_m: float, height_m: float) -> Assembly:
-    """Books in a row, in groups of different heights."""
-    made, x = Assembly(), -0.5 * width_m
-    for k in range(3):
-        width = min(float(rng.uniform(0.25, 0.7)) * width_m, 0.5 * width_m - x)
-        if width < 0.06:
-            break
-        high = height_m * float(rng.uniform(0.6, 0.92))
-        columns = int(np.clip(width / 0.007, 8, 96))
-        surface = materials.print(graphics.spines(rng, (24, columns)), (width, high))
-        made.box(
-            f"books_{k + 1}",
-            (x, x + width),
-            (-0.5 * depth_m, 0.5 * depth_m * rng.uniform(0.5, 1.0)),
-            (0.0, high),
-            surface,
-        )
-        x += width + (0.0 if rng.random() < 0.6 else 0.08)
-    return made
-
-
-def thing(rng: Rng, materials: MaterialSet, size_m: float, height_m: float) -> Assembly:
-    """Something small within a square of a size: a box, a bottle, a pile of paper, a device, a plant, a bowl."""
-    made, kind = Assembly(), rng.integers(6)
-    high, half = height_m * float(rng.uniform(0.25, 0.9)), 0.5 * size_m * float(rng.uniform(0.5, 0.98))
-    if kind == 0:
-        surface = one_of(rng, materials, ("cardboard", *_THINGS), 2)
-        turn = float(rng.uniform(-0.3, 0.3))
-        made.box("box", (-0.75 * half, 0.75 * half), (-0.6 * half, 0.6 * half), (0.0, high), surface, turn)
-    elif kind == 1:
-        radius = min(half, 0.05)
-        surface = one_of(rng, materials, (*_PAINTS, "dark_glass", "porcelain", "white_plastic"), 2)
-        made.post("body", 0.0, 0.0, (0.0, 0.7 * high), radius, surface)
-        made.post("neck", 0.0, 0.0, (0.7 * high, high), 0.4 * radius, surface, 6)
-    elif kind == 2:
-        surface = materials.surface("paper", int(rng.integers(3)))
-        made.box(
-            "paper",
-            (-half * 0.7, half * 0.7),
-            (-half, half),
-            (0.0, min(high, 0.08)),
-            surface,
-            float(rng.uniform(-0.2, 0.2)),
-        )
-    elif kind == 3:
-        case = one_of(rng, materials, ("dark_plastic", "grey_plastic", "white_plastic"))
-        made.box("device", (-half, half), (-0.7 * half, 0.7 * half), (0.0, high), case)
-        front = graphics.buttons(rng, (16, 24), graphics.ink_colours(rng, 3))
-        size = (1.8 * half, 0.8 * high)
-        made.panel(
-            "front", (0.0, -0.7 * half - 0.002, 0.5 * high), (0.0, -1.0, 0.0), size, materials.print(front, size)
-        )
-    elif kind == 4:
-        made.post("pot", 0.0, 0.0, (0.0, 0.4 * high), 0.55 * half, materials.surface("terracotta"))
-        made.post(
-            "leaves", 0.0, 0.0, (0.4 * high, high), 0.95 * half, materials.surface("leaves", int(rng.integers(2))), 7
-        )
-    else:
-        made.post("bowl", 0.0, 0.0, (0.0, min(high, 0.12)), half, one_of(rng, materials, _THINGS, 2), 10)
-    return made
-
-
-def scatter(
-    rng: Rng,
-    made: Assembly,
-    materials: MaterialSet,
-    x: tuple[float, float],
-    y: tuple[float, float],
-    z: float,
-    count: int,
-    name: str = "thing",
-) -> None:
-    """Things in cells of a board that starts at (x, y, z)."""
-    cells = max(int((x[1] - x[0]) / 0.22), 1)
-    for k in rng.permutation(cells)[: min(count, cells)]:
-        pitch = (x[1] - x[0]) / cells
-        size = min(pitch, y[1] - y[0]) * 0.9
-        piece = thing(rng, materials, size, float(rng.uniform(0.08, 0.35)))
-        made.add(
-            piece,
-            x[0] + (k + 0.5) * pitch,
-            float(rng.uniform(y[0] + size / 2, y[1] - size / 2)),
-            z,
-            0.0,
-            f"{name}_{k + 1}",
-        )
-
-
-def monitor(rng: Rng, materials: MaterialSet) -> Assembly:
-    """Screen on a foot."""
-    made, dark = Assembly(), materials.surface("dark_plastic")
-    width = float(rng.uniform(0.42, 0.7))
-    high = width * 0.6
-    made.box("foot", (-0.12, 0.12), (-0.09, 0.09), (0.0, 0.012), dark)
-    made.box("neck", (-0.025, 0.025), (0.03, 0.06), (0.012, 0.14 + 0.3 * high), dark)
-    made.box("case", (-0.5 * width, 0.5 * width), (-0.02, 0.03), (0.14, 0.14 + high), dark)
-    place = (0.0, -0.022, 0.14 + 0.5 * high)
-    made.panel(
-        "screen", place, (0.0, -1.0, 0.0), (width - 0.03, high - 0.03), materials.surface("dark_glass"), "screen"
-    )
-    return made
-
-
-def desk_lamp(rng: Rng, materials: MaterialSet) -> Assembly:
-    """Lamp with a foot, an arm and a shade; the bulb is a square under the shade."""
-    made, metal = Assembly(), one_of(rng, materials, (*_PAINTS, "steel", "dark_plastic"))
-    high = float(rng.uniform(0.32, 0.5))
-    made.post("foot", 0.0, 0.0, (0.0, 0.02), 0.08, metal, 12)
-    made.rod("arm", (0.0, 0.0, 0.022), (0.068, -0.027, high - 0.002), 0.008, metal, 6)
-    made.post("shade", 0.13, -0.08, (high, high + 0.09), 0.075, metal, 12)
-    made.panel(
-        "bulb", (0.13, -0.08, high - 0.001), (0.0, 0.0, -1.0), (0.09, 0.09), materials.surface("white_plastic"), "bulb"
-    )
-    return made
-
+from phibench.scenes.worlds.materials import MaterialSet
+from phibench.scenes.worlds.standing_objects import barrel, boxes, column, partition, plant, tripod, trolley
+from phibench.scenes.worlds.tabletop import (
+    CASES,
+    CLOTHS,
+    PAINTS,
+    WOODS,
+    Piece,
+    Rng,
+    book_row,
+    desk_lamp,
+    monitor,
+    one_of,
+    scatter,
+    thing,
+)
 
 # Seats.
 
@@ -155,8 +36,8 @@ def desk_lamp(rng: Rng, materials: MaterialSet) -> Assembly:
 def chair(rng: Rng, materials: MaterialSet) -> Assembly:
     """Chair with four legs, a seat and a back."""
     made = Assembly()
-    frame = one_of(rng, materials, ("steel", "dark_plastic", *_WOODS), upright=True)
-    seat = one_of(rng, materials, (*_WOODS, *_CLOTHS, "dark_plastic", "paint_red", "paint_blue"))
+    frame = one_of(rng, materials, ("steel", "dark_plastic", *WOODS), upright=True)
+    seat = one_of(rng, materials, (*WOODS, *CLOTHS, "dark_plastic", "paint_red", "paint_blue"))
     half, high = float(rng.uniform(0.19, 0.23)), float(rng.uniform(0.42, 0.46))
     leg = 0.032
     for k, (sx, sy) in enumerate(((-1, -1), (1, -1), (1, 1), (-1, 1))):
@@ -175,7 +56,7 @@ def chair(rng: Rng, materials: MaterialSet) -> Assembly:
 def office_chair(rng: Rng, materials: MaterialSet) -> Assembly:
     """Chair on a column with five feet."""
     made, dark = Assembly(), materials.surface("dark_plastic")
-    cloth = one_of(rng, materials, (*_CLOTHS, "leather"), 2)
+    cloth = one_of(rng, materials, (*CLOTHS, "leather"), 2)
     for k in range(5):
         turn = 2.0 * np.pi * k / 5.0
         made.rod(
@@ -199,18 +80,18 @@ def office_chair(rng: Rng, materials: MaterialSet) -> Assembly:
 
 def stool(rng: Rng, materials: MaterialSet) -> Assembly:
     """Round stool."""
-    made, frame = Assembly(), one_of(rng, materials, ("steel", *_WOODS), upright=True)
+    made, frame = Assembly(), one_of(rng, materials, ("steel", *WOODS), upright=True)
     high = float(rng.uniform(0.42, 0.75))
     for k in range(3):
         c, s = np.cos(2.1 * k), np.sin(2.1 * k)
         made.rod(f"leg_{k + 1}", (0.18 * c, 0.18 * s, 0.004), (0.1 * c, 0.1 * s, high - 0.004), 0.015, frame, 6)
-    made.post("seat", 0.0, 0.0, (high, high + 0.04), 0.17, one_of(rng, materials, (*_WOODS, *_CLOTHS)), 16)
+    made.post("seat", 0.0, 0.0, (high, high + 0.04), 0.17, one_of(rng, materials, (*WOODS, *CLOTHS)), 16)
     return made
 
 
 def sofa(rng: Rng, materials: MaterialSet) -> Assembly:
     """Sofa or armchair with cushions."""
-    made, cloth = Assembly(), one_of(rng, materials, (*_CLOTHS, "leather"), 3)
+    made, cloth = Assembly(), one_of(rng, materials, (*CLOTHS, "leather"), 3)
     seats = int(rng.integers(1, 4))
     half = 0.33 * seats
     made.box("base", (-half, half), (-0.38, 0.28), (0.06, 0.26), cloth)
@@ -222,7 +103,7 @@ def sofa(rng: Rng, materials: MaterialSet) -> Assembly:
         x = -half + 0.66 * k
         made.box(f"cushion_{k + 1}", (x + 0.005, x + 0.655), (-0.4, 0.27), (0.26, 0.44), cloth)
         if rng.random() < 0.6:
-            surface = one_of(rng, materials, _CLOTHS, 3)
+            surface = one_of(rng, materials, CLOTHS, 3)
             made.tilted(f"pillow_{k + 1}", (x + 0.33, 0.12, 0.66), (0.42, 0.12, 0.4), surface, rotation_xyz(x_rad=-0.3))
     return made
 
@@ -231,8 +112,8 @@ def sofa(rng: Rng, materials: MaterialSet) -> Assembly:
 
 
 def _top(rng: Rng, materials: MaterialSet, made: Assembly, width: float, depth: float, high: float) -> None:
-    surface = one_of(rng, materials, (*_WOODS, "white_lacquer", "grey_lacquer"))
-    legs = one_of(rng, materials, ("steel", "dark_plastic", *_WOODS), upright=True)
+    surface = one_of(rng, materials, (*WOODS, "white_lacquer", "grey_lacquer"))
+    legs = one_of(rng, materials, ("steel", "dark_plastic", *WOODS), upright=True)
     thick = float(rng.uniform(0.022, 0.045))
     made.box("top", (-width / 2, width / 2), (-depth / 2, depth / 2), (high - thick, high), surface)
     if rng.random() < 0.3:
@@ -269,7 +150,7 @@ def desk(rng: Rng, materials: MaterialSet) -> Assembly:
     if width > 1.45 and rng.random() < 0.6:
         made.add(desk_lamp(rng, materials), -width / 2 + 0.1, back - 0.12, high, -0.5 * np.pi, "lamp")
     if rng.random() < 0.6:
-        case = one_of(rng, materials, _CASES)
+        case = one_of(rng, materials, CASES)
         for k in range(3):
             made.box(
                 f"drawer_{k + 1}",
@@ -320,7 +201,7 @@ def round_table(rng: Rng, materials: MaterialSet) -> Assembly:
     radius, high = float(rng.uniform(0.3, 0.55)), float(rng.uniform(0.5, 1.05))
     made.post("foot", 0.0, 0.0, (0.0, 0.03), 0.6 * radius, materials.surface("cast_iron"), 16)
     made.post("column", 0.0, 0.0, (0.03, high - 0.03), 0.04, materials.surface("steel"))
-    made.post("top", 0.0, 0.0, (high - 0.03, high), radius, one_of(rng, materials, (*_WOODS, "white_lacquer")), 24)
+    made.post("top", 0.0, 0.0, (high - 0.03, high), radius, one_of(rng, materials, (*WOODS, "white_lacquer")), 24)
     made.add(thing(rng, materials, 0.25, 0.3), 0.0, 0.0, high, 0.0, "thing")
     for k in range(int(rng.integers(0, 4))):
         turn = 2.1 * k + float(rng.uniform(0.0, 0.6))
@@ -367,7 +248,7 @@ def workbench(rng: Rng, materials: MaterialSet) -> Assembly:
     made.box("pegboard", (-width / 2, width / 2), (0.36, 0.375), (0.95, 1.75), materials.surface("pegboard"))
     for k in range(int(2 + 8 * materials.properties.clutter)):
         x, z = float(rng.uniform(-width / 2 + 0.1, width / 2 - 0.1)), float(rng.uniform(1.25, 1.6))
-        surface = one_of(rng, materials, (*_PAINTS, "steel", "dark_plastic", "light_wood"))
+        surface = one_of(rng, materials, (*PAINTS, "steel", "dark_plastic", "light_wood"))
         made.box(
             f"tool_{k + 1}",
             (x, x + float(rng.uniform(0.02, 0.06))),
@@ -383,7 +264,7 @@ def workbench(rng: Rng, materials: MaterialSet) -> Assembly:
 
 def bookshelf(rng: Rng, materials: MaterialSet) -> Assembly:
     """Open shelf with a back, filled with books and things."""
-    made, case = Assembly(), one_of(rng, materials, (*_CASES, "plywood"))
+    made, case = Assembly(), one_of(rng, materials, (*CASES, "plywood"))
     width, depth, high = float(rng.uniform(0.6, 1.4)), float(rng.uniform(0.26, 0.4)), float(rng.uniform(1.1, 2.05))
     board, half, back = 0.022, width / 2, depth / 2
     made.box("side_1", (-half, -half + board), (-back, back), (0.0, high), case)
@@ -438,7 +319,7 @@ def rack(rng: Rng, materials: MaterialSet) -> Assembly:
             wide = float(rng.uniform(0.18, 0.5))
             if x + wide < width / 2 - 0.05 and rng.random() < 0.3 + 0.6 * materials.properties.clutter:
                 tall = float(rng.uniform(0.15, max((high - 0.2) / levels - 0.08, 0.2)))
-                surface = one_of(rng, materials, ("cardboard", "cardboard", *_PAINTS, "grey_plastic"), 3)
+                surface = one_of(rng, materials, ("cardboard", "cardboard", *PAINTS, "grey_plastic"), 3)
                 made.box(
                     f"crate_{k + 1}_{int(100 * x) + 200}",
                     (x, x + wide),
@@ -452,7 +333,7 @@ def rack(rng: Rng, materials: MaterialSet) -> Assembly:
 
 def cabinet(rng: Rng, materials: MaterialSet) -> Assembly:
     """Closed case with doors, handles and things on top."""
-    made, case = Assembly(), one_of(rng, materials, _CASES, 2, upright=True)
+    made, case = Assembly(), one_of(rng, materials, CASES, 2, upright=True)
     width, depth = float(rng.uniform(0.6, 1.8)), float(rng.uniform(0.4, 0.62))
     high = float(rng.choice([0.75, 0.9, 1.2, 1.8, 2.0]))
     made.box(
@@ -464,7 +345,7 @@ def cabinet(rng: Rng, materials: MaterialSet) -> Assembly:
     )
     made.box("case", (-width / 2, width / 2), (-depth / 2 + 0.02, depth / 2), (0.07, high), case)
     doors = max(int(width / 0.5), 1)
-    front = one_of(rng, materials, _CASES, 2, upright=True)
+    front = one_of(rng, materials, CASES, 2, upright=True)
     for k in range(doors):
         x = -width / 2 + k * width / doors
         made.box(
@@ -543,161 +424,7 @@ def machine(rng: Rng, materials: MaterialSet) -> Assembly:
     return made
 
 
-# Free pieces.
-
-
-def figure(rng: Rng, materials: MaterialSet) -> Assembly:
-    """People-sized figure: legs, trunk, arms, head and hair."""
-    made = Assembly()
-    tall = float(rng.uniform(1.5, 1.92))
-    trousers, shirt = one_of(rng, materials, _CLOTHS, 4), one_of(rng, materials, (*_CLOTHS, "paper"), 4)
-    skin, step = materials.surface("skin", int(rng.integers(3))), float(rng.uniform(0.0, 0.12))
-    hip, neck = 0.5 * tall, 0.84 * tall
-    for k, sign in enumerate((-1.0, 1.0)):
-        made.rod(f"leg_{k + 1}", (sign * 0.1, sign * step, 0.07), (sign * 0.085, 0.0, hip - 0.001), 0.075, trousers, 9)
-        made.box(
-            f"shoe_{k + 1}",
-            (sign * 0.1 - 0.05, sign * 0.1 + 0.05),
-            (sign * step - 0.18, sign * step + 0.08),
-            (0.0, 0.065),
-            materials.surface("leather"),
-        )
-        swing, out = float(rng.uniform(-0.35, 0.25)), sign * float(rng.uniform(0.26, 0.34))
-        elbow = (out, swing * 0.4, 0.66 * tall)
-        made.rod(f"upper_arm_{k + 1}", (sign * 0.235, 0.0, neck - 0.05), elbow, 0.048, shirt, 8)
-        made.rod(
-            f"lower_arm_{k + 1}", (elbow[0], elbow[1], elbow[2] - 0.01), (out, swing - 0.1, 0.52 * tall), 0.036, skin, 8
-        )
-    made.box("hips", (-0.17, 0.17), (-0.11, 0.11), (hip, hip + 0.14), trousers)
-    made.box("trunk", (-0.18, 0.18), (-0.12, 0.11), (hip + 0.14, neck - 0.12), shirt)
-    made.box("shoulders", (-0.22, 0.22), (-0.1, 0.1), (neck - 0.12, neck), shirt)
-    made.post("neck", 0.0, 0.0, (neck, neck + 0.05), 0.055, skin, 8)
-    made.post("face", 0.0, -0.01, (neck + 0.05, tall - 0.07), 0.085, skin, 12)
-    made.post("hair", 0.0, 0.005, (tall - 0.07, tall), 0.095, materials.surface("hair", int(rng.integers(3))), 12)
-    return made
-
-
-def plant(rng: Rng, materials: MaterialSet) -> Assembly:
-    """Pot with a stem and leaves as two-sided blades."""
-    made = Assembly()
-    high, reach = float(rng.uniform(0.7, 1.9)), float(rng.uniform(0.25, 0.45))
-    pot = float(rng.uniform(0.13, 0.22))
-    made.post(
-        "pot", 0.0, 0.0, (0.0, 0.28), pot, one_of(rng, materials, ("terracotta", "white_plastic", "dark_plastic")), 14
-    )
-    made.post("soil", 0.0, 0.0, (0.28, 0.29), 0.9 * pot, materials.surface("soil"), 10)
-    made.post("stem", 0.0, 0.0, (0.29, 0.75 * high), 0.018, materials.surface("dark_wood"), 6)
-    count = int(rng.integers(14, 26))
-    turn, z = rng.uniform(0.0, 2.0 * np.pi, count), rng.uniform(0.35 * high, 0.8 * high, count)
-    away = np.stack([np.cos(turn), np.sin(turn), np.zeros(count)], axis=1)
-    side = np.stack([-np.sin(turn), np.cos(turn), np.zeros(count)], axis=1) * rng.uniform(0.03, 0.09, count)[:, None]
-    length = rng.uniform(0.5, 1.0, count)[:, None] * reach
-    root = 0.02 * away + np.array([0.0, 0.0, 1.0]) * z[:, None]
-    rise, drop = (
-        np.array([0.0, 0.0, 1.0]) * rng.uniform(0.0, 0.25, (count, 1)),
-        np.array([0.0, 0.0, -1.0]) * rng.uniform(0.0, 0.15, (count, 1)),
-    )
-    middle, tip = root + 0.5 * length * away + rise, root + length * away + rise + drop
-    vertices = np.stack([root, middle - side, middle + side, tip], axis=1).reshape(-1, 3)
-    corners = 4 * np.arange(count)[:, None, None] + np.array([[0, 1, 2], [1, 3, 2]])
-    made.mesh("leaves", vertices, corners.reshape(-1, 3), materials.surface("leaves", int(rng.integers(3))), 0.008)
-    return made
-
-
-def boxes(rng: Rng, materials: MaterialSet) -> Assembly:
-    """Pile of boxes or crates."""
-    made, z = Assembly(), 0.0
-    half = float(rng.uniform(0.18, 0.4))
-    for k in range(int(rng.integers(1, 5))):
-        high = float(rng.uniform(0.15, 0.45))
-        surface = one_of(rng, materials, ("cardboard", "cardboard", "plywood", *_PAINTS), 3)
-        made.box(
-            f"crate_{k + 1}",
-            (-half, half),
-            (-0.8 * half, 0.8 * half),
-            (z, z + high),
-            surface,
-            float(rng.uniform(-0.25, 0.25)),
-        )
-        z, half = z + high, half * float(rng.uniform(0.7, 1.0))
-    return made
-
-
-def barrel(rng: Rng, materials: MaterialSet) -> Assembly:
-    """Barrel or tall bin with rings and a lid."""
-    made, body = Assembly(), one_of(rng, materials, (*_PAINTS, "steel", "grey_plastic", "cast_iron"))
-    radius, high = float(rng.uniform(0.15, 0.3)), float(rng.uniform(0.4, 0.95))
-    made.post("body", 0.0, 0.0, (0.0, high), radius, body, 20)
-    made.post("lid", 0.0, 0.0, (high, high + 0.03), radius * 1.04, materials.surface("dark_plastic"), 20)
-    return made
-
-
-def column(rng: Rng, materials: MaterialSet) -> Assembly:
-    """Round or square column up to a little below the ceiling."""
-    made, surface = Assembly(), one_of(rng, materials, ("concrete_wall", "plaster", "brick_wall", "cast_iron"))
-    high, half = materials.properties.height_m - 0.002, float(rng.uniform(0.1, 0.25))
-    if rng.random() < 0.5:
-        made.post("shaft", 0.0, 0.0, (0.0, high), half, surface, 20)
-    else:
-        made.box("shaft", (-half, half), (-half, half), (0.0, high), surface)
-    return made
-
-
-def partition(rng: Rng, materials: MaterialSet) -> Assembly:
-    """Screen on feet with notices."""
-    made, cloth = Assembly(), one_of(rng, materials, ("cloth_blue", "cloth_grey", "cork", "cloth_green"), 2)
-    width, high = float(rng.uniform(0.9, 1.8)), float(rng.uniform(1.3, 1.9))
-    made.box("board", (-width / 2, width / 2), (-0.02, 0.02), (0.12, high), cloth)
-    for k, sign in enumerate((-1.0, 1.0)):
-        x = sign * (width / 2 - 0.1)
-        made.box(f"foot_{k + 1}", (x - 0.03, x + 0.03), (-0.22, 0.22), (0.0, 0.03), materials.surface("steel"))
-        made.box(f"post_{k + 1}", (x - 0.015, x + 0.015), (-0.015, 0.015), (0.03, 0.12), materials.surface("steel"))
-    for k in range(int(rng.integers(0, 4))):
-        surface = materials.print(graphics.notice(rng, (36, 26)), (0.21, 0.297))
-        made.panel(
-            f"notice_{k + 1}",
-            (-width / 2 + 0.2 + 0.28 * k, -0.024, high - float(rng.uniform(0.25, 0.5))),
-            (0.0, -1.0, 0.0),
-            (0.21, 0.297),
-            surface,
-        )
-    return made
-
-
-def trolley(rng: Rng, materials: MaterialSet) -> Assembly:
-    """Trolley: three trays on posts with wheels."""
-    made, frame = Assembly(), one_of(rng, materials, ("steel", "paint_red", "paint_blue", "galvanised"))
-    for k, (sx, sy) in enumerate(((-1, -1), (1, -1), (1, 1), (-1, 1))):
-        x, y = 0.33 * sx, 0.2 * sy
-        made.box(f"post_{k + 1}", (x - 0.012, x + 0.012), (y - 0.012, y + 0.012), (0.07, 0.88), frame)
-        made.box(
-            f"wheel_{k + 1}", (x - 0.012, x + 0.012), (y - 0.035, y + 0.035), (0.0, 0.07), materials.surface("rubber")
-        )
-    for k in range(3):
-        z = 0.15 + 0.33 * k
-        made.box(f"tray_{k + 1}", (-0.315, 0.315), (-0.18, 0.18), (z, z + 0.025), frame)
-        scatter(
-            rng,
-            made,
-            materials,
-            (-0.3, 0.3),
-            (-0.17, 0.17),
-            z + 0.025,
-            int(3 * materials.properties.clutter),
-            f"tray_{k + 1}_thing",
-        )
-    return made
-
-
-def tripod(rng: Rng, materials: MaterialSet) -> Assembly:
-    """Tripod with a camera-like box."""
-    made, dark = Assembly(), materials.surface("dark_plastic")
-    high = float(rng.uniform(0.8, 1.5))
-    for k in range(3):
-        c, s = np.cos(2.1 * k), np.sin(2.1 * k)
-        made.rod(f"leg_{k + 1}", (0.35 * c, 0.35 * s, 0.005), (0.03 * c, 0.03 * s, high), 0.012, dark, 6)
-    made.box("head", (-0.07, 0.07), (-0.05, 0.05), (high + 0.012, high + 0.12), one_of(rng, materials, _THINGS))
-    return made
+# What suits which use.
 
 
 AGAINST_WALLS: Mapping[str, Mapping[str, Piece]] = MappingProxyType(

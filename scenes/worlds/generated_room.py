@@ -18,7 +18,7 @@ from phibench.scenes.room import Room, Sun
 from phibench.scenes.shapes import Rectangle, Shape
 from phibench.scenes.textures import Bitmap, Uniform
 from phibench.scenes.validation import SceneError
-from phibench.scenes.worlds import fixtures, furniture, graphics
+from phibench.scenes.worlds import fixtures, furniture, graphics, small_objects, standing_objects, tabletop
 from phibench.scenes.worlds.assembly import Assembly, Footprint, Part, footprint_of, moved
 from phibench.scenes.worlds.floor_plan import (
     FREE_DISC_M,
@@ -29,10 +29,10 @@ from phibench.scenes.worlds.floor_plan import (
     patch_count,
     shell,
 )
-from phibench.scenes.worlds.furniture import Piece
 from phibench.scenes.worlds.lamps import EFFICACY_LM_W, band_radiance, hang_lamps
 from phibench.scenes.worlds.materials import MaterialSet, Surface, radiance_bitmap
 from phibench.scenes.worlds.properties import RoomProperties
+from phibench.scenes.worlds.tabletop import Piece
 
 MOST_LIGHTS = 12  # emitting rectangles: each is sampled by itself
 _TRIES = 25
@@ -145,7 +145,7 @@ class _Generator:
         rng = self.rng("skirting")
         high, surface = (
             float(rng.uniform(0.05, 0.12)),
-            furniture.one_of(rng, self.materials, ("white_lacquer", "dark_wood", "light_wood", "grey_plastic")),
+            tabletop.one_of(rng, self.materials, ("white_lacquer", "dark_wood", "light_wood", "grey_plastic")),
         )
         doors = [taken for taken in self.layout.taken if taken.z[0] < 0.05 and taken.z[1] > 1.9]
         for wall in self.plan.walls:
@@ -170,7 +170,7 @@ class _Generator:
             else:
                 spent += self._wall_piece(kind, table[kind], rng)
         for k in range(self.properties.figures):
-            self._free_piece("figure", furniture.figure, self.rng("figure", k))
+            self._free_piece("figure", standing_objects.figure, self.rng("figure", k))
 
     def _wall_piece(self, kind: str, piece: Piece, rng: np.random.Generator) -> int:
         made = piece(rng, self.materials)
@@ -202,15 +202,15 @@ class _Generator:
         spent = 0
         for k in range(self.properties.near_objects):
             rng = self.rng("near", k)
-            kind = int(rng.integers(len(fixtures.NEAR_THINGS)))
-            made = fixtures.NEAR_THINGS[kind](rng, self.materials)
+            kind = int(rng.integers(len(small_objects.NEAR_THINGS)))
+            made = small_objects.NEAR_THINGS[kind](rng, self.materials)
             for _ in range(_TRIES if spent < _NEAR_PATCHES else 0):
                 angle, off = float(rng.uniform(-math.pi, math.pi)), float(rng.uniform(0.27, 1.0))
                 x, y = self.plan.robot[0] + off * math.cos(angle), self.plan.robot[1] + off * math.sin(angle)
                 turn = angle + math.pi / 2.0 + float(rng.normal(0.0, 0.2))  # +y towards the axis
                 place = footprint_of(made, x, y, turn)
                 if self.layout.is_free(place, 0.02, 0.0) and self.layout.leaves_the_robot(made, x, y, turn):
-                    self.layout.put(f"near_{fixtures.NEAR_THINGS[kind].__name__}", made, x, y, turn)
+                    self.layout.put(f"near_{small_objects.NEAR_THINGS[kind].__name__}", made, x, y, turn)
                     spent += patch_count(made.parts)
                     break
 
@@ -218,7 +218,7 @@ class _Generator:
         spent = 0
         for k in range(self.properties.floor_objects):
             rng = self.rng("floor", k)
-            piece = fixtures.FLOOR_THINGS[rng.integers(len(fixtures.FLOOR_THINGS))]
+            piece = small_objects.FLOOR_THINGS[rng.integers(len(small_objects.FLOOR_THINGS))]
             if spent < _FLOOR_PATCHES:
                 spent += self._free_piece(piece.__name__, piece, rng)
 
