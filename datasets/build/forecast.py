@@ -25,7 +25,8 @@ from phibench.datasets.plan.plan import PairPlan, Plan
 from phibench.datasets.rooms.room_sources import room_of
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import SpotTruth, depth_m, spot_truth
-from phibench.render.room.light_map import BOUNCE_TEXEL_M, texel_count
+from phibench.render.room.bounced_light import BOUNCE_TEXEL_M
+from phibench.render.room.light_map import texel_count
 from phibench.scenes.rig import POSITIONS
 from phibench.scenes.room import Room
 

@@ -13,6 +13,7 @@ mirrors F of what comes from the mirrored direction.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
@@ -48,6 +49,30 @@ def aligned(values: Any, dtype: type[np.generic] = np.float32) -> NDArray[Any]:
     return copy
 
 
+@dataclass(frozen=True)
+class LookUp:
+    """Light that faces send out, as a function of the irradiance: Dr.Jit arrays.
+
+    Attributes
+    ----------
+    first, across : unsigned integers
+        First of four texels around the point, and texels in a row.
+    tx, ty : floats
+        Place between them, texels.
+    factor, emitted : colours
+        The radiance is factor times irradiance, plus what is emitted.
+    active : masks
+    """
+
+    first: Any
+    across: Any
+    tx: Any
+    ty: Any
+    factor: Any
+    emitted: Any
+    active: Any
+
+
 class Surfaces:
     """A Mitsuba scene of faces, with tables that answer look-ups.
 
@@ -74,6 +99,7 @@ class Surfaces:
         self._patch = mi.UInt32(aligned(table.patch, np.uint32))
         self._texels, self._places = self._textures()
         self._inside = mi.Float(aligned(_inside_reflectance(mi, table.coat))) if self.has_coats else None
+        self._grid: TexelGrid | None = None
 
     def set_light(self, grid: TexelGrid, irradiance_w_m2: NDArray[np.floating]) -> None:
         """Give the texels of a grid their irradiance, shape (texels, 3), W/m^2."""
@@ -81,7 +107,8 @@ class Surfaces:
         padded = np.full((grid.count + 4, 4), math.pi, dtype=np.float32)
         padded[: grid.count, :3] = irradiance_w_m2
         self._irradiance = self._mi.Float(aligned(padded))
-        self._rows = self._mi.Float(aligned(self._row_table(grid)))
+        if grid is not self._grid:
+            self._grid, self._rows = grid, self._mi.Float(aligned(self._row_table(grid)))
 
     def hit(self, ray: Any, active: Any = True, *, coherent: bool = True) -> tuple[Any, Any, Any]:
         """Distance (mm) and patch of the first face along rays, and whether there is one.
@@ -111,17 +138,26 @@ class Surfaces:
         """
         import drjit as dr
 
-        value, normal = self._ground(patch, point, direction, active, lamps=lamps)
+        value = self.light(self.ground(patch, point, direction, active, lamps))
         if not self.has_coats:
             return value
-        mi = self._mi
-        cos = -dr.dot(normal, direction)
-        coat = dr.gather(mi.Vector4f, self._rows, patch * _ROW, active).w
-        coated = active & (coat > 0.0) & (cos > 0.0)
-        onward = mi.Ray3f(point + _LIFT_MM * normal, direction + 2.0 * cos * normal)
+        onward, coated, mirrored = self.mirrored(patch, point, direction, active)
         t, other, valid = self.hit(onward, coated)
-        mirrored, _ = self._ground(other, onward(t), onward.d, valid, lamps=True)
-        return value + dr.select(coated, self.reflectance(cos, coat), 0.0) * mirrored
+        light = self.light(self.ground(other, onward(t), onward.d, valid, True))
+        return value + dr.select(coated, mirrored, 0.0) * light
+
+    def mirrored(self, patch: Any, point: Any, direction: Any, active: Any) -> tuple[Any, Any, Any]:
+        """Rays that coats mirror, where there is a coat, and its reflectance."""
+        import drjit as dr
+
+        mi = self._mi
+        plane = dr.gather(mi.Vector4f, self._rows, patch * _ROW, active)
+        side = mi.Vector3f(plane.x, plane.y, plane.z)
+        normal = dr.select(dr.dot(side, direction) < 0.0, side, -side)
+        cos = -dr.dot(normal, direction)
+        coated = active & (plane.w > 0.0) & (cos > 0.0)
+        onward = mi.Ray3f(point + _LIFT_MM * normal, direction + 2.0 * cos * normal)
+        return onward, coated, self.reflectance(cos, plane.w)
 
     def emission(self, patch: Any, point: Any) -> Any:
         """Radiance of lamps and screens at points on them (scene, mm)."""
@@ -136,38 +172,38 @@ class Surfaces:
         """Fresnel reflectance of a coat from outside, for the cosine of the angle to its normal."""
         return self._mi.fresnel(cos, coat)[0]
 
-    def _ground(self, patch: Any, point: Any, direction: Any, active: Any, *, lamps: bool) -> tuple[Any, Any]:
-        """Radiance without what coats mirror, and the normal on the side of the ray."""
+    def ground(self, patch: Any, point: Any, direction: Any, active: Any, lamps: Any) -> LookUp:
+        """Light of a face without what its coat mirrors; `lamps` says whether what it emits counts."""
         import drjit as dr
 
         mi = self._mi
         plane, grid, along_x, along_y, column, row, texture, light = (
             dr.gather(mi.Vector4f, self._rows, patch * _ROW + k, active) for k in range(_ROW)
         )
-        normal = mi.Vector3f(plane.x, plane.y, plane.z)
-        front = dr.dot(normal, direction) < 0.0
+        cos = dr.dot(mi.Vector3f(plane.x, plane.y, plane.z), direction)
+        front = cos < 0.0
         start = dr.select(front, grid.z, grid.w)
         seen = active & (start >= 0.0)
         fx, fy, s, t = (_affine(dr, group, point) for group in (along_x, along_y, column, row))
-        irradiance = self._bilinear(fx, fy, grid.x, grid.y, mi.UInt32(start), seen)
         albedo = self._albedo(s, t, texture, seen)
         if self.has_coats:
-            albedo = self._coated(patch, albedo, dr.abs(dr.dot(normal, direction)), plane.w, seen)
-        value = albedo * (dr.maximum(irradiance, 0.0) * (light.w / math.pi))
-        if lamps:
-            value += dr.select(front, albedo * mi.Color3f(light.x, light.y, light.z), 0.0)
-        return dr.select(seen, value, 0.0), dr.select(front, normal, -normal)
+            albedo = self._coated(patch, albedo, dr.abs(cos), plane.w, seen)
+        emitted = dr.select(seen & front & lamps, albedo * mi.Color3f(light.x, light.y, light.z), 0.0)
+        low_x, low_y = dr.clip(dr.floor(fx), 0.0, grid.x - 2.0), dr.clip(dr.floor(fy), 0.0, grid.y - 2.0)
+        across = mi.UInt32(grid.x)
+        first = mi.UInt32(start) + mi.UInt32(low_y) * across + mi.UInt32(low_x)
+        factor = dr.select(seen, albedo * (light.w / math.pi), 0.0)
+        return LookUp(dr.select(seen, first, 0), across, fx - low_x, fy - low_y, factor, emitted, seen)
 
-    def _bilinear(self, fx: Any, fy: Any, columns: Any, rows: Any, start: Any, active: Any) -> Any:
+    def light(self, found: LookUp) -> Any:
+        """Radiance of what was looked up, by the present irradiance."""
         import drjit as dr
 
-        mi = self._mi
-        low_x, low_y = dr.clip(dr.floor(fx), 0.0, columns - 2.0), dr.clip(dr.floor(fy), 0.0, rows - 2.0)
-        tx, ty = fx - low_x, fy - low_y
-        across = mi.UInt32(columns)
-        first = start + mi.UInt32(low_y) * across + mi.UInt32(low_x)
+        first, across = found.first, found.across
         corners = (first, first + 1, first + across, first + across + 1)
-        return self._blend(self._irradiance, corners, tx, ty, active)
+        irradiance = self._blend(self._irradiance, corners, found.tx, found.ty, found.active)
+        # rays that meet nothing have no place: what is computed there may be no number
+        return dr.select(found.active, found.factor * dr.maximum(irradiance, 0.0) + found.emitted, 0.0)
 
     def _albedo(self, s: Any, t: Any, texture: Any, active: Any) -> Any:
         """Value of a texture at a place in its own units; `texture` is width, height, start, and 0.5 if smooth."""
@@ -223,7 +259,7 @@ class Surfaces:
         return self._mi.Float(aligned(texels)), np.array([*places, (1, 1, white, 0.0)])
 
     def _row_table(self, grid: TexelGrid) -> Array:
-        """Rows of all patches, shape (P, 8, 4); see `_ground`."""
+        """Rows of all patches, shape (P, 8, 4); see `ground`."""
         table = self.table
         count = len(table.size_m)
         rows = np.zeros((count, _ROW, 4))

@@ -1,0 +1,188 @@
+"""Light of lamps and of the sun on a room's texels: what arrives without a bounce.
+
+Where a lamp is seen whole, its irradiance is Lambert's closed form for a polygon. Where a part of it is hidden, rays
+over the lamp give the part that is seen, and the closed form the rest. A few rays tell which texels those are; their
+neighbours count as well, so that a texel's own luck decides nothing.
+The sun: rays over its disc that leave by a window.
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from phibench.render.room.camera_plugin import MM_PER_M
+from phibench.render.room.subpixel_grid import points, shifts
+from phibench.render.room.surfaces import Surfaces, aligned
+from phibench.render.room.texel_points import Texels, chosen, transmitted
+from phibench.scenes.frames import Array, BoolArray
+from phibench.scenes.room import Sun
+
+_LAMP_GAP_MM = 1.0  # rays end this far in front of a lamp
+_FIRST_RAYS = 8  # towards a lamp
+_PENUMBRA_TEXELS = 2  # around those that see a part of a lamp
+_SUN_RAYS = 16
+
+
+def direct_light(
+    mi: ModuleType, surfaces: Surfaces, texels: Texels, sun: Sun | None, rays: int, seed: int
+) -> tuple[Array, Array]:
+    """Irradiance from lamps and sun, shape (texels, 3), twice: halves with `rays` rays a lamp each, where they differ.
+
+    L cos cos' / r^2 over the lamp's area, W/m^2.
+    """
+    halves = tuple(
+        np.zeros((len(texels), 3)) if sun is None else _sunlight(mi, surfaces, texels, sun, seed + half)
+        for half in (0, 1)
+    )
+    for number, lamp in enumerate(_lamps(surfaces)):
+        way = lamp[:3] - texels.points_mm
+        # the nearest corner's side decides whether any part of the lamp is above the texel's horizon
+        reach = 0.5 * sum(np.abs(texels.normals_world @ edge) for edge in (lamp[3:6], lamp[6:9]))
+        above = np.einsum("ni,ni->n", way, texels.normals_world)
+        seen = np.flatnonzero((above > -reach) & (way @ lamp[9:12] < 0.0))
+        if len(seen) == 0:
+            continue
+        whole = whole_lamp(way[seen], texels.normals_world[seen], lamp)
+        whole[above[seen] < reach[seen]] = np.nan
+        key = seed + 100 * number
+        value, share = _lamp_rays(mi, surfaces, texels, seen, lamp, whole, min(_FIRST_RAYS, rays), key)
+        partly = np.zeros(len(texels), dtype=bool)
+        partly[seen] = (share > 0.0) & (share < 1.0)
+        # a screen's picture needs all rays
+        again = _around(texels, partly)[seen] | np.isnan(whole) | surfaces.table.is_radiance[int(lamp[13])]
+        for half, total in enumerate(halves):
+            if again.any():
+                value[again], _ = _lamp_rays(
+                    mi, surfaces, texels, seen[again], lamp, whole[again], rays, key + 50 + half
+                )
+            total[seen] += value
+    return halves[0], halves[1]
+
+
+def _lamps(surfaces: Surfaces) -> Array:
+    """Per lamp: centre, edges along x and y, normal (scene, mm), area in mm^2, patch; shape (lamps, 14)."""
+    table, view, lamps = surfaces.table, surfaces.view, np.flatnonzero(surfaces.is_lamp)
+    size = MM_PER_M * table.size_m[lamps]
+    centre = MM_PER_M * (table.centre_m[lamps] - view.sphere_centre_m)
+    edges = (size[:, :1] * table.x_axis[lamps], size[:, 1:] * table.y_axis[lamps], table.normal[lamps])
+    return np.concatenate([centre, *edges, size.prod(axis=1)[:, None], lamps[:, None]], axis=1)
+
+
+def whole_lamp(way: Array, normals: Array, lamp: Array) -> Array:
+    """Irradiance per radiance by a rectangle that is above the horizon, shape (n,): Lambert's formula for polygons.
+
+    Half the sum over the edges of the angle that an edge subtends, times its plane's normal, times the texel's normal.
+    `way` leads to the lamp's centre, mm.
+    """
+    corners = [way + a * lamp[3:6] + b * lamp[6:9] for a, b in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))]
+    total = np.zeros(len(way))
+    for here, there in zip(corners, corners[1:] + corners[:1], strict=True):
+        across = np.cross(here, there)
+        length = np.linalg.norm(across, axis=1)
+        angle = np.arctan2(length, np.einsum("ni,ni->n", here, there))
+        total += angle * np.einsum("ni,ni->n", across, normals) / np.maximum(length, 1e-30)
+    return np.asarray(0.5 * np.abs(total))
+
+
+def _around(texels: Texels, marked: BoolArray) -> BoolArray:
+    """Texels that are marked, and those within two of them on their grid."""
+    if len(texels) != texels.grid.count:  # those of the carriage: few
+        return np.ones_like(marked)
+    wide = marked.copy()
+    for part, rows, columns in texels.grid.grids():
+        if marked[part].any():
+            grid = marked[part].reshape(rows, columns)
+            wide[part] = ndimage.maximum_filter(grid, size=2 * _PENUMBRA_TEXELS + 1).ravel()
+    return wide
+
+
+def _lamp_rays(
+    mi: ModuleType,
+    surfaces: Surfaces,
+    texels: Texels,
+    some: NDArray[np.intp],
+    lamp: Array,
+    whole: Array,
+    rays: int,
+    seed: int,
+) -> tuple[Array, Array]:
+    """Irradiance of some texels by a lamp, shape (n, 3), and the part of the rays that reach it, shape (n,).
+
+    The rays give the part of the light that arrives; `whole`, where it is no NaN, the light itself.
+    """
+    import drjit as dr
+
+    lanes = mi.UInt32(aligned(some, np.uint32))
+    point, normal, coat = chosen(mi, texels, lanes)
+    numbers = [dr.opaque(mi.Float, float(value)) for value in lamp]
+    is_screen = bool(surfaces.table.is_radiance[int(lamp[13])])
+    count, key, patch = (dr.opaque(mi.UInt32, value) for value in (rays, seed, int(lamp[13])))
+    shift = shifts(mi, lanes, 2, key)
+    dr.eval(shift)
+
+    def body(i: Any, total: Any, weights: Any, seen: Any) -> tuple[Any, Any, Any, Any]:
+        a, b = (x - 0.5 for x in points(mi, shift, i))
+        place = mi.Point3f(*(numbers[k] + a * numbers[3 + k] + b * numbers[6 + k] for k in range(3)))
+        way = place - point
+        r2 = dr.squared_norm(way)
+        r = dr.sqrt(r2)
+        way /= r
+        cos_here, cos_lamp = dr.dot(way, normal), -dr.dot(way, mi.Vector3f(*numbers[9:12]))
+        faces = (cos_here > 0.0) & (cos_lamp > 0.0)
+        ray = mi.Ray3f(point, way)
+        ray.maxt = r - _LAMP_GAP_MM
+        free = faces & ~surfaces.scene.ray_test(ray, coherent=True, active=faces)
+        weight = dr.select(faces, cos_here * cos_lamp / r2, 0.0)
+        arrives = mi.Float(1.0) if coat is None else transmitted(surfaces, coat, cos_here)
+        part = dr.select(free, weight * arrives, 0.0)
+        light = part * surfaces.emission(patch, place) if is_screen else mi.Color3f(part)
+        return i + 1, total + light, weights + weight, seen + dr.select(free | ~faces, 1.0, 0.0)
+
+    n = len(some)
+    zero = (mi.UInt32(0), dr.zeros(mi.Color3f, n), dr.zeros(mi.Float, n), dr.zeros(mi.Float, n))
+    _, total, weights, seen = dr.while_loop(zero, lambda i, *_: i < count, body)
+    value = np.stack([np.array(total[k], dtype=float) for k in range(3)], axis=-1)
+    if not is_screen:
+        value *= surfaces.table.radiance_w_m2_sr[int(lamp[13])]
+    weight = np.array(weights, dtype=float)
+    scale = np.divide(whole, weight, out=np.zeros_like(whole), where=weight > 0.0)
+    scale = np.where(np.isnan(whole), lamp[12] / rays, scale)
+    return value * scale[:, None], np.array(seen, dtype=float) / rays
+
+
+def _sunlight(mi: ModuleType, surfaces: Surfaces, texels: Texels, sun: Sun, seed: int) -> Array:
+    """Irradiance from the sun, shape (texels, 3): rays over its disc that leave by a window."""
+    import drjit as dr
+
+    direction = np.array(sun.direction_world)
+    towards = np.flatnonzero(texels.normals_world @ direction > 0.0)
+    total = np.zeros((len(texels), 3))
+    if len(towards) == 0 or not surfaces.table.window.any():
+        return total
+    lanes = mi.UInt32(aligned(towards, np.uint32))
+    point, normal, coat = chosen(mi, texels, lanes)
+    window = mi.Float(aligned(surfaces.table.window))
+    axis = mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in direction))
+    radius, key = dr.opaque(mi.Float, sun.radius_rad), dr.opaque(mi.UInt32, seed + 7)
+    count, frame = dr.opaque(mi.UInt32, _SUN_RAYS), mi.Frame3f(axis)
+    shift = shifts(mi, lanes, 2, key)
+    dr.eval(shift)
+
+    def body(i: Any, total: Any) -> tuple[Any, Any]:
+        disc = radius * mi.warp.square_to_uniform_disk_concentric(mi.Point2f(*points(mi, shift, i)))
+        way = dr.normalize(frame.to_world(mi.Vector3f(disc.x, disc.y, 1.0)))
+        _, patch, valid = surfaces.hit(mi.Ray3f(point, way))
+        out = valid & (dr.gather(mi.Float, window, patch, valid) > 0.0)
+        cos = dr.maximum(dr.dot(way, normal), 0.0)
+        if coat is not None:
+            cos *= transmitted(surfaces, coat, cos)
+        return i + 1, total + dr.select(out, cos, 0.0)
+
+    _, light = dr.while_loop((mi.UInt32(0), dr.zeros(mi.Float, len(towards))), lambda i, _: i < count, body)
+    total[towards] = np.array(light, dtype=float)[:, None] / _SUN_RAYS * np.array(sun.irradiance_w_m2)
+    return total
