@@ -221,7 +221,8 @@ class _Makers:
             if not left:
                 return [found[number] for number in numbers]
         text = f"sample {left[0]} has no possible rig, spot and stroke in {TRIES} draws; the last: {outcomes[left[0]]}"
-        raise RecipeError(f"random: {text}; narrow the distributions or move the boards")
+        boards = " or move the boards" if self._targets else ""
+        raise RecipeError(f"random: {text}; narrow the distributions{boards}")
 
     def _once(self, numbers: list[int], attempt: int) -> dict[int, RandomSample | str]:
         """Draw some samples once; the reason instead of a sample that is impossible."""
