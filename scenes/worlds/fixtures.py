@@ -31,7 +31,7 @@ def door(rng: Rng, materials: MaterialSet, angle_deg: float) -> Assembly:
     frame = one_of(rng, materials, _FRAMES, upright=True)
     leaf = one_of(rng, materials, ("white_lacquer", "grey_lacquer", "light_wood", "dark_wood", *_PAINTS), upright=True)
     if angle_deg > 3.0:
-        dim = materials.print(0.15 * graphics.photograph(rng, (48, 24)), (width, high))
+        dim = materials.print(graphics.corridor(rng, (80, 36)), (width, high))
         made.panel("corridor", (0.0, -0.005, high / 2.0), _FRONT, (width, high - 0.002), dim)
     half = width / 2.0
     made.box("jamb_1", (-half - 0.07, -half), (-0.03, -0.001), (0.0, high), frame)

@@ -23,6 +23,7 @@ from phibench.scenes.worlds.tabletop import (
     Piece,
     Rng,
     book_row,
+    carton,
     desk_lamp,
     monitor,
     one_of,
@@ -319,7 +320,7 @@ def rack(rng: Rng, materials: MaterialSet) -> Assembly:
             wide = float(rng.uniform(0.18, 0.5))
             if x + wide < width / 2 - 0.05 and rng.random() < 0.3 + 0.6 * materials.properties.clutter:
                 tall = float(rng.uniform(0.15, max((high - 0.2) / levels - 0.08, 0.2)))
-                surface = one_of(rng, materials, ("cardboard", "cardboard", *PAINTS, "grey_plastic"), 3)
+                surface = carton(rng, materials, (wide, tall))
                 made.box(
                     f"crate_{k + 1}_{int(100 * x) + 200}",
                     (x, x + wide),

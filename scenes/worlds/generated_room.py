@@ -35,8 +35,10 @@ from phibench.scenes.worlds.properties import RoomProperties
 from phibench.scenes.worlds.tabletop import Piece
 
 MOST_LIGHTS = 12  # emitting rectangles: each is sampled by itself
+MOST_PATCHES = 3200
+_FEWEST_PATCHES = 30  # of a piece of furniture, but for boxes
 _TRIES = 25
-_FURNITURE_PATCHES, _WALL_PATCHES, _NEAR_PATCHES, _FLOOR_PATCHES = 1200, 330, 220, 180  # below 3000 with the shell
+_FURNITURE_PATCHES, _WALL_PATCHES, _NEAR_PATCHES, _FLOOR_PATCHES = 1050, 330, 220, 180  # of subjects
 _DAYLIGHT_K, _SUN_K, _SCREEN_K = 6500.0, 5500.0, 6500.0
 _DESK_LUMEN = 400.0
 _FLOORS = {
@@ -160,20 +162,23 @@ class _Generator:
     def _furniture(self) -> None:
         count, spent = round(self.properties.furniture_per_m2 * self.plan.area_m2), 0
         for k in range(count):
-            if spent > _FURNITURE_PATCHES:
+            rng, left = self.rng("furniture", k), _FURNITURE_PATCHES - spent
+            if left < _FEWEST_PATCHES:
                 break
-            rng = self.rng("furniture", k)
             table = (furniture.AGAINST_WALLS, furniture.FREE)[int(k % 5 in (1, 3))][self.properties.use]
             kind = list(table)[rng.integers(len(table))]
             if table is furniture.FREE[self.properties.use]:
-                spent += self._free_piece(kind, table[kind], rng)
+                spent += self._free_piece(kind, table[kind], rng, left)
             else:
-                spent += self._wall_piece(kind, table[kind], rng)
+                spent += self._wall_piece(kind, table[kind], rng, left)
         for k in range(self.properties.figures):
             self._free_piece("figure", standing_objects.figure, self.rng("figure", k))
 
-    def _wall_piece(self, kind: str, piece: Piece, rng: np.random.Generator) -> int:
+    def _wall_piece(self, kind: str, piece: Piece, rng: np.random.Generator, most: int) -> int:
+        """Place a piece of at most so many patches at a wall; return its patches, 0 if it finds no place."""
         made = piece(rng, self.materials)
+        if patch_count(made.parts) > most:
+            return 0
         low, high = made.bounds_m()
         for _ in range(_TRIES):
             wall = self.plan.walls[rng.integers(len(self.plan.walls))]
@@ -186,8 +191,10 @@ class _Generator:
                 return patch_count(made.parts)
         return 0
 
-    def _free_piece(self, kind: str, piece: Piece, rng: np.random.Generator) -> int:
+    def _free_piece(self, kind: str, piece: Piece, rng: np.random.Generator, most: int = MOST_PATCHES) -> int:
         made = piece(rng, self.materials)
+        if patch_count(made.parts) > most:
+            return 0
         for _ in range(_TRIES):
             x, y = float(rng.uniform(0.3, self.plan.length_m - 0.3)), float(rng.uniform(0.3, self.plan.width_m - 0.3))
             turn = float(rng.integers(4)) * math.pi / 2.0 + float(rng.normal(0.0, 0.12))

@@ -1,4 +1,4 @@
-"""Printed and shining pictures: posters, notices, book spines, charts, screens and views through windows.
+"""Printed and shining pictures: posters, notices, boxes, spines, charts, screens, views.
 
 Each fills one surface. A print has albedos, shape (rows, columns, 4): bands R, G, B and the laser; row 0 is the lowest.
 Screens and views are relative luminances with the same shape; who uses them scales them to radiances.
@@ -71,18 +71,148 @@ def poster(rng: np.random.Generator, shape: Shape2) -> Array:
 
 
 def photograph(rng: np.random.Generator, shape: Shape2) -> Array:
-    """Scene-like picture: a sky, grounds of fractal outline one behind the other, and things in front."""
+    """Photograph: a landscape, a portrait or things over each other; one in four is black and white."""
+    kind = rng.integers(4)
+    if kind < 2:
+        values = landscape(rng, shape)
+    elif kind == 2:
+        values = portrait(rng, shape)
+    else:
+        values = dead_leaves(rng, shape, _muted(ink_colours(rng, 9), rng.uniform(0.2, 0.6)))
+    if rng.random() < 0.25:
+        values = np.repeat(values[..., 1:2], 4, axis=-1) * 0.9
+    return np.clip(values, 0.02, 0.9)
+
+
+def _muted(colours: Array, part: float) -> Array:
+    """Colours with a part of their saturation, as of things in a photograph."""
+    grey = colours[:, :3].mean(axis=1, keepdims=True)
+    return np.asarray(grey + part * (colours - grey))
+
+
+_GROUNDS = np.array(
+    [
+        [0.10, 0.14, 0.05, 0.09],  # meadow
+        [0.05, 0.08, 0.04, 0.04],  # wood
+        [0.33, 0.27, 0.17, 0.36],  # sand, stubble
+        [0.21, 0.20, 0.20, 0.21],  # rock, streets
+        [0.09, 0.15, 0.20, 0.08],  # water
+        [0.60, 0.62, 0.66, 0.60],  # snow
+    ]
+)
+_SKIES = np.array(
+    [
+        [[0.74, 0.75, 0.74, 0.74], [0.28, 0.42, 0.62, 0.27]],
+        [[0.70, 0.70, 0.70, 0.70], [0.50, 0.52, 0.55, 0.50]],
+        [[0.80, 0.55, 0.33, 0.82], [0.35, 0.36, 0.50, 0.36]],
+    ]
+)
+
+
+def landscape(rng: np.random.Generator, shape: Shape2) -> Array:
+    """Sky and grounds of fractal outline one behind the other, paler with distance."""
     rows, columns = shape
-    colours = ink_colours(rng, 9)
-    if rng.random() < 0.5:
-        return dead_leaves(rng, shape, colours)
     y = np.linspace(0.0, 1.0, rows)[:, None]
-    values = mixed(colours, 0, 1, np.clip(y + 0.2 * fractal(rng, shape, 1.6), 0.0, 1.0))
-    for k, top in enumerate(np.sort(rng.uniform(0.1, 0.75, 4))[::-1]):
-        outline = top + 0.08 * fractal(rng, (1, columns), 1.1)
-        ground = shaded(np.broadcast_to(colours[2 + k], (*shape, 4)), 1.0 + 0.2 * fractal(rng, shape, 1.0))
+    sky = _SKIES[rng.integers(len(_SKIES))]
+    values = mixed(sky, 0, 1, np.clip(1.4 * y - 0.4 + 0.12 * fractal(rng, shape, 1.6), 0.0, 1.0))
+    for k, top in enumerate(np.sort(rng.uniform(0.1, 0.65, 4))[::-1]):
+        near = _GROUNDS[rng.integers(len(_GROUNDS))] * rng.uniform(0.7, 1.3)
+        colour = near + 0.6 * (1.0 - k / 3.0) * (sky[0] - near)
+        outline = top + 0.05 * fractal(rng, (1, columns), 1.1)
+        ground = shaded(np.broadcast_to(colour, (*shape, 4)), 1.0 + (0.08 + 0.05 * k) * fractal(rng, shape, 1.0))
         values += np.clip((outline - y) * rows + 0.5, 0.0, 1.0)[..., None] * (ground - values)
-    return np.clip(values, 0.0, 0.9)
+    return values
+
+
+def portrait(rng: np.random.Generator, shape: Shape2) -> Array:
+    """Head and shoulders before a plain ground."""
+    rows, columns = shape
+    clothes, ground = _muted(ink_colours(rng, 2), 0.6)
+    skin = rng.uniform(0.12, 0.42) * np.array([1.45, 1.0, 0.72, 1.6])
+    hair = rng.uniform(0.02, 0.2) * np.array([1.3, 1.0, 0.7, 1.4])
+    y = (np.arange(rows)[:, None] + 0.5) / rows - 0.6
+    x = ((np.arange(columns)[None] + 0.5) - (0.5 + rng.uniform(-0.1, 0.1)) * columns) / rows
+    values = np.broadcast_to(ground, (*shape, 4)).copy()
+    size = rng.uniform(0.8, 1.3)
+    for colour, up, across, high, wide in (
+        (hair, 0.06, 0.0, 0.24, 0.19),
+        (clothes, -0.6, 0.0, 0.42, 0.42),
+        (skin, -0.22, 0.0, 0.10, 0.07),
+        (skin, 0.0, rng.uniform(-0.02, 0.02), 0.21, 0.15),
+    ):
+        distance = np.hypot((y / size - up) / high, (x / size - across) / wide)
+        values += np.clip((1.0 - distance) * 0.15 * rows, 0.0, 1.0)[..., None] * (colour - values)
+    return shaded(values, 1.0 + 0.25 * np.clip(2.0 * x, -0.6, 0.6) * rng.choice([-1, 1]) + 0.05 * fractal(rng, shape))
+
+
+def corridor(rng: np.random.Generator, shape: Shape2) -> Array:
+    """Dim corridor behind an open door, in perspective: floor, ceiling lamps, walls with doors, and an end."""
+    rows, columns = shape
+    v = (np.arange(rows)[:, None] + 0.5) / rows + np.zeros(shape)
+    u = ((np.arange(columns)[None] + 0.5) / columns - 0.5) * columns / rows + np.zeros(shape)
+    eye, at, high = float(rng.uniform(0.8, 1.5)), (float(rng.uniform(-0.1, 0.1)), 0.6), float(rng.uniform(1.1, 1.3))
+    half, length = float(rng.uniform(0.35, 0.7)), float(rng.uniform(1.5, 6.0))
+    du, dv = u - at[0], v - at[1]  # of the sight lines, per depth `eye`
+    with np.errstate(divide="ignore"):
+        depth = eye * np.stack(
+            [
+                np.where(dv < 0.0, at[1] / np.abs(dv), np.inf) - 1.0,
+                np.where(dv > 0.0, (high - at[1]) / np.abs(dv), np.inf) - 1.0,
+                np.where(du < 0.0, half + at[0], half - at[0]) / np.abs(du) - 1.0,
+                np.full(shape, length / eye),
+            ]
+        )
+    which, z = depth.argmin(axis=0), np.maximum(depth.min(axis=0), 0.0)
+    up = at[1] + dv * (1.0 + z / eye)
+    wall, floor = rng.uniform(0.35, 0.75) * np.array([1.0, 0.97, 0.9, 1.0]), _muted(ink_colours(rng, 1), 0.3)[0] * 0.6
+    leaf = _muted(ink_colours(rng, 1), 0.5)[0]
+    colours = np.array([floor, 0.75 * np.ones(4), wall, 0.9 * wall])
+    values = colours[which]
+    phase = float(rng.uniform(0.0, 1.0))
+    door = (which == 2) & (np.mod(z + phase, 1.5) < 0.45) & (up < 0.95)
+    door |= (which == 3) & (np.abs(u - at[0]) * (1.0 + z / eye) < 0.25) & (up < 0.95)
+    values = np.where(door[..., None], leaf, values)
+    light = 0.35 + 0.65 * np.cos(np.pi * (z / 1.2 + phase)) ** 2 * np.exp(-0.15 * z)
+    return 0.5 * shaded(values, light * (1.0 + 0.03 * fractal(rng, shape, 1.0)))
+
+
+def carton(rng: np.random.Generator, shape: Shape2) -> Array:
+    """Side of a box: brown or white board with tape, flaps, a label and print; or a plastic crate with ribs."""
+    rows, columns = shape
+    kind = rng.random()
+    brown = rng.uniform(0.2, 0.36) * np.array([1.35, 1.0, 0.62, 1.45])
+    base = brown if kind < 0.6 else _PAPER * rng.uniform(0.6, 1.0) if kind < 0.72 else _plastic(rng)
+    values = np.broadcast_to(base, (*shape, 4)).copy()
+    if kind < 0.72:
+        values *= 1.0 - 0.4 * (np.arange(rows)[:, None] == int(rows * rng.uniform(0.9, 0.97)))[..., None]  # flap
+        tape = slice(int(0.45 * columns), max(int(0.55 * columns), int(0.45 * columns) + 1))
+        low = 0 if rng.random() < 0.4 else int(0.7 * rows)
+        values[low:, tape] += 0.6 * (brown * np.array([1.25, 1.15, 1.0, 1.25]) - values[low:, tape])
+        if rng.random() < 0.6:
+            ink = _INK if rng.random() < 0.7 else 0.5 * ink_colours(rng, 1)[0]
+            low, left = int(rng.uniform(0.1, 0.6) * rows), int(rng.uniform(0.05, 0.5) * columns)
+            text(rng, values, (low, low + max(rows // 4, 4), left, left + columns // 3), 4, ink)
+    else:
+        values[:: max(rows // 6, 2)] *= 0.55
+        values[:, :: max(columns // 5, 2)] *= 0.75
+        hole = values[int(0.7 * rows) : int(0.85 * rows), int(0.38 * columns) : int(0.62 * columns)]
+        hole *= 0.25  # handle
+    if rng.random() < 0.6:
+        low, left = int(rng.uniform(0.05, 0.55) * rows), int(rng.uniform(0.05, 0.6) * columns)
+        label = (low, low + max(int(0.3 * rows), 3), left, left + max(int(0.3 * columns), 4))
+        values[label[0] : label[1], label[2] : label[3]] = _PAPER
+        text(rng, values, (label[0] + 1, label[1], label[2] + 1, min(label[3] - 1, columns)), 3, _INK)
+    edge = np.minimum(np.arange(rows), np.arange(rows)[::-1])[:, None] + np.zeros(shape)
+    edge = np.minimum(edge, np.minimum(np.arange(columns), np.arange(columns)[::-1])[None])
+    wear = 1.0 - 0.18 * (edge < 1) + 0.07 * fractal(rng, shape, 1.3) + 0.03 * fractal(rng, shape, 0.4)
+    return np.clip(shaded(values, wear), 0.02, 0.88)
+
+
+def _plastic(rng: np.random.Generator) -> Array:
+    """Colour of a crate: grey, black, or a dyed plastic."""
+    if rng.random() < 0.5:
+        return np.full(4, float(rng.choice([0.04, 0.12, 0.3, 0.5])))
+    return np.asarray(_muted(ink_colours(rng, 1), 0.8)[0])
 
 
 def notice(rng: np.random.Generator, shape: Shape2) -> Array:

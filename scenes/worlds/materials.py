@@ -86,6 +86,7 @@ _WOOD: dict[str, Any] = {
     "second": (0.55, 0.8),
     "coated": 0.6,
 }
+_WORN: dict[str, Any] = {"pattern": patterns.worn, "second": (0.82, 0.95), "third": (1.1, 1.6)}
 _FLOOR: dict[str, Any] = {"shape": (192, 192), "texel_m": 0.010}
 _BIG: dict[str, Any] = {"shape": (128, 128), "texel_m": 0.012}
 
@@ -169,9 +170,9 @@ MATERIALS: Mapping[str, Material] = MappingProxyType(
         "grey_lacquer": Material(
             (0.2, 0.45), (0.95, 1.02), (0.95, 1.1), pattern=patterns.metal, second=(0.85, 0.95), coated=0.8
         ),
-        "dark_plastic": Material((0.025, 0.06), coated=0.7),
-        "grey_plastic": Material((0.15, 0.4), (0.97, 1.03), (0.9, 1.05), coated=0.5),
-        "white_plastic": Material((0.6, 0.8), (0.98, 1.03), (0.85, 0.97), coated=0.6),
+        "dark_plastic": Material((0.025, 0.06), coated=0.7, **_WORN),
+        "grey_plastic": Material((0.15, 0.4), (0.97, 1.03), (0.9, 1.05), coated=0.5, **_WORN),
+        "white_plastic": Material((0.6, 0.8), (0.98, 1.03), (0.85, 0.97), coated=0.6, **_WORN),
         "steel": Material((0.3, 0.5), (1.0, 1.05), (0.93, 1.0), pattern=patterns.metal, second=(0.7, 0.9)),
         "cast_iron": Material((0.06, 0.15), (1.0, 1.1), (0.9, 1.0), pattern=patterns.concrete, second=(0.5, 0.8)),
         "copper": Material((0.15, 0.25), (1.8, 2.4), (0.5, 0.7), (1.05, 1.2)),
@@ -214,11 +215,11 @@ MATERIALS: Mapping[str, Material] = MappingProxyType(
         ),
         "cork": Material((0.2, 0.3), (1.4, 1.7), (0.45, 0.6), (1.05, 1.15), patterns.terrazzo, (64, 64), 0.005),
         "rubber": Material((0.03, 0.06), (1.0, 1.05), (0.95, 1.0), pattern=patterns.concrete, shape=(32, 32)),
-        "paint_red": Material((0.03, 0.07), (6.0, 10.0), (0.7, 1.1), (1.05, 1.2), coated=0.8),
-        "paint_blue": Material((0.06, 0.2), (0.3, 0.6), (1.6, 2.6), (0.8, 1.1), coated=0.8),
-        "paint_green": Material((0.12, 0.3), (0.25, 0.6), (0.4, 0.8), (0.8, 1.0), coated=0.8),
-        "paint_yellow": Material((0.4, 0.55), (1.3, 1.5), (0.06, 0.2), (1.02, 1.08), coated=0.8),
-        "paint_orange": Material((0.16, 0.25), (2.4, 3.2), (0.1, 0.3), (1.05, 1.15), coated=0.8),
+        "paint_red": Material((0.03, 0.07), (6.0, 10.0), (0.7, 1.1), (1.05, 1.2), coated=0.8, **_WORN),
+        "paint_blue": Material((0.06, 0.2), (0.3, 0.6), (1.6, 2.6), (0.8, 1.1), coated=0.8, **_WORN),
+        "paint_green": Material((0.12, 0.3), (0.25, 0.6), (0.4, 0.8), (0.8, 1.0), coated=0.8, **_WORN),
+        "paint_yellow": Material((0.4, 0.55), (1.3, 1.5), (0.06, 0.2), (1.02, 1.08), coated=0.8, **_WORN),
+        "paint_orange": Material((0.16, 0.25), (2.4, 3.2), (0.1, 0.3), (1.05, 1.15), coated=0.8, **_WORN),
         "dark_glass": Material((0.015, 0.03), coated=2.0),
     }
 )

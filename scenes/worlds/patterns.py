@@ -161,14 +161,31 @@ def bricks(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
     )
 
 
+def motif(rng: np.random.Generator, shape: Shape2, repeats: int, slope: float, quarters: bool) -> Array:
+    """Ornament that repeats `repeats` times each way, mean 0 and standard deviation 1.
+
+    Mirrored left to right and dropped by half in every other column, as on printed paper; or with `quarters` mirrored
+    both ways, as in a carpet. A shape that cannot be divided gets one ornament.
+    """
+    rows, columns = shape
+    count = repeats if rows % repeats == columns % repeats == 0 else 1
+    field = fractal(rng, (rows // count, columns // count), slope)
+    field = field + field[:, ::-1]
+    if quarters:
+        field = field + field[::-1]
+    if count % 2 or quarters:
+        whole = np.tile(field, (count, count))
+    else:
+        whole = np.tile(np.concatenate([field, np.roll(field, len(field) // 2, axis=0)], axis=1), (count, count // 2))
+    return np.asarray(whole / whole.std())
+
+
 def carpet(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
-    """Pile with a woven ornament of three colours, mirrored in both directions."""
-    field = fractal(rng, shape, 1.4)
-    field = field + field[::-1] + field[:, ::-1] + field[::-1, ::-1]
-    level = np.clip(2.5 * field / field.std(), -3.0, 3.0)
-    values = mixed(colours, 0, 1, level)
-    values += np.clip(level - 1.5, 0.0, 1.0)[..., None] * (colours[-1] - values)
-    return shaded(values, 1.0 + 0.12 * fractal(rng, shape, 0.3))
+    """Pile with a woven ornament of three colours that repeats."""
+    level = motif(rng, shape, int(rng.choice([4, 8])), 1.2, True)
+    values = mixed(colours, 0, 1, 0.5 + 0.7 * level)
+    values += 0.8 * np.clip(1.5 * level - 1.5, 0.0, 1.0)[..., None] * (colours[-1] - values)
+    return shaded(values, 1.0 + 0.1 * fractal(rng, shape, 0.3) + 0.06 * fractal(rng, shape, 1.4))
 
 
 def pile(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
@@ -177,17 +194,16 @@ def pile(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
 
 
 def wallpaper(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
-    """Stripes, or an ornament mirrored left to right, on paper."""
+    """Stripes, or an ornament that repeats every few decimetres, on paper."""
     _, columns = shape
     _, x = lattice(shape)
     if rng.random() < 0.5:
         count = int(rng.integers(2, 7))
         stripe = np.broadcast_to(joints(x, columns, count, rng.uniform(0.2, 0.5) / count), shape)
     else:
-        field = fractal(rng, shape, 1.8)
-        field = field + field[:, ::-1]
-        stripe = np.clip(4.0 * (field / field.std() - 0.3) + 0.5, 0.0, 1.0)
-    return shaded(mixed(colours, 0, 1, stripe), 1.0 + 0.02 * fractal(rng, shape, 0.8))
+        level = motif(rng, shape, int(rng.choice([4, 8])), 1.4, False)
+        stripe = rng.uniform(0.4, 1.0) * np.clip(1.5 * level + 0.3, 0.0, 1.0)
+    return shaded(mixed(colours, 0, 1, stripe), 1.0 + 0.02 * fractal(rng, shape, 0.8) + 0.02 * fractal(rng, shape, 1.4))
 
 
 def plaid(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
@@ -235,6 +251,15 @@ def metal(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
     """Brushed or painted sheet: fine streaks along the columns, scratches and smudges."""
     streaks, smudges = fractal(rng, shape, 0.4, (1.0, 10.0)), fractal(rng, shape, 1.5)
     return shaded(mixed(colours, 0, 1, 0.35 + 0.3 * smudges), 1.0 + 0.05 * streaks)
+
+
+def worn(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
+    """Paint or plastic in use: smudges, dust, and thin scratches in both directions."""
+    dust, smudges = fractal(rng, shape, 0.5), fractal(rng, shape, 1.3)
+    scratches = [np.clip(fractal(rng, shape, 0.3, stretch) - 2.0, 0.0, 1.0) for stretch in ((1.0, 16.0), (16.0, 1.0))]
+    values = mixed(colours, 0, 1, 0.3 + 0.25 * smudges)
+    values += 0.4 * np.minimum(sum(scratches), 1.0)[..., None] * (colours[-1] - values)
+    return shaded(values, 1.0 + 0.04 * dust)
 
 
 def foliage(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:

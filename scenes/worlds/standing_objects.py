@@ -12,6 +12,7 @@ from phibench.scenes.worlds.tabletop import (
     PAINTS,
     THINGS,
     Rng,
+    carton,
     one_of,
     scatter,
 )
@@ -81,7 +82,7 @@ def boxes(rng: Rng, materials: MaterialSet) -> Assembly:
     half = float(rng.uniform(0.18, 0.4))
     for k in range(int(rng.integers(1, 5))):
         high = float(rng.uniform(0.15, 0.45))
-        surface = one_of(rng, materials, ("cardboard", "cardboard", "plywood", *PAINTS), 3)
+        surface = carton(rng, materials, (2.0 * half, high))
         made.box(
             f"crate_{k + 1}",
             (-half, half),

@@ -27,6 +27,12 @@ def one_of(rng: Rng, materials: MaterialSet, names: tuple[str, ...], kinds: int 
     return materials.surface(names[rng.integers(len(names))], int(rng.integers(kinds)), upright=upright)
 
 
+def carton(rng: Rng, materials: MaterialSet, size_m: tuple[float, float]) -> Surface:
+    """Surface of a box whose front has a size: its picture fills the front once."""
+    rows, columns = (int(np.clip(length / 0.012, 8, 48)) for length in (size_m[1], size_m[0]))
+    return materials.print(graphics.carton(rng, (rows, columns)), size_m)
+
+
 # Small things on boards and tables.
 
 
@@ -56,7 +62,7 @@ def thing(rng: Rng, materials: MaterialSet, size_m: float, height_m: float) -> A
     made, kind = Assembly(), rng.integers(6)
     high, half = height_m * float(rng.uniform(0.25, 0.9)), 0.5 * size_m * float(rng.uniform(0.5, 0.98))
     if kind == 0:
-        surface = one_of(rng, materials, ("cardboard", *THINGS), 2)
+        surface = carton(rng, materials, (1.5 * half, high))
         turn = float(rng.uniform(-0.3, 0.3))
         made.box("box", (-0.75 * half, 0.75 * half), (-0.6 * half, 0.6 * half), (0.0, high), surface, turn)
     elif kind == 1:

@@ -13,13 +13,16 @@ from phibench.scenes.worlds.materials import MATERIALS, MaterialSet
 from phibench.scenes.worlds.properties import drawn_properties
 
 COLOURS = np.array([[0.45, 0.32, 0.2, 0.5], [0.25, 0.2, 0.15, 0.3], [0.6, 0.6, 0.55, 0.6]])
-HELPERS = {"fractal", "mixed", "shaded", "lattice", "band", "joints"}
+HELPERS = {"fractal", "mixed", "shaded", "lattice", "band", "joints", "motif"}
 PATTERNS = {
     name: function
     for name, function in inspect.getmembers(patterns, inspect.isfunction)
     if function.__module__ == patterns.__name__ and name not in HELPERS
 }
-PICTURES = ("poster", "photograph", "notice", "spines", "whiteboard", "chart", "hazard", "screen", "outdoors")
+PICTURES = (
+    *("poster", "photograph", "landscape", "portrait", "notice", "corridor", "carton"),
+    *("spines", "whiteboard", "chart", "hazard", "screen", "outdoors"),
+)
 
 
 def drawn(name: str, shape: tuple[int, int] = (96, 96), seed: int = 0) -> np.ndarray:
