@@ -213,7 +213,7 @@ def device(rng: Rng, materials: MaterialSet) -> Assembly:
     made.box("case", (-width / 2, width / 2), (-depth, -0.003), (z, z + high), case)
     size = (0.8 * width, 0.7 * high)
     draw = (
-        graphics.buttons(rng, (24, 20), graphics.ink_colours(rng, 3))
+        graphics.buttons(rng, (24, 20), graphics.muted(graphics.ink_colours(rng, 3), 0.25))
         if rng.random() < 0.7
         else graphics.hazard(rng, (24, 24))
     )
@@ -314,6 +314,7 @@ WALL_THINGS: Mapping[str, tuple[Piece, ...]] = MappingProxyType(
         "store": (poster, device, extinguisher, pipes, poster, clock),
     }
 )
+ONE_EACH = (extinguisher, clock)  # a second one in a room would look copied
 
 
 # On ceilings.

@@ -394,7 +394,7 @@ def machine(rng: Rng, materials: MaterialSet) -> Assembly:
     )
     normal = (0.0, -1.0, 0.0)
     size = (0.8 * width, 0.35 * high)
-    front = graphics.buttons(rng, (32, 40), graphics.ink_colours(rng, 3))
+    front = graphics.buttons(rng, (32, 40), graphics.muted(graphics.ink_colours(rng, 3), 0.25))
     made.panel("controls", (0.0, -depth / 2 - 0.002, 0.72 * high), normal, size, materials.print(front, size))
     if rng.random() < 0.5:
         made.panel(

@@ -231,12 +231,14 @@ class _Generator:
 
     def _wall_things(self) -> None:
         length, spent = sum(wall.length_m for wall in self.plan.walls), 0
-        pieces = fixtures.WALL_THINGS[self.properties.use]
+        pieces, placed = fixtures.WALL_THINGS[self.properties.use], set()
         for k in range(round(self.properties.wall_objects_per_m * length)):
             rng = self.rng("wall", k)
             piece = pieces[rng.integers(len(pieces))]
             if spent > _WALL_PATCHES:
                 break
+            if piece in placed and piece in fixtures.ONE_EACH:
+                continue
             made = piece(rng, self.materials)
             if made.bounds_m()[1, 2] > self.properties.height_m - 0.05:
                 continue
@@ -244,6 +246,7 @@ class _Generator:
                 wall = self.plan.walls[rng.integers(len(self.plan.walls))]
                 if self._on_wall(piece.__name__, made, wall, rng, 0.1):
                     spent += patch_count(made.parts)
+                    placed.add(piece)
                     break
 
     def _ceiling_things(self) -> None:

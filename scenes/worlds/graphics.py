@@ -78,14 +78,14 @@ def photograph(rng: np.random.Generator, shape: Shape2) -> Array:
     elif kind == 2:
         values = portrait(rng, shape)
     else:
-        values = dead_leaves(rng, shape, _muted(ink_colours(rng, 9), rng.uniform(0.2, 0.6)))
+        values = dead_leaves(rng, shape, muted(ink_colours(rng, 9), rng.uniform(0.2, 0.6)))
     if rng.random() < 0.25:
         values = np.repeat(values[..., 1:2], 4, axis=-1) * 0.9
     return np.clip(values, 0.02, 0.9)
 
 
-def _muted(colours: Array, part: float) -> Array:
-    """Colours with a part of their saturation, as of things in a photograph."""
+def muted(colours: Array, part: float) -> Array:
+    """Colours with a part of their saturation, as of things in a photograph or of painted metal."""
     grey = colours[:, :3].mean(axis=1, keepdims=True)
     return np.asarray(grey + part * (colours - grey))
 
@@ -127,7 +127,7 @@ def landscape(rng: np.random.Generator, shape: Shape2) -> Array:
 def portrait(rng: np.random.Generator, shape: Shape2) -> Array:
     """Head and shoulders before a plain ground."""
     rows, columns = shape
-    clothes, ground = _muted(ink_colours(rng, 2), 0.6)
+    clothes, ground = muted(ink_colours(rng, 2), 0.6)
     skin = rng.uniform(0.12, 0.42) * np.array([1.45, 1.0, 0.72, 1.6])
     hair = rng.uniform(0.02, 0.2) * np.array([1.3, 1.0, 0.7, 1.4])
     y = (np.arange(rows)[:, None] + 0.5) / rows - 0.6
@@ -164,8 +164,8 @@ def corridor(rng: np.random.Generator, shape: Shape2) -> Array:
         )
     which, z = depth.argmin(axis=0), np.maximum(depth.min(axis=0), 0.0)
     up = at[1] + dv * (1.0 + z / eye)
-    wall, floor = rng.uniform(0.35, 0.75) * np.array([1.0, 0.97, 0.9, 1.0]), _muted(ink_colours(rng, 1), 0.3)[0] * 0.6
-    leaf = _muted(ink_colours(rng, 1), 0.5)[0]
+    wall, floor = rng.uniform(0.35, 0.75) * np.array([1.0, 0.97, 0.9, 1.0]), muted(ink_colours(rng, 1), 0.3)[0] * 0.6
+    leaf = muted(ink_colours(rng, 1), 0.5)[0]
     colours = np.array([floor, 0.75 * np.ones(4), wall, 0.9 * wall])
     values = colours[which]
     phase = float(rng.uniform(0.0, 1.0))
@@ -212,7 +212,7 @@ def _plastic(rng: np.random.Generator) -> Array:
     """Colour of a crate: grey, black, or a dyed plastic."""
     if rng.random() < 0.5:
         return np.full(4, float(rng.choice([0.04, 0.12, 0.3, 0.5])))
-    return np.asarray(_muted(ink_colours(rng, 1), 0.8)[0])
+    return np.asarray(0.7 * muted(ink_colours(rng, 1), 0.5)[0])
 
 
 def notice(rng: np.random.Generator, shape: Shape2) -> Array:

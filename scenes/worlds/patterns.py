@@ -230,10 +230,10 @@ def pegboard(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
 def terrazzo(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:
     """Chips of several colours and sizes in a ground."""
     values = np.broadcast_to(colours[0], (*shape, 4)).copy()
-    for k, slope in enumerate((1.3, 0.9, 0.6, 0.3)):
-        chips = np.clip(3.0 * (fractal(rng, shape, slope) - 1.1), 0.0, 1.0)
+    for k, slope in enumerate((0.6, 0.45, 0.3, 0.1)):  # higher ones would make blots instead of chips
+        chips = np.clip(2.0 * (fractal(rng, shape, slope) - 1.2), 0.0, 1.0)
         values += chips[..., None] * (colours[1 + k % (len(colours) - 1)] - values)
-    return shaded(values, 1.0 + 0.03 * fractal(rng, shape, 1.0))
+    return shaded(values, 1.0 + 0.04 * fractal(rng, shape, 1.2))
 
 
 def panels(rng: np.random.Generator, shape: Shape2, colours: Array) -> Array:

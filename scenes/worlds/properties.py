@@ -121,7 +121,7 @@ class RoomProperties:
     heading_deg: float = _number(
         -180.0, 180.0, "the robot's heading against the length, degrees", uniform=(-180.0, 180.0)
     )
-    wall_albedo: float = _number(0.1, 0.9, "mean albedo of the walls, green band", uniform=(0.3, 0.8))
+    wall_albedo: float = _number(0.1, 0.9, "mean albedo of the walls, green band", uniform=(0.15, 0.85))
     ceiling_albedo: float = _number(0.2, 0.9, "mean albedo of the ceiling, green band", uniform=(0.55, 0.88))
     floor_albedo: float = _number(0.04, 0.7, "mean albedo of the floor, green band", uniform=(0.1, 0.45))
     saturation: float = _number(0.0, 1.0, "strength of the walls' colours; 0 is grey", uniform=(0.1, 0.9))

@@ -22,7 +22,8 @@ def figure(rng: Rng, materials: MaterialSet) -> Assembly:
     """People-sized figure: legs, trunk, arms, head and hair."""
     made = Assembly()
     tall = float(rng.uniform(1.5, 1.92))
-    trousers, shirt = one_of(rng, materials, CLOTHS, 4), one_of(rng, materials, (*CLOTHS, "paper"), 4)
+    trousers = one_of(rng, materials, ("cloth_grey", "cloth_grey", "cloth_blue"), 4)
+    shirt = one_of(rng, materials, (*CLOTHS, "paper"), 4)
     skin, step = materials.surface("skin", int(rng.integers(3))), float(rng.uniform(0.0, 0.12))
     hip, neck = 0.5 * tall, 0.84 * tall
     for k, sign in enumerate((-1.0, 1.0)):

@@ -83,7 +83,7 @@ def thing(rng: Rng, materials: MaterialSet, size_m: float, height_m: float) -> A
     elif kind == 3:
         case = one_of(rng, materials, ("dark_plastic", "grey_plastic", "white_plastic"))
         made.box("device", (-half, half), (-0.7 * half, 0.7 * half), (0.0, high), case)
-        front = graphics.buttons(rng, (16, 24), graphics.ink_colours(rng, 3))
+        front = graphics.buttons(rng, (16, 24), graphics.muted(graphics.ink_colours(rng, 3), 0.25))
         size = (1.8 * half, 0.8 * high)
         made.panel(
             "front", (0.0, -0.7 * half - 0.002, 0.5 * high), (0.0, -1.0, 0.0), size, materials.print(front, size)
