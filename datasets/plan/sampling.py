@@ -8,7 +8,8 @@ it into a value (`distributions.quantile`).
 
 A sample may be impossible: rig, spot and stroke do not go together, or not with the room. It is then drawn again, with
 numbers of streams of its own (`further_points`), so that no other sample moves. The same holds for a rig of `[rigs]`
-that cannot exist or cannot make one of the strokes.
+that cannot exist or cannot make one of the strokes. Whether a sample's spot is to be hidden in one image is dealt once
+and stays, however often the sample is drawn: the share of hidden ones is that of the recipe.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from phibench.datasets.recipe.build import (
     true_stroke_m,
 )
 from phibench.datasets.recipe.distributions import DistributionTable, pick, quantile
-from phibench.datasets.recipe.spot_placement import Boards, Placed, place
+from phibench.datasets.recipe.spot_placement import Boards, Placed, place, visibility_fault
 from phibench.datasets.recipe.tables import (
     DRAWABLE,
     DrawnRigsTable,
@@ -62,6 +63,7 @@ PARAMETERS = (
     *(name for key in DRAWABLE if (name := f"rig.{key}") not in _OFTEN),
     *(f"misalignment.{key}" for key in MISALIGNMENT),
     "spot.elevation_deg",  # later than the others, which keep their dimensions
+    "spot.hidden",
 )
 """Everything that can be drawn; the place in this list is the dimension in Sobol's sequence, whose first ones are the
 best: 16 of them correlate by at most 0.25 at 100 samples, where independent ones reach 0.38 (12 seeds each)."""
@@ -101,6 +103,10 @@ def further_points(
 # Samples of `[random]`.
 
 TRIES = 100
+HIDDEN_TRIES = 1000
+"""Of samples whose spot one image is to hide: in the worst rooms one draw in some 50 does."""
+HIDDEN, SHOWN = "in one image", "in none"
+"""Values of "spot.hidden"."""
 _PILOT = 8  # samples
 _NANOMETRE = 9  # decimals of a stroke: a pose's name then says its offset exactly
 
@@ -174,7 +180,7 @@ def draw_samples(recipe: Recipe, table: RandomTable, rooms: Mapping[str, RoomSou
     Raises
     ------
     RecipeError
-        If a sample stays impossible after `TRIES` draws, with the reason of the last one.
+        If a sample stays impossible after `TRIES` draws (`HIDDEN_TRIES` of a hidden spot), with the last reason.
     """
     dataset, found = recipe.dataset, dict[int, RandomSample]()
     first = first_points(table.sequence, dataset.name, dataset.seed, table.samples, drawn_parameters(table))
@@ -214,15 +220,22 @@ class _Makers:
         """Draw some samples, those that are impossible again until they are not."""
         found: dict[int, RandomSample] = {}
         left = list(numbers)
-        for attempt in range(TRIES):
+        for attempt in range(HIDDEN_TRIES):
             outcomes = self._once(left, attempt)
             found |= {number: sample for number, sample in outcomes.items() if isinstance(sample, RandomSample)}
             left = [number for number in left if number not in found]
             if not left:
                 return [found[number] for number in numbers]
-        text = f"sample {left[0]} has no possible rig, spot and stroke in {TRIES} draws; the last: {outcomes[left[0]]}"
-        boards = " or move the boards" if self._targets else ""
-        raise RecipeError(f"random: {text}; narrow the distributions{boards}")
+            tries = attempt + 1
+            if lost := [number for number in left if tries == self._tries(number)]:
+                why = f"has no possible rig, spot and stroke in {tries} draws; the last: {outcomes[lost[0]]}"
+                boards = " or move the boards" if self._targets else ""
+                raise RecipeError(f"random: sample {lost[0]} {why}; narrow the distributions{boards}")
+        raise AssertionError("every sample is found or lost")
+
+    def _tries(self, number: int) -> int:
+        share = self._table.spot.hidden
+        return TRIES if share is None or self._first["spot.hidden"][number] >= share else HIDDEN_TRIES
 
     def _once(self, numbers: list[int], attempt: int) -> dict[int, RandomSample | str]:
         """Draw some samples once; the reason instead of a sample that is impossible."""
@@ -238,8 +251,9 @@ class _Makers:
         drawn = drawn_parameters(self._table)
         if attempt == 0:
             return {name: self._first[name][numbers] for name in drawn}
-        dataset = self._recipe.dataset
-        return further_points(dataset.name, dataset.seed, drawn, numbers, attempt)
+        dataset, dealt = self._recipe.dataset, [name for name in drawn if name == "spot.hidden"]
+        points = further_points(dataset.name, dataset.seed, [n for n in drawn if n not in dealt], numbers, attempt)
+        return points | {name: self._first[name][numbers] for name in dealt}
 
     def _sample(
         self, number: int, tries: int, drawn: tuple[tuple[str, Value], ...], placed: Placed
@@ -257,6 +271,10 @@ class _Makers:
         except SceneError as error:
             return str(error)
         if fault := rig_fault(rig, stroke_m, self._ceiling_m, self._boards):
+            return fault
+        if "spot.hidden" in values and (
+            fault := visibility_fault(values["spot.hidden"] == HIDDEN, rig, stroke_m, placed[1], self._room)
+        ):
             return fault
         place = (self._room_id, rig, *placed)
         return RandomSample(number, tries, drawn, *place, stroke_m, nominal_rig, nominal_stroke_m)
@@ -279,7 +297,12 @@ def rig_fault(rig: Rig, stroke_m: float, ceiling_m: float, boards: Boards) -> st
 def drawn_parameters(table: RandomTable) -> list[str]:
     """Names of the parameters that a recipe draws, in the order of `PARAMETERS`."""
     chosen = dict(_sample_distributions(table))
-    return [name for name in PARAMETERS if name in chosen or (name == "spot.target" and not table.spot.by_ray)]
+    others = {
+        "spot.target": not table.spot.by_ray,
+        "spot.hidden": table.spot.hidden is not None,
+        "spot.elevation_deg": table.spot.hidden_elevation_deg is not None,
+    }
+    return [name for name in PARAMETERS if name in chosen or others.get(name, False)]
 
 
 def draw_values(table: RandomTable, targets: list[str], points: Mapping[str, Array]) -> dict[str, Any]:
@@ -290,6 +313,12 @@ def draw_values(table: RandomTable, targets: list[str], points: Mapping[str, Arr
     if "spot.target" in points:
         names = targets if table.spot.target is None else table.spot.target.choice
         values["spot.target"] = pick(names, points["spot.target"])
+    if "spot.hidden" in points:
+        hidden = points["spot.hidden"] < table.spot.hidden
+        values["spot.hidden"] = [HIDDEN if one else SHOWN for one in hidden]
+        if table.spot.hidden_elevation_deg is not None:
+            there = quantile(table.spot.hidden_elevation_deg, points["spot.elevation_deg"])
+            values["spot.elevation_deg"] = np.where(hidden, there, values.get("spot.elevation_deg", 0.0))
     return {name: values[name] for name in points}
 
 

@@ -242,6 +242,10 @@ def _draws(draft: _Draft) -> Iterator[Fault]:
         yield Fault("random.spot", f"{text}; give one or the other")
     elif "elevation_deg" in spot and not ray:
         yield Fault("random.spot.azimuth_deg", "missing; elevation_deg needs it, azimuth_deg and height_m make the ray")
+    elif "hidden_elevation_deg" in spot and not ("hidden" in spot and ray):
+        missing_key = "hidden" if ray else "azimuth_deg"
+        text = "hidden_elevation_deg is the elevation of rays to spots that one image hides"
+        yield Fault(f"random.spot.{missing_key}", f"missing; {text}")
     elif len(ray) == 1:
         [missing] = set(_BY_RAY) - set(ray)
         yield Fault(f"random.spot.{missing}", f"missing; {ray[0]} needs it, the two make the ray")

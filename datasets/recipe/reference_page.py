@@ -129,6 +129,7 @@ counts `tries`. The reasons:
 * The carriage would cut a board or reach the lamps.
 * A spot found by a ray would not lie wholly on one face; a beam's would be split between places far apart.
 * The ray would meet a lamp, a window, a screen, the back of a face, or something like a mirror.
+* The spot is not shown or hidden as `[random.spot] hidden` deals it.
 
 `sobol` takes Sobol's points, each dimension scrambled by a random stream of its own;
 `independent` takes a random stream per parameter. Every distribution draws on its own: the value of one does
@@ -150,6 +151,12 @@ the ray. With a number as `laser.albedo` the spot is a flat disc of that albedo,
 With `albedo = "surface"` it is what a beam along the ray leaves on the surfaces. Curved things and edges
 carry one, too, each with its own texture and coat. Places more than 0.25 m nearer or farther than the
 spot's centre must not be in the beam.
+
+`hidden` deals that share of the samples, evenly over the sequence with `sobol`. Their spot is seen in exactly one
+image. The other image does not show it: a thing is in the way, or the robot, or the mirror does not reflect it, or it
+faces away. It then holds at most 1 % of the spot's light. All other samples show their spot in both images. A
+sample with a hidden spot is drawn again at most 1000 times. The manifest has `visible` and `cause` of each
+image, and `spot.hidden` among what was drawn. Without the key nothing is asked.
 """,
     "[frames]": """Optional. How the frames of a benchmark are taken. **Nothing of it is rendered**: it may be changed
 in a finished data set, and making it again writes `dataset.json` anew and nothing else. Each number is drawn

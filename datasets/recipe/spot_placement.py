@@ -1,6 +1,6 @@
 """Positions of drawn laser spots: on a target board, or where a ray from the axis meets the room.
 
-The first part finds boards that the carriage would hit.
+The first part finds boards that the carriage would hit, the last one spots that an image does not show.
 """
 
 from __future__ import annotations
@@ -15,12 +15,14 @@ import numpy as np
 from phibench.datasets.recipe.build import build_spot, grown_diameter_m, make_spot
 from phibench.datasets.recipe.tables import OWN_ALBEDO, LaserTable, TargetTable
 from phibench.render.optics.beam_deposit import BEAM_REACH_M
-from phibench.render.optics.room_tracer import RoomGeometry, RoomHits, own_geometry
+from phibench.render.optics.room_tracer import RoomGeometry, RoomHits, own_geometry, room_geometry
+from phibench.render.optics.spot_layer import spot_layer
+from phibench.render.optics.truth import VISIBLE, spot_truth
 from phibench.scenes.catalog import BOARD_SIZE_M, Target, board
 from phibench.scenes.faces import FaceTable
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.rig import Rig, View
+from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
 from phibench.scenes.room import Room, carriage
 from phibench.scenes.shapes import Cuboid
 
@@ -212,3 +214,25 @@ def place(laser: LaserTable, room: Room, targets: Mapping[str, TargetTable], val
         (name, on_board(laser, targets[name], float(across), float(up)))
         for name, (across, up) in zip(names, offsets, strict=True)
     ]
+
+
+_DARK = 0.01  # of the spot's light in the image that shows it: what a hidden spot may still send into the other one
+
+
+def visibility_fault(hidden: bool, rig: Rig, stroke_m: float, spot: LaserSpot, room: Room) -> str | None:
+    """Say why a spot is not shown as it should be: by exactly one image if `hidden`, else by both; None if it is.
+
+    The hidden image must hold no light of the spot either. Where a chief ray just fails, half of the spot may be seen:
+    whoever finds that is not wrong.
+    """
+    views = [rig.at(Stroke(stroke_m).offset_m(position)) for position in POSITIONS]
+    rooms = [room_geometry(room, view) for view in views]
+    causes = [spot_truth(view, spot, geometry).cause for view, geometry in zip(views, rooms, strict=True)]
+    seen = [cause == VISIBLE for cause in causes]
+    if not hidden:
+        return None if all(seen) else f"the spot is not visible ({next(c for c in causes if c != VISIBLE)})"
+    if all(seen) or not any(seen):
+        return "the spot is not hidden in exactly one image"
+    light = [float(spot_layer(*of).total_electrons_per_s.sum()) for of in zip(views, (spot, spot), rooms, strict=True)]
+    shown = seen.index(True)
+    return None if light[1 - shown] <= _DARK * light[shown] else "the image that hides the spot shows a part of it"

@@ -306,6 +306,12 @@ class RandomSpotTable(Table):
     elevation_deg: Elevation | None = Field(
         default=None, description="of the ray above the horizontal; 0 where not given"
     )
+    hidden: Probability | None = Field(
+        default=None, description="share of samples whose spot is hidden in one image; the others show it in both"
+    )
+    hidden_elevation_deg: Elevation | None = Field(
+        default=None, description="instead of elevation_deg for those samples: floor beside the robot, ceiling above it"
+    )
 
     @property
     def by_ray(self) -> bool:

@@ -35,9 +35,10 @@ from phibench.scenes.frames import Array
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
 
-TASK_VERSION = 4
+TASK_VERSION = 5
 """Version of the task: what a method is given, what it must answer and what is counted. A change of any raises it.
 
+5: spots may be hidden in one image, and a D of such a pair is false.
 4: a missed pair counts as the best constant depth would; a sealed set shows each sample once.
 """
 

@@ -399,8 +399,11 @@ _EDGES: dict[str, tuple[str, tuple[float, ...], str]] = {
     "sigmas": ("snr", (0.0, 3.0, 5.0, 10.0, 30.0, math.inf), "sigma"),
     "azimuth": ("azimuth_deg", tuple(float(x) for x in range(-180, 181, 45)), "deg"),
 }
-_VALUES = {"hint": "hint", "image": "image", "bayer": "bayer", "quality": "jpeg_quality", "preset": "preset"}
-_OF_IMAGES = ("sigmas", "image", "bayer")
+_VALUES = {
+    **{"hint": "hint", "image": "image", "bayer": "bayer", "quality": "jpeg_quality", "preset": "preset"},
+    "spot": "shown",
+}
+_OF_IMAGES = ("sigmas", "image", "bayer", "spot")
 _IMAGE_METRICS = tuple(name for name, metric in METRICS.items() if metric.family not in OF_PAIRS)
 STRATA = ("all", *_EDGES, *_VALUES)
 
@@ -433,7 +436,8 @@ class Stratum:
 def strata(records: pl.DataFrame) -> Iterator[Stratum]:
     """The whole, then all strata that hold some of the images, but not all."""
     hint = pl.when(pl.col("hinted")).then(pl.lit("boxes")).otherwise(pl.lit("no boxes"))
-    table = prepared(records).with_columns(azimuth_deg=pl.col("azimuth_rad").degrees(), hint=hint)
+    shown = pl.when(pl.col("visible")).then(pl.lit("visible")).otherwise(pl.lit("not visible"))
+    table = prepared(records).with_columns(azimuth_deg=pl.col("azimuth_rad").degrees(), hint=hint, shown=shown)
     yield Stratum("all", "all", None, None, None, table, table)
     for by in _EDGES:
         yield from _by_edges(by, table)

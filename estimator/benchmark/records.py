@@ -84,7 +84,7 @@ COLUMNS: dict[str, str] = {
     "pair_bound_phi_rad2": "variance of phi at that bound",
     "rank_phi2_rad2": "square that the rank by phi sums: error (of outline: of phi_ray), missed and false",
     "pair_visible": "both spots are visible",
-    "pair_false": "a false detection in either image",
+    "pair_false": "a false detection in either image, or a D of the method's own where a spot is not visible",
     "pair_electrons": "the fainter spot's electrons",
     "depth_found": "both spots are found, and a finite depth above 0 follows",
     "depth_from": "method or pixels",
@@ -340,7 +340,7 @@ def _pair_columns(
     own_sigma = np.hypot(own_sigma, found_m.calibration_sigma_m)
     depth, sigma = np.where(has_own, own, found_m.depth_m), np.where(has_own, own_sigma, found_m.sigma_m)
     both = down["visible"] & up["visible"]
-    false = down["false_detection"] | up["false_detection"]
+    false = down["false_detection"] | up["false_detection"] | (has_own & ~both)
     found = down["detected"] & up["detected"] & (depth > 0.0)  # False for NaN
     return {
         "number": [t.number for t in truths],

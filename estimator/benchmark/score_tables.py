@@ -57,7 +57,7 @@ FLAGGED = " !"
 """Mark behind the name of a method whose answers are better than the images allow."""
 _FLAG_NOTE = "!: knows more than the images"
 _MANY = 9  # columns that stand close together
-_STRATA = ("detection_rate", "rms_px", "rms_phi_rad", "rms_depth_relative", "efficiency_px")
+_STRATA = ("detection_rate", "false_rate", "rms_px", "rms_phi_rad", "rms_depth_relative", "efficiency_px")
 
 
 @dataclass(frozen=True)

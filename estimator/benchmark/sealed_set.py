@@ -209,7 +209,8 @@ def earlier_warnings(folder: Path) -> tuple[str, ...]:
 
 def board_warnings(name: str, recipe: Recipe) -> tuple[str, ...]:
     """A sentence about boards that everybody knows."""
-    if not (RECIPES / f"{name}.toml").is_file() or load_recipe(name).targets != recipe.targets:
+    known = recipe.targets and (RECIPES / f"{name}.toml").is_file()
+    if not known or load_recipe(name).targets != recipe.targets:
         return ()
     return (
         f"the boards stand where the shipped recipe '{name}' puts them: whoever knows them gets D from the azimuth, "

@@ -38,15 +38,18 @@ _LEAST_AREA_PX = 80
 _HALO_PX = {True: 5, False: 12}  # of raw pixels; of processed ones, a JPEG's block and its neighbour's interpolation
 
 
-def lamp_halo(planes: ColourPlanes, inside: BoolArray, card: SensorCard) -> BoolArray:
+def lamp_halo(planes: ColourPlanes, inside: BoolArray, card: SensorCard, laser_off: bool) -> BoolArray:
     """Lamps and what is near to them, shape (h, w): large bright areas.
 
     Around them an edge, clipping or JPEG's ringing look like anything. Bright is a multiple of the usual level; a spot,
-    however strong, is small.
+    however strong, is small. Of a laser-off frame (`laser_off`) only full pixels count: what is merely bright, such as
+    a sunlit wall, is subtracted, and its noise is known.
     """
     step = 2 if planes.mosaic else 1
     red = planes.values_e[0][::step, ::step]
-    bright = (red > _BRIGHT * np.median(red[inside[::step, ::step]])) | planes.full[0][::step, ::step]
+    bright = planes.full[0][::step, ::step]
+    if not laser_off:
+        bright = bright | (red > _BRIGHT * np.median(red[inside[::step, ::step]]))
     areas, count = label(bright)
     large = np.bincount(areas.ravel(), minlength=count + 1) * step**2 >= _LEAST_AREA_PX
     large[0] = False
@@ -263,7 +266,7 @@ def _searched(image: Image, dark: Image | None, pair: Pair, hint: Box | None, le
     on = colour_planes(image, card, box)
     off = None if dark is None else colour_planes(dark, card, box)
     inside = outline_mask(pair.rig, box)
-    inside = inside & ~lamp_halo(off or on, inside, card)
+    inside = inside & ~lamp_halo(off or on, inside, card, off is not None)
     sigma = blur_of(card, pair.rig.camera.blur_sigma_px)
     noise = candidate_noise(on, off, card, sigma, inside)
     where = inside if hint is None else inside & _hinted(hint, box)
