@@ -153,8 +153,8 @@ carry one, too, each with its own texture and coat. Places more than 0.25 m near
 spot's centre must not be in the beam.
 
 `hidden` deals that share of the samples, evenly over the sequence with `sobol`. Their spot is seen in exactly one
-image. The other image does not show it: a thing is in the way, or the robot, or the mirror does not reflect it, or it
-faces away. It then holds at most 1 % of the spot's light. All other samples show their spot in both images. A
+image. In the other one a thing is in the way, or the robot, or the mirror does not reflect it, or it faces
+away. That image then holds at most 1 % of the spot's light. All other samples show their spot in both images. A
 sample with a hidden spot is drawn again at most 1000 times. The manifest has `visible` and `cause` of each
 image, and `spot.hidden` among what was drawn. Without the key nothing is asked.
 """,

@@ -399,6 +399,8 @@ _EDGES: dict[str, tuple[str, tuple[float, ...], str]] = {
     "sigmas": ("snr", (0.0, 3.0, 5.0, 10.0, 30.0, math.inf), "sigma"),
     "azimuth": ("azimuth_deg", tuple(float(x) for x in range(-180, 181, 45)), "deg"),
 }
+CLEAR_SIGMAS = 10.0
+"""Signal to noise of a spot that a search of the whole image has to find."""
 _VALUES = {
     **{"hint": "hint", "image": "image", "bayer": "bayer", "quality": "jpeg_quality", "preset": "preset"},
     "spot": "shown",
@@ -436,7 +438,10 @@ class Stratum:
 def strata(records: pl.DataFrame) -> Iterator[Stratum]:
     """The whole, then all strata that hold some of the images, but not all."""
     hint = pl.when(pl.col("hinted")).then(pl.lit("boxes")).otherwise(pl.lit("no boxes"))
-    shown = pl.when(pl.col("visible")).then(pl.lit("visible")).otherwise(pl.lit("not visible"))
+    clear = pl.when(pl.col("snr") >= CLEAR_SIGMAS).then(pl.lit(f"from {CLEAR_SIGMAS:g} sigma"))
+    shown = (
+        pl.when(~pl.col("visible")).then(pl.lit("not visible")).otherwise(clear.otherwise(pl.lit("visible, fainter")))
+    )
     table = prepared(records).with_columns(azimuth_deg=pl.col("azimuth_rad").degrees(), hint=hint, shown=shown)
     yield Stratum("all", "all", None, None, None, table, table)
     for by in _EDGES:

@@ -30,8 +30,9 @@ from phibench.scenes.rig import Rig
 
 RAW_MARGIN = 1.15
 """Largest rms at the raw pixels' bound over the smallest possible one. The bound takes the room behind the spot as
-unknown and the fixed pattern as noise. A laser-off frame tells both in part. Known in full, the pattern is worth 9 % of
-the rms at most on the Bayer spots of bench-dev (docs/measurements/scores.md), and 12 % on rendered mono ones."""
+unknown and the fixed pattern as noise. A laser-off frame tells both in part. Known in full, the pattern is worth 13 %
+of the rms at most on the Bayer spots of the recipe random (docs/measurements/scores.md), and 12 % on rendered mono
+ones."""
 MODEL_MARGIN = 1.3
 """The same of processed images, whose bound is that of a model: 10 to 30 % too large in a dark room (docs/limits)."""
 FALSE_ALARM = 1e-3

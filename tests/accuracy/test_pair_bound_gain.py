@@ -1,4 +1,4 @@
-"""What the bound of both images together gains over that of each image, on drawn samples of bench-dev: docs/limits.md.
+"""What the bound of both images together gains over that of each image, on drawn samples of the recipe random: docs/limits.md.
 
 `pytest --slow -s tests/accuracy/test_pair_bound_gain.py` prints the ratios. Nothing is rendered: rigs, strokes and
 spots are those of the recipe, over an even room.
@@ -43,7 +43,7 @@ def bound(card: SensorCard, uv: Array, sigma_px: float, flux_e: float, pattern_k
 @pytest.mark.parametrize("preset", ["bayer-raw", "mjpeg"])
 def test_gain_of_the_pairs_bound(preset: str) -> None:
     """At least 1 for every pair; positions gain sqrt(4 / 3) = 1.15 where all coordinates are alike, D hardly."""
-    recipe = load_recipe("bench-dev")
+    recipe = load_recipe("random")
     assert recipe.random is not None
     few = recipe.random.model_copy(update={"samples": SAMPLES})
     plan, rng, rows = make_plan(recipe.model_copy(update={"random": few})), generator("pair bound", preset), []

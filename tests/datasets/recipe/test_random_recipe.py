@@ -101,6 +101,6 @@ def test_nonsense_is_reported_and_never_raises_anything_else(nonsense: Any) -> N
 
 def test_every_drawable_key_is_a_key_of_the_rig_and_has_a_parameter() -> None:
     assert tuple(RandomRigTable.model_fields) == DRAWABLE
-    assert len(PARAMETERS) == len(set(PARAMETERS)) == len(DRAWABLE) + 7 + len(MISALIGNMENT)
+    assert len(PARAMETERS) == len(set(PARAMETERS)) == len(DRAWABLE) + 8 + len(MISALIGNMENT)
     recipe = check_recipe(drawing(rig={"z_c_m": 0.3}))
     assert Recipe.model_validate(json.loads(json.dumps(recipe.model_dump(mode="json")))) == recipe

@@ -13,7 +13,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.benchmark.answer_errors import MATCH_PX, Rules, phi_of
-from phibench.estimator.benchmark.records import COLUMNS, COUNTED, records
+from phibench.estimator.benchmark.records import COLUMNS, COUNTED, record_table, records, with_missed
 from phibench.estimator.geometry.phi import CONVENTIONS, outline_circle
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Outcome, Spot
@@ -140,6 +140,31 @@ def test_a_spot_that_is_not_visible_can_only_be_falsely_detected():
     assert none["false_detection"]
     for name in ("u_true_px", "du_px", "radial_px", "distance_px", "phi_error_rad", "bound_px2", "bayer"):
         assert none[name] is None, name
+
+
+@pytest.mark.parametrize(
+    ("answers", "depth_m", "false", "squares"),
+    [
+        ((True, False), None, False, 0.0),  # the honest one
+        ((False, False), None, False, 0.0),
+        ((True, True), None, True, 1.0),
+        ((True, False), 2.0, True, 1.0),  # a D that only a guess can give
+        ((False, False), 2.0, True, 1.0),
+    ],
+)
+def test_any_number_for_a_hidden_spot_is_false(
+    answers: tuple[bool, bool], depth_m: float | None, false: bool, squares: float
+) -> None:
+    """Squares that the rank by D sums, in units of that of a missed pair."""
+    t = change(cases(1).truths[0], "up", visible=False, cause="occluded:table")
+    spots = [Spot(s.uv_px) if given else NOTHING for s, given in zip((t.down, t.up), answers, strict=True)]
+    table = record_table([t], [Outcome(0, Answer(*spots, depth_m=depth_m), 0.01)], RULES)
+    counted = with_missed(table, 0.4)
+    assert counted["pair_false"].to_list() == [false, false]
+    assert counted["rank_depth2"].to_list() == pytest.approx([0.16 * squares] * 2)
+    shown = change(t, "up", visible=True, cause="none")
+    own = Answer(Spot(t.down.uv_px), Spot(t.up.uv_px), depth_m=t.depth_m)
+    assert not record_table([shown], [Outcome(0, own, 0.01)], RULES)["pair_false"].any()
 
 
 def test_a_status_other_than_ok_takes_the_position_back():

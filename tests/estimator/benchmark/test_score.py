@@ -74,8 +74,8 @@ def test_strata_part_the_whole(mine):
     by = {}
     for stratum in (mine.document.whole, *mine.document.strata):
         by.setdefault(stratum.by, []).append(stratum)
-    # one preset, no hints, and one class of signal to noise: these strata are the whole again
-    assert set(by) == set(STRATA) - {"preset", "hint", "sigmas"}
+    # one preset, no hints, all visible, and one class of signal to noise: these strata are the whole again
+    assert set(by) == set(STRATA) - {"preset", "hint", "sigmas", "spot"}
     whole = by["all"][0].metrics["rms_px"].value
     for name in ("depth", "stroke", "signal", "azimuth", "image", "bayer", "quality"):
         assert sum(stratum.images for stratum in by[name]) == 80, name
@@ -85,6 +85,22 @@ def test_strata_part_the_whole(mine):
             assert sum(s.metrics["rms_depth_m"].n for s in by[name]) == 40, name
             assert sum(stratum.pairs for stratum in by[name] if stratum.pairs) >= 40
     assert "rms_depth_m" not in by["bayer"][0].metrics
+
+
+def test_hidden_and_faint_spots_have_strata_of_their_own():
+    """40 pairs: one up image hides its spot, another has it at 8 sigma. Whoever answers all is false once."""
+    pairs = cases(40)
+    some = (
+        *(change(pairs.truths[0], "up", visible=False, cause="occluded:table", snr=0.0),),
+        *(change(pairs.truths[1], "up", snr=8.0), *pairs.truths[2:]),
+    )
+    d = scored(truth_itself, Cases(some)).document
+    found = {s.label: s for s in d.strata if s.by == "spot"}
+    assert {name: s.images for name, s in found.items()} == {"from 10 sigma": 78, "not visible": 1, "visible, fainter": 1}
+    assert [found[name].metrics["false_rate"].value for name in sorted(found)] == [0.0, 1.0, 0.0]
+    assert found["from 10 sigma"].metrics["detection_rate"].value == 1.0
+    # 39 samples with both images and one with one, none false: Clopper-Pearson's limit of 40 samples is 1 - 0.025^(1/40)
+    assert found["from 10 sigma"].metrics["false_rate"].high == pytest.approx(1.0 - 0.025 ** (1 / 40), rel=0.05)
 
 
 def test_a_stratum_holds_its_own_errors():
