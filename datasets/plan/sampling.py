@@ -313,7 +313,7 @@ def draw_values(table: RandomTable, targets: list[str], points: Mapping[str, Arr
     if "spot.target" in points:
         names = targets if table.spot.target is None else table.spot.target.choice
         values["spot.target"] = pick(names, points["spot.target"])
-    if "spot.hidden" in points:
+    if "spot.hidden" in points and table.spot.hidden is not None:
         hidden = points["spot.hidden"] < table.spot.hidden
         values["spot.hidden"] = [HIDDEN if one else SHOWN for one in hidden]
         if table.spot.hidden_elevation_deg is not None:

@@ -1,4 +1,4 @@
-"""What the bound of both images together gains over that of each image, on drawn samples of the recipe random: docs/limits.md.
+"""What the bound of both images together gains over that of each image, on samples of `random`: docs/limits.md.
 
 `pytest --slow -s tests/accuracy/test_pair_bound_gain.py` prints the ratios. Nothing is rendered: rigs, strokes and
 spots are those of the recipe, over an even room.

@@ -96,10 +96,14 @@ def test_hidden_and_faint_spots_have_strata_of_their_own():
     )
     d = scored(truth_itself, Cases(some)).document
     found = {s.label: s for s in d.strata if s.by == "spot"}
-    assert {name: s.images for name, s in found.items()} == {"from 10 sigma": 78, "not visible": 1, "visible, fainter": 1}
+    assert {name: s.images for name, s in found.items()} == {
+        "from 10 sigma": 78,
+        "not visible": 1,
+        "visible, fainter": 1,
+    }
     assert [found[name].metrics["false_rate"].value for name in sorted(found)] == [0.0, 1.0, 0.0]
     assert found["from 10 sigma"].metrics["detection_rate"].value == 1.0
-    # 39 samples with both images and one with one, none false: Clopper-Pearson's limit of 40 samples is 1 - 0.025^(1/40)
+    # 40 samples, none false: the limit of Clopper and Pearson is 1 - 0.025^(1/40)
     assert found["from 10 sigma"].metrics["false_rate"].high == pytest.approx(1.0 - 0.025 ** (1 / 40), rel=0.05)
 
 
