@@ -18,7 +18,9 @@ from phibench.datasets.build.journal import FolderHead, Journal
 from phibench.datasets.build.run_tasks import (
     assemble,
     claimed,
+    copy_room_files,
     differing,
+    missing_room_files,
     refuse_other,
     remove_files,
     run_tasks,
@@ -35,7 +37,7 @@ from phibench.datasets.input_files import InputFile
 from phibench.datasets.plan.plan import Plan, make_plan, shard_plan
 from phibench.datasets.progress import progress_console
 from phibench.datasets.recipe.checks import warnings
-from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_text, with_numbers
+from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_files, recipe_text, with_numbers
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import dataset_info, info_text, parse_info, read_manifest, same_content
 from phibench.datasets.store.files import WriteError, write_text
@@ -150,6 +152,7 @@ def _planned(
 ) -> tuple[Plan, str, str]:
     """Plan, text of its recipe, and a line on samples that are kept although fewer are asked for."""
     text, source, note = recipe_text(recipe), str(find_recipe(recipe)), ""
+    files = recipe_files(recipe)
     if samples is not None or seed is not None:
         text = with_numbers(text, source, samples, seed)
     asked = parse_recipe(text, source)
@@ -157,7 +160,7 @@ def _planned(
     if held is not None and asked.random is not None:
         text, count = with_numbers(text, source, held, None), asked.random.samples
         note = f"{out} keeps its {held} samples; the first {count} of them are those that were asked for"
-    return shard_plan(make_plan(parse_recipe(text, source)), shard), text, note
+    return shard_plan(make_plan(parse_recipe(text, source, files), files), shard), text, note
 
 
 def _keys(tasks: Mapping[str, Task]) -> dict[str, str]:
@@ -200,7 +203,8 @@ def _make(
     if todo and no_renderer is not None:
         what = f"{len(todo)} of {len(tasks)} tasks are to be done, such as '{todo[0]}'"
         raise DatasetError(f"{what}, and {no_renderer}") from no_renderer
-    if not todo and not (faults := _loose_ends(plan, head, journal, tasks, out)):
+    copies = missing_room_files(plan.files, out)
+    if not todo and not (faults := _loose_ends(plan, head, journal, tasks, out)) and not copies:
         if journal.is_written(head, tasks):
             console.print(f"{out} is complete, nothing to do", highlight=False)
             return []
@@ -212,12 +216,13 @@ def _make(
         run_tasks(plan, tasks, todo, journal, head, out, pool, console)
         faults = _loose_ends(plan, head, journal, tasks, out)
     journal.begin(head, tasks)
+    copy_room_files(plan.files, out)
     wanted = assemble(plan, head, journal.entries)
     remove_files(out, [name for name in faults if name not in wanted])
     write_documents(out, wanted, [name for name in faults if name in wanted])
     _write_run(out, pool.width, began, time.monotonic() - started)
     console.print(f"{out}: {visibility_line(read_manifest(out))}", highlight=False, soft_wrap=True)
-    return [*todo, *faults]
+    return [*todo, *(schema.room_file(name) for name in copies), *faults]
 
 
 def _environment(pool: WorkerPool, journal: Journal) -> tuple[Environment, NoRendererError | None]:

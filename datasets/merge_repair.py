@@ -20,6 +20,7 @@ from phibench.datasets.build.journal import Entry, FolderHead, Journal
 from phibench.datasets.build.run_tasks import (
     assemble,
     claimed,
+    copy_room_files,
     held_head,
     is_intact,
     remove_files,
@@ -34,6 +35,7 @@ from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.recipe.load import parse_recipe, recipe_text
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store import schema
+from phibench.datasets.store.checksums import held_room_files
 from phibench.datasets.store.documents import (
     dataset_info,
     info_text,
@@ -64,7 +66,7 @@ def merge(out: str | Path, shards: Sequence[str | Path], console: Console | None
         console or progress_console(),
     )
     head, info, entries = _collect(folders)
-    plan = make_plan(parse_recipe(head.recipe))
+    plan = make_plan(parse_recipe(head.recipe), held_room_files(folders[0]))
     names = task_names(plan)
     if missing := [name for name in names if name not in entries]:
         raise DatasetError(f"the shards lack {len(missing)} tasks, such as {missing[0]}; finish or add their shards")
@@ -73,6 +75,7 @@ def merge(out: str | Path, shards: Sequence[str | Path], console: Console | None
             raise DatasetError(f"{lost}; give another folder")
         (out / CHECKSUMS).unlink(missing_ok=True)
         journal.begin(head, [])  # says what the folder is, should this be interrupted
+        copy_room_files(plan.files, out)
         _copy(out, [entries[name] for name in names], console)
         journal.entries = {name: entries[name][0] for name in names}
         journal.begin(head, names)
@@ -88,7 +91,7 @@ def _collect(folders: list[Path]) -> tuple[FolderHead, DatasetInfo, dict[str, tu
         raise DatasetError("give the folders of the shards")
     heads = [_finished(folder) for folder in folders]
     infos = [parse_info(head.info) for head in heads]
-    whole = [_whole(info, head) for info, head in zip(infos, heads, strict=True)]
+    whole = [_whole(*one) for one in zip(folders, infos, heads, strict=True)]
     for folder, info in zip(folders, whole, strict=True):
         if not same_content(info, whole[0]):
             raise DatasetError(f"{folder} and {folders[0]} are of different recipes, code or environments")
@@ -108,9 +111,9 @@ def _finished(folder: Path) -> FolderHead:
     return head
 
 
-def _whole(info: DatasetInfo, head: FolderHead) -> DatasetInfo:
+def _whole(folder: Path, info: DatasetInfo, head: FolderHead) -> DatasetInfo:
     """Description of the data set that a shard is a part of."""
-    plan = make_plan(parse_recipe(head.recipe))
+    plan = make_plan(parse_recipe(head.recipe), held_room_files(folder))
     if recipe_sha256(plan.recipe) != info.recipe_sha256:
         raise DatasetError(f"the recipe of shard {info.shard} is not the one it was made from")
     return dataset_info(plan, info.provenance)
@@ -187,12 +190,12 @@ def _held_plan(folder: Path) -> tuple[Plan, str]:
             raise error from None
         with only_run(folder), Journal(folder) as journal:
             journal.begin(head, list(journal.entries))
-        return make_plan(parse_recipe(head.recipe)), head.recipe
+        return make_plan(parse_recipe(head.recipe), held_room_files(folder)), head.recipe
     if head is None:
         raise DatasetError(f"{folder} is not a data set: there is nothing to repair")
     info = parse_info(head.info)
     _refuse_other_code(folder, info.provenance)
-    return shard_plan(make_plan(_recipe(folder, head, info)), info.shard), head.recipe
+    return shard_plan(make_plan(_recipe(folder, head, info), held_room_files(folder)), info.shard), head.recipe
 
 
 def _lost_head(folder: Path) -> FolderHead | None:
@@ -207,7 +210,7 @@ def _lost_head(folder: Path) -> FolderHead | None:
     if not (path.is_file() and layers):
         return None
     text = recipe_text(path)
-    plan = make_plan(parse_recipe(text, f"{path}"))
+    plan = make_plan(parse_recipe(text, f"{path}"), held_room_files(folder))
     expected = {pose.pose_id: pose.seed for pose in plan.poses}
     headers = [_header(layer) for layer in layers]
     held = {header["pose"]: header["seed"] for header in headers if header.get("dataset") == plan.recipe.dataset.name}
@@ -233,6 +236,7 @@ def _places(plan: Plan) -> list[str]:
     return [
         *(schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.RIGS, schema.ROOMS, *schema.NOT_DATA),
         *(schema.light_map_file(room) for room in plan.rooms),
+        *(schema.room_file(name) for name in plan.files.digests),
         *(schema.view_file(pose.pose_id, kind) for pose in plan.poses for kind in ("ambient", "truth", "preview")),
         *(schema.spot_file(sample, position) for sample in samples for position in POSITIONS),
         *(schema.preview_file(sample) for sample in samples),

@@ -188,7 +188,9 @@ class Dataset:
         infos = list(self.rooms.infos.values())
         if len(infos) != 1:
             return f"{len(infos)} rooms"
-        return f"{self.info.recipe['room']['name']}, {_count(len(infos[0].object_names), 'object')}"
+        kind = infos[0].source.get("kind", "named")
+        name = self.info.recipe["room"]["name"] if kind == "named" else kind
+        return f"{name}, {_count(len(infos[0].object_names), 'object')}"
 
     def _image_size(self) -> str:
         if not self.rows:

@@ -26,7 +26,14 @@ from phibench.datasets.plan.plan import PairPlan, Plan, make_plan, shard_plan
 from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import damaged, differing_files, misplaced, read_checksums, strays
+from phibench.datasets.store.checksums import (
+    damaged,
+    differing_files,
+    held_room_files,
+    misplaced,
+    read_checksums,
+    strays,
+)
 from phibench.datasets.store.documents import differences, same_number, sensitivity_fault, to_json
 from phibench.datasets.store.layers import (
     SPOT_STACKS,
@@ -322,7 +329,7 @@ def _guarded(faults: Iterator[str]) -> Iterator[str]:
 def plan_faults(dataset: Dataset) -> Iterator[str]:
     """Faults of manifest, rigs and poses against the plan of the recipe."""
     try:
-        plan = shard_plan(make_plan(dataset.recipe), dataset.info.shard)
+        plan = shard_plan(make_plan(dataset.recipe, held_room_files(dataset.folder)), dataset.info.shard)
     except DatasetError as error:
         yield f"{schema.INFO}: its recipe cannot be followed: {error}"
         return

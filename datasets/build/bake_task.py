@@ -24,7 +24,7 @@ def bake_settings(ambient: AmbientTable) -> BakeSettings:
 
 def bake_room(out: Path, rig: Rig, room_id: str, source: RoomSource, ambient: AmbientTable) -> Made:
     """Task: write a room's light map below `out`, if it has any light; the result is its `RoomInfo`."""
-    room, view, file = room_of(source), rig.at(0.0), schema.light_map_file(room_id)
+    room, view, file = room_of(source, out / schema.ROOM_FILES), rig.at(0.0), schema.light_map_file(room_id)
     info = RoomInfo(
         room=room_id, source=to_json(source), digest=room.digest, lit=room.lit, object_names=room.object_names(view)
     )

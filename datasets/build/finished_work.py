@@ -24,7 +24,7 @@ from phibench.datasets.plan.plan import make_plan, shard_plan
 from phibench.datasets.recipe.load import parse_recipe
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store import schema
-from phibench.datasets.store.checksums import read_checksums
+from phibench.datasets.store.checksums import held_room_files, read_checksums
 from phibench.datasets.store.documents import parse_info
 from phibench.datasets.store.provenance import code_sha256
 from phibench.datasets.store.schema import DatasetInfo
@@ -86,7 +86,7 @@ def _held_keys(out: Path, journal: Journal, wanted: DatasetInfo) -> dict[str, st
     if head is None or info is None or info.provenance.get("code_sha256") != code_sha256():
         return unlike
     try:
-        plan = shard_plan(make_plan(parse_recipe(head.recipe)), info.shard)
+        plan = shard_plan(make_plan(parse_recipe(head.recipe), held_room_files(out)), info.shard)
         # a description that `repair` has recovered does not know the renderer
         environment = versions({**wanted.provenance, **info.provenance})
         return {name: task.key for name, task in plan_tasks(plan, environment).items()}

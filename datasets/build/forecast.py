@@ -22,7 +22,6 @@ from phibench.datasets.build.light_map_cache import is_cached
 from phibench.datasets.build.scheduler import Executor, Outcome
 from phibench.datasets.build.tasks import Done, Task
 from phibench.datasets.plan.plan import PairPlan, Plan
-from phibench.datasets.rooms.room_sources import room_of
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import SpotTruth, depth_m, spot_truth
 from phibench.render.room.bounced_light import BOUNCE_TEXEL_M
@@ -122,7 +121,7 @@ def _bake_s(plan: Plan) -> float:
 
 
 def _first_room(plan: Plan) -> Room:
-    return room_of(next(iter(plan.rooms.values())))
+    return plan.room(next(iter(plan.rooms)))
 
 
 def _texels(plan: Plan) -> int:
@@ -315,7 +314,7 @@ def _traced(plan: Plan, pairs: Iterable[PairPlan]) -> Iterator[PairForecast]:
     for pair in pairs:
         spot, rig = plan.spots[pair.spot], plan.rigs[pair.rig]
         views = [plan.view(pair, position) for position in POSITIONS]
-        room = room_of(plan.rooms[pair.room])
+        room = plan.room(pair.room)
         down, up = (spot_truth(view, spot, room_geometry(room, view)) for view in views)
         distance_m = depth_m(np.array(spot.position_world_m), rig.at(0.0).sphere_centre_m)
         yield PairForecast(pair, float(distance_m), down, up)

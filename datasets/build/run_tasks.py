@@ -28,6 +28,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import InputFile
 from phibench.datasets.plan.plan import PairPlan, Plan
 from phibench.datasets.progress import Steps
+from phibench.datasets.rooms.room_files import RoomFiles, checked_data
 from phibench.datasets.rooms.room_sources import ONLY_ROOM
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import checksums_text
@@ -83,6 +84,24 @@ def check_disk(out: Path, needed: int, replaced: Collection[str]) -> None:
     if needed > free:
         text = f"about {megabytes(needed)} are needed and {megabytes(free)} are free at {out}"
         raise DatasetError(f"{text}; free some space or give a folder on another disk")
+
+
+def missing_room_files(files: RoomFiles, out: Path) -> list[str]:
+    """Names of files of rooms of which a folder has no copy, or one with other bytes."""
+    held = {name: out / schema.room_file(name) for name in files.digests}
+    return [name for name, path in held.items() if not path.is_file() or sha256(path) != files.digests[name]]
+
+
+def copy_room_files(files: RoomFiles, out: Path) -> None:
+    """Copy files of rooms into a folder, for its tasks and readers; those that are there stay.
+
+    Raises
+    ------
+    RoomError
+        If one is missing in its own folder, too large, or another one than it must be.
+    """
+    for name in missing_room_files(files, out):
+        write_bytes(out / schema.room_file(name), checked_data(files.folder, name, files.digests[name]))
 
 
 def stale_files(out: Path, expected: Collection[str]) -> list[str]:
@@ -175,6 +194,7 @@ def run_tasks(
     console.print(cost.text(pool.width, factor) + kept, highlight=False, soft_wrap=True)
     left = set(todo)
     journal.begin(head, [name for name in tasks if name not in left])
+    copy_room_files(plan.files, out)  # tasks see this folder alone
     failures = _run(chosen, Pace(cost.seconds, factor, pool.width), journal, out, pool, console)
     for name, entry in before.items():
         if name in journal.entries and journal.entries[name] != entry and journal.entries[name].key == entry.key:
@@ -227,6 +247,7 @@ def assemble(plan: Plan, head: FolderHead, entries: Mapping[str, Entry]) -> dict
     }
     hashes = {name: digest for entry in entries.values() for name, digest in entry.files.items()}
     hashes |= {name: hashlib.sha256(data).hexdigest() for name, data in small.items()}
+    hashes |= {schema.room_file(name): digest for name, digest in plan.files.digests.items()}
     return {**small, schema.CHECKSUMS: checksums_text(hashes).encode()}
 
 

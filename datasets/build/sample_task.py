@@ -33,7 +33,7 @@ def finish_sample(out: Path, pair: PairPlan, rig: Rig, source: RoomSource, spot:
     RefusedSampleError
         If a view's noise is above the budget of this quality at the spot, with the numbers.
     """
-    sides, rows, room = [], {}, room_of(source)
+    sides, rows, room = [], {}, room_of(source, out / schema.ROOM_FILES)
     for position in POSITIONS:
         view = rig.at(Stroke(pair.stroke_m).offset_m(position))
         truth = spot_truth(view, spot, room_geometry(room, view))

@@ -61,7 +61,7 @@ def make_spot(out: Path, dataset: str, rig: Rig, source: RoomSource, spot: Laser
         If a certificate is out of tolerance, with its numbers.
     """
     views = {position: rig.at(Stroke(pair.stroke_m).offset_m(position)) for position in POSITIONS}
-    room = room_of(source)
+    room = room_of(source, out / schema.ROOM_FILES)
     answers = {position: answer_spot(view, spot, room) for position, view in views.items()}
     if refused := [line for position in POSITIONS for line in _complaints(pair, position, answers[position])]:
         raise RefusedSampleError("\n".join(["refused, a certificate is out of tolerance:", *refused]))

@@ -38,7 +38,7 @@ def render_view(out: Path, dataset: str, rig: Rig, source: RoomSource, pose: Pos
     from phibench.render.setup.variant import activate
 
     activate()
-    view, room = rig.at(pose.offset_m), room_of(source)
+    view, room = rig.at(pose.offset_m), room_of(source, out / schema.ROOM_FILES)
     surfaces = view_surfaces(view, room)
     header = {"dataset": dataset, "pose": pose.pose_id, "offset_m": pose.offset_m}
     if room.lit:

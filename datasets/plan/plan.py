@@ -12,14 +12,18 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from phibench.datasets.errors import DatasetError, RecipeError
-from phibench.datasets.plan.sampling import RandomSample, draw_rigs, draw_rooms, draw_samples
+from phibench.datasets.plan.room_draws import draw_rooms, room_files
+from phibench.datasets.plan.sampling import RandomSample, draw_rigs, draw_samples
 from phibench.datasets.recipe.build import build_misalignment, build_rig, build_spot, true_stroke_m
 from phibench.datasets.recipe.tables import DrawnRigsTable, RandomTable, Recipe
+from phibench.datasets.rooms.room_errors import RoomError
+from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.rooms.room_sources import ONLY_ROOM, RoomSource, room_of
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.random_streams import seed_32
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
+from phibench.scenes.room import Room
 from phibench.scenes.validation import printable_line
 
 RECIPE_RIG = "rig"
@@ -112,6 +116,8 @@ class Plan:
         In the order of the recipe.
     shard : str or None
         "i/n" where this is a part of the recipe (`shard_plan`).
+    files : RoomFiles
+        Of all rooms of the recipe, with the SHA-256 that they must have.
     """
 
     recipe: Recipe
@@ -122,24 +128,34 @@ class Plan:
     poses: tuple[PosePlan, ...]
     pairs: tuple[PairPlan, ...]
     shard: str | None = None
+    files: RoomFiles = RoomFiles()
+
+    def room(self, name: str) -> Room:
+        """Room of an id, built from the files in their folder."""
+        return room_of(self.rooms[name], self.files.folder)
 
     def view(self, pair: PairPlan, position: str) -> View:
         """View of a pair at a stroke position."""
         return self.rigs[pair.rig].at(Stroke(pair.stroke_m).offset_m(position))
 
 
-def make_plan(recipe: Recipe) -> Plan:
-    """Plan of a recipe.
+def make_plan(recipe: Recipe, files: RoomFiles | None = None) -> Plan:
+    """Plan of a recipe; `files` are those of its rooms, where it has panoramas or meshes.
 
     Raises
     ------
     RecipeError
         If two strokes differ by less than a nanometre, so that their poses would share a name, or if a sample of
-        `[random]` stays impossible.
+        `[random]` stays impossible, or if a room cannot be built.
     """
-    rig, rooms = build_rig(recipe.rig), draw_rooms(recipe)
+    rig = build_rig(recipe.rig)
+    try:
+        files = room_files(recipe, files or RoomFiles())
+        rooms = draw_rooms(recipe, files)
+    except RoomError as error:
+        raise RecipeError(f"rooms: {error}") from error
     if recipe.random is not None:
-        return _random_plan(recipe, recipe.random, rig, rooms)
+        return replace(_random_plan(recipe, recipe.random, rig, rooms, files), files=files)
     room = rooms[ONLY_ROOM]
     if recipe.rigs is not None:
         return _rigs_plan(recipe, recipe.rigs, rig, room)
@@ -200,9 +216,9 @@ def pose_of(rig: str, offset_m: float, room: str = ONLY_ROOM) -> str:
     return "-".join(parts)
 
 
-def _random_plan(recipe: Recipe, table: RandomTable, rig: Rig, rooms: dict[str, RoomSource]) -> Plan:
+def _random_plan(recipe: Recipe, table: RandomTable, rig: Rig, rooms: dict[str, RoomSource], files: RoomFiles) -> Plan:
     """Equal rigs share an id, and so their views; the first sample that has one names it, so that more change none."""
-    samples = draw_samples(recipe, table, rooms)
+    samples = draw_samples(recipe, table, rooms, files.folder)
     ids = {rig: RECIPE_RIG}
     for sample in samples:
         ids.setdefault(sample.rig, f"r{sample.number:06d}")

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -26,7 +27,6 @@ from phibench.datasets.recipe.build import (
     build_rig,
     build_target,
     ceiling_m,
-    room_source,
     true_stroke_m,
 )
 from phibench.datasets.recipe.distributions import DistributionTable, pick, quantile
@@ -38,9 +38,8 @@ from phibench.datasets.recipe.tables import (
     RandomTable,
     Recipe,
     RigTable,
-    RoomPropertiesTable,
 )
-from phibench.datasets.rooms.room_sources import ONLY_ROOM, GeneratedRoom, RoomSource, room_of
+from phibench.datasets.rooms.room_sources import ONLY_ROOM, RoomSource, room_of
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
@@ -49,7 +48,6 @@ from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
 from phibench.scenes.validation import SceneError
-from phibench.scenes.worlds.properties import drawn_properties
 
 Sequence = Literal["sobol", "independent"]
 
@@ -149,48 +147,33 @@ class RandomSample:
     nominal_stroke_m: float
 
 
-def draw_rooms(recipe: Recipe) -> dict[str, RoomSource]:
-    """Sources of the rooms of a recipe, by id: the one of `[room]`, or those of `[rooms]`.
-
-    Each property has a random stream of its own, so that neither more rooms nor another property changes it.
-    """
-    table, dataset = recipe.rooms, recipe.dataset
-    if table is None:
-        return {ONLY_ROOM: room_source(recipe.room, recipe.targets)}
-    return {
-        f"room{k:06d}": _generated(table.properties, (dataset.name, dataset.seed, "room", k))
-        for k in range(table.count)
-    }
-
-
-def _generated(table: RoomPropertiesTable, stream: tuple[str | int, ...]) -> GeneratedRoom:
-    fixed: dict[str, Value] = {}
-    for name in type(table).model_fields:
-        if (chosen := getattr(table, name)) is not None:
-            u = np.array([generator(*stream, "property", name).random()])
-            named = not isinstance(chosen, DistributionTable)
-            value = chosen.choice[int(u[0] * len(chosen.choice))] if named else quantile(chosen, u)[0]
-            fixed[name] = value if isinstance(value, str) else float(value)
-    return GeneratedRoom(drawn_properties(*stream, **fixed), stream)
-
-
-def draw_samples(recipe: Recipe, table: RandomTable, rooms: Mapping[str, RoomSource]) -> tuple[RandomSample, ...]:
-    """All samples of a recipe with `[random]`, dealt to its rooms in turn.
+def draw_samples(
+    recipe: Recipe, table: RandomTable, rooms: Mapping[str, RoomSource], folder: Path | None = None
+) -> tuple[RandomSample, ...]:
+    """All samples of a recipe with `[random]`, dealt to its rooms in turn; `folder` has the files of the rooms.
 
     Raises
     ------
     RecipeError
-        If a sample stays impossible after `TRIES` draws (`HIDDEN_TRIES` of a hidden spot), with the last reason.
+        If a sample stays impossible after `TRIES` draws (`HIDDEN_TRIES` of a hidden spot), with the last reason, or if
+        a room cannot be built.
     """
     dataset, found = recipe.dataset, dict[int, RandomSample]()
     first = first_points(table.sequence, dataset.name, dataset.seed, table.samples, drawn_parameters(table))
     for k, room_id in enumerate(rooms):  # a room is built once, and let go before the next
         numbers = range(k, table.samples, len(rooms))
         if numbers:
-            makers = _Makers(recipe, table, room_id, room_of(rooms[room_id]), first)
+            makers = _Makers(recipe, table, room_id, _built(room_id, rooms[room_id], folder), first)
             pilot = numbers[:_PILOT]  # whether the recipe is possible at all is known after a few
             found |= {sample.number: sample for part in (pilot, numbers[_PILOT:]) for sample in makers.draw(part)}
     return tuple(found[number] for number in range(table.samples))
+
+
+def _built(room_id: str, source: RoomSource, folder: Path | None) -> Room:
+    try:
+        return room_of(source, folder)
+    except SceneError as error:
+        raise RecipeError(f"rooms: {room_id} cannot be built: {error}") from error
 
 
 def rig_table(table: RigTable, values: Mapping[str, Value]) -> RigTable:
@@ -228,7 +211,8 @@ class _Makers:
                 return [found[number] for number in numbers]
             tries = attempt + 1
             if lost := [number for number in left if tries == self._tries(number)]:
-                why = f"has no possible rig, spot and stroke in {tries} draws; the last: {outcomes[lost[0]]}"
+                where = "" if self._room_id == ONLY_ROOM else f" in {self._room_id}"
+                why = f"has no possible rig, spot and stroke{where} in {tries} draws; the last: {outcomes[lost[0]]}"
                 boards = " or move the boards" if self._targets else ""
                 raise RecipeError(f"random: sample {lost[0]} {why}; narrow the distributions{boards}")
         raise AssertionError("every sample is found or lost")

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from phibench.datasets.recipe.room_tables import RoomTable
 from phibench.datasets.recipe.tables import (
     OWN_ALBEDO,
     LaserTable,
     MisalignmentTable,
     Recipe,
     RigTable,
-    RoomTable,
     TargetTable,
 )
 from phibench.datasets.rooms.room_sources import NamedRoom, room_of

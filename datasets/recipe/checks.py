@@ -8,9 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar, cast
-
-from pydantic import ValidationError
+from typing import Any, cast
 
 from phibench.datasets.recipe.build import (
     build_misalignment,
@@ -22,7 +20,17 @@ from phibench.datasets.recipe.build import (
     ceiling_m,
     true_stroke_m,
 )
-from phibench.datasets.recipe.distributions import DistributionTable, Table, one_number
+from phibench.datasets.recipe.faulty_tables import (
+    Raw,
+    boards_of,
+    distribution_of,
+    list_of,
+    sound_of,
+    table_of,
+    tables_of,
+)
+from phibench.datasets.recipe.room_checks import low_rooms, room_faults
+from phibench.datasets.recipe.room_tables import RoomTable
 from phibench.datasets.recipe.spot_placement import cut_part, free_margin_m
 from phibench.datasets.recipe.tables import (
     DRAWABLE,
@@ -34,7 +42,6 @@ from phibench.datasets.recipe.tables import (
     MisalignmentTable,
     Recipe,
     RigTable,
-    RoomTable,
     TargetTable,
 )
 from phibench.render.room.subpixel_grid import FilmGrid
@@ -45,8 +52,6 @@ from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room, chassis
 from phibench.scenes.validation import Fault, SceneError, close_names, nearest
 
-Raw = dict[str, Any]
-T = TypeVar("T", bound=Table)
 _ON_BOARD, _BY_RAY = ("target", "across_m", "up_m"), ("azimuth_deg", "height_m")
 _BOARD = "the board ({:.2f} m wide, {:.2f} m high)".format(*BOARD_SIZE_M)
 
@@ -57,7 +62,7 @@ def semantic_faults(raw: Raw) -> list[Fault]:
     return [
         *(
             *_purpose(raw),
-            *_rooms(draft),
+            *room_faults(raw),
             *_names(draft),
             *_repeats(raw),
             *_draws(draft),
@@ -105,52 +110,16 @@ class _Draft:
     @classmethod
     def of(cls, raw: Raw) -> _Draft:
         single = (("rig", RigTable), ("misalignment", MisalignmentTable), ("room", RoomTable), ("laser", LaserTable))
-        targets = [(i, _sound(entry, TargetTable)) for i, entry in _tables(raw, "targets")]
-        found: Any = [_sound(raw.get(key, {}), model) for key, model in single]
+        targets = [(i, sound_of(entry, TargetTable)) for i, entry in tables_of(raw, "targets")]
+        found: Any = [sound_of(raw.get(key, {}), model) for key, model in single]
         rig, misalignment, room, laser = found
+        room = None if "rooms" in raw else room  # drawn ones have heights of their own
         return cls(raw, rig, misalignment, room, laser, [(i, table) for i, table in targets if table is not None])
 
     @property
     def names(self) -> list[str]:
         """Names of all targets, the faulty ones too."""
-        return [entry["name"] for _, entry in _tables(self.raw, "targets") if isinstance(entry.get("name"), str)]
-
-
-def _sound(raw: object, model: type[T]) -> T | None:
-    """Table of `raw` without its faulty keys; None where that leaves out a key that must be there."""
-    try:
-        return model.model_validate(raw)
-    except ValidationError as error:
-        faulty = {details["loc"][0] for details in error.errors() if details["loc"]}
-    rest = {key: value for key, value in raw.items() if key not in faulty} if isinstance(raw, dict) else None
-    return None if rest is None or len(rest) == len(cast(Raw, raw)) else _sound(rest, model)
-
-
-def _distribution(given: object) -> DistributionTable | None:
-    return None if given is None else _sound(one_number(given), DistributionTable)
-
-
-def _table(raw: Raw, *keys: str) -> Raw:
-    """Table below some keys; an empty one where there is none."""
-    found: object = raw
-    for key in keys:
-        found = found.get(key) if isinstance(found, dict) else None
-    return found if isinstance(found, dict) else {}
-
-
-def _tables(raw: Raw, key: str) -> list[tuple[int, Raw]]:
-    """Entries of an array of tables that are tables, with their index."""
-    return [(i, entry) for i, entry in enumerate(_list(raw, key)) if isinstance(entry, dict)]
-
-
-def _list(table: Raw, key: str) -> list[Any]:
-    return values if isinstance(values := table.get(key), list) else []
-
-
-def _boards(table: Raw) -> list[Any]:
-    """Names of the boards that a table with `target` draws from."""
-    given = table.get("target")
-    return [given] if isinstance(given, str) else _list(_table(table, "target"), "choice")
+        return [entry["name"] for _, entry in tables_of(self.raw, "targets") if isinstance(entry.get("name"), str)]
 
 
 # Names.
@@ -166,43 +135,27 @@ def _purpose(raw: Raw) -> Iterator[Fault]:
     elif raw.get("experiments") == [] or not (given or misspelt):
         what = "empty" if given else "missing"
         yield Fault("experiments", f"{what}; add [[experiments]] (which targets with which strokes) or [random]")
-    if "random" in raw and _table(raw, "rigs"):
+    if "random" in raw and table_of(raw, "rigs"):
         yield Fault("rigs", "given together with [random], whose samples have rigs of their own; remove one")
-    if _table(raw, "rigs") and not _table(raw, "rigs", "misalignment"):
+    if table_of(raw, "rigs") and not table_of(raw, "rigs", "misalignment"):
         yield Fault("rigs.misalignment", "draws nothing; add distributions of keys of [misalignment] or remove [rigs]")
-
-
-def _rooms(draft: _Draft) -> Iterator[Fault]:
-    """A recipe has boards, or generated rooms with spots that rays find."""
-    if "rooms" not in draft.raw:
-        if draft.raw.get("targets") in (None, []):
-            yield Fault(
-                "targets", "missing; add [[targets]] (boards with a laser spot), or [rooms] for generated rooms"
-            )
-        return
-    if draft.raw.get("targets"):
-        yield Fault("targets", "given together with [rooms]; generated rooms have no boards, remove [[targets]]")
-    if "room" in draft.raw:
-        yield Fault("room", "given together with [rooms]; give one or the other")
-    if "random" not in draft.raw:
-        yield Fault("rooms", "given without [random]; generated rooms are for samples that are drawn")
-    elif "azimuth_deg" not in _table(draft.raw, "random", "spot"):
-        yield Fault("random.spot.azimuth_deg", "missing; in generated rooms a ray finds the spot, give its azimuth_deg")
 
 
 def _names(draft: _Draft) -> Iterator[Fault]:
     """Names that are given twice, and names of targets that are not there."""
     for key in ("targets", "experiments"):
         first: dict[str, int] = {}
-        for i, entry in _tables(draft.raw, key):
+        for i, entry in tables_of(draft.raw, key):
             name = entry.get("name")
             # names that differ by case only are refused too: they become file names
             if isinstance(name, str) and (earlier := first.setdefault(name.casefold(), i)) != i:
                 yield Fault(f"{key}[{i}].name", f"'{name}' is also the name of {key}[{earlier}]; rename one of them")
     known = draft.names
-    if len(known) < len(_list(draft.raw, "targets")) or not known:
+    if len(known) < len(list_of(draft.raw, "targets")) or not known:
         return  # a target without a name is a fault of its own
-    wanted = [(f"experiments[{i}].targets", _list(entry, "targets")) for i, entry in _tables(draft.raw, "experiments")]
+    wanted = [
+        (f"experiments[{i}].targets", list_of(entry, "targets")) for i, entry in tables_of(draft.raw, "experiments")
+    ]
     for path, names in (*wanted, *_choices(draft.raw)):
         for j, name in enumerate(names):
             if isinstance(name, str) and name not in known:
@@ -211,15 +164,15 @@ def _names(draft: _Draft) -> Iterator[Fault]:
 
 def _choices(raw: Raw) -> Iterator[tuple[str, list[Any]]]:
     """Lists of boards that are drawn from, with their paths."""
-    yield "random.spot.target.choice", _boards(_table(raw, "random", "spot"))
-    for i, entry in _tables(raw, "distractors"):
-        yield f"distractors[{i}].target.choice", _boards(entry)
+    yield "random.spot.target.choice", boards_of(table_of(raw, "random", "spot"))
+    for i, entry in tables_of(raw, "distractors"):
+        yield f"distractors[{i}].target.choice", boards_of(entry)
 
 
 def _repeats(raw: Raw) -> Iterator[Fault]:
-    experiments = _tables(raw, "experiments")
-    lists = [(f"experiments[{i}].{key}", _list(e, key)) for i, e in experiments for key in ("targets", "strokes_m")]
-    for path, values in (*lists, *_choices(raw), ("frames.presets", _list(_table(raw, "frames"), "presets"))):
+    experiments = tables_of(raw, "experiments")
+    lists = [(f"experiments[{i}].{key}", list_of(e, key)) for i, e in experiments for key in ("targets", "strokes_m")]
+    for path, values in (*lists, *_choices(raw), ("frames.presets", list_of(table_of(raw, "frames"), "presets"))):
         for j, value in enumerate(values):
             if value in values[:j]:
                 yield Fault(f"{path}[{j}]", f"{value!r} is listed twice; remove one")
@@ -229,13 +182,13 @@ def _repeats(raw: Raw) -> Iterator[Fault]:
 
 
 def _draws(draft: _Draft) -> Iterator[Fault]:
-    for key in _table(draft.raw, "random", "rig"):
+    for key in table_of(draft.raw, "random", "rig"):
         if key in RigTable.model_fields and key not in DRAWABLE:
             why = (
                 "is not a number" if key in ("preset", "laser_filter_response") else "must be the same for all samples"
             )
             yield Fault(f"random.rig.{key}", f"cannot be drawn, it {why}; set {key} in [rig]")
-    spot = _table(draft.raw, "random", "spot")
+    spot = table_of(draft.raw, "random", "spot")
     ray, on_board = ([key for key in keys if key in spot] for keys in (_BY_RAY, _ON_BOARD))
     if ray and on_board:
         text = f"{', '.join(on_board)} (on a board) and {', '.join(ray)} (by a ray) are both given"
@@ -256,10 +209,10 @@ def _draws(draft: _Draft) -> Iterator[Fault]:
 
 def _off_board(spot: Raw, laser: LaserTable, targets: Sequence[TargetTable]) -> Iterator[Fault]:
     """Distributions that reach beyond where a spot of the drawn boards is wholly on its board."""
-    chosen = _boards(spot)
+    chosen = boards_of(spot)
     drawn = [target for target in targets if not chosen or target.name in chosen]
     for axis, key in enumerate(("across_m", "up_m") if drawn else ()):
-        table = _distribution(spot.get(key, 0.0))
+        table = distribution_of(spot.get(key, 0.0))
         if table is None:
             continue
         farthest = max(map(abs, table.support))
@@ -274,7 +227,7 @@ def _off_board(spot: Raw, laser: LaserTable, targets: Sequence[TargetTable]) -> 
 
 def _off_wall(path: str, given: object, room: RoomTable | None) -> Iterator[Fault]:
     """Heights of rays below the floor or above the lamps."""
-    table = _distribution(given)
+    table = distribution_of(given)
     if table is None or room is None:
         return
     (low, high), limit_m = table.support, ceiling_m(build_room(room, ()))
@@ -285,9 +238,9 @@ def _off_wall(path: str, given: object, room: RoomTable | None) -> Iterator[Faul
 
 def _frames(raw: Raw) -> Iterator[Fault]:
     """Numbers of `[frames]` that the sensor does not take; its ranges are its own."""
-    frames = _table(raw, "frames")
+    frames = table_of(raw, "frames")
     for key in (*SENSOR_KEYS, "exposure_s"):
-        table = _distribution(frames.get(key))
+        table = distribution_of(frames.get(key))
         for value in dict.fromkeys(table.support) if table is not None else ():
             if key == "jpeg_quality" and value != int(value):
                 continue  # told by the table
@@ -298,7 +251,7 @@ def _frames(raw: Raw) -> Iterator[Fault]:
 
 
 def _distractors(draft: _Draft) -> Iterator[Fault]:
-    for i, table in _tables(draft.raw, "distractors"):
+    for i, table in tables_of(draft.raw, "distractors"):
         path, given = f"distractors[{i}]", [key for key in (*_BY_RAY, "distance_m") if key in table]
         if given and "target" in table:
             text = f"given together with {', '.join(given)} (a ray); give one or the other"
@@ -335,10 +288,12 @@ def _rig(draft: _Draft) -> Iterator[Fault]:
             yield Fault("rig", str(error))
     if draft.rig is None or rig is None:
         return
-    yield from _cells(rig, _sound(draft.raw.get("ambient", {}), AmbientTable))
+    yield from _cells(rig, sound_of(draft.raw.get("ambient", {}), AmbientTable))
     too_high = None if room is None else _height(draft.rig, rig, room)
     if too_high is not None:
         yield too_high
+    if "rooms" in draft.raw:
+        yield from low_rooms(draft.raw, rig)
     if not rig.in_image():
         yield Fault("rig", "the mirror is outside of the image; move it or the principal point")
     elif draft.misalignment is not None:
@@ -354,8 +309,8 @@ def _true_rig(
     """Faults of the true rig; no strokes are judged where `room` is None."""
     strokes = [
         (f"experiments[{i}].strokes_m[{j}]", stroke_m)
-        for i, experiment in _tables(raw, "experiments")
-        for j, stroke_m in enumerate(_list(experiment, "strokes_m"))
+        for i, experiment in tables_of(raw, "experiments")
+        for j, stroke_m in enumerate(list_of(experiment, "strokes_m"))
         if type(stroke_m) in (int, float) and 0.0 < stroke_m <= MAX_STROKE_M
     ]
     try:

@@ -5,22 +5,24 @@ A value is the quantile of a number u in [0, 1), so any sequence of points in th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import (
-    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
     Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
     TypeAdapter,
     ValidationError,
     ValidationInfo,
     field_validator,
     model_validator,
 )
+from pydantic_core import CoreSchema, core_schema
 from scipy.special import ndtr, ndtri
 
 from phibench.scenes.frames import Array
@@ -117,9 +119,35 @@ Distribution = Annotated[
 ]
 
 
-def values_of(kind: Any) -> AfterValidator:
-    """Make a validator of distributions whose values are all of a type, such as ``Annotated[float, Field(gt=0.0)]``."""
+def is_whole(table: DistributionTable) -> DistributionTable:
+    """Return a distribution of whole numbers; any other is a fault."""
+    if table.choice is None or any(value != int(value) for value in table.choice):
+        raise ValueError("must be a whole number or a choice of whole numbers, such as { choice = [60, 75, 90] }")
+    return table
+
+
+class ValuesOf:
+    """Validator of distributions whose values are all of a type, such as ``Annotated[float, Field(gt=0.0)]``.
+
+    The JSON schema tells the range of the values by the key `values`.
+    """
+
+    def __init__(self, check: Callable[[DistributionTable], DistributionTable], words: str) -> None:
+        self._check, self._words = check, words
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Schema of the annotated type, and the check after it."""
+        return core_schema.no_info_after_validator_function(self._check, handler(source))
+
+    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        """JSON schema of the annotated type, and the range of its values."""
+        return {**handler(core), "values": self._words}
+
+
+def values_of(kind: Any, whole: bool = False) -> ValuesOf:
+    """Make a validator of distributions whose values are all of a type, and whole numbers where that is asked for."""
     adapter = TypeAdapter(kind)
+    words = allowed(schema_node(adapter.json_schema(), ()))
 
     def is_sound(value: float) -> bool:
         try:
@@ -130,11 +158,10 @@ def values_of(kind: Any) -> AfterValidator:
 
     def check(table: DistributionTable) -> DistributionTable:
         if faulty := [f"{value:g}" for value in dict.fromkeys(table.support) if not is_sound(value)]:
-            words = allowed(schema_node(adapter.json_schema(), ()))
             raise ValueError(f"reaches {' and '.join(faulty)}, which is not allowed; stay with {words}")
-        return table
+        return is_whole(table) if whole else table
 
-    return AfterValidator(check)
+    return ValuesOf(check, words.replace("a number", "a whole number") if whole else words)
 
 
 class TargetChoice(Table):

@@ -12,7 +12,9 @@ from typing import Any
 from phibench.datasets.errors import RecipeError
 from phibench.datasets.input_files import SETTINGS_BYTES, InputFile
 from phibench.datasets.recipe.checks import semantic_faults
+from phibench.datasets.recipe.room_checks import file_faults
 from phibench.datasets.recipe.tables import Recipe
+from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.scenes.validation import nearest, structural_faults
 
 RECIPES = Path(__file__).parents[1] / "recipes"
@@ -34,7 +36,13 @@ def load_recipe(path: str | Path) -> Recipe:
     RecipeError
         With one line per fault, all of them.
     """
-    return parse_recipe(recipe_text(path), str(find_recipe(path)))
+    return parse_recipe(recipe_text(path), str(find_recipe(path)), recipe_files(path))
+
+
+def recipe_files(path: str | Path) -> RoomFiles:
+    """Files of rooms of a recipe: they lie beside it, or in `rooms/` where it lies in a data set."""
+    folder = find_recipe(path).parent
+    return RoomFiles(folder / "rooms" if (folder / "dataset.json").is_file() else folder)
 
 
 def recipe_text(path: str | Path) -> str:
@@ -48,14 +56,17 @@ def recipe_text(path: str | Path) -> str:
     return _text(find_recipe(path))
 
 
-def parse_recipe(text: str, source: str = "recipe") -> Recipe:
-    """Check the TOML text of a recipe; `source` is what the error calls it."""
-    return check_recipe(_input_file(Path(source)).toml_of(text), source)
+def parse_recipe(text: str, source: str = "recipe", files: RoomFiles | None = None) -> Recipe:
+    """Check the TOML text of a recipe; `source` is what the error calls it.
+
+    The files of its rooms are looked for where `files` says in which folder they lie.
+    """
+    return check_recipe(_input_file(Path(source)).toml_of(text), source, files)
 
 
-def check_recipe(raw: dict[str, Any], source: str = "recipe") -> Recipe:
+def check_recipe(raw: dict[str, Any], source: str = "recipe", files: RoomFiles | None = None) -> Recipe:
     """Check a recipe that is a dict already."""
-    found = semantic_faults(raw)
+    found = [*semantic_faults(raw), *([] if files is None else file_faults(raw, files))]
     explained = {fault.path for fault in found}  # better than that the key is unknown
     faults = [*(f for f in structural_faults(Recipe, raw) if not (f.unknown and f.path in explained)), *found]
     if faults:

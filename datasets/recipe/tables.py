@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, create_model
+from pydantic import AfterValidator, Discriminator, Field, Tag, create_model
 
 from phibench.datasets.recipe.distributions import (
     Distribution,
@@ -16,12 +16,12 @@ from phibench.datasets.recipe.distributions import (
     Name,
     Table,
     Targets,
-    one_name,
+    is_whole,
     values_of,
 )
+from phibench.datasets.recipe.room_tables import RoomsTable, RoomTable
 from phibench.scenes.catalog import BOARD_SIZE_M
 from phibench.scenes.misalignment import PARAMETERS
-from phibench.scenes.worlds.properties import PROPERTIES, Property
 
 MIN_STROKE_M, MAX_STROKE_M = 1e-3, 10.0
 DatasetName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
@@ -44,12 +44,6 @@ _ONE = DistributionTable(choice=(1.0,))
 _HALF = DistributionTable(log_uniform=(0.05, 0.5))
 
 
-def _is_whole(table: DistributionTable) -> DistributionTable:
-    if table.choice is None or any(value != int(value) for value in table.choice):
-        raise ValueError("must be a whole number or a choice of whole numbers, such as { choice = [60, 75, 90] }")
-    return table
-
-
 def _albedo_tag(given: object) -> str:
     return "<surface>" if isinstance(given, str) else "<number>"
 
@@ -64,7 +58,7 @@ FluxRatio = Annotated[Distribution, values_of(Annotated[float, Field(ge=1e-6, le
 Diameter = Annotated[Distribution, values_of(Annotated[float, Field(ge=1e-6, le=min(BOARD_SIZE_M) / 2.0)])]
 Distance = Annotated[Distribution, values_of(Annotated[float, Field(ge=0.1, le=100.0)])]
 Elevation = Annotated[Distribution, values_of(Annotated[float, Field(ge=-89.0, le=89.0)])]
-WholeNumbers = Annotated[Distribution, AfterValidator(_is_whole)]
+WholeNumbers = Annotated[Distribution, AfterValidator(is_whole)]
 Exposure = Annotated[
     Annotated[Distribution, Tag("<distribution>")] | Annotated[Literal["auto"], Tag("<auto>")],
     Discriminator(_exposure_tag),
@@ -153,47 +147,6 @@ else:
             )
             for key, one in PARAMETERS.items()
         },
-    )
-
-
-class RoomTable(Table):
-    """`[room]`."""
-
-    name: Literal["lab", "dark"] = Field(default="lab", description="'dark' is the lab with every lamp off")
-
-
-def _property(entry: Property) -> Any:
-    """Field of a property's distribution, in its range or of its names."""
-    kind: Any
-    if entry.choices:
-        names: Any = Annotated[tuple[Literal[entry.choices], ...], Field(strict=False, min_length=1)]  # type: ignore[name-defined]
-        column: Any = (names, Field(description="names that are equally probable"))
-        kind = Annotated[create_model("NameChoice", __base__=Table, choice=column) | None, BeforeValidator(one_name)]
-    else:
-        kind = Annotated[Distribution, values_of(Annotated[float, Field(ge=entry.low, le=entry.high)])]
-        kind = (Annotated[kind, AfterValidator(_is_whole)] if entry.whole else kind) | None
-    ((law, values),) = entry.default.items()
-    words = ", ".join(f"{value:g}" if isinstance(value, float | int) else value for value in values)
-    return kind, Field(default=None, description=f"{entry.meaning}; else {law} [{words}]")
-
-
-if TYPE_CHECKING:
-    RoomPropertiesTable = Table
-else:
-    RoomPropertiesTable = create_model(
-        "RoomPropertiesTable",
-        __base__=Table,
-        __doc__="`[rooms.properties]`: distributions of a generated room's properties.",
-        **{name: _property(entry) for name, entry in PROPERTIES.items()},
-    )
-
-
-class RoomsTable(Table):
-    """`[rooms]`: generated rooms for the samples of `[random]`, which are dealt to them in turn."""
-
-    count: int = Field(default=1, ge=1, le=1_000_000, description="how many; sample i stands in room i modulo count")
-    properties: RoomPropertiesTable = Field(
-        default=RoomPropertiesTable(), description="distributions of what the rooms are like"
     )
 
 
@@ -376,7 +329,7 @@ class DistractorTable(Table):
     )
     probability: Probability = Field(default=1.0, description="part of the samples that have it")
     flux_ratio: FluxRatio = Field(
-        default=_HALF, description="its electrons relative to the spot's, in the image where that is more"
+        default=_HALF, description="its electrons over the spot's, in the image where that is more"
     )
     diameter_m: Diameter = Field(default=DistributionTable(choice=(0.005,)), description="diameter of the disc")
     target: Targets = Field(default=None, description="boards; all but the sample's own where no place is given")
@@ -403,9 +356,9 @@ class Recipe(Table):
     room: RoomTable = Field(default=RoomTable(), description="the room")
     laser: LaserTable = Field(default=LaserTable(), description="the laser")
     ambient: AmbientTable = Field(default=AmbientTable(), description="quality of the ambient layer")
-    rooms: RoomsTable | None = Field(default=None, description="generated rooms, instead of the one of [room]")
+    rooms: RoomsTable | None = Field(default=None, description="rooms of several kinds, instead of the one of [room]")
     targets: Annotated[tuple[TargetTable, ...], Field(strict=False)] = Field(
-        default=(), description="boards with a laser spot; generated rooms have none"
+        default=(), description="boards with a laser spot; the rooms of [rooms] have none"
     )
     experiments: Annotated[tuple[ExperimentTable, ...], Field(strict=False)] = Field(
         default=(), description="which targets with which strokes"

@@ -92,8 +92,8 @@ class MeshPart:
         return replace(self, name=name, triangles=self.triangles[chosen], paint=paint, light=light)
 
 
-def read_mesh(path: Path) -> tuple[MeshPart, ...]:
-    """Read the parts of a mesh file, in the order of their names.
+def read_mesh(path: Path, one_file: bool = False) -> tuple[MeshPart, ...]:
+    """Read the parts of a mesh file, in the order of their names; `one_file` refuses one that names others.
 
     Raises
     ------
@@ -107,7 +107,7 @@ def read_mesh(path: Path) -> tuple[MeshPart, ...]:
     try:
         with np.errstate(all="ignore"):
             plain = suffix.removeprefix(".") if suffix in (".obj", ".ply") else ""
-            parts = _parts_of_plain(file, plain) if plain else _parts_of_gltf(file, _Gltf(file))
+            parts = _parts_of_plain(file, plain, one_file) if plain else _parts_of_gltf(file, _Gltf(file), one_file)
     except DatasetError:
         raise
     except Exception as error:  # documents and arrays can contradict each other in any way
@@ -154,8 +154,8 @@ class _Folder:
     `trimesh` asks by `get` and by index.
     """
 
-    def __init__(self, file: InputFile, inside: dict[str, bytes] | None = None) -> None:
-        self.file, self.inside, self.fault = file, inside or {}, ""
+    def __init__(self, file: InputFile, one_file: bool, inside: dict[str, bytes] | None = None) -> None:
+        self.file, self.one_file, self.inside, self.fault = file, one_file, inside or {}, ""
         self.file_name = file.path.stem
 
     def get(self, name: str) -> bytes:
@@ -163,6 +163,8 @@ class _Folder:
         if name in self.inside:
             return self.inside[name]
         plain = urllib.parse.unquote(name.strip()).replace("\\", "/")
+        if self.one_file:
+            raise self._noted(f"names the file '{printable_line(plain)}', and here a mesh must be one file")
         folder = self.file.path.parent.resolve()
         path = (folder / plain).resolve()
         if not path.is_relative_to(folder):
@@ -262,8 +264,8 @@ def _corner_values(values: Any, geometry: Any, transform: Array) -> Array | None
 # OBJ and PLY.
 
 
-def _parts_of_plain(file: InputFile, kind: str) -> list[MeshPart]:
-    data, folder, pictures = file.read(), _Folder(file), _Pictures(file)
+def _parts_of_plain(file: InputFile, kind: str, one_file: bool) -> list[MeshPart]:
+    data, folder, pictures = file.read(), _Folder(file, one_file), _Pictures(file)
     scene = _load(file, data, kind, folder, **({"split_objects": True} if kind == "obj" else {}))
     parts = []
     for _, name, geometry, transform in _geometries(file, scene):
@@ -417,8 +419,8 @@ def _source(texture: dict[str, Any]) -> Any:
     return webp.get("source", texture.get("source"))
 
 
-def _parts_of_gltf(file: InputFile, document: _Gltf) -> list[MeshPart]:
-    folder, pictures = _Folder(file, document.inside), _Pictures(file)
+def _parts_of_gltf(file: InputFile, document: _Gltf, one_file: bool) -> list[MeshPart]:
+    folder, pictures = _Folder(file, one_file, document.inside), _Pictures(file)
     scene = _load(file, json.dumps(document.tree).encode(), "gltf", folder)
     parts = []
     for label, _, geometry, transform in _geometries(file, scene):

@@ -88,6 +88,8 @@ class MeshSettings:
     stroke_m : float
         Largest stroke for which the mirror's way is checked.
     name : str
+    one_file : bool
+        Refuse a file that names others, such as textures.
     """
 
     path: Path
@@ -102,6 +104,7 @@ class MeshSettings:
     plain_albedo: Vector = (0.5, 0.5, 0.5)
     stroke_m: float = 1.4
     name: str = "mesh"
+    one_file: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "path", Path(self.path))
@@ -144,7 +147,10 @@ def placed_parts(settings: MeshSettings) -> tuple[MeshPart, ...]:
         If the file cannot be read, the room's size is not plausible, there is no floor, or something is in the way.
     """
     with np.errstate(all="ignore"):  # a number beyond all measure fails the check of the extent
-        parts = [replace(part, vertices=_to_world(settings, part.vertices)) for part in read_mesh(settings.path)]
+        parts = [
+            replace(part, vertices=_to_world(settings, part.vertices))
+            for part in read_mesh(settings.path, settings.one_file)
+        ]
     _check_extent(settings, parts)
     floor = _floor_height(settings, parts)
     parts = [replace(part, vertices=part.vertices - np.array([0.0, 0.0, floor])) for part in parts]

@@ -1,15 +1,23 @@
 """Sources of rooms: what a room is made from, small enough for a task and a line of `rooms.jsonl`.
 
 A room of the catalogue is its name and its boards; a generated one its properties and the names of its random stream;
-a photographed room or a mesh its settings and the SHA-256 of its file. `room_of` builds the room, in any process.
+a photographed room or a mesh its settings and the SHA-256 of its file, whose name is relative to a folder. `room_of`
+builds the room, in any process, given the folder of the files there.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Literal
+from pathlib import Path
+from typing import Literal, cast
 
+from phibench.datasets.input_files import FILE_NAME
+from phibench.datasets.rooms.mesh_placement import MeshSettings
+from phibench.datasets.rooms.panorama_settings import PanoramaSettings
+from phibench.datasets.rooms.room_errors import RoomError
+from phibench.datasets.rooms.room_files import checked_file
 from phibench.scenes.catalog import ROOMS, Target
 from phibench.scenes.room import Room
 from phibench.scenes.validation import SceneError, nearest, printable_line
@@ -29,7 +37,7 @@ class NamedRoom:
     targets: tuple[Target, ...]
     kind: Literal["named"] = "named"
 
-    def build(self) -> Room:
+    def build(self, folder: Path | None = None) -> Room:
         """The room itself.
 
         Raises
@@ -50,7 +58,7 @@ class GeneratedRoom:
     stream: tuple[str | int, ...]
     kind: Literal["generated"] = "generated"
 
-    def build(self) -> Room:
+    def build(self, folder: Path | None = None) -> Room:
         """The room itself.
 
         Raises
@@ -61,10 +69,83 @@ class GeneratedRoom:
         return generate_room(self.properties, *self.stream)
 
 
-RoomSource = NamedRoom | GeneratedRoom
+@dataclass(frozen=True)
+class PanoramaRoom:
+    """A photographed room, on a box or on a mesh.
+
+    Parameters
+    ----------
+    settings : PanoramaSettings
+        Its paths are names of files, relative to a folder of room files.
+    sha256, mesh_sha256
+        Of these files; the second is "" on a box.
+    """
+
+    settings: PanoramaSettings
+    sha256: str
+    mesh_sha256: str = ""
+    kind: Literal["panorama"] = "panorama"
+
+    def __post_init__(self) -> None:
+        _require_names(self.settings.path, *(() if self.settings.mesh is None else (self.settings.mesh.path,)))
+
+    def build(self, folder: Path | None = None) -> Room:
+        """The room itself, of the files in a folder.
+
+        Raises
+        ------
+        RoomError
+            If a file is missing or another one, or no room can be made of it.
+        """
+        from phibench.datasets.rooms.panorama_room import panorama_room
+
+        path = checked_file(folder, self.settings.path.as_posix(), self.sha256)
+        mesh = self.settings.mesh
+        if mesh is not None:
+            mesh = replace(mesh, path=checked_file(folder, mesh.path.as_posix(), self.mesh_sha256), one_file=True)
+        return panorama_room(replace(self.settings, path=path, mesh=mesh))
+
+
+@dataclass(frozen=True)
+class MeshRoom:
+    """A room of a mesh file, whose path is a name relative to a folder of room files."""
+
+    settings: MeshSettings
+    sha256: str
+    kind: Literal["mesh"] = "mesh"
+
+    def __post_init__(self) -> None:
+        _require_names(self.settings.path)
+
+    def build(self, folder: Path | None = None) -> Room:
+        """The room itself, of the file in a folder.
+
+        Raises
+        ------
+        RoomError
+            If the file is missing or another one, or no room can be made of it.
+        """
+        from phibench.datasets.rooms.mesh_room import mesh_room
+
+        path = checked_file(folder, self.settings.path.as_posix(), self.sha256)
+        return mesh_room(replace(self.settings, path=path, one_file=True))
+
+
+def _require_names(*paths: Path) -> None:
+    for path in paths:
+        if re.fullmatch(FILE_NAME, path.as_posix()) is None:
+            raise RoomError(f"'{printable_line(str(path), 60)}' is no name of a file below the folder of room files")
+
+
+RoomSource = NamedRoom | GeneratedRoom | PanoramaRoom | MeshRoom
+SOURCES: dict[str, type[RoomSource]] = {
+    cast(str, kind.__dataclass_fields__["kind"].default): kind
+    for kind in (NamedRoom, GeneratedRoom, PanoramaRoom, MeshRoom)
+}
+"""Kinds of sources by the name that their documents have."""
 
 
 @lru_cache(maxsize=_KEPT)
-def room_of(source: RoomSource) -> Room:
-    """Room of a source; the last few are kept."""
-    return source.build()
+def room_of(source: RoomSource, folder: Path | None = None) -> Room:
+    """Room of a source, of files in a folder; the last few are kept."""
+    return source.build(folder)

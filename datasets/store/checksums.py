@@ -7,15 +7,20 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from pydantic import ValidationError
+
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.input_files import FILE_NAME, InputFile
+from phibench.datasets.input_files import FILE_NAME, InputFile, first_fault
+from phibench.datasets.recipe.room_tables import RoomsTable
+from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import read_info, read_manifest
 from phibench.datasets.store.files import require_file, sha256, write_text
 from phibench.datasets.store.leftovers import TEMPORARY_PREFIX
+from phibench.datasets.store.schema import DatasetInfo
 from phibench.datasets.store.stored_rooms import read_rooms
 from phibench.scenes.rig import POSITIONS
 
@@ -39,11 +44,31 @@ def data_files(folder: Path) -> list[str]:
     if info.room is None:
         names.add(schema.ROOMS)
     names.update(schema.light_map_file(room.room) for room in read_rooms(folder, info).infos.values() if room.lit)
+    names.update(schema.room_file(name) for name in _room_files(info))
     names.update(name for pose in info.poses for name in pose.files.values())
     names.update(schema.preview_file(row.sample_id) for row in rows)
     spots = (row.position(position) for row in rows for position in POSITIONS)
     names.update(spot.spot_file for spot in spots if spot.spot_file is not None)
     return sorted(names)
+
+
+def _room_files(info: DatasetInfo) -> Iterable[str]:
+    """Names of the files of rooms that the recipe of a data set gives."""
+    try:
+        rooms = info.recipe.get("rooms")
+        return () if rooms is None else RoomsTable.model_validate(rooms).pinned
+    except ValidationError as error:
+        raise DatasetError(f"{schema.INFO} is damaged: recipe.rooms.{first_fault(error)}") from error
+
+
+def held_room_files(folder: Path) -> RoomFiles:
+    """Files of rooms that a data set holds, with the SHA-256 that its list says; none are known without the list."""
+    listed: dict[str, str] = {}
+    with contextlib.suppress(DatasetError):
+        listed = read_checksums(folder)
+    head = schema.room_file("")
+    known = {name.removeprefix(head): digest for name, digest in listed.items() if name.startswith(head)}
+    return RoomFiles(folder / schema.ROOM_FILES, known)
 
 
 def strays(folder: Path) -> list[str]:

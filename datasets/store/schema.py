@@ -269,6 +269,7 @@ TABLE = "manifest.parquet"
 RECIPE = "recipe.toml"
 RIGS = "rigs.jsonl"
 ROOMS = "rooms.jsonl"
+ROOM_FILES = "rooms"
 CHECKSUMS = "SHA256SUMS"
 RUN = "run.json"
 LOG = "log.jsonl"
@@ -285,6 +286,11 @@ _TASK_FILE = re.compile(
     rf"lightmaps/{_ID}\.npz|lightmap\.npz|views/{_ID}/(ambient|truth)\.exr|views/{_ID}/preview\.png|"
     rf"spots/{_ID}-(down|up)\.exr|previews/{_ID}\.png"
 )
+
+
+def room_file(name: str) -> str:
+    """Copy of a file that the recipe names for a room."""
+    return f"{ROOM_FILES}/{name}"
 
 
 def light_map_file(room_id: str) -> str:

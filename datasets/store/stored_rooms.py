@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import cast
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.rooms.room_sources import ONLY_ROOM, RoomSource, room_of
+from phibench.datasets.rooms.room_sources import ONLY_ROOM, SOURCES, NamedRoom, RoomSource, room_of
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import from_json
 from phibench.datasets.store.files import read_rows
@@ -19,9 +18,10 @@ from phibench.scenes.validation import SceneError, nearest
 
 @dataclass(frozen=True)
 class Rooms:
-    """Rooms by id; each is built from its source when it is asked for."""
+    """Rooms by id; each is built from its source, and the files in `folder`, when it is asked for."""
 
     infos: dict[str, RoomInfo]
+    folder: Path | None = None
 
     def __len__(self) -> int:
         return len(self.infos)
@@ -39,7 +39,8 @@ class Rooms:
         """
         info = self.info(name)
         try:
-            room = room_of(from_json(cast(type[RoomSource], RoomSource), info.source))
+            kind: type[RoomSource] = SOURCES.get(str(info.source.get("kind")), NamedRoom)
+            room = room_of(from_json(kind, info.source), self.folder)
         except (DatasetError, SceneError) as error:
             raise DatasetError(f"{schema.ROOMS}: {name} cannot be built: {error}") from error
         if room.digest != info.digest:
@@ -58,7 +59,7 @@ class Rooms:
 class OldRooms(Rooms):
     """The only room of a data set of version 4 or 5, whose description holds it shape by shape."""
 
-    room: Room
+    room: Room = field(kw_only=True)
 
     def __getitem__(self, name: str) -> Room:
         self.info(name)
@@ -74,14 +75,14 @@ def read_rooms(folder: Path, info: DatasetInfo) -> Rooms:
         If the file is missing, or with the number of the first line that is not a room or names one again.
     """
     if info.room is None:
-        return Rooms(_once_each(folder / schema.ROOMS))
+        return Rooms(_once_each(folder / schema.ROOMS), folder / schema.ROOM_FILES)
     try:
         room = from_json(Room, info.room)
     except DatasetError as error:
         raise DatasetError(f"{folder / schema.INFO}: {error}; run `phibench dataset repair`") from error
     name = ONLY_ROOM
     row = RoomInfo(room=name, source={}, digest=room.digest, lit=room.lit, object_names=info.object_names)
-    return OldRooms({name: row}, room)
+    return OldRooms({name: row}, room=room)
 
 
 def _once_each(path: Path) -> dict[str, RoomInfo]:

@@ -91,7 +91,7 @@ def test_files() -> None:
         schema.CONTACT_SHEET,
     }
     single |= {schema.LOG, schema.JOURNAL, schema.RIGS, schema.SENSITIVITIES}
-    rooms = {schema.ROOMS, schema.light_map_file("room"), schema.light_map_file("ROOM")}
+    rooms = {schema.ROOMS, schema.room_file("FILE"), schema.light_map_file("room"), schema.light_map_file("ROOM")}
     assert said == views | spots | single | rooms | {schema.preview_file("SAMPLE")}
 
 

@@ -11,7 +11,8 @@ from PIL import Image
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.rooms.panorama_files import read_panorama
-from phibench.datasets.rooms.panorama_room import PanoramaSettings, panorama_room
+from phibench.datasets.rooms.panorama_room import panorama_room
+from phibench.datasets.rooms.panorama_settings import PanoramaSettings
 from phibench.estimator.calibration.mirror_ball import BallPhoto, find_ball, unwrap
 from phibench.estimator.cli.main import main
 

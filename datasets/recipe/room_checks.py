@@ -1,0 +1,139 @@
+"""Checks of the rooms in a recipe: which tables go together, places of camera and robot, heights, and the files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+from pydantic import ValidationError
+
+from phibench.datasets.recipe.distributions import DistributionTable
+from phibench.datasets.recipe.faulty_tables import Raw, distribution_of, table_of, tables_of
+from phibench.datasets.recipe.room_tables import GeometryTable, MeshTable, PanoramaTable, generated_count
+from phibench.datasets.rooms.room_errors import RoomError
+from phibench.datasets.rooms.room_files import RoomFiles
+from phibench.scenes.rig import Rig
+from phibench.scenes.validation import Fault, SceneError
+from phibench.scenes.worlds.properties import PROPERTIES
+
+_KINDS: tuple[tuple[str, type[PanoramaTable] | type[MeshTable]], ...] = (
+    ("panoramas", PanoramaTable),
+    ("meshes", MeshTable),
+)
+
+
+def room_faults(raw: Raw) -> Iterator[Fault]:
+    """Faults of the tables of rooms: a recipe has boards, or rooms with spots that rays find."""
+    if "rooms" not in raw:
+        if raw.get("targets") in (None, []):
+            yield Fault(
+                "targets", "missing; add [[targets]] (boards with a laser spot), or [rooms] for generated rooms"
+            )
+        return
+    if raw.get("targets"):
+        yield Fault("targets", "given together with [rooms], whose rooms have no boards; remove [[targets]]")
+    if "room" in raw:
+        yield Fault("room", "given together with [rooms]; give one or the other")
+    if "random" not in raw:
+        yield Fault("rooms", "given without [random]; rooms of their own are for samples that are drawn")
+    elif "azimuth_deg" not in table_of(raw, "random", "spot"):
+        yield Fault("random.spot.azimuth_deg", "missing; in these rooms a ray finds the spot, give its azimuth_deg")
+    yield from _counts(raw)
+    for path, one in _file_rooms(raw):
+        if text := _settings_fault(one, raw):
+            yield Fault(path, text)
+    yield from _ray_height(raw)
+
+
+def _counts(raw: Raw) -> Iterator[Fault]:
+    rooms = table_of(raw, "rooms")
+    others = sum(len(tables_of(rooms, key)) for key, _ in _KINDS)
+    if rooms.get("count") == 0 and type(rooms["count"]) is int and not others:
+        text = "0, and there are no panoramas or meshes; give 1 or more, or [[rooms.panoramas]] or [[rooms.meshes]]"
+        yield Fault("rooms.count", text)
+    elif others and not rooms.get("count") and table_of(rooms, "properties"):
+        yield Fault("rooms.properties", "given, but no room is generated; give rooms.count above 0, or remove it")
+
+
+def _file_rooms(raw: Raw) -> Iterator[tuple[str, PanoramaTable | MeshTable]]:
+    """Sound tables of panoramas and meshes, with their paths; a faulty one is told by itself."""
+    for key, model in _KINDS:
+        for i, entry in tables_of(table_of(raw, "rooms"), key):
+            try:
+                yield f"rooms.{key}[{i}]", model.model_validate(entry)
+            except ValidationError:
+                continue
+
+
+def _settings_fault(one: PanoramaTable | MeshTable, raw: Raw) -> str:
+    """Sentence on numbers of which no room can be made; empty if there is none."""
+    try:
+        one.settings(_least_stroke_m(raw))
+    except SceneError as error:
+        return re.sub(r"\b(PanoramaSettings|MeshSettings|MeshLamp)(\.|: )", "", str(error))
+    return ""
+
+
+# Heights.
+
+
+def low_rooms(raw: Raw, rig: Rig) -> Iterator[Fault]:
+    """Rooms whose ceiling the mirror's top reaches with the shortest stroke; longer ones are drawn again."""
+    stroke_m = _least_stroke_m(raw)
+    top_m = float(rig.at(stroke_m).sphere_centre_m[2]) + rig.mirror.bound_m
+    with_it = f"the mirror's top is at {top_m:.2f} m with the shortest stroke of [random], {stroke_m:g} m"
+    for path, height_m in _heights(raw):
+        if height_m <= top_m:
+            text = f"the ceiling can be at {height_m:g} m, and {with_it}"
+            yield Fault(path, f"{text}; make the room higher or the stroke shorter")
+
+
+def _heights(raw: Raw) -> Iterator[tuple[str, float]]:
+    """Path and least height of generated rooms and of boxes."""
+    rooms = table_of(raw, "rooms")
+    others, count = sum(len(tables_of(rooms, key)) for key, _ in _KINDS), rooms.get("count")
+    if generated_count(count if isinstance(count, int) else None, others):
+        default = DistributionTable.model_validate(dict(PROPERTIES["height_m"].default))
+        table = distribution_of(table_of(rooms, "properties").get("height_m")) or default
+        yield "rooms.properties.height_m", table.support[0]
+    for path, one in _file_rooms(raw):
+        if isinstance(one, PanoramaTable) and one.box_m is not None and not _settings_fault(one, raw):
+            yield f"{path}.box_m", one.box_m[4]
+
+
+def _ray_height(raw: Raw) -> Iterator[Fault]:
+    table = distribution_of(table_of(raw, "random", "spot").get("height_m"))
+    if table is None:
+        return
+    (low, high), limit_m = table.support, min((height for _, height in _heights(raw)), default=float("inf"))
+    if low <= 0.0 or high >= limit_m:
+        text = f"reaches from {low:g} to {high:g} m, beyond floor or ceiling"
+        yield Fault("random.spot.height_m", f"{text}; stay above 0 and below {limit_m:g}")
+
+
+def _least_stroke_m(raw: Raw) -> float:
+    table = distribution_of(table_of(raw, "random").get("stroke_m"))
+    return 0.0 if table is None else max(table.support[0], 0.0)
+
+
+# Files.
+
+
+def file_faults(raw: Raw, files: RoomFiles) -> Iterator[Fault]:
+    """Files of rooms that are missing, too large, or not those of the stated SHA-256."""
+    for path, one in _file_rooms(raw):
+        yield from _file_fault(path, one, files)
+        if isinstance(one, PanoramaTable) and one.mesh is not None:
+            yield from _file_fault(f"{path}.mesh", one.mesh, files)
+
+
+def _file_fault(path: str, one: PanoramaTable | GeometryTable, files: RoomFiles) -> Iterator[Fault]:
+    try:
+        found = RoomFiles(files.folder).sha256(one.file)
+    except RoomError as error:
+        yield Fault(f"{path}.file", str(error))
+        return
+    wanted = one.sha256 or files.digests.get(one.file, found)
+    if found != wanted:
+        text = f"is not that of {one.file}, which has {found}"
+        yield Fault(f"{path}.sha256", f"{text}; put the right file there, or correct the number")

@@ -1,0 +1,76 @@
+"""Files of rooms: panoramas and meshes that a recipe names, below one folder, each with the SHA-256 that it must have.
+
+The folder is the recipe's own. A data set keeps a copy of each file in its folder `rooms/`, by the same names.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from phibench.datasets.input_files import MIB, InputFile
+from phibench.datasets.rooms.room_errors import RoomError
+
+LARGEST_BYTES = 64 * MIB
+
+
+@dataclass(frozen=True)
+class RoomFiles:
+    """Folder of room files, and what is known of them.
+
+    Parameters
+    ----------
+    folder : Path or None
+        None where nobody knows it: then no file can be read.
+    digests : mapping
+        SHA-256 by name, relative to the folder; what is not in it has the one that its file has.
+    """
+
+    folder: Path | None = None
+    digests: Mapping[str, str] = field(default_factory=dict)
+
+    def sha256(self, name: str) -> str:
+        """SHA-256 that a file must have.
+
+        Raises
+        ------
+        RoomError
+            If it is not known and the file cannot be read.
+        """
+        return self.digests.get(name) or hashlib.sha256(_data(self.folder, name)).hexdigest()
+
+    def of(self, names: Iterable[str]) -> RoomFiles:
+        """Some of the files, whose SHA-256 are all known."""
+        return replace(self, digests={name: self.sha256(name) for name in dict.fromkeys(names)})
+
+
+def checked_data(folder: Path | None, name: str, sha256: str) -> bytes:
+    """Bytes of a file.
+
+    Raises
+    ------
+    RoomError
+        If it is missing, larger than 64 MiB, or not the file with that SHA-256.
+    """
+    data = _data(folder, name)
+    if (found := hashlib.sha256(data).hexdigest()) != sha256:
+        raise RoomError(
+            f"{folder}/{name} is another file than the room was made from: its SHA-256 begins with {found[:12]}, not "
+            f"{sha256[:12]}; put the right file back"
+        )
+    return data
+
+
+def checked_file(folder: Path | None, name: str, sha256: str) -> Path:
+    """Path of a file; raises `RoomError` as `checked_data`."""
+    checked_data(folder, name, sha256)
+    assert folder is not None
+    return folder / name
+
+
+def _data(folder: Path | None, name: str) -> bytes:
+    if folder is None:
+        raise RoomError(f"the file '{name}' of a room is needed, and nobody says in which folder it is; give a folder")
+    return InputFile(folder / name, "put it there", RoomError, LARGEST_BYTES).read()

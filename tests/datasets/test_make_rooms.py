@@ -1,0 +1,121 @@
+"""Data sets with rooms of three kinds, generated, photographed and of a mesh: whole, without their files, damaged."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.inline_workers import InlineWorkerPool, make_inline
+from helpers.processes import quiet
+from helpers.room_files import KINDS_TOML, write_files
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.make import make
+from phibench.datasets.merge_repair import merge, repair
+from phibench.datasets.plan.plan import make_plan
+from phibench.datasets.read import open_finished
+from phibench.datasets.recipe.load import load_recipe, recipe_files
+from phibench.datasets.store.checksums import data_files, read_checksums
+from phibench.datasets.verify import verify
+
+IDS = ["room000000", "panorama000000", "mesh000000"]
+FILES = ["rooms/meshes/hall.glb", "rooms/office.png"]
+
+
+@pytest.fixture(scope="module")
+def recipe(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Recipe beside its files. Read only."""
+    path = write_files(tmp_path_factory.mktemp("kinds")) / "kinds.toml"
+    path.write_text(KINDS_TOML)
+    return path
+
+
+@pytest.fixture(scope="module")
+def made(recipe: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Data set of the recipe. Read only: copy it to change it."""
+    return make_inline(recipe, tmp_path_factory.mktemp("made") / "out")
+
+
+@pytest.fixture
+def copy(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "copy"))
+
+
+def sentence(act: Callable[[], object]) -> str:
+    with pytest.raises(DatasetError) as caught:
+        act()
+    assert str(caught.value).isprintable()
+    return str(caught.value)
+
+
+def test_the_first_samples_show_all_kinds_and_the_set_verifies(made: Path) -> None:
+    dataset = open_finished(made)
+    assert [sample.row.room for sample in dataset] == list(dataset.rooms) == IDS
+    assert [info.source["kind"] for info in dataset.rooms.infos.values()] == ["generated", "panorama", "mesh"]
+    assert [sample.room.name for sample in dataset] == ["generated:kinds:0:room:0", "panorama", "mesh"]
+    assert all(sample.ambient("up").max() > 0.0 for sample in dataset)
+    assert [name for name in data_files(made) if name.startswith("rooms/")] == FILES
+    assert set(data_files(made)) == set(read_checksums(made))
+    report = verify(made, console=quiet())
+    assert (report.faults, report.notes) == ((), ())
+
+
+def test_images_and_truth_need_no_file_but_the_room_does(copy: Path) -> None:
+    shutil.rmtree(copy / "rooms")
+    dataset = open_finished(copy)
+    for sample in dataset:
+        assert np.isfinite(sample.expected_image("down")).all()
+        assert sample.truth("up")["object_id"].max() >= 0
+    assert dataset["random-000000"].room.name.startswith("generated")
+    for number, name in ((1, "office.png"), (2, "meshes/hall.glb")):
+        text = sentence(lambda number=number: dataset[number].room)  # type: ignore[misc]
+        assert text.startswith(f"rooms.jsonl: {IDS[number]} cannot be built: {copy}/rooms/{name} is missing")
+    faults = verify(copy, console=quiet()).faults
+    assert {f"{name} is missing" for name in FILES} <= set(faults)
+
+
+def test_a_changed_file_is_one_sentence_and_cannot_be_repaired(copy: Path) -> None:
+    (copy / FILES[1]).write_bytes((copy / FILES[1]).read_bytes() + b" ")
+    text = sentence(lambda: open_finished(copy)[1].room)
+    assert f"{FILES[1]} is another file than the room was made from" in text
+    assert f"{FILES[1]} is damaged: its SHA-256 is not the listed one" in verify(copy, console=quiet()).faults
+    assert f"{FILES[1]} is another file" in sentence(lambda: repair(copy, console=quiet()))
+
+
+def test_a_lost_copy_is_put_back_by_the_recipe_alone(copy: Path, recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is rendered again: all other files keep their times."""
+    (copy / FILES[0]).unlink()
+    before = {path: path.stat().st_mtime_ns for path in copy.rglob("*.exr")}
+    monkeypatch.setattr("phibench.datasets.make.WorkerPool", InlineWorkerPool)
+    make(recipe, copy, 1, quiet())
+    assert {path: path.stat().st_mtime_ns for path in copy.rglob("*.exr")} == before
+    assert verify(copy, truth_layers=False, console=quiet()).ok
+
+
+def test_the_recipe_of_a_data_set_finds_the_copies(made: Path, recipe: Path) -> None:
+    plans = [make_plan(load_recipe(path), recipe_files(path)) for path in (recipe, made / "recipe.toml")]
+    assert plans[0].rooms == plans[1].rooms
+    assert plans[0].pairs == plans[1].pairs
+
+
+def test_another_file_under_the_same_name_is_other_work(
+    copy: Path, recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("phibench.datasets.make.WorkerPool", InlineWorkerPool)
+    folder = Path(shutil.copytree(recipe.parent, tmp_path / "other"))
+    (folder / "office.png").write_bytes((folder / "office.png").read_bytes() + b" ")
+    text = sentence(lambda: make(folder / "kinds.toml", copy, 1, quiet()))
+    assert "finished tasks" in text
+    assert "--replace" in text
+    assert verify(copy, truth_layers=False, console=quiet()).ok
+
+
+@pytest.mark.slow
+def test_two_workers_and_merged_shards_give_the_same_bytes(made: Path, recipe: Path, tmp_path: Path) -> None:
+    make(recipe, tmp_path / "two", 2, quiet())
+    shards = [make(recipe, tmp_path / f"shard{i}", 2, quiet(), shard=f"{i}/2") for i in (1, 2)]
+    merge(tmp_path / "merged", shards, quiet())
+    assert all(verify(shard, truth_layers=False, console=quiet()).ok for shard in shards)
+    for other in ("two", "merged"):
+        assert read_checksums(tmp_path / other) == read_checksums(made)
