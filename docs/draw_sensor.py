@@ -27,8 +27,9 @@ from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.electrons import collected, expected_electrons, mean_charge
 from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.noise_tiles import NoiseStream, frame_stream, whole_tiles
-from phibench.render.sensor.processing import compressed, linear_rgb, linear_signal, srgb_encoded
+from phibench.render.sensor.processing import compressed, linear_rgb, linear_signal
 from phibench.render.sensor.settings import Sensor, sensor
+from phibench.render.sensor.srgb import srgb_encoded
 
 _POSITION, _SIDE_PX, _ZOOM = "down", 24, 16
 _FOLDER = Path(__file__).parent

@@ -29,7 +29,7 @@ from phibench.datasets.rooms.mesh_placement import (
     placed_parts,
 )
 from phibench.datasets.rooms.room_errors import RoomError
-from phibench.render.sensor.processing import srgb_decoded
+from phibench.render.sensor.srgb import srgb_decoded
 from phibench.scenes.frames import Array, Pose, as_matrix, as_vector
 from phibench.scenes.room import Room
 from phibench.scenes.shapes import Mesh, Rectangle, rectangle

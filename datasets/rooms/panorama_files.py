@@ -18,7 +18,7 @@ from PIL import ImageOps
 
 from phibench.datasets.input_files import PICTURE_PIXELS, InputFile, quiet_terminal
 from phibench.datasets.rooms.room_errors import RoomError
-from phibench.render.sensor.processing import srgb_decoded
+from phibench.render.sensor.srgb import srgb_decoded
 from phibench.scenes.validation import printable_line
 
 Light = NDArray[np.float32]

@@ -19,7 +19,8 @@ from PIL import Image, ImageDraw
 from phibench.datasets.store.files import write_bytes
 from phibench.datasets.store.schema import SpotRow
 from phibench.render.optics.truth import SpotTruth
-from phibench.render.sensor.processing import eight_bit, srgb_encoded
+from phibench.render.sensor.processing import eight_bit
+from phibench.render.sensor.srgb import srgb_encoded
 from phibench.scenes.camera import Detector
 
 # Layers as sRGB.

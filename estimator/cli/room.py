@@ -1,4 +1,4 @@
-"""Commands `phibench room`: files of which a room can be made."""
+"""Commands `phibench room`: files of which a room can be made, of photographs and of rooms."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from cyclopts import App, Parameter
 
 from phibench.estimator.cli.options import DATA, Whole
 
-room = App(name="room", group=DATA, help="Make rooms of photographs.")
+room = App(name="room", group=DATA, help="Make rooms of photographs, and files of rooms.")
 
 
 @room.command
@@ -84,4 +84,76 @@ def from_mirror_ball(
         f"{out}: {columns} x {rows} pixels of {360.0 / columns:.2g} degrees, scene {surroundings_m:g} m away; "
         f"{100.0 * float(panorama.seen.mean()):.1f} % is seen, the rest takes the nearest that is"
     )
+    return 0
+
+
+_Properties = Annotated[tuple[str, ...], Parameter(name="--set", negative="")]
+
+
+@room.command
+def panorama(
+    *,
+    out: Path,
+    point_m: Annotated[tuple[float, float, float], Parameter(negative="")],
+    room_name: Annotated[str | None, Parameter(name="--room")] = None,
+    seed: Whole | None = None,
+    properties: _Properties = (),
+    heading_deg: float = 0.0,
+    rows: Whole = 512,
+) -> int:
+    """Render a panorama of a generated room or of one of the catalogue, for rooms without a photograph.
+
+    The robot is left out. The table of a recipe that reads the file is printed.
+
+    Parameters
+    ----------
+    out
+        OpenEXR file to write, W/(m^2 sr).
+    point_m
+        Place of the camera: from the robot, x its front, z up from the floor.
+    room_name
+        Room of the catalogue, "lab"; without its boards.
+    seed
+        Number of a generated room, instead: a box along the world's axes unless --set says otherwise.
+    properties
+        A property of the generated room, such as height_m=2.6; once for each, the others are drawn.
+    heading_deg
+        Azimuth of the picture's middle column, from world x towards y.
+    rows
+        Rows of the panorama; it has twice as many columns.
+    """
+    from phibench.datasets.build.room_export import export_panorama, export_room
+
+    made = export_panorama(export_room(room_name, seed, properties, box=True), out, point_m, heading_deg, rows)
+    print(f"{made.path}: {2 * rows} x {rows} pixels; in a recipe:\n\n{made.table}")
+    return 0
+
+
+@room.command
+def mesh(
+    *,
+    out: Path,
+    room_name: Annotated[str | None, Parameter(name="--room")] = None,
+    seed: Whole | None = None,
+    properties: _Properties = (),
+) -> int:
+    """Write a generated room or one of the catalogue as glTF, with its textures and lamps.
+
+    The robot, the sun and glossy coats are left out. The table of a recipe that reads the file is printed.
+
+    Parameters
+    ----------
+    out
+        File to write, .glb.
+    room_name
+        Room of the catalogue, "lab"; without its boards.
+    seed
+        Number of a generated room, instead.
+    properties
+        A property of the generated room, such as height_m=2.6; once for each, the others are drawn.
+    """
+    from phibench.datasets.build.room_export import export_mesh, export_room
+
+    made = export_mesh(export_room(room_name, seed, properties), out)
+    print(f"{made.path}: {made.path.stat().st_size / 1e6:.1f} MB; in a recipe:\n\n{made.table}")
     return 0

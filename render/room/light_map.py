@@ -79,7 +79,11 @@ def bake(view: View, room: Room, settings: BakeSettings) -> LightMap:
     """Light map of a room; `view` only gives the origin of the scene's coordinates."""
     mi = activate()
     surfaces = Surfaces(mi, view, face_table(fixed_shapes(room)))
-    fine = Texels.of(mi, surfaces, TexelGrid.of(surfaces.table, settings.texel_m))
+    grid = TexelGrid.of(surfaces.table, settings.texel_m)
+    if not grid.count:  # all surfaces shine by themselves
+        none = np.zeros((0, 3), dtype=np.float32)
+        return LightMap(none, none, np.zeros(0, dtype=bool))
+    fine = Texels.of(mi, surfaces, grid)
     covered = covered_texels(mi, surfaces, fine, settings.texel_m)
     surfaces.set_light(fine.grid, np.zeros((len(fine), 3)))
     direct = direct_light(mi, surfaces, fine, room.sun, settings.lamp_rays, _SEED)

@@ -41,10 +41,10 @@ from phibench.render.sensor.processing import (
     linear_rgb,
     linear_signal,
     rendered,
-    srgb_encoded,
     white_balanced,
 )
 from phibench.render.sensor.settings import Sensor, SensorError
+from phibench.render.sensor.srgb import srgb_encoded
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
 

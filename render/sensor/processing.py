@@ -4,7 +4,7 @@ Planes R, G, B stand in the third axis from the end, shape (..., 3, H, W); the 8
 takes any number of leading axes and keeps float32, so that a fit can send many model images through at once. Pixels
 beyond the border are mirrored about the border pixel, which keeps the order of the mosaic's colours.
 
-The simulator's only sRGB curve, demosaicing and JPEG are here; the estimator has its own, in `spots/image_planes`.
+The simulator's only demosaicing and JPEG are here; the estimator has its own, in `spots/image_planes`.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from phibench.render.sensor.settings import Sensor
+from phibench.render.sensor.srgb import srgb_decoded, srgb_encoded
 from phibench.scenes.frames import Array
 
-_SRGB_KNEE, _SRGB_SLOPE = 0.0031308, 12.92  # IEC 61966-2-1
 Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -70,20 +70,6 @@ def colour_corrected(planes: Array, matrix: Matrix) -> Array:
     r, g, b = (planes[..., i, :, :] for i in range(3))
     m = np.asarray(matrix, planes.dtype)
     return np.stack([m[i, 0] * r + m[i, 1] * g + m[i, 2] * b for i in range(3)], axis=-3)
-
-
-def srgb_encoded(linear: Array) -> Array:
-    """sRGB curve of values cut to [0, 1] (IEC 61966-2-1)."""
-    x = np.clip(linear, 0.0, 1.0)
-    # constants in the input's own type: float32 stays float32
-    curve = x.dtype.type(1.055) * np.power(x, x.dtype.type(1.0 / 2.4)) - x.dtype.type(0.055)
-    return np.where(x <= _SRGB_KNEE, x * x.dtype.type(_SRGB_SLOPE), curve)
-
-
-def srgb_decoded(encoded: Array) -> Array:
-    """Linear values of the sRGB curve, both in [0, 1]."""
-    x = np.asarray(encoded)
-    return np.where(x <= _SRGB_KNEE * _SRGB_SLOPE, x / _SRGB_SLOPE, ((x + 0.055) / 1.055) ** 2.4)
 
 
 def sharpened(planes: Array, amount: float) -> Array:

@@ -32,7 +32,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "properties of no room": ({"count": 0, "properties": {"lamps": 2}}, "rooms.properties: given, but no room is"),
     "a file elsewhere": (panorama(file="../office.png"), "rooms.panoramas[0].file: '../office.png' is no file beside"),
     "a file of the system": (panorama(file="/etc/passwd"), "rooms.panoramas[0].file: '/etc/passwd' is no file beside"),
-    "no file": (panorama("file"), "rooms.panoramas[0].file: missing; add a string (name of the file"),
+    "no file": (panorama("file"), "rooms.panoramas[0].file: missing; add a string (file in the recipe"),
     "no camera": (panorama("point_m"), "rooms.panoramas[0].point_m: missing; add a list of 3"),
     "camera outside": (
         panorama(point_m=[0.0, 1.98, 1.4]),

@@ -1,0 +1,150 @@
+"""Rooms as files: a panorama from a point of a room, and a mesh of it; of rooms that need nobody else's file.
+
+Both come with the table of a recipe that reads them. The robot is left out: it stands in every room by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from phibench.datasets.build.light_map_cache import light_map
+from phibench.datasets.rooms.gltf_export import glb_of
+from phibench.datasets.rooms.room_errors import RoomError
+from phibench.datasets.rooms.room_sources import NamedRoom
+from phibench.datasets.store.files import require_writable, write_bytes
+from phibench.datasets.store.layers import write_exr
+from phibench.render.room.light_map import BakeSettings
+from phibench.scenes.catalog import default_rig
+from phibench.scenes.faces import face_table
+from phibench.scenes.frames import Vector
+from phibench.scenes.room import Room
+from phibench.scenes.validation import finite_vector, printable_line, within
+from phibench.scenes.worlds.generated_room import generate_room
+from phibench.scenes.worlds.properties import PROPERTIES, drawn_properties
+
+SETTINGS = BakeSettings(texel_m=0.05, indirect_texel_m=0.1, lamp_rays=32, bounces=8, bounce_rays=32, final_rays=128)
+_BOX: dict[str, float | str] = {"heading_deg": 0.0, "l_shape": 0.0}
+_LEAST_ROWS, _MOST_ROWS = 16, 4096
+_CLOSED = 0.75  # part of the directions from a point of a room that meet a surface
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A file of a room, and the table of a recipe that reads it."""
+
+    path: Path
+    table: str
+
+
+def export_room(name: str | None, seed: int | None, properties: Sequence[str] = (), *, box: bool = False) -> Room:
+    """Room of the catalogue without boards, or a generated one, without the robot.
+
+    Parameters
+    ----------
+    name, seed : one of them
+    properties : texts such as ``height_m=2.6``
+        Of a generated room; others are drawn.
+    box : bool
+        Its walls are a box along the world's axes unless `properties` say otherwise: what a panorama is laid on.
+
+    Raises
+    ------
+    SceneError
+        If there is no such room or property.
+    """
+    if (name is None) == (seed is None):
+        raise RoomError("give --room for a room of the catalogue, or --seed for a generated one, one of them")
+    if name is not None:
+        if properties:
+            raise RoomError("--set is for generated rooms; leave it out, or give --seed instead of --room")
+        return replace(NamedRoom(name, ()).build(), robot=False)
+    stream = ("export", int(seed or 0))
+    fixed = (dict(_BOX) if box else {}) | dict(_property(text) for text in properties)
+    return replace(generate_room(drawn_properties(*stream, **fixed), *stream), robot=False)
+
+
+def _property(text: str) -> tuple[str, float | str]:
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise RoomError(f"--set {printable_line(text, 60)}: give a property and its value, such as height_m=2.6")
+    if key in PROPERTIES and PROPERTIES[key].choices:
+        return key, PROPERTIES[key].checked(value)
+    try:
+        return key, float(value)
+    except ValueError:
+        raise RoomError(f"--set {printable_line(text, 60)}: the value must be a number") from None
+
+
+def export_panorama(
+    room: Room, out: Path, point_m: Vector, heading_deg: float = 0.0, rows: int = 512, settings: BakeSettings = SETTINGS
+) -> Exported:
+    """Write the radiance at a point of a room, W/(m^2 sr), as an OpenEXR file of `rows` x 2 `rows` pixels.
+
+    Raises
+    ------
+    RoomError
+        If the point is not inside the room, or the file cannot be a panorama.
+    """
+    from phibench.render.room.equirectangular import equirectangular
+
+    if out.suffix.lower() != ".exr":
+        raise RoomError(f"{out}: a panorama is written as OpenEXR; give a name that ends in .exr")
+    require_writable(out)
+    point_m = finite_vector("panorama", "point_m", point_m, 3)
+    within("panorama", "heading_deg", heading_deg, -360.0, 360.0)
+    within("panorama", "rows", rows, _LEAST_ROWS, _MOST_ROWS)
+    if (solid := room.solid_around(point_m)) is not None:
+        raise RoomError(f"point_m = {point_m}: the camera would be inside '{solid}'; move it into the open")
+    view = default_rig().at(0.0)
+    light = light_map(view, room, settings)
+    radiance, closed = equirectangular(view, room, light, settings, point_m, heading_deg, rows)
+    if closed < _CLOSED or radiance.max() <= 0.0:
+        text = "shows no light" if closed >= _CLOSED else f"is open in {100.0 * (1.0 - closed):.0f} % of all directions"
+        raise RoomError(f"point_m = {point_m}: the room {text} from there; give a point inside a lit room, metres")
+    header = {"kind": "panorama", "room": room.name, "point_m": list(point_m), "heading_deg": heading_deg}
+    write_exr(out, {name: radiance[..., k] for k, name in enumerate("RGB")}, header)
+    low, high = bounds_m(room)
+    box = [float(low[0]), float(high[0]), float(low[1]), float(high[1]), float(high[2])]
+    lines = (
+        "[[rooms.panoramas]]",
+        f'file = "{out.name}"',
+        f"point_m = {[float(x) for x in point_m]}",
+        f"heading_deg = {heading_deg}",
+        f"box_m = {[round(x, 4) for x in box]}  # around all surfaces",
+        "radiance_scale = 1.0  # the file holds W/(m^2 sr)",
+    )
+    return Exported(out, "\n".join(lines))
+
+
+def export_mesh(room: Room, out: Path) -> Exported:
+    """Write a room as glTF, textures inside, lamps and screens as emission.
+
+    Raises
+    ------
+    RoomError
+        If the name is not that of a `.glb` file.
+    """
+    if out.suffix.lower() != ".glb":
+        raise RoomError(f"{out}: a mesh is written as binary glTF; give a name that ends in .glb")
+    require_writable(out)
+    write_bytes(out, glb_of(room))
+    lines = (
+        "[[rooms.meshes]]",
+        f'file = "{out.name}"',
+        "metres_per_unit = 1.0",
+        'up_axis = "y"',
+        "floor_point = [0.0, 0.0, 0.0]",
+        "emission_w_m2_sr = 1.0  # the file holds W/(m^2 sr)",
+        "largest_albedo = 1.0",
+    )
+    return Exported(out, "\n".join(lines))
+
+
+def bounds_m(room: Room) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner of all surfaces of a room, metres."""
+    corners = face_table((*room.surfaces, *room.furniture)).corners_m.reshape(-1, 3)
+    return corners.min(axis=0), corners.max(axis=0)
