@@ -263,7 +263,7 @@ class RandomSpotTable(Table):
         default=None, description="share of samples whose spot is hidden in one image; the others show it in both"
     )
     hidden_elevation_deg: Elevation | None = Field(
-        default=None, description="instead of elevation_deg for those samples: floor beside the robot, ceiling above it"
+        default=None, description="instead of elevation_deg for those samples"
     )
 
     @property

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from phibench.datasets.plan.plan import Plan, make_plan
-from phibench.datasets.plan.sampling import HIDDEN, draw_rooms
+from phibench.datasets.plan.room_draws import draw_rooms
+from phibench.datasets.plan.sampling import HIDDEN
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.rooms.room_sources import room_of
