@@ -236,6 +236,13 @@ class Sample:
         return self.dataset.rigs[self.row.rig]
 
     @property
+    def object_names(self) -> tuple[str, ...]:
+        """Name by `object_id` of the truth layers: those of the room, then the parts of the rig's holder."""
+        holder = self.rig.holder
+        of_room = self.dataset.rooms.info(self.row.room).object_names
+        return of_room if holder is None else (*of_room, *holder.part_names)
+
+    @property
     def nominal_rig(self) -> Rig:
         """Nominal rig, which estimators are given with `row.nominal_stroke_m`; the true one without misalignment."""
         return self.dataset.rigs[self.row.nominal_rig]

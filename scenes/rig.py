@@ -17,8 +17,10 @@ import numpy as np
 
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector
+from phibench.scenes.holder import Holder, holder_shapes
 from phibench.scenes.mirror import Form, SphereMirror, deviation, level
 from phibench.scenes.misalignment import Misalignment, Motion
+from phibench.scenes.shapes import Cuboid, Prism
 from phibench.scenes.validation import SceneError, finite, positive, unit_vector
 
 _STEPS = 8  # Newton's method starts within the form's slopes, some 1e-3 rad
@@ -100,6 +102,8 @@ class Rig:
         Direction of the stroke, made a unit vector.
     motion : Motion or None
         What else moves the rig between the two images: it holds at every carriage position but down.
+    holder : Holder or None
+        What carries the mirror; None is nothing that is seen.
     """
 
     camera: Camera = field(default_factory=Camera)
@@ -108,6 +112,7 @@ class Rig:
     T_camera_sphere: Pose = Pose("camera", "sphere", (0.0, 0.0, 0.26))
     stroke_axis_world: Vector = (0.0, 0.0, 1.0)
     motion: Motion | None = None
+    holder: Holder | None = None
 
     def __post_init__(self) -> None:
         axis = unit_vector("Rig", "stroke_axis_world", self.stroke_axis_world)
@@ -122,11 +127,23 @@ class Rig:
                 f"Rig.T_camera_sphere: the sphere centre is {self.T_camera_sphere.translation_m[2]:.4f} m in front of "
                 f"the camera; it must be more than the mirror radius {radius:.4f} m"
             )
+        if self.holder is not None:
+            self.holder.check(radius, self.camera.aperture_radius_m)
 
     @property
     def sphere_in_camera_m(self) -> Array:
         """Sphere centre in the camera frame, shape (3,), metres."""
         return self.T_camera_sphere.t
+
+    @property
+    def top_m(self) -> float:
+        """Height of the rig's highest part above the sphere centre: the mirror's top, or its holder's."""
+        return max(self.mirror.bound_m, 0.0 if self.holder is None else self.holder.top_m)
+
+    @property
+    def top_part(self) -> str:
+        """Name of the rig's highest part: "mirror" or "holder"."""
+        return "mirror" if self.holder is None else "holder"
 
     def at(self, offset_m: float) -> View:
         """Return the rig with its carriage moved by `offset_m` along the stroke axis."""
@@ -157,6 +174,7 @@ class Rig:
             T_camera_sphere=T_camera_sphere,
             stroke_axis_world=misalignment.stroke_axis(self.stroke_axis_world),
             motion=misalignment.motion(self.motion),
+            holder=self.holder,
         )
 
     def outline_px(self, count: int = 720) -> Array:
@@ -211,6 +229,14 @@ class View:
         if self.rig.mirror.form is not None:
             return self.T_world_sphere.R
         return np.eye(3) if self.motion is None else np.array(self.motion.rotation)
+
+    @cached_property
+    def holder_shapes(self) -> tuple[Prism | Cuboid, ...]:
+        """Shapes of the mirror's holder, in the world."""
+        rig = self.rig
+        if rig.holder is None:
+            return ()
+        return holder_shapes(rig.holder, self.T_world_camera, self.sphere_centre_m, rig.mirror.radius_m)
 
     @property
     def camera_centre_m(self) -> Array:

@@ -2,8 +2,8 @@
 
 The robot is the ESCALADE360 as simple solids. The paper gives its overall dimensions, 0.90 x 0.53 x 0.30 m, and tracks
 with flippers after the PackBot; the split into body, tracks and flippers is ours. So are the mast that lifts the sensor
-and the camera's housing, which make the middle of the mirror show a camera on a robot. The holder of the mirror is not
-modelled.
+and the camera's housing, which make the middle of the mirror show a camera on a robot. The holder of the mirror is the
+rig's (`scenes/holder.py`), and is part of every room that the rig looks into.
 """
 
 from __future__ import annotations
@@ -131,11 +131,15 @@ class Room:
 
     def shapes(self, view: View) -> tuple[Shape, ...]:
         """All shapes for one view; the index of a shape in this tuple is its object id, the same at every offset."""
-        return (*self.surfaces, *self.furniture, *(escalade360(view) if self.robot else ()))
+        return (*self.surfaces, *self.furniture, *self.brought(view))
+
+    def brought(self, view: View) -> tuple[Shape, ...]:
+        """Shapes that come with the rig: robot and carriage where the room has them, and the mirror's holder."""
+        return (*(escalade360(view) if self.robot else ()), *view.holder_shapes)
 
     def object_names(self, view: View) -> tuple[str, ...]:
-        """Names of the shapes in the order of their object ids."""
-        return tuple(shape.name for shape in self.shapes(view))
+        """Names of the shapes in the order of their object ids, but for the holder's, whose ids follow."""
+        return tuple(shape.name for shape in self.shapes(view)[: -len(view.holder_shapes) or None])
 
     def dark(self) -> Room:
         """Return the same room with every lamp switched off."""

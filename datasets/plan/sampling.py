@@ -34,6 +34,7 @@ from phibench.datasets.recipe.spot_placement import Boards, Placed, place, visib
 from phibench.datasets.recipe.tables import (
     DRAWABLE,
     DrawnRigsTable,
+    HolderTable,
     MisalignmentTable,
     RandomTable,
     Recipe,
@@ -62,6 +63,7 @@ PARAMETERS = (
     *(f"misalignment.{key}" for key in MISALIGNMENT),
     "spot.elevation_deg",  # later than the others, which keep their dimensions
     "spot.hidden",
+    *(f"rig.holder.{key}" for key in HolderTable.model_fields),
 )
 """Everything that can be drawn; the place in this list is the dimension in Sobol's sequence, whose first ones are the
 best: 16 of them correlate by at most 0.25 at 100 samples, where independent ones reach 0.38 (12 seeds each)."""
@@ -108,7 +110,7 @@ HIDDEN, SHOWN = "in one image", "in none"
 _PILOT = 8  # samples
 _NANOMETRE = 9  # decimals of a stroke: a pose's name then says its offset exactly
 
-_PREFIX = "misalignment."
+_PREFIX, _HOLDER = "misalignment.", "holder."
 
 Value = float | str
 
@@ -179,6 +181,9 @@ def _built(room_id: str, source: RoomSource, folder: Path | None) -> Room:
 def rig_table(table: RigTable, values: Mapping[str, Value]) -> RigTable:
     """`[rig]` with drawn numbers, by parameter."""
     drawn = {key.removeprefix("rig."): value for key, value in values.items() if key.startswith("rig.")}
+    of_holder = {key.removeprefix(_HOLDER): drawn.pop(key) for key in [*drawn] if key.startswith(_HOLDER)}
+    if of_holder:
+        drawn["holder"] = table.holder.model_copy(update=of_holder)  # type: ignore[assignment]
     return table.model_copy(update=drawn)
 
 
@@ -270,11 +275,12 @@ def rig_fault(rig: Rig, stroke_m: float, ceiling_m: float, boards: Boards) -> st
         return "the mirror is outside of the image"
     sphere_m = rig.T_world_camera.points(rig.sphere_in_camera_m)  # `rig.at` takes ten times as long
     if rig.motion is None:
-        top_m = sphere_m[2] + stroke_m * rig.stroke_axis_world[2] + rig.mirror.bound_m
+        top_m = sphere_m[2] + stroke_m * rig.stroke_axis_world[2] + rig.top_m
     else:
-        top_m = rig.at(stroke_m).sphere_centre_m[2] + rig.mirror.bound_m
+        top_m = rig.at(stroke_m).sphere_centre_m[2] + rig.top_m
     if top_m >= ceiling_m:
-        return f"the mirror's top at {top_m:.3f} m is above the ceiling or what hangs from it, at {ceiling_m:.2f} m"
+        above = f"is above the ceiling or what hangs from it, at {ceiling_m:.2f} m"
+        return f"the {rig.top_part}'s top at {top_m:.3f} m {above}"
     return boards.cut_by(rig, stroke_m)
 
 
@@ -292,7 +298,7 @@ def drawn_parameters(table: RandomTable) -> list[str]:
 def draw_values(table: RandomTable, targets: list[str], points: Mapping[str, Array]) -> dict[str, Any]:
     """Values of all samples by parameter, for the points in [0, 1) of each."""
     chosen = dict(_sample_distributions(table))
-    values: dict[str, Any] = {name: quantile(chosen[name], u) for name, u in points.items() if name in chosen}
+    values: dict[str, Any] = {name: _values(chosen[name], u) for name, u in points.items() if name in chosen}
     values["stroke_m"] = np.round(values["stroke_m"], _NANOMETRE)
     if "spot.target" in points:
         names = targets if table.spot.target is None else table.spot.target.choice
@@ -306,13 +312,21 @@ def draw_values(table: RandomTable, targets: list[str], points: Mapping[str, Arr
     return {name: values[name] for name in points}
 
 
-def _sample_distributions(table: RandomTable) -> Iterator[tuple[str, DistributionTable]]:
-    """Parameter and distribution of every number that is drawn."""
+def _sample_distributions(table: RandomTable) -> Iterator[tuple[str, Any]]:
+    """Parameter and distribution of every number, and of every name but the board's, that is drawn."""
     yield "stroke_m", table.stroke_m
-    for prefix, group in (("rig", table.rig), ("spot", table.spot), ("misalignment", table.misalignment)):
+    rig, holder = table.rig, table.rig.holder  # type: ignore[attr-defined]
+    groups = (("rig", rig), ("spot", table.spot), ("misalignment", table.misalignment), ("rig.holder", holder))
+    for prefix, group in groups:
         for key in type(group).model_fields:
-            if isinstance(value := getattr(group, key), DistributionTable):
-                yield f"{prefix}.{key}", value
+            value, name = getattr(group, key), f"{prefix}.{key}"
+            if isinstance(value, DistributionTable) or (value is not None and name == "rig.holder.kind"):
+                yield name, value
+
+
+def _values(chosen: Any, points: Array) -> Any:
+    """Values of a distribution, or of a choice of names, for points in [0, 1)."""
+    return quantile(chosen, points) if isinstance(chosen, DistributionTable) else pick(chosen.choice, points)
 
 
 def _plain(value: Any) -> Value:

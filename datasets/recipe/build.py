@@ -11,6 +11,7 @@ import numpy as np
 from phibench.datasets.recipe.room_tables import RoomTable
 from phibench.datasets.recipe.tables import (
     OWN_ALBEDO,
+    HolderTable,
     LaserTable,
     MisalignmentTable,
     Recipe,
@@ -22,6 +23,7 @@ from phibench.scenes.camera import Camera
 from phibench.scenes.catalog import BOARD_ALBEDO, RIGS, Target
 from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Array, Pose, Vector, as_vector, rotation_xyz
+from phibench.scenes.holder import LENGTHS, Holder, fitted
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.misalignment import Misalignment
@@ -54,7 +56,15 @@ def build_rig(table: RigTable) -> Rig:
         )
     stroke = np.array(rotation_xyz(table.stroke_tilt_x_rad, table.stroke_tilt_y_rad)) @ np.array([0.0, 0.0, 1.0])
     camera = _camera(base.camera, table, z_c_m, mirror)
-    return Rig(camera, mirror, T_world_camera, T_camera_sphere, as_vector(stroke))
+    holder = _holder(table.holder, mirror)
+    return Rig(camera, mirror, T_world_camera, T_camera_sphere, as_vector(stroke), holder=holder)
+
+
+def _holder(table: HolderTable, mirror: SphereMirror) -> Holder | None:
+    if table.kind == "none":
+        return None
+    given = {name: value for name in LENGTHS if (value := getattr(table, name)) is not None}
+    return fitted(table.kind, mirror.bound_m, azimuth_rad=float(np.radians(table.azimuth_deg)), **given)
 
 
 def build_misalignment(table: MisalignmentTable) -> Misalignment:

@@ -183,7 +183,7 @@ def _repeats(raw: Raw) -> Iterator[Fault]:
 
 def _draws(draft: _Draft) -> Iterator[Fault]:
     for key in table_of(draft.raw, "random", "rig"):
-        if key in RigTable.model_fields and key not in DRAWABLE:
+        if key in RigTable.model_fields and key not in (*DRAWABLE, "holder"):
             why = (
                 "is not a number" if key in ("preset", "laser_filter_response") else "must be the same for all samples"
             )
@@ -331,12 +331,14 @@ def _true_rig(
     for path, stroke_m, true_m in reached if room is not None else ():
         above_m = _top_m(rig, true_m) - ceiling_m(cast(Room, room))
         if above_m >= 0.0:
-            text = f"{stroke_m} lifts the mirror's top through the ceiling at {ceiling_m(cast(Room, room)):.2f} m"
+            text = (
+                f"{stroke_m} lifts the {rig.top_part}'s top through the ceiling at {ceiling_m(cast(Room, room)):.2f} m"
+            )
             yield Fault(path, f"{text}; give less than {stroke_m - above_m:.3f}")
 
 
 def _top_m(rig: Rig, offset_m: float) -> float:
-    return float(rig.at(offset_m).sphere_centre_m[2]) + rig.mirror.bound_m
+    return float(rig.at(offset_m).sphere_centre_m[2]) + rig.top_m
 
 
 def _height(table: RigTable, rig: Rig, room: Room) -> Fault | None:
@@ -346,7 +348,7 @@ def _height(table: RigTable, rig: Rig, room: Room) -> Fault | None:
         return None
     given = {key: getattr(table, key) for key in ("camera_height_m", "z_c_m")} | {"radius_m": rig.mirror.radius_m}
     key, value = next((key, value) for key, value in given.items() if value is not None)
-    text = f"{value} puts the mirror's top through the ceiling at {ceiling_m(room):.2f} m when it is down"
+    text = f"{value} puts the {rig.top_part}'s top through the ceiling at {ceiling_m(room):.2f} m when it is down"
     return Fault(f"rig.{key}", f"{text}; give less than {value - above_m:.3f}")
 
 

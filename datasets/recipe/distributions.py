@@ -19,6 +19,7 @@ from pydantic import (
     TypeAdapter,
     ValidationError,
     ValidationInfo,
+    create_model,
     field_validator,
     model_validator,
 )
@@ -112,6 +113,13 @@ def one_number(given: object) -> object:
 def one_name(given: object) -> object:
     """A plain name is a choice of one."""
     return {"choice": [given]} if isinstance(given, str) else given
+
+
+def names_of(name: Any) -> Any:
+    """Type of a choice of names of a type such as ``Literal["a", "b"]``, or None."""
+    names: Any = Annotated[tuple[name, ...], Field(strict=False, min_length=1)]
+    column: Any = (names, Field(description="names that are equally probable"))
+    return Annotated[create_model("NameChoice", __base__=Table, choice=column) | None, BeforeValidator(one_name)]
 
 
 Distribution = Annotated[

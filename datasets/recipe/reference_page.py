@@ -29,8 +29,10 @@ from phibench.datasets.recipe.tables import (
     DrawnRigsTable,
     ExperimentTable,
     FramesTable,
+    HolderTable,
     LaserTable,
     MisalignmentTable,
+    RandomHolderTable,
     RandomMisalignmentTable,
     RandomRigTable,
     RandomSpotTable,
@@ -46,6 +48,7 @@ from phibench.scenes.worlds.properties import PROPERTIES
 TABLES: dict[str, type[BaseModel]] = {
     "[dataset]": DatasetTable,
     "[rig]": RigTable,
+    "[rig.holder]": HolderTable,
     "[misalignment]": MisalignmentTable,
     "[room]": RoomTable,
     "[rooms]": RoomsTable,
@@ -62,6 +65,7 @@ TABLES: dict[str, type[BaseModel]] = {
     "[rigs.misalignment]": RandomMisalignmentTable,
     "[random]": RandomTable,
     "[random.rig]": RandomRigTable,
+    "[random.rig.holder]": RandomHolderTable,
     "[random.misalignment]": RandomMisalignmentTable,
     "[random.spot]": RandomSpotTable,
     "[frames]": FramesTable,
@@ -106,6 +110,10 @@ _NOTES = {
 
 `z_c_m` must exceed `radius_m`. A smaller `width_px` alone keeps the focal length, and so cuts the image.
 Divide `fx_px` by the same factor to see as much as before.
+""",
+    "[rig.holder]": """What carries the mirror. It moves with the rig, is seen in the mirror and hides spots; see
+`docs/holder.md`. R is `radius_m` of `[rig]`: sizes that are left out follow it. Its axis runs from the lens centre to
+the sphere centre. Rods and column must stand beside the mirror and within the plates.
 """,
     "[misalignment]": """What the true rig deviates by from `[rig]`, which then is the nominal one: what an estimator
 is given. Images and truth are those of the true rig. Signs, axes and figures: `docs/misalignment.md`.
@@ -168,6 +176,9 @@ not depend on which others are there.
 not drawn is as in `[rig]`, which must be a possible rig itself. A drawn `fx_px` is `fy_px` too
 (square pixels) unless `fy_px` is drawn or set in `[rig]`, and the other way round.
 """,
+    "[random.rig.holder]": """Any key of `[rig.holder]`, and `kind` from a choice of names, such as
+`kind = { choice = ["none", "rods", "post"] }`. A sample whose sizes do not go together is drawn again.
+""",
     "[random.misalignment]": """Any key of `[misalignment]`, within its range, in place of the value there. The rig
 that `[random.rig]` gives is the nominal one.
 """,
@@ -214,6 +225,8 @@ strongest light that goes out with the laser.
 _NAMES = "NameChoice"
 _ABSENT: dict[type[BaseModel], str] = {
     RigTable: "as preset",
+    HolderTable: "follows R",
+    RandomHolderTable: "as in [rig.holder]",
     RandomRigTable: "as in [rig]",
     RandomMisalignmentTable: "as in [misalignment]",
     FramesTable: "as preset",

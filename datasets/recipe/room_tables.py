@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, create_model
+from pydantic import AfterValidator, Field, create_model
 
 from phibench.datasets.input_files import FILE_NAME, NAME_LENGTH
-from phibench.datasets.recipe.distributions import Distribution, Name, Table, one_name, values_of
+from phibench.datasets.recipe.distributions import Distribution, Name, Table, names_of, values_of
 from phibench.datasets.rooms.mesh_placement import MeshLamp, MeshSettings
 from phibench.datasets.rooms.panorama_settings import PanoramaSettings
 from phibench.scenes.worlds.properties import PROPERTIES, Property
@@ -31,9 +31,7 @@ def _property(entry: Property) -> Any:
     """Field of a property's distribution, in its range or of its names."""
     kind: Any
     if entry.choices:
-        names: Any = Annotated[tuple[Literal[entry.choices], ...], Field(strict=False, min_length=1)]  # type: ignore[name-defined]
-        column: Any = (names, Field(description="names that are equally probable"))
-        kind = Annotated[create_model("NameChoice", __base__=Table, choice=column) | None, BeforeValidator(one_name)]
+        kind = names_of(Literal[entry.choices])
     else:
         values = values_of(Annotated[float, Field(ge=entry.low, le=entry.high)], entry.whole)
         kind = Annotated[Distribution, values] | None

@@ -39,7 +39,8 @@ class Boards:
     def cut_by(self, rig: Rig, stroke_m: float) -> str | None:
         """Say which board a rig cuts at an end of its stroke; None if none."""
         lens_m = rig.T_world_camera.t
-        reach_m = float(np.linalg.norm(rig.sphere_in_camera_m[:2])) + rig.mirror.bound_m + _HOUSING_REACH_M
+        wide_m = rig.mirror.bound_m if rig.holder is None else rig.holder.plate_m
+        reach_m = float(np.linalg.norm(rig.sphere_in_camera_m[:2])) + wide_m + _HOUSING_REACH_M
         reach_m += abs(stroke_m) * math.hypot(*rig.stroke_axis_world[:2]) + rig.sphere_in_camera_m[2] * _tilt(rig)
         if rig.motion is not None:  # at most: the sphere swings about the lens as far as it is from it, twice
             reach_m += math.hypot(*rig.motion.translation_m) + 2.0 * float(np.linalg.norm(rig.sphere_in_camera_m))
@@ -57,10 +58,14 @@ def _tilt(rig: Rig) -> float:
 
 
 def cut_part(view: View, plate: Cuboid) -> str | None:
-    """Name the part of the carriage (mirror, housing, mast) that a board cuts; None if none."""
+    """Name the part of the carriage (mirror, housing, mast, holder) that a board cuts; None if none.
+
+    Round parts of the holder count as the boxes around them.
+    """
     if plate.distance_m(view.sphere_centre_m) <= view.rig.mirror.bound_m:
         return "mirror"
-    return next((part.name.replace("_", " ") for part in carriage(view) if plate.meets(part)), None)
+    boxes = (Cuboid(one.name, one.T_world_shape, one.size_m) for one in view.holder_shapes)
+    return next((part.name.replace("_", " ") for part in (*carriage(view), *boxes) if plate.meets(part)), None)
 
 
 Placed = tuple[str, LaserSpot] | str

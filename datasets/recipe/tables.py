@@ -17,6 +17,7 @@ from phibench.datasets.recipe.distributions import (
     Table,
     Targets,
     is_whole,
+    names_of,
     values_of,
 )
 from phibench.datasets.recipe.room_tables import RoomsTable, RoomTable
@@ -32,6 +33,7 @@ Distortion = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 FocalPx = Annotated[float, Field(ge=50.0, le=50000.0)]
 Unit = Annotated[float, Field(ge=0.0, le=1.0)]
 Response = Annotated[tuple[Unit, ...], Field(strict=False, min_length=3, max_length=3)]
+HolderM = Annotated[float, Field(ge=1e-4, le=1.0)]
 Preset = Literal["mono-raw", "bayer-raw", "srgb8", "mjpeg"]
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 OWN_ALBEDO = "surface"
@@ -75,6 +77,25 @@ class DatasetTable(Table):
 
     name: DatasetName = Field(description="name of the data set")
     seed: int = Field(default=0, ge=0, le=2**63 - 1, description="root of all random streams; 0 is legal")
+
+
+class HolderTable(Table):
+    """`[rig.holder]`: what carries the mirror."""
+
+    kind: Literal["none", "rods", "post"] = Field(
+        default="none", description="three rods around the mirror, or a post from above on an arm"
+    )
+    radius_m: HolderM | None = Field(default=None, description="of each rod; of post, arm and column; R/15")
+    circle_m: HolderM | None = Field(
+        default=None, description="from the axis to that of each rod, or of the column; 1.25 R + radius_m"
+    )
+    plate_m: HolderM | None = Field(default=None, description="radius of the plates; circle_m + 3 radius_m")
+    rise_m: HolderM | None = Field(
+        default=None, description="sphere centre to the upper plate, or to the arm's top; 1.5 R"
+    )
+    azimuth_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = Field(
+        default=30.0, description="of the first rod, or the column, from the camera's x axis"
+    )
 
 
 class RigTable(Table):
@@ -121,6 +142,7 @@ class RigTable(Table):
     tilt_y_rad: Tilt = Field(default=0.0, description="camera turned about world y, the mirror stays")
     stroke_tilt_x_rad: Tilt = Field(default=0.0, description="stroke axis turned about world x")
     stroke_tilt_y_rad: Tilt = Field(default=0.0, description="stroke axis turned about world y")
+    holder: HolderTable = Field(default=HolderTable(), description="what carries the mirror")
 
 
 if TYPE_CHECKING:
@@ -225,6 +247,24 @@ DRAWABLE = tuple(
 """Keys of `[rig]` that may be drawn: all single numbers but the size of the image, which all samples share."""
 
 if TYPE_CHECKING:
+    RandomHolderTable = Table
+else:
+    RandomHolderTable = create_model(
+        "RandomHolderTable",
+        __base__=Table,
+        __doc__="`[random.rig.holder]`: distributions of keys of `[rig.holder]`.",
+        **{
+            key: (
+                names_of(field.annotation)
+                if key == "kind"
+                else Annotated[Distribution, values_of(field.annotation)] | None,
+                Field(default=None, description=field.description),
+            )
+            for key, field in HolderTable.model_fields.items()
+        },
+    )
+
+if TYPE_CHECKING:
     RandomRigTable = Table
 else:
     RandomRigTable = create_model(
@@ -239,6 +279,10 @@ else:
             for key, field in RigTable.model_fields.items()
             if key in DRAWABLE
         },
+        holder=(
+            RandomHolderTable,
+            Field(default=RandomHolderTable(), description="distributions of keys of [rig.holder]"),
+        ),
     )
 
 

@@ -1,7 +1,7 @@
 """Room tracer in float64: first plane face along rays, as the exact counterpart of the renderer's float32 hits.
 
 A room is the table of its plane faces (`scenes.faces`) and a tree of them (`face_tree`). What belongs to the room is
-made ready once and stays with the room; robot and carriage are added for each view.
+made ready once and stays with the room; robot, carriage and holder are added for each view.
 
 Rays are origins and unit directions, shape (N, 3), world frame, metres.
 """
@@ -19,7 +19,7 @@ from phibench.render.optics.face_tree import FaceTree, Rays
 from phibench.scenes.faces import FaceTable, IntArray, face_table, joined
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import View
-from phibench.scenes.room import Room, escalade360
+from phibench.scenes.room import Room
 from phibench.scenes.shapes import Shape
 
 Finder = Callable[[Array, Array], IntArray]
@@ -74,7 +74,7 @@ class RoomGeometry:
 
     @property
     def without_robot(self) -> RoomGeometry:
-        """The same without robot and carriage; ids stay what they are."""
+        """The same without robot, carriage and holder; ids stay what they are."""
         return RoomGeometry._of(self._parts[0])
 
     @cached_property
@@ -153,9 +153,9 @@ def own_geometry(room: Room) -> RoomGeometry:
 
 
 def room_geometry(room: Room, view: View) -> RoomGeometry:
-    """Geometry of `room.shapes(view)`: the room's own, with robot and carriage where it has them."""
-    own = own_geometry(room)
-    return RoomGeometry._of(*own._parts, _Part(escalade360(view))) if room.robot else own
+    """Geometry of `room.shapes(view)`: the room's own, and what comes with the rig."""
+    own, brought = own_geometry(room), room.brought(view)
+    return RoomGeometry._of(*own._parts, _Part(brought)) if brought else own
 
 
 _KEPT = "_traced_part"

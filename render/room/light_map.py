@@ -3,8 +3,8 @@
 First what comes from lamps and the sun (`lamp_light`), then the bounces over a coarse grid (`bounced_light`). Last a
 gather over the fine grid from the full map, in two independent halves; what both agree on is smoothed
 (`irradiance_filter`).
-The mirror ball itself (12 cm) and the carriage are left out of the room's light. The carriage is lit by the map when a
-view is rendered.
+The mirror ball itself (12 cm), its holder and the carriage are left out of the room's light. Carriage and holder are
+lit by the map when a view is rendered.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class LightMap:
 
 
 def fixed_shapes(room: Room) -> tuple[Shape, ...]:
-    """Shapes of a room that stand still: everything but the carriage and the mirror."""
+    """Shapes of a room that stand still: everything but the carriage, the mirror and its holder."""
     return (*room.surfaces, *room.furniture, *(chassis() if room.robot else ()))
 
 

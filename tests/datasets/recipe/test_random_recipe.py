@@ -10,7 +10,7 @@ from helpers.recipes import changed, complaints
 
 from phibench.datasets.plan.sampling import MISALIGNMENT, PARAMETERS
 from phibench.datasets.recipe.load import check_recipe
-from phibench.datasets.recipe.tables import DRAWABLE, RandomRigTable, Recipe
+from phibench.datasets.recipe.tables import DRAWABLE, HolderTable, RandomRigTable, Recipe
 
 UNIFORM = {"uniform": [0.1, 1.4]}
 
@@ -48,6 +48,10 @@ UNIFORM = {"uniform": [0.1, 1.4]}
         ({"rig": {"f_number": {"uniform": [0.1, 3]}}}, "random.rig.f_number", ("reaches 0.1", "from 0.5 up to 256")),
         ({"rig": {"z_c_m": {"choice": [0.3, 7.0]}}}, "random.rig.z_c_m", ("reaches 7", "up to 5")),
         ({"rig": {"k1": True}}, "random.rig.k1", ("True", "a table")),
+        ({"rig": {"holder": {"kind": "tripod"}}}, "random.rig.holder.kind.choice[0]", ("'tripod'", "'rods', 'post'")),
+        ({"rig": {"holder": {"kind": {"choice": []}}}}, "random.rig.holder.kind.choice", ("at least 1",)),
+        ({"rig": {"holder": {"radius_m": -0.1}}}, "random.rig.holder.radius_m", ("reaches -0.1", "from 0.0001")),
+        ({"rig": {"holder": {"radius": 0.1}}}, "random.rig.holder.radius", ("unknown", "'radius_m'")),
         ({"spot": {"target": {"choice": ["b"]}}}, "random.spot.target.choice[0]", ("'b'", "known: a")),
         ({"spot": {"target": "b"}}, "random.spot.target.choice[0]", ("'b'", "known: a")),
         ({"spot": {"target": {"choice": ["a", "a"]}}}, "random.spot.target.choice[1]", ("twice",)),
@@ -100,7 +104,8 @@ def test_nonsense_is_reported_and_never_raises_anything_else(nonsense: Any) -> N
 
 
 def test_every_drawable_key_is_a_key_of_the_rig_and_has_a_parameter() -> None:
-    assert tuple(RandomRigTable.model_fields) == DRAWABLE
-    assert len(PARAMETERS) == len(set(PARAMETERS)) == len(DRAWABLE) + 8 + len(MISALIGNMENT)
+    assert tuple(RandomRigTable.model_fields) == (*DRAWABLE, "holder")
+    others = 8 + len(MISALIGNMENT) + len(HolderTable.model_fields)
+    assert len(PARAMETERS) == len(set(PARAMETERS)) == len(DRAWABLE) + others
     recipe = check_recipe(drawing(rig={"z_c_m": 0.3}))
     assert Recipe.model_validate(json.loads(json.dumps(recipe.model_dump(mode="json")))) == recipe

@@ -1,0 +1,202 @@
+"""Holder of the mirror: what carries the ball above the camera, between two plates or on a post from above.
+
+It has a file of its own because three sides need the same thing: the rig checks its sizes, rooms take its shapes, and
+recipes draw it. It belongs to the rig and moves with it. Its axis is the line from the lens centre to the ball's
+centre: the ball sits centred in its holder, and the two are misaligned together against camera and stroke axis. Along
+that axis z is 0 at the lens centre.
+
+* Rods: three upright rods on a circle around the ball, between a plate below the camera and one above the ball.
+* Post: a post from above ends at the ball's top. Nothing that is wholly behind a convex mirror is ever seen in it. The
+  post therefore hangs from an arm, and a column beside the ball carries that from the plate below the camera.
+
+**Nothing of it stands between lens and mirror.** Ball and lens lie in a cylinder around the axis with the ball's
+radius (`check`: the lens opening is narrower), and so does every line between their points, since a cylinder is convex.
+All parts beside the ball lie outside that cylinder. What hides a spot, it hides between mirror and wall.
+
+Rods are prisms of `SIDES` sides. Their corners lie r (pi / n) / sin(pi / n) from the axis, so that the mean width of
+the prism, seen from all sides, is that of the round rod (Cauchy: the perimeter over pi). Its outline then lies within
+r ((pi / n) / sin(pi / n) - 1) = 0.29 % of r outside, and 0.57 % inside, the round one's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+import numpy as np
+
+from phibench.scenes.frames import Array, Pose, as_matrix, as_vector
+from phibench.scenes.shapes import Cuboid, Prism
+from phibench.scenes.textures import Uniform
+from phibench.scenes.validation import SceneError, finite, within
+
+HolderKind = Literal["rods", "post"]
+Part = Prism | Cuboid
+
+SIDES = 24
+PLATE_SIDES = 48
+_PLATE_M = 0.004  # thickness
+_BELOW_LENS_M = 0.034  # top of the plate below the camera, whose housing ends 1 mm above
+_BLACK_METAL = Uniform((0.10, 0.10, 0.10))
+_RODS = 3
+
+
+@dataclass(frozen=True)
+class Holder:
+    """Kind and sizes of a holder; `check` holds them against a ball.
+
+    Parameters
+    ----------
+    kind : "rods" or "post"
+    radius_m : float
+        Of each rod; of post, arm and column.
+    circle_m : float
+        From the holder's axis to that of each rod, or of the column.
+    plate_m : float
+        Radius of the plates.
+    rise_m : float
+        From the ball's centre up to the upper plate, or to the top of the arm.
+    azimuth_rad : float
+        Direction of the first rod, or of the column, from the camera's x axis against the clock seen from above.
+    """
+
+    kind: HolderKind
+    radius_m: float = 0.004
+    circle_m: float = 0.080
+    plate_m: float = 0.090
+    rise_m: float = 0.090
+    azimuth_rad: float = math.pi / 6.0
+
+    def __post_init__(self) -> None:
+        for name in LENGTHS:
+            within("Holder", name, getattr(self, name), 1e-4, 1.0)
+        finite("Holder", "azimuth_rad", self.azimuth_rad)
+
+    @property
+    def part_names(self) -> tuple[str, ...]:
+        """Names of the parts, in the order of `holder_shapes`."""
+        if self.kind == "rods":
+            return ("holder_plate_low", "holder_plate_high", *(f"holder_rod_{i + 1}" for i in range(_RODS)))
+        return ("holder_plate_low", "holder_column", "holder_arm", "holder_post")
+
+    @property
+    def top_m(self) -> float:
+        """Height of its highest part above the ball's centre, along its axis."""
+        return self.rise_m + (_PLATE_M if self.kind == "rods" else 0.0)
+
+    def check(self, ball_m: float, lens_m: float) -> None:
+        """Raise `SceneError` if it does not fit a ball of radius `ball_m` and a lens opening of radius `lens_m`."""
+        thick = prism_radius_m(self.radius_m)
+        inside = max(ball_m, lens_m) + thick
+        upright = "rods" if self.kind == "rods" else "column"
+        if self.circle_m <= inside:
+            raise SceneError(
+                f"Holder.circle_m = {self.circle_m:g}: the {upright} would stand inside the ball, whose radius is "
+                f"{ball_m:g} m; give more than {inside:.4f}"
+            )
+        if self.circle_m + thick > self.plate_m:
+            raise SceneError(
+                f"Holder.plate_m = {self.plate_m:g}: the {upright} would stand outside the plate; give at least "
+                f"{self.circle_m + thick:.4f}, or a smaller circle_m"
+            )
+        if self.kind == "post" and thick >= ball_m:
+            raise SceneError(
+                f"Holder.radius_m = {self.radius_m:g}: the post is thicker than the ball, whose radius is "
+                f"{ball_m:g} m; give less"
+            )
+        low = ball_m if self.kind == "rods" else ball_m + 2.0 * self.radius_m
+        if self.rise_m <= low:
+            raise SceneError(
+                f"Holder.rise_m = {self.rise_m:g}: the holder's top would lie inside the ball; give more than {low:.4f}"
+            )
+
+
+def fitted(kind: HolderKind, ball_m: float, **given: float) -> Holder:
+    """Holder with the sizes that are given, and others that suit a ball of radius `ball_m`.
+
+    The gap between ball and rods is a quarter of the ball's radius, the plates reach two radii of a rod beyond them,
+    and the upper plate is half the ball's radius above its top.
+    """
+    sizes = {"radius_m": ball_m / 15.0, **given}
+    sizes.setdefault("circle_m", 1.25 * ball_m + sizes["radius_m"])
+    sizes.setdefault("plate_m", sizes["circle_m"] + 3.0 * sizes["radius_m"])
+    sizes.setdefault("rise_m", 1.5 * ball_m)
+    return Holder(kind, **sizes)
+
+
+LENGTHS = tuple(field.name for field in fields(Holder) if field.name.endswith("_m"))
+"""Names of the sizes that `fitted` may choose."""
+
+
+def prism_radius_m(radius_m: float, sides: int = SIDES) -> float:
+    """Radius of the corners of a prism that has the mean width of a round rod."""
+    half = math.pi / sides
+    return radius_m * half / math.sin(half)
+
+
+def holder_shapes(holder: Holder, T_world_camera: Pose, sphere_centre_m: Array, ball_m: float) -> tuple[Part, ...]:
+    """Shapes of a holder in the world, in the order of `Holder.part_names`.
+
+    Parameters
+    ----------
+    T_world_camera : Pose
+    sphere_centre_m : array, shape (3,)
+        In the world.
+    ball_m : float
+        Radius of the ball, which the post ends on.
+    """
+    axis = _Axis.of(T_world_camera, sphere_centre_m)
+    foot, top = -_BELOW_LENS_M, axis.length_m + holder.rise_m
+    plates: list[Part] = [axis.upright(0.0, 0.0, foot - _PLATE_M, foot, holder.plate_m, PLATE_SIDES)]
+    thick = prism_radius_m(holder.radius_m)
+    if holder.kind == "rods":
+        plates.append(axis.upright(0.0, 0.0, top, top + _PLATE_M, holder.plate_m, PLATE_SIDES))
+        turns = [holder.azimuth_rad + 2.0 * math.pi * i / _RODS for i in range(_RODS)]
+        posts = [axis.upright(turn, holder.circle_m, foot, top, thick, SIDES) for turn in turns]
+        return _named(holder, [*plates, *posts])
+    width, turn = 2.0 * holder.radius_m, holder.azimuth_rad
+    column = axis.upright(turn, holder.circle_m, foot, top - width, thick, SIDES)
+    arm = Cuboid(
+        "",
+        axis.pose(turn, 0.5 * holder.circle_m, top - holder.radius_m),
+        (holder.circle_m + width, width, width),
+        _BLACK_METAL,
+    )
+    post = axis.upright(0.0, 0.0, axis.length_m + ball_m, top - width, thick, SIDES)
+    return _named(holder, [*plates, column, arm, post])
+
+
+def _named(holder: Holder, parts: Sequence[Part]) -> tuple[Part, ...]:
+    return tuple(replace(part, name=name) for part, name in zip(parts, holder.part_names, strict=True))
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """The holder's frame: z from the lens centre to the ball's centre, x as near to the camera's as it can be."""
+
+    origin_m: Array
+    rotation: Array
+    length_m: float
+
+    @staticmethod
+    def of(T_world_camera: Pose, sphere_centre_m: Array) -> _Axis:
+        way = sphere_centre_m - T_world_camera.t
+        length = float(np.linalg.norm(way))
+        z = way / length
+        y = np.cross(z, T_world_camera.R[:, 0])
+        y /= np.linalg.norm(y)
+        return _Axis(T_world_camera.t, np.stack([np.cross(y, z), y, z], axis=1), length)
+
+    def pose(self, turn: float, away_m: float, height_m: float) -> Pose:
+        """Pose at a distance from the axis, its x axis outwards."""
+        c, s = math.cos(turn), math.sin(turn)
+        place = self.origin_m + self.rotation @ np.array([away_m * c, away_m * s, height_m])
+        turned = self.rotation @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return Pose("world", "shape", as_vector(place), as_matrix(turned))
+
+    def upright(self, turn: float, away_m: float, low_m: float, high_m: float, radius_m: float, sides: int) -> Prism:
+        """Prism along the axis from one height to another."""
+        pose = self.pose(turn, away_m, 0.5 * (low_m + high_m))
+        return Prism("", pose, radius_m, high_m - low_m, sides, _BLACK_METAL)
