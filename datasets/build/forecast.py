@@ -7,6 +7,7 @@ is. Afterwards the tasks of the run itself say how long their kind takes.
 
 from __future__ import annotations
 
+import math
 import os
 import statistics
 import threading
@@ -25,7 +26,10 @@ from phibench.datasets.plan.plan import PairPlan, Plan
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import SpotTruth, depth_m, spot_truth
 from phibench.render.room.bounced_light import BOUNCE_TEXEL_M
-from phibench.render.room.light_map import texel_count
+from phibench.render.room.lamp_light import FIRST_RAYS
+from phibench.render.room.light_map import fixed_shapes, texel_count
+from phibench.render.room.texel_grid import TexelGrid
+from phibench.scenes.faces import face_table
 from phibench.scenes.rig import POSITIONS
 from phibench.scenes.room import Room
 
@@ -34,7 +38,9 @@ START_S = 7.0  # workers, Mitsuba in each, first kernels, hashes
 VIEW_S = 0.5
 VIEW_S_PER_MEGAPIXEL = 3.5  # refinement, truth, encoding, fsync
 VIEW_S_PER_MEGASAMPLE = 0.1  # look-ups in the light map, a million of them
-BAKE_S_PER_MEGARAY = 0.13
+BAKE_S_PER_MEGATEXEL = 20.0  # grids, filters
+_TRIANGLES = (0.05, -0.15)  # seconds per million rays: slope by log2 of the room's triangles, and at one triangle
+_PENUMBRA = 1.0 / 27.0  # part of the pairs of texel and lamp that get all rays, by the same logarithm
 CACHED_BAKE_S = 0.5
 SPOT_S = 0.2  # two positions with their certificates
 SAMPLE_S_PER_MEGAPIXEL = 0.45  # picture, noise budget
@@ -115,9 +121,20 @@ def _bake_s(plan: Plan) -> float:
     ambient, room = plan.recipe.ambient, _first_room(plan)
     if not room.lit or is_cached(plan.rig.at(0.0), room, bake_settings(ambient)):
         return CACHED_BAKE_S
-    coarse = texel_count(room, max(BOUNCE_TEXEL_M, ambient.texel_m))
-    rays = 2 * ambient.final_rays * _texels(plan) + ambient.bounces * ambient.bounce_rays * coarse
-    return rays / 1e6 * BAKE_S_PER_MEGARAY
+    table = face_table(fixed_shapes(room))
+    doubled = math.log2(max(len(table.patch), 64))
+    fine, indirect, coarse = (
+        TexelGrid.of(table, size).count
+        for size in (
+            ambient.texel_m,
+            max(ambient.indirect_texel_m, ambient.texel_m),
+            max(BOUNCE_TEXEL_M, ambient.texel_m),
+        )
+    )
+    # every other texel faces a lamp
+    lamps = 0.5 * fine * table.emits.sum() * (FIRST_RAYS + 2.0 * _PENUMBRA * doubled * ambient.lamp_rays)
+    rays = lamps + 2 * ambient.final_rays * indirect + ambient.bounce_rays * coarse
+    return float(rays * (_TRIANGLES[0] * doubled + _TRIANGLES[1]) + fine * BAKE_S_PER_MEGATEXEL) / 1e6
 
 
 def _first_room(plan: Plan) -> Room:

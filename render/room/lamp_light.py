@@ -23,7 +23,8 @@ from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.room import Sun
 
 _LAMP_GAP_MM = 1.0  # rays end this far in front of a lamp
-_FIRST_RAYS = 8  # towards a lamp
+FIRST_RAYS = 8
+"""Towards a lamp, from every texel that faces it."""
 _PENUMBRA_TEXELS = 2  # around those that see a part of a lamp
 _SUN_RAYS = 16
 
@@ -50,7 +51,7 @@ def direct_light(
         whole = whole_lamp(way[seen], texels.normals_world[seen], lamp)
         whole[above[seen] < reach[seen]] = np.nan
         key = seed + 100 * number
-        value, share = _lamp_rays(mi, surfaces, texels, seen, lamp, whole, min(_FIRST_RAYS, rays), key)
+        value, share = _lamp_rays(mi, surfaces, texels, seen, lamp, whole, min(FIRST_RAYS, rays), key)
         partly = np.zeros(len(texels), dtype=bool)
         partly[seen] = (share > 0.0) & (share < 1.0)
         # a screen's picture needs all rays
