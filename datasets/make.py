@@ -38,6 +38,7 @@ from phibench.datasets.plan.plan import Plan, make_plan, shard_plan
 from phibench.datasets.progress import progress_console
 from phibench.datasets.recipe.checks import warnings
 from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_files, recipe_text, with_numbers
+from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import dataset_info, info_text, parse_info, read_manifest, same_content
 from phibench.datasets.store.files import WriteError, write_text
@@ -55,6 +56,7 @@ def make(
     samples: int | None = None,
     seed: int | None = None,
     replace: bool = False,
+    room_files: str | Path | None = None,
 ) -> Path:
     """Render the data set of a recipe into a folder; what is finished there is kept, whatever ended the last run.
 
@@ -71,6 +73,7 @@ def make(
     shard : part of the recipe, "i/n"
     samples, seed : numbers instead of the recipe's `[random].samples` and `[dataset].seed`
     replace : whether finished work that does not fit may be deleted or made again; what fits is kept
+    room_files : folder of the files that the recipe names for rooms; by default the recipe's own
 
     Returns
     -------
@@ -85,7 +88,7 @@ def make(
         half-written under a final name, and `SHA256SUMS` is missing.
     """
     console, out = console or progress_console(), Path(out)
-    plan, text, note = _planned(recipe, out, shard, samples, seed, replace)
+    plan, text, note = _planned(recipe, out, shard, samples, seed, replace, room_files)
     for warning in [*warnings(plan.recipe), *_hidden(pair_forecasts(plan))]:
         console.print(f"warning: {warning}", highlight=False, soft_wrap=True)
     make_from_plan(plan, text, out, workers, console, scheduler, replace)
@@ -102,6 +105,7 @@ def dry_run(
     samples: int | None = None,
     seed: int | None = None,
     replace: bool = False,
+    room_files: str | Path | None = None,
 ) -> str:
     """Say what `make` would do, and render and write nothing: what will be seen, how many tasks, bytes, seconds.
 
@@ -111,7 +115,7 @@ def dry_run(
         If recipe or folder will not do.
     """
     out, count = Path(out), _count(workers)
-    plan, _, note = _planned(recipe, out, shard, samples, seed, replace)
+    plan, _, note = _planned(recipe, out, shard, samples, seed, replace, room_files)
     refuse_other(out, None if replace else plan.recipe.dataset.name)
     pairs, journal = list(pair_forecasts(plan)), Journal(out)
     tasks, todo, told = plan_tasks(plan, {}), [], [note] if note else []
@@ -148,11 +152,17 @@ def _count(workers: int | None) -> int:
 
 
 def _planned(
-    recipe: str | Path, out: Path, shard: str | None, samples: int | None, seed: int | None, replace: bool
+    recipe: str | Path,
+    out: Path,
+    shard: str | None,
+    samples: int | None,
+    seed: int | None,
+    replace: bool,
+    room_files: str | Path | None,
 ) -> tuple[Plan, str, str]:
     """Plan, text of its recipe, and a line on samples that are kept although fewer are asked for."""
     text, source, note = recipe_text(recipe), str(find_recipe(recipe)), ""
-    files = recipe_files(recipe)
+    files = recipe_files(recipe) if room_files is None else RoomFiles(Path(room_files))
     if samples is not None or seed is not None:
         text = with_numbers(text, source, samples, seed)
     asked = parse_recipe(text, source)

@@ -29,6 +29,7 @@ def make(
     samples: Whole | None = None,
     seed: Whole | None = None,
     replace: Annotated[bool, Parameter(negative="")] = False,
+    room_files: Path | None = None,
     dry_run: bool = False,
 ) -> int:
     """Render a data set; what is finished already is kept. Sensitivities of D come last, sensitivities.parquet.
@@ -51,17 +52,20 @@ def make(
         Root of all random streams, instead of the recipe's; a secret one for a set that is to be sealed.
     replace
         Delete or make again finished work that does not fit, of another seed or recipe; what fits is kept.
+    room_files
+        Folder of the panoramas and meshes that the recipe names; the recipe's own by default.
     dry_run
         Say what will be seen, where and why not, how many tasks, bytes and seconds it takes; render nothing.
     """
+    given: Any = {"shard": shard, "samples": samples, "seed": seed, "replace": replace, "room_files": room_files}
     if dry_run:
         from phibench.datasets.make import dry_run as dry_run_text
 
-        print(dry_run_text(recipe, out, workers, shard=shard, samples=samples, seed=seed, replace=replace))
+        print(dry_run_text(recipe, out, workers, **given))
         return 0
     from phibench.estimator.paper.sensitivity_table import make as make_dataset
 
-    make_dataset(recipe, out, workers, scheduler=scheduler, shard=shard, samples=samples, seed=seed, replace=replace)
+    make_dataset(recipe, out, workers, scheduler=scheduler, **given)
     return 0
 
 

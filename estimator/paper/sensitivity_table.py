@@ -109,12 +109,13 @@ def make(
     samples: int | None = None,
     seed: int | None = None,
     replace: bool = False,
+    room_files: str | Path | None = None,
 ) -> Path:
     """Make the data set of a recipe; parameters and errors are those of `phibench.datasets.make.make`.
 
     A shard has no table of sensitivities: `merge` writes that of the whole.
     """
-    folder = rendering.make(recipe, out, workers, console, scheduler, shard, samples, seed, replace)
+    folder = rendering.make(recipe, out, workers, console, scheduler, shard, samples, seed, replace, room_files)
     if shard is None:
         keep_sensitivities(folder)
     return folder

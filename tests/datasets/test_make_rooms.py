@@ -11,7 +11,7 @@ from helpers.processes import quiet
 from helpers.room_files import KINDS_TOML, write_files
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.make import make
+from phibench.datasets.make import dry_run, make
 from phibench.datasets.merge_repair import merge, repair
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.read import open_finished
@@ -97,6 +97,20 @@ def test_the_recipe_of_a_data_set_finds_the_copies(made: Path, recipe: Path) -> 
     plans = [make_plan(load_recipe(path), recipe_files(path)) for path in (recipe, made / "recipe.toml")]
     assert plans[0].rooms == plans[1].rooms
     assert plans[0].pairs == plans[1].pairs
+
+
+def test_files_may_lie_in_another_folder(
+    copy: Path, recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("phibench.datasets.make.WorkerPool", InlineWorkerPool)
+    alone = Path(shutil.copyfile(recipe, tmp_path / "alone.toml"))
+    with pytest.raises(DatasetError, match=r"alone\.toml has 2 faults:\n .*office\.png is missing; put it there\n"):
+        dry_run(alone, tmp_path / "new")
+    told = dry_run(alone, tmp_path / "new", room_files=recipe.parent)
+    assert "3 of 3 pairs will be visible" in told
+    before = {path: path.stat().st_mtime_ns for path in copy.rglob("*")}
+    make(alone, copy, 1, quiet(), room_files=recipe.parent)  # complete already
+    assert {path: path.stat().st_mtime_ns for path in copy.rglob("*") if path in before} == before
 
 
 def test_another_file_under_the_same_name_is_other_work(
