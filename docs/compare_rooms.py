@@ -71,15 +71,19 @@ def distances(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
     return float(ks_2samp(one, other).statistic), float(wasserstein_distance(one, other)) / spread
 
 
-def interval(one: np.ndarray, other: np.ndarray, rng: np.random.Generator) -> tuple[float, float]:
-    """95 % of the bootstrap of the Wasserstein distance, over the second sample's standard deviation."""
+def interval(one: np.ndarray, other: np.ndarray, rng: np.random.Generator) -> tuple[float, float, float]:
+    """95 % of the bootstrap of the Wasserstein distance over the second sample's standard deviation, and chance.
+
+    Chance: 95 % of the distances between samples of these sizes, both drawn from the second, are below.
+    """
     spread = float(other.std(ddof=1))
-    drawn = [
-        wasserstein_distance(rng.choice(one, len(one)), rng.choice(other, len(other))) / spread
-        for _ in range(_RESAMPLED)
-    ]
+    drawn, same = [], []
+    for _ in range(_RESAMPLED):
+        again = rng.choice(other, len(other))
+        drawn.append(wasserstein_distance(rng.choice(one, len(one)), again) / spread)
+        same.append(wasserstein_distance(rng.choice(other, len(one)), again) / spread)
     low, high = np.quantile(drawn, (0.025, 0.975))
-    return float(low), float(high)
+    return float(low), float(high), float(np.quantile(same, 0.95))
 
 
 def main() -> None:
@@ -91,13 +95,15 @@ def main() -> None:
     for path, found in zip(paths, photographs, strict=True):
         print(path.name, *(f"{name} {getattr(found, name):.3f}" for name in NAMES))
     print(f"\n{len(rooms)} generated, {len(photographs)} photographed")
-    print("| statistic | photographs | generated | KS | Wasserstein / sd |\n|---|---|---|---|---|")
+    print(
+        "| statistic | photographs | generated | KS | Wasserstein / sd | by chance below |\n|---|---|---|---|---|---|"
+    )
     for name in NAMES:
         one, other = (np.array([getattr(found, name) for found in group]) for group in (rooms, photographs))
         ks, moved = distances(one, other)
-        low, high = interval(one, other, rng)
+        low, high, same = interval(one, other, rng)
         cells = [f"{values.mean():.3f} ({values.std(ddof=1):.3f})" for values in (other, one)]
-        print(f"| {name} | {cells[0]} | {cells[1]} | {ks:.2f} | {moved:.2f} [{low:.2f}, {high:.2f}] |")
+        print(f"| {name} | {cells[0]} | {cells[1]} | {ks:.2f} | {moved:.2f} [{low:.2f}, {high:.2f}] | {same:.2f} |")
     steps = [np.array([found.steps for found in group]) for group in (rooms, photographs)]
     pooled = [np.sort(group.ravel()) for group in steps]
     drawn = [
@@ -109,7 +115,7 @@ def main() -> None:
     ks = ks_2samp(*pooled).statistic
     print(
         f"| histogram of steps, pooled | {cells[0]} | {cells[1]} | {ks:.2f} | "
-        f"{wasserstein_distance(*pooled):.3f} [{low:.3f}, {high:.3f}], not over sd |"
+        f"{wasserstein_distance(*pooled):.3f} [{low:.3f}, {high:.3f}], not over sd | - |"
     )
 
 
