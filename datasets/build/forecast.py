@@ -117,8 +117,13 @@ def _seconds(plan: Plan, megapixels: float, bakes: bool) -> dict[str, float]:
 
 
 def _bake_s(plan: Plan) -> float:
-    """Seconds of a light map, that of the first room: rays are texels times rays per texel."""
-    ambient, room = plan.recipe.ambient, _first_room(plan)
+    """Seconds of a light map, the mean over the rooms of a plan; the first of a kind stands for all of it."""
+    return sum(part * _room_s(plan, room) for part, room in _first_rooms(plan))
+
+
+def _room_s(plan: Plan, room: Room) -> float:
+    """Seconds of the light map of a room: rays are texels times rays per texel."""
+    ambient = plan.recipe.ambient
     if not room.lit or is_cached(plan.rig.at(0.0), room, bake_settings(ambient)):
         return CACHED_BAKE_S
     table = face_table(fixed_shapes(room))
@@ -137,13 +142,17 @@ def _bake_s(plan: Plan) -> float:
     return float(rays * (_TRIANGLES[0] * doubled + _TRIANGLES[1]) + fine * BAKE_S_PER_MEGATEXEL) / 1e6
 
 
-def _first_room(plan: Plan) -> Room:
-    return plan.room(next(iter(plan.rooms)))
+def _first_rooms(plan: Plan) -> Iterator[tuple[float, Room]]:
+    """First room of each kind, and the part of all rooms that are of it."""
+    counts = Counter(source.kind for source in plan.rooms.values())
+    firsts = {source.kind: name for name, source in reversed(plan.rooms.items())}
+    return ((counts[kind] / len(plan.rooms), plan.room(name)) for kind, name in firsts.items())
 
 
-def _texels(plan: Plan) -> int:
-    room = _first_room(plan)
-    return texel_count(room, plan.recipe.ambient.texel_m) if room.lit else 0
+def _texels(plan: Plan) -> float:
+    """Texels of a light map, the mean over the rooms of a plan."""
+    size = plan.recipe.ambient.texel_m
+    return sum(part * texel_count(room, size) for part, room in _first_rooms(plan) if room.lit)
 
 
 def megabytes(count: int) -> str:

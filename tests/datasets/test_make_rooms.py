@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ from helpers.inline_workers import InlineWorkerPool, make_inline
 from helpers.processes import quiet
 from helpers.room_files import KINDS_TOML, write_files
 
+from phibench.datasets.build.forecast import forecast
+from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import dry_run, make
 from phibench.datasets.merge_repair import merge, repair
@@ -111,6 +114,21 @@ def test_files_may_lie_in_another_folder(
     before = {path: path.stat().st_mtime_ns for path in copy.rglob("*")}
     make(alone, copy, 1, quiet(), room_files=recipe.parent)  # complete already
     assert {path: path.stat().st_mtime_ns for path in copy.rglob("*") if path in before} == before
+
+
+def test_the_forecast_of_a_bake_is_the_mean_over_kinds(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four rooms, of which two are generated: the first of them stands for both."""
+    monkeypatch.setattr("phibench.datasets.build.forecast.is_cached", lambda *_: False)
+    plan = make_plan(load_recipe(recipe), recipe_files(recipe))
+    plan = replace(plan, rooms={**plan.rooms, "room000001": plan.rooms["room000000"]})
+    tasks = [task for task in plan_tasks(make_plan(plan.recipe, plan.files), {}).values() if task.kind == "bake"]
+
+    def seconds(*names: str) -> float:
+        return forecast(replace(plan, rooms={name: plan.rooms[name] for name in names}), tasks).seconds["bake"]
+
+    alone = [seconds(name) for name in IDS]
+    assert len(set(alone)) == 3
+    assert seconds(*IDS, "room000001") == pytest.approx((2 * alone[0] + alone[1] + alone[2]) / 4)
 
 
 def test_another_file_under_the_same_name_is_other_work(
