@@ -62,7 +62,8 @@ def lamp_halo(planes: ColourPlanes, inside: BoolArray, card: SensorCard, laser_o
 NEAREST_M, FARTHEST_M = 0.3, 12.0  # of D
 NEAR_CURVE_PX = 4.0  # shift of the curve for a rig that differs a little from the nominal one
 _POINTS = 48
-_FLUX_RATIO = 6.0  # of one spot in both images, at most
+_FLUX_RATIO = 6.0  # of one spot in both images, for 98 % of all surfaces
+_FLUX_RATIO_ALONE = 30.0  # where each is sure by itself: 17 at most in 900 pairs, times 2 for a sharp one on a mosaic
 _STRONGER = 1.5  # a single candidate over a pair's: others have half the spot's light at most
 _MOST = 24  # candidates of an image that are compared
 
@@ -99,8 +100,9 @@ def choose(rig: Rig, stroke_m: float, down: Candidates, up: Candidates, least: T
     """
     fits = consistent(rig, stroke_m, down.uv_px[:_MOST], up.uv_px[:_MOST])
     ratio = up.electrons[None, :_MOST] / np.maximum(down.electrons[:_MOST, None], 1e-9)
-    fits &= (ratio < _FLUX_RATIO) & (ratio > 1.0 / _FLUX_RATIO)
     z_down, z_up = down.z[:_MOST, None], up.z[None, :_MOST]
+    most = np.where(np.minimum(z_down, z_up) >= least.alone, _FLUX_RATIO_ALONE, _FLUX_RATIO)
+    fits &= (ratio < most) & (ratio > 1.0 / most)
     fits &= (np.minimum(z_down, z_up) >= least.each) & (z_down**2 + z_up**2 >= 2.0 * least.together**2)
     single = _single(down, up, least.alone)
     if not fits.any():

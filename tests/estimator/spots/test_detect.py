@@ -24,10 +24,12 @@ from phibench.estimator.limits.position_bound import spot_limit
 from phibench.estimator.methods.locate import box_around, locate
 from phibench.estimator.methods.raw_likelihood import joint_fit
 from phibench.estimator.methods.simple import detected_spots
-from phibench.estimator.spots.candidates import candidates_at, lattice
+from phibench.estimator.spots.candidates import Candidates, candidates_at, lattice
 from phibench.estimator.spots.detect import (
     RAW,
+    Choice,
     PairDetection,
+    choose,
     consistent,
     detect,
     epipolar_curve,
@@ -356,3 +358,24 @@ def test_spots_of_a_rendered_room_are_found(tiny_dataset: Path, preset: str, off
         for spot, row in ((found.down, sample.row.down), (found.up, sample.row.up)):
             assert spot is not None
             assert np.hypot(spot.uv_px[0] - row.u_px, spot.uv_px[1] - row.v_px) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("electrons", "significance", "pair"),
+    [
+        (5.0, 5.0, True),  # a ratio that nearly every surface has
+        (10.0, 5.0, False),  # noise beside a strong spot, which the other image hides
+        (10.0, 8.0, True),  # each sure by itself: a wall that is seen at a low angle
+        (40.0, 8.0, False),
+    ],
+)
+def test_one_spot_may_be_much_fainter_in_one_image_if_it_is_sure_there(
+    electrons: float, significance: float, pair: bool
+) -> None:
+    """The strong one is in the down image; the other lies on its curve, `electrons` times fainter."""
+    rig, strong = Rig(), np.array([[760.0, 420.0]])
+    on_curve = epipolar_curve(rig, 0.5, strong)[0, 20][None]
+    one, true = np.ones(1), np.ones(1, bool)
+    down = Candidates(strong, 60.0 * one, 1e4 * one, one, one, true)
+    up = Candidates(on_curve, significance * one, 1e4 / electrons * one, one, one, true)
+    assert choose(rig, 0.5, down, up, RAW, sure=True) == (Choice(0, 0) if pair else Choice(0))
