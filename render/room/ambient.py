@@ -25,6 +25,7 @@ from phibench.render.room.surfaces import Surfaces
 from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera
+from phibench.scenes.frames import Array
 from phibench.scenes.rig import View
 from phibench.scenes.room import Room
 
@@ -100,12 +101,22 @@ def render_ambient(
     surfaces = surfaces or view_surfaces(view, room)
     table = surfaces.table
     fixed = int(np.searchsorted(table.shape, len(fixed_shapes(room))))
-    light_carriage(surfaces, TexelGrid.of(table, settings.texel_m), fixed, light.irradiance_w_m2, settings, room.sun)
+    texels = TexelGrid.of(table, _texel_sizes_m(surfaces, fixed, settings.texel_m))
+    light_carriage(surfaces, texels, fixed, light.irradiance_w_m2, settings, room.sun)
     grid = FilmGrid.of(camera, cells_per_pixel)
     film = Film(mi, Look(mi, surfaces), grid, seed)
     layers = [_band(film, band, window, rounds, budget) for band in _bands(grid, window)]
     dr.flush_kernel_cache()  # other mirrors need other kernels; those of the next view are read from Dr.Jit's own cache
     return AmbientLayer(*(np.concatenate([pair[i] for pair in layers], axis=1) for i in (0, 1)))
+
+
+def _texel_sizes_m(surfaces: Surfaces, fixed: int, texel_m: float) -> Array:
+    """Texels of each patch: a third of the ball's radius where a holder is lit, whose light the ball changes."""
+    sizes = np.full(len(surfaces.table.shape), texel_m)
+    rig = surfaces.view.rig
+    if rig.holder is not None:
+        sizes[fixed:] = min(texel_m, rig.mirror.radius_m / 3.0)
+    return sizes
 
 
 def _bands(grid: FilmGrid, window: Crop) -> list[Crop]:

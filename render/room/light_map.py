@@ -16,7 +16,9 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
+from phibench.render.room.ball_light import ball_light
 from phibench.render.room.bounced_light import bounced_light, finer, gathered
+from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.render.room.irradiance_filter import smoothed
 from phibench.render.room.lamp_light import direct_light
 from phibench.render.room.surfaces import Surfaces
@@ -123,7 +125,10 @@ def light_carriage(
     settings: BakeSettings,
     sun: Sun | None = None,
 ) -> NDArray[np.float32]:
-    """Irradiance of all texels of a view: the map for the `fixed` first patches, gathered now for the others."""
+    """Irradiance of all texels of a view: the map for the `fixed` first patches, gathered now for the others.
+
+    With a holder, which stands close to it, the mirror ball takes and gives light as well (`ball_light`).
+    """
     mi = activate()
     first = grid.texels_of(fixed)
     full = np.zeros((grid.count, 3), dtype=np.float32)
@@ -131,13 +136,20 @@ def light_carriage(
     surfaces.set_light(grid, full)
     if first < grid.count:
         texels = Texels.of(mi, surfaces, grid, first)
-        direct = direct_light(mi, surfaces, texels, sun, settings.lamp_rays, _SEED)
-        full[first:] = 0.5 * (direct[0] + direct[1]) + gathered(mi, surfaces, texels, _CARRIAGE_RAYS, _SEED + 2)
+        rig = surfaces.view.rig
+        ball_mm = 0.0 if rig.holder is None else MM_PER_M * rig.mirror.radius_m
+        rays = _HOLDER_RAYS if ball_mm else _CARRIAGE_RAYS
+        direct = direct_light(mi, surfaces, texels, sun, settings.lamp_rays, _SEED, ball_mm)
+        light = 0.5 * (direct[0] + direct[1]) + gathered(mi, surfaces, texels, rays, _SEED + 2)
+        if ball_mm:
+            light = np.maximum(light + ball_light(mi, surfaces, texels, rays, _SEED + 3), 0.0)
+        full[first:] = light
         surfaces.set_light(grid, full)
     return full
 
 
 _CARRIAGE_RAYS = 1024
+_HOLDER_RAYS = 256  # its texels are many and small; 1024 rays would take 3 CPU-s for each view
 
 
 # Light maps as files.

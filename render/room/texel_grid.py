@@ -36,9 +36,9 @@ class TexelGrid:
     start: IntArray
 
     @classmethod
-    def of(cls, table: FaceTable, texel_m: float) -> TexelGrid:
-        """Grid with texels of at most `texel_m`."""
-        sides = np.maximum(np.ceil(table.size_m / texel_m - 1e-9), 2).astype(np.int64)
+    def of(cls, table: FaceTable, texel_m: float | Array) -> TexelGrid:
+        """Grid with texels of at most `texel_m`, a number or one for each patch, shape (P,)."""
+        sides = np.maximum(np.ceil(table.size_m / np.reshape(texel_m, (-1, 1)) - 1e-9), 2).astype(np.int64)
         columns, rows = np.where(table.emits | table.is_radiance, 0, sides.T)
         counts = columns * rows * np.where(table.two_sided, 2, 1)
         return cls(table, columns, rows, np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64))

@@ -17,6 +17,7 @@ from phibench.render.room.light_map import BakeSettings, LightMap, bake, fixed_s
 from phibench.render.room.texel_grid import TexelGrid
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Pose, rotation_xyz
+from phibench.scenes.holder import fitted
 from phibench.scenes.room import Room, Sun
 from phibench.scenes.shapes import Mesh, Prism, cuboid, rectangle
 from phibench.scenes.textures import Bitmap, Uniform
@@ -106,6 +107,31 @@ def test_means_against_path_tracing(lit: tuple[Room, LightMap], name: str) -> No
     print(name, ours / mean - 1.0, "+-", error / mean)
     assert np.all(error < 0.01 * mean)
     assert np.all(np.abs(ours - mean) <= 0.01 * mean + 5.0 * error)
+
+
+HELD = {  # kind of the mirror's holder, and a window of which a rod, or the plate, is a large part
+    "rod": ("rods", (616, 140, 48, 24)),
+    "rod beside the lamp": ("rods", (838, 470, 36, 30)),
+    "plate": ("rods", (670, 320, 20, 16)),
+    "column": ("post", (838, 470, 36, 30)),
+}
+
+
+@pytest.mark.parametrize("lit", [0.0], indirect=True, ids=["matt"])
+@pytest.mark.parametrize("name", [one if one == "rod" else pytest.param(one, marks=pytest.mark.slow) for one in HELD])
+def test_holders_against_path_tracing(lit: tuple[Room, LightMap], name: str) -> None:
+    """As above. Without the light that the ball takes and gives, the window of the rod is 1.3 to 1.8 % too bright."""
+    kind, crop = HELD[name]
+    view = dataclasses.replace(RIG, holder=fitted(kind, RIG.mirror.radius_m)).at(0.3)
+    place, light = lit
+    traced = np.array([path_trace(view, place, 64, 30, seed, crop) for seed in range(4)]).mean(axis=(2, 3))
+    mean, error = traced.mean(axis=0), traced.std(axis=0, ddof=1) / 2.0
+    ours = render_ambient(view, place, light, SETTINGS, 4, 0, crop).electrons_per_s.mean(axis=(1, 2))
+    print(name, ours / mean - 1.0, "+-", error / mean)
+    assert np.all(error < 0.0025 * mean)
+    assert np.all(np.abs(ours - mean) <= 0.01 * mean + 2.0 * error)
+    bare = render_ambient(RIG.at(0.3), place, light, SETTINGS, 4, 0, crop).electrons_per_s.mean(axis=(1, 2))
+    assert np.all(np.abs(bare / mean - 1.0) > 0.05)  # the window shows the holder
 
 
 def test_the_sun_lights_what_it_reaches_through_the_window() -> None:
