@@ -21,7 +21,7 @@ from phibench.scenes.frames import Array
 
 
 def meets_ball(radius_mm: Any, point: Any, way: Any) -> tuple[Any, Any]:
-    """Whether rays (scene, mm) meet the ball, whose centre is the origin, and how far away."""
+    """Mask of rays (scene, mm) that meet the ball, whose centre is the origin, and their distances from it."""
     import drjit as dr
 
     approach = -dr.dot(point, way)
