@@ -1,7 +1,7 @@
 """Pictures of docs/rooms.md: generated rooms in the mirror. Run from the repository root.
 
 `draw_rooms.py` draws four rooms and takes some minutes. `draw_rooms.py --sheet` draws the contact sheet of forty from
-coarse light maps, 13 CPU-s each, and keeps the views in `out/rooms/views.npz` for `compare_rooms.py`.
+coarse light maps, 9 CPU-s each, and keeps the views in `out/rooms/views.npz` for `compare_rooms.py`.
 """
 
 from __future__ import annotations
