@@ -136,8 +136,9 @@ MIN_PIXELS = 12
 """Pixels that a sector needs to count: four times its coefficients."""
 _HUBER, _CUT, _TUKEY = 2.0, 6.0, 4.685
 _ROUNDS = 3
-NEIGHBOURS = 3
-"""Sectors on each side, each of 18 px, whose errors may be correlated: JPEG's blocks and the room's structures."""
+NEIGHBOURS = 12
+"""Sectors on each side, each of 18 px, whose errors may be correlated: JPEG's blocks reach over two, pools of light
+on a ceiling over thirty. More than this leave too few independent parts of the outline to take a scatter from."""
 _MISFIT = (1.4, 2.0)
 """Rms of what the model leaves in a sector, over the usual one: trusted up to the first, not from the second on."""
 _HARMLESS = 0.003
@@ -279,7 +280,7 @@ def scatter(z: Array, trust: Array, directions: Array) -> Array:
     """Variance of the sectors' shifts over what their pixels promise, with the correlation of neighbours, shape ().
 
     One number for all of the limb: a sandwich of the parameters' own scores has a relative error of a quarter in sigma
-    from 120 sectors, this has an eighth. Bartlett weights around the full turn (Newey and West, Econometrica 55, 703,
+    from 120 sectors, this has a fifth. Bartlett weights around the full turn (Newey and West, Econometrica 55, 703,
     1987). The scatter left by a fit is too small; what white errors would leave is computed and divided out (the idea
     of Bell and McCaffrey, Survey Methodology 28, 169, 2002).
 
@@ -294,8 +295,9 @@ def scatter(z: Array, trust: Array, directions: Array) -> Array:
     lag = np.abs(np.arange(z.size)[:, None] - np.arange(z.size))
     W = np.clip(1.0 - np.minimum(lag, z.size - lag) / (NEIGHBOURS + 1), 0.0, None)
     left = np.eye(z.size) - directions @ np.linalg.pinv(directions)
-    white = float(np.sum(W * (left @ (trust[:, None] * left))))
-    return np.asarray(max(float(z @ W @ z), float(z @ z)) / max(white, 1.0))
+    alone = left @ (trust[:, None] * left)
+    white, single = float(np.sum(W * alone)), float(np.trace(alone))
+    return np.asarray(max(float(z @ W @ z) / max(white, 1.0), float(z @ z) / max(single, 1.0)))
 
 
 def _normal(group: NDArray[np.int64], groups: int, basis: Array, columns: Array, weight: Array) -> tuple[Array, Array]:

@@ -153,7 +153,7 @@ def _plain(texture: Texture) -> Vector:
 
 def _bitmap_dict(mi: ModuleType, texture: Bitmap) -> dict[str, Any]:
     """Bitmap as Mitsuba's: linear values, repeated."""
-    image = mi.Bitmap(np.ascontiguousarray(texture.values[..., :3]))
+    image = mi.Bitmap(np.array(texture.values[..., :3]))  # a copy in any case: one texel's slice would be read-only
     return {"type": "bitmap", "bitmap": image, "raw": True, "filter_type": "bilinear", "wrap_mode": "repeat"}
 
 
