@@ -29,6 +29,7 @@ _ASPECT_TOLERANCE = 0.01
 _LEAST_ROWS = 16
 _REMEDY = "give a JPEG, PNG, OpenEXR or Radiance HDR file"
 _HDR_MAGIC = (b"#?RADIANCE", b"#?RGBE")
+_OVERSHOOT = 0.01  # of the light, below 0
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 
 
@@ -66,9 +67,15 @@ def read_light(path: Path) -> Light:
         light = _hdr(file, data)
     else:
         light = _photograph(file, data)
-    if not np.isfinite(light).all() or light.min() < 0.0:
-        raise file.fault("has pixels that are negative or no finite numbers")
-    return light
+    lit = np.maximum(light, 0.0)
+    # lossy compression overshoots beside lamps, below 0 as well
+    if not np.isfinite(light).all() or lit.sum(dtype=float) - light.sum(dtype=float) > _OVERSHOOT * lit.sum(
+        dtype=float
+    ):
+        raise file.fault(
+            f"has pixels that are no finite numbers, or negative ones of more than {100 * _OVERSHOOT:g} % of its light"
+        )
+    return np.asarray(lit, dtype=np.float32)
 
 
 def _photograph(file: InputFile, data: bytes) -> Light:

@@ -109,8 +109,20 @@ def test_cut_hdr_files_are_refused(tmp_path):
 @pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
 def test_values_that_are_no_light_are_refused(tmp_path, value):
     planes = {name: np.full((16, 32), value, np.float32) for name in "RGB"}
-    with pytest.raises(SceneError, match="negative or no finite numbers"):
+    with pytest.raises(SceneError, match="no finite numbers, or negative ones"):
         read_light(write_exr(tmp_path / "a.exr", planes))
+
+
+@pytest.mark.parametrize(("undershoot", "accepted"), [(0.009, True), (0.011, False)])
+def test_a_lossy_picture_may_fall_below_zero_by_a_hundredth_of_its_light(tmp_path, undershoot, accepted):
+    plane = np.ones((16, 32), np.float32)
+    plane[0, 0] = -undershoot * (plane.size - 1)  # of what is above 0
+    path = write_exr(tmp_path / "a.exr", dict.fromkeys("RGB", plane))
+    if accepted:
+        assert read_light(path).min() == 0.0
+    else:
+        with pytest.raises(SceneError, match="more than 1 % of its light"):
+            read_light(path)
 
 
 @pytest.mark.parametrize("size", [(200, 90), (90, 200), (100, 100), (203, 100), (8, 4)])
