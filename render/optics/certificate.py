@@ -306,7 +306,10 @@ def _through_lens(view: View, spot: LaserSpot, uv: Array, rays: _Reflected, radi
 # Spots of a beam.
 
 
-_PILOTS = 256
+_PILOTS = 4096
+_APART = 4.0  # standard deviations from the image's middle: 3e-4 of a Gaussian
+_MOST_APART = 8  # faces
+_APART_WIDTH = 2.0  # a few pilots tell the extent badly
 _WIDTHS = (1.3, 3.0)  # of the two Gaussians, relative to the image: bounded weights, and tails where it is no Gaussian
 
 
@@ -317,11 +320,14 @@ def _trace_beam(
     x = np.clip(qmc.Sobol(7, scramble=True, rng=_SEED).random_base2(log2_rays), 1e-12, 1.0 - 1e-12)
     bundle = _Bundle(view.rig.camera.aperture_radius_m * _disc(x[:, :2]), _facets(view, x[:, 4:6]))
     centres = aim(view, spot, bundle, np.zeros((len(x), 2)), _through_chief_point(view, truth, bundle.lens_m))
-    mean, spread = _image_extent(view, spot, room, np.array([truth.u_px, truth.v_px]))
-    z = np.array(_WIDTHS)[(x[:, 6] < 0.5).astype(int), None] * ndtri(x[:, 2:4])
-    uv = centres + mean + z @ spread.T
-    r2 = (z**2).sum(axis=1)
-    density = sum(np.exp(-0.5 * r2 / w**2) / (4.0 * math.pi * w**2) for w in _WIDTHS) / abs(np.linalg.det(spread))
+    parts = _image_parts(view, spot, room, np.array([truth.u_px, truth.v_px]))
+    chosen = np.searchsorted(np.cumsum([part.share for part in parts])[:-1], x[:, 6], side="right")
+    z = ndtri(x[:, 2:4])
+    offset = np.empty_like(z)
+    for number, part in enumerate(parts):
+        own = chosen == number
+        offset[own] = part.mean + z[own] @ part.root.T
+    uv, density = centres + offset, sum(part.density(offset) for part in parts)
     rays = _reflect(view, spot, uv, bundle)
     seen = np.flatnonzero(np.isfinite(rays.directions).all(axis=1) & np.isfinite(uv).all(axis=1))
     radiance = np.zeros(len(uv))
@@ -333,19 +339,51 @@ def _trace_beam(
     return _moments(view, uv, watts / density / len(x))
 
 
-def _image_extent(view: View, spot: LaserSpot, room: RoomGeometry, chief_px: Array) -> tuple[Array, Array]:
-    """Mean (2,) from the chief ray's pixel, and root (2, 2) of the covariance, of the spot's image, pixels.
+@dataclass(frozen=True)
+class _Part:
+    """Gaussian by which film positions are drawn: share of the rays, mean (2,) and root (2, 2) of the covariance."""
 
-    Only how densely film positions are drawn follows from it, which is why the world-side solution may be used.
+    share: float
+    mean: Array
+    root: Array
+
+    def density(self, offset: Array) -> Array:
+        """Rays per square pixel at offsets (N, 2), as a part of all rays."""
+        r2 = (np.linalg.solve(self.root, (offset - self.mean).T) ** 2).sum(axis=0)
+        return np.asarray(self.share * np.exp(-0.5 * r2) / (2.0 * math.pi * abs(np.linalg.det(self.root))))
+
+
+def _image_parts(view: View, spot: LaserSpot, room: RoomGeometry, chief_px: Array) -> list[_Part]:
+    """Gaussians that cover the spot's image, pixels from the chief ray's.
+
+    Two cover the whole. A tail of the beam that passes an edge lands further on, and its image apart from the rest:
+    each face with such a part gets a Gaussian of its own. Only how densely film positions are drawn follows from all
+    this, which is why the world-side solution may be used.
     """
     places = ndtri(np.clip(qmc.Sobol(2, scramble=True, rng=_SEED).random(_PILOTS), 1e-4, 1.0 - 1e-4))
     light = deposit(spot, room, places if spot.profile == "gaussian" else 0.5 * places)
-    points = light.points_m[light.lit]
-    mirror = mirror_points(view, points, np.broadcast_to(view.camera_centre_m, points.shape)).points_m
+    light = light[light.lit]
+    mirror = mirror_points(view, light.points_m, np.broadcast_to(view.camera_centre_m, light.points_m.shape)).points_m
     uv = view.rig.camera.project(view.T_world_camera.inverse().points(mirror)) - chief_px
-    uv = np.concatenate([uv[np.isfinite(uv).all(axis=1)], np.zeros((1, 2))])
-    covariance = np.atleast_2d(np.cov(uv.T, bias=True)) + 1e-6 * np.eye(2)  # a spot of a point has an extent, too
-    return uv.mean(axis=0), np.asarray(np.linalg.cholesky(covariance), float)
+    found = np.isfinite(uv).all(axis=1)
+    uv, patch = np.concatenate([uv[found], np.zeros((1, 2))]), np.append(light.patch[found], -1)
+    mean, covariance = _moments_of(uv)
+    root = np.asarray(np.linalg.cholesky(covariance), float)
+    away = np.linalg.norm(np.linalg.solve(root, (uv - mean).T), axis=0) > _APART
+    faces, counts = np.unique(patch[away], return_counts=True)
+    apart = faces[np.argsort(-counts, kind="stable")][:_MOST_APART]
+    whole = 1.0 if len(apart) == 0 else 0.75
+    parts = [_Part(0.5 * whole, mean, width * root) for width in _WIDTHS]
+    for face in apart:
+        own_mean, own = _moments_of(uv[away & (patch == face)])
+        own_root = _APART_WIDTH * np.asarray(np.linalg.cholesky(own + 0.01 * covariance), float)
+        parts.append(_Part((1.0 - whole) / len(apart), own_mean, own_root))
+    return parts
+
+
+def _moments_of(uv: Array) -> tuple[Array, Array]:
+    """Mean and covariance; a spot of a point has an extent, too."""
+    return uv.mean(axis=0), np.atleast_2d(np.cov(uv.T, bias=True)) + 1e-6 * np.eye(2)
 
 
 def _beam_radiance(spot: LaserSpot, room: RoomGeometry, origins: Array, directions: Array) -> Array:

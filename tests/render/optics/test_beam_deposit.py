@@ -214,6 +214,26 @@ def test_certificate_of_a_beam(shapes: tuple[Shape, ...], aim: tuple[float, floa
         assert max(centroid_px / CENTROID_TOLERANCE_PX, flux / FLUX_TOLERANCE) > 3.0
 
 
+def test_certificate_of_a_beam_whose_tail_passes_an_edge() -> None:
+    """0.5 % of the power lands behind, away from the rest, on a surface that faces the mirror: above 1 % of the light.
+
+    The layer without it is more than three tolerances off, so the certificate's rays must find it.
+    """
+    lean = math.radians(82.0)
+    panel = rectangle("panel", (2.0, 0.0, 0.7), (-math.cos(lean), math.sin(lean), 0.0), (0.2, 0.4))
+    behind = rectangle("behind", (2.3, 0.0, 0.7), (-1.0, 0.0, 0.0), (0.6, 0.6))
+    edge = np.array([0.1 * math.sin(lean), 0.1 * math.cos(lean)])
+    inside = 2.6 * 5e-3 / 4.0
+    aim = (2.0 + edge[0] - inside / math.tan(math.pi / 2.0 - lean), edge[1] - inside, 0.7)
+    shapes = (panel, behind)
+    spot = beam_onto(shapes, aim)
+    truth, layer = spot_truth(VIEW, spot, shapes), spot_layer(VIEW, spot, shapes)
+    certificate = certify(VIEW, spot, shapes, truth, layer)
+    assert certificate.passed, certificate
+    alone = spot_layer(VIEW, spot, (panel,))
+    assert _differences(VIEW, spot, RoomGeometry(shapes), truth, alone, 15)[1] > 3.0 * FLUX_TOLERANCE
+
+
 def test_coats_keep_energy() -> None:
     """A white ground returns all that enters; f(1.5) = 0.596 (Egan and Hilgeman 1979), T(1.5) = 0.96 head on."""
     assert inside_reflectance(1.5) == pytest.approx(0.596, abs=1e-3)
