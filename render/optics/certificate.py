@@ -37,7 +37,7 @@ from phibench.scenes.rig import View
 CHIEF_TOLERANCE_PX = 1e-6
 CENTROID_TOLERANCE_PX = 2e-3
 FLUX_TOLERANCE = 3e-3
-_LOG2_RAYS = (13, 15, 17)  # 13: centroid within 4e-4 px, flux within 5e-4, for the random rigs of the tests
+_LOG2_RAYS = (13, 15, 17, 19)  # 13: centroid within 4e-4 px, flux within 5e-4, for the random rigs of the tests
 _SEED = 0  # the scramble is part of the quadrature rule, not a noise draw
 _STEP_PX = 1e-3
 _NEWTON_STEPS = 8
