@@ -125,7 +125,7 @@ def panorama(
     from phibench.datasets.build.room_export import export_panorama, export_room
 
     made = export_panorama(export_room(room_name, seed, properties, box=True), out, point_m, heading_deg, rows)
-    print(f"{made.path}: {2 * rows} x {rows} pixels; in a recipe:\n\n{made.table}")
+    print(f"\n# {made.path}: {2 * rows} x {rows} pixels\n{made.table}")
     return 0
 
 
@@ -155,5 +155,5 @@ def mesh(
     from phibench.datasets.build.room_export import export_mesh, export_room
 
     made = export_mesh(export_room(room_name, seed, properties), out)
-    print(f"{made.path}: {made.path.stat().st_size / 1e6:.1f} MB; in a recipe:\n\n{made.table}")
+    print(f"\n# {made.path}: {made.path.stat().st_size / 1e6:.1f} MB\n{made.table}")
     return 0
