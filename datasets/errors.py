@@ -9,3 +9,11 @@ class DatasetError(ValueError):
 
 class RecipeError(DatasetError):
     """A recipe with faults; the message has one line per fault."""
+
+
+class RefusedSampleError(DatasetError):
+    """A sample that cannot be made, while others can: an answer that is not certain, or too much noise."""
+
+
+class IncompleteError(DatasetError):
+    """A run that has finished all samples but those that were refused; the message has one line for each of these."""

@@ -86,6 +86,8 @@ def make(
     DatasetError
         If recipe, folder or disk will not do, or a task fails (the others are finished first). Nothing is then
         half-written under a final name, and `SHA256SUMS` is missing.
+    IncompleteError
+        If nothing but samples by themselves cannot be made; the others are finished first, and `SHA256SUMS` is missing.
     """
     console, out = console or progress_console(), Path(out)
     plan, text, note = _planned(recipe, out, shard, samples, seed, replace, room_files)
@@ -129,6 +131,7 @@ def dry_run(
     cost = forecast(plan, chosen).text(count, slowdown(count)) if chosen else "to make: nothing"
     seen = f"{sum(pair.visible for pair in pairs)} of {len(pairs)} pairs will be visible in both images"
     told += [f"warning: {warning}" for warning in warnings(plan.recipe)]
+    told += [f"will be refused: {name}: {reason}" for name, reason in plan.refused.items()]
     return "\n".join([*pair_table(pairs), seen, *told, f"{cost}, {len(tasks)} tasks in all; nothing was rendered"])
 
 
@@ -214,14 +217,14 @@ def _make(
         what = f"{len(todo)} of {len(tasks)} tasks are to be done, such as '{todo[0]}'"
         raise DatasetError(f"{what}, and {no_renderer}") from no_renderer
     copies = missing_room_files(plan.files, out)
-    if not todo and not (faults := _loose_ends(plan, head, journal, tasks, out)) and not copies:
+    if not todo and not plan.refused and not (faults := _loose_ends(plan, head, journal, tasks, out)) and not copies:
         if journal.is_written(head, tasks):
             console.print(f"{out} is complete, nothing to do", highlight=False)
             return []
         journal.begin(head, tasks)
         console.print(f"{out} is complete, its journal is written anew", highlight=False)
         return [schema.JOURNAL]
-    if todo:
+    if todo or plan.refused:
         (out / schema.CHECKSUMS).unlink(missing_ok=True)
         run_tasks(plan, tasks, todo, journal, head, out, pool, console)
         faults = _loose_ends(plan, head, journal, tasks, out)

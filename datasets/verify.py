@@ -21,10 +21,12 @@ from phibench.datasets.build.bake_task import read_light_map
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.sample_task import noise_row, spot_noise
 from phibench.datasets.build.spot_task import SpotAnswer, answer_spot
+from phibench.datasets.build.task_list import sample_task_name
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan.plan import PairPlan, Plan, make_plan, shard_plan
 from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import Dataset, Sample, open_dataset
+from phibench.datasets.recipe.load import parse_recipe
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import (
     damaged,
@@ -34,7 +36,7 @@ from phibench.datasets.store.checksums import (
     read_checksums,
     strays,
 )
-from phibench.datasets.store.documents import differences, same_number, sensitivity_fault, to_json
+from phibench.datasets.store.documents import differences, parse_info, same_number, sensitivity_fault, to_json
 from phibench.datasets.store.layers import (
     SPOT_STACKS,
     read_ambient,
@@ -102,6 +104,9 @@ def verify(folder: str | Path, truth_layers: bool = True, console: Console | Non
     if not any((folder / name).is_file() for name in _SIGNS):
         raise DatasetError(f"{folder} is not a data set: it has no {schema.INFO}")
     faults, files, notes = file_faults(folder)
+    if not (folder / schema.CHECKSUMS).is_file() and (missing := _missing_samples(folder)):
+        others = (fault for fault in faults if not any(name in fault for name in _LAST))
+        return Report(_once([missing, *others]), files, 0, notes)
     if not (folder / schema.INFO).is_file():
         lost = f"{schema.INFO} is missing; `phibench dataset repair` writes it anew"
         return Report(_once([lost, *faults]), files, 0, notes)
@@ -118,6 +123,26 @@ def verify(folder: str | Path, truth_layers: bool = True, console: Console | Non
     return Report(_once(faults), files, len(dataset), notes)
 
 
+def _missing_samples(folder: Path) -> str:
+    """One sentence on the samples that an unfinished data set lacks; empty if it lacks none, or nobody can tell."""
+    journal = Journal(folder)
+    try:
+        if journal.head is None:
+            return ""
+        info = parse_info(journal.head.info)
+        plan = shard_plan(make_plan(parse_recipe(journal.head.recipe), held_room_files(folder)), info.shard)
+    except ValueError:  # damaged, or of another version
+        return ""
+    names = [pair.sample_id for pair in plan.pairs if sample_task_name(pair) not in journal.entries]
+    if not (names := [*names, *plan.refused]):
+        return ""
+    what = " is" if len(names) == 1 else f" and {len(names) - 1} more are"
+    text = f"{folder} was not finished: {names[0]}{what} missing of {len(plan.pairs) + len(plan.refused)} samples"
+    return f"{text}; run `phibench dataset make` again"
+
+
+_LAST = (schema.INFO, schema.RECIPE, schema.CHECKSUMS)
+"""Files that are written when all samples are done."""
 _SIGNS = (schema.INFO, schema.JOURNAL, schema.CHECKSUMS, schema.MANIFEST)  # any of them tells a data set
 
 

@@ -24,7 +24,7 @@ from phibench.datasets.build.scheduler import schedule
 from phibench.datasets.build.task_list import bake_task_name, sample_task_name, spot_task_name
 from phibench.datasets.build.tasks import Done, Failed, Task, log_entry
 from phibench.datasets.build.workers import WorkerPool
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.errors import DatasetError, IncompleteError
 from phibench.datasets.input_files import InputFile
 from phibench.datasets.plan.plan import PairPlan, Plan
 from phibench.datasets.progress import Steps
@@ -185,22 +185,27 @@ def run_tasks(
     ------
     DatasetError
         If the disk has no room, or, when all others are done, with the tasks that failed and why.
+    IncompleteError
+        If samples were refused and nothing else has failed, when all others are done.
     """
     chosen = [tasks[name] for name in todo]
     cost, before = forecast(plan, chosen), {name: journal.entries[name] for name in todo if name in journal.entries}
     check_disk(out, cost.size, [name for entry in before.values() for name in entry.files])
     factor = slowdown(pool.width)
     kept = f", {len(tasks) - len(todo)} of {len(tasks)} tasks are done" if len(todo) < len(tasks) else ""
-    console.print(cost.text(pool.width, factor) + kept, highlight=False, soft_wrap=True)
+    if chosen:
+        console.print(cost.text(pool.width, factor) + kept, highlight=False, soft_wrap=True)
     left = set(todo)
     journal.begin(head, [name for name in tasks if name not in left])
     copy_room_files(plan.files, out)  # tasks see this folder alone
-    failures = _run(chosen, Pace(cost.seconds, factor, pool.width), journal, out, pool, console)
+    failures = _run(chosen, Pace(cost.seconds, factor, pool.width), journal, out, pool, console) if chosen else {}
     for name, entry in before.items():
         if name in journal.entries and journal.entries[name] != entry and journal.entries[name].key == entry.key:
             console.print(f"warning: {name} came out with other bytes than the first time", highlight=False)
-    if failures:
+    if any(not failed.refused for failed in failures.values()):
         raise DatasetError(_report(failures, len(todo)))
+    if refused := {**plan.refused, **_refused(plan, tasks, failures)}:
+        raise IncompleteError(_refusals(plan, refused))
 
 
 def _run(
@@ -224,12 +229,44 @@ def _run(
 
 
 def _report(failures: dict[str, Failed], count: int) -> str:
-    lines = [f"  {name}: {failed.cause}" for name, failed in list(failures.items())[:_TOLD]]
-    more = [f"  and {len(failures) - _TOLD} more, see {schema.LOG}"] if len(failures) > _TOLD else []
+    lines = [f"{name}: {failed.cause}" for name, failed in failures.items()]
     first = (
         f"{len(failures)} of {count} tasks failed; what is finished is kept, run the same command again for the rest:"
     )
-    return "\n".join([first, *lines, *more])
+    return _listed(first, lines)
+
+
+def _listed(first: str, lines: Sequence[str]) -> str:
+    more = [f"  and {len(lines) - _TOLD} more, see {schema.LOG}"] if len(lines) > _TOLD else []
+    return "\n".join([first, *(f"  {line}" for line in lines[:_TOLD]), *more])
+
+
+def _refused(plan: Plan, tasks: Mapping[str, Task], failures: Mapping[str, Failed]) -> dict[str, str]:
+    """Cause by sample, for those whose last task is not done: that of the first task of theirs that failed."""
+    named = {pair.sample_id: sample_task_name(pair) for pair in plan.pairs}
+    return {
+        sample_id: failures[_culprit(name, tasks, failures)].cause
+        for sample_id, name in named.items()
+        if name in failures
+    }
+
+
+def _culprit(name: str, tasks: Mapping[str, Task], failures: Mapping[str, Failed]) -> str:
+    need = next((need for need in tasks[name].needs if need in failures), None)
+    return name if need is None else _culprit(need, tasks, failures)
+
+
+def _refusals(plan: Plan, refused: Mapping[str, str]) -> str:
+    """One sentence for each refused sample: which, why, and what to do."""
+    order, count = sorted(refused) if plan.recipe.random else list(refused), len(plan.pairs) + len(plan.refused)
+    remedy = "change its target, its stroke or its rig"
+    if plan.recipe.random is not None:
+        number = int(order[0].rsplit("-", 1)[1])  # the samples of a shard are numbered as in the whole
+        fewer = f", or `--samples {number}` for those before {order[0]} alone" if number and plan.shard is None else ""
+        remedy = f"give another seed{fewer}"
+    lines = [f"{name} is refused: {refused[name]}; {remedy}" for name in order]
+    first = f"{len(refused)} of {count} samples are refused, all others are kept; the data set is not finished:"
+    return _listed(first, lines)
 
 
 # The small files, when all tasks are done.

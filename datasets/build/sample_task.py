@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from phibench.datasets.build.spot_task import RefusedSampleError
 from phibench.datasets.build.tasks import Made
+from phibench.datasets.errors import RefusedSampleError
 from phibench.datasets.plan.plan import PairPlan
 from phibench.datasets.rooms.room_sources import RoomSource, room_of
 from phibench.datasets.store import schema
@@ -40,7 +40,7 @@ def finish_sample(out: Path, pair: PairPlan, rig: Rig, source: RoomSource, spot:
         ambient = out / schema.view_file(pair.pose_id(position), "ambient")
         planes, window = read_ambient(ambient), _window(out, pair, position)
         budget = spot_noise(view, truth, window, planes, read_ambient_variance(ambient))
-        _check(f"{pair.sample_id} {position}", budget, BUDGETS[quality])
+        _check(position, budget, BUDGETS[quality])
         rows[position] = None if budget is None else noise_row(budget).model_dump(mode="json")
         frame = planes.astype(float)
         window.add_to(frame)
@@ -64,11 +64,11 @@ def noise_row(budget: NoiseBudget) -> NoiseRow:
     return NoiseRow(phi_sensor_rad=budget.phi_sensor_rad, phi_render_rad=budget.phi_render_rad)
 
 
-def _check(name: str, budget: NoiseBudget | None, allowed: float) -> None:
+def _check(position: str, budget: NoiseBudget | None, allowed: float) -> None:
     if budget is not None and not budget.kept(allowed):
         raise RefusedSampleError(
-            f"refused: the rendering noise of {name} is an error of phi of {budget.phi_render_rad:.2g} rad, more than "
-            f"{allowed:g} of the sensor's {budget.phi_sensor_rad:.2g} rad; give ambient.cells_per_pixel a larger value"
+            f"the rendering noise of its view {position} is an error of phi of {budget.phi_render_rad:.2g} rad, more "
+            f"than {allowed:g} of the sensor's {budget.phi_sensor_rad:.2g} rad: raise ambient.cells_per_pixel"
         )
 
 

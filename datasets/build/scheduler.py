@@ -86,7 +86,7 @@ class _Queue:
         for reader in self._readers.pop(task.name, ()):
             if isinstance(outcome, Failed):
                 if self._missing.pop(reader.name, None) is not None:
-                    failed = Failed(f"not made, because {task.name} failed")
+                    failed = Failed(f"not made, because {task.name} failed", refused=outcome.refused)
                     yield reader, failed
                     yield from self.settle(reader, failed)
             elif reader.name in self._missing:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from phibench.datasets.build.tasks import Made
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.errors import RefusedSampleError
 from phibench.datasets.plan.plan import PairPlan
 from phibench.datasets.rooms.room_sources import RoomSource, room_of
 from phibench.datasets.store import schema
@@ -40,10 +40,6 @@ class SpotAnswer:
         return float(u_px) - self.truth.u_px, float(v_px) - self.truth.v_px
 
 
-class RefusedSampleError(DatasetError):
-    """A sample whose certificate is out of tolerance."""
-
-
 def answer_spot(view: View, spot: LaserSpot, room: Room) -> SpotAnswer:
     """Compute one spot in one view."""
     geometry = room_geometry(room, view)
@@ -63,8 +59,8 @@ def make_spot(out: Path, dataset: str, rig: Rig, source: RoomSource, spot: Laser
     views = {position: rig.at(Stroke(pair.stroke_m).offset_m(position)) for position in POSITIONS}
     room = room_of(source, out / schema.ROOM_FILES)
     answers = {position: answer_spot(view, spot, room) for position, view in views.items()}
-    if refused := [line for position in POSITIONS for line in _complaints(pair, position, answers[position])]:
-        raise RefusedSampleError("\n".join(["refused, a certificate is out of tolerance:", *refused]))
+    if refused := [text for position in POSITIONS for text in _complaints(position, answers[position])]:
+        raise RefusedSampleError(f"a certificate is out of tolerance ({'; '.join(refused)})")
     rows = {}
     for position, answer in answers.items():
         file = _write_layer(out, dataset, pair, position, answer)
@@ -131,7 +127,7 @@ def _triple(values: Iterable[float]) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _complaints(pair: PairPlan, position: str, answer: SpotAnswer) -> list[str]:
+def _complaints(position: str, answer: SpotAnswer) -> list[str]:
     c = answer.certificate
     if c is None or c.passed:
         return []
@@ -140,7 +136,7 @@ def _complaints(pair: PairPlan, position: str, answer: SpotAnswer) -> list[str]:
         f"centroid {c.centroid_difference_px:.3g} px ({c.centroid_tolerance_px:g}), "
         f"flux {c.flux_difference:.3g} ({c.flux_tolerance:g})"
     )
-    return [f"  {pair.sample_id} {position}: {numbers}"]
+    return [f"{position}: {numbers}"]
 
 
 def _window(layer: SpotLayer) -> SpotWindow:

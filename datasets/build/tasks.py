@@ -18,8 +18,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.rooms.room_errors import RoomError
 from phibench.datasets.store.files import sha256, working
 from phibench.datasets.store.provenance import code_sha256
+from phibench.scenes.validation import SceneError
 
 
 @dataclass(frozen=True)
@@ -73,10 +76,21 @@ class Done:
 
 @dataclass(frozen=True)
 class Failed:
-    """A task that ended badly; `cause` is for people."""
+    """A task that ended badly.
+
+    Attributes
+    ----------
+    cause : str
+        For people.
+    lethal : bool
+        Its worker died.
+    refused : bool
+        The fault is that of a sample, or of the room of a few: neither of the program nor of the machine.
+    """
 
     cause: str
     lethal: bool = field(default=False, kw_only=True)
+    refused: bool = field(default=False, kw_only=True)
 
 
 def task_key(inputs: Any, code: str, versions: Mapping[str, Any], needs: tuple[str, ...] = ()) -> str:
@@ -98,7 +112,7 @@ def perform(task: Task, out: Path, code: str | None = None) -> Done | Failed:
             made = task.function(out, *task.arguments)
             files = {name: sha256(out / name) for name in made.files}
     except Exception as error:
-        return Failed(fault_text(error))
+        return Failed(fault_text(error), refused=_is_refusal(error))
     return Done(files, made.result, round(time.perf_counter() - began, 3), _peak_mb(), worker_name())
 
 
@@ -113,10 +127,15 @@ def fault_text(error: Exception) -> str:
     return (str(error) or type(error).__name__) if told else traceback.format_exc()
 
 
+def _is_refusal(error: Exception) -> bool:
+    """Tell whether an error says that a sample cannot be made; a room's file that has gone is no such error."""
+    return isinstance(error, DatasetError | SceneError) and not isinstance(error, RoomError)
+
+
 def log_entry(task: Task, outcome: Done | Failed) -> dict[str, Any]:
     """One line of `log.jsonl`, without the time."""
     entry = {"task": task.name, "key": task.key, "ok": isinstance(outcome, Done), **asdict(outcome)}
-    return {key: value for key, value in entry.items() if key not in ("files", "result", "lethal")}
+    return {key: value for key, value in entry.items() if key not in ("files", "result", "lethal", "refused")}
 
 
 def _peak_mb() -> float:

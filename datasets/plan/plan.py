@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from phibench.datasets.errors import DatasetError, RecipeError
 from phibench.datasets.plan.room_draws import draw_rooms, room_files
@@ -118,6 +118,8 @@ class Plan:
         "i/n" where this is a part of the recipe (`shard_plan`).
     files : RoomFiles
         Of all rooms of the recipe, with the SHA-256 that they must have.
+    refused : dict
+        Samples that are not among `pairs`, because they cannot be drawn: the reason by id.
     """
 
     recipe: Recipe
@@ -129,6 +131,7 @@ class Plan:
     pairs: tuple[PairPlan, ...]
     shard: str | None = None
     files: RoomFiles = RoomFiles()
+    refused: dict[str, str] = field(default_factory=dict)
 
     def room(self, name: str) -> Room:
         """Room of an id, built from the files in their folder."""
@@ -145,8 +148,8 @@ def make_plan(recipe: Recipe, files: RoomFiles | None = None) -> Plan:
     Raises
     ------
     RecipeError
-        If two strokes differ by less than a nanometre, so that their poses would share a name, or if a sample of
-        `[random]` stays impossible, or if a room cannot be built.
+        If two strokes differ by less than a nanometre, so that their poses would share a name, or if all of the first
+        samples of `[random]` stay impossible, or if a room cannot be built.
     """
     rig = build_rig(recipe.rig)
     try:
@@ -218,7 +221,7 @@ def pose_of(rig: str, offset_m: float, room: str = ONLY_ROOM) -> str:
 
 def _random_plan(recipe: Recipe, table: RandomTable, rig: Rig, rooms: dict[str, RoomSource], files: RoomFiles) -> Plan:
     """Equal rigs share an id, and so their views; the first sample that has one names it, so that more change none."""
-    samples = draw_samples(recipe, table, rooms, files.folder)
+    samples, refused = draw_samples(recipe, table, rooms, files.folder)
     ids = {rig: RECIPE_RIG}
     for sample in samples:
         ids.setdefault(sample.rig, f"r{sample.number:06d}")
@@ -228,11 +231,17 @@ def _random_plan(recipe: Recipe, table: RandomTable, rig: Rig, rooms: dict[str, 
     rigs = {name: one for one, name in ids.items() if name in used}
     spots = {pair.spot: sample.spot for pair, sample in zip(pairs, samples, strict=True)}
     used_rooms = {name: rooms[name] for name in dict.fromkeys(pair.room for pair in pairs)}
-    return Plan(recipe, rig, rigs, used_rooms, spots, _poses(recipe, dict.fromkeys(_places(pairs))), pairs)
+    poses = _poses(recipe, dict.fromkeys(_places(pairs)))
+    reasons = {_random_name(number): reason for number, reason in refused.items()}
+    return Plan(recipe, rig, rigs, used_rooms, spots, poses, pairs, refused=reasons)
+
+
+def _random_name(number: int) -> str:
+    return f"random-{number:06d}"
 
 
 def _random_pair(sample: RandomSample, rig: str, nominal_rig: str) -> PairPlan:
-    name, strokes_m = f"random-{sample.number:06d}", (sample.stroke_m, sample.nominal_stroke_m)
+    name, strokes_m = _random_name(sample.number), (sample.stroke_m, sample.nominal_stroke_m)
     numbers = (name, "random", sample.surface, *strokes_m, name, rig, nominal_rig)
     return PairPlan(*numbers, drawn=sample.drawn, tries=sample.tries, room=sample.room)
 
@@ -274,10 +283,13 @@ def shard_plan(plan: Plan, shard: str | None) -> Plan:
         return plan
     i, n = parse_shard(shard)
     # shards in a row, without a gap; their sizes differ by one sample at most
-    first, end = (k * len(plan.pairs) // n for k in (i - 1, i))
+    names = [pair.sample_id for pair in plan.pairs]
+    names = sorted([*names, *plan.refused]) if plan.refused else names  # drawn samples: their numbers give the order
+    first, end = (k * len(names) // n for k in (i - 1, i))
     if first == end:
-        raise DatasetError(f"shard {shard} is empty: there are {len(plan.pairs)} samples; use at most as many shards")
-    pairs = plan.pairs[first:end]
+        raise DatasetError(f"shard {shard} is empty: there are {len(names)} samples; use at most as many shards")
+    owned = set(names[first:end])
+    pairs = tuple(pair for pair in plan.pairs if pair.sample_id in owned)
     poses, spots = {pair.pose_id(p) for pair in pairs for p in POSITIONS}, {pair.spot for pair in pairs}
     rigs = {name for pair in pairs for name in (pair.rig, pair.nominal_rig)}
     return replace(
@@ -288,6 +300,7 @@ def shard_plan(plan: Plan, shard: str | None) -> Plan:
         poses=tuple(pose for pose in plan.poses if pose.pose_id in poses),
         pairs=pairs,
         shard=f"{i}/{n}",
+        refused={name: reason for name, reason in plan.refused.items() if name in owned},
     )
 
 

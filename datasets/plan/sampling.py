@@ -8,13 +8,14 @@ it into a value (`distributions.quantile`).
 
 A sample may be impossible: rig, spot and stroke do not go together, or not with the room. It is then drawn again, with
 numbers of streams of its own (`further_points`), so that no other sample moves. The same holds for a rig of `[rigs]`
-that cannot exist or cannot make one of the strokes. Whether a sample's spot is to be hidden in one image is dealt once
+that cannot exist or cannot make one of the strokes. A sample that stays impossible is refused alone, if others are
+possible. Whether a sample's spot is to be hidden in one image is dealt once
 and stays, however often the sample is drawn: the share of hidden ones is that of the recipe.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -40,7 +41,7 @@ from phibench.datasets.recipe.tables import (
     Recipe,
     RigTable,
 )
-from phibench.datasets.rooms.room_sources import ONLY_ROOM, RoomSource, room_of
+from phibench.datasets.rooms.room_sources import ONLY_ROOM, MeshRoom, PanoramaRoom, RoomSource, room_of
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
@@ -151,31 +152,52 @@ class RandomSample:
 
 def draw_samples(
     recipe: Recipe, table: RandomTable, rooms: Mapping[str, RoomSource], folder: Path | None = None
-) -> tuple[RandomSample, ...]:
+) -> tuple[tuple[RandomSample, ...], dict[int, str]]:
     """All samples of a recipe with `[random]`, dealt to its rooms in turn; `folder` has the files of the rooms.
+
+    Returns
+    -------
+    samples : tuple of RandomSample
+    refused : dict of number and reason
+        Samples that stay impossible after `TRIES` draws (`HIDDEN_TRIES` of a hidden spot), or whose generated room
+        cannot be built.
 
     Raises
     ------
     RecipeError
-        If a sample stays impossible after `TRIES` draws (`HIDDEN_TRIES` of a hidden spot), with the last reason, or if
-        a room cannot be built.
+        If a panorama or mesh cannot be used, or if none of the first samples is possible, of all or of one of these.
     """
-    dataset, found = recipe.dataset, dict[int, RandomSample]()
+    dataset, found, refused = recipe.dataset, dict[int, RandomSample](), dict[int, str]()
     first = first_points(table.sequence, dataset.name, dataset.seed, table.samples, drawn_parameters(table))
     for k, room_id in enumerate(rooms):  # a room is built once, and let go before the next
         numbers = range(k, table.samples, len(rooms))
         if numbers:
-            makers = _Makers(recipe, table, room_id, _built(room_id, rooms[room_id], folder), first)
-            pilot = numbers[:_PILOT]  # whether the recipe is possible at all is known after a few
-            found |= {sample.number: sample for part in (pilot, numbers[_PILOT:]) for sample in makers.draw(part)}
-    return tuple(found[number] for number in range(table.samples))
+            stated = isinstance(rooms[room_id], PanoramaRoom | MeshRoom)
+            try:
+                room = room_of(rooms[room_id], folder)
+            except SceneError as error:
+                fault = f"{room_id} cannot be built: {error}"
+                if stated or room_id == ONLY_ROOM:
+                    raise RecipeError(f"rooms: {fault}") from error
+                refused |= dict.fromkeys(numbers, fault)
+                _require_some(refused, found, table.samples)
+                continue
+            makers = _Makers(recipe, table, room_id, room, first)
+            for part in (numbers[:_PILOT], numbers[_PILOT:]):  # whether it is possible at all is known after a few
+                drawn, lost = makers.draw(part)
+                found |= {sample.number: sample for sample in drawn}
+                refused |= lost
+                _require_some(refused, found, table.samples)
+                if stated:  # it is the recipe that names it
+                    _require_some(lost, [number for number in numbers if number in found], len(numbers))
+    return tuple(found[number] for number in sorted(found)), dict(sorted(refused.items()))
 
 
-def _built(room_id: str, source: RoomSource, folder: Path | None) -> Room:
-    try:
-        return room_of(source, folder)
-    except SceneError as error:
-        raise RecipeError(f"rooms: {room_id} cannot be built: {error}") from error
+def _require_some(refused: Mapping[int, str], found: Collection[int], count: int) -> None:
+    """Raise `RecipeError` if all of the first few samples are refused: it is then the recipe that is impossible."""
+    if refused and not found and len(refused) >= min(_PILOT, count):
+        number = min(refused)
+        raise RecipeError(f"random: sample {number} {refused[number]}")
 
 
 def rig_table(table: RigTable, values: Mapping[str, Value]) -> RigTable:
@@ -204,23 +226,27 @@ class _Makers:
         self._boards = Boards([build_target(target) for target in recipe.targets])
         self._ceiling_m = ceiling_m(room)
 
-    def draw(self, numbers: range) -> list[RandomSample]:
-        """Draw some samples, those that are impossible again until they are not."""
+    def draw(self, numbers: range) -> tuple[list[RandomSample], dict[int, str]]:
+        """Draw some samples, those that are impossible again until they are not; the reason where they stay so."""
         found: dict[int, RandomSample] = {}
+        refused: dict[int, str] = {}
         left = list(numbers)
         for attempt in range(HIDDEN_TRIES):
             outcomes = self._once(left, attempt)
             found |= {number: sample for number, sample in outcomes.items() if isinstance(sample, RandomSample)}
             left = [number for number in left if number not in found]
+            lost = [number for number in left if attempt + 1 == self._tries(number)]
+            refused |= {number: self._reason(attempt + 1, str(outcomes[number])) for number in lost}
+            left = [number for number in left if number not in refused]
             if not left:
-                return [found[number] for number in numbers]
-            tries = attempt + 1
-            if lost := [number for number in left if tries == self._tries(number)]:
-                where = "" if self._room_id == ONLY_ROOM else f" in {self._room_id}"
-                why = f"has no possible rig, spot and stroke{where} in {tries} draws; the last: {outcomes[lost[0]]}"
-                boards = " or move the boards" if self._targets else ""
-                raise RecipeError(f"random: sample {lost[0]} {why}; narrow the distributions{boards}")
+                return [found[number] for number in numbers if number in found], refused
         raise AssertionError("every sample is found or lost")
+
+    def _reason(self, tries: int, last: str) -> str:
+        where = "" if self._room_id == ONLY_ROOM else f" in {self._room_id}"
+        boards = " or move the boards" if self._targets else ""
+        why = f"has no possible rig, spot and stroke{where} in {tries} draws; the last: {last}"
+        return f"{why}; narrow the distributions{boards}"
 
     def _tries(self, number: int) -> int:
         share = self._table.spot.hidden

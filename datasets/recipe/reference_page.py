@@ -158,8 +158,8 @@ drawn. Sample i depends on the rest of the recipe and on i, not on `samples`. Ma
 folder again with more, and only the new ones are rendered. Spots that the mirror does not show are kept,
 with the cause.
 
-A sample alone is drawn again, at most 100 times, where rig, spot and stroke do not go together. The manifest
-counts `tries`. The reasons:
+A sample alone is drawn again, at most 100 times, where rig, spot and stroke do not go together. One that stays
+impossible is refused by itself, and the others are made. The manifest counts `tries`. The reasons:
 
 * The mirror would not be before the lens.
 * The distortion would fold the image.

@@ -132,7 +132,7 @@ def main(tokens: Sequence[str] | None = None) -> int:
     except Exception as error:  # the last resort: a fault in a file that no reader has seen
         if _is_users(error):
             print(f"phibench: {_sentence(error)}", file=sys.stderr)
-            return 2
+            return 1 if _is_incomplete(error) else 2
         if os.environ.get(TRACEBACK):
             raise
         print(f"phibench: {_confession(error)}", file=sys.stderr)
@@ -177,6 +177,12 @@ def _refuse_strange(tokens: Sequence[str]) -> None:
     for token in tokens:
         if "\0" in token or any("\ud800" <= c <= "\udfff" for c in token):
             raise DatasetError(f"the argument {token!r} is not UTF-8, or has a zero byte; give another name")
+
+
+def _is_incomplete(error: Exception) -> bool:
+    from phibench.datasets.errors import IncompleteError
+
+    return isinstance(error, IncompleteError)
 
 
 def _is_users(error: Exception) -> bool:

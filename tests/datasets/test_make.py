@@ -179,8 +179,9 @@ def test_a_sample_out_of_tolerance_is_refused_with_its_numbers(tmp_path: Path, m
 
     monkeypatch.setattr(spot_task, "certify", off_by_a_hundredth)
     text = refusal(tmp_path / "out")
-    assert "seen-near-h0.500 down: chief ray 0.01 px (tolerance 1e-06)" in text
-    assert "4 of 8 tasks failed" in text  # two spots and the previews that wait for them; the views were finished
+    cause = "is refused: a certificate is out of tolerance (down: chief ray 0.01 px (tolerance 1e-06)"
+    assert f"  seen-near-h0.500 {cause}" in text
+    assert "2 of 2 samples are refused" in text
     assert not (tmp_path / "out" / schema.CHECKSUMS).exists()
     assert not (tmp_path / "out" / schema.MANIFEST).exists()
 
