@@ -1,4 +1,4 @@
-"""Drawing of docs/holder.jpg: the mirror without a holder, with rods, with a post. Run `python docs/draw_holder.py`."""
+"""Drawing of docs/holder.jpg: the mirror with all kinds of holders. Run `python docs/draw_holder.py`."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def main() -> None:
     camera = replace(old, width_px=_WIDTH, height_px=_HEIGHT, **half, **middle)
     light = light_map(rig.at(0.0), room, _COARSE)
     parts = []
-    for holder in (None, *(fitted(kind, rig.mirror.radius_m) for kind in ("rods", "post"))):
+    for holder in (None, *(fitted(kind, rig.mirror.radius_m) for kind in ("rods", "post", "tube"))):
         view = replace(rig, camera=camera, holder=holder).at(0.3)
         planes = render_ambient(view, room, light, _COARSE, 2, 0).electrons_per_s
         left = (_WIDTH - _SQUARE) // 2
         picture = to_srgb(planes, camera.detector, display_exposure_s(planes, camera.detector))
         parts.append(picture[:, left : left + _SQUARE])
     image = Image.fromarray(np.concatenate(parts, axis=1))
-    image.save(Path(__file__).with_name("holder.jpg"), quality=72, optimize=True)
+    image.save(Path(__file__).with_name("holder.jpg"), quality=68, optimize=True)
 
 
 if __name__ == "__main__":

@@ -28,11 +28,12 @@ from typing import Literal
 import numpy as np
 
 from phibench.scenes.frames import Array, Pose, as_matrix, as_vector
+from phibench.scenes.glass_tube import GlassTube
 from phibench.scenes.shapes import Cuboid, Prism
 from phibench.scenes.textures import Uniform
 from phibench.scenes.validation import SceneError, finite, within
 
-HolderKind = Literal["rods", "post"]
+HolderKind = Literal["rods", "post", "tube"]
 Part = Prism | Cuboid
 
 SIDES = 24
@@ -41,6 +42,7 @@ _PLATE_M = 0.004  # thickness
 _BELOW_LENS_M = 0.034  # top of the plate below the camera, whose housing ends 1 mm above
 _BLACK_METAL = Uniform((0.10, 0.10, 0.10))
 _RODS = 3
+LARGEST_INDEX = 2.5  # of a tube: diamond has 2.42
 
 
 @dataclass(frozen=True)
@@ -49,17 +51,22 @@ class Holder:
 
     Parameters
     ----------
-    kind : "rods" or "post"
+    kind : "rods", "post" or "tube"
     radius_m : float
-        Of each rod; of post, arm and column.
+        Of each rod; of post, arm and column; a tube has none.
     circle_m : float
-        From the holder's axis to that of each rod, or of the column.
+        From the holder's axis to that of each rod, or of the column; to the inner face of a tube.
     plate_m : float
         Radius of the plates.
     rise_m : float
         From the ball's centre up to the upper plate, or to the top of the arm.
     azimuth_rad : float
         Direction of the first rod, or of the column, from the camera's x axis against the clock seen from above.
+    wall_m : float
+        Thickness of a tube's wall.
+    glass_index : float
+        Refractive index of a tube. Borosilicate glass 3.3: 1.473 at 587.6 nm (data sheet of Schott's Duran tubing),
+        acrylic: 1.491 (Kasarova et al., Optical Materials 29, 1481, 2007). One for all wavelengths.
     """
 
     kind: HolderKind
@@ -68,26 +75,34 @@ class Holder:
     plate_m: float = 0.090
     rise_m: float = 0.090
     azimuth_rad: float = math.pi / 6.0
+    wall_m: float = 0.003
+    glass_index: float = 1.473
 
     def __post_init__(self) -> None:
         for name in LENGTHS:
             within("Holder", name, getattr(self, name), 1e-4, 1.0)
         finite("Holder", "azimuth_rad", self.azimuth_rad)
+        within("Holder", "glass_index", self.glass_index, 1.0, LARGEST_INDEX)
 
     @property
     def part_names(self) -> tuple[str, ...]:
         """Names of the parts, in the order of `holder_shapes`."""
         if self.kind == "rods":
             return ("holder_plate_low", "holder_plate_high", *(f"holder_rod_{i + 1}" for i in range(_RODS)))
+        if self.kind == "tube":
+            return ("holder_plate_low", "holder_plate_high")
         return ("holder_plate_low", "holder_column", "holder_arm", "holder_post")
 
     @property
     def top_m(self) -> float:
         """Height of its highest part above the ball's centre, along its axis."""
-        return self.rise_m + (_PLATE_M if self.kind == "rods" else 0.0)
+        return self.rise_m + (0.0 if self.kind == "post" else _PLATE_M)
 
     def check(self, ball_m: float, lens_m: float) -> None:
         """Raise `SceneError` if it does not fit a ball of radius `ball_m` and a lens opening of radius `lens_m`."""
+        if self.kind == "tube":
+            self._check_tube(ball_m, lens_m)
+            return
         thick = prism_radius_m(self.radius_m)
         inside = max(ball_m, lens_m) + thick
         upright = "rods" if self.kind == "rods" else "column"
@@ -106,7 +121,24 @@ class Holder:
                 f"Holder.radius_m = {self.radius_m:g}: the post is thicker than the ball, whose radius is "
                 f"{ball_m:g} m; give less"
             )
-        low = ball_m if self.kind == "rods" else ball_m + 2.0 * self.radius_m
+        self._check_rise(ball_m if self.kind == "rods" else ball_m + 2.0 * self.radius_m)
+
+    def _check_tube(self, ball_m: float, lens_m: float) -> None:
+        if self.circle_m <= max(ball_m, lens_m):
+            raise SceneError(
+                f"Holder.circle_m = {self.circle_m:g}: the tube would stand inside the ball, whose radius is "
+                f"{ball_m:g} m; give more than {max(ball_m, lens_m):.4f}"
+            )
+        outer = self.circle_m + self.wall_m
+        if outer > self.plate_m * math.cos(math.pi / PLATE_SIDES):
+            least = math.ceil(1e4 * outer / math.cos(math.pi / PLATE_SIDES)) / 1e4
+            raise SceneError(
+                f"Holder.plate_m = {self.plate_m:g}: the tube's wall would stand outside the plate; give at least "
+                f"{least:.4f}, or a smaller circle_m or wall_m"
+            )
+        self._check_rise(ball_m)
+
+    def _check_rise(self, low: float) -> None:
         if self.rise_m <= low:
             raise SceneError(
                 f"Holder.rise_m = {self.rise_m:g}: the holder's top would lie inside the ball; give more than {low:.4f}"
@@ -116,16 +148,20 @@ class Holder:
 def fitted(kind: HolderKind, ball_m: float, **given: float) -> Holder:
     """Holder with the sizes that are given, and others that suit a ball of radius `ball_m`.
 
-    The gap between ball and rods is a quarter of the ball's radius, the plates reach two radii of a rod beyond them,
-    and the upper plate is half the ball's radius above its top.
+    The gap between ball and rods, or tube, is a quarter of the ball's radius. The plates reach two radii of a rod
+    beyond them, and the upper plate is half the ball's radius above its top. A tube's wall does not follow the ball.
     """
-    sizes = {"radius_m": ball_m / 15.0, **given}
-    sizes.setdefault("circle_m", 1.25 * ball_m + sizes["radius_m"])
-    sizes.setdefault("plate_m", sizes["circle_m"] + 3.0 * sizes["radius_m"])
+    sizes = {"radius_m": ball_m / 15.0, "wall_m": Holder.wall_m, **given}
+    tube = kind == "tube"
+    sizes.setdefault("circle_m", 1.25 * ball_m + (0.0 if tube else sizes["radius_m"]))
+    beyond = sizes["wall_m"] + 2.0 * sizes["radius_m"] if tube else 3.0 * sizes["radius_m"]
+    sizes.setdefault("plate_m", sizes["circle_m"] + beyond)
     sizes.setdefault("rise_m", 1.5 * ball_m)
     return Holder(kind, **sizes)
 
 
+OF_TUBES = ("wall_m", "glass_index")
+"""Fields that mean something for a tube alone; documents of other holders leave them out."""
 LENGTHS = tuple(field.name for field in fields(Holder) if field.name.endswith("_m"))
 """Names of the sizes that `fitted` may choose."""
 
@@ -148,11 +184,14 @@ def holder_shapes(holder: Holder, T_world_camera: Pose, sphere_centre_m: Array, 
         Radius of the ball, which the post ends on.
     """
     axis = _Axis.of(T_world_camera, sphere_centre_m)
-    foot, top = -_BELOW_LENS_M, axis.length_m + holder.rise_m
+    foot, top = _ends_m(holder, axis)
     plates: list[Part] = [axis.upright(0.0, 0.0, foot - _PLATE_M, foot, holder.plate_m, PLATE_SIDES)]
     thick = prism_radius_m(holder.radius_m)
-    if holder.kind == "rods":
+    if holder.kind != "post":
         plates.append(axis.upright(0.0, 0.0, top, top + _PLATE_M, holder.plate_m, PLATE_SIDES))
+    if holder.kind == "tube":
+        return _named(holder, plates)
+    if holder.kind == "rods":
         turns = [holder.azimuth_rad + 2.0 * math.pi * i / _RODS for i in range(_RODS)]
         posts = [axis.upright(turn, holder.circle_m, foot, top, thick, SIDES) for turn in turns]
         return _named(holder, [*plates, *posts])
@@ -166,6 +205,18 @@ def holder_shapes(holder: Holder, T_world_camera: Pose, sphere_centre_m: Array, 
     )
     post = axis.upright(0.0, 0.0, axis.length_m + ball_m, top - width, thick, SIDES)
     return _named(holder, [*plates, column, arm, post])
+
+
+def holder_tube(holder: Holder, T_world_camera: Pose, sphere_centre_m: Array) -> GlassTube:
+    """Wall of a holder that is a tube, in the world, from plate to plate; heights count from the lens centre."""
+    axis = _Axis.of(T_world_camera, sphere_centre_m)
+    radii = (holder.circle_m, holder.circle_m + holder.wall_m)
+    return GlassTube(*radii, holder.glass_index, *_ends_m(holder, axis), axis.origin_m, axis.rotation[:, 2])
+
+
+def _ends_m(holder: Holder, axis: _Axis) -> tuple[float, float]:
+    """Heights above the lens between which upright parts stand."""
+    return -_BELOW_LENS_M, axis.length_m + holder.rise_m
 
 
 def _named(holder: Holder, parts: Sequence[Part]) -> tuple[Part, ...]:

@@ -17,7 +17,8 @@ import numpy as np
 
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector
-from phibench.scenes.holder import Holder, holder_shapes
+from phibench.scenes.glass_tube import GlassTube
+from phibench.scenes.holder import Holder, holder_shapes, holder_tube
 from phibench.scenes.mirror import Form, SphereMirror, deviation, level
 from phibench.scenes.misalignment import Misalignment, Motion
 from phibench.scenes.shapes import Cuboid, Prism
@@ -237,6 +238,14 @@ class View:
         if rig.holder is None:
             return ()
         return holder_shapes(rig.holder, self.T_world_camera, self.sphere_centre_m, rig.mirror.radius_m)
+
+    @cached_property
+    def tube(self) -> GlassTube | None:
+        """Wall of glass around the mirror, in the world; None where the holder is no tube."""
+        rig = self.rig
+        if rig.holder is None or rig.holder.kind != "tube":
+            return None
+        return holder_tube(rig.holder, self.T_world_camera, self.sphere_centre_m)
 
     @property
     def camera_centre_m(self) -> Array:

@@ -63,7 +63,7 @@ def build_rig(table: RigTable) -> Rig:
 def _holder(table: HolderTable, mirror: SphereMirror) -> Holder | None:
     if table.kind == "none":
         return None
-    given = {name: value for name in LENGTHS if (value := getattr(table, name)) is not None}
+    given = {name: value for name in (*LENGTHS, "glass_index") if (value := getattr(table, name)) is not None}
     return fitted(table.kind, mirror.bound_m, azimuth_rad=float(np.radians(table.azimuth_deg)), **given)
 
 

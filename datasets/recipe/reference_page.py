@@ -113,7 +113,8 @@ Divide `fx_px` by the same factor to see as much as before.
 """,
     "[rig.holder]": """What carries the mirror. It moves with the rig, is seen in the mirror and hides spots; see
 `docs/holder.md`. R is `radius_m` of `[rig]`: sizes that are left out follow it. Its axis runs from the lens centre to
-the sphere centre. Rods and column must stand beside the mirror and within the plates.
+the sphere centre. Rods, column and tube must stand beside the mirror and within the plates. The last two keys
+are a tube's alone.
 """,
     "[misalignment]": """What the true rig deviates by from `[rig]`, which then is the nominal one: what an estimator
 is given. Images and truth are those of the true rig. Signs, axes and figures: `docs/misalignment.md`.
@@ -177,7 +178,7 @@ not drawn is as in `[rig]`, which must be a possible rig itself. A drawn `fx_px`
 (square pixels) unless `fy_px` is drawn or set in `[rig]`, and the other way round.
 """,
     "[random.rig.holder]": """Any key of `[rig.holder]`, and `kind` from a choice of names, such as
-`kind = { choice = ["none", "rods", "post"] }`. A sample whose sizes do not go together is drawn again.
+`kind = { choice = ["none", "rods", "tube"] }`. A sample whose sizes do not go together is drawn again.
 """,
     "[random.misalignment]": """Any key of `[misalignment]`, within its range, in place of the value there. The rig
 that `[random.rig]` gives is the nominal one.

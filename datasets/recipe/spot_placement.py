@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -60,11 +60,15 @@ def _tilt(rig: Rig) -> float:
 def cut_part(view: View, plate: Cuboid) -> str | None:
     """Name the part of the carriage (mirror, housing, mast, holder) that a board cuts; None if none.
 
-    Round parts of the holder count as the boxes around them.
+    Round parts of the holder count as the boxes around them, its glass included.
     """
     if plate.distance_m(view.sphere_centre_m) <= view.rig.mirror.bound_m:
         return "mirror"
-    boxes = (Cuboid(one.name, one.T_world_shape, one.size_m) for one in view.holder_shapes)
+    boxes = [Cuboid(one.name, one.T_world_shape, one.size_m) for one in view.holder_shapes]
+    if (tube := view.tube) is not None:
+        middle = tube.origin_m + 0.5 * (tube.low_m + tube.high_m) * tube.axis
+        upright = replace(boxes[0].T_world_shape, translation_m=as_vector(middle))
+        boxes.append(Cuboid("holder_tube", upright, (2.0 * tube.outer_m, 2.0 * tube.outer_m, tube.high_m - tube.low_m)))
     return next((part.name.replace("_", " ") for part in (*carriage(view), *boxes) if plate.meets(part)), None)
 
 

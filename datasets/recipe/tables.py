@@ -8,7 +8,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, Discriminator, Field, Tag, create_model
+from pydantic import (
+    AfterValidator,
+    Discriminator,
+    Field,
+    SerializerFunctionWrapHandler,
+    Tag,
+    create_model,
+    model_serializer,
+)
 
 from phibench.datasets.recipe.distributions import (
     Distribution,
@@ -22,6 +30,7 @@ from phibench.datasets.recipe.distributions import (
 )
 from phibench.datasets.recipe.room_tables import RoomsTable, RoomTable
 from phibench.scenes.catalog import BOARD_SIZE_M
+from phibench.scenes.holder import LARGEST_INDEX, OF_TUBES
 from phibench.scenes.misalignment import PARAMETERS
 
 MIN_STROKE_M, MAX_STROKE_M = 1e-3, 10.0
@@ -33,6 +42,7 @@ Distortion = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 FocalPx = Annotated[float, Field(ge=50.0, le=50000.0)]
 Unit = Annotated[float, Field(ge=0.0, le=1.0)]
 Response = Annotated[tuple[Unit, ...], Field(strict=False, min_length=3, max_length=3)]
+GlassIndex = Annotated[float, Field(ge=1.0, le=LARGEST_INDEX)]
 HolderM = Annotated[float, Field(ge=1e-4, le=1.0)]
 Preset = Literal["mono-raw", "bayer-raw", "srgb8", "mjpeg"]
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -79,22 +89,37 @@ class DatasetTable(Table):
     seed: int = Field(default=0, ge=0, le=2**63 - 1, description="root of all random streams; 0 is legal")
 
 
-class HolderTable(Table):
+class _OfHolder(Table):
+    """Table with keys of a holder."""
+
+    @model_serializer(mode="wrap")
+    def _without_what_is_not_given(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Recipes that say nothing of a tube keep the hash that they had before there was one."""
+        document: dict[str, Any] = serialised(self)
+        return {key: value for key, value in document.items() if key not in OF_TUBES or value is not None}
+
+
+class HolderTable(_OfHolder):
     """`[rig.holder]`: what carries the mirror."""
 
-    kind: Literal["none", "rods", "post"] = Field(
-        default="none", description="three rods around the mirror, or a post from above on an arm"
+    kind: Literal["none", "rods", "post", "tube"] = Field(
+        default="none", description="three rods around the mirror, a post from above, or a glass tube"
     )
     radius_m: HolderM | None = Field(default=None, description="of each rod; of post, arm and column; R/15")
     circle_m: HolderM | None = Field(
-        default=None, description="from the axis to that of each rod, or of the column; 1.25 R + radius_m"
+        default=None,
+        description="from the axis to rods or column, 1.25 R + radius_m; to a tube, 1.25 R",
     )
-    plate_m: HolderM | None = Field(default=None, description="radius of the plates; circle_m + 3 radius_m")
+    plate_m: HolderM | None = Field(default=None, description="radius of the plates; 2 radius_m beyond rods or tube")
     rise_m: HolderM | None = Field(
         default=None, description="sphere centre to the upper plate, or to the arm's top; 1.5 R"
     )
     azimuth_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = Field(
         default=30.0, description="of the first rod, or the column, from the camera's x axis"
+    )
+    wall_m: HolderM | None = Field(default=None, description="thickness of the tube's wall; 0.003 whatever R")
+    glass_index: GlassIndex | None = Field(
+        default=None, description="refractive index of the tube; 1.473 whatever R, borosilicate glass 3.3"
     )
 
 
@@ -251,7 +276,7 @@ if TYPE_CHECKING:
 else:
     RandomHolderTable = create_model(
         "RandomHolderTable",
-        __base__=Table,
+        __base__=_OfHolder,
         __doc__="`[random.rig.holder]`: distributions of keys of `[rig.holder]`.",
         **{
             key: (

@@ -42,6 +42,7 @@ from phibench.datasets.store.schema import (
     drawn_columns,
     row_line,
 )
+from phibench.scenes.holder import OF_TUBES
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import nearest, printable_line
 
@@ -59,10 +60,14 @@ def to_json(value: object) -> Any:
     """JSON document (dicts, lists, numbers) of a frozen dataclass such as `Rig` or `Room`.
 
     A rig without a holder says nothing of one: its document, and with it every key and digest, is that of older ones.
+    A holder that is no tube says nothing of glass.
     """
     document = _adapter(cast(Any, type(value))).dump_python(value, mode="json")
-    if isinstance(value, Rig) and value.holder is None:
-        del document["holder"]
+    if isinstance(value, Rig):
+        if value.holder is None:
+            del document["holder"]
+        elif value.holder.kind != "tube":
+            document["holder"] = {key: part for key, part in document["holder"].items() if key not in OF_TUBES}
     return document
 
 
@@ -88,7 +93,7 @@ def from_json(kind: type[T], document: Any) -> T:
     return value
 
 
-_LATER = {"form", "coat", "window", "sun", "holder"}
+_LATER = {"form", "coat", "window", "sun", "holder", *OF_TUBES}
 """Fields that older versions do not have, whose default is what these versions meant: `mirror.form` in version 4."""
 _LARGEST = 1e12
 

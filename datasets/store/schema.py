@@ -96,7 +96,7 @@ class SpotRow(Document):
     reflection_point_world_m: Vector3 = described("m", "where the chief ray meets the mirror")
     camera_centre_world_m: Vector3 = described("m", "lens centre")
     sphere_centre_world_m: Vector3 = described("m", "sphere centre")
-    path_spot_mirror_m: Number = described("m", "spot centre to reflection point")
+    path_spot_mirror_m: Number = described("m", "spot centre to reflection point, along the ray")
     path_mirror_camera_m: Number = described("m", "reflection point to lens centre")
     visible: bool = described("-", "whether the chief ray reaches the sensor")
     cause: str = described("-", "why not; 'none' if visible")

@@ -10,6 +10,9 @@ A spot of a beam is found the same way round: each ray goes on to the first surf
 looked for backwards, with a shadow test. Film positions are drawn from two Gaussians that cover the spot's image; the
 faces that the spot lies on play no part in that, so that edges and textures need nothing of their own.
 
+A glass tube around the mirror is crossed by Snell's law for vectors, at one face after the other; Fresnel's equations
+and the sum over the reflections between the faces give what passes.
+
 Film positions are pixels (u, v), shape (N, 2); points are world coordinates in metres, shape (N, 3).
 """
 
@@ -17,6 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import ndtri
@@ -29,7 +33,8 @@ from phibench.render.optics.room_tracer import GeometryLike, RoomGeometry, as_ge
 from phibench.render.optics.spot_layer import SpotLayer
 from phibench.render.optics.truth import SpotTruth
 from phibench.scenes.faces import FaceTable, IntArray
-from phibench.scenes.frames import Array
+from phibench.scenes.frames import Array, BoolArray
+from phibench.scenes.glass_tube import GlassTube
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
 
@@ -42,6 +47,7 @@ _SEED = 0  # the scramble is part of the quadrature rule, not a noise draw
 _STEP_PX = 1e-3
 _NEWTON_STEPS = 8
 _HALVINGS = 6
+_ECHOES = 60  # between the faces of a plate: R^120 is left, 1e-6 for R = 0.89
 
 
 @dataclass(frozen=True)
@@ -231,14 +237,29 @@ def _disc(x: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Reflected:
-    """Rays of film positions after the mirror."""
+    """Rays of film positions after the mirror, and after the glass around it where there is a tube.
+
+    `corners_m` are the mirror point and, in order, where a ray meets the faces of the glass; the ray goes on from the
+    last in `directions`.
+    """
 
     lens_points_m: Array
-    mirror_points_m: Array
+    corners_m: tuple[Array, ...]
     directions: Array
     cos_facet: Array
     cos_lens: Array
     facet_weight: Array
+    transmittance: Array | float
+
+    @property
+    def starts_m(self) -> Array:
+        """Places from which the rays go on into the room."""
+        return self.corners_m[-1]
+
+    def legs(self, chosen: IntArray | BoolArray) -> list[tuple[Array, Array]]:
+        """Starts and ends of straight parts of some rays, from the lens on."""
+        places = [place[chosen] for place in (self.lens_points_m, *self.corners_m)]
+        return list(pairwise(places))
 
 
 def _reflect(view: View, spot: LaserSpot, uv: Array, bundle: _Bundle) -> _Reflected:
@@ -250,7 +271,45 @@ def _reflect(view: View, spot: LaserSpot, uv: Array, bundle: _Bundle) -> _Reflec
     cos_facet = -np.einsum("ni,ni->n", facet, directions)
     out = directions + 2.0 * cos_facet[:, None] * facet
     weight = cos_facet / (rays.cos_incidence * np.einsum("ni,ni->n", facet, rays.normals))
-    return _Reflected(origins, rays.points_m, out, cos_facet, directions @ view.T_world_camera.R[:, 2], weight)
+    cos_lens = directions @ view.T_world_camera.R[:, 2]
+    if view.tube is None:
+        return _Reflected(origins, (rays.points_m,), out, cos_facet, cos_lens, weight, 1.0)
+    corners, out, passing = _through_glass(view.tube, rays.points_m, out)
+    return _Reflected(origins, corners, out, cos_facet, cos_lens, weight, passing)
+
+
+def _through_glass(tube: GlassTube, points: Array, directions: Array) -> tuple[tuple[Array, ...], Array, Array]:
+    """Points where rays leave the mirror and meet the two faces, directions behind the glass, and what it passes."""
+    corners, passing = [points], np.zeros(len(points))
+    for radius, ratio in ((tube.inner_m, 1.0 / tube.index), (tube.outer_m, tube.index)):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            points, outward = _to_cylinder(tube, points, directions, radius)
+            cos = np.einsum("ni,ni->n", directions, outward)
+            along = ratio * (directions - cos[:, None] * outward)
+            directions = along + np.sqrt(1.0 - np.einsum("ni,ni->n", along, along))[:, None] * outward
+            if radius == tube.inner_m:
+                passing = _through_plate(cos, tube.index)
+        corners.append(points)
+    return tuple(corners), directions, passing
+
+
+def _to_cylinder(tube: GlassTube, points: Array, directions: Array, radius: float) -> tuple[Array, Array]:
+    """Points of a cylinder about the tube's axis that rays from inside meet, and its outward normals there."""
+    flat = np.eye(3) - np.outer(tube.axis, tube.axis)
+    offset, way = (points - tube.origin_m) @ flat, directions @ flat
+    a, b = np.einsum("ni,ni->n", way, way), np.einsum("ni,ni->n", way, offset)
+    c = np.einsum("ni,ni->n", offset, offset) - radius**2
+    distance = ((np.sqrt(b * b - a * c) - b) / a)[:, None]
+    return points + distance * directions, (offset + distance * way) / radius
+
+
+def _through_plate(cos: Array, n: float) -> Array:
+    """Part of unpolarised light that a plate passes: (1 - R)^2 (1 + R^2 + R^4 + ...) for each polarisation."""
+    outside = np.clip(np.arccos(cos), 1e-9, None)
+    inside = np.arcsin(np.sin(outside) / n)
+    apart, together = outside - inside, outside + inside
+    faces = (np.sin(apart) / np.sin(together)) ** 2, (np.tan(apart) / np.tan(together)) ** 2
+    return np.asarray(0.5 * sum((1.0 - R) ** 2 * sum(R ** (2 * k) for k in range(_ECHOES)) for R in faces))
 
 
 def _tangents(view: View, spot: LaserSpot, rays: MirrorRays) -> Array:
@@ -267,7 +326,7 @@ def _tangents(view: View, spot: LaserSpot, rays: MirrorRays) -> Array:
 def _on_wall(view: View, spot: LaserSpot, uv: Array, bundle: _Bundle) -> Array:
     """Landing points in the spot's plane of rays from film positions, metres along its tangents, shape (N, 2)."""
     rays = _reflect(view, spot, uv, bundle)
-    return _meet(spot, rays.mirror_points_m, rays.directions)[0]
+    return _meet(spot, rays.starts_m, rays.directions)[0]
 
 
 def _meet(spot: LaserSpot, origins: Array, directions: Array) -> tuple[Array, Array]:
@@ -286,11 +345,11 @@ def _wall_jacobian(view: View, spot: LaserSpot, uv: Array, bundle: _Bundle) -> A
 def _watts(view: View, spot: LaserSpot, room: RoomGeometry, uv: Array, bundle: _Bundle) -> Array:
     """Radiance x etendue, watts per square pixel for the whole aperture, shape (N,)."""
     rays = _reflect(view, spot, uv, bundle)
-    wall, points = _meet(spot, rays.mirror_points_m, rays.directions)
+    wall, points = _meet(spot, rays.starts_m, rays.directions)
     facing = rays.directions @ np.array(spot.normal_world) < 0.0
     watts = _through_lens(view, spot, uv, rays, spot.radiance_w_m2_sr(np.linalg.norm(wall, axis=-1)) * facing)
     hit = np.isfinite(watts)
-    legs = ((rays.mirror_points_m[hit], points[hit]), (rays.lens_points_m[hit], rays.mirror_points_m[hit]))
+    legs = (*rays.legs(hit), (rays.starts_m[hit], points[hit]))
     watts[hit] *= np.all([blocked_by(room, start, end) < 0 for start, end in legs], axis=0)
     return watts
 
@@ -299,6 +358,7 @@ def _through_lens(view: View, spot: LaserSpot, uv: Array, rays: _Reflected, radi
     """Watts per square pixel for the whole aperture of a radiance that rays come from, shape (N,)."""
     camera = view.rig.camera
     reflectance = rays.facet_weight * view.rig.mirror.reflectance(rays.cos_facet, spot.wavelength_nm)
+    reflectance = reflectance * rays.transmittance
     density = camera.solid_angle_density(camera.normalised(uv))
     return radiance * reflectance * density * rays.cos_lens**4 * math.pi * camera.aperture_radius_m**2
 
@@ -331,9 +391,10 @@ def _trace_beam(
     rays = _reflect(view, spot, uv, bundle)
     seen = np.flatnonzero(np.isfinite(rays.directions).all(axis=1) & np.isfinite(uv).all(axis=1))
     radiance = np.zeros(len(uv))
-    radiance[seen] = _beam_radiance(spot, room, rays.mirror_points_m[seen], rays.directions[seen])
+    radiance[seen] = _beam_radiance(spot, room, rays.starts_m[seen], rays.directions[seen])
     lit = np.flatnonzero(radiance > 0.0)
-    radiance[lit] *= blocked_by(room, rays.lens_points_m[lit], rays.mirror_points_m[lit]) < 0
+    for start, end in rays.legs(lit):
+        radiance[lit] *= blocked_by(room, start, end) < 0
     watts = np.zeros(len(uv))
     watts[seen] = _through_lens(view, spot, uv, rays, radiance)[seen]
     return _moments(view, uv, watts / density / len(x))

@@ -22,6 +22,12 @@ checks it). The tangent plane at a point that both ends see has the straight lin
 mirror on the other, so that there is at most one such point. With a the source, l^2 m^2 det(M) / cos^2 i is the spread
 of the reflected bundle from steradians to square metres at b: Coddington's (1 + m / s_t) (1 + m / s_s) l^2 for any
 curvature matrix.
+
+**Glass tube around the mirror.** A point outside appears at another place to rays from inside, which depends on the
+ray (`scenes.glass_tube`): the reflection point of that place gives the ray, and the ray the place. Rounds of the two
+settle, because a few millimetres of glass move little. The bundle that spreads from the place to the eye is that of
+the point but for the growth of areas across it (`GlassTube.stretch`), with the ray's derivatives by the place from M:
+where it moves by dW, the reflection point moves by M^-1 (I - u u^T) dW / l, tangentially.
 """
 
 from __future__ import annotations
@@ -32,6 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.scenes.frames import Array, BoolArray
+from phibench.scenes.glass_tube import GlassTube, across
 from phibench.scenes.mirror import Form, deviation, level
 from phibench.scenes.rig import View
 
@@ -45,28 +52,105 @@ class MirrorPoints:
     points_m, normals : arrays, shape (N, 3)
     lit : bool array, shape (N,)
         Whether both ends see the point.
+    apparent_m : array, shape (N, 3)
+        Where the world points appear from inside a tube; the points themselves where no glass is between.
+    bent : bool array, shape (N,), or None
+        Whether a tube's wall is on the way; None without a tube.
     """
 
     points_m: Array
     normals: Array
     lit: BoolArray
+    apparent_m: Array
+    bent: BoolArray | None = None
 
 
 def mirror_points(view: View, points_m: Array, eyes_m: Array) -> MirrorPoints:
-    """Reflection points for pairs of world points, shape (N, 3) each."""
+    """Reflection points for pairs of world points, shape (N, 3) each.
+
+    Where glass is around the mirror and no ray through it leads to a point, the straight one is given, and not lit.
+    """
+    tube = view.tube
+    if tube is None:
+        return _straight(view, points_m, eyes_m)
+    apparent, bent = points_m, tube.outside(points_m)
+    step = np.full(len(points_m), np.inf)
+    for _ in range(_GLASS_ROUNDS):
+        found = _straight(view, apparent, eyes_m)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ray = _split(apparent - found.points_m)[1]
+            new = np.where(bent[:, None], tube.appearing(points_m, *tube.invariants(found.points_m, ray)), points_m)
+            step = np.linalg.norm(new - apparent, axis=1)
+        if not np.any(step > _SETTLED_M):
+            break
+        apparent = np.where((found.lit & np.isfinite(step))[:, None], new, apparent)
+    lost = found.lit & ~(step <= _ENOUGH_M)
+    if lost.any():
+        apparent, bent = np.where(lost[:, None], points_m, apparent), bent & ~lost
+        found = _straight(view, apparent, eyes_m)
+    return MirrorPoints(found.points_m, found.normals, found.lit & ~lost, apparent, bent)
+
+
+def _straight(view: View, points_m: Array, eyes_m: Array) -> MirrorPoints:
+    """Reflection points without glass."""
     centre, mirror = view.sphere_centre_m, view.rig.mirror
     if mirror.form is None:
         found, lit = reflection_points(points_m - centre, eyes_m - centre, mirror.radius_m)
         found = found + centre
-        return MirrorPoints(found, (found - centre) / mirror.radius_m, lit)
+        return MirrorPoints(found, (found - centre) / mirror.radius_m, lit, points_m)
     axes = view.T_world_sphere.R
     ends = ((points_m - centre) @ axes, (eyes_m - centre) @ axes)
     found, normals, lit = fermat_points(*ends, mirror.radius_m, mirror.form)
-    return MirrorPoints(found @ axes.T + centre, normals @ axes.T, lit)
+    return MirrorPoints(found @ axes.T + centre, normals @ axes.T, lit, points_m)
 
 
-def bundle_spread(view: View, mirror_m: Array, points_m: Array, eyes_m: Array, cos_i: Array) -> Array:
-    """Square metres at the eye per steradian at the point, shape (N,), of the bundle that is reflected there.
+@dataclass(frozen=True)
+class Onward:
+    """Ways from reflection points to world points.
+
+    Attributes
+    ----------
+    directions : array, shape (N, 3)
+        Unit directions in which the points are reached.
+    legs : tuple of pairs of arrays, shape (N, 3)
+        Starts and ends of the straight parts, in order.
+    transmittance : array, shape (N,)
+        Of the glass.
+    """
+
+    directions: Array
+    legs: tuple[tuple[Array, Array], ...]
+    transmittance: Array | float
+
+
+def onward(view: View, found: MirrorPoints, points_m: Array) -> Onward:
+    """Ways from reflection points to the points (N, 3) that they were found for."""
+    mirror, tube = found.points_m, view.tube
+    directions = -_split(mirror - found.apparent_m)[1]
+    if tube is None or found.bent is None:
+        return Onward(directions, ((mirror, points_m),), 1.0)
+    crossing, bent = tube.leave(mirror, directions), found.bent[:, None]
+    whole = points_m - mirror  # a straight way is cut anywhere
+    inner, outer = (
+        np.where(bent, crossing.inner_m, mirror + whole / 3.0),
+        np.where(bent, crossing.outer_m, mirror + whole * (2.0 / 3.0)),
+    )
+    legs = ((mirror, inner), (inner, outer), (outer, points_m))
+    return Onward(
+        np.where(bent, crossing.directions, directions), legs, np.where(found.bent, crossing.transmittance, 1.0)
+    )
+
+
+def bundle_spread(view: View, found: MirrorPoints, eyes_m: Array, cos_i: Array) -> Array:
+    """Square metres at the eye per steradian at the point, shape (N,), of the bundle that is reflected there."""
+    spread = _spread(view, found.points_m, found.apparent_m, eyes_m, cos_i)
+    if view.tube is None or found.bent is None:
+        return spread
+    return spread * np.where(found.bent, _stretch(view, view.tube, found, eyes_m), 1.0)
+
+
+def _spread(view: View, mirror_m: Array, points_m: Array, eyes_m: Array, cos_i: Array) -> Array:
+    """Spread of a bundle without glass.
 
     With s the distance point to mirror, l mirror to eye and i the angle of incidence, on a sphere
     s^2 (1 + l/s_t) (1 + l/s_s); otherwise s^2 l^2 det(M) / cos^2 i.
@@ -79,6 +163,38 @@ def bundle_spread(view: View, mirror_m: Array, points_m: Array, eyes_m: Array, c
     axes, centre = view.T_world_sphere.R, view.sphere_centre_m
     P, a, b = ((place - centre) @ axes for place in (mirror_m, points_m, eyes_m))
     return (s * far / cos_i) ** 2 * path_determinant(P, a, b, mirror.radius_m, mirror.form)
+
+
+# Glass around the mirror.
+
+
+_GLASS_ROUNDS = 40  # three to six do, unless the wall is thick and the point near
+_SETTLED_M = 1e-13
+_ENOUGH_M = 1e-12  # rounding of a room 100 m wide
+
+
+def _stretch(view: View, tube: GlassTube, found: MirrorPoints, eyes_m: Array) -> Array:
+    """Growth of areas across the bundle from an eye, shape (N,)."""
+    axes, centre, mirror = view.T_world_sphere.R, view.sphere_centre_m, view.rig.mirror
+    P, a, b = ((place - centre) @ axes for place in (found.points_m, found.apparent_m, eyes_m))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        tangents, _, M = _path(P, a, b, mirror.radius_m, mirror.form or Form())
+        tangents = tangents @ axes.T
+        length, ray = _split(found.apparent_m - found.points_m)
+        inverse = np.stack([M[:, 1, 1], -M[:, 0, 1], -M[:, 0, 1], M[:, 0, 0]], axis=-1).reshape(-1, 2, 2)
+        inverse = inverse / (M[:, 0, 0] * M[:, 1, 1] - M[:, 0, 1] ** 2)[:, None, None]
+
+        def moved(vectors: Array) -> Array:
+            """Transposed derivative of the reflection point by the place, times vectors."""
+            flat = np.einsum("nkl,nli,ni->nk", inverse, tangents, vectors)
+            return across(np.einsum("nk,nki->ni", flat, tangents), ray, length)
+
+        axis = np.broadcast_to(tube.axis, ray.shape)
+        by_moment = across(np.cross(tube.axis, found.points_m - tube.origin_m), ray, length)
+        by_cosine = across(axis, ray, length)
+        moment_slope = by_moment + moved(np.cross(ray, axis) - by_moment)
+        cosine_slope = by_cosine - moved(by_cosine)
+        return tube.stretch(found.apparent_m, found.points_m, moment_slope, cosine_slope)
 
 
 # Alhazen's problem.

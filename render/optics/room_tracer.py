@@ -186,6 +186,44 @@ def blocked_by(room: GeometryLike, starts_m: Array, ends_m: Array) -> IntArray:
     return geometry.first_hit(starts_m + SURFACE_GAP_M * directions, directions, limit).object_id
 
 
+@dataclass(frozen=True)
+class IntoRoom:
+    """Rays from inside the holder on their way into the room.
+
+    Attributes
+    ----------
+    starts_m, directions : arrays, shape (N, 3)
+    path_m : array, shape (N,), or 0 where all are as they were
+        Length of the way to the start.
+    """
+
+    starts_m: Array
+    directions: Array
+    path_m: Array | float
+
+
+def into_room(view: View, room: RoomGeometry, points_m: Array, directions: Array) -> IntoRoom:
+    """Rays that leave the mirror, unit directions, as they go on into the room: as they are unless a tube bends them.
+
+    A ray that meets a plate or the camera before the glass stays as it is. One that meets a plate within the wall goes
+    on from its inner face, the others from its outer one.
+    """
+    if view.tube is None:
+        return IntoRoom(points_m, directions, 0.0)
+    crossing = view.tube.leave(points_m, directions)
+    crosses = np.flatnonzero(crossing.crosses)
+    inner, outer = crossing.inner_m[crosses], crossing.outer_m[crosses]
+    clear = blocked_by(room, points_m[crosses], inner) < 0
+    crosses, inner, outer = crosses[clear], inner[clear], outer[clear]
+    passes = crossing.passes[crosses][:, None]
+    before, within = np.linalg.norm(inner - points_m[crosses], axis=1), np.linalg.norm(outer - inner, axis=1)
+    starts, onward, path = points_m.copy(), directions.copy(), np.zeros(len(points_m))
+    starts[crosses] = np.where(passes, outer, inner)
+    onward[crosses] = np.where(passes, crossing.directions[crosses], (outer - inner) / within[:, None])
+    path[crosses] = before + np.where(passes[:, 0], within, 0.0)
+    return IntoRoom(starts, onward, path)
+
+
 # Parts: shapes with their faces and tree.
 
 

@@ -20,7 +20,7 @@ from scipy.stats import qmc
 
 from phibench.render.optics.beam_deposit import Deposit, deposit
 from phibench.render.optics.ray_tracer import MirrorRays, lens_rays, reflect
-from phibench.render.optics.reflection_point import mirror_points
+from phibench.render.optics.reflection_point import MirrorPoints, mirror_points, onward
 from phibench.render.optics.room_tracer import GeometryLike, RoomGeometry, as_geometry, blocked_by
 from phibench.render.optics.spot_samples import FilmCloud, disc_points, film_position, slices, specular_cloud
 from phibench.scenes.frames import Array
@@ -194,17 +194,31 @@ def _power(view: View, spot: LaserSpot, room: RoomGeometry, uv: Array, lens: Arr
     camera, points = view.rig.camera, light.points_m
     origins, directions = lens_rays(view, uv, lens)
     rays = reflect(view, origins, directions)
-    to_point = points - rays.points_m
+    found, growth = _seen_from(view, rays, points)
+    way, to_point = onward(view, found, points), found.apparent_m - rays.points_m
     s2 = np.einsum("ni,ni->n", to_point, to_point)
     leaving = to_point / np.sqrt(s2)[:, None]
+    reached = leaving if view.tube is None else way.directions
     cos_lens = directions @ view.T_world_camera.R[:, 2]
     etendue = camera.solid_angle_density(camera.normalised(uv)) * cos_lens**4 * math.pi * camera.aperture_radius_m**2
-    radiance = spot.power_w * light.scattered(-leaving) / s2 * _reflection(view, spot, rays, points, leaving)
+    reflected = _reflection(view, spot, rays, found.apparent_m, leaving) * way.transmittance
+    radiance = spot.power_w * light.scattered(-reached) / (s2 * growth) * reflected
     free = np.ones(len(uv), dtype=bool)
     hit = np.isfinite(radiance)
-    legs = ((rays.points_m[hit], points[hit]), (origins[hit], rays.points_m[hit]))
+    legs = ((start[hit], end[hit]) for start, end in (*way.legs, (origins, rays.points_m)))
     free[hit] = np.all([blocked_by(room, start, end) < 0 for start, end in legs], axis=0)
     return np.where(free, etendue * radiance, 0.0)
+
+
+def _seen_from(view: View, rays: MirrorRays, points: Array) -> tuple[MirrorPoints, Array | float]:
+    """Points as they are seen from where rays meet a rough mirror, and the growth of areas across the way to them."""
+    if view.tube is None:
+        return MirrorPoints(rays.points_m, rays.normals, np.isfinite(rays.cos_incidence), points), 1.0
+    bent = view.tube.outside(points)
+    seen, growth = view.tube.seen_from(rays.points_m, points)
+    seen, growth = np.where(bent[:, None], seen, points), np.where(bent, growth, 1.0)
+    lit = np.asarray(np.isfinite(seen).all(axis=1))
+    return MirrorPoints(rays.points_m, rays.normals, lit, seen, bent), growth
 
 
 def _reflection(view: View, spot: LaserSpot, rays: MirrorRays, points: Array, leaving: Array) -> Array:

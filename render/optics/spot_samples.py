@@ -10,7 +10,8 @@ Coddington's equations for a convex sphere give the distances of the virtual ima
     1/s_t = 1/s + 2 / (R cos i)      1/s_s = 1/s + 2 cos(i) / R
 
 and dPhi = L rho(i) cos(theta_spot) cos(theta_lens) / (s^2 (1 + l/s_t) (1 + l/s_s)) dA_spot dA_lens.
-With a form error the two factors become a determinant, that of the reflected bundle's curvature (`reflection_point`).
+With a form error the two factors become a determinant, that of the reflected bundle's curvature (`reflection_point`). A
+glass tube around the mirror moves the point that the mirror sees, and takes a part of the light.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from scipy.special import ndtri
 from scipy.stats import qmc
 
 from phibench.render.optics.beam_deposit import Deposit, deposit, footprint, is_plain
-from phibench.render.optics.reflection_point import bundle_spread, mirror_points
+from phibench.render.optics.reflection_point import bundle_spread, mirror_points, onward
 from phibench.render.optics.room_tracer import GeometryLike, RoomGeometry, as_geometry, blocked_by
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import LaserSpot
@@ -232,22 +233,22 @@ def _connect(view: View, spot: LaserSpot, room: RoomGeometry, light: Deposit, ey
     points = light.points_m
     found = mirror_points(view, points, eyes)
     mirror, lit = found.points_m, found.lit
-    from_spot, to_lens = _unit(mirror - points), _unit(eyes - mirror)
+    way, to_lens = onward(view, found, points), _unit(eyes - mirror)
     cos_i = np.einsum("ni,ni->n", to_lens, found.normals)
     cos_lens = -to_lens @ view.T_world_camera.R[:, 2]
-    spread = bundle_spread(view, mirror, points, eyes, cos_i)
+    spread = bundle_spread(view, found, eyes, cos_i)
     rho = view.rig.mirror.reflectance(cos_i, spot.wavelength_nm)
-    watts = weight * light.scattered(from_spot) * rho * np.maximum(cos_lens, 0.0) / spread
-    free = lit & _unobstructed(room, points, mirror, eyes, lit)
+    watts = weight * light.scattered(-way.directions) * rho * np.maximum(cos_lens, 0.0) / spread * way.transmittance
+    free = _unobstructed(room, (*way.legs, (eyes, mirror)), lit)
     pose = view.T_world_camera.inverse()
     uv = film_position(view, pose.points(eyes), pose.points(mirror))
     return FilmCloud(uv[lit], np.where(free, watts, 0.0)[lit])
 
 
-def _unobstructed(room: RoomGeometry, points: Array, mirror: Array, eyes: Array, lit: BoolArray) -> BoolArray:
-    free = np.zeros(len(points), dtype=bool)
-    legs = ((mirror[lit], points[lit]), (eyes[lit], mirror[lit]))
-    free[lit] = np.all([blocked_by(room, start, end) < 0 for start, end in legs], axis=0)
+def _unobstructed(room: RoomGeometry, legs: tuple[tuple[Array, Array], ...], lit: BoolArray) -> BoolArray:
+    """Mask of lit pairs, shape (N,), of whose legs nothing stands in the way."""
+    free = np.zeros(len(lit), dtype=bool)
+    free[lit] = np.all([blocked_by(room, start[lit], end[lit]) < 0 for start, end in legs], axis=0)
     return free
 
 

@@ -8,19 +8,22 @@ metres. NaN marks what does not exist.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from phibench.render.optics.ray_tracer import trace_pixels
-from phibench.render.optics.reflection_point import mirror_points
+from phibench.render.optics.reflection_point import MirrorPoints, Onward, mirror_points, onward
 from phibench.render.optics.room_tracer import (
     Finder,
     GeometryLike,
+    IntoRoom,
     RoomGeometry,
     as_geometry,
     blocked_by,
+    into_room,
 )
 from phibench.scenes.faces import IntArray
 from phibench.scenes.frames import Array
@@ -119,11 +122,11 @@ def spot_truth(view: View, spot: LaserSpot, room: GeometryLike) -> SpotTruth:
     point, eye, centre = np.array([spot.position_world_m]), view.camera_centre_m[None], view.sphere_centre_m
     found = mirror_points(view, point, eye)
     mirror = found.points_m
-    normals, leaving = found.normals, point - mirror
-    path = np.linalg.norm(leaving, axis=-1)
+    leaving = found.apparent_m - mirror
+    way = onward(view, found, point)
     uv = view.rig.camera.project(view.T_world_camera.inverse().points(mirror))[0]
-    angles = mirror_angles(normals, leaving / path[:, None])
-    cause = _cause(view, spot, room, mirror, uv)
+    angles = mirror_angles(found.normals, leaving / np.linalg.norm(leaving, axis=-1)[:, None])
+    cause = _cause(view, spot, room, found, way, uv)
     return SpotTruth(
         u_px=float(uv[0]),
         v_px=float(uv[1]),
@@ -134,7 +137,7 @@ def spot_truth(view: View, spot: LaserSpot, room: GeometryLike) -> SpotTruth:
         reflection_point_world_m=_floats(mirror[0]),
         camera_centre_world_m=_floats(eye[0]),
         sphere_centre_world_m=_floats(centre),
-        path_spot_mirror_m=float(path[0]),
+        path_spot_mirror_m=math.fsum(np.linalg.norm(end - start, axis=-1)[0] for start, end in way.legs),
         path_mirror_camera_m=float(np.linalg.norm(mirror - eye)),
         visible=cause == VISIBLE,
         cause=cause,
@@ -148,21 +151,24 @@ def depth_m(point_world_m: Array, sphere_centre_down_m: Array) -> Array:
     return np.sqrt(x * x + y * y)
 
 
-def _cause(view: View, spot: LaserSpot, room: GeometryLike, mirror: Array, uv: Array) -> str:
-    point, eye = np.array([spot.position_world_m]), view.camera_centre_m[None]
+def _cause(view: View, spot: LaserSpot, room: GeometryLike, found: MirrorPoints, way: Onward, uv: Array) -> str:
+    mirror, eye = found.points_m, view.camera_centre_m[None]
     if not np.isfinite(mirror).all():
         return NO_REFLECTION
     if _outline_distance_px(view, mirror[0]) < EDGE_PX:
         return EDGE
-    if np.dot(mirror[0] - point[0], spot.normal_world) <= 0.0:
+    if np.dot(-way.directions[0], spot.normal_world) <= 0.0:
         return FACES_AWAY
     if not view.rig.camera.contains(uv):
         return OUTSIDE
     geometry = as_geometry(room)
-    for start, end in ((mirror, point), (eye, mirror)):
+    for start, end in (*way.legs, (eye, mirror)):
         blocker = int(blocked_by(geometry, start, end)[0])
         if blocker >= 0:
             return OCCLUDED + geometry.shapes[blocker].name
+    if not found.lit[0]:  # so steep that no ray through the glass leads there: an end of the tube is in the way
+        assert view.rig.holder is not None
+        return OCCLUDED + view.rig.holder.part_names[int(way.directions[0] @ view.T_world_camera.R[:, 2] > 0.0)]
     return VISIBLE
 
 
@@ -228,29 +234,33 @@ def truth_layer(view: View, room: GeometryLike, finder: Finder | None = None) ->
         zip(TRUTH_PLANES, np.full((len(TRUTH_PLANES), camera.height_px, camera.width_px), np.nan), strict=True)
     )
     planes["object_id"][:] = -1.0
-    blocks = [_traced_rows(view, rows, columns) for rows, columns in _disc_blocks(view)]
+    blocks = [_traced_rows(view, geometry, rows, columns) for rows, columns in _disc_blocks(view)]
     guesses: list[IntArray | None] = [None] * len(blocks)
     if finder is not None:
         ends = np.cumsum([len(block.pixel) for block in blocks])[:-1]
-        points, directions = (np.concatenate([getattr(b, name) for b in blocks]) for name in ("points_m", "directions"))
+        points, directions = (np.concatenate([getattr(b.way, name) for b in blocks]) for name in _RAY)
         guesses = list(np.split(finder(points, directions), ends))
     for block, guess in zip(blocks, guesses, strict=True):
         _fill(planes, view, geometry, block, guess)
     return planes
 
 
+_RAY = ("starts_m", "directions")
 _ROWS = 24  # of the image at a time: the work arrays stay in the cache
 
 
 @dataclass(frozen=True)
 class _Block:
-    """Chief rays of N pixels after the mirror; `pixel` counts along the rows of the image."""
+    """Chief rays of N pixels after the mirror; `pixel` counts along the rows of the image.
+
+    `directions` leave the mirror. `way` goes on into the room, and `path_m` is that from the lens to where it starts.
+    """
 
     pixel: IntArray
-    points_m: Array
     normals: Array
     directions: Array
-    path_camera_mirror_m: Array
+    way: IntoRoom
+    path_m: Array
 
 
 def _disc_blocks(view: View) -> Iterator[tuple[range, range]]:
@@ -259,26 +269,27 @@ def _disc_blocks(view: View) -> Iterator[tuple[range, range]]:
         yield range(first, min(first + _ROWS, rows.stop)), range(columns.start, columns.stop)
 
 
-def _traced_rows(view: View, rows: range, columns: range) -> _Block:
+def _traced_rows(view: View, room: RoomGeometry, rows: range, columns: range) -> _Block:
     v, u = np.repeat(np.array(rows), len(columns)), np.tile(np.array(columns), len(rows))
     rays = trace_pixels(view, np.stack([u, v]).T.astype(float))
     hit = np.flatnonzero(np.isfinite(rays.cos_incidence))
     points, normals, directions = (np.take(a.T, hit, axis=1).T for a in (rays.points_m, rays.normals, rays.directions))
     pixel = (v * view.rig.camera.width_px + u)[hit]
-    return _Block(pixel, points, normals, directions, rays.path_camera_mirror_m[hit])
+    way = into_room(view, room, points, directions)
+    return _Block(pixel, normals, directions, way, rays.path_camera_mirror_m[hit] + way.path_m)
 
 
 def _fill(planes: dict[str, Array], view: View, room: RoomGeometry, block: _Block, guess: IntArray | None) -> None:
-    points, directions = block.points_m, block.directions
+    points, directions = block.way.starts_m, block.way.directions
     found = room.first_hit(points, directions) if guess is None else room.resolve(points, directions, guess)
     seen = found.object_id >= 0
     distance = np.where(seen, found.distance_m, np.nan)
     world = points.T + distance * directions.T
-    angles = mirror_angles(block.normals, directions)
+    angles = mirror_angles(block.normals, block.directions)
     values = (
         *world,
         depth_m(world.T, view.rig.at(0.0).sphere_centre_m),
-        block.path_camera_mirror_m + distance,
+        block.path_m + distance,
         *(np.where(seen, angle, np.nan) for angle in (angles.phi_ray_rad, angles.phi_normal_rad)),
         *(np.where(seen, angle, np.nan) for angle in (angles.phi_incidence_rad, angles.azimuth_rad)),
         found.object_id,

@@ -7,6 +7,9 @@ lens and mirror, such as a holder, the way to the mirror is a query of its own.
 Rays that meet a mirror with a form error are solved by Newton's method on q(t) = |P|^2 - r(P / |P|)^2 along the ray:
 first to its least value, which tells hit from miss, then from the parabola's zero to that of q. `ray_tracer` answers
 the same question from values alone, `reflection_point` from the other side; tests compare the three.
+
+A glass tube around mirror and lens turns and lifts rays on their way out (`scenes.glass_tube`, float64 here as well),
+whether they come from the mirror or from the lens. What its faces mirror back to the inside is left out.
 """
 
 from __future__ import annotations
@@ -39,6 +42,7 @@ class Look:
         rig = self.view.rig
         self._sensor = mi.load_dict(sensor_dict(mi, self.view))
         self._crossed = _crossed(surfaces)
+        self._tube = None if self.view.tube is None else Tube(mi, self.view)
         self._radius = dr.opaque(mi.Float64, MM_PER_M * rig.mirror.radius_m)
         self._alpha = dr.opaque(mi.Float, rig.mirror.roughness_alpha)
         bands = [rig.mirror.refractive_index(nm) for nm in rig.camera.detector.band_wavelength_nm]
@@ -56,16 +60,20 @@ class Look:
         origin, direction, weight = self._sensor.film_ray(u, v, lens)
         point, normal, mirrored = self._meet(origin, direction)
         if self._crossed:
-            way = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
-            way.maxt = dr.select(mirrored, mi.Float(dr.norm(point - origin)), 0.0)
-            mirrored &= ~self._surfaces.scene.ray_test(way, coherent=True, active=mirrored)
+            approach = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
+            approach.maxt = dr.select(mirrored, mi.Float(dr.norm(point - origin)), 0.0)
+            mirrored &= ~self._surfaces.scene.ray_test(approach, coherent=True, active=mirrored)
         facet, shadowing = normal, mi.Float(1.0)
         if x[2:]:
             turned, shadowing = _facet(mi, self._alpha, mi.Vector3f(normal), mi.Vector3f(direction), x[2:])
             facet = mi.Vector3d(turned)
         cos = -dr.dot(direction, facet)
-        start = mi.Point3f(dr.select(mirrored, point, origin))
-        onward = mi.Vector3f(dr.select(mirrored, direction + 2.0 * cos * facet, direction))
+        place = dr.select(mirrored, point, origin)
+        way = dr.select(mirrored, direction + 2.0 * cos * facet, direction)
+        if self._tube is not None:
+            place, way, passing = self._tube.leave(self._surfaces, place, way)
+            weight *= passing
+        start, onward = mi.Point3f(place), mi.Vector3f(way)
         ray = mi.Ray3f(start, onward)
         t, patch, valid = self._surfaces.hit(ray)
         radiance = self._surfaces.radiance(patch, ray(t), onward, valid, lamps=True)
@@ -89,6 +97,80 @@ class Look:
         """Reflectance of the three bands."""
         mi = self._mi
         return mi.Color3f(*(mi.fresnel_conductor(cos, mi.Complex2f(n, k)) for n, k in self._index))
+
+
+class Tube:
+    """Glass tube of a view in the scene's coordinates: mm, world axes, the sphere centre, on the tube's axis, at 0."""
+
+    def __init__(self, mi: ModuleType, view: View) -> None:
+        import drjit as dr
+
+        tube = view.tube
+        assert tube is not None
+        self._mi = mi
+        centre = float(tube.height_m(view.sphere_centre_m[None])[0])
+        lengths = (tube.inner_m, tube.outer_m, tube.low_m - centre, tube.high_m - centre)
+        self._inner, self._outer, self._low, self._high = (dr.opaque(mi.Float64, MM_PER_M * one) for one in lengths)
+        self._index = dr.opaque(mi.Float64, tube.index)
+        self._axis = mi.Vector3d(*(dr.opaque(mi.Float64, float(x)) for x in tube.axis))
+
+    def leave(self, surfaces: Surfaces, start: Any, direction: Any) -> tuple[Any, Any, Any]:
+        """Rays from inside as they go on into the room, and what the glass passes; float64.
+
+        The same as `room_tracer.into_room`: what meets a face before the glass stays as it is.
+        """
+        import drjit as dr
+
+        mi = self._mi
+        direction = dr.normalize(direction)
+        inner, outer, onward, passing = self.cross(start, direction)
+        crosses, passes = (self._within(point) for point in (inner, outer))
+        before = mi.Ray3f(mi.Point3f(start), mi.Vector3f(direction))
+        before.maxt = dr.select(crosses, mi.Float(dr.norm(inner - start)), 0.0)
+        crosses &= ~surfaces.scene.ray_test(before, coherent=True, active=crosses)
+        place, way = dr.select(passes, outer, inner), dr.select(passes, onward, dr.normalize(outer - inner))
+        return (
+            dr.select(crosses, place, start),
+            dr.select(crosses, way, direction),
+            dr.select(crosses, mi.Float(passing), 1.0),
+        )
+
+    def cross(self, start: Any, direction: Any) -> tuple[Any, Any, Any, Any]:
+        """Points on the two faces, direction outside and transmittance: the closed forms of `scenes.glass_tube`."""
+        import drjit as dr
+
+        axis, n2 = self._axis, dr.square(self._index)
+        L, q = dr.dot(axis, dr.cross(start, direction)), dr.dot(axis, direction)
+        square = 1.0 - q * q
+        w, w_g = dr.sqrt(square), dr.sqrt(n2 - q * q)
+        towards = dr.dot(start, direction) - dr.dot(start, axis) * q
+        s1, s2 = ((dr.sqrt(square * r * r - L * L) - towards) / square for r in (self._inner, self._outer))
+        (S_g, C_g), (S, C) = (self._between(L / one) for one in (w_g, w))
+        sine, cosine = dr.sincos(S_g - S)
+        outer = self._turned(start + s2 * direction, sine, cosine) + q * (C_g / w_g - C / w) * axis
+        cos = dr.sqrt(square - dr.square(L / self._inner))
+        inside, steep = dr.sqrt(n2 - 1.0 + cos * cos), n2 * cos
+        passing = cos * inside / (cos * cos + inside * inside) + steep * inside / (steep * steep + inside * inside)
+        return start + s1 * direction, outer, self._turned(direction, sine, cosine), passing
+
+    def _between(self, b: Any) -> tuple[Any, Any]:
+        """Angle and length between the radii of a line at a distance b from the axis."""
+        import drjit as dr
+
+        near, far = self._inner, self._outer
+        return dr.asin(b / near) - dr.asin(b / far), dr.sqrt(far * far - b * b) - dr.sqrt(near * near - b * b)
+
+    def _turned(self, vector: Any, sine: Any, cosine: Any) -> Any:
+        import drjit as dr
+
+        along = dr.dot(self._axis, vector) * self._axis
+        return along + cosine * (vector - along) + sine * dr.cross(self._axis, vector)
+
+    def _within(self, point: Any) -> Any:
+        import drjit as dr
+
+        height = dr.dot(self._axis, point)
+        return (height > self._low) & (height < self._high)
 
 
 def _crossed(surfaces: Surfaces) -> bool:

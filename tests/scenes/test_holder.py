@@ -106,7 +106,7 @@ def test_rods_are_round_ones_within_the_error_of_their_prisms(kind: str, misalig
     assert camera.width_px == 1280
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [*KINDS, "tube"])
 def test_nothing_of_it_stands_between_lens_and_mirror(kind: str) -> None:
     """Segments from all over the lens to all that it sees of the mirror, with sizes at their limits."""
     rng = np.random.default_rng(3)
@@ -196,6 +196,14 @@ def test_a_rod_cuts_a_part_of_the_light_and_the_certificate_agrees(kind: str) ->
         ("post", {"radius_m": 0.06, "circle_m": 0.2, "plate_m": 0.3, "rise_m": 0.2}, "thicker than the ball"),
         ("post", {"rise_m": 0.067}, "give more than 0.0680"),
         ("rods", {"radius_m": -1.0}, "allowed range"),
+        ("tube", {"circle_m": 0.06}, "tube would stand inside the ball"),
+        ("tube", {"wall_m": 0.0}, "wall_m = 0.0: allowed range is 0.0001"),
+        ("tube", {"wall_m": -0.003}, "allowed range"),
+        ("tube", {"plate_m": 0.083}, "wall would stand outside the plate; give at least 0.0832"),
+        ("tube", {"rise_m": 0.06}, "top would lie inside the ball"),
+        ("tube", {"glass_index": 0.99}, "allowed range is 1.0 to 2.5"),
+        ("tube", {"glass_index": 2.6}, "allowed range is 1.0 to 2.5"),
+        ("tube", {"glass_index": math.nan}, "finite"),
         ("rods", {"azimuth_rad": math.nan}, "finite"),
     ],
 )
@@ -209,6 +217,7 @@ def test_limits_of_sizes_themselves_are_possible() -> None:
     thick = prism_radius_m(0.004)
     for kind, sizes in (
         ("rods", {"circle_m": BALL_M + thick + 1e-9, "plate_m": BALL_M + 2.0 * thick + 2e-9, "rise_m": BALL_M + 1e-9}),
+        ("tube", {"circle_m": BALL_M + 1e-9, "wall_m": 1e-4, "plate_m": 0.0603, "rise_m": BALL_M + 1e-9}),
         ("post", {"radius_m": 0.059, "circle_m": 0.12, "plate_m": 0.2, "rise_m": BALL_M + 0.119}),
     ):
         view = dataclasses.replace(default_rig(), holder=Holder(kind, **sizes)).at(0.0)

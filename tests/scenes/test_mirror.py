@@ -293,10 +293,10 @@ def test_spread_of_the_bundle_against_rays_that_fan_out() -> None:
                 ends.append(ray.points_m[0] + along * ray.directions[0])
         a, b = (ends[0] - ends[1]) / (2 * h), (ends[2] - ends[3]) / (2 * h)
         area = abs(np.cross(a, b) @ final)
-        spread = bundle_spread(view, found.points_m, point, eye, cos_i)[0]
+        spread = bundle_spread(view, found, eye, cos_i)[0]
         # at grazing incidence the rays curve more: differences err by (h / cos i^2)^2, roundings by 1e-15 / h / cos i
         assert spread == pytest.approx(area, rel=1e-7 / cos_i[0] ** 2)
-        sphere = bundle_spread(default_rig().at(0.4), found.points_m, point, eye, cos_i)[0]
+        sphere = bundle_spread(default_rig().at(0.4), found, eye, cos_i)[0]
         checked += abs(spread / sphere - 1.0) > 0.01
     assert checked > 20  # and Coddington's equations for the sphere would be wrong
 

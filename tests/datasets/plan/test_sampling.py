@@ -115,23 +115,29 @@ def test_sobols_draws_follow_more_closely_than_chance(k: int) -> None:
 def test_holders_are_drawn_by_name_and_by_size() -> None:
     """Kinds are equally probable, sizes follow the drawn mirror, and no other parameter moves."""
     rig = {"radius_m": {"uniform": [0.05, 0.07]}}
-    holder = {"kind": {"choice": ["none", "rods", "post"]}, "azimuth_deg": {"uniform": [0.0, 360.0]}}
+    holder = {
+        "kind": {"choice": ["none", "rods", "tube"]},
+        "azimuth_deg": {"uniform": [0.0, 360.0]},
+        "glass_index": {"uniform": [1.45, 1.52]},
+    }
     plain, held = (plan(samples=60, rig=one) for one in (rig, {**rig, "holder": holder}))
     rigs = [held.rigs[pair.rig] for pair in held.pairs]
     kinds = ["none" if one.holder is None else one.holder.kind for one in rigs]
     assert [dict(pair.drawn)["rig.holder.kind"] for pair in held.pairs] == kinds
-    assert all(15 <= kinds.count(kind) <= 25 for kind in ("none", "rods", "post"))  # Sobol's points: 20 each, nearly
+    assert all(15 <= kinds.count(kind) <= 25 for kind in ("none", "rods", "tube"))  # Sobol's points: 20 each, nearly
     assert all(one.holder.radius_m == one.mirror.radius_m / 15.0 for one in rigs if one.holder is not None)
     assert [dict(pair.drawn)["rig.radius_m"] for pair in plain.pairs] == [one.mirror.radius_m for one in rigs]
     assert len({one.holder.azimuth_rad for one in rigs if one.holder is not None}) == 60 - kinds.count("none")
+    tubes = [one.holder for one in rigs if one.holder is not None and one.holder.kind == "tube"]
+    assert all(1.45 <= one.glass_index <= 1.52 and one.wall_m == 0.003 for one in tubes)
 
 
 @pytest.mark.parametrize("sequence", ["sobol", "independent"])
 def test_parameters_do_not_correlate(sequence: Any) -> None:
-    """2775 pairs of independent columns: beyond 6 sigma in one of them with 5e-6; Sobol's stay far below that."""
+    """2926 pairs of independent columns: beyond 6 sigma in one of them with 5e-6; Sobol's stay far below that."""
     points = np.stack(list(first_points(sequence, "x", 0, N).values()))
     off = np.corrcoef(points) - np.eye(len(points))
-    assert len(points) == 75
+    assert len(points) == 77
     assert np.abs(off).max() < 6.0 / math.sqrt(N)
     assert abs(np.corrcoef(points[0], points[1] + 0.2 * points[0])[0, 1]) > 6.0 / math.sqrt(N)
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from helpers.oracles import undistort_cv2
 from helpers.proof_rooms import MESHES, generated, of_mesh, of_panorama
+from helpers.snell import through
 
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import truth_layer
@@ -20,6 +21,8 @@ from phibench.render.room.ambient import view_surfaces
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.faces import FaceTable
 from phibench.scenes.frames import Pose, rotation_xyz
+from phibench.scenes.glass_tube import GlassTube
+from phibench.scenes.holder import Holder, fitted
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.room import Room
 
@@ -32,7 +35,7 @@ ANGLE_RAD = 1e-7
 """Angles by arccos: the square root of rounding near 0 and pi."""
 
 
-def rig(number: int) -> Rig:
+def rig(number: int, holder: Holder | None = None) -> Rig:
     """An eighth of the size, distorted, tilted and off axis, another one for each room."""
     rng, nominal = np.random.default_rng(number), default_rig()
     camera = replace(
@@ -48,7 +51,7 @@ def rig(number: int) -> Rig:
     )
     tilt = rotation_xyz(*rng.uniform(-0.02, 0.02, 3))
     pose = Pose("world", "camera", (*rng.uniform(-5e-3, 5e-3, 2), nominal.T_world_camera.t[2]), tilt)
-    return replace(nominal, camera=camera, T_world_camera=pose)
+    return replace(nominal, camera=camera, T_world_camera=pose, holder=holder)
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,7 @@ class Found:
     point_m: np.ndarray
     shape: np.ndarray
     depth_m: np.ndarray
+    path_m: np.ndarray
     phi_ray_rad: np.ndarray
     phi_normal_rad: np.ndarray
     near: list[set[int]]
@@ -78,13 +82,32 @@ def by_brute_force(view: View, table: FaceTable, uv: np.ndarray) -> Found:
     mirror = pose.t + t[:, None] * d
     normal = (mirror - centre) / radius
     out = d - 2.0 * np.sum(d * normal, axis=1, keepdims=True) * normal
-    distance, shape, near = _first(table, mirror, out)
-    point = mirror + distance[:, None] * out
+    start, way, before = mirror, out, t
+    if view.tube is not None:
+        start, way, before = _behind_glass(view.tube, table, mirror, out, t)
+    distance, shape, near = _first(table, start, way)
+    point = start + distance[:, None] * way
     down = view.rig.at(0.0).sphere_centre_m
     phi = [np.arccos(np.clip(-a[:, 2], -1.0, 1.0)) for a in (out, normal)]
     met = shape >= 0
     phi_ray, phi_normal = (np.where(met, p, np.nan) for p in (0.5 * phi[0], phi[1]))
-    return Found(point, shape, np.hypot(*(point - down)[:, :2].T), phi_ray, phi_normal, near)
+    return Found(point, shape, np.hypot(*(point - down)[:, :2].T), before + distance, phi_ray, phi_normal, near)
+
+
+def _behind_glass(
+    tube: GlassTube, table: FaceTable, mirror: np.ndarray, out: np.ndarray, path: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rays on their way into the room, and paths up to there: Snell's law, unless a shape comes before the glass."""
+    inner, outer, onward = through(tube, mirror, out)
+    low, high = (tube.origin_m + z * tube.axis for z in (tube.low_m, tube.high_m))
+    to_glass, in_glass = (np.linalg.norm(b - a, axis=1) for a, b in ((mirror, inner), (inner, outer)))
+    first, _, _ = _first(table, mirror, out)
+    between = [((place - low) @ tube.axis > 0.0) & ((place - high) @ tube.axis < 0.0) for place in (inner, outer)]
+    enters = between[0] & ~(first < to_glass)
+    leaves = enters & between[1]
+    start = np.where(leaves[:, None], outer, np.where(enters[:, None], inner, mirror))
+    way = np.where(leaves[:, None], onward, np.where(enters[:, None], (outer - inner) / in_glass[:, None], out))
+    return start, way, path + np.where(enters, to_glass, 0.0) + np.where(leaves, in_glass, 0.0)
 
 
 def _first(table: FaceTable, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[set[int]]]:
@@ -114,7 +137,7 @@ def _first(table: FaceTable, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, 
     return distance, shape, near
 
 
-def check(room: Room, number: int) -> None:
+def check(room: Room, number: int, holder: Holder | None = None) -> None:
     """Point, surface, D and phi of random pixels of both views.
 
     Where a ray passes within 1e-5 m of another shape's border, that shape may be named: there are about 30 m of
@@ -123,7 +146,7 @@ def check(room: Room, number: int) -> None:
     rng, other, checked = np.random.default_rng(number), 0, 0
     errors, angles, names = list[float](), list[float](), set[str]()
     for offset_m in (0.0, 0.37):
-        view = rig(number).at(offset_m)
+        view = rig(number, holder).at(offset_m)
         geometry = room_geometry(room, view)
         planes = truth_layer(view, geometry, view_surfaces(view, room).first_patch)
         on_mirror = np.argwhere(np.isfinite(planes["depth_m"]))
@@ -135,7 +158,8 @@ def check(room: Room, number: int) -> None:
             assert int(truth["object_id"][i]) in found.near[i], (room.name, u[i], v[i])
         other += np.count_nonzero(~same)
         point = np.stack([truth[name] for name in ("x_m", "y_m", "z_m")], axis=-1)
-        errors += [np.abs(point - found.point_m)[same].max(), np.abs(truth["depth_m"] - found.depth_m)[same].max()]
+        errors.append(np.abs(point - found.point_m)[same].max())
+        errors += [np.abs(truth[name] - getattr(found, name))[same].max() for name in ("depth_m", "path_m")]
         for name in ("phi_ray_rad", "phi_normal_rad"):
             angles.append(np.abs(truth[name] - getattr(found, name))[same].max())
         names |= {geometry.shapes[k].name for k in found.shape[same]}
@@ -156,6 +180,13 @@ QUICK = 2
 @pytest.mark.parametrize("number", [k if k < QUICK else pytest.param(k, marks=pytest.mark.slow) for k in range(15)])
 def test_accuracy_of_truth_in_generated_rooms(number: int) -> None:
     check(generated(number), number)
+
+
+@pytest.mark.parametrize("number", [k if k < 1 else pytest.param(k, marks=pytest.mark.slow) for k in range(5)])
+def test_accuracy_of_truth_through_a_glass_tube(number: int) -> None:
+    """Walls of 3 to 15 mm around the mirror; plates, camera and robot inside and outside of it."""
+    holder = fitted("tube", 0.060, wall_m=0.003 * (number + 1), glass_index=1.4 + 0.1 * number, rise_m=0.063)
+    check(generated(number), number, holder)
 
 
 @pytest.mark.parametrize("kind", MESHES)
