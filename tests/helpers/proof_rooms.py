@@ -120,8 +120,12 @@ def _place(room: trimesh.Scene, name: str, shape: trimesh.Trimesh, visual: objec
 
 ROWS = 256
 POINT_M = (0.4, -0.3, 1.5)
-HEADING_DEG = {"box": 0.0, "flat box": 130.0, "mesh": -75.0}
-BOX_M = {"box": (-3.0, 2.5, -2.0, 2.4, 2.7), "flat box": (-6.5, 7.0, -4.0, 3.0, 2.4)}
+HEADING_DEG = {"box": 0.0, "flat box": 130.0, "mesh": -75.0, "high box": -20.0}
+BOX_M = {
+    "box": (-3.0, 2.5, -2.0, 2.4, 2.7),
+    "flat box": (-6.5, 7.0, -4.0, 3.0, 2.4),
+    "high box": (-2.0, 6.0, -5.0, 2.5, 4.2),
+}
 LAMP_DIRECTIONS = ((0.3, 0.5, 0.8), (-0.7, 0.2, 0.6), (0.9, -0.4, 0.1))
 """Of three lamps in the picture, 40 times as bright as the rest and 15 degrees wide."""
 
