@@ -11,9 +11,7 @@ the ball, and those that only the outermost rim shows, take the nearest directio
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,19 +19,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
-from skimage.measure import block_reduce
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.store.layers import write_exr
 from phibench.datasets.store.pictures import save_png
-from phibench.estimator.calibration.outline_start import (
-    Circle,
-    circle_edges,
-    hough,
-    plain_circle,
-    sphere_from_circle,
-    sphere_from_rays,
-)
+from phibench.estimator.calibration.ball_circle import LONGEST_PX, BallCircle, find_circle, shrunk
+from phibench.estimator.calibration.edge_ring import Circle
+from phibench.estimator.calibration.outline_start import sphere_from_circle, sphere_from_rays
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.panorama import Grid, unrolled
 from phibench.estimator.spots.image_planes import ImageError, linear_to_srgb
@@ -44,10 +36,6 @@ from phibench.scenes.rig import Rig, View
 
 SUFFIXES = (".exr", ".png")
 MOST_COLUMNS = 8192
-_SEARCH_PX = 1024  # long side of the picture in which the outline is looked for
-_SIZES = (0.2, 0.3, 0.44)  # radii of the search over the short side; each reaches from 0.7 to 1.4 of its own
-_TURNS = 360  # rays of `circle_edges`
-_LEAST_EDGES = 0.33  # of the outline: a right one may lie before ground as light as the ball
 _RIM = (0.005, 1.0)  # of the outline's radius, and pixels: inside it the background blurs into the ball
 _NODES = 20_000  # 1.6e-4 rad: linear between them errs by less than 1e-8 rad
 _ROWS_AT_ONCE = 128
@@ -143,8 +131,8 @@ def find_ball(light: NDArray[np.float32], photo: BallPhoto) -> Ball:
     if photo.circle_px is not None:
         circle, points, edges = photo.circle_px, None, 1.0
     else:
-        circle, points = _outline(light)
-        edges = len(points) / _TURNS
+        found = _outline(light)
+        circle, points, edges = found.circle_px, found.points_px, found.edges
     u, v, radius = circle
     if not (radius >= 10.0 and -radius < u < columns + radius and -radius < v < rows + radius):
         raise DatasetError(
@@ -181,48 +169,11 @@ def _camera_axes(elevation_deg: float) -> Array:
 # The outline.
 
 
-def _outline(light: NDArray[np.float32]) -> tuple[Circle, Array]:
-    """Circle of the outline and its edges, shape (n, 2): in a small picture, then in the whole one."""
-    grey = light.mean(axis=-1, dtype=float)
-    level = float(np.median(grey[grey > 0.0])) if np.any(grey > 0.0) else 1.0
-    block = max(1, math.ceil(max(grey.shape) / _SEARCH_PX))
-    small = block_reduce(grey, (block, block), np.mean) / level  # type: ignore[no-untyped-call]
-    best: tuple[int, Circle] = (0, (0.0, 0.0, 0.0))
-    for circle in _candidates(small):
-        try:
-            edges = circle_edges(small, circle, either=True)
-        except ImageError:
-            continue
-        if len(edges) > best[0]:
-            best = len(edges), plain_circle(edges)
-    count, (u, v, radius) = best
-    points = np.empty((0, 2))
-    if count >= _LEAST_EDGES * _TURNS:
-        whole = ((u + 0.5) * block - 0.5, (v + 0.5) * block - 0.5, radius * block)
-        with contextlib.suppress(ImageError):
-            points = circle_edges(grey / level, whole, either=True)
-        count = len(points)
-    if count < _LEAST_EDGES * _TURNS:
-        raise DatasetError(
-            f"no outline of a ball was found: the likeliest circle has edges on {100.0 * count / _TURNS:.0f} % of it, "
-            f"{100.0 * _LEAST_EDGES:.0f} % are needed; give it by --circle U V RADIUS, in pixels"
-        )
-    return plain_circle(points), points
-
-
-def _candidates(small: Array) -> Iterator[Circle]:
-    """Strongest circles of the sizes that a ball may have."""
-    rows, columns = small.shape
-    for size in _SIZES:
-        radius = size * min(rows, columns)
-        focal = radius / math.tan(math.asin(0.1))
-        options: dict[str, Any] = {"cx_px": 0.5 * (columns - 1), "cy_px": 0.5 * (rows - 1)}
-        camera = Camera(width_px=columns, height_px=rows, fx_px=focal, fy_px=focal, **options)
-        pose = Pose("camera", "sphere", (0.0, 0.0, 1.0))
-        try:
-            yield from hough(small, Rig(camera=camera, mirror=SphereMirror(radius_m=0.1), T_camera_sphere=pose))
-        except ImageError:
-            continue
+def _outline(light: NDArray[np.float32]) -> BallCircle:
+    try:
+        return find_circle(light)
+    except ImageError as error:
+        raise DatasetError(f"{error}; give it by --circle U V RADIUS, in pixels") from None
 
 
 # The panorama.
@@ -345,8 +296,8 @@ def write_panorama(path: Path, panorama: BallPanorama) -> Path:
 
 def write_outline(path: Path, light: NDArray[np.float32], ball: Ball) -> Path:
     """Write a small copy of the photograph with the outline that was taken; PNG."""
-    block = max(1, math.ceil(max(light.shape[:2]) / _SEARCH_PX))
-    small = block_reduce(light, (block, block, 1), np.mean)  # type: ignore[no-untyped-call]
+    block = max(1, math.ceil(max(light.shape[:2]) / LONGEST_PX))
+    small = shrunk(light, block)
     bright = max(1.0, float(np.percentile(small, 99.0)))
     picture = Image.fromarray(np.rint(255.0 * linear_to_srgb(small / bright)).astype(np.uint8))
     points = (ball.view.rig.outline_px() + 0.5) / block - 0.5

@@ -8,6 +8,8 @@ left is the centre s: Gauss-Newton with robust weights, sector by sector.
 * The covariance comes from the scatter of the sectors' shifts, with the correlation of neighbours: the room and JPEG's
   blocks err over many pixels together.
 * The effect of JPEG on the limb is simulated from the frame itself (`outline_jpeg`).
+* Where the light is not as the model has it, in other mirrors or among lamps, the edge in the picture is the outline
+  (`ball_circle`), with its own, larger covariance; so it is where the fit leaves that edge.
 
 R and |s| scale together: the outline is that of every sphere with the same R / |s|, so that ds / s = dR / R. Radius and
 camera count as exact here; `bundle` adds their errors.
@@ -15,6 +17,8 @@ camera count as exact here; `bundle` adds their errors.
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -23,10 +27,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.calibration.ball_circle import BallCircle
+from phibench.estimator.calibration.edge_ring import TURNS
 from phibench.estimator.calibration.limb_image import Measured, Plane, planes_of
 from phibench.estimator.calibration.outline_fit import OutlinePixels, Step, band, step_from
 from phibench.estimator.calibration.outline_jpeg import JpegAgain
-from phibench.estimator.calibration.outline_start import grey, radii_px, rough_outlines
+from phibench.estimator.calibration.outline_start import grey, radii_px, rough_outlines, sphere_from_rays
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, as_vector
@@ -46,6 +52,8 @@ _CHOOSE = 3  # steps that choose their pixels anew
 _STEPS, _REST_M, _REST_SIGMAS, _UNREST_M = 30, 1e-7, 0.05, 1e-6
 _MIN_CONTRAST, _MAX_CONTRAST = 0.5, 1.6
 _BLUR_RANGE_PX2 = (0.02, 9.0)
+_LEAST_CONTRAST = 9.0  # of a circle whose light is worth a fit; patterns and noise give up to 8
+_FROM_EDGE_PX = 1.0  # the steepest place of the light is some tenths of a pixel inside the limb
 
 
 @dataclass(frozen=True)
@@ -66,6 +74,9 @@ class Outline:
     residual : float
         Robust standard deviation of the residuals over the light.
     pixels, steps : int
+    by_edge : bool
+        The light is not as the model has it: the outline is the edge in the picture. Contrast, blur and residual are
+        NaN.
     shifts_px : shape (SECTORS,)
         Shift of the limb that the fit leaves in each sector, outwards positive, pixels; NaN where it is not used.
         Sector k begins at the angle -pi + 2 pi k / SECTORS about the sphere's direction, from the camera's x to y.
@@ -80,6 +91,7 @@ class Outline:
     pixels: int
     steps: int
     shifts_px: Array = field(default_factory=lambda: np.zeros(SECTORS), repr=False)
+    by_edge: bool = False
 
     @property
     def sigma_m(self) -> Array:
@@ -129,24 +141,71 @@ def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) 
     """
     planes = planes_of(image, card)
     _require_size(planes[0].values, rig.camera)
-    fault = ImageError("an image without a mirror")
+    fault, by_edge = ImageError("an image without a mirror"), None
     again = (image, card) if card and card.output == "mjpeg" else None
     low, high = radii_px(rig)
     try:
-        for start in rough_outlines(grey(planes), rig):
+        for start, circle in rough_outlines(grey(planes), rig):
             try:
-                return fit_outline(planes, rig, start, again=again)
+                if circle.contrast < _LEAST_CONTRAST:
+                    continue
+                if by_edge is None:
+                    by_edge = _by_edge(rig, start, circle)
+                found = fit_outline(planes, rig, start, again=again)
+                _require_near(found.rig(rig), circle)
+                return found
             except ImageError as error:
                 # that it is cut, or lit badly, says more than that the last circle tried was none
                 fault = error if "without a mirror" in str(fault) else fault
     except ImageError as error:
         fault = error
+    if by_edge:
+        return by_edge
     if "without a mirror" not in str(fault):
         raise fault
     raise ImageError(
         f"{fault}; looked for was an outline with a radius of {low:.0f} to {high:.0f} px, as the rig's focal length, "
         "mirror radius and distance say: check these numbers, too"
     )
+
+
+def _by_edge(rig: Rig, s: Array, circle: BallCircle) -> Outline | None:
+    """Outline by the edge in the picture alone, if that is clear; its covariance is the edge's."""
+    if visible_arc(rig, s) < MIN_ARC:
+        return None
+    try:
+        circle.require_clear()
+    except ImageError:
+        return None
+    u, v, radius = circle.circle_px
+    steps = ((u + 1.0, v, radius), (u, v + 1.0, radius), (u, v, radius + 1.0))
+    moved = [
+        sphere_from_rays(rig.camera.rays(replace(circle, circle_px=one).points_px), rig.mirror.radius_m) - s
+        for one in steps
+    ]
+    J = np.stack(moved, axis=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a sector without an edge
+        shifts = np.nanmean(np.roll(circle.off_px, TURNS // 2).reshape(SECTORS, -1), axis=1)
+    covariance = J @ circle.covariance_px2 @ J.T
+    return Outline(s, covariance, circle.edges, math.nan, math.nan, math.nan, TURNS, 0, shifts, by_edge=True)
+
+
+def _require_near(rig: Rig, circle: BallCircle) -> None:
+    """Raise `ImageError` if a fit of the light has left the edge that it began at."""
+    u, v, _ = circle.circle_px
+    outline, edge = rig.outline_px(TURNS) - (u, v), circle.points_px - (u, v)
+    turn, order = np.arctan2(edge[:, 1], edge[:, 0]), np.argsort(np.arctan2(edge[:, 1], edge[:, 0]))
+    there = np.interp(
+        np.arctan2(outline[:, 1], outline[:, 0]), turn[order], np.hypot(*edge.T)[order], period=2.0 * np.pi
+    )
+    off = float(np.abs(np.hypot(*outline.T) - there).max())
+    allowed = _FROM_EDGE_PX + 3.0 * float(circle.sigma_px.max())
+    if off > allowed:
+        raise ImageError(
+            f"an image without a mirror: the light of polished steel fits best {off:.1f} px from the edge that is "
+            f"there; {allowed:.1f} px are allowed"
+        )
 
 
 def fit_outline(

@@ -14,10 +14,9 @@ from phibench.estimator.calibration.limb_image import planes_of
 from phibench.estimator.calibration.outline import find_outline, fit_outline, visible_arc
 from phibench.estimator.calibration.outline_fit import Sectors, scatter
 from phibench.estimator.calibration.outline_start import (
-    circle_edges,
     grey,
-    hough,
     plain_circle,
+    rough_outlines,
     sphere_from_circle,
     sphere_from_ellipse,
     sphere_from_rays,
@@ -69,7 +68,7 @@ def test_plain_fits_are_biased(case) -> None:
     """The steepest place of the light is inside the limb: circle, ellipse and cone put the sphere 0.1 mm too far."""
     rig, light = case
     picture = grey(planes_of(light))
-    points, s = circle_edges(picture, hough(picture, nominal(rig))[0]), rig.sphere_in_camera_m
+    points, s = next(rough_outlines(picture, nominal(rig)))[1].points_px, rig.sphere_in_camera_m
     camera, R = rig.camera, rig.mirror.radius_m
     for found in (
         sphere_from_circle(plain_circle(points), camera, R),
