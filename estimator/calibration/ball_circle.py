@@ -38,7 +38,8 @@ _ELLIPSE = 0.01  # standard deviation of e1 and e2 over the radius: a sphere 8 d
 _DRAWS, _NEAR_PX, _NEAR_REACH_PX = 400, 1.5, 12.0
 _SCALES = (6.0, 3.0, 2.0, 1.5, 1.5, 1.5)  # of the robust weights, in steps
 _SECTORS = 12
-_SAME_PX = 3.0
+_OVERWHELMING = 2.5
+_SAME_PX, _SAME = 3.0, 0.04  # pixels, and parts of the radius
 
 
 @dataclass(frozen=True)
@@ -122,8 +123,9 @@ def circles(
     block = max(1, math.ceil(max(light.shape[:2]) / LONGEST_PX))
     radii = None if radii_px is None else _over(radii_px, block)
     found = _settled(log_colours(shrunk(light, block)), radii, count)
-    for number, one in enumerate(found):
-        yield _measured(_clearer(one), found[1][0] if number == 0 and len(found) > 1 else found[0][0], block)
+    for one in found:
+        others = [other[0] for other in found if other is not one]
+        yield _measured(_clearer(one), max(others, default=0.0), block)
 
 
 def shrunk(light: NDArray[Any], block: int) -> NDArray[Any]:
@@ -202,18 +204,23 @@ def _settled(channels: Array, radii_px: tuple[float, float] | None, count: int) 
     for circle in candidates(channels, radii_px, count):
         ring = EdgeRing(channels, circle, max(12.0, 0.05 * circle[2]), 1.0, 1.5)
         rough.append(_rated(*ring.moved(_climbed(ring, np.zeros(3), (6.0, 3.0)))))
+        if len(rough) >= _SETTLED and max(one[0] for one in rough) > _OVERWHELMING * LEAST_CONTRAST:
+            break
     rough.sort(key=lambda one: -one[0])
     found: list[_Curve] = []
-    for _, ring, _ in rough[:_SETTLED]:
-        if not any(_same(ring.circle, other.circle) for _, other, _ in found):
-            joined = _joined(ring)
-            if joined and not any(_same(joined[1].circle, other.circle) for _, other, _ in found):
-                found.append(joined)
-    return sorted(found, key=lambda one: -one[0])
+    for one in rough[:_SETTLED]:
+        # settling makes a curve clearer, but not by that much
+        hopeless = found and one[0] < found[0][0] / _OVERWHELMING
+        settled = one if hopeless else _joined(one[1])
+        if settled:
+            found.append(settled)
+    found.sort(key=lambda one: -one[0])
+    return [one for i, one in enumerate(found) if not any(_same(one[1].circle, other[1].circle) for other in found[:i])]
 
 
 def _same(a: Circle, b: Circle) -> bool:
-    return max(abs(x - y) for x, y in zip(a, b, strict=True)) < _SAME_PX
+    """True for circles that share most of an edge: what lies beside the clearer one is no other outline."""
+    return max(abs(x - y) for x, y in zip(a, b, strict=True)) < max(_SAME_PX, _SAME * a[2])
 
 
 def _rated(ring: EdgeRing, curve: Array) -> _Curve:

@@ -53,6 +53,7 @@ _STEPS, _REST_M, _REST_SIGMAS, _UNREST_M = 30, 1e-7, 0.05, 1e-6
 _MIN_CONTRAST, _MAX_CONTRAST = 0.5, 1.6
 _BLUR_RANGE_PX2 = (0.02, 9.0)
 _LEAST_CONTRAST = 9.0  # of a circle whose light is worth a fit; patterns and noise give up to 8
+_MOST_OFF = 0.05  # of the distance, for an outline by its edge alone: a holder's plates are clear circles, too
 _FROM_EDGE_PX = 1.0  # the steepest place of the light is some tenths of a pixel inside the limb
 
 
@@ -171,7 +172,8 @@ def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) 
 
 def _by_edge(rig: Rig, s: Array, circle: BallCircle) -> Outline | None:
     """Outline by the edge in the picture alone, if that is clear; its covariance is the edge's."""
-    if visible_arc(rig, s) < MIN_ARC:
+    expected = float(np.linalg.norm(rig.sphere_in_camera_m))
+    if visible_arc(rig, s) < MIN_ARC or abs(float(np.linalg.norm(s)) - expected) > _MOST_OFF * expected:
         return None
     try:
         circle.require_clear()
