@@ -28,16 +28,17 @@ from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array
 
 LONGEST_PX = 1024  # long side of the picture in which the outline is looked for
-LEAST_CONTRAST = 14.0  # photographs without a ball of the sizes below give up to 12
-LEAST_LEAD = 1.3  # over the next curve
+LEAST_CONTRAST = 16.0  # wrong circles give up to 15
+LEAST_LEAD = 1.9  # over the next curve
 MOST_SIGMA = 0.01  # of the radius
 SIZES = (0.14, 0.75)  # radii over the short side
-_FLOOR_PX = 0.3  # of an edge's place in the small picture: inside the limb the room is squeezed into fractions of it
-_VOTE_PX, _CANDIDATES, _SETTLED = 256, 30, 6
+_FLOOR_PX = 0.4  # of an edge's place in the small picture: inside the limb the room is squeezed into fractions of it
+_VOTE_PX, _LEAST_SIDE, _CANDIDATES, _SETTLED = 256, 16, 30, 6
 _ELLIPSE = 0.01  # standard deviation of e1 and e2 over the radius: a sphere 8 degrees off the axis
 _DRAWS, _NEAR_PX, _NEAR_REACH_PX = 400, 1.5, 12.0
 _SCALES = (6.0, 3.0, 2.0, 1.5, 1.5, 1.5)  # of the robust weights, in steps
 _SECTORS = 12
+_ALIKE = 0.5
 _OVERWHELMING = 2.5
 _SAME_PX, _SAME = 3.0, 0.04  # pixels, and parts of the radius
 
@@ -148,8 +149,10 @@ def candidates(channels: Array, radii_px: tuple[float, float] | None = None, cou
     """Circles with the most votes, the best first."""
     block = max(1, round(max(channels.shape[1:]) / _VOTE_PX))
     small = np.moveaxis(shrunk(np.moveaxis(channels, 0, -1), block), -1, 0)
-    v, u, cosine, sine = _edge_elements(small)
     rows, columns = small.shape[1:]
+    if min(rows, columns) < _LEAST_SIDE:
+        return []
+    v, u, cosine, sine = _edge_elements(small)
     short = min(rows, columns)
     low, high = (SIZES[0] * short, SIZES[1] * short) if radii_px is None else _over(radii_px, block)
     radii = np.arange(max(low, 4.0), max(high, low + 2.0), 1.5)
@@ -308,7 +311,9 @@ def _least_squares(
     for scale in scales_px:
         off = place - (CURVES @ curve)[:, None]
         near = np.maximum(1.0 - (off / (2.0 * scale)) ** 2, 0.0) ** 2 * weight
-        best = np.argmax(near, axis=1)
+        # the room is squeezed to edges inside the limb, not outside it: of edges alike, the outer one
+        alike = near >= _ALIKE * near.max(axis=1, keepdims=True)
+        best = np.argmax(np.where(alike & (near > 0.0), place, -np.inf), axis=1)
         w = near[rows, best] if used is None else near[rows, best] * used
         curve = np.linalg.solve((CURVES.T * w) @ CURVES + prior, CURVES.T @ (w * place[rows, best]))
     return curve, np.where(w > 0.0, place[rows, best] - CURVES @ curve, np.nan)

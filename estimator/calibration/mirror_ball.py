@@ -95,11 +95,14 @@ class Ball:
     circle_px : centre (u, v) and radius of the outline
     edges : float
         Part of the outline at which the photograph has an edge; 1 for a stated circle.
+    sigma_px : float
+        Largest standard deviation of centre and radius; 0 for a stated circle.
     """
 
     view: View
     circle_px: Circle
     edges: float
+    sigma_px: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -129,10 +132,10 @@ def find_ball(light: NDArray[np.float32], photo: BallPhoto) -> Ball:
     rows, columns = light.shape[:2]
     centre = photo.centre_px or (0.5 * (columns - 1), 0.5 * (rows - 1))
     if photo.circle_px is not None:
-        circle, points, edges = photo.circle_px, None, 1.0
+        circle, points, edges, sigma = photo.circle_px, None, 1.0, 0.0
     else:
         found = _outline(light)
-        circle, points, edges = found.circle_px, found.points_px, found.edges
+        circle, points, edges, sigma = found.circle_px, found.points_px, found.edges, float(found.sigma_px.max())
     u, v, radius = circle
     if not (radius >= 10.0 and -radius < u < columns + radius and -radius < v < rows + radius):
         raise DatasetError(
@@ -156,7 +159,7 @@ def find_ball(light: NDArray[np.float32], photo: BallPhoto) -> Ball:
         T_world_camera=Pose("world", "camera", (0.0, 0.0, 0.0), as_matrix(_camera_axes(photo.elevation_deg))),
         T_camera_sphere=Pose("camera", "sphere", as_vector(s)),
     )
-    return Ball(rig.at(0.0), circle, edges)
+    return Ball(rig.at(0.0), circle, edges, sigma)
 
 
 def _camera_axes(elevation_deg: float) -> Array:

@@ -53,7 +53,7 @@ _STEPS, _REST_M, _REST_SIGMAS, _UNREST_M = 30, 1e-7, 0.05, 1e-6
 _MIN_CONTRAST, _MAX_CONTRAST = 0.5, 1.6
 _BLUR_RANGE_PX2 = (0.02, 9.0)
 _LEAST_CONTRAST = 9.0  # of a circle whose light is worth a fit; patterns and noise give up to 8
-_MOST_OFF = 0.05  # of the distance, for an outline by its edge alone: a holder's plates are clear circles, too
+_MOST_OFF = 0.06  # of the distance, for an outline by its edge alone: a holder's plates are clear circles, too
 _FROM_EDGE_PX = 1.0  # the steepest place of the light is some tenths of a pixel inside the limb
 
 

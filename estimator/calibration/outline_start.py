@@ -21,8 +21,9 @@ from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
-_CANDIDATES = 12
-_RADII = (0.7, 1.4)  # of the nominal rig's outline
+_FEW, _CANDIDATES = 6, 12
+_NEAR = (0.95, 1.05)  # of the nominal rig's outline: looked at first
+_RADII = (0.7, 1.4)
 _LEAST_RADIUS_PX = 30.0
 
 
@@ -50,10 +51,12 @@ def rough_outlines(picture: Array, rig: Rig) -> Iterator[tuple[Array, BallCircle
     ImageError
         If no circle of about the expected size is found.
     """
-    found = 0
-    for circle in circles(picture, radii_px(rig), _CANDIDATES):
-        found += 1
-        yield sphere_from_rays(rig.camera.rays(circle.points_px), rig.mirror.radius_m), circle
+    found, (low, high) = 0, radii_px(rig)
+    near = (low * _NEAR[0] / _RADII[0], high * _NEAR[1] / _RADII[1])  # a holder's plates are clear circles, too
+    for radii, count in ((near, _FEW), ((low, high), _CANDIDATES)):
+        for circle in circles(picture, radii, count):
+            found += 1
+            yield sphere_from_rays(rig.camera.rays(circle.points_px), rig.mirror.radius_m), circle
     if not found:
         raise ImageError(
             "an image without a mirror: no circle of the outline's size has edges all around; check the picture"

@@ -71,7 +71,12 @@ def from_mirror_ball(
     light = read_light(photo)
     ball = find_ball(light, stated)
     u, v, radius = ball.circle_px
-    found = "as stated" if circle else f"with edges on {100.0 * ball.edges:.0f} % of it; if it is wrong, give --circle"
+    found = (
+        "as stated"
+        if circle
+        else f"each +- {ball.sigma_px:.2g} px, with edges on {100.0 * ball.edges:.0f} % of it; if it is wrong, give "
+        "--circle"
+    )
     print(f"outline: centre ({u:.1f}, {v:.1f}) px, radius {radius:.1f} px, {found}")
     camera, s = ball.view.rig.camera, ball.view.rig.sphere_in_camera_m
     print(f"focal length {camera.fx_px:.0f} px; ball's centre {sum(x * x for x in s) ** 0.5:.4g} m from the lens")
