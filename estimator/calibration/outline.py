@@ -53,6 +53,7 @@ _STEPS, _REST_M, _REST_SIGMAS, _UNREST_M = 30, 1e-7, 0.05, 1e-6
 _MIN_CONTRAST, _MAX_CONTRAST = 0.5, 1.6
 _BLUR_RANGE_PX2 = (0.02, 9.0)
 _LEAST_CONTRAST = 9.0  # of a circle whose light is worth a fit; patterns and noise give up to 8
+_MOST_TRIED = 4  # circles whose light is fitted, which takes seconds where it does not come to rest
 _MOST_OFF = 0.06  # of the distance, for an outline by its edge alone: a holder's plates are clear circles, too
 _FROM_EDGE_PX = 1.0  # the steepest place of the light is some tenths of a pixel inside the limb
 
@@ -146,18 +147,23 @@ def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) 
     again = (image, card) if card and card.output == "mjpeg" else None
     low, high = radii_px(rig)
     try:
+        tried = 0
         for start, circle in rough_outlines(grey(planes), rig):
+            if circle.contrast < _LEAST_CONTRAST:
+                continue
+            if tried == _MOST_TRIED:
+                break
+            tried += 1
+            by_edge = by_edge or _by_edge(rig, start, circle)
             try:
-                if circle.contrast < _LEAST_CONTRAST:
-                    continue
-                if by_edge is None:
-                    by_edge = _by_edge(rig, start, circle)
                 found = fit_outline(planes, rig, start, again=again)
                 _require_near(found.rig(rig), circle)
                 return found
             except ImageError as error:
                 # that it is cut, or lit badly, says more than that the last circle tried was none
                 fault = error if "without a mirror" in str(fault) else fault
+            if by_edge:
+                break
     except ImageError as error:
         fault = error
     if by_edge:
