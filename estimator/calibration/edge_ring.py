@@ -87,7 +87,7 @@ class EdgeRing:
 
     @cached_property
     def inside(self) -> BoolArray:
-        """Where the picture is, shape (TURNS, distances)."""
+        """True inside the picture, shape (TURNS, distances)."""
         u, v = self._uv
         rows, columns = self.channels.shape[1:]
         return np.asarray((u > 2.0) & (u < columns - 3.0) & (v > 2.0) & (v < rows - 3.0))
