@@ -35,7 +35,7 @@ from phibench.scenes.rig import Rig
 
 _BRIGHT = 3.0  # times the median inside the mirror
 _LEAST_AREA_PX = 80
-_HALO_PX = {True: 5, False: 12}  # of raw pixels; of processed ones, a JPEG's block and its neighbour's interpolation
+_HALO_PX, _JPEG_HALO_PX = 5, 12  # a JPEG's block and its neighbour's interpolation
 
 
 def lamp_halo(planes: ColourPlanes, inside: BoolArray, card: SensorCard, laser_off: bool) -> BoolArray:
@@ -54,7 +54,7 @@ def lamp_halo(planes: ColourPlanes, inside: BoolArray, card: SensorCard, laser_o
     large = np.bincount(areas.ravel(), minlength=count + 1) * step**2 >= _LEAST_AREA_PX
     large[0] = False
     lamps = np.repeat(np.repeat(large[areas], step, axis=0), step, axis=1)[: planes.shape[0], : planes.shape[1]]
-    return np.asarray(maximum_filter(lamps, 2 * _HALO_PX[card.output == "raw"] + 1))
+    return np.asarray(maximum_filter(lamps, 2 * (_JPEG_HALO_PX if card.output == "mjpeg" else _HALO_PX) + 1))
 
 
 # -- both images together --------------------------------------------------------------------------------------------
@@ -109,8 +109,11 @@ def choose(rig: Rig, stroke_m: float, down: Candidates, up: Candidates, least: T
         return single
     row = int(np.flatnonzero(fits.any(axis=1))[0])
     pair = Choice(row, int(np.flatnonzero(fits[row])[0]))
-    if sure and single.down is not None and down.electrons[single.down] > _STRONGER * down.electrons[row]:
-        return Choice(single.down)
+    if not sure:
+        return pair
+    for side, alone, other in ((down, single.down, pair.down), (up, single.up, pair.up)):
+        if alone is not None and other is not None and side.electrons[alone] > _STRONGER * side.electrons[other]:
+            return single
     return pair
 
 
