@@ -136,9 +136,10 @@ def verdict(found: Alignment) -> str:
     off = float(np.linalg.norm(found.move_world_m)) / found.sigma_m if found.sigma_m > 0.0 else math.inf
     mark = "mirror centred, as far as the camera is known" if off < _SIGNIFICANT else "mirror off centre: move it"
     outline = found.outline
+    by_edge = "; by the edge in the picture alone: its light is not that of polished steel" if outline.by_edge else ""
     return (
         f"{mark} ({off:.1f} standard deviations); outline residual {outline.shift_rms_px:.2f} px rms over "
-        f"{100.0 * outline.arc:.0f} % of it"
+        f"{100.0 * outline.arc:.0f} % of it{by_edge}"
     )
 
 

@@ -157,7 +157,7 @@ def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) 
             by_edge = by_edge or _by_edge(rig, start, circle)
             try:
                 found = fit_outline(planes, rig, start, again=again)
-                _require_near(found.rig(rig), circle)
+                require_near(found.rig(rig), circle)
                 return found
             except ImageError as error:
                 # that it is cut, or lit badly, says more than that the last circle tried was none
@@ -199,7 +199,7 @@ def _by_edge(rig: Rig, s: Array, circle: BallCircle) -> Outline | None:
     return Outline(s, covariance, circle.edges, math.nan, math.nan, math.nan, TURNS, 0, shifts, by_edge=True)
 
 
-def _require_near(rig: Rig, circle: BallCircle) -> None:
+def require_near(rig: Rig, circle: BallCircle) -> None:
     """Raise `ImageError` if a fit of the light has left the edge that it began at."""
     u, v, _ = circle.circle_px
     outline, edge = rig.outline_px(TURNS) - (u, v), circle.points_px - (u, v)

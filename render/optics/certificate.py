@@ -27,14 +27,13 @@ from scipy.special import ndtri
 from scipy.stats import qmc
 
 from phibench.render.optics.beam_deposit import BEAM_REACH_M, deposit
-from phibench.render.optics.ray_tracer import MirrorRays, lens_rays, reflect
+from phibench.render.optics.ray_tracer import MirrorRays, lens_rays, reflect, through_glass
 from phibench.render.optics.reflection_point import mirror_points
 from phibench.render.optics.room_tracer import GeometryLike, RoomGeometry, as_geometry, blocked_by
 from phibench.render.optics.spot_layer import SpotLayer
 from phibench.render.optics.truth import SpotTruth
 from phibench.scenes.faces import FaceTable, IntArray
 from phibench.scenes.frames import Array, BoolArray
-from phibench.scenes.glass_tube import GlassTube
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import View
 
@@ -47,7 +46,6 @@ _SEED = 0  # the scramble is part of the quadrature rule, not a noise draw
 _STEP_PX = 1e-3
 _NEWTON_STEPS = 8
 _HALVINGS = 6
-_ECHOES = 60  # between the faces of a plate: R^120 is left, 1e-6 for R = 0.89
 
 
 @dataclass(frozen=True)
@@ -274,42 +272,8 @@ def _reflect(view: View, spot: LaserSpot, uv: Array, bundle: _Bundle) -> _Reflec
     cos_lens = directions @ view.T_world_camera.R[:, 2]
     if view.tube is None:
         return _Reflected(origins, (rays.points_m,), out, cos_facet, cos_lens, weight, 1.0)
-    corners, out, passing = _through_glass(view.tube, rays.points_m, out)
+    corners, out, passing = through_glass(view.tube, rays.points_m, out)
     return _Reflected(origins, corners, out, cos_facet, cos_lens, weight, passing)
-
-
-def _through_glass(tube: GlassTube, points: Array, directions: Array) -> tuple[tuple[Array, ...], Array, Array]:
-    """Points where rays leave the mirror and meet the two faces, directions behind the glass, and what it passes."""
-    corners, passing = [points], np.zeros(len(points))
-    for radius, ratio in ((tube.inner_m, 1.0 / tube.index), (tube.outer_m, tube.index)):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            points, outward = _to_cylinder(tube, points, directions, radius)
-            cos = np.einsum("ni,ni->n", directions, outward)
-            along = ratio * (directions - cos[:, None] * outward)
-            directions = along + np.sqrt(1.0 - np.einsum("ni,ni->n", along, along))[:, None] * outward
-            if radius == tube.inner_m:
-                passing = _through_plate(cos, tube.index)
-        corners.append(points)
-    return tuple(corners), directions, passing
-
-
-def _to_cylinder(tube: GlassTube, points: Array, directions: Array, radius: float) -> tuple[Array, Array]:
-    """Points of a cylinder about the tube's axis that rays from inside meet, and its outward normals there."""
-    flat = np.eye(3) - np.outer(tube.axis, tube.axis)
-    offset, way = (points - tube.origin_m) @ flat, directions @ flat
-    a, b = np.einsum("ni,ni->n", way, way), np.einsum("ni,ni->n", way, offset)
-    c = np.einsum("ni,ni->n", offset, offset) - radius**2
-    distance = ((np.sqrt(b * b - a * c) - b) / a)[:, None]
-    return points + distance * directions, (offset + distance * way) / radius
-
-
-def _through_plate(cos: Array, n: float) -> Array:
-    """Part of unpolarised light that a plate passes: (1 - R)^2 (1 + R^2 + R^4 + ...) for each polarisation."""
-    outside = np.clip(np.arccos(cos), 1e-9, None)
-    inside = np.arcsin(np.sin(outside) / n)
-    apart, together = outside - inside, outside + inside
-    faces = (np.sin(apart) / np.sin(together)) ** 2, (np.tan(apart) / np.tan(together)) ** 2
-    return np.asarray(0.5 * sum((1.0 - R) ** 2 * sum(R ** (2 * k) for k in range(_ECHOES)) for R in faces))
 
 
 def _tangents(view: View, spot: LaserSpot, rays: MirrorRays) -> Array:

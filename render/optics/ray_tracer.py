@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from phibench.scenes.frames import Array
+from phibench.scenes.glass_tube import GlassTube
 from phibench.scenes.mirror import Form
 from phibench.scenes.rig import View
 
@@ -232,3 +233,53 @@ def _slope(added: Radius, n: Array, e: Array) -> Array:
 def _difference(added: Radius, n: Array, e: Array, angle: float) -> Array:
     c, s = math.cos(angle), math.sin(angle)
     return added(c * n + s * e) - added(c * n - s * e)
+
+
+# Glass around the mirror.
+
+
+_ECHOES = 60  # between the faces of a plate: R^120 is left, 1e-6 for R = 0.89
+
+
+def through_glass(tube: GlassTube, points: Array, directions: Array) -> tuple[tuple[Array, ...], Array, Array]:
+    """Rays from inside a tube through its wall, by Snell's law at one face after the other.
+
+    Returns
+    -------
+    corners : three arrays, shape (N, 3)
+        Where the rays began, and where they meet the two faces.
+    directions : array, shape (N, 3)
+        Behind the wall.
+    passing : array, shape (N,)
+        Part of unpolarised light that a bare wall passes.
+    """
+    corners, passing = [points], np.zeros(len(points))
+    for radius, ratio in ((tube.inner_m, 1.0 / tube.index), (tube.outer_m, tube.index)):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            points, outward = _to_cylinder(tube, points, directions, radius)
+            cos = np.einsum("ni,ni->n", directions, outward)
+            along = ratio * (directions - cos[:, None] * outward)
+            directions = along + np.sqrt(1.0 - np.einsum("ni,ni->n", along, along))[:, None] * outward
+            if radius == tube.inner_m:
+                passing = _through_plate(cos, tube.index)
+        corners.append(points)
+    return tuple(corners), directions, passing
+
+
+def _to_cylinder(tube: GlassTube, points: Array, directions: Array, radius: float) -> tuple[Array, Array]:
+    """Points of a cylinder about the tube's axis that rays from inside meet, and its outward normals there."""
+    flat = np.eye(3) - np.outer(tube.axis, tube.axis)
+    offset, way = (points - tube.origin_m) @ flat, directions @ flat
+    a, b = np.einsum("ni,ni->n", way, way), np.einsum("ni,ni->n", way, offset)
+    c = np.einsum("ni,ni->n", offset, offset) - radius**2
+    distance = ((np.sqrt(b * b - a * c) - b) / a)[:, None]
+    return points + distance * directions, (offset + distance * way) / radius
+
+
+def _through_plate(cos: Array, n: float) -> Array:
+    """Part of unpolarised light that a plate passes: (1 - R)^2 (1 + R^2 + R^4 + ...) for each polarisation."""
+    outside = np.clip(np.arccos(cos), 1e-9, None)
+    inside = np.arcsin(np.sin(outside) / n)
+    apart, together = outside - inside, outside + inside
+    faces = (np.sin(apart) / np.sin(together)) ** 2, (np.tan(apart) / np.tan(together)) ** 2
+    return np.asarray(0.5 * sum((1.0 - R) ** 2 * sum(R ** (2 * k) for k in range(_ECHOES)) for R in faces))

@@ -26,11 +26,17 @@ class BallPhotograph:
         Points of the limb.
     radius_px : float
         Their mean distance from their mean.
+    focal_px : float
+        The principal point is the middle of the picture.
+    centre : array, shape (3,)
+        Of the ball in the camera frame, in radii of the ball.
     """
 
     light: np.ndarray
     outline_px: np.ndarray
     radius_px: float
+    focal_px: float
+    centre: np.ndarray
 
     def distance_px(self, points_px: np.ndarray) -> float:
         """Largest distance of points from the outline."""
@@ -38,7 +44,9 @@ class BallPhotograph:
         return float(apart.min(axis=1).max())
 
 
-def ball_photograph(rng: np.random.Generator, size: tuple[int, int] = (480, 640), ball: bool = True) -> BallPhotograph:
+def ball_photograph(
+    rng: np.random.Generator, size: tuple[int, int] = (480, 640), ball: bool = True, reflectance: float = 0.6
+) -> BallPhotograph:
     """Photograph with a ball of 0.2 to 0.45 of the short side, somewhere near the middle; or the room alone."""
     short = min(size)
     focal = short * rng.uniform(1.2, 3.0)
@@ -58,7 +66,7 @@ def ball_photograph(rng: np.random.Generator, size: tuple[int, int] = (480, 640)
     onward = d.copy()
     onward[hit] = d[hit] - 2.0 * np.sum(d[hit] * n, axis=-1, keepdims=True) * n
     light = _surroundings(rng, onward)
-    light[hit] *= 0.6
+    light[hit] *= reflectance
     light = ndimage.gaussian_filter(light, (FINE * _BLUR_PX, FINE * _BLUR_PX, 0.0))
     light = light.reshape(size[0], FINE, size[1], FINE, 3).mean(axis=(1, 3))
     light *= 1.0 + 0.02 * rng.standard_normal(light.shape)
@@ -68,7 +76,7 @@ def ball_photograph(rng: np.random.Generator, size: tuple[int, int] = (480, 640)
     limb = np.cos(half) * axis + np.sin(half) * (np.cos(turn) * across + np.sin(turn) * np.cross(axis, across))
     outline = focal * limb[:, :2] / limb[:, 2:] + 0.5 * (np.array(size[::-1]) - 1.0)
     mean = float(np.linalg.norm(outline - outline.mean(axis=0), axis=1).mean())
-    return BallPhotograph(light.astype(np.float32), outline, mean)
+    return BallPhotograph(light.astype(np.float32), outline, mean, focal, centre)
 
 
 def _surroundings(rng: np.random.Generator, d: np.ndarray) -> np.ndarray:

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.ball_photographs import ball_photograph
+from scipy import stats
 
+from phibench.estimator.calibration.align import alignment, verdict
 from phibench.estimator.calibration.ball_circle import BallCircle, circles, find_circle
 from phibench.estimator.calibration.edge_ring import TURNS, EdgeRing, log_colours
+from phibench.estimator.calibration.outline import find_outline, require_near
 from phibench.estimator.spots.image_planes import ImageError
+from phibench.scenes.frames import Pose, as_vector
+from phibench.scenes.rig import Rig
 
 DRAWN = 5
 
@@ -93,3 +101,53 @@ def test_a_grey_picture_is_enough() -> None:
 def test_empty_pictures_are_refused(light) -> None:
     with pytest.raises(ImageError, match="no outline of a ball"):
         find_circle(light)
+
+
+# In a rig's image: `find_outline`.
+
+
+@pytest.fixture(scope="module")
+def rig_and_light() -> tuple[Rig, np.ndarray]:
+    """A mirror that loses nothing among patterns: not the light of polished steel. Planes as of a layer."""
+    photo = ball_photograph(np.random.default_rng([7, 3]), reflectance=1.0)
+    rows, columns = photo.light.shape[:2]
+    middle = {"cx_px": 0.5 * (columns - 1), "cy_px": 0.5 * (rows - 1)}
+    focal = {"fx_px": photo.focal_px, "fy_px": photo.focal_px}
+    camera = replace(Rig().camera, width_px=columns, height_px=rows, k1=0.0, k2=0.0, k3=0.0, p1=0.0, p2=0.0)
+    mirror = Rig().mirror
+    pose = Pose("camera", "sphere", as_vector(photo.centre * mirror.radius_m))
+    rig = replace(Rig(), camera=replace(camera, **middle, **focal), T_camera_sphere=pose)
+    return rig, np.moveaxis(photo.light, -1, 0).astype(float)
+
+
+def test_where_the_light_is_not_steels_the_edge_is_the_outline(rig_and_light) -> None:
+    """Mahalanobis distance of three numbers, false alarm rate 1e-4; a centre 5 sigma off is refused."""
+    rig, light = rig_and_light
+    moved = alignment(light, rig)
+    found = moved.outline
+    assert found.by_edge
+    error, limit = found.sphere_in_camera_m - rig.sphere_in_camera_m, stats.chi2.isf(1e-4, 3)
+    assert error @ np.linalg.solve(found.covariance_m2, error) < limit
+    off = error + 5.0 * found.sigma_m
+    assert off @ np.linalg.solve(found.covariance_m2, off) > limit
+    assert "by the edge in the picture alone" in verdict(moved)
+
+
+@pytest.mark.slow  # four fits that do not come to rest
+def test_a_clear_circle_of_another_size_is_no_outline(rig_and_light) -> None:
+    """A rig whose distance is a fifth larger: such an edge may be a holder's plate."""
+    rig, light = rig_and_light
+    farther = replace(rig.T_camera_sphere, translation_m=as_vector(1.2 * rig.sphere_in_camera_m))
+    with pytest.raises(ImageError, match=r"without a mirror|lamps or edges"):
+        find_outline(light, replace(rig, T_camera_sphere=farther))
+
+
+def test_a_fit_that_left_its_edge_is_refused() -> None:
+    """Half a pixel is allowed, 1 px and 3 sigmas of 0.5 px; 5 px are not."""
+    rig = Rig()
+    u, v = rig.outline_px(TURNS).mean(axis=0)
+    radius = float(np.linalg.norm(rig.outline_px(TURNS) - (u, v), axis=1).mean())
+    for wider, refused in ((0.5, False), (5.0, True)):
+        circle = BallCircle((u, v, radius + wider), (0.0, 0.0), 0.25 * np.eye(3), 20.0, 2.0, np.zeros(TURNS))
+        with pytest.raises(ImageError, match="from the edge that is there") if refused else nullcontext():
+            require_near(rig, circle)
