@@ -1,7 +1,7 @@
-"""Image of a world point in the mirror: the inverse of `reflection.reflect`; and the epipolar line of a pixel.
+"""Image of a world point in the mirror: the inverse of `reflection.room_rays`; and the epipolar line of a pixel.
 
 The pixel is the one whose reflected ray P + t r goes through the point X. Newton's method brings the ray's miss
-e = w - (w . r) r, w = X - P, to 0, with the analytic derivatives of `reflect_jacobian`.
+e = w - (w . r) r, w = X - P, to 0, with the analytic derivatives of `room_rays_jacobian`.
 
 Epipolar line: the down pixel's ray is X(t) = P + t r. t follows from |X_h - S_h| = D, h the horizontal part and S the
 sphere centre at the down position. `up_image` gives the pixel of X in the up image, with derivatives.
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from phibench.estimator.geometry.reflection import reflect, reflect_jacobian
+from phibench.estimator.geometry.reflection import room_rays, room_rays_jacobian
 from phibench.estimator.geometry.status import Status, StatusArray, first_fault, flag, keep, stroke_status
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig, View
@@ -62,7 +62,8 @@ def image_of(view: View, points_world_m: Array) -> MirrorImage:
                 break
         step, px_per_m = _newton(view, uv, X)
         found = np.all(np.abs(step) < 1e3 * _TOLERANCE_PX, axis=-1)
-        ahead = np.sum((X - reflect(view, uv).origin_world_m) * reflect(view, uv).direction_world, axis=-1) > 0.0
+        ray = room_rays(view, uv)
+        ahead = np.sum((X - ray.origin_world_m) * ray.direction_world, axis=-1) > 0.0
     status = first_fault(
         flag((~np.isfinite(X).all(axis=-1), Status.NOT_FINITE)), flag((~(found & ahead), Status.NOT_CONVERGED))
     )
@@ -82,7 +83,7 @@ def _start(view: View, X: Array) -> Array:
 
 def _newton(view: View, uv: Array, X: Array) -> tuple[Array, Array]:
     """Step of (u, v), shape (..., 2), and derivative by the point, shape (..., 2, 3), exact where the step is 0."""
-    ray, J = reflect(view, uv), reflect_jacobian(view, uv)
+    ray, J = room_rays(view, uv), room_rays_jacobian(view, uv)
     w, r = X - ray.origin_world_m, ray.direction_world
     along = np.sum(w * r, axis=-1)
     e = w - along[..., None] * r
@@ -139,7 +140,7 @@ def up_image(rig: Rig, stroke_m: ArrayLike, uv_down_px: Array, inverse_depth_per
     """
     view, uv = rig.at(0.0), np.asarray(uv_down_px, float)
     q, h = np.asarray(inverse_depth_per_m, float), np.asarray(stroke_m, float)
-    ray, J = reflect(view, uv), reflect_jacobian(view, uv)
+    ray, J = room_rays(view, uv), room_rays_jacobian(view, uv)
     with np.errstate(all="ignore"):
         D = 1.0 / q
         t = range_at(ray.origin_world_m - view.sphere_centre_m, ray.direction_world, D)

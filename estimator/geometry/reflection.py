@@ -5,17 +5,20 @@ Estimators assume a perfect sphere. The form error serves the true rig, whose er
 Symbols: d unit camera ray, s sphere centre in the camera frame, P reflection point relative to the sphere centre,
 n outward normal, i angle of incidence, r unit ray that leaves the mirror. Frames, poses and pixels as in
 `phibench.scenes.frames`. Every kernel takes leading axes and never raises for one bad ray: NaN and a `Status`.
+
+A glass tube around the mirror bends the rays that leave it: `room_rays` follows them by Snell's law for vectors.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from phibench.estimator.geometry.status import Status, StatusArray, flag, keep
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
+from phibench.scenes.glass_tube import GlassTube
 from phibench.scenes.mirror import Form, Level, level
 from phibench.scenes.rig import View
 
@@ -191,7 +194,7 @@ def ray_slope(view: View, uv_px: Array, points_world_m: Array) -> Array:
 
     At a distance t along the ray r from the mirror point P, d(P + t r)/d(u, v) along the two directions of `ray_basis`.
     """
-    ray, J = reflect(view, uv_px), reflect_jacobian(view, uv_px)
+    ray, J = room_rays(view, uv_px), room_rays_jacobian(view, uv_px)
     along = np.sum((points_world_m - ray.origin_world_m) * ray.direction_world, axis=-1)[..., None, None]
     return ray_basis(ray.direction_world) @ (J.origin_m_per_px + along * J.direction_per_px)
 
@@ -202,6 +205,55 @@ def ray_basis(directions: Array) -> Array:
     first = np.cross(directions, least)
     first = first / np.linalg.norm(first, axis=-1, keepdims=True)
     return np.stack([first, np.cross(directions, first)], axis=-2)
+
+
+# -- glass tube around the mirror --------------------------------------------------------------------------------------
+
+
+def room_rays(view: View, uv_px: Array) -> Reflection:
+    """Reflected rays as they go on into the room: from the mirror, or from the outer face of a glass tube around it.
+
+    Normals and angles are those at the mirror. What a plate of the tube hides is not asked.
+    """
+    ray = reflect(view, uv_px)
+    if view.tube is None:
+        return ray
+    with np.errstate(all="ignore"):
+        origin, direction, _, _ = _through_glass(view.tube, ray, None)
+    return replace(ray, origin_world_m=keep(origin, ray.status), direction_world=keep(direction, ray.status))
+
+
+def room_rays_jacobian(view: View, uv_px: Array) -> ReflectionJacobian:
+    """Derivatives of `room_rays` by the pixel, analytically."""
+    J = reflect_jacobian(view, uv_px)
+    if view.tube is None:
+        return J
+    ray = reflect(view, uv_px)
+    with np.errstate(all="ignore"):
+        _, _, origin, direction = _through_glass(view.tube, ray, J)
+    return replace(J, origin_m_per_px=keep(origin, ray.status), direction_per_px=keep(direction, ray.status))
+
+
+def _through_glass(tube: GlassTube, ray: Reflection, J: ReflectionJacobian | None) -> tuple[Array, Array, Array, Array]:
+    """Points on the outer face, directions behind it, and the derivatives of both; 0 without those of the ray."""
+    flat = np.eye(3) - np.outer(tube.axis, tube.axis)
+    X, d = ((vector)[..., None] for vector in (ray.origin_world_m - tube.origin_m, ray.direction_world))
+    zero = np.zeros((*ray.origin_world_m.shape, 2))
+    dX, dd = (zero, zero) if J is None else (J.origin_m_per_px, J.direction_per_px)
+    for radius, ratio in ((tube.inner_m, 1.0 / tube.index), (tube.outer_m, tube.index)):
+        # |flat (X + t d)| = radius, the later of its two roots
+        a, b, c = _dot(flat @ d, d), _dot(flat @ d, X), _dot(flat @ X, X) - radius**2
+        t = (np.sqrt(b * b - a * c) - b) / a
+        X = X + t * d
+        n, moved = flat @ X / radius, dX + t * dd
+        dX = moved - d * _dot(n, moved) / _dot(n, d)  # it stays on the cylinder
+        dn = flat @ dX / radius
+        cos = _dot(n, d)
+        along = ratio * (d - cos * n)
+        dalong = ratio * (dd - (_dot(dd, n) + _dot(d, dn)) * n - cos * dn)
+        behind = np.sqrt(1.0 - _dot(along, along))
+        d, dd = along + behind * n, dalong - _dot(along, dalong) / behind * n + behind * dn
+    return X[..., 0] + tube.origin_m, d[..., 0], dX, dd
 
 
 # -- hit on a mirror with a form error ---------------------------------------------------------------------------------

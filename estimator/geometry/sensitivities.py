@@ -87,7 +87,8 @@ def truth_gradient(true_rig: Rig, point_world_m: Array) -> Array:
 def pixel_gradient(view: View, uv_px: Array, point_world_m: Array) -> Array:
     """d(u, v)/dp, shape (2, p), pixels per unit, of a world point, shape (3,), that is seen at a pixel, shape (2,).
 
-    The reflected ray P + t r goes through the point whatever p is: across the ray, dP + t dr = 0.
+    The reflected ray P + t r goes through the point whatever p is: across the ray, dP + t dr = 0. How a glass tube
+    around the mirror changes dP and dr is left out.
     """
     with np.errstate(all="ignore"):
         dP, dr = _ray_changes(view, uv_px)

@@ -1,6 +1,7 @@
 """Depth from two reflected rays: the midpoint of their common perpendicular.
 
-Ray k (1 down, 2 up) leaves the mirror at P_k with the direction r_k: X = P_k + t_k r_k, world frame, metres. D is the
+Ray k (1 down, 2 up) leaves the mirror at P_k with the direction r_k: X = P_k + t_k r_k, world frame, metres. Where a
+glass tube is around the mirror, it leaves the glass at P_k. D is the
 horizontal distance of the point from the vertical line through the sphere centre at the down position. Leading axes of
 all arguments broadcast together. `least_squares_depth` takes the same rays and weighs them.
 """
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from phibench.estimator.geometry.paper_depth import PARALLEL_SINE
-from phibench.estimator.geometry.reflection import reflect, reflect_jacobian
+from phibench.estimator.geometry.reflection import room_rays, room_rays_jacobian
 from phibench.estimator.geometry.status import (
     DepthEstimate,
     Status,
@@ -215,14 +216,14 @@ def _meet_in_plane(rays: _Rays, d: _Tangents, centre: Array) -> tuple[Array, Arr
 def _rays(rig: Rig, stroke_m: ArrayLike, uv_down_px: Array, uv_up_px: Array) -> _Rays:
     """Both reflected rays; a stroke moves origins along the axis and turns nothing."""
     view, h = rig.at(0.0), np.asarray(stroke_m, float)
-    down, up = reflect(view, uv_down_px), reflect(view, uv_up_px)
+    down, up = room_rays(view, uv_down_px), room_rays(view, uv_up_px)
     raised = up.origin_world_m + h[..., None] * np.array(rig.stroke_axis_world)
     status = first_fault(down.status, up.status, stroke_status(h))
     return _Rays(down.origin_world_m, down.direction_world, raised, up.direction_world, status)
 
 
 def _tangents(rig: Rig, uv_down_px: Array, uv_up_px: Array) -> _Tangents:
-    J1, J2 = (reflect_jacobian(rig.at(0.0), uv) for uv in (uv_down_px, uv_up_px))
+    J1, J2 = (room_rays_jacobian(rig.at(0.0), uv) for uv in (uv_down_px, uv_up_px))
     return _Tangents(
         _columns(J1.origin_m_per_px, 0),
         _columns(J1.direction_per_px, 0),

@@ -10,7 +10,9 @@ import pytest
 from helpers.snell import through
 
 from phibench.datasets.store.documents import from_json, to_json
-from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.geometry.least_squares_depth import depth_general
+from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.triangulate import depth_exact, exact_gradient
 from phibench.render.optics import certificate
 from phibench.render.optics.certificate import certify
 from phibench.render.optics.ray_tracer import trace_pixels
@@ -237,6 +239,37 @@ def test_what_the_glass_costs_an_estimator_that_neglects_it() -> None:
     assert np.array(rows)[:, 2] == pytest.approx(-plate_mm, rel=0.1)
     assert np.array(rows)[:, 1].min() > -2.5 * plate_mm
     assert rows[0][0] == pytest.approx(0.135, abs=2e-3)
+
+
+@pytest.mark.parametrize("name", ["aligned", "crooked"])
+def test_estimators_that_know_of_the_glass_are_exact(name: str) -> None:
+    """D, point and image by the estimator's Snell's law, from pixels of the simulator's closed form; derivatives."""
+    one, rng = rig(RIGS[name], wall_m=0.006), np.random.default_rng(4)
+    turn, depth = rng.uniform(0.0, 2.0 * np.pi, 200), rng.uniform(0.8, 5.0, 200)
+    points = np.stack([depth * np.cos(turn), depth * np.sin(turn), rng.uniform(0.05, 2.2, 200)], axis=1)
+    down, up = (chief_px(one.at(h), points) for h in (0.0, 0.5))
+    image = image_of(one.at(0.5), points)
+    assert image.uv_px == pytest.approx(up, abs=1e-9)
+    true = np.hypot(*(points - one.at(0.0).sphere_centre_m)[:, :2].T)
+    covariance = np.broadcast_to(np.eye(2), (200, 2, 2))
+    exact, general = depth_exact(one, 0.5, down, up), depth_general(one, 0.5, down, up, covariance, covariance)
+    for found in (exact, general):
+        assert found.depth_m == pytest.approx(true, rel=1e-9)  # 1e-12 px, times the 500 of D by pixels
+        assert found.point_world_m == pytest.approx(points, abs=1e-8)
+    without = depth_exact(dataclasses.replace(one, holder=None), 0.5, down, up)
+    assert np.abs(without.depth_m - true).min() > 1e-3
+    by_pixel = np.moveaxis(np.array([(numeric(one, down, up, k)) for k in range(4)]), 0, -1)
+    assert exact_gradient(one, 0.5, down, up) == pytest.approx(by_pixel, rel=1e-5, abs=1e-6)
+    steps = 1e-5 * np.eye(3)
+    slopes = [(image_of(one.at(0.5), points + h).uv_px - image_of(one.at(0.5), points - h).uv_px) / 2e-5 for h in steps]
+    assert image.px_per_m == pytest.approx(np.stack(slopes, axis=-1), rel=1e-4, abs=1e-3)
+
+
+def numeric(one: Rig, down: np.ndarray, up: np.ndarray, k: int) -> np.ndarray:
+    """Derivative of D by the k-th of four pixel coordinates."""
+    h = 1e-4 * np.eye(4)[k]
+    plus, minus = (depth_exact(one, 0.5, down + s * h[:2], up + s * h[2:]).depth_m for s in (1.0, -1.0))
+    return (plus - minus) / 2e-4
 
 
 def chief_px(view: View, points: np.ndarray) -> np.ndarray:
