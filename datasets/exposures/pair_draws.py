@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exposures.distractors import Distractor, distractors, present
 from phibench.datasets.frames.request import Exposure, FrameRequest, whole_number
+from phibench.datasets.frames.sensor_file import SensorFile
 from phibench.datasets.frames.source import FrameSource, has_place
 from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.recipe.distributions import DistributionTable, quantile
@@ -73,7 +74,9 @@ class PairDraw:
         return self.draw * len(PRESETS) + PRESETS.index(self.preset)
 
 
-def pair_draws(dataset: Dataset, preset: str | None = None, draws: int | None = None) -> tuple[PairDraw, ...]:
+def pair_draws(
+    dataset: Dataset, preset: str | None = None, draws: int | None = None, sensor: SensorFile | None = None
+) -> tuple[PairDraw, ...]:
     """All pair draws of a data set, by number.
 
     Parameters
@@ -83,6 +86,8 @@ def pair_draws(dataset: Dataset, preset: str | None = None, draws: int | None = 
         This one instead of the recipe's; needed where the recipe has no `[frames]`, whose defaults then hold.
     draws : int, optional
         Draws of the noise instead of the recipe's.
+    sensor : SensorFile, optional
+        Its numbers go before the recipe's and the preset's; its preset is taken where none is given.
 
     Raises
     ------
@@ -90,6 +95,8 @@ def pair_draws(dataset: Dataset, preset: str | None = None, draws: int | None = 
         If there is no preset, or one that gives no pixels.
     """
     frames = dataset.recipe.frames
+    if preset is None and sensor is not None:
+        preset = sensor.preset
     if frames is None and preset is None:
         raise DatasetError(
             f"{dataset.folder}: its recipe has no [frames] that names presets; give one, such as --preset bayer-raw"
@@ -97,26 +104,30 @@ def pair_draws(dataset: Dataset, preset: str | None = None, draws: int | None = 
     frames = frames or FramesTable()
     presets = frames.presets if preset is None else (preset,)
     count = frames.draws if draws is None else whole_number("draws", draws, 1)
-    found = [pair_draw for sample in dataset for pair_draw in _of_sample(sample, frames, presets, count)]
+    found = [pair_draw for sample in dataset for pair_draw in _of_sample(sample, frames, presets, count, sensor)]
     name, seed = dataset.info.name, dataset.info.recipe["dataset"]["seed"]
     order = generator(name, seed, _ORDER_STREAM, "order", *presets, count).permutation(len(found))
     return tuple(replace(found[k], number=number) for number, k in enumerate(order))
 
 
-def _of_sample(sample: Sample, frames: FramesTable, presets: tuple[str, ...], draws: int) -> Iterator[PairDraw]:
+def _of_sample(
+    sample: Sample, frames: FramesTable, presets: tuple[str, ...], draws: int, sensor: SensorFile | None
+) -> Iterator[PairDraw]:
     lights = present(sample.stream_names, sample.dataset.recipe.distractors)
-    requests = {preset: _request(sample, frames, preset) for preset in presets}
+    requests = {preset: _request(sample, frames, preset, sensor) for preset in presets}
     boxes = _boxes(sample, frames)
     for draw in range(draws):
         for preset, request in requests.items():
             yield PairDraw(0, sample.row.sample_id, preset, draw, request, frames.laser_off, boxes, lights)
 
 
-def _request(sample: Sample, frames: FramesTable, preset: str) -> FrameRequest:
+def _request(sample: Sample, frames: FramesTable, preset: str, sensor: SensorFile | None) -> FrameRequest:
     if preset == "ideal":
         raise DatasetError("preset 'ideal' ends before the pixels: take bayer-raw, mono-raw, srgb8 or mjpeg")
     numbers = {key: _value(sample, key, given) for key in SENSOR_KEYS if (given := getattr(frames, key)) is not None}
     overrides = {key: round(value) if key == "jpeg_quality" else value for key, value in numbers.items()}
+    if sensor is not None:
+        overrides |= sensor.numbers
     return FrameRequest(
         preset,
         _exposure(sample, frames),

@@ -15,6 +15,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.exposures.expected import ExpectedRegion, expected_of_light
 from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, pair_draws, search_boxes
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
+from phibench.datasets.frames.sensor_file import SensorFile
 from phibench.datasets.frames.source import FrameSource, Side
 from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.store import schema
@@ -113,6 +114,7 @@ def dataset_pairs(
     pairs: int | None = None,
     hints: bool = True,
     boxes_px: int | None = None,
+    sensor: SensorFile | None = None,
 ) -> DatasetPairs:
     """Pairs of a data set in random order.
 
@@ -129,13 +131,15 @@ def dataset_pairs(
         Show the boxes of pairs that have some.
     boxes_px : int, optional
         Side of a box for every pair, instead of those of the recipe's `[frames]`.
+    sensor : SensorFile, optional
+        Numbers of a measured camera, which go before the recipe's and the preset's.
 
     Raises
     ------
     DatasetError
         If neither recipe nor caller names a preset, or a number is out of its range.
     """
-    chosen = pair_draws(dataset, preset, draws)
+    chosen = pair_draws(dataset, preset, draws, sensor)
     if pairs is not None and pairs < 1:
         raise DatasetError(f"pairs = {pairs}: must be 1 or above")
     if boxes_px is not None:

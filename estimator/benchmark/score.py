@@ -18,6 +18,7 @@ import polars as pl
 from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.sensor_file import read_sensor_file
 from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import Dataset, open_finished
 from phibench.datasets.store.files import require_writable
@@ -209,6 +210,7 @@ def score(
     hints: bool = True,
     calibration: str | Path | None = None,
     boxes_px: int | None = None,
+    sensor: str | Path | None = None,
     limits: RunLimits | None = None,
     workers: int = 1,
     seed: int = 0,
@@ -225,7 +227,7 @@ def score(
         in this process: no limits, and it can be stopped with a debugger.
     preset : str, optional
         Preset of the sensor; by default those of the recipe's `[frames]`.
-    draws, pairs, hints, calibration, boxes_px
+    draws, pairs, hints, calibration, boxes_px, sensor
         As for `wanted_pairs`.
     limits : RunLimits, optional
         Of time and memory; not for a function.
@@ -254,7 +256,7 @@ def score(
     opened = dataset if isinstance(dataset, Dataset) else open_finished(dataset)
     if out is not None:
         require_writable(Path(out))
-    chosen = wanted_pairs(opened, preset, draws, pairs, hints, calibration, boxes_px)
+    chosen = wanted_pairs(opened, preset, draws, pairs, hints, calibration, boxes_px, sensor)
     if isinstance(method, str):
         (scored,) = run_and_score([method], chosen, workers, console, "pairs", seed, limits)
     else:
@@ -375,18 +377,23 @@ def wanted_pairs(
     hints: bool = True,
     calibration: str | Path | None = None,
     boxes_px: int | None = None,
+    sensor: str | Path | None = None,
 ) -> PairSet:
     """Pairs as of `dataset_pairs`; with a calibration file its rig's, with calibrated rig, stroke and covariance.
+
+    `sensor` is a sensor file.
 
     Raises
     ------
     DatasetError
         As `dataset_pairs`, or if the calibration cannot be read or is that of another rig.
     """
+    camera = None if sensor is None else read_sensor_file(sensor)
     if calibration is None:
-        return dataset_pairs(dataset, preset, draws, pairs, hints, boxes_px)
+        return dataset_pairs(dataset, preset, draws, pairs, hints, boxes_px, camera)
     read = read_calibration(calibration)
-    return CalibratedPairs(dataset_pairs(of_calibration(dataset, read), preset, draws, pairs, hints, boxes_px), read)
+    of_rig = of_calibration(dataset, read)
+    return CalibratedPairs(dataset_pairs(of_rig, preset, draws, pairs, hints, boxes_px, camera), read)
 
 
 def refusal(method: BuiltIn, pairs: PairSet) -> str:

@@ -147,7 +147,8 @@ def show(directory: Path, *, out: Path | None = None) -> int:
 def frames(
     directory: Path,
     *,
-    preset: str = DEFAULT_PRESET,
+    preset: str | None = None,
+    sensor: Path | None = None,
     draws: Whole = 1,
     out: Path | None = None,
     sample: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
@@ -165,7 +166,10 @@ def frames(
         Folder of a data set.
     preset
         Where the chain ends: "ideal" (EXR, expected electrons), "mono-raw", "bayer-raw" (PNG of 16 bits that holds
-        10-bit DN, not scaled), "srgb8" (PNG) or "mjpeg" (the camera's JPEG; PNG with --region).
+        10-bit DN, not scaled), "srgb8" (PNG) or "mjpeg" (the camera's JPEG; PNG with --region). By default
+        that of --sensor, or "mjpeg".
+    sensor
+        Sensor file of `phibench sensor fit`: its numbers stand for the preset's.
     draws
         Draws of every image.
     out
@@ -185,9 +189,13 @@ def frames(
     """
     from phibench.datasets.exposures.draw import draw_frames
     from phibench.datasets.frames.request import FrameRequest, default_exposure, exposure_of
+    from phibench.datasets.frames.sensor_file import read_sensor_file
 
+    file = None if sensor is None else read_sensor_file(sensor)
+    preset = preset or (DEFAULT_PRESET if file is None else file.preset)
     seconds = default_exposure(preset) if exposure is None else exposure_of(exposure)
-    request = FrameRequest(preset, seconds, region=region, camera_seed=camera_seed)
+    numbers = {} if file is None else dict(file.numbers)
+    request = FrameRequest(preset, seconds, region=region, camera_seed=camera_seed, overrides=numbers)
     done = draw_frames(directory, request, draws, out=out, samples=sample or None, laser_off=laser_off, workers=workers)
     for note in done.notes:
         print(f"note: {note}")

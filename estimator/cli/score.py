@@ -66,6 +66,7 @@ def score(
     bootstrap_seed: Whole = 0,
     workers: Whole = 1,
     calibration: Path | None = None,
+    sensor: Path | None = None,
     limits: Limits = LIMITS,
     out: Path | None = None,
     output: Output = _TABLES,
@@ -94,6 +95,8 @@ def score(
         Pairs that are worked on at a time.
     calibration
         File of `phibench calibrate`: its rig's samples, with the calibrated rig, stroke and covariance.
+    sensor
+        Sensor file of `phibench sensor fit`: its numbers stand for the recipe's and the preset's.
     out
         JSON file for the score, records beside it as Parquet; with several methods their names are added to it.
     """
@@ -115,7 +118,7 @@ def score(
     files = _files(out, [MethodCard.of(name, **resolve(name).document()) for name in method])
     for target in filter(None, files):
         require_writable(target)
-    pair_set = wanted_pairs(open_finished(directory), preset, draws, pairs, hints, calibration, boxes)
+    pair_set = wanted_pairs(open_finished(directory), preset, draws, pairs, hints, calibration, boxes, sensor)
     scored = run_and_score(method, pair_set, workers, progress_console(), "pairs", _seed(bootstrap_seed), run_limits)
     scored = [one if file is None else saved(one, file) for one, file in zip(scored, files, strict=True)]
     print_scores(scored, form, rank, output.wide, calibration is not None)
