@@ -305,7 +305,7 @@ class Sample:
 
         Parameters
         ----------
-        preset : "ideal", "mono-raw", "bayer-raw", "srgb8" or "mjpeg"
+        preset : "ideal", "mono-raw", "bayer-raw", "srgb8", "yuyv" or "mjpeg"
         draw : int, 0 or above
         laser_off : bool
             Also `frames.down_off` and `frames.up_off`.

@@ -57,7 +57,7 @@ def steps(source: FrameSource) -> list[tuple[str, Picture]]:
     inner = (..., *region.slices(box))
     whole = chain.jpeg_region(region, size)
     eight = chain.developed(light, stream, whole)
-    jpeg = compressed(eight, s.jpeg_quality, s.jpeg_subsampling)[region.slices(whole)]
+    jpeg = compressed(eight, s)[region.slices(whole)]
     full_e = (s.top_dn - s.black_level_dn) / s.dn_per_e
     return [
         ("spot layer, 1/60 s", shown(spot_alone / full_e)),

@@ -33,6 +33,7 @@ VALUES = {
     "electrons": "expected electrons in one exposure behind R, G, B, float32",
     "raw": "DN of the converter, not scaled, in 16 bits; RGGB by the pixel's place on the sensor",
     "srgb8": "sRGB, 8 bits",
+    "yuyv": "Y' and, in turns, Cb (even columns of the sensor) and Cr, 8 bits, the bytes of a YUYV buffer",
     "mjpeg": "sRGB, 8 bits, as the camera sends it",
 }
 PREVIEW = "sRGB, 8 bits, for people; not the camera's"
@@ -47,7 +48,7 @@ def suffix(sensor: Sensor, whole: bool) -> str:
 
 def has_preview(sensor: Sensor) -> bool:
     """True if a picture for people is wanted, because the frame itself is dark or unreadable to a viewer."""
-    return sensor.output in ("electrons", "raw")
+    return sensor.output in ("electrons", "raw", "yuyv")
 
 
 def write_frame(path: Path, frame: Frame, names: tuple[str, int, str]) -> Path:
@@ -67,15 +68,21 @@ def write_preview(path: Path, frame: Frame) -> Path:
 
 
 def png_bytes(image: NDArray[Any]) -> bytes:
-    """PNG of an image, shape (h, w) of 16 bits or (h, w, 3) of 8 bits."""
+    """PNG of an image, shape (h, w) of 16 bits, (h, w, 2) or (h, w, 3) of 8; two planes are grey and opacity."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="PNG", compress_level=6)
     return buffer.getvalue()
 
 
 def preview(frame: Frame) -> NDArray[np.uint8]:
-    """Picture of a frame of electrons or DN as the preset's processing would show it, shape (h, w, 3)."""
+    """Picture of a frame of electrons, DN or Y'CbCr as the preset's processing would show it, shape (h, w, 3)."""
     sensor = frame.sensor
+    if sensor.output == "yuyv":
+        first, width = frame.region.u0_px % 2, frame.image.shape[1]
+        # reflection gives a pair that the crop divides the chroma of the pair beside
+        whole = [(0, 0), (first, (first + width) % 2), (0, 0)]
+        padded = np.pad(frame.image, whole, mode="reflect" if width > 1 else "edge")
+        return processing.rgb_from_yuyv(padded, sensor)[:, first : first + width]
     if sensor.output == "raw":
         # interpolation starts at a red pixel and needs two rows and columns: reflection keeps the filters' order
         before = frame.region.v0_px % 2, frame.region.u0_px % 2

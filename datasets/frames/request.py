@@ -18,7 +18,7 @@ from phibench.render.sensor.light import Region
 from phibench.render.sensor.settings import Sensor, SensorError, sensor
 
 Exposure = float | Literal["auto"] | None
-AUTO_EXPOSED = ("srgb8", "mjpeg")
+AUTO_EXPOSED = ("srgb8", "yuyv", "mjpeg")
 """Presets that deliver what the camera has processed: exposed as it would, unless an exposure is given."""
 
 _RANGES = {"lamp_level": (0.0, 1e6), "laser_level": (0.0, 1e6), "carriage_speed_m_s": (-1e3, 1e3)}
@@ -31,7 +31,7 @@ class FrameRequest:
     Parameters
     ----------
     preset : str
-        Sensor preset: "ideal", "mono-raw", "bayer-raw", "srgb8" or "mjpeg".
+        Sensor preset: "ideal", "mono-raw", "bayer-raw", "srgb8", "yuyv" or "mjpeg".
     exposure : float, "auto" or None
         Seconds; "auto" is the camera's auto exposure, for each position by itself; None is the preset's time.
         `FrameRequest.of` and the command line choose it where none is given: `default_exposure`.

@@ -27,17 +27,29 @@ class SensorCard:
     black_level_dn : float
     top_dn : int
         Largest code.
-    output : "electrons", "raw", "srgb8" or "mjpeg"
+    output : "electrons", "raw", "srgb8", "yuyv" or "mjpeg"
         Stage after which the chain ends.
     white_balance : 3 floats
         Gains of R, G, B on linear planes.
     colour_matrix : 3 x 3
         Rows give linear sRGB from white-balanced R, G, B.
     sharpen_amount : float
-        Gain of the unsharp mask x + amount (x - blur x), blur (1 2 1)/4 along both axes, after the sRGB curve.
+        Gain of the unsharp mask x + amount (x - blur x), blur (1 2 1)/4 along both axes, after the tone curve.
     jpeg_quality : int
         libjpeg's quality.
     jpeg_subsampling : "4:4:4", "4:2:2" or "4:2:0"
+    jpeg_qtables : two tables of 64 steps, row by row, or None
+        Of luma and chroma, in place of the quality.
+    transfer_function : "srgb", "rec709" or "table"
+        Tone curve from linear to encoded R, G, B.
+    transfer_points : pairs (linear, encoded), or None
+        Of "table"; straight lines join them.
+    denoise_luma, denoise_chroma : float
+        Share d of the blur in x + d (blur x - x), on Y' and on Cb, Cr, after the unsharp mask.
+    ycbcr_range : "full" or "limited"
+        Of "yuyv", BT.601: Y' on 0 to 255, or on 16 to 235.
+    chroma_taps : 3 floats
+        Of "yuyv": weights of columns 2k - 1, 2k and 2k + 1 in chroma sample k.
     """
 
     name: str
@@ -53,12 +65,19 @@ class SensorCard:
     dn_per_e: float
     black_level_dn: float
     top_dn: int
-    output: Literal["electrons", "raw", "srgb8", "mjpeg"]
+    output: Literal["electrons", "raw", "srgb8", "yuyv", "mjpeg"]
     white_balance: tuple[float, float, float]
     colour_matrix: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
     sharpen_amount: float
     jpeg_quality: int
     jpeg_subsampling: Literal["4:4:4", "4:2:2", "4:2:0"]
+    jpeg_qtables: tuple[tuple[int, ...], tuple[int, ...]] | None = None
+    transfer_function: Literal["srgb", "rec709", "table"] = "srgb"
+    transfer_points: tuple[tuple[float, float], ...] | None = None
+    denoise_luma: float = 0.0
+    denoise_chroma: float = 0.0
+    ycbcr_range: Literal["full", "limited"] = "full"
+    chroma_taps: tuple[float, float, float] = (0.25, 0.5, 0.25)
 
     @property
     def saturation_e(self) -> float:

@@ -39,7 +39,7 @@ class Frame:
     ----------
     image : array
         By `sensor.output`: "electrons" (3, h, w) float64, expected electrons behind R, G, B; "raw" (h, w) uint16, DN;
-        "srgb8" and "mjpeg" (h, w, 3) uint8.
+        "srgb8" and "mjpeg" (h, w, 3) uint8; "yuyv" (h, w, 2) uint8, Y' and in turns Cb and Cr.
     jpeg : bytes or None
         The file that the camera sends; None for a region and for other outputs than "mjpeg".
     position : "down" or "up"

@@ -54,7 +54,7 @@ FORMAT = "phibench submission 1"
 SINGLE_PAIRS = 4
 """Version of the task from which on a sealed set shows each sample once."""
 Matrix = Annotated[tuple[Vector2, Vector2], Field(strict=False)]
-_MODES = ("RGB", "I;16", "L")  # of PNG and JPEG as `phibench seal make` writes them
+_MODES = ("RGB", "I;16", "L", "LA")  # of PNG and JPEG as `phibench seal make` writes them
 
 
 # -- pairs ---------------------------------------------------------------------------------------------------------

@@ -33,6 +33,7 @@ from phibench.render.sensor.electrons import (
 from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.noise_tiles import NoiseStream, whole_tiles
 from phibench.render.sensor.processing import (
+    LUMA,
     MCU_PX,
     colour_corrected,
     compressed,
@@ -41,10 +42,11 @@ from phibench.render.sensor.processing import (
     linear_rgb,
     linear_signal,
     rendered,
+    tone_encoded,
     white_balanced,
+    yuyv,
 )
 from phibench.render.sensor.settings import Sensor, SensorError
-from phibench.render.sensor.srgb import srgb_encoded
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
 
@@ -81,12 +83,12 @@ class Chain:
         -------
         array
             By `sensor.output`: "electrons" (3, h, w) float64, expected; "raw" (h, w) uint16 DN; "srgb8" and "mjpeg"
-            (h, w, 3) uint8.
+            (h, w, 3) uint8, R, G, B; "yuyv" (h, w, 2) uint8, Y' and in turns Cb (even columns of the image) and Cr.
 
         Raises
         ------
         SensorError
-            If the region is not inside the image.
+            If the region is not inside the image, or the image of "yuyv" has an odd number of columns.
         """
         region = (region or Region.whole(light.size)).within(light.size)
         if self.sensor.output == "electrons":
@@ -94,16 +96,15 @@ class Chain:
             return expected_electrons(light, self.sensor, self.camera, region, gain)
         if self.sensor.output == "raw":
             return self.raw(light, stream, region)
-        if self.sensor.output == "srgb8":
+        if self.sensor.output in ("srgb8", "yuyv"):
             return self.developed(light, stream, region)
         box = self.jpeg_region(region, light.size)
-        image = self.developed(light, stream, box)
-        return compressed(image, self.sensor.jpeg_quality, self.sensor.jpeg_subsampling)[region.slices(box)]
+        return compressed(self.developed(light, stream, box), self.sensor)[region.slices(box)]
 
     def jpeg_bytes(self, light: Light, stream: NoiseStream) -> bytes:
         """Return the whole frame as the camera sends it, one JPEG file."""
         image = self.developed(light, stream, Region.whole(light.size))
-        return encoded(image, self.sensor.jpeg_quality, self.sensor.jpeg_subsampling)
+        return encoded(image, self.sensor)
 
     def raw(self, light: Light, stream: NoiseStream, region: Region) -> NDArray[np.uint16]:
         """Return the converter's DN, shape (h, w)."""
@@ -114,10 +115,15 @@ class Chain:
         return digitised(read_out(charge, self.sensor, pattern, stream, tiles), self.sensor)[region.slices(tiles)]
 
     def developed(self, light: Light, stream: NoiseStream, region: Region) -> NDArray[np.uint8]:
-        """Return the processed image before JPEG, shape (h, w, 3)."""
+        """Return the processed image before JPEG, shape (h, w, 3), or (h, w, 2) of "yuyv"."""
         box = self.raw_region(region, light.size)
         signal = linear_signal(self.raw(light, stream, box), self.sensor, np.float32)
-        return eight_bit(rendered(linear_rgb(signal, self.sensor), self.sensor))[region.slices(box)]
+        planes = rendered(linear_rgb(signal, self.sensor), self.sensor)
+        if self.sensor.output != "yuyv":
+            return eight_bit(planes)[region.slices(box)]
+        if light.size[1] % 2:
+            raise SensorError(f"image of {light.size[1]} columns: YUYV holds pairs of them, give an even number")
+        return yuyv(planes, self.sensor)[region.slices(box)]
 
     def photo_electrons(self, light: Light, region: Region, gain: float = 1.0) -> Array:
         """Expected photo-electrons of the pixels, shape (h, w), without the fixed pattern."""
@@ -133,8 +139,11 @@ class Chain:
 
     def raw_region(self, region: Region, size: tuple[int, int]) -> Region:
         """Pixels of the mosaic that the processed pixels of `region` depend on, red first."""
-        margin = 2 if self.sensor.sharpen_amount > 0.0 else 1
-        return region.grown(size, (2, 2), (margin, margin))
+        s = self.sensor
+        # demosaicing, unsharp mask, denoising, and the chroma's column to the left of a pair
+        margin = 1 + (s.sharpen_amount > 0.0) + (max(s.denoise_luma, s.denoise_chroma) > 0.0)
+        pair = 2 if s.output == "yuyv" else 0
+        return region.grown(size, (2, 2), (margin, margin + pair))
 
     def jpeg_region(self, region: Region, size: tuple[int, int]) -> Region:
         """Pixels that the JPEG's pixels of `region` depend on: whole units, and one more on each side."""
@@ -145,7 +154,6 @@ class Chain:
 # Auto exposure.
 
 
-LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601, the Y of JPEG
 _STEP_PX = 8  # every eighth row and column are enough for a mean
 
 
@@ -181,7 +189,7 @@ def mean_level(electrons: Array, sensor: Sensor) -> float:
     full_scale_e = (sensor.top_dn - sensor.black_level_dn) / sensor.gain_dn_per_e
     if sensor.mosaic == "mono":
         grey = np.minimum(mono(electrons, sensor.mono_weights) / full_scale_e, 1.0)
-        return 255.0 * float(srgb_encoded(grey).mean())
+        return 255.0 * float(tone_encoded(grey, sensor).mean())
     planes = np.minimum(electrons / full_scale_e, 1.0)
-    encoded = srgb_encoded(colour_corrected(white_balanced(planes, sensor.white_balance), sensor.colour_matrix))
-    return 255.0 * float(np.average(encoded.mean(axis=(1, 2)), weights=LUMA))
+    linear = colour_corrected(white_balanced(planes, sensor.white_balance), sensor.colour_matrix)
+    return 255.0 * float(np.average(tone_encoded(linear, sensor).mean(axis=(1, 2)), weights=LUMA))

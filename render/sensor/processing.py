@@ -1,10 +1,10 @@
-"""Image processing of the camera, from DN to 8 bits and JPEG: pure functions on stacks of images. NumPy and Pillow.
+"""Image processing of the camera, from DN to 8 bits, Y'CbCr 4:2:2 or JPEG: pure functions on stacks of images.
 
 Planes R, G, B stand in the third axis from the end, shape (..., 3, H, W); the 8-bit image has them last. Every function
 takes any number of leading axes and keeps float32, so that a fit can send many model images through at once. Pixels
 beyond the border are mirrored about the border pixel, which keeps the order of the mosaic's colours.
 
-The simulator's only demosaicing and JPEG are here; the estimator has its own, in `spots/image_planes`.
+The simulator's only demosaicing, Y'CbCr and JPEG are here; the estimator has its own. NumPy and Pillow.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from phibench.render.sensor.settings import Sensor
 from phibench.render.sensor.srgb import srgb_decoded, srgb_encoded
 from phibench.scenes.frames import Array
 
+LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601, the Y' of YUYV and of JPEG
 Matrix = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -76,12 +77,53 @@ def sharpened(planes: Array, amount: float) -> Array:
     """Unsharp mask x + amount (x - blur x), blur (1 2 1)/4 along both axes."""
     if amount == 0.0:
         return planes
+    return planes + planes.dtype.type(amount) * (planes - _blurred(planes))
+
+
+def denoised(planes: Array, luma: float, chroma: float) -> Array:
+    """R, G, B whose Y', and Cb and Cr, are x + share (blur x - x), each with its own share; blur as in `sharpened`."""
+    if luma == chroma == 0.0:
+        return planes
+    of = planes.dtype.type
+    change = _blurred(planes) - planes
+    r, g, b = (change[..., i, :, :] for i in range(3))
+    y = of(LUMA[0]) * r + of(LUMA[1]) * g + of(LUMA[2]) * b
+    # colour differences from Y' have the share of chroma, and Y' its own
+    return planes + of(chroma) * change + of(luma - chroma) * y[..., None, :, :]
+
+
+def _blurred(planes: Array) -> Array:
     *lead, _, _ = planes.shape
     p = np.pad(planes, [(0, 0)] * len(lead) + [(1, 1), (1, 1)], mode="reflect")
     quarter, two = planes.dtype.type(0.25), planes.dtype.type(2.0)
     down = (p[..., :-2, :] + two * p[..., 1:-1, :] + p[..., 2:, :]) * quarter
-    blurred = (down[..., :-2] + two * down[..., 1:-1] + down[..., 2:]) * quarter
-    return planes + planes.dtype.type(amount) * (planes - blurred)
+    return (down[..., :-2] + two * down[..., 1:-1] + down[..., 2:]) * quarter
+
+
+# Tone curves: linear light to encoded R, G, B, both cut to [0, 1].
+
+
+_ALPHA, _BETA = 1.09929682680944, 0.018053968510807  # ITU-R BT.709 with the digits of BT.2020, where the pieces meet
+
+
+def tone_encoded(linear: Array, sensor: Sensor) -> Array:
+    """Encoded values of linear light by the sensor's transfer function."""
+    if sensor.transfer_function == "srgb":
+        return srgb_encoded(linear)
+    x = np.clip(linear, 0.0, 1.0)
+    of = x.dtype.type
+    if sensor.transfer_points is not None:
+        return np.interp(x, *np.transpose(sensor.transfer_points)).astype(x.dtype)
+    return np.where(x < _BETA, of(4.5) * x, of(_ALPHA) * np.power(x, of(0.45)) - of(_ALPHA - 1.0))
+
+
+def tone_decoded(encoded: Array, sensor: Sensor) -> Array:
+    """Linear light of encoded values."""
+    if sensor.transfer_function == "srgb":
+        return srgb_decoded(encoded)
+    if sensor.transfer_points is not None:
+        return np.interp(encoded, *np.transpose(sensor.transfer_points)[::-1])
+    return np.where(encoded < 4.5 * _BETA, encoded / 4.5, ((encoded + _ALPHA - 1.0) / _ALPHA) ** (1.0 / 0.45))
 
 
 def eight_bit(planes: Array) -> NDArray[np.uint8]:
@@ -101,14 +143,15 @@ def linear_rgb(signal: Array, sensor: Sensor) -> Array:
 
 
 def rendered(linear: Array, sensor: Sensor) -> Array:
-    """sRGB curve and sharpening: planes, shape (..., 3, H, W), before they are rounded to 8 bits."""
-    return sharpened(srgb_encoded(linear), sensor.sharpen_amount)
+    """Tone curve, sharpening and denoising: planes, shape (..., 3, H, W), before they are rounded to 8 bits."""
+    sharp = sharpened(tone_encoded(linear, sensor), sensor.sharpen_amount)
+    return denoised(sharp, sensor.denoise_luma, sensor.denoise_chroma)
 
 
 def electrons_from_srgb(image: NDArray[np.uint8], sensor: Sensor) -> Array:
     """Electrons behind R, G, B, shape (..., 3, H, W): the inverse for flat, unclipped, unsharpened light."""
     encoded = np.moveaxis(image, -1, -3) / 255.0
-    balanced = colour_corrected(srgb_decoded(encoded), _inverse(sensor.colour_matrix))
+    balanced = colour_corrected(tone_decoded(encoded, sensor), _inverse(sensor.colour_matrix))
     gains = sensor.white_balance
     full_scale_e = (sensor.top_dn - sensor.black_level_dn) / sensor.dn_per_e
     return white_balanced(balanced, (1.0 / gains[0], 1.0 / gains[1], 1.0 / gains[2])) * full_scale_e
@@ -116,6 +159,44 @@ def electrons_from_srgb(image: NDArray[np.uint8], sensor: Sensor) -> Array:
 
 def _inverse(matrix: Matrix) -> Matrix:
     return matrix if matrix == IDENTITY else tuple(map(tuple, np.linalg.inv(matrix)))  # type: ignore[return-value]
+
+
+# Y'CbCr 4:2:2, ITU-R BT.601, 8 bits.
+
+
+_CODES = {"full": (0.0, 255.0, 255.0, 0, 255), "limited": (16.0, 219.0, 224.0, 1, 254)}
+"""Y' of black, codes from black to white, codes of the whole Cb or Cr axis, least and largest code."""
+
+
+def yuyv(planes: Array, sensor: Sensor) -> NDArray[np.uint8]:
+    """Bytes of an image, shape (..., H, W, 2), of planes R, G, B in [0, 1]; the first column must be even.
+
+    The first of each pixel's bytes is its Y'. The second is Cb at even columns and Cr at odd ones, both of chroma
+    sample k = column // 2. It is a sensor's YUYV buffer, and what OpenCV delivers with CAP_PROP_CONVERT_RGB off.
+    """
+    black, luma, chroma, least, most = _CODES[sensor.ycbcr_range]
+    of = planes.dtype.type
+    r, g, b = (planes[..., i, :, :] for i in range(3))
+    y = of(LUMA[0]) * r + of(LUMA[1]) * g + of(LUMA[2]) * b
+    width = y.shape[-1]
+    second = np.empty_like(y)
+    for first, plane, weight in ((0, b, LUMA[2]), (1, r, LUMA[0])):
+        difference = np.pad(plane - y, [(0, 0)] * (y.ndim - 1) + [(1, 1)], mode="reflect")
+        left, middle, right = (of(tap) * difference[..., k : k + width : 2] for k, tap in enumerate(sensor.chroma_taps))
+        samples = (left + middle + right) * of(0.5 * chroma / (1.0 - weight)) + of(128.0)
+        second[..., first::2] = samples[..., : second[..., first::2].shape[-1]]
+    codes = np.stack([y * of(luma) + of(black), second], axis=-1)
+    return np.clip(np.rint(codes), least, most).astype(np.uint8)
+
+
+def rgb_from_yuyv(image: NDArray[np.uint8], sensor: Sensor) -> NDArray[np.uint8]:
+    """Picture, shape (..., H, W, 3), W even, of bytes as `yuyv` gives them; both pixels of a pair get its chroma."""
+    black, luma, chroma, _, _ = _CODES[sensor.ycbcr_range]
+    y = (image[..., 0] - black) / luma
+    cb, cr = (np.repeat(image[..., k::2, 1], 2, axis=-1) for k in (0, 1))
+    blue, red = ((c - 128.0) * 2.0 * (1.0 - weight) / chroma + y for c, weight in ((cb, LUMA[2]), (cr, LUMA[0])))
+    green = (y - LUMA[0] * red - LUMA[2] * blue) / LUMA[1]
+    return eight_bit(np.stack([red, green, blue], axis=-3))
 
 
 # JPEG: Pillow (libjpeg-turbo), and the grid on which it works.
@@ -128,10 +209,18 @@ A decoded pixel depends on its own unit and, where chroma is interpolated betwee
 """
 
 
-def encoded(image: NDArray[np.uint8], quality: int, subsampling: str) -> bytes:
-    """JPEG file of an image, shape (H, W, 3)."""
-    file = io.BytesIO()
-    Image.fromarray(image).save(file, "JPEG", quality=quality, subsampling=subsampling)
+def encoded(image: NDArray[np.uint8], sensor: Sensor) -> bytes:
+    """JPEG file of an image, shape (H, W, 3), with the sensor's tables, subsampling and restart markers."""
+    file, tables = io.BytesIO(), sensor.jpeg_qtables
+    # Pillow scales given tables by the quality in per cent: none is given with them
+    steps = {"quality": sensor.jpeg_quality} if tables is None else {"qtables": [list(table) for table in tables]}
+    Image.fromarray(image).save(
+        file,
+        "JPEG",
+        subsampling=sensor.jpeg_subsampling,
+        restart_marker_blocks=sensor.jpeg_restart_interval,
+        **steps,
+    )
     return file.getvalue()
 
 
@@ -141,7 +230,7 @@ def decoded(data: bytes) -> NDArray[np.uint8]:
         return np.asarray(image.convert("RGB"))
 
 
-def compressed(images: NDArray[np.uint8], quality: int, subsampling: str) -> NDArray[np.uint8]:
+def compressed(images: NDArray[np.uint8], sensor: Sensor) -> NDArray[np.uint8]:
     """Images, shape (..., H, W, 3), encoded and decoded again."""
     flat = images.reshape(-1, *images.shape[-3:])
-    return np.stack([decoded(encoded(image, quality, subsampling)) for image in flat]).reshape(images.shape)
+    return np.stack([decoded(encoded(image, sensor)) for image in flat]).reshape(images.shape)

@@ -3,11 +3,13 @@
 Terms of EMVA 1288. The layers are photo-electrons: the quantum efficiency comes before them (`scenes/camera.py`), and a
 photon count cannot be told from here. K = `gain_dn_per_e` x `analogue_gain` is the overall system gain in DN/e-. The
 dark signal is `black_level_dn` + K x (dark electrons + DSNU). PRNU is a spread of the responsivity from pixel to pixel:
-it multiplies the mean of the photo-electrons, before the Poisson draw.
+it multiplies the mean of the photo-electrons, before the Poisson draw. Y'CbCr is that of ITU-R BT.601; ranges and
+transfer functions have the names that V4L2 gives them.
 """
 
 from __future__ import annotations
 
+import itertools
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,6 +19,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from phibench.scenes.validation import nearest, structural_faults
 
 PRESETS_FILE = Path(__file__).with_name("settings_presets.toml")
+_UNIT_SUM = 1e-6  # of weights that were written with six digits
 
 
 class SensorError(ValueError):
@@ -33,6 +36,13 @@ Weights = Annotated[tuple[Weight, Weight, Weight], BeforeValidator(_tuples)]
 Coefficient = Annotated[float, Field(ge=-100.0, le=100.0)]
 Row = tuple[Coefficient, Coefficient, Coefficient]
 Matrix = Annotated[tuple[Row, Row, Row], BeforeValidator(_tuples)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Taps = Annotated[tuple[Share, Share, Share], BeforeValidator(_tuples)]
+Points = Annotated[
+    tuple[tuple[Share, Share], ...], BeforeValidator(_tuples), Field(min_length=2, max_length=1024)
+]  # rising in both columns
+Table = Annotated[tuple[int, ...], Field(min_length=64, max_length=64)]
+Tables = Annotated[tuple[Table, Table], BeforeValidator(_tuples)]
 
 
 class Sensor(BaseModel):
@@ -44,7 +54,9 @@ class Sensor(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: str = Field(description="name of the preset")
-    output: Literal["electrons", "raw", "srgb8", "mjpeg"] = Field(description="stage after which the chain ends")
+    output: Literal["electrons", "raw", "srgb8", "yuyv", "mjpeg"] = Field(
+        description="stage after which the chain ends"
+    )
     mosaic: Literal["bayer", "mono"] = Field(description="RGGB colour filters, or none")
     mono_weights: Weights = Field(description="weight of the planes R, G, B in a pixel without filter")
     exposure_s: float = Field(gt=0.0, le=10.0, description="exposure time, seconds")
@@ -68,9 +80,21 @@ class Sensor(BaseModel):
     black_level_dn: float = Field(ge=0.0, le=65535.0, description="DN of a pixel without electrons")
     white_balance: Weights = Field(description="gains of R, G, B")
     colour_matrix: Matrix = Field(description="rows give linear sRGB from white-balanced R, G, B")
+    transfer_function: Literal["srgb", "rec709", "table"] = Field(description="tone curve: linear to encoded R, G, B")
+    transfer_points: Points | None = Field(
+        default=None, description="with 'table': (linear, encoded) pairs that straight lines join"
+    )
     sharpen_amount: float = Field(ge=0.0, le=4.0, description="gain of the unsharp mask")
+    denoise_luma: float = Field(ge=0.0, le=1.0, description="share of the 3 x 3 binomial blur in Y'")
+    denoise_chroma: float = Field(ge=0.0, le=1.0, description="share of the 3 x 3 binomial blur in Cb and Cr")
+    ycbcr_range: Literal["full", "limited"] = Field(description="quantisation range of the output 'yuyv'")
+    chroma_taps: Taps = Field(description="weights of columns 2k - 1, 2k, 2k + 1 in chroma sample k of 'yuyv'")
     jpeg_quality: int = Field(ge=1, le=100, description="libjpeg's quality")
+    jpeg_qtables: Tables | None = Field(
+        default=None, description="luma's and chroma's 64 steps row by row, in place of jpeg_quality"
+    )
     jpeg_subsampling: Literal["4:4:4", "4:2:2", "4:2:0"] = Field(description="chroma of the JPEG")
+    jpeg_restart_interval: int = Field(ge=0, le=65535, description="units between restart markers; 0 is none")
     readout_s: float = Field(ge=0.0, le=1.0, description="rolling shutter, first row to last; 0 is a global shutter")
     auto_exposure_level: float = Field(gt=0.0, lt=255.0, description="mean 8-bit luma that auto exposure aims at")
     exposure_min_s: float = Field(gt=0.0, le=10.0, description="shortest automatic exposure")
@@ -142,6 +166,27 @@ def _faults(s: Sensor) -> list[str]:
             f"full_well_e = {s.full_well_e:g} gives {s.full_well_e * s.dn_per_e:.4g} DN, not above black_level_dn = "
             f"{s.black_level_dn:g}: raise full_well_e or gain_dn_per_e"
         )
+    faults += _transfer_faults(s)
+    if bad := [step for table in s.jpeg_qtables or () for step in table if not 1 <= step <= 255]:
+        faults.append(f"jpeg_qtables hold {bad[0]}: steps must be whole numbers from 1 to 255")
+    if abs(sum(s.chroma_taps) - 1.0) > _UNIT_SUM:
+        faults.append(f"chroma_taps = {s.chroma_taps}: must add up to 1, not {sum(s.chroma_taps):g}")
     if s.exposure_min_s > s.exposure_max_s:
         faults.append(f"exposure_min_s = {s.exposure_min_s:g}: must not be above exposure_max_s = {s.exposure_max_s:g}")
     return faults
+
+
+def _transfer_faults(s: Sensor) -> list[str]:
+    """Faults of a measured transfer function."""
+    points = s.transfer_points
+    if points is None:
+        missing = "transfer_function = 'table': give the measured curve, transfer_points = [[linear, encoded], ...]"
+        return [missing] if s.transfer_function == "table" else []
+    if s.transfer_function != "table":
+        return [f"transfer_points: only for transfer_function = 'table', not '{s.transfer_function}'"]
+    if (points[0][0], points[-1]) != (0.0, (1.0, 1.0)):
+        return [f"transfer_points go from {points[0]} to {points[-1]}: must go from [0, y] to [1, 1]"]
+    for k, (one, two) in enumerate(itertools.pairwise(points)):
+        if not (two[0] > one[0] and two[1] > one[1]):
+            return [f"transfer_points {k + 1} and {k + 2}, {one} and {two}: both columns must rise from point to point"]
+    return []

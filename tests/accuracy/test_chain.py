@@ -21,7 +21,7 @@ from phibench.render.sensor.moments import drawn_moments
 from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import Sensor, sensor
 
-SRGB, MJPEG = sensor("srgb8"), sensor("mjpeg")
+SRGB, MJPEG = sensor("srgb8"), sensor("mjpeg", jpeg_quality=85)
 CELLS = [
     (SRGB, 0.7, 500.0, 0.0),
     (SRGB, 0.7, 2000.0, 100.0),

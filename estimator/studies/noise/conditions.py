@@ -37,13 +37,14 @@ from phibench.estimator.studies.image_cutout import (
     truth_of,
     without_off,
 )
-from phibench.render.sensor.settings import sensor
+from phibench.render.sensor.settings import Sensor, sensor
 from phibench.scenes.frames import as_vector
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.random_streams import Name, generator
 from phibench.scenes.rig import POSITIONS, Rig
 
 OFF = 0.0
+_QUALITY = 85  # of the base case's JPEG, which the study's figures were measured with
 BASE = "base"
 """Name of the factor of a cell in which nothing is changed."""
 Change = Callable[[str, Rig, float], tuple[Shot, Rig]]
@@ -69,33 +70,39 @@ class Factor:
     ranked: bool = True
 
 
+def _base(preset: str, **changes: float) -> Sensor:
+    """Sensor of the base case: the preset, with the study's JPEG quality."""
+    quality = {"jpeg_quality": _QUALITY} if preset == "mjpeg" else {}
+    return sensor(preset, **{**quality, **changes})
+
+
 def _sensor(key: str, whole: bool = False) -> Change:
-    return lambda preset, rig, x: (Shot(sensor(preset, **{key: round(x) if whole else x})), rig)
+    return lambda preset, rig, x: (Shot(_base(preset, **{key: round(x) if whole else x})), rig)
 
 
 def _power(preset: str, rig: Rig, power_mw: float) -> tuple[Shot, Rig]:
-    return Shot(sensor(preset), laser_level=power_mw), rig  # layers are rendered for 1 mW
+    return Shot(_base(preset), laser_level=power_mw), rig  # layers are rendered for 1 mW
 
 
 def _bits(preset: str, rig: Rig, bits: float) -> tuple[Shot, Rig]:
     """Another converter over the same range: gain and black level follow the codes."""
-    plain = sensor(preset)
+    plain = _base(preset)
     scale = 2.0 ** (round(bits) - plain.adc_bits)
     changes = {"gain_dn_per_e": plain.gain_dn_per_e * scale, "black_level_dn": plain.black_level_dn * scale}
-    return Shot(sensor(preset, adc_bits=round(bits), **changes)), rig
+    return Shot(_base(preset, adc_bits=round(bits), **changes)), rig
 
 
 def _speckle(preset: str, rig: Rig, contrast: float) -> tuple[Shot, Rig]:
     # M independent speckle patterns have the contrast 1 / sqrt(M); without speckle there is no M
-    return Shot(sensor(preset) if contrast == OFF else sensor(preset, speckle_m=contrast**-2)), rig
+    return Shot(_base(preset) if contrast == OFF else _base(preset, speckle_m=contrast**-2)), rig
 
 
 def _blur(preset: str, rig: Rig, sigma_px: float) -> tuple[Shot, Rig]:
-    return Shot(sensor(preset)), replace(rig, camera=replace(rig.camera, blur_sigma_px=sigma_px))
+    return Shot(_base(preset)), replace(rig, camera=replace(rig.camera, blur_sigma_px=sigma_px))
 
 
 def _focus(preset: str, rig: Rig, distance_m: float) -> tuple[Shot, Rig]:
-    return Shot(sensor(preset)), replace(rig, camera=replace(rig.camera, focus_distance_m=distance_m))
+    return Shot(_base(preset)), replace(rig, camera=replace(rig.camera, focus_distance_m=distance_m))
 
 
 FACTORS: dict[str, Factor] = {
@@ -104,7 +111,7 @@ FACTORS: dict[str, Factor] = {
     "read_noise_e": Factor("read noise, e-", _sensor("read_noise_e"), 4.0),
     "blur_sigma_px": Factor("optical blur sigma, px", _blur, 0.7),
     "focus_distance_m": Factor("focus distance, m", _focus, 0.23, ranked=False),
-    "jpeg_quality": Factor("JPEG quality", _sensor("jpeg_quality", True), 85.0, ("mjpeg",)),
+    "jpeg_quality": Factor("JPEG quality", _sensor("jpeg_quality", True), float(_QUALITY), ("mjpeg",)),
     "adc_bits": Factor("converter, bits", _bits, 10.0),
     "speckle_contrast": Factor("speckle contrast of the flux", _speckle, OFF),
 }
@@ -120,7 +127,7 @@ def applied(factor: str, preset: str, rig: Rig, level: float) -> tuple[Shot, Rig
         If the level is not allowed.
     """
     if factor == BASE:
-        return Shot(sensor(preset)), rig
+        return Shot(_base(preset)), rig
     return FACTORS[factor].change(preset, rig, level)
 
 

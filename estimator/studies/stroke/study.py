@@ -41,6 +41,7 @@ AS_BUILT, CALIBRATED, EXACT = "as built", "calibrated by the outline", "pixels a
 _Depths = Annotated[tuple[Annotated[float, Field(ge=0.2, le=20.0)], ...], Field(strict=False, min_length=1)]
 _Preset = Literal["bayer-raw", "srgb8", "mjpeg"]
 _Range = Annotated[tuple[float, float], Field(strict=False)]
+_QUALITY = 85  # of the charts' JPEG, if their preset has one: that of the study's figures
 _FREE_STROKES_M = (0.1, 6.0)  # beyond every carriage: by geometry alone the best stroke is 1.2 to 2 D
 
 
@@ -72,7 +73,7 @@ class StrokeSettings(Settings):
 
 def run(settings: StrokeSettings, datasets: StudyDatasets) -> Result:
     """Run the study."""
-    rig, card = Rig(), sensor_card(settings.preset)
+    rig, card = Rig(), sensor_card(settings.preset, jpeg_quality=_QUALITY)
     around = Surroundings(heights_m=(settings.spot_height_m,))
     rigs, spot = tolerances(rig, settings.outline_sigma_um), spot_bound(rig, card)
     longest = _paper(settings)

@@ -52,7 +52,7 @@ RIG = Rig(camera=Camera(320, 180, 11.2, 357.5, 357.5, 159.5, 89.5))
 SIZE = (180, 320)
 STROKE_M = 0.5
 BAYER, MONO = sensor("bayer-raw"), sensor("mono-raw")
-SRGB, MJPEG = sensor("srgb8"), sensor("mjpeg")
+SRGB, MJPEG = sensor("srgb8"), sensor("mjpeg", jpeg_quality=85)
 POINT = (1.6, 1.2, 0.5)  # D = 2 m
 WHITE = np.array([1.0, 0.85, 0.42])
 Light2 = tuple[str, tuple[float, float], float, Array]  # image, (u, v), electrons behind red, colour

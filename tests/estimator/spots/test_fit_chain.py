@@ -28,7 +28,7 @@ from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.random_streams import generator
 
-SRGB, MJPEG = sensor("srgb8"), sensor("mjpeg")
+SRGB, MJPEG = sensor("srgb8"), sensor("mjpeg", jpeg_quality=85)
 FLUX_E = 5000.0 / COLLECTED
 
 

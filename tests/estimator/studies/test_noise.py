@@ -62,7 +62,7 @@ jpeg_quality = [50.0]
 
 
 def test_every_factor_changes_its_own_number_only() -> None:
-    rig, base = Rig(), sensor("mjpeg")
+    rig, base = Rig(), sensor("mjpeg", jpeg_quality=85)
     for name, factor in FACTORS.items():
         level = {"jpeg_quality": 40.0, "adc_bits": 12.0, "speckle_contrast": 0.5}.get(name, 2.0 * factor.base)
         shot, changed = applied(name, "mjpeg", rig, level)

@@ -95,11 +95,12 @@ def test_the_frame_is_what_pillow_reads_from_the_written_file(tmp_path: Path, su
 
 def test_a_stack_of_images_is_compressed_one_by_one() -> None:
     stack = np.stack([SMALL, 255 - SMALL]).reshape(2, 1, *SMALL.shape)
-    result = compressed(stack, 70, "4:2:2")
-    np.testing.assert_array_equal(result[1, 0], decoded(encoded(255 - SMALL, 70, "4:2:2")))
+    s = sensor("mjpeg", jpeg_quality=70)
+    result = compressed(stack, s)
+    np.testing.assert_array_equal(result[1, 0], decoded(encoded(255 - SMALL, s)))
     reference = io.BytesIO()
     Image.fromarray(SMALL).save(reference, "JPEG", quality=70, subsampling=1)
-    assert encoded(SMALL, 70, "4:2:2") == reference.getvalue()
+    assert encoded(SMALL, s) == reference.getvalue()
 
 
 @pytest.mark.parametrize("matrix", [processing.IDENTITY, MATRIX])

@@ -29,6 +29,12 @@ CHAINS = {name: Chain(sensor(name, **changes), 3, CAMERA) for name, changes in P
 CHAINS |= {name: Chain(sensor("mjpeg", **changes), 3, CAMERA) for name, changes in JPEGS.items()}
 CHAINS |= {"all on": Chain(sensor("mjpeg", jpeg_subsampling="4:2:0", sharpen_amount=0.5, **ALL_ON), 3, CAMERA)}
 CHAINS |= {"sharpened": Chain(sensor("srgb8", sharpen_amount=1.0, **ALL_ON), 3, CAMERA)}
+SMOOTH = {"denoise_luma": 0.3, "denoise_chroma": 0.8, "transfer_function": "rec709"}
+CHAINS |= {
+    "yuyv": Chain(sensor("yuyv"), 3, CAMERA),
+    "yuyv all on": Chain(sensor("yuyv", sharpen_amount=0.5, **SMOOTH, **ALL_ON), 3, CAMERA),
+    "denoised": Chain(sensor("mjpeg", jpeg_restart_interval=3, **SMOOTH), 3, CAMERA),
+}
 
 
 def regions(size: tuple[int, int]) -> Iterator[Region]:
@@ -48,6 +54,8 @@ def regions(size: tuple[int, int]) -> Iterator[Region]:
 
 def mismatches(chain: Chain, size: tuple[int, int], velocity: tuple[float, float] = (0.0, 0.0)) -> list[bool]:
     """For each region whether it differs from the whole frame."""
+    if chain.sensor.output == "yuyv":
+        size = size[0], size[1] // 2 * 2  # it has pairs of columns
     light = replace(room(size), velocity_px_per_s=velocity)
     whole = chain.frame(light, STREAM)
     assert whole.std() > 0
