@@ -3,7 +3,8 @@
 The radiance of a surface is albedo x irradiance / pi, plus what a lamp emits. The image is cut into cells
 (`subpixel_grid`). Every cell gets two independent samples, whose difference is the noise estimate. Where that noise is
 above the budget of `noise_budget`, the cells around are sampled again, more finely, until the budget is kept
-(`refinement`). The light map's own noise is the same in every view.
+(`refinement`). What lamps cover of these is computed (`LampOutlines`). The light map's own noise is the same in every
+view.
 
 Layers have the shape (3, H, W), planes R, G, B, expected electrons per second and pixel.
 """
@@ -19,7 +20,7 @@ from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.room.light_map import BakeSettings, LightMap, fixed_shapes, light_carriage
 from phibench.render.room.noise_budget import BUDGET
 from phibench.render.room.refinement import render_refined
-from phibench.render.room.shading import Look
+from phibench.render.room.shading import LampOutlines, Look
 from phibench.render.room.subpixel_grid import Crop, Film, FilmGrid, Stack
 from phibench.render.room.surfaces import Surfaces
 from phibench.render.room.texel_grid import TexelGrid
@@ -93,21 +94,37 @@ def render_ambient(
     surfaces : Surfaces, or None
         Of `view_surfaces`, if they are there already.
     """
-    mi = activate()
+    activate()
     import drjit as dr
 
     camera = view.rig.camera
     window = crop or (0, 0, camera.width_px, camera.height_px)
-    surfaces = surfaces or view_surfaces(view, room)
+    film = view_film(view, room, light, settings, cells_per_pixel, seed, surfaces or view_surfaces(view, room))
+    layers = [_band(film, band, window, rounds, budget) for band in _bands(film.grid, window)]
+    dr.flush_kernel_cache()  # other mirrors need other kernels; those of the next view are read from Dr.Jit's own cache
+    return AmbientLayer(*(np.concatenate([pair[i] for pair in layers], axis=1) for i in (0, 1)))
+
+
+def view_film(
+    view: View,
+    room: Room,
+    light: LightMap,
+    settings: BakeSettings,
+    cells_per_pixel: int,
+    seed: int,
+    surfaces: Surfaces,
+) -> Film:
+    """Film of one view, whose cells can be sampled; arguments as for `render_ambient`."""
+    mi = activate()
     table = surfaces.table
     fixed = int(np.searchsorted(table.shape, len(fixed_shapes(room))))
     texels = TexelGrid.of(table, _texel_sizes_m(surfaces, fixed, settings.texel_m))
     light_carriage(surfaces, texels, fixed, light.irradiance_w_m2, settings, room.sun)
-    grid = FilmGrid.of(camera, cells_per_pixel)
-    film = Film(mi, Look(mi, surfaces), grid, seed)
-    layers = [_band(film, band, window, rounds, budget) for band in _bands(grid, window)]
-    dr.flush_kernel_cache()  # other mirrors need other kernels; those of the next view are read from Dr.Jit's own cache
-    return AmbientLayer(*(np.concatenate([pair[i] for pair in layers], axis=1) for i in (0, 1)))
+    look = Look(mi, surfaces)
+    # a rough mirror blurs outlines by itself
+    known = view.rig.mirror.roughness_alpha == 0.0 and bool(table.emits.any())
+    lamps = LampOutlines(mi, look, surfaces) if known else None
+    return Film(mi, look, FilmGrid.of(view.rig.camera, cells_per_pixel), seed, lamps)
 
 
 def _texel_sizes_m(surfaces: Surfaces, fixed: int, texel_m: float) -> Array:

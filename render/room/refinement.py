@@ -22,6 +22,7 @@ _NEAR_PX = 3  # an edge that both samples of a cell missed shows in a cell not f
 _GROWTH = 8.0  # of the strata along a side, in one round
 _BLIND = (16.0, 500.0)  # excess from which a cell's first refinement has 4 and 6 strata along a side, 2 below
 _SMALL = 0.1  # a cell below this part of its allowance is not what keeps a pixel above its budget
+_SURELY = 2.0  # by two samples a pixel at the edge of a lamp may look full that is not
 _AIM = 0.7  # of the allowed variance
 
 
@@ -47,6 +48,8 @@ class Cells:
         Pixels that see the mirror.
     budget : float
         Largest allowed error by noise, one of `noise_budget.BUDGETS`.
+    lamps : array, shape (rows, columns), int32
+        Lamp that is seen at each cell or close to it, -1 for none.
     """
 
     grid: FilmGrid
@@ -59,6 +62,7 @@ class Cells:
     suspected: Stack
     mirrored: NDArray[np.bool_]
     budget: float
+    lamps: NDArray[np.int32]
 
 
 def render_refined(film: Film, window: Crop, rounds: int, budget: float) -> tuple[Stack, Stack]:
@@ -67,7 +71,7 @@ def render_refined(film: Film, window: Crop, rounds: int, budget: float) -> tupl
     All cells get two samples. Those that see the mirror, and the few around them, are then refined.
     """
     grid, numbers = film.grid, film.grid.numbers(window)
-    a, b = (film.sample(numbers.ravel(), 1, half) for half in (0, 1))
+    a, b = (film.sample_once(numbers.ravel(), half) for half in (0, 1))
     mean, variance = (plane.reshape(3, *numbers.shape) for plane in _estimate(a, b))
     pixels = grid.pixels(mean), grid.pixels(variance, power=2)
     mirrored = grid.inner((a.mirrored | b.mirrored).reshape(numbers.shape))
@@ -77,7 +81,8 @@ def render_refined(film: Film, window: Crop, rounds: int, budget: float) -> tupl
         halves = [half.electrons_per_s.sum(axis=0).reshape(numbers.shape)[part] for half in (a, b)]
         own = [np.ascontiguousarray(plane[:, *part]) for plane in (mean, variance)]  # changed in place
         inner = (np.ascontiguousarray(pixels[0][:, *box]), np.ascontiguousarray(pixels[1][:, *box]))
-        cells = _cells(grid, numbers[part].copy(), own, inner, halves, mirrored[box], budget)
+        lamps = _lamps_near(film, [half.patch.reshape(numbers.shape)[part] for half in (a, b)])
+        cells = _cells(grid, numbers[part].copy(), own, inner, halves, mirrored[box], budget, lamps)
         for turn in range(1, rounds + 1):
             if not refine(film, cells, turn):
                 break
@@ -105,15 +110,16 @@ def _cells(
     halves: list[Stack],
     mirrored: NDArray[np.bool_],
     budget: float,
+    lamps: NDArray[np.int32],
 ) -> Cells:
     """Cells after their first two samples: mean and variance; `halves` are the samples' sums over the colours."""
     mean, variance = estimate
     allowed = allowed_per_s2(pixels[0], grid.blur_sigma_px, budget).sum(axis=0)
     tight = ndimage.minimum_filter(allowed, size=_NEAR_PX, mode="nearest")
-    full = is_full(pixels[0]).all(axis=0)
+    full = ndimage.minimum_filter(is_full(pixels[0] / _SURELY).all(axis=0), size=_NEAR_PX, mode="nearest")
     suspected = np.where(full, np.float32(0.0), _suspected(grid, *halves) / allowed)
     side = np.ones(numbers.shape, dtype=np.int32)
-    return Cells(grid, numbers, side, mean, variance, pixels, tight, suspected, mirrored, budget)
+    return Cells(grid, numbers, side, mean, variance, pixels, tight, suspected, mirrored, budget, lamps)
 
 
 def refine(film: Film, cells: Cells, turn: int) -> bool:
@@ -133,9 +139,9 @@ def refine(film: Film, cells: Cells, turn: int) -> bool:
     near, tight = near.ravel()[pixel], cells.tight.ravel()[pixel]
     wanted = _wanted(cells, chosen, near, tight)
     more = wanted > cells.side.ravel()[chosen]
-    for m in np.unique(wanted[more]):
-        _sample_again(film, cells, chosen[more & (wanted == m)], int(m), turn)
-    _update(cells, chosen[more])
+    if more.any():
+        _sample_again(film, cells, chosen[more], wanted[more], turn)
+        _update(cells, chosen[more])
     cells.suspected[:] = 0.0
     return True
 
@@ -176,14 +182,32 @@ def _wanted(cells: Cells, chosen: NDArray[np.intp], near: Stack, tight: Stack) -
     return np.where(side == 1, blind, informed).astype(np.int32)
 
 
-def _sample_again(film: Film, cells: Cells, chosen: NDArray[np.intp], side: int, turn: int) -> None:
+def _sample_again(film: Film, cells: Cells, chosen: NDArray[np.intp], side: NDArray[np.int32], turn: int) -> None:
     """Replace what is known of some cells (flat indices) by new samples."""
-    a, b = (film.sample(cells.numbers.ravel()[chosen], side, 2 * turn + half) for half in (0, 1))
+    lamps = cells.lamps.ravel()[chosen]
+    for part, near in ((lamps < 0, None), (lamps >= 0, lamps[lamps >= 0])):
+        if part.any():
+            numbers = cells.numbers.ravel()[chosen[part]]
+            halves = (film.sample(numbers, side[part], 2 * turn + half, near) for half in (0, 1))
+            _replace(cells, chosen[part], side[part], *halves)
+
+
+def _replace(cells: Cells, chosen: NDArray[np.intp], side: NDArray[np.int32], a: Samples, b: Samples) -> None:
+    """Set mean and variance of cells by two halves."""
     mean, variance = _estimate(a, b)
-    spread = np.maximum(0.5 * (a.square + b.square) - mean**2, 0.0)
+    edges = (0.25 * (a.spread + b.spread)) / side.astype(np.float32) ** 3
     cells.mean.reshape(3, -1)[:, chosen] = mean
-    cells.variance.reshape(3, -1)[:, chosen] = np.maximum(variance, spread / np.float32(2.0 * side**3))
+    cells.variance.reshape(3, -1)[:, chosen] = np.maximum(variance, edges)
     cells.side.ravel()[chosen] = side
+
+
+def _lamps_near(film: Film, patches: list[NDArray[np.uint32]]) -> NDArray[np.int32]:
+    """Brightest lamp that samples of a cell or of its neighbours met, shape (rows, columns), -1 for none."""
+    if film.lamps is None:
+        return np.full(patches[0].shape, -1, dtype=np.int32)
+    seen = np.maximum(*(film.lamps.lamp(patch) for patch in patches))
+    reach = film.grid.cells * (_NEAR_PX // 2)
+    return np.asarray(ndimage.maximum_filter(seen, size=2 * reach + 1, mode="nearest"))
 
 
 def _estimate(a: Samples, b: Samples) -> tuple[Stack, Stack]:

@@ -14,13 +14,15 @@ whether they come from the mirror or from the lens. What its faces mirror back t
 
 from __future__ import annotations
 
+import math
 from types import ModuleType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from phibench.render.room.camera_plugin import MM_PER_M, sensor_dict
-from phibench.render.room.surfaces import Surfaces
+from phibench.render.room.surfaces import Surfaces, aligned
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import View
 
@@ -48,21 +50,23 @@ class Look:
         bands = [rig.mirror.refractive_index(nm) for nm in rig.camera.detector.band_wavelength_nm]
         self._index = [[dr.opaque(mi.Float, float(part)) for part in (one.real, one.imag)] for one in bands]
 
-    def electrons(self, u: Any, v: Any, x: list[Any]) -> tuple[Any, Any]:
-        """Electrons/s per square pixel at film positions (u, v), float64 pixels, and whether they see the mirror.
+    def electrons(self, u: Any, v: Any, x: list[Any]) -> tuple[Any, Any, Any, Any]:
+        """Electrons/s per square pixel at film positions (u, v), float64 pixels.
 
+        Also whether they see the mirror, the patch that is met by it, 0 for none, and the mirrored ray: its start (mm),
+        direction, and whether the mirror is met, whatever stands before it.
         `x` are uniform deviates: two for the lens point, and two for the facet of a rough mirror.
         """
         import drjit as dr
 
         mi = self._mi
-        lens = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(x[0], x[1]))
-        origin, direction, weight = self._sensor.film_ray(u, v, lens)
+        origin, direction, weight = self._sensor.film_ray(u, v, self.lens(x))
         point, normal, mirrored = self._meet(origin, direction)
+        found = mirrored
         if self._crossed:
             approach = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
             approach.maxt = dr.select(mirrored, mi.Float(dr.norm(point - origin)), 0.0)
-            mirrored &= ~self._surfaces.scene.ray_test(approach, coherent=True, active=mirrored)
+            mirrored = mirrored & ~self._surfaces.scene.ray_test(approach, coherent=True, active=mirrored)
         facet, shadowing = normal, mi.Float(1.0)
         if x[2:]:
             turned, shadowing = _facet(mi, self._alpha, mi.Vector3f(normal), mi.Vector3f(direction), x[2:])
@@ -78,7 +82,29 @@ class Look:
         t, patch, valid = self._surfaces.hit(ray)
         radiance = self._surfaces.radiance(patch, ray(t), onward, valid, lamps=True)
         reflectance = dr.select(mirrored, shadowing * self._reflectance(mi.Float(cos)), 1.0)
-        return weight * reflectance * radiance, mirrored
+        return (
+            weight * reflectance * radiance,
+            mirrored,
+            dr.select(valid & mirrored, patch, 0),
+            (point, direction + 2.0 * cos * facet, found),
+        )
+
+    def lens(self, x: list[Any]) -> Any:
+        """Point of the unit disc that two uniform deviates mean."""
+        return self._mi.warp.square_to_uniform_disk_concentric(self._mi.Point2f(x[0], x[1]))
+
+    def reflected(self, u: Any, v: Any, lens: Any) -> tuple[Any, Any, Any, Any]:
+        """Ray that an ideal mirror sends on: start (mm), direction, float64; its weight, and whether there is one.
+
+        What stands between lens and mirror does not count.
+        """
+        import drjit as dr
+
+        mi = self._mi
+        origin, direction, weight = self._sensor.film_ray(u, v, lens)
+        point, normal, found = self._meet(origin, direction)
+        cos = -dr.dot(direction, normal)
+        return point, direction + 2.0 * cos * normal, weight * self._reflectance(mi.Float(cos)), found
 
     def _meet(self, origin: Any, direction: Any) -> tuple[Any, Any, Any]:
         """Point of the mirror (mm), its outward normal, and whether there is one; float64."""
@@ -199,6 +225,173 @@ def _facet(mi: ModuleType, alpha: Any, normal: Any, direction: Any, x: list[Any]
     facet, _ = facets.sample(towards, mi.Point2f(x[0], x[1]))
     out = 2.0 * dr.dot(towards, facet) * facet - towards
     return frame.to_world(facet), dr.select(out.z > 0.0, facets.smith_g1(out, facet), 0.0)
+
+
+# Outlines of lamps.
+
+_GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))  # of a spiral that fills the disc evenly
+_MEANS = (1.0 / 6.0, 1.0 / 6.0, 1.0 / 8.0, 1.0 / 8.0)  # of a second difference: half of the mean square
+_MOST_BENDS = (0.04, 0.04, 0.1, 0.1)  # second differences over the film and over the lens, half squares
+_FLAT = 1e-9  # of the area that the same sides would span: a lamp seen edge on
+
+
+class LampOutlines:
+    """Rectangles that emit, seen by an ideal mirror: how much of a square of the film each covers.
+
+    A cell that a lamp's outline cuts is a mean over its square and over the lens. Samples that meet the lamp or not
+    know it to 1e-4 only after 16 000 of them; a dark pixel beside a lamp a thousand times as bright needs that. By one
+    lens point the mirror maps a small square to the lamp's plane almost linearly, and what the lamp covers of it is the
+    area in which two parallelograms meet. The mean C over squares and lens points takes the place of what chance gives:
+    a sample counts L (C - I) more, with I = 1 if its ray meets the plane within the lamp, and L the light of a cell
+    that the lamp covers. Its expectation is 0, whatever hides the lamp; where something does, it adds noise, no bias.
+
+    Of the map's second order the mean is taken into account. What is left moves C by some 1e-4 (a test bounds it).
+    Cells in which the map bends too much are left to chance.
+
+    Parameters
+    ----------
+    look : Look
+    surfaces : Surfaces
+    """
+
+    def __init__(self, mi: ModuleType, look: Look, surfaces: Surfaces) -> None:
+        self._mi, self._look = mi, look
+        table = surfaces.table
+        patches = np.flatnonzero(table.emits)
+        half = 0.5 * MM_PER_M * table.size_m[patches]
+        centre = MM_PER_M * (table.centre_m[patches] - surfaces.view.sphere_centre_m)
+        axes = [axis[patches] / half[:, [k]] for k, axis in enumerate((table.x_axis, table.y_axis))]
+        rows = np.concatenate([centre, table.normal[patches], *axes, table.radiance_w_m2_sr[patches]], axis=1)
+        self._lamp = np.full(len(table.size_m), -1, dtype=np.int32)
+        brightest_last = np.argsort(table.radiance_w_m2_sr[patches].sum(axis=1), kind="stable")
+        self._lamp[patches[brightest_last]] = np.arange(len(patches), dtype=np.int32)
+        self._rows = [mi.Float64(aligned(column, np.float64)) for column in rows[brightest_last].T]
+
+    def lamp(self, patch: NDArray[np.uint32]) -> NDArray[np.int32]:
+        """Number of the lamp that is a patch, -1 where it is none; brighter lamps have higher numbers."""
+        return np.asarray(self._lamp[patch])
+
+    def share(self, middle: list[Any], half: Any, points: Any, turn: list[Any], lamp: Any) -> tuple[Any, Any]:
+        """Light of a lamp on squares of the film, electrons/s per square pixel, and the part that it covers.
+
+        The light is that of a square which the lamp covers whole; 0 where the map is not known well enough.
+
+        Parameters
+        ----------
+        middle, half
+            Middle (u, v) of squares and half of their sides, float64 pixels.
+        points, turn
+            Number of lens points, and two uniform deviates that turn their pattern.
+        lamp
+            Numbers of lamps, -1 for none.
+        """
+        import drjit as dr
+
+        mi, (u, v) = self._mi, middle
+        steps = [(0.0, 0.0)] + [(sign * (k == 0), sign * (k == 1)) for k in (0, 1) for sign in (-1.0, 1.0)]
+        rays = [self._look.reflected(u + a * half, v + b * half, mi.Point2f(0.0)) for a, b in steps]
+        rays += [self._look.reflected(u, v, mi.Point2f(a, b)) for a, b in steps[1:]]
+        rows, known = self._row(lamp)
+        ends = [_place(dr, rows, ray) for ray in rays]
+        for _, _, met in ends:
+            known &= met
+        part, valid = self._covered([(a, b) for a, b, _ in ends], points, turn)
+        light = rays[0][2] * mi.Color3f(*(mi.Float(value) for value in rows[4]))
+        return dr.select(known & valid, light, 0.0), mi.Float(part)
+
+    def meets(self, ray: tuple[Any, Any, Any], lamp: Any) -> Any:
+        """True where rays meet the plane of a lamp within the lamp, whatever hides it."""
+        import drjit as dr
+
+        rows, known = self._row(lamp)
+        a, b, met = _place(dr, rows, ray)
+        return known & met & (dr.abs(a) <= 1.0) & (dr.abs(b) <= 1.0)
+
+    def _row(self, lamp: Any) -> tuple[list[Any], Any]:
+        """Centre, normal, two axes over half sides squared, and radiance of lamps; whether there is one."""
+        import drjit as dr
+
+        mi, known = self._mi, lamp >= 0
+        index = mi.UInt32(dr.maximum(lamp, 0))
+        row = [dr.gather(mi.Float64, column, index, known) for column in self._rows]
+        return [mi.Vector3d(*row[3 * k : 3 * k + 3]) for k in range(5)], known
+
+    def _covered(self, ends: list[tuple[Any, Any]], points: Any, turn: list[Any]) -> tuple[Any, Any]:
+        """Part of squares, (s, t) in [-1, 1]^2, that a lamp covers, mean over the lens; whether the map is known.
+
+        `ends` are places on the lamp for the middle, for -s, s, -t, t, and for four points on the rim of the lens.
+        """
+        import drjit as dr
+
+        mi = self._mi
+        middle, *others = ends
+        slopes, bends = [], []
+        for low, high in zip(others[::2], others[1::2], strict=True):
+            slopes.append([0.5 * (q - p) for p, q in zip(low, high, strict=True)])
+            bends.append([p + q - 2.0 * m for p, q, m in zip(low, high, middle, strict=True)])
+        (ja, jb), (ka, kb), *tilt = slopes
+        det = ja * kb - jb * ka
+        valid = dr.abs(det) > _FLAT * dr.sqrt((ja * ja + ka * ka) * (jb * jb + kb * kb))
+        inverse = 1.0 / dr.select(valid, det, 1.0)
+
+        def square(a: Any, b: Any) -> tuple[Any, Any]:
+            return (kb * a - ka * b) * inverse, (ja * b - jb * a) * inverse
+
+        # the mean of s^2 over [-1, 1] is 1/3, that of x^2 over a disc 1/4
+        a, b = (m + sum(one[k] * part for one, part in zip(bends, _MEANS, strict=True)) for k, m in enumerate(middle))
+        for bend, most in zip(bends, _MOST_BENDS, strict=True):
+            s, t = square(*bend)
+            valid &= (dr.abs(s) < most) & (dr.abs(t) < most)
+        corners = [square(p - a, q - b) for p, q in ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))]
+        (xs, xt), (ys, yt) = (square(*one) for one in tilt)
+
+        first, angle0 = mi.Float64(turn[0]), 2.0 * math.pi * mi.Float64(turn[1])
+
+        def body(i: Any, area: Any) -> tuple[Any, Any]:
+            radius, angle = (
+                dr.sqrt((mi.Float64(i) + first) / mi.Float64(points)),
+                _GOLDEN_ANGLE * mi.Float64(i) + angle0,
+            )
+            x, y = radius * dr.cos(angle), radius * dr.sin(angle)
+            moved = [(s - x * xs - y * ys, t - x * xt - y * yt) for s, t in corners]
+            return i + 1, area + dr.abs(sum(_swept(dr, moved[k], moved[(k + 1) % 4]) for k in range(4)))
+
+        start = (mi.UInt32(0), dr.zeros(mi.Float64, dr.width(a)))
+        _, area = dr.while_loop(start, lambda i, _: i < points, body)
+        return area / (4.0 * mi.Float64(dr.maximum(points, 1))), valid
+
+
+def _place(dr: ModuleType, lamp: list[Any], ray: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+    """Place at which a ray meets a lamp's plane, in half sides from its centre, and whether it meets its front."""
+    centre, normal, x, y, _ = lamp
+    start, direction, *_, found = ray
+    slope = dr.dot(normal, direction)
+    way = centre - start
+    height = dr.dot(normal, way)
+    valid = found & (slope < 0.0) & (height < 0.0)
+    arm = height / dr.select(valid, slope, -1.0) * direction - way
+    return dr.dot(arm, x), dr.dot(arm, y), valid
+
+
+def _swept(dr: ModuleType, start: tuple[Any, Any], end: tuple[Any, Any]) -> Any:
+    """Integral of x, held within [-1, 1], by y within [-1, 1] along a line.
+
+    Summed over the sides of a polygon this is the area of its part within the square.
+    """
+    (x0, y0), (x1, y1) = start, end
+    rise = y1 - y0
+    slope = (x1 - x0) / dr.select(dr.abs(rise) > 0.0, rise, 1.0)
+    low, high = dr.clip(y0, -1.0, 1.0), dr.clip(y1, -1.0, 1.0)
+    left, right = x0 + (low - y0) * slope, x0 + (high - y0) * slope
+    run = right - left
+    plain = dr.abs(run) < 1e-6
+    mean = (_antiderivative(dr, right) - _antiderivative(dr, left)) / dr.select(plain, 1.0, run)
+    return (high - low) * dr.select(plain, dr.clip(0.5 * (left + right), -1.0, 1.0), mean)
+
+
+def _antiderivative(dr: ModuleType, x: Any) -> Any:
+    held = dr.minimum(dr.abs(x), 1.0)
+    return held * (dr.abs(x) - 0.5 * held)
 
 
 # Mirror with a form error.

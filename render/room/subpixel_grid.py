@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.special import ndtr
 
-from phibench.render.room.shading import Look
+from phibench.render.room.shading import LampOutlines, Look
 from phibench.render.room.surfaces import aligned
 from phibench.scenes.camera import Camera
 from phibench.scenes.validation import SceneError
@@ -171,6 +171,10 @@ def _uniform(mi: ModuleType, word: Any) -> Any:
 
 # Sampling.
 
+_PARTS = 2  # of a cell, along a side, in each of which the map to a lamp is linear
+_LENS_POINTS = 32  # for each of the strata along a cell's side
+_CHUNK = 256  # samples of a cell that one lane takes: the few cells with thousands share them among many lanes
+
 
 @dataclass(frozen=True)
 class Samples:
@@ -180,54 +184,140 @@ class Samples:
     ----------
     electrons_per_s : array, shape (3, n), float32
         Mean over the cell, per square pixel.
-    square : array, shape (3, n), float32
-        Mean square.
+    spread : array, shape (3, n), float32
+        Variance of single samples, without what the outlines of lamps contribute.
     mirrored : bool array, shape (n,)
         Whether a sample saw the mirror.
+    patch : array, shape (n,), uint32
+        Patch of the room that a sample met by the mirror, or 0.
     """
 
     electrons_per_s: Stack
-    square: Stack
+    spread: Stack
     mirrored: NDArray[np.bool_]
+    patch: NDArray[np.uint32]
 
 
 class Film:
-    """Samples cells; what a cell gets depends on its number, the seed and the stream alone."""
+    """Samples cells; what a cell gets depends on its number, the seed and the stream alone.
 
-    def __init__(self, mi: ModuleType, look: Look, grid: FilmGrid, seed: int) -> None:
-        self._mi, self._look, self.grid, self._seed = mi, look, grid, seed
+    Parameters
+    ----------
+    lamps : LampOutlines, or None
+        Outlines of lamps that are known in closed form.
+    """
+
+    def __init__(self, mi: ModuleType, look: Look, grid: FilmGrid, seed: int, lamps: LampOutlines | None) -> None:
+        self._mi, self._look, self.grid, self._seed, self.lamps = mi, look, grid, seed, lamps
         self._dimensions = 4 if look.view.rig.mirror.roughness_alpha == 0.0 else 6
 
-    def sample(self, numbers: NDArray[np.uint32], side: int, stream: int) -> Samples:
-        """Sample cells, shape (n,), with side x side points each."""
+    def sample_once(self, numbers: NDArray[np.uint32], stream: int) -> Samples:
+        """Sample cells, shape (n,), with one point each."""
+        import drjit as dr
+
+        mi = self._mi
+        lanes = mi.UInt32(aligned(numbers, np.uint32))
+        x = shifts(mi, lanes, self._dimensions, dr.opaque(mi.UInt32, self._key(stream)))
+        corner, h = self._corner(lanes)
+        u, v = (start + mi.Float64(value) * h for start, value in zip(corner, x[:2], strict=True))
+        value, mirrored, patch, _ = self._look.electrons(u, v, x[2:])
+        dr.eval(value, mirrored, patch)
+        none = np.zeros((3, len(numbers)), dtype=np.float32)
+        return Samples(_planes(value), none, np.array(mirrored, dtype=bool), np.array(patch, dtype=np.uint32))
+
+    def sample(
+        self, numbers: NDArray[np.uint32], side: NDArray[np.int32], stream: int, lamp: NDArray[np.int32] | None
+    ) -> Samples:
+        """Sample cells, shape (n,), with side x side points each; `lamp` is the one whose part of each is computed.
+
+        Where `lamp` is -1 there is none; None if there is none anywhere.
+        """
+        import drjit as dr
+
+        mi, key = self._mi, self._key(stream)
+        cell, start, stop = _chunks(side)
+        lanes, m, first, end = (
+            mi.UInt32(aligned(values, np.uint32)) for values in (numbers[cell], side[cell], start, stop)
+        )
+        m = dr.maximum(m, 1)  # lanes beyond the last have none, and are divided by nonetheless
+        shift = shifts(mi, lanes, self._dimensions, dr.opaque(mi.UInt32, key))
+        corner, h = self._corner(lanes)
+        if lamp is not None:
+            light, part = self._shares(numbers, side, key, lamp)
+            which = mi.Int32(aligned(lamp[cell], np.int32))
+            shine = mi.Color3f(*(mi.Float(aligned(plane[cell])) for plane in light))
+
+        def body(i: Any, total: Any, square: Any) -> tuple[Any, Any, Any]:
+            x = points(mi, shift, i)
+            u, v = (
+                low + (mi.Float64(k) + mi.Float64(value)) / mi.Float64(m) * h
+                for low, k, value in zip(corner, (i % m, i // m), x[:2], strict=True)
+            )
+            value, _, _, ray = self._look.electrons(u, v, x[2:])
+            if self.lamps is not None and lamp is not None:
+                value -= dr.select(self.lamps.meets(ray, which), shine, 0.0)
+            return i + 1, total + value, square + value * value
+
+        zero = (first, dr.zeros(mi.Color3f, len(cell)), dr.zeros(mi.Color3f, len(cell)))
+        _, *sums = dr.while_loop(zero, lambda i, *_: i < end, body)
+        dr.eval(*sums)
+        per_sample = 1.0 / side.astype(float) ** 2
+        mean, square = (
+            np.stack([np.bincount(cell, plane, len(side)) for plane in _planes(one)]) * per_sample for one in sums
+        )
+        spread = np.maximum(square - mean**2, 0.0).astype(np.float32)
+        if lamp is not None:
+            mean = mean + light * part
+        none = np.zeros(0, dtype=bool)
+        return Samples(mean.astype(np.float32), spread, none, none.astype(np.uint32))
+
+    def _shares(
+        self, numbers: NDArray[np.uint32], side: NDArray[np.int32], key: int, lamp: NDArray[np.int32]
+    ) -> tuple[Stack, Stack]:
+        """Light (3, n) of lamps on cells that they cover whole, 0 if unknown, and the part (n,) that they cover."""
+        import drjit as dr
+
+        assert self.lamps is not None
+        mi, n = self._mi, _PARTS
+        place = np.tile(np.arange(n * n), len(numbers))
+        lanes, points, column, row = (
+            mi.UInt32(aligned(values, np.uint32))
+            for values in (np.repeat(numbers, n * n), np.repeat(_LENS_POINTS * side, n * n), place % n, place // n)
+        )
+        corner, h = self._corner(lanes)
+        h = h / n
+        middle = [low + (mi.Float64(k) + 0.5) * h for low, k in zip(corner, (column, row), strict=True)]
+        turn = shifts(mi, lanes * (n * n) + row * n + column, 2, dr.opaque(mi.UInt32, key))
+        which = mi.Int32(aligned(np.repeat(lamp, n * n), np.int32))
+        light, part = self.lamps.share(middle, 0.5 * h, points, turn, which)
+        dr.eval(light, part)
+        lights = _planes(light).reshape(3, -1, n * n)
+        known = (lights.sum(axis=0) > 0.0).all(axis=1)
+        return np.where(known, lights.mean(axis=2), np.float32(0.0)), np.array(part).reshape(-1, n * n).mean(axis=1)
+
+    def _corner(self, lanes: Any) -> tuple[list[Any], Any]:
+        """Corner (u, v) of cells and their side, float64 pixels; opaque: one kernel for all cameras."""
         import drjit as dr
 
         mi, grid = self._mi, self.grid
-        lanes = mi.UInt32(aligned(numbers, np.uint32))
-        m, key = (dr.opaque(mi.UInt32, value) for value in (side, self._key(stream)))
-        shift = shifts(mi, lanes, self._dimensions, key)
-        # opaque: one kernel for all cameras
         columns = dr.opaque(mi.UInt32, grid.columns)
         h, start = (dr.opaque(mi.Float64, value) for value in (1.0 / grid.cells, -0.5 - grid.margin_px))
-        column, row = mi.Float64(lanes % columns), mi.Float64(lanes // columns)
-
-        def body(i: Any, total: Any, square: Any, seen: Any) -> tuple[Any, Any, Any, Any]:
-            x = points(mi, shift, i)
-            u = (column + (mi.Float64(i % m) + mi.Float64(x[0])) / mi.Float64(m)) * h + start
-            v = (row + (mi.Float64(i // m) + mi.Float64(x[1])) / mi.Float64(m)) * h + start
-            value, mirrored = self._look.electrons(u, v, x[2:])
-            return i + 1, total + value, square + value * value, seen | mirrored
-
-        n = len(numbers)
-        zero = (mi.UInt32(0), dr.zeros(mi.Color3f, n), dr.zeros(mi.Color3f, n), dr.zeros(mi.Bool, n))
-        _, total, square, seen = dr.while_loop(zero, lambda i, *_: i < m * m, body)
-        total, square = total / mi.Float(m * m), square / mi.Float(m * m)
-        dr.eval(total, square, seen)
-        return Samples(_planes(total), _planes(square), np.array(seen, dtype=bool))
+        return [mi.Float64(place) * h + start for place in (lanes % columns, lanes // columns)], h
 
     def _key(self, stream: int) -> int:
         """32-bit seed of one of the view's streams."""
         return int(np.random.SeedSequence([self._seed, stream]).generate_state(1, np.uint32)[0])
+
+
+def _chunks(side: NDArray[np.int32]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Cell, first sample and end of each lane; lanes of like length lie together, because 16 lanes run as one."""
+    samples = side.astype(np.intp) ** 2
+    count = -(-samples // _CHUNK)
+    cell = np.repeat(np.arange(len(side)), count)
+    start = (np.arange(len(cell)) - np.repeat(np.cumsum(count) - count, count)) * _CHUNK
+    stop = np.minimum(start + _CHUNK, samples[cell])
+    order = np.argsort(start - stop, kind="stable")
+    return cell[order], start[order], stop[order]
 
 
 def _planes(colour: Any) -> Stack:
