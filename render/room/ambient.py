@@ -121,8 +121,8 @@ def view_film(
     texels = TexelGrid.of(table, _texel_sizes_m(surfaces, fixed, settings.texel_m))
     light_carriage(surfaces, texels, fixed, light.irradiance_w_m2, settings, room.sun)
     look = Look(mi, surfaces)
-    # a rough mirror blurs outlines by itself
-    known = view.rig.mirror.roughness_alpha == 0.0 and bool(table.emits.any())
+    # a rough mirror blurs outlines by itself, a glass tube bends the rays
+    known = view.rig.mirror.roughness_alpha == 0.0 and view.tube is None and bool(table.emits.any())
     lamps = LampOutlines(mi, look, surfaces) if known else None
     return Film(mi, look, FilmGrid.of(view.rig.camera, cells_per_pixel), seed, lamps)
 
