@@ -7,6 +7,7 @@ Once cells are refined, the larger of the two is taken: stopping by a cell's own
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,7 @@ _NEAR_PX = 3  # an edge that both samples of a cell missed shows in a cell not f
 _GROWTH = 8.0  # of the strata along a side, in one round
 _BLIND = (16.0, 500.0)  # excess from which a cell's first refinement has 4 and 6 strata along a side, 2 below
 _SMALL = 0.1  # a cell below this part of its allowance is not what keeps a pixel above its budget
+_WIDE_SIGMAS = 2.5  # cells of a lamp 20 times as bright as a full pixel count for pixels as far away
 _SURELY = 2.0  # by two samples a pixel at the edge of a lamp may look full that is not
 _AIM = 0.7  # of the allowed variance
 
@@ -116,7 +118,9 @@ def _cells(
     mean, variance = estimate
     allowed = allowed_per_s2(pixels[0], grid.blur_sigma_px, budget).sum(axis=0)
     tight = ndimage.minimum_filter(allowed, size=_NEAR_PX, mode="nearest")
-    full = ndimage.minimum_filter(is_full(pixels[0] / _SURELY).all(axis=0), size=_NEAR_PX, mode="nearest")
+    full = ndimage.minimum_filter(
+        is_full(pixels[0] / _SURELY).all(axis=0), size=2 * _reach_px(grid) + 1, mode="nearest"
+    )
     suspected = np.where(full, np.float32(0.0), _suspected(grid, *halves) / allowed)
     side = np.ones(numbers.shape, dtype=np.int32)
     return Cells(grid, numbers, side, mean, variance, pixels, tight, suspected, mirrored, budget, lamps)
@@ -162,6 +166,11 @@ def _suspected(grid: FilmGrid, a: Stack, b: Stack) -> Stack:
     return np.asarray(contrast**2 * np.float32(_share(grid) / 24.0))
 
 
+def _reach_px(grid: FilmGrid) -> int:
+    """Pixels from a pixel to the farthest cells that count for it."""
+    return math.ceil(_WIDE_SIGMAS * grid.blur_sigma_px)
+
+
 def _share(grid: FilmGrid) -> float:
     """Part of a cell's variance that is a pixel's, if all cells have the same."""
     return float(np.sum(grid.taps**2) ** 2)
@@ -202,11 +211,11 @@ def _replace(cells: Cells, chosen: NDArray[np.intp], side: NDArray[np.int32], a:
 
 
 def _lamps_near(film: Film, patches: list[NDArray[np.uint32]]) -> NDArray[np.int32]:
-    """Brightest lamp that samples of a cell or of its neighbours met, shape (rows, columns), -1 for none."""
+    """Brightest lamp that samples of cells within the blur's reach met, shape (rows, columns), -1 for none."""
     if film.lamps is None:
         return np.full(patches[0].shape, -1, dtype=np.int32)
     seen = np.maximum(*(film.lamps.lamp(patch) for patch in patches))
-    reach = film.grid.cells * (_NEAR_PX // 2)
+    reach = film.grid.cells * _reach_px(film.grid)
     return np.asarray(ndimage.maximum_filter(seen, size=2 * reach + 1, mode="nearest"))
 
 

@@ -43,7 +43,7 @@ class Look:
         self.view = surfaces.view
         rig = self.view.rig
         self._sensor = mi.load_dict(sensor_dict(mi, self.view))
-        self._crossed = _crossed(surfaces)
+        self._crossed = surfaces.cross_the_way()
         self._tube = None if self.view.tube is None else Tube(mi, self.view)
         self._radius = dr.opaque(mi.Float64, MM_PER_M * rig.mirror.radius_m)
         self._alpha = dr.opaque(mi.Float, rig.mirror.roughness_alpha)
@@ -82,12 +82,8 @@ class Look:
         t, patch, valid = self._surfaces.hit(ray)
         radiance = self._surfaces.radiance(patch, ray(t), onward, valid, lamps=True)
         reflectance = dr.select(mirrored, shadowing * self._reflectance(mi.Float(cos)), 1.0)
-        return (
-            weight * reflectance * radiance,
-            mirrored,
-            dr.select(valid & mirrored, patch, 0),
-            (point, direction + 2.0 * cos * facet, found),
-        )
+        met = dr.select(valid & mirrored, patch, 0)
+        return weight * reflectance * radiance, mirrored, met, (point, direction + 2.0 * cos * facet, found)
 
     def lens(self, x: list[Any]) -> Any:
         """Point of the unit disc that two uniform deviates mean."""
@@ -199,19 +195,6 @@ class Tube:
         return (height > self._low) & (height < self._high)
 
 
-def _crossed(surfaces: Surfaces) -> bool:
-    """True if a face may stand between the lens and the mirror: their common box meets a triangle's."""
-    view = surfaces.view
-    reach_mm = MM_PER_M * view.rig.mirror.bound_m
-    lens = MM_PER_M * (view.camera_centre_m - view.sphere_centre_m)
-    rim_mm = MM_PER_M * view.rig.camera.aperture_radius_m
-    axis = view.T_world_camera.R[:, 2]
-    tilted = rim_mm * np.sqrt(np.maximum(1.0 - axis**2, 0.0))  # half extents of the lens's disc
-    low, high = np.minimum(lens - tilted, -reach_mm), np.maximum(lens + tilted, reach_mm)
-    corners = surfaces.corners_mm
-    return bool(np.all((corners.max(axis=1) > low) & (corners.min(axis=1) < high), axis=1).any())
-
-
 def _facet(mi: ModuleType, alpha: Any, normal: Any, direction: Any, x: list[Any]) -> tuple[Any, Any]:
     """Normal of a visible Beckmann facet, and Smith's masking of the way out (0 below the surface).
 
@@ -245,8 +228,8 @@ class LampOutlines:
     a sample counts L (C - I) more, with I = 1 if its ray meets the plane within the lamp, and L the light of a cell
     that the lamp covers. Its expectation is 0, whatever hides the lamp; where something does, it adds noise, no bias.
 
-    Of the map's second order the mean is taken into account. What is left moves C by some 1e-4 (a test bounds it).
-    Cells in which the map bends too much are left to chance.
+    Of the map's second order the mean is taken into account; docs/model.md has what was measured of the rest. Cells in
+    which the map bends too much are left to chance.
 
     Parameters
     ----------
@@ -348,10 +331,8 @@ class LampOutlines:
         first, angle0 = mi.Float64(turn[0]), 2.0 * math.pi * mi.Float64(turn[1])
 
         def body(i: Any, area: Any) -> tuple[Any, Any]:
-            radius, angle = (
-                dr.sqrt((mi.Float64(i) + first) / mi.Float64(points)),
-                _GOLDEN_ANGLE * mi.Float64(i) + angle0,
-            )
+            radius = dr.sqrt((mi.Float64(i) + first) / mi.Float64(points))
+            angle = _GOLDEN_ANGLE * mi.Float64(i) + angle0
             x, y = radius * dr.cos(angle), radius * dr.sin(angle)
             moved = [(s - x * xs - y * ys, t - x * xt - y * yt) for s, t in corners]
             return i + 1, area + dr.abs(sum(_swept(dr, moved[k], moved[(k + 1) % 4]) for k in range(4)))

@@ -101,6 +101,17 @@ class Surfaces:
         self._inside = mi.Float(aligned(_inside_reflectance(mi, table.coat))) if self.has_coats else None
         self._grid: TexelGrid | None = None
 
+    def cross_the_way(self) -> bool:
+        """True if a face may stand between the lens and the mirror: their common box meets a triangle's."""
+        view, corners = self.view, self.corners_mm
+        reach_mm = MM_PER_M * view.rig.mirror.bound_m
+        lens = MM_PER_M * (view.camera_centre_m - view.sphere_centre_m)
+        rim_mm = MM_PER_M * view.rig.camera.aperture_radius_m
+        axis = view.T_world_camera.R[:, 2]
+        tilted = rim_mm * np.sqrt(np.maximum(1.0 - axis**2, 0.0))  # half extents of the lens's disc
+        low, high = np.minimum(lens - tilted, -reach_mm), np.maximum(lens + tilted, reach_mm)
+        return bool(np.all((corners.max(axis=1) > low) & (corners.min(axis=1) < high), axis=1).any())
+
     def set_light(self, grid: TexelGrid, irradiance_w_m2: NDArray[np.floating]) -> None:
         """Give the texels of a grid their irradiance, shape (texels, 3), W/m^2."""
         # four more texels, of pi: with them a texture of radiance is what its surface sends out

@@ -26,6 +26,7 @@ from phibench.render.room.noise_budget import (
     phi_gradient,
     webcam,
 )
+from phibench.render.room.refinement import _cells
 from phibench.render.room.subpixel_grid import Film, FilmGrid, _chunks, golden_steps, shifts
 from phibench.render.setup.variant import activate
 from phibench.scenes.catalog import default_rig, lab
@@ -233,6 +234,37 @@ def test_pixels_that_look_full_by_chance_are_refined(
     print(len(off[0]), [float((one > 3.0).mean()) for one in off], np.sqrt(np.mean(np.square(off))))
     assert len(off[0]) > 300
     assert np.mean(np.concatenate(off) > 3.0) < 1e-3
+
+
+def test_cells_that_count_for_a_pixel_below_full_are_refined() -> None:
+    """A lamp's outline two pixels off a pixel below full, all around it full: what two samples give is not kept.
+
+    A cell counts for pixels two away with some 2 %, as much as the whole pixel if the lamp is bright.
+    """
+    grid = FilmGrid(40, 9, RIG.camera.blur_sigma_px, 1)
+    numbers = grid.numbers((0, 0, 40, 9))
+    lamp = 100.0 * webcam().full_well_e / webcam().exposure_s
+    column = np.arange(numbers.shape[1]) - grid.margin_px
+    one, other = (np.tile(np.where(column < last, 1e-3, 1.0) * lamp, (9 + 2 * grid.margin_px, 1)) for last in (20, 21))
+    mean = np.repeat(0.5 * (one + other)[None], 3, axis=0).astype(np.float32)
+    pixels = grid.pixels(mean), np.zeros((3, 9, 40), dtype=np.float32)
+    full = is_full(pixels[0] / 2.0).all(axis=(0, 1))
+    first = int(np.argmax(full))
+    assert not full[:first].any()
+    assert full[first:].all()
+    cells = _cells(
+        grid,
+        numbers,
+        [mean, np.zeros_like(mean)],
+        pixels,
+        [3.0 * half.astype(np.float32) for half in (one, other)],
+        np.ones((9, 40), dtype=bool),
+        BUDGET,
+        np.full(numbers.shape, -1, dtype=np.int32),
+    )
+    print(first, np.flatnonzero(cells.suspected[4] > 1.0))
+    assert np.all(cells.suspected[:, first : first + 2] > 1.0)
+    assert np.all(cells.suspected[:, first + 2 :] <= 1.0)
 
 
 def _excess(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
