@@ -48,6 +48,7 @@ estimator/limits estimator/methods
 estimator/draw_pairs
 estimator/calibration
 estimator/sandbox
+estimator/captures
 estimator/benchmark
 estimator/paper
 estimator/studies

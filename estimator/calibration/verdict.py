@@ -111,7 +111,7 @@ def write_overlay(
     title : str
         First line of the legend.
     """
-    picture = Image.fromarray(_visible(image, card)).convert("RGB")
+    picture = Image.fromarray(visible_picture(image, card)).convert("RGB")
     legend = draw_outline(picture, outline.rig(nominal), outline)
     draw_legend(picture, (title, *legend) if title else legend)
     buffer = io.BytesIO()
@@ -174,7 +174,7 @@ def _line(draw: ImageDraw.ImageDraw, uv_px: Array, show: NDArray[np.bool_], colo
             draw.line((*uv_px[k - 1], *uv_px[k]), fill=colour, width=width)
 
 
-def _visible(image: NDArray[Any], card: SensorCard | None) -> NDArray[np.uint8]:
+def visible_picture(image: NDArray[Any], card: SensorCard | None) -> NDArray[np.uint8]:
     """8-bit picture of a frame or a layer, without colours where it has to be developed first."""
     if image.dtype == np.uint8:
         return np.ascontiguousarray(image)

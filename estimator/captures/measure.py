@@ -1,0 +1,453 @@
+"""Measurement of D from a person's own pictures: spots, outline, rig, depth with its standard deviation, and a test.
+
+The rig is that of the rig file with the corrections of a calibration file. Without one, the mirror's outline in these
+very pictures corrects it, as far as an outline can, and the covariance is that of a rig measured by a ruler. The width
+of the spots is that of the outline's blur, where its light could be fitted.
+
+Several frames of a position: frames of DN are added up, which is one frame of a sensor with as much more of everything
+(`_summed`), so that nothing is lost. Of processed pictures each is measured alone and the positions are combined by
+their inverse covariances; a scatter above what they claim widens the result. Frames that share a laser-off frame share
+its noise: the covariance is then that of as many answers as there are laser-off frames. The fixed pattern is in all
+frames alike and does not average out: its part is added (`_PATTERN_PX`).
+
+The test: both spots are images of one point. Four coordinates stand against three unknowns, so that the gap of the two
+rays over its standard deviation, rig included, is chi^2 of one degree of freedom.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.sensor_card import SensorCard, card_of, read_sensor_file
+from phibench.estimator.calibration.bundle import calibrate
+from phibench.estimator.calibration.file import Calibration, read_calibration
+from phibench.estimator.calibration.limb_image import Measured
+from phibench.estimator.calibration.outline import Outline, find_outline, mean_measured, mean_outline
+from phibench.estimator.calibration.spots import method_for
+from phibench.estimator.captures.picture_files import Photo, SensorChoice, require_one_camera, sensor_choice
+from phibench.estimator.captures.rig_file import MeasuredRig, read_rig_file, require_camera_size
+from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas, stroke_of
+from phibench.estimator.geometry.status import Status, describe
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.interface import Answer, Image, Pair
+from phibench.estimator.spots.detect import FARTHEST_M, NEAREST_M, PairDetection, detect
+from phibench.estimator.spots.image_planes import ImageError
+from phibench.scenes.frames import Array
+from phibench.scenes.rig import POSITIONS, Rig
+
+LEAST_STROKE_M, MOST_STROKE_M = 1e-3, 10.0
+DOUBTFUL_P = 1e-3
+"""Probability of the two rays' gap below which the two spots are not taken for one point."""
+_PATTERN_PX = 0.2  # rms error of a position over PRNU: 1 % costs 2 mpx (docs/limits.md)
+_FACTORS = (0.1, 10.0, 0.3, 3.0, 0.01, 100.0, 0.001)  # of the stroke: units mistaken, and a few times too much
+_SURE_SIGMAS = 12.0  # of both spots, before something else is said to be wrong: a faint one may be noise
+_MOST_SUMMED = 64  # frames of 10 bits whose sum is below 2^16
+
+
+@dataclass(frozen=True)
+class PositionPhotos:
+    """Pictures of one stroke position: laser on, and laser off where there are any."""
+
+    on: tuple[Photo, ...]
+    off: tuple[Photo, ...] = ()
+
+
+@dataclass(frozen=True)
+class PairPhotos:
+    """Pictures of both positions.
+
+    Raises
+    ------
+    DatasetError
+        If the counts do not go together, or the pictures are of different cameras.
+    """
+
+    down: PositionPhotos
+    up: PositionPhotos
+
+    def __post_init__(self) -> None:
+        counts = {p: (len(getattr(self, p).on), len(getattr(self, p).off)) for p in POSITIONS}
+        if counts["down"] != counts["up"] or not counts["down"][0]:
+            (a, b), (c, d) = counts["down"], counts["up"]
+            raise DatasetError(
+                f"{a} pictures down ({b} with the laser off) and {c} up ({d} off): give as many of both positions"
+            )
+        if counts["down"][1] > counts["down"][0]:
+            raise DatasetError("more pictures with the laser off than on: give at most as many")
+        require_one_camera(self.all)
+
+    @property
+    def all(self) -> tuple[Photo, ...]:
+        """All pictures, those with the laser on first."""
+        return (*self.down.on, *self.up.on, *self.down.off, *self.up.off)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Numbers that are known beside the pictures.
+
+    Attributes
+    ----------
+    known : MeasuredRig
+    calibration : Calibration or None
+    sensor : SensorCard or None
+        Of a sensor file.
+    stroke_sigma_m : float
+        Of a single stroke, besides what the calibration says of all strokes.
+    """
+
+    known: MeasuredRig
+    calibration: Calibration | None = None
+    sensor: SensorCard | None = None
+    stroke_sigma_m: float = 0.0
+
+
+def read_setting(
+    rig: Path, calibration: Path | None = None, sensor: Path | None = None, stroke_sigma_m: float = 0.0
+) -> Setting:
+    """Setting of files.
+
+    Raises
+    ------
+    DatasetError
+        If a file will not do, or the calibration began with another rig than the rig file's; in one sentence.
+    """
+    known = read_rig_file(rig)
+    held = None if calibration is None else read_calibration(calibration, known.rig)
+    if not 0.0 <= stroke_sigma_m <= MOST_STROKE_M:
+        raise DatasetError(f"the stroke's standard deviation is {stroke_sigma_m:g} m: must be 0 or above")
+    return Setting(known, held, None if sensor is None else card_of(read_sensor_file(sensor)), stroke_sigma_m)
+
+
+@dataclass(frozen=True)
+class SeenSpot:
+    """Position of a spot in one image; pixels, covariance of (u, v)."""
+
+    uv_px: Array
+    covariance_px2: Array = field(repr=False)
+
+    @property
+    def sigma_px(self) -> float:
+        """Root mean square of both coordinates' standard deviations."""
+        return math.sqrt(0.5 * float(np.trace(self.covariance_px2)))
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Result for one pair.
+
+    Attributes
+    ----------
+    depth : GeneralDepth
+        Scalars: D, sigma, its parts, chi^2 and its probability.
+    down, up : SeenSpot
+    rig : Rig
+        The corrected one.
+    stroke_m : float
+        The corrected one.
+    outlines : tuple of Outline
+        Of these pictures, found with the nominal rig; none where none was found.
+    nominal : Rig
+        As in the rig file.
+    pair : Pair
+        The first frames, or their sum, with the corrected rig.
+    sensor : SensorChoice
+    notes : tuple of str
+        Sentences for the person: sensor, rig, frames, doubts.
+    """
+
+    depth: GeneralDepth
+    down: SeenSpot
+    up: SeenSpot
+    rig: Rig
+    stroke_m: float
+    outlines: tuple[Outline, ...] = field(repr=False)
+    nominal: Rig = field(repr=False)
+    pair: Pair = field(repr=False)
+    sensor: SensorChoice
+    notes: tuple[str, ...]
+
+    @property
+    def depth_m(self) -> float:
+        """D."""
+        return float(self.depth.depth_m)
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of D, of all that is known to be uncertain."""
+        return float(self.depth.sigma_m)
+
+    @property
+    def one_point(self) -> bool:
+        """The spots can be images of one point."""
+        return bool(self.depth.p_value >= DOUBTFUL_P)
+
+
+def measure(photos: PairPhotos, stroke_m: float, setting: Setting) -> Measurement:
+    """Measure D.
+
+    Parameters
+    ----------
+    photos : PairPhotos
+    stroke_m : float
+        As the person read it.
+    setting : Setting
+
+    Raises
+    ------
+    DatasetError
+        If a picture does not fit to the rig or the sensor, no spot is found, the positions are swapped, or the stroke
+        contradicts the pictures; in one sentence.
+    """
+    if not LEAST_STROKE_M <= stroke_m <= MOST_STROKE_M:
+        raise DatasetError(f"a stroke of {stroke_m:g} m: allowed is {LEAST_STROKE_M:g} to {MOST_STROKE_M:g} m, metres")
+    for photo in photos.all:
+        require_camera_size(setting.known.rig, photo.size_px, str(photo.path))
+    chosen = sensor_choice(photos.down.on[0], setting.sensor)
+    for photo in photos.all:
+        sensor_choice(photo, setting.sensor)
+    pairs = _pairs(photos, stroke_m, setting.known, chosen.card)
+    outlines, missing = _outlines(pairs[0])
+    rig, covariance, values, note = _corrected(setting, outlines, missing)
+    rig, blur_note = _with_blur(rig, outlines)
+    stroke = float(stroke_of(np.array(stroke_m), values))
+    ready = [replace(pair, rig=rig, stroke_m=stroke) for pair in pairs]
+    spots = _spots([_answer(pair, photos) for pair in ready], len(photos.down.off), chosen.card)
+    down, up = spots["down"], spots["up"]
+    depth = depth_general(
+        rig,
+        stroke,
+        down.uv_px,
+        up.uv_px,
+        down.covariance_px2,
+        up.covariance_px2,
+        covariance,
+        setting.stroke_sigma_m,
+    )
+    if int(depth.status) != Status.OK:
+        raise _contradiction(ready[0], photos, describe(int(depth.status)))
+    frames = _frames_note(photos, chosen.card)
+    notes = tuple(text for text in (chosen.note, note, blur_note, frames, _doubt(depth)) if text)
+    return Measurement(depth, down, up, rig, stroke, outlines, setting.known.rig, ready[0], chosen, notes)
+
+
+# -- frames ----------------------------------------------------------------------------------------------------------
+
+
+def _pairs(photos: PairPhotos, stroke_m: float, known: MeasuredRig, card: SensorCard) -> list[Pair]:
+    """Pairs to be measured one by one: one of sums of frames of DN, else one for each frame."""
+    count, offs = len(photos.down.on), len(photos.down.off)
+    if card.output == "raw" and count > 1 and offs in (0, count):
+        groups = [(*photos.down.on,), (*photos.up.on,), (*photos.down.off,), (*photos.up.off,)]
+        sums = [_summed([photo.pixels for photo in group]) if group else None for group in groups]
+        return [_pair(0, sums, stroke_m, known, _of_sum(card, count))]
+    found = []
+    for k in range(count):
+        on = [photos.down.on[k].pixels, photos.up.on[k].pixels]
+        off = [photos.down.off[k % offs].pixels, photos.up.off[k % offs].pixels] if offs else [None, None]
+        found.append(_pair(k, [*on, *off], stroke_m, known, card))
+    return found
+
+
+def _pair(number: int, images: Sequence[Image | None], stroke_m: float, known: MeasuredRig, card: SensorCard) -> Pair:
+    down, up, down_off, up_off = images
+    if down is None or up is None:
+        raise ValueError("a pair needs both positions")
+    return Pair(number, down, up, known.rig, stroke_m, card, down_off, up_off, beam=known.beam)
+
+
+def _summed(images: Sequence[Image]) -> Image:
+    if len(images) > _MOST_SUMMED:
+        raise DatasetError(f"{len(images)} frames of a position: at most {_MOST_SUMMED} are added up")
+    total = np.sum([image.astype(np.uint32) for image in images], axis=0)
+    if total.max() > 65535:
+        raise DatasetError("the sum of the frames is beyond 16 bits: give fewer frames of a position")
+    summed = total.astype(np.uint16)
+    summed.flags.writeable = False
+    return summed
+
+
+def _of_sum(card: SensorCard, count: int) -> SensorCard:
+    """Card of the sum of frames: Poisson laws add up, and so do wells, codes and the variances of the noise.
+
+    The responsivity's pattern stays the same part of the light. The n roundings are n / 12 DN^2 instead of 1 / 12.
+    """
+    rounding_e2 = (count - 1) / (12.0 * card.dn_per_e**2)
+    return replace(
+        card,
+        exposure_s=card.exposure_s * count,
+        full_well_e=card.full_well_e * count,
+        read_noise_e=math.sqrt(count * card.read_noise_e**2 + rounding_e2),
+        row_noise_e=math.sqrt(count) * card.row_noise_e,
+        dsnu_e=count * card.dsnu_e,
+        black_level_dn=count * card.black_level_dn,
+        top_dn=count * card.top_dn,
+    )
+
+
+def _frames_note(photos: PairPhotos, card: SensorCard) -> str:
+    count, offs = len(photos.down.on), len(photos.down.off)
+    if count == 1:
+        return ""
+    if card.output == "raw" and offs in (0, count):
+        return f"frames: {count} of each position, added up"
+    shared = f", {offs} with the laser off" if offs else ""
+    return f"frames: {count} of each position{shared}, each measured alone, positions combined"
+
+
+# -- rig -------------------------------------------------------------------------------------------------------------
+
+
+def _outlines(pair: Pair) -> tuple[tuple[Outline, ...], str]:
+    """Outlines of both positions, laser off where there is such a picture; and why there is none."""
+    found, why = [], ""
+    for position in POSITIONS:
+        image = pair.images.get(f"{position}_off", pair.images[position])
+        try:
+            found.append(find_outline(image, pair.rig, pair.card))
+        except ImageError as error:
+            why = str(error)
+    return tuple(found), why
+
+
+def _corrected(setting: Setting, outlines: Sequence[Outline], why: str) -> tuple[Rig, Array, Array, str]:
+    """Corrected rig, covariance and values of `PARAMETERS`, and a sentence."""
+    nominal = setting.known.rig
+    if setting.calibration is not None:
+        held = setting.calibration
+        return held.rig, held.covariance, held.values, _calibration_note(held, nominal, outlines)
+    if not outlines:
+        values, covariance = np.zeros(len(PARAMETERS)), np.diag(prior_sigmas() ** 2)
+        return nominal, covariance, values, f"rig: as in the rig file, with the errors of a ruler; no outline: {why}"
+    bundle = calibrate(nominal, mean_outline(outlines))
+    kind = ", by its edge alone" if any(one.by_edge for one in outlines) else ""
+    text = f"rig: corrected by the mirror's outline in these pictures{kind}; the rest has the errors of a ruler"
+    return bundle.rig, bundle.covariance, bundle.values, text
+
+
+_MOVED_SIGMAS = 5.0
+
+
+def _calibration_note(held: Calibration, nominal: Rig, outlines: Sequence[Outline]) -> str:
+    """Sentence on the calibration, and whether the mirror is still where it was."""
+    made, text = held.made_from.get("sphere_in_camera_m"), "rig: of the calibration file"
+    if not made or not outlines:
+        return text
+    sigmas = np.array(held.made_from["sigma_m"])
+    then = Measured(np.mean(made, axis=0), np.diag(np.mean(sigmas**2, axis=0)))
+    now = mean_outline(outlines)
+    across = (now.value - then.value)[:2]
+    off = float(np.sqrt(across @ np.linalg.solve((now.covariance + then.covariance)[:2, :2], across)))
+    if off > _MOVED_SIGMAS:
+        moved = 1e3 * float(np.linalg.norm(across))
+        return f"{text}; doubtful: the mirror has moved by {moved:.2f} mm ({off:.0f} sigma) since; calibrate again"
+    return f"{text}; the mirror is still where it was"
+
+
+def _with_blur(rig: Rig, outlines: Sequence[Outline]) -> tuple[Rig, str]:
+    """Rig with the blur that the outlines' light has; as it is where none could be fitted."""
+    blurs = [one.blur_px for one in outlines if math.isfinite(one.blur_px)]
+    if not blurs:
+        return rig, f"blur: {rig.camera.blur_sigma_px:g} px of the rig file"
+    blur = float(np.mean(blurs))
+    return replace(rig, camera=replace(rig.camera, blur_sigma_px=blur)), f"blur: {blur:.2f} px, of the outline"
+
+
+# -- spots -----------------------------------------------------------------------------------------------------------
+
+
+def _answer(pair: Pair, photos: PairPhotos) -> Answer:
+    answer = method_for(pair.card)(pair)
+    if any(spot.uv_px is None or spot.covariance_px2 is None for spot in (answer.down, answer.up)):
+        raise _nothing_found(pair, photos, answer)
+    return answer
+
+
+def _spots(answers: Sequence[Answer], offs: int, card: SensorCard) -> dict[str, SeenSpot]:
+    """Positions of all frames together."""
+    found, count = {}, len(answers)
+    for position in POSITIONS:
+        seen = [getattr(answer, position) for answer in answers]
+        parts = [Measured(np.array(spot.uv_px), np.array(spot.covariance_px2)) for spot in seen]
+        mean, C = parts[0], parts[0].covariance
+        if count > 1:
+            mean = mean_measured(parts)
+            shared = 1.0 if not offs else count / min(count, offs)
+            C = mean.covariance * shared + (_PATTERN_PX * card.prnu) ** 2 * np.eye(2)
+        found[position] = SeenSpot(np.asarray(mean.value), np.asarray(C))
+    return found
+
+
+# -- what is wrong ---------------------------------------------------------------------------------------------------
+
+
+def _swapped(pair: Pair) -> Pair:
+    return replace(pair, down=pair.up, up=pair.down, down_off=pair.up_off, up_off=pair.down_off)
+
+
+def _nothing_found(pair: Pair, photos: PairPhotos, answer: Answer) -> DatasetError:
+    """Error of a pair in which a spot lacks: positions swapped, a wrong stroke, or no laser."""
+    if contradiction := _known_contradiction(pair, photos):
+        return contradiction
+    lacking = [p for p in POSITIONS if getattr(answer, p).uv_px is None]
+    where = " and ".join(f"{p} ({getattr(photos, p).on[0].path})" for p in lacking or POSITIONS)
+    status = getattr(answer, (lacking or POSITIONS)[0]).status
+    advice = "; give pictures with the laser off, too" if pair.down_off is None else ""
+    return DatasetError(
+        f"no laser spot in the picture {where}: {status}; look whether the laser is on and its spot is seen in the "
+        f"mirror, and whether the picture is overexposed{advice}"
+    )
+
+
+def _contradiction(pair: Pair, photos: PairPhotos, status: str) -> DatasetError:
+    """Error of two spots that no point of the room gives."""
+    return _known_contradiction(pair, photos) or DatasetError(
+        f"the spots in {photos.down.on[0].path} and {photos.up.on[0].path} have no distance: their rays are {status}; "
+        "look whether both show the same spot, with camera and mirror moved together"
+    )
+
+
+def _known_contradiction(pair: Pair, photos: PairPhotos) -> DatasetError | None:
+    """Error of positions that are swapped or a stroke that is wrong, if the pictures show it."""
+    if _both(detect(_swapped(pair))):
+        return DatasetError(
+            f"down and up are swapped: the spot moves the wrong way from {photos.down.on[0].path} to "
+            f"{photos.up.on[0].path}, but the right one if they change places; give them to --down and --up the other "
+            "way round"
+        )
+    for stroke in (factor * pair.stroke_m for factor in _FACTORS):
+        if not LEAST_STROKE_M <= stroke <= MOST_STROKE_M:
+            continue
+        found = detect(replace(pair, stroke_m=stroke))
+        if found.down is None or found.up is None or not _both(found):
+            continue
+        uv = np.array(found.down.uv_px), np.array(found.up.uv_px)
+        per_m = float(depth_exact(pair.rig, stroke, *uv).depth_m) / stroke  # D grows with the stroke
+        return DatasetError(
+            f"the stroke contradicts the pictures: with {pair.stroke_m:.4g} m no point of a room, {NEAREST_M:g} to "
+            f"{FARTHEST_M:g} m away, is seen at both spots; a stroke of {NEAREST_M / per_m:.2g} to "
+            f"{FARTHEST_M / per_m:.2g} m is possible; give --stroke-m in metres"
+        )
+    return None
+
+
+def _both(found: PairDetection) -> bool:
+    return all(one is not None and one.significance >= _SURE_SIGMAS for one in (found.down, found.up))
+
+
+def _doubt(depth: GeneralDepth) -> str:
+    """Sentence on the test."""
+    p, chi2 = float(depth.p_value), float(depth.chi2)
+    if p >= DOUBTFUL_P:
+        return f"one point: chi^2 {chi2:.2f} for one degree of freedom (p = {p:.2g})"
+    return (
+        f"doubtful: the spots are not images of one point, chi^2 {chi2:.1f} for one degree of freedom (p = {p:.1e}); "
+        "one may be a reflection, the rig may have turned between the pictures, or the calibration is another rig's"
+    )

@@ -1,0 +1,125 @@
+"""Rig file: what a person has measured of a real rig, as a small TOML file.
+
+A rig file has the tables `[rig]`, `[rig.holder]` and `[laser]` of a recipe, with the same keys, so that they can be
+pasted. `[rig]` takes one key more, `fov_deg`, for a camera whose data sheet names no focal length. What is left out is
+that of the default rig, a C310 under a sphere of 60 mm. Without `[laser]` the size of the spot is not used.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import Field
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import SETTINGS_BYTES, InputFile
+from phibench.datasets.recipe.build import build_rig
+from phibench.datasets.recipe.distributions import Table
+from phibench.datasets.recipe.tables import LaserTable, RigTable
+from phibench.scenes.catalog import RIGS
+from phibench.scenes.laser import Beam
+from phibench.scenes.rig import Rig
+from phibench.scenes.validation import SceneError, structural_faults
+
+_REMEDY = "mend the file; docs/measure.md has an example"
+
+
+class MeasuredRigTable(RigTable):
+    """`[rig]` of a rig file."""
+
+    fov_deg: float | None = Field(
+        default=None, ge=5.0, le=150.0, description="horizontal field of view, degrees; instead of fx_px"
+    )
+
+
+class RigFile(Table):
+    """A rig file."""
+
+    rig: MeasuredRigTable = Field(default=MeasuredRigTable(), description="camera, mirror and stroke axis")
+    laser: LaserTable | None = Field(default=None, description="the laser; its diameter is used")
+
+
+@dataclass(frozen=True)
+class MeasuredRig:
+    """Rig of a file.
+
+    Attributes
+    ----------
+    rig : Rig
+        Nominal: what the person has measured.
+    beam : Beam or None
+        Diameter of the laser's spot by the distance, where the file says it.
+    """
+
+    rig: Rig
+    beam: Beam | None
+
+
+def read_rig_file(path: Path) -> MeasuredRig:
+    """Rig of a file.
+
+    Raises
+    ------
+    DatasetError
+        If the file cannot be read, has an unknown key or a value that is not allowed, or the rig cannot exist; in one
+        sentence.
+    """
+    file = InputFile(path, _REMEDY, limit_bytes=SETTINGS_BYTES)
+    raw = file.toml()
+    if faults := structural_faults(RigFile, raw):
+        raise file.fault("; ".join(str(fault) for fault in faults))
+    document = RigFile.model_validate(raw)
+    table = document.rig
+    if fault := _focal_fault(table):
+        raise file.fault(fault)
+    try:
+        rig = build_rig(_with_focal_length(table))
+    except SceneError as error:
+        raise file.fault(f"describes no rig: {error}") from error
+    return MeasuredRig(rig, None if document.laser is None else _beam(document.laser))
+
+
+def _focal_fault(table: MeasuredRigTable) -> str:
+    """Fault of the keys of the focal length; "" if there is none."""
+    focal = table.fx_px is not None or table.fy_px is not None
+    if focal and table.fov_deg is not None:
+        return "rig.fov_deg: the focal length is given twice, in pixels, too; keep fx_px or fov_deg"
+    camera = RIGS[table.preset]().camera
+    other = table.width_px not in (None, camera.width_px) or table.height_px not in (None, camera.height_px)
+    if other and not focal and table.fov_deg is None:
+        return (
+            f"rig.fx_px: missing; the focal length of {camera.width_px} x {camera.height_px} pixels does not hold for "
+            "another size; add fx_px or fov_deg"
+        )
+    return ""
+
+
+def _with_focal_length(table: MeasuredRigTable) -> RigTable:
+    if table.fov_deg is None:
+        return table
+    width = RIGS[table.preset]().camera.width_px if table.width_px is None else table.width_px
+    return table.model_copy(update={"fx_px": 0.5 * width / math.tan(math.radians(0.5 * table.fov_deg))})
+
+
+def _beam(laser: LaserTable) -> Beam:
+    if laser.diameter_m is not None:
+        return Beam(laser.diameter_m, 0.0)
+    return Beam(laser.diameter_base_m, laser.diameter_growth_m_per_m)
+
+
+def require_camera_size(rig: Rig, size_px: tuple[int, int], name: str) -> None:
+    """Refuse pictures of another size than the rig's camera.
+
+    Raises
+    ------
+    DatasetError
+        In one sentence.
+    """
+    camera = rig.camera
+    if size_px != (camera.width_px, camera.height_px):
+        raise DatasetError(
+            f"{name} has {size_px[0]} x {size_px[1]} pixels, the camera of the rig file {camera.width_px} x "
+            f"{camera.height_px}; write width_px, height_px and the focal length of this picture into [rig]"
+        )

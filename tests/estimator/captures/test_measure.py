@@ -1,0 +1,220 @@
+"""`phibench measure`: D from camera files, its standard deviation, and one sentence for every mistake."""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.camera_files import NAMES, write_pictures
+from PIL import Image
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.read import Sample, open_dataset
+from phibench.estimator.calibration.outline import Outline
+from phibench.estimator.captures.measure import PairPhotos, PositionPhotos, measure, read_setting
+from phibench.estimator.captures.picture_files import read_photo
+from phibench.estimator.cli.main import main
+from phibench.estimator.spots.image_planes import ImageError
+
+Files = dict[str, list[Path]]
+
+
+class Case:
+    """Camera files of the pair of `tests/tiny.toml` that is seen, three frames of each kind."""
+
+    def __init__(self, folder: Path, out: Path) -> None:
+        dataset = open_dataset(folder)
+        self.sample: Sample = next(s for s in dataset if s.row.down.visible and s.row.up.visible)
+        self.folder = out
+        self.jpg = write_pictures(dataset, self.sample, out, "mjpeg", 3)
+        self.raw = write_pictures(dataset, self.sample, out, "bayer-raw", 3)
+
+    def arguments(self, files: Files, stroke_m: float | None = None, names: tuple[str, ...] = NAMES) -> list[str]:
+        """Command line for the first frames."""
+        given = [word for name in names for word in (f"--{name.replace('_', '-')}", str(files[name][0]))]
+        stroke = self.sample.row.stroke_m if stroke_m is None else stroke_m
+        return ["measure", *given, "--stroke-m", str(stroke), "--rig", str(self.folder / "rig.toml")]
+
+
+@pytest.fixture(scope="module")
+def case(tiny_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Case:
+    return Case(tiny_dataset, tmp_path_factory.mktemp("pictures"))
+
+
+@pytest.fixture
+def unaligned(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No outline is looked for, which takes seconds: the rig is then as a ruler gives it."""
+
+    def nothing(*_: object) -> None:
+        raise ImageError("not looked for")
+
+    monkeypatch.setattr("phibench.estimator.captures.measure.find_outline", nothing)
+
+
+def refused(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> str:
+    """The one sentence with which a command ends."""
+    assert main(arguments) == 2
+    text = capsys.readouterr().err
+    assert len(text.strip().splitlines()) == 1
+    return text
+
+
+@pytest.mark.usefixtures("unaligned")
+def test_the_command_gives_d_and_a_picture(case: Case, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "found.png"
+    assert main([*case.arguments(case.raw), "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    depth, sigma = (float(x) for x in re.findall(r"D = ([\d.]+) m, sigma ([\d.]+) m", text)[0])
+    # 4 sigma: by chance in 6e-5 of all cases; and the sigma is of the size that the paper's rig has
+    assert abs(depth - case.sample.row.depth_m) < 4.0 * sigma
+    assert 0.001 < sigma < 0.4
+    for words in ("assumed", "one point", "errors of a ruler; no outline: not looked for"):
+        assert words in text
+    with Image.open(out) as picture:
+        assert picture.size[0] > 2 * 600
+
+
+def test_the_outline_corrects_the_rig_and_gives_the_blur(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    setting, true = read_setting(case.folder / "rig.toml"), case.sample.rig
+    # a mirror 2 mm further away than in the rig file, seen to 0.05 mm across and 0.1 mm along
+    s, C = true.sphere_in_camera_m + np.array([0.0, 0.0, 2e-3]), np.diag([5e-5, 5e-5, 1e-4]) ** 2
+    outline = Outline(s, C, 1.0, 1.0, 0.9, 0.1, 1000, 5)
+    monkeypatch.setattr("phibench.estimator.captures.measure.find_outline", lambda *_: outline)
+    read = {name: (read_photo(paths[0], setting.known.rig),) for name, paths in case.raw.items()}
+    photos = PairPhotos(PositionPhotos(read["down"], read["down_off"]), PositionPhotos(read["up"], read["up_off"]))
+    found = measure(photos, case.sample.row.stroke_m, setting)
+    # the outline says |s| / R only: most of it goes into the distance, whose ruler is the worst
+    assert 1e-3 < found.rig.sphere_in_camera_m[2] - setting.known.rig.sphere_in_camera_m[2] < 2e-3
+    assert found.rig.camera.blur_sigma_px == 0.9
+    assert any("corrected by the mirror's outline" in note for note in found.notes)
+
+
+@pytest.mark.usefixtures("unaligned")
+def test_frames_of_dn_are_added_up_and_sigma_falls(case: Case) -> None:
+    setting = read_setting(case.folder / "rig.toml")
+    read = {name: [read_photo(path, setting.known.rig) for path in paths] for name, paths in case.raw.items()}
+
+    def spots(count: int) -> tuple[float, float]:
+        groups = {name: tuple(photos[:count]) for name, photos in read.items()}
+        photos = PairPhotos(
+            PositionPhotos(groups["down"], groups["down_off"]), PositionPhotos(groups["up"], groups["up_off"])
+        )
+        found = measure(photos, case.sample.row.stroke_m, setting)
+        return float(found.depth.sigma_spot_m), abs(found.depth_m - case.sample.row.depth_m) / found.sigma_m
+
+    (one, _), (three, pull) = spots(1), spots(3)
+    # sqrt(3) for pure noise; the responsivity's pattern does not average, the fit's own misfit scatters
+    assert 1.3 < one / three < 2.0
+    assert pull < 4.0
+
+
+@pytest.mark.usefixtures("unaligned")
+def test_jpeg_frames_are_combined(case: Case, capsys) -> None:
+    several = [word for name in NAMES for word in (f"--{name.replace('_', '-')}", *map(str, case.jpg[name]))]
+    stroke = ["--stroke-m", str(case.sample.row.stroke_m), "--rig", str(case.folder / "rig.toml")]
+    assert main(["measure", *several, *stroke]) == 0
+    text = capsys.readouterr().out
+    depth, sigma = (float(x) for x in re.findall(r"D = ([\d.]+) m, sigma ([\d.]+) m", text)[0])
+    assert abs(depth - case.sample.row.depth_m) < 4.0 * sigma
+    assert "3 of each position" in text
+
+
+@pytest.mark.usefixtures("unaligned")
+def test_swapped_positions_are_told(case: Case, capsys) -> None:
+    swapped = {"down": case.raw["up"], "up": case.raw["down"]}
+    swapped |= {"down_off": case.raw["up_off"], "up_off": case.raw["down_off"]}
+    assert "swapped" in refused(capsys, case.arguments(swapped))
+
+
+@pytest.mark.usefixtures("unaligned")
+def test_a_stroke_in_centimetres_is_told(case: Case, capsys) -> None:
+    text = refused(capsys, case.arguments(case.raw, 0.01 * case.sample.row.stroke_m))
+    assert "stroke contradicts" in text
+    low, high = (float(x) for x in re.findall(r"a stroke of ([\d.e-]+) to ([\d.e-]+) m", text)[0])
+    assert low < case.sample.row.stroke_m < high
+
+
+@pytest.mark.usefixtures("unaligned")
+def test_a_laser_that_is_off_is_told(case: Case, capsys) -> None:
+    dark = {"down": case.raw["down_off"][1:], "up": case.raw["up_off"][1:]}
+    dark |= {"down_off": case.raw["down_off"], "up_off": case.raw["up_off"]}
+    assert "no laser spot" in refused(capsys, case.arguments(dark))
+
+
+def test_the_same_picture_twice_is_told(case: Case, capsys) -> None:
+    files = {"down": case.jpg["down"], "up": case.jpg["down"]}
+    assert "the same picture" in refused(capsys, case.arguments(files, names=("down", "up")))
+
+
+def test_pictures_of_two_cameras_are_told(case: Case, tmp_path: Path, capsys) -> None:
+    names = ("down", "up")
+    with Image.open(case.jpg["up"][0]) as picture:
+        smaller, coarser, other = (tmp_path / f"{name}.jpg" for name in ("smaller", "coarser", "other"))
+        picture.resize((160, 90)).save(smaller, subsampling="4:2:2")
+        picture.save(coarser, quality=30, subsampling="4:2:2")
+        exif = Image.Exif()
+        exif[0x0110] = "Another"
+        picture.save(other, exif=exif, qtables=picture.quantization, subsampling="4:2:2")
+    for path, word in ((smaller, "size"), (coarser, "quantisation tables"), (other, "Another")):
+        assert word in refused(capsys, case.arguments({**case.jpg, "up": [path]}, names=names))
+    assert "kind" in refused(capsys, case.arguments({**case.jpg, "up": case.raw["up"]}, names=names))
+
+
+def test_a_picture_turned_by_exif_and_no_picture_are_told(case: Case, tmp_path: Path, capsys) -> None:
+    exif, turned, none = Image.Exif(), tmp_path / "turned.jpg", tmp_path / "none.jpg"
+    exif[0x0112] = 6
+    with Image.open(case.jpg["up"][0]) as picture:
+        picture.save(turned, exif=exif, quality=85, subsampling="4:2:2")
+    none.write_text("no picture at all")
+    for path, word in ((turned, "turned by EXIF"), (none, "is not a picture"), (tmp_path / "gone.jpg", "is missing")):
+        assert word in refused(capsys, case.arguments({**case.jpg, "up": [path]}, names=("down", "up")))
+
+
+def test_pictures_of_another_size_than_the_rigs_are_told(case: Case, tmp_path: Path, capsys) -> None:
+    rig = tmp_path / "rig.toml"
+    rig.write_text("[rig]\n")
+    arguments = [str(rig) if word.endswith("rig.toml") else word for word in case.arguments(case.jpg)]
+    assert "320 x 180 pixels, the camera of the rig file 1280 x 720" in refused(capsys, arguments)
+
+
+def test_a_pgm_and_a_headerless_file_hold_the_same_dn(case: Case, tmp_path: Path) -> None:
+    setting = read_setting(case.folder / "rig.toml")
+    with Image.open(case.raw["down"][0]) as picture:
+        dn = np.array(picture).astype(np.uint16)
+    (tmp_path / "a.pgm").write_bytes(b"P5\n# a camera's\n320 180\n1023\n" + dn.astype(">u2").tobytes())
+    (tmp_path / "a.raw").write_bytes(dn.astype("<u2").tobytes())
+    (tmp_path / "sensor.toml").write_text('preset = "bayer-raw"\nread_noise_e = 5.0\n')
+    known = read_setting(case.folder / "rig.toml", sensor=tmp_path / "sensor.toml")
+    assert known.sensor is not None
+    assert known.sensor.read_noise_e == 5.0
+    for path in (tmp_path / "a.pgm", tmp_path / "a.raw"):
+        assert np.array_equal(read_photo(path, known.known.rig, known.sensor).pixels, dn)
+    with pytest.raises(DatasetError, match="headerless"):
+        read_photo(tmp_path / "a.raw", setting.known.rig)
+    (tmp_path / "b.raw").write_bytes(dn.tobytes()[:-2])
+    with pytest.raises(DatasetError, match="bytes"):
+        read_photo(tmp_path / "b.raw", known.known.rig, known.sensor)
+    for head in (b"P5 320 180 1023 ", b"P5 0 0 1023\n", b"P5 99999999 9 9\n", b"P5\n"):
+        (tmp_path / "b.pgm").write_bytes(head + bytes(3))
+        with pytest.raises(DatasetError, match="PGM"):
+            read_photo(tmp_path / "b.pgm", setting.known.rig)
+
+
+def test_a_sensor_file_of_another_kind_is_told(case: Case, tmp_path: Path, capsys) -> None:
+    sensor = tmp_path / "sensor.toml"
+    for text, word in (
+        ('preset = "bayer-raw"\n', "picture of the kind 'mjpeg'"),
+        ("read_noise_e = -1.0\n", "read_noise_e"),
+        ("nonsense", "TOML"),
+    ):
+        sensor.write_text(text)
+        assert word in refused(capsys, [*case.arguments(case.jpg), "--sensor", str(sensor)])
+
+
+def test_a_grey_jpeg_is_told(case: Case, tmp_path: Path, capsys) -> None:
+    with Image.open(io.BytesIO(case.jpg["up"][0].read_bytes())) as picture:
+        picture.convert("L").save(tmp_path / "grey.jpg")
+    assert "mode L" in refused(capsys, case.arguments({**case.jpg, "up": [tmp_path / "grey.jpg"]}))
