@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
-from phibench.datasets.input_files import SETTINGS_BYTES, InputFile
-from phibench.render.sensor.settings import Sensor, SensorError, sensor
+from phibench.render.sensor.settings import Sensor, sensor
 
 
 @dataclass(frozen=True)
@@ -110,22 +108,3 @@ def sensor_card(preset: str = "bayer-raw", **changes: Any) -> SensorCard:
 def card_of(s: Sensor) -> SensorCard:
     """Card of a sensor."""
     return SensorCard(**{name: getattr(s, name) for name in SensorCard.__dataclass_fields__})
-
-
-def read_sensor_file(path: Path) -> Sensor:
-    """Sensor of a TOML file: fields of `Sensor`, besides `preset`, the one that the rest is taken from.
-
-    Raises
-    ------
-    DatasetError
-        If the file cannot be read, or holds what is no sensor; in one sentence.
-    """
-    file = InputFile(path, "make it again with `phibench sensor fit`", limit_bytes=SETTINGS_BYTES)
-    raw = file.toml()
-    preset = raw.pop("preset", "mjpeg")
-    if not isinstance(preset, str):
-        raise file.fault("preset: give the name of a preset, such as 'mjpeg'")
-    try:
-        return sensor(preset, **{name: value for name, value in raw.items() if name != "name"})
-    except SensorError as error:
-        raise file.fault(f"holds no sensor: {error}") from error

@@ -24,7 +24,8 @@ from pathlib import Path
 import numpy as np
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.frames.sensor_card import SensorCard, card_of, read_sensor_file
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
 from phibench.estimator.calibration.bundle import calibrate
 from phibench.estimator.calibration.file import Calibration, read_calibration
 from phibench.estimator.calibration.limb_image import Measured
@@ -97,15 +98,14 @@ class Setting:
     ----------
     known : MeasuredRig
     calibration : Calibration or None
-    sensor : SensorCard or None
-        Of a sensor file.
+    sensor : SensorFile or None
     stroke_sigma_m : float
         Of a single stroke, besides what the calibration says of all strokes.
     """
 
     known: MeasuredRig
     calibration: Calibration | None = None
-    sensor: SensorCard | None = None
+    sensor: SensorFile | None = None
     stroke_sigma_m: float = 0.0
 
 
@@ -123,7 +123,7 @@ def read_setting(
     held = None if calibration is None else read_calibration(calibration, known.rig)
     if not 0.0 <= stroke_sigma_m <= MOST_STROKE_M:
         raise DatasetError(f"the stroke's standard deviation is {stroke_sigma_m:g} m: must be 0 or above")
-    return Setting(known, held, None if sensor is None else card_of(read_sensor_file(sensor)), stroke_sigma_m)
+    return Setting(known, held, None if sensor is None else read_sensor_file(sensor), stroke_sigma_m)
 
 
 @dataclass(frozen=True)

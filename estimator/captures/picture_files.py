@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from PIL import Image as Picture
 from PIL import JpegImagePlugin
 
-from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
+from phibench.datasets.frames.sensor_card import SensorCard, card_of, sensor_card
+from phibench.datasets.frames.sensor_file import SensorFile
 from phibench.datasets.input_files import PICTURE_PIXELS, InputFile
 from phibench.estimator.interface import Image
 from phibench.estimator.spots.image_planes import ImageError
@@ -70,7 +71,7 @@ class Photo:
 # -- reading ---------------------------------------------------------------------------------------------------------
 
 
-def read_photo(path: Path, rig: Rig, given: SensorCard | None = None) -> Photo:
+def read_photo(path: Path, rig: Rig, given: SensorFile | None = None) -> Photo:
     """Picture of a file.
 
     Parameters
@@ -78,7 +79,7 @@ def read_photo(path: Path, rig: Rig, given: SensorCard | None = None) -> Photo:
     path : Path
     rig : Rig
         Of headerless raw files: their width and height.
-    given : SensorCard, optional
+    given : SensorFile, optional
         Of a sensor file: the bits of headerless raw files.
 
     Raises
@@ -144,19 +145,20 @@ def _pgm(file: InputFile, data: bytes) -> NDArray[np.uint16]:
     return np.frombuffer(data, kind, offset=head.end()).reshape(height, width).astype(np.uint16)
 
 
-def _headerless(file: InputFile, data: bytes, rig: Rig, given: SensorCard | None) -> NDArray[np.uint16]:
+def _headerless(file: InputFile, data: bytes, rig: Rig, given: SensorFile | None) -> NDArray[np.uint16]:
     if given is None:
         raise file.fault("is headerless: its bits and black level are in no file; give them with --sensor")
     width, height = rig.camera.width_px, rig.camera.height_px
-    kind = np.dtype(np.uint8) if given.top_dn < 256 else np.dtype("<u2")
+    top_dn = given.sensor("bayer-raw").top_dn
+    kind = np.dtype(np.uint8) if top_dn < 256 else np.dtype("<u2")
     if len(data) != width * height * kind.itemsize:
         raise file.fault(
             f"has {len(data)} bytes: {width} x {height} pixels of the rig file in {8 * kind.itemsize} bits are "
             f"{width * height * kind.itemsize}"
         )
     pixels = np.frombuffer(data, kind).reshape(height, width).astype(np.uint16)
-    if pixels.max(initial=0) > given.top_dn:
-        raise file.fault(f"has DN up to {pixels.max()}: the sensor file's end at {given.top_dn}")
+    if pixels.max(initial=0) > top_dn:
+        raise file.fault(f"has DN up to {pixels.max()}: the sensor file's end at {top_dn}")
     return pixels
 
 
@@ -217,36 +219,43 @@ class SensorChoice:
 
 
 _PRESET = {"jpeg": "mjpeg", "rgb": "srgb8", "raw": "bayer-raw"}
-_OUTPUT = {"jpeg": "mjpeg", "rgb": "srgb8", "raw": "raw"}
+_ALSO = {"rgb": ("yuyv",), "raw": ("mono-raw",)}
 
 
-def sensor_choice(photo: Photo, given: SensorCard | None = None) -> SensorChoice:
+def sensor_choice(photo: Photo, given: SensorFile | None = None) -> SensorChoice:
     """Sensor of a picture: of the sensor file, or the preset of its kind; JPEG tables are always the picture's own.
+
+    The chain of a sensor file ends where the kind of picture says: a file that was fitted to DN holds for the same
+    camera's JPEG, too.
 
     Raises
     ------
     ImageError
-        If the sensor of the file does not deliver such pictures.
+        If the picture's DN are beyond the sensor's, or the file's numbers allow no such picture.
     """
-    chosen, source = given, "sensor file"
-    if chosen is None:
-        chosen, source = sensor_card(_PRESET[photo.kind]), f"assumed, preset {_PRESET[photo.kind]}"
-    if chosen.output != _OUTPUT[photo.kind]:
+    preset = _PRESET[photo.kind]
+    if given is None:
+        card, source = sensor_card(preset), f"assumed, preset {preset}"
+    else:
+        preset = given.preset if given.preset in _ALSO.get(photo.kind, ()) else preset
+        card, source = card_of(given.sensor(preset)), f"of the sensor file, as {preset}"
+    if photo.kind == "raw" and photo.pixels.max(initial=0) > card.top_dn:
         raise ImageError(
-            f"{photo.path} is a picture of the kind '{_OUTPUT[photo.kind]}', the sensor file is of '{chosen.output}'; "
-            "give the sensor file of this kind of picture"
-        )
-    if photo.kind == "raw" and photo.pixels.max(initial=0) > chosen.top_dn:
-        raise ImageError(
-            f"{photo.path} has DN up to {photo.pixels.max()}: the sensor's end at {chosen.top_dn}; give the "
-            "camera's bits and black level with --sensor"
+            f"{photo.path} has DN up to {photo.pixels.max()}: the sensor's end at {card.top_dn}; give the camera's "
+            "bits and black level with --sensor"
         )
     text = "" if given is not None else "; the covariance is widened by the fit's misfit where that is above 1"
     if photo.subsampling is not None:
         quality, off = nearest_quality(photo.tables)
-        chosen = replace(chosen, jpeg_quality=quality, jpeg_subsampling=photo.subsampling)
-        text = f", JPEG quality {quality}{'' if off == 0.0 else ' (nearest; tables of its own)'}{text}"
-    return SensorChoice(chosen, given is None, f"sensor: {source}{text}")
+        luma, chroma = photo.tables[0], photo.tables[min(1, len(photo.tables) - 1)]
+        own = None if off == 0.0 else (_steps(luma), _steps(chroma))
+        card = replace(card, jpeg_quality=quality, jpeg_subsampling=photo.subsampling, jpeg_qtables=own)
+        text = f", JPEG quality {quality}{'' if own is None else ' (about: tables of its own)'}{text}"
+    return SensorChoice(card, given is None, f"sensor: {source}{text}")
+
+
+def _steps(table: Array) -> tuple[int, ...]:
+    return tuple(int(step) for step in table.ravel())
 
 
 def nearest_quality(tables: Sequence[Array]) -> tuple[int, float]:

@@ -189,7 +189,7 @@ def test_a_pgm_and_a_headerless_file_hold_the_same_dn(case: Case, tmp_path: Path
     (tmp_path / "sensor.toml").write_text('preset = "bayer-raw"\nread_noise_e = 5.0\n')
     known = read_setting(case.folder / "rig.toml", sensor=tmp_path / "sensor.toml")
     assert known.sensor is not None
-    assert known.sensor.read_noise_e == 5.0
+    assert known.sensor.sensor().read_noise_e == 5.0
     for path in (tmp_path / "a.pgm", tmp_path / "a.raw"):
         assert np.array_equal(read_photo(path, known.known.rig, known.sensor).pixels, dn)
     with pytest.raises(DatasetError, match="headerless"):
@@ -203,10 +203,10 @@ def test_a_pgm_and_a_headerless_file_hold_the_same_dn(case: Case, tmp_path: Path
             read_photo(tmp_path / "b.pgm", setting.known.rig)
 
 
-def test_a_sensor_file_of_another_kind_is_told(case: Case, tmp_path: Path, capsys) -> None:
+def test_a_faulty_sensor_file_is_told(case: Case, tmp_path: Path, capsys) -> None:
     sensor = tmp_path / "sensor.toml"
     for text, word in (
-        ('preset = "bayer-raw"\n', "picture of the kind 'mjpeg'"),
+        ('preset = "film"\n', "no sensor preset 'film'"),
         ("read_noise_e = -1.0\n", "read_noise_e"),
         ("nonsense", "TOML"),
     ):
