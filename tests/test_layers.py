@@ -44,6 +44,7 @@ estimator/pair_set
 estimator/truth_file
 estimator/geometry
 estimator/spots
+estimator/sensor_fit
 estimator/limits estimator/methods
 estimator/draw_pairs
 estimator/calibration

@@ -30,6 +30,7 @@ from phibench.estimator.cli.options import INSTALLATION, METHODS, SENSOR, answer
 from phibench.estimator.cli.room import room
 from phibench.estimator.cli.score import bench, compare, report, score
 from phibench.estimator.cli.seal import seal
+from phibench.estimator.cli.sensor import sensor
 from phibench.estimator.cli.studies import paper, study
 
 app = App(
@@ -38,7 +39,7 @@ app = App(
     suppress_keyboard_interrupt=False,
     result_action="return_value",
 )
-for _group in (dataset, room, method, seal, study):
+for _group in (dataset, room, method, seal, sensor, study):
     app.command(_group)
 app.command(score, group=METHODS)
 app.command(bench, group=METHODS)

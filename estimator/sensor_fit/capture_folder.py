@@ -1,0 +1,260 @@
+"""Folder of frames from which a sensor is measured: dark, flat, exposure series, edges, chessboards.
+
+    capture.toml               optional: what the files do not say
+    dark/*                     lens capped
+    flat/LEVEL/*               an even surface; LEVEL is any name, two frames or more of each
+    exposure/SECONDS/*         the same surface, lamp unchanged; SECONDS is a number
+    dark-exposure/SECONDS/*    lens capped
+    edge/*                     straight edges, 2 to 15 degrees from rows or columns
+    chessboard/*               views of one chessboard
+
+Files are PNG or PGM with one plane of up to 16 bits (raw), headerless YUYV (`.yuyv`), PNG with R, G, B, or the camera's
+JPEG. `docs/capture.py` writes such a folder.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import SETTINGS_BYTES, InputFile
+from phibench.datasets.store.schema import Document
+from phibench.scenes.frames import Array
+from phibench.scenes.validation import printable_line
+
+Kind = Literal["bayer-raw", "mono-raw", "yuyv", "srgb8", "mjpeg"]
+RAW = ("bayer-raw", "mono-raw")
+MANIFEST = "capture.toml"
+_SUFFIXES = (".png", ".pgm", ".yuyv", ".jpg", ".jpeg")
+_DRIFT = 0.02  # of the signal, from the first to the last frame of one level
+_DRIFT_SIGMAS = 8.0
+_FRAME_BYTES = 512 * 2**20
+
+
+class CaptureError(DatasetError):
+    """A folder of frames that cannot be used; the message is one sentence for the person at the terminal."""
+
+
+class CaptureNotes(Document):
+    """`capture.toml`: what the files do not say."""
+
+    camera: str = Field(default="", max_length=200)
+    format: Kind | None = None
+    width_px: int | None = Field(default=None, ge=8, le=16384)
+    height_px: int | None = Field(default=None, ge=8, le=16384)
+    bits: int = Field(default=10, ge=8, le=16)
+    exposure_s: float | None = Field(default=None, gt=0.0, le=60.0)
+    analogue_gain: float = Field(default=1.0, ge=1.0, le=16.0)
+    board_columns: int | None = Field(default=None, ge=3, le=100)
+    board_rows: int | None = Field(default=None, ge=3, le=100)
+    board_square_m: float | None = Field(default=None, gt=0.0, le=1.0)
+    controls: dict[str, int | float | str] = Field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FrameGroup:
+    """Files of one level, exposure time or subject.
+
+    Attributes
+    ----------
+    name : str
+        Its folder below the capture, such as "flat/03".
+    files : tuple of Path
+        By name.
+    seconds : float or None
+        Exposure time that the folder's name states.
+    """
+
+    name: str
+    files: tuple[Path, ...]
+    seconds: float | None = None
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A folder of frames, looked through but not read.
+
+    Attributes
+    ----------
+    folder : Path
+    notes : CaptureNotes
+    kind : str
+        Format of its frames, see `Kind`.
+    dark : FrameGroup or None
+    flats, exposures, dark_exposures : tuples of FrameGroup
+    edges, chessboards : FrameGroup or None
+    """
+
+    folder: Path
+    notes: CaptureNotes
+    kind: Kind
+    size: tuple[int, int]
+    dark: FrameGroup | None
+    flats: tuple[FrameGroup, ...] = ()
+    exposures: tuple[FrameGroup, ...] = ()
+    dark_exposures: tuple[FrameGroup, ...] = ()
+    edges: FrameGroup | None = None
+    chessboards: FrameGroup | None = None
+    _count: int = field(default=0)
+
+    @property
+    def frames(self) -> int:
+        """Number of files."""
+        return self._count
+
+    def read(self, path: Path) -> NDArray[Any]:
+        """One frame: raw (h, w); yuyv (h, w, 2), Y' and in turns Cb, Cr; others (h, w, 3).
+
+        Raises
+        ------
+        CaptureError
+            If the file is no frame of the capture's kind and size.
+        """
+        kind, image = read_frame(path, self.notes)
+        if (kind in RAW) != (self.kind in RAW) or (kind not in RAW and kind != self.kind):
+            raise CaptureError(f"{path} is {kind} and the first frame {self.kind}: a folder holds one format")
+        if image.shape[:2] != self.size:
+            (h, w), (height, width) = image.shape[:2], self.size
+            raise CaptureError(
+                f"{path} has {w} x {h} pixels and the first frame {width} x {height}: a folder holds one size"
+            )
+        return image
+
+    def stack(self, group: FrameGroup) -> NDArray[Any]:
+        """All frames of a group that must not have changed, first axis the frame.
+
+        Raises
+        ------
+        CaptureError
+            If there is one frame only, or the level drifts.
+        """
+        if len(group.files) < 2:
+            raise CaptureError(
+                f"{self.folder / group.name} has one frame: noise needs two or more of each level, better 16"
+            )
+        frames = np.stack([self.read(path) for path in group.files])
+        self._refuse_drift(group, frames)
+        return frames
+
+    def _refuse_drift(self, group: FrameGroup, frames: NDArray[Any]) -> None:
+        values = frames[..., 0] if self.kind == "yuyv" else frames
+        means = values.reshape(len(values), -1).mean(axis=1)
+        noise = float((values[1].astype(float) - values[0]).std()) / np.sqrt(0.5 * values[0].size)
+        low, high = float(means.min()), float(means.max())
+        # an exposure that the camera changes moves all pixels; single lines of noise move the mean by far less
+        if high - low > max(_DRIFT * high, _DRIFT_SIGMAS * noise):
+            raise CaptureError(
+                f"{self.folder / group.name}: the mean goes from {low:.1f} to {high:.1f} within one level; switch auto "
+                "exposure, auto gain and auto white balance off, and let lamp and camera warm up"
+            )
+
+
+def open_capture(folder: Path) -> Capture:
+    """Look a folder through.
+
+    Raises
+    ------
+    CaptureError
+        If there is no such folder, it has no frames, or its notes are not valid.
+    """
+    if not folder.is_dir():
+        raise CaptureError(f"{folder} is no folder: give one with dark/, flat/LEVEL/ and others, see docs/capture.md")
+    notes = _notes(folder / MANIFEST)
+    groups = {
+        "dark": _group(folder, "dark"),
+        "edges": _group(folder, "edge"),
+        "chessboards": _group(folder, "chessboard"),
+    }
+    series = {
+        "flats": tuple(_series(folder, "flat", False)),
+        "exposures": tuple(_series(folder, "exposure", True)),
+        "dark_exposures": tuple(_series(folder, "dark-exposure", True)),
+    }
+    every = [g for g in groups.values() if g is not None] + [g for many in series.values() for g in many]
+    if not every:
+        raise CaptureError(
+            f"{folder} has no frames: put them into dark/, flat/LEVEL/, exposure/SECONDS/, edge/ or chessboard/ as "
+            f"{', '.join(_SUFFIXES)}"
+        )
+    kind, first = read_frame(every[0].files[0], notes)
+    count = sum(len(group.files) for group in every)
+    size = (first.shape[0], first.shape[1])
+    return Capture(folder, notes, kind, size, **groups, **series, _count=count)  # type: ignore[arg-type]
+
+
+def read_frame(path: Path, notes: CaptureNotes) -> tuple[Kind, NDArray[Any]]:
+    """One frame with its kind: see `Capture.read`."""
+    file = InputFile(path, "give the camera's own frame", CaptureError, _FRAME_BYTES)
+    if path.suffix.lower() == ".yuyv":
+        return "yuyv", _yuyv(file, notes)
+    picture = file.picture(("PNG", "PPM", "JPEG"))
+    if picture.format == "JPEG":
+        return "mjpeg", np.asarray(picture.convert("RGB"))
+    if picture.mode in ("I;16", "I", "I;16B", "L"):
+        values = np.asarray(picture).astype(np.uint16)
+        if notes.format in (None, *RAW):
+            return ("mono-raw" if notes.format == "mono-raw" else "bayer-raw"), values
+        raise file.fault(f"has one plane, and {MANIFEST} says {notes.format}")
+    if picture.mode == "LA":
+        return "yuyv", np.asarray(picture)
+    if picture.mode == "RGB":
+        return "srgb8", np.asarray(picture)
+    raise file.fault(f"has the mode {picture.mode}: one plane (raw), two (YUYV) or R, G, B are read")
+
+
+def _yuyv(file: InputFile, notes: CaptureNotes) -> NDArray[np.uint8]:
+    data = file.read()
+    if notes.width_px is None or notes.height_px is None:
+        raise file.fault(f"has no header: write width_px and height_px into {MANIFEST}")
+    if len(data) != 2 * notes.width_px * notes.height_px:
+        raise file.fault(
+            f"has {len(data)} bytes, and YUYV of {notes.width_px} x {notes.height_px} has "
+            f"{2 * notes.width_px * notes.height_px}"
+        )
+    return np.frombuffer(data, np.uint8).reshape(notes.height_px, notes.width_px, 2)
+
+
+def _notes(path: Path) -> CaptureNotes:
+    if not path.exists():
+        return CaptureNotes()
+    file = InputFile(path, "docs/capture.md has an example", CaptureError, SETTINGS_BYTES)
+    return file.validated(CaptureNotes, file.toml())
+
+
+def _group(folder: Path, name: str, seconds: float | None = None) -> FrameGroup | None:
+    place = folder / name
+    if not place.is_dir():
+        return None
+    files = tuple(sorted(p for p in place.iterdir() if p.suffix.lower() in _SUFFIXES and p.is_file()))
+    return FrameGroup(name, files, seconds) if files else None
+
+
+def _series(folder: Path, name: str, timed: bool) -> Iterator[FrameGroup]:
+    place = folder / name
+    for level in sorted(place.iterdir()) if place.is_dir() else []:
+        seconds = _seconds(level) if timed and level.is_dir() else None
+        if level.is_dir() and (found := _group(folder, f"{name}/{level.name}", seconds)):
+            yield found
+
+
+def _seconds(level: Path) -> float:
+    if not re.fullmatch(r"\d+(\.\d+)?(e-?\d+)?", level.name) or not 0.0 < float(level.name) <= 60.0:
+        raise CaptureError(
+            f"{printable_line(str(level))}: the folder's name must be its exposure time, seconds, such as 0.0100"
+        )
+    return float(level.name)
+
+
+def luma(image: NDArray[Any], kind: Kind) -> Array:
+    """Y' of a processed frame, shape (h, w), BT.601, on 0 to 255 (that of YUYV as it is)."""
+    if kind == "yuyv":
+        return image[..., 0].astype(float)
+    return np.asarray(image.astype(float) @ np.array([0.299, 0.587, 0.114]))
