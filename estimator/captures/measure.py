@@ -214,7 +214,7 @@ def measure(photos: PairPhotos, stroke_m: float, setting: Setting) -> Measuremen
     for photo in photos.all:
         sensor_choice(photo, setting.sensor)
     pairs = _pairs(photos, stroke_m, setting.known, chosen.card)
-    outlines, missing = _outlines(pairs[0])
+    outlines, missing = _outlines(pairs[0], setting.calibration is not None)
     rig, covariance, values, note = _corrected(setting, outlines, missing)
     rig = with_blur_of(rig, outlines)
     stroke = float(stroke_of(np.array(stroke_m), values))
@@ -305,10 +305,13 @@ def _frames_note(photos: PairPhotos, card: SensorCard) -> str:
 # -- rig -------------------------------------------------------------------------------------------------------------
 
 
-def _outlines(pair: Pair) -> tuple[tuple[Outline, ...], str]:
-    """Outlines of both positions, laser off where there is such a picture; and why there is none."""
+def _outlines(pair: Pair, calibrated: bool) -> tuple[tuple[Outline, ...], str]:
+    """Outlines of both positions, laser off where there is such a picture; and why there is none.
+
+    With a calibration one is enough: it only tells whether the mirror is still there.
+    """
     found, why = [], ""
-    for position in POSITIONS:
+    for position in POSITIONS[: 1 if calibrated else 2]:
         image = pair.images.get(f"{position}_off", pair.images[position])
         try:
             found.append(find_outline(image, pair.rig, pair.card))
