@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, optimize
 from skimage.measure import block_reduce
 
-from phibench.estimator.calibration.edge_ring import CURVES, PEAKS, TURNS, Circle, EdgeRing, log_colours
+from phibench.estimator.calibration.edge_ring import CURVES, PEAKS, TURNS, Circle, EdgeRing, LimbRing, log_colours
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array
 
@@ -33,12 +33,14 @@ LEAST_LEAD = 1.9  # over the next curve
 MOST_SIGMA = 0.01  # of the radius
 SIZES = (0.14, 0.75)  # radii over the short side
 _FLOOR_PX = 0.4  # of an edge's place in the small picture: inside the limb the room is squeezed into fractions of it
+_LIMB_FLOOR_PX = (0.1, 0.1, 0.3)  # of u, v, radius: a plate's edge lies a pixel inside the limb, all around
+_LIMB_SHARED = 0.6  # part of the scatter of its places that neighbours share
+_LIMB_ROUNDS = ((24.0, 1.5), (14.0, 1.0), (8.0, 0.7))  # reach, and how near a limb's place must be to a circle, pixels
 _VOTE_PX, _LEAST_SIDE, _CANDIDATES, _SETTLED = 256, 16, 30, 6
 _ELLIPSE = 0.01  # standard deviation of e1 and e2 over the radius: a sphere 8 degrees off the axis
 _DRAWS, _NEAR_PX, _NEAR_REACH_PX = 400, 1.5, 12.0
 _SCALES = (6.0, 3.0, 2.0, 1.5, 1.5, 1.5)  # of the robust weights, in steps
 _SECTORS = 12
-_ALIKE = 0.5
 _OVERWHELMING = 2.5
 _SAME_PX, _SAME = 3.0, 0.04  # pixels, and parts of the radius
 
@@ -312,7 +314,7 @@ def _least_squares(
         off = place - (CURVES @ curve)[:, None]
         near = np.maximum(1.0 - (off / (2.0 * scale)) ** 2, 0.0) ** 2 * weight
         # the room is squeezed to edges inside the limb, not outside it: of edges alike, the outer one
-        alike = near >= _ALIKE * near.max(axis=1, keepdims=True)
+        alike = near >= ring.alike * near.max(axis=1, keepdims=True)
         best = np.argmax(np.where(alike & (near > 0.0), place, -np.inf), axis=1)
         w = near[rows, best] if used is None else near[rows, best] * used
         curve = np.linalg.solve((CURVES.T * w) @ CURVES + prior, CURVES.T @ (w * place[rows, best]))
@@ -326,18 +328,67 @@ def _measured(best: _Curve, next_contrast: float, block: int) -> BallCircle:
         near = EdgeRing(ring.channels, ring.circle, _NEAR_REACH_PX)
         ring, curve = ring.moved(_least_squares(near, curve, _SCALES)[0])
     near = EdgeRing(ring.channels, ring.circle, _NEAR_REACH_PX)
-    curve, off = _least_squares(near, curve, _SCALES)
+    return _with_covariance(
+        contrast, near, curve, _SCALES, (_FLOOR_PX,) * 3, block, contrast / max(next_contrast, 1e-9)
+    )
+
+
+def _with_covariance(
+    contrast: float,
+    ring: EdgeRing,
+    curve: Array,
+    scales_px: tuple[float, ...],
+    floor_px: tuple[float, float, float],
+    block: int,
+    lead: float,
+) -> BallCircle:
+    curve, off = _least_squares(ring, curve, scales_px)
     left: list[Array] = []
     for sector in range(_SECTORS):
         used = np.ones(TURNS)
         used[sector * TURNS // _SECTORS : (sector + 1) * TURNS // _SECTORS] = 0.0
-        left.append(_least_squares(near, curve, _SCALES[1:], used)[0])
+        left.append(_least_squares(ring, curve, scales_px[1:], used)[0])
     spread = np.array(left)[:, [1, 2, 0]]
     spread = spread - spread.mean(axis=0)
-    covariance = (_SECTORS - 1) / _SECTORS * spread.T @ spread + _FLOOR_PX**2 * np.eye(3)
+    covariance = (_SECTORS - 1) / _SECTORS * spread.T @ spread + np.diag(floor_px) ** 2
     ring, curve = ring.moved(curve)
     u, v, radius = ring.circle
     whole = ((u + 0.5) * block - 0.5, (v + 0.5) * block - 0.5, radius * block)
     ellipse = (float(curve[3]) * block, float(curve[4]) * block)
-    lead = contrast / max(next_contrast, 1e-9)
     return BallCircle(whole, ellipse, covariance * block**2, contrast, lead, off * block)
+
+
+# Limbs.
+
+
+def on_limb(light: NDArray[Any], near: Circle, blur_px: float) -> BallCircle | None:
+    """The limb of a reflection beside a circle, where the room's edges inside it may be the clearer ones.
+
+    Long pictures are made smaller first, to at most 2048 px.
+
+    Parameters
+    ----------
+    light : array, shape (H, W) or (H, W, 3), linear
+    near : Circle
+        Within 24 px of the limb.
+    blur_px : float
+        As `LimbRing.blur_px`.
+    """
+    block = max(1, math.ceil(max(light.shape[:2]) / (2 * LONGEST_PX)))
+    blur_px = math.sqrt(blur_px**2 / block**2 + (1.0 - 1.0 / block**2) / 12.0)
+    small = shrunk(light, block)
+    channels = small[None] if small.ndim == 2 else np.moveaxis(small, -1, 0)
+    u, v, radius = near
+    start = ((u + 0.5) / block - 0.5, (v + 0.5) / block - 0.5, radius / block)
+    ring, curve = LimbRing(channels, start, blur_px=blur_px), np.zeros(5)
+    for seed, (reach, px) in enumerate(_LIMB_ROUNDS):
+        ring = LimbRing(channels, ring.circle, reach, blur_px=blur_px)
+        found = _consensus(ring, px, seed)
+        if found is None:
+            return None
+        ring, curve = ring.moved(found, blur_px=blur_px)
+    last = LimbRing(channels, ring.circle, reach, blur_px=blur_px)
+    scales = (2.0 * px, px, px)
+    limb = _with_covariance(ring.contrast(curve), last, curve, scales, _LIMB_FLOOR_PX, block, math.inf)
+    shared = _LIMB_SHARED * float(np.nanstd(limb.off_px)) if limb.edges else 0.0
+    return replace(limb, covariance_px2=limb.covariance_px2 + shared**2 * np.eye(3))

@@ -1,20 +1,29 @@
-"""Edges across a circle in a picture, by turn and by distance from it; closed curves near it.
+"""Edges and limbs across a circle in a picture, by turn and by distance from it; closed curves near it.
 
 The light is taken as logarithm and colour differences, so that a step counts the same in the dark and in the bright.
 What is sought is a curve r(t) = r0 + dr + du cos t + dv sin t + e1 cos 2t + e2 sin 2t: a circle that may move, and the
 ellipse that a sphere beside the camera's axis has for an outline. A mirror ball shows the room: edges are everywhere,
 and of either sign. The outline differs by being an edge nearly all around, which the room's edges are not.
+
+At the limb a ray grazes the ball and goes on undeviated. Just outside, the room's light hardly changes within a few
+pixels. Just inside, the mirror turns rays by T(d) = 2 arccos(1 + d / r), which grows as the root of the depth -d: 15
+degrees at 3 px. So the light across the limb is nearly a + b T + c T^2, blurred, with T = 0 outside; reflectance near
+grazing is of that form, too. A window of light that this describes better than a parabola has its limb there. The
+room's edges, reflected a few pixels inside, are as sharp, but they are no such root.
+
+Symbols: d distance from the limb, pixels, outwards positive; r radius of the outline, pixels.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.signal import fftconvolve
 
 from phibench.scenes.frames import Array, BoolArray
 
@@ -67,6 +76,8 @@ class EdgeRing:
     blur_px : float
     """
 
+    alike: ClassVar[float] = 0.5
+    """Part of the strongest edge from which the outermost counts: the room is squeezed to edges inside the limb."""
     channels: Array = field(repr=False)
     circle: Circle
     reach_px: float = REACH_PX
@@ -80,7 +91,8 @@ class EdgeRing:
         return np.asarray(np.arange(-count, count + 1) * self.step_px)
 
     @cached_property
-    def _uv(self) -> tuple[Array, Array]:
+    def uv(self) -> tuple[Array, Array]:
+        """Pixels (u, v) of all turns and distances, each of shape (TURNS, distances)."""
         u, v, radius = self.circle
         r = radius + self.distances_px
         return u + np.outer(CURVES[:, 1], r), v + np.outer(CURVES[:, 2], r)
@@ -88,14 +100,14 @@ class EdgeRing:
     @cached_property
     def inside(self) -> BoolArray:
         """True inside the picture, shape (TURNS, distances)."""
-        u, v = self._uv
+        u, v = self.uv
         rows, columns = self.channels.shape[1:]
         return np.asarray((u > 2.0) & (u < columns - 3.0) & (v > 2.0) & (v < rows - 3.0))
 
     @cached_property
     def strength(self) -> Array:
         """Slope of the light across the circle over that of its turn, 0 to 1, shape (TURNS, distances)."""
-        u, v = self._uv
+        u, v = self.uv
         light = np.stack([ndimage.map_coordinates(plane, [v, u], order=1, mode="nearest") for plane in self.channels])
         along = max(1.0, _ALONG_PX * TURNS / (2.0 * np.pi * max(self.circle[2], 1.0)))
         modes = ("nearest", "wrap", "nearest")
@@ -145,8 +157,68 @@ class EdgeRing:
         means = more[: places * together].reshape(places, together).mean(axis=1)
         return float(means.mean() / (means.std(ddof=1) / np.sqrt(places) + 1e-9))
 
-    def moved(self, curve: Array, **options: float) -> tuple[EdgeRing, Array]:
+    def moved(self, curve: Array, **options: float) -> tuple[Self, Array]:
         """A ring around a curve's circle, and the curve from there: its e1 and e2."""
         u, v, radius = self.circle
         circle = (u + float(curve[1]), v + float(curve[2]), radius + float(curve[0]))
-        return EdgeRing(self.channels, circle, **options), np.array([0.0, 0.0, 0.0, curve[3], curve[4]])
+        return type(self)(self.channels, circle, **options), np.array([0.0, 0.0, 0.0, curve[3], curve[4]])
+
+
+# Limbs.
+
+_HALF_PX = 5.0  # of a window
+_ALONG_PX = 4.0
+_NOISE = 0.002  # of the window's light: better descriptions do not count
+_FULL, _AGAINST = 5.0, 2.0  # logarithms of the ratio of squares: of a limb without doubt; of none
+_FINE = 10  # samples of the blur per step
+
+
+@dataclass(frozen=True)
+class LimbRing(EdgeRing):
+    """A ring whose `strength` tells limbs from the room's edges.
+
+    Parameters
+    ----------
+    channels : array, shape (n, H, W)
+        Linear light.
+    circle, reach_px, step_px
+        As of `EdgeRing`.
+    blur_px : float
+        Standard deviation of all blur in the picture: lens, pixel, and what made it smaller.
+    """
+
+    alike: ClassVar[float] = 1.0
+
+    @cached_property
+    def strength(self) -> Array:
+        """By how much better a limb describes the light than a parabola, 0 to 1, shape (TURNS, distances)."""
+        half = round(_HALF_PX / self.step_px)
+        wide = EdgeRing(self.channels, self.circle, self.reach_px + half * self.step_px, self.step_px)
+        u, v = wide.uv
+        along = max(1.0, _ALONG_PX * TURNS / (2.0 * np.pi * max(self.circle[2], 1.0)))
+        x: Array = self.step_px * np.arange(-half, half + 1, dtype=np.float64)
+        limb, parabola = (np.linalg.qr(basis)[0] for basis in (self._limb(x), np.vander(x, 3)))
+        square, left, right = 0.0, 0.0, 0.0
+        for plane in self.channels:
+            light = ndimage.map_coordinates(plane, [v, u], order=1, mode="nearest")
+            light = ndimage.gaussian_filter1d(light, along, axis=0, mode="wrap")
+            windows = np.lib.stride_tricks.sliding_window_view(light, len(x), axis=1)
+            own = np.square(windows).sum(axis=-1)
+            square = square + own
+            left = left + own - np.square(windows @ limb).sum(axis=-1)
+            right = right + own - np.square(windows @ parabola).sum(axis=-1)
+        inside = np.lib.stride_tricks.sliding_window_view(wide.inside, len(x), axis=1).all(axis=-1)
+        floor = _NOISE**2 * square + 1e-300
+        ratio = np.log((np.maximum(right, 0.0) + floor) / (np.maximum(left, 0.0) + floor))
+        return np.asarray(np.where(inside, np.clip(ratio, -_AGAINST, _FULL) / _FULL, 0.0))
+
+    def _limb(self, x: Array) -> Array:
+        """Blurred 1, T and T^2 at distances from the limb, shape (n, 3)."""
+        fine = self.step_px / _FINE
+        reach = np.ceil(6.0 * self.blur_px / self.step_px) * self.step_px
+        d = np.arange(x[0] - reach, x[-1] + reach + 0.5 * fine, fine)
+        k = np.arange(-reach, reach + 0.5 * fine, fine)
+        kernel = np.exp(-0.5 * np.square(k / self.blur_px))
+        T = 2.0 * np.arccos(np.clip(1.0 + d / self.circle[2], 0.0, 1.0))
+        turned, squared = (fftconvolve(f, kernel / kernel.sum(), mode="valid")[::_FINE] for f in (T, T * T))
+        return np.stack([np.ones(len(x)), turned, squared], axis=-1)

@@ -27,12 +27,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.calibration.ball_circle import BallCircle
+from phibench.estimator.calibration.ball_circle import BallCircle, on_limb
 from phibench.estimator.calibration.edge_ring import TURNS
-from phibench.estimator.calibration.limb_image import Measured, Plane, planes_of
+from phibench.estimator.calibration.limb_image import Measured, Plane, limb_angle_rad, planes_of
 from phibench.estimator.calibration.outline_fit import OutlinePixels, Step, band, step_from
 from phibench.estimator.calibration.outline_jpeg import JpegAgain
-from phibench.estimator.calibration.outline_start import grey, radii_px, rough_outlines, sphere_from_rays
+from phibench.estimator.calibration.outline_start import (
+    PICTURE_BLUR_PX2,
+    grey,
+    radii_px,
+    rough_outlines,
+    sphere_from_rays,
+)
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, as_vector
@@ -56,6 +62,9 @@ _LEAST_CONTRAST = 9.0  # of a circle whose light is worth a fit; patterns and no
 _MOST_TRIED = 4  # circles whose light is fitted, which takes seconds where it does not come to rest
 _MOST_OFF = 0.06  # of the distance, for an outline by its edge alone: a holder's plates are clear circles, too
 _FROM_EDGE_PX = 1.0  # the steepest place of the light is some tenths of a pixel inside the limb
+_SHARED = 0.55
+_SMOOTH, _SMOOTH_JPEG = 2.5, 10.0
+_CLEAR_LIMB = 30.0  # contrast from which no other circle is looked at
 
 
 @dataclass(frozen=True)
@@ -143,31 +152,19 @@ def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) 
     """
     planes = planes_of(image, card)
     _require_size(planes[0].values, rig.camera)
-    fault, by_edge = ImageError("an image without a mirror"), None
     again = (image, card) if card and card.output == "mjpeg" else None
     low, high = radii_px(rig)
-    try:
-        tried = 0
-        for start, circle in rough_outlines(grey(planes), rig):
-            if circle.contrast < _LEAST_CONTRAST:
-                continue
-            if tried == _MOST_TRIED:
-                break
-            tried += 1
-            by_edge = by_edge or _by_edge(rig, start, circle)
-            try:
-                found = fit_outline(planes, rig, start, again=again)
-                require_near(found.rig(rig), circle)
-                return found
-            except ImageError as error:
-                # that it is cut, or lit badly, says more than that the last circle tried was none
-                fault = error if "without a mirror" in str(fault) else fault
-            if by_edge:
-                break
-    except ImageError as error:
-        fault = error
-    if by_edge:
-        return by_edge
+    fault = ImageError("an image without a mirror")
+    for start, circle, edge in _clearest(grey(planes), rig):
+        try:
+            found = fit_outline(planes, rig, start, again=again)
+            require_near(found.rig(rig), circle)
+            return found
+        except ImageError as error:
+            # that it is cut, or lit badly, says more than that the last circle tried was none
+            fault = error if "without a mirror" in str(fault) else fault
+        if by_edge := _by_edge(rig, circle) or _by_edge(rig, edge):
+            return by_edge
     if "without a mirror" not in str(fault):
         raise fault
     raise ImageError(
@@ -176,27 +173,60 @@ def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) 
     )
 
 
-def _by_edge(rig: Rig, s: Array, circle: BallCircle) -> Outline | None:
-    """Outline by the edge in the picture alone, if that is clear; its covariance is the edge's."""
+def _clearest(picture: Array, rig: Rig) -> list[tuple[Array, BallCircle, BallCircle]]:
+    """Sphere centres, limbs and the edges near them that a picture may show, at most `_MOST_TRIED`.
+
+    Those at about the distance that the rig says come first, then the clearest: a holder's plates are clear circles,
+    too. Where there is no limb, an edge stands for it.
+    """
+    blur_px = math.sqrt(rig.camera.blur_sigma_px**2 + PICTURE_BLUR_PX2)
+    found: list[tuple[bool, float, Array, BallCircle, BallCircle]] = []
+    for _, edge in rough_outlines(picture, rig):
+        if edge.contrast < _LEAST_CONTRAST:
+            continue
+        circle = on_limb(picture, edge.circle_px, blur_px) or edge
+        s = _sphere(rig, circle)
+        found.append((not _as_far(rig, s), -circle.contrast, s, circle, edge))
+        if len(found) == _MOST_TRIED or (_as_far(rig, s) and circle.contrast > _CLEAR_LIMB):
+            break
+    return [one[2:] for one in sorted(found, key=lambda one: one[:2])]
+
+
+def _sphere(rig: Rig, circle: BallCircle) -> Array:
+    return sphere_from_rays(rig.camera.rays(circle.points_px), rig.mirror.radius_m)
+
+
+def _as_far(rig: Rig, s: Array) -> bool:
     expected = float(np.linalg.norm(rig.sphere_in_camera_m))
-    if visible_arc(rig, s) < MIN_ARC or abs(float(np.linalg.norm(s)) - expected) > _MOST_OFF * expected:
+    return abs(float(np.linalg.norm(s)) - expected) <= _MOST_OFF * expected
+
+
+def _by_edge(rig: Rig, circle: BallCircle) -> Outline | None:
+    """Outline by a limb or an edge in the picture alone, if that is clear; its covariance is the circle's."""
+    s = _sphere(rig, circle)
+    if visible_arc(rig, s) < MIN_ARC or not _as_far(rig, s):
         return None
     try:
         circle.require_clear()
     except ImageError:
         return None
-    u, v, radius = circle.circle_px
-    steps = ((u + 1.0, v, radius), (u, v + 1.0, radius), (u, v, radius + 1.0))
-    moved = [
-        sphere_from_rays(rig.camera.rays(replace(circle, circle_px=one).points_px), rig.mirror.radius_m) - s
-        for one in steps
-    ]
-    J = np.stack(moved, axis=1)
+    J = _by_pixels(rig, s)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a sector without an edge
         shifts = np.nanmean(np.roll(circle.off_px, TURNS // 2).reshape(SECTORS, -1), axis=1)
     covariance = J @ circle.covariance_px2 @ J.T
     return Outline(s, covariance, circle.edges, math.nan, math.nan, math.nan, TURNS, 0, shifts, by_edge=True)
+
+
+def _by_pixels(rig: Rig, s: Array) -> Array:
+    """d s / d (u, v, r) of the outline's centre and radius r = f tan a0, shape (3, 3), metres per pixel.
+
+    |s| = R / sin a0: d |s| / |s| = -d a0 / tan a0 = -cos^2 a0 d r / r. Near the axis, where the outline is a circle.
+    """
+    camera, a0 = rig.camera, limb_angle_rad(s, rig.mirror.radius_m)
+    r = math.sqrt(camera.fx_px * camera.fy_px) * math.tan(a0)
+    across = np.diag([s[2] / camera.fx_px, s[2] / camera.fy_px, 0.0])[:, :2]
+    return np.column_stack([across, -s * math.cos(a0) ** 2 / r])
 
 
 def require_near(rig: Rig, circle: BallCircle) -> None:
@@ -288,8 +318,21 @@ def _settle(
     arc = step.sectors_used / SECTORS
     change, covariance = (step.move, step.covariance) if again is None else without_jpeg(pixels, step, *again)
     s, blur = _moved(s, change[:3], rig), float(np.clip(blur + change[3], *_BLUR_RANGE_PX2))
-    shifts = step.solution.sector_shifts(pixels.y - step.model)
-    return Outline(s, covariance[:3, :3], arc, step.contrast, blur**0.5, step.residual, len(pixels.y), count, shifts)
+    left = pixels.y - step.model
+    shifts, J = step.solution.sector_shifts(left), _by_pixels(rig, s)
+    shared = _shared_px2(shifts, step.solution.scatter(left), again is not None)
+    covariance = covariance[:3, :3] + shared * J @ J.T
+    return Outline(s, covariance, arc, step.contrast, blur**0.5, step.residual, len(pixels.y), count, shifts)
+
+
+def _shared_px2(shifts_px: Array, scatter: float, jpeg: bool) -> float:
+    """Variance of centre and radius by what errs alike in all sectors, which their scatter does not show.
+
+    The edges of a room lie at one height all around. The share of the sectors' scatter was measured in 60 rooms; a
+    scatter of a few times the pixels' noise is JPEG's, and of rooms without edges.
+    """
+    usual = 1.4826 * float(np.nanmedian(np.abs(shifts_px)))
+    return float((_SHARED * usual) ** 2 * max(1.0 - (_SMOOTH_JPEG if jpeg else _SMOOTH) / scatter, 0.0))
 
 
 def without_jpeg(pixels: OutlinePixels, step: Step, frame: NDArray[Any], card: SensorCard) -> tuple[Array, Array]:

@@ -397,8 +397,8 @@ class Solution:
         # light moves with the distance from the limb: a limb further out is light from further in
         return np.where(information > 0.0, -left / np.where(information > 0.0, information, 1.0), np.nan)
 
-    def covariance(self, residual: Array) -> Array:
-        """Covariance of the step, shape (4, 4), from the scatter of the residuals (N,) that it leaves."""
+    def scatter(self, residual: Array) -> float:
+        """Variance of the sectors' shifts that the residuals (N,) leave, over what their pixels promise."""
         where, own, trust = self.where, self.own, self.trust
         information = where.summed((own * self.shift**2)[:, None])[:, 0]
         root = np.sqrt(np.maximum(information, 1e-300))
@@ -406,10 +406,13 @@ class Solution:
         z = np.sqrt(trust) * np.where(information > 0.0, where.summed(left)[:, 0] / root, 0.0)
         by_s = where.summed((own * self.shift)[:, None] * self.J[:, :3])
         directions = np.where(information > 0.0, np.sqrt(trust) / root, 0.0)[:, None] * by_s
-        size = scatter(z, trust * (information > 0.0), directions / np.abs(directions).max())
+        return float(scatter(z, trust * (information > 0.0), directions / np.abs(directions).max()))
+
+    def covariance(self, residual: Array) -> Array:
+        """Covariance of the step, shape (4, 4), from the scatter of the residuals (N,) that it leaves."""
         inverse = np.linalg.inv(self.normal())
-        meat = self.J.T @ ((self.weight * trust[where.sector])[:, None] * self.J)
-        return np.asarray(inverse @ meat @ inverse * size / self.slack**2)
+        meat = self.J.T @ ((self.weight * self.trust[self.where.sector])[:, None] * self.J)
+        return np.asarray(inverse @ meat @ inverse * self.scatter(residual) / self.slack**2)
 
     def normal(self) -> Array:
         """Normal matrix, shape (4, 4)."""

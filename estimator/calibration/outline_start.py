@@ -25,6 +25,8 @@ _FEW, _CANDIDATES = 6, 12
 _NEAR = (0.95, 1.05)  # of the nominal rig's outline: looked at first
 _RADII = (0.7, 1.4)
 _LEAST_RADIUS_PX = 30.0
+PICTURE_BLUR_PX2 = 0.5 + 1.0 / 6.0 + 1.0 / 12.0
+"""Variance of the blur of `grey` besides the lens: the mosaic's mean, linear interpolation, the pixel."""
 
 
 def grey(planes: tuple[Plane, ...]) -> Array:
