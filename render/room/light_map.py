@@ -31,6 +31,8 @@ from phibench.scenes.rig import View
 from phibench.scenes.room import Room, Sun, chassis
 from phibench.scenes.shapes import Shape
 
+# texels along a side over which smoothing keeps the mean: light of surfaces changes slowly
+_KEPT_OF_LAMPS, _KEPT_OF_SURFACES = 5, 9
 _SEED = 0  # the shifts are part of the quadrature rule; the two halves use different streams
 
 
@@ -89,7 +91,8 @@ def bake(view: View, room: Room, settings: BakeSettings) -> LightMap:
     covered = covered_texels(mi, surfaces, fine, settings.texel_m)
     surfaces.set_light(fine.grid, np.zeros((len(fine), 3)))
     direct = direct_light(mi, surfaces, fine, room.sun, settings.lamp_rays, _SEED)
-    lamps, noise = smoothed(fine.grid, *(filled(half, covered, fine.grid) for half in direct))
+    one, other = (filled(half, covered, fine.grid) for half in direct)
+    lamps, noise = smoothed(fine.grid, one, other, _KEPT_OF_LAMPS)
     lit = lamps + bounced_light(
         mi, surfaces, fine.grid, lamps, settings.texel_m, settings.bounces, settings.bounce_rays, _SEED + 10
     )
@@ -111,7 +114,7 @@ def _indirect(
     halves = [
         filled(gathered(mi, surfaces, texels, settings.final_rays, 2 + 2 * i), hidden, texels.grid) for i in (0, 1)
     ]
-    mean, sigma = smoothed(texels.grid, halves[0], halves[1])
+    mean, sigma = smoothed(texels.grid, halves[0], halves[1], _KEPT_OF_SURFACES)
     if texels is fine:
         return mean, sigma
     return finer(texels.grid, fine.grid, mean), finer(texels.grid, fine.grid, sigma)
