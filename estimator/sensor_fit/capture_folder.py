@@ -52,6 +52,7 @@ class CaptureNotes(Document):
     height_px: int | None = Field(default=None, ge=8, le=16384)
     bits: int = Field(default=10, ge=8, le=16)
     exposure_s: float | None = Field(default=None, gt=0.0, le=60.0)
+    scaled: bool = False  # the camera shrinks its frames after interpolation: not all pixels of the sensor
     analogue_gain: float = Field(default=1.0, ge=1.0, le=16.0)
     board_columns: int | None = Field(default=None, ge=3, le=100)
     board_rows: int | None = Field(default=None, ge=3, le=100)

@@ -1,7 +1,8 @@
 """Fit of a sensor from a folder of its frames: everything that these frames tell, and what they do not.
 
-Raw frames give photon transfer. Every number comes with its sigma; numbers of the preset that the frames leave open
-stand in `not_determined` with the reason.
+Raw frames give photon transfer; processed frames give tone curve, noise and sharpening; both give blur from edges and
+the lens from chessboards. Every number comes with its sigma. Numbers of the preset that the frames leave open stand in
+`not_determined` with the reason.
 """
 
 from __future__ import annotations
@@ -9,28 +10,48 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from phibench.datasets.frames.sensor_file import FitTables, Measured, SensorFile, allowed_numbers
-from phibench.estimator.sensor_fit.capture_folder import RAW, Capture, open_capture
-from phibench.estimator.sensor_fit.photon_transfer import TransferFit, fit_transfer
+import numpy as np
 
-_FRAMES_ONLY = "not determined from these frames"
+from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
+from phibench.datasets.frames.sensor_file import FitTables, Measured, SensorFile, allowed_numbers
+from phibench.estimator.sensor_fit.capture_folder import RAW, Capture, CaptureError, FrameGroup, luma, open_capture
+from phibench.estimator.sensor_fit.edge_spread import Edge, EdgeFit, EdgeModel, edges_of, fit_edges
+from phibench.estimator.sensor_fit.jpeg_header import JpegHeader, read_header
+from phibench.estimator.sensor_fit.lens_fit import LensFit, fit_lens
+from phibench.estimator.sensor_fit.photon_transfer import TransferFit, fit_transfer
+from phibench.estimator.sensor_fit.processed_noise import LUMA, LumaModel, ProcessedNoise, fit_noise, stack_level
+from phibench.estimator.sensor_fit.tone_curve import ToneFit, fit_tone
+from phibench.scenes.frames import Array
+
+_NO_FLATS = "needs flat/LEVEL with two frames or more of each level"
+_MJPEG = "MJPEG rounds noise away: take YUYV or raw frames"
+_RGB_OF_YCBCR = np.array([[1.0, 0.0, 1.402], [1.0, -0.344136, -0.714136], [1.0, 1.772, 0.0]])  # BT.601
 
 
 @dataclass(frozen=True)
 class SensorFit:
-    """Result of a fit.
+    """Result of a fit; parts that the frames do not give are None.
 
     Attributes
     ----------
     capture : Capture
     file : SensorFile
     transfer : TransferFit or None
-        Of raw frames.
+    tone : ToneFit or None
+    noise : ProcessedNoise or None
+    edges : EdgeFit or None
+    lens : LensFit or None
+    jpeg : JpegHeader or None
     """
 
     capture: Capture
     file: SensorFile
     transfer: TransferFit | None = None
+    tone: ToneFit | None = None
+    noise: ProcessedNoise | None = None
+    edges: EdgeFit | None = None
+    lens: LensFit | None = None
+    jpeg: JpegHeader | None = None
 
 
 @dataclass
@@ -42,15 +63,17 @@ class _Draft:
     missing: dict[str, str] = field(default_factory=dict)
     measured: dict[str, Measured] = field(default_factory=dict)
 
-    def take(self, name: str, value: object, sigma: float | None) -> None:
+    def take(self, name: str, value: object, sigma: float | None = None) -> None:
         self.numbers[name] = value
         if sigma is not None:
             self.sigma[name] = sigma
 
+    def measure(self, name: str, value: float, sigma: float, unit: str) -> None:
+        self.measured[name] = Measured(value=value, sigma=sigma, unit=unit)
+
     def file(self, capture: Capture) -> SensorFile:
         kept, refused = allowed_numbers(capture.kind, self.numbers)
-        missing = dict(sorted(self.missing.items()))
-        missing |= {name: f"{_FRAMES_ONLY}: {why}" for name, why in refused.items()}
+        missing = dict(sorted((self.missing | refused).items()))
         sigma = {name: value for name, value in self.sigma.items() if name in kept}
         source: dict[str, str | float | int] = {
             "frames": capture.frames,
@@ -73,25 +96,164 @@ def fit_sensor(folder: Path) -> SensorFit:
         If the folder or its frames will not do; in one sentence.
     """
     capture = open_capture(folder)
-    draft = _Draft()
-    transfer = None
+    draft, transfer, tone, noise, jpeg = _Draft(), None, None, None, None
     if capture.kind in RAW:
-        transfer = fit_transfer(capture)
-        _take_transfer(draft, capture, transfer)
-    return SensorFit(capture, draft.file(capture), transfer)
+        if capture.dark or capture.flats or not (capture.edges or capture.chessboards):
+            transfer = fit_transfer(capture)
+            _take_transfer(draft, capture, transfer)
+    else:
+        tone = _take_tone(draft, capture)
+        noise = _take_noise(draft, capture, tone)
+        jpeg = _take_jpeg(draft, capture)
+    edges = _take_edges(draft, capture, tone)
+    lens = _take_lens(draft, capture)
+    return SensorFit(capture, draft.file(capture), transfer, tone, noise, edges, lens, jpeg)
+
+
+# -- raw frames ------------------------------------------------------------------------------------------------------
 
 
 def _take_transfer(draft: _Draft, capture: Capture, found: TransferFit) -> None:
     top = (1 << capture.notes.bits) - 1
-    draft.take("adc_bits", capture.notes.bits, None)
+    draft.take("adc_bits", capture.notes.bits)
     for name, value in found.values.items():
         draft.take(name, value, found.sigmas[name])
     draft.missing |= found.reasons
     if "full_well_e" not in found.values:
-        # the chain needs a number: one beyond the converter's end changes nothing
-        end_e = (top - found.values["black_level_dn"]) / found.values["gain_dn_per_e"] / capture.notes.analogue_gain
-        draft.take("full_well_e", round(1.05 * end_e), None)
+        _take_end(draft, top - found.values["black_level_dn"], capture)
     if "row_noise_e" not in found.values and "row_noise_e" not in found.reasons:
         draft.missing["row_noise_e"] = "not above the noise of these frames"
     if found.ratios:
         draft.measured["flat_red_green_blue"] = Measured(value=list(found.ratios))
+
+
+def _take_end(draft: _Draft, codes: float, capture: Capture) -> None:
+    """Full well beyond the converter's end: the chain needs a number, and there it changes nothing."""
+    gain = draft.numbers["gain_dn_per_e"]
+    if isinstance(gain, float):
+        draft.take("full_well_e", float(round(1.05 * codes / (gain * capture.notes.analogue_gain))))
+
+
+# -- processed frames ------------------------------------------------------------------------------------------------
+
+
+def _take_tone(draft: _Draft, capture: Capture) -> ToneFit | None:
+    found = fit_tone(capture)
+    if isinstance(found, str):
+        draft.missing["transfer_function"] = found
+        return None
+    draft.take("transfer_function", found.curve)
+    if found.points is not None:
+        draft.take("transfer_points", [list(point) for point in found.points])
+    draft.measure("tone_residual", found.rms_codes["srgb"], 0.0, "codes rms, against sRGB")
+    return found
+
+
+def _take_noise(draft: _Draft, capture: Capture, tone: ToneFit | None) -> ProcessedNoise | None:
+    names = ("gain_dn_per_e", "read_noise_e", "prnu", "sharpen_amount")
+    if capture.kind == "mjpeg" or not capture.flats:
+        draft.missing |= dict.fromkeys(names, _MJPEG if capture.kind == "mjpeg" else _NO_FLATS)
+        return None
+    card = sensor_card(capture.kind)
+    levels = []
+    for group in capture.flats:
+        frames = capture.stack(group)
+        codes = _mean_rgb(frames, capture, card)
+        levels.append(stack_level(group.name, np.stack([luma(one, capture.kind) for one in frames]), codes))
+    bright = [one for one in levels if max(one.codes) < 254.0]
+    if not bright:
+        raise CaptureError(f"{capture.folder}: every level of flat/ is saturated; take levels from code 20 to 240")
+    curve, points = (tone.curve, tone.points) if tone is not None else ("srgb", None)
+    scale = 219.0 / 255.0 if capture.kind == "yuyv" and card.ycbcr_range == "limited" else 1.0
+    rounding = (1.0 if capture.kind == "yuyv" else sum(w * w for w in LUMA)) / 12.0
+    model = LumaModel(curve, points, card, scale=scale, rounding=rounding)
+    found = fit_noise(levels, model, capture.notes.analogue_gain)
+    for name, value in found.values.items():
+        draft.take(name, value, found.sigmas[name])
+    draft.missing |= found.reasons
+    if "gain_dn_per_e" in found.values:
+        _take_end(draft, card.top_dn - card.black_level_dn, capture)
+        draft.measure("noise_misfit", found.chi2, 0.0, "mean square of standardised residuals")
+    draft.missing |= {
+        "white_balance": "the colours of lamp and surface are not known",
+        "dsnu_e": "the tone curve starts at black",
+        "black_level_dn": "the tone curve starts at black",
+        "full_well_e": "processed frames end at white",
+    }
+    return found
+
+
+def _mean_rgb(frames: Array, capture: Capture, card: SensorCard) -> tuple[float, float, float]:
+    """Mean R, G, B on 0 to 255."""
+    if capture.kind != "yuyv":
+        red, green, blue = (float(x) for x in frames.reshape(-1, 3).mean(axis=0))
+        return red, green, blue
+    black, y_codes, c_codes = (0.0, 255.0, 255.0) if card.ycbcr_range == "full" else (16.0, 219.0, 224.0)
+    y = 255.0 * (float(frames[..., 0].mean()) - black) / y_codes
+    cb, cr = (255.0 * (float(frames[..., k::2, 1].mean()) - 128.0) / c_codes for k in (0, 1))
+    red, green, blue = (float(x) for x in _RGB_OF_YCBCR @ np.array([y, cb, cr]))
+    return red, green, blue
+
+
+def _take_jpeg(draft: _Draft, capture: Capture) -> JpegHeader | None:
+    if capture.kind != "mjpeg":
+        return None
+    first = next(g for g in _every_group(capture) if g.files).files[0]
+    found = read_header(first.read_bytes(), str(first))
+    if found.quality is not None:
+        draft.take("jpeg_quality", found.quality)
+    else:
+        draft.take("jpeg_qtables", [list(table) for table in found.tables])
+    draft.take("jpeg_subsampling", found.subsampling)
+    if found.restart_interval:
+        draft.take("jpeg_restart_interval", found.restart_interval)
+    return found
+
+
+def _every_group(capture: Capture) -> list[FrameGroup]:
+    single = [g for g in (capture.dark, capture.edges, capture.chessboards) if g is not None]
+    return [*single, *capture.flats, *capture.exposures, *capture.dark_exposures]
+
+
+# -- edges and lens --------------------------------------------------------------------------------------------------
+
+
+def _take_edges(draft: _Draft, capture: Capture, tone: ToneFit | None) -> EdgeFit | None:
+    groups = [g for g in (capture.edges, capture.chessboards) if g is not None]
+    if not groups:
+        draft.missing["edge_sigma_px"] = "needs edge/ or chessboard/: straight edges, 2 to 30 degrees from rows"
+        return None
+    if capture.kind in RAW:
+        draft.missing["edge_sigma_px"] = "edges are measured on processed frames"
+        return None
+    edges = [edge for group in groups for path in group.files for edge in _edges(capture, path)]
+    curve, points = (tone.curve, tone.points) if tone is not None else ("srgb", None)
+    found = fit_edges(edges, EdgeModel(curve, points, "mean" if capture.notes.scaled else "placed"))
+    if isinstance(found, str):
+        draft.missing["edge_sigma_px"] = found
+        return None
+    draft.measure("edge_sigma_px", found.sigma_px, found.sigma_sigma_px, "px")
+    draft.measure("edge_sharpen_amount", found.sharpness, found.sharpness_sigma, "1")
+    for name, value in vars(found.measure).items():
+        unit = "px" if name.endswith("_px") else "1"
+        draft.measure(f"edge_{name}", value, getattr(found.measure_sigma, name), unit)
+    if "sharpen_amount" not in draft.numbers and "denoise_luma" not in draft.numbers:
+        name = "sharpen_amount" if found.sharpness >= 0.0 else "denoise_luma"
+        draft.take(name, abs(found.sharpness), found.sharpness_sigma)
+        draft.missing.pop("sharpen_amount", None)
+    return found
+
+
+def _edges(capture: Capture, path: Path) -> list[Edge]:
+    return list(edges_of(luma(capture.read(path), capture.kind)))
+
+
+def _take_lens(draft: _Draft, capture: Capture) -> LensFit | None:
+    found = fit_lens(capture)
+    if isinstance(found, str):
+        draft.missing["lens"] = found
+        return None
+    for name, value in found.values.items():
+        draft.measure(name, value, found.sigmas[name], "px" if name.endswith("_px") else "1")
+    draft.measure("corner_residual_px", found.rms_px, found.rms_px / np.sqrt(2.0 * found.views), "px")
+    return found
