@@ -200,7 +200,7 @@ _LUMA = (0.299, 0.587, 0.114)
 
 @dataclass(frozen=True)
 class EdgeModel:
-    """What is known of the chain when edges are fitted.
+    """Known parts of the chain when edges are fitted.
 
     Parameters
     ----------

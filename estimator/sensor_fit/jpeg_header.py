@@ -14,7 +14,7 @@ _SUBSAMPLING = {(1, 1): "4:4:4", (2, 1): "4:2:2", (2, 2): "4:2:0"}
 
 @dataclass(frozen=True)
 class JpegHeader:
-    """What a camera's JPEG files have in common.
+    """Tables and layout that all JPEG files of a camera share.
 
     Attributes
     ----------
