@@ -30,7 +30,7 @@ class SpotTruth:
 
     Attributes
     ----------
-    uv_px : (u, v), the chief ray's; NaN where there is none
+    uv_px : (u, v), the chief ray's; NaN where there is none, or a visible spot's place is not known: of a real pair
     phi_rad : dict of "ray", "normal", "incidence" to float
     azimuth_rad : float
     visible : bool
@@ -90,6 +90,8 @@ class PairTruth:
         The stroke in `Pair.stroke_m`; None if it is the true one.
     calibration_covariance : array, shape (p, p), or None
         That of the pair: the predicted error of D then includes the calibration's.
+    depth_sigma_m : float
+        Of `depth_m` where it was measured by a tape; 0 of an exact one.
     """
 
     number: int
@@ -106,6 +108,7 @@ class PairTruth:
     up: SpotTruth
     nominal_stroke_m: float | None = None
     calibration_covariance: Array | None = None
+    depth_sigma_m: float = 0.0
 
 
 class Pairs(Protocol):

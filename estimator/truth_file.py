@@ -32,7 +32,10 @@ _MATRICES = ("bound_px2", "raw_bound_px2")
 _RIGS = ("true_rig", "nominal_rig")
 # keys of "phibench truth 1"
 _RENAMED = {"believed_rig": "nominal_rig", "believed_stroke_m": "nominal_stroke_m"}
-_NOT_SEALED = ("calibration_covariance",)  # a calibration comes with the score, never with the set
+_NOT_SEALED = (
+    "calibration_covariance",
+    "depth_sigma_m",
+)  # of a score's calibration, and of real pairs: never of a seal
 _LARGEST = 1e100  # of a number of a truth: its square is a double, too
 
 

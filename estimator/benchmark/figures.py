@@ -111,9 +111,18 @@ def error_panels(scores: Named) -> list[Picture]:
     return panels
 
 
+def _placed(tables: Tables) -> dict[str, pl.DataFrame]:
+    """Tables of pairs whose spots have a true place: not of real ones."""
+    return {name: table for name, table in tables.items() if table["u_true_px"].is_not_null().any()}
+
+
 def error_maps(tables: Tables) -> dict[str, Picture]:
     """Maps of errors over the frame: a mark at every true position, as large as the error."""
-    scale, maps = _scale(tables), {}
+    tables = _placed(tables)
+    maps: dict[str, Picture] = {}
+    if not tables:
+        return maps
+    scale = _scale(tables)
     for name, table in tables.items():
         with mpl.rc_context(_PANEL):
             figure = Figure(figsize=_SIZE, layout="constrained", dpi=150)
@@ -132,8 +141,9 @@ def error_maps(tables: Tables) -> dict[str, Picture]:
 
 def radius_panels(tables: Tables) -> list[Picture]:
     """Radial and tangential rms error against the distance from the image of the sphere centre."""
-    panels = []
-    for column, label in (("radial_px", "radial"), ("tangential_px", "tangential")):
+    panels: list[Picture] = []
+    tables = _placed(tables)
+    for column, label in (("radial_px", "radial"), ("tangential_px", "tangential")) if tables else ():
         with mpl.rc_context(_PANEL):
             figure, axes = _panel()
             for i, (name, table) in enumerate(tables.items()):

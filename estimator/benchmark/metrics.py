@@ -56,7 +56,7 @@ _DEEP = pl.col("bound_depth_m2").sqrt() < 0.1 * pl.col("depth_m")
 FAMILIES: dict[str, pl.Expr] = {
     "image": pl.lit(True),
     "visible": pl.col("visible"),
-    "detected": _DETECTED,
+    "detected": _DETECTED & pl.col("distance_px").is_not_null(),
     "radial": _DETECTED & pl.col("radial_px").is_not_null(),
     "phi": _DETECTED & pl.col("phi_error_rad").is_not_null(),
     "phi bound": _DETECTED & pl.col("phi_error_rad").is_not_null() & pl.col("bound_phi_rad2").is_not_null() & _SHARP,
@@ -75,6 +75,9 @@ FAMILIES: dict[str, pl.Expr] = {
     & pl.col("pair_bound_phi_rad2").is_not_null()
     & _SHARP,
     "pair depth bound": _FOUND & pl.col("pair_bound_depth_m2").is_not_null() & _DEEP,
+    # of a real pair nobody has measured where the spots are
+    "placed": pl.col("visible") & pl.col("counted_px").is_not_null(),
+    "ranked phi": pl.col("rank_phi2_rad2").is_not_null(),
 }
 """Which records enter a metric; those of pairs take each pair once, by its row "down"."""
 
@@ -100,6 +103,8 @@ WHY_EMPTY = {
     "pair bound": "no bound for these pairs, or none below a third of 3 px",
     "pair phi bound": "no bound for these pairs, or none below a third of 3 px",
     "pair depth bound": "no bound for these pairs, or none below 10 % of D",
+    "placed": "no visible spot whose place is known",
+    "ranked phi": "no image whose phi is known",
 }
 """Why a metric has no value, by family."""
 
@@ -156,7 +161,7 @@ METRICS: dict[str, Metric] = {
     "bias_v_px": Metric("detected", "mean", ("dv_px",), "px", "none", "mean error of v"),
     "bias_radial_px": Metric("radial", "mean", ("radial_px",), "px", "none", "mean radial error, outwards"),
     "bias_tangential_px": Metric("radial", "mean", ("tangential_px",), "px", "none", "mean tangential error"),
-    "rms_counted_px": Metric("visible", "rms", ("counted_px",), "px", "lower", "rms distance, missed counted"),
+    "rms_counted_px": Metric("placed", "rms", ("counted_px",), "px", "lower", "rms distance, missed counted"),
     **_errors("detected", ("du_px", "dv_px"), "distance_px", "px", "px", "distance"),
     "rms_radial_px": Metric("radial", "rms", ("radial_px",), "px", "lower", "rms radial error"),
     "rms_tangential_px": Metric("radial", "rms", ("tangential_px",), "px", "lower", "rms tangential error"),
@@ -201,7 +206,12 @@ METRICS: dict[str, Metric] = {
     ),
     "seconds": Metric("timed", "mean", ("seconds",), "s", "lower", "mean time per pair"),
     "rank_phi_rad": Metric(
-        "image", "rank", ("rank_phi2_rad2", "visible"), "rad", "lower", "rms error of phi, missed and false counted"
+        "ranked phi",
+        "rank",
+        ("rank_phi2_rad2", "visible"),
+        "rad",
+        "lower",
+        "rms error of phi, missed and false counted",
     ),
     "rank_depth": Metric(
         "any pair",

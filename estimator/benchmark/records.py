@@ -92,7 +92,7 @@ COLUMNS: dict[str, str] = {
     "depth_error_m": "depth_estimate_m - depth_m",
     "depth_relative": "depth_error_m / depth_m",
     "depth_sigma_m": "claimed: the method's with its own depth, else from its covariances; with a calibration's part",
-    "depth_pull": "depth_error_m / depth_sigma_m",
+    "depth_pull": "depth_error_m / depth_sigma_m; of real pairs the tape's standard deviation is added",
     "bound_depth_m2": "variance of D at the bounds of both spots, each by itself; without calibration",
     "pair_bound_depth_m2": "the same of both images together",
     "possible_position_chi2": "errors of the pair's positions over what is possible, squared; 3 degrees of freedom",
@@ -215,8 +215,10 @@ def _image_columns(
     xy, uv = _stack(spot.uv_px for spot in spots), _stack(map(_position, answers))
     error, phi = pixel_errors(true, xy, uv), _phi_columns(nominal, true, xy, uv, spots, answers)
     given, visible = np.isfinite(uv).all(axis=1), np.array([spot.visible for spot in spots])
+    # of a real pair nobody knows the spot's place: any position counts as found, and D tells what it is worth
+    known = ~visible | np.isfinite(xy).all(axis=1)
     near = error.distance_px <= rules.match_px  # False for NaN
-    detected = visible & near
+    detected = visible & np.where(known, near, given)
     false = given & ~detected
     pull = whitened(np.stack([error.du_px, error.dv_px], -1), usable_covariance(_claimed(answers)))
     bound, raw = (_bounds(spots, name) for name in ("bound_px2", "raw_bound_px2"))
@@ -243,7 +245,7 @@ def _image_columns(
         "detected": detected,
         "missed": visible & ~detected,
         "false_detection": false,
-        "counted_px": np.where(visible, np.where(detected, error.distance_px, rules.match_px), np.nan),
+        "counted_px": np.where(visible & known, np.where(detected, error.distance_px, rules.match_px), np.nan),
         **phi,
         "pull_u": pull[:, 0],
         "pull_v": pull[:, 1],
@@ -251,8 +253,10 @@ def _image_columns(
         "bound_px2": np.trace(bound, axis1=1, axis2=2),
         "raw_bound_px2": np.trace(raw, axis1=1, axis2=2),
         "bound_phi_rad2": phi_variance(nominal, xy, bound),
-        "rank_phi2_rad2": rank_squares(
-            _ranked_phi_error(nominal, spots, uv, phi), detected, visible, false, rules.missed_phi_rad
+        "rank_phi2_rad2": np.where(
+            known,
+            rank_squares(_ranked_phi_error(nominal, spots, uv, phi), detected, visible, false, rules.missed_phi_rad),
+            np.nan,
         ),
     }
 
@@ -329,6 +333,7 @@ def _pair_columns(
     bounds = [_bounds([getattr(t, p) for t in truths], "bound_px2") for p in POSITIONS]
     claims = [usable_covariance(_claimed([_spot(o, p) for o in outcomes])) for p in POSITIONS]
     true_m, h = (np.array([getattr(t, name) for t in truths], float) for name in ("depth_m", "stroke_m"))
+    true_sigma_m = np.array([t.depth_sigma_m for t in truths])
     nominal_h = _nominal_stroke_m(truths)
     answers, truth = (
         [np.stack([i[u], i[v]], -1) for i in (down, up)] for u, v in (("u_px", "v_px"), ("u_true_px", "v_true_px"))
@@ -360,7 +365,7 @@ def _pair_columns(
         "depth_error_m": depth - true_m,
         "depth_relative": depth / true_m - 1.0,
         "depth_sigma_m": sigma,
-        "depth_pull": (depth - true_m) / np.where(sigma > 0.0, sigma, np.nan),
+        "depth_pull": (depth - true_m) / np.where(sigma > 0.0, np.hypot(sigma, true_sigma_m), np.nan),
         "bound_depth_m2": depth_exact(nominal, nominal_h, *truth, *bounds).sigma_m ** 2,
         "seconds": [float(o.seconds) for o in outcomes],
         "failure": [o.failure for o in outcomes],

@@ -25,7 +25,7 @@ from phibench.datasets.store.files import require_writable
 from phibench.datasets.store.provenance import code_behind, provenance
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.causes import count, count_failures, with_causes
-from phibench.estimator.benchmark.dataset_pairs import CalibratedPairs, dataset_pairs, of_calibration
+from phibench.estimator.benchmark.dataset_pairs import TASK_VERSION, CalibratedPairs, dataset_pairs, of_calibration
 from phibench.estimator.benchmark.document import (
     KIND,
     VERSION,
@@ -45,6 +45,7 @@ from phibench.estimator.benchmark.records import in_order, missed_relative, reco
 from phibench.estimator.benchmark.report import write_report
 from phibench.estimator.benchmark.worst_images import worst, worst_of
 from phibench.estimator.calibration.file import read_calibration
+from phibench.estimator.captures.imported_set import ImportedSet, imported_pairs, is_imported, open_imported
 from phibench.estimator.interface import Box, Method, Outcome
 from phibench.estimator.methods.registry import METHODS, BuiltIn
 from phibench.estimator.pair_set import CachedPairs, PairSet, truth_folders
@@ -253,7 +254,7 @@ def score(
         If the method cannot be found or imported.
     """
     console = console or progress_console()
-    opened = dataset if isinstance(dataset, Dataset) else open_finished(dataset)
+    opened = dataset if isinstance(dataset, Dataset) else open_scored(dataset)
     if out is not None:
         require_writable(Path(out))
     chosen = wanted_pairs(opened, preset, draws, pairs, hints, calibration, boxes_px, sensor)
@@ -317,7 +318,7 @@ def bench(
     DatasetError
         If the data set will not do, or a method is unknown.
     """
-    dataset, out = open_finished(folder), Path(out)
+    dataset, out = open_scored(folder), Path(out)
     console, chosen = console or progress_console(), _chosen(METHODS, methods)
     if out.resolve() == dataset.folder.resolve() or dataset.folder.resolve() in out.resolve().parents:
         raise DatasetError(f"{out} lies inside the data set, whose files are signed; give a folder outside, --out")
@@ -369,8 +370,13 @@ def isolated(scored: Scored, isolation: str) -> Scored:
     return replace(scored, document=scored.document.model_copy(update={"isolation": isolation}))
 
 
+def open_scored(folder: str | Path) -> Dataset | ImportedSet:
+    """Finished data set, or a set of real pairs."""
+    return open_imported(folder) if is_imported(folder) else open_finished(folder)
+
+
 def wanted_pairs(
-    dataset: Dataset,
+    dataset: Dataset | ImportedSet,
     preset: str | None,
     draws: int | None = None,
     pairs: int | None = None,
@@ -388,12 +394,34 @@ def wanted_pairs(
     DatasetError
         As `dataset_pairs`, or if the calibration cannot be read or is that of another rig.
     """
+    if isinstance(dataset, ImportedSet):
+        return _real_pairs(dataset, preset, draws, pairs, boxes_px, calibration, sensor)
     camera = None if sensor is None else read_sensor_file(sensor)
     if calibration is None:
         return dataset_pairs(dataset, preset, draws, pairs, hints, boxes_px, camera)
     read = read_calibration(calibration)
     of_rig = of_calibration(dataset, read)
     return CalibratedPairs(dataset_pairs(of_rig, preset, draws, pairs, hints, boxes_px, camera), read)
+
+
+def _real_pairs(
+    imported: ImportedSet,
+    preset: str | None,
+    draws: int | None,
+    pairs: int | None,
+    boxes_px: int | None,
+    calibration: str | Path | None,
+    sensor: str | Path | None,
+) -> PairSet:
+    if preset not in (None, imported.preset):
+        raise DatasetError(f"{imported.folder} holds pictures of the kind '{imported.preset}': leave --preset out")
+    if boxes_px is not None or sensor is not None:
+        raise DatasetError(
+            f"{imported.folder} holds pictures: their boxes are not known, and their sensor is the one that they were "
+            "imported with; leave --boxes and --sensor out"
+        )
+    found = imported_pairs(imported, TASK_VERSION, draws, pairs)
+    return found if calibration is None else CalibratedPairs(found, read_calibration(calibration, imported.rig))
 
 
 def refusal(method: BuiltIn, pairs: PairSet) -> str:
@@ -409,7 +437,9 @@ def show(page: Path) -> bool:
     return sys.stdout.isatty() and display and webbrowser.open(page.resolve().as_uri())
 
 
-def _presets(dataset: Dataset) -> tuple[str, ...]:
+def _presets(dataset: Dataset | ImportedSet) -> tuple[str, ...]:
+    if isinstance(dataset, ImportedSet):
+        return (dataset.preset,)
     frames = dataset.recipe.frames
     return PRESETS if frames is None else frames.presets
 

@@ -85,7 +85,7 @@ def _ranked(records: pl.DataFrame) -> pl.DataFrame:
     """One image of each sample, the worst first."""
     rank = pl.when(pl.col("detected")).then(0).when(pl.col("distance_px").is_null()).then(1).otherwise(2)
     return (
-        records.filter(pl.col("visible"))
+        records.filter(pl.col("visible") & pl.col("u_true_px").is_not_null())
         .with_columns(rank=rank)
         .sort("rank", "distance_px", "number", "image", descending=[True, True, False, False], nulls_last=True)
         .unique("sample_id", keep="first", maintain_order=True)

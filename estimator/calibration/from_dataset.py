@@ -117,11 +117,24 @@ def calibrate_dataset(
     upright = _vertical(images, outlines, rig) if vertical else None
     bundle = calibrate(rig, mean_outline(outlines), known, upright)
     made_from = _made_from(dataset, chosen, preset, outlines, known, upright)
-    write_calibration(out, bundle, rig, made_from)
     # in the order of the images, one per pose
-    names = tuple(f"{sample.row.sample_id} {position}" for sample, position in one_per_pose(chosen))
-    verdict = verdict_of(bundle, prior_sigmas(), outlines)
-    return DatasetCalibration(bundle, rig, tuple(images), tuple(outlines), names, verdict)
+    names = [f"{sample.row.sample_id} {position}" for sample, position in one_per_pose(chosen)]
+    return write_bundle(out, bundle, rig, images, outlines, names, made_from)
+
+
+def write_bundle(
+    out: Path,
+    bundle: Bundle,
+    nominal: Rig,
+    images: Sequence[Photograph],
+    outlines: Sequence[Outline],
+    names: Sequence[str],
+    made_from: dict[str, Any],
+) -> DatasetCalibration:
+    """Write a calibration and judge it; images, their outlines and names belong together."""
+    write_calibration(out, bundle, nominal, made_from)
+    verdict = verdict_of(bundle, prior_sigmas(), list(outlines))
+    return DatasetCalibration(bundle, nominal, tuple(images), tuple(outlines), tuple(names), verdict)
 
 
 def frame_outline(dataset: Dataset, sample: Sample, position: str, preset: str, laser_off: bool = True) -> Outline:

@@ -214,12 +214,12 @@ def measure(photos: PairPhotos, stroke_m: float, setting: Setting) -> Measuremen
     for photo in photos.all:
         sensor_choice(photo, setting.sensor)
     pairs = _pairs(photos, stroke_m, setting.known, chosen.card)
-    outlines, missing = _outlines(pairs[0])
+    outlines, missing = _outlines(pairs[0], setting.calibration is not None)
     rig, covariance, values, note = _corrected(setting, outlines, missing)
-    rig, blur_note = _with_blur(rig, outlines)
+    rig = with_blur_of(rig, outlines)
     stroke = float(stroke_of(np.array(stroke_m), values))
     ready = [replace(pair, rig=rig, stroke_m=stroke) for pair in pairs]
-    spots = _spots([_answer(pair, photos) for pair in ready], len(photos.down.off), chosen.card)
+    spots = combined_spots([_answer(pair, photos) for pair in ready], len(photos.down.off), chosen.card)
     down, up = spots["down"], spots["up"]
     depth = depth_general(
         rig,
@@ -234,7 +234,7 @@ def measure(photos: PairPhotos, stroke_m: float, setting: Setting) -> Measuremen
     if int(depth.status) != Status.OK:
         raise _contradiction(ready[0], photos, describe(int(depth.status)))
     frames = _frames_note(photos, chosen.card)
-    notes = tuple(text for text in (chosen.note, note, blur_note, frames, _doubt(depth)) if text)
+    notes = tuple(text for text in (chosen.note, note, _blur_note(rig, outlines), frames, _doubt(depth)) if text)
     return Measurement(depth, down, up, rig, stroke, outlines, setting.known.rig, ready[0], chosen, notes)
 
 
@@ -305,10 +305,13 @@ def _frames_note(photos: PairPhotos, card: SensorCard) -> str:
 # -- rig -------------------------------------------------------------------------------------------------------------
 
 
-def _outlines(pair: Pair) -> tuple[tuple[Outline, ...], str]:
-    """Outlines of both positions, laser off where there is such a picture; and why there is none."""
+def _outlines(pair: Pair, calibrated: bool) -> tuple[tuple[Outline, ...], str]:
+    """Outlines of both positions, laser off where there is such a picture; and why there is none.
+
+    With a calibration one is enough: it only tells whether the mirror is still there.
+    """
     found, why = [], ""
-    for position in POSITIONS:
+    for position in POSITIONS[: 1 if calibrated else 2]:
         image = pair.images.get(f"{position}_off", pair.images[position])
         try:
             found.append(find_outline(image, pair.rig, pair.card))
@@ -351,13 +354,15 @@ def _calibration_note(held: Calibration, nominal: Rig, outlines: Sequence[Outlin
     return f"{text}; the mirror is still where it was"
 
 
-def _with_blur(rig: Rig, outlines: Sequence[Outline]) -> tuple[Rig, str]:
+def with_blur_of(rig: Rig, outlines: Sequence[Outline]) -> Rig:
     """Rig with the blur that the outlines' light has; as it is where none could be fitted."""
     blurs = [one.blur_px for one in outlines if math.isfinite(one.blur_px)]
-    if not blurs:
-        return rig, f"blur: {rig.camera.blur_sigma_px:g} px of the rig file"
-    blur = float(np.mean(blurs))
-    return replace(rig, camera=replace(rig.camera, blur_sigma_px=blur)), f"blur: {blur:.2f} px, of the outline"
+    return replace(rig, camera=replace(rig.camera, blur_sigma_px=float(np.mean(blurs)))) if blurs else rig
+
+
+def _blur_note(rig: Rig, outlines: Sequence[Outline]) -> str:
+    source = "of the outline" if any(math.isfinite(one.blur_px) for one in outlines) else "of the rig file"
+    return f"blur: {rig.camera.blur_sigma_px:.2f} px, {source}"
 
 
 # -- spots -----------------------------------------------------------------------------------------------------------
@@ -370,8 +375,8 @@ def _answer(pair: Pair, photos: PairPhotos) -> Answer:
     return answer
 
 
-def _spots(answers: Sequence[Answer], offs: int, card: SensorCard) -> dict[str, SeenSpot]:
-    """Positions of all frames together."""
+def combined_spots(answers: Sequence[Answer], offs: int, card: SensorCard) -> dict[str, SeenSpot]:
+    """Positions of all frames together, by position; `offs` laser-off frames are shared by them."""
     found, count = {}, len(answers)
     for position in POSITIONS:
         seen = [getattr(answer, position) for answer in answers]

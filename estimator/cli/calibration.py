@@ -63,6 +63,8 @@ def calibrate(
     from phibench.datasets.store.files import require_writable
     from phibench.estimator.calibration.from_dataset import calibrate_dataset
     from phibench.estimator.calibration.spots import Ruler
+    from phibench.estimator.captures.imported_calibration import calibrate_imported
+    from phibench.estimator.captures.imported_set import is_imported, open_imported
     from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
     from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 
@@ -71,7 +73,15 @@ def calibrate(
     ruler = Ruler(distance_sigma_m, height_sigma_m, math.radians(azimuth_sigma_deg))
     require_writable(out)  # a folder such as "." has no name to which an ending could be given
     picture = out.with_suffix(".png") if picture is None else picture
-    found = calibrate_dataset(directory, out, sample, preset, spots, ruler, vertical, outline_sigma_factor)
+    if is_imported(directory):
+        if vertical or ruler != Ruler() or preset not in (DEFAULT_PRESET, open_imported(directory).preset):
+            raise DatasetError(
+                f"{directory} holds pictures: their kind and the tape's standard deviation were imported with them; "
+                "leave --preset, --vertical and the sigmas out"
+            )
+        found = calibrate_imported(directory, out, sample, spots, outline_sigma_factor)
+    else:
+        found = calibrate_dataset(directory, out, sample, preset, spots, ruler, vertical, outline_sigma_factor)
     print(f"{found.verdict}.")
     print(f"{found.write_picture(picture)}: the outline on the frame that fits worst, residuals enlarged")
     print(_LAB)

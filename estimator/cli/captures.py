@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
+
+if TYPE_CHECKING:
+    from phibench.estimator.captures.measure import Setting
 
 Pictures = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative="")]
 
 
 def measure(
+    directory: Path | None = None,
     *,
-    down: Pictures,
-    up: Pictures,
-    stroke_m: float,
     rig: Path,
+    down: Pictures = (),
+    up: Pictures = (),
+    stroke_m: float | None = None,
     down_off: Pictures = (),
     up_off: Pictures = (),
     stroke_sigma_m: float = 0.0,
@@ -23,17 +27,19 @@ def measure(
     sensor: Path | None = None,
     out: Path | None = None,
 ) -> int:
-    """Measure D from two pictures of a laser spot in the mirror, down and up.
+    """Measure D from two pictures of a laser spot in the mirror, down and up; or from a folder of such pairs.
 
     Parameters
     ----------
+    directory
+        Folder with pictures and `pairs.csv`, instead of --down, --up and --stroke-m.
+    rig
+        TOML file with what is known of the rig: `[rig]` of a recipe. docs/measure.md has an example.
     down, up
         Pictures at stroke position 1 and 2, laser on: JPEG, PNG, PGM or headerless .raw. Several frames of each
         position may be given, as many of both.
     stroke_m
         Stroke between the two positions, metres.
-    rig
-        TOML file with what is known of the rig: `[rig]` of a recipe. docs/measure.md has an example.
     down_off, up_off
         The same with the laser off.
     stroke_sigma_m
@@ -43,21 +49,29 @@ def measure(
     sensor
         TOML file of the sensor; by default the preset of the kind of file is assumed.
     out
-        PNG or JPEG to write: spots, epipolar line and outline.
+        PNG or JPEG to write: spots, epipolar line and outline. Of a folder, CSV of the results.
     """
+    from phibench.datasets.errors import DatasetError
     from phibench.datasets.store.files import require_writable
-    from phibench.estimator.captures.measure import PairPhotos, PositionPhotos, read_setting
+    from phibench.estimator.captures.measure import read_setting
+
+    if (directory is None) != bool(down and up and stroke_m is not None) or (directory and (down or up or stroke_m)):
+        raise DatasetError("give --down, --up and --stroke-m, or a folder with pairs.csv instead of them")
+    if out is not None:
+        require_writable(out)
+    setting = read_setting(rig, calibration, sensor, stroke_sigma_m)
+    if directory is not None:
+        return _measure_folder(directory, setting, out)
+    return _measure_pair((down, up, down_off, up_off), stroke_m or 0.0, setting, out)
+
+
+def _measure_pair(files: tuple[Pictures, ...], stroke_m: float, setting: Setting, out: Path | None) -> int:
+    from phibench.estimator.captures.measure import PairPhotos, PositionPhotos
     from phibench.estimator.captures.measure import measure as measured
     from phibench.estimator.captures.measure_picture import write_measure_picture
     from phibench.estimator.captures.picture_files import read_photo
 
-    if out is not None:
-        require_writable(out)
-    setting = read_setting(rig, calibration, sensor, stroke_sigma_m)
-    groups = [
-        tuple(read_photo(path, setting.known.rig, setting.sensor) for path in paths)
-        for paths in (down, up, down_off, up_off)
-    ]
+    groups = [tuple(read_photo(path, setting.known.rig, setting.sensor) for path in paths) for paths in files]
     photos = PairPhotos(PositionPhotos(groups[0], groups[2]), PositionPhotos(groups[1], groups[3]))
     found = measured(photos, stroke_m, setting)
     print(f"D = {found.depth_m:.4f} m, sigma {found.sigma_m:.4f} m")
@@ -69,4 +83,44 @@ def measure(
         print(note)
     if out is not None:
         print(f"{write_measure_picture(out, found)}: spots, epipolar line and outline")
+    return 0
+
+
+def _measure_folder(directory: Path, setting: Setting, out: Path | None) -> int:
+    """Exit code 1 if a pair could not be measured, or contradicts itself or the tape."""
+    from phibench.datasets.errors import DatasetError
+    from phibench.estimator.captures.pair_list import Result, measured_pairs, write_results
+
+    if out is None or out.suffix.lower() != ".csv":
+        raise DatasetError(f"--out {out}: the results of a folder are a CSV file; give a name that ends in .csv")
+
+    def told(result: Result) -> None:
+        found = result.found
+        text = "" if found is None else f"D = {found.depth_m:.4f} m, sigma {found.sigma_m:.4f} m; "
+        print(f"{result.row.name}: {text}{result.status}", flush=True)
+
+    results = measured_pairs(directory, setting, told)
+    print(f"{write_results(out, results)}: {len(results)} pairs")
+    return 0 if all(result.status == "ok" for result in results) else 1
+
+
+def import_(directory: Path, *, out: Path, rig: Path | None = None, sensor: Path | None = None) -> int:
+    """Make a data set of real pairs, which `score`, `compare`, `report` and `calibrate` take like a rendered one.
+
+    Parameters
+    ----------
+    directory
+        Folder with pictures and `pairs.csv`; the D of a tape with its standard deviation is the truth of a pair.
+    out
+        Folder to write, new or empty.
+    rig
+        Rig file; `rig.toml` of the folder by default.
+    sensor
+        Sensor file; `sensor.toml` of the folder by default, and if there is none the preset of the kind of picture.
+    """
+    from phibench.estimator.captures.imported_set import import_pairs
+
+    made = import_pairs(directory, out, rig, sensor)
+    print(f"{made.folder}: {made.pairs} pairs, {made.with_depth} of them with a measured D")
+    print(made.sensor)
     return 0

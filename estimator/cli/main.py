@@ -23,7 +23,7 @@ from cyclopts import App, CycloptsError
 
 from phibench.datasets.parallel import ONE_THREAD
 from phibench.estimator.cli.calibration import align, calibrate
-from phibench.estimator.cli.captures import measure
+from phibench.estimator.cli.captures import import_, measure
 from phibench.estimator.cli.dataset import dataset
 from phibench.estimator.cli.methods import method
 from phibench.estimator.cli.options import INSTALLATION, METHODS, SENSOR, answer_to_old_spelling
@@ -48,6 +48,7 @@ app.command(report, group=METHODS)
 app.command(calibrate, group=SENSOR)
 app.command(align, group=SENSOR)
 app.command(measure, group=SENSOR)
+app.command(import_, name="import", group=SENSOR)
 app.command(paper, group=SENSOR)
 
 

@@ -102,10 +102,9 @@ def score(
     """
     from phibench.datasets.errors import DatasetError
     from phibench.datasets.progress import progress_console
-    from phibench.datasets.read import open_finished
     from phibench.datasets.store.files import require_writable
     from phibench.estimator.benchmark.document import MethodCard
-    from phibench.estimator.benchmark.score import run_and_score, saved, wanted_pairs
+    from phibench.estimator.benchmark.score import open_scored, run_and_score, saved, wanted_pairs
     from phibench.estimator.benchmark.score_tables import print_scores
     from phibench.estimator.sandbox.resolve import resolve
 
@@ -118,7 +117,7 @@ def score(
     files = _files(out, [MethodCard.of(name, **resolve(name).document()) for name in method])
     for target in filter(None, files):
         require_writable(target)
-    pair_set = wanted_pairs(open_finished(directory), preset, draws, pairs, hints, calibration, boxes, sensor)
+    pair_set = wanted_pairs(open_scored(directory), preset, draws, pairs, hints, calibration, boxes, sensor)
     scored = run_and_score(method, pair_set, workers, progress_console(), "pairs", _seed(bootstrap_seed), run_limits)
     scored = [one if file is None else saved(one, file) for one, file in zip(scored, files, strict=True)]
     print_scores(scored, form, rank, output.wide, calibration is not None)

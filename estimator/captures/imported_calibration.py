@@ -1,0 +1,163 @@
+"""Calibration from real pictures: outlines of an imported set, and its spots at the distances of a tape."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.store.files import require_writable
+from phibench.estimator.calibration.bundle import Bundle, KnownSpot, calibrate
+from phibench.estimator.calibration.from_dataset import DatasetCalibration, Photograph, write_bundle
+from phibench.estimator.calibration.outline import Outline, find_outline, mean_outline
+from phibench.estimator.calibration.spots import method_for
+from phibench.estimator.captures.imported_set import ImportedRow, ImportedSet, open_imported
+from phibench.estimator.captures.measure import combined_spots, with_blur_of
+from phibench.estimator.geometry.least_squares_depth import depth_general
+from phibench.estimator.geometry.rig_parameters import stroke_of
+from phibench.estimator.interface import Pair
+from phibench.estimator.spots.image_planes import ImageError
+from phibench.scenes.rig import POSITIONS, Rig
+from phibench.scenes.validation import nearest
+
+_FAR_SIGMAS = 4.0  # of D, or of the gap of the rays, from what outline and ruler allow: another light was taken
+
+
+def calibrate_imported(
+    folder: Path,
+    out: Path,
+    samples: Sequence[str] = (),
+    spots: bool = False,
+    outline_sigma_factor: float = 1.0,
+) -> DatasetCalibration:
+    """Calibrate the rig of an imported set and write the file.
+
+    Parameters
+    ----------
+    folder : Path
+    out : Path
+    samples : ids; by default the first, with `spots` all that have a measured D
+    spots : bool
+        Also use the spots, at the distances of the tape. A sample is left out where no spot is found, or where what is
+        found contradicts the tape or itself by more than outline and ruler allow.
+    outline_sigma_factor : float
+        As in `calibrate_dataset`.
+
+    Raises
+    ------
+    DatasetError
+        If no picture shows the mirror's outline, or no spot is left.
+    """
+    require_writable(out)
+    imported = open_imported(folder)
+    rows = _rows(imported, samples, spots)
+    images, outlines, names = _outlines(imported, rows, outline_sigma_factor)
+    rig = with_blur_of(imported.rig, outlines)
+    aligned = calibrate(imported.rig, mean_outline(outlines))
+    known: dict[str, KnownSpot] = {}
+    left_out: dict[str, str] = {}
+    if spots:
+        for sample_id in dict.fromkeys(row.sample_id for row in rows):
+            try:
+                own = [row for row in rows if row.sample_id == sample_id]
+                spot = _known(imported, own, rig)
+                _require_sound(spot, aligned)
+                known[sample_id] = spot
+            except DatasetError as error:
+                left_out[sample_id] = str(error)
+        if not known:
+            raise DatasetError(
+                f"no spot of {folder} to calibrate with; of {next(iter(left_out))}: {next(iter(left_out.values()))}"
+            )
+    bundle = calibrate(imported.rig, mean_outline(outlines), list(known.values()))
+    made_from: dict[str, Any] = {
+        "dataset": imported.info.name,
+        "samples": list(known) or sorted({row.sample_id for row in rows}),
+        "left_out": left_out,
+        "preset": imported.preset,
+        "spots": bool(known),
+        "sphere_in_camera_m": [outline.sphere_in_camera_m.tolist() for outline in outlines],
+        "sigma_m": [outline.sigma_m.tolist() for outline in outlines],
+        "spot_uv_px": [[spot.uv_down_px.tolist(), spot.uv_up_px.tolist()] for spot in known.values()],
+        "spot_depth_m": [spot.depth_m for spot in known.values()],
+    }
+    return write_bundle(out, bundle, imported.rig, images, outlines, names, made_from)
+
+
+def _rows(imported: ImportedSet, samples: Sequence[str], spots: bool) -> list[ImportedRow]:
+    ids = list(dict.fromkeys(row.sample_id for row in imported.rows))
+    if strange := [name for name in samples if name not in ids]:
+        raise DatasetError(f"{imported.folder} has no sample '{strange[0]}'; {nearest(strange[0], ids)}")
+    wanted = set(samples or (ids if spots else ids[:1]))
+    rows = [row for row in imported.rows if row.sample_id in wanted and not (spots and row.depth_m is None)]
+    if not rows:
+        raise DatasetError(f"no sample of {imported.folder} has a measured D: put depth_m into pairs.csv")
+    return rows
+
+
+def _outlines(
+    imported: ImportedSet, rows: Sequence[ImportedRow], factor: float
+) -> tuple[list[Photograph], list[Outline], list[str]]:
+    """One outline of each sample and position, laser off where there is such a picture; those that were found."""
+    images, outlines, names = [], [], []
+    fault: ImageError | None = None
+    for row in rows:
+        if row.draw:
+            continue
+        pair = imported.pair(row)
+        for position in POSITIONS:
+            image = Photograph(pair.images.get(f"{position}_off", pair.images[position]), imported.card)
+            try:
+                outlines.append(find_outline(image.pixels, imported.rig, image.card).widened(factor))
+            except ImageError as error:
+                fault = error
+                continue
+            images.append(image)
+            names.append(f"{row.sample_id} {position}")
+    if fault is not None and not outlines:
+        raise fault
+    return images, outlines, names
+
+
+def _known(imported: ImportedSet, rows: Sequence[ImportedRow], rig: Rig) -> KnownSpot:
+    """Spot of a sample, of all its frames, at the distance of the tape."""
+    pairs: list[Pair] = [replace(imported.pair(row), rig=rig) for row in rows]
+    answers = [method_for(imported.card)(pair) for pair in pairs]
+    for answer in answers:
+        for position in POSITIONS:
+            spot = getattr(answer, position)
+            if spot.uv_px is None or spot.covariance_px2 is None:
+                raise DatasetError(f"no spot {position}: {spot.status}")
+    offs = len({row.files.get("down_off") for row in rows} - {None})
+    found = combined_spots(answers, offs, imported.card)
+    row = rows[0]
+    if row.depth_m is None or row.depth_sigma_m is None:
+        raise DatasetError("no measured D")
+    down, up = found["down"], found["up"]
+    return KnownSpot(
+        down.uv_px,
+        up.uv_px,
+        down.covariance_px2,
+        up.covariance_px2,
+        row.stroke_m,
+        depth_m=row.depth_m,
+        depth_sigma_m=row.depth_sigma_m,
+    )
+
+
+def _require_sound(spot: KnownSpot, aligned: Bundle) -> None:
+    """Refuse a spot that another light was taken for."""
+    stroke_m = float(stroke_of(np.array(spot.stroke_m), aligned.values))
+    places = spot.uv_down_px, spot.uv_up_px, spot.covariance_down_px2, spot.covariance_up_px2
+    found = depth_general(aligned.rig, stroke_m, *places, aligned.covariance)
+    off = abs(float(found.depth_m) - spot.depth_m) / math.hypot(float(found.sigma_m), spot.depth_sigma_m)
+    if not (off < _FAR_SIGMAS and float(found.chi2) < _FAR_SIGMAS**2):
+        raise DatasetError(
+            f"what was found is {float(found.depth_m):.3f} m away, the tape says {spot.depth_m:.3f} m; gap of the rays "
+            f"{math.sqrt(float(found.chi2)):.1f} sigma"
+        )
