@@ -51,7 +51,8 @@ class Pair:
         Of the pair in its set; says nothing about the scene.
     down, up : array
         Images at stroke position 1 and 2, laser on, read-only. By `card.output`: "raw" (H, W) uint16, DN of the mosaic
-        (RGGB, red at even row and column) or of a sensor without filters; "srgb8" and "mjpeg" (H, W, 3) uint8, R, G, B.
+        (RGGB, red at even row and column) or of a sensor without filters; "srgb8" and "mjpeg" (H, W, 3) uint8, R, G, B;
+        "yuyv" (H, W, 2) uint8, the camera's bytes: Y', and in turns Cb (even columns) and Cr (`camera_codes`).
     down_off, up_off : array or None
         The same with the laser off, from another exposure.
     rig : Rig

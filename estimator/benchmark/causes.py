@@ -33,6 +33,8 @@ import polars as pl
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.interface import FAILURES, Pair
 from phibench.estimator.pair_set import PairSet, PairTruth, SpotTruth
+from phibench.estimator.spots.camera_codes import rgb_codes
+from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
@@ -84,9 +86,13 @@ class Case:
         """
         u, v = (int(x) for x in np.floor(uv_px))
         rows, columns = (slice(max(x - before, 0), max(x + after + 1, 0)) for x in (v, u))
-        part = _planes(getattr(self.pair, self.position)[rows, columns])
+        part = self._planes(getattr(self.pair, self.position), rows, columns)
         off = getattr(self.pair, f"{self.position}_off")
-        return part - _planes(off[rows, columns]) if less_off and off is not None else part
+        return part - self._planes(off, rows, columns) if less_off and off is not None else part
+
+    def _planes(self, image: Any, rows: slice, columns: slice) -> Array:
+        planes = np.asarray(rgb_codes(image[rows, columns], self.pair.card, (columns.start, 0)), float)
+        return planes[..., None] if planes.ndim == 2 else planes
 
 
 def cause_of(case: Case) -> str:
@@ -187,7 +193,7 @@ def _below_noise(case: Case) -> bool:
 
 def _compression(case: Case) -> bool:
     raw = case.spot.raw_bound_px2
-    if raw is None or not np.sqrt(np.trace(raw) / 2.0) < GOOD_RAW_PX or case.pair.card.output not in ("srgb8", "mjpeg"):
+    if raw is None or not np.sqrt(np.trace(raw) / 2.0) < GOOD_RAW_PX or case.pair.card.output not in PROCESSED:
         return False
     return not _stands_out(case)
 
@@ -260,11 +266,6 @@ def _is_lamp(case: Case, uv_px: Array, spot_level: float) -> bool:
 
 def _margin_px(rig: Rig) -> float:
     return EDGE_BLURS * float(np.sqrt(rig.camera.blur_sigma_px**2 + _PIXEL_SIGMA2))
-
-
-def _planes(image: Any) -> Array:
-    planes = np.asarray(image, float)
-    return planes[..., None] if planes.ndim == 2 else planes
 
 
 def _level(case: Case, uv_px: Array, less_off: bool) -> float:

@@ -25,7 +25,8 @@ from scipy import ndimage
 from scipy.signal import fftconvolve
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.spots.image_planes import ImageError, srgb_to_linear
+from phibench.estimator.spots.camera_codes import light_of, rgb_picture
+from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.rig import Rig
@@ -71,7 +72,7 @@ def planes_of(image: NDArray[Any], card: SensorCard | None = None) -> tuple[Plan
     ----------
     image : array
         Without a card, or for a card whose output is "electrons": a layer or an ideal frame, shape (3, H, W). Else by
-        `card.output`: "raw" (H, W) DN; "srgb8" and "mjpeg" (H, W, 3) of 8 bits.
+        `card.output`: "raw" (H, W) DN; "srgb8" and "mjpeg" (H, W, 3) of 8 bits; "yuyv" (H, W, 2).
     card : SensorCard, optional
 
     Raises
@@ -83,6 +84,7 @@ def planes_of(image: NDArray[Any], card: SensorCard | None = None) -> tuple[Plan
     shape_is_right = {
         "electrons": image.ndim == 3 and image.shape[0] == 3,
         "raw": image.ndim == 2,
+        "yuyv": image.ndim == 3 and image.shape[-1] == 2,
     }.get(output, image.ndim == 3 and image.shape[-1] == 3)
     if not shape_is_right or image.size == 0:
         raise ImageError(
@@ -92,7 +94,7 @@ def planes_of(image: NDArray[Any], card: SensorCard | None = None) -> tuple[Plan
         return tuple(_whole(image[i], (Tap(1.0, i),)) for i in range(3))
     if output == "raw":
         return _raw(image, card)
-    return (_luma(image, card),)
+    return (_luma(rgb_picture(image, card), card),)
 
 
 def _whole(values: NDArray[Any], taps: Taps) -> Plane:
@@ -116,7 +118,7 @@ def _raw(image: NDArray[Any], card: SensorCard) -> tuple[Plane, ...]:
 
 def _luma(image: NDArray[Any], card: SensorCard) -> Plane:
     """Luma of the linear, white-balanced planes. It is a filter's own light only where the colour matrix is one."""
-    linear = srgb_to_linear(np.asarray(image, float) / 255.0)
+    linear = light_of(np.asarray(image, float) / 255.0, card)
     values = linear @ np.array(JPEG_LUMA)
     clipped = ndimage.binary_dilation((image >= _CLIPPED).any(axis=-1), iterations=2)
     level = np.median(linear.reshape(-1, 3), axis=0) * np.array(JPEG_LUMA)

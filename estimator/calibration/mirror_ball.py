@@ -28,7 +28,8 @@ from phibench.estimator.calibration.edge_ring import Circle
 from phibench.estimator.calibration.outline_start import sphere_from_circle, sphere_from_rays
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.panorama import Grid, unrolled
-from phibench.estimator.spots.image_planes import ImageError, linear_to_srgb
+from phibench.estimator.spots.camera_codes import linear_to_srgb
+from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, Pose, as_matrix, as_vector
 from phibench.scenes.mirror import SphereMirror

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.calibration.limb_image import JPEG_LUMA
 from phibench.estimator.calibration.outline_fit import OutlinePixels
-from phibench.estimator.spots.image_planes import full_scale_e, linear_to_srgb, srgb_to_linear, through_jpeg
+from phibench.estimator.spots.camera_codes import light_of, tone_of
+from phibench.estimator.spots.image_planes import full_scale_e, through_jpeg
 from phibench.estimator.spots.jpeg_coefficients import mcu_px
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
@@ -78,15 +79,15 @@ class JpegAgain:
         factor = np.ones(self.frame.shape[:2])
         with np.errstate(all="ignore"):
             factor[self.pixels.v, self.pixels.u] = np.clip(np.nan_to_num(model / self.pixels.y, nan=1.0), 0.25, 4.0)
-        linear = srgb_to_linear(self.frame[units.v, units.u] / 255.0) * factor[units.v, units.u][..., None]
+        linear = light_of(self.frame[units.v, units.u] / 255.0, self.card) * factor[units.v, units.u][..., None]
         return np.array([self._seen(units, linear, k) for k in range(draws)])
 
     def _seen(self, units: Units, linear: Array, draw: int) -> Array:
         rng = generator("calibration", "outline_jpeg", draw)
         light = linear[:, 1:-1, 1:-1] + _noise(linear, units, self.card, rng)
-        codes = np.rint(255.0 * linear_to_srgb(light)).astype(np.uint8)
+        codes = np.rint(255.0 * tone_of(light, self.card)).astype(np.uint8)
         image = through_jpeg(_packed(codes, units.rows), self.card)
-        decoded = srgb_to_linear(image.reshape(-1, 3)[units.place] / 255.0)
+        decoded = light_of(image.reshape(-1, 3)[units.place] / 255.0, self.card)
         return np.asarray(decoded @ np.array(JPEG_LUMA) / self.pixels.ray[:, 2] ** 4)
 
 

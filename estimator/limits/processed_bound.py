@@ -1,8 +1,9 @@
 """Bound of a spot's position behind the camera's processing, from the estimator's own model; no frame is simulated.
 
-"srgb8": the information of each pixel's own code (`pixel_statistics`); interpolated colours are left out. "mjpeg":
-J^T C^-1 J of the quantised coefficients' mean and covariance (M. Stein, A. Mezghani, J. A. Nossek, IEEE Signal Process.
-Lett. 21, 796, 2014; `fit_jpeg`). The coefficients carry all that the decoded image does, unless the decoder cuts.
+"srgb8": the information of each pixel's own code (`pixel_statistics`); interpolated colours are left out. "yuyv" and
+"mjpeg", and "srgb8" whose codes sharpening, denoising or a colour matrix mix: J^T C^-1 J of the mean and covariance of
+codes or quantised coefficients (M. Stein, A. Mezghani, J. A. Nossek, IEEE Signal Process. Lett. 21, 796, 2014;
+`fit_jpeg`). The coefficients carry all that the decoded image does, unless the decoder cuts.
 
 Both are lower bounds of the information. Their inverse is the smallest covariance of estimates that use no more than
 the model does; it is no theorem for every method. The Cramer-Rao bound lies between that of the raw pixels
@@ -24,10 +25,10 @@ from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.limits.position_bound import SpotLimit, limit_of, raw_information
 from phibench.estimator.spots.chain_model import chain_model
 from phibench.estimator.spots.fisher import covariance_bound, fisher_matrix
-from phibench.estimator.spots.fit_chain import unrounded
-from phibench.estimator.spots.fit_jpeg import Window
+from phibench.estimator.spots.fit_chain import own_codes, unrounded
+from phibench.estimator.spots.fit_jpeg import Window, grid_px
 from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel, SpotPixels
-from phibench.estimator.spots.jpeg_coefficients import mcu_px
+from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.estimator.spots.pixel_statistics import code_law, code_table
 from phibench.estimator.spots.raw_pixels import bayer_filters
 from phibench.scenes.frames import Array
@@ -56,7 +57,7 @@ def chain_limit(
     Parameters
     ----------
     card : SensorCard
-        Of the output "srgb8" or "mjpeg".
+        Of the output "srgb8", "yuyv" or "mjpeg".
     uv_px : shape (2,), in the image
     blur : SpotBlur
     flux_e : float
@@ -71,15 +72,17 @@ def chain_limit(
     Raises
     ------
     ValueError
-        If the output is neither of the two.
+        If the output is none of them.
     """
     uv = np.asarray(uv_px, float)
     theta = np.array([*uv, flux_e, *np.asarray(background_e, float)])
-    if card.output == "srgb8":
+    if own_codes(card):
         return _of_codes(card, theta, blur, response, pattern_known)
-    if card.output == "mjpeg":
-        return _of_coefficients(card, theta, blur, response, pattern_known)
-    raise ValueError(f"output '{card.output}': chain_limit knows 'srgb8' and 'mjpeg'; take spot_limit for raw pixels")
+    if card.output in PROCESSED:
+        return _of_window(card, theta, blur, response, pattern_known)
+    raise ValueError(
+        f"output '{card.output}': chain_limit knows 'srgb8', 'yuyv' and 'mjpeg'; take spot_limit for raw pixels"
+    )
 
 
 def _of_codes(
@@ -94,13 +97,12 @@ def _of_codes(
     return SpotLimit(covariance_bound(fisher), fisher)
 
 
-def _of_coefficients(
+def _of_window(
     card: SensorCard, theta: Array, blur: SpotBlur, response: tuple[float, float, float], known: bool
 ) -> SpotLimit:
     model = chain_model(card, unrounded(card, known))
-    down, across = mcu_px(card.jpeg_subsampling)
-    units = np.array([across, down])
-    corner = (np.rint((theta[:2] + 0.5) / units) - 1.0) * units - model.margin
+    units, sides = np.array(grid_px(card)[::-1]), np.array(model.shape[::-1])
+    corner = np.rint((theta[:2] + 0.5 - sides / 2) / units) * units - model.margin
     theta = theta - np.array([*corner, 0, 0, 0, 0])
     pixels = SpotPixels.of(model.filters[None], blur, SpotModel(response))
     fisher = Window(np.zeros(len(model.step)), model, pixels).fisher(theta)
@@ -145,7 +147,7 @@ def spot_sigma(
     Parameters
     ----------
     card : SensorCard
-        Raw output of a Bayer sensor, "srgb8" or "mjpeg".
+        Raw output of a Bayer sensor, "srgb8", "yuyv" or "mjpeg".
     blur_sigma_px : float
         Of the spot's image.
     background_e : 3 floats

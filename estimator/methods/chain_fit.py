@@ -1,4 +1,4 @@
-"""Built-in method `chain_fit`: both spots through the camera's own processing, for "srgb8" and "mjpeg" images."""
+"""Built-in method `chain_fit`: both spots through the camera's own processing, for images that it has processed."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Box, Pair, Spot
 from phibench.estimator.methods.locate import box_around, measured_twice, pair_blur, seen_depth_m
 from phibench.estimator.spots.detect import Detection, detect
-from phibench.estimator.spots.fit_chain import first_fit, fit_jpeg, fit_srgb, undone, unrounded
+from phibench.estimator.spots.fit_chain import first_fit, fit_jpeg, fit_srgb, fit_yuyv, undone, unrounded
 from phibench.estimator.spots.fit_raw import SpotFit
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
+from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.estimator.spots.jpeg_coefficients import mcu_px
-from phibench.estimator.spots.raw_pixels import Background, around, background_of, bayer_filters
+from phibench.estimator.spots.raw_pixels import Background, around, background_of
 from phibench.scenes.frames import Array
 
 _HALF_PX = 8
@@ -32,8 +33,8 @@ def chain_fit(pair: Pair) -> Answer:
     comes from the laser-off frames where they are there, otherwise from what surrounds the spot. A misfit above 1 per
     degree of freedom widens the covariance by as much.
     """
-    if pair.card.output not in ("srgb8", "mjpeg"):
-        missing = Spot.missing(f"chain_fit needs srgb8 or mjpeg images, not {pair.card.output}")
+    if pair.card.output not in PROCESSED:
+        missing = Spot.missing(f"chain_fit needs srgb8, yuyv or mjpeg images, not {pair.card.output}")
         return Answer(missing, missing)
     found = detect(pair)
 
@@ -80,6 +81,8 @@ def _spot(pair: Pair, image: NDArray[Any], off: NDArray[Any] | None, box: Box | 
     if background is None:
         known = around(start[None], origin, (region.height_px, region.width_px))
         background = _background(on, known, origin, pair.card)
+    if pair.card.output == "yuyv":
+        return _answer(fit_yuyv(on, origin, pair.card, blur, model, background))
     size = (image.shape[1], image.shape[0])
     return _answer(fit_jpeg(on, origin, pair.card, blur, model, background, size_px=size))
 
@@ -126,7 +129,7 @@ def _srgb(
 
 def _background(image: NDArray[Any], known: Array | None, origin: NDArray[np.int64], card: SensorCard) -> Background:
     """Room in a region: of the laser-off frame, or of what is `known` of the laser-on frame."""
-    x, rounding = undone(image, bayer_filters(origin, image.shape[1:3]), card)
+    x, rounding = undone(image, origin, card)
     variance = unrounded(card).variance_e2(x) + 1.0 / (12.0 * card.dn_per_e**2) + rounding
     return background_of(x, variance, np.ones(x.shape) if known is None else known)
 

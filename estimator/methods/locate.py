@@ -29,6 +29,7 @@ from scipy.ndimage import gaussian_filter
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Box, Image, Method, Pair, Spot
+from phibench.estimator.spots.camera_codes import rgb_codes
 from phibench.estimator.spots.detect import Detection, detect, outline_mask
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import demosaiced, kind_of, linear_planes, redness
@@ -201,7 +202,7 @@ class SearchRegion:
     @property
     def picture(self) -> Array:
         """Box as a viewer shows it: R, G, B, shape (h, w, 3), or one plane; raw ones interpolated, not encoded."""
-        pixels = self.pixels.astype(float)
+        pixels = rgb_codes(self.pixels, self.pair.card, self.origin_px).astype(float)
         if kind_of(self.pair.card) != "bayer-raw":
             return pixels
         return np.moveaxis(demosaiced(pixels, self.origin_px), 0, -1)

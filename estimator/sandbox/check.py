@@ -60,7 +60,7 @@ def check_method(
     ----------
     reference : str
         As for `runner.run_method`.
-    preset : "bayer-raw", "mono-raw", "srgb8" or "mjpeg"
+    preset : "bayer-raw", "mono-raw", "srgb8", "yuyv" or "mjpeg"
     limits : RunLimits, optional
     count : int
         How many pairs.

@@ -26,8 +26,9 @@ from phibench.estimator.limits.position_bound import spot_limit
 from phibench.estimator.methods.locate import around, clipped
 from phibench.estimator.pair_set import PairTruth, SpotTruth
 from phibench.estimator.sandbox.resolve import MethodError
+from phibench.estimator.spots.camera_codes import tone_of, yuyv_image
 from phibench.estimator.spots.gaussian_spot import outer, profile
-from phibench.estimator.spots.image_planes import KINDS, linear_planes, linear_to_srgb, through_jpeg
+from phibench.estimator.spots.image_planes import KINDS, linear_planes, through_jpeg
 from phibench.estimator.spots.raw_pixels import bayer_filters
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.scenes.camera import Camera
@@ -166,7 +167,10 @@ class EasyCamera:
     def _processed(self, dn: NDArray[np.uint16]) -> NDArray[np.uint8]:
         planes = linear_planes(dn, _raw(self.card)).astype(np.float32)  # a power of half the bytes takes half the time
         planes = np.repeat(planes, 3, axis=0) if len(planes) == 1 else planes
-        image = np.rint(255.0 * np.moveaxis(linear_to_srgb(planes), 0, -1)).astype(np.uint8)
+        codes = 255.0 * np.moveaxis(tone_of(planes, self.card), 0, -1)
+        if self.card.output == "yuyv":
+            return yuyv_image(codes, self.card)
+        image = np.rint(codes).astype(np.uint8)
         return through_jpeg(image, self.card) if self.card.output == "mjpeg" else image
 
 
@@ -204,7 +208,7 @@ class EasyPairs:
 
     Parameters
     ----------
-    preset : "bayer-raw", "mono-raw", "srgb8" or "mjpeg"
+    preset : "bayer-raw", "mono-raw", "srgb8", "yuyv" or "mjpeg"
     count : int
     rig : Rig
         Its whole mirror should be in the image.

@@ -32,8 +32,8 @@ from phibench.scenes.frames import Array, BoolArray
 _KERNEL_REACH_PX = 4
 _PHASES = (0.0, 0.5)
 _AROUND_PX, _CORE_PX = 13, 5  # of the surroundings that a background is taken from, and what is left out of them
-# JPEG's coarse chroma spreads red into green: what is taken off would move the peak
-_GREEN_TAKEN = {"raw": 1.0, "srgb8": 1.0, "mjpeg": 0.0}
+# coarse chroma spreads red into green: what is taken off would move the peak
+_GREEN_TAKEN = {"raw": 1.0, "srgb8": 1.0, "yuyv": 0.0, "mjpeg": 0.0}
 _NOISE = 0.70  # standard deviation of the highest of the four phases for pure noise, measured
 
 
@@ -156,8 +156,8 @@ def _map_spread(z: NDArray[Any], inside: BoolArray) -> float:
 
 # of a patch: of a mosaic, where a quarter of the pixels are red, and of whole planes
 _PATCH_REACH_PX = {True: 6, False: 4}
-# of white light's green: where red ends; the laser's is 0.1, but for JPEG's coarse chroma
-_GREEN_SHARE = {"raw": 0.5, "srgb8": 0.5, "mjpeg": 0.75}
+# of white light's green: where red ends; the laser's is 0.1, but for coarse chroma
+_GREEN_SHARE = {"raw": 0.5, "srgb8": 0.5, "yuyv": 0.75, "mjpeg": 0.75}
 _FULLER = 0.5
 _OUTSHINES = 0.7  # peak of a spot over the level around it, more than the contrast of walls and furniture
 _LATTICE_PX = 17

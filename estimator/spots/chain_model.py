@@ -1,14 +1,16 @@
 """Mean and covariance of processed images from the mean electrons of the raw pixels.
 
-The stages, for a window of whole JPEG units and the raw pixels around it:
+The stages, for a window of the image (of MJPEG whole units) and the raw pixels around it:
 
 * raw pixels: independent, mean and variance in electrons, cut at saturation;
 * bilinear demosaicing, white balance, colour matrix: a sparse matrix A on electrons;
-* sRGB curve and 8 bits: mean and slope under the noise, from the converter's law (`mean_codes`), or, where a colour
-  matrix or sharpening mixes the pixels, of a Gaussian value (`noisy_srgb`);
-* sharpening, Y Cb Cr, chroma averages, DCT: a matrix T.
+* tone curve: mean and slope under the noise, from the converter's law (`mean_codes`), or, where a colour matrix mixes
+  the pixels, of a Gaussian value (`noisy_code`);
+* sharpening, denoising and what the output adds, a matrix T: nothing for srgb8; Y', Cb, Cr and their 4:2:2 for yuyv;
+  Y, Cb, Cr, chroma averages and DCT for mjpeg.
 
-Covariance of the coefficients: (T D A) V (T D A)^T with the slopes D, plus what rounding adds.
+The outputs are what is then quantised: codes in steps of 1, or coefficients in those of JPEG's tables. Covariance:
+(T D A) V (T D A)^T with the slopes D, plus what rounding adds.
 """
 
 from __future__ import annotations
@@ -21,13 +23,24 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.spots.image_planes import full_scale_e, noisy_srgb
-from phibench.estimator.spots.jpeg_coefficients import CHROMA_STEP, YCC_FROM_RGB, coefficients, mcu_px, steps, transform
+from phibench.estimator.spots.camera_codes import noisy_code, ycbcr_transform
+from phibench.estimator.spots.image_planes import full_scale_e
+from phibench.estimator.spots.jpeg_coefficients import (
+    CHROMA_STEP,
+    YCC_FROM_RGB,
+    coefficients,
+    mcu_px,
+    qtables_of,
+    steps,
+    transform,
+)
 from phibench.estimator.spots.pixel_statistics import COUNTS, MeanCodes, mean_codes
 from phibench.estimator.spots.raw_pixels import PixelNoise, bayer_filters
 from phibench.scenes.frames import Array
 
-_UNITS = 2  # a window holds 2 x 2 units: the spot is at least half a unit from its sides
+_UNITS = 2  # a window of JPEG holds 2 x 2 units: the spot is at least half a unit from its sides
+_SIDE_PX = 12  # of other windows: the spot is at least 5 px from its sides, and 18 px would tell 0.1 % more
+_LUMA = YCC_FROM_RGB[0]
 _ROUNDING = 1.0 / 12.0  # variance of rounding to whole codes: uniform over one code
 UNIT_MATRIX = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -41,26 +54,26 @@ class ChainModel:
     card : SensorCard
     noise : PixelNoise
         Without the converter's rounding.
-    shape : (h, w) of the window, whole units
+    shape : (h, w) of the window, whole units of JPEG or pairs of rows and columns
     margin : int
         Raw pixels around the window on each side.
     filters : shape (h + 2 margin, w + 2 margin)
     linear : sparse, shape (3 p, r)
-        From electrons of the raw pixels to linear R, G, B, full scale 1, on the window (and what sharpening needs).
+        From electrons of the raw pixels to linear R, G, B, full scale 1, on the window and what is needed around it.
     squared : sparse, shape (3 p, r)
         Squares of its elements.
     kinds : shape (3 p,)
         Colour and number of the pixels that a value is the mean of, as rows of the tables.
     tables : MeanCodes or None
-        None where a colour matrix mixes the pixels, or sharpening comes between curve and rounding.
+        None where a colour matrix mixes the pixels.
     transform, squares : shape (3 p, n)
-        From codes to coefficients, and the squares of its elements.
+        From codes to outputs, and the squares of its elements.
     step : shape (n,)
         Of the quantiser.
     shift : shape (n,)
-        Of the coefficients by the level shift, and by libjpeg's way to round chroma averages.
+        What is added: levels of black and of no colour, and libjpeg's way to round chroma averages.
     rounding : shape (n,)
-        Variance of the coefficients from all roundings before the quantiser.
+        Variance of the outputs from all roundings before the quantiser.
     """
 
     card: SensorCard
@@ -103,7 +116,7 @@ class Codes:
 
 @lru_cache(maxsize=8)
 def chain_model(card: SensorCard, noise: PixelNoise) -> ChainModel:
-    """Model of a sensor with JPEG, on 2 x 2 units; kept, because it is the same for all spots.
+    """Model of a processed output, on `window_px` pixels; kept, because it is the same for all spots.
 
     Parameters
     ----------
@@ -111,21 +124,28 @@ def chain_model(card: SensorCard, noise: PixelNoise) -> ChainModel:
     noise : PixelNoise
         Without the converter's rounding.
     """
-    h, w = (_UNITS * side for side in mcu_px(card.jpeg_subsampling))
-    grown = 1 if card.sharpen_amount > 0.0 else 0
-    margin = grown + 1
-    outer = (h + 2 * grown, w + 2 * grown)
+    h, w = window_px(card)
+    mixed = (card.sharpen_amount > 0.0) + _denoised(card)
+    # R, G, B are whole codes before JPEG; those that sharpening or denoising mix are rounded after it
+    whole = card.output == "mjpeg" and not mixed and card.colour_matrix == UNIT_MATRIX
+    output = _output((h, w), card, whole)
+    grown = output.margin + mixed
+    margin, outer = grown + 1, (h + 2 * grown, w + 2 * grown)
     filters = bayer_filters(np.array([[margin % 2, margin % 2]]), (outer[0] + 2, outer[1] + 2))[0]
     linear = _linear(card, outer, margin)
-    T = np.ascontiguousarray(_sharpening(outer, card.sharpen_amount).T @ transform((h, w), card.jpeg_subsampling).T)
-    step = steps((h, w), card.jpeg_subsampling, card.jpeg_quality)
-    shift, rounding = _shift((h, w), card.jpeg_subsampling), _rounding((h, w), card.jpeg_subsampling)
-    plain = card.colour_matrix == UNIT_MATRIX and card.sharpen_amount == 0.0
-    tables = mean_codes(card, noise) if plain else None
+    T = np.ascontiguousarray((_neighbours(outer, card).T @ output.transform.T).toarray())
+    tables = mean_codes(card, noise, whole) if card.colour_matrix == UNIT_MATRIX else None
     kinds = _kinds(filters)
-    return ChainModel(
-        card, noise, (h, w), margin, filters, linear, linear.power(2), kinds, tables, T, T * T, step, shift, rounding
-    )
+    parts = (T, T * T, output.step, output.shift, output.rounding)
+    return ChainModel(card, noise, (h, w), margin, filters, linear, linear.power(2), kinds, tables, *parts)
+
+
+def window_px(card: SensorCard) -> tuple[int, int]:
+    """Rows and columns of a model's window."""
+    if card.output != "mjpeg":
+        return _SIDE_PX, _SIDE_PX
+    down, across = mcu_px(card.jpeg_subsampling)
+    return _UNITS * down, _UNITS * across
 
 
 def codes(model: ChainModel, mean_e: Array) -> Codes:
@@ -133,10 +153,10 @@ def codes(model: ChainModel, mean_e: Array) -> Codes:
     linear = _apply(model.linear, mean_e)
     if model.tables is None:
         sigma = np.sqrt(_apply(model.squared, raw_variance_e2(model, mean_e)))
-        n = noisy_srgb(linear, sigma)
+        n = noisy_code(linear, sigma, model.card)
         # the slope carries (by_mean sigma)^2 through the matrices: only what is left of the variance is added as white
         excess = np.maximum(n.variance - (n.by_mean * sigma) ** 2, 0.0)
-        return Codes(255.0 * n.mean, 255.0 * n.by_mean, 255.0 * n.by_mean, 255.0**2 * excess + _ROUNDING)
+        return Codes(255.0 * n.mean, 255.0 * n.by_mean, 255.0 * n.by_mean, 255.0**2 * excess)
     gain = np.repeat(full_scale_e(model.card) / np.asarray(model.card.white_balance), linear.shape[-1] // 3)
     at, table = linear * gain, model.tables.at
     by_mean, regression = (table(name, at, model.kinds) * gain for name in ("by_mean", "regression"))
@@ -209,18 +229,61 @@ def _interpolation(h: int, w: int, margin: int, colour: int) -> sparse.csr_array
     return sparse.csr_array((values, (rows, columns)), shape=(h * w, (h + 2) * (w + 2)))
 
 
-def _sharpening(outer: tuple[int, int], amount: float) -> sparse.csr_array:
-    """Unsharp mask of three planes from the grown window to the window; the unit matrix without sharpening."""
-    h, w = outer
-    if amount == 0.0:
-        return sparse.csr_array(sparse.eye_array(3 * h * w))
+def _denoised(card: SensorCard) -> bool:
+    return max(card.denoise_luma, card.denoise_chroma) > 0.0
+
+
+def _neighbours(outer: tuple[int, int], card: SensorCard) -> sparse.csr_array:
+    """Unsharp mask, then denoising, of three planes; each leaves a pixel less on all sides; the unit matrix without."""
+    (h, w), matrix = outer, sparse.csr_array(sparse.eye_array(3 * outer[0] * outer[1]))
+    if card.sharpen_amount > 0.0:
+        blur, cut = _blur_and_cut(h, w)
+        sharp = (1.0 + card.sharpen_amount) * cut - card.sharpen_amount * blur
+        matrix, h, w = sparse.csr_array(sparse.kron(sparse.eye_array(3), sharp)), h - 2, w - 2
+    if _denoised(card):
+        blur, cut = _blur_and_cut(h, w)
+        luma = sparse.csr_array(np.tile(_LUMA, (3, 1)))
+        chroma = sparse.kron(sparse.eye_array(3), cut + card.denoise_chroma * (blur - cut))
+        smooth = chroma + (card.denoise_luma - card.denoise_chroma) * sparse.kron(luma, blur - cut)
+        matrix = sparse.csr_array(smooth @ matrix)
+    return matrix
+
+
+def _blur_and_cut(h: int, w: int) -> tuple[sparse.csr_array, sparse.csr_array]:
+    """Binomial blur of a plane and the plane itself, both without its outermost pixels."""
     blur, cut = (sparse.kron(_band(h, weights), _band(w, weights)) for weights in ((0.25, 0.5, 0.25), (0.0, 1.0, 0.0)))
-    return sparse.csr_array(sparse.kron(sparse.eye_array(3), (1.0 + amount) * cut - amount * blur))
+    return sparse.csr_array(blur), sparse.csr_array(cut)
 
 
 def _band(size: int, weights: tuple[float, float, float]) -> sparse.csr_array:
     """Filter of three taps, shape (size - 2, size)."""
     return sparse.csr_array(sparse.diags_array(weights, offsets=(0, 1, 2), shape=(size - 2, size)))
+
+
+@dataclass(frozen=True)
+class _Output:
+    """Way from codes of R, G, B on the window and `margin` pixels around to outputs; fields as `ChainModel`'s."""
+
+    transform: sparse.csr_array
+    margin: int
+    step: Array
+    shift: Array
+    rounding: Array
+
+
+def _output(shape: tuple[int, int], card: SensorCard, whole: bool) -> _Output:
+    """Transform to what is quantised, shape (n, 3 p); `whole` codes are rounded before it, in their own law."""
+    if card.output == "mjpeg":
+        parts = shape, card.jpeg_subsampling
+        rounding = _rounding(*parts, 0.0 if whole else _ROUNDING)
+        return _Output(
+            sparse.csr_array(transform(*parts)), 0, steps(*parts, qtables_of(card)), _shift(*parts), rounding
+        )
+    count = shape[0] * shape[1]
+    if card.output == "yuyv":
+        matrix, shift = ycbcr_transform(shape, card)
+        return _Output(matrix, 1, np.ones(2 * count), shift, np.zeros(2 * count))
+    return _Output(sparse.csr_array(sparse.eye_array(3 * count)), 0, np.ones(3 * count), *np.zeros((2, 3 * count)))
 
 
 def _shift(shape: tuple[int, int], subsampling: str) -> Array:
@@ -235,11 +298,11 @@ def _shift(shape: tuple[int, int], subsampling: str) -> Array:
     return coefficients(np.einsum("ij,jhw->ihw", np.linalg.inv(YCC_FROM_RGB), ycc), subsampling)
 
 
-def _rounding(shape: tuple[int, int], subsampling: str) -> Array:
-    """Variance of orthonormal coefficients of white rounding: R, G, B to codes, Y Cb Cr to integers, averages."""
+def _rounding(shape: tuple[int, int], subsampling: str, of_rgb: float) -> Array:
+    """Variance of orthonormal coefficients of white rounding: R, G, B by `of_rgb`, Y Cb Cr to integers, averages."""
     down, across = CHROMA_STEP[subsampling]
     count, n = shape[0] * shape[1], down * across
-    of_codes = _ROUNDING * np.sum(YCC_FROM_RGB**2, axis=1)
+    of_codes = of_rgb * np.sum(YCC_FROM_RGB**2, axis=1)
     # mean square of rounding to whole numbers: halves err by 0, 1/2; quarters by 0, 1/4, 1/2, 1/4
     average = {1: 0.0, 2: 0.125, 4: 0.094}[n]
     chroma = [(part + _ROUNDING) / n + average for part in of_codes[1:]]

@@ -1,8 +1,8 @@
-"""Fit of spots through the camera's own processing: mosaic, demosaicing, white balance, sRGB curve, 8 bits, JPEG.
+"""Fit of spots through the camera's own processing: mosaic, demosaicing, white balance, tone curve, 8 bits, JPEG.
 
-`fit_srgb` takes processed 8-bit images, `fit_jpeg` decoded MJPEG ones. Fits to the luminance have a floor of 0.1 to
-0.25 px that does not fall with the signal, because a demosaiced, gamma-encoded spot is no Gaussian. A fit of the raw
-pixels' model through the same processing has none.
+`fit_srgb` takes processed 8-bit images, `fit_yuyv` Y'CbCr ones, `fit_jpeg` decoded MJPEG ones. Fits to the luminance
+have a floor of 0.1 to 0.25 px that does not fall with the signal, because a demosaiced, gamma-encoded spot is no
+Gaussian. A fit of the raw pixels' model through the same processing has none.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ from scipy.ndimage import convolve1d, gaussian_filter
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.status import Status, flag, keep
-from phibench.estimator.spots.chain_model import UNIT_MATRIX, chain_model
+from phibench.estimator.spots.camera_codes import light_of, rgb_codes, tone_slope
+from phibench.estimator.spots.chain_model import UNIT_MATRIX, chain_model, window_px
 from phibench.estimator.spots.fisher import covariance_bound
-from phibench.estimator.spots.fit_jpeg import JpegFit, Region, fit_region
+from phibench.estimator.spots.fit_jpeg import JpegFit, Region, fit_region, grid_px
 from phibench.estimator.spots.fit_raw import LEAST_SNR, SpotFit, fit_law
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
-from phibench.estimator.spots.image_planes import full_scale_e, srgb_slope, srgb_to_linear
-from phibench.estimator.spots.jpeg_coefficients import mcu_px
+from phibench.estimator.spots.image_planes import full_scale_e
+from phibench.estimator.spots.jpeg_coefficients import RGB_FROM_YCC, mcu_px
 from phibench.estimator.spots.pixel_statistics import code_law, code_table
 from phibench.estimator.spots.raw_pixels import (
     Background,
@@ -50,9 +51,8 @@ def fit_srgb(
 ) -> SpotFit:
     """Fit one spot in each region of processed 8-bit images.
 
-    Without sharpening and with the unit colour matrix each pixel's own colour is an interval of electrons, and the
-    likelihood is exact (`pixel_statistics`). Otherwise sharpening and matrix are undone, and the codes' widths count as
-    noise.
+    Where each pixel's own colour is an interval of electrons (`own_codes`), the likelihood is exact
+    (`pixel_statistics`). Otherwise mean and covariance of all codes are fitted, as `fit_jpeg` does it.
 
     Parameters
     ----------
@@ -74,19 +74,49 @@ def fit_srgb(
     """
     planes = _checked(images, card)
     origin = np.broadcast_to(np.asarray(origin_px, np.int64), (len(planes), 2))
+    if not own_codes(card):
+        known = None if model is None else model.background_e
+        levels = np.zeros(planes.shape[:3]) if known is None else np.broadcast_to(known, planes.shape[:3])
+        background = Background(levels, np.full(levels.shape, extra_e2))
+        return _fit_windows(planes, origin, card, blur, model, background, pattern_known)
     filters = bayer_filters(origin, planes.shape[1:3])
     noise = unrounded(card, pattern_known)
     noise = PixelNoise(noise.gaussian_e2 + extra_e2, noise.prnu)
-    if card.sharpen_amount == 0.0 and card.colour_matrix == UNIT_MATRIX:
-        table = code_table(card)
-        codes = np.take_along_axis(planes, filters[..., None], axis=3)[..., 0]
-        law = code_law(codes, filters, card, noise, table)
-        x = table.middle_e[filters, codes]
-        return fit_law(spot_regions(x, origin), law, blur, model)
-    x, extra = undone(planes, filters, card)
-    used = (planes < 255).all(axis=3)
-    gauss = GaussLaw(PixelNoise(noise.gaussian_e2 + 1.0 / (12.0 * card.dn_per_e**2), noise.prnu), extra)
-    return fit_law(spot_regions(x, origin, used), gauss, blur, model)
+    table = code_table(card)
+    codes = np.take_along_axis(planes, filters[..., None], axis=3)[..., 0]
+    law = code_law(codes, filters, card, noise, table)
+    x = table.middle_e[filters, codes]
+    return fit_law(spot_regions(x, origin), law, blur, model)
+
+
+def fit_yuyv(
+    images: NDArray[Any],
+    origin_px: ArrayLike,
+    card: SensorCard,
+    blur: SpotBlur,
+    model: SpotModel | None = None,
+    background: Background | None = None,
+    pattern_known: bool = False,
+) -> SpotFit:
+    """Fit one spot in each region of Y'CbCr 4:2:2 images, to their codes.
+
+    Parameters
+    ----------
+    images : shape (n, h, w, 2), uint8
+        13 x 13 pixels or more.
+    origin_px : shape (2,) or (n, 2)
+        Image pixel (u, v) of the first column and row; it may be odd.
+    card, blur, model, background, pattern_known
+        As for `fit_jpeg`.
+
+    Raises
+    ------
+    ValueError
+        If the images are not of two planes or too small, or the sensor has no mosaic.
+    """
+    planes = _checked(images, card, 2)
+    origin = np.broadcast_to(np.asarray(origin_px, np.int64), (len(planes), 2))
+    return _fit_windows(planes, origin, card, blur, model, background, pattern_known)
 
 
 def fit_jpeg(
@@ -128,9 +158,29 @@ def fit_jpeg(
         If the images are not of three planes or not on the grid of units, or the sensor has no mosaic.
     """
     planes = _checked(images, card)
-    n, (h, w) = len(planes), planes.shape[1:3]
-    origin, model = np.broadcast_to(np.asarray(origin_px, np.int64), (n, 2)), model or SpotModel()
-    _on_grid(origin, (h, w), card)
+    origin = np.broadcast_to(np.asarray(origin_px, np.int64), (len(planes), 2))
+    _on_grid(origin, planes.shape[1:3], card)
+    return _fit_windows(planes, origin, card, blur, model, background, pattern_known, size_px)
+
+
+def own_codes(card: SensorCard) -> bool:
+    """True if each pixel's own colour alone decides about its code."""
+    smooth = max(card.sharpen_amount, card.denoise_luma, card.denoise_chroma) == 0.0
+    return card.output == "srgb8" and smooth and card.colour_matrix == UNIT_MATRIX
+
+
+def _fit_windows(
+    planes: NDArray[np.uint8],
+    origin: NDArray[np.int64],
+    card: SensorCard,
+    blur: SpotBlur,
+    model: SpotModel | None,
+    background: Background | None,
+    pattern_known: bool,
+    size_px: tuple[int, int] = (0, 0),
+) -> SpotFit:
+    """Fit each image's window of outputs; `size_px` of the whole image matters for JPEG alone."""
+    n, (h, w), model = len(planes), planes.shape[1:3], model or SpotModel()
     if n == 0:
         return _collected([], origin, np.zeros(0), model.free_width)
     chain, blurs = chain_model(card, unrounded(card, pattern_known)), blur.each(n)
@@ -144,8 +194,13 @@ def fit_jpeg(
         known = (zero, zero) if background is None else (background.mean_e[i], background.variance_e2[i])
         room = None if background is None or background.image is None else background.image[i]
         start = first[i] if not model.free_width else np.append(first[i], widths[i])
-        region = Region(planes[i], ends, known[0], known[1], room)
-        rows.append(fit_region(region, chain, start[None], blurs.rows(np.array([i])), model))
+        # the window's grid begins in the region's first row and column
+        u1, v1 = origin[i] % np.array(grid_px(card)[::-1])
+        start[:2] -= u1, v1
+        region = Region(planes[i, v1:, u1:], ends, known[0][v1:, u1:], known[1][v1:, u1:], room)
+        fit, off = fit_region(region, chain, start[None], blurs.rows(np.array([i])), model)
+        fit.theta[:2] += u1, v1
+        rows.append((fit, off))
     return _collected(rows, origin, widths, model.free_width)
 
 
@@ -161,7 +216,7 @@ def first_fit(
     if response is None:
         raise ValueError("the fit through the chain needs the response of the filters: SpotModel(response=...)")
     filters = bayer_filters(origin, images.shape[1:3])
-    x, extra = undone(images, filters, card)
+    x, extra = undone(images, origin, card)
     x = x - (0.0 if background is None else background.mean_e)
     rough, spread = _ROUGH_CODES2 * 12.0 * extra, unrounded(card)
     x, rough, corner = _cut(x, rough, filters, response)
@@ -224,20 +279,25 @@ def unrounded(card: SensorCard, pattern_known: bool = False) -> PixelNoise:
     return PixelNoise(max(noise.gaussian_e2 - 1.0 / (12.0 * card.dn_per_e**2), 0.0), noise.prnu)
 
 
-def undone(images: NDArray[Any], filters: NDArray[np.int64], card: SensorCard) -> tuple[Array, Array]:
+def undone(images: NDArray[Any], origin: NDArray[np.int64], card: SensorCard) -> tuple[Array, Array]:
     """Electrons of each pixel's own colour and the variance that 8 bits add, electrons squared, shape (n, h, w) each.
 
-    Undoes, from the end: sharpening, sRGB curve, colour matrix, white balance.
+    Undoes, from the end: Y'CbCr, sharpening, tone curve, colour matrix, white balance. Denoising and the loss of chroma
+    stay.
 
     Parameters
     ----------
-    images : shape (n, h, w, 3), codes 0 to 255, whole or not
-    filters : shape (n, h, w)
+    images : shape (n, h, w, 3), codes 0 to 255, whole or not; (n, h, w, 2) of "yuyv"
+    origin : shape (n, 2)
+        Image pixel (u, v) of the first column and row.
     card : SensorCard
     """
-    code = _unsharpened(np.asarray(images, float), card.sharpen_amount) / 255.0
-    linear = srgb_to_linear(code)
-    width = 1.0 / (255.0 * np.maximum(srgb_slope(np.clip(linear, 0.0, 1.0)), 1e-3))
+    filters = bayer_filters(origin, images.shape[1:3])
+    rgb = np.stack([rgb_codes(image, card, corner) for image, corner in zip(images, origin, strict=True)])
+    code = np.clip(_unsharpened(np.asarray(rgb, float), card.sharpen_amount) / 255.0, 0.0, 1.0)
+    linear = light_of(code, card)
+    spread = np.sqrt(np.sum(RGB_FROM_YCC**2, axis=1)) if card.output == "yuyv" else np.ones(3)
+    width = spread / (255.0 * np.maximum(tone_slope(linear, card), 1e-3))
     inverse = np.linalg.inv(np.asarray(card.colour_matrix)) / np.asarray(card.white_balance)[:, None]
     own = inverse[filters] * full_scale_e(card)  # (n, h, w, 3): row of the inverse for the pixel's filter
     return np.sum(own * linear, axis=3), np.sum((own * width) ** 2, axis=3) / 12.0
@@ -255,12 +315,15 @@ def _unsharpened(codes: Array, amount: float) -> Array:
     return x
 
 
-def _checked(images: NDArray[Any], card: SensorCard) -> NDArray[np.uint8]:
+def _checked(images: NDArray[Any], card: SensorCard, count: int = 3) -> NDArray[np.uint8]:
     planes = np.asarray(images)
-    if planes.ndim != 4 or planes.shape[3] != 3 or planes.dtype != np.uint8:
+    if planes.ndim != 4 or planes.shape[3] != count or planes.dtype != np.uint8:
         raise ValueError(
-            f"images have the shape {planes.shape} and are {planes.dtype}: (n, h, w, 3) of uint8 is needed"
+            f"images have the shape {planes.shape} and are {planes.dtype}: (n, h, w, {count}) of uint8 is needed"
         )
+    least = 0 if own_codes(card) or card.output == "mjpeg" else window_px(card)[0] + 1
+    if min(planes.shape[1:3]) < least:
+        raise ValueError(f"images have the shape {planes.shape}: {least} x {least} pixels or more are needed")
     if card.mosaic != "bayer":
         raise ValueError(
             f"sensor '{card.name}' has the mosaic '{card.mosaic}': the fit through the chain needs 'bayer'"

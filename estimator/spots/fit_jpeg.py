@@ -1,4 +1,6 @@
-"""Fit of a spot to the quantised coefficients of a JPEG window, by a quasi-score through the processing.
+"""Fit of a spot to a window of quantised outputs, by a quasi-score through the processing.
+
+Outputs are codes of R, G, B (srgb8), of Y', Cb, Cr (yuyv), or a JPEG's coefficients (mjpeg).
 
 With m the mean and C the covariance of the quantiser's output, the estimating equation J^T C^-1 (z - m) = 0 is unbiased
 whatever the law of the output (R. W. M. Wedderburn, Biometrika 61, 439, 1974). Its covariance (J^T C^-1 J)^-1 is the
@@ -6,7 +8,7 @@ smallest of estimates that know m and C only (`limits.processed_bound`). The qua
 input gives m, and C_ij = g_i g_j C'_ij off the diagonal, g its mean slope and C' the input's covariance (J. J.
 Bussgang, 1952). A coefficient that is 0 whatever the noise has no slope and is left out.
 
-A window is 2 x 2 JPEG units of a decoded region, with the spot nearest to its middle.
+A window is 2 x 2 JPEG units of a decoded region, or 12 x 12 pixels of another, with the spot nearest to its middle.
 """
 
 from __future__ import annotations
@@ -18,10 +20,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from phibench.estimator.spots.chain_model import ChainModel, code_slopes, codes, noise_factor, raw_variance_e2
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.spots.camera_codes import ycbcr_codes
+from phibench.estimator.spots.chain_model import (
+    ChainModel,
+    code_slopes,
+    codes,
+    noise_factor,
+    raw_variance_e2,
+    window_px,
+)
 from phibench.estimator.spots.fisher import limited, scoring_step
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
-from phibench.estimator.spots.jpeg_coefficients import mcu_px, quantised, recovered, room_variance
+from phibench.estimator.spots.jpeg_coefficients import mcu_px, qtables_of, quantised, recovered, room_variance
 from phibench.estimator.spots.pixel_statistics import CutPixels, cut_pixels
 from phibench.scenes.frames import Array
 
@@ -229,11 +240,11 @@ def _moved(window: Window, theta: Array, step: Array) -> Array:
 
 @dataclass(frozen=True)
 class Region:
-    """One decoded region on the grid of JPEG units.
+    """One region on the grid of JPEG units, or one that begins at an even row and column.
 
     Attributes
     ----------
-    image : shape (h, w, 3), uint8
+    image : shape (h, w, 3), uint8; (h, w, 2) of "yuyv"
     ends : 4 booleans
         Top, bottom, left and right side are the image's own.
     background_e, extra_e2 : shape (h, w)
@@ -250,13 +261,18 @@ class Region:
 
 
 def window_at(region: Region, chain: ChainModel, uv: Array) -> tuple[int, int]:
-    """First row and column, in the region, of the 2 x 2 units that have (u, v) nearest to their middle."""
-    sides = mcu_px(chain.card.jpeg_subsampling)
+    """First row and column, in the region, of the window on the grid that has (u, v) nearest to its middle."""
+    steps = grid_px(chain.card)
     places = []
-    for centre, unit, size in zip((uv[1], uv[0]), sides, region.image.shape[:2], strict=True):
-        first = int(np.clip(np.rint((centre + 0.5) / unit) - 1, 0, size // unit - 2))
+    for centre, unit, side, size in zip((uv[1], uv[0]), steps, chain.shape, region.image.shape[:2], strict=True):
+        first = int(np.clip(np.rint((centre + 0.5 - side / 2) / unit), 0, (size - side) // unit))
         places.append(first * unit)
     return places[0], places[1]
+
+
+def grid_px(card: SensorCard) -> tuple[int, int]:
+    """Rows and columns at whose multiples a window may begin: JPEG's units, or the mosaic's cell."""
+    return mcu_px(card.jpeg_subsampling) if card.output == "mjpeg" else (2, 2)
 
 
 def fit_region(
@@ -293,14 +309,23 @@ def fit_region(
     shifted = starts.copy()
     shifted[:, :2] -= corner
     room: Array | float = 0.0
-    if region.room is not None:
+    if region.room is not None and chain.card.output == "mjpeg":
         room = room_variance(coefficients_at(replace(region, image=region.room), chain, row, column), chain.step)
-    fit = fit_window(Window(coefficients_at(region, chain, row, column), chain, pixels, extra.ravel(), room), shifted)
+    fit = fit_window(Window(outputs_at(region, chain, row, column), chain, pixels, extra.ravel(), room), shifted)
     middle = np.array([(w - 1) / 2.0 + m, (h - 1) / 2.0 + m])
     off = np.abs(fit.theta[:2] - middle) / np.array([w / 2.0, h / 2.0])
     theta = fit.theta.copy()
     theta[:2] += corner
     return JpegFit(theta, fit.fisher, fit.chi2, fit.converged), off
+
+
+def outputs_at(region: Region, chain: ChainModel, row: int, column: int) -> Array:
+    """Quantised outputs, shape (n,), of the window that begins at (row, column) of the region."""
+    if chain.card.output == "mjpeg":
+        return coefficients_at(region, chain, row, column)
+    h, w = window_px(chain.card)
+    image = region.image[row : row + h, column : column + w]
+    return ycbcr_codes(image) if chain.card.output == "yuyv" else np.moveaxis(image, -1, 0).ravel().astype(float)
 
 
 def coefficients_at(region: Region, chain: ChainModel, row: int, column: int) -> Array:
@@ -316,7 +341,7 @@ def coefficients_at(region: Region, chain: ChainModel, row: int, column: int) ->
         region.ends[2] and left == 0,
         region.ends[3] and right == width,
     )
-    found = recovered(region.image[None, top:bottom, left:right], card.jpeg_quality, card.jpeg_subsampling, ends)
+    found = recovered(region.image[None, top:bottom, left:right], qtables_of(card), card.jpeg_subsampling, ends)
     v, u = row - top, column - left
     luma = found.luma[0, v // 8 : (v + h) // 8, u // 8 : (u + w) // 8]
     chroma = found.chroma[0, :, v // down : (v + h) // down, u // across : (u + w) // across]

@@ -1,11 +1,11 @@
-"""Linear light of camera images: the sRGB curve, demosaicing, JPEG and colour planes on the estimator's side.
+"""Linear light of camera images: demosaicing, JPEG and colour planes on the estimator's side.
 
-Images are as a camera delivers them: raw DN of a mosaic or of pixels without filters, or 8-bit R, G, B.
+Images are as a camera delivers them: raw DN of a mosaic or of pixels without filters, 8-bit R, G, B, or Y'CbCr 4:2:2.
 
 * `linear_planes`: linear sRGB, shape (3, h, w), full scale 1 before gains. A grey room under the camera's own white
   balance has three equal planes. A sensor without filters has one plane, shape (1, h, w).
 * `colour_planes`: electrons behind each filter, for the search of spots. Raw pixels stay where they are: a mosaic's
-  plane holds values at its own sites and zeros elsewhere. 8-bit images go back through the sRGB curve, the colour
+  plane holds values at its own sites and zeros elsewhere. 8-bit images go back through the tone curve, the colour
   matrix and the white balance. Their pixels are interpolated, so that their noise is correlated and only roughly what
   `variance_e2` says: what uses it calibrates it on the image.
 
@@ -27,18 +27,17 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.datasets.input_files import InputFile
 from phibench.estimator.interface import Box, Image
+from phibench.estimator.spots.camera_codes import light_of, rgb_codes, rgb_picture, tone_slope
+from phibench.estimator.spots.jpeg_coefficients import qtables_of
 from phibench.estimator.spots.raw_pixels import bayer_filters, raw_electrons
 from phibench.scenes.frames import Array, BoolArray
 
-KINDS = ("bayer-raw", "mono-raw", "srgb8", "mjpeg")
+KINDS = ("bayer-raw", "mono-raw", "srgb8", "yuyv", "mjpeg")
 RAW = KINDS[:2]
 PROCESSED = KINDS[2:]
 
 _TOP_CODE = 254  # of 8 bits: from here on a pixel may be cut
 _DEMOSAIC_VARIANCE_PX2 = 0.5  # of bilinear interpolation's kernel (1/2, 1, 1/2), per axis
-_KNEE, _SLOPE = 0.0031308, 12.92  # of the sRGB curve's straight part
-_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
-_WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
 
 
 class ImageError(DatasetError):
@@ -54,7 +53,7 @@ def kind_of(card: SensorCard) -> str:
 
 
 def read_picture(path: Path) -> tuple[NDArray[np.uint8], SensorCard]:
-    """Image, shape (H, W, 3), of a PNG or JPEG file, with the card of its kind.
+    """Image of a PNG or JPEG file, with the card of its kind: (H, W, 3), or (H, W, 2) of a "yuyv" PNG.
 
     Raises
     ------
@@ -63,6 +62,8 @@ def read_picture(path: Path) -> tuple[NDArray[np.uint8], SensorCard]:
     """
     picture = InputFile(path, "give a PNG or JPEG file of the camera", ImageError).picture()
     kind, mode = picture.format, picture.mode
+    if (kind, mode) == ("PNG", "LA"):
+        return np.asarray(picture), sensor_card("yuyv")
     pixels = np.asarray(picture.convert("RGB"))
     if mode not in ("RGB", "RGBA") or kind not in ("PNG", "JPEG"):
         raise ImageError(f"{path} is a {kind} file of mode {mode}: give the camera's colour frame as PNG or JPEG")
@@ -72,66 +73,10 @@ def read_picture(path: Path) -> tuple[NDArray[np.uint8], SensorCard]:
 def through_jpeg(image: NDArray[np.uint8], card: SensorCard) -> NDArray[np.uint8]:
     """Image, shape (H, W, 3), after the card's JPEG, by libjpeg."""
     file = io.BytesIO()
-    Picture.fromarray(image).save(file, "JPEG", quality=card.jpeg_quality, subsampling=card.jpeg_subsampling)
+    tables = qtables_of(card)
+    steps = {"quality": tables} if isinstance(tables, int) else {"qtables": [list(table) for table in tables]}
+    Picture.fromarray(image).save(file, "JPEG", subsampling=card.jpeg_subsampling, **steps)
     return np.array(Picture.open(file))
-
-
-# -- sRGB curve, IEC 61966-2-1 ---------------------------------------------------------------------------------------
-
-
-def linear_to_srgb(linear: NDArray[Any]) -> NDArray[Any]:
-    """sRGB values in [0, 1] of linear light, cut to [0, 1]; any shape."""
-    x = np.clip(linear, 0.0, 1.0)
-    return np.asarray(np.where(x <= _KNEE, _SLOPE * x, 1.055 * x ** (1.0 / 2.4) - 0.055))
-
-
-def srgb_to_linear(encoded: Array) -> Array:
-    """Linear light of sRGB values in [0, 1]; any shape."""
-    y = np.asarray(encoded, float)
-    return np.asarray(np.where(y <= _SLOPE * _KNEE, y / _SLOPE, ((np.maximum(y, 0.0) + 0.055) / 1.055) ** 2.4))
-
-
-def srgb_slope(linear: Array) -> Array:
-    """Derivative of `linear_to_srgb`, any shape; 0 outside [0, 1]."""
-    x = np.asarray(linear, float)
-    inside = (x >= 0.0) & (x <= 1.0)
-    power = 1.055 / 2.4 * np.maximum(x, _KNEE) ** (1.0 / 2.4 - 1.0)
-    return np.asarray(np.where(inside, np.where(x <= _KNEE, _SLOPE, power), 0.0))
-
-
-@dataclass(frozen=True)
-class NoisyCode:
-    """Encoded value of a Gaussian, arrays of the shape of its mean.
-
-    Attributes
-    ----------
-    mean : E f(x)
-    by_mean : its derivative by the mean of x, E f'(x)
-    by_sigma : its derivative by the standard deviation of x
-    variance : of f(x)
-    """
-
-    mean: Array
-    by_mean: Array
-    by_sigma: Array
-    variance: Array
-
-
-def noisy_srgb(mean: Array, sigma: Array) -> NoisyCode:
-    """Encoded value of linear light with a Gaussian error, by Gauss-Hermite quadrature with 9 nodes.
-
-    Derivatives by Stein's lemma: E f' = E f z / s, d E f / ds = E f (z^2 - 1) / s, z the standardised error. Where the
-    curve is cut within the error, at 0 and 1, the quadrature is good to some per cent of the error.
-
-    Parameters
-    ----------
-    mean, sigma : arrays of the same shape, full scale 1; sigma above 0
-    """
-    f = linear_to_srgb(mean[..., None] + sigma[..., None] * _NODES)
-    first = f @ _WEIGHTS
-    by_mean = f @ (_WEIGHTS * _NODES) / sigma
-    by_sigma = f @ (_WEIGHTS * (_NODES**2 - 1.0)) / sigma
-    return NoisyCode(first, by_mean, by_sigma, (f - first[..., None]) ** 2 @ _WEIGHTS)
 
 
 # -- linear planes and demosaicing -----------------------------------------------------------------------------------
@@ -147,14 +92,15 @@ def linear_planes(image: NDArray[Any], card: SensorCard, origin_px: tuple[int, i
 
     Parameters
     ----------
-    image : shape (h, w) DN or (h, w, 3) 8-bit R, G, B
+    image : shape (h, w) DN, (h, w, 3) 8-bit R, G, B, or (h, w, 2) of "yuyv"
         An image or a part of one.
     card : SensorCard
     origin_px : (u, v)
-        Image pixel of the first column and row: where the mosaic's red pixels are.
+        Image pixel of the first column and row: where the mosaic's red pixels are, and pairs of "yuyv" begin.
     """
     if card.output != "raw":
-        return srgb_to_linear(np.moveaxis(np.asarray(image, float) / 255.0, -1, 0))
+        codes = np.asarray(rgb_codes(image, card, origin_px), float)
+        return light_of(np.moveaxis(np.clip(codes / 255.0, 0.0, 1.0), -1, 0), card)
     signal = raw_electrons(image, card) / full_scale_e(card)
     if card.mosaic == "mono":
         return signal[None]
@@ -232,17 +178,17 @@ def colour_planes(image: Image, card: SensorCard, box: Box) -> ColourPlanes:
     Raises
     ------
     ValueError
-        If the card's output is neither "raw", "srgb8" nor "mjpeg", or the image has another shape than it says.
+        If the card's output is "electrons", or the image has another shape than it says.
     """
     part = image[box.slices]
-    if card.output not in ("raw", "srgb8", "mjpeg") or part.ndim != (2 if card.output == "raw" else 3):
+    if part.shape[2:] != {"raw": (), "srgb8": (3,), "yuyv": (2,), "mjpeg": (3,)}.get(card.output) or part.ndim < 2:
         raise ValueError(
             f"an image of the shape {image.shape} for the output '{card.output}': raw needs (H, W), srgb8 and mjpeg "
-            "need (H, W, 3)"
+            "need (H, W, 3), yuyv needs (H, W, 2)"
         )
     if card.output == "raw":
         return _raw(part, card, box)
-    return _developed(part, card, box)
+    return _developed(rgb_picture(part, card, (box.u0_px, box.v0_px)), card, box)
 
 
 def blur_of(card: SensorCard, sigma_px: float) -> float:
@@ -293,7 +239,7 @@ def _raw(part: Image, card: SensorCard, box: Box) -> ColourPlanes:
 
 def _developed(part: Image, card: SensorCard, box: Box) -> ColourPlanes:
     planes = [np.ascontiguousarray(part[..., c]) for c in range(3 if card.mosaic == "bayer" else 1)]
-    curve = (srgb_to_linear(np.arange(256) / 255.0) * full_scale_e(card)).astype(np.float32)
+    curve = (light_of(np.arange(256) / 255.0, card) * full_scale_e(card)).astype(np.float32)
     linear = np.stack([curve[plane] for plane in planes])
     if card.mosaic == "bayer":
         linear = np.einsum("ij,jhw->ihw", _to_sensor(card).astype(np.float32), linear, optimize=True)
@@ -307,7 +253,6 @@ def _to_sensor(card: SensorCard) -> Array:
 
 
 def _code_step_e(mean_e: Array, card: SensorCard) -> Array:
-    """Electrons per 8-bit code at a level: the slope of the sRGB curve."""
-    x = np.clip(mean_e / full_scale_e(card), 0.0, 1.0)
-    slope = np.where(x <= _KNEE, 1.0 / _SLOPE, 2.4 / 1.055 * np.maximum(x, 1e-6) ** (1.4 / 2.4))
-    return np.asarray(slope * full_scale_e(card) / 255.0)
+    """Electrons per 8-bit code at a level: the slope of the tone curve."""
+    slope = tone_slope(np.clip(mean_e / full_scale_e(card), 0.0, 1.0), card)
+    return np.asarray(full_scale_e(card) / (255.0 * slope))

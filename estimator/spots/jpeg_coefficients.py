@@ -26,8 +26,10 @@ from scipy.fft import dctn, idctn
 from scipy.ndimage import uniform_filter
 from scipy.special import ndtr
 
+from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.scenes.frames import Array, BoolArray
 
+Tables = tuple[tuple[int, ...], tuple[int, ...]]
 BLOCK_PX = 8
 CHROMA_STEP = {"4:4:4": (1, 1), "4:2:2": (1, 2), "4:2:0": (2, 2)}
 """Rows and columns of pixels per chroma sample."""
@@ -47,14 +49,26 @@ def mcu_px(subsampling: str) -> tuple[int, int]:
     return BLOCK_PX * down, BLOCK_PX * across
 
 
-def quantisation(quality: int) -> tuple[Array, Array]:
-    """Steps of luma and chroma coefficients, shape (8, 8) each, rows are vertical frequencies, quality 1 to 100.
+def qtables_of(card: SensorCard) -> int | Tables:
+    """Quality of a card's JPEG, or its tables where it has some."""
+    return card.jpeg_quality if card.jpeg_qtables is None else card.jpeg_qtables
+
+
+def quantisation(quality: int | Tables) -> tuple[Array, Array]:
+    """Steps of luma and chroma coefficients, shape (8, 8) each, rows are vertical frequencies.
+
+    Parameters
+    ----------
+    quality : libjpeg's, 1 to 100, or the two tables, 64 steps each, row by row
 
     Raises
     ------
     ValueError
         If the quality is none of libjpeg's.
     """
+    if not isinstance(quality, int):
+        first, second = (np.array(table, float).reshape(8, 8) for table in quality)
+        return first, second
     if not 1 <= quality <= 100:
         raise ValueError(f"JPEG quality {quality}: allowed range is 1 to 100")
     percent = 5000 // quality if quality < 50 else 200 - 2 * quality
@@ -100,8 +114,8 @@ def transform(shape: tuple[int, int], subsampling: str) -> Array:
     return matrix
 
 
-def steps(shape: tuple[int, int], subsampling: str, quality: int) -> Array:
-    """Quantiser's step of each of `coefficients`, shape (n,)."""
+def steps(shape: tuple[int, int], subsampling: str, quality: int | Tables) -> Array:
+    """Quantiser's step of each of `coefficients`, shape (n,); quality as in `quantisation`."""
     luma, chroma = quantisation(quality)
     down, across = CHROMA_STEP[subsampling]
     count = shape[0] * shape[1] // 64
@@ -133,7 +147,7 @@ class Recovered:
 
 
 def recovered(
-    images: NDArray[Any], quality: int, subsampling: str, ends: tuple[bool, bool, bool, bool] = (False,) * 4
+    images: NDArray[Any], quality: int | Tables, subsampling: str, ends: tuple[bool, bool, bool, bool] = (False,) * 4
 ) -> Recovered:
     """Coefficients of decoded images of whole units.
 
@@ -142,7 +156,7 @@ def recovered(
     Parameters
     ----------
     images : shape (n, h, w, 3), uint8
-    quality : int
+    quality : int or tables, as in `quantisation`
     subsampling : "4:4:4", "4:2:2" or "4:2:0"
     ends : 4 booleans
         Top, bottom, left and right side are the image's own.

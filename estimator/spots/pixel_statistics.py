@@ -3,7 +3,7 @@
 A code is a pixel's 8-bit value. All is in closed form or from exact sums.
 
 * `code_law`: likelihood of the code at a pixel's own colour. Bilinear demosaicing keeps the value of a pixel behind its
-  own filter, and white balance, sRGB curve and both roundings are a monotonic map from the converter's DN to the code.
+  own filter, and white balance, tone curve and both roundings are a monotonic map from the converter's DN to the code.
   A code is therefore an interval [low, high) of electrons before the converter, with the probability
   Phi((high - mu) / s) - Phi((low - mu) / s), s^2 = V(mu). Rounding and clipping at both ends are in it exactly. The
   Poisson law is taken as a Gaussian.
@@ -31,7 +31,7 @@ from scipy.special import log_ndtr, ndtr
 from scipy.stats import poisson
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.spots.image_planes import linear_to_srgb
+from phibench.estimator.spots.camera_codes import tone_of
 from phibench.estimator.spots.raw_pixels import PixelNoise
 from phibench.scenes.frames import Array
 
@@ -65,14 +65,14 @@ class CodeTable:
 
 
 def code_table(card: SensorCard) -> CodeTable:
-    """Intervals of a sensor without sharpening whose colour matrix is the unit matrix.
+    """Intervals of a sensor without sharpening and denoising whose colour matrix is the unit matrix.
 
     A code that no DN gives has the interval of the next one above that occurs.
     """
     dn = np.arange(card.top_dn + 1)
     linear = np.asarray((dn - card.black_level_dn) / (card.top_dn - card.black_level_dn), float)
     rows = [
-        _ends(np.rint(255.0 * linear_to_srgb(gain * linear)).astype(int), card.top_dn) for gain in card.white_balance
+        _ends(np.rint(255.0 * tone_of(gain * linear, card)).astype(int), card.top_dn) for gain in card.white_balance
     ]
     low, high = ((np.array(x) - card.black_level_dn) / card.dn_per_e for x in zip(*rows, strict=True))
     well = card.saturation_e - _WELL_SIGMAS * np.sqrt(card.read_noise_e**2 + card.dsnu_e**2)
@@ -259,16 +259,19 @@ class MeanCodes:
 
 
 @lru_cache(maxsize=8)
-def mean_codes(card: SensorCard, noise: PixelNoise) -> MeanCodes:
-    """Tables of a sensor whose colour matrix is the unit matrix; `noise` is without the converter's rounding."""
+def mean_codes(card: SensorCard, noise: PixelNoise, rounded: bool = True) -> MeanCodes:
+    """Tables of a sensor whose colour matrix is the unit matrix; `noise` is without the converter's rounding.
+
+    Codes are rounded to whole ones unless the camera goes on with finer ones.
+    """
     root, step = np.linspace(0.0, np.sqrt(1.3 * card.saturation_e), _MEAN_NODES, retstep=True)
-    sums = np.array([_moments(mu, card, noise) for mu in root**2])  # (m, colour, count, 4)
+    sums = np.array([_moments(mu, card, noise, rounded) for mu in root**2])  # (m, colour, count, 4)
     mean, regression, excess = np.ascontiguousarray(sums.transpose(3, 1, 2, 0))
     by_mean = np.gradient(mean, root**2, axis=-1)
     return MeanCodes(float(step), mean, by_mean, regression, excess)
 
 
-def _moments(mu: float, card: SensorCard, noise: PixelNoise) -> Array:
+def _moments(mu: float, card: SensorCard, noise: PixelNoise, rounded: bool) -> Array:
     """Mean code, regression and excess, shape (3 colours, 3 counts, 3)."""
     first, chance = _law(mu, card, noise)
     result = np.empty((3, len(COUNTS), 3))
@@ -278,7 +281,8 @@ def _moments(mu: float, card: SensorCard, noise: PixelNoise) -> Array:
         x = first + np.arange(len(chance)) / count - card.black_level_dn  # DN above black
         p = chance / chance.sum()
         linear = x / (card.top_dn - card.black_level_dn)
-        y = np.stack([np.rint(255.0 * linear_to_srgb(gain * linear)) for gain in card.white_balance])
+        y = np.stack([255.0 * tone_of(gain * linear, card) for gain in card.white_balance])
+        y = np.rint(y) if rounded else y
         mean = y @ p
         dx = x - x @ p
         variance = dx**2 @ p

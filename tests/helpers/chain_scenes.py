@@ -10,7 +10,7 @@ from helpers.sensor_light import FILTERS, spot_at
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.processed_bound import chain_limit
-from phibench.estimator.spots.fit_chain import fit_jpeg, fit_srgb
+from phibench.estimator.spots.fit_chain import fit_jpeg, fit_srgb, fit_yuyv
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light, Region
@@ -23,6 +23,7 @@ SQUARE, UNITS = Region.around(*MIDDLE, SIZE, 17), Region(16, 16, 80, 48)  # 17 x
 ROOM = np.array([1.0, 0.9, 0.6])
 # electrons in all pixels of the mosaic, per electron of an unfiltered red pixel: a quarter R, a half G, a quarter B
 COLLECTED = float(FILTERS @ (0.25, 0.5, 0.25))
+FITS = {"srgb8": fit_srgb, "yuyv": fit_yuyv, "mjpeg": fit_jpeg}
 
 
 def scene(uv: np.ndarray, sigma_px: float, flux_e: float, background_e: float, s: Sensor) -> Light:
@@ -55,7 +56,7 @@ def drawn(s: Sensor, sigma_px: float, collected_e: float, background_e: float, p
         light = scene(uv, sigma_px, flux_e, background_e, s)
         chains = [Chain(s, cameras * k + j) for j in range(cameras)]
         frames = np.stack([c.frame(light, NoiseStream(("chain", k, j)), box) for j, c in enumerate(chains)])
-        fit = (fit_jpeg if s.output == "mjpeg" else fit_srgb)(frames, (box.u0_px, box.v0_px), card, SpotBlur(sigma_px))
+        fit = FITS[s.output](frames, (box.u0_px, box.v0_px), card, SpotBlur(sigma_px))
         good = fit.status == Status.OK
         failed += int((~good).sum())
         dark = s.dark_e_per_s * s.exposure_s

@@ -21,7 +21,8 @@ from phibench.estimator.calibration.outline_start import (
     sphere_from_ellipse,
     sphere_from_rays,
 )
-from phibench.estimator.spots.image_planes import ImageError, linear_to_srgb, srgb_to_linear
+from phibench.estimator.spots.camera_codes import linear_to_srgb, srgb_to_linear
+from phibench.estimator.spots.image_planes import ImageError
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light
 from phibench.render.sensor.noise_tiles import NoiseStream

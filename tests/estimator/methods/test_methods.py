@@ -17,14 +17,13 @@ from phibench.estimator.interface import Answer, Box, Pair, Spot
 from phibench.estimator.methods.locate import around, clipped, laser_light, locate, mirror_mask, red_peak
 from phibench.estimator.methods.registry import KNOWN, METHODS, BuiltIn
 from phibench.estimator.sandbox.easy_pairs import EasyPairs
+from phibench.estimator.spots.camera_codes import linear_to_srgb, srgb_to_linear
 from phibench.estimator.spots.image_planes import (
     KINDS,
     demosaiced,
     kind_of,
     linear_planes,
-    linear_to_srgb,
     redness,
-    srgb_to_linear,
 )
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.render.optics.spot_layer import spot_layer

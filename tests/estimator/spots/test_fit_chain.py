@@ -14,11 +14,11 @@ from scipy import integrate, stats
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.processed_bound import chain_limit
+from phibench.estimator.spots.camera_codes import linear_to_srgb, noisy_code, srgb_slope, srgb_to_linear
 from phibench.estimator.spots.chain_model import chain_model, codes
 from phibench.estimator.spots.fit_chain import fit_jpeg, fit_srgb, undone, unrounded
 from phibench.estimator.spots.fit_raw import fit_law
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
-from phibench.estimator.spots.image_planes import linear_to_srgb, noisy_srgb, srgb_slope, srgb_to_linear
 from phibench.estimator.spots.jpeg_coefficients import coefficients, quantisation, quantised, recovered, steps
 from phibench.estimator.spots.pixel_statistics import code_law, code_table
 from phibench.estimator.spots.raw_pixels import GaussLaw, PixelNoise, around, background_of, bayer_filters, spot_regions
@@ -61,7 +61,8 @@ def test_noisy_curve_against_quadrature() -> None:
             points=[0.0, 0.0031308] if wide[0] < 0 else None,
             limit=400,
         )
-        assert noisy_srgb(np.array([mean]), np.array([sigma])).mean[0] == pytest.approx(exact, abs=tolerance)
+        found = noisy_code(np.array([mean]), np.array([sigma]), card_of(SRGB)).mean[0]
+        assert found == pytest.approx(exact, abs=tolerance)
 
 
 def test_every_raw_code_lies_in_the_interval_of_its_8_bit_code() -> None:
@@ -195,8 +196,7 @@ def test_sharpening_and_matrix_are_undone() -> None:
     frame = Chain(s.replace(shot_noise=False, read_noise_e=0.0, prnu=0.0, dsnu_e=0.0)).frame(
         light, NoiseStream(("undone",)), SQUARE
     )
-    filters = bayer_filters(np.array([[SQUARE.u0_px, SQUARE.v0_px]]), (17, 17))
-    x, extra = undone(frame[None], filters, card_of(s))
+    x, extra = undone(frame[None], np.array([[SQUARE.u0_px, SQUARE.v0_px]]), card_of(s))
     photo = Chain(s.replace(output="raw")).photo_electrons(light, SQUARE)
     inner = (slice(4, -4), slice(4, -4))
     # 5 deviations of 8 bits, and half a DN of the converter
@@ -227,7 +227,7 @@ def test_messages() -> None:
         fit_jpeg(image, (8, 8), card, SpotBlur(0.7))
     with pytest.raises(ValueError, match="needs 'bayer'"):
         fit_srgb(image, (0, 0), card_of(sensor("srgb8", mosaic="mono")), SpotBlur(0.7))
-    with pytest.raises(ValueError, match="knows 'srgb8' and 'mjpeg'"):
+    with pytest.raises(ValueError, match="knows 'srgb8', 'yuyv' and 'mjpeg'"):
         chain_limit(card_of(sensor("bayer-raw")), (10.0, 10.0), SpotBlur(0.7), 1e4, (1.0, 1.0, 1.0))
     with pytest.raises(ValueError, match="1 to 100"):
         quantisation(0)
