@@ -1,6 +1,6 @@
 """One frame on disk (PNG, JPEG or EXR), and the index of a folder of frames.
 
-A frame is written as PNG, as the camera's own JPEG, or as EXR; a frame that a viewer shows dark gets a preview for
+A frame is written as PNG, as the chain's JPEG, or as EXR; a frame that a viewer shows dark gets a preview for
 people. The index has one row per file: its SHA-256, every number that it depends on, and the truth of its image. It is
 written twice, as `frames.jsonl` and as `frames.parquet`.
 """
@@ -34,7 +34,7 @@ VALUES = {
     "raw": "DN of the converter, not scaled, in 16 bits; RGGB by the pixel's place on the sensor",
     "srgb8": "sRGB, 8 bits",
     "yuyv": "Y' and, in turns, Cb (even columns of the sensor) and Cr, 8 bits, the bytes of a YUYV buffer",
-    "mjpeg": "sRGB, 8 bits, as the camera sends it",
+    "mjpeg": "sRGB, 8 bits, in a JPEG",
 }
 PREVIEW = "sRGB, 8 bits, for people; not the camera's"
 

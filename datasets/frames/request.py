@@ -11,9 +11,11 @@ import operator
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import InputFile
 from phibench.render.sensor.light import Region
 from phibench.render.sensor.settings import Sensor, SensorError, sensor
 
@@ -21,6 +23,7 @@ Exposure = float | Literal["auto"] | None
 AUTO_EXPOSED = ("srgb8", "yuyv", "mjpeg")
 """Presets that deliver what the camera has processed: exposed as it would, unless an exposure is given."""
 
+_JPEG = b"\xff\xd8"  # start of image
 _RANGES = {"lamp_level": (0.0, 1e6), "laser_level": (0.0, 1e6), "carriage_speed_m_s": (-1e3, 1e3)}
 
 
@@ -44,7 +47,7 @@ class FrameRequest:
     camera_seed : int
         Names the camera: frames of one seed share the fixed pattern. 0 is a camera like others.
     overrides : dict
-        Other numbers of the preset, such as ``jpeg_quality=60``.
+        Other numbers of the preset, such as ``jpeg_quality=60``; `jpeg_qtables` may be a file, see `jpeg_tables`.
     """
 
     preset: str = "mjpeg"
@@ -63,6 +66,8 @@ class FrameRequest:
             raise DatasetError(f"exposure = '{self.exposure}': give seconds above 0, or 'auto'")
         if not isinstance(self.preset, str):
             raise DatasetError(f"preset = {self.preset!r}: give the name of a preset, such as 'mjpeg'")
+        if isinstance(file := self.overrides.get("jpeg_qtables"), (str, Path)):
+            object.__setattr__(self, "overrides", {**self.overrides, "jpeg_qtables": jpeg_tables(Path(file))})
         for name, (low, high) in _RANGES.items():
             object.__setattr__(self, name, _number(name, getattr(self, name), low, high))
         object.__setattr__(self, "camera_seed", whole_number("camera_seed", self.camera_seed))
@@ -97,6 +102,33 @@ class FrameRequest:
 def default_exposure(preset: str) -> Exposure:
     """Exposure where none is given: "auto" for `AUTO_EXPOSED`, otherwise the preset's time."""
     return "auto" if preset in AUTO_EXPOSED else None
+
+
+def jpeg_tables(path: Path) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Quantisation tables of luma and chroma, 64 steps each, row by row, of a JPEG or a text file.
+
+    A text file is what `cjpeg -qtables` takes: whole numbers row by row, one table or two, and comments after "#". A
+    file with one table gives it to both.
+
+    Raises
+    ------
+    DatasetError
+        If the file has no such tables.
+    """
+    file = InputFile(path, "give a JPEG of the camera, or 64 or 128 whole numbers from 1 to 255 in a text file")
+    data = file.read()
+    if data.startswith(_JPEG):
+        held = file.picture(("JPEG",), data).quantization  # type: ignore[attr-defined]
+        tables = [tuple(held[key]) for key in sorted(held)][:2]
+    else:
+        words = " ".join(line.partition("#")[0] for line in file.text(data).splitlines()).split()
+        if len(words) not in (64, 128) or not all(word.isascii() and word.isdigit() for word in words):
+            raise file.fault("holds no quantisation tables")
+        steps = [int(word[:6]) for word in words]
+        tables = [tuple(steps[k : k + 64]) for k in range(0, len(steps), 64)]
+    if not all(1 <= step <= 255 for table in tables for step in table):
+        raise file.fault("has steps outside 1 to 255")
+    return tables[0], tables[-1]
 
 
 def exposure_of(text: str) -> Exposure:

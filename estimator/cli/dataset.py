@@ -166,8 +166,8 @@ def frames(
         Folder of a data set.
     preset
         Where the chain ends: "ideal" (EXR, expected electrons), "mono-raw", "bayer-raw" (PNG of 16 bits that holds
-        10-bit DN, not scaled), "srgb8" (PNG) or "mjpeg" (the camera's JPEG; PNG with --region). By default
-        that of --sensor, or "mjpeg".
+        10-bit DN, not scaled), "srgb8" (PNG), "yuyv" (PNG of Y' and chroma) or "mjpeg" (JPEG; PNG with
+        --region). By default that of --sensor, or "mjpeg".
     sensor
         Sensor file of `phibench sensor fit`: its numbers stand for the preset's.
     draws
@@ -179,7 +179,7 @@ def frames(
     laser_off
         Also every image without the spot.
     exposure
-        Seconds, "auto", or "preset" for the preset's time; by default "auto" for srgb8 and mjpeg, else "preset".
+        Seconds, "auto", or "preset" for the preset's time; by default "auto" for srgb8, yuyv and mjpeg, else "preset".
     region
         Side in pixels of a square around the spot, instead of the whole image.
     camera_seed

@@ -51,7 +51,7 @@ def check(
     reference
         File and function, my_phi.py:extract, or a name that `phibench method list` shows.
     preset
-        What the camera delivers: "mjpeg", "srgb8", "bayer-raw" or "mono-raw".
+        What the camera delivers: "mjpeg", "yuyv", "srgb8", "bayer-raw" or "mono-raw".
     show_output
         Also show what the method prints: the last 20 lines of every pair.
     """

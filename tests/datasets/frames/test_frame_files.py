@@ -49,7 +49,13 @@ def image_in(path: Path) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("preset", "end", "mode"),
-    [("ideal", "exr", ""), ("bayer-raw", "png", "I;16"), ("srgb8", "png", "RGB"), ("mjpeg", "jpg", "RGB")],
+    [
+        ("ideal", "exr", ""),
+        ("bayer-raw", "png", "I;16"),
+        ("srgb8", "png", "RGB"),
+        ("yuyv", "png", "LA"),
+        ("mjpeg", "jpg", "RGB"),
+    ],
 )
 def test_files_are_what_the_api_gives(tiny_dataset: Path, tmp_path: Path, preset: str, end: str, mode: str) -> None:
     out = tmp_path / "f"
@@ -57,7 +63,7 @@ def test_files_are_what_the_api_gives(tiny_dataset: Path, tmp_path: Path, preset
     rows = read_index(out)
     frames = {name: row for name, row in rows.items() if row.kind == "frame"}
     assert len(frames) == 2 * 2 * 2 * 2
-    assert len(rows) - len(frames) == (8 if preset in ("ideal", "bayer-raw") else 0)
+    assert len(rows) - len(frames) == (8 if preset in ("ideal", "bayer-raw", "yuyv") else 0)
     assert f"{SEEN}-down-on-0000.{end}" in frames
     dataset = open_dataset(tiny_dataset)
     for name, row in frames.items():

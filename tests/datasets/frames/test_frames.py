@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import json
 import re
 import shutil
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from PIL import Image
 from scipy import stats
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.request import AUTO_EXPOSED, FrameRequest, jpeg_tables
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.render.sensor.light import Region
@@ -46,6 +48,7 @@ def sample(dataset: Dataset) -> Sample:
         ("mono-raw", (180, 320), np.uint16),
         ("bayer-raw", (180, 320), np.uint16),
         ("srgb8", (180, 320, 3), np.uint8),
+        ("yuyv", (180, 320, 2), np.uint8),
         ("mjpeg", (180, 320, 3), np.uint8),
     ],
 )
@@ -77,7 +80,7 @@ def test_the_jpeg_is_what_pillow_reads(sample: Sample) -> None:
     assert len(better.jpeg["down"]) > len(frames.jpeg["down"])
 
 
-@pytest.mark.parametrize("preset", ["ideal", "mono-raw", "bayer-raw", "srgb8", "mjpeg"])
+@pytest.mark.parametrize("preset", ["ideal", "mono-raw", "bayer-raw", "srgb8", "yuyv", "mjpeg"])
 def test_a_region_is_a_crop_of_the_frame(sample: Sample, preset: str) -> None:
     whole = sample.camera_frames(preset, draw=2, laser_off=True)
     source = sample.region_frames(preset, 64)
@@ -87,7 +90,7 @@ def test_a_region_is_a_crop_of_the_frame(sample: Sample, preset: str) -> None:
         row = sample.truth_row(frame.position)
         assert frame.region == Region.around(row.u_px, row.v_px, (180, 320), 64)
         slices = frame.region.slices()
-        expected = getattr(whole, name)[(..., *slices) if preset != "srgb8" and preset != "mjpeg" else slices]
+        expected = getattr(whole, name)[slices if preset in AUTO_EXPOSED else (..., *slices)]
         np.testing.assert_array_equal(frame.image, expected)
     assert part.jpeg == {}
 
@@ -320,3 +323,27 @@ def test_a_missing_layer_is_named(tiny_dataset: Path, tmp_path: Path) -> None:
     (copy / "views/h0.500/ambient.exr").unlink()
     with pytest.raises(DatasetError, match=r"ambient\.exr is missing"):
         open_dataset(copy)[SEEN].camera_frames()
+
+
+def test_tables_of_a_file_go_into_the_frames(tmp_path: Path) -> None:
+    """Of a JPEG and of `cjpeg -qtables` text, read by Pillow; what is no table is refused in one sentence."""
+    luma, chroma = tuple(range(2, 66)), tuple(range(40, 104))
+    Image.new("RGB", (16, 16)).save(tmp_path / "camera.jpg", qtables=[list(luma), list(chroma)])
+    assert jpeg_tables(tmp_path / "camera.jpg") == (luma, chroma)
+    Image.new("L", (16, 16)).save(tmp_path / "grey.jpg", qtables=[list(luma)])
+    assert jpeg_tables(tmp_path / "grey.jpg") == (luma, luma)
+    words = [str(step) for step in (*luma, *chroma)]
+    rows = (" ".join(words[k : k + 8]) for k in range(0, 128, 8))
+    (tmp_path / "tables.txt").write_text("# of a camera\n" + "\n".join(rows))
+    request = FrameRequest.of("mjpeg", {"jpeg_qtables": tmp_path / "tables.txt"})
+    assert request.sensor().jpeg_qtables == (luma, chroma)
+    assert json.loads(json.dumps(request.document()))["overrides"]["jpeg_qtables"][1][0] == 40
+    for text, complaint in (("1 2 3", "no quantisation"), ("0 " * 64, "steps outside 1 to 255"), ("x", "no quant")):
+        (tmp_path / "bad.txt").write_text(text)
+        with pytest.raises(DatasetError, match=complaint) as caught:
+            FrameRequest.of("mjpeg", {"jpeg_qtables": str(tmp_path / "bad.txt")})
+        assert "bad.txt" in str(caught.value)
+        assert "\n" not in str(caught.value)
+    Image.new("RGB", (16, 16)).save(tmp_path / "frame.png")
+    with pytest.raises(DatasetError, match=r"frame.png"):
+        jpeg_tables(tmp_path / "frame.png")

@@ -81,7 +81,7 @@ def test_a_striped_room_behind_the_spot_is_taken_from_the_off_frame(preset: str)
 def test_raw_images_are_refused() -> None:
     raw = np.zeros((720, 1280), np.uint16)
     answer = chain_fit(Pair(0, raw, raw, RIG, 0.5, card_of(sensor("bayer-raw"))))
-    assert "needs srgb8 or mjpeg" in answer.down.status
+    assert "needs srgb8, yuyv or mjpeg" in answer.down.status
 
 
 def test_blur_is_that_of_spot_layers() -> None:
