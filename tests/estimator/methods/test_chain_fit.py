@@ -41,7 +41,7 @@ def pair_of(preset: str, off: bool, stripes: bool = False, collected_e: float = 
 
 
 @pytest.mark.parametrize("off", [False, True])
-@pytest.mark.parametrize("preset", ["srgb8", "mjpeg"])
+@pytest.mark.parametrize("preset", ["srgb8", "yuyv", "mjpeg"])
 def test_both_spots_are_found(preset: str, off: bool) -> None:
     """Within 6 of its own standard deviations, and those below 0.06 px."""
     answer = chain_fit(pair_of(preset, off))
@@ -53,7 +53,7 @@ def test_both_spots_are_found(preset: str, off: bool) -> None:
         assert (sd < 0.06).all()
 
 
-@pytest.mark.parametrize("preset", ["srgb8", "mjpeg"])
+@pytest.mark.parametrize("preset", ["srgb8", "yuyv", "mjpeg"])
 def test_full_pixels_are_part_of_the_model(preset: str) -> None:
     """30 times the light, up to four full pixels: within 5 of its own standard deviations, and those below 0.03 px.
 
@@ -67,7 +67,7 @@ def test_full_pixels_are_part_of_the_model(preset: str) -> None:
         assert (sd < 0.03).all()
 
 
-@pytest.mark.parametrize("preset", ["srgb8", "mjpeg"])
+@pytest.mark.parametrize("preset", ["srgb8", "yuyv", "mjpeg"])
 def test_a_striped_room_behind_the_spot_is_taken_from_the_off_frame(preset: str) -> None:
     """Stripes of 5 px and 300 e-: with the off frame within 0.15 px."""
     answer = chain_fit(pair_of(preset, off=True, stripes=True))
