@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from phibench.estimator.sensor_fit.capture_folder import Capture, luma
-from phibench.estimator.spots.image_planes import linear_to_srgb, srgb_to_linear
+from phibench.estimator.spots.camera_codes import linear_to_srgb, srgb_to_linear
 from phibench.scenes.frames import Array
 
 Curve = Literal["srgb", "rec709", "table"]
