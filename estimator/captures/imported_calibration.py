@@ -57,8 +57,9 @@ def calibrate_imported(
     imported = open_imported(folder)
     rows = _rows(imported, samples, spots)
     images, outlines, names = _outlines(imported, rows, outline_sigma_factor)
-    rig = with_blur_of(imported.rig, outlines)
     aligned = calibrate(imported.rig, mean_outline(outlines))
+    # spots are looked for with the mirror where it is: a rig off by some pixels has other epipolar lines
+    rig = with_blur_of(aligned.rig, outlines)
     known: dict[str, KnownSpot] = {}
     left_out: dict[str, str] = {}
     if spots:
@@ -103,14 +104,16 @@ def _rows(imported: ImportedSet, samples: Sequence[str], spots: bool) -> list[Im
 def _outlines(
     imported: ImportedSet, rows: Sequence[ImportedRow], factor: float
 ) -> tuple[list[Photograph], list[Outline], list[str]]:
-    """One outline of each sample and position, laser off where there is such a picture; those that were found."""
+    """Outlines that were found: of one sample in both positions, of several in one position each, taking turns.
+
+    Of frames with the laser off, where there are some. Camera and mirror move together: positions differ by the room.
+    """
     images, outlines, names = [], [], []
     fault: ImageError | None = None
-    for row in rows:
-        if row.draw:
-            continue
+    firsts = [row for row in rows if row.draw == 0]
+    for number, row in enumerate(firsts):
         pair = imported.pair(row)
-        for position in POSITIONS:
+        for position in POSITIONS if len(firsts) == 1 else (POSITIONS[number % 2],):
             image = Photograph(pair.images.get(f"{position}_off", pair.images[position]), imported.card)
             try:
                 outlines.append(find_outline(image.pixels, imported.rig, image.card).widened(factor))

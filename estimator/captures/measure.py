@@ -402,12 +402,18 @@ def _nothing_found(pair: Pair, photos: PairPhotos, answer: Answer) -> DatasetErr
     if contradiction := _known_contradiction(pair, photos):
         return contradiction
     lacking = [p for p in POSITIONS if getattr(answer, p).uv_px is None]
-    where = " and ".join(f"{p} ({getattr(photos, p).on[0].path})" for p in lacking or POSITIONS)
-    status = getattr(answer, (lacking or POSITIONS)[0]).status
+    if not lacking:
+        unfit = next(p for p in POSITIONS if getattr(answer, p).covariance_px2 is None)
+        u, v = getattr(answer, unfit).uv_px
+        return DatasetError(
+            f"a light is seen in the picture {unfit} ({getattr(photos, unfit).on[0].path}) at ({u:.0f}, {v:.0f}) px, "
+            "but it is too faint to be fitted; give more frames, less light of the room or more of the laser"
+        )
+    where = " and ".join(f"{p} ({getattr(photos, p).on[0].path})" for p in lacking)
     advice = "; give pictures with the laser off, too" if pair.down_off is None else ""
     return DatasetError(
-        f"no laser spot in the picture {where}: {status}; look whether the laser is on and its spot is seen in the "
-        f"mirror, and whether the picture is overexposed{advice}"
+        f"no laser spot in the picture {where}: {getattr(answer, lacking[0]).status}; look whether the laser is on and "
+        f"its spot is seen in the mirror, and whether the picture is overexposed{advice}"
     )
 
 
@@ -435,6 +441,8 @@ def _known_contradiction(pair: Pair, photos: PairPhotos) -> DatasetError | None:
             continue
         uv = np.array(found.down.uv_px), np.array(found.up.uv_px)
         per_m = float(depth_exact(pair.rig, stroke, *uv).depth_m) / stroke  # D grows with the stroke
+        if not per_m > 0.0 or NEAREST_M <= per_m * pair.stroke_m <= FARTHEST_M:
+            continue  # the stroke is possible: something else is wrong
         return DatasetError(
             f"the stroke contradicts the pictures: with {pair.stroke_m:.4g} m no point of a room, {NEAREST_M:g} to "
             f"{FARTHEST_M:g} m away, is seen at both spots; a stroke of {NEAREST_M / per_m:.2g} to "

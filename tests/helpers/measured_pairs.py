@@ -1,17 +1,18 @@
 """Figures of `phibench measure`: pairs of one rig written as camera files, calibrated and measured from them alone.
 
     phibench dataset make tests/one_rig.toml --out FOLDER
-    python tests/helpers/measured_pairs.py FOLDER PICTURES [mjpeg | bayer-raw]
+    python tests/helpers/measured_pairs.py FOLDER PICTURES [mjpeg | bayer-raw [own]]
 
 The rig file says what the drawing says, `[rig]` without any number: the true rig is off by its `[misalignment]`, and
 its blur and filters are others. A third of the samples calibrate it, at the distances of a tape of 2 mm. The others are
-measured by the calibration, by their own outlines alone, and by the scorer that knows the true rig and stroke.
+measured by the calibration, with `own` by their own outlines alone, too, and by the scorer that knows the true rig and
+stroke.
 """
 
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -69,7 +70,7 @@ def write_files(dataset: Dataset, samples: list[Sample], folder: Path, preset: s
 
 def known(dataset: Dataset, sample: Sample, preset: str) -> float:
     """D of the same frames by the scorer that knows rig and stroke; NaN where the method finds no spot."""
-    pair = pairs_of(dataset, [sample], preset).pair(0)
+    pair = replace(pairs_of(dataset, [sample], preset).pair(0), rig=sample.rig, stroke_m=sample.row.stroke_m)
     method = METHODS["chain_fit" if preset == "mjpeg" else "raw_maximum_likelihood"]
     answer = method(pair)
     if answer.down.uv_px is None or answer.up.uv_px is None:
@@ -134,10 +135,9 @@ def main(arguments: list[str]) -> None:
     calibration = calibrate_imported(pictures / "set", pictures / "rig.json", spots=True)
     print(calibration.verdict, flush=True)
     rig = pictures / "measure" / "rig.toml"
-    for name, setting in (
-        ("calibrated", read_setting(rig, pictures / "rig.json")),
-        ("own outlines", read_setting(rig)),
-    ):
+    settings = [("calibrated", read_setting(rig, pictures / "rig.json"))]
+    settings += [("own outlines", read_setting(rig))] if "own" in arguments else []
+    for name, setting in settings:
         rows = [measured(dataset, sample, pictures / "measure", preset, setting) for sample in rest]
         print(summary(name, [row for row in rows if row is not None]), flush=True)
 
