@@ -62,7 +62,7 @@ def checked(cell: tuple[Sensor, float, float, float], positions: int, cameras: i
     assert 1.4 * ratio * (1.0 - sigmas * error) > ratio_limit
 
 
-@pytest.mark.parametrize("cell", [CELLS[1], CELLS[5], CELLS[9]], ids=[NAMES[1], NAMES[5], NAMES[9]])
+@pytest.mark.parametrize("cell", [CELLS[1], CELLS[9]], ids=[NAMES[1], NAMES[9]])
 def test_accuracy_of_the_chain_in_short(cell: tuple[Sensor, float, float, float]) -> None:
     """160 draws: a standard error of 4 %; at the true ratio of 1.02 and three of them the chance to fail is 1e-4."""
     checked(cell, 16, 10, 3.0)
