@@ -14,10 +14,10 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.store.files import require_writable
 from phibench.estimator.calibration.bundle import Bundle, KnownSpot, calibrate
 from phibench.estimator.calibration.from_dataset import DatasetCalibration, Photograph, write_bundle
-from phibench.estimator.calibration.outline import Outline, find_outline, mean_outline
+from phibench.estimator.calibration.outline import Outline, find_outline
 from phibench.estimator.calibration.spots import method_for
 from phibench.estimator.captures.imported_set import ImportedRow, ImportedSet, open_imported
-from phibench.estimator.captures.measure import combined_spots, with_blur_of
+from phibench.estimator.captures.measure import combined_spots, outlines_as_one, with_blur_of
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.interface import Pair
@@ -57,7 +57,7 @@ def calibrate_imported(
     imported = open_imported(folder)
     rows = _rows(imported, samples, spots)
     images, outlines, names = _outlines(imported, rows, outline_sigma_factor)
-    aligned = calibrate(imported.rig, mean_outline(outlines))
+    aligned = calibrate(imported.rig, outlines_as_one(outlines))
     # spots are looked for with the mirror where it is: a rig off by some pixels has other epipolar lines
     rig = with_blur_of(aligned.rig, outlines)
     known: dict[str, KnownSpot] = {}
@@ -75,7 +75,7 @@ def calibrate_imported(
             raise DatasetError(
                 f"no spot of {folder} to calibrate with; of {next(iter(left_out))}: {next(iter(left_out.values()))}"
             )
-    bundle = calibrate(imported.rig, mean_outline(outlines), list(known.values()))
+    bundle = calibrate(imported.rig, outlines_as_one(outlines), list(known.values()))
     made_from: dict[str, Any] = {
         "dataset": imported.info.name,
         "samples": list(known) or sorted({row.sample_id for row in rows}),

@@ -329,10 +329,20 @@ def _corrected(setting: Setting, outlines: Sequence[Outline], why: str) -> tuple
     if not outlines:
         values, covariance = np.zeros(len(PARAMETERS)), np.diag(prior_sigmas() ** 2)
         return nominal, covariance, values, f"rig: as in the rig file, with the errors of a ruler; no outline: {why}"
-    bundle = calibrate(nominal, mean_outline(outlines))
+    bundle = calibrate(nominal, outlines_as_one(outlines))
     kind = ", by its edge alone" if any(one.by_edge for one in outlines) else ""
     text = f"rig: corrected by the mirror's outline in these pictures{kind}; the rest has the errors of a ruler"
     return bundle.rig, bundle.covariance, bundle.values, text
+
+
+def outlines_as_one(outlines: Sequence[Outline]) -> Measured:
+    """Weighted mean of outlines of one rig, with the covariance of a single one.
+
+    What an outline claims is mostly what all of them share: the lens's blur, where the limb lies in its edge, the
+    nominal camera. Ten outlines of a rig in ten rooms were all 0.4 to 0.6 mm short, each within its sigma.
+    """
+    mean = mean_outline(outlines)
+    return replace(mean, covariance=mean.covariance * len(outlines))
 
 
 _MOVED_SIGMAS = 5.0
@@ -345,7 +355,7 @@ def _calibration_note(held: Calibration, nominal: Rig, outlines: Sequence[Outlin
         return text
     sigmas = np.array(held.made_from["sigma_m"])
     then = Measured(np.mean(made, axis=0), np.diag(np.mean(sigmas**2, axis=0)))
-    now = mean_outline(outlines)
+    now = outlines_as_one(outlines)
     across = (now.value - then.value)[:2]
     off = float(np.sqrt(across @ np.linalg.solve((now.covariance + then.covariance)[:2, :2], across)))
     if off > _MOVED_SIGMAS:

@@ -14,7 +14,7 @@ from PIL import Image
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import Sample, open_dataset
 from phibench.estimator.calibration.outline import Outline
-from phibench.estimator.captures.measure import PairPhotos, PositionPhotos, measure, read_setting
+from phibench.estimator.captures.measure import PairPhotos, PositionPhotos, measure, outlines_as_one, read_setting
 from phibench.estimator.captures.picture_files import read_photo
 from phibench.estimator.cli.main import main
 from phibench.estimator.spots.image_planes import ImageError
@@ -90,6 +90,12 @@ def test_the_outline_corrects_the_rig_and_gives_the_blur(case: Case, monkeypatch
     assert 1e-3 < found.rig.sphere_in_camera_m[2] - setting.known.rig.sphere_in_camera_m[2] < 2e-3
     assert found.rig.camera.blur_sigma_px == 0.9
     assert any("corrected by the mirror's outline" in note for note in found.notes)
+
+
+def test_outlines_of_one_rig_claim_what_one_does() -> None:
+    C = np.diag([5e-5, 5e-5, 1e-4]) ** 2
+    outlines = [Outline(np.array([0.0, 0.0, z]), C, 1.0, 1.0, 0.9, 0.1, 1000, 5) for z in (0.26, 0.26, 0.26)]
+    assert np.allclose(outlines_as_one(outlines).covariance, C, rtol=1e-12, atol=0.0)
 
 
 @pytest.mark.usefixtures("unaligned")
