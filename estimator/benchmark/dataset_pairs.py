@@ -25,6 +25,7 @@ from phibench.estimator.calibration.file import Calibration, CalibrationError
 from phibench.estimator.draw_pairs import DrawnPairs
 from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.interface import Pair
+from phibench.estimator.limits.off_frame_bound import FrameCounts, on_off_limit, processed_on_off_limit
 from phibench.estimator.limits.position_bound import SpotLimit, spot_limit
 from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.pair_set import Distraction, PairSet, PairTruth, SpotTruth, truth_folders
@@ -209,6 +210,7 @@ def spot_bounds(
     pattern_known: bool = False,
     depth_m: float | None = None,
     beam: Beam | None = None,
+    frames: FrameCounts | None = None,
 ) -> SpotBounds:
     """Bounds of a spot in the image of a sensor and in the raw pixels behind it.
 
@@ -226,16 +228,22 @@ def spot_bounds(
         Whether the camera's PRNU and DSNU are calibrated; otherwise the bounds count them as noise.
     depth_m, beam
         As for `spot_blur`: the spot's own size. Raw pixels' bound does not need it, it takes the light as it is.
+    frames : FrameCounts, optional
+        Frames with the laser on and off, from which alone the room is known; by default one frame with the laser on,
+        and the room a level per filter.
     """
     sensor = side.chain.sensor
     raw = sensor.replace(output="raw")
     card = card_of(raw)
     region = expected_of_light(side.light, raw, rig.camera) if visible else None
-    raw_limit = None if region is None else spot_limit(region, card, pattern_known=pattern_known)
+    raw_limit = None if region is None else _raw_limit(region, card, pattern_known, frames)
     limit, electrons, unit = raw_limit, spot_electrons(rates_per_s, side), 1.0
     if region is not None and sensor.output in PROCESSED:
         blur = spot_blur(rig, uv_px, depth_m, beam)
-        limit, unit = _processed_limit(region, card_of(sensor), rig, uv_px, blur, electrons, pattern_known), electrons
+        limit, unit = (
+            _processed_limit(region, card_of(sensor), rig, uv_px, blur, electrons, pattern_known, frames),
+            electrons,
+        )
     peak_e = 0.0 if region is None else _peak_e(region)
     return SpotBounds(
         electrons=electrons,
@@ -254,6 +262,12 @@ def spot_electrons(rates_per_s: tuple[float, ...] | Array, side: Side) -> float:
     return float(np.dot(rates_per_s, weights)) * sensor.exposure_s * side.light.laser_level
 
 
+def _raw_limit(region: ExpectedRegion, card: SensorCard, pattern_known: bool, frames: FrameCounts | None) -> SpotLimit:
+    if frames is None:
+        return spot_limit(region, card, pattern_known=pattern_known)
+    return on_off_limit(region, card, frames, pattern_known)
+
+
 def _processed_limit(
     region: ExpectedRegion,
     card: SensorCard,
@@ -262,6 +276,7 @@ def _processed_limit(
     blur: SpotBlur,
     electrons: float,
     pattern_known: bool,
+    frames: FrameCounts | None,
 ) -> SpotLimit:
     """Limit of the 8-bit or JPEG image: the room as one level per filter, its mean under the spot; a Gaussian spot."""
     weight = region.spot_e + 1e-3 * region.spot_e.max()  # of a filter that sees nothing of the spot: the mean of all
@@ -271,7 +286,9 @@ def _processed_limit(
     ]
     r, g, b = rig.camera.detector.laser_filter_response
     upright = SpotBlur(blur.sigma_px, blur.ratio)  # the mixed moment would change the bound by 3 % at most
-    return chain_limit(card, uv_px, upright, electrons, levels, (r, g, b), pattern_known)
+    if frames is None:
+        return chain_limit(card, uv_px, upright, electrons, levels, (r, g, b), pattern_known)
+    return processed_on_off_limit(card, uv_px, upright, electrons, levels, frames, (r, g, b), pattern_known)
 
 
 def _bound(limit: SpotLimit | None) -> Array | None:

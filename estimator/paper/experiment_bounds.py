@@ -27,6 +27,7 @@ from phibench.estimator.benchmark.intervals import Clusters, Estimate, estimates
 from phibench.estimator.benchmark.score_tables import Grid, cell_parts
 from phibench.estimator.draw_pairs import pairs_of
 from phibench.estimator.geometry.least_squares_depth import depth_general
+from phibench.estimator.limits.off_frame_bound import FrameCounts
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import Beam
 from phibench.scenes.random_streams import generator
@@ -41,8 +42,9 @@ def spot_bounds(
     samples: Sequence[Sample] | None = None,
     laser_level: float = 1.0,
     exposure: Exposure = "auto",
+    frames: FrameCounts | None = None,
 ) -> pl.DataFrame:
-    """Bound of D from one frame per position, for a rig that is known exactly.
+    """Bound of D for a rig that is known exactly, from one frame per position, or from some on and some off.
 
     Parameters
     ----------
@@ -53,6 +55,9 @@ def spot_bounds(
         Factor of the laser's light.
     exposure : float, "auto" or None
         Seconds; "auto" is the camera's for the room of the down image; None that of the preset.
+    frames : FrameCounts, optional
+        Frames per position with the laser on and off, from which alone the room is known; by default one frame with the
+        laser on, and the room a level per filter.
 
     Returns
     -------
@@ -65,7 +70,7 @@ def spot_bounds(
     wanted = dataset.samples if samples is None else samples
     for sample, source in _sources(dataset, preset, wanted, laser_level, exposure):
         row = sample.row
-        bound_m, known_m = (_bound_m(sample, source, pattern_known) for pattern_known in (False, True))
+        bound_m, known_m = (_bound_m(sample, source, pattern_known, frames) for pattern_known in (False, True))
         rows.append(
             {
                 "sample_id": row.sample_id,
@@ -130,19 +135,21 @@ def _sources(
         yield sample, sample.source(replace(pair_draw, request=request))
 
 
-def _bound_m(sample: CachedSample, source: FrameSource, pattern_known: bool) -> float:
+def _bound_m(sample: CachedSample, source: FrameSource, pattern_known: bool, frames: FrameCounts | None) -> float:
     rows = [sample.row.position(position) for position in POSITIONS]
-    C_down, C_up = (_bound_px2(sample, source, position, pattern_known) for position in POSITIONS)
+    C_down, C_up = (_bound_px2(sample, source, position, pattern_known, frames) for position in POSITIONS)
     down, up = (np.array([row.u_px, row.v_px]) for row in rows)
     return float(depth_general(sample.rig, sample.row.stroke_m, down, up, C_down, C_up).sigma_m)
 
 
-def _bound_px2(sample: CachedSample, source: FrameSource, position: str, pattern_known: bool) -> Array:
+def _bound_px2(
+    sample: CachedSample, source: FrameSource, position: str, pattern_known: bool, frames: FrameCounts | None
+) -> Array:
     """Bound of (u, v), shape (2, 2), pixels squared; NaN where there is none."""
     row = sample.row.position(position)
     uv_px, rates = (row.u_px, row.v_px), row.electrons_per_s
     side, beam, depth_m = source.sides[position], Beam(sample.row.spot_diameter_m, 0.0), sample.row.depth_m
-    found = bounds_of_spot(side, sample.rig, uv_px, rates, row.visible, pattern_known, depth_m, beam).bound_px2
+    found = bounds_of_spot(side, sample.rig, uv_px, rates, row.visible, pattern_known, depth_m, beam, frames).bound_px2
     return _NO_MATRIX if found is None else found
 
 

@@ -1,0 +1,242 @@
+"""Bound of a spot's position from frames with the laser on and frames with it off, the room unknown in every pixel.
+
+The other bounds take the room behind the spot as a level per filter, or as known. What is measured is another thing:
+n_on frames show room and spot, n_off frames of the same place show the room, and each pixel's room is an unknown of its
+own. Without those unknowns (Schur complement) a pixel keeps the information J about the spot's light s,
+
+    1 / J = 1 / (n_on I_on) + 1 / (n_off I_off) + (PRNU s)^2,
+
+I_on and I_off being those of one reading. The fixed pattern is shared by all frames of a camera. DSNU, and PRNU of the
+room, are part of the unknown room and cost nothing; PRNU of the spot stays whatever the number of frames.
+
+Behind the camera's processing the room's error goes through the on frame's slopes, as the noise does. The off frames
+of a JPEG count as they are before the quantiser: what its steps hide of the room depends on the room's structure. A
+smooth one has next to no coefficients to hide, a rough one is known to a step. `steps` counts that: with places spread
+evenly in the steps q, the error of a mean of n frames has the variance q^2 / 12 (rho + (1 - rho) / n), and
+
+    rho = 6 / pi^2 sum over k of exp(-4 pi^2 k^2 sigma^2 / q^2) / k^2
+
+is its correlation between frames (B. Widrow, I. Kollar, "Quantization Noise", 2008, chapter 6). Without `steps` the
+result is a bound for any room; with them it is what a method reaches that knows nothing of the room's structure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import cho_factor, cho_solve
+
+from phibench.datasets.exposures.expected import ExpectedRegion
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.limits.position_bound import SpotLimit, derivative_images, limit_of, raw_information
+from phibench.estimator.spots.chain_model import (
+    ChainModel,
+    Codes,
+    chain_model,
+    code_slopes,
+    codes,
+    noise_factor,
+    raw_variance_e2,
+)
+from phibench.estimator.spots.fisher import covariance_bound, fisher_matrix
+from phibench.estimator.spots.fit_chain import unrounded
+from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel, SpotPixels
+from phibench.estimator.spots.jpeg_coefficients import mcu_px, quantised
+from phibench.estimator.spots.pixel_statistics import code_law, code_table, cut_pixels
+from phibench.estimator.spots.raw_pixels import bayer_filters
+from phibench.scenes.frames import Array
+
+_REACH_PX = 10  # around the spot, for "srgb8"
+_LIVE = 2e-3  # variance of an output, in steps squared, below which its coefficient says nothing
+_TERMS = 60  # of the sum over k: 1 % are left out without noise, nothing from a tenth of a step on
+
+
+@dataclass(frozen=True)
+class FrameCounts:
+    """Frames per position.
+
+    Attributes
+    ----------
+    on, off : int, 1 or more
+        With the laser, and without it.
+    """
+
+    on: int = 1
+    off: int = 1
+
+    def __post_init__(self) -> None:
+        if self.on < 1 or self.off < 1:
+            raise ValueError(f"{self.on} frames with the laser on and {self.off} with it off: 1 or more of each needed")
+
+
+def on_off_limit(
+    region: ExpectedRegion, card: SensorCard, frames: FrameCounts, pattern_known: bool = False
+) -> SpotLimit:
+    """Bound of (u, v) on raw pixels; unknown are the flux and the room of each pixel.
+
+    Parameters
+    ----------
+    region : ExpectedRegion
+    card : SensorCard
+    frames : FrameCounts
+    pattern_known : bool
+        PRNU is calibrated and taken out.
+    """
+    on, off = (raw_information(mean, card, pattern_known=True) for mean in (region.mean_e, region.background_e))
+    prnu = 0.0 if pattern_known else card.prnu
+    return limit_of(derivative_images(region, "flux"), without_room(on, off, region.spot_e, frames, prnu))
+
+
+def without_room(on: Array, off: Array, spot_e: Array, frames: FrameCounts, prnu: float) -> Array:
+    """Information of pixels about the spot's light, electrons^-2, shape of `on`; the room is an unknown of each.
+
+    Parameters
+    ----------
+    on, off : information of one reading with and without the laser, pattern left out
+    spot_e : electrons of the spot
+    frames : FrameCounts
+    prnu : float, relative, unknown
+    """
+    with np.errstate(divide="ignore"):
+        return np.asarray(1.0 / (1.0 / (frames.on * on) + 1.0 / (frames.off * off) + (prnu * spot_e) ** 2))
+
+
+def processed_on_off_limit(
+    card: SensorCard,
+    uv_px: ArrayLike,
+    blur: SpotBlur,
+    flux_e: float,
+    background_e: ArrayLike,
+    frames: FrameCounts,
+    response: tuple[float, float, float] = LASER_RESPONSE,
+    pattern_known: bool = False,
+    steps: bool = False,
+) -> SpotLimit:
+    """Bound of (u, v) behind the camera's processing; unknown are the flux and the room of each pixel.
+
+    Parameters
+    ----------
+    card : SensorCard
+        Of the output "srgb8" or "mjpeg".
+    frames : FrameCounts
+    uv_px, blur, flux_e, background_e, response, pattern_known
+        As for `processed_bound.chain_limit`; `background_e` says how bright the room is, a method does not know it.
+    steps : bool
+        Of "mjpeg": the steps hide each of the room's coefficients, as of a room with structure everywhere.
+
+    Raises
+    ------
+    ValueError
+        If the output is neither of the two.
+    """
+    theta = np.array([*np.asarray(uv_px, float), flux_e, *np.asarray(background_e, float)])
+    prnu = 0.0 if pattern_known else card.prnu
+    if card.output == "srgb8":
+        return _of_codes(card, theta, blur, response, frames, prnu)
+    if card.output == "mjpeg":
+        return _of_coefficients(card, theta, blur, response, frames, prnu, steps)
+    raise ValueError(f"output '{card.output}': 'srgb8' and 'mjpeg' are known; take on_off_limit for raw pixels")
+
+
+def _of_codes(
+    card: SensorCard,
+    theta: Array,
+    blur: SpotBlur,
+    response: tuple[float, float, float],
+    frames: FrameCounts,
+    prnu: float,
+) -> SpotLimit:
+    corner = np.floor(theta[:2]).astype(np.int64) - _REACH_PX
+    filters = bayer_filters(corner[None], (2 * _REACH_PX + 2, 2 * _REACH_PX + 2))
+    theta = theta - np.array([*corner, 0, 0, 0, 0])
+    mean, derivatives = SpotPixels.of(filters, blur, SpotModel(response)).at(theta[None])
+    law = code_law(np.zeros(filters.shape, np.uint8), filters, card, unrounded(card, True), code_table(card))
+    spot = theta[2] * derivatives[:, 2]
+    J = without_room(law.information(mean), law.information(mean - spot), spot, frames, prnu)
+    fisher = fisher_matrix(derivatives[0, :3], J[0])
+    return SpotLimit(covariance_bound(fisher), fisher)
+
+
+# -- coefficients of a JPEG ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Readings:
+    """Coefficients of one frame at its means: codes, factor of the noise from raw pixels, and the rest of it.
+
+    Attributes
+    ----------
+    at : Codes
+    slope : shape (r,), of the raw pixels' means below the full well
+    factor : shape (r, n), F of which F^T F is the covariance by the raw pixels
+    rest : shape (n,), variance by roundings
+    mean : shape (n,), before the quantiser
+    """
+
+    at: Codes
+    slope: Array
+    factor: Array
+    rest: Array
+    mean: Array
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviation before the quantiser, shape (n,)."""
+        return np.sqrt(np.einsum("rn,rn->n", self.factor, self.factor) + self.rest)
+
+
+def _readings(model: ChainModel, mean_e: Array) -> _Readings:
+    """Coefficients for means of the raw pixels, shape (r,)."""
+    cut = cut_pixels(mean_e, raw_variance_e2(model, mean_e), model.card.saturation_e)
+    at = codes(model, cut.mean_e)
+    factor = noise_factor(model, at, cut.variance_e2, model.transform)
+    rest = at.excess @ model.squares + model.rounding
+    return _Readings(at, cut.slope, factor, rest, at.mean @ model.transform + model.shift)
+
+
+def _of_coefficients(
+    card: SensorCard,
+    theta: Array,
+    blur: SpotBlur,
+    response: tuple[float, float, float],
+    frames: FrameCounts,
+    prnu: float,
+    steps: bool,
+) -> SpotLimit:
+    model = chain_model(card, unrounded(card, True))
+    down, across = mcu_px(card.jpeg_subsampling)
+    units = np.array([across, down])
+    corner = (np.rint((theta[:2] + 0.5) / units) - 1.0) * units - model.margin
+    pixels = SpotPixels.of(model.filters[None], blur, SpotModel(response))
+    mean, derivatives = pixels.at((theta - np.array([*corner, 0, 0, 0, 0]))[None])
+    D = derivatives[0, :3].reshape(3, -1)
+    spot, mean_e = theta[2] * D[2], mean.ravel()
+    on, off = _readings(model, mean_e), _readings(model, mean_e - spot)
+    output = quantised(on.mean, on.sigma, model.step)
+    noise = (on.factor * output.slope).T @ (on.factor * output.slope)
+    np.fill_diagonal(noise, output.variance)
+    extra_e2 = raw_variance_e2(model, mean_e - spot) / frames.off + (prnu * spot) ** 2
+    E = noise_factor(model, on.at, on.slope**2 * extra_e2, model.transform) * output.slope
+    room = off.rest / frames.off + (_hidden(off, model.step, frames.off) if steps else 0.0)
+    C = noise / frames.on + E.T @ E + np.diag(output.slope**2 * room)
+    J = (code_slopes(model, on.at, D * on.slope) @ model.transform) * output.slope
+    live = output.variance > _LIVE * model.step**2
+    if not live.any():
+        return SpotLimit(np.full((2, 2), np.nan), np.zeros((3, 3)))
+    fisher = J[:, live] @ cho_solve(cho_factor(C[np.ix_(live, live)], lower=True), J[:, live].T)
+    return SpotLimit(covariance_bound(fisher), fisher)
+
+
+def _hidden(off: _Readings, step: Array, count: int) -> Array:
+    """Variance of the room's coefficients by the quantiser in a mean of off frames, shape (n,)."""
+    rho = step_correlation(off.sigma / step)
+    return np.asarray(step**2 / 12.0 * (rho + (1.0 - rho) / count))
+
+
+def step_correlation(sigma: Array) -> Array:
+    """Correlation between frames of a quantiser's error, shape of `sigma`, the noise in steps."""
+    k = np.arange(1, _TERMS + 1)
+    terms = np.exp(-4.0 * np.pi**2 * k**2 * np.asarray(sigma)[..., None] ** 2) / k**2
+    return np.asarray(6.0 / np.pi**2 * terms.sum(axis=-1))
