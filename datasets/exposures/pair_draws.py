@@ -34,6 +34,8 @@ from phibench.scenes.rig import POSITIONS, Rig, View
 BOX_MARGIN_PX = 4
 """A hinted spot is at least this far from the edges of its box."""
 PRESETS = ("mono-raw", "bayer-raw", "srgb8", "mjpeg")
+"""Presets of the first version: the numbers of their draws stay, and with them every byte of their frames."""
+_LATER = {"yuyv": 2**32}  # first draw of a later preset
 _CAMERAS = 2**31
 _STREAM, _ORDER_STREAM = "take", "takes"  # names of random streams: another name would draw other numbers
 
@@ -71,6 +73,8 @@ class PairDraw:
     @property
     def noise_draw(self) -> int:
         """Draw of `FrameSource.frames`: another one in each preset, or JPEG frames would have a raw twin's noise."""
+        if self.preset in _LATER:
+            return _LATER[self.preset] + self.draw
         return self.draw * len(PRESETS) + PRESETS.index(self.preset)
 
 
@@ -123,7 +127,7 @@ def _of_sample(
 
 def _request(sample: Sample, frames: FramesTable, preset: str, sensor: SensorFile | None) -> FrameRequest:
     if preset == "ideal":
-        raise DatasetError("preset 'ideal' ends before the pixels: take bayer-raw, mono-raw, srgb8 or mjpeg")
+        raise DatasetError("preset 'ideal' ends before the pixels: take bayer-raw, mono-raw, srgb8, yuyv or mjpeg")
     numbers = {key: _value(sample, key, given) for key in SENSOR_KEYS if (given := getattr(frames, key)) is not None}
     overrides = {key: round(value) if key == "jpeg_quality" else value for key, value in numbers.items()}
     if sensor is not None:

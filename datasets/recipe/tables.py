@@ -44,7 +44,7 @@ Unit = Annotated[float, Field(ge=0.0, le=1.0)]
 Response = Annotated[tuple[Unit, ...], Field(strict=False, min_length=3, max_length=3)]
 GlassIndex = Annotated[float, Field(ge=1.0, le=LARGEST_INDEX)]
 HolderM = Annotated[float, Field(ge=1e-4, le=1.0)]
-Preset = Literal["mono-raw", "bayer-raw", "srgb8", "mjpeg"]
+Preset = Literal["mono-raw", "bayer-raw", "srgb8", "yuyv", "mjpeg"]
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 OWN_ALBEDO = "surface"
 """Value of `laser.albedo`: that of each surface."""

@@ -19,6 +19,7 @@ from PIL import Image
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.benchmark.document import EncodedPicture, Worst
 from phibench.estimator.pair_set import Pairs
+from phibench.estimator.spots.camera_codes import rgb_picture
 from phibench.scenes.frames import Array
 
 CROP_PX = 48
@@ -94,7 +95,7 @@ def _ranked(records: pl.DataFrame) -> pl.DataFrame:
 
 def _entry(row: dict[str, Any], pairs: Pairs, whole: bool) -> Worst:
     pair = pairs.pair(row["number"])
-    image, true_px = getattr(pair, row["image"]), (row["u_true_px"], row["v_true_px"])
+    image, true_px = rgb_picture(getattr(pair, row["image"]), pair.card), (row["u_true_px"], row["v_true_px"])
     pixels, origin = crop(image, np.array(true_px))
     return Worst(
         **{

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import math
 from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 from helpers.bench_samples import hidden, with_tables
+from PIL import Image
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exposures.expected import expected_of_light, expected_region
@@ -17,6 +21,7 @@ from phibench.datasets.exposures.pair_draws import CachedSample
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import Dataset, open_dataset
 from phibench.estimator.benchmark.dataset_pairs import DatasetPairs, dataset_pairs
+from phibench.estimator.benchmark.worst_images import worst
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Pair
 from phibench.estimator.limits.position_bound import spot_limit
@@ -29,6 +34,7 @@ SHAPES = {
     "mono-raw": ((180, 320), np.uint16),
     "bayer-raw": ((180, 320), np.uint16),
     "srgb8": ((180, 320, 3), np.uint8),
+    "yuyv": ((180, 320, 2), np.uint8),
     "mjpeg": ((180, 320, 3), np.uint8),
 }
 
@@ -60,6 +66,23 @@ def test_pairs_are_the_frames_of_their_takes(dataset: Dataset, pairs: DatasetPai
         assert pair.card == card_of(frames.by_name["up"].sensor)
         assert (pair.card.output == "mjpeg") == (pair_draw.preset == "mjpeg")
         assert pair.stroke_m == dataset[pair_draw.sample_id].row.stroke_m
+
+
+def test_a_report_shows_yuyv_in_colour(dataset: Dataset) -> None:
+    """Two planes, luma and chroma in turns, are no picture."""
+    pairs = dataset_pairs(dataset, "yuyv", pairs=1)
+    truth = pairs.truth(0)
+    assert truth.down.bound_px2 is not None
+    assert np.isfinite(truth.down.bound_px2).all()
+    u, v = truth.down.uv_px
+    row = {"number": 0, "image": "down", "sample_id": truth.sample_id, "depth_m": truth.depth_m, "electrons": 1.0}
+    row |= {"status": "no spot", "cause": "method", "visible": True, "detected": False, "u_true_px": u, "v_true_px": v}
+    missing = {"distance_px": None, "u_px": None, "v_px": None}
+    [shown] = worst(pl.DataFrame([row | missing]), pairs)
+    for picture in (shown.crop, shown.frame):
+        assert picture
+        with Image.open(io.BytesIO(base64.b64decode(picture.base64))) as opened:
+            assert opened.mode == "RGB"
 
 
 @pytest.mark.parametrize("preset", SHAPES)
