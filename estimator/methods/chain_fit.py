@@ -11,9 +11,21 @@ from numpy.typing import NDArray
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Box, Pair, Spot
+from phibench.estimator.methods.likelihood_maps import SpotLikelihood, of_codes, of_window
+from phibench.estimator.methods.locate import around as box_at
 from phibench.estimator.methods.locate import box_around, measured_twice, pair_blur, seen_depth_m
 from phibench.estimator.spots.detect import Detection, detect
-from phibench.estimator.spots.fit_chain import first_fit, fit_jpeg, fit_srgb, fit_yuyv, undone, unrounded
+from phibench.estimator.spots.fit_chain import (
+    code_data,
+    first_fit,
+    fit_jpeg,
+    fit_srgb,
+    fit_yuyv,
+    own_codes,
+    spot_window,
+    undone,
+    unrounded,
+)
 from phibench.estimator.spots.fit_raw import SpotFit
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
 from phibench.estimator.spots.image_planes import PROCESSED
@@ -22,6 +34,7 @@ from phibench.estimator.spots.raw_pixels import Background, around, background_o
 from phibench.scenes.frames import Array
 
 _HALF_PX = 8
+_AROUND_PX = 21  # of the box whose units a likelihood is made of
 _FLAT_CHI2 = 1.5  # below it one level per filter describes the room
 _MOST_CHI2 = 30.0  # beyond it the light around the spot is not what the model says
 
@@ -108,11 +121,8 @@ def _srgb(
     model: SpotModel,
 ) -> SpotFit:
     """Fit a square of 17 x 17 pixels about the start."""
-    u0, v0 = (
-        int(np.clip(np.rint(centre) - _HALF_PX, 0, size - 2 * _HALF_PX - 1))
-        for centre, size in zip(start, (image.shape[1], image.shape[0]), strict=True)
-    )
-    square, origin = Box(u0, v0, 2 * _HALF_PX + 1, 2 * _HALF_PX + 1), np.array([[u0, v0]])
+    square = _square(start, image)
+    origin = np.array([[square.u0_px, square.v0_px]])
     on = image[square.slices][None]
 
     if off is None:
@@ -147,3 +157,38 @@ def _answer(fit: SpotFit) -> Spot:
     c = fit.covariance_px2[0] * max(1.0, float(fit.chi2[0]))
     u, v = (float(x) for x in fit.uv_px[0])
     return Spot((u, v), ((float(c[0, 0]), float(c[0, 1])), (float(c[1, 0]), float(c[1, 1]))))
+
+
+def spot_likelihood(
+    pair: Pair, image: NDArray[Any], off: NDArray[Any] | None, spot: Spot, depth_m: float | None
+) -> SpotLikelihood | None:
+    """Likelihood of one image about a spot that `chain_fit` has found; None where its outputs say nothing."""
+    uv, card = np.array(spot.uv_px, float), pair.card
+    region = (
+        _square(uv, image)
+        if own_codes(card)
+        else _region(box_at((uv[0], uv[1]), image.shape, _AROUND_PX), card, image.shape)
+    )
+    origin, on = np.array([[region.u0_px, region.v0_px]]), image[region.slices][None]
+    if off is None:
+        background = _background(on, around(uv[None], origin, on.shape[1:3]), origin, card)
+    else:
+        dark = off[region.slices][None]
+        background = replace(_background(dark, None, origin, card), image=dark)
+    blur, model = pair_blur(pair, uv, depth_m), SpotModel(_response(pair))
+    if own_codes(card):
+        behind = replace(model, background_e=background.mean_e)
+        extra_e2 = float(np.median(background.variance_e2))
+        return of_codes(code_data(on, origin, card, blur, behind, extra_e2=extra_e2), uv)
+    size = (image.shape[1], image.shape[0])
+    return of_window(*spot_window(on, origin, uv, card, blur, model, background, size))
+
+
+def _square(uv: Array, image: NDArray[Any]) -> Box:
+    """Square of 17 x 17 pixels about a place, inside the image."""
+    side = 2 * _HALF_PX + 1
+    u0, v0 = (
+        int(np.clip(np.rint(centre) - _HALF_PX, 0, size - side))
+        for centre, size in zip(uv, (image.shape[1], image.shape[0]), strict=True)
+    )
+    return Box(u0, v0, side, side)

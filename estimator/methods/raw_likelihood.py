@@ -9,8 +9,9 @@ per filter, or, where that does not describe it, what surrounds the spot. A misf
 `joint_fit` first fits each image by itself: raw pixels by `raw_maximum_likelihood`, processed ones by `chain_fit`. Raw
 pixels are then fitted together (`spots.fit_joint`): with laser-off frames the fit sees on - off + the usual level of
 off, and the off frame's noise is added to the on frame's; without them a level per filter is fitted. Of processed
-pixels the two positions are combined by their covariances (`combine`), which is the same where both are Gaussian. Where
-the two are not one point, the separate answer stands, without a depth of its own.
+pixels it gives means and covariances of the posterior of both images (`joint_posterior`), which knows of valleys and of
+several minima; D is the posterior's mean. Where the maps do not hold the posterior, the two positions are combined by
+their covariances (`combine`). Where the two are not one point, the separate answer stands, without a depth of its own.
 """
 
 from __future__ import annotations
@@ -21,9 +22,11 @@ import numpy as np
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.combine import CombinedEstimate, combine
+from phibench.estimator.geometry.joint_posterior import JointPosterior, joint_posterior
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Image, Matrix2, Pair, Spot
-from phibench.estimator.methods.chain_fit import chain_fit
+from phibench.estimator.methods.chain_fit import chain_fit, spot_likelihood
+from phibench.estimator.methods.likelihood_maps import likelihood_map
 from phibench.estimator.methods.locate import SearchRegion, each_spot_twice, pair_blur, seen_depth_m
 from phibench.estimator.spots.fit_joint import JointFit, fit_joint
 from phibench.estimator.spots.fit_raw import SpotData, SpotFit, fit_law, spot_data
@@ -134,10 +137,33 @@ def _raw(pair: Pair, separate: Answer) -> Answer:
 def _processed(pair: Pair, separate: Answer) -> Answer:
     if separate.down.covariance_px2 is None or separate.up.covariance_px2 is None:
         return separate
+    found = _posterior(pair, separate)
+    if found is not None and found.status == Status.OK:
+        return separate if not found.misfit < _MOST_CHI2 else _posterior_answer(found)
     (uv1, C1), (uv2, C2) = (
         (np.array([spot.uv_px], float), np.array([spot.covariance_px2], float)) for spot in (separate.down, separate.up)
     )
     return _answer(combine(pair.rig, pair.stroke_m, uv1, C1, uv2, C2), separate)
+
+
+def _posterior(pair: Pair, separate: Answer) -> JointPosterior | None:
+    """Posterior of both images; None where one has no likelihood about its fit."""
+    depth_m, maps = seen_depth_m(pair, separate), []
+    images = ((pair.down, pair.down_off, separate.down), (pair.up, pair.up_off, separate.up))
+    for image, off, spot in images:
+        likelihood = spot_likelihood(pair, image, off, spot, depth_m)
+        maps.append(None if likelihood is None else likelihood_map(likelihood))
+    down, up = maps
+    return None if down is None or up is None else joint_posterior(pair.rig, pair.stroke_m, down, up)
+
+
+def _posterior_answer(found: JointPosterior) -> Answer:
+    return Answer(
+        _joint_spot(found.uv_down_px, found.covariance_down_px2),
+        _joint_spot(found.uv_up_px, found.covariance_up_px2),
+        found.depth_m,
+        found.sigma_m,
+    )
 
 
 def _answer(found: JointFit | CombinedEstimate, separate: Answer) -> Answer:

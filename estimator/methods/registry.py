@@ -137,7 +137,7 @@ _ALL = (
     BuiltIn(
         "joint_fit",
         joint_fit,
-        "both images as one point of the room: likelihood on raw pixels, chain_fit's positions combined on others",
+        "both images as one point of the room: likelihood on raw pixels, mean of the posterior on others",
         "docs/limits.md",
         joint=True,
     ),

@@ -18,8 +18,8 @@ from phibench.estimator.geometry.status import Status, flag, keep
 from phibench.estimator.spots.camera_codes import light_of, rgb_codes, tone_slope
 from phibench.estimator.spots.chain_model import UNIT_MATRIX, chain_model, window_px
 from phibench.estimator.spots.fisher import covariance_bound
-from phibench.estimator.spots.fit_jpeg import JpegFit, Region, fit_region, grid_px
-from phibench.estimator.spots.fit_raw import LEAST_SNR, SpotFit, fit_law
+from phibench.estimator.spots.fit_jpeg import JpegFit, Region, Window, fit_region, grid_px, region_window
+from phibench.estimator.spots.fit_raw import LEAST_SNR, SpotData, SpotFit, fit_law, spot_data
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
 from phibench.estimator.spots.image_planes import full_scale_e
 from phibench.estimator.spots.jpeg_coefficients import RGB_FROM_YCC, mcu_px
@@ -79,14 +79,27 @@ def fit_srgb(
         levels = np.zeros(planes.shape[:3]) if known is None else np.broadcast_to(known, planes.shape[:3])
         background = Background(levels, np.full(levels.shape, extra_e2))
         return _fit_windows(planes, origin, card, blur, model, background, pattern_known)
+    data = code_data(planes, origin, card, blur, model, pattern_known, extra_e2)
+    return fit_law(data.regions, data.law, blur, model)
+
+
+def code_data(
+    planes: NDArray[np.uint8],
+    origin: NDArray[np.int64],
+    card: SensorCard,
+    blur: SpotBlur,
+    model: SpotModel | None = None,
+    pattern_known: bool = False,
+    extra_e2: float = 0.0,
+) -> SpotData:
+    """Likelihood of each pixel's own code, for cards of `own_codes`; origin of shape (n, 2), the rest as `fit_srgb`."""
     filters = bayer_filters(origin, planes.shape[1:3])
     noise = unrounded(card, pattern_known)
     noise = PixelNoise(noise.gaussian_e2 + extra_e2, noise.prnu)
     table = code_table(card)
     codes = np.take_along_axis(planes, filters[..., None], axis=3)[..., 0]
     law = code_law(codes, filters, card, noise, table)
-    x = table.middle_e[filters, codes]
-    return fit_law(spot_regions(x, origin), law, blur, model)
+    return spot_data(spot_regions(table.middle_e[filters, codes], origin), law, blur, model)
 
 
 def fit_yuyv(
@@ -180,28 +193,63 @@ def _fit_windows(
     size_px: tuple[int, int] = (0, 0),
 ) -> SpotFit:
     """Fit each image's window of outputs; `size_px` of the whole image matters for JPEG alone."""
-    n, (h, w), model = len(planes), planes.shape[1:3], model or SpotModel()
+    n, model = len(planes), model or SpotModel()
     if n == 0:
         return _collected([], origin, np.zeros(0), model.free_width)
     chain, blurs = chain_model(card, unrounded(card, pattern_known)), blur.each(n)
     widths = np.asarray(blurs.sigma_px)
     first = first_fit(planes, origin, card, SpotBlur(widths), model.response, background)
-    zero = np.zeros((h, w))
     rows = []
     for i in range(n):
-        u0, v0 = origin[i]
-        ends = (bool(v0 == 0), bool(v0 + h == size_px[1]), bool(u0 == 0), bool(u0 + w == size_px[0]))
-        known = (zero, zero) if background is None else (background.mean_e[i], background.variance_e2[i])
-        room = None if background is None or background.image is None else background.image[i]
         start = first[i] if not model.free_width else np.append(first[i], widths[i])
-        # the window's grid begins in the region's first row and column
-        u1, v1 = origin[i] % np.array(grid_px(card)[::-1])
-        start[:2] -= u1, v1
-        region = Region(planes[i, v1:, u1:], ends, known[0][v1:, u1:], known[1][v1:, u1:], room)
+        region, corner = _region(planes[i], origin[i], card, background, i, size_px)
+        start[:2] -= corner
         fit, off = fit_region(region, chain, start[None], blurs.rows(np.array([i])), model)
-        fit.theta[:2] += u1, v1
+        fit.theta[:2] += corner
         rows.append((fit, off))
     return _collected(rows, origin, widths, model.free_width)
+
+
+def _region(
+    plane: NDArray[np.uint8],
+    origin: NDArray[np.int64],
+    card: SensorCard,
+    background: Background | None,
+    index: int,
+    size_px: tuple[int, int],
+) -> tuple[Region, Array]:
+    """Region of one image, and its first row and column (u, v): the window's grid begins there."""
+    (u0, v0), (h, w), zero = origin, plane.shape[:2], np.zeros(plane.shape[:2])
+    ends = (bool(v0 == 0), bool(v0 + h == size_px[1]), bool(u0 == 0), bool(u0 + w == size_px[0]))
+    known = (zero, zero) if background is None else (background.mean_e[index], background.variance_e2[index])
+    room = None if background is None or background.image is None else background.image[index]
+    u1, v1 = origin % np.array(grid_px(card)[::-1])
+    return Region(plane[v1:, u1:], ends, known[0][v1:, u1:], known[1][v1:, u1:], room), np.array([u1, v1])
+
+
+def spot_window(
+    image: NDArray[np.uint8],
+    origin: NDArray[np.int64],
+    uv_px: Array,
+    card: SensorCard,
+    blur: SpotBlur,
+    model: SpotModel,
+    background: Background | None,
+    size_px: tuple[int, int],
+) -> tuple[Window, Array, Array]:
+    """Window of outputs of one image, a start of a fit at (u, v) of the whole image, and the window's corner there.
+
+    Parameters as for `fit_jpeg`, with n = 1; `image` has the shape (1, h, w, planes), `origin` (1, 2).
+    """
+    planes = _checked(image, card, image.shape[3])
+    region, corner = _region(planes[0], origin[0], card, background, 0, size_px)
+    one = blur.each(1)
+    start = first_fit(planes, origin, card, SpotBlur(np.asarray(one.sigma_px)), model.response, background)[0]
+    chain = chain_model(card, unrounded(card))
+    window, first = region_window(region, chain, uv_px - origin[0] - corner, one, model)
+    place = first + corner + origin[0]
+    start[:2] = uv_px - place
+    return window, start, place
 
 
 def first_fit(

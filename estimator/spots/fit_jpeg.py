@@ -297,7 +297,23 @@ def fit_region(
     shape (2,)
         Distance of (u, v) from the window's middle, in half windows: above 1 it lies outside.
     """
-    row, column = window_at(region, chain, starts[0, :2])
+    window, corner = region_window(region, chain, starts[0, :2], blur, model)
+    shifted = starts.copy()
+    shifted[:, :2] -= corner
+    fit = fit_window(window, shifted)
+    (h, w), m = chain.shape, chain.margin
+    middle = np.array([(w - 1) / 2.0 + m, (h - 1) / 2.0 + m])
+    off = np.abs(fit.theta[:2] - middle) / np.array([w / 2.0, h / 2.0])
+    theta = fit.theta.copy()
+    theta[:2] += corner
+    return JpegFit(theta, fit.fisher, fit.chi2, fit.converged), off
+
+
+def region_window(
+    region: Region, chain: ChainModel, uv: Array, blur: SpotBlur, model: SpotModel
+) -> tuple[Window, Array]:
+    """Window of a region for a spot near (u, v), and the window's first raw pixel (u, v) in the region."""
+    row, column = window_at(region, chain, uv)
     (h, w), m = chain.shape, chain.margin
     raw = (slice(row, row + h + 2 * m), slice(column, column + w + 2 * m))
     background, extra = (np.pad(x, m, mode="reflect")[raw] for x in (region.background_e, region.extra_e2))
@@ -306,17 +322,10 @@ def fit_region(
         SpotPixels.of(chain.filters[None], blur, replace(model, background_e=None)), background_e=background[None]
     )
     corner = np.array([column - m, row - m], float)
-    shifted = starts.copy()
-    shifted[:, :2] -= corner
     room: Array | float = 0.0
     if region.room is not None and chain.card.output == "mjpeg":
         room = room_variance(coefficients_at(replace(region, image=region.room), chain, row, column), chain.step)
-    fit = fit_window(Window(outputs_at(region, chain, row, column), chain, pixels, extra.ravel(), room), shifted)
-    middle = np.array([(w - 1) / 2.0 + m, (h - 1) / 2.0 + m])
-    off = np.abs(fit.theta[:2] - middle) / np.array([w / 2.0, h / 2.0])
-    theta = fit.theta.copy()
-    theta[:2] += corner
-    return JpegFit(theta, fit.fisher, fit.chi2, fit.converged), off
+    return Window(outputs_at(region, chain, row, column), chain, pixels, extra.ravel(), room), corner
 
 
 def outputs_at(region: Region, chain: ChainModel, row: int, column: int) -> Array:

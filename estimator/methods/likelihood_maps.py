@@ -1,0 +1,174 @@
+"""Likelihood maps of the spots of processed images: misfit over (u, v), flux and levels profiled out.
+
+The quasi-likelihood is that of `chain_fit`: r^T C^-1 r of a JPEG's coefficients with C kept from the fit, or the exact
+law of each pixel's own code. At each place flux and levels come from one step of Gauss-Newton, and what a second would
+gain is taken off: both are nearly linear once the place is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import RegularGridInterpolator
+
+from phibench.estimator.geometry.joint_posterior import MISFIT_RANGE, LikelihoodMap
+from phibench.estimator.spots.fisher import covariance_bound, limited, scoring_step
+from phibench.estimator.spots.fit_jpeg import Window, fit_window
+from phibench.estimator.spots.fit_raw import SpotData
+from phibench.scenes.frames import Array
+
+_AT_ONCE = 48  # hypotheses, whose arrays take some 50 MB
+_WIDE_PX = 1.25  # half side of the first map: the next minimum of a Bayer grid lies a pixel off
+_WIDE_STEP_PX = 0.25
+_SIGMAS = 4.5
+_STEP_SIGMAS = 0.6  # of the second map: cubic splines between are within 1 % of a unit of misfit
+_MOST_SIDE = 41
+_OUTLIER = 3.0  # of a residual in standard deviations
+_STEPS = 12  # of the scoring from a place that a fit has found
+_WORTH = 1.5 * MISFIT_RANGE  # of a first guess of the misfit, above the least
+_SIDE = np.arange(-_WIDE_PX, _WIDE_PX + 1e-9, _WIDE_STEP_PX)
+_PLACE = 2  # unknowns u, v, the first ones
+_LEAST_FLUX = 1e-3  # of the fit's flux, below which a hypothesis has no spot
+
+Scores = Callable[[Array], tuple[Array, Array, Array]]
+"""From hypotheses, shape (m, k): misfit (m,), score (m, k) and Fisher matrix (m, k, k)."""
+
+
+@dataclass(frozen=True)
+class SpotLikelihood:
+    """Likelihood of one image about its best place.
+
+    Attributes
+    ----------
+    scores : Scores
+    theta : shape (k,), the best hypothesis found, position from `corner_px`
+    corner_px : shape (2,), image pixel (u, v) of the position's origin
+    excess : float
+        Misfit per degree of freedom where it is above 1, by which misfits are divided; otherwise 1. Residuals count up
+        to 3 sigma: a coefficient that hardly ever changes says, when it does, nothing of the others.
+    """
+
+    scores: Scores
+    theta: Array
+    corner_px: Array
+    excess: float
+
+
+def of_window(window: Window, start: Array, corner_px: Array) -> SpotLikelihood | None:
+    """Likelihood of a JPEG window; None where its coefficients say nothing."""
+    fit = fit_window(window, start[None])
+    noise = window.noise(fit.theta)
+    if noise.dead or not np.isfinite(fit.chi2):
+        return None
+    residuals, _ = window.residual(noise, fit.theta[None])
+    limited_square = float(np.minimum(residuals**2, _OUTLIER**2).sum())
+    excess = max(limited_square / max(len(noise.sigma) - len(start), 1), 1.0)
+
+    def scores(theta: Array) -> tuple[Array, Array, Array]:
+        r, J = window.residual(noise, theta)
+        return np.einsum("ml,ml->m", r, r), np.einsum("mkl,ml->mk", J, r), J @ np.swapaxes(J, 1, 2)
+
+    return SpotLikelihood(scores, fit.theta, corner_px, excess)
+
+
+def of_codes(data: SpotData, uv_px: Array) -> SpotLikelihood:
+    """Likelihood of one region's codes about a place (u, v) in the image, where a fit has put the spot."""
+    corner = np.asarray(data.regions.origin_px[0], float)
+
+    def scores(theta: Array) -> tuple[Array, Array, Array]:
+        many = data.rows(np.zeros(len(theta), np.int64))
+        mean, derivatives = many.pixels.at(theta)
+        used, x = many.regions.used, many.regions.x_e
+        flat = derivatives.reshape(*theta.shape, -1)
+        weight = (used * many.law.information(mean)).reshape(len(theta), 1, -1)
+        score = (flat @ (used * many.law.score(x, mean)).reshape(len(theta), -1, 1))[..., 0]
+        misfit = np.sum(used * many.law.misfit(x, mean), axis=(1, 2))
+        return misfit, score, (flat * weight) @ np.swapaxes(flat, 1, 2)
+
+    above = np.sum((data.regions.x_e - data.pixels.background_e)[0] * data.pixels.response[0])
+    start = np.array([*(uv_px - corner), max(float(above), 100.0), *np.zeros(data.unknowns - 3)])
+    for _ in range(_STEPS):
+        _, score, fisher = scores(start[None])
+        start = limited(start[None], scoring_step(fisher, score))[0]
+    return SpotLikelihood(scores, start, corner, 1.0)
+
+
+def likelihood_map(one: SpotLikelihood) -> LikelihoodMap | None:
+    """Map of all places near the fit whose misfit is within the range of the least; None if the fit has no place."""
+    misfit, _, fisher = (part[0] for part in one.scores(one.theta[None]))
+    C = covariance_bound(fisher) * one.excess
+    if not np.isfinite(C).all():
+        return None
+    wide = _wide(one)
+    low, high = _ends(wide, float(misfit) / one.excess, _SIGMAS * np.sqrt(np.diag(C)))
+    steps = _STEP_SIGMAS * np.sqrt(np.diag(C))
+    counts = np.clip(np.ceil((high - low) / steps) + 1, 5, _MOST_SIDE).astype(int)
+    u, v = (np.linspace(*ends) for ends in zip(low, high, counts, strict=True))
+    off = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, _PLACE)
+    parabola = float(misfit) / one.excess + np.einsum("mi,ij,mj->m", off, np.linalg.inv(C), off)
+    coarse = _between(wide, off)
+    theta = one.theta + np.where((parabola < coarse[:, 0])[:, None], _along(fisher, off), coarse[:, 1:])
+    values = np.minimum(parabola, coarse[:, 0])
+    worth = np.flatnonzero(values < min(float(values.min()), float(wide[..., 0].min())) + _WORTH)
+    values[worth], _ = _profiled(one, theta[worth], 1)
+    corner = one.corner_px + one.theta[:_PLACE]
+    return LikelihoodMap(u + corner[0], v + corner[1], values.reshape(len(v), len(u)))
+
+
+def _wide(one: SpotLikelihood) -> Array:
+    """Profiled misfit and hypotheses less the best one, shape (s, s, 1 + k), at the places `_SIDE` x `_SIDE`."""
+    off = np.stack(np.meshgrid(_SIDE, _SIDE), axis=-1).reshape(-1, _PLACE)
+    theta = np.repeat(one.theta[None], len(off), axis=0)
+    theta[:, :_PLACE] += off
+    misfit, theta = _profiled(one, theta, 2)
+    return np.column_stack([misfit, theta - one.theta]).reshape(len(_SIDE), len(_SIDE), -1)
+
+
+def _ends(wide: Array, least: float, reach: Array) -> tuple[Array, Array]:
+    """Sides, shape (2,) each, of what is worth a closer look, from the fit's place."""
+    near = wide[..., 0] < min(float(wide[..., 0].min()), least) + MISFIT_RANGE
+    near[len(_SIDE) // 2, len(_SIDE) // 2] = False  # the fit's own place, about which `reach` is enough
+    low, high = -reach, reach.copy()
+    for axis in range(_PLACE):
+        index = np.flatnonzero(near.any(axis=axis))
+        if index.size:
+            low[axis] = min(low[axis], _SIDE[index[0]] - _WIDE_STEP_PX)
+            high[axis] = max(high[axis], _SIDE[index[-1]] + _WIDE_STEP_PX)
+    return low, high
+
+
+def _between(wide: Array, off: Array) -> Array:
+    """Values of the wide map at places from the fit's, shape (m, 1 + k); linear, carried on outside."""
+    at = RegularGridInterpolator((_SIDE, _SIDE), wide, bounds_error=False, fill_value=None)
+    values = np.asarray(at(off[:, ::-1]))
+    values[:, 1 : 1 + _PLACE] = off
+    return values
+
+
+def _along(fisher: Array, off: Array) -> Array:
+    """Change of a hypothesis, shape (m, k), along which flux and levels are at their best near the fit."""
+    slope = -np.linalg.solve(fisher[_PLACE:, _PLACE:], fisher[_PLACE:, :_PLACE])
+    return np.concatenate([off, off @ slope.T], axis=1)
+
+
+def _profiled(one: SpotLikelihood, theta: Array, evaluations: int) -> tuple[Array, Array]:
+    """Misfit, shape (m,), with flux and levels at their best for the places of hypotheses, and these."""
+    parts = [_part_profiled(one, theta[i : i + _AT_ONCE], evaluations) for i in range(0, len(theta), _AT_ONCE)]
+    misfits, thetas = zip(*parts, strict=True)
+    return np.concatenate(misfits), np.concatenate(thetas)
+
+
+def _part_profiled(one: SpotLikelihood, theta: Array, evaluations: int) -> tuple[Array, Array]:
+    rest, theta = slice(_PLACE, None), theta.copy()
+    least = _LEAST_FLUX * one.theta[_PLACE]
+    theta[:, _PLACE] = np.maximum(theta[:, _PLACE], least)
+    misfit = gain = np.zeros(len(theta))
+    for _ in range(evaluations):
+        misfit, score, F = one.scores(theta)
+        step = scoring_step(F[:, rest, rest], score[:, rest])
+        gain = np.sum(step * score[:, rest], axis=1)
+        theta[:, rest] += step
+        theta[:, _PLACE] = np.maximum(theta[:, _PLACE], least)
+    return (misfit - np.maximum(gain, 0.0)) / one.excess, theta
