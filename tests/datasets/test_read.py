@@ -90,9 +90,10 @@ def test_the_ambient_layer_states_its_noise(dataset: Dataset) -> None:
     assert variance.shape == ambient.shape == (3, 180, 320)
     assert variance.dtype == np.float32
     assert np.all(variance >= 0.0)
-    # of the whole image's light: a pixel's noise is 0.1 % to 100 % of it, and that of 320 x 180 pixels averages out
+    # of the whole image's light: a pixel's noise is 0.01 % to 100 % of it, and that of 320 x 180 pixels averages out;
+    # outlines of lamps, which made most of it, are computed
     noise = np.sqrt(variance.sum(dtype=float)) / ambient.sum(dtype=float)
-    assert 1e-3 < noise * np.sqrt(320 * 180) < 1.0
+    assert 1e-4 < noise * np.sqrt(320 * 180) < 1.0
 
 
 def test_a_hidden_spot_has_an_empty_window(dataset: Dataset) -> None:
