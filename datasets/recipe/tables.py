@@ -369,7 +369,7 @@ class FramesTable(Table):
     """`[frames]`: how frames are taken; every number is drawn per sample and is the same in all presets."""
 
     presets: Annotated[tuple[Preset, ...], Field(strict=False, min_length=1)] = Field(
-        default=("bayer-raw",), description="sensor presets; every sample is taken in each"
+        default=("bayer-raw",), description="sensor presets, each for every sample"
     )
     draws: int = Field(default=1, ge=1, le=10_000, description="draws of the noise, per sample and preset")
     exposure_s: Exposure | None = Field(
