@@ -97,6 +97,23 @@ def planes_of(image: NDArray[Any], card: SensorCard | None = None) -> tuple[Plan
     return (_luma(rgb_picture(image, card), card),)
 
 
+def binned(planes: tuple[Plane, ...], block: int) -> tuple[Plane, ...]:
+    """Planes of squares of `block` pixels: means of what is usable there; a pixel's sum has no neighbours then."""
+    return tuple(_binned(plane, block) for plane in planes)
+
+
+def _binned(plane: Plane, block: int) -> Plane:
+    height, width = (size // block for size in plane.values.shape)
+    whole = (slice(height * block), slice(width * block))
+    weight = plane.usable[whole].reshape(height, block, width, block)
+    values = np.where(plane.usable, plane.values, 0.0)[whole].reshape(height, block, width, block)
+    count = weight.sum(axis=(1, 3))
+    shares = [sum(t.weight for t in taps if t.filter_index == i) for taps in plane.taps for i in range(3)]
+    share = np.array(shares, float).reshape(4, 3).mean(axis=0)
+    taps = tuple(Tap(float(one), i) for i, one in enumerate(share) if one)
+    return Plane(values.sum(axis=(1, 3)) / np.maximum(count, 1), count > 0, (taps, taps, taps, taps))
+
+
 def _whole(values: NDArray[Any], taps: Taps) -> Plane:
     values = np.asarray(values, float)
     return Plane(values, np.isfinite(values), (taps, taps, taps, taps))
@@ -118,14 +135,27 @@ def _raw(image: NDArray[Any], card: SensorCard) -> tuple[Plane, ...]:
 
 def _luma(image: NDArray[Any], card: SensorCard) -> Plane:
     """Luma of the linear, white-balanced planes. It is a filter's own light only where the colour matrix is one."""
-    linear = light_of(np.asarray(image, float) / 255.0, card)
-    values = linear @ np.array(JPEG_LUMA)
-    clipped = ndimage.binary_dilation((image >= _CLIPPED).any(axis=-1), iterations=2)
-    level = np.median(linear.reshape(-1, 3), axis=0) * np.array(JPEG_LUMA)
+    weights = np.array(JPEG_LUMA)
+    clipped: BoolArray = np.asarray((image >= _CLIPPED).any(axis=-1))
+    clipped = ndimage.binary_dilation(clipped, iterations=2) if clipped.any() else clipped
+    if image.dtype == np.uint8:  # 256 codes have 256 values: the tone curve of twelve megapixels would take seconds
+        light = light_of(np.arange(256) / 255.0, card)
+        values = np.sum([(light * weights[i])[image[..., i]] for i in range(3)], axis=0)
+        level = np.array([_median_light(light, image[..., i]) for i in range(3)]) * weights
+    else:
+        linear = light_of(np.asarray(image, float) / 255.0, card)
+        values, level = linear @ weights, np.median(linear.reshape(-1, 3), axis=0) * weights
     # shares of the filters in the luma of this picture; three equal ones would be as good, the room is nearly grey
     share = level / level.sum() if level.sum() > 0.0 else np.array(JPEG_LUMA)
     taps = [_merged(_luma_taps(parity, share, card)) for parity in range(4)]
     return Plane(values, ~clipped, (taps[0], taps[1], taps[2], taps[3]))
+
+
+def _median_light(light: Array, codes: NDArray[np.uint8]) -> float:
+    """Median of the light of codes, shape (256,), which rises with the code."""
+    below = np.cumsum(np.bincount(codes.ravel(), minlength=256))
+    middle = np.searchsorted(below, [(codes.size - 1) // 2, codes.size // 2], side="right")
+    return float(light[middle].mean())
 
 
 _CROSS = tuple((0.25, du, dv) for du, dv in ((-1, 0), (1, 0), (0, -1), (0, 1)))

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.calibration.ball_circle import BallCircle, on_limb
 from phibench.estimator.calibration.edge_ring import TURNS
-from phibench.estimator.calibration.limb_image import Measured, Plane, limb_angle_rad, planes_of
+from phibench.estimator.calibration.limb_image import Measured, Plane, binned, limb_angle_rad, planes_of
 from phibench.estimator.calibration.outline_fit import OutlinePixels, Step, band, step_from
 from phibench.estimator.calibration.outline_jpeg import JpegAgain
 from phibench.estimator.calibration.outline_start import (
@@ -57,6 +57,8 @@ _NEAR_M = (3e-5, 3e-5, 1.2e-4)  # about 0.15 px of the outline
 _CHOOSE = 3  # steps that choose their pixels anew
 _STEPS, _REST_M, _REST_SIGMAS, _UNREST_M = 30, 1e-7, 0.05, 1e-6
 _MIN_CONTRAST, _MAX_CONTRAST = 0.5, 1.6
+_BINNED_PX = 1000  # long side from twice which on the light is first fitted in squares of pixels
+_HOPELESS = (6, 0.25, 2.2)  # step at which a fit with a contrast beyond these is given up
 _BLUR_RANGE_PX2 = (0.02, 9.0)
 _LEAST_CONTRAST = 9.0  # of a circle whose light is worth a fit; patterns and noise give up to 8
 _MOST_TRIED = 4  # circles whose light is fitted, which takes seconds where it does not come to rest
@@ -153,11 +155,15 @@ def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) 
     planes = planes_of(image, card)
     _require_size(planes[0].values, rig.camera)
     again = (image, card) if card and card.output == "mjpeg" else None
+    block = max(max(rig.camera.width_px, rig.camera.height_px) // _BINNED_PX, 1)
+    small = (planes, rig) if block == 1 else (binned(planes, block), binned_rig(rig, block))
     low, high = radii_px(rig)
     fault = ImageError("an image without a mirror")
     for start, circle, edge in _clearest(grey(planes), rig):
         try:
-            found = fit_outline(planes, rig, start, again=again)
+            found = fit_outline(*small, start, again=again if block == 1 else None)
+            if block > 1:  # the last refinement alone sees all pixels
+                found = fit_outline(planes, rig, found.sphere_in_camera_m, again=again, near=True)
             require_near(found.rig(rig), circle)
             return found
         except ImageError as error:
@@ -170,6 +176,17 @@ def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) 
     raise ImageError(
         f"{fault}; looked for was an outline with a radius of {low:.0f} to {high:.0f} px, as the rig's focal length, "
         "mirror radius and distance say: check these numbers, too"
+    )
+
+
+def binned_rig(rig: Rig, block: int) -> Rig:
+    """Rig whose pixels are squares of `block` of the camera's."""
+    camera = rig.camera
+    lengths = {name: getattr(camera, name) / block for name in ("fx_px", "fy_px", "blur_sigma_px")}
+    centre = {name: (getattr(camera, name) + 0.5) / block - 0.5 for name in ("cx_px", "cy_px")}
+    size = {name: getattr(camera, name) // block for name in ("width_px", "height_px")}
+    return replace(
+        rig, camera=replace(camera, pixel_pitch_um=camera.pixel_pitch_um * block, **size, **lengths, **centre)
     )
 
 
@@ -252,10 +269,14 @@ def fit_outline(
     start_m: Array,
     half_px: float = HALF_WIDTH_PX,
     again: tuple[NDArray[Any], SensorCard] | None = None,
+    near: bool = False,
 ) -> Outline:
-    """As `find_outline`, from a start within some pixels of the outline; `again` is frame and card of a JPEG frame."""
+    """As `find_outline`, from a start within some pixels of the outline, or `near` it, within some tenths.
+
+    `again` is frame and card of a JPEG frame.
+    """
     s, blur = np.asarray(start_m, float), rig.camera.blur_sigma_px**2
-    s = _approach(planes, rig, s, blur)
+    s = s if near else _approach(planes, rig, s, blur)
     arc = visible_arc(rig, s, half_px)
     if arc < MIN_ARC:
         raise ImageError(
@@ -304,11 +325,13 @@ def _settle(
         step = step_from(pixels, planes, rig, s, blur, SECTORS, half_px, again is not None, near=True)
         # weights that are cut off can take turns for ever: shorter steps end between them
         move = step.move * min(1.0, 6.0 / count)
-        sigma = np.sqrt(np.diag(step.covariance)[:3])
+        sigma = np.sqrt(np.diag(step.covariance)[:3]) if count >= _CHOOSE else np.zeros(3)
         if count >= _CHOOSE and np.all(np.abs(move[:3]) < np.maximum(_REST_M, _REST_SIGMAS * sigma)):
             break
+        if count == _HOPELESS[0] and not _HOPELESS[1] < step.contrast < _HOPELESS[2]:
+            break  # a fit that goes to polished steel is near it by now; others go round for all steps
         s, blur = _moved(s, move[:3], rig), float(np.clip(blur + move[3], *_BLUR_RANGE_PX2))
-    if np.any(np.abs(move[:3]) > np.maximum(_UNREST_M, sigma)):
+    if count > _HOPELESS[0] and np.any(np.abs(move[:3]) > np.maximum(_UNREST_M, sigma)):
         raise ImageError("an image without a mirror: the fit of the outline does not come to rest")
     if not _MIN_CONTRAST < step.contrast < _MAX_CONTRAST:
         raise ImageError(

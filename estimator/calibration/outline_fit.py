@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -80,11 +81,13 @@ def _ring(camera: Camera, s: Array, radius_m: float, half_px: float) -> tuple[ND
     low = np.clip(np.floor(uv.min(axis=0) - half_px).astype(int), 0, None)
     high = np.clip(np.ceil(uv.max(axis=0) + half_px).astype(int) + 1, 0, (camera.width_px, camera.height_px))
     centre = uv.mean(axis=0)
-    v, u = np.mgrid[low[1] : high[1], low[0] : high[0]]
-    off = np.hypot(u - centre[0], v - centre[1])
     own = np.hypot(*(uv - centre).T)
-    rough = np.abs(off - 0.5 * (own.min() + own.max())) < half_px + 0.5 * np.ptp(own) + _RING_MARGIN_PX
-    u, v, off = u[rough], v[rough], off[rough]
+    middle, reach = 0.5 * (own.min() + own.max()), half_px + 0.5 * np.ptp(own) + _RING_MARGIN_PX
+    # squares, and both axes apart: of twelve megapixels every array of the whole box counts
+    square = (np.arange(low[1], high[1])[:, None] - centre[1]) ** 2 + (np.arange(low[0], high[0]) - centre[0]) ** 2
+    v, u = np.nonzero((square > max(middle - reach, 0.0) ** 2) & (square < (middle + reach) ** 2))
+    v, u = v + low[1], u + low[0]
+    off = np.hypot(u - centre[0], v - centre[1])
     azimuth = np.arctan2(uv[:, 1] - centre[1], uv[:, 0] - centre[0])
     order = np.argsort(azimuth)
     there = np.interp(np.arctan2(v - centre[1], u - centre[0]), azimuth[order], own[order], period=2.0 * np.pi)
@@ -241,14 +244,20 @@ class Sectors:
 
     def _spread(self, residual: Array, mean: Array, pixels: NDArray[np.int64]) -> Array:
         """Robust standard deviation of each group; half of the usual relative one at least, so that no sector rules."""
-        order = np.argsort(self.group, kind="stable")
-        parts = np.split(np.abs(residual[order]), np.cumsum(np.bincount(self.group, minlength=self.groups))[:-1])
-        spread = np.array([1.4826 * np.median(part) if part.size else 0.0 for part in parts])
+        spread = 1.4826 * _medians(np.abs(residual), self.group, pixels)
         seen = (pixels >= MIN_PIXELS) & (mean > 0.0)
         if not seen.any():
             return np.ones(self.groups)
         usual = float(np.median(spread[seen] / mean[seen]))
         return np.hypot(spread, np.maximum(0.5 * usual * np.abs(mean), 1e-12 * np.abs(mean).max() + 1e-300))
+
+
+def _medians(values: Array, group: NDArray[np.int64], counts: NDArray[np.int64]) -> Array:
+    """Median of each group, 0 for one without values; one sort of all is ten times faster than a median of each."""
+    rising = values[np.lexsort((values, group))]
+    first = np.cumsum(counts) - counts
+    low, high = (np.clip(first + middle, 0, max(len(rising) - 1, 0)) for middle in ((counts - 1) // 2, counts // 2))
+    return np.where(counts > 0, 0.5 * (rising[low] + rising[high]), 0.0) if len(rising) else np.zeros(len(counts))
 
 
 @dataclass(frozen=True)
@@ -332,25 +341,38 @@ class Step:
     Attributes
     ----------
     move : shape (4,), metres and square pixels
-    covariance : shape (4, 4)
-    contrast, residual : float
+    residual : float
         See `outline.Outline`.
-    sectors_used : int
-    model : shape (N,)
-        Light of the pixels, as fitted.
+    y, model, light, depth : shape (N,)
+        Light of the pixels, as seen, as fitted, and as the limb alone has it; distance from the limb over the band's.
     by_parameters : shape (N, 4)
-        Its derivatives.
+        Derivatives of the model.
     solution : Solution
     """
 
     move: Array
-    covariance: Array
-    contrast: float
     residual: float
-    sectors_used: int
+    y: Array
     model: Array
+    light: Array
+    depth: Array
     by_parameters: Array
     solution: Solution
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance of the step, shape (4, 4)."""
+        return self.solution.covariance(self.y - self.model)
+
+    @cached_property
+    def contrast(self) -> float:
+        """See `outline.Outline`."""
+        return _contrast(self.solution.where, self.y, self.light, self.depth)
+
+    @property
+    def sectors_used(self) -> int:
+        """Sectors with a weight."""
+        return int(np.unique(self.solution.where.sector[self.solution.weight > 0.0]).size)
 
 
 @dataclass(frozen=True)
@@ -452,10 +474,7 @@ def step_from(
     trust = where.described(pixels.y, fit.residual) if near else np.ones(sectors)
     solution = _solution(where, fit, columns, trust)
     move = solution.move(fit.residual)
-    used = int(np.unique(where.sector[solution.weight > 0.0]).size)
-    contrast = _contrast(where, pixels.y, light, d)
-    covariance = solution.covariance(fit.residual)
-    return Step(move, covariance, contrast, fit.relative_residual, used, fit.model, by_parameters, solution)
+    return Step(move, fit.relative_residual, pixels.y, fit.model, light, d, by_parameters, solution)
 
 
 def _solution(where: Sectors, fit: SectorFit, columns: Array, described: Array) -> Solution:

@@ -17,14 +17,25 @@ from phibench.estimator.calibration.from_dataset import DatasetCalibration, Phot
 from phibench.estimator.calibration.outline import Outline, find_outline
 from phibench.estimator.calibration.spots import method_for
 from phibench.estimator.captures.imported_set import ImportedRow, ImportedSet, open_imported
-from phibench.estimator.captures.measure import combined_spots, outlines_as_one, with_blur_of
+from phibench.estimator.captures.measure import (
+    SHAPE,
+    combined_spots,
+    outlines_as_one,
+    seen_images,
+    shape_prior,
+    widened_by_shape,
+    with_blur_of,
+)
+from phibench.estimator.captures.spot_shape import SpotImage, SpotShape, fit_shape
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.rig_parameters import stroke_of
+from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Pair
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.rig import POSITIONS, Rig
 from phibench.scenes.validation import nearest
 
+_NEAR = 0.15  # of D, by which a spot may be off and still be the laser's, for blur and filters
 _FAR_SIGMAS = 4.0  # of D, or of the gap of the rays, from what outline and ruler allow: another light was taken
 
 
@@ -62,11 +73,13 @@ def calibrate_imported(
     rig = with_blur_of(aligned.rig, outlines)
     known: dict[str, KnownSpot] = {}
     left_out: dict[str, str] = {}
+    shape = SpotShape.prior(rig)
     if spots:
+        shape = _shape(imported, rows, rig, aligned, outlines)
         for sample_id in dict.fromkeys(row.sample_id for row in rows):
             try:
                 own = [row for row in rows if row.sample_id == sample_id]
-                spot = _known(imported, own, rig)
+                spot = _known(imported, own, rig, shape)
                 _require_sound(spot, aligned)
                 known[sample_id] = spot
             except DatasetError as error:
@@ -82,6 +95,7 @@ def calibrate_imported(
         "left_out": left_out,
         "preset": imported.preset,
         "spots": bool(known),
+        **({SHAPE: shape.document()} if shape.images else {}),
         "sphere_in_camera_m": [outline.sphere_in_camera_m.tolist() for outline in outlines],
         "sigma_m": [outline.sigma_m.tolist() for outline in outlines],
         "spot_uv_px": [[spot.uv_down_px.tolist(), spot.uv_up_px.tolist()] for spot in known.values()],
@@ -127,9 +141,25 @@ def _outlines(
     return images, outlines, names
 
 
-def _known(imported: ImportedSet, rows: Sequence[ImportedRow], rig: Rig) -> KnownSpot:
+def _shape(
+    imported: ImportedSet, rows: Sequence[ImportedRow], rig: Rig, aligned: Bundle, outlines: Sequence[Outline]
+) -> SpotShape:
+    """Blur and filters of all spots that lie where the tape says: another light has another width and colour."""
+    images: list[SpotImage] = []
+    for row in rows:
+        stroke_m = float(stroke_of(np.array(row.stroke_m), aligned.values))
+        pair = replace(imported.pair(row), rig=rig, stroke_m=stroke_m)
+        seen = seen_images(pair)
+        if len(seen) == len(POSITIONS) and row.depth_m is not None:
+            found_m = float(depth_exact(rig, stroke_m, seen["down"].uv_px, seen["up"].uv_px).depth_m)
+            if abs(found_m / row.depth_m - 1.0) < _NEAR:
+                images.extend(seen.values())
+    return fit_shape(images, shape_prior(rig, outlines))
+
+
+def _known(imported: ImportedSet, rows: Sequence[ImportedRow], rig: Rig, shape: SpotShape) -> KnownSpot:
     """Spot of a sample, of all its frames, at the distance of the tape."""
-    pairs: list[Pair] = [replace(imported.pair(row), rig=rig) for row in rows]
+    pairs: list[Pair] = [replace(imported.pair(row), rig=shape.rig(rig)) for row in rows]
     answers = [method_for(imported.card)(pair) for pair in pairs]
     for answer in answers:
         for position in POSITIONS:
@@ -141,7 +171,8 @@ def _known(imported: ImportedSet, rows: Sequence[ImportedRow], rig: Rig) -> Know
     row = rows[0]
     if row.depth_m is None or row.depth_sigma_m is None:
         raise DatasetError("no measured D")
-    down, up = found["down"], found["up"]
+    images = seen_images(pairs[0])
+    down, up = (widened_by_shape(found[name], images.get(name), shape) for name in POSITIONS)
     return KnownSpot(
         down.uv_px,
         up.uv_px,

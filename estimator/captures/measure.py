@@ -1,8 +1,8 @@
 """Measurement of D from a person's own pictures: spots, outline, rig, depth with its standard deviation, and a test.
 
 The rig is that of the rig file with the corrections of a calibration file. Without one, the mirror's outline in these
-very pictures corrects it, as far as an outline can, and the covariance is that of a rig measured by a ruler. The width
-of the spots is that of the outline's blur, where its light could be fitted.
+very pictures corrects it, as far as an outline can, and the covariance is that of a rig measured by a ruler. Blur and
+filters at the laser's line are those of the calibration's spots, or are fitted to these spots (`spot_shape`).
 
 Several frames of a position: frames of DN are added up, which is one frame of a sensor with as much more of everything
 (`_summed`), so that nothing is lost. Of processed pictures each is measured alone and the positions are combined by
@@ -33,16 +33,27 @@ from phibench.estimator.calibration.outline import Outline, find_outline, mean_m
 from phibench.estimator.calibration.spots import method_for
 from phibench.estimator.captures.picture_files import Photo, SensorChoice, require_one_camera, sensor_choice
 from phibench.estimator.captures.rig_file import MeasuredRig, read_rig_file, require_camera_size
+from phibench.estimator.captures.spot_shape import (
+    OUTLINE_SIGMA_PX,
+    PRIOR_SIGMA,
+    SpotImage,
+    SpotShape,
+    fit_shape,
+    shape_covariance,
+    spot_images,
+)
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas, stroke_of
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.estimator.interface import Answer, Image, Pair
+from phibench.estimator.interface import Answer, Image, Pair, Spot
 from phibench.estimator.spots.detect import FARTHEST_M, NEAREST_M, PairDetection, detect
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig
 
+SHAPE = "spot_shape"
+"""Key of a `SpotShape` in what a calibration was made from."""
 LEAST_STROKE_M, MOST_STROKE_M = 1e-3, 10.0
 DOUBTFUL_P = 1e-3
 """Probability of the two rays' gap below which the two spots are not taken for one point."""
@@ -216,11 +227,15 @@ def measure(photos: PairPhotos, stroke_m: float, setting: Setting) -> Measuremen
     pairs = _pairs(photos, stroke_m, setting.known, chosen.card)
     outlines, missing = _outlines(pairs[0], setting.calibration is not None)
     rig, covariance, values, note = _corrected(setting, outlines, missing)
-    rig = with_blur_of(rig, outlines)
     stroke = float(stroke_of(np.array(stroke_m), values))
-    ready = [replace(pair, rig=rig, stroke_m=stroke) for pair in pairs]
-    spots = combined_spots([_answer(pair, photos) for pair in ready], len(photos.down.off), chosen.card)
-    down, up = spots["down"], spots["up"]
+    seen = [replace(pair, rig=with_blur_of(rig, outlines), stroke_m=stroke) for pair in pairs]
+    images = seen_images(seen[0])
+    shape = _shape(setting, seen, images, outlines)
+    ready = [replace(pair, rig=shape.rig(rig)) for pair in seen]
+    answers = [_answer(pair, photos) for pair in ready]
+    spots = combined_spots(answers, len(photos.down.off), chosen.card)
+    down, up = (widened_by_shape(spots[name], images.get(name), shape) for name in POSITIONS)
+    rig = shape.rig(rig)
     depth = depth_general(
         rig,
         stroke,
@@ -234,7 +249,7 @@ def measure(photos: PairPhotos, stroke_m: float, setting: Setting) -> Measuremen
     if int(depth.status) != Status.OK:
         raise _contradiction(ready[0], photos, describe(int(depth.status)))
     frames = _frames_note(photos, chosen.card)
-    notes = tuple(text for text in (chosen.note, note, _blur_note(rig, outlines), frames, _doubt(depth)) if text)
+    notes = tuple(text for text in (chosen.note, note, _shape_note(shape, setting), frames, _doubt(depth)) if text)
     return Measurement(depth, down, up, rig, stroke, outlines, setting.known.rig, ready[0], chosen, notes)
 
 
@@ -370,12 +385,44 @@ def with_blur_of(rig: Rig, outlines: Sequence[Outline]) -> Rig:
     return replace(rig, camera=replace(rig.camera, blur_sigma_px=float(np.mean(blurs)))) if blurs else rig
 
 
-def _blur_note(rig: Rig, outlines: Sequence[Outline]) -> str:
-    source = "of the outline" if any(math.isfinite(one.blur_px) for one in outlines) else "of the rig file"
-    return f"blur: {rig.camera.blur_sigma_px:.2f} px, {source}"
-
-
 # -- spots -----------------------------------------------------------------------------------------------------------
+
+
+def seen_images(pair: Pair) -> dict[str, SpotImage]:
+    """Pictures of a pair, by position, in which `detect` sees the spot."""
+    found = detect(pair)
+    return spot_images(pair, *(Spot(None if one is None else one.uv_px) for one in (found.down, found.up)))
+
+
+def _shape(
+    setting: Setting, pairs: Sequence[Pair], images: dict[str, SpotImage], outlines: Sequence[Outline]
+) -> SpotShape:
+    """Blur and filters: of the calibration's spots, or of these, about what outline and rig file say."""
+    held = setting.calibration
+    if held is not None and (document := held.made_from.get(SHAPE)) is not None:
+        return SpotShape.of_document(document)
+    all_images = [*images.values(), *(image for pair in pairs[1:] for image in seen_images(pair).values())]
+    return fit_shape(all_images, shape_prior(pairs[0].rig, outlines))
+
+
+def shape_prior(rig: Rig, outlines: Sequence[Outline]) -> SpotShape:
+    """Shape that a rig says, with the blur of outlines in it where their light could be fitted."""
+    by_light = any(math.isfinite(one.blur_px) for one in outlines)
+    return SpotShape.prior(rig, OUTLINE_SIGMA_PX if by_light else PRIOR_SIGMA[0])
+
+
+def widened_by_shape(spot: SeenSpot, image: SpotImage | None, shape: SpotShape) -> SeenSpot:
+    """Spot with what the uncertainty of blur and filters adds to its place."""
+    if image is None:
+        return spot
+    return replace(spot, covariance_px2=spot.covariance_px2 + shape_covariance(image, shape))
+
+
+def _shape_note(shape: SpotShape, setting: Setting) -> str:
+    (blur, green, blue), (blur_sigma, *_) = shape.values, shape.sigmas
+    held = setting.calibration is not None and SHAPE in setting.calibration.made_from
+    source = "of the calibration" if held else "of these spots" if shape.images else "of the rig file"
+    return f"spots: blur {blur:.2f} +- {blur_sigma:.2f} px, filters 1 : {green:.2f} : {blue:.2f}, {source}"
 
 
 def _answer(pair: Pair, photos: PairPhotos) -> Answer:

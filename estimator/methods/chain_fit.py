@@ -26,7 +26,8 @@ from phibench.estimator.spots.fit_chain import (
     undone,
     unrounded,
 )
-from phibench.estimator.spots.fit_raw import SpotFit
+from phibench.estimator.spots.fit_jpeg import Window
+from phibench.estimator.spots.fit_raw import SpotData, SpotFit
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
 from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.estimator.spots.jpeg_coefficients import mcu_px
@@ -163,7 +164,19 @@ def spot_likelihood(
     pair: Pair, image: NDArray[Any], off: NDArray[Any] | None, spot: Spot, depth_m: float | None
 ) -> SpotLikelihood | None:
     """Likelihood of one image about a spot that `chain_fit` has found; None where its outputs say nothing."""
-    uv, card = np.array(spot.uv_px, float), pair.card
+    uv = np.array(spot.uv_px, float)
+    outputs = spot_outputs(pair, image, off, uv, depth_m)
+    return of_codes(outputs, uv) if isinstance(outputs, SpotData) else of_window(*outputs)
+
+
+def spot_outputs(
+    pair: Pair, image: NDArray[Any], off: NDArray[Any] | None, uv: Array, depth_m: float | None
+) -> SpotData | tuple[Window, Array, Array]:
+    """Outputs of one image about a spot at (u, v), with their model: what a fit and a likelihood are made of.
+
+    Codes of their own where the card has such (`own_codes`); else a window, a start and the window's corner.
+    """
+    card = pair.card
     region = (
         _square(uv, image)
         if own_codes(card)
@@ -179,9 +192,9 @@ def spot_likelihood(
     if own_codes(card):
         behind = replace(model, background_e=background.mean_e)
         extra_e2 = float(np.median(background.variance_e2))
-        return of_codes(code_data(on, origin, card, blur, behind, extra_e2=extra_e2), uv)
+        return code_data(on, origin, card, blur, behind, extra_e2=extra_e2)
     size = (image.shape[1], image.shape[0])
-    return of_window(*spot_window(on, origin, uv, card, blur, model, background, size))
+    return spot_window(on, origin, uv, card, blur, model, background, size)
 
 
 def _square(uv: Array, image: NDArray[Any]) -> Box:

@@ -130,7 +130,7 @@ def _raw(pair: Pair, separate: Answer) -> Answer:
     starts = [np.array([spot.uv_px], float) for spot in (separate.down, separate.up)]
     images = ((pair.down, pair.down_off), (pair.up, pair.up_off))
     depth_m = seen_depth_m(pair, separate)
-    down, up = (_region(*image, pair, start[0], depth_m) for image, start in zip(images, starts, strict=True))
+    down, up = (raw_spot_data(*image, pair, start[0], depth_m) for image, start in zip(images, starts, strict=True))
     return _answer(fit_joint(pair.rig, pair.stroke_m, down, up, *starts), separate)
 
 
@@ -177,8 +177,8 @@ def _answer(found: JointFit | CombinedEstimate, separate: Answer) -> Answer:
     )
 
 
-def _region(image: Image, dark: Image | None, pair: Pair, start: Array, depth_m: float | None) -> SpotData:
-    """Square around a start, moved inside the image."""
+def raw_spot_data(image: Image, dark: Image | None, pair: Pair, start: Array, depth_m: float | None) -> SpotData:
+    """Square of raw pixels around a start, moved inside the image, with the model of a spot there."""
     height, width = image.shape
     side = _SIDE_PX[dark is not None]
     u0 = min(max(round(start[0]) - side // 2, 0), max(width - side, 0))

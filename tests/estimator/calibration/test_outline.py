@@ -10,9 +10,10 @@ from helpers.limb_frames import drawn_rig, limb_light
 from scipy import stats
 
 from phibench.datasets.frames.sensor_card import sensor_card
-from phibench.estimator.calibration.limb_image import planes_of
-from phibench.estimator.calibration.outline import find_outline, fit_outline, visible_arc
-from phibench.estimator.calibration.outline_fit import Sectors, scatter
+from phibench.estimator.calibration.limb_image import Plane, Tap, binned, planes_of
+from phibench.estimator.calibration.outline import _approach as approach
+from phibench.estimator.calibration.outline import binned_rig, find_outline, fit_outline, visible_arc
+from phibench.estimator.calibration.outline_fit import Sectors, _medians, scatter
 from phibench.estimator.calibration.outline_start import (
     grey,
     plain_circle,
@@ -94,6 +95,56 @@ def test_frames_within_their_covariance(case, frames, preset: str) -> None:
     assert distance(error + [0.0, 0.0, 2e-4]) > limit
     assert found.sigma_m.max() < 3e-5
     assert found.contrast == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_long_picture_is_fitted_in_squares_first(case, frames, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last refinement sees all pixels: the answer is the same to a fifth of its sigma, where both rest."""
+    rig, card = nominal(case[0]), sensor_card("mjpeg")
+    whole = find_outline(frames["mjpeg"], rig, card)
+    monkeypatch.setattr("phibench.estimator.calibration.outline._BINNED_PX", 640)
+    sizes: list[tuple[int, ...]] = []
+
+    def approached(planes, *arguments):
+        sizes.append(planes[0].values.shape)
+        return approach(planes, *arguments)
+
+    monkeypatch.setattr("phibench.estimator.calibration.outline._approach", approached)
+    found = find_outline(frames["mjpeg"], rig, card)
+    assert sizes == [(360, 640)]
+    assert (np.abs(found.sphere_in_camera_m - whole.sphere_in_camera_m) < 0.2 * whole.sigma_m).all()
+    assert np.allclose(found.sigma_m, whole.sigma_m, rtol=0.1)
+    assert np.allclose((binned_rig(rig, 2).outline_px() + 0.5) * 2.0 - 0.5, rig.outline_px())
+
+
+@pytest.mark.parametrize("block", [2, 3])
+def test_squares_hold_the_mean_of_what_is_usable(block: int) -> None:
+    rng = np.random.default_rng(3)
+    values, usable = rng.random((7, 8)), rng.random((7, 8)) > 0.3
+    plane = Plane(values, usable, (((Tap(0.7, 0, 1, 0), Tap(0.3, 1)),) * 4))
+    small = binned((plane,), block)[0]
+    for v, u in np.ndindex(small.values.shape):
+        square = slice(v * block, (v + 1) * block), slice(u * block, (u + 1) * block)
+        assert small.usable[v, u] == usable[square].any()
+        if small.usable[v, u]:
+            assert small.values[v, u] == pytest.approx(values[square][usable[square]].mean())
+    assert small.taps[0] == (Tap(0.7, 0), Tap(0.3, 1))
+
+
+def test_medians_of_groups_are_numpys() -> None:
+    rng = np.random.default_rng(4)
+    group, values = rng.integers(0, 7, 40), rng.standard_normal(40)
+    group[group == 3] = 2  # one without values
+    found = _medians(values, group, np.bincount(group, minlength=8))
+    expected = [np.median(values[group == k]) if (group == k).any() else 0.0 for k in range(8)]
+    assert np.allclose(found, expected, rtol=1e-12)
+
+
+def test_light_of_codes_is_light_of_numbers(frames) -> None:
+    by_codes = planes_of(frames["mjpeg"], sensor_card("mjpeg"))[0]
+    by_numbers = planes_of(frames["mjpeg"].astype(float), sensor_card("mjpeg"))[0]
+    assert np.allclose(by_codes.values, by_numbers.values, rtol=0.0, atol=1e-14)
+    assert np.array_equal(by_codes.usable, by_numbers.usable)
+    assert by_codes.taps == by_numbers.taps
 
 
 def test_radius_and_distance_scale_together(case) -> None:

@@ -77,7 +77,7 @@ def test_the_command_gives_d_and_a_picture(case: Case, tmp_path: Path, capsys) -
         assert picture.size[0] > 2 * 600
 
 
-def test_the_outline_corrects_the_rig_and_gives_the_blur(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_outline_corrects_the_rig_and_the_spots_say_their_blur(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     setting, true = read_setting(case.folder / "rig.toml"), case.sample.rig
     # a mirror 2 mm further away than in the rig file, seen to 0.05 mm across and 0.1 mm along
     s, C = true.sphere_in_camera_m + np.array([0.0, 0.0, 2e-3]), np.diag([5e-5, 5e-5, 1e-4]) ** 2
@@ -88,7 +88,8 @@ def test_the_outline_corrects_the_rig_and_gives_the_blur(case: Case, monkeypatch
     found = measure(photos, case.sample.row.stroke_m, setting)
     # the outline says |s| / R only: most of it goes into the distance, whose ruler is the worst
     assert 1e-3 < found.rig.sphere_in_camera_m[2] - setting.known.rig.sphere_in_camera_m[2] < 2e-3
-    assert found.rig.camera.blur_sigma_px == 0.9
+    # two bright spots against an outline's 0.90 px: theirs is 0.70 px, to some 0.03 px; 2 sigma
+    assert abs(found.rig.camera.blur_sigma_px - true.camera.blur_sigma_px) < 0.06
     assert any("corrected by the mirror's outline" in note for note in found.notes)
 
 
