@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.oracles import TARGETS
-from helpers.path_windows import two_bakes
+from helpers.path_windows import independent_bake
 
 from phibench.render.room.light_map import BakeSettings
 from phibench.scenes.catalog import lab
@@ -21,7 +21,8 @@ def test_accuracy_of_the_stated_noise_of_a_light_map(final_rays: int) -> None:
     The difference also has what two halves of one bake share: lamps' rays and bounces. The map has some 30 000 texels,
     and smoothing makes about 50 of them alike: 600 independent ones give a variance to 6 %.
     """
-    first, second = two_bakes(lab(TARGETS), BakeSettings(final_rays=final_rays))
+    settings = BakeSettings(final_rays=final_rays)
+    first, second = (independent_bake(lab(TARGETS), settings, number) for number in (0, 1))
     seen = ~first.covered & (first.irradiance_w_m2.min(axis=-1) > 0.0)
     level = 0.5 * (first.irradiance_w_m2 + second.irradiance_w_m2)[seen].astype(float)
     error = (first.irradiance_w_m2 - second.irradiance_w_m2)[seen].astype(float) / np.sqrt(2.0)
