@@ -15,9 +15,10 @@ import numpy as np
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, pair_draws
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
-from phibench.datasets.frames.source import Frames, FrameSource
+from phibench.datasets.frames.source import Frame, Frames, FrameSource
 from phibench.datasets.read import Dataset, Sample
 from phibench.estimator.interface import Box, Image, Pair
+from phibench.estimator.limits.off_frame_bound import FrameCounts
 
 
 class DrawnPairs:
@@ -59,14 +60,14 @@ class DrawnPairs:
         return self.pair_and_frames(number)[0]
 
     def pair_and_frames(self, number: int) -> tuple[Pair, Frames]:
-        """Pair as a method sees it, and the frames behind it, with the camera's JPEG files."""
+        """Pair as a method sees it, and the first frame of each image, with the camera's JPEG file."""
         pair_draw, sample, source = self.drawn_from(number)
         frames = source.frames(pair_draw.noise_draw, laser_off=pair_draw.laser_off)
-        images = {name: _sealed(frame.image) for name, frame in frames.by_name.items()}
+        images = {name: _each(source, pair_draw, frame) for name, frame in frames.by_name.items()}
         box_down, box_up = (None, None) if pair_draw.boxes is None else tuple(map(_box, pair_draw.boxes))
-        pair = Pair(
+        pair = Pair.of_frames(
             number,
-            **images,
+            images,
             rig=sample.nominal_rig,
             stroke_m=sample.row.nominal_stroke_m,
             card=card_of(source.sides["down"].chain.sensor),
@@ -77,7 +78,7 @@ class DrawnPairs:
         return pair, frames
 
     def image(self, number: int, position: str, laser: bool) -> Image:
-        """One image of a pair, alone; the same bytes as in `pair`."""
+        """First frame of one image of a pair, alone; the same bytes as in `pair`."""
         pair_draw, _, source = self.drawn_from(number)
         return source.frame(position, pair_draw.noise_draw, laser).image
 
@@ -101,7 +102,12 @@ class DrawnPairs:
 
 
 def pairs_of(
-    dataset: Dataset, samples: Sequence[Sample], preset: str, draws: int = 1, laser_off: bool = True
+    dataset: Dataset,
+    samples: Sequence[Sample],
+    preset: str,
+    draws: int = 1,
+    laser_off: bool = True,
+    frames: FrameCounts | None = None,
 ) -> DrawnPairs:
     """Pairs of some samples in one preset, in the order of the samples, then of the noise realisations.
 
@@ -114,12 +120,22 @@ def pairs_of(
         Noise realisations of each sample.
     laser_off : bool
         Whether frames with the laser off belong to them, whatever the recipe says.
+    frames : FrameCounts, optional
+        Of each position; one of each by default.
     """
     order = {sample.row.sample_id: place for place, sample in enumerate(samples)}
     few = replace(dataset, rows=tuple(sample.row for sample in samples))
     chosen = sorted(pair_draws(few, preset, draws), key=lambda pair_draw: (order[pair_draw.sample_id], pair_draw.draw))
-    numbered = (replace(pair_draw, number=number, laser_off=laser_off) for number, pair_draw in enumerate(chosen))
+    counts = (1, 1) if frames is None else (frames.on, frames.off)
+    numbered = (replace(one, number=k, laser_off=laser_off, frames=counts) for k, one in enumerate(chosen))
     return DrawnPairs(few, tuple(numbered))
+
+
+def _each(source: FrameSource, pair_draw: PairDraw, first: Frame) -> list[Image]:
+    """Frames of one image."""
+    others = pair_draw.frame_draws(first.laser)[1:]
+    images = [first.image, *(source.frame(first.position, draw, first.laser).image for draw in others)]
+    return [_sealed(image) for image in images]
 
 
 def _sealed(image: Image) -> Image:

@@ -4,17 +4,19 @@
 >>> def extract(pair: Pair) -> Answer:
 ...     return Answer(Spot((640.0, 120.0)), Spot.missing("not looked for"))
 
-Nothing of the truth is in a pair. Pixels: integer (u, v) are pixel centres of the whole image, u to the right, v
-downwards, so that the image spans [-0.5, W - 0.5].
+Nothing of the truth is in a pair. Where a pair has several frames of an image, the image is their mean: a method for
+one frame works unchanged, and one that knows better finds the single frames in `Pair.stack`. Pixels: integer (u, v) are
+pixel centres of the whole image, u to the right, v downwards, so that the image spans [-0.5, W - 0.5].
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.frames.sensor_card import SensorCard
@@ -55,6 +57,9 @@ class Pair:
         "yuyv" (H, W, 2) uint8, the camera's bytes: Y', and in turns Cb (even columns) and Cr (`camera_codes`).
     down_off, up_off : array or None
         The same with the laser off, from another exposure.
+    frames : mapping of image name to array, or None
+        Where images are of several frames: the single ones, shape (n, H, W, ...), as the camera delivers them,
+        read-only. The images above are then their means, float32, in the same unit.
     rig : Rig
         Nominal camera, mirror and stroke axis, at the down position.
     stroke_m : float
@@ -82,12 +87,38 @@ class Pair:
     box_up: Box | None = None
     calibration_covariance: NDArray[Any] | None = field(default=None, repr=False)
     beam: Beam | None = None
+    frames: Mapping[str, Image] | None = field(default=None, repr=False)
+
+    @classmethod
+    def of_frames(cls, number: int, frames: Mapping[str, Sequence[Image]], **others: Any) -> Pair:
+        """Pair of the frames of each image; of one frame each, images are these very frames."""
+        if all(len(group) == 1 for group in frames.values()):
+            single: dict[str, Any] = {name: group[0] for name, group in frames.items()}
+            return cls(number, **single, **others)
+        stacks = {name: _read_only(np.stack(group)) for name, group in frames.items()}
+        means: dict[str, Any] = {
+            name: _read_only(stack.mean(axis=0, dtype=np.float32)) for name, stack in stacks.items()
+        }
+        return cls(number, **means, **others, frames=MappingProxyType(stacks))
+
+    def stack(self, name: str) -> Image:
+        """Frames of an image that is there, shape (n, H, W, ...)."""
+        return np.asarray(self.images[name])[None] if self.frames is None else self.frames[name]
+
+    def count(self, name: str) -> int:
+        """Number of frames of an image; 0 where it is not there."""
+        return len(self.stack(name)) if name in self.images else 0
 
     @property
     def images(self) -> Mapping[str, Image]:
         """Images by name, those that are there: "down", "up", "down_off", "up_off"."""
         named = {name: getattr(self, name) for name in ("down", "up", "down_off", "up_off")}
         return MappingProxyType({name: image for name, image in named.items() if image is not None})
+
+
+def _read_only(image: Image) -> Image:
+    image.flags.writeable = False
+    return image
 
 
 @dataclass(frozen=True)
@@ -128,12 +159,16 @@ class Answer:
     down, up : Spot
     depth_m, sigma_depth_m : float or None
         The standard deviation is that of the pixels' noise: what a calibration adds, the score adds.
+    interval_depth_m : (low, high) or None
+        Between which D lies with 95 %, 2.5 % on either side, where that is not D -+ 1.96 sigma; likewise of the
+        pixels' noise.
     """
 
     down: Spot
     up: Spot
     depth_m: float | None = None
     sigma_depth_m: float | None = None
+    interval_depth_m: tuple[float, float] | None = None
 
 
 Method = Callable[[Pair], Answer]

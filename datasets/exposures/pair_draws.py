@@ -36,6 +36,7 @@ BOX_MARGIN_PX = 4
 PRESETS = ("mono-raw", "bayer-raw", "srgb8", "mjpeg")
 """Presets of the first version: the numbers of their draws stay, and with them every byte of their frames."""
 _LATER = {"yuyv": 2**32}  # first draw of a later preset
+_FRAMES = 2**40  # draws between the frames of one image: more than any data set has
 _CAMERAS = 2**31
 _STREAM, _ORDER_STREAM = "take", "takes"  # names of random streams: another name would draw other numbers
 
@@ -59,6 +60,8 @@ class PairDraw:
         Region hints; both or none.
     distractors : tuple of int
         Tables of the recipe's `[[distractors]]` that the sample was drawn to have.
+    frames : (on, off)
+        Frames of each position with the laser on, and with it off where they belong to it.
     """
 
     number: int
@@ -69,6 +72,7 @@ class PairDraw:
     laser_off: bool
     boxes: tuple[Region, Region] | None
     distractors: tuple[int, ...]
+    frames: tuple[int, int] = (1, 1)
 
     @property
     def noise_draw(self) -> int:
@@ -76,6 +80,10 @@ class PairDraw:
         if self.preset in _LATER:
             return _LATER[self.preset] + self.draw
         return self.draw * len(PRESETS) + PRESETS.index(self.preset)
+
+    def frame_draws(self, laser: bool) -> tuple[int, ...]:
+        """Draws of the single frames of an image; the first is `noise_draw`."""
+        return tuple(self.noise_draw + k * _FRAMES for k in range(self.frames[0 if laser else 1]))
 
 
 def pair_draws(

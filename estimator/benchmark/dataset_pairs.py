@@ -84,8 +84,8 @@ class DatasetPairs(DrawnPairs):
             stroke_m=sample.row.stroke_m,
             true_rig=sample.rig,
             nominal_rig=sample.nominal_rig,
-            down=_spot_truth(sample, source, "down"),
-            up=_spot_truth(sample, source, "up"),
+            down=_spot_truth(sample, source, "down", _counts(pair_draw)),
+            up=_spot_truth(sample, source, "up", _counts(pair_draw)),
             nominal_stroke_m=sample.row.nominal_stroke_m,
         )
 
@@ -116,6 +116,7 @@ def dataset_pairs(
     hints: bool = True,
     boxes_px: int | None = None,
     sensor: SensorFile | None = None,
+    frames: FrameCounts | None = None,
 ) -> DatasetPairs:
     """Pairs of a data set in random order.
 
@@ -134,6 +135,9 @@ def dataset_pairs(
         Side of a box for every pair, instead of those of the recipe's `[frames]`.
     sensor : SensorFile, optional
         Numbers of a measured camera, which go before the recipe's and the preset's.
+    frames : FrameCounts, optional
+        Frames of each position with the laser on and off, in place of one and the recipe's; bounds are then those of
+        `off_frame_bound`.
 
     Raises
     ------
@@ -143,6 +147,8 @@ def dataset_pairs(
     chosen = pair_draws(dataset, preset, draws, sensor)
     if pairs is not None and pairs < 1:
         raise DatasetError(f"pairs = {pairs}: must be 1 or above")
+    if frames is not None:
+        chosen = tuple(replace(draw, laser_off=True, frames=(frames.on, frames.off)) for draw in chosen)
     if boxes_px is not None:
         chosen = _with_boxes(dataset, chosen, boxes_px, hints)
     elif not hints:
@@ -159,11 +165,18 @@ def _with_boxes(dataset: Dataset, chosen: tuple[PairDraw, ...], side_px: int, hi
     return tuple(replace(draw, boxes=boxes[draw.sample_id]) for draw in chosen)
 
 
-def _spot_truth(sample: CachedSample, source: FrameSource, position: str) -> SpotTruth:
+def _counts(pair_draw: PairDraw) -> FrameCounts | None:
+    """Frames that the bound counts; None for a single frame with the laser on."""
+    return FrameCounts(*pair_draw.frames) if pair_draw.laser_off and pair_draw.frames != (1, 1) else None
+
+
+def _spot_truth(sample: CachedSample, source: FrameSource, position: str, frames: FrameCounts | None) -> SpotTruth:
     row, side = sample.row.position(position), source.sides[position]
     uv_px = (row.u_px, row.v_px)
     beam, depth_m = Beam(sample.row.spot_diameter_m, 0.0), sample.row.depth_m
-    bounds = spot_bounds(side, sample.rig, uv_px, row.electrons_per_s, row.visible, beam=beam, depth_m=depth_m)
+    bounds = spot_bounds(
+        side, sample.rig, uv_px, row.electrons_per_s, row.visible, depth_m=depth_m, beam=beam, frames=frames
+    )
     return SpotTruth(
         uv_px=uv_px,
         phi_rad={"ray": row.phi_ray_rad, "normal": row.phi_normal_rad, "incidence": row.phi_incidence_rad},

@@ -35,6 +35,8 @@ from phibench.estimator.pair_set import PairSet, PairTruth, SpotTruth
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig
 
+WITHIN = 1.959963984540054
+"""Standard deviations of a normal error that hold 95 %."""
 _NO_MATRIX = np.full((2, 2), np.nan)
 _BAYER = {(0, 0): "red", (1, 0): "green in red row", (0, 1): "green in blue row", (1, 1): "blue"}
 
@@ -93,6 +95,7 @@ COLUMNS: dict[str, str] = {
     "depth_relative": "depth_error_m / depth_m",
     "depth_sigma_m": "claimed: the method's with its own depth, else from its covariances; with a calibration's part",
     "depth_pull": "depth_error_m / depth_sigma_m; of real pairs the tape's standard deviation is added",
+    "depth_within": "D in the claimed 95 % interval: the method's own, widened as its sigma is, else |pull| <= 1.96",
     "bound_depth_m2": "variance of D at the bounds of both spots, each by itself; without calibration",
     "pair_bound_depth_m2": "the same of both images together",
     "possible_position_chi2": "errors of the pair's positions over what is possible, squared; 3 degrees of freedom",
@@ -117,7 +120,7 @@ _TEXTS = (
 )
 _TRUTH_VALUES = (
     *("hinted", "saturated", "visible", "detected", "missed"),
-    *("false_detection", "pair_visible", "pair_false", "depth_found"),
+    *("false_detection", "pair_visible", "pair_false", "depth_found", "depth_within"),
 )
 _TYPES = {
     **dict.fromkeys(_WHOLE, pl.Int64()),
@@ -344,6 +347,9 @@ def _pair_columns(
     has_own = np.isfinite(own)
     own_sigma = np.hypot(own_sigma, found_m.calibration_sigma_m)
     depth, sigma = np.where(has_own, own, found_m.depth_m), np.where(has_own, own_sigma, found_m.sigma_m)
+    pull = (depth - true_m) / np.where(sigma > 0.0, np.hypot(sigma, true_sigma_m), np.nan)
+    intervals = np.array([_own_interval(o.answer) for o in outcomes])
+    within = _within(depth, true_m, pull, intervals, np.hypot(found_m.calibration_sigma_m, true_sigma_m))
     both = down["visible"] & up["visible"]
     false = down["false_detection"] | up["false_detection"] | (has_own & ~both)
     found = down["detected"] & up["detected"] & (depth > 0.0)  # False for NaN
@@ -365,7 +371,8 @@ def _pair_columns(
         "depth_error_m": depth - true_m,
         "depth_relative": depth / true_m - 1.0,
         "depth_sigma_m": sigma,
-        "depth_pull": (depth - true_m) / np.where(sigma > 0.0, np.hypot(sigma, true_sigma_m), np.nan),
+        "depth_pull": pull,
+        "depth_within": within,
         "bound_depth_m2": depth_exact(nominal, nominal_h, *truth, *bounds).sigma_m ** 2,
         "seconds": [float(o.seconds) for o in outcomes],
         "failure": [o.failure for o in outcomes],
@@ -404,6 +411,20 @@ def _own_phi(spot: Spot | None) -> float:
 def _own_depth(answer: Answer | None, name: str) -> float:
     value = None if answer is None else getattr(answer, name)
     return math.nan if value is None else float(value)
+
+
+def _own_interval(answer: Answer | None) -> tuple[float, float]:
+    interval = None if answer is None or answer.depth_m is None else answer.interval_depth_m
+    return (math.nan, math.nan) if interval is None else interval
+
+
+def _within(depth: Array, true_m: Array, pull: Array, intervals: Array, added_m: Array) -> list[bool | None]:
+    """Whether D lies in the claimed interval, None where none is claimed; `added_m` are errors that it leaves out."""
+    more = WITHIN * np.nan_to_num(added_m)
+    low, high = depth - np.hypot(depth - intervals[:, 0], more), depth + np.hypot(intervals[:, 1] - depth, more)
+    inside = np.where(np.isfinite(low), (low <= true_m) & (true_m <= high), np.abs(pull) <= WITHIN)
+    known = np.isfinite(true_m) & (np.isfinite(low) | np.isfinite(pull))
+    return [bool(x) if there else None for x, there in zip(inside, known, strict=True)]
 
 
 def _depth_from(own: bool, there: bool) -> str | None:

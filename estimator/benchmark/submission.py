@@ -228,6 +228,7 @@ class AnswerLine(Document):
     up: SpotLine | None
     depth_m: Number | None
     sigma_depth_m: Number | None
+    interval_depth_m: Vector2 | None = None
     seconds: Number
     failure: Name
     message: Text
@@ -361,6 +362,7 @@ def _line(outcome: Outcome) -> AnswerLine:
         up=None if answer is None else _spot_line(answer.up),
         depth_m=None if answer is None else _finite(answer.depth_m),
         sigma_depth_m=None if answer is None else _finite(answer.sigma_depth_m),
+        interval_depth_m=None if answer is None else answer.interval_depth_m,
         seconds=math.nan if _finite(outcome.seconds) is None else float(outcome.seconds),
         failure=outcome.failure,
         message=_without_folders(outcome.message),

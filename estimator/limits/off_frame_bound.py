@@ -41,16 +41,17 @@ from phibench.estimator.spots.chain_model import (
     raw_variance_e2,
 )
 from phibench.estimator.spots.fisher import covariance_bound, fisher_matrix
-from phibench.estimator.spots.fit_chain import unrounded
+from phibench.estimator.spots.fit_chain import own_codes, unrounded
+from phibench.estimator.spots.fit_jpeg import grid_px
 from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel, SpotPixels
-from phibench.estimator.spots.jpeg_coefficients import mcu_px, quantised
+from phibench.estimator.spots.image_planes import PROCESSED
+from phibench.estimator.spots.jpeg_coefficients import hidden_share, quantised
 from phibench.estimator.spots.pixel_statistics import code_law, code_table, cut_pixels
 from phibench.estimator.spots.raw_pixels import bayer_filters
 from phibench.scenes.frames import Array
 
-_REACH_PX = 10  # around the spot, for "srgb8"
+_REACH_PX = 10  # around the spot, for codes of their own
 _LIVE = 2e-3  # variance of an output, in steps squared, below which its coefficient says nothing
-_TERMS = 60  # of the sum over k: 1 % are left out without noise, nothing from a tenth of a step on
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ def processed_on_off_limit(
     Parameters
     ----------
     card : SensorCard
-        Of the output "srgb8" or "mjpeg".
+        Of the output "srgb8", "yuyv" or "mjpeg".
     frames : FrameCounts
     uv_px, blur, flux_e, background_e, response, pattern_known
         As for `processed_bound.chain_limit`; `background_e` says how bright the room is, a method does not know it.
@@ -129,15 +130,15 @@ def processed_on_off_limit(
     Raises
     ------
     ValueError
-        If the output is neither of the two.
+        If the output is none of the three.
     """
     theta = np.array([*np.asarray(uv_px, float), flux_e, *np.asarray(background_e, float)])
     prnu = 0.0 if pattern_known else card.prnu
-    if card.output == "srgb8":
+    if own_codes(card):
         return _of_codes(card, theta, blur, response, frames, prnu)
-    if card.output == "mjpeg":
-        return _of_coefficients(card, theta, blur, response, frames, prnu, steps)
-    raise ValueError(f"output '{card.output}': 'srgb8' and 'mjpeg' are known; take on_off_limit for raw pixels")
+    if card.output in PROCESSED:
+        return _of_window(card, theta, blur, response, frames, prnu, steps)
+    raise ValueError(f"output '{card.output}': 'srgb8', 'yuyv' and 'mjpeg' are known; take on_off_limit for raw pixels")
 
 
 def _of_codes(
@@ -159,12 +160,12 @@ def _of_codes(
     return SpotLimit(covariance_bound(fisher), fisher)
 
 
-# -- coefficients of a JPEG ------------------------------------------------------------------------------------------
+# -- windows of codes, or of a JPEG's coefficients ---------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class _Readings:
-    """Coefficients of one frame at its means: codes, factor of the noise from raw pixels, and the rest of it.
+    """Outputs of one frame at its means: codes, factor of the noise from raw pixels, and the rest of it.
 
     Attributes
     ----------
@@ -188,7 +189,7 @@ class _Readings:
 
 
 def _readings(model: ChainModel, mean_e: Array) -> _Readings:
-    """Coefficients for means of the raw pixels, shape (r,)."""
+    """Outputs for means of the raw pixels, shape (r,)."""
     cut = cut_pixels(mean_e, raw_variance_e2(model, mean_e), model.card.saturation_e)
     at = codes(model, cut.mean_e)
     factor = noise_factor(model, at, cut.variance_e2, model.transform)
@@ -196,7 +197,7 @@ def _readings(model: ChainModel, mean_e: Array) -> _Readings:
     return _Readings(at, cut.slope, factor, rest, at.mean @ model.transform + model.shift)
 
 
-def _of_coefficients(
+def _of_window(
     card: SensorCard,
     theta: Array,
     blur: SpotBlur,
@@ -206,9 +207,8 @@ def _of_coefficients(
     steps: bool,
 ) -> SpotLimit:
     model = chain_model(card, unrounded(card, True))
-    down, across = mcu_px(card.jpeg_subsampling)
-    units = np.array([across, down])
-    corner = (np.rint((theta[:2] + 0.5) / units) - 1.0) * units - model.margin
+    units, sides = np.array(grid_px(card)[::-1]), np.array(model.shape[::-1])
+    corner = np.rint((theta[:2] + 0.5 - sides / 2) / units) * units - model.margin
     pixels = SpotPixels.of(model.filters[None], blur, SpotModel(response))
     mean, derivatives = pixels.at((theta - np.array([*corner, 0, 0, 0, 0]))[None])
     D = derivatives[0, :3].reshape(3, -1)
@@ -231,12 +231,4 @@ def _of_coefficients(
 
 def _hidden(off: _Readings, step: Array, count: int) -> Array:
     """Variance of the room's coefficients by the quantiser in a mean of off frames, shape (n,)."""
-    rho = step_correlation(off.sigma / step)
-    return np.asarray(step**2 / 12.0 * (rho + (1.0 - rho) / count))
-
-
-def step_correlation(sigma: Array) -> Array:
-    """Correlation between frames of a quantiser's error, shape of `sigma`, the noise in steps."""
-    k = np.arange(1, _TERMS + 1)
-    terms = np.exp(-4.0 * np.pi**2 * k**2 * np.asarray(sigma)[..., None] ** 2) / k**2
-    return np.asarray(6.0 / np.pi**2 * terms.sum(axis=-1))
+    return np.asarray(step**2 / 12.0 * hidden_share(off.sigma / step, count))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Box, Pair, Spot
-from phibench.estimator.methods.likelihood_maps import SpotLikelihood, of_codes, of_window
+from phibench.estimator.methods.likelihood_maps import SpotLikelihood, of_pixels, of_window
 from phibench.estimator.methods.locate import around as box_at
 from phibench.estimator.methods.locate import box_around, measured_twice, pair_blur, seen_depth_m
 from phibench.estimator.spots.detect import Detection, detect
@@ -23,7 +23,7 @@ from phibench.estimator.spots.fit_chain import (
     fit_yuyv,
     own_codes,
     spot_window,
-    undone,
+    undone_mean,
     unrounded,
 )
 from phibench.estimator.spots.fit_jpeg import Window
@@ -31,7 +31,7 @@ from phibench.estimator.spots.fit_raw import SpotData, SpotFit
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
 from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.estimator.spots.jpeg_coefficients import mcu_px
-from phibench.estimator.spots.raw_pixels import Background, around, background_of
+from phibench.estimator.spots.raw_pixels import Background, PatternNoise, around, background_of
 from phibench.scenes.frames import Array
 
 _HALF_PX = 8
@@ -54,8 +54,8 @@ def chain_fit(pair: Pair) -> Answer:
 
     def measure(depth_m: float | None) -> Answer:
         return Answer(
-            _spot_or_place(pair, pair.down, pair.down_off, found.down, pair.box_down, depth_m),
-            _spot_or_place(pair, pair.up, pair.up_off, found.up, pair.box_up, depth_m),
+            _spot_or_place(pair, "down", found.down, pair.box_down, depth_m),
+            _spot_or_place(pair, "up", found.up, pair.box_up, depth_m),
         )
 
     depth_m = None
@@ -64,40 +64,31 @@ def chain_fit(pair: Pair) -> Answer:
     return measured_twice(measure, pair) if depth_m is None else measure(depth_m)
 
 
-def _spot_or_place(
-    pair: Pair,
-    image: NDArray[Any],
-    off: NDArray[Any] | None,
-    found: Detection | None,
-    hint: Box | None,
-    depth_m: float | None,
-) -> Spot:
+def _spot_or_place(pair: Pair, position: str, found: Detection | None, hint: Box | None, depth_m: float | None) -> Spot:
     """Fit; or, of a spot that was seen but gives no fit, the place of the matched filter, without covariance."""
-    spot = _spot(pair, image, off, box_around(found, image) or hint, depth_m)
+    spot = _spot(pair, position, box_around(found, pair.images[position]) or hint, depth_m)
     return Spot(found.uv_px) if spot.uv_px is None and found is not None else spot
 
 
-def _spot(pair: Pair, image: NDArray[Any], off: NDArray[Any] | None, box: Box | None, depth_m: float | None) -> Spot:
+def _spot(pair: Pair, position: str, box: Box | None, depth_m: float | None) -> Spot:
     if box is None:
         return Spot.missing("no spot found")
-    region = _region(box, pair.card, image.shape)
+    shape = pair.images[position].shape
+    region = _region(box, pair.card, shape)
     origin = np.array([[region.u0_px, region.v0_px]])
-    on = image[region.slices][None]
-    background = None
-    if off is not None:
-        dark = off[region.slices][None]
-        background = replace(_background(dark, None, origin, pair.card), image=dark)
+    on, dark = _parts(pair, position, region)
+    background = None if dark is None else _background(dark, None, origin, pair.card)
     lens, model = SpotBlur(pair.rig.camera.blur_sigma_px), SpotModel(_response(pair))
     start = first_fit(on, origin, pair.card, lens, model.response, background)[0, :2] + origin[0]
     blur = pair_blur(pair, start, depth_m)
     if pair.card.output == "srgb8":
-        return _answer(_srgb(image, off, start, pair.card, blur, model))
+        return _answer(_srgb(pair, position, start, blur, model))
     if background is None:
         known = around(start[None], origin, (region.height_px, region.width_px))
         background = _background(on, known, origin, pair.card)
     if pair.card.output == "yuyv":
         return _answer(fit_yuyv(on, origin, pair.card, blur, model, background))
-    size = (image.shape[1], image.shape[0])
+    size = (shape[1], shape[0])
     return _answer(fit_jpeg(on, origin, pair.card, blur, model, background, size_px=size))
 
 
@@ -113,36 +104,47 @@ def _grown(first: int, last: int, unit: int, size: int) -> tuple[int, int]:
     return max((first // unit - 1) * unit, 0), min((-(-last // unit) + 1) * unit, size // unit * unit)
 
 
-def _srgb(
-    image: NDArray[Any],
-    off: NDArray[Any] | None,
-    start: Array,
-    card: SensorCard,
-    blur: SpotBlur,
-    model: SpotModel,
-) -> SpotFit:
-    """Fit a square of 17 x 17 pixels about the start."""
-    square = _square(start, image)
-    origin = np.array([[square.u0_px, square.v0_px]])
-    on = image[square.slices][None]
+def _parts(pair: Pair, position: str, box: Box) -> tuple[NDArray[Any], NDArray[Any] | None]:
+    """Part of all frames of an image, shape (1, f, h, w, c), and of those with the laser off."""
+    off = f"{position}_off"
+    rows, columns = box.slices
+    on, dark = (pair.stack(name)[None, :, rows, columns] if pair.count(name) else None for name in (position, off))
+    assert on is not None, "a pair has both positions"
+    return on, dark
 
-    if off is None:
+
+def _srgb(pair: Pair, position: str, start: Array, blur: SpotBlur, model: SpotModel) -> SpotFit:
+    """Fit a square of 17 x 17 pixels about the start."""
+    card, square = pair.card, _square(start, pair.images[position])
+    origin = np.array([[square.u0_px, square.v0_px]])
+    on, dark = _parts(pair, position, square)
+    own = own_codes(card) and on.shape[1] == 1
+
+    if dark is None:
         flat = fit_srgb(on, origin, card, blur, model)
         if flat.chi2[0] < _FLAT_CHI2:
             return flat
         known = around(start[None], origin, (2 * _HALF_PX + 1, 2 * _HALF_PX + 1))
-        background = _background(on, known, origin, card)
+        background = _background(on, known, origin, card, own)
     else:
-        background = _background(off[square.slices][None], None, origin, card)
-    behind = replace(model, background_e=background.mean_e)
-    return fit_srgb(on, origin, card, blur, behind, extra_e2=float(np.median(background.variance_e2)))
+        background = _background(dark, None, origin, card, own)
+    behind, extra_e2 = replace(model, background_e=background.mean_e), float(np.median(background.variance_e2))
+    return fit_srgb(on, origin, card, blur, behind, extra_e2=extra_e2, background=background)
 
 
-def _background(image: NDArray[Any], known: Array | None, origin: NDArray[np.int64], card: SensorCard) -> Background:
-    """Room in a region: of the laser-off frame, or of what is `known` of the laser-on frame."""
-    x, rounding = undone(image, origin, card)
-    variance = unrounded(card).variance_e2(x) + 1.0 / (12.0 * card.dn_per_e**2) + rounding
-    return background_of(x, variance, np.ones(x.shape) if known is None else known)
+def _background(
+    frames: NDArray[Any], known: Array | None, origin: NDArray[np.int64], card: SensorCard, own: bool = False
+) -> Background:
+    """Room in a region, of frames (1, f, h, w, c) with the laser off, or of what is `known` of those with it on.
+
+    For the law of a single frame's `own` codes, which counts the pattern of all its light itself.
+    """
+    x, rounding = undone_mean(frames, origin, card)
+    variance = unrounded(card, not own).variance_e2(x) + 1.0 / (12.0 * card.dn_per_e**2)
+    everywhere = np.ones(x.shape) if known is None else known
+    pattern = None if own else PatternNoise.of(card)
+    found = background_of(x, variance / frames.shape[1] + rounding, everywhere, pattern)
+    return replace(found, image=frames) if known is None else found
 
 
 def _response(pair: Pair) -> tuple[float, float, float]:
@@ -160,39 +162,33 @@ def _answer(fit: SpotFit) -> Spot:
     return Spot((u, v), ((float(c[0, 0]), float(c[0, 1])), (float(c[1, 0]), float(c[1, 1]))))
 
 
-def spot_likelihood(
-    pair: Pair, image: NDArray[Any], off: NDArray[Any] | None, spot: Spot, depth_m: float | None
-) -> SpotLikelihood | None:
+def spot_likelihood(pair: Pair, position: str, spot: Spot, depth_m: float | None) -> SpotLikelihood | None:
     """Likelihood of one image about a spot that `chain_fit` has found; None where its outputs say nothing."""
     uv = np.array(spot.uv_px, float)
-    outputs = spot_outputs(pair, image, off, uv, depth_m)
-    return of_codes(outputs, uv) if isinstance(outputs, SpotData) else of_window(*outputs)
+    outputs = spot_outputs(pair, position, uv, depth_m)
+    return of_pixels(outputs, uv) if isinstance(outputs, SpotData) else of_window(*outputs)
 
 
 def spot_outputs(
-    pair: Pair, image: NDArray[Any], off: NDArray[Any] | None, uv: Array, depth_m: float | None
+    pair: Pair, position: str, uv: Array, depth_m: float | None
 ) -> SpotData | tuple[Window, Array, Array]:
     """Outputs of one image about a spot at (u, v), with their model: what a fit and a likelihood are made of.
 
-    Codes of their own where the card has such (`own_codes`); else a window, a start and the window's corner.
+    Codes of their own where a single frame has such (`own_codes`); else a window, a start and the window's corner.
     """
-    card = pair.card
-    region = (
-        _square(uv, image)
-        if own_codes(card)
-        else _region(box_at((uv[0], uv[1]), image.shape, _AROUND_PX), card, image.shape)
-    )
-    origin, on = np.array([[region.u0_px, region.v0_px]]), image[region.slices][None]
-    if off is None:
-        background = _background(on, around(uv[None], origin, on.shape[1:3]), origin, card)
+    card, image = pair.card, pair.images[position]
+    own = own_codes(card) and pair.count(position) == 1
+    region = _square(uv, image) if own else _region(box_at((uv[0], uv[1]), image.shape, _AROUND_PX), card, image.shape)
+    origin, (on, dark) = np.array([[region.u0_px, region.v0_px]]), _parts(pair, position, region)
+    if dark is None:
+        background = _background(on, around(uv[None], origin, on.shape[2:4]), origin, card, own)
     else:
-        dark = off[region.slices][None]
-        background = replace(_background(dark, None, origin, card), image=dark)
+        background = _background(dark, None, origin, card, own)
     blur, model = pair_blur(pair, uv, depth_m), SpotModel(_response(pair))
-    if own_codes(card):
+    if own:
         behind = replace(model, background_e=background.mean_e)
         extra_e2 = float(np.median(background.variance_e2))
-        return code_data(on, origin, card, blur, behind, extra_e2=extra_e2)
+        return code_data(on[:, 0], origin, card, blur, behind, extra_e2=extra_e2)
     size = (image.shape[1], image.shape[0])
     return spot_window(on, origin, uv, card, blur, model, background, size)
 

@@ -1,7 +1,7 @@
 """Likelihood maps of the spots of processed images: misfit over (u, v), flux and levels profiled out.
 
-The quasi-likelihood is that of `chain_fit`: r^T C^-1 r of a JPEG's coefficients with C kept from the fit, or the exact
-law of each pixel's own code. At each place flux and levels come from one step of Gauss-Newton, and what a second would
+The quasi-likelihood is that of `chain_fit`: r^T C^-1 r of a JPEG's coefficients with C kept from the fit, or the law
+of each raw pixel or own code. At each place flux and levels come from one step of Gauss-Newton, and what a second would
 gain is taken off: both are nearly linear once the place is given.
 """
 
@@ -25,6 +25,9 @@ _WIDE_STEP_PX = 0.25
 _SIGMAS = 4.5
 _STEP_SIGMAS = 0.6  # of the second map: cubic splines between are within 1 % of a unit of misfit
 _MOST_SIDE = 41
+# least variance of a coefficient that counts, in steps squared: one that changes in fewer than 2 % of the frames says
+# next to nothing, and when it changes a Gaussian's square is 50 and more, far beyond the logarithm of its chance
+_LIVE = 0.02
 _OUTLIER = 3.0  # of a residual in standard deviations
 _STEPS = 12  # of the scoring from a place that a fit has found
 _WORTH = 1.5 * MISFIT_RANGE  # of a first guess of the misfit, above the least
@@ -59,7 +62,7 @@ class SpotLikelihood:
 def of_window(window: Window, start: Array, corner_px: Array) -> SpotLikelihood | None:
     """Likelihood of a JPEG window; None where its coefficients say nothing."""
     fit = fit_window(window, start[None])
-    noise = window.noise(fit.theta)
+    noise = window.noise(fit.theta, least=_LIVE)
     if noise.dead or not np.isfinite(fit.chi2):
         return None
     residuals, _ = window.residual(noise, fit.theta[None])
@@ -73,8 +76,8 @@ def of_window(window: Window, start: Array, corner_px: Array) -> SpotLikelihood 
     return SpotLikelihood(scores, fit.theta, corner_px, excess)
 
 
-def of_codes(data: SpotData, uv_px: Array) -> SpotLikelihood:
-    """Likelihood of one region's codes about a place (u, v) in the image, where a fit has put the spot."""
+def of_pixels(data: SpotData, uv_px: Array) -> SpotLikelihood:
+    """Likelihood of one region's pixels or codes about a place (u, v) in the image, where a fit has put the spot."""
     corner = np.asarray(data.regions.origin_px[0], float)
 
     def scores(theta: Array) -> tuple[Array, Array, Array]:
@@ -87,12 +90,18 @@ def of_codes(data: SpotData, uv_px: Array) -> SpotLikelihood:
         misfit = np.sum(used * many.law.misfit(x, mean), axis=(1, 2))
         return misfit, score, (flat * weight) @ np.swapaxes(flat, 1, 2)
 
-    above = np.sum((data.regions.x_e - data.pixels.background_e)[0] * data.pixels.response[0])
-    start = np.array([*(uv_px - corner), max(float(above), 100.0), *np.zeros(data.unknowns - 3)])
+    used, above = data.regions.used[0], (data.regions.x_e - data.pixels.background_e)[0]
+    levels = [_median(above[used & (level > 0.0)]) for level in data.pixels.levels[0]]
+    above = used * (above - np.einsum("c,chw->hw", levels, data.pixels.levels[0])) * data.pixels.response[0]
+    start = np.array([*(uv_px - corner), max(float(above.sum()), 100.0), *levels])
     for _ in range(_STEPS):
         _, score, fisher = scores(start[None])
         start = limited(start[None], scoring_step(fisher, score))[0]
     return SpotLikelihood(scores, start, corner, 1.0)
+
+
+def _median(values: Array) -> float:
+    return float(np.median(values)) if values.size else 0.0
 
 
 def likelihood_map(one: SpotLikelihood) -> LikelihoodMap | None:

@@ -195,6 +195,11 @@ class SearchRegion:
         return None if off is None else off[self.box.slices]
 
     @property
+    def frames(self) -> tuple[int, int]:
+        """Frames with the laser on, and with it off, that the pixels are means of."""
+        return self.pair.count(self.position), self.pair.count(f"{self.position}_off")
+
+    @property
     def planes(self) -> Array:
         """Linear light of the box: `image_planes.linear_planes`."""
         return linear_planes(self.pixels, self.pair.card, self.origin_px)

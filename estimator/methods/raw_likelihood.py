@@ -17,6 +17,8 @@ their covariances (`combine`). Where the two are not one point, the separate ans
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,9 +26,9 @@ from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.combine import CombinedEstimate, combine
 from phibench.estimator.geometry.joint_posterior import JointPosterior, joint_posterior
 from phibench.estimator.geometry.status import Status, describe
-from phibench.estimator.interface import Answer, Image, Matrix2, Pair, Spot
+from phibench.estimator.interface import Answer, Matrix2, Pair, Spot
 from phibench.estimator.methods.chain_fit import chain_fit, spot_likelihood
-from phibench.estimator.methods.likelihood_maps import likelihood_map
+from phibench.estimator.methods.likelihood_maps import SpotLikelihood, likelihood_map, of_pixels
 from phibench.estimator.methods.locate import SearchRegion, each_spot_twice, pair_blur, seen_depth_m
 from phibench.estimator.spots.fit_joint import JointFit, fit_joint
 from phibench.estimator.spots.fit_raw import SpotData, SpotFit, fit_law, spot_data
@@ -34,6 +36,7 @@ from phibench.estimator.spots.gaussian_spot import SpotModel
 from phibench.estimator.spots.raw_pixels import (
     Background,
     GaussLaw,
+    PatternNoise,
     PixelNoise,
     around,
     background_of,
@@ -42,15 +45,17 @@ from phibench.estimator.spots.raw_pixels import (
     spot_regions,
 )
 from phibench.scenes.frames import Array
+from phibench.scenes.rig import POSITIONS
 
 _FLAT_SIGMAS = 4.0  # by which the chi2 of a fit with flat levels must exceed 1 for the room to have structure
+_SHOT_SIGMAS = 4.0  # of a full pixel in one frame, by which the mean of several must be below it
 _MISFIT_SIGMAS = 3.0  # by which the fit's chi2 must exceed 1 before its covariance is widened
 
 
 def raw_maximum_likelihood(region: SearchRegion) -> Spot:
     """Position and covariance by maximum likelihood on 15 x 15 raw pixels around the red peak."""
     try:
-        noise = noise_of(region.pair.card)
+        noise = noise_of(region.pair.card, pattern_known=True)
     except ValueError:
         return Spot.missing("the fit needs shot noise and no row noise")
     near = region.narrowed()
@@ -75,8 +80,18 @@ def _fit(near: SearchRegion, x: Array, noise: PixelNoise, background: Background
     blur = pair_blur(near.pair, (u0 + near.box.width_px // 2, v0 + near.box.height_px // 2), near.depth_m)
     rough = rig.mirror.roughness_alpha > 0.0
     model = SpotModel(_response(near.pair), None if background is None else background.mean_e, rough)
-    law = GaussLaw(noise, 0.0 if background is None else background.variance_e2)
-    return fit_law(spot_regions(x, near.origin_px, x < card.full_from_e), law, blur, model)
+    pattern, frames = PatternNoise.of(card), near.frames[0]
+    law = (
+        GaussLaw(noise, pattern.dsnu_e2, frames, pattern.prnu)
+        if background is None
+        else GaussLaw(noise, background.variance_e2, frames, pattern.prnu, background.mean_e)
+    )
+    return fit_law(spot_regions(x, near.origin_px, x < _full_from_e(card, frames)), law, blur, model)
+
+
+def _full_from_e(card: SensorCard, frames: int) -> float:
+    """Mean of frames from which on one of them may be full; of one frame it is seen."""
+    return card.full_from_e - (_SHOT_SIGMAS * math.sqrt(max(card.full_from_e, 0.0)) if frames > 1 else 0.0)
 
 
 def _response(pair: Pair) -> tuple[float, float, float] | None:
@@ -87,14 +102,14 @@ def _response(pair: Pair) -> tuple[float, float, float] | None:
 
 def _background(near: SearchRegion, x: Array, noise: PixelNoise, flat: SpotFit) -> Background:
     """Room of the laser-off frame; without one, of the pixels around the spot."""
-    off = near.off_pixels
+    off, pattern, frames = near.off_pixels, PatternNoise.of(near.pair.card), near.frames
     if off is not None:
         electrons = raw_electrons(off, near.pair.card)[None]
-        return background_of(electrons, noise.variance_e2(electrons), np.ones(x.shape))
+        return background_of(electrons, noise.variance_e2(electrons) / frames[1], np.ones(x.shape), pattern)
     origin = np.array([near.origin_px], float)
     middle = origin + (np.array([x.shape[2], x.shape[1]]) - 1.0) / 2.0
     uv = np.where(np.isfinite(flat.uv_px), flat.uv_px, middle)
-    return background_of(x, noise.variance_e2(x), around(uv, origin, (x.shape[1], x.shape[2])))
+    return background_of(x, noise.variance_e2(x) / frames[0], around(uv, origin, (x.shape[1], x.shape[2])), pattern)
 
 
 def _fitted_spot(fit: SpotFit, count: int) -> Spot:
@@ -128,16 +143,19 @@ def joint_of(pair: Pair, separate: Answer) -> Answer:
 
 def _raw(pair: Pair, separate: Answer) -> Answer:
     starts = [np.array([spot.uv_px], float) for spot in (separate.down, separate.up)]
-    images = ((pair.down, pair.down_off), (pair.up, pair.up_off))
     depth_m = seen_depth_m(pair, separate)
-    down, up = (raw_spot_data(*image, pair, start[0], depth_m) for image, start in zip(images, starts, strict=True))
+    down, up = (raw_spot_data(pair, p, start[0], depth_m) for p, start in zip(POSITIONS, starts, strict=True))
+    found = _posterior(pair, [of_pixels(one, start[0]) for one, start in zip((down, up), starts, strict=True)])
+    if found is not None and found.status == Status.OK:
+        return separate if not found.misfit < _MOST_CHI2 else _posterior_answer(found)
     return _answer(fit_joint(pair.rig, pair.stroke_m, down, up, *starts), separate)
 
 
 def _processed(pair: Pair, separate: Answer) -> Answer:
     if separate.down.covariance_px2 is None or separate.up.covariance_px2 is None:
         return separate
-    found = _posterior(pair, separate)
+    depth_m = seen_depth_m(pair, separate)
+    found = _posterior(pair, [spot_likelihood(pair, p, getattr(separate, p), depth_m) for p in POSITIONS])
     if found is not None and found.status == Status.OK:
         return separate if not found.misfit < _MOST_CHI2 else _posterior_answer(found)
     (uv1, C1), (uv2, C2) = (
@@ -146,14 +164,9 @@ def _processed(pair: Pair, separate: Answer) -> Answer:
     return _answer(combine(pair.rig, pair.stroke_m, uv1, C1, uv2, C2), separate)
 
 
-def _posterior(pair: Pair, separate: Answer) -> JointPosterior | None:
+def _posterior(pair: Pair, likelihoods: Sequence[SpotLikelihood | None]) -> JointPosterior | None:
     """Posterior of both images; None where one has no likelihood about its fit."""
-    depth_m, maps = seen_depth_m(pair, separate), []
-    images = ((pair.down, pair.down_off, separate.down), (pair.up, pair.up_off, separate.up))
-    for image, off, spot in images:
-        likelihood = spot_likelihood(pair, image, off, spot, depth_m)
-        maps.append(None if likelihood is None else likelihood_map(likelihood))
-    down, up = maps
+    down, up = (None if one is None else likelihood_map(one) for one in likelihoods)
     return None if down is None or up is None else joint_posterior(pair.rig, pair.stroke_m, down, up)
 
 
@@ -163,6 +176,7 @@ def _posterior_answer(found: JointPosterior) -> Answer:
         _joint_spot(found.uv_up_px, found.covariance_up_px2),
         found.depth_m,
         found.sigma_m,
+        found.interval_m,
     )
 
 
@@ -177,26 +191,28 @@ def _answer(found: JointFit | CombinedEstimate, separate: Answer) -> Answer:
     )
 
 
-def raw_spot_data(image: Image, dark: Image | None, pair: Pair, start: Array, depth_m: float | None) -> SpotData:
-    """Square of raw pixels around a start, moved inside the image, with the model of a spot there."""
+def raw_spot_data(pair: Pair, position: str, start: Array, depth_m: float | None) -> SpotData:
+    """Square of raw pixels around a start, moved inside the image, with the model of a spot there.
+
+    Pixels are the mean of the frames, less that of frames with the laser off: the spot is left. The room, as each
+    pixel of this camera sees it, has the noise of both means; PRNU counts for the spot alone.
+    """
+    image, dark, card = pair.images[position], pair.images.get(f"{position}_off"), pair.card
     height, width = image.shape
     side = _SIDE_PX[dark is not None]
     u0 = min(max(round(start[0]) - side // 2, 0), max(width - side, 0))
     v0 = min(max(round(start[1]) - side // 2, 0), max(height - side, 0))
     window = (slice(v0, v0 + side), slice(u0, u0 + side))
-    x, extra = raw_electrons(image[window], pair.card), np.zeros((1, 1, 1))
-    x = np.where(x < pair.card.full_from_e, x, np.nan)
+    noise, pattern, frames = noise_of(card, pattern_known=True), PatternNoise.of(card), pair.count(position)
+    x = raw_electrons(image[window], card)[None]
+    x = np.where(x < _full_from_e(card, frames), x, np.nan)
+    law = GaussLaw(noise, pattern.dsnu_e2, frames, pattern.prnu)
     if dark is not None:
-        off = raw_electrons(dark[window], pair.card)
-        x, extra = x - off + float(np.median(off)), _variance(off, pair.card)[None]
-    law, blur = GaussLaw(noise_of(pair.card), extra), pair_blur(pair, start, depth_m)
-    return spot_data(spot_regions(x[None], (u0, v0)), law, blur, SpotModel(_response(pair)))
-
-
-def _variance(off_e: Array, card: SensorCard) -> Array:
-    """Noise of the off frame's pixels; of the fixed pattern, which cancels, nothing."""
-    noise: PixelNoise = noise_of(card, pattern_known=True)
-    return noise.variance_e2(off_e)
+        off, count = raw_electrons(dark[window], card)[None], pair.count(f"{position}_off")
+        room = np.maximum(background_of(off, noise.variance_e2(off) / count, np.ones(off.shape), pattern).mean_e, 0.0)
+        x, law = x - off, replace(law, extra_e2=room / frames + noise.variance_e2(room) / count)
+    blur = pair_blur(pair, start, depth_m)
+    return spot_data(spot_regions(x, (u0, v0)), law, blur, SpotModel(_response(pair)))
 
 
 def _joint_spot(uv_px: Array, covariance_px2: Array) -> Spot:

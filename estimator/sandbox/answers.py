@@ -27,7 +27,7 @@ def answer_text(value: object) -> dict[str, Any]:
     for name in ("down", "up"):
         if not isinstance(getattr(value, name), Spot):
             return {"wrong": f"{name} is {described(getattr(value, name))}: a Spot is needed"}
-    numbers = {name: plain(getattr(value, name)) for name in ("depth_m", "sigma_depth_m")}
+    numbers = {name: plain(getattr(value, name)) for name in ("depth_m", "sigma_depth_m", "interval_depth_m")}
     return {"down": _spot_document(value.down), "up": _spot_document(value.up), **numbers}
 
 
@@ -132,7 +132,7 @@ def _checked(document: dict[str, Any]) -> Answer:
     sigma = _positive("sigma_depth_m", document["sigma_depth_m"], _SIGMA_DEPTH_M)
     if sigma is not None and depth is None:
         raise AnswerError("sigma_depth_m comes without depth_m: give both or neither")
-    return Answer(down, up, depth, sigma)
+    return Answer(down, up, depth, sigma, _interval(document.get("interval_depth_m"), depth))
 
 
 def _checked_spot(name: str, document: dict[str, Any]) -> Spot:
@@ -202,6 +202,19 @@ def _covariance(name: str, value: Any) -> Matrix2 | None:
             f"the least, and their ratio may be {_ELONGATION:g}"
         )
     return (float(C[0, 0]), float(C[0, 1])), (float(C[1, 0]), float(C[1, 1]))
+
+
+def _interval(value: Any, depth_m: float | None) -> tuple[float, float] | None:
+    if value is None:
+        return None
+    if depth_m is None:
+        raise AnswerError("interval_depth_m comes without depth_m: give both or neither")
+    if not isinstance(value, list) or len(value) != 2:
+        raise AnswerError(f"interval_depth_m is {_shown(value)}: two numbers (low, high) are needed, metres, or None")
+    low, high = (_positive("interval_depth_m", x, _DEPTH_M) for x in value)
+    if low is None or high is None or not low <= depth_m <= high or low == high:
+        raise AnswerError(f"interval_depth_m is {_shown(value)}: two numbers low < high about depth_m are needed")
+    return low, high
 
 
 def _positive(name: str, value: Any, allowed: tuple[float, float]) -> float | None:

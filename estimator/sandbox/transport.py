@@ -27,11 +27,12 @@ import tempfile
 import time
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from phibench.estimator.interface import Pair
+from phibench.estimator.interface import Image, Pair
 
 _LENGTH = struct.Struct("!Q")
 LARGEST = 1 << 24  # bytes; images do not go this way
@@ -113,6 +114,7 @@ class Connection:
 
 _ALIGNED = 64  # bytes of a cache line; any type of pixel may begin there
 _IMAGES = ("down", "up", "down_off", "up_off")
+_FRAMES_OF = "frames of "  # before an image's name: its single frames
 _IN_MEMORY = Path("/dev/shm")
 LEAST_BYTES = 1 << 26
 """Memory for a pair, as address space: pages that nothing is written to take none."""
@@ -182,7 +184,7 @@ def aligned(count: int) -> int:
 
 def needed_bytes(pair: Pair) -> int:
     """Memory that the images of a pair take."""
-    return sum(aligned(image.nbytes) for image in pair.images.values())
+    return sum(aligned(image.nbytes) for image in _arrays(pair).values())
 
 
 class SharedPages:
@@ -234,13 +236,18 @@ class ReceivedPair:
         return bool(np.array_equal(here, there))
 
 
+def _arrays(pair: Pair) -> dict[str, Image]:
+    """Images of a pair by name, and the single frames behind them where there are several."""
+    return {**pair.images, **{_FRAMES_OF + name: stack for name, stack in (pair.frames or {}).items()}}
+
+
 def pack(pair: Pair, memory: MemoryFile, nonce: str = "") -> bytes:
     """Images into the memory file, all else into the message; nothing but the fields of `Pair` goes along."""
     plain = Pair(**{field.name: getattr(pair, field.name) for field in fields(Pair)})
-    images = {name: np.ascontiguousarray(image) for name, image in plain.images.items()}
+    images = {name: np.ascontiguousarray(image) for name, image in _arrays(plain).items()}
     views = [image.data.cast("B") for image in images.values()]
     layout = [(name, image.dtype.str, image.shape) for name, image in images.items()]
-    nothing: dict[str, Any] = dict.fromkeys(_IMAGES)
+    nothing: dict[str, Any] = dict.fromkeys((*_IMAGES, "frames"))
     rest = replace(plain, **nothing)
     return pickle.dumps((rest, layout, memory.write(views), nonce), protocol=5)
 
@@ -254,4 +261,6 @@ def unpack(message: bytes, shared: SharedPages) -> ReceivedPair:
         name: np.frombuffer(data, dtype, int(np.prod(shape)), start).reshape(shape)
         for (name, dtype, shape), start in zip(layout, starts, strict=False)
     }
-    return ReceivedPair(replace(rest, **images), data, original, nonce)
+    frames = {name.removeprefix(_FRAMES_OF): images.pop(name) for name in tuple(images) if name.startswith(_FRAMES_OF)}
+    pair = replace(rest, **images, frames=MappingProxyType(frames) if frames else None)
+    return ReceivedPair(pair, data, original, nonce)

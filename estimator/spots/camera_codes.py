@@ -165,7 +165,7 @@ def rgb_codes(image: NDArray[Any], card: SensorCard, origin_px: ArrayLike = (0, 
 
 def rgb_picture(image: NDArray[Any], card: SensorCard, origin_px: ArrayLike = (0, 0)) -> NDArray[np.uint8]:
     """As `rgb_codes`, rounded and cut to 8 bits."""
-    if card.output != "yuyv":
+    if card.output != "yuyv" and image.dtype == np.uint8:
         return image
     return np.clip(np.rint(rgb_codes(image, card, origin_px)), 0.0, 255.0).astype(np.uint8)
 

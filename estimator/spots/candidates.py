@@ -247,12 +247,23 @@ def candidates_at(
 
 
 def candidate_noise(
-    on: ColourPlanes, off: ColourPlanes | None, card: SensorCard, sigma_px: float, inside: BoolArray
+    on: ColourPlanes,
+    off: ColourPlanes | None,
+    card: SensorCard,
+    sigma_px: float,
+    inside: BoolArray,
+    frames: tuple[int, int] = (1, 1),
 ) -> CandidateNoise:
-    """Result of tests all over the part, where there is no spot; (1, 1) for raw pixels, whose noise is known."""
+    """Result of tests all over the part, where there is no spot; of raw pixels the noise is known.
+
+    `frames` are those with the laser on, and off, of which the planes are means.
+    """
     places = lattice(inside, _LATTICE_PX)
     if card.output == "raw" or not len(places):
-        return CandidateNoise()
+        if off is None:
+            return CandidateNoise(frames[0] ** -0.5, 1.0 / frames[0])
+        # no structure is left that the misfit of a mean, small against that of one frame, would have to tell
+        return CandidateNoise(float(np.sqrt(0.5 / frames[0] + 0.5 / frames[1])))
     tests = candidates_at(on, off, card, places, sigma_px)
     chi2 = float(max(np.quantile(tests.chi2, _CHI2_SHARE), 0.1))
     z = tests.z * np.sqrt(np.maximum(tests.chi2, 1.0) / np.maximum(tests.chi2 / chi2, 1.0))

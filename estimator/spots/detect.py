@@ -25,7 +25,7 @@ from scipy.ndimage import label, maximum_filter
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.mirror_image import up_image
-from phibench.estimator.interface import Box, Image, Pair
+from phibench.estimator.interface import Box, Pair
 from phibench.estimator.spots.candidates import Candidates, candidate_noise, candidates_at, peaks
 from phibench.estimator.spots.image_planes import ColourPlanes, blur_of, colour_planes
 from phibench.scenes.frames import Array, BoolArray
@@ -227,8 +227,8 @@ def detect(pair: Pair) -> PairDetection:
     sure = off or pair.card.mosaic == "bayer"
     least = _thresholds(pair.card, sure, off)
     least = _lowered(least) if _is_small(pair.box_down) and _is_small(pair.box_up) else least
-    down = _searched(pair.down, pair.down_off, pair, pair.box_down, least.each)
-    up = _searched(pair.up, pair.up_off, pair, pair.box_up, least.each)
+    down = _searched(pair, "down", pair.box_down, least.each)
+    up = _searched(pair, "up", pair.box_up, least.each)
     choice = choose(pair.rig, pair.stroke_m, down.found, up.found, least, sure)
     return _refined(choice, down, up, pair.card)
 
@@ -266,14 +266,15 @@ def mirror_box(rig: Rig) -> Box:
     return Box(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
 
 
-def _searched(image: Image, dark: Image | None, pair: Pair, hint: Box | None, least_z: float) -> _Searched:
-    card, box = pair.card, mirror_box(pair.rig)
-    on = colour_planes(image, card, box)
+def _searched(pair: Pair, position: str, hint: Box | None, least_z: float) -> _Searched:
+    card, box, dark = pair.card, mirror_box(pair.rig), pair.images.get(f"{position}_off")
+    on = colour_planes(pair.images[position], card, box)
     off = None if dark is None else colour_planes(dark, card, box)
     inside = outline_mask(pair.rig, box)
     inside = inside & ~lamp_halo(off or on, inside, card, off is not None)
     sigma = blur_of(card, pair.rig.camera.blur_sigma_px)
-    noise = candidate_noise(on, off, card, sigma, inside)
+    counts = pair.count(position), max(pair.count(f"{position}_off"), 1)
+    noise = candidate_noise(on, off, card, sigma, inside, counts)
     where = inside if hint is None else inside & _hinted(hint, box)
     places = peaks(on, off, card, sigma, where, _LEAST_PEAK, _MOST_PEAKS).uv_px
     first = candidates_at(on, off, card, places, sigma, noise)

@@ -16,7 +16,7 @@ from scipy.ndimage import convolve1d, gaussian_filter
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.status import Status, flag, keep
 from phibench.estimator.spots.camera_codes import light_of, rgb_codes, tone_slope
-from phibench.estimator.spots.chain_model import UNIT_MATRIX, chain_model, window_px
+from phibench.estimator.spots.chain_model import UNIT_MATRIX, ChainModel, chain_model, window_px
 from phibench.estimator.spots.fisher import covariance_bound
 from phibench.estimator.spots.fit_jpeg import JpegFit, Region, Window, fit_region, grid_px, region_window
 from phibench.estimator.spots.fit_raw import LEAST_SNR, SpotData, SpotFit, fit_law, spot_data
@@ -48,24 +48,27 @@ def fit_srgb(
     model: SpotModel | None = None,
     pattern_known: bool = False,
     extra_e2: float = 0.0,
+    background: Background | None = None,
 ) -> SpotFit:
     """Fit one spot in each region of processed 8-bit images.
 
-    Where each pixel's own colour is an interval of electrons (`own_codes`), the likelihood is exact
+    Where each pixel's own colour is an interval of electrons (`own_codes`), the likelihood of a single frame is exact
     (`pixel_statistics`). Otherwise mean and covariance of all codes are fitted, as `fit_jpeg` does it.
 
     Parameters
     ----------
-    images : shape (n, h, w, 3), uint8
+    images : shape (n, h, w, 3), uint8; (n, f, h, w, 3) of f frames of each
     origin_px : shape (2,) or (n, 2)
         Image pixel (u, v) of the first column and row.
     card : SensorCard
     blur, model
         As for `fit_law`.
     pattern_known : bool
-        PRNU and DSNU were calibrated; otherwise they count as noise.
+        PRNU and DSNU were calibrated, or the background holds those of the room; otherwise they count as noise.
     extra_e2 : float
-        Variance of the known background's error, electrons squared.
+        Variance of the known background's error, electrons squared; frames share it.
+    background : Background, optional
+        Where all codes are fitted, instead of the model's background and `extra_e2`.
 
     Raises
     ------
@@ -74,12 +77,12 @@ def fit_srgb(
     """
     planes = _checked(images, card)
     origin = np.broadcast_to(np.asarray(origin_px, np.int64), (len(planes), 2))
-    if not own_codes(card):
-        known = None if model is None else model.background_e
-        levels = np.zeros(planes.shape[:3]) if known is None else np.broadcast_to(known, planes.shape[:3])
-        background = Background(levels, np.full(levels.shape, extra_e2))
+    if not own_codes(card) or planes.shape[1] > 1:
+        known, shape = None if model is None else model.background_e, (len(planes), *planes.shape[2:4])
+        levels = np.zeros(shape) if known is None else np.broadcast_to(known, shape)
+        background = background or Background(levels, np.full(levels.shape, extra_e2))
         return _fit_windows(planes, origin, card, blur, model, background, pattern_known)
-    data = code_data(planes, origin, card, blur, model, pattern_known, extra_e2)
+    data = code_data(planes[:, 0], origin, card, blur, model, pattern_known, extra_e2)
     return fit_law(data.regions, data.law, blur, model)
 
 
@@ -92,7 +95,7 @@ def code_data(
     pattern_known: bool = False,
     extra_e2: float = 0.0,
 ) -> SpotData:
-    """Likelihood of each pixel's own code, for cards of `own_codes`; origin of shape (n, 2), the rest as `fit_srgb`."""
+    """Likelihood of each pixel's own code, of one frame and for cards of `own_codes`; the rest as `fit_srgb`."""
     filters = bayer_filters(origin, planes.shape[1:3])
     noise = unrounded(card, pattern_known)
     noise = PixelNoise(noise.gaussian_e2 + extra_e2, noise.prnu)
@@ -115,7 +118,7 @@ def fit_yuyv(
 
     Parameters
     ----------
-    images : shape (n, h, w, 2), uint8
+    images : shape (n, h, w, 2), uint8; (n, f, h, w, 2) of f frames of each
         13 x 13 pixels or more.
     origin_px : shape (2,) or (n, 2)
         Image pixel (u, v) of the first column and row; it may be odd.
@@ -146,7 +149,7 @@ def fit_jpeg(
 
     Parameters
     ----------
-    images : shape (n, h, w, 3), uint8
+    images : shape (n, h, w, 3), uint8; (n, f, h, w, 3) of f frames of each
         Whole units of the JPEG, 2 x 2 or more; one more on each side helps.
     origin_px : shape (2,) or (n, 2)
         Image pixel (u, v) of the first column and row, on the grid of units.
@@ -172,7 +175,7 @@ def fit_jpeg(
     """
     planes = _checked(images, card)
     origin = np.broadcast_to(np.asarray(origin_px, np.int64), (len(planes), 2))
-    _on_grid(origin, planes.shape[1:3], card)
+    _on_grid(origin, planes.shape[2:4], card)
     return _fit_windows(planes, origin, card, blur, model, background, pattern_known, size_px)
 
 
@@ -196,13 +199,13 @@ def _fit_windows(
     n, model = len(planes), model or SpotModel()
     if n == 0:
         return _collected([], origin, np.zeros(0), model.free_width)
-    chain, blurs = chain_model(card, unrounded(card, pattern_known)), blur.each(n)
+    chain, blurs = _chain(card, background, pattern_known), blur.each(n)
     widths = np.asarray(blurs.sigma_px)
     first = first_fit(planes, origin, card, SpotBlur(widths), model.response, background)
     rows = []
     for i in range(n):
         start = first[i] if not model.free_width else np.append(first[i], widths[i])
-        region, corner = _region(planes[i], origin[i], card, background, i, size_px)
+        region, corner = _region(planes[i], origin[i], card, background, i, size_px, pattern_known)
         start[:2] -= corner
         fit, off = fit_region(region, chain, start[None], blurs.rows(np.array([i])), model)
         fit.theta[:2] += corner
@@ -210,21 +213,30 @@ def _fit_windows(
     return _collected(rows, origin, widths, model.free_width)
 
 
+def _chain(card: SensorCard, background: Background | None, pattern_known: bool) -> ChainModel:
+    """Model of the processing; the room's pattern is the background's, where that holds it."""
+    held = background is not None and background.holds_pattern
+    return chain_model(card, unrounded(card, pattern_known or held))
+
+
 def _region(
-    plane: NDArray[np.uint8],
+    frames: NDArray[np.uint8],
     origin: NDArray[np.int64],
     card: SensorCard,
     background: Background | None,
     index: int,
     size_px: tuple[int, int],
+    pattern_known: bool = False,
 ) -> tuple[Region, Array]:
-    """Region of one image, and its first row and column (u, v): the window's grid begins there."""
-    (u0, v0), (h, w), zero = origin, plane.shape[:2], np.zeros(plane.shape[:2])
+    """Region of one image's frames, and its first row and column (u, v): the window's grid begins there."""
+    (u0, v0), (h, w), zero = origin, frames.shape[1:3], np.zeros(frames.shape[1:3])
     ends = (bool(v0 == 0), bool(v0 + h == size_px[1]), bool(u0 == 0), bool(u0 + w == size_px[0]))
     known = (zero, zero) if background is None else (background.mean_e[index], background.variance_e2[index])
-    room = None if background is None or background.image is None else background.image[index]
+    room = None if background is None or background.image is None else _frames_of(background.image)[index]
+    prnu = card.prnu if background is not None and background.holds_pattern and not pattern_known else 0.0
     u1, v1 = origin % np.array(grid_px(card)[::-1])
-    return Region(plane[v1:, u1:], ends, known[0][v1:, u1:], known[1][v1:, u1:], room), np.array([u1, v1])
+    behind = (known[0][v1:, u1:], known[1][v1:, u1:])
+    return Region(frames[:, v1:, u1:], ends, *behind, room, prnu), np.array([u1, v1])
 
 
 def spot_window(
@@ -239,13 +251,13 @@ def spot_window(
 ) -> tuple[Window, Array, Array]:
     """Window of outputs of one image, a start of a fit at (u, v) of the whole image, and the window's corner there.
 
-    Parameters as for `fit_jpeg`, with n = 1; `image` has the shape (1, h, w, planes), `origin` (1, 2).
+    Parameters as for `fit_jpeg`, with n = 1; `image` has the shape (1, f, h, w, planes), `origin` (1, 2).
     """
-    planes = _checked(image, card, image.shape[3])
+    planes = _checked(image, card, image.shape[-1])
     region, corner = _region(planes[0], origin[0], card, background, 0, size_px)
     one = blur.each(1)
     start = first_fit(planes, origin, card, SpotBlur(np.asarray(one.sigma_px)), model.response, background)[0]
-    chain = chain_model(card, unrounded(card))
+    chain = _chain(card, background, False)
     window, first = region_window(region, chain, uv_px - origin[0] - corner, one, model)
     place = first + corner + origin[0]
     start[:2] = uv_px - place
@@ -260,11 +272,14 @@ def first_fit(
     response: tuple[float, float, float] | None,
     background: Background | None = None,
 ) -> Array:
-    """Start of a fit, shape (n, 6): u, v in the region, flux, levels; a Gaussian fit of each pixel's own colour."""
+    """Start of a fit, shape (n, 6): u, v in the region, flux, levels; a Gaussian fit of each pixel's own colour.
+
+    `images` have the shape (n, f, h, w, c), f frames of each.
+    """
     if response is None:
         raise ValueError("the fit through the chain needs the response of the filters: SpotModel(response=...)")
-    filters = bayer_filters(origin, images.shape[1:3])
-    x, extra = undone(images, origin, card)
+    filters = bayer_filters(origin, images.shape[2:4])
+    x, extra = undone_mean(images, origin, card)
     x = x - (0.0 if background is None else background.mean_e)
     rough, spread = _ROUGH_CODES2 * 12.0 * extra, unrounded(card)
     x, rough, corner = _cut(x, rough, filters, response)
@@ -351,6 +366,13 @@ def undone(images: NDArray[Any], origin: NDArray[np.int64], card: SensorCard) ->
     return np.sum(own * linear, axis=3), np.sum((own * width) ** 2, axis=3) / 12.0
 
 
+def undone_mean(images: NDArray[Any], origin: NDArray[np.int64], card: SensorCard) -> tuple[Array, Array]:
+    """Mean over frames of what `undone` gives, and the variance that 8 bits add to it; images (n, f, h, w, c)."""
+    frames = [undone(images[:, k], origin, card) for k in range(images.shape[1])]
+    x, variance = (sum(parts) / len(frames) for parts in zip(*frames, strict=True))
+    return np.asarray(x), np.asarray(variance) / len(frames)
+
+
 def _unsharpened(codes: Array, amount: float) -> Array:
     """Solution x of x + amount (x - blur x) = codes, shape (n, h, w, 3), by fixed-point iteration."""
     x = codes
@@ -363,15 +385,21 @@ def _unsharpened(codes: Array, amount: float) -> Array:
     return x
 
 
+def _frames_of(images: NDArray[Any]) -> NDArray[Any]:
+    """Images with an axis of frames, shape (n, f, h, w, c); of single ones it has the length 1."""
+    return images[:, None] if images.ndim == 4 else images
+
+
 def _checked(images: NDArray[Any], card: SensorCard, count: int = 3) -> NDArray[np.uint8]:
-    planes = np.asarray(images)
-    if planes.ndim != 4 or planes.shape[3] != count or planes.dtype != np.uint8:
+    planes = _frames_of(np.asarray(images))
+    if planes.ndim != 5 or planes.shape[4] != count or planes.shape[1] < 1 or planes.dtype != np.uint8:
         raise ValueError(
-            f"images have the shape {planes.shape} and are {planes.dtype}: (n, h, w, {count}) of uint8 is needed"
+            f"images have the shape {np.shape(images)} and are {planes.dtype}: (n, h, w, {count}) or, of f frames, "
+            f"(n, f, h, w, {count}) of uint8 is needed"
         )
     least = 0 if own_codes(card) or card.output == "mjpeg" else window_px(card)[0] + 1
-    if min(planes.shape[1:3]) < least:
-        raise ValueError(f"images have the shape {planes.shape}: {least} x {least} pixels or more are needed")
+    if min(planes.shape[2:4]) < least:
+        raise ValueError(f"images have the shape {np.shape(images)}: {least} x {least} pixels or more are needed")
     if card.mosaic != "bayer":
         raise ValueError(
             f"sensor '{card.name}' has the mosaic '{card.mosaic}': the fit through the chain needs 'bayer'"

@@ -32,7 +32,15 @@ from phibench.estimator.spots.chain_model import (
 )
 from phibench.estimator.spots.fisher import limited, scoring_step
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
-from phibench.estimator.spots.jpeg_coefficients import mcu_px, qtables_of, quantised, recovered, room_variance
+from phibench.estimator.spots.jpeg_coefficients import (
+    hidden_share,
+    mcu_px,
+    qtables_of,
+    quantised,
+    recovered,
+    room_variance,
+    step_correlation,
+)
 from phibench.estimator.spots.pixel_statistics import CutPixels, cut_pixels
 from phibench.scenes.frames import Array
 
@@ -118,7 +126,7 @@ class Window:
 
     Attributes
     ----------
-    z : shape (n,), quantised coefficients in the order of `jpeg_coefficients.coefficients`
+    z : shape (n,), quantised coefficients in the order of `jpeg_coefficients.coefficients`, mean of the frames
     model : ChainModel
     pixels : SpotPixels
         Of the one window and the raw pixels around it, r in all.
@@ -126,6 +134,10 @@ class Window:
         Variance of the background, electrons squared, which counts as noise of the raw pixels.
     room : shape (n,) or float
         Variance of the background's coefficients by quantisation (`room_variance`).
+    frames : int
+        That `z` is the mean of. They share the background's errors and the pattern.
+    prnu : float
+        Relative spread of the responsivity, of the spot's light alone.
     """
 
     z: Array
@@ -133,14 +145,19 @@ class Window:
     pixels: SpotPixels
     extra_e2: Array | float = 0.0
     room: Array | float = 0.0
+    frames: int = 1
+    prnu: float = 0.0
 
-    def noise(self, theta: Array, live: Rows | None = None) -> Noise:
-        """Covariance of the quantised coefficients for one hypothesis, shape (k,); which are live, if it is known."""
+    def noise(self, theta: Array, live: Rows | None = None, least: float = _LIVE) -> Noise:
+        """Covariance of the quantised coefficients for one hypothesis, shape (k,); which are live, if it is known.
+
+        Otherwise those are whose variance exceeds `least`, in steps squared.
+        """
         model = self.model
         rows = live or Rows.all(model)
         raw, _ = self._raw(theta[None])
         at = codes(model, raw.mean_e).one(0)
-        extra = raw.slope[0] ** 2 * self.extra_e2
+        extra = raw.slope[0] ** 2 * (self.extra_e2 + self._pattern_e2(theta))
         F = noise_factor(model, at, raw.variance_e2[0] + extra, rows.transform)
         room = np.broadcast_to(self.room, len(model.step))[rows.index]
         sigma = np.sqrt(np.einsum("rn,rn->n", F, F) + at.excess @ rows.squares + rows.rounding + room)
@@ -148,12 +165,26 @@ class Window:
         variance = np.maximum(output.variance, _LEAST * rows.step**2)
         slope = output.slope
         if live is None:
-            index = np.flatnonzero(output.variance > _LIVE * rows.step**2)
+            index = np.flatnonzero(output.variance > least * rows.step**2)
             F, slope, variance, sigma, rows = F[:, index], slope[index], variance[index], sigma[index], rows.part(index)
+            room = room[index]
         F *= slope
         C = F.T @ F
         np.fill_diagonal(C, variance)
+        if self.frames > 1:
+            if model.noise.prnu > 0.0:
+                extra = extra + raw.slope[0] ** 2 * (model.noise.prnu * np.maximum(raw.mean_e[0], 0.0)) ** 2
+            E = noise_factor(model, at, extra, rows.transform)
+            alike = shared_covariance(E, room, sigma, slope, rows.step)
+            C = C / self.frames + (1.0 - 1.0 / self.frames) * alike
         return Noise(rows, sigma, np.asarray(np.linalg.cholesky(C), float))
+
+    def _pattern_e2(self, theta: Array) -> Array | float:
+        """Variance of the spot's light by PRNU, shape (r,)."""
+        if self.prnu == 0.0:
+            return 0.0
+        _, derivatives = self.pixels.at(theta[None])
+        return np.asarray((self.prnu * theta[2] * derivatives[0, 2].ravel()) ** 2)
 
     def residual(self, noise: Noise, theta: Array) -> tuple[Array, Array]:
         """Whitened residuals, shape (m, l), and derivatives of the mean, shape (m, k, l), of hypotheses (m, k)."""
@@ -182,6 +213,28 @@ class Window:
             return np.zeros((len(theta), len(theta)))
         _, J = self.residual(noise, theta[None])
         return np.asarray(J[0] @ J[0].T)
+
+
+def shared_covariance(factor: Array, room: Array, sigma: Array, slope: Array, step: Array) -> Array:
+    """Covariance between the quantised coefficients of two frames that share some errors, shape (n, n).
+
+    An error that both share comes through the quantiser with its slope. Besides that, both are rounded alike as far as
+    the noise of each alone does not move them in their step, and as the shared error leaves open where they are.
+
+    Parameters
+    ----------
+    factor : shape (r, n), F of which F^T F is the shared covariance by the raw pixels, before the quantiser
+    room : shape (n,), shared variance of other origin
+    sigma : shape (n,), standard deviation before the quantiser, all in all
+    slope, step : shape (n,), of the quantiser
+    """
+    shared = np.einsum("rn,rn->n", factor, factor) + room
+    own = np.sqrt(np.maximum(sigma**2 - shared, 0.0))
+    alike = step_correlation(own / step) - step_correlation(sigma / step)
+    E = factor * slope
+    C = E.T @ E
+    C[np.diag_indices_from(C)] += slope**2 * room + step**2 / 12.0 * alike
+    return np.asarray(C)
 
 
 def fit_window(window: Window, starts: Array) -> JpegFit:
@@ -244,13 +297,15 @@ class Region:
 
     Attributes
     ----------
-    image : shape (h, w, 3), uint8; (h, w, 2) of "yuyv"
+    image : shape (f, h, w, 3), uint8, of f frames; (f, h, w, 2) of "yuyv"
     ends : 4 booleans
         Top, bottom, left and right side are the image's own.
     background_e, extra_e2 : shape (h, w)
         Background of the raw pixels, and the variance of its error.
-    room : shape (h, w, 3), uint8, optional
-        Decoded frame without the laser that the background was taken from.
+    room : shape (f, h, w, 3), uint8, optional
+        Decoded frames without the laser that the background was taken from.
+    prnu : float
+        Of the spot's light, where the background's variance holds the pattern of the room.
     """
 
     image: NDArray[Any]
@@ -258,13 +313,14 @@ class Region:
     background_e: Array
     extra_e2: Array
     room: NDArray[Any] | None = None
+    prnu: float = 0.0
 
 
 def window_at(region: Region, chain: ChainModel, uv: Array) -> tuple[int, int]:
     """First row and column, in the region, of the window on the grid that has (u, v) nearest to its middle."""
     steps = grid_px(chain.card)
     places = []
-    for centre, unit, side, size in zip((uv[1], uv[0]), steps, chain.shape, region.image.shape[:2], strict=True):
+    for centre, unit, side, size in zip((uv[1], uv[0]), steps, chain.shape, region.image.shape[1:3], strict=True):
         first = int(np.clip(np.rint((centre + 0.5 - side / 2) / unit), 0, (size - side) // unit))
         places.append(first * unit)
     return places[0], places[1]
@@ -324,8 +380,21 @@ def region_window(
     corner = np.array([column - m, row - m], float)
     room: Array | float = 0.0
     if region.room is not None and chain.card.output == "mjpeg":
-        room = room_variance(coefficients_at(replace(region, image=region.room), chain, row, column), chain.step)
-    return Window(outputs_at(region, chain, row, column), chain, pixels, extra.ravel(), room), corner
+        room = _room(replace(region, image=region.room), chain, row, column, background)
+    z = outputs_at(region, chain, row, column)
+    return Window(z, chain, pixels, extra.ravel(), room, len(region.image), region.prnu), corner
+
+
+def _room(region: Region, chain: ChainModel, row: int, column: int, background_e: Array) -> Array:
+    """Variance of the room's coefficients by the quantiser, shape (n,), known from the region's frames."""
+    found, count = coefficients_at(region, chain, row, column), len(region.image)
+    if count == 1:
+        return room_variance(found, chain.step)
+    mean_e = np.maximum(background_e.ravel(), 0.0)
+    at = codes(chain, mean_e)
+    F = noise_factor(chain, at, raw_variance_e2(chain, mean_e), chain.transform)
+    sigma = np.sqrt(np.einsum("rn,rn->n", F, F) + at.excess @ chain.squares + chain.rounding)
+    return room_variance(found, chain.step, hidden_share(sigma / chain.step, count))
 
 
 def outputs_at(region: Region, chain: ChainModel, row: int, column: int) -> Array:
@@ -333,15 +402,15 @@ def outputs_at(region: Region, chain: ChainModel, row: int, column: int) -> Arra
     if chain.card.output == "mjpeg":
         return coefficients_at(region, chain, row, column)
     h, w = window_px(chain.card)
-    image = region.image[row : row + h, column : column + w]
-    return ycbcr_codes(image) if chain.card.output == "yuyv" else np.moveaxis(image, -1, 0).ravel().astype(float)
+    image = region.image[:, row : row + h, column : column + w].mean(axis=0)
+    return ycbcr_codes(image) if chain.card.output == "yuyv" else np.moveaxis(image, -1, 0).ravel()
 
 
 def coefficients_at(region: Region, chain: ChainModel, row: int, column: int) -> Array:
-    """Quantised coefficients, shape (n,), of the window that begins at (row, column) of the region."""
+    """Quantised coefficients, mean of the frames, shape (n,), of the window that begins at (row, column)."""
     card, (h, w) = chain.card, chain.shape
     down, across = mcu_px(card.jpeg_subsampling)
-    height, width = region.image.shape[:2]
+    height, width = region.image.shape[1:3]
     top, left = max(row - down, 0), max(column - across, 0)
     bottom, right = min(row + h + down, height), min(column + w + across, width)
     ends = (
@@ -350,8 +419,8 @@ def coefficients_at(region: Region, chain: ChainModel, row: int, column: int) ->
         region.ends[2] and left == 0,
         region.ends[3] and right == width,
     )
-    found = recovered(region.image[None, top:bottom, left:right], qtables_of(card), card.jpeg_subsampling, ends)
+    found = recovered(region.image[:, top:bottom, left:right], qtables_of(card), card.jpeg_subsampling, ends)
     v, u = row - top, column - left
-    luma = found.luma[0, v // 8 : (v + h) // 8, u // 8 : (u + w) // 8]
-    chroma = found.chroma[0, :, v // down : (v + h) // down, u // across : (u + w) // across]
-    return np.concatenate([luma.ravel(), chroma.ravel()])
+    luma = found.luma[:, v // 8 : (v + h) // 8, u // 8 : (u + w) // 8]
+    chroma = found.chroma[:, :, v // down : (v + h) // down, u // across : (u + w) // across]
+    return np.concatenate([luma.mean(axis=0).ravel(), chroma.mean(axis=0).ravel()])

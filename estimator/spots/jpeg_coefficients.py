@@ -234,28 +234,47 @@ def _plane(coefficients: Array) -> Array:
 # -- room behind a spot ----------------------------------------------------------------------------------------------
 
 _SIDE = 8
+_TERMS = 60  # of the sum over k: 1 % are left out without noise, nothing from a tenth of a step on
 _NEAR = 3  # frequencies on a side of the square that the mean is taken over
 
 
-def room_variance(coefficients: Array, step: Array) -> Array:
+def room_variance(coefficients: Array, step: Array, hidden: float | Array = 1.0) -> Array:
     """Variance of the error of the room's coefficients, shape (n,).
 
     Parameters
     ----------
     coefficients : shape (n,)
-        Of the quantised frame without the laser, blocks of 8 x 8 one after the other.
+        Of the quantised frame without the laser, or the mean of several, blocks of 8 x 8 one after the other.
     step : shape (n,), of the quantiser
+    hidden : 1, or shape (n,)
+        Of several frames: `hidden_share`.
     """
     blocks = np.asarray(coefficients, float).reshape(-1, _SIDE, _SIDE)
     power = blocks * blocks
     power[:, 0, 0] = 0.0  # the level says nothing of the structure
     near = uniform_filter(power, (0, _NEAR, _NEAR), mode="constant") * _NEAR**2 / _counts()
-    quantised = step * step / 12.0
+    quantised = hidden * step * step / 12.0
     mean = near.ravel()
     variance = quantised * mean / (mean + quantised)
     levels = np.zeros((_SIDE, _SIDE), bool)
     levels[0, 0] = True
     return np.where(np.tile(levels.ravel(), len(blocks)), quantised, variance)
+
+
+def step_correlation(sigma: Array) -> Array:
+    """Correlation between frames of a quantiser's error, shape of `sigma`, the noise in steps; places spread evenly.
+
+    6 / pi^2 sum over k of exp(-4 pi^2 k^2 sigma^2) / k^2 (B. Widrow, I. Kollar, "Quantization Noise", 2008, chapter 6).
+    """
+    k = np.arange(1, _TERMS + 1)
+    terms = np.exp(-4.0 * np.pi**2 * k**2 * np.asarray(sigma)[..., None] ** 2) / k**2
+    return np.asarray(6.0 / np.pi**2 * terms.sum(axis=-1))
+
+
+def hidden_share(sigma: Array, count: int) -> Array:
+    """Variance of a quantiser's error in the mean of frames over that in one, shape of `sigma`, the noise in steps."""
+    rho = step_correlation(sigma)
+    return np.asarray(rho + (1.0 - rho) / count)
 
 
 def _counts() -> Array:

@@ -68,6 +68,23 @@ def noise_of(card: SensorCard, pattern_known: bool = False) -> PixelNoise:
     return PixelNoise(card.read_noise_e**2 + fixed_e2 + rounding_e2, 0.0 if pattern_known else card.prnu)
 
 
+@dataclass(frozen=True)
+class PatternNoise:
+    """Fixed pattern of a camera, the same in all its frames: dsnu_e2 + (prnu mu)^2, electrons squared."""
+
+    dsnu_e2: float
+    prnu: float
+
+    @classmethod
+    def of(cls, card: SensorCard) -> PatternNoise:
+        """Pattern of a sensor."""
+        return cls(card.dsnu_e**2, card.prnu)
+
+    def variance_e2(self, mean_e: Array) -> Array:
+        """Variance for means of any shape."""
+        return np.asarray(self.dsnu_e2 + (self.prnu * np.maximum(mean_e, 0.0)) ** 2)
+
+
 def raw_electrons(dn: NDArray[Any], card: SensorCard) -> Array:
     """Electrons of DN: black level taken off, divided by the system gain."""
     return (np.asarray(dn, float) - card.black_level_dn) / card.dn_per_e
@@ -165,22 +182,32 @@ class PixelLaw(Protocol):
 
 @dataclass(frozen=True)
 class GaussLaw:
-    """Gaussian quasi-likelihood with the variance V(mu), plus `extra_e2` of other origin.
+    """Gaussian quasi-likelihood of a mean of frames, with the variance V(mu) / frames + (prnu (mu - room))^2 + extra.
 
     Parameters
     ----------
     noise : PixelNoise
+        V, of one frame.
     extra_e2 : float or shape (n, h, w)
-        Variance that does not depend on the mean, such as that of a background.
+        Variance that does not depend on the mean, such as that of a background; all frames share it.
+    frames : int
+        That the readings are means of.
+    prnu : float
+        Relative spread of the responsivity, of the light above `room_e` and the same in all frames; besides that in V.
+    room_e : float or shape (n, h, w)
+        Light whose pattern is not to be counted, because the background holds it.
     """
 
     noise: PixelNoise
     extra_e2: float | Array = 0.0
+    frames: int = 1
+    prnu: float = 0.0
+    room_e: float | Array = 0.0
 
     def rows(self, index: NDArray[np.int64]) -> GaussLaw:
         """Law of some of the spots."""
-        extra = self.extra_e2[index] if isinstance(self.extra_e2, np.ndarray) else self.extra_e2
-        return replace(self, extra_e2=extra)
+        extra, room = (x[index] if isinstance(x, np.ndarray) else x for x in (self.extra_e2, self.room_e))
+        return replace(self, extra_e2=extra, room_e=room)
 
     def score(self, x: Array, mean: Array) -> Array:
         """(x - mu) / V."""
@@ -188,7 +215,8 @@ class GaussLaw:
 
     def information(self, mean: Array) -> Array:
         """1 / V."""
-        return np.asarray(1.0 / (self.noise.variance_e2(mean) + self.extra_e2))
+        variance = self.noise.variance_e2(mean) / self.frames + self.extra_e2
+        return np.asarray(1.0 / (variance + (self.prnu * (mean - self.room_e)) ** 2))
 
     def misfit(self, x: Array, mean: Array) -> Array:
         """(x - mu)^2 / V + log V."""
@@ -212,16 +240,19 @@ class Background:
     mean_e : shape (n, h, w)
     variance_e2 : shape (n, h, w)
         Of its error, taken as independent from pixel to pixel.
-    image : shape (n, h, w, 3), uint8, optional
-        The decoded JPEG frame that it was taken from.
+    image : shape (n, h, w, 3) or, of f frames, (n, f, h, w, 3), uint8, optional
+        The decoded JPEG frames that it was taken from.
+    holds_pattern : bool
+        The error is that of the room as this camera's pixels see it: PRNU and DSNU of the room are counted here.
     """
 
     mean_e: Array
     variance_e2: Array
     image: NDArray[Any] | None = None
+    holds_pattern: bool = False
 
 
-def background_of(x_e: Array, variance_e2: Array, known: Array) -> Background:
+def background_of(x_e: Array, variance_e2: Array, known: Array, pattern: PatternNoise | None = None) -> Background:
     """Smooth images without the spot, or around it.
 
     Each of the mosaic's four phases is smoothed as strongly as its local variance allows (adaptive Wiener filter: J. S.
@@ -235,13 +266,16 @@ def background_of(x_e: Array, variance_e2: Array, known: Array) -> Background:
     known : shape (n, h, w), 0 or 1
         0 where the image says nothing about the background. What surrounds it is carried on, and its structure counts
         as variance.
+    pattern : PatternNoise, optional
+        Of the camera, where `variance_e2` leaves it out: a structure that every room has at least.
     """
+    least = np.zeros(x_e.shape) if pattern is None else pattern.variance_e2(x_e)
     mean, variance = np.empty(x_e.shape), np.empty(x_e.shape)
     for row in (0, 1):
         for column in (0, 1):
             at = (slice(None), slice(row, None, 2), slice(column, None, 2))
-            mean[at], variance[at] = _of_phase(x_e[at], variance_e2[at], np.asarray(known, float)[at])
-    return Background(mean, variance)
+            mean[at], variance[at] = _of_phase(x_e[at], variance_e2[at], np.asarray(known, float)[at], least[at])
+    return Background(mean, variance, holds_pattern=pattern is not None)
 
 
 def around(uv_px: Array, origin_px: Array, shape: tuple[int, int]) -> Array:
@@ -251,13 +285,13 @@ def around(uv_px: Array, origin_px: Array, shape: tuple[int, int]) -> Array:
     return (v[:, :, None] ** 2 + u[:, None, :] ** 2 > _HIDDEN_PX**2).astype(float)
 
 
-def _of_phase(x: Array, noise: Array, known: Array) -> tuple[Array, Array]:
+def _of_phase(x: Array, noise: Array, known: Array, least: Array) -> tuple[Array, Array]:
     weight = np.maximum(_smooth(known), _LEAST_WEIGHT)
     local = _smooth(known * x) / weight
     spread = _smooth(known * (x - local) ** 2) / weight
     typical = _smooth(known * noise) / weight
-    structure = np.maximum(spread - typical, 0.0)
-    gain = known * structure / np.maximum(spread, _LEAST_WEIGHT)
+    structure = np.maximum(spread - typical, _smooth(known * least) / weight)
+    gain = known * structure / np.maximum(structure + typical, _LEAST_WEIGHT)
     # local + gain (x - local) errs by the pixel's own noise times the gain; the rest is a Gaussian mean, whose variance
     # falls by 4 pi sigma^2. A pixel that is not known has the structure itself as its error.
     left = np.where(known > 0.0, (gain + (1.0 - gain) / (4.0 * np.pi * _SIGMA_PX**2)) * typical, structure)

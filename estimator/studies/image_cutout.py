@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.frames.source import Side
 from phibench.estimator.benchmark.dataset_pairs import SpotBounds, spot_bounds
-from phibench.estimator.interface import Box, Image, Pair
+from phibench.estimator.interface import Box, Pair
 from phibench.estimator.pair_set import PairTruth
 from phibench.estimator.pair_set import SpotTruth as Answer
 from phibench.render.optics.spot_layer import SpotLayer, spot_layer
@@ -158,7 +159,7 @@ def drawn_pair(
     box_px : side of the boxes around the spots
     """
     seed = int(generator(*names, "camera").integers(_CAMERAS))
-    images: dict[str, Image] = {}
+    images: dict[str, Any] = {}
     for position in POSITIONS:
         side = shot.side(pair, position, seed)
         for key, light, word in ((position, side.light, "on"), (f"{position}_off", side.light.laser_off(), "off")):

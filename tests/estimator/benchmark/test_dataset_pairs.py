@@ -20,10 +20,11 @@ from phibench.datasets.exposures.expected import expected_of_light, expected_reg
 from phibench.datasets.exposures.pair_draws import CachedSample
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import Dataset, open_dataset
-from phibench.estimator.benchmark.dataset_pairs import DatasetPairs, dataset_pairs
+from phibench.estimator.benchmark.dataset_pairs import DatasetPairs, dataset_pairs, spot_bounds
 from phibench.estimator.benchmark.worst_images import worst
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Pair
+from phibench.estimator.limits.off_frame_bound import FrameCounts
 from phibench.estimator.limits.position_bound import spot_limit
 from phibench.estimator.pair_set import PairTruth
 from phibench.render.sensor.light import Region
@@ -66,6 +67,33 @@ def test_pairs_are_the_frames_of_their_takes(dataset: Dataset, pairs: DatasetPai
         assert pair.card == card_of(frames.by_name["up"].sensor)
         assert (pair.card.output == "mjpeg") == (pair_draw.preset == "mjpeg")
         assert pair.stroke_m == dataset[pair_draw.sample_id].row.stroke_m
+
+
+def test_several_frames_are_a_mean_with_their_number_and_have_their_own_bound(dataset: Dataset) -> None:
+    single = dataset_pairs(dataset, "bayer-raw", pairs=1)
+    several = dataset_pairs(dataset, "bayer-raw", pairs=1, frames=FrameCounts(3, 2))
+    one, many = single.pair(0), several.pair(0)
+    assert [many.count(name) for name in ("down", "up", "down_off", "up_off")] == [3, 3, 2, 2]
+    for name, image in one.images.items():
+        stack = many.stack(name)
+        assert one.count(name) == 1
+        assert stack.dtype == image.dtype
+        assert np.array_equal(stack[0], image)  # the first frame is that of a pair of single ones
+        assert not np.array_equal(stack[0], stack[1])
+        assert np.allclose(many.images[name], stack.mean(axis=0), rtol=1e-6)
+        for held in (stack, many.images[name]):
+            with pytest.raises(ValueError, match="read-only"):
+                held[0, 0] = 0
+    draw = several.pair_draws[0]
+    source = CachedSample(dataset[draw.sample_id]).source(draw)
+    sample, side = dataset[draw.sample_id], source.sides["down"]
+    row, bound = sample.row.down, several.truth(0).down.bound_px2
+    expected = spot_bounds(
+        side, sample.rig, (row.u_px, row.v_px), row.electrons_per_s, row.visible, frames=FrameCounts(3, 2)
+    ).bound_px2
+    assert bound is not None
+    assert expected is not None
+    assert np.allclose(bound, expected)
 
 
 def test_a_report_shows_yuyv_in_colour(dataset: Dataset) -> None:

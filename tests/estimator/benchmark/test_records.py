@@ -46,6 +46,19 @@ def test_pulls_are_the_triangular_solution_and_give_the_mahalanobis_distance():
     assert checked == 60
 
 
+def test_a_depth_is_within_its_own_interval_or_within_1_96_sigma():
+    truth = cases(1).truths[0]
+    down, up, D = Spot(truth.down.uv_px), Spot(truth.up.uv_px), truth.depth_m
+    for answer, expected in (
+        (Answer(down, up, D + 0.1, 0.01), False),
+        (Answer(down, up, D + 0.1, 0.06), True),
+        (Answer(down, up, D + 0.1, 0.01, (D - 0.01, D + 0.2)), True),
+        (Answer(down, up, D + 0.1, 0.06, (D + 0.01, D + 0.2)), False),
+        (Answer(down, up, D + 0.1), None),
+    ):
+        assert one(answer)[0]["depth_within"] is expected
+
+
 @pytest.mark.parametrize(
     "claim",
     [

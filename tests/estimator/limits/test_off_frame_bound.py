@@ -14,14 +14,13 @@ from phibench.estimator.limits.off_frame_bound import (
     FrameCounts,
     on_off_limit,
     processed_on_off_limit,
-    step_correlation,
 )
 from phibench.estimator.limits.position_bound import spot_limit
 from phibench.estimator.limits.processed_bound import chain_limit
 from phibench.estimator.spots.chain_model import chain_model, codes, raw_variance_e2
 from phibench.estimator.spots.fit_chain import unrounded
 from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel, SpotPixels
-from phibench.estimator.spots.jpeg_coefficients import quantised
+from phibench.estimator.spots.jpeg_coefficients import quantised, step_correlation
 from phibench.render.sensor.light import Light
 from phibench.render.sensor.settings import sensor
 
@@ -150,12 +149,12 @@ def test_jpeg_bound_is_that_of_explicit_unknowns(counts: tuple[int, int], steps:
 
 def test_codes_with_off_frames_lie_between_raw_pixels_and_a_jpeg() -> None:
     one = FrameCounts(1, 1)
-    srgb, jpeg = (
+    srgb, yuyv, jpeg = (
         np.trace(processed_on_off_limit(sensor_card(name), (100.3, 100.4), BLUR, 14e3, LEVELS, one).covariance_px2)
-        for name in ("srgb8", "mjpeg")
+        for name in ("srgb8", "yuyv", "mjpeg")
     )
     known = np.trace(chain_limit(sensor_card("srgb8"), (100.3, 100.4), BLUR, 14e3, LEVELS).covariance_px2)
-    assert known < srgb < jpeg
+    assert known < srgb < yuyv < jpeg  # yuyv averages chroma of two pixels
 
 
 @pytest.mark.parametrize("sigma", [0.1, 0.3, 0.6])

@@ -24,6 +24,8 @@ def test_sound_answers_arrive_as_they_were() -> None:
     spot = Spot((1.5, -0.5), ((0.04, 0.01), (0.01, 0.09)), 0.7, "normal")
     whole = Answer(spot, MISSING, 2.5, 0.1)
     assert through(whole) == whole
+    interval = Answer(spot, MISSING, 2.5, 0.1, (2.2, 2.9))
+    assert through(interval) == interval
     numpy_like = Answer(Spot(np.array([1.5, -0.5]), np.eye(2), np.float64(0.7)), MISSING, np.float32(2.5))  # type: ignore[arg-type]
     assert through(numpy_like) == Answer(Spot((1.5, -0.5), ((1.0, 0.0), (0.0, 1.0)), 0.7), MISSING, 2.5)
     assert through(Answer(Spot((np.nan, np.nan), status="too faint"), MISSING)).down == Spot.missing("too faint")
@@ -93,6 +95,11 @@ def test_tensors_are_numbers() -> None:
         (Answer(MISSING, MISSING, -2.0), "depth_m is -2.0: a finite number above 0"),
         (Answer(MISSING, MISSING, math.nan), "depth_m is nan"),
         (Answer(MISSING, MISSING, None, 0.1), "sigma_depth_m comes without depth_m"),
+        (Answer(MISSING, MISSING, None, None, (1.0, 2.0)), "interval_depth_m comes without depth_m"),
+        (Answer(MISSING, MISSING, 2.5, 0.1, (2.6, 2.9)), "two numbers low < high about depth_m"),
+        (Answer(MISSING, MISSING, 2.5, 0.1, (2.5, 2.5)), "two numbers low < high about depth_m"),
+        (Answer(MISSING, MISSING, 2.5, 0.1, (math.nan, 2.9)), "interval_depth_m is nan"),
+        (Answer(MISSING, MISSING, 2.5, 0.1, 0.3), "two numbers (low, high) are needed"),  # type: ignore[arg-type]
         (Answer(Spot(status=""), MISSING), "down.status is ''"),
         (Answer(Spot(status=3), MISSING), "down.status is 3"),  # type: ignore[arg-type]
     ],

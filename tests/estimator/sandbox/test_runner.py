@@ -352,6 +352,24 @@ def test_images_arrive_as_they_were_and_cannot_be_written(sealed: bool, monkeypa
     memory.close()
 
 
+def test_single_frames_arrive_beside_their_means() -> None:
+    small, memory = SmallPairs().pair(0), MemoryFile()
+    rng = np.random.default_rng(1)
+    counts = {"down": 3, "up": 3, "down_off": 2, "up_off": 2}
+    groups = {name: [rng.integers(0, 255, (6, 8, 3), np.uint8) for _ in range(n)] for name, n in counts.items()}
+    sent = Pair.of_frames(4, groups, rig=small.rig, stroke_m=0.5, card=small.card)
+    assert needed_bytes(sent) > sum(image.nbytes for group in groups.values() for image in group)
+    parcel = unpack(pack(sent, memory), SharedPages(memory.reader))
+    for name, group in groups.items():
+        assert parcel.pair.count(name) == len(group)
+        np.testing.assert_array_equal(parcel.pair.stack(name), np.stack(group))
+        np.testing.assert_allclose(parcel.pair.images[name], np.mean(group, axis=0), rtol=1e-6)
+        with pytest.raises(ValueError, match="read-only"):
+            parcel.pair.stack(name)[0, 0, 0, 0] = 1
+    assert parcel.unchanged()
+    memory.close()
+
+
 @pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="Linux alone has sealed memory")
 def test_shared_memory_is_sealed() -> None:
     """Cut short, it would kill the runner with SIGBUS at its next pair."""
