@@ -6,12 +6,14 @@ beam's size once the pair's distance is known. A rough mirror's blur is not pred
 well. The room behind is the laser-off frame, smoothed as far as it is flat (`background_of`). Without one it is a level
 per filter, or, where that does not describe it, what surrounds the spot. A misfit that is left widens the covariance.
 
-`joint_fit` first fits each image by itself: raw pixels by `raw_maximum_likelihood`, processed ones by `chain_fit`. Raw
-pixels are then fitted together (`spots.fit_joint`): with laser-off frames the fit sees on - off + the usual level of
-off, and the off frame's noise is added to the on frame's; without them a level per filter is fitted. Of processed
-pixels it gives means and covariances of the posterior of both images (`joint_posterior`), which knows of valleys and of
-several minima; D is the posterior's mean. Where the maps do not hold the posterior, the two positions are combined by
-their covariances (`combine`). Where the two are not one point, the separate answer stands, without a depth of its own.
+`joint_fit` first fits each image by itself: raw pixels by `raw_maximum_likelihood`, processed ones by `chain_fit`. It
+then gives means, covariances and a 95 % interval of the posterior of both images (`joint_posterior`), which knows of
+valleys and of several minima; D is the posterior's mean. Of raw pixels with laser-off frames the likelihood is that of
+on - off, with the noise of both and the pattern of the spot alone. Where the maps do not hold the posterior, raw pixels
+are fitted together (`spots.fit_joint`) and the positions of processed ones combined by their covariances (`combine`).
+Where the two are not one point, the separate answer stands, without a depth of its own.
+
+Several frames: means are fitted. Photons, read noise and rounding fall with their number; what frames share does not.
 """
 
 from __future__ import annotations

@@ -153,7 +153,7 @@ def test_boxes_for_every_pair_are_those_of_a_recipe_that_has_them(dataset: Datas
 def test_a_pair_knows_nothing_of_the_scene(pairs: DatasetPairs) -> None:
     """All that a pair has besides images: number, rig, stroke, card, boxes; none of them a number of the truth."""
     names = {field.name for field in fields(Pair)}
-    images = {"down", "up", "down_off", "up_off"}
+    images = {"down", "up", "down_off", "up_off", "frames"}
     known = {"number", "rig", "calibration_covariance", "stroke_m", "card", "beam", "box_down", "box_up"}
     assert names - images == known
     for pair, truth in every(pairs):
