@@ -419,7 +419,7 @@ def _own_interval(answer: Answer | None) -> tuple[float, float]:
 
 
 def _within(depth: Array, true_m: Array, pull: Array, intervals: Array, added_m: Array) -> list[bool | None]:
-    """Whether D lies in the claimed interval, None where none is claimed; `added_m` are errors that it leaves out."""
+    """Truth of D in the claimed interval, None where none is claimed; `added_m` are errors that it leaves out."""
     more = WITHIN * np.nan_to_num(added_m)
     low, high = depth - np.hypot(depth - intervals[:, 0], more), depth + np.hypot(intervals[:, 1] - depth, more)
     inside = np.where(np.isfinite(low), (low <= true_m) & (true_m <= high), np.abs(pull) <= WITHIN)
