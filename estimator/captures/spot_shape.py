@@ -19,7 +19,7 @@ import numpy as np
 
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.geometry.status import Status
-from phibench.estimator.interface import Answer, Image, Pair, Spot
+from phibench.estimator.interface import Answer, Pair, Spot
 from phibench.estimator.methods.chain_fit import spot_outputs
 from phibench.estimator.methods.locate import pair_blur, seen_depth_m
 from phibench.estimator.methods.raw_likelihood import raw_spot_data
@@ -106,8 +106,7 @@ class SpotImage:
     """One picture of a spot near (u, v), with the distance, if it is known."""
 
     pair: Pair
-    image: Image
-    off: Image | None
+    position: str
     uv_px: Array
     depth_m: float | None
 
@@ -116,7 +115,7 @@ def spot_images(pair: Pair, down: Spot, up: Spot) -> dict[str, SpotImage]:
     """Pictures of a pair, by position, in which a spot was seen."""
     depth_m = seen_depth_m(pair, Answer(down, up))
     return {
-        name: SpotImage(pair, pair.images[name], pair.images.get(f"{name}_off"), np.array(spot.uv_px), depth_m)
+        name: SpotImage(pair, name, np.array(spot.uv_px), depth_m)
         for name, spot in zip(POSITIONS, (down, up), strict=True)
         if spot.uv_px is not None
     }
@@ -193,10 +192,8 @@ class _Linear:
 
 
 def _outputs(image: SpotImage) -> _Outputs:
-    given = image.image, image.off
-    if image.pair.card.output == "raw":
-        return raw_spot_data(*given, image.pair, image.uv_px, image.depth_m)
-    return spot_outputs(image.pair, *given, image.uv_px, image.depth_m)
+    outputs = raw_spot_data if image.pair.card.output == "raw" else spot_outputs
+    return outputs(image.pair, image.position, image.uv_px, image.depth_m)
 
 
 def _linear(image: SpotImage, outputs: _Outputs, values: Array, theta: Array | None) -> _Linear | None:
