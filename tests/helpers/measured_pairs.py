@@ -1,24 +1,27 @@
 """Figures of `phibench measure`: pairs of one rig written as camera files, calibrated and measured from them alone.
 
     phibench dataset make tests/one_rig.toml --out FOLDER
-    python tests/helpers/measured_pairs.py FOLDER PICTURES [mjpeg | bayer-raw [own]]
+    PYTHONPATH=tests python tests/helpers/measured_pairs.py FOLDER PICTURES [mjpeg | bayer-raw] [own] [sensor] [0 | 1]
 
 The rig file says what the drawing says, `[rig]` without any number: the true rig is off by its `[misalignment]`, and
-its blur and filters are others. A third of the samples calibrate it, at the distances of a tape of 2 mm. The others are
-measured by the calibration, with `own` by their own outlines alone, too, and by the scorer that knows the true rig and
-stroke.
+its blur and filters are others. A third of the samples, by the number 0 to 2, calibrate it, at the distances of a tape
+of 2 mm. The others are measured by the calibration, with `own` by their own outlines alone, too, and by the scorer that
+knows the true rig and stroke. With `sensor` the sensor is fitted to dark and flat raw frames of the same camera first.
 """
 
 from __future__ import annotations
 
+import shutil
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from helpers.sensor_captures import write_raw_capture
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.frame_files import png_bytes
+from phibench.datasets.frames.sensor_file import write_sensor_file
 from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.estimator.captures.imported_calibration import calibrate_imported
 from phibench.estimator.captures.imported_set import import_pairs
@@ -27,6 +30,8 @@ from phibench.estimator.captures.picture_files import read_photo
 from phibench.estimator.draw_pairs import pairs_of
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.methods.registry import METHODS
+from phibench.estimator.sensor_fit.fit import fit_sensor
+from phibench.render.sensor.settings import sensor
 
 TAPE_M, PART = 0.002, 3
 NAMES = ("down", "up", "down_off", "up_off")
@@ -66,6 +71,14 @@ def write_files(dataset: Dataset, samples: list[Sample], folder: Path, preset: s
         lines.append(f"{sample.row.sample_id},{','.join(files)},{sample.row.nominal_stroke_m},{tape_m:.4f},{TAPE_M}")
     (folder / "pairs.csv").write_text("\n".join(lines) + "\n")
     (folder / "rig.toml").write_text("[rig]\n")
+
+
+def write_sensor(pictures: Path) -> Path:
+    """Sensor file of dark and flat raw frames of the simulated camera; the set that calibrates takes it, too."""
+    found = fit_sensor(write_raw_capture(pictures / "capture", sensor("bayer-raw")))
+    write_sensor_file(pictures / "sensor.toml", found.file)
+    shutil.copy(pictures / "sensor.toml", pictures / "calibrate" / "sensor.toml")
+    return pictures / "sensor.toml"
 
 
 def known(dataset: Dataset, sample: Sample, preset: str) -> float:
@@ -127,16 +140,17 @@ def main(arguments: list[str]) -> None:
     """Print the figures."""
     dataset, pictures = open_finished(arguments[0]), Path(arguments[1])
     preset = arguments[2] if len(arguments) > 2 else "mjpeg"
-    samples = seen(dataset)
-    first, rest = samples[::PART], [sample for k, sample in enumerate(samples) if k % PART]
+    samples, which = seen(dataset), next((int(word) for word in arguments if word in ("0", "1", "2")), 0)
+    first, rest = samples[which::PART], [sample for k, sample in enumerate(samples) if k % PART != which]
     write_files(dataset, first, pictures / "calibrate", preset)
+    sensor_file = write_sensor(pictures) if "sensor" in arguments else None
     write_files(dataset, rest, pictures / "measure", preset)
     import_pairs(pictures / "calibrate", pictures / "set")
     calibration = calibrate_imported(pictures / "set", pictures / "rig.json", spots=True)
     print(calibration.verdict, flush=True)
     rig = pictures / "measure" / "rig.toml"
-    settings = [("calibrated", read_setting(rig, pictures / "rig.json"))]
-    settings += [("own outlines", read_setting(rig))] if "own" in arguments else []
+    settings = [("calibrated", read_setting(rig, pictures / "rig.json", sensor_file))]
+    settings += [("own outlines", read_setting(rig, sensor=sensor_file))] if "own" in arguments else []
     for name, setting in settings:
         rows = [measured(dataset, sample, pictures / "measure", preset, setting) for sample in rest]
         print(summary(name, [row for row in rows if row is not None]), flush=True)
