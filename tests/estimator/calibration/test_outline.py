@@ -13,7 +13,7 @@ from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.calibration.limb_image import Plane, Tap, binned, planes_of
 from phibench.estimator.calibration.outline import _approach as approach
 from phibench.estimator.calibration.outline import binned_rig, find_outline, fit_outline, visible_arc
-from phibench.estimator.calibration.outline_fit import Sectors, _medians, scatter
+from phibench.estimator.calibration.outline_fit import Sectors, _medians, scatter, step_from
 from phibench.estimator.calibration.outline_start import (
     grey,
     plain_circle,
@@ -114,6 +114,26 @@ def test_a_long_picture_is_fitted_in_squares_first(case, frames, monkeypatch: py
     assert (np.abs(found.sphere_in_camera_m - whole.sphere_in_camera_m) < 0.2 * whole.sigma_m).all()
     assert np.allclose(found.sigma_m, whole.sigma_m, rtol=0.1)
     assert np.allclose((binned_rig(rig, 2).outline_px() + 0.5) * 2.0 - 0.5, rig.outline_px())
+
+
+def test_a_hopeless_fit_ends_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A dark disc on a bright wall is an outline, but no light of polished steel: 30 steps would not come to rest."""
+    rig = Rig()
+    v, u = np.mgrid[: rig.camera.height_px, : rig.camera.width_px]
+    middle = rig.outline_px().mean(axis=0)
+    radius = float(np.hypot(*(rig.outline_px() - middle).T).mean())
+    light = np.where(np.hypot(u - middle[0], v - middle[1]) < radius - 1.0, 0.2, 1.0)
+    light = light + 0.02 * np.random.default_rng(5).standard_normal(light.shape)
+    steps = []
+
+    def counted(*arguments, **options):
+        steps.append(step_from(*arguments, **options))
+        return steps[-1]
+
+    monkeypatch.setattr("phibench.estimator.calibration.outline.step_from", counted)
+    with pytest.raises(ImageError, match="without a mirror"):
+        fit_outline(planes_of(np.stack([light] * 3)), rig, rig.sphere_in_camera_m)
+    assert len(steps) <= 6 + 6  # to come near, and to see that it leads nowhere
 
 
 @pytest.mark.parametrize("block", [2, 3])
