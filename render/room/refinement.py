@@ -51,7 +51,7 @@ class Cells:
     budget : float
         Largest allowed error by noise, one of `noise_budget.BUDGETS`.
     lamps : array, shape (rows, columns), int32
-        Lamp that is seen at each cell or close to it, -1 for none.
+        Lamp whose part of each cell is computed, -1 for none.
     """
 
     grid: FilmGrid
@@ -83,8 +83,9 @@ def render_refined(film: Film, window: Crop, rounds: int, budget: float) -> tupl
         halves = [half.electrons_per_s.sum(axis=0).reshape(numbers.shape)[part] for half in (a, b)]
         own = [np.ascontiguousarray(plane[:, *part]) for plane in (mean, variance)]  # changed in place
         inner = (np.ascontiguousarray(pixels[0][:, *box]), np.ascontiguousarray(pixels[1][:, *box]))
-        lamps = _lamps_near(film, [half.patch.reshape(numbers.shape)[part] for half in (a, b)])
-        cells = _cells(grid, numbers[part].copy(), own, inner, halves, mirrored[box], budget, lamps)
+        own_numbers = numbers[part].copy()
+        lamps = _lamps_near(film, own_numbers, [half.patch.reshape(numbers.shape)[part] for half in (a, b)])
+        cells = _cells(grid, own_numbers, own, inner, halves, mirrored[box], budget, lamps)
         for turn in range(1, rounds + 1):
             if not refine(film, cells, turn):
                 break
@@ -199,6 +200,22 @@ def _sample_again(film: Film, cells: Cells, chosen: NDArray[np.intp], side: NDAr
             numbers = cells.numbers.ravel()[chosen[part]]
             halves = (film.sample(numbers, side[part], 2 * turn + half, near) for half in (0, 1))
             _replace(cells, chosen[part], side[part], *halves)
+    _without_hidden_lamps(film, cells, turn)
+
+
+def _without_hidden_lamps(film: Film, cells: Cells, turn: int) -> None:
+    """Sample cells again by chance around those whose mean is negative: no cell that sees its lamp has such a mean."""
+    computed = (cells.side > 1) & (cells.lamps >= 0)
+    negative = computed & (cells.mean.min(axis=0) < 0.0)
+    if not negative.any():
+        return
+    around = _in_reach(cells.grid, negative)
+    again = np.flatnonzero(around & computed)
+    cells.lamps[around] = -1
+    side = cells.side.ravel()[again]
+    halves = (film.sample(cells.numbers.ravel()[again], side, 2 * turn + half, None) for half in (0, 1))
+    _replace(cells, again, side, *halves)
+    _update(cells, again)
 
 
 def _replace(cells: Cells, chosen: NDArray[np.intp], side: NDArray[np.int32], a: Samples, b: Samples) -> None:
@@ -210,13 +227,32 @@ def _replace(cells: Cells, chosen: NDArray[np.intp], side: NDArray[np.int32], a:
     cells.side.ravel()[chosen] = side
 
 
-def _lamps_near(film: Film, patches: list[NDArray[np.uint32]]) -> NDArray[np.int32]:
-    """Brightest lamp that samples of cells within the blur's reach met, shape (rows, columns), -1 for none."""
+def _lamps_near(film: Film, numbers: NDArray[np.uint32], patches: list[NDArray[np.uint32]]) -> NDArray[np.int32]:
+    """Brightest lamp that samples of cells within the blur's reach met, shape (rows, columns), -1 for none.
+
+    None either where a sample in reach met the outline of that lamp but not the lamp. What a hidden lamp would cover
+    is noise, of few and large errors: the halves of a cell agree by chance on a wrong mean.
+    """
     if film.lamps is None:
         return np.full(patches[0].shape, -1, dtype=np.int32)
     seen = np.maximum(*(film.lamps.lamp(patch) for patch in patches))
-    reach = film.grid.cells * _reach_px(film.grid)
-    return np.asarray(ndimage.maximum_filter(seen, size=2 * reach + 1, mode="nearest"))
+    lamps = np.asarray(ndimage.maximum_filter(seen, size=2 * _reach_cells(film.grid) + 1, mode="nearest"))
+    near = np.flatnonzero(lamps >= 0)
+    if near.size:
+        chosen = numbers.ravel()[near], lamps.ravel()[near]
+        hidden = np.zeros(lamps.shape, dtype=bool)
+        hidden.ravel()[near] = film.hidden(chosen[0], 0, chosen[1]) | film.hidden(chosen[0], 1, chosen[1])
+        lamps[_in_reach(film.grid, hidden)] = -1
+    return lamps
+
+
+def _reach_cells(grid: FilmGrid) -> int:
+    return grid.cells * _reach_px(grid)
+
+
+def _in_reach(grid: FilmGrid, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cells within the blur's reach of some."""
+    return np.asarray(ndimage.maximum_filter(cells, size=2 * _reach_cells(grid) + 1, mode="nearest"))
 
 
 def _estimate(a: Samples, b: Samples) -> tuple[Stack, Stack]:

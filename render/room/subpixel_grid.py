@@ -225,6 +225,21 @@ class Film:
         none = np.zeros((3, len(numbers)), dtype=np.float32)
         return Samples(_planes(value), none, np.array(mirrored, dtype=bool), np.array(patch, dtype=np.uint32))
 
+    def hidden(self, numbers: NDArray[np.uint32], stream: int, lamp: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """Whether the points of `sample_once` lie within a lamp's outline and see something else; shape (n,)."""
+        import drjit as dr
+
+        assert self.lamps is not None
+        mi = self._mi
+        lanes = mi.UInt32(aligned(numbers, np.uint32))
+        x = shifts(mi, lanes, self._dimensions, dr.opaque(mi.UInt32, self._key(stream)))
+        corner, h = self._corner(lanes)
+        u, v = (start + mi.Float64(value) * h for start, value in zip(corner, x[:2], strict=True))
+        _, _, patch, ray = self._look.electrons(u, v, x[2:])
+        met = self.lamps.meets(ray, mi.Int32(aligned(lamp, np.int32)))
+        dr.eval(met, patch)
+        return np.array(met, dtype=bool) & (self.lamps.lamp(np.array(patch, dtype=np.uint32)) != lamp)
+
     def sample(
         self, numbers: NDArray[np.uint32], side: NDArray[np.int32], stream: int, lamp: NDArray[np.int32] | None
     ) -> Samples:

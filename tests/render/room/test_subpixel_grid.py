@@ -11,8 +11,10 @@ from helpers.oracles import TARGETS
 from helpers.path_ambient import path_trace
 from scipy.special import ndtr
 
+from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.spot_layer import spot_layer
-from phibench.render.optics.truth import spot_truth
+from phibench.render.optics.truth import spot_truth, truth_layer
+from phibench.render.room import refinement
 from phibench.render.room.ambient import render_ambient, view_film, view_surfaces
 from phibench.render.room.light_map import BakeSettings, LightMap, bake
 from phibench.render.room.noise_budget import (
@@ -31,6 +33,8 @@ from phibench.render.room.subpixel_grid import Film, FilmGrid, _chunks, golden_s
 from phibench.render.setup.variant import activate
 from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
+from phibench.scenes.shapes import rectangle
+from phibench.scenes.textures import Uniform
 
 ROOM, RIG = lab(TARGETS), default_rig()
 SETTINGS = BakeSettings(lamp_rays=16, bounces=4, bounce_rays=16, final_rays=64)
@@ -195,6 +199,40 @@ def test_cells_at_lamps_need_few_samples(film: Film, outline: tuple[np.ndarray, 
         return float(np.median(np.std(runs, axis=0)))
 
     assert noise(6, lamp) < noise(32, None) < noise(6, None)
+
+
+def test_a_lamp_that_something_hides_is_left_to_chance(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A board under half of a lamp: no pixel is negative, and the noise is what is stated.
+
+    The computed part of a hidden lamp is noise: most cells get a little light, a few lose a lamp. Their halves agree by
+    chance, so that the variance of 8 seeds is above four times the budget in many pixels; by chi2(7) noise at the
+    budget is so in one of 4000.
+    """
+    lamp = next(one for one in ROOM.surfaces if one.name == "lamp_4")
+    x, y, z = lamp.T_world_shape.t
+    size = (0.5 * lamp.size_m[0], 2.0 * lamp.size_m[1])
+    board = rectangle("board", (x, y, z - 0.3), (0, 0, -1), size, texture=Uniform((0.5,) * 3))
+    room = dataclasses.replace(ROOM, furniture=(*ROOM.furniture, board))
+    settings = BakeSettings(texel_m=0.2, indirect_texel_m=0.4, lamp_rays=4, bounces=1, bounce_rays=4, final_rays=4)
+    coarse, surfaces = bake(RIG.at(0.0), room, settings), view_surfaces(VIEW, room)
+    ids = truth_layer(VIEW, room_geometry(room, VIEW), surfaces.first_patch)["object_id"]
+    v, u = np.argwhere(ids == [one.name for one in room.shapes(VIEW)].index("board")).mean(axis=0).astype(int)
+
+    def found() -> tuple[float, float]:
+        layers = [
+            render_ambient(VIEW, room, coarse, settings, 2, seed, (u - 16, v - 16, 32, 32), surfaces=surfaces)
+            for seed in range(8)
+        ]
+        values = np.array([layer.electrons_per_s for layer in layers], dtype=float)
+        allowed = allowed_per_s2(values.mean(axis=0).astype(np.float32), RIG.camera.blur_sigma_px, BUDGET)
+        return float(values.min()), float(np.mean(values.var(axis=0, ddof=1) > 4.0 * allowed))
+
+    least, over = found()
+    assert least >= 0.0
+    assert over < 0.005
+    monkeypatch.setattr(Film, "hidden", lambda self, numbers, stream, lamp: np.zeros(len(numbers), dtype=bool))
+    monkeypatch.setattr(refinement, "_without_hidden_lamps", lambda film, cells, turn: None)
+    assert found()[1] > 0.02
 
 
 def test_samples_of_a_cell_are_shared_among_lanes(film: Film) -> None:
