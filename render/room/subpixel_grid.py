@@ -226,7 +226,7 @@ class Film:
         return Samples(_planes(value), none, np.array(mirrored, dtype=bool), np.array(patch, dtype=np.uint32))
 
     def hidden(self, numbers: NDArray[np.uint32], stream: int, lamp: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Whether the points of `sample_once` lie within a lamp's outline and see something else; shape (n,)."""
+        """True where the point of `sample_once` lies within a lamp's outline and sees something else; shape (n,)."""
         import drjit as dr
 
         assert self.lamps is not None
