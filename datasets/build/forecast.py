@@ -224,15 +224,17 @@ class Pace:
     def left_s(self, waiting: Mapping[str, int], running: Iterable[tuple[str, float]], width: int) -> float:
         """Seconds until all have ended: tasks that wait by kind, and kind and age of those that run.
 
-        Views and samples wait for the light map, which is one task.
+        Views and samples wait for light maps, each of which is one task.
         """
         left = {kind: count * self.seconds(kind) for kind, count in waiting.items()}
+        bakes = waiting.get("bake", 0)
         for kind, age_s in running:
+            bakes += kind == "bake"
             # a task that takes longer than expected is likely to go on for a while
             left[kind] = left.get(kind, 0.0) + max(self.seconds(kind) - age_s, 0.2 * age_s)
         bake_s, total_s = left.get("bake", 0.0), sum(left.values())
         after_bake_s = total_s - bake_s - left.get("spot", 0.0)
-        return max(total_s / width, bake_s + after_bake_s / width)
+        return max(total_s / width, bake_s / max(min(bakes, width), 1) + after_bake_s / width)
 
 
 class TaskProgress:

@@ -102,6 +102,7 @@ def render_ambient(
     film = view_film(view, room, light, settings, cells_per_pixel, seed, surfaces or view_surfaces(view, room))
     layers = [_band(film, band, window, rounds, budget) for band in _bands(film.grid, window)]
     dr.flush_kernel_cache()  # other mirrors need other kernels; those of the next view are read from Dr.Jit's own cache
+    dr.flush_malloc_cache()  # arrays that it keeps for the next time: those of a bake and of a view add up
     return AmbientLayer(*(np.concatenate([pair[i] for pair in layers], axis=1) for i in (0, 1)))
 
 

@@ -82,6 +82,8 @@ def texel_count(room: Room, texel_m: float) -> int:
 def bake(view: View, room: Room, settings: BakeSettings) -> LightMap:
     """Light map of a room; `view` only gives the origin of the scene's coordinates."""
     mi = activate()
+    import drjit as dr
+
     surfaces = Surfaces(mi, view, face_table(fixed_shapes(room)))
     grid = TexelGrid.of(surfaces.table, settings.texel_m)
     if not grid.count:  # all surfaces shine by themselves
@@ -98,6 +100,7 @@ def bake(view: View, room: Room, settings: BakeSettings) -> LightMap:
     )
     surfaces.set_light(fine.grid, lit)
     mean, sigma = _indirect(mi, surfaces, fine, covered, settings)
+    dr.flush_malloc_cache()  # arrays that Dr.Jit keeps for the next time, of other sizes than a view's
     total = np.maximum(mean, 0.0) + np.maximum(lamps, 0.0)  # a straight line through noise may end below 0
     return LightMap(total.astype(np.float32), np.hypot(noise, sigma).astype(np.float32), covered)
 

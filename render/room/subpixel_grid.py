@@ -14,7 +14,7 @@ lane, dimension and seed, so that lanes are independent.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from types import ModuleType
 from typing import Any
@@ -174,6 +174,7 @@ def _uniform(mi: ModuleType, word: Any) -> Any:
 _PARTS = 2  # of a cell, along a side, in each of which the map to a lamp is linear
 _LENS_POINTS = 32  # for each of the strata along a cell's side
 _CHUNK = 256  # samples of a cell that one lane takes: the few cells with thousands share them among many lanes
+_CELLS_AT_A_TIME = 1 << 19
 
 
 @dataclass(frozen=True)
@@ -185,7 +186,7 @@ class Samples:
     electrons_per_s : array, shape (3, n), float32
         Mean over the cell, per square pixel.
     spread : array, shape (3, n), float32
-        Variance of single samples, without what the outlines of lamps contribute.
+        Variance of single samples, without what the outlines of lamps contribute; (3, 0) of a single one.
     mirrored : bool array, shape (n,)
         Whether a sample saw the mirror.
     patch : array, shape (n,), uint32
@@ -213,6 +214,9 @@ class Film:
 
     def sample_once(self, numbers: NDArray[np.uint32], stream: int) -> Samples:
         """Sample cells, shape (n,), with one point each."""
+        return _joined([self._once(part, stream) for part in np.split(numbers, _starts(len(numbers)))])
+
+    def _once(self, numbers: NDArray[np.uint32], stream: int) -> Samples:
         import drjit as dr
 
         mi = self._mi
@@ -222,7 +226,7 @@ class Film:
         u, v = (start + mi.Float64(value) * h for start, value in zip(corner, x[:2], strict=True))
         value, mirrored, patch, _ = self._look.electrons(u, v, x[2:])
         dr.eval(value, mirrored, patch)
-        none = np.zeros((3, len(numbers)), dtype=np.float32)
+        none = np.zeros((3, 0), dtype=np.float32)
         return Samples(_planes(value), none, np.array(mirrored, dtype=bool), np.array(patch, dtype=np.uint32))
 
     def hidden(self, numbers: NDArray[np.uint32], stream: int, lamp: NDArray[np.int32]) -> NDArray[np.bool_]:
@@ -247,6 +251,14 @@ class Film:
 
         Where `lamp` is -1 there is none; None if there is none anywhere.
         """
+        starts = _starts(len(numbers))
+        parts = [None] * (len(starts) + 1) if lamp is None else np.split(lamp, starts)
+        split = zip(np.split(numbers, starts), np.split(side, starts), parts, strict=True)
+        return _joined([self._again(some, points, stream, near) for some, points, near in split])
+
+    def _again(
+        self, numbers: NDArray[np.uint32], side: NDArray[np.int32], stream: int, lamp: NDArray[np.int32] | None
+    ) -> Samples:
         import drjit as dr
 
         mi, key = self._mi, self._key(stream)
@@ -333,6 +345,19 @@ def _chunks(side: NDArray[np.int32]) -> tuple[NDArray[np.intp], NDArray[np.intp]
     stop = np.minimum(start + _CHUNK, samples[cell])
     order = np.argsort(start - stop, kind="stable")
     return cell[order], start[order], stop[order]
+
+
+def _starts(cells: int) -> range:
+    """Where parts of some cells begin, but for the first: what is sampled at a time bounds the memory."""
+    return range(_CELLS_AT_A_TIME, cells, _CELLS_AT_A_TIME)
+
+
+def _joined(parts: list[Samples]) -> Samples:
+    """Samples of all parts, in their order."""
+    if len(parts) == 1:
+        return parts[0]
+    names = [field.name for field in fields(Samples)]
+    return Samples(*(np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in names))
 
 
 def _planes(colour: Any) -> Stack:

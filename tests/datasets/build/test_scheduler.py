@@ -145,6 +145,9 @@ def test_the_forecast_learns_from_the_tasks_of_the_run() -> None:
     """A machine four times slower than the first guess; kernels are compiled in the first view of both workers."""
     pace = Pace(SECONDS, 1.0, workers=2)
     assert pace.left_s({"bake": 1, "view": 10, "spot": 5}, [], 2) == pytest.approx(80.0 + 22.5)
+    # two workers bake two rooms at a time
+    assert pace.left_s({"bake": 12}, [], 2) == pytest.approx(12 * 80.0 / 2)
+    assert pace.left_s({"bake": 1}, [], 2) == pytest.approx(80.0)
     for _ in range(25):
         pace.add("spot", 0.8)
     assert pace.seconds("view") == pytest.approx(4.0 * 4.5, rel=0.3)

@@ -29,7 +29,7 @@ from phibench.render.room.noise_budget import (
     webcam,
 )
 from phibench.render.room.refinement import _cells
-from phibench.render.room.subpixel_grid import Film, FilmGrid, _chunks, golden_steps, shifts
+from phibench.render.room.subpixel_grid import Film, FilmGrid, Samples, _chunks, golden_steps, shifts
 from phibench.render.setup.variant import activate
 from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
@@ -246,6 +246,23 @@ def test_samples_of_a_cell_are_shared_among_lanes(film: Film) -> None:
     whole = film.sample(numbers, side, 3, None).electrons_per_s
     alone = [film.sample(numbers[[k]], side[[k]], 3, None).electrons_per_s[:, 0] for k in range(6)]
     assert np.array_equal(whole, np.stack(alone, axis=1))
+
+
+def test_cells_sampled_in_parts_get_the_same_bits(
+    film: Film, outline: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Seven cells at a time, the last part shorter, against all at once: one sample each, and refined ones."""
+    numbers, lamp = outline[0][:40], outline[1][:40].astype(np.int32)
+    side = np.tile(np.array([2, 17], dtype=np.int32), 20)
+
+    def sampled() -> list[Samples]:
+        return [film.sample_once(numbers, 0), film.sample(numbers, side, 3, None), film.sample(numbers, side, 3, lamp)]
+
+    whole = sampled()
+    monkeypatch.setattr("phibench.render.room.subpixel_grid._CELLS_AT_A_TIME", 7)
+    for one, other in zip(whole, sampled(), strict=True):
+        for field in dataclasses.fields(Samples):
+            assert np.array_equal(getattr(one, field.name), getattr(other, field.name)), field.name
 
 
 def test_pixels_that_look_full_by_chance_are_refined(
