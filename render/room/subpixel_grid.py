@@ -348,7 +348,7 @@ def _chunks(side: NDArray[np.int32]) -> tuple[NDArray[np.intp], NDArray[np.intp]
 
 
 def _starts(cells: int) -> range:
-    """Where parts of some cells begin, but for the first: what is sampled at a time bounds the memory."""
+    """Beginnings of parts of some cells, without the first: what is sampled at a time bounds the memory."""
     return range(_CELLS_AT_A_TIME, cells, _CELLS_AT_A_TIME)
 
 
