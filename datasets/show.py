@@ -81,14 +81,15 @@ def _console() -> Console:
 
 
 def table(dataset: Dataset) -> Table:
-    """Table of all samples."""
+    """Table of all samples; each one's room takes the place of its experiment where there are several."""
     result = Table(title=_title(dataset), box=box.SIMPLE)
-    for heading in ("sample", "experiment"):
+    several = len({row.room for row in dataset.rows}) > 1
+    for heading in ("sample", "room" if several else "experiment"):
         result.add_column(heading, no_wrap=True)
     for heading in ("D (m)", "h (m)", "down u, v (px)", "up u, v (px)", "phi_ray (deg)", "visible", "certificate"):
         result.add_column(heading, justify="right", no_wrap=True)
     for row in dataset.rows:
-        result.add_row(*_cells(row))
+        result.add_row(*_cells(row, row.room if several else row.experiment))
     return result
 
 
@@ -148,11 +149,11 @@ def _certificate(spot: SpotRow) -> str:
     return "passed" if spot.certificate.passed else "failed"
 
 
-def _cells(row: ManifestRow) -> tuple[str, ...]:
+def _cells(row: ManifestRow, group: str) -> tuple[str, ...]:
     spots = (row.down, row.up)
     return (
         row.sample_id,
-        row.experiment,
+        group,
         f"{row.depth_m:.3f}",
         f"{row.stroke_m:.3f}",
         *(_pixel(spot) for spot in spots),

@@ -62,6 +62,8 @@ def export_room(name: str | None, seed: int | None, properties: Sequence[str] = 
         if properties:
             raise RoomError("--set is for generated rooms; leave it out, or give --seed instead of --room")
         return replace(NamedRoom(name, ()).build(), robot=False)
+    if seed is not None and not 0 <= seed < 2**63:
+        raise RoomError(f"--seed {seed}: must be a whole number from 0 to 2^63 - 1")
     stream = ("export", int(seed or 0))
     fixed = (dict(_BOX) if box else {}) | dict(_property(text) for text in properties)
     return replace(generate_room(drawn_properties(*stream, **fixed), *stream), robot=False)
@@ -99,6 +101,9 @@ def export_panorama(
     within("panorama", "rows", rows, _LEAST_ROWS, _MOST_ROWS)
     if (solid := room.solid_around(point_m)) is not None:
         raise RoomError(f"point_m = {point_m}: the camera would be inside '{solid}'; move it into the open")
+    low, high = bounds_m(room)
+    if not all(a < x < b for a, x, b in zip(low, point_m, high, strict=True)):
+        raise RoomError(f"point_m = {point_m}: outside the room, {low.round(2)} to {high.round(2)} m; move it inside")
     view = default_rig().at(0.0)
     light = light_map(view, room, settings)
     radiance, closed = equirectangular(view, room, light, settings, point_m, heading_deg, rows)
@@ -107,7 +112,6 @@ def export_panorama(
         raise RoomError(f"point_m = {point_m}: the room {text} from there; give a point inside a lit room, metres")
     header = {"kind": "panorama", "room": room.name, "point_m": list(point_m), "heading_deg": heading_deg}
     write_exr(out, {name: radiance[..., k] for k, name in enumerate("RGB")}, header)
-    low, high = bounds_m(room)
     box = [float(low[0]), float(high[0]), float(low[1]), float(high[1]), float(high[2])]
     lines = (
         "[[rooms.panoramas]]",

@@ -12,6 +12,7 @@ from phibench.datasets.build.bake_task import bake_settings, read_light_map
 from phibench.datasets.build.tasks import Made
 from phibench.datasets.plan.plan import PosePlan
 from phibench.datasets.recipe.tables import AmbientTable
+from phibench.datasets.rooms.room_errors import RoomError
 from phibench.datasets.rooms.room_sources import RoomSource, room_of
 from phibench.datasets.store import schema
 from phibench.datasets.store.layers import write_ambient, write_truth
@@ -49,6 +50,8 @@ def render_view(out: Path, dataset: str, rig: Rig, source: RoomSource, pose: Pos
     else:
         layer = dark_layer(rig.camera)
     planes = layer.electrons_per_s
+    if room.lit and not planes.any():
+        raise RoomError(f"room {pose.room}: no light reaches the camera; move its lamps inside, facing the room")
     truth = truth_layer(view, room_geometry(room, view), surfaces.first_patch)
     header_ambient = {**header, **ambient.model_dump(), "seed": pose.seed}
     write_ambient(out / schema.view_file(pose.pose_id, "ambient"), planes, layer.variance_per_s2, header_ambient)

@@ -221,7 +221,7 @@ class AmbientTable(Table):
 
     quality: Literal["reference", "training"] = Field(
         default="reference",
-        description="noise of the room's light: below a quarter of the sensor's, or below a half, in less time",
+        description="noise of the room's light in the mirror: below a quarter of the sensor's, or below a half",
     )
     cells_per_pixel: int = Field(
         default=2, ge=2, le=32, description="cells along a pixel's side; two samples each, more where noise asks for it"

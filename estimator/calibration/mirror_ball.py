@@ -37,6 +37,7 @@ from phibench.scenes.rig import Rig, View
 
 SUFFIXES = (".exr", ".png")
 MOST_COLUMNS = 8192
+READABLE_COLUMNS = 2880  # four planes of float32 then have less than the 64 MiB that a recipe reads
 _RIM = (0.005, 1.0)  # of the outline's radius, and pixels: inside it the background blurs into the ball
 _NODES = 20_000  # 1.6e-4 rad: linear between them errs by less than 1e-8 rad
 _ROWS_AT_ONCE = 128
@@ -193,7 +194,8 @@ def unwrap(light: NDArray[np.float32], ball: Ball, surroundings_m: float, width_
     surroundings_m : float
         Distance of the surroundings from the ball's centre.
     width_px : int, or None
-        Columns, even; by default as fine as the photograph is in the ball's middle, at most 8192. Fewer are averaged.
+        Columns, even; by default as fine as the photograph is in the ball's middle, at most 2880: then a recipe reads
+        the file. Fewer are averaged.
 
     Raises
     ------
@@ -203,7 +205,7 @@ def unwrap(light: NDArray[np.float32], ball: Ball, surroundings_m: float, width_
     if not surroundings_m > 1.5 * ball.view.rig.mirror.radius_m:
         raise DatasetError(f"--surroundings-m {surroundings_m:g}: must be above 1.5 radii of the ball")
     native = math.pi * ball.circle_px[2]
-    width = min(MOST_COLUMNS, max(32, 2 * round(native / 2.0))) if width_px is None else width_px
+    width = min(READABLE_COLUMNS, max(32, 2 * round(native / 2.0))) if width_px is None else width_px
     if not 32 <= width <= MOST_COLUMNS or width % 2:
         raise DatasetError(f"--width {width}: must be an even number from 32 to {MOST_COLUMNS}")
     parts = max(1, math.ceil(native / width - 0.01))

@@ -52,7 +52,7 @@ def from_mirror_ball(
     camera_elevation_deg
         Of the camera's axis above the horizon: 0 horizontal, 90 looking up at the ball.
     width
-        Columns of the panorama, even; by default as fine as the photograph.
+        Columns of the panorama, even; by default as fine as the photograph, up to the 2880 that a recipe reads.
     """
     from phibench.datasets.rooms.panorama_files import read_light
     from phibench.datasets.store.files import require_writable

@@ -1,5 +1,6 @@
 """Data sets with rooms of three kinds, generated, photographed and of a mesh: whole, without their files, damaged."""
 
+import io
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,6 +11,7 @@ import pytest
 from helpers.inline_workers import InlineWorkerPool, make_inline
 from helpers.processes import quiet
 from helpers.room_files import KINDS_TOML, write_files
+from rich.console import Console
 
 from phibench.datasets.build.forecast import forecast
 from phibench.datasets.build.task_list import plan_tasks
@@ -19,6 +21,8 @@ from phibench.datasets.merge_repair import merge, repair
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.read import open_finished
 from phibench.datasets.recipe.load import load_recipe, recipe_files
+from phibench.datasets.rooms.room_errors import RoomError
+from phibench.datasets.show import table
 from phibench.datasets.store.checksums import data_files, read_checksums
 from phibench.datasets.verify import verify
 
@@ -62,6 +66,25 @@ def test_the_first_samples_show_all_kinds_and_the_set_verifies(made: Path) -> No
     assert set(data_files(made)) == set(read_checksums(made))
     report = verify(made, console=quiet())
     assert (report.faults, report.notes) == ((), ())
+
+
+def test_the_table_of_samples_names_their_rooms(made: Path) -> None:
+    console = Console(file=io.StringIO(), width=170)
+    console.print(table(open_finished(made)))
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert all(name in text for name in IDS)
+
+
+def test_lamps_outside_a_room_are_one_sentence(tmp_path: Path) -> None:
+    folder, out = write_files(tmp_path), tmp_path / "out"
+    shutil.copytree(folder / "meshes", out / "rooms" / "meshes")
+    (folder / "dark.toml").write_text(KINDS_TOML.replace("[0.0, 0.6, 2.55]", "[0.0, 0.6, 5.0]"))
+    tasks = plan_tasks(make_plan(load_recipe(folder / "dark.toml"), recipe_files(folder / "dark.toml")), {})
+    bake = tasks["bake mesh000000"]
+    bake.function(out, *bake.arguments)
+    view = next(task for name, task in tasks.items() if name.startswith("view mesh000000"))
+    with pytest.raises(RoomError, match="room mesh000000: no light reaches the camera; move its lamps inside"):
+        view.function(out, *view.arguments)
 
 
 def test_images_and_truth_need_no_file_but_the_room_does(copy: Path) -> None:

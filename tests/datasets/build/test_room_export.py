@@ -140,6 +140,7 @@ FAULTS: dict[str, tuple[list[str], str]] = {
     "too high": (["--seed", "3", "--set", "height_m=30"], "RoomProperties.height_m = 30.0: allowed range is 2.3"),
     "no number": (["--seed", "3", "--set", "height_m=high"], "--set height_m=high: the value must be a number"),
     "no value": (["--seed", "3", "--set", "height_m"], "--set height_m: give a property and its value, such as"),
+    "negative seed": (["--seed", "-1"], "--seed -1: must be a whole number from 0"),
     "properties of the lab": (["--room", "lab", "--set", "height_m=3"], "--set is for generated rooms; leave it out"),
 }
 
@@ -159,7 +160,7 @@ def test_a_room_that_is_none_is_one_sentence(
     ("name", "point", "words"),
     [
         ("a.png", (0.5, 0.0, 1.2), "a panorama is written as OpenEXR"),
-        ("a.exr", (0.5, 0.0, -1.2), "the room is open in"),
+        ("a.exr", (0.5, 0.0, -1.2), "outside the room"),
         ("a.exr", (0.5, float("nan"), 1.2), "must be a finite number"),
     ],
 )
@@ -169,6 +170,12 @@ def test_a_panorama_that_cannot_be_is_one_sentence(
     with pytest.raises(ValueError, match=words):
         export_panorama(plain_room(), tmp_path / name, point, 0.0, 16, COARSE)
     assert not (tmp_path / name).exists()
+
+
+def test_a_panorama_of_an_open_room_is_one_sentence(tmp_path: Path) -> None:
+    room = plain_room()
+    with pytest.raises(ValueError, match="the room is open in"):
+        export_panorama(replace(room, surfaces=room.surfaces[1:]), tmp_path / "a.exr", POINT, 0.0, 16, COARSE)
 
 
 def test_a_panorama_of_a_dark_room_is_one_sentence(tmp_path: Path) -> None:
