@@ -216,7 +216,7 @@ def test_a_png_of_two_planes_is_read_as_yuyv(tmp_path) -> None:
 
 def test_messages() -> None:
     card = card_of(YUYV)
-    with pytest.raises(ValueError, match=r"\(n, h, w, 2\) of uint8 is needed"):
+    with pytest.raises(ValueError, match=r"\(n, h, w, 2\) or, of f frames, \(n, f, h, w, 2\) of uint8 is needed"):
         FITS["yuyv"](np.zeros((1, 17, 17, 3), np.uint8), (0, 0), card, SpotBlur(0.7))
     with pytest.raises(ValueError, match="13 x 13 pixels or more are needed"):
         FITS["yuyv"](np.zeros((1, 9, 9, 2), np.uint8), (0, 0), card, SpotBlur(0.7))
