@@ -26,6 +26,7 @@ _SMALL = 0.1  # a cell below this part of its allowance is not what keeps a pixe
 _WIDE_SIGMAS = 2.5  # cells of a lamp 20 times as bright as a full pixel count for pixels as far away
 _SURELY = 2.0  # by two samples a pixel at the edge of a lamp may look full that is not
 _AIM = 0.7  # of the allowed variance
+_AGAIN = 1000  # first stream of cells that are sampled again by chance; rounds are fewer than 500
 
 
 @dataclass
@@ -205,7 +206,10 @@ def _sample_again(film: Film, cells: Cells, chosen: NDArray[np.intp], side: NDAr
 
 
 def _without_hidden_lamps(film: Film, cells: Cells, turn: int) -> None:
-    """Sample cells again by chance around those whose mean is negative: no cell that sees its lamp has such a mean."""
+    """Sample cells again by chance around those whose mean is negative: no cell that sees its lamp has such a mean.
+
+    The samples are new ones: those that told of it have met more of what hides the lamp than others.
+    """
     computed = (cells.side > 1) & (cells.lamps >= 0)
     negative = computed & (cells.mean.min(axis=0) < 0.0)
     if not negative.any():
@@ -214,7 +218,8 @@ def _without_hidden_lamps(film: Film, cells: Cells, turn: int) -> None:
     again = np.flatnonzero(around & computed)
     cells.lamps[around] = -1
     side = cells.side.ravel()[again]
-    halves = (film.sample(cells.numbers.ravel()[again], side, 2 * turn + half, None) for half in (0, 1))
+    streams = (_AGAIN + 2 * turn + half for half in (0, 1))
+    halves = (film.sample(cells.numbers.ravel()[again], side, stream, None) for stream in streams)
     _replace(cells, again, side, *halves)
     _update(cells, again)
 

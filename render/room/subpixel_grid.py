@@ -219,28 +219,34 @@ class Film:
     def _once(self, numbers: NDArray[np.uint32], stream: int) -> Samples:
         import drjit as dr
 
-        mi = self._mi
-        lanes = mi.UInt32(aligned(numbers, np.uint32))
-        x = shifts(mi, lanes, self._dimensions, dr.opaque(mi.UInt32, self._key(stream)))
-        corner, h = self._corner(lanes)
-        u, v = (start + mi.Float64(value) * h for start, value in zip(corner, x[:2], strict=True))
-        value, mirrored, patch, _ = self._look.electrons(u, v, x[2:])
+        value, mirrored, patch, _ = self._first(numbers, stream)
         dr.eval(value, mirrored, patch)
         none = np.zeros((3, 0), dtype=np.float32)
         return Samples(_planes(value), none, np.array(mirrored, dtype=bool), np.array(patch, dtype=np.uint32))
 
-    def hidden(self, numbers: NDArray[np.uint32], stream: int, lamp: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """True where the point of `sample_once` lies within a lamp's outline and sees something else; shape (n,)."""
+    def _first(self, numbers: NDArray[np.uint32], stream: int) -> tuple[Any, Any, Any, Any]:
+        """What `Look.electrons` gives for the one point of each cell."""
         import drjit as dr
 
-        assert self.lamps is not None
         mi = self._mi
         lanes = mi.UInt32(aligned(numbers, np.uint32))
         x = shifts(mi, lanes, self._dimensions, dr.opaque(mi.UInt32, self._key(stream)))
         corner, h = self._corner(lanes)
         u, v = (start + mi.Float64(value) * h for start, value in zip(corner, x[:2], strict=True))
-        _, _, patch, ray = self._look.electrons(u, v, x[2:])
-        met = self.lamps.meets(ray, mi.Int32(aligned(lamp, np.int32)))
+        return self._look.electrons(u, v, x[2:])
+
+    def hidden(self, numbers: NDArray[np.uint32], stream: int, lamp: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """True where the point of `sample_once` lies within a lamp's outline and sees something else; shape (n,)."""
+        starts = _starts(len(numbers))
+        parts = zip(np.split(numbers, starts), np.split(lamp, starts), strict=True)
+        return np.concatenate([self._hidden(some, stream, near) for some, near in parts])
+
+    def _hidden(self, numbers: NDArray[np.uint32], stream: int, lamp: NDArray[np.int32]) -> NDArray[np.bool_]:
+        import drjit as dr
+
+        assert self.lamps is not None
+        _, _, patch, ray = self._first(numbers, stream)
+        met = self.lamps.meets(ray, self._mi.Int32(aligned(lamp, np.int32)))
         dr.eval(met, patch)
         return np.array(met, dtype=bool) & (self.lamps.lamp(np.array(patch, dtype=np.uint32)) != lamp)
 
