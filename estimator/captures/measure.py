@@ -4,11 +4,10 @@ The rig is that of the rig file with the corrections of a calibration file. With
 very pictures corrects it, as far as an outline can, and the covariance is that of a rig measured by a ruler. Blur and
 filters at the laser's line are those of the calibration's spots, or are fitted to these spots (`spot_shape`).
 
-Several frames of a position: frames of DN are added up, which is one frame of a sensor with as much more of everything
-(`_summed`), so that nothing is lost. Of processed pictures each is measured alone and the positions are combined by
-their inverse covariances; a scatter above what they claim widens the result. Frames that share a laser-off frame share
-its noise: the covariance is then that of as many answers as there are laser-off frames. The fixed pattern is in all
-frames alike and does not average out: its part is added (`_PATTERN_PX`).
+Several frames of a position: frames of DN are added up (`pair_photos`). Of processed pictures each is measured alone
+and the positions are combined by their inverse covariances; a scatter above what they claim widens the result. Frames
+that share a laser-off frame share its noise: the covariance is then that of as many answers as there are laser-off
+frames. The fixed pattern is in all frames alike and does not average out: its part is added (`_PATTERN_PX`).
 
 The test: both spots are images of one point. Four coordinates stand against three unknowns, so that the gap of the two
 rays over its standard deviation, rig included, is chi^2 of one degree of freedom.
@@ -31,7 +30,8 @@ from phibench.estimator.calibration.file import Calibration, read_calibration
 from phibench.estimator.calibration.limb_image import Measured
 from phibench.estimator.calibration.outline import Outline, find_outline, mean_measured, mean_outline
 from phibench.estimator.calibration.spots import method_for
-from phibench.estimator.captures.picture_files import Photo, SensorChoice, require_one_camera, sensor_choice
+from phibench.estimator.captures.pair_photos import PairPhotos, frames_note, pairs_of_photos
+from phibench.estimator.captures.picture_files import SensorChoice, sensor_choice
 from phibench.estimator.captures.rig_file import MeasuredRig, read_rig_file, require_camera_size
 from phibench.estimator.captures.spot_shape import (
     OUTLINE_SIGMA_PX,
@@ -46,7 +46,7 @@ from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas, stroke_of
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.estimator.interface import Answer, Image, Pair, Spot
+from phibench.estimator.interface import Answer, Pair, Spot
 from phibench.estimator.spots.detect import FARTHEST_M, NEAREST_M, PairDetection, detect
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array
@@ -60,45 +60,6 @@ DOUBTFUL_P = 1e-3
 _PATTERN_PX = 0.2  # rms error of a position over PRNU: 1 % costs 2 mpx (docs/limits.md)
 _FACTORS = (0.1, 10.0, 0.3, 3.0, 0.01, 100.0, 0.001)  # of the stroke: units mistaken, and a few times too much
 _SURE_SIGMAS = 12.0  # of both spots, before something else is said to be wrong: a faint one may be noise
-_MOST_SUMMED = 64  # frames of 10 bits whose sum is below 2^16
-
-
-@dataclass(frozen=True)
-class PositionPhotos:
-    """Pictures of one stroke position: laser on, and laser off where there are any."""
-
-    on: tuple[Photo, ...]
-    off: tuple[Photo, ...] = ()
-
-
-@dataclass(frozen=True)
-class PairPhotos:
-    """Pictures of both positions.
-
-    Raises
-    ------
-    DatasetError
-        If the counts do not go together, or the pictures are of different cameras.
-    """
-
-    down: PositionPhotos
-    up: PositionPhotos
-
-    def __post_init__(self) -> None:
-        counts = {p: (len(getattr(self, p).on), len(getattr(self, p).off)) for p in POSITIONS}
-        if counts["down"] != counts["up"] or not counts["down"][0]:
-            (a, b), (c, d) = counts["down"], counts["up"]
-            raise DatasetError(
-                f"{a} pictures down ({b} with the laser off) and {c} up ({d} off): give as many of both positions"
-            )
-        if counts["down"][1] > counts["down"][0]:
-            raise DatasetError("more pictures with the laser off than on: give at most as many")
-        require_one_camera(self.all)
-
-    @property
-    def all(self) -> tuple[Photo, ...]:
-        """All pictures, those with the laser on first."""
-        return (*self.down.on, *self.up.on, *self.down.off, *self.up.off)
 
 
 @dataclass(frozen=True)
@@ -224,7 +185,7 @@ def measure(photos: PairPhotos, stroke_m: float, setting: Setting) -> Measuremen
     chosen = sensor_choice(photos.down.on[0], setting.sensor)
     for photo in photos.all:
         sensor_choice(photo, setting.sensor)
-    pairs = _pairs(photos, stroke_m, setting.known, chosen.card)
+    pairs = pairs_of_photos(photos, stroke_m, setting.known, chosen.card)
     outlines, missing = _outlines(pairs[0], setting.calibration is not None)
     rig, covariance, values, note = _corrected(setting, outlines, missing)
     stroke = float(stroke_of(np.array(stroke_m), values))
@@ -248,73 +209,9 @@ def measure(photos: PairPhotos, stroke_m: float, setting: Setting) -> Measuremen
     )
     if int(depth.status) != Status.OK:
         raise _contradiction(ready[0], photos, describe(int(depth.status)))
-    frames = _frames_note(photos, chosen.card)
+    frames = frames_note(photos, chosen.card)
     notes = tuple(text for text in (chosen.note, note, _shape_note(shape, setting), frames, _doubt(depth)) if text)
     return Measurement(depth, down, up, rig, stroke, outlines, setting.known.rig, ready[0], chosen, notes)
-
-
-# -- frames ----------------------------------------------------------------------------------------------------------
-
-
-def _pairs(photos: PairPhotos, stroke_m: float, known: MeasuredRig, card: SensorCard) -> list[Pair]:
-    """Pairs to be measured one by one: one of sums of frames of DN, else one for each frame."""
-    count, offs = len(photos.down.on), len(photos.down.off)
-    if card.output == "raw" and count > 1 and offs in (0, count):
-        groups = [(*photos.down.on,), (*photos.up.on,), (*photos.down.off,), (*photos.up.off,)]
-        sums = [_summed([photo.pixels for photo in group]) if group else None for group in groups]
-        return [_pair(0, sums, stroke_m, known, _of_sum(card, count))]
-    found = []
-    for k in range(count):
-        on = [photos.down.on[k].pixels, photos.up.on[k].pixels]
-        off = [photos.down.off[k % offs].pixels, photos.up.off[k % offs].pixels] if offs else [None, None]
-        found.append(_pair(k, [*on, *off], stroke_m, known, card))
-    return found
-
-
-def _pair(number: int, images: Sequence[Image | None], stroke_m: float, known: MeasuredRig, card: SensorCard) -> Pair:
-    down, up, down_off, up_off = images
-    if down is None or up is None:
-        raise ValueError("a pair needs both positions")
-    return Pair(number, down, up, known.rig, stroke_m, card, down_off, up_off, beam=known.beam)
-
-
-def _summed(images: Sequence[Image]) -> Image:
-    if len(images) > _MOST_SUMMED:
-        raise DatasetError(f"{len(images)} frames of a position: at most {_MOST_SUMMED} are added up")
-    total = np.sum([image.astype(np.uint32) for image in images], axis=0)
-    if total.max() > 65535:
-        raise DatasetError("the sum of the frames is beyond 16 bits: give fewer frames of a position")
-    summed = total.astype(np.uint16)
-    summed.flags.writeable = False
-    return summed
-
-
-def _of_sum(card: SensorCard, count: int) -> SensorCard:
-    """Card of the sum of frames: Poisson laws add up, and so do wells, codes and the variances of the noise.
-
-    The responsivity's pattern stays the same part of the light. The n roundings are n / 12 DN^2 instead of 1 / 12.
-    """
-    rounding_e2 = (count - 1) / (12.0 * card.dn_per_e**2)
-    return replace(
-        card,
-        exposure_s=card.exposure_s * count,
-        full_well_e=card.full_well_e * count,
-        read_noise_e=math.sqrt(count * card.read_noise_e**2 + rounding_e2),
-        row_noise_e=math.sqrt(count) * card.row_noise_e,
-        dsnu_e=count * card.dsnu_e,
-        black_level_dn=count * card.black_level_dn,
-        top_dn=count * card.top_dn,
-    )
-
-
-def _frames_note(photos: PairPhotos, card: SensorCard) -> str:
-    count, offs = len(photos.down.on), len(photos.down.off)
-    if count == 1:
-        return ""
-    if card.output == "raw" and offs in (0, count):
-        return f"frames: {count} of each position, added up"
-    shared = f", {offs} with the laser off" if offs else ""
-    return f"frames: {count} of each position{shared}, each measured alone, positions combined"
 
 
 # -- rig -------------------------------------------------------------------------------------------------------------

@@ -23,11 +23,10 @@ from phibench.estimator.captures.measure import (
     LEAST_STROKE_M,
     MOST_STROKE_M,
     Measurement,
-    PairPhotos,
-    PositionPhotos,
     Setting,
     measure,
 )
+from phibench.estimator.captures.pair_photos import PairPhotos, PositionPhotos
 from phibench.estimator.captures.picture_files import read_photo
 from phibench.scenes.validation import nearest, printable_line
 

@@ -66,9 +66,9 @@ def measure(
 
 
 def _measure_pair(files: tuple[Pictures, ...], stroke_m: float, setting: Setting, out: Path | None) -> int:
-    from phibench.estimator.captures.measure import PairPhotos, PositionPhotos
     from phibench.estimator.captures.measure import measure as measured
     from phibench.estimator.captures.measure_picture import write_measure_picture
+    from phibench.estimator.captures.pair_photos import PairPhotos, PositionPhotos
     from phibench.estimator.captures.picture_files import read_photo
 
     groups = [tuple(read_photo(path, setting.known.rig, setting.sensor) for path in paths) for paths in files]

@@ -225,7 +225,7 @@ class Film:
         return Samples(_planes(value), none, np.array(mirrored, dtype=bool), np.array(patch, dtype=np.uint32))
 
     def _first(self, numbers: NDArray[np.uint32], stream: int) -> tuple[Any, Any, Any, Any]:
-        """What `Look.electrons` gives for the one point of each cell."""
+        """Light, mirror, patch and ray of the one point of each cell, as `Look.electrons` gives them."""
         import drjit as dr
 
         mi = self._mi

@@ -25,7 +25,8 @@ from phibench.datasets.frames.sensor_file import write_sensor_file
 from phibench.datasets.read import Dataset, Sample, open_finished
 from phibench.estimator.captures.imported_calibration import calibrate_imported
 from phibench.estimator.captures.imported_set import import_pairs
-from phibench.estimator.captures.measure import PairPhotos, PositionPhotos, Setting, measure, read_setting
+from phibench.estimator.captures.measure import Setting, measure, read_setting
+from phibench.estimator.captures.pair_photos import PairPhotos, PositionPhotos
 from phibench.estimator.captures.picture_files import read_photo
 from phibench.estimator.draw_pairs import pairs_of
 from phibench.estimator.geometry.triangulate import depth_exact
