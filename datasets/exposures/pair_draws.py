@@ -138,6 +138,7 @@ def _request(sample: Sample, frames: FramesTable, preset: str, sensor: SensorFil
         raise DatasetError("preset 'ideal' ends before the pixels: take bayer-raw, mono-raw, srgb8, yuyv or mjpeg")
     numbers = {key: _value(sample, key, given) for key in SENSOR_KEYS if (given := getattr(frames, key)) is not None}
     overrides = {key: round(value) if key == "jpeg_quality" else value for key, value in numbers.items()}
+    overrides |= frames.sensor or {}
     if sensor is not None:
         overrides |= sensor.numbers
     return FrameRequest(

@@ -37,6 +37,7 @@ from phibench.datasets.recipe.tables import (
     MAX_STROKE_M,
     MIN_STROKE_M,
     SENSOR_KEYS,
+    SENSOR_OF_FRAME,
     AmbientTable,
     LaserTable,
     MisalignmentTable,
@@ -248,6 +249,29 @@ def _frames(raw: Raw) -> Iterator[Fault]:
                 sensor("mjpeg", **{key: round(value) if key == "jpeg_quality" else value})
             except SensorError as error:
                 yield Fault(f"frames.{key}", f"reaches {value:g}; stay with what the sensor takes ({error})")
+    yield from _sensor(frames)
+
+
+def _sensor(frames: Raw) -> Iterator[Fault]:
+    """Numbers of `[frames.sensor]` that a sensor does not take, that belong to a frame, or that are given twice."""
+    numbers = frames.get("sensor")
+    if not isinstance(numbers, dict):
+        return
+    given = {key: value for key, value in numbers.items() if key not in (*SENSOR_OF_FRAME, *SENSOR_KEYS)}
+    for key in numbers:
+        if key in SENSOR_OF_FRAME:
+            yield Fault(f"frames.sensor.{key}", "belongs to frames and not to a camera; leave it out")
+        elif key in frames and key in SENSOR_KEYS:
+            yield Fault(f"frames.sensor.{key}", f"given together with frames.{key}; give one or the other")
+        elif key in SENSOR_KEYS:
+            given[key] = numbers[key]
+    presets = frames.get("presets")
+    for preset in presets if isinstance(presets, list) else ("bayer-raw",):
+        try:
+            sensor(str(preset), **given)
+        except SensorError as error:
+            yield Fault("frames.sensor", str(error))
+            return
 
 
 def _distractors(draft: _Draft) -> Iterator[Fault]:

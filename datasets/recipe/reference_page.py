@@ -205,6 +205,9 @@ per sample from a random stream of its own, and is the same in all presets. It k
 not given. A number that a preset does not use (`jpeg_quality` before MJPEG) does nothing. Down and up share all of
 it. A box holds its spot anywhere, at least 4 px from its edges, so that its centre tells nothing. It stays in the
 image. Where the image has no place of the spot, the box is anywhere. `hint` gives both boxes or none.
+
+`[frames.sensor]` holds numbers of a measured camera, as `phibench sensor fit` writes them: the lines of the sensor file
+above its first table, but for `preset`. They go before the preset's, and no key stands there and in `[frames]`.
 """,
     "[[distractors]]": """Optional. Each is a flat Lambertian disc of the laser's wavelength, not rendered but computed
 when frames are drawn, like the spot. The keys that are given decide its place:

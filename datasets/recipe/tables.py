@@ -51,6 +51,8 @@ OWN_ALBEDO = "surface"
 LEVELS = ("laser_level", "lamp_level")
 SENSOR_KEYS = ("jpeg_quality", "sharpen_amount", "analogue_gain", "read_noise_e", "prnu")
 """Keys of `[frames]` that are numbers of the sensor's preset."""
+SENSOR_OF_FRAME = ("preset", "name", "exposure_s", "output", "sigma", "not_determined", "measured", "source")
+"""What `[frames.sensor]` does not take: what belongs to frames, and a sensor file's tables beside its numbers."""
 
 _ONE = DistributionTable(choice=(1.0,))
 _HALF = DistributionTable(log_uniform=(0.05, 0.5))
@@ -388,6 +390,15 @@ class FramesTable(Table):
     camera: Literal["per_sample", "one"] = Field(
         default="per_sample", description="whether each sample has a camera, hence a fixed pattern, of its own"
     )
+    sensor: dict[str, Any] | None = Field(
+        default=None, description="numbers of a measured camera, as in a sensor file"
+    )
+
+    @model_serializer(mode="wrap")
+    def _without_a_sensor(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Recipes without a sensor of their own keep the hash that they had before there was one."""
+        document: dict[str, Any] = serialised(self)
+        return {key: value for key, value in document.items() if key != "sensor" or value is not None}
 
 
 class DistractorTable(Table):

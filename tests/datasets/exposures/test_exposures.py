@@ -20,12 +20,14 @@ from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.errors import DatasetError, RecipeError
 from phibench.datasets.exposures import pair_draws as module
 from phibench.datasets.exposures.pair_draws import BOX_MARGIN_PX, CachedSample, PairDraw, pair_draws
+from phibench.datasets.frames.sensor_file import SensorFile
 from phibench.datasets.make import make, make_from_plan
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.read import Dataset, open_dataset, open_finished
 from phibench.datasets.recipe.build import build_rig
 from phibench.datasets.recipe.load import load_recipe, parse_recipe, recipe_text, with_numbers
 from phibench.datasets.recipe.tables import Recipe, RigTable
+from phibench.datasets.store.documents import recipe_sha256
 from phibench.render.sensor.light import Region
 
 TINY_BENCH = Path(__file__).resolve().parents[2] / "tiny_bench.toml"
@@ -112,6 +114,21 @@ def test_cameras_are_per_sample_or_one(dataset: Dataset) -> None:
     assert (
         len({t.request.camera_seed for t in pair_draws(with_tables(dataset, frames={**frames, "camera": "one"}))}) == 1
     )
+
+
+def test_a_recipe_has_the_numbers_of_a_measured_camera(dataset: Dataset) -> None:
+    """All presets take them, beside what is drawn; a sensor file of the command line goes before them."""
+    frames = dataset.info.recipe["frames"]
+    numbers = {"gain_dn_per_e": 0.3, "adc_bits": 12, "white_balance": [1.5, 1.0, 1.8]}
+    given = with_tables(dataset, frames={**frames, "sensor": numbers})
+    for pair_draw in pair_draws(given):
+        sensor = pair_draw.request.sensor()
+        assert (sensor.gain_dn_per_e, sensor.adc_bits, sensor.white_balance) == (0.3, 12, (1.5, 1.0, 1.8))
+        assert sensor.jpeg_quality in (60, 85)
+    file = SensorFile("bayer-raw", {"gain_dn_per_e": 0.2})
+    assert {p.request.sensor().gain_dn_per_e for p in pair_draws(given, sensor=file)} == {0.2}
+    plain = with_tables(dataset, frames={**frames, "sensor": None})
+    assert recipe_sha256(plain.recipe) == recipe_sha256(dataset.recipe) != recipe_sha256(given.recipe)
 
 
 def boxes(bench_dataset: Path, count: int = 1500) -> tuple[np.ndarray, Dataset, list[Region]]:
@@ -293,6 +310,11 @@ SPOT = {"kind": "spot"}
         ({"frames": {"analogue_gain": 0.5}}, "frames.analogue_gain", ("reaches 0.5",)),
         ({"frames": {"hint": 1.5}}, "frames.hint", ("1.5", "from 0 up to 1")),
         ({"frames": {"hnt": 1.0}}, "frames.hnt", ("unknown", "'hint'")),
+        ({"frames": {"sensor": {"gain": 0.3}}}, "frames.sensor", ("gain", "unknown")),
+        ({"frames": {"sensor": {"prnu": 2.0}}}, "frames.sensor", ("prnu", "up to 0.2")),
+        ({"frames": {"sensor": {"exposure_s": 0.01}}}, "frames.sensor.exposure_s", ("belongs to frames",)),
+        ({"frames": {"sensor": {"sigma": {"prnu": 0.1}}}}, "frames.sensor.sigma", ("leave it out",)),
+        ({"frames": {"prnu": 0.01, "sensor": {"prnu": 0.02}}}, "frames.sensor.prnu", ("one or the other",)),
         ({"rig": {"laser_filter_response": [1.0, 0.1]}}, "rig.laser_filter_response", ("a list of 3",)),
         ({"rig": {"laser_filter_response": [1.0, 0.1, 2.0]}}, "rig.laser_filter_response[2]", ("2.0", "up to 1")),
         ({"distractors": [{"kind": "sun"}]}, "distractors[0].kind", ("'sun'", "'glow'")),
