@@ -390,9 +390,7 @@ class FramesTable(Table):
     camera: Literal["per_sample", "one"] = Field(
         default="per_sample", description="whether each sample has a camera, hence a fixed pattern, of its own"
     )
-    sensor: dict[str, Any] | None = Field(
-        default=None, description="numbers of a measured camera, as in a sensor file"
-    )
+    sensor: dict[str, Any] | None = Field(default=None, description="numbers of a measured camera, as in a sensor file")
 
     @model_serializer(mode="wrap")
     def _without_a_sensor(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
