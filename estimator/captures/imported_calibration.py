@@ -19,9 +19,9 @@ from phibench.estimator.calibration.spots import method_for
 from phibench.estimator.captures.imported_set import ImportedRow, ImportedSet, open_imported
 from phibench.estimator.captures.measure import (
     SHAPE,
-    combined_spots,
     outlines_as_one,
     seen_images,
+    seen_spots,
     shape_prior,
     widened_by_shape,
     with_blur_of,
@@ -159,19 +159,17 @@ def _shape(
 
 def _known(imported: ImportedSet, rows: Sequence[ImportedRow], rig: Rig, shape: SpotShape) -> KnownSpot:
     """Spot of a sample, of all its frames, at the distance of the tape."""
-    pairs: list[Pair] = [replace(imported.pair(row), rig=shape.rig(rig)) for row in rows]
-    answers = [method_for(imported.card)(pair) for pair in pairs]
-    for answer in answers:
-        for position in POSITIONS:
-            spot = getattr(answer, position)
-            if spot.uv_px is None or spot.covariance_px2 is None:
-                raise DatasetError(f"no spot {position}: {spot.status}")
-    offs = len({row.files.get("down_off") for row in rows} - {None})
-    found = combined_spots(answers, offs, imported.card)
+    pair = replace(_pair(imported, rows), rig=shape.rig(rig))
+    answer = method_for(imported.card)(pair)
+    for position in POSITIONS:
+        spot = getattr(answer, position)
+        if spot.uv_px is None or spot.covariance_px2 is None:
+            raise DatasetError(f"no spot {position}: {spot.status}")
+    found = seen_spots(answer)
     row = rows[0]
     if row.depth_m is None or row.depth_sigma_m is None:
         raise DatasetError("no measured D")
-    images = seen_images(pairs[0])
+    images = seen_images(pair)
     down, up = (widened_by_shape(found[name], images.get(name), shape) for name in POSITIONS)
     return KnownSpot(
         down.uv_px,
@@ -182,6 +180,18 @@ def _known(imported: ImportedSet, rows: Sequence[ImportedRow], rig: Rig, shape: 
         depth_m=row.depth_m,
         depth_sigma_m=row.depth_sigma_m,
     )
+
+
+def _pair(imported: ImportedSet, rows: Sequence[ImportedRow]) -> Pair:
+    """Pair of all frames of a sample; frames with the laser off that rows share count once."""
+    pairs = [imported.pair(row) for row in rows]
+    first = pairs[0]
+    frames = {
+        name: list({row.files[name]: pair.images[name] for row, pair in zip(rows, pairs, strict=True)}.values())
+        for name in first.images
+    }
+    known = {"rig": first.rig, "stroke_m": first.stroke_m, "card": first.card, "beam": first.beam}
+    return Pair.of_frames(first.number, frames, **known)
 
 
 def _require_sound(spot: KnownSpot, aligned: Bundle) -> None:

@@ -4,10 +4,8 @@ The rig is that of the rig file with the corrections of a calibration file. With
 very pictures corrects it, as far as an outline can, and the covariance is that of a rig measured by a ruler. Blur and
 filters at the laser's line are those of the calibration's spots, or are fitted to these spots (`spot_shape`).
 
-Several frames of a position: frames of DN are added up (`pair_photos`). Of processed pictures each is measured alone
-and the positions are combined by their inverse covariances; a scatter above what they claim widens the result. Frames
-that share a laser-off frame share its noise: the covariance is then that of as many answers as there are laser-off
-frames. The fixed pattern is in all frames alike and does not average out: its part is added (`_PATTERN_PX`).
+Several frames of a position are one pair of their means (`Pair.of_frames`). The fits weigh what the frames share: the
+fixed pattern, the room, the steps of JPEG. The outline is that of the mean of raw frames, and of the first JPEG.
 
 The test: both spots are images of one point. Four coordinates stand against three unknowns, so that the gap of the two
 rays over its standard deviation, rig included, is chi^2 of one degree of freedom.
@@ -23,14 +21,13 @@ from pathlib import Path
 import numpy as np
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
 from phibench.estimator.calibration.bundle import calibrate
 from phibench.estimator.calibration.file import Calibration, read_calibration
 from phibench.estimator.calibration.limb_image import Measured
-from phibench.estimator.calibration.outline import Outline, find_outline, mean_measured, mean_outline
+from phibench.estimator.calibration.outline import Outline, find_outline, mean_outline
 from phibench.estimator.calibration.spots import method_for
-from phibench.estimator.captures.pair_photos import PairPhotos, frames_note, pairs_of_photos
+from phibench.estimator.captures.pair_photos import PairPhotos, frames_note, pair_of_photos
 from phibench.estimator.captures.picture_files import SensorChoice, sensor_choice
 from phibench.estimator.captures.rig_file import MeasuredRig, read_rig_file, require_camera_size
 from phibench.estimator.captures.spot_shape import (
@@ -46,7 +43,7 @@ from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas, stroke_of
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.estimator.interface import Answer, Pair, Spot
+from phibench.estimator.interface import Answer, Image, Pair, Spot
 from phibench.estimator.spots.detect import FARTHEST_M, NEAREST_M, PairDetection, detect
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array
@@ -57,7 +54,6 @@ SHAPE = "spot_shape"
 LEAST_STROKE_M, MOST_STROKE_M = 1e-3, 10.0
 DOUBTFUL_P = 1e-3
 """Probability of the two rays' gap below which the two spots are not taken for one point."""
-_PATTERN_PX = 0.2  # rms error of a position over PRNU: 1 % costs 2 mpx (docs/limits.md)
 _FACTORS = (0.1, 10.0, 0.3, 3.0, 0.01, 100.0, 0.001)  # of the stroke: units mistaken, and a few times too much
 _SURE_SIGMAS = 12.0  # of both spots, before something else is said to be wrong: a faint one may be noise
 
@@ -129,7 +125,7 @@ class Measurement:
     nominal : Rig
         As in the rig file.
     pair : Pair
-        The first frames, or their sum, with the corrected rig.
+        With the corrected rig and stroke.
     sensor : SensorChoice
     notes : tuple of str
         Sentences for the person: sensor, rig, frames, doubts.
@@ -185,16 +181,15 @@ def measure(photos: PairPhotos, stroke_m: float, setting: Setting) -> Measuremen
     chosen = sensor_choice(photos.down.on[0], setting.sensor)
     for photo in photos.all:
         sensor_choice(photo, setting.sensor)
-    pairs = pairs_of_photos(photos, stroke_m, setting.known, chosen.card)
-    outlines, missing = _outlines(pairs[0], setting.calibration is not None)
+    pair = pair_of_photos(photos, stroke_m, setting.known, chosen.card)
+    outlines, missing = _outlines(pair, setting.calibration is not None)
     rig, covariance, values, note = _corrected(setting, outlines, missing)
     stroke = float(stroke_of(np.array(stroke_m), values))
-    seen = [replace(pair, rig=with_blur_of(rig, outlines), stroke_m=stroke) for pair in pairs]
-    images = seen_images(seen[0])
+    seen = replace(pair, rig=with_blur_of(rig, outlines), stroke_m=stroke)
+    images = seen_images(seen)
     shape = _shape(setting, seen, images, outlines)
-    ready = [replace(pair, rig=shape.rig(rig)) for pair in seen]
-    answers = [_answer(pair, photos) for pair in ready]
-    spots = combined_spots(answers, len(photos.down.off), chosen.card)
+    ready = replace(pair, rig=shape.rig(rig), stroke_m=stroke)
+    spots = seen_spots(_answer(ready, photos))
     down, up = (widened_by_shape(spots[name], images.get(name), shape) for name in POSITIONS)
     rig = shape.rig(rig)
     depth = depth_general(
@@ -208,10 +203,10 @@ def measure(photos: PairPhotos, stroke_m: float, setting: Setting) -> Measuremen
         setting.stroke_sigma_m,
     )
     if int(depth.status) != Status.OK:
-        raise _contradiction(ready[0], photos, describe(int(depth.status)))
-    frames = frames_note(photos, chosen.card)
+        raise _contradiction(ready, photos, describe(int(depth.status)))
+    frames = frames_note(photos)
     notes = tuple(text for text in (chosen.note, note, _shape_note(shape, setting), frames, _doubt(depth)) if text)
-    return Measurement(depth, down, up, rig, stroke, outlines, setting.known.rig, ready[0], chosen, notes)
+    return Measurement(depth, down, up, rig, stroke, outlines, setting.known.rig, ready, chosen, notes)
 
 
 # -- rig -------------------------------------------------------------------------------------------------------------
@@ -224,12 +219,17 @@ def _outlines(pair: Pair, calibrated: bool) -> tuple[tuple[Outline, ...], str]:
     """
     found, why = [], ""
     for position in POSITIONS[: 1 if calibrated else 2]:
-        image = pair.images.get(f"{position}_off", pair.images[position])
         try:
-            found.append(find_outline(image, pair.rig, pair.card))
+            found.append(find_outline(_picture(pair, position), pair.rig, pair.card))
         except ImageError as error:
             why = str(error)
     return tuple(found), why
+
+
+def _picture(pair: Pair, position: str) -> Image:
+    """Picture of the mirror, laser off where there is one: the mean of raw frames, the first of others."""
+    name = f"{position}_off" if f"{position}_off" in pair.images else position
+    return pair.images[name] if pair.card.output == "raw" else pair.stack(name)[0]
 
 
 def _corrected(setting: Setting, outlines: Sequence[Outline], why: str) -> tuple[Rig, Array, Array, str]:
@@ -291,15 +291,12 @@ def seen_images(pair: Pair) -> dict[str, SpotImage]:
     return spot_images(pair, *(Spot(None if one is None else one.uv_px) for one in (found.down, found.up)))
 
 
-def _shape(
-    setting: Setting, pairs: Sequence[Pair], images: dict[str, SpotImage], outlines: Sequence[Outline]
-) -> SpotShape:
+def _shape(setting: Setting, pair: Pair, images: dict[str, SpotImage], outlines: Sequence[Outline]) -> SpotShape:
     """Blur and filters: of the calibration's spots, or of these, about what outline and rig file say."""
     held = setting.calibration
     if held is not None and (document := held.made_from.get(SHAPE)) is not None:
         return SpotShape.of_document(document)
-    all_images = [*images.values(), *(image for pair in pairs[1:] for image in seen_images(pair).values())]
-    return fit_shape(all_images, shape_prior(pairs[0].rig, outlines))
+    return fit_shape(list(images.values()), shape_prior(pair.rig, outlines))
 
 
 def shape_prior(rig: Rig, outlines: Sequence[Outline]) -> SpotShape:
@@ -329,19 +326,10 @@ def _answer(pair: Pair, photos: PairPhotos) -> Answer:
     return answer
 
 
-def combined_spots(answers: Sequence[Answer], offs: int, card: SensorCard) -> dict[str, SeenSpot]:
-    """Positions of all frames together, by position; `offs` laser-off frames are shared by them."""
-    found, count = {}, len(answers)
-    for position in POSITIONS:
-        seen = [getattr(answer, position) for answer in answers]
-        parts = [Measured(np.array(spot.uv_px), np.array(spot.covariance_px2)) for spot in seen]
-        mean, C = parts[0], parts[0].covariance
-        if count > 1:
-            mean = mean_measured(parts)
-            shared = 1.0 if not offs else count / min(count, offs)
-            C = mean.covariance * shared + (_PATTERN_PX * card.prnu) ** 2 * np.eye(2)
-        found[position] = SeenSpot(np.asarray(mean.value), np.asarray(C))
-    return found
+def seen_spots(answer: Answer) -> dict[str, SeenSpot]:
+    """Positions of an answer that has both, by position."""
+    both = dict(zip(POSITIONS, (answer.down, answer.up), strict=True))
+    return {name: SeenSpot(np.array(spot.uv_px), np.array(spot.covariance_px2)) for name, spot in both.items()}
 
 
 # -- what is wrong ---------------------------------------------------------------------------------------------------

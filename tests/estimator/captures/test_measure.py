@@ -101,7 +101,7 @@ def test_outlines_of_one_rig_claim_what_one_does() -> None:
 
 
 @pytest.mark.usefixtures("unaligned")
-def test_frames_of_dn_are_added_up_and_sigma_falls(case: Case) -> None:
+def test_sigma_falls_with_the_frames(case: Case) -> None:
     setting = read_setting(case.folder / "rig.toml")
     read = {name: [read_photo(path, setting.known.rig) for path in paths] for name, paths in case.raw.items()}
 
@@ -120,7 +120,7 @@ def test_frames_of_dn_are_added_up_and_sigma_falls(case: Case) -> None:
 
 
 @pytest.mark.usefixtures("unaligned")
-def test_jpeg_frames_are_combined(case: Case, capsys) -> None:
+def test_jpeg_frames_are_fitted_together(case: Case, capsys) -> None:
     several = [word for name in NAMES for word in (f"--{name.replace('_', '-')}", *map(str, case.jpg[name]))]
     stroke = ["--stroke-m", str(case.sample.row.stroke_m), "--rig", str(case.folder / "rig.toml")]
     assert main(["measure", *several, *stroke]) == 0
