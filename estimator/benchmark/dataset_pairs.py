@@ -6,6 +6,8 @@ The bound of a spot counts room, dark current and distractors as background: one
 
 from __future__ import annotations
 
+import hashlib
+import json
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -63,11 +65,19 @@ class DatasetPairs(DrawnPairs):
         Numbered from 0.
     boxes_px : int, optional
         Side of the boxes of all pairs, if they are not the recipe's.
+    sensor : SensorFile, optional
+        Of the pairs, for the record.
     """
 
-    def __init__(self, dataset: Dataset, pair_draws: tuple[PairDraw, ...], boxes_px: int | None = None) -> None:
+    def __init__(
+        self,
+        dataset: Dataset,
+        pair_draws: tuple[PairDraw, ...],
+        boxes_px: int | None = None,
+        sensor: SensorFile | None = None,
+    ) -> None:
         super().__init__(dataset, pair_draws)
-        self._boxes_px = boxes_px
+        self._boxes_px, self._sensor = boxes_px, sensor
 
     def truth(self, number: int) -> PairTruth:
         """The exact answer, with the bounds of the image and of the raw pixels behind it."""
@@ -105,7 +115,18 @@ class DatasetPairs(DrawnPairs):
             "recipe_sha256": info.recipe_sha256,
             "dataset_sha256": sha256(listed) if listed.is_file() else None,
             "provenance": provenance(),
+            **self._otherwise(),
         }
+
+    def _otherwise(self) -> dict[str, Any]:
+        """Frames and numbers of the sensor that are not the recipe's: scores of others are not comparable."""
+        found: dict[str, Any] = {}
+        if (counts := sorted({draw.frames for draw in self.pair_draws})) != [(1, 1)]:
+            found["frames"] = [list(one) for one in counts]
+        if self._sensor is not None:
+            text = json.dumps([self._sensor.preset, dict(self._sensor.numbers)], sort_keys=True)
+            found["sensor_sha256"] = hashlib.sha256(text.encode()).hexdigest()
+        return found
 
 
 def dataset_pairs(
@@ -153,7 +174,7 @@ def dataset_pairs(
         chosen = _with_boxes(dataset, chosen, boxes_px, hints)
     elif not hints:
         chosen = tuple(replace(draw, boxes=None) for draw in chosen)
-    return DatasetPairs(dataset, chosen[:pairs], boxes_px)
+    return DatasetPairs(dataset, chosen[:pairs], boxes_px, sensor)
 
 
 def _with_boxes(dataset: Dataset, chosen: tuple[PairDraw, ...], side_px: int, hints: bool) -> tuple[PairDraw, ...]:

@@ -47,6 +47,7 @@ from phibench.estimator.benchmark.worst_images import worst, worst_of
 from phibench.estimator.calibration.file import read_calibration
 from phibench.estimator.captures.imported_set import ImportedSet, imported_pairs, is_imported, open_imported
 from phibench.estimator.interface import Box, Method, Outcome
+from phibench.estimator.limits.off_frame_bound import FrameCounts
 from phibench.estimator.methods.registry import METHODS, BuiltIn
 from phibench.estimator.pair_set import CachedPairs, PairSet, truth_folders
 from phibench.estimator.sandbox.resolve import MethodError, RunLimits, resolve
@@ -212,6 +213,7 @@ def score(
     calibration: str | Path | None = None,
     boxes_px: int | None = None,
     sensor: str | Path | None = None,
+    frames: tuple[int, int] | None = None,
     limits: RunLimits | None = None,
     workers: int = 1,
     seed: int = 0,
@@ -228,7 +230,7 @@ def score(
         in this process: no limits, and it can be stopped with a debugger.
     preset : str, optional
         Preset of the sensor; by default those of the recipe's `[frames]`.
-    draws, pairs, hints, calibration, boxes_px, sensor
+    draws, pairs, hints, calibration, boxes_px, sensor, frames
         As for `wanted_pairs`.
     limits : RunLimits, optional
         Of time and memory; not for a function.
@@ -257,7 +259,7 @@ def score(
     opened = dataset if isinstance(dataset, Dataset) else open_scored(dataset)
     if out is not None:
         require_writable(Path(out))
-    chosen = wanted_pairs(opened, preset, draws, pairs, hints, calibration, boxes_px, sensor)
+    chosen = wanted_pairs(opened, preset, draws, pairs, hints, calibration, boxes_px, sensor, frames)
     if isinstance(method, str):
         (scored,) = run_and_score([method], chosen, workers, console, "pairs", seed, limits)
     else:
@@ -384,10 +386,11 @@ def wanted_pairs(
     calibration: str | Path | None = None,
     boxes_px: int | None = None,
     sensor: str | Path | None = None,
+    frames: tuple[int, int] | None = None,
 ) -> PairSet:
     """Pairs as of `dataset_pairs`; with a calibration file its rig's, with calibrated rig, stroke and covariance.
 
-    `sensor` is a sensor file.
+    `sensor` is a sensor file; `frames` are the frames of each position with the laser on and off.
 
     Raises
     ------
@@ -395,13 +398,39 @@ def wanted_pairs(
         As `dataset_pairs`, or if the calibration cannot be read or is that of another rig.
     """
     if isinstance(dataset, ImportedSet):
-        return _real_pairs(dataset, preset, draws, pairs, boxes_px, calibration, sensor)
+        if boxes_px is not None or sensor is not None or frames is not None:
+            raise DatasetError(
+                f"{dataset.folder} holds pictures: their boxes are not known, and sensor and frames are those of the "
+                "import; leave --boxes, --sensor and --frames out"
+            )
+        return _real_pairs(dataset, preset, draws, pairs, calibration)
     camera = None if sensor is None else read_sensor_file(sensor)
+    counts = None if frames is None else frame_counts(*frames)
     if calibration is None:
-        return dataset_pairs(dataset, preset, draws, pairs, hints, boxes_px, camera)
+        return dataset_pairs(dataset, preset, draws, pairs, hints, boxes_px, camera, counts)
     read = read_calibration(calibration)
     of_rig = of_calibration(dataset, read)
-    return CalibratedPairs(dataset_pairs(of_rig, preset, draws, pairs, hints, boxes_px, camera), read)
+    return CalibratedPairs(dataset_pairs(of_rig, preset, draws, pairs, hints, boxes_px, camera, counts), read)
+
+
+MOST_FRAMES = 100
+"""Frames of a position: an image and the single frames are held at a time."""
+
+
+def frame_counts(on: int, off: int) -> FrameCounts:
+    """Frames of each position with the laser on and off.
+
+    Raises
+    ------
+    DatasetError
+        If there are too few or too many.
+    """
+    if not (1 <= on <= MOST_FRAMES and 1 <= off <= MOST_FRAMES):
+        raise DatasetError(
+            f"--frames {on} {off}: give the frames of a position with the laser on and off, 1 to {MOST_FRAMES} each, "
+            "such as --frames 6 6"
+        )
+    return FrameCounts(on, off)
 
 
 def _real_pairs(
@@ -409,17 +438,10 @@ def _real_pairs(
     preset: str | None,
     draws: int | None,
     pairs: int | None,
-    boxes_px: int | None,
     calibration: str | Path | None,
-    sensor: str | Path | None,
 ) -> PairSet:
     if preset not in (None, imported.preset):
         raise DatasetError(f"{imported.folder} holds pictures of the kind '{imported.preset}': leave --preset out")
-    if boxes_px is not None or sensor is not None:
-        raise DatasetError(
-            f"{imported.folder} holds pictures: their boxes are not known, and their sensor is the one that they were "
-            "imported with; leave --boxes and --sensor out"
-        )
     found = imported_pairs(imported, TASK_VERSION, draws, pairs)
     return found if calibration is None else CalibratedPairs(found, read_calibration(calibration, imported.rig))
 

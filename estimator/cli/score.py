@@ -67,6 +67,7 @@ def score(
     workers: Whole = 1,
     calibration: Path | None = None,
     sensor: Path | None = None,
+    frames: Annotated[tuple[Whole, Whole] | None, Parameter(negative="")] = None,
     limits: Limits = LIMITS,
     out: Path | None = None,
     output: Output = _TABLES,
@@ -97,6 +98,8 @@ def score(
         File of `phibench calibrate`: its rig's samples, with the calibrated rig, stroke and covariance.
     sensor
         Sensor file of `phibench sensor fit`: its numbers stand for the recipe's and the preset's.
+    frames
+        Frames of each position with the laser on and with it off, such as 6 6; one of each by default.
     out
         JSON file for the score, records beside it as Parquet; with several methods their names are added to it.
     """
@@ -117,7 +120,7 @@ def score(
     files = _files(out, [MethodCard.of(name, **resolve(name).document()) for name in method])
     for target in filter(None, files):
         require_writable(target)
-    pair_set = wanted_pairs(open_scored(directory), preset, draws, pairs, hints, calibration, boxes, sensor)
+    pair_set = wanted_pairs(open_scored(directory), preset, draws, pairs, hints, calibration, boxes, sensor, frames)
     scored = run_and_score(method, pair_set, workers, progress_console(), "pairs", _seed(bootstrap_seed), run_limits)
     scored = [one if file is None else saved(one, file) for one, file in zip(scored, files, strict=True)]
     print_scores(scored, form, rank, output.wide, calibration is not None)

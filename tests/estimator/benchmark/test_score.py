@@ -15,6 +15,7 @@ from helpers.bench_cases import Cases, cases, change, constant, outcomes, sample
 from PIL import Image
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.sensor_file import SensorFile, write_sensor_file
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.document import MethodCard, ScoreDocument, read_records, read_score, write_score
 from phibench.estimator.benchmark.metrics import METRICS, STRATA
@@ -287,6 +288,27 @@ def test_score_with_methods_compare_and_report(bench_dataset, half, tmp_path, ca
     assert (tmp_path / "page.html").read_text().startswith("<!DOCTYPE html>")
 
 
+def test_several_frames_of_a_position_are_scored_against_their_own_bound(bench_dataset, tmp_path):
+    """Bounds fall with the frames, and a score of other frames or another sensor is no score of the same pairs."""
+    sensor = SensorFile("bayer-raw", {"read_noise_e": 3.0})
+    write_sensor_file(tmp_path / "sensor.toml", sensor)
+    files = {"one": [], "six": ["--frames", "6", "6"], "sensor": ["--sensor", str(tmp_path / "sensor.toml")]}
+    bounds = {}
+    for name, words in files.items():
+        out = tmp_path / f"{name}.json"
+        chosen = [*words, "--method", "raw_maximum_likelihood", "--preset", "bayer-raw", "--pairs", "2"]
+        assert cli.main(["score", str(bench_dataset), *chosen, "--out", str(out)]) == 0
+        bounds[name] = read_records(out, read_score(out))["bound_px2"].drop_nulls().to_numpy() ** 0.5
+    # sqrt(6) less for pure noise; the single frame's bound knows the room, that of six frames on and off does not, which
+    # costs a factor of 1 to sqrt(2); the fixed pattern is a few percent of both
+    ratio = bounds["one"] / bounds["six"]
+    assert (ratio > 6**0.5 / 2**0.5 * 0.9).all()
+    assert (ratio < 6**0.5 * 1.05).all()
+    assert read_score(tmp_path / "six.json").pair_set["frames"] == [[6, 6]]
+    for other in ("six", "sensor"):
+        assert cli.main(["compare", str(tmp_path / "one.json"), str(tmp_path / f"{other}.json")]) == 2
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
@@ -297,6 +319,7 @@ def test_score_with_methods_compare_and_report(bench_dataset, half, tmp_path, ca
         (["--method", "red_centroid", "--method", "red_centroid", "--out", "a.json"], "two methods"),
         (["--method", "red_centriod"], "no method 'red_centriod': did you mean 'red_centroid'?"),
         (["--method", "red_centroid", "--pairs", "0"], "pairs = 0: must be 1 or above"),
+        (["--method", "red_centroid", "--frames", "6", "0"], "--frames 6 0: give the frames of a position"),
     ],
 )
 def test_mistakes_are_one_sentence(bench_dataset, capsys, words, sentence):
