@@ -299,8 +299,8 @@ def test_several_frames_of_a_position_are_scored_against_their_own_bound(bench_d
         chosen = [*words, "--method", "raw_maximum_likelihood", "--preset", "bayer-raw", "--pairs", "2"]
         assert cli.main(["score", str(bench_dataset), *chosen, "--out", str(out)]) == 0
         bounds[name] = read_records(out, read_score(out))["bound_px2"].drop_nulls().to_numpy() ** 0.5
-    # sqrt(6) less for pure noise; the single frame's bound knows the room, that of six frames on and off does not, which
-    # costs a factor of 1 to sqrt(2); the fixed pattern is a few percent of both
+    # sqrt(6) less for pure noise; the single frame's bound knows the room, that of six frames on and off does not,
+    # which costs a factor of 1 to sqrt(2); the fixed pattern is a few percent of both
     ratio = bounds["one"] / bounds["six"]
     assert (ratio > 6**0.5 / 2**0.5 * 0.9).all()
     assert (ratio < 6**0.5 * 1.05).all()
