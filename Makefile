@@ -11,12 +11,15 @@ STUDIES ?= out/studies
 STUDIES_ALL := noise misalignment baseline cause isotropy stroke
 # Which Python makes the environment: `make setup PYTHON=python3.13`. Without it the first that is new enough.
 PYTHON ?=
+# Tests start hundreds of processes. Where compiled modules may not be kept, each compiles the package anew, for a second.
+unexport PYTHONDONTWRITEBYTECODE
 # Test files are shared between two processes; `make test PARALLEL=` runs them one after the other.
 PARALLEL ?= --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup dataset bench studies studies-full test test-slow proof test-all attack mutants benchmark lint clean
+.PHONY: help setup dataset bench studies studies-full lint clean
+.PHONY: test test-slow proof test-proof test-all attack mutants benchmark
 
 help:
 	@echo "make setup      make .venv with everything in it, and make sure of LLVM"
@@ -27,6 +30,7 @@ help:
 	@echo "make test       the tests, without the slow ones"
 	@echo "make test-slow  the slow tests"
 	@echo "make proof      the slow tests of accuracy, but those of many minutes"
+	@echo "make test-proof the tests of test and proof in one run, which is quicker"
 	@echo "make test-all   all tests"
 	@echo "make attack     hostile methods, files and moments: nothing is lost, and nobody is fooled (docs/trust.md)"
 	@echo "make mutants    proof that the tests see faults: one fault at a time, in copies of the checkout"
@@ -89,6 +93,9 @@ test-slow: $(READY)
 proof: $(READY)
 	$(BIN)/python -m pytest $(PARALLEL) --slow -m slow -k accuracy
 
+test-proof: $(READY)
+	$(BIN)/python -m pytest $(PARALLEL) --proof
+
 test-all: $(READY)
 	$(BIN)/python -m pytest --slow --study
 
@@ -104,7 +111,7 @@ benchmark: $(READY)
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy -p phibench
+	$(BIN)/mypy --num-workers 2 -p phibench
 
 clean:
 	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks
