@@ -31,6 +31,7 @@ from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Pair
+from phibench.estimator.methods.raw_likelihood import with_posteriors
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.rig import POSITIONS, Rig
 from phibench.scenes.validation import nearest
@@ -165,7 +166,7 @@ def _known(imported: ImportedSet, rows: Sequence[ImportedRow], rig: Rig, shape: 
         spot = getattr(answer, position)
         if spot.uv_px is None or spot.covariance_px2 is None:
             raise DatasetError(f"no spot {position}: {spot.status}")
-    found = seen_spots(answer)
+    found = seen_spots(with_posteriors(pair, answer))
     row = rows[0]
     if row.depth_m is None or row.depth_sigma_m is None:
         raise DatasetError("no measured D")

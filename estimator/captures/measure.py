@@ -44,6 +44,7 @@ from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas,
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Image, Pair, Spot
+from phibench.estimator.methods.raw_likelihood import with_posteriors
 from phibench.estimator.spots.detect import FARTHEST_M, NEAREST_M, PairDetection, detect
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array
@@ -323,7 +324,7 @@ def _answer(pair: Pair, photos: PairPhotos) -> Answer:
     answer = method_for(pair.card)(pair)
     if any(spot.uv_px is None or spot.covariance_px2 is None for spot in (answer.down, answer.up)):
         raise _nothing_found(pair, photos, answer)
-    return answer
+    return with_posteriors(pair, answer)
 
 
 def seen_spots(answer: Answer) -> dict[str, SeenSpot]:

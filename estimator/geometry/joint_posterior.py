@@ -27,6 +27,7 @@ MISFIT_RANGE = 30.0  # above the least misfit: beyond it lies 3e-7 of a posterio
 _WALL = 2.0 * MISFIT_RANGE  # above which a misfit is not told from a larger one
 _COARSE = (17, 17, 41)  # nodes along u, v, 1 / D that find where the posterior is
 _FINE = (41, 41, 81)
+_SINGLE = 4  # nodes of a single image's posterior for each step of its map
 _NODES = (4, 4, 6)  # of the polynomial that stands for `up_image`, exact on them
 _MOST_AT_SIDES = 0.01  # part of the posterior that may lie within a step of a map's sides
 
@@ -130,6 +131,21 @@ def _evaluated(
         return None
     total, at_sides = _misfits(down, up, splines, axes, up_px)
     return _Grid(axes, up_px, total, at_sides) if np.isfinite(total).any() else None
+
+
+def single_posterior(one: LikelihoodMap) -> tuple[Array, Array] | None:
+    """Mean (u, v), shape (2,), and covariance, shape (2, 2), of one image by itself; None beyond its map."""
+    axes = [np.linspace(axis[0], axis[-1], _SINGLE * (len(axis) - 1) + 1) for axis in (one.u_px, one.v_px)]
+    u, v = np.meshgrid(*axes, indexing="ij")
+    above, within = _at(one, _spline(one), u, v)
+    weight = np.exp(-0.5 * (above - float(above.min())))
+    weight /= float(weight.sum())
+    if float(weight[within < 1.0].sum()) > _MOST_AT_SIDES:
+        return None
+    places = np.stack([u.ravel(), v.ravel()])
+    mean = places @ weight.ravel()
+    off = places - mean[:, None]
+    return mean, (off * weight.ravel()) @ off.T
 
 
 def _best(one: LikelihoodMap) -> Array:

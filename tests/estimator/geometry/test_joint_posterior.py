@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from phibench.estimator.geometry.combine import combine
-from phibench.estimator.geometry.joint_posterior import LikelihoodMap, joint_posterior
+from phibench.estimator.geometry.joint_posterior import LikelihoodMap, joint_posterior, single_posterior
 from phibench.estimator.geometry.mirror_image import image_of, up_image
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.methods.likelihood_maps import SpotLikelihood, likelihood_map
@@ -103,3 +103,27 @@ def test_map_of_a_quadratic_misfit_is_its_profile(sigma_px: float) -> None:
     np.testing.assert_allclose(found.misfit[near], expected[near], atol=1e-6)
     reach = min(float(np.ptp(found.u_px)), float(np.ptp(found.v_px)))
     assert reach > 8.0 * math.sqrt(float(np.linalg.eigvalsh(C)[0]))
+
+
+def test_a_single_image_has_the_moments_of_its_own_posterior() -> None:
+    mean = np.array([640.3, 250.7])
+    found, covariance = single_posterior(gaussian(mean, C_DOWN)) or (None, None)
+    # sums over a quarter of a step of a map that ends at 6 sigma; the spline is good to 1 %
+    np.testing.assert_allclose(found, mean, atol=1e-4)
+    np.testing.assert_allclose(covariance, C_DOWN, rtol=0.02, atol=2e-6)
+
+
+def test_two_minima_of_a_single_image_are_both_in_its_moments() -> None:
+    side, C = np.linspace(-1.0, 1.0, 61), np.eye(2) * 0.05**2
+    at = np.stack(np.meshgrid(side, side), axis=-1)
+    each = [np.einsum("...i,ij,...j->...", at - m, np.linalg.inv(C), at - m) for m in ([-0.4, 0.0], [0.4, 0.0])]
+    misfit = -2.0 * np.logaddexp(-0.5 * each[0], -0.5 * each[1] - math.log(3.0))
+    found, covariance = single_posterior(LikelihoodMap(side, side, misfit)) or (None, None)
+    # weights 3 : 1 at -0.4 and 0.4: mean -0.2, variance 0.8^2 * 3 / 16 beside 0.05^2
+    np.testing.assert_allclose(found, [-0.2, 0.0], atol=2e-3)
+    np.testing.assert_allclose(covariance, np.diag([0.12 + 0.05**2, 0.05**2]), rtol=0.03, atol=1e-5)
+
+
+def test_a_single_image_whose_map_ends_at_the_minimum_has_no_moments() -> None:
+    whole = gaussian(np.array([640.3, 250.7]), C_DOWN)
+    assert single_posterior(LikelihoodMap(whole.u_px[12:], whole.v_px, whole.misfit[:, 12:])) is None
