@@ -91,6 +91,10 @@ def close_names(name: str, known: Iterable[str]) -> list[str]:
 Schema = dict[str, Any]
 Location = tuple[str | int, ...]
 _LIMITS = {"exclusiveMinimum": "above {}", "minimum": "from {}", "exclusiveMaximum": "below {}", "maximum": "up to {}"}
+SHA256 = "^[0-9a-f]{64}$"
+"""Pattern of a SHA-256 in a table."""
+KINDS_OF_NUMBERS = {"uniform", "choice"}
+"""Keys by which the schema of a distribution of numbers is known."""
 _KINDS = {
     "number": "a number",
     "integer": "an integer",
@@ -190,15 +194,29 @@ def _resolve(schema: Schema, node: Schema) -> Schema:
 
 def allowed(node: Schema) -> str:
     """Say in words what a JSON schema node allows."""
+    if KINDS_OF_NUMBERS <= set(node.get("properties", {})):
+        return "a number or a distribution such as { uniform = [low, high] }"
+    if set(node.get("properties", {})) == {"choice"}:
+        return "a name or { choice = [names] }" + _names(node["properties"]["choice"])
     if "enum" in node or "const" in node:
         return "one of " + ", ".join(repr(value) for value in node.get("enum", [node.get("const")]))
     words = [_KINDS.get(node.get("type", ""), "a value"), *_limits(node)]
     if "pattern" in node:
+        if node["pattern"] == SHA256:
+            return "a string of 64 digits 0 to 9 and a to f"
         words.append(f"of at most {node['maxLength']} letters, digits and signs like {_signs(node['pattern'])}")
     if "minItems" in node:
         count = "of" if node["minItems"] == node.get("maxItems") else "of at least"
         words.append(f"{count} {node['minItems']} ({allowed(_entry(node))})" if _plain(node) else "with entries")
+    elif "maxItems" in node:
+        words.append(f"of at most {node['maxItems']} entries")
     return " ".join(words)
+
+
+def _names(node: Schema) -> str:
+    """Names of a choice, if they are known: with a colon before them."""
+    known = _entry(node).get("enum", ())
+    return f": {', '.join(map(repr, known))}" if known else ""
 
 
 def _limits(node: Schema) -> list[str]:

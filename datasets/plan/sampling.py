@@ -27,6 +27,7 @@ from phibench.datasets.recipe.build import (
     build_misalignment,
     build_rig,
     build_target,
+    by_keys,
     ceiling_m,
     true_stroke_m,
 )
@@ -245,8 +246,11 @@ class _Makers:
     def _reason(self, tries: int, last: str) -> str:
         where = "" if self._room_id == ONLY_ROOM else f" in {self._room_id}"
         boards = " or move the boards" if self._targets else ""
+        spreads = [name for name, one in _sample_distributions(self._table) if len(set(_support(one))) > 1]
+        drawn = f"narrow the distributions ({', '.join(spreads[:4])}{', ...' * (len(spreads) > 4)})" if spreads else ""
+        advice = " or ".join(filter(None, ("change the numbers that are fixed", drawn)))
         why = f"has no possible rig, spot and stroke{where} in {tries} draws; the last: {last}"
-        return f"{why}; narrow the distributions{boards}"
+        return f"{why}; {advice}{boards}"
 
     def _tries(self, number: int) -> int:
         share = self._table.spot.hidden
@@ -284,7 +288,7 @@ class _Makers:
             misalignment = drawn_misalignment(self._recipe.misalignment, values)
             rig, stroke_m = nominal_rig.perturbed(misalignment), true_stroke_m(misalignment, nominal_stroke_m)
         except SceneError as error:
-            return str(error)
+            return by_keys(str(error))
         if fault := rig_fault(rig, stroke_m, self._ceiling_m, self._boards):
             return fault
         if "spot.hidden" in values and (
@@ -348,6 +352,11 @@ def _sample_distributions(table: RandomTable) -> Iterator[tuple[str, Any]]:
             value, name = getattr(group, key), f"{prefix}.{key}"
             if isinstance(value, DistributionTable) or (value is not None and name == "rig.holder.kind"):
                 yield name, value
+
+
+def _support(chosen: Any) -> tuple[Any, ...]:
+    """Smallest and largest value of a distribution, or the names of a choice."""
+    return chosen.support if isinstance(chosen, DistributionTable) else chosen.choice
 
 
 def _values(chosen: Any, points: Array) -> Any:
@@ -429,7 +438,7 @@ def _made(
         rig = nominal.perturbed(misalignment)
         strokes_m = {true_stroke_m(misalignment, h) for one in recipe.experiments for h in one.strokes_m}
     except SceneError as error:
-        return str(error)
+        return by_keys(str(error))
     faults = (rig_fault(rig, stroke_m, top_m, boards) for stroke_m in sorted(strokes_m))
     why = next((fault for fault in faults if fault), None)
     return why or DrawnRig(f"r{number:06d}", tries, tuple(drawn.items()), misalignment, rig)

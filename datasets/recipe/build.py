@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -29,18 +30,63 @@ from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
-from phibench.scenes.validation import SceneError
+from phibench.scenes.validation import Fault, SceneError
 
 CAMERA_KEYS = (
     *("width_px", "height_px", "pixel_pitch_um", "fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "p1", "p2"),
     *("f_number", "focus_distance_m", "blur_sigma_px"),
 )
 
+HOLDER_KINDS: Mapping[str, tuple[str, ...]] = {
+    "radius_m": ("rods", "post", "tube"),  # of a tube it sets the plates where plate_m is not given
+    "circle_m": ("rods", "post", "tube"),
+    "plate_m": ("rods", "post", "tube"),
+    "rise_m": ("rods", "post", "tube"),
+    "azimuth_deg": ("rods", "post"),
+    "wall_m": ("tube",),
+    "glass_index": ("tube",),
+}
+"""Kinds of a holder that a key of `[rig.holder]` has an effect on."""
+
 _NANOMETRE = 9  # decimals
+_OWNERS = (("Holder.", "rig.holder."), ("SphereMirror.", "rig."), ("Camera.", "rig."))
 
 
 def build_rig(table: RigTable) -> Rig:
-    """Rig of a recipe; raises `SceneError` where the numbers do not go together."""
+    """Rig of a recipe; raises `SceneError`, by the recipe's keys, where the numbers do not go together."""
+    try:
+        return _rig(table)
+    except SceneError as error:
+        raise SceneError(by_keys(str(error))) from error
+
+
+def by_keys(text: str) -> str:
+    """Sentence of a `SceneError` of a rig with the recipe's keys instead of names of classes."""
+    for owner, path in _OWNERS:
+        text = re.sub(rf"\b{re.escape(owner)}(?=[a-z])", path, text)
+    return text
+
+
+def rig_fault_of(error: SceneError) -> Fault:
+    """Fault at the key of `[rig]` that an error of `build_rig` begins with, or else of the whole table."""
+    found = re.match(r"(rig(?:\.\w+)+) = (.+)", str(error), re.DOTALL)
+    return Fault("rig", str(error)) if found is None else Fault(found[1], found[2])
+
+
+def idle_holder_keys(path: str, given: Iterable[str], kinds: Iterable[str]) -> list[Fault]:
+    """Faults of keys of a holder that have no effect on any of the kinds that it may be of."""
+    possible, faults = sorted(set(kinds) - {"none"}), []
+    for key in given:
+        takers = HOLDER_KINDS.get(key, ())
+        if takers and not set(takers) & set(possible):
+            quoted = " or ".join(f'"{kind}"' for kind in takers)
+            is_now = " or ".join(f'"{kind}"' for kind in possible) or '"none"'
+            text = f"has no effect on a holder of kind {is_now}; remove it, or give kind = {quoted}"
+            faults.append(Fault(f"{path}.{key}", text))
+    return faults
+
+
+def _rig(table: RigTable) -> Rig:
     base = RIGS[table.preset]()
     mirror = replace(base.mirror, **_given(table, ("radius_m", "roughness_alpha")))
     z_c_m = base.sphere_in_camera_m[2] if table.z_c_m is None else table.z_c_m

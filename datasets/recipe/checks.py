@@ -17,7 +17,10 @@ from phibench.datasets.recipe.build import (
     build_spot,
     build_target,
     build_true_rig,
+    by_keys,
     ceiling_m,
+    idle_holder_keys,
+    rig_fault_of,
     true_stroke_m,
 )
 from phibench.datasets.recipe.faulty_tables import (
@@ -39,8 +42,10 @@ from phibench.datasets.recipe.tables import (
     SENSOR_KEYS,
     SENSOR_OF_FRAME,
     AmbientTable,
+    HolderTable,
     LaserTable,
     MisalignmentTable,
+    RandomHolderTable,
     Recipe,
     RigTable,
     TargetTable,
@@ -70,7 +75,7 @@ def semantic_faults(raw: Raw) -> list[Fault]:
             *_frames(raw),
             *_distractors(draft),
         ),
-        *(*_laser(draft.laser), *_rig(draft)),
+        *(*_laser(draft.laser), *_holder(raw), *_rig(draft)),
     ]
 
 
@@ -300,6 +305,21 @@ def _laser(laser: LaserTable | None) -> Iterator[Fault]:
         yield Fault("laser.diameter_base_m", "0.0 with no growth makes spots of diameter 0; give a number above 0")
 
 
+def _holder(raw: Raw) -> Iterator[Fault]:
+    """Keys of a holder that none of its kinds has; a drawn kind makes the sizes of each of its names useful."""
+    fixed, drawn = table_of(raw, "rig", "holder"), table_of(raw, "random", "rig", "holder")
+    sound, chosen = sound_of(fixed, HolderTable), sound_of(drawn, RandomHolderTable)
+    for table, one in ((fixed, sound), (drawn, chosen)):
+        if one is None or ("kind" in table and "kind" not in one.model_fields_set):
+            return  # told by the tables
+    assert sound is not None
+    assert chosen is not None
+    drawn_kind = getattr(chosen, "kind", None)
+    kinds = (sound.kind,) if drawn_kind is None else drawn_kind.choice
+    yield from idle_holder_keys("rig.holder", sorted(sound.model_fields_set), kinds)
+    yield from idle_holder_keys("random.rig.holder", sorted(chosen.model_fields_set), kinds)
+
+
 def _rig(draft: _Draft) -> Iterator[Fault]:
     """Faults of the rig, nominal and true, and of the boards and strokes that do not go with it."""
     misplaced = dict(_places(draft))
@@ -309,7 +329,7 @@ def _rig(draft: _Draft) -> Iterator[Fault]:
         try:
             rig = build_rig(draft.rig)
         except SceneError as error:
-            yield Fault("rig", str(error))
+            yield rig_fault_of(error)
     if draft.rig is None or rig is None:
         return
     yield from _cells(rig, sound_of(draft.raw.get("ambient", {}), AmbientTable))
@@ -341,7 +361,7 @@ def _true_rig(
         rig = nominal.perturbed(deviation)
         reached = [(path, stroke_m, true_stroke_m(deviation, float(stroke_m))) for path, stroke_m in strokes]
     except SceneError as error:
-        yield Fault("misalignment", str(error))
+        yield Fault("misalignment", by_keys(str(error)))
         return
     if not rig.in_image():
         yield Fault("misalignment", "the mirror is outside of the image; take smaller deviations")

@@ -81,7 +81,13 @@ def _text(path: Path) -> str:
     if not path.is_file():
         shipped = nearest(path.name, sorted(file.stem for file in RECIPES.glob("*.toml")))
         raise RecipeError(f"there is no recipe {path}; give a TOML file or the name of a shipped recipe ({shipped})")
-    return _input_file(path).text(encoding="utf-8-sig")  # some editors put a byte order mark first
+    data = _input_file(path).read()
+    if b"\0" in data[:4096]:  # never in a text of UTF-8 that people write, and early in pictures and archives
+        raise RecipeError(
+            f"{path} is no TOML recipe: it is a picture or another binary file; give a .toml file, which may name "
+            "pictures in [[rooms.panoramas]]"
+        )
+    return _input_file(path).text(data, encoding="utf-8-sig")  # some editors put a byte order mark first
 
 
 def _input_file(path: Path) -> InputFile:

@@ -40,8 +40,8 @@ def room_faults(raw: Raw) -> Iterator[Fault]:
         yield Fault("random.spot.azimuth_deg", "missing; in these rooms a ray finds the spot, give its azimuth_deg")
     yield from _counts(raw)
     for path, one in _file_rooms(raw):
-        if text := _settings_fault(one, raw):
-            yield Fault(path, text)
+        if fault := _settings_fault(path, one, raw):
+            yield fault
     yield from _ray_height(raw)
 
 
@@ -65,13 +65,19 @@ def _file_rooms(raw: Raw) -> Iterator[tuple[str, PanoramaTable | MeshTable]]:
                 continue
 
 
-def _settings_fault(one: PanoramaTable | MeshTable, raw: Raw) -> str:
-    """Sentence on numbers of which no room can be made; empty if there is none."""
+def _settings_fault(path: str, one: PanoramaTable | MeshTable, raw: Raw) -> Fault | None:
+    """Fault of numbers of which no room can be made, at the key that it is about; None if there is none."""
     try:
         one.settings(_least_stroke_m(raw))
     except SceneError as error:
-        return re.sub(r"\b(PanoramaSettings|MeshSettings|MeshLamp)(\.|: )", "", str(error))
-    return ""
+        within_it = ".mesh" if isinstance(one, PanoramaTable) else ""
+        text = str(error).replace("MeshSettings", f"PanoramaSettings{within_it}", 1)
+        found = re.match(r"PanoramaSettings((?:\.\w+|\[\d+\])*)(?: = (.*?): |: | )(.*)", text, re.DOTALL)
+        if found is None:
+            return Fault(path, text)
+        key, given, rest = found.groups()
+        return Fault(path + key, rest if given is None else f"{given}: {rest}")
+    return None
 
 
 # Heights.
@@ -95,9 +101,10 @@ def _heights(raw: Raw) -> Iterator[tuple[str, float]]:
     if generated_count(count if isinstance(count, int) else None, others):
         default = DistributionTable.model_validate(dict(PROPERTIES["height_m"].default))
         table = distribution_of(table_of(rooms, "properties").get("height_m")) or default
-        yield "rooms.properties.height_m", table.support[0]
+        if table.support[0] >= PROPERTIES["height_m"].low:  # else told by the table
+            yield "rooms.properties.height_m", table.support[0]
     for path, one in _file_rooms(raw):
-        if isinstance(one, PanoramaTable) and one.box_m is not None and not _settings_fault(one, raw):
+        if isinstance(one, PanoramaTable) and one.box_m is not None and not _settings_fault(path, one, raw):
             yield f"{path}.box_m", one.box_m[4]
 
 
@@ -107,8 +114,8 @@ def _ray_height(raw: Raw) -> Iterator[Fault]:
         return
     (low, high), limit_m = table.support, min((height for _, height in _heights(raw)), default=float("inf"))
     if low <= 0.0 or high >= limit_m:
-        text = f"reaches from {low:g} to {high:g} m, beyond floor or ceiling"
-        yield Fault("random.spot.height_m", f"{text}; stay above 0 and below {limit_m:g}")
+        text = f"{low:g} m is" if low == high else f"reaches from {low:g} to {high:g} m,"
+        yield Fault("random.spot.height_m", f"{text} beyond floor or ceiling; stay above 0 and below {limit_m:g}")
 
 
 def _least_stroke_m(raw: Raw) -> float:

@@ -13,6 +13,7 @@ from phibench.datasets.input_files import FILE_NAME, NAME_LENGTH
 from phibench.datasets.recipe.distributions import Distribution, Name, Table, names_of, values_of
 from phibench.datasets.rooms.mesh_placement import MeshLamp, MeshSettings
 from phibench.datasets.rooms.panorama_settings import PanoramaSettings
+from phibench.scenes.validation import SHA256, SceneError
 from phibench.scenes.worlds.properties import PROPERTIES, Property
 
 MESH_SUFFIXES = (".glb", ".ply")
@@ -69,9 +70,18 @@ def _is_one_file(name: str) -> str:
     return name
 
 
-RoomFile = Annotated[str, AfterValidator(_is_below)]
+def _is_picture(name: str) -> str:
+    if name.lower().endswith((*MESH_SUFFIXES, ".gltf", ".obj")):
+        raise ValueError(
+            f"'{name}' is a mesh and no picture; give the panorama here, and the mesh in [rooms.panoramas.mesh] or "
+            "[[rooms.meshes]]"
+        )
+    return name
+
+
+RoomFile = Annotated[str, AfterValidator(_is_below), AfterValidator(_is_picture)]
 MeshFile = Annotated[str, AfterValidator(_is_below), AfterValidator(_is_one_file)]
-Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$", max_length=64)]
+Digest = Annotated[str, Field(pattern=SHA256, max_length=64)]
 HeadingDeg = Annotated[float, Field(ge=-360.0, le=360.0)]
 TexelM = Annotated[float, Field(ge=5e-4, le=1.0)]
 Unit = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -141,7 +151,15 @@ class MeshTable(GeometryTable):
 
     def settings(self, stroke_m: float) -> MeshSettings:
         """Settings of the room, as for `GeometryTable`, with its lamps."""
-        return MeshSettings(**self._given(stroke_m), lamps=tuple(MeshLamp(**dict(lamp)) for lamp in self.lamps))
+        return MeshSettings(**self._given(stroke_m), lamps=tuple(map(_lamp, range(len(self.lamps)), self.lamps)))
+
+
+def _lamp(number: int, table: LampTable) -> MeshLamp:
+    """Lamp of a table; its faults name its place in the list."""
+    try:
+        return MeshLamp(**dict(table))
+    except SceneError as error:
+        raise SceneError(str(error).replace("MeshLamp", f"MeshSettings.lamps[{number}]")) from error
 
 
 class PanoramaTable(Table):

@@ -33,6 +33,7 @@ from phibench.scenes.validation import printable_line
 MOST_TRIANGLES = 1_000_000
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
 _REMEDY = "export it again as one .glb file with its textures inside"
+_DAMAGED = "is damaged: it ends early, or its numbers do not go together"  # the reader's own words name its code
 _PICTURES = ("PNG", "JPEG", "BMP", "TGA", "TIFF", "WEBP")
 _BLACK: Vector = (0.0, 0.0, 0.0)
 _WHITE: Vector = (1.0, 1.0, 1.0)
@@ -111,7 +112,7 @@ def read_mesh(path: Path, one_file: bool = False) -> tuple[MeshPart, ...]:
     except DatasetError:
         raise
     except Exception as error:  # documents and arrays can contradict each other in any way
-        raise file.fault(f"is damaged: {printable_line(f'{type(error).__name__} {error}', 200)}") from error
+        raise file.fault(_DAMAGED) from error
     found = _named([part for part in parts if len(part.triangles)])
     count = sum(len(part.triangles) for part in found)
     if not 0 < count <= MOST_TRIANGLES:
@@ -205,7 +206,7 @@ def _load(file: InputFile, data: bytes, kind: str, folder: _Folder, **options: A
     except Exception as error:
         if folder.fault:
             raise RoomError(folder.fault) from error
-        raise file.fault(f"is damaged: {printable_line(f'{type(error).__name__} {error}', 200)}") from error
+        raise file.fault(_DAMAGED) from error
     finally:
         log.setLevel(level)
     if folder.fault:

@@ -54,10 +54,15 @@ class MeshLamp:
         for name, length in (("centre_m", 3), ("size_m", 2), ("radiance_w_m2_sr", 3)):
             object.__setattr__(self, name, finite_vector("MeshLamp", name, getattr(self, name), length))
         object.__setattr__(self, "normal", unit_vector("MeshLamp", "normal", self.normal))
-        for value in (*self.size_m, max(self.radiance_w_m2_sr)):
-            positive("MeshLamp", "size_m and radiance_w_m2_sr", value)
+        for value in self.size_m:
+            positive("MeshLamp", "size_m", value)
         for value in self.radiance_w_m2_sr:
             within("MeshLamp", "radiance_w_m2_sr", value, 0.0, 1e5)
+        if max(self.radiance_w_m2_sr) <= 0.0:
+            raise RoomError(
+                f"MeshLamp.radiance_w_m2_sr = {self.radiance_w_m2_sr}: a lamp shines; give a band above 0, or leave "
+                "the lamp out"
+            )
 
 
 @dataclass(frozen=True)
@@ -116,7 +121,11 @@ class MeshSettings:
         within("MeshSettings", "stroke_m", self.stroke_m, 0.0, 10.0)
         object.__setattr__(self, "plain_albedo", finite_vector("MeshSettings", "plain_albedo", self.plain_albedo, 3))
         for value in self.plain_albedo:
-            within("MeshSettings", "plain_albedo", value, 0.0, self.largest_albedo)
+            if not 0.0 <= value <= self.largest_albedo:
+                raise RoomError(
+                    f"MeshSettings.plain_albedo = {self.plain_albedo}: allowed range is 0 to largest_albedo, "
+                    f"{self.largest_albedo:g}; give darker ones or a larger largest_albedo"
+                )
         object.__setattr__(self, "lamps", tuple(self.lamps))
         within("MeshSettings", "number of lamps", len(self.lamps), 0, 12)
 

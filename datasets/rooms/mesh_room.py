@@ -59,7 +59,7 @@ def mesh_room(settings: MeshSettings) -> Room:
     if not lamps and not any(part.light for part in meshes):
         raise RoomError(
             f"{settings.path} has no material that emits light, and no lamps are stated: without light the room is "
-            "black; give MeshSettings.lamps, or materials with an emission"
+            "black; add [[rooms.meshes.lamps]], or materials with an emission"
         )
     paints = [_paint(settings, part) for part in meshes]
     bitmaps = _bitmaps(settings, meshes, paints)

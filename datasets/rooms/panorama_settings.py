@@ -64,7 +64,7 @@ class PanoramaSettings:
         if self.radiance_scale is not None:
             within("PanoramaSettings", "radiance_scale", self.radiance_scale, 1e-9, 1e9)
         if (self.box_m is None) == (self.mesh is None):
-            raise RoomError("PanoramaSettings: state the geometry by box_m or by mesh, one of them")
+            raise RoomError("PanoramaSettings: state the geometry by box_m or by mesh, one of them and not both")
         if self.mesh is not None and self.mesh.lamps:
             raise RoomError(
                 "PanoramaSettings.mesh has lamps: the walls of a panorama shine by themselves; leave them out"
@@ -76,14 +76,22 @@ class PanoramaSettings:
         object.__setattr__(self, "box_m", box)
         low, high = np.array([box[0], box[2], 0.0]), np.array([box[1], box[3], box[4]])
         extent, text = high - low, f"PanoramaSettings.box_m = {box}"
+        for axis in range(2):
+            if extent[axis] <= 0.0:
+                names = f"{'xy'[axis]}_low = {low[axis]:g} is not below {'xy'[axis]}_high = {high[axis]:g}"
+                raise RoomError(f"{text}: {names}; give x_low, x_high, y_low, y_high, height in this order")
         if extent.min() < EXTENT_M[0] or extent.max() > EXTENT_M[1]:
             raise RoomError(
                 f"{text} (x_low, x_high, y_low, y_high, height) measures {extent[0]:.3g} x {extent[1]:.3g} x "
-                f"{extent[2]:.3g} m: a room measures {EXTENT_M[0]:g} to {EXTENT_M[1]:g} m each way"
+                f"{extent[2]:.3g} m: a room measures {EXTENT_M[0]:g} to {EXTENT_M[1]:g} m each way; move the walls"
             )
         robot_low, robot_high = robot_box()
         if np.any(low[:2] > robot_low[:2]) or np.any(high[:2] < robot_high[:2]):
-            raise RoomError(f"{text}: the robot, {robot_low[:2]} to {robot_high[:2]} m, must stand between the walls")
+            (x_low, y_low), (x_high, y_high) = robot_low[:2], robot_high[:2]
+            raise RoomError(
+                f"{text}: the robot, x {x_low:.2f} to {x_high:.2f} m and y {y_low:.2f} to {y_high:.2f} m, must stand "
+                "between the walls; the box counts from the robot, so x_low and y_low are below 0"
+            )
         if box[4] < MIRROR_TOP_M + self.stroke_m:
             raise RoomError(
                 f"{text}: the ceiling is lower than the mirror, which rises to {MIRROR_TOP_M + self.stroke_m:.2f} m "
@@ -91,7 +99,9 @@ class PanoramaSettings:
             )
         point = np.array(self.point_m)
         if np.any(point < low + CLEAR_M) or np.any(point > high - CLEAR_M):
+            inside = zip("xyz", low + CLEAR_M, high - CLEAR_M, strict=True)
+            clear = ", ".join(f"{axis} {least:g} to {most:g} m" for axis, least, most in inside)
             raise RoomError(
                 f"PanoramaSettings.point_m = {self.point_m}: the camera must be inside the box, {CLEAR_M:g} m or "
-                f"more from its walls {low} to {high} m"
+                f"more from its walls: {clear}; move it or the walls"
             )

@@ -14,6 +14,7 @@ from phibench.datasets.input_files import MIB, InputFile
 from phibench.datasets.rooms.room_errors import RoomError
 
 LARGEST_BYTES = 64 * MIB
+_REMEDY = "put a file of at most 64 MiB there, or give the name of another one"
 
 
 @dataclass(frozen=True)
@@ -73,4 +74,4 @@ def checked_file(folder: Path | None, name: str, sha256: str) -> Path:
 def _data(folder: Path | None, name: str) -> bytes:
     if folder is None:
         raise RoomError(f"the file '{name}' of a room is needed, and nobody says in which folder it is; give a folder")
-    return InputFile(folder / name, "put it there", RoomError, LARGEST_BYTES).read()
+    return InputFile(folder / name, _REMEDY, RoomError, LARGEST_BYTES).read()

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import SETTINGS_BYTES, InputFile
-from phibench.datasets.recipe.build import build_rig
+from phibench.datasets.recipe.build import build_rig, idle_holder_keys
 from phibench.datasets.recipe.distributions import Table
 from phibench.datasets.recipe.tables import LaserTable, RigTable
 from phibench.scenes.catalog import RIGS
@@ -72,6 +72,8 @@ def read_rig_file(path: Path) -> MeasuredRig:
         raise file.fault("; ".join(str(fault) for fault in faults))
     document = RigFile.model_validate(raw)
     table = document.rig
+    if idle := idle_holder_keys("rig.holder", sorted(table.holder.model_fields_set), (table.holder.kind,)):
+        raise file.fault(str(idle[0]))
     if fault := _focal_fault(table):
         raise file.fault(fault)
     try:

@@ -121,7 +121,7 @@ def test_a_sample_that_cannot_be_drawn_ends_no_run(
 ) -> None:
     never(1, monkeypatch)
     out = tmp_path / "out"
-    reason = "has no possible rig, spot and stroke in 100 draws; the last: the wall is in the way; narrow the"
+    reason = "has no possible rig, spot and stroke in 100 draws; the last: the wall is in the way; change the"
     assert f"will be refused: {REFUSED}: {reason}" in dry_run(recipe, out, workers=1)
     for _ in range(2):  # the second time, nothing but that sample is left
         assert main(["dataset", "make", str(recipe), "--out", str(out), "--workers", "1"]) == 1

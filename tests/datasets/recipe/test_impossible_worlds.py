@@ -54,7 +54,8 @@ def test_a_generated_room_lower_than_the_stroke(tmp_path: Path, capsys: pytest.C
     text = said(tmp_path, capsys, windows="1\nheight_m = 2.4", stroke_m="{ uniform = [1.62, 1.8] }", samples="1")
     assert "the mirror's top at 2." in text
     assert "is above the ceiling or what hangs from it, at 2.3" in text
-    assert text.endswith("narrow the distributions\n")  # there are no boards to move
+    assert "; change the numbers that are fixed or narrow the distributions (stroke_m, spot.azimuth_deg" in text
+    assert "boards" not in text  # there are none to move
 
 
 def everywhere(**options: Any) -> Room:

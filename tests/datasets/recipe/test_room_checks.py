@@ -27,6 +27,7 @@ def mesh(*absent: str, **values: Any) -> dict[str, Any]:
 LOW = (*BOX[:4], 2.05)
 GEOMETRY = without(MESH, "lamps")
 LAMP = MESH["lamps"][0]
+THERE = "put a file of at most 64 MiB there, or give the name of another one"
 FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "no rooms at all": ({"count": 0, "panoramas": [], "meshes": []}, "rooms.count: 0, and there are no panoramas"),
     "properties of no room": ({"count": 0, "properties": {"lamps": 2}}, "rooms.properties: given, but no room is"),
@@ -36,16 +37,16 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "no camera": (panorama("point_m"), "rooms.panoramas[0].point_m: missing; add a list of 3"),
     "camera outside": (
         panorama(point_m=[0.0, 1.98, 1.4]),
-        "rooms.panoramas[0]: point_m = (0.0, 1.98, 1.4): the cam",
+        "rooms.panoramas[0].point_m: (0.0, 1.98, 1.4): the camera",
     ),
     "no geometry": (panorama("box_m"), "rooms.panoramas[0]: state the geometry by box_m or by mesh, one of them"),
     "two geometries": (panorama(mesh=GEOMETRY), "rooms.panoramas[0]: state the geometry by box_m or by mesh"),
     "robot outside": (
         panorama(box_m=[0.1, 4.0, -2.0, 2.0, 2.6]),
-        "rooms.panoramas[0]: box_m = (0.1, 4.0, -2.0, 2.0",
+        "rooms.panoramas[0].box_m: (0.1, 4.0, -2.0, 2.0, 2.6): the robot, x -0.45 to 0.44 m",
     ),
-    "a box too small": (panorama(box_m=[-0.9, 0.9, -2.0, 2.0, 2.6]), "rooms.panoramas[0]: box_m = (-0.9, 0.9, -2.0, 2"),
-    "a low box": (panorama(box_m=LOW, stroke_m=1.3), "rooms.panoramas[0]: box_m = (-2.5, 2.5, -2.0, 2.0, 2.05): the c"),
+    "a box too small": (panorama(box_m=[-0.9, 0.9, -2.0, 2.0, 2.6]), "rooms.panoramas[0].box_m: (-0.9, 0.9, -2.0, 2"),
+    "a low box": (panorama(box_m=LOW, stroke_m=1.3), "rooms.panoramas[0].box_m: (-2.5, 2.5, -2.0, 2.0, 2.05): the c"),
     "an unknown key": (panorama(scale=2.0), "rooms.panoramas[0].scale: unknown key; "),
     "a mesh without scale": (
         mesh("metres_per_unit"),
@@ -54,7 +55,25 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "a mesh without up axis": (mesh("up_axis"), "rooms.meshes[0].up_axis: missing; add one of 'y', 'z' (axis of the"),
     "a mesh without floor": (mesh("floor_point"), "rooms.meshes[0].floor_point: missing; add a list of 3"),
     "a mesh of many files": (mesh(file="hall.obj"), "rooms.meshes[0].file: 'hall.obj' is no mesh of one file"),
-    "a lamp that faces nowhere": (mesh(lamps=[{**LAMP, "normal": [0, 0, 0]}]), "rooms.meshes[0]: normal = ("),
+    "a lamp that faces nowhere": (mesh(lamps=[{**LAMP, "normal": [0, 0, 0]}]), "rooms.meshes[0].lamps[0].normal: ("),
+    "a lamp that is dark": (
+        mesh(lamps=[LAMP, {**LAMP, "radiance_w_m2_sr": [0, 0, 0]}]),
+        "rooms.meshes[0].lamps[1].radiance_w_m2_sr: (0.0, 0.0, 0.0): a lamp shines; give",
+    ),
+    "a box of another order": (
+        panorama(box_m=[2.5, -2.5, -2.0, 2.0, 2.6]),
+        "rooms.panoramas[0].box_m: (2.5, -2.5, -2.0, 2.0, 2.6): x_low = 2.5 is not below x_high = -2.5; give x_low",
+    ),
+    "a mesh as a picture": (panorama(file="hall.glb"), "rooms.panoramas[0].file: 'hall.glb' is a mesh and no picture"),
+    "a short SHA-256": (mesh(sha256="ab"), "rooms.meshes[0].sha256: 'ab' is not allowed; give a string of 64 digits"),
+    "albedo above the largest": (
+        mesh(plain_albedo=[0.5] * 3, largest_albedo=0.3),
+        "rooms.meshes[0].plain_albedo: (0.5, 0.5, 0.5): allowed range is 0 to largest_albedo, 0.3; give",
+    ),
+    "geometry turned too far": (
+        panorama("box_m", mesh={**GEOMETRY, "heading_deg": 400.0}),
+        "rooms.panoramas[0].mesh.heading_deg: 400.0 is not allowed; give a number from -360 up to 360",
+    ),
     "a lamp without a size": (mesh(lamps=[without(LAMP, "size_m")]), "rooms.meshes[0].lamps[0].size_m: missing; add"),
     "geometry with lamps": (panorama("box_m", mesh=MESH), "rooms.panoramas[0].mesh.lamps: unknown key; "),
 }
@@ -105,11 +124,11 @@ def test_files_are_looked_for_beside_the_recipe(folder: Path, monkeypatch: pytes
     files = RoomFiles(folder)
     assert check_recipe(recipe(), files=files)
     [line] = complaints(recipe(**panorama(file="ofice.png")), files)
-    assert line == f"rooms.panoramas[0].file: {folder}/ofice.png is missing; put it there"
+    assert line == f"rooms.panoramas[0].file: {folder}/ofice.png is missing; {THERE}"
     [line] = complaints(recipe(**mesh(file="meshes/all.glb")), files)
-    assert line == f"rooms.meshes[0].file: {folder}/meshes/all.glb is missing; put it there"
+    assert line == f"rooms.meshes[0].file: {folder}/meshes/all.glb is missing; {THERE}"
     [line] = complaints(recipe(**panorama(file="meshes")), files)
-    assert line == f"rooms.panoramas[0].file: {folder}/meshes is not readable: it is a folder; put it there"
+    assert line == f"rooms.panoramas[0].file: {folder}/meshes is not readable: it is a folder; {THERE}"
     monkeypatch.setattr(room_files, "LARGEST_BYTES", 1 << 10)
     lines = complaints(recipe(), files)
     assert len(lines) == 2

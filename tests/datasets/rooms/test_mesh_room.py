@@ -25,6 +25,7 @@ from helpers.mesh_files import (
 from PIL import Image
 
 from phibench.datasets.rooms import mesh_room as mesh_room_module
+from phibench.datasets.rooms.mesh_files import read_mesh
 from phibench.datasets.rooms.mesh_placement import MeshLamp, MeshSettings, meets_box
 from phibench.datasets.rooms.mesh_room import mesh_room
 from phibench.scenes.faces import FaceTable, face_table
@@ -307,6 +308,16 @@ def test_cut_files_end_in_one_sentence(glb, tmp_path, kept):
     with pytest.raises(SceneError, match=r"cut\.glb") as caught:
         of_glb(tmp_path / "cut.glb")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("head", ["", "format\n", "format ascii 1.0\nelement\nend_header\n"])
+def test_a_broken_ply_names_no_slip_of_the_reader(tmp_path, head):
+    path = tmp_path / "room.ply"
+    path.write_text(f"ply\n{head}")
+    with pytest.raises(
+        SceneError, match=r"room\.ply is damaged: it ends early, or its numbers do not go together; exp"
+    ):
+        read_mesh(path)
 
 
 def test_missing_companions_of_an_obj_are_named(tmp_path):

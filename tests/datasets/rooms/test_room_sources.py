@@ -51,7 +51,7 @@ def test_a_missing_or_changed_file_is_one_sentence(
     sources: tuple[PanoramaRoom | MeshRoom, ...], tmp_path: Path
 ) -> None:
     photo, on_mesh, mesh = sources
-    with pytest.raises(RoomError, match=r"office\.png is missing; put it there$"):
+    with pytest.raises(RoomError, match=r"office\.png is missing; put a file of at most 64 MiB there"):
         photo.build(tmp_path)
     folder = write_files(tmp_path)
     (folder / "meshes" / "hall.glb").write_bytes(b"glTF")
