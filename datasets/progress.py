@@ -34,6 +34,8 @@ class Steps:
         Seconds left; by default the steps are taken to be equal.
     running : callable, optional
         What is being done, in words.
+    announce : bool
+        Print a line at the start too, for a single step that takes long.
     """
 
     def __init__(
@@ -43,9 +45,11 @@ class Steps:
         total: int,
         left_s: Callable[[], float] | None = None,
         running: Callable[[], str] | None = None,
+        announce: bool = False,
     ) -> None:
         self._console, self._title, self._total = console, title, total
         self._forecast_s, self._running = left_s, running
+        self._announce = announce
         self._done, self._started, self._share = 0, time.monotonic(), 0.0
         self._bar = _bar(console) if console.is_terminal else None
         self._end = threading.Event()
@@ -55,6 +59,8 @@ class Steps:
         if self._bar is not None:
             self._bar.start()
             self._task = self._bar.add_task(self._title, total=self._total, share=0.0, left="")
+        elif self._announce:
+            self._tell()
         self._teller.start()
         return self
 

@@ -15,6 +15,7 @@ import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -32,6 +33,8 @@ from phibench.render.room.texel_grid import TexelGrid
 from phibench.scenes.faces import face_table
 from phibench.scenes.rig import POSITIONS
 from phibench.scenes.room import Room
+
+Light = Literal["baked", "cached", "none"]
 
 # Seconds.
 START_S = 7.0  # workers, Mitsuba in each, first kernels, hashes
@@ -68,11 +71,13 @@ class Forecast:
         Bytes on the disk.
     seconds : dict
         Seconds of one task of each kind, on an idle core of the machine of the constants.
+    light : "baked", "cached" where the cache has every light map, or "none" where no room has any light to bake
     """
 
     counts: dict[str, int]
     size: int
     seconds: dict[str, float]
+    light: Light = "baked"
 
     def text(self, workers: int, slowdown: float) -> str:
         """One sentence for the terminal."""
@@ -86,10 +91,11 @@ class Forecast:
     def _count(self, kind: str, number: int, pace: Pace) -> str:
         if kind != "bake":
             return f"{number} {kind}{'s' * (number != 1)}"
-        is_cached = self.seconds[kind] <= CACHED_BAKE_S
+        if self.light == "none":
+            return f"{number} room{'s' * (number != 1)} without a bake"
         what = "bake of the room's light" if number == 1 else "bakes of rooms' light"
         each = "" if number == 1 else " each"
-        return f"{number} {what} ({'cached' if is_cached else duration(pace.seconds(kind)) + each})"
+        return f"{number} {what} ({'cached' if self.light == 'cached' else duration(pace.seconds(kind)) + each})"
 
 
 def forecast(plan: Plan, tasks: Collection[Task]) -> Forecast:
@@ -103,7 +109,24 @@ def forecast(plan: Plan, tasks: Collection[Task]) -> Forecast:
         "sample": 0.5 * pixels * _PREVIEW_BYTES_PX,
     }
     total = sum(count * size.get(kind, 0.0) for kind, count in counts.items())
-    return Forecast(dict(counts), int(_RESERVE * total), _seconds(plan, pixels / 1e6, "bake" in counts))
+    bakes = "bake" in counts
+    seconds = _seconds(plan, pixels / 1e6, bakes)
+    return Forecast(dict(counts), int(_RESERVE * total), seconds, _light(plan) if bakes else "none")
+
+
+def _light(plan: Plan) -> Light:
+    """Tell where the light of a plan's rooms comes from.
+
+    Only the first room of each kind is made and looked up: it takes a while. So "cached" is said where there is no
+    other room with light.
+    """
+    lit = [(part, room) for part, room in _first_rooms(plan) if room.lit]
+    if not lit:
+        return "none"
+    settings = bake_settings(plan.recipe.ambient)
+    is_all = round(sum(part for part, _ in lit) * len(plan.rooms)) == len(lit)
+    found = is_all and all(is_cached(plan.rig.at(0.0), room, settings) for _, room in lit)
+    return "cached" if found else "baked"
 
 
 def _seconds(plan: Plan, megapixels: float, bakes: bool) -> dict[str, float]:
@@ -162,6 +185,8 @@ def megabytes(count: int) -> str:
 
 def duration(seconds: float) -> str:
     """Seconds for people."""
+    if seconds < 1.0:
+        return "under 1 s"
     return f"{seconds:.0f} s" if seconds < 90.0 else f"{seconds / 60.0:.0f} min"
 
 

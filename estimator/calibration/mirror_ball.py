@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.rooms.panorama_settings import PanoramaSettings
 from phibench.datasets.store.layers import write_exr
 from phibench.datasets.store.pictures import save_png
 from phibench.estimator.calibration.ball_circle import LONGEST_PX, BallCircle, find_circle, shrunk
@@ -31,9 +32,10 @@ from phibench.estimator.geometry.panorama import Grid, unrolled
 from phibench.estimator.spots.camera_codes import linear_to_srgb
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
-from phibench.scenes.frames import Array, Pose, as_matrix, as_vector
+from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector
 from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.rig import Rig, View
+from phibench.scenes.validation import SceneError
 
 SUFFIXES = (".exr", ".png")
 MOST_COLUMNS = 8192
@@ -298,6 +300,49 @@ def write_panorama(path: Path, panorama: BallPanorama) -> Path:
         "sphere_in_camera_m": [float(x) for x in view.rig.sphere_in_camera_m],
     }
     return write_exr(path, {**planes, "seen": panorama.seen.astype(np.float32)}, header)
+
+
+_POINT_M = (0.0, 0.0, 1.2)
+_WALL_M = (1.0, 45.0)  # distance of the example's walls: a room measures 2 to 100 m
+
+
+def panorama_table(path: Path, point_m: Vector | None, box_m: Vector | None, surroundings_m: float) -> str:
+    """Table of a recipe that reads a panorama; what a photograph does not tell is an example to change.
+
+    Parameters
+    ----------
+    path : Path
+    point_m : 3 floats, or None
+        Place of the ball's centre, from the robot.
+    box_m : 5 floats, or None
+        Walls around the robot; the example's are at the distance of the surroundings.
+    surroundings_m : float
+
+    Raises
+    ------
+    DatasetError
+        If no room can be made of the point and the box.
+    """
+    wall = min(max(surroundings_m, _WALL_M[0]), _WALL_M[1])
+    point = _POINT_M if point_m is None else point_m
+    box = (-wall, wall, -wall, wall, 2.5) if box_m is None else box_m
+    try:
+        PanoramaSettings(path, point, box_m=box, stroke_m=0.0)
+    except SceneError as error:
+        text = str(error).replace("PanoramaSettings.box_m", "--box-m").replace("PanoramaSettings.point_m", "--point-m")
+        raise DatasetError(text) from error
+    lines = (
+        "[[rooms.panoramas]]",
+        f'file = "{path.name}"',
+        f"point_m = {[float(x) for x in point]}  # the ball's centre{_example(point_m)}",
+        "heading_deg = 0.0  # of the direction from the ball to the camera; an example: put in yours",
+        f"box_m = {[float(x) for x in box]}  # x_low, x_high, y_low, y_high, height{_example(box_m)}",
+    )
+    return "\n".join(lines)
+
+
+def _example(given: Vector | None) -> str:
+    return "; an example: put in yours" if given is None else ""
 
 
 def write_outline(path: Path, light: NDArray[np.float32], ball: Ball) -> Path:

@@ -25,11 +25,14 @@ def from_mirror_ball(
     principal_point_px: Annotated[tuple[float, float] | None, Parameter(negative="")] = None,
     camera_elevation_deg: float = 0.0,
     width: Whole | None = None,
+    point_m: Annotated[tuple[float, float, float] | None, Parameter(negative="")] = None,
+    box_m: Annotated[tuple[float, float, float, float, float] | None, Parameter(negative="")] = None,
 ) -> int:
     """Unwrap a photograph of a mirror ball into a panorama of its surroundings.
 
     A copy of the photograph with the ball's outline is written beside it. The panorama's middle looks from the ball to
-    the camera, which is seen there. It is taken at the ball's centre.
+    the camera, which is seen there. It is taken at the ball's centre. The table of a recipe that reads the file is
+    printed. A photograph does not tell the walls and where the ball was: state them, or put them into the table.
 
     Parameters
     ----------
@@ -53,12 +56,17 @@ def from_mirror_ball(
         Of the camera's axis above the horizon: 0 horizontal, 90 looking up at the ball.
     width
         Columns of the panorama, even; by default as fine as the photograph, up to the 2880 that a recipe reads.
+    point_m
+        Place of the ball's centre in the room: from the robot, x its front, z up from the floor; for the table.
+    box_m
+        Walls around the robot: x_low, x_high, y_low, y_high, height; for the table.
     """
     from phibench.datasets.rooms.panorama_files import read_light
     from phibench.datasets.store.files import require_writable
     from phibench.estimator.calibration.mirror_ball import (
         BallPhoto,
         find_ball,
+        panorama_table,
         require_suffix,
         unwrap,
         write_outline,
@@ -68,6 +76,7 @@ def from_mirror_ball(
     stated = BallPhoto(radius_m, distance_m, focal_px, principal_point_px, circle, camera_elevation_deg)
     require_suffix(out)
     require_writable(out)
+    table = panorama_table(out, point_m, box_m, surroundings_m)
     light = read_light(photo)
     ball = find_ball(light, stated)
     u, v, radius = ball.circle_px
@@ -89,6 +98,7 @@ def from_mirror_ball(
         f"{out}: {columns} x {rows} pixels of {360.0 / columns:.2g} degrees, scene {surroundings_m:g} m away; "
         f"{100.0 * float(panorama.seen.mean()):.1f} % is seen, the rest takes the nearest that is"
     )
+    print(f"\n{table}")
     return 0
 
 
@@ -128,8 +138,12 @@ def panorama(
         Rows of the panorama; it has twice as many columns.
     """
     from phibench.datasets.build.room_export import export_panorama, export_room
+    from phibench.datasets.progress import Steps, progress_console
 
-    made = export_panorama(export_room(room_name, seed, properties, box=True), out, point_m, heading_deg, rows)
+    room_of_it = export_room(room_name, seed, properties, box=True)
+    with Steps(progress_console(), f"panorama of {room_of_it.name}, light and pixels", 1, announce=True) as steps:
+        made = export_panorama(room_of_it, out, point_m, heading_deg, rows)
+        steps.advance()
     print(f"\n# {made.path}: {2 * rows} x {rows} pixels\n{made.table}")
     return 0
 

@@ -282,6 +282,14 @@ def test_a_long_bake_is_not_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert "s left, running: bake room (0 s)" in said(console)
 
 
+def test_a_single_long_step_is_announced() -> None:
+    console = quiet()
+    with Steps(console, "panorama", 1, announce=True) as steps:
+        assert said(console) == "panorama: 0/1 after 0 s\n"
+        steps.advance()
+    assert said(console).splitlines()[-1].startswith("panorama: 1/1 after ")
+
+
 def test_the_preview_says_what_the_data_set_will_be(smallest_dataset: Path, tmp_path: Path) -> None:
     rows, text = read_manifest(smallest_dataset), make.dry_run(SMALLEST, tmp_path / "out", workers=2)
     assert list(tmp_path.iterdir()) == []
@@ -296,7 +304,7 @@ def test_the_preview_says_what_the_data_set_will_be(smallest_dataset: Path, tmp_
     assert hidden == 1
     assert "1 of 2 pairs will be visible" in text
     assert re.search(
-        r"to make: 2 spots, 1 bake of the room's light \((cached|\d+ s)\), 3 views, 2 samples; about", text
+        r"to make: 2 spots, 1 bake of the room's light \((cached|under 1 s|\d+ s)\), 3 views, 2 samples; about", text
     )
     assert "a first guess" in text
     console = quiet()

@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -152,6 +153,21 @@ def test_the_forecast_of_a_bake_is_the_mean_over_kinds(recipe: Path, monkeypatch
     alone = [seconds(name) for name in IDS]
     assert len(set(alone)) == 3
     assert seconds(*IDS, "room000001") == pytest.approx((2 * alone[0] + alone[1] + alone[2]) / 4)
+
+
+def test_cached_is_said_of_light_maps_in_the_cache_alone(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bake that takes less than a second is no cached one, and one room in the cache speaks for no other."""
+    plan = make_plan(load_recipe(recipe), recipe_files(recipe))
+    tasks = [task for task in plan_tasks(make_plan(plan.recipe, plan.files), {}).values() if task.kind == "bake"]
+
+    def said(found: bool, rooms: dict[str, Any]) -> str:
+        monkeypatch.setattr("phibench.datasets.build.forecast.is_cached", lambda *_: found)
+        return forecast(replace(plan, rooms=rooms), tasks).text(1, 1e-3)
+
+    rooms = dict(plan.rooms)
+    assert "(cached)" in said(True, rooms)
+    assert "(under 1 s each)" in said(False, rooms)
+    assert "cached" not in said(True, {**rooms, "room000001": rooms["room000000"]})
 
 
 def test_another_file_under_the_same_name_is_other_work(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from PIL import Image
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.recipe.room_tables import PanoramaTable
 from phibench.datasets.rooms.panorama_files import read_panorama
 from phibench.datasets.rooms.panorama_room import panorama_room
 from phibench.datasets.rooms.panorama_settings import PanoramaSettings
@@ -151,6 +153,11 @@ def test_command_writes_a_panorama_that_makes_a_room(photo, tmp_path, capsys, na
     said = capsys.readouterr().out
     assert "outline: centre" in said
     assert "ball's centre 0.3" in said
+    # the printed table is that of a recipe: no number in it is refused, and the example says that it is one
+    [table] = tomllib.loads(said[said.index("[[rooms") :])["rooms"]["panoramas"]
+    assert table["file"] == name
+    assert PanoramaTable.model_validate(table).settings(0.0).box_m == (-1.0, 1.0, -1.0, 1.0, 2.5)  # a room has 2 m
+    assert said.count("an example: put in yours") == 3
     drawn = np.asarray(Image.open(tmp_path / "room-outline.png")).astype(int)
     red = np.argwhere((drawn == [255, 0, 0]).all(axis=-1))
     middle = 0.5 * (np.array(SIZE) - 1.0) + FOCAL / 0.3 * CENTRE[1::-1]  # of the ball, (row, column), to some pixels
@@ -175,6 +182,8 @@ def test_command_writes_a_panorama_that_makes_a_room(photo, tmp_path, capsys, na
         ({"--camera-elevation-deg": "120"}, "-90 to 90"),
         ({"--out": "room.jpg"}, ".exr or .png"),
         ({"--focal-px": "10"}, "into the ball"),
+        ({"--point-m": ("9", "0", "1")}, "--point-m = (9.0, 0.0, 1.0): the camera must be inside the box"),
+        ({"--box-m": ("2", "-2", "-2", "2", "2.5")}, "--box-m = (2.0, -2.0, -2.0, 2.0, 2.5): x_low = 2 is not below"),
         ({"--circle": ("5000", "100", "50")}, "meet the picture"),
     ],
 )
