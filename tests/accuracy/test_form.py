@@ -101,8 +101,8 @@ def test_a_wrong_sign_of_any_harmonic_is_noticed(name: str) -> None:
 def test_accuracy_chief_ray_and_centroid_of_formed_mirrors() -> None:
     """Chief ray <= 1e-6 px, centroid <= 0.002 px, flux <= 0.3 %: rays from the camera, rough mirrors included."""
     rng = np.random.default_rng(5)
-    assert sum(check(draw_formed(rng)) for _ in range(5)) > 5
-    assert sum(check(draw_formed(rng, 3e-4)) for _ in range(2)) > 1
+    assert sum(check(draw_formed(rng)) for _ in range(3)) > 3
+    assert check(draw_formed(rng, 3e-4)) > 0
 
 
 @pytest.mark.slow

@@ -104,7 +104,7 @@ def test_truth_layer_at_the_spot_is_the_spots_truth(paper: Dataset) -> None:
         assert planes["depth_m"][v, u] == pytest.approx(sample.row.depth_m, rel=0.02)  # the board, not the wall behind
 
 
-@pytest.mark.slow  # all certificates once more; quick on smaller data sets in tests/datasets/test_verify.py
+@pytest.mark.study  # all certificates once more; quick on smaller data sets in tests/datasets/test_verify.py
 def test_verify_finds_no_fault(paper: Dataset) -> None:
     report = verify(paper.folder)
     assert report.ok, report.faults

@@ -63,7 +63,7 @@ def test_accuracy_chief_ray_against_quartic_and_fermat_path() -> None:
     assert checked > 190
 
 
-@pytest.mark.parametrize("count", [60, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [20, pytest.param(200, marks=pytest.mark.slow)])
 def test_accuracy_centroid_and_flux_of_random_rigs(count: int) -> None:
     """<= 0.002 px and 0.3 % for random rigs, spots and strokes, distorted, off axis, in and out of focus."""
     checked = 0
@@ -91,6 +91,13 @@ def test_accuracy_centroid_and_flux_of_the_paper() -> None:
             assert certify(view, spot, room.shapes(view), truth, layer).passed
 
 
+@pytest.fixture
+def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Certificates without their further rounds of up to 2^19 rays, which would only find a fault again."""
+    monkeypatch.setattr("phibench.render.optics.certificate._LOG2_RAYS", (13, 15))
+
+
+@pytest.mark.usefixtures("few_rays")
 @pytest.mark.parametrize("fault", ["half a pixel", "1 % of flux", "0.003 px"])
 def test_certificate_notices_a_wrong_layer(fault: str) -> None:
     view, spot = default_rig().at(0.4), LaserSpot((2.0, 0.5, 0.5), (-1, 0, 0), 5e-3)
@@ -102,6 +109,7 @@ def test_certificate_notices_a_wrong_layer(fault: str) -> None:
     assert not certify(view, spot, (), truth, wrong).passed
 
 
+@pytest.mark.usefixtures("few_rays")
 def test_certificate_notices_a_wrong_chief_ray() -> None:
     view, spot = default_rig().at(0.4), LaserSpot((2.0, 0.5, 0.5), (-1, 0, 0), 5e-3)
     truth = spot_truth(view, spot, ())
@@ -125,7 +133,7 @@ def test_node_count_is_sufficient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Doubling all node counts changes no pixel by more than 1e-4 of the peak and the flux by less than 1e-6."""
     from phibench.render.optics import spot_samples
 
-    coarse = [(view, spot, spot_layer(view, spot, ())) for view, spot in _cases(3, 20)]
+    coarse = [(view, spot, spot_layer(view, spot, ())) for view, spot in _cases(3, 10)]
     nodes = spot_samples.disc_nodes
     monkeypatch.setattr(spot_samples, "disc_nodes", lambda profile, smoothness: nodes(profile, 2.0 * smoothness + 2.0))
     checked = 0
@@ -137,7 +145,7 @@ def test_node_count_is_sufficient(monkeypatch: pytest.MonkeyPatch) -> None:
         assert np.abs(a - b).max() <= 1e-4 * b.max()
         assert layer.total_electrons_per_s[0] == pytest.approx(fine.total_electrons_per_s[0], rel=1e-6)
         checked += 1
-    assert checked > 12
+    assert checked > 6
 
 
 def _embed(layer, u0: int, v0: int, size: int) -> np.ndarray:
@@ -241,15 +249,15 @@ def test_accuracy_of_a_spot_cut_by_an_edge() -> None:
     disc, lens = rng.normal(size=(count, 2)), rng.uniform(size=(count, 2))
     radius, turn = np.sqrt(lens[:, 0]), 2.0 * np.pi * lens[:, 1]
     eyes = spot_samples._lens_points(view, radius[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1))
-    free = specular_cloud(view, spot, ())
+    free, whole = specular_cloud(view, spot, ()), spot_layer(view, spot, ()).total_electrons_per_s[0]
+    light, weight = deposit(spot, RoomGeometry(), disc), np.full(count, 1.0 / count)
+    open_watts = spot_samples._connect(view, spot, RoomGeometry(), light, eyes, weight).watts.sum()
     for edge_m in (-2e-3, -5e-4, 0.0, 7e-4, 1.5e-3):
         screen = (cuboid("screen", (1.9, edge_m - 0.5, 0.5), (0.01, 1.0, 1.0), (0.5, 0.5, 0.5)),)
         layer = spot_layer(view, spot, screen)
-        light, weight = deposit(spot, RoomGeometry(), disc), np.full(count, 1.0 / count)
         pairs = spot_samples._connect(view, spot, RoomGeometry(screen), light, eyes, weight)
-        open_pairs = spot_samples._connect(view, spot, RoomGeometry(), light, eyes, weight)
-        share = pairs.watts.sum() / open_pairs.watts.sum()
-        ours = layer.total_electrons_per_s[0] / spot_layer(view, spot, ()).total_electrons_per_s[0]
+        share = pairs.watts.sum() / open_watts
+        ours = layer.total_electrons_per_s[0] / whole
         assert ours == pytest.approx(share, abs=4e-3)
         assert np.linalg.norm(layer.centroid_uv_px - pairs.centroid_px()) < 2e-3
         shares.append(ours)
@@ -296,15 +304,15 @@ def test_near_the_outline_a_spot_is_certified_or_flagged() -> None:
     """Spots that climb up a wall until the mirror's edge: each passes its certificate, or says why it is not seen."""
     view, causes = default_rig().at(0.0), []
     for x in (0.3, 0.5, 1.0, 2.0):
-        for z in np.arange(1.0, 5.0, 0.25):
+        for z in np.arange(1.0, 5.0, 0.5):
             spot = LaserSpot((x, 0.0, z), (-1, 0, 0), 4e-3)
             truth = spot_truth(view, spot, ())
             causes.append(truth.cause)
             if truth.visible:
                 assert certify(view, spot, (), truth, spot_layer(view, spot, ())).passed, (x, z)
-    assert causes.count("none") > 20
-    assert causes.count("mirror_edge") > 5
-    assert causes.count("no_reflection") > 5
+    assert causes.count("none") > 10
+    assert causes.count("mirror_edge") > 2
+    assert causes.count("no_reflection") > 2
 
 
 def test_causes_of_a_spot_that_is_not_seen() -> None:

@@ -101,6 +101,7 @@ def _without_noise(row: ManifestRow) -> dict[str, object]:
     return row.model_dump(exclude={"down": {"noise"}, "up": {"noise"}})
 
 
+@pytest.mark.usefixtures("inline")
 def test_a_finished_data_set_is_left_alone_and_a_damaged_one_made_again(smallest_dataset: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(smallest_dataset, tmp_path / "copy"))
     console = quiet()
@@ -333,6 +334,7 @@ def _changed(folder: Path, old: str, new: str) -> Path:
     return folder / "changed.toml"
 
 
+@pytest.mark.usefixtures("inline")
 def test_without_mitsuba_frames_may_change_and_nothing_may_be_rendered(smallest_dataset: Path, tmp_path: Path) -> None:
     copy, blocked = Path(shutil.copytree(smallest_dataset, tmp_path / "copy")), tmp_path / "blocked"
     for name in ("mitsuba", "drjit"):

@@ -61,7 +61,7 @@ def tasks() -> list[Task]:
     return [*innocent[:3], *guilty, *innocent[3:], Task("reader", "", square, (1,), ("kill 9",))]
 
 
-@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.slow), 2])  # each: 7 starts of a worker
 def test_who_kills_workers_is_named_and_all_others_finish(tmp_path: Path, count: int) -> None:
     with local_workers(count, tmp_path) as pool:
         outcomes = {task.name: outcome for task, outcome in schedule(tasks(), pool)}
@@ -297,12 +297,12 @@ def test_every_task_is_logged(smallest_dataset: Path) -> None:
 
 @pytest.mark.usefixtures("inline")
 def test_a_worker_that_fails_half_way_leaves_the_rest_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "phibench.datasets.build.sample_task.save_png", lambda *_: (_ for _ in ()).throw(OSError(28, "full"))
-    )
-    with pytest.raises(DatasetError, match="2 of 8 tasks failed"):
-        make(SMALLEST, tmp_path / "out", workers=1, console=quiet())
-    monkeypatch.undo()
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            "phibench.datasets.build.sample_task.save_png", lambda *_: (_ for _ in ()).throw(OSError(28, "full"))
+        )
+        with pytest.raises(DatasetError, match="2 of 8 tasks failed"):
+            make(SMALLEST, tmp_path / "out", workers=1, console=quiet())
     console = quiet()
     make(SMALLEST, tmp_path / "out", workers=2, console=console)
     assert "to make: 2 samples" in said(console)

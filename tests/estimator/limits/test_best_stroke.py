@@ -214,12 +214,12 @@ def test_far_camera_gives_the_closed_form_and_its_minimum() -> None:
 
 def test_minimum_is_that_of_a_brute_force_search_with_a_rig_as_built() -> None:
     best = best_stroke(2.18, covariance_rig=np.diag(prior_sigmas() ** 2), spot=SAME)
-    strokes = np.linspace(0.1, 1.4, 131)
+    strokes = np.linspace(0.1, 1.4, 53)
     sigma = _curve(2.18, strokes, covariance_rig=np.diag(prior_sigmas() ** 2))
     # the higher orders are interpolated between 9 strokes: within 2e-4 of all strokes by themselves
     assert best.sigma_m <= sigma.min() * (1.0 + 5e-4)
-    # the error is flat: 5e-4 of it are 0.02 m of the stroke
-    assert best.stroke_m == pytest.approx(strokes[np.argmin(sigma)], abs=0.03)
+    # the error is flat: 5e-4 of it are 0.02 m of the stroke; half a step is 0.0125 m
+    assert best.stroke_m == pytest.approx(strokes[np.argmin(sigma)], abs=0.035)
     low, high = best.near()
     assert low < best.stroke_m < high
     assert sigma[-1] > 1.2 * best.sigma_m  # the error of a rig as built grows again
@@ -227,7 +227,7 @@ def test_minimum_is_that_of_a_brute_force_search_with_a_rig_as_built() -> None:
 
 def test_a_rig_as_built_errs_beyond_first_order_as_drawn_rigs_do() -> None:
     """At D = 1.4 m, h = 0.4 m the first order of a tilt is nearly 0; what is left is its square."""
-    random, n, D, h = generator("test", "drawn rigs"), 250, 1.4, 0.4
+    random, n, D, h = generator("test", "drawn rigs"), 125, 1.4, 0.4
     C, one = np.diag(prior_sigmas() ** 2), replace(OPEN, azimuths_rad=(0.0, 1.6, 3.1, 4.7))
     curve = stroke_curve(RIG, D, np.array([h]), SAME, C, one, Laser(), 1.0 / 60.0, 0.0)
     points, root = one.points_m(RIG, D), covariance_root(C)
@@ -241,7 +241,7 @@ def test_a_rig_as_built_errs_beyond_first_order_as_drawn_rigs_do() -> None:
     pixels = 0.05**2 * np.eye(2)
     found = depth_general(RIG, h, np.array(down), np.array(up), pixels, pixels, C).depth_m
     rms = float(np.sqrt(np.mean((found - np.array(true)) ** 2)))
-    # squares of 250 rigs scatter by about 2: the rms by 2 / (2 sqrt(250)) = 6 %, that of the rule's 32 pairs by 15 %
+    # squares of 125 rigs scatter by about 2: the rms by 2 / (2 sqrt(125)) = 9 %, that of the rule's 32 pairs by 15 %
     assert rms == pytest.approx(float(curve.sigma_m[0]), rel=0.45)
     assert rms > 2.0 * float(curve.sigma_calibration_m[0])
 
@@ -344,7 +344,7 @@ def test_causes_are_the_simulators() -> None:
     # within a pixel of the outline the search for the pixel may end without one
     rim = (NO_IMAGE, MIRROR_EDGE)
     words = {NO_REFLECTION: rim, EDGE: rim, OUTSIDE: (IMAGE_EDGE,)}
-    for _ in range(300):
+    for _ in range(160):
         azimuth, height = random.uniform(-3.0, 3.0), random.uniform(0.0, 2.9)
         depth, h = random.uniform(0.1, 1.5) * random.uniform(0.3, 1.0), random.uniform(0.1, 1.4)
         around = Surroundings((height,), (azimuth,), edge_px=1.0)
@@ -362,7 +362,7 @@ def test_causes_are_the_simulators() -> None:
         elif expected[0] != "faces_away":  # a wall that faces the axis shows its back to a mirror that is beyond it
             assert cause in words.get(expected[0], (expected[0].replace(RENDERED_OCCLUDED, f"{OCCLUDED} "),))
             hidden.add(cause)
-    assert seen > 100
+    assert seen > 50
     assert len(hidden) >= 2
 
 

@@ -133,31 +133,31 @@ def places(count: int) -> list[tuple[float, float, float]]:
 @pytest.mark.parametrize("off", [True, False], ids=["off frame", "one frame"])
 @pytest.mark.parametrize("s", [BAYER, MONO, SRGB, MJPEG], ids=lambda s: s.name)
 def test_spots_above_the_threshold_are_found(s: Sensor, off: bool) -> None:
-    """24 places, one draw each; spots of so many sigma of the raw pixels in both images. All are found within 1 px.
+    """12 places, one draw each; spots of so many sigma of the raw pixels in both images. All are found within 1 px.
 
     MJPEG keeps about half of the significance; in one frame the edges of the tiles take their part, most of all of a
     mono sensor's, to which a tile's corner is as good as a spot.
     """
     target = {"bayer-raw": (14, 14), "mono-raw": (14, 50), "srgb8": (14, 20), "mjpeg": (24, 50)}[s.name][not off]
     checked = 0
-    for k, point in enumerate(places(24)):
+    for k, point in enumerate(places(12)):
         one = Scene(s, (1000.0, 1000.0), point)
         # nearly proportional: shot noise of the spot itself lowers it a little
         two = replace(one, electrons=tuple(1000.0 * target / one.snr(name) for name in ("down", "up")))
         assert two.snr("down") > 0.6 * target
         assert max(misses(detect(two.pair(k, off)), two)) < 1.0
         checked += 1
-    assert checked == 24
+    assert checked == 12
 
 
 @pytest.mark.parametrize("off", [True, False], ids=["off frame", "one frame"])
 @pytest.mark.parametrize("s", [BAYER, MONO, SRGB, MJPEG], ids=lambda s: s.name)
 def test_without_a_spot_nothing_is_found(s: Sensor, off: bool) -> None:
-    """24 pairs without laser. The bound for a whole frame is 4e-4; here the disc is 1/16: a false alarm of this test
-    has a chance below 24 x 2 x 4e-4 / 16 = 0.1 % on raw pixels; on processed ones it is not known.
+    """12 pairs without laser. The bound for a whole frame is 4e-4; here the disc is 1/16: a false alarm of this test
+    has a chance below 12 x 2 x 4e-4 / 16 = 0.06 % on raw pixels; on processed ones it is not known.
     """
     scene = Scene(s, (0.0, 0.0))
-    found = [detect(scene.pair(100 + k, off)) for k in range(24)]
+    found = [detect(scene.pair(100 + k, off)) for k in range(12)]
     assert [f for f in found if f != PairDetection(None, None)] == []
     # and the same frames with a spot are not empty
     assert detect(Scene(s, (12_000.0, 12_000.0)).pair(100, off)) != PairDetection(None, None)

@@ -77,18 +77,19 @@ def fitted(dn: np.ndarray, s: Sensor, sigma_px: float) -> SpotFit:
     )
 
 
+def _named(value: object) -> str:
+    return value.name if isinstance(value, Sensor) else f"{value:g}"
+
+
 @pytest.mark.parametrize(
     ("s", "sigma_px", "collected_e", "background_e"),
     [
-        (MONO, 0.7, 500.0, 100.0),
         (MONO, 0.7, 2000.0, 100.0),
-        (MONO, 0.7, 20_000.0, 100.0),
         (BAYER, 0.7, 500.0, 0.0),
-        (BAYER, 0.7, 2000.0, 0.0),
         (BAYER, 0.7, 2000.0, 100.0),
         (BAYER, 1.2, 20_000.0, 100.0),  # at 0.7 px the brightest red pixels would be full
     ],
-    ids=lambda x: x.name if isinstance(x, Sensor) else f"{x:g}",
+    ids=_named,
 )
 def test_accuracy_of_the_fit(s: Sensor, sigma_px: float, collected_e: float, background_e: float) -> None:
     """rms / bound <= 1.05 and the pulls' standard deviation within 0.95 to 1.05, each with its interval.
@@ -115,6 +116,17 @@ def test_accuracy_of_the_fit(s: Sensor, sigma_px: float, collected_e: float, bac
     assert pull * (1.0 + half) <= 1.05
     # the same fit taken for 8 % worse is rejected
     assert not 1.08 * ratio * (1.0 + half) <= 1.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("s", "sigma_px", "collected_e", "background_e"),
+    [(MONO, 0.7, 500.0, 100.0), (MONO, 0.7, 20_000.0, 100.0), (BAYER, 0.7, 2000.0, 0.0)],
+    ids=_named,
+)
+def test_the_fit_of_further_spots(s: Sensor, sigma_px: float, collected_e: float, background_e: float) -> None:
+    """As above, at a flux or background between those or beside them."""
+    test_accuracy_of_the_fit(s, sigma_px, collected_e, background_e)
 
 
 @pytest.mark.slow

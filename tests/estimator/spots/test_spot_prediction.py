@@ -102,14 +102,14 @@ def test_full_pixels_are_left_out() -> None:
 @pytest.mark.parametrize("power_w", [3e-4, 3e-3])
 @pytest.mark.parametrize("preset", ["srgb8", "mjpeg"])
 def test_full_pixels_of_processed_frames(preset: str, power_w: float) -> None:
-    """As above, through the chain: 30 pairs, deviation of the mean 0.13; limits with false alarms of 1e-4.
+    """As above, through the chain: 20 pairs, deviation of the mean 0.16; limits with false alarms of 1e-4.
 
-    MJPEG's claims are a little too large: mean 0.66 and 0.86.
+    MJPEG's claims are a little too large: mean 0.66 and 0.86 over 30 pairs.
     """
-    found = pulls2(Beam(), power_w, preset, 30)
+    found = pulls2(Beam(), power_w, preset, 20)
     print(f"{preset}, {1e3 * power_w:g} mW: pull {math.sqrt(found.mean()):.2f}")
-    assert found.size > 100
-    assert 0.45 < found.mean() < 1.6
+    assert found.size > 65
+    assert 0.33 < found.mean() < 1.7
 
 
 def test_the_joint_fit_takes_the_oblique_blur() -> None:

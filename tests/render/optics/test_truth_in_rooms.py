@@ -174,15 +174,18 @@ def check(room: Room, number: int, holder: Holder | None = None) -> None:
     assert len(names) >= 6
 
 
-QUICK = 2
+def of_each(quick: int, slow: int, count: int) -> list[object]:
+    """Numbers of a parametrised test: some quick, some slow, the rest for `make test-all`."""
+    marks = [()] * quick + [pytest.mark.slow] * (slow - quick) + [pytest.mark.study] * (count - slow)
+    return [pytest.param(number, marks=mark) for number, mark in enumerate(marks)]
 
 
-@pytest.mark.parametrize("number", [k if k < QUICK else pytest.param(k, marks=pytest.mark.slow) for k in range(15)])
+@pytest.mark.parametrize("number", of_each(2, 7, 15))
 def test_accuracy_of_truth_in_generated_rooms(number: int) -> None:
     check(generated(number), number)
 
 
-@pytest.mark.parametrize("number", [k if k < 1 else pytest.param(k, marks=pytest.mark.slow) for k in range(5)])
+@pytest.mark.parametrize("number", of_each(1, 3, 5))
 def test_accuracy_of_truth_through_a_glass_tube(number: int) -> None:
     """Walls of 3 to 15 mm around the mirror; plates, camera and robot inside and outside of it."""
     holder = fitted("tube", 0.060, wall_m=0.003 * (number + 1), glass_index=1.4 + 0.1 * number, rise_m=0.063)
