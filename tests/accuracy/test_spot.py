@@ -237,7 +237,7 @@ def test_accuracy_rough_mirror_certificate(alpha: float) -> None:
 
 
 def test_accuracy_of_a_spot_cut_by_an_edge() -> None:
-    """A board's edge moves across the beam: flux and centroid against 2^19 random pairs, to 0.4 % and 0.002 px.
+    """A board's edge moves across the beam: flux and centroid against 2^18 random pairs, to 0.4 % and 0.002 px.
 
     Pairs scatter like sqrt(f (1 - f) / N) < 1e-3 of the flux even if they were random.
     """
@@ -245,7 +245,7 @@ def test_accuracy_of_a_spot_cut_by_an_edge() -> None:
     from phibench.scenes.shapes import cuboid
 
     view, spot = default_rig().at(0.4), LaserSpot((2.0, 0.0, 0.5), (-1, 0, 0), 5e-3)
-    rng, count, shares = np.random.default_rng(8), 2**19, []
+    rng, count, shares = np.random.default_rng(8), 2**18, []
     disc, lens = rng.normal(size=(count, 2)), rng.uniform(size=(count, 2))
     radius, turn = np.sqrt(lens[:, 0]), 2.0 * np.pi * lens[:, 1]
     eyes = spot_samples._lens_points(view, radius[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1))
