@@ -6,15 +6,24 @@ import contextlib
 import json
 import os
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
 from rich.console import Console
 
-from phibench.datasets.build.finished_work import OR_REPLACE, kept_samples, lost_work
+from phibench.datasets.build.finished_work import OR_REPLACE, LostWorkError, kept_samples, lost_work
 from phibench.datasets.build.forecast import PairForecast, forecast, pair_forecasts, pair_table, slowdown
 from phibench.datasets.build.journal import FolderHead, Journal
+from phibench.datasets.build.room_export import (
+    damaged_exports,
+    export_lines,
+    export_rooms,
+    held,
+    own_files,
+    stale_exports,
+)
 from phibench.datasets.build.run_tasks import (
     assemble,
     claimed,
@@ -35,9 +44,11 @@ from phibench.datasets.build.workers import Environment, NoRendererError, Worker
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import InputFile
 from phibench.datasets.plan.plan import Plan, make_plan, shard_plan
+from phibench.datasets.plan.room_draws import unexported
 from phibench.datasets.progress import progress_console
 from phibench.datasets.recipe.checks import warnings
 from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_files, recipe_text, with_numbers
+from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import dataset_info, info_text, parse_info, read_manifest, same_content
@@ -89,11 +100,20 @@ def make(
     IncompleteError
         If nothing but samples by themselves cannot be made; the others are finished first, and `SHA256SUMS` is missing.
     """
-    console, out = console or progress_console(), Path(out)
-    plan, text, note = _planned(recipe, out, shard, samples, seed, replace, room_files)
+    console, out, exports = console or progress_console(), Path(out), Exports()
+
+    def export(asked: Recipe, files: RoomFiles) -> RoomFiles:
+        return _export(asked, files, out, workers, console, scheduler, replace, exports)
+
+    plan, text, note = _planned(recipe, out, shard, samples, seed, replace, room_files, export)
     for warning in [*warnings(plan.recipe), *_hidden(pair_forecasts(plan))]:
         console.print(f"warning: {warning}", highlight=False, soft_wrap=True)
-    make_from_plan(plan, text, out, workers, console, scheduler, replace)
+    try:
+        make_from_plan(plan, text, out, workers, console, scheduler, replace)
+    except LostWorkError:
+        remove_files(out, exports.made)  # the folder is as it was
+        raise
+    remove_files(out, stale_exports(out, plan.files))
     if note:
         console.print(note, highlight=False, soft_wrap=True)
     return out
@@ -117,7 +137,7 @@ def dry_run(
         If recipe or folder will not do.
     """
     out, count = Path(out), _count(workers)
-    plan, _, note = _planned(recipe, out, shard, samples, seed, replace, room_files)
+    plan, _, note = _planned(recipe, out, shard, samples, seed, replace, room_files, lambda _, files: held(files, out))
     refuse_other(out, None if replace else plan.recipe.dataset.name)
     pairs, journal = list(pair_forecasts(plan)), Journal(out)
     tasks, todo, told = plan_tasks(plan, {}), [], [note] if note else []
@@ -132,6 +152,7 @@ def dry_run(
     seen = f"{sum(pair.visible for pair in pairs)} of {len(pairs)} pairs will be visible in both images"
     told += [f"warning: {warning}" for warning in warnings(plan.recipe)]
     told += [f"will be refused: {name}: {reason}" for name, reason in plan.refused.items()]
+    told += export_lines(unexported(plan.recipe, plan.files))
     return "\n".join([*pair_table(pairs), seen, *told, f"{cost}, {len(tasks)} tasks in all; nothing was rendered"])
 
 
@@ -162,8 +183,12 @@ def _planned(
     seed: int | None,
     replace: bool,
     room_files: str | Path | None,
+    exported: Callable[[Recipe, RoomFiles], RoomFiles],
 ) -> tuple[Plan, str, str]:
-    """Plan, text of its recipe, and a line on samples that are kept although fewer are asked for."""
+    """Plan, text of its recipe, and a line on samples that are kept although fewer are asked for.
+
+    `exported` sees to the files that the data set makes itself, and gives those of all rooms.
+    """
     text, source, note = recipe_text(recipe), str(find_recipe(recipe)), ""
     files = recipe_files(recipe) if room_files is None else RoomFiles(Path(room_files))
     if samples is not None or seed is not None:
@@ -173,7 +198,44 @@ def _planned(
     if held is not None and asked.random is not None:
         text, count = with_numbers(text, source, held, None), asked.random.samples
         note = f"{out} keeps its {held} samples; the first {count} of them are those that were asked for"
-    return shard_plan(make_plan(parse_recipe(text, source, files), files), shard), text, note
+    parsed = parse_recipe(text, source, files)
+    if parsed.rooms is not None and parsed.rooms.exported:
+        files = exported(parsed, files)
+    return shard_plan(make_plan(parsed, files), shard), text, note
+
+
+@dataclass
+class Exports:
+    """Files of rooms that this call has made, relative to the folder."""
+
+    made: list[str] = field(default_factory=list)
+
+
+def _export(
+    recipe: Recipe,
+    files: RoomFiles,
+    out: Path,
+    workers: int | None,
+    console: Console,
+    scheduler: str | None,
+    replace: bool,
+    exports: Exports,
+) -> RoomFiles:
+    """Make the files of rooms that are missing in a folder, beside copies of the recipe's own.
+
+    Samples are drawn from what the files hold, so that this comes before the plan.
+    """
+    with claimed(out, None if replace else recipe.dataset.name):
+        remove_files(out, damaged_exports(out))
+        own = own_files(recipe, files)
+        exports.made += [schema.room_file(name) for name in missing_room_files(own, out)]
+        copy_room_files(own, out)
+        held = RoomFiles(out / schema.ROOM_FILES, own.digests)
+        if todo := unexported(recipe, held):
+            with WorkerPool(out, _count(workers), scheduler) as pool:
+                pool.environment()  # tells where nothing can be rendered, and connects to a scheduler
+                export_rooms(todo, recipe.ambient, pool, console, exports.made)
+    return held
 
 
 def _keys(tasks: Mapping[str, Task]) -> dict[str, str]:
@@ -210,7 +272,7 @@ def _make(
     environment, no_renderer = _environment(pool, journal)
     info, tasks = dataset_info(plan, environment), plan_tasks(plan, versions(environment))
     if not replace and (lost := lost_work(out, _keys(tasks), journal, info)):
-        raise DatasetError(f"{lost}; {OR_REPLACE}")
+        raise LostWorkError(f"{lost}; {OR_REPLACE}")
     head = FolderHead(_info_text(info, journal, out), recipe)
     todo = unfinished(tasks, journal, out)
     if todo and no_renderer is not None:

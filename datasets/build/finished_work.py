@@ -35,6 +35,10 @@ _NOT_IN_KEYS = ("dataset", "frames", "distractors")
 _ENVIRONMENT = ("python", "machine", "packages", "variant", "llvm", "threads_per_process")
 
 
+class LostWorkError(DatasetError):
+    """Finished work would be lost; nothing has been changed."""
+
+
 def lost_work(out: Path, keys: Mapping[str, str], journal: Journal, wanted: DatasetInfo) -> str | None:
     """Finished work that a run would delete or make again, as the beginning of a sentence; None if there is none.
 

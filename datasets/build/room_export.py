@@ -1,21 +1,38 @@
 """Rooms as files: a panorama from a point of a room, and a mesh of it; of rooms that need nobody else's file.
 
 Both come with the table of a recipe that reads them. The robot is left out: it stands in every room by itself.
+
+A data set exports rooms by itself before samples are drawn, to `rooms/exported/`. The name of each file holds a hash of
+all that it is made from: a file that is there is the right one, and is kept. Each is written whole or not at all.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from rich.console import Console
 
+from phibench.datasets.build.bake_task import bake_settings
 from phibench.datasets.build.light_map_cache import light_map
+from phibench.datasets.build.run_tasks import missing_room_files
+from phibench.datasets.build.scheduler import schedule
+from phibench.datasets.build.tasks import Failed, Made, Task
+from phibench.datasets.build.workers import WorkerPool
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.plan.room_draws import BOX, room_files
+from phibench.datasets.progress import Steps
+from phibench.datasets.recipe.tables import AmbientTable, Recipe
 from phibench.datasets.rooms.gltf_export import glb_of
+from phibench.datasets.rooms.panorama_settings import PanoramaSettings
 from phibench.datasets.rooms.room_errors import RoomError
-from phibench.datasets.rooms.room_sources import NamedRoom
-from phibench.datasets.store.files import require_writable, write_bytes
+from phibench.datasets.rooms.room_files import RoomFiles
+from phibench.datasets.rooms.room_sources import EXPORTED, NamedRoom, UnexportedRoom
+from phibench.datasets.store import schema
+from phibench.datasets.store.checksums import held_room_files
+from phibench.datasets.store.files import require_writable, sha256, write_bytes
 from phibench.datasets.store.layers import write_exr
 from phibench.render.room.light_map import BakeSettings
 from phibench.scenes.catalog import default_rig
@@ -27,7 +44,6 @@ from phibench.scenes.worlds.generated_room import generate_room
 from phibench.scenes.worlds.properties import PROPERTIES, drawn_properties
 
 SETTINGS = BakeSettings(texel_m=0.05, indirect_texel_m=0.1, lamp_rays=32, bounces=8, bounce_rays=32, final_rays=128)
-_BOX: dict[str, float | str] = {"heading_deg": 0.0, "l_shape": 0.0}
 _LEAST_ROWS, _MOST_ROWS = 16, 4096
 _CLOSED = 0.75  # part of the directions from a point of a room that meet a surface
 
@@ -65,7 +81,7 @@ def export_room(name: str | None, seed: int | None, properties: Sequence[str] = 
     if seed is not None and not 0 <= seed < 2**63:
         raise RoomError(f"--seed {seed}: must be a whole number from 0 to 2^63 - 1")
     stream = ("export", int(seed or 0))
-    fixed = (dict(_BOX) if box else {}) | dict(_property(text) for text in properties)
+    fixed = (dict(BOX) if box else {}) | dict(_property(text) for text in properties)
     return replace(generate_room(drawn_properties(*stream, **fixed), *stream), robot=False)
 
 
@@ -152,3 +168,91 @@ def bounds_m(room: Room) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper corner of all surfaces of a room, metres."""
     corners = face_table((*room.surfaces, *room.furniture)).corners_m.reshape(-1, 3)
     return corners.min(axis=0), corners.max(axis=0)
+
+
+# Rooms that a data set exports by itself.
+
+
+def own_files(recipe: Recipe, files: RoomFiles) -> RoomFiles:
+    """Files that the recipe itself names, with their SHA-256.
+
+    Raises
+    ------
+    RoomError
+        If one is not known and cannot be read.
+    """
+    found = room_files(recipe, files)
+    return RoomFiles(found.folder, {n: d for n, d in found.digests.items() if not n.startswith(f"{EXPORTED}/")})
+
+
+def held(files: RoomFiles, out: Path) -> RoomFiles:
+    """Files of rooms as a folder holds them, where it has all that are known; else as they were."""
+    there = (out / schema.ROOM_FILES / EXPORTED).is_dir() and not missing_room_files(files, out)
+    return RoomFiles(out / schema.ROOM_FILES, files.digests) if there else files
+
+
+def export_rooms(
+    todo: Sequence[UnexportedRoom], ambient: AmbientTable, pool: WorkerPool, console: Console, made: list[str]
+) -> None:
+    """Write the files of rooms below the pool's folder, and add their names to `made`.
+
+    Raises
+    ------
+    DatasetError
+        If some cannot be made, when the others are done.
+    """
+    console.print(f"{_counted(todo)} to be exported before samples are drawn", highlight=False, soft_wrap=True)
+    tasks, failures = [export_task(source, ambient) for source in todo], list[str]()
+    with Steps(console, "rooms", len(tasks)) as steps:
+        for task, outcome in schedule(tasks, pool.executor(len(tasks))):
+            if isinstance(outcome, Failed):
+                failures.append(f"{task.name} cannot be exported: {outcome.cause}")
+            else:
+                made += outcome.files
+            steps.advance()
+    if failures:
+        text = f"{len(failures)} of {len(tasks)} rooms failed, the others are kept"
+        raise DatasetError("\n".join([f"{text}; run the same command again, or give another seed:", *failures]))
+
+
+def export_lines(todo: Sequence[UnexportedRoom]) -> list[str]:
+    """Say what a run will export first; nothing where all files are there."""
+    if not todo:
+        return []
+    return [f"{_counted(todo)} to be exported first; the samples above are drawn from the surfaces of these files"]
+
+
+def _counted(todo: Iterable[UnexportedRoom]) -> str:
+    kinds = [source.kind.removeprefix("unexported ") for source in todo]
+    return f"generated rooms: {kinds.count('panorama')} as panoramas and {kinds.count('mesh')} as meshes are"
+
+
+def damaged_exports(out: Path) -> list[str]:
+    """Exported files of a folder that have other bytes than SHA256SUMS says."""
+    folder, known = out / schema.ROOM_FILES, held_room_files(out).digests
+    names = {name: folder / name for name in known if name.startswith(f"{EXPORTED}/")}
+    return [schema.room_file(name) for name, path in names.items() if path.is_file() and sha256(path) != known[name]]
+
+
+def stale_exports(out: Path, files: RoomFiles) -> list[str]:
+    """Exported files of a folder that no room has: of another seed or other settings, before `--replace`."""
+    names = (path.relative_to(out).as_posix() for path in (out / schema.ROOM_FILES / EXPORTED).glob("*"))
+    wanted = {schema.room_file(name) for name in files.digests}
+    return sorted(name for name in names if name not in wanted)
+
+
+def export_task(source: UnexportedRoom, ambient: AmbientTable) -> Task:
+    """Task that writes the file of a room. It has no key: its file's name tells it from all others."""
+    kind = source.kind.removeprefix("unexported ")
+    return Task(f"{kind} {source.settings.path.stem}", "", write_room_file, (source, ambient))
+
+
+def write_room_file(out: Path, source: UnexportedRoom, ambient: AmbientTable) -> Made:
+    """Task: write a room's panorama or mesh below `out`, whole or not at all."""
+    name, room = schema.room_file(source.file), source.generated()
+    settings = source.settings
+    if isinstance(settings, PanoramaSettings):
+        export_panorama(room, out / name, settings.point_m, settings.heading_deg, source.rows, bake_settings(ambient))
+    else:
+        export_mesh(room, out / name)
+    return Made((name,))

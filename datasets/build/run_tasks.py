@@ -141,7 +141,8 @@ def held_head(out: Path) -> FolderHead | None:
     DatasetError
         If it holds something else.
     """
-    if not out.is_dir() or all(path.name.startswith(_OWN) for path in out.iterdir()):
+    # a run that ended while it exported rooms has left their folder alone
+    if not out.is_dir() or all(path.name.startswith(_OWN) or path.name == schema.ROOM_FILES for path in out.iterdir()):
         return None
     head = Journal(out).head
     if head is not None:

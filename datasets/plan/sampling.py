@@ -42,7 +42,7 @@ from phibench.datasets.recipe.tables import (
     Recipe,
     RigTable,
 )
-from phibench.datasets.rooms.room_sources import ONLY_ROOM, MeshRoom, PanoramaRoom, RoomSource, room_of
+from phibench.datasets.rooms.room_sources import ONLY_ROOM, MeshRoom, PanoramaRoom, RoomSource, is_exported, room_of
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
@@ -173,7 +173,7 @@ def draw_samples(
     for k, room_id in enumerate(rooms):  # a room is built once, and let go before the next
         numbers = range(k, table.samples, len(rooms))
         if numbers:
-            stated = isinstance(rooms[room_id], PanoramaRoom | MeshRoom)
+            stated = isinstance(rooms[room_id], PanoramaRoom | MeshRoom) and not is_exported(rooms[room_id])
             try:
                 room = room_of(rooms[room_id], folder)
             except SceneError as error:

@@ -126,6 +126,10 @@ metres, (x, y, z) the direction from the sphere centre in the world's axes at th
 Sample i stands in room i modulo their number. The kinds take turns, generated rooms first, until one has no
 more. Ids are `room000000`, `panorama000000`, `mesh000000` and so on. A room must leave the shortest stroke
 free; longer ones are drawn again.
+
+`exported_panoramas` and `exported_meshes` are further generated rooms, which the data set turns into files first. It
+draws them by its name and seed, and by `[rooms.properties]`. A room with a panorama is a box: its `l_shape` and
+`heading_deg` are 0. The light in a panorama is baked as `[ambient]` says. See `docs/rooms.md`.
 """,
     "[[rooms.panoramas]]": """Any number, each a room. The file lies in the recipe's folder or below. The data set gets
 a copy of it in `rooms/`, so that it can be read anywhere. Nothing is baked. See `docs/rooms.md`.

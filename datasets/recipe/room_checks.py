@@ -47,12 +47,18 @@ def room_faults(raw: Raw) -> Iterator[Fault]:
 
 def _counts(raw: Raw) -> Iterator[Fault]:
     rooms = table_of(raw, "rooms")
-    others = sum(len(tables_of(rooms, key)) for key, _ in _KINDS)
-    if rooms.get("count") == 0 and type(rooms["count"]) is int and not others:
+    others, exported = sum(len(tables_of(rooms, key)) for key, _ in _KINDS), _exported(rooms)
+    if rooms.get("count") == 0 and type(rooms["count"]) is int and not others and not exported:
         text = "0, and there are no panoramas or meshes; give 1 or more, or [[rooms.panoramas]] or [[rooms.meshes]]"
         yield Fault("rooms.count", text)
-    elif others and not rooms.get("count") and table_of(rooms, "properties"):
+    elif others and not exported and not rooms.get("count") and table_of(rooms, "properties"):
         yield Fault("rooms.properties", "given, but no room is generated; give rooms.count above 0, or remove it")
+
+
+def _exported(rooms: Raw) -> int:
+    """Number of generated rooms that become files; a value that is no number of rooms is told by itself."""
+    counts = (rooms.get(f"exported_{key}", 0) for key, _ in _KINDS)
+    return sum(count for count in counts if type(count) is int and count > 0)
 
 
 def _file_rooms(raw: Raw) -> Iterator[tuple[str, PanoramaTable | MeshTable]]:
@@ -98,7 +104,8 @@ def _heights(raw: Raw) -> Iterator[tuple[str, float]]:
     """Path and least height of generated rooms and of boxes."""
     rooms = table_of(raw, "rooms")
     others, count = sum(len(tables_of(rooms, key)) for key, _ in _KINDS), rooms.get("count")
-    if generated_count(count if isinstance(count, int) else None, others):
+    exported = _exported(rooms)
+    if exported or generated_count(count if isinstance(count, int) else None, others):
         default = DistributionTable.model_validate(dict(PROPERTIES["height_m"].default))
         table = distribution_of(table_of(rooms, "properties").get("height_m")) or default
         if table.support[0] >= PROPERTIES["height_m"].low:  # else told by the table

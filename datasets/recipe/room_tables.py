@@ -220,10 +220,28 @@ class RoomsTable(Table):
         default=(), description="rooms of mesh files"
     )
 
+    exported_panoramas: int = Field(
+        default=0,
+        ge=0,
+        le=100_000,
+        description="how many further rooms are generated and shown by a panorama of each, on its box",
+    )
+    exported_meshes: int = Field(
+        default=0, ge=0, le=100_000, description="how many further rooms are generated and written as a glTF mesh each"
+    )
+    panorama_rows: int = Field(
+        default=512, ge=16, le=4096, description="rows of an exported panorama; it has twice as many columns"
+    )
+
     @property
     def generated(self) -> int:
-        """Number of generated rooms."""
-        return generated_count(self.count, len(self.panoramas) + len(self.meshes))
+        """Number of generated rooms that are rendered as they are."""
+        return generated_count(self.count, len(self.panoramas) + len(self.meshes) + self.exported)
+
+    @property
+    def exported(self) -> int:
+        """Number of generated rooms that become files first."""
+        return self.exported_panoramas + self.exported_meshes
 
     @property
     def pinned(self) -> Mapping[str, str | None]:

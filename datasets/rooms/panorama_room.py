@@ -16,7 +16,7 @@ carries the picture of what stood before it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +61,15 @@ def panorama_room(settings: PanoramaSettings) -> Room:
     ends = np.cumsum([len(part.triangles) for part in parts])[:-1]
     pairs = zip(parts, np.split(texels, ends), strict=True)
     return Room(settings.name, (), tuple(mesh_shape(part, bitmap, each) for part, each in pairs))
+
+
+def blank_room(settings: PanoramaSettings) -> Room:
+    """Room of a panorama that is not there yet: the same box, and the same light from everywhere.
+
+    Geometry and the laser's albedo are those of `panorama_room`, so that spots can be planned.
+    """
+    settings = replace(settings, texel_m=1.0)
+    return Room(settings.name, _box(settings, _Panorama(np.ones((16, 32, 3), np.float32), settings)))
 
 
 def _scale(settings: PanoramaSettings, light: Light) -> float:

@@ -42,6 +42,10 @@ class RoomFiles:
         """
         return self.digests.get(name) or hashlib.sha256(_data(self.folder, name)).hexdigest()
 
+    def holds(self, name: str) -> bool:
+        """True if a file is known or there."""
+        return name in self.digests or (self.folder is not None and (self.folder / name).is_file())
+
     def of(self, names: Iterable[str]) -> RoomFiles:
         """Some of the files, whose SHA-256 are all known."""
         return replace(self, digests={name: self.sha256(name) for name in dict.fromkeys(names)})

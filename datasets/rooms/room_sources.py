@@ -8,6 +8,7 @@ builds the room, in any process, given the folder of the files there.
 from __future__ import annotations
 
 import re
+import tempfile
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -24,6 +25,8 @@ from phibench.scenes.validation import SceneError, nearest, printable_line
 from phibench.scenes.worlds.generated_room import generate_room
 from phibench.scenes.worlds.properties import RoomProperties
 
+EXPORTED = "exported"
+"""Folder, among the files of rooms, of those that a data set makes itself."""
 ONLY_ROOM = "room"
 """Id of the room of a recipe that has one for all samples."""
 _KEPT = 3  # rooms of a process; one with many textures has 60 MB
@@ -131,13 +134,71 @@ class MeshRoom:
         return mesh_room(replace(self.settings, path=path, one_file=True))
 
 
+@dataclass(frozen=True)
+class UnexportedRoom:
+    """A generated room that is to become a panorama or a mesh, and has no file yet.
+
+    It gives the surfaces that the file will give, so that samples can be drawn. Nothing is rendered from it.
+
+    Parameters
+    ----------
+    room : GeneratedRoom
+    settings : PanoramaSettings or MeshSettings
+        Of the room that reads the file.
+    rows : int
+        Of the panorama.
+    kind
+        Kind of the file, for forecasts.
+    """
+
+    room: GeneratedRoom
+    settings: PanoramaSettings | MeshSettings
+    rows: int
+    kind: Literal["unexported panorama", "unexported mesh"]
+
+    @property
+    def file(self) -> str:
+        """Name of the file below the folder of room files."""
+        return self.settings.path.as_posix()
+
+    def generated(self) -> Room:
+        """The generated room that is exported, without the robot, which stands in every room by itself."""
+        return replace(self.room.build(), robot=False)
+
+    def build(self, folder: Path | None = None) -> Room:
+        """The room as its file will give it; a panorama's walls are grey.
+
+        Raises
+        ------
+        SceneError
+            If no lamp finds a place, or the robot has none.
+        """
+        from phibench.datasets.rooms.gltf_export import glb_of
+        from phibench.datasets.rooms.mesh_room import mesh_room
+        from phibench.datasets.rooms.panorama_room import blank_room
+
+        if isinstance(self.settings, PanoramaSettings):
+            return blank_room(self.settings)
+        with tempfile.TemporaryDirectory() as place:
+            path = Path(place) / "room.glb"
+            path.write_bytes(glb_of(self.generated()))
+            return mesh_room(replace(self.settings, path=path, one_file=True))
+
+
+def is_exported(source: RoomSource) -> bool:
+    """Tell whether the data set makes a room's file itself."""
+    if isinstance(source, UnexportedRoom):
+        return True
+    return isinstance(source, PanoramaRoom | MeshRoom) and source.settings.path.parts[0] == EXPORTED
+
+
 def _require_names(*paths: Path) -> None:
     for path in paths:
         if re.fullmatch(FILE_NAME, path.as_posix()) is None:
             raise RoomError(f"'{printable_line(str(path), 60)}' is no name of a file below the folder of room files")
 
 
-RoomSource = NamedRoom | GeneratedRoom | PanoramaRoom | MeshRoom
+RoomSource = NamedRoom | GeneratedRoom | PanoramaRoom | MeshRoom | UnexportedRoom
 SOURCES: dict[str, type[RoomSource]] = {
     cast(str, kind.__dataclass_fields__["kind"].default): kind
     for kind in (NamedRoom, GeneratedRoom, PanoramaRoom, MeshRoom)

@@ -16,6 +16,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import FILE_NAME, InputFile, first_fault
 from phibench.datasets.recipe.room_tables import RoomsTable
 from phibench.datasets.rooms.room_files import RoomFiles
+from phibench.datasets.rooms.room_sources import EXPORTED
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import read_info, read_manifest
 from phibench.datasets.store.files import require_file, sha256, write_text
@@ -45,6 +46,7 @@ def data_files(folder: Path) -> list[str]:
         names.add(schema.ROOMS)
     names.update(schema.light_map_file(room.room) for room in read_rooms(folder, info).infos.values() if room.lit)
     names.update(schema.room_file(name) for name in _room_files(info))
+    names.update(_exported_files(folder, info))
     names.update(name for pose in info.poses for name in pose.files.values())
     names.update(schema.preview_file(row.sample_id) for row in rows)
     spots = (row.position(position) for row in rows for position in POSITIONS)
@@ -59,6 +61,15 @@ def _room_files(info: DatasetInfo) -> Iterable[str]:
         return () if rooms is None else RoomsTable.model_validate(rooms).pinned
     except ValidationError as error:
         raise DatasetError(f"{schema.INFO} is damaged: recipe.rooms.{first_fault(error)}") from error
+
+
+def _exported_files(folder: Path, info: DatasetInfo) -> Iterable[str]:
+    """Files of rooms that the data set has made itself: the lines of its rooms name them."""
+    for room in read_rooms(folder, info).infos.values():
+        settings = room.source.get("settings")
+        path = settings.get("path") if isinstance(settings, dict) else None
+        if isinstance(path, str) and path.startswith(f"{EXPORTED}/") and re.fullmatch(FILE_NAME, path):
+            yield schema.room_file(path)
 
 
 def held_room_files(folder: Path) -> RoomFiles:

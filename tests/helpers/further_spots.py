@@ -14,7 +14,7 @@ from phibench.datasets.plan.plan import PairPlan
 from phibench.datasets.read import Dataset, Sample
 from phibench.datasets.recipe.distributions import quantile
 from phibench.datasets.recipe.spot_placement import by_ray, visibility_fault
-from phibench.datasets.rooms.room_sources import GeneratedRoom
+from phibench.datasets.rooms.room_sources import SOURCES, RoomSource
 from phibench.datasets.store.documents import from_json
 from phibench.datasets.store.schema import ManifestRow
 from phibench.scenes.random_streams import generator
@@ -26,15 +26,23 @@ def with_further_spots(dataset: Dataset, folder: Path, count: int, seed: int) ->
     folder.mkdir(parents=True)
     (folder / "views").symlink_to(dataset.folder.resolve() / "views")
     (folder / "spots").mkdir()
+    if (dataset.folder / "rooms").is_dir():
+        (folder / "rooms").symlink_to(dataset.folder.resolve() / "rooms")
     rows = [row for k, sample in enumerate(dataset) for row in _rows(sample, folder, count, k, seed)]
     return replace(dataset, folder=folder, rows=tuple(rows))
+
+
+def _source(sample: Sample) -> RoomSource:
+    document = sample.dataset.rooms.info(sample.row.room).source
+    kind: type[RoomSource] = SOURCES[str(document["kind"])]
+    return from_json(kind, document)
 
 
 def _rows(sample: Sample, folder: Path, count: int, number: int, seed: int) -> list[ManifestRow]:
     row, room, source = (
         sample.row,
         sample.room,
-        from_json(GeneratedRoom, sample.dataset.rooms.info(sample.row.room).source),
+        _source(sample),
     )
     recipe = sample.dataset.recipe
     assert recipe.random is not None
