@@ -10,6 +10,8 @@ import hashlib
 
 import numpy as np
 
+from phibench.scenes.frames import Array
+
 Name = str | int
 
 
@@ -32,6 +34,15 @@ def generator(*names: Name) -> np.random.Generator:
 def seed_32(*names: Name) -> int:
     """Seed of a stream for a renderer that takes 32 bits."""
     return int(seed_sequence(*names).generate_state(1, np.uint32)[0])
+
+
+def sobol(dimensions: int, count: int) -> Array:
+    """Nodes of a quadrature rule: a Sobol sequence of one scramble for all, shape (count, dimensions), in [0, 1)."""
+    from scipy.stats import qmc  # takes two seconds, and most of what imports this file needs none
+
+    engine = qmc.Sobol(dimensions, scramble=True, rng=0)  # part of the rule, not a noise draw
+    power = max(count - 1, 0).bit_length()  # scipy warns about numbers that are no power of two
+    return np.asarray(engine.random_base2(power)[:count])
 
 
 def _digest(names: tuple[Name, ...]) -> bytes:

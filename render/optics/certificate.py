@@ -24,7 +24,6 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.special import ndtri
-from scipy.stats import qmc
 
 from phibench.render.optics.beam_deposit import BEAM_REACH_M, deposit
 from phibench.render.optics.ray_tracer import MirrorRays, lens_rays, reflect, through_glass
@@ -35,6 +34,7 @@ from phibench.render.optics.truth import SpotTruth
 from phibench.scenes.faces import FaceTable, IntArray
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import LaserSpot
+from phibench.scenes.random_streams import sobol
 from phibench.scenes.rig import View
 
 # Both chief rays are exact up to rounding. Centroid and flux: five and six times what the fewest rays leave, below.
@@ -42,7 +42,6 @@ CHIEF_TOLERANCE_PX = 1e-6
 CENTROID_TOLERANCE_PX = 2e-3
 FLUX_TOLERANCE = 3e-3
 _LOG2_RAYS = (13, 15, 17, 19)  # 13: centroid within 4e-4 px, flux within 5e-4, for the random rigs of the tests
-_SEED = 0  # the scramble is part of the quadrature rule, not a noise draw
 _STEP_PX = 1e-3
 _NEWTON_STEPS = 8
 _HALVINGS = 6
@@ -186,7 +185,7 @@ def trace_spot(
     if spot.beam_direction_world is not None:
         return _trace_beam(view, spot, as_geometry(room), truth, log2_rays)
     room = as_geometry(room)
-    x = np.clip(qmc.Sobol(6, scramble=True, rng=_SEED).random_base2(log2_rays), 1e-12, 1.0 - 1e-12)
+    x = np.clip(sobol(6, 2**log2_rays), 1e-12, 1.0 - 1e-12)
     bundle = _Bundle(view.rig.camera.aperture_radius_m * _disc(x[:, :2]), _facets(view, x[:, 4:]))
     wall, density = _wall_samples(spot, x[:, 2:4])
     uv, jacobian = _linear_aim(view, spot, bundle, wall, truth)
@@ -341,7 +340,7 @@ def _trace_beam(
     view: View, spot: LaserSpot, room: RoomGeometry, truth: SpotTruth, log2_rays: int
 ) -> tuple[Array, float]:
     """Centroid (2,) and power of the image of what a beam leaves on surfaces."""
-    x = np.clip(qmc.Sobol(7, scramble=True, rng=_SEED).random_base2(log2_rays), 1e-12, 1.0 - 1e-12)
+    x = np.clip(sobol(7, 2**log2_rays), 1e-12, 1.0 - 1e-12)
     bundle = _Bundle(view.rig.camera.aperture_radius_m * _disc(x[:, :2]), _facets(view, x[:, 4:6]))
     centres = aim(view, spot, bundle, np.zeros((len(x), 2)), _through_chief_point(view, truth, bundle.lens_m))
     parts = _image_parts(view, spot, room, np.array([truth.u_px, truth.v_px]))
@@ -385,7 +384,7 @@ def _image_parts(view: View, spot: LaserSpot, room: RoomGeometry, chief_px: Arra
     each face with such a part gets a Gaussian of its own. Only how densely film positions are drawn follows from all
     this, which is why the world-side solution may be used.
     """
-    places = ndtri(np.clip(qmc.Sobol(2, scramble=True, rng=_SEED).random(_PILOTS), 1e-4, 1.0 - 1e-4))
+    places = ndtri(np.clip(sobol(2, _PILOTS), 1e-4, 1.0 - 1e-4))
     light = deposit(spot, room, places if spot.profile == "gaussian" else 0.5 * places)
     light = light[light.lit]
     mirror = mirror_points(view, light.points_m, np.broadcast_to(view.camera_centre_m, light.points_m.shape)).points_m

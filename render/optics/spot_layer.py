@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import erf, ndtr
-from scipy.stats import qmc
 
 from phibench.render.optics.beam_deposit import Deposit, deposit
 from phibench.render.optics.ray_tracer import MirrorRays, lens_rays, reflect
@@ -25,6 +24,7 @@ from phibench.render.optics.room_tracer import GeometryLike, RoomGeometry, as_ge
 from phibench.render.optics.spot_samples import FilmCloud, disc_points, film_position, slices, specular_cloud
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
+from phibench.scenes.random_streams import sobol
 from phibench.scenes.rig import View
 
 _TAIL_SIGMAS = 6.5  # a Gaussian's flux beyond it is 8e-11
@@ -110,7 +110,6 @@ def _dark_layer() -> SpotLayer:
 
 
 _LOG2_SAMPLES, _LOG2_MOST = 14, 20  # for a lobe as narrow as the blur; a wider one needs more in proportion to its area
-_SEED = 0  # the scramble is part of the quadrature rule, not a noise draw
 _WIDER = 1.2  # film positions are drawn this much wider than the lobe: bounded weights
 _STEP_PX = 0.01
 
@@ -148,7 +147,7 @@ def _log2_samples(spread_px: Array, blur_px: float) -> int:
 
 
 def _draw(view: View, spot: LaserSpot, room: RoomGeometry, log2_samples: int) -> _Samples:
-    x = qmc.Sobol(6, scramble=True, rng=_SEED).random_base2(log2_samples)
+    x = sobol(6, 2**log2_samples)
     light = deposit(spot, room, disc_points(spot.profile, x[:, :2]))
     lens = view.rig.camera.aperture_radius_m * disc_points("uniform", x[:, 2:4])
     lit = light.lit

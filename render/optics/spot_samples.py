@@ -25,13 +25,13 @@ import numpy as np
 from numpy.polynomial.laguerre import laggauss
 from numpy.polynomial.legendre import leggauss
 from scipy.special import ndtri
-from scipy.stats import qmc
 
 from phibench.render.optics.beam_deposit import Deposit, deposit, footprint, is_plain
 from phibench.render.optics.reflection_point import bundle_spread, mirror_points, onward
 from phibench.render.optics.room_tracer import GeometryLike, RoomGeometry, as_geometry, blocked_by
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import LaserSpot
+from phibench.scenes.random_streams import sobol
 from phibench.scenes.rig import View
 
 Profile = Literal["uniform", "gaussian"]
@@ -95,7 +95,6 @@ def slices(total: int, size: int) -> Iterator[slice]:
 _PAIRS_AT_ONCE = 65536
 _LOG2_DENSE = 17  # where edges cut the light on its way
 _LOG2_UNEVEN = 15  # where it is only uneven on the surfaces: steps in two of the four dimensions
-_SEED = 0  # the scramble is part of the quadrature rule, not a noise draw
 
 
 @dataclass(frozen=True)
@@ -152,7 +151,7 @@ def _node_cloud(view: View, spot: LaserSpot, room: RoomGeometry) -> FilmCloud:
 
 def _dense_cloud(view: View, spot: LaserSpot, room: RoomGeometry, log2_pairs: int) -> FilmCloud:
     """Sobol pairs of spot and aperture: steps are found to about 1e-3 of the flux."""
-    x = qmc.Sobol(4, scramble=True, rng=_SEED).random_base2(log2_pairs)
+    x = sobol(4, 2**log2_pairs)
     light = deposit(spot, room, disc_points(spot.profile, x[:, :2]))
     lit = light.lit
     light, eyes = light[lit], _lens_points(view, disc_points("uniform", x[lit, 2:]))
