@@ -99,10 +99,11 @@ def own_bound(rig: Rig, spot: SpotSigma, depth_m: float, stroke_m: float) -> Own
 def two_fisheyes(method: str, disparity_mae_deg: float, depth_mare: float) -> Peer:
     """Helvipad: one camera above the other; the distance at which both mean errors agree stands for its scenes.
 
-    Baseline and rows are those of `compute_depth_from_disparity` in public code: 0.191 m, 1920 rows in 180 degrees.
+    Baseline and rows are those of `compute_depth_from_disparity` in public code: 0.191 m, and 960 rows in 180 degrees,
+    on which disparities are estimated. The photographs have 1920.
     """
     depth = depth_mare * 0.191 / float(np.radians(disparity_mae_deg))
-    return Peer(f"two fisheyes, {method}", depth, 0.191, np.pi / 1920, depth_mare)
+    return Peer(f"two fisheyes, {method}", depth, 0.191, np.pi / 960, depth_mare)
 
 
 def folded_hyperboloids() -> Peer:

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.combine import CombinedEstimate, combine
 from phibench.estimator.geometry.joint_posterior import JointPosterior, joint_posterior, single_posterior
 from phibench.estimator.geometry.status import Status, describe
-from phibench.estimator.interface import Answer, Matrix2, Pair, Spot
+from phibench.estimator.interface import Answer, Image, Matrix2, Pair, Spot
 from phibench.estimator.methods.chain_fit import chain_fit, spot_likelihood
 from phibench.estimator.methods.likelihood_maps import SpotLikelihood, likelihood_map, of_pixels
 from phibench.estimator.methods.locate import SearchRegion, each_spot_twice, pair_blur, seen_depth_m
@@ -170,7 +170,24 @@ def _likelihood(pair: Pair, position: str, spot: Spot, depth_m: float | None) ->
     if pair.card.output != "raw":
         return spot_likelihood(pair, position, spot, depth_m)
     uv = np.array(spot.uv_px, float)
-    return of_pixels(raw_spot_data(pair, position, uv, depth_m), uv)
+    return of_pixels(_over_known_room(pair, position, uv, depth_m), uv)
+
+
+def _over_known_room(pair: Pair, position: str, start: Array, depth_m: float | None) -> SpotData:
+    """Pixels of the fit, over the room that the laser-off frame shows, smoothed where it is flat.
+
+    On - off, as the joint fit takes it, has the noise of both frames: errors are then 1.2 times as large.
+    """
+    card, near = pair.card, _around(pair, position, start)
+    if near.off is None:
+        return raw_spot_data(pair, position, start, depth_m)
+    noise, pattern, frames = noise_of(card, pattern_known=True), PatternNoise.of(card), pair.count(position)
+    x, off = raw_electrons(near.on, card)[None], raw_electrons(near.off, card)[None]
+    variance = noise.variance_e2(off) / pair.count(f"{position}_off")
+    room = background_of(off, variance, np.ones(off.shape), pattern)
+    law = GaussLaw(noise, room.variance_e2, frames, pattern.prnu, room.mean_e)
+    regions = spot_regions(x, near.corner_px, x < _full_from_e(card, frames))
+    return spot_data(regions, law, pair_blur(pair, start, depth_m), SpotModel(_response(pair), room.mean_e))
 
 
 def _raw(pair: Pair, separate: Answer) -> Answer:
@@ -229,22 +246,37 @@ def raw_spot_data(pair: Pair, position: str, start: Array, depth_m: float | None
     Pixels are the mean of the frames, less that of frames with the laser off: the spot is left. The room, as each
     pixel of this camera sees it, has the noise of both means; PRNU counts for the spot alone.
     """
-    image, dark, card = pair.images[position], pair.images.get(f"{position}_off"), pair.card
+    card, near = pair.card, _around(pair, position, start)
+    noise, pattern, frames = noise_of(card, pattern_known=True), PatternNoise.of(card), pair.count(position)
+    x = raw_electrons(near.on, card)[None]
+    x = np.where(x < _full_from_e(card, frames), x, np.nan)
+    law = GaussLaw(noise, pattern.dsnu_e2, frames, pattern.prnu)
+    if near.off is not None:
+        off, count = raw_electrons(near.off, card)[None], pair.count(f"{position}_off")
+        room = np.maximum(background_of(off, noise.variance_e2(off) / count, np.ones(off.shape), pattern).mean_e, 0.0)
+        x, law = x - off, replace(law, extra_e2=room / frames + noise.variance_e2(room) / count)
+    blur = pair_blur(pair, start, depth_m)
+    return spot_data(spot_regions(x, near.corner_px), law, blur, SpotModel(_response(pair)))
+
+
+@dataclass(frozen=True)
+class _Square:
+    """Pixels around a place, shape (n, n), with the laser on and off, and the image pixel (u, v) of their corner."""
+
+    on: Image
+    off: Image | None
+    corner_px: tuple[int, int]
+
+
+def _around(pair: Pair, position: str, start: Array) -> _Square:
+    """Square of pixels around a place, moved inside the image; wider where there is a laser-off frame."""
+    image, dark = pair.images[position], pair.images.get(f"{position}_off")
     height, width = image.shape
     side = _SIDE_PX[dark is not None]
     u0 = min(max(round(start[0]) - side // 2, 0), max(width - side, 0))
     v0 = min(max(round(start[1]) - side // 2, 0), max(height - side, 0))
     window = (slice(v0, v0 + side), slice(u0, u0 + side))
-    noise, pattern, frames = noise_of(card, pattern_known=True), PatternNoise.of(card), pair.count(position)
-    x = raw_electrons(image[window], card)[None]
-    x = np.where(x < _full_from_e(card, frames), x, np.nan)
-    law = GaussLaw(noise, pattern.dsnu_e2, frames, pattern.prnu)
-    if dark is not None:
-        off, count = raw_electrons(dark[window], card)[None], pair.count(f"{position}_off")
-        room = np.maximum(background_of(off, noise.variance_e2(off) / count, np.ones(off.shape), pattern).mean_e, 0.0)
-        x, law = x - off, replace(law, extra_e2=room / frames + noise.variance_e2(room) / count)
-    blur = pair_blur(pair, start, depth_m)
-    return spot_data(spot_regions(x, (u0, v0)), law, blur, SpotModel(_response(pair)))
+    return _Square(image[window], None if dark is None else dark[window], (u0, v0))
 
 
 def _joint_spot(uv_px: Array, covariance_px2: Array) -> Spot:
