@@ -104,17 +104,21 @@ def choose(rig: Rig, stroke_m: float, down: Candidates, up: Candidates, least: T
     most = np.where(np.minimum(z_down, z_up) >= least.alone, _FLUX_RATIO_ALONE, _FLUX_RATIO)
     fits &= (ratio < most) & (ratio > 1.0 / most)
     fits &= (np.minimum(z_down, z_up) >= least.each) & (z_down**2 + z_up**2 >= 2.0 * least.together**2)
-    single = _single(down, up, least.alone)
+    alone = (_strongest(down, least.alone), _strongest(up, least.alone))
     if not fits.any():
-        return single
-    row = int(np.flatnonzero(fits.any(axis=1))[0])
-    pair = Choice(row, int(np.flatnonzero(fits[row])[0]))
+        return _single(down, up, alone)
+    # by the light of both: a saturated spot may seem fainter in one image than another light
+    light = np.sqrt(np.maximum(down.electrons[:_MOST, None], 0.0) * np.maximum(up.electrons[None, :_MOST], 0.0))
+    row, column = (int(k) for k in np.unravel_index(np.argmax(np.where(fits, light, -1.0)), fits.shape))
     if not sure:
-        return pair
-    for side, alone, other in ((down, single.down, pair.down), (up, single.up, pair.up)):
-        if alone is not None and other is not None and side.electrons[alone] > _STRONGER * side.electrons[other]:
-            return single
-    return pair
+        return Choice(row, column)
+    outshone = [
+        one is not None and side.electrons[one] > _STRONGER * side.electrons[other]
+        for side, one, other in ((down, alone[0], row), (up, alone[1], column))
+    ]
+    if not any(outshone):
+        return Choice(row, column)
+    return _single(down, up, (alone[0] if outshone[0] else None, alone[1] if outshone[1] else None))
 
 
 def consistent(rig: Rig, stroke_m: float, uv_down_px: Array, uv_up_px: Array) -> BoolArray:
@@ -144,9 +148,14 @@ def _distance(curve: Array, points: Array) -> Array:
     return np.min(np.where(np.isfinite(distance), distance, np.inf), axis=-1)
 
 
-def _single(down: Candidates, up: Candidates, alone: float) -> Choice:
-    """More significant one of the strongest candidates that pass alone; both could not be one point."""
-    rows = [int(np.flatnonzero(side.z >= alone)[0]) if (side.z >= alone).any() else None for side in (down, up)]
+def _strongest(side: Candidates, alone: float) -> int | None:
+    """Strongest candidate that passes alone."""
+    passing = np.flatnonzero(side.z >= alone)
+    return int(passing[0]) if passing.size else None
+
+
+def _single(down: Candidates, up: Candidates, rows: tuple[int | None, int | None]) -> Choice:
+    """One candidate, the more significant of two: both could not be one point."""
     if rows[0] is None or rows[1] is None:
         return Choice(rows[0], rows[1])
     return Choice(rows[0]) if down.z[rows[0]] >= up.z[rows[1]] else Choice(None, rows[1])

@@ -26,6 +26,7 @@ from phibench.estimator.methods.raw_likelihood import joint_fit
 from phibench.estimator.methods.simple import detected_spots
 from phibench.estimator.spots.candidates import Candidates, candidates_at, lattice
 from phibench.estimator.spots.detect import (
+    PROCESSED,
     RAW,
     Choice,
     PairDetection,
@@ -379,3 +380,31 @@ def test_one_spot_may_be_much_fainter_in_one_image_if_it_is_sure_there(
     down = Candidates(strong, 60.0 * one, 1e4 * one, one, one, true)
     up = Candidates(on_curve, significance * one, 1e4 / electrons * one, one, one, true)
     assert choose(rig, 0.5, down, up, RAW, sure=True) == (Choice(0, 0) if pair else Choice(0))
+
+
+SPOT_PX, OTHER_PX = np.array([760.0, 420.0]), np.array([540.0, 300.0])
+
+
+def candidates(uv_px: list[np.ndarray], z: tuple[float, ...], electrons: tuple[float, ...]) -> Candidates:
+    one = np.ones(len(z))
+    return Candidates(np.array(uv_px), np.array(z), np.array(electrons), one, one, one.astype(bool))
+
+
+def test_a_saturated_spot_that_seems_fainter_in_one_image_is_not_lost_to_another_light() -> None:
+    """A full spot's electrons are too low in the down image; up it outshines the other light by far."""
+    rig = Rig()
+    spot_up, other_up = (epipolar_curve(rig, 0.5, place[None])[0, 20] for place in (SPOT_PX, OTHER_PX))
+    down = candidates([OTHER_PX, SPOT_PX], (45.0, 12.0), (1.1e5, 0.9e5))
+    up = candidates([spot_up, other_up], (32.0, 16.0), (7e4, 1.5e4))
+    assert choose(rig, 0.5, down, up, PROCESSED, sure=True) == Choice(1, 0)
+
+
+def test_a_spot_that_down_hides_is_not_lost_to_another_light_in_both_images() -> None:
+    """The other light is the more significant one down, with half of the spot's light at most."""
+    rig = Rig()
+    other_up = epipolar_curve(rig, 0.5, OTHER_PX[None])[0, 20]
+    down = candidates([OTHER_PX], (26.0,), (1.2e4,))
+    up = candidates([SPOT_PX, other_up], (24.0, 13.0), (2.5e4, 1e4))
+    assert choose(rig, 0.5, down, up, PROCESSED, sure=True) == Choice(None, 0)
+    weaker = candidates([SPOT_PX, other_up], (24.0, 13.0), (1.4e4, 1e4))  # not by 1.5 times: no other light is so near
+    assert choose(rig, 0.5, down, weaker, PROCESSED, sure=True) == Choice(0, 1)
