@@ -78,7 +78,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "no spot": (
         {"panoramas": [{**PANORAMA, "laser_albedo": 0.0}]},
         r"^random: sample \d+ has no possible rig, spot and stroke in panorama000000 in 100 draws; the last: the ray "
-        r"meets wall_\w+, a screen; narrow",
+        r"meets wall_\w+, a screen; change the numbers that are fixed or narrow",
     ),
     "no floor": (
         {"meshes": [{**MESH, "floor_point": [0.0, 1.0, 0.0]}]},
