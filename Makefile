@@ -19,7 +19,7 @@ PARALLEL ?= --numprocesses 2 --dist loadfile --no-loadscope-reorder
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help setup dataset bench studies studies-full lint clean
-.PHONY: test test-slow proof test-proof test-all attack mutants benchmark
+.PHONY: test test-slow proof test-all attack mutants benchmark
 
 help:
 	@echo "make setup      make .venv with everything in it, and make sure of LLVM"
@@ -30,7 +30,6 @@ help:
 	@echo "make test       the tests, without the slow ones"
 	@echo "make test-slow  the slow tests"
 	@echo "make proof      the slow tests of accuracy, but those of many minutes"
-	@echo "make test-proof the tests of test and proof in one run, which is quicker"
 	@echo "make test-all   all tests"
 	@echo "make attack     hostile methods, files and moments: nothing is lost, and nobody is fooled (docs/trust.md)"
 	@echo "make mutants    proof that the tests see faults: one fault at a time, in copies of the checkout"
@@ -92,9 +91,6 @@ test-slow: $(READY)
 
 proof: $(READY)
 	$(BIN)/python -m pytest $(PARALLEL) --slow -m slow -k accuracy
-
-test-proof: $(READY)
-	$(BIN)/python -m pytest $(PARALLEL) --proof
 
 test-all: $(READY)
 	$(BIN)/python -m pytest --slow --study

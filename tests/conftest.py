@@ -22,7 +22,6 @@ ROOT = Path(__file__).resolve().parent.parent
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the options that ask for more than the quick tests."""
     parser.addoption("--slow", action="store_true", help="run the tests marked slow too, but those of many minutes")
-    parser.addoption("--proof", action="store_true", help="run the slow tests of accuracy beside the quick tests")
     parser.addoption("--study", action="store_true", help="run the tests of many minutes too (marked study)")
 
 
@@ -35,18 +34,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         # a test marked study may be marked slow as well: --study runs it
         mark = next((name for name in ("study", "slow") if item.get_closest_marker(name)), None)
         timing = "benchmark" in getattr(item, "fixturenames", ()) and not timed
-        asked = any(item.nodeid.startswith(name) for name in named) or (mark == "slow" and _is_proof(item))
+        asked = any(item.nodeid.startswith(name) for name in named)
         (left_out if ((mark and not config.getoption(mark)) or timing) and not asked else wanted).append(item)
     if left_out:
         config.hook.pytest_deselected(items=left_out)
-    # the longest files first, so that the test processes end at about the same time
-    long = {item.path for item in wanted if item.get_closest_marker("slow")} if config.getoption("proof") else set()
-    items[:] = sorted(wanted, key=lambda item: item.path not in long)
-
-
-def _is_proof(item: pytest.Item) -> bool:
-    """Tell a test that `make proof` runs: slow, of accuracy, and asked for by `--proof`."""
-    return bool(item.config.getoption("proof")) and "accuracy" in item.nodeid
+        items[:] = wanted
 
 
 @pytest.fixture
