@@ -142,7 +142,7 @@ def sealed(bench_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Any
     """Sealed set of 3 pairs, one of each sample, with its truth. Read only: copy it to change it."""
     from rich.console import Console
 
-    from phibench.estimator.benchmark.sealed_set import seal
+    from phibench.estimator.sealed.sealed_set import seal
 
     folder = tmp_path_factory.mktemp("private")
     shutil.copytree(bench_dataset, folder / "set")
@@ -152,7 +152,7 @@ def sealed(bench_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Any
 @pytest.fixture(scope="session")
 def submitted(sealed: Any, method: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Submission of `method` to `sealed`."""
-    from phibench.estimator.benchmark.submission import submit
+    from phibench.estimator.sealed.submission import submit
 
     out = tmp_path_factory.mktemp("submission") / "submission.json"
     done = submit(sealed.public, method, out)

@@ -41,16 +41,17 @@ datasets/make
 datasets/show datasets/verify datasets/merge_repair
 estimator/interface
 estimator/pair_set
-estimator/truth_file
 estimator/geometry
 estimator/spots
 estimator/sensor_fit
+estimator/outline
 estimator/limits estimator/methods
 estimator/draw_pairs
 estimator/calibration
 estimator/sandbox
 estimator/captures
 estimator/benchmark
+estimator/sealed
 estimator/paper
 estimator/studies
 estimator/cli

@@ -39,10 +39,11 @@ from phibench.estimator.benchmark.document import (
     finite,
     write_score,
 )
-from phibench.estimator.benchmark.metrics import METRICS, Measured, Stratum, count_pairs, measured, strata
+from phibench.estimator.benchmark.metrics import METRICS, Measured
 from phibench.estimator.benchmark.pair_bounds import excesses
 from phibench.estimator.benchmark.records import in_order, missed_relative, record_table, with_missed
 from phibench.estimator.benchmark.report import write_report
+from phibench.estimator.benchmark.strata import Stratum, count_pairs, measured, strata
 from phibench.estimator.benchmark.worst_images import worst, worst_of
 from phibench.estimator.calibration.file import read_calibration
 from phibench.estimator.captures.imported_set import ImportedSet, imported_pairs, is_imported, open_imported

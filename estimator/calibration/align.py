@@ -18,8 +18,8 @@ from PIL import Image, ImageDraw
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.store.files import write_bytes
-from phibench.estimator.calibration.outline import Outline, find_outline
 from phibench.estimator.calibration.verdict import draw_legend, draw_outline
+from phibench.estimator.outline.outline import Outline, find_outline
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array

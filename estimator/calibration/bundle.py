@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.calibration.limb_image import Measured
 from phibench.estimator.calibration.vertical_edges import vertical_of
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.reflection import reflect, reflect_jacobian
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas, stroke_of
 from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.outline.limb_image import Measured
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.validation import SceneError

@@ -16,14 +16,14 @@ from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.store.files import require_writable
 from phibench.estimator.calibration.bundle import Bundle, KnownSpot, calibrate
 from phibench.estimator.calibration.file import write_calibration
-from phibench.estimator.calibration.limb_image import Measured
-from phibench.estimator.calibration.outline import Outline, find_outline, mean_measured, mean_outline
 from phibench.estimator.calibration.spots import Ruler, known_spot, measured_spot, method_for, one_per_pose
 from phibench.estimator.calibration.verdict import Verdict, verdict_of, write_overlay
 from phibench.estimator.calibration.vertical_edges import find_vertical
 from phibench.estimator.draw_pairs import pairs_of
 from phibench.estimator.geometry.rig_parameters import prior_sigmas
 from phibench.estimator.geometry.status import Status, describe
+from phibench.estimator.outline.limb_image import Measured
+from phibench.estimator.outline.outline import Outline, find_outline, mean_measured, mean_outline
 from phibench.estimator.spots.simple_spots import find_spot
 from phibench.scenes.rig import POSITIONS, Rig
 

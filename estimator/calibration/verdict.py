@@ -20,10 +20,10 @@ from scipy import stats
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.store.files import write_bytes
 from phibench.estimator.calibration.bundle import Bundle
-from phibench.estimator.calibration.limb_image import planes_of
-from phibench.estimator.calibration.outline import SECTORS, Outline
-from phibench.estimator.calibration.outline_start import grey
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
+from phibench.estimator.outline.limb_image import planes_of
+from phibench.estimator.outline.outline import SECTORS, Outline
+from phibench.estimator.outline.outline_start import grey
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 

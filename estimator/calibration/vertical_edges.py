@@ -27,9 +27,9 @@ from skimage.feature import canny
 from skimage.transform import probabilistic_hough_line
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.calibration.limb_image import Measured, planes_of
-from phibench.estimator.calibration.outline_start import grey
 from phibench.estimator.geometry.reflection import reflect
+from phibench.estimator.outline.limb_image import Measured, planes_of
+from phibench.estimator.outline.outline_start import grey
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array, Pose
 from phibench.scenes.rig import Rig

@@ -14,7 +14,6 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.store.files import require_writable
 from phibench.estimator.calibration.bundle import Bundle, KnownSpot, calibrate
 from phibench.estimator.calibration.from_dataset import DatasetCalibration, Photograph, write_bundle
-from phibench.estimator.calibration.outline import Outline, find_outline
 from phibench.estimator.calibration.spots import method_for
 from phibench.estimator.captures.imported_set import ImportedRow, ImportedSet, open_imported
 from phibench.estimator.captures.measure import (
@@ -32,6 +31,7 @@ from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Pair
 from phibench.estimator.methods.raw_likelihood import with_posteriors
+from phibench.estimator.outline.outline import Outline, find_outline
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.rig import POSITIONS, Rig
 from phibench.scenes.validation import nearest

@@ -24,8 +24,6 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
 from phibench.estimator.calibration.bundle import calibrate
 from phibench.estimator.calibration.file import Calibration, read_calibration
-from phibench.estimator.calibration.limb_image import Measured
-from phibench.estimator.calibration.outline import Outline, find_outline, mean_outline
 from phibench.estimator.calibration.spots import method_for
 from phibench.estimator.captures.pair_photos import PairPhotos, frames_note, pair_of_photos
 from phibench.estimator.captures.picture_files import SensorChoice, sensor_choice
@@ -45,6 +43,8 @@ from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Image, Pair, Spot
 from phibench.estimator.methods.raw_likelihood import with_posteriors
+from phibench.estimator.outline.limb_image import Measured
+from phibench.estimator.outline.outline import Outline, find_outline, mean_outline
 from phibench.estimator.spots.detect import FARTHEST_M, NEAREST_M, PairDetection, detect
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array

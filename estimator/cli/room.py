@@ -63,7 +63,7 @@ def from_mirror_ball(
     """
     from phibench.datasets.rooms.panorama_files import read_light
     from phibench.datasets.store.files import require_writable
-    from phibench.estimator.calibration.mirror_ball import (
+    from phibench.estimator.outline.mirror_ball import (
         BallPhoto,
         find_ball,
         panorama_table,

@@ -32,7 +32,7 @@ def make(directory: Path, *, out: Path, preset: str | None = None) -> int:
     preset
         One sensor preset, instead of those of the recipe's [frames].
     """
-    from phibench.estimator.benchmark.sealed_set import seal as seal_dataset
+    from phibench.estimator.sealed.sealed_set import seal as seal_dataset
 
     sealed = seal_dataset(directory, out, preset)
     for warning in sealed.warnings:
@@ -64,7 +64,7 @@ def submit(
     workers
         Pairs that are worked on at a time.
     """
-    from phibench.estimator.benchmark.submission import submit as submit_method
+    from phibench.estimator.sealed.submission import submit as submit_method
 
     done = submit_method(public, method, out, workers, limits.of_run)
     print(
@@ -97,7 +97,7 @@ def open_(public: Path, *, truth: Path, submission: Path, out: Path | None = Non
     from phibench.estimator.benchmark.answer_errors import Rules
     from phibench.estimator.benchmark.score import isolated, saved, score_outcomes
     from phibench.estimator.benchmark.score_tables import print_scores
-    from phibench.estimator.benchmark.submission import unseal as unseal_set
+    from phibench.estimator.sealed.submission import unseal as unseal_set
 
     if out is not None:
         if out.suffix != ".json":

@@ -25,12 +25,12 @@ from phibench.datasets.read import Dataset, Sample
 from phibench.estimator.benchmark.dataset_pairs import DatasetPairs
 from phibench.estimator.calibration.bundle import Bundle, calibrate
 from phibench.estimator.calibration.from_dataset import frame_outline, frame_spots
-from phibench.estimator.calibration.outline import mean_outline
 from phibench.estimator.calibration.spots import Ruler, method_for, one_per_pose
 from phibench.estimator.draw_pairs import pairs_of
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
 from phibench.estimator.geometry.status import describe
 from phibench.estimator.interface import OK, Answer, Pair
+from phibench.estimator.outline.outline import mean_outline
 from phibench.estimator.pair_set import PairTruth
 from phibench.scenes.rig import POSITIONS
 

@@ -14,9 +14,17 @@ import numpy as np
 
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.datasets.frames.sensor_file import FitTables, Measured, SensorFile, allowed_numbers
-from phibench.estimator.sensor_fit.capture_folder import RAW, Capture, CaptureError, FrameGroup, luma, open_capture
+from phibench.estimator.sensor_fit.capture_folder import (
+    RAW,
+    Capture,
+    CaptureError,
+    FrameGroup,
+    JpegHeader,
+    luma,
+    open_capture,
+    read_header,
+)
 from phibench.estimator.sensor_fit.edge_spread import Edge, EdgeFit, EdgeModel, edges_of, fit_edges
-from phibench.estimator.sensor_fit.jpeg_header import JpegHeader, read_header
 from phibench.estimator.sensor_fit.lens_fit import LensFit, fit_lens
 from phibench.estimator.sensor_fit.photon_transfer import TransferFit, fit_transfer
 from phibench.estimator.sensor_fit.processed_noise import LUMA, LumaModel, ProcessedNoise, fit_noise, stack_level

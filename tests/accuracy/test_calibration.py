@@ -14,11 +14,11 @@ from scipy import stats
 
 from phibench.datasets.parallel import parallel_map
 from phibench.estimator.calibration.bundle import KnownSpot, calibrate
-from phibench.estimator.calibration.limb_image import Measured
 from phibench.estimator.calibration.vertical_edges import vertical_of
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas, stroke_of
 from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.outline.limb_image import Measured
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.random_streams import generator

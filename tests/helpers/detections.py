@@ -16,7 +16,7 @@ from phibench.datasets.read import Dataset, open_dataset
 from phibench.estimator.benchmark.answer_errors import MATCH_PX, Rules
 from phibench.estimator.benchmark.dataset_pairs import dataset_pairs
 from phibench.estimator.benchmark.intervals import Clusters, Estimate, rate
-from phibench.estimator.benchmark.metrics import CLEAR_SIGMAS
+from phibench.estimator.benchmark.strata import CLEAR_SIGMAS
 from phibench.estimator.spots.detect import detect
 
 PRESETS = ("bayer-raw", "srgb8", "mjpeg")

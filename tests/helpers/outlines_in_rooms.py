@@ -17,7 +17,7 @@ import numpy as np
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.estimator.calibration.align import alignment
 from phibench.estimator.calibration.from_dataset import photograph
-from phibench.estimator.calibration.outline import find_outline
+from phibench.estimator.outline.outline import find_outline
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.rig import POSITIONS
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.benchmark.submission import unseal
+from phibench.estimator.sealed.submission import unseal
 
 METHOD = """\
 import numpy as np

@@ -36,22 +36,22 @@ from phibench.datasets.store.layers import read_layer, write_exr
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.document import MethodCard, read_records, read_score, write_score
 from phibench.estimator.benchmark.score import score_outcomes
-from phibench.estimator.benchmark.sealed_set import (
+from phibench.estimator.calibration.bundle import Bundle
+from phibench.estimator.calibration.file import read_calibration, write_calibration
+from phibench.estimator.geometry.rig_parameters import PARAMETERS
+from phibench.estimator.sandbox.resolve import Reference
+from phibench.estimator.sealed.sealed_set import (
     FORMAT,
     PAIRS,
     SEAL,
     public_sha256,
     seal_id,
 )
-from phibench.estimator.benchmark.submission import SealedPairs, outcomes_of, read_submission, submission
-from phibench.estimator.calibration.bundle import Bundle
-from phibench.estimator.calibration.file import read_calibration, write_calibration
-from phibench.estimator.geometry.rig_parameters import PARAMETERS
-from phibench.estimator.sandbox.resolve import Reference
+from phibench.estimator.sealed.submission import SealedPairs, outcomes_of, read_submission, submission
+from phibench.estimator.sealed.truth_file import read_truth_file, truth_text
 from phibench.estimator.spots.image_planes import read_picture
 from phibench.estimator.studies.framework import read_settings
 from phibench.estimator.studies.run import find_study, read_study
-from phibench.estimator.truth_file import read_truth_file, truth_text
 from phibench.render.room.light_map import LightMap, encoded
 from phibench.scenes.rig import Rig
 

@@ -14,11 +14,11 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.datasets.progress import Steps
 from phibench.estimator.calibration.bundle import calibrate
-from phibench.estimator.calibration.limb_image import Measured
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
 from phibench.estimator.limits.best_stroke import BestStroke, best_stroke, spot_bound
 from phibench.estimator.limits.processed_bound import SpotSigma
 from phibench.estimator.limits.stroke_curve import StrokeCurve, Surroundings, stroke_curve, stroke_grid
+from phibench.estimator.outline.limb_image import Measured
 from phibench.estimator.spots.spot_prediction import Laser
 from phibench.estimator.studies.framework import Result, Settings, Study, StudyDatasets
 from phibench.estimator.studies.stroke.drawings import best_drawing, check_drawing, curves_drawing

@@ -18,9 +18,10 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_file import SensorFile, write_sensor_file
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.document import MethodCard, ScoreDocument, read_records, read_score, write_score
-from phibench.estimator.benchmark.metrics import METRICS, STRATA
+from phibench.estimator.benchmark.metrics import METRICS
 from phibench.estimator.benchmark.score import score_methods, score_outcomes
 from phibench.estimator.benchmark.score_tables import leaderboard, number, ranked
+from phibench.estimator.benchmark.strata import STRATA
 from phibench.estimator.benchmark.worst_images import crop
 from phibench.estimator.cli import main as cli
 from phibench.estimator.interface import Outcome

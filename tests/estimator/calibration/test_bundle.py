@@ -14,10 +14,10 @@ from scipy import stats
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.calibration.bundle import Bundle, KnownSpot, calibrate, seen_at
 from phibench.estimator.calibration.file import CalibrationError, read_calibration, write_calibration
-from phibench.estimator.calibration.limb_image import Measured
-from phibench.estimator.calibration.outline import Outline, mean_outline
 from phibench.estimator.cli import main as cli
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas, stroke_of
+from phibench.estimator.outline.limb_image import Measured
+from phibench.estimator.outline.outline import Outline, mean_outline
 from phibench.scenes.rig import Rig
 
 PIXEL2 = 0.05**2 * np.eye(2)

@@ -11,11 +11,11 @@ from helpers.limb_frames import limb_light
 from PIL import Image
 
 from phibench.estimator.calibration.bundle import Bundle, calibrate
-from phibench.estimator.calibration.limb_image import Measured, planes_of
-from phibench.estimator.calibration.outline import SECTORS, Outline, find_outline
-from phibench.estimator.calibration.outline_fit import band, step_from
 from phibench.estimator.calibration.verdict import BAD, DOUBTFUL, GOOD, verdict_of, write_overlay
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
+from phibench.estimator.outline.limb_image import Measured, planes_of
+from phibench.estimator.outline.outline import SECTORS, Outline, find_outline
+from phibench.estimator.outline.outline_fit import band, step_from
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Pose
 from phibench.scenes.rig import Rig

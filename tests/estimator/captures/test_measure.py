@@ -13,11 +13,11 @@ from PIL import Image
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import Sample, open_dataset
-from phibench.estimator.calibration.outline import Outline
 from phibench.estimator.captures.measure import measure, outlines_as_one, read_setting
 from phibench.estimator.captures.pair_photos import PairPhotos, PositionPhotos
 from phibench.estimator.captures.picture_files import read_photo
 from phibench.estimator.cli.main import main
+from phibench.estimator.outline.outline import Outline
 from phibench.estimator.spots.image_planes import ImageError
 
 Files = dict[str, list[Path]]

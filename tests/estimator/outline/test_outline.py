@@ -10,11 +10,12 @@ from helpers.limb_frames import drawn_rig, limb_light
 from scipy import stats
 
 from phibench.datasets.frames.sensor_card import sensor_card
-from phibench.estimator.calibration.limb_image import Plane, Tap, binned, planes_of
-from phibench.estimator.calibration.outline import _approach as approach
-from phibench.estimator.calibration.outline import binned_rig, find_outline, fit_outline, visible_arc
-from phibench.estimator.calibration.outline_fit import Sectors, _medians, scatter, step_from
-from phibench.estimator.calibration.outline_start import (
+from phibench.estimator.outline.limb_image import Plane, Tap, binned, planes_of
+from phibench.estimator.outline.limb_sectors import Sectors, _medians, scatter
+from phibench.estimator.outline.outline import _approach as approach
+from phibench.estimator.outline.outline import binned_rig, find_outline, fit_outline, visible_arc
+from phibench.estimator.outline.outline_fit import step_from
+from phibench.estimator.outline.outline_start import (
     grey,
     plain_circle,
     rough_outlines,
@@ -101,14 +102,14 @@ def test_a_long_picture_is_fitted_in_squares_first(case, frames, monkeypatch: py
     """The last refinement sees all pixels: the answer is the same to a fifth of its sigma, where both rest."""
     rig, card = nominal(case[0]), sensor_card("mjpeg")
     whole = find_outline(frames["mjpeg"], rig, card)
-    monkeypatch.setattr("phibench.estimator.calibration.outline._BINNED_PX", 640)
+    monkeypatch.setattr("phibench.estimator.outline.outline._BINNED_PX", 640)
     sizes: list[tuple[int, ...]] = []
 
     def approached(planes, *arguments):
         sizes.append(planes[0].values.shape)
         return approach(planes, *arguments)
 
-    monkeypatch.setattr("phibench.estimator.calibration.outline._approach", approached)
+    monkeypatch.setattr("phibench.estimator.outline.outline._approach", approached)
     found = find_outline(frames["mjpeg"], rig, card)
     assert sizes == [(360, 640)]
     assert (np.abs(found.sphere_in_camera_m - whole.sphere_in_camera_m) < 0.2 * whole.sigma_m).all()
@@ -130,7 +131,7 @@ def test_a_hopeless_fit_ends_soon(monkeypatch: pytest.MonkeyPatch) -> None:
         steps.append(step_from(*arguments, **options))
         return steps[-1]
 
-    monkeypatch.setattr("phibench.estimator.calibration.outline.step_from", counted)
+    monkeypatch.setattr("phibench.estimator.outline.outline.step_from", counted)
     with pytest.raises(ImageError, match="without a mirror"):
         fit_outline(planes_of(np.stack([light] * 3)), rig, rig.sphere_in_camera_m)
     assert len(steps) <= 6 + 6  # to come near, and to see that it leads nowhere

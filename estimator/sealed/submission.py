@@ -29,7 +29,12 @@ from phibench.datasets.store.files import write_text
 from phibench.datasets.store.provenance import provenance
 from phibench.datasets.store.schema import Document, Number, Vector2
 from phibench.estimator.benchmark.document import MethodCard
-from phibench.estimator.benchmark.sealed_set import (
+from phibench.estimator.interface import FAILURES, Box, Image, Outcome, Pair, Spot
+from phibench.estimator.pair_set import PairTruth, truth_folders
+from phibench.estimator.sandbox.answers import AnswerError, checked
+from phibench.estimator.sandbox.resolve import Reference, RunLimits, resolve
+from phibench.estimator.sandbox.runner import Harness
+from phibench.estimator.sealed.sealed_set import (
     CHECKSUMS,
     FRAMES,
     PAIRS,
@@ -40,12 +45,7 @@ from phibench.estimator.benchmark.sealed_set import (
     read_pairs,
     read_seal,
 )
-from phibench.estimator.interface import FAILURES, Box, Image, Outcome, Pair, Spot
-from phibench.estimator.pair_set import PairTruth, truth_folders
-from phibench.estimator.sandbox.answers import AnswerError, checked
-from phibench.estimator.sandbox.resolve import Reference, RunLimits, resolve
-from phibench.estimator.sandbox.runner import Harness
-from phibench.estimator.truth_file import MOST_PAIRS, read_truth_file
+from phibench.estimator.sealed.truth_file import MOST_PAIRS, read_truth_file
 from phibench.scenes.camera import Camera
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from phibench.estimator.calibration.ball_circle import on_limb
-from phibench.estimator.calibration.edge_ring import TURNS, EdgeRing, LimbRing, log_colours
+from phibench.estimator.outline.ball_circle import on_limb
+from phibench.estimator.outline.edge_ring import TURNS, EdgeRing, LimbRing, log_colours
 
 ROWS, COLUMNS, FINE = 300, 320, 4
 CIRCLE = (161.3, 148.8, 101.6)

@@ -24,11 +24,11 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.rooms.panorama_settings import PanoramaSettings
 from phibench.datasets.store.layers import write_exr
 from phibench.datasets.store.pictures import save_png
-from phibench.estimator.calibration.ball_circle import LONGEST_PX, BallCircle, find_circle, shrunk
-from phibench.estimator.calibration.edge_ring import Circle
-from phibench.estimator.calibration.outline_start import sphere_from_circle, sphere_from_rays
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.panorama import Grid, unrolled
+from phibench.estimator.outline.ball_circle import LONGEST_PX, BallCircle, find_circle, shrunk
+from phibench.estimator.outline.edge_ring import Circle
+from phibench.estimator.outline.outline_start import sphere_from_circle, sphere_from_rays
 from phibench.estimator.spots.camera_codes import linear_to_srgb
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera

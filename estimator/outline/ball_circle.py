@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, optimize
 from skimage.measure import block_reduce
 
-from phibench.estimator.calibration.edge_ring import CURVES, PEAKS, TURNS, Circle, EdgeRing, LimbRing, log_colours
+from phibench.estimator.outline.edge_ring import CURVES, PEAKS, TURNS, Circle, EdgeRing, LimbRing, log_colours
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.calibration.limb_image import JPEG_LUMA
-from phibench.estimator.calibration.outline_fit import OutlinePixels
+from phibench.estimator.outline.limb_image import JPEG_LUMA
+from phibench.estimator.outline.outline_fit import OutlinePixels
 from phibench.estimator.spots.camera_codes import light_of, tone_of
 from phibench.estimator.spots.image_planes import full_scale_e, through_jpeg
 from phibench.estimator.spots.jpeg_coefficients import mcu_px

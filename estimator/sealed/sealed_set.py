@@ -5,7 +5,7 @@ pairs.jsonl     per pair what a user knows: rig, stroke, sensor, boxes, files
 frames/         images: PNG of 8 or 16 bits, or the camera's JPEG
 SHA256SUMS      of everything above
 
-The truth stays with the organiser (`estimator/truth_file.py`), and its hash in the seal proves later which it was.
+The truth stays with the organiser (`truth_file`), and its hash in the seal proves later which it was.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from phibench.datasets.store.leftovers import OwnedFolder
 from phibench.datasets.store.schema import Document
 from phibench.estimator.benchmark.dataset_pairs import TASK_VERSION, DatasetPairs, dataset_pairs
 from phibench.estimator.interface import Box, Pair
-from phibench.estimator.truth_file import MOST_PAIRS, Digest, truth_text
+from phibench.estimator.sealed.truth_file import MOST_PAIRS, Digest, truth_text
 from phibench.scenes.camera import LARGEST_SIDE_PX
 from phibench.scenes.random_streams import generator
 

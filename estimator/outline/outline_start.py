@@ -13,9 +13,9 @@ import numpy as np
 from scipy import ndimage
 from skimage.measure import CircleModel, EllipseModel
 
-from phibench.estimator.calibration.ball_circle import BallCircle, circles
-from phibench.estimator.calibration.edge_ring import Circle
-from phibench.estimator.calibration.limb_image import Plane
+from phibench.estimator.outline.ball_circle import BallCircle, circles
+from phibench.estimator.outline.edge_ring import Circle
+from phibench.estimator.outline.limb_image import Plane
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array

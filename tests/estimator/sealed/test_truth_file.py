@@ -12,7 +12,7 @@ import pytest
 from helpers.bench_cases import cases
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.truth_file import read_truth_file, truth_document, truth_text
+from phibench.estimator.sealed.truth_file import read_truth_file, truth_document, truth_text
 
 TEXT = "0123456789abcdef" * 4
 Change = Callable[[dict[str, Any]], object]

@@ -23,7 +23,9 @@ from phibench.datasets.recipe.tables import Recipe
 from phibench.estimator.benchmark.dataset_pairs import dataset_pairs
 from phibench.estimator.benchmark.document import read_score
 from phibench.estimator.benchmark.score import show
-from phibench.estimator.benchmark.sealed_set import (
+from phibench.estimator.cli import main as cli
+from phibench.estimator.pair_set import PairTruth
+from phibench.estimator.sealed.sealed_set import (
     Sealed,
     board_warnings,
     earlier_warnings,
@@ -32,10 +34,8 @@ from phibench.estimator.benchmark.sealed_set import (
     sequence_warnings,
     single_pairs,
 )
-from phibench.estimator.benchmark.submission import SealedPairs, submit
-from phibench.estimator.cli import main as cli
-from phibench.estimator.pair_set import PairTruth
-from phibench.estimator.truth_file import TruthRow, truth_document, truth_of
+from phibench.estimator.sealed.submission import SealedPairs, submit
+from phibench.estimator.sealed.truth_file import TruthRow, truth_document, truth_of
 from phibench.scenes.laser import Beam
 
 
@@ -315,7 +315,7 @@ def test_an_interrupted_seal_leaves_nothing(
     def fail(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("phibench.estimator.benchmark.sealed_set.truth_text", fail)
+    monkeypatch.setattr("phibench.estimator.sealed.sealed_set.truth_text", fail)
     with pytest.raises(KeyboardInterrupt):
         seal(copy, tmp_path / "public", "bayer-raw", quiet())
     assert [path.name for path in tmp_path.iterdir()] == ["set"]

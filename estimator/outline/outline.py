@@ -27,12 +27,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.calibration.ball_circle import BallCircle, on_limb
-from phibench.estimator.calibration.edge_ring import TURNS
-from phibench.estimator.calibration.limb_image import Measured, Plane, binned, limb_angle_rad, planes_of
-from phibench.estimator.calibration.outline_fit import OutlinePixels, Step, band, step_from
-from phibench.estimator.calibration.outline_jpeg import JpegAgain
-from phibench.estimator.calibration.outline_start import (
+from phibench.estimator.outline.ball_circle import BallCircle, on_limb
+from phibench.estimator.outline.edge_ring import TURNS
+from phibench.estimator.outline.limb_image import Measured, Plane, binned, limb_angle_rad, planes_of
+from phibench.estimator.outline.outline_fit import OutlinePixels, Step, band, step_from
+from phibench.estimator.outline.outline_jpeg import JpegAgain
+from phibench.estimator.outline.outline_start import (
     PICTURE_BLUR_PX2,
     grey,
     radii_px,

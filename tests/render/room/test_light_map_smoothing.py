@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from phibench.render.room.bounced_light import _between, _overlap
-from phibench.render.room.irradiance_filter import line_fit, smoothed
+from phibench.render.room.light_map import line_fit, smoothed
 from phibench.render.room.texel_grid import TexelGrid
 from phibench.scenes.faces import face_table
 from phibench.scenes.shapes import rectangle

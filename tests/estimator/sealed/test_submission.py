@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from helpers.sealed_sets import METHOD, refusal, tampered
 
-from phibench.estimator.benchmark.sealed_set import Sealed
-from phibench.estimator.benchmark.submission import SealedPairs, outcomes_of, read_submission, unseal
 from phibench.estimator.sandbox.runner import run_method
+from phibench.estimator.sealed.sealed_set import Sealed
+from phibench.estimator.sealed.submission import SealedPairs, outcomes_of, read_submission, unseal
 
 
 def test_a_submission_comes_back_as_it_was(sealed: Sealed, submitted: Path, method: str) -> None:
