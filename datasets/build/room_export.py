@@ -3,7 +3,8 @@
 Both come with the table of a recipe that reads them. The robot is left out: it stands in every room by itself.
 
 A data set exports rooms by itself before samples are drawn, to `rooms/exported/`. The name of each file holds a hash of
-all that it is made from: a file that is there is the right one, and is kept. Each is written whole or not at all.
+the room and of its settings: a file that is there is kept, by a later version of the code too, and its SHA-256 stands
+in the documents. Each is written whole or not at all.
 """
 
 from __future__ import annotations

@@ -265,7 +265,7 @@ def _sensor(frames: Raw) -> Iterator[Fault]:
     given = {key: value for key, value in numbers.items() if key not in (*SENSOR_OF_FRAME, *SENSOR_KEYS)}
     for key in numbers:
         if key in SENSOR_OF_FRAME:
-            yield Fault(f"frames.sensor.{key}", "belongs to frames and not to a camera; leave it out")
+            yield Fault(f"frames.sensor.{key}", "is no number of a camera; leave it out")
         elif key in frames and key in SENSOR_KEYS:
             yield Fault(f"frames.sensor.{key}", f"given together with frames.{key}; give one or the other")
         elif key in SENSOR_KEYS:

@@ -63,6 +63,7 @@ _BLUR_RANGE_PX2 = (0.02, 9.0)
 _LEAST_CONTRAST = 9.0  # of a circle whose light is worth a fit; patterns and noise give up to 8
 _MOST_TRIED = 4  # circles whose light is fitted, which takes seconds where it does not come to rest
 _MOST_OFF = 0.06  # of the distance, for an outline by its edge alone: a holder's plates are clear circles, too
+_AT_EDGE_PX = 3.0  # of centre and radius, between a limb and the edge that it was looked for from
 _FROM_EDGE_PX = 1.0  # the steepest place of the light is some tenths of a pixel inside the limb
 _SHARED = 0.55
 _SMOOTH, _SMOOTH_JPEG = 2.5, 10.0
@@ -193,20 +194,30 @@ def binned_rig(rig: Rig, block: int) -> Rig:
 def _clearest(picture: Array, rig: Rig) -> list[tuple[Array, BallCircle, BallCircle]]:
     """Sphere centres, limbs and the edges near them that a picture may show, at most `_MOST_TRIED`.
 
-    Those at about the distance that the rig says come first, then the clearest: a holder's plates are clear circles,
-    too. Where there is no limb, an edge stands for it.
+    Those at about the distance that the rig says come first: a holder's plates are clear circles, too. Then come limbs
+    that lie at a clear edge, then the clearest. A limb that was looked for from afar may be that of a lamp along the
+    true one: both bend the light alike. Where there is no limb, an edge stands for it.
     """
     blur_px = math.sqrt(rig.camera.blur_sigma_px**2 + PICTURE_BLUR_PX2)
-    found: list[tuple[bool, float, Array, BallCircle, BallCircle]] = []
+    found: list[tuple[bool, bool, float, Array, BallCircle, BallCircle]] = []
     for _, edge in rough_outlines(picture, rig):
         if edge.contrast < _LEAST_CONTRAST:
             continue
         circle = on_limb(picture, edge.circle_px, blur_px) or edge
         s = _sphere(rig, circle)
-        found.append((not _as_far(rig, s), -circle.contrast, s, circle, edge))
+        found.append((not _as_far(rig, s), not _at_edge(circle, edge), -circle.contrast, s, circle, edge))
         if len(found) == _MOST_TRIED or (_as_far(rig, s) and circle.contrast > _CLEAR_LIMB):
             break
-    return [one[2:] for one in sorted(found, key=lambda one: one[:2])]
+    return [one[3:] for one in sorted(found, key=lambda one: one[:3])]
+
+
+def _at_edge(limb: BallCircle, edge: BallCircle) -> bool:
+    """Tell a limb that lies at a clear edge."""
+    try:
+        edge.require_clear()
+    except ImageError:
+        return False
+    return max(abs(a - b) for a, b in zip(limb.circle_px, edge.circle_px, strict=True)) <= _AT_EDGE_PX
 
 
 def _sphere(rig: Rig, circle: BallCircle) -> Array:

@@ -12,6 +12,7 @@ from helpers.processes import quiet
 
 from phibench.datasets.errors import DatasetError, RecipeError
 from phibench.datasets.make import dry_run, make
+from phibench.datasets.merge_repair import merge
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.plan.room_draws import draw_rooms
 from phibench.datasets.read import open_finished
@@ -106,7 +107,25 @@ def test_a_killed_export_is_taken_up_again_with_the_same_bytes(made: Path, tmp_p
     assert read_checksums(out) == read_checksums(made)
 
 
-def test_more_samples_keep_the_files_and_a_damaged_one_is_made_again(copy: Path, made: Path) -> None:
+def test_more_samples_keep_the_files_and_add_those_of_their_rooms(made: Path, tmp_path: Path) -> None:
+    """Two samples need the panorama alone; the third needs the mesh."""
+    out = tmp_path / "out"
+    make_inline(KINDS, out, samples=2)
+    first = exported(out)
+    assert [Path(name).suffix for name in first] == [".exr"]
+    make_inline(KINDS, out)
+    assert exported(out) == {**exported(made), **first} == exported(made)
+    assert read_checksums(out) == read_checksums(made)
+
+
+def test_shards_merge_to_the_same_bytes(made: Path, tmp_path: Path) -> None:
+    """Each shard exports by itself."""
+    shards = [make_inline(KINDS, tmp_path / f"shard-{k}", shard=f"{k}/2") for k in (1, 2)]
+    merged = merge(tmp_path / "merged", shards, quiet())
+    assert read_checksums(merged) == read_checksums(made)
+
+
+def test_a_damaged_file_is_made_again(copy: Path, made: Path) -> None:
     mesh = next((copy / "rooms" / "exported").glob("*.glb"))
     mesh.write_bytes(mesh.read_bytes()[:-1] + b"!")
     make_inline(KINDS, copy)

@@ -29,12 +29,12 @@ class InlineWorkerPool:
         return InlineExecutor(self._out)
 
 
-def make_inline(recipe: str | Path, out: Path) -> Path:
+def make_inline(recipe: str | Path, out: Path, **options: Any) -> Path:
     """Data set, rendered in this process: the same bytes as by workers, without starting them."""
     from phibench.datasets.make import make
 
     with patch("phibench.datasets.make.WorkerPool", InlineWorkerPool):
-        return make(recipe, out, workers=1)
+        return make(recipe, out, workers=1, **options)
 
 
 class InlineExecutor:

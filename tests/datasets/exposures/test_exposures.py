@@ -312,7 +312,7 @@ SPOT = {"kind": "spot"}
         ({"frames": {"hnt": 1.0}}, "frames.hnt", ("unknown", "'hint'")),
         ({"frames": {"sensor": {"gain": 0.3}}}, "frames.sensor", ("gain", "unknown")),
         ({"frames": {"sensor": {"prnu": 2.0}}}, "frames.sensor", ("prnu", "up to 0.2")),
-        ({"frames": {"sensor": {"exposure_s": 0.01}}}, "frames.sensor.exposure_s", ("belongs to frames",)),
+        ({"frames": {"sensor": {"exposure_s": 0.01}}}, "frames.sensor.exposure_s", ("no number of a camera",)),
         ({"frames": {"sensor": {"sigma": {"prnu": 0.1}}}}, "frames.sensor.sigma", ("leave it out",)),
         ({"frames": {"prnu": 0.01, "sensor": {"prnu": 0.02}}}, "frames.sensor.prnu", ("one or the other",)),
         ({"rig": {"laser_filter_response": [1.0, 0.1]}}, "rig.laser_filter_response", ("a list of 3",)),
