@@ -36,6 +36,7 @@ from phibench.scenes.rig import Rig
 _BRIGHT = 3.0  # times the median inside the mirror
 _LEAST_AREA_PX = 80
 _HALO_PX, _JPEG_HALO_PX = 5, 12  # a JPEG's block and its neighbour's interpolation
+_IN_HALO = 3.0  # times the threshold of a candidate alone, where a laser-off frame shows the lamp
 
 
 def lamp_halo(planes: ColourPlanes, inside: BoolArray, card: SensorCard, laser_off: bool) -> BoolArray:
@@ -43,7 +44,7 @@ def lamp_halo(planes: ColourPlanes, inside: BoolArray, card: SensorCard, laser_o
 
     Around them an edge, clipping or JPEG's ringing look like anything. Bright is a multiple of the usual level; a spot,
     however strong, is small. Of a laser-off frame (`laser_off`) only full pixels count: what is merely bright, such as
-    a sunlit wall, is subtracted, and its noise is known.
+    a sunlit wall, is subtracted, and its noise is known. There a spot of several times the threshold counts.
     """
     step = 2 if planes.mosaic else 1
     red = planes.values_e[0][::step, ::step]
@@ -164,7 +165,8 @@ def _single(down: Candidates, up: Candidates, rows: tuple[int | None, int | None
 # -- detection -------------------------------------------------------------------------------------------------------
 
 RAW = Thresholds(alone=6.2, each=4.8, together=4.8)
-PROCESSED = Thresholds(alone=7.5, each=4.6, together=5.5)
+PROCESSED = Thresholds(alone=6.8, each=4.6, together=5.5)  # without JPEG 5.6 was the largest of 204 frames' false ones
+JPEG = Thresholds(alone=7.5, each=4.6, together=5.5)
 PROCESSED_ONE_FRAME = Thresholds(alone=8.5, each=5.0, together=6.5)  # without a laser-off frame
 UNSURE = Thresholds(alone=16.0, each=5.0, together=10.0)  # neither filters nor a laser-off frame
 _IN_A_BOX = 0.7  # less than in the whole mirror, see above
@@ -236,8 +238,8 @@ def detect(pair: Pair) -> PairDetection:
     sure = off or pair.card.mosaic == "bayer"
     least = _thresholds(pair.card, sure, off)
     least = _lowered(least) if _is_small(pair.box_down) and _is_small(pair.box_up) else least
-    down = _searched(pair, "down", pair.box_down, least.each)
-    up = _searched(pair, "up", pair.box_up, least.each)
+    down = _searched(pair, "down", pair.box_down, least)
+    up = _searched(pair, "up", pair.box_up, least)
     choice = choose(pair.rig, pair.stroke_m, down.found, up.found, least, sure)
     return _refined(choice, down, up, pair.card)
 
@@ -247,7 +249,9 @@ def _thresholds(card: SensorCard, sure: bool, off: bool) -> Thresholds:
         return UNSURE
     if card.output == "raw":
         return RAW
-    return PROCESSED if off else PROCESSED_ONE_FRAME
+    if off:
+        return JPEG if card.output == "mjpeg" else PROCESSED
+    return PROCESSED_ONE_FRAME
 
 
 def _is_small(hint: Box | None) -> bool:
@@ -275,21 +279,24 @@ def mirror_box(rig: Rig) -> Box:
     return Box(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
 
 
-def _searched(pair: Pair, position: str, hint: Box | None, least_z: float) -> _Searched:
+def _searched(pair: Pair, position: str, hint: Box | None, least: Thresholds) -> _Searched:
     card, box, dark = pair.card, mirror_box(pair.rig), pair.images.get(f"{position}_off")
     on = colour_planes(pair.images[position], card, box)
     off = None if dark is None else colour_planes(dark, card, box)
-    inside = outline_mask(pair.rig, box)
-    inside = inside & ~lamp_halo(off or on, inside, card, off is not None)
+    outline = outline_mask(pair.rig, box)
+    halo = lamp_halo(off or on, outline, card, off is not None)
+    inside = outline & ~halo
     sigma = blur_of(card, pair.rig.camera.blur_sigma_px)
     counts = pair.count(position), max(pair.count(f"{position}_off"), 1)
     noise = candidate_noise(on, off, card, sigma, inside, counts)
-    where = inside if hint is None else inside & _hinted(hint, box)
+    seen = inside if off is None else outline  # a strong spot beside a lamp is still one
+    where = seen if hint is None else seen & _hinted(hint, box)
     places = peaks(on, off, card, sigma, where, _LEAST_PEAK, _MOST_PEAKS).uv_px
     first = candidates_at(on, off, card, places, sigma, noise)
     first = _rows(first, first.z >= np.sort(first.z)[-_MOST_TESTED:][:1].sum())
     best = _better(first, candidates_at(on, off, card, first.uv_px, _WIDER * sigma, noise))
-    keep = best.red & (best.z >= least_z)
+    near = halo[tuple(np.rint(best.uv_px).astype(int).T[::-1])]
+    keep = best.red & (best.z >= np.where(near, _IN_HALO * least.alone, least.each))
     return _Searched(on, off, sigma, _moved(_rows(best, keep), box))
 
 

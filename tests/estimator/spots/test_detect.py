@@ -69,6 +69,7 @@ class Scene:
     always: tuple[Light2, ...] = ()
     with_laser: tuple[Light2, ...] = ()
     tiles: float = 0.15
+    lamp: Box | None = None  # of the down image
 
     def uv(self, name: str) -> Array:
         return image_of(RIG.at(0.0 if name == "down" else STROKE_M), np.array(self.point_m)).uv_px
@@ -77,7 +78,10 @@ class Scene:
         rng, s = generator("detect", "room", name), self.s
         grey = np.kron(1.0 + self.tiles * rng.uniform(-1.0, 1.0, (18, 32)), np.ones((10, 10)))
         # the optics blur the room as they blur the spot
-        room = 800.0 * WHITE[:, None, None] * gaussian_filter(grey, 0.7) / s.exposure_s
+        grey = gaussian_filter(grey, 0.7)
+        if self.lamp is not None and name == "down":
+            grey[self.lamp.slices] = 200.0  # all three bands are full
+        room = 800.0 * WHITE[:, None, None] * grey / s.exposure_s
         lights = [*self.always, *(self.with_laser if laser else ())]
         if laser:
             lights.append((name, tuple(self.uv(name)), self.electrons[name == "up"], FILTERS))
@@ -211,6 +215,15 @@ def test_lights_of_the_room_are_taken_off_with_the_off_frame(s: Sensor) -> None:
     assert max(misses(detect(scene.pair()), scene)) < 1.0
     dark = replace(scene, electrons=(0.0, 0.0))
     assert detect(dark.pair()) == PairDetection(None, None)
+
+
+@pytest.mark.parametrize("s", [BAYER, MONO], ids=lambda s: s.name)
+def test_a_strong_spot_beside_a_lamp_is_found(s: Sensor) -> None:
+    """The lamp begins 4 px beside the spot: within the part around lamps where weak lights are not believed."""
+    u, v = Scene(s).uv("down")
+    scene = Scene(s, (16_000.0, 16_000.0), lamp=Box(int(u) + 4, int(v) - 10, 20, 20))
+    assert max(misses(detect(scene.pair()), scene)) < 1.0
+    assert detect(replace(scene, electrons=(0.0, 0.0)).pair()) == PairDetection(None, None)
 
 
 @pytest.mark.parametrize("s", [BAYER, SRGB], ids=lambda s: s.name)
