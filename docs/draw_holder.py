@@ -28,7 +28,7 @@ def main() -> None:
     camera = replace(old, width_px=_WIDTH, height_px=_HEIGHT, **half, **middle)
     light = light_map(rig.at(0.0), room, _COARSE)
     parts = []
-    for holder in (None, *(fitted(kind, rig.mirror.radius_m) for kind in ("rods", "post", "tube"))):
+    for holder in (None, *(fitted(kind, rig.sphere.radius_m) for kind in ("rods", "post", "tube"))):
         view = replace(rig, camera=camera, holder=holder).at(0.3)
         planes = render_ambient(view, room, light, _COARSE, 2, 0).electrons_per_s
         left = (_WIDTH - _SQUARE) // 2

@@ -219,8 +219,31 @@ _LEAST_CURVATURE = 0.5  # times 1/R: convex with a margin, so that every point h
 _PLACES = 500  # where the curvature is looked at, 9 degrees apart: peaks of degree 3 are missed by 5 % at most
 
 
+class Metal:
+    """Reflectance of polished stainless steel: what mirrors of every shape share."""
+
+    roughness_alpha: float
+
+    def refractive_index(self, wavelength_nm: float) -> complex:
+        """Complex index n + i k of the steel, linear between the table's wavelengths (400 to 700 nm)."""
+        if not STEEL[0, 0] <= wavelength_nm <= STEEL[-1, 0]:
+            raise SceneError(f"wavelength_nm = {wavelength_nm}: the steel's table covers 400 to 700 nm")
+        n, k = (float(np.interp(wavelength_nm, STEEL[:, 0], STEEL[:, i])) for i in (1, 2))
+        return complex(n, k)
+
+    def reflectance(self, cos_incidence: Array, wavelength_nm: float) -> Array:
+        """Unpolarised Fresnel power reflectance, shape of `cos_incidence` (cosine of the angle of incidence)."""
+        m2 = self.refractive_index(wavelength_nm) ** 2
+        cos_i = np.asarray(cos_incidence, float)
+        with np.errstate(invalid="ignore"):  # NaN in, NaN out
+            root = np.sqrt(m2 - (1.0 - cos_i * cos_i))
+            r_s = (cos_i - root) / (cos_i + root)
+            r_p = (m2 * cos_i - root) / (m2 * cos_i + root)
+        return 0.5 * (np.abs(r_s) ** 2 + np.abs(r_p) ** 2)
+
+
 @dataclass(frozen=True)
-class SphereMirror:
+class SphereMirror(Metal):
     """A polished stainless-steel sphere.
 
     Parameters
@@ -251,22 +274,9 @@ class SphereMirror:
         """No point of the surface is farther from the centre than this; the radius of a perfect sphere."""
         return self.radius_m if self.form is None else self.radius_m + self.form.bound_m
 
-    def refractive_index(self, wavelength_nm: float) -> complex:
-        """Complex index n + i k of the steel, linear between the table's wavelengths (400 to 700 nm)."""
-        if not STEEL[0, 0] <= wavelength_nm <= STEEL[-1, 0]:
-            raise SceneError(f"wavelength_nm = {wavelength_nm}: the steel's table covers 400 to 700 nm")
-        n, k = (float(np.interp(wavelength_nm, STEEL[:, 0], STEEL[:, i])) for i in (1, 2))
-        return complex(n, k)
-
-    def reflectance(self, cos_incidence: Array, wavelength_nm: float) -> Array:
-        """Unpolarised Fresnel power reflectance, shape of `cos_incidence` (cosine of the angle of incidence)."""
-        m2 = self.refractive_index(wavelength_nm) ** 2
-        cos_i = np.asarray(cos_incidence, float)
-        with np.errstate(invalid="ignore"):  # NaN in, NaN out
-            root = np.sqrt(m2 - (1.0 - cos_i * cos_i))
-            r_s = (cos_i - root) / (cos_i + root)
-            r_p = (m2 * cos_i - root) / (m2 * cos_i + root)
-        return 0.5 * (np.abs(r_s) ** 2 + np.abs(r_p) ** 2)
+    def level(self, points_m: Array) -> Level:
+        """g of the module's docstring at points (..., 3) in the sphere's frame."""
+        return level(points_m, self.radius_m, self.form or Form())
 
 
 def _check_convex(radius_m: float, form: Form) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import IDENTITY, Matrix, Pose, Vector, as_matrix, as_vector, rotation_xyz
 from phibench.scenes.mirror import HARMONICS, Form, SphereMirror
+from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.validation import SceneError, within
 
 
@@ -202,13 +203,24 @@ class Misalignment:
         added = {name: getattr(nominal, name) + getattr(self, name) for name in _ADDED_TO_CAMERA}
         return replace(nominal, fx_px=nominal.fx_px * scale, fy_px=nominal.fy_px * scale, **added)
 
-    def mirror(self, nominal: SphereMirror) -> SphereMirror:
-        """True mirror; forms add up in the sphere's own frame."""
+    def mirror(self, nominal: SphereMirror | RevolvedMirror) -> SphereMirror | RevolvedMirror:
+        """True mirror; forms add up in the sphere's own frame, and a mirror of revolution has none."""
+        if isinstance(nominal, RevolvedMirror):
+            return self._revolved(nominal)
         form, old = Form(**{name: getattr(self, name) for name in HARMONICS}), nominal.form
         if old is not None:
             form = Form(*(a + b for a, b in zip(old.coefficients_m, form.coefficients_m, strict=True)))
         alpha = nominal.roughness_alpha + self.roughness_alpha
         return SphereMirror(nominal.radius_m + self.radius_m, alpha, form)
+
+    def _revolved(self, nominal: RevolvedMirror) -> RevolvedMirror:
+        """True mirror of revolution: `radius_m` is added to the vertex radius."""
+        if any(getattr(self, name) for name in HARMONICS):
+            raise SceneError(f"Misalignment: form errors are a sphere's; the mirror is a {nominal.profile.shape}")
+        profile = nominal.profile
+        if self.radius_m:
+            profile = replace(profile, vertex_radius_m=profile.vertex_radius_m + self.radius_m)
+        return RevolvedMirror(profile, nominal.roughness_alpha + self.roughness_alpha)
 
     def poses(self, T_world_camera: Pose, T_camera_sphere: Pose) -> tuple[Pose, Pose]:
         """True camera pose in the world and sphere pose in the camera, both down."""

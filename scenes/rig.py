@@ -21,6 +21,7 @@ from phibench.scenes.glass_tube import GlassTube
 from phibench.scenes.holder import Holder, holder_shapes, holder_tube
 from phibench.scenes.mirror import Form, SphereMirror, deviation, level
 from phibench.scenes.misalignment import Misalignment, Motion
+from phibench.scenes.revolved_mirror import RevolvedMirror, rim_points
 from phibench.scenes.shapes import Cuboid, Prism
 from phibench.scenes.validation import SceneError, finite, positive, unit_vector
 
@@ -70,6 +71,7 @@ def _surface(n: Array, radius_m: float, form: Form) -> Array:
     return (radius_m + deviation(n, form).value_m)[:, None] * n
 
 
+Mirror = SphereMirror | RevolvedMirror
 POSITIONS = ("down", "up")  # stroke positions 1 and 2 of the paper
 
 
@@ -108,7 +110,7 @@ class Rig:
     """
 
     camera: Camera = field(default_factory=Camera)
-    mirror: SphereMirror = field(default_factory=SphereMirror)
+    mirror: Mirror = field(default_factory=SphereMirror)
     T_world_camera: Pose = Pose("world", "camera", (0.0, 0.0, 0.45))
     T_camera_sphere: Pose = Pose("camera", "sphere", (0.0, 0.0, 0.26))
     stroke_axis_world: Vector = (0.0, 0.0, 1.0)
@@ -122,6 +124,9 @@ class Rig:
             pose = getattr(self, name)
             if (pose.target, pose.source) != frames:
                 raise SceneError(f"Rig.{name} joins frames {pose.target}, {pose.source}: must be {frames}")
+        if isinstance(self.mirror, RevolvedMirror):
+            self._check_revolved(self.mirror)
+            return
         distance, radius = math.hypot(*self.T_camera_sphere.translation_m), self.mirror.bound_m
         if self.T_camera_sphere.translation_m[2] <= radius or distance <= radius:
             raise SceneError(
@@ -130,6 +135,32 @@ class Rig:
             )
         if self.holder is not None:
             self.holder.check(radius, self.camera.aperture_radius_m)
+
+    def _check_revolved(self, mirror: RevolvedMirror) -> None:
+        """Raise `SceneError` if the lens is inside the mirror or behind its rim, or if something else carries it."""
+        lens = self.T_camera_sphere.inverse().t
+        if self.T_camera_sphere.translation_m[2] <= 0.0 or mirror.profile.holds(lens):
+            raise SceneError(
+                f"Rig.T_camera_sphere: the lens is inside the mirror, whose vertex is at "
+                f"{self.T_camera_sphere.translation_m[2]:.4f} m in front of it; put the vertex farther away"
+            )
+        if not lens[2] < mirror.profile.depth_m:
+            raise SceneError("Rig.T_camera_sphere: the lens is behind the mirror's rim; turn the mirror towards it")
+        if self.holder is not None:
+            raise SceneError(f"Rig.holder: a holder carries a sphere; a {mirror.profile.shape} needs none")
+
+    @property
+    def sphere(self) -> SphereMirror:
+        """The mirror, where it is a sphere.
+
+        Raises
+        ------
+        SceneError
+            If it is not: what asks holds for spheres alone.
+        """
+        if isinstance(self.mirror, RevolvedMirror):
+            raise SceneError(f"only spherical mirrors are computed here; the rig's is a {self.mirror.profile.shape}")
+        return self.mirror
 
     @property
     def sphere_in_camera_m(self) -> Array:
@@ -166,7 +197,8 @@ class Rig:
             return self
         T_world_camera, T_camera_sphere = misalignment.poses(self.T_world_camera, self.T_camera_sphere)
         mirror = misalignment.mirror(self.mirror)
-        if mirror.form is not None and self.mirror.form is None:
+        is_new = isinstance(mirror, SphereMirror) and mirror.form is not None and self.sphere.form is None
+        if is_new:
             T_camera_sphere = replace(T_camera_sphere, rotation=as_matrix(T_world_camera.R.T))
         return Rig(
             camera=misalignment.camera(self.camera),
@@ -180,6 +212,10 @@ class Rig:
 
     def outline_px(self, count: int = 720) -> Array:
         """Image of the mirror's outline (its occluding contour), shape (count, 2), pixels."""
+        if isinstance(self.mirror, RevolvedMirror):
+            turns = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+            rim_m = rim_points(self.mirror.profile, self.T_camera_sphere.inverse().t, turns)
+            return self.camera.project(self.T_camera_sphere.points(rim_m))
         s = self.sphere_in_camera_m
         distance = float(np.linalg.norm(s))
         axis = s / distance
@@ -187,11 +223,11 @@ class Rig:
         side /= np.linalg.norm(side)
         turn = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)[:, None]
         rim = np.cos(turn) * side + np.sin(turn) * np.cross(axis, side)
-        if self.mirror.form is not None:
+        if self.sphere.form is not None:
             turned = self.T_camera_sphere.R
-            limb = limb_points(-s @ turned, rim @ turned, self.mirror.radius_m, self.mirror.form)
+            limb = limb_points(-s @ turned, rim @ turned, self.sphere.radius_m, self.sphere.form)
             return self.camera.project(self.T_camera_sphere.points(limb))
-        sine = self.mirror.radius_m / distance
+        sine = self.sphere.radius_m / distance
         return self.camera.project(math.sqrt(1.0 - sine * sine) * axis + sine * rim)
 
     def in_image(self) -> bool:
@@ -227,7 +263,8 @@ class View:
     @cached_property
     def form_axes(self) -> Array:
         """Axes of the mirror's form as columns, world, shape (3, 3); where there is none, those that one would get."""
-        if self.rig.mirror.form is not None:
+        mirror = self.rig.mirror
+        if isinstance(mirror, RevolvedMirror) or mirror.form is not None:
             return self.T_world_sphere.R
         return np.eye(3) if self.motion is None else np.array(self.motion.rotation)
 
@@ -237,7 +274,7 @@ class View:
         rig = self.rig
         if rig.holder is None:
             return ()
-        return holder_shapes(rig.holder, self.T_world_camera, self.sphere_centre_m, rig.mirror.radius_m)
+        return holder_shapes(rig.holder, self.T_world_camera, self.sphere_centre_m, rig.sphere.radius_m)
 
     @cached_property
     def tube(self) -> GlassTube | None:

@@ -88,7 +88,7 @@ def idle_holder_keys(path: str, given: Iterable[str], kinds: Iterable[str]) -> l
 
 def _rig(table: RigTable) -> Rig:
     base = RIGS[table.preset]()
-    mirror = replace(base.mirror, **_given(table, ("radius_m", "roughness_alpha")))
+    mirror = replace(base.sphere, **_given(table, ("radius_m", "roughness_alpha")))
     z_c_m = base.sphere_in_camera_m[2] if table.z_c_m is None else table.z_c_m
     height_m = base.T_world_camera.t[2] if table.camera_height_m is None else table.camera_height_m
     T_world_camera = Pose("world", "camera", (0.0, 0.0, height_m), rotation_xyz(table.tilt_x_rad, table.tilt_y_rad))

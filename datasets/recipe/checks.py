@@ -390,7 +390,7 @@ def _height(table: RigTable, rig: Rig, room: Room) -> Fault | None:
     above_m = _top_m(rig, MIN_STROKE_M) - ceiling_m(room)
     if above_m < 0.0:
         return None
-    given = {key: getattr(table, key) for key in ("camera_height_m", "z_c_m")} | {"radius_m": rig.mirror.radius_m}
+    given = {key: getattr(table, key) for key in ("camera_height_m", "z_c_m")} | {"radius_m": rig.sphere.radius_m}
     key, value = next((key, value) for key, value in given.items() if value is not None)
     text = f"{value} puts the {rig.top_part}'s top through the ceiling at {ceiling_m(room):.2f} m when it is down"
     return Fault(f"rig.{key}", f"{text}; give less than {value - above_m:.3f}")

@@ -255,7 +255,7 @@ def preset_value(rig: Rig, key: str) -> float | tuple[float, ...] | None:
         **{name: getattr(rig.camera, name) for name in CAMERA_KEYS},
         "camera_height_m": camera_height_m,
         "z_c_m": z_c_m,
-        "radius_m": rig.mirror.radius_m,
+        "radius_m": rig.sphere.radius_m,
         "roughness_alpha": rig.mirror.roughness_alpha,
         **{name: 0.0 for name in RigTable.model_fields if "tilt" in name or "decentre" in name},
     }

@@ -281,7 +281,7 @@ def apparent_centre(nominal: Rig, true: Rig) -> Array:
     rays = nominal.camera.rays(uv)
     x = np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0]  # n / cos a0
     cosine = 1.0 / np.linalg.norm(x)  # of the limb's angle a0; |s| = R / sin a0
-    return np.asarray(x * cosine * nominal.mirror.radius_m / np.sqrt((1.0 - cosine) * (1.0 + cosine)))
+    return np.asarray(x * cosine * nominal.sphere.radius_m / np.sqrt((1.0 - cosine) * (1.0 + cosine)))
 
 
 def apparent_vertical(nominal: Rig, true: Rig) -> Array:

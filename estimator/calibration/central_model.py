@@ -82,7 +82,7 @@ def fit_central(rig: Rig, distance_m: float = 2.0, theta_deg: tuple[float, float
     outline_px = float(np.ptp(rig.outline_px(), axis=0).mean()) / 2.0
 
     def model(x: Array) -> CentralModel:
-        up = centre + np.array([0.0, 0.0, x[6] * rig.mirror.radius_m])
+        up = centre + np.array([0.0, 0.0, x[6] * rig.sphere.radius_m])
         return CentralModel(x[0], x[1] * outline_px, x[2], x[3], x[4], x[5], up)
 
     def residuals(x: Array) -> Array:

@@ -196,7 +196,7 @@ def _relative_focal(path: Path, nominal: Rig, values: Array, covariance: Array) 
 
 def _document(rig: Rig) -> dict[str, Any]:
     """Rig as JSON; the rotation of a perfect sphere means nothing, and version 1 left it out."""
-    if rig.mirror.form is None:
+    if rig.sphere.form is None:
         rig = replace(rig, T_camera_sphere=replace(rig.T_camera_sphere, rotation=IDENTITY))
     return dict(to_json(rig))
 

@@ -18,7 +18,7 @@ Estimator = Callable[[Rig, float, Array, Array], DepthEstimate]
 def paper_estimator(convention: str, rig: Rig, stroke_m: float, uv_down_px: Array, uv_up_px: Array) -> DepthEstimate:
     """Eq. (4) with phi in one convention."""
     phi1, phi2 = _phis(convention, rig, stroke_m, uv_down_px, uv_up_px)
-    return depth_paper(phi1, phi2, stroke_m, rig.mirror.radius_m)
+    return depth_paper(phi1, phi2, stroke_m, rig.sphere.radius_m)
 
 
 def approx_estimator(convention: str, rig: Rig, stroke_m: float, uv_down_px: Array, uv_up_px: Array) -> DepthEstimate:

@@ -20,10 +20,13 @@ from numpy.typing import ArrayLike
 from phibench.estimator.geometry.reflection import room_rays, room_rays_jacobian
 from phibench.estimator.geometry.status import Status, StatusArray, first_fault, flag, keep, stroke_status
 from phibench.scenes.frames import Array, BoolArray
+from phibench.scenes.revolved_mirror import Profile, RevolvedMirror
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.shapes import Cuboid
 
 _BISECTIONS = 4  # the error of the start falls by R / distance in each
+_HALVINGS = 40
+_UNEVEN = 0.999  # so that no middle is on the axis, where a cone has its tip
 _NEWTON_STEPS = 12
 _TOLERANCE_PX = 1e-10
 
@@ -54,11 +57,12 @@ def image_of(view: View, points_world_m: Array) -> MirrorImage:
     """
     X = np.asarray(points_world_m, float)
     with np.errstate(all="ignore"):
-        uv = _start(view, X)
+        uv = last = _start(view, X)
         for _ in range(_NEWTON_STEPS):
             step, _ = _newton(view, uv, X)
-            uv = uv + step
-            if not np.any(np.abs(step) > _TOLERANCE_PX):
+            beyond = ~np.isfinite(step).all(axis=-1, keepdims=True)  # of the rim: half the way back
+            uv, last = np.where(beyond, 0.5 * (uv + last), uv + step), np.where(beyond, last, uv)
+            if not np.any(np.abs(uv - last) > _TOLERANCE_PX):
                 break
         step, px_per_m = _newton(view, uv, X)
         found = np.all(np.abs(step) < 1e3 * _TOLERANCE_PX, axis=-1)
@@ -72,6 +76,8 @@ def image_of(view: View, points_world_m: Array) -> MirrorImage:
 
 def _start(view: View, X: Array) -> Array:
     """Pixel of the point of the sphere whose normal halves the angle between camera and point."""
+    if isinstance(view.rig.mirror, RevolvedMirror):
+        return _start_in_meridian(view, X, view.rig.mirror.profile)
     S, C, R = view.sphere_centre_m, view.camera_centre_m, view.rig.mirror.radius_m
     P = np.broadcast_to(S, X.shape)
     for _ in range(_BISECTIONS):
@@ -79,6 +85,30 @@ def _start(view: View, X: Array) -> Array:
         P = S + R * _unit(n)
     T = view.T_world_camera
     return view.rig.camera.project((P - T.t) @ T.R)
+
+
+def _start_in_meridian(view: View, X: Array, profile: Profile) -> Array:
+    """Pixel of the point of the profile, in the meridian of X, from where the reflected ray goes to X.
+
+    The camera is moved into the meridian; on the axis it lies in all of them. From the axis to the rim the ray turns
+    from straight down outwards, and passes X once: bisection finds where.
+    """
+    pose = view.T_world_sphere.inverse()
+    point, eye = pose.points(X), pose.points(view.camera_centre_m)
+    away = np.linalg.norm(point[..., :2], axis=-1)
+    across = np.where(away[..., None] > 0.0, point[..., :2] / away[..., None], [1.0, 0.0])
+    aside = across @ eye[:2]
+    high = np.full(away.shape, profile.rim_radius_m)
+    low = -_UNEVEN * high
+    for _ in range(_HALVINGS):
+        r = 0.5 * (low + high)
+        sag = profile.sag(r * r)
+        normal = np.arctan2(2.0 * r * sag.slope_per_m, 1.0)  # angles from straight down, outwards
+        ray = 2.0 * normal - np.arctan2(aside - r, sag.z_m - eye[2])
+        before = ray < np.arctan2(away - r, sag.z_m - point[..., 2])
+        low, high = np.where(before, r, low), np.where(before, high, r)
+    P = np.concatenate([r[..., None] * across, profile.sag(r * r).z_m[..., None]], axis=-1)
+    return view.rig.camera.project(view.rig.T_camera_sphere.points(P))
 
 
 def _newton(view: View, uv: Array, X: Array) -> tuple[Array, Array]:

@@ -116,7 +116,7 @@ def pixels_by_model(view: View, grid: Grid, distance_m: float = FAR_M) -> Array:
     distance_m : float
         Of the scene from the sphere centre.
     """
-    if not distance_m > view.rig.mirror.radius_m:
+    if not distance_m > view.rig.sphere.radius_m:
         raise DatasetError(f"distance of the scene = {distance_m:g} m: must be above the mirror's radius")
     points = (view.sphere_centre_m + distance_m * grid.directions()).reshape(-1, 3)
     parts = [image_of(view, points[i : i + _AT_ONCE]).uv_px for i in range(0, len(points), _AT_ONCE)]
@@ -299,7 +299,7 @@ def ray_directions(sample: Sample, position: str) -> Array:
     angle, turn = truth["phi_normal_rad"], truth["azimuth_rad"]
     n = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), -np.cos(angle)], axis=-1)
     X = np.stack([truth[name] for name in ("x_m", "y_m", "z_m")], axis=-1)
-    away = X - (np.array(row.sphere_centre_world_m) + sample.rig.mirror.radius_m * n)
+    away = X - (np.array(row.sphere_centre_world_m) + sample.rig.sphere.radius_m * n)
     return np.asarray(away / np.linalg.norm(away, axis=-1, keepdims=True))
 
 

@@ -1,4 +1,4 @@
-"""Camera rays reflected at the mirror: in closed form for a sphere, by Newton's method for one with a form error.
+"""Camera rays reflected at the mirror: in closed form for a sphere, by Newton's method for other surfaces.
 
 Estimators assume a perfect sphere. The form error serves the true rig, whose errors `sensitivities` predicts.
 
@@ -19,8 +19,9 @@ from phibench.estimator.geometry.status import Status, StatusArray, flag, keep
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
 from phibench.scenes.glass_tube import GlassTube
-from phibench.scenes.mirror import Form, Level, level
-from phibench.scenes.rig import View
+from phibench.scenes.mirror import Form, Level, SphereMirror, level
+from phibench.scenes.revolved_mirror import Profile, RevolvedMirror
+from phibench.scenes.rig import Mirror, View
 
 # cos i = 1e-3 is 2e-4 px inside the outline of the default rig; the error of theta per pixel grows as 1 / cos i.
 GRAZING_COSINE = 1e-3
@@ -110,7 +111,7 @@ def reflect_jacobian(view: View, uv_px: Array) -> ReflectionJacobian:
         status = _status(hit)
         d, P, n, cos_i, t = (x[..., None] for x in (hit.d, hit.P, hit.n, hit.cos_i, hit.t))
         dd = ray_jacobian(view.rig.camera, uv_px)
-        outward = P if view.rig.mirror.form is None else n  # of any length
+        outward = P if _is_round(view.rig.mirror) else n  # of any length
         dt = -t * _dot(outward, dd) / _dot(outward, d)  # P stays on the mirror: n . dP = 0
         dP = t * dd + d * dt
         dn = _normal_change(view, hit.P, dP)
@@ -125,16 +126,23 @@ def reflect_jacobian(view: View, uv_px: Array) -> ReflectionJacobian:
 def _normal_change(view: View, P: Array, dP: Array) -> Array:
     """Change of the unit normal, camera frame, when P, shape (..., 3), moves on the mirror by dP, shape (..., 3, k)."""
     mirror = view.rig.mirror
-    if mirror.form is None:
+    if isinstance(mirror, SphereMirror) and mirror.form is None:
         return dP / mirror.radius_m
     turned = view.rig.T_camera_sphere.R
-    return turned @ normal_slope(level(P @ turned, mirror.radius_m, mirror.form)) @ turned.T @ dP
+    return turned @ normal_slope(mirror.level(P @ turned)) @ turned.T @ dP
+
+
+def _is_round(mirror: Mirror) -> bool:
+    return isinstance(mirror, SphereMirror) and mirror.form is None
 
 
 def _first_hit(view: View, uv_px: Array) -> _Hit:
-    if view.rig.mirror.form is not None:
-        return _first_hit_of_form(view, uv_px, view.rig.mirror.form)
-    s, radius = view.rig.sphere_in_camera_m, view.rig.mirror.radius_m
+    mirror = view.rig.mirror
+    if isinstance(mirror, RevolvedMirror):
+        return _first_hit_of_profile(view, uv_px, mirror.profile)
+    if mirror.form is not None:
+        return _first_hit_of_form(view, uv_px, mirror.form)
+    s, radius = view.rig.sphere_in_camera_m, mirror.radius_m
     d = view.rig.camera.rays(uv_px)
     b = np.sum(d * s, axis=-1, keepdims=True)
     miss2 = np.sum(np.cross(d, s) ** 2, axis=-1, keepdims=True)  # squared distance of the ray from the sphere centre
@@ -147,11 +155,23 @@ def _first_hit(view: View, uv_px: Array) -> _Hit:
 
 
 def _first_hit_of_form(view: View, uv_px: Array, form: Form) -> _Hit:
-    turned, radius = view.rig.T_camera_sphere.R, view.rig.mirror.radius_m
+    turned, radius = view.rig.T_camera_sphere.R, view.rig.sphere.radius_m
     d = view.rig.camera.rays(uv_px)
-    t = first_meeting(-view.rig.sphere_in_camera_m @ turned, d @ turned, radius, form)[..., None]
+    t = first_meeting(-view.rig.sphere_in_camera_m @ turned, d @ turned, radius, form)
+    return _hit_at(view, d, t)
+
+
+def _first_hit_of_profile(view: View, uv_px: Array, profile: Profile) -> _Hit:
+    turned = view.rig.T_camera_sphere.R
+    d = view.rig.camera.rays(uv_px)
+    return _hit_at(view, d, profile_meeting(-view.rig.sphere_in_camera_m @ turned, d @ turned, profile))
+
+
+def _hit_at(view: View, d: Array, distance: Array) -> _Hit:
+    """Hit after distances (...) along rays (..., 3) in the camera frame."""
+    turned, t = view.rig.T_camera_sphere.R, distance[..., None]
     P = t * d - view.rig.sphere_in_camera_m
-    n = unit_normal(level(P @ turned, radius, form)) @ turned.T
+    n = unit_normal(view.rig.mirror.level(P @ turned)) @ turned.T
     cos_i = -np.sum(d * n, axis=-1, keepdims=True)
     sin_i = np.linalg.norm(np.cross(d, n), axis=-1, keepdims=True)
     return _Hit(d, t, P, n, cos_i, sin_i)
@@ -254,6 +274,32 @@ def _through_glass(tube: GlassTube, ray: Reflection, J: ReflectionJacobian | Non
         behind = np.sqrt(1.0 - _dot(along, along))
         d, dd = along + behind * n, dalong - _dot(along, dalong) / behind * n + behind * dn
     return X[..., 0] + tube.origin_m, d[..., 0], dX, dd
+
+
+# -- hit on a mirror of revolution -------------------------------------------------------------------------------------
+
+_CONVEX_STEPS = 60  # 6 to 9 do; each step of a ray that grazes halves what is left
+
+
+def profile_meeting(origin_m: Array, directions: Array, profile: Profile) -> Array:
+    """Distance to the mirror along unit directions (..., 3) from one point (3,), shape (...), mirror's frame.
+
+    NaN where the mirror is missed. The depth of the profile over the ray, sag(x^2 + y^2) - z, is a convex function of
+    the distance t, because the profile is convex. It is above 0 at a lens outside. Newton's method on a convex function
+    comes to its first zero from one side, without a bracket: it cannot pass it.
+    """
+    t = np.zeros(directions.shape[:-1])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        for _ in range(_CONVEX_STEPS):
+            x, y, z = np.moveaxis(origin_m + t[..., None] * directions, -1, 0)
+            s = x * x + y * y
+            sag = profile.sag(s)
+            rise = np.where(s > 0.0, 2.0 * sag.slope_per_m * (x * directions[..., 0] + y * directions[..., 1]), 0.0)
+            step = (z - sag.z_m) / (rise - directions[..., 2])
+            t = np.where(step >= -_CLOSE_M, t + step, np.nan)  # back means that there is no zero ahead
+            if not np.any(np.abs(step) > _CLOSE_M):
+                break
+        return np.where((np.abs(step) <= _CLOSE_M) & (s <= profile.rim_radius_m**2), t, np.nan)
 
 
 # -- hit on a mirror with a form error ---------------------------------------------------------------------------------

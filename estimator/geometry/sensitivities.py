@@ -22,8 +22,9 @@ from phibench.estimator.geometry.reflection import ray_basis, ray_slope, reflect
 from phibench.estimator.geometry.triangulate import exact_gradient
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
-from phibench.scenes.mirror import HARMONICS, Form, Level, gradients_by_parameter, level
+from phibench.scenes.mirror import HARMONICS, Level, gradients_by_parameter
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
+from phibench.scenes.revolved_mirror import RevolvedMirror, by_vertex_radius
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
 
 PARAMETERS = tuple(name for name in MISALIGNMENT if name not in ("focus_distance_m", "roughness_alpha"))
@@ -128,9 +129,13 @@ def _ray_changes(view: View, uv_px: Array) -> tuple[Array, Array]:
 def _surface_changes(view: View, P: Array) -> tuple[Level, Array, Array]:
     """Level function g of the mirror, world axes about its centre, at P, shape (3,), and dg/dp, d(grad g)/dp at P."""
     axes, mirror = view.form_axes, view.rig.mirror
-    at = level(P @ axes, mirror.radius_m, mirror.form or Form())
+    at = mirror.level(P @ axes)
     world = Level(at.value_m, axes @ at.gradient, axes @ at.hessian_per_m @ axes.T)
     g1, gradient1 = np.zeros(len(PARAMETERS)), np.zeros((len(PARAMETERS), 3))
+    if isinstance(mirror, RevolvedMirror):
+        value, gradient = by_vertex_radius(mirror.profile, P @ axes)
+        g1[PARAMETERS.index("radius_m")], gradient1[PARAMETERS.index("radius_m")] = value, axes @ gradient
+        return world, g1, gradient1
     values, gradients = gradients_by_parameter(P @ axes)
     rows = [PARAMETERS.index(name) for name in HARMONICS]
     g1[rows], gradient1[rows] = -values, -gradients @ axes.T
@@ -199,7 +204,7 @@ def _paper_pixel_gradient(convention: str, of_radius: float, rig: Rig, h: float,
     phi1, phi2 = (CONVENTIONS[convention](view, uv) for view, uv in zip(views, pixels, strict=True))
     with np.errstate(all="ignore"):
         slopes = [GRADIENTS[convention](view, uv) for view, uv in zip(views, pixels, strict=True)]
-    by_phi = paper_gradient(phi1, phi2, h, of_radius * rig.mirror.radius_m)
+    by_phi = paper_gradient(phi1, phi2, h, of_radius * rig.sphere.radius_m)
     return np.concatenate([by_phi[i] * slopes[i] for i in range(2)])
 
 

@@ -173,7 +173,7 @@ def causes(
 def _fault(rig: Rig, points_m: Array, uv_px: Array, offset_m: float, around: Surroundings) -> str:
     """Cause that the rig at one offset does not see all of the points, which it has at pixels (m, 2)."""
     view = rig.at(offset_m)
-    if view.sphere_centre_m[2] + rig.mirror.radius_m > around.room_height_m:
+    if view.sphere_centre_m[2] + rig.sphere.radius_m > around.room_height_m:
         return CEILING
     if not np.isfinite(uv_px).all():
         return NO_IMAGE
@@ -219,7 +219,7 @@ def _outline_distance_px(rig: Rig, uv_px: Array) -> Array:
     """Distance of pixels, shape (m, 2), from the mirror's outline, inwards: angle times focal length."""
     centre = rig.sphere_in_camera_m
     away = np.arccos(np.clip(rig.camera.rays(uv_px) @ centre / np.linalg.norm(centre), -1.0, 1.0))
-    rim = math.asin(rig.mirror.radius_m / float(np.linalg.norm(centre)))
+    rim = math.asin(rig.sphere.radius_m / float(np.linalg.norm(centre)))
     return np.asarray((rim - away) * rig.camera.fx_px)
 
 

@@ -256,10 +256,10 @@ def limb_of(rig: Rig, s: Array, blur_px2: float) -> Limb:
         Variance of the lens's blur, besides defocus and pixel.
     """
     camera, distance = rig.camera, float(np.linalg.norm(s))
-    a0 = limb_angle_rad(s, rig.mirror.radius_m)
+    a0 = limb_angle_rad(s, rig.sphere.radius_m)
     scale = np.sqrt(camera.fx_px * camera.fy_px) / np.cos(a0) ** 2  # pixels per radian across the limb
     d = np.arange(-_REACH_PX, _REACH_PX + _STEP_PX / 2.0, _STEP_PX)
-    miss = distance / rig.mirror.radius_m * np.sin(a0 + d / scale)  # sine of the angle of incidence
+    miss = distance / rig.sphere.radius_m * np.sin(a0 + d / scale)  # sine of the angle of incidence
     cos_i = np.sqrt(np.clip(1.0 - miss * miss, 0.0, None))
     kernel = _kernel(camera, limb_depth_m=distance * np.cos(a0) ** 2, blur_px2=blur_px2)
     light, turned, squared = [], [], []

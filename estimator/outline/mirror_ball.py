@@ -204,7 +204,7 @@ def unwrap(light: NDArray[np.float32], ball: Ball, surroundings_m: float, width_
     DatasetError
         If a number is out of range.
     """
-    if not surroundings_m > 1.5 * ball.view.rig.mirror.radius_m:
+    if not surroundings_m > 1.5 * ball.view.rig.sphere.radius_m:
         raise DatasetError(f"--surroundings-m {surroundings_m:g}: must be above 1.5 radii of the ball")
     native = math.pi * ball.circle_px[2]
     width = min(READABLE_COLUMNS, max(32, 2 * round(native / 2.0))) if width_px is None else width_px
@@ -249,7 +249,7 @@ class _Angles:
         uv = image_of(view, view.T_world_camera.points(points)).uv_px
         ray = view.rig.camera.rays(uv)
         image = np.arctan2(ray @ across, ray @ self.axis)
-        limb = math.asin(view.rig.mirror.radius_m / float(np.linalg.norm(s)))
+        limb = math.asin(view.rig.sphere.radius_m / float(np.linalg.norm(s)))
         most = limb * (1.0 - _RIM[0] - _RIM[1] / radius_px)
         kept = np.isfinite(image) & (np.nan_to_num(image, nan=np.inf) <= most)
         kept &= np.cumsum(~kept) == 0  # what follows the first that is lost is behind the ball

@@ -221,7 +221,7 @@ def _at_edge(limb: BallCircle, edge: BallCircle) -> bool:
 
 
 def _sphere(rig: Rig, circle: BallCircle) -> Array:
-    return sphere_from_rays(rig.camera.rays(circle.points_px), rig.mirror.radius_m)
+    return sphere_from_rays(rig.camera.rays(circle.points_px), rig.sphere.radius_m)
 
 
 def _as_far(rig: Rig, s: Array) -> bool:
@@ -251,7 +251,7 @@ def _by_pixels(rig: Rig, s: Array) -> Array:
 
     |s| = R / sin a0: d |s| / |s| = -d a0 / tan a0 = -cos^2 a0 d r / r. Near the axis, where the outline is a circle.
     """
-    camera, a0 = rig.camera, limb_angle_rad(s, rig.mirror.radius_m)
+    camera, a0 = rig.camera, limb_angle_rad(s, rig.sphere.radius_m)
     r = math.sqrt(camera.fx_px * camera.fy_px) * math.tan(a0)
     across = np.diag([s[2] / camera.fx_px, s[2] / camera.fy_px, 0.0])[:, :2]
     return np.column_stack([across, -s * math.cos(a0) ** 2 / r])
@@ -314,7 +314,7 @@ def visible_arc(rig: Rig, s: Array, margin_px: float = 0.0) -> float:
 def _approach(planes: tuple[Plane, ...], rig: Rig, s: Array, blur: float) -> Array:
     """Come near with a wide band, whose pixels are chosen anew at every step."""
     for _ in range(_COARSE_STEPS):
-        pixels = band(planes, rig.camera, s, rig.mirror.radius_m, _COARSE_HALF_PX)
+        pixels = band(planes, rig.camera, s, rig.sphere.radius_m, _COARSE_HALF_PX)
         step = step_from(pixels, planes, rig, s, blur, SECTORS // 2, _COARSE_HALF_PX)
         s = _moved(s, step.move[:3], rig)
         if np.all(np.abs(step.move[:3]) < _NEAR_M):
@@ -332,7 +332,7 @@ def _settle(
 ) -> Outline:
     for count in range(1, _STEPS + 1):
         if count <= _CHOOSE:  # later the pixels stay, so that the steps come to rest
-            pixels = band(planes, rig.camera, s, rig.mirror.radius_m, half_px)
+            pixels = band(planes, rig.camera, s, rig.sphere.radius_m, half_px)
         step = step_from(pixels, planes, rig, s, blur, SECTORS, half_px, again is not None, near=True)
         # weights that are cut off can take turns for ever: shorter steps end between them
         move = step.move * min(1.0, 6.0 / count)
@@ -386,7 +386,7 @@ def without_jpeg(pixels: OutlinePixels, step: Step, frame: NDArray[Any], card: S
 def _moved(s: Array, move: Array, rig: Rig) -> Array:
     """Take a step of at most 3 mm; a centre that runs away is no mirror's."""
     s = s + move * min(1.0, 3e-3 / max(float(np.abs(move).max()), 1e-12))
-    if not (np.isfinite(s).all() and s[2] > 1.02 * rig.mirror.radius_m):
+    if not (np.isfinite(s).all() and s[2] > 1.02 * rig.sphere.radius_m):
         raise ImageError("an image without a mirror: no outline of a sphere fits the light")
     return s
 

@@ -74,7 +74,7 @@ def _ring(camera: Camera, s: Array, radius_m: float, half_px: float) -> tuple[ND
     mark = Rig(camera=camera)
     uv = replace(
         mark,
-        mirror=replace(mark.mirror, radius_m=radius_m),
+        mirror=replace(mark.sphere, radius_m=radius_m),
         T_camera_sphere=replace(mark.T_camera_sphere, translation_m=as_vector(s)),
     ).outline_px(_OUTLINE_POINTS)
     low = np.clip(np.floor(uv.min(axis=0) - half_px).astype(int), 0, None)
@@ -264,7 +264,7 @@ def step_from(
     ImageError
         If there is no light across the outline.
     """
-    place, limb = place_of(pixels, s, rig.mirror.radius_m), limb_of(rig, s, blur_px2)
+    place, limb = place_of(pixels, s, rig.sphere.radius_m), limb_of(rig, s, blur_px2)
     light, slope, curvature, turned, squared = through_taps(pixels, planes, limb, place)
     where = Sectors.of(pixels.plane, place.turn_rad, sectors)
     d = place.d_px / half_px

@@ -58,7 +58,7 @@ def rough_outlines(picture: Array, rig: Rig) -> Iterator[tuple[Array, BallCircle
     for radii, count in ((near, _FEW), ((low, high), _CANDIDATES)):
         for circle in circles(picture, radii, count):
             found += 1
-            yield sphere_from_rays(rig.camera.rays(circle.points_px), rig.mirror.radius_m), circle
+            yield sphere_from_rays(rig.camera.rays(circle.points_px), rig.sphere.radius_m), circle
     if not found:
         raise ImageError(
             "an image without a mirror: no circle of the outline's size has edges all around; check the picture"

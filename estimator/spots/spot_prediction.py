@@ -71,7 +71,7 @@ def _defocus_px2(view: View, uv_px: Array, point_m: Array | None) -> Array:
     hit = reflect(view, uv_px)
     cosine = np.cos(float(hit.incidence_rad))
     vergence = 0.0 if point_m is None else 1.0 / float(np.linalg.norm(point_m - hit.origin_world_m))
-    behind = 1.0 / (vergence + 2.0 / rig.mirror.radius_m * np.array([1.0 / cosine, cosine]))
+    behind = 1.0 / (vergence + 2.0 / rig.sphere.radius_m * np.array([1.0 / cosine, cosine]))
     ahead_m = into_camera.points(hit.origin_world_m)[2] + behind * camera.rays(uv_px)[2]
     disc = camera.fx_px * camera.aperture_radius_m * (1.0 / ahead_m - 1.0 / camera.focus_distance_m)
     away = uv_px - camera.project(into_camera.points(view.sphere_centre_m))

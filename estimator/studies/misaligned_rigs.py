@@ -174,7 +174,7 @@ def errors_of_many(nominal: Rig, drawn: Sequence[Misalignment], places: Places, 
         If a mirror has an error of form.
     """
     undistorted = [nominal.perturbed(replace(m, **dict.fromkeys(_BROWN, 0.0))) for m in drawn]
-    if any(rig.mirror.form is not None for rig in undistorted):
+    if any(rig.sphere.form is not None for rig in undistorted):
         raise ValueError("errors_of_many: a mirror has an error of form; spheres only")
     down = _views([rig.at(0.0) for rig in undistorted], drawn)
     up = _views([rig.at(m.stroke_m(places.stroke_m)) for rig, m in zip(undistorted, drawn, strict=True)], drawn)
@@ -193,7 +193,7 @@ def _views(views: Sequence[View], drawn: Sequence[Misalignment]) -> _Views:
         np.array([view.camera_centre_m for view in views]),
         np.array([view.sphere_centre_m for view in views]),
         np.array([view.T_world_camera.R for view in views]),
-        np.array([view.rig.mirror.radius_m for view in views]),
+        np.array([view.rig.sphere.radius_m for view in views]),
         np.concatenate([lens, brown], axis=1),
     )
 

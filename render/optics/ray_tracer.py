@@ -20,6 +20,7 @@ import numpy as np
 from phibench.scenes.frames import Array
 from phibench.scenes.glass_tube import GlassTube
 from phibench.scenes.mirror import Form
+from phibench.scenes.revolved_mirror import Profile, RevolvedMirror
 from phibench.scenes.rig import View
 
 Radius = Callable[[Array], Array]
@@ -76,6 +77,8 @@ def lens_rays(view: View, uv_px: Array, lens_m: Array | None = None) -> tuple[Ar
 
 def reflect(view: View, origins_m: Array, directions: Array) -> MirrorRays:
     """Intersect world rays, shape (N, 3), with the mirror and reflect them."""
+    if isinstance(view.rig.mirror, RevolvedMirror):
+        return _reflect_at_profile(view, origins_m, directions, view.rig.mirror.profile)
     if view.rig.mirror.form is not None:
         return _reflect_at_form(view, origins_m, directions)
     radius, centre, d = view.rig.mirror.radius_m, view.sphere_centre_m[:, None], directions.T
@@ -99,9 +102,15 @@ def _inner(a: Array, b: Array) -> Array:
 
 
 def _reflect_at_form(view: View, origins_m: Array, directions: Array) -> MirrorRays:
-    axes, centre, mirror = view.T_world_sphere.R, view.sphere_centre_m, view.rig.mirror
+    axes, centre, mirror = view.T_world_sphere.R, view.sphere_centre_m, view.rig.sphere
     assert mirror.form is not None
     points, normals, t = meet((origins_m - centre) @ axes, directions @ axes, mirror.radius_m, mirror.form)
+    return _reflected(view, points, normals, t, directions)
+
+
+def _reflected(view: View, points: Array, normals: Array, t: Array, directions: Array) -> MirrorRays:
+    """Rays from points and normals in the mirror's frame; what lies behind their start is no hit."""
+    axes, centre = view.T_world_sphere.R, view.sphere_centre_m
     behind = ~(t > 0.0)
     points, normals, t = (np.where(behind.reshape(-1, *[1] * (v.ndim - 1)), np.nan, v) for v in (points, normals, t))
     normals = normals @ axes.T
@@ -233,6 +242,78 @@ def _slope(added: Radius, n: Array, e: Array) -> Array:
 def _difference(added: Radius, n: Array, e: Array, angle: float) -> Array:
     c, s = math.cos(angle), math.sin(angle)
     return added(c * n + s * e) - added(c * n - s * e)
+
+
+# Mirror of revolution.
+
+
+_REGULA_STEPS = 60  # 6 to 10 do
+_REST_M = 1e-16  # less than a rounding of a lens's distance
+
+
+def _reflect_at_profile(view: View, origins_m: Array, directions: Array, profile: Profile) -> MirrorRays:
+    axes, centre = view.T_world_sphere.R, view.sphere_centre_m
+    points, normals, t = meet_profile((origins_m - centre) @ axes, directions @ axes, profile)
+    return _reflected(view, points, normals, t, directions)
+
+
+def meet_profile(origins_m: Array, directions: Array, profile: Profile) -> tuple[Array, Array, Array]:
+    """First points of a mirror of revolution on rays from outside, in its frame; as `meet`.
+
+    A quadric gives a quadratic in the distance, counted from the ray's place that is nearest to the vertex. A
+    polynomial is added to the quadric by the secant method, which needs the sag alone; the normal is that of the sag's
+    slope. Only the sheet before the rim counts: it is met first, because the body behind it is convex.
+    """
+    approach = -_dot(origins_m, directions)
+    foot, A, R = origins_m + approach[:, None] * directions, 1.0 + profile.conic, profile.vertex_radius_m
+    flat_f, flat_d = foot[:, :2], directions[:, :2]
+    a = _dot(flat_d, flat_d) + A * directions[:, 2] ** 2
+    b = _dot(flat_f, flat_d) + (A * foot[:, 2] - R) * directions[:, 2]
+    c = _dot(flat_f, flat_f) + (A * foot[:, 2] - 2.0 * R) * foot[:, 2]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        q = -(b + np.where(b < 0.0, -1.0, 1.0) * np.sqrt(b * b - a * c))
+        x = _nearest_on_sheet(foot, directions, np.stack([q / a, c / q]), -approach, profile)
+        if not profile.is_quadric:
+            x = _secant_to_sag(foot, directions, x, profile)
+        points = foot + x[:, None] * directions
+        s = points[:, 0] ** 2 + points[:, 1] ** 2
+        slope = 2.0 * profile.sag(s).slope_per_m
+        normals = np.stack([slope * points[:, 0], slope * points[:, 1], np.full(len(points), -1.0)], axis=-1)
+        normals /= np.sqrt(1.0 + slope**2 * s)[:, None]
+        hit = (s <= profile.rim_radius_m**2) & (_dot(normals, directions) < 0.0)
+    return (
+        np.where(hit[:, None], points, np.nan),
+        np.where(hit[:, None], normals, np.nan),
+        np.where(hit, approach + x, np.nan),
+    )
+
+
+def _nearest_on_sheet(foot: Array, d: Array, roots: Array, start: Array, profile: Profile) -> Array:
+    """First of two roots, shape (2, N), that lies after the start and on the sheet of the vertex; NaN without one."""
+    z = foot[:, 2] + roots * d[:, 2]
+    A, R = 1.0 + profile.conic, profile.vertex_radius_m
+    on_sheet = (R - A * z >= 0.0) & (z >= -1e-12) & (roots > start)  # the half before the equator, or one sheet of two
+    best = np.min(np.where(on_sheet, roots, np.inf), axis=0)
+    return np.where(np.isfinite(best), best, np.nan)
+
+
+def _secant_to_sag(foot: Array, d: Array, x: Array, profile: Profile) -> Array:
+    """Places x where rays meet the sag, from those where they meet its quadric part."""
+
+    def excess(x: Array) -> Array:
+        P = foot + x[:, None] * d
+        return np.asarray(profile.sag(P[:, 0] ** 2 + P[:, 1] ** 2).z_m - P[:, 2])
+
+    old, new = x, x - 1e-4 * profile.rim_radius_m
+    f_old, f_new = excess(old), excess(new)
+    for _ in range(_REGULA_STEPS):
+        step = f_new * (new - old) / (f_new - f_old)
+        step = np.where(np.isfinite(step) | np.isnan(new), step, 0.0)
+        old, f_old, new = new, f_new, new - step
+        f_new = excess(new)
+        if not np.any(np.abs(step) > _REST_M):
+            break
+    return new
 
 
 # Glass around the mirror.

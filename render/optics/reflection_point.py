@@ -23,6 +23,8 @@ mirror on the other, so that there is at most one such point. With a the source,
 of the reflected bundle from steradians to square metres at b: Coddington's (1 + m / s_t) (1 + m / s_s) l^2 for any
 curvature matrix.
 
+**Mirror of revolution.** `revolved_reflection` finds the point; M is the same.
+
 **Glass tube around the mirror.** A point outside appears at another place to rays from inside, which depends on the
 ray (`scenes.glass_tube`): the reflection point of that place gives the ray, and the ray the place. Rounds of the two
 settle, because a few millimetres of glass move little. The bundle that spreads from the place to the eye is that of
@@ -37,10 +39,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from phibench.render.optics.revolved_reflection import revolved_points
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.glass_tube import GlassTube, across
-from phibench.scenes.mirror import Form, deviation, level
-from phibench.scenes.rig import View
+from phibench.scenes.mirror import Form, Level, SphereMirror, deviation, level
+from phibench.scenes.revolved_mirror import RevolvedMirror
+from phibench.scenes.rig import Mirror, View
 
 
 @dataclass(frozen=True)
@@ -94,11 +98,15 @@ def mirror_points(view: View, points_m: Array, eyes_m: Array) -> MirrorPoints:
 def _straight(view: View, points_m: Array, eyes_m: Array) -> MirrorPoints:
     """Reflection points without glass."""
     centre, mirror = view.sphere_centre_m, view.rig.mirror
+    axes = view.T_world_sphere.R
+    if isinstance(mirror, RevolvedMirror):
+        ends = ((points_m - centre) @ axes, (eyes_m - centre) @ axes)
+        found, normals, lit = revolved_points(*ends, mirror.profile)
+        return MirrorPoints(found @ axes.T + centre, normals @ axes.T, lit, points_m)
     if mirror.form is None:
         found, lit = reflection_points(points_m - centre, eyes_m - centre, mirror.radius_m)
         found = found + centre
         return MirrorPoints(found, (found - centre) / mirror.radius_m, lit, points_m)
-    axes = view.T_world_sphere.R
     ends = ((points_m - centre) @ axes, (eyes_m - centre) @ axes)
     found, normals, lit = fermat_points(*ends, mirror.radius_m, mirror.form)
     return MirrorPoints(found @ axes.T + centre, normals @ axes.T, lit, points_m)
@@ -157,12 +165,12 @@ def _spread(view: View, mirror_m: Array, points_m: Array, eyes_m: Array, cos_i: 
     """
     mirror = view.rig.mirror
     s, far = (np.linalg.norm(end - mirror_m, axis=-1) for end in (points_m, eyes_m))
-    if mirror.form is None:
+    if isinstance(mirror, SphereMirror) and mirror.form is None:
         spread = s**2 * (1.0 + far * (1.0 / s + 2.0 / (mirror.radius_m * cos_i)))
         return spread * (1.0 + far * (1.0 / s + 2.0 * cos_i / mirror.radius_m))
     axes, centre = view.T_world_sphere.R, view.sphere_centre_m
     P, a, b = ((place - centre) @ axes for place in (mirror_m, points_m, eyes_m))
-    return (s * far / cos_i) ** 2 * path_determinant(P, a, b, mirror.radius_m, mirror.form)
+    return (s * far / cos_i) ** 2 * path_determinant(P, a, b, mirror)
 
 
 # Glass around the mirror.
@@ -178,7 +186,7 @@ def _stretch(view: View, tube: GlassTube, found: MirrorPoints, eyes_m: Array) ->
     axes, centre, mirror = view.T_world_sphere.R, view.sphere_centre_m, view.rig.mirror
     P, a, b = ((place - centre) @ axes for place in (found.points_m, found.apparent_m, eyes_m))
     with np.errstate(divide="ignore", invalid="ignore"):
-        tangents, _, M = _path(P, a, b, mirror.radius_m, mirror.form or Form())
+        tangents, _, M = _path(P, a, b, mirror.level(P))
         tangents = tangents @ axes.T
         length, ray = _split(found.apparent_m - found.points_m)
         inverse = np.stack([M[:, 1, 1], -M[:, 0, 1], -M[:, 0, 1], M[:, 0, 0]], axis=-1).reshape(-1, 2, 2)
@@ -312,15 +320,15 @@ def fermat_points(
     return reflection, normals, valid
 
 
-def path_determinant(mirror_m: Array, points_m: Array, eyes_m: Array, radius_m: float, form: Form) -> Array:
-    """det(M), shape (N,), 1/m^2, at reflection points, all in the sphere's frame."""
-    _, _, M = _path(mirror_m, points_m, eyes_m, radius_m, form)
+def path_determinant(mirror_m: Array, points_m: Array, eyes_m: Array, mirror: Mirror) -> Array:
+    """det(M), shape (N,), 1/m^2, at reflection points, all in the mirror's frame."""
+    _, _, M = _path(mirror_m, points_m, eyes_m, mirror.level(mirror_m))
     return M[:, 0, 0] * M[:, 1, 1] - M[:, 0, 1] ** 2
 
 
 def _newton(P: Array, a: Array, b: Array, radius_m: float, form: Form) -> Array:
     """Step in the tangent plane, shape (N, 3), no longer than `_LONGEST` radii."""
-    tangents, slope, M = _path(P, a, b, radius_m, form)
+    tangents, slope, M = _path(P, a, b, level(P, radius_m, form))
     det = M[:, 0, 0] * M[:, 1, 1] - M[:, 0, 1] ** 2
     x = (M[:, 1, 1] * slope[:, 0] - M[:, 0, 1] * slope[:, 1]) / det
     y = (M[:, 0, 0] * slope[:, 1] - M[:, 0, 1] * slope[:, 0]) / det
@@ -329,9 +337,8 @@ def _newton(P: Array, a: Array, b: Array, radius_m: float, form: Form) -> Array:
     return move * np.minimum(1.0, _LONGEST * radius_m / np.maximum(length, 1e-300))
 
 
-def _path(P: Array, a: Array, b: Array, radius_m: float, form: Form) -> tuple[Array, Array, Array]:
+def _path(P: Array, a: Array, b: Array, surface: Level) -> tuple[Array, Array, Array]:
     """Two tangents (N, 2, 3), the path's slopes along them (N, 2) and second derivatives M (N, 2, 2)."""
-    surface = level(P, radius_m, form)
     length = np.linalg.norm(surface.gradient, axis=-1)
     N = surface.gradient / length[:, None]
     tangents = _tangents(N)

@@ -28,6 +28,7 @@ from phibench.render.optics.room_tracer import (
 from phibench.scenes.faces import IntArray
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
+from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import View, limb_points
 
 
@@ -82,6 +83,7 @@ VISIBLE, NO_REFLECTION, EDGE, FACES_AWAY, OUTSIDE = (
     "outside_image",
 )
 OCCLUDED = "occluded:"  # followed by the name of the object in the way
+_CORNERS = 720
 EDGE_PX = 1.0  # nearer to the outline part of the aperture sees no reflection, and the blur goes past the mirror
 
 
@@ -174,15 +176,26 @@ def _cause(view: View, spot: LaserSpot, room: GeometryLike, found: MirrorPoints,
 
 def _outline_distance_px(view: View, mirror: Array) -> float:
     """Distance of a mirror point's image from the mirror's outline, across it, pixels (angle times focal length)."""
+    if isinstance(view.rig.mirror, RevolvedMirror):
+        return _polygon_distance_px(view, mirror)
     to_mirror, to_centre = mirror - view.camera_centre_m, view.sphere_centre_m - view.camera_centre_m
     across, along = np.linalg.norm(np.cross(to_mirror, to_centre)), np.dot(to_mirror, to_centre)
     outline = _outline_angle(view, to_mirror, to_centre)
     return float((outline - np.arctan2(across, along)) * view.rig.camera.fx_px)
 
 
+def _polygon_distance_px(view: View, mirror: Array) -> float:
+    """Distance of a mirror point's image from the polygon of the outline, whose sides sag by 0.003 px."""
+    uv = view.rig.camera.project(view.T_world_camera.inverse().points(mirror[None]))[0]
+    corners = view.rig.outline_px(_CORNERS)
+    side = np.roll(corners, -1, axis=0) - corners
+    share = np.clip(np.sum((uv - corners) * side, axis=1) / np.sum(side * side, axis=1), 0.0, 1.0)
+    return float(np.linalg.norm(uv - corners - share[:, None] * side, axis=1).min())
+
+
 def _outline_angle(view: View, to_mirror: Array, to_centre: Array) -> float:
     """Angle, seen from the lens, between the sphere centre and the outline on the mirror point's side."""
-    distance, mirror = np.linalg.norm(to_centre), view.rig.mirror
+    distance, mirror = np.linalg.norm(to_centre), view.rig.sphere
     if mirror.form is None:
         return float(np.arcsin(mirror.radius_m / distance))
     axes, axis = view.T_world_sphere.R, to_centre / distance

@@ -133,7 +133,7 @@ def _texel_sizes_m(surfaces: Surfaces, fixed: int, texel_m: float) -> Array:
     sizes = np.full(len(surfaces.table.shape), texel_m)
     rig = surfaces.view.rig
     if rig.holder is not None:
-        sizes[fixed:] = min(texel_m, rig.mirror.radius_m / 3.0)
+        sizes[fixed:] = min(texel_m, rig.sphere.radius_m / 3.0)
     return sizes
 
 

@@ -35,7 +35,7 @@ def ball_light(mi: ModuleType, surfaces: Surfaces, texels: Texels, rays: int, se
     import drjit as dr
 
     rig = surfaces.view.rig
-    radius = dr.opaque(mi.Float, MM_PER_M * rig.mirror.radius_m)
+    radius = dr.opaque(mi.Float, MM_PER_M * rig.sphere.radius_m)
     indices = [rig.mirror.refractive_index(nm) for nm in rig.camera.detector.band_wavelength_nm]
     index = [[dr.opaque(mi.Float, float(part)) for part in (one.real, one.imag)] for one in indices]
     point, normal, lanes = texels.points, texels.normals, dr.arange(mi.UInt32, len(texels))

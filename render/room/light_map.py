@@ -154,7 +154,7 @@ def light_carriage(
     if first < grid.count:
         texels = Texels.of(mi, surfaces, grid, first)
         rig = surfaces.view.rig
-        ball_mm = 0.0 if rig.holder is None else MM_PER_M * rig.mirror.radius_m
+        ball_mm = 0.0 if rig.holder is None else MM_PER_M * rig.sphere.radius_m
         rays = _HOLDER_RAYS if ball_mm else _CARRIAGE_RAYS
         direct = direct_light(mi, surfaces, texels, sun, settings.lamp_rays, _SEED, ball_mm)
         light = 0.5 * (direct[0] + direct[1]) + gathered(mi, surfaces, texels, rays, _SEED + 2)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from phibench.render.room.camera_plugin import MM_PER_M, sensor_dict
 from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Array, Vector
-from phibench.scenes.mirror import SphereMirror, deviation, level
+from phibench.scenes.mirror import Metal, deviation, level
 from phibench.scenes.rig import View
 from phibench.scenes.room import MIRROR_NAME, Room
 from phibench.scenes.shapes import Cuboid, Rectangle, Shape
@@ -33,7 +33,7 @@ _RINGS, _SPOKES = 450, 900  # 0.4 degrees apart
 
 def form_mesh(mi: ModuleType, view: View, name: str, bsdf: Any) -> Any:
     """Mesh in the scene's coordinates: millimetres, world axes, the sphere centre at the origin."""
-    mirror, axes = view.rig.mirror, view.T_world_sphere.R
+    mirror, axes = view.rig.sphere, view.T_world_sphere.R
     assert mirror.form is not None
     n = _directions()
     points = (mirror.radius_m + deviation(n, mirror.form).value_m)[:, None] * n
@@ -73,7 +73,7 @@ def scene_dict(mi: ModuleType, view: View, room: Room, crop: tuple[int, int, int
     A mirror with a form error is a fine mesh.
     """
     scene: dict[str, Any] = {"type": "scene", "sensor": sensor_dict(mi, view, crop)}
-    scene[MIRROR_NAME] = mirror_dict(mi, view) if view.rig.mirror.form is None else _mirror_mesh(mi, view)
+    scene[MIRROR_NAME] = mirror_dict(mi, view) if view.rig.sphere.form is None else _mirror_mesh(mi, view)
     for index, shape in enumerate(room.shapes(view)):
         scene[shape_key(index)] = shape_dict(mi, view, shape)
     return scene
@@ -170,7 +170,7 @@ def _mirror_mesh(mi: ModuleType, view: View) -> Any:
     return form_mesh(mi, view, MIRROR_NAME, mi.load_dict(bsdf))
 
 
-def mirror_bsdf(mirror: SphereMirror, wavelengths_nm: Vector) -> dict[str, Any]:
+def mirror_bsdf(mirror: Metal, wavelengths_nm: Vector) -> dict[str, Any]:
     """Smooth or rough conductor with the steel's n and k at the three bands' wavelengths."""
     index = [mirror.refractive_index(nm) for nm in wavelengths_nm]
     entry: dict[str, Any] = {"eta": _rgb([m.real for m in index]), "k": _rgb([m.imag for m in index])}

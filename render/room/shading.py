@@ -45,7 +45,7 @@ class Look:
         self._sensor = mi.load_dict(sensor_dict(mi, self.view))
         self._crossed = surfaces.cross_the_way()
         self._tube = None if self.view.tube is None else Tube(mi, self.view)
-        self._radius = dr.opaque(mi.Float64, MM_PER_M * rig.mirror.radius_m)
+        self._radius = dr.opaque(mi.Float64, MM_PER_M * rig.sphere.radius_m)
         self._alpha = dr.opaque(mi.Float, rig.mirror.roughness_alpha)
         bands = [rig.mirror.refractive_index(nm) for nm in rig.camera.detector.band_wavelength_nm]
         self._index = [[dr.opaque(mi.Float, float(part)) for part in (one.real, one.imag)] for one in bands]
@@ -106,7 +106,7 @@ class Look:
         """Point of the mirror (mm), its outward normal, and whether there is one; float64."""
         import drjit as dr
 
-        if self.view.rig.mirror.form is not None:
+        if self.view.rig.sphere.form is not None:
             return meet(self._mi, self.view, origin, direction)
         approach = -dr.dot(origin, direction)
         foot = origin + approach * direction  # nearest point to the centre: no cancellation
@@ -390,10 +390,10 @@ def meet(mi: ModuleType, view: View, origin: Any, direction: Any) -> tuple[Any, 
     import drjit as dr
 
     V, axes = mi.Vector3d, view.T_world_sphere.R
-    form = view.rig.mirror.form
+    form = view.rig.sphere.form
     assert form is not None
     tensors = [MM_PER_M * tensor for tensor in form.tensors]
-    radius = dr.opaque(mi.Float64, MM_PER_M * view.rig.mirror.radius_m)
+    radius = dr.opaque(mi.Float64, MM_PER_M * view.rig.sphere.radius_m)
     o, d = (_turned(V, axes.T, vector) for vector in (origin, direction))
     d = dr.normalize(d)
     foot = o - dr.dot(o, d) * d

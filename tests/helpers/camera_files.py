@@ -15,7 +15,7 @@ NAMES = ("down", "up", "down_off", "up_off")
 def rig_text(rig: Rig) -> str:
     """`[rig]` with the numbers of a rig that a person can measure."""
     camera = rig.camera
-    lines = [f"z_c_m = {rig.sphere_in_camera_m[2]}", f"radius_m = {rig.mirror.radius_m}"]
+    lines = [f"z_c_m = {rig.sphere_in_camera_m[2]}", f"radius_m = {rig.sphere.radius_m}"]
     keys = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px", "pixel_pitch_um", "f_number")
     lines += [f"{key} = {getattr(camera, key)}" for key in keys]
     return "\n".join(("[rig]", *lines, ""))

@@ -75,9 +75,9 @@ def form_pixel(rig: Rig, offset_m: float, spot_world_m: np.ndarray) -> np.ndarra
     """Pixel of a world point seen in the mirror of a rig, shape (2,)."""
     camera, axes = camera_at(rig, offset_m)
     centre, turned = camera + axes @ rig.T_camera_sphere.t, axes @ rig.T_camera_sphere.R
-    assert rig.mirror.form is not None
+    assert rig.sphere.form is not None
     P = fermat_on_form(
-        turned.T @ (camera - centre), turned.T @ (spot_world_m - centre), rig.mirror.radius_m, rig.mirror.form
+        turned.T @ (camera - centre), turned.T @ (spot_world_m - centre), rig.sphere.radius_m, rig.sphere.form
     )
     return project_cv2(rig.camera, (axes.T @ (turned @ P + centre - camera))[None])[0]
 

@@ -57,7 +57,7 @@ def limb_light(rig: Rig, rng: np.random.Generator, mean_e_per_s: float = 1.5e5, 
     v, u = np.nonzero(np.kron(ring, np.ones((FINE, FINE), bool)))
     uv = (np.stack([u, v], axis=-1) + 0.5) / FINE - 0.5
     d = camera.rays(uv)
-    s, R = rig.sphere_in_camera_m, rig.mirror.radius_m
+    s, R = rig.sphere_in_camera_m, rig.sphere.radius_m
     along = d @ s
     gap2 = s @ s - along**2 - R * R  # squared distance of the ray from the sphere centre, less R^2
     hit = gap2 < 0.0

@@ -160,7 +160,7 @@ def true_reflection(rig: Rig, offset_m: float, spot_world_m: np.ndarray, solve=a
     """Reflection point in the world, shape (3,)."""
     camera, axes = camera_at(rig, offset_m)
     centre = camera + axes @ rig.T_camera_sphere.t
-    return centre + solve(camera - centre, spot_world_m - centre, rig.mirror.radius_m)
+    return centre + solve(camera - centre, spot_world_m - centre, rig.sphere.radius_m)
 
 
 def true_pixel(rig: Rig, offset_m: float, spot_world_m: np.ndarray, solve=alhazen_quartic) -> np.ndarray:

@@ -146,7 +146,7 @@ def test_form_parameters_are_those_of_the_misalignment() -> None:
 
 def test_forms_add_up_and_follow_through_a_file() -> None:
     rig = formed(Form(form_20_m=1e-4)).perturbed(Misalignment(form_20_m=2e-4, form_33s_m=-1e-5))
-    assert rig.mirror.form == Form(form_20_m=1e-4 + 2e-4, form_33s_m=-1e-5)
+    assert rig.sphere.form == Form(form_20_m=1e-4 + 2e-4, form_33s_m=-1e-5)
     assert from_json(Rig, json.loads(json.dumps(to_json(rig)))) == rig
 
 
@@ -304,7 +304,7 @@ def test_spread_of_the_bundle_against_rays_that_fan_out() -> None:
 def test_a_vanishing_form_is_the_sphere() -> None:
     """A form of 1e-13 m through the general way against the closed forms of the perfect sphere."""
     plain, tiny = (formed(form).at(0.4) for form in (Form(), Form(form_20_m=1e-13)))
-    assert tiny.rig.mirror.form is not None
+    assert tiny.rig.sphere.form is not None
     a, b = (spot_truth(view, SPOT, ()) for view in (plain, tiny))
     assert math.dist((a.u_px, a.v_px), (b.u_px, b.v_px)) < 1e-7
     assert (a.visible, a.cause) == (b.visible, b.cause)

@@ -218,7 +218,7 @@ def estimates(sense: str, rig: Rig, strokes_m: Array, down_px: Array, up_px: Arr
         return depth_exact(rig, strokes_m, down_px, up_px).depth_m
     view = rig.at(0.0)
     phi1, phi2 = (CONVENTIONS[sense](view, uv) for uv in (down_px, up_px))
-    return depth_paper(phi1, phi2, strokes_m, rig.mirror.radius_m).depth_m
+    return depth_paper(phi1, phi2, strokes_m, rig.sphere.radius_m).depth_m
 
 
 def drawn_errors(

@@ -189,7 +189,7 @@ def inverse_depth(
     parameters: Parameters, experiments: Experiments, reader: Reader, rig: Rig, down_px: Array, up_px: Array
 ) -> Array:
     """1 / D by equation (4), or (5), from radii, shape (..., n); the printed stroke and the nominal rig are used."""
-    R, h = rig.mirror.radius_m, experiments.stroke_m
+    R, h = rig.sphere.radius_m, experiments.stroke_m
     phi = phi_of(parameters, reader, rig, np.stack([down_px, up_px]))
     (S1, S2), (C1, C2) = np.sin(2.0 * phi), np.cos(2.0 * phi)
     sine = S1 * C2 - C1 * S2
@@ -209,7 +209,7 @@ def phi_of(parameters: Parameters, reader: Reader, rig: Rig, radius_px: Array) -
         if reader.convention == "outline":
             return np.asarray(np.arcsin(radius_px / _outline_px(parameters, rig)))
         alpha = np.arctan(radius_px / rig.camera.fx_px)
-        incidence = np.arcsin(_get(parameters, "z_c_m") / rig.mirror.radius_m * np.sin(alpha))
+        incidence = np.arcsin(_get(parameters, "z_c_m") / rig.sphere.radius_m * np.sin(alpha))
     return np.asarray(incidence - _CAMERA_RAYS[reader.convention] * alpha)
 
 
@@ -217,7 +217,7 @@ _CAMERA_RAYS = {"ray": 0.5, "normal": 1.0, "incidence": 0.0}  # how many alpha p
 
 
 def _true_radius_m(parameters: Parameters, rig: Rig) -> Array:
-    return rig.mirror.radius_m + _get(parameters, "radius_m")
+    return rig.sphere.radius_m + _get(parameters, "radius_m")
 
 
 def _true_focal_px(parameters: Parameters, rig: Rig) -> Array:

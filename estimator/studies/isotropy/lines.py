@@ -125,7 +125,7 @@ def hidden_by(seeing: View, other: View, points_m: Array) -> np.ndarray[tuple[in
     to_sphere = other.sphere_centre_m - P
     # the place nearest to the other centre, on the way to the point and not beyond it
     t = np.clip(np.sum(to_sphere * r, axis=-1), 0.0, length)
-    by_mirror = np.linalg.norm(to_sphere - t[:, None] * r, axis=-1) < other.rig.mirror.radius_m
+    by_mirror = np.linalg.norm(to_sphere - t[:, None] * r, axis=-1) < other.rig.sphere.radius_m
     return by_mirror | (blocked_by(carriage(other), P, points_m) >= 0)
 
 
@@ -166,7 +166,7 @@ def half_width_rad(rig: Rig, apart_m: float, depth_m: float, height_m: float) ->
     # A cos(a)^2 + B cos(a) + C = d^2 - R^2; below 0 at a = 0 where the other mirror hides anything
     A = b * b * (cosine2 * m * m - 1.0)
     B = 2.0 * cosine2 * level * m * b
-    C = b * b + cosine2 * level * level - rig.mirror.radius_m**2
+    C = b * b + cosine2 * level * level - rig.sphere.radius_m**2
     roots = np.roots([A, B, C])
     inside = [float(root.real) for root in roots if abs(root.imag) < 1e-12 and 0.0 < root.real < 1.0]
     return math.acos(max(inside)) if inside and A + B + C < 0.0 else 0.0

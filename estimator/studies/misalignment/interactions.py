@@ -72,7 +72,7 @@ def moving(
         name
         for name in parameters
         if name in ANALYTIC
-        and nominal.perturbed(usual := Misalignment(**{name: PARAMETERS[name].study})).mirror.form is None
+        and nominal.perturbed(usual := Misalignment(**{name: PARAMETERS[name].study})).sphere.form is None
         and np.max(np.abs(errors(nominal, usual, places, estimators) - aligned)) > 0.0
     )
 

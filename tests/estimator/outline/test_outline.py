@@ -72,7 +72,7 @@ def test_plain_fits_are_biased(case) -> None:
     rig, light = case
     picture = grey(planes_of(light))
     points, s = next(rough_outlines(picture, nominal(rig)))[1].points_px, rig.sphere_in_camera_m
-    camera, R = rig.camera, rig.mirror.radius_m
+    camera, R = rig.camera, rig.sphere.radius_m
     for found in (
         sphere_from_circle(plain_circle(points), camera, R),
         sphere_from_ellipse(points, camera, R),
@@ -171,7 +171,7 @@ def test_light_of_codes_is_light_of_numbers(frames) -> None:
 def test_radius_and_distance_scale_together(case) -> None:
     rig, light = case
     planes, s = planes_of(light), rig.sphere_in_camera_m
-    larger = replace(rig, mirror=replace(rig.mirror, radius_m=1.01 * rig.mirror.radius_m))
+    larger = replace(rig, mirror=replace(rig.mirror, radius_m=1.01 * rig.sphere.radius_m))
     a, b = fit_outline(planes, rig, s + 1e-4), fit_outline(planes, larger, 1.01 * (s + 1e-4))
     # the same cone; Fresnel's angle across the limb is the same too; 1e-7 m is where the steps come to rest
     assert b.sphere_in_camera_m == pytest.approx(1.01 * a.sphere_in_camera_m, abs=1e-6)

@@ -27,7 +27,7 @@ def test_mirror_images_against_alhazens_quartic() -> None:
             place = np.array([2.0 * math.cos(number), 2.5 * math.sin(number), 0.1 + 0.15 * number])
             view = rig.at(0.1 * number)
             centre = view.sphere_centre_m
-            P = alhazen_quartic(view.camera_centre_m - centre, place - centre, rig.mirror.radius_m) + centre
+            P = alhazen_quartic(view.camera_centre_m - centre, place - centre, rig.sphere.radius_m) + centre
             expected = rig.camera.project(view.T_world_camera.inverse().points(P))
             np.testing.assert_allclose(image_of(view, place).uv_px, expected, rtol=0, atol=1e-6)
             checked += 1

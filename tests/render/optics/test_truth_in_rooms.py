@@ -70,7 +70,7 @@ class Found:
 
 def by_brute_force(view: View, table: FaceTable, uv: np.ndarray) -> Found:
     """Chief rays of pixels (N, 2) by other mathematics than `truth_layer`'s."""
-    pose, centre, radius = view.T_world_camera, view.sphere_centre_m, view.rig.mirror.radius_m
+    pose, centre, radius = view.T_world_camera, view.sphere_centre_m, view.rig.sphere.radius_m
     xy = undistort_cv2(view.rig.camera, uv)
     d = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
     d = (d / np.linalg.norm(d, axis=1, keepdims=True)) @ pose.R.T

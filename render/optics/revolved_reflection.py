@@ -1,0 +1,175 @@
+"""Reflection points on a mirror of revolution: Fermat's path, from a start in the right basin.
+
+With a and b two points outside the mirror, F(P) = |a P| + |P b| is a convex function of P. The mirror with all that is
+behind it, K = {z >= sag(x^2 + y^2)}, is a convex body. Where the straight line from a to b misses K, the least F on K
+is on the surface, and it is a place where the gradient of F points into K: there light is reflected from a to b. A
+convex problem has one such place. Where the line meets K the mirror stands between a and b, and no light is reflected.
+So a stationary point that both ends see is the only one, wherever the search began.
+
+The search begins in the half-plane of the axis and the point (its *meridian*), the eye moved into it. There f(r), the
+slope of the path along the profile at the radius r, is at most 0 where the eye's line of sight touches the profile on
+the side away from the point, and at least 0 where it touches on the point's side; between the two f has one root with
+both ends outside. Newton's method inside the shrinking bracket finds it. For an eye on the axis this is the answer.
+Otherwise Newton's method in the two coordinates across the axis starts there.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.scenes.frames import Array
+from phibench.scenes.revolved_mirror import Profile
+
+_PLANE_STEPS = 80  # bisection alone would need 55; Newton takes 5 to 8
+_STEPS = 30  # 2 to 5 do
+_BEYOND = 1.05  # rim radii: where the search ends, unless the equator comes first
+_EQUATOR = 0.999999
+_LONGEST = 0.3  # step, in rim radii
+_CLOSE = 1e-9  # of the rim's radius: the step after that would be its square
+_FOUND = 1e-6
+_STRAIGHT = 1e-15  # of the rim's radius: where bisection ends
+
+
+def revolved_points(points_m: Array, eyes_m: Array, profile: Profile) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Reflection points in the mirror's frame.
+
+    Parameters
+    ----------
+    points_m, eyes_m : arrays, shape (N, 3)
+        The two points, metres, relative to the vertex.
+    profile
+
+    Returns
+    -------
+    reflection_m : array, shape (N, 3); NaN where there is none inside the rim
+    normals : array, shape (N, 3), unit, away from the mirror; NaN where there is none
+    valid : bool array, shape (N,)
+        The point lies inside the rim, and both ends on the outer side of the tangent plane there.
+    """
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        xy = _start(points_m, eyes_m, profile)
+        index = np.flatnonzero(np.isfinite(xy).all(axis=1))
+        step = np.full(len(xy), np.inf)
+        for _ in range(_STEPS):
+            if not len(index):
+                break
+            move = _newton(xy[index], points_m[index], eyes_m[index], profile)
+            xy[index] += move
+            step[index] = np.linalg.norm(move, axis=-1)
+            index = index[step[index] > _CLOSE * profile.rim_radius_m]  # NaN leaves as well
+        P = _on_surface(xy, profile)
+        N = _unit(profile.level(P).gradient)
+        seen = [np.einsum("ni,ni->n", end - P, N) >= 0.0 for end in (points_m, eyes_m)]
+        inside = np.hypot(*xy.T) <= profile.rim_radius_m
+        valid = np.asarray(seen[0] & seen[1] & inside & (step <= _FOUND * profile.rim_radius_m))
+    return np.where(valid[:, None], P, np.nan), np.where(valid[:, None], N, np.nan), valid
+
+
+def _start(points_m: Array, eyes_m: Array, profile: Profile) -> Array:
+    """Places (x, y) to begin at, shape (N, 2); NaN where no place inside the rim can be the answer."""
+    away = np.hypot(points_m[:, 0], points_m[:, 1])
+    across = np.where(away[:, None] > 0.0, points_m[:, :2] / away[:, None], [1.0, 0.0])
+    end = (away, points_m[:, 2])
+    eye = (np.einsum("ni,ni->n", eyes_m[:, :2], across), eyes_m[:, 2])
+    r = _in_meridian(end, eye, profile)
+    return r[:, None] * across
+
+
+Plane = tuple[Array, Array]  # radius and height of points in a half-plane, each of shape (N,)
+
+
+def _in_meridian(point: Plane, eye: Plane, profile: Profile) -> Array:
+    """Root of f, shape (N,); NaN where it lies beyond the rim."""
+    reach = min(_BEYOND * profile.rim_radius_m, _EQUATOR * profile.equator_m)
+    low, high = _seen_part(eye, profile, reach)
+    lost = (_slope(low, point, eye, profile)[0] > 0.0) | (_slope(high, point, eye, profile)[0] < 0.0)
+    r = np.where(lost, np.nan, 0.5 * (low + high))
+    for _ in range(_PLANE_STEPS):
+        f, bend = _slope(r, point, eye, profile)
+        low, high = np.where(f < 0.0, r, low), np.where(f > 0.0, r, high)
+        step = r - f / bend
+        new = np.where((step >= low) & (step <= high), step, 0.5 * (low + high))
+        moving = np.abs(new - r) > _STRAIGHT * profile.rim_radius_m
+        r = new
+        if not moving.any():
+            break
+    return r
+
+
+def _seen_part(eye: Plane, profile: Profile, reach: float) -> Plane:
+    """Least and largest radius on the profile that the eye sees, up to `reach`."""
+    ends = []
+    for side in (-1.0, 1.0):
+        high = np.full(len(eye[0]), side * reach)
+        hidden = np.flatnonzero(~_faces(high, eye, profile))
+        if len(hidden):
+            part = (eye[0][hidden], eye[1][hidden])
+            low, far = np.clip(part[0], -reach, reach), high[hidden]
+            for _ in range(_PLANE_STEPS):
+                middle = 0.5 * (low + far)
+                facing = _faces(middle, part, profile)
+                low, far = np.where(facing, middle, low), np.where(facing, far, middle)
+            high[hidden] = low
+        ends.append(high)
+    return ends[0], ends[1]
+
+
+def _faces(r: Array, eye: Plane, profile: Profile) -> NDArray[np.bool_]:
+    """Whether the eye lies below the profile's tangent at r."""
+    z, slope, _ = _profile(r, profile)
+    return np.asarray(z + slope * (eye[0] - r) - eye[1] > 0.0)
+
+
+def _profile(r: Array, profile: Profile) -> tuple[Array, Array, Array]:
+    """Height of the profile and its derivatives by the radius, which may be negative."""
+    sag = profile.sag(r * r)
+    slope, bend = 2.0 * r * sag.slope_per_m, 2.0 * sag.slope_per_m + 4.0 * r * r * sag.bend_per_m3
+    if profile.shape != "cone":
+        return sag.z_m, slope, bend
+    tangent = (-1.0 - profile.conic) ** -0.5
+    return sag.z_m, tangent * np.where(r < 0.0, -1.0, 1.0), np.zeros_like(r)
+
+
+def _slope(r: Array, point: Plane, eye: Plane, profile: Profile) -> tuple[Array, Array]:
+    """f and its derivative: of the path by the radius."""
+    z, z1, z2 = _profile(r, profile)
+    f, bend = np.zeros_like(r), np.zeros_like(r)
+    for away, height in (point, eye):
+        dr, dz = r - away, z - height
+        length = np.hypot(dr, dz)
+        along = (dr + dz * z1) / length
+        f += along
+        bend += (1.0 + z1 * z1 + dz * z2 - along * along) / length
+    return f, bend
+
+
+def _newton(xy: Array, points_m: Array, eyes_m: Array, profile: Profile) -> Array:
+    """Step in (x, y), shape (N, 2), no longer than `_LONGEST` rim radii: of the path as a function of x and y."""
+    s = np.einsum("ni,ni->n", xy, xy)
+    sag = profile.sag(s)
+    rise = 2.0 * sag.slope_per_m[:, None] * xy  # of z by x and y
+    curve = 4.0 * sag.bend_per_m3[:, None, None] * xy[:, :, None] * xy[:, None, :]
+    curve += 2.0 * sag.slope_per_m[:, None, None] * np.eye(2)
+    gradient, hessian = np.zeros_like(xy), np.zeros((len(xy), 2, 2))
+    for end in (points_m, eyes_m):
+        way, dz = xy - end[:, :2], sag.z_m - end[:, 2]
+        length = np.sqrt(np.einsum("ni,ni->n", way, way) + dz * dz)
+        along = (way + dz[:, None] * rise) / length[:, None]
+        gradient += along
+        part = np.eye(2) + rise[:, :, None] * rise[:, None, :] + dz[:, None, None] * curve
+        hessian += (part - along[:, :, None] * along[:, None, :]) / length[:, None, None]
+    det = hessian[:, 0, 0] * hessian[:, 1, 1] - hessian[:, 0, 1] ** 2
+    x = (hessian[:, 1, 1] * gradient[:, 0] - hessian[:, 0, 1] * gradient[:, 1]) / det
+    y = (hessian[:, 0, 0] * gradient[:, 1] - hessian[:, 0, 1] * gradient[:, 0]) / det
+    move = -np.stack([x, y], axis=-1)
+    length = np.linalg.norm(move, axis=-1, keepdims=True)
+    return move * np.minimum(1.0, _LONGEST * profile.rim_radius_m / np.maximum(length, 1e-300))
+
+
+def _on_surface(xy: Array, profile: Profile) -> Array:
+    return np.concatenate([xy, profile.sag(np.einsum("ni,ni->n", xy, xy)).z_m[:, None]], axis=-1)
+
+
+def _unit(vectors: Array) -> Array:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
