@@ -155,7 +155,7 @@ class Profile:
         return bool(point_m[2] >= self.sag(np.array(point_m[0] ** 2 + point_m[1] ** 2)).z_m)
 
     def level(self, points_m: Array) -> Level:
-        """Zero on the surface, above 0 before it, at points (..., 3): sag - z; of quadrics their polynomial.
+        """Level of the surface: 0 on it, above 0 before it, at points (..., 3): sag - z; of quadrics their polynomial.
 
         That of a hyperboloid or cone is below 0 inside the other sheet as well.
         """
@@ -240,7 +240,7 @@ class RevolvedMirror(Metal):
         return math.hypot(self.profile.rim_radius_m, self.profile.depth_m)
 
     def level(self, points_m: Array) -> Level:
-        """Zero on the surface, above 0 before it, at points (..., 3) in the mirror's frame."""
+        """Level of the surface: 0 on it, above 0 before it, at points (..., 3) in the mirror's frame."""
         return self.profile.level(points_m)
 
 

@@ -116,7 +116,7 @@ def _seen_part(eye: Plane, profile: Profile, reach: float) -> Plane:
 
 
 def _faces(r: Array, eye: Plane, profile: Profile) -> NDArray[np.bool_]:
-    """Whether the eye lies below the profile's tangent at r."""
+    """Mask of places r whose tangent has the eye below it."""
     z, slope, _ = _profile(r, profile)
     return np.asarray(z + slope * (eye[0] - r) - eye[1] > 0.0)
 
