@@ -33,6 +33,7 @@ from phibench.scenes.validation import SceneError, finite, positive, within
 Shape = Literal["sphere", "ellipsoid", "paraboloid", "hyperboloid", "cone", "polynomial"]
 
 _LARGEST_M = 1.0
+_BISECTIONS = 55
 _PLACES = 2001  # where a polynomial's curvature is looked at, from the axis to the rim
 _WIDEST = 1.0 - 1e-6  # of an ellipsoid's equator: at it the slope is infinite
 
@@ -150,6 +151,25 @@ class Profile:
             bend = bend + i * (i - 1) * a * s ** (i - 2)
         return Sag(z, slope, bend)
 
+    def radius_at_slope(self, slope: Array) -> Array:
+        """Radius at which dz/dr has a value, shape (...); NaN where no place inside the rim has it, as on a cone."""
+        t, R, A = np.asarray(slope, float), self.vertex_radius_m, 1.0 + self.conic
+        if self.shape == "cone":
+            return np.full(np.shape(t), np.nan)
+        with np.errstate(invalid="ignore"):
+            if self.is_quadric:
+                r = t * R / np.sqrt(1.0 + A * t * t)
+            else:
+                low, high = np.zeros(np.shape(t)), np.full(np.shape(t), self.rim_radius_m)
+                for _ in range(_BISECTIONS):
+                    r = 0.5 * (low + high)
+                    flatter = 2.0 * r * self.sag(r * r).slope_per_m < t
+                    low, high = np.where(flatter, r, low), np.where(flatter, high, r)
+                r = np.where(
+                    t <= 2.0 * self.rim_radius_m * self.sag(np.array(self.rim_radius_m**2)).slope_per_m, r, np.nan
+                )
+            return np.where((t >= 0.0) & (r <= self.rim_radius_m), r, np.nan)
+
     def holds(self, point_m: Array) -> bool:
         """Return True if a point, shape (3,), lies on the mirror or behind it, within the equator."""
         return bool(point_m[2] >= self.sag(np.array(point_m[0] ** 2 + point_m[1] ** 2)).z_m)
@@ -217,6 +237,11 @@ def cone(half_angle_rad: float, rim_radius_m: float) -> Profile:
     return Profile(0.0, -1.0 - math.tan(half_angle_rad) ** 2, rim_radius_m)
 
 
+def image_depth_m(profile: Profile) -> float:
+    """Depth behind the vertex at which a far room's virtual image lies: R / 2; behind a cone, half its height."""
+    return 0.5 * (profile.vertex_radius_m or profile.depth_m)
+
+
 @dataclass(frozen=True)
 class RevolvedMirror(Metal):
     """A polished mirror of revolution.
@@ -228,7 +253,7 @@ class RevolvedMirror(Metal):
         Beckmann roughness; 0 is an ideal mirror.
     """
 
-    profile: Profile = Profile(0.060, -1.0, 0.060)
+    profile: Profile
     roughness_alpha: float = 0.0
 
     def __post_init__(self) -> None:
@@ -260,9 +285,6 @@ def rim_points(profile: Profile, eye_m: Array, turns_rad: Array) -> Array:
         low, high = np.where(facing, middle, low), np.where(facing, high, middle)
     radius = np.where(seen, profile.rim_radius_m, 0.5 * (low + high))
     return _points(profile, across, radius)
-
-
-_BISECTIONS = 55
 
 
 def _points(profile: Profile, across: Array, radius: Array) -> Array:

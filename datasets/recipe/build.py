@@ -14,6 +14,7 @@ from phibench.datasets.recipe.tables import (
     OWN_ALBEDO,
     HolderTable,
     LaserTable,
+    MirrorTable,
     MisalignmentTable,
     Recipe,
     RigTable,
@@ -23,11 +24,12 @@ from phibench.datasets.rooms.room_sources import NamedRoom, room_of
 from phibench.scenes.camera import Camera
 from phibench.scenes.catalog import BOARD_ALBEDO, RIGS, Target
 from phibench.scenes.faces import face_table
-from phibench.scenes.frames import Array, Pose, Vector, as_vector, rotation_xyz
+from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector, rotation_xyz
 from phibench.scenes.holder import LENGTHS, Holder, fitted
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.revolved_mirror import Profile, RevolvedMirror, cone, image_depth_m
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
 from phibench.scenes.validation import Fault, SceneError
@@ -49,7 +51,10 @@ HOLDER_KINDS: Mapping[str, tuple[str, ...]] = {
 """Kinds of a holder that a key of `[rig.holder]` has an effect on."""
 
 _NANOMETRE = 9  # decimals
-_OWNERS = (("Holder.", "rig.holder."), ("SphereMirror.", "rig."), ("Camera.", "rig."))
+_OWNERS = (
+    *(("Holder.", "rig.holder."), ("SphereMirror.", "rig."), ("Camera.", "rig.")),
+    *(("Profile.", "rig.mirror."), ("RevolvedMirror.", "rig.")),
+)
 
 
 def build_rig(table: RigTable) -> Rig:
@@ -88,22 +93,97 @@ def idle_holder_keys(path: str, given: Iterable[str], kinds: Iterable[str]) -> l
 
 def _rig(table: RigTable) -> Rig:
     base = RIGS[table.preset]()
+    if table.mirror is not None:
+        return _revolved_rig(table, table.mirror, base)
     mirror = replace(base.sphere, **_given(table, ("radius_m", "roughness_alpha")))
     z_c_m = base.sphere_in_camera_m[2] if table.z_c_m is None else table.z_c_m
-    height_m = base.T_world_camera.t[2] if table.camera_height_m is None else table.camera_height_m
-    T_world_camera = Pose("world", "camera", (0.0, 0.0, height_m), rotation_xyz(table.tilt_x_rad, table.tilt_y_rad))
-    sphere_from_camera = np.array([table.decentre_x_m, table.decentre_y_m, z_c_m])  # world axes
-    T_camera_sphere = Pose("camera", "sphere", as_vector(T_world_camera.R.T @ sphere_from_camera))
-    before_m = min(T_camera_sphere.translation_m[2], float(np.linalg.norm(sphere_from_camera)))
+    T_world_camera, T_camera_sphere = _poses(table, base, z_c_m)
+    before_m = min(T_camera_sphere.translation_m[2], float(np.linalg.norm(T_camera_sphere.t)))
     if before_m <= mirror.radius_m:
         raise SceneError(
             f"z_c_m = {z_c_m:g} with radius_m = {mirror.radius_m:g}: the sphere centre is {before_m:.4f} m in front of "
             f"the lens, which is inside the sphere; give a z_c_m above the mirror radius or a smaller radius_m"
         )
-    stroke = np.array(rotation_xyz(table.stroke_tilt_x_rad, table.stroke_tilt_y_rad)) @ np.array([0.0, 0.0, 1.0])
-    camera = _camera(base.camera, table, z_c_m, mirror)
+    camera = _camera(base.camera, table)
+    if table.z_c_m is not None or table.radius_m is not None:  # on the virtual image
+        camera = _focused(camera, table, z_c_m - mirror.radius_m / 2.0)
     holder = _holder(table.holder, mirror)
-    return Rig(camera, mirror, T_world_camera, T_camera_sphere, as_vector(stroke), holder=holder)
+    return Rig(camera, mirror, T_world_camera, T_camera_sphere, _stroke_axis(table), holder=holder)
+
+
+MIRROR_SHAPES: Mapping[str, tuple[str, ...]] = {
+    "vertex_radius_m": ("ellipsoid", "paraboloid", "hyperboloid", "polynomial"),
+    "conic": ("ellipsoid", "hyperboloid", "polynomial"),
+    "half_angle_deg": ("cone",),
+    "even_terms": ("polynomial",),
+}
+"""Shapes that a key of `[rig.mirror]` belongs to."""
+
+_VERTEX_M = 0.220  # from the lens: rims of 60 mm fit the image
+_VERTEX_RADIUS_M = 0.060
+_CONICS = {"ellipsoid": -0.5, "paraboloid": -1.0, "hyperboloid": -1.5625, "polynomial": -1.0}
+
+
+def idle_mirror_keys(path: str, table: MirrorTable) -> list[Fault]:
+    """Faults of keys of `[rig.mirror]` that do not belong to its shape, and of one that a shape needs."""
+    faults = []
+    for key, shapes in MIRROR_SHAPES.items():
+        if getattr(table, key) is not None and table.shape not in shapes:
+            quoted = " or ".join(f'"{shape}"' for shape in shapes)
+            text = f'has no effect on shape = "{table.shape}"; remove it, or give shape = {quoted}'
+            faults.append(Fault(f"{path}.{key}", text))
+    if table.shape == "polynomial" and not table.even_terms:
+        faults.append(Fault(f"{path}.even_terms", 'is missing: shape = "polynomial" needs at least one number'))
+    return faults
+
+
+def build_profile(table: MirrorTable, vertex_m: float) -> Profile:
+    """Profile of a mirror whose vertex lies so far before the lens; the lens is in a hyperboloid's focus by default."""
+    if table.shape == "cone":
+        return cone(float(np.radians(table.half_angle_deg or 45.0)), table.rim_radius_m)
+    conic = _CONICS[table.shape] if table.conic is None else table.conic
+    low, high = {"ellipsoid": (-1.0, np.inf), "hyperboloid": (-np.inf, -1.0)}.get(table.shape, (-np.inf, np.inf))
+    if not low < conic < high:
+        side = "below" if table.shape == "hyperboloid" else "above"
+        raise SceneError(f'Profile.conic = {conic:g}: {side} -1 for shape = "{table.shape}"')
+    radius_m = table.vertex_radius_m
+    if radius_m is None:
+        radius_m = vertex_m * ((-conic) ** 0.5 - 1.0) if table.shape == "hyperboloid" else _VERTEX_RADIUS_M
+    return Profile(radius_m, conic, table.rim_radius_m, table.even_terms or ())
+
+
+def _revolved_rig(table: RigTable, mirror: MirrorTable, base: Rig) -> Rig:
+    """Rig with a mirror of revolution, its axis upright."""
+    if table.radius_m is not None:
+        raise SceneError(f"rig.radius_m = {table.radius_m:g}: is a sphere's; a {mirror.shape} has its own keys")
+    if table.holder.kind != "none":
+        raise SceneError(f"rig.holder.kind = {table.holder.kind}: carries a sphere; remove it for a {mirror.shape}")
+    vertex_m = _VERTEX_M if table.z_c_m is None else table.z_c_m
+    profile = build_profile(mirror, vertex_m)
+    given = _given(table, ("roughness_alpha",))
+    T_world_camera, T_camera_sphere = _poses(table, base, vertex_m)
+    T_camera_mirror = replace(T_camera_sphere, rotation=as_matrix(T_world_camera.R.T))
+    camera = _focused(_camera(base.camera, table), table, vertex_m + image_depth_m(profile))
+    stroke = _stroke_axis(table)
+    return Rig(camera, RevolvedMirror(profile, **given), T_world_camera, T_camera_mirror, stroke)
+
+
+def _poses(table: RigTable, base: Rig, z_c_m: float) -> tuple[Pose, Pose]:
+    """Camera in the world, and mirror in the camera, for a mirror so far above the lens."""
+    height_m = base.T_world_camera.t[2] if table.camera_height_m is None else table.camera_height_m
+    T_world_camera = Pose("world", "camera", (0.0, 0.0, height_m), rotation_xyz(table.tilt_x_rad, table.tilt_y_rad))
+    mirror_from_camera = np.array([table.decentre_x_m, table.decentre_y_m, z_c_m])  # world axes
+    return T_world_camera, Pose("camera", "sphere", as_vector(T_world_camera.R.T @ mirror_from_camera))
+
+
+def _stroke_axis(table: RigTable) -> Vector:
+    turn = rotation_xyz(table.stroke_tilt_x_rad, table.stroke_tilt_y_rad)
+    return as_vector(np.array(turn) @ np.array([0.0, 0.0, 1.0]))
+
+
+def _focused(camera: Camera, table: RigTable, distance_m: float) -> Camera:
+    """Camera focused at a distance, unless the recipe says where."""
+    return camera if table.focus_distance_m is not None else replace(camera, focus_distance_m=distance_m)
 
 
 def _holder(table: HolderTable, mirror: SphereMirror) -> Holder | None:
@@ -223,13 +303,11 @@ def _given(table: RigTable, keys: Iterable[str]) -> dict[str, Any]:
     return {key: value for key in keys if (value := getattr(table, key)) is not None}
 
 
-def _camera(base: Camera, table: RigTable, z_c_m: float, mirror: SphereMirror) -> Camera:
-    """Camera with the recipe's numbers; focus, principal point and second focal length follow unless they are set."""
+def _camera(base: Camera, table: RigTable) -> Camera:
+    """Camera with the recipe's numbers; principal point and second focal length follow unless they are set."""
     implied: dict[str, Any] = {}
     if table.fx_px is not None or table.fy_px is not None:  # square pixels: the one that is given holds for both
         implied["fx_px"], implied["fy_px"] = table.fx_px or table.fy_px, table.fy_px or table.fx_px
-    if table.z_c_m is not None or table.radius_m is not None:
-        implied["focus_distance_m"] = z_c_m - mirror.radius_m / 2.0  # on the virtual image
     if table.width_px is not None:
         implied["cx_px"] = (table.width_px - 1) / 2.0
     if table.height_px is not None:

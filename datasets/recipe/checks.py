@@ -20,6 +20,7 @@ from phibench.datasets.recipe.build import (
     by_keys,
     ceiling_m,
     idle_holder_keys,
+    idle_mirror_keys,
     rig_fault_of,
     true_stroke_m,
 )
@@ -44,6 +45,7 @@ from phibench.datasets.recipe.tables import (
     AmbientTable,
     HolderTable,
     LaserTable,
+    MirrorTable,
     MisalignmentTable,
     RandomHolderTable,
     Recipe,
@@ -53,6 +55,7 @@ from phibench.datasets.recipe.tables import (
 from phibench.render.room.subpixel_grid import FilmGrid
 from phibench.render.sensor.settings import SensorError, sensor
 from phibench.scenes.catalog import BOARD_SIZE_M, board
+from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room, chassis
@@ -75,7 +78,7 @@ def semantic_faults(raw: Raw) -> list[Fault]:
             *_frames(raw),
             *_distractors(draft),
         ),
-        *(*_laser(draft.laser), *_holder(raw), *_rig(draft)),
+        *(*_laser(draft.laser), *_holder(raw), *_mirror(raw), *_rig(draft)),
     ]
 
 
@@ -320,6 +323,14 @@ def _holder(raw: Raw) -> Iterator[Fault]:
     yield from idle_holder_keys("random.rig.holder", sorted(chosen.model_fields_set), kinds)
 
 
+def _mirror(raw: Raw) -> Iterator[Fault]:
+    """Keys of a mirror of revolution that its shape does not have."""
+    if table := table_of(raw, "rig", "mirror"):
+        sound = sound_of(table, MirrorTable)
+        if sound is not None and table.keys() <= sound.model_fields_set:
+            yield from idle_mirror_keys("rig.mirror", sound)
+
+
 def _rig(draft: _Draft) -> Iterator[Fault]:
     """Faults of the rig, nominal and true, and of the boards and strokes that do not go with it."""
     misplaced = dict(_places(draft))
@@ -390,7 +401,11 @@ def _height(table: RigTable, rig: Rig, room: Room) -> Fault | None:
     above_m = _top_m(rig, MIN_STROKE_M) - ceiling_m(room)
     if above_m < 0.0:
         return None
-    given = {key: getattr(table, key) for key in ("camera_height_m", "z_c_m")} | {"radius_m": rig.sphere.radius_m}
+    given = {key: getattr(table, key) for key in ("camera_height_m", "z_c_m")}
+    if isinstance(rig.mirror, SphereMirror):
+        given["radius_m"] = rig.mirror.radius_m
+    elif not any(given.values()):
+        given["camera_height_m"] = rig.T_world_camera.translation_m[2]
     key, value = next((key, value) for key, value in given.items() if value is not None)
     text = f"{value} puts the {rig.top_part}'s top through the ceiling at {ceiling_m(room):.2f} m when it is down"
     return Fault(f"rig.{key}", f"{text}; give less than {value - above_m:.3f}")

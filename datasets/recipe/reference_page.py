@@ -31,6 +31,7 @@ from phibench.datasets.recipe.tables import (
     FramesTable,
     HolderTable,
     LaserTable,
+    MirrorTable,
     MisalignmentTable,
     RandomHolderTable,
     RandomMisalignmentTable,
@@ -49,6 +50,7 @@ TABLES: dict[str, type[BaseModel]] = {
     "[dataset]": DatasetTable,
     "[rig]": RigTable,
     "[rig.holder]": HolderTable,
+    "[rig.mirror]": MirrorTable,
     "[misalignment]": MisalignmentTable,
     "[room]": RoomTable,
     "[rooms]": RoomsTable,
@@ -115,6 +117,21 @@ Divide `fx_px` by the same factor to see as much as before.
 `docs/holder.md`. R is `radius_m` of `[rig]`: sizes that are left out follow it. Its axis runs from the lens centre to
 the sphere centre. Rods, column and tube must stand beside the mirror and within the plates. The last two keys
 are a tube's alone.
+""",
+    "[rig.mirror]": """A mirror of revolution instead of the sphere; see `docs/mirrors.md`. `z_c_m` is then
+the distance from the lens centre to the vertex; 0.22 m where it is not given. The mirror's axis is upright, and its
+metal is steel. The surface is z = s / (R + sqrt(R^2 - (1 + k) s)) + a_2 s^2 + a_3 s^3 + ..., with s the square of the
+distance from the axis.
+
+| `shape` | keys | what is not given |
+|---|---|---|
+| `ellipsoid` | `vertex_radius_m`, `conic` above -1 | R = 0.06 m, k = -0.5 |
+| `paraboloid` | `vertex_radius_m` | R = 0.06 m |
+| `hyperboloid` | `vertex_radius_m`, `conic` below -1 | k = -1.5625, R puts the lens in the outer focus |
+| `cone` | `half_angle_deg` | 45 |
+| `polynomial` | `vertex_radius_m`, `conic`, `even_terms` | R = 0.06 m, k = -1 |
+
+It has no holder, and no form error.
 """,
     "[misalignment]": """What the true rig deviates by from `[rig]`, which then is the nominal one: what an estimator
 is given. Images and truth are those of the true rig. Signs, axes and figures: `docs/misalignment.md`.

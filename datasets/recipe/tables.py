@@ -125,8 +125,31 @@ class HolderTable(_OfHolder):
     )
 
 
+class MirrorTable(Table):
+    """`[rig.mirror]`: a mirror of revolution instead of the sphere."""
+
+    shape: Literal["ellipsoid", "paraboloid", "hyperboloid", "cone", "polynomial"] = Field(
+        description="surface; z_c_m leads to its vertex"
+    )
+    rim_radius_m: float = Field(default=0.060, gt=0.0, le=1.0, description="radius of the rim, where the mirror ends")
+    vertex_radius_m: float | None = Field(
+        default=None, gt=0.0, le=1.0, description="R, radius of curvature at the vertex"
+    )
+    conic: float | None = Field(default=None, ge=-100.0, le=100.0, description="k, conic constant")
+    half_angle_deg: float | None = Field(default=None, ge=3.0, le=87.0, description="of a cone: from axis to surface")
+    even_terms: tuple[float, ...] | None = Field(
+        default=None, max_length=8, strict=False, description="a_2, a_3, ... of r^4, r^6, ... in m^-3, m^-5, ..."
+    )
+
+
 class RigTable(Table):
     """`[rig]`: a preset, and what differs from it."""
+
+    @model_serializer(mode="wrap")
+    def _without_a_mirror_that_is_not_given(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Recipes with a sphere keep the hash that they had before there were other mirrors."""
+        document: dict[str, Any] = serialised(self)
+        return {key: value for key, value in document.items() if key != "mirror" or value is not None}
 
     preset: Literal["default", "c310"] = Field(default="default", description="rig to start from")
     z_c_m: float | None = Field(
@@ -170,6 +193,7 @@ class RigTable(Table):
     stroke_tilt_x_rad: Tilt = Field(default=0.0, description="stroke axis turned about world x")
     stroke_tilt_y_rad: Tilt = Field(default=0.0, description="stroke axis turned about world y")
     holder: HolderTable = Field(default=HolderTable(), description="what carries the mirror")
+    mirror: MirrorTable | None = Field(default=None, description="a mirror of another shape than a sphere")
 
 
 if TYPE_CHECKING:

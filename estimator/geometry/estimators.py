@@ -5,20 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from phibench.estimator.geometry.paper_depth import depth_approx, depth_paper
+from phibench.estimator.geometry.paper_depth import depth_approx, depth_paper, depth_revolved
 from phibench.estimator.geometry.phi import CONVENTIONS
 from phibench.estimator.geometry.status import DepthEstimate
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.scenes.frames import Array
+from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig
 
 Estimator = Callable[[Rig, float, Array, Array], DepthEstimate]
 
 
 def paper_estimator(convention: str, rig: Rig, stroke_m: float, uv_down_px: Array, uv_up_px: Array) -> DepthEstimate:
-    """Eq. (4) with phi in one convention."""
+    """Eq. (4) with phi in one convention; on a mirror of revolution, with its profile."""
     phi1, phi2 = _phis(convention, rig, stroke_m, uv_down_px, uv_up_px)
-    return depth_paper(phi1, phi2, stroke_m, rig.sphere.radius_m)
+    if isinstance(rig.mirror, RevolvedMirror):
+        return depth_revolved(phi1, phi2, stroke_m, rig.mirror.profile)
+    return depth_paper(phi1, phi2, stroke_m, rig.mirror.radius_m)
 
 
 def approx_estimator(convention: str, rig: Rig, stroke_m: float, uv_down_px: Array, uv_up_px: Array) -> DepthEstimate:

@@ -25,6 +25,7 @@ from phibench.estimator.geometry.status import (
     stroke_status,
 )
 from phibench.scenes.frames import Array
+from phibench.scenes.revolved_mirror import Profile
 
 # Sine of the disparity below which two rays count as parallel: the depth would be more than 1e8 strokes.
 PARALLEL_SINE = 1e-9
@@ -80,6 +81,46 @@ def depth_paper(
         status = first_fault(_status(phi1, phi2, h, a), flag((~ahead, Status.DIVERGING)))
         sigma = propagate(_paper_gradient(a, D, h, lam, R), covariance_rad2)
     return DepthEstimate(keep(D, status), keep(sigma, status), status)
+
+
+def depth_revolved(
+    phi1_rad: ArrayLike,
+    phi2_rad: ArrayLike,
+    stroke_m: ArrayLike,
+    profile: Profile,
+    covariance_rad2: Array | None = None,
+) -> DepthEstimate:
+    """Depth by eq. (4) for a mirror of revolution.
+
+    The paper takes phi for the normal's angle as well, so that the mirror's slope at the reflection point is tan phi.
+    With r and z the radius and height of that place of the profile, the two rays meet where
+
+        D = ((h + z2 - z1) S1 S2 + r2 C2 S1 - r1 C1 S2) / sin(2 phi1 - 2 phi2),    S, C = sin, cos of 2 phi.
+
+    On a sphere r = R sin phi and z = -R cos phi, and this is eq. (4). A cone has one slope: there is no depth.
+
+    Parameters and result as for `depth_paper`; OUT_OF_RANGE where the profile has no such slope.
+    """
+    phi1, phi2, h = _inputs(phi1_rad, phi2_rad, stroke_m)
+    with np.errstate(all="ignore"):
+        a = _angles(phi1, phi2)
+        one, two = _place(phi1, profile), _place(phi2, profile)
+        D = _revolved_depth(a, h, one, two)
+        ahead = (D > one.r) & (D > two.r)
+        has_places = np.isfinite(one.r) & np.isfinite(two.r)
+        status = first_fault(
+            _status(phi1, phi2, h, a), flag((~has_places, Status.OUT_OF_RANGE), (~ahead, Status.DIVERGING))
+        )
+        sigma = propagate(_revolved_gradient(a, D, h, one, two), covariance_rad2)
+    return DepthEstimate(keep(D, status), keep(sigma, status), status)
+
+
+def revolved_gradient(phi1_rad: ArrayLike, phi2_rad: ArrayLike, stroke_m: ArrayLike, profile: Profile) -> Array:
+    """dD/d(phi1, phi2) of `depth_revolved`, shape (..., 2), metres per radian, analytic."""
+    phi1, phi2, h = _inputs(phi1_rad, phi2_rad, stroke_m)
+    with np.errstate(all="ignore"):
+        a, one, two = _angles(phi1, phi2), _place(phi1, profile), _place(phi2, profile)
+        return _revolved_gradient(a, _revolved_depth(a, h, one, two), h, one, two)
 
 
 def depth_approx(
@@ -157,6 +198,38 @@ def _paper_gradient(a: _Angles, D: Array, h: Array, lam: Array | float, R: float
         a.c2 * a.C2 * a.S1 - 2.0 * a.s2 * a.S2 * a.S1 - 2.0 * a.s1 * a.C1 * a.C2
     )
     turn = 2.0 * a.cos_disparity * D
+    return np.stack([dN1 - turn, dN2 + turn], -1) / a.sin_disparity[..., None]
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Radius and height on a profile where the normal has an angle, and their derivatives by it."""
+
+    r: Array
+    z: Array
+    r1: Array
+    z1: Array
+
+
+def _place(phi: Array, profile: Profile) -> _Place:
+    slope = np.tan(phi)
+    r = profile.radius_at_slope(slope)
+    sag = profile.sag(r * r)
+    r1 = (1.0 + slope * slope) / (2.0 * sag.slope_per_m + 4.0 * r * r * sag.bend_per_m3)
+    return _Place(r, sag.z_m, r1, slope * r1)
+
+
+def _revolved_depth(a: _Angles, h: Array, one: _Place, two: _Place) -> Array:
+    return np.asarray(((h + two.z - one.z) * a.S1 * a.S2 + two.r * a.C2 * a.S1 - one.r * a.C1 * a.S2) / a.sin_disparity)
+
+
+def _revolved_gradient(a: _Angles, D: Array, h: Array, one: _Place, two: _Place) -> Array:
+    """dD/d(phi1, phi2), shape (..., 2), of D = N / sin(disparity)."""
+    reach, turn = h + two.z - one.z, 2.0 * a.cos_disparity * D
+    dN1 = (2.0 * reach * a.C1 - one.z1 * a.S1) * a.S2 + 2.0 * two.r * a.C2 * a.C1
+    dN1 += (2.0 * one.r * a.S1 - one.r1 * a.C1) * a.S2
+    dN2 = (2.0 * reach * a.C2 + two.z1 * a.S2) * a.S1 - 2.0 * one.r * a.C1 * a.C2
+    dN2 += (two.r1 * a.C2 - 2.0 * two.r * a.S2) * a.S1
     return np.stack([dN1 - turn, dN2 + turn], -1) / a.sin_disparity[..., None]
 
 

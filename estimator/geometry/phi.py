@@ -18,6 +18,7 @@ import numpy as np
 from phibench.estimator.geometry.reflection import ON_AXIS_SINE, reflect, reflect_jacobian
 from phibench.estimator.geometry.status import Status, StatusArray, flag, keep
 from phibench.scenes.frames import Array
+from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig, View
 
 Convention = Callable[[View, Array], Array]
@@ -55,11 +56,18 @@ def phi_incidence(view: View, uv_px: Array) -> Array:
 
 
 def phi_outline(view: View, uv_px: Array) -> Array:
-    """asin(r / r_outline): an image distance taken for an orthographic one."""
+    """asin(r / r_outline): an image distance taken for an orthographic one.
+
+    On a mirror of revolution the angle of the normal at so large a part of the rim's radius.
+    """
     uv = np.asarray(uv_px, float)
     centre, radius_px = outline_circle(view.rig)
-    ratio = np.linalg.norm(uv - centre, axis=-1) / radius_px
-    return keep(np.arcsin(np.minimum(ratio, 1.0)), _outline_status(view, uv))
+    ratio = np.minimum(np.linalg.norm(uv - centre, axis=-1) / radius_px, 1.0)
+    if isinstance(view.rig.mirror, RevolvedMirror):
+        profile = view.rig.mirror.profile
+        r = ratio * profile.rim_radius_m
+        return keep(np.arctan(2.0 * r * profile.sag(r * r).slope_per_m), _outline_status(view, uv))
+    return keep(np.arcsin(ratio), _outline_status(view, uv))
 
 
 def outline_circle(rig: Rig) -> tuple[Array, float]:
@@ -85,6 +93,13 @@ def _outline_gradient(view: View, uv_px: Array) -> Array:
     centre, radius_px = outline_circle(view.rig)
     offset = np.asarray(uv_px, float) - centre
     r2 = np.sum(offset * offset, axis=-1, keepdims=True)
+    if isinstance(view.rig.mirror, RevolvedMirror):
+        profile = view.rig.mirror.profile
+        scale = profile.rim_radius_m / radius_px
+        s = r2 * scale * scale
+        sag = profile.sag(s)
+        steeper = (2.0 * sag.slope_per_m + 4.0 * s * sag.bend_per_m3) / (1.0 + 4.0 * s * sag.slope_per_m**2)
+        return offset / np.sqrt(r2) * scale * steeper
     return offset / np.sqrt(r2 * (radius_px**2 - r2))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.mirror_image import image_of
-from phibench.estimator.geometry.paper_depth import paper_gradient
+from phibench.estimator.geometry.paper_depth import paper_gradient, revolved_gradient
 from phibench.estimator.geometry.phi import CONVENTIONS, GRADIENTS
 from phibench.estimator.geometry.reflection import ray_basis, ray_slope, reflect
 from phibench.estimator.geometry.triangulate import exact_gradient
@@ -204,7 +204,12 @@ def _paper_pixel_gradient(convention: str, of_radius: float, rig: Rig, h: float,
     phi1, phi2 = (CONVENTIONS[convention](view, uv) for view, uv in zip(views, pixels, strict=True))
     with np.errstate(all="ignore"):
         slopes = [GRADIENTS[convention](view, uv) for view, uv in zip(views, pixels, strict=True)]
-    by_phi = paper_gradient(phi1, phi2, h, of_radius * rig.sphere.radius_m)
+    if isinstance(rig.mirror, RevolvedMirror):
+        by_phi = (
+            revolved_gradient(phi1, phi2, h, rig.mirror.profile) if of_radius else paper_gradient(phi1, phi2, h, 0.0)
+        )
+    else:
+        by_phi = paper_gradient(phi1, phi2, h, of_radius * rig.mirror.radius_m)
     return np.concatenate([by_phi[i] * slopes[i] for i in range(2)])
 
 
