@@ -14,6 +14,8 @@ from phibench.estimator.calibration.central_model import (
     fit_central,
     unified,
 )
+from phibench.scenes.frames import Pose
+from phibench.scenes.revolved_mirror import Profile, RevolvedMirror, hyperboloid, paraboloid
 from phibench.scenes.rig import Rig
 
 RIG = Rig()
@@ -27,12 +29,36 @@ def test_without_xi_it_is_opencvs_pinhole() -> None:
     assert model.project(POINTS * [1, 1, -1]) == pytest.approx(expected.reshape(-1, 2), abs=1e-9)
 
 
-@pytest.mark.skipif(not hasattr(cv2, "omnidir"), reason="this OpenCV has no omnidir")
 def test_against_opencvs_omnidir() -> None:
-    model = CentralModel(1.2, 500.0, 320.0, 240.0, -0.1, 0.02, np.zeros(3))
-    K, D = np.array([[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]]), np.array([[-0.1, 0.02, 0.0, 0.0]])
-    expected, _ = cv2.omnidir.projectPoints(POINTS.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), K, 1.2, D)
-    assert model.project(POINTS * [1, 1, -1]) == pytest.approx(expected.reshape(-1, 2), abs=1e-9)
+    """Projection with all parameters, and the way back."""
+    model = CentralModel(1.2, 500.0, 320.0, 240.0, -0.1, 0.02, np.zeros(3), p1=0.003, p2=-0.002)
+    K, D = np.array([[500.0, 0, 320], [0, 500.0, 240], [0, 0, 1]]), np.array([[-0.1, 0.02, 0.003, -0.002]])
+    points = POINTS.reshape(-1, 1, 3)
+    expected, _ = cv2.omnidir.projectPoints(points, np.zeros((3, 1)), np.zeros((3, 1)), K, 1.2, D)
+    uv = model.project(POINTS * [1, 1, -1])
+    assert uv == pytest.approx(expected.reshape(-1, 2), abs=1e-9)
+    ray = POINTS * [1, 1, -1] / np.linalg.norm(POINTS, axis=1, keepdims=True)
+    assert model.ray(uv) == pytest.approx(ray, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("profile", "off_m", "rms_px", "error"),
+    [
+        (hyperboloid(0.22, 1.25, 0.06), 0.0, (0.0, 1e-5), (0.0, 1e-6)),
+        (hyperboloid(0.22, 1.25, 0.06), 0.001, (0.002, 0.01), (2e-4, 2e-3)),
+        (paraboloid(0.06, 0.06), 0.0, (1e-4, 1e-3), (2e-3, 8e-3)),
+    ],
+    ids=["lens in the focus", "1 mm beside it", "paraboloid"],
+)
+def test_one_viewpoint_is_a_hyperboloids_alone(
+    profile: Profile, off_m: float, rms_px: tuple[float, float], error: tuple[float, float]
+) -> None:
+    """Only with the lens in the focus nothing is left; what is left elsewhere is measured, in halves and doubles."""
+    rig = Rig(mirror=RevolvedMirror(profile), T_camera_sphere=Pose("camera", "sphere", (off_m, 0.0, 0.22)))
+    model = fit_central(rig, is_round=off_m == 0.0)
+    assert rms_px[0] <= model.rms_px <= rms_px[1]
+    worst = np.abs(error_by_distance(rig, model, 0.5, 0.69, np.array([1.0, 2.0, 4.2]))).max()
+    assert error[0] <= worst <= error[1]
 
 
 def test_unified_is_stereographic_for_xi_one() -> None:
@@ -46,7 +72,7 @@ def test_its_own_pixels_give_its_own_depth() -> None:
     model = fit_central(RIG)
     point = model.viewpoint_world_m + [2.5, 0.0, -0.2]
     shift = np.array([0.0, 0.0, 0.5])
-    depth = depth_central(model, 0.5, model.project(point), model.project(point - shift))
+    depth = depth_central(RIG, model, 0.5, model.project(point), model.project(point - shift))
     assert depth == pytest.approx(2.5, rel=1e-9)
 
 
@@ -66,4 +92,4 @@ def test_error_uses_the_exact_pixels() -> None:
     point = np.array([3.0, 0.0, 0.5])
     down, up = true_pixel(RIG, 0.0, point), true_pixel(RIG, 0.5, point)
     (error,) = error_by_distance(RIG, model, 0.5, 0.5, np.array([3.0]))
-    assert depth_central(model, 0.5, down, up) / 3.0 - 1.0 == pytest.approx(error, abs=1e-9)
+    assert depth_central(RIG, model, 0.5, down, up) / 3.0 - 1.0 == pytest.approx(error, abs=1e-9)
