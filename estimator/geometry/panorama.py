@@ -116,7 +116,7 @@ def pixels_by_model(view: View, grid: Grid, distance_m: float = FAR_M) -> Array:
     distance_m : float
         Of the scene from the sphere centre.
     """
-    if not distance_m > view.rig.sphere.radius_m:
+    if not distance_m > view.rig.mirror.bound_m:
         raise DatasetError(f"distance of the scene = {distance_m:g} m: must be above the mirror's radius")
     points = (view.sphere_centre_m + distance_m * grid.directions()).reshape(-1, 3)
     parts = [image_of(view, points[i : i + _AT_ONCE]).uv_px for i in range(0, len(points), _AT_ONCE)]

@@ -31,6 +31,7 @@ from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.processed_bound import SpotSigma
 from phibench.estimator.spots.spot_prediction import Laser, spot_electrons_per_s
 from phibench.scenes.frames import Array
+from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import escalade360
 
@@ -173,7 +174,7 @@ def causes(
 def _fault(rig: Rig, points_m: Array, uv_px: Array, offset_m: float, around: Surroundings) -> str:
     """Cause that the rig at one offset does not see all of the points, which it has at pixels (m, 2)."""
     view = rig.at(offset_m)
-    if view.sphere_centre_m[2] + rig.sphere.radius_m > around.room_height_m:
+    if view.sphere_centre_m[2] + rig.mirror.bound_m > around.room_height_m:
         return CEILING
     if not np.isfinite(uv_px).all():
         return NO_IMAGE
@@ -216,10 +217,19 @@ def _covariance(image: MirrorImage, spot: SpotSigma, electrons: Array) -> Array:
 
 
 def _outline_distance_px(rig: Rig, uv_px: Array) -> Array:
-    """Distance of pixels, shape (m, 2), from the mirror's outline, inwards: angle times focal length."""
+    """Distance of pixels, shape (m, 2), from the mirror's outline, inwards: angle times focal length.
+
+    That of a mirror of revolution is a polygon in the image.
+    """
+    if isinstance(rig.mirror, RevolvedMirror):
+        corners = rig.outline_px()
+        side, to = np.roll(corners, -1, axis=0) - corners, uv_px[:, None] - corners
+        share = np.clip(np.sum(to * side, axis=-1) / np.sum(side * side, axis=-1), 0.0, 1.0)
+        near = np.linalg.norm(to - share[..., None] * side, axis=-1).min(axis=-1)
+        return np.where(reflect(rig.at(0.0), uv_px).status == Status.OK, near, -near)
     centre = rig.sphere_in_camera_m
     away = np.arccos(np.clip(rig.camera.rays(uv_px) @ centre / np.linalg.norm(centre), -1.0, 1.0))
-    rim = math.asin(rig.sphere.radius_m / float(np.linalg.norm(centre)))
+    rim = math.asin(rig.mirror.radius_m / float(np.linalg.norm(centre)))
     return np.asarray((rim - away) * rig.camera.fx_px)
 
 

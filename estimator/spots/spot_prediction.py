@@ -23,10 +23,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from phibench.estimator.geometry.mirror_image import MirrorImage, image_of
-from phibench.estimator.geometry.reflection import reflect
+from phibench.estimator.geometry.reflection import ON_AXIS_SINE, Reflection, reflect
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import Beam
+from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.rig import Rig, View
 
 
@@ -67,16 +68,33 @@ def _point_m(view: View, uv_px: Array, depth_m: float) -> Array | None:
 
 def _defocus_px2(view: View, uv_px: Array, point_m: Array | None) -> Array:
     """Second moments that defocus and astigmatism add, shape (2, 2); NaN where the pixel does not see the mirror."""
-    rig, camera, into_camera = view.rig, view.rig.camera, view.T_world_camera.inverse()
+    camera, into_camera = view.rig.camera, view.T_world_camera.inverse()
     hit = reflect(view, uv_px)
     cosine = np.cos(float(hit.incidence_rad))
     vergence = 0.0 if point_m is None else 1.0 / float(np.linalg.norm(point_m - hit.origin_world_m))
-    behind = 1.0 / (vergence + 2.0 / rig.sphere.radius_m * np.array([1.0 / cosine, cosine]))
+    with np.errstate(divide="ignore"):  # a cone is flat along its side
+        behind = 1.0 / (vergence + 2.0 * _curvatures(view, hit) * np.array([1.0 / cosine, cosine]))
     ahead_m = into_camera.points(hit.origin_world_m)[2] + behind * camera.rays(uv_px)[2]
     disc = camera.fx_px * camera.aperture_radius_m * (1.0 / ahead_m - 1.0 / camera.focus_distance_m)
     away = uv_px - camera.project(into_camera.points(view.sphere_centre_m))
     along = np.outer(away, away) / max(float(away @ away), 1e-12)  # the radial direction
     return np.asarray(0.25 * (disc[0] ** 2 * along + disc[1] ** 2 * (np.eye(2) - along)))
+
+
+def _curvatures(view: View, hit: Reflection) -> Array:
+    """Curvatures of the mirror, 1/m, shape (2,), in the plane of incidence and across it, where a ray meets it."""
+    mirror = view.rig.mirror
+    if isinstance(mirror, SphereMirror):
+        return np.full(2, 1.0 / mirror.radius_m)
+    axes, n = view.T_world_sphere.R, hit.normal_world
+    surface = mirror.level((hit.origin_world_m - view.sphere_centre_m) @ axes)
+    K = axes @ surface.hessian_per_m @ axes.T / np.linalg.norm(surface.gradient)
+    across = np.cross(n, hit.direction_world)
+    if np.linalg.norm(across) < ON_AXIS_SINE:
+        across = np.cross(n, axes[:, 0])
+    across = across / np.linalg.norm(across)
+    along = np.cross(across, n)
+    return np.array([along @ K @ along, across @ K @ across])
 
 
 def _beam_px2(view: View, point_m: Array, diameter_m: float) -> Array:
