@@ -1,4 +1,4 @@
-"""Spherical mirror: radius, form error, roughness, and reflectance of its steel.
+"""Spherical mirror: radius, form error and roughness.
 
 The form error adds low-order harmonics to the sphere's radius. The surface is r(n) = R + sum of c_k h_k(n), with
 n = (x, y, z) a unit direction in the sphere's own frame (`T_camera_sphere`). `Rig.perturbed` lays its axes along the
@@ -17,10 +17,6 @@ and degree 1, to first order, a decentre: both are parameters already.
 On the unit sphere a harmonic of degree l is a homogeneous polynomial H of degree l (x^2 + y^2 + z^2 = 1 makes the terms
 equal in degree). Off the surface it is continued as H(P) / |P|^l, and the surface is the zero of the level function
 g(P) = |P| - R - H2(P) / |P|^2 - H3(P) / |P|^3.
-
-Source of the steel's constants: austenitic stainless steel (about 316), B. Karlsson and C. G. Ribbing,
-"Optical constants and spectral selectivity of stainless steel and its oxides", J. Appl. Phys. 53, 6340 (1982),
-read from a figure, good to 1 to 2 %.
 """
 
 from __future__ import annotations
@@ -33,6 +29,7 @@ from functools import cache, cached_property
 import numpy as np
 
 from phibench.scenes.frames import Array
+from phibench.scenes.metals import MetalName, MetalSurface, known_metal
 from phibench.scenes.validation import SceneError, finite, positive, within
 
 _A, _B = 3.0 * math.sqrt(15.0) / 16.0, 3.0 * math.sqrt(3.0) / 2.0
@@ -192,59 +189,13 @@ def _symmetric(monomial: str, coefficient: float) -> Array:
     return result
 
 
-# The mirror and its steel: wavelength in nm, n, k.
-STEEL = np.array(
-    [
-        [400, 1.5249, 2.7925],
-        [420, 1.5762, 2.9240],
-        [440, 1.6386, 3.0555],
-        [460, 1.7169, 3.1785],
-        [480, 1.7921, 3.2933],
-        [500, 1.8636, 3.4010],
-        [520, 1.9349, 3.5072],
-        [540, 2.0072, 3.6166],
-        [560, 2.0807, 3.7298],
-        [580, 2.1557, 3.8451],
-        [600, 2.2325, 3.9594],
-        [620, 2.3122, 4.0504],
-        [640, 2.3962, 4.1378],
-        [660, 2.4839, 4.2261],
-        [680, 2.5731, 4.3155],
-        [700, 2.6617, 4.4066],
-    ]
-)
-STEEL.setflags(write=False)
-
 _LEAST_CURVATURE = 0.5  # times 1/R: convex with a margin, so that every point has one image at most
 _PLACES = 500  # where the curvature is looked at, 9 degrees apart: peaks of degree 3 are missed by 5 % at most
 
 
-class Metal:
-    """Reflectance of polished stainless steel: what mirrors of every shape share."""
-
-    roughness_alpha: float
-
-    def refractive_index(self, wavelength_nm: float) -> complex:
-        """Complex index n + i k of the steel, linear between the table's wavelengths (400 to 700 nm)."""
-        if not STEEL[0, 0] <= wavelength_nm <= STEEL[-1, 0]:
-            raise SceneError(f"wavelength_nm = {wavelength_nm}: the steel's table covers 400 to 700 nm")
-        n, k = (float(np.interp(wavelength_nm, STEEL[:, 0], STEEL[:, i])) for i in (1, 2))
-        return complex(n, k)
-
-    def reflectance(self, cos_incidence: Array, wavelength_nm: float) -> Array:
-        """Unpolarised Fresnel power reflectance, shape of `cos_incidence` (cosine of the angle of incidence)."""
-        m2 = self.refractive_index(wavelength_nm) ** 2
-        cos_i = np.asarray(cos_incidence, float)
-        with np.errstate(invalid="ignore"):  # NaN in, NaN out
-            root = np.sqrt(m2 - (1.0 - cos_i * cos_i))
-            r_s = (cos_i - root) / (cos_i + root)
-            r_p = (m2 * cos_i - root) / (m2 * cos_i + root)
-        return 0.5 * (np.abs(r_s) ** 2 + np.abs(r_p) ** 2)
-
-
 @dataclass(frozen=True)
-class SphereMirror(Metal):
-    """A polished stainless-steel sphere.
+class SphereMirror(MetalSurface):
+    """A polished metal sphere.
 
     Parameters
     ----------
@@ -253,15 +204,18 @@ class SphereMirror(Metal):
         Beckmann roughness (rms slope x sqrt 2); 0 is an ideal mirror, 0.005 blurs by about 1 px.
     form : Form or None
         Deviations from the sphere; None is a perfect one, and so is a `Form` whose numbers are all 0.
+    metal : "steel", "aluminium" or "gold"
     """
 
     radius_m: float = 0.060
     roughness_alpha: float = 0.0
     form: Form | None = None
+    metal: MetalName = "steel"
 
     def __post_init__(self) -> None:
         positive("SphereMirror", "radius_m", self.radius_m)
         within("SphereMirror", "roughness_alpha", self.roughness_alpha, 0.0, 0.05)
+        known_metal("SphereMirror", self.metal)
         if self.form is None:
             return
         if not any(self.form.coefficients_m):

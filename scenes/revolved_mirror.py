@@ -27,7 +27,8 @@ from typing import Literal
 import numpy as np
 
 from phibench.scenes.frames import Array
-from phibench.scenes.mirror import Level, Metal
+from phibench.scenes.metals import MetalName, MetalSurface, known_metal
+from phibench.scenes.mirror import Level
 from phibench.scenes.validation import SceneError, finite, positive, within
 
 Shape = Literal["sphere", "ellipsoid", "paraboloid", "hyperboloid", "cone", "polynomial"]
@@ -243,7 +244,7 @@ def image_depth_m(profile: Profile) -> float:
 
 
 @dataclass(frozen=True)
-class RevolvedMirror(Metal):
+class RevolvedMirror(MetalSurface):
     """A polished mirror of revolution.
 
     Parameters
@@ -251,13 +252,16 @@ class RevolvedMirror(Metal):
     profile : Profile
     roughness_alpha : float
         Beckmann roughness; 0 is an ideal mirror.
+    metal : "steel", "aluminium" or "gold"
     """
 
     profile: Profile
     roughness_alpha: float = 0.0
+    metal: MetalName = "steel"
 
     def __post_init__(self) -> None:
         within("RevolvedMirror", "roughness_alpha", self.roughness_alpha, 0.0, 0.05)
+        known_metal("RevolvedMirror", self.metal)
 
     @property
     def bound_m(self) -> float:

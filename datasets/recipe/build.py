@@ -95,7 +95,7 @@ def _rig(table: RigTable) -> Rig:
     base = RIGS[table.preset]()
     if table.mirror is not None:
         return _revolved_rig(table, table.mirror, base)
-    mirror = replace(base.sphere, **_given(table, ("radius_m", "roughness_alpha")))
+    mirror = replace(base.sphere, **_given(table, ("radius_m", "roughness_alpha", "metal")))
     z_c_m = base.sphere_in_camera_m[2] if table.z_c_m is None else table.z_c_m
     T_world_camera, T_camera_sphere = _poses(table, base, z_c_m)
     before_m = min(T_camera_sphere.translation_m[2], float(np.linalg.norm(T_camera_sphere.t)))
@@ -160,7 +160,7 @@ def _revolved_rig(table: RigTable, mirror: MirrorTable, base: Rig) -> Rig:
         raise SceneError(f"rig.holder.kind = {table.holder.kind}: carries a sphere; remove it for a {mirror.shape}")
     vertex_m = _VERTEX_M if table.z_c_m is None else table.z_c_m
     profile = build_profile(mirror, vertex_m)
-    given = _given(table, ("roughness_alpha",))
+    given = _given(table, ("roughness_alpha", "metal"))
     T_world_camera, T_camera_sphere = _poses(table, base, vertex_m)
     T_camera_mirror = replace(T_camera_sphere, rotation=as_matrix(T_world_camera.R.T))
     camera = _focused(_camera(base.camera, table), table, vertex_m + image_depth_m(profile))

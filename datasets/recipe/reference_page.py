@@ -119,17 +119,15 @@ the sphere centre. Rods, column and tube must stand beside the mirror and within
 are a tube's alone.
 """,
     "[rig.mirror]": """A mirror of revolution instead of the sphere; see `docs/mirrors.md`. `z_c_m` is then
-the distance from the lens centre to the vertex; 0.22 m where it is not given. The mirror's axis is upright, and its
-metal is steel. The surface is z = s / (R + sqrt(R^2 - (1 + k) s)) + a_2 s^2 + a_3 s^3 + ..., with s the square of the
+the distance from the lens centre to the vertex; 0.22 m where it is not given. The mirror's axis is upright.
+The surface is z = s / (R + sqrt(R^2 - (1 + k) s)) + a_2 s^2 + a_3 s^3 + ..., with s the square of the
 distance from the axis.
 
-| `shape` | keys | what is not given |
-|---|---|---|
-| `ellipsoid` | `vertex_radius_m`, `conic` above -1 | R = 0.06 m, k = -0.5 |
-| `paraboloid` | `vertex_radius_m` | R = 0.06 m |
-| `hyperboloid` | `vertex_radius_m`, `conic` below -1 | k = -1.5625, R puts the lens in the outer focus |
-| `cone` | `half_angle_deg` | 45 |
-| `polynomial` | `vertex_radius_m`, `conic`, `even_terms` | R = 0.06 m, k = -1 |
+* An ellipsoid has `vertex_radius_m` (0.06 where not given) and `conic` above -1 (-0.5).
+* A paraboloid has `vertex_radius_m` (0.06).
+* A hyperboloid has `conic` below -1 (-1.5625). Without `vertex_radius_m` the lens is in its outer focus.
+* A cone has `half_angle_deg` (45).
+* A polynomial has `vertex_radius_m` (0.06), `conic` (-1) and `even_terms`, which must be given.
 
 It has no holder, and no form error.
 """,

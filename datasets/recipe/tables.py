@@ -31,6 +31,7 @@ from phibench.datasets.recipe.distributions import (
 from phibench.datasets.recipe.room_tables import RoomsTable, RoomTable
 from phibench.scenes.catalog import BOARD_SIZE_M
 from phibench.scenes.holder import LARGEST_INDEX, OF_TUBES
+from phibench.scenes.metals import MetalName
 from phibench.scenes.misalignment import PARAMETERS
 
 MIN_STROKE_M, MAX_STROKE_M = 1e-3, 10.0
@@ -146,10 +147,10 @@ class RigTable(Table):
     """`[rig]`: a preset, and what differs from it."""
 
     @model_serializer(mode="wrap")
-    def _without_a_mirror_that_is_not_given(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Recipes with a sphere keep the hash that they had before there were other mirrors."""
+    def _without_what_is_not_given(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Recipes with a sphere of steel keep the hash that they had before there were other mirrors."""
         document: dict[str, Any] = serialised(self)
-        return {key: value for key, value in document.items() if key != "mirror" or value is not None}
+        return {key: value for key, value in document.items() if key not in ("mirror", "metal") or value is not None}
 
     preset: Literal["default", "c310"] = Field(default="default", description="rig to start from")
     z_c_m: float | None = Field(
@@ -162,6 +163,7 @@ class RigTable(Table):
     roughness_alpha: float | None = Field(
         default=None, ge=0.0, le=0.05, description="Beckmann roughness of the mirror; 0 is ideal"
     )
+    metal: MetalName | None = Field(default=None, description='metal of the mirror; "steel" where not given')
     width_px: int | None = Field(default=None, ge=16, le=8192, description="image width")
     height_px: int | None = Field(default=None, ge=16, le=8192, description="image height")
     pixel_pitch_um: float | None = Field(default=None, gt=0.0, le=100.0, description="pixel pitch")

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from phibench.render.room.camera_plugin import MM_PER_M, sensor_dict
 from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Array, Vector
-from phibench.scenes.mirror import Metal, deviation, level
+from phibench.scenes.metals import MetalSurface
+from phibench.scenes.mirror import deviation, level
 from phibench.scenes.rig import View
 from phibench.scenes.room import MIRROR_NAME, Room
 from phibench.scenes.shapes import Cuboid, Rectangle, Shape
@@ -170,7 +171,7 @@ def _mirror_mesh(mi: ModuleType, view: View) -> Any:
     return form_mesh(mi, view, MIRROR_NAME, mi.load_dict(bsdf))
 
 
-def mirror_bsdf(mirror: Metal, wavelengths_nm: Vector) -> dict[str, Any]:
+def mirror_bsdf(mirror: MetalSurface, wavelengths_nm: Vector) -> dict[str, Any]:
     """Smooth or rough conductor with the steel's n and k at the three bands' wavelengths."""
     index = [mirror.refractive_index(nm) for nm in wavelengths_nm]
     entry: dict[str, Any] = {"eta": _rgb([m.real for m in index]), "k": _rgb([m.imag for m in index])}

@@ -13,7 +13,8 @@ from phibench.scenes.camera import Camera
 from phibench.scenes.catalog import c310_rig, lab
 from phibench.scenes.frames import Pose, rotation_facing, rotation_xyz
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
-from phibench.scenes.mirror import STEEL, SphereMirror
+from phibench.scenes.metals import METALS, STEEL
+from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.rig import POSITIONS, Rig, Stroke
 from phibench.scenes.textures import Uniform
 from phibench.scenes.validation import SceneError
@@ -194,6 +195,23 @@ def test_reflectance_against_real_arithmetic(wavelength_nm):
 def test_reflectance_of_the_steel(degrees, percent):
     reflectance = SphereMirror().reflectance(np.cos(np.radians(degrees)), 650.0)
     assert 100 * reflectance == pytest.approx(percent, abs=0.05)  # docs/model.md has one decimal
+
+
+@pytest.mark.parametrize(
+    ("metal", "wavelength_nm", "percent"),
+    [("aluminium", 450.0, 92.2), ("aluminium", 650.0, 90.5), ("gold", 450.0, 40.0), ("gold", 650.0, 96.6)],
+)
+def test_reflectance_of_evaporated_films(metal, wavelength_nm, percent):
+    """Handbook values at normal incidence of evaporated films; tables of different authors differ by 1 %."""
+    reflectance = SphereMirror(metal=metal).reflectance(np.ones(1), wavelength_nm)[0]
+    assert 100 * reflectance == pytest.approx(percent, abs=1.0)
+    assert METALS[metal][0, 0] <= 400.0
+    assert METALS[metal][-1, 0] >= 700.0
+
+
+def test_an_unknown_metal_is_refused_in_a_sentence():
+    with pytest.raises(SceneError, match="known are steel, aluminium, gold"):
+        SphereMirror(metal="brass")
 
 
 def test_index_is_the_table_and_linear_between():
