@@ -4,7 +4,8 @@
   stainless steel and its oxides", J. Appl. Phys. 53, 6340 (1982), read from a figure, good to 1 to 2 %.
 * Aluminium, evaporated: A. D. Rakic, "Algorithm for the determination of intrinsic optical constants of metal films:
   application to aluminum", Appl. Opt. 34, 4755 (1995).
-* Gold, evaporated: P. B. Johnson and R. W. Christy, "Optical constants of the noble metals", Phys. Rev. B 6, 4370 (1972).
+* Gold, evaporated: P. B. Johnson and R. W. Christy, "Optical constants of the noble metals", Phys. Rev. B 6, 4370
+  (1972).
 
 A polished or oxidised surface reflects less than an evaporated film.
 """

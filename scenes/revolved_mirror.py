@@ -110,8 +110,8 @@ class Profile:
             return
         at = float(np.sqrt(s[np.argmin(curved & (sag.slope_per_m > 0.0))]))
         raise SceneError(
-            f"Profile: the surface is not convex towards the camera at {at:.4g} m from the axis; change conic or "
-            "even_terms, or end the mirror before, with rim_radius_m"
+            f"Profile.even_terms = {list(self.even_terms)}: the surface is not convex towards the camera at {at:.4g} m "
+            "from the axis; change it or conic, or end the mirror before, with rim_radius_m"
         )
 
     @property

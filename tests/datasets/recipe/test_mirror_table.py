@@ -1,0 +1,95 @@
+"""`[rig.mirror]`: what it builds, which keys go together, and that spheres stay what they were."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.room_files import recipe
+
+from phibench.datasets.errors import RecipeError
+from phibench.datasets.recipe.build import MIRROR_SHAPES, build_rig
+from phibench.datasets.recipe.load import check_recipe
+from phibench.datasets.recipe.tables import MirrorTable, RigTable
+from phibench.datasets.store.documents import from_json, to_json
+from phibench.scenes.revolved_mirror import RevolvedMirror
+from phibench.scenes.rig import Rig
+
+SHAPES: dict[str, dict[str, Any]] = {
+    "ellipsoid": {},
+    "paraboloid": {"vertex_radius_m": 0.05},
+    "hyperboloid": {},
+    "cone": {"half_angle_deg": 50.0},
+    "polynomial": {"even_terms": [20.0, 300.0]},
+}
+
+
+def table(**rig: Any) -> RigTable:
+    return RigTable.model_validate(rig)
+
+
+def profile_of(rig: Rig) -> Any:
+    assert isinstance(rig.mirror, RevolvedMirror)
+    return rig.mirror.profile
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_every_shape_is_built_fits_the_image_and_survives_its_file(shape: str) -> None:
+    rig = build_rig(table(mirror={"shape": shape, **SHAPES[shape]}, tilt_x_rad=0.01, decentre_x_m=0.002))
+    assert profile_of(rig).shape == shape
+    assert build_rig(table(mirror={"shape": shape, **SHAPES[shape]})).fits_image()
+    assert from_json(Rig, to_json(rig)) == rig
+    # the camera is tilted, and the mirror's axis stays upright
+    assert rig.at(0.0).T_world_sphere.R[:, 2] == pytest.approx([0.0, 0.0, 1.0], abs=1e-15)
+    assert rig.at(0.0).sphere_centre_m - rig.at(0.0).camera_centre_m == pytest.approx([0.002, 0.0, 0.22], abs=1e-15)
+    assert rig.camera.focus_distance_m > 0.22
+
+
+@pytest.mark.parametrize("z_c_m", [0.2, 0.3])
+def test_the_lens_is_in_the_focus_of_a_hyperboloid(z_c_m: float) -> None:
+    """The foci of s - 2 R z + (1 + k) z^2 = 0 are at z = R / (1 + e) and R / (1 - e), e^2 = -k."""
+    profile = profile_of(build_rig(table(z_c_m=z_c_m, mirror={"shape": "hyperboloid"})))
+    assert profile.vertex_radius_m / (1.0 - np.sqrt(-profile.conic)) == pytest.approx(-z_c_m, rel=1e-12)
+
+
+def test_every_key_has_its_shapes() -> None:
+    assert set(MIRROR_SHAPES) == set(MirrorTable.model_fields) - {"shape", "rim_radius_m"}
+
+
+@pytest.mark.parametrize(
+    ("rig", "begin"),
+    [
+        ({"mirror": {"shape": "cone", "conic": -2.0}}, 'rig.mirror.conic: has no effect on shape = "cone"'),
+        ({"mirror": {"shape": "paraboloid", "half_angle_deg": 40.0}}, "rig.mirror.half_angle_deg: has no effect"),
+        ({"mirror": {"shape": "polynomial"}}, "rig.mirror.even_terms: is missing"),
+        ({"mirror": {"shape": "torus"}}, "rig.mirror.shape: 'torus' is not allowed; give one of 'ellipsoid'"),
+        ({"mirror": {"rim_radius_m": 0.05}}, "rig.mirror.shape: missing"),
+        ({"mirror": {"shape": "hyperboloid", "conic": -0.5}}, "rig.mirror.conic: -0.5: below -1 for shape"),
+        ({"mirror": {"shape": "ellipsoid", "conic": -1.5}}, "rig.mirror.conic: -1.5: above -1 for shape"),
+        ({"mirror": {"shape": "ellipsoid", "rim_radius_m": 0.09}}, "rig.mirror.rim_radius_m: 0.09: the surface folds"),
+        (
+            {"mirror": {"shape": "polynomial", "even_terms": [-500.0]}},
+            "rig.mirror.even_terms: [-500.0]: the surface is",
+        ),
+        ({"radius_m": 0.05, "mirror": {"shape": "cone"}}, "rig.radius_m: 0.05: is a sphere's"),
+        ({"holder": {"kind": "rods"}, "mirror": {"shape": "cone"}}, "rig.holder.kind: rods: carries a sphere"),
+        ({"metal": "brass"}, "rig.metal: 'brass' is not allowed; give one of 'steel'"),
+    ],
+)
+def test_what_does_not_go_together_is_one_sentence(rig: dict[str, Any], begin: str) -> None:
+    raw = recipe(panoramas=[], meshes=[], count=1)
+    raw["rig"] = {**raw.get("rig", {}), **rig}
+    with pytest.raises(RecipeError) as caught:
+        check_recipe(raw)
+    _, line = str(caught.value).splitlines()
+    assert line.startswith(f"  {begin}")
+
+
+def test_a_sphere_of_steel_says_nothing_of_shape_or_metal() -> None:
+    """Hashes of recipes and of rigs stay what they were."""
+    assert not {"mirror", "metal"} & table(radius_m=0.05).model_dump().keys()
+    assert "metal" not in to_json(build_rig(table()))["mirror"]
+    gold = build_rig(table(metal="gold"))
+    assert to_json(gold)["mirror"]["metal"] == "gold"
+    assert from_json(Rig, to_json(gold)) == gold
