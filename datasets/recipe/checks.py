@@ -141,7 +141,7 @@ def _purpose(raw: Raw) -> Iterator[Fault]:
     misspelt = [key for key in raw if key not in tables and set(close_names(key, tables)) & {"experiments", "random"}]
     if len(given) == 2:
         yield Fault("random", "given together with [[experiments]]; give one or the other")
-    elif raw.get("experiments") == [] or not (given or misspelt):
+    elif raw.get("experiments") == [] or not (given or misspelt or "rooms" in raw):  # [rooms] says what it needs
         what = "empty" if given else "missing"
         yield Fault("experiments", f"{what}; add [[experiments]] (which targets with which strokes) or [random]")
     if "random" in raw and table_of(raw, "rigs"):

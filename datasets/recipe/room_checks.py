@@ -35,7 +35,7 @@ def room_faults(raw: Raw) -> Iterator[Fault]:
     if "room" in raw:
         yield Fault("room", "given together with [rooms]; give one or the other")
     if "random" not in raw:
-        yield Fault("rooms", "given without [random]; rooms of their own are for samples that are drawn")
+        yield Fault("rooms", "given without [random]; rooms of their own are for samples that are drawn, add [random]")
     elif "azimuth_deg" not in table_of(raw, "random", "spot"):
         yield Fault("random.spot.azimuth_deg", "missing; in these rooms a ray finds the spot, give its azimuth_deg")
     yield from _counts(raw)
