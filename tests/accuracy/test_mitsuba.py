@@ -19,7 +19,7 @@ from phibench.render.optics.truth import spot_truth, truth_layer
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.camera_plugin import MM_PER_M, sensor_dict
 from phibench.render.room.light_map import BakeSettings, bake
-from phibench.render.room.scene import load_scene, mirror_dict, scene_dict, to_scene_mm
+from phibench.render.room.scene import load_scene, mirror_entry, scene_dict, to_scene_mm
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera, Detector
 from phibench.scenes.catalog import c310_camera, default_rig, lab
@@ -133,7 +133,7 @@ def _spot_scene(mi: ModuleType, view: View, spot: LaserSpot, crop: tuple[int, in
         "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.0, 0.0, 0.0]}},
     }
     sensor = sensor_dict(mi, view, crop) | {"sampler": {"type": "independent"}}
-    return load_scene(mi, {"type": "scene", "sensor": sensor, "mirror": mirror_dict(mi, view), "spot": disk})
+    return load_scene(mi, {"type": "scene", "sensor": sensor, "mirror": mirror_entry(mi, view), "spot": disk})
 
 
 def _brute_force(
