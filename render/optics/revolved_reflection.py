@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from phibench.scenes.frames import Array
 from phibench.scenes.revolved_mirror import Profile
 
-_PLANE_STEPS = 80  # bisection alone would need 55; Newton takes 5 to 8
+_PLANE_STEPS = 80  # bisection alone would need 55; Newton takes 3 to 5
 _STEPS = 30  # 2 to 5 do
 _BEYOND = 1.05  # rim radii: where the search ends, unless the equator comes first
 _EQUATOR = 0.999999
 _LONGEST = 0.3  # step, in rim radii
 _CLOSE = 1e-9  # of the rim's radius: the step after that would be its square
 _FOUND = 1e-6
-_STRAIGHT = 1e-15  # of the rim's radius: where bisection ends
+_START = 1e-6  # of the rim's radius: where the search in the half-plane ends; the one in two coordinates goes on
 
 
 def revolved_points(points_m: Array, eyes_m: Array, profile: Profile) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -90,7 +90,7 @@ def _in_meridian(point: Plane, eye: Plane, profile: Profile) -> Array:
         low, high = np.where(f < 0.0, r, low), np.where(f > 0.0, r, high)
         step = r - f / bend
         new = np.where((step >= low) & (step <= high), step, 0.5 * (low + high))
-        moving = np.abs(new - r) > _STRAIGHT * profile.rim_radius_m
+        moving = np.abs(new - r) > _START * profile.rim_radius_m
         r = new
         if not moving.any():
             break

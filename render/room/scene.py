@@ -6,9 +6,11 @@ Layers are per filter, no measured spectra of the room's materials exist, and th
 elsewhere: a spectral variant would add colour noise for no gain in truth. The steel's n and k are taken at each band's
 wavelength.
 
-A mirror with a form error is a triangle mesh, for the reference by path tracing alone. Facets 0.4 degrees wide lie
-within R (0.4 degrees)^2 / 8 = 0.4 micrometres of the surface. The normals, which steer the reflection, are those of the
-surface at the corners and interpolated between.
+A mirror that is no perfect sphere is a triangle mesh, for the reference by path tracing alone. The normals, which steer
+the reflection, are those of the surface at the corners and interpolated between. With e the side of a facet and k the
+curvature, facets lie within k e^2 / 8 of the surface. With a form error e is R (0.4 degrees): 0.4 micrometres. The cap
+of a mirror of revolution has facets of 0.4 degrees around the axis and of pi / 900 rim radii along it: 0.4 micrometres
+for a rim radius of 60 mm. Interpolated normals err by some (0.4 degrees)^2 / 8 = 6e-6 rad, which is 0.002 px.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ from phibench.render.room.camera_plugin import MM_PER_M, sensor_dict
 from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Array, Vector
 from phibench.scenes.metals import MetalSurface
-from phibench.scenes.mirror import deviation, level
+from phibench.scenes.mirror import SphereMirror, deviation, level
+from phibench.scenes.revolved_mirror import Profile, RevolvedMirror
 from phibench.scenes.rig import View
 from phibench.scenes.room import MIRROR_NAME, Room
 from phibench.scenes.shapes import Cuboid, Rectangle, Shape
@@ -32,49 +35,82 @@ from phibench.scenes.textures import Bitmap, Texture, Uniform
 _RINGS, _SPOKES = 450, 900  # 0.4 degrees apart
 
 
-def form_mesh(mi: ModuleType, view: View, name: str, bsdf: Any) -> Any:
-    """Mesh in the scene's coordinates: millimetres, world axes, the sphere centre at the origin."""
-    mirror, axes = view.rig.sphere, view.T_world_sphere.R
-    assert mirror.form is not None
-    n = _directions()
-    points = (mirror.radius_m + deviation(n, mirror.form).value_m)[:, None] * n
-    normals = level(points, mirror.radius_m, mirror.form).gradient
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+def grid_mesh(mi: ModuleType, view: View, points_m: Array, normals: Array, bsdf: Any, *, closed: bool) -> Any:
+    """Mesh in the scene's coordinates of a grid of points in the mirror's frame.
+
+    Parameters
+    ----------
+    points_m, normals : arrays, shape (rings, spokes, 3)
+        Outside is where spokes times rings point: the side that mirrors.
+    bsdf
+    closed : bool
+        Whether the last spoke has the first beside it.
+    """
+    axes, (rings, spokes, _) = view.T_world_sphere.R, points_m.shape
     props = mi.Properties()
     props["bsdf"] = bsdf
-    triangles = _triangles()
-    mesh = mi.Mesh(name, len(n), len(triangles), has_vertex_normals=True, props=props)
+    triangles = _triangles(rings, spokes, closed)
+    mesh = mi.Mesh(MIRROR_NAME, rings * spokes, len(triangles), has_vertex_normals=True, props=props)
     buffers = mi.traverse(mesh)
-    buffers["vertex_positions"] = (MM_PER_M * points @ axes.T).ravel().astype(np.float32)
+    buffers["vertex_positions"] = (MM_PER_M * points_m @ axes.T).ravel().astype(np.float32)
     buffers["vertex_normals"] = (normals @ axes.T).ravel().astype(np.float32)
     buffers["faces"] = triangles.ravel()
     buffers.update()
     return mesh
 
 
-def _directions() -> Array:
-    """Unit vectors on rings from pole to pole, shape (rings * spokes, 3)."""
+def _triangles(rings: int, spokes: int, closed: bool) -> NDArray[np.uint32]:
+    """Corners of the triangles between the rings, outside first, shape (n, 3)."""
+    ring, spoke = np.mgrid[0 : rings - 1, 0 : spokes - (not closed)]
+    a, b = spokes * ring + spoke, spokes * ring + (spoke + 1) % spokes
+    c, d = a + spokes, b + spokes
+    return np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)]).reshape(-1, 3).astype(np.uint32)
+
+
+def form_grid(mirror: SphereMirror) -> tuple[Array, Array]:
+    """Points and outward unit normals of a mirror with a form error, from pole to pole, shape (rings, spokes, 3)."""
+    assert mirror.form is not None
     polar = np.linspace(0.0, np.pi, _RINGS)[:, None]
     turn = np.linspace(0.0, 2.0 * np.pi, _SPOKES, endpoint=False)
     grid = np.broadcast_arrays(np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar))
-    return np.stack(grid, axis=-1).reshape(-1, 3)
+    n = np.stack(grid, axis=-1)
+    points = (mirror.radius_m + deviation(n, mirror.form).value_m)[..., None] * n
+    normals = level(points, mirror.radius_m, mirror.form).gradient
+    return points, normals / np.linalg.norm(normals, axis=-1, keepdims=True)
 
 
-def _triangles() -> NDArray[np.uint32]:
-    """Corners of the triangles between the rings, outside first, shape (n, 3)."""
-    ring, spoke = np.mgrid[0 : _RINGS - 1, 0:_SPOKES]
-    a, b = _SPOKES * ring + spoke, _SPOKES * ring + (spoke + 1) % _SPOKES
-    c, d = a + _SPOKES, b + _SPOKES
-    return np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)]).reshape(-1, 3).astype(np.uint32)
+def cap_grid(profile: Profile, radii_m: Array, turns_rad: Array) -> tuple[Array, Array]:
+    """Points and unit normals of a mirror of revolution, shape (rings, spokes, 3), for falling radii."""
+    sag = profile.sag(radii_m**2)
+    # a cone's tip has the normals of all its spokes
+    rise = (
+        2.0 * radii_m * sag.slope_per_m
+        if profile.shape != "cone"
+        else np.full_like(radii_m, (-1.0 - profile.conic) ** -0.5)
+    )
+    across = np.stack([np.cos(turns_rad), np.sin(turns_rad)], axis=-1)
+
+    def grid(flat: Array, z: Array) -> Array:
+        tall = np.broadcast_to(z[:, None, None], (len(radii_m), len(turns_rad), 1))
+        return np.concatenate([flat[:, None, None] * across, tall], axis=-1)
+
+    normals = grid(rise, np.full_like(rise, -1.0))
+    return grid(radii_m, sag.z_m), normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+
+
+def cap_places(profile: Profile) -> tuple[Array, Array]:
+    """Radii and turns of the whole cap's grid: rings lie closer towards the rim, where the surface may be steep."""
+    angle = np.linspace(0.5 * np.pi, 0.0, _RINGS)
+    return profile.rim_radius_m * np.sin(angle), np.linspace(0.0, 2.0 * np.pi, _SPOKES, endpoint=False)
 
 
 def scene_dict(mi: ModuleType, view: View, room: Room, crop: tuple[int, int, int, int] | None = None) -> dict[str, Any]:
     """Whole scene of one view: sensor, mirror, and every shape of the room under its name.
 
-    A mirror with a form error is a fine mesh.
+    A mirror that is no perfect sphere is a fine mesh.
     """
     scene: dict[str, Any] = {"type": "scene", "sensor": sensor_dict(mi, view, crop)}
-    scene[MIRROR_NAME] = mirror_dict(mi, view) if view.rig.sphere.form is None else _mirror_mesh(mi, view)
+    scene[MIRROR_NAME] = mirror_entry(mi, view)
     for index, shape in enumerate(room.shapes(view)):
         scene[shape_key(index)] = shape_dict(mi, view, shape)
     return scene
@@ -158,17 +194,17 @@ def _bitmap_dict(mi: ModuleType, texture: Bitmap) -> dict[str, Any]:
     return {"type": "bitmap", "bitmap": image, "raw": True, "filter_type": "bilinear", "wrap_mode": "repeat"}
 
 
-def mirror_dict(mi: ModuleType, view: View) -> dict[str, Any]:
-    """The steel sphere at the origin; for a mirror with a form error a sphere that encloses it (`view_rays` knows)."""
-    rig = view.rig
-    bsdf = mirror_bsdf(rig.mirror, rig.camera.detector.band_wavelength_nm)
-    return {"type": "sphere", "center": [0.0, 0.0, 0.0], "radius": MM_PER_M * rig.mirror.bound_m, "bsdf": bsdf}
-
-
-def _mirror_mesh(mi: ModuleType, view: View) -> Any:
-    """The steel mirror with its form error."""
-    bsdf = mirror_bsdf(view.rig.mirror, view.rig.camera.detector.band_wavelength_nm)
-    return form_mesh(mi, view, MIRROR_NAME, mi.load_dict(bsdf))
+def mirror_entry(mi: ModuleType, view: View) -> Any:
+    """The steel mirror: a sphere at the origin, or a mesh."""
+    mirror = view.rig.mirror
+    bsdf = mirror_bsdf(mirror, view.rig.camera.detector.band_wavelength_nm)
+    if isinstance(mirror, RevolvedMirror):
+        grid = cap_grid(mirror.profile, *cap_places(mirror.profile))
+    elif mirror.form is not None:
+        grid = form_grid(mirror)
+    else:
+        return {"type": "sphere", "center": [0.0, 0.0, 0.0], "radius": MM_PER_M * mirror.radius_m, "bsdf": bsdf}
+    return grid_mesh(mi, view, *grid, mi.load_dict(bsdf), closed=True)
 
 
 def mirror_bsdf(mirror: MetalSurface, wavelengths_nm: Vector) -> dict[str, Any]:

@@ -1,12 +1,8 @@
 """Shading kernel (Dr.Jit): the camera's look into a room, directly or by the mirror.
 
-The ray from the film to the mirror and its reflection are float64. A spherical mirror is met in closed form; it is
-convex and stands in no table of faces, so that a reflected ray needs no lift. Only where something may stand between
-lens and mirror, such as a holder, the way to the mirror is a query of its own.
-
-Rays that meet a mirror with a form error are solved by Newton's method on q(t) = |P|^2 - r(P / |P|)^2 along the ray:
-first to its least value, which tells hit from miss, then from the parabola's zero to that of q. `ray_tracer` answers
-the same question from values alone, `reflection_point` from the other side; tests compare the three.
+The ray from the film to the mirror and its reflection are float64 (`mirror_intersection`). The mirror is convex and
+stands in no table of faces, so that a reflected ray needs no lift. Only where something may stand between lens and
+mirror, such as a holder, the way to the mirror is a query of its own.
 
 A glass tube around mirror and lens turns and lifts rays on their way out (`scenes.glass_tube`, float64 here as well),
 whether they come from the mirror or from the lens. What its faces mirror back to the inside is left out.
@@ -22,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.render.room.camera_plugin import MM_PER_M, sensor_dict
+from phibench.render.room.mirror_intersection import mirror_intersection
 from phibench.render.room.surfaces import Surfaces, aligned
-from phibench.scenes.frames import Array
 from phibench.scenes.rig import View
 
 
@@ -45,7 +41,7 @@ class Look:
         self._sensor = mi.load_dict(sensor_dict(mi, self.view))
         self._crossed = surfaces.cross_the_way()
         self._tube = None if self.view.tube is None else Tube(mi, self.view)
-        self._radius = dr.opaque(mi.Float64, MM_PER_M * rig.sphere.radius_m)
+        self._meet = mirror_intersection(mi, self.view)
         self._alpha = dr.opaque(mi.Float, rig.mirror.roughness_alpha)
         bands = [rig.mirror.refractive_index(nm) for nm in rig.camera.detector.band_wavelength_nm]
         self._index = [[dr.opaque(mi.Float, float(part)) for part in (one.real, one.imag)] for one in bands]
@@ -101,19 +97,6 @@ class Look:
         point, normal, found = self._meet(origin, direction)
         cos = -dr.dot(direction, normal)
         return point, direction + 2.0 * cos * normal, weight * self._reflectance(mi.Float(cos)), found
-
-    def _meet(self, origin: Any, direction: Any) -> tuple[Any, Any, Any]:
-        """Point of the mirror (mm), its outward normal, and whether there is one; float64."""
-        import drjit as dr
-
-        if self.view.rig.sphere.form is not None:
-            return meet(self._mi, self.view, origin, direction)
-        approach = -dr.dot(origin, direction)
-        foot = origin + approach * direction  # nearest point to the centre: no cancellation
-        square = dr.square(self._radius) - dr.squared_norm(foot)
-        found = (square > 0.0) & (approach > 0.0)
-        point = foot - dr.sqrt(dr.maximum(square, 0.0)) * direction
-        return point, point / self._radius, found
 
     def _reflectance(self, cos: Any) -> Any:
         """Reflectance of the three bands."""
@@ -373,77 +356,3 @@ def _swept(dr: ModuleType, start: tuple[Any, Any], end: tuple[Any, Any]) -> Any:
 def _antiderivative(dr: ModuleType, x: Any) -> Any:
     held = dr.minimum(dr.abs(x), 1.0)
     return held * (dr.abs(x) - 0.5 * held)
-
-
-# Mirror with a form error.
-
-_LEAST_STEPS = 3
-_STEPS = 5
-
-
-def meet(mi: ModuleType, view: View, origin: Any, direction: Any) -> tuple[Any, Any, Any]:
-    """First point of a mirror with a form error, its outward normal, and whether there is one.
-
-    All are float64, in the scene's coordinates: mm, world axes, the sphere centre at the origin. The ray comes from
-    outside.
-    """
-    import drjit as dr
-
-    V, axes = mi.Vector3d, view.T_world_sphere.R
-    form = view.rig.sphere.form
-    assert form is not None
-    tensors = [MM_PER_M * tensor for tensor in form.tensors]
-    radius = dr.opaque(mi.Float64, MM_PER_M * view.rig.sphere.radius_m)
-    o, d = (_turned(V, axes.T, vector) for vector in (origin, direction))
-    d = dr.normalize(d)
-    foot = o - dr.dot(o, d) * d
-    foot2 = dr.dot(foot, foot)
-    central = foot2 < 0.25 * radius * radius  # certainly hits, and q is no parabola near the sphere's centre
-    x = mi.Float64(0.0)
-    for _ in range(_LEAST_STEPS):  # q'' is 2 but for the form
-        _, slope = _q(V, foot, foot2, d, x, radius, tensors)
-        x = dr.select(central, 0.0, x - 0.5 * slope)
-    q, _ = _q(V, foot, foot2, d, x, radius, tensors)
-    q = dr.select(central, foot2 - radius * radius, q)
-    found = q < 0.0
-    x = x - dr.sqrt(dr.maximum(-q, 0.0))
-    for _ in range(_STEPS):
-        q, slope = _q(V, foot, foot2, d, x, radius, tensors)
-        x = dr.select(found, x - q / slope, x)
-    P = foot + x * d
-    rho = dr.norm(P)
-    n = P / rho
-    _, gradient = _added(V, n, tensors)
-    normal = dr.normalize(n - gradient / rho)
-    return _turned(V, axes, P), _turned(V, axes, normal), found
-
-
-def _q(V: Any, foot: Any, foot2: Any, d: Any, x: Any, radius: Any, tensors: list[Array]) -> tuple[Any, Any]:
-    """q and its derivative by the distance x from the foot."""
-    import drjit as dr
-
-    rho2 = foot2 + x * x
-    rho = dr.sqrt(rho2)
-    added, gradient = _added(V, (foot + x * d) / rho, tensors)
-    r = radius + added
-    return rho2 - r * r, 2.0 * x - 2.0 * r * dr.dot(gradient, d) / rho
-
-
-def _added(V: Any, n: Any, tensors: list[Array]) -> tuple[Any, Any]:
-    """Deviation of the radius in a unit direction, and its derivative along the unit sphere."""
-    import drjit as dr
-
-    Q, T = tensors
-    q = _turned(V, Q, n)
-    t = V(*(dr.dot(n, _turned(V, T[i], n)) for i in range(3)))
-    along_q, along_t = dr.dot(q, n), dr.dot(t, n)
-    return along_q + along_t, 2.0 * q + 3.0 * t - (2.0 * along_q + 3.0 * along_t) * n
-
-
-def _turned(V: Any, matrix: Array, vector: Any) -> Any:
-    """Matrix times vector."""
-    import drjit as dr
-
-    number = type(vector.x)
-    rows = [[dr.opaque(number, float(value)) for value in row] for row in matrix]  # one kernel for all forms
-    return V(*(row[0] * vector.x + row[1] * vector.y + row[2] * vector.z for row in rows))

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from helpers.form_oracles import form_pixel
 from helpers.formed_mirrors import formed
+from helpers.lamp_views import LAMP_ROOM, electrons, lamp_image, moments, traced_lamp
 from helpers.misaligned_cases import Case, check, draw_case
 
 from phibench.render.optics.certificate import certify, trace_spot
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
-from phibench.scenes.camera import Camera
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import HARMONICS, Form
 from phibench.scenes.misalignment import Misalignment
-from phibench.scenes.rig import POSITIONS, View
+from phibench.scenes.rig import POSITIONS
 from phibench.scenes.room import Room
 from phibench.scenes.shapes import rectangle
 from phibench.scenes.textures import Uniform
@@ -146,93 +146,33 @@ def test_accuracy_flux_against_traced_rays() -> None:
 
 # -- ambient -------------------------------------------------------------------------------------------------------
 
-LAMP = rectangle(
-    *("lamp", (1.5, 0.2, 0.7), (-1, 0, 0), (0.4, 0.4)),
-    texture=Uniform((0.0, 0.0, 0.0)),
-    radiance_w_m2_sr=(1.0, 2.0, 3.0),
-)
 FORM = Form(form_20_m=5e-4, form_31c_m=5e-4, form_22s_m=4e-4)
 CROP = (795, 315, 130, 110)
 
 
-def moments(image: np.ndarray) -> tuple[float, float, float]:
-    """Sum and centroid (u, v)."""
-    v, u = np.indices(image.shape)
-    total = float(image.sum(dtype=float))
-    return total, float((image * u).sum() / total), float((image * v).sum() / total)
-
-
-def lamp_image(view: View, room: Room, crop: tuple[int, int, int, int] = CROP) -> np.ndarray:
-    """Ambient layer, plane R, of a room with nothing in it but a lamp: its light map is dark."""
-    from phibench.render.room.ambient import render_ambient
-    from phibench.render.room.light_map import BakeSettings, LightMap, texel_count
-
-    settings = BakeSettings(lamp_rays=4, bounce_rays=4, final_rays=4)
-    texels = texel_count(room, settings.texel_m)
-    dark = np.zeros((texels, 3), dtype=np.float32)
-    light = LightMap(dark, dark, np.zeros(texels, dtype=bool))
-    return render_ambient(view, room, light, settings, 4, 0, crop).electrons_per_s[0]
-
-
-@pytest.fixture(scope="module")
-def lamp_room() -> Room:
-    return Room("a lamp", (LAMP,), (), robot=False)
-
-
-def test_accuracy_ambient_image_of_a_lamp(lamp_room: Room) -> None:
+def test_accuracy_ambient_image_of_a_lamp() -> None:
     """Flux 0.2 % and centroid 0.02 px of a lamp in the mirror, against float64 rays; the sphere's are far off.
 
     The expected image: 5 x 5 jittered rays per pixel, over the lens: some 130 pixels on the lamp's edge err by 0.05
     each, 0.06 % of its 1000; film cells of a quarter of a pixel keep an edge to 0.01 px (docs/model.md), 0.06 %.
     """
     view = formed(FORM).at(0.2)
-    flux, u, v = moments(lamp_image(view, lamp_room))
-    expected = moments(traced_lamp(view))
+    flux, u, v = moments(lamp_image(view, LAMP_ROOM, CROP))
+    expected = moments(traced_lamp(view, CROP))
     assert flux == pytest.approx(expected[0], rel=2e-3)
     assert math.dist((u, v), expected[1:]) < 0.02
-    sphere = moments(traced_lamp(default_rig().at(0.2)))
+    sphere = moments(traced_lamp(default_rig().at(0.2), CROP))
     assert abs(sphere[0] / flux - 1.0) > 0.03
     assert math.dist(sphere[1:], (u, v)) > 0.5
 
 
-def traced_lamp(view: View, side: int = 5) -> np.ndarray:
-    """Image of the lamp, electrons/s per pixel behind R, without blur, by `trace` and `raycast`.
-
-    Rays go all over the lens: through its centre alone the centroid would be 0.02 px off, of a sphere's image as well.
-    """
-    from phibench.render.optics.ray_tracer import trace_pixels
-    from phibench.render.optics.room_tracer import first_hit
-
-    u0, v0, width, height = CROP
-    cell, rng = np.mgrid[0:side, 0:side].reshape(2, -1).T, np.random.default_rng(0)
-    place = (cell + rng.random((width * height, side * side, 2))) / side - 0.5  # one ray in each cell of a pixel
-    v, u = np.mgrid[v0 : v0 + height, u0 : u0 + width]
-    uv = (np.stack([u.ravel(), v.ravel()], axis=-1)[:, None] + place).reshape(-1, 2)
-    radius, turn = np.sqrt(rng.random(len(uv))), 2.0 * np.pi * rng.random(len(uv))
-    lens = view.rig.camera.aperture_radius_m * radius[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    rays = trace_pixels(view, uv, lens)
-    seen = np.isfinite(rays.cos_incidence)
-    lit = np.zeros(len(uv))
-    lit[seen] = first_hit((LAMP,), rays.points_m[seen], rays.directions[seen]).object_id == 0
-    reflectance = view.rig.mirror.reflectance(rays.cos_incidence, view.rig.camera.detector.band_wavelength_nm[0])
-    value = np.nan_to_num(lit * electrons(view.rig.camera, uv) * reflectance)
-    return value.reshape(height, width, side * side).mean(axis=-1)
-
-
-def electrons(camera: Camera, uv: np.ndarray) -> np.ndarray:
-    """Electrons/s per pixel behind R for a radiance of 1 W/(m^2 sr) at film positions (N, 2)."""
-    cos_lens = camera.rays(uv)[:, 2]
-    etendue = camera.solid_angle_density(camera.normalised(uv)) * cos_lens**4 * math.pi * camera.aperture_radius_m**2
-    return camera.detector.band_electrons_per_joule()[0] * etendue
-
-
 @pytest.mark.slow
-def test_accuracy_ambient_against_a_mesh_in_the_path_tracer(lamp_room: Room) -> None:
+def test_accuracy_ambient_against_a_mesh_in_the_path_tracer() -> None:
     """The same image by Mitsuba's own path tracer on a fine mesh: flux 0.3 %, centroid 0.03 px (64 samples)."""
     from helpers.path_ambient import path_trace
 
     view = formed(FORM, yaw_rad=0.02).at(0.2)
-    ours, traced = moments(lamp_image(view, lamp_room)), moments(path_trace(view, lamp_room, 64, 3, 0, CROP)[0])
+    ours, traced = moments(lamp_image(view, LAMP_ROOM, CROP)), moments(path_trace(view, LAMP_ROOM, 64, 3, 0, CROP)[0])
     assert ours[0] == pytest.approx(traced[0], rel=3e-3)
     assert math.dist(ours[1:], traced[1:]) < 0.03
 

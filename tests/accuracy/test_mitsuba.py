@@ -13,17 +13,18 @@ import numpy as np
 import pytest
 from helpers.oracles import TARGETS, project_cv2
 from helpers.path_ambient import path_trace
+from helpers.path_spots import compare
 
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth, truth_layer
 from phibench.render.room.ambient import render_ambient
-from phibench.render.room.camera_plugin import MM_PER_M, sensor_dict
+from phibench.render.room.camera_plugin import sensor_dict
 from phibench.render.room.light_map import BakeSettings, bake
-from phibench.render.room.scene import load_scene, mirror_dict, scene_dict, to_scene_mm
+from phibench.render.room.scene import load_scene, scene_dict, to_scene_mm
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Camera, Detector
 from phibench.scenes.catalog import c310_camera, default_rig, lab
-from phibench.scenes.frames import Pose, rotation_facing, rotation_xyz
+from phibench.scenes.frames import Pose, rotation_xyz
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.room import Room
@@ -119,36 +120,6 @@ def test_accuracy_truth_layer_against_closed_form() -> None:
 # -- the spot by brute force ---------------------------------------------------------------------------------------
 
 
-def _spot_scene(mi: ModuleType, view: View, spot: LaserSpot, crop: tuple[int, int, int, int]) -> Any:
-    """Mirror, sensor and the spot as a disk emitter of the spot's own radiance in every band."""
-    radius = MM_PER_M * spot.diameter_m / 2.0
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.array(rotation_facing(spot.normal_world))
-    matrix[:3, 3] = to_scene_mm(view, np.array(spot.position_world_m))
-    radiance = {"type": "rgb", "value": [float(spot.radiance_w_m2_sr(0.0))] * 3}
-    disk = {
-        "type": "disk",
-        "to_world": mi.ScalarTransform4f(matrix) @ mi.ScalarTransform4f().scale([radius, radius, 1.0]),
-        "emitter": {"type": "area", "radiance": radiance},
-        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.0, 0.0, 0.0]}},
-    }
-    sensor = sensor_dict(mi, view, crop) | {"sampler": {"type": "independent"}}
-    return load_scene(mi, {"type": "scene", "sensor": sensor, "mirror": mirror_dict(mi, view), "spot": disk})
-
-
-def _brute_force(
-    mi: ModuleType, view: View, spot: LaserSpot, crop: tuple[int, int, int, int], paths: float
-) -> np.ndarray:
-    """Electrons per second (height, width) of the crop by the `path` integrator, and their standard error."""
-    scene = _spot_scene(mi, view, spot, crop)
-    integrator = mi.load_dict({"type": "path", "max_depth": 3})
-    per_pass = 2**16  # samples per pixel and pass; float32 sums stay exact enough, passes add up in float64
-    count = math.ceil(paths / (per_pass * crop[2] * crop[3]))
-    seeds = np.random.SeedSequence(7).generate_state(count, dtype=np.uint32)
-    passes = [np.array(mi.render(scene, integrator=integrator, spp=per_pass, seed=int(s)))[..., 0] for s in seeds]
-    return np.array(passes, dtype=float)
-
-
 def _red_laser_rig(blur_px: float, focus_m: float = 0.23, alpha: float = 0.0, **changes: Any) -> Rig:
     """Default rig whose ambient bands lie at the laser line, so that both renderers count the same electrons."""
     rig = default_rig()
@@ -156,31 +127,6 @@ def _red_laser_rig(blur_px: float, focus_m: float = 0.23, alpha: float = 0.0, **
     camera = dataclasses.replace(rig.camera, detector=detector, blur_sigma_px=blur_px, focus_distance_m=focus_m)
     mirror = dataclasses.replace(rig.mirror, roughness_alpha=alpha)
     return dataclasses.replace(rig, camera=camera, mirror=mirror, **changes)
-
-
-def _compare(mi: ModuleType, rig: Rig, spot: LaserSpot, half: int, paths: float) -> dict[str, float]:
-    """Flux ratio and largest column-share difference of path tracing and spot layer on a crop, with standard errors."""
-    view = rig.at(0.3)
-    truth = spot_truth(view, spot, ())
-    u0, v0, size = round(truth.u_px) - half, round(truth.v_px) - half, 2 * half + 1
-    passes = _brute_force(mi, view, spot, (u0, v0, size, size), paths)
-    layer = spot_layer(view, spot, ())
-    ours = np.pad(layer.electrons_per_s[0], 60)[
-        v0 - layer.v0_px + 60 : v0 - layer.v0_px + 60 + size, u0 - layer.u0_px + 60 : u0 - layer.u0_px + 60 + size
-    ]
-    image, sums = passes.mean(axis=0), passes.sum(axis=(1, 2))
-    share, share_ours = image.sum(axis=0) / image.sum(), ours.sum(axis=0) / ours.sum()
-    error = sums.std(ddof=1) / math.sqrt(len(sums)) / sums.mean()
-    figures = {
-        "flux": image.sum() / ours.sum() - 1.0,
-        "flux_error": error,
-        "share": float(np.abs(share - share_ours).max()),
-        "inside": ours.sum() / layer.total_electrons_per_s[0],
-        "largest_share": float(share_ours.max()),
-        "paths": passes.shape[0] * 2**16 * size**2,
-    }
-    print(figures)
-    return figures
 
 
 @pytest.mark.slow
@@ -191,7 +137,7 @@ def test_accuracy_spot_layer_against_brute_force_path_tracing(mi: ModuleType) ->
     error 4e-4 (one sigma), so that the tolerances stand at 4 and 5 sigma: false alarm below 1e-4.
     """
     spot = LaserSpot((1.9, 0.7, 0.5), (-1.9, -0.7, 0.0), 12e-3, profile="uniform")
-    figures = _compare(mi, _red_laser_rig(0.25), spot, 2, 1.05e8)
+    figures = compare(mi, _red_laser_rig(0.25), spot, 2, 1.05e8)
     assert figures["paths"] >= 1e8
     assert figures["flux_error"] < 1e-3
     assert abs(figures["flux"]) <= 3e-3
@@ -213,7 +159,7 @@ def test_accuracy_spot_layer_against_path_tracing_short(mi: ModuleType, name: st
     2.5e7 paths: sigma is at most 0.55 %, so that 3 % are always seen; 0.3 % are for the slow test above.
     """
     spot = LaserSpot((1.9, 0.7, 0.5), (-1.9, -0.7, 0.0), 20e-3, profile="uniform")
-    figures = _compare(mi, _red_laser_rig(**changes), spot, 5, 2.5e7)
+    figures = compare(mi, _red_laser_rig(**changes), spot, 5, 2.5e7)
     assert figures["flux_error"] < 5.5e-3
     assert abs(figures["flux"]) <= 5.0 * figures["flux_error"] + 3e-3
     assert figures["share"] <= 2.5 * figures["flux_error"] + 2e-3

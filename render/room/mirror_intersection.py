@@ -1,0 +1,233 @@
+"""Rays that meet the mirror, in Dr.Jit: float64, in the scene's coordinates.
+
+These are millimetres, world axes, and the sphere centre or the vertex of a mirror of revolution at the origin. Numbers
+of a mirror are opaque: one kernel serves all mirrors of a kind. Rays come from outside; those that miss the mirror get
+finite numbers that mean nothing.
+
+**Sphere.** Closed form.
+
+**Form error.** Newton's method on q(t) = |P|^2 - r(P / |P|)^2 along the ray: first to its least value, which tells hit
+from miss, then from the parabola's zero to that of q.
+
+**Mirror of revolution.** A quadric gives a quadratic in the distance. Even terms add P(s) to its sag. The excess of sag
+over height is a convex function along the ray, because the profile is convex. The quadric shifted by the least P lies
+before the surface: from where it is met Newton's method runs up to the first root and never beyond.
+
+`ray_tracer` answers the same questions from values alone, `reflection_point` from the other side; tests compare them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from phibench.render.room.camera_plugin import MM_PER_M
+from phibench.scenes.frames import Array
+from phibench.scenes.revolved_mirror import Profile, RevolvedMirror
+from phibench.scenes.rig import View
+
+Meeting = Callable[[Any, Any], tuple[Any, Any, Any]]
+
+
+def mirror_intersection(mi: ModuleType, view: View) -> Meeting:
+    """Function from origins and unit directions to first points, outward unit normals, and whether there is one."""
+    mirror = view.rig.mirror
+    if isinstance(mirror, RevolvedMirror):
+        return _Revolved(mi, view, mirror.profile).meet
+    if mirror.form is not None:
+        return lambda origin, direction: meet_form(mi, view, origin, direction)
+    return _ball(mi, mirror.radius_m)
+
+
+def _ball(mi: ModuleType, radius_m: float) -> Meeting:
+    import drjit as dr
+
+    radius = dr.opaque(mi.Float64, MM_PER_M * radius_m)
+
+    def meet(origin: Any, direction: Any) -> tuple[Any, Any, Any]:
+        approach = -dr.dot(origin, direction)
+        foot = origin + approach * direction  # nearest point to the centre: no cancellation
+        square = dr.square(radius) - dr.squared_norm(foot)
+        found = (square > 0.0) & (approach > 0.0)
+        point = foot - dr.sqrt(dr.maximum(square, 0.0)) * direction
+        return point, point / radius, found
+
+    return meet
+
+
+# Mirror of revolution.
+
+_BEFORE_TIP_MM = 1e-9  # rounding of a height near the vertex
+_RISES = 12  # 3 to 5 do, but where the ray grazes: each step halves the way there
+_TOUCHED_MM = 1e-6  # excess of what is met: 12 halvings leave a grazing ray 4^-12 of its first, some 0.01 mm
+_PLACES = 1001  # where the least of the even terms is looked for
+
+
+class _Revolved:
+    """A profile's numbers in millimetres."""
+
+    def __init__(self, mi: ModuleType, view: View, profile: Profile) -> None:
+        import drjit as dr
+
+        def number(value: float) -> Any:
+            return dr.opaque(mi.Float64, float(value))
+
+        self._vector, self._axes = mi.Vector3d, view.T_world_sphere.R
+        self._radius, self._bend = number(MM_PER_M * profile.vertex_radius_m), number(1.0 + profile.conic)
+        self._rim2 = number((MM_PER_M * profile.rim_radius_m) ** 2)
+        terms = profile.even_terms if not profile.is_quadric else ()
+        self._terms = [number(a * MM_PER_M ** (1 - 2 * i)) for i, a in enumerate(terms, start=2)]
+        self._least = number(MM_PER_M * _least_of_terms(profile))
+
+    def meet(self, origin: Any, direction: Any) -> tuple[Any, Any, Any]:
+        """First points, normals, and whether there are any; see `mirror_intersection`."""
+        import drjit as dr
+
+        V, axes = self._vector, self._axes
+        o, d = (_turned(V, axes.T, vector) for vector in (origin, direction))
+        approach = -dr.dot(o, d)
+        foot = o + approach * d
+        if not self._terms:
+            x, found = self._to_quadric(foot, d, -approach)
+            P = foot + x * d
+            gradient = V(P.x, P.y, self._bend * P.z - self._radius)
+        else:
+            x, found = self._to_quadric(foot - V(0.0, 0.0, self._least), d, -approach)
+            x, excess = self._to_sag(foot, d, x)
+            found &= excess < _TOUCHED_MM
+            P = foot + x * d
+            _, slope = self._sag(P)
+            gradient = V(2.0 * slope * P.x, 2.0 * slope * P.y, -1.0)
+        found &= P.x * P.x + P.y * P.y <= self._rim2
+        # at a cone's tip itself there is no normal
+        normal = dr.select(found & (dr.squared_norm(gradient) > 0.0), dr.normalize(gradient), -d)
+        return _turned(V, axes, dr.select(found, P, foot)), _turned(V, axes, normal), found
+
+    def _to_quadric(self, foot: Any, d: Any, start: Any) -> tuple[Any, Any]:
+        """Distance from the foot to the sheet of the vertex, 0 without one, and whether the ray meets it."""
+        import drjit as dr
+
+        A, R = self._bend, self._radius
+        a = d.x * d.x + d.y * d.y + A * d.z * d.z
+        b = foot.x * d.x + foot.y * d.y + (A * foot.z - R) * d.z
+        c = foot.x * foot.x + foot.y * foot.y + (A * foot.z - 2.0 * R) * foot.z
+        square = b * b - a * c
+        root = dr.sqrt(dr.maximum(square, 0.0))
+        q = -(b + dr.select(b < 0.0, -root, root))  # no cancellation
+        best, found = type(b)(0.0), square < 0.0
+        found = found & ~found
+        for x in (q / a, c / q):
+            z = foot.z + x * d.z
+            # the half before the equator, or one sheet of two
+            here = (square > 0.0) & (R - A * z >= 0.0) & (z >= -_BEFORE_TIP_MM) & (x > start) & dr.isfinite(x)
+            best = dr.select(here & (~found | (x < best)), x, best)
+            found |= here
+        return best, found
+
+    def _to_sag(self, foot: Any, d: Any, x: Any) -> tuple[Any, Any]:
+        """Distance to the surface with its even terms, and the excess that is left there."""
+        excess = x
+        for step in range(_RISES + 1):
+            P = foot + x * d
+            z, slope = self._sag(P)
+            excess = z - P.z
+            if step < _RISES:
+                x = x - excess / (2.0 * slope * (P.x * d.x + P.y * d.y) - d.z)
+        return x, excess
+
+    def _sag(self, P: Any) -> tuple[Any, Any]:
+        """Sag at places and its derivative by the radius squared; as in `Profile.sag`."""
+        import drjit as dr
+
+        s = P.x * P.x + P.y * P.y
+        w = dr.sqrt(self._radius * self._radius - self._bend * s)
+        z, slope = s / (self._radius + w), 0.5 / w
+        power = s
+        for i, a in enumerate(self._terms, start=2):
+            z, slope = z + a * power * s, slope + i * a * power
+            power = power * s
+        return z, slope
+
+
+def _least_of_terms(profile: Profile) -> float:
+    """Least sum of the even terms inside the rim, metres, with a margin for what is between the places: at most 0."""
+    s = np.linspace(0.0, profile.rim_radius_m**2, _PLACES)
+    added = sum((a * s**i for i, a in enumerate(profile.even_terms, start=2)), np.zeros_like(s))
+    return float(added.min()) - 1e-3 * float(np.ptp(added))
+
+
+# Mirror with a form error.
+
+_LEAST_STEPS = 3
+_STEPS = 5
+
+
+def meet_form(mi: ModuleType, view: View, origin: Any, direction: Any) -> tuple[Any, Any, Any]:
+    """First point of a mirror with a form error, its outward normal, and whether there is one.
+
+    All are float64, in the scene's coordinates: mm, world axes, the sphere centre at the origin. The ray comes from
+    outside.
+    """
+    import drjit as dr
+
+    V, axes = mi.Vector3d, view.T_world_sphere.R
+    form = view.rig.sphere.form
+    assert form is not None
+    tensors = [MM_PER_M * tensor for tensor in form.tensors]
+    radius = dr.opaque(mi.Float64, MM_PER_M * view.rig.sphere.radius_m)
+    o, d = (_turned(V, axes.T, vector) for vector in (origin, direction))
+    d = dr.normalize(d)
+    foot = o - dr.dot(o, d) * d
+    foot2 = dr.dot(foot, foot)
+    central = foot2 < 0.25 * radius * radius  # certainly hits, and q is no parabola near the sphere's centre
+    x = mi.Float64(0.0)
+    for _ in range(_LEAST_STEPS):  # q'' is 2 but for the form
+        _, slope = _q(V, foot, foot2, d, x, radius, tensors)
+        x = dr.select(central, 0.0, x - 0.5 * slope)
+    q, _ = _q(V, foot, foot2, d, x, radius, tensors)
+    q = dr.select(central, foot2 - radius * radius, q)
+    found = q < 0.0
+    x = x - dr.sqrt(dr.maximum(-q, 0.0))
+    for _ in range(_STEPS):
+        q, slope = _q(V, foot, foot2, d, x, radius, tensors)
+        x = dr.select(found, x - q / slope, x)
+    P = foot + x * d
+    rho = dr.norm(P)
+    n = P / rho
+    _, gradient = _added(V, n, tensors)
+    normal = dr.normalize(n - gradient / rho)
+    return _turned(V, axes, P), _turned(V, axes, normal), found
+
+
+def _q(V: Any, foot: Any, foot2: Any, d: Any, x: Any, radius: Any, tensors: list[Array]) -> tuple[Any, Any]:
+    """q and its derivative by the distance x from the foot."""
+    import drjit as dr
+
+    rho2 = foot2 + x * x
+    rho = dr.sqrt(rho2)
+    added, gradient = _added(V, (foot + x * d) / rho, tensors)
+    r = radius + added
+    return rho2 - r * r, 2.0 * x - 2.0 * r * dr.dot(gradient, d) / rho
+
+
+def _added(V: Any, n: Any, tensors: list[Array]) -> tuple[Any, Any]:
+    """Deviation of the radius in a unit direction, and its derivative along the unit sphere."""
+    import drjit as dr
+
+    Q, T = tensors
+    q = _turned(V, Q, n)
+    t = V(*(dr.dot(n, _turned(V, T[i], n)) for i in range(3)))
+    along_q, along_t = dr.dot(q, n), dr.dot(t, n)
+    return along_q + along_t, 2.0 * q + 3.0 * t - (2.0 * along_q + 3.0 * along_t) * n
+
+
+def _turned(V: Any, matrix: Array, vector: Any) -> Any:
+    """Matrix times vector."""
+    import drjit as dr
+
+    number = type(vector.x)
+    rows = [[dr.opaque(number, float(value)) for value in row] for row in matrix]  # one kernel for all forms
+    return V(*(row[0] * vector.x + row[1] * vector.y + row[2] * vector.z for row in rows))
