@@ -418,9 +418,11 @@ def _room_line_faults(plan: Plan, dataset: Dataset, info: RoomInfo) -> Iterator[
 
 
 def _with_form(rig: dict[str, Any]) -> dict[str, Any]:
-    """Document of a rig; one of schema version 4 knows no form, and its mirror has none."""
+    """Document of a rig; one of schema version 4 knows no form, and its mirror has none. Nor has one of revolution."""
     mirror = rig.get("mirror")
-    return {**rig, "mirror": {"form": None, **mirror}} if isinstance(mirror, dict) else rig
+    if not isinstance(mirror, dict) or "profile" in mirror:
+        return rig
+    return {**rig, "mirror": {"form": None, **mirror}}
 
 
 def alike(a: Any, b: Any) -> bool:
