@@ -145,26 +145,45 @@ def _slope(r: Array, point: Plane, eye: Plane, profile: Profile) -> tuple[Array,
 
 
 def _newton(xy: Array, points_m: Array, eyes_m: Array, profile: Profile) -> Array:
-    """Step in (x, y), shape (N, 2), no longer than `_LONGEST` rim radii: of the path as a function of x and y."""
-    s = np.einsum("ni,ni->n", xy, xy)
-    sag = profile.sag(s)
-    rise = 2.0 * sag.slope_per_m[:, None] * xy  # of z by x and y
-    curve = 4.0 * sag.bend_per_m3[:, None, None] * xy[:, :, None] * xy[:, None, :]
-    curve += 2.0 * sag.slope_per_m[:, None, None] * np.eye(2)
-    gradient, hessian = np.zeros_like(xy), np.zeros((len(xy), 2, 2))
-    for end in (points_m, eyes_m):
-        way, dz = xy - end[:, :2], sag.z_m - end[:, 2]
-        length = np.sqrt(np.einsum("ni,ni->n", way, way) + dz * dz)
-        along = (way + dz[:, None] * rise) / length[:, None]
-        gradient += along
-        part = np.eye(2) + rise[:, :, None] * rise[:, None, :] + dz[:, None, None] * curve
-        hessian += (part - along[:, :, None] * along[:, None, :]) / length[:, None, None]
-    det = hessian[:, 0, 0] * hessian[:, 1, 1] - hessian[:, 0, 1] ** 2
-    x = (hessian[:, 1, 1] * gradient[:, 0] - hessian[:, 0, 1] * gradient[:, 1]) / det
-    y = (hessian[:, 0, 0] * gradient[:, 1] - hessian[:, 0, 1] * gradient[:, 0]) / det
-    move = -np.stack([x, y], axis=-1)
-    length = np.linalg.norm(move, axis=-1, keepdims=True)
+    """Step in (x, y), shape (N, 2), no longer than `_LONGEST` rim radii."""
+    (g_x, g_y), (h_xx, h_xy, h_yy), _ = _path(xy, points_m, eyes_m, profile)
+    det = h_xx * h_yy - h_xy * h_xy
+    move = np.stack([h_xy * g_y - h_yy * g_x, h_xy * g_x - h_xx * g_y], axis=-1) / det[:, None]
+    length = np.hypot(move[:, 0], move[:, 1])[:, None]
     return move * np.minimum(1.0, _LONGEST * profile.rim_radius_m / np.maximum(length, 1e-300))
+
+
+def _path(
+    xy: Array, points_m: Array, eyes_m: Array, profile: Profile
+) -> tuple[tuple[Array, Array], tuple[Array, Array, Array], Array]:
+    """Derivatives of the path as a function of x and y: slopes, second derivatives xx, xy, yy; and squared slope of z.
+
+    All of shape (N,). Components are written out: matrices of each pair would take three times as long.
+    """
+    x, y = xy.T
+    sag = profile.sag(x * x + y * y)
+    z_x, z_y = 2.0 * sag.slope_per_m * x, 2.0 * sag.slope_per_m * y
+    bend = 4.0 * sag.bend_per_m3
+    z_xx, z_xy, z_yy = 2.0 * sag.slope_per_m + bend * x * x, bend * x * y, 2.0 * sag.slope_per_m + bend * y * y
+    g_x, g_y, h_xx, h_xy, h_yy = np.zeros((5, len(x)))
+    for end in (points_m, eyes_m):
+        dx, dy, dz = x - end[:, 0], y - end[:, 1], sag.z_m - end[:, 2]
+        near = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
+        u_x, u_y = (dx + dz * z_x) * near, (dy + dz * z_y) * near
+        g_x, g_y = g_x + u_x, g_y + u_y
+        h_xx = h_xx + near * (1.0 + z_x * z_x + dz * z_xx - u_x * u_x)
+        h_xy = h_xy + near * (z_x * z_y + dz * z_xy - u_x * u_y)
+        h_yy = h_yy + near * (1.0 + z_y * z_y + dz * z_yy - u_y * u_y)
+    return (g_x, g_y), (h_xx, h_xy, h_yy), z_x * z_x + z_y * z_y
+
+
+def revolved_determinant(mirror_m: Array, points_m: Array, eyes_m: Array, profile: Profile) -> Array:
+    """Determinant of the path's second derivatives along the surface, shape (N,), 1/m^2, at reflection points.
+
+    Those by x and y are T^T M T, with T the derivatives of the surface point: det(T)^2 = 1 + |grad z|^2.
+    """
+    _, (h_xx, h_xy, h_yy), steep = _path(mirror_m[:, :2], points_m, eyes_m, profile)
+    return np.asarray((h_xx * h_yy - h_xy * h_xy) / (1.0 + steep))
 
 
 def _on_surface(xy: Array, profile: Profile) -> Array:
