@@ -97,12 +97,12 @@ def streak_nodes(profile: Profile, along: float, across: float) -> tuple[Array, 
 def _gaussian_line(extent: float) -> tuple[Array, Array]:
     """Nodes on a line and weights for exp(-x^2 / 2)."""
     if extent <= _SMALL:
-        x, weight = (np.asarray(a) for a in hermegauss(2 + math.ceil(8.0 * extent + 3.0 * extent**2)))
-        return x, weight
+        rule = np.array(hermegauss(2 + math.ceil(8.0 * extent + 3.0 * extent**2)))
+        return rule[0], rule[1]
     # a Gaussian of variance 1 / (1 + extent^2), as the blur leaves it: exp(-2 pi^2 / (step^2 (1 + extent^2))) aliases
     step = 2.0 * np.pi / (4.6 * extent + 3.0)
     half = math.ceil(_REACH / step)
-    x = step * np.arange(-half, half + 1)
+    x = np.linspace(-half * step, half * step, 2 * half + 1)
     return x, np.exp(-0.5 * x * x)
 
 
