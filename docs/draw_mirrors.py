@@ -20,7 +20,7 @@ from phibench.scenes.revolved_mirror import RevolvedMirror, cone, hyperboloid, p
 _COARSE = BakeSettings(texel_m=0.25, lamp_rays=8, bounces=3, bounce_rays=16, final_rays=32)
 _WIDTH, _HEIGHT, _SQUARE = 640, 480, 470
 _VERTEX_M, _RIM_M = 0.2, 0.06
-_IMAGE_M = 0.03  # behind the vertex: where the room's image lies, nearly
+_IMAGE_M = 0.05  # behind the vertex: where the room's image lies, nearly
 
 
 def main() -> None:

@@ -145,7 +145,7 @@ class Profile:
         R, A, s = self.vertex_radius_m, 1.0 + self.conic, np.asarray(s_m2, float)
         with np.errstate(invalid="ignore", divide="ignore"):
             w = np.sqrt(R * R - A * s)
-            z, slope, bend = np.where(s > 0.0, s / (R + w), 0.0), 0.5 / w, 0.25 * A / w**3
+            z, slope, bend = np.where(s > 0.0, s / (R + w), 0.0), 0.5 / w, 0.25 * A / (w * w * w)
         for i, a in enumerate(self.even_terms, start=2):
             z = z + a * s**i
             slope = slope + i * a * s ** (i - 1)

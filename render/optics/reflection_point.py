@@ -39,7 +39,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.render.optics.revolved_reflection import revolved_points
+from phibench.render.optics.revolved_reflection import revolved_determinant, revolved_points
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.glass_tube import GlassTube, across
 from phibench.scenes.mirror import Form, Level, SphereMirror, deviation, level
@@ -170,6 +170,8 @@ def _spread(view: View, mirror_m: Array, points_m: Array, eyes_m: Array, cos_i: 
         return spread * (1.0 + far * (1.0 / s + 2.0 * cos_i / mirror.radius_m))
     axes, centre = view.T_world_sphere.R, view.sphere_centre_m
     P, a, b = ((place - centre) @ axes for place in (mirror_m, points_m, eyes_m))
+    if isinstance(mirror, RevolvedMirror):
+        return (s * far / cos_i) ** 2 * revolved_determinant(P, a, b, mirror.profile)
     return (s * far / cos_i) ** 2 * path_determinant(P, a, b, mirror)
 
 

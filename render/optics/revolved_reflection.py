@@ -10,7 +10,8 @@ The search begins in the half-plane of the axis and the point (its *meridian*), 
 slope of the path along the profile at the radius r, is at most 0 where the eye's line of sight touches the profile on
 the side away from the point, and at least 0 where it touches on the point's side; between the two f has one root with
 both ends outside. Newton's method inside the shrinking bracket finds it. For an eye on the axis this is the answer.
-Otherwise Newton's method in the two coordinates across the axis starts there.
+Otherwise Newton's method in the two coordinates across the axis starts there. Where many pairs lie close together, as
+those of a spot and the lens, all start at the place of their middle; those that get nowhere take the long way.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ _EQUATOR = 0.999999
 _LONGEST = 0.3  # step, in rim radii
 _CLOSE = 1e-9  # of the rim's radius: the step after that would be its square
 _FOUND = 1e-6
+_MANY, _NEAR = 32, 0.05  # pairs, and their extent over their distance, that start together
 _START = 1e-6  # of the rim's radius: where the search in the half-plane ends; the one in two coordinates goes on
 
 
@@ -47,23 +49,52 @@ def revolved_points(points_m: Array, eyes_m: Array, profile: Profile) -> tuple[A
     valid : bool array, shape (N,)
         The point lies inside the rim, and both ends on the outer side of the tangent plane there.
     """
+    P, N = np.full((2, *points_m.shape), np.nan)
+    valid = np.zeros(len(points_m), dtype=bool)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        xy = _start(points_m, eyes_m, profile)
-        index = np.flatnonzero(np.isfinite(xy).all(axis=1))
-        step = np.full(len(xy), np.inf)
-        for _ in range(_STEPS):
-            if not len(index):
-                break
-            move = _newton(xy[index], points_m[index], eyes_m[index], profile)
+        if _are_close(points_m) and _are_close(eyes_m):
+            middle = points_m.mean(axis=0)[None], eyes_m.mean(axis=0)[None]
+            xy = np.repeat(_start(*middle, profile), len(points_m), axis=0)
+            P, N, valid = _search(xy, points_m, eyes_m, profile)
+        rest = np.flatnonzero(~valid)
+        if len(rest):
+            ends = points_m[rest], eyes_m[rest]
+            P[rest], N[rest], valid[rest] = _search(_start(*ends, profile), *ends, profile)
+    return P, N, valid
+
+
+def _are_close(ends_m: Array) -> bool:
+    """Return True for many points, shape (N, 3), within a small part of their distance."""
+    return len(ends_m) >= _MANY and bool(np.ptp(ends_m, axis=0).max() <= _NEAR * np.linalg.norm(ends_m[0]))
+
+
+def _search(xy: Array, points_m: Array, eyes_m: Array, profile: Profile) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Newton's method from places (x, y), shape (N, 2); returns as `revolved_points`."""
+    index = np.flatnonzero(np.isfinite(xy).all(axis=1))
+    step = np.full(len(xy), np.inf)
+    for _ in range(_STEPS):
+        if not len(index):
+            break
+        whole = len(index) == len(xy)
+        part = (xy, points_m, eyes_m) if whole else (xy[index], points_m[index], eyes_m[index])
+        move = _newton(*part, profile)
+        length = np.hypot(move[:, 0], move[:, 1])
+        if whole:
+            xy, step = xy + move, length
+        else:
             xy[index] += move
-            step[index] = np.linalg.norm(move, axis=-1)
-            index = index[step[index] > _CLOSE * profile.rim_radius_m]  # NaN leaves as well
-        P = _on_surface(xy, profile)
-        N = _unit(profile.level(P).gradient)
-        seen = [np.einsum("ni,ni->n", end - P, N) >= 0.0 for end in (points_m, eyes_m)]
-        inside = np.hypot(*xy.T) <= profile.rim_radius_m
-        valid = np.asarray(seen[0] & seen[1] & inside & (step <= _FOUND * profile.rim_radius_m))
-    return np.where(valid[:, None], P, np.nan), np.where(valid[:, None], N, np.nan), valid
+            step[index] = length
+        index = index[length > _CLOSE * profile.rim_radius_m]  # NaN leaves as well
+    s = np.einsum("ni,ni->n", xy, xy)
+    sag = profile.sag(s)
+    P = np.concatenate([xy, sag.z_m[:, None]], axis=-1)
+    N = np.concatenate([2.0 * sag.slope_per_m[:, None] * xy, np.full((len(xy), 1), -1.0)], axis=-1)
+    N /= np.sqrt(1.0 + 4.0 * sag.slope_per_m**2 * s)[:, None]
+    seen = [np.einsum("ni,ni->n", end - P, N) >= 0.0 for end in (points_m, eyes_m)]
+    valid = seen[0] & seen[1] & (s <= profile.rim_radius_m**2) & (step <= _FOUND * profile.rim_radius_m)
+    lost = ~valid
+    P[lost], N[lost] = np.nan, np.nan
+    return P, N, np.asarray(valid)
 
 
 def _start(points_m: Array, eyes_m: Array, profile: Profile) -> Array:
@@ -145,31 +176,42 @@ def _slope(r: Array, point: Plane, eye: Plane, profile: Profile) -> tuple[Array,
 
 
 def _newton(xy: Array, points_m: Array, eyes_m: Array, profile: Profile) -> Array:
-    """Step in (x, y), shape (N, 2), no longer than `_LONGEST` rim radii: of the path as a function of x and y."""
-    s = np.einsum("ni,ni->n", xy, xy)
-    sag = profile.sag(s)
-    rise = 2.0 * sag.slope_per_m[:, None] * xy  # of z by x and y
-    curve = 4.0 * sag.bend_per_m3[:, None, None] * xy[:, :, None] * xy[:, None, :]
-    curve += 2.0 * sag.slope_per_m[:, None, None] * np.eye(2)
-    gradient, hessian = np.zeros_like(xy), np.zeros((len(xy), 2, 2))
-    for end in (points_m, eyes_m):
-        way, dz = xy - end[:, :2], sag.z_m - end[:, 2]
-        length = np.sqrt(np.einsum("ni,ni->n", way, way) + dz * dz)
-        along = (way + dz[:, None] * rise) / length[:, None]
-        gradient += along
-        part = np.eye(2) + rise[:, :, None] * rise[:, None, :] + dz[:, None, None] * curve
-        hessian += (part - along[:, :, None] * along[:, None, :]) / length[:, None, None]
-    det = hessian[:, 0, 0] * hessian[:, 1, 1] - hessian[:, 0, 1] ** 2
-    x = (hessian[:, 1, 1] * gradient[:, 0] - hessian[:, 0, 1] * gradient[:, 1]) / det
-    y = (hessian[:, 0, 0] * gradient[:, 1] - hessian[:, 0, 1] * gradient[:, 0]) / det
-    move = -np.stack([x, y], axis=-1)
-    length = np.linalg.norm(move, axis=-1, keepdims=True)
+    """Step in (x, y), shape (N, 2), no longer than `_LONGEST` rim radii."""
+    (g_x, g_y), (h_xx, h_xy, h_yy), _ = _path(xy, points_m, eyes_m, profile)
+    det = h_xx * h_yy - h_xy * h_xy
+    move = np.stack([h_xy * g_y - h_yy * g_x, h_xy * g_x - h_xx * g_y], axis=-1) / det[:, None]
+    length = np.hypot(move[:, 0], move[:, 1])[:, None]
     return move * np.minimum(1.0, _LONGEST * profile.rim_radius_m / np.maximum(length, 1e-300))
 
 
-def _on_surface(xy: Array, profile: Profile) -> Array:
-    return np.concatenate([xy, profile.sag(np.einsum("ni,ni->n", xy, xy)).z_m[:, None]], axis=-1)
+def _path(
+    xy: Array, points_m: Array, eyes_m: Array, profile: Profile
+) -> tuple[tuple[Array, Array], tuple[Array, Array, Array], Array]:
+    """Derivatives of the path as a function of x and y: slopes, second derivatives xx, xy, yy; and squared slope of z.
+
+    All of shape (N,). Components are written out: matrices of each pair would take three times as long.
+    """
+    x, y = xy.T
+    sag = profile.sag(x * x + y * y)
+    z_x, z_y = 2.0 * sag.slope_per_m * x, 2.0 * sag.slope_per_m * y
+    bend = 4.0 * sag.bend_per_m3
+    z_xx, z_xy, z_yy = 2.0 * sag.slope_per_m + bend * x * x, bend * x * y, 2.0 * sag.slope_per_m + bend * y * y
+    g_x, g_y, h_xx, h_xy, h_yy = np.zeros((5, len(x)))
+    for end in (points_m, eyes_m):
+        dx, dy, dz = x - end[:, 0], y - end[:, 1], sag.z_m - end[:, 2]
+        near = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
+        u_x, u_y = (dx + dz * z_x) * near, (dy + dz * z_y) * near
+        g_x, g_y = g_x + u_x, g_y + u_y
+        h_xx = h_xx + near * (1.0 + z_x * z_x + dz * z_xx - u_x * u_x)
+        h_xy = h_xy + near * (z_x * z_y + dz * z_xy - u_x * u_y)
+        h_yy = h_yy + near * (1.0 + z_y * z_y + dz * z_yy - u_y * u_y)
+    return (g_x, g_y), (h_xx, h_xy, h_yy), z_x * z_x + z_y * z_y
 
 
-def _unit(vectors: Array) -> Array:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+def revolved_determinant(mirror_m: Array, points_m: Array, eyes_m: Array, profile: Profile) -> Array:
+    """Determinant of the path's second derivatives along the surface, shape (N,), 1/m^2, at reflection points.
+
+    Those by x and y are T^T M T, with T the derivatives of the surface point: det(T)^2 = 1 + |grad z|^2.
+    """
+    _, (h_xx, h_xy, h_yy), steep = _path(mirror_m[:, :2], points_m, eyes_m, profile)
+    return np.asarray((h_xx * h_yy - h_xy * h_xy) / (1.0 + steep))

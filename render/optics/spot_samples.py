@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.polynomial.hermite_e import hermegauss
 from numpy.polynomial.laguerre import laggauss
 from numpy.polynomial.legendre import leggauss
 from scipy.special import ndtri
@@ -64,6 +65,45 @@ def disc_nodes(profile: Profile, smoothness: float) -> tuple[Array, Array]:
     nodes = [r * np.stack([np.cos(turn), np.sin(turn)], axis=-1) for r, turn in zip(radius, turns, strict=True)]
     weights = np.repeat(weight / around, around)
     return np.concatenate(nodes), weights / weights.sum()
+
+
+def streak_nodes(profile: Profile, along: float, across: float) -> tuple[Array, Array]:
+    """Nodes as of `disc_nodes` for discs whose image is a streak: x runs along it, y across.
+
+    Ring upon ring would be as fine across the streak as along it. Over the uniform disc this is Gauss-Chebyshev
+    quadrature of the second kind in x, whose weight is the length of the chord, times Gauss-Legendre on the chord. Over
+    the Gaussian it is the trapezoidal rule where the image is long, exact for a Gaussian up to what aliases, and
+    Gauss-Hermite where it is short.
+
+    Parameters
+    ----------
+    profile
+    along, across : float
+        Extents of the image in units of the blur.
+    """
+    if profile == "uniform":
+        count = 4 + math.ceil(2.2 * along)
+        angle = np.pi * np.arange(1, count + 1) / (count + 1)
+        x, weight_x = np.cos(angle), np.sin(angle) ** 2
+        y, weight_y = leggauss(2 + math.ceil(2.2 * across))
+        nodes = np.stack(np.broadcast_arrays(x[:, None], np.sin(angle)[:, None] * y), axis=-1)
+    else:
+        (x, weight_x), (y, weight_y) = (_gaussian_line(extent) for extent in (along, across))
+        nodes = np.stack(np.broadcast_arrays(x[:, None], y), axis=-1)
+    weights = np.outer(weight_x, weight_y).ravel()
+    return nodes.reshape(-1, 2), weights / weights.sum()
+
+
+def _gaussian_line(extent: float) -> tuple[Array, Array]:
+    """Nodes on a line and weights for exp(-x^2 / 2)."""
+    if extent <= _SMALL:
+        rule = np.array(hermegauss(2 + math.ceil(8.0 * extent + 3.0 * extent**2)))
+        return rule[0], rule[1]
+    # a Gaussian of variance 1 / (1 + extent^2), as the blur leaves it: exp(-2 pi^2 / (step^2 (1 + extent^2))) aliases
+    step = 2.0 * np.pi / (4.6 * extent + 3.0)
+    half = math.ceil(_REACH / step)
+    x = np.linspace(-half * step, half * step, 2 * half + 1)
+    return x, np.exp(-0.5 * x * x)
 
 
 def disc_points(profile: Profile, uniform: Array) -> Array:
@@ -185,13 +225,14 @@ def film_position(view: View, lens_m: Array, mirror_m: Array) -> Array:
     return view.rig.camera.to_pixel(at_focus[:, :2] / focus)
 
 
-def image_radii_px(view: View, spot: LaserSpot) -> tuple[float, float]:
-    """Extent of the image, before blur, of the spot's rim (or sigma) and of the aperture's rim, pixels."""
+def _rim_images(view: View, spot: LaserSpot) -> tuple[Array, Array]:
+    """Images, before blur, of the spot's rim (or sigma) and of the aperture's rim, film positions (8, 2)."""
     spot_uv = _film(view, footprint(spot, _RIM), _lens_points(view, np.zeros_like(_RIM)))
-    lens_uv = _film(view, np.broadcast_to(spot.position_world_m, (len(_RIM), 3)), _lens_points(view, _RIM))
-    return _reach(spot_uv), _reach(lens_uv)
+    return spot_uv, _film(view, np.broadcast_to(spot.position_world_m, (len(_RIM), 3)), _lens_points(view, _RIM))
 
 
+_LONG, _SLENDER = 1.0, 3.0  # blurs along a streak, and lengths over its width
+_BENT = 0.1  # blurs that the map of the rim may deviate from a linear one
 _TURN = 2.0 * np.pi * np.arange(8) / 8.0
 _RIM = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
 
@@ -201,6 +242,21 @@ def _reach(uv: Array) -> float:
     return float(np.linalg.norm(seen - seen.mean(axis=0), axis=-1).max()) if len(seen) else 0.0
 
 
+def _fitting_nodes(profile: Profile, rim_uv: Array, blur_px: float) -> tuple[Array, Array]:
+    """Nodes of a disc whose rim has this image: those of a streak where it is one, and the map to it is linear."""
+    nodes = disc_nodes(profile, _reach(rim_uv) / blur_px)
+    if not np.isfinite(rim_uv).all():
+        return nodes
+    offset = rim_uv - rim_uv.mean(axis=0)
+    to_film = offset.T @ _RIM / (0.5 * len(_RIM))
+    _, (along, across), axes = np.linalg.svd(to_film)
+    bend = np.abs(offset - _RIM @ to_film.T).max()
+    if along < _LONG * blur_px or along < _SLENDER * across or bend > _BENT * blur_px:
+        return nodes
+    streak, weights = streak_nodes(profile, along / blur_px, across / blur_px)
+    return streak @ axes, weights
+
+
 def _film(view: View, points: Array, eyes: Array) -> Array:
     pose = view.T_world_camera.inverse()
     return film_position(view, pose.points(eyes), pose.points(mirror_points(view, points, eyes).points_m))
@@ -208,10 +264,9 @@ def _film(view: View, points: Array, eyes: Array) -> Array:
 
 def _nodes(view: View, spot: LaserSpot) -> tuple[Array, Array, Array, Array]:
     """Places across the spot, their weights (W), world points on the aperture, weights (m^2)."""
-    blur = view.rig.camera.blur_sigma_px
-    spot_px, lens_px = image_radii_px(view, spot)
-    disc, share = disc_nodes(spot.profile, spot_px / blur)
-    aperture, area = disc_nodes("uniform", lens_px / blur)
+    blur, (spot_uv, lens_uv) = view.rig.camera.blur_sigma_px, _rim_images(view, spot)
+    disc, share = _fitting_nodes(spot.profile, spot_uv, blur)
+    aperture, area = _fitting_nodes("uniform", lens_uv, blur)
     area = area * math.pi * view.rig.camera.aperture_radius_m**2
     return disc, share * spot.power_w, _lens_points(view, aperture), area
 

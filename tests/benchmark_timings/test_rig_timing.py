@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.revolved_rigs import revolved
 
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.panorama import Grid, pixels_by_model, unrolled
 from phibench.estimator.limits.best_stroke import best_stroke, spot_bound
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.render.optics.spot_layer import spot_layer
+from phibench.render.room.ambient import render_ambient
+from phibench.render.room.light_map import BakeSettings, bake
 from phibench.render.sensor.settings import sensor
+from phibench.scenes.catalog import default_rig, lab
 from phibench.scenes.laser import Beam, LaserSpot, beam_diameter_m
 from phibench.scenes.mirror import Form
 from phibench.scenes.rig import Rig
@@ -28,6 +34,44 @@ def test_benchmark_spot_layer(benchmark, mirror: str) -> None:
     rig = Rig()
     view = replace(rig, mirror=replace(rig.mirror, form=FORMS[mirror])).at(0.0)
     assert benchmark(lambda: spot_layer(view, SPOT, ())).electrons_per_s.sum() > 0.0
+
+
+def ratio(ours: Callable[[], object], sphere: Callable[[], object], rounds: int) -> float:
+    """Median ratio of CPU times, taken alternately after a first round."""
+    seconds = np.zeros((rounds + 1, 2))
+    for row in seconds:
+        for i, function in enumerate((ours, sphere)):
+            began = time.process_time()
+            function()
+            row[i] = time.process_time() - began
+    return float(np.median(seconds[1:, 0] / seconds[1:, 1]))
+
+
+@pytest.mark.benchmark(group="mirrors")
+@pytest.mark.parametrize("shape", ["sphere", "paraboloid", "hyperboloid", "cone", "polynomial"])
+def test_benchmark_price_of_a_mirror_of_revolution(benchmark, shape: str) -> None:
+    """Spot layer and view against the default sphere's: at most 1.5 times; a cone draws the spot to a streak: 2.5.
+
+    Both views are of the same room, by a coarse light map.
+    """
+    if benchmark.disabled:
+        pytest.skip("a benchmark")
+    # a cone of 90 degrees sees what is above its tip
+    spot = replace(SPOT, position_world_m=(2.0, 0.5, 1.2)) if shape == "cone" else SPOT
+    view, sphere = revolved(shape).at(0.3), default_rig().at(0.3)
+    room = lab()
+    settings = BakeSettings(texel_m=0.5, lamp_rays=4, bounces=2, bounce_rays=8, final_rays=8)
+    light = bake(sphere, room, settings)
+    benchmark(lambda: spot_layer(view, spot, ()))
+    spots = ratio(lambda: spot_layer(view, spot, ()), lambda: spot_layer(sphere, SPOT, ()), 30)
+    views = ratio(
+        lambda: render_ambient(view, room, light, settings, 2, 0),
+        lambda: render_ambient(sphere, room, light, settings, 2, 0),
+        3,
+    )
+    print(f"\n{shape}: spot layer {spots:.2f}, view {views:.2f} of the sphere's")
+    assert spots <= (2.5 if shape == "cone" else 1.5)
+    assert views <= 1.5
 
 
 @pytest.mark.benchmark(group="panorama")

@@ -11,6 +11,7 @@ from phibench.scenes.revolved_mirror import Profile, RevolvedMirror, cone, hyper
 from phibench.scenes.rig import Rig
 
 VERTEX_M = 0.2
+IMAGE_M = 0.05  # behind the vertex: where paraboloid and hyperboloid show what is level with them
 PROFILES = {
     "sphere": sphere_cap(0.06, 0.055),
     "ellipsoid": Profile(0.06, 0.5, 0.045),
@@ -28,7 +29,7 @@ def revolved(shape: str, *, aligned: bool = True, alpha: float = 0.0, **camera: 
     pose = Pose("camera", "sphere", (0.0, 0.0, VERTEX_M))
     if not aligned:
         pose = Pose("camera", "sphere", (0.004, -0.003, VERTEX_M), rotation_xyz(0.04, -0.03))
-    settings = {"focus_distance_m": VERTEX_M + 0.03} | camera
+    settings = {"focus_distance_m": VERTEX_M + IMAGE_M} | camera
     return dataclasses.replace(
         rig,
         camera=dataclasses.replace(rig.camera, **settings),  # type: ignore[arg-type]

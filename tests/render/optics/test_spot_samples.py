@@ -7,7 +7,7 @@ import pytest
 from scipy import integrate
 from scipy.special import i0e
 
-from phibench.render.optics.spot_samples import disc_nodes, disc_points, slices
+from phibench.render.optics.spot_samples import disc_nodes, disc_points, slices, streak_nodes
 
 SMOOTHNESS = [0.0, 0.2, 0.7, 0.999, 1.001, 2.0, 4.0, 8.0, 16.0]
 
@@ -46,6 +46,24 @@ def test_disc_blurred_is_the_integral_over_its_radius(smoothness: float) -> None
 
     exact = integrate.quad_vec(ring, 0.0, 1.0, epsabs=1e-10)[0]
     assert np.abs(_blurred("uniform", smoothness, at) - exact).max() <= 1e-4 * exact.max()
+
+
+@pytest.mark.parametrize("along", [1.0, 2.0, 4.0, 8.0, 16.0])
+@pytest.mark.parametrize("slender", [0.0, 0.1, 1.0 / 3.0])
+def test_streaks_blurred(along: float, slender: float) -> None:
+    """As above, with extents that differ: the Gaussian in closed form, the disc by rings enough for its length."""
+    extents = np.array([along, slender * along])
+    at = np.stack(np.meshgrid(np.linspace(0.0, along + 4.0, 41), np.linspace(0.0, extents[1] + 4.0, 11)), axis=-1)
+    at, variance = at.reshape(-1, 2), 1.0 + extents**2
+
+    def blurred(nodes: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        distance2 = ((at[:, None] - extents * nodes[None]) ** 2).sum(axis=-1)
+        return np.exp(-0.5 * distance2) @ weights / (2.0 * np.pi)
+
+    exact = np.exp(-0.5 * (at**2 / variance).sum(axis=-1)) / (2.0 * np.pi * np.sqrt(variance.prod()))
+    assert np.abs(blurred(*streak_nodes("gaussian", *extents)) - exact).max() <= 1e-4 * exact.max()
+    exact = blurred(*disc_nodes("uniform", 1.5 * along + 1.0))
+    assert np.abs(blurred(*streak_nodes("uniform", *extents)) - exact).max() <= 1e-4 * exact.max()
 
 
 def test_too_few_nodes_would_be_noticed() -> None:
