@@ -214,11 +214,11 @@ class Misalignment:
         return SphereMirror(nominal.radius_m + self.radius_m, alpha, form, nominal.metal)
 
     def _revolved(self, nominal: RevolvedMirror) -> RevolvedMirror:
-        """True mirror of revolution: `radius_m` is added to the vertex radius."""
+        """True mirror of revolution: `radius_m` is added to the vertex radius; a cone has none and stays as it is."""
         if any(getattr(self, name) for name in HARMONICS):
             raise SceneError(f"Misalignment: form errors are a sphere's; the mirror is a {nominal.profile.shape}")
         profile = nominal.profile
-        if self.radius_m:
+        if self.radius_m and profile.shape != "cone":
             profile = replace(profile, vertex_radius_m=profile.vertex_radius_m + self.radius_m)
         return RevolvedMirror(profile, nominal.roughness_alpha + self.roughness_alpha, nominal.metal)
 

@@ -200,9 +200,11 @@ class Profile:
 def by_vertex_radius(profile: Profile, points_m: Array) -> tuple[Array, Array]:
     """Derivatives of the level function and of its gradient by R, at points (..., 3) of the surface.
 
-    The gradient's part along itself is left out: it changes the length and not the normal.
+    The gradient's part along itself is left out: it changes the length and not the normal. A cone has no radius.
     """
     x, y, z = np.moveaxis(np.asarray(points_m, float), -1, 0)
+    if profile.shape == "cone":
+        return np.zeros_like(x), np.zeros((*np.shape(x), 3))
     if profile.is_quadric:
         scale = 0.5 / max(profile.vertex_radius_m, profile.rim_radius_m)
         return -2.0 * scale * z, np.broadcast_to([0.0, 0.0, -2.0 * scale], (*np.shape(x), 3))

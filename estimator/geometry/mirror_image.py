@@ -12,7 +12,9 @@ Line of sight: segments against boxes, by clipping (`blocked`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,9 +25,11 @@ from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.revolved_mirror import Profile, RevolvedMirror
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.shapes import Cuboid
+from phibench.scenes.validation import SceneError
 
 _BISECTIONS = 4  # the error of the start falls by R / distance in each
 _HALVINGS = 40
+_WIDER = (1.2, 1.1, 1.05, 1.02, 1.01)  # times the rim's radius
 _UNEVEN = 0.999  # so that no middle is on the axis, where a cone has its tip
 _NEWTON_STEPS = 12
 _TOLERANCE_PX = 1e-10
@@ -57,12 +61,11 @@ def image_of(view: View, points_world_m: Array) -> MirrorImage:
     """
     X = np.asarray(points_world_m, float)
     with np.errstate(all="ignore"):
-        uv = last = _start(view, X)
+        uv, wide = _start(view, X), _beyond_rim(view)
         for _ in range(_NEWTON_STEPS):
-            step, _ = _newton(view, uv, X)
-            beyond = ~np.isfinite(step).all(axis=-1, keepdims=True)  # of the rim: half the way back
-            uv, last = np.where(beyond, 0.5 * (uv + last), uv + step), np.where(beyond, last, uv)
-            if not np.any(np.abs(uv - last) > _TOLERANCE_PX):
+            step, _ = _newton(wide, uv, X)
+            uv = uv + step
+            if not np.any(np.abs(step) > _TOLERANCE_PX):
                 break
         step, px_per_m = _newton(view, uv, X)
         found = np.all(np.abs(step) < 1e3 * _TOLERANCE_PX, axis=-1)
@@ -85,6 +88,22 @@ def _start(view: View, X: Array) -> Array:
         P = S + R * _unit(n)
     T = view.T_world_camera
     return view.rig.camera.project((P - T.t) @ T.R)
+
+
+def _beyond_rim(view: View) -> View:
+    """View of a mirror that goes on behind its rim, which Newton's method may pass on its way."""
+    mirror = view.rig.mirror
+    if not isinstance(mirror, RevolvedMirror):
+        return view
+    return replace(view, rig=replace(view.rig, mirror=replace(mirror, profile=_wider(mirror.profile))))
+
+
+@lru_cache(maxsize=64)
+def _wider(profile: Profile) -> Profile:
+    for factor in _WIDER:
+        with suppress(SceneError):  # folds, or is no longer convex
+            return replace(profile, rim_radius_m=factor * profile.rim_radius_m)
+    return profile
 
 
 def _start_in_meridian(view: View, X: Array, profile: Profile) -> Array:
