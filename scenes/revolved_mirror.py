@@ -27,8 +27,7 @@ from typing import Literal
 import numpy as np
 
 from phibench.scenes.frames import Array
-from phibench.scenes.metals import MetalName, MetalSurface, known_metal
-from phibench.scenes.mirror import Level
+from phibench.scenes.mirror import Level, MetalName, MetalSurface, known_metal
 from phibench.scenes.validation import SceneError, finite, positive, within
 
 Shape = Literal["sphere", "ellipsoid", "paraboloid", "hyperboloid", "cone", "polynomial"]

@@ -31,7 +31,7 @@ from phibench.datasets.recipe.distributions import (
 from phibench.datasets.recipe.room_tables import RoomsTable, RoomTable
 from phibench.scenes.catalog import BOARD_SIZE_M
 from phibench.scenes.holder import LARGEST_INDEX, OF_TUBES
-from phibench.scenes.metals import MetalName
+from phibench.scenes.mirror import MetalName
 from phibench.scenes.misalignment import PARAMETERS
 
 MIN_STROKE_M, MAX_STROKE_M = 1e-3, 10.0

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from phibench.render.room.camera_plugin import MM_PER_M, sensor_dict
 from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Array, Vector
-from phibench.scenes.metals import MetalSurface
-from phibench.scenes.mirror import SphereMirror, deviation, level
+from phibench.scenes.mirror import MetalSurface, SphereMirror, deviation, level
 from phibench.scenes.revolved_mirror import Profile, RevolvedMirror
 from phibench.scenes.rig import View
 from phibench.scenes.room import MIRROR_NAME, Room
