@@ -8,7 +8,7 @@ OUT    ?= out/paper
 SAMPLES ?= 12
 BENCH  ?= out/bench-dev
 STUDIES ?= out/studies
-STUDIES_ALL := noise misalignment baseline cause isotropy stroke
+STUDIES_ALL := noise misalignment baseline cause isotropy stroke mirror
 # Which Python makes the environment: `make setup PYTHON=python3.13`. Without it the first that is new enough.
 PYTHON ?=
 # Tests start hundreds of processes. Where compiled modules may not be kept, each compiles the package anew, for a second.
@@ -25,7 +25,7 @@ help:
 	@echo "make setup      make .venv with everything in it, and make sure of LLVM"
 	@echo "make dataset    render $(RECIPE) into $(OUT)"
 	@echo "make bench      $(SAMPLES) samples of bench-dev, all built-in methods on them, a report, in out/"
-	@echo "make studies    the six studies, reduced, and a report on them, in out/studies"
+	@echo "make studies    the seven studies, reduced, and a report on them, in out/studies"
 	@echo "make studies-full  the same in full (hours), published to docs/studies"
 	@echo "make test       the tests, without the slow ones"
 	@echo "make test-slow  the slow tests"

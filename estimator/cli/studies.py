@@ -1,4 +1,4 @@
-"""Commands `phibench paper` and `phibench study ...`: the tables of the paper, its experiments, and six studies."""
+"""Commands `phibench paper` and `phibench study ...`: the tables of the paper, its experiments, and seven studies."""
 
 from __future__ import annotations
 
@@ -132,6 +132,7 @@ STUDIES = {
     "cause": "What makes the error curves that the paper has published.",
     "isotropy": "Error of D against azimuth, and what panoramas keep.",
     "stroke": "The stroke that measures a distance best.",
+    "mirror": "Mirrors of other shapes beside each other, for the choice of one.",
 }
 """Every study in one sentence; the names are those of `studies.run`."""
 

@@ -178,7 +178,7 @@ def _fault(rig: Rig, points_m: Array, uv_px: Array, offset_m: float, around: Sur
         return CEILING
     if not np.isfinite(uv_px).all():
         return NO_IMAGE
-    if np.any(_outline_distance_px(rig, uv_px) < around.edge_px):
+    if np.any(outline_distance_px(rig, uv_px) < around.edge_px):
         return MIRROR_EDGE
     if not np.all(rig.camera.contains(uv_px - around.edge_px) & rig.camera.contains(uv_px + around.edge_px)):
         return IMAGE_EDGE
@@ -216,7 +216,7 @@ def _covariance(image: MirrorImage, spot: SpotSigma, electrons: Array) -> Array:
     return np.asarray(np.where(np.isfinite(variance), variance, np.nan)[..., None, None] * np.eye(2))
 
 
-def _outline_distance_px(rig: Rig, uv_px: Array) -> Array:
+def outline_distance_px(rig: Rig, uv_px: Array) -> Array:
     """Distance of pixels, shape (m, 2), from the mirror's outline, inwards: angle times focal length.
 
     That of a mirror of revolution is a polygon in the image.

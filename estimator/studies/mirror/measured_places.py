@@ -1,0 +1,240 @@
+"""Places that a pair measures, the bound of D there, and the cost of every misalignment.
+
+The blur of a spot differs between mirrors: a cone is flat along its side and focuses there much farther off than
+across. D depends on the radius in the image alone, whose bound for a spot with the radial sigma s_r and the tangential
+one s_t is taken from round spots of s = sqrt(s_r s_t):
+
+    sigma_r = sigma_round(s) s_r / s.
+
+Where the spot's own light is the noise, sigma_round grows as s, and where the background is, as s^2: sigma_r is then
+s_r / sqrt(N) and proportional to s_r sqrt(s_r s_t), as for an elliptic Gaussian spot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.geometry.mirror_image import MirrorImage, blocked, image_of
+from phibench.estimator.geometry.reflection import reflect
+from phibench.estimator.geometry.sensitivities import PARAMETERS, sensitivity
+from phibench.estimator.geometry.status import Status
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.limits.best_stroke import ROOM_E_PER_S
+from phibench.estimator.limits.processed_bound import SpotSigma, spot_sigma
+from phibench.estimator.limits.stroke_curve import outline_distance_px
+from phibench.estimator.spots.gaussian_spot import SpotBlur
+from phibench.estimator.spots.spot_prediction import Laser, spot_blur, spot_electrons_per_s
+from phibench.scenes.frames import Array, BoolArray
+from phibench.scenes.laser import Beam
+from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
+from phibench.scenes.rig import Rig
+from phibench.scenes.room import escalade360
+
+_WALL_NORMAL = np.array([-1.0, 0.0, 0.0])  # an upright wall along world x, facing the mirror
+_CHUNK = 500  # points whose distances from all sides of the outline are taken at once
+
+
+# -- visibility --------------------------------------------------------------------------------------------------------
+
+
+def measured(rig: Rig, points_m: Array, stroke_m: float, edge_px: float, azimuths_rad: Array) -> BoolArray:
+    """Places that both images of a pair show, from every one of the azimuths, shape (n,).
+
+    Parameters
+    ----------
+    rig : Rig, aligned
+    points_m : shape (n, 3), in the upright plane through world x
+    stroke_m : float
+    edge_px : float
+        Least distance from the outline of the mirror and from the edge of the image.
+    azimuths_rad : shape (a,)
+        The places are turned about the mirror's axis; what the robot hides differs between them.
+    """
+    turned = [points_m @ _about_z(a).T for a in azimuths_rad]
+    fine = [shown(rig, points_m, offset, edge_px) for offset in (0.0, stroke_m)]
+    free = [unhidden(rig, points, offset) for points in turned for offset in (0.0, stroke_m)]
+    return np.asarray(np.all([*fine, *free], axis=0))
+
+
+def shown(rig: Rig, points_m: Array, offset_m: float, edge_px: float) -> BoolArray:
+    """Places whose image lies inside the mirror's and the camera's, shape (n,); the robot is not asked."""
+    parts = np.array_split(points_m, max(len(points_m) // _CHUNK, 1))
+    return np.concatenate([_shown(rig, part, offset_m, edge_px) for part in parts])
+
+
+def _shown(rig: Rig, points_m: Array, offset_m: float, edge_px: float) -> BoolArray:
+    image = _image(rig, points_m, offset_m)
+    seen = image.status == Status.OK
+    uv = np.where(seen[:, None], image.uv_px, rig.camera.project(rig.sphere_in_camera_m))
+    inside = rig.camera.contains(uv - edge_px) & rig.camera.contains(uv + edge_px)
+    return np.asarray(seen & inside & (outline_distance_px(rig, uv) >= edge_px))
+
+
+def unhidden(rig: Rig, points_m: Array, offset_m: float) -> BoolArray:
+    """Places that robot, mast and housing do not hide on the way to the mirror, shape (n,)."""
+    view, image = rig.at(offset_m), _image(rig, points_m, offset_m)
+    mirror = reflect(view, image.uv_px).origin_world_m
+    known = np.isfinite(mirror).all(axis=-1)
+    start = np.where(known[:, None], mirror, view.sphere_centre_m)
+    solids = escalade360(view)
+    inside = [_holds(solid.T_world_shape.inverse().points(points_m), solid.size_m) for solid in solids]
+    return np.asarray(known & ~np.any([*inside, *(blocked(solid, start, points_m) for solid in solids)], axis=0))
+
+
+def _holds(points_m: Array, size_m: Sequence[float]) -> BoolArray:
+    return np.asarray(np.all(np.abs(points_m) <= 0.5 * np.array(size_m), axis=-1))
+
+
+def _image(rig: Rig, points_m: Array, offset_m: float) -> MirrorImage:
+    """Image of places by a raised rig: that of lowered places by the rig where it is."""
+    return image_of(rig.at(0.0), points_m - offset_m * np.array(rig.stroke_axis_world))
+
+
+def _about_z(angle_rad: float) -> Array:
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+# -- bound -------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class BlurBounds:
+    """Bound of a coordinate by electrons and blur, for one sensor over a white wall.
+
+    Attributes
+    ----------
+    blurs_px : tuple of float
+        Sigma of round spots, rising.
+    bounds : tuple of SpotSigma, one per blur
+    exposure_s : float
+    """
+
+    blurs_px: tuple[float, ...]
+    bounds: tuple[SpotSigma, ...]
+    exposure_s: float
+
+    def round_at(self, flux_e: ArrayLike, blur_px: float) -> float:
+        """Bound for a round spot, pixels, log-log between the blurs; infinite beyond them."""
+        if not self.blurs_px[0] <= blur_px <= self.blurs_px[-1]:
+            return float("inf")
+        values = np.array([float(bound.at(flux_e)) for bound in self.bounds])
+        return float(np.exp(np.interp(np.log(blur_px), np.log(self.blurs_px), np.log(values))))
+
+    def at(self, flux_e: float, blur: SpotBlur) -> tuple[float, float]:
+        """Bounds along and across the radius, pixels, for a spot on the image's u axis."""
+        radial, tangential = float(blur.sigma_px), float(blur.sigma_px * blur.ratio)
+        middle = float(np.sqrt(radial * tangential))
+        found = self.round_at(flux_e, middle)
+        return found * radial / middle, found * tangential / middle
+
+
+def blur_bounds(card: SensorCard, response: tuple[float, float, float], blurs_px: Sequence[float]) -> BlurBounds:
+    """Table of bounds for a sensor, over a white wall of the lab."""
+    room = [rate * card.exposure_s for rate in ROOM_E_PER_S]
+    fluxes = tuple(np.geomspace(100.0, 1e6, 25 if card.output == "raw" else 9).tolist())
+    found = tuple(spot_sigma(card, blur, room, response, flux_e=fluxes) for blur in blurs_px)
+    return BlurBounds(tuple(blurs_px), found, card.exposure_s)
+
+
+@dataclass(frozen=True)
+class PlaceBound:
+    """Bound of D at one place.
+
+    Attributes
+    ----------
+    relative : float
+        Standard deviation of D over D; NaN where a pair does not measure the place.
+    theta_rad : (down, up)
+        Of the rays, from straight down.
+    radial_blur_px : float
+        Larger sigma of both spots along the radius.
+    """
+
+    relative: float
+    theta_rad: tuple[float, float]
+    radial_blur_px: float
+
+
+NOTHING = PlaceBound(float("nan"), (float("nan"), float("nan")), float("nan"))
+
+
+def place_bound(rig: Rig, table: BlurBounds, depth_m: float, height_m: float, stroke_m: float) -> PlaceBound:
+    """Bound of D for a spot of the default laser on an upright wall along world x, the rig known exactly."""
+    point = np.array([depth_m, 0.0, height_m])
+    pixels, covariances, thetas, blurs = [], [], [], []
+    for offset in (0.0, stroke_m):
+        image = _image(rig, point, offset)
+        if image.status != Status.OK:
+            return NOTHING
+        blur = spot_blur(rig, image.uv_px, depth_m, Beam())
+        light = float(spot_electrons_per_s(rig, Laser(), image, _WALL_NORMAL)) * table.exposure_s
+        ray = reflect(rig.at(0.0), image.uv_px).direction_world
+        pixels.append(image.uv_px)
+        covariances.append(np.diag(np.square(table.at(light, blur))))
+        thetas.append(float(np.arctan2(ray[0], -ray[2])))
+        blurs.append(float(blur.sigma_px))
+    found = depth_exact(rig, stroke_m, *pixels, *covariances)
+    return PlaceBound(float(found.sigma_m) / depth_m, (thetas[0], thetas[1]), max(blurs))
+
+
+# -- misalignments -----------------------------------------------------------------------------------------------------
+
+DIRECTIONS: Mapping[str, tuple[str, ...]] = {
+    "mirror aside": ("decentre_x_m", "decentre_y_m"),
+    "mirror higher": ("axial_m",),
+    "vertex radius": ("radius_m",),
+    "camera tilted": ("tilt_x_rad", "tilt_y_rad"),
+    "focal length": ("focal_relative",),
+    "principal point": ("cx_px", "cy_px"),
+    "distortion k1": ("k1",),
+    "distortion k2": ("k2",),
+    "distortion k3": ("k3",),
+    "distortion p1, p2": ("p1", "p2"),
+    "stroke, offset": ("stroke_offset_m",),
+    "stroke, scale": ("stroke_relative",),
+    "stroke axis tilted": ("stroke_tilt_x_rad", "stroke_tilt_y_rad"),
+    "rig turned between the images": ("roll_rad", "pitch_rad"),
+    "rig moved aside between the images": ("shift_x_m", "shift_y_m"),
+    "rig moved up between the images": ("shift_z_m",),
+}
+"""Parameters of a rig by kind. Two of a kind differ in direction alone, and count in the costlier one. Form errors
+are a sphere's; the plane of focus and roughness move no ray; a yaw between the images has no first order."""
+UNCALIBRATED = (
+    "stroke, offset",
+    "rig turned between the images",
+    "rig moved aside between the images",
+    "rig moved up between the images",
+)
+"""Kinds that differ from pair to pair, so that no calibration knows them."""
+
+
+def usual(kind: str) -> float:
+    """Usual size of a kind, in its unit: what is left after careful mounting."""
+    return MISALIGNMENT[DIRECTIONS[kind][0]].study
+
+
+def unit(kind: str) -> str:
+    """Unit of a kind: "m", "rad", "px" or "1"."""
+    return MISALIGNMENT[DIRECTIONS[kind][0]].unit
+
+
+def costs(rig: Rig, depth_m: float, height_m: float, stroke_m: float) -> dict[str, float]:
+    """Relative error of D per unit of each kind, in its costlier direction; NaN where no pair measures the place.
+
+    Derivatives of the exact estimator's error at the nominal rig, for a spot along world x. Of two parameters of a kind
+    the derivative is a vector, whose length is taken.
+    """
+    found = sensitivity("exact", rig, stroke_m, rig, stroke_m, np.array([depth_m, 0.0, height_m]))
+    by_name = dict(zip(PARAMETERS, found.error_gradient / depth_m, strict=True))
+    return {kind: float(np.sqrt(sum(by_name[name] ** 2 for name in names))) for kind, names in DIRECTIONS.items()}
+
+
+def together(found: Mapping[str, float], kinds: Sequence[str]) -> float:
+    """Root of the sum of squares of kinds at their usual sizes, relative to D."""
+    return float(np.sqrt(sum((found[kind] * usual(kind)) ** 2 for kind in kinds)))
