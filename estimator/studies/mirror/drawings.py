@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from phibench.estimator.studies.framework import COLOURS, LINES, MARKERS, Drawing, canvas, drawn
-from phibench.estimator.studies.mirror.measured_places import DIRECTIONS, usual
+from phibench.estimator.studies.mirror.measured_places import DIRECTIONS
 from phibench.estimator.studies.mirror.tables import Asked, Compared
 
 _LEAST = 1e-2  # per cent: what costs less is not drawn
@@ -25,7 +25,7 @@ def comparison_drawing(found: Mapping[str, Compared], asked: Asked) -> Drawing:
         _costs(last, found, asked)
         handles = [Line2D([], [], color=COLOURS[i], linestyle=LINES[i % 4], label=n) for i, n in enumerate(found)]
         left.legend(handles=handles, frameon=False)
-        far = asked.depths_m[-2 if len(asked.depths_m) > 1 else -1]
+        far = asked.misaligned_m[-1]
         parts = "; ".join(
             f"{name} {100.0 * value:.2g} %"
             for name, c in found.items()
@@ -75,11 +75,11 @@ def _places(ax: Axes, found: Mapping[str, Compared]) -> None:
 
 
 def _costs(ax: Axes, found: Mapping[str, Compared], asked: Asked) -> None:
-    middle = asked.depths_m[len(asked.depths_m) // 2]
+    middle = asked.misaligned_m[len(asked.misaligned_m) // 2]
     kinds = list(DIRECTIONS)
     for i, c in enumerate(found.values()):
-        cost = np.array([100.0 * c.costs[middle][kind] * usual(kind) for kind in kinds])
-        cost = np.where(cost >= _LEAST, cost, np.nan)
+        cost = np.array([100.0 * c.costs[middle][kind] for kind in kinds])
+        cost = np.where((cost >= _LEAST) & np.isfinite(cost), cost, np.nan)
         ax.plot(cost, np.arange(len(kinds)), MARKERS[i], color=COLOURS[i], markersize=5, linestyle="")
     ax.set_yticks(np.arange(len(kinds)), kinds, fontsize=7)
     ax.invert_yaxis()

@@ -5,8 +5,8 @@ from straight down. With the ray r(u) at the radius u of the image and r = (sin 
 
     d theta / du = (r_x r_z' - r_z r_x')    (a prime is d / du; `reflect_jacobian` has it analytically),
 
-and the resolution is its inverse. The ray's line meets the mirror's axis at the height z - x r_z / r_x: the viewpoint of
-a central camera, and a different one for each ray of any other.
+and the resolution is its inverse. The ray's line meets the mirror's axis at the height z - x r_z / r_x: the viewpoint
+of a central camera, and a different one for each ray of any other.
 """
 
 from __future__ import annotations

@@ -21,7 +21,6 @@ from numpy.typing import ArrayLike
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.geometry.mirror_image import MirrorImage, blocked, image_of
 from phibench.estimator.geometry.reflection import reflect
-from phibench.estimator.geometry.sensitivities import PARAMETERS, sensitivity
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.limits.best_stroke import ROOM_E_PER_S
@@ -32,10 +31,15 @@ from phibench.estimator.spots.spot_prediction import Laser, spot_blur, spot_elec
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import Beam
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
+from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import escalade360
+from phibench.scenes.validation import SceneError
 
 _WALL_NORMAL = np.array([-1.0, 0.0, 0.0])  # an upright wall along world x, facing the mirror
+_FLOOR_M, _FLOOR_STEP_M = 0.1, 0.02
+_FIRST, _LARGEST = 64.0, 256.0  # usual size over the least one that is tried, and largest one over it
+_HALVINGS = 8
 _CHUNK = 500  # points whose distances from all sides of the outline are taken at once
 
 
@@ -98,6 +102,15 @@ def _image(rig: Rig, points_m: Array, offset_m: float) -> MirrorImage:
 def _about_z(angle_rad: float) -> Array:
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def floor_from_m(rig: Rig, stroke_m: float, edge_px: float, azimuth_rad: float, last_m: float) -> float:
+    """Least distance from which on every spot on the floor is measured up to the last, NaN where the last is not."""
+    D = np.arange(_FLOOR_M, last_m + 0.5 * _FLOOR_STEP_M, _FLOOR_STEP_M)
+    points = np.stack([D, np.zeros_like(D), np.zeros_like(D)], axis=-1)
+    missing = np.flatnonzero(~measured(rig, points, stroke_m, edge_px, np.array([azimuth_rad])))
+    first = missing[-1] + 1 if missing.size else 0
+    return float(D[first]) if first < len(D) else float("nan")
 
 
 # -- bound -------------------------------------------------------------------------------------------------------------
@@ -199,14 +212,16 @@ DIRECTIONS: Mapping[str, tuple[str, ...]] = {
     "stroke, offset": ("stroke_offset_m",),
     "stroke, scale": ("stroke_relative",),
     "stroke axis tilted": ("stroke_tilt_x_rad", "stroke_tilt_y_rad"),
-    "rig turned between the images": ("roll_rad", "pitch_rad"),
+    "rig tilted between the images": ("roll_rad", "pitch_rad"),
+    "rig turned between the images": ("yaw_rad",),
     "rig moved aside between the images": ("shift_x_m", "shift_y_m"),
     "rig moved up between the images": ("shift_z_m",),
 }
 """Parameters of a rig by kind. Two of a kind differ in direction alone, and count in the costlier one. Form errors
-are a sphere's; the plane of focus and roughness move no ray; a yaw between the images has no first order."""
+are a sphere's; the plane of focus and roughness move no ray."""
 UNCALIBRATED = (
     "stroke, offset",
+    "rig tilted between the images",
     "rig turned between the images",
     "rig moved aside between the images",
     "rig moved up between the images",
@@ -224,17 +239,58 @@ def unit(kind: str) -> str:
     return MISALIGNMENT[DIRECTIONS[kind][0]].unit
 
 
-def costs(rig: Rig, depth_m: float, height_m: float, stroke_m: float) -> dict[str, float]:
-    """Relative error of D per unit of each kind, in its costlier direction; NaN where no pair measures the place.
+def errors(rig: Rig, kind: str, size: float, points_m: Array, stroke_m: float) -> Array:
+    """Largest error of D relative to D by a deviation of this size, over directions and signs, shape (n,).
 
-    Derivatives of the exact estimator's error at the nominal rig, for a spot along world x. Of two parameters of a kind
-    the derivative is a vector, whose length is taken.
+    Pairs of the rig that deviates are measured with the nominal one, by the exact estimator. Infinite where the pair is
+    lost: the spot leaves the mirror, or the rays part.
+
+    Parameters
+    ----------
+    rig : Rig, the nominal one
+    kind : of `DIRECTIONS`
+    size : float, in the kind's unit
+    points_m : shape (n, 3)
+    stroke_m : float, the nominal stroke
     """
-    found = sensitivity("exact", rig, stroke_m, rig, stroke_m, np.array([depth_m, 0.0, height_m]))
-    by_name = dict(zip(PARAMETERS, found.error_gradient / depth_m, strict=True))
-    return {kind: float(np.sqrt(sum(by_name[name] ** 2 for name in names))) for kind, names in DIRECTIONS.items()}
+    signed = [{name: sign * size} for name in DIRECTIONS[kind] for sign in (1.0, -1.0)]
+    return np.asarray(np.max([_errors_of(rig, Misalignment(**one), points_m, stroke_m) for one in signed], axis=0))
+
+
+def _errors_of(rig: Rig, wrong: Misalignment, points_m: Array, stroke_m: float) -> Array:
+    try:
+        true = rig.perturbed(wrong)
+    except SceneError:  # there is no such rig
+        return np.full(len(points_m), np.inf)
+    down, up = (image_of(true.at(offset), points_m).uv_px for offset in (0.0, wrong.stroke_m(stroke_m)))
+    away = points_m[:, :2] - true.at(0.0).sphere_centre_m[:2]
+    D = np.hypot(away[:, 0], away[:, 1])
+    relative = np.abs(depth_exact(rig, stroke_m, down, up).depth_m / D - 1.0)
+    return np.asarray(np.where(np.isfinite(relative), relative, np.inf))
+
+
+def tolerance(rig: Rig, kind: str, points_m: Array, stroke_m: float, cost: float) -> float:
+    """Least size of a kind that costs so much of D at the costliest place; NaN where no size up to the largest does.
+
+    Whole errors are searched, not slopes: near a cone's tip a deviation turns the azimuth, which has no first order.
+    Sizes are doubled from a 64th of the usual one, then bisected.
+    """
+    largest = min(_LARGEST * usual(kind), MISALIGNMENT[DIRECTIONS[kind][0]].limit)
+
+    def too_large(size: float) -> bool:
+        return bool(np.max(errors(rig, kind, size, points_m, stroke_m)) >= cost)
+
+    low, high = 0.0, usual(kind) / _FIRST
+    while not too_large(high):
+        if high >= largest:
+            return float("nan")
+        low, high = high, min(2.0 * high, largest)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if too_large(middle) else (middle, high)
+    return high
 
 
 def together(found: Mapping[str, float], kinds: Sequence[str]) -> float:
-    """Root of the sum of squares of kinds at their usual sizes, relative to D."""
-    return float(np.sqrt(sum((found[kind] * usual(kind)) ** 2 for kind in kinds)))
+    """Root of the sum of squares of errors of some kinds."""
+    return float(np.sqrt(sum(found[kind] ** 2 for kind in kinds)))

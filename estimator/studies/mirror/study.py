@@ -21,26 +21,28 @@ from phibench.estimator.studies.mirror.field import disc_shares, meridian, outli
 from phibench.estimator.studies.mirror.measured_places import (
     DIRECTIONS,
     NOTHING,
-    UNCALIBRATED,
     BlurBounds,
     blur_bounds,
-    costs,
+    errors,
+    floor_from_m,
     measured,
     place_bound,
-    together,
+    tolerance,
     usual,
 )
 from phibench.estimator.studies.mirror.tables import (
     Compared,
     PlaceMap,
     bound_table,
+    cost_findings,
     cost_table,
     criteria_findings,
     field_table,
     pick_table,
-    reach_table,
     ratio_findings,
+    reach_table,
     resolution_table,
+    single_table,
     tolerance_table,
 )
 from phibench.scenes.frames import Array
@@ -85,6 +87,7 @@ class MirrorSettings(Settings):
     depths_m: _Metres = Field(description="distances of the tables, rising")
     curve_m: Annotated[tuple[float, float, float], Field(strict=False)] = Field(description="first, last, step")
     spot_height_m: float = Field(ge=0.0, le=3.0, description="of the curves and of the misalignments")
+    misaligned_m: _Metres = Field(description="distances of the misalignments, rising")
     angles_deg: _Angles = Field(description="theta of the resolution")
     viewpoints_deg: Annotated[tuple[float, float], Field(strict=False)] = Field(description="theta of the viewpoints")
     azimuths_deg: Annotated[tuple[float, ...], Field(strict=False, min_length=1)] = Field(
@@ -120,32 +123,25 @@ def run(settings: MirrorSettings, datasets: StudyDatasets) -> Result:
         for name, rig in rigs.items():
             found[name] = compare(settings, rig, tables)
             steps.advance()
-    heights = [h for h in dict.fromkeys((*settings.heights_m, settings.spot_height_m))]
-    percent = f"{100.0 * settings.cost:g} %"
-    spot = f"{settings.spot_height_m:g} m"
+    heights = list(dict.fromkeys((*settings.heights_m, settings.spot_height_m)))
+    percent, spot = f"{100.0 * settings.cost:g} %", f"spots at {settings.spot_height_m:g} m"
     shown = {
         "Pick a mirror": pick_table(found, settings),
         "Field of view and use of the image": field_table(found, settings),
         "Resolution, pixels per degree of theta": resolution_table(found, settings.angles_deg),
         "Places that both images show": reach_table(found, settings),
         **{f"Bound of D, %, {preset}": bound_table(found, preset, heights, settings.depths_m) for preset in tables},
-        f"Error of D, %, by deviations of usual size, spots at {spot}": cost_table(found, settings),
-        f"Deviation that costs {percent} of D at {middle_m(settings):g} m, spots at {spot}": (
-            tolerance_table(found, middle_m(settings), settings.cost)
-        ),
+        f"Error of D, %, by deviations of usual size, {spot}": cost_table(found, settings),
+        f"Deviation that costs {percent} of D at the costliest distance, {spot}": tolerance_table(found),
+        f"Error of D, %, by one deviation of usual size, {spot}": single_table(found, settings),
     }
     return Result(
         {"table": bound_frame(found), "rays": ray_frame(found), "costs": cost_frame(found), "map": map_frame(found)},
-        (*criteria_findings(found, settings), *ratio_findings(found, settings)),
+        (*criteria_findings(found, settings), *ratio_findings(found, settings), *cost_findings(found, settings)),
         (comparison_drawing(found, settings),),
         shown,
         _notes(settings),
     )
-
-
-def middle_m(settings: MirrorSettings) -> float:
-    """Distance of the tolerances: the middle one of the tables."""
-    return settings.depths_m[len(settings.depths_m) // 2]
 
 
 def _rigs(settings: MirrorSettings) -> dict[str, Rig]:
@@ -159,7 +155,7 @@ def _rigs(settings: MirrorSettings) -> dict[str, Rig]:
     first, last, step = settings.curve_m
     if not 0.2 <= first < last <= 20.0 or not 0.0 < step <= last - first:
         raise DatasetError(f"curve_m = {list(settings.curve_m)}: must be first < last, 0.2 to 20 m, and a step above 0")
-    for name in ("blurs_px", "depths_m", "azimuths_deg", "viewpoints_deg"):
+    for name in ("blurs_px", "depths_m", "misaligned_m", "azimuths_deg", "viewpoints_deg"):
         values = getattr(settings, name)
         if list(values) != sorted(set(values)):
             raise DatasetError(f"{name} = {list(values)}: must rise")
@@ -184,7 +180,7 @@ def compare(settings: MirrorSettings, rig: Rig, tables: Mapping[str, BlurBounds]
     rays = meridian(rig)
     places = place_map(settings, rig)
     heights = dict.fromkeys((*settings.heights_m, settings.spot_height_m))
-    depths = sorted({*settings.depths_m, *(settings.curve_depths_m.tolist())})
+    depths = sorted({*settings.depths_m, *settings.misaligned_m, *(settings.curve_depths_m.tolist())})
     seen = _seen(settings, rig, [(d, h) for h in heights for d in depths])
     bounds = {
         (preset, h, d): place_bound(rig, table, d, h, settings.stroke_m) if seen[d, h] else NOTHING
@@ -193,7 +189,11 @@ def compare(settings: MirrorSettings, rig: Rig, tables: Mapping[str, BlurBounds]
         for d in (depths if h == settings.spot_height_m else settings.depths_m)
     }
     nothing = dict.fromkeys(DIRECTIONS, math.nan)
-    at = settings.spot_height_m
+    at, h = settings.spot_height_m, settings.stroke_m
+    wrong = [d for d in settings.misaligned_m if seen[d, at]]
+    spots = np.array([(d, 0.0, at) for d in wrong])
+    found = {kind: errors(rig, kind, usual(kind), spots, h) for kind in DIRECTIONS} if wrong else {}
+    sides = (0.0, 0.5 * math.pi, math.pi)
     return Compared(
         rays=rays,
         field_deg=rays.field_deg(settings.edge_px),
@@ -204,7 +204,10 @@ def compare(settings: MirrorSettings, rig: Rig, tables: Mapping[str, BlurBounds]
         up=disc_shares(rig, rays, settings.stroke_m, settings.azimuths_rad),
         places=places,
         bounds=bounds,
-        costs={d: costs(rig, d, at, settings.stroke_m) if seen[d, at] else nothing for d in settings.depths_m},
+        floor_m=tuple(floor_from_m(rig, h, settings.edge_px, a, settings.curve_m[1]) for a in sides),
+        costs=dict.fromkeys(settings.misaligned_m, nothing)
+        | {d: {kind: float(column[i]) for kind, column in found.items()} for i, d in enumerate(wrong)},
+        tolerances={k: tolerance(rig, k, spots, h, settings.cost) if wrong else math.nan for k in DIRECTIONS},
     )
 
 
@@ -266,20 +269,20 @@ def ray_frame(found: Mapping[str, Compared]) -> pl.DataFrame:
 
 
 def cost_frame(found: Mapping[str, Compared]) -> pl.DataFrame:
-    """A row per mirror, distance and kind of deviation: relative error of D per unit and at the usual size."""
+    """A row per mirror, distance and kind of deviation: error of D at the usual size, and tolerance."""
     rows = [
         {
             "mirror": name,
             "depth_m": d,
             "deviation": kind,
             "parameters": ", ".join(DIRECTIONS[kind]),
-            "relative_per_unit": per_unit,
             "usual": usual(kind),
-            "relative_at_usual": per_unit * usual(kind),
+            "error_relative": error,
+            "tolerance": compared.tolerances[kind],
         }
         for name, compared in found.items()
         for d, by_kind in compared.costs.items()
-        for kind, per_unit in by_kind.items()
+        for kind, error in by_kind.items()
     ]
     return pl.DataFrame(rows)
 
@@ -306,7 +309,8 @@ def _notes(settings: MirrorSettings) -> tuple[str, ...]:
         f"pixels out, and are those of frames with {1e3 * settings.exposure_s:g} ms.",
         "Places count where spots are seen in both images from all azimuths, and robot, mast and camera's housing hide "
         "none; a dash is a place that is not measured.",
-        "Costs are slopes times usual sizes, in the costlier direction; a calibration is not counted.",
+        "Errors of D by deviations are those of the costlier direction and sign, one deviation at a time, and the rig is not "
+        "calibrated. Together they are roots of sums of squares.",
     )
 
 

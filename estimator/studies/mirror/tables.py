@@ -22,7 +22,8 @@ from phibench.estimator.studies.mirror.measured_places import (
 from phibench.scenes.frames import Array, BoolArray
 
 ALL_KINDS = tuple(DIRECTIONS)
-_NONE = "-"
+_NONE, _LOST = "-", "lost"
+_FEW = 2  # names that a cell holds
 _SHOWN_UNITS = {"m": ("mm", 1e3), "rad": ("deg", math.degrees(1.0)), "px": ("px", 1.0), "1": ("", 1.0)}
 
 
@@ -30,15 +31,28 @@ class Asked(Protocol):
     """Settings that the tables read."""
 
     @property
-    def depths_m(self) -> tuple[float, ...]: ...
+    def depths_m(self) -> tuple[float, ...]:
+        """Distances of the tables."""
+
     @property
-    def presets(self) -> tuple[str, ...]: ...
+    def misaligned_m(self) -> tuple[float, ...]:
+        """Distances of the misalignments."""
+
     @property
-    def spot_height_m(self) -> float: ...
+    def presets(self) -> tuple[str, ...]:
+        """Sensors; the first is compared."""
+
     @property
-    def stroke_m(self) -> float: ...
+    def spot_height_m(self) -> float:
+        """Height of the compared spots."""
+
     @property
-    def cost(self) -> float: ...
+    def stroke_m(self) -> float:
+        """Stroke of every pair."""
+
+    @property
+    def cost(self) -> float:
+        """Relative error of D that a tolerance allows."""
 
 
 @dataclass(frozen=True)
@@ -60,14 +74,6 @@ class PlaceMap:
     def share(self) -> float:
         """Share of the map's area."""
         return float(self.measured.mean())
-
-    def floor_from_m(self) -> float:
-        """Least distance from which on every spot on the floor is measured; NaN where the last one is not."""
-        row = self.measured[0]
-        if not row[-1]:
-            return math.nan
-        last_gap = np.flatnonzero(~row)
-        return float(self.depths_m[last_gap[-1] + 1 if last_gap.size else 0])
 
     def heights_at(self, depth_m: float) -> tuple[float, float]:
         """Lowest and highest measured height at the map's nearest distance; NaN where there is none."""
@@ -91,8 +97,10 @@ class Compared:
     spread_m : of the viewpoints
     down, up : DiscShares
     places : PlaceMap
+    floor_m : least distance from which on the floor is measured: before, beside and behind the robot
     bounds : by preset, height and distance
-    costs : by distance and kind of deviation, relative error of D per unit
+    costs : by distance and kind of deviation, relative error of D at the usual size; infinite where the pair is lost
+    tolerances : by kind, size that costs the allowed error at the costliest distance; NaN where none does
     """
 
     rays: Meridian
@@ -103,8 +111,10 @@ class Compared:
     down: DiscShares
     up: DiscShares
     places: PlaceMap
+    floor_m: tuple[float, ...]
     bounds: Mapping[tuple[str, float, float], PlaceBound]
     costs: Mapping[float, Mapping[str, float]]
+    tolerances: Mapping[str, float]
 
 
 # -- tables ------------------------------------------------------------------------------------------------------------
@@ -148,12 +158,19 @@ def resolution_table(found: Mapping[str, Compared], angles_deg: Sequence[float])
 
 
 def reach_table(found: Mapping[str, Compared], asked: Asked) -> tuple[Row, ...]:
-    """Nearest spot on the floor, and lowest and highest spot by distance."""
-    heads = ("mirror", "floor from, m", *(f"heights at {d:g} m, m" for d in asked.depths_m), "share of the map, %")
+    """Nearest spot on the floor before, beside and behind the robot; lowest and highest spot by distance."""
+    heads = (
+        "mirror",
+        "floor before, m",
+        "beside, m",
+        "behind, m",
+        *(f"heights at {d:g} m, m" for d in asked.depths_m),
+        "share of the map, %",
+    )
     return heads, *(
         (
             name,
-            _cell(c.places.floor_from_m(), ".1f"),
+            *(_cell(nearest, ".2f") for nearest in c.floor_m),
             *(_pair(c.places.heights_at(d), ".2f") for d in asked.depths_m),
             f"{100.0 * c.places.share:.0f}",
         )
@@ -175,37 +192,41 @@ def bound_table(
 
 def cost_table(found: Mapping[str, Compared], asked: Asked) -> tuple[Row, ...]:
     """Errors of D of all deviations together and of those that no calibration knows, by distance."""
-    heads = ("mirror, deviations", *(f"{d:g} m" for d in asked.depths_m))
+    heads = ("mirror, deviations", *(f"{d:g} m" for d in asked.misaligned_m))
     groups = {"all": ALL_KINDS, "not calibrated": UNCALIBRATED}
     return heads, *(
-        (f"{name}, {label}", *(_cell(100.0 * together(c.costs[d], kinds), ".2g") for d in asked.depths_m))
+        (f"{name}, {label}", *(_cell(100.0 * together(c.costs[d], kinds), ".2g") for d in asked.misaligned_m))
         for label, kinds in groups.items()
         for name, c in found.items()
     )
 
 
-def tolerance_table(found: Mapping[str, Compared], depth_m: float, cost: float) -> tuple[Row, ...]:
+def single_table(found: Mapping[str, Compared], asked: Asked) -> tuple[Row, ...]:
+    """Error of D by each kind of deviation alone, by mirror and distance."""
+    heads = ("deviation, mirror", *(f"{d:g} m" for d in asked.misaligned_m))
+    return heads, *(
+        (f"{kind}, {name}", *(_cell(100.0 * c.costs[d][kind], ".2g") for d in asked.misaligned_m))
+        for kind in ALL_KINDS
+        for name, c in found.items()
+    )
+
+
+def tolerance_table(found: Mapping[str, Compared]) -> tuple[Row, ...]:
     """Value of every kind that costs so much of D, and the usual size."""
     heads = ("deviation", "usual", *found)
     return heads, *(
-        (kind, _sized(kind, usual(kind)), *(_sized(kind, tolerance(c, depth_m, kind, cost)) for c in found.values()))
+        (kind, _sized(kind, usual(kind)), *(_sized(kind, c.tolerances[kind]) for c in found.values()))
         for kind in ALL_KINDS
     )
 
 
-def tolerance(compared: Compared, depth_m: float, kind: str, cost: float) -> float:
-    """Value of a kind that costs so much of D by its slope; NaN where it costs nothing or D is not measured."""
-    per_unit = compared.costs[depth_m][kind]
-    return cost / per_unit if per_unit > 1e-12 else math.nan
-
-
 def _sized(kind: str, value: float) -> str:
     name, scale = _SHOWN_UNITS[unit(kind)]
-    return f"{scale * value:.2g} {name}".strip() if math.isfinite(value) else _NONE
+    return f"{number(float(f'{scale * value:.2g}'))} {name}".strip() if math.isfinite(value) else _NONE
 
 
 def _cell(value: float, form: str) -> str:
-    return format(value, form) if math.isfinite(value) else _NONE
+    return format(value, form) if math.isfinite(value) else _LOST if math.isinf(value) else _NONE
 
 
 def _pair(ends: tuple[float, float], form: str = ".0f") -> str:
@@ -239,39 +260,44 @@ class Criterion:
 
 def criteria(asked: Asked) -> tuple[Criterion, ...]:
     """What mirrors are compared by."""
-    near, far = asked.depths_m[1 if len(asked.depths_m) > 1 else 0], asked.depths_m[-1]
-    middle, preset, z = asked.depths_m[len(asked.depths_m) // 2], asked.presets[0], asked.spot_height_m
-
-    def bound(depth_m: float) -> Callable[[Compared], float]:
-        return lambda c: 100.0 * c.bounds[preset, z, depth_m].relative
-
-    def resolution(angle: float) -> Callable[[Compared], float]:
-        return lambda c: math.radians(1.0) * c.rays.at(angle, c.rays.px_per_rad)
-
+    near, far, last = asked.misaligned_m[0], asked.misaligned_m[-1], asked.depths_m[-1]
+    preset, z = asked.presets[0], asked.spot_height_m
     return (
         Criterion("seen above the horizon", "deg", lambda c: c.field_deg[1] - 90.0, small=False),
-        Criterion("floor measured from", "m", lambda c: c.places.floor_from_m()),
-        Criterion(f"highest spot at {middle:g} m", "m", lambda c: c.places.heights_at(middle)[1], small=False),
+        Criterion("floor beside the robot from", "m", lambda c: c.floor_m[1]),
+        Criterion(f"highest spot at {far:g} m", "m", lambda c: c.places.heights_at(far)[1], small=False),
         Criterion("places measured, of the map", "%", lambda c: 100.0 * c.places.share, small=False),
-        Criterion("resolution at 60 deg", "px/deg", resolution(60.0), small=False),
-        Criterion("resolution at 85 deg", "px/deg", resolution(85.0), small=False),
-        Criterion(f"bound of D at {near:g} m", "%", bound(near)),
-        Criterion(f"bound of D at {middle:g} m", "%", bound(middle)),
-        Criterion(f"bound of D at {far:g} m", "%", bound(far)),
+        *(Criterion(f"resolution at {a:g} deg", "px/deg", _resolution(a), small=False) for a in (60.0, 85.0)),
+        *(Criterion(f"bound of D at {d:g} m", "%", _bound(preset, z, d)) for d in dict.fromkeys((near, far, last))),
         Criterion(
-            f"mirror aside, {100.0 * asked.cost:g} % of D at {middle:g} m",
+            f"mirror aside that costs {100.0 * asked.cost:g} %",
             "mm",
-            lambda c: 1e3 * tolerance(c, middle, "mirror aside", asked.cost),
+            lambda c: 1e3 * c.tolerances["mirror aside"],
             small=False,
         ),
-        Criterion(f"usual deviations at {middle:g} m", "%", lambda c: 100.0 * together(c.costs[middle], ALL_KINDS)),
+        *(Criterion(f"usual deviations at {d:g} m", "%", _together(d, ALL_KINDS)) for d in (near, far)),
+        Criterion(f"not calibrated, at {far:g} m", "%", _together(far, UNCALIBRATED)),
         Criterion(
-            f"of these not calibrated, at {middle:g} m", "%", lambda c: 100.0 * together(c.costs[middle], UNCALIBRATED)
+            f"bound and not calibrated, at {far:g} m",
+            "%",
+            lambda c: math.hypot(_bound(preset, z, far)(c), _together(far, UNCALIBRATED)(c)),
         ),
         Criterion("pixels that show the robot", "%", lambda c: 100.0 * c.down.robot),
         Criterion("radial blur of the spot, largest", "px", lambda c: _largest_blur(c, preset, z)),
         Criterion("spread of the viewpoints", "mm", lambda c: 1e3 * c.spread_m),
     )
+
+
+def _bound(preset: str, height_m: float, depth_m: float) -> Callable[[Compared], float]:
+    return lambda c: 100.0 * c.bounds[preset, height_m, depth_m].relative
+
+
+def _resolution(angle_deg: float) -> Callable[[Compared], float]:
+    return lambda c: math.radians(1.0) * c.rays.at(angle_deg, c.rays.px_per_rad)
+
+
+def _together(depth_m: float, kinds: Sequence[str]) -> Callable[[Compared], float]:
+    return lambda c: 100.0 * together(c.costs[depth_m], kinds)
 
 
 def _largest_blur(compared: Compared, preset: str, height_m: float) -> float:
@@ -290,35 +316,57 @@ def pick_table(found: Mapping[str, Compared], asked: Asked) -> tuple[Row, ...]:
 
 
 def _short(value: float) -> str:
-    return number(value) if abs(value) >= 1e-3 else "0" if math.isfinite(value) else _NONE
+    return number(value) if abs(value) >= 1e-3 else _cell(value, ".0f")
 
 
 def _ends(values: Mapping[str, float], small: bool) -> tuple[str, str]:
-    """Names of the best and the worst; a mirror without a value is the worst where there is only one."""
-    known = sorted((x if small else -x, name) for name, x in values.items() if math.isfinite(x))
-    without = [name for name, x in values.items() if not math.isfinite(x)]
+    """Names of the best and the worst; mirrors without a value are the worst. Of many that are equal, their number."""
+    known = {name: float(_short(x)) for name, x in values.items() if math.isfinite(x)}
+    without = [name for name in values if name not in known]
     if not known:
         return _NONE, _NONE
-    return known[0][1], " and ".join(without) if without else known[-1][1]
+    best, worst = (min, max) if small else (max, min)
+    ends = ([name for name, x in known.items() if x == end(known.values())] for end in (best, worst))
+    first, last = ends
+    return _names(first), _names(without or last)
+
+
+def _names(names: Sequence[str]) -> str:
+    return ", ".join(names) if len(names) <= _FEW else f"{len(names)} are equal"
 
 
 # -- findings ----------------------------------------------------------------------------------------------------------
 
 
 def criteria_findings(found: Mapping[str, Compared], asked: Asked) -> Iterator[Finding]:
-    """Every cell of the table from which a mirror is picked."""
+    """Best and worst value of each criterion, of the mirrors that have one."""
     for one in criteria(asked):
-        for name, compared in found.items():
-            yield Finding(f"{one.label}: {name}", one.value(compared), unit=one.unit)
+        known = sorted((x, name) for name, c in found.items() if math.isfinite(x := one.value(c)))
+        if known:
+            ends = (known[0], known[-1]) if one.small else (known[-1], known[0])
+            for word, (value, name) in zip(("best", "worst"), ends, strict=True):
+                yield Finding(f"{one.label}, {word}: {name}", value, unit=one.unit)
 
 
 def ratio_findings(found: Mapping[str, Compared], asked: Asked) -> Iterator[Finding]:
-    """Bounds and costs of the other mirrors over those of the first."""
-    first, preset, z = next(iter(found)), asked.presets[0], asked.spot_height_m
-    for name in list(found)[1:]:
-        for d in asked.depths_m:
-            ratio = found[first].bounds[preset, z, d].relative / found[name].bounds[preset, z, d].relative
-            yield Finding(f"bound of D at {d:g} m, {first} over {name}", ratio)
-        for d in asked.depths_m:
-            mine, theirs = (found[n].costs[d]["mirror aside"] for n in (name, first))
-            yield Finding(f"error by a mirror aside at {d:g} m, {name} over {first}", mine / theirs)
+    """Bounds of the first mirror over those of the others, and its tolerance of being aside over theirs."""
+    first, *others = found
+    preset, z, far = asked.presets[0], asked.spot_height_m, asked.misaligned_m[-1]
+    for name in others:
+        bound = _bound(preset, z, far)
+        ratio = bound(found[first]) / bound(found[name])
+        if math.isfinite(ratio):
+            yield Finding(f"bound of D at {far:g} m, {first} over {name}", ratio)
+    for name in others:
+        ratio = found[first].tolerances["mirror aside"] / found[name].tolerances["mirror aside"]
+        if math.isfinite(ratio):
+            yield Finding(f"allowed mirror aside, {first} over {name}", ratio)
+
+
+def cost_findings(found: Mapping[str, Compared], asked: Asked) -> Iterator[Finding]:
+    """Errors that no calibration knows, least and largest of all mirrors."""
+    for d in asked.misaligned_m:
+        known = [x for c in found.values() if math.isfinite(x := _together(d, UNCALIBRATED)(c))]
+        if known:
+            yield Finding(f"not calibrated, at {d:g} m: least of all mirrors", min(known), unit="%")
+            yield Finding(f"not calibrated, at {d:g} m: largest of all mirrors", max(known), unit="%")
