@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -23,7 +24,7 @@ def comparison_drawing(found: Mapping[str, Compared], asked: Asked) -> Drawing:
         _bounds(right, found, asked)
         _places(low, found)
         _costs(last, found, asked)
-        handles = [Line2D([], [], color=COLOURS[i], linestyle=LINES[i % 4], label=n) for i, n in enumerate(found)]
+        handles = [Line2D([], [], label=n, **_style(i)) for i, n in enumerate(found)]
         left.legend(handles=handles, frameon=False)
         far = asked.misaligned_m[-1]
         parts = "; ".join(
@@ -38,8 +39,8 @@ def comparison_drawing(found: Mapping[str, Compared], asked: Asked) -> Drawing:
         return drawn("mirror", figure, alt, "png")
 
 
-def _style(i: int) -> dict[str, str]:
-    return {"color": COLOURS[i], "linestyle": LINES[i % len(LINES)]}
+def _style(i: int) -> dict[str, Any]:
+    return {"color": COLOURS[i % len(COLOURS)], "linestyle": LINES[i % len(LINES)]}
 
 
 def _resolution(ax: Axes, found: Mapping[str, Compared]) -> None:

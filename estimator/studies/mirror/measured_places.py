@@ -38,8 +38,9 @@ from phibench.scenes.validation import SceneError
 
 _WALL_NORMAL = np.array([-1.0, 0.0, 0.0])  # an upright wall along world x, facing the mirror
 _FLOOR_M, _FLOOR_STEP_M = 0.1, 0.02
-_FIRST, _LARGEST = 64.0, 256.0  # usual size over the least one that is tried, and largest one over it
-_HALVINGS = 8
+_LARGEST = 256.0  # of the sizes that are tried, over the usual one
+_NO_ERROR = 1e-9  # of D
+_WIDER, _HALVINGS = 1.4, 5  # to 0.6 %: tables have two digits
 _CHUNK = 500  # points whose distances from all sides of the outline are taken at once
 
 
@@ -73,7 +74,7 @@ def shown(rig: Rig, points_m: Array, offset_m: float, edge_px: float) -> BoolArr
 
 def _shown(rig: Rig, points_m: Array, offset_m: float, edge_px: float) -> BoolArray:
     image = _image(rig, points_m, offset_m)
-    seen = image.status == Status.OK
+    seen = np.asarray(image.status == Status.OK)
     uv = np.where(seen[:, None], image.uv_px, rig.camera.project(rig.sphere_in_camera_m))
     inside = rig.camera.contains(uv - edge_px) & rig.camera.contains(uv + edge_px)
     return np.asarray(seen & inside & (outline_distance_px(rig, uv) >= edge_px))
@@ -202,23 +203,23 @@ DIRECTIONS: Mapping[str, tuple[str, ...]] = {
     "mirror aside": ("decentre_x_m", "decentre_y_m"),
     "mirror higher": ("axial_m",),
     "vertex radius": ("radius_m",),
-    "camera tilted": ("tilt_x_rad", "tilt_y_rad"),
+    "camera tilted": ("tilt_y_rad", "tilt_x_rad"),
     "focal length": ("focal_relative",),
     "principal point": ("cx_px", "cy_px"),
     "distortion k1": ("k1",),
     "distortion k2": ("k2",),
     "distortion k3": ("k3",),
-    "distortion p1, p2": ("p1", "p2"),
+    "distortion p1, p2": ("p2", "p1"),
     "stroke, offset": ("stroke_offset_m",),
     "stroke, scale": ("stroke_relative",),
-    "stroke axis tilted": ("stroke_tilt_x_rad", "stroke_tilt_y_rad"),
-    "rig tilted between the images": ("roll_rad", "pitch_rad"),
+    "stroke axis tilted": ("stroke_tilt_y_rad", "stroke_tilt_x_rad"),
+    "rig tilted between the images": ("pitch_rad", "roll_rad"),
     "rig turned between the images": ("yaw_rad",),
     "rig moved aside between the images": ("shift_x_m", "shift_y_m"),
     "rig moved up between the images": ("shift_z_m",),
 }
-"""Parameters of a rig by kind. Two of a kind differ in direction alone, and count in the costlier one. Form errors
-are a sphere's; the plane of focus and roughness move no ray."""
+"""Parameters of a rig by kind. Of two of a kind the first acts along world x, where the spots are, and the other
+across; the costlier counts. Form errors are a sphere's; the plane of focus and roughness move no ray."""
 UNCALIBRATED = (
     "stroke, offset",
     "rig tilted between the images",
@@ -253,7 +254,9 @@ def errors(rig: Rig, kind: str, size: float, points_m: Array, stroke_m: float) -
     points_m : shape (n, 3)
     stroke_m : float, the nominal stroke
     """
-    signed = [{name: sign * size} for name in DIRECTIONS[kind] for sign in (1.0, -1.0)]
+    along, *across = DIRECTIONS[kind]
+    # an aligned rig and its mirror image across world x are one, so that both signs across give the same
+    signed = [{along: size}, {along: -size}, *({name: size} for name in across)]
     return np.asarray(np.max([_errors_of(rig, Misalignment(**one), points_m, stroke_m) for one in signed], axis=0))
 
 
@@ -262,33 +265,46 @@ def _errors_of(rig: Rig, wrong: Misalignment, points_m: Array, stroke_m: float) 
         true = rig.perturbed(wrong)
     except SceneError:  # there is no such rig
         return np.full(len(points_m), np.inf)
-    down, up = (image_of(true.at(offset), points_m).uv_px for offset in (0.0, wrong.stroke_m(stroke_m)))
+    down, up = _pixels(true, points_m, wrong.stroke_m(stroke_m))
     away = points_m[:, :2] - true.at(0.0).sphere_centre_m[:2]
     D = np.hypot(away[:, 0], away[:, 1])
     relative = np.abs(depth_exact(rig, stroke_m, down, up).depth_m / D - 1.0)
     return np.asarray(np.where(np.isfinite(relative), relative, np.inf))
 
 
+def _pixels(true: Rig, points_m: Array, stroke_m: float) -> tuple[Array, Array]:
+    """Down and up pixels of points, each of shape (n, 2)."""
+    if true.motion is not None:
+        return image_of(true.at(0.0), points_m).uv_px, image_of(true.at(stroke_m), points_m).uv_px
+    lowered = points_m - stroke_m * np.array(true.stroke_axis_world)
+    both = image_of(true.at(0.0), np.concatenate([points_m, lowered])).uv_px
+    return both[: len(points_m)], both[len(points_m) :]
+
+
 def tolerance(rig: Rig, kind: str, points_m: Array, stroke_m: float, cost: float) -> float:
     """Least size of a kind that costs so much of D at the costliest place; NaN where no size up to the largest does.
 
     Whole errors are searched, not slopes: near a cone's tip a deviation turns the azimuth, which has no first order.
-    Sizes are doubled from a 64th of the usual one, then bisected.
+    The search begins where the error would be in proportion to that of the usual size, and bisects in the logarithm.
     """
     largest = min(_LARGEST * usual(kind), MISALIGNMENT[DIRECTIONS[kind][0]].limit)
 
     def too_large(size: float) -> bool:
         return bool(np.max(errors(rig, kind, size, points_m, stroke_m)) >= cost)
 
-    low, high = 0.0, usual(kind) / _FIRST
-    while not too_large(high):
+    at_usual = float(np.max(errors(rig, kind, usual(kind), points_m, stroke_m)))
+    share = np.clip(cost / max(at_usual, _NO_ERROR), 1.0 / _LARGEST, _LARGEST) if np.isfinite(at_usual) else 0.5
+    low = high = min(float(share) * usual(kind), largest)
+    while too_large(low):
+        low, high = low / _WIDER, low
+    while low == high or not too_large(high):
         if high >= largest:
             return float("nan")
-        low, high = high, min(2.0 * high, largest)
+        low, high = high, min(_WIDER * high, largest)
     for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
+        middle = float(np.sqrt(low * high))
         low, high = (low, middle) if too_large(middle) else (middle, high)
-    return high
+    return float(np.sqrt(low * high))
 
 
 def together(found: Mapping[str, float], kinds: Sequence[str]) -> float:

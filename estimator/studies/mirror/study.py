@@ -115,7 +115,7 @@ def run(settings: MirrorSettings, datasets: StudyDatasets) -> Result:
     """Run the study; it renders nothing."""
     rigs = _rigs(settings)
     with Steps(datasets.console, "mirror, bounds and mirrors", len(settings.presets) + len(rigs)) as steps:
-        tables = {}
+        tables: dict[str, BlurBounds] = {}
         for preset in settings.presets:
             tables[preset] = _bounds_of_spots(settings, preset, next(iter(rigs.values())))
             steps.advance()
@@ -172,7 +172,8 @@ def _rigs(settings: MirrorSettings) -> dict[str, Rig]:
 
 def _bounds_of_spots(settings: MirrorSettings, preset: str, rig: Rig) -> BlurBounds:
     card = sensor_card(preset, exposure_s=settings.exposure_s)
-    return blur_bounds(card, rig.camera.detector.laser_filter_response, settings.blurs_px)
+    r, g, b = rig.camera.detector.laser_filter_response
+    return blur_bounds(card, (r, g, b), settings.blurs_px)
 
 
 def compare(settings: MirrorSettings, rig: Rig, tables: Mapping[str, BlurBounds]) -> Compared:
@@ -309,8 +310,8 @@ def _notes(settings: MirrorSettings) -> tuple[str, ...]:
         f"pixels out, and are those of frames with {1e3 * settings.exposure_s:g} ms.",
         "Places count where spots are seen in both images from all azimuths, and robot, mast and camera's housing hide "
         "none; a dash is a place that is not measured.",
-        "Errors of D by deviations are those of the costlier direction and sign, one deviation at a time, and the rig is not "
-        "calibrated. Together they are roots of sums of squares.",
+        "Errors of D by deviations are those of the costlier direction and sign, one deviation at a time, in a rig "
+        "that is not calibrated; together they are roots of sums of squares. A pair is lost where the lens folds, too.",
     )
 
 

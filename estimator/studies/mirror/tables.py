@@ -195,7 +195,7 @@ def cost_table(found: Mapping[str, Compared], asked: Asked) -> tuple[Row, ...]:
     heads = ("mirror, deviations", *(f"{d:g} m" for d in asked.misaligned_m))
     groups = {"all": ALL_KINDS, "not calibrated": UNCALIBRATED}
     return heads, *(
-        (f"{name}, {label}", *(_cell(100.0 * together(c.costs[d], kinds), ".2g") for d in asked.misaligned_m))
+        (f"{name}, {label}", *(_error(together(c.costs[d], kinds)) for d in asked.misaligned_m))
         for label, kinds in groups.items()
         for name, c in found.items()
     )
@@ -205,7 +205,7 @@ def single_table(found: Mapping[str, Compared], asked: Asked) -> tuple[Row, ...]
     """Error of D by each kind of deviation alone, by mirror and distance."""
     heads = ("deviation, mirror", *(f"{d:g} m" for d in asked.misaligned_m))
     return heads, *(
-        (f"{kind}, {name}", *(_cell(100.0 * c.costs[d][kind], ".2g") for d in asked.misaligned_m))
+        (f"{kind}, {name}", *(_error(c.costs[d][kind]) for d in asked.misaligned_m))
         for kind in ALL_KINDS
         for name, c in found.items()
     )
@@ -221,8 +221,20 @@ def tolerance_table(found: Mapping[str, Compared]) -> tuple[Row, ...]:
 
 
 def _sized(kind: str, value: float) -> str:
+    if not math.isfinite(value):
+        return _NONE
     name, scale = _SHOWN_UNITS[unit(kind)]
-    return f"{number(float(f'{scale * value:.2g}'))} {name}".strip() if math.isfinite(value) else _NONE
+    return f"{_two_digits(scale * value)} {name}".strip()
+
+
+def _two_digits(value: float) -> str:
+    return f"{value:.0f}" if value >= 100.0 else f"{value:.2g}"
+
+
+def _error(relative: float) -> str:
+    """Error of D in %; what is below 0.001 % is 0."""
+    percent = 100.0 * relative
+    return _two_digits(percent if percent >= 1e-3 else 0.0) if math.isfinite(relative) else _cell(relative, "")
 
 
 def _cell(value: float, form: str) -> str:
