@@ -176,7 +176,7 @@ def schema_node(schema: Schema, location: Location) -> Schema:
     """Return the part of a JSON schema that describes one key, references and optional values resolved."""
     node = _resolve(schema, schema)
     for part in location:
-        inner = _entry(node, part) if isinstance(part, int) else node.get("properties", {}).get(part, {})
+        inner = _entry(node, part) if isinstance(part, int) else _value(node, part)
         description = inner.get("description")
         node = _resolve(schema, inner)
         node = {**node, "description": description} if description else node
@@ -232,6 +232,13 @@ def _entry(node: Schema, index: int = 0) -> Schema:
     """Schema of a list's entry; a list of so many entries has one for each."""
     each = node.get("prefixItems", ())
     found: Schema = each[min(index, len(each) - 1)] if each else node.get("items") or {}
+    return found
+
+
+def _value(node: Schema, key: str) -> Schema:
+    """Schema of a key's value; where the keys are names of anyone's choice, all have the same."""
+    named = node.get("additionalProperties")
+    found: Schema = node.get("properties", {}).get(key, named if isinstance(named, dict) else {})
     return found
 
 

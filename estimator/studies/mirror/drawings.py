@@ -24,7 +24,7 @@ def comparison_drawing(found: Mapping[str, Compared], asked: Asked) -> Drawing:
         _bounds(right, found, asked)
         _places(low, found)
         _costs(last, found, asked)
-        handles = [Line2D([], [], label=n, **_style(i)) for i, n in enumerate(found)]
+        handles = [Line2D([], [], label=n, marker=MARKERS[i], **_style(i)) for i, n in enumerate(found)]
         left.legend(handles=handles, frameon=False)
         far = asked.misaligned_m[-1]
         parts = "; ".join(

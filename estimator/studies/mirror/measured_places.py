@@ -40,7 +40,7 @@ _WALL_NORMAL = np.array([-1.0, 0.0, 0.0])  # an upright wall along world x, faci
 _FLOOR_M, _FLOOR_STEP_M = 0.1, 0.02
 _LARGEST = 256.0  # of the sizes that are tried, over the usual one
 _NO_ERROR = 1e-9  # of D
-_WIDER, _HALVINGS = 1.4, 5  # to 0.6 %: tables have two digits
+_WIDER, _HALVINGS = 1.2, 4  # to 0.6 %: tables have two digits
 _CHUNK = 500  # points whose distances from all sides of the outline are taken at once
 
 
@@ -84,7 +84,7 @@ def unhidden(rig: Rig, points_m: Array, offset_m: float) -> BoolArray:
     """Places that robot, mast and housing do not hide on the way to the mirror, shape (n,)."""
     view, image = rig.at(offset_m), _image(rig, points_m, offset_m)
     mirror = reflect(view, image.uv_px).origin_world_m
-    known = np.isfinite(mirror).all(axis=-1)
+    known = np.asarray(np.isfinite(mirror).all(axis=-1))
     start = np.where(known[:, None], mirror, view.sphere_centre_m)
     solids = escalade360(view)
     inside = [_holds(solid.T_world_shape.inverse().points(points_m), solid.size_m) for solid in solids]
@@ -213,19 +213,19 @@ DIRECTIONS: Mapping[str, tuple[str, ...]] = {
     "stroke, offset": ("stroke_offset_m",),
     "stroke, scale": ("stroke_relative",),
     "stroke axis tilted": ("stroke_tilt_y_rad", "stroke_tilt_x_rad"),
-    "rig tilted between the images": ("pitch_rad", "roll_rad"),
-    "rig turned between the images": ("yaw_rad",),
-    "rig moved aside between the images": ("shift_x_m", "shift_y_m"),
-    "rig moved up between the images": ("shift_z_m",),
+    "tilt between images": ("pitch_rad", "roll_rad"),
+    "turn between images": ("yaw_rad",),
+    "aside between images": ("shift_x_m", "shift_y_m"),
+    "up between images": ("shift_z_m",),
 }
 """Parameters of a rig by kind. Of two of a kind the first acts along world x, where the spots are, and the other
 across; the costlier counts. Form errors are a sphere's; the plane of focus and roughness move no ray."""
 UNCALIBRATED = (
     "stroke, offset",
-    "rig tilted between the images",
-    "rig turned between the images",
-    "rig moved aside between the images",
-    "rig moved up between the images",
+    "tilt between images",
+    "turn between images",
+    "aside between images",
+    "up between images",
 )
 """Kinds that differ from pair to pair, so that no calibration knows them."""
 

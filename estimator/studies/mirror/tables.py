@@ -193,7 +193,7 @@ def bound_table(
 def cost_table(found: Mapping[str, Compared], asked: Asked) -> tuple[Row, ...]:
     """Errors of D of all deviations together and of those that no calibration knows, by distance."""
     heads = ("mirror, deviations", *(f"{d:g} m" for d in asked.misaligned_m))
-    groups = {"all": ALL_KINDS, "not calibrated": UNCALIBRATED}
+    groups = {"all": ALL_KINDS, "beyond calibration": UNCALIBRATED}
     return heads, *(
         (f"{name}, {label}", *(_error(together(c.costs[d], kinds)) for d in asked.misaligned_m))
         for label, kinds in groups.items()
@@ -288,15 +288,15 @@ def criteria(asked: Asked) -> tuple[Criterion, ...]:
             small=False,
         ),
         *(Criterion(f"usual deviations at {d:g} m", "%", _together(d, ALL_KINDS)) for d in (near, far)),
-        Criterion(f"not calibrated, at {far:g} m", "%", _together(far, UNCALIBRATED)),
+        Criterion(f"beyond calibration, at {far:g} m", "%", _together(far, UNCALIBRATED)),
         Criterion(
-            f"bound and not calibrated, at {far:g} m",
+            f"bound and beyond calibration, at {far:g} m",
             "%",
             lambda c: math.hypot(_bound(preset, z, far)(c), _together(far, UNCALIBRATED)(c)),
         ),
         Criterion("pixels that show the robot", "%", lambda c: 100.0 * c.down.robot),
         Criterion("radial blur of the spot, largest", "px", lambda c: _largest_blur(c, preset, z)),
-        Criterion("spread of the viewpoints", "mm", lambda c: 1e3 * c.spread_m),
+        Criterion("spread of the viewpoints", "mm", lambda c: round(1e3 * c.spread_m, 6)),
     )
 
 
@@ -380,5 +380,5 @@ def cost_findings(found: Mapping[str, Compared], asked: Asked) -> Iterator[Findi
     for d in asked.misaligned_m:
         known = [x for c in found.values() if math.isfinite(x := _together(d, UNCALIBRATED)(c))]
         if known:
-            yield Finding(f"not calibrated, at {d:g} m: least of all mirrors", min(known), unit="%")
-            yield Finding(f"not calibrated, at {d:g} m: largest of all mirrors", max(known), unit="%")
+            yield Finding(f"beyond calibration, at {d:g} m: least of all mirrors", min(known), unit="%")
+            yield Finding(f"beyond calibration, at {d:g} m: largest of all mirrors", max(known), unit="%")
