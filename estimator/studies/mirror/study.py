@@ -39,6 +39,7 @@ from phibench.estimator.studies.mirror.tables import (
     criteria_findings,
     field_table,
     pick_table,
+    place_findings,
     ratio_findings,
     reach_table,
     resolution_table,
@@ -111,6 +112,9 @@ class MirrorSettings(Settings):
         return np.arange(first, last + 0.5 * step, step)
 
 
+_FINDINGS = (criteria_findings, place_findings, ratio_findings, cost_findings)
+
+
 def run(settings: MirrorSettings, datasets: StudyDatasets) -> Result:
     """Run the study; it renders nothing."""
     rigs = _rigs(settings)
@@ -137,7 +141,7 @@ def run(settings: MirrorSettings, datasets: StudyDatasets) -> Result:
     }
     return Result(
         {"table": bound_frame(found), "rays": ray_frame(found), "costs": cost_frame(found), "map": map_frame(found)},
-        (*criteria_findings(found, settings), *ratio_findings(found, settings), *cost_findings(found, settings)),
+        tuple(row for part in _FINDINGS for row in part(found, settings)),
         (comparison_drawing(found, settings),),
         shown,
         _notes(settings),

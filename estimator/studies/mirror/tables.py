@@ -375,8 +375,18 @@ def ratio_findings(found: Mapping[str, Compared], asked: Asked) -> Iterator[Find
             yield Finding(f"allowed mirror aside, {first} over {name}", ratio)
 
 
+def place_findings(found: Mapping[str, Compared], asked: Asked) -> Iterator[Finding]:
+    """Nearest distance with a bound, and the pixels that are spent on what is above the horizon."""
+    for name, c in found.items():
+        seen = [d for (_, h, d), one in c.bounds.items() if h == asked.spot_height_m and math.isfinite(one.relative)]
+        yield Finding(f"nearest D of spots at {asked.spot_height_m:g} m: {name}", min(seen, default=None), unit="m")
+    for name, c in found.items():
+        yield Finding(f"pixels above the horizon: {name}", 100.0 * c.down.above_horizon, unit="%")
+
+
 def cost_findings(found: Mapping[str, Compared], asked: Asked) -> Iterator[Finding]:
-    """Errors that no calibration knows, least and largest of all mirrors."""
+    """Allowed error, and errors that no calibration knows: least and largest of all mirrors."""
+    yield Finding("error of D that a tolerance allows", 100.0 * asked.cost, unit="%")
     for d in asked.misaligned_m:
         known = [x for c in found.values() if math.isfinite(x := _together(d, UNCALIBRATED)(c))]
         if known:
