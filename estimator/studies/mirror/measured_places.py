@@ -40,7 +40,7 @@ _WALL_NORMAL = np.array([-1.0, 0.0, 0.0])  # an upright wall along world x, faci
 _FLOOR_M, _FLOOR_STEP_M = 0.1, 0.02
 _LARGEST = 256.0  # of the sizes that are tried, over the usual one
 _NO_ERROR = 1e-9  # of D
-_WIDER, _HALVINGS = 1.2, 4  # to 0.6 %: tables have two digits
+_WIDER, _HALVINGS = 1.2, 6  # to 0.15 %: tables have two digits
 _CHUNK = 500  # points whose distances from all sides of the outline are taken at once
 
 

@@ -131,7 +131,7 @@ def run(settings: MirrorSettings, datasets: StudyDatasets) -> Result:
     percent, spot = f"{100.0 * settings.cost:g} %", f"spots at {settings.spot_height_m:g} m"
     shown = {
         "Pick a mirror": pick_table(found, settings),
-        "Field of view and use of the image": field_table(found, settings),
+        "Field of view and use of the image": field_table(found),
         "Resolution, pixels per degree of theta": resolution_table(found, settings.angles_deg),
         "Places that both images show": reach_table(found, settings),
         **{f"Bound of D, %, {preset}": bound_table(found, preset, heights, settings.depths_m) for preset in tables},

@@ -47,10 +47,6 @@ class Asked(Protocol):
         """Height of the compared spots."""
 
     @property
-    def stroke_m(self) -> float:
-        """Stroke of every pair."""
-
-    @property
     def cost(self) -> float:
         """Relative error of D that a tolerance allows."""
 
@@ -120,18 +116,18 @@ class Compared:
 # -- tables ------------------------------------------------------------------------------------------------------------
 
 
-def field_table(found: Mapping[str, Compared], asked: Asked) -> tuple[Row, ...]:
-    """Field of view, use of the image, and viewpoints."""
+def field_table(found: Mapping[str, Compared]) -> tuple[Row, ...]:
+    """Field of view, use of the image down, theta up to which the robot is seen down and up, and viewpoints."""
     heads = (
         "mirror",
-        "theta seen, deg",
-        "to the outline, deg",
+        "theta, deg",
+        "outline, deg",
         "outline, px",
-        "pixels on the robot, %",
-        "below the horizon, %",
+        "robot, % of pixels",
+        "below horizon, %",
         "above, %",
-        "robot up to theta, down, deg",
-        f"at h = {asked.stroke_m:g} m, deg",
+        "robot to, deg",
+        "the same up, deg",
         "viewpoints, mm",
     )
     return heads, *(
