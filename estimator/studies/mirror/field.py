@@ -115,7 +115,7 @@ class DiscShares:
 
 
 def disc_shares(rig: Rig, rays: Meridian, offset_m: float, azimuths_rad: Array) -> DiscShares:
-    """What the pixels of the mirror's image show, for an aligned rig at an offset of its carriage.
+    """Shares of the mirror's image by what its pixels show, for an aligned rig at an offset of its carriage.
 
     Parameters
     ----------

@@ -267,7 +267,7 @@ class Criterion:
 
 
 def criteria(asked: Asked) -> tuple[Criterion, ...]:
-    """What mirrors are compared by."""
+    """Criteria by which mirrors are compared."""
     near, far, last = asked.misaligned_m[0], asked.misaligned_m[-1], asked.depths_m[-1]
     preset, z = asked.presets[0], asked.spot_height_m
     return (
