@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.datasets.progress import Steps
-from phibench.datasets.recipe.build import build_rig
+from phibench.datasets.recipe.build import build_rig, idle_mirror_keys
 from phibench.datasets.recipe.tables import MirrorTable, RigTable
 from phibench.estimator.studies.framework import Result, Settings, Study, StudyDatasets
 from phibench.estimator.studies.mirror.drawings import comparison_drawing
@@ -69,11 +69,22 @@ class MirrorEntry(BaseModel):
     even_terms: tuple[float, ...] | None = Field(default=None, max_length=8, strict=False)
 
     def rig(self, rim_radius_m: float) -> Rig:
-        """Default rig with this mirror."""
+        """Default rig with this mirror.
+
+        Raises
+        ------
+        SceneError
+            If there is no such mirror, or a key does not belong to its shape.
+        """
+        given = self.model_dump(exclude_none=True, exclude={"shape"})
         if self.shape == "sphere":
+            if given:
+                raise SceneError(f'{next(iter(given))} has no effect on shape = "sphere"; remove it')
             return build_rig(RigTable(radius_m=rim_radius_m))
-        given = self.model_dump(exclude_none=True)
-        return build_rig(RigTable(mirror=MirrorTable(rim_radius_m=rim_radius_m, **given)))
+        table = MirrorTable(shape=self.shape, rim_radius_m=rim_radius_m, **given)
+        if faults := idle_mirror_keys("", table):
+            raise SceneError("; ".join(f"{fault.path.removeprefix('.')} {fault.text}" for fault in faults))
+        return build_rig(RigTable(mirror=table))
 
 
 class MirrorSettings(Settings):
@@ -167,8 +178,8 @@ def _rigs(settings: MirrorSettings) -> dict[str, Rig]:
     for name, entry in settings.mirrors.items():
         try:
             rigs[name] = entry.rig(settings.rim_radius_m)
-        except (SceneError, ValueError) as error:
-            raise DatasetError(f"mirrors.{name}: {error}") from error
+        except SceneError as error:
+            raise DatasetError(f"mirrors.{name}: {str(error).replace('rig.mirror.', '')}") from error
         if not rigs[name].fits_image():
             raise DatasetError(f"mirrors.{name}: its outline is cut by the image; give a smaller rim_radius_m")
     return rigs

@@ -337,6 +337,7 @@ def test_tolerances_cost_what_they_may() -> None:
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> tuple[MirrorSettings, Result]:
+    # some 5 s: tolerances of 17 kinds of deviations are searched for two mirrors
     folder = tmp_path_factory.mktemp("mirror")
     (folder / "mirror.toml").write_text(TINY, encoding="utf-8")
     settings = read_settings(STUDY, False, folder / "mirror.toml")
@@ -379,6 +380,9 @@ def test_the_table_for_the_choice_names_best_and_worst(tiny: tuple[MirrorSetting
         ("depths_m = [1.0, 3.0]\ncurve", "depths_m = [3.0, 1.0]\ncurve", ("depths_m = [3.0, 1.0]", "must rise")),
         ("curve_m = [0.5, 4.5, 2.0]", "curve_m = [4.5, 0.5, 2.0]", ("curve_m", "first < last")),
         ('shape = "hyperboloid"', 'shape = "hyperboloid"\nconic = -0.5', ("mirrors.dish", "conic")),
+        ('shape = "hyperboloid"', 'shape = "cone"\nconic = -3.0', ("mirrors.dish: conic has no effect", '"cone"')),
+        ('shape = "hyperboloid"', 'shape = "polynomial"', ("mirrors.dish: even_terms is missing",)),
+        ('shape = "sphere"', 'shape = "sphere"\nconic = 0.0', ("mirrors.ball: conic has no effect",)),
         ('shape = "hyperboloid"', 'shape = "polynomial"\neven_terms = [-500.0]', ("mirrors.dish", "not convex")),
         ("rim_radius_m = 0.060", "rim_radius_m = 0.09", ("mirrors.ball", "smaller rim_radius_m")),
         ('shape = "sphere"', 'shape = "torus"', ("mirrors.ball.shape", "paraboloid")),
