@@ -26,10 +26,11 @@ from phibench.estimator.limits.position_bound import SpotLimit, limit_of, raw_in
 from phibench.estimator.spots.chain_model import chain_model
 from phibench.estimator.spots.fisher import covariance_bound, fisher_matrix
 from phibench.estimator.spots.fit_chain import own_codes, unrounded
-from phibench.estimator.spots.fit_jpeg import Window, grid_px
+from phibench.estimator.spots.fit_jpeg import grid_px
 from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel, SpotPixels
 from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.estimator.spots.pixel_statistics import code_law, code_table
+from phibench.estimator.spots.quasi_score import Window
 from phibench.estimator.spots.raw_pixels import bayer_filters
 from phibench.scenes.frames import Array
 

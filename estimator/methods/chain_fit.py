@@ -26,11 +26,11 @@ from phibench.estimator.spots.fit_chain import (
     undone_mean,
     unrounded,
 )
-from phibench.estimator.spots.fit_jpeg import Window
 from phibench.estimator.spots.fit_raw import SpotData, SpotFit
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
 from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.estimator.spots.jpeg_coefficients import mcu_px
+from phibench.estimator.spots.quasi_score import Window
 from phibench.estimator.spots.raw_pixels import Background, PatternNoise, around, background_of
 from phibench.scenes.frames import Array
 
