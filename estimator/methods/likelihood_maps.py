@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
@@ -16,6 +17,7 @@ from scipy.interpolate import RegularGridInterpolator
 from phibench.estimator.geometry.joint_posterior import MISFIT_RANGE, LikelihoodMap
 from phibench.estimator.spots.fisher import covariance_bound, limited, scoring_step
 from phibench.estimator.spots.fit_raw import SpotData
+from phibench.estimator.spots.interval_fit import interval_posterior
 from phibench.estimator.spots.quasi_score import Window, fit_window
 from phibench.scenes.frames import Array
 
@@ -60,20 +62,28 @@ class SpotLikelihood:
 
 
 def of_window(window: Window, start: Array, corner_px: Array) -> SpotLikelihood | None:
-    """Likelihood of a JPEG window; None where its coefficients say nothing."""
-    fit = fit_window(window, start[None])
-    noise = window.noise(fit.theta, least=_LIVE)
-    if noise.dead or not np.isfinite(fit.chi2):
+    """Likelihood of a window of outputs; None where they say nothing."""
+    if window.of_intervals:
+        posterior = interval_posterior(window, start)
+        if posterior is None or not posterior.settled:
+            return None
+        residuals, theta = posterior.likelihood(), posterior.theta
+        noise = window.noise(theta, least=_LIVE)
+    else:
+        fit = fit_window(window, start[None])
+        noise, theta = window.noise(fit.theta, least=_LIVE), fit.theta
+        residuals = partial(window.residual, noise)
+    if noise.dead:
         return None
-    residuals, _ = window.residual(noise, fit.theta[None])
-    limited_square = float(np.minimum(residuals**2, _OUTLIER**2).sum())
+    misfit, _ = window.residual(noise, theta[None])
+    limited_square = float(np.minimum(misfit**2, _OUTLIER**2).sum())
     excess = max(limited_square / max(len(noise.sigma) - len(start), 1), 1.0)
 
     def scores(theta: Array) -> tuple[Array, Array, Array]:
-        r, J = window.residual(noise, theta)
+        r, J = residuals(theta)
         return np.einsum("ml,ml->m", r, r), np.einsum("mkl,ml->mk", J, r), J @ np.swapaxes(J, 1, 2)
 
-    return SpotLikelihood(scores, fit.theta, corner_px, excess)
+    return SpotLikelihood(scores, theta, corner_px, excess) if np.isfinite(excess) else None
 
 
 def of_pixels(data: SpotData, uv_px: Array) -> SpotLikelihood:

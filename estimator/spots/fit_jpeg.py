@@ -86,8 +86,7 @@ def fit_region(
     window, corner = region_window(region, chain, starts[0, :2], blur, model)
     shifted = starts.copy()
     shifted[:, :2] -= corner
-    single_jpeg = chain.card.output == "mjpeg" and window.frames == 1
-    fit = fit_intervals(window, shifted[0]) if single_jpeg else fit_window(window, shifted)
+    fit = fit_intervals(window, shifted[0]) if window.of_intervals else fit_window(window, shifted)
     (h, w), m = chain.shape, chain.margin
     middle = np.array([(w - 1) / 2.0 + m, (h - 1) / 2.0 + m])
     off = np.abs(fit.theta[:2] - middle) / np.array([w / 2.0, h / 2.0])

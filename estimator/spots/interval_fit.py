@@ -13,6 +13,7 @@ a Gaussian that gives y_i the same mean and variance. m is linear about the post
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,18 +22,20 @@ from scipy.linalg import solve_triangular
 from scipy.special import erfcx, ndtr
 
 from phibench.estimator.spots.fisher import limited
-from phibench.estimator.spots.quasi_score import Inputs, Window, WindowFit
+from phibench.estimator.spots.quasi_score import Inputs, Rows, Window, WindowFit, fit_window
 from phibench.scenes.frames import Array
 
 _PRIOR_PX = 2.0  # one standard deviation about the start; twice or half of it moves a fit by hundredths of its own
 _PRIOR_LEVEL_E = 200.0  # of a level, and at least of a flux
 _PRIOR_WIDTH = 0.5  # of a free width, relative
+_CLOSER = 0.15  # of the prior's deviations: hypotheses that count in the first round
 _FAR = 6.0  # standard deviations from the edges of its step beyond which an output tells nothing
-_ROUNDS = 8  # of linearisation
+_ROUNDS = 10  # of linearisation
 _SWEEPS = (8, 4)  # in the first round, and in the others
 _DAMPING = 0.8
 _STEP_PX = 0.4
 _SETTLED = 0.03  # last step in standard deviations
+_TOLD = 1e6  # variance in steps squared from which an interval's Gaussian tells nothing
 _LEAST_STEP2 = 1e-9  # variance of an output, in steps squared: less is rounding of the arithmetic
 
 
@@ -100,6 +103,57 @@ class _Belief:
         return self.theta + self.cross @ push - cross.T @ G[:, -1], self.covariance - cross.T @ cross
 
 
+@dataclass(frozen=True)
+class IntervalPosterior:
+    """Posterior of one frame's window.
+
+    Attributes
+    ----------
+    window : Window
+    theta : shape (k,), mean
+    covariance : shape (k, k)
+    index : shape (l,), outputs that tell something
+    sites : of these, shape (l,)
+    settled : bool
+    """
+
+    window: Window
+    theta: Array
+    covariance: Array
+    index: NDArray[np.int64]
+    sites: _Sites
+    settled: bool
+
+    def likelihood(self) -> Callable[[Array], tuple[Array, Array]]:
+        """Likelihood of other hypotheses, with the Gaussians in place of the intervals.
+
+        Returns
+        -------
+        callable
+            From hypotheses, shape (m, k), to whitened residuals, shape (m, l), and derivatives, shape (m, k, l).
+        """
+        inputs, used = (
+            self.window.inputs(self.theta),
+            self.sites.precision * _TOLD > (1.0 / self.window.model.step**2)[self.index],
+        )
+        index, precision = self.index[used], self.sites.precision[used]
+        rows, middle, F = (
+            Rows.all(self.window.model).part(index),
+            self.sites.shift[used] / precision,
+            inputs.factor[:, index],
+        )
+        L = np.linalg.cholesky(F.T @ F + np.diag(inputs.own[index] + 1.0 / precision))
+
+        def residuals(theta: Array) -> tuple[Array, Array]:
+            mean, slopes = self.window.means(theta, rows)
+            m, k, count = slopes.shape
+            both = np.concatenate([(middle - mean)[:, None], slopes], axis=1).reshape(-1, count)
+            white = solve_triangular(L, both.T, lower=True, check_finite=False).T.reshape(m, k + 1, count)
+            return white[:, 0], white[:, 1:]
+
+        return residuals
+
+
 def fit_intervals(window: Window, start: Array) -> WindowFit:
     """Fit one frame's window from a hypothesis, shape (k,), which is also the prior's mean.
 
@@ -108,34 +162,43 @@ def fit_intervals(window: Window, start: Array) -> WindowFit:
     WindowFit
         The posterior's mean, and its inverse covariance. The misfit is that of the quasi-score there.
     """
-    P, theta, step = np.diag(_prior_sigma(start, window) ** 2), start.copy(), window.model.step
+    found = interval_posterior(window, start)
+    if found is None:
+        return _nothing(start)
+    noise = window.noise(found.theta)
+    if noise.dead:
+        return _nothing(start)
+    r, _ = window.residual(noise, found.theta[None])
+    chi2 = float(r[0] @ r[0]) / max(len(noise.sigma) - len(start), 1)
+    return WindowFit(found.theta, np.asarray(np.linalg.inv(found.covariance), float), chi2, found.settled)
+
+
+def interval_posterior(window: Window, start: Array) -> IntervalPosterior | None:
+    """Posterior of one frame's window, parameters as `fit_intervals`; None where the arithmetic fails."""
+    prior, step = np.diag(_prior_sigma(start, window) ** 2), window.model.step
     low, high = window.z - step / 2.0, window.z + step / 2.0
-    sites, covariance, settled = _Sites(np.zeros(len(step)), np.zeros(len(step))), P, False
+    theta, covariance = fit_window(window, start[None]).theta, _CLOSER**2 * prior
+    sites, last, settled = _Sites(*np.zeros((2, len(step)))), np.zeros(len(start)), False
     for k in range(_ROUNDS):
         inputs = window.inputs(theta)
         index = _near(inputs, covariance, low, high)
-        belief = _Belief.of(start, P, theta, inputs, index)
+        belief = _Belief.of(start, prior, theta, inputs, index)
         try:
             part = _propagated(belief, sites.part(index), low[index], high[index], _SWEEPS[k > 0])
             mean, covariance = belief.posterior(part)
         except np.linalg.LinAlgError:
-            return _nothing(theta)
-        sites = _scattered(part, index, len(step))
-        change = mean - theta
+            return None
+        if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
+            return None
+        sites, change = _scattered(part, index, len(step)), mean - theta
+        # about a wide posterior whole changes go to and fro
+        change *= 0.5 if change[:2] @ last[:2] < 0.0 else 1.0
         theta = limited(theta[None], change[None], most_px=_STEP_PX, free_width=window.pixels.free_width)[0]
+        last = change
         settled = bool(k and (np.abs(change[:2]) < _SETTLED * np.sqrt(np.diagonal(covariance)[:2])).all())
         if settled:
             break
-    return _fit(window, theta, covariance, settled)
-
-
-def _fit(window: Window, theta: Array, covariance: Array, settled: bool) -> WindowFit:
-    noise = window.noise(theta)
-    if noise.dead or not np.isfinite(covariance).all():
-        return _nothing(theta)
-    r, _ = window.residual(noise, theta[None])
-    chi2 = float(r[0] @ r[0]) / max(len(noise.sigma) - len(theta), 1)
-    return WindowFit(theta, np.asarray(np.linalg.inv(covariance), float), chi2, settled)
+    return IntervalPosterior(window, theta, covariance, index, part, settled)
 
 
 def _nothing(theta: Array) -> WindowFit:

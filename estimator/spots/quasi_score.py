@@ -148,6 +148,11 @@ class Window:
     frames: int = 1
     prnu: float = 0.0
 
+    @property
+    def of_intervals(self) -> bool:
+        """One frame's coefficients of JPEG, to be fitted by `interval_fit`."""
+        return self.model.card.output == "mjpeg" and self.frames == 1
+
     def noise(self, theta: Array, live: Rows | None = None, least: float = _LIVE) -> Noise:
         """Covariance of the quantised coefficients for one hypothesis, shape (k,); which are live, if it is known.
 
@@ -179,6 +184,12 @@ class Window:
             C = C / self.frames + (1.0 - 1.0 / self.frames) * alike
         return Noise(rows, sigma, np.asarray(np.linalg.cholesky(C), float))
 
+    def means(self, theta: Array, rows: Rows) -> tuple[Array, Array]:
+        """Means before the quantiser, shape (m, l), and derivatives, shape (m, k, l), of hypotheses (m, k)."""
+        raw, derivatives = self._raw(theta)
+        at = codes(self.model, raw.mean_e)
+        return at.mean @ rows.transform + rows.shift, code_slopes(self.model, at, derivatives) @ rows.transform
+
     def inputs(self, theta: Array) -> Inputs:
         """Outputs before the quantiser for one hypothesis, shape (k,)."""
         model = self.model
@@ -200,11 +211,9 @@ class Window:
     def residual(self, noise: Noise, theta: Array) -> tuple[Array, Array]:
         """Whitened residuals, shape (m, l), and derivatives of the mean, shape (m, k, l), of hypotheses (m, k)."""
         rows = noise.rows
-        raw, derivatives = self._raw(theta)
-        at = codes(self.model, raw.mean_e)
-        output = quantised(at.mean @ rows.transform + rows.shift, noise.sigma, rows.step)
-        changes = code_slopes(self.model, at, derivatives)
-        slopes = (changes @ rows.transform) * output.slope[:, None, :]
+        mean, slopes = self.means(theta, rows)
+        output = quantised(mean, noise.sigma, rows.step)
+        slopes *= output.slope[:, None, :]
         m, k, count = slopes.shape
         both = np.concatenate([(self.z[rows.index] - output.mean)[:, None], slopes], axis=1)
         white = noise.whitened(both.reshape(-1, count).T).T.reshape(m, k + 1, count)
