@@ -43,6 +43,7 @@ estimator/interface
 estimator/pair_set
 estimator/geometry
 estimator/spots
+estimator/processed
 estimator/sensor_fit
 estimator/outline
 estimator/limits estimator/methods

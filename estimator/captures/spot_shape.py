@@ -23,10 +23,10 @@ from phibench.estimator.interface import Answer, Pair, Spot
 from phibench.estimator.methods.chain_fit import spot_outputs
 from phibench.estimator.methods.locate import pair_blur, seen_depth_m
 from phibench.estimator.methods.raw_likelihood import raw_spot_data
+from phibench.estimator.processed.quasi_score import Window, fit_window
 from phibench.estimator.spots.fisher import limited
 from phibench.estimator.spots.fit_raw import SpotData, fit_law
 from phibench.estimator.spots.gaussian_spot import SpotModel, SpotPixels
-from phibench.estimator.spots.quasi_score import Window, fit_window
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig
 

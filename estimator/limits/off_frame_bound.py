@@ -31,7 +31,7 @@ from scipy.linalg import cho_factor, cho_solve
 from phibench.datasets.exposures.expected import ExpectedRegion
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.limits.position_bound import SpotLimit, derivative_images, limit_of, raw_information
-from phibench.estimator.spots.chain_model import (
+from phibench.estimator.processed.chain_model import (
     ChainModel,
     Codes,
     chain_model,
@@ -40,9 +40,9 @@ from phibench.estimator.spots.chain_model import (
     noise_factor,
     raw_variance_e2,
 )
+from phibench.estimator.processed.fit_chain import own_codes, unrounded
+from phibench.estimator.processed.fit_jpeg import grid_px
 from phibench.estimator.spots.fisher import covariance_bound, fisher_matrix
-from phibench.estimator.spots.fit_chain import own_codes, unrounded
-from phibench.estimator.spots.fit_jpeg import grid_px
 from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel, SpotPixels
 from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.estimator.spots.jpeg_coefficients import hidden_share, quantised

@@ -23,14 +23,14 @@ from numpy.typing import ArrayLike
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.limits.position_bound import SpotLimit, limit_of, raw_information
-from phibench.estimator.spots.chain_model import chain_model
+from phibench.estimator.processed.chain_model import chain_model
+from phibench.estimator.processed.fit_chain import own_codes, unrounded
+from phibench.estimator.processed.fit_jpeg import grid_px
+from phibench.estimator.processed.quasi_score import Window
 from phibench.estimator.spots.fisher import covariance_bound, fisher_matrix
-from phibench.estimator.spots.fit_chain import own_codes, unrounded
-from phibench.estimator.spots.fit_jpeg import grid_px
 from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel, SpotPixels
 from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.estimator.spots.pixel_statistics import code_law, code_table
-from phibench.estimator.spots.quasi_score import Window
 from phibench.estimator.spots.raw_pixels import bayer_filters
 from phibench.scenes.frames import Array
 

@@ -14,8 +14,7 @@ from phibench.estimator.interface import Answer, Box, Pair, Spot
 from phibench.estimator.methods.likelihood_maps import SpotLikelihood, of_pixels, of_window
 from phibench.estimator.methods.locate import around as box_at
 from phibench.estimator.methods.locate import box_around, measured_twice, pair_blur, seen_depth_m
-from phibench.estimator.spots.detect import Detection, detect
-from phibench.estimator.spots.fit_chain import (
+from phibench.estimator.processed.fit_chain import (
     code_data,
     first_fit,
     fit_jpeg,
@@ -26,11 +25,12 @@ from phibench.estimator.spots.fit_chain import (
     undone_mean,
     unrounded,
 )
+from phibench.estimator.processed.quasi_score import Window
+from phibench.estimator.spots.detect import Detection, detect
 from phibench.estimator.spots.fit_raw import SpotData, SpotFit
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
 from phibench.estimator.spots.image_planes import PROCESSED
 from phibench.estimator.spots.jpeg_coefficients import mcu_px
-from phibench.estimator.spots.quasi_score import Window
 from phibench.estimator.spots.raw_pixels import Background, PatternNoise, around, background_of
 from phibench.scenes.frames import Array
 

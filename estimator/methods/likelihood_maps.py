@@ -15,10 +15,10 @@ import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
 from phibench.estimator.geometry.joint_posterior import MISFIT_RANGE, LikelihoodMap
+from phibench.estimator.processed.interval_fit import interval_posterior
+from phibench.estimator.processed.quasi_score import Window, fit_window
 from phibench.estimator.spots.fisher import covariance_bound, limited, scoring_step
 from phibench.estimator.spots.fit_raw import SpotData
-from phibench.estimator.spots.interval_fit import interval_posterior
-from phibench.estimator.spots.quasi_score import Window, fit_window
 from phibench.scenes.frames import Array
 
 _AT_ONCE = 48  # hypotheses, whose arrays take some 50 MB

@@ -17,8 +17,8 @@ from phibench.estimator.limits.off_frame_bound import (
 )
 from phibench.estimator.limits.position_bound import spot_limit
 from phibench.estimator.limits.processed_bound import chain_limit
-from phibench.estimator.spots.chain_model import chain_model, codes, raw_variance_e2
-from phibench.estimator.spots.fit_chain import unrounded
+from phibench.estimator.processed.chain_model import chain_model, codes, raw_variance_e2
+from phibench.estimator.processed.fit_chain import unrounded
 from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel, SpotPixels
 from phibench.estimator.spots.jpeg_coefficients import quantised, step_correlation
 from phibench.render.sensor.light import Light

@@ -14,9 +14,9 @@ from phibench.estimator.interface import Box, Pair, Spot
 from phibench.estimator.methods.chain_fit import chain_fit
 from phibench.estimator.methods.locate import each_spot_twice
 from phibench.estimator.methods.raw_likelihood import raw_maximum_likelihood
+from phibench.estimator.processed.quasi_score import shared_covariance
 from phibench.estimator.sandbox.example_method import extract
 from phibench.estimator.spots.detect import detect
-from phibench.estimator.spots.quasi_score import shared_covariance
 from phibench.estimator.spots.raw_pixels import GaussLaw, PixelNoise
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.estimator.studies.image_cutout import cut_region, cut_rig

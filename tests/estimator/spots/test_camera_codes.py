@@ -14,6 +14,9 @@ from PIL import Image
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.processed_bound import chain_limit
+from phibench.estimator.processed.chain_model import chain_model, codes
+from phibench.estimator.processed.fit_chain import unrounded
+from phibench.estimator.processed.fit_jpeg import grid_px
 from phibench.estimator.spots.camera_codes import (
     light_of,
     rgb_codes,
@@ -24,9 +27,6 @@ from phibench.estimator.spots.camera_codes import (
     ycbcr_transform,
     yuyv_image,
 )
-from phibench.estimator.spots.chain_model import chain_model, codes
-from phibench.estimator.spots.fit_chain import unrounded
-from phibench.estimator.spots.fit_jpeg import grid_px
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import colour_planes, linear_planes, read_picture, through_jpeg
 from phibench.estimator.spots.jpeg_coefficients import coefficients, quantised, recovered

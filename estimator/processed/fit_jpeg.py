@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.processed.chain_model import ChainModel, codes, noise_factor, raw_variance_e2, window_px
+from phibench.estimator.processed.interval_fit import fit_intervals
+from phibench.estimator.processed.quasi_score import Window, WindowFit, fit_window
 from phibench.estimator.spots.camera_codes import ycbcr_codes
-from phibench.estimator.spots.chain_model import ChainModel, codes, noise_factor, raw_variance_e2, window_px
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
-from phibench.estimator.spots.interval_fit import fit_intervals
 from phibench.estimator.spots.jpeg_coefficients import hidden_share, mcu_px, qtables_of, recovered, room_variance
-from phibench.estimator.spots.quasi_score import Window, WindowFit, fit_window
 from phibench.scenes.frames import Array
 
 

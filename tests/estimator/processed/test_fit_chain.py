@@ -14,9 +14,9 @@ from scipy import integrate, stats
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.processed_bound import chain_limit
+from phibench.estimator.processed.chain_model import chain_model, codes
+from phibench.estimator.processed.fit_chain import fit_jpeg, fit_srgb, undone, unrounded
 from phibench.estimator.spots.camera_codes import linear_to_srgb, noisy_code, srgb_slope, srgb_to_linear
-from phibench.estimator.spots.chain_model import chain_model, codes
-from phibench.estimator.spots.fit_chain import fit_jpeg, fit_srgb, undone, unrounded
 from phibench.estimator.spots.fit_raw import fit_law
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
 from phibench.estimator.spots.jpeg_coefficients import coefficients, quantisation, quantised, recovered, steps

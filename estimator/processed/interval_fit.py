@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import erfcx, ndtr
 
+from phibench.estimator.processed.quasi_score import Inputs, Rows, Window, WindowFit, fit_window
 from phibench.estimator.spots.fisher import limited
-from phibench.estimator.spots.quasi_score import Inputs, Rows, Window, WindowFit, fit_window
 from phibench.scenes.frames import Array
 
 _PRIOR_PX = 2.0  # one standard deviation about the start; twice or half of it moves a fit by hundredths of its own

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from phibench.estimator.spots.chain_model import ChainModel, code_slopes, codes, noise_factor, raw_variance_e2
+from phibench.estimator.processed.chain_model import ChainModel, code_slopes, codes, noise_factor, raw_variance_e2
 from phibench.estimator.spots.fisher import limited, scoring_step
 from phibench.estimator.spots.gaussian_spot import SpotPixels
 from phibench.estimator.spots.jpeg_coefficients import quantised, step_correlation
