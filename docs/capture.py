@@ -155,6 +155,8 @@ def main(arguments=None):
     options = parsed(arguments)
     camera = cv2.VideoCapture(options.device, cv2.CAP_V4L2)
     try:
+        if not camera.isOpened():
+            raise CaptureError(f"no camera at /dev/video{options.device}; name another with --device")
         run(options, camera, cv2)
     except CaptureError as fault:
         print(f"capture: {fault}", file=sys.stderr)

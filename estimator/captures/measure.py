@@ -25,7 +25,15 @@ from phibench.datasets.frames.sensor_file import SensorFile, read_sensor_file
 from phibench.estimator.calibration.bundle import calibrate
 from phibench.estimator.calibration.file import Calibration, read_calibration
 from phibench.estimator.calibration.spots import method_for
-from phibench.estimator.captures.pair_photos import PairPhotos, frames_note, pair_of_photos
+from phibench.estimator.captures.pair_photos import (
+    LEAST_STROKE_M,
+    MOST_STROKE_M,
+    PairPhotos,
+    contradiction,
+    frames_note,
+    nothing_found,
+    pair_of_photos,
+)
 from phibench.estimator.captures.picture_files import SensorChoice, sensor_choice
 from phibench.estimator.captures.rig_file import MeasuredRig, read_rig_file, require_camera_size
 from phibench.estimator.captures.spot_shape import (
@@ -40,23 +48,19 @@ from phibench.estimator.captures.spot_shape import (
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas, stroke_of
 from phibench.estimator.geometry.status import Status, describe
-from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Image, Pair, Spot
 from phibench.estimator.methods.raw_likelihood import with_posteriors
 from phibench.estimator.outline.limb_image import Measured
 from phibench.estimator.outline.outline import Outline, find_outline, mean_outline
-from phibench.estimator.spots.detect import FARTHEST_M, NEAREST_M, PairDetection, detect
+from phibench.estimator.spots.detect import detect
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig
 
 SHAPE = "spot_shape"
 """Key of a `SpotShape` in what a calibration was made from."""
-LEAST_STROKE_M, MOST_STROKE_M = 1e-3, 10.0
 DOUBTFUL_P = 1e-3
 """Probability of the two rays' gap below which the two spots are not taken for one point."""
-_FACTORS = (0.1, 10.0, 0.3, 3.0, 0.01, 100.0, 0.001)  # of the stroke: units mistaken, and a few times too much
-_SURE_SIGMAS = 12.0  # of both spots, before something else is said to be wrong: a faint one may be noise
 
 
 @dataclass(frozen=True)
@@ -204,7 +208,7 @@ def measure(photos: PairPhotos, stroke_m: float, setting: Setting) -> Measuremen
         setting.stroke_sigma_m,
     )
     if int(depth.status) != Status.OK:
-        raise _contradiction(ready, photos, describe(int(depth.status)))
+        raise contradiction(ready, photos, describe(int(depth.status)))
     frames = frames_note(photos)
     notes = tuple(text for text in (chosen.note, note, _shape_note(shape, setting), frames, _doubt(depth)) if text)
     return Measurement(depth, down, up, rig, stroke, outlines, setting.known.rig, ready, chosen, notes)
@@ -323,7 +327,7 @@ def _shape_note(shape: SpotShape, setting: Setting) -> str:
 def _answer(pair: Pair, photos: PairPhotos) -> Answer:
     answer = method_for(pair.card)(pair)
     if any(spot.uv_px is None or spot.covariance_px2 is None for spot in (answer.down, answer.up)):
-        raise _nothing_found(pair, photos, answer)
+        raise nothing_found(pair, photos, answer)
     return with_posteriors(pair, answer)
 
 
@@ -331,71 +335,6 @@ def seen_spots(answer: Answer) -> dict[str, SeenSpot]:
     """Positions of an answer that has both, by position."""
     both = dict(zip(POSITIONS, (answer.down, answer.up), strict=True))
     return {name: SeenSpot(np.array(spot.uv_px), np.array(spot.covariance_px2)) for name, spot in both.items()}
-
-
-# -- what is wrong ---------------------------------------------------------------------------------------------------
-
-
-def _swapped(pair: Pair) -> Pair:
-    return replace(pair, down=pair.up, up=pair.down, down_off=pair.up_off, up_off=pair.down_off)
-
-
-def _nothing_found(pair: Pair, photos: PairPhotos, answer: Answer) -> DatasetError:
-    """Error of a pair in which a spot lacks: positions swapped, a wrong stroke, or no laser."""
-    if contradiction := _known_contradiction(pair, photos):
-        return contradiction
-    lacking = [p for p in POSITIONS if getattr(answer, p).uv_px is None]
-    if not lacking:
-        unfit = next(p for p in POSITIONS if getattr(answer, p).covariance_px2 is None)
-        u, v = getattr(answer, unfit).uv_px
-        return DatasetError(
-            f"a light is seen in the picture {unfit} ({getattr(photos, unfit).on[0].path}) at ({u:.0f}, {v:.0f}) px, "
-            "but it is too faint to be fitted; give more frames, less light of the room or more of the laser"
-        )
-    where = " and ".join(f"{p} ({getattr(photos, p).on[0].path})" for p in lacking)
-    advice = "; give pictures with the laser off, too" if pair.down_off is None else ""
-    return DatasetError(
-        f"no laser spot in the picture {where}: {getattr(answer, lacking[0]).status}; look whether the laser is on and "
-        f"its spot is seen in the mirror, and whether the picture is overexposed{advice}"
-    )
-
-
-def _contradiction(pair: Pair, photos: PairPhotos, status: str) -> DatasetError:
-    """Error of two spots that no point of the room gives."""
-    return _known_contradiction(pair, photos) or DatasetError(
-        f"the spots in {photos.down.on[0].path} and {photos.up.on[0].path} have no distance: their rays are {status}; "
-        "look whether both show the same spot, with camera and mirror moved together"
-    )
-
-
-def _known_contradiction(pair: Pair, photos: PairPhotos) -> DatasetError | None:
-    """Error of positions that are swapped or a stroke that is wrong, if the pictures show it."""
-    if _both(detect(_swapped(pair))):
-        return DatasetError(
-            f"down and up are swapped: the spot moves the wrong way from {photos.down.on[0].path} to "
-            f"{photos.up.on[0].path}, but the right one if they change places; give them to --down and --up the other "
-            "way round"
-        )
-    for stroke in (factor * pair.stroke_m for factor in _FACTORS):
-        if not LEAST_STROKE_M <= stroke <= MOST_STROKE_M:
-            continue
-        found = detect(replace(pair, stroke_m=stroke))
-        if found.down is None or found.up is None or not _both(found):
-            continue
-        uv = np.array(found.down.uv_px), np.array(found.up.uv_px)
-        per_m = float(depth_exact(pair.rig, stroke, *uv).depth_m) / stroke  # D grows with the stroke
-        if not per_m > 0.0 or NEAREST_M <= per_m * pair.stroke_m <= FARTHEST_M:
-            continue  # the stroke is possible: something else is wrong
-        return DatasetError(
-            f"the stroke contradicts the pictures: with {pair.stroke_m:.4g} m no point of a room, {NEAREST_M:g} to "
-            f"{FARTHEST_M:g} m away, is seen at both spots; a stroke of {NEAREST_M / per_m:.2g} to "
-            f"{FARTHEST_M / per_m:.2g} m is possible; give --stroke-m in metres"
-        )
-    return None
-
-
-def _both(found: PairDetection) -> bool:
-    return all(one is not None and one.significance >= _SURE_SIGMAS for one in (found.down, found.up))
 
 
 def _doubt(depth: GeneralDepth) -> str:

@@ -19,14 +19,8 @@ from pathlib import Path
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import FILE_NAME, MIB, InputFile
 from phibench.datasets.store.files import write_text
-from phibench.estimator.captures.measure import (
-    LEAST_STROKE_M,
-    MOST_STROKE_M,
-    Measurement,
-    Setting,
-    measure,
-)
-from phibench.estimator.captures.pair_photos import PairPhotos, PositionPhotos
+from phibench.estimator.captures.measure import Measurement, Setting, measure
+from phibench.estimator.captures.pair_photos import LEAST_STROKE_M, MOST_STROKE_M, PairPhotos, PositionPhotos
 from phibench.estimator.captures.picture_files import read_photo
 from phibench.scenes.validation import nearest, printable_line
 
@@ -83,6 +77,9 @@ def read_pair_list(folder: Path) -> list[ListedPair]:
     except csv.Error as error:
         raise file.fault(f"is no CSV: {printable_line(str(error))}") from error
     known = ("name", *_FILES, *_NUMBERS)
+    if len(columns) == 1 and (mark := next((m for m in (";", "\t") if m in columns[0]), "")):
+        name = "semicolons" if mark == ";" else "tabs"
+        raise file.fault(f"has columns between {name}: save it with commas between them, and points in numbers")
     if strange := [column for column in columns if column not in known]:
         raise file.fault(f"has the column {printable_line(strange[0], 40)!r}; {nearest(strange[0], known)}")
     if lacking := [column for column in _NEEDED if column not in columns]:

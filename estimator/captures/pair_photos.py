@@ -1,15 +1,30 @@
-"""Photographs of a pair, laser on and off, one or several of each, and the pair to be measured that is made of them."""
+"""Photographs of a pair, laser on and off, one or several of each; the pair made of them; mistakes that they show.
+
+Each mistake is tried on the pictures themselves: the spot is looked for as if it were mended. Only spots that are sure
+prove one, so that noise is never explained.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.captures.picture_files import Photo, require_one_camera
 from phibench.estimator.captures.rig_file import MeasuredRig
-from phibench.estimator.interface import Pair
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.interface import Answer, Pair
+from phibench.estimator.spots.detect import FARTHEST_M, NEAREST_M, PairDetection, detect
 from phibench.scenes.rig import POSITIONS
+
+LEAST_STROKE_M, MOST_STROKE_M = 1e-3, 10.0
+_FACTORS = (0.1, 10.0, 0.3, 3.0, 0.01, 100.0, 0.001)  # of the stroke: units mistaken, and a few times too much
+_SURE_SIGMAS, _EACH_SIGMAS = 12.0, 9.0  # of both spots together and of each: a fainter one may be noise
+_ALIKE = 0.8  # of the difference of two rooms, below which pictures are of one position
 
 
 @dataclass(frozen=True)
@@ -38,7 +53,8 @@ class PairPhotos:
         if counts["down"] != counts["up"] or not counts["down"][0]:
             (a, b), (c, d) = counts["down"], counts["up"]
             raise DatasetError(
-                f"{a} pictures down ({b} with the laser off) and {c} up ({d} off): give as many of both positions"
+                f"pictures with the laser on: {a} down and {c} up; with the laser off: {b} down and {d} up; give as "
+                "many of both positions"
             )
         if counts["down"][1] > counts["down"][0]:
             raise DatasetError("more pictures with the laser off than on: give at most as many")
@@ -63,3 +79,95 @@ def frames_note(photos: PairPhotos) -> str:
     if count == 1:
         return ""
     return f"frames: {count} of each position with the laser on, {offs} with it off, fitted together"
+
+
+# -- mistakes ----------------------------------------------------------------------------------------------------------
+
+
+def nothing_found(pair: Pair, photos: PairPhotos, answer: Answer) -> DatasetError:
+    """Error of a pair in which a spot lacks or cannot be fitted."""
+    if known := known_fault(pair, photos):
+        return known
+    lacking = [p for p in POSITIONS if getattr(answer, p).uv_px is None]
+    if not lacking:
+        unfit = next(p for p in POSITIONS if getattr(answer, p).covariance_px2 is None)
+        u, v = getattr(answer, unfit).uv_px
+        return DatasetError(
+            f"a light is seen in the picture {unfit} ({getattr(photos, unfit).on[0].path}) at ({u:.0f}, {v:.0f}) px, "
+            "but it is too faint to be fitted; give more frames, less light of the room or more of the laser"
+        )
+    where = " and ".join(f"{p} ({getattr(photos, p).on[0].path})" for p in lacking)
+    advice = "" if pair.down_off is not None else "; give pictures with the laser off, too"
+    return DatasetError(
+        f"no laser spot in the picture {where}: {getattr(answer, lacking[0]).status}; look whether the laser is on and "
+        "its spot is seen in the mirror, whether it is overexposed, whether down and up are swapped, and whether the "
+        f"stroke is in metres{advice}"
+    )
+
+
+def contradiction(pair: Pair, photos: PairPhotos, status: str) -> DatasetError:
+    """Error of two spots that no point of the room gives."""
+    return known_fault(pair, photos) or DatasetError(
+        f"the spots in {photos.down.on[0].path} and {photos.up.on[0].path} have no distance: their rays are {status}; "
+        "look whether both show the same spot, with camera and mirror moved together"
+    )
+
+
+def known_fault(pair: Pair, photos: PairPhotos) -> DatasetError | None:
+    """Error of a mistake that the pictures themselves show, if they show one."""
+    down, up = photos.down.on[0].path, photos.up.on[0].path
+    if _offs_exchanged(pair):
+        return DatasetError(
+            f"the pictures with the laser off are exchanged: {photos.up.off[0].path} shows what {down} does; give it "
+            "to --down-off, and the other to --up-off"
+        )
+    if _both(detect(replace(pair, down=pair.up, up=pair.down, down_off=pair.up_off, up_off=pair.down_off))):
+        return DatasetError(
+            f"down and up are swapped: the spot moves the wrong way from {down} to {up}, but the right one if they "
+            "change places; give them to --down and --up the other way round"
+        )
+    if pair.down_off is not None and pair.up_off is not None:
+        other = replace(pair, down=pair.down_off, up=pair.up_off, down_off=pair.down, up_off=pair.up)
+        if _both(detect(other)):
+            return DatasetError(
+                f"laser on and off are exchanged: the spot is in {photos.down.off[0].path} and "
+                f"{photos.up.off[0].path}; give these to --down and --up, the others to --down-off and --up-off"
+            )
+    return next(_strokes_faults(pair), None)
+
+
+def _offs_exchanged(pair: Pair) -> bool:
+    """True where each laser-off picture is far more alike to the other position's picture."""
+    if pair.down_off is None or pair.up_off is None:
+        return False
+    images = {name: np.asarray(image, float) for name, image in pair.images.items()}
+
+    def off(a: str, b: str) -> float:
+        return float(np.sqrt(np.mean((images[a] - images[b]) ** 2)))
+
+    return all(off(a, f"{b}_off") < _ALIKE * off(a, f"{a}_off") for a, b in (POSITIONS, POSITIONS[::-1]))
+
+
+def _strokes_faults(pair: Pair) -> Iterator[DatasetError]:
+    """Errors of a stroke with which both spots are no point of a room, but are with another."""
+    for stroke in (factor * pair.stroke_m for factor in _FACTORS):
+        if not LEAST_STROKE_M <= stroke <= MOST_STROKE_M:
+            continue
+        found = detect(replace(pair, stroke_m=stroke))
+        if found.down is None or found.up is None or not _both(found):
+            continue
+        uv = np.array(found.down.uv_px), np.array(found.up.uv_px)
+        per_m = float(depth_exact(pair.rig, stroke, *uv).depth_m) / stroke  # D grows with the stroke
+        if not per_m > 0.0 or NEAREST_M <= per_m * pair.stroke_m <= FARTHEST_M:
+            continue  # the stroke is possible: something else is wrong
+        yield DatasetError(
+            f"the stroke contradicts the pictures: with {pair.stroke_m:.4g} m no point of a room, {NEAREST_M:g} to "
+            f"{FARTHEST_M:g} m away, is seen at both spots; a stroke of {NEAREST_M / per_m:.2g} to "
+            f"{FARTHEST_M / per_m:.2g} m is possible; give --stroke-m in metres"
+        )
+
+
+def _both(found: PairDetection) -> bool:
+    """True where both spots are sure."""
+    z = [one.significance for one in (found.down, found.up) if one is not None]
+    return len(z) == len(POSITIONS) and min(z) >= _EACH_SIGMAS and math.hypot(*z) >= math.sqrt(2.0) * _SURE_SIGMAS

@@ -23,7 +23,7 @@ from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError, structural_faults
 
-_REMEDY = "mend the file; docs/measure.md has an example"
+_REMEDY = "docs/measure.md has an example of a rig file"
 
 
 class MeasuredRigTable(RigTable):

@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from phibench.estimator.cli.options import number
+
 if TYPE_CHECKING:
     from phibench.estimator.captures.measure import Setting
 
-Pictures = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative="")]
+Pictures = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative="", show_default=False)]
+Metres = Annotated[float, Parameter(converter=number)]
 
 
 def measure(
@@ -19,10 +22,10 @@ def measure(
     rig: Path,
     down: Pictures = (),
     up: Pictures = (),
-    stroke_m: float | None = None,
+    stroke_m: Metres | None = None,
     down_off: Pictures = (),
     up_off: Pictures = (),
-    stroke_sigma_m: float = 0.0,
+    stroke_sigma_m: Metres = 0.0,
     calibration: Path | None = None,
     sensor: Path | None = None,
     out: Path | None = None,
@@ -35,13 +38,16 @@ def measure(
         Folder with pictures and `pairs.csv`, instead of --down, --up and --stroke-m.
     rig
         TOML file with what is known of the rig: `[rig]` of a recipe. docs/measure.md has an example.
-    down, up
-        Pictures at stroke position 1 and 2, laser on: JPEG, PNG, PGM or headerless .raw. Several frames of each
-        position may be given, as many of both.
+    down
+        Picture at stroke position 1, laser on: JPEG, PNG, PGM or headerless .raw. Several frames may be given.
+    up
+        The same at stroke position 2; as many frames as of position 1.
     stroke_m
         Stroke between the two positions, metres.
-    down_off, up_off
-        The same with the laser off.
+    down_off
+        Picture at stroke position 1, laser off.
+    up_off
+        The same at stroke position 2.
     stroke_sigma_m
         How well this stroke is known besides what is common to all strokes, one standard deviation.
     calibration
@@ -92,7 +98,8 @@ def _measure_folder(directory: Path, setting: Setting, out: Path | None) -> int:
     from phibench.estimator.captures.pair_list import Result, measured_pairs, write_results
 
     if out is None or out.suffix.lower() != ".csv":
-        raise DatasetError(f"--out {out}: the results of a folder are a CSV file; give a name that ends in .csv")
+        given = "without --out" if out is None else f"--out {out}"
+        raise DatasetError(f"{given}: the results of a folder are a CSV file; give --out with a name that ends in .csv")
 
     def told(result: Result) -> None:
         found = result.found

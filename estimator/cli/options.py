@@ -33,6 +33,17 @@ def _whole(_kind: object, tokens: Sequence[Token]) -> int:
         raise ValueError(f"{tokens[0].value!r} is not a whole number") from None
 
 
+def number(_kind: object, tokens: Sequence[Token]) -> float:
+    """Convert a number; one with a comma is refused with what to write instead."""
+    text = tokens[0].value
+    try:
+        return float(text)
+    except ValueError:
+        other = text.replace(",", ".")
+        hint = f"; write {other}" if text.count(",") == 1 and other.replace(".", "", 1).isdigit() else ""
+        raise ValueError(f"{text!r} is not a number{hint}") from None
+
+
 Whole = Annotated[int, Parameter(converter=_whole)]
 Methods = Annotated[
     list[str] | None,

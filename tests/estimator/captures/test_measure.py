@@ -138,6 +138,41 @@ def test_swapped_positions_are_told(case: Case, capsys) -> None:
 
 
 @pytest.mark.usefixtures("unaligned")
+def test_laser_on_and_off_exchanged_is_told(case: Case, capsys) -> None:
+    dark = {"down": case.raw["down_off"], "up": case.raw["up_off"]}
+    dark |= {"down_off": case.raw["down"], "up_off": case.raw["up"]}
+    assert "laser on and off are exchanged" in refused(capsys, case.arguments(dark))
+
+
+@pytest.mark.usefixtures("unaligned")
+def test_laser_off_pictures_of_the_other_position_are_told(case: Case, capsys) -> None:
+    mixed = {**case.raw, "down_off": case.raw["up_off"], "up_off": case.raw["down_off"]}
+    assert "laser off are exchanged" in refused(capsys, case.arguments(mixed))
+
+
+def test_a_laser_off_picture_of_one_position_alone_is_told(case: Case, capsys) -> None:
+    text = refused(capsys, case.arguments(case.raw, names=("down", "up", "down_off")))
+    assert "with the laser off: 1 down and 0 up" in text
+
+
+def test_a_stroke_with_a_comma_is_told(case: Case, capsys) -> None:
+    arguments = case.arguments(case.raw)
+    arguments[arguments.index("--stroke-m") + 1] = "0,425"
+    assert main(arguments) == 2
+    assert "write 0.425" in "".join(capsys.readouterr())
+
+
+def test_a_list_between_semicolons_and_a_folder_without_out_are_told(case: Case, tmp_path: Path, capsys) -> None:
+    rig = ["--rig", str(case.folder / "rig.toml")]
+    assert "give --out" in refused(capsys, ["measure", str(tmp_path), *rig])
+    for mark, name in ((";", "semicolons"), ("\t", "tabs")):
+        head = mark.join(("name", "down", "up", "stroke_m"))
+        (tmp_path / "pairs.csv").write_text(f"{head}\n{mark.join(('a', 'a.jpg', 'b.jpg', '1,0'))}\n")
+        out = ["--out", str(tmp_path / "out.csv")]
+        assert name in refused(capsys, ["measure", str(tmp_path), *rig, *out])
+
+
+@pytest.mark.usefixtures("unaligned")
 def test_a_stroke_in_centimetres_is_told(case: Case, capsys) -> None:
     text = refused(capsys, case.arguments(case.raw, 0.01 * case.sample.row.stroke_m))
     assert "stroke contradicts" in text
