@@ -27,7 +27,7 @@ Sources of the metals' refractive indices:
 * Gold, evaporated: P. B. Johnson and R. W. Christy, "Optical constants of the noble metals", Phys. Rev. B 6, 4370
   (1972).
 
-A polished or oxidised surface reflects less than an evaporated film.
+A polished or oxidised surface reflects less than an evaporated film. A `ReflectanceTable` takes what was measured.
 """
 
 from __future__ import annotations
@@ -271,11 +271,106 @@ def known_metal(owner: str, name: str) -> None:
         raise SceneError(f"{owner}.metal = {name}: known are {', '.join(METALS)}")
 
 
+@dataclass(frozen=True)
+class ReflectanceTable:
+    """Measured power reflectance of a mirror, unpolarised, linear between its wavelengths and angles.
+
+    Parameters
+    ----------
+    wavelength_nm : floats, rising
+        A single one stands for all wavelengths.
+    value : floats
+        One for each wavelength; or, row after row, one for each wavelength and angle.
+    angle_deg : floats, rising
+        Angles of incidence of the columns; beyond the first and last the nearest holds, so that one angle stands for
+        all. Empty: values R are at normal incidence, and the metal says how they depend on the angle. With F by
+        Fresnel's equations, a smaller R than F(0) is a factor, R(i) = F(i) R / F(0), as of dirt or scratches; of a
+        larger one the loss is scaled, 1 - R(i) = (1 - F(i)) (1 - R) / (1 - F(0)). So R(i) stays within 0 and 1.
+    """
+
+    wavelength_nm: tuple[float, ...]
+    value: tuple[float, ...]
+    angle_deg: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("wavelength_nm", "value", "angle_deg"):
+            numbers = tuple(finite("ReflectanceTable", name, float(x)) for x in getattr(self, name))
+            object.__setattr__(self, name, numbers)
+        for name, low, high in (("wavelength_nm", 300.0, 1100.0), ("value", 0.0, 1.0), ("angle_deg", 0.0, 90.0)):
+            for x in getattr(self, name):
+                within("ReflectanceTable", name, x, low, high)
+            if name != "value" and any(b <= a for a, b in itertools.pairwise(getattr(self, name))):
+                raise SceneError(f"ReflectanceTable.{name} = {list(getattr(self, name))}: must rise")
+        wanted = len(self.wavelength_nm) * max(len(self.angle_deg), 1)
+        if len(self.value) != wanted or not wanted:
+            raise SceneError(
+                f"ReflectanceTable.value = {list(self.value)}: {len(self.value)} numbers for {len(self.wavelength_nm)} "
+                f"wavelengths and {max(len(self.angle_deg), 1)} angles; give one for each wavelength and angle"
+            )
+
+    def row(self, wavelength_nm: float) -> Array:
+        """Values at a wavelength, shape (angles,), or (1,) without angles.
+
+        Raises
+        ------
+        SceneError
+            If the table does not cover the wavelength.
+        """
+        nm, rows = np.array(self.wavelength_nm), np.reshape(self.value, (len(self.wavelength_nm), -1))
+        if len(nm) > 1 and not nm[0] <= wavelength_nm <= nm[-1]:
+            raise SceneError(
+                f"ReflectanceTable.wavelength_nm = {list(self.wavelength_nm)}: does not cover {wavelength_nm:g} nm, "
+                "which the laser or a colour filter needs; add a wavelength, or give a single one that stands for all"
+            )
+        return np.array([np.interp(wavelength_nm, nm, column) for column in rows.T])
+
+
+@dataclass(frozen=True)
+class BandReflectance:
+    """Reflectance at one wavelength, by the angle of incidence: a metal's, a table's, or a mixture of the two.
+
+    Attributes
+    ----------
+    index : complex
+        Refractive index n + i k of the metal.
+    gain, loss : float
+        Factors of the metal's reflectance and of what that leaves: 1 without a table.
+    angles_rad, values : arrays, shape (m,)
+        Of a table with angles, which then counts alone; empty otherwise.
+    """
+
+    index: complex
+    gain: float
+    loss: float
+    angles_rad: Array
+    values: Array
+
+    def at(self, cos_incidence: Array) -> Array:
+        """Reflectance, shape of `cos_incidence` (cosine of the angle of incidence); NaN in, NaN out."""
+        cos_i = np.asarray(cos_incidence, float)
+        if len(self.values):
+            angle = np.arccos(np.clip(cos_i, -1.0, 1.0))
+            return np.where(np.isnan(cos_i), np.nan, np.interp(angle, self.angles_rad, self.values))
+        fresnel = self.gain * _fresnel(self.index, cos_i)
+        return fresnel if self.loss == 1.0 else 1.0 - self.loss * (1.0 - fresnel)
+
+
+def _fresnel(index: complex, cos_i: Array) -> Array:
+    """Unpolarised Fresnel power reflectance."""
+    m2 = index**2
+    with np.errstate(invalid="ignore"):  # NaN in, NaN out
+        root = np.sqrt(m2 - (1.0 - cos_i * cos_i))
+        r_s = (cos_i - root) / (cos_i + root)
+        r_p = (m2 * cos_i - root) / (m2 * cos_i + root)
+    return 0.5 * (np.abs(r_s) ** 2 + np.abs(r_p) ** 2)
+
+
 class MetalSurface:
     """Reflectance of a polished metal: what mirrors of every shape share."""
 
     metal: MetalName
     roughness_alpha: float
+    reflectance_table: ReflectanceTable | None
 
     def refractive_index(self, wavelength_nm: float) -> complex:
         """Complex index n + i k of the metal, linear between the table's wavelengths (400 to 700 nm)."""
@@ -285,15 +380,21 @@ class MetalSurface:
         n, k = (float(np.interp(wavelength_nm, table[:, 0], table[:, i])) for i in (1, 2))
         return complex(n, k)
 
+    def band(self, wavelength_nm: float) -> BandReflectance:
+        """Reflectance at a wavelength."""
+        index, table = self.refractive_index(wavelength_nm), self.reflectance_table
+        none = np.empty(0)
+        if table is None:
+            return BandReflectance(index, 1.0, 1.0, none, none)
+        row, normal = table.row(wavelength_nm), float(_fresnel(index, np.array(1.0)))
+        if table.angle_deg:
+            return BandReflectance(index, 1.0, 1.0, np.radians(table.angle_deg), row)
+        value = float(row[0])
+        return BandReflectance(index, min(value / normal, 1.0), min((1.0 - value) / (1.0 - normal), 1.0), none, none)
+
     def reflectance(self, cos_incidence: Array, wavelength_nm: float) -> Array:
-        """Unpolarised Fresnel power reflectance, shape of `cos_incidence` (cosine of the angle of incidence)."""
-        m2 = self.refractive_index(wavelength_nm) ** 2
-        cos_i = np.asarray(cos_incidence, float)
-        with np.errstate(invalid="ignore"):  # NaN in, NaN out
-            root = np.sqrt(m2 - (1.0 - cos_i * cos_i))
-            r_s = (cos_i - root) / (cos_i + root)
-            r_p = (m2 * cos_i - root) / (m2 * cos_i + root)
-        return 0.5 * (np.abs(r_s) ** 2 + np.abs(r_p) ** 2)
+        """Unpolarised power reflectance, shape of `cos_incidence` (cosine of the angle of incidence)."""
+        return self.band(wavelength_nm).at(cos_incidence)
 
 
 # The sphere.
@@ -315,12 +416,15 @@ class SphereMirror(MetalSurface):
     form : Form or None
         Deviations from the sphere; None is a perfect one, and so is a `Form` whose numbers are all 0.
     metal : "steel", "aluminium" or "gold"
+    reflectance_table : ReflectanceTable or None
+        Measured reflectance instead of the metal's.
     """
 
     radius_m: float = 0.060
     roughness_alpha: float = 0.0
     form: Form | None = None
     metal: MetalName = "steel"
+    reflectance_table: ReflectanceTable | None = None
 
     def __post_init__(self) -> None:
         positive("SphereMirror", "radius_m", self.radius_m)

@@ -211,7 +211,7 @@ class Misalignment:
         if old is not None:
             form = Form(*(a + b for a, b in zip(old.coefficients_m, form.coefficients_m, strict=True)))
         alpha = nominal.roughness_alpha + self.roughness_alpha
-        return SphereMirror(nominal.radius_m + self.radius_m, alpha, form, nominal.metal)
+        return replace(nominal, radius_m=nominal.radius_m + self.radius_m, roughness_alpha=alpha, form=form)
 
     def _revolved(self, nominal: RevolvedMirror) -> RevolvedMirror:
         """True mirror of revolution: `radius_m` is added to the vertex radius; a cone has none and stays as it is."""
@@ -220,7 +220,8 @@ class Misalignment:
         profile = nominal.profile
         if self.radius_m and profile.shape != "cone":
             profile = replace(profile, vertex_radius_m=profile.vertex_radius_m + self.radius_m)
-        return RevolvedMirror(profile, nominal.roughness_alpha + self.roughness_alpha, nominal.metal)
+        alpha = nominal.roughness_alpha + self.roughness_alpha
+        return replace(nominal, profile=profile, roughness_alpha=alpha)
 
     def poses(self, T_world_camera: Pose, T_camera_sphere: Pose) -> tuple[Pose, Pose]:
         """True camera pose in the world and sphere pose in the camera, both down."""

@@ -27,7 +27,7 @@ from typing import Literal
 import numpy as np
 
 from phibench.scenes.frames import Array
-from phibench.scenes.mirror import Level, MetalName, MetalSurface, known_metal
+from phibench.scenes.mirror import Level, MetalName, MetalSurface, ReflectanceTable, known_metal
 from phibench.scenes.validation import SceneError, finite, positive, within
 
 Shape = Literal["sphere", "ellipsoid", "paraboloid", "hyperboloid", "cone", "polynomial"]
@@ -254,11 +254,14 @@ class RevolvedMirror(MetalSurface):
     roughness_alpha : float
         Beckmann roughness; 0 is an ideal mirror.
     metal : "steel", "aluminium" or "gold"
+    reflectance_table : ReflectanceTable or None
+        Measured reflectance instead of the metal's.
     """
 
     profile: Profile
     roughness_alpha: float = 0.0
     metal: MetalName = "steel"
+    reflectance_table: ReflectanceTable | None = None
 
     def __post_init__(self) -> None:
         within("RevolvedMirror", "roughness_alpha", self.roughness_alpha, 0.0, 0.05)

@@ -124,6 +124,8 @@ class Rig:
             pose = getattr(self, name)
             if (pose.target, pose.source) != frames:
                 raise SceneError(f"Rig.{name} joins frames {pose.target}, {pose.source}: must be {frames}")
+        for nm in self.camera.detector.band_wavelength_nm if self.mirror.reflectance_table else ():
+            self.mirror.band(nm)
         if isinstance(self.mirror, RevolvedMirror):
             self._check_revolved(self.mirror)
             return

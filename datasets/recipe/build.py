@@ -27,7 +27,7 @@ from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector, rotation_xyz
 from phibench.scenes.holder import LENGTHS, Holder, fitted
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.mirror import SphereMirror
+from phibench.scenes.mirror import ReflectanceTable, SphereMirror
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.revolved_mirror import Profile, RevolvedMirror, cone, image_depth_m
 from phibench.scenes.rig import Rig
@@ -53,7 +53,7 @@ HOLDER_KINDS: Mapping[str, tuple[str, ...]] = {
 _NANOMETRE = 9  # decimals
 _OWNERS = (
     *(("Holder.", "rig.holder."), ("SphereMirror.", "rig."), ("Camera.", "rig.")),
-    *(("Profile.", "rig.mirror."), ("RevolvedMirror.", "rig.")),
+    *(("Profile.", "rig.mirror."), ("RevolvedMirror.", "rig."), ("ReflectanceTable.", "rig.reflectance.")),
 )
 
 
@@ -95,7 +95,7 @@ def _rig(table: RigTable) -> Rig:
     base = RIGS[table.preset]()
     if table.mirror is not None:
         return _revolved_rig(table, table.mirror, base)
-    mirror = replace(base.sphere, **_given(table, ("radius_m", "roughness_alpha", "metal")))
+    mirror = replace(base.sphere, **_given(table, ("radius_m", *_SURFACE)), reflectance_table=_reflectance(table))
     z_c_m = base.sphere_in_camera_m[2] if table.z_c_m is None else table.z_c_m
     T_world_camera, T_camera_sphere = _poses(table, base, z_c_m)
     before_m = min(T_camera_sphere.translation_m[2], float(np.linalg.norm(T_camera_sphere.t)))
@@ -160,12 +160,21 @@ def _revolved_rig(table: RigTable, mirror: MirrorTable, base: Rig) -> Rig:
         raise SceneError(f"rig.holder.kind = {table.holder.kind}: carries a sphere; remove it for a {mirror.shape}")
     vertex_m = _VERTEX_M if table.z_c_m is None else table.z_c_m
     profile = build_profile(mirror, vertex_m)
-    given = _given(table, ("roughness_alpha", "metal"))
+    given = _given(table, _SURFACE)
     T_world_camera, T_camera_sphere = _poses(table, base, vertex_m)
     T_camera_mirror = replace(T_camera_sphere, rotation=as_matrix(T_world_camera.R.T))
     camera = _focused(_camera(base.camera, table), table, vertex_m + image_depth_m(profile))
     stroke = _stroke_axis(table)
-    return Rig(camera, RevolvedMirror(profile, **given), T_world_camera, T_camera_mirror, stroke)
+    revolved = RevolvedMirror(profile, **given, reflectance_table=_reflectance(table))
+    return Rig(camera, revolved, T_world_camera, T_camera_mirror, stroke)
+
+
+_SURFACE = ("roughness_alpha", "metal")
+
+
+def _reflectance(table: RigTable) -> ReflectanceTable | None:
+    given = table.reflectance
+    return None if given is None else ReflectanceTable(given.wavelength_nm, given.value, given.angle_deg)
 
 
 def _poses(table: RigTable, base: Rig, z_c_m: float) -> tuple[Pose, Pose]:

@@ -343,6 +343,11 @@ def _rig(draft: _Draft) -> Iterator[Fault]:
             yield rig_fault_of(error)
     if draft.rig is None or rig is None:
         return
+    if draft.laser is not None and rig.mirror.reflectance_table is not None:
+        try:
+            rig.mirror.band(draft.laser.wavelength_nm)
+        except SceneError as error:
+            yield rig_fault_of(SceneError(by_keys(str(error))))
     yield from _cells(rig, sound_of(draft.raw.get("ambient", {}), AmbientTable))
     too_high = None if room is None else _height(draft.rig, rig, room)
     if too_high is not None:

@@ -38,6 +38,7 @@ from phibench.datasets.recipe.tables import (
     RandomRigTable,
     RandomSpotTable,
     RandomTable,
+    ReflectionTable,
     RigTable,
     TargetTable,
 )
@@ -49,6 +50,7 @@ from phibench.scenes.worlds.properties import PROPERTIES
 TABLES: dict[str, type[BaseModel]] = {
     "[dataset]": DatasetTable,
     "[rig]": RigTable,
+    "[rig.reflectance]": ReflectionTable,
     "[rig.holder]": HolderTable,
     "[rig.mirror]": MirrorTable,
     "[misalignment]": MisalignmentTable,
@@ -112,6 +114,12 @@ _NOTES = {
 
 `z_c_m` must exceed `radius_m`. A smaller `width_px` alone keeps the focal length, and so cuts the image.
 Divide `fx_px` by the same factor to see as much as before.
+""",
+    "[rig.reflectance]": """Measured reflectance of the mirror, unpolarised, instead of that of `metal`; see
+`docs/mirrors.md`. It holds for the spot, the views and the ambient light, and for a mirror of any shape. Between
+wavelengths and angles it is linear. The colour filters (460, 540 and 610 nm) and the laser must be covered.
+Without `angle_deg` the values are at normal incidence. `metal` then says how they depend on the angle.
+A value below the metal's is a factor at every angle; of a larger one the loss is scaled.
 """,
     "[rig.holder]": """What carries the mirror. It moves with the rig, is seen in the mirror and hides spots; see
 `docs/holder.md`. R is `radius_m` of `[rig]`: sizes that are left out follow it. Its axis runs from the lens centre to

@@ -143,6 +143,23 @@ class MirrorTable(Table):
     )
 
 
+class ReflectionTable(Table):
+    """`[rig.reflectance]`: measured reflectance of the mirror instead of its metal's."""
+
+    wavelength_nm: tuple[float, ...] = Field(
+        strict=False, min_length=1, max_length=200, description="rising; a single one stands for all"
+    )
+    value: tuple[Unit, ...] = Field(
+        strict=False, min_length=1, max_length=20000, description="one for each wavelength and angle, row after row"
+    )
+    angle_deg: tuple[Annotated[float, Field(ge=0.0, le=90.0)], ...] = Field(
+        default=(), strict=False, max_length=100, description="angles of incidence, rising; a single one stands for all"
+    )
+
+
+_LATER_RIG = ("mirror", "metal", "reflectance")
+
+
 class RigTable(Table):
     """`[rig]`: a preset, and what differs from it."""
 
@@ -150,7 +167,7 @@ class RigTable(Table):
     def _without_what_is_not_given(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Recipes with a sphere of steel keep the hash that they had before there were other mirrors."""
         document: dict[str, Any] = serialised(self)
-        return {key: value for key, value in document.items() if key not in ("mirror", "metal") or value is not None}
+        return {key: value for key, value in document.items() if key not in _LATER_RIG or value is not None}
 
     preset: Literal["default", "c310"] = Field(default="default", description="rig to start from")
     z_c_m: float | None = Field(
@@ -194,6 +211,7 @@ class RigTable(Table):
     tilt_y_rad: Tilt = Field(default=0.0, description="camera turned about world y, the mirror stays")
     stroke_tilt_x_rad: Tilt = Field(default=0.0, description="stroke axis turned about world x")
     stroke_tilt_y_rad: Tilt = Field(default=0.0, description="stroke axis turned about world y")
+    reflectance: ReflectionTable | None = Field(default=None, description="measured reflectance of the mirror")
     holder: HolderTable = Field(default=HolderTable(), description="what carries the mirror")
     mirror: MirrorTable | None = Field(default=None, description="a mirror of another shape than a sphere")
 

@@ -60,12 +60,15 @@ def to_json(value: object) -> Any:
     """JSON document (dicts, lists, numbers) of a frozen dataclass such as `Rig` or `Room`.
 
     A rig without a holder says nothing of one: its document, and with it every key and digest, is that of older ones.
-    A holder that is no tube says nothing of glass, and a mirror of steel nothing of its metal.
+    A holder that is no tube says nothing of glass, a mirror of steel nothing of its metal, and one without a measured
+    reflectance nothing of that.
     """
     document = _adapter(cast(Any, type(value))).dump_python(value, mode="json")
     if isinstance(value, Rig):
         if value.mirror.metal == "steel":
             del document["mirror"]["metal"]
+        if value.mirror.reflectance_table is None:
+            del document["mirror"]["reflectance_table"]
         if value.holder is None:
             del document["holder"]
         elif value.holder.kind != "tube":
@@ -95,7 +98,7 @@ def from_json(kind: type[T], document: Any) -> T:
     return value
 
 
-_LATER = {"form", "coat", "window", "sun", "holder", "metal", *OF_TUBES}
+_LATER = {"form", "coat", "window", "sun", "holder", "metal", "reflectance_table", *OF_TUBES}
 """Fields that older versions do not have, whose default is what these versions meant: `mirror.form` in version 4."""
 _LARGEST = 1e12
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from phibench.render.room.camera_plugin import MM_PER_M
+from phibench.render.room.shading import mirror_bands
 from phibench.render.room.subpixel_grid import points, shifts
 from phibench.render.room.surfaces import Surfaces
 from phibench.render.room.texel_points import Texels, transmitted
@@ -36,8 +37,7 @@ def ball_light(mi: ModuleType, surfaces: Surfaces, texels: Texels, rays: int, se
 
     rig = surfaces.view.rig
     radius = dr.opaque(mi.Float, MM_PER_M * rig.sphere.radius_m)
-    indices = [rig.mirror.refractive_index(nm) for nm in rig.camera.detector.band_wavelength_nm]
-    index = [[dr.opaque(mi.Float, float(part)) for part in (one.real, one.imag)] for one in indices]
+    bands = mirror_bands(mi, rig)
     point, normal, lanes = texels.points, texels.normals, dr.arange(mi.UInt32, len(texels))
     distance = dr.norm(point)
     rim = dr.safe_sqrt(1.0 - dr.square(dr.minimum(radius / distance, 1.0)))  # cosine of the cone's half angle
@@ -64,7 +64,7 @@ def ball_light(mi: ModuleType, surfaces: Surfaces, texels: Texels, rays: int, se
         onward = mi.Ray3f(at, way + 2.0 * cos_ball * facet)
         t, patch, valid = surfaces.hit(onward, met, coherent=False)
         mirrored = surfaces.radiance(patch, onward(t), onward.d, valid, lamps=True)
-        mirrored *= mi.Color3f(*(mi.fresnel_conductor(cos_ball, mi.Complex2f(n, k)) for n, k in index))
+        mirrored *= mi.Color3f(*(band(cos_ball) for band in bands))
         weight = dr.select(met, cos, 0.0)
         if texels.coat is not None:
             weight *= transmitted(surfaces, texels.coat, cos)

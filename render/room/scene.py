@@ -30,6 +30,7 @@ from phibench.scenes.rig import View
 from phibench.scenes.room import MIRROR_NAME, Room
 from phibench.scenes.shapes import Cuboid, Rectangle, Shape
 from phibench.scenes.textures import Bitmap, Texture, Uniform
+from phibench.scenes.validation import SceneError
 
 _RINGS, _SPOKES = 450, 900  # 0.4 degrees apart
 
@@ -207,8 +208,18 @@ def mirror_entry(mi: ModuleType, view: View) -> Any:
 
 
 def mirror_bsdf(mirror: MetalSurface, wavelengths_nm: Vector) -> dict[str, Any]:
-    """Smooth or rough conductor with the steel's n and k at the three bands' wavelengths."""
+    """Smooth or rough conductor with the metal's n and k at the three bands' wavelengths.
+
+    Of a measured reflectance one that is the same for all angles: a perfect conductor with a factor. Mitsuba has no
+    table of angles.
+    """
     index = [mirror.refractive_index(nm) for nm in wavelengths_nm]
+    table = mirror.reflectance_table
+    if table is not None:
+        if len(table.angle_deg) != 1 or mirror.roughness_alpha > 0.0:
+            raise SceneError("path tracing knows a measured reflectance of one angle and a smooth mirror alone")
+        values = [float(mirror.band(nm).values[0]) for nm in wavelengths_nm]
+        return {"type": "conductor", "material": "none", "specular_reflectance": _rgb(values)}
     entry: dict[str, Any] = {"eta": _rgb([m.real for m in index]), "k": _rgb([m.imag for m in index])}
     if mirror.roughness_alpha > 0.0:
         return {"type": "roughconductor", "distribution": "beckmann", "alpha": mirror.roughness_alpha, **entry}

@@ -11,6 +11,8 @@ whether they come from the mirror or from the lens. What its faces mirror back t
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from itertools import pairwise
 from types import ModuleType
 from typing import Any
 
@@ -20,7 +22,8 @@ from numpy.typing import NDArray
 from phibench.render.room.camera_plugin import MM_PER_M, sensor_dict
 from phibench.render.room.mirror_intersection import mirror_intersection
 from phibench.render.room.surfaces import Surfaces, aligned
-from phibench.scenes.rig import View
+from phibench.scenes.mirror import BandReflectance
+from phibench.scenes.rig import Rig, View
 
 
 class Look:
@@ -43,8 +46,7 @@ class Look:
         self._tube = None if self.view.tube is None else Tube(mi, self.view)
         self._meet = mirror_intersection(mi, self.view)
         self._alpha = dr.opaque(mi.Float, rig.mirror.roughness_alpha)
-        bands = [rig.mirror.refractive_index(nm) for nm in rig.camera.detector.band_wavelength_nm]
-        self._index = [[dr.opaque(mi.Float, float(part)) for part in (one.real, one.imag)] for one in bands]
+        self._bands = mirror_bands(mi, rig)
 
     def electrons(self, u: Any, v: Any, x: list[Any]) -> tuple[Any, Any, Any, Any]:
         """Electrons/s per square pixel at film positions (u, v), float64 pixels.
@@ -100,8 +102,40 @@ class Look:
 
     def _reflectance(self, cos: Any) -> Any:
         """Reflectance of the three bands."""
-        mi = self._mi
-        return mi.Color3f(*(mi.fresnel_conductor(cos, mi.Complex2f(n, k)) for n, k in self._index))
+        return self._mi.Color3f(*(band(cos) for band in self._bands))
+
+
+def mirror_bands(mi: ModuleType, rig: Rig) -> list[Callable[[Any], Any]]:
+    """Reflectance of the mirror in each band, by the cosine of the angle of incidence: as `BandReflectance`."""
+    return [_band(mi, rig.mirror.band(nm)) for nm in rig.camera.detector.band_wavelength_nm]
+
+
+def _band(mi: ModuleType, band: BandReflectance) -> Callable[[Any], Any]:
+    import drjit as dr
+
+    numbers = (band.index.real, band.index.imag, band.gain, band.loss)
+    n, k, gain, loss = (dr.opaque(mi.Float, float(x)) for x in numbers)
+    start, *knots = ([dr.opaque(mi.Float, float(x)) for x in pair] for pair in _slopes(band))
+
+    def by_angle(cos: Any) -> Any:
+        angle, value = dr.safe_acos(cos), start[1]
+        for (low, slope), (high, _) in pairwise([*knots, (dr.opaque(mi.Float, math.pi), 0.0)]):
+            value = value + slope * dr.clip(angle - low, 0.0, high - low)
+        return value
+
+    if len(band.values):
+        return by_angle
+    if band.gain == band.loss == 1.0:
+        return lambda cos: mi.fresnel_conductor(cos, mi.Complex2f(n, k))
+    return lambda cos: 1.0 - loss * (1.0 - gain * mi.fresnel_conductor(cos, mi.Complex2f(n, k)))
+
+
+def _slopes(band: BandReflectance) -> list[tuple[float, float]]:
+    """Place and value of the first angle of a table, then place and slope of each part that is linear."""
+    if not len(band.values):
+        return [(0.0, 1.0)]
+    slopes = np.append(np.diff(band.values) / np.diff(band.angles_rad), 0.0)
+    return [(0.0, float(band.values[0])), *zip(band.angles_rad.tolist(), slopes.tolist(), strict=True)]
 
 
 class Tube:

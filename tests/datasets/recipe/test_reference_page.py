@@ -28,7 +28,7 @@ def test_every_key_has_its_line(heading: str) -> None:
 
 
 def test_units_ranges_and_defaults_are_there() -> None:
-    [line] = [line for line in PAGE.splitlines() if line.startswith("| `wavelength_nm`")]
+    line = next(line for line in PAGE.splitlines() if line.startswith("| `wavelength_nm` | nm | a number"))
     assert line.split(" | ")[1:4] == ["nm", "a number from 400 up to 700", "650"]
     [line] = [line for line in PAGE.splitlines() if line.startswith("| `strokes_m`")]
     assert "from 0.001 up to 10" in line
@@ -41,6 +41,6 @@ def test_a_recipe_that_writes_the_presets_values_gets_the_preset(name: str) -> N
     values = {key: reference_page.preset_value(rig, key) for key in RigTable.model_fields}
     table = {key: value for key, value in values.items() if value is not None}
     table |= {key: int(table[key]) for key in ("width_px", "height_px")}
-    assert RigTable.model_fields.keys() - table == {"preset", "holder", "mirror", "metal"}
+    assert RigTable.model_fields.keys() - table == {"preset", "holder", "mirror", "metal", "reflectance"}
     for other in RIGS:
         assert build_rig(RigTable.model_validate({"preset": other, **table})) == rig
