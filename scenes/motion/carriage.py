@@ -223,7 +223,7 @@ class Vibration:
 
 @dataclass(frozen=True)
 class Encoder:
-    """What the robot is told of the carriage's offset: rounded to steps, with noise; vibration is none of it.
+    """Readings of the carriage's offset that the robot gets: rounded to steps, with noise; vibration is none of it.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What moves in a film: the rig with its carriage and vibration, and the laser spot on its path; all at any time.
+"""Moving parts of a film: the rig with its carriage and vibration, and the laser spot on its path, at any time.
 
 `FilmScene.view_at` and `spot_at` give the still of any instant: what holds for stills holds for every row of a film.
 """
