@@ -25,6 +25,7 @@ scenes
 scenes/motion scenes/worlds
 render/optics
 render/sensor
+render/film
 render/setup
 render/room
 datasets/errors
@@ -38,6 +39,7 @@ datasets/read
 datasets/exposures
 datasets/build
 datasets/make
+datasets/film
 datasets/show datasets/verify datasets/merge_repair
 estimator/interface
 estimator/pair_set

@@ -13,6 +13,7 @@ from pydantic import BaseModel
 
 from phibench.datasets.recipe.build import CAMERA_KEYS
 from phibench.datasets.recipe.distributions import DistributionTable, TargetChoice
+from phibench.datasets.recipe.film_tables import FilmTable, VibrationTable
 from phibench.datasets.recipe.room_tables import (
     GeometryTable,
     LampTable,
@@ -73,11 +74,16 @@ TABLES: dict[str, type[BaseModel]] = {
     "[random.misalignment]": RandomMisalignmentTable,
     "[random.spot]": RandomSpotTable,
     "[frames]": FramesTable,
+    "[film]": FilmTable,
+    "[[film.vibration]]": VibrationTable,
     "[[distractors]]": DistractorTable,
     "a distribution": DistributionTable,
 }
 _UNITS = {
     "_m_per_m": "m/m",
+    "_m_per_s2": "m/s^2",
+    "_m_per_s": "m/s",
+    "_hz": "Hz",
     "_w_m2_sr": "W/(m^2 sr)",
     "_per_m2": "1/m^2",
     "_per_m": "1/m",
@@ -180,6 +186,15 @@ Samples are called `<experiment>-<target>-h<stroke>-r<rig>`, rigs `r000000` and 
 """,
     "[rigs.misalignment]": """Any key of `[misalignment]`, within its range, in place of the value there; at least one.
 Independent random streams, one per parameter.
+""",
+    "[film]": """Optional: `phibench film make` then makes a film of every pair, beside what `dataset make` makes; see
+`docs/film.md`. The carriage starts at the first of `stops` and rests there for the first of `pauses_s`, and so
+on. A leg between two stops speeds up with `acceleration_m_per_s2` to `speed_m_per_s`, and slows down likewise.
+`stops` count in parts of the pair's true stroke. With a `path` the spot moves in the plane of its board, from
+waypoint to waypoint: to the right, seen from its front, and up. The board, or what the spot lies on, must be larger.
+""",
+    "[[film.vibration]]": """Each of 16 equal parts of the band has a sine wave, its frequency and phase drawn from
+the seed. Bands add up.
 """,
     "[random]": """Instead of `[[experiments]]`: `samples` stroke pairs, each with a rig, a spot and a stroke that are
 drawn. Sample i depends on the rest of the recipe and on i, not on `samples`. Make the same

@@ -28,6 +28,7 @@ from phibench.datasets.recipe.distributions import (
     names_of,
     values_of,
 )
+from phibench.datasets.recipe.film_tables import FilmTable
 from phibench.datasets.recipe.room_tables import RoomsTable, RoomTable
 from phibench.scenes.catalog import BOARD_SIZE_M
 from phibench.scenes.holder import LARGEST_INDEX, OF_TUBES
@@ -472,6 +473,12 @@ class DistractorTable(Table):
 class Recipe(Table):
     """A whole recipe: `[[experiments]]` or `[random]` says what is seen."""
 
+    @model_serializer(mode="wrap")
+    def _without_a_film(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Recipes that film nothing keep the hash that they had before anything moved."""
+        document: dict[str, Any] = serialised(self)
+        return {key: value for key, value in document.items() if key != "film" or value is not None}
+
     dataset: DatasetTable = Field(description="name and seed")
     rig: RigTable = Field(default=RigTable(), description="camera, mirror and stroke axis, as the estimator knows them")
     misalignment: MisalignmentTable = Field(default=MisalignmentTable(), description="what the true rig deviates by")
@@ -488,6 +495,7 @@ class Recipe(Table):
     rigs: DrawnRigsTable | None = Field(default=None, description="drawn rigs, each of which sees all experiments")
     random: RandomTable | None = Field(default=None, description="samples that are drawn, instead of experiments")
     frames: FramesTable | None = Field(default=None, description="how frames of the samples are taken")
+    film: FilmTable | None = Field(default=None, description="the pairs as films of their strokes")
     distractors: Annotated[tuple[DistractorTable, ...], Field(strict=False)] = Field(
         default=(), description="other lights that may be taken for the spot"
     )

@@ -25,6 +25,7 @@ from phibench.datasets.parallel import ONE_THREAD
 from phibench.estimator.cli.calibration import align, calibrate
 from phibench.estimator.cli.captures import import_, measure
 from phibench.estimator.cli.dataset import dataset
+from phibench.estimator.cli.film import film
 from phibench.estimator.cli.methods import method
 from phibench.estimator.cli.options import INSTALLATION, METHODS, SENSOR, answer_to_old_spelling
 from phibench.estimator.cli.room import room
@@ -39,7 +40,7 @@ app = App(
     suppress_keyboard_interrupt=False,
     result_action="return_value",
 )
-for _group in (dataset, room, method, seal, sensor, study):
+for _group in (dataset, film, room, method, seal, sensor, study):
     app.command(_group)
 app.command(score, group=METHODS)
 app.command(bench, group=METHODS)

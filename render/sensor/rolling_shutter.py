@@ -70,7 +70,7 @@ def moved_spot(
     shape = tuple(n + 2 * margin for n in spot.electrons_per_s.shape[1:])
     shift = row_times_s(spot.v0_px - margin + np.arange(shape[0]), height, readout_s)[:, None] * velocity_px_per_s
     image = np.zeros((3, *shape))
-    for spectrum, kv, ku in _spectra(spot, margin):
+    for spectrum, kv, ku in layer_spectra(spot, margin):
         smear = np.sinc((ku * velocity_px_per_s[0] + kv[:, None] * velocity_px_per_s[1]) * exposure_s)
         image += _at_rows(spectrum * smear, kv, ku, shift)
     return spot.u0_px - margin, spot.v0_px - margin, image
@@ -87,7 +87,7 @@ def _margin_px(velocity_px_per_s: tuple[float, float], exposure_s: float, readou
     return math.ceil(reach) + 2
 
 
-def _spectra(spot: SpotImage, margin: int) -> list[tuple[Spectrum, Array, Array]]:
+def layer_spectra(spot: SpotImage, margin: int) -> list[tuple[Spectrum, Array, Array]]:
     """Split the layer's spectrum into its base band and the neighbours along u and along v.
 
     Returns tuples (spectrum, frequencies along v, frequencies along u), cycles per pixel.

@@ -20,6 +20,7 @@ from phibench.scenes.random_streams import Name, generator
 from phibench.scenes.validation import SceneError, finite, positive, within
 
 Axis = Literal["stroke", "x", "y"]
+Times = Array | Sequence[float] | float
 _LINES = 16  # sine waves of a band: a fourth moment within 6 % of the Gaussian's, (1 - 1 / (2 n)) of 3
 
 
@@ -137,19 +138,19 @@ class Carriage:
         """True unless all stops are the same."""
         return len(set(self.stops_m)) > 1
 
-    def position_m(self, times_s: Array | Sequence[float]) -> Array:
+    def position_m(self, times_s: Times) -> Array:
         """Offset along the stroke axis."""
         return self._sum(times_s)[0]
 
-    def velocity_m_per_s(self, times_s: Array | Sequence[float]) -> Array:
+    def velocity_m_per_s(self, times_s: Times) -> Array:
         """Derivative of `position_m`."""
         return self._sum(times_s)[1]
 
-    def acceleration(self, times_s: Array | Sequence[float]) -> Array:
+    def acceleration(self, times_s: Times) -> Array:
         """Derivative of `velocity_m_per_s`, m/s^2; where it jumps, one of the two values."""
         return self._sum(times_s)[2]
 
-    def _sum(self, times_s: Array | Sequence[float]) -> tuple[Array, Array, Array]:
+    def _sum(self, times_s: Times) -> tuple[Array, Array, Array]:
         """Legs rest before and after themselves, so that their ways add up."""
         times = np.asarray(times_s, float)
         position, velocity, change = np.full(times.shape, self.stops_m[0]), np.zeros(times.shape), np.zeros(times.shape)
@@ -203,15 +204,15 @@ class Vibration:
         """Root mean square over a long time."""
         return math.sqrt(math.fsum(0.5 * wave.amplitude_m**2 for wave in self.waves))
 
-    def displacement_m(self, times_s: Array | Sequence[float]) -> Array:
+    def displacement_m(self, times_s: Times) -> Array:
         """Displacement along the axis."""
         return self._wave(times_s, 0)
 
-    def velocity_m_per_s(self, times_s: Array | Sequence[float]) -> Array:
+    def velocity_m_per_s(self, times_s: Times) -> Array:
         """Derivative of `displacement_m`."""
         return self._wave(times_s, 1)
 
-    def _wave(self, times_s: Array | Sequence[float], order: int) -> Array:
+    def _wave(self, times_s: Times, order: int) -> Array:
         times = np.asarray(times_s, float)[..., None]
         amplitude, frequency, phase = (
             np.array([(w.amplitude_m, w.frequency_hz, w.phase_rad) for w in self.waves]).reshape(-1, 3).T

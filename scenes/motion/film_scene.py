@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +14,7 @@ import numpy as np
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import Motion
-from phibench.scenes.motion.carriage import Carriage, Vibration
+from phibench.scenes.motion.carriage import Carriage, Times, Vibration
 from phibench.scenes.motion.film_times import BlinkCode, FilmTimes
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.validation import SceneError, finite
@@ -47,7 +46,7 @@ class SpotPath:
         if any(after <= before for before, after in itertools.pairwise(times)):
             raise SceneError(f"SpotPath: times {times} of the waypoints must rise")
 
-    def place_m(self, times_s: Array | Sequence[float]) -> Array:
+    def place_m(self, times_s: Times) -> Array:
         """Across and up, shape (..., 2)."""
         times = np.asarray(times_s, float)
         if not self.waypoints:
@@ -55,7 +54,7 @@ class SpotPath:
         when, where = self._table
         return np.stack([np.interp(times, when, column) for column in where.T], axis=-1)
 
-    def velocity_m_per_s(self, times_s: Array | Sequence[float]) -> Array:
+    def velocity_m_per_s(self, times_s: Times) -> Array:
         """Derivative of `place_m`, shape (..., 2); at a waypoint, that of what follows."""
         times = np.asarray(times_s, float)
         if len(self.waypoints) < 2:
@@ -116,29 +115,29 @@ class FilmScene:
                 "must hold the whole code; give more frames or a shorter code"
             )
 
-    def offset_m(self, times_s: Array | float) -> Array:
+    def offset_m(self, times_s: Times) -> Array:
         """Carriage and vibration along the stroke axis."""
         along = [one.displacement_m(times_s) for one in self.vibrations if one.axis == "stroke"]
         return np.asarray(self.carriage.position_m(times_s) + sum(along, np.zeros(np.shape(times_s))))
 
-    def offset_velocity_m_per_s(self, times_s: Array | float) -> Array:
+    def offset_velocity_m_per_s(self, times_s: Times) -> Array:
         """Derivative of `offset_m`."""
         along = [one.velocity_m_per_s(times_s) for one in self.vibrations if one.axis == "stroke"]
         return np.asarray(self.carriage.velocity_m_per_s(times_s) + sum(along, np.zeros(np.shape(times_s))))
 
-    def sway_m(self, times_s: Array | float) -> Array:
+    def sway_m(self, times_s: Times) -> Array:
         """Vibration along world x, y, z, shape (..., 3)."""
         return self._sway(times_s, "displacement_m")
 
-    def sway_velocity_m_per_s(self, times_s: Array | float) -> Array:
+    def sway_velocity_m_per_s(self, times_s: Times) -> Array:
         """Derivative of `sway_m`."""
         return self._sway(times_s, "velocity_m_per_s")
 
-    def spot_m(self, times_s: Array | float) -> Array:
+    def spot_m(self, times_s: Times) -> Array:
         """Centre of the spot in the world, shape (..., 3)."""
         return np.array(self.spot.position_world_m) + self.path.place_m(times_s) @ across_and_up(self.spot)
 
-    def spot_velocity_m_per_s(self, times_s: Array | float) -> Array:
+    def spot_velocity_m_per_s(self, times_s: Times) -> Array:
         """Derivative of `spot_m`."""
         return self.path.velocity_m_per_s(times_s) @ across_and_up(self.spot)
 
@@ -152,7 +151,7 @@ class FilmScene:
             return self.spot
         return replace(self.spot, position_world_m=as_vector(self.spot_m(time_s)))
 
-    def _sway(self, times_s: Array | float, what: str) -> Array:
+    def _sway(self, times_s: Times, what: str) -> Array:
         result = np.zeros((*np.shape(times_s), 3))
         for one in self.vibrations:
             if one.axis != "stroke":

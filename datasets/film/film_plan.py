@@ -1,0 +1,186 @@
+"""Plan of the films of a recipe: one for every pair, with the motions of `[film]`. NumPy only; nothing is rendered."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from phibench.datasets.errors import DatasetError, RecipeError
+from phibench.datasets.plan.plan import PairPlan, Plan, make_plan
+from phibench.datasets.recipe.film_tables import FilmTable
+from phibench.datasets.recipe.tables import Recipe
+from phibench.datasets.rooms.room_files import RoomFiles
+from phibench.render.film.moving_rows import chief_uv_px
+from phibench.render.sensor.light import Region
+from phibench.scenes.frames import Array
+from phibench.scenes.motion.carriage import Carriage, Encoder, Vibration
+from phibench.scenes.motion.film_scene import FilmScene, SpotPath, Waypoint, frames_of
+from phibench.scenes.motion.film_times import BlinkCode, FilmTimes
+from phibench.scenes.validation import SceneError
+
+TILE_PX = 32
+MARGIN_PX = 20  # a JPEG's unit and what demosaicing looks at, around a window
+KEY_PX = 1.5  # motion of the spot's image from key view to key view, before the proof is asked
+_SAMPLES = 257
+
+
+@dataclass(frozen=True)
+class FilmPlan:
+    """One film.
+
+    Attributes
+    ----------
+    film_id : str
+        That of its pair.
+    pair : PairPlan
+    scene, nominal : FilmScene
+        True one, and what an estimator may know: nominal rig, stroke and carriage, no vibration.
+    encoder : Encoder
+    names : tuple
+        Data set, seed, film: the beginning of its random streams.
+    region : Region
+        Part of the image that is rendered.
+    window_px : int or None
+        Side of the square around the spot; None where whole images are made.
+    keys : int
+        Key views to begin with.
+    """
+
+    film_id: str
+    pair: PairPlan
+    scene: FilmScene
+    nominal: FilmScene
+    encoder: Encoder
+    names: tuple[str, int, str]
+    region: Region
+    window_px: int | None
+    keys: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) of the image."""
+        return self.scene.rig.camera.height_px, self.scene.rig.camera.width_px
+
+
+def film_plans(recipe: Recipe, files: RoomFiles | None = None) -> tuple[Plan, tuple[FilmPlan, ...]]:
+    """Plan of the recipe's pairs, and of their films.
+
+    Raises
+    ------
+    RecipeError
+        If the recipe has no `[film]`, or what it says cannot be filmed.
+    """
+    if recipe.film is None:
+        raise RecipeError(f"recipe {recipe.dataset.name} has no [film]; add the table, [film] alone takes the defaults")
+    plan = make_plan(recipe, files)
+    return plan, tuple(_film(plan, recipe.film, pair) for pair in plan.pairs)
+
+
+def _film(plan: Plan, table: FilmTable, pair: PairPlan) -> FilmPlan:
+    names = (plan.recipe.dataset.name, plan.recipe.dataset.seed, pair.sample_id)
+    try:
+        scene = film_scene(plan, table, pair)
+        nominal = nominal_scene(plan, scene, pair, table)
+    except SceneError as error:
+        raise RecipeError(f"film {pair.sample_id}: {error}") from error
+    size = scene.rig.camera.height_px, scene.rig.camera.width_px
+    uv = spot_track_px(scene)
+    if not np.isfinite(uv).all():
+        raise DatasetError(
+            f"film {pair.sample_id}: the mirror shows the spot at {np.isfinite(uv).all(axis=1).mean():.0%} of the "
+            "times only; a target must have an image all the time: move it, or shorten the stroke"
+        )
+    whole = table.view == "full"
+    region = Region.whole(size) if whole else _around(uv, table.window_px, size, pair.sample_id)
+    encoder = Encoder(table.encoder_rms_m, table.encoder_step_m)
+    window = None if whole else table.window_px
+    return FilmPlan(pair.sample_id, pair, scene, nominal, encoder, names, region, window, _keys(scene, uv))
+
+
+def film_scene(plan: Plan, table: FilmTable, pair: PairPlan) -> FilmScene:
+    """True scene of a pair's film."""
+    rig = plan.rigs[pair.rig]
+    if rig.motion is not None:
+        raise SceneError("[misalignment] moves the rig between two images; a film has [[film.vibration]] instead")
+    carriage = _carriage(table, pair.stroke_m)
+    height = rig.camera.height_px
+    frames = frames_of(carriage, table.rate_hz) if table.frames is None else table.frames
+    times = FilmTimes(frames, table.rate_hz, table.exposure_s, table.readout_s, height)
+    seed = plan.recipe.dataset.name, plan.recipe.dataset.seed, pair.sample_id
+    bands = tuple(
+        Vibration.band(one.axis, one.low_hz, one.high_hz, one.rms_m, *seed, number)
+        for number, one in enumerate(table.vibration)
+    )
+    path = SpotPath(tuple(Waypoint(*row) for row in table.path))
+    return FilmScene(rig, plan.spots[pair.spot], times, carriage, bands, path, BlinkCode(table.code, table.bit_s))
+
+
+def nominal_scene(plan: Plan, scene: FilmScene, pair: PairPlan, table: FilmTable) -> FilmScene:
+    """Scene as an estimator may take it to be: it knows neither vibration nor the path of the target."""
+    rig, carriage = plan.rigs[pair.nominal_rig], _carriage(table, pair.nominal_stroke_m)
+    return replace(scene, rig=rig, carriage=carriage, vibrations=(), path=SpotPath())
+
+
+def _carriage(table: FilmTable, stroke_m: float) -> Carriage:
+    stops = tuple(share * stroke_m for share in table.stops)
+    return Carriage(stops, table.pauses_s, table.speed_m_per_s, table.acceleration_m_per_s2)
+
+
+def spot_track_px(scene: FilmScene) -> Array:
+    """Image of the spot's centre at 257 times of a film, and at all its frames, shape (N, 2)."""
+    times = scene.times
+    half = 0.5 * (times.exposure_s + times.readout_s)
+    dense = np.linspace(times.frame_s[0] - half, times.frame_s[-1] + half, _SAMPLES)
+    return chief_uv_px(scene, np.concatenate([dense, times.frame_s]))
+
+
+def _around(uv: Array, side_px: int, size: tuple[int, int], film_id: str) -> Region:
+    """Whole tiles around all windows of a film."""
+    height, width = size
+    outside = (uv[:, 0] < -0.5) | (uv[:, 0] > width - 0.5) | (uv[:, 1] < -0.5) | (uv[:, 1] > height - 0.5)
+    if outside.any():
+        u, v = uv[np.flatnonzero(outside)[0]]
+        raise DatasetError(
+            f"film {film_id}: the spot leaves the image, at ({u:.1f}, {v:.1f}) px; move the target, or shorten the "
+            "stroke"
+        )
+    windows = [Region.around(float(u), float(v), size, min(side_px, *size)) for u, v in uv]
+    box = Region(
+        min(w.u0_px for w in windows),
+        min(w.v0_px for w in windows),
+        max(w.u1_px for w in windows),
+        max(w.v1_px for w in windows),
+    )
+    return box.grown(size, (TILE_PX, TILE_PX), (MARGIN_PX, MARGIN_PX))
+
+
+def _keys(scene: FilmScene, uv: Array) -> int:
+    """Number of key views at which the image moves by about `KEY_PX` from one to the next."""
+    low, high = offset_range_m(scene)
+    if high - low < 1e-9:
+        return 1
+    apart = float(np.linalg.norm(uv.max(axis=0) - uv.min(axis=0)))
+    return max(4, math.ceil(apart / KEY_PX) + 1)
+
+
+def offset_range_m(scene: FilmScene) -> tuple[float, float]:
+    """Smallest and largest offset at which a row is exposed."""
+    times = scene.times
+    half = 0.5 * (times.exposure_s + times.readout_s)
+    dense = np.arange(times.frame_s[0] - half, times.frame_s[-1] + half, min(1e-3, times.exposure_s / 4.0))
+    offsets = scene.offset_m(dense)
+    return float(offsets.min()), float(offsets.max())
+
+
+def listed(plans: tuple[FilmPlan, ...]) -> Iterator[str]:
+    """Lines that say what will be made."""
+    for plan in plans:
+        times = plan.scene.times
+        height, width = plan.region.shape
+        yield (
+            f"{plan.film_id}: {times.frames} frames, {times.duration_s:.2f} s, {width} x {height} px, "
+            f"{plan.keys} key views or more"
+        )

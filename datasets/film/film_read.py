@@ -1,0 +1,235 @@
+"""Reading of films: truth, light and camera frames of any frame, without Mitsuba.
+
+A frame is drawn from the light when it is asked for, any number of times: the light holds rolling shutter, motion blur
+and the laser's code already. A window of a frame has the same pixels as the whole frame of a film of whole images.
+
+Examples
+--------
+>>> films = open_films("out/films")  # doctest: +SKIP
+>>> film = films["table2-d3.180-h0.425"]  # doctest: +SKIP
+>>> film.frame(17, "bayer-raw", draw=3).image.shape  # doctest: +SKIP
+(48, 48)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars
+from numpy.typing import NDArray
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.exposures.expected import ExpectedRegion, expected_of_light
+from phibench.datasets.film.film_plan import FilmPlan, film_plans
+from phibench.datasets.film.film_store import (
+    CHECKSUMS,
+    INFO,
+    RECIPE,
+    SCHEMA_VERSION,
+    FilmFolder,
+    FilmInfo,
+    SetInfo,
+    read_document,
+    read_spots,
+    read_table,
+    read_view,
+)
+from phibench.datasets.frames.request import in_one_sentence
+from phibench.datasets.plan.plan import Plan
+from phibench.datasets.recipe.load import parse_recipe, recipe_files, recipe_text
+from phibench.datasets.store.layers import SpotWindow
+from phibench.render.film.key_views import blended, row_weights
+from phibench.render.film.moving_rows import RowsImage
+from phibench.render.optics.room_tracer import room_geometry
+from phibench.render.optics.truth import truth_layer
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.light import Light, Region
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.processing import decoded
+from phibench.render.sensor.settings import Sensor, sensor
+from phibench.scenes.frames import Array
+
+
+@dataclass(frozen=True)
+class FilmFrame:
+    """One frame as the camera delivers it.
+
+    Attributes
+    ----------
+    image : array
+        As `phibench.datasets.frames.source.Frame.image`, on `region`.
+    jpeg : bytes or None
+        The file that the camera sends; None for a window and for other outputs than "mjpeg".
+    frame, draw : int
+    sensor : Sensor
+    region : Region
+    """
+
+    image: NDArray[Any] = field(repr=False)
+    jpeg: bytes | None = field(repr=False)
+    frame: int
+    draw: int
+    sensor: Sensor
+    region: Region
+
+
+@dataclass(frozen=True)
+class Film:
+    """One film of a data set.
+
+    Attributes
+    ----------
+    folder : FilmFolder
+    plan : FilmPlan
+        Scene, nominal scene, encoder.
+    info : FilmInfo
+    """
+
+    folder: FilmFolder
+    plan: FilmPlan
+    info: FilmInfo
+    _set: Plan = field(repr=False)
+
+    def __len__(self) -> int:
+        return self.info.frames
+
+    @cached_property
+    def table(self) -> polars.DataFrame:
+        """Truth, a row per frame: the columns of FORMAT.md."""
+        return read_table(self.folder.path / "film.parquet", self.info.frames)
+
+    @cached_property
+    def spots(self) -> list[RowsImage]:
+        """Spot in every frame, electrons per second over the exposure."""
+        return read_spots(self.folder.path / "spots.npz", self.info.frames)
+
+    @cached_property
+    def views(self) -> NDArray[np.float32]:
+        """Key views of the room, shape (keys, 3, h, w), electrons per second."""
+        region = self.info.region
+        return np.stack([read_view(self.folder.view(n), region) for n in range(len(self.info.keys_m))])
+
+    def room(self, frame: int) -> NDArray[np.float32]:
+        """Room in a frame on the film's region, shape (3, h, w), electrons per second over each row's exposure."""
+        region = self.info.region
+        rows = np.arange(region.v0_px, region.v1_px).astype(float)
+        return blended(self.views, row_weights(self.plan.scene, np.array(self.info.keys_m), self._number(frame), rows))
+
+    def light(self, frame: int) -> Light:
+        """Light of a frame; outside of the film's region there is none."""
+        region, (height, width) = self.info.region, self.plan.size
+        ambient = np.zeros((3, height, width), np.float32)
+        ambient[(slice(None), *region.slices())] = self.room(frame)
+        one = self.spots[frame]
+        stacks = (one.electrons_per_s, one.du_electrons_per_s_px, one.dv_electrons_per_s_px)
+        return Light(ambient, SpotWindow(one.u0_px, one.v0_px, *stacks), f_number=self.plan.scene.rig.camera.f_number)
+
+    def window(self, frame: int) -> Region:
+        """Pixels of a frame that are drawn: the square around the spot, or the whole image."""
+        side, row = self.info.window_px, self.table.row(self._number(frame), named=True)
+        if side is None:
+            return Region.whole(self.plan.size)
+        return Region.around(row["row_u_px"], row["row_v_px"], self.plan.size, min(side, *self.plan.size))
+
+    def sensor(self, preset: str = "mjpeg", **changes: Any) -> Sensor:
+        """Sensor of the film: a preset with the film's exposure and read-out."""
+        times = self.plan.scene.times
+        if fixed := {"exposure_s", "readout_s"} & set(changes):
+            raise DatasetError(f"{fixed.pop()} is that of the film, whose motion blur it is; change [film] instead")
+        with in_one_sentence():
+            return sensor(preset, exposure_s=times.exposure_s, readout_s=times.readout_s, **changes)
+
+    def frame(
+        self, number: int, preset: str = "mjpeg", draw: int = 0, camera_seed: int = 0, **changes: Any
+    ) -> FilmFrame:
+        """One draw of a frame.
+
+        Parameters
+        ----------
+        number, draw : int
+        preset : str
+            Of the sensor.
+        camera_seed : int
+            Frames of one seed share the fixed pattern.
+        **changes
+            Numbers of the preset.
+
+        Raises
+        ------
+        DatasetError
+            If there is no such frame, preset or number.
+        """
+        chosen, light = self.sensor(preset, **changes), self.light(number)
+        chain = Chain(chosen, camera_seed, self.plan.scene.rig.camera)
+        stream = NoiseStream((*self.plan.names, "film", number, draw))
+        region, jpeg = self.window(number), None
+        with in_one_sentence():
+            if chosen.output == "mjpeg" and region == Region.whole(light.size):
+                jpeg = chain.jpeg_bytes(light, stream)
+                return FilmFrame(decoded(jpeg), jpeg, number, draw, chosen, region)
+            return FilmFrame(chain.frame(light, stream, region), jpeg, number, draw, chosen, region)
+
+    def expected(self, number: int, preset: str = "bayer-raw", margin_px: int = 4, **changes: Any) -> ExpectedRegion:
+        """Means and derivatives around the spot of a frame, as `datasets.exposures.expected`."""
+        return expected_of_light(
+            self.light(number), self.sensor(preset, **changes), self.plan.scene.rig.camera, margin_px
+        )
+
+    def truth_layer(self, number: int, time_s: float | None = None) -> dict[str, Array]:
+        """Exact geometry of every pixel in the pose of a frame, or of any time: `render.optics.truth.truth_layer`."""
+        scene = self.plan.scene
+        view = scene.view_at(float(scene.times.frame_s[self._number(number)]) if time_s is None else time_s)
+        return truth_layer(view, room_geometry(self._set.room(self.plan.pair.room), view))
+
+    def _number(self, frame: int) -> int:
+        if not 0 <= frame < self.info.frames:
+            raise DatasetError(f"frame {frame}: film {self.info.film} has frames 0 to {self.info.frames - 1}")
+        return frame
+
+
+@dataclass(frozen=True)
+class Films:
+    """A data set of films, by id."""
+
+    folder: Path
+    info: SetInfo
+    plans: dict[str, FilmPlan]
+    _set: Plan = field(repr=False)
+
+    def __getitem__(self, film_id: str) -> Film:
+        if film_id not in self.plans:
+            raise DatasetError(f"{self.folder} has no film '{film_id}'; it has {', '.join(list(self.plans)[:8])}")
+        folder = FilmFolder.of(self.folder, film_id)
+        return Film(folder, self.plans[film_id], folder.info(), self._set)
+
+    def __iter__(self) -> Iterator[Film]:
+        return (self[film_id] for film_id in self.plans)
+
+    def __len__(self) -> int:
+        return len(self.plans)
+
+
+def open_films(folder: str | Path) -> Films:
+    """Open a finished data set of films.
+
+    Raises
+    ------
+    DatasetError
+        If it is none, is not finished, or is of another version; in one sentence.
+    """
+    path = Path(folder)
+    if not (path / INFO).is_file():
+        raise DatasetError(f"{path} holds no films: it has no {INFO}; make them with `phibench film make`")
+    if not (path / CHECKSUMS).is_file():
+        raise DatasetError(f"{path} was not finished; run `phibench film make` again")
+    info = read_document(path / INFO, SetInfo)
+    if info.schema_version != SCHEMA_VERSION:
+        raise DatasetError(f"{path} has the layout {info.schema_version}, {SCHEMA_VERSION} is read; make it again")
+    recipe = parse_recipe(recipe_text(path / RECIPE), str(path / RECIPE))
+    plan, films = film_plans(recipe, recipe_files(path / RECIPE))
+    return Films(path, info, {film.film_id: film for film in films}, plan)

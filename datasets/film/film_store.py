@@ -1,0 +1,314 @@
+"""Files of films: names, `film.json`, `film.parquet`, spot windows, key views; writing and checking of them.
+
+film.json                  the data set: recipe, code, what each film holds and its proof; written last
+recipe.toml
+films/<film>/film.parquet  truth, a row per frame
+films/<film>/spots.npz     the spot in each frame, electrons per second over the exposure
+films/<film>/views/k000.exr  key views of the room
+films/<film>/done.json     what the film was made from; a film that has it is complete
+SHA256SUMS
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import polars
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import InputFile, first_fault
+from phibench.datasets.store.checksums import checksums_text
+from phibench.datasets.store.files import sha256, write_bytes, write_text
+from phibench.datasets.store.layers import read_exr, write_exr
+from phibench.datasets.store.schema import Document, described
+from phibench.render.film.film_truth import RATES, InstantTruth
+from phibench.render.film.moving_rows import RowsImage
+from phibench.render.sensor.light import Region
+from phibench.scenes.camera import FILTERS
+
+INFO, RECIPE, CHECKSUMS = "film.json", "recipe.toml", "SHA256SUMS"
+SCHEMA_VERSION = 1
+_Model = TypeVar("_Model", bound=Document)
+_AGAIN = "run `phibench film make` again"
+_ARRAYS = {
+    "origin_px": ("<i8", 2),
+    "shape_px": ("<i8", 2),
+    "images_per_s": ("<f4", 1),
+}
+
+
+class FilmInfo(Document):
+    """What a film was made from, and what it holds: `done.json`."""
+
+    film: str = described("-", "id of the film, that of its pair")
+    key: str = described("-", "SHA-256 over all that the film depends on")
+    frames: int = described("-", "number of frames")
+    u0_px: int = described("px", "first column that is rendered")
+    v0_px: int = described("px", "first row that is rendered")
+    width_px: int = described("px", "columns that are rendered")
+    height_px: int = described("px", "rows that are rendered")
+    window_px: int | None = described("px", "side of the window around the spot; null for whole images")
+    keys_m: tuple[float, ...] = described(
+        "m",
+        "offsets of the key views",
+    )
+    pixel_ratio: float | None = described("1", "held-out view: rms error of a pixel near the spot, over its noise")
+    position_ratio: float | None = described("1", "held-out view: error of the spot's position, over its bound")
+    cpu_s: float = described("s", "processor time of making it, start of the renderer and light map not counted")
+    sha256: dict[str, str] = described("-", "hash of each file, relative to the film's folder")
+
+    @property
+    def region(self) -> Region:
+        """Part of the image that is rendered."""
+        return Region(self.u0_px, self.v0_px, self.u0_px + self.width_px, self.v0_px + self.height_px)
+
+
+class SetInfo(Document):
+    """A data set of films: `film.json`."""
+
+    schema_version: int = described("-", "version of this layout")
+    name: str = described("-", "name of the data set")
+    seed: int = described("-", "root of all random streams")
+    code_sha256: str = described("-", "hash of the code that makes data")
+    films: tuple[str, ...] = described("-", "ids of the films")
+
+
+@dataclass(frozen=True)
+class FilmFolder:
+    """Folder of one film below that of its data set."""
+
+    path: Path
+
+    @classmethod
+    def of(cls, out: Path, film_id: str) -> FilmFolder:
+        """Folder of a film."""
+        return cls(out / "films" / film_id)
+
+    def view(self, number: int) -> Path:
+        """File of a key view."""
+        return self.path / "views" / f"k{number:03d}.exr"
+
+    @property
+    def done(self) -> Path:
+        """File that says that the film is complete."""
+        return self.path / "done.json"
+
+    def info(self) -> FilmInfo:
+        """Content of `done.json`.
+
+        Raises
+        ------
+        DatasetError
+            If it is missing or damaged.
+        """
+        if not self.done.is_file():
+            raise DatasetError(f"{self.path} is not finished; {_AGAIN}")
+        return read_document(self.done, FilmInfo)
+
+    def is_whole(self, info: FilmInfo) -> bool:
+        """True if all files are there with the right bytes."""
+        files = ((self.path / name, digest) for name, digest in info.sha256.items())
+        return all(path.is_file() and sha256(path) == digest for path, digest in files)
+
+
+def read_document(path: Path, model: type[_Model]) -> _Model:
+    """Read a JSON document and check it."""
+    raw = InputFile(path, _AGAIN).json()
+    try:
+        return model.model_validate_json(json.dumps(raw))
+    except ValidationError as error:
+        raise DatasetError(f"{path} is damaged: {first_fault(error)}; {_AGAIN}") from error
+
+
+def write_document(path: Path, document: Document) -> None:
+    """Write a JSON document."""
+    write_text(path, json.dumps(document.model_dump(mode="json"), indent=1, allow_nan=False) + "\n")
+
+
+# Key views.
+
+
+def write_view(path: Path, planes: NDArray[np.float32], region: Region, header: dict[str, Any]) -> None:
+    """Write a key view, shape (3, h, w), electrons per second."""
+    named = dict(zip(FILTERS, planes, strict=True))
+    write_exr(path, named, {"kind": "film_view", "unit": "electrons/s", **header}, (region.u0_px, region.v0_px))
+
+
+def read_view(path: Path, region: Region) -> NDArray[np.float32]:
+    """Read a key view, shape (3, h, w).
+
+    Raises
+    ------
+    DatasetError
+        If it cannot be read or is of other pixels.
+    """
+    try:
+        file = read_exr(path)
+    except DatasetError as error:
+        raise DatasetError(f"{error}; {_AGAIN}") from error
+    missing = [name for name in FILTERS if name not in file.planes]
+    if missing or file.header.get("kind") != "film_view":
+        raise DatasetError(f"{path} is no key view of a film; {_AGAIN}")
+    planes = np.stack([file.planes[name] for name in FILTERS])
+    if file.origin_px != (region.u0_px, region.v0_px) or planes.shape[1:] != region.shape:
+        raise DatasetError(f"{path} holds other pixels than its film; {_AGAIN}")
+    return planes
+
+
+def view_key(path: Path) -> object:
+    """Key in the header of a key view; None where there is no readable one."""
+    try:
+        return read_exr(path).header.get("key") if path.is_file() else None
+    except DatasetError:
+        return None
+
+
+# Spots.
+
+
+def write_spots(path: Path, images: Sequence[RowsImage]) -> None:
+    """Write the spot's images of all frames: origins, shapes, and the values one after the other."""
+    stacks = [
+        np.stack([one.electrons_per_s, one.du_electrons_per_s_px, one.dv_electrons_per_s_px]).astype("<f4")
+        for one in images
+    ]
+    arrays: dict[str, Any] = {
+        "origin_px": np.array([(one.u0_px, one.v0_px) for one in images], "<i8").reshape(-1, 2),
+        "shape_px": np.array([stack.shape[2:] for stack in stacks], "<i8").reshape(-1, 2),
+        "images_per_s": np.concatenate([stack.ravel() for stack in stacks] or [np.zeros(0, "<f4")]),
+    }
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    write_bytes(path, buffer.getvalue())
+
+
+def read_spots(path: Path, frames: int) -> list[RowsImage]:
+    """Read the spot's images.
+
+    Raises
+    ------
+    DatasetError
+        If the file cannot be read, or does not hold so many frames.
+    """
+    arrays = InputFile(path, _AGAIN).arrays(_ARRAYS)
+    origins, shapes, values = (arrays[name] for name in _ARRAYS)
+    sizes = 9 * np.prod(shapes, axis=1)
+    if origins.shape != (frames, 2) or shapes.shape != (frames, 2) or (shapes < 0).any() or sizes.sum() != len(values):
+        raise DatasetError(f"{path} is damaged: it does not hold {frames} images; {_AGAIN}")
+    ends = np.cumsum(sizes)
+    result = []
+    for (u0, v0), shape, size, end in zip(origins, shapes, sizes, ends, strict=True):
+        stack = values[end - size : end].reshape(3, 3, *shape).astype(float)
+        result.append(RowsImage(int(u0), int(v0), *stack))
+    return result
+
+
+# The table.
+
+
+@dataclass(frozen=True)
+class FrameTruth:
+    """Truth of one frame: at its time, and at that of the spot's own row; the encoder's reading at the frame's time."""
+
+    frame: int
+    encoder_m: float
+    encoder_sigma_m: float
+    at_frame: InstantTruth
+    at_row: InstantTruth
+    electrons_per_s: tuple[float, ...]
+
+    def record(self) -> dict[str, Any]:
+        """Row of `film.parquet`: columns of the frame's time, and with `row_` those of the spot's row."""
+        head = {
+            "frame": self.frame,
+            "encoder_m": self.encoder_m,
+            "encoder_sigma_m": self.encoder_sigma_m,
+            "electrons_per_s": list(self.electrons_per_s),
+        }
+        both = (("", self.at_frame), ("row_", self.at_row))
+        return head | {prefix + name: value for prefix, one in both for name, value in _columns(one).items()}
+
+
+def _columns(one: InstantTruth) -> dict[str, Any]:
+    flat = {name: value for name, value in asdict(one).items() if name not in ("spot", "rates")}
+    spot, rates = asdict(one.spot), {f"{name}_per_s": one.rates[name] for name in RATES}
+    return {name: list(v) if isinstance(v, tuple) else v for name, v in {**flat, **spot, **rates}.items()}
+
+
+def write_table(path: Path, rows: Sequence[FrameTruth]) -> None:
+    """Write `film.parquet`."""
+    buffer = io.BytesIO()
+    table = polars.DataFrame([row.record() for row in rows], infer_schema_length=None)
+    table.write_parquet(buffer, compression="zstd", statistics=False)
+    write_bytes(path, buffer.getvalue())
+
+
+def read_table(path: Path, frames: int) -> polars.DataFrame:
+    """Read `film.parquet`.
+
+    Raises
+    ------
+    DatasetError
+        If it cannot be read or has another number of rows.
+    """
+    try:
+        table = polars.read_parquet(io.BytesIO(InputFile(path, _AGAIN).read()))
+    except polars.exceptions.PolarsError as error:
+        raise DatasetError(f"{path} is damaged; {_AGAIN}") from error
+    if len(table) != frames or "row_u_px" not in table.columns:
+        raise DatasetError(f"{path} does not hold {frames} frames; {_AGAIN}")
+    return table
+
+
+def finite_or_none(value: float) -> float | None:
+    """Number for JSON; None for NaN."""
+    return value if math.isfinite(value) else None
+
+
+# Checksums.
+
+
+def data_files(out: Path, films: Sequence[str]) -> list[str]:
+    """Names of all files of a data set of films, relative to its folder, sorted."""
+    names = [INFO, RECIPE]
+    for film in films:
+        folder = FilmFolder.of(out, film)
+        names += [f"films/{film}/{name}" for name in (*folder.info().sha256, "done.json")]
+    return sorted(names)
+
+
+def write_checksums(out: Path, films: Sequence[str]) -> None:
+    """Write SHA256SUMS."""
+    write_text(out / CHECKSUMS, checksums_text({name: sha256(out / name) for name in data_files(out, films)}))
+
+
+def verify(out: Path) -> list[str]:
+    """Faults of a data set of films, one sentence each; none for a sound one.
+
+    Raises
+    ------
+    DatasetError
+        If it is not finished.
+    """
+    if not (out / CHECKSUMS).is_file():
+        raise DatasetError(f"{out} has no {CHECKSUMS}: it was not finished; {_AGAIN}")
+    lines = InputFile(out / CHECKSUMS, _AGAIN).read().decode("utf-8", errors="replace").splitlines()
+    listed = dict(line.split("  ", 1)[::-1] for line in lines if "  " in line)
+    info = read_document(out / INFO, SetInfo)
+    faults = [f"{name}: not in {CHECKSUMS}" for name in data_files(out, info.films) if name not in listed]
+    for name, digest in listed.items():
+        path = out / name
+        if not path.is_file():
+            faults.append(f"{name}: missing")
+        elif sha256(path) != digest:
+            faults.append(f"{name}: has other bytes than when it was made")
+    return faults

@@ -1,0 +1,83 @@
+"""Table `[film]` of a recipe: the pairs of a recipe as films of the stroke, and what moves in them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from phibench.datasets.recipe.distributions import Table
+
+Share = Annotated[float, Field(ge=-1.0, le=1.0)]
+Pause = Annotated[float, Field(ge=0.0, le=3600.0)]
+Place = Annotated[float, Field(ge=-100.0, le=100.0)]
+WaypointRow = Annotated[tuple[Place, ...], Field(strict=False, min_length=3, max_length=3)]
+
+
+class VibrationTable(Table):
+    """`[[film.vibration]]`: a band of vibration of the rig."""
+
+    axis: Literal["stroke", "x", "y"] = Field(default="stroke", description="along the stroke axis or a world axis")
+    low_hz: float = Field(gt=0.0, le=1e4, description="lower end of the band")
+    high_hz: float = Field(gt=0.0, le=1e4, description="upper end; the lower one for a sine wave")
+    rms_m: float = Field(ge=0.0, le=0.1, description="root mean square of the displacement")
+
+    @model_validator(mode="after")
+    def _rising(self) -> Self:
+        if self.high_hz < self.low_hz:
+            raise ValueError(f"high_hz = {self.high_hz:g} is below low_hz = {self.low_hz:g}; exchange them")
+        return self
+
+
+class FilmTable(Table):
+    """`[film]`: every pair of the recipe as a film of its stroke."""
+
+    rate_hz: float = Field(default=30.0, gt=0.0, le=1000.0, description="frames per second")
+    frames: int | None = Field(
+        default=None, ge=1, le=100_000, description="how many; as many as the motion takes where not given"
+    )
+    exposure_s: float = Field(default=1 / 60, gt=0.0, le=1.0, description="exposure of each row")
+    readout_s: float = Field(default=0.030, ge=0.0, le=1.0, description="rolling shutter, first row to last; 0 is none")
+    view: Literal["windows", "full"] = Field(
+        default="windows", description="the room around the spot alone, or the whole image"
+    )
+    window_px: int = Field(default=48, ge=16, le=512, description="side of the square around the spot")
+    stops: Annotated[tuple[Share, ...], Field(strict=False, min_length=1, max_length=100)] = Field(
+        default=(0.0, 1.0), description="where the carriage stops, in parts of the pair's stroke"
+    )
+    pauses_s: Annotated[tuple[Pause, ...], Field(strict=False, min_length=1, max_length=100)] = Field(
+        default=(0.5, 0.5), description="rest at each stop"
+    )
+    speed_m_per_s: float = Field(default=0.25, gt=0.0, le=10.0, description="largest speed of the carriage")
+    acceleration_m_per_s2: float = Field(default=1.0, gt=0.0, le=100.0, description="largest acceleration")
+    encoder_rms_m: float = Field(default=2e-4, ge=0.0, le=0.1, description="noise of a reading of the offset")
+    encoder_step_m: float = Field(default=0.0, ge=0.0, le=0.1, description="resolution of a reading; 0 is none")
+    code: Annotated[str, Field(pattern="^[01]+$", max_length=4096)] = Field(
+        default="1", description="bits of the laser's blink code, which repeats; '1' is always on"
+    )
+    bit_s: float = Field(default=1 / 30, ge=1e-4, le=3600.0, description="time of a bit")
+    path: Annotated[tuple[WaypointRow, ...], Field(strict=False, max_length=1000)] = Field(
+        default=(), description="waypoints [time_s, across_m, up_m] of the spot on its board; it rests where not given"
+    )
+    vibration: Annotated[tuple[VibrationTable, ...], Field(strict=False, max_length=20)] = Field(
+        default=(), description="bands of vibration"
+    )
+
+    @model_validator(mode="after")
+    def _together(self) -> Self:
+        """Check what no single key shows."""
+        if len(self.pauses_s) != len(self.stops):
+            raise ValueError(f"{len(self.pauses_s)} pauses_s for {len(self.stops)} stops; give one pause for each stop")
+        longest = 1.0 / self.rate_hz * (1.0 + 1e-9)
+        for name in ("exposure_s", "readout_s"):
+            if getattr(self, name) > longest:
+                raise ValueError(
+                    f"{name} = {getattr(self, name):g} is longer than a frame at rate_hz = {self.rate_hz:g}; "
+                    f"give at most {longest:.4g}"
+                )
+        if "1" not in self.code:
+            raise ValueError(f"code = '{self.code}' never lights the laser; give a 1")
+        times = [row[0] for row in self.path]
+        if sorted(set(times)) != times:
+            raise ValueError(f"times {times} of path must rise")
+        return self

@@ -1,0 +1,132 @@
+"""Commands `phibench film ...`: make, check and show films of the stroke."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from cyclopts import App
+
+from phibench.estimator.cli.options import DATA, Whole
+
+film = App(name="film", group=DATA, help="Make, check and show films of the stroke.")
+
+
+@film.command
+def make(recipe: str, *, out: Path, workers: Whole | None = None, dry_run: bool = False) -> int:
+    """Make the films of a recipe with [film]; what is finished already is kept.
+
+    Parameters
+    ----------
+    recipe
+        TOML file, or the name of a shipped recipe.
+    out
+        Folder to write.
+    workers
+        Number of processes; one for each core by default.
+    dry_run
+        Say what will be made; render nothing.
+    """
+    if dry_run:
+        from phibench.datasets.film.film_plan import film_plans, listed
+        from phibench.datasets.recipe.load import load_recipe, recipe_files
+
+        for line in listed(film_plans(load_recipe(recipe), recipe_files(recipe))[1]):
+            print(line)
+        return 0
+    from phibench.datasets.film.film_make import make_films
+
+    made = make_films(recipe, out, workers)
+    print(f"{out}: {len(made.made)} films made, {len(made.kept)} kept")
+    return 0
+
+
+@film.command
+def verify(directory: Path) -> int:
+    """Check every file of a data set of films; exit code 1 if there is a fault.
+
+    Parameters
+    ----------
+    directory
+        Folder of films.
+    """
+    from phibench.datasets.film.film_store import verify as verify_films
+
+    faults = verify_films(directory)
+    for fault in faults:
+        print(fault)
+    print(f"{directory}: {len(faults)} faults")
+    return 1 if faults else 0
+
+
+@film.command
+def show(
+    directory: Path, *, name: str | None = None, preset: str = "mjpeg", draw: int = 0, out: Path | None = None
+) -> int:
+    """Print a table of films and write one of them as an MP4 with overlays.
+
+    Parameters
+    ----------
+    directory
+        Folder of films.
+    name
+        Id of the film; the first one by default.
+    preset
+        Sensor preset of its frames.
+    draw
+        Draw of the noise.
+    out
+        MP4 to write; the film's id with .mp4 in the folder by default.
+    """
+    from phibench.datasets.film.film_read import open_films
+    from phibench.datasets.film.film_show import show_film
+
+    films = open_films(directory)
+    print(f"{'film':32s} {'frames':>6s} {'region px':>11s} {'key views':>9s} {'of noise':>8s} {'CPU-s':>7s}")
+    for one in films:
+        info, ratios = one.info, (one.info.pixel_ratio or 0.0, one.info.position_ratio or 0.0)
+        size = f"{info.width_px} x {info.height_px}"
+        print(
+            f"{info.film:32s} {info.frames:6d} {size:>11s} {len(info.keys_m):9d} {max(ratios):8.3f} {info.cpu_s:7.2f}"
+        )
+    chosen = films[name or next(iter(films.plans))]
+    path = show_film(chosen, out or directory / f"{chosen.info.film}.mp4", preset, draw)
+    print(f"{path}: {len(chosen)} frames, preset {preset}; the green cross is around the exact place of the spot")
+    return 0
+
+
+@film.command
+def frames(
+    directory: Path,
+    *,
+    out: Path,
+    preset: Literal["mjpeg", "yuyv"] = "mjpeg",
+    draws: Whole = 1,
+    camera_seed: Whole = 0,
+    container: Literal["avi", "mkv"] = "mkv",
+    workers: Whole | None = None,
+) -> int:
+    """Write the camera's own frames of whole images, one video per film and draw; the frames' bytes are untouched.
+
+    Parameters
+    ----------
+    directory
+        Folder of films with view = "full".
+    out
+        Folder to write.
+    preset
+        What the camera sends.
+    draws
+        Draws of the noise, each a video.
+    camera_seed
+        Videos of one seed share the fixed pattern.
+    container
+        Format of the file.
+    workers
+        Number of processes; one for each core by default.
+    """
+    from phibench.datasets.film.film_frames import write_videos
+
+    paths = write_videos(directory, out, preset, draws, camera_seed, f".{container}", workers=workers)
+    print(f"{out}: {len(paths)} videos")
+    return 0

@@ -1,0 +1,233 @@
+"""Films as data sets: made, read, checked, resumed; frames, bytes in videos, mistakes in one sentence."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import ROOT, SharedFolder
+
+from phibench.datasets.errors import DatasetError, RecipeError
+from phibench.datasets.film import film_make
+from phibench.datasets.film.film_frames import write_videos
+from phibench.datasets.film.film_make import make_films
+from phibench.datasets.film.film_plan import film_plans
+from phibench.datasets.film.film_read import Film, open_films
+from phibench.datasets.film.film_show import picture
+from phibench.datasets.film.film_store import verify
+from phibench.datasets.film.film_video import read_frames, write_frames, write_mp4
+from phibench.datasets.recipe.load import parse_recipe
+from phibench.render.optics.spot_layer import spot_layer
+from phibench.render.optics.truth import spot_truth
+
+TEXT = (ROOT / "tests" / "films.toml").read_text(encoding="utf-8")
+FILM = "seen-near-h0.300"
+
+
+def made(shared: SharedFolder, name: str, text: str) -> Path:
+    def make(out: Path) -> None:
+        recipe = out.with_suffix(".toml")
+        recipe.write_text(text, encoding="utf-8")
+        make_films(recipe, out, 1)
+
+    return shared.made(name, make)
+
+
+@pytest.fixture(scope="session")
+def windows(shared: SharedFolder) -> Path:
+    """Films of `tests/films.toml`. Read only."""
+    return made(shared, "films-windows", TEXT)
+
+
+@pytest.fixture(scope="session")
+def whole(shared: SharedFolder) -> Path:
+    """The same as whole images. Read only."""
+    return made(shared, "films-whole", TEXT.replace("window_px = 24", 'view = "full"'))
+
+
+def film_of(folder: Path) -> Film:
+    return open_films(folder)[FILM]
+
+
+def test_truth_of_every_frame_is_the_stills(windows: Path) -> None:
+    film, checked = film_of(windows), 0
+    scene = film.plan.scene
+    for row in film.table.iter_rows(named=True):
+        for prefix in ("", "row_"):
+            time = row[f"{prefix}time_s"]
+            still = spot_truth(scene.view_at(time), scene.spot_at(time), ())
+            # what parquet holds are the doubles themselves
+            assert (row[f"{prefix}u_px"], row[f"{prefix}v_px"]) == (still.u_px, still.v_px)
+            assert row[f"{prefix}phi_ray_rad"] == still.phi_ray_rad
+            assert row[f"{prefix}visible"]
+            checked += 1
+        assert row["encoder_m"] == pytest.approx(float(scene.carriage.position_m(row["time_s"])), abs=6 * 2e-4)
+    assert checked == 20
+    assert film.table["offset_m"].to_numpy()[-1] == pytest.approx(0.3, abs=1e-12)  # the stroke is over
+
+
+def test_interpolated_views_are_held_to_a_quarter_of_the_noise(windows: Path, whole: Path) -> None:
+    for folder in (windows, whole):
+        info = film_of(folder).info
+        assert 0.0 < max(info.pixel_ratio or 0.0, info.position_ratio or 0.0) <= 0.25
+        assert len(info.keys_m) < 2 * info.frames
+
+
+def test_the_proof_fails_where_key_views_are_too_far_apart(whole: Path) -> None:
+    film = film_of(whole)
+    plan, _ = film_plans(parse_recipe(TEXT))
+    render = film_make.renderer(plan, film.plan, plan.room(film.plan.pair.room))
+    # key views of a stroke of 2 m in place of 0.3 m: the board moves over the spot's window
+    offsets = np.array([-0.3, 0.1, 0.5, 0.9])
+    views = np.stack([render(film.plan.scene.rig.at(float(at)), 1) for at in offsets])
+    error = film_make.held_out_error(film.plan, render, offsets, views, film.spots)
+    assert error.largest > 0.25
+
+
+def test_a_windows_pixels_are_those_of_the_whole_frame(windows: Path, whole: Path) -> None:
+    part, all_ = film_of(windows), film_of(whole)
+    # the rooms differ by their rendering noise alone, so that the spot alone is compared: means, no draw
+    for frame in (0, 4, 9):
+        a, b = part.expected(frame, "mono-raw"), all_.expected(frame, "mono-raw")
+        assert (a.u0_px, a.v0_px) == (b.u0_px, b.v0_px)
+        np.testing.assert_array_equal(a.spot_e, b.spot_e)
+        assert part.frame(frame, "bayer-raw").image.shape == (24, 24)
+        assert part.window(frame).slices() == part.frame(frame, "mjpeg").region.slices()
+
+
+def test_laser_off_frames_have_no_spot_and_others_have_their_flux(windows: Path) -> None:
+    film = film_of(windows)
+    scene, seen = film.plan.scene, set()
+    for frame, time in enumerate(film.table["row_time_s"]):
+        around = scene.code.mean_level(time + np.array([-4e-3, 0.0, 4e-3]), scene.times.exposure_s)
+        if np.ptp(around) > 0.0:
+            continue  # an edge of the code is near: the rows differ
+        level = round(float(around[0]), 9)
+        seen.add(level)
+        total = spot_layer(scene.view_at(time), scene.spot_at(time), ()).total_electrons_per_s[0]
+        # a rolling shutter stretches what moves down by (px per s) x (time from row to row): 5 px/s x 0.33 ms = 2e-3
+        assert film.spots[frame].electrons_per_s[0].sum() == pytest.approx(level * total, rel=4e-3, abs=1.0)
+    assert seen == {0.0, 1.0}
+
+
+def test_a_killed_run_goes_on_and_gives_the_same_bytes(windows: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    recipe = tmp_path / "films.toml"
+    recipe.write_text(TEXT, encoding="utf-8")
+    out, calls = tmp_path / "out", []
+
+    def killed(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(film_make, "write_spots", killed)
+        with pytest.raises(KeyboardInterrupt):
+            make_films(recipe, out, 1)
+    with pytest.raises(DatasetError, match=r"no film\.json"):
+        open_films(out)
+    real = film_make.write_view
+    monkeypatch.setattr(film_make, "write_view", lambda *a: (calls.append(1), real(*a)))
+    assert make_films(recipe, out, 1).made == (FILM,)
+    assert not calls  # the key views were there
+    assert make_films(recipe, out, 1).made == ()
+    ours, theirs = (
+        {p.relative_to(d).as_posix(): p.read_bytes() for p in d.rglob("*") if p.suffix in (".exr", ".npz", ".parquet")}
+        for d in (out, windows)
+    )
+    assert ours == theirs
+    assert len(ours) > 5
+
+
+def test_damage_is_found_and_mended(windows: Path, tmp_path: Path) -> None:
+    out = tmp_path / "films"
+    shutil.copytree(windows, out)
+    assert verify(out) == []
+    table = out / "films" / FILM / "film.parquet"
+    table.write_bytes(table.read_bytes()[:-1])
+    assert verify(out) == [f"films/{FILM}/film.parquet: has other bytes than when it was made"]
+    (out / "films" / FILM / "done.json").write_text(json.dumps({"film": 3}), encoding="utf-8")
+    with pytest.raises(DatasetError, match=r"done\.json is damaged.*again"):
+        film_of(out)
+    recipe = out / "again.toml"
+    recipe.write_text(TEXT, encoding="utf-8")
+    make_films(recipe, out, 1)
+    assert verify(out) == []
+
+
+@pytest.mark.parametrize("name", ["film.avi", "film.mkv"])
+def test_a_container_gives_the_cameras_bytes_back(whole: Path, tmp_path: Path, name: str) -> None:
+    film = film_of(whole)
+    sent = [film.frame(k).jpeg or b"" for k in range(4)]
+    write_frames(tmp_path / name, sent, "mjpeg", film.plan.size, 10.0)
+    assert list(read_frames(tmp_path / name)) == sent
+    assert min(map(len, sent)) > 500
+    raw = [film.frame(k, "yuyv").image.tobytes() for k in range(3)]
+    write_frames(tmp_path / name, raw, "yuyv", film.plan.size, 10.0)
+    assert list(read_frames(tmp_path / name)) == raw
+
+
+def test_videos_and_pictures(windows: Path, whole: Path, tmp_path: Path) -> None:
+    (path,) = write_videos(whole, tmp_path, "mjpeg", workers=1)
+    assert len(list(read_frames(path))) == 10
+    again = path.read_bytes()
+    path.unlink()
+    assert write_videos(whole, tmp_path, "mjpeg", workers=1)[0].read_bytes() == again
+    with pytest.raises(DatasetError, match="holds windows"):
+        write_videos(windows, tmp_path, "mjpeg", workers=1)
+    shown = [
+        picture(film, film.frame(3, preset))
+        for film in map(film_of, (windows, whole))
+        for preset in ("yuyv", "mjpeg", "bayer-raw")
+    ]
+    assert {one.ndim for one in shown} == {3}
+    film = write_mp4(tmp_path / "a.mp4", shown[:2], 10.0)
+    assert film.stat().st_size > 1000
+
+
+def faulty(change: str, by: str = "") -> str:
+    assert change in TEXT
+    return TEXT.replace(change, by)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (faulty("bit_s = 0.2", "bit_s = 2.0"), r"must hold the whole code"),
+        (faulty('code = "110"', 'code = "000"'), r"never lights the laser"),
+        (faulty("pauses_s = [0.2, 0.1]", "pauses_s = [0.2]"), r"1 pauses_s for 2 stops"),
+        (faulty("rate_hz = 10.0", "rate_hz = 60.0\nexposure_s = 0.02"), r"longer than a frame"),
+        (faulty("high_hz = 20.0", "high_hz = 2.0"), r"exchange them"),
+        (faulty("frames = 10", "path = [[1.0, 0.0, 0.0], [0.5, 0.1, 0.0]]"), r"must rise"),
+        (faulty("speed_m_per_s = 1.0", "speed = 0.5"), r"speed_m_per_s"),
+        (faulty("[film]", "[misalignment]\nyaw_rad = 0.01\n[film]"), r"has \[\[film.vibration\]\] instead"),
+        (TEXT[: TEXT.index("[film]")], r"has no \[film\]"),
+    ],
+)
+def test_each_mistake_is_one_sentence(text: str, words: str) -> None:
+    with pytest.raises((RecipeError, DatasetError), match=words):
+        film_plans(parse_recipe(text))
+
+
+def test_a_target_that_is_never_seen_is_one_sentence(tmp_path: Path) -> None:
+    recipe = tmp_path / "hidden.toml"
+    # behind the cabinet of the lab
+    hidden = TEXT.replace("depth_m = 1.5", "depth_m = 4.9").replace("azimuth_deg = 100.0", "azimuth_deg = 228.1")
+    hidden = hidden.replace("height_m = 0.50", "height_m = 0.45").replace("frames = 10", "frames = 3")
+    recipe.write_text(hidden.replace('code = "110"\n', ""), encoding="utf-8")
+    with pytest.raises(DatasetError, match=r"never seen|an image all the time"):
+        make_films(recipe, tmp_path / "out", 1)
+
+
+def test_other_folders_are_refused(windows: Path, tiny_dataset: Path, tmp_path: Path) -> None:
+    recipe = tmp_path / "films.toml"
+    recipe.write_text(TEXT, encoding="utf-8")
+    with pytest.raises(DatasetError, match="data set of pairs"):
+        make_films(recipe, tiny_dataset, 1)
+    with pytest.raises(DatasetError, match="holds no films"):
+        open_films(tmp_path)
+    recipe.write_text(TEXT.replace('name = "films"', 'name = "others"'), encoding="utf-8")
+    with pytest.raises(DatasetError, match="holds the films of 'films'"):
+        make_films(recipe, windows, 1)
+    with pytest.raises(DatasetError, match="frames 0 to 9"):
+        film_of(windows).room(10)
