@@ -48,7 +48,7 @@ estimator/spots
 estimator/processed
 estimator/sensor_fit
 estimator/outline
-estimator/limits estimator/methods
+estimator/film estimator/limits estimator/methods
 estimator/draw_pairs
 estimator/calibration
 estimator/sandbox

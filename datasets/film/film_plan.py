@@ -23,7 +23,7 @@ from phibench.scenes.validation import SceneError
 
 TILE_PX = 32
 MARGIN_PX = 20  # a JPEG's unit and what demosaicing looks at, around a window
-KEY_PX = 1.5  # motion of the spot's image from key view to key view, before the proof is asked
+KEY_PX = 1.2  # motion of the spot's image from key view to key view, before the proof is asked
 _SAMPLES = 257
 
 

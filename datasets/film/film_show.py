@@ -18,7 +18,7 @@ from phibench.render.sensor.light import Region
 
 Picture = NDArray[np.uint8]
 _LINE_PX = 16
-_ZOOM, _INSET_PX = 9, 32
+_ZOOM, _INSET_PX = 5, 36
 _GREEN, _YELLOW = (80, 255, 80), (255, 210, 60)
 
 

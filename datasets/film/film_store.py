@@ -47,7 +47,7 @@ _ARRAYS = {
 
 
 class FilmInfo(Document):
-    """What a film was made from, and what it holds: `done.json`."""
+    """Origin and content of a film: `done.json`."""
 
     film: str = described("-", "id of the film, that of its pair")
     key: str = described("-", "SHA-256 over all that the film depends on")
