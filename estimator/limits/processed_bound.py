@@ -101,13 +101,24 @@ def _of_codes(
 def _of_window(
     card: SensorCard, theta: Array, blur: SpotBlur, response: tuple[float, float, float], known: bool
 ) -> SpotLimit:
-    model = chain_model(card, unrounded(card, known))
-    units, sides = np.array(grid_px(card)[::-1]), np.array(model.shape[::-1])
-    corner = np.rint((theta[:2] + 0.5 - sides / 2) / units) * units - model.margin
-    theta = theta - np.array([*corner, 0, 0, 0, 0])
-    pixels = SpotPixels.of(model.filters[None], blur, SpotModel(response))
-    fisher = Window(np.zeros(len(model.step)), model, pixels).fisher(theta)
+    window, corner = limit_window(card, theta[:2], blur, response, known)
+    fisher = window.fisher(theta - np.array([*corner, 0, 0, 0, 0]))
     return SpotLimit(covariance_bound(fisher), fisher)
+
+
+def limit_window(
+    card: SensorCard,
+    uv_px: Array,
+    blur: SpotBlur,
+    response: tuple[float, float, float] = LASER_RESPONSE,
+    pattern_known: bool = False,
+) -> tuple[Window, Array]:
+    """Window of outputs, all 0, that holds a spot at (u, v), and its first raw pixel (u, v); rest as `chain_limit`."""
+    model = chain_model(card, unrounded(card, pattern_known))
+    units, sides = np.array(grid_px(card)[::-1]), np.array(model.shape[::-1])
+    corner = np.rint((uv_px + 0.5 - sides / 2) / units) * units - model.margin
+    pixels = SpotPixels.of(model.filters[None], blur, SpotModel(response))
+    return Window(np.zeros(len(model.step)), model, pixels), corner
 
 
 # -- bound by the electrons of a spot --------------------------------------------------------------------------------

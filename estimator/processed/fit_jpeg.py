@@ -17,7 +17,8 @@ from phibench.estimator.processed.interval_fit import fit_intervals
 from phibench.estimator.processed.quasi_score import Window, WindowFit, fit_window
 from phibench.estimator.spots.camera_codes import ycbcr_codes
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
-from phibench.estimator.spots.jpeg_coefficients import hidden_share, mcu_px, qtables_of, recovered, room_variance
+from phibench.estimator.spots.jpeg_coefficients import hidden_share, mcu_px, qtables_of, room_variance
+from phibench.estimator.spots.jpeg_recovery import recovered
 from phibench.scenes.frames import Array
 
 
@@ -111,13 +112,13 @@ def region_window(
     room: Array | float = 0.0
     if region.room is not None and chain.card.output == "mjpeg":
         room = _room(replace(region, image=region.room), chain, row, column, background)
-    z = outputs_at(region, chain, row, column)
-    return Window(z, chain, pixels, extra.ravel(), room, len(region.image), region.prnu), corner
+    each = outputs_at(region, chain, row, column)
+    return Window(each.mean(axis=0), chain, pixels, extra.ravel(), room, len(each), region.prnu, each), corner
 
 
 def _room(region: Region, chain: ChainModel, row: int, column: int, background_e: Array) -> Array:
     """Variance of the room's coefficients by the quantiser, shape (n,), known from the region's frames."""
-    found, count = coefficients_at(region, chain, row, column), len(region.image)
+    found, count = coefficients_at(region, chain, row, column).mean(axis=0), len(region.image)
     if count == 1:
         return room_variance(found, chain.step)
     mean_e = np.maximum(background_e.ravel(), 0.0)
@@ -128,16 +129,18 @@ def _room(region: Region, chain: ChainModel, row: int, column: int, background_e
 
 
 def outputs_at(region: Region, chain: ChainModel, row: int, column: int) -> Array:
-    """Quantised outputs, shape (n,), of the window that begins at (row, column) of the region."""
+    """Quantised outputs of each frame, shape (f, n), of the window that begins at (row, column) of the region."""
     if chain.card.output == "mjpeg":
         return coefficients_at(region, chain, row, column)
     h, w = window_px(chain.card)
-    image = region.image[:, row : row + h, column : column + w].mean(axis=0)
-    return ycbcr_codes(image) if chain.card.output == "yuyv" else np.moveaxis(image, -1, 0).ravel()
+    images = region.image[:, row : row + h, column : column + w]
+    if chain.card.output == "yuyv":
+        return np.stack([ycbcr_codes(image) for image in images])
+    return np.asarray(np.moveaxis(images, -1, 1).reshape(len(images), -1), float)
 
 
 def coefficients_at(region: Region, chain: ChainModel, row: int, column: int) -> Array:
-    """Quantised coefficients, mean of the frames, shape (n,), of the window that begins at (row, column)."""
+    """Quantised coefficients of each frame, shape (f, n), of the window that begins at (row, column)."""
     card, (h, w) = chain.card, chain.shape
     down, across = mcu_px(card.jpeg_subsampling)
     height, width = region.image.shape[1:3]
@@ -153,4 +156,5 @@ def coefficients_at(region: Region, chain: ChainModel, row: int, column: int) ->
     v, u = row - top, column - left
     luma = found.luma[:, v // 8 : (v + h) // 8, u // 8 : (u + w) // 8]
     chroma = found.chroma[:, :, v // down : (v + h) // down, u // across : (u + w) // across]
-    return np.concatenate([luma.mean(axis=0).ravel(), chroma.mean(axis=0).ravel()])
+    count = len(region.image)
+    return np.concatenate([luma.reshape(count, -1), chroma.reshape(count, -1)], axis=1)

@@ -1,4 +1,4 @@
-"""Posterior of a spot from one frame's rounded outputs: each lies in one step of the quantiser.
+"""Posterior of a spot from rounded outputs of one or several frames: each lies in one step of the quantiser.
 
 Steps of JPEG are often larger than the noise. Then a coefficient near the edge of its step seems to say much about the
 spot, and one far from the edges nothing, both only if the spot is where it is thought to be: a quasi-score has many
@@ -8,7 +8,8 @@ roots. The intervals themselves say the same for every hypothesis. With Gaussian
 
 the posterior of theta is a Gaussian cut by planes in y. Expectation propagation finds its mean and covariance (T. P.
 Minka, UAI 2001; boxes: J. P. Cunningham, P. Hennig, S. Lacoste-Julien, arXiv:1111.6832): each interval is replaced by
-a Gaussian that gives y_i the same mean and variance. m is linear about the posterior's mean, found again some times.
+a Gaussian that gives y_i the same mean and variance. m is linear about the posterior's mean, found again some times. Of
+several frames y is their mean before the quantiser (`interval_moments`).
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.special import erfcx, ndtr
 
+from phibench.estimator.processed.interval_moments import Sites, Steps
 from phibench.estimator.processed.quasi_score import Inputs, Rows, Window, WindowFit, fit_window
 from phibench.estimator.spots.fisher import limited
 from phibench.scenes.frames import Array
@@ -37,17 +38,7 @@ _STEP_PX = 0.4
 _SETTLED = 0.03  # last step in standard deviations
 _TOLD = 1e6  # variance in steps squared from which an interval's Gaussian tells nothing
 _LEAST_STEP2 = 1e-9  # variance of an output, in steps squared: less is rounding of the arithmetic
-
-
-@dataclass(frozen=True)
-class _Sites:
-    """Gaussians that stand for the intervals: exp(-precision y^2 / 2 + shift y), shape (n,) each."""
-
-    precision: Array
-    shift: Array
-
-    def part(self, index: NDArray[np.int64]) -> _Sites:
-        return _Sites(self.precision[index], self.shift[index])
+_START_STEPS = 6  # of the quasi-score, from whose place the first round begins
 
 
 @dataclass(frozen=True)
@@ -78,14 +69,14 @@ class _Belief:
         outputs[np.diag_indices_from(outputs)] += inputs.own[index]
         return cls(prior, covariance, inputs.mean[index] + (prior - theta) @ slopes, cross, outputs)
 
-    def factor(self, sites: _Sites) -> tuple[Array, Array]:
+    def factor(self, sites: Sites) -> tuple[Array, Array]:
         """Square roots of the sites' precisions, and the Cholesky factor of 1 + root outputs root."""
         root = np.sqrt(sites.precision)
         B = root[:, None] * self.outputs * root
         B[np.diag_indices_from(B)] += 1.0
         return root, np.asarray(np.linalg.cholesky(B))
 
-    def updated(self, sites: _Sites) -> tuple[Array, Array]:
+    def updated(self, sites: Sites) -> tuple[Array, Array]:
         """Mean and variance of the outputs with the sites, shape (n,) each."""
         root, L = self.factor(sites)
         A = solve_triangular(L, root[:, None] * self.outputs, lower=True, check_finite=False)
@@ -93,7 +84,7 @@ class _Belief:
         mean = self.mean + self.outputs @ push - A.T @ (A @ push)
         return mean, np.diagonal(self.outputs) - np.einsum("ij,ij->j", A, A)
 
-    def posterior(self, sites: _Sites) -> tuple[Array, Array]:
+    def posterior(self, sites: Sites) -> tuple[Array, Array]:
         """Mean, shape (k,), and covariance, shape (k, k), of theta with the sites."""
         root, L = self.factor(sites)
         push = sites.shift - sites.precision * self.mean
@@ -105,7 +96,7 @@ class _Belief:
 
 @dataclass(frozen=True)
 class IntervalPosterior:
-    """Posterior of one frame's window.
+    """Posterior of a window.
 
     Attributes
     ----------
@@ -121,7 +112,7 @@ class IntervalPosterior:
     theta: Array
     covariance: Array
     index: NDArray[np.int64]
-    sites: _Sites
+    sites: Sites
     settled: bool
 
     def likelihood(self) -> Callable[[Array], tuple[Array, Array]]:
@@ -155,7 +146,7 @@ class IntervalPosterior:
 
 
 def fit_intervals(window: Window, start: Array) -> WindowFit:
-    """Fit one frame's window from a hypothesis, shape (k,), which is also the prior's mean.
+    """Fit a window from a hypothesis, shape (k,), which is also the prior's mean.
 
     Returns
     -------
@@ -174,17 +165,18 @@ def fit_intervals(window: Window, start: Array) -> WindowFit:
 
 
 def interval_posterior(window: Window, start: Array) -> IntervalPosterior | None:
-    """Posterior of one frame's window, parameters as `fit_intervals`; None where the arithmetic fails."""
+    """Posterior of a window, parameters as `fit_intervals`; None where the arithmetic fails."""
     prior, step = np.diag(_prior_sigma(start, window) ** 2), window.model.step
-    low, high = window.z - step / 2.0, window.z + step / 2.0
-    theta, covariance = fit_window(window, start[None]).theta, _CLOSER**2 * prior
-    sites, last, settled = _Sites(*np.zeros((2, len(step)))), np.zeros(len(start)), False
+    steps = Steps.of(window.each, step)
+    theta, covariance = fit_window(window, start[None], _START_STEPS).theta, _CLOSER**2 * prior
+    sites, last, settled = Sites(*np.zeros((2, len(step)))), np.zeros(len(start)), False
     for k in range(_ROUNDS):
         inputs = window.inputs(theta)
-        index = _near(inputs, covariance, low, high)
+        index = _near(inputs, covariance, steps)
         belief = _Belief.of(start, prior, theta, inputs, index)
         try:
-            part = _propagated(belief, sites.part(index), low[index], high[index], _SWEEPS[k > 0])
+            seen, spread = steps.part(index), inputs.spread[index]
+            part = _propagated(belief, sites.part(index), seen, spread, _SWEEPS[k > 0])
             mean, covariance = belief.posterior(part)
         except np.linalg.LinAlgError:
             return None
@@ -211,85 +203,38 @@ def _prior_sigma(start: Array, window: Window) -> Array:
     return np.array([_PRIOR_PX, _PRIOR_PX, _PRIOR_LEVEL_E + abs(start[2]), *level, *width])
 
 
-def _near(inputs: Inputs, covariance: Array, low: Array, high: Array) -> NDArray[np.int64]:
+def _near(inputs: Inputs, covariance: Array, steps: Steps) -> NDArray[np.int64]:
     """Index of outputs that noise and hypotheses can bring to an edge of their steps."""
     J, F = inputs.slopes, inputs.factor
     variance = np.einsum("rn,rn->n", F, F) + inputs.own + np.einsum("kn,kl,ln->n", J, covariance, J)
-    room = np.minimum(high - inputs.mean, inputs.mean - low)
+    if steps.frames > 1:
+        variance += inputs.spread
+    apart = steps.last - steps.first > 1.5 * steps.step
+    room = np.where(apart, 0.0, np.minimum(steps.last - inputs.mean, inputs.mean - steps.first))
     return np.flatnonzero(room < _FAR * np.sqrt(variance))
 
 
-def _propagated(belief: _Belief, sites: _Sites, low: Array, high: Array, sweeps: int) -> _Sites:
+def _propagated(belief: _Belief, sites: Sites, steps: Steps, spread: Array, sweeps: int) -> Sites:
     """Sites after some sweeps of expectation propagation, all intervals at once."""
     prior = np.diagonal(belief.outputs)
-    least = _LEAST_STEP2 * (high - low) ** 2
+    least = _LEAST_STEP2 * steps.step**2
     for k in range(sweeps):
         mean, variance = belief.updated(sites)
         variance = np.maximum(variance, least)
         # without its own interval an output is known no worse than before all of them
         precision = np.maximum(1.0 / variance - sites.precision, 1.0 / prior)
         shift = mean / variance - sites.shift
-        cut_mean, cut_variance = truncated_moments(shift / precision, 1.0 / np.sqrt(precision), low, high)
-        cut_variance = np.maximum(cut_variance, least)
-        new = np.maximum(1.0 / cut_variance - precision, 0.0), cut_mean / cut_variance - shift
+        new = steps.sites(shift / precision, 1.0 / precision, spread)
         damping = _DAMPING if k else 1.0
-        sites = _Sites(
-            sites.precision + damping * (new[0] - sites.precision), sites.shift + damping * (new[1] - sites.shift)
+        sites = Sites(
+            sites.precision + damping * (new.precision - sites.precision),
+            sites.shift + damping * (new.shift - sites.shift),
         )
     return sites
 
 
-def _scattered(sites: _Sites, index: NDArray[np.int64], count: int) -> _Sites:
+def _scattered(sites: Sites, index: NDArray[np.int64], count: int) -> Sites:
     """Sites of all outputs; those that tell nothing have none."""
     precision, shift = np.zeros((2, count))
     precision[index], shift[index] = sites.precision, sites.shift
-    return _Sites(precision, shift)
-
-
-# -- Gaussian cut to an interval -------------------------------------------------------------------------------------
-
-_NARROW = 0.02  # width in standard deviations below which the density is an exponential: off by 5e-5 of a deviation
-_TAIL = 1e3  # distance in standard deviations from which it is too
-_STEEP = 300.0  # exponent beyond which nothing is left of the other end
-_SQRT2 = np.sqrt(2.0)
-
-
-def truncated_moments(mean: Array, sigma: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Mean and variance of a Gaussian inside an interval; arrays broadcast together.
-
-    Within 5e-5 standard deviations, relative in the variance, also far in the tails and for narrow intervals.
-    """
-    a, b = (low - mean) / sigma, (high - mean) / sigma
-    mirrored = a + b < 0.0
-    a, b = np.where(mirrored, -b, a), np.where(mirrored, -a, b)  # the mean lies left of the middle
-    exponential = (b - a < _NARROW) | (a > _TAIL)
-    by_rate, by_density = (
-        _of_exponential(a, b),
-        _of_gaussian(np.where(exponential, 0.0, a), np.where(exponential, 1.0, b)),
-    )
-    first, second = (np.where(exponential, x, y) for x, y in zip(by_rate, by_density, strict=True))
-    return mean + sigma * np.where(mirrored, -first, first), sigma**2 * second
-
-
-def _of_gaussian(a: Array, b: Array) -> tuple[Array, Array]:
-    """Moments of the standard Gaussian in [a, b], a + b >= 0."""
-    decay = np.exp(-0.5 * (b - a) * (a + b))  # density at b over that at a
-    tail = np.sqrt(2.0 / np.pi) / (erfcx(np.maximum(a, 0.0) / _SQRT2) - decay * erfcx(np.maximum(b, 0.0) / _SQRT2))
-    inside = np.exp(-0.5 * np.minimum(a, 0.0) ** 2) / (np.sqrt(2.0 * np.pi) * (ndtr(b) - ndtr(np.minimum(a, 0.0))))
-    at_a = np.where(a > 0.0, tail, inside)
-    first = at_a * (1.0 - decay)
-    return first, np.clip(1.0 + at_a * (a - b * decay) - first**2, 0.0, 1.0)
-
-
-def _of_exponential(a: Array, b: Array) -> tuple[Array, Array]:
-    """Moments in [a, b] of a density that falls with the rate of the Gaussian, at a where it is steep."""
-    width, steep = b - a, a > _TAIL
-    far = np.maximum(a, 1.0)
-    rate = np.where(steep, far + 0.5 * np.minimum(width, 1.0 / far), 0.5 * (a + b))
-    x = 0.5 * rate * width
-    flat, gone = x < 1e-2, x > _STEEP
-    some = np.where(flat | gone, 1.0, x)
-    middle = 0.5 * (a + b) - 0.5 * width * np.where(flat, x / 3.0, 1.0 / np.tanh(some) - 1.0 / some)
-    variance = 0.25 * width**2 * np.where(flat, 1.0 / 3.0 - x * x / 15.0, 1.0 / some**2 - 1.0 / np.sinh(some) ** 2)
-    rest = 1.0 / np.where(gone, rate, 1.0)
-    return np.where(gone, a + rest, middle), np.where(gone, rest**2, variance)
+    return Sites(precision, shift)

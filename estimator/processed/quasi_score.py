@@ -8,7 +8,7 @@ smallest of estimates that know m and C only (`limits.processed_bound`). The qua
 input gives m, and C_ij = g_i g_j C'_ij off the diagonal, g its mean slope and C' the input's covariance (J. J.
 Bussgang, 1952). A coefficient that is 0 whatever the noise has no slope and is left out.
 
-Where steps exceed the noise the equation has several roots; `interval_fit` is for a single frame of such.
+Where steps exceed the noise the equation has several roots; `interval_fit` is for JPEG.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Inputs:
-    """Gaussian outputs before the quantiser: covariance F^T F, and `own` on the diagonal.
+    """Gaussian outputs before the quantiser, mean of the frames: covariance F^T F, and `own` on the diagonal.
 
     Attributes
     ----------
@@ -94,12 +94,15 @@ class Inputs:
     slopes : shape (k, n), derivatives of the mean by the unknowns
     factor : shape (r, n), F
     own : shape (n,)
+    spread : shape (n,)
+        Variance of one frame about what the frames share.
     """
 
     mean: Array
     slopes: Array
     factor: Array
     own: Array
+    spread: Array
 
 
 @dataclass(frozen=True)
@@ -138,6 +141,8 @@ class Window:
         That `z` is the mean of. They share the background's errors and the pattern.
     prnu : float
         Relative spread of the responsivity, of the spot's light alone.
+    readings : shape (f, n), optional
+        Outputs of each frame, where they are several.
     """
 
     z: Array
@@ -147,11 +152,17 @@ class Window:
     room: Array | float = 0.0
     frames: int = 1
     prnu: float = 0.0
+    readings: Array | None = None
 
     @property
     def of_intervals(self) -> bool:
-        """One frame's coefficients of JPEG, to be fitted by `interval_fit`."""
-        return self.model.card.output == "mjpeg" and self.frames == 1
+        """Coefficients of JPEG, to be fitted by `interval_fit`."""
+        return self.model.card.output == "mjpeg" and (self.frames == 1 or self.readings is not None)
+
+    @property
+    def each(self) -> Array:
+        """Outputs of each frame, shape (f, n)."""
+        return self.z[None] if self.readings is None else self.readings
 
     def noise(self, theta: Array, live: Rows | None = None, least: float = _LIVE) -> Noise:
         """Covariance of the quantised coefficients for one hypothesis, shape (k,); which are live, if it is known.
@@ -195,11 +206,18 @@ class Window:
         model = self.model
         raw, derivatives = self._raw(theta[None])
         at = codes(model, raw.mean_e)
-        extra = raw.slope[0] ** 2 * (self.extra_e2 + self._pattern_e2(theta))
-        F = noise_factor(model, at.one(0), raw.variance_e2[0] + extra, model.transform)
-        own = at.one(0).excess @ model.squares + model.rounding + self.room
+        shared = raw.slope[0] ** 2 * (self.extra_e2 + self._pattern_e2(theta))
+        pattern = raw.slope[0] ** 2 * (model.noise.prnu * np.maximum(raw.mean_e[0], 0.0)) ** 2
+        changing = np.maximum(raw.variance_e2[0] - pattern, 0.0)
+        white = at.one(0).excess @ model.squares + model.rounding
+        F = noise_factor(model, at.one(0), shared + pattern + changing / self.frames, model.transform)
         mean = at.one(0).mean @ model.transform + model.shift
-        return Inputs(mean, (code_slopes(model, at, derivatives) @ model.transform)[0], F, own)
+        spread = white
+        if self.frames > 1:
+            changes = noise_factor(model, at.one(0), changing, model.transform)
+            spread = np.einsum("rn,rn->n", changes, changes) + white
+        slopes = (code_slopes(model, at, derivatives) @ model.transform)[0]
+        return Inputs(mean, slopes, F, white / self.frames + self.room, spread)
 
     def _pattern_e2(self, theta: Array) -> Array | float:
         """Variance of the spot's light by PRNU, shape (r,)."""
@@ -257,7 +275,7 @@ def shared_covariance(factor: Array, room: Array, sigma: Array, slope: Array, st
     return np.asarray(C)
 
 
-def fit_window(window: Window, starts: Array) -> WindowFit:
+def fit_window(window: Window, starts: Array, steps: int = _STEPS) -> WindowFit:
     """Fit one window from hypotheses, shape (s, k); the one with the smallest misfit after some steps goes on."""
     noise = window.noise(starts[0])
     if noise.dead:
@@ -265,7 +283,7 @@ def fit_window(window: Window, starts: Array) -> WindowFit:
     theta = _best(window, noise, starts)
     r, J = window.residual(noise, theta[None])
     length = np.inf
-    for k in range(_STEPS):
+    for k in range(steps):
         if 0 < k < _FRESH:
             noise = window.noise(theta, noise.rows)
             r, J = window.residual(noise, theta[None])

@@ -1,12 +1,7 @@
-"""Baseline JPEG as linear algebra: tables, transform, recovered coefficients, and the quantiser's statistics.
+"""Baseline JPEG as linear algebra: tables, transform, and the quantiser's statistics.
 
 * Numbers: ITU-T T.81 (1992), annex K, for the quantisation tables; libjpeg's scaling of them by the quality; JFIF 1.02
   for the colours. `coefficients` is the linear part of the encoder, without rounding.
-* `recovered`: quantised coefficients behind a decoded image. The decoder interpolates the chroma samples (libjpeg's
-  triangle filter, 3/4 and 1/4 of the two nearest), converts to R, G, B and cuts to 0 to 255. Interpolation is undone by
-  least squares, and each coefficient is a multiple of the quantiser's step, which takes out the decoder's rounding.
-  Where a pixel was cut, the value that the coefficients found so far would give takes its place, and the search goes on
-  until the image comes out again.
 * `room_variance`: error of the room's coefficients, known from the laser-off frame to a quantiser's step only. A
   coefficient c lies anywhere in its step s, with the variance s^2 / 12. Where the room is flat, the high frequencies
   are 0 and their step says nothing: of a coefficient whose neighbours have the mean square P the error has the variance
@@ -18,16 +13,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.fft import dctn, idctn
+from scipy.fft import dctn
 from scipy.ndimage import uniform_filter
 from scipy.special import ndtr
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.scenes.frames import Array, BoolArray
+from phibench.scenes.frames import Array
 
 Tables = tuple[tuple[int, ...], tuple[int, ...]]
 BLOCK_PX = 8
@@ -120,115 +113,6 @@ def steps(shape: tuple[int, int], subsampling: str, quality: int | Tables) -> Ar
     down, across = CHROMA_STEP[subsampling]
     count = shape[0] * shape[1] // 64
     return np.concatenate([np.tile(luma.ravel(), count), np.tile(chroma.ravel(), 2 * count // (down * across))])
-
-
-# -- recovery from decoded images ------------------------------------------------------------------------------------
-
-_SHIFT = 128.0
-_SAME_CODES = 3.5  # of the decoder's own rounding, between our decoder in floating point and libjpeg's integers
-_MOST_ROUNDS = 40
-
-
-@dataclass(frozen=True)
-class Recovered:
-    """Coefficients of images, level shift taken off.
-
-    Attributes
-    ----------
-    luma : shape (n, h / 8, w / 8, 8, 8)
-    chroma : shape (n, 2, ...), Cb and Cr
-    wrong : boolean, shape (n, h, w)
-        Pixels that do not come out again.
-    """
-
-    luma: Array
-    chroma: Array
-    wrong: BoolArray
-
-
-def recovered(
-    images: NDArray[Any], quality: int | Tables, subsampling: str, ends: tuple[bool, bool, bool, bool] = (False,) * 4
-) -> Recovered:
-    """Coefficients of decoded images of whole units.
-
-    The chroma at sides that are not the image's own is interpolated with samples outside: leave a unit there.
-
-    Parameters
-    ----------
-    images : shape (n, h, w, 3), uint8
-    quality : int or tables, as in `quantisation`
-    subsampling : "4:4:4", "4:2:2" or "4:2:0"
-    ends : 4 booleans
-        Top, bottom, left and right side are the image's own.
-    """
-    rgb = np.moveaxis(np.asarray(images, float), -1, 1)
-    tables = quantisation(quality)
-    down, across = (
-        _interpolation(size, step, *end)
-        for size, step, end in zip(rgb.shape[2:], CHROMA_STEP[subsampling], (ends[:2], ends[2:]), strict=True)
-    )
-    seen, found = rgb, _quantised(rgb, tables, down, across)
-    for _ in range(_MOST_ROUNDS):
-        again = _decoded(*found, tables, down, across)
-        cut = ((rgb <= 0.0) & (again < 0.0)) | ((rgb >= 255.0) & (again > 255.0))
-        seen, before = np.where(cut, again, rgb), found
-        found = _quantised(seen, tables, down, across)
-        if all(np.array_equal(a, b) for a, b in zip(found, before, strict=True)):
-            break
-    luma, chroma = found
-    again = np.clip(_decoded(luma, chroma, tables, down, across), 0.0, 255.0)
-    wrong = (np.abs(again - rgb) > _SAME_CODES).any(axis=1)
-    return Recovered(luma * tables[0], chroma * tables[1], wrong)
-
-
-@dataclass(frozen=True)
-class _Axis:
-    """Interpolation along one axis: `up` (pixels, samples), its pseudo-inverse, and how many samples lie outside."""
-
-    up: Array
-    back: Array
-    before: int
-    after: int
-
-
-@lru_cache(maxsize=32)
-def _interpolation(size: int, step: int, first: bool, last: bool) -> _Axis:
-    """Triangle filter from samples to `size` pixels; a sample outside is unknown where the side is not the image's."""
-    if step == 1:
-        return _Axis(np.eye(size), np.eye(size), 0, 0)
-    n, before, after = size // 2, int(not first), int(not last)
-    up = np.zeros((size, n + before + after))
-    for pixel in range(size):
-        near = pixel // 2
-        far = near + (1 if pixel % 2 else -1)
-        up[pixel, near + before] += 0.75
-        up[pixel, min(max(far + before, 0), up.shape[1] - 1)] += 0.25
-    return _Axis(up, np.asarray(np.linalg.pinv(up), float), before, after)
-
-
-def _quantised(rgb: Array, tables: tuple[Array, Array], down: _Axis, across: _Axis) -> tuple[Array, Array]:
-    """Multiples of the steps, of luma and chroma."""
-    ycc = np.einsum("ij,njhw->inhw", YCC_FROM_RGB, rgb)
-    samples = np.einsum("ah,inhw,bw->niab", down.back, ycc[1:], across.back, optimize=True)
-    inner = samples[:, :, down.before : samples.shape[2] - down.after, across.before : samples.shape[3] - across.after]
-    return np.rint(blocks(ycc[0] - _SHIFT) / tables[0]), np.rint(blocks(inner) / tables[1])
-
-
-def _decoded(luma: Array, chroma: Array, tables: tuple[Array, Array], down: _Axis, across: _Axis) -> Array:
-    """Image, shape (n, 3, h, w), of multiples, not cut; samples outside repeat the outermost ones."""
-    y = np.rint(_plane(luma * tables[0])) + _SHIFT
-    inner = np.rint(_plane(chroma * tables[1]))
-    pads = [(0, 0), (0, 0), (down.before, down.after), (across.before, across.after)]
-    samples = np.pad(inner, pads, mode="edge")
-    full = np.einsum("ha,niab,wb->inhw", down.up, samples, across.up, optimize=True)
-    return np.einsum("ij,jnhw->nihw", RGB_FROM_YCC, np.concatenate([y[None], full]))
-
-
-def _plane(coefficients: Array) -> Array:
-    """Plane, shape (..., h, w), of blocks."""
-    *lead, rows, columns, _, _ = coefficients.shape
-    cut = np.moveaxis(np.asarray(idctn(coefficients, axes=(-2, -1), norm="ortho")), -3, -2)
-    return cut.reshape(*lead, 8 * rows, 8 * columns)
 
 
 # -- room behind a spot ----------------------------------------------------------------------------------------------

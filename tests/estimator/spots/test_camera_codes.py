@@ -29,7 +29,8 @@ from phibench.estimator.spots.camera_codes import (
 )
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import colour_planes, linear_planes, read_picture, through_jpeg
-from phibench.estimator.spots.jpeg_coefficients import coefficients, quantised, recovered
+from phibench.estimator.spots.jpeg_coefficients import coefficients, quantised
+from phibench.estimator.spots.jpeg_recovery import recovered
 from phibench.render.sensor import processing
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Region
