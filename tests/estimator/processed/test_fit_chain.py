@@ -148,12 +148,12 @@ def test_coefficients_behind_a_decoded_image(subsampling: str, background_e: flo
 
 @pytest.mark.parametrize("subsampling", ["4:2:2", "4:2:0"])
 def test_a_dark_room_comes_out_again(subsampling: str) -> None:
-    """Half of the pixels are cut at 0: without steps of single coefficients 1 % of the pixels are wrong."""
+    """Half of the pixels are cut at 0: without steps of single coefficients 0.5 % of the pixels are wrong in five of six."""
     s = MJPEG.replace(jpeg_subsampling=subsampling)
     for k in range(3):
         light = scene(MIDDLE + [0.2 * k, 0.3], 0.7, 4.0 * FLUX_E, 0.0, s)
         found = recovered(Chain(s).frame(light, NoiseStream(("dark", k)))[None], 85, subsampling, (True,) * 4)
-        assert found.wrong.mean() < 0.004
+        assert found.wrong.mean() < 0.002
 
 
 @pytest.mark.parametrize("changes", [{}, {"sharpen_amount": 0.5}], ids=["plain", "sharpened"])
