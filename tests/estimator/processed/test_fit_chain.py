@@ -148,7 +148,7 @@ def test_coefficients_behind_a_decoded_image(subsampling: str, background_e: flo
 
 @pytest.mark.parametrize("subsampling", ["4:2:2", "4:2:0"])
 def test_a_dark_room_comes_out_again(subsampling: str) -> None:
-    """Half of the pixels are cut at 0: without steps of single coefficients 0.5 % of the pixels are wrong in five of six."""
+    """Half of the pixels are cut at 0: without steps of single coefficients 0.5 % of the pixels are wrong."""
     s = MJPEG.replace(jpeg_subsampling=subsampling)
     for k in range(3):
         light = scene(MIDDLE + [0.2 * k, 0.3], 0.7, 4.0 * FLUX_E, 0.0, s)
