@@ -1,0 +1,187 @@
+"""Beliefs over a target: consistent with the truth after strokes and drives, for targets at rest and moving."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from helpers.target_approach import RIG, VEHICLE, Approach, step, stroked
+from scipy.stats import chi2
+
+from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.loop.belief import PairTracker, TargetBelief, direction_of
+from phibench.scenes.frames import Array
+
+RUNS = 24
+FALSE_ALARM = 1e-3  # of each band; the streams are fixed, so that a pass stays one
+
+
+def band(runs: int) -> tuple[float, float]:
+    """Mean NEES of consistent beliefs over independent runs: chi squared of 3 degrees of freedom each."""
+    low, high = chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], 3 * runs) / runs
+    return float(low), float(high)
+
+
+def test_a_direction_is_that_of_the_ray_to_the_point() -> None:
+    """A far point lies in the direction itself; the covariance agrees with drawn pixels to 5 sqrt(2 / 4000)."""
+    far = np.array([400.0, 100.0, 50.0])
+    uv = image_of(RIG.at(0.0), far).uv_px
+    found = direction_of(RIG, float(uv[0]), float(uv[1]), 0.05)
+    assert found is not None
+    assert found.values == pytest.approx([math.atan2(100, 400), (50 - 0.71) / math.hypot(400, 100)], abs=2e-4)
+    rng = np.random.default_rng(1)
+    drawn = []
+    for du, dv in 0.05 * rng.standard_normal((300, 2)):
+        other = direction_of(RIG, float(uv[0] + du), float(uv[1] + dv), 0.05)
+        assert other is not None
+        drawn.append(other.values)
+    ratio = np.cov(np.array(drawn).T) / found.covariance
+    assert np.diag(ratio) == pytest.approx([1.0, 1.0], abs=5 * math.sqrt(2 / 300))
+
+
+def test_a_pixel_off_the_mirror_has_no_direction() -> None:
+    assert direction_of(RIG, 5.0, 5.0, 0.1) is None
+
+
+@pytest.fixture(scope="module")
+def runs() -> list[tuple[float, float, float, float]]:
+    """NEES and pull of q after a stroke, then after a drive towards the target, for each run."""
+    rows = []
+    for number in range(RUNS):
+        run = Approach(number)
+        belief = stroked(run, 0.42, 6)
+        after = belief.nees(run.place()), pull(belief, run.place())
+        for k in range(10):
+            step(run, belief, *((0.04, 0.04) if k % 3 else (0.02, 0.05)))
+        rows.append((*after, belief.nees(run.place()), pull(belief, run.place())))
+    return rows
+
+
+def pull(belief: TargetBelief, place: Array) -> float:
+    return float((belief.mean[2] - 1 / math.hypot(place[0], place[1])) / math.sqrt(belief.covariance[2, 2]))
+
+
+def test_beliefs_are_consistent_after_a_stroke_and_after_a_drive(runs) -> None:
+    low, high = band(RUNS)
+    for column in (0, 2):
+        mean = np.mean([row[column] for row in runs])
+        assert low < mean < high
+        # standard deviations stated twice too small or too large would leave the band
+        assert not low < mean * 4 < high
+        assert not low < mean / 4 < high
+
+
+def test_a_stroke_gives_the_depth_that_triangulation_gives() -> None:
+    """Four of its own standard deviations: a false alarm in 16 000; triangulation of exact pixels gives the truth."""
+    run = Approach(3)
+    belief = stroked(run, 0.42, 6)
+    D = math.hypot(*run.place()[:2])
+    assert abs(belief.distance_m - D) < 4 * belief.distance_sigma_m
+    assert belief.distance_sigma_m < 0.02 * D
+    down, up = (image_of(RIG.at(h), run.point - [VEHICLE.sensor_x_m, 0, 0]).uv_px for h in (0.0, 0.42))
+    assert depth_exact(RIG, 0.42, down, up).depth_m == pytest.approx(D, rel=1e-9)
+
+
+def test_driving_alone_gives_depth_but_no_better_than_the_slip_is_known() -> None:
+    """Motion stereo: D scales with the way driven, whose scale is known to sigma_slip / (1 - slip)."""
+    shares = []
+    for number in (1, 5, 7):
+        run = Approach(number)
+        first = run.look()
+        assert first is not None
+        belief = TargetBelief(RIG, VEHICLE, first, 0.0)
+        start = belief.distance_sigma_m / belief.distance_m
+        for _ in range(20):
+            step(run, belief, 0.03, 0.03)
+        shares.append(belief.distance_sigma_m / belief.distance_m)
+        assert shares[-1] < 0.35 * start
+        assert abs(belief.distance_m - math.hypot(*run.place()[:2])) < 4 * belief.distance_sigma_m
+    floor = VEHICLE.slip_sigma / (1 - VEHICLE.slip)
+    # what is left of the way scales with the slip: (D - way) / D of nothing less than the floor
+    assert min(shares) > 0.8 * floor
+
+
+def test_a_lifted_robot_sees_the_same_place() -> None:
+    """Flippers tilt the stroke axis by 8 degrees: with the attitude given, the belief stays consistent."""
+    run = Approach(4)
+    belief = stroked(run, 0.42, 6)
+    run.flipper_rad = -1.0
+    for _ in range(5):
+        step(run, belief, 0.0, 0.0)
+    assert belief.nees(run.place()) < chi2.ppf(1 - 1e-4, 3)
+    seen = run.look()
+    assert seen is not None
+    belief.predict(0.0, 0.0, 0.1)
+    assert belief.distance2(seen, run.stroke_m, run.held) < chi2.ppf(1 - 1e-4, 2)
+    assert belief.distance2(seen, run.stroke_m) > 1e3  # as if the robot were level
+
+
+# -- moving targets ----------------------------------------------------------------------------------------------------
+
+MOVING = 0.01  # m2/s3: the speed changes by 0.1 m/s in a second
+
+
+def moved(number: int, seconds: float = 6.0) -> tuple[float, float, float, float]:
+    """NEES, and relative errors of D by belief and by the last pair, and the latter's claim, of a target on its way."""
+    run = Approach(number)
+    side = np.array([-run.normal[1], run.normal[0], 0.0])
+    velocity = (
+        0.25 * run.rng.choice([-1.0, 1.0]) * side
+        + 0.05 * run.rng.standard_normal(3) * [0, 0, 1]
+        + (0.15 * run.rng.choice([-1.0, 1.0]) * run.normal)
+    )
+    first = run.look()
+    assert first is not None
+    belief, pairs = TargetBelief(RIG, VEHICLE, first, 0.0, acceleration_m2_per_s3=MOVING), PairTracker(RIG)
+    for k in range(round(10 * seconds)):
+        kick, rest = math.sqrt(MOVING * 0.1) * run.rng.standard_normal((2, 3))
+        # the integral of a velocity that walks randomly: half of its step, and a part of its own
+        run.point = run.point + 0.1 * (velocity + 0.5 * kick + rest / math.sqrt(12))
+        velocity = velocity + kick
+        run.stroke_m = 0.21 * (1 - math.cos(0.2 * math.pi * k / 2))  # up and down in two seconds
+        belief.predict(0.0, 0.0, 0.1)
+        read = run.read()
+        if read is None:
+            continue
+        seen = direction_of(RIG, read.u_px, read.v_px, read.sigma_px)
+        assert seen is not None
+        belief.update(seen, run.stroke_m)
+        pairs.update(read, run.stroke_m)
+    D = math.hypot(*run.place()[:2])
+    return belief.nees(run.place()), belief.distance_m / D - 1, pairs.distance_m / D - 1, pairs.distance_sigma_m / D
+
+
+@pytest.fixture(scope="module")
+def moves() -> list[tuple[float, float, float, float]]:
+    return [moved(number) for number in range(12)]
+
+
+def test_a_moving_target_is_tracked_and_two_frames_are_not_enough(moves) -> None:
+    """The last pair takes the motion between its frames for depth: wrong by much more than it claims."""
+    nees, belief, pair, claim = np.array(moves).T
+    low, high = band(len(moves))
+    assert low < nees.mean() < high
+    pair = np.where(np.isfinite(pair), pair, -1.0)  # rays that do not meet
+    assert np.sqrt(np.mean(belief**2)) < 0.5 * np.sqrt(np.mean(pair**2))
+    assert np.nanmedian(np.abs(pair / claim)) > 5
+
+
+@pytest.mark.slow
+def test_tracking_accuracy_over_many_runs(capsys) -> None:
+    """NEES within its 95 % band, at rest and moving: bands of 5 % false alarm each, at fixed streams."""
+    n = 120
+    rows = []
+    for number in range(1000, 1000 + n):
+        run = Approach(number)
+        belief = stroked(run, 0.42, 6)
+        after = belief.nees(run.place())
+        for k in range(12):
+            step(run, belief, *((0.04, 0.04) if k % 3 else (0.02, 0.05)))
+        rows.append((after, belief.nees(run.place()), moved(number)[0]))
+    low, high = chi2.ppf([0.025, 0.975], 3 * n) / n
+    means = np.mean(rows, axis=0)
+    with capsys.disabled():
+        print(f"NEES of {n} runs after a stroke, a drive, moving: {means.round(2)}; 95 % band {low:.2f} to {high:.2f}")
+    assert np.all((low < means) & (means < high))

@@ -1,0 +1,90 @@
+"""Robots that look at a target, stroke and drive: what tests of beliefs share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+
+from phibench.estimator.loop.belief import Direction, TargetBelief, direction_of
+from phibench.estimator.loop.sensing import SEEN, Light, Reading, Sensing
+from phibench.scenes.motion.vehicle import PlanarPose, Stance, Vehicle, rig_placement, stance
+from phibench.scenes.random_streams import generator
+from phibench.scenes.rig import Rig
+
+RIG, VEHICLE = Rig(), Vehicle()
+
+
+@lru_cache(maxsize=1)
+def sensing() -> Sensing:
+    return Sensing(RIG)
+
+
+@dataclass
+class Approach:
+    """One run: a target between 1.2 and 4.5 m, drawn by its number, and a robot whose slip is drawn as well."""
+
+    number: int
+    flipper_rad: float = 0.0
+    pose: PlanarPose = field(default_factory=PlanarPose)
+    stroke_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.rng = generator("test", "approach", self.number)
+        D, a, z = self.rng.uniform((1.2, -0.4, 0.2), (4.5, 0.4, 1.1))
+        self.point = np.array([VEHICLE.sensor_x_m + D * math.cos(a), D * math.sin(a), z])
+        self.normal = -np.array([math.cos(a), math.sin(a), 0.0])
+        self.slip = VEHICLE.slip + VEHICLE.slip_sigma * self.rng.standard_normal()
+        self.skid = VEHICLE.skid + VEHICLE.skid_sigma * self.rng.standard_normal()
+
+    @property
+    def held(self) -> Stance:
+        return stance(VEHICLE, self.pose, self.flipper_rad)
+
+    def place(self) -> np.ndarray:
+        """True place in the rig's frame made level."""
+        R, t = rig_placement(VEHICLE, self.pose, Stance())
+        return (self.point - t) @ R
+
+    def read(self) -> Reading | None:
+        placement = rig_placement(VEHICLE, self.pose, self.held)
+        for exposure in (4, 3, 2, 1, 0):
+            light = Light(self.point, self.normal, 1.0)
+            (read,) = sensing().read([light], placement, self.stroke_m, exposure, None, self.rng)
+            if read.cause == SEEN:
+                return read
+        return None
+
+    def look(self) -> Direction | None:
+        read = self.read()
+        return None if read is None else direction_of(RIG, read.u_px, read.v_px, read.sigma_px)
+
+    def drive(self, left: float, right: float) -> None:
+        noise = self.rng.standard_normal(2)
+        true = [w + math.sqrt(VEHICLE.track_variance_m2(w)) * z for w, z in zip((left, right), noise, strict=True)]
+        self.pose = self.pose.after(VEHICLE.arc(*true, self.slip, self.skid))
+
+
+def stroked(run: Approach, to_m: float, frames: int, moving: float = 0.0) -> TargetBelief:
+    """Belief after a stroke with frames on its way."""
+    first = run.look()
+    assert first is not None
+    belief = TargetBelief(RIG, VEHICLE, first, 0.0, acceleration_m2_per_s3=moving)
+    for k in range(frames):
+        run.stroke_m = to_m * (k + 1) / frames
+        step(run, belief, 0.0, 0.0)
+    return belief
+
+
+def step(
+    run: Approach, belief: TargetBelief, left: float, right: float, seen: Callable[[], bool] = lambda: True
+) -> None:
+    belief.predict(left, right, 0.1)
+    if left or right:
+        run.drive(left, right)
+    direction = run.look() if seen() else None
+    if direction is not None:
+        belief.update(direction, run.stroke_m, run.held if run.flipper_rad else None)
