@@ -46,6 +46,12 @@ class SensorCard:
         Of "table"; straight lines join them.
     denoise_luma, denoise_chroma : float
         Share d of the blur in x + d (blur x - x), on Y' and on Cb, Cr, after the unsharp mask.
+    denoise_reach_px : int
+        Of the blur in Y': 1 is (1 2 1)/4, 2 is (1 4 6 4 1)/16.
+    denoise_vertical : float
+        Share v of that blur along columns: v (blur) + (1 - v) (no blur).
+    denoise_threshold_codes : float or None
+        T: a difference d of Y' counts as d exp(-d^2 / 2 T^2) in the blur; as d if T is None.
     ycbcr_range : "full" or "limited"
         Of "yuyv", BT.601: Y' on 0 to 255, or on 16 to 235.
     chroma_taps : 3 floats
@@ -76,6 +82,9 @@ class SensorCard:
     transfer_points: tuple[tuple[float, float], ...] | None = None
     denoise_luma: float = 0.0
     denoise_chroma: float = 0.0
+    denoise_reach_px: int = 1
+    denoise_vertical: float = 1.0
+    denoise_threshold_codes: float | None = None
     ycbcr_range: Literal["full", "limited"] = "full"
     chroma_taps: tuple[float, float, float] = (0.25, 0.5, 0.25)
 

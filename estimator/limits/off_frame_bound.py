@@ -37,6 +37,7 @@ from phibench.estimator.processed.chain_model import (
     chain_model,
     code_slopes,
     codes,
+    excess_variance,
     noise_factor,
     raw_variance_e2,
 )
@@ -193,7 +194,7 @@ def _readings(model: ChainModel, mean_e: Array) -> _Readings:
     cut = cut_pixels(mean_e, raw_variance_e2(model, mean_e), model.card.saturation_e)
     at = codes(model, cut.mean_e)
     factor = noise_factor(model, at, cut.variance_e2, model.transform)
-    rest = at.excess @ model.squares + model.rounding
+    rest = excess_variance(model, at, model.transform) + model.rounding
     return _Readings(at, cut.slope, factor, rest, at.mean @ model.transform + model.shift)
 
 

@@ -7,7 +7,8 @@ The stages, for a window of the image (of MJPEG whole units) and the raw pixels 
 * tone curve: mean and slope under the noise, from the converter's law (`mean_codes`), or, where a colour matrix mixes
   the pixels, of a Gaussian value (`noisy_code`);
 * sharpening, denoising and what the output adds, a matrix T: nothing for srgb8; Y', Cb, Cr and their 4:2:2 for yuyv;
-  Y, Cb, Cr, chroma averages and DCT for mjpeg.
+  Y, Cb, Cr, chroma averages and DCT for mjpeg;
+* denoising that spares edges: its changes of Y' are values beside the codes (`edge_sparing`), which T adds.
 
 The outputs are what is then quantised: codes in steps of 1, or coefficients in those of JPEG's tables. Covariance:
 (T D A) V (T D A)^T with the slopes D, plus what rounding adds.
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.processed.neighbour_filters import EdgeSparing, denoise_margin_px, edge_sparing, neighbours
 from phibench.estimator.spots.camera_codes import noisy_code, ycbcr_transform
 from phibench.estimator.spots.image_planes import full_scale_e
 from phibench.estimator.spots.jpeg_coefficients import (
@@ -40,7 +42,6 @@ from phibench.scenes.frames import Array
 
 _UNITS = 2  # a window of JPEG holds 2 x 2 units: the spot is at least half a unit from its sides
 _SIDE_PX = 12  # of other windows: the spot is at least 5 px from its sides, and 18 px would tell 0.1 % more
-_LUMA = YCC_FROM_RGB[0]
 _ROUNDING = 1.0 / 12.0  # variance of rounding to whole codes: uniform over one code
 UNIT_MATRIX = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -66,8 +67,10 @@ class ChainModel:
         Colour and number of the pixels that a value is the mean of, as rows of the tables.
     tables : MeanCodes or None
         None where a colour matrix mixes the pixels.
-    transform, squares : shape (3 p, n)
-        From codes to outputs, and the squares of its elements.
+    sparing : EdgeSparing or None
+        Changes of Y' by denoising that spares edges, q of them; None where denoising is linear, and q is 0.
+    transform : shape (3 p + q, n)
+        From codes, and changes of Y', to outputs.
     step : shape (n,)
         Of the quantiser.
     shift : shape (n,)
@@ -85,8 +88,8 @@ class ChainModel:
     squared: sparse.csr_array
     kinds: NDArray[np.int64]
     tables: MeanCodes | None
+    sparing: EdgeSparing | None
     transform: Array
-    squares: Array
     step: Array
     shift: Array
     rounding: Array
@@ -94,24 +97,27 @@ class ChainModel:
 
 @dataclass(frozen=True)
 class Codes:
-    """Mean codes of one raw mean, and how they change; p values of a plane, three planes.
+    """Mean codes of one raw mean, and how they change; p values of a plane, three planes, and q changes of Y'.
 
     Attributes
     ----------
-    mean : shape (..., 3 p), codes
+    mean : shape (..., 3 p + q), codes
     by_mean : shape (..., 3 p), change of the mean code with that of the linear light, codes per unit of full scale
     regression : shape (..., 3 p), change of a drawn code with that of the drawn light
     excess : shape (..., 3 p), variance of the codes that the regression leaves
+    smoothing : shape (..., k, q), change of a change of Y' with each of k differences; None for q = 0
     """
 
     mean: Array
     by_mean: Array
     regression: Array
     excess: Array
+    smoothing: Array | None = None
 
     def one(self, index: int) -> Codes:
         """Codes of one of the means."""
-        return Codes(self.mean[index], self.by_mean[index], self.regression[index], self.excess[index])
+        parts = (self.mean, self.by_mean, self.regression, self.excess)
+        return Codes(*(x[index] for x in parts), None if self.smoothing is None else self.smoothing[index])
 
 
 @lru_cache(maxsize=8)
@@ -125,7 +131,7 @@ def chain_model(card: SensorCard, noise: PixelNoise) -> ChainModel:
         Without the converter's rounding.
     """
     h, w = window_px(card)
-    mixed = (card.sharpen_amount > 0.0) + _denoised(card)
+    mixed = (card.sharpen_amount > 0.0) + denoise_margin_px(card)
     # R, G, B are whole codes before JPEG; those that sharpening or denoising mix are rounded after it
     whole = card.output == "mjpeg" and not mixed and card.colour_matrix == UNIT_MATRIX
     output = _output((h, w), card, whole)
@@ -133,11 +139,16 @@ def chain_model(card: SensorCard, noise: PixelNoise) -> ChainModel:
     margin, outer = grown + 1, (h + 2 * grown, w + 2 * grown)
     filters = bayer_filters(np.array([[margin % 2, margin % 2]]), (outer[0] + 2, outer[1] + 2))[0]
     linear = _linear(card, outer, margin)
-    T = np.ascontiguousarray((_neighbours(outer, card).T @ output.transform.T).toarray())
+    sharp, smooth = neighbours(outer, card)
+    T = ((smooth @ sharp).T @ output.transform.T).toarray()
+    sparing = edge_sparing(sharp, outer, card)
+    if sparing is not None:  # R, G and B change by what Y' does
+        same = sparse.kron(np.ones((3, 1)), sparse.eye_array(len(sparing.centre)))
+        T = np.vstack([T, card.denoise_luma * (output.transform @ same).toarray().T])
     tables = mean_codes(card, noise, whole) if card.colour_matrix == UNIT_MATRIX else None
     kinds = _kinds(filters)
-    parts = (T, T * T, output.step, output.shift, output.rounding)
-    return ChainModel(card, noise, (h, w), margin, filters, linear, linear.power(2), kinds, tables, *parts)
+    parts = (np.ascontiguousarray(T), output.step, output.shift, output.rounding)
+    return ChainModel(card, noise, (h, w), margin, filters, linear, linear.power(2), kinds, tables, sparing, *parts)
 
 
 def window_px(card: SensorCard) -> tuple[int, int]:
@@ -150,6 +161,23 @@ def window_px(card: SensorCard) -> tuple[int, int]:
 
 def codes(model: ChainModel, mean_e: Array) -> Codes:
     """Mean codes and their slopes for means of the raw pixels, shape (..., r), electrons."""
+    at = _codes(model, mean_e)
+    if model.sparing is None:
+        return at
+    flat, noise_e = at.mean.reshape(-1, at.mean.shape[-1]), np.sqrt(raw_variance_e2(model, mean_e))
+    regression, noise_e = (x.reshape(len(flat), -1) for x in (at.regression, noise_e))
+    parts = [
+        model.sparing.means(mean, _spread(model, slope, sigma_e))
+        for mean, slope, sigma_e in zip(flat, regression, noise_e, strict=True)
+    ]
+    lead = at.mean.shape[:-1]
+    change, smoothing = (np.stack(x) for x in zip(*parts, strict=True))
+    mean = np.concatenate([at.mean, change.reshape(*lead, -1)], axis=-1)
+    return Codes(mean, at.by_mean, at.regression, at.excess, smoothing.reshape(*lead, *smoothing.shape[1:]))
+
+
+def _codes(model: ChainModel, mean_e: Array) -> Codes:
+    """Codes of R, G, B alone."""
     linear = _apply(model.linear, mean_e)
     if model.tables is None:
         sigma = np.sqrt(_apply(model.squared, raw_variance_e2(model, mean_e)))
@@ -169,8 +197,14 @@ def raw_variance_e2(model: ChainModel, mean_e: Array) -> Array:
 
 
 def code_slopes(model: ChainModel, at: Codes, derivatives: Array) -> Array:
-    """Derivatives of the mean codes, shape (..., k, 3 p), from those of the raw pixels, shape (..., k, r)."""
-    return at.by_mean[..., None, :] * _apply(model.linear, derivatives)
+    """Derivatives of `Codes.mean`, shape (..., k, 3 p + q), from those of the raw pixels, shape (..., k, r)."""
+    slopes = at.by_mean[..., None, :] * _apply(model.linear, derivatives)
+    if model.sparing is None or at.smoothing is None:
+        return slopes
+    if slopes.ndim == 2:
+        return np.concatenate([slopes, model.sparing.changes(at.smoothing, slopes)], axis=-1)
+    each = [model.sparing.changes(a, b) for a, b in zip(at.smoothing, slopes, strict=True)]
+    return np.concatenate([slopes, np.stack(each)], axis=-1)
 
 
 def noise_factor(model: ChainModel, at: Codes, variance_e2: Array, transform: Array) -> Array:
@@ -180,10 +214,29 @@ def noise_factor(model: ChainModel, at: Codes, variance_e2: Array, transform: Ar
     ----------
     at : Codes, of one window
     variance_e2 : shape (r,)
-    transform : shape (3 p, n), of those coefficients
+    transform : shape (3 p + q, n), of those coefficients
     """
-    spread = sparse.diags_array(at.regression) @ model.linear @ sparse.diags_array(np.sqrt(variance_e2))
-    return np.asarray(sparse.csr_array(spread.T) @ transform)
+    spread = _spread(model, at.regression, np.sqrt(variance_e2))
+    return np.asarray(sparse.csr_array(spread.T) @ _of_codes(model, at, transform))
+
+
+def excess_variance(model: ChainModel, at: Codes, transform: Array) -> Array:
+    """Variance of outputs, shape (n,), by what the regression of the codes leaves; one window; as `noise_factor`."""
+    T = _of_codes(model, at, transform)
+    return np.asarray(np.einsum("p,pn,pn->n", at.excess, T, T))
+
+
+def _spread(model: ChainModel, regression: Array, sigma_e: Array) -> sparse.csr_array:
+    """Matrix from noise of variance 1 of the raw pixels to the codes, shape (3 p, r)."""
+    return sparse.csr_array(sparse.diags_array(regression) @ model.linear @ sparse.diags_array(sigma_e))
+
+
+def _of_codes(model: ChainModel, at: Codes, transform: Array) -> Array:
+    """Outputs by codes of R, G, B, shape (3 p, n), the changes of Y' included."""
+    if model.sparing is None or at.smoothing is None:
+        return transform
+    count = len(at.by_mean)
+    return np.asarray(transform[:count] + model.sparing.matrix(at.smoothing).T @ transform[count:])
 
 
 def _apply(matrix: sparse.csr_array, values: Array) -> Array:
@@ -227,37 +280,6 @@ def _interpolation(h: int, w: int, margin: int, colour: int) -> sparse.csr_array
             columns += [a * (w + 2) + b for a, b in near]
             values += [1.0 / len(near)] * len(near)
     return sparse.csr_array((values, (rows, columns)), shape=(h * w, (h + 2) * (w + 2)))
-
-
-def _denoised(card: SensorCard) -> bool:
-    return max(card.denoise_luma, card.denoise_chroma) > 0.0
-
-
-def _neighbours(outer: tuple[int, int], card: SensorCard) -> sparse.csr_array:
-    """Unsharp mask, then denoising, of three planes; each leaves a pixel less on all sides; the unit matrix without."""
-    (h, w), matrix = outer, sparse.csr_array(sparse.eye_array(3 * outer[0] * outer[1]))
-    if card.sharpen_amount > 0.0:
-        blur, cut = _blur_and_cut(h, w)
-        sharp = (1.0 + card.sharpen_amount) * cut - card.sharpen_amount * blur
-        matrix, h, w = sparse.csr_array(sparse.kron(sparse.eye_array(3), sharp)), h - 2, w - 2
-    if _denoised(card):
-        blur, cut = _blur_and_cut(h, w)
-        luma = sparse.csr_array(np.tile(_LUMA, (3, 1)))
-        chroma = sparse.kron(sparse.eye_array(3), cut + card.denoise_chroma * (blur - cut))
-        smooth = chroma + (card.denoise_luma - card.denoise_chroma) * sparse.kron(luma, blur - cut)
-        matrix = sparse.csr_array(smooth @ matrix)
-    return matrix
-
-
-def _blur_and_cut(h: int, w: int) -> tuple[sparse.csr_array, sparse.csr_array]:
-    """Binomial blur of a plane and the plane itself, both without its outermost pixels."""
-    blur, cut = (sparse.kron(_band(h, weights), _band(w, weights)) for weights in ((0.25, 0.5, 0.25), (0.0, 1.0, 0.0)))
-    return sparse.csr_array(blur), sparse.csr_array(cut)
-
-
-def _band(size: int, weights: tuple[float, float, float]) -> sparse.csr_array:
-    """Filter of three taps, shape (size - 2, size)."""
-    return sparse.csr_array(sparse.diags_array(weights, offsets=(0, 1, 2), shape=(size - 2, size)))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.processed.chain_model import ChainModel, codes, noise_factor, raw_variance_e2, window_px
+from phibench.estimator.processed.chain_model import (
+    ChainModel,
+    codes,
+    excess_variance,
+    noise_factor,
+    raw_variance_e2,
+    window_px,
+)
 from phibench.estimator.processed.interval_fit import fit_intervals
 from phibench.estimator.processed.quasi_score import Window, WindowFit, fit_window
 from phibench.estimator.spots.camera_codes import ycbcr_codes
@@ -124,7 +131,8 @@ def _room(region: Region, chain: ChainModel, row: int, column: int, background_e
     mean_e = np.maximum(background_e.ravel(), 0.0)
     at = codes(chain, mean_e)
     F = noise_factor(chain, at, raw_variance_e2(chain, mean_e), chain.transform)
-    sigma = np.sqrt(np.einsum("rn,rn->n", F, F) + at.excess @ chain.squares + chain.rounding)
+    rest = excess_variance(chain, at, chain.transform) + chain.rounding
+    sigma = np.sqrt(np.einsum("rn,rn->n", F, F) + rest)
     return room_variance(found, chain.step, hidden_share(sigma / chain.step, count))
 
 

@@ -19,7 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from phibench.estimator.processed.chain_model import ChainModel, code_slopes, codes, noise_factor, raw_variance_e2
+from phibench.estimator.processed.chain_model import (
+    ChainModel,
+    code_slopes,
+    codes,
+    excess_variance,
+    noise_factor,
+    raw_variance_e2,
+)
 from phibench.estimator.spots.fisher import limited, scoring_step
 from phibench.estimator.spots.gaussian_spot import SpotPixels
 from phibench.estimator.spots.jpeg_coefficients import quantised, step_correlation
@@ -43,7 +50,6 @@ class Rows:
 
     index: NDArray[np.int64]
     transform: Array
-    squares: Array
     step: Array
     shift: Array
     rounding: Array
@@ -51,7 +57,7 @@ class Rows:
     @classmethod
     def all(cls, model: ChainModel) -> Rows:
         """All coefficients of a model."""
-        names = ("transform", "squares", "step", "shift", "rounding")
+        names = ("transform", "step", "shift", "rounding")
         return cls(np.arange(len(model.step)), *(getattr(model, name) for name in names))
 
     def part(self, index: NDArray[np.int64]) -> Rows:
@@ -176,7 +182,8 @@ class Window:
         extra = raw.slope[0] ** 2 * (self.extra_e2 + self._pattern_e2(theta))
         F = noise_factor(model, at, raw.variance_e2[0] + extra, rows.transform)
         room = np.broadcast_to(self.room, len(model.step))[rows.index]
-        sigma = np.sqrt(np.einsum("rn,rn->n", F, F) + at.excess @ rows.squares + rows.rounding + room)
+        rest = excess_variance(model, at, rows.transform) + rows.rounding + room
+        sigma = np.sqrt(np.einsum("rn,rn->n", F, F) + rest)
         output = quantised(at.mean @ rows.transform + rows.shift, sigma, rows.step)
         variance = np.maximum(output.variance, _LEAST * rows.step**2)
         slope = output.slope
@@ -209,7 +216,7 @@ class Window:
         shared = raw.slope[0] ** 2 * (self.extra_e2 + self._pattern_e2(theta))
         pattern = raw.slope[0] ** 2 * (model.noise.prnu * np.maximum(raw.mean_e[0], 0.0)) ** 2
         changing = np.maximum(raw.variance_e2[0] - pattern, 0.0)
-        white = at.one(0).excess @ model.squares + model.rounding
+        white = excess_variance(model, at.one(0), model.transform) + model.rounding
         F = noise_factor(model, at.one(0), shared + pattern + changing / self.frames, model.transform)
         mean = at.one(0).mean @ model.transform + model.shift
         spread = white

@@ -37,6 +37,7 @@ from phibench.render.sensor.processing import (
     MCU_PX,
     colour_corrected,
     compressed,
+    denoise_margin_px,
     eight_bit,
     encoded,
     linear_rgb,
@@ -141,7 +142,7 @@ class Chain:
         """Pixels of the mosaic that the processed pixels of `region` depend on, red first."""
         s = self.sensor
         # demosaicing, unsharp mask, denoising, and the chroma's column to the left of a pair
-        margin = 1 + (s.sharpen_amount > 0.0) + (max(s.denoise_luma, s.denoise_chroma) > 0.0)
+        margin = 1 + (s.sharpen_amount > 0.0) + denoise_margin_px(s)
         pair = 2 if s.output == "yuyv" else 0
         return region.grown(size, (2, 2), (margin, margin + pair))
 

@@ -80,16 +80,56 @@ def sharpened(planes: Array, amount: float) -> Array:
     return planes + planes.dtype.type(amount) * (planes - _blurred(planes))
 
 
-def denoised(planes: Array, luma: float, chroma: float) -> Array:
-    """R, G, B whose Y', and Cb and Cr, are x + share (blur x - x), each with its own share; blur as in `sharpened`."""
-    if luma == chroma == 0.0:
-        return planes
+def denoised(planes: Array, sensor: Sensor) -> Array:
+    """R, G, B whose Cb and Cr are x + share (blur x - x), blur as in `sharpened`, and whose Y' is smoothed by itself.
+
+    Y' of pixel i changes by share x the sum of b_j f(Y'_j - Y'_i) over the pixels j of a binomial blur with the weights
+    b; f(d) = d exp(-d^2 / 2 T^2) spares edges (P. Perona, J. Malik, IEEE PAMI 12, 629, 1990, eq. 10: one step with more
+    neighbours). Without a threshold T it is the blur.
+    """
+    result, of = planes, planes.dtype.type
+    if sensor.denoise_chroma > 0.0:
+        change = _blurred(planes) - planes
+        result = result + of(sensor.denoise_chroma) * (change - luma_of(change)[..., None, :, :])
+    if sensor.denoise_luma > 0.0:
+        y = luma_of(planes)
+        result = result + of(sensor.denoise_luma) * _smoothing(y, sensor)[..., None, :, :]
+    return result
+
+
+def denoise_margin_px(sensor: Sensor) -> int:
+    """Pixels on each side that denoising looks at."""
+    return max(sensor.denoise_reach_px * (sensor.denoise_luma > 0.0), int(sensor.denoise_chroma > 0.0))
+
+
+def luma_of(planes: Array) -> Array:
+    """Y', shape (..., H, W)."""
+    r, g, b = (planes[..., i, :, :] for i in range(3))
     of = planes.dtype.type
-    change = _blurred(planes) - planes
-    r, g, b = (change[..., i, :, :] for i in range(3))
-    y = of(LUMA[0]) * r + of(LUMA[1]) * g + of(LUMA[2]) * b
-    # colour differences from Y' have the share of chroma, and Y' its own
-    return planes + of(chroma) * change + of(luma - chroma) * y[..., None, :, :]
+    return np.asarray(of(LUMA[0]) * r + of(LUMA[1]) * g + of(LUMA[2]) * b)
+
+
+_BINOMIAL = {1: (0.25, 0.5, 0.25), 2: (0.0625, 0.25, 0.375, 0.25, 0.0625)}
+
+
+def _smoothing(y: Array, sensor: Sensor) -> Array:
+    """Sum of the weighted differences from the neighbours, those across edges suppressed; shape as `y`."""
+    *lead, h, w = y.shape
+    reach, of = sensor.denoise_reach_px, y.dtype.type
+    taps = np.array(_BINOMIAL[reach])
+    down = sensor.denoise_vertical * taps + (1.0 - sensor.denoise_vertical) * (np.arange(-reach, reach + 1) == 0)
+    p = np.pad(y, [(0, 0)] * len(lead) + [(reach, reach)] * 2, mode="reflect")
+    total = np.zeros_like(y)
+    for i, row in enumerate(down):
+        for j, column in enumerate(taps):
+            if (i, j) == (reach, reach) or row == 0.0:
+                continue
+            difference = p[..., i : i + h, j : j + w] - y
+            if sensor.denoise_threshold_codes is not None:
+                per_t2 = of(-0.5 * (255.0 / sensor.denoise_threshold_codes) ** 2)
+                difference = difference * np.exp(per_t2 * difference * difference)
+            total += of(row * column) * difference
+    return total
 
 
 def _blurred(planes: Array) -> Array:
@@ -145,7 +185,7 @@ def linear_rgb(signal: Array, sensor: Sensor) -> Array:
 def rendered(linear: Array, sensor: Sensor) -> Array:
     """Tone curve, sharpening and denoising: planes, shape (..., 3, H, W), before they are rounded to 8 bits."""
     sharp = sharpened(tone_encoded(linear, sensor), sensor.sharpen_amount)
-    return denoised(sharp, sensor.denoise_luma, sensor.denoise_chroma)
+    return denoised(sharp, sensor)
 
 
 def electrons_from_srgb(image: NDArray[np.uint8], sensor: Sensor) -> Array:
@@ -176,11 +216,10 @@ def yuyv(planes: Array, sensor: Sensor) -> NDArray[np.uint8]:
     """
     black, luma, chroma, least, most = _CODES[sensor.ycbcr_range]
     of = planes.dtype.type
-    r, g, b = (planes[..., i, :, :] for i in range(3))
-    y = of(LUMA[0]) * r + of(LUMA[1]) * g + of(LUMA[2]) * b
+    y = luma_of(planes)
     width = y.shape[-1]
     second = np.empty_like(y)
-    for first, plane, weight in ((0, b, LUMA[2]), (1, r, LUMA[0])):
+    for first, plane, weight in ((0, planes[..., 2, :, :], LUMA[2]), (1, planes[..., 0, :, :], LUMA[0])):
         difference = np.pad(plane - y, [(0, 0)] * (y.ndim - 1) + [(1, 1)], mode="reflect")
         left, middle, right = (of(tap) * difference[..., k : k + width : 2] for k, tap in enumerate(sensor.chroma_taps))
         samples = (left + middle + right) * of(0.5 * chroma / (1.0 - weight)) + of(128.0)

@@ -85,7 +85,15 @@ class Sensor(BaseModel):
         default=None, description="with 'table': (linear, encoded) pairs that straight lines join"
     )
     sharpen_amount: float = Field(ge=0.0, le=4.0, description="gain of the unsharp mask")
-    denoise_luma: float = Field(ge=0.0, le=1.0, description="share of the 3 x 3 binomial blur in Y'")
+    denoise_luma: float = Field(ge=0.0, le=1.0, description="share of a binomial blur in Y'")
+    denoise_reach_px: int = Field(ge=1, le=2, description="reach of that blur: 1 is 3 x 3, 2 is 5 x 5")
+    denoise_vertical: float = Field(ge=0.0, le=1.0, description="share of that blur from row to row; 0 is rows only")
+    denoise_threshold_codes: float | None = Field(
+        default=None,
+        ge=1.0,
+        le=1000.0,
+        description="differences of Y' far above are edges, which that blur spares; none is spared if not given",
+    )
     denoise_chroma: float = Field(ge=0.0, le=1.0, description="share of the 3 x 3 binomial blur in Cb and Cr")
     ycbcr_range: Literal["full", "limited"] = Field(description="quantisation range of the output 'yuyv'")
     chroma_taps: Taps = Field(description="weights of columns 2k - 1, 2k, 2k + 1 in chroma sample k of 'yuyv'")

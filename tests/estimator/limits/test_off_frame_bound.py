@@ -126,7 +126,7 @@ def test_jpeg_bound_is_that_of_explicit_unknowns(counts: tuple[int, int], steps:
         return np.asarray((model.linear.T.toarray() * at.regression) @ T)  # type: ignore[attr-defined]
 
     K, V = by_raw(on), raw_variance_e2(model, mean)
-    rest = [at.excess @ model.squares + model.rounding for at in (on, off)]
+    rest = [at.excess @ model.transform**2 + model.rounding for at in (on, off)]
     output = quantised(on.mean @ T + model.shift, np.sqrt(V @ K**2 + rest[0]), model.step)
     live = output.variance > 2e-3 * model.step**2
     S = (K.T * V) @ K * np.outer(output.slope, output.slope)

@@ -104,12 +104,21 @@ def test_a_grey_room_has_equal_planes_and_its_light() -> None:
         colour_planes(np.zeros((8, 8, 3), np.uint8), card, Box(0, 0, 4, 4))
 
 
+SPARING = {
+    "denoise_luma": 0.9,
+    "denoise_reach_px": 2,
+    "denoise_vertical": 0.7,
+    "denoise_threshold_codes": 20.0,
+}
 CHAINS = {
     "yuyv": YUYV,
     "yuyv limited": YUYV.replace(ycbcr_range="limited", chroma_taps=(0.0, 0.5, 0.5)),
     "yuyv all on": YUYV.replace(
         sharpen_amount=0.4, denoise_luma=0.2, denoise_chroma=0.7, colour_matrix=MATRIX, transfer_function="rec709"
     ),
+    "yuyv edges spared": YUYV.replace(sharpen_amount=0.5, **SPARING),
+    "srgb8 edges spared": sensor("srgb8", denoise_chroma=0.5, **SPARING),
+    "mjpeg edges spared": sensor("mjpeg", jpeg_quality=92, **SPARING),
     "srgb8 sharpened": sensor("srgb8", sharpen_amount=0.5),
     "srgb8 matrix, table": sensor("srgb8", colour_matrix=MATRIX, **TABLE),
     "srgb8 denoised": sensor("srgb8", denoise_luma=0.3, denoise_chroma=0.3),

@@ -136,8 +136,28 @@ def test_denoising_is_a_convolution_of_luma_and_chroma() -> None:
     ycc = np.einsum("ij,jhw->ihw", to_ycc, PLANES)
     mixed = [x + d * (convolve(x, blur, mode="mirror") - x) for x, d in zip(ycc, (0.3, 0.9, 0.9), strict=True)]
     by_hand = np.einsum("ij,jhw->ihw", np.linalg.inv(to_ycc), mixed)
-    np.testing.assert_allclose(processing.denoised(PLANES, 0.3, 0.9), by_hand, rtol=0, atol=2e-6)  # six digits
-    assert processing.denoised(PLANES, 0.0, 0.0) is PLANES
+    s = sensor("yuyv", denoise_luma=0.3, denoise_chroma=0.9)
+    np.testing.assert_allclose(processing.denoised(PLANES, s), by_hand, rtol=0, atol=2e-6)  # six digits
+    assert processing.denoised(PLANES, sensor("yuyv")) is PLANES
+
+
+def test_denoising_spares_edges_and_smooths_the_rest() -> None:
+    """One pixel by hand, from fractions of its 5 x 5 neighbours; a step of ten thresholds stays, noise goes down."""
+    s = sensor("yuyv", denoise_luma=0.8, denoise_reach_px=2, denoise_vertical=0.6, denoise_threshold_codes=20.0)
+    grey = np.repeat(RANDOM.uniform(0.3, 0.5, (1, 9, 9)), 3, axis=0)
+    across = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
+    down = 0.6 * across + np.array([0.0, 0.0, 0.4, 0.0, 0.0])
+    near = grey[0, 2:7, 2:7] - grey[0, 4, 4]
+    wanted = grey[0, 4, 4] + 0.8 * float(down @ (near * np.exp(-0.5 * (255.0 * near / 20.0) ** 2)) @ across)
+    np.testing.assert_allclose(processing.denoised(grey, s)[:, 4, 4], wanted, rtol=1e-6)
+    step = np.broadcast_to(np.where(np.arange(40) < 20, 0.1, 0.9), (3, 30, 40))
+    noisy = step + RANDOM.normal(0.0, 0.01, (1, 30, 40))
+    kept = processing.denoised(noisy, s)[0, :, 3:-3]
+    assert abs(np.diff(kept.mean(axis=0))[16] - 0.8) < 0.01  # between columns 19 and 20
+    # weights of 5 x 5 pixels: the sum of their squares is 0.16 for a share of 0.8 and 0.6 of the blur along columns
+    assert 0.3 < kept[:, :14].std() / 0.01 < 0.5
+    blurred = processing.denoised(noisy, s.replace(denoise_threshold_codes=1000.0))[0, :, 3:-3]
+    assert np.diff(blurred.mean(axis=0)).max() < 0.5
 
 
 TABLES = (tuple(range(3, 67)), tuple(range(70, 134)))
