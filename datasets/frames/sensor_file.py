@@ -52,7 +52,7 @@ class Measured(Document):
 class FitTables(Document):
     """Tables of a sensor file beside the numbers."""
 
-    sigma: dict[str, float] = Field(default_factory=dict)
+    sigma: dict[str, float | list[float]] = Field(default_factory=dict)
     not_determined: dict[str, str] = Field(default_factory=dict)
     measured: dict[str, Measured] = Field(default_factory=dict)
     source: dict[str, str | float | int] = Field(default_factory=dict)

@@ -116,8 +116,8 @@ class Codes:
 
     def one(self, index: int) -> Codes:
         """Codes of one of the means."""
-        parts = (self.mean, self.by_mean, self.regression, self.excess)
-        return Codes(*(x[index] for x in parts), None if self.smoothing is None else self.smoothing[index])
+        smoothing = None if self.smoothing is None else self.smoothing[index]
+        return Codes(self.mean[index], self.by_mean[index], self.regression[index], self.excess[index], smoothing)
 
 
 @lru_cache(maxsize=8)
@@ -236,7 +236,7 @@ def _of_codes(model: ChainModel, at: Codes, transform: Array) -> Array:
     if model.sparing is None or at.smoothing is None:
         return transform
     count = len(at.by_mean)
-    return np.asarray(transform[:count] + model.sparing.matrix(at.smoothing).T @ transform[count:])
+    return np.asarray(transform[:count] + model.sparing.of_codes(at.smoothing, transform[count:]))
 
 
 def _apply(matrix: sparse.csr_array, values: Array) -> Array:

@@ -37,6 +37,8 @@ _STEP_PX = 0.25
 _FINE_PX = 0.08
 _MOST_EDGES = 60
 _BINOMIAL = {0: 0.5, 1: 0.25}
+_TAPS = {1: (0.25, 0.5, 0.25), 2: (0.0625, 0.25, 0.375, 0.25, 0.0625)}
+_THRESHOLD = (2.0, 500.0)  # codes: beyond, an edge does not tell it
 
 
 @dataclass(frozen=True)
@@ -206,18 +208,19 @@ class EdgeModel:
     ----------
     curve, points : tone curve
     mosaic : "placed" (an RGGB mosaic, red at even row and column), "mean" (its mean over the places) or "none"
+    smoothing : denoising that spares edges, or None
     """
 
     curve: Curve
     points: tuple[tuple[float, float], ...] | None = None
     mosaic: Literal["placed", "mean", "none"] = "placed"
+    smoothing: Smoothing | None = None
 
-    def codes(self, edge: Edge, sigma_px: float, sharpness: float, low: float, high: float, shift_px: float) -> Array:
+    def codes(self, edge: Edge, x: EdgeNumbers) -> Array:
         """Codes of the edge's pixels."""
         fine = np.arange(-_REACH_PX - 2.0, _REACH_PX + 2.0, _FINE_PX)
-        dark, bright = decoded_by(self.curve, np.array([low, high]), self.points)
-
-        shares = {(i, j): ndtr((fine + _along(edge, i, j) - shift_px) / sigma_px) for i, j, _ in _TENT}
+        dark, bright = decoded_by(self.curve, np.array([x.low, x.high]), self.points)
+        shares = {(i, j): ndtr((fine + _along(edge, i, j) - x.shift_px) / x.sigma_px) for i, j, _ in _TENT}
 
         def luma(planes: tuple[Offsets, Offsets, Offsets]) -> Array:
             total = np.zeros_like(fine)
@@ -228,22 +231,66 @@ class EdgeModel:
 
         planes = _BY_PLACE if self.mosaic == "placed" else ((_HERE,) * 3 if self.mosaic == "none" else _MEAN,)
         curves = np.stack([luma(each) for each in planes])
-        plain = _looked_up(curves, edge.places, edge.distance_px)
-        if sharpness == 0.0:
-            return plain
-        blurred = sum(
-            w * _looked_up(curves, _neighbour(edge.places, i, j), edge.distance_px + _along(edge, i, j))
-            for i, j, w in _TENT
-        )
-        return np.asarray(plain + sharpness * (plain - blurred))
+        if x.sharpness != 0.0:
+            blurred = sum(w * _moved(curves, fine, edge, i, j) for i, j, w in _TENT)
+            curves = curves + x.sharpness * (curves - blurred)
+        if self.smoothing is not None:
+            curves = curves + self.smoothing.share * sum(
+                w * _spared(_moved(curves, fine, edge, i, j) - curves, x.threshold_codes)
+                for i, j, w in self.smoothing.offsets()
+            )
+        return _looked_up(curves, edge.places, edge.distance_px)
+
+
+@dataclass(frozen=True)
+class Smoothing:
+    """Denoising of Y' as noise has told it: share, reach and share along columns of the binomial blur."""
+
+    share: float
+    reach_px: int = 1
+    vertical: float = 1.0
+
+    def offsets(self) -> Offsets:
+        """Rows and columns of the neighbours, and their weights."""
+        across = np.array(_TAPS[self.reach_px])
+        alone = np.zeros(len(across))
+        alone[self.reach_px] = 1.0
+        down = self.vertical * across + (1.0 - self.vertical) * alone
+        reach = range(-self.reach_px, self.reach_px + 1)
+        weights = np.outer(down, across)
+        return [(i, j, float(weights[i + self.reach_px, j + self.reach_px])) for i in reach for j in reach if i or j]
+
+
+@dataclass(frozen=True)
+class EdgeNumbers:
+    """Numbers of one edge: blur, gain of the unsharp mask, plateaus, place; threshold of denoising, codes."""
+
+    sigma_px: float
+    sharpness: float
+    low: float
+    high: float
+    shift_px: float
+    threshold_codes: float = np.inf
+
+
+def _spared(difference: Array, threshold_codes: float) -> Array:
+    return np.asarray(difference * np.exp(-0.5 * (difference / threshold_codes) ** 2))
+
+
+def _moved(curves: Array, fine: Array, edge: Edge, rows: int, columns: int) -> Array:
+    """Curves of the neighbours of each place."""
+    at = fine + _along(edge, rows, columns)
+    if len(curves) == 1:
+        return np.interp(at, fine, curves[0])[None]
+    return np.stack([np.interp(at, fine, curves[_neighbour(place, rows, columns)]) for place in range(4)])
 
 
 def _along(edge: Edge, rows: int, columns: int) -> float:
     return rows * edge.normal[0] + columns * edge.normal[1]
 
 
-def _neighbour(places: NDArray[np.int64], rows: int, columns: int) -> NDArray[np.int64]:
-    return 2 * ((places // 2 + rows) % 2) + (places + columns) % 2
+def _neighbour(place: int, rows: int, columns: int) -> int:
+    return 2 * ((place // 2 + rows) % 2) + (place + columns) % 2
 
 
 def _looked_up(curves: Array, places: NDArray[np.int64], at: Array) -> Array:
@@ -265,6 +312,8 @@ class EdgeFit:
     measure, measure_sigma : means of rise and overshoot, with standard errors
     edges : number of edges
     profile : mean edge spread function: distances, values
+    threshold_codes : of denoising, with its standard error; None without `EdgeModel.smoothing`, and where denoising
+        spares no edge
     """
 
     sigma_px: float
@@ -275,15 +324,22 @@ class EdgeFit:
     measure_sigma: EdgeMeasure
     edges: int
     profile: tuple[Array, Array]
+    threshold_codes: tuple[float, float] | None = None
 
 
-def fit_edges(edges: list[Edge], model: EdgeModel, free_sharpness: bool = True) -> EdgeFit | str:
-    """Blur and sharpening of all edges, or the reason why they do not tell."""
+def fit_edges(edges: list[Edge], model: EdgeModel, sharpness: float | None = None) -> EdgeFit | str:
+    """Blur and sharpening of all edges, or the reason why they do not tell.
+
+    Parameters
+    ----------
+    sharpness : float, optional
+        Gain of the unsharp mask, if noise has told it; free otherwise.
+    """
     if len(edges) < 5:
         return f"{len(edges)} straight slanted edges found, 5 are needed: turn a printed edge by 5 to 10 degrees"
     # evenly out of all, so that every frame has its share
     chosen = [edges[k] for k in np.unique(np.linspace(0, len(edges) - 1, _MOST_EDGES).astype(int))]
-    found = np.array([_fit_one(edge, model, free_sharpness) for edge in chosen])
+    found = np.array([_fit_one(edge, model, sharpness) for edge in chosen])
     good = np.isfinite(found).all(axis=1)
     found = found[good]
     if len(found) < 5:
@@ -300,21 +356,45 @@ def fit_edges(edges: list[Edge], model: EdgeModel, free_sharpness: bool = True) 
         EdgeMeasure(*map(float, spread)),
         len(found),
         _mean_profile(edges),
+        _threshold(found[:, 2:], centre, error),
     )
 
 
-def _fit_one(edge: Edge, model: EdgeModel, free_sharpness: bool) -> tuple[float, float]:
-    start = np.array([0.8, 0.0, edge.low, edge.high, 0.0])
+def _threshold(each: Array, centre: Array, error: Array) -> tuple[float, float] | None:
+    """Threshold with its standard error; None if it lies beyond what edges tell."""
+    if each.size == 0 or float(np.median(each)) > 0.5 * _THRESHOLD[1]:
+        return None
+    return float(centre[2]), float(error[2])
+
+
+def _fit_one(edge: Edge, model: EdgeModel, sharpness: float | None) -> tuple[float, ...]:
+    """Blur, sharpness, and threshold of one edge; NaN where the fit ends at a bound."""
+    free = sharpness is None
+    start = [0.8, edge.low, edge.high, 0.0, *((0.0,) if free else ()), *((np.log(25.0),) if model.smoothing else ())]
+
+    def numbers(x: Array) -> EdgeNumbers:
+        threshold = float(np.exp(x[-1])) if model.smoothing else np.inf
+        return EdgeNumbers(x[0], x[4] if sharpness is None else sharpness, x[1], x[2], x[3], threshold)
 
     def residuals(x: Array) -> Array:
-        sharpness = x[1] if free_sharpness else 0.0
-        return model.codes(edge, x[0], sharpness, x[2], x[3], x[4]) - edge.codes
+        return model.codes(edge, numbers(x)) - edge.codes
 
-    bounds = ([0.15, -1.0, 0.0, 0.0, -1.5], [4.0, 4.0, 255.0, 255.0, 1.5])
-    scale = np.array([0.1, 0.1, 1.0, 1.0, 0.1])
-    done = least_squares(residuals, np.clip(start, *bounds), bounds=bounds, x_scale=scale, max_nfev=25, loss="soft_l1")
-    at_end = not 0.16 < done.x[0] < 3.9 or abs(done.x[4]) > 1.4
-    return (np.nan, np.nan) if at_end else (float(done.x[0]), float(done.x[1]))
+    low, high = [0.15, 0.0, 0.0, -1.5], [4.0, 255.0, 255.0, 1.5]
+    scale = [0.1, 1.0, 1.0, 0.1]
+    for used, bounds, unit in ((free, (-1.0, 4.0), 0.1), (model.smoothing is not None, np.log(_THRESHOLD), 0.2)):
+        if used:
+            low.append(float(bounds[0]))
+            high.append(float(bounds[1]))
+            scale.append(unit)
+    first = np.clip(np.array(start, float), low, high)
+    done = least_squares(residuals, first, bounds=(low, high), x_scale=scale, max_nfev=25, loss="soft_l1")
+    found = numbers(done.x)
+    wanted = [found.sigma_px, found.sharpness]
+    at_end = not 0.16 < found.sigma_px < 3.9 or abs(found.shift_px) > 1.4
+    if model.smoothing is not None:
+        wanted.append(found.threshold_codes)
+        at_end = at_end or found.threshold_codes < 1.01 * _THRESHOLD[0]
+    return (np.nan,) * len(wanted) if at_end else tuple(map(float, wanted))
 
 
 def _robust(values: Array) -> tuple[Array, Array]:

@@ -7,7 +7,7 @@ the lens from chessboards. Every number comes with its sigma. Numbers of the pre
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,12 +26,14 @@ from phibench.estimator.sensor_fit.capture_folder import (
 )
 from phibench.estimator.sensor_fit.edge_spread import Edge, EdgeFit, EdgeModel, edges_of, fit_edges
 from phibench.estimator.sensor_fit.lens_fit import LensFit, fit_lens
+from phibench.estimator.sensor_fit.noise_levels import stack_level
 from phibench.estimator.sensor_fit.photon_transfer import TransferFit, fit_transfer
-from phibench.estimator.sensor_fit.processed_noise import LUMA, LumaModel, ProcessedNoise, fit_noise, stack_level
+from phibench.estimator.sensor_fit.processed_noise import ProcessedNoise, fit_noise
 from phibench.estimator.sensor_fit.tone_curve import ToneFit, fit_tone
 from phibench.scenes.frames import Array
 
 _NO_FLATS = "needs flat/LEVEL with two frames or more of each level"
+_SCALED = "the camera shrinks these frames by an unknown filter: take frames of the sensor's own size"
 _MJPEG = "MJPEG rounds noise away: take YUYV or raw frames"
 _RGB_OF_YCBCR = np.array([[1.0, 0.0, 1.402], [1.0, -0.344136, -0.714136], [1.0, 1.772, 0.0]])  # BT.601
 
@@ -67,14 +69,14 @@ class _Draft:
     """Sensor file in the making."""
 
     numbers: dict[str, object] = field(default_factory=dict)
-    sigma: dict[str, float] = field(default_factory=dict)
+    sigma: dict[str, float | list[float]] = field(default_factory=dict)
     missing: dict[str, str] = field(default_factory=dict)
     measured: dict[str, Measured] = field(default_factory=dict)
 
-    def take(self, name: str, value: object, sigma: float | None = None) -> None:
+    def take(self, name: str, value: object, sigma: float | tuple[float, ...] | None = None) -> None:
         self.numbers[name] = value
         if sigma is not None:
-            self.sigma[name] = sigma
+            self.sigma[name] = list(sigma) if isinstance(sigma, tuple) else sigma
 
     def measure(self, name: str, value: float, sigma: float, unit: str) -> None:
         self.measured[name] = Measured(value=value, sigma=sigma, unit=unit)
@@ -111,9 +113,17 @@ def fit_sensor(folder: Path) -> SensorFit:
             _take_transfer(draft, capture, transfer)
     else:
         tone = _take_tone(draft, capture)
-        noise = _take_noise(draft, capture, tone)
+        noise = _fit_noise(draft, capture, tone)
         jpeg = _take_jpeg(draft, capture)
-    edges = _take_edges(draft, capture, tone)
+    edges = _fit_edges(draft, capture, tone, noise)
+    if noise is not None:
+        if edges is not None and edges.threshold_codes is not None:
+            # noise shows the blur less what the threshold takes from it
+            noise = fit_noise(list(noise.levels), noise.card, capture.notes.analogue_gain, edges.threshold_codes[0])
+            edges = _fit_edges(draft, capture, tone, noise)
+        _take_noise(draft, capture, noise, edges)
+    if edges is not None:
+        _take_edges(draft, edges)
     lens = _take_lens(draft, capture)
     return SensorFit(capture, draft.file(capture), transfer, tone, noise, edges, lens, jpeg)
 
@@ -157,38 +167,51 @@ def _take_tone(draft: _Draft, capture: Capture) -> ToneFit | None:
     return found
 
 
-def _take_noise(draft: _Draft, capture: Capture, tone: ToneFit | None) -> ProcessedNoise | None:
-    names = ("gain_dn_per_e", "read_noise_e", "prnu", "sharpen_amount")
+def _fit_noise(draft: _Draft, capture: Capture, tone: ToneFit | None) -> ProcessedNoise | None:
+    names = ("gain_dn_per_e", "read_noise_e", "prnu", "sharpen_amount", "white_balance", "denoise_chroma")
     if capture.kind == "mjpeg" or not capture.flats:
         draft.missing |= dict.fromkeys(names, _MJPEG if capture.kind == "mjpeg" else _NO_FLATS)
+        return None
+    if capture.notes.scaled:
+        draft.missing |= dict.fromkeys(names, _SCALED)
         return None
     card = sensor_card(capture.kind)
     levels = []
     for group in capture.flats:
         frames = capture.stack(group)
-        codes = _mean_rgb(frames, capture, card)
-        levels.append(stack_level(group.name, np.stack([luma(one, capture.kind) for one in frames]), codes))
-    bright = [one for one in levels if max(one.codes) < 254.0]
-    if not bright:
+        levels.append(stack_level(group.name, frames, _mean_rgb(frames, capture, card)))
+    if not any(max(one.codes) < 254.0 for one in levels):
         raise CaptureError(f"{capture.folder}: every level of flat/ is saturated; take levels from code 20 to 240")
-    curve, points = (tone.curve, tone.points) if tone is not None else ("srgb", None)
-    scale = 219.0 / 255.0 if capture.kind == "yuyv" and card.ycbcr_range == "limited" else 1.0
-    rounding = (1.0 if capture.kind == "yuyv" else sum(w * w for w in LUMA)) / 12.0
-    model = LumaModel(curve, points, card, scale=scale, rounding=rounding)
-    found = fit_noise(levels, model, capture.notes.analogue_gain)
+    return fit_noise(levels, _toned(card, tone), capture.notes.analogue_gain)
+
+
+def _take_noise(draft: _Draft, capture: Capture, found: ProcessedNoise, edges: EdgeFit | None) -> None:
     for name, value in found.values.items():
-        draft.take(name, value, found.sigmas[name])
+        plain = list(value) if isinstance(value, tuple) else value
+        draft.take(name, plain, found.sigmas.get(name))
     draft.missing |= found.reasons
+    if found.smoothing is not None:
+        draft.take("denoise_reach_px", found.smoothing.reach_px)
+        if edges is not None and edges.threshold_codes is not None:
+            draft.take("denoise_threshold_codes", *edges.threshold_codes)
+        elif edges is None:
+            draft.missing["denoise_threshold_codes"] = "needs edge/: flat frames do not show what is spared"
     if "gain_dn_per_e" in found.values:
+        card = sensor_card(capture.kind)
         _take_end(draft, card.top_dn - card.black_level_dn, capture)
         draft.measure("noise_misfit", found.chi2, 0.0, "mean square of standardised residuals")
     draft.missing |= {
-        "white_balance": "the colours of lamp and surface are not known",
         "dsnu_e": "the tone curve starts at black",
         "black_level_dn": "the tone curve starts at black",
         "full_well_e": "processed frames end at white",
     }
-    return found
+
+
+def _toned(card: SensorCard, tone: ToneFit | None) -> SensorCard:
+    """Card with the measured tone curve."""
+    if tone is None:
+        return card
+    return replace(card, transfer_function=tone.curve, transfer_points=tone.points)
 
 
 def _mean_rgb(frames: Array, capture: Capture, card: SensorCard) -> tuple[float, float, float]:
@@ -226,7 +249,7 @@ def _every_group(capture: Capture) -> list[FrameGroup]:
 # -- edges and lens --------------------------------------------------------------------------------------------------
 
 
-def _take_edges(draft: _Draft, capture: Capture, tone: ToneFit | None) -> EdgeFit | None:
+def _fit_edges(draft: _Draft, capture: Capture, tone: ToneFit | None, noise: ProcessedNoise | None) -> EdgeFit | None:
     groups = [g for g in (capture.edges, capture.chessboards) if g is not None]
     if not groups:
         draft.missing["edge_sigma_px"] = "needs edge/ or chessboard/: straight edges, 2 to 30 degrees from rows"
@@ -236,10 +259,19 @@ def _take_edges(draft: _Draft, capture: Capture, tone: ToneFit | None) -> EdgeFi
         return None
     edges = [edge for group in groups for path in group.files for edge in _edges(capture, path)]
     curve, points = (tone.curve, tone.points) if tone is not None else ("srgb", None)
-    found = fit_edges(edges, EdgeModel(curve, points, "mean" if capture.notes.scaled else "placed"))
+    model = EdgeModel(curve, points, "mean" if capture.notes.scaled else "placed")
+    if noise is not None and noise.smoothing is not None and noise.numbers is not None:
+        found = fit_edges(edges, replace(model, smoothing=noise.smoothing), max(noise.numbers.sharpen, 0.0))
+        if not isinstance(found, str) and found.threshold_codes is not None:
+            return found
+    found = fit_edges(edges, model)
     if isinstance(found, str):
         draft.missing["edge_sigma_px"] = found
         return None
+    return found
+
+
+def _take_edges(draft: _Draft, found: EdgeFit) -> None:
     draft.measure("edge_sigma_px", found.sigma_px, found.sigma_sigma_px, "px")
     draft.measure("edge_sharpen_amount", found.sharpness, found.sharpness_sigma, "1")
     for name, value in vars(found.measure).items():
@@ -249,7 +281,6 @@ def _take_edges(draft: _Draft, capture: Capture, tone: ToneFit | None) -> EdgeFi
         name = "sharpen_amount" if found.sharpness >= 0.0 else "denoise_luma"
         draft.take(name, abs(found.sharpness), found.sharpness_sigma)
         draft.missing.pop("sharpen_amount", None)
-    return found
 
 
 def _edges(capture: Capture, path: Path) -> list[Edge]:

@@ -56,12 +56,18 @@ def numbers_of(found: SensorFit) -> list[tuple[str, str, str]]:
     rows = []
     for name, value in found.file.numbers.items():
         sigma = tables.sigma.get(name)
-        rows.append((name, _text(value), "" if sigma is None else f"{sigma:.2g}"))
+        rows.append((name, _text(value), _sigma(sigma)))
     for name, one in tables.measured.items():
         sigma_text = f"{one.sigma:.2g}" if isinstance(one.sigma, float) and one.sigma > 0.0 else ""
         unit = "" if one.unit == "1" else f" {one.unit}"
         rows.append((f"measured {name}", f"{_text(one.value)}{unit}", sigma_text))
     return rows
+
+
+def _sigma(sigma: float | list[float] | None) -> str:
+    if sigma is None:
+        return ""
+    return ", ".join(f"{one:.2g}" for one in sigma) if isinstance(sigma, list) else f"{sigma:.2g}"
 
 
 def _text(value: object) -> str:
@@ -145,10 +151,12 @@ def _draw_noise(axes: Axes, found: SensorFit) -> None:
     assert found.noise is not None
     levels = found.noise.levels
     codes = [level.codes[1] for level in levels]
-    axes.plot(codes, [np.sqrt(max(float(level.covariance[0, 0]), 0.0)) for level in levels], "k.-", label="rms, codes")
+    main = "Y'" if found.capture.kind == "yuyv" else "R"
+    covariances = [level.planes[0].covariance[0] for level in levels]
+    axes.plot(codes, [np.sqrt(max(float(one[0]), 0.0)) for one in covariances], "k.-", label="rms, codes")
     for column, label in ((1, "correlation beside"), (2, "correlation below")):
-        axes.plot(codes, [float(level.covariance[0, column] / level.covariance[0, 0]) for level in levels], label=label)
-    axes.set(xlabel="green code", title="Noise of Y'")
+        axes.plot(codes, [float(one[column] / one[0]) for one in covariances], label=label)
+    axes.set(xlabel="green code", title=f"Noise of {main}")
     axes.legend(fontsize=8)
 
 

@@ -126,6 +126,26 @@ class Chain:
             raise SensorError(f"image of {light.size[1]} columns: YUYV holds pairs of them, give an even number")
         return yuyv(planes, self.sensor)[region.slices(box)]
 
+    def shrunk_frame(self, light: Light, stream: NoiseStream, factor: int) -> NDArray[np.uint8]:
+        """Whole frame of a camera that shrinks its image, shape (h, w, 3) or (h, w, 2) of "yuyv".
+
+        The light has `factor` times its rows and columns: of the sensor's own pixels.
+
+        Raises
+        ------
+        SensorError
+            If the light's size is no multiple of the factor.
+        """
+        if light.size[0] % factor or light.size[1] % (2 * factor):
+            raise SensorError(f"image of {light.size[1]} x {light.size[0]} pixels: cannot be shrunk {factor} times")
+        raw = self.raw(light, stream, Region.whole(light.size))
+        linear = linear_rgb(linear_signal(raw, self.sensor, np.float32), self.sensor)
+        planes = rendered(linear, self.sensor, factor)
+        if self.sensor.output == "yuyv":
+            return yuyv(planes, self.sensor)
+        image = eight_bit(planes)
+        return compressed(image, self.sensor) if self.sensor.output == "mjpeg" else image
+
     def photo_electrons(self, light: Light, region: Region, gain: float = 1.0) -> Array:
         """Expected photo-electrons of the pixels, shape (h, w), without the fixed pattern."""
         if self.sensor.output == "electrons":

@@ -166,6 +166,12 @@ def tone_decoded(encoded: Array, sensor: Sensor) -> Array:
     return np.where(encoded < 4.5 * _BETA, encoded / 4.5, ((encoded + _ALPHA - 1.0) / _ALPHA) ** (1.0 / 0.45))
 
 
+def shrunk(planes: Array, factor: int) -> Array:
+    """Means over squares of `factor` x `factor` pixels, shape (..., h / factor, w / factor)."""
+    *lead, h, w = planes.shape
+    return np.asarray(planes.reshape(*lead, h // factor, factor, w // factor, factor).mean(axis=(-3, -1)))
+
+
 def eight_bit(planes: Array) -> NDArray[np.uint8]:
     """Image, shape (..., H, W, 3), of planes in [0, 1], rounded and clipped."""
     scaled = np.clip(np.rint(planes * planes.dtype.type(255.0)), 0.0, 255.0).astype(np.uint8)
@@ -182,10 +188,15 @@ def linear_rgb(signal: Array, sensor: Sensor) -> Array:
     return colour_corrected(white_balanced(demosaic(signal), sensor.white_balance), sensor.colour_matrix)
 
 
-def rendered(linear: Array, sensor: Sensor) -> Array:
-    """Tone curve, sharpening and denoising: planes, shape (..., 3, H, W), before they are rounded to 8 bits."""
-    sharp = sharpened(tone_encoded(linear, sensor), sensor.sharpen_amount)
-    return denoised(sharp, sensor)
+def rendered(linear: Array, sensor: Sensor, shrink: int = 1) -> Array:
+    """Tone curve, sharpening and denoising: planes, shape (..., 3, H, W), before they are rounded to 8 bits.
+
+    A camera that sends less pixels than it has shrinks between the tone curve and the unsharp mask.
+    """
+    encoded = tone_encoded(linear, sensor)
+    if shrink > 1:
+        encoded = shrunk(encoded, shrink)
+    return denoised(sharpened(encoded, sensor.sharpen_amount), sensor)
 
 
 def electrons_from_srgb(image: NDArray[np.uint8], sensor: Sensor) -> Array:

@@ -34,7 +34,9 @@ CHAINS |= {
     "yuyv": Chain(sensor("yuyv"), 3, CAMERA),
     "yuyv all on": Chain(sensor("yuyv", sharpen_amount=0.5, **SMOOTH, **ALL_ON), 3, CAMERA),
     "edges spared": Chain(
-        sensor("yuyv", sharpen_amount=0.8, denoise_luma=0.9, denoise_reach_px=2, denoise_threshold_codes=15.0), 3, CAMERA
+        sensor("yuyv", sharpen_amount=0.8, denoise_luma=0.9, denoise_reach_px=2, denoise_threshold_codes=15.0),
+        3,
+        CAMERA,
     ),
     "denoised": Chain(sensor("mjpeg", jpeg_restart_interval=3, **SMOOTH), 3, CAMERA),
 }
