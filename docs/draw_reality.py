@@ -207,7 +207,7 @@ def column(title: str, frames: Sequence[Array], run: Sequence[Array], share: flo
 
 @dataclass(frozen=True)
 class Settings:
-    """What is fitted.
+    """Numbers that are fitted.
 
     Attributes
     ----------

@@ -37,7 +37,7 @@ _HARMONICS = np.arange(1, 6)
 
 @dataclass(frozen=True)
 class Numbers:
-    """What is fitted.
+    """Numbers that are fitted.
 
     Attributes
     ----------
