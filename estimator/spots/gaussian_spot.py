@@ -1,8 +1,9 @@
 """Pixel model of a spot: Gaussians integrated over pixels, with derivatives by position, flux and width.
 
-A spot is an upright Gaussian, sigma along u and another along v, with a mixed second moment to first order. Pixels are
-integrated: point-sampled Gaussians are biased below a blur of 0.5 px (27 mpx at 0.3 px). Positions (u, v) count from
-the centre of a window's first pixel. Fluxes and levels are in electrons.
+A spot is an upright Gaussian, sigma along u and another along v, with a mixed second moment to first order; or several
+such parts side by side, where a mirror draws the lens's aperture to something else. Pixels are integrated:
+point-sampled Gaussians are biased below a blur of 0.5 px (27 mpx at 0.3 px). Positions (u, v) count from the centre of
+a window's first pixel. Fluxes and levels are in electrons.
 """
 
 from __future__ import annotations
@@ -20,6 +21,22 @@ _ROOT_2PI = np.sqrt(2.0 * np.pi)
 
 
 @dataclass(frozen=True)
+class SpotParts:
+    """Equal Gaussians that a spot's image is made of, seen through k points of the lens.
+
+    Attributes
+    ----------
+    offset_px : shape (k, 2) or (n, k, 2), from the chief ray's place
+    weight : shape (k,) or (n, k), with the sum 1
+    blur : SpotBlur, of each part
+    """
+
+    offset_px: Array
+    weight: Array
+    blur: SpotBlur
+
+
+@dataclass(frozen=True)
 class SpotBlur:
     """Second moments of a spot's image, or of n spots' images.
 
@@ -28,11 +45,14 @@ class SpotBlur:
     sigma_px : float or shape (n,), along u
     ratio : float or shape (n,), sigma along v over it
     mixed_px2 : float or shape (n,), mixed moment of u and v
+    parts : SpotParts, optional
+        What the image is made of, where it is no Gaussian; the moments are then those of all parts.
     """
 
     sigma_px: float | Array
     ratio: float | Array = 1.0
     mixed_px2: float | Array = 0.0
+    parts: SpotParts | None = None
 
     @classmethod
     def of(cls, moments_px2: Array) -> SpotBlur:
@@ -50,12 +70,19 @@ class SpotBlur:
         sigma, ratio, mixed = (
             np.broadcast_to(np.asarray(value, float), n) for value in (self.sigma_px, self.ratio, self.mixed_px2)
         )
-        return SpotBlur(sigma, ratio, mixed)
+        if self.parts is None:
+            return SpotBlur(sigma, ratio, mixed)
+        k = self.parts.offset_px.shape[-2]
+        offset, weight = np.broadcast_to(self.parts.offset_px, (n, k, 2)), np.broadcast_to(self.parts.weight, (n, k))
+        return SpotBlur(sigma, ratio, mixed, SpotParts(offset, weight, self.parts.blur.each(n)))
 
     def rows(self, index: NDArray[np.int64]) -> SpotBlur:
         """Blur of some of n spots."""
         sigma, ratio, mixed = (np.asarray(value)[index] for value in (self.sigma_px, self.ratio, self.mixed_px2))
-        return SpotBlur(sigma, ratio, mixed)
+        if self.parts is None:
+            return SpotBlur(sigma, ratio, mixed)
+        offset, weight = self.parts.offset_px[index], self.parts.weight[index]
+        return SpotBlur(sigma, ratio, mixed, SpotParts(offset, weight, self.parts.blur.rows(index)))
 
 
 @dataclass(frozen=True)
@@ -123,10 +150,18 @@ def spot_images(place_px: Array, flux: Array, blur: SpotBlur, shape: tuple[int, 
     place_px : shape (m, 2), (u, v) from the first pixel's centre
     flux : shape (m,)
     blur : SpotBlur
-        Of m spots; the mixed moment kappa enters as kappa d^2/du dv of the upright Gaussian.
+        Of m spots; the mixed moment kappa enters as kappa d^2/du dv of the upright Gaussian. A free width knows no
+        parts.
     shape : (h, w)
     by_width : bool
     """
+    if blur.parts is not None and not by_width:
+        offset, weight = blur.parts.offset_px, blur.parts.weight
+        images = np.zeros((len(place_px), 3, *shape))
+        for k in range(offset.shape[-2]):
+            one = spot_images(place_px + offset[:, k], flux, blur.parts.blur, shape)
+            images += weight[:, k, None, None, None] * one
+        return images
     h, w = shape
     sigma, ratio, mixed = (np.asarray(value) for value in (blur.sigma_px, blur.ratio, blur.mixed_px2))
     across, down = profile(place_px[:, 0], sigma, w), profile(place_px[:, 1], ratio * sigma, h)

@@ -4,6 +4,10 @@ Blur: second moments of lens, defocus with the mirror's astigmatism, and the bea
 4 mm at 1 m adds 0.02 to 0.05 px^2 to 0.5 px^2. A fit that leaves it out is off by up to 0.04 px there, and by 0.01 px
 at 2 m, wherever a Bayer mosaic lets one or two pixels see most of the spot.
 
+A mirror of revolution may draw the aperture to a disc or a streak that is wider than the blur, and bent: a cone, flat
+along its side, to one of 8 px. Its centroid lies beside the chief ray's place: by 0.1 px in a cone, 4 mpx in a
+hyperboloid. There the image is made of parts: what is seen through single points of the lens.
+
 Electrons: radiance times etendue, in closed form. A mirror keeps radiance but for its reflectance rho. A Lambertian
 spot of power P on a wall of albedo a has the radiance integral a P / pi over its area. Its image covers
 |d(u, v) / d(wall)| square pixels per square metre, and a square pixel collects the etendue A cos(alpha) dOmega, alpha
@@ -17,17 +21,19 @@ The aperture is taken as a point; the quadrature over it is the simulator's (`re
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.polynomial.legendre import leggauss
 from numpy.typing import ArrayLike
 
 from phibench.estimator.geometry.mirror_image import MirrorImage, image_of
 from phibench.estimator.geometry.reflection import ON_AXIS_SINE, Reflection, reflect
-from phibench.estimator.spots.gaussian_spot import SpotBlur
-from phibench.scenes.frames import Array
+from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotParts
+from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.laser import Beam
 from phibench.scenes.mirror import SphereMirror
+from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig, View
 
 
@@ -50,10 +56,68 @@ def spot_blur(rig: Rig, uv_px: ArrayLike, depth_m: float | None = None, beam: Be
     """
     camera, view, uv = rig.camera, rig.at(0.0), np.asarray(uv_px, float)
     point = None if depth_m is None else _point_m(view, uv, depth_m)
-    moments = camera.blur_sigma_px**2 * np.eye(2) + _defocus_px2(view, uv, point)
+    of_point = camera.blur_sigma_px**2 * np.eye(2)
     if point is not None and beam is not None and depth_m is not None:
-        moments = moments + _beam_px2(view, point, beam.diameter_m(depth_m))
-    return SpotBlur.of(moments) if np.isfinite(moments).all() else SpotBlur(camera.blur_sigma_px)
+        of_point = of_point + _beam_px2(view, point, beam.diameter_m(depth_m))
+    lens = _defocus_px2(view, uv, point)
+    if not np.isfinite(lens).all():
+        return SpotBlur(camera.blur_sigma_px)
+    whole = SpotBlur.of(of_point + lens)
+    parts = _parts(view, uv, point, lens, of_point) if isinstance(rig.mirror, RevolvedMirror) else None
+    return whole if parts is None else replace(whole, parts=parts)
+
+
+_FAR_M = 100.0  # where a point is whose distance is not known
+_FEWEST, _PER_BLUR = 3, 2.0  # chords of the lens: exp(i k x) with k = 2 / blur over a disc of so many blurs
+
+
+def _parts(view: View, uv_px: Array, point_m: Array | None, lens_px2: Array, of_point_px2: Array) -> SpotParts | None:
+    """Images of a point through single points of the lens; None where one of them does not see the mirror.
+
+    Chords across the longer axis of the aperture's image, by Chebyshev's rule of the second kind, whose weights are
+    their lengths; points on each by Gauss and Legendre. A ray through the lens point L that leaves in the direction
+    (x, y, 1) meets the plane of focus at L + z_f (x, y), which the film shows at the place of (x, y) + L / z_f.
+    """
+    camera = view.rig.camera
+    variance, axes = np.linalg.eigh(lens_px2)
+    reach = 2.0 * np.sqrt(np.maximum(variance, 0.0)) / camera.blur_sigma_px  # of the disc's image, in blurs
+    chords, on_each = (_FEWEST - k + math.ceil(_PER_BLUR * extent) for k, extent in enumerate(reach[::-1]))
+    angle = np.pi * np.arange(1, chords + 1) / (chords + 1)
+    y, weight = leggauss(on_each)
+    disc = np.stack(np.broadcast_arrays(np.cos(angle)[:, None], np.sin(angle)[:, None] * y), axis=-1).reshape(-1, 2)
+    weights = np.outer(np.sin(angle) ** 2, weight).ravel()
+    lens_m = camera.aperture_radius_m * disc @ axes[:, ::-1].T
+    if point_m is None:
+        ray = reflect(view, uv_px)
+        point_m = ray.origin_world_m + _FAR_M * ray.direction_world
+    places, shares = (np.array(x) for x in zip(*(_through(view, one, point_m) for one in lens_m), strict=True))
+    if not np.isfinite(places).all():
+        return None
+    weights = weights * shares
+    return SpotParts(places - uv_px, weights / weights.sum(), SpotBlur.of(of_point_px2))
+
+
+def _through(view: View, lens_xy_m: Array, point_m: Array) -> tuple[Array, float]:
+    """Film position (2,) of a world point through a point (2,) of the lens, after the mirror; and its light.
+
+    That is in proportion to the area that an upright wall there has in the image.
+    """
+    rig, T, lens_m = view.rig, view.T_world_camera, np.append(lens_xy_m, 0.0)
+    moved = replace(
+        rig,
+        T_world_camera=replace(T, translation_m=as_vector(T.points(lens_m))),
+        T_camera_sphere=replace(rig.T_camera_sphere, translation_m=as_vector(rig.T_camera_sphere.t - lens_m)),
+    )
+    image = image_of(moved.at(0.0), point_m)
+    xy = rig.camera.normalised(image.uv_px)
+    area = _area_px2_per_m2(image.px_per_m, _towards_axis(view, point_m))
+    return rig.camera.to_pixel(xy + lens_xy_m / rig.camera.focus_distance_m), float(area)
+
+
+def _towards_axis(view: View, point_m: Array) -> Array:
+    """Normal (3,) of an upright wall at a point that faces the axis."""
+    outward = (point_m - view.sphere_centre_m) * [1.0, 1.0, 0.0]
+    return np.asarray(-outward / np.linalg.norm(outward))
 
 
 def _point_m(view: View, uv_px: Array, depth_m: float) -> Array | None:
@@ -99,8 +163,7 @@ def _curvatures(view: View, hit: Reflection) -> Array:
 
 def _beam_px2(view: View, point_m: Array, diameter_m: float) -> Array:
     """Second moments of the image of a spot of this size."""
-    outward = (point_m - view.sphere_centre_m) * [1.0, 1.0, 0.0]
-    normal = outward / np.linalg.norm(outward)
+    normal = _towards_axis(view, point_m)
     image = image_of(view, point_m).px_per_m @ (np.eye(3) - np.outer(normal, normal))
     moments = (diameter_m / 4.0) ** 2 * image @ image.T
     return np.asarray(moments if np.isfinite(moments).all() else np.zeros((2, 2)))

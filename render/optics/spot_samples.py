@@ -85,7 +85,7 @@ def streak_nodes(profile: Profile, along: float, across: float) -> tuple[Array, 
         count = 4 + math.ceil(2.2 * along)
         angle = np.pi * np.arange(1, count + 1) / (count + 1)
         x, weight_x = np.cos(angle), np.sin(angle) ** 2
-        y, weight_y = leggauss(2 + math.ceil(2.2 * across))
+        y, weight_y = leggauss(2 + math.ceil(2.2 * across - 0.5))
         nodes = np.stack(np.broadcast_arrays(x[:, None], np.sin(angle)[:, None] * y), axis=-1)
     else:
         (x, weight_x), (y, weight_y) = (_gaussian_line(extent) for extent in (along, across))

@@ -50,7 +50,7 @@ def ratio(ours: Callable[[], object], sphere: Callable[[], object], rounds: int)
 @pytest.mark.benchmark(group="mirrors")
 @pytest.mark.parametrize("shape", ["sphere", "paraboloid", "hyperboloid", "cone", "polynomial"])
 def test_benchmark_price_of_a_mirror_of_revolution(benchmark, shape: str) -> None:
-    """Spot layer and view against the default sphere's: at most 1.5 times; a cone draws the spot to a streak: 2.5.
+    """Spot layer and view against the default sphere's: at most 1.5 times.
 
     Both views are of the same room, by a coarse light map.
     """
@@ -70,7 +70,7 @@ def test_benchmark_price_of_a_mirror_of_revolution(benchmark, shape: str) -> Non
         3,
     )
     print(f"\n{shape}: spot layer {spots:.2f}, view {views:.2f} of the sphere's")
-    assert spots <= (2.5 if shape == "cone" else 1.5)
+    assert spots <= 1.5
     assert views <= 1.5
 
 

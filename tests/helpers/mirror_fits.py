@@ -7,6 +7,7 @@ to them. A fit takes the blur that `spot_blur` predicts from the rig, as the met
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from helpers.sensor_light import FILTERS
@@ -79,7 +80,8 @@ class Place:
     blur: SpotBlur
 
 
-def places(shape: str, count: int) -> list[Place]:
+@cache
+def places(shape: str, count: int) -> tuple[Place, ...]:
     """Spots 1 to 4 m away on all azimuths, up to 0.9 m high; of a cone 2 to 12 degrees above its tip."""
     rig, rng, found = rig_of(shape), generator("tests", "mirror fits", shape), []
     view = rig.at(0.0)
@@ -103,11 +105,11 @@ def places(shape: str, count: int) -> list[Place]:
         )
         found.append(Place(moved, uv - corner, spot_blur(rig, uv, D, BEAM)))
         if len(found) == count:
-            return found
+            return tuple(found)
     raise AssertionError(f"{shape}: {len(found)} visible spots of {count}")
 
 
-def drawn(s: Sensor, spots: list[Place], collected_e: float, background_e: float, cameras: int) -> Draws:
+def drawn(s: Sensor, spots: tuple[Place, ...], collected_e: float, background_e: float, cameras: int) -> Draws:
     """Fits of some spots by `cameras` cameras each, every one with its own fixed pattern."""
     card, dark, flux_e = card_of(s), s.dark_e_per_s * s.exposure_s, collected_e / COLLECTED
     errors, bounds, pulls, failed = [], [], [], 0
