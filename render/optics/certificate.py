@@ -35,6 +35,7 @@ from phibench.scenes.faces import FaceTable, IntArray
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.random_streams import sobol
+from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import View
 
 # Both chief rays are exact up to rounding. Centroid and flux: five and six times what the fewest rays leave, below.
@@ -181,14 +182,22 @@ def _through_chief_point(view: View, truth: SpotTruth, lens_m: Array) -> Array:
 def trace_spot(
     view: View, spot: LaserSpot, room: GeometryLike, truth: SpotTruth, log2_rays: int
 ) -> tuple[Array, float]:
-    """Centroid (2,) of the pixel-sampled image of the spot, and its power on the film, watts."""
+    """Centroid (2,) of the pixel-sampled image of the spot, and its power on the film, watts.
+
+    Film positions are drawn by a linear map about the image of the spot's centre. In a mirror of revolution each is
+    aimed at its own point of the wall: near a cone's tip no linear map covers the image.
+    """
     if spot.beam_direction_world is not None:
         return _trace_beam(view, spot, as_geometry(room), truth, log2_rays)
     room = as_geometry(room)
     x = np.clip(sobol(6, 2**log2_rays), 1e-12, 1.0 - 1e-12)
     bundle = _Bundle(view.rig.camera.aperture_radius_m * _disc(x[:, :2]), _facets(view, x[:, 4:]))
     wall, density = _wall_samples(spot, x[:, 2:4])
-    uv, jacobian = _linear_aim(view, spot, bundle, wall, truth)
+    if isinstance(view.rig.mirror, RevolvedMirror):
+        uv = aim(view, spot, bundle, wall, _through_chief_point(view, truth, bundle.lens_m))
+        jacobian = _wall_jacobian(view, spot, uv, bundle)
+    else:
+        uv, jacobian = _linear_aim(view, spot, bundle, wall, truth)
     with np.errstate(invalid="ignore"):
         area = density * np.abs(jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0])
         return _moments(view, uv, _watts(view, spot, room, uv, bundle) / area / len(x))
