@@ -48,12 +48,8 @@ estimator/spots
 estimator/processed
 estimator/sensor_fit
 estimator/outline
-<<<<<<< HEAD
 estimator/film estimator/limits estimator/methods
-=======
-estimator/limits estimator/methods
 estimator/loop
->>>>>>> 4e086b7 (Loop: exact measurement model in rooms, belief over a target in direction and inverse distance, baseline)
 estimator/draw_pairs
 estimator/calibration
 estimator/sandbox
