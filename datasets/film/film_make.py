@@ -314,7 +314,9 @@ def frame_truths(film: FilmPlan, room: Room, times_s: Sequence[float], images: S
     """Truth of every frame."""
     scene = film.scene
     frames = scene.times.frame_s
-    readings = film.encoder.readings_m(scene.carriage.position_m(frames), *film.names)
+    # an encoder counts what it takes for metres: at the stop above, the stroke that it was told
+    told = film.pair.nominal_stroke_m / film.pair.stroke_m
+    readings = film.encoder.readings_m(told * scene.carriage.position_m(frames), *film.names)
     return [
         FrameTruth(
             frame,

@@ -129,11 +129,20 @@ class Film:
         stacks = (one.electrons_per_s, one.du_electrons_per_s_px, one.dv_electrons_per_s_px)
         return Light(ambient, SpotWindow(one.u0_px, one.v0_px, *stacks), f_number=self.plan.scene.rig.camera.f_number)
 
-    def window(self, frame: int) -> Region:
-        """Pixels of a frame that are drawn: the square around the spot, or the whole image."""
-        side, row = self.info.window_px, self.table.row(self._number(frame), named=True)
+    def window(self, frame: int, side_px: int | None = None) -> Region:
+        """Pixels of a frame that are drawn: the square around the spot, or the whole image.
+
+        Raises
+        ------
+        DatasetError
+            If `side_px` is larger than the film's windows.
+        """
+        row, most = self.table.row(self._number(frame), named=True), self.info.window_px
+        side = most if side_px is None else side_px
         if side is None:
             return Region.whole(self.plan.size)
+        if most is not None and side > most:
+            raise DatasetError(f"window of {side} px: the film holds {most} px around the spot; ask for no more")
         return Region.around(row["row_u_px"], row["row_v_px"], self.plan.size, min(side, *self.plan.size))
 
     def sensor(self, preset: str = "mjpeg", **changes: Any) -> Sensor:
@@ -145,7 +154,15 @@ class Film:
             return sensor(preset, exposure_s=times.exposure_s, readout_s=times.readout_s, **changes)
 
     def frame(
-        self, number: int, preset: str = "mjpeg", draw: int = 0, camera_seed: int = 0, **changes: Any
+        self,
+        number: int,
+        preset: str = "mjpeg",
+        draw: int = 0,
+        camera_seed: int = 0,
+        *,
+        laser: bool = True,
+        side_px: int | None = None,
+        **changes: Any,
     ) -> FilmFrame:
         """One draw of a frame.
 
@@ -156,6 +173,10 @@ class Film:
             Of the sensor.
         camera_seed : int
             Frames of one seed share the fixed pattern.
+        laser : bool
+            False switches the laser off, whatever the code says.
+        side_px : int, optional
+            Side of the window, at most that of the film; the film's own by default.
         **changes
             Numbers of the preset.
 
@@ -166,8 +187,9 @@ class Film:
         """
         chosen, light = self.sensor(preset, **changes), self.light(number)
         chain = Chain(chosen, camera_seed, self.plan.scene.rig.camera)
-        stream = NoiseStream((*self.plan.names, "film", number, draw))
-        region, jpeg = self.window(number), None
+        light = light if laser else light.laser_off()
+        stream = NoiseStream((*self.plan.names, "film", "on" if laser else "off", number, draw))
+        region, jpeg = self.window(number, side_px), None
         with in_one_sentence():
             if chosen.output == "mjpeg" and region == Region.whole(light.size):
                 jpeg = chain.jpeg_bytes(light, stream)

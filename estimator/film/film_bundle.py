@@ -140,7 +140,7 @@ def rig_derivatives(rig: Rig, X: Array, offsets: Array, by_offset: Array) -> Arr
     columns = []
     for name in PARAMETERS:
         if name in STROKE_PARAMETERS:
-            share = offsets if name == "stroke_relative" else (offsets > 0.5 * offsets.max()).astype(float)
+            share = offsets if name == "stroke_relative" else offsets / offsets.max()  # of a stroke that long
             columns.append((share[:, None] * by_offset).ravel())
             continue
         one = MISALIGNMENT[name]
