@@ -115,6 +115,32 @@ def misaligned_dataset(shared: SharedFolder, tmp_path_factory: pytest.TempPathFa
     return rendered(shared, "misaligned", folder / "recipe.toml")
 
 
+def filmed(shared: SharedFolder, name: str, old: str = "", new: str = "") -> Path:
+    """Films of `tests/films.toml` with a change, made once for all test processes. Read only."""
+    from phibench.datasets.film.film_make import make_films
+
+    def make(out: Path) -> None:
+        recipe = out.with_suffix(".toml")
+        recipe.write_text(
+            (ROOT / "tests" / "films.toml").read_text(encoding="utf-8").replace(old, new), encoding="utf-8"
+        )
+        make_films(recipe, out, 1)
+
+    return shared.made(name, make)
+
+
+@pytest.fixture(scope="session")
+def film_windows(shared: SharedFolder) -> Path:
+    """Films of windows around the spot. Read only."""
+    return filmed(shared, "films-windows")
+
+
+@pytest.fixture(scope="session")
+def film_images(shared: SharedFolder) -> Path:
+    """The same as whole images. Read only."""
+    return filmed(shared, "films-images", "window_px = 24", 'view = "full"')
+
+
 @pytest.fixture(scope="session")
 def smoke_dataset(shared: SharedFolder) -> Path:
     """Data set of the shipped recipe `smoke`. Read only."""

@@ -96,6 +96,64 @@ def show(
 
 
 @film.command
+def experiments(
+    directory: Path,
+    *,
+    calibration: Path,
+    preset: Literal["bayer-raw", "mjpeg"] = "bayer-raw",
+    on: Whole = 30,
+    off: Whole = 30,
+    cameras: Whole = 1,
+    jpeg_quality: Whole = 76,
+    stroke: bool = True,
+    out: Path | None = None,
+) -> int:
+    """Depth of every film with rigs that calibrate themselves: bursts at both ends, and the whole stroke.
+
+    Parameters
+    ----------
+    directory
+        Folder of films.
+    calibration
+        Data set of the same rigs with an experiment "calibration", as the recipe paper-misaligned has it.
+    preset
+        Sensor preset.
+    on
+        Frames at each end with the laser on.
+    off
+        Frames at each end with the laser off.
+    cameras
+        Cameras, each with a fixed pattern that nobody knows.
+    jpeg_quality
+        Of mjpeg.
+    stroke
+        Fit all frames of the stroke as well; raw pixels only.
+    out
+        Parquet file for the rows.
+    """
+    from phibench.datasets.film.film_read import open_films
+    from phibench.datasets.read import open_finished
+    from phibench.datasets.store.files import require_writable
+    from phibench.estimator.paper.film_experiments import FilmProcedure, run_film_experiments, summary
+
+    if out is not None:
+        require_writable(out)
+    numbers = {"jpeg_quality": jpeg_quality} if preset == "mjpeg" else None
+    procedure = FilmProcedure(preset, on, off, cameras, stroke, numbers)
+    rows = run_film_experiments(open_films(directory), open_finished(calibration), procedure)
+    print(f"{'way':8s} {'films':>5s} {'rms':>8s} {'predicted':>9s} {'pull':>6s} {'within 95 %':>11s}")
+    for row in summary(rows).iter_rows(named=True):
+        print(
+            f"{row['way']:8s} {row['films']:5d} {row['rms']:8.3%} {row['predicted']:9.3%} {row['pull']:6.2f} "
+            f"{row['within_95']:11.1%}"
+        )
+    if out is not None:
+        rows.write_parquet(out)
+        print(f"{out}: {len(rows)} rows")
+    return 0
+
+
+@film.command
 def frames(
     directory: Path,
     *,

@@ -52,6 +52,7 @@ def seen_film(
     depth_m: float | None = None,
     vibration_sigma_m: float = 0.0,
     frames: Array | None = None,
+    rig: Rig | None = None,
 ) -> SeenFilm:
     """Draw frames of raw pixels and fit the spot in each.
 
@@ -64,13 +65,15 @@ def seen_film(
         Of the carriage beside its encoder.
     frames : array of int, optional
         Frames to take; all by default.
+    rig : Rig, optional
+        Calibrated; the nominal one by default.
     """
     numbers = np.arange(len(film)) if frames is None else np.asarray(frames)
     drawn = [film.frame(int(k), preset, draw, camera_seed) for k in numbers]
     card = card_of(drawn[0].sensor)
     windows = np.stack([one.image for one in drawn])
     origins = np.array([(one.region.u0_px, one.region.v0_px) for one in drawn])
-    rig, times = film.plan.nominal.rig, film.plan.nominal.times
+    rig, times = rig or film.plan.nominal.rig, film.plan.nominal.times
     readings = film.table["encoder_m"].to_numpy()
     sigma = float(np.hypot(film.plan.encoder.sigma_m, vibration_sigma_m))
     beam = Beam()

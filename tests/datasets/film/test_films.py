@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import ROOT, SharedFolder
+from conftest import ROOT
 
 from phibench.datasets.errors import DatasetError, RecipeError
 from phibench.datasets.film import film_make
@@ -26,33 +26,12 @@ TEXT = (ROOT / "tests" / "films.toml").read_text(encoding="utf-8")
 FILM = "seen-near-h0.300"
 
 
-def made(shared: SharedFolder, name: str, text: str) -> Path:
-    def make(out: Path) -> None:
-        recipe = out.with_suffix(".toml")
-        recipe.write_text(text, encoding="utf-8")
-        make_films(recipe, out, 1)
-
-    return shared.made(name, make)
-
-
-@pytest.fixture(scope="session")
-def windows(shared: SharedFolder) -> Path:
-    """Films of `tests/films.toml`. Read only."""
-    return made(shared, "films-windows", TEXT)
-
-
-@pytest.fixture(scope="session")
-def whole(shared: SharedFolder) -> Path:
-    """The same as whole images. Read only."""
-    return made(shared, "films-whole", TEXT.replace("window_px = 24", 'view = "full"'))
-
-
 def film_of(folder: Path) -> Film:
     return open_films(folder)[FILM]
 
 
-def test_truth_of_every_frame_is_the_stills(windows: Path) -> None:
-    film, checked = film_of(windows), 0
+def test_truth_of_every_frame_is_the_stills(film_windows: Path) -> None:
+    film, checked = film_of(film_windows), 0
     scene = film.plan.scene
     for row in film.table.iter_rows(named=True):
         for prefix in ("", "row_"):
@@ -68,15 +47,15 @@ def test_truth_of_every_frame_is_the_stills(windows: Path) -> None:
     assert film.table["offset_m"].to_numpy()[-1] == pytest.approx(0.3, abs=1e-12)  # the stroke is over
 
 
-def test_interpolated_views_are_held_to_a_quarter_of_the_noise(windows: Path, whole: Path) -> None:
-    for folder in (windows, whole):
+def test_interpolated_views_are_held_to_a_quarter_of_the_noise(film_windows: Path, film_images: Path) -> None:
+    for folder in (film_windows, film_images):
         info = film_of(folder).info
         assert 0.0 < max(info.pixel_ratio or 0.0, info.position_ratio or 0.0) <= 0.25
         assert len(info.keys_m) < 2 * info.frames
 
 
-def test_the_proof_fails_where_key_views_are_too_far_apart(whole: Path) -> None:
-    film = film_of(whole)
+def test_the_proof_fails_where_key_views_are_too_far_apart(film_images: Path) -> None:
+    film = film_of(film_images)
     plan, _ = film_plans(parse_recipe(TEXT))
     render = film_make.renderer(plan, film.plan, plan.room(film.plan.pair.room))
     # key views of a stroke of 2 m in place of 0.3 m: the board moves over the spot's window
@@ -86,8 +65,8 @@ def test_the_proof_fails_where_key_views_are_too_far_apart(whole: Path) -> None:
     assert error.largest > 0.25
 
 
-def test_a_windows_pixels_are_those_of_the_whole_frame(windows: Path, whole: Path) -> None:
-    part, all_ = film_of(windows), film_of(whole)
+def test_a_windows_pixels_are_those_of_the_whole_frame(film_windows: Path, film_images: Path) -> None:
+    part, all_ = film_of(film_windows), film_of(film_images)
     # the rooms differ by their rendering noise alone, so that the spot alone is compared: means, no draw
     for frame in (0, 4, 9):
         a, b = part.expected(frame, "mono-raw"), all_.expected(frame, "mono-raw")
@@ -97,8 +76,8 @@ def test_a_windows_pixels_are_those_of_the_whole_frame(windows: Path, whole: Pat
         assert part.window(frame).slices() == part.frame(frame, "mjpeg").region.slices()
 
 
-def test_laser_off_frames_have_no_spot_and_others_have_their_flux(windows: Path) -> None:
-    film = film_of(windows)
+def test_laser_off_frames_have_no_spot_and_others_have_their_flux(film_windows: Path) -> None:
+    film = film_of(film_windows)
     scene, seen = film.plan.scene, set()
     for frame, time in enumerate(film.table["row_time_s"]):
         around = scene.code.mean_level(time + np.array([-4e-3, 0.0, 4e-3]), scene.times.exposure_s)
@@ -112,7 +91,7 @@ def test_laser_off_frames_have_no_spot_and_others_have_their_flux(windows: Path)
     assert seen == {0.0, 1.0}
 
 
-def test_a_killed_run_goes_on_and_gives_the_same_bytes(windows: Path, tmp_path: Path, monkeypatch: Any) -> None:
+def test_a_killed_run_goes_on_and_gives_the_same_bytes(film_windows: Path, tmp_path: Path, monkeypatch: Any) -> None:
     recipe = tmp_path / "films.toml"
     recipe.write_text(TEXT, encoding="utf-8")
     out, calls = tmp_path / "out", []
@@ -133,15 +112,15 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(windows: Path, tmp_path: 
     assert make_films(recipe, out, 1).made == ()
     ours, theirs = (
         {p.relative_to(d).as_posix(): p.read_bytes() for p in d.rglob("*") if p.suffix in (".exr", ".npz", ".parquet")}
-        for d in (out, windows)
+        for d in (out, film_windows)
     )
     assert ours == theirs
     assert len(ours) > 5
 
 
-def test_damage_is_found_and_mended(windows: Path, tmp_path: Path) -> None:
+def test_damage_is_found_and_mended(film_windows: Path, tmp_path: Path) -> None:
     out = tmp_path / "films"
-    shutil.copytree(windows, out)
+    shutil.copytree(film_windows, out)
     assert verify(out) == []
     table = out / "films" / FILM / "film.parquet"
     table.write_bytes(table.read_bytes()[:-1])
@@ -156,8 +135,8 @@ def test_damage_is_found_and_mended(windows: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["film.avi", "film.mkv"])
-def test_a_container_gives_the_cameras_bytes_back(whole: Path, tmp_path: Path, name: str) -> None:
-    film = film_of(whole)
+def test_a_container_gives_the_cameras_bytes_back(film_images: Path, tmp_path: Path, name: str) -> None:
+    film = film_of(film_images)
     sent = [film.frame(k).jpeg or b"" for k in range(4)]
     write_frames(tmp_path / name, sent, "mjpeg", film.plan.size, 10.0)
     assert list(read_frames(tmp_path / name)) == sent
@@ -167,17 +146,17 @@ def test_a_container_gives_the_cameras_bytes_back(whole: Path, tmp_path: Path, n
     assert list(read_frames(tmp_path / name)) == raw
 
 
-def test_videos_and_pictures(windows: Path, whole: Path, tmp_path: Path) -> None:
-    (path,) = write_videos(whole, tmp_path, "mjpeg", workers=1)
+def test_videos_and_pictures(film_windows: Path, film_images: Path, tmp_path: Path) -> None:
+    (path,) = write_videos(film_images, tmp_path, "mjpeg", workers=1)
     assert len(list(read_frames(path))) == 10
     again = path.read_bytes()
     path.unlink()
-    assert write_videos(whole, tmp_path, "mjpeg", workers=1)[0].read_bytes() == again
+    assert write_videos(film_images, tmp_path, "mjpeg", workers=1)[0].read_bytes() == again
     with pytest.raises(DatasetError, match="holds windows"):
-        write_videos(windows, tmp_path, "mjpeg", workers=1)
+        write_videos(film_windows, tmp_path, "mjpeg", workers=1)
     shown = [
         picture(film, film.frame(3, preset))
-        for film in map(film_of, (windows, whole))
+        for film in map(film_of, (film_windows, film_images))
         for preset in ("yuyv", "mjpeg", "bayer-raw")
     ]
     assert {one.ndim for one in shown} == {3}
@@ -219,7 +198,7 @@ def test_a_target_that_is_never_seen_is_one_sentence(tmp_path: Path) -> None:
         make_films(recipe, tmp_path / "out", 1)
 
 
-def test_other_folders_are_refused(windows: Path, tiny_dataset: Path, tmp_path: Path) -> None:
+def test_other_folders_are_refused(film_windows: Path, tiny_dataset: Path, tmp_path: Path) -> None:
     recipe = tmp_path / "films.toml"
     recipe.write_text(TEXT, encoding="utf-8")
     with pytest.raises(DatasetError, match="data set of pairs"):
@@ -228,6 +207,6 @@ def test_other_folders_are_refused(windows: Path, tiny_dataset: Path, tmp_path: 
         open_films(tmp_path)
     recipe.write_text(TEXT.replace('name = "films"', 'name = "others"'), encoding="utf-8")
     with pytest.raises(DatasetError, match="holds the films of 'films'"):
-        make_films(recipe, windows, 1)
+        make_films(recipe, film_windows, 1)
     with pytest.raises(DatasetError, match="frames 0 to 9"):
-        film_of(windows).room(10)
+        film_of(film_windows).room(10)

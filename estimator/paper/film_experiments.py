@@ -1,0 +1,229 @@
+"""The paper's experiments as films, with rigs that calibrate themselves: bursts at both ends, and the whole stroke.
+
+For every rig of the films, a data set of the same recipe gives the calibration (`experiment_tables.calibrate_rig`).
+Every film then gives D in two ways, each for several cameras, whose fixed pattern nobody knows:
+
+1. burst: frames at rest at both ends, on and off, by the method that is closest to the bound (`method_for`), as for
+   stills of so many frames;
+2. stroke (raw pixels): all frames of the film, laser on, by the joint bundle (`film_bundle`).
+
+A film holds the room around its spot alone. Its images are cut-outs, seen by a camera whose principal point is moved by
+as much: mosaic and JPEG blocks keep their phase, because regions begin at whole tiles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.film.film_read import Film, Films
+from phibench.datasets.frames.sensor_card import card_of
+from phibench.datasets.read import Dataset
+from phibench.estimator.calibration.bundle import Bundle
+from phibench.estimator.calibration.spots import method_for
+from phibench.estimator.film.film_estimates import bundle_depth, seen_film
+from phibench.estimator.geometry.least_squares_depth import depth_general
+from phibench.estimator.interface import Image, Pair
+from phibench.estimator.paper.experiment_tables import Procedure, calibrate_rig
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.light import Region
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.scenes.laser import Beam
+from phibench.scenes.rig import Rig
+
+COLUMNS = ("film", "experiment", "rig", "camera", "way", "depth_m", "error_m", "sigma_m", "frames")
+WITHIN = 1.959963984540054
+
+
+@dataclass(frozen=True)
+class FilmProcedure:
+    """Settings.
+
+    Parameters
+    ----------
+    preset : "bayer-raw" or "mjpeg"
+    on, off : int
+        Frames at each end with the laser on and off.
+    cameras : int
+        Cameras with a fixed pattern of their own, 0 to `cameras` - 1, each with a draw of the noise.
+    stroke : bool
+        Whether the whole stroke is fitted, too; raw pixels only.
+    sensor : dict
+        Numbers of the preset, such as ``jpeg_quality``.
+    """
+
+    preset: str = "bayer-raw"
+    on: int = 30
+    off: int = 30
+    cameras: int = 1
+    stroke: bool = True
+    sensor: dict[str, Any] | None = None
+
+
+def run_film_experiments(
+    films: Films, calibration: Dataset, procedure: FilmProcedure, names: Sequence[str] | None = None
+) -> pl.DataFrame:
+    """Errors of D of every film, camera and way: one row each, `COLUMNS`.
+
+    Raises
+    ------
+    DatasetError
+        If a rig of the films has no calibration spots in `calibration`, or a film does not rest so long.
+    """
+    rows: list[dict[str, Any]] = []
+    known: dict[str, Bundle] = {}
+    for name in films.plans if names is None else names:
+        film = films[name]
+        rig = film.plan.pair.rig
+        if rig not in known:
+            if calibration.rigs[rig] != film.plan.scene.rig:
+                raise DatasetError(
+                    f"{calibration.folder}: rig {rig} is not that of film {name}; make both of one recipe"
+                )
+            known[rig] = calibrate_rig(calibration, rig, Procedure(procedure.preset))
+        for camera in range(procedure.cameras):
+            rows += _rows(film, known[rig], procedure, camera)
+    return pl.DataFrame(rows, schema={name: _TYPES.get(name, pl.Float64) for name in COLUMNS})
+
+
+_TYPES: dict[str, Any] = {
+    **dict.fromkeys(("film", "experiment", "rig", "way"), pl.String),
+    **dict.fromkeys(("camera", "frames"), pl.Int64),
+}
+
+
+def _rows(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> list[dict[str, Any]]:
+    found = [("burst", *burst(film, bundle, procedure, camera), 2 * (procedure.on + procedure.off))]
+    if procedure.stroke and procedure.preset == "bayer-raw":
+        found.append(("stroke", *whole_stroke(film, bundle, procedure, camera), len(film)))
+    pair, depth_m = film.plan.pair, float(film.table["depth_m"][0])
+    return [
+        {
+            "film": film.info.film,
+            "experiment": pair.experiment,
+            "rig": pair.rig,
+            "camera": camera,
+            "way": way,
+            "depth_m": depth_m,
+            "error_m": estimate - depth_m,
+            "sigma_m": sigma,
+            "frames": frames,
+        }
+        for way, estimate, sigma, frames in found
+    ]
+
+
+# Bursts.
+
+
+def burst(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> tuple[float, float]:
+    """D and its standard deviation from frames at rest at both ends, metres; NaN where there is no answer."""
+    pair = burst_pair(film, bundle, procedure, camera)
+    answer = method_for(pair.card)(pair)
+    spots = (answer.down, answer.up)
+    if any(one.uv_px is None or one.covariance_px2 is None for one in spots):
+        return float("nan"), float("nan")
+    (uv1, uv2), (C1, C2) = (
+        [np.array(one.uv_px, float) for one in spots],
+        [np.array(one.covariance_px2, float) for one in spots],
+    )
+    at = depth_general(pair.rig, pair.stroke_m, uv1, uv2, C1, C2, bundle.covariance)
+    return float(at.depth_m), float(at.sigma_m)
+
+
+def burst_pair(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> Pair:
+    """Pair of the film's frames at rest, cut out, with the calibrated rig.
+
+    Raises
+    ------
+    DatasetError
+        If the film rests for fewer frames.
+    """
+    ends = resting_frames(film)
+    images: dict[str, list[Image]] = {}
+    sensor = film.sensor(procedure.preset, **(procedure.sensor or {}))
+    for position, end in zip(("down", "up"), ends, strict=True):
+        if len(end) < procedure.on:
+            raise DatasetError(
+                f"film {film.info.film} rests {position} for {len(end)} frames, {procedure.on} are asked for; raise "
+                "film.pauses_s"
+            )
+        images[position] = [_cut_out(film, k, procedure, camera, True, 0) for k in end[: procedure.on]]
+        # frames with the laser off are further draws of the frames at rest
+        off = [_cut_out(film, end[n % len(end)], procedure, camera, False, n // len(end)) for n in range(procedure.off)]
+        if off:
+            images[f"{position}_off"] = off
+    nominal = film.plan.pair.nominal_stroke_m
+    return Pair.of_frames(
+        0,
+        images,
+        rig=cut_rig(bundle.rig, film.info.region),
+        stroke_m=float(bundle.stroke(np.array(nominal))),
+        card=card_of(sensor),
+        beam=Beam(),
+    )
+
+
+def resting_frames(film: Film) -> tuple[list[int], list[int]]:
+    """Frames that are exposed while the carriage rests at its first and at its last stop."""
+    scene, times = film.plan.nominal, film.plan.nominal.times
+    half = 0.5 * (times.exposure_s + times.readout_s)
+    inner = times.frame_s[:, None] + half * np.linspace(-1.0, 1.0, 9)
+    at = scene.carriage.position_m(inner)
+    stops = (scene.carriage.stops_m[0], scene.carriage.stops_m[-1])
+    first, last = (np.flatnonzero(np.all(np.abs(at - stop) < 1e-9, axis=1)).tolist() for stop in stops)
+    return first, last
+
+
+def _cut_out(film: Film, frame: int, procedure: FilmProcedure, camera: int, laser: bool, draw: int) -> Image:
+    """One draw of the whole region of a film; some 20 px at its borders lack their neighbours."""
+    light = film.light(frame)
+    chain = Chain(film.sensor(procedure.preset, **(procedure.sensor or {})), camera, film.plan.scene.rig.camera)
+    stream = NoiseStream((*film.plan.names, "film", "on" if laser else "off", frame, draw, "camera", camera))
+    return chain.frame(light if laser else light.laser_off(), stream, film.info.region)
+
+
+def cut_rig(rig: Rig, region: Region) -> Rig:
+    """Rig whose camera has the pixels of a region alone, numbered from its corner."""
+    height, width = region.shape
+    camera = replace(
+        rig.camera,
+        width_px=width,
+        height_px=height,
+        cx_px=rig.camera.cx_px - region.u0_px,
+        cy_px=rig.camera.cy_px - region.v0_px,
+    )
+    return replace(rig, camera=camera)
+
+
+# The whole stroke.
+
+
+def whole_stroke(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> tuple[float, float]:
+    """D and its standard deviation from all frames of a film, metres."""
+    seen = seen_film(film, camera_seed=camera, preset=procedure.preset, rig=bundle.rig)
+    nominal = film.plan.pair.nominal_stroke_m
+    scale = float(bundle.stroke(np.array(nominal))) / nominal
+    found = bundle_depth(replace(seen, encoder_m=scale * seen.encoder_m), bundle.covariance)
+    return found.depth_m, found.sigma_m
+
+
+# What came out.
+
+
+def summary(rows: pl.DataFrame) -> pl.DataFrame:
+    """Per way: pairs, rms of the relative error, predicted rms, their ratio, share within 95 %."""
+    relative, claim = pl.col("error_m") / pl.col("depth_m"), pl.col("sigma_m") / pl.col("depth_m")
+    good = rows.filter(pl.col("error_m").is_finite() & pl.col("sigma_m").is_finite())
+    return good.group_by("way", maintain_order=True).agg(
+        pl.len().alias("films"),
+        (relative**2).mean().sqrt().alias("rms"),
+        (claim**2).mean().sqrt().alias("predicted"),
+        (pl.col("error_m").abs() <= WITHIN * pl.col("sigma_m")).mean().alias("within_95"),
+        ((pl.col("error_m") / pl.col("sigma_m")) ** 2).mean().sqrt().alias("pull"),
+    )

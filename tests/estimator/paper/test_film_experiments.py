@@ -1,0 +1,90 @@
+"""Experiments as films: bursts and the whole stroke of a small film with a known rig, and what is refused."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.film.film_read import Film, open_films
+from phibench.datasets.read import open_finished
+from phibench.estimator.calibration.bundle import Bundle
+from phibench.estimator.geometry.rig_parameters import PARAMETERS
+from phibench.estimator.paper.film_experiments import (
+    COLUMNS,
+    FilmProcedure,
+    burst,
+    burst_pair,
+    cut_rig,
+    resting_frames,
+    run_film_experiments,
+    summary,
+    whole_stroke,
+)
+
+FEW = FilmProcedure(on=2, off=2)
+
+
+def film_and_bundle(folder: Path) -> tuple[Film, Bundle]:
+    film = next(iter(open_films(folder)))
+    count = len(PARAMETERS)
+    return film, Bundle(film.plan.nominal.rig, np.zeros(count), np.zeros((count, count)), 0.0, 1)
+
+
+def test_frames_at_rest_are_those_before_and_after_the_stroke(film_windows: Path) -> None:
+    film, _ = film_and_bundle(film_windows)
+    first, last = resting_frames(film)
+    assert first == [0, 1]
+    assert last == [8, 9]
+
+
+def test_a_burst_of_a_cut_out_gives_the_depth(film_windows: Path) -> None:
+    film, bundle = film_and_bundle(film_windows)
+    depth_m, sigma_m = burst(film, bundle, FEW, 0)
+    # a normal error beyond 5 sigma: 6e-7
+    assert abs(depth_m - film.table["depth_m"][0]) < 5.0 * sigma_m
+    assert sigma_m < 0.1 * depth_m
+
+
+def test_the_whole_stroke_gives_the_depth(film_windows: Path) -> None:
+    film, bundle = film_and_bundle(film_windows)
+    depth_m, sigma_m = whole_stroke(film, bundle, FEW, 0)
+    assert abs(depth_m - film.table["depth_m"][0]) < 5.0 * sigma_m
+
+
+def test_a_cut_camera_sees_the_same_rays(film_windows: Path) -> None:
+    film, bundle = film_and_bundle(film_windows)
+    region = film.info.region
+    corner = np.array([region.u0_px, region.v0_px])
+    uv = np.array([[40.0, 30.0], [60.5, 33.25]])
+    camera, cut = bundle.rig.camera, cut_rig(bundle.rig, region).camera
+    # the principal point is moved by whole pixels
+    np.testing.assert_allclose(cut.rays(uv - corner), camera.rays(uv), atol=1e-14)
+    pair = burst_pair(film, bundle, FEW, 0)
+    assert pair.down.shape == region.shape
+    assert pair.count("up_off") == 2
+    processed = burst_pair(film, bundle, replace(FEW, preset="mjpeg", sensor={"jpeg_quality": 85}), 0)
+    assert processed.stack("down").shape == (2, *region.shape, 3)
+
+
+def test_what_does_not_go_together_is_one_sentence(film_windows: Path, tiny_dataset: Path) -> None:
+    film, bundle = film_and_bundle(film_windows)
+    with pytest.raises(DatasetError, match="rests down for 2 frames, 9 are asked for"):
+        burst_pair(film, bundle, replace(FEW, on=9), 0)
+    with pytest.raises(DatasetError, match="make both of one recipe"):
+        run_film_experiments(open_films(film_windows), open_finished(tiny_dataset), FEW)
+
+
+def test_summary_of_rows() -> None:
+    rows = pl.DataFrame(
+        [("f", "e", "r", k, "burst", 2.0, error, 0.02, 4) for k, error in enumerate((0.02, -0.02, 0.06, float("nan")))],
+        schema=list(COLUMNS),
+        orient="row",
+    )
+    (row,) = summary(rows).iter_rows(named=True)
+    assert row["films"] == 3
+    assert row["rms"] == pytest.approx(np.sqrt((1 + 1 + 9) / 3) * 0.01)
+    assert row["predicted"] == pytest.approx(0.01)
+    assert row["within_95"] == pytest.approx(2 / 3)
