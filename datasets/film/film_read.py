@@ -185,11 +185,28 @@ class Film:
         DatasetError
             If there is no such frame, preset or number.
         """
-        chosen, light = self.sensor(preset, **changes), self.light(number)
-        chain = Chain(chosen, camera_seed, self.plan.scene.rig.camera)
-        light = light if laser else light.laser_off()
+        region = self.window(number, side_px)
+        return self._drawn(number, self.sensor(preset, **changes), draw, camera_seed, laser, region)
+
+    def cut_out(
+        self,
+        number: int,
+        preset: str = "mjpeg",
+        draw: int = 0,
+        camera_seed: int = 0,
+        *,
+        laser: bool = True,
+        **changes: Any,
+    ) -> FilmFrame:
+        """One draw of all that a film holds of a frame; some 20 px at the borders of windows lack their neighbours."""
+        return self._drawn(number, self.sensor(preset, **changes), draw, camera_seed, laser, self.info.region)
+
+    def _drawn(
+        self, number: int, chosen: Sensor, draw: int, camera_seed: int, laser: bool, region: Region
+    ) -> FilmFrame:
+        light = self.light(number) if laser else self.light(number).laser_off()
+        chain, jpeg = Chain(chosen, camera_seed, self.plan.scene.rig.camera), None
         stream = NoiseStream((*self.plan.names, "film", "on" if laser else "off", number, draw))
-        region, jpeg = self.window(number, side_px), None
         with in_one_sentence():
             if chosen.output == "mjpeg" and region == Region.whole(light.size):
                 jpeg = chain.jpeg_bytes(light, stream)

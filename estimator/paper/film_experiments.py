@@ -22,6 +22,7 @@ import polars as pl
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.film.film_read import Film, Films
+from phibench.datasets.film.film_store import FilmInfo
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import Dataset
 from phibench.estimator.calibration.bundle import Bundle
@@ -30,14 +31,12 @@ from phibench.estimator.film.film_estimates import bundle_depth, seen_film
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.interface import Image, Pair
 from phibench.estimator.paper.experiment_tables import Procedure, calibrate_rig
-from phibench.render.sensor.camera_chain import Chain
-from phibench.render.sensor.light import Region
-from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
 
 COLUMNS = ("film", "experiment", "rig", "camera", "way", "depth_m", "error_m", "sigma_m", "frames")
 WITHIN = 1.959963984540054
+_DRAWS_OF_A_CAMERA = 10_000
 
 
 @dataclass(frozen=True)
@@ -162,7 +161,7 @@ def burst_pair(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int
     return Pair.of_frames(
         0,
         images,
-        rig=cut_rig(bundle.rig, film.info.region),
+        rig=cut_rig(bundle.rig, film.info),
         stroke_m=float(bundle.stroke(np.array(nominal))),
         card=card_of(sensor),
         beam=Beam(),
@@ -181,22 +180,20 @@ def resting_frames(film: Film) -> tuple[list[int], list[int]]:
 
 
 def _cut_out(film: Film, frame: int, procedure: FilmProcedure, camera: int, laser: bool, draw: int) -> Image:
-    """One draw of the whole region of a film; some 20 px at its borders lack their neighbours."""
-    light = film.light(frame)
-    chain = Chain(film.sensor(procedure.preset, **(procedure.sensor or {})), camera, film.plan.scene.rig.camera)
-    stream = NoiseStream((*film.plan.names, "film", "on" if laser else "off", frame, draw, "camera", camera))
-    return chain.frame(light if laser else light.laser_off(), stream, film.info.region)
+    # each camera with a noise of its own
+    number = camera * _DRAWS_OF_A_CAMERA + draw
+    sensor = procedure.sensor or {}
+    return film.cut_out(frame, procedure.preset, number, camera, laser=laser, **sensor).image
 
 
-def cut_rig(rig: Rig, region: Region) -> Rig:
-    """Rig whose camera has the pixels of a region alone, numbered from its corner."""
-    height, width = region.shape
+def cut_rig(rig: Rig, film: FilmInfo) -> Rig:
+    """Rig whose camera has the pixels of a film's region alone, numbered from its corner."""
     camera = replace(
         rig.camera,
-        width_px=width,
-        height_px=height,
-        cx_px=rig.camera.cx_px - region.u0_px,
-        cy_px=rig.camera.cy_px - region.v0_px,
+        width_px=film.width_px,
+        height_px=film.height_px,
+        cx_px=rig.camera.cx_px - film.u0_px,
+        cy_px=rig.camera.cy_px - film.v0_px,
     )
     return replace(rig, camera=camera)
 
@@ -206,7 +203,7 @@ def cut_rig(rig: Rig, region: Region) -> Rig:
 
 def whole_stroke(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> tuple[float, float]:
     """D and its standard deviation from all frames of a film, metres."""
-    seen = seen_film(film, camera_seed=camera, preset=procedure.preset, rig=bundle.rig)
+    seen = seen_film(film, camera * _DRAWS_OF_A_CAMERA, camera, preset=procedure.preset, rig=bundle.rig)
     nominal = film.plan.pair.nominal_stroke_m
     scale = float(bundle.stroke(np.array(nominal))) / nominal
     found = bundle_depth(replace(seen, encoder_m=scale * seen.encoder_m), bundle.covariance)
