@@ -25,7 +25,7 @@ from phibench.estimator.captures.measure import (
     widened_by_shape,
     with_blur_of,
 )
-from phibench.estimator.captures.spot_shape import SpotImage, SpotShape, fit_shape
+from phibench.estimator.captures.spot_shape import UNLIKE, SpotImage, SpotShape, fit_shape
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.geometry.triangulate import depth_exact
@@ -172,6 +172,8 @@ def _known(imported: ImportedSet, rows: Sequence[ImportedRow], rig: Rig, shape: 
         raise DatasetError("no measured D")
     images = seen_images(pair)
     down, up = (widened_by_shape(found[name], images.get(name), shape) for name in POSITIONS)
+    if max(down.unlike, up.unlike) >= UNLIKE:
+        raise DatasetError("the light has not the shape of a spot: the beam meets an edge or grazes a surface")
     return KnownSpot(
         down.uv_px,
         up.uv_px,

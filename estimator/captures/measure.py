@@ -39,10 +39,11 @@ from phibench.estimator.captures.rig_file import MeasuredRig, read_rig_file, req
 from phibench.estimator.captures.spot_shape import (
     OUTLINE_SIGMA_PX,
     PRIOR_SIGMA,
+    UNLIKE,
     SpotImage,
     SpotShape,
     fit_shape,
-    shape_covariance,
+    seen_through,
     spot_images,
 )
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
@@ -101,10 +102,11 @@ def read_setting(
 
 @dataclass(frozen=True)
 class SeenSpot:
-    """Position of a spot in one image; pixels, covariance of (u, v)."""
+    """Position of a spot in one image; pixels, covariance of (u, v), and how unlike a spot its light is (0 to 1)."""
 
     uv_px: Array
     covariance_px2: Array = field(repr=False)
+    unlike: float = 0.0
 
     @property
     def sigma_px(self) -> float:
@@ -162,6 +164,11 @@ class Measurement:
         """The spots can be images of one point."""
         return bool(self.depth.p_value >= DOUBTFUL_P)
 
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Sentences on why D may be wrong by far more than its sigma says; none of a sound pair."""
+        return tuple(note for note in self.notes if note.startswith(_DOUBTFUL_SPOTS))
+
 
 def measure(photos: PairPhotos, stroke_m: float, setting: Setting) -> Measurement:
     """Measure D.
@@ -210,7 +217,8 @@ def measure(photos: PairPhotos, stroke_m: float, setting: Setting) -> Measuremen
     if int(depth.status) != Status.OK:
         raise contradiction(ready, photos, describe(int(depth.status)))
     frames = frames_note(photos)
-    notes = tuple(text for text in (chosen.note, note, _shape_note(shape, setting), frames, _doubt(depth)) if text)
+    tests = _doubt(depth), _torn(down, "down"), _torn(up, "up")
+    notes = tuple(text for text in (chosen.note, note, _shape_note(shape, setting), frames, *tests) if text)
     return Measurement(depth, down, up, rig, stroke, outlines, setting.known.rig, ready, chosen, notes)
 
 
@@ -311,10 +319,11 @@ def shape_prior(rig: Rig, outlines: Sequence[Outline]) -> SpotShape:
 
 
 def widened_by_shape(spot: SeenSpot, image: SpotImage | None, shape: SpotShape) -> SeenSpot:
-    """Spot with what the uncertainty of blur and filters adds to its place."""
+    """Spot with what the uncertainty of blur and filters adds to its place, and how far its light is none."""
     if image is None:
         return spot
-    return replace(spot, covariance_px2=spot.covariance_px2 + shape_covariance(image, shape))
+    added, unlike = seen_through(image, shape)
+    return replace(spot, covariance_px2=spot.covariance_px2 + added, unlike=unlike)
 
 
 def _shape_note(shape: SpotShape, setting: Setting) -> str:
@@ -337,12 +346,26 @@ def seen_spots(answer: Answer) -> dict[str, SeenSpot]:
     return {name: SeenSpot(np.array(spot.uv_px), np.array(spot.covariance_px2)) for name, spot in both.items()}
 
 
+_DOUBTFUL_SPOTS = "doubtful: the spot"
+
+
+def _torn(spot: SeenSpot, position: str) -> str:
+    """Sentence on a light that is no spot."""
+    if spot.unlike < UNLIKE:
+        return ""
+    u, v = spot.uv_px
+    return (
+        f"{_DOUBTFUL_SPOTS} {position} at ({u:.0f}, {v:.0f}) px has not the shape of one, {100.0 * spot.unlike:.0f} % "
+        "of its light do not fit; the beam may meet an edge or graze a surface, turn the laser a little"
+    )
+
+
 def _doubt(depth: GeneralDepth) -> str:
     """Sentence on the test."""
     p, chi2 = float(depth.p_value), float(depth.chi2)
     if p >= DOUBTFUL_P:
         return f"one point: chi^2 {chi2:.2f} for one degree of freedom (p = {p:.2g})"
     return (
-        f"doubtful: the spots are not images of one point, chi^2 {chi2:.1f} for one degree of freedom (p = {p:.1e}); "
+        f"{_DOUBTFUL_SPOTS}s are not images of one point, chi^2 {chi2:.1f} for one degree of freedom (p = {p:.1e}); "
         "one may be a reflection, the rig may have turned between the pictures, or the calibration is another rig's"
     )

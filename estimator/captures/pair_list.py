@@ -169,8 +169,8 @@ class Result:
         """Fault in one sentence; "ok" if there is none."""
         if self.found is None:
             return self.fault
-        if not self.found.one_point:
-            return next(note for note in self.found.notes if note.startswith("doubtful: the spots"))
+        if self.found.doubts:
+            return self.found.doubts[0]
         sigmas = self.tape_sigmas
         if sigmas is not None and abs(sigmas) > _CONTRADICTS_SIGMAS:
             return (

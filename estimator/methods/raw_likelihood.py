@@ -118,10 +118,12 @@ def _fitted_spot(fit: SpotFit, count: int) -> Spot:
     status = Status(int(fit.status[0]))
     if status is not Status.OK:
         return Spot.missing(describe(status))
-    # a room that the model does not follow shows in chi2; the claim is widened by it, as for any fit of least squares
-    chi2 = float(fit.chi2[0])
-    widened = chi2 if chi2 > 1.0 + _MISFIT_SIGMAS * math.sqrt(2.0 / count) else 1.0
-    (a, b), (c, d) = (widened * fit.covariance_px2[0]).tolist()
+    chi2, covariance = float(fit.chi2[0]), fit.covariance_px2[0]
+    if chi2 > 1.0 + _MISFIT_SIGMAS * math.sqrt(2.0 / count):
+        # a room that the model does not follow misfits everywhere: the claim is widened by chi2, as for any fit of
+        # least squares; a light of another shape, such as a spot on an edge, misfits on the few pixels that place it
+        covariance = max(chi2 * covariance, fit.misfit_px2[0], key=np.trace)
+    (a, b), (c, d) = covariance.tolist()
     return Spot((float(fit.uv_px[0, 0]), float(fit.uv_px[0, 1])), ((a, b), (c, d)))
 
 
@@ -249,14 +251,14 @@ def raw_spot_data(pair: Pair, position: str, start: Array, depth_m: float | None
     card, near = pair.card, _around(pair, position, start)
     noise, pattern, frames = noise_of(card, pattern_known=True), PatternNoise.of(card), pair.count(position)
     x = raw_electrons(near.on, card)[None]
-    x = np.where(x < _full_from_e(card, frames), x, np.nan)
+    used = x < _full_from_e(card, frames)
     law = GaussLaw(noise, pattern.dsnu_e2, frames, pattern.prnu)
     if near.off is not None:
         off, count = raw_electrons(near.off, card)[None], pair.count(f"{position}_off")
         room = np.maximum(background_of(off, noise.variance_e2(off) / count, np.ones(off.shape), pattern).mean_e, 0.0)
         x, law = x - off, replace(law, extra_e2=room / frames + noise.variance_e2(room) / count)
     blur = pair_blur(pair, start, depth_m)
-    return spot_data(spot_regions(x, near.corner_px), law, blur, SpotModel(_response(pair)))
+    return spot_data(spot_regions(np.where(used, x, 0.0), near.corner_px, used), law, blur, SpotModel(_response(pair)))
 
 
 @dataclass(frozen=True)

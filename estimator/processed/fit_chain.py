@@ -324,7 +324,7 @@ def _collected(
     chi2 = np.array([fit.chi2 for fit, _ in rows], float)
     values = (theta[:, :2] + origin, covariance[:, :2, :2], theta[:, 2], theta[:, 3:6], sigma, chi2)
     uv, uv_covariance, flux, levels, width, misfit = (keep(np.asarray(value, float), status) for value in values)
-    return SpotFit(uv, uv_covariance, flux, levels, width, misfit, status)
+    return SpotFit(uv, uv_covariance, flux, levels, width, misfit, status, np.full(uv_covariance.shape, np.nan))
 
 
 def _on_grid(origin: NDArray[np.int64], shape: tuple[int, int], card: SensorCard) -> None:

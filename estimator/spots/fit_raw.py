@@ -27,6 +27,7 @@ DAMPING = (1.0,) * 12 + (0.5,) * 16 + (0.25,) * 24  # of the steps after screeni
 DECREMENT = 1e-8  # squared distance from the minimum in standard deviations: 1e-4 of one
 AT_ONCE = 64  # spots that are fitted together: their arrays stay in the cache
 _SCREENING_STEPS = 4
+_LEAST_FREEDOM = 0.1  # of a pixel, 1 - leverage: one that a fit follows wholly says nothing of its misfit
 _LEAST_INFORMATION = 1e-12  # per electron squared: of a pixel that is full
 
 
@@ -44,6 +45,8 @@ class SpotFit:
     chi2 : shape (n,), sum over the pixels that were used of score^2 / information, which is (x - mu)^2 / V for raw
         pixels, per degree of freedom
     status : shape (n,), values of `Status`
+    misfit_px2 : shape (n, 2, 2), covariance of (u, v) from the pixels' own misfits (`_sandwich`); NaN where a fit of
+        another kind has none
     """
 
     uv_px: Array
@@ -53,6 +56,7 @@ class SpotFit:
     sigma_px: Array
     chi2: Array
     status: StatusArray
+    misfit_px2: Array
 
 
 @dataclass(frozen=True)
@@ -239,6 +243,7 @@ def _result(data: SpotData, theta: Array, converged: BoolArray) -> SpotFit:
     h, w = regions.x_e.shape[1:]
     _, fisher = _scores(data, theta)
     covariance = covariance_bound(fisher, keep=3)
+    sandwich = _sandwich(data, theta, fisher)
     inside = (np.abs(theta[:, 0] - (w - 1) / 2) <= w / 2) & (np.abs(theta[:, 1] - (h - 1) / 2) <= h / 2)
     used = regions.used.sum(axis=(1, 2))
     status = flag(
@@ -255,12 +260,34 @@ def _result(data: SpotData, theta: Array, converged: BoolArray) -> SpotFit:
     c = pixels.levels.shape[1]
     background = theta[:, 3 : 3 + c] if c else np.full((n, 1), np.nan)
     sigma = theta[:, -1] if pixels.free_width else np.asarray(pixels.blur.sigma_px)
-    values = (theta[:, :2] + regions.origin_px, covariance[:, :2, :2], theta[:, 2], background, sigma, chi2)
-    uv, uv_covariance, flux, levels, width, misfit = (keep(value, status) for value in values)
-    return SpotFit(uv, uv_covariance, flux, levels, width, misfit, status)
+    values = (theta[:, :2] + regions.origin_px, covariance[:, :2, :2], theta[:, 2], background, sigma, chi2, sandwich)
+    uv, uv_covariance, flux, levels, width, misfit, own = (keep(value, status) for value in values)
+    return SpotFit(uv, uv_covariance, flux, levels, width, misfit, status, own)
+
+
+def _sandwich(data: SpotData, theta: Array, fisher: Array) -> Array:
+    """Covariance of (u, v) that the misfit of each pixel says by itself, shape (n, 2, 2).
+
+    F^-1 (sum of J_i J_i^T s_i^2 / (1 - h_i)^2) F^-1 with the scores s_i and the leverages h_i = w_i J_i^T F^-1 J_i: H.
+    White, Econometrica 48, 817 (1980), in the form HC3 of J. G. MacKinnon and H. White (1985). It holds whatever the
+    pixels' variances are. A light that has not the model's shape misfits on the few pixels that place it, and chi^2
+    over all pixels would dilute that.
+    """
+    mean, derivatives = data.pixels.at(theta)
+    n, k = theta.shape
+    J = derivatives.reshape(n, k, -1)
+    used = data.regions.used
+    w = (used * data.law.information(mean)).reshape(n, -1)
+    s = (used * data.law.score(data.regions.x_e, mean)).reshape(n, -1)
+    inverse = covariance_bound(fisher, keep=k)
+    own = inverse @ J
+    leverage = w * np.einsum("nkp,nkp->np", J, own)
+    scaled = own[:, :2] * (s / np.maximum(1.0 - leverage, _LEAST_FREEDOM))[:, None]
+    return np.asarray(scaled @ np.swapaxes(scaled, 1, 2))
 
 
 def _nothing(levels: int) -> SpotFit:
     none = np.zeros(0)
     shape = (0, max(levels, 1))
-    return SpotFit(np.zeros((0, 2)), np.zeros((0, 2, 2)), none, np.zeros(shape), none, none, np.zeros(0, np.int64))
+    status, matrices = np.zeros(0, np.int64), np.zeros((0, 2, 2))
+    return SpotFit(np.zeros((0, 2)), matrices, none, np.zeros(shape), none, none, status, matrices)

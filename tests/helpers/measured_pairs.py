@@ -1,19 +1,26 @@
 """Figures of `phibench measure`: pairs of one rig written as camera files, calibrated and measured from them alone.
 
     phibench dataset make tests/one_rig.toml --out FOLDER
-    PYTHONPATH=tests python tests/helpers/measured_pairs.py FOLDER PICTURES [mjpeg | bayer-raw] [own] [sensor] [0 | 1]
+    PYTHONPATH=tests python tests/helpers/measured_pairs.py FOLDER PICTURES --preset bayer-raw --sensor --third 0
 
 The rig file says what the drawing says, `[rig]` without any number: the true rig is off by its `[misalignment]`, and
-its blur and filters are others. A third of the samples, by the number 0 to 2, calibrate it, at the distances of a tape
-of 2 mm. The others are measured by the calibration, with `own` by their own outlines alone, too, and by the scorer that
-knows the true rig and stroke. With `sensor` the sensor is fitted to dark and flat raw frames of the same camera first.
+its blur and filters are others. A third of the samples calibrate it, at the distances of a tape of 2 mm. The others are
+measured by the calibration, with --own by their own outlines alone, too, and by the scorer that knows the true rig and
+stroke. With --sensor the sensor is fitted to dark and flat raw frames of the same camera first. With --quick no outline
+of a pair that is measured is looked for: with a calibration it only tells whether the mirror has moved.
+
+Each pair is one line of JSON in PICTURES/rows.jsonl. Files of that kind are put together by
+
+    PYTHONPATH=tests python tests/helpers/measured_pairs.py --summary ROWS.jsonl ...
 """
 
 from __future__ import annotations
 
+import argparse
+import json
 import shutil
-import sys
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,31 +30,43 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.frame_files import png_bytes
 from phibench.datasets.frames.sensor_file import write_sensor_file
 from phibench.datasets.read import Dataset, Sample, open_finished
+from phibench.estimator.captures import measure as command
 from phibench.estimator.captures.imported_calibration import calibrate_imported
 from phibench.estimator.captures.imported_set import import_pairs
 from phibench.estimator.captures.measure import Setting, measure, read_setting
-from phibench.estimator.captures.pair_photos import PairPhotos, PositionPhotos
-from phibench.estimator.captures.picture_files import read_photo
+from phibench.estimator.captures.pair_list import photos_of, read_pair_list
 from phibench.estimator.draw_pairs import pairs_of
 from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.limits.off_frame_bound import FrameCounts
 from phibench.estimator.methods.registry import METHODS
 from phibench.estimator.sensor_fit.fit import fit_sensor
+from phibench.estimator.spots.image_planes import ImageError
 from phibench.render.sensor.settings import sensor
 
 TAPE_M, PART = 0.002, 3
 NAMES = ("down", "up", "down_off", "up_off")
+_FAR = 0.1  # of D, by which the scorer's D may be off before another light was taken
 
 
 @dataclass(frozen=True)
 class Row:
-    """One pair: true D, D and sigma of the command, D of the scorer that knows the rig."""
+    """One pair: true D; D, sigma, its parts, p and doubt of the command; D of the scorer that knows the rig."""
 
-    sample_id: str
+    setting: str
+    name: str
     true_m: float
+    known_m: float
     found_m: float
     sigma_m: float
     spot_m: float
-    known_m: float
+    rig_m: float
+    p_value: float
+    doubtful: bool
+
+    @property
+    def pull(self) -> float:
+        """Error over sigma."""
+        return (self.found_m - self.true_m) / self.sigma_m
 
 
 def seen(dataset: Dataset) -> list[Sample]:
@@ -55,23 +74,36 @@ def seen(dataset: Dataset) -> list[Sample]:
     return [sample for sample in dataset if sample.row.down.visible and sample.row.up.visible]
 
 
-def write_files(dataset: Dataset, samples: list[Sample], folder: Path, preset: str) -> None:
-    """Camera files, `pairs.csv` with a tape's D, and a rig file without a number."""
+# -- files ---------------------------------------------------------------------------------------------------------
+
+
+def write_files(
+    dataset: Dataset, samples: Sequence[Sample], folder: Path, preset: str, draws: int = 1, frames: int = 1
+) -> None:
+    """Camera files of samples, `pairs.csv` with a tape's D, and a rig file without a number."""
     folder.mkdir(parents=True, exist_ok=True)
     rng, lines = np.random.default_rng(20261123), ["name,down,up,down_off,up_off,stroke_m,depth_m,depth_sigma_m"]
-    pairs = pairs_of(dataset, samples, preset)
-    for number, sample in enumerate(samples):
-        _, frames = pairs.pair_and_frames(number)
-        files = []
-        for name in NAMES:
-            frame = frames.by_name[name]
-            file = folder / f"{sample.row.sample_id}-{name}.{'png' if frame.jpeg is None else 'jpg'}"
-            file.write_bytes(png_bytes(frame.image) if frame.jpeg is None else frame.jpeg)
-            files.append(file.name)
+    pairs = pairs_of(dataset, samples, preset, draws, frames=FrameCounts(frames, frames))
+    for number in range(len(pairs)):
+        sample, draw = samples[number // draws], number % draws
+        name = f"{sample.row.sample_id}-{draw}"
+        groups = [_write_frames(pairs, number, image, folder / name) for image in NAMES]
         tape_m = sample.row.depth_m + TAPE_M * rng.standard_normal()
-        lines.append(f"{sample.row.sample_id},{','.join(files)},{sample.row.nominal_stroke_m},{tape_m:.4f},{TAPE_M}")
+        lines.append(f"{name},{','.join(groups)},{sample.row.nominal_stroke_m},{tape_m:.4f},{TAPE_M}")
     (folder / "pairs.csv").write_text("\n".join(lines) + "\n")
     (folder / "rig.toml").write_text("[rig]\n")
+
+
+def _write_frames(pairs, number: int, image: str, stem: Path) -> str:
+    """Names of one image's files, as `pairs.csv` has them."""
+    pair_draw, _, source = pairs.drawn_from(number)
+    laser, names = not image.endswith("_off"), []
+    for k, draw in enumerate(pair_draw.frame_draws(laser)):
+        frame = source.frame(image.removesuffix("_off"), draw, laser)
+        file = stem.with_name(f"{stem.name}-{image}-{k}.{'png' if frame.jpeg is None else 'jpg'}")
+        file.write_bytes(png_bytes(frame.image) if frame.jpeg is None else frame.jpeg)
+        names.append(file.name)
+    return ";".join(names)
 
 
 def write_sensor(pictures: Path) -> Path:
@@ -82,9 +114,13 @@ def write_sensor(pictures: Path) -> Path:
     return pictures / "sensor.toml"
 
 
-def known(dataset: Dataset, sample: Sample, preset: str) -> float:
+# -- measuring -----------------------------------------------------------------------------------------------------
+
+
+def known(dataset: Dataset, sample: Sample, preset: str, draw: int, frames: int) -> float:
     """D of the same frames by the scorer that knows rig and stroke; NaN where the method finds no spot."""
-    pair = replace(pairs_of(dataset, [sample], preset).pair(0), rig=sample.rig, stroke_m=sample.row.stroke_m)
+    pairs = pairs_of(dataset, [sample], preset, draw + 1, frames=FrameCounts(frames, frames))
+    pair = replace(pairs.pair(draw), rig=sample.rig, stroke_m=sample.row.stroke_m)
     method = METHODS["chain_fit" if preset == "mjpeg" else "raw_maximum_likelihood"]
     answer = method(pair)
     if answer.down.uv_px is None or answer.up.uv_px is None:
@@ -93,69 +129,100 @@ def known(dataset: Dataset, sample: Sample, preset: str) -> float:
     return float(depth_exact(sample.rig, sample.row.stroke_m, *places).depth_m)
 
 
-def measured(dataset: Dataset, sample: Sample, folder: Path, preset: str, setting: Setting) -> Row | None:
-    """The command's result for one sample; None where it refuses."""
-    end = "jpg" if preset == "mjpeg" else "png"
-    read = [
-        (read_photo(folder / f"{sample.row.sample_id}-{name}.{end}", setting.known.rig, setting.sensor),)
-        for name in NAMES
-    ]
-    photos = PairPhotos(PositionPhotos(read[0], read[2]), PositionPhotos(read[1], read[3]))
-    try:
-        found = measure(photos, sample.row.nominal_stroke_m, setting)
-    except DatasetError as error:
-        print(f"{sample.row.sample_id}: {error}", flush=True)
-        return None
-    doubt = "" if found.one_point else " DOUBTFUL"
-    known_m = known(dataset, sample, preset)
-    row = Row(
-        sample.row.sample_id,
-        sample.row.depth_m,
-        found.depth_m,
-        found.sigma_m,
-        float(found.depth.sigma_spot_m),
-        known_m,
-    )
-    print(
-        f"{row.sample_id}: true {row.true_m:.3f} m, found {row.found_m:.3f} +- {row.sigma_m:.3f} (spots "
-        f"{row.spot_m:.3f}), rig known {row.known_m:.3f}{doubt}",
-        flush=True,
-    )
-    return None if doubt else row
+def measured(dataset: Dataset, preset: str, folder: Path, name: str, setting: Setting, frames: int) -> Iterator[Row]:
+    """Results of the command for a folder's pairs; those that it refuses are printed."""
+    by_id = {sample.row.sample_id: sample for sample in dataset}
+    for listed in read_pair_list(folder):
+        sample_id, draw = listed.name.rsplit("-", 1)
+        sample = by_id[sample_id]
+        try:
+            found = measure(photos_of(folder, listed, setting), listed.stroke_m, setting)
+        except DatasetError as error:
+            print(f"{listed.name}: {error}", flush=True)
+            continue
+        known_m = known(dataset, sample, preset, int(draw), frames)
+        depth = found.depth
+        for doubt in found.doubts:
+            print(f"{listed.name}: {doubt}", flush=True)
+        parts = float(depth.sigma_spot_m), float(depth.sigma_calibration_m), float(depth.p_value), bool(found.doubts)
+        yield Row(name, listed.name, sample.row.depth_m, known_m, found.depth_m, found.sigma_m, *parts)
 
 
-def summary(name: str, rows: list[Row]) -> str:
-    """Rms relative errors, their ratio, and the pull, over pairs that the scorer finds to 10 %."""
-    both = [row for row in rows if abs(row.known_m / row.true_m - 1.0) < 0.1]
+def summary(name: str, rows: Sequence[Row]) -> str:
+    """Rms relative errors, their ratio, and the pull, over pairs that are not doubtful and the scorer finds to 10 %.
+
+    The interval of the pull is that of resampled samples: draws of one sample share its light.
+    """
+    both = [row for row in rows if abs(row.known_m / row.true_m - 1.0) < _FAR and not row.doubtful]
     found = np.array([row.found_m / row.true_m - 1.0 for row in both])
     other = np.array([row.known_m / row.true_m - 1.0 for row in both])
-    pull = np.array([(row.found_m - row.true_m) / row.sigma_m for row in both])
-    rms, rms_known, pull_rms = (float(np.sqrt(np.mean(x**2))) for x in (found, other, pull))
+    rms, rms_known = (float(np.sqrt(np.mean(x**2))) for x in (found, other))
+    groups: dict[str, list[float]] = {}
+    for row in both:
+        groups.setdefault(row.name.rsplit("-", 1)[0], []).append(row.pull**2)
+    squares, rng = list(groups.values()), np.random.default_rng(1)
+    again = [
+        np.sqrt(np.mean(np.concatenate([squares[k] for k in rng.integers(0, len(squares), len(squares))])))
+        for _ in range(2000)
+    ]
+    low, high = np.quantile(again, (0.16, 0.84))
+    pull = float(np.sqrt(np.mean([row.pull**2 for row in both])))
+    doubtful = sum(row.doubtful for row in rows)
     return (
-        f"{name}: {len(both)} pairs, rms of D {100.0 * rms:.3f} %, of the scorer that knows the rig "
-        f"{100.0 * rms_known:.3f} %, ratio {rms / rms_known:.2f}, pull {pull_rms:.2f}"
+        f"{name}: {len(both)} pairs of {len(groups)} samples, {doubtful} doubtful; rms of D {100.0 * rms:.3f} %, of "
+        f"the scorer that knows the rig {100.0 * rms_known:.3f} %, ratio {rms / rms_known:.2f}; "
+        f"pull {pull:.2f} ({low:.2f} to {high:.2f})"
     )
 
 
-def main(arguments: list[str]) -> None:
-    """Print the figures."""
-    dataset, pictures = open_finished(arguments[0]), Path(arguments[1])
-    preset = arguments[2] if len(arguments) > 2 else "mjpeg"
-    samples, which = seen(dataset), next((int(word) for word in arguments if word in ("0", "1", "2")), 0)
-    first, rest = samples[which::PART], [sample for k, sample in enumerate(samples) if k % PART != which]
-    write_files(dataset, first, pictures / "calibrate", preset)
-    sensor_file = write_sensor(pictures) if "sensor" in arguments else None
-    write_files(dataset, rest, pictures / "measure", preset)
+def run(options: argparse.Namespace) -> None:
+    """Write, calibrate, measure."""
+    dataset, pictures, preset = open_finished(options.folder), options.pictures, options.preset
+    samples = seen(dataset)
+    rest = [sample for k, sample in enumerate(samples) if k % PART != options.third]
+    write_files(dataset, samples[options.third :: PART], pictures / "calibrate", preset)
+    sensor_file = write_sensor(pictures) if options.sensor else None
+    write_files(dataset, rest, pictures / "measure", preset, options.draws, options.frames)
     import_pairs(pictures / "calibrate", pictures / "set")
-    calibration = calibrate_imported(pictures / "set", pictures / "rig.json", spots=True)
-    print(calibration.verdict, flush=True)
+    print(calibrate_imported(pictures / "set", pictures / "rig.json", spots=True).verdict, flush=True)
     rig = pictures / "measure" / "rig.toml"
     settings = [("calibrated", read_setting(rig, pictures / "rig.json", sensor_file))]
-    settings += [("own outlines", read_setting(rig, sensor=sensor_file))] if "own" in arguments else []
-    for name, setting in settings:
-        rows = [measured(dataset, sample, pictures / "measure", preset, setting) for sample in rest]
-        print(summary(name, [row for row in rows if row is not None]), flush=True)
+    settings += [("own outlines", read_setting(rig, sensor=sensor_file))] if options.own else []
+    if options.quick:
+        command.find_outline = _no_outline
+    with (pictures / "rows.jsonl").open("w") as lines:
+        for name, setting in settings:
+            rows = []
+            for row in measured(dataset, preset, pictures / "measure", name, setting, options.frames):
+                rows.append(row)
+                lines.write(json.dumps(asdict(row)) + "\n")
+                lines.flush()
+            print(summary(name, rows), flush=True)
+
+
+def _no_outline(*_: object) -> None:
+    raise ImageError("not looked for")
+
+
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, nargs="?")
+    parser.add_argument("pictures", type=Path, nargs="?")
+    parser.add_argument("--preset", default="mjpeg", choices=("mjpeg", "bayer-raw"))
+    parser.add_argument("--third", type=int, default=0, choices=range(PART))
+    parser.add_argument("--draws", type=int, default=1)
+    parser.add_argument("--frames", type=int, default=1)
+    for flag in ("--own", "--sensor", "--quick"):
+        parser.add_argument(flag, action="store_true")
+    parser.add_argument("--summary", nargs="+", type=Path)
+    options = parser.parse_args()
+    if options.summary:
+        lines = [line for path in options.summary for line in path.read_text().splitlines()]
+        print(summary("together", [Row(**json.loads(line)) for line in lines]))
+        return
+    run(options)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

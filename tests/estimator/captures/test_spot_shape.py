@@ -10,7 +10,14 @@ import pytest
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import Sample, open_dataset
-from phibench.estimator.captures.spot_shape import SpotImage, SpotShape, fit_shape, shape_covariance, spot_images
+from phibench.estimator.captures.spot_shape import (
+    UNLIKE,
+    SpotImage,
+    SpotShape,
+    fit_shape,
+    seen_through,
+    spot_images,
+)
 from phibench.estimator.draw_pairs import pairs_of
 from phibench.estimator.interface import Pair, Spot
 from phibench.scenes.rig import Rig
@@ -54,11 +61,32 @@ def test_spots_say_their_blur_and_colour(tiny_dataset: Path, sample: Sample, pre
 def test_an_uncertain_shape_widens_the_place(tiny_dataset: Path, sample: Sample) -> None:
     image = drawn(tiny_dataset, sample, "bayer-raw", 1)[0]
     prior = SpotShape.prior(image.pair.rig)
-    wide = shape_covariance(image, prior)
-    half = shape_covariance(image, replace(prior, covariance=prior.covariance / 4.0))
+    wide, _ = seen_through(image, prior)
+    half, _ = seen_through(image, replace(prior, covariance=prior.covariance / 4.0))
     assert np.linalg.eigvalsh(wide).min() >= -1e-15
     assert np.trace(wide) > 0.0
     assert np.allclose(half, wide / 4.0)
+
+
+def test_a_light_in_two_parts_is_no_spot(tiny_dataset: Path, sample: Sample) -> None:
+    image = drawn(tiny_dataset, sample, "bayer-raw", 1)[0]
+    shape = SpotShape(true_shape(sample.rig), np.diag([0.02, 0.01, 0.01]) ** 2)
+    on, off = (image.pair.images[name].astype(float) for name in ("down", "down_off"))
+    light = on - off
+    torn = off + 0.5 * light + 0.5 * np.roll(light, 4, axis=1)  # an even shift keeps the mosaic
+    other = replace(image, pair=replace(image.pair, down=np.rint(torn).astype(np.uint16)))
+    # half of the light is not where one spot has it; blur and room are as the model says in the whole one
+    assert seen_through(image, shape)[1] < 0.2 < UNLIKE < seen_through(other, shape)[1]
+
+
+def test_full_pixels_leave_the_shape_uncertain(tiny_dataset: Path, sample: Sample) -> None:
+    image = drawn(tiny_dataset, sample, "bayer-raw", 1)[0]
+    on = image.pair.images["down"].copy()
+    v, u = np.unravel_index(np.argmax(on), on.shape)
+    on[v, u] = image.pair.card.top_dn
+    full = replace(image, pair=replace(image.pair, down=on))
+    prior = SpotShape.prior(image.pair.rig)
+    assert np.trace(seen_through(full, prior)[0]) > 0.5 * np.trace(seen_through(image, prior)[0])
 
 
 def test_without_a_spot_the_prior_stands(sample: Sample) -> None:

@@ -17,9 +17,16 @@ from phibench.datasets.exposures.expected import expected_of_light
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.limits.position_bound import spot_limit
-from phibench.estimator.spots.fit_raw import SpotFit, fit_raw
+from phibench.estimator.spots.fit_raw import SpotFit, fit_law, fit_raw
 from phibench.estimator.spots.gaussian_spot import LASER_RESPONSE, SpotBlur, SpotModel, outer, profile
-from phibench.estimator.spots.raw_pixels import PixelNoise, bayer_filters, noise_of, raw_electrons
+from phibench.estimator.spots.raw_pixels import (
+    GaussLaw,
+    PixelNoise,
+    bayer_filters,
+    noise_of,
+    raw_electrons,
+    spot_regions,
+)
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.noise_tiles import NoiseStream
@@ -258,3 +265,39 @@ def test_a_fit_does_not_depend_on_its_neighbours() -> None:
     together = fit_raw(x, origin, PixelNoise(16.0), SpotBlur(0.8))
     alone = [fit_raw(x[i : i + 1], origin[i], PixelNoise(16.0), SpotBlur(0.8)).uv_px[0] for i in range(0, 64, 9)]
     np.testing.assert_allclose(together.uv_px[::9], alone, rtol=0, atol=1e-9)
+
+
+def test_the_covariance_by_misfits_is_that_of_fits_without_a_pixel() -> None:
+    origin, uv = np.array([[100, 100]]), np.array([[106.3, 105.8]])
+    mean = perfect(uv, 1.2, 20_000.0, 50.0, origin)
+    x = generator("fit", "jackknife").normal(mean, np.sqrt(mean + 16.0))
+    law, blur, count = GaussLaw(PixelNoise(16.0)), SpotBlur(1.2), x.size
+
+    def known(n: int) -> SpotModel:
+        return SpotModel(LASER_RESPONSE, np.full((n, 13, 13), 50.0))
+
+    one = fit_law(spot_regions(x, origin), law, blur, known(1))
+    others = ~np.eye(count, dtype=bool).reshape(count, 13, 13)
+    without = fit_law(
+        spot_regions(np.repeat(x, count, 0), np.repeat(origin, count, 0), others), law, blur, known(count)
+    )
+    off = without.uv_px - one.uv_px
+    # exact for a linear model; this one bends by some per cent where a pixel holds a third of what is known
+    np.testing.assert_allclose(one.misfit_px2[0], off.T @ off, rtol=0, atol=0.1 * np.trace(off.T @ off))
+
+
+def test_light_of_another_shape_is_claimed_by_its_own_pixels() -> None:
+    origin, uv = phases()
+    turn = generator("fit", "halves").uniform(0.0, 2.0 * np.pi, len(uv))
+    off = 0.5 * np.stack([np.cos(turn), np.sin(turn)], axis=1)  # a beam on an edge: two parts 1 px apart
+    mean = 0.7 * perfect(uv + off, 0.8, 2e5, 60.0, origin) + 0.3 * perfect(uv - off, 0.8, 2e5, 60.0, origin)
+    x = generator("fit", "noise of halves").normal(mean, np.sqrt(mean + 16.0))
+    fit = fit_raw(x, origin, PixelNoise(16.0), SpotBlur(0.8))
+
+    def pull(covariance: np.ndarray) -> float:
+        e = fit.uv_px - uv
+        return float(np.sqrt(np.mean(np.einsum("ni,nij,nj->n", e, np.linalg.inv(covariance), e)) / 2.0))
+
+    # 0.14 px of error: chi^2 of all pixels claims 0.01 px, the pixels of the spot 0.05 px
+    assert pull(fit.chi2[:, None, None] * fit.covariance_px2) > 8.0
+    assert pull(fit.misfit_px2) < 4.0
