@@ -194,7 +194,7 @@ class _Linear:
 
     @property
     def sound(self) -> bool:
-        """What is there is one spot alone."""
+        """True where one spot alone is there."""
         return bool(self.excess < _MOST_EXCESS and np.linalg.cond(self.A) < 1e15)
 
     @property
