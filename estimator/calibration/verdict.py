@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
-from scipy import stats
+from scipy.special import chdtrc
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.store.files import write_bytes
@@ -75,7 +75,7 @@ def verdict_of(bundle: Bundle, prior: Array, outlines: list[Outline]) -> Verdict
         Standard deviations that the fit began with.
     outlines : of the images that it used
     """
-    p = float(stats.chi2.sf(bundle.chi2, bundle.degrees)) if bundle.degrees > 0 else 1.0
+    p = float(chdtrc(bundle.degrees, bundle.chi2)) if bundle.degrees > 0 else 1.0
     with np.errstate(all="ignore"):
         far = np.nan_to_num(np.abs(bundle.values) / prior)
         left = np.sqrt(np.diag(bundle.covariance)) / prior

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
-from skimage.measure import block_reduce
 
 from phibench.estimator.outline.edge_ring import CURVES, PEAKS, TURNS, Circle, EdgeRing, LimbRing, log_colours
+from phibench.estimator.outline.limb_image import block_sums
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array
 
@@ -135,9 +135,7 @@ def shrunk(light: NDArray[Any], block: int) -> NDArray[Any]:
     """Means over squares of `block` pixels; what is left over at the right and below is cut off."""
     if block == 1:
         return light
-    rows, columns = (length // block * block for length in light.shape[:2])
-    cut = light[:rows, :columns]
-    return np.asarray(block_reduce(cut, (block, block, 1)[: light.ndim], np.mean))  # type: ignore[no-untyped-call]
+    return block_sums(light, block) / block**2
 
 
 def _over(radii_px: tuple[float, float], block: int) -> tuple[float, float]:

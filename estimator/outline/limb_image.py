@@ -103,15 +103,28 @@ def binned(planes: tuple[Plane, ...], block: int) -> tuple[Plane, ...]:
 
 
 def _binned(plane: Plane, block: int) -> Plane:
-    height, width = (size // block for size in plane.values.shape)
-    whole = (slice(height * block), slice(width * block))
-    weight = plane.usable[whole].reshape(height, block, width, block)
-    values = np.where(plane.usable, plane.values, 0.0)[whole].reshape(height, block, width, block)
-    count = weight.sum(axis=(1, 3))
+    count = block_sums(plane.usable.astype(np.uint16), block)
+    sums = block_sums(np.where(plane.usable, plane.values, 0.0), block)
     shares = [sum(t.weight for t in taps if t.filter_index == i) for taps in plane.taps for i in range(3)]
     share = np.array(shares, float).reshape(4, 3).mean(axis=0)
     taps = tuple(Tap(float(one), i) for i, one in enumerate(share) if one)
-    return Plane(values.sum(axis=(1, 3)) / np.maximum(count, 1), count > 0, (taps, taps, taps, taps))
+    return Plane(sums / np.maximum(count, 1), count > 0, (taps, taps, taps, taps))
+
+
+def block_sums(values: NDArray[Any], block: int) -> NDArray[Any]:
+    """Sums over squares of `block` pixels, shape (H // block, W // block, ...); what is left over is cut off.
+
+    Slices are added up: five times as fast as `skimage.measure.block_reduce`, which sums along short axes.
+    """
+    height, width = (size // block for size in values.shape[:2])
+    cut = values[: height * block, : width * block]
+    rows = cut[::block].copy()
+    for k in range(1, block):
+        rows += cut[k::block]
+    sums = rows[:, ::block].copy()
+    for k in range(1, block):
+        sums += rows[:, k::block]
+    return sums
 
 
 def _whole(values: NDArray[Any], taps: Taps) -> Plane:
@@ -136,11 +149,13 @@ def _raw(image: NDArray[Any], card: SensorCard) -> tuple[Plane, ...]:
 def _luma(image: NDArray[Any], card: SensorCard) -> Plane:
     """Luma of the linear, white-balanced planes. It is a filter's own light only where the colour matrix is one."""
     weights = np.array(JPEG_LUMA)
-    clipped: BoolArray = np.asarray((image >= _CLIPPED).any(axis=-1))
+    clipped: BoolArray = np.maximum(np.maximum(image[..., 0], image[..., 1]), image[..., 2]) >= _CLIPPED
     clipped = ndimage.binary_dilation(clipped, iterations=2) if clipped.any() else clipped
     if image.dtype == np.uint8:  # 256 codes have 256 values: the tone curve of twelve megapixels would take seconds
         light = light_of(np.arange(256) / 255.0, card)
-        values = np.sum([(light * weights[i])[image[..., i]] for i in range(3)], axis=0)
+        values = (light * weights[0])[image[..., 0]]
+        for i in (1, 2):
+            values += (light * weights[i])[image[..., i]]
         level = np.array([_median_light(light, image[..., i]) for i in range(3)]) * weights
     else:
         linear = light_of(np.asarray(image, float) / 255.0, card)

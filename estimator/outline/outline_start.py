@@ -25,6 +25,7 @@ _FEW, _CANDIDATES = 6, 12
 _NEAR = (0.95, 1.05)  # of the nominal rig's outline: looked at first
 _RADII = (0.7, 1.4)
 _LEAST_RADIUS_PX = 30.0
+_LEVEL_PX = 1000  # rows and columns that are enough for a level
 PICTURE_BLUR_PX2 = 0.5 + 1.0 / 6.0 + 1.0 / 12.0
 """Variance of the blur of `grey` besides the lens: the mosaic's mean, linear interpolation, the pixel."""
 
@@ -36,7 +37,9 @@ def grey(planes: tuple[Plane, ...]) -> Array:
         picture = np.mean([plane.values for plane in planes], axis=0)
     elif len(planes) == 3:
         picture = ndimage.convolve(picture, np.outer([1, 2, 1], [1, 2, 1]) / 16.0, mode="mirror")
-    level = np.median(picture[np.isfinite(picture)]) if np.isfinite(picture).any() else 0.0
+    every = max(1, max(picture.shape) // _LEVEL_PX)
+    some = picture[::every, ::every]
+    level = np.median(some[np.isfinite(some)]) if np.isfinite(some).any() else 0.0
     if not level > 0.0:
         raise ImageError("an image without a mirror: it is dark")
     return np.nan_to_num(picture / level)
