@@ -6,7 +6,6 @@ tilt and principal point of the camera give the vertical; their errors usually d
 
 from __future__ import annotations
 
-import io
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,11 +13,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw
+from PIL import ImageDraw
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.datasets.store.files import write_bytes
-from phibench.estimator.calibration.verdict import draw_legend, draw_outline
+from phibench.estimator.calibration.outline_picture import overlay
 from phibench.estimator.outline.outline import Outline, find_outline
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
@@ -114,21 +112,17 @@ def alignment(
 
 def write_alignment_picture(path: Path, image: NDArray[np.uint8], rig: Rig, found: Alignment) -> Path:
     """Draw the outline with its residuals, its centre and the move, both enlarged, into a copy of the image; PNG."""
-    picture = Image.fromarray(np.ascontiguousarray(image))
-    legend = draw_outline(picture, found.outline.rig(rig), found.outline)
-    draw = ImageDraw.Draw(picture)
-    u, v = rig.camera.project(found.outline.sphere_in_camera_m)
-    du, dv = _ARROW_TIMES * found.move_px
+    drawn = overlay(image, rig, found.outline)
+    draw = ImageDraw.Draw(drawn.picture)
+    u, v = drawn.rig.camera.project(found.outline.sphere_in_camera_m)
+    du, dv = _ARROW_TIMES * drawn.times * found.move_px
     draw.ellipse((u - 3, v - 3, u + 3, v + 3), outline=_CENTRE)
     draw.line((u, v, u + du, v + dv), fill=_MOVE, width=2)
     turn, head = math.atan2(dv, du), min(10.0, 0.5 * math.hypot(du, dv))
     for side in (-0.4, 0.4):
         back = (u + du - head * math.cos(turn + side), v + dv - head * math.sin(turn + side))
         draw.line((u + du, v + dv, *back), fill=_MOVE, width=2)
-    draw_legend(picture, (*legend, f"red: move x {_ARROW_TIMES:g}"))
-    buffer = io.BytesIO()
-    picture.save(buffer, format="PNG")
-    return write_bytes(path, buffer.getvalue())
+    return drawn.write(path, f"red: move x {_ARROW_TIMES:g}")
 
 
 def verdict(found: Alignment) -> str:

@@ -16,8 +16,9 @@ from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.store.files import require_writable
 from phibench.estimator.calibration.bundle import Bundle, KnownSpot, calibrate
 from phibench.estimator.calibration.file import write_calibration
+from phibench.estimator.calibration.outline_picture import write_overlay
 from phibench.estimator.calibration.spots import Ruler, known_spot, measured_spot, method_for, one_per_pose
-from phibench.estimator.calibration.verdict import Verdict, verdict_of, write_overlay
+from phibench.estimator.calibration.verdict import Verdict, verdict_of
 from phibench.estimator.calibration.vertical_edges import find_vertical
 from phibench.estimator.draw_pairs import pairs_of
 from phibench.estimator.geometry.rig_parameters import prior_sigmas
@@ -61,7 +62,7 @@ class DatasetCalibration:
     verdict: Verdict
 
     def write_picture(self, path: Path) -> Path:
-        """Overlay of the image whose outline fits worst, see `verdict.write_overlay`."""
+        """Overlay of the image whose outline fits worst, see `outline_picture.write_overlay`."""
         worst = int(np.argmax([one.shift_rms_px for one in self.outlines]))
         image, title = self.images[worst], self.names[worst]
         return write_overlay(path, image.pixels, image.card, self.nominal, self.outlines[worst], title)

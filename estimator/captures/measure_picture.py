@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from phibench.datasets.store.files import write_bytes
-from phibench.estimator.calibration.verdict import visible_picture
+from phibench.estimator.calibration.outline_picture import visible_picture
 from phibench.estimator.captures.measure import Measurement, SeenSpot
 from phibench.estimator.interface import Box
 from phibench.estimator.spots.detect import epipolar_curve, mirror_box

@@ -160,6 +160,7 @@ def align(
         rig.camera,
         width_px=pixels.shape[1],
         height_px=pixels.shape[0],
+        pixel_pitch_um=rig.camera.pixel_pitch_um * rig.camera.width_px / pixels.shape[1],
         fx_px=focal_px,
         fy_px=focal_px,
         cx_px=centre[0],

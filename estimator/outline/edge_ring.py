@@ -23,8 +23,8 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.signal import fftconvolve
 
+from phibench.estimator.outline.limb_image import convolved
 from phibench.scenes.frames import Array, BoolArray
 
 Circle = tuple[float, float, float]
@@ -220,5 +220,5 @@ class LimbRing(EdgeRing):
         k = np.arange(-reach, reach + 0.5 * fine, fine)
         kernel = np.exp(-0.5 * np.square(k / self.blur_px))
         T = 2.0 * np.arccos(np.clip(1.0 + d / self.circle[2], 0.0, 1.0))
-        turned, squared = (fftconvolve(f, kernel / kernel.sum(), mode="valid")[::_FINE] for f in (T, T * T))
+        turned, squared = (convolved(f, kernel / kernel.sum())[::_FINE] for f in (T, T * T))
         return np.stack([np.ones(len(x)), turned, squared], axis=-1)

@@ -21,8 +21,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
-from scipy.signal import fftconvolve
+from scipy import fft, ndimage
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.spots.camera_codes import light_of, rgb_picture
@@ -295,14 +294,22 @@ def _kernel(camera: Camera, limb_depth_m: float, blur_px2: float) -> Array:
     kernel = np.exp(-0.5 * x * x / (blur_px2 + _PIXEL_VARIANCE_PX2))
     disc_px = camera.aperture_radius_m * camera.fx_px * abs(1.0 / camera.focus_distance_m - 1.0 / limb_depth_m)
     if disc_px > 2.0 * _STEP_PX:
-        kernel = fftconvolve(kernel, np.sqrt(np.clip(disc_px**2 - x * x, 0.0, None)), mode="same")
+        half = len(x) // 2
+        kernel = convolved(np.pad(kernel, half), np.sqrt(np.clip(disc_px**2 - x * x, 0.0, None)))
     return np.asarray(kernel / kernel.sum())
 
 
 def _blurred(sharp: Array, kernel: Array) -> Array:
     half = len(kernel) // 2
     padded = np.concatenate([np.full(half, sharp[0]), sharp, np.full(half, sharp[-1])])
-    return np.asarray(fftconvolve(padded, kernel, mode="valid"))
+    return convolved(padded, kernel)
+
+
+def convolved(values: Array, kernel: Array) -> Array:
+    """Convolution where the kernel lies within the values, by FFT: what `scipy.signal`, slow to import, gives."""
+    length = fft.next_fast_len(len(values), real=True)
+    product = fft.rfft(values, length) * fft.rfft(kernel, length)
+    return np.asarray(fft.irfft(product, length)[len(kernel) - 1 : len(values)])
 
 
 @dataclass(frozen=True)

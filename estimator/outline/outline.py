@@ -57,7 +57,10 @@ _NEAR_M = (3e-5, 3e-5, 1.2e-4)  # about 0.15 px of the outline
 _CHOOSE = 3  # steps that choose their pixels anew
 _STEPS, _REST_M, _REST_SIGMAS, _UNREST_M = 30, 1e-7, 0.05, 1e-6
 _MIN_CONTRAST, _MAX_CONTRAST = 0.5, 1.6
-_BINNED_PX = 1000  # long side from twice which on the light is first fitted in squares of pixels
+_BINNED_PX = 1000
+"""Long side from twice which on the light is fitted in squares of pixels. What tells the limb is the root that the light
+follows over some 15 degrees of turn: over 5 squares of 4 px as over 5 px of a small picture, not over 5 px of a large
+one."""
 _HOPELESS = (6, 0.25, 2.2)  # step at which a fit with a contrast beyond these is given up
 _BLUR_RANGE_PX2 = (0.02, 9.0)
 _LEAST_CONTRAST = 9.0  # of a circle whose light is worth a fit; patterns and noise give up to 8
@@ -88,6 +91,7 @@ class Outline:
     residual : float
         Robust standard deviation of the residuals over the light.
     pixels, steps : int
+        Squares of pixels in long pictures.
     by_edge : bool
         The light is not as the model has it: the outline is the edge in the picture. Contrast, blur and residual are
         NaN.
@@ -163,10 +167,8 @@ def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) 
     for start, circle, edge in _clearest(grey(planes), rig):
         try:
             found = fit_outline(*small, start, again=again if block == 1 else None)
-            if block > 1:  # the last refinement alone sees all pixels
-                found = fit_outline(planes, rig, found.sphere_in_camera_m, again=again, near=True)
             require_near(found.rig(rig), circle)
-            return found
+            return replace(found, blur_px=block * found.blur_px, shifts_px=block * found.shifts_px)
         except ImageError as error:
             # that it is cut, or lit badly, says more than that the last circle tried was none
             fault = error if "without a mirror" in str(fault) else fault
@@ -280,14 +282,10 @@ def fit_outline(
     start_m: Array,
     half_px: float = HALF_WIDTH_PX,
     again: tuple[NDArray[Any], SensorCard] | None = None,
-    near: bool = False,
 ) -> Outline:
-    """As `find_outline`, from a start within some pixels of the outline, or `near` it, within some tenths.
-
-    `again` is frame and card of a JPEG frame.
-    """
+    """As `find_outline`, from a start within some pixels of the outline. `again` is frame and card of a JPEG frame."""
     s, blur = np.asarray(start_m, float), rig.camera.blur_sigma_px**2
-    s = s if near else _approach(planes, rig, s, blur)
+    s = _approach(planes, rig, s, blur)
     arc = visible_arc(rig, s, half_px)
     if arc < MIN_ARC:
         raise ImageError(

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 
 import numpy as np
 from scipy import ndimage
-from skimage.measure import CircleModel, EllipseModel
 
 from phibench.estimator.outline.ball_circle import BallCircle, circles
 from phibench.estimator.outline.edge_ring import Circle
@@ -95,6 +94,8 @@ def _nominal(rig: Rig) -> Circle:
 
 def plain_circle(points_px: Array) -> Circle:
     """Least-squares circle (u, v, radius) through edges, shape (n, 2), pixels."""
+    from skimage.measure import CircleModel  # takes half a second, and the search needs it not
+
     model = CircleModel.from_estimate(points_px)  # type: ignore[no-untyped-call]
     return float(model.center[0]), float(model.center[1]), float(model.radius)
 
@@ -108,6 +109,8 @@ def sphere_from_circle(circle: Circle, camera: Camera, radius_m: float) -> Array
 
 def sphere_from_ellipse(points_px: Array, camera: Camera, radius_m: float) -> Array:
     """Sphere centre from the least-squares ellipse through edges: the cone over it."""
+    from skimage.measure import EllipseModel  # as above
+
     model = EllipseModel.from_estimate(points_px)  # type: ignore[no-untyped-call]
     return sphere_from_rays(camera.rays(model.predict_xy(np.linspace(0.0, 2.0 * np.pi, 360))), radius_m)
 

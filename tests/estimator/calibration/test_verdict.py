@@ -11,7 +11,8 @@ from helpers.limb_frames import limb_light
 from PIL import Image
 
 from phibench.estimator.calibration.bundle import Bundle, calibrate
-from phibench.estimator.calibration.verdict import BAD, DOUBTFUL, GOOD, verdict_of, write_overlay
+from phibench.estimator.calibration.outline_picture import write_overlay
+from phibench.estimator.calibration.verdict import BAD, DOUBTFUL, GOOD, verdict_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
 from phibench.estimator.outline.limb_image import Measured, planes_of
 from phibench.estimator.outline.outline import SECTORS, Outline, find_outline
