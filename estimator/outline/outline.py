@@ -58,9 +58,9 @@ _CHOOSE = 3  # steps that choose their pixels anew
 _STEPS, _REST_M, _REST_SIGMAS, _UNREST_M = 30, 1e-7, 0.05, 1e-6
 _MIN_CONTRAST, _MAX_CONTRAST = 0.5, 1.6
 _BINNED_PX = 1000
-"""Long side from twice which on the light is fitted in squares of pixels. What tells the limb is the root that the light
-follows over some 15 degrees of turn: over 5 squares of 4 px as over 5 px of a small picture, not over 5 px of a large
-one."""
+"""Long side from twice which on the light is fitted in squares of pixels. What tells the limb is the root that the
+light follows over some 15 degrees of turn: 5 squares of 4 px reach as far as 5 px of a small picture do, 5 px of a
+large one do not."""
 _HOPELESS = (6, 0.25, 2.2)  # step at which a fit with a contrast beyond these is given up
 _BLUR_RANGE_PX2 = (0.02, 9.0)
 _LEAST_CONTRAST = 9.0  # of a circle whose light is worth a fit; patterns and noise give up to 8
