@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
-from phibench.estimator.outline.edge_ring import CURVES, PEAKS, TURNS, Circle, EdgeRing, LimbRing, log_colours
+from phibench.estimator.outline.edge_ring import CURVES, PEAKS, TURNS, Circle, EdgeRing, FineRing, LimbRing, log_colours
 from phibench.estimator.outline.limb_image import block_sums
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array
@@ -116,7 +116,31 @@ def find_circle(light: NDArray[Any], radii_px: tuple[float, float] | None = None
     if best is None:
         raise ImageError("no outline of a ball was found: the picture has no edges on a circle")
     best.require_clear()
-    return best
+    return refined(light, best)
+
+
+def refined(light: NDArray[Any], found: BallCircle) -> BallCircle:
+    """An outline that was found in a picture made smaller, in the squares of one twice as long.
+
+    Finer ones say no more: the pixels of long photographs are finer than what lens and sharpening leave of an edge.
+    """
+    searched, block = (max(1, math.ceil(max(light.shape[:2]) / length)) for length in (LONGEST_PX, 2 * LONGEST_PX))
+    if block == searched:
+        return found
+    return _finer(light[None] if light.ndim == 2 else np.moveaxis(light, -1, 0), found, block)
+
+
+def _finer(channels: NDArray[Any], found: BallCircle, block: int) -> BallCircle:
+    u, v, radius = found.circle_px
+    circle = ((u + 0.5) / block - 0.5, (v + 0.5) / block - 0.5, radius / block)
+    e = np.array(found.ellipse_px) / block
+    curve = np.array([0.0, 0.0, 0.0, *e])
+    for _ in range(2):
+        ring = FineRing(channels, circle, _NEAR_REACH_PX, block=block, ellipse=(float(curve[3]), float(curve[4])))
+        moved, curve = ring.moved(_least_squares(ring, curve, _SCALES)[0])
+        circle = moved.circle
+    ring = FineRing(channels, circle, _NEAR_REACH_PX, block=block, ellipse=(float(curve[3]), float(curve[4])))
+    return _with_covariance(found.contrast, ring, curve, _SCALES, (_FLOOR_PX,) * 3, block, found.lead)
 
 
 def circles(

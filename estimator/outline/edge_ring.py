@@ -16,6 +16,7 @@ Symbols: d distance from the limb, pixels, outwards positive; r radius of the ou
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar, Self
@@ -105,10 +106,15 @@ class EdgeRing:
         return np.asarray((u > 2.0) & (u < columns - 3.0) & (v > 2.0) & (v < rows - 3.0))
 
     @cached_property
+    def light(self) -> Array:
+        """Channels at all turns and distances, shape (n, TURNS, distances)."""
+        u, v = self.uv
+        return np.stack([ndimage.map_coordinates(plane, [v, u], order=1, mode="nearest") for plane in self.channels])
+
+    @cached_property
     def strength(self) -> Array:
         """Slope of the light across the circle over that of its turn, 0 to 1, shape (TURNS, distances)."""
-        u, v = self.uv
-        light = np.stack([ndimage.map_coordinates(plane, [v, u], order=1, mode="nearest") for plane in self.channels])
+        light = self.light
         along = max(1.0, _ALONG_PX * TURNS / (2.0 * np.pi * max(self.circle[2], 1.0)))
         modes = ("nearest", "wrap", "nearest")
         smooth = ndimage.gaussian_filter(light, (0.0, along, self.blur_px / self.step_px), mode=modes)
@@ -162,6 +168,47 @@ class EdgeRing:
         u, v, radius = self.circle
         circle = (u + float(curve[1]), v + float(curve[2]), radius + float(curve[0]))
         return type(self)(self.channels, circle, **options), np.array([0.0, 0.0, 0.0, curve[3], curve[4]])
+
+
+@dataclass(frozen=True)
+class FineRing(EdgeRing):
+    """Edges across a curve in a picture that was searched at a smaller size: all pixels between two turns are used.
+
+    Parameters
+    ----------
+    channels : array, shape (n, H, W)
+        Linear light of the whole picture.
+    circle, reach_px, step_px, blur_px
+        As of `EdgeRing`, in squares of `block` pixels.
+    block : int
+    ellipse : e1, e2
+        Of the curve that the light is taken along, in squares, too: distances are from the circle.
+    """
+
+    block: int = 1
+    ellipse: tuple[float, float] = (0.0, 0.0)
+
+    @cached_property
+    def light(self) -> Array:
+        """Logarithms of the mean light between turns, as channels, shape (n, TURNS, distances)."""
+        parts = max(1, math.ceil(2.0 * np.pi * self.circle[2] * self.block / TURNS))
+        turn = (np.arange(TURNS * parts) - 0.5 * (parts - 1)) * (2.0 * np.pi / (TURNS * parts))
+        # between two turns the ellipse goes on: the light is averaged along the curve, not across it
+        here = self.ellipse[0] * np.cos(2.0 * turn) + self.ellipse[1] * np.sin(2.0 * turn)
+        bend = here - np.repeat(CURVES[:, 3:] @ np.array(self.ellipse), parts)
+        u, v, radius = self.circle
+        r = radius + self.distances_px[None, :] + bend[:, None]
+        uv = [(c + r * f(turn)[:, None] + 0.5) * self.block - 0.5 for c, f in ((v, np.sin), (u, np.cos))]
+        planes = [ndimage.map_coordinates(plane, uv, order=1, mode="nearest") for plane in self.channels]
+        mean = np.stack([plane.reshape(TURNS, parts, -1).mean(axis=1) for plane in planes], axis=-1)
+        return log_colours(mean if mean.shape[-1] == 3 else mean[..., 0])
+
+    @cached_property
+    def inside(self) -> BoolArray:
+        """True inside the picture, shape (TURNS, distances)."""
+        u, v = self.uv
+        rows, columns = (length / self.block for length in self.channels.shape[1:])
+        return np.asarray((u > 2.0) & (u < columns - 3.0) & (v > 2.0) & (v < rows - 3.0))
 
 
 # Limbs.
