@@ -391,6 +391,7 @@ def on_limb(light: NDArray[Any], near: Circle, blur_px: float) -> BallCircle | N
     Parameters
     ----------
     light : array, shape (H, W) or (H, W, 3), linear
+        NaN where pixels are full.
     near : Circle
         Within 24 px of the limb.
     blur_px : float
@@ -412,5 +413,7 @@ def on_limb(light: NDArray[Any], near: Circle, blur_px: float) -> BallCircle | N
     last = LimbRing(channels, ring.circle, reach, blur_px=blur_px)
     scales = (2.0 * px, px, px)
     limb = _with_covariance(ring.contrast(curve), last, curve, scales, _LIMB_FLOOR_PX, block, math.inf)
-    shared = _LIMB_SHARED * float(np.nanstd(limb.off_px)) if limb.edges else 0.0
+    if not limb.edges:
+        return None
+    shared = _LIMB_SHARED * float(np.nanstd(limb.off_px))
     return replace(limb, covariance_px2=limb.covariance_px2 + shared**2 * np.eye(3))

@@ -227,7 +227,7 @@ class LimbRing(EdgeRing):
     Parameters
     ----------
     channels : array, shape (n, H, W)
-        Linear light.
+        Linear light; NaN where pixels are full.
     circle, reach_px, step_px
         As of `EdgeRing`.
     blur_px : float
@@ -235,6 +235,13 @@ class LimbRing(EdgeRing):
     """
 
     alike: ClassVar[float] = 1.0
+
+    @cached_property
+    def inside(self) -> BoolArray:
+        """True inside the picture, where the light is known, shape (TURNS, distances)."""
+        u, v = self.uv
+        known = np.isfinite(ndimage.map_coordinates(self.channels[0], [v, u], order=1, mode="nearest"))
+        return np.asarray(super().inside & known)
 
     @cached_property
     def strength(self) -> Array:
@@ -257,7 +264,7 @@ class LimbRing(EdgeRing):
         inside = np.lib.stride_tricks.sliding_window_view(wide.inside, len(x), axis=1).all(axis=-1)
         floor = _NOISE**2 * square + 1e-300
         ratio = np.log((np.maximum(right, 0.0) + floor) / (np.maximum(left, 0.0) + floor))
-        return np.asarray(np.where(inside, np.clip(ratio, -_AGAINST, _FULL) / _FULL, 0.0))
+        return np.asarray(np.where(inside & np.isfinite(ratio), np.clip(ratio, -_AGAINST, _FULL) / _FULL, 0.0))
 
     def _limb(self, x: Array) -> Array:
         """Blurred 1, T and T^2 at distances from the limb, shape (n, 3)."""

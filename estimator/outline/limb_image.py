@@ -96,6 +96,11 @@ def planes_of(image: NDArray[Any], card: SensorCard | None = None) -> tuple[Plan
     return (_luma(rgb_picture(image, card), card),)
 
 
+def full_pixels(planes: tuple[Plane, ...]) -> BoolArray:
+    """Pixels that no plane can use, shape (H, W): saturated ones."""
+    return ~np.logical_or.reduce([plane.usable for plane in planes])
+
+
 def binned(planes: tuple[Plane, ...], block: int) -> tuple[Plane, ...]:
     """Planes of squares of `block` pixels: means of what is usable there; a pixel's sum has no neighbours then."""
     return tuple(_binned(plane, block) for plane in planes)

@@ -25,11 +25,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.outline.ball_circle import BallCircle, on_limb
 from phibench.estimator.outline.edge_ring import TURNS
-from phibench.estimator.outline.limb_image import Measured, Plane, binned, limb_angle_rad, planes_of
+from phibench.estimator.outline.limb_image import Measured, Plane, binned, full_pixels, limb_angle_rad, planes_of
 from phibench.estimator.outline.outline_fit import OutlinePixels, Step, band, step_from
 from phibench.estimator.outline.outline_jpeg import JpegAgain
 from phibench.estimator.outline.outline_start import (
@@ -41,7 +42,7 @@ from phibench.estimator.outline.outline_start import (
 )
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
-from phibench.scenes.frames import Array, as_vector
+from phibench.scenes.frames import Array, BoolArray, as_vector
 from phibench.scenes.rig import Rig
 
 HALF_WIDTH_PX = 5.0
@@ -70,6 +71,8 @@ _AT_EDGE_PX = 3.0  # of centre and radius, between a limb and the edge that it w
 _FROM_EDGE_PX = 1.0  # the steepest place of the light is some tenths of a pixel inside the limb
 _SHARED = 0.55
 _SMOOTH, _SMOOTH_JPEG = 2.5, 10.0
+_BESIDE_LAMP_PX, _FEWEST_FULL = 4.0, 2  # pixels on both sides of an outline, and of 9 places there
+_MOST_LIT_EDGE = 0.1  # of an edge: it is looked for in full pixels, too
 _CLEAR_LIMB = 30.0  # contrast from which no other circle is looked at
 
 
@@ -164,16 +167,23 @@ def find_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = None) 
     small = (planes, rig) if block == 1 else (binned(planes, block), binned_rig(rig, block))
     low, high = radii_px(rig)
     fault = ImageError("an image without a mirror")
-    for start, circle, edge in _clearest(grey(planes), rig):
+    full = full_pixels(planes)
+    for start, circle, edge in _clearest(grey(planes), full, rig):
         try:
             found = fit_outline(*small, start, again=again if block == 1 else None)
             require_near(found.rig(rig), circle)
+            require_unlit(full, found.rig(rig).outline_px(), 1.0 - MIN_USED)
             return replace(found, blur_px=block * found.blur_px, shifts_px=block * found.shifts_px)
         except ImageError as error:
             # that it is cut, or lit badly, says more than that the last circle tried was none
             fault = error if "without a mirror" in str(fault) else fault
-        if by_edge := _by_edge(rig, circle) or _by_edge(rig, edge):
-            return by_edge
+        for curve, most_lit in ((circle, 1.0 - MIN_USED), (edge, _MOST_LIT_EDGE)):
+            if by_edge := _by_edge(rig, curve):
+                try:
+                    require_unlit(full, curve.points_px, most_lit)
+                    return by_edge
+                except ImageError as error:
+                    fault = error
     if "without a mirror" not in str(fault):
         raise fault
     raise ImageError(
@@ -193,7 +203,27 @@ def binned_rig(rig: Rig, block: int) -> Rig:
     )
 
 
-def _clearest(picture: Array, rig: Rig) -> list[tuple[Array, BallCircle, BallCircle]]:
+def require_unlit(full: BoolArray, outline_px: Array, most: float) -> None:
+    """Raise `ImageError` if more than a part of an outline, shape (n, 2), lies beside full pixels.
+
+    A lamp in the mirror fills the pixels that its blur reaches: before a dark plate the edge of what is full lies some
+    pixels outside the limb, and that of a lamp all along the limb as many inside.
+    """
+    middle = outline_px.mean(axis=0)
+    away = outline_px - middle
+    reach = 1.0 + _BESIDE_LAMP_PX * np.linspace(-1.0, 1.0, 9) / np.linalg.norm(away, axis=1)[:, None]
+    u, v = (np.rint(middle[k] + reach * away[:, k, None]).astype(np.intp) for k in (0, 1))
+    seen = (u >= 0) & (v >= 0) & (u < full.shape[1]) & (v < full.shape[0])
+    lit = (full[np.clip(v, 0, full.shape[0] - 1), np.clip(u, 0, full.shape[1] - 1)] & seen).sum(axis=1) >= _FEWEST_FULL
+    part = float(lit[seen.any(axis=1)].mean()) if seen.any() else 0.0
+    if part > most:
+        raise ImageError(
+            f"lamps fill the pixels along {100.0 * part:.0f} % of the mirror's outline: where the limb is cannot be "
+            "seen there; take the picture with a shorter exposure, or switch lamps off"
+        )
+
+
+def _clearest(picture: Array, full: BoolArray, rig: Rig) -> list[tuple[Array, BallCircle, BallCircle]]:
     """Sphere centres, limbs and the edges near them that a picture may show, at most `_MOST_TRIED`.
 
     Those at about the distance that the rig says come first: a holder's plates are clear circles, too. Then come limbs
@@ -201,11 +231,13 @@ def _clearest(picture: Array, rig: Rig) -> list[tuple[Array, BallCircle, BallCir
     true one: both bend the light alike. Where there is no limb, an edge stands for it.
     """
     blur_px = math.sqrt(rig.camera.blur_sigma_px**2 + PICTURE_BLUR_PX2)
+    # the mosaic's mean takes its neighbours in
+    unknown = np.where(ndimage.binary_dilation(full), np.nan, picture) if full.any() else picture
     found: list[tuple[bool, bool, float, Array, BallCircle, BallCircle]] = []
     for _, edge in rough_outlines(picture, rig):
         if edge.contrast < _LEAST_CONTRAST:
             continue
-        circle = on_limb(picture, edge.circle_px, blur_px) or edge
+        circle = on_limb(unknown, edge.circle_px, blur_px) or edge
         s = _sphere(rig, circle)
         found.append((not _as_far(rig, s), not _at_edge(circle, edge), -circle.contrast, s, circle, edge))
         if len(found) == _MOST_TRIED or (_as_far(rig, s) and circle.contrast > _CLEAR_LIMB):
@@ -234,7 +266,7 @@ def _as_far(rig: Rig, s: Array) -> bool:
 def _by_edge(rig: Rig, circle: BallCircle) -> Outline | None:
     """Outline by a limb or an edge in the picture alone, if that is clear; its covariance is the circle's."""
     s = _sphere(rig, circle)
-    if visible_arc(rig, s) < MIN_ARC or not _as_far(rig, s):
+    if visible_arc(rig, s) < MIN_ARC or circle.edges < MIN_ARC or not _as_far(rig, s):
         return None
     try:
         circle.require_clear()
