@@ -67,6 +67,8 @@ class DatasetPairs(DrawnPairs):
         Side of the boxes of all pairs, if they are not the recipe's.
     sensor : SensorFile, optional
         Of the pairs, for the record.
+    count_frames : bool
+        Bounds count frames on and off of single ones, too.
     """
 
     def __init__(
@@ -75,9 +77,10 @@ class DatasetPairs(DrawnPairs):
         pair_draws: tuple[PairDraw, ...],
         boxes_px: int | None = None,
         sensor: SensorFile | None = None,
+        count_frames: bool = False,
     ) -> None:
         super().__init__(dataset, pair_draws)
-        self._boxes_px, self._sensor = boxes_px, sensor
+        self._boxes_px, self._sensor, self._count_frames = boxes_px, sensor, count_frames
 
     def truth(self, number: int) -> PairTruth:
         """The exact answer, with the bounds of the image and of the raw pixels behind it."""
@@ -94,10 +97,15 @@ class DatasetPairs(DrawnPairs):
             stroke_m=sample.row.stroke_m,
             true_rig=sample.rig,
             nominal_rig=sample.nominal_rig,
-            down=_spot_truth(sample, source, "down", _counts(pair_draw)),
-            up=_spot_truth(sample, source, "up", _counts(pair_draw)),
+            down=_spot_truth(sample, source, "down", self._counts(pair_draw)),
+            up=_spot_truth(sample, source, "up", self._counts(pair_draw)),
             nominal_stroke_m=sample.row.nominal_stroke_m,
         )
+
+    def _counts(self, pair_draw: PairDraw) -> FrameCounts | None:
+        """Frames that the bound counts; None for a single frame with the laser on."""
+        counted = pair_draw.laser_off and (self._count_frames or pair_draw.frames != (1, 1))
+        return FrameCounts(*pair_draw.frames) if counted else None
 
     def document(self) -> dict[str, Any]:
         """Provenance of the set."""
@@ -184,11 +192,6 @@ def _with_boxes(dataset: Dataset, chosen: tuple[PairDraw, ...], side_px: int, hi
         raise DatasetError(f"boxes = {side_px} px: must be {LEAST_BOX_PX} or above, such as 64")
     boxes = {sample.row.sample_id: search_boxes(sample, side_px) for sample in dataset}
     return tuple(replace(draw, boxes=boxes[draw.sample_id]) for draw in chosen)
-
-
-def _counts(pair_draw: PairDraw) -> FrameCounts | None:
-    """Frames that the bound counts; None for a single frame with the laser on."""
-    return FrameCounts(*pair_draw.frames) if pair_draw.laser_off and pair_draw.frames != (1, 1) else None
 
 
 def _spot_truth(sample: CachedSample, source: FrameSource, position: str, frames: FrameCounts | None) -> SpotTruth:

@@ -12,6 +12,7 @@ from cyclopts import App, Parameter
 from phibench.estimator.cli.options import DEFAULT_PRESET, SENSOR, Whole
 
 if TYPE_CHECKING:
+    from phibench.estimator.paper.experiment_tables import Procedure
     from phibench.estimator.paper.paper_tables import Score
 
 
@@ -23,6 +24,7 @@ def paper(
     preset: str | None = None,
     draws: Whole | None = None,
     laser_off: bool | None = None,
+    frames: Annotated[tuple[Whole, Whole] | None, Parameter(negative="")] = None,
     rig: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
     wide: Annotated[bool, Parameter(negative="")] = False,
     out: Path | None = None,
@@ -46,6 +48,8 @@ def paper(
         With --misaligned: draws of the noise per sample; 1 by default.
     laser_off
         With --misaligned: also a frame with the laser off beside each (default); --no-laser-off does without.
+    frames
+        With --misaligned: frames of each position, on and off; 1 1 by default.
     rig
         With --misaligned: ids of rigs; all by default.
     wide
@@ -54,20 +58,26 @@ def paper(
         JSON file for the scores; with --misaligned a Parquet file, one row per sample and draw.
     """
     if not misaligned:
-        _refuse("is for the misaligned experiments: give --misaligned too", preset, draws, laser_off, rig or None)
+        given = preset, draws, laser_off, frames, rig or None
+        _refuse("is for the misaligned experiments: give --misaligned too", *given)
         return _tables(directory, calibration, wide, out)
     if calibration is not None:
         from phibench.datasets.errors import DatasetError
 
         raise DatasetError("--calibration does not go with --misaligned, which calibrates every rig itself")
     with_off = True if laser_off is None else laser_off
-    return _experiments(directory, preset or DEFAULT_PRESET, 1 if draws is None else draws, with_off, rig, wide, out)
+    from phibench.estimator.limits.off_frame_bound import FrameCounts
+    from phibench.estimator.paper.experiment_tables import Procedure
+
+    counts = FrameCounts() if frames is None else FrameCounts(*frames)
+    procedure = Procedure(preset or DEFAULT_PRESET, 1 if draws is None else draws, with_off, frames=counts)
+    return _experiments(directory, procedure, rig, wide, out)
 
 
 def _refuse(why: str, *values: object) -> None:
     from phibench.datasets.errors import DatasetError
 
-    for name, value in zip(("preset", "draws", "laser-off", "rig"), values, strict=True):
+    for name, value in zip(("preset", "draws", "laser-off", "frames", "rig"), values, strict=True):
         if value is not None:
             raise DatasetError(f"--{name} {why}")
 
@@ -106,18 +116,15 @@ def _write_scores(out: Path, directory: Path, scores: Sequence[Score]) -> None:
     write_text(out, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
-def _experiments(
-    directory: Path, preset: str, draws: int, laser_off: bool, rig: tuple[str, ...], wide: bool, out: Path | None
-) -> int:
+def _experiments(directory: Path, procedure: Procedure, rig: tuple[str, ...], wide: bool, out: Path | None) -> int:
     from phibench.datasets.read import open_finished
     from phibench.datasets.store.files import require_writable
     from phibench.estimator.benchmark.score_tables import show_grid, table_console
     from phibench.estimator.paper.experiment_bounds import budget_table, write_rows
-    from phibench.estimator.paper.experiment_tables import Procedure, run_experiments
+    from phibench.estimator.paper.experiment_tables import run_experiments
 
     if out is not None:
         require_writable(out)
-    procedure = Procedure(preset, draws, laser_off)
     rows = run_experiments(open_finished(directory), procedure, rig or None, lambda name: print(f"{name} is measured"))
     if out is not None:
         write_rows(rows, out)

@@ -4,9 +4,10 @@ For every rig of a data set (recipe `paper-misaligned`, or any with experiments 
 
 1. outlines of the mirror in the frames, one for each of some mirror poses, and the spots of the experiment
    "calibration", whose distances were measured with a ruler, give the rig with its covariance (`calibration.bundle`);
-2. every other pair gives D with its standard deviation (`depth_general`), from the method closest to the bound of
-   such frames, with the calibrated rig;
-3. beside it stands the bound: the pixels' bound and the same calibration, at the true pixels.
+2. every other pair gives D with its standard deviation and a 95 % interval from `joint_fit` with the calibrated rig;
+   the calibration's part comes from `depth_general`, as all of it does where `joint_fit` has no depth;
+3. beside it stands the bound: the pixels' bound of these frames on and off and the same calibration, at the true
+   pixels.
 
 One row per sample and draw. `experiment_bounds` makes the error budget of it.
 """
@@ -30,6 +31,8 @@ from phibench.estimator.draw_pairs import pairs_of
 from phibench.estimator.geometry.least_squares_depth import GeneralDepth, depth_general
 from phibench.estimator.geometry.status import describe
 from phibench.estimator.interface import OK, Answer, Pair
+from phibench.estimator.limits.off_frame_bound import FrameCounts
+from phibench.estimator.methods.raw_likelihood import joint_of
 from phibench.estimator.outline.outline import mean_outline
 from phibench.estimator.pair_set import PairTruth
 from phibench.scenes.rig import POSITIONS
@@ -60,7 +63,7 @@ COLUMNS: dict[str, str] = {
     "bound_calibration_m": "its part from the rig and the stroke",
     "chi2": "of the two rays' meeting, one degree of freedom",
     "p_value": "probability of a larger chi2",
-    "within_95": "whether the error is within 1.96 sigma_m",
+    "within_95": "whether D is in the 95 % interval",
     "nominal_error": "relative error with the nominal rig, before calibration, same pixels",
     "status": "ok, or why there is no estimate",
 }
@@ -90,6 +93,8 @@ class Procedure:
         Experiment with these spots.
     outlines : int
         Mirror poses whose outlines are taken, spread over those that there are; the room behind the limb differs.
+    frames : FrameCounts
+        Frames per position of the pairs that are measured, with the laser on and, with `laser_off`, off.
     """
 
     preset: str = "mjpeg"
@@ -98,6 +103,7 @@ class Procedure:
     ruler: Ruler = field(default=Ruler())
     calibration: str = CALIBRATION
     outlines: int = 6
+    frames: FrameCounts = field(default=FrameCounts())
 
 
 Told = Callable[[str], None]
@@ -167,7 +173,7 @@ def measure(dataset: Dataset, samples: Sequence[Sample], bundle: Bundle, procedu
     for number, pair_draw in enumerate(pairs.pair_draws):
         sample, seen, truth = dataset[pair_draw.sample_id], pairs.pair(number), pairs.truth(number)
         pair = replace(seen, rig=bundle.rig, stroke_m=float(bundle.stroke(np.array(seen.stroke_m))))
-        answer = method_for(pair.card)(pair)  # may use the calibrated rig, never the truth
+        separate = method_for(pair.card)(pair)  # may use the calibrated rig, never the truth
         rows.append(
             {
                 "sample_id": pair_draw.sample_id,
@@ -176,28 +182,35 @@ def measure(dataset: Dataset, samples: Sequence[Sample], bundle: Bundle, procedu
                 "draw": pair_draw.draw,
                 "depth_m": truth.depth_m,
                 "stroke_m": sample.row.nominal_stroke_m,
-                **_estimate(pair, answer, bundle, truth.depth_m),
+                **_estimate(pair, separate, bundle, truth.depth_m),
                 **_bound(truth, bundle),
-                "nominal_error": _nominal(seen, answer) / truth.depth_m - 1.0,
+                "nominal_error": _nominal(seen, separate) / truth.depth_m - 1.0,
             }
         )
     return [{name: row[name] for name in COLUMNS} for row in rows]
 
 
-def _estimate(pair: Pair, answer: Answer, bundle: Bundle, depth_m: float) -> dict[str, Any]:
-    found = _depth_of(pair, answer, bundle)
-    fault = _answer_fault(answer)
-    error, sigma = float(found.depth_m) - depth_m, float(found.sigma_m)
+def _estimate(pair: Pair, separate: Answer, bundle: Bundle, depth_m: float) -> dict[str, Any]:
+    found, joint = _depth_of(pair, separate, bundle), joint_of(pair, separate)
+    fault = _answer_fault(separate)
+    calibration_m = float(np.hypot(found.sigma_calibration_m, found.sigma_stroke_m))
+    here_m, spot_m, interval_m = float(found.depth_m), float(found.sigma_spot_m), joint.interval_depth_m
+    if joint.depth_m is not None and joint.sigma_depth_m is not None:
+        here_m, spot_m = joint.depth_m, joint.sigma_depth_m
+    low_m, high_m = interval_m or (here_m - WITHIN * spot_m, here_m + WITHIN * spot_m)
+    # the calibration widens both sides of an interval that need not be even
+    below, above = (np.hypot(x, WITHIN * calibration_m) for x in (here_m - low_m, high_m - here_m))
+    error = here_m - depth_m
     return {
-        "estimate_m": float(found.depth_m),
+        "estimate_m": here_m,
         "error_m": error,
         "relative_error": error / depth_m,
-        "sigma_m": sigma,
-        "sigma_spot_m": float(found.sigma_spot_m),
-        "sigma_calibration_m": float(np.hypot(found.sigma_calibration_m, found.sigma_stroke_m)),
+        "sigma_m": float(np.hypot(spot_m, calibration_m)),
+        "sigma_spot_m": spot_m,
+        "sigma_calibration_m": calibration_m,
         "chi2": float(found.chi2),
         "p_value": float(found.p_value),
-        "within_95": bool(abs(error) <= WITHIN * sigma),
+        "within_95": bool(-above <= error <= below),
         "status": fault or describe(int(found.status)),
     }
 
@@ -239,8 +252,8 @@ def _bound(truth: PairTruth, bundle: Bundle) -> dict[str, float]:
 
 
 def _pairs(dataset: Dataset, samples: Sequence[Sample], procedure: Procedure, draws: int = 1) -> DatasetPairs:
-    drawn = pairs_of(dataset, samples, procedure.preset, draws, procedure.laser_off)
-    return DatasetPairs(drawn.dataset, drawn.pair_draws)
+    drawn = pairs_of(dataset, samples, procedure.preset, draws, procedure.laser_off, procedure.frames)
+    return DatasetPairs(drawn.dataset, drawn.pair_draws, count_frames=True)
 
 
 def _of_rig(dataset: Dataset, rig: str) -> list[Sample]:

@@ -21,12 +21,16 @@ from phibench.estimator.processed.chain_model import (
     window_px,
 )
 from phibench.estimator.processed.interval_fit import fit_intervals
+from phibench.estimator.processed.interval_moments import Steps
 from phibench.estimator.processed.quasi_score import Window, WindowFit, fit_window
 from phibench.estimator.spots.camera_codes import ycbcr_codes
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
 from phibench.estimator.spots.jpeg_coefficients import hidden_share, mcu_px, qtables_of, room_variance
 from phibench.estimator.spots.jpeg_recovery import recovered
 from phibench.scenes.frames import Array
+
+_WEAK = 4.0  # by which the variance of a background counts that is made of the same frames
+_HIDDEN = 1e-4  # variance of a room's coefficient, in steps squared, from which its place in the step is looked for
 
 
 @dataclass(frozen=True)
@@ -116,24 +120,45 @@ def region_window(
         SpotPixels.of(chain.filters[None], blur, replace(model, background_e=None)), background_e=background[None]
     )
     corner = np.array([column - m, row - m], float)
-    room: Array | float = 0.0
+    room: tuple[Array | float, Array | float] = 0.0, 0.0
     if region.room is not None and chain.card.output == "mjpeg":
-        room = _room(replace(region, image=region.room), chain, row, column, background)
+        room = _room(replace(region, image=region.room), chain, (row, column), background, extra.ravel())
     each = outputs_at(region, chain, row, column)
-    return Window(each.mean(axis=0), chain, pixels, extra.ravel(), room, len(each), region.prnu, each), corner
+    shared = extra.ravel(), room[0], len(each), region.prnu
+    return Window(each.mean(axis=0), chain, pixels, *shared, each, room[1]), corner
 
 
-def _room(region: Region, chain: ChainModel, row: int, column: int, background_e: Array) -> Array:
-    """Variance of the room's coefficients by the quantiser, shape (n,), known from the region's frames."""
-    found, count = coefficients_at(region, chain, row, column).mean(axis=0), len(region.image)
-    if count == 1:
-        return room_variance(found, chain.step)
+def _room(
+    region: Region, chain: ChainModel, place: tuple[int, int], background_e: Array, extra_e2: Array
+) -> tuple[Array, Array | float]:
+    """Room's coefficients as the region's frames show them.
+
+    Of several frames each coefficient has the posterior of its intervals, which knows more than their mean where the
+    noise is a part of a step. The background by itself comes from the frames, too: it counts with a quarter.
+
+    Returns
+    -------
+    shape (n,)
+        Variance besides that of the background.
+    shape (n,)
+        By how much they differ from the background's.
+    """
+    each, step = coefficients_at(region, chain, *place), chain.step
+    if len(each) == 1:
+        return room_variance(each[0], step), 0.0
     mean_e = np.maximum(background_e.ravel(), 0.0)
     at = codes(chain, mean_e)
-    F = noise_factor(chain, at, raw_variance_e2(chain, mean_e), chain.transform)
-    rest = excess_variance(chain, at, chain.transform) + chain.rounding
-    sigma = np.sqrt(np.einsum("rn,rn->n", F, F) + rest)
-    return room_variance(found, chain.step, hidden_share(sigma / chain.step, count))
+    F, E = (noise_factor(chain, at, x, chain.transform) for x in (raw_variance_e2(chain, mean_e), extra_e2))
+    spread = np.einsum("rn,rn->n", F, F) + excess_variance(chain, at, chain.transform) + chain.rounding
+    room = room_variance(each.mean(axis=0), step, hidden_share(np.sqrt(spread) / step, len(each)))
+    known = np.einsum("rn,rn->n", E, E)
+    coarse = np.flatnonzero((spread < step**2) & (room > _HIDDEN * step**2))
+    steps, mean = Steps.of(each, step).part(coarse), (at.mean @ chain.transform + chain.shift)[coarse]
+    found, left = steps.shared(mean, _WEAK * (known + room)[coarse], spread[coarse])
+    offset = np.zeros(len(step))
+    offset[coarse] = found - mean
+    room[coarse] = np.clip(left - known[coarse], 0.0, room[coarse])
+    return room, offset
 
 
 def outputs_at(region: Region, chain: ChainModel, row: int, column: int) -> Array:

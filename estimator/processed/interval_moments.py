@@ -24,6 +24,7 @@ _LEAST_STEP2 = 1e-9  # variance of an output, in steps squared: less is rounding
 _FINE = 0.9  # spread in steps from which a mean of frames is the mean of their middles, and rounding is noise
 _NODES = 33  # along x
 _REACH = 6.0  # standard deviations
+_FAR_STEPS = 1e4  # beyond which what the others say is no place any more
 _LEAST_SHARE = 0.1  # of the variance of y that x has at least: the outputs of others may tell of the noise, too
 
 
@@ -110,20 +111,31 @@ class Steps:
         return Sites(precision, precision * middle)
 
     def _of_several(self, mean: Array, variance: Array, spread: Array) -> Sites:
+        far = _FAR_STEPS * self.step
+        mean, variance = np.clip(mean, self.first - far, self.last + far), np.minimum(variance, far**2)
         own = spread / self.frames
         shared = np.maximum(variance - own, _LEAST_SHARE * variance)
-        sigma, deep = np.sqrt(spread), np.sqrt(shared)
+        off, left = self._shared(mean, shared, spread)
+        # derivatives of the integral's logarithm by the mean
+        first, second = off / shared, np.maximum((1.0 - left / shared) / shared, 0.0)
+        rest = np.maximum(1.0 - (shared + own) * second, _LEAST_STEP2)
+        return Sites(second / rest, (first + mean * second) / rest)
+
+    def shared(self, mean: Array, variance: Array, spread: Array) -> tuple[Array, Array]:
+        """Mean and variance of x, shape (n,) each, of which the rest says `mean` and `variance`; several frames."""
+        off, left = self._shared(mean, variance, spread)
+        return mean + off, left
+
+    def _shared(self, mean: Array, variance: Array, spread: Array) -> tuple[Array, Array]:
+        """Change of the mean of x, and its variance."""
+        sigma, deep = np.sqrt(spread), np.sqrt(variance)
         x = self._nodes(mean, deep, sigma)
         log = -0.5 * ((x - mean) / deep) ** 2 + self._log_chance(x, sigma)
         weight = np.exp(log - log.max(axis=0))
         weight[[0, -1]] *= 0.5
         weight /= weight.sum(axis=0)
         off = (weight * (x - mean)).sum(axis=0)
-        left = (weight * (x - mean - off) ** 2).sum(axis=0)
-        # derivatives of the integral's logarithm by the mean
-        first, second = off / shared, np.maximum((1.0 - left / shared) / shared, 0.0)
-        rest = np.maximum(1.0 - (shared + own) * second, _LEAST_STEP2)
-        return Sites(second / rest, (first + mean * second) / rest)
+        return off, (weight * (x - mean - off) ** 2).sum(axis=0)
 
     def _nodes(self, mean: Array, deep: Array, sigma: Array) -> Array:
         """Nodes of x, shape (nodes, n), where both the others and the intervals leave something."""

@@ -149,6 +149,8 @@ class Window:
         Relative spread of the responsivity, of the spot's light alone.
     readings : shape (f, n), optional
         Outputs of each frame, where they are several.
+    offset : shape (n,) or float
+        By which the background's outputs differ from those that the model gives it.
     """
 
     z: Array
@@ -159,6 +161,7 @@ class Window:
     frames: int = 1
     prnu: float = 0.0
     readings: Array | None = None
+    offset: Array | float = 0.0
 
     @property
     def of_intervals(self) -> bool:
@@ -181,10 +184,10 @@ class Window:
         at = codes(model, raw.mean_e).one(0)
         extra = raw.slope[0] ** 2 * (self.extra_e2 + self._pattern_e2(theta))
         F = noise_factor(model, at, raw.variance_e2[0] + extra, rows.transform)
-        room = np.broadcast_to(self.room, len(model.step))[rows.index]
+        room, offset = (np.broadcast_to(x, len(model.step))[rows.index] for x in (self.room, self.offset))
         rest = excess_variance(model, at, rows.transform) + rows.rounding + room
         sigma = np.sqrt(np.einsum("rn,rn->n", F, F) + rest)
-        output = quantised(at.mean @ rows.transform + rows.shift, sigma, rows.step)
+        output = quantised(at.mean @ rows.transform + rows.shift + offset, sigma, rows.step)
         variance = np.maximum(output.variance, _LEAST * rows.step**2)
         slope = output.slope
         if live is None:
@@ -205,8 +208,8 @@ class Window:
     def means(self, theta: Array, rows: Rows) -> tuple[Array, Array]:
         """Means before the quantiser, shape (m, l), and derivatives, shape (m, k, l), of hypotheses (m, k)."""
         raw, derivatives = self._raw(theta)
-        at = codes(self.model, raw.mean_e)
-        return at.mean @ rows.transform + rows.shift, code_slopes(self.model, at, derivatives) @ rows.transform
+        at, offset = codes(self.model, raw.mean_e), np.broadcast_to(self.offset, len(self.model.step))[rows.index]
+        return at.mean @ rows.transform + rows.shift + offset, code_slopes(self.model, at, derivatives) @ rows.transform
 
     def inputs(self, theta: Array) -> Inputs:
         """Outputs before the quantiser for one hypothesis, shape (k,)."""
@@ -218,7 +221,7 @@ class Window:
         changing = np.maximum(raw.variance_e2[0] - pattern, 0.0)
         white = excess_variance(model, at.one(0), model.transform) + model.rounding
         F = noise_factor(model, at.one(0), shared + pattern + changing / self.frames, model.transform)
-        mean = at.one(0).mean @ model.transform + model.shift
+        mean = at.one(0).mean @ model.transform + model.shift + self.offset
         spread = white
         if self.frames > 1:
             changes = noise_factor(model, at.one(0), changing, model.transform)

@@ -106,9 +106,9 @@ def test_score_without_a_method_names_the_command_of_the_tables(capsys: pytest.C
     assert "`phibench paper out/paper`" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("option", ["--preset", "--draws", "--rig"])
+@pytest.mark.parametrize("option", ["--preset", "--draws", "--frames", "--rig"])
 def test_options_of_the_misaligned_experiments(option: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["paper", "x", option, "1"]) == 2
+    assert cli.main(["paper", "x", option, *(["2", "3"] if option == "--frames" else ["1"])]) == 2
     assert f"{option} is for the misaligned experiments" in capsys.readouterr().err
     assert cli.main(["paper", "x", "--misaligned", "--calibration", "c.json"]) == 2
     assert "--calibration does not go with --misaligned" in capsys.readouterr().err
