@@ -14,8 +14,9 @@ paraboloid (k = -1), a hyperboloid (k < -1), or a cone with its tip at the verte
 the tangent sqrt(-1 - k)). Derivatives of the quadric's sag by s are 1 / (2 w) and (1 + k) / (4 w^3).
 
 The profile has to be convex as seen from the camera: the second derivative by the radius, 2 sag' + 4 s sag'', is not
-negative anywhere inside the rim. The mirror and all behind it, z >= sag, is then a convex body, so that of two points
-outside it at most one point of the mirror reflects light from one to the other (`render.optics.revolved_reflection`).
+negative anywhere inside the rim. Of a quadric it is R^2 / w^3, and nothing needs to be looked at. The mirror and all
+behind it, z >= sag, is then a convex body, so that of two points outside it at most one point of the mirror reflects
+light from one to the other (`render.optics.revolved_reflection`).
 """
 
 from __future__ import annotations
@@ -99,7 +100,13 @@ class Profile:
                 f"Profile.rim_radius_m = {self.rim_radius_m:g}: the surface folds back at its equator, at "
                 f"{self.equator_m:g} m from the axis; the rim must lie before it"
             )
-        self._check_convex()
+        if not self.is_quadric:
+            self._check_convex()
+        if not self.depth_m <= _LARGEST_M:
+            raise SceneError(
+                f"Profile.rim_radius_m = {self.rim_radius_m:g}: the mirror would be {self.depth_m:.3g} m deep; allowed "
+                f"is {_LARGEST_M:g} m; end it before, or make it flatter"
+            )
 
     def _check_convex(self) -> None:
         s = np.linspace(1e-3, 1.0, _PLACES) ** 2 * self.rim_radius_m**2

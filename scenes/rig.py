@@ -148,8 +148,27 @@ class Rig:
             )
         if not lens[2] < mirror.profile.depth_m:
             raise SceneError("Rig.T_camera_sphere: the lens is behind the mirror's rim; turn the mirror towards it")
+        if mirror.profile.shape == "cone":
+            self._check_cone(mirror.profile.rim_radius_m)
         if self.holder is not None:
             raise SceneError(f"Rig.holder: a holder carries a sphere; a {mirror.profile.shape} needs none")
+
+    def _check_cone(self, rim_radius_m: float) -> None:
+        """Raise `SceneError` for a cone of which the image shows the tip alone.
+
+        Nearer to the tip than the aperture's diameter a part of the lens sees no reflection.
+        """
+        camera, aperture_m = self.camera, self.camera.aperture_radius_m
+        u, v = camera.width_px - 0.5, camera.height_px - 0.5
+        rays = camera.rays(np.array([[-0.5, -0.5], [u, -0.5], [-0.5, v], [u, v]]))
+        tip = self.T_camera_sphere.t
+        shown_m = np.linalg.norm(rays[:, :2] / rays[:, 2:] * tip[2] - tip[:2], axis=1).max()
+        seen_m = min(rim_radius_m, float(shown_m) if np.isfinite(shown_m) else math.inf)
+        if seen_m <= 2.0 * aperture_m:
+            raise SceneError(
+                f"Profile.rim_radius_m = {rim_radius_m:g}: the tip of the cone is all that is seen, up to {seen_m:.2g} "
+                f"m from the axis; more than {2.0 * aperture_m:.2g} m, the lens's aperture, is needed"
+            )
 
     @property
     def sphere(self) -> SphereMirror:

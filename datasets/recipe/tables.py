@@ -135,7 +135,7 @@ class MirrorTable(Table):
     )
     rim_radius_m: float = Field(default=0.060, gt=0.0, le=1.0, description="radius of the rim, where the mirror ends")
     vertex_radius_m: float | None = Field(
-        default=None, gt=0.0, le=1.0, description="R, radius of curvature at the vertex"
+        default=None, gt=0.0, le=1.0, description="R, radius of curvature at the vertex; convex"
     )
     conic: float | None = Field(default=None, ge=-100.0, le=100.0, description="k, conic constant")
     half_angle_deg: float | None = Field(default=None, ge=3.0, le=87.0, description="of a cone: from axis to surface")

@@ -156,12 +156,7 @@ def spot_images(place_px: Array, flux: Array, blur: SpotBlur, shape: tuple[int, 
     by_width : bool
     """
     if blur.parts is not None and not by_width:
-        offset, weight = blur.parts.offset_px, blur.parts.weight
-        images = np.zeros((len(place_px), 3, *shape))
-        for k in range(offset.shape[-2]):
-            one = spot_images(place_px + offset[:, k], flux, blur.parts.blur, shape)
-            images += weight[:, k, None, None, None] * one
-        return images
+        return _images_of_parts(place_px, flux, blur.parts, shape)
     h, w = shape
     sigma, ratio, mixed = (np.asarray(value) for value in (blur.sigma_px, blur.ratio, blur.mixed_px2))
     across, down = profile(place_px[:, 0], sigma, w), profile(place_px[:, 1], ratio * sigma, h)
@@ -179,6 +174,30 @@ def spot_images(place_px: Array, flux: Array, blur: SpotBlur, shape: tuple[int, 
         images[:, 0] += outer(kappa * flux * down.by_centre, across.by_sigma / wide)
         images[:, 1] += outer(kappa * flux * down.by_sigma / tall, across.by_centre)
         images[:, 2] += outer(kappa * down.by_centre, across.by_centre)
+    return images
+
+
+def _images_of_parts(place_px: Array, flux: Array, parts: SpotParts, shape: tuple[int, int]) -> Array:
+    """Derivatives by u, v and flux, shape (m, 3, h, w), of spots of k parts: products of (h, k) and (k, w) matrices."""
+    (h, w), (m, k) = shape, parts.weight.shape
+    where = (place_px[:, None] + parts.offset_px).reshape(-1, 2)
+    sigma, ratio, mixed = (
+        np.repeat(np.asarray(value, float), k)
+        for value in (parts.blur.sigma_px, parts.blur.ratio, parts.blur.mixed_px2)
+    )
+    across, down = profile(where[:, 0], sigma, w), profile(where[:, 1], ratio * sigma, h)
+    kappa, wide, tall = mixed[:, None], sigma[:, None], (ratio * sigma)[:, None]
+    sums = (  # the second of each pair is the mixed moment's, as in `spot_images`
+        ((down.share, across.by_centre), (kappa * down.by_centre, across.by_sigma / wide)),
+        ((down.by_centre, across.share), (kappa * down.by_sigma / tall, across.by_centre)),
+        ((down.share, across.share), (kappa * down.by_centre, across.by_centre)),
+    )
+    images = np.empty((m, 3, h, w))
+    for image, pairs in zip(np.moveaxis(images, 1, 0), sums, strict=True):
+        tall_parts, wide_parts = ([pair[i].reshape(m, k, -1) for pair in pairs] for i in (0, 1))
+        tall_parts = [part * parts.weight[..., None] for part in tall_parts]
+        np.matmul(np.concatenate(tall_parts, 1).swapaxes(1, 2), np.concatenate(wide_parts, 1), out=image)
+    images[:, :2] *= flux[:, None, None, None]
     return images
 
 

@@ -68,7 +68,7 @@ def spot_blur(rig: Rig, uv_px: ArrayLike, depth_m: float | None = None, beam: Be
 
 
 _FAR_M = 100.0  # where a point is whose distance is not known
-_FEWEST, _PER_BLUR = 3, 2.0  # chords of the lens: exp(i k x) with k = 2 / blur over a disc of so many blurs
+_FEWEST, _PER_BLUR = 2, 1.2  # chords of the lens: exp(i k x) with k = 2 / blur over a disc of so many blurs
 
 
 def _parts(view: View, uv_px: Array, point_m: Array | None, lens_px2: Array, of_point_px2: Array) -> SpotParts | None:

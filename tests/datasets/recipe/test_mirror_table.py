@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from phibench.datasets.recipe.tables import MirrorTable, RigTable
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig
+from phibench.scenes.validation import SceneError
 
 SHAPES: dict[str, dict[str, Any]] = {
     "ellipsoid": {},
@@ -72,6 +74,14 @@ def test_every_key_has_its_shapes() -> None:
             {"mirror": {"shape": "polynomial", "even_terms": [-500.0]}},
             "rig.mirror.even_terms: [-500.0]: the surface is",
         ),
+        (
+            {"mirror": {"shape": "polynomial", "even_terms": [1e12]}},
+            "rig.mirror.rim_radius_m: 0.06: the mirror would be",
+        ),
+        ({"mirror": {"shape": "hyperboloid", "conic": -1.0001}}, "rig.mirror.rim_radius_m: 0.06: the mirror would be"),
+        ({"mirror": {"shape": "cone", "half_angle_deg": 3.0}}, "rig.mirror.rim_radius_m: 0.06: the mirror would be"),
+        ({"mirror": {"shape": "cone", "rim_radius_m": 5e-4}}, "rig.mirror.rim_radius_m: 0.0005: the tip of the cone"),
+        ({"mirror": {"shape": "paraboloid", "vertex_radius_m": -0.06}}, "rig.mirror.vertex_radius_m: -0.06 is not"),
         ({"radius_m": 0.05, "mirror": {"shape": "cone"}}, "rig.radius_m: 0.05: is a sphere's"),
         ({"holder": {"kind": "rods"}, "mirror": {"shape": "cone"}}, "rig.holder.kind: rods: carries a sphere"),
         ({"metal": "brass"}, "rig.metal: 'brass' is not allowed; give one of 'steel'"),
@@ -84,6 +94,32 @@ def test_what_does_not_go_together_is_one_sentence(rig: dict[str, Any], begin: s
         check_recipe(raw)
     _, line = str(caught.value).splitlines()
     assert line.startswith(f"  {begin}")
+
+
+@pytest.mark.parametrize(
+    ("deviation", "begin"),
+    [
+        ({"axial_m": -0.1}, "misalignment: Rig.T_camera_sphere: the lens is inside the mirror"),
+        ({"radius_m": -0.059}, "misalignment: rig.mirror.rim_radius_m = 0.06: the mirror would be 1.8 m deep"),
+        ({"radius_m": -0.1}, "misalignment: rig.mirror.vertex_radius_m = -0.04"),
+    ],
+)
+def test_a_true_mirror_that_cannot_be_is_one_sentence(deviation: dict[str, float], begin: str) -> None:
+    raw = recipe(panoramas=[], meshes=[], count=1)
+    raw["rig"] = {**raw.get("rig", {}), "z_c_m": 0.08, "mirror": {"shape": "paraboloid"}}
+    with pytest.raises(RecipeError) as caught:
+        check_recipe(raw | {"misalignment": deviation})
+    _, line = str(caught.value).splitlines()
+    assert line.startswith(f"  {begin}")
+
+
+def test_a_cone_may_not_be_all_tip() -> None:
+    """An image 2 mm wide at the mirror shows the tip alone, whatever the rim; beside the axis it shows more."""
+    rig = build_rig(table(mirror={"shape": "cone"}))
+    narrow = replace(rig.camera, width_px=12, height_px=12, cx_px=5.5, cy_px=5.5)
+    with pytest.raises(SceneError, match=r"the tip of the cone is all that is seen, up to 0.0013 m"):
+        replace(rig, camera=narrow)
+    assert replace(rig, camera=replace(narrow, cx_px=-100.0)).mirror == rig.mirror
 
 
 def test_a_sphere_of_steel_says_nothing_of_shape_or_metal() -> None:
