@@ -97,10 +97,12 @@ class SensorCard:
     def full_from_e(self) -> float:
         """Reading, electrons, from which on a pixel may be full, though noise that is added later hides it.
 
-        5 deviations of read noise and DSNU, and half a code, below the full well.
+        5 deviations of read noise and DSNU, and half a code, below the full well; and as far below the last code. The
+        well may lie there, too, when frames have not shown where it is, and a full pixel then reads a code less.
         """
-        added = 5.0 * math.hypot(self.read_noise_e, self.dsnu_e) + 0.5 / self.dn_per_e
-        return min(self.full_well_e - added, self.saturation_e)
+        return min(self.full_well_e - 0.5 / self.dn_per_e, self.saturation_e) - 5.0 * math.hypot(
+            self.read_noise_e, self.dsnu_e
+        )
 
 
 def sensor_card(preset: str = "bayer-raw", **changes: Any) -> SensorCard:

@@ -109,6 +109,24 @@ class Ranking:
     false_lines: Mapping[str, str]
 
     @property
+    def placed(self) -> bool:
+        """True where the places of the spots are known; of real pairs nobody has measured them."""
+        return any(score.metrics["rms_counted_px"].value is not None for score in self.scores.values())
+
+    @property
+    def board(self) -> list[str]:
+        """Metrics of the ranking; without places those that have a value, and the pull of D."""
+        return self._valued([*HEADS, "pull_depth"]) if not self.placed else list(HEADS)
+
+    @property
+    def strata_metrics(self) -> list[str]:
+        """Metrics of the strata; without places those that have a value."""
+        return self._valued(_STRATA) if not self.placed else list(_STRATA)
+
+    def _valued(self, names: Sequence[str]) -> list[str]:
+        return [name for name in names if any(score.metrics[name].value is not None for score in self.scores.values())]
+
+    @property
     def occurring(self) -> list[str]:
         """Causes that some method has an image of, in the order in which they are tried."""
         return [cause for cause in CAUSES if any(any(s.causes[cause].values()) for s in self.scores.values())]
@@ -150,11 +168,9 @@ def report_html(
     )  # fmt: skip
     environment.globals.update(
         applies=applies,
-        board=HEADS,
         head=head,
         parts=shown_parts,
         ranked_by=rank_words(by),
-        strata_metrics=_STRATA,
         definitions=CAUSES,
         kinds=KINDS,
     )
@@ -216,7 +232,8 @@ def verdict(scores: Mapping[str, ScoreDocument], by: str) -> str:
     found = _rate(first, "detection_rate")
     missing = {name: kind["missed"] + kind["false"] for name, kind in first.causes.items()}
     cause = max(missing, key=lambda name: missing[name])
-    why = f", the others are mostly {cause}" if missing[cause] else ""
+    placed = first.metrics["rms_counted_px"].value is not None  # of real pairs no cause can be told
+    why = f", the others are mostly {cause}" if missing[cause] and placed else ""
     alone = "is best by" if len(scores) > 1 else "has, by the rank of"
     parts = [f"{best}: {flag.text}." for flag in first.flags]
     parts += [

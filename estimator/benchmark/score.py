@@ -47,6 +47,7 @@ from phibench.estimator.benchmark.strata import Stratum, count_pairs, measured, 
 from phibench.estimator.benchmark.worst_images import worst, worst_of
 from phibench.estimator.calibration.file import read_calibration
 from phibench.estimator.captures.imported_set import ImportedSet, imported_pairs, is_imported, open_imported
+from phibench.estimator.captures.spot_shape import with_shape
 from phibench.estimator.interface import Box, Method, Outcome
 from phibench.estimator.limits.off_frame_bound import FrameCounts
 from phibench.estimator.methods.registry import METHODS, BuiltIn
@@ -444,7 +445,11 @@ def _real_pairs(
     if preset not in (None, imported.preset):
         raise DatasetError(f"{imported.folder} holds pictures of the kind '{imported.preset}': leave --preset out")
     found = imported_pairs(imported, TASK_VERSION, draws, pairs)
-    return found if calibration is None else CalibratedPairs(found, read_calibration(calibration, imported.rig))
+    return (
+        found
+        if calibration is None
+        else CalibratedPairs(found, with_shape(read_calibration(calibration, imported.rig)))
+    )
 
 
 def refusal(method: BuiltIn, pairs: PairSet) -> str:

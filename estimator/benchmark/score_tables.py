@@ -442,7 +442,7 @@ def _escaped(text: str) -> str:
 def head(name: str) -> str:
     """Head of a metric's column, its unit on the second line."""
     unit = METRICS[name].shown[1]
-    text = HEADS.get(name, METRICS[name].text)
+    text = "pull of D" if name == "pull_depth" else HEADS.get(name, METRICS[name].text)
     return text if unit == "1" else f"{text}\n{unit}"
 
 

@@ -17,7 +17,6 @@ from phibench.estimator.calibration.from_dataset import DatasetCalibration, Phot
 from phibench.estimator.calibration.spots import method_for
 from phibench.estimator.captures.imported_set import ImportedRow, ImportedSet, open_imported
 from phibench.estimator.captures.measure import (
-    SHAPE,
     outlines_as_one,
     seen_images,
     seen_spots,
@@ -25,7 +24,7 @@ from phibench.estimator.captures.measure import (
     widened_by_shape,
     with_blur_of,
 )
-from phibench.estimator.captures.spot_shape import UNLIKE, SpotImage, SpotShape, fit_shape
+from phibench.estimator.captures.spot_shape import SHAPE, UNLIKE, SpotImage, SpotShape, fit_shape
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.geometry.triangulate import depth_exact

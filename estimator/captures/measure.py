@@ -39,6 +39,7 @@ from phibench.estimator.captures.rig_file import MeasuredRig, read_rig_file, req
 from phibench.estimator.captures.spot_shape import (
     OUTLINE_SIGMA_PX,
     PRIOR_SIGMA,
+    SHAPE,
     UNLIKE,
     SpotImage,
     SpotShape,
@@ -58,8 +59,6 @@ from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig
 
-SHAPE = "spot_shape"
-"""Key of a `SpotShape` in what a calibration was made from."""
 DOUBTFUL_P = 1e-3
 """Probability of the two rays' gap below which the two spots are not taken for one point."""
 

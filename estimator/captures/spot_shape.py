@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from phibench.datasets.errors import DatasetError
+from phibench.estimator.calibration.file import Calibration
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.interface import Answer, Pair, Spot
 from phibench.estimator.methods.chain_fit import spot_outputs
@@ -35,6 +36,8 @@ from phibench.estimator.spots.gaussian_spot import SpotModel, SpotPixels
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import POSITIONS, Rig
 
+SHAPE = "spot_shape"
+"""Key of a `SpotShape` in what a calibration was made from."""
 PRIOR_SIGMA = (0.25, 0.06, 0.04)
 """Of the blur in pixels, and of green's and blue's response over red's, of a camera that nobody has measured."""
 OUTLINE_SIGMA_PX = 0.1  # of a blur that the mirror's outline gave
@@ -117,6 +120,14 @@ class SpotImage:
     position: str
     uv_px: Array
     depth_m: float | None
+
+
+def with_shape(calibration: Calibration) -> Calibration:
+    """Calibration whose rig has the blur and filters that its file holds; the same where it holds none."""
+    document = calibration.made_from.get(SHAPE)
+    if document is None:
+        return calibration
+    return replace(calibration, rig=SpotShape.of_document(document).rig(calibration.rig))
 
 
 def spot_images(pair: Pair, down: Spot, up: Spot) -> dict[str, SpotImage]:

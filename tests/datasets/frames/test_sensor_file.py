@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.exposures.pair_draws import pair_draws
+from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.datasets.frames.sensor_file import (
     FitTables,
     Measured,
@@ -74,3 +77,16 @@ def test_frames_and_scores_take_the_numbers(smallest_dataset: Path, tmp_path: Pa
     assert main([*given, "--sensor", str(camera)]) == 0
     assert '"read_noise_e":3.25' in (out / "request.json").read_text().replace(" ", "")
     assert list(out.glob("**/*.png"))
+
+
+def test_a_full_pixel_is_told_though_no_frame_has_shown_the_well() -> None:
+    card = sensor_card("bayer-raw")
+    # frames of a flat that is nowhere full say only that the well lies above them: one that is taken too deep
+    unseen = replace(card, full_well_e=1.05 * card.full_well_e)
+    full_dn = round(card.black_level_dn + card.dn_per_e * card.full_well_e)
+    assert full_dn == card.top_dn
+    # read noise and fixed pattern of 4.3 electrons: a full pixel reads up to two codes less
+    low_dn = full_dn - math.floor(5.0 * math.hypot(card.read_noise_e, card.dsnu_e) * card.dn_per_e)
+    for one in (card, unseen):
+        assert (low_dn - one.black_level_dn) / one.dn_per_e > one.full_from_e
+        assert (full_dn - 4 - one.black_level_dn) / one.dn_per_e < one.full_from_e

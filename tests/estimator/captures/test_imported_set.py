@@ -14,6 +14,7 @@ from helpers.camera_files import write_pictures
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.read import Sample, open_dataset
 from phibench.estimator.benchmark.document import read_score
+from phibench.estimator.benchmark.score import wanted_pairs
 from phibench.estimator.calibration.file import read_calibration
 from phibench.estimator.captures.imported_set import import_pairs, imported_pairs, open_imported
 from phibench.estimator.captures.pair_list import read_pair_list
@@ -110,7 +111,11 @@ def test_an_imported_set_is_scored_by_its_tape(
         assert metrics[name].value is None
     assert main(["compare", *map(str, files)]) == 0
     assert main(["report", *map(str, files), "--rank", "depth", "--out", str(tmp_path / "page.html")]) == 0
-    assert "chain_fit" in (tmp_path / "page.html").read_text()
+    page = (tmp_path / "page.html").read_text()
+    for words in ("chain_fit", "any position counts as found", "pull of D"):
+        assert words in page
+    for words in ("Where in the image", "The worst images", "Cramér-Rao", "mostly method"):
+        assert words not in page
     assert main(["score", str(imported), "--method", "chain_fit", "--preset", "bayer-raw"]) == 2
     assert "leave --preset out" in capsys.readouterr().err
 
@@ -157,6 +162,10 @@ def test_the_rig_is_calibrated_from_pictures(
     arguments = ["score", str(imported), "--method", "chain_fit", "--calibration", str(file), "--out", str(scored)]
     assert main(arguments) == 0
     assert read_score(scored).pair_set["calibration"] == held.sha256
+    # spots are scored with the blur and filters that the calibration's spots gave
+    blur_px, *_ = held.made_from["spot_shape"]["values"]
+    assert blur_px != held.rig.camera.blur_sigma_px
+    assert wanted_pairs(open_imported(imported), None, calibration=file).pair(0).rig.camera.blur_sigma_px == blur_px
 
 
 @pytest.mark.parametrize(
