@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from PIL import ImageDraw
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.calibration.outline_picture import overlay
+from phibench.estimator.calibration.outline_picture import overlay, shown, write_picture
+from phibench.estimator.outline.ball_circle import BallCircle, find_circle
 from phibench.estimator.outline.outline import Outline, find_outline
+from phibench.estimator.spots.camera_codes import light_of, rgb_picture
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
@@ -123,6 +125,40 @@ def write_alignment_picture(path: Path, image: NDArray[np.uint8], rig: Rig, foun
         back = (u + du - head * math.cos(turn + side), v + dv - head * math.sin(turn + side))
         draw.line((u + du, v + dv, *back), fill=_MOVE, width=2)
     return drawn.write(path, f"red: move x {_ARROW_TIMES:g}")
+
+
+def circle_of(image: NDArray[Any], card: SensorCard) -> BallCircle:
+    """Outline of the mirror as a circle, from a picture alone: no number of camera or rig is used.
+
+    Raises
+    ------
+    ImageError
+        If no outline is found.
+    """
+    table = light_of(np.arange(256) / 255.0, card).astype(np.float32)
+    return find_circle(table[rgb_picture(image, card)])
+
+
+def distance_of(circle: BallCircle, focal_px: float, radius_m: float) -> float:
+    """Distance of a mirror's centre from the lens, metres: |s| = R / sin(a0), tan(a0) = radius / focal length."""
+    return radius_m / math.sin(math.atan(circle.circle_px[2] / focal_px))
+
+
+def circle_in_words(circle: BallCircle) -> str:
+    """Centre and radius with their standard deviations, and what is missing for a move in millimetres."""
+    (u, v, radius), (su, sv, sr) = circle.circle_px, circle.sigma_px
+    return (
+        f"outline: centre ({u:.1f} +- {su:.1f}, {v:.1f} +- {sv:.1f}) px, radius {radius:.1f} +- {sr:.1f} px, with "
+        f"edges on {100.0 * circle.edges:.0f} % of it; for a move in mm give --focal-px, --cx-px and --cy-px"
+    )
+
+
+def write_circle_picture(path: Path, image: NDArray[np.uint8], card: SensorCard, circle: BallCircle) -> Path:
+    """Draw an outline into a copy of the image of at most 1600 px; PNG."""
+    picture, block = shown(rgb_picture(image, card))
+    points = [tuple(point) for point in (circle.points_px + 0.5) / block - 0.5]
+    ImageDraw.Draw(picture).line([*points, points[0]], fill=_CENTRE, width=2)
+    return write_picture(path, picture)
 
 
 def verdict(found: Alignment) -> str:

@@ -49,9 +49,20 @@ class Overlay:
     def write(self, path: Path, *lines: str) -> Path:
         """Write a PNG, atomically, with the legend and further lines below."""
         _draw_legend(self.picture, (*self.legend, *lines))
-        buffer = io.BytesIO()
-        self.picture.save(buffer, format="PNG")
-        return write_bytes(path, buffer.getvalue())
+        return write_picture(path, self.picture)
+
+
+def write_picture(path: Path, picture: Image.Image) -> Path:
+    """Write a PNG, atomically."""
+    buffer = io.BytesIO()
+    picture.save(buffer, format="PNG")
+    return write_bytes(path, buffer.getvalue())
+
+
+def shown(codes: NDArray[np.uint8]) -> tuple[Image.Image, int]:
+    """RGB picture of codes, shape (H, W, 3) or (H, W), of at most 1600 px, and how many pixels are one of its."""
+    block = max(1, math.ceil(max(codes.shape[:2]) / _LONGEST_PX))
+    return Image.fromarray(np.ascontiguousarray(codes)).reduce(block).convert("RGB"), block
 
 
 def overlay(codes: NDArray[np.uint8], rig: Rig, outline: Outline) -> Overlay:
@@ -65,8 +76,7 @@ def overlay(codes: NDArray[np.uint8], rig: Rig, outline: Outline) -> Overlay:
     outline : Outline
         Found in the frame.
     """
-    block = max(1, math.ceil(max(codes.shape[:2]) / _LONGEST_PX))
-    picture = Image.fromarray(np.ascontiguousarray(codes)).reduce(block).convert("RGB")
+    picture, block = shown(codes)
     there = binned_rig(outline.rig(rig), block)
     legend = _draw_outline(picture, there, replace(outline, shifts_px=outline.shifts_px / block))
     return Overlay(picture, there, 1.0 / block, legend)

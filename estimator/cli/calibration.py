@@ -103,8 +103,8 @@ def align(
     *,
     out: Path | None = None,
     radius_mm: float = 60.0,
-    distance_mm: float = 260.0,
-    focal_px: float = 1430.0,
+    distance_mm: float | None = None,
+    focal_px: float | None = None,
     cx_px: float | None = None,
     cy_px: float | None = None,
     focus_mm: float | None = None,
@@ -114,6 +114,8 @@ def align(
 ) -> int:
     """Print by how far and in which direction the mirror must move to be centred.
 
+    Of a camera whose focal length is not stated, the circle of the mirror's outline is printed and drawn, in pixels.
+
     Parameters
     ----------
     image
@@ -122,10 +124,11 @@ def align(
         PNG to write: the outline and an arrow, 20 times as long as the move; by default `<image>-align.png` in
         the current folder.
     radius_mm, distance_mm
-        Of the mirror: its radius, and its centre from the lens, roughly.
+        Of the mirror: its radius, and its centre from the lens, roughly. For a frame of 1280 x 720 the distance is
+        260 by default; otherwise the outline tells it.
     focal_px, cx_px, cy_px
-        Focal length and principal point, pixels. The principal point may be left out for a whole frame of the C310,
-        which has 1280 x 720.
+        Focal length and principal point, pixels. They may be left out for a whole frame of the C310, which has
+        1280 x 720: the focal length is 1430 by default.
     focus_mm
         Distance of the plane of focus; by default on the virtual image, half a radius before the mirror's centre.
     tilt_sigma_deg
@@ -138,23 +141,41 @@ def align(
     from phibench.datasets.errors import DatasetError
     from phibench.estimator.calibration.align import (
         alignment,
+        circle_in_words,
+        circle_of,
+        distance_of,
         in_words,
         nominal_centre,
         verdict,
         write_alignment_picture,
+        write_circle_picture,
     )
     from phibench.estimator.spots.image_planes import read_picture
     from phibench.scenes.mirror import SphereMirror
     from phibench.scenes.rig import Rig
 
-    if not 0.0 < 1.02 * radius_mm < distance_mm <= 1e4:
-        raise DatasetError(
-            f"--radius-mm {radius_mm:g}, --distance-mm {distance_mm:g}: the radius must be above 0, and the mirror's "
-            "centre 1.02 radii to 10 m from the lens"
-        )
+    if not 0.0 < radius_mm < math.inf:
+        raise DatasetError(f"--radius-mm {radius_mm:g}: must be above 0")
+    if focal_px is not None and not 0.0 < focal_px < math.inf:
+        raise DatasetError(f"--focal-px {focal_px:g}: must be above 0")
     pixels, card = read_picture(image)
+    out = Path(f"{image.stem}-align.png") if out is None else out
     rig = Rig()
+    whole = pixels.shape[:2] == (rig.camera.height_px, rig.camera.width_px)
+    if focal_px is None and not whole:
+        circle = circle_of(pixels, card)
+        print(circle_in_words(circle))
+        print(f"{write_circle_picture(out, pixels, card, circle)}: outline; look at it")
+        return 0
+    focal_px = rig.camera.fx_px if focal_px is None else focal_px
     centre = nominal_centre(pixels, rig.camera, cx_px, cy_px)
+    if distance_mm is None:
+        distance_mm = 260.0 if whole else 1e3 * distance_of(circle_of(pixels, card), focal_px, 1e-3 * radius_mm)
+    if not 1.02 * radius_mm < distance_mm <= 1e4:
+        raise DatasetError(
+            f"--radius-mm {radius_mm:g}, --distance-mm {distance_mm:g}: the mirror's centre must be 1.02 radii to 10 m "
+            "from the lens"
+        )
     focus_m = 1e-3 * (distance_mm - 0.5 * radius_mm if focus_mm is None else focus_mm)
     camera = replace(
         rig.camera,
@@ -171,7 +192,6 @@ def align(
     rig = Rig(camera=camera, mirror=SphereMirror(radius_m=1e-3 * radius_mm), T_camera_sphere=pose)
     doubts = math.radians(tilt_sigma_deg), principal_point_sigma_px, outline_sigma_factor
     found = alignment(pixels, rig, card, *doubts)
-    out = Path(f"{image.stem}-align.png") if out is None else out
     print(verdict(found))
     print(f"{write_alignment_picture(out, pixels, rig, found)}: outline, and the move drawn 20 times as long")
     print(in_words(found))

@@ -79,11 +79,15 @@ class BallCircle:
 
     def require_clear(self) -> None:
         """Raise `ImageError` for a circle that may not be an outline, or is too uncertain."""
-        if self.contrast < LEAST_CONTRAST or self.lead < LEAST_LEAD:
+        if self.contrast < LEAST_CONTRAST:
             raise ImageError(
-                f"no outline of a ball was found: the clearest circle stands out by {self.contrast:.0f} standard "
-                f"errors and {self.lead:.1f} times as much as the next; {LEAST_CONTRAST:.0f} and {LEAST_LEAD:g} are "
-                "needed"
+                f"no outline of a ball was found: the clearest circle stands out by {self.contrast:.1f} standard "
+                f"errors, {LEAST_CONTRAST:.0f} are needed; cut out the part with the ball where it is small"
+            )
+        if self.lead < LEAST_LEAD:
+            raise ImageError(
+                f"no outline of a ball was found: the clearest circle stands out {self.lead:.1f} times as much as the "
+                f"next, {LEAST_LEAD:g} times are needed; which of them is the ball's cannot be told"
             )
         if self.sigma_px.max() > MOST_SIGMA * self.circle_px[2]:
             raise ImageError(

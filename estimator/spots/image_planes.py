@@ -31,11 +31,13 @@ from phibench.estimator.spots.camera_codes import light_of, rgb_codes, rgb_pictu
 from phibench.estimator.spots.jpeg_coefficients import qtables_of
 from phibench.estimator.spots.raw_pixels import bayer_filters, raw_electrons
 from phibench.scenes.frames import Array, BoolArray
+from phibench.scenes.validation import printable_line
 
 KINDS = ("bayer-raw", "mono-raw", "srgb8", "yuyv", "mjpeg")
 RAW = KINDS[:2]
 PROCESSED = KINDS[2:]
 
+_ORIENTATION = 0x0112  # EXIF tag
 _TOP_CODE = 254  # of 8 bits: from here on a pixel may be cut
 _DEMOSAIC_VARIANCE_PX2 = 0.5  # of bilinear interpolation's kernel (1/2, 1, 1/2), per axis
 
@@ -58,10 +60,17 @@ def read_picture(path: Path) -> tuple[NDArray[np.uint8], SensorCard]:
     Raises
     ------
     ImageError
-        If the file is no colour picture of 8 bits.
+        If the file is no colour picture of 8 bits, or is turned by EXIF.
     """
-    picture = InputFile(path, "give a PNG or JPEG file of the camera", ImageError).picture()
+    file = InputFile(path, "give a PNG or JPEG file of the camera", ImageError)
+    picture = file.picture()
     kind, mode = picture.format, picture.mode
+    turned = picture.getexif().get(_ORIENTATION, 1)
+    if turned != 1:
+        raise file.fault(
+            f"is turned by EXIF (orientation {printable_line(str(turned), 10)}): its pixels are not in the order of "
+            "the sensor, nor is the picture as you see it"
+        )
     if (kind, mode) == ("PNG", "LA"):
         return np.asarray(picture), sensor_card("yuyv")
     pixels = np.asarray(picture.convert("RGB"))

@@ -7,11 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.ball_photographs import ball_photograph
 from helpers.limb_frames import limb_light
 from PIL import Image
 
-from phibench.estimator.calibration.align import alignment, nominal_centre
+from phibench.datasets.frames.sensor_card import sensor_card
+from phibench.estimator.calibration.align import alignment, circle_of, distance_of, nominal_centre
 from phibench.estimator.cli import main as cli
+from phibench.estimator.spots.camera_codes import linear_to_srgb
 from phibench.estimator.spots.image_planes import ImageError, read_picture
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light
@@ -79,6 +82,43 @@ def test_what_is_no_frame_is_refused_in_one_sentence(tmp_path, capsys) -> None:
     assert cli.main(["align", str(text)]) == 2
     assert cli.main(["align", str(tmp_path / "none.png")]) == 2
     assert capsys.readouterr().err.count("\n") == 2
+
+
+def test_a_photograph_of_an_unknown_camera_gives_the_circle(tmp_path, capsys) -> None:
+    """Neither focal length nor distance: the circle in pixels. With the focal length the outline tells the distance."""
+    photo = ball_photograph(np.random.default_rng([7, 3]))
+    codes = np.rint(255.0 * linear_to_srgb(np.clip(photo.light / 1.5, 0.0, 1.0))).astype(np.uint8)
+    file, out = tmp_path / "ball.png", tmp_path / "circle.png"
+    Image.fromarray(codes).save(file)
+    assert cli.main(["align", str(file), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert f"radius {photo.radius_px:.0f}"[:-1] in said
+    assert "give --focal-px" in said
+    assert Image.open(out).size == (640, 480)
+    found = circle_of(codes, sensor_card("srgb8"))
+    distance = distance_of(found, photo.focal_px, 0.06)
+    assert distance == pytest.approx(0.06 * np.linalg.norm(photo.centre), rel=0.01)
+
+
+def test_a_photograph_turned_by_exif_is_refused(tmp_path, capsys) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    file = tmp_path / "phone.jpg"
+    Image.fromarray(np.zeros((90, 120, 3), np.uint8)).save(file, exif=exif)
+    assert cli.main(["align", str(file)]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "turned by EXIF (orientation 6)" in said
+
+
+@pytest.mark.parametrize("size", [(1, 1), (12, 9), (300, 200)])
+def test_pictures_without_a_ball_end_in_one_sentence(tmp_path, capsys, size) -> None:
+    file = tmp_path / "grey.png"
+    Image.fromarray(np.full((size[1], size[0], 3), 90, np.uint8)).save(file)
+    assert cli.main(["align", str(file)]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "no outline of a ball was found" in said
 
 
 @pytest.mark.parametrize(
