@@ -97,6 +97,26 @@ class PlaneModel:
             result.append(np.array(parts))
         return result
 
+    def lattice_errors(self, level: NoiseLevel, x: Numbers) -> list[float]:
+        """Relative errors of `covariances`, one deviation, by planes: the converter's codes lie on a lattice.
+
+        Steps of the converter are s codes of 8 bits apart. Rounding beats with them at |k s - round(k s)| = f per step;
+        that changes the slope from the converter to the codes by up to 2 f exp(-2 pi^2 f^2 sigma^2) / (k s), twice as
+        much the variance. Other pixels that are mixed in lessen it; the shares are from simulated frames.
+        """
+        card, k = self.card, np.arange(1, 5)[:, None]
+        linear, raw, planes = self._light(level, x)
+        at = noisy_code(linear, np.sqrt(planes[:, 0]), card)
+        full = card.top_dn - card.black_level_dn
+        steps = 255.0 * at.by_mean * self._balance(x) / full
+        beat = np.abs(k * steps - np.rint(k * steps))
+        waves = 4.0 * beat / (k * steps) * np.exp(-2.0 * (np.pi * beat * full) ** 2 * raw[[0, 1, 3]])
+        each = np.sqrt(0.5 * (waves**2).sum(axis=0))
+        if self.halved:
+            return [0.25 * float(each.max())] * len(level.planes)
+        own = [0.4 * each[0], each[1], 0.4 * each[2]]
+        return [*map(float, own), *[0.5 * float(each[1])] * (len(level.planes) - 3)]
+
     def pattern(self, level: NoiseLevel, x: Numbers) -> float:
         """`NoiseLevel.spatial` of a responsivity that spreads by 1."""
         answers, _ = self._answers(level, x)

@@ -31,7 +31,7 @@ _FLOOR = 3e-4  # codes^2, of each autocovariance: what models of rounding and cl
 _BETTER = 30.0  # sum of squares by which another filter must fit better
 _FOUND = 3.0  # sigmas from 0
 _BASE = ("white_e", "read_noise_e", "sharpen", "chroma", "red", "blue")
-_CHAINS = ((1, ()), (1, ("denoise",)), (2, ("denoise", "vertical")))
+_CHAINS = ((1, ("denoise",)), (2, ("denoise", "vertical")))
 _LOW = {"white_e": np.log(100.0), "sharpen": -1.0, "red": 0.2, "blue": 0.2, "left": -0.1, "right": -0.1}
 _HIGH = {"white_e": np.log(1e6), "read_noise_e": 300.0, "sharpen": 4.0, "red": 8.0, "blue": 8.0}
 _SCALE = {"white_e": 0.1, "read_noise_e": 2.0}
@@ -61,12 +61,13 @@ class ProcessedNoise:
 
 @dataclass(frozen=True)
 class _Solution:
-    """Least squares with one chain: numbers, and replicates of each by the jackknife."""
+    """Least squares with one chain: numbers, replicates of each by the jackknife, and deviations by the lattice."""
 
     model: PlaneModel
     names: tuple[str, ...]
     x: Array
     replicates: Array
+    systematic: Array
     misfit: float
     chi2: float
 
@@ -93,13 +94,13 @@ def fit_noise(
         return ProcessedNoise(
             {}, {}, dict.fromkeys((*names, "white_balance"), reason), float("nan"), tuple(levels), card
         )
-    best: _Solution | None = None
+    first = _solved(used, PlaneModel(card, 1, threshold_codes), (), None, None)
+    lattice = [first.model.lattice_errors(one, first.numbers()) for one in used]
+    best = _solved(used, first.model, (), first.numbers(), lattice)
     for reach, extra in _CHAINS:
-        start = None if best is None else best.numbers()
-        found = _solved(used, PlaneModel(card, reach, threshold_codes), extra, start)
-        if best is None or found.misfit < best.misfit - _BETTER:
+        found = _solved(used, PlaneModel(card, reach, threshold_codes), extra, best.numbers(), lattice)
+        if found.misfit < best.misfit - _BETTER:
             best = found
-    assert best is not None
     return _told(best, used, levels, card, analogue_gain)
 
 
@@ -113,7 +114,13 @@ def _numbers(names: tuple[str, ...], x: Array) -> Numbers:
     return replace(Numbers(), **{**values, "white_e": float(np.exp(values["white_e"]))})
 
 
-def _solved(used: list[NoiseLevel], model: PlaneModel, extra: tuple[str, ...], start: Numbers | None) -> _Solution:
+def _solved(
+    used: list[NoiseLevel],
+    model: PlaneModel,
+    extra: tuple[str, ...],
+    start: Numbers | None,
+    lattice: list[list[float]] | None,
+) -> _Solution:
     names = (*_BASE, *(("left", "right") if model.halved else ()), *extra)
     seen = np.concatenate([plane.covariance[0] for one in used for plane in one.planes])
     scatter = [
@@ -122,7 +129,10 @@ def _solved(used: list[NoiseLevel], model: PlaneModel, extra: tuple[str, ...], s
         for plane in one.planes
         for i in range(plane.covariance.shape[1])
     ]
-    sigma = np.hypot(scatter, _FLOOR)
+    planes = [plane for one in used for plane in one.planes]
+    errors = [0.0] * len(planes) if lattice is None else [error for one in lattice for error in one]
+    alike = [e * p.covariance[0] for e, p in zip(errors, planes, strict=True)]
+    sigma = np.sqrt(np.square(scatter) + _FLOOR**2 + np.concatenate(alike) ** 2)
 
     def predicted(x: Array) -> Array:
         numbers = _numbers(names, x)
@@ -142,7 +152,14 @@ def _solved(used: list[NoiseLevel], model: PlaneModel, extra: tuple[str, ...], s
     rows = [np.concatenate([p.covariance[r] for one in used for p in one.planes]) for r in range(_count(used))]
     replicates = done.x + ((np.stack(rows) - seen) / sigma) @ gain.T
     misfit = float(np.sum(done.fun**2))
-    return _Solution(model, names, done.x, replicates, misfit, misfit / max(len(seen) - len(names), 1))
+    # all lags of a plane err together
+    ends = np.cumsum([len(part) for part in alike])
+    shifts = [
+        gain[:, b - len(part) : b] @ (part / sigma[b - len(part) : b]) for part, b in zip(alike, ends, strict=True)
+    ]
+    systematic = np.sqrt(np.square(shifts).sum(axis=0) + ((gain * (_FLOOR / sigma)) ** 2).sum(axis=1))
+    chi2 = misfit / max(len(seen) - len(names), 1)
+    return _Solution(model, names, done.x, replicates, systematic, misfit, chi2)
 
 
 def _count(used: list[NoiseLevel]) -> int:
@@ -154,36 +171,36 @@ def _told(
 ) -> ProcessedNoise:
     """Numbers of the sensor."""
     column = {name: best.replicates[:, k] for k, name in enumerate(best.names)}
+    error = {
+        name: float(np.hypot(jackknife_sigma(column[name]), best.systematic[k])) for k, name in enumerate(best.names)
+    }
     numbers, full = best.numbers(), card.top_dn - card.black_level_dn
     values: dict[str, Array] = {"gain_dn_per_e": full / np.exp(column["white_e"]) / analogue_gain}
+    own_error = {"gain_dn_per_e": error["white_e"] * float(values["gain_dn_per_e"][0])}
     reasons: dict[str, str] = {}
     for name, own in (("read_noise_e", "read_noise_e"), ("denoise_chroma", "chroma")):
-        if column[own][0] > _FOUND * jackknife_sigma(column[own]):
-            values[name] = column[own]
+        if column[own][0] > _FOUND * error[own]:
+            values[name], own_error[name] = column[own], error[own]
         else:
             reasons[name] = _REASONS[name]
-    if numbers.sharpen >= 0.0:
-        values["sharpen_amount"] = column["sharpen"]
-    else:
-        values["denoise_luma"] = -column["sharpen"]
-    if "denoise" in column:
-        values["denoise_luma"] = column["denoise"]
-    if "vertical" in column:
-        values["denoise_vertical"] = column["vertical"]
+    sharp = "sharpen_amount" if numbers.sharpen >= 0.0 else "denoise_luma"
+    values[sharp], own_error[sharp] = np.abs(column["sharpen"]), error["sharpen"]
+    for name, own in (("denoise_luma", "denoise"), ("denoise_vertical", "vertical")):
+        if own in column:
+            values[name], own_error[name] = column[own], error[own]
     pattern = _prnu(used, best.model, numbers)
     if pattern is not None and pattern[0] > _FOUND * jackknife_sigma(pattern):
         values["prnu"] = np.sqrt(np.maximum(pattern, 0.0))
     else:
         reasons["prnu"] = "lost in temporal noise: take more frames of the brighter levels"
     found: dict[str, float | tuple[float, ...]] = {n: float(x[0]) for n, x in values.items()}
-    sigmas: dict[str, float | tuple[float, ...]] = {n: jackknife_sigma(x) for n, x in values.items()}
-    groups = {"white_balance": (column["red"], np.ones(1), column["blue"])}
+    sigmas: dict[str, float | tuple[float, ...]] = {n: own_error.get(n, jackknife_sigma(x)) for n, x in values.items()}
+    found["white_balance"] = (numbers.red, 1.0, numbers.blue)
+    sigmas["white_balance"] = (error["red"], 0.0, error["blue"])
     if best.model.halved:
-        left, right = column["left"], column["right"]
-        groups["chroma_taps"] = (left, 1.0 - left - right, right)
-    for name, parts in groups.items():
-        found[name] = tuple(float(x[0]) for x in parts)
-        sigmas[name] = tuple(jackknife_sigma(x) if len(x) > 1 else 0.0 for x in parts)
+        middle = 1.0 - column["left"] - column["right"]
+        found["chroma_taps"] = (numbers.left, 1.0 - numbers.left - numbers.right, numbers.right)
+        sigmas["chroma_taps"] = (error["left"], jackknife_sigma(middle), error["right"])
     share = numbers.denoise if "denoise" in column else max(-numbers.sharpen, 0.0)
     smoothing = Smoothing(share, best.model.reach_px, numbers.vertical) if share > 0.0 else None
     return ProcessedNoise(found, sigmas, reasons, best.chi2, tuple(levels), card, numbers, smoothing)

@@ -80,22 +80,42 @@ def drawn_sensor(k: int) -> Sensor:
 
 
 def drawn_processed(k: int) -> Sensor:
-    """A processed sensor drawn within the ranges of `settings_presets.toml`: srgb8 or yuyv, sharpened or denoised."""
+    """A processed sensor drawn within the ranges of `settings_presets.toml`: srgb8 or yuyv.
+
+    Two of four are sharpened or denoised by 3 x 3 pixels; the others are sharpened, and denoised by 5 x 5 with edges
+    spared.
+    """
     from phibench.render.sensor.settings import sensor
 
     rng = np.random.default_rng(1000 + k)
     full_well = rng.uniform(6000.0, 12000.0)
     amount = rng.uniform(0.2, 1.0)
+    left, right = rng.uniform(0.0, 0.3, 2)
+    own: dict[str, Any] = {
+        "sharpen_amount": 0.0 if k % 3 == 2 else amount,
+        "denoise_luma": 0.5 * amount if k % 3 == 2 else 0.0,
+    }
+    if k % 4 > 1:
+        own = {
+            "sharpen_amount": amount,
+            "denoise_luma": rng.uniform(0.4, 0.9),
+            "denoise_reach_px": 2,
+            "denoise_vertical": rng.uniform(0.5, 0.95),
+            "denoise_threshold_codes": rng.uniform(15.0, 40.0),
+        }
+    if k % 2:
+        own["chroma_taps"] = (left, 1.0 - left - right, right)
     return sensor(
         "yuyv" if k % 2 else "srgb8",
         full_well_e=1.2 * full_well,
         gain_dn_per_e=959.0 / full_well,
         read_noise_e=rng.uniform(6.0, 15.0),
         prnu=rng.uniform(0.008, 0.02),
-        transfer_function="rec709" if k % 4 > 1 else "srgb",
-        sharpen_amount=0.0 if k % 3 == 2 else amount,
-        denoise_luma=0.5 * amount if k % 3 == 2 else 0.0,
+        transfer_function="rec709" if k % 8 > 3 else "srgb",
+        white_balance=(rng.uniform(0.9, 1.3), 1.0, rng.uniform(1.1, 1.6)),
+        denoise_chroma=rng.uniform(0.2, 0.9),
         exposure_s=0.01,
+        **own,
     )
 
 
@@ -110,6 +130,8 @@ def write_processed_capture(folder: Path, s: Sensor, seed: int = 0, frames: int 
         images = flat_frames(s, tuple(share * white_e * grey), 1, f"t{share}", seed, (64, 64))
         tiles = [np.tile(image, (side // 64, side // 64, 1)) for image in images]
         write_frames(folder / "exposure" / f"{share * 0.02:.4f}", tiles)
+    if s.denoise_threshold_codes is not None:
+        write_frames(folder / "edge", edge_frames(s, 0.6, (5.0, 8.0, 12.0, 15.0), side))
     return folder
 
 
