@@ -38,6 +38,9 @@ _FINE_PX = 0.08
 _MOST_EDGES = 60
 _BINOMIAL = {0: 0.5, 1: 0.25}
 _TAPS = {1: (0.25, 0.5, 0.25), 2: (0.0625, 0.25, 0.375, 0.25, 0.0625)}
+_MODEL = (0.008, 0.01, 0.02)
+"""Errors of the model, one deviation, from fits of simulated frames: blur, px; gain of the unsharp mask; threshold,
+relative. Noise before the tone curve and rounding are not in it."""
 _THRESHOLD = (2.0, 500.0)  # codes: beyond, an edge does not tell it
 
 
@@ -349,9 +352,9 @@ def fit_edges(edges: list[Edge], model: EdgeModel, sharpness: float | None = Non
     mean, spread = _robust(measures)
     return EdgeFit(
         float(centre[0]),
-        float(error[0]),
+        float(np.hypot(error[0], _MODEL[0])),
         float(centre[1]),
-        float(error[1]),
+        float(np.hypot(error[1], _MODEL[1])),
         EdgeMeasure(*map(float, mean)),
         EdgeMeasure(*map(float, spread)),
         len(found),
@@ -364,7 +367,7 @@ def _threshold(each: Array, centre: Array, error: Array) -> tuple[float, float] 
     """Threshold with its standard error; None if it lies beyond what edges tell."""
     if each.size == 0 or float(np.median(each)) > 0.5 * _THRESHOLD[1]:
         return None
-    return float(centre[2]), float(error[2])
+    return float(centre[2]), float(np.hypot(error[2], _MODEL[2] * centre[2]))
 
 
 def _fit_one(edge: Edge, model: EdgeModel, sharpness: float | None) -> tuple[float, ...]:

@@ -199,7 +199,8 @@ def _told(
     sigmas["white_balance"] = (error["red"], 0.0, error["blue"])
     if best.model.halved:
         middle = 1.0 - column["left"] - column["right"]
-        found["chroma_taps"] = (numbers.left, 1.0 - numbers.left - numbers.right, numbers.right)
+        left, right = max(numbers.left, 0.0), max(numbers.right, 0.0)  # noise takes absent taps below 0
+        found["chroma_taps"] = (left, 1.0 - left - right, right)
         sigmas["chroma_taps"] = (error["left"], jackknife_sigma(middle), error["right"])
     share = numbers.denoise if "denoise" in column else max(-numbers.sharpen, 0.0)
     smoothing = Smoothing(share, best.model.reach_px, numbers.vertical) if share > 0.0 else None
