@@ -5,13 +5,15 @@ mask, denoising, chroma of 4:2:2. The answer of each plane to one electron at ea
 variance of a pixel, the autocovariance. Denoising that spares edges has the weights that `neighbour_filters` gives for
 the noise that comes in.
 
-Rounding to whole codes is exact. With x and y Gaussian codes of mean mu and covariance C(lag), the error of rounding is
-the series of sin(2 pi k x) (-1)^k / (pi k), so that the covariance of the rounded codes is
+Rounding to whole codes is exact. With x and y Gaussian codes of mean mu, variance V and covariance C, the error of
+rounding is the series of sin(2 pi k x) (-1)^k / (pi k), so that the covariance of the rounded codes is
 
-    C (1 + 4 sum (-1)^k cos(2 pi k mu) exp(-2 pi^2 k^2 C(0))) + sum exp(-4 pi^2 k^2 (C(0) - C)) / (2 pi^2 k^2),
+    C (1 + 4 sum_k (-1)^k cos(2 pi k mu) E(k, 0)) + sum_kl (-1)^(k + l) / (2 pi^2 k l) (
+        cos(2 pi (k - l) mu) (E(k, l) exp(4 pi^2 k l C) - E(k, l)) - cos(2 pi (k + l) mu) (E(k, l) exp(-4 pi^2 k l C)
+        - E(k, l))),   E(k, l) = exp(-2 pi^2 (k^2 + l^2) V),
 
-less what the spread of the pixels' means takes away from the cosines; terms of exp(-4 pi^2 (C(0) + C)) are left out.
-The second sum is 1/12 at lag 0: it is white rounding only where the noise of a pixel differs from its neighbour's.
+less what the spread of the pixels' means takes from the cosines. It is 1/12 on the variance, and nothing elsewhere,
+only where the noise of a pixel differs from its neighbour's by more than half a code.
 """
 
 from __future__ import annotations
@@ -212,14 +214,28 @@ class PlaneModel:
 
 def _rounded(own: Array, plane: PlaneNoise) -> Array:
     """Covariances after rounding."""
-    k, apart = _HARMONICS[:, None], 0.0 if plane.apart is None else plane.apart
-    sign = np.where(k % 2, -1.0, 1.0)
-    waves = sign * np.cos(2.0 * np.pi * k * plane.mean) * np.exp(-2.0 * (np.pi * k) ** 2 * (own[0] + plane.spread))
-    alike = np.exp(-4.0 * (np.pi * k) ** 2 * (own[0] - own) - 2.0 * (np.pi * k) ** 2 * apart)
-    result = own * (1.0 + 4.0 * waves.sum(axis=0)) + (alike / (2.0 * (np.pi * k) ** 2)).sum(axis=0)
+    k = _HARMONICS
+    sign, total = np.where(k % 2, -1.0, 1.0), 2.0 * np.pi**2 * own[0]
+    waves = sign * np.exp(-(k**2) * total) * _cosine(k, plane)
+    result = own * (1.0 + 4.0 * waves.sum())
+    pairs, both = np.add.outer(k**2, k**2), np.multiply.outer(k, k)
+    weight = np.multiply.outer(sign, sign) / (2.0 * np.pi**2 * both)
+    fade = np.exp(-2.0 * np.pi**2 * np.multiply.outer(own * 0.0 if plane.apart is None else plane.apart, both))
+    less, more = _cosine(np.subtract.outer(k, k), plane), _cosine(np.add.outer(k, k), plane)
+    shared = 4.0 * np.pi**2 * np.multiply.outer(own, both)
+    alone = np.exp(-pairs * total)
+    # exponents are added before the exponential: each alone would overflow
+    same = np.exp(shared - pairs * total) * fade - alone
+    opposite = np.exp(-shared - pairs * total) * fade - alone
+    result = result + (weight * (less * same - more * opposite)).sum(axis=(1, 2))
     # the series' tail at lag 0
-    result[0] += 1.0 / 12.0 - (1.0 / (2.0 * (np.pi * _HARMONICS) ** 2)).sum()
+    result[0] += 1.0 / 12.0 - (1.0 / (2.0 * (np.pi * k) ** 2)).sum()
     return np.asarray(result)
+
+
+def _cosine(k: Array, plane: PlaneNoise) -> Array:
+    """Mean of cos 2 pi k mu over the pixels."""
+    return np.asarray(np.cos(2.0 * np.pi * k * plane.mean) * np.exp(-2.0 * (np.pi * k) ** 2 * plane.spread))
 
 
 def _weights(colour: int, place: int) -> Array:

@@ -10,7 +10,7 @@ import pytest
 from helpers.sensor_light import room
 
 from phibench.render.sensor.camera_chain import Chain
-from phibench.render.sensor.light import Region
+from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import SensorError, sensor
 from phibench.scenes.camera import Camera
@@ -127,3 +127,16 @@ def test_a_square_is_moved_inside_and_keeps_its_size() -> None:
 def test_a_region_outside_is_refused(call, complaint: str) -> None:
     with pytest.raises(SensorError, match=complaint):
         call()
+
+
+def test_a_shrunk_frame_is_the_mean_of_its_pixels() -> None:
+    """An even field: the level stays, and noise of Y' falls below that of the sensor's own pixels."""
+    chain, stream = Chain(sensor("yuyv", prnu=0.0)), NoiseStream(("shrunk",))
+    light = Light.flat((9e4, 9e4, 6e4), (64, 128))
+    small, full = chain.shrunk_frame(light, stream, 2)[..., 0], chain.frame(light, stream)[..., 0]
+    assert small.shape == (32, 64)
+    assert abs(small.mean() - full.mean()) < 0.1
+    blocks = full.reshape(32, 2, 64, 2).mean(axis=(1, 3))
+    assert np.abs(small - blocks).max() < 1.0  # rounding before and after the mean
+    with pytest.raises(SensorError, match="cannot be shrunk 3 times"):
+        chain.shrunk_frame(light, stream, 3)
