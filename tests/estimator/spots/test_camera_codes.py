@@ -126,6 +126,8 @@ CHAINS = {
         "mjpeg", jpeg_quality=92, denoise_luma=0.3, denoise_chroma=0.8, transfer_function="rec709"
     ),
 }
+SLOW = ("srgb8 edges spared", "mjpeg edges spared")
+NAMES = [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in CHAINS]
 # one colour's values lie on the converter's lattice of 1 to 3 codes, which mixing pixels and 8 bits do not smear enough
 COARSE = ("srgb8 sharpened", "srgb8 denoised")
 
@@ -138,7 +140,7 @@ def outputs(frames: np.ndarray, s: Sensor) -> np.ndarray:
     return np.stack([ycbcr_codes(f) for f in frames]) if s.output == "yuyv" else planes.reshape(len(frames), -1)
 
 
-@pytest.mark.parametrize("name", CHAINS)
+@pytest.mark.parametrize("name", NAMES)
 def test_model_of_the_outputs_against_the_chain(name: str) -> None:
     """Means of 400 frames on the model's window, a bright spot in it: standard errors of sigma / 20.
 
@@ -170,7 +172,7 @@ def test_model_of_the_outputs_against_the_chain(name: str) -> None:
     assert np.mean(shifted**2) > 1.5 * most
 
 
-@pytest.mark.parametrize("name", CHAINS)
+@pytest.mark.parametrize("name", NAMES)
 def test_fit_of_a_bright_spot(name: str) -> None:
     """Three frames: within 6 standard deviations of its own, which are the bound's; the flux within 10 %."""
     s, uv = CHAINS[name], MIDDLE + [0.3, -0.4]
