@@ -34,7 +34,7 @@ _SIDE = 16  # of the torus: answers reach 4 pixels, lags 3
 _PLACES = ((0, 0), (0, 1), (1, 0), (1, 1))
 _SITES = np.array([[0, 1], [1, 2]])  # colour of each place
 _TAPS = {1: (0.25, 0.5, 0.25), 2: (0.0625, 0.25, 0.375, 0.25, 0.0625)}
-_HARMONICS = np.arange(1, 6)
+_HARMONICS = np.arange(1.0, 6.0)
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ class PlaneModel:
 def _rounded(own: Array, plane: PlaneNoise) -> Array:
     """Covariances after rounding."""
     k = _HARMONICS
-    sign, total = np.where(k % 2, -1.0, 1.0), 2.0 * np.pi**2 * own[0]
+    sign, total = np.where(k % 2.0 == 1.0, -1.0, 1.0), 2.0 * np.pi**2 * own[0]
     waves = sign * np.exp(-(k**2) * total) * _cosine(k, plane)
     result = own * (1.0 + 4.0 * waves.sum())
     pairs, both = np.add.outer(k**2, k**2), np.multiply.outer(k, k)
