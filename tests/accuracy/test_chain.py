@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.chain_scenes import COLLECTED, MIDDLE, ROOM, SQUARE, drawn, scene
+from helpers.mjpeg_grid import line
 from scipy import stats
 
 from phibench.datasets.frames.sensor_card import card_of
@@ -81,6 +82,21 @@ def test_accuracy_of_the_chain_in_short(cell: tuple[Sensor, float, float, float]
 def test_accuracy_of_the_chain(cell: tuple[Sensor, float, float, float]) -> None:
     """4000 draws: a standard error of 0.8 %."""
     checked(cell, 40, 100, 0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.study
+@pytest.mark.parametrize("background_e", [0.0, 20.0, 100.0, 500.0])
+@pytest.mark.parametrize("collected_e", [2000.0, 5000.0, 20_000.0])
+@pytest.mark.parametrize("quality", [60, 76, 85, 95])
+def test_accuracy_of_mjpeg_over_rooms(quality: int, collected_e: float, background_e: float) -> None:
+    """200 draws: a standard error of 3.5 %, of which two are allowed: of 48 cells two fail by chance at the limits."""
+    found = drawn(sensor("mjpeg", jpeg_quality=quality), 0.7, collected_e, background_e, 20, 10)
+    pull, error = float(np.sqrt(np.mean(found.pull**2))), 1.0 / np.sqrt(2.0 * found.error_px.size)
+    print(line(f"quality {quality}, {collected_e:g} e- over {background_e:g} e-", found))
+    assert found.failed <= 6
+    assert found.over_bound * (1.0 - 2.0 * error) <= 1.2
+    assert 0.9 * (1.0 - 2.0 * error) <= pull <= 1.1 * (1.0 + 2.0 * error)
 
 
 @pytest.mark.slow

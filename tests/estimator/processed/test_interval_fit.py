@@ -97,7 +97,7 @@ def test_coarse_steps_give_honest_errors() -> None:
     ("spread", "shared", "frames"), [(0.02, 0.5, 3), (0.1, 0.7, 6), (0.3, 0.7, 6), (0.5, 0.2, 4), (0.8, 1.0, 6)]
 )
 def test_site_of_several_frames_against_draws(spread: float, shared: float, frames: int) -> None:
-    """Mean of frames before the quantiser, of all draws that give the same steps in any order.
+    """Mean of frames before the quantiser, and what they share, of all draws that give the same steps in any order.
 
     2000 draws and more are left: a mean is known to 0.03 deviations, a deviation to 2 %; three times that is allowed.
     """
@@ -105,14 +105,17 @@ def test_site_of_several_frames_against_draws(spread: float, shared: float, fram
     x = 0.37 + shared * rng.normal(size=(400_000, 1))
     y = x + spread * rng.normal(size=(len(x), frames))
     z = np.sort(np.rint(y), axis=1)
-    steps = Steps.of(z[7][:, None], np.ones(1))
-    found = y.mean(axis=1)[(z == z[7]).all(axis=1)]
+    steps, kept = Steps.of(z[7][:, None], np.ones(1)), (z == z[7]).all(axis=1)
+    found, places = y.mean(axis=1)[kept], x[kept, 0]
     assert len(found) > 2000
     variance = shared**2 + spread**2 / frames
     site = steps.sites(np.array([0.37]), np.array([variance]), np.array([spread**2]))
     precision = 1.0 / variance + site.precision[0]
     assert (0.37 / variance + site.shift[0]) / precision == pytest.approx(found.mean(), abs=0.1 * found.std())
     assert precision**-0.5 == pytest.approx(found.std(), rel=0.06)
+    mean, left = steps.shared(np.array([0.37]), np.array([shared**2]), np.array([spread**2]))
+    assert mean[0] == pytest.approx(places.mean(), abs=0.1 * places.std())
+    assert left[0] ** 0.5 == pytest.approx(places.std(), rel=0.06)
 
 
 def test_several_frames_in_coarse_steps_give_honest_errors() -> None:
