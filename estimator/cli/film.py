@@ -141,11 +141,11 @@ def experiments(
     numbers = {"jpeg_quality": jpeg_quality} if preset == "mjpeg" else None
     procedure = FilmProcedure(preset, on, off, cameras, stroke, numbers)
     rows = run_film_experiments(open_films(directory), open_finished(calibration), procedure)
-    print(f"{'way':8s} {'films':>5s} {'rms':>8s} {'predicted':>9s} {'pull':>6s} {'within 95 %':>11s}")
+    print(f"{'way':8s} {'films':>5s} {'rms':>8s} {'predicted':>9s} {'pull':>6s} {'within 95 %':>11s} {'gain':>6s}")
     for row in summary(rows).iter_rows(named=True):
         print(
             f"{row['way']:8s} {row['films']:5d} {row['rms']:8.3%} {row['predicted']:9.3%} {row['pull']:6.2f} "
-            f"{row['within_95']:11.1%}"
+            f"{row['within_95']:11.1%} {row['gain']:6.2f}"
         )
     if out is not None:
         rows.write_parquet(out)

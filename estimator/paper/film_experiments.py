@@ -27,14 +27,20 @@ from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import Dataset
 from phibench.estimator.calibration.bundle import Bundle
 from phibench.estimator.calibration.spots import method_for
-from phibench.estimator.film.film_estimates import bundle_depth, seen_film
+from phibench.estimator.film.film_bundle import FilmDepth
+from phibench.estimator.film.film_estimates import EqualLight, bundle_depth, equal_light, seen_film
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.interface import Image, Pair
 from phibench.estimator.paper.experiment_tables import Procedure, calibrate_rig
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
 
-COLUMNS = ("film", "experiment", "rig", "camera", "way", "depth_m", "error_m", "sigma_m", "frames")
+COLUMNS = (
+    *("film", "experiment", "rig", "camera", "way", "depth_m", "error_m", "sigma_m", "frames"),
+    *("film_pixels_m", "two_ends_pixels_m"),
+)
+"""The last two: standard deviations of D from pixels and encoder alone, of the film and of as many frames in two bursts
+at the ends of its stroke; NaN for bursts."""
 WITHIN = 1.959963984540054
 _DRAWS_OF_A_CAMERA = 10_000
 
@@ -97,9 +103,11 @@ _TYPES: dict[str, Any] = {
 
 
 def _rows(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> list[dict[str, Any]]:
-    found = [("burst", *burst(film, bundle, procedure, camera), 2 * (procedure.on + procedure.off))]
+    nan = float("nan")
+    found = [("burst", *burst(film, bundle, procedure, camera), 2 * (procedure.on + procedure.off), nan, nan)]
     if procedure.stroke and procedure.preset == "bayer-raw":
-        found.append(("stroke", *whole_stroke(film, bundle, procedure, camera), len(film)))
+        at, light = whole_stroke(film, bundle, procedure, camera)
+        found.append(("stroke", at.depth_m, at.sigma_m, at.frames, light.film_m, light.two_ends_m))
     pair, depth_m = film.plan.pair, float(film.table["depth_m"][0])
     return [
         {
@@ -112,8 +120,10 @@ def _rows(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> 
             "error_m": estimate - depth_m,
             "sigma_m": sigma,
             "frames": frames,
+            "film_pixels_m": film_pixels_m,
+            "two_ends_pixels_m": two_ends_pixels_m,
         }
-        for way, estimate, sigma, frames in found
+        for way, estimate, sigma, frames, film_pixels_m, two_ends_pixels_m in found
     ]
 
 
@@ -201,20 +211,21 @@ def cut_rig(rig: Rig, film: FilmInfo) -> Rig:
 # The whole stroke.
 
 
-def whole_stroke(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> tuple[float, float]:
-    """D and its standard deviation from all frames of a film, metres."""
+def whole_stroke(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> tuple[FilmDepth, EqualLight]:
+    """Depth from all frames of a film, and what two bursts of as many frames would give."""
     seen = seen_film(film, camera * _DRAWS_OF_A_CAMERA, camera, preset=procedure.preset, rig=bundle.rig)
     nominal = film.plan.pair.nominal_stroke_m
     scale = float(bundle.stroke(np.array(nominal))) / nominal
-    found = bundle_depth(replace(seen, encoder_m=scale * seen.encoder_m), bundle.covariance)
-    return found.depth_m, found.sigma_m
+    seen = replace(seen, encoder_m=scale * seen.encoder_m)
+    found = bundle_depth(seen, bundle.covariance)
+    return found, equal_light(seen, found.point_world_m)
 
 
 # What came out.
 
 
 def summary(rows: pl.DataFrame) -> pl.DataFrame:
-    """Per way: pairs, rms of the relative error, predicted rms, their ratio, share within 95 %."""
+    """Per way: films, rms of the relative error, its prediction, pull, share within 95 %, gain of the film."""
     relative, claim = pl.col("error_m") / pl.col("depth_m"), pl.col("sigma_m") / pl.col("depth_m")
     good = rows.filter(pl.col("error_m").is_finite() & pl.col("sigma_m").is_finite())
     return good.group_by("way", maintain_order=True).agg(
@@ -223,4 +234,6 @@ def summary(rows: pl.DataFrame) -> pl.DataFrame:
         (claim**2).mean().sqrt().alias("predicted"),
         (pl.col("error_m").abs() <= WITHIN * pl.col("sigma_m")).mean().alias("within_95"),
         ((pl.col("error_m") / pl.col("sigma_m")) ** 2).mean().sqrt().alias("pull"),
+        # median over films: one of a short stroke has as much say as one of a long one
+        ((pl.col("two_ends_pixels_m") / pl.col("film_pixels_m")) ** 2).median().alias("gain"),
     )

@@ -50,8 +50,10 @@ def test_a_burst_of_a_cut_out_gives_the_depth(film_windows: Path) -> None:
 
 def test_the_whole_stroke_gives_the_depth(film_windows: Path) -> None:
     film, bundle = film_and_bundle(film_windows)
-    depth_m, sigma_m = whole_stroke(film, bundle, FEW, 0)
-    assert abs(depth_m - film.table["depth_m"][0]) < 5.0 * sigma_m
+    found, light = whole_stroke(film, bundle, FEW, 0)
+    assert abs(found.depth_m - film.table["depth_m"][0]) < 5.0 * found.sigma_m
+    assert light.film_m == pytest.approx(found.sigma_m, rel=0.05)  # the rig is known: pixels and encoder are all
+    assert light.gain > 0.0
 
 
 def test_a_cut_camera_sees_the_same_rays(film_windows: Path) -> None:
@@ -79,7 +81,10 @@ def test_what_does_not_go_together_is_one_sentence(film_windows: Path, tiny_data
 
 def test_summary_of_rows() -> None:
     rows = pl.DataFrame(
-        [("f", "e", "r", k, "burst", 2.0, error, 0.02, 4) for k, error in enumerate((0.02, -0.02, 0.06, float("nan")))],
+        [
+            ("f", "e", "r", k, "burst", 2.0, error, 0.02, 4, 0.01, 0.02)
+            for k, error in enumerate((0.02, -0.02, 0.06, float("nan")))
+        ],
         schema=list(COLUMNS),
         orient="row",
     )
@@ -88,3 +93,4 @@ def test_summary_of_rows() -> None:
     assert row["rms"] == pytest.approx(np.sqrt((1 + 1 + 9) / 3) * 0.01)
     assert row["predicted"] == pytest.approx(0.01)
     assert row["within_95"] == pytest.approx(2 / 3)
+    assert row["gain"] == pytest.approx(4.0)
