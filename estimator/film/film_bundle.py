@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from phibench.datasets.errors import DatasetError
 from phibench.estimator.film.film_positions import FilmPositions
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, STROKE_PARAMETERS
@@ -81,13 +82,13 @@ def film_depth(
 
     Raises
     ------
-    ValueError
+    DatasetError
         If fewer than two frames have a position, or the carriage does not move.
     """
     keep = np.flatnonzero(positions.good)
     readings = np.asarray(encoder_m, float)[keep]
     if len(keep) < 2 or np.ptp(readings) < _LEAST_STROKE_M:
-        raise ValueError(
+        raise DatasetError(
             f"film of {len(keep)} positions over {np.ptp(readings) if len(keep) else 0.0:.4f} m of the stroke: two "
             f"positions that are {_LEAST_STROKE_M:g} m apart are the least that give a depth"
         )
@@ -157,7 +158,7 @@ def _start(rig: Rig, positions: FilmPositions, readings: Array) -> Array:
     uv, offset = ([values[end].mean(axis=0) for end in ends] for values in (positions.uv_px, readings))
     found = depth_exact(rig, offset[1] - offset[0], *uv)
     if not np.isfinite(found.point_world_m).all():
-        raise ValueError("the rays of the film's ends do not meet before the rig: its positions are no spot's")
+        raise DatasetError("the rays of the film's ends do not meet before the rig: its positions are no spot's")
     return np.asarray(found.point_world_m + offset[0] * np.array(rig.stroke_axis_world))
 
 

@@ -5,7 +5,7 @@ Each takes what a robot has: raw windows, their times, encoder readings, the nom
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,13 +14,16 @@ from numpy.typing import NDArray
 from phibench.datasets.film.film_read import Film
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.estimator.film.film_bundle import FilmDepth, expected_sigma_m, film_depth
-from phibench.estimator.film.film_positions import FilmPositions, fit_positions
+from phibench.estimator.film.film_positions import FilmPositions, fit_positions, stepped_positions
 from phibench.estimator.film.recursive_filter import FilterState, first_state, updated
+from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import Beam
 from phibench.scenes.rig import Rig
 
+_STEPS, _SETTLED = 6, 0.02  # of the bundle, and standard deviations that it stops at
 _REST_M = 5e-3  # of the ends of the stroke: what counts as resting there
 
 
@@ -31,17 +34,36 @@ class SeenFilm:
     Attributes
     ----------
     rig : Rig
-        Nominal.
+        Nominal, or calibrated.
     positions : FilmPositions
+        Of each frame by itself.
     encoder_m : array, shape (N,)
         Readings, taken to the time at which the spot's row was exposed.
     encoder_sigma_m : float
+    windows_dn, origins_px : arrays, shape (N, h, w) and (N, 2)
+        Raw pixels, and the image pixel (u, v) of the first one.
+    card : SensorCard
+    blur : SpotBlur
     """
 
     rig: Rig
     positions: FilmPositions
     encoder_m: Array
     encoder_sigma_m: float
+    windows_dn: NDArray[Any] = field(repr=False)
+    origins_px: NDArray[np.int64] = field(repr=False)
+    card: SensorCard
+    blur: SpotBlur
+
+    def some(self, index: NDArray[np.int64]) -> SeenFilm:
+        """Some of the frames."""
+        return replace(
+            self,
+            positions=self.positions.some(index),
+            encoder_m=self.encoder_m[index],
+            windows_dn=self.windows_dn[index],
+            origins_px=self.origins_px[index],
+        )
 
 
 def seen_film(
@@ -72,37 +94,44 @@ def seen_film(
     drawn = [film.frame(int(k), preset, draw, camera_seed) for k in numbers]
     card = card_of(drawn[0].sensor)
     windows = np.stack([one.image for one in drawn])
-    origins = np.array([(one.region.u0_px, one.region.v0_px) for one in drawn])
+    origins = np.array([(one.region.u0_px, one.region.v0_px) for one in drawn], np.int64)
     rig, times = rig or film.plan.nominal.rig, film.plan.nominal.times
     readings = film.table["encoder_m"].to_numpy()
     sigma = float(np.hypot(film.plan.encoder.sigma_m, vibration_sigma_m))
-    beam = Beam()
+    middle = origins.mean(axis=0) + 0.5 * (np.array(windows.shape[:0:-1]) - 1.0)
     for _ in range(1 if depth_m is not None else 2):
-        positions = _positions(windows, origins, card, rig, depth_m, beam)
-        rows = np.where(positions.good, positions.uv_px[:, 1], 0.5 * times.height_px)
+        blur = spot_blur(rig, middle, depth_m, Beam())
+        positions = fit_positions(windows, origins, card, rig, blur)
+        rows = np.where(positions.good, positions.uv_px[:, 1], middle[1])
         at_row = np.interp(times.row_s(numbers.astype(float), rows), times.frame_s, readings)
         if depth_m is None:
             depth_m = film_depth(rig, positions, at_row, sigma).depth_m
-    return SeenFilm(rig, positions, at_row, sigma)
-
-
-def _positions(
-    windows: NDArray[Any], origins: Array, card: SensorCard, rig: Rig, depth_m: float | None, beam: Beam
-) -> FilmPositions:
-    middle = origins.mean(axis=0) + 0.5 * (np.array(windows.shape[:0:-1]) - 1.0)
-    return fit_positions(windows, origins, card, rig, spot_blur(rig, middle, depth_m, beam))
+    return SeenFilm(rig, positions, at_row, sigma, windows, origins, card, blur)
 
 
 def bundle_depth(seen: SeenFilm, covariance_rig: Array | None = None) -> FilmDepth:
-    """Joint bundle over all frames."""
-    return film_depth(seen.rig, seen.positions, seen.encoder_m, seen.encoder_sigma_m, covariance_rig)
+    """Joint bundle over all frames: Gauss-Newton steps of the likelihood of all pixels, from the frames' own fits."""
+    found, positions = film_depth(seen.rig, seen.positions, seen.encoder_m, seen.encoder_sigma_m), seen.positions
+    for _ in range(_STEPS):
+        positions = joint_positions(seen, found)
+        before, found = found, film_depth(seen.rig, positions, seen.encoder_m, seen.encoder_sigma_m, covariance_rig)
+        if abs(found.depth_m - before.depth_m) < _SETTLED * found.sigma_m:
+            break
+    return found
+
+
+def joint_positions(seen: SeenFilm, found: FilmDepth) -> FilmPositions:
+    """Positions one step from where a depth predicts them."""
+    axis = np.array(seen.rig.stroke_axis_world)
+    at = image_of(seen.rig.at(0.0), found.point_world_m - seen.encoder_m[:, None] * axis)
+    return stepped_positions(seen.windows_dn, seen.origins_px, seen.card, seen.rig, seen.blur, at.uv_px)
 
 
 def burst_depth(seen: SeenFilm, covariance_rig: Array | None = None) -> FilmDepth:
     """Frames at rest at both ends of the stroke alone, all of them, as two bursts."""
     low, high = seen.encoder_m.min(), seen.encoder_m.max()
     ends = np.flatnonzero((seen.encoder_m < low + _REST_M) | (seen.encoder_m > high - _REST_M))
-    return film_depth(seen.rig, seen.positions.some(ends), seen.encoder_m[ends], seen.encoder_sigma_m, covariance_rig)
+    return bundle_depth(seen.some(ends), covariance_rig)
 
 
 def filtered(seen: SeenFilm) -> list[FilterState]:
@@ -133,8 +162,11 @@ class EqualLight:
 
 def equal_light(seen: SeenFilm, point_world_m: Array, covariance_rig: Array | None = None) -> EqualLight:
     """Bound of a film against two bursts of as many frames at the ends of its stroke, from the frames' covariances."""
-    good = np.flatnonzero(seen.positions.good)
-    positions, offsets = seen.positions.some(good), seen.encoder_m[good]
+    axis = np.array(seen.rig.stroke_axis_world)
+    at = image_of(seen.rig.at(0.0), point_world_m - seen.encoder_m[:, None] * axis)
+    stepped = stepped_positions(seen.windows_dn, seen.origins_px, seen.card, seen.rig, seen.blur, at.uv_px)
+    good = np.flatnonzero(stepped.good)
+    positions, offsets = stepped.some(good), seen.encoder_m[good]
     ends = np.where(np.arange(len(good)) < len(good) // 2, np.argmin(offsets), np.argmax(offsets))
     return EqualLight(
         expected_sigma_m(seen.rig, point_world_m, offsets, positions, seen.encoder_sigma_m, covariance_rig),

@@ -7,6 +7,9 @@ frames k and l, whose spots share pixels p, have the covariance
     sum_p A_kp A_lp (prnu^2 mu_kp mu_lp + dsnu^2).
 
 A spot that rests gains nothing against the pattern from more frames; one that moves over pixels does.
+
+A faint spot behind a mosaic has several minima in one frame. `stepped_positions` takes one scoring step from places
+that all frames together predict: repeated with the bundle, these are Gauss-Newton steps of the joint likelihood.
 """
 
 from __future__ import annotations
@@ -95,6 +98,50 @@ def fit_positions(
     return _with_pattern(fit, pixels, regions.used, origins, law, pattern)
 
 
+def stepped_positions(
+    windows_dn: NDArray[Any], origins_px: ArrayLike, card: SensorCard, rig: Rig, blur: SpotBlur, at_px: Array
+) -> FilmPositions:
+    """Positions after one scoring step from predicted ones, flux and levels fitted there; all frames have one.
+
+    Parameters
+    ----------
+    at_px : array, shape (N, 2)
+        Predicted positions. Others as for `fit_positions`.
+    """
+    x, origins = raw_electrons(windows_dn, card), np.asarray(origins_px, np.int64)
+    shape = np.array(x.shape[:0:-1])
+    corner = np.clip(np.rint(at_px).astype(np.int64) - origins - SIDE_PX // 2, 0, shape - SIDE_PX)
+    x = np.stack([part[v : v + SIDE_PX, u : u + SIDE_PX] for part, (u, v) in zip(x, corner, strict=True)])
+    origins = origins + corner
+    noise, pattern = noise_of(card, pattern_known=True), PatternNoise.of(card)
+    law = GaussLaw(noise, pattern.dsnu_e2, 1, pattern.prnu)
+    red, green, blue = rig.camera.detector.laser_filter_response
+    model = SpotModel((red, green, blue) if card.mosaic == "bayer" else None)
+    regions = spot_regions(x, origins, x < card.full_from_e)
+    pixels = SpotPixels.of(regions.filters, blur, model)
+    theta = _linear_unknowns(pixels, regions.x_e, regions.used, law, at_px - origins)
+    mean, derivatives = pixels.at(theta)
+    weight = regions.used * law.information(mean)
+    score = np.einsum("nkhw,nhw->nk", derivatives, weight * (regions.x_e - mean))
+    step = np.einsum("nkl,nl->nk", np.linalg.pinv(fisher_matrix(derivatives, weight), hermitian=True), score)
+    good = np.isfinite(step).all(axis=1) & (theta[:, 2] > 0.0)
+    uv = np.where(good[:, None], at_px + step[:, :2], np.nan)
+    return _covariances(uv, theta, pixels, regions.used, origins, law, pattern)
+
+
+def _linear_unknowns(pixels: SpotPixels, x: Array, used: BoolArray, law: GaussLaw, place_px: Array) -> Array:
+    """Flux and levels that fit best at given places, shape (N, unknowns): two rounds of weighted least squares."""
+    theta = np.column_stack([place_px, np.ones((len(x), pixels.unknowns - 2))])
+    basis = pixels.at(theta)[1][:, 2:]  # linear in flux and levels
+    mean = np.broadcast_to(np.maximum(x.mean(axis=(1, 2), keepdims=True), 1.0), x.shape)
+    for _ in range(2):
+        weight = used * law.information(mean)
+        right = np.einsum("nkhw,nhw->nk", basis, weight * x)
+        theta[:, 2:] = np.einsum("nkl,nl->nk", np.linalg.pinv(fisher_matrix(basis, weight), hermitian=True), right)
+        mean = np.maximum(np.einsum("nk,nkhw->nhw", theta[:, 2:], basis), 1.0)
+    return theta
+
+
 def _narrowed(x: Array, origins: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
     """Small regions around the brightest place that is as wide as a spot, near the middle of each window."""
     count, h, w = x.shape
@@ -128,6 +175,19 @@ def _with_pattern(
     good = fit.status == Status.OK
     theta = np.column_stack([fit.uv_px - origins, fit.flux_e, fit.background_e])
     theta = np.where(good[:, None], theta, 1.0)
+    uv = np.where(good[:, None], fit.uv_px, np.nan)
+    return _covariances(uv, theta, pixels, used, origins, law, pattern)
+
+
+def _covariances(
+    uv_px: Array,
+    theta: Array,
+    pixels: SpotPixels,
+    used: BoolArray,
+    origins: NDArray[np.int64],
+    law: GaussLaw,
+    pattern: PatternNoise,
+) -> FilmPositions:
     mean, derivatives = pixels.at(theta)
     weight = used * law.information(mean)
     inverse = np.linalg.pinv(fisher_matrix(derivatives, weight), hermitian=True)[:, :2]
@@ -135,7 +195,7 @@ def _with_pattern(
     own = law.noise.variance_e2(mean) / law.frames
     new = np.einsum("nihw,nhw,njhw->nij", influence, own, influence)
     shared = _shared(influence * mean[:, None], origins, pattern.prnu**2) + _shared(influence, origins, pattern.dsnu_e2)
-    return FilmPositions(np.where(good[:, None], fit.uv_px, np.nan), new, shared)
+    return FilmPositions(uv_px, new, shared)
 
 
 def _shared(weights: Array, origins: NDArray[np.int64], variance: float) -> Array:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.estimator.film.film_bundle import expected_sigma_m, film_depth
-from phibench.estimator.film.film_positions import FilmPositions, fit_positions
+from phibench.estimator.film.film_positions import FilmPositions, fit_positions, stepped_positions
 from phibench.estimator.film.recursive_filter import FilterState, first_state, updated
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
 from phibench.estimator.spots.spot_prediction import spot_blur
@@ -135,7 +136,7 @@ def test_the_bound_is_the_bundles_own_sigma() -> None:
 
 def test_too_little_motion_is_a_sentence() -> None:
     positions, readings = drawn(3)
-    with pytest.raises(ValueError, match="two positions that are"):
+    with pytest.raises(DatasetError, match="two positions that are"):
         film_depth(SCENE.rig, positions.some(np.array([0, 1])), readings[:1].repeat(2), ENCODER_M)
 
 
@@ -162,3 +163,19 @@ def test_pattern_of_a_camera_is_the_claimed_covariance() -> None:
     assert np.mean(claims) > 0.7  # most of it is pattern: six frames have averaged the noise
     low, high = stats.chi2.ppf([5e-6, 1 - 5e-6], 80) / 40
     assert low < np.mean(squares) < high
+
+
+def test_one_step_from_a_near_place_is_the_fit() -> None:
+    """Fits of bright spots, and one step from 0.05 px beside them: the step is linear to 0.05^2 px; 6 frames."""
+    view, strong = SCENE.rig.at(0.1), sensor("bayer-raw")
+    layer, card = spot_layer(view, SPOT, ()), card_of(strong)
+    v0, u0 = layer.v0_px + 6, layer.u0_px + 6
+    light = Light(np.full((3, 720, 1280), 4e3, np.float32), layer)
+    box, chain = Region(u0 - 14, v0 - 14, u0 + 14, v0 + 14), Chain(strong, 1)
+    frames = np.stack([chain.raw(light, NoiseStream(("step", k)), box) for k in range(6)])
+    origins = np.full((6, 2), (box.u0_px, box.v0_px))
+    blur = spot_blur(SCENE.rig, np.array([u0, v0], float), DEPTH_M)
+    fit = fit_positions(frames, origins, card, SCENE.rig, blur)
+    stepped = stepped_positions(frames, origins, card, SCENE.rig, blur, fit.uv_px + 0.05)
+    np.testing.assert_allclose(stepped.uv_px, fit.uv_px, atol=5e-3)
+    np.testing.assert_allclose(stepped.noise_px2, fit.noise_px2, rtol=0.2, atol=1e-6)
