@@ -78,10 +78,11 @@ def test_accuracy_certificates_of_many_spots(shape: str) -> None:
     assert certified(shape, 2, 60) >= 40
 
 
-def test_accuracy_certificates_of_a_rough_mirror() -> None:
+@pytest.mark.parametrize("shape", PROFILES)
+def test_accuracy_certificates_of_a_rough_mirror(shape: str) -> None:
     """BRDF at given pairs against drawn facets, as for the sphere."""
-    view = revolved("hyperboloid", aligned=False, alpha=0.002).at(0.3)
-    spot = LaserSpot((2.0, 1.0, 0.5), (-1.0, -0.4, 0.0), 5e-3)
+    view = revolved(shape, aligned=False, alpha=0.002).at(0.3)
+    spot = LaserSpot((2.0, 1.0, 1.25 if shape == "cone" else 0.5), (-1.0, -0.4, 0.0), 5e-3)
     assert certify(view, spot, (), spot_truth(view, spot, ()), spot_layer(view, spot, ())).passed
 
 
@@ -119,20 +120,31 @@ def test_accuracy_spread_of_a_bundle(shape: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("shape", "height_m", "half_px"), [("paraboloid", 0.5, 3), ("hyperboloid", 0.5, 3), ("cone", 1.2, 8)]
+    ("shape", "height_m", "half_px", "paths"),
+    [
+        ("paraboloid", 0.5, 3, 5e7),
+        ("hyperboloid", 0.5, 3, 5e7),
+        ("cone", 1.2, 8, 5e7),
+        pytest.param("ellipsoid", 0.5, 3, 5e7, marks=pytest.mark.study),
+        pytest.param("polynomial", 0.5, 3, 5e7, marks=pytest.mark.study),
+        pytest.param("cone", 1.2, 8, 2.5e8, marks=pytest.mark.study),
+    ],
 )
-def test_accuracy_spot_layer_against_path_tracing(mi: ModuleType, shape: str, height_m: float, half_px: int) -> None:
+def test_accuracy_spot_layer_against_path_tracing(
+    mi: ModuleType, shape: str, height_m: float, half_px: int, paths: float
+) -> None:
     """Flux within 0.3 %, and shares of the columns within 0.002, off axis.
 
     5e7 paths: flux error 5e-4 to 1e-3, share error 3e-4 (one sigma): false alarm 3e-3 at worst, for the cone's streak.
-    Its window takes three passes, whose scatter tells the error to a factor of 3 only.
+    Its window takes three passes, whose scatter tells the error to a factor of 3 only; 2.5e8 paths take 14, and their
+    error is 1e-3.
     """
     detector = Detector(band_wavelength_nm=(650.0,) * 3, band_efficiency=(0.35,) * 3)  # at the laser line
     spot = LaserSpot((1.9, 0.7, height_m), (-1.9, -0.7, 0.0), 12e-3, profile="uniform")
     rig = revolved(shape, aligned=False, blur_sigma_px=0.25, detector=detector)
-    figures = compare(mi, rig, spot, half_px, 5e7)
-    assert figures["paths"] >= 5e7
-    assert figures["flux_error"] < 3e-3
+    figures = compare(mi, rig, spot, half_px, paths)
+    assert figures["paths"] >= paths
+    assert figures["flux_error"] < (3e-3 if paths < 1e8 else 1.2e-3)
     assert abs(figures["flux"]) <= 3e-3
     assert figures["share"] <= 2e-3
 

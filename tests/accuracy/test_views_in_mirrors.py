@@ -20,7 +20,7 @@ from phibench.scenes.catalog import lab
 from phibench.scenes.laser import LaserSpot
 
 SETTINGS = BakeSettings(texel_m=0.1, indirect_texel_m=0.1, lamp_rays=32, bounces=12, bounce_rays=32, final_rays=192)
-HEIGHT_M = {"cone": 1.5}  # of the place on the wall: 6 degrees above a cone's tip; else 2 degrees below the mirror
+HEIGHT_M = {"cone": 1.5, "polynomial": 0.3}  # of the place on the wall: a cone looks up, a polynomial down; 0.8 m else
 SIDE_PX, SAMPLES, RUNS, DEPTH = 16, 96, 6, 30
 SIGMAS = 3.3
 
