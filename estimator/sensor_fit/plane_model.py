@@ -19,8 +19,10 @@ only where the noise of a pixel differs from its neighbour's by more than half a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.sensor_fit.noise_levels import BOX_PX, NoiseLevel, PlaneNoise
@@ -34,6 +36,7 @@ _SIDE = 16  # of the torus: answers reach 4 pixels, lags 3
 _PLACES = ((0, 0), (0, 1), (1, 0), (1, 1))
 _SITES = np.array([[0, 1], [1, 2]])  # colour of each place
 _TAPS = {1: (0.25, 0.5, 0.25), 2: (0.0625, 0.25, 0.375, 0.25, 0.0625)}
+Spectra = NDArray[np.complex128]
 _HARMONICS = np.arange(1.0, 6.0)
 
 
@@ -91,12 +94,11 @@ class PlaneModel:
         result = []
         for k, plane in enumerate(level.planes[:3]):
             halved = self.halved and k > 0
-            own = np.array([_correlated(answers[k], answers[k], variances, lag, halved) for lag in plane.lags])
-            result.append(_rounded(own, plane))
+            at = _correlated(answers[k], answers[k], variances, halved)
+            result.append(_rounded(np.array([at[r, c * (2 if halved else 1)] for r, c in plane.lags]), plane))
         for k, plane in zip(others, level.planes[3:], strict=True):
-            lags = [(r, c / 2.0) for r, c in plane.lags] if self.halved else plane.lags
-            parts = [_correlated(answers[k], answers[main], variances, lag, self.halved) for lag in lags]
-            result.append(np.array(parts))
+            at = _correlated(answers[k], answers[main], variances, self.halved)
+            result.append(np.array([at[lag] for lag in plane.lags]))
         return result
 
     def lattice_errors(self, level: NoiseLevel, x: Numbers) -> list[float]:
@@ -124,9 +126,8 @@ class PlaneModel:
         answers, _ = self._answers(level, x)
         linear, _, _ = self._light(level, x)
         light = (linear / self._balance(x))[_SITES.ravel()]
-        luma = answers[0][:4]
-        boxed = np.fft.ifft2(np.fft.fft2(luma) * _box()).real
-        return float(0.25 * light**2 @ ((luma - boxed) ** 2).sum(axis=(1, 2)))
+        rough = np.fft.ifft2(answers[0][:4] * (1.0 - _box())).real
+        return float(0.25 * light**2 @ (rough**2).sum(axis=(1, 2)))
 
     def _balance(self, x: Numbers) -> Array:
         return np.array([x.red, 1.0, x.blue])
@@ -151,8 +152,8 @@ class PlaneModel:
             linear = linear + (wanted - 255.0 * at.mean.mean(axis=1)) / (255.0 * at.by_mean.mean(axis=1))
         return linear, raw, planes
 
-    def _answers(self, level: NoiseLevel, x: Numbers) -> tuple[Array, Array]:
-        """Answers of Y', Cb, Cr to each source, shape (3, sources, side, side), codes, and the sources' variances.
+    def _answers(self, level: NoiseLevel, x: Numbers) -> tuple[Spectra, Array]:
+        """Spectra of the answers of Y', Cb, Cr, shape (3, sources, side, side), and the sources' variances.
 
         Sources are raw pixels at four places, and what the tone curve's bend leaves of each colour at each place.
         """
@@ -160,11 +161,7 @@ class PlaneModel:
         at = noisy_code(np.repeat(linear[:, None], 4, axis=1), np.sqrt(planes), self.card)
         slope = 255.0 * at.by_mean * self._balance(x)[:, None]
         gains = np.tile(slope.reshape(3, 2, 2), (1, _SIDE // 2, _SIDE // 2))
-        codes, own = [], []
-        for row, column in _PLACES:
-            pulse = np.zeros((_SIDE, _SIDE))
-            pulse[_SIDE // 2 + row, _SIDE // 2 + column] = 1.0
-            codes.append(gains * demosaiced(pulse))
+        codes, own = list(gains * _pulses()), []
         excess = np.maximum(255.0**2 * at.variance - (255.0 * at.by_mean) ** 2 * planes, 0.0)
         for colour in range(3):
             for row, column in _PLACES:
@@ -175,8 +172,8 @@ class PlaneModel:
         variances = np.concatenate([raw, own])
         return self._filtered(np.stack(codes), variances, x), variances
 
-    def _filtered(self, codes: Array, variances: Array, x: Numbers) -> Array:
-        """Y', Cb, Cr after unsharp mask, denoising and 4:2:2, shape (3, sources, side, side)."""
+    def _filtered(self, codes: Array, variances: Array, x: Numbers) -> Spectra:
+        """Spectra of Y', Cb, Cr after unsharp mask, denoising and 4:2:2, shape (3, sources, side, side)."""
         limited = self.halved and self.card.ycbcr_range == "limited"
         scale = np.array([219.0, 224.0, 224.0]) / 255.0 if limited else np.ones(3)
         ycc = np.fft.fft2(np.einsum("ij,sjhw->ishw", scale[:, None] * YCC_FROM_RGB, codes))
@@ -184,20 +181,20 @@ class PlaneModel:
         ycc = ycc * (1.0 + max(x.sharpen, 0.0) * rest)
         ycc[0] = ycc[0] * (1.0 + min(x.sharpen, 0.0) * rest)
         if x.denoise > 0.0:
-            noise = np.fft.ifft2(ycc[0]).real / scale[0]
-            ycc[0] = ycc[0] * (1.0 + x.denoise * self._smoothing(noise, variances, x))
+            ycc[0] = ycc[0] * (1.0 + x.denoise * self._smoothing(ycc[0] / scale[0], variances, x))
         ycc[1:] = ycc[1:] * (1.0 - x.chroma * rest)
         if self.halved:
             ycc[1:] = ycc[1:] * _transfer((0.0, 1.0, 0.0), (x.left, 1.0 - x.left - x.right, x.right))
-        return np.asarray(np.fft.ifft2(ycc).real)
+        return np.asarray(ycc)
 
-    def _smoothing(self, luma: Array, variances: Array, x: Numbers) -> Array:
+    def _smoothing(self, luma: Spectra, variances: Array, x: Numbers) -> Array:
         """Transfer function of the blur of Y' less 1, by the noise that comes in, shape (side, side)."""
         across = np.array(_TAPS[self.reach_px])
         alone = np.zeros(len(across))
         alone[self.reach_px] = 1.0
         down = x.vertical * across + (1.0 - x.vertical) * alone
         kernel = np.zeros((_SIDE, _SIDE))
+        at = _correlated(luma, luma, variances)
         for i, row in enumerate(down):
             for j, column in enumerate(across):
                 lag = (i - self.reach_px, j - self.reach_px)
@@ -205,7 +202,7 @@ class PlaneModel:
                     continue
                 weight = row * column
                 if self.threshold_codes is not None:
-                    v = 2.0 * (_correlated(luma, luma, variances, (0, 0)) - _correlated(luma, luma, variances, lag))
+                    v = 2.0 * (at[0, 0] - at[lag])
                     weight *= (1.0 + v / self.threshold_codes**2) ** -1.5
                 kernel[lag] += weight
                 kernel[0, 0] -= weight
@@ -263,10 +260,25 @@ def _box() -> Array:
     return _transfer((1.0 / BOX_PX,) * BOX_PX, (1.0 / BOX_PX,) * BOX_PX)
 
 
-def _correlated(one: Array, two: Array, variances: Array, lag: tuple[float, float], halved: bool = False) -> float:
-    """Covariance, mean over the places of a sample; lags in samples, of which chroma has half of the columns."""
-    rows, columns = lag
-    product = one * np.roll(two, (-int(rows), -round(columns * (2 if halved else 1))), axis=(1, 2))
+def _correlated(one: Spectra, two: Spectra, variances: Array, halved: bool = False) -> Array:
+    """Covariances of a sample of one plane with the other plane's pixel at each lag, by their spectra.
+
+    Shape (side, side), mean over the places of a sample. Samples of chroma of "yuyv" lie on even columns.
+    """
+    part = 0.25
     if halved:
-        return float(0.5 * variances @ product[:, :, 0::2].sum(axis=(1, 2)))
-    return float(0.25 * variances @ product.sum(axis=(1, 2)))
+        # of an answer times (1 + (-1)^column) / 2
+        part, one = 0.5, 0.5 * (one + np.roll(one, _SIDE // 2, axis=-1))
+    spectrum = (variances[:, None, None] * np.conj(one) * two).sum(axis=0)
+    return np.asarray(part * np.fft.ifft2(spectrum).real)
+
+
+@lru_cache(maxsize=1)
+def _pulses() -> Array:
+    """Planes of one electron at each place, shape (4, 3, side, side)."""
+    planes = []
+    for row, column in _PLACES:
+        pulse = np.zeros((_SIDE, _SIDE))
+        pulse[_SIDE // 2 + row, _SIDE // 2 + column] = 1.0
+        planes.append(demosaiced(pulse))
+    return np.stack(planes)
