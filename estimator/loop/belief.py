@@ -181,6 +181,16 @@ class TargetBelief:
         error[0] = wrapped(error[0])
         return float(error @ np.linalg.solve(self.covariance[:PLACE, :PLACE], error))
 
+    def expected(self, stroke_m: float, held: Stance | None = None) -> tuple[float, float]:
+        """Azimuth and rise at which the mean is seen."""
+        azimuth, rise = self._seen(self.mean, stroke_m, held)
+        return float(azimuth), float(rise)
+
+    def pixel(self, stroke_m: float, held: Stance | None = None) -> tuple[float, float] | None:
+        """Pixel at which the mean is seen; None where the mirror does not show it."""
+        image = self._imager.image(*self._lowered(self.mean, stroke_m, held).tolist())
+        return None if image is None else (image.u_px, image.v_px)
+
     # -- what changes it -------------------------------------------------------------------------------------------
 
     def predict(self, left_m: float, right_m: float, step_s: float) -> None:
@@ -215,14 +225,18 @@ class TargetBelief:
 
     def _seen(self, x: Array, stroke_m: float, held: Stance | None) -> Array:
         """Direction of a state's image; its own where the mirror does not show it."""
+        lowered = self._lowered(x, stroke_m, held)
+        image = self._imager.image(*lowered.tolist())
+        d = lowered - np.array([0.0, 0.0, self._z0]) if image is None else np.array(image.ray)
+        return np.array([math.atan2(d[1], d[0]), d[2] / math.hypot(d[0], d[1])])
+
+    def _lowered(self, x: Array, stroke_m: float, held: Stance | None) -> Array:
+        """Place of a state in the rig's frame, lowered by the stroke."""
         point = self.point_m(x)
         if held is not None:
             R, t = rig_placement(self.vehicle, PlanarPose(), held)
             point = (point + np.array([self.vehicle.sensor_x_m, 0.0, 0.0]) - t) @ R
-        lowered = point - stroke_m * self._axis
-        image = self._imager.image(*lowered.tolist())
-        d = lowered - np.array([0.0, 0.0, self._z0]) if image is None else np.array(image.ray)
-        return np.array([math.atan2(d[1], d[0]), d[2] / math.hypot(d[0], d[1])])
+        return np.asarray(point - stroke_m * self._axis)
 
     def _moved(self, x: Array, left_m: float, right_m: float, step_s: float, about_rad: float) -> Array:
         """State after a step."""

@@ -1,0 +1,237 @@
+"""Episodes of a policy: one row each, however the policy ends."""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from multiprocessing.connection import Connection
+from typing import Any
+
+import polars as pl
+
+from phibench.estimator.loop.belief import TargetBelief
+from phibench.estimator.loop.policies import POLICIES, Policy
+from phibench.estimator.loop.simulator import REACHED, RUNNING, Action, Known, Observation, Setup, Simulator
+from phibench.scenes.random_streams import Name
+from phibench.scenes.validation import SceneError, nearest
+
+LOST = "policy failed"
+_STARTUP_S = 60.0  # a process that imports on a busy machine
+
+
+@dataclass(frozen=True)
+class Episode:
+    """Result of one episode.
+
+    Attributes
+    ----------
+    number : int
+    outcome : str
+        Of `simulator`, or `LOST` where the policy failed.
+    cause : str
+        One sentence for an episode that was not reached; empty for one that was.
+    time_s, driven_m : float
+    strokes : int
+    distance_m, stated_m, sigma_m : float
+        True D at the end, what was stated, and the belief's standard deviation; NaN where there is none.
+    locked_s : float
+        Time of the first lock; NaN without one.
+    pull : float
+        Error of the inverse distance over its standard deviation, at the end; NaN without a belief.
+    nees : float
+    """
+
+    number: int
+    outcome: str
+    cause: str
+    time_s: float
+    driven_m: float
+    strokes: int
+    distance_m: float
+    stated_m: float
+    sigma_m: float
+    locked_s: float
+    pull: float
+    nees: float
+
+    @property
+    def reached(self) -> bool:
+        """True for a success."""
+        return self.outcome == REACHED
+
+
+def run_episode(simulator: Simulator, policy: Policy, observation: Observation, number: int = 0) -> Episode:
+    """Run one episode, which has begun, to its end; a policy that raises or answers nonsense loses it."""
+    stated, failure, was_seen = math.nan, "", False
+    while simulator.outcome == RUNNING:
+        try:
+            action = policy.act(observation)
+            observation = simulator.act(Action(*action))
+        except Exception as error:  # whatever a policy does, its episode alone is lost
+            failure = f"{type(error).__name__} in step {simulator.step}: {' '.join(str(error).split())[:200]}"
+            break
+        was_seen = was_seen or simulator.unseen_cause == ""
+        stated = action.stated_m if action.stated_m > 0.0 else stated
+    belief = getattr(policy, "belief", None)
+    locked = getattr(policy, "locked_step", -1)
+    pull, nees, sigma = _judged(simulator, belief)
+    return Episode(
+        number,
+        LOST if failure else simulator.outcome,
+        failure or _cause(simulator, stated, was_seen),
+        simulator.time_s,
+        simulator.driven_m,
+        simulator.strokes,
+        simulator.distance_m,
+        stated,
+        sigma,
+        locked * simulator.setup.task.step_s if locked >= 0 else math.nan,
+        pull,
+        nees,
+    )
+
+
+def _judged(simulator: Simulator, belief: TargetBelief | None) -> tuple[float, float, float]:
+    """Pull, NEES and standard deviation of D of a belief at the end."""
+    if not isinstance(belief, TargetBelief):
+        return math.nan, math.nan, math.nan
+    error = belief.mean[2] - 1.0 / simulator.distance_m
+    pull = float(error / math.sqrt(belief.covariance[2, 2]))
+    return pull, belief.nees(simulator.target_in_rig_m()), belief.distance_sigma_m
+
+
+def _cause(simulator: Simulator, stated_m: float, was_seen: bool) -> str:
+    if simulator.outcome == REACHED:
+        return ""
+    if not was_seen:
+        return f"the target was never seen ({simulator.unseen_cause}): change exposure, laser or distances"
+    if math.isfinite(stated_m):
+        return f"stated {stated_m:.3f} m at {simulator.distance_m:.3f} m"
+    return f"{simulator.outcome} at D = {simulator.distance_m:.2f} m after {simulator.time_s:.1f} s"
+
+
+def run_episodes(setup: Setup, policy: str, count: int, *stream: Name) -> list[Episode]:
+    """Episodes of a built-in policy, in this process.
+
+    Raises
+    ------
+    SceneError
+        If there is no such policy.
+    """
+    if policy not in POLICIES:
+        raise SceneError(f"policy '{policy}': {nearest(policy, POLICIES)}")
+    simulator, rows = Simulator(setup), []
+    for number in range(count):
+        observation = simulator.start(*stream, number)
+        rows.append(run_episode(simulator, POLICIES[policy](setup.known, simulator), observation, number))
+    return rows
+
+
+def episode_frame(episodes: Sequence[Episode]) -> pl.DataFrame:
+    """A row per episode."""
+    return pl.DataFrame([asdict(episode) for episode in episodes])
+
+
+# -- policies of others, in a process of their own -------------------------------------------------------------------
+
+
+class PolicyProcess:
+    """Policy that runs in a process of its own, which is ended when an answer takes too long.
+
+    Parameters
+    ----------
+    factory : callable
+        From `Known` to a policy; importable, because it is named to the process.
+    known : Known
+    limit_s : float
+        Time for one answer.
+    """
+
+    def __init__(self, factory: Callable[[Known], Policy], known: Known, limit_s: float = 5.0) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._limit_s = limit_s
+        self._end, other = context.Pipe()
+        self._process = context.Process(target=_serve, args=(other, factory, known), daemon=True)
+        self._process.start()
+        other.close()
+        self._receive(_STARTUP_S, "start")
+
+    def act(self, observation: Observation) -> Action:
+        """Command of the next step.
+
+        Raises
+        ------
+        SceneError
+            If the policy raised, ended its process, or did not answer in time.
+        """
+        self._end.send(observation)
+        answer = self._receive(self._limit_s, "answer")
+        return Action(*answer)
+
+    def close(self) -> None:
+        """End the process."""
+        if not self._end.closed:
+            self._process.kill()
+            self._process.join()
+            self._end.close()
+
+    def _receive(self, limit_s: float, what: str) -> Any:
+        if not self._end.poll(limit_s):
+            self.close()
+            raise SceneError(f"the policy did not {what} within {limit_s:g} s: its process was ended")
+        try:
+            kind, content = self._end.recv()
+        except (EOFError, OSError) as error:
+            self.close()
+            raise SceneError("the policy ended its own process") from error
+        if kind == "raised":
+            raise SceneError(f"the policy raised {content}")
+        return content
+
+
+def _serve(end: Connection, factory: Callable[[Known], Policy], known: Known) -> None:
+    """Answer observations until the other end closes."""
+    try:
+        policy = factory(known)
+        end.send(("ready", ()))
+        while True:
+            action = policy.act(end.recv())
+            end.send(("action", tuple(Action(*action))))
+    except (EOFError, BrokenPipeError):
+        return
+    except Exception as error:  # told to the other side, in one line
+        end.send(("raised", f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"))
+
+
+def run_foreign(
+    setup: Setup, factory: Callable[[Known], Policy], count: int, *stream: Name, limit_s: float = 5.0
+) -> Iterator[Episode]:
+    """Episodes of a policy of others: a process for each, so that what it does to one episode stays there."""
+    simulator = Simulator(setup)
+    for number in range(count):
+        observation, policy = simulator.start(*stream, number), _Started(factory, setup.known, limit_s)
+        try:
+            yield run_episode(simulator, policy, observation, number)
+        finally:
+            policy.close()
+
+
+class _Started:
+    """Policy whose process starts with the first observation, so that a faulty start loses the episode alone."""
+
+    def __init__(self, factory: Callable[[Known], Policy], known: Known, limit_s: float) -> None:
+        self._factory, self._known, self._limit_s = factory, known, limit_s
+        self._process: PolicyProcess | None = None
+
+    def act(self, observation: Observation) -> Action:
+        """Command of the next step."""
+        if self._process is None:
+            self._process = PolicyProcess(self._factory, self._known, self._limit_s)
+        return self._process.act(observation)
+
+    def close(self) -> None:
+        """End the process, if there is one."""
+        if self._process is not None:
+            self._process.close()

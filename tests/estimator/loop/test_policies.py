@@ -1,0 +1,165 @@
+"""Policies: the process reaches its target and is calibrated; policies that fail lose their episode alone."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+
+import numpy as np
+import pytest
+from scipy.stats import binomtest
+
+from phibench.estimator.loop.arena import generated_arena
+from phibench.estimator.loop.episodes import LOST, episode_frame, run_episode, run_episodes, run_foreign
+from phibench.estimator.loop.policies import CODED, POLICIES, Identifier, Plan
+from phibench.estimator.loop.sensing import SEEN, Reading
+from phibench.estimator.loop.simulator import CODES, Action, Known, Observation, Setup, Simulator, Task
+from phibench.scenes.validation import SceneError
+
+
+@pytest.mark.parametrize("policy", ["paper", "greedy", "oracle"])
+def test_policies_reach_their_targets(policy: str) -> None:
+    episodes = run_episodes(Setup(), policy, 3, "policies")
+    assert [episode.outcome for episode in episodes] == ["reached"] * 3
+    for episode in episodes:
+        assert abs(episode.distance_m - 1.0) <= 0.05
+        assert abs(episode.stated_m / episode.distance_m - 1) <= 0.02
+    frame = episode_frame(episodes)
+    assert frame["time_s"].max() < 40.0
+    if policy == "paper":
+        assert frame["strokes"].min() >= 1
+        assert frame["locked_s"].to_list() == [1.5] * 3  # one code of 15 steps
+
+
+def test_chance_reaches_nothing() -> None:
+    assert not any(episode.reached for episode in run_episodes(Setup(), "random", 5, "policies"))
+
+
+def test_the_same_stream_gives_the_same_episodes() -> None:
+    one, other = (run_episodes(Setup(), "random", 2, "policies") for _ in range(2))
+    assert repr(one) == repr(other)
+
+
+def frame(step: int, lit: bool, *places: float) -> Observation:
+    spots = tuple(Reading(u, 100.0, 0.1, 1e4, SEEN) for u in places)
+    return Observation(step, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, lit, spots)
+
+
+def test_the_target_is_the_spot_that_blinks_with_the_laser() -> None:
+    found, code = Identifier(), CODES[CODED]
+    for k, bit in enumerate(code):
+        assert found.target() is None
+        places = [300.0, *([200.0] if bit == "1" else []), *([400.0] if k % 2 else [])]
+        found.add(frame(k, bit == "1", *places))
+    target = found.target()
+    assert target is not None
+    assert target.u_px == 200.0
+
+
+def test_no_target_is_found_where_nothing_blinks_with_the_laser() -> None:
+    found = Identifier()
+    for k, bit in enumerate(CODES[CODED] * 2):
+        found.add(frame(k, bit == "1", 300.0, *([400.0] if k % 3 else [])))
+    assert found.target() is None
+
+
+def test_greedy_plans_a_stroke_because_driving_leaves_the_slip_unknown() -> None:
+    simulator = Simulator(Setup())
+    policy = POLICIES["greedy"](simulator.setup.known, simulator)
+    observation = simulator.start("greedy", 1)
+    while policy.belief is None:
+        observation = simulator.act(policy.act(observation))
+    policy._track(policy.belief, observation)
+    none, some = (policy.expected(Plan(*plan)) for plan in ((0.0, 0.0), (0.0, 0.2)))
+    slip = simulator.setup.vehicle.slip_sigma
+    assert none.sigma_m > 0.5 * slip  # of a metre
+    assert some.sigma_m < 0.5 * none.sigma_m
+    assert some.time_s > none.time_s
+
+
+# -- policies that fail ------------------------------------------------------------------------------------------------
+
+
+class Raises:
+    def act(self, observation: Observation) -> Action:
+        raise ValueError("no idea")
+
+
+class AnswersNan:
+    def act(self, observation: Observation) -> Action:
+        return Action(drive_m_per_s=math.nan)
+
+
+class Stands:
+    def act(self, observation: Observation) -> Action:
+        return Action()
+
+
+class Hangs:
+    def act(self, observation: Observation) -> Action:
+        time.sleep(3600)
+        return Action()
+
+
+class Dies:
+    def act(self, observation: Observation) -> Action:
+        os._exit(3)
+
+
+def stands(known: Known) -> Stands:
+    return Stands()
+
+
+def hangs(known: Known) -> Hangs:
+    return Hangs()
+
+
+@pytest.mark.parametrize(
+    ("policy", "words"),
+    [(Raises(), "ValueError in step 0: no idea"), (AnswersNan(), "action drive_m_per_s = nan: must be finite")],
+)
+def test_a_policy_that_fails_loses_its_episode_in_one_sentence(policy, words: str) -> None:
+    simulator = Simulator(Setup())
+    episode = run_episode(simulator, policy, simulator.start("fails"))
+    assert episode.outcome == LOST
+    assert words in episode.cause
+    assert "\n" not in episode.cause
+    assert run_episode(
+        simulator, POLICIES["oracle"](simulator.setup.known, simulator), simulator.start("fails")
+    ).reached
+
+
+def test_a_target_that_is_never_seen_is_said() -> None:
+    setup = Setup(task=Task(power=1e-3, longest_s=1.0, lights=0))
+    (episode,) = run_episodes(setup, "paper", 1, "dark")
+    assert "the target was never seen (too faint)" in episode.cause
+
+
+def test_unknown_policies_are_refused() -> None:
+    with pytest.raises(SceneError, match="papr"):
+        run_episodes(Setup(), "papr", 1, "x")
+
+
+@pytest.mark.slow
+def test_a_process_of_its_own_ends_policies_that_hang() -> None:
+    short = Setup(task=Task(longest_s=0.5))
+    (stood,) = run_foreign(short, stands, 1, "foreign")
+    assert stood.outcome == "time is over"
+    hung = list(run_foreign(short, hangs, 2, "foreign", limit_s=0.5))
+    assert [episode.outcome for episode in hung] == [LOST, LOST]
+    assert "did not answer within 0.5 s" in hung[0].cause
+
+
+@pytest.mark.study
+def test_the_process_reaches_its_target_in_twenty_rooms(capsys) -> None:
+    """200 episodes: at least 95 % reached; pull of 1 / D over all beliefs 0.9 to 1.1."""
+    setup = Setup(arenas=tuple(generated_arena("loop", k) for k in range(20)))
+    frame = episode_frame(run_episodes(setup, "paper", 200, "rooms"))
+    reached = int((frame["outcome"] == "reached").sum())
+    pull = float(np.sqrt(np.mean(frame["pull"].drop_nans().to_numpy() ** 2)))
+    low, high = binomtest(reached, 200).proportion_ci()
+    with capsys.disabled():
+        print(f"reached {reached} of 200 ({low:.3f} to {high:.3f}), pull {pull:.2f}")
+    assert reached >= 190
+    assert 0.9 <= pull <= 1.1
