@@ -9,6 +9,7 @@ it takes the plan that is quickest among those whose expected standard deviation
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -30,8 +31,10 @@ _AGREEMENT = 0.9  # of frames with the code; a light that is always on agrees in
 _GATE = 25.0  # chi squared of 2: 4e-6 of the target's own spots lie beyond
 _NEAR_PX = 60.0  # spots farther from what is expected are not asked: a target's own never are
 _LOST_STEPS = 15
+_HIDDEN_STEPS = 2
 _STROKE_SPEED = 0.2  # m/s: a frame every 2 cm
 _ALIGNED_RAD = 0.03
+_SEARCH_RAD_PER_S, _SEARCH_STEPS = 0.8, 15
 _EXPOSURES = (4, 5, 3, 2)  # in the order in which they are tried
 _GOAL_SHARE = 0.3  # of the tolerances, for the standard deviation of D
 
@@ -93,7 +96,8 @@ class SearchingPolicy:
         self.observation: Observation
         self.exposure = _EXPOSURES[0]
         self.locked_step = -1
-        self._missed = 0
+        self.locks = 0
+        self._missed, self._seen_stroke_m = 0, 0.0
         self._run = self._process()
 
     def act(self, observation: Observation) -> Action:
@@ -112,22 +116,30 @@ class SearchingPolicy:
             yield from self._identify()
             for action in self.plan():
                 yield action
-                if self._missed > _LOST_STEPS:
+                if self._missed > _LOST_STEPS and self.target.distance_sigma_m > 0.5 * self.known.task.reach_m:
                     break
             self.belief = None
 
     # -- detection and identification ------------------------------------------------------------------------------
 
     def _identify(self) -> Iterator[Action]:
-        """Stand with the blinking laser until one spot agrees with its code; try other exposures where none does."""
-        while True:
-            for self.exposure in _EXPOSURES:
-                found = Identifier()
-                for _ in range(2 * len(CODES[CODED])):
-                    yield Action(exposure=self.exposure, code=CODED)
-                    found.add(self.observation)
-                    if (spot := found.target()) is not None and self._lock(spot):
-                        return
+        """Stand with the blinking laser until one spot agrees with its code.
+
+        Where none does, furniture may hide the target: the robot turns, which moves the sensor by centimetres, and the
+        carriage goes to its other end. Every other time another exposure is tried.
+        """
+        for attempt in itertools.count():
+            self.exposure = _EXPOSURES[attempt // 2 % len(_EXPOSURES)]
+            if attempt:
+                yield from itertools.repeat(Action(turn_rad_per_s=_SEARCH_RAD_PER_S), _SEARCH_STEPS)
+            if attempt % 2:
+                yield from self.stroke(0.0 if self.observation.stroke_m > 0.5 * PAPER_STROKE_M else PAPER_STROKE_M)
+            found = Identifier()
+            for _ in range(2 * len(CODES[CODED])):
+                yield Action(exposure=self.exposure, code=CODED)
+                found.add(self.observation)
+                if (spot := found.target()) is not None and self._lock(spot):
+                    return
 
     def _lock(self, spot: Reading) -> bool:
         first = direction_of(self.known.rig, spot.u_px, spot.v_px, spot.sigma_px)
@@ -135,10 +147,11 @@ class SearchingPolicy:
             return False
         self.belief = TargetBelief(self.known.rig, self.known.vehicle, first, self.observation.stroke_m)
         self.locked_step, self._missed = self.observation.step, 0
+        self.locks, self._seen_stroke_m = self.locks + 1, self.observation.stroke_m
         return True
 
     def _track(self, belief: TargetBelief, seen: Observation) -> None:
-        """Take the step in, and the spot that lies nearest to what is expected."""
+        """Take the step in, and the spot that lies nearest to what is expected; a hidden target is reckoned on."""
         belief.predict(seen.left_m, seen.right_m, self.known.task.step_s)
         held = seen.attitude(self.known.vehicle)
         best: tuple[float, Direction] | None = None
@@ -153,6 +166,7 @@ class SearchingPolicy:
                     best = (far, direction)
         self._missed = 0 if best is not None or not seen.lit else self._missed + 1
         if best is not None:
+            self._seen_stroke_m = seen.stroke_m
             belief.update(best[1], seen.stroke_m, held)
 
     # -- moves -----------------------------------------------------------------------------------------------------
@@ -173,9 +187,12 @@ class SearchingPolicy:
             yield self.command(turn_rad_per_s=2.0 * self.target.bearing_rad)
 
     def stroke(self, to_m: float) -> Iterator[Action]:
-        """Move the carriage, a frame every few centimetres."""
+        """Move the carriage, a frame every few centimetres; back to where the target was seen last if it is hidden."""
         step_s = self.known.task.step_s
         while abs(way := to_m - self.observation.stroke_m) > 1e-6:
+            if self.belief is not None and self._missed > _HIDDEN_STEPS:
+                to_m = self._seen_stroke_m
+                way = to_m - self.observation.stroke_m
             yield self.command(stroke_m_per_s=float(np.clip(way / step_s, -_STROKE_SPEED, _STROKE_SPEED)))
 
     def approach(self) -> Iterator[Action]:
@@ -207,6 +224,8 @@ class PaperProcess(SearchingPolicy):
 
     def plan(self) -> Iterator[Action]:
         """Actions from the first lock to the statement."""
+        if self.locks > 1:  # the target hides when the robot faces it: measure first
+            yield from self.stroke(PAPER_STROKE_M if self.observation.stroke_m < 0.5 * PAPER_STROKE_M else 0.0)
         yield from self.orient()
         yield from self.stroke(PAPER_STROKE_M)
         while True:

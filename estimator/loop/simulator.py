@@ -26,7 +26,8 @@ from phibench.scenes.validation import SceneError, within
 
 CODES = ("0", "1", "111100010011010")
 """Laser codes, a bit per step: off, on, and a maximal sequence that no light imitates by chance."""
-RUNNING, REACHED, WRONG, COLLISION, LATE = (
+NOT_STARTED, RUNNING, REACHED, WRONG, COLLISION, LATE = (
+    "not started",
     "running",
     "reached",
     "stated wrongly",
@@ -206,7 +207,7 @@ class Simulator:
     def __init__(self, setup: Setup) -> None:
         self.setup = setup
         self._sensing = Sensing(setup.rig.perturbed(setup.misalignment), setup.preset, setup.task.laser)
-        self.start("never started")
+        self.outcome = NOT_STARTED
 
     def start(self, *stream: Name) -> Observation:
         """Begin an episode: the names decide on room, target, lights, slip and noise."""
@@ -276,7 +277,7 @@ class Simulator:
             If a number of the action is not finite, no such exposure or code exists, or the episode is over.
         """
         if self.outcome != RUNNING:
-            raise SceneError(f"the episode is over ({self.outcome}): reset before the next step")
+            raise SceneError(f"no episode is running ({self.outcome}): reset before the next step")
         _check(action)
         task, self.refused = self.setup.task, ""
         left, right = self._drive(action)

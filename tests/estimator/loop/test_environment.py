@@ -85,7 +85,7 @@ def test_reward_and_ends(env) -> None:
     assert still(env)[0] == pytest.approx(-0.001)
     reward, over, late, info = still(env, stated_m=np.array([env.simulator.distance_m]))
     assert (reward, over, late, info["outcome"]) == (pytest.approx(-1.001), True, False, WRONG)
-    with pytest.raises(SceneError, match="episode is over"):
+    with pytest.raises(SceneError, match="no episode is running"):
         still(env)
 
     near = ApproachTarget(distances_m=(1.0, 1.04))
