@@ -145,7 +145,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Known:
-    """What a policy knows: nominal vehicle and rig, and the task."""
+    """Knowledge of a policy: nominal vehicle and rig, and the task."""
 
     vehicle: Vehicle
     rig: Rig
@@ -179,7 +179,7 @@ class Setup:
 
     @property
     def known(self) -> Known:
-        """What policies may know."""
+        """Knowledge that policies may have."""
         return Known(self.vehicle, self.rig, self.task)
 
 
