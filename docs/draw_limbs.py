@@ -1,8 +1,8 @@
 """Limbs of real mirror balls beside simulated ones, through the same measures: a table of `reality.md`.
 
     git clone https://github.com/FrostKiwi/Mirrorball
-    phibench dataset make bench-test --out out/limbs --samples 12 --seed 7
-    python docs/draw_limbs.py Mirrorball/assets/media out/limbs
+    phibench dataset make paper-misaligned --out out/limbs
+    python docs/draw_limbs.py Mirrorball/assets/media out/limbs --samples 29
 
 Give a folder of photographs and a data set. No photograph is copied. All pictures are made smaller by whole squares of
 pixels, so that the outline's radius is near that of the C310, and looked for by `find_circle` alone.
