@@ -169,7 +169,7 @@ def test_a_moving_target_is_tracked_and_two_frames_are_not_enough(moves) -> None
 
 
 @pytest.mark.slow
-def test_tracking_accuracy_over_many_runs(capsys) -> None:
+def test_tracking_over_many_runs(capsys) -> None:
     """NEES within its 95 % band, at rest and moving: bands of 5 % false alarm each, at fixed streams."""
     n = 120
     rows = []
