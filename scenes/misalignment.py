@@ -6,7 +6,8 @@ sensitivities and studies use these names. `Motion` is what moves the whole rig 
 Conventions: world axes (z up; the robot's front is world +x); angles turn right-handed. The form's x, y, z are the
 world's at the down position, about the sphere centre; from there the form goes with the rig. Of several deviations at
 once: the sphere moves first, then the camera turns about its lens and leaves sphere and lens where they are. A recipe's
-`decentre`, `tilt` and `stroke_tilt` in `[rig]` mean the same as here.
+`decentre`, `tilt` and `stroke_tilt` in `[rig]` mean the same as here. A mirror of revolution moves with its vertex, and
+turns about it: its tilt is its own, besides that of the camera.
 """
 
 from __future__ import annotations
@@ -191,6 +192,25 @@ class Misalignment:
     form_32s_m: float = _number("m", 1e-3, 2e-5, "form: peak of 5.196 x y z")
     form_33c_m: float = _number("m", 1e-3, 2e-5, "form: peak of x^3 - 3 x y^2")
     form_33s_m: float = _number("m", 1e-3, 2e-5, "form: peak of 3 x^2 y - y^3")
+    mirror_tilt_x_rad: float = _number(
+        "rad",
+        0.5,
+        8.7e-3,
+        "mirror of revolution turned about world x through its vertex; the camera stays",
+        step=5e-4,
+        sigma=math.radians(0.5),
+    )
+    mirror_tilt_y_rad: float = _number(
+        "rad",
+        0.5,
+        8.7e-3,
+        "mirror of revolution turned about world y through its vertex; the camera stays",
+        step=5e-4,
+        sigma=math.radians(0.5),
+    )
+    rim_radius_m: float = _number(
+        "m", 0.1, 1e-4, "added to the rim's radius of a mirror of revolution", step=5e-5, sigma=5e-5
+    )
 
     def __post_init__(self) -> None:
         for name, parameter in PARAMETERS.items():
@@ -214,10 +234,12 @@ class Misalignment:
         return replace(nominal, radius_m=nominal.radius_m + self.radius_m, roughness_alpha=alpha, form=form)
 
     def _revolved(self, nominal: RevolvedMirror) -> RevolvedMirror:
-        """True mirror of revolution: `radius_m` is added to the vertex radius; a cone has none and stays as it is."""
+        """True mirror of revolution: `radius_m` is added to the vertex radius; a cone has none, and that changes nothing."""
         if any(getattr(self, name) for name in HARMONICS):
             raise SceneError(f"Misalignment: form errors are a sphere's; the mirror is a {nominal.profile.shape}")
         profile = nominal.profile
+        if self.rim_radius_m:
+            profile = replace(profile, rim_radius_m=profile.rim_radius_m + self.rim_radius_m)
         if self.radius_m and profile.shape != "cone":
             profile = replace(profile, vertex_radius_m=profile.vertex_radius_m + self.radius_m)
         alpha = nominal.roughness_alpha + self.roughness_alpha
@@ -226,11 +248,13 @@ class Misalignment:
     def poses(self, T_world_camera: Pose, T_camera_sphere: Pose) -> tuple[Pose, Pose]:
         """True camera pose in the world and sphere pose in the camera, both down."""
         moved_m = (self.decentre_x_m, self.decentre_y_m, self.axial_m)
-        if not any((*moved_m, self.tilt_x_rad, self.tilt_y_rad)):
+        tilt = (self.mirror_tilt_x_rad, self.mirror_tilt_y_rad)
+        if not any((*moved_m, self.tilt_x_rad, self.tilt_y_rad, *tilt)):
             return T_world_camera, T_camera_sphere
         R = np.array(rotation_xyz(self.tilt_x_rad, self.tilt_y_rad)) @ T_world_camera.R
         sphere = T_world_camera.directions(T_camera_sphere.t) + moved_m  # from the lens, world axes
-        turned = R.T @ T_world_camera.R @ T_camera_sphere.R
+        own = R.T @ np.array(rotation_xyz(*tilt)) if any(tilt) else R.T
+        turned = own @ T_world_camera.R @ T_camera_sphere.R
         return (
             replace(T_world_camera, rotation=as_matrix(R)),
             replace(T_camera_sphere, translation_m=as_vector(R.T @ sphere), rotation=as_matrix(turned)),
@@ -269,5 +293,7 @@ class Misalignment:
 
 PARAMETERS = {entry.name: RigParameter(entry.name, **entry.metadata) for entry in fields(Misalignment)}
 """All parameters of `Misalignment` by name, in order."""
+OF_REVOLVED = ("mirror_tilt_x_rad", "mirror_tilt_y_rad", "rim_radius_m")
+"""Parameters that mean nothing for a perfect sphere, which has neither axis nor rim."""
 
 _ADDED_TO_CAMERA = ("cx_px", "cy_px", "k1", "k2", "k3", "p1", "p2", "focus_distance_m")

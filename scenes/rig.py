@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from phibench.scenes.camera import Camera
-from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector
+from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector, rotation_xyz
 from phibench.scenes.glass_tube import GlassTube
 from phibench.scenes.holder import Holder, holder_shapes, holder_tube
 from phibench.scenes.mirror import Form, SphereMirror, deviation, level
@@ -220,7 +220,8 @@ class Rig:
         mirror = misalignment.mirror(self.mirror)
         is_new = isinstance(mirror, SphereMirror) and mirror.form is not None and self.sphere.form is None
         if is_new:
-            T_camera_sphere = replace(T_camera_sphere, rotation=as_matrix(T_world_camera.R.T))
+            axes = rotation_xyz(misalignment.mirror_tilt_x_rad, misalignment.mirror_tilt_y_rad)
+            T_camera_sphere = replace(T_camera_sphere, rotation=as_matrix(T_world_camera.R.T @ np.array(axes)))
         return Rig(
             camera=misalignment.camera(self.camera),
             mirror=mirror,

@@ -46,7 +46,7 @@ from phibench.datasets.rooms.room_sources import ONLY_ROOM, MeshRoom, PanoramaRo
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
-from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.misalignment import OF_REVOLVED, Misalignment
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
@@ -62,10 +62,11 @@ _OFTEN = (
 PARAMETERS = (
     *_OFTEN,
     *(name for key in DRAWABLE if (name := f"rig.{key}") not in _OFTEN),
-    *(f"misalignment.{key}" for key in MISALIGNMENT),
+    *(f"misalignment.{key}" for key in MISALIGNMENT if key not in OF_REVOLVED),
     "spot.elevation_deg",  # later than the others, which keep their dimensions
     "spot.hidden",
     *(f"rig.holder.{key}" for key in HolderTable.model_fields),
+    *(f"misalignment.{key}" for key in OF_REVOLVED),
 )
 """Everything that can be drawn; the place in this list is the dimension in Sobol's sequence, whose first ones are the
 best: 16 of them correlate by at most 0.25 at 100 samples, where independent ones reach 0.38 (12 seeds each)."""

@@ -153,7 +153,7 @@ def build_profile(table: MirrorTable, vertex_m: float) -> Profile:
 
 
 def _revolved_rig(table: RigTable, mirror: MirrorTable, base: Rig) -> Rig:
-    """Rig with a mirror of revolution, its axis upright."""
+    """Rig with a mirror of revolution, its axis upright but for its tilt."""
     if table.radius_m is not None:
         raise SceneError(f"rig.radius_m = {table.radius_m:g}: is a sphere's; a {mirror.shape} has its own keys")
     if table.holder.kind != "none":
@@ -162,7 +162,8 @@ def _revolved_rig(table: RigTable, mirror: MirrorTable, base: Rig) -> Rig:
     profile = build_profile(mirror, vertex_m)
     given = _given(table, _SURFACE)
     T_world_camera, T_camera_sphere = _poses(table, base, vertex_m)
-    T_camera_mirror = replace(T_camera_sphere, rotation=as_matrix(T_world_camera.R.T))
+    tilt = rotation_xyz(mirror.tilt_x_rad, mirror.tilt_y_rad)
+    T_camera_mirror = replace(T_camera_sphere, rotation=as_matrix(T_world_camera.R.T @ np.array(tilt)))
     camera = _focused(_camera(base.camera, table), table, vertex_m + image_depth_m(profile))
     stroke = _stroke_axis(table)
     revolved = RevolvedMirror(profile, **given, reflectance_table=_reflectance(table))

@@ -56,7 +56,7 @@ from phibench.render.room.subpixel_grid import FilmGrid
 from phibench.render.sensor.settings import SensorError, sensor
 from phibench.scenes.catalog import BOARD_SIZE_M, board
 from phibench.scenes.mirror import SphereMirror
-from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.misalignment import OF_REVOLVED, Misalignment
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room, chassis
 from phibench.scenes.validation import Fault, SceneError, close_names, nearest
@@ -348,6 +348,7 @@ def _rig(draft: _Draft) -> Iterator[Fault]:
             rig.mirror.band(draft.laser.wavelength_nm)
         except SceneError as error:
             yield rig_fault_of(SceneError(by_keys(str(error))))
+    yield from _without_axis(draft.raw, rig)
     yield from _cells(rig, sound_of(draft.raw.get("ambient", {}), AmbientTable))
     too_high = None if room is None else _height(draft.rig, rig, room)
     if too_high is not None:
@@ -361,6 +362,17 @@ def _rig(draft: _Draft) -> Iterator[Fault]:
         yield from _true_rig(
             rig, build_misalignment(draft.misalignment), None if too_high else room, targets, draft.raw
         )
+
+
+def _without_axis(raw: Raw, rig: Rig) -> Iterator[Fault]:
+    """Faults of deviations of a sphere that has neither axis nor rim."""
+    if not isinstance(rig.mirror, SphereMirror):
+        return
+    for path in (("misalignment",), ("random", "misalignment"), ("rigs", "misalignment")):
+        for key in table_of(raw, *path):
+            if key in OF_REVOLVED:
+                text = "is of mirrors of revolution; a sphere has neither axis nor rim: remove it, or give [rig.mirror]"
+                yield Fault(".".join((*path, key)), text)
 
 
 def _true_rig(

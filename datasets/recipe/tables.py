@@ -33,7 +33,7 @@ from phibench.datasets.recipe.room_tables import RoomsTable, RoomTable
 from phibench.scenes.catalog import BOARD_SIZE_M
 from phibench.scenes.holder import LARGEST_INDEX, OF_TUBES
 from phibench.scenes.mirror import MetalName
-from phibench.scenes.misalignment import PARAMETERS
+from phibench.scenes.misalignment import OF_REVOLVED, PARAMETERS
 
 MIN_STROKE_M, MAX_STROKE_M = 1e-3, 10.0
 DatasetName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
@@ -130,6 +130,12 @@ class HolderTable(_OfHolder):
 class MirrorTable(Table):
     """`[rig.mirror]`: a mirror of revolution instead of the sphere."""
 
+    @model_serializer(mode="wrap")
+    def _without_what_is_not_given(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Recipes of mirrors that are upright keep the hash that they had before a tilt could be given."""
+        document: dict[str, Any] = serialised(self)
+        return {key: value for key, value in document.items() if not key.startswith("tilt_") or value}
+
     shape: Literal["ellipsoid", "paraboloid", "hyperboloid", "cone", "polynomial"] = Field(
         description="surface; z_c_m leads to its vertex"
     )
@@ -142,6 +148,8 @@ class MirrorTable(Table):
     even_terms: tuple[float, ...] | None = Field(
         default=None, max_length=8, strict=False, description="a_2, a_3, ... of r^4, r^6, ... in m^-3, m^-5, ..."
     )
+    tilt_x_rad: Tilt = Field(default=0.0, description="mirror turned about world x through its vertex")
+    tilt_y_rad: Tilt = Field(default=0.0, description="mirror turned about world y through its vertex")
 
 
 class ReflectionTable(Table):
@@ -217,13 +225,23 @@ class RigTable(Table):
     mirror: MirrorTable | None = Field(default=None, description="a mirror of another shape than a sphere")
 
 
+class _OfMisalignment(Table):
+    """Table with keys of a misalignment."""
+
+    @model_serializer(mode="wrap")
+    def _without_what_is_not_given(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Recipes that say nothing of a mirror's own tilt or rim keep the hash that they had before there were any."""
+        document: dict[str, Any] = serialised(self)
+        return {key: value for key, value in document.items() if key not in OF_REVOLVED or value}
+
+
 if TYPE_CHECKING:
     MisalignmentTable = Table
     RandomMisalignmentTable = Table
 else:
     MisalignmentTable = create_model(
         "MisalignmentTable",
-        __base__=Table,
+        __base__=_OfMisalignment,
         __doc__="`[misalignment]`: what the true rig deviates by from `[rig]`, which is the nominal one.",
         **{
             key: (float, Field(default=0.0, ge=-one.limit, le=one.limit, description=one.meaning))
@@ -232,7 +250,7 @@ else:
     )
     RandomMisalignmentTable = create_model(
         "RandomMisalignmentTable",
-        __base__=Table,
+        __base__=_OfMisalignment,
         __doc__="`[random.misalignment]`: distributions of keys of `[misalignment]`.",
         **{
             key: (

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, steps, stroke_of
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, moves_rays, steps, stroke_of
 from phibench.estimator.geometry.status import (
     DepthEstimate,
     first_fault,
@@ -224,7 +224,12 @@ def _gradients(rig: Rig, h: Array, z: Array) -> tuple[Array, Array]:
 def _rig_gradients(rig: Rig, h: Array, z: Array) -> tuple[Array, Array, Array]:
     """Derivatives of gap, D and point by the parameters and this pair's stroke, by central differences."""
     slopes: dict[str, list[Array]] = {"gap_m": [], "depth_m": [], "point_world_m": []}
+    moving = moves_rays(rig)
     for i, size in enumerate(steps()):
+        if not moving[i]:
+            for name, found in slopes.items():
+                found.append(np.zeros_like(slopes[name][0]))  # the first, a stroke, moves rays of every rig
+            continue
         values = np.zeros(len(PARAMETERS))
         values[i] = size
         plus, minus = (meeting(changed(rig, v), stroke_of(h, v), z[..., :2], z[..., 2:4]) for v in (values, -values))

@@ -16,9 +16,10 @@ from numpy.typing import ArrayLike
 
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.scenes.frames import Array
+from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
-from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.misalignment import OF_REVOLVED, Misalignment
+from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import nearest
 
@@ -35,6 +36,7 @@ RIG_PARAMETERS = (
     "tilt_y_rad",
     "stroke_tilt_x_rad",
     "stroke_tilt_y_rad",
+    *OF_REVOLVED,
 )
 """Order of `rig_gradient` and `rig_covariance`: one stroke tells its offset and its scale not apart."""
 PARAMETERS = (*RIG_PARAMETERS, "stroke_relative")
@@ -49,6 +51,22 @@ RENAMED = {
     "f_px": "focal_relative",
 }
 """Names of version 0.1. `f_px` was in pixels, added to fx and fy; `focal_relative` is relative to them."""
+
+
+def has_effect(rig: Rig) -> BoolArray:
+    """True for the parameters that mean something for a rig's mirror, shape (p,).
+
+    A sphere has neither axis nor rim, and a cone no vertex radius.
+    """
+    idle: tuple[str, ...] = OF_REVOLVED
+    if isinstance(rig.mirror, RevolvedMirror):
+        idle = ("radius_m",) if rig.mirror.profile.shape == "cone" else ()
+    return np.array([name not in idle for name in PARAMETERS])
+
+
+def moves_rays(rig: Rig) -> BoolArray:
+    """True for the parameters that change a reflected ray or a stroke, shape (p,): the rim ends the mirror, no more."""
+    return has_effect(rig) & np.array([name != "rim_radius_m" for name in PARAMETERS])
 
 
 def changed(rig: Rig, values: Array) -> Rig:
@@ -123,8 +141,12 @@ def rig_gradient(rig: Rig, stroke_m: ArrayLike, uv_down_px: Array, uv_up_px: Arr
         return depth_exact(MISALIGNMENT[name].apply(rig, by), h, uv_down_px, uv_up_px).depth_m
 
     # f' = (8 (f1 - f-1) - (f2 - f-2)) / 12 step
-    slopes = []
+    slopes, moving = [], dict(zip(PARAMETERS, moves_rays(rig).tolist(), strict=True))
+    still = 0.0 * depth("stroke_offset_m", 0.0)
     for name in RIG_PARAMETERS:
+        if not moving[name]:
+            slopes.append(still)
+            continue
         f, size = partial(depth, name), step * MISALIGNMENT[name].step
         near, far = f(size) - f(-size), f(2.0 * size) - f(-2.0 * size)
         slopes.append((8.0 * near - far) / (12.0 * size))

@@ -3,7 +3,7 @@
 An estimate depends on the true rig through the pixels alone: dD/dp = dD/d(u1, v1, u2, v2) . d(u1, v1, u2, v2)/dp. The
 first factor is the estimator's own gradient at the nominal rig. The second follows from the reflected ray through the
 spot by implicit differentiation, at the true rig. p are the parameters of `Misalignment`, of a further misalignment of
-the true rig: `true_rig.perturbed(...)`. The plane of focus and roughness move no chief ray and are left out.
+the true rig: `true_rig.perturbed(...)`. The plane of focus, roughness and rim move no chief ray and are left out.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.revolved_mirror import RevolvedMirror, by_vertex_radius
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
 
-PARAMETERS = tuple(name for name in MISALIGNMENT if name not in ("focus_distance_m", "roughness_alpha"))
+_MOVES_NO_RAY = ("focus_distance_m", "roughness_alpha", "rim_radius_m")
+PARAMETERS = tuple(name for name in MISALIGNMENT if name not in _MOVES_NO_RAY)
 """Order of all gradients by p."""
 _CAMERA = ("focal_relative", "cx_px", "cy_px", "k1", "k2", "k3", "p1", "p2")
 _AXES = np.eye(3)
@@ -157,8 +158,10 @@ def _rigid_changes(view: View) -> tuple[Array, Array, Array, Array]:
         to_sphere = view.sphere_centre_m - view.camera_centre_m
         for name, axis in zip(("roll_rad", "pitch_rad", "yaw_rad"), _AXES, strict=True):
             turn[name], sphere[name] = axis, np.cross(axis, to_sphere)
-    # a tilt of the camera leaves the mirror as it is
+    # a tilt of the camera leaves the mirror as it is, and the mirror's own leaves the camera
     mirror_turn = {name: np.zeros(3) if name.startswith("tilt") else axis for name, axis in turn.items()}
+    for name, axis in zip(("mirror_tilt_x_rad", "mirror_tilt_y_rad"), moved.T[:2], strict=True):
+        mirror_turn[name] = axis
     a, b, c, d = (np.array([*changes.values()]) for changes in (lens, sphere, turn, mirror_turn))
     return a, b, c, d
 

@@ -30,13 +30,13 @@ from phibench.render.optics.reflection_point import reflection_points
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.scenes.frames import Array
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
-from phibench.scenes.misalignment import PARAMETERS, Misalignment
+from phibench.scenes.misalignment import OF_REVOLVED, PARAMETERS, Misalignment
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.validation import SceneError
 
 NOMINAL = ("paper_ray", "paper_normal", "paper_incidence", "paper_outline", "exact")
 CALIBRATED = "exact_calibrated"
-ALL = tuple(PARAMETERS)
+ALL = tuple(name for name in PARAMETERS if name not in OF_REVOLVED)
 _SMALL = 0.01  # of the study's magnitude: step of a slope that nothing gives in closed form
 
 Calibrate = Callable[[Misalignment], Bundle]

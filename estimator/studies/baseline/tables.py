@@ -30,7 +30,7 @@ from phibench.estimator.interface import Spot
 from phibench.estimator.methods.registry import METHODS
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
-from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.misalignment import OF_REVOLVED, Misalignment
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError
@@ -188,7 +188,8 @@ def drawn_misalignment(rig: Rig, random: np.random.Generator) -> Misalignment:
     One that cannot exist (a distortion that folds the image) is drawn again.
     """
     for _ in range(_TRIES):
-        drawn = Misalignment(**{name: random.normal(scale=MISALIGNMENT[name].study) for name in PARAMETERS})
+        names = (name for name in PARAMETERS if name not in OF_REVOLVED)  # the study's mirror is a sphere
+        drawn = Misalignment(**{name: random.normal(scale=MISALIGNMENT[name].study) for name in names})
         try:
             rig.perturbed(drawn)
         except SceneError:

@@ -202,6 +202,7 @@ def place_bound(rig: Rig, table: BlurBounds, depth_m: float, height_m: float, st
 DIRECTIONS: Mapping[str, tuple[str, ...]] = {
     "mirror aside": ("decentre_x_m", "decentre_y_m"),
     "mirror higher": ("axial_m",),
+    "mirror tilted": ("mirror_tilt_y_rad", "mirror_tilt_x_rad"),
     "vertex radius": ("radius_m",),
     "camera tilted": ("tilt_y_rad", "tilt_x_rad"),
     "focal length": ("focal_relative",),
@@ -219,7 +220,7 @@ DIRECTIONS: Mapping[str, tuple[str, ...]] = {
     "up between images": ("shift_z_m",),
 }
 """Parameters of a rig by kind. Of two of a kind the first acts along world x, where the spots are, and the other
-across; the costlier counts. Form errors are a sphere's; the plane of focus and roughness move no ray."""
+across; the costlier counts. Form errors are a sphere's; the plane of focus, roughness and rim move no ray."""
 UNCALIBRATED = (
     "stroke, offset",
     "tilt between images",

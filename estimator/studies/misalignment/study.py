@@ -21,6 +21,7 @@ from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.studies.findings import Finding, Row
 from phibench.estimator.studies.framework import Drawing, Result, Settings, Study, StudyDatasets
 from phibench.estimator.studies.misaligned_rigs import (
+    ALL,
     CALIBRATED,
     NOMINAL,
     Calibrate,
@@ -125,7 +126,7 @@ class MisalignmentSettings(Settings):
         for name in self.parameters:
             if name not in PARAMETERS:
                 raise DatasetError(f"parameters: no misalignment '{name}'; {nearest(name, tuple(PARAMETERS))}")
-        return self.parameters or tuple(PARAMETERS)
+        return self.parameters or ALL
 
     @property
     def calibration_setup(self) -> CalibrationSetup:

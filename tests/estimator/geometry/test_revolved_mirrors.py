@@ -13,14 +13,16 @@ from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.paper_depth import depth_paper, depth_revolved, paper_gradient, revolved_gradient
 from phibench.estimator.geometry.phi import CONVENTIONS, GRADIENTS
 from phibench.estimator.geometry.reflection import reflect, reflect_jacobian
-from phibench.estimator.geometry.sensitivities import PARAMETERS, pixel_gradient
+from phibench.estimator.geometry.rig_parameters import RIG_PARAMETERS, has_effect, moves_rays, rig_gradient
+from phibench.estimator.geometry.sensitivities import PARAMETERS, pixel_gradient, sensitivity
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.reflection_point import mirror_points
-from phibench.scenes.frames import Array
+from phibench.scenes.catalog import default_rig
+from phibench.scenes.frames import Array, rotation_xyz
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
-from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.misalignment import OF_REVOLVED, Misalignment
 from phibench.scenes.revolved_mirror import cone, sphere_cap
 from phibench.scenes.rig import Rig, View
 
@@ -132,7 +134,11 @@ def test_accuracy_exact_depth_from_true_pixels(shape: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["radius_m", "decentre_x_m", "axial_m", "tilt_y_rad", "focal_relative", "pitch_rad", "k1"]
+    "name",
+    [
+        *("radius_m", "decentre_x_m", "axial_m", "tilt_y_rad", "mirror_tilt_x_rad", "mirror_tilt_y_rad"),
+        *("focal_relative", "pitch_rad", "k1"),
+    ],
 )
 @pytest.mark.parametrize("shape", [shape for shape in PROFILES if shape != "cone"])
 def test_sensitivities_of_the_pixel_against_the_simulator(shape: str, name: str) -> None:
@@ -146,6 +152,53 @@ def test_sensitivities_of_the_pixel_against_the_simulator(shape: str, name: str)
     for i, point in enumerate(points):
         ours = pixel_gradient(rig.at(STROKE_M), up[i], point)[:, PARAMETERS.index(name)]
         assert ours == pytest.approx(expected[i], rel=1e-4, abs=1e-5 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("shape", PROFILES)
+def test_a_tilt_of_the_mirror_alone(shape: str) -> None:
+    """Vertex and camera stay; exact depth of the simulator's pixels to 1e-9; dD/d(tilt) by two ways.
+
+    Five-point differences of the midpoint's D, and the analytic chain through the pixels: both at the true rig, where
+    they are each other's negative. The differences err by 1e-8, and by what the pixels' slopes lose.
+    """
+    wrong = Misalignment(mirror_tilt_x_rad=0.012, mirror_tilt_y_rad=-0.02, decentre_x_m=1e-3, tilt_y_rad=0.005)
+    nominal = revolved(shape)
+    rig, still = nominal.perturbed(wrong), nominal.perturbed(Misalignment(decentre_x_m=1e-3, tilt_y_rad=0.005))
+    assert rig.at(0.0).sphere_centre_m == pytest.approx(still.at(0.0).sphere_centre_m, abs=1e-15)
+    assert rig.T_world_camera == still.T_world_camera
+    turned = np.array(rotation_xyz(0.012, -0.02)) @ [0.0, 0.0, 1.0]
+    assert rig.at(0.0).T_world_sphere.R[:, 2] == pytest.approx(turned, abs=1e-14)
+    points, down, up = seen_from_both(rig, 6, rng_of("tilt", shape))
+    D = np.linalg.norm(points[:, :2] - rig.at(0.0).sphere_centre_m[:2], axis=1)
+    found = depth_exact(rig, STROKE_M, down, up)
+    apart = np.isfinite(found.depth_m)
+    assert apart.sum() >= 3
+    assert found.depth_m[apart] == pytest.approx(D[apart], rel=1e-9)
+    gradient = rig_gradient(rig, STROKE_M, down[apart], up[apart])
+    # a stencil of 1e-3 rad may take a ray off the rim, or off the side of a cone that it was on
+    whole = np.isfinite(gradient).all(axis=1)
+    assert whole.sum() >= 2
+    for i in np.flatnonzero(whole):
+        point = points[apart][i]
+        ours = sensitivity("exact", rig, STROKE_M, rig, STROKE_M, point).estimate_gradient
+        for name in ("mirror_tilt_x_rad", "mirror_tilt_y_rad"):
+            a, b = ours[PARAMETERS.index(name)], -gradient[i, RIG_PARAMETERS.index(name)]
+            assert a == pytest.approx(b, rel=1e-5, abs=1e-5 * D[apart][i])
+    assert (gradient[whole, RIG_PARAMETERS.index("rim_radius_m")] == 0.0).all()
+
+
+def test_a_sphere_has_neither_axis_nor_rim() -> None:
+    """What they change of a sphere is nothing: its rays, and its derivatives."""
+    rig = default_rig()
+    other = rig.perturbed(Misalignment(mirror_tilt_x_rad=0.1, rim_radius_m=1e-3))
+    uv = np.array([[800.0, 300.0], [500.0, 420.0]])
+    a, b = reflect(rig.at(0.0), uv), reflect(other.at(0.0), uv)
+    assert (a.direction_world == b.direction_world).all()
+    named = dict(zip(RIG_PARAMETERS, has_effect(rig), strict=False))
+    assert [name for name, is_one in named.items() if not is_one] == list(OF_REVOLVED)
+    assert not has_effect(revolved("cone"))[RIG_PARAMETERS.index("radius_m")]
+    assert has_effect(revolved("paraboloid")).all()
+    assert moves_rays(revolved("paraboloid")).sum() == has_effect(rig).sum() + 2
 
 
 # -- phi and eq. (4) -------------------------------------------------------------------------------------------------

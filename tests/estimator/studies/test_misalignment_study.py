@@ -54,12 +54,12 @@ from phibench.estimator.studies.misalignment.tables import (
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.misalignment import PARAMETERS, Misalignment
+from phibench.scenes.misalignment import OF_REVOLVED, PARAMETERS, Misalignment
 from phibench.scenes.random_streams import generator
 
 RIG = default_rig()
 PLACES = Places(np.array([1.0, 3.18]), np.radians([0.0, 90.0, 200.0]), 0.5, 0.425)
-GEOMETRIC = tuple(name for name in PARAMETERS if name not in ("focus_distance_m", "roughness_alpha"))
+GEOMETRIC = tuple(name for name in PARAMETERS if name not in ("focus_distance_m", "roughness_alpha", *OF_REVOLVED))
 SPHERICAL = tuple(name for name in GEOMETRIC if not name.startswith("form_"))
 SETUP = CalibrationSetup(
     np.array([[1.2, 0.3, 0.5], [-1.0, 1.8, 0.5], [-2.0, -2.1, 0.5], [2.6, -3.0, 0.5]]), 0.02, 1e-3, (8e-6, 8e-6, 24e-6)
