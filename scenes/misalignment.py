@@ -234,7 +234,7 @@ class Misalignment:
         return replace(nominal, radius_m=nominal.radius_m + self.radius_m, roughness_alpha=alpha, form=form)
 
     def _revolved(self, nominal: RevolvedMirror) -> RevolvedMirror:
-        """True mirror of revolution: `radius_m` is added to the vertex radius; a cone has none, and that changes nothing."""
+        """True mirror of revolution: `radius_m` is added to the vertex radius; a cone has none and stays as it is."""
         if any(getattr(self, name) for name in HARMONICS):
             raise SceneError(f"Misalignment: form errors are a sphere's; the mirror is a {nominal.profile.shape}")
         profile = nominal.profile

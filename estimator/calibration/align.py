@@ -18,7 +18,8 @@ from PIL import ImageDraw
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.calibration.outline_picture import overlay, shown, write_picture
 from phibench.estimator.outline.ball_circle import BallCircle, find_circle
-from phibench.estimator.outline.outline import Outline, find_outline
+from phibench.estimator.outline.outline import find_outline
+from phibench.estimator.outline.outline_result import Outline
 from phibench.estimator.spots.camera_codes import light_of, rgb_picture
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera

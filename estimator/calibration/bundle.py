@@ -5,7 +5,8 @@ of every calibration spot. The data:
 
 * the prior of every parameter: the accuracy of the nominal numbers;
 * the sphere centre from an outline, 3 numbers. It was found with the nominal camera and radius. A camera or radius off
-  by some per cent moves it, and the fit accounts for that (`apparent_centre`);
+  by some per cent moves it, and the fit accounts for that (`apparent_outline`). Of a mirror of revolution the outline
+  gives vertex and ellipse, 5 numbers, found with the nominal profile and tilt, too (`contour`);
 * the vertical from upright edges, 2 numbers, with the effect of the principal point (`apparent_vertical`);
 * for every spot, 4 pixel coordinates, its distance D, and its azimuth and height where they were measured.
 
@@ -26,10 +27,12 @@ from phibench.datasets.errors import DatasetError
 from phibench.estimator.calibration.vertical_edges import vertical_of
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.reflection import reflect, reflect_jacobian
-from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas, stroke_of
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, has_effect, prior_sigmas, stroke_of
 from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.outline.contour import place_of_outline
 from phibench.estimator.outline.limb_image import Measured
 from phibench.scenes.frames import Array, as_vector
+from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.validation import SceneError
 
@@ -127,20 +130,22 @@ def calibrate(
     ----------
     nominal : Rig
     outline : Measured, optional
-        Sphere centre in the camera frame, found with the nominal camera and radius.
+        Sphere centre in the camera frame, or vertex and ellipse, found with the nominal camera and mirror:
+        `Outline.measured`.
     spots : sequence of KnownSpot
     vertical : Measured, optional
         The world's vertical in the camera frame, x and y of the unit vector, shape (2,), found with the nominal camera
         and the sphere where the outline is (`find_vertical`): a wrong principal point turns it.
     sigmas : shape (p,), optional
-        Standard deviations of the nominal numbers; 0 holds one. `prior_sigmas()` by default.
+        Standard deviations of the nominal numbers; 0 holds one. `prior_sigmas()` by default. Those of parameters that
+        mean nothing for this mirror do not count.
 
     Raises
     ------
     DatasetError
         If a spot is not seen in the nominal rig, or the fit does not come to rest.
     """
-    prior = prior_sigmas() if sigmas is None else np.asarray(sigmas, float)
+    prior = np.where(has_effect(nominal), prior_sigmas() if sigmas is None else np.asarray(sigmas, float), 0.0)
     free = np.flatnonzero(prior > 0.0)
     turned = np.zeros((2, 2)) if vertical is None else vertical_by_principal_point(nominal)
     problem = _Problem(nominal, outline, tuple(spots), vertical, prior, free, turned)
@@ -179,7 +184,7 @@ class _Problem:
         rig = changed(self.nominal, values)
         parts = [x[: self.free.size]]
         if self.outline is not None:
-            seen = apparent_centre(self.nominal, rig)
+            seen = apparent_outline(self.nominal, rig)
             parts.append(_whitened(seen - self.outline.value, self.outline.covariance))
         if self.vertical is not None:
             up = rig.T_world_camera.R.T[:2, 2] + self.by_principal_point @ (_centre_px(rig) - _centre_px(self.nominal))
@@ -272,12 +277,15 @@ _DISTANCE_M = 2.5
 _ELEVATIONS_RAD = (-0.35, 0.5)  # walls of a room
 
 
-def apparent_centre(nominal: Rig, true: Rig) -> Array:
-    """Sphere centre, camera frame, shape (3,), that the true rig's outline gives with the nominal camera and radius.
+def apparent_outline(nominal: Rig, true: Rig) -> Array:
+    """What the true rig's outline gives with the nominal camera and mirror: centre, shape (3,), or place, shape (5,).
 
-    The true outline's pixels, as the nominal camera sees them, are a cone: its axis and its opening give the centre.
+    The pixels of a sphere's outline, as the nominal camera sees them, are a cone: its axis and its opening give the
+    centre. Of a mirror of revolution it is the `contour` of the nominal one that is nearest.
     """
     uv = true.outline_px(90)
+    if isinstance(nominal.mirror, RevolvedMirror):
+        return place_of_outline(nominal, uv)
     rays = nominal.camera.rays(uv)
     x = np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0]  # n / cos a0
     cosine = 1.0 / np.linalg.norm(x)  # of the limb's angle a0; |s| = R / sin a0
@@ -289,7 +297,7 @@ def apparent_vertical(nominal: Rig, true: Rig) -> Array:
 
     The sphere is where the outline puts it, as `find_vertical` wants it.
     """
-    pose = replace(nominal.T_camera_sphere, translation_m=as_vector(apparent_centre(nominal, true)))
+    pose = replace(nominal.T_camera_sphere, translation_m=as_vector(apparent_outline(nominal, true)[:3]))
     edges = [image_of(true.at(0.0), line).uv_px for line in _lines(true)]
     return np.asarray(vertical_of(edges, replace(nominal, T_camera_sphere=pose)).up[:2])
 

@@ -24,11 +24,14 @@ from phibench.estimator.calibration.bundle import Bundle
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, RENAMED, changed
 from phibench.scenes.frames import IDENTITY, Array
 from phibench.scenes.mirror import SphereMirror
+from phibench.scenes.misalignment import OF_REVOLVED
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError, printable_line
 
 VERSION = 2
+_OF_SPHERES = tuple(name for name in PARAMETERS if name not in OF_REVOLVED)
+"""Parameters of files from before mirrors of other shapes were calibrated; the others meant nothing then."""
 
 
 class CalibrationError(DatasetError):
@@ -125,11 +128,13 @@ def read_calibration(path: str | Path, nominal: Rig | None = None) -> Calibratio
     if raw.get("sha256") != _digest({k: v for k, v in raw.items() if k != "sha256"}):
         raise CalibrationError(f"{path} was changed after it was written: its hash does not fit; make it again")
     document = _file(path).validated(CalibrationDocument, _of_version_2(raw) if raw["version"] == 1 else raw)
-    p = len(PARAMETERS)
+    names, p = tuple(document.parameters), len(document.parameters)
     sizes = {len(document.values), len(document.covariance), *map(len, document.covariance)}
-    if tuple(document.parameters) != PARAMETERS or sizes != {p}:
-        raise CalibrationError(f"{path} has other parameters than this program's {p}: make it again")
-    covariance, values = np.array(document.covariance), np.array(document.values)
+    if names not in (PARAMETERS, _OF_SPHERES) or sizes != {p}:
+        raise CalibrationError(f"{path} has other parameters than this program's {len(PARAMETERS)}: make it again")
+    rows = [PARAMETERS.index(name) for name in names]
+    values, covariance = np.zeros(len(PARAMETERS)), np.zeros((len(PARAMETERS),) * 2)
+    values[rows], covariance[np.ix_(rows, rows)] = document.values, document.covariance
     try:
         return _calibration(path, document, values, covariance, nominal)
     except CalibrationError:

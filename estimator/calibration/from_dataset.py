@@ -24,7 +24,8 @@ from phibench.estimator.draw_pairs import pairs_of
 from phibench.estimator.geometry.rig_parameters import prior_sigmas
 from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.outline.limb_image import Measured
-from phibench.estimator.outline.outline import Outline, find_outline, mean_measured, mean_outline
+from phibench.estimator.outline.outline import find_outline
+from phibench.estimator.outline.outline_result import Outline, mean_measured, mean_outline
 from phibench.estimator.spots.simple_spots import find_spot
 from phibench.scenes.rig import POSITIONS, Rig
 

@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.store.files import write_bytes
 from phibench.estimator.outline.limb_image import planes_of
-from phibench.estimator.outline.outline import SECTORS, Outline, binned_rig
+from phibench.estimator.outline.outline_result import SECTORS, Outline, binned_rig
 from phibench.estimator.outline.outline_start import grey
 from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig

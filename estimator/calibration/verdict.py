@@ -13,7 +13,7 @@ from scipy.special import chdtrc
 
 from phibench.estimator.calibration.bundle import Bundle
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
-from phibench.estimator.outline.outline import Outline
+from phibench.estimator.outline.outline_result import Outline
 from phibench.scenes.frames import Array
 
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"

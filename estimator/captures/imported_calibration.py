@@ -30,7 +30,8 @@ from phibench.estimator.geometry.rig_parameters import stroke_of
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Pair
 from phibench.estimator.methods.raw_likelihood import with_posteriors
-from phibench.estimator.outline.outline import Outline, find_outline
+from phibench.estimator.outline.outline import find_outline
+from phibench.estimator.outline.outline_result import Outline
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.rig import POSITIONS, Rig
 from phibench.scenes.validation import nearest

@@ -53,7 +53,8 @@ from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Image, Pair, Spot
 from phibench.estimator.methods.raw_likelihood import with_posteriors
 from phibench.estimator.outline.limb_image import Measured
-from phibench.estimator.outline.outline import Outline, find_outline, mean_outline
+from phibench.estimator.outline.outline import find_outline
+from phibench.estimator.outline.outline_result import Outline, mean_outline
 from phibench.estimator.spots.detect import detect
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Array

@@ -65,7 +65,7 @@ def calibrate(
     from phibench.estimator.calibration.spots import Ruler
     from phibench.estimator.captures.imported_calibration import calibrate_imported
     from phibench.estimator.captures.imported_set import is_imported, open_imported
-    from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
+    from phibench.estimator.geometry.rig_parameters import PARAMETERS, has_effect, prior_sigmas
     from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 
     if not spots and (math.isfinite(height_sigma_m) or math.isfinite(azimuth_sigma_deg)):
@@ -86,7 +86,8 @@ def calibrate(
     print(f"{found.write_picture(picture)}: the outline on the frame that fits worst, residuals enlarged")
     print(_LAB)
     print(f"\n{'parameter':18s} {'unit':4s} {'correction':>11s} {'sigma':>8s} {'prior sigma':>11s}")
-    for name, value, prior in zip(PARAMETERS, found.bundle.values, prior_sigmas(), strict=True):
+    every = zip(PARAMETERS, found.bundle.values, prior_sigmas(), has_effect(found.nominal), strict=True)
+    for name, value, prior in (row[:3] for row in every if row[3]):
         unit = MISALIGNMENT[name].unit
         print(f"{name:18s} {unit:4s} {value:+11.3e} {found.bundle.sigmas[name]:8.1e} {prior:11.1e}")
     if found.bundle.undetermined:

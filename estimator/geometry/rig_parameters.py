@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.scenes.frames import Array, BoolArray
-from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.misalignment import OF_REVOLVED, Misalignment
+from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import nearest

@@ -218,7 +218,8 @@ def _merged(taps: Iterable[Tap]) -> Taps:
 
 # -- light across the limb ---------------------------------------------------------------------------------------------
 
-_STEP_PX = 0.01
+STEP_PX = 0.01
+"""Of tables of the light across an outline."""
 _REACH_PX = 30.0
 _PIXEL_VARIANCE_PX2 = 1.0 / 12.0  # of a square pixel, in every direction
 
@@ -252,7 +253,7 @@ class Limb:
 
     def all_at(self, filter_index: int, d_px: Array) -> Array:
         """Values of the five at distances, shape (..., 5), linear between the table's evenly spaced rows."""
-        at = np.clip((d_px - self.d_px[0]) / _STEP_PX, 0.0, len(self.d_px) - 1.001)
+        at = np.clip((d_px - self.d_px[0]) / STEP_PX, 0.0, len(self.d_px) - 1.001)
         row = at.astype(np.intp)
         rows, part = self.rows[filter_index], (at - row)[..., None]
         return np.asarray(rows[row] * (1.0 - part) + rows[row + 1] * part)
@@ -277,34 +278,40 @@ def limb_of(rig: Rig, s: Array, blur_px2: float) -> Limb:
     camera, distance = rig.camera, float(np.linalg.norm(s))
     a0 = limb_angle_rad(s, rig.sphere.radius_m)
     scale = np.sqrt(camera.fx_px * camera.fy_px) / np.cos(a0) ** 2  # pixels per radian across the limb
-    d = np.arange(-_REACH_PX, _REACH_PX + _STEP_PX / 2.0, _STEP_PX)
+    d = distances_px()
     miss = distance / rig.sphere.radius_m * np.sin(a0 + d / scale)  # sine of the angle of incidence
     cos_i = np.sqrt(np.clip(1.0 - miss * miss, 0.0, None))
-    kernel = _kernel(camera, limb_depth_m=distance * np.cos(a0) ** 2, blur_px2=blur_px2)
+    kernel = line_spread(camera, distance * np.cos(a0) ** 2, blur_px2)
     light, turned, squared = [], [], []
     turn = 2.0 * np.arcsin(cos_i)
     for wavelength_nm in camera.detector.band_wavelength_nm:
         sharp = np.where(d < 0.0, rig.mirror.reflectance(cos_i, wavelength_nm), 1.0)
-        light.append(_blurred(sharp, kernel))
-        turned.append(_blurred(sharp * turn, kernel))
-        squared.append(_blurred(sharp * turn**2, kernel))
+        light.append(blurred(sharp, kernel))
+        turned.append(blurred(sharp * turn, kernel))
+        squared.append(blurred(sharp * turn**2, kernel))
     table = np.array(light)
-    slope = np.gradient(table, _STEP_PX, axis=-1)
-    return Limb(d, table, slope, np.gradient(slope, _STEP_PX, axis=-1), np.array(turned), np.array(squared))
+    slope = np.gradient(table, STEP_PX, axis=-1)
+    return Limb(d, table, slope, np.gradient(slope, STEP_PX, axis=-1), np.array(turned), np.array(squared))
 
 
-def _kernel(camera: Camera, limb_depth_m: float, blur_px2: float) -> Array:
-    """Line spread: Gaussian for lens and pixel, and the projection of the disc of defocus."""
-    x = np.arange(-8.0, 8.0 + _STEP_PX / 2.0, _STEP_PX)
+def distances_px() -> Array:
+    """Distances from an outline of a table of its light, evenly spaced, shape (n,)."""
+    return np.asarray(np.arange(-_REACH_PX, _REACH_PX + STEP_PX / 2.0, STEP_PX))
+
+
+def line_spread(camera: Camera, depth_m: float, blur_px2: float) -> Array:
+    """Line spread at the table's steps: Gaussian for lens and pixel, and the projection of the disc of defocus."""
+    x = np.arange(-8.0, 8.0 + STEP_PX / 2.0, STEP_PX)
     kernel = np.exp(-0.5 * x * x / (blur_px2 + _PIXEL_VARIANCE_PX2))
-    disc_px = camera.aperture_radius_m * camera.fx_px * abs(1.0 / camera.focus_distance_m - 1.0 / limb_depth_m)
-    if disc_px > 2.0 * _STEP_PX:
+    disc_px = camera.aperture_radius_m * camera.fx_px * abs(1.0 / camera.focus_distance_m - 1.0 / depth_m)
+    if disc_px > 2.0 * STEP_PX:
         half = len(x) // 2
         kernel = convolved(np.pad(kernel, half), np.sqrt(np.clip(disc_px**2 - x * x, 0.0, None)))
     return np.asarray(kernel / kernel.sum())
 
 
-def _blurred(sharp: Array, kernel: Array) -> Array:
+def blurred(sharp: Array, kernel: Array) -> Array:
+    """Light of a table, shape (n,), through a line spread."""
     half = len(kernel) // 2
     padded = np.concatenate([np.full(half, sharp[0]), sharp, np.full(half, sharp[-1])])
     return convolved(padded, kernel)

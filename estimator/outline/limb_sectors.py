@@ -98,11 +98,12 @@ class Sectors:
             relative = float(np.nanmedian(spread[seen] / np.abs(mean[seen]))) if seen.any() else float("nan")
         return SectorFit(coefficients, model, residual, weight, core, relative, basis, self.group)
 
-    def described(self, y: Array, residual: Array) -> Array:
+    def described(self, y: Array, residual: Array, usual_quantile: float = 0.5) -> Array:
         """Trust in the sectors, shape (count,), 0 to 1, by how well the model describes the light in them.
 
         A lamp's edge, reflected 1 px inside the limb, looks like a limb that is somewhere else; what gives it away is
         what the model leaves. Noise grows as the root of the light. The sectors beside a spoilt one have the same edge.
+        `usual_quantile` of the sectors, with the least misfit, stands for all that are not spoilt.
         """
         pixels = np.bincount(self.group, minlength=self.groups)
         with np.errstate(all="ignore"):
@@ -111,7 +112,7 @@ class Sectors:
         size = np.sqrt(np.where((pixels >= MIN_PIXELS) & (light > 0.0), square, np.nan)).reshape(-1, self.count)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # a group without a single sector
-            median = np.nanmedian(size, axis=1, keepdims=True)
+            median = np.nanquantile(size, usual_quantile, axis=1, keepdims=True)
         usual = np.hypot(median, _HARMLESS * np.sqrt(np.abs(light)).reshape(size.shape))
         worst = np.nan_to_num((size / usual).max(axis=0), nan=np.inf)
         trust = np.clip((_MISFIT[1] - worst) / (_MISFIT[1] - _MISFIT[0]), 0.0, 1.0)

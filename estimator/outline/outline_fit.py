@@ -7,6 +7,7 @@ with a covariance from the scatter of the sectors.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -52,12 +53,30 @@ class Place:
 
 
 def band(planes: tuple[Plane, ...], camera: Camera, s: Array, radius_m: float, half_px: float) -> OutlinePixels:
-    """Usable pixels within `half_px` of the outline."""
+    """Usable pixels within `half_px` of a sphere's outline."""
+    mark = Rig(camera=camera)
+    outline_px = replace(
+        mark,
+        mirror=replace(mark.sphere, radius_m=radius_m),
+        T_camera_sphere=replace(mark.T_camera_sphere, translation_m=as_vector(s)),
+    ).outline_px(_OUTLINE_POINTS)
+    return pixels_near(planes, camera, outline_px, half_px, lambda rays: place_of(rays, s, radius_m).d_px)
+
+
+def pixels_near(
+    planes: tuple[Plane, ...],
+    camera: Camera,
+    outline_px: Array,
+    half_px: float,
+    distance_px: Callable[[OutlinePixels], Array],
+) -> OutlinePixels:
+    """Usable pixels within `half_px` of an outline, of which points (n, 2) are given, and distances of pixels."""
     height, width = planes[0].values.shape
-    u, v = _ring(camera, s, radius_m, half_px)
+    u, v = _ring(camera, outline_px, half_px)
     uv = np.stack([u, v], axis=-1).astype(float)
     ray, by_pixel = camera.rays(uv), ray_jacobian(camera, uv)
-    near = np.abs(place_of_rays(ray, by_pixel, s, radius_m).d_px) < half_px
+    whole = OutlinePixels(np.zeros(u.size, np.int64), u, v, ray, by_pixel, np.zeros(u.size))
+    near = np.abs(distance_px(whole)) < half_px
     inside = (u >= 2) & (v >= 2) & (u < width - 2) & (v < height - 2)
     parts = []
     for number, plane in enumerate(planes):
@@ -69,14 +88,8 @@ def band(planes: tuple[Plane, ...], camera: Camera, s: Array, radius_m: float, h
     )
 
 
-def _ring(camera: Camera, s: Array, radius_m: float, half_px: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _ring(camera: Camera, uv: Array, half_px: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Pixels (u, v) that may be within `half_px`: by their distance from the outline's centre, at its own azimuths."""
-    mark = Rig(camera=camera)
-    uv = replace(
-        mark,
-        mirror=replace(mark.sphere, radius_m=radius_m),
-        T_camera_sphere=replace(mark.T_camera_sphere, translation_m=as_vector(s)),
-    ).outline_px(_OUTLINE_POINTS)
     low = np.clip(np.floor(uv.min(axis=0) - half_px).astype(int), 0, None)
     high = np.clip(np.ceil(uv.max(axis=0) + half_px).astype(int) + 1, 0, (camera.width_px, camera.height_px))
     centre = uv.mean(axis=0)
@@ -139,16 +152,18 @@ _MIN_SLACK = 0.5
 
 @dataclass(frozen=True)
 class Step:
-    """A step of (x, y, z of s, blur variance), and what is known where it starts.
+    """A step of p parameters, of which the blur's variance is the last, and what is known where it starts.
+
+    The others are x, y, z of s, or those of a `contour`.
 
     Attributes
     ----------
-    move : shape (4,), metres and square pixels
+    move : shape (p,), metres and square pixels
     residual : float
-        See `outline.Outline`.
+        See `outline_result.Outline`.
     y, model, light, depth : shape (N,)
         Light of the pixels, as seen, as fitted, and as the limb alone has it; distance from the limb over the band's.
-    by_parameters : shape (N, 4)
+    by_parameters : shape (N, p)
         Derivatives of the model.
     solution : Solution
     """
@@ -164,12 +179,12 @@ class Step:
 
     @cached_property
     def covariance(self) -> Array:
-        """Covariance of the step, shape (4, 4)."""
+        """Covariance of the step, shape (p, p)."""
         return self.solution.covariance(self.y - self.model)
 
     @cached_property
     def contrast(self) -> float:
-        """See `outline.Outline`."""
+        """See `outline_result.Outline`."""
         return _contrast(self.solution.where, self.y, self.light, self.depth)
 
     @property
@@ -185,7 +200,7 @@ class Solution:
     Attributes
     ----------
     where : Sectors
-    J : shape (N, 4)
+    J : shape (N, p)
         Derivatives, less what the sectors' coefficients can imitate.
     shift : shape (N,)
         The same of a limb that is displaced by 1 px.
@@ -211,7 +226,7 @@ class Solution:
         return np.asarray(self.own * self.trust[self.where.sector])
 
     def move(self, residual: Array) -> Array:
-        """Step of the parameters, shape (4,), for residuals (N,)."""
+        """Step of the parameters, shape (p,), for residuals (N,)."""
         return np.asarray(np.linalg.lstsq(self.normal(), self.J.T @ (self.weight * residual), rcond=1e-14)[0])
 
     def sector_shifts(self, residual: Array) -> Array:
@@ -229,18 +244,18 @@ class Solution:
         root = np.sqrt(np.maximum(information, 1e-300))
         left = (own * self.shift * (residual - self.J @ self.move(residual)))[:, None]
         z = np.sqrt(trust) * np.where(information > 0.0, where.summed(left)[:, 0] / root, 0.0)
-        by_s = where.summed((own * self.shift)[:, None] * self.J[:, :3])
+        by_s = where.summed((own * self.shift)[:, None] * self.J[:, :-1])
         directions = np.where(information > 0.0, np.sqrt(trust) / root, 0.0)[:, None] * by_s
         return float(scatter(z, trust * (information > 0.0), directions / np.abs(directions).max()))
 
     def covariance(self, residual: Array) -> Array:
-        """Covariance of the step, shape (4, 4), from the scatter of the residuals (N,) that it leaves."""
+        """Covariance of the step, shape (p, p), from the scatter of the residuals (N,) that it leaves."""
         inverse = np.linalg.inv(self.normal())
         meat = self.J.T @ ((self.weight * self.trust[self.where.sector])[:, None] * self.J)
         return np.asarray(inverse @ meat @ inverse * self.scatter(residual) / self.slack**2)
 
     def normal(self) -> Array:
-        """Normal matrix, shape (4, 4)."""
+        """Normal matrix, shape (p, p)."""
         return np.asarray(self.J.T @ (self.weight[:, None] * self.J))
 
 
@@ -275,14 +290,24 @@ def step_from(
     by_parameters = np.concatenate([place.by_s * slope[:, None], 0.5 * curvature[:, None]], axis=-1) * level[:, None]
     columns = fit.without_nuisance(np.concatenate([by_parameters, (slope * level)[:, None]], axis=-1))
     trust = where.described(pixels.y, fit.residual) if near else np.ones(sectors)
-    solution = _solution(where, fit, columns, trust)
+    solution = solution_of(where, fit, columns, trust)
     move = solution.move(fit.residual)
     return Step(move, fit.relative_residual, pixels.y, fit.model, light, d, by_parameters, solution)
 
 
-def _solution(where: Sectors, fit: SectorFit, columns: Array, described: Array) -> Solution:
-    """Weights of the sectors by their shifts, and with them the whole step."""
-    J, shift = columns[:, :4], columns[:, 4]
+def solution_of(where: Sectors, fit: SectorFit, columns: Array, described: Array) -> Solution:
+    """Weights of the sectors by their shifts, and with them the whole step.
+
+    Parameters
+    ----------
+    where, fit
+    columns : shape (N, p + 1)
+        Derivatives of the model by the p parameters, the blur last, and by a displacement of the outline by 1 px; less
+        what the sectors' coefficients can imitate.
+    described : shape (count,)
+        See `Sectors.described`.
+    """
+    J, shift = columns[:, :-1], columns[:, -1]
     own = fit.weight * (described > 0.0)[where.sector]
     trust = bread = described
     for _ in range(4):

@@ -33,7 +33,7 @@ from phibench.estimator.geometry.status import describe
 from phibench.estimator.interface import OK, Answer, Pair
 from phibench.estimator.limits.off_frame_bound import FrameCounts
 from phibench.estimator.methods.raw_likelihood import joint_of
-from phibench.estimator.outline.outline import mean_outline
+from phibench.estimator.outline.outline_result import mean_outline
 from phibench.estimator.pair_set import PairTruth
 from phibench.scenes.rig import POSITIONS
 

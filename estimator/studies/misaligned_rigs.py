@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.calibration.bundle import Bundle, KnownSpot, apparent_centre, calibrate
+from phibench.estimator.calibration.bundle import Bundle, KnownSpot, apparent_outline, calibrate
 from phibench.estimator.geometry.estimators import ESTIMATORS
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.rig_parameters import PRIOR_SIGMA, prior_sigmas
@@ -336,7 +336,7 @@ class CalibrationSetup:
             If a calibration spot is not in the image, or the fit finds no start.
         """
         true, h = nominal.perturbed(misalignment), misalignment.stroke_m(stroke_m)
-        outline = apparent_centre(nominal, true) + _noise(rng, np.array(self.outline_sigma_m))
+        outline = apparent_outline(nominal, true) + _noise(rng, np.array(self.outline_sigma_m))
         down, up = (seen_px(true.at(offset), self.points_m) for offset in (0.0, h))
         if not np.isfinite([down, up]).all():
             raise DatasetError("a calibration spot is not in the image of the misaligned rig")

@@ -11,7 +11,12 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
+from phibench.datasets.recipe.build import build_rig
+from phibench.datasets.recipe.tables import RigTable
+from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.scenes.frames import Pose, as_matrix, as_vector, rotation_xyz
+from phibench.scenes.mirror import SphereMirror
+from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.rig import Rig
 
 FINE = 3
@@ -38,6 +43,26 @@ def drawn_rig(rng: np.random.Generator, blur_px: tuple[float, float] = (0.5, 1.0
     return replace(rig, camera=camera, T_world_camera=pose, T_camera_sphere=Pose("camera", "sphere", as_vector(sphere)))
 
 
+def drawn_revolved(rng: np.random.Generator, shape: str, **mirror: object) -> Rig:
+    """A mirror of revolution with the same deviations, and a tilt of its own of 0.5 deg."""
+    n, f = rng.standard_normal, 1430.0 * (1.0 + 0.003 * rng.standard_normal())
+    table = {"mirror": {"shape": shape, **mirror}, "fx_px": f, "fy_px": f, "blur_sigma_px": rng.uniform(0.5, 1.0)}
+    size, tilt = 1e-3, np.radians(0.5)
+    return build_rig(RigTable.model_validate(table)).perturbed(
+        Misalignment(
+            decentre_x_m=size * n(),
+            decentre_y_m=size * n(),
+            axial_m=2.0 * size * n(),
+            tilt_x_rad=tilt * n(),
+            tilt_y_rad=tilt * n(),
+            mirror_tilt_x_rad=tilt * n(),
+            mirror_tilt_y_rad=tilt * n(),
+            cx_px=5.0 * n(),
+            cy_px=5.0 * n(),
+        )
+    )
+
+
 TINT = (1.0, 0.85, 0.45)
 
 
@@ -57,21 +82,12 @@ def limb_light(rig: Rig, rng: np.random.Generator, mean_e_per_s: float = 1.5e5, 
     v, u = np.nonzero(np.kron(ring, np.ones((FINE, FINE), bool)))
     uv = (np.stack([u, v], axis=-1) + 0.5) / FINE - 0.5
     d = camera.rays(uv)
-    s, R = rig.sphere_in_camera_m, rig.sphere.radius_m
-    along = d @ s
-    gap2 = s @ s - along**2 - R * R  # squared distance of the ray from the sphere centre, less R^2
-    hit = gap2 < 0.0
-    t = along - np.sqrt(np.where(hit, -gap2, 0.0))
-    P = t[:, None] * d
-    normal = (P - s) / R
-    cosine = -np.sum(d * normal, axis=-1)
-    out = np.where(hit[:, None], d + 2.0 * cosine[:, None] * normal, d)
-    start = np.where(hit[:, None], P, 0.0)
+    hit, start, out, cosine = (_at_sphere if isinstance(rig.mirror, SphereMirror) else _at_profile)(rig, uv, d)
     light = radiance(start @ rig.T_world_camera.R.T + rig.T_world_camera.t, out @ rig.T_world_camera.R.T)
     rows, columns = np.indices(size)
     chief = camera.rays(np.stack([columns, rows], axis=-1).astype(float))
     fall_off = chief[..., 2] ** 4
-    inside = chief @ s > np.sqrt(s @ s - R * R)  # the mirror's disc, roughly as bright as steel makes it
+    inside = _is_inside(outline, size)  # the mirror's disc, roughly as bright as steel makes it
     level = np.where(inside, 0.67, 1.0).astype(np.float32)
     # only the box around the ring is drawn on the fine grid
     low, high = cells.min(axis=0) - BOX_PX, cells.max(axis=0) + BOX_PX
@@ -88,6 +104,44 @@ def limb_light(rig: Rig, rng: np.random.Generator, mean_e_per_s: float = 1.5e5, 
         plane[box] = fine.reshape(high[1] - low[1], FINE, high[0] - low[0], FINE).mean(axis=(1, 3))
         planes.append(share * mean_e_per_s * fall_off * plane)
     return np.array(planes, np.float32)
+
+
+def _at_sphere(rig: Rig, uv: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Hit, start, direction and cosine of incidence of what pixels see by way of the sphere, camera frame."""
+    s, R = rig.sphere_in_camera_m, rig.sphere.radius_m
+    along = d @ s
+    gap2 = s @ s - along**2 - R * R  # squared distance of the ray from the sphere centre, less R^2
+    hit = gap2 < 0.0
+    t = along - np.sqrt(np.where(hit, -gap2, 0.0))
+    P = t[:, None] * d
+    normal = (P - s) / R
+    cosine = -np.sum(d * normal, axis=-1)
+    out = np.where(hit[:, None], d + 2.0 * cosine[:, None] * normal, d)
+    return hit, np.where(hit[:, None], P, 0.0), out, cosine
+
+
+def _at_profile(rig: Rig, uv: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The same of a mirror of revolution, by the simulator's rays."""
+    found, pose = trace_pixels(rig.at(0.0), uv), rig.T_world_camera.inverse()
+    hit = np.isfinite(found.cos_incidence)
+    start = np.where(hit[:, None], pose.points(np.nan_to_num(found.points_m)), 0.0)
+    out = np.where(hit[:, None], pose.directions(np.nan_to_num(found.directions)), d)
+    return hit, start, out, np.where(hit, found.cos_incidence, 1.0)
+
+
+def _is_inside(outline: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Pixels inside a closed curve that is nearly a circle, shape `size`."""
+    middle = outline.mean(axis=0)
+    turn = np.arctan2(*(outline - middle).T[::-1])
+    order = np.argsort(turn)
+    v, u = np.indices(size)
+    there = np.interp(
+        np.arctan2(v - middle[1], u - middle[0]),
+        turn[order],
+        np.hypot(*(outline - middle).T)[order],
+        period=2.0 * np.pi,
+    )
+    return np.hypot(u - middle[0], v - middle[1]) < there
 
 
 def drawn_tint(rng: np.random.Generator) -> tuple[float, float, float]:

@@ -10,7 +10,8 @@ from helpers.limb_frames import drawn_rig, drawn_room, drawn_tint, limb_light
 
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.outline.limb_image import planes_of
-from phibench.estimator.outline.outline import find_outline, fit_outline
+from phibench.estimator.outline.sphere_outline import find_sphere_outline as find_outline
+from phibench.estimator.outline.sphere_outline import fit_outline
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light

@@ -14,6 +14,7 @@ import pytest
 from helpers.drawn_values import drawing
 from helpers.oracles import camera_at, random_rig
 from helpers.recipes import changed, complaints
+from helpers.revolved_rigs import revolved
 from scipy.spatial.transform import Rotation
 
 from phibench.datasets.errors import RecipeError
@@ -31,7 +32,7 @@ from phibench.scenes.catalog import c310_rig, default_rig
 from phibench.scenes.frames import Pose
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import HARMONICS, Form
-from phibench.scenes.misalignment import PARAMETERS, Misalignment, Motion
+from phibench.scenes.misalignment import OF_REVOLVED, PARAMETERS, Misalignment, Motion
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import carriage
 from phibench.scenes.validation import SceneError
@@ -52,7 +53,7 @@ def test_all_are_zero_by_default_and_zero_changes_nothing() -> None:
     for rig in (default_rig(), tilted):
         assert rig.perturbed(Misalignment()) == rig
     assert Misalignment().stroke_m(0.1 + 0.2) == 0.1 + 0.2
-    assert len(PARAMETERS) == 38
+    assert len(PARAMETERS) == 41
 
 
 @pytest.mark.parametrize("name", PARAMETERS)
@@ -70,6 +71,11 @@ def test_each_parameter_changes_the_rig_or_the_stroke(name: str) -> None:
     """One at a time: something changes, and what is changed is not shared with another parameter by mistake."""
     value = min(0.5 * PARAMETERS[name].study, 4e-4)  # which every parameter may be
     one = Misalignment(**{name: value})
+    if name in OF_REVOLVED:
+        rig = revolved("paraboloid")
+        names = [other for other in PARAMETERS if other not in (name, *HARMONICS)]
+        assert rig.perturbed(one) not in [rig, *(rig.perturbed(Misalignment(**{other: value})) for other in names)]
+        return
     rigs = {other: default_rig().perturbed(Misalignment(**{other: value})) for other in PARAMETERS if other != name}
     if name.startswith("stroke_") and "tilt" not in name:
         assert default_rig().perturbed(one) == default_rig()
@@ -82,7 +88,7 @@ def test_each_parameter_changes_the_rig_or_the_stroke(name: str) -> None:
 def test_the_table_has_what_a_calibration_needs() -> None:
     """A parameter has a step and a prior, or neither; both are far inside the limit; `apply` changes it alone."""
     fitted = [one for one in PARAMETERS.values() if math.isfinite(one.prior_sigma)]
-    assert len(fitted) == 13
+    assert len(fitted) == 16
     for name, one in PARAMETERS.items():
         assert one.name == name
         assert math.isfinite(one.step) == math.isfinite(one.prior_sigma)

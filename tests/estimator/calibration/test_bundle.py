@@ -17,7 +17,7 @@ from phibench.estimator.calibration.file import CalibrationError, read_calibrati
 from phibench.estimator.cli import main as cli
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, prior_sigmas, stroke_of
 from phibench.estimator.outline.limb_image import Measured
-from phibench.estimator.outline.outline import Outline, mean_outline
+from phibench.estimator.outline.outline_result import Outline, mean_outline
 from phibench.scenes.rig import Rig
 
 PIXEL2 = 0.05**2 * np.eye(2)

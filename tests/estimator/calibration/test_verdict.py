@@ -15,8 +15,9 @@ from phibench.estimator.calibration.outline_picture import write_overlay
 from phibench.estimator.calibration.verdict import BAD, DOUBTFUL, GOOD, verdict_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, prior_sigmas
 from phibench.estimator.outline.limb_image import Measured, planes_of
-from phibench.estimator.outline.outline import SECTORS, Outline, find_outline
+from phibench.estimator.outline.outline import find_outline
 from phibench.estimator.outline.outline_fit import band, step_from
+from phibench.estimator.outline.outline_result import SECTORS, Outline
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Pose
 from phibench.scenes.rig import Rig

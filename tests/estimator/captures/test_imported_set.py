@@ -19,7 +19,7 @@ from phibench.estimator.calibration.file import read_calibration
 from phibench.estimator.captures.imported_set import import_pairs, imported_pairs, open_imported
 from phibench.estimator.captures.pair_list import read_pair_list
 from phibench.estimator.cli.main import main
-from phibench.estimator.outline.outline import Outline
+from phibench.estimator.outline.outline_result import Outline
 from phibench.estimator.spots.image_planes import ImageError
 
 HEAD = "name,down,up,down_off,up_off,stroke_m,depth_m,depth_sigma_m\n"

@@ -17,7 +17,7 @@ from phibench.estimator.captures.measure import measure, outlines_as_one, read_s
 from phibench.estimator.captures.pair_photos import PairPhotos, PositionPhotos
 from phibench.estimator.captures.picture_files import read_photo
 from phibench.estimator.cli.main import main
-from phibench.estimator.outline.outline import Outline
+from phibench.estimator.outline.outline_result import Outline
 from phibench.estimator.spots.image_planes import ImageError
 
 Files = dict[str, list[Path]]

@@ -21,8 +21,8 @@ from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.reflection_point import mirror_points
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Array, rotation_xyz
-from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.misalignment import OF_REVOLVED, Misalignment
+from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.revolved_mirror import cone, sphere_cap
 from phibench.scenes.rig import Rig, View
 

@@ -13,7 +13,8 @@ from scipy import stats
 from phibench.estimator.calibration.align import alignment, verdict
 from phibench.estimator.outline.ball_circle import BallCircle, circles, find_circle
 from phibench.estimator.outline.edge_ring import TURNS, EdgeRing, log_colours
-from phibench.estimator.outline.outline import find_outline, require_near
+from phibench.estimator.outline.outline import find_outline
+from phibench.estimator.outline.outline_result import require_near
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.frames import Pose, as_vector
 from phibench.scenes.rig import Rig

@@ -12,9 +12,9 @@ from scipy import stats
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.outline.limb_image import Plane, Tap, binned, planes_of
 from phibench.estimator.outline.limb_sectors import Sectors, _medians, scatter
-from phibench.estimator.outline.outline import _approach as approach
-from phibench.estimator.outline.outline import binned_rig, find_outline, fit_outline, visible_arc
+from phibench.estimator.outline.outline import find_outline
 from phibench.estimator.outline.outline_fit import step_from
+from phibench.estimator.outline.outline_result import binned_rig
 from phibench.estimator.outline.outline_start import (
     grey,
     plain_circle,
@@ -23,6 +23,8 @@ from phibench.estimator.outline.outline_start import (
     sphere_from_ellipse,
     sphere_from_rays,
 )
+from phibench.estimator.outline.sphere_outline import _approach as approach
+from phibench.estimator.outline.sphere_outline import fit_outline, visible_arc
 from phibench.estimator.spots.camera_codes import linear_to_srgb, srgb_to_linear
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.render.sensor.camera_chain import Chain
@@ -105,14 +107,14 @@ def test_a_long_picture_is_fitted_in_squares(case, frames, monkeypatch: pytest.M
     """
     rig, card = nominal(case[0]), sensor_card("mjpeg")
     whole = find_outline(frames["mjpeg"], rig, card)
-    monkeypatch.setattr("phibench.estimator.outline.outline._BINNED_PX", 640)
+    monkeypatch.setattr("phibench.estimator.outline.sphere_outline._BINNED_PX", 640)
     sizes: list[tuple[int, ...]] = []
 
     def approached(planes, *arguments):
         sizes.append(planes[0].values.shape)
         return approach(planes, *arguments)
 
-    monkeypatch.setattr("phibench.estimator.outline.outline._approach", approached)
+    monkeypatch.setattr("phibench.estimator.outline.sphere_outline._approach", approached)
     found = find_outline(frames["mjpeg"], rig, card)
     assert sizes == [(360, 640)]
     error = found.sphere_in_camera_m - case[0].sphere_in_camera_m
@@ -139,7 +141,7 @@ def test_a_hopeless_fit_ends_soon(monkeypatch: pytest.MonkeyPatch) -> None:
         steps.append(step_from(*arguments, **options))
         return steps[-1]
 
-    monkeypatch.setattr("phibench.estimator.outline.outline.step_from", counted)
+    monkeypatch.setattr("phibench.estimator.outline.sphere_outline.step_from", counted)
     with pytest.raises(ImageError, match="without a mirror"):
         fit_outline(planes_of(np.stack([light] * 3)), rig, rig.sphere_in_camera_m)
     assert len(steps) <= 6 + 6  # to come near, and to see that it leads nowhere
