@@ -1,7 +1,8 @@
 """Alignment of the paper: with the camera vertical, move the mirror sideways until its image is centred.
 
 The mirror is aligned when its centre lies on the vertical through the lens. The outline gives the centre. The nominal
-tilt and principal point of the camera give the vertical; their errors usually dominate.
+tilt and principal point of the camera give the vertical; their errors usually dominate. Of a mirror of revolution it is
+the vertex that counts. The outline gives it for an upright axis: a tilt of the mirror moves its rim aside.
 """
 
 from __future__ import annotations
@@ -18,12 +19,14 @@ from PIL import ImageDraw
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.calibration.outline_picture import overlay, shown, write_picture
 from phibench.estimator.outline.ball_circle import BallCircle, find_circle
+from phibench.estimator.outline.contour import aside_by_tilt_m
 from phibench.estimator.outline.outline import find_outline
 from phibench.estimator.outline.outline_result import Outline
 from phibench.estimator.spots.camera_codes import light_of, rgb_picture
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
+from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig
 
 _SIGNIFICANT = 2.5  # of a distance in two axes: 4 % of aligned mirrors are further off
@@ -80,6 +83,7 @@ def alignment(
     tilt_sigma_rad: float = math.radians(0.1),
     principal_point_sigma_px: float = 5.0,
     outline_sigma_factor: float = 1.0,
+    mirror_tilt_sigma_rad: float = math.radians(0.5),
 ) -> Alignment:
     """Move that centres the mirror, with its standard deviation.
 
@@ -92,14 +96,16 @@ def alignment(
         How well its principal point is known, each axis.
     outline_sigma_factor : float
         Widens the outline's standard deviation, which was checked in the room `lab` and in rooms like it.
+    mirror_tilt_sigma_rad : float
+        How well the axis of a mirror of revolution is known to be upright, each axis; of no effect for a sphere.
 
     Raises
     ------
     ImageError
         If the image shows no whole mirror, or a standard deviation is below 0.
     """
-    if not (tilt_sigma_rad >= 0.0 and principal_point_sigma_px >= 0.0):
-        raise ImageError("the standard deviations of tilt and principal point must be 0 or above")
+    if not (tilt_sigma_rad >= 0.0 and principal_point_sigma_px >= 0.0 and mirror_tilt_sigma_rad >= 0.0):
+        raise ImageError("the standard deviations of tilts and principal point must be 0 or above")
     found = find_outline(image, rig, card).widened(outline_sigma_factor)
     s, R = found.sphere_in_camera_m, rig.T_world_camera.R
     offset = R @ s
@@ -110,6 +116,8 @@ def alignment(
     own = R @ found.covariance_m2 @ R.T
     sigma_outline = float(np.sqrt(0.5 * (own[0, 0] + own[1, 1])))
     doubt = math.hypot(tilt_sigma_rad, principal_point_sigma_px / camera.fx_px) * float(s[2])
+    if isinstance(rig.mirror, RevolvedMirror):
+        doubt = math.hypot(doubt, mirror_tilt_sigma_rad * aside_by_tilt_m(rig))
     return Alignment(move, in_camera, move_px, sigma_outline, math.hypot(sigma_outline, doubt), found)
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -277,6 +278,7 @@ _DISTANCE_M = 2.5
 _ELEVATIONS_RAD = (-0.35, 0.5)  # walls of a room
 
 
+@lru_cache(maxsize=64)  # a fit moves its spots' points more often than the rig
 def apparent_outline(nominal: Rig, true: Rig) -> Array:
     """What the true rig's outline gives with the nominal camera and mirror: centre, shape (3,), or place, shape (5,).
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -29,7 +30,7 @@ PLACES = 5
 """Numbers of a place: x, y, z of the vertex, metres; e1, e2, pixels."""
 POINTS = 240  # a spline through so many is exact to 1e-6 px
 _FEWER = 96  # exact to 1e-5 px
-_STEP_M = 1e-5
+_STEP_M, _TILT_RAD = 1e-5, 1e-3
 _ROUNDS, _REST_PX = 12, 1e-9
 
 
@@ -139,14 +140,9 @@ def place_of_outline(rig: Rig, outline_px: Array, start: Array | None = None, el
     ellipse : bool
         Without, e1 and e2 stay 0: for points that are not exact.
     """
-    place = place_of_rig(rig) if start is None else start
-    middle = outline_px.mean(axis=0)
-    off = outline_px - middle
-    turn = np.arctan2(off[:, 1], off[:, 0])
-    there = np.hypot(*off.T)
-    free = slice(0, PLACES if ellipse else 3)
-    # the slopes change little on the way: those at the start lead there
-    inverse = np.linalg.pinv(_slopes(rig, place, turn, middle)[:, free])
+    middle, inverse = _way_back(rig if start is None else rig_at(rig, start), ellipse)
+    turn = _turns(_FEWER)
+    there, place = _radius_at(turn, outline_px, middle), place_of_rig(rig) if start is None else start
     for _ in range(_ROUNDS):
         radius = _radius_at(turn, rig_at(rig, place).outline_px(_FEWER), middle)
         radius = radius + place[3] * np.cos(2.0 * turn) + place[4] * np.sin(2.0 * turn)
@@ -155,6 +151,20 @@ def place_of_outline(rig: Rig, outline_px: Array, start: Array | None = None, el
         if not np.abs(move).max() > _REST_PX:
             break
     return place
+
+
+@lru_cache(maxsize=8)
+def _way_back(rig: Rig, ellipse: bool) -> tuple[Array, Array]:
+    """Middle of a rig's own contour, and the place's change with its radii; slopes change little on the way there."""
+    middle = rig.outline_px(POINTS).mean(axis=0)
+    slopes = _slopes(rig, place_of_rig(rig), _turns(_FEWER), middle)
+    return middle, np.asarray(np.linalg.pinv(slopes[:, : PLACES if ellipse else 3]))
+
+
+def aside_by_tilt_m(rig: Rig) -> float:
+    """Distance by which the vertex of an upright mirror seems to be aside, per radian of a tilt of its axis, m/rad."""
+    true = rig.perturbed(Misalignment(mirror_tilt_y_rad=_TILT_RAD))
+    return float(np.linalg.norm((place_of_outline(rig, true.outline_px(_FEWER)) - place_of_rig(rig))[:2])) / _TILT_RAD
 
 
 def tilts_of_ellipse(rig: Rig, size_rad: float) -> Callable[[Array], Array]:

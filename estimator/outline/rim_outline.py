@@ -46,12 +46,12 @@ from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError
 
-_HALF_PX, _COARSE_HALF_PX = 5.0, 8.0
+_HALF_PX, _COARSE_HALF_PX, _NARROW_PX = 5.0, 8.0, 3.5
 _COARSE_STEPS, _CHOOSE, _STEPS = 8, 3, 24
 _NEAR_M, _REST_M, _REST_SIGMAS = 5e-5, 1e-7, 0.05
 _LARGEST_MOVE_M, _LARGEST_ELLIPSE_PX = 3e-3, 3.0
 _BLUR_RANGE_PX2 = (0.02, 9.0)
-_MIN_ARC, _MIN_USED = 0.5, 0.5
+_MIN_ARC, _MIN_USED = 0.5, 0.2
 _EDGE_SIGMA_PX = 0.5  # of a sector that has an edge
 _LEAST_CONTRAST, _MOST_TRIED, _MOST_OFF = 9.0, 4, 0.06
 _NEAR_RADII = (0.95, 1.05)
@@ -219,6 +219,7 @@ def _settle(
     by_curve = _by_curve(contour)
     shared = shared_px2(shifts, step.solution.scatter(left), again is not None)
     covariance = covariance[:PLACES, :PLACES] + shared * by_curve @ by_curve.T
+    covariance = covariance + _by_band(planes, rig, contour, blur, pixels, step)
     return Outline(
         place[:3],
         covariance[:3, :3],
@@ -232,6 +233,20 @@ def _settle(
         ellipse_px=(float(place[3]), float(place[4])),
         covariance=covariance,
     )
+
+
+def _by_band(
+    planes: tuple[Plane, ...], rig: Rig, contour: Contour, blur: float, pixels: OutlinePixels, step: Step
+) -> Array:
+    """Covariance, shape (5, 5), by what a narrower band has otherwise.
+
+    Where a wall ends, its edge is reflected along the rim. Within some pixels of it, the edge looks like a rim that is
+    displaced, in many sectors alike, which their scatter does not show. The narrower the band, the less of it is seen.
+    """
+    narrow = pixels[np.abs(contour.place_of(pixels).d_px) < _NARROW_PX]
+    other = rim_step(narrow, planes, rig, contour, blur, SECTORS, _NARROW_PX, near=True)
+    change = other.move[:PLACES] - step.move[:PLACES]
+    return np.asarray(np.outer(change, change))
 
 
 def _require_edges(step: Step, arc: float) -> None:
