@@ -20,6 +20,7 @@ GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
 _P = (0.01, 1e-4)  # probability of a larger chi2: below the first doubtful, below the second bad
 _FAR_SIGMAS = (3.0, 5.0)  # largest correction over its prior sigma, of 13: by chance in 3 % and in 1e-5 of all rigs
 _ARC = 0.75  # an outline is refused below 0.6
+_RIM_ARC = 0.3  # a rim below 0.2: in rooms full of things a third of it lies before a plain part of them
 _SHIFT_PX = 0.4  # rms over sectors; in `lab` MJPEG frames have 0.18 px, raw ones 0.12 px, layers 0.05 px
 _ONLY_PRIOR = 0.9  # of the prior's sigma is left: the data say next to nothing
 
@@ -66,11 +67,12 @@ def verdict_of(bundle: Bundle, prior: Array, outlines: list[Outline]) -> Verdict
         far = np.nan_to_num(np.abs(bundle.values) / prior)
         left = np.sqrt(np.diag(bundle.covariance)) / prior
     worst, arc = int(np.argmax(far)), min(one.arc for one in outlines)
+    least = _ARC if outlines[0].ellipse_px is None else _RIM_ARC
     shift_px = max(one.shift_rms_px for one in outlines)
     faults = [
         (_level(-np.log(max(p, 1e-300)), *(-np.log(_P))), f"chi2 is too large, p = {p:.1e}"),
         (_level(far[worst], *_FAR_SIGMAS), f"{PARAMETERS[worst]} is corrected by {far[worst]:.1f} prior sigmas"),
-        (_level(-arc, -_ARC), f"only {100.0 * arc:.0f} % of an outline could be used"),
+        (_level(-arc, -least), f"only {100.0 * arc:.0f} % of an outline could be used"),
         (_level(shift_px, _SHIFT_PX), f"an outline is off by {shift_px:.2f} px rms: another mirror, or a bad frame"),
     ]
     faults = sorted((fault for fault in faults if fault[0]), key=lambda fault: -fault[0])

@@ -52,7 +52,7 @@ _NEAR_M, _REST_M, _REST_SIGMAS = 5e-5, 1e-7, 0.05
 _LARGEST_MOVE_M, _LARGEST_ELLIPSE_PX = 3e-3, 3.0
 _BLUR_RANGE_PX2 = (0.02, 9.0)
 _MIN_ARC, _MIN_USED = 0.5, 0.2
-_EDGE_SIGMA_PX = 0.5  # of a sector that has an edge
+_EDGE_SIGMA_PX = 0.25  # of a sector that has an edge
 _LEAST_CONTRAST, _MOST_TRIED, _MOST_OFF = 9.0, 4, 0.06
 _NEAR_RADII = (0.95, 1.05)
 _RADII = (0.7, 1.4)  # of `radii_px`
@@ -215,7 +215,9 @@ def _settle(
     change, covariance = (step.move, step.covariance) if again is None else without_jpeg(pixels, step, *again)
     place, blur = _moved(place, change[:PLACES]), float(np.clip(blur + change[PLACES], *_BLUR_RANGE_PX2))
     left = pixels.y - step.model
-    shifts = step.solution.sector_shifts(left)
+    with np.errstate(invalid="ignore"):
+        clear = sector_sigmas_px(step) < _EDGE_SIGMA_PX
+    shifts = np.where(clear, step.solution.sector_shifts(left), np.nan)
     by_curve = _by_curve(contour)
     shared = shared_px2(shifts, step.solution.scatter(left), again is not None)
     covariance = covariance[:PLACES, :PLACES] + shared * by_curve @ by_curve.T
@@ -223,7 +225,7 @@ def _settle(
     return Outline(
         place[:3],
         covariance[:3, :3],
-        step.sectors_used / SECTORS,
+        float(np.mean(clear)),
         math.nan,
         blur**0.5,
         step.residual,
