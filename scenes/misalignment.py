@@ -196,7 +196,7 @@ class Misalignment:
         "rad",
         0.5,
         8.7e-3,
-        "mirror of revolution turned about world x through its vertex; the camera stays",
+        "mirror of revolution turned about world x through its vertex",
         step=5e-4,
         sigma=math.radians(0.5),
     )
@@ -204,7 +204,7 @@ class Misalignment:
         "rad",
         0.5,
         8.7e-3,
-        "mirror of revolution turned about world y through its vertex; the camera stays",
+        "mirror of revolution turned about world y through its vertex",
         step=5e-4,
         sigma=math.radians(0.5),
     )

@@ -280,7 +280,7 @@ _ELEVATIONS_RAD = (-0.35, 0.5)  # walls of a room
 
 @lru_cache(maxsize=64)  # a fit moves its spots' points more often than the rig
 def apparent_outline(nominal: Rig, true: Rig) -> Array:
-    """What the true rig's outline gives with the nominal camera and mirror: centre, shape (3,), or place, shape (5,).
+    """Centre, shape (3,), or place, shape (5,), that the true rig's outline gives with the nominal camera and mirror.
 
     The pixels of a sphere's outline, as the nominal camera sees them, are a cone: its axis and its opening give the
     centre. Of a mirror of revolution it is the `contour` of the nominal one that is nearest.

@@ -217,7 +217,7 @@ def _radius_at(turn: Array, outline_px: Array, middle: Array) -> Array:
 
 
 def _seen(rig: Rig, t: Array, middle: Array) -> tuple[BoolArray, float, float]:
-    """Where the rim is seen, mean depth, and mean `bend` of the rest."""
+    """Parts where the rim is seen, mean depth, and mean `bend` of the rest."""
     mirror = rig.mirror
     assert isinstance(mirror, RevolvedMirror)
     eye = rig.T_camera_sphere.inverse().t

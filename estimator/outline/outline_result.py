@@ -100,7 +100,7 @@ class Outline:
 
     @property
     def measured(self) -> Measured:
-        """What a bundle takes: the sphere's centre, shape (3,), or vertex and ellipse, shape (5,)."""
+        """Data of a bundle: the sphere's centre, shape (3,), or vertex and ellipse, shape (5,)."""
         if self.ellipse_px is None or self.covariance is None:
             return Measured(self.sphere_in_camera_m, self.covariance_m2)
         return Measured(np.concatenate([self.sphere_in_camera_m, self.ellipse_px]), self.covariance)
