@@ -188,9 +188,9 @@ class SearchingPolicy:
 
     def stroke(self, to_m: float) -> Iterator[Action]:
         """Move the carriage, a frame every few centimetres; back to where the target was seen last if it is hidden."""
-        step_s = self.known.task.step_s
+        step_s, was_seen = self.known.task.step_s, self._missed == 0
         while abs(way := to_m - self.observation.stroke_m) > 1e-6:
-            if self.belief is not None and self._missed > _HIDDEN_STEPS:
+            if self.belief is not None and was_seen and self._missed > _HIDDEN_STEPS:
                 to_m = self._seen_stroke_m
                 way = to_m - self.observation.stroke_m
             yield self.command(stroke_m_per_s=float(np.clip(way / step_s, -_STROKE_SPEED, _STROKE_SPEED)))

@@ -155,10 +155,10 @@ def test_a_process_of_its_own_ends_policies_that_hang() -> None:
 def test_the_process_reaches_its_target_in_twenty_rooms(capsys) -> None:
     """200 episodes: at least 95 % reached; pull of 1 / D over all beliefs 0.9 to 1.1.
 
-    Rooms and episodes are none of those ("loop", "rooms") on which policies were mended.
+    Rooms and episodes are none of those ("loop", "loop test") on which policies were mended.
     """
-    setup = Setup(arenas=tuple(generated_arena("loop test", k) for k in range(20)))
-    frame = episode_frame(run_episodes(setup, "paper", 200, "test rooms"))
+    setup = Setup(arenas=tuple(generated_arena("loop test 2", k) for k in range(20)))
+    frame = episode_frame(run_episodes(setup, "paper", 200, "test rooms 2"))
     reached = int((frame["outcome"] == "reached").sum())
     pull = float(np.sqrt(np.mean(frame["pull"].drop_nans().to_numpy() ** 2)))
     low, high = binomtest(reached, 200).proportion_ci()
