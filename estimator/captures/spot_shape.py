@@ -52,6 +52,9 @@ _MOST_EXCESS = 6.0  # of the misfit per degree of freedom: what is there is not 
 UNLIKE = 0.5
 """Share of a light that a spot leaves unexplained, from which on it is none; half of what was seen of torn beams."""
 _UNLIKE_SIGMAS = 6.0  # of the misfit, below which its share is noise
+_ROOM_EXCESS = (
+    2.0  # of the misfit per degree of freedom that steps of a JPEG leave of a room full of edges; 1.8 was seen
+)
 
 
 @dataclass(frozen=True)
@@ -269,7 +272,10 @@ def _of_window(image: SpotImage, window: Window, start: Array, values: Array, th
     freedom = max(len(r) - len(J), 1)
     excess = max(float(np.minimum(r * r, _OUTLIER**2).sum()) / freedom, 1.0)
     A = J @ J.T
-    unlike = _unlike(float(r @ r), freedom, float(theta[2] ** 2 * A[2, 2]))
+    light2 = float(theta[2] ** 2 * A[2, 2])
+    # where the room's misfit alone could pass for the share, nothing is said of the light
+    told = light2 * UNLIKE**2 > _ROOM_EXCESS * freedom
+    unlike = _unlike(float(r @ r), freedom, light2) if told else 0.0
     return _Linear(theta, A, J @ K.T, K @ K.T, J @ r, K @ r, excess, unlike)
 
 
