@@ -124,12 +124,17 @@ def align(
     out
         PNG to write: the outline and an arrow, 20 times as long as the move; by default `<image>-align.png` in
         the current folder.
-    radius_mm, distance_mm
-        Of the mirror: its radius, and its centre from the lens, roughly. For a frame of 1280 x 720 the distance is
-        260 by default; otherwise the outline tells it.
-    focal_px, cx_px, cy_px
-        Focal length and principal point, pixels. They may be left out for a whole frame of the C310, which has
-        1280 x 720: the focal length is 1430 by default.
+    radius_mm
+        Radius of the mirror.
+    distance_mm
+        Of the mirror's centre from the lens, roughly. For a frame of 1280 x 720 it is 260 by default; otherwise the
+        outline tells it.
+    focal_px
+        Focal length, pixels. For a whole frame of the C310, 1280 x 720, it is 1430 by default.
+    cx_px
+        Principal point, column, pixels. Left out only for a whole frame of the C310; otherwise it goes with --focal-px.
+    cy_px
+        Principal point, row, pixels. Left out only for a whole frame of the C310; otherwise it goes with --focal-px.
     focus_mm
         Distance of the plane of focus; by default on the virtual image, half a radius before the mirror's centre.
     tilt_sigma_deg
