@@ -14,7 +14,7 @@ from pathlib import Path
 from rich.console import Console
 
 from phibench.datasets.build.finished_work import OR_REPLACE, LostWorkError, kept_samples, lost_work
-from phibench.datasets.build.forecast import PairForecast, forecast, pair_forecasts, pair_table, slowdown
+from phibench.datasets.build.forecast import PairForecast, forecast, pair_forecasts, pair_table, rim_lines, slowdown
 from phibench.datasets.build.journal import FolderHead, Journal
 from phibench.datasets.build.room_export import (
     damaged_exports,
@@ -150,7 +150,7 @@ def dry_run(
     chosen = [tasks[name] for name in (todo if journal.entries else tasks)]
     cost = forecast(plan, chosen).text(count, slowdown(count)) if chosen else "to make: nothing"
     seen = f"{sum(pair.visible for pair in pairs)} of {len(pairs)} pairs will be visible in both images"
-    told += [f"warning: {warning}" for warning in warnings(plan.recipe)]
+    told += rim_lines(plan, pairs) + [f"warning: {warning}" for warning in warnings(plan.recipe)]
     told += [f"will be refused: {name}: {reason}" for name, reason in plan.refused.items()]
     told += export_lines(unexported(plan.recipe, plan.files))
     return "\n".join([*pair_table(pairs), seen, *told, f"{cost}, {len(tasks)} tasks in all; nothing was rendered"])

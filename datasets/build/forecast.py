@@ -25,12 +25,13 @@ from phibench.datasets.build.scheduler import Executor, Outcome
 from phibench.datasets.build.tasks import Done, Task
 from phibench.datasets.plan.plan import PairPlan, Plan
 from phibench.render.optics.room_tracer import room_geometry
-from phibench.render.optics.truth import SpotTruth, depth_m, spot_truth
+from phibench.render.optics.truth import EDGE, NO_REFLECTION, SpotTruth, depth_m, spot_truth
 from phibench.render.room.bounced_light import BOUNCE_TEXEL_M
 from phibench.render.room.lamp_light import FIRST_RAYS
 from phibench.render.room.light_map import fixed_shapes, texel_count
 from phibench.render.room.texel_grid import TexelGrid
 from phibench.scenes.faces import face_table
+from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import POSITIONS
 from phibench.scenes.room import Room
 
@@ -361,6 +362,22 @@ def pair_forecasts(plan: Plan) -> Iterator[PairForecast]:
     rooms = {name: number for number, name in enumerate(plan.rooms)}
     found = {one.pair.sample_id: one for one in _traced(plan, sorted(plan.pairs, key=lambda pair: rooms[pair.room]))}
     return (found[pair.sample_id] for pair in plan.pairs)
+
+
+def rim_lines(plan: Plan, pairs: Iterable[PairForecast]) -> list[str]:
+    """Say what to do about spots that the rim of a mirror of revolution hides; no line where there are none."""
+    hidden = [
+        one.pair.sample_id
+        for one in pairs
+        if isinstance(plan.rigs[one.pair.rig].mirror, RevolvedMirror)
+        and {one.down.cause, one.up.cause} & {NO_REFLECTION, EDGE}
+    ]
+    if not hidden:
+        return []
+    return [
+        f"{NO_REFLECTION} and {EDGE} of {hidden[0]}: the mirror ends at its rim, before the place that would show the "
+        "spot; put the spot nearer to the mirror's height or farther away, or make rim_radius_m of [rig.mirror] larger"
+    ]
 
 
 def _traced(plan: Plan, pairs: Iterable[PairPlan]) -> Iterator[PairForecast]:

@@ -16,14 +16,17 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.captures.picture_files import Photo, require_one_camera
 from phibench.estimator.captures.rig_file import MeasuredRig
+from phibench.estimator.geometry.reflection import reflect
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Pair
 from phibench.estimator.spots.detect import FARTHEST_M, NEAREST_M, PairDetection, detect
-from phibench.scenes.rig import POSITIONS
+from phibench.scenes.revolved_mirror import RevolvedMirror
+from phibench.scenes.rig import POSITIONS, Rig
 
 LEAST_STROKE_M, MOST_STROKE_M = 1e-3, 10.0
 _FACTORS = (0.1, 10.0, 0.3, 3.0, 0.01, 100.0, 0.001)  # of the stroke: units mistaken, and a few times too much
 _SURE_SIGMAS, _EACH_SIGMAS = 12.0, 9.0  # of both spots together and of each: a fainter one may be noise
+_OUTLINE_POINTS, _INSIDE = 24, 2e-3  # and the part of the mirror's size by which rays are traced inside its outline
 _ALIKE = 0.8  # of the difference of two rooms, below which pictures are of one position
 
 
@@ -100,9 +103,20 @@ def nothing_found(pair: Pair, photos: PairPhotos, answer: Answer) -> DatasetErro
     advice = "" if pair.down_off is not None else "; give pictures with the laser off, too"
     return DatasetError(
         f"no laser spot in the picture {where}: {getattr(answer, lacking[0]).status}; look whether the laser is on and "
-        "its spot is seen in the mirror, whether it is overexposed, whether down and up are swapped, and whether the "
-        f"stroke is in metres{advice}"
+        f"its spot is seen in the mirror{_highest_seen(pair.rig)}, whether it is overexposed, whether down and up are "
+        f"swapped, and whether the stroke is in metres{advice}"
     )
+
+
+def _highest_seen(rig: Rig) -> str:
+    """Say how high above the horizon a mirror of revolution shows anything, by the rays of its outline."""
+    if not isinstance(rig.mirror, RevolvedMirror):
+        return ""
+    outline = rig.outline_px(_OUTLINE_POINTS)
+    middle = outline.mean(axis=0)
+    leaving = reflect(rig.at(0.0), middle + (1.0 - _INSIDE) * (outline - middle)).direction_world
+    highest = math.degrees(float(np.nanmax(np.arcsin(leaving[:, 2]))))
+    return f", whose rim hides what is more than about {highest:.0f} degrees above the horizon"
 
 
 def contradiction(pair: Pair, photos: PairPhotos, status: str) -> DatasetError:

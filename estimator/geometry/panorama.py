@@ -11,7 +11,7 @@ mirror: it searches the directions of a data set's truth layer. Upright edges of
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -26,6 +26,7 @@ from phibench.datasets.store.pictures import display_exposure_s, to_srgb
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.reflection import reflect
 from phibench.scenes.frames import Array
+from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import POSITIONS, View
 from phibench.scenes.room import Room
 from phibench.scenes.shapes import Cuboid, Rectangle, Shape, faces
@@ -284,8 +285,9 @@ def _line(rows: Array, places: Array) -> tuple[float, float, float]:
 
 # -- pixels by the truth layer -----------------------------------------------------------------------------------------
 #
-# The truth has, for every pixel, the outward normal and the world point that it sees. The ray leaves at P = S + R n and
-# goes to X: its direction is (X - P) / |X - P|. For every grid point the pixel with the nearest direction is looked up.
+# The truth has, for every pixel, the outward normal and the world point X that it sees. The normal tells the place P at
+# which the ray leaves the mirror: S + R n on a sphere, and the radius with that slope on a mirror of revolution. The
+# direction is (X - P) / |X - P|. For every grid point the pixel with the nearest direction is looked up.
 # Differences over its 3 x 3 neighbours give the step to the place between pixels. A mirror with an error of form counts
 # as its sphere here: at a peak of 50 um P is off by as much, and the place by 0.014 px.
 
@@ -293,14 +295,36 @@ _ROUNDS = 4
 _REACH_PX = 1.5  # the place must be within reach of the nearest pixel's neighbours
 
 
-def ray_directions(sample: Sample, position: str) -> Array:
-    """Unit vectors of the rays that leave the mirror, shape (H, W, 3), from the truth layer; NaN beside the mirror."""
-    truth, row = sample.truth(position), sample.truth_row(position)
+def ray_directions(truth: Mapping[str, NDArray[Any]], view: View) -> Array:
+    """Unit vectors of the rays that leave the mirror, shape (H, W, 3), from a truth layer; NaN beside the mirror.
+
+    Raises
+    ------
+    DatasetError
+        If the mirror is a cone.
+    """
     angle, turn = truth["phi_normal_rad"], truth["azimuth_rad"]
     n = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), -np.cos(angle)], axis=-1)
-    X = np.stack([truth[name] for name in ("x_m", "y_m", "z_m")], axis=-1)
-    away = X - (np.array(row.sphere_centre_world_m) + sample.rig.sphere.radius_m * n)
+    away = np.stack([truth[name] for name in ("x_m", "y_m", "z_m")], axis=-1) - _places_of_normals(n, view)
     return np.asarray(away / np.linalg.norm(away, axis=-1, keepdims=True))
+
+
+def _places_of_normals(normals: Array, view: View) -> Array:
+    """Places on the mirror, world, shape (H, W, 3), that have these outward unit normals, world."""
+    mirror = view.rig.mirror
+    if not isinstance(mirror, RevolvedMirror):
+        return np.asarray(view.sphere_centre_m + mirror.radius_m * normals)
+    profile, n = mirror.profile, normals @ view.T_world_sphere.R
+    if profile.shape == "cone":
+        raise DatasetError(
+            "a panorama by the truth layer needs a mirror whose normal tells the place on it, and a cone has the same "
+            "slope everywhere: use the model (--by model)"
+        )
+    across = np.hypot(n[..., 0], n[..., 1])
+    r = profile.radius_at_slope(-across / n[..., 2])
+    share = r / np.maximum(across, 1e-300)
+    P = np.stack([share * n[..., 0], share * n[..., 1], profile.sag(r * r).z_m], axis=-1)
+    return view.T_world_sphere.points(P)
 
 
 def pixels_by_truth(directions: Array, grid: Grid) -> Array:
@@ -385,7 +409,7 @@ def places(sample: Sample, position: str, grid: Grid, by: By = "model", distance
         return pixels_by_model(nominal_view(sample, position), grid, distance_m)
     if distance_m != FAR_M:
         raise DatasetError("a distance of the scene needs the model (--by model): the truth layer gives directions")
-    return pixels_by_truth(ray_directions(sample, position), grid)
+    return pixels_by_truth(ray_directions(sample.truth(position), sample.view(position)), grid)
 
 
 def nominal_view(sample: Sample, position: str) -> View:

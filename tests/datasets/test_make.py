@@ -313,6 +313,18 @@ def test_the_preview_says_what_the_data_set_will_be(smallest_dataset: Path, tmp_
     assert "1 of 2 pairs will not be visible in both images, such as half-hidden-h1.400 (down occluded" in said(console)
 
 
+def test_the_preview_says_what_to_do_about_a_spot_that_a_rim_hides(tmp_path: Path) -> None:
+    """The board that the rim hides is 0.8 m over a mirror that shows 3 degrees above the horizon."""
+    text = SMALLEST.read_text().replace("[laser]", '[rig.mirror]\nshape = "hyperboloid"\n\n[laser]')
+    recipe = tmp_path / "hyperboloid.toml"
+    for height, lines in (("1.50", 1), ("0.50", 0)):
+        recipe.write_text(
+            text.replace("azimuth_deg = 100.0\nheight_m = 0.50", f"azimuth_deg = 100.0\nheight_m = {height}")
+        )
+        told = make.dry_run(recipe, tmp_path / "data")
+        assert told.count("of seen-near-h0.500: the mirror ends at its rim") == lines
+
+
 @pytest.mark.usefixtures("inline")
 def test_the_preview_of_a_folder_with_a_data_set(smallest_dataset: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(smallest_dataset, tmp_path / "copy"))

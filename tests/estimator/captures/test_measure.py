@@ -184,7 +184,15 @@ def test_a_stroke_in_centimetres_is_told(case: Case, capsys) -> None:
 def test_a_laser_that_is_off_is_told(case: Case, capsys) -> None:
     dark = {"down": case.raw["down_off"][1:], "up": case.raw["up_off"][1:]}
     dark |= {"down_off": case.raw["down_off"], "up_off": case.raw["up_off"]}
-    assert "no laser spot" in refused(capsys, case.arguments(dark))
+    arguments = case.arguments(dark)
+    text = refused(capsys, arguments)
+    assert "no laser spot" in text
+    assert "rim" not in text
+    rig = case.folder / "paraboloid.toml"
+    of_sphere = re.sub("radius_m = .*\n", "", (case.folder / "rig.toml").read_text())
+    rig.write_text(of_sphere + '\n[rig.mirror]\nshape = "paraboloid"\n')
+    # docs/studies/mirror.md, by bisection of heights: 12.5 degrees
+    assert "rim hides what is more than about 13 degrees above" in refused(capsys, [*arguments[:-1], str(rig)])
 
 
 def test_the_same_picture_twice_is_told(case: Case, capsys) -> None:

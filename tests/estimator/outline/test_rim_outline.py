@@ -169,6 +169,15 @@ def check(found: Outline, rig: Rig) -> None:
     assert wrong @ np.linalg.solve(found.covariance, wrong) > 2.0 * limit
 
 
+@cache
+def nearby(shape: str) -> Outline:
+    """Fit of a raw frame from a place nearby."""
+    rig, card = scene(shape)[0], sensor_card("bayer-raw")
+    start = place_of_rig(rig) + [2e-5, -2e-5, 3e-4, 0.0, 0.0]
+    return fit_rim(planes_of(frame_of(shape, "bayer-raw"), card), rig, start)
+
+
+@pytest.mark.slow
 def test_from_the_picture_alone() -> None:
     rig = scene("paraboloid")[0]
     found = find_outline(frame_of("paraboloid", "mjpeg"), nominal(rig), sensor_card("mjpeg"))
@@ -177,31 +186,31 @@ def test_from_the_picture_alone() -> None:
     assert found.blur_px == pytest.approx(rig.camera.blur_sigma_px, abs=0.15)
 
 
-@pytest.mark.parametrize("shape", ["cone", "grazed"])
+@pytest.mark.parametrize("shape", ["cone", pytest.param("grazed", marks=pytest.mark.slow)])
 def test_from_nearby(shape: str) -> None:
-    rig, card = scene(shape)[0], sensor_card("bayer-raw")
-    start = place_of_rig(rig) + [2e-5, -2e-5, 3e-4, 0.0, 0.0]
-    found = fit_rim(planes_of(frame_of(shape, "bayer-raw"), card), rig, start)
-    check(found, rig)
+    check(nearby(shape), scene(shape)[0])
 
 
 def test_measured_numbers_of_several_outlines() -> None:
-    rig, light = scene("paraboloid")
-    found = fit_rim(planes_of(light), rig, place_of_rig(rig))
+    found = nearby("cone")
     together = mean_outline([found, found])
     assert together.value == pytest.approx(found.measured.value)
     assert together.covariance == pytest.approx(found.covariance / 2.0)
     assert found.widened(2.0).measured.covariance == pytest.approx(4.0 * found.covariance)
 
 
+@pytest.mark.slow
 def test_pictures_without_a_rim_are_refused_in_one_sentence() -> None:
     rig, rng = revolved("paraboloid"), np.random.default_rng(3)
-    blank = 1000.0 + rng.standard_normal((3, 720, 1280))
+    blank = planes_of(1000.0 + rng.standard_normal((3, 720, 1280)))
     with pytest.raises(ImageError, match="no circle of the rim's size has edges all around"):
         find_outline(np.ones((3, 720, 1280)), rig)
     with pytest.raises(ImageError, match="no edge along the mirror's rim"):
-        fit_rim(planes_of(blank), rig, place_of_rig(rig))
+        fit_rim(blank, rig, place_of_rig(rig))
     with pytest.raises(ImageError, match="cut by the frame"):
-        fit_rim(planes_of(blank), rig, place_of_rig(rig) + [0.14, 0.0, 0.0, 0.0, 0.0], near=True)
+        fit_rim(blank, rig, place_of_rig(rig) + [0.14, 0.0, 0.0, 0.0, 0.0], near=True)
+
+
+def test_a_part_of_a_picture_is_refused_in_one_sentence() -> None:
     with pytest.raises(ImageError, match="give a whole frame"):
-        find_outline(blank[:, :100], rig)
+        find_outline(np.ones((3, 100, 1280)), revolved("paraboloid"))
