@@ -8,8 +8,8 @@ q = T^2 / (T^2 + v) and e = q^(3/2) exp(-m^2 / 2 (T^2 + v)),
 
 and the covariance of f(d) with any other Gaussian is that slope times the covariance of d (C. M. Stein, 1981). The mean
 and the covariance with what lies before are therefore exact for Gaussian codes. Left out is the variance of f(d) beyond
-its regression, of the order of b^2 v^2 / T^2. With v up to T^2 / 3 variances are right to 1 %; beyond, nothing was
-tried.
+its regression, of the order of b^2 v^2 / T^2: variances are 1 % too small at v = 0.08 T^2, and 2 to 4 % at T^2 / 3 and
+T^2 (20 000 draws of flat patches, edges and spots).
 """
 
 from __future__ import annotations
