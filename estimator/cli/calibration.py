@@ -169,6 +169,9 @@ def align(
     rig = Rig()
     whole = pixels.shape[:2] == (rig.camera.height_px, rig.camera.width_px)
     if focal_px is None and not whole:
+        for option, value in (("--cx-px", cx_px), ("--cy-px", cy_px), ("--distance-mm", distance_mm)):
+            if value is not None:
+                raise DatasetError(f"{option} {value:g}: needs --focal-px, the focal length in pixels of this picture")
         circle = circle_of(pixels, card)
         print(circle_in_words(circle))
         print(f"{write_circle_picture(out, pixels, card, circle)}: outline; look at it")

@@ -95,6 +95,8 @@ def test_a_photograph_of_an_unknown_camera_gives_the_circle(tmp_path, capsys) ->
     assert f"radius {photo.radius_px:.0f}"[:-1] in said
     assert "give --focal-px" in said
     assert Image.open(out).size == (640, 480)
+    assert cli.main(["align", str(file), "--cx-px", "319.5", "--out", str(out)]) == 2
+    assert "--cx-px 319.5: needs --focal-px" in capsys.readouterr().err
     found = circle_of(codes, sensor_card("srgb8"))
     distance = distance_of(found, photo.focal_px, 0.06)
     assert distance == pytest.approx(0.06 * np.linalg.norm(photo.centre), rel=0.01)
