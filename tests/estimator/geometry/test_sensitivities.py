@@ -149,7 +149,8 @@ def test_accuracy_pixel_gradient_against_differences_of_the_simulator() -> None:
                 moving += bool(np.any(analytic[:, k]))
                 checked += 1
     assert checked == 5 * 2 * len(PARAMETERS)
-    assert moving == 5 * (36 + 36 - 10)  # stroke (4) and motion between the images (6) act on the up image alone
+    # stroke (4) and motion between the images (6) act on the up image alone; form errors turn with the mirror's own tilt
+    assert moving == 5 * (38 + 38 - 10)
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
@@ -184,7 +185,7 @@ def test_accuracy_depth_sensitivity_against_rendering() -> None:
     The spot moves by at most 0.1 px each way, so that D stays linear to 1e-3, and by less where distortion could fold;
     with a blur of 1.2 px pixels sample a centroid to 1e-12 px.
     """
-    [case] = seen_cases(4, 1)
+    [case] = seen_cases(5, 1)
     camera = dataclasses.replace(case.nominal.camera, blur_sigma_px=1.2)
     case = dataclasses.replace(case, nominal=dataclasses.replace(case.nominal, camera=camera))
     nominal, point = (case.nominal, case.nominal_stroke_m), np.array(case.spot.position_world_m)
@@ -243,7 +244,7 @@ def test_accuracy_nominal_and_true_derivatives_cancel() -> None:
         true, truth = (dict(zip(PARAMETERS, g, strict=True)) for g in (found.estimate_gradient, found.truth_gradient))
         if not math.isfinite(found.estimate_m):
             continue
-        for name in RIG_PARAMETERS:
+        for name in true.keys() & nominal.keys():
             assert nominal[name] + true[name] == pytest.approx(truth[name], abs=1e-6 * abs(true[name]) + 1e-7)
         checked += 1
     assert checked > 7
@@ -253,9 +254,9 @@ def test_what_moves_no_chief_ray_is_left_out() -> None:
     rig, point = default_rig(), (2.0, 1.0, 0.5)
     spot = LaserSpot(point, (-1.0, -0.5, 0.0), 5e-3)
     left_out = set(MISALIGNMENT) - set(PARAMETERS)
-    assert left_out == {"focus_distance_m", "roughness_alpha"}
+    assert left_out == {"focus_distance_m", "roughness_alpha", "rim_radius_m"}
     still = spot_truth(rig.at(0.4), spot, ())
-    for name in left_out:
+    for name in left_out - {"rim_radius_m"}:  # a sphere has no rim
         moved = spot_truth(rig.perturbed(Misalignment(**{name: MISALIGNMENT[name].study})).at(0.4), spot, ())
         assert (moved.u_px, moved.v_px) == (still.u_px, still.v_px)
 

@@ -42,7 +42,7 @@ def test_accuracy_depth_limit_against_draws() -> None:
     down, up = pixels(RIG, spot, h)
     limit = depth_limit(RIG, h, down, up, C_DOWN, C_UP, rig_covariance(SIGMAS))
     n, rng = 1000, generator("limits", "depth")
-    draws = [SIGMAS[name] * rng.standard_normal(n) for name in RIG_PARAMETERS]
+    draws = [SIGMAS.get(name, 0.0) * rng.standard_normal(n) for name in RIG_PARAMETERS]
     uv = (rng.multivariate_normal(down, C_DOWN, n), rng.multivariate_normal(up, C_UP, n))
     depths = np.empty(n)
     for k in range(n):
@@ -107,7 +107,7 @@ def test_vectorised_over_spots_and_nan_for_bad_ones() -> None:
     down, up = (np.array(x) for x in zip(*(pixels(RIG, spot, row.baseline_m) for row, spot in cases), strict=True))
     down[2] = [2.0, 3.0]  # beside the mirror
     limit = depth_limit(RIG, h, down, up, C_DOWN, C_UP, rig_covariance(SIGMAS))
-    assert limit.gradient.shape == (4, 12)
+    assert limit.gradient.shape == (4, len(RIG_PARAMETERS)) == (4, 15)
     assert np.isnan(limit.sigma_m).tolist() == [False, False, True, False]
     single = depth_limit(RIG, h[1], down[1], up[1], C_DOWN, C_UP, rig_covariance(SIGMAS))
     assert limit.sigma_m[1] == pytest.approx(float(single.sigma_m), rel=1e-9)
