@@ -149,7 +149,7 @@ def test_accuracy_pixel_gradient_against_differences_of_the_simulator() -> None:
                 moving += bool(np.any(analytic[:, k]))
                 checked += 1
     assert checked == 5 * 2 * len(PARAMETERS)
-    # stroke (4) and motion between the images (6) act on the up image alone; form errors turn with the mirror's own tilt
+    # stroke (4) and motion between the images (6) act on the up image alone; form errors turn with the mirror's tilt
     assert moving == 5 * (38 + 38 - 10)
 
 
