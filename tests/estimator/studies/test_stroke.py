@@ -70,10 +70,10 @@ def test_drawn_rigs_have_the_covariance() -> None:
     x = np.stack([deviations(C, ("test", k)) for k in range(n)])
     scale = np.sqrt(np.diag(C))
     correlation = (x.T @ x / n) / np.outer(scale, scale)
-    # the standard error of an element is at most sqrt(2 / n); 5 of them for 169 elements: wrong once in 10 000
+    # the standard error of an element is at most sqrt(2 / n); 5 of them for 256 elements: wrong once in 10 000
     assert np.abs(correlation - C / np.outer(scale, scale)).max() < 5.0 * math.sqrt(2.0 / n)
     assert np.abs(correlation - np.eye(len(PARAMETERS))).max() > 0.3  # which it would not be without the covariances
-    assert not deviations(np.zeros((13, 13)), ("test", 0)).any()
+    assert not deviations(np.zeros((len(PARAMETERS),) * 2), ("test", 0)).any()
 
 
 def test_intervals_of_an_rms_cover() -> None:
