@@ -16,7 +16,7 @@ from phibench.render.optics.certificate import CENTROID_TOLERANCE_PX, CHIEF_TOLE
 from phibench.render.optics.truth import SpotTruth, depth_m, spot_truth
 from phibench.scenes.camera import Camera
 from phibench.scenes.mirror import HARMONICS
-from phibench.scenes.misalignment import PARAMETERS, Misalignment
+from phibench.scenes.misalignment import OF_REVOLVED, PARAMETERS, Misalignment
 from phibench.scenes.rig import POSITIONS
 
 
@@ -84,7 +84,7 @@ def test_accuracy_from_the_numbers_alone() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", [name for name in PARAMETERS if name not in ("focus_distance_m", "roughness_alpha", *HARMONICS)]
+    "name", [n for n in PARAMETERS if n not in ("focus_distance_m", "roughness_alpha", *HARMONICS, *OF_REVOLVED)]
 )
 def test_a_wrong_sign_of_any_parameter_is_noticed(name: str) -> None:
     """The comparison above with one sign turned is off by more than 1e-3 px in one of the two images."""
