@@ -7,7 +7,9 @@ PyAV is imported when it is needed: `pip install 'phibench[film]'`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,10 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.film.film_read import Film, open_films
+from phibench.datasets.parallel import parallel_map
 from phibench.datasets.store.files import write_atomic
 from phibench.scenes.validation import printable_line
 
 Codec = Literal["mjpeg", "yuyv"]
+PRESETS = ("mjpeg", "yuyv")
 CONTAINERS = {".avi": "avi", ".mkv": "matroska"}
 _CODECS = {"mjpeg": ("mjpeg", "yuvj422p"), "yuyv": ("rawvideo", "yuyv422")}
 
@@ -110,15 +115,68 @@ def write_mp4(path: Path, pictures: Iterable[NDArray[np.uint8]], rate_hz: float)
     return write_atomic(path, write)
 
 
-def contact_sheet(pictures: Sequence[NDArray[np.uint8]], columns: int = 4) -> NDArray[np.uint8]:
-    """Pictures of one size side by side, shape (rows h, columns w, 3)."""
-    height, width = pictures[0].shape[:2]
-    rows = -(-len(pictures) // columns)
-    sheet = np.zeros((rows * height, columns * width, 3), np.uint8)
-    for number, picture in enumerate(pictures):
-        v, u = number // columns * height, number % columns * width
-        sheet[v : v + height, u : u + width] = picture
-    return sheet
+# -- whole films ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Job:
+    folder: Path
+    film_id: str
+    preset: Codec
+    draw: int
+    camera_seed: int
+    path: Path
+
+
+def write_videos(
+    folder: str | Path,
+    out: str | Path,
+    preset: str = "mjpeg",
+    draws: int = 1,
+    camera_seed: int = 0,
+    container: str = ".mkv",
+    films: Sequence[str] | None = None,
+    workers: int | None = None,
+) -> list[Path]:
+    """Write a video of every film and draw; videos that are there are kept.
+
+    Raises
+    ------
+    DatasetError
+        If the films are windows, or the preset is not one that a camera sends.
+    """
+    if preset not in PRESETS:
+        raise DatasetError(f"preset '{preset}': a camera sends {' or '.join(PRESETS)}; read other presets in Python")
+    opened, target = open_films(folder), Path(out)
+    require_container(Path(f"film{container}"))
+    jobs = []
+    for film in opened if films is None else [opened[name] for name in dict.fromkeys(films)]:
+        if film.info.window_px is not None:
+            raise DatasetError(
+                f'{film.info.film} holds windows around the spot: give view = "full" in [film], or read it in Python'
+            )
+        name = f"{film.info.film}-{preset}-{{:04d}}{container}"
+        codec: Codec = "mjpeg" if preset == "mjpeg" else "yuyv"
+        jobs += [
+            _Job(Path(folder), film.info.film, codec, draw, camera_seed, target / name.format(draw))
+            for draw in range(draws)
+        ]
+    todo = [job for job in jobs if not job.path.is_file()]
+    for _ in parallel_map(partial(_write), todo, workers, in_order=False):
+        pass
+    return [job.path for job in jobs]
+
+
+def _write(job: _Job) -> None:
+    film = open_films(job.folder)[job.film_id]
+    data = _packets(film, job.preset, job.draw, job.camera_seed)
+    write_frames(job.path, data, job.preset, film.plan.size, film.plan.scene.times.rate_hz)
+
+
+def _packets(film: Film, preset: Codec, draw: int, camera_seed: int) -> Iterator[bytes]:
+    for number in range(len(film)):
+        frame = film.frame(number, preset, draw, camera_seed)
+        yield frame.image.tobytes() if frame.jpeg is None else frame.jpeg
 
 
 def _av() -> Any:

@@ -32,11 +32,11 @@ from phibench.datasets.recipe.build import (
     true_stroke_m,
 )
 from phibench.datasets.recipe.distributions import DistributionTable, pick, quantile
+from phibench.datasets.recipe.mirror_tables import HolderTable
 from phibench.datasets.recipe.spot_placement import Boards, Placed, place, visibility_fault
 from phibench.datasets.recipe.tables import (
     DRAWABLE,
     DrawnRigsTable,
-    HolderTable,
     MisalignmentTable,
     RandomTable,
     Recipe,

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from phibench.datasets.recipe.mirror_tables import HolderTable, MirrorTable
 from phibench.datasets.recipe.room_tables import RoomTable
 from phibench.datasets.recipe.tables import (
     OWN_ALBEDO,
-    HolderTable,
     LaserTable,
-    MirrorTable,
     MisalignmentTable,
     Recipe,
     RigTable,

@@ -33,6 +33,7 @@ from phibench.datasets.recipe.faulty_tables import (
     table_of,
     tables_of,
 )
+from phibench.datasets.recipe.mirror_tables import HolderTable, MirrorTable
 from phibench.datasets.recipe.room_checks import low_rooms, room_faults
 from phibench.datasets.recipe.room_tables import RoomTable
 from phibench.datasets.recipe.spot_placement import cut_part, free_margin_m
@@ -43,9 +44,7 @@ from phibench.datasets.recipe.tables import (
     SENSOR_KEYS,
     SENSOR_OF_FRAME,
     AmbientTable,
-    HolderTable,
     LaserTable,
-    MirrorTable,
     MisalignmentTable,
     RandomHolderTable,
     Recipe,

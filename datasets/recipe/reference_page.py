@@ -14,6 +14,7 @@ from pydantic import BaseModel
 from phibench.datasets.recipe.build import CAMERA_KEYS
 from phibench.datasets.recipe.distributions import DistributionTable, TargetChoice
 from phibench.datasets.recipe.film_tables import FilmTable, VibrationTable
+from phibench.datasets.recipe.mirror_tables import HolderTable, MirrorTable, ReflectionTable
 from phibench.datasets.recipe.room_tables import (
     GeometryTable,
     LampTable,
@@ -30,16 +31,13 @@ from phibench.datasets.recipe.tables import (
     DrawnRigsTable,
     ExperimentTable,
     FramesTable,
-    HolderTable,
     LaserTable,
-    MirrorTable,
     MisalignmentTable,
     RandomHolderTable,
     RandomMisalignmentTable,
     RandomRigTable,
     RandomSpotTable,
     RandomTable,
-    ReflectionTable,
     RigTable,
     TargetTable,
 )

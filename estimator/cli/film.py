@@ -183,7 +183,7 @@ def frames(
     workers
         Number of processes; one for each core by default.
     """
-    from phibench.datasets.film.film_frames import write_videos
+    from phibench.datasets.film.film_video import write_videos
 
     paths = write_videos(directory, out, preset, draws, camera_seed, f".{container}", workers=workers)
     print(f"{out}: {len(paths)} videos")

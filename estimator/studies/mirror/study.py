@@ -14,7 +14,8 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.datasets.progress import Steps
 from phibench.datasets.recipe.build import build_rig, idle_mirror_keys
-from phibench.datasets.recipe.tables import MirrorTable, RigTable
+from phibench.datasets.recipe.mirror_tables import MirrorTable
+from phibench.datasets.recipe.tables import RigTable
 from phibench.estimator.studies.framework import Result, Settings, Study, StudyDatasets
 from phibench.estimator.studies.mirror.drawings import comparison_drawing
 from phibench.estimator.studies.mirror.field import disc_shares, meridian, outline_radius_px

@@ -11,13 +11,12 @@ from conftest import ROOT
 
 from phibench.datasets.errors import DatasetError, RecipeError
 from phibench.datasets.film import film_make
-from phibench.datasets.film.film_frames import write_videos
 from phibench.datasets.film.film_make import make_films
 from phibench.datasets.film.film_plan import film_plans
 from phibench.datasets.film.film_read import Film, open_films
 from phibench.datasets.film.film_show import picture
 from phibench.datasets.film.film_store import verify
-from phibench.datasets.film.film_video import read_frames, write_frames, write_mp4
+from phibench.datasets.film.film_video import read_frames, write_frames, write_mp4, write_videos
 from phibench.datasets.recipe.load import parse_recipe
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth

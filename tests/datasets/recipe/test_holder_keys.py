@@ -9,7 +9,7 @@ from helpers.room_files import recipe
 from phibench.datasets.errors import DatasetError, RecipeError
 from phibench.datasets.recipe.build import HOLDER_KINDS
 from phibench.datasets.recipe.load import check_recipe, load_recipe
-from phibench.datasets.recipe.tables import HolderTable
+from phibench.datasets.recipe.mirror_tables import HolderTable
 from phibench.estimator.captures.rig_file import read_rig_file
 
 

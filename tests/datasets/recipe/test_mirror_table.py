@@ -12,7 +12,8 @@ from helpers.room_files import recipe
 from phibench.datasets.errors import RecipeError
 from phibench.datasets.recipe.build import MIRROR_SHAPES, build_rig
 from phibench.datasets.recipe.load import check_recipe
-from phibench.datasets.recipe.tables import MirrorTable, RigTable
+from phibench.datasets.recipe.mirror_tables import MirrorTable
+from phibench.datasets.recipe.tables import RigTable
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig

@@ -10,7 +10,8 @@ from helpers.recipes import changed, complaints
 
 from phibench.datasets.plan.sampling import MISALIGNMENT, PARAMETERS
 from phibench.datasets.recipe.load import check_recipe
-from phibench.datasets.recipe.tables import DRAWABLE, HolderTable, RandomRigTable, Recipe
+from phibench.datasets.recipe.mirror_tables import HolderTable
+from phibench.datasets.recipe.tables import DRAWABLE, RandomRigTable, Recipe
 
 UNIFORM = {"uniform": [0.1, 1.4]}
 

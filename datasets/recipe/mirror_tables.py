@@ -1,0 +1,88 @@
+"""Tables of a recipe on the mirror: its shape, its measured reflectance, and what carries it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
+
+from phibench.datasets.recipe.distributions import Table
+from phibench.scenes.holder import LARGEST_INDEX, OF_TUBES
+
+Tilt = Annotated[float, Field(ge=-0.5, le=0.5)]
+Unit = Annotated[float, Field(ge=0.0, le=1.0)]
+GlassIndex = Annotated[float, Field(ge=1.0, le=LARGEST_INDEX)]
+HolderM = Annotated[float, Field(ge=1e-4, le=1.0)]
+
+
+class OfHolder(Table):
+    """Table with keys of a holder."""
+
+    @model_serializer(mode="wrap")
+    def _without_what_is_not_given(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Recipes that say nothing of a tube keep the hash that they had before there was one."""
+        document: dict[str, Any] = serialised(self)
+        return {key: value for key, value in document.items() if key not in OF_TUBES or value is not None}
+
+
+class HolderTable(OfHolder):
+    """`[rig.holder]`: what carries the mirror."""
+
+    kind: Literal["none", "rods", "post", "tube"] = Field(
+        default="none", description="three rods around the mirror, a post from above, or a glass tube"
+    )
+    radius_m: HolderM | None = Field(default=None, description="of each rod; of post, arm and column; R/15")
+    circle_m: HolderM | None = Field(
+        default=None,
+        description="from the axis to rods or column, 1.25 R + radius_m; to a tube, 1.25 R",
+    )
+    plate_m: HolderM | None = Field(default=None, description="radius of the plates; 2 radius_m beyond rods or tube")
+    rise_m: HolderM | None = Field(
+        default=None, description="sphere centre to the upper plate, or to the arm's top; 1.5 R"
+    )
+    azimuth_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = Field(
+        default=30.0, description="of the first rod, or the column, from the camera's x axis"
+    )
+    wall_m: HolderM | None = Field(default=None, description="thickness of the tube's wall; 0.003 whatever R")
+    glass_index: GlassIndex | None = Field(
+        default=None, description="refractive index of the tube; 1.473 whatever R, borosilicate glass 3.3"
+    )
+
+
+class MirrorTable(Table):
+    """`[rig.mirror]`: a mirror of revolution instead of the sphere."""
+
+    @model_serializer(mode="wrap")
+    def _without_what_is_not_given(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Recipes of mirrors that are upright keep the hash that they had before a tilt could be given."""
+        document: dict[str, Any] = serialised(self)
+        return {key: value for key, value in document.items() if not key.startswith("tilt_") or value}
+
+    shape: Literal["ellipsoid", "paraboloid", "hyperboloid", "cone", "polynomial"] = Field(
+        description="surface; z_c_m leads to its vertex"
+    )
+    rim_radius_m: float = Field(default=0.060, gt=0.0, le=1.0, description="radius of the rim, where the mirror ends")
+    vertex_radius_m: float | None = Field(
+        default=None, gt=0.0, le=1.0, description="R, radius of curvature at the vertex; convex"
+    )
+    conic: float | None = Field(default=None, ge=-100.0, le=100.0, description="k, conic constant")
+    half_angle_deg: float | None = Field(default=None, ge=3.0, le=87.0, description="of a cone: from axis to surface")
+    even_terms: tuple[float, ...] | None = Field(
+        default=None, max_length=8, strict=False, description="a_2, a_3, ... of r^4, r^6, ... in m^-3, m^-5, ..."
+    )
+    tilt_x_rad: Tilt = Field(default=0.0, description="mirror turned about world x through its vertex")
+    tilt_y_rad: Tilt = Field(default=0.0, description="mirror turned about world y through its vertex")
+
+
+class ReflectionTable(Table):
+    """`[rig.reflectance]`: measured reflectance of the mirror instead of its metal's."""
+
+    wavelength_nm: tuple[float, ...] = Field(
+        strict=False, min_length=1, max_length=200, description="rising; a single one stands for all"
+    )
+    value: tuple[Unit, ...] = Field(
+        strict=False, min_length=1, max_length=20000, description="one for each wavelength and angle, row after row"
+    )
+    angle_deg: tuple[Annotated[float, Field(ge=0.0, le=90.0)], ...] = Field(
+        default=(), strict=False, max_length=100, description="angles of incidence, rising; a single one stands for all"
+    )
