@@ -8,6 +8,7 @@ it takes the plan that is quickest among those whose expected standard deviation
 
 from __future__ import annotations
 
+import abc
 import copy
 import itertools
 import math
@@ -82,7 +83,7 @@ class Identifier:
         return self.latest[best] if agreement[best] >= _AGREEMENT else None
 
 
-class SearchingPolicy:
+class SearchingPolicy(abc.ABC):
     """Identification, tracking and servoing; what follows the first lock is `plan`, a generator of actions.
 
     Parameters
@@ -107,9 +108,9 @@ class SearchingPolicy:
             self._track(self.belief, observation)
         return next(self._run)
 
+    @abc.abstractmethod
     def plan(self) -> Iterator[Action]:
         """Actions from the first lock to the statement."""
-        raise NotImplementedError
 
     def _process(self) -> Iterator[Action]:
         while True:
