@@ -299,6 +299,8 @@ def verify(out: Path) -> list[str]:
     DatasetError
         If it is not finished.
     """
+    if not (out / INFO).is_file():
+        raise DatasetError(f"{out} holds no films: it has no {INFO}; make them with `phibench film make`")
     if not (out / CHECKSUMS).is_file():
         raise DatasetError(f"{out} has no {CHECKSUMS}: it was not finished; {_AGAIN}")
     lines = InputFile(out / CHECKSUMS, _AGAIN).read().decode("utf-8", errors="replace").splitlines()

@@ -173,7 +173,11 @@ def write_circle_picture(path: Path, image: NDArray[np.uint8], card: SensorCard,
 def verdict(found: Alignment) -> str:
     """Judgement in one sentence: centred or not, and how well the outline fits."""
     off = float(np.linalg.norm(found.move_world_m)) / found.sigma_m if found.sigma_m > 0.0 else math.inf
-    mark = "mirror centred, as far as the camera is known" if off < _SIGNIFICANT else "mirror off centre: move it"
+    mark = (
+        "mirror centred, as far as the camera is known: no move is needed"
+        if off < _SIGNIFICANT
+        else "mirror off centre: move it"
+    )
     outline = found.outline
     by_edge = "; by the edge in the picture alone: its light is not that of polished steel" if outline.by_edge else ""
     return (

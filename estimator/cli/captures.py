@@ -107,7 +107,8 @@ def _measure_folder(directory: Path, setting: Setting, out: Path | None) -> int:
         print(f"{result.row.name}: {text}{result.status}", flush=True)
 
     results = measured_pairs(directory, setting, told)
-    print(f"{write_results(out, results)}: {len(results)} pairs")
+    told_depth = sum(result.found is not None for result in results)
+    print(f"{write_results(out, results)}: D of {told_depth} of {len(results)} pairs")
     return 0 if all(result.status == "ok" for result in results) else 1
 
 
