@@ -10,7 +10,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -23,6 +23,8 @@ from phibench.datasets.film.film_plan import FilmPlan, film_plans, offset_range_
 from phibench.datasets.film.film_store import (
     CHECKSUMS,
     INFO,
+    LIGHT_IMAGES,
+    LIGHTS,
     RECIPE,
     SCHEMA_VERSION,
     FilmFolder,
@@ -30,11 +32,13 @@ from phibench.datasets.film.film_store import (
     FrameTruth,
     SetInfo,
     finite_or_none,
+    light_record,
     read_document,
     read_view,
     view_key,
     write_checksums,
     write_document,
+    write_records,
     write_spots,
     write_table,
     write_view,
@@ -156,7 +160,8 @@ def make_film(out: Path, plan: Plan, keys: dict[str, str], film: FilmPlan) -> st
     offsets, error = key_views(film, folder, keys[film.film_id], render, images)
     write_spots(folder.path / "spots.npz", images)
     write_table(folder.path / "film.parquet", rows)
-    names = ["film.parquet", "spots.npz", *(f"views/k{n:03d}.exr" for n in range(len(offsets)))]
+    lights = _make_lights(film, room, folder)
+    names = ["film.parquet", "spots.npz", *lights, *(f"views/k{n:03d}.exr" for n in range(len(offsets)))]
     info = FilmInfo(
         film=film.film_id,
         key=keys[film.film_id],
@@ -174,6 +179,38 @@ def make_film(out: Path, plan: Plan, keys: dict[str, str], film: FilmPlan) -> st
     )
     write_document(folder.done, info)
     return film.film_id
+
+
+def _make_lights(film: FilmPlan, room: Room, folder: FilmFolder) -> list[str]:
+    """Write images and truth of the other lights; return the files' names."""
+    names, records = [], []
+    for number, light in enumerate(film.scene.lights):
+        images, rows = light_images(film, room, number)
+        names.append(LIGHT_IMAGES.format(number))
+        write_spots(folder.path / names[-1], images)
+        records += [light_record(light.name, row) for row in rows]
+    if records:
+        names.append(LIGHTS)
+        write_records(folder.path / LIGHTS, records)
+    return names
+
+
+def light_images(film: FilmPlan, room: Room, number: int) -> tuple[list[RowsImage], list[FrameTruth]]:
+    """Another light in every frame, in its colour, and its truth."""
+    alone = replace(film, scene=film.scene.of_light(number))
+    times = [spot_time_s(alone.scene, frame) for frame in range(alone.scene.times.frames)]
+    images = frame_spots(alone, room, times)
+    colour = film.scene.lights[number].colour
+    if colour is not None:
+        images = [_coloured(one, colour) for one in images]
+    return images, frame_truths(alone, room, times, images)
+
+
+def _coloured(image: RowsImage, colour: tuple[float, ...]) -> RowsImage:
+    """Image whose planes are shares of the laser's red one."""
+    share = np.array(colour)[:, None, None]
+    stacks = (image.electrons_per_s, image.du_electrons_per_s_px, image.dv_electrons_per_s_px)
+    return RowsImage(image.u0_px, image.v0_px, *(share * stack[:1] for stack in stacks))
 
 
 def renderer(plan: Plan, film: FilmPlan, room: Room) -> Render:

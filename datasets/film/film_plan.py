@@ -10,21 +10,26 @@ import numpy as np
 
 from phibench.datasets.errors import DatasetError, RecipeError
 from phibench.datasets.plan.plan import PairPlan, Plan, make_plan
-from phibench.datasets.recipe.film_tables import FilmTable
-from phibench.datasets.recipe.tables import Recipe
+from phibench.datasets.recipe.build import spot_albedo
+from phibench.datasets.recipe.film_tables import FilmLightTable, FilmTable
+from phibench.datasets.recipe.spot_placement import by_ray
+from phibench.datasets.recipe.tables import OWN_ALBEDO, LaserTable, Recipe
 from phibench.datasets.rooms.room_files import RoomFiles
 from phibench.render.film.moving_rows import chief_uv_px
 from phibench.render.sensor.light import Region
-from phibench.scenes.frames import Array
+from phibench.scenes.frames import Array, as_vector
+from phibench.scenes.laser import LaserSpot
 from phibench.scenes.motion.carriage import Carriage, Encoder, Vibration
-from phibench.scenes.motion.film_scene import FilmScene, SpotPath, Waypoint, frames_of
+from phibench.scenes.motion.film_scene import FilmLight, FilmScene, SpotPath, Waypoint, frames_of
 from phibench.scenes.motion.film_times import BlinkCode, FilmTimes
+from phibench.scenes.room import Room
 from phibench.scenes.validation import SceneError
 
 TILE_PX = 32
 MARGIN_PX = 20  # a JPEG's unit and what demosaicing looks at, around a window
 KEY_PX = 1.2  # motion of the spot's image from key view to key view, before the proof is asked
 _SAMPLES = 257
+_DISC_ALBEDO = 0.5  # of a light, where the laser's spot takes that of the surface
 
 
 @dataclass(frozen=True)
@@ -115,13 +120,47 @@ def film_scene(plan: Plan, table: FilmTable, pair: PairPlan) -> FilmScene:
         for number, one in enumerate(table.vibration)
     )
     path = SpotPath(tuple(Waypoint(*row) for row in table.path))
-    return FilmScene(rig, plan.spots[pair.spot], times, carriage, bands, path, BlinkCode(table.code, table.bit_s))
+    code = BlinkCode(table.code, table.bit_s, table.code_start_s)
+    lights = _lights(plan, table, pair, code)
+    return FilmScene(rig, plan.spots[pair.spot], times, carriage, bands, path, code, lights)
+
+
+def _lights(plan: Plan, table: FilmTable, pair: PairPlan, code: BlinkCode) -> tuple[FilmLight, ...]:
+    """Other lights of a film."""
+    if not table.lights:
+        return ()
+    room, laser = plan.room(pair.room), plan.recipe.laser
+    if laser.albedo == OWN_ALBEDO:  # a light is a disc, which may move; a beam's spot stays where it ends
+        laser = laser.model_copy(update={"albedo": _DISC_ALBEDO})
+    return tuple(_light(laser, room, one, code) for one in table.lights)
+
+
+def _light(laser: LaserTable, room: Room, table: FilmLightTable, code: BlinkCode) -> FilmLight:
+    azimuth, elevation = np.array([table.azimuth_deg]), np.array([table.elevation_deg])
+    if table.distance_m is None:
+        [found] = by_ray(laser, room, azimuth, np.array([table.height_m]), elevation)
+        if isinstance(found, str):
+            raise SceneError(f"light '{table.name}': {found}; give another direction, or distance_m")
+        spot = found[1]
+    else:
+        turn, rise = np.radians(azimuth[0]), np.radians(elevation[0])
+        ray = np.array([math.cos(turn) * math.cos(rise), math.sin(turn) * math.cos(rise), math.sin(rise)])
+        place = np.array([0.0, 0.0, table.height_m]) + table.distance_m * ray
+        if room.solid_around(as_vector(place)) is not None:
+            raise SceneError(f"light '{table.name}' lies within the room's things; give another distance_m")
+        diameter = laser.diameter_base_m + laser.diameter_growth_m_per_m * table.distance_m
+        albedo = spot_albedo(laser.albedo, None) or _DISC_ALBEDO
+        spot = LaserSpot(as_vector(place), as_vector(-ray), diameter, albedo, laser.power_w, laser.wavelength_nm)
+    spot = replace(spot, power_w=table.power_ratio * laser.power_w, diameter_m=table.diameter_m or spot.diameter_m)
+    own = code if table.follows_laser else BlinkCode(table.code, table.bit_s, table.code_start_s)
+    path = SpotPath(tuple(Waypoint(*row) for row in table.path))
+    return FilmLight(table.name, spot, path, own, table.colour, table.follows_laser, table.is_target)
 
 
 def nominal_scene(plan: Plan, scene: FilmScene, pair: PairPlan, table: FilmTable) -> FilmScene:
     """Scene as an estimator may take it to be: it knows neither vibration nor the path of the target."""
     rig, carriage = plan.rigs[pair.nominal_rig], _carriage(table, pair.nominal_stroke_m)
-    return replace(scene, rig=rig, carriage=carriage, vibrations=(), path=SpotPath())
+    return replace(scene, rig=rig, carriage=carriage, vibrations=(), path=SpotPath(), lights=())
 
 
 def _carriage(table: FilmTable, stroke_m: float) -> Carriage:

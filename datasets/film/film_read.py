@@ -13,7 +13,7 @@ Examples
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -29,6 +29,8 @@ from phibench.datasets.film.film_plan import FilmPlan, film_plans
 from phibench.datasets.film.film_store import (
     CHECKSUMS,
     INFO,
+    LIGHT_IMAGES,
+    LIGHTS,
     RECIPE,
     SCHEMA_VERSION,
     FilmFolder,
@@ -48,11 +50,12 @@ from phibench.render.film.moving_rows import RowsImage
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import truth_layer
 from phibench.render.sensor.camera_chain import Chain
-from phibench.render.sensor.light import Light, Region
+from phibench.render.sensor.light import Light, OtherSpot, Region
 from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.processing import decoded
 from phibench.render.sensor.settings import Sensor, sensor
 from phibench.scenes.frames import Array
+from phibench.scenes.motion.film_scene import FilmScene
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,18 @@ class Film:
         return read_spots(self.folder.path / "spots.npz", self.info.frames)
 
     @cached_property
+    def lights_table(self) -> polars.DataFrame:
+        """Truth of other lights, a row per light and frame: `light`, and the columns of `table` without the encoder."""
+        frames = self.info.frames * len(self.plan.scene.lights)
+        return read_table(self.folder.path / LIGHTS, frames) if frames else polars.DataFrame()
+
+    @cached_property
+    def light_spots(self) -> list[list[RowsImage]]:
+        """Other lights, one list per light, as `spots`."""
+        count = range(len(self.plan.scene.lights))
+        return [read_spots(self.folder.path / LIGHT_IMAGES.format(n), self.info.frames) for n in count]
+
+    @cached_property
     def views(self) -> NDArray[np.float32]:
         """Key views of the room, shape (keys, 3, h, w), electrons per second."""
         region = self.info.region
@@ -125,9 +140,7 @@ class Film:
         region, (height, width) = self.info.region, self.plan.size
         ambient = np.zeros((3, height, width), np.float32)
         ambient[(slice(None), *region.slices())] = self.room(frame)
-        one = self.spots[frame]
-        stacks = (one.electrons_per_s, one.du_electrons_per_s_px, one.dv_electrons_per_s_px)
-        return Light(ambient, SpotWindow(one.u0_px, one.v0_px, *stacks), f_number=self.plan.scene.rig.camera.f_number)
+        return film_light(self.plan.scene, ambient, self.spots[frame], [one[frame] for one in self.light_spots])
 
     def window(self, frame: int, side_px: int | None = None) -> Region:
         """Pixels of a frame that are drawn: the square around the spot, or the whole image.
@@ -229,6 +242,15 @@ class Film:
         if not 0 <= frame < self.info.frames:
             raise DatasetError(f"frame {frame}: film {self.info.film} has frames 0 to {self.info.frames - 1}")
         return frame
+
+
+def film_light(scene: FilmScene, room: NDArray[Any], spot: RowsImage, others: Sequence[RowsImage] = ()) -> Light:
+    """Light of a frame from its room, shape (3, H, W), the target's spot and the other lights' in their order."""
+    stacks = (spot.electrons_per_s, spot.du_electrons_per_s_px, spot.dv_electrons_per_s_px)
+    told = zip(others, scene.lights, strict=True)
+    beside = tuple(OtherSpot(image, light.follows_laser) for image, light in told if image.electrons_per_s.size)
+    window = SpotWindow(spot.u0_px, spot.v0_px, *stacks)
+    return Light(room, window, f_number=scene.rig.camera.f_number, others=beside)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ film.json                  the data set: recipe, code, what each film holds and 
 recipe.toml
 films/<film>/film.parquet  truth, a row per frame
 films/<film>/spots.npz     the spot in each frame, electrons per second over the exposure
+films/<film>/lights.parquet  truth of other lights, a row per light and frame; light00.npz, ... their images
 films/<film>/views/k000.exr  key views of the room
 films/<film>/done.json     what the film was made from; a film that has it is complete
 SHA256SUMS
@@ -36,6 +37,7 @@ from phibench.render.sensor.light import Region
 from phibench.scenes.camera import FILTERS
 
 INFO, RECIPE, CHECKSUMS = "film.json", "recipe.toml", "SHA256SUMS"
+LIGHTS, LIGHT_IMAGES = "lights.parquet", "light{:02d}.npz"
 SCHEMA_VERSION = 1
 _Model = TypeVar("_Model", bound=Document)
 _AGAIN = "run `phibench film make` again"
@@ -244,10 +246,20 @@ def _columns(one: InstantTruth) -> dict[str, Any]:
     return {name: list(v) if isinstance(v, tuple) else v for name, v in {**flat, **spot, **rates}.items()}
 
 
+def light_record(name: str, row: FrameTruth) -> dict[str, Any]:
+    """Row of `lights.parquet`: that of `film.parquet` without the encoder."""
+    return {"light": name} | {key: value for key, value in row.record().items() if not key.startswith("encoder")}
+
+
 def write_table(path: Path, rows: Sequence[FrameTruth]) -> None:
     """Write `film.parquet`."""
+    write_records(path, [row.record() for row in rows])
+
+
+def write_records(path: Path, records: Sequence[dict[str, Any]]) -> None:
+    """Write a Parquet file of rows."""
     buffer = io.BytesIO()
-    table = polars.DataFrame([row.record() for row in rows], infer_schema_length=None)
+    table = polars.DataFrame(records, infer_schema_length=None)
     table.write_parquet(buffer, compression="zstd", statistics=False)
     write_bytes(path, buffer.getvalue())
 

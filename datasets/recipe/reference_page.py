@@ -13,7 +13,7 @@ from pydantic import BaseModel
 
 from phibench.datasets.recipe.build import CAMERA_KEYS
 from phibench.datasets.recipe.distributions import DistributionTable, TargetChoice
-from phibench.datasets.recipe.film_tables import FilmTable, VibrationTable
+from phibench.datasets.recipe.film_tables import FilmLightTable, FilmTable, VibrationTable
 from phibench.datasets.recipe.mirror_tables import HolderTable, MirrorTable, ReflectionTable
 from phibench.datasets.recipe.room_tables import (
     GeometryTable,
@@ -74,6 +74,7 @@ TABLES: dict[str, type[BaseModel]] = {
     "[frames]": FramesTable,
     "[film]": FilmTable,
     "[[film.vibration]]": VibrationTable,
+    "[[film.lights]]": FilmLightTable,
     "[[distractors]]": DistractorTable,
     "a distribution": DistributionTable,
 }
@@ -193,6 +194,10 @@ waypoint to waypoint: to the right, seen from its front, and up. The board, or w
 """,
     "[[film.vibration]]": """Each of 16 equal parts of the band has a sine wave, its frequency and phase drawn from
 the seed. Bands add up.
+""",
+    "[[film.lights]]": """Flat diffuse discs beside the target's spot: what a robot may take for its target, and
+further targets. Each has a place, a power, a colour, a code and a path. A light that follows the laser is a
+reflection. Their images and their truth are stored with the film's.
 """,
     "[random]": """Instead of `[[experiments]]`: `samples` stroke pairs, each with a rig, a spot and a stroke that are
 drawn. Sample i depends on the rest of the recipe and on i, not on `samples`. Make the same

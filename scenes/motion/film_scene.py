@@ -80,6 +80,34 @@ def across_and_up(spot: LaserSpot) -> Array:
 
 
 @dataclass(frozen=True)
+class FilmLight:
+    """Another light of a film: a lamp, a reflection, another laser or target.
+
+    Parameters
+    ----------
+    name : str
+    spot : LaserSpot
+        At the start of its path; a disc.
+    path : SpotPath
+    code : BlinkCode
+    colour : 3 floats or None
+        Electrons behind R, G, B over those of the laser behind red; None is the laser's own colour.
+    follows_laser : bool
+        It goes out with the laser, as a reflection does.
+    is_target : bool
+        It is looked for by its code, beside the target.
+    """
+
+    name: str
+    spot: LaserSpot
+    path: SpotPath = SpotPath()
+    code: BlinkCode = BlinkCode()
+    colour: tuple[float, ...] | None = None
+    follows_laser: bool = False
+    is_target: bool = False
+
+
+@dataclass(frozen=True)
 class FilmScene:
     """Rig, spot and their motions over the times of a film.
 
@@ -94,6 +122,8 @@ class FilmScene:
     vibrations : tuple of Vibration
     path : SpotPath
     code : BlinkCode
+    lights : tuple of FilmLight
+        Other lights.
     """
 
     rig: Rig
@@ -103,6 +133,7 @@ class FilmScene:
     vibrations: tuple[Vibration, ...] = ()
     path: SpotPath = SpotPath()
     code: BlinkCode = BlinkCode()
+    lights: tuple[FilmLight, ...] = ()
 
     def __post_init__(self) -> None:
         if self.rig.motion is not None:
@@ -114,6 +145,17 @@ class FilmScene:
                 f"FilmScene.code takes {self.code.duration_s:g} s and the film {self.times.duration_s:g} s: a film "
                 "must hold the whole code; give more frames or a shorter code"
             )
+        for light in self.lights:
+            if light.code.duration_s > self.times.duration_s * (1.0 + 1e-9):
+                raise SceneError(
+                    f"light '{light.name}': its code takes {light.code.duration_s:g} s and the film "
+                    f"{self.times.duration_s:g} s: a film must hold the whole code; give more frames or a shorter code"
+                )
+
+    def of_light(self, number: int) -> FilmScene:
+        """Same film with another light in place of the target's spot."""
+        one = self.lights[number]
+        return replace(self, spot=one.spot, path=one.path, code=one.code, lights=())
 
     def offset_m(self, times_s: Times) -> Array:
         """Carriage and vibration along the stroke axis."""

@@ -2,10 +2,12 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import polars
 import pytest
 from conftest import ROOT
 
@@ -20,6 +22,8 @@ from phibench.datasets.film.film_video import read_frames, write_frames, write_m
 from phibench.datasets.recipe.load import parse_recipe
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
+from phibench.render.sensor.camera_chain import Chain
+from phibench.render.sensor.noise_tiles import NoiseStream
 
 TEXT = (ROOT / "tests" / "films.toml").read_text(encoding="utf-8")
 FILM = "seen-near-h0.300"
@@ -88,6 +92,28 @@ def test_laser_off_frames_have_no_spot_and_others_have_their_flux(film_windows: 
         # a rolling shutter stretches what moves down by (px per s) x (time from row to row): 5 px/s x 0.33 ms = 2e-3
         assert film.spots[frame].electrons_per_s[0].sum() == pytest.approx(level * total, rel=4e-3, abs=1.0)
     assert seen == {0.0, 1.0}
+
+
+def test_other_lights_have_their_own_code_colour_and_path(film_images: Path) -> None:
+    film = film_of(film_images)
+    assert [one.name for one in film.plan.scene.lights] == ["beacon", "lamp"]
+    rows = {name: film.lights_table.filter(polars.col("light") == name) for name in ("beacon", "lamp")}
+    laser, lamp = film.light_spots
+    # bits of 0.2 s and frames of 0.1 s: two frames lit, two dark, but for rows that see an edge of the code
+    level = rows["beacon"]["row_laser_level"].to_numpy()
+    light = np.array([one.electrons_per_s[0].sum() for one in laser])
+    assert set(np.round(level, 9)) >= {0.0, 1.0}
+    assert light[level == 0.0].max(initial=0.0) < 1e-3 * light.max()
+    # a lamp of the colour (0.5, 1.0, 0.8), and it moves
+    planes = np.array([one.electrons_per_s.sum(axis=(1, 2)) for one in lamp])
+    np.testing.assert_allclose(planes[:, 0] / planes[:, 1], 0.5, rtol=1e-5)
+    assert np.ptp(rows["lamp"]["row_u_px"].to_numpy()) > 1.0
+    # a frame holds the light: one electron per photon that is counted, whatever else there is
+    k = int(np.argmax(light))
+    chain, both = Chain(film.sensor("ideal"), 0, film.plan.scene.rig.camera), film.light(k)
+    stream = NoiseStream(("light", k))
+    more = chain.frame(both, stream) - chain.frame(replace(both, others=both.others[1:]), stream)
+    assert more[0].sum() == pytest.approx(film.sensor("ideal").exposure_s * light[k], rel=1e-4)
 
 
 def test_a_killed_run_goes_on_and_gives_the_same_bytes(film_windows: Path, tmp_path: Path, monkeypatch: Any) -> None:
@@ -177,6 +203,8 @@ def faulty(change: str, by: str = "") -> str:
         (faulty("rate_hz = 10.0", "rate_hz = 60.0\nexposure_s = 0.02"), r"longer than a frame"),
         (faulty("high_hz = 20.0", "high_hz = 2.0"), r"exchange them"),
         (faulty("frames = 10", "path = [[1.0, 0.0, 0.0], [0.5, 0.1, 0.0]]"), r"must rise"),
+        (faulty('name = "lamp"', 'name = "target"'), r"must differ"),
+        (faulty('code = "10"', 'code = "10000000"'), r"light 'beacon'.*must hold the whole code"),
         (faulty("speed_m_per_s = 1.0", "speed = 0.5"), r"speed_m_per_s"),
         (faulty("[film]", "[misalignment]\nyaw_rad = 0.01\n[film]"), r"has \[\[film.vibration\]\] instead"),
         (TEXT[: TEXT.index("[film]")], r"has no \[film\]"),
@@ -192,7 +220,7 @@ def test_a_target_that_is_never_seen_is_one_sentence(tmp_path: Path) -> None:
     # behind the cabinet of the lab
     hidden = TEXT.replace("depth_m = 1.5", "depth_m = 4.9").replace("azimuth_deg = 100.0", "azimuth_deg = 228.1")
     hidden = hidden.replace("height_m = 0.50", "height_m = 0.45").replace("frames = 10", "frames = 3")
-    recipe.write_text(hidden.replace('code = "110"\n', ""), encoding="utf-8")
+    recipe.write_text(hidden.replace('code = "110"\n', "").replace('code = "10"\n', ""), encoding="utf-8")
     with pytest.raises(DatasetError, match=r"never seen|an image all the time"):
         make_films(recipe, tmp_path / "out", 1)
 
