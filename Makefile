@@ -55,7 +55,7 @@ $(READY): pyproject.toml constraints.txt
 	    echo "Making $(VENV) with $$python"; \
 	    "$$python" -m venv --clear $(VENV) )
 	@echo "Installing phibench and what it needs (some minutes the first time)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[render,cluster,study,film,test,check]'
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[render,cluster,study,film,export,test,check]'
 	@$(BIN)/python -m phibench.render.setup.llvm
 	@touch $@
 

@@ -138,7 +138,7 @@ def draw_frames(
 def perform(job: SampleJob) -> tuple[list[FrameRow], int]:
     """Do a job: rows of all its files, and how many were written."""
     sample = _opened(job.dataset, sha256(job.dataset / schema.CHECKSUMS))[job.sample_id]
-    base, source = _key_base(sample, job.request), None
+    base, source = sample_key(sample, job.request), None
     rows, made = [], 0
     with working(job.out):
         for item in job.items:
@@ -279,8 +279,8 @@ def _document(request: FrameRequest) -> dict[str, object]:
     return document
 
 
-def _key_base(sample: Sample, request: FrameRequest) -> str:
-    """Hash of what all files of a sample depend on."""
+def sample_key(sample: Sample, request: FrameRequest) -> str:
+    """Hash of all that the frames of a sample depend on: names, numbers, layers, code, libraries."""
     listed = read_checksums(sample.dataset.folder)
     layers = [listed.get(schema.RIGS)]
     for position in POSITIONS:

@@ -113,10 +113,15 @@ def verify(directory: Path) -> int:
     Parameters
     ----------
     directory
-        Folder of a data set.
+        Folder of a data set, or of an export.
     """
+    from phibench.datasets.export.export_make import INFO, verify_export
     from phibench.datasets.verify import verify as verify_dataset
 
+    if (directory / INFO).is_file():
+        faults = verify_export(directory)
+        print("\n".join([*faults, f"{directory}: {len(faults)} faults"]))
+        return 1 if faults else 0
     report = verify_dataset(directory)
     for fault in report.faults:
         print(fault)
@@ -200,6 +205,71 @@ def frames(
     for note in done.notes:
         print(f"note: {note}")
     print(f"{done.folder}: {done.made} files written, {done.kept} kept, index frames.jsonl and frames.parquet")
+    return 0
+
+
+def export(
+    directory: Path,
+    *,
+    to: Literal["parquet", "webdataset", "frames"],
+    out: Path,
+    preset: str = DEFAULT_PRESET,
+    draws: Whole = 1,
+    laser_off: bool = False,
+    exposure: str | None = None,
+    region: Whole | None = None,
+    camera_seed: Whole = 0,
+    split_by: Literal["both", "rig", "room"] = "both",
+    validation: float = 0.1,
+    test: float = 0.1,
+    pairs_per_shard: Whole = 64,
+    workers: Whole | None = None,
+) -> int:
+    """Write a data set's pairs for other tools, with truth, splits, card, licence and Croissant description.
+
+    What is finished already is kept. `phibench dataset verify` checks an export, too.
+
+    Parameters
+    ----------
+    directory
+        Folder of a data set.
+    to
+        "parquet" (read by `datasets`), "webdataset" (tar files) or "frames" (image files).
+    out
+        Folder to write.
+    preset
+        Where the camera's chain ends: "mono-raw", "bayer-raw", "srgb8", "yuyv" or "mjpeg" (the camera's own JPEG).
+    draws
+        Draws of the noise of every pair.
+    laser_off
+        Also every image without the spot.
+    exposure
+        As in `phibench dataset frames`.
+    region
+        Side in pixels of a square around the spot, instead of the whole image.
+    camera_seed
+        Names the camera whose fixed pattern the frames share.
+    split_by
+        What no two splits share: "both" rig and room, or one of them.
+    validation, test
+        Shares of the pairs, at most; the rest is for training. A set of one rig or room is all for training.
+    pairs_per_shard
+        Pairs in one file of Parquet or tar, or in one folder of image files.
+    workers
+        Number of processes; one for each core by default.
+    """
+    from phibench.datasets.export.export_make import export as export_pairs
+    from phibench.datasets.export.pair_rows import ExportRequest
+    from phibench.datasets.frames.request import FrameRequest, default_exposure, exposure_of
+
+    seconds = default_exposure(preset) if exposure is None else exposure_of(exposure)
+    frames_request = FrameRequest(preset, seconds, region=region, camera_seed=camera_seed)
+    request = ExportRequest(to, frames_request, draws, laser_off, split_by, validation, test, pairs_per_shard)
+    done = export_pairs(directory, request, out, workers=workers)
+    for note in done.notes:
+        print(f"note: {note}")
+    counts = ", ".join(f"{count} {name}" for name, count in done.pairs.items())
+    print(f"{done.folder}: pairs {counts}; {done.made} shards written, {done.kept} kept")
     return 0
 
 

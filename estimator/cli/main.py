@@ -24,10 +24,10 @@ from cyclopts import App, CycloptsError
 from phibench.datasets.parallel import ONE_THREAD
 from phibench.estimator.cli.calibration import align, calibrate
 from phibench.estimator.cli.captures import import_, measure
-from phibench.estimator.cli.dataset import dataset
+from phibench.estimator.cli.dataset import dataset, export
 from phibench.estimator.cli.film import film
 from phibench.estimator.cli.methods import method
-from phibench.estimator.cli.options import INSTALLATION, METHODS, SENSOR, answer_to_old_spelling
+from phibench.estimator.cli.options import DATA, INSTALLATION, METHODS, SENSOR, answer_to_old_spelling
 from phibench.estimator.cli.room import room
 from phibench.estimator.cli.score import bench, compare, report, score
 from phibench.estimator.cli.seal import seal
@@ -42,6 +42,7 @@ app = App(
 )
 for _group in (dataset, film, room, method, seal, sensor, study):
     app.command(_group)
+app.command(export, group=DATA)
 app.command(score, group=METHODS)
 app.command(bench, group=METHODS)
 app.command(compare, group=METHODS)
