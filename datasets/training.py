@@ -1,0 +1,356 @@
+"""Data sets for training, as maps from an index to NumPy arrays; PyTorch's loaders take them as they are.
+
+`PairDataset` has whole pairs, with new noise in every epoch. `SpotCrops` has crops about the spot. It moves each spot
+by fractions of a pixel and over all places in the mosaic and in the blocks of JPEG, so that 10^5 crops of a few hundred
+spots show 10^5 different phases.
+
+An item is a function of (seed, epoch, index) alone. The number of processes that load, and their order, do not enter.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.request import FrameRequest, in_one_sentence, whole_number
+from phibench.datasets.frames.source import FrameSource
+from phibench.datasets.read import Dataset, open_finished
+from phibench.datasets.store.layers import SpotWindow
+from phibench.render.sensor.camera_chain import Chain, auto_exposed
+from phibench.render.sensor.light import Light, Region
+from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.scenes.frames import Array
+from phibench.scenes.random_streams import generator
+from phibench.scenes.rig import POSITIONS
+
+Item = dict[str, Any]
+PERIOD_PX = 16  # of JPEG units with chroma of half resolution; a multiple of the mosaic's 2
+_MARGIN_PX = 32  # of a crop: what demosaicing, denoising and the units beside it look at
+_OPENED_SOURCES = 8
+
+
+class PairDataset:
+    """Pairs of frames of a data set, one draw per epoch.
+
+    Item k is a dict: "down" and "up", the images as `Frame.image`; "sample_id"; "depth_m" and "stroke_m"; for both
+    positions "u_px", "v_px", "phi_ray_rad" and "visible" with "down_" or "up_" before, and "u0_px" and "v0_px", the
+    image's first column and row on the sensor.
+
+    Parameters
+    ----------
+    folder : folder of a finished data set
+    preset, options : as `Sample.frame_source`
+    samples : ids; all by default
+    laser_off : bool
+        Also "down_off" and "up_off".
+
+    Raises
+    ------
+    DatasetError
+        If the data set or the options will not do.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        preset: str = "mjpeg",
+        *,
+        samples: Sequence[str] | None = None,
+        laser_off: bool = False,
+        **options: Any,
+    ) -> None:
+        self.folder, self.request = Path(folder), FrameRequest.of(preset, options)
+        dataset = _opened(self.folder)
+        names = [row.sample_id for row in dataset.rows] if samples is None else list(samples)
+        self.sample_ids = tuple(dataset[name].row.sample_id for name in names)
+        self.laser_off, self.epoch = laser_off, 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the draw of all items; call it before a loader starts its workers."""
+        self.epoch = whole_number("epoch", epoch)
+
+    def __len__(self) -> int:
+        return len(self.sample_ids)
+
+    def __getitem__(self, index: int) -> Item:
+        source = _source(self.folder, self.sample_ids[_place(index, len(self))], _Hashed(self.request))
+        row = _opened(self.folder)[source.names[2]].row
+        item: Item = {"sample_id": row.sample_id, "depth_m": row.depth_m, "stroke_m": row.stroke_m}
+        for position in POSITIONS:
+            frame, truth = source.frame(position, self.epoch), row.position(position)
+            item[position] = frame.image
+            if self.laser_off:
+                item[f"{position}_off"] = source.frame(position, self.epoch, laser=False).image
+            item |= {f"{position}_{name}": getattr(truth, name) for name in _TRUTH}
+            item |= {f"{position}_u0_px": frame.region.u0_px, f"{position}_v0_px": frame.region.v0_px}
+        return item
+
+
+_TRUTH = ("u_px", "v_px", "phi_ray_rad", "visible")
+
+
+@dataclass(frozen=True)
+class CropSettings:
+    """What crops are drawn from.
+
+    Parameters
+    ----------
+    side_px : int
+        Side of a crop.
+    spread_px : float
+        The spot lies up to this far from the crop's middle, in u and in v, uniformly.
+    laser_levels : 2 floats
+        Range of the factor of the spot's light, drawn uniformly in its logarithm.
+    cameras : int
+        Number of fixed patterns.
+    """
+
+    side_px: int = 32
+    spread_px: float = 4.0
+    laser_levels: tuple[float, float] = (0.25, 4.0)
+    cameras: int = 1000
+
+    def __post_init__(self) -> None:
+        whole_number("side_px", self.side_px, 8)
+        whole_number("cameras", self.cameras, 1)
+        if not 0.0 <= self.spread_px <= self.side_px / 2:
+            raise DatasetError(f"spread_px = {self.spread_px:g}: must be from 0 to half a side, {self.side_px / 2:g}")
+        low, high = self.laser_levels
+        if not (math.isfinite(high) and 0.0 < low <= high):
+            raise DatasetError(
+                f"laser_levels = {self.laser_levels}: must be two numbers above 0, the smaller one first"
+            )
+
+    @property
+    def patch_px(self) -> int:
+        """Side of the simulated square that holds the crop at every phase."""
+        return -(-(self.side_px + 2 * _MARGIN_PX + PERIOD_PX) // PERIOD_PX) * PERIOD_PX
+
+
+class SpotCrops:
+    """Crops about the spots of data sets, at every phase of pixel, mosaic and JPEG unit.
+
+    Item k is a dict: "image" as `Frame.image`; "uv_px", shape (2,), the true image of the spot's centre in the crop;
+    "phase_px", shape (2,), column and row of the crop's first pixel on the sensor, modulo 16; "sample_id" and
+    "position" of the spot; "laser_level"; "preset".
+
+    The light of a spot and of what surrounds it is that of the data set. It is moved over the sensor as a whole, by
+    whole pixels, and the spot by the fraction that is left. The room under the spot keeps its place to half a pixel.
+
+    Parameters
+    ----------
+    folders : folders of finished data sets
+    requests : sequence of FrameRequest
+        One of them is drawn for every crop.
+    length : int
+        Crops in an epoch.
+    seed : int
+    settings : CropSettings
+
+    Raises
+    ------
+    DatasetError
+        If a data set or a setting will not do, or no spot is seen.
+    """
+
+    def __init__(
+        self,
+        folders: Sequence[str | Path],
+        requests: Sequence[FrameRequest],
+        length: int,
+        *,
+        seed: int = 0,
+        settings: CropSettings | None = None,
+    ) -> None:
+        self.settings, self.requests = settings or CropSettings(), tuple(requests)
+        self.length, self.seed, self.epoch = whole_number("length", length, 1), whole_number("seed", seed), 0
+        if not self.requests:
+            raise DatasetError("requests is empty: give at least one FrameRequest")
+        if any(request.region is not None for request in self.requests):
+            raise DatasetError("region: the crops have a side of their own, CropSettings.side_px")
+        self._sides = tuple(_sides([open_finished(folder) for folder in folders], self.settings))
+        if not self._sides:
+            raise DatasetError("no spot is seen in these data sets: there is nothing to crop")
+        self._sensors: dict[tuple[int, int], Chain] = {}
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose new crops; call it before a loader starts its workers."""
+        self.epoch = whole_number("epoch", epoch)
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __getitem__(self, index: int) -> Item:
+        k = _place(index, self.length)
+        names = ("crops", self.seed, self.epoch, k)
+        draw, s = generator(*names), self.settings
+        side = self._sides[int(draw.integers(len(self._sides)))]
+        number = int(draw.integers(len(self.requests)))
+        low, high = np.log(s.laser_levels)
+        level = float(np.exp(draw.uniform(low, high)))
+        phase = draw.integers(PERIOD_PX, size=2)
+        place = (s.side_px - 1) / 2 + draw.uniform(-s.spread_px, s.spread_px, 2)
+        first = _MARGIN_PX + phase  # of the crop, in the square
+        request = self.requests[number]
+        light = side.moved(first + place, s.patch_px, request.lamp_level, request.laser_level * level)
+        chain = replace(self._chain(side, number), camera_seed=int(draw.integers(s.cameras)))
+        region = Region(*(int(x) for x in (*first, *(first + s.side_px))))
+        with in_one_sentence():
+            image = chain.frame(light, NoiseStream((*names, "noise")), region)
+        return {
+            "image": image,
+            "uv_px": place,
+            "phase_px": phase,
+            "sample_id": side.sample_id,
+            "position": side.position,
+            "laser_level": level,
+            "preset": request.preset,
+        }
+
+    def _chain(self, side: _Side, number: int) -> Chain:
+        """Camera of a spot for a request; its exposure is that of the whole image."""
+        key = id(side), number
+        if key not in self._sensors:
+            request, sensor = self.requests[number], self.requests[number].sensor()
+            if request.exposure == "auto":
+                # it looks at every eighth pixel: repeated, so that it finds these where it looks
+                planes = side.coarse.repeat(_STEP_PX, 1).repeat(_STEP_PX, 2)
+                sensor = auto_exposed(sensor, Light(planes, lamp_level=request.lamp_level, f_number=side.f_number))
+            self._sensors[key] = Chain(sensor)
+        return self._sensors[key]
+
+    def __getstate__(self) -> Mapping[str, Any]:
+        return {**self.__dict__, "_sensors": {}}  # filled anew in each process
+
+
+@dataclass(frozen=True, eq=False)
+class _Side:
+    """One spot: its window, what surrounds it, and every eighth pixel of the whole image for auto exposure."""
+
+    sample_id: str
+    position: str
+    uv_px: Array
+    window: SpotWindow
+    around: NDArray[np.float32]
+    origin: tuple[int, int]
+    coarse: NDArray[np.float32]
+    f_number: float
+
+    def moved(self, uv_px: Array, size_px: int, lamp_level: float, laser_level: float) -> Light:
+        """Light on a square of `size_px` pixels, with the spot's centre at `uv_px` in it."""
+        shift = uv_px - self.uv_px
+        whole = np.floor(shift + 0.5).astype(int)
+        columns, rows = (
+            np.clip(np.arange(size_px) - whole[axis] - self.origin[axis], 0, self.around.shape[2 - axis] - 1)
+            for axis in (0, 1)
+        )
+        planes = shifted_spot(self.window, *(shift - whole))
+        nothing = np.zeros_like(planes)
+        spot = SpotWindow(
+            self.window.u0_px + int(whole[0]), self.window.v0_px + int(whole[1]), planes, nothing, nothing
+        )
+        return Light(
+            self.around[:, rows][:, :, columns],
+            spot,
+            lamp_level=lamp_level,
+            laser_level=laser_level,
+            f_number=self.f_number,
+        )
+
+
+_STEP_PX = 8
+
+
+def _sides(datasets: Sequence[Dataset], settings: CropSettings) -> list[_Side]:
+    """All spots that are seen, with light enough around them for every phase."""
+    reach = settings.patch_px
+    found = []
+    for dataset in datasets:
+        for sample in dataset.samples:
+            for position in POSITIONS:
+                truth = sample.truth_row(position)
+                if not truth.visible or truth.spot_file is None:
+                    continue
+                ambient, middle = sample.ambient(position), np.array([truth.u_px, truth.v_px])
+                u0, v0 = (max(int(x) - reach, 0) for x in middle)
+                around = ambient[:, v0 : int(middle[1]) + reach, u0 : int(middle[0]) + reach].copy()
+                coarse = ambient[:, ::_STEP_PX, ::_STEP_PX].copy()
+                found.append(
+                    _Side(
+                        sample.row.sample_id,
+                        position,
+                        middle,
+                        sample.spot(position),
+                        around,
+                        (u0, v0),
+                        coarse,
+                        sample.rig.camera.f_number,
+                    )
+                )
+    return found
+
+
+def shifted_spot(window: SpotWindow, du_px: float, dv_px: float) -> Array:
+    """Planes of a spot whose image is moved by a fraction of a pixel, shape of the window's own.
+
+    Samples and derivatives at whole pixels together determine a function whose spectrum ends below one cycle per pixel
+    (D. L. Jagerman and L. J. Fogel, "Some general aspects of the sampling theorem", 1956). Samples alone would fold
+    what lies beyond half a cycle: 6 % of a spot with a blur of 0.7 px.
+
+    With F the spectrum, f from -1/2 to 1/2 and g = f - sign(f), samples have S = F(f) + F(g) along each axis.
+    Derivatives by a shift, which are minus those by the place, have -2 pi i (f F(f) + g F(g)). So F(g) is known in u
+    and in v. What is folded in both at once, 0.06^2 of the spot, is taken as if the spectrum were a product.
+    """
+    shape = window.electrons_per_s.shape[1:]
+    pad = [(0, 0), (2, 2), (2, 2)]
+    layers = window.electrons_per_s, window.du_electrons_per_s_px, window.dv_electrons_per_s_px
+    whole, by_u, by_v = (np.fft.fft2(np.pad(planes, pad)) for planes in layers)
+    f_v, f_u = (np.fft.fftfreq(n + 4).reshape(place) for n, place in zip(shape, ((-1, 1), (1, -1)), strict=True))
+    sign_v, sign_u = (np.where(f < 0.0, -1.0, 1.0) for f in (f_v, f_u))
+    folded_u = (f_u * whole - by_u / (-2j * np.pi)) * sign_u
+    folded_v = (f_v * whole - by_v / (-2j * np.pi)) * sign_v
+    turn = np.exp(-2j * np.pi * (f_u * du_px + f_v * dv_px))
+    back_u, back_v = np.exp(2j * np.pi * sign_u * du_px), np.exp(2j * np.pi * sign_v * dv_px)
+    both = folded_u * folded_v * whole.conj() / (np.abs(whole) ** 2 + (1e-6 * np.abs(whole).max()) ** 2)
+    back_u, back_v = back_u - 1.0, back_v - 1.0
+    moved = turn * (whole + folded_u * back_u + folded_v * back_v + both * back_u * back_v)
+    return np.maximum(np.fft.ifft2(moved).real[:, 2 : shape[0] + 2, 2 : shape[1] + 2], 0.0)
+
+
+class _Hashed:
+    """A request as a key of a cache: its numbers are a dict."""
+
+    def __init__(self, request: FrameRequest) -> None:
+        self.request, self._key = request, repr(request.document())
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Hashed) and other._key == self._key
+
+
+@lru_cache(maxsize=4)
+def _opened(folder: Path) -> Dataset:
+    return open_finished(folder)
+
+
+@lru_cache(maxsize=_OPENED_SOURCES)
+def _source(folder: Path, sample_id: str, request: _Hashed) -> FrameSource:
+    return FrameSource.from_request(_opened(folder)[sample_id], request.request)
+
+
+def _place(index: int, length: int) -> int:
+    """Index from 0, as a list takes it."""
+    k = index + length if index < 0 else index
+    if not 0 <= k < length:
+        raise IndexError(f"index {index}: there are {length} items")
+    return k
