@@ -99,7 +99,7 @@ _TRUTH = ("u_px", "v_px", "phi_ray_rad", "visible")
 
 @dataclass(frozen=True)
 class CropSettings:
-    """What crops are drawn from.
+    """Choices that crops are drawn from.
 
     Parameters
     ----------
