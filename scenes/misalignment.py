@@ -19,7 +19,7 @@ from typing import Any, Protocol, Self, TypeVar
 import numpy as np
 
 from phibench.scenes.camera import Camera
-from phibench.scenes.frames import IDENTITY, Matrix, Pose, Vector, as_matrix, as_vector, rotation_xyz
+from phibench.scenes.frames import IDENTITY, Array, Matrix, Pose, Vector, as_matrix, as_vector, rotation_xyz
 from phibench.scenes.mirror import HARMONICS, Form, SphereMirror
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.validation import SceneError, within
@@ -52,6 +52,25 @@ class Motion:
             translation_m=as_vector(T_world_camera.t + np.array(self.translation_m)),
             rotation=as_matrix(np.array(self.rotation) @ T_world_camera.R),
         )
+
+    def part(self, share: float) -> Motion | None:
+        """Motion of which a share has happened: shift and angle of turn in proportion; None for 0."""
+        if share in (0.0, 1.0):
+            return self if share else None
+        shift = share * np.array(self.translation_m)
+        return Motion(as_vector(shift), as_matrix(self.turns(np.array([share]))[0]))
+
+    def turns(self, shares: Array) -> Array:
+        """Rotation matrices of shares of the turn, shape (N, 3, 3), for shares of the shape (N,)."""
+        R = np.array(self.rotation)
+        axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])  # 2 sin(angle) times the axis
+        size = float(np.linalg.norm(axis))
+        if size == 0.0:
+            return np.broadcast_to(np.eye(3), (len(shares), 3, 3))
+        x, y, z = axis / size
+        K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        angle = np.asarray(shares, float)[:, None, None] * math.atan2(size, float(np.trace(R)) - 1.0)
+        return np.asarray(np.eye(3) + np.sin(angle) * K + 2.0 * np.sin(0.5 * angle) ** 2 * (K @ K))
 
     def then(self, other: Motion) -> Motion:
         """Both motions, `other` last; both turn about the lens centre, so that shifts add."""

@@ -263,18 +263,40 @@ class Rig:
 
 
 @dataclass(frozen=True)
+class RobotPose:
+    """Place of a robot that has driven, and its flippers.
+
+    Parameters
+    ----------
+    T_world_rig : Pose
+        Of the frame in which rig and robot are written: the world's before the robot drives.
+    flipper_rad : float
+        Angle of the flippers; 0 is ahead, up counts.
+    """
+
+    T_world_rig: Pose
+    flipper_rad: float
+
+
+@dataclass(frozen=True)
 class View:
-    """A rig with its carriage at one offset, and moved where it is not down: what one image is taken from."""
+    """A rig with its carriage at one offset, and moved where it is not down: what one image is taken from.
+
+    `robot` says where the robot has driven to; None is where it starts. `motion` comes after it.
+    """
 
     rig: Rig
     offset_m: float
     motion: Motion | None = None
+    robot: RobotPose | None = None
 
     @cached_property
     def T_world_camera(self) -> Pose:
         """Camera pose in the world."""
         shift = self.offset_m * np.array(self.rig.stroke_axis_world)
         carried = replace(self.rig.T_world_camera, translation_m=as_vector(self.rig.T_world_camera.t + shift))
+        if self.robot is not None:
+            carried = self.robot.T_world_rig @ replace(carried, target="rig")
         return carried if self.motion is None else self.motion.moved(carried)
 
     @cached_property
@@ -288,7 +310,8 @@ class View:
         mirror = self.rig.mirror
         if isinstance(mirror, RevolvedMirror) or mirror.form is not None:
             return self.T_world_sphere.R
-        return np.eye(3) if self.motion is None else np.array(self.motion.rotation)
+        driven = np.eye(3) if self.robot is None else self.robot.T_world_rig.R
+        return driven if self.motion is None else np.array(self.motion.rotation) @ driven
 
     @cached_property
     def holder_shapes(self) -> tuple[Prism | Cuboid, ...]:

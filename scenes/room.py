@@ -15,8 +15,8 @@ from functools import cached_property
 
 import numpy as np
 
-from phibench.scenes.frames import Pose, Vector, as_vector, rotation_xyz
-from phibench.scenes.rig import View
+from phibench.scenes.frames import Pose, Vector, as_matrix, as_vector, rotation_xyz
+from phibench.scenes.rig import RobotPose, View
 from phibench.scenes.shapes import Cuboid, Mesh, Rectangle, Shape, cuboid, shines
 from phibench.scenes.textures import Uniform
 from phibench.scenes.validation import SceneError, finite_vector, unit_vector, within
@@ -29,16 +29,32 @@ _LENS_CLEARANCE_M = 1e-3  # the housing's top stays below the lens centre so tha
 _GREY, _BLACK, _OLIVE = (0.10, 0.10, 0.10), (0.03, 0.03, 0.03), (0.16, 0.17, 0.10)
 
 
-def chassis() -> tuple[Cuboid, ...]:
-    """Body, two tracks and two flippers, standing on the floor, front towards world +x."""
-    flipper = rotation_xyz(y_rad=math.radians(-25.0))
-    return (
+FLIPPER_RAD = math.radians(25.0)
+"""Angle at which the flippers are drawn unless a robot turns them; 0 is ahead, up counts."""
+_AXLE_M = np.array([0.23, 0.0, 0.10])  # of the front rollers, about which the flippers turn
+
+
+def chassis(robot: RobotPose | None = None) -> tuple[Cuboid, ...]:
+    """Body, two tracks and two flippers, standing on the floor, front towards world +x unless the robot has driven."""
+    flipper = rotation_xyz(y_rad=-FLIPPER_RAD)
+    parts = (
         cuboid("robot_body", (-0.05, 0.0, 0.19), (0.66, 0.31, 0.22), _OLIVE),
         cuboid("robot_track_left", (-0.06, 0.21, 0.10), (0.78, 0.09, 0.20), _BLACK),
         cuboid("robot_track_right", (-0.06, -0.21, 0.10), (0.78, 0.09, 0.20), _BLACK),
         cuboid("robot_flipper_left", (0.30, 0.21, 0.18), (0.28, 0.05, 0.08), _GREY, flipper),
         cuboid("robot_flipper_right", (0.30, -0.21, 0.18), (0.28, 0.05, 0.08), _GREY, flipper),
     )
+    if robot is None:
+        return parts
+    turn = np.array(rotation_xyz(y_rad=FLIPPER_RAD - robot.flipper_rad))
+    about = Pose("rig", "rig", as_vector(_AXLE_M - turn @ _AXLE_M), as_matrix(turn))
+    return tuple(_placed(part, robot.T_world_rig, about if "flipper" in part.name else None) for part in parts)
+
+
+def _placed(part: Cuboid, T_world_rig: Pose, moved: Pose | None = None) -> Cuboid:
+    """Part that is written in the rig's frame, in the world."""
+    own = replace(part.T_world_shape, target="rig")
+    return replace(part, T_world_shape=T_world_rig @ (own if moved is None else moved @ own))
 
 
 def carriage(view: View) -> tuple[Cuboid, ...]:
@@ -48,16 +64,18 @@ def carriage(view: View) -> tuple[Cuboid, ...]:
     centre = Pose("camera", "shape", (0.0, 0.0, -_LENS_CLEARANCE_M - height / 2.0))
     housing = Cuboid("camera_housing", T_world_camera @ centre, _HOUSING_M, Uniform(_GREY))
     foot = T_world_camera.points(np.array([0.0, 0.0, -_LENS_CLEARANCE_M - height]))
+    if view.robot is not None:
+        foot = view.robot.T_world_rig.inverse().points(foot)
     rise = max(float(foot[2]) - BODY_TOP_M, 1e-3)
     mast = cuboid(
         "robot_mast", as_vector(np.array([foot[0], foot[1], BODY_TOP_M + rise / 2.0])), (0.03, 0.02, rise), _GREY
     )
-    return (housing, mast)
+    return (housing, mast if view.robot is None else _placed(mast, view.robot.T_world_rig))
 
 
 def escalade360(view: View) -> tuple[Cuboid, ...]:
     """All solids of robot and sensor housing for one view; the same number and order at every offset."""
-    return (*chassis(), *carriage(view))
+    return (*chassis(view.robot), *carriage(view))
 
 
 # The room.

@@ -56,7 +56,7 @@ def light_map(view: View, room: Room, settings: BakeSettings, folder: Path | Non
     Parameters
     ----------
     view : View
-        Any view of the rig; only the origin of coordinates is taken from it.
+        Any view of the rig; the origin of coordinates is taken from it, and where the robot stands.
     folder : Path, or None for the user's cache
     """
     recipe = _recipe(view, room, settings)
@@ -105,7 +105,7 @@ def _radiance(shape: Shape) -> float:
 def _recipe(view: View, room: Room, settings: BakeSettings) -> bytes:
     """All that a light map depends on, as one line of JSON."""
     document = {
-        "room": repr((fixed_shapes(room), room.sun)),
+        "room": repr((fixed_shapes(room, view.robot), room.sun)),
         "origin_m": repr(tuple(view.sphere_centre_m)),
         "settings": repr(settings),
         "packages": {name: version(name) for name in ("mitsuba", "drjit", "numpy", "scipy")},

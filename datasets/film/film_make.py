@@ -1,7 +1,7 @@
 """Making of films: key views of the room, the spot in every frame, the truth; what is finished is kept.
 
-A killed run loses the view or film that it was at: key views are kept one by one, films when they are complete. The
-number of key views is doubled until the view that was left out agrees with the interpolated one (`key_views`).
+A killed run loses the view or film that it was at: key views are kept one by one (`film_room`), films when they are
+complete.
 """
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.film.film_plan import FilmPlan, film_plans, offset_range_m
+from phibench.datasets.film.film_plan import FilmPlan, check_drives, film_plans
+from phibench.datasets.film.film_room import key_views, renderer
 from phibench.datasets.film.film_store import (
     CHECKSUMS,
     INFO,
@@ -34,35 +34,25 @@ from phibench.datasets.film.film_store import (
     finite_or_none,
     light_record,
     read_document,
-    read_view,
-    view_key,
+    view_name,
     write_checksums,
     write_document,
     write_records,
     write_spots,
     write_table,
-    write_view,
 )
 from phibench.datasets.parallel import parallel_map
 from phibench.datasets.plan.plan import Plan
 from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_files, recipe_text
-from phibench.datasets.recipe.tables import AmbientTable
 from phibench.datasets.store.files import WriteError, only_run, sha256, write_text
 from phibench.datasets.store.provenance import code_behind, code_sha256
 from phibench.render.film.film_truth import instant_truth
-from phibench.render.film.key_views import ALLOWED, ViewError, blended, compare, key_offsets_m, key_weights
 from phibench.render.film.moving_rows import RowsImage, rows_image, spot_time_s
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.spot_layer import spot_layer
-from phibench.scenes.frames import Array
-from phibench.scenes.random_streams import seed_32
-from phibench.scenes.rig import View
+from phibench.scenes.frames import as_vector
 from phibench.scenes.room import Room
-
-_DOUBLINGS = 5
-Render = Callable[[View, int], NDArray[np.float32]]
-"""Room of a view on the film's region, shape (3, h, w), from a seed."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +76,7 @@ def make_films(recipe: str | Path, out: str | Path, workers: int | None = None, 
     text = recipe_text(recipe)
     parsed = parse_recipe(text, str(find_recipe(recipe)), recipe_files(recipe))
     plan, films = film_plans(parsed, recipe_files(recipe))
+    check_drives(plan, films)
     _refuse_other(out, parsed.dataset.name)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -157,11 +148,13 @@ def make_film(out: Path, plan: Plan, keys: dict[str, str], film: FilmPlan) -> st
     images = frame_spots(film, room, times)
     rows = frame_truths(film, room, times, images)
     _check_seen(film, rows)
-    offsets, error = key_views(film, folder, keys[film.film_id], render, images)
+    places, error = key_views(film, folder, keys[film.film_id], render, images)
     write_spots(folder.path / "spots.npz", images)
     write_table(folder.path / "film.parquet", rows)
     lights = _make_lights(film, room, folder)
-    names = ["film.parquet", "spots.npz", *lights, *(f"views/k{n:03d}.exr" for n in range(len(offsets)))]
+    counts = tuple(map(len, places))
+    views = [view_name(part, float(place)) for part, at in enumerate(places) for place in at]
+    names = ["film.parquet", "spots.npz", *lights, *views]
     info = FilmInfo(
         film=film.film_id,
         key=keys[film.film_id],
@@ -171,7 +164,8 @@ def make_film(out: Path, plan: Plan, keys: dict[str, str], film: FilmPlan) -> st
         width_px=film.region.shape[1],
         height_px=film.region.shape[0],
         window_px=film.window_px,
-        keys_m=tuple(map(float, offsets)),
+        keys_m=tuple(map(float, np.concatenate(places))),
+        key_counts=counts,
         pixel_ratio=finite_or_none(error.pixel_ratio),
         position_ratio=finite_or_none(error.position_ratio),
         cpu_s=round(time.process_time() - began, 3),
@@ -213,107 +207,6 @@ def _coloured(image: RowsImage, colour: tuple[float, ...]) -> RowsImage:
     return RowsImage(image.u0_px, image.v0_px, *(share * stack[:1] for stack in stacks))
 
 
-def renderer(plan: Plan, film: FilmPlan, room: Room) -> Render:
-    """Renderer of the room on the film's region; the light map is baked, or taken from the cache, now."""
-    if not room.lit:
-        return lambda view, seed: np.zeros((3, *film.region.shape), np.float32)
-    from phibench.datasets.build.bake_task import bake_settings
-    from phibench.datasets.build.light_map_cache import light_map
-    from phibench.datasets.build.view_task import start_renderer
-    from phibench.render.room.ambient import render_ambient
-    from phibench.render.room.noise_budget import BUDGETS
-
-    start_renderer()
-    ambient: AmbientTable = plan.recipe.ambient
-    settings = bake_settings(ambient)
-    light = light_map(plan.rig.at(0.0), room, settings)
-    height, width = film.region.shape
-    crop = (film.region.u0_px, film.region.v0_px, width, height)
-
-    def render(view: View, seed: int) -> NDArray[np.float32]:
-        budget = BUDGETS[ambient.quality]
-        layer = render_ambient(view, room, light, settings, ambient.cells_per_pixel, seed, crop=crop, budget=budget)
-        return layer.electrons_per_s
-
-    return render
-
-
-# Room.
-
-
-def key_views(
-    film: FilmPlan, folder: FilmFolder, key: str, render: Render, images: Sequence[RowsImage]
-) -> tuple[Array, ViewError]:
-    """Render key views until a view that was left out agrees; return their offsets and that view's error.
-
-    Raises
-    ------
-    DatasetError
-        If five doublings do not do.
-    """
-    count = film.keys
-    for _ in range(_DOUBLINGS + 1):
-        offsets = key_offsets_m(*offset_range_m(film.scene), count)
-        views = np.stack([_key_view(film, folder, key, render, n, float(at)) for n, at in enumerate(offsets)])
-        error = held_out_error(film, render, offsets, views, images)
-        if error.largest <= ALLOWED:
-            for stale in sorted(folder.path.glob("views/k*.exr"))[len(offsets) :]:
-                stale.unlink()
-            return offsets, error
-        count = 2 * len(offsets) - 1
-    raise DatasetError(
-        f"film {film.film_id}: a view that was left out differs from the interpolated one by {error.largest:.2f} of "
-        f"the sensor's noise, {ALLOWED} is allowed, with {len(offsets)} key views; weaken the vibration"
-    )
-
-
-def _key_view(
-    film: FilmPlan, folder: FilmFolder, key: str, render: Render, number: int, offset_m: float
-) -> NDArray[np.float32]:
-    """Key view from its file, or rendered and written; after a killed run, or one with other keys, files are told."""
-    path = folder.view(number)
-    wanted = hashlib.sha256(f"{key} {offset_m!r}".encode()).hexdigest()
-    if view_key(path) != wanted:
-        seed = seed_32(*film.names, "key", f"{offset_m:.9f}")
-        planes = render(film.scene.rig.at(offset_m), seed)
-        write_view(path, planes, film.region, {"film": film.film_id, "offset_m": offset_m, "key": wanted})
-    return read_view(path, film.region)
-
-
-def held_out_error(
-    film: FilmPlan, render: Render, offsets: Array, views: NDArray[np.float32], images: Sequence[RowsImage]
-) -> ViewError:
-    """Error at the frame whose pose is nearest to half-way between two keys, where the views change most.
-
-    The view is rendered in the pose of that frame, vibration across the stroke included.
-    """
-    frame = _frame_between(film, offsets, views, images)
-    time_s = spot_time_s(film.scene, frame)
-    view = film.scene.view_at(time_s)
-    rendered = render(view, seed_32(*film.names, "held out", frame))
-    weights = key_weights(offsets, np.full(film.region.shape[0], view.offset_m))
-    interpolated = blended(views, weights)
-    return compare(rendered, interpolated, film.region, images[frame], film.scene.times.exposure_s)
-
-
-def _frame_between(film: FilmPlan, offsets: Array, views: NDArray[np.float32], images: Sequence[RowsImage]) -> int:
-    at = film.scene.offset_m(film.scene.times.frame_s)
-    light = np.array([max(float(one.electrons_per_s.sum()), 0.0) for one in images])
-    if len(offsets) == 1:
-        return int(np.argmax(light))
-    place = (at - offsets[0]) / (offsets[1] - offsets[0])
-    # second differences of the views say where they bend; the half-way point of that interval is the worst
-    bend = np.abs(np.diff(views.astype(np.float32), n=2, axis=0)).mean(axis=(1, 2, 3))
-    interval = np.clip(np.floor(place).astype(int), 0, len(offsets) - 2)
-    strength = 0.5 * (bend[np.clip(interval - 1, 0, len(bend) - 1)] + bend[np.clip(interval, 0, len(bend) - 1)])
-    halfway = 1.0 - 2.0 * np.abs(place - np.floor(place) - 0.5)
-    bright = light > 0.5 * light.max()  # a laser that is off cannot be put beside noise
-    return int(np.argmax(np.where(bright, strength * np.clip(halfway, 0.0, 1.0) ** 2, -1.0)))
-
-
-# Spot.
-
-
 def frame_spots(film: FilmPlan, room: Room, times_s: Sequence[float]) -> list[RowsImage]:
     """Spot in every frame; frames of one pose, in which nothing moves, share their image."""
     scene, images = film.scene, []
@@ -333,7 +226,8 @@ def frame_spots(film: FilmPlan, room: Room, times_s: Sequence[float]) -> list[Ro
 
 def _state(film: FilmPlan, at: float) -> tuple[float, ...]:
     scene = film.scene
-    return (float(scene.offset_m(at)), *map(float, scene.sway_m(at)), *map(float, scene.spot_m(at)))
+    parts = scene.sway_m(at), scene.spot_m(at), scene.robot_state(at)
+    return (float(scene.offset_m(at)), *(float(x) for part in parts for x in part))
 
 
 def _moves(film: FilmPlan, frame: int) -> bool:
@@ -344,7 +238,8 @@ def _moves(film: FilmPlan, frame: int) -> bool:
     times = scene.times
     half = 0.5 * (times.exposure_s + times.readout_s)
     ends = times.frame_s[frame] + half * np.linspace(-1.0, 1.0, 9)
-    return bool(np.ptp(scene.offset_m(ends)) or np.ptp(scene.spot_m(ends), axis=0).any())
+    ways = scene.spot_m(ends), scene.robot_state(ends)
+    return bool(np.ptp(scene.offset_m(ends)) or any(np.ptp(way, axis=0).any() for way in ways))
 
 
 def frame_truths(film: FilmPlan, room: Room, times_s: Sequence[float], images: Sequence[RowsImage]) -> list[FrameTruth]:
@@ -354,11 +249,13 @@ def frame_truths(film: FilmPlan, room: Room, times_s: Sequence[float], images: S
     # an encoder counts what it takes for metres: at the stop above, the stroke that it was told
     told = film.pair.nominal_stroke_m / film.pair.stroke_m
     readings = film.encoder.readings_m(told * scene.carriage.position_m(frames), *film.names)
+    tracks = np.zeros((len(frames), 2)) if scene.drive is None else scene.drive.readings_m(frames, *film.names)
     return [
         FrameTruth(
             frame,
             float(readings[frame]),
             film.encoder.sigma_m,
+            as_vector(tracks[frame]),
             instant_truth(scene, room, float(frames[frame])),
             instant_truth(scene, room, at),
             tuple(float(x) for x in images[frame].electrons_per_s.sum(axis=(1, 2))),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,13 +15,17 @@ from phibench.datasets.recipe.film_tables import FilmLightTable, FilmTable
 from phibench.datasets.recipe.spot_placement import by_ray
 from phibench.datasets.recipe.tables import OWN_ALBEDO, LaserTable, Recipe
 from phibench.datasets.rooms.room_files import RoomFiles
+from phibench.render.film.key_views import PoseParts
 from phibench.render.film.moving_rows import chief_uv_px
+from phibench.render.optics.room_tracer import own_geometry
 from phibench.render.sensor.light import Region
 from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.motion.carriage import Carriage, Encoder, Vibration
+from phibench.scenes.motion.drive import Drive, DriveLeg, placement
 from phibench.scenes.motion.film_scene import FilmLight, FilmScene, SpotPath, Waypoint, frames_of
 from phibench.scenes.motion.film_times import BlinkCode, FilmTimes
+from phibench.scenes.motion.vehicle import Vehicle
 from phibench.scenes.room import Room
 from phibench.scenes.validation import SceneError
 
@@ -50,8 +54,8 @@ class FilmPlan:
         Part of the image that is rendered.
     window_px : int or None
         Side of the square around the spot; None where whole images are made.
-    keys : int
-        Key views to begin with.
+    keys : tuple of int
+        Key views to begin with, of each part of the poses (`PoseParts`).
     """
 
     film_id: str
@@ -62,7 +66,7 @@ class FilmPlan:
     names: tuple[str, int, str]
     region: Region
     window_px: int | None
-    keys: int
+    keys: tuple[int, ...]
 
     @property
     def size(self) -> tuple[int, int]:
@@ -96,7 +100,7 @@ def _film(plan: Plan, table: FilmTable, pair: PairPlan) -> FilmPlan:
     if not np.isfinite(uv).all():
         raise DatasetError(
             f"film {pair.sample_id}: the mirror shows the spot at {np.isfinite(uv).all(axis=1).mean():.0%} of the "
-            "times only; a target must have an image all the time: move it, or shorten the stroke"
+            "times only; a target must have an image all the time: move it, or shorten the stroke or the drive"
         )
     whole = table.view == "full"
     region = Region.whole(size) if whole else _around(uv, table.window_px, size, pair.sample_id)
@@ -108,13 +112,12 @@ def _film(plan: Plan, table: FilmTable, pair: PairPlan) -> FilmPlan:
 def film_scene(plan: Plan, table: FilmTable, pair: PairPlan) -> FilmScene:
     """True scene of a pair's film."""
     rig = plan.rigs[pair.rig]
-    if rig.motion is not None:
-        raise SceneError("[misalignment] moves the rig between two images; a film has [[film.vibration]] instead")
     carriage = _carriage(table, pair.stroke_m)
     height = rig.camera.height_px
-    frames = frames_of(carriage, table.rate_hz) if table.frames is None else table.frames
-    times = FilmTimes(frames, table.rate_hz, table.exposure_s, table.readout_s, height)
     seed = plan.recipe.dataset.name, plan.recipe.dataset.seed, pair.sample_id
+    drive = _drive(table, carriage, seed)
+    frames = frames_of(carriage, table.rate_hz, drive) if table.frames is None else table.frames
+    times = FilmTimes(frames, table.rate_hz, table.exposure_s, table.readout_s, height)
     bands = tuple(
         Vibration.band(one.axis, one.low_hz, one.high_hz, one.rms_m, *seed, number)
         for number, one in enumerate(table.vibration)
@@ -122,7 +125,7 @@ def film_scene(plan: Plan, table: FilmTable, pair: PairPlan) -> FilmScene:
     path = SpotPath(tuple(Waypoint(*row) for row in table.path))
     code = BlinkCode(table.code, table.bit_s, table.code_start_s)
     lights = _lights(plan, table, pair, code)
-    return FilmScene(rig, plan.spots[pair.spot], times, carriage, bands, path, code, lights)
+    return FilmScene(rig, plan.spots[pair.spot], times, carriage, bands, path, code, lights, drive, pair.stroke_m)
 
 
 def _lights(plan: Plan, table: FilmTable, pair: PairPlan, code: BlinkCode) -> tuple[FilmLight, ...]:
@@ -158,14 +161,36 @@ def _light(laser: LaserTable, room: Room, table: FilmLightTable, code: BlinkCode
 
 
 def nominal_scene(plan: Plan, scene: FilmScene, pair: PairPlan, table: FilmTable) -> FilmScene:
-    """Scene as an estimator may take it to be: it knows neither vibration nor the path of the target."""
+    """Scene as an estimator may take it to be: it knows neither vibration, nor the paths of target and robot."""
     rig, carriage = plan.rigs[pair.nominal_rig], _carriage(table, pair.nominal_stroke_m)
-    return replace(scene, rig=rig, carriage=carriage, vibrations=(), path=SpotPath(), lights=())
+    known = replace(scene, rig=rig, carriage=carriage, stroke_m=pair.nominal_stroke_m)
+    return replace(known, vibrations=(), path=SpotPath(), lights=(), drive=None)
 
 
 def _carriage(table: FilmTable, stroke_m: float) -> Carriage:
     stops = tuple(share * stroke_m for share in table.stops)
     return Carriage(stops, table.pauses_s, table.speed_m_per_s, table.acceleration_m_per_s2)
+
+
+def _drive(table: FilmTable, carriage: Carriage, names: tuple[str, int, str]) -> Drive | None:
+    """Drive whose legs follow each other, the first one after the carriage's last move, unless they have times."""
+    if not table.drive:
+        return None
+    drive, legs, now = Drive(Vehicle(), (), 0.0, 1.0), [], carriage.duration_s
+    for row in table.drive:
+        flipper = None if row.flipper_deg is None else _flipper_rad(row.flipper_deg)
+        start, turn = now if row.start_s is None else row.start_s, math.radians(row.turn_deg)
+        legs.append(DriveLeg(start, row.length_m, turn, flipper, row.speed_m_per_s, row.acceleration_m_per_s2))
+        drive = Drive.drawn(Vehicle(), legs, *names)
+        now = drive.end_s
+    return drive
+
+
+def _flipper_rad(angle_deg: float) -> float:
+    low, high = (math.degrees(Vehicle().flipper_low_rad), math.degrees(Vehicle().flipper_high_rad))
+    if not low <= angle_deg <= high:
+        raise SceneError(f"flipper_deg = {angle_deg:g}: the flippers turn from {low:.1f} to {high:.1f} deg; give less")
+    return math.radians(angle_deg)
 
 
 def spot_track_px(scene: FilmScene) -> Array:
@@ -184,7 +209,7 @@ def _around(uv: Array, side_px: int, size: tuple[int, int], film_id: str) -> Reg
         u, v = uv[np.flatnonzero(outside)[0]]
         raise DatasetError(
             f"film {film_id}: the spot leaves the image, at ({u:.1f}, {v:.1f}) px; move the target, or shorten the "
-            "stroke"
+            "stroke or the drive"
         )
     windows = [Region.around(float(u), float(v), size, min(side_px, *size)) for u, v in uv]
     box = Region(
@@ -196,22 +221,88 @@ def _around(uv: Array, side_px: int, size: tuple[int, int], film_id: str) -> Reg
     return box.grown(size, (TILE_PX, TILE_PX), (MARGIN_PX, MARGIN_PX))
 
 
-def _keys(scene: FilmScene, uv: Array) -> int:
-    """Number of key views at which the image moves by about `KEY_PX` from one to the next."""
-    low, high = offset_range_m(scene)
-    if high - low < 1e-9:
-        return 1
-    apart = float(np.linalg.norm(uv.max(axis=0) - uv.min(axis=0)))
-    return max(4, math.ceil(apart / KEY_PX) + 1)
+def _keys(scene: FilmScene, uv: Array) -> tuple[int, ...]:
+    """Number of key views of each part at which the image moves by about `KEY_PX` from one to the next."""
+    parts = PoseParts.of(scene).parts
+    counts = []
+    for number, part in enumerate(parts):
+        if part.high - part.low < 1e-9:
+            counts.append(1)
+            continue
+        if scene.drive is None:
+            way = float(np.linalg.norm(uv.max(axis=0) - uv.min(axis=0)))
+        else:
+            end = parts[number + 1].start_s if number + 1 < len(parts) else scene.times.duration_s
+            quiet = replace(scene, vibrations=(), path=SpotPath())
+            track = chief_uv_px(quiet, np.linspace(part.start_s, end, _SAMPLES))
+            way = float(np.linalg.norm(np.diff(track, axis=0), axis=1).sum())
+        counts.append(max(4, math.ceil(way / KEY_PX) + 1))
+    return tuple(counts)
 
 
-def offset_range_m(scene: FilmScene) -> tuple[float, float]:
-    """Smallest and largest offset at which a row is exposed."""
-    times = scene.times
-    half = 0.5 * (times.exposure_s + times.readout_s)
-    dense = np.arange(times.frame_s[0] - half, times.frame_s[-1] + half, min(1e-3, times.exposure_s / 4.0))
-    offsets = scene.offset_m(dense)
-    return float(offsets.min()), float(offsets.max())
+# -- what the robot runs into ----------------------------------------------------------------------------------------
+
+_STEP_M, _GRID_M = 0.03, 0.03  # way of the robot's ends from check to check; thinner things may slip through
+_ENDS_M, _SIDE_M, _LEVELS_M = (-0.45, 0.43), 0.255, (0.05, 0.17, 0.29)
+_FLOOR_M = 0.03  # rugs and wires are no obstacles
+
+
+def check_drives(plan: Plan, films: Iterable[FilmPlan]) -> None:
+    """Check that no robot runs into anything on its way.
+
+    Raises
+    ------
+    RecipeError
+        If one does: film, leg, time and the thing.
+    """
+    for film in films:
+        if film.scene.drive is not None and (told := _collision(film.scene, plan.room(film.pair.room))):
+            raise RecipeError(f"film {film.film_id}: {told}; shorten or turn the leg, or move what stands there")
+
+
+def _collision(scene: FilmScene, room: Room) -> str:
+    """Sentence about the first thing that is run into; none where the way is free."""
+    drive, geometry = scene.drive, own_geometry(room)
+    assert drive is not None
+    for number, (leg, profile) in enumerate(zip(drive.legs, drive.profiles, strict=True)):
+        up_m = float(scene.carriage.position_m(profile.start_s))
+        starts, ends = _robot_lines(scene, up_m)
+        way_m = abs(leg.length_m) + _ENDS_M[1] * abs(leg.turn_rad) if leg.drives else 0.3
+        count = math.ceil(way_m / _STEP_M) + 1
+        places = np.linspace(profile.start_m, profile.end_m, count)
+        turns, origins = placement(drive.vehicle, drive.state_on_leg(number, places))
+        one, other = (points @ turns.transpose(0, 2, 1) + origins[:, None] for points in (starts, ends))
+        span = (other - one).reshape(-1, 3)
+        length = np.linalg.norm(span, axis=1)
+        hits = geometry.first_hit(one.reshape(-1, 3), span / length[:, None], length)
+        with np.errstate(invalid="ignore"):
+            high = one.reshape(-1, 3)[:, 2] + hits.distance_m * span[:, 2] / length > _FLOOR_M
+        bad = np.flatnonzero((hits.object_id >= 0) & high)
+        if len(bad):
+            name = geometry.shapes[int(hits.object_id[bad[0]])].name
+            share = (bad[0] // len(starts)) / max(count - 1, 1)
+            return f"leg {number + 1} of the drive runs into '{name}' after {share:.0%} of its way"
+    return ""
+
+
+def _robot_lines(scene: FilmScene, up_m: float) -> tuple[Array, Array]:
+    """Lines through chassis, mast and holder, in the rig's frame, shape (N, 3) each: starts and ends."""
+    rig, (back, front) = scene.rig, _ENDS_M
+    lines = [((back, y, z), (front, y, z)) for y in _grid(-_SIDE_M, _SIDE_M) for z in _LEVELS_M]
+    lines += [((x, -_SIDE_M, z), (x, _SIDE_M, z)) for x in _grid(back, front) for z in _LEVELS_M]
+    view = replace(rig, motion=None).at(up_m)
+    axis, top = view.sphere_centre_m, float(view.sphere_centre_m[2]) + rig.top_m
+    reach = rig.mirror.bound_m if rig.holder is None else rig.holder.plate_m
+    for z in _grid(_LEVELS_M[-1], top):
+        wide = reach if z > view.camera_centre_m[2] - 0.04 else 0.03
+        lines += [((axis[0] - wide, axis[1], z), (axis[0] + wide, axis[1], z))]
+        lines += [((axis[0], axis[1] - wide, z), (axis[0], axis[1] + wide, z))]
+    ends = np.array(lines)
+    return ends[:, 0], ends[:, 1]
+
+
+def _grid(low: float, high: float) -> Array:
+    return np.linspace(low, high, math.ceil((high - low) / _GRID_M) + 1)
 
 
 def listed(plans: tuple[FilmPlan, ...]) -> Iterator[str]:
@@ -221,5 +312,5 @@ def listed(plans: tuple[FilmPlan, ...]) -> Iterator[str]:
         height, width = plan.region.shape
         yield (
             f"{plan.film_id}: {times.frames} frames, {times.duration_s:.2f} s, {width} x {height} px, "
-            f"{plan.keys} key views or more"
+            f"{sum(plan.keys)} key views or more"
         )

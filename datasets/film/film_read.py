@@ -45,7 +45,7 @@ from phibench.datasets.frames.request import in_one_sentence
 from phibench.datasets.plan.plan import Plan
 from phibench.datasets.recipe.load import parse_recipe, recipe_files, recipe_text
 from phibench.datasets.store.layers import SpotWindow
-from phibench.render.film.key_views import blended, row_weights
+from phibench.render.film.key_views import PoseParts, blended
 from phibench.render.film.moving_rows import RowsImage
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.truth import truth_layer
@@ -127,13 +127,18 @@ class Film:
     def views(self) -> NDArray[np.float32]:
         """Key views of the room, shape (keys, 3, h, w), electrons per second."""
         region = self.info.region
-        return np.stack([read_view(self.folder.view(n), region) for n in range(len(self.info.keys_m))])
+        poses = ((part, float(place)) for part, places in enumerate(self.info.keys) for place in places)
+        return np.stack([read_view(self.folder.view(*pose), region) for pose in poses])
+
+    @cached_property
+    def _parts(self) -> PoseParts:
+        return PoseParts.of(self.plan.scene)
 
     def room(self, frame: int) -> NDArray[np.float32]:
         """Room in a frame on the film's region, shape (3, h, w), electrons per second over each row's exposure."""
         region = self.info.region
         rows = np.arange(region.v0_px, region.v1_px).astype(float)
-        return blended(self.views, row_weights(self.plan.scene, np.array(self.info.keys_m), self._number(frame), rows))
+        return blended(self.views, self._parts.row_weights(self.info.keys, self._number(frame), rows))
 
     def light(self, frame: int) -> Light:
         """Light of a frame; outside of the film's region there is none."""

@@ -5,7 +5,7 @@ recipe.toml
 films/<film>/film.parquet  truth, a row per frame
 films/<film>/spots.npz     the spot in each frame, electrons per second over the exposure
 films/<film>/lights.parquet  truth of other lights, a row per light and frame; light00.npz, ... their images
-films/<film>/views/k000.exr  key views of the room
+films/<film>/views/k0_0.150000.exr  key views of the room: part of the poses, and place there
 films/<film>/done.json     what the film was made from; a film that has it is complete
 SHA256SUMS
 """
@@ -35,10 +35,11 @@ from phibench.render.film.film_truth import RATES, InstantTruth
 from phibench.render.film.moving_rows import RowsImage
 from phibench.render.sensor.light import Region
 from phibench.scenes.camera import FILTERS
+from phibench.scenes.frames import Array
 
 INFO, RECIPE, CHECKSUMS = "film.json", "recipe.toml", "SHA256SUMS"
 LIGHTS, LIGHT_IMAGES = "lights.parquet", "light{:02d}.npz"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 _Model = TypeVar("_Model", bound=Document)
 _AGAIN = "run `phibench film make` again"
 _ARRAYS = {
@@ -61,7 +62,11 @@ class FilmInfo(Document):
     window_px: int | None = described("px", "side of the window around the spot; null for whole images")
     keys_m: tuple[float, ...] = described(
         "m",
-        "offsets of the key views",
+        "places of the key views: offset of the carriage; on a leg of the drive the way of the faster track, or the "
+        "angle of the flippers, rad",
+    )
+    key_counts: tuple[int, ...] = described(
+        "-", "how many of them belong to each part of the poses: moves of the carriage, and legs of the drive, in order"
     )
     pixel_ratio: float | None = described("1", "held-out view: rms error of a pixel near the spot, over its noise")
     position_ratio: float | None = described("1", "held-out view: error of the spot's position, over its bound")
@@ -73,6 +78,12 @@ class FilmInfo(Document):
         """Part of the image that is rendered."""
         return Region(self.u0_px, self.v0_px, self.u0_px + self.width_px, self.v0_px + self.height_px)
 
+    @property
+    def keys(self) -> list[Array]:
+        """Places of the key views of each part."""
+        ends = np.cumsum(self.key_counts)[:-1]
+        return np.split(np.array(self.keys_m), ends)
+
 
 class SetInfo(Document):
     """A data set of films: `film.json`."""
@@ -82,6 +93,11 @@ class SetInfo(Document):
     seed: int = described("-", "root of all random streams")
     code_sha256: str = described("-", "hash of the code that makes data")
     films: tuple[str, ...] = described("-", "ids of the films")
+
+
+def view_name(part: int, place: float) -> str:
+    """Name of a key view's file in the folder of its film."""
+    return f"views/k{part}_{place + 0.0:.6f}.exr"
 
 
 @dataclass(frozen=True)
@@ -95,9 +111,9 @@ class FilmFolder:
         """Folder of a film."""
         return cls(out / "films" / film_id)
 
-    def view(self, number: int) -> Path:
-        """File of a key view."""
-        return self.path / "views" / f"k{number:03d}.exr"
+    def view(self, part: int, place: float) -> Path:
+        """File of a key view, named by its part of the poses and its place there."""
+        return self.path / view_name(part, place)
 
     @property
     def done(self) -> Path:
@@ -219,11 +235,12 @@ def read_spots(path: Path, frames: int) -> list[RowsImage]:
 
 @dataclass(frozen=True)
 class FrameTruth:
-    """Truth of one frame: at its time, and at that of the spot's own row; the encoder's reading at the frame's time."""
+    """Truth of one frame: at its time, and at that of the spot's own row; readings of encoders at the frame's time."""
 
     frame: int
     encoder_m: float
     encoder_sigma_m: float
+    tracks_m: tuple[float, ...]
     at_frame: InstantTruth
     at_row: InstantTruth
     electrons_per_s: tuple[float, ...]
@@ -234,6 +251,7 @@ class FrameTruth:
             "frame": self.frame,
             "encoder_m": self.encoder_m,
             "encoder_sigma_m": self.encoder_sigma_m,
+            "tracks_m": list(self.tracks_m),
             "electrons_per_s": list(self.electrons_per_s),
         }
         both = (("", self.at_frame), ("row_", self.at_row))
@@ -247,8 +265,9 @@ def _columns(one: InstantTruth) -> dict[str, Any]:
 
 
 def light_record(name: str, row: FrameTruth) -> dict[str, Any]:
-    """Row of `lights.parquet`: that of `film.parquet` without the encoder."""
-    return {"light": name} | {key: value for key, value in row.record().items() if not key.startswith("encoder")}
+    """Row of `lights.parquet`: that of `film.parquet` without the encoders."""
+    told = ("encoder_m", "encoder_sigma_m", "tracks_m")
+    return {"light": name} | {key: value for key, value in row.record().items() if key not in told}
 
 
 def write_table(path: Path, rows: Sequence[FrameTruth]) -> None:

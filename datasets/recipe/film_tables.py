@@ -60,6 +60,24 @@ class FilmLightTable(Table):
     is_target: bool = Field(default=False, description="it is looked for as well, by its code")
 
 
+class DriveTable(Table):
+    """`[[film.drive]]`: a leg of the robot's drive, or a turn of its flippers."""
+
+    start_s: float | None = Field(
+        default=None,
+        ge=0.0,
+        le=3600.0,
+        description="start; where not given, when the leg before has ended, and the first when the carriage rests",
+    )
+    length_m: float = Field(default=0.0, ge=-20.0, le=20.0, description="length of the arc of the base; ahead counts")
+    turn_deg: float = Field(default=0.0, ge=-720.0, le=720.0, description="turn over the arc; to the left counts")
+    flipper_deg: float | None = Field(
+        default=None, ge=-180.0, le=180.0, description="angle of the flippers at the end; such a leg does not drive"
+    )
+    speed_m_per_s: float = Field(default=0.2, gt=0.0, le=10.0, description="largest speed of the faster track")
+    acceleration_m_per_s2: float = Field(default=0.5, gt=0.0, le=100.0, description="largest acceleration of it")
+
+
 class FilmTable(Table):
     """`[film]`: every pair of the recipe as a film of its stroke."""
 
@@ -96,6 +114,9 @@ class FilmTable(Table):
     )
     lights: Annotated[tuple[FilmLightTable, ...], Field(strict=False, max_length=50)] = Field(
         default=(), description="other lights"
+    )
+    drive: Annotated[tuple[DriveTable, ...], Field(strict=False, max_length=100)] = Field(
+        default=(), description="legs of the robot's drive; it stands where not given"
     )
 
     @model_validator(mode="after")

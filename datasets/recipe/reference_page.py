@@ -13,7 +13,7 @@ from pydantic import BaseModel
 
 from phibench.datasets.recipe.build import CAMERA_KEYS
 from phibench.datasets.recipe.distributions import DistributionTable, TargetChoice
-from phibench.datasets.recipe.film_tables import FilmLightTable, FilmTable, VibrationTable
+from phibench.datasets.recipe.film_tables import DriveTable, FilmLightTable, FilmTable, VibrationTable
 from phibench.datasets.recipe.mirror_tables import HolderTable, MirrorTable, ReflectionTable
 from phibench.datasets.recipe.room_tables import (
     GeometryTable,
@@ -75,6 +75,7 @@ TABLES: dict[str, type[BaseModel]] = {
     "[film]": FilmTable,
     "[[film.vibration]]": VibrationTable,
     "[[film.lights]]": FilmLightTable,
+    "[[film.drive]]": DriveTable,
     "[[distractors]]": DistractorTable,
     "a distribution": DistributionTable,
 }
@@ -198,6 +199,12 @@ the seed. Bands add up.
     "[[film.lights]]": """Flat diffuse discs beside the target's spot: what a robot may take for its target, and
 further targets. Each has a place, a power, a colour, a code and a path. A light that follows the laser is a
 reflection. Their images and their truth are stored with the film's.
+""",
+    "[[film.drive]]": """The robot drives from leg to leg, each from rest to rest, on a level floor. A leg is an arc:
+`length_m` alone is straight, `turn_deg` alone turns about the middle of the tracks. A leg with `flipper_deg` turns the
+flippers instead, which start at 25 deg; down, they lift the robot's front. Slip and skid factor are drawn from the
+seed; the path is the true one whatever they are. The robot makes a stroke only while it stands. A film without a stroke
+has `stops = [0.0]` and one of `pauses_s`.
 """,
     "[random]": """Instead of `[[experiments]]`: `samples` stroke pairs, each with a rig, a spot and a stroke that are
 drawn. Sample i depends on the rest of the recipe and on i, not on `samples`. Make the same

@@ -28,10 +28,12 @@ def make(recipe: str, *, out: Path, workers: Whole | None = None, dry_run: bool 
         Say what will be made; render nothing.
     """
     if dry_run:
-        from phibench.datasets.film.film_plan import film_plans, listed
+        from phibench.datasets.film.film_plan import check_drives, film_plans, listed
         from phibench.datasets.recipe.load import load_recipe, recipe_files
 
-        for line in listed(film_plans(load_recipe(recipe), recipe_files(recipe))[1]):
+        plan, films = film_plans(load_recipe(recipe), recipe_files(recipe))
+        check_drives(plan, films)
+        for line in listed(films):
             print(line)
         return 0
     from phibench.datasets.film.film_make import make_films

@@ -1,8 +1,8 @@
 """Image of a spot in a frame of a film: rows at their own times, smeared over their exposures, lit by the code.
 
-All motions of a film are shifts without a turn. In the rig's frame it is the spot that moves, so that the chief rays of
-all instants are one call: the shift of the spot's image is exact for every row and every node of the exposure. Shape
-and flux are those of the spot's layer at the time at which the spot's own row is read.
+In the rig's frame it is the spot that moves, so that the chief rays of all instants are one call: the shift of the
+spot's image is exact for every row and every node of the exposure. Shape and flux are those of the spot's layer at the
+time at which the spot's own row is read. A robot that turns turns that shape as well: by half a degree in an exposure.
 
 The shifted image is `rolling_shutter`'s, by the sampling theorem with derivatives, with a sum over the nodes of an
 exposure instead of a straight smear: w_rj is the laser's level times the weight of node j of row r.
@@ -34,16 +34,12 @@ def chief_uv_px(scene: FilmScene, times_s: Array) -> Array:
     """Image of the spot's centre through the lens centre, shape (N, 2), at N times; NaN without a reflection."""
     times = np.asarray(times_s, float)
     view = scene.view_at(float(times[0]))
-    points = scene.spot_m(times) - (rig_shift_m(scene, times) - rig_shift_m(scene, times[:1]))
+    turns, lenses = scene.camera_at(times)
+    from_lens = np.einsum("nji,nj->ni", turns, scene.spot_m(times) - lenses)  # in the rig's axes
+    points = from_lens @ turns[0].T + lenses[0]
     eyes = np.broadcast_to(view.camera_centre_m, points.shape)
     found = mirror_points(view, points, eyes)
     return view.rig.camera.project(view.T_world_camera.inverse().points(found.points_m))
-
-
-def rig_shift_m(scene: FilmScene, times_s: Array) -> Array:
-    """Shift of camera and mirror from the down position, world, shape (N, 3)."""
-    along = scene.offset_m(times_s)[..., None] * np.array(scene.rig.stroke_axis_world)
-    return np.asarray(along + scene.sway_m(times_s))
 
 
 def spot_time_s(scene: FilmScene, frame: int) -> float:

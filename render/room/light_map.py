@@ -38,7 +38,7 @@ from phibench.render.room.texel_points import Texels, covered_texels, filled
 from phibench.render.setup.variant import activate
 from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Array, BoolArray
-from phibench.scenes.rig import View
+from phibench.scenes.rig import RobotPose, View
 from phibench.scenes.room import Room, Sun, chassis
 from phibench.scenes.shapes import Shape
 
@@ -80,9 +80,9 @@ class LightMap:
     covered: BoolArray
 
 
-def fixed_shapes(room: Room) -> tuple[Shape, ...]:
+def fixed_shapes(room: Room, robot: RobotPose | None = None) -> tuple[Shape, ...]:
     """Shapes of a room that stand still: everything but the carriage, the mirror and its holder."""
-    return (*room.surfaces, *room.furniture, *(chassis() if room.robot else ()))
+    return (*room.surfaces, *room.furniture, *(chassis(robot) if room.robot else ()))
 
 
 def texel_count(room: Room, texel_m: float) -> int:
@@ -91,11 +91,11 @@ def texel_count(room: Room, texel_m: float) -> int:
 
 
 def bake(view: View, room: Room, settings: BakeSettings) -> LightMap:
-    """Light map of a room; `view` only gives the origin of the scene's coordinates."""
+    """Light map of a room; `view` only gives the origin of the scene's coordinates, and where the robot stands."""
     mi = activate()
     import drjit as dr
 
-    surfaces = Surfaces(mi, view, face_table(fixed_shapes(room)))
+    surfaces = Surfaces(mi, view, face_table(fixed_shapes(room, view.robot)))
     grid = TexelGrid.of(surfaces.table, settings.texel_m)
     if not grid.count:  # all surfaces shine by themselves
         none = np.zeros((0, 3), dtype=np.float32)
@@ -167,6 +167,16 @@ def light_carriage(
 
 _CARRIAGE_RAYS = 1024
 _HOLDER_RAYS = 256  # its texels are many and small; 1024 rays would take 3 CPU-s for each view
+
+
+def between(one: LightMap, other: LightMap, share: float) -> LightMap:
+    """Light map of a room between two places of its robot: irradiances in proportion."""
+    if share in (0.0, 1.0):
+        return other if share else one
+    keep, take = np.float32(1.0 - share), np.float32(share)
+    light = keep * one.irradiance_w_m2 + take * other.irradiance_w_m2
+    sigma = np.hypot(keep * one.sigma_w_m2, take * other.sigma_w_m2)
+    return LightMap(light, sigma, one.covered & other.covered)
 
 
 # Light maps as files.

@@ -1,6 +1,10 @@
-"""Moving parts of a film: the rig with its carriage and vibration, and the laser spot on its path, at any time.
+"""Moving parts of a film: robot, carriage, vibration, and the laser spot on its path, at any time.
 
 `FilmScene.view_at` and `spot_at` give the still of any instant: what holds for stills holds for every row of a film.
+`FilmScene.camera_at` is the same pose for many times at once.
+
+A misalignment may turn and shift the rig between two images. In a film that grows with the carriage's offset, in
+proportion, and is complete at the pair's stroke.
 """
 
 from __future__ import annotations
@@ -15,9 +19,10 @@ from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import Motion
 from phibench.scenes.motion.carriage import Carriage, Times, Vibration
+from phibench.scenes.motion.drive import Drive, placement, robot_pose
 from phibench.scenes.motion.film_times import BlinkCode, FilmTimes
 from phibench.scenes.rig import Rig, View
-from phibench.scenes.validation import SceneError, finite
+from phibench.scenes.validation import SceneError, finite, positive
 
 
 @dataclass(frozen=True)
@@ -114,7 +119,6 @@ class FilmScene:
     Parameters
     ----------
     rig : Rig
-        Without a motion between images: a film has vibration instead.
     spot : LaserSpot
         At the start of its path.
     times : FilmTimes
@@ -124,6 +128,10 @@ class FilmScene:
     code : BlinkCode
     lights : tuple of FilmLight
         Other lights.
+    drive : Drive or None
+        The carriage rests while the robot drives.
+    stroke_m : float
+        Offset at which the rig's own motion between two images is complete; needed where it has one.
     """
 
     rig: Rig
@@ -134,10 +142,12 @@ class FilmScene:
     path: SpotPath = SpotPath()
     code: BlinkCode = BlinkCode()
     lights: tuple[FilmLight, ...] = ()
+    drive: Drive | None = None
+    stroke_m: float = 0.0
 
     def __post_init__(self) -> None:
         if self.rig.motion is not None:
-            raise SceneError("FilmScene.rig moves between two images: a film has vibration, leave that motion out")
+            positive("FilmScene", "stroke_m", self.stroke_m)
         if self.spot.beam_direction_world is not None and self.path.waypoints:
             raise SceneError("FilmScene.path: the spot of a beam stays where its beam ends; give a spot without beam")
         if self.code.duration_s > self.times.duration_s * (1.0 + 1e-9):
@@ -151,6 +161,15 @@ class FilmScene:
                     f"light '{light.name}': its code takes {light.code.duration_s:g} s and the film "
                     f"{self.times.duration_s:g} s: a film must hold the whole code; give more frames or a shorter code"
                 )
+        for number, way in enumerate(() if self.drive is None else self.drive.profiles, 1):
+            start, end = way.start_s, way.start_s + way.duration_s
+            for leg in self.carriage.legs:
+                if leg.start_m != leg.end_m and start < leg.start_s + leg.duration_s and end > leg.start_s:
+                    raise SceneError(
+                        f"leg {number} of the drive goes from {start:.3f} to {end:.3f} s, and the carriage moves from "
+                        f"{leg.start_s:.3f} to {leg.start_s + leg.duration_s:.3f} s: the robot makes a stroke only "
+                        "while it stands; change start_s of the leg, or stops and pauses_s of the carriage"
+                    )
 
     def of_light(self, number: int) -> FilmScene:
         """Same film with another light in place of the target's spot."""
@@ -183,9 +202,42 @@ class FilmScene:
         """Derivative of `spot_m`."""
         return self.path.velocity_m_per_s(times_s) @ across_and_up(self.spot)
 
+    def robot_state(self, times_s: Times) -> Array:
+        """State (x, y, heading, flipper) of the robot, shape (..., 4); 0 in a film without a drive."""
+        return np.zeros((*np.shape(times_s), 4)) if self.drive is None else self.drive.state(times_s)
+
+    def robot_rate(self, times_s: Times) -> Array:
+        """Derivative of `robot_state`."""
+        return np.zeros((*np.shape(times_s), 4)) if self.drive is None else self.drive.rate(times_s)
+
     def view_at(self, time_s: float) -> View:
         """View of an instant."""
-        return moved_view(self.rig, float(self.offset_m(time_s)), self.sway_m(time_s))
+        return self.view_of(float(self.offset_m(time_s)), self.sway_m(time_s), self.robot_state(time_s))
+
+    def view_of(self, offset_m: float, sway_m: Array, robot_state: Array) -> View:
+        """View with the carriage at an offset, the rig shifted by `sway_m` (3,) in world axes, the robot in a state."""
+        motion = None if self.rig.motion is None else self.rig.motion.part(offset_m / self.stroke_m)
+        if np.any(sway_m):
+            sway = Motion(as_vector(np.asarray(sway_m, float)))
+            motion = sway if motion is None else motion.then(sway)
+        if self.drive is None or np.array_equal(robot_state, self.drive.starts[0]):
+            return View(self.rig, offset_m, motion)
+        return View(self.rig, offset_m, motion, robot_pose(self.drive.vehicle, robot_state))
+
+    def camera_at(self, times_s: Array) -> tuple[Array, Array]:
+        """Turns of the rig (N, 3, 3), from its axes as written to the world's, and lens centres (N, 3), at N times."""
+        times = np.asarray(times_s, float)
+        offsets = self.offset_m(times)
+        lens = self.rig.T_world_camera.t + offsets[:, None] * np.array(self.rig.stroke_axis_world)
+        turns = np.broadcast_to(np.eye(3), (len(times), 3, 3))
+        if self.drive is not None:
+            turns, origins = placement(self.drive.vehicle, self.robot_state(times))
+            lens = (turns @ lens[..., None])[..., 0] + origins
+        if (motion := self.rig.motion) is not None:
+            shares = offsets / self.stroke_m
+            turns = motion.turns(shares) @ turns
+            lens = lens + shares[:, None] * np.array(motion.translation_m)
+        return turns, lens + self.sway_m(times)
 
     def spot_at(self, time_s: float) -> LaserSpot:
         """Spot of an instant."""
@@ -201,12 +253,7 @@ class FilmScene:
         return result
 
 
-def moved_view(rig: Rig, offset_m: float, sway_m: Array) -> View:
-    """View of a rig with its carriage at an offset, shifted by `sway_m`, shape (3,), in world axes."""
-    still = not np.any(sway_m)
-    return View(rig, offset_m, None if still else Motion(as_vector(np.asarray(sway_m, float))))
-
-
-def frames_of(carriage: Carriage, rate_hz: float) -> int:
-    """Number of frames that show the whole motion of a carriage, the first one at the time 0."""
-    return math.floor(carriage.duration_s * rate_hz + 1e-9) + 1
+def frames_of(carriage: Carriage, rate_hz: float, drive: Drive | None = None) -> int:
+    """Number of frames that show the whole motion of carriage and robot, the first one at the time 0."""
+    end_s = max(carriage.duration_s, 0.0 if drive is None else drive.end_s)
+    return math.floor(end_s * rate_hz + 1e-9) + 1

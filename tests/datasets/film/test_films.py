@@ -12,14 +12,15 @@ import pytest
 from conftest import ROOT
 
 from phibench.datasets.errors import DatasetError, RecipeError
-from phibench.datasets.film import film_make
+from phibench.datasets.film import film_make, film_room
 from phibench.datasets.film.film_make import make_films
-from phibench.datasets.film.film_plan import film_plans
+from phibench.datasets.film.film_plan import check_drives, film_plans
 from phibench.datasets.film.film_read import Film, open_films
 from phibench.datasets.film.film_show import picture
 from phibench.datasets.film.film_store import verify
 from phibench.datasets.film.film_video import read_frames, write_frames, write_mp4, write_videos
 from phibench.datasets.recipe.load import parse_recipe
+from phibench.render.film.key_views import PoseParts
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
 from phibench.render.sensor.camera_chain import Chain
@@ -60,11 +61,12 @@ def test_interpolated_views_are_held_to_a_quarter_of_the_noise(film_windows: Pat
 def test_the_proof_fails_where_key_views_are_too_far_apart(film_images: Path) -> None:
     film = film_of(film_images)
     plan, _ = film_plans(parse_recipe(TEXT))
-    render = film_make.renderer(plan, film.plan, plan.room(film.plan.pair.room))
+    render = film_room.renderer(plan, film.plan, plan.room(film.plan.pair.room))
     # key views of a stroke of 2 m in place of 0.3 m: the board moves over the spot's window
     offsets = np.array([-0.3, 0.1, 0.5, 0.9])
-    views = np.stack([render(film.plan.scene.rig.at(float(at)), 1) for at in offsets])
-    error = film_make.held_out_error(film.plan, render, offsets, views, film.spots)
+    views = np.stack([render(film.plan.scene.rig.at(float(at)), (0, float(at)), 1) for at in offsets])
+    parts = PoseParts.of(film.plan.scene)
+    error = film_room.held_out_error(film.plan, render, parts, 0, offsets, views, film.spots)
     assert error.largest > 0.25
 
 
@@ -130,8 +132,8 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(film_windows: Path, tmp_p
             make_films(recipe, out, 1)
     with pytest.raises(DatasetError, match=r"no film\.json"):
         open_films(out)
-    real = film_make.write_view
-    monkeypatch.setattr(film_make, "write_view", lambda *a: (calls.append(1), real(*a)))
+    real = film_room.write_view
+    monkeypatch.setattr(film_room, "write_view", lambda *a: (calls.append(1), real(*a)))
     assert make_films(recipe, out, 1).made == (FILM,)
     assert not calls  # the key views were there
     assert make_films(recipe, out, 1).made == ()
@@ -194,9 +196,20 @@ def faulty(change: str, by: str = "") -> str:
     return TEXT.replace(change, by)
 
 
+def driving(*rows: str) -> str:
+    return TEXT.replace("frames = 10\n", "") + "".join(f"\n[[film.drive]]\n{row}\n" for row in rows)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
+        (driving("length_m = 0.5\nstart_s = 0.1"), r"makes a stroke only while it stands"),
+        (driving("length_m = 5.0"), r"runs into 'wall_east' after 9\d%"),
+        (driving("turn_deg = -28.0", "length_m = 3.2"), r"leg 2 of the drive runs into 'table"),
+        (driving("flipper_deg = -90.0"), r"turn from -80\.2 to 91\.7 deg"),
+        (driving("speed_m_per_s = 0.1"), r"neither drives nor turns"),
+        (driving("length_m = 0.1\nspeed_m_per_s = 0.6"), r"run 0\.5 m/s at most"),
+        (driving("length_m = 0.3\nstart_s = 1.0", "length_m = 0.1\nstart_s = 1.1"), r"start it then or later"),
         (faulty("bit_s = 0.2", "bit_s = 2.0"), r"must hold the whole code"),
         (faulty('code = "110"', 'code = "000"'), r"never lights the laser"),
         (faulty("pauses_s = [0.2, 0.1]", "pauses_s = [0.2]"), r"1 pauses_s for 2 stops"),
@@ -206,13 +219,12 @@ def faulty(change: str, by: str = "") -> str:
         (faulty('name = "lamp"', 'name = "target"'), r"must differ"),
         (faulty('code = "10"', 'code = "10000000"'), r"light 'beacon'.*must hold the whole code"),
         (faulty("speed_m_per_s = 1.0", "speed = 0.5"), r"speed_m_per_s"),
-        (faulty("[film]", "[misalignment]\nyaw_rad = 0.01\n[film]"), r"has \[\[film.vibration\]\] instead"),
         (TEXT[: TEXT.index("[film]")], r"has no \[film\]"),
     ],
 )
 def test_each_mistake_is_one_sentence(text: str, words: str) -> None:
     with pytest.raises((RecipeError, DatasetError), match=words):
-        film_plans(parse_recipe(text))
+        check_drives(*film_plans(parse_recipe(text)))
 
 
 def test_a_target_that_is_never_seen_is_one_sentence(tmp_path: Path) -> None:

@@ -4,18 +4,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from phibench.render.film.film_truth import RATES, instant_truth
 from phibench.render.film.moving_rows import chief_uv_px, exposure_nodes, rows_image, spot_time_s
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
 from phibench.scenes.catalog import Target, lab
-from phibench.scenes.frames import Array
+from phibench.scenes.frames import Array, Pose, as_matrix, as_vector
 from phibench.scenes.laser import LaserSpot
+from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.motion.carriage import Carriage, Vibration
+from phibench.scenes.motion.drive import Drive, DriveLeg
 from phibench.scenes.motion.film_scene import FilmScene, SpotPath, Waypoint
 from phibench.scenes.motion.film_times import BlinkCode, FilmTimes
-from phibench.scenes.rig import Rig
+from phibench.scenes.motion.vehicle import PlanarPose, Vehicle, rig_placement, stance
+from phibench.scenes.rig import Rig, View
 
 TARGET = Target("t", 1.5, 0.6, 0.5)
 ROOM = lab((TARGET,))
@@ -23,8 +27,13 @@ SPOT = LaserSpot(TARGET.position_world_m, TARGET.normal_world, 4.5e-3)
 TIMES = FilmTimes(20, 30.0, 1 / 60, 0.03, 720)
 SHAKE = tuple(Vibration.band(axis, 20.0, 60.0, 1e-4, "t", axis) for axis in ("stroke", "x", "y"))
 MOVING = FilmScene(Rig(), SPOT, TIMES, Carriage((0.0, 0.5), (0.0, 0.0), 0.5, 2.0), SHAKE)
+LEGS = (DriveLeg(0.0, 0.08, -0.15, None, 0.5, 3.0), DriveLeg(0.46, flipper_rad=-1.2))
+DRIVING = replace(MOVING, carriage=Carriage((0.1,), (1.0,)), drive=Drive(Vehicle(), LEGS, 0.05, 1.4))
+ERRANT = Rig().perturbed(Misalignment(roll_rad=0.02, pitch_rad=-0.01, yaw_rad=0.03, shift_x_m=5e-3))
 CASES = {
     "carriage": MOVING,
+    "driving": DRIVING,
+    "misaligned": replace(MOVING, rig=ERRANT, stroke_m=0.5),
     "still": replace(MOVING, carriage=Carriage((0.1,), (1.0,)), vibrations=()),
     "blinking": replace(MOVING, code=BlinkCode("10110", 0.011, 0.002)),
     "target": replace(
@@ -50,7 +59,7 @@ def brute_force(scene: FilmScene, frame: int, rows: Array, columns: Array) -> Ar
     return image
 
 
-@pytest.mark.parametrize("name", ["carriage", "target"])
+@pytest.mark.parametrize("name", ["carriage", "target", "driving"])
 def test_moving_rows_are_those_of_brute_force(name: str) -> None:
     scene, frame = CASES[name], 8
     time = spot_time_s(scene, frame)
@@ -119,17 +128,33 @@ def test_derivatives_of_the_moving_image_are_those_of_a_shift() -> None:
         assert 0 < moment < len(k) + len(grid)
 
 
+def by_hand(scene: FilmScene, time: float) -> View:
+    """View put together by hand: the down pose, the stroke axis up, the way of the robot, the turn between images."""
+    rig, offset = scene.rig, float(scene.offset_m(time))
+    lens = rig.T_world_camera.t + [0.0, 0.0, offset]
+    turn, where = np.eye(3), np.zeros(3)
+    if scene.drive is not None:
+        x, y, heading, flipper = scene.drive.state(time)
+        held = stance(Vehicle(), PlanarPose(x, y, heading), float(flipper))
+        turn, where = rig_placement(Vehicle(), PlanarPose(x, y, heading), held)
+    lens = turn @ lens + where
+    if rig.motion is not None:
+        share = offset / scene.stroke_m
+        whole = Rotation.from_matrix(rig.motion.rotation)
+        turn = Rotation.from_rotvec(share * whole.as_rotvec()).as_matrix() @ turn
+        lens = lens + share * np.array(rig.motion.translation_m)
+    lens = lens + scene.sway_m(time)
+    pose = Pose("world", "camera", as_vector(lens), as_matrix(turn @ rig.T_world_camera.R))
+    return replace(rig, T_world_camera=pose, motion=None).at(0.0)
+
+
 @pytest.mark.parametrize("name", list(CASES))
 def test_truth_of_a_frame_is_that_of_the_still_in_its_pose(name: str) -> None:
     scene, checked = CASES[name], 0
     for frame in range(0, 20, 3):
         time = spot_time_s(scene, frame)
         found = instant_truth(scene, ROOM, time)
-        # the pose put together by hand: the down pose, the stroke axis up, and the sway
-        rig = scene.rig
-        lens = np.array(rig.T_world_camera.t) + [0.0, 0.0, float(scene.offset_m(time))] + scene.sway_m(time)
-        moved = replace(rig, T_world_camera=replace(rig.T_world_camera, translation_m=tuple(map(float, lens))))
-        still = spot_truth(moved.at(0.0), scene.spot_at(time), ())
+        still = spot_truth(by_hand(scene, time), scene.spot_at(time), ())
         for key in RATES:
             assert getattr(found.spot, key) == pytest.approx(getattr(still, key), abs=1e-9)
         assert found.spot.visible
@@ -141,7 +166,7 @@ def test_truth_of_a_frame_is_that_of_the_still_in_its_pose(name: str) -> None:
     assert checked == 7
 
 
-@pytest.mark.parametrize("name", ["carriage", "target"])
+@pytest.mark.parametrize("name", ["carriage", "target", "driving", "misaligned"])
 def test_velocities_are_differences_of_stills(name: str) -> None:
     scene, step = CASES[name], 1e-4
     for time in (0.123, 0.301, 0.45):
