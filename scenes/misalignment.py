@@ -4,10 +4,11 @@
 sensitivities and studies use these names. `Motion` is what moves the whole rig between the two images of a pair.
 
 Conventions: world axes (z up; the robot's front is world +x); angles turn right-handed. The form's x, y, z are the
-world's at the down position, about the sphere centre; from there the form goes with the rig. Of several deviations at
-once: the sphere moves first, then the camera turns about its lens and leaves sphere and lens where they are. A recipe's
-`decentre`, `tilt` and `stroke_tilt` in `[rig]` mean the same as here. A mirror of revolution moves with its vertex, and
-turns about it: its tilt is its own, besides that of the camera.
+world's at the down position, about the sphere centre; from there the form goes with the rig. That of a mirror of
+revolution lies in its own frame, and its harmonics are polynomials on the rim's disc (`scenes.revolved_mirror`). Of
+several deviations at once: the sphere moves first, then the camera turns about its lens and leaves sphere and lens
+where they are. A recipe's `decentre`, `tilt` and `stroke_tilt` in `[rig]` mean the same as here. A mirror of revolution
+moves with its vertex, and turns about it: its tilt is its own, besides that of the camera.
 """
 
 from __future__ import annotations
@@ -243,26 +244,27 @@ class Misalignment:
         return replace(nominal, fx_px=nominal.fx_px * scale, fy_px=nominal.fy_px * scale, **added)
 
     def mirror(self, nominal: SphereMirror | RevolvedMirror) -> SphereMirror | RevolvedMirror:
-        """True mirror; forms add up in the sphere's own frame, and a mirror of revolution has none."""
-        if isinstance(nominal, RevolvedMirror):
-            return self._revolved(nominal)
+        """True mirror; forms add up in the mirror's own frame."""
         form, old = Form(**{name: getattr(self, name) for name in HARMONICS}), nominal.form
         if old is not None:
             form = Form(*(a + b for a, b in zip(old.coefficients_m, form.coefficients_m, strict=True)))
+        if isinstance(nominal, RevolvedMirror):
+            return self._revolved(nominal, form)
         alpha = nominal.roughness_alpha + self.roughness_alpha
         return replace(nominal, radius_m=nominal.radius_m + self.radius_m, roughness_alpha=alpha, form=form)
 
-    def _revolved(self, nominal: RevolvedMirror) -> RevolvedMirror:
-        """True mirror of revolution: `radius_m` is added to the vertex radius; a cone has none and stays as it is."""
-        if any(getattr(self, name) for name in HARMONICS):
-            raise SceneError(f"Misalignment: form errors are a sphere's; the mirror is a {nominal.profile.shape}")
-        profile = nominal.profile
+    def _revolved(self, nominal: RevolvedMirror, form: Form) -> RevolvedMirror:
+        """True mirror of revolution: `radius_m` is added to the vertex radius; a cone has none and stays as it is.
+
+        A new form belongs to the disc of the nominal rim: where the mirror is cut does not change its surface.
+        """
+        profile, disc_m = nominal.profile, nominal.form_radius_m or nominal.profile.rim_radius_m
         if self.rim_radius_m:
             profile = replace(profile, rim_radius_m=profile.rim_radius_m + self.rim_radius_m)
         if self.radius_m and profile.shape != "cone":
             profile = replace(profile, vertex_radius_m=profile.vertex_radius_m + self.radius_m)
         alpha = nominal.roughness_alpha + self.roughness_alpha
-        return replace(nominal, profile=profile, roughness_alpha=alpha)
+        return replace(nominal, profile=profile, roughness_alpha=alpha, form=form, form_radius_m=disc_m)
 
     def poses(self, T_world_camera: Pose, T_camera_sphere: Pose) -> tuple[Pose, Pose]:
         """True camera pose in the world and sphere pose in the camera, both down."""

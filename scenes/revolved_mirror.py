@@ -17,18 +17,40 @@ The profile has to be convex as seen from the camera: the second derivative by t
 negative anywhere inside the rim. Of a quadric it is R^2 / w^3, and nothing needs to be looked at. The mirror and all
 behind it, z >= sag, is then a convex body, so that of two points outside it at most one point of the mirror reflects
 light from one to the other (`render.optics.revolved_reflection`).
+
+**Form error.** h(x, y), in metres along the normal towards the camera, makes the surface z = sag - h N, N = sqrt(1 +
+4 s sag'^2) being 1 over the cosine of the slope: what is moved along the axis by h N is moved along the normal by h, to
+first order in the form's slope. h is a sum of peak times Zernike polynomial on the disc of the rim, whose largest
+magnitude is 1. With rho the radius over the rim's, and phi the angle from x to y:
+
+    20   6 rho^4 - 6 rho^2 + 1                     spherical aberration
+    21   (3 rho^3 - 2 rho) cos, sin phi            coma
+    22   rho^2 cos, sin 2 phi                      astigmatism
+    30   20 rho^6 - 30 rho^4 + 12 rho^2 - 1        secondary spherical aberration
+    31   (10 rho^5 - 12 rho^3 + 3 rho) cos, sin phi
+    32   (4 rho^4 - 3 rho^2) cos, sin 2 phi
+    33   rho^3 cos, sin 3 phi                      trefoil
+
+These are the fringe Zernike polynomials 5 to 16 (J. C. Wyant and K. Creath, "Basic wavefront aberration theory for
+optical metrology", Applied Optics and Optical Engineering XI, 1992, table III). Half the sum of power and order is the
+degree, as of a sphere's harmonics (`scenes.mirror`). Degrees 0 and 1 are parameters already: axial shift, tilt, radius.
+
+z - sag / 2 has to remain convex: then the body does, and keeps half of its curvature. A cone has none along its side:
+the mean of -h over circles around the axis would be convex, and so rise from the axis on. Without a part in 1 and rho^2
+it is then 0. What is left has two signs on every circle. So no form error leaves a cone convex.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
 from phibench.scenes.frames import Array
-from phibench.scenes.mirror import Level, MetalName, MetalSurface, ReflectanceTable, known_metal
+from phibench.scenes.mirror import HARMONICS, Form, Level, MetalName, MetalSurface, ReflectanceTable, known_metal
 from phibench.scenes.validation import SceneError, finite, positive, within
 
 Shape = Literal["sphere", "ellipsoid", "paraboloid", "hyperboloid", "cone", "polynomial"]
@@ -55,6 +77,18 @@ class Sag:
     z_m: Array
     slope_per_m: Array
     bend_per_m3: Array
+
+
+@dataclass(frozen=True)
+class Heights:
+    """Surface z(x, y) and its derivatives at places of any one shape."""
+
+    z_m: Array
+    x: Array
+    y: Array
+    xx_per_m: Array
+    xy_per_m: Array
+    yy_per_m: Array
 
 
 @dataclass(frozen=True)
@@ -158,6 +192,17 @@ class Profile:
             bend = bend + i * (i - 1) * a * s ** (i - 2)
         return Sag(z, slope, bend)
 
+    def heights(self, x: Array, y: Array) -> Heights:
+        """z at places off the axis, and its derivatives."""
+        sag = self.sag(x * x + y * y)
+        steep, bend = 2.0 * sag.slope_per_m, 4.0 * sag.bend_per_m3
+        return Heights(sag.z_m, steep * x, steep * y, steep + bend * x * x, bend * x * y, steep + bend * y * y)
+
+    @property
+    def ideal(self) -> Profile:
+        """The profile itself: it has no form error."""
+        return self
+
     def radius_at_slope(self, slope: Array) -> Array:
         """Radius at which dz/dr has a value, shape (...); NaN where no place inside the rim has it, as on a cone."""
         t, R, A = np.asarray(slope, float), self.vertex_radius_m, 1.0 + self.conic
@@ -203,23 +248,6 @@ class Profile:
         return Level(sag.z_m - z, gradient, hessian)
 
 
-def by_vertex_radius(profile: Profile, points_m: Array) -> tuple[Array, Array]:
-    """Derivatives of the level function and of its gradient by R, at points (..., 3) of the surface.
-
-    The gradient's part along itself is left out: it changes the length and not the normal. A cone has no radius.
-    """
-    x, y, z = np.moveaxis(np.asarray(points_m, float), -1, 0)
-    if profile.shape == "cone":
-        return np.zeros_like(x), np.zeros((*np.shape(x), 3))
-    if profile.is_quadric:
-        scale = 0.5 / max(profile.vertex_radius_m, profile.rim_radius_m)
-        return -2.0 * scale * z, np.broadcast_to([0.0, 0.0, -2.0 * scale], (*np.shape(x), 3))
-    R, s = profile.vertex_radius_m, x * x + y * y
-    w = np.sqrt(R * R - (1.0 + profile.conic) * s)
-    turned = -R / w**3
-    return -s / ((R + w) * w), np.stack([turned * x, turned * y, np.zeros_like(x)], axis=-1)
-
-
 def sphere_cap(radius_m: float, rim_radius_m: float) -> Profile:
     """Cap of a sphere."""
     return Profile(radius_m, 0.0, rim_radius_m)
@@ -246,9 +274,143 @@ def cone(half_angle_rad: float, rim_radius_m: float) -> Profile:
     return Profile(0.0, -1.0 - math.tan(half_angle_rad) ** 2, rim_radius_m)
 
 
-def image_depth_m(profile: Profile) -> float:
-    """Depth behind the vertex at which a far room's virtual image lies: R / 2; behind a cone, half its height."""
-    return 0.5 * (profile.vertex_radius_m or profile.depth_m)
+# Form error.
+
+_LEAST_CURVATURE = 0.5  # of the ideal's, as of a sphere's
+_RADII, _TURNS = 40, 48  # where it is looked at: the curvature has up to three waves around, and degree 4 along
+
+
+@dataclass(frozen=True)
+class FormedProfile:
+    """Profile of revolution with a form error, which `RevolvedMirror` checks.
+
+    Parameters
+    ----------
+    ideal : Profile
+    form : Form
+        Peaks of the polynomials of the module's docstring.
+    disc_m : float
+        Radius of the disc that they belong to.
+    """
+
+    ideal: Profile
+    form: Form
+    disc_m: float
+
+    @property
+    def rim_radius_m(self) -> float:
+        """Radius of the rim."""
+        return self.ideal.rim_radius_m
+
+    @property
+    def reach_m(self) -> float:
+        """No point of the surface is farther from the ideal one than this, along the axis."""
+        return self.form.bound_m * float(lengthening(self.ideal, np.array(self.rim_radius_m**2))[0])
+
+    def heights(self, x: Array, y: Array) -> Heights:
+        """z at places off the axis, and its derivatives."""
+        ideal, h, (N, N1, N2) = self.ideal.heights(x, y), self.deviation(x, y), lengthening(self.ideal, x * x + y * y)
+        return Heights(
+            ideal.z_m - h.z_m * N,
+            ideal.x - h.x * N - 2.0 * x * N1 * h.z_m,
+            ideal.y - h.y * N - 2.0 * y * N1 * h.z_m,
+            ideal.xx_per_m - h.xx_per_m * N - 4.0 * x * N1 * h.x - (2.0 * N1 + 4.0 * N2 * x * x) * h.z_m,
+            ideal.xy_per_m - h.xy_per_m * N - 2.0 * N1 * (y * h.x + x * h.y) - 4.0 * N2 * x * y * h.z_m,
+            ideal.yy_per_m - h.yy_per_m * N - 4.0 * y * N1 * h.y - (2.0 * N1 + 4.0 * N2 * y * y) * h.z_m,
+        )
+
+    def deviation(self, x: Array, y: Array) -> Heights:
+        """h and its derivatives: c0 + a1 X + b1 Y + a2 C2 + b2 S2 + a3 C3 + b3 S3, polynomials of t = X^2 + Y^2.
+
+        X, Y are places in radii of the disc; C2 + i S2 and C3 + i S3 are the powers of X + i Y.
+        """
+        c0, a1, b1, a2, b2, a3, b3 = disc_polynomials(self.form)
+        X, Y = x / self.disc_m, y / self.disc_m
+        t = X * X + Y * Y
+        (c, c1, c2), (a, a_1, a_2), (b, b_1, b_2) = (_by_power(k, t) for k in (c0, a1, b1))
+        p, q = a2[0] + a2[1] * t, b2[0] + b2[1] * t
+        C2, S2 = X * X - Y * Y, 2.0 * X * Y
+        h = c + a * X + b * Y + p * C2 + q * S2 + a3[0] * (C2 * X - S2 * Y) + b3[0] * (C2 * Y + S2 * X)
+        by_t = c1 + a_1 * X + b_1 * Y + a2[1] * C2 + b2[1] * S2
+        by_tt = c2 + a_2 * X + b_2 * Y
+        # of what stands beside t, and of its slope by t
+        own_x = a + 2.0 * (p * X + q * Y) + 3.0 * (a3[0] * C2 + b3[0] * S2)
+        own_y = b + 2.0 * (q * X - p * Y) + 3.0 * (b3[0] * C2 - a3[0] * S2)
+        mix_x, mix_y = a_1 + 2.0 * (a2[1] * X + b2[1] * Y), b_1 + 2.0 * (b2[1] * X - a2[1] * Y)
+        bent, twisted = 2.0 * p + 6.0 * (a3[0] * X + b3[0] * Y), 2.0 * q + 6.0 * (b3[0] * X - a3[0] * Y)
+        k, k2 = 1.0 / self.disc_m, 1.0 / self.disc_m**2
+        return Heights(
+            h,
+            k * (2.0 * X * by_t + own_x),
+            k * (2.0 * Y * by_t + own_y),
+            k2 * (2.0 * by_t + 4.0 * X * (X * by_tt + mix_x) + bent),
+            k2 * (4.0 * X * Y * by_tt + 2.0 * (Y * mix_x + X * mix_y) + twisted),
+            k2 * (2.0 * by_t + 4.0 * Y * (Y * by_tt + mix_y) - bent),
+        )
+
+    def level(self, points_m: Array) -> Level:
+        """Level of the surface: 0 on it, above 0 before it, at points (..., 3)."""
+        return height_level(self, points_m)
+
+    def check(self) -> None:
+        """Raise `SceneError` where too little is left of the ideal's curvature.
+
+        The least root of det(H - ratio H_ideal) = 0, H the second derivatives of z.
+        """
+        r = np.linspace(0.0, 1.0, _RADII + 1)[1:, None] * self.rim_radius_m
+        turn = np.linspace(0.0, 2.0 * np.pi, _TURNS, endpoint=False)
+        ours, ideal = (surface.heights(r * np.cos(turn), r * np.sin(turn)) for surface in (self, self.ideal))
+        (a, b, c), (d, e, f) = ((k.xx_per_m, k.xy_per_m, k.yy_per_m) for k in (ours, ideal))
+        det, mean = d * f - e * e, 0.5 * (a * f + c * d) - b * e
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = (mean - np.sqrt(np.maximum(mean**2 - det * (a * c - b * b), 0.0))) / det
+        ratio = np.where(np.isfinite(ratio), ratio, -np.inf)
+        at = np.unravel_index(np.argmin(ratio), ratio.shape)
+        if not ratio[at] >= _LEAST_CURVATURE:
+            raise SceneError(
+                f"the form error bends the {self.ideal.shape} too far: at {float(r[at[0], 0]):.2g} m from its axis the "
+                f"curvature falls to {ratio[at]:.2f} of the ideal's; at least {_LEAST_CURVATURE} is needed, so that "
+                "every point has one image; make form_20_m ... form_33s_m smaller"
+            )
+
+
+def disc_polynomials(form: Form) -> tuple[Array, ...]:
+    """Coefficients by powers of rho^2, of c0, a1, b1, a2, b2, a3, b3 in `FormedProfile`."""
+    f = dict(zip((name[5:-2] for name in HARMONICS), form.coefficients_m, strict=True))
+    c0 = f["20"] * np.array([1.0, -6.0, 6.0, 0.0]) + f["30"] * np.array([-1.0, 12.0, -30.0, 20.0])
+    coma, astigmatism = (
+        [f[f"2{m}{part}"] * np.array(low) + f[f"3{m}{part}"] * np.array(high) for part in "cs"]
+        for m, low, high in ((1, [-2.0, 3.0, 0.0], [3.0, -12.0, 10.0]), (2, [1.0, 0.0], [-3.0, 4.0]))
+    )
+    return (c0, *coma, *astigmatism, *(np.array([f[f"33{part}"]]) for part in "cs"))
+
+
+def _by_power(c: Array, t: Array) -> tuple[Array, Array, Array]:
+    """Polynomial of degree 2 or 3 and its first two derivatives."""
+    third = c[3] if len(c) == 4 else 0.0
+    value = c[0] + t * (c[1] + t * (c[2] + t * third))
+    return value, c[1] + t * (2.0 * c[2] + 3.0 * third * t), 2.0 * c[2] + 6.0 * third * t
+
+
+def lengthening(profile: Profile, s: Array) -> tuple[Array, Array, Array]:
+    """N and its derivatives by s: N^2 = 1 + 4 s p^2 with p = sag'."""
+    sag, A = profile.sag(s), 1.0 + profile.conic
+    p, p1 = sag.slope_per_m, sag.bend_per_m3
+    p2 = 0.375 * A * A / np.sqrt(profile.vertex_radius_m**2 - A * s) ** 5
+    for i, a in enumerate(profile.even_terms[1:], start=3):
+        p2 = p2 + i * (i - 1) * (i - 2) * a * s ** (i - 3)
+    N = np.sqrt(1.0 + 4.0 * s * p * p)
+    N1 = (2.0 * p * p + 4.0 * s * p * p1) / N
+    return N, N1, (8.0 * p * p1 + 4.0 * s * (p1 * p1 + p * p2) - N1 * N1) / N
+
+
+def height_level(surface: Profile | FormedProfile, points_m: Array) -> Level:
+    """z(x, y) less the height, at points (..., 3)."""
+    x, y, z = np.moveaxis(np.asarray(points_m, float), -1, 0)
+    at, hessian = surface.heights(x, y), np.zeros((*np.shape(x), 3, 3))
+    hessian[..., 0, 0], hessian[..., 1, 1] = at.xx_per_m, at.yy_per_m
+    hessian[..., 0, 1] = hessian[..., 1, 0] = at.xy_per_m
+    return Level(at.z_m - z, np.stack([at.x, at.y, np.full(np.shape(x), -1.0)], axis=-1), hessian)
 
 
 @dataclass(frozen=True)
@@ -263,28 +425,56 @@ class RevolvedMirror(MetalSurface):
     metal : "steel", "aluminium" or "gold"
     reflectance_table : ReflectanceTable or None
         Measured reflectance instead of the metal's.
+    form : Form or None
+        Form error, by peaks of the module's polynomials; None is a perfect surface, as is a `Form` of zeros.
+    form_radius_m : float
+        Radius of the disc of these polynomials; 0 stands for the rim's, and is replaced by it.
     """
 
     profile: Profile
     roughness_alpha: float = 0.0
     metal: MetalName = "steel"
     reflectance_table: ReflectanceTable | None = None
+    form: Form | None = None
+    form_radius_m: float = 0.0
 
     def __post_init__(self) -> None:
         within("RevolvedMirror", "roughness_alpha", self.roughness_alpha, 0.0, 0.05)
         known_metal("RevolvedMirror", self.metal)
+        within("RevolvedMirror", "form_radius_m", self.form_radius_m, 0.0, _LARGEST_M)
+        if self.form is None or not any(self.form.coefficients_m):
+            object.__setattr__(self, "form", None)
+            object.__setattr__(self, "form_radius_m", 0.0)
+            return
+        if self.profile.shape == "cone":
+            raise SceneError(
+                "no form error leaves a cone convex, because its side has no curvature: a point could have several "
+                "images; remove form_20_m ... form_33s_m, or take another shape"
+            )
+        object.__setattr__(self, "form_radius_m", self.form_radius_m or self.profile.rim_radius_m)
+        FormedProfile(self.profile, self.form, self.form_radius_m).check()
+
+    @cached_property
+    def surface(self) -> Profile | FormedProfile:
+        """Surface of the mirror."""
+        return self.profile if self.form is None else FormedProfile(self.profile, self.form, self.form_radius_m)
+
+    @property
+    def reach_m(self) -> float:
+        """No point of the surface is farther from the ideal one than this, along the axis."""
+        return 0.0 if isinstance(self.surface, Profile) else self.surface.reach_m
 
     @property
     def bound_m(self) -> float:
         """No point of the surface is farther from the vertex than this."""
-        return math.hypot(self.profile.rim_radius_m, self.profile.depth_m)
+        return math.hypot(self.profile.rim_radius_m, self.profile.depth_m) + self.reach_m
 
     def level(self, points_m: Array) -> Level:
         """Level of the surface: 0 on it, above 0 before it, at points (..., 3) in the mirror's frame."""
-        return self.profile.level(points_m)
+        return self.surface.level(points_m)
 
 
-def rim_points(profile: Profile, eye_m: Array, turns_rad: Array) -> Array:
+def rim_points(profile: Profile | FormedProfile, eye_m: Array, turns_rad: Array) -> Array:
     """Occluding contour as seen from an eye, mirror's frame, shape (N, 3), metres.
 
     In each half-plane around the axis it is the rim, where that is seen, or else the place where lines of sight touch
@@ -302,10 +492,13 @@ def rim_points(profile: Profile, eye_m: Array, turns_rad: Array) -> Array:
     return _points(profile, across, radius)
 
 
-def _points(profile: Profile, across: Array, radius: Array) -> Array:
-    return np.concatenate([radius[:, None] * across, profile.sag(radius**2).z_m[:, None]], axis=-1)
+def _points(profile: Profile | FormedProfile, across: Array, radius: Array) -> Array:
+    if isinstance(profile, Profile):
+        return np.concatenate([radius[:, None] * across, profile.sag(radius**2).z_m[:, None]], axis=-1)
+    flat = radius[:, None] * across
+    return np.concatenate([flat, profile.heights(*flat.T).z_m[:, None]], axis=-1)
 
 
-def _faces(profile: Profile, across: Array, radius: Array, eye_m: Array) -> Array:
+def _faces(profile: Profile | FormedProfile, across: Array, radius: Array, eye_m: Array) -> Array:
     P = _points(profile, across, radius)
     return np.einsum("ni,ni->n", profile.level(P).gradient, eye_m - P) > 0.0

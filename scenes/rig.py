@@ -100,7 +100,7 @@ class Rig:
         Camera pose at the down position.
     T_camera_sphere : Pose
         Mirror pose in the camera frame; aligned optics have the translation (0, 0, z_c). Its rotation says how a form
-        error lies, and means nothing for a perfect sphere.
+        error and a mirror's axis lie, and means nothing for a perfect sphere.
     stroke_axis_world : 3 floats
         Direction of the stroke, made a unit vector.
     motion : Motion or None
@@ -141,12 +141,12 @@ class Rig:
     def _check_revolved(self, mirror: RevolvedMirror) -> None:
         """Raise `SceneError` if the lens is inside the mirror or behind its rim, or if something else carries it."""
         lens = self.T_camera_sphere.inverse().t
-        if self.T_camera_sphere.translation_m[2] <= 0.0 or mirror.profile.holds(lens):
+        if self.T_camera_sphere.translation_m[2] <= 0.0 or mirror.profile.holds(lens + [0.0, 0.0, mirror.reach_m]):
             raise SceneError(
                 f"Rig.T_camera_sphere: the lens is inside the mirror, whose vertex is at "
                 f"{self.T_camera_sphere.translation_m[2]:.4f} m in front of it; put the vertex farther away"
             )
-        if not lens[2] < mirror.profile.depth_m:
+        if not lens[2] < mirror.profile.depth_m - mirror.reach_m:
             raise SceneError("Rig.T_camera_sphere: the lens is behind the mirror's rim; turn the mirror towards it")
         if mirror.profile.shape == "cone":
             self._check_cone(mirror.profile.rim_radius_m)
@@ -236,7 +236,7 @@ class Rig:
         """Image of the mirror's outline (its occluding contour), shape (count, 2), pixels."""
         if isinstance(self.mirror, RevolvedMirror):
             turns = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
-            rim_m = rim_points(self.mirror.profile, self.T_camera_sphere.inverse().t, turns)
+            rim_m = rim_points(self.mirror.surface, self.T_camera_sphere.inverse().t, turns)
             return self.camera.project(self.T_camera_sphere.points(rim_m))
         s = self.sphere_in_camera_m
         distance = float(np.linalg.norm(s))

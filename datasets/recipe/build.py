@@ -28,7 +28,7 @@ from phibench.scenes.holder import LENGTHS, Holder, fitted
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.mirror import ReflectanceTable, SphereMirror
 from phibench.scenes.misalignment import Misalignment
-from phibench.scenes.revolved_mirror import Profile, RevolvedMirror, cone, image_depth_m
+from phibench.scenes.revolved_mirror import Profile, RevolvedMirror, cone
 from phibench.scenes.rig import Rig
 from phibench.scenes.room import Room
 from phibench.scenes.validation import Fault, SceneError
@@ -163,10 +163,15 @@ def _revolved_rig(table: RigTable, mirror: MirrorTable, base: Rig) -> Rig:
     T_world_camera, T_camera_sphere = _poses(table, base, vertex_m)
     tilt = rotation_xyz(mirror.tilt_x_rad, mirror.tilt_y_rad)
     T_camera_mirror = replace(T_camera_sphere, rotation=as_matrix(T_world_camera.R.T @ np.array(tilt)))
-    camera = _focused(_camera(base.camera, table), table, vertex_m + image_depth_m(profile))
+    camera = _focused(_camera(base.camera, table), table, vertex_m + _image_depth_m(profile))
     stroke = _stroke_axis(table)
     revolved = RevolvedMirror(profile, **given, reflectance_table=_reflectance(table))
     return Rig(camera, revolved, T_world_camera, T_camera_mirror, stroke)
+
+
+def _image_depth_m(profile: Profile) -> float:
+    """Depth behind the vertex at which a far room's virtual image lies: R / 2; behind a cone, half its height."""
+    return 0.5 * (profile.vertex_radius_m or profile.depth_m)
 
 
 _SURFACE = ("roughness_alpha", "metal")

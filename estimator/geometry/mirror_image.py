@@ -95,15 +95,16 @@ def _beyond_rim(view: View) -> View:
     mirror = view.rig.mirror
     if not isinstance(mirror, RevolvedMirror):
         return view
-    return replace(view, rig=replace(view.rig, mirror=replace(mirror, profile=_wider(mirror.profile))))
+    return replace(view, rig=replace(view.rig, mirror=_wider(mirror)))
 
 
 @lru_cache(maxsize=64)
-def _wider(profile: Profile) -> Profile:
+def _wider(mirror: RevolvedMirror) -> RevolvedMirror:
+    profile = mirror.profile
     for factor in _WIDER:
         with suppress(SceneError):  # folds, or is no longer convex
-            return replace(profile, rim_radius_m=factor * profile.rim_radius_m)
-    return profile
+            return replace(mirror, profile=replace(profile, rim_radius_m=factor * profile.rim_radius_m))
+    return mirror
 
 
 def _start_in_meridian(view: View, X: Array, profile: Profile) -> Array:

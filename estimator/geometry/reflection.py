@@ -20,7 +20,7 @@ from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
 from phibench.scenes.glass_tube import GlassTube
 from phibench.scenes.mirror import Form, Level, SphereMirror, level
-from phibench.scenes.revolved_mirror import Profile, RevolvedMirror
+from phibench.scenes.revolved_mirror import FormedProfile, Profile, RevolvedMirror, height_level
 from phibench.scenes.rig import Mirror, View
 
 # cos i = 1e-3 is 2e-4 px inside the outline of the default rig; the error of theta per pixel grows as 1 / cos i.
@@ -139,7 +139,7 @@ def _is_round(mirror: Mirror) -> bool:
 def _first_hit(view: View, uv_px: Array) -> _Hit:
     mirror = view.rig.mirror
     if isinstance(mirror, RevolvedMirror):
-        return _first_hit_of_profile(view, uv_px, mirror.profile)
+        return _first_hit_of_profile(view, uv_px, mirror.surface)
     if mirror.form is not None:
         return _first_hit_of_form(view, uv_px, mirror.form)
     s, radius = view.rig.sphere_in_camera_m, mirror.radius_m
@@ -161,10 +161,13 @@ def _first_hit_of_form(view: View, uv_px: Array, form: Form) -> _Hit:
     return _hit_at(view, d, t)
 
 
-def _first_hit_of_profile(view: View, uv_px: Array, profile: Profile) -> _Hit:
+def _first_hit_of_profile(view: View, uv_px: Array, surface: Profile | FormedProfile) -> _Hit:
     turned = view.rig.T_camera_sphere.R
     d = view.rig.camera.rays(uv_px)
-    return _hit_at(view, d, profile_meeting(-view.rig.sphere_in_camera_m @ turned, d @ turned, profile))
+    lens, ways = -view.rig.sphere_in_camera_m @ turned, d @ turned
+    if isinstance(surface, FormedProfile):
+        return _hit_at(view, d, formed_meeting(lens, ways, surface))
+    return _hit_at(view, d, profile_meeting(lens, ways, surface))
 
 
 def _hit_at(view: View, d: Array, distance: Array) -> _Hit:
@@ -279,9 +282,10 @@ def _through_glass(tube: GlassTube, ray: Reflection, J: ReflectionJacobian | Non
 # -- hit on a mirror of revolution -------------------------------------------------------------------------------------
 
 _CONVEX_STEPS = 60  # 6 to 9 do; each step of a ray that grazes halves what is left
+_AROUND = 1.1  # of the rim: as far as a ray may enter beside it
 
 
-def profile_meeting(origin_m: Array, directions: Array, profile: Profile) -> Array:
+def profile_meeting(origin_m: Array, directions: Array, profile: Profile, rim_m: float | None = None) -> Array:
     """Distance to the mirror along unit directions (..., 3) from one point (3,), shape (...), mirror's frame.
 
     NaN where the mirror is missed. The depth of the profile over the ray, sag(x^2 + y^2) - z, is a convex function of
@@ -299,7 +303,27 @@ def profile_meeting(origin_m: Array, directions: Array, profile: Profile) -> Arr
             t = np.where(step >= -_CLOSE_M, t + step, np.nan)  # back means that there is no zero ahead
             if not np.any(np.abs(step) > _CLOSE_M):
                 break
-        return np.where((np.abs(step) <= _CLOSE_M) & (s <= profile.rim_radius_m**2), t, np.nan)
+        rim_m = profile.rim_radius_m if rim_m is None else rim_m
+        return np.where((np.abs(step) <= _CLOSE_M) & (s <= rim_m**2), t, np.nan)
+
+
+def formed_meeting(origin_m: Array, directions: Array, surface: FormedProfile) -> Array:
+    """Distances as of `profile_meeting` to a surface with a form error.
+
+    The depth over the ray is convex within the rim, where its polynomials belong. The ideal profile, brought before
+    the surface, is met within it or nearly so: Newton's method goes on from there.
+    """
+    profile, raised = surface.ideal, np.array([0.0, 0.0, surface.reach_m])
+    t = profile_meeting(origin_m + raised, directions, profile, _AROUND * profile.rim_radius_m)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        for _ in range(_CONVEX_STEPS):
+            at = height_level(surface, origin_m + t[..., None] * directions)
+            step = -at.value_m / np.sum(at.gradient * directions, axis=-1)
+            t = np.where(step >= -_CLOSE_M, t + step, np.nan)
+            if not np.any(np.abs(step) > _CLOSE_M):
+                break
+        s = np.sum((origin_m + t[..., None] * directions)[..., :2] ** 2, axis=-1)
+        return np.where((np.abs(step) <= _CLOSE_M) & (s <= surface.rim_radius_m**2), t, np.nan)
 
 
 # -- hit on a mirror with a form error ---------------------------------------------------------------------------------

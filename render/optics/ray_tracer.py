@@ -1,8 +1,8 @@
 """Camera-side ray tracer in float64: from the pixel to the mirror and away; `room_tracer` goes on to the room.
 
 It shares no mathematics with the world-side solution (`reflection_point`), so that the two can certify each other. A
-form error enters by the values of the mirror's radius alone: neither its tensors nor its derivatives are used. The
-harmonics are written out as in `scenes/mirror.py`. The ray's place is found by the secant method on
+form error enters by the values of the mirror's radius or height alone: neither its tensors nor its derivatives are
+used. The harmonics are written out as in `scenes/mirror.py`. The ray's place is found by the secant method on
 q = |P|^2 - r(P / |P|)^2, which for a sphere is a parabola in the distance along the ray. The normal follows from
 differences of surface points.
 
@@ -17,10 +17,11 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from phibench.scenes.faces import IntArray
 from phibench.scenes.frames import Array
 from phibench.scenes.glass_tube import GlassTube
 from phibench.scenes.mirror import Form
-from phibench.scenes.revolved_mirror import Profile, RevolvedMirror
+from phibench.scenes.revolved_mirror import FormedProfile, Profile, RevolvedMirror
 from phibench.scenes.rig import View
 
 Radius = Callable[[Array], Array]
@@ -78,7 +79,7 @@ def lens_rays(view: View, uv_px: Array, lens_m: Array | None = None) -> tuple[Ar
 def reflect(view: View, origins_m: Array, directions: Array) -> MirrorRays:
     """Intersect world rays, shape (N, 3), with the mirror and reflect them."""
     if isinstance(view.rig.mirror, RevolvedMirror):
-        return _reflect_at_profile(view, origins_m, directions, view.rig.mirror.profile)
+        return _reflect_at_profile(view, origins_m, directions, view.rig.mirror.surface)
     if view.rig.mirror.form is not None:
         return _reflect_at_form(view, origins_m, directions)
     radius, centre, d = view.rig.mirror.radius_m, view.sphere_centre_m[:, None], directions.T
@@ -251,35 +252,47 @@ _REGULA_STEPS = 60  # 6 to 10 do
 _REST_M = 1e-16  # less than a rounding of a lens's distance
 
 
-def _reflect_at_profile(view: View, origins_m: Array, directions: Array, profile: Profile) -> MirrorRays:
+def _reflect_at_profile(view: View, origins_m: Array, directions: Array, surface: Surface) -> MirrorRays:
     axes, centre = view.T_world_sphere.R, view.sphere_centre_m
-    points, normals, t = meet_profile((origins_m - centre) @ axes, directions @ axes, profile)
+    points, normals, t = meet_profile((origins_m - centre) @ axes, directions @ axes, surface)
     return _reflected(view, points, normals, t, directions)
 
 
-def meet_profile(origins_m: Array, directions: Array, profile: Profile) -> tuple[Array, Array, Array]:
+def meet_profile(origins_m: Array, directions: Array, surface: Surface) -> tuple[Array, Array, Array]:
     """First points of a mirror of revolution on rays from outside, in its frame; as `meet`.
 
     A quadric gives a quadratic in the distance, counted from the ray's place that is nearest to the vertex. A
     polynomial is added to the quadric by the secant method, which needs the sag alone; the normal is that of the sag's
-    slope. Only the sheet before the rim counts: it is met first, because the body behind it is convex.
+    slope. Only the sheet before the rim counts: it is met first, because the body behind it is convex. With a form
+    error the secants begin at a quadric that certainly lies before the surface: along the ray the depth is a convex
+    function, whose secants from there do not pass its first zero.
     """
+    profile, height, before_m = surface.ideal, None, 0.0
+    if isinstance(surface, FormedProfile):
+        height, before_m = _form_height(surface), _before_m(surface)
     approach = -_dot(origins_m, directions)
     foot, A, R = origins_m + approach[:, None] * directions, 1.0 + profile.conic, profile.vertex_radius_m
-    flat_f, flat_d = foot[:, :2], directions[:, :2]
+    start = foot + [0.0, 0.0, before_m]
+    flat_f, flat_d = start[:, :2], directions[:, :2]
     a = _dot(flat_d, flat_d) + A * directions[:, 2] ** 2
-    b = _dot(flat_f, flat_d) + (A * foot[:, 2] - R) * directions[:, 2]
-    c = _dot(flat_f, flat_f) + (A * foot[:, 2] - 2.0 * R) * foot[:, 2]
-    with np.errstate(invalid="ignore", divide="ignore"):
+    b = _dot(flat_f, flat_d) + (A * start[:, 2] - R) * directions[:, 2]
+    c = _dot(flat_f, flat_f) + (A * start[:, 2] - 2.0 * R) * start[:, 2]
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         q = -(b + np.where(b < 0.0, -1.0, 1.0) * np.sqrt(b * b - a * c))
-        x = _nearest_on_sheet(foot, directions, np.stack([q / a, c / q]), -approach, profile)
-        if not profile.is_quadric:
+        x = _nearest_on_sheet(start, directions, np.stack([q / a, c / q]), -approach, profile)
+        if height is not None:
+            x = _secants_to_form(foot, directions, x, profile, height)
+        elif not profile.is_quadric:
             x = _secant_to_sag(foot, directions, x, profile)
         points = foot + x[:, None] * directions
         s = points[:, 0] ** 2 + points[:, 1] ** 2
         slope = 2.0 * profile.sag(s).slope_per_m
         normals = np.stack([slope * points[:, 0], slope * points[:, 1], np.full(len(points), -1.0)], axis=-1)
-        normals /= np.sqrt(1.0 + slope**2 * s)[:, None]
+        if height is not None:
+            normals[:, :2] -= _height_slopes(height, points, _STENCIL * profile.rim_radius_m)
+            normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+        else:
+            normals /= np.sqrt(1.0 + slope**2 * s)[:, None]
         hit = (s <= profile.rim_radius_m**2) & (_dot(normals, directions) < 0.0)
     return (
         np.where(hit[:, None], points, np.nan),
@@ -314,6 +327,93 @@ def _secant_to_sag(foot: Array, d: Array, x: Array, profile: Profile) -> Array:
         if not np.any(np.abs(step) > _REST_M):
             break
     return new
+
+
+# Form error of a mirror of revolution.
+
+Surface = Profile | FormedProfile
+Height = Callable[[Array, Array], Array]
+_MET_M = 1e-12  # depth that is left where a ray meets the surface
+_FORM_STEPS = 40  # 5 to 8 do; of a ray that grazes each leaves 0.6 of the way
+_STENCIL = 1e-4  # of the rim's radius: five points err by 1e-16 of the form's fifth derivative
+_ASIDE = 1.2  # of the rim's radius: where a ray is given up
+_ON_DISC: dict[str, Callable[[Array, Array, Array], Array]] = {  # of x, y and their squares' sum, in radii
+    "form_20_m": lambda x, y, t: (6.0 * t - 6.0) * t + 1.0,
+    "form_21c_m": lambda x, y, t: (3.0 * t - 2.0) * x,
+    "form_21s_m": lambda x, y, t: (3.0 * t - 2.0) * y,
+    "form_22c_m": lambda x, y, t: x * x - y * y,
+    "form_22s_m": lambda x, y, t: 2.0 * x * y,
+    "form_30_m": lambda x, y, t: ((20.0 * t - 30.0) * t + 12.0) * t - 1.0,
+    "form_31c_m": lambda x, y, t: ((10.0 * t - 12.0) * t + 3.0) * x,
+    "form_31s_m": lambda x, y, t: ((10.0 * t - 12.0) * t + 3.0) * y,
+    "form_32c_m": lambda x, y, t: (4.0 * t - 3.0) * (x * x - y * y),
+    "form_32s_m": lambda x, y, t: (4.0 * t - 3.0) * 2.0 * x * y,
+    "form_33c_m": lambda x, y, t: x * (x * x - 3.0 * y * y),
+    "form_33s_m": lambda x, y, t: y * (3.0 * x * x - y * y),
+}
+
+
+def _form_height(surface: FormedProfile) -> Height:
+    """Height of the surface over the ideal one, along the axis towards the camera, at places (x, y)."""
+    terms = [(peak, _ON_DISC[name]) for name, peak in asdict(surface.form).items() if peak]
+
+    def height(x: Array, y: Array) -> Array:
+        s = x * x + y * y
+        half_slope = surface.ideal.sag(s).slope_per_m
+        place = x / surface.disc_m, y / surface.disc_m, s / surface.disc_m**2
+        along_normal = sum(peak * wave(*place) for peak, wave in terms)
+        return np.asarray(along_normal * np.sqrt(1.0 + 4.0 * s * half_slope * half_slope))
+
+    return height
+
+
+def _secants_to_form(foot: Array, d: Array, x: Array, profile: Profile, height: Height) -> Array:
+    """Places x where rays meet a surface with a form error, from places before it; NaN where there is none.
+
+    The depth along a ray is convex, and two places before its first zero have their secant's zero before it as well.
+    """
+
+    def depth(x: Array, rays: IntArray) -> Array:
+        P = foot[rays] + x[:, None] * d[rays]
+        s = P[:, 0] ** 2 + P[:, 1] ** 2
+        z = np.asarray(profile.sag(s).z_m - height(P[:, 0], P[:, 1]) - P[:, 2])
+        return np.where(s < (_ASIDE * profile.rim_radius_m) ** 2, z, np.nan)
+
+    met = np.full(len(x), np.nan)
+    rays = np.flatnonzero(np.isfinite(x))
+    new, old = x[rays], x[rays] - 1e-4 * profile.rim_radius_m
+    f_new, f_old = depth(new, rays), depth(old, rays)
+    for _ in range(_FORM_STEPS):
+        step = f_new * (new - old) / (f_new - f_old)
+        step = np.where((f_new == f_old) & np.isfinite(f_new), 0.0, step)
+        old, f_old, new = new, f_new, new - step
+        f_new = depth(new, rays)
+        done = (np.abs(step) <= _REST_M) & (np.abs(f_new) < _MET_M)
+        met[rays[done]] = new[done]
+        going = ~done & np.isfinite(f_new)
+        rays, old, f_old, new, f_new = (values[going] for values in (rays, old, f_old, new, f_new))
+        if not len(rays):
+            break
+    close = np.abs(f_new) < _MET_M
+    met[rays[close]] = new[close]
+    return met
+
+
+def _before_m(surface: FormedProfile) -> float:
+    """Shift of the quadric that brings it before the surface."""
+    rim, terms = surface.rim_radius_m, surface.ideal.even_terms
+    return surface.reach_m + sum(max(-a, 0.0) * rim ** (2 * i) for i, a in enumerate(terms, start=2))
+
+
+def _height_slopes(height: Height, points: Array, step: float) -> Array:
+    """Derivatives of a height by x and y, shape (N, 2)."""
+    x, y = points[:, 0], points[:, 1]
+
+    def slope(a: float, b: float) -> Array:
+        near, far = (height(x + k * a, y + k * b) - height(x - k * a, y - k * b) for k in (1.0, 2.0))
+        return np.asarray((8.0 * near - far) / (12.0 * step))
+
+    return np.stack([slope(step, 0.0), slope(0.0, step)], axis=-1)
 
 
 # Glass around the mirror.

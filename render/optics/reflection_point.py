@@ -101,7 +101,7 @@ def _straight(view: View, points_m: Array, eyes_m: Array) -> MirrorPoints:
     axes = view.T_world_sphere.R
     if isinstance(mirror, RevolvedMirror):
         ends = ((points_m - centre) @ axes, (eyes_m - centre) @ axes)
-        found, normals, lit = revolved_points(*ends, mirror.profile)
+        found, normals, lit = revolved_points(*ends, mirror.surface)
         return MirrorPoints(found @ axes.T + centre, normals @ axes.T, lit, points_m)
     if mirror.form is None:
         found, lit = reflection_points(points_m - centre, eyes_m - centre, mirror.radius_m)
@@ -171,7 +171,7 @@ def _spread(view: View, mirror_m: Array, points_m: Array, eyes_m: Array, cos_i: 
     axes, centre = view.T_world_sphere.R, view.sphere_centre_m
     P, a, b = ((place - centre) @ axes for place in (mirror_m, points_m, eyes_m))
     if isinstance(mirror, RevolvedMirror):
-        return (s * far / cos_i) ** 2 * revolved_determinant(P, a, b, mirror.profile)
+        return (s * far / cos_i) ** 2 * revolved_determinant(P, a, b, mirror.surface)
     return (s * far / cos_i) ** 2 * path_determinant(P, a, b, mirror)
 
 

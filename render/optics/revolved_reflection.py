@@ -12,6 +12,10 @@ the side away from the point, and at least 0 where it touches on the point's sid
 both ends outside. Newton's method inside the shrinking bracket finds it. For an eye on the axis this is the answer.
 Otherwise Newton's method in the two coordinates across the axis starts there. Where many pairs lie close together, as
 those of a spot and the lens, all start at the place of their middle; those that get nowhere take the long way.
+
+A form error leaves K convex (`FormedProfile.check`), and all this remains true. The search in the half-plane is that of
+the ideal profile. Where it ends beyond the rim or the limb, the other one starts there: the form may shift the answer
+inside.
 """
 
 from __future__ import annotations
@@ -20,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.scenes.frames import Array
-from phibench.scenes.revolved_mirror import Profile
+from phibench.scenes.revolved_mirror import FormedProfile, Profile
 
 _PLANE_STEPS = 80  # bisection alone would need 55; Newton takes 3 to 5
 _STEPS = 30  # 2 to 5 do
@@ -30,17 +34,18 @@ _LONGEST = 0.3  # step, in rim radii
 _CLOSE = 1e-9  # of the rim's radius: the step after that would be its square
 _FOUND = 1e-6
 _MANY, _NEAR = 32, 0.05  # pairs, and their extent over their distance, that start together
+Surface = Profile | FormedProfile
 _START = 1e-6  # of the rim's radius: where the search in the half-plane ends; the one in two coordinates goes on
 
 
-def revolved_points(points_m: Array, eyes_m: Array, profile: Profile) -> tuple[Array, Array, NDArray[np.bool_]]:
+def revolved_points(points_m: Array, eyes_m: Array, surface: Surface) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Reflection points in the mirror's frame.
 
     Parameters
     ----------
     points_m, eyes_m : arrays, shape (N, 3)
         The two points, metres, relative to the vertex.
-    profile
+    surface
 
     Returns
     -------
@@ -54,12 +59,12 @@ def revolved_points(points_m: Array, eyes_m: Array, profile: Profile) -> tuple[A
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         if _are_close(points_m) and _are_close(eyes_m):
             middle = points_m.mean(axis=0)[None], eyes_m.mean(axis=0)[None]
-            xy = np.repeat(_start(*middle, profile), len(points_m), axis=0)
-            P, N, valid = _search(xy, points_m, eyes_m, profile)
+            xy = np.repeat(_start(*middle, surface), len(points_m), axis=0)
+            P, N, valid = _search(xy, points_m, eyes_m, surface)
         rest = np.flatnonzero(~valid)
         if len(rest):
             ends = points_m[rest], eyes_m[rest]
-            P[rest], N[rest], valid[rest] = _search(_start(*ends, profile), *ends, profile)
+            P[rest], N[rest], valid[rest] = _search(_start(*ends, surface), *ends, surface)
     return P, N, valid
 
 
@@ -68,7 +73,7 @@ def _are_close(ends_m: Array) -> bool:
     return len(ends_m) >= _MANY and bool(np.ptp(ends_m, axis=0).max() <= _NEAR * np.linalg.norm(ends_m[0]))
 
 
-def _search(xy: Array, points_m: Array, eyes_m: Array, profile: Profile) -> tuple[Array, Array, NDArray[np.bool_]]:
+def _search(xy: Array, points_m: Array, eyes_m: Array, surface: Surface) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Newton's method from places (x, y), shape (N, 2); returns as `revolved_points`."""
     index = np.flatnonzero(np.isfinite(xy).all(axis=1))
     step = np.full(len(xy), np.inf)
@@ -77,45 +82,45 @@ def _search(xy: Array, points_m: Array, eyes_m: Array, profile: Profile) -> tupl
             break
         whole = len(index) == len(xy)
         part = (xy, points_m, eyes_m) if whole else (xy[index], points_m[index], eyes_m[index])
-        move = _newton(*part, profile)
+        move = _newton(*part, surface)
         length = np.hypot(move[:, 0], move[:, 1])
         if whole:
             xy, step = xy + move, length
         else:
             xy[index] += move
             step[index] = length
-        index = index[length > _CLOSE * profile.rim_radius_m]  # NaN leaves as well
-    s = np.einsum("ni,ni->n", xy, xy)
-    sag = profile.sag(s)
-    P = np.concatenate([xy, sag.z_m[:, None]], axis=-1)
-    N = np.concatenate([2.0 * sag.slope_per_m[:, None] * xy, np.full((len(xy), 1), -1.0)], axis=-1)
-    N /= np.sqrt(1.0 + 4.0 * sag.slope_per_m**2 * s)[:, None]
+        index = index[length > _CLOSE * surface.rim_radius_m]  # NaN leaves as well
+    s, at = np.einsum("ni,ni->n", xy, xy), surface.heights(*xy.T)
+    P = np.concatenate([xy, at.z_m[:, None]], axis=-1)
+    N = np.stack([at.x, at.y, np.full(len(xy), -1.0)], axis=-1)
+    N /= np.sqrt(1.0 + at.x**2 + at.y**2)[:, None]
     seen = [np.einsum("ni,ni->n", end - P, N) >= 0.0 for end in (points_m, eyes_m)]
-    valid = seen[0] & seen[1] & (s <= profile.rim_radius_m**2) & (step <= _FOUND * profile.rim_radius_m)
+    valid = seen[0] & seen[1] & (s <= surface.rim_radius_m**2) & (step <= _FOUND * surface.rim_radius_m)
     lost = ~valid
     P[lost], N[lost] = np.nan, np.nan
     return P, N, np.asarray(valid)
 
 
-def _start(points_m: Array, eyes_m: Array, profile: Profile) -> Array:
+def _start(points_m: Array, eyes_m: Array, surface: Surface) -> Array:
     """Places (x, y) to begin at, shape (N, 2); NaN where no place inside the rim can be the answer."""
     away = np.hypot(points_m[:, 0], points_m[:, 1])
     across = np.where(away[:, None] > 0.0, points_m[:, :2] / away[:, None], [1.0, 0.0])
     end = (away, points_m[:, 2])
     eye = (np.einsum("ni,ni->n", eyes_m[:, :2], across), eyes_m[:, 2])
-    r = _in_meridian(end, eye, profile)
+    r = _in_meridian(end, eye, surface.ideal, to_end=surface is not surface.ideal)
     return r[:, None] * across
 
 
 Plane = tuple[Array, Array]  # radius and height of points in a half-plane, each of shape (N,)
 
 
-def _in_meridian(point: Plane, eye: Plane, profile: Profile) -> Array:
-    """Root of f, shape (N,); NaN where it lies beyond the rim."""
+def _in_meridian(point: Plane, eye: Plane, profile: Profile, *, to_end: bool) -> Array:
+    """Root of f, shape (N,). Where it lies beyond the rim or the limb, NaN, or the end of what is seen."""
     reach = min(_BEYOND * profile.rim_radius_m, _EQUATOR * profile.equator_m)
     low, high = _seen_part(eye, profile, reach)
-    lost = (_slope(low, point, eye, profile)[0] > 0.0) | (_slope(high, point, eye, profile)[0] < 0.0)
-    r = np.where(lost, np.nan, 0.5 * (low + high))
+    inside, outside = _slope(low, point, eye, profile)[0] > 0.0, _slope(high, point, eye, profile)[0] < 0.0
+    ends = np.where(inside, low, high), inside | outside
+    r = np.where(ends[1], np.nan, 0.5 * (low + high))
     for _ in range(_PLANE_STEPS):
         f, bend = _slope(r, point, eye, profile)
         low, high = np.where(f < 0.0, r, low), np.where(f > 0.0, r, high)
@@ -125,7 +130,7 @@ def _in_meridian(point: Plane, eye: Plane, profile: Profile) -> Array:
         r = new
         if not moving.any():
             break
-    return r
+    return np.where(ends[1], ends[0], r) if to_end else r
 
 
 def _seen_part(eye: Plane, profile: Profile, reach: float) -> Plane:
@@ -175,30 +180,28 @@ def _slope(r: Array, point: Plane, eye: Plane, profile: Profile) -> tuple[Array,
     return f, bend
 
 
-def _newton(xy: Array, points_m: Array, eyes_m: Array, profile: Profile) -> Array:
+def _newton(xy: Array, points_m: Array, eyes_m: Array, surface: Surface) -> Array:
     """Step in (x, y), shape (N, 2), no longer than `_LONGEST` rim radii."""
-    (g_x, g_y), (h_xx, h_xy, h_yy), _ = _path(xy, points_m, eyes_m, profile)
+    (g_x, g_y), (h_xx, h_xy, h_yy), _ = _path(xy, points_m, eyes_m, surface)
     det = h_xx * h_yy - h_xy * h_xy
     move = np.stack([h_xy * g_y - h_yy * g_x, h_xy * g_x - h_xx * g_y], axis=-1) / det[:, None]
     length = np.hypot(move[:, 0], move[:, 1])[:, None]
-    return move * np.minimum(1.0, _LONGEST * profile.rim_radius_m / np.maximum(length, 1e-300))
+    return move * np.minimum(1.0, _LONGEST * surface.rim_radius_m / np.maximum(length, 1e-300))
 
 
 def _path(
-    xy: Array, points_m: Array, eyes_m: Array, profile: Profile
+    xy: Array, points_m: Array, eyes_m: Array, surface: Surface
 ) -> tuple[tuple[Array, Array], tuple[Array, Array, Array], Array]:
     """Derivatives of the path as a function of x and y: slopes, second derivatives xx, xy, yy; and squared slope of z.
 
     All of shape (N,). Components are written out: matrices of each pair would take three times as long.
     """
     x, y = xy.T
-    sag = profile.sag(x * x + y * y)
-    z_x, z_y = 2.0 * sag.slope_per_m * x, 2.0 * sag.slope_per_m * y
-    bend = 4.0 * sag.bend_per_m3
-    z_xx, z_xy, z_yy = 2.0 * sag.slope_per_m + bend * x * x, bend * x * y, 2.0 * sag.slope_per_m + bend * y * y
+    at = surface.heights(x, y)
+    z_x, z_y, z_xx, z_xy, z_yy = at.x, at.y, at.xx_per_m, at.xy_per_m, at.yy_per_m
     g_x, g_y, h_xx, h_xy, h_yy = np.zeros((5, len(x)))
     for end in (points_m, eyes_m):
-        dx, dy, dz = x - end[:, 0], y - end[:, 1], sag.z_m - end[:, 2]
+        dx, dy, dz = x - end[:, 0], y - end[:, 1], at.z_m - end[:, 2]
         near = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
         u_x, u_y = (dx + dz * z_x) * near, (dy + dz * z_y) * near
         g_x, g_y = g_x + u_x, g_y + u_y
@@ -208,10 +211,10 @@ def _path(
     return (g_x, g_y), (h_xx, h_xy, h_yy), z_x * z_x + z_y * z_y
 
 
-def revolved_determinant(mirror_m: Array, points_m: Array, eyes_m: Array, profile: Profile) -> Array:
+def revolved_determinant(mirror_m: Array, points_m: Array, eyes_m: Array, surface: Surface) -> Array:
     """Determinant of the path's second derivatives along the surface, shape (N,), 1/m^2, at reflection points.
 
     Those by x and y are T^T M T, with T the derivatives of the surface point: det(T)^2 = 1 + |grad z|^2.
     """
-    _, (h_xx, h_xy, h_yy), steep = _path(mirror_m[:, :2], points_m, eyes_m, profile)
+    _, (h_xx, h_xy, h_yy), steep = _path(mirror_m[:, :2], points_m, eyes_m, surface)
     return np.asarray((h_xx * h_yy - h_xy * h_xy) / (1.0 + steep))

@@ -6,8 +6,8 @@ finite numbers that mean nothing.
 
 **Sphere.** Closed form.
 
-**Form error.** Newton's method on q(t) = |P|^2 - r(P / |P|)^2 along the ray: first to its least value, which tells hit
-from miss, then from the parabola's zero to that of q.
+**Form error of a sphere.** Newton's method on q(t) = |P|^2 - r(P / |P|)^2 along the ray: first to its least value,
+which tells hit from miss, then from the parabola's zero to that of q.
 
 **Mirror of revolution.** A quadric gives a quadratic in the distance. Even terms add P(s) to its sag. The excess of sag
 over height is a convex function along the ray, because the profile is convex. The quadric shifted by the least P lies
@@ -26,7 +26,7 @@ import numpy as np
 
 from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.scenes.frames import Array
-from phibench.scenes.revolved_mirror import Profile, RevolvedMirror
+from phibench.scenes.revolved_mirror import FormedProfile, Profile, RevolvedMirror, disc_polynomials
 from phibench.scenes.rig import View
 
 Meeting = Callable[[Any, Any], tuple[Any, Any, Any]]
@@ -36,7 +36,7 @@ def mirror_intersection(mi: ModuleType, view: View) -> Meeting:
     """Function from origins and unit directions to first points, outward unit normals, and whether there is one."""
     mirror = view.rig.mirror
     if isinstance(mirror, RevolvedMirror):
-        return _Revolved(mi, view, mirror.profile).meet
+        return _Revolved(mi, view, mirror.surface).meet
     if mirror.form is not None:
         return lambda origin, direction: meet_form(mi, view, origin, direction)
     return _ball(mi, mirror.radius_m)
@@ -69,8 +69,10 @@ _PLACES = 1001  # where the least of the even terms is looked for
 class _Revolved:
     """A profile's numbers in millimetres."""
 
-    def __init__(self, mi: ModuleType, view: View, profile: Profile) -> None:
+    def __init__(self, mi: ModuleType, view: View, surface: Profile | FormedProfile) -> None:
         import drjit as dr
+
+        profile = surface.ideal
 
         def number(value: float) -> Any:
             return dr.opaque(mi.Float64, float(value))
@@ -80,7 +82,9 @@ class _Revolved:
         self._rim2 = number((MM_PER_M * profile.rim_radius_m) ** 2)
         terms = profile.even_terms if not profile.is_quadric else ()
         self._terms = [number(a * MM_PER_M ** (1 - 2 * i)) for i, a in enumerate(terms, start=2)]
-        self._least = number(MM_PER_M * _least_of_terms(profile))
+        formed = isinstance(surface, FormedProfile)
+        self._least = number(MM_PER_M * (_least_of_terms(profile) - (surface.reach_m if formed else 0.0)))
+        self._is_plain, self._form = not terms and not formed, _DiscForm(number, surface) if formed else None
 
     def meet(self, origin: Any, direction: Any) -> tuple[Any, Any, Any]:
         """First points, normals, and whether there are any; see `mirror_intersection`."""
@@ -90,7 +94,7 @@ class _Revolved:
         o, d = (_turned(V, axes.T, vector) for vector in (origin, direction))
         approach = -dr.dot(o, d)
         foot = o + approach * d
-        if not self._terms:
+        if self._is_plain:
             x, found = self._to_quadric(foot, d, -approach)
             P = foot + x * d
             gradient = V(P.x, P.y, self._bend * P.z - self._radius)
@@ -99,8 +103,8 @@ class _Revolved:
             x, excess = self._to_sag(foot, d, x)
             found &= excess < _TOUCHED_MM
             P = foot + x * d
-            _, slope = self._sag(P)
-            gradient = V(2.0 * slope * P.x, 2.0 * slope * P.y, -1.0)
+            _, z_x, z_y = self._height(P)
+            gradient = V(z_x, z_y, -1.0)
         found &= P.x * P.x + P.y * P.y <= self._rim2
         # at a cone's tip itself there is no normal
         normal = dr.select(found & (dr.squared_norm(gradient) > 0.0), dr.normalize(gradient), -d)
@@ -132,24 +136,54 @@ class _Revolved:
         excess = x
         for step in range(_RISES + 1):
             P = foot + x * d
-            z, slope = self._sag(P)
+            z, z_x, z_y = self._height(P)
             excess = z - P.z
             if step < _RISES:
-                x = x - excess / (2.0 * slope * (P.x * d.x + P.y * d.y) - d.z)
+                x = x - excess / (z_x * d.x + z_y * d.y - d.z)
         return x, excess
 
-    def _sag(self, P: Any) -> tuple[Any, Any]:
-        """Sag at places and its derivative by the radius squared; as in `Profile.sag`."""
+    def _height(self, P: Any) -> tuple[Any, Any, Any]:
+        """Height of the surface at places and its derivatives by x and y; as in `FormedProfile.heights`."""
         import drjit as dr
 
         s = P.x * P.x + P.y * P.y
         w = dr.sqrt(self._radius * self._radius - self._bend * s)
-        z, slope = s / (self._radius + w), 0.5 / w
-        power = s
+        z, slope, bend = s / (self._radius + w), 0.5 / w, 0.25 * self._bend / (w * w * w)
+        power, lower = s, type(s)(1.0)
         for i, a in enumerate(self._terms, start=2):
-            z, slope = z + a * power * s, slope + i * a * power
-            power = power * s
-        return z, slope
+            z, slope, bend = z + a * power * s, slope + i * a * power, bend + i * (i - 1) * a * lower
+            power, lower = power * s, power
+        z_x, z_y = 2.0 * slope * P.x, 2.0 * slope * P.y
+        if self._form is None:
+            return z, z_x, z_y
+        h, h_x, h_y = self._form.at(P)
+        N = dr.sqrt(1.0 + 4.0 * s * slope * slope)
+        turned = 2.0 * h * (2.0 * slope * slope + 4.0 * s * slope * bend) / N
+        return z - h * N, z_x - h_x * N - turned * P.x, z_y - h_y * N - turned * P.y
+
+
+class _DiscForm:
+    """Form error of a mirror of revolution, millimetres; as in `FormedProfile.deviation`."""
+
+    def __init__(self, number: Callable[[float], Any], surface: FormedProfile) -> None:
+        self._terms = [[number(MM_PER_M * c) for c in terms] for terms in disc_polynomials(surface.form)]
+        self._scale = number(1.0 / (MM_PER_M * surface.disc_m))
+
+    def at(self, P: Any) -> tuple[Any, Any, Any]:
+        """h and its derivatives by x and y."""
+        c0, a1, b1, a2, b2, (a3,), (b3,) = self._terms
+        X, Y = self._scale * P.x, self._scale * P.y
+        t = X * X + Y * Y
+        a, b = a1[0] + t * (a1[1] + t * a1[2]), b1[0] + t * (b1[1] + t * b1[2])
+        p, q = a2[0] + a2[1] * t, b2[0] + b2[1] * t
+        C2, S2 = X * X - Y * Y, 2.0 * X * Y
+        h = c0[0] + t * (c0[1] + t * (c0[2] + t * c0[3])) + a * X + b * Y + p * C2 + q * S2
+        h = h + a3 * (C2 * X - S2 * Y) + b3 * (C2 * Y + S2 * X)
+        by_t = c0[1] + t * (2.0 * c0[2] + 3.0 * c0[3] * t) + (a1[1] + 2.0 * a1[2] * t) * X
+        by_t = by_t + (b1[1] + 2.0 * b1[2] * t) * Y + a2[1] * C2 + b2[1] * S2
+        h_x = 2.0 * X * by_t + a + 2.0 * (p * X + q * Y) + 3.0 * (a3 * C2 + b3 * S2)
+        h_y = 2.0 * Y * by_t + b + 2.0 * (q * X - p * Y) + 3.0 * (b3 * C2 - a3 * S2)
+        return h, self._scale * h_x, self._scale * h_y
 
 
 def _least_of_terms(profile: Profile) -> float:
@@ -159,7 +193,7 @@ def _least_of_terms(profile: Profile) -> float:
     return float(added.min()) - 1e-3 * float(np.ptp(added))
 
 
-# Mirror with a form error.
+# Sphere with a form error.
 
 _LEAST_STEPS = 3
 _STEPS = 5

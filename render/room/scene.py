@@ -25,7 +25,7 @@ from phibench.render.room.camera_plugin import MM_PER_M, sensor_dict
 from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Array, Vector
 from phibench.scenes.mirror import MetalSurface, SphereMirror, deviation, level
-from phibench.scenes.revolved_mirror import Profile, RevolvedMirror
+from phibench.scenes.revolved_mirror import FormedProfile, Profile, RevolvedMirror
 from phibench.scenes.rig import View
 from phibench.scenes.room import MIRROR_NAME, Room
 from phibench.scenes.shapes import Cuboid, Rectangle, Shape
@@ -79,8 +79,13 @@ def form_grid(mirror: SphereMirror) -> tuple[Array, Array]:
     return points, normals / np.linalg.norm(normals, axis=-1, keepdims=True)
 
 
-def cap_grid(profile: Profile, radii_m: Array, turns_rad: Array) -> tuple[Array, Array]:
+def cap_grid(profile: Profile | FormedProfile, radii_m: Array, turns_rad: Array) -> tuple[Array, Array]:
     """Points and unit normals of a mirror of revolution, shape (rings, spokes, 3), for falling radii."""
+    if isinstance(profile, FormedProfile):
+        x, y = radii_m[:, None] * np.cos(turns_rad), radii_m[:, None] * np.sin(turns_rad)
+        at = profile.heights(x, y)
+        normals = np.stack([at.x, at.y, np.full(x.shape, -1.0)], axis=-1)
+        return np.stack([x, y, at.z_m], axis=-1), normals / np.linalg.norm(normals, axis=-1, keepdims=True)
     sag = profile.sag(radii_m**2)
     # a cone's tip has the normals of all its spokes
     rise = (
@@ -199,7 +204,7 @@ def mirror_entry(mi: ModuleType, view: View) -> Any:
     mirror = view.rig.mirror
     bsdf = mirror_bsdf(mirror, view.rig.camera.detector.band_wavelength_nm)
     if isinstance(mirror, RevolvedMirror):
-        grid = cap_grid(mirror.profile, *cap_places(mirror.profile))
+        grid = cap_grid(mirror.surface, *cap_places(mirror.profile))
     elif mirror.form is not None:
         grid = form_grid(mirror)
     else:
