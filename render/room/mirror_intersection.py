@@ -62,6 +62,7 @@ def _ball(mi: ModuleType, radius_m: float) -> Meeting:
 
 _BEFORE_TIP_MM = 1e-9  # rounding of a height near the vertex
 _RISES = 12  # 3 to 5 do, but where the ray grazes: each step halves the way there
+_FORM_RISES = 8  # of a dearer function, from nearer to it
 _TOUCHED_MM = 1e-6  # excess of what is met: 12 halvings leave a grazing ray 4^-12 of its first, some 0.01 mm
 _PLACES = 1001  # where the least of the even terms is looked for
 
@@ -134,11 +135,12 @@ class _Revolved:
     def _to_sag(self, foot: Any, d: Any, x: Any) -> tuple[Any, Any]:
         """Distance to the surface with its even terms, and the excess that is left there."""
         excess = x
-        for step in range(_RISES + 1):
+        rises = _RISES if self._form is None else _FORM_RISES
+        for step in range(rises + 1):
             P = foot + x * d
             z, z_x, z_y = self._height(P)
             excess = z - P.z
-            if step < _RISES:
+            if step < rises:
                 x = x - excess / (z_x * d.x + z_y * d.y - d.z)
         return x, excess
 
