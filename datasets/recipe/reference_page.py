@@ -143,13 +143,14 @@ distance from the axis.
 * A cone has `half_angle_deg` (45).
 * A polynomial has `vertex_radius_m` (0.06), `conic` (-1) and `even_terms`, which must be given.
 
-It has no holder, and no form error.
+It has no holder. A cone has no form error; the others have those of `[misalignment]`.
 """,
     "[misalignment]": """What the true rig deviates by from `[rig]`, which then is the nominal one: what an estimator
 is given. Images and truth are those of the true rig. Signs, axes and figures: `docs/misalignment.md`.
 Motions between the images hold at every carriage position but down. The light of the room stays
 that of the nominal rig, and the robot's body where it is. `form_...` are harmonics with their peaks in
-metres, (x, y, z) the direction from the sphere centre in the world's axes at the down position.
+metres, (x, y, z) the direction from the sphere centre in the world's axes at the down position. For a mirror
+of revolution they are polynomials on the rim's disc: `docs/mirrors.md`.
 """,
     "[rooms]": """Instead of `[room]` and `[[targets]]`: rooms of several kinds for the samples of `[random]`.
 Sample i stands in room i modulo their number. The kinds take turns, generated rooms first, until one has no

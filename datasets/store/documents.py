@@ -43,6 +43,7 @@ from phibench.datasets.store.schema import (
     row_line,
 )
 from phibench.scenes.holder import OF_TUBES
+from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import nearest, printable_line
 
@@ -61,7 +62,7 @@ def to_json(value: object) -> Any:
 
     A rig without a holder says nothing of one: its document, and with it every key and digest, is that of older ones.
     A holder that is no tube says nothing of glass, a mirror of steel nothing of its metal, and one without a measured
-    reflectance nothing of that.
+    reflectance nothing of that. A mirror of revolution without a form error says nothing of one.
     """
     document = _adapter(cast(Any, type(value))).dump_python(value, mode="json")
     if isinstance(value, Rig):
@@ -69,6 +70,8 @@ def to_json(value: object) -> Any:
             del document["mirror"]["metal"]
         if value.mirror.reflectance_table is None:
             del document["mirror"]["reflectance_table"]
+        if isinstance(value.mirror, RevolvedMirror) and value.mirror.form is None:
+            del document["mirror"]["form"], document["mirror"]["form_radius_m"]
         if value.holder is None:
             del document["holder"]
         elif value.holder.kind != "tube":
@@ -98,7 +101,7 @@ def from_json(kind: type[T], document: Any) -> T:
     return value
 
 
-_LATER = {"form", "coat", "window", "sun", "holder", "metal", "reflectance_table", *OF_TUBES}
+_LATER = {"form", "form_radius_m", "coat", "window", "sun", "holder", "metal", "reflectance_table", *OF_TUBES}
 """Fields that older versions do not have, whose default is what these versions meant: `mirror.form` in version 4."""
 _LARGEST = 1e12
 

@@ -8,14 +8,14 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from helpers.lamp_views import LAMP, LAMP_ROOM, lamp_image, moments, traced_lamp
+from helpers.lamp_views import LAMP_ROOM, lamp_image, lamp_window, moments, traced_lamp
 from helpers.path_ambient import path_trace
 from helpers.path_spots import compare
 from helpers.revolved_rigs import PROFILES, revolved
 
 from phibench.render.optics import spot_samples
 from phibench.render.optics.certificate import certify
-from phibench.render.optics.reflection_point import mirror_points, path_determinant
+from phibench.render.optics.reflection_point import path_determinant
 from phibench.render.optics.revolved_reflection import revolved_determinant, revolved_points
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import SpotTruth, spot_truth
@@ -26,7 +26,6 @@ from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import View
 
 SEEN_M = {"cone": (1.05, 1.3)}  # heights that a cone of 90 degrees sees: between its tip's and 14 degrees upwards
-MARGIN_PX = 12
 
 
 @pytest.fixture(scope="module")
@@ -165,14 +164,7 @@ def test_accuracy_spot_layer_against_path_tracing(
 def lamp_view(shape: str, *, aligned: bool) -> tuple[View, tuple[int, int, int, int]]:
     """View of the lamp, and a window around its image. A cone's tip lies below the lamp's lower edge or beside it."""
     view = revolved(shape, aligned=aligned).at(-0.2 if shape == "cone" else 0.2)
-    steps = np.linspace(-0.5, 0.5, 9)
-    flat = np.stack(np.meshgrid(steps * LAMP.size_m[0], steps * LAMP.size_m[1], 0.0), axis=-1).reshape(-1, 3)
-    points = LAMP.T_world_shape.points(flat)
-    found = mirror_points(view, points, np.broadcast_to(view.camera_centre_m, points.shape))
-    uv = view.rig.camera.project(view.T_world_camera.inverse().points(found.points_m[found.lit]))
-    low = np.floor(uv.min(axis=0)).astype(int) - MARGIN_PX
-    width, height = np.ceil(uv.max(axis=0)).astype(int) + MARGIN_PX + 1 - low
-    return view, (int(low[0]), int(low[1]), int(width), int(height))
+    return view, lamp_window(view)
 
 
 @pytest.mark.parametrize(("shape", "aligned"), [("hyperboloid", False), ("polynomial", True)])

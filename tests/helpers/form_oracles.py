@@ -6,11 +6,14 @@ found from values alone, in long double.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from helpers.oracles import camera_at, project_cv2
 from scipy import optimize
 
-from phibench.scenes.mirror import Form
+from phibench.scenes.mirror import HARMONICS, Form
+from phibench.scenes.revolved_mirror import FormedProfile
 from phibench.scenes.rig import Rig
 
 # magnitude of each polar factor's peak, from its derivative's zero
@@ -69,6 +72,58 @@ def fermat_on_form(a: np.ndarray, b: np.ndarray, radius_m: float, form: Form) ->
         slope, curvature = _derivatives(path)
         x = -np.linalg.solve(curvature.astype(float), slope.astype(float)).astype(np.longdouble)
     return place(centre, across, x).astype(float)
+
+
+def fermat_on_disc(a: np.ndarray, b: np.ndarray, surface: FormedProfile) -> np.ndarray:
+    """Point, shape (3,), that makes |a P| + |P b| least, frame of a mirror of revolution, as `fermat_on_form`.
+
+    The search is in x and y over the rim's radius. The surface is written with Noll's sums of factorials.
+    """
+    a, b, rim = a.astype(np.longdouble), b.astype(np.longdouble), np.longdouble(surface.rim_radius_m)
+
+    def place(xy: np.ndarray) -> np.ndarray:
+        x, y = rim * xy
+        return np.array([x, y, disc_height(x, y, surface)])
+
+    def path(xy: np.ndarray) -> np.longdouble:
+        P = place(middle + np.asarray(xy))
+        return np.sqrt((P - a) @ (P - a)) + np.sqrt((P - b) @ (P - b))
+
+    middle = np.zeros(2, np.longdouble)
+    with np.errstate(invalid="ignore"):  # the search may pass the equator
+        start = optimize.minimize(
+            lambda x: float(path(x)), np.full(2, 1e-3), method="Nelder-Mead", options={"xatol": 1e-7}
+        )
+    middle = start.x.astype(np.longdouble)
+    for _ in range(6):
+        slope, curvature = _derivatives(path)
+        middle = middle - np.linalg.solve(curvature.astype(float), slope.astype(float)).astype(np.longdouble)
+    return place(middle).astype(float)
+
+
+def disc_height(x: np.longdouble, y: np.longdouble, surface: FormedProfile) -> np.longdouble:
+    """z of a mirror of revolution with a form error."""
+    profile, r, turn = surface.ideal, np.hypot(x, y), np.arctan2(y, x)
+    R, A = np.longdouble(profile.vertex_radius_m), 1 + np.longdouble(profile.conic)
+    w = np.sqrt(R * R - A * r * r)
+    z, slope = r * r / (R + w), r / w
+    for i, c in enumerate(profile.even_terms, start=2):
+        z, slope = z + c * r ** (2 * i), slope + 2 * i * c * r ** (2 * i - 1)
+    h = np.longdouble(0)
+    for name in HARMONICS:
+        degree, order = int(name[5]), int(name[6])
+        wave = np.sin(order * turn) if "s_m" in name else np.cos(order * turn)
+        h += np.longdouble(getattr(surface.form, name)) * _radial(2 * degree - order, order, r / surface.disc_m) * wave
+    return z - h * np.sqrt(1 + slope * slope)
+
+
+def _radial(n: int, m: int, rho: np.longdouble) -> np.longdouble:
+    """Zernike's radial polynomial (R. J. Noll, J. Opt. Soc. Am. 66, 207, 1976, eq. 2)."""
+    f = math.factorial
+    return sum(
+        (-1) ** s * f(n - s) / (f(s) * f((n + m) // 2 - s) * f((n - m) // 2 - s)) * rho ** (n - 2 * s)
+        for s in range((n - m) // 2 + 1)
+    )
 
 
 def form_pixel(rig: Rig, offset_m: float, spot_world_m: np.ndarray) -> np.ndarray:

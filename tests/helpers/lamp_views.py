@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from phibench.render.optics.ray_tracer import trace_pixels
+from phibench.render.optics.reflection_point import mirror_points
 from phibench.render.optics.room_tracer import first_hit
 from phibench.scenes.camera import Camera
 from phibench.scenes.rig import View
@@ -19,6 +20,7 @@ LAMP = rectangle(
     texture=Uniform((0.0, 0.0, 0.0)),
     radiance_w_m2_sr=(1.0, 2.0, 3.0),
 )
+_MARGIN_PX = 12
 LAMP_ROOM = Room("a lamp", (LAMP,), (), robot=False)
 
 
@@ -27,6 +29,18 @@ def moments(image: np.ndarray) -> tuple[float, float, float]:
     v, u = np.indices(image.shape)
     total = float(image.sum(dtype=float))
     return total, float((image * u).sum() / total), float((image * v).sum() / total)
+
+
+def lamp_window(view: View) -> tuple[int, int, int, int]:
+    """Window around the lamp's image in the mirror: left, top, width and height."""
+    steps = np.linspace(-0.5, 0.5, 9)
+    flat = np.stack(np.meshgrid(steps * LAMP.size_m[0], steps * LAMP.size_m[1], 0.0), axis=-1).reshape(-1, 3)
+    points = LAMP.T_world_shape.points(flat)
+    found = mirror_points(view, points, np.broadcast_to(view.camera_centre_m, points.shape))
+    uv = view.rig.camera.project(view.T_world_camera.inverse().points(found.points_m[found.lit]))
+    low = np.floor(uv.min(axis=0)).astype(int) - _MARGIN_PX
+    width, height = np.ceil(uv.max(axis=0)).astype(int) + _MARGIN_PX + 1 - low
+    return int(low[0]), int(low[1]), int(width), int(height)
 
 
 def lamp_image(view: View, room: Room, crop: tuple[int, int, int, int]) -> np.ndarray:

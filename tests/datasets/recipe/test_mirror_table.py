@@ -103,6 +103,7 @@ def test_what_does_not_go_together_is_one_sentence(rig: dict[str, Any], begin: s
         ({"axial_m": -0.1}, "misalignment: Rig.T_camera_sphere: the lens is inside the mirror"),
         ({"radius_m": -0.059}, "misalignment: rig.mirror.rim_radius_m = 0.06: the mirror would be 1.8 m deep"),
         ({"radius_m": -0.1}, "misalignment: rig.mirror.vertex_radius_m = -0.04"),
+        ({"form_30_m": 5e-4}, "misalignment: the form error bends the paraboloid too far: at 0.06 m from its axis"),
     ],
 )
 def test_a_true_mirror_that_cannot_be_is_one_sentence(deviation: dict[str, float], begin: str) -> None:
