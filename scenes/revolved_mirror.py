@@ -31,9 +31,9 @@ magnitude is 1. With rho the radius over the rim's, and phi the angle from x to 
     32   (4 rho^4 - 3 rho^2) cos, sin 2 phi
     33   rho^3 cos, sin 3 phi                      trefoil
 
-These are the fringe Zernike polynomials 5 to 16 (J. C. Wyant and K. Creath, "Basic wavefront aberration theory for
-optical metrology", Applied Optics and Optical Engineering XI, 1992, table III). Half the sum of power and order is the
-degree, as of a sphere's harmonics (`scenes.mirror`). Degrees 0 and 1 are parameters already: axial shift, tilt, radius.
+These are fringe Zernike polynomials 5 to 16 (J. C. Wyant and K. Creath, "Basic wavefront aberration theory for optical
+metrology", Applied Optics and Optical Engineering XI, 1992, table III). The degree is half the sum of power and order.
+Degrees 0 and 1 are parameters already: axial shift, tilt, radius.
 
 z - sag / 2 has to remain convex: then the body does, and keeps half of its curvature. A cone has none along its side:
 the mean of -h over circles around the axis would be convex, and so rise from the axis on. Without a part in 1 and rho^2
@@ -194,9 +194,7 @@ class Profile:
 
     def heights(self, x: Array, y: Array) -> Heights:
         """z at places off the axis, and its derivatives."""
-        sag = self.sag(x * x + y * y)
-        steep, bend = 2.0 * sag.slope_per_m, 4.0 * sag.bend_per_m3
-        return Heights(sag.z_m, steep * x, steep * y, steep + bend * x * x, bend * x * y, steep + bend * y * y)
+        return _raised(self.sag(x * x + y * y), x, y)
 
     @property
     def ideal(self) -> Profile:
@@ -231,21 +229,15 @@ class Profile:
 
         That of a hyperboloid or cone is below 0 inside the other sheet as well.
         """
+        if not self.is_quadric:
+            return height_level(self, points_m)
         x, y, z = np.moveaxis(np.asarray(points_m, float), -1, 0)
-        s, hessian = x * x + y * y, np.zeros((*np.shape(x), 3, 3))
-        if self.is_quadric:
-            A, R = 1.0 + self.conic, self.vertex_radius_m
-            scale = 0.5 / max(R, self.rim_radius_m)  # makes the value a distance, nearly
-            hessian[..., 0, 0] = hessian[..., 1, 1] = 2.0 * scale
-            hessian[..., 2, 2] = 2.0 * scale * A
-            gradient = 2.0 * scale * np.stack([x, y, A * z - R], axis=-1)
-            return Level(scale * (s + A * z * z - 2.0 * R * z), gradient, hessian)
-        sag = self.sag(s)
-        flat = np.stack([x, y], axis=-1)
-        hessian[..., :2, :2] = 4.0 * sag.bend_per_m3[..., None, None] * flat[..., :, None] * flat[..., None, :]
-        hessian[..., :2, :2] += 2.0 * sag.slope_per_m[..., None, None] * np.eye(2)
-        gradient = np.concatenate([2.0 * sag.slope_per_m[..., None] * flat, -np.ones((*np.shape(x), 1))], axis=-1)
-        return Level(sag.z_m - z, gradient, hessian)
+        s, hessian, A, R = x * x + y * y, np.zeros((*np.shape(x), 3, 3)), 1.0 + self.conic, self.vertex_radius_m
+        scale = 0.5 / max(R, self.rim_radius_m)  # makes the value a distance, nearly
+        hessian[..., 0, 0] = hessian[..., 1, 1] = 2.0 * scale
+        hessian[..., 2, 2] = 2.0 * scale * A
+        gradient = 2.0 * scale * np.stack([x, y, A * z - R], axis=-1)
+        return Level(scale * (s + A * z * z - 2.0 * R * z), gradient, hessian)
 
 
 def sphere_cap(radius_m: float, rim_radius_m: float) -> Profile:
@@ -282,16 +274,7 @@ _RADII, _TURNS = 40, 48  # where it is looked at: the curvature has up to three 
 
 @dataclass(frozen=True)
 class FormedProfile:
-    """Profile of revolution with a form error, which `RevolvedMirror` checks.
-
-    Parameters
-    ----------
-    ideal : Profile
-    form : Form
-        Peaks of the polynomials of the module's docstring.
-    disc_m : float
-        Radius of the disc that they belong to.
-    """
+    """Profile with a form error: peaks of the polynomials above, on a disc of a radius; `RevolvedMirror` checks it."""
 
     ideal: Profile
     form: Form
@@ -307,9 +290,15 @@ class FormedProfile:
         """No point of the surface is farther from the ideal one than this, along the axis."""
         return self.form.bound_m * float(lengthening(self.ideal, np.array(self.rim_radius_m**2))[0])
 
+    @cached_property
+    def _polynomials(self) -> tuple[Array, ...]:
+        return disc_polynomials(self.form)
+
     def heights(self, x: Array, y: Array) -> Heights:
         """z at places off the axis, and its derivatives."""
-        ideal, h, (N, N1, N2) = self.ideal.heights(x, y), self.deviation(x, y), lengthening(self.ideal, x * x + y * y)
+        s = x * x + y * y
+        sag, h = self.ideal.sag(s), self.deviation(x, y)
+        ideal, (N, N1, N2) = _raised(sag, x, y), lengthening(self.ideal, s, sag)
         return Heights(
             ideal.z_m - h.z_m * N,
             ideal.x - h.x * N - 2.0 * x * N1 * h.z_m,
@@ -324,7 +313,7 @@ class FormedProfile:
 
         X, Y are places in radii of the disc; C2 + i S2 and C3 + i S3 are the powers of X + i Y.
         """
-        c0, a1, b1, a2, b2, a3, b3 = disc_polynomials(self.form)
+        c0, a1, b1, a2, b2, a3, b3 = self._polynomials
         X, Y = x / self.disc_m, y / self.disc_m
         t = X * X + Y * Y
         (c, c1, c2), (a, a_1, a_2), (b, b_1, b_2) = (_by_power(k, t) for k in (c0, a1, b1))
@@ -374,9 +363,14 @@ class FormedProfile:
             )
 
 
+def _raised(sag: Sag, x: Array, y: Array) -> Heights:
+    steep, bend = 2.0 * sag.slope_per_m, 4.0 * sag.bend_per_m3
+    return Heights(sag.z_m, steep * x, steep * y, steep + bend * x * x, bend * x * y, steep + bend * y * y)
+
+
 def disc_polynomials(form: Form) -> tuple[Array, ...]:
     """Coefficients by powers of rho^2, of c0, a1, b1, a2, b2, a3, b3 in `FormedProfile`."""
-    f = dict(zip((name[5:-2] for name in HARMONICS), form.coefficients_m, strict=True))
+    f = {name[5:-2]: getattr(form, name) for name in HARMONICS}
     c0 = f["20"] * np.array([1.0, -6.0, 6.0, 0.0]) + f["30"] * np.array([-1.0, 12.0, -30.0, 20.0])
     coma, astigmatism = (
         [f[f"2{m}{part}"] * np.array(low) + f[f"3{m}{part}"] * np.array(high) for part in "cs"]
@@ -392,9 +386,9 @@ def _by_power(c: Array, t: Array) -> tuple[Array, Array, Array]:
     return value, c[1] + t * (2.0 * c[2] + 3.0 * third * t), 2.0 * c[2] + 6.0 * third * t
 
 
-def lengthening(profile: Profile, s: Array) -> tuple[Array, Array, Array]:
+def lengthening(profile: Profile, s: Array, sag: Sag | None = None) -> tuple[Array, Array, Array]:
     """N and its derivatives by s: N^2 = 1 + 4 s p^2 with p = sag'."""
-    sag, A = profile.sag(s), 1.0 + profile.conic
+    sag, A = sag or profile.sag(s), 1.0 + profile.conic
     p, p1 = sag.slope_per_m, sag.bend_per_m3
     p2 = 0.375 * A * A / np.sqrt(profile.vertex_radius_m**2 - A * s) ** 5
     for i, a in enumerate(profile.even_terms[1:], start=3):
@@ -428,7 +422,7 @@ class RevolvedMirror(MetalSurface):
     form : Form or None
         Form error, by peaks of the module's polynomials; None is a perfect surface, as is a `Form` of zeros.
     form_radius_m : float
-        Radius of the disc of these polynomials; 0 stands for the rim's, and is replaced by it.
+        Radius of the disc of these polynomials; 0 is replaced by the rim's.
     """
 
     profile: Profile
@@ -493,10 +487,9 @@ def rim_points(profile: Profile | FormedProfile, eye_m: Array, turns_rad: Array)
 
 
 def _points(profile: Profile | FormedProfile, across: Array, radius: Array) -> Array:
-    if isinstance(profile, Profile):
-        return np.concatenate([radius[:, None] * across, profile.sag(radius**2).z_m[:, None]], axis=-1)
     flat = radius[:, None] * across
-    return np.concatenate([flat, profile.heights(*flat.T).z_m[:, None]], axis=-1)
+    z = profile.sag(radius**2).z_m if isinstance(profile, Profile) else profile.heights(*flat.T).z_m
+    return np.concatenate([flat, z[:, None]], axis=-1)
 
 
 def _faces(profile: Profile | FormedProfile, across: Array, radius: Array, eye_m: Array) -> Array:

@@ -391,7 +391,8 @@ def _secants_to_form(foot: Array, d: Array, x: Array, profile: Profile, height: 
         done = (np.abs(step) <= _REST_M) & (np.abs(f_new) < _MET_M)
         met[rays[done]] = new[done]
         going = ~done & np.isfinite(f_new)
-        rays, old, f_old, new, f_new = (values[going] for values in (rays, old, f_old, new, f_new))
+        rays = rays[going]
+        old, f_old, new, f_new = (values[going] for values in (old, f_old, new, f_new))
         if not len(rays):
             break
     close = np.abs(f_new) < _MET_M

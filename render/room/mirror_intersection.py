@@ -83,9 +83,10 @@ class _Revolved:
         self._rim2 = number((MM_PER_M * profile.rim_radius_m) ** 2)
         terms = profile.even_terms if not profile.is_quadric else ()
         self._terms = [number(a * MM_PER_M ** (1 - 2 * i)) for i, a in enumerate(terms, start=2)]
-        formed = isinstance(surface, FormedProfile)
-        self._least = number(MM_PER_M * (_least_of_terms(profile) - (surface.reach_m if formed else 0.0)))
-        self._is_plain, self._form = not terms and not formed, _DiscForm(number, surface) if formed else None
+        self._form, before_m = None, -_least_of_terms(profile)
+        if isinstance(surface, FormedProfile):
+            self._form, before_m = _DiscForm(number, surface), before_m + surface.reach_m
+        self._least, self._is_plain = number(-MM_PER_M * before_m), not terms and self._form is None
 
     def meet(self, origin: Any, direction: Any) -> tuple[Any, Any, Any]:
         """First points, normals, and whether there are any; see `mirror_intersection`."""
