@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from phibench.datasets.film.moving_camera import BakedRoom, open_baked_rooms
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.random_streams import Name, generator
 from phibench.scenes.room import Room
@@ -28,6 +30,7 @@ _LOW_M, _HIGH_M = 0.03, 0.95  # what the robot can run into: not rugs and wires,
 _ROBOT_M = 0.40  # beside the way; the robot is 0.53 m wide
 _BODY_M = 0.28  # about the base; boxes nearer than that are run into
 _TRIES = 400
+_SAME_M = 2e-3  # a box and the shape that it stands for, where a spot lies
 
 
 @dataclass(frozen=True)
@@ -132,11 +135,14 @@ class Arena:
         What stands in lines of sight.
     floor : Boxes
         What the robot runs into.
+    baked : BakedRoom, optional
+        The same room with its light, for pixels. Spots then lie where its own shapes and the boxes agree.
     """
 
     name: str
     sight: Boxes
     floor: Boxes
+    baked: BakedRoom | None = None
 
     def draw_target(self, rng: np.random.Generator, distances_m: tuple[float, float], stand_off_m: float) -> Target:
         """Target at a distance from the origin's upright axis, which a robot at the origin can drive to.
@@ -149,7 +155,7 @@ class Arena:
         for _ in range(_TRIES):
             azimuth, height = rng.uniform(-math.pi, math.pi), rng.uniform(0.2, 1.1)
             ahead = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
-            hit = self.sight.first_hit(np.array([0.0, 0.0, height]), ahead, distances_m[1])
+            hit = self._first_hit(np.array([0.0, 0.0, height]), ahead, distances_m[1])
             if hit is None or hit[0] < distances_m[0] or hit[1] @ ahead > -0.5:
                 continue
             way = np.arange(0.0, hit[0] - stand_off_m + 0.05, 0.05)
@@ -165,10 +171,18 @@ class Arena:
         for _ in range(_TRIES):
             azimuth, rise = rng.uniform(-math.pi, math.pi), rng.uniform(-0.2, 0.5)
             d = np.array([math.cos(azimuth) * math.cos(rise), math.sin(azimuth) * math.cos(rise), math.sin(rise)])
-            hit = self.sight.first_hit(np.array([0.0, 0.0, 0.8]), d, 8.0)
+            hit = self._first_hit(np.array([0.0, 0.0, 0.8]), d, 8.0)
             if hit is not None and hit[0] > 1.0:
                 return Target(np.array([0.0, 0.0, 0.8]) + hit[0] * d, hit[1])
         raise SceneError(f"room {self.name}: no surface within 8 m; take a room with walls")
+
+    def _first_hit(self, start_m: Array, direction: Array, reach_m: float) -> tuple[float, Array] | None:
+        """Distance of the first box, and its normal; None if the room's own shape lies elsewhere."""
+        hit = self.sight.first_hit(start_m, direction, reach_m)
+        if hit is None or self.baked is None:
+            return hit
+        own = self.baked.lit.geometry.first_hit(start_m[None], direction[None])
+        return hit if abs(float(own.distance_m[0]) - hit[0]) < _SAME_M else None
 
     def collides(self, x_m: float, y_m: float) -> bool:
         """True if the base at a place runs into something."""
@@ -192,6 +206,11 @@ def _upright(boxes: Boxes) -> Boxes:
         np.where(leans[:, None, None], np.eye(3), boxes.axes),
         np.where(leans[:, None], around, boxes.half_m),
     )
+
+
+def baked_arenas(folder: str | Path) -> tuple[Arena, ...]:
+    """Arenas of the baked rooms in a folder (`phibench loop bake`), of which there are pixels."""
+    return tuple(replace(arena_of(one.room), baked=one) for one in open_baked_rooms(folder).values())
 
 
 def generated_arena(*stream: Name) -> Arena:

@@ -7,6 +7,8 @@
 Reward: -0.01 a second, -0.01 for a command that is refused, +1 when the distance is stated right at the stand-off
 distance, -1 when it is stated wrongly or the robot runs into something. `terminated` says the last three, `truncated`
 that the time is over. `info` holds the outcome, what was refused, and the truth, which no policy may use.
+
+The exact model observes spots with their noise; the other fidelities of `Setup` observe pixels of baked rooms.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from phibench.estimator.loop.pictures import WINDOW_PX, pixel_form
 from phibench.estimator.loop.sensing import EXPOSURES_S
 from phibench.estimator.loop.simulator import (
     CODES,
@@ -73,7 +76,7 @@ class ApproachTarget(gymnasium.Env[dict[str, Any], dict[str, Any]]):
     def __init__(self, setup: Setup | None = None, **task: Any) -> None:
         given = setup or Setup()
         self.setup = replace(given, task=replace(given.task, **task)) if task else given
-        self.simulator = Simulator(self.setup)
+        self.simulator = Simulator(self.setup, reads=False)
         self.action_space = _action_space(self.setup)
         self.observation_space = _observation_space(self.setup)
 
@@ -84,7 +87,7 @@ class ApproachTarget(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         super().reset(seed=seed)
         stream: tuple[Name, ...] = tuple((options or {}).get("stream", ()))
         observation = self.simulator.start(*(stream or ("episode", int(self.np_random.integers(2**62)))))
-        return as_arrays(observation), self._info()
+        return as_arrays(observation, self.setup), self._info()
 
     def step(self, action: dict[str, Any]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Perform one step.
@@ -99,7 +102,7 @@ class ApproachTarget(gymnasium.Env[dict[str, Any], dict[str, Any]]):
         reward = -_COST_PER_S * self.setup.task.step_s - (_COST_REFUSED if self.simulator.refused else 0.0)
         reward += {REACHED: 1.0, WRONG: -1.0, COLLISION: -1.0}.get(outcome, 0.0)
         over = outcome not in (RUNNING, LATE)
-        return as_arrays(observation), reward, over, outcome == LATE, self._info()
+        return as_arrays(observation, self.setup), reward, over, outcome == LATE, self._info()
 
     def _info(self) -> dict[str, Any]:
         s = self.simulator
@@ -117,20 +120,41 @@ def action_of(values: dict[str, Any]) -> Action:
     return Action(**numbers, **chosen)
 
 
-def as_arrays(observation: Observation) -> dict[str, Any]:
-    """Observation as a dict of the observation space."""
-    spots = np.zeros((LIGHT_ROWS, len(SPOT_COLUMNS)))
-    for row, spot in zip(spots, observation.spots, strict=False):
-        row[:] = spot[:4]
+def as_arrays(observation: Observation, setup: Setup | None = None) -> dict[str, Any]:
+    """Observation as a dict of the observation space; of the exact model by default."""
+    given = setup or Setup()
     return {
         "step": np.array([observation.step], np.float64),
         "tracks_m": np.array([observation.left_m, observation.right_m]),
         "attitude_rad": np.array([observation.flipper_rad, observation.pitch_rad, observation.roll_rad]),
         "stroke_m": np.array([observation.stroke_m]),
         "lit": int(observation.lit),
-        "spots": spots,
-        "seen": np.array([k < len(observation.spots) for k in range(LIGHT_ROWS)], np.int8),
+        **{"exact": _spots, "windows": _windows, "frames": _frame}[given.fidelity](observation, given),
     }
+
+
+def _spots(observation: Observation, setup: Setup) -> dict[str, Any]:
+    spots = np.zeros((LIGHT_ROWS, len(SPOT_COLUMNS)))
+    for row, spot in zip(spots, observation.spots, strict=False):
+        row[:] = spot[:4]
+    return {"spots": spots, "seen": _first(len(observation.spots))}
+
+
+def _windows(observation: Observation, setup: Setup) -> dict[str, Any]:
+    channels, kind, _ = pixel_form(setup.preset)
+    pixels = np.zeros((LIGHT_ROWS, WINDOW_PX, WINDOW_PX, *channels), kind)
+    corners = np.zeros((LIGHT_ROWS, 2), np.int64)
+    for k, window in enumerate(observation.windows):
+        pixels[k], corners[k] = window.pixels, (window.u0_px, window.v0_px)
+    return {"windows": pixels, "corners_px": corners, "seen": _first(len(observation.windows))}
+
+
+def _frame(observation: Observation, setup: Setup) -> dict[str, Any]:
+    return {"frame": observation.windows[0].pixels}
+
+
+def _first(count: int) -> NDArray[np.int8]:
+    return np.array([k < count for k in range(LIGHT_ROWS)], np.int8)
 
 
 def _box(low: float, high: float, shape: tuple[int, ...] = (1,)) -> spaces.Box:
@@ -153,10 +177,7 @@ def _action_space(setup: Setup) -> spaces.Dict:
 
 
 def _observation_space(setup: Setup) -> spaces.Dict:
-    camera, task = setup.rig.camera, setup.task
-    # noise may put a spot a few pixels outside of the image; none of 9 standard deviations of at most 1 px
-    low, high = np.zeros((LIGHT_ROWS, 4)), np.zeros((LIGHT_ROWS, 4))
-    low[:, :2], high[:] = -9.5, (camera.width_px + 9.5, camera.height_px + 9.5, 1.0, 1e9)
+    task = setup.task
     way = setup.vehicle.top_speed_m_per_s * task.step_s
     bounds: dict[str, spaces.Space[Any]] = {
         "step": _box(0.0, float(task.steps)),
@@ -164,10 +185,27 @@ def _observation_space(setup: Setup) -> spaces.Dict:
         "attitude_rad": _box(-np.pi, np.pi, (3,)),
         "stroke_m": _box(0.0, task.stroke_m),
         "lit": spaces.Discrete(2),
-        "spots": spaces.Box(low, high, dtype=np.float64),
+    }
+    return spaces.Dict(bounds | (_spot_space(setup) if setup.fidelity == "exact" else _pixel_space(setup)))
+
+
+def _spot_space(setup: Setup) -> dict[str, spaces.Space[Any]]:
+    camera = setup.rig.camera
+    # noise may put a spot a few pixels outside of the image; none of 9 standard deviations of at most 1 px
+    low, high = np.zeros((LIGHT_ROWS, 4)), np.zeros((LIGHT_ROWS, 4))
+    low[:, :2], high[:] = -9.5, (camera.width_px + 9.5, camera.height_px + 9.5, 1.0, 1e9)
+    return {"spots": spaces.Box(low, high, dtype=np.float64), "seen": spaces.MultiBinary(LIGHT_ROWS)}
+
+
+def _pixel_space(setup: Setup) -> dict[str, spaces.Space[Any]]:
+    camera, (channels, kind, top) = setup.rig.camera, pixel_form(setup.preset)
+    if setup.fidelity == "frames":
+        return {"frame": spaces.Box(0, top, (camera.height_px, camera.width_px, *channels), kind)}
+    return {
+        "windows": spaces.Box(0, top, (LIGHT_ROWS, WINDOW_PX, WINDOW_PX, *channels), kind),
+        "corners_px": spaces.Box(0, max(camera.width_px, camera.height_px), (LIGHT_ROWS, 2), np.int64),
         "seen": spaces.MultiBinary(LIGHT_ROWS),
     }
-    return spaces.Dict(bounds)
 
 
 def flat_observation(observation: dict[str, Any]) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from phibench.datasets.film.moving_camera import BakedRoom
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.estimator.geometry.sphere_image import SphereImage, SphereImager
 from phibench.estimator.limits.best_stroke import spot_bound
@@ -167,6 +168,34 @@ class Sensing:
             for one, light, stands in zip(seen, lights, hidden, strict=True)
         ]
 
+    def unhidden(
+        self, lights: Sequence[Light], placement: tuple[Array, Array], stroke_m: float, arena: Arena
+    ) -> list[tuple[float, float] | str]:
+        """Pixel of each light that a baked room shows, by the room's own shapes; else the cause, `OUTSIDE` or `HIDDEN`.
+
+        Brightness does not count.
+        """
+        R, origin = placement
+        assert arena.baked is not None
+        seen = [self._image(light, R, origin, stroke_m) for light in lights]
+        robot = self._hidden(seen, placement, stroke_m, None, robot=True)
+        result: list[tuple[float, float] | str] = []
+        for one, light, stands in zip(seen, lights, robot, strict=True):
+            if one is None:
+                result.append(OUTSIDE)
+            elif stands or one.facing <= 0.0 or self._in_shadow(one, light, placement, stroke_m, arena.baked):
+                result.append(HIDDEN)
+            else:
+                result.append((one.image.u_px, one.image.v_px))
+        return result
+
+    def _in_shadow(
+        self, seen: _Seen, light: Light, placement: tuple[Array, Array], stroke_m: float, room: BakedRoom
+    ) -> bool:
+        mirror = np.array(self.imager.mirror_point_m(seen.image, *seen.lowered_m.tolist())) + stroke_m * self._axis
+        start = mirror @ placement[0].T + placement[1]
+        return room.blocks(start, light.point_m)
+
     def _image(self, light: Light, R: Array, origin: Array, stroke_m: float) -> _Seen | None:
         own = (light.point_m - origin) @ R
         lowered = own - stroke_m * self._axis
@@ -190,16 +219,26 @@ class Sensing:
         return Reading(image.u_px + du, image.v_px + dv, sigma, electrons, SEEN)
 
     def _hidden(
-        self, seen: Sequence[_Seen | None], placement: tuple[Array, Array], stroke_m: float, arena: Arena | None
+        self,
+        seen: Sequence[_Seen | None],
+        placement: tuple[Array, Array],
+        stroke_m: float,
+        arena: Arena | None,
+        robot: bool = False,
     ) -> list[bool]:
-        """True where the room or the robot stands between spot and mirror; the camera's housing is too small to."""
+        """True where the room or the robot stands between spot and mirror; the camera's housing is too small to.
+
+        Without an arena nothing does, or the `robot` alone.
+        """
         found = [one for one in seen if one is not None]
-        if arena is None or not found:
+        if (arena is None and not robot) or not found:
             return [False] * len(seen)
         own = np.array([one.own_m for one in found])
         mirror = np.array([self.imager.mirror_point_m(one.image, *one.lowered_m.tolist()) for one in found])
         mirror += stroke_m * self._axis
         R, origin = placement
-        stands = self._robot.block(mirror, own) | arena.sight.block(mirror @ R.T + origin, own @ R.T + origin)
+        stands = self._robot.block(mirror, own)
+        if arena is not None:
+            stands |= arena.sight.block(mirror @ R.T + origin, own @ R.T + origin)
         each = iter(stands.tolist())
         return [one is not None and next(each) for one in seen]

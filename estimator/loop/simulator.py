@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from phibench.estimator.loop.arena import Arena, Target, plain_arena
-from phibench.estimator.loop.sensing import DARK, EXPOSURES_S, SEEN, Light, Reading, Sensing
+from phibench.estimator.loop.pictures import FIDELITIES, Fidelity, RobotCamera, SpotReader, Window, pixel_form
+from phibench.estimator.loop.sensing import DARK, EXPOSURES_S, FAINT, SEEN, Light, Reading, Sensing
 from phibench.estimator.spots.spot_prediction import Laser
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import Misalignment
@@ -36,6 +37,7 @@ NOT_STARTED, RUNNING, REACHED, WRONG, COLLISION, LATE = (
 )
 LIGHT_ROWS = 6
 """Most lights of an episode, the target among them."""
+_NEAR_PX = 4.0  # of a spot that counts as the target's
 _OTHER_CODES = ("1", "1", "10", "1100101")  # lamps and red objects; other lasers
 
 
@@ -77,7 +79,9 @@ class Observation(NamedTuple):
     lit : bool
         The robot's laser was on.
     spots : tuple of Reading
-        Spots that were seen, by rising u.
+        Spots that were seen, by rising u; measured in the pixels where there are any.
+    windows : tuple of Window
+        Pixels around spots, by rising u, or the whole frame; none of the exact model.
     """
 
     step: int
@@ -89,6 +93,7 @@ class Observation(NamedTuple):
     stroke_m: float
     lit: bool
     spots: tuple[Reading, ...]
+    windows: tuple[Window, ...] = ()
 
     def attitude(self, vehicle: Vehicle) -> Stance | None:
         """Attitude of the robot; None where it is level."""
@@ -164,10 +169,17 @@ class Setup:
     misalignment : Misalignment
         Deviations of the true rig from it, which they do not know.
     preset : str
-        Sensor whose bound is the noise.
+        Sensor whose bound is the noise, or whose pixels are drawn.
     task : Task
     arenas : tuple of Arena
         Rooms, of which each episode draws one; without any each episode has a plain room of its own.
+    fidelity : "exact", "windows" or "frames"
+        Spots by the measurement model, or pixels of rooms that are baked: windows around spots, or whole frames.
+
+    Raises
+    ------
+    SceneError
+        If there is no such fidelity, or pixels are asked for and a room is not baked.
     """
 
     vehicle: Vehicle = field(default_factory=Vehicle)
@@ -176,6 +188,19 @@ class Setup:
     preset: str = "bayer-raw"
     task: Task = field(default_factory=Task)
     arenas: tuple[Arena, ...] = ()
+    fidelity: Fidelity = "exact"
+
+    def __post_init__(self) -> None:
+        if self.fidelity not in FIDELITIES:
+            raise SceneError(f"Setup.fidelity = '{self.fidelity}': must be one of {', '.join(FIDELITIES)}")
+        if self.fidelity == "exact":
+            return
+        pixel_form(self.preset)
+        if not self.arenas or any(arena.baked is None for arena in self.arenas):
+            raise SceneError(
+                f"Setup.fidelity = '{self.fidelity}' needs rooms whose light is baked: run `phibench loop bake --out "
+                "DIR`, and give Setup(arenas=baked_arenas('DIR'))"
+            )
 
     @property
     def known(self) -> Known:
@@ -197,16 +222,24 @@ class Simulator:
     Parameters
     ----------
     setup : Setup
+    reads : bool
+        Measure the spots in pixels; False leaves that to the policy, and `Observation.spots` empty.
 
     Raises
     ------
     SceneError
-        If the true rig's mirror is no perfect sphere.
+        If the true rig's mirror is no perfect sphere, or spots are to be measured in other pixels than raw ones.
     """
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, setup: Setup, reads: bool = True) -> None:
         self.setup = setup
-        self._sensing = Sensing(setup.rig.perturbed(setup.misalignment), setup.preset, setup.task.laser)
+        rig, laser = setup.rig.perturbed(setup.misalignment), setup.task.laser
+        self._sensing = Sensing(rig, setup.preset, laser)
+        self._camera: RobotCamera | None = None
+        self._reader: SpotReader | None = None
+        if setup.fidelity != "exact":
+            self._camera = RobotCamera(rig, setup.preset, laser, setup.fidelity)
+            self._reader = SpotReader(setup.rig, setup.preset, setup.fidelity) if reads else None
         self.outcome = NOT_STARTED
 
     def start(self, *stream: Name) -> Observation:
@@ -353,10 +386,37 @@ class Simulator:
         lit = CODES[action.code][self.step % len(CODES[action.code])] == "1"
         on = [light.spot for light in self._lights if light.bits[self.step % len(light.bits)] == "1"]
         lights = [Light(*self.target, self.setup.task.power), *on] if lit else on
-        read = self._sensing.read(lights, self.placement, self.stroke_m, action.exposure, self.arena, self._rng)
-        self.unseen_cause = read[0].cause if lit else DARK
-        spots = sorted(reading for reading in read if reading.cause == SEEN)
-        return Observation(self.step, left_m, right_m, self.flipper_rad, 0.0, 0.0, self.stroke_m, lit, tuple(spots))
+        windows: tuple[Window, ...] = ()
+        if self._camera is None:
+            read = self._sensing.read(lights, self.placement, self.stroke_m, action.exposure, self.arena, self._rng)
+            self.unseen_cause = read[0].cause if lit else DARK
+            spots = tuple(sorted(reading for reading in read if reading.cause == SEEN))
+        else:
+            windows, spots = self._look(self._camera, lights, action.exposure, lit)
+        held = self.flipper_rad, 0.0, 0.0, self.stroke_m
+        return Observation(self.step, left_m, right_m, *held, lit, spots, windows)
+
+    def _look(
+        self, camera: RobotCamera, lights: Sequence[Light], exposure: int, lit: bool
+    ) -> tuple[tuple[Window, ...], tuple[Reading, ...]]:
+        """Pixels, and the spots that are read in them."""
+        room = self.arena.baked
+        assert room is not None
+        places = self._sensing.unhidden(lights, self.placement, self.stroke_m, self.arena)
+        shown = [(light, *at) for light, at in zip(lights, places, strict=True) if not isinstance(at, str)]
+        stream = (*self.stream, "frame", self.step)
+        windows = camera.take(room, shown, self.placement, self.stroke_m, exposure, self._rng, *stream)
+        spots = () if self._reader is None else self._reader.read(windows, exposure)
+        self.unseen_cause = _cause_of(places[0], spots, self._reader is not None) if lit else DARK
+        return windows, spots
+
+
+def _cause_of(place: tuple[float, float] | str, spots: Sequence[Reading], read: bool) -> str:
+    """Cause that the target is not among the spots."""
+    if isinstance(place, str):
+        return place
+    near = any(math.hypot(spot.u_px - place[0], spot.v_px - place[1]) < _NEAR_PX for spot in spots)
+    return SEEN if near or not read else FAINT
 
 
 def _check(action: Action) -> None:
