@@ -26,6 +26,7 @@ from phibench.estimator.cli.calibration import align, calibrate
 from phibench.estimator.cli.captures import import_, measure
 from phibench.estimator.cli.dataset import dataset, export
 from phibench.estimator.cli.film import film
+from phibench.estimator.cli.loop import loop
 from phibench.estimator.cli.methods import method
 from phibench.estimator.cli.options import DATA, INSTALLATION, METHODS, SENSOR, answer_to_old_spelling
 from phibench.estimator.cli.room import room
@@ -40,7 +41,7 @@ app = App(
     suppress_keyboard_interrupt=False,
     result_action="return_value",
 )
-for _group in (dataset, film, room, method, seal, sensor, study):
+for _group in (dataset, film, room, method, seal, sensor, loop, study):
     app.command(_group)
 app.command(export, group=DATA)
 app.command(score, group=METHODS)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import multiprocessing
+import runpy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from multiprocessing.connection import Connection
-from typing import Any
+from pathlib import Path
+from typing import Any, cast
 
 import polars as pl
 
@@ -70,7 +72,8 @@ def run_episode(simulator: Simulator, policy: Policy, observation: Observation, 
             action = policy.act(observation)
             observation = simulator.act(Action(*action))
         except Exception as error:  # whatever a policy does, its episode alone is lost
-            failure = f"{type(error).__name__} in step {simulator.step}: {' '.join(str(error).split())[:200]}"
+            named = "" if isinstance(error, SceneError) else f"{type(error).__name__} "
+            failure = f"{named}in step {simulator.step}: {' '.join(str(error).split())[:200]}"
             break
         was_seen = was_seen or simulator.unseen_cause == ""
         stated = action.stated_m if action.stated_m > 0.0 else stated
@@ -137,6 +140,48 @@ def episode_frame(episodes: Sequence[Episode]) -> pl.DataFrame:
 # -- policies of others, in a process of their own -------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class PolicyFile:
+    """Function of a Python file that makes a policy of what is known.
+
+    Parameters
+    ----------
+    path : Path
+    name : str
+    """
+
+    path: Path
+    name: str
+
+    @classmethod
+    def of(cls, text: str) -> PolicyFile:
+        """From FILE.py:NAME.
+
+        Raises
+        ------
+        SceneError
+            If there is no such file, or no name is given.
+        """
+        path, _, name = text.rpartition(":")
+        if not path.endswith(".py") or not name.isidentifier():
+            raise SceneError(
+                f"policy '{text}': give FILE.py:NAME, NAME being a function from what is known to a policy"
+            )
+        if not Path(path).is_file():
+            raise SceneError(f"policy '{text}': there is no file {path}; give the path of a Python file")
+        return cls(Path(path).resolve(), name)
+
+    def __call__(self, known: Known) -> Policy:
+        """Policy for an episode; the file is run in the process of the policy."""
+        content = runpy.run_path(str(self.path))
+        if not callable(content.get(self.name)):
+            raise SceneError(f"{self.path.name} has no function {self.name}")
+        policy = content[self.name](known)
+        if not callable(getattr(policy, "act", None)):
+            raise SceneError(f"{self.name} gave {type(policy).__name__}, which has no function act(observation)")
+        return cast(Policy, policy)
+
+
 class PolicyProcess:
     """Policy that runs in a process of its own, which is ended when an answer takes too long.
 
@@ -198,7 +243,9 @@ def _serve(end: Connection, factory: Callable[[Known], Policy], known: Known) ->
         end.send(("ready", ()))
         while True:
             action = policy.act(end.recv())
-            end.send(("action", tuple(Action(*action))))
+            if not isinstance(action, tuple) or len(action) != len(Action._fields):
+                raise SceneError(f"act answered {type(action).__name__}, not an Action; give simulator.Action(...)")
+            end.send(("action", tuple(action)))
     except (EOFError, BrokenPipeError):
         return
     except Exception as error:  # told to the other side, in one line

@@ -208,8 +208,9 @@ class SpotReader:
         blur = SpotBlur(sigma_px, ratio, mixed)
         fit = fit_raw(raw_electrons(regions, card), origin, noise_of(card), blur, saturation_e=card.saturation_e)
         sigma = np.sqrt(0.5 * np.trace(fit.covariance_px2, axis1=1, axis2=2) * np.maximum(fit.chi2, 1.0))
-        # a spot of n standard deviations has its place to a blur over n; what fits badly counts for less
-        good = (fit.status == Status.OK) & (sigma <= self._sigma_px / self._least_z)
+        # a spot of n standard deviations has its place to a blur over n, to twice that between red pixels; what fits
+        # badly counts for less
+        good = (fit.status == Status.OK) & (sigma <= 2.0 * self._sigma_px / self._least_z)
         rows = np.column_stack([fit.uv_px, sigma, fit.flux_e])[good]
         return [Reading(u, v, s, e, SEEN) for u, v, s, e in rows.tolist()]
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -130,11 +130,15 @@ class Sensing:
     def __init__(self, rig: Rig, preset: str = "bayer-raw", laser: Laser | None = None) -> None:
         self.rig, self.laser = rig, laser or Laser()
         self.imager = SphereImager(rig, self.laser.wavelength_nm)
-        self._tables = sigma_tables(rig, preset)
+        self._preset = preset
         self._axis = np.array(rig.stroke_axis_world)
         self._robot: Boxes = boxes_of(chassis())
         response = rig.camera.detector.laser_electrons_per_joule(self.laser.wavelength_nm)[0]
         self._electrons_per_etendue_s = self.laser.power_w * self.laser.albedo / np.pi * response
+
+    @cached_property
+    def _tables(self) -> tuple[SigmaTable, ...]:
+        return sigma_tables(self.rig, self._preset)
 
     def read(
         self,
