@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.estimator.loop.pictures import WINDOW_PX, pixel_form
+from phibench.estimator.loop.robot_pixels import WINDOW_PX, pixel_form
 from phibench.estimator.loop.sensing import EXPOSURES_S
 from phibench.estimator.loop.simulator import (
     CODES,

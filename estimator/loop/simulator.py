@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from phibench.estimator.loop.arena import Arena, Target, plain_arena
-from phibench.estimator.loop.pictures import FIDELITIES, Fidelity, RobotCamera, SpotReader, Window, pixel_form
+from phibench.estimator.loop.robot_pixels import FIDELITIES, Fidelity, RobotCamera, SpotReader, Window, pixel_form
 from phibench.estimator.loop.sensing import DARK, EXPOSURES_S, FAINT, SEEN, Light, Reading, Sensing
 from phibench.estimator.spots.spot_prediction import Laser
 from phibench.scenes.frames import Array
