@@ -8,7 +8,7 @@ the vertex that counts. The outline gives it for an upright axis: a tilt of the 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ImageDraw
 
+from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.calibration.outline_picture import overlay, shown, write_picture
 from phibench.estimator.outline.ball_circle import BallCircle, find_circle
@@ -26,11 +27,14 @@ from phibench.estimator.spots.camera_codes import light_of, rgb_picture
 from phibench.estimator.spots.image_planes import ImageError
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
+from phibench.scenes.mirror import SphereMirror
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig
 
 _SIGNIFICANT = 2.5  # of a distance in two axes: 4 % of aligned mirrors are further off
 _CENTRE, _MOVE = (0, 255, 0), (255, 60, 60)
+_RADIUS_MM, _DISTANCE_MM = 60.0, 260.0
+_NEAREST, _FARTHEST_MM = 1.02, 1e4  # in radii; nearer, the lens is at the mirror
 _ARROW_TIMES = 20.0  # the move is a few pixels: the picture draws it larger
 
 
@@ -54,6 +58,80 @@ class Alignment:
     sigma_outline_m: float
     sigma_m: float
     outline: Outline = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Camera and mirror, a sphere, as options of the command; None where an option is not given.
+
+    `distance_mm` is that of the mirror's centre from the lens, `focus_mm` that of the plane of focus.
+    """
+
+    radius_mm: float | None = None
+    distance_mm: float | None = None
+    focal_px: float | None = None
+    cx_px: float | None = None
+    cy_px: float | None = None
+    focus_mm: float | None = None
+
+    def given(self) -> dict[str, float]:
+        """Values of the options that are given."""
+        values = ((f"--{one.name.replace('_', '-')}", getattr(self, one.name)) for one in fields(self))
+        return {option: value for option, value in values if value is not None}
+
+    def require_sound(self) -> None:
+        """Raise `DatasetError` for a radius or a focal length that none has."""
+        for option in ("--radius-mm", "--focal-px"):
+            value = self.given().get(option, 1.0)
+            if not 0.0 < value < math.inf:
+                raise DatasetError(f"{option} {value:g}: must be above 0")
+
+
+def rig_of_numbers(image: NDArray[Any], card: SensorCard, numbers: Numbers) -> Rig | None:
+    """Rig of a picture by numbers, those of the default rig where they are not given.
+
+    None for a picture of another size than the default camera's, if no focal length is given.
+
+    Raises
+    ------
+    DatasetError
+        If a number needs the focal length, or the mirror is nearer than it can be.
+    ImageError
+        If a principal point is missing, or the outline that would tell the distance is not found.
+    """
+    rig, (height, width) = Rig(), image.shape[:2]
+    radius_mm = _RADIUS_MM if numbers.radius_mm is None else numbers.radius_mm
+    whole = (height, width) == (rig.camera.height_px, rig.camera.width_px)
+    if numbers.focal_px is None and not whole:
+        for option in ("--cx-px", "--cy-px", "--distance-mm"):
+            if option in numbers.given():
+                value = numbers.given()[option]
+                raise DatasetError(f"{option} {value:g}: needs --focal-px, the focal length in pixels of this picture")
+        return None
+    focal_px = rig.camera.fx_px if numbers.focal_px is None else numbers.focal_px
+    centre = nominal_centre(image, rig.camera, numbers.cx_px, numbers.cy_px)
+    distance_mm = numbers.distance_mm
+    if distance_mm is None:
+        distance_mm = _DISTANCE_MM if whole else 1e3 * distance_of(circle_of(image, card), focal_px, 1e-3 * radius_mm)
+    if not _NEAREST * radius_mm < distance_mm <= _FARTHEST_MM:
+        raise DatasetError(
+            f"--radius-mm {radius_mm:g}, --distance-mm {distance_mm:g}: the mirror's centre must be {_NEAREST} radii "
+            f"to {1e-3 * _FARTHEST_MM:g} m from the lens"
+        )
+    focus_mm = distance_mm - 0.5 * radius_mm if numbers.focus_mm is None else numbers.focus_mm
+    camera = replace(
+        rig.camera,
+        width_px=width,
+        height_px=height,
+        pixel_pitch_um=rig.camera.pixel_pitch_um * rig.camera.width_px / width,
+        fx_px=focal_px,
+        fy_px=focal_px,
+        cx_px=centre[0],
+        cy_px=centre[1],
+        focus_distance_m=1e-3 * focus_mm,
+    )
+    pose = replace(rig.T_camera_sphere, translation_m=(0.0, 0.0, 1e-3 * distance_mm))
+    return Rig(camera=camera, mirror=SphereMirror(radius_m=1e-3 * radius_mm), T_camera_sphere=pose)
 
 
 def nominal_centre(

@@ -6,12 +6,16 @@ of every calibration spot. The data:
 * the prior of every parameter: the accuracy of the nominal numbers;
 * the sphere centre from an outline, 3 numbers. It was found with the nominal camera and radius. A camera or radius off
   by some per cent moves it, and the fit accounts for that (`apparent_outline`). Of a mirror of revolution the outline
-  gives vertex and ellipse, 5 numbers, found with the nominal profile and tilt, too (`contour`);
+  gives the vertex, found with the nominal profile and tilt, and the two numbers of the rim's ellipse (`contour`);
 * the vertical from upright edges, 2 numbers, with the effect of the principal point (`apparent_vertical`);
 * for every spot, 4 pixel coordinates, its distance D, and its azimuth and height where they were measured.
 
 A spot has 4 pixel coordinates for 3 unknowns. With exact D, and without azimuth and height, it leaves two conditions on
 the rig: D itself and the meeting of the rays.
+
+The rim's ellipse is quadratic in the mirror's tilt. A fit without it is nearly linear, and its result is a normal
+distribution; the ellipse turns that into one with two hills, or a ring. What is returned are mean and covariance of
+this distribution (`_with_ellipse`): no hill is chosen where the data choose none.
 """
 
 from __future__ import annotations
@@ -30,14 +34,21 @@ from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.reflection import reflect, reflect_jacobian
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, changed, has_effect, prior_sigmas, stroke_of
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.estimator.outline.contour import place_of_outline
+from phibench.estimator.outline.contour import place_of_outline, tilts_of_ellipse
 from phibench.estimator.outline.limb_image import Measured
 from phibench.scenes.frames import Array, as_vector
+from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.revolved_mirror import RevolvedMirror
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.validation import SceneError
 
 _NEWTON = 3
+_TURNS = ("mirror_tilt_x_rad", "mirror_tilt_y_rad")
+_TURN_RAD = 0.01  # for differences of a tilt
+_PART = 0.1  # of a prior sigma, for differences
+_REACH = 8.0  # sigmas on both sides of a fit without the ellipse
+_NODES = (121, 801)
+_HELD_RAD = 1e-9  # of a tilt that is exact: the covariance of both keeps its inverse
 _WEAK = 0.9  # of the prior's variance: a direction that keeps so much was not measured
 
 
@@ -158,13 +169,14 @@ def calibrate(
     if not found.success or not np.isfinite(found.cost):
         raise DatasetError(f"the calibration does not come to rest: {found.message}")
     normal = found.jac.T @ found.jac  # residuals are over their sigmas: the inverse is the covariance
-    whole = np.linalg.inv(normal)
-    values, covariance = np.zeros(len(PARAMETERS)), np.zeros((len(PARAMETERS),) * 2)
-    values[free] = found.x[: free.size] * prior[free]
-    covariance[np.ix_(free, free)] = whole[: free.size, : free.size] * np.outer(prior[free], prior[free])
+    fit = _Fit(found.x[: free.size], np.linalg.inv(normal)[: free.size, : free.size], 2.0 * float(found.cost))
     degrees = found.fun.size - found.x.size
-    weak = _undetermined(whole[: free.size, : free.size], [PARAMETERS[i] for i in free])
-    return Bundle(changed(nominal, values), values, covariance, 2.0 * float(found.cost), degrees, weak)
+    if problem.has_ellipse:
+        fit, degrees = _with_ellipse(problem, fit, found.jac[free.size : free.size + 3, : free.size]), degrees + 2
+    values, covariance = problem.values(fit.x), np.zeros((len(PARAMETERS),) * 2)
+    covariance[np.ix_(free, free)] = fit.covariance * np.outer(prior[free], prior[free])
+    weak = _undetermined(fit.covariance, [PARAMETERS[i] for i in free])
+    return Bundle(changed(nominal, values), values, covariance, fit.chi2, degrees, weak)
 
 
 @dataclass(frozen=True)
@@ -179,14 +191,24 @@ class _Problem:
     free: NDArray[np.intp]
     by_principal_point: Array
 
-    def residuals(self, x: Array) -> Array:
+    @property
+    def has_ellipse(self) -> bool:
+        """True if the outline has more than a centre."""
+        return self.outline is not None and len(self.outline.value) > 3
+
+    def values(self, x: Array) -> Array:
+        """Values of `PARAMETERS` at the unknowns, of which points are left out, shape (p,)."""
         values = np.zeros(len(PARAMETERS))
         values[self.free] = x[: self.free.size] * self.prior[self.free]
+        return values
+
+    def residuals(self, x: Array) -> Array:
+        values = self.values(x)
         rig = changed(self.nominal, values)
         parts = [x[: self.free.size]]
         if self.outline is not None:
-            seen = apparent_outline(self.nominal, rig)
-            parts.append(_whitened(seen - self.outline.value, self.outline.covariance))
+            seen = apparent_outline(self.nominal, rig)[:3]
+            parts.append(_whitened(seen - self.outline.value[:3], self.outline.covariance[:3, :3]))
         if self.vertical is not None:
             up = rig.T_world_camera.R.T[:2, 2] + self.by_principal_point @ (_centre_px(rig) - _centre_px(self.nominal))
             parts.append(_whitened(up - self.vertical.value, self.vertical.covariance))
@@ -194,6 +216,101 @@ class _Problem:
         if self.spots:
             parts.append(_spot_residuals(rig, values, self.spots, points))
         return np.concatenate(parts)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Mean, shape (p,), and covariance of the free parameters, in units of their prior sigmas; and the misfit."""
+
+    x: Array
+    covariance: Array
+    chi2: float
+
+
+def _with_ellipse(problem: _Problem, fit: _Fit, vertex_rows: Array) -> _Fit:
+    """Mean and covariance of a fit without the rim's ellipse, given the ellipse, too.
+
+    The ellipse is quadratic in the mirror's tilt against the line of sight, r, shape (2,), and nearly linear in all
+    else: e = E(r) + L x. Its error given the vertex has a mean of B (v - v(x)), which is linear in x, too. So for each
+    r on a grid all else is normal, and the moments of r and l = (B V - L) x are sums over the grid, with V = dv/dx.
+    x follows r and l linearly.
+
+    Parameters
+    ----------
+    vertex_rows : shape (3, p)
+        Derivatives of the vertex's whitened residuals by x.
+    """
+    assert problem.outline is not None
+    C = problem.outline.covariance
+    rig = changed(problem.nominal, problem.values(fit.x))
+    seen = apparent_outline(problem.nominal, rig)
+    off = seen - problem.outline.value
+    B = np.linalg.solve(C[:3, :3], C[:3, 3:]).T
+    adds = tilts_of_ellipse(rig, _TURN_RAD)
+    turned, by_x = _ellipse_slopes(problem, fit.x)
+    by_r = np.stack([adds(step) - adds(-step) for step in _TURN_RAD * np.eye(2)], axis=-1) / (2.0 * _TURN_RAD)
+    V = np.linalg.cholesky(C[:3, :3]) @ vertex_rows
+    of_x = np.concatenate([turned, B @ V - (by_x - by_r @ turned)])
+    P = of_x @ fit.covariance @ of_x.T  # of (r, l)
+    P[:2, :2] += _HELD_RAD**2 * np.eye(2)
+    K = np.linalg.solve(P[:2, :2], P[:2, 2:]).T
+    Q = P[2:, 2:] - K @ P[:2, 2:]  # of l, given r
+    W = C[3:, 3:] - B @ C[:3, 3:] + Q  # of e - E(r) + l, given r
+    L = np.linalg.cholesky(P[:2, :2])
+    unit = _grid(float(np.abs(adds(_REACH * np.sqrt(np.diag(P)[:2]))).max() / np.sqrt(np.diag(W)).min()))
+    r = unit @ L.T
+    y = r @ K.T - (adds(r) + off[3:] - B @ off[:3])
+    misfit = np.sum(unit**2, axis=1) + np.sum(y * np.linalg.solve(W, y.T).T, axis=1)
+    weight = np.exp(-0.5 * (misfit - misfit.min()))
+    weight /= weight.sum()
+    gain = np.linalg.solve(W, Q).T
+    z = np.concatenate([r, r @ K.T - y @ gain.T], axis=1)
+    mean = weight @ z
+    spread = (z - mean).T @ ((z - mean) * weight[:, None])
+    spread[2:, 2:] += Q - gain @ Q
+    G = fit.covariance @ of_x.T @ np.linalg.pinv(P, rcond=1e-12, hermitian=True)
+    covariance = fit.covariance - G @ (P - spread) @ G.T
+    return _Fit(fit.x + G @ mean, 0.5 * (covariance + covariance.T), fit.chi2 + float(misfit.min()))
+
+
+def _grid(steepness: float) -> Array:
+    """Nodes over `_REACH` sigmas in two axes, shape (n, 2), so dense that an ellipse of this steepness is resolved."""
+    count = int(np.clip(4.0 * steepness, *_NODES))
+    axis = np.linspace(-_REACH, _REACH, count)
+    return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+
+
+def _ellipse_slopes(problem: _Problem, x: Array) -> tuple[Array, Array]:
+    """Derivatives by x of the tilt against the line of sight, as turns of the mirror about x and y, and of the ellipse.
+
+    Both have the shape (2, p), radians and pixels.
+
+    The image of a circle of radius q at the distance Z, with k = q / Z, has the ellipse
+    -(f k / 4) (1 - k^2) (r^2 - g^2) to second order. Here g = b / (1 - k^2) and r = a - g are complex numbers, a the
+    direction of the mirror's axis and b that of the circle's middle, both against the optical axis.
+    """
+    mirror = problem.nominal.mirror
+    assert isinstance(mirror, RevolvedMirror)
+
+    def tilt(rig: Rig) -> Array:
+        pose = rig.T_camera_sphere
+        a, c = pose.R[:, 2], pose.t + pose.R[:, 2] * mirror.profile.depth_m
+        return np.asarray(a[:2] / a[2] - c[:2] / c[2] / (1.0 - (mirror.profile.rim_radius_m / c[2]) ** 2))
+
+    def at(x: Array) -> Rig:
+        return changed(problem.nominal, problem.values(x))
+
+    by_turn = []
+    for name in _TURNS:
+        plus, minus = (at(x).perturbed(Misalignment(**{name: sign * _TURN_RAD})) for sign in (1.0, -1.0))
+        by_turn.append((tilt(plus) - tilt(minus)) / (2.0 * _TURN_RAD))
+    turns, ellipses = [], []
+    for step in _PART * np.eye(problem.free.size):
+        plus, minus = at(x + step), at(x - step)
+        turns.append((tilt(plus) - tilt(minus)) / (2.0 * _PART))
+        seen = [apparent_outline(problem.nominal, rig)[3:] for rig in (plus, minus)]
+        ellipses.append((seen[0] - seen[1]) / (2.0 * _PART))
+    return np.linalg.solve(np.stack(by_turn, axis=-1), np.stack(turns, axis=-1)), np.stack(ellipses, axis=-1)
 
 
 def _centre_px(rig: Rig) -> Array:

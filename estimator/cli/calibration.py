@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -103,7 +102,8 @@ def align(
     image: Path,
     *,
     out: Path | None = None,
-    radius_mm: float = 60.0,
+    rig: Path | None = None,
+    radius_mm: float | None = None,
     distance_mm: float | None = None,
     focal_px: float | None = None,
     cx_px: float | None = None,
@@ -111,11 +111,13 @@ def align(
     focus_mm: float | None = None,
     tilt_sigma_deg: float = 0.1,
     principal_point_sigma_px: float = 5.0,
+    mirror_tilt_sigma_deg: float = 0.5,
     outline_sigma_factor: float = 1.0,
 ) -> int:
     """Print by how far and in which direction the mirror must move to be centred.
 
-    Of a camera whose focal length is not stated, the circle of the mirror's outline is printed and drawn, in pixels.
+    A rig file says camera and mirror, of any shape. Without one the mirror is a sphere, and numbers say the rest. Of a
+    camera whose focal length is not stated, the circle of the mirror's outline is printed and drawn, in pixels.
 
     Parameters
     ----------
@@ -124,8 +126,10 @@ def align(
     out
         PNG to write: the outline and an arrow, 20 times as long as the move; by default `<image>-align.png` in
         the current folder.
+    rig
+        TOML file with what is known of the rig, as for `phibench measure`; instead of the numbers of camera and mirror.
     radius_mm
-        Radius of the mirror.
+        Radius of the mirror, a sphere; 60 by default.
     distance_mm
         Of the mirror's centre from the lens, roughly. For a frame of 1280 x 720 it is 260 by default; otherwise the
         outline tells it.
@@ -141,68 +145,47 @@ def align(
         How well the camera is known to be vertical.
     principal_point_sigma_px
         How well the principal point is known.
+    mirror_tilt_sigma_deg
+        How well the axis of a mirror that is no sphere is known to be upright.
     outline_sigma_factor
         As in `phibench calibrate`.
     """
     from phibench.datasets.errors import DatasetError
     from phibench.estimator.calibration.align import (
+        Numbers,
         alignment,
         circle_in_words,
         circle_of,
-        distance_of,
         in_words,
-        nominal_centre,
+        rig_of_numbers,
         verdict,
         write_alignment_picture,
         write_circle_picture,
     )
+    from phibench.estimator.captures.rig_file import read_rig_file, require_camera_size
     from phibench.estimator.spots.image_planes import read_picture
-    from phibench.scenes.mirror import SphereMirror
-    from phibench.scenes.rig import Rig
 
-    if not 0.0 < radius_mm < math.inf:
-        raise DatasetError(f"--radius-mm {radius_mm:g}: must be above 0")
-    if focal_px is not None and not 0.0 < focal_px < math.inf:
-        raise DatasetError(f"--focal-px {focal_px:g}: must be above 0")
+    numbers = Numbers(radius_mm, distance_mm, focal_px, cx_px, cy_px, focus_mm)
+    numbers.require_sound()
+    given = numbers.given()
+    if rig is not None and given:
+        raise DatasetError(f"{next(iter(given))}: {rig} says what the rig is; write it there, and leave the option out")
+    known = None if rig is None else read_rig_file(rig).rig
     pixels, card = read_picture(image)
     out = Path(f"{image.stem}-align.png") if out is None else out
-    rig = Rig()
-    whole = pixels.shape[:2] == (rig.camera.height_px, rig.camera.width_px)
-    if focal_px is None and not whole:
-        for option, value in (("--cx-px", cx_px), ("--cy-px", cy_px), ("--distance-mm", distance_mm)):
-            if value is not None:
-                raise DatasetError(f"{option} {value:g}: needs --focal-px, the focal length in pixels of this picture")
+    if known is None:
+        known = rig_of_numbers(pixels, card, numbers)
+    else:
+        require_camera_size(known, (pixels.shape[1], pixels.shape[0]), str(image))
+    if known is None:
         circle = circle_of(pixels, card)
         print(circle_in_words(circle))
         print(f"{write_circle_picture(out, pixels, card, circle)}: outline; look at it")
         return 0
-    focal_px = rig.camera.fx_px if focal_px is None else focal_px
-    centre = nominal_centre(pixels, rig.camera, cx_px, cy_px)
-    if distance_mm is None:
-        distance_mm = 260.0 if whole else 1e3 * distance_of(circle_of(pixels, card), focal_px, 1e-3 * radius_mm)
-    if not 1.02 * radius_mm < distance_mm <= 1e4:
-        raise DatasetError(
-            f"--radius-mm {radius_mm:g}, --distance-mm {distance_mm:g}: the mirror's centre must be 1.02 radii to 10 m "
-            "from the lens"
-        )
-    focus_m = 1e-3 * (distance_mm - 0.5 * radius_mm if focus_mm is None else focus_mm)
-    camera = replace(
-        rig.camera,
-        width_px=pixels.shape[1],
-        height_px=pixels.shape[0],
-        pixel_pitch_um=rig.camera.pixel_pitch_um * rig.camera.width_px / pixels.shape[1],
-        fx_px=focal_px,
-        fy_px=focal_px,
-        cx_px=centre[0],
-        cy_px=centre[1],
-        focus_distance_m=focus_m,
-    )
-    pose = replace(rig.T_camera_sphere, translation_m=(0.0, 0.0, 1e-3 * distance_mm))
-    rig = Rig(camera=camera, mirror=SphereMirror(radius_m=1e-3 * radius_mm), T_camera_sphere=pose)
     doubts = math.radians(tilt_sigma_deg), principal_point_sigma_px, outline_sigma_factor
-    found = alignment(pixels, rig, card, *doubts)
+    found = alignment(pixels, known, card, *doubts, math.radians(mirror_tilt_sigma_deg))
     print(verdict(found))
-    print(f"{write_alignment_picture(out, pixels, rig, found)}: outline, and the move drawn 20 times as long")
+    print(f"{write_alignment_picture(out, pixels, known, found)}: outline, and the move drawn 20 times as long")
     print(in_words(found))
     print(_LAB)
     return 0

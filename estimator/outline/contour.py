@@ -168,7 +168,7 @@ def aside_by_tilt_m(rig: Rig) -> float:
 
 
 def tilts_of_ellipse(rig: Rig, size_rad: float) -> Callable[[Array], Array]:
-    """Ellipse, shape (2,), that a tilt of the mirror about x and y of the world, shape (2,), adds, to second order.
+    """Ellipses, shape (..., 2), that tilts of the mirror about x and y of the world add, to second order.
 
     Differences of tilts of `size_rad` give the quadratic form of each number.
     """
@@ -183,7 +183,7 @@ def tilts_of_ellipse(rig: Rig, size_rad: float) -> Callable[[Array], Array]:
     x1, y1 = (0.5 * (ellipse(*a) - ellipse(*b)) for a, b in (((s, 0), (-s, 0)), ((0, s), (0, -s))))
 
     def of(tilt: Array) -> Array:
-        x, y = tilt[0] / s, tilt[1] / s
+        x, y = tilt[..., :1] / s, tilt[..., 1:] / s
         return np.asarray(x * x * xx + y * y * yy + x * y * xy + x * x1 + y * y1)
 
     return of

@@ -13,7 +13,9 @@ from PIL import Image
 
 from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.calibration.align import alignment, circle_of, distance_of, nominal_centre
+from phibench.estimator.captures.rig_file import read_rig_file
 from phibench.estimator.cli import main as cli
+from phibench.estimator.outline.contour import aside_by_tilt_m
 from phibench.estimator.spots.camera_codes import linear_to_srgb
 from phibench.estimator.spots.image_planes import ImageError, read_picture
 from phibench.render.sensor.camera_chain import Chain
@@ -69,6 +71,58 @@ def test_command_reads_the_cameras_jpeg_and_draws(light, tmp_path, capsys) -> No
     assert "down" in said
     before, after = (np.asarray(Image.open(path).convert("RGB"), float) for path in (file, out))
     assert (np.abs(after - before).max(axis=-1) > 30).sum() > 1000  # the outline alone is 2000 px long
+
+
+@pytest.fixture
+def rig_file(tmp_path):
+    file = tmp_path / "rig.toml"
+    file.write_text('[rig.mirror]\nshape = "hyperboloid"\n')
+    return file
+
+
+def test_a_rig_file_says_a_mirror_of_another_shape(rig_file, tmp_path, capsys) -> None:
+    """A hyperboloid aside by 1.70 mm, within 0.03 mm; half a degree of its own tilt is in sigma."""
+    rig = read_rig_file(rig_file).rig
+    aside = replace(rig, T_camera_sphere=Pose("camera", "sphere", (*OFF_M, rig.sphere_in_camera_m[2])))
+    frame = Chain(sensor("srgb8")).frame(
+        Light(limb_light(aside, np.random.default_rng(5), room=room)), NoiseStream(("align",))
+    )
+    file, out = tmp_path / "frame.png", tmp_path / "arrow.png"
+    Image.fromarray(frame).save(file)
+    exact = ("--principal-point-sigma-px", "0", "--tilt-sigma-deg", "0")
+    assert cli.main(["align", str(file), "--rig", str(rig_file), "--out", str(out), *exact]) == 0
+    said = capsys.readouterr().out
+    moved = [float(said.split(f"{axis} ")[1].split(" mm")[0]) for axis in ("world x", "mm, y")]
+    assert moved == pytest.approx([-1.5, 0.8], abs=0.03)
+    sigma = float(said.split("standard deviation ")[1].split(" mm")[0])
+    assert sigma == pytest.approx(1e3 * aside_by_tilt_m(rig) * np.radians(0.5), abs=0.02)
+    assert sigma > 0.3
+    assert Image.open(out).size == (1280, 720)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--radius-mm", "60"), ("--radius-mm: ", "says what the rig is", "leave the option out")),
+        (("--cx-px", "630"), ("--cx-px: ", "leave the option out")),
+        ((), ("300 x 200 pixels", "1280 x 720", "write width_px")),
+    ],
+)
+def test_what_contradicts_a_rig_file_is_refused(rig_file, tmp_path, capsys, options, words) -> None:
+    file = tmp_path / "grey.png"
+    Image.fromarray(np.full((200, 300, 3), 90, np.uint8)).save(file)
+    assert cli.main(["align", str(file), "--rig", str(rig_file), *options]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert all(word in said for word in words), said
+
+
+def test_a_rig_file_that_is_none_is_refused(tmp_path, capsys) -> None:
+    file = tmp_path / "rig.toml"
+    for text in ('[rig.mirror]\nshape = "pyramid"\n', "[rig.mirror"):
+        file.write_text(text)
+        assert cli.main(["align", str(tmp_path / "a.png"), "--rig", str(file)]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_what_is_no_frame_is_refused_in_one_sentence(tmp_path, capsys) -> None:
