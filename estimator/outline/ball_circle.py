@@ -123,18 +123,19 @@ def find_circle(light: NDArray[Any], radii_px: tuple[float, float] | None = None
     return refined(light, best)
 
 
-def refined(light: NDArray[Any], found: BallCircle) -> BallCircle:
+def refined(light: NDArray[Any], found: BallCircle, floor_px: float = _FLOOR_PX) -> BallCircle:
     """An outline that was found in a picture made smaller, in the squares of one twice as long.
 
     Finer ones say no more: the pixels of long photographs are finer than what lens and sharpening leave of an edge.
+    `floor_px` is what an edge errs all around, in those squares.
     """
     searched, block = (max(1, math.ceil(max(light.shape[:2]) / length)) for length in (LONGEST_PX, 2 * LONGEST_PX))
     if block == searched:
         return found
-    return _finer(light[None] if light.ndim == 2 else np.moveaxis(light, -1, 0), found, block)
+    return _finer(light[None] if light.ndim == 2 else np.moveaxis(light, -1, 0), found, block, floor_px)
 
 
-def _finer(channels: NDArray[Any], found: BallCircle, block: int) -> BallCircle:
+def _finer(channels: NDArray[Any], found: BallCircle, block: int, floor_px: float) -> BallCircle:
     u, v, radius = found.circle_px
     circle = ((u + 0.5) / block - 0.5, (v + 0.5) / block - 0.5, radius / block)
     e = np.array(found.ellipse_px) / block
@@ -144,7 +145,7 @@ def _finer(channels: NDArray[Any], found: BallCircle, block: int) -> BallCircle:
         moved, curve = ring.moved(_least_squares(ring, curve, _SCALES)[0])
         circle = moved.circle
     ring = FineRing(channels, circle, _NEAR_REACH_PX, block=block, ellipse=(float(curve[3]), float(curve[4])))
-    return _with_covariance(found.contrast, ring, curve, _SCALES, (_FLOOR_PX,) * 3, block, found.lead)
+    return _with_covariance(found.contrast, ring, curve, _SCALES, (floor_px,) * 3, block, found.lead)
 
 
 def circles(

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.outline.ball_circle import BallCircle, circles
+from phibench.estimator.outline.ball_circle import BallCircle, circles, refined
 from phibench.estimator.outline.contour import (
     PLACES,
     Contour,
@@ -47,11 +47,13 @@ from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError
 
 _HALF_PX, _COARSE_HALF_PX, _NARROW_PX = 5.0, 8.0, 3.5
+_LEAST_GAIN = 0.1  # of a variance: by a band of 5 px over one of 3.5 px
 _COARSE_STEPS, _CHOOSE, _STEPS = 8, 3, 24
 _NEAR_M, _REST_M, _REST_SIGMAS = 5e-5, 1e-7, 0.05
 _LARGEST_MOVE_M, _LARGEST_ELLIPSE_PX = 3e-3, 3.0
 _BLUR_RANGE_PX2 = (0.02, 9.0)
 _MIN_ARC, _MIN_USED = 0.5, 0.2
+_RIM_FLOOR_PX = 0.2  # of an edge's place, all around, besides its scatter
 _EDGE_SIGMA_PX = 0.25  # of a sector that has an edge
 _LEAST_CONTRAST, _MOST_TRIED, _MOST_OFF = 9.0, 4, 0.06
 _NEAR_RADII = (0.95, 1.05)
@@ -83,7 +85,8 @@ def find_rim_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = No
     small = (planes, rig) if block == 1 else (binned(planes, block), binned_rig(rig, block))
     low, high = radii_px(rig)
     fault = ImageError("an image without a mirror: no circle of the rim's size has edges all around")
-    for place, circle in _clearest(grey(planes), rig):
+    picture = grey(planes)
+    for place, circle in _clearest(picture, rig):
         try:
             found = fit_rim(*small, place, again=again if block == 1 else None)
             if block > 1:  # the last refinement alone sees all pixels
@@ -93,7 +96,7 @@ def find_rim_outline(image: NDArray[Any], rig: Rig, card: SensorCard | None = No
             return found
         except ImageError as error:
             fault = error if "without a mirror" in str(fault) else fault
-        if by_edge := _by_edge(rig, place, circle):
+        if by_edge := _by_edge(rig, picture, circle):
             return by_edge
     if "without a mirror" not in str(fault):
         raise fault
@@ -244,11 +247,17 @@ def _by_band(
 
     Where a wall ends, its edge is reflected along the rim. Within some pixels of it, the edge looks like a rim that is
     displaced, in many sectors alike, which their scatter does not show. The narrower the band, the less of it is seen.
+    A narrower band has more noise, too. Of an efficient fit and another the difference has the variance of the one less
+    that of the other (Hausman, Econometrica 46, 1251, 1978): only what is beyond it counts.
     """
     narrow = pixels[np.abs(contour.place_of(pixels).d_px) < _NARROW_PX]
     other = rim_step(narrow, planes, rig, contour, blur, SECTORS, _NARROW_PX, near=True)
     change = other.move[:PLACES] - step.move[:PLACES]
-    return np.asarray(np.outer(change, change))
+    own = np.diag(step.covariance)[:PLACES]
+    # the scatter of either is uncertain: the difference may come out too small, or below 0
+    expected = np.maximum(np.diag(other.covariance)[:PLACES] - own, _LEAST_GAIN * own)
+    beyond = max(1.0 - 1.0 / float(np.mean(change**2 / expected)), 0.0)
+    return np.asarray(beyond * np.outer(change, change))
 
 
 def _require_edges(step: Step, arc: float) -> None:
@@ -268,12 +277,18 @@ def _by_curve(contour: Contour) -> Array:
     return np.asarray(np.linalg.lstsq(contour.by_place(TURN_RAD), CURVES, rcond=None)[0])
 
 
-def _by_edge(rig: Rig, place: Array, circle: BallCircle) -> Outline | None:
-    """Contour by an edge in the picture alone, if that is clear; its covariance is the circle's."""
+def _by_edge(rig: Rig, picture: Array, circle: BallCircle) -> Outline | None:
+    """Contour by an edge in the picture alone, if that is clear; its covariance is the circle's.
+
+    A circle is looked for in a small picture, and inside the limb of a ball the room is squeezed into parts of a pixel.
+    A rim is a plain step, whose place the whole picture tells to a part of a pixel.
+    """
     try:
         circle.require_clear()
+        circle = refined(picture, circle, _RIM_FLOOR_PX)
+        place = place_of_outline(rig, circle.points_px, _start(rig, circle), ellipse=False)
         contour = _contour(rig, place)
-    except ImageError:
+    except (ImageError, SceneError):
         return None
     if _visible_arc(rig.camera, contour) < _MIN_ARC or not _as_far(rig, place):
         return None

@@ -16,6 +16,9 @@ those of a spot and the lens, all start at the place of their middle; those that
 A form error leaves K convex (`FormedProfile.check`), and all this remains true. The search in the half-plane is that of
 the ideal profile. Where it ends beyond the rim or the limb, the other one starts there: the form may shift the answer
 inside.
+
+At the tip of a cone the path has a kink, where the search in the half-plane may end, and no second derivatives. What is
+lost there begins again, one Newton step from the tip along the side on which the path falls most (`_beside_tip`).
 """
 
 from __future__ import annotations
@@ -65,7 +68,30 @@ def revolved_points(points_m: Array, eyes_m: Array, surface: Surface) -> tuple[A
         if len(rest):
             ends = points_m[rest], eyes_m[rest]
             P[rest], N[rest], valid[rest] = _search(_start(*ends, surface), *ends, surface)
+        rest = np.flatnonzero(~valid)
+        if len(rest) and isinstance(surface, Profile) and surface.shape == "cone":  # a cone bears no form error
+            ends = points_m[rest], eyes_m[rest]
+            P[rest], N[rest], valid[rest] = _search(_beside_tip(*ends, surface), *ends, surface)
     return P, N, valid
+
+
+def _beside_tip(points_m: Array, eyes_m: Array, profile: Profile) -> Array:
+    """Places (x, y) one step from a cone's tip down the path, shape (N, 2); NaN where the path is least at the tip.
+
+    Along a side (u, c), with u a unit vector across the axis and c the cone's slope, the path's derivative at the tip
+    is -w.(u, c), where w is the sum of the unit vectors to the two ends. It is least for u along w.
+    """
+    ways = [end / np.linalg.norm(end, axis=-1, keepdims=True) for end in (points_m, eyes_m)]
+    slope = (-1.0 - profile.conic) ** -0.5
+    w = ways[0] + ways[1]
+    across = np.hypot(w[:, 0], w[:, 1])
+    side = np.column_stack([w[:, :2] / across[:, None], np.full(len(w), slope)])
+    falls = across + slope * w[:, 2]
+    bend = np.zeros(len(w))
+    for end, way in zip((points_m, eyes_m), ways, strict=True):
+        along = np.einsum("ni,ni->n", way, side)
+        bend += (1.0 + slope * slope - along * along) / np.linalg.norm(end, axis=-1)
+    return np.where(falls > 0.0, falls / bend, np.nan)[:, None] * side[:, :2]
 
 
 def _are_close(ends_m: Array) -> bool:

@@ -161,7 +161,7 @@ def test_accuracy_of_a_tilts_sign() -> None:
     nominal, sigmas = nominal_of("hyperboloid"), prior_sigmas(DRAWN | {"tilt_x_rad": 0.0, "tilt_y_rad": 0.0})
     sigmas[[PARAMETERS.index(name) for name in ("decentre_x_m", "decentre_y_m")]] = 1e-4  # the line of sight is known
     true = changed(nominal, np.where(np.array(PARAMETERS) == "mirror_tilt_y_rad", math.radians(1.0), 0.0))
-    sigma = np.array([1e-3, 1e-3, 1e-3, 2e-3, 2e-3])  # metres: the vertex tells nothing of the tilt
+    sigma = np.array([1e-2, 1e-2, 1e-2, 2e-3, 2e-3])  # 10 mm: the vertex tells nothing of the tilt
     bundle = calibrate(nominal, Measured(seen_place(nominal, true), np.diag(sigma**2)), sigmas=sigmas)
     about_x, about_y = (math.degrees(bundle.sigmas[f"mirror_tilt_{axis}_rad"]) for axis in "xy")
     assert about_y == pytest.approx(1.0, rel=0.1)  # the prior of half a degree draws it nearer

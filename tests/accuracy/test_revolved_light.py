@@ -13,12 +13,12 @@ from helpers.path_ambient import path_trace
 from helpers.path_spots import compare
 from helpers.revolved_rigs import PROFILES, revolved
 
-from phibench.render.optics import spot_samples
+from phibench.render.optics import revolved_reflection, spot_samples
 from phibench.render.optics.certificate import certify
 from phibench.render.optics.reflection_point import path_determinant
 from phibench.render.optics.revolved_reflection import revolved_determinant, revolved_points
 from phibench.render.optics.spot_layer import spot_layer
-from phibench.render.optics.truth import SpotTruth, spot_truth
+from phibench.render.optics.truth import spot_truth
 from phibench.render.setup.variant import activate
 from phibench.scenes.camera import Detector
 from phibench.scenes.laser import LaserSpot, beam_diameter_m
@@ -31,15 +31,6 @@ SEEN_M = {"cone": (1.05, 1.3)}  # heights that a cone of 90 degrees sees: betwee
 @pytest.fixture(scope="module")
 def mi() -> ModuleType:
     return activate()
-
-
-def at_the_tip(view: View, shape: str, aligned: bool, truth: SpotTruth) -> bool:
-    """Return True for a chief ray within 1 mm of the tip of a cone that is off the axis, where samples are refused.
-
-    One spot of two there: certificate and layer differ by 0.024 px and 0.6 %. Which of them is off is not known.
-    """
-    to_tip = np.array(truth.reflection_point_world_m) - view.sphere_centre_m
-    return shape == "cone" and not aligned and float(np.linalg.norm(to_tip)) < 1e-3
 
 
 def certified(shape: str, seed: int, spots: int) -> int:
@@ -55,7 +46,7 @@ def certified(shape: str, seed: int, spots: int) -> int:
         aligned = number % 4 < 2
         view = revolved(shape, aligned=aligned, blur_sigma_px=rng.uniform(0.5, 1.2)).at(0.3)
         truth = spot_truth(view, spot, ())
-        if truth.visible and not at_the_tip(view, shape, aligned, truth):
+        if truth.visible:
             certificate = certify(view, spot, (), truth, spot_layer(view, spot, ()))
             assert certificate.passed, (view, spot, certificate)
             checked += 1
@@ -65,6 +56,16 @@ def certified(shape: str, seed: int, spots: int) -> int:
 @pytest.mark.parametrize("shape", PROFILES)
 def test_accuracy_certificates_of_spots(shape: str) -> None:
     assert certified(shape, 1, 4) >= 2
+
+
+def test_accuracy_certificate_at_the_tip_of_a_cone_off_its_axis(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Chief ray 0.13 mm from the tip. Without the search that begins there the layer loses two fifths of the light."""
+    view, spot = revolved("cone", aligned=False).at(0.3), LaserSpot((0.0, 2.0, 1.076), (0.0, -1.0, 0.0), 5e-3)
+    truth = spot_truth(view, spot, ())
+    assert certify(view, spot, (), truth, spot_layer(view, spot, ())).passed
+    monkeypatch.setattr(revolved_reflection, "_beside_tip", lambda points, *_: np.full((len(points), 2), np.nan))
+    monkeypatch.setattr("phibench.render.optics.certificate._LOG2_RAYS", (13,))
+    assert certify(view, spot, (), truth, spot_layer(view, spot, ())).flux_difference > 0.3
 
 
 @pytest.mark.parametrize("from_tip_mm", [0.26, 0.77])

@@ -378,6 +378,23 @@ def test_spread_of_bundles_against_neighbouring_rays(shape: str) -> None:
     assert 1.0 / steradians[good] == pytest.approx(spread[good], rel=2e-4)
 
 
+def test_places_beside_the_tip_of_a_cone_are_found() -> None:
+    """400 places 1 um to 1 mm from the tip, lens 4 mm off the axis: the point to which a ray goes on leads back there.
+
+    The tip is where the search in the half-plane ends for most of them.
+    """
+    profile, rng = PROFILES["cone"], np.random.default_rng(9)
+    r, turn = 10.0 ** rng.uniform(-6.0, -3.0, 400), rng.uniform(0.0, 2.0 * np.pi, 400)
+    side = np.stack([np.cos(turn), np.sin(turn), np.ones(400)], axis=-1)  # 45 degrees: as far up as out
+    places, normals = r[:, None] * side, (side - [0.0, 0.0, 2.0]) / np.sqrt(2.0)
+    eyes = np.array([0.004, -0.003, -0.2]) + np.append(rng.uniform(-8e-4, 8e-4, (400, 2)), np.zeros((400, 1)), axis=1)
+    ways = (places - eyes) / np.linalg.norm(places - eyes, axis=1)[:, None]
+    out = ways - 2.0 * np.einsum("ni,ni->n", ways, normals)[:, None] * normals
+    found, _, valid = revolved_points(places + rng.uniform(0.5, 4.0, (400, 1)) * out, eyes, profile)
+    assert valid.all()
+    assert np.abs(found - places).max() < 1e-12
+
+
 @pytest.mark.parametrize("half_angle", [0.5, np.pi / 4.0])
 def test_the_tip_of_a_cone_reflects_nothing(half_angle: float) -> None:
     """A point straight below is seen nowhere, and the ray into the tip has no answer that is finite by chance."""
