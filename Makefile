@@ -19,7 +19,7 @@ PARALLEL ?= --numprocesses 2 --dist loadfile --no-loadscope-reorder
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help setup dataset bench studies studies-full lint clean
-.PHONY: test test-slow proof test-all attack mutants benchmark
+.PHONY: docs test test-slow proof test-all attack mutants benchmark
 
 help:
 	@echo "make setup      make .venv with everything in it, and make sure of LLVM"
@@ -34,6 +34,7 @@ help:
 	@echo "make attack     hostile methods, files and moments: nothing is lost, and nobody is fooled (docs/trust.md)"
 	@echo "make mutants    proof that the tests see faults: one fault at a time, in copies of the checkout"
 	@echo "make benchmark  timings of what must be fast"
+	@echo "make docs       all pages and the reference as a site, in out/site; it works from disk"
 	@echo "make lint       ruff and mypy"
 	@echo "make clean      remove caches and builds; .venv and out/ stay"
 
@@ -103,6 +104,11 @@ mutants: $(READY)
 
 benchmark: $(READY)
 	$(BIN)/python -m pytest --benchmark-enable --benchmark-only
+
+docs: $(READY)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict --site-dir out/site
+	@echo "out/site/index.html"
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -1,0 +1,141 @@
+"""Hooks of the site: pages that lie elsewhere in the tree, sources that pages link to, and the reference.
+
+A link of a page is relative to the page's place in the repository. Here every file gets a place in the site, and links
+are turned towards it.
+"""
+
+from __future__ import annotations
+
+import posixpath
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+from mkdocs.plugins import event_priority
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = {
+    "README.md": "index.md",
+    "CHANGELOG.md": "CHANGELOG.md",
+    "CONTRIBUTING.md": "CONTRIBUTING.md",
+    "datasets/RECIPE.md": "datasets/RECIPE.md",
+    "datasets/FORMAT.md": "datasets/FORMAT.md",
+}
+"""Place in the site of every page that does not lie in docs/."""
+
+REFERENCE = {
+    "Public names": ("phibench.estimator.interface", "phibench.datasets.read"),
+    "Rig, camera, mirror": (
+        "phibench.scenes.rig",
+        "phibench.scenes.camera",
+        "phibench.scenes.mirror",
+        "phibench.scenes.revolved_mirror",
+        "phibench.scenes.laser",
+        "phibench.scenes.misalignment",
+    ),
+    "Sensor and frames": (
+        "phibench.render.sensor.settings",
+        "phibench.render.sensor.camera_chain",
+        "phibench.datasets.frames.request",
+        "phibench.datasets.frames.source",
+    ),
+    "Geometry and limits": (
+        "phibench.estimator.geometry.triangulate",
+        "phibench.estimator.geometry.paper_depth",
+        "phibench.estimator.limits.position_bound",
+        "phibench.estimator.limits.best_stroke",
+    ),
+    "Training and export": (
+        "phibench.datasets.training",
+        "phibench.datasets.export.export_make",
+        "phibench.datasets.export.pair_rows",
+    ),
+    "Films and loop": (
+        "phibench.datasets.film.film_read",
+        "phibench.estimator.film.film_estimates",
+        "phibench.estimator.loop.environment",
+        "phibench.estimator.loop.simulator",
+    ),
+}
+_LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
+_LANGUAGE = {".py": "python", ".toml": "toml", ".csv": "text", ".cff": "yaml", ".txt": "text", "": "text"}
+
+
+@event_priority(100)  # before the reference's reader looks there
+def on_config(config: Any) -> Any:
+    """Lay out the package as the reference's reader wants it: with `__init__.py` in every folder."""
+    package = ROOT / "out" / "site-sources" / "phibench"
+    shutil.rmtree(package.parent, ignore_errors=True)
+    for folder in ("scenes", "render", "datasets", "estimator"):
+        for file in (ROOT / folder).rglob("*.py"):
+            there = package / file.relative_to(ROOT)
+            there.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, there)
+    for place in [package, *(path for path in package.rglob("*") if path.is_dir())]:
+        (place / "__init__.py").touch()
+    return config
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add pages of other folders, sources that pages name, and the reference."""
+    linked = set()
+    for source, place in PAGES.items():
+        text = (ROOT / source).read_text(encoding="utf-8")
+        files.append(File.generated(config, place, content=text))
+        linked |= _sources(text, source)
+    for file in list(files.documentation_pages()):
+        if file.src_uri not in PAGES.values():
+            linked |= _sources(file.content_string, f"docs/{file.src_uri}")
+    for source in sorted(linked):
+        text = (ROOT / source).read_text(encoding="utf-8")
+        fence = f"# {source}\n\n````{_LANGUAGE.get(Path(source).suffix, 'text')}\n{text}\n````\n"
+        files.append(File.generated(config, _source_place(source), content=fence))
+    for title, modules in REFERENCE.items():
+        body = "\n".join(f"::: {module}\n" for module in modules)
+        place = f"reference/{title.lower().replace(', ', '-').replace(' ', '-')}.md"
+        files.append(File.generated(config, place, content=f"# {title}\n\n{body}"))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
+    """Turn links towards the places that files have in the site."""
+    place = page.file.src_uri
+    source = next((name for name, there in PAGES.items() if there == place), f"docs/{place}")
+
+    def turned(link: re.Match[str]) -> str:
+        target = _repository_path(link[2], source)
+        if target is None:
+            return link[0]
+        there = posixpath.relpath(_place(target), posixpath.dirname(place) or ".")
+        return f"{link[1]}{there}{link[3] or ''}{link[4]}"
+
+    return _LINK.sub(turned, markdown)
+
+
+def _place(target: str) -> str:
+    """Place in the site of a file of the repository."""
+    if target in PAGES:
+        return PAGES[target]
+    if target.startswith("docs/") and Path(target).suffix not in (".py", ".json"):
+        return target.removeprefix("docs/")
+    return _source_place(target)
+
+
+def _source_place(source: str) -> str:
+    return f"source/{source}.md"
+
+
+def _sources(text: str, page: str) -> set[str]:
+    """Files, neither pages nor pictures, that a page links to."""
+    targets = {_repository_path(link[2], page) for link in _LINK.finditer(text)}
+    return {t for t in targets if t is not None and _place(t).startswith("source/")}
+
+
+def _repository_path(link: str, page: str) -> str | None:
+    """Path in the repository of a relative link; None for what leads elsewhere or is no file."""
+    if "://" in link or link.startswith(("mailto:", "/")):
+        return None
+    path = posixpath.normpath(posixpath.join(posixpath.dirname(page), link))
+    return path if (ROOT / path).is_file() else None
