@@ -135,6 +135,16 @@ def film_windows(shared: SharedFolder) -> Path:
     return filmed(shared, "films-windows")
 
 
+_MOVES = "window_px = 24\nspeed_m_per_s = 1.0\nacceleration_m_per_s2 = 4.0\n"
+_BLINKING = f'frames = 10\n{_MOVES}pauses_s = [0.2, 0.1]\ncode = "110"\nbit_s = 0.2\n'
+
+
+@pytest.fixture(scope="session")
+def film_with_rests(shared: SharedFolder) -> Path:
+    """Film with a laser that is on all the time, and with rests of some frames."""
+    return filmed(shared, "films-rests", _BLINKING, f"{_MOVES}pauses_s = [0.6, 0.6]\n")
+
+
 @pytest.fixture(scope="session")
 def film_images(shared: SharedFolder) -> Path:
     """The same as whole images. Read only."""

@@ -121,9 +121,9 @@ def experiments(
     preset
         Sensor preset.
     on
-        Frames at each end with the laser on.
+        Most frames of a burst, at each end, with the laser on.
     off
-        Frames at each end with the laser off.
+        Most frames of a burst, at each end, with the laser off.
     cameras
         Cameras, each with a fixed pattern that nobody knows.
     jpeg_quality

@@ -1,12 +1,15 @@
-"""Positions of the spot in the frames of a film, with noise, and with the pattern that frames share.
+"""Positions of the spot in the frames of a film, with their noise, and with what frames share.
 
-Raw pixels around the spot are fitted frame by frame (`spots.fit_raw`). A fit errs by A (x - mu), with A = F^-1 d / V
-the influence of every pixel. Noise is new in every frame. PRNU and DSNU are the same in all, so that the errors of
-frames k and l, whose spots share pixels p, have the covariance
+What is left of a frame when the room is taken off (`laser_off_room`) is fitted around the spot: place and flux. A fit
+errs by A (x - mu), with A = F^-1 d / V the influence of every pixel. Of frames k and l, whose spots share pixels p, the
+errors have these covariances, w the weights of frames with the laser off:
 
-    sum_p A_kp A_lp (prnu^2 mu_kp mu_lp + dsnu^2).
+    noise     new in every frame: A_kp^2 V_kp
+    room      sum_p A_kp A_lp V_p (sum_j w_kj w_lj): the same frames with the laser off were taken off both
+    pattern   sum_p A_kp A_lp prnu^2 s_kp s_lp, s the spot's light alone
 
-A spot that rests gains nothing against the pattern from more frames; one that moves over pixels does.
+DSNU and the pattern of the room's light are taken off with the room. A spot that rests gains nothing against the rest
+of the pattern from more frames; one that moves over pixels does.
 
 A faint spot behind a mosaic has several minima in one frame. `stepped_positions` takes one scoring step from places
 that all frames together predict: repeated with the bundle, these are Gauss-Newton steps of the joint likelihood.
@@ -15,22 +18,22 @@ that all frames together predict: repeated with the bundle, these are Gauss-Newt
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.film.film_frames import FilmFrames
+from phibench.estimator.film.laser_off_room import FARTHEST_PX, room_weights
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.spots.fisher import fisher_matrix
-from phibench.estimator.spots.fit_raw import SpotFit, fit_law
+from phibench.estimator.spots.fit_raw import fit_law
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
-from phibench.estimator.spots.raw_pixels import GaussLaw, PatternNoise, noise_of, raw_electrons, spot_regions
+from phibench.estimator.spots.raw_pixels import GaussLaw, PatternNoise, SpotRegions, noise_of, spot_regions
 from phibench.scenes.frames import Array, BoolArray
-from phibench.scenes.rig import Rig
 
-SIDE_PX = 9  # a level per filter describes the room over so few pixels only
-_SEARCH_PX = 12  # around the middle of a window
+SIDE_PX = 11  # a spot of 0.9 px that moves by 2 px, and its tails
+_SEARCH_PX = 12  # around the place where a spot is looked for
 
 
 @dataclass(frozen=True)
@@ -43,13 +46,13 @@ class FilmPositions:
         NaN where there is none.
     noise_px2 : array, shape (N, 2, 2)
         Covariance of what is new in every frame.
-    pattern_px2 : array, shape (N, 2, N, 2)
-        Covariance of what the fixed pattern does, between all frames.
+    shared_px2 : array, shape (N, 2, N, 2)
+        Covariance of what frames share: pattern, and room.
     """
 
     uv_px: Array
     noise_px2: Array
-    pattern_px2: Array
+    shared_px2: Array
 
     @property
     def good(self) -> BoolArray:
@@ -58,153 +61,137 @@ class FilmPositions:
 
     def some(self, index: NDArray[np.int64]) -> FilmPositions:
         """Positions of some frames."""
-        return FilmPositions(self.uv_px[index], self.noise_px2[index], self.pattern_px2[index][:, :, index])
+        return FilmPositions(self.uv_px[index], self.noise_px2[index], self.shared_px2[index][:, :, index])
 
     def covariance_px2(self) -> Array:
         """Covariance of all positions, shape (2 N, 2 N), frame by frame (u, v)."""
         count = len(self.uv_px)
-        total = self.pattern_px2.copy()
+        total = self.shared_px2.copy()
         each = np.arange(count)
         total[each, :, each, :] += self.noise_px2
         return total.reshape(2 * count, 2 * count)
 
 
-def fit_positions(
-    windows_dn: NDArray[Any], origins_px: ArrayLike, card: SensorCard, rig: Rig, blur: SpotBlur, frames: int = 1
-) -> FilmPositions:
-    """Fit the spot in windows of raw pixels.
+@dataclass(frozen=True)
+class _Windows:
+    """Squares of N frames, room taken off, with the law of their pixels and the weights (N, M) of the room."""
+
+    regions: SpotRegions
+    law: GaussLaw
+    room_e: Array
+    weights: Array
+    prnu: float
+
+
+def fit_positions(frames: FilmFrames, blur: SpotBlur, weights: Array) -> FilmPositions:
+    """Fit each frame by itself, where the light that blinks is brightest within 12 px of `frames.near_px`.
 
     Parameters
     ----------
-    windows_dn : array, shape (N, h, w)
-        The spot lies within 12 px of their middle.
-    origins_px : shape (N, 2)
-        Image pixel (u, v) of each window's first column and row.
-    card, rig
-        Of the sensor; nominal rig, for the filters' response.
+    frames : FilmFrames
     blur : SpotBlur
-    frames : int
-        That each window is the mean of.
+        Of one spot, or of each.
+    weights : array, shape (N, M)
+        Of the frames with the laser off, for the room.
     """
-    x, origins = raw_electrons(windows_dn, card), np.asarray(origins_px, np.int64)
-    x, origins = _narrowed(x, origins)
-    noise, pattern = noise_of(card, pattern_known=True), PatternNoise.of(card)
-    law = GaussLaw(noise, pattern.dsnu_e2, frames, pattern.prnu)
-    red, green, blue = rig.camera.detector.laser_filter_response
-    model = SpotModel((red, green, blue) if card.mosaic == "bayer" else None)
-    regions = spot_regions(x, origins, x < card.full_from_e)
-    fit = fit_law(regions, law, blur, model)
-    pixels = SpotPixels.of(regions.filters, blur, model)
-    return _with_pattern(fit, pixels, regions.used, origins, law, pattern)
+    left = frames.on_e - np.tensordot(weights, frames.off_e, 1)
+    windows = _windows(frames, _brightest(left, frames.near_px - frames.origin_px) + frames.origin_px, weights)
+    model = _model(frames, windows)
+    fit = fit_law(windows.regions, windows.law, blur, model)
+    good = fit.status == Status.OK
+    pixels = SpotPixels.of(windows.regions.filters, blur, model)
+    theta = np.column_stack([fit.uv_px - windows.regions.origin_px, fit.flux_e])
+    uv = np.where(good[:, None], fit.uv_px, np.nan)
+    return _covariances(uv, np.where(good[:, None], theta, 1.0), pixels, windows)
 
 
-def stepped_positions(
-    windows_dn: NDArray[Any], origins_px: ArrayLike, card: SensorCard, rig: Rig, blur: SpotBlur, at_px: Array
-) -> FilmPositions:
-    """Positions after one scoring step from predicted ones, flux and levels fitted there; all frames have one.
+def stepped_positions(frames: FilmFrames, blur: SpotBlur, at_px: Array) -> FilmPositions:
+    """Positions after one scoring step from predicted ones, flux fitted there; frames without light have none.
 
     Parameters
     ----------
-    at_px : array, shape (N, 2)
-        Predicted positions. Others as for `fit_positions`.
+    at_px : array, shape (N + M, 2)
+        Predicted positions in the frames with the laser on, then in those with it off. Others as for `fit_positions`.
     """
-    x, origins = raw_electrons(windows_dn, card), np.asarray(origins_px, np.int64)
-    shape = np.array(x.shape[:0:-1])
-    corner = np.clip(np.rint(at_px).astype(np.int64) - origins - SIDE_PX // 2, 0, shape - SIDE_PX)
-    x = np.stack([part[v : v + SIDE_PX, u : u + SIDE_PX] for part, (u, v) in zip(x, corner, strict=True)])
-    origins = origins + corner
-    noise, pattern = noise_of(card, pattern_known=True), PatternNoise.of(card)
-    law = GaussLaw(noise, pattern.dsnu_e2, 1, pattern.prnu)
-    red, green, blue = rig.camera.detector.laser_filter_response
-    model = SpotModel((red, green, blue) if card.mosaic == "bayer" else None)
-    regions = spot_regions(x, origins, x < card.full_from_e)
-    pixels = SpotPixels.of(regions.filters, blur, model)
-    theta = _linear_unknowns(pixels, regions.x_e, regions.used, law, at_px - origins)
+    count = len(frames.on)
+    here, weights = at_px[:count], room_weights(at_px[:count], at_px[count:])
+    windows = _windows(frames, np.rint(here).astype(np.int64), weights)
+    pixels = SpotPixels.of(windows.regions.filters, blur, _model(frames, windows))
+    x, used = windows.regions.x_e, windows.regions.used
+    theta = np.column_stack([here - windows.regions.origin_px, _fluxes(pixels, windows, here)])
     mean, derivatives = pixels.at(theta)
-    weight = regions.used * law.information(mean)
-    score = np.einsum("nkhw,nhw->nk", derivatives, weight * (regions.x_e - mean))
+    weight = used * windows.law.information(mean)
+    score = np.einsum("nkhw,nhw->nk", derivatives, weight * (x - mean))
     step = np.einsum("nkl,nl->nk", np.linalg.pinv(fisher_matrix(derivatives, weight), hermitian=True), score)
-    good = np.isfinite(step).all(axis=1) & (theta[:, 2] > 0.0)
-    uv = np.where(good[:, None], at_px + step[:, :2], np.nan)
-    return _covariances(uv, theta, pixels, regions.used, origins, law, pattern)
+    # farther from all frames with the laser off the room is not known
+    known = np.linalg.norm(here[:, None] - at_px[count:], axis=2).min(axis=1) < FARTHEST_PX
+    good = np.isfinite(step).all(axis=1) & (theta[:, 2] > 0.0) & known
+    uv = np.where(good[:, None], here + step[:, :2], np.nan)
+    return _covariances(uv, theta, pixels, windows)
 
 
-def _linear_unknowns(pixels: SpotPixels, x: Array, used: BoolArray, law: GaussLaw, place_px: Array) -> Array:
-    """Flux and levels that fit best at given places, shape (N, unknowns): two rounds of weighted least squares."""
-    theta = np.column_stack([place_px, np.ones((len(x), pixels.unknowns - 2))])
-    basis = pixels.at(theta)[1][:, 2:]  # linear in flux and levels
-    mean = np.broadcast_to(np.maximum(x.mean(axis=(1, 2), keepdims=True), 1.0), x.shape)
+def _fluxes(pixels: SpotPixels, windows: _Windows, here: Array) -> Array:
+    """Fluxes that fit best at given places, shape (N,): two rounds of weighted least squares."""
+    x, used, origin = windows.regions.x_e, windows.regions.used, windows.regions.origin_px
+    shape = pixels.at(np.column_stack([here - origin, np.ones(len(x))]))[0]
+    flux = np.maximum(np.sum(used * x * shape, axis=(1, 2)) / np.sum(used * shape**2, axis=(1, 2)), 1.0)
     for _ in range(2):
-        weight = used * law.information(mean)
-        right = np.einsum("nkhw,nhw->nk", basis, weight * x)
-        theta[:, 2:] = np.einsum("nkl,nl->nk", np.linalg.pinv(fisher_matrix(basis, weight), hermitian=True), right)
-        mean = np.maximum(np.einsum("nk,nkhw->nhw", theta[:, 2:], basis), 1.0)
-    return theta
+        weight = used * windows.law.information(flux[:, None, None] * shape)
+        flux = np.sum(weight * x * shape, axis=(1, 2)) / np.sum(weight * shape**2, axis=(1, 2))
+    return np.asarray(flux)
 
 
-def _narrowed(x: Array, origins: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
-    """Small regions around the brightest place that is as wide as a spot, near the middle of each window."""
-    count, h, w = x.shape
-    level = np.median(x[:, ::2, ::2].reshape(count, -1), axis=1)[:, None, None]
-    rows, columns = (_middle(n) for n in (h, w))
-    # a mosaic shows the spot in one pixel of four: what counts is the sum over 3 x 3
-    padded = np.pad(x - level, ((0, 0), (1, 1), (1, 1)), mode="edge")
-    total = sum(padded[:, a : a + h, b : b + w] for a in range(3) for b in range(3))
-    near = np.asarray(total)[:, rows, columns].reshape(count, -1)
-    v, u = np.unravel_index(near.argmax(axis=1), (rows.stop - rows.start, columns.stop - columns.start))
-    best = np.stack([u, v], axis=1)
-    corner = best + (columns.start, rows.start) - SIDE_PX // 2
-    corner = np.clip(corner, 0, (w - SIDE_PX, h - SIDE_PX))
-    cut = [part[v : v + SIDE_PX, u : u + SIDE_PX] for part, (u, v) in zip(x, corner, strict=True)]
-    return np.stack(cut), origins + corner
+def _model(frames: FilmFrames, windows: _Windows) -> SpotModel:
+    red, green, blue = frames.rig.camera.detector.laser_filter_response
+    nothing = np.zeros(windows.regions.x_e.shape)
+    return SpotModel((red, green, blue) if frames.card.mosaic == "bayer" else None, nothing)
 
 
-def _middle(length: int) -> slice:
-    half = min(_SEARCH_PX, length // 2)
-    return slice(length // 2 - half, length // 2 + half)
+def _windows(frames: FilmFrames, middle_px: NDArray[np.int64], weights: Array) -> _Windows:
+    """Squares around these pixels, moved inside the region."""
+    card: SensorCard = frames.card
+    limit = np.array(frames.on_e.shape[:0:-1]) - SIDE_PX
+    corners = np.clip(middle_px - frames.origin_px - SIDE_PX // 2, 0, limit)
+    squares = [(slice(v, v + SIDE_PX), slice(u, u + SIDE_PX)) for u, v in corners]
+    on = np.stack([one[square] for one, square in zip(frames.on_e, squares, strict=True)])
+    room = np.stack([np.tensordot(w, frames.off_e[:, *at], 1) for w, at in zip(weights, squares, strict=True)])
+    noise, pattern = noise_of(card, pattern_known=True), PatternNoise.of(card)
+    seen = np.maximum(room, 0.0)
+    extra = seen + noise.variance_e2(seen) * np.sum(weights**2, axis=1)[:, None, None]
+    regions = spot_regions(on - room, corners + frames.origin_px, on < card.full_from_e)
+    return _Windows(regions, GaussLaw(noise, extra, 1, pattern.prnu), seen, weights, pattern.prnu)
 
 
-def _with_pattern(
-    fit: SpotFit,
-    pixels: SpotPixels,
-    used: BoolArray,
-    origins: NDArray[np.int64],
-    law: GaussLaw,
-    pattern: PatternNoise,
-) -> FilmPositions:
-    good = fit.status == Status.OK
-    theta = np.column_stack([fit.uv_px - origins, fit.flux_e, fit.background_e])
-    theta = np.where(good[:, None], theta, 1.0)
-    uv = np.where(good[:, None], fit.uv_px, np.nan)
-    return _covariances(uv, theta, pixels, used, origins, law, pattern)
+def _brightest(left_e: Array, near_px: Array) -> NDArray[np.int64]:
+    """Place (u, v) of the brightest 3 x 3 pixels near a place in each image; a mosaic shows a spot in one of four."""
+    count, h, w = left_e.shape
+    padded = np.pad(left_e, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    total = np.asarray(sum(padded[:, a : a + h, b : b + w] for a in range(3) for b in range(3)))
+    v, u = np.arange(h)[None, :, None], np.arange(w)[None, None, :]
+    far = np.maximum(np.abs(u - near_px[:, 0, None, None]), np.abs(v - near_px[:, 1, None, None])) > _SEARCH_PX
+    best = np.where(far, -np.inf, total).reshape(count, -1).argmax(axis=1)
+    return np.stack(np.unravel_index(best, (h, w))[::-1], axis=1)
 
 
-def _covariances(
-    uv_px: Array,
-    theta: Array,
-    pixels: SpotPixels,
-    used: BoolArray,
-    origins: NDArray[np.int64],
-    law: GaussLaw,
-    pattern: PatternNoise,
-) -> FilmPositions:
+def _covariances(uv_px: Array, theta: Array, pixels: SpotPixels, windows: _Windows) -> FilmPositions:
     mean, derivatives = pixels.at(theta)
-    weight = used * law.information(mean)
+    law, origins = windows.law, windows.regions.origin_px
+    weight = windows.regions.used * law.information(mean)
     inverse = np.linalg.pinv(fisher_matrix(derivatives, weight), hermitian=True)[:, :2]
     influence = np.einsum("nik,nkhw->nihw", inverse, derivatives * weight[:, None])
-    own = law.noise.variance_e2(mean) / law.frames
-    new = np.einsum("nihw,nhw,njhw->nij", influence, own, influence)
-    shared = _shared(influence * mean[:, None], origins, pattern.prnu**2) + _shared(influence, origins, pattern.dsnu_e2)
-    return FilmPositions(uv_px, new, shared)
+    room = np.sqrt(law.noise.variance_e2(windows.room_e))[:, None]
+    new = np.einsum("nihw,nhw,njhw->nij", influence, law.noise.variance_e2(mean) + windows.room_e, influence)
+    common = _common(influence * room, origins) * (windows.weights @ windows.weights.T)[:, None, :, None]
+    return FilmPositions(uv_px, new, common + windows.prnu**2 * _common(influence * mean[:, None], origins))
 
 
-def _shared(weights: Array, origins: NDArray[np.int64], variance: float) -> Array:
-    """Sum over common pixels of the weights (N, 2, h, w) of every two frames, shape (N, 2, N, 2), times a variance."""
-    count, _, h, w = weights.shape
+def _common(values: Array, origins: NDArray[np.int64]) -> Array:
+    """Sum over common pixels of the products of values (N, 2, h, w) of every two frames, shape (N, 2, N, 2)."""
+    count, _, h, w = values.shape
     low = origins.min(axis=0)
     width, height = origins.max(axis=0) - low + (w, h)
     images = np.zeros((count, 2, int(height), int(width)))
-    for image, part, (u, v) in zip(images, weights, origins - low, strict=True):
+    for image, part, (u, v) in zip(images, values, origins - low, strict=True):
         image[:, v : v + h, u : u + w] = part
     flat = images.reshape(2 * count, -1)
-    return variance * (flat @ flat.T).reshape(count, 2, count, 2)
+    return np.asarray((flat @ flat.T).reshape(count, 2, count, 2))

@@ -3,9 +3,9 @@
 For every rig of the films, a data set of the same recipe gives the calibration (`experiment_tables.calibrate_rig`).
 Every film then gives D in two ways, each for several cameras, whose fixed pattern nobody knows:
 
-1. burst: frames at rest at both ends, on and off, by the method that is closest to the bound (`method_for`), as for
-   stills of so many frames;
-2. stroke (raw pixels): all frames of the film, laser on, by the joint bundle (`film_bundle`).
+1. burst: frames at rest at both ends, every other one with the laser off, by the method that is closest to the bound
+   (`method_for`), as for stills of so many frames;
+2. stroke (raw pixels): all frames of the film, by the joint bundle (`film_bundle`).
 
 A film holds the room around its spot alone. Its images are cut-outs, seen by a camera whose principal point is moved by
 as much: mosaic and JPEG blocks keep their phase, because regions begin at whole tiles.
@@ -29,6 +29,7 @@ from phibench.estimator.calibration.bundle import Bundle
 from phibench.estimator.calibration.spots import method_for
 from phibench.estimator.film.film_bundle import FilmDepth
 from phibench.estimator.film.film_estimates import EqualLight, bundle_depth, equal_light, seen_film
+from phibench.estimator.film.film_frames import film_frames, lit_frames
 from phibench.estimator.geometry.least_squares_depth import depth_general
 from phibench.estimator.interface import Image, Pair
 from phibench.estimator.paper.experiment_tables import Procedure, calibrate_rig
@@ -42,7 +43,6 @@ COLUMNS = (
 """The last two: standard deviations of D from pixels and encoder alone, of the film and of as many frames in two bursts
 at the ends of its stroke; NaN for bursts."""
 WITHIN = 1.959963984540054
-_DRAWS_OF_A_CAMERA = 10_000
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class FilmProcedure:
     ----------
     preset : "bayer-raw" or "mjpeg"
     on, off : int
-        Frames at each end with the laser on and off.
+        Most frames of a burst, at each end, with the laser on and off; the film's own rest has every other one on.
     cameras : int
         Cameras with a fixed pattern of their own, 0 to `cameras` - 1, each with a draw of the noise.
     stroke : bool
@@ -104,10 +104,10 @@ _TYPES: dict[str, Any] = {
 
 def _rows(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> list[dict[str, Any]]:
     nan = float("nan")
-    found = [("burst", *burst(film, bundle, procedure, camera), 2 * (procedure.on + procedure.off), nan, nan)]
+    found = [("burst", *burst(film, bundle, procedure, camera), nan, nan)]
     if procedure.stroke and procedure.preset == "bayer-raw":
         at, light = whole_stroke(film, bundle, procedure, camera)
-        found.append(("stroke", at.depth_m, at.sigma_m, at.frames, light.film_m, light.two_ends_m))
+        found.append(("stroke", at.depth_m, at.sigma_m, len(film), light.film_m, light.two_ends_m))
     pair, depth_m = film.plan.pair, float(film.table["depth_m"][0])
     return [
         {
@@ -130,19 +130,20 @@ def _rows(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> 
 # Bursts.
 
 
-def burst(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> tuple[float, float]:
-    """D and its standard deviation from frames at rest at both ends, metres; NaN where there is no answer."""
+def burst(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> tuple[float, float, int]:
+    """D and its standard deviation from frames at rest at both ends, metres, and their number; NaN without answer."""
     pair = burst_pair(film, bundle, procedure, camera)
+    frames = sum(pair.count(name) for name in ("down", "down_off", "up", "up_off"))
     answer = method_for(pair.card)(pair)
     spots = (answer.down, answer.up)
     if any(one.uv_px is None or one.covariance_px2 is None for one in spots):
-        return float("nan"), float("nan")
+        return float("nan"), float("nan"), frames
     (uv1, uv2), (C1, C2) = (
         [np.array(one.uv_px, float) for one in spots],
         [np.array(one.covariance_px2, float) for one in spots],
     )
     at = depth_general(pair.rig, pair.stroke_m, uv1, uv2, C1, C2, bundle.covariance)
-    return float(at.depth_m), float(at.sigma_m)
+    return float(at.depth_m), float(at.sigma_m), frames
 
 
 def burst_pair(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> Pair:
@@ -153,20 +154,17 @@ def burst_pair(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int
     DatasetError
         If the film rests for fewer frames.
     """
-    ends = resting_frames(film)
     images: dict[str, list[Image]] = {}
     sensor = film.sensor(procedure.preset, **(procedure.sensor or {}))
-    for position, end in zip(("down", "up"), ends, strict=True):
-        if len(end) < procedure.on:
+    for position, end in zip(("down", "up"), resting_frames(film), strict=True):
+        if len(end) < 3:
             raise DatasetError(
-                f"film {film.info.film} rests {position} for {len(end)} frames, {procedure.on} are asked for; raise "
-                "film.pauses_s"
+                f"film {film.info.film} rests {position} for {len(end)} frames, two with the laser on and one with it "
+                "off are the least; raise film.pauses_s"
             )
-        images[position] = [_cut_out(film, k, procedure, camera, True, 0) for k in end[: procedure.on]]
-        # frames with the laser off are further draws of the frames at rest
-        off = [_cut_out(film, end[n % len(end)], procedure, camera, False, n // len(end)) for n in range(procedure.off)]
-        if off:
-            images[f"{position}_off"] = off
+        on, off, blinks = lit_frames(film, np.array(end))
+        images[position] = [_cut_out(film, int(k), procedure, camera, True) for k in on[: procedure.on]]
+        images[f"{position}_off"] = [_cut_out(film, int(k), procedure, camera, blinks) for k in off[: procedure.off]]
     nominal = film.plan.pair.nominal_stroke_m
     return Pair.of_frames(
         0,
@@ -189,11 +187,10 @@ def resting_frames(film: Film) -> tuple[list[int], list[int]]:
     return first, last
 
 
-def _cut_out(film: Film, frame: int, procedure: FilmProcedure, camera: int, laser: bool, draw: int) -> Image:
+def _cut_out(film: Film, frame: int, procedure: FilmProcedure, camera: int, laser: bool) -> Image:
     # each camera with a noise of its own
-    number = camera * _DRAWS_OF_A_CAMERA + draw
     sensor = procedure.sensor or {}
-    return film.cut_out(frame, procedure.preset, number, camera, laser=laser, **sensor).image
+    return film.cut_out(frame, procedure.preset, camera, camera, laser=laser, **sensor).image
 
 
 def cut_rig(rig: Rig, film: FilmInfo) -> Rig:
@@ -213,10 +210,9 @@ def cut_rig(rig: Rig, film: FilmInfo) -> Rig:
 
 def whole_stroke(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> tuple[FilmDepth, EqualLight]:
     """Depth from all frames of a film, and what two bursts of as many frames would give."""
-    seen = seen_film(film, camera * _DRAWS_OF_A_CAMERA, camera, preset=procedure.preset, rig=bundle.rig)
     nominal = film.plan.pair.nominal_stroke_m
     scale = float(bundle.stroke(np.array(nominal))) / nominal
-    seen = replace(seen, encoder_m=scale * seen.encoder_m)
+    seen = seen_film(film_frames(film, camera, camera, procedure.preset, rig=bundle.rig, stroke_scale=scale))
     found = bundle_depth(seen, bundle.covariance)
     return found, equal_light(seen, found.point_world_m)
 

@@ -1,26 +1,33 @@
 """Depth of a film: bundle and filter against drawn errors, the pattern's covariance against drawn cameras."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.special import ndtr
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import card_of
+from phibench.datasets.store.layers import SpotWindow
 from phibench.estimator.film.film_bundle import expected_sigma_m, film_depth
+from phibench.estimator.film.film_estimates import bundle_depth, seen_film
+from phibench.estimator.film.film_frames import FilmFrames
 from phibench.estimator.film.film_positions import FilmPositions, fit_positions, stepped_positions
+from phibench.estimator.film.laser_off_room import held_out_chi2
 from phibench.estimator.film.recursive_filter import FilterState, first_state, updated
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
+from phibench.estimator.spots.raw_pixels import PixelNoise, bayer_filters, raw_electrons
 from phibench.estimator.spots.spot_prediction import spot_blur
-from phibench.render.film.moving_rows import chief_uv_px
+from phibench.render.film.moving_rows import chief_uv_px, rows_image, spot_time_s
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.sensor.camera_chain import Chain
 from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.noise_tiles import NoiseStream
-from phibench.render.sensor.settings import sensor
+from phibench.render.sensor.settings import Sensor, sensor
 from phibench.scenes.frames import Array
-from phibench.scenes.laser import LaserSpot
+from phibench.scenes.laser import Beam, LaserSpot
 from phibench.scenes.motion.carriage import Carriage
 from phibench.scenes.motion.film_scene import FilmScene
 from phibench.scenes.motion.film_times import FilmTimes
@@ -54,7 +61,7 @@ def drawn(number: int, noise_px: float = NOISE_PX, encoder_m: float = ENCODER_M)
 
 def test_exact_positions_give_the_exact_point() -> None:
     offsets, uv = exact()
-    positions = FilmPositions(uv, drawn(0)[0].noise_px2, drawn(0)[0].pattern_px2)
+    positions = FilmPositions(uv, drawn(0)[0].noise_px2, drawn(0)[0].shared_px2)
     found = film_depth(SCENE.rig, positions, offsets, ENCODER_M)
     # positions are good to 1e-9 px, and a pixel is about 0.1 m of depth
     np.testing.assert_allclose(found.point_world_m, POINT, atol=1e-8)
@@ -140,42 +147,138 @@ def test_too_little_motion_is_a_sentence() -> None:
         film_depth(SCENE.rig, positions.some(np.array([0, 1])), readings[:1].repeat(2), ENCODER_M)
 
 
+# Pixels: a moving spot before an edge that moves with it.
+
+FILM = replace(
+    SCENE, times=FilmTimes(FRAMES, 30.0, 1 / 30, 0.03, 720), carriage=Carriage((0.0, 0.1), (0.2, 0.2), 0.4, 4.0)
+)
+STRONG = sensor("bayer-raw", exposure_s=FILM.times.exposure_s, readout_s=FILM.times.readout_s)
+NUMBERS = np.arange(FRAMES)
+
+
+@cache
+def told() -> tuple[Array, Array]:
+    """Offsets and exact positions at the frames' times."""
+    times = FILM.times.frame_s
+    return FILM.offset_m(times), chief_uv_px(FILM, times)
+
+
+@cache
+def lights() -> tuple[list[Light], Region]:
+    """Light of every frame, and the region around all spots. The room is smooth at the scale of the lens's blur."""
+    uv = told()[1]
+    low, high = np.rint(uv.min(axis=0)).astype(int) - 20, np.rint(uv.max(axis=0)).astype(int) + 21
+    box = Region(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+    rows, columns = np.mgrid[box.slices()].astype(float)
+    result = []
+    for k in range(FRAMES):
+        time_s = spot_time_s(FILM, k)
+        spot = rows_image(FILM, k, spot_layer(FILM.view_at(time_s), SPOT, ()), time_s)
+        u, v = chief_uv_px(FILM, np.array([time_s]))[0]
+        edge = ndtr((0.6 * (columns - u) + 0.8 * (rows - v) - 3.0) / 0.9)
+        room = np.zeros((3, 720, 1280), np.float32)
+        room[:, *box.slices()] = (6e4 - 3e4 * edge) * np.array([1.0, 0.8, 0.6])[:, None, None]
+        images = spot.electrons_per_s, spot.du_electrons_per_s_px, spot.dv_electrons_per_s_px
+        result.append(Light(room, SpotWindow(spot.u0_px, spot.v0_px, *images)))
+    return result, box
+
+
+def frames_of(images: list[Array], encoder_m: Array, times: FilmTimes = FILM.times) -> FilmFrames:
+    """Frames with the laser on in every other one."""
+    x, box = np.stack(images), lights()[1]
+    near = np.rint(told()[1][::2])
+    origin = np.array([box.u0_px, box.v0_px])
+    parts = NUMBERS[::2], NUMBERS[1::2], x[::2], x[1::2], origin, near
+    return FilmFrames(SCENE.rig, card_of(STRONG), times, FILM.carriage, encoder_m, ENCODER_M, *parts)
+
+
+def mean_electrons(k: int) -> Array:
+    """Expected electrons of a frame behind an RGGB mosaic."""
+    light, box = lights()[0][k], lights()[1]
+    planes, one = light.ambient_electrons_per_s[:, *box.slices()].astype(float), light.spot
+    assert one is not None
+    if k % 2 == 0:
+        u, v = one.u0_px - box.u0_px, one.v0_px - box.v0_px
+        h, w = one.electrons_per_s.shape[1:]
+        planes[:, v : v + h, u : u + w] += one.electrons_per_s
+    colours = np.take_along_axis(planes, bayer_filters([[box.u0_px, box.v0_px]], box.shape), axis=0)
+    return np.asarray(colours[0] * FILM.times.exposure_s)
+
+
+def test_expected_frames_give_the_exact_point() -> None:
+    """Model against the simulator's moving rows: 0.1 of a frame's noise, 0.3 of D's; still spots are noticed."""
+    images = [mean_electrons(k) for k in range(FRAMES)]
+    seen = seen_film(frames_of(images, told()[0]))
+    found = bundle_depth(seen)
+    assert found.chi2 / found.frames < 2 * 0.1**2
+    assert abs(found.depth_m - DEPTH_M) < 0.3 * found.sigma_m
+    still = replace(FILM.times, exposure_s=1e-6)
+    assert bundle_depth(seen_film(frames_of(images, told()[0], still))).chi2 > 10.0 * found.chi2
+
+
+def test_room_of_expected_frames_is_that_between_them() -> None:
+    images = np.stack([mean_electrons(k) for k in NUMBERS[1::2]])
+    # means without noise leave what interpolation errs by: a fifth of the noise at twice the spacing, squared
+    places = told()[1][1::2]
+    assert held_out_chi2(images, places, PixelNoise(9.0))[1:-1].max() < 0.2**2
+    assert held_out_chi2(images, np.zeros_like(places), PixelNoise(9.0))[1:-1].max() > 1.0
+
+
+def test_drawn_films_have_the_claimed_errors() -> None:
+    """Six cameras with 2 % PRNU: chi2 and squared pulls of the point, each within its band of 1e-5."""
+    box, chi2, pulls, dof = lights()[1], 0.0, 0.0, 0
+    for seed in range(6):
+        chain, rng = Chain(STRONG.model_copy(update={"prnu": 0.02}), seed), generator("film depth", "drawn", seed)
+        drawn_light = [light if k % 2 == 0 else light.laser_off() for k, light in enumerate(lights()[0])]
+        raw = [chain.raw(light, NoiseStream(("film", seed, k)), box) for k, light in enumerate(drawn_light)]
+        card = card_of(chain.sensor)
+        frames = frames_of(
+            [raw_electrons(one, card) for one in raw], told()[0] + ENCODER_M * rng.standard_normal(FRAMES)
+        )
+        found = bundle_depth(seen_film(replace(frames, card=card)))
+        error = found.point_world_m - POINT
+        chi2, dof = chi2 + found.chi2, dof + 2 * found.frames - 3
+        pulls += float(error @ np.linalg.solve(found.covariance_m2, error))
+    for value, degrees in ((chi2, dof), (pulls, 18)):
+        low, high = stats.chi2.ppf([5e-6, 1 - 5e-6], degrees)
+        assert low < value < high
+
+
 def test_pattern_of_a_camera_is_the_claimed_covariance() -> None:
-    """One place, 40 cameras of 6 frames: means of frames err by the pattern. 80 squares of pulls; band of 1e-5."""
-    view = SCENE.rig.at(0.1)
-    layer = spot_layer(view, SPOT, ())
-    strong = sensor("bayer-raw", prnu=0.05, read_noise_e=1.0)
-    card = card_of(strong)
-    v0, u0 = layer.v0_px + 6, layer.u0_px + 6
-    light = Light(np.full((3, 720, 1280), 4e3, np.float32), layer)
-    box = Region(u0 - 14, v0 - 14, u0 + 14, v0 + 14)
-    blur = spot_blur(SCENE.rig, np.array([u0, v0], float), DEPTH_M)
+    """One place, 40 cameras of 6 frames on and off: what is common errs by the pattern. 80 squares; band of 1e-5."""
+    strong = STRONG.model_copy(update={"prnu": 0.05, "read_noise_e": 1.0})
     squares, claims = [], []
     for seed in range(40):
-        chain = Chain(strong, seed)
-        frames = np.stack([chain.raw(light, NoiseStream(("pattern", seed, k)), box) for k in range(6)])
-        found = fit_positions(frames, np.full((6, 2), (box.u0_px, box.v0_px)), card, SCENE.rig, blur)
-        assert found.good.all()
-        error = found.uv_px.mean(axis=0) - layer.centroid_uv_px
+        found, truth = still_spot(strong, seed)
+        error = found.uv_px.mean(axis=0) - truth
         total = found.covariance_px2().reshape(6, 2, 6, 2).mean(axis=(0, 2))
         squares.append(error @ np.linalg.solve(total, error))
-        claims.append(found.pattern_px2.mean(axis=(0, 2))[0, 0] / total[0, 0])
+        claims.append(found.shared_px2.mean(axis=(0, 2))[0, 0] / total[0, 0])
     assert np.mean(claims) > 0.7  # most of it is pattern: six frames have averaged the noise
     low, high = stats.chi2.ppf([5e-6, 1 - 5e-6], 80) / 40
     assert low < np.mean(squares) < high
 
 
-def test_one_step_from_a_near_place_is_the_fit() -> None:
-    """Fits of bright spots, and one step from 0.05 px beside them: the step is linear to 0.05^2 px; 6 frames."""
-    view, strong = SCENE.rig.at(0.1), sensor("bayer-raw")
-    layer, card = spot_layer(view, SPOT, ()), card_of(strong)
-    v0, u0 = layer.v0_px + 6, layer.u0_px + 6
+def still_spot(camera: Sensor, seed: int) -> tuple[FilmPositions, Array]:
+    """Positions in six frames at rest, and the exact one."""
+    layer, chain, card = spot_layer(SCENE.rig.at(0.1), SPOT, ()), Chain(camera, seed), card_of(camera)
     light = Light(np.full((3, 720, 1280), 4e3, np.float32), layer)
-    box, chain = Region(u0 - 14, v0 - 14, u0 + 14, v0 + 14), Chain(strong, 1)
-    frames = np.stack([chain.raw(light, NoiseStream(("step", k)), box) for k in range(6)])
-    origins = np.full((6, 2), (box.u0_px, box.v0_px))
-    blur = spot_blur(SCENE.rig, np.array([u0, v0], float), DEPTH_M)
-    fit = fit_positions(frames, origins, card, SCENE.rig, blur)
-    stepped = stepped_positions(frames, origins, card, SCENE.rig, blur, fit.uv_px + 0.05)
-    np.testing.assert_allclose(stepped.uv_px, fit.uv_px, atol=5e-3)
-    np.testing.assert_allclose(stepped.noise_px2, fit.noise_px2, rtol=0.2, atol=1e-6)
+    u0, v0 = np.rint(layer.centroid_uv_px).astype(int) - 14
+    box = Region(int(u0), int(v0), int(u0) + 28, int(v0) + 28)
+    on, off = (
+        raw_electrons(np.stack([chain.raw(one, NoiseStream((name, seed, k)), box) for k in range(6)]), card)
+        for name, one in (("on", light), ("off", light.laser_off()))
+    )
+    each, near = np.arange(6), np.full((6, 2), (u0 + 14.0, v0 + 14.0))
+    origin = np.array([u0, v0])
+    args = (SCENE.rig, card, FILM.times, FILM.carriage, np.zeros(12), ENCODER_M, 2 * each, 2 * each + 1, on, off)
+    frames = FilmFrames(*args, origin, near)
+    blur = spot_blur(SCENE.rig, near[0], DEPTH_M, Beam())
+    fit = fit_positions(frames, blur, np.full((6, 6), 1.0 / 6.0))
+    assert fit.good.all()
+    at = fit.uv_px + 0.05
+    stepped = stepped_positions(frames, blur.each(6), np.vstack([at, at]))
+    # the step is linear to some 0.05^2 px, a spot being 0.8 px wide
+    np.testing.assert_allclose(stepped.uv_px, fit.uv_px, atol=1e-2)
+    np.testing.assert_allclose(stepped.noise_px2, fit.noise_px2, atol=0.1 * fit.noise_px2.max())
+    return fit, layer.centroid_uv_px

@@ -11,6 +11,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.film.film_read import Film, open_films
 from phibench.datasets.read import open_finished
 from phibench.estimator.calibration.bundle import Bundle
+from phibench.estimator.film.film_frames import film_frames, lit_frames
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
 from phibench.estimator.paper.film_experiments import (
     COLUMNS,
@@ -40,24 +41,40 @@ def test_frames_at_rest_are_those_before_and_after_the_stroke(film_windows: Path
     assert last == [8, 9]
 
 
-def test_a_burst_of_a_cut_out_gives_the_depth(film_windows: Path) -> None:
-    film, bundle = film_and_bundle(film_windows)
-    depth_m, sigma_m = burst(film, bundle, FEW, 0)
+def test_frames_are_lit_by_the_code_or_by_turns(film_windows: Path, film_with_rests: Path) -> None:
+    film = next(iter(open_films(film_windows)))
+    # bits of 0.2 s from the time 0, frames every 0.1 s; the spot's row is read after half an exposure, so that no
+    # frame sees an edge of the code
+    times, row = film.plan.nominal.times, film.table["row_v_px"].min()
+    assert times.row_s(0, row) > 0.5 * times.exposure_s
+    on, off, blinks = lit_frames(film, np.arange(len(film)))
+    assert blinks
+    assert on.tolist() == [0, 1, 2, 3, 6, 7, 8, 9]
+    assert off.tolist() == [4, 5]
+    on, off, blinks = lit_frames(next(iter(open_films(film_with_rests))), np.arange(5))
+    assert not blinks
+    assert (on.tolist(), off.tolist()) == ([0, 2, 4], [1, 3])
+
+
+def test_a_burst_of_a_cut_out_gives_the_depth(film_with_rests: Path) -> None:
+    film, bundle = film_and_bundle(film_with_rests)
+    depth_m, sigma_m, frames = burst(film, bundle, FEW, 0)
+    assert frames == 8
     # a normal error beyond 5 sigma: 6e-7
     assert abs(depth_m - film.table["depth_m"][0]) < 5.0 * sigma_m
     assert sigma_m < 0.1 * depth_m
 
 
-def test_the_whole_stroke_gives_the_depth(film_windows: Path) -> None:
-    film, bundle = film_and_bundle(film_windows)
+def test_the_whole_stroke_gives_the_depth(film_with_rests: Path) -> None:
+    film, bundle = film_and_bundle(film_with_rests)
     found, light = whole_stroke(film, bundle, FEW, 0)
     assert abs(found.depth_m - film.table["depth_m"][0]) < 5.0 * found.sigma_m
     assert light.film_m == pytest.approx(found.sigma_m, rel=0.05)  # the rig is known: pixels and encoder are all
     assert light.gain > 0.0
 
 
-def test_a_cut_camera_sees_the_same_rays(film_windows: Path) -> None:
-    film, bundle = film_and_bundle(film_windows)
+def test_a_cut_camera_sees_the_same_rays(film_with_rests: Path) -> None:
+    film, bundle = film_and_bundle(film_with_rests)
     region = film.info.region
     corner = np.array([region.u0_px, region.v0_px])
     uv = np.array([[40.0, 30.0], [60.5, 33.25]])
@@ -73,8 +90,10 @@ def test_a_cut_camera_sees_the_same_rays(film_windows: Path) -> None:
 
 def test_what_does_not_go_together_is_one_sentence(film_windows: Path, tiny_dataset: Path) -> None:
     film, bundle = film_and_bundle(film_windows)
-    with pytest.raises(DatasetError, match="rests down for 2 frames, 9 are asked for"):
-        burst_pair(film, bundle, replace(FEW, on=9), 0)
+    with pytest.raises(DatasetError, match="rests down for 2 frames, two with the laser on"):
+        burst_pair(film, bundle, FEW, 0)
+    with pytest.raises(DatasetError, match="off in 0; two on and one off"):
+        film_frames(film, frames=np.arange(4))
     with pytest.raises(DatasetError, match="make both of one recipe"):
         run_film_experiments(open_films(film_windows), open_finished(tiny_dataset), FEW)
 

@@ -1,0 +1,206 @@
+"""Frames of a film as a robot has them: laser on and off, the carriage when a spot's row was read, motion blur.
+
+The laser is on in every other frame, switched as the spot's row is read, or blinks by the film's own code. Positions
+belong to the time at which the spot's row is in the middle of its exposure. The encoder is read at the frame's time;
+from there to the row's time the carriage goes as it was told to.
+
+A spot that moves during an exposure is drawn out along its way. Its image is made of parts, as those of a wide lens
+are: where the spot is at the nodes of a quadrature over the exposure. Rows within a spot differ in time by 0.2 ms, and
+are taken as one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.polynomial.legendre import leggauss
+from numpy.typing import NDArray
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.film.film_read import Film
+from phibench.datasets.frames.sensor_card import SensorCard, card_of
+from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotParts
+from phibench.estimator.spots.raw_pixels import raw_electrons
+from phibench.estimator.spots.spot_prediction import spot_blur
+from phibench.scenes.frames import Array
+from phibench.scenes.laser import Beam
+from phibench.scenes.motion.carriage import Carriage
+from phibench.scenes.motion.film_times import FilmTimes
+from phibench.scenes.rig import Rig
+
+_NODES = 4  # of an exposure: exact to the seventh power of a motion of 2 px over a blur of 0.7 px
+_SIDE_PX = 48  # of what is kept around all spots
+_LIT = 0.99  # of an exposure: a frame with less, and more than none, is no frame of either kind
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class FilmFrames:
+    """Raw pixels of a film on one region, with the laser on in N frames and off in M.
+
+    Attributes
+    ----------
+    rig : Rig
+        Nominal, or calibrated.
+    card : SensorCard
+    times : FilmTimes
+    carriage : Carriage
+        As it was told to go.
+    encoder_m : array, shape (frames,)
+        Readings at the frames' times.
+    encoder_sigma_m : float
+    on, off : arrays of int, shape (N,) and (M,)
+        Numbers of the frames.
+    on_e, off_e : arrays, shape (N, h, w) and (M, h, w)
+        Electrons.
+    origin_px : array, shape (2,)
+        Image pixel (u, v) of the first one.
+    near_px : array, shape (N, 2)
+        Places within 12 px of the spots.
+    stroke_scale : float
+        Of a calibrated stroke, over the nominal one.
+    """
+
+    rig: Rig
+    card: SensorCard
+    times: FilmTimes
+    carriage: Carriage
+    encoder_m: Array
+    encoder_sigma_m: float
+    on: Index
+    off: Index
+    on_e: Array = field(repr=False)
+    off_e: Array = field(repr=False)
+    origin_px: Index
+    near_px: Array
+    stroke_scale: float = 1.0
+
+    def some(self, on: Index, off: Index) -> FilmFrames:
+        """Some of the frames, by their index among those with the laser on, and off; twice is allowed."""
+        return replace(
+            self,
+            on=self.on[on],
+            off=self.off[off],
+            on_e=self.on_e[on],
+            off_e=self.off_e[off],
+            near_px=self.near_px[on],
+        )
+
+    def offsets_m(self, numbers: Index, rows: Array) -> Array:
+        """Carriage when these rows, shape (N,), of these frames were exposed."""
+        told = self.carriage.position_m
+        since = told(self.times.row_s(numbers.astype(float), rows)) - told(self.times.frame_s[numbers])
+        return self.stroke_scale * (self.encoder_m[numbers] + since)
+
+    def image_px(self, point_world_m: Array, offsets_m: Array) -> Array:
+        """Image of a point with the carriage at offsets, shape (..., 2)."""
+        axis = np.array(self.rig.stroke_axis_world)
+        return image_of(self.rig.at(0.0), point_world_m - np.asarray(offsets_m)[..., None] * axis).uv_px
+
+    def positions_px(self, point_world_m: Array, numbers: Index) -> tuple[Array, Array]:
+        """Predicted positions, shape (N, 2), and the offsets at the times of their rows, shape (N,)."""
+        rows = np.full(len(numbers), 0.5 * (self.times.height_px - 1))
+        for _ in range(3):  # an image moves by a thousandth of a row in the time of a row
+            offsets = self.offsets_m(numbers, rows)
+            uv = self.image_px(point_world_m, offsets)
+            rows = uv[:, 1]
+        return uv, offsets
+
+    def blur(self, point_world_m: Array, uv_px: Array) -> SpotBlur:
+        """Blur of the N spots at (u, v), drawn out by the motion during the exposure."""
+        D = float(np.hypot(*(point_world_m[:2] - self.rig.at(0.0).sphere_centre_m[:2])))
+        each = [spot_blur(self.rig, uv, D, Beam()) for uv in uv_px]
+        sigma, ratio, mixed = np.array([(b.sigma_px, b.ratio, b.mixed_px2) for b in each], float).T
+        still = SpotBlur(sigma, ratio, mixed)
+        nodes, weights = leggauss(_NODES)
+        middle = self.times.row_s(self.on.astype(float), uv_px[:, 1])[:, None]
+        when = np.hstack([middle, middle + 0.5 * self.times.exposure_s * nodes])
+        places = self.image_px(point_world_m, self.stroke_scale * self.carriage.position_m(when))
+        apart = places[:, 1:] - places[:, :1]
+        return replace(still, parts=SpotParts(apart, np.broadcast_to(0.5 * weights, apart.shape[:2]), still))
+
+
+def film_frames(
+    film: Film,
+    draw: int = 0,
+    camera_seed: int = 0,
+    preset: str = "bayer-raw",
+    *,
+    vibration_sigma_m: float = 0.0,
+    frames: Array | None = None,
+    rig: Rig | None = None,
+    stroke_scale: float = 1.0,
+) -> FilmFrames:
+    """Draw frames of raw pixels, with the laser on and off.
+
+    Parameters
+    ----------
+    film, draw, camera_seed, preset
+    vibration_sigma_m : float
+        Of the carriage beside its encoder.
+    frames : array of int, optional
+        Frames to take; all by default.
+    rig : Rig, optional
+        Calibrated; the nominal one by default.
+    stroke_scale : float
+        Of the calibrated stroke.
+
+    Raises
+    ------
+    DatasetError
+        If fewer than two frames have the laser on, or none has it off.
+    """
+    numbers = np.arange(len(film)) if frames is None else np.asarray(frames, np.int64)
+    on, off, blinks = lit_frames(film, numbers)
+    region = film.info.region
+    nominal, card = film.plan.nominal, card_of(film.sensor(preset))
+    side = min(_SIDE_PX, film.info.window_px or _SIDE_PX)
+    windows = np.array([(w.u0_px, w.v0_px, w.u1_px, w.v1_px) for w in (film.window(int(k), side) for k in on)])
+    (u0, v0), (u1, v1) = windows[:, :2].min(axis=0), windows[:, 2:].max(axis=0)
+    rows, columns = (slice(a - first, b - first) for a, b, first in ((v0, v1, region.v0_px), (u0, u1, region.u0_px)))
+
+    def drawn(frame: int, laser: bool) -> Array:
+        return raw_electrons(film.cut_out(frame, preset, draw, camera_seed, laser=laser).image[rows, columns], card)
+
+    sigma = float(np.hypot(film.plan.encoder.sigma_m, vibration_sigma_m))
+    return FilmFrames(
+        rig or nominal.rig,
+        card,
+        nominal.times,
+        nominal.carriage,
+        film.table["encoder_m"].to_numpy(),
+        sigma,
+        on,
+        off,
+        np.stack([drawn(int(k), True) for k in on]),
+        np.stack([drawn(int(k), blinks) for k in off]),
+        np.array([u0, v0]),
+        0.5 * (windows[:, :2] + windows[:, 2:] - 1.0),
+        stroke_scale,
+    )
+
+
+def lit_frames(film: Film, numbers: Index) -> tuple[Index, Index, bool]:
+    """Frames with the laser on, frames with it off, and whether the film's own code switches it.
+
+    Raises
+    ------
+    DatasetError
+        If fewer than two are on, or none is off.
+    """
+    code, times = film.plan.nominal.code, film.plan.nominal.times
+    blinks = code.duration_s > 0.0
+    if blinks:
+        rows = film.table["row_v_px"].to_numpy()[numbers]
+        level = code.mean_level(times.row_s(numbers.astype(float), rows), times.exposure_s)
+        on, off = numbers[level > _LIT], numbers[level == 0.0]
+    else:
+        on, off = numbers[::2], numbers[1::2]
+    if len(on) < 2 or not len(off):
+        raise DatasetError(
+            f"film {film.info.film}: the laser is on in {len(on)} of {len(numbers)} frames and off in {len(off)}; two "
+            "on and one off are the least: take more frames, or a code whose bits are longer than two frames"
+        )
+    return on, off, blinks
