@@ -63,7 +63,7 @@ def film_depth(
     rig: Rig,
     positions: FilmPositions,
     encoder_m: Array,
-    encoder_sigma_m: float,
+    encoder_sigma_m: float | Array,
     covariance_rig: Array | None = None,
 ) -> FilmDepth:
     """Fit the point of a film.
@@ -75,7 +75,7 @@ def film_depth(
     positions : FilmPositions
     encoder_m : array, shape (N,)
         Reading of the carriage at the time at which the spot's row was exposed.
-    encoder_sigma_m : float
+    encoder_sigma_m : float, or array of shape (N,)
         Of a reading, vibration along the stroke included.
     covariance_rig : array, shape (p, p), optional
         Of `rig_parameters.PARAMETERS`.
@@ -92,12 +92,12 @@ def film_depth(
             f"film of {len(keep)} positions over {np.ptp(readings) if len(keep) else 0.0:.4f} m of the stroke: two "
             f"positions that are {_LEAST_STROKE_M:g} m apart are the least that give a depth"
         )
-    few = positions.some(keep)
+    few, sigma_m = positions.some(keep), np.broadcast_to(encoder_sigma_m, positions.good.shape)[keep]
     C, y = few.covariance_px2(), few.uv_px.ravel()
     X = _start(rig, few, readings)
     for _ in range(_STEPS):
         at = _predicted(rig, X, readings)
-        S = cho_factor(_total(rig, X, readings, C, at.by_offset, encoder_sigma_m, covariance_rig))
+        S = cho_factor(_total(rig, X, readings, C, at.by_offset, sigma_m, covariance_rig))
         information = at.by_point.T @ cho_solve(S, at.by_point)
         step = np.linalg.solve(information, at.by_point.T @ cho_solve(S, y - at.uv))
         # nearly all of a step is along the line of sight: half of the distance at most
@@ -105,7 +105,7 @@ def film_depth(
         X = X + step * min(1.0, 0.5 * far / max(float(np.linalg.norm(step)), 1e-12))
         if float(np.linalg.norm(step)) < _SETTLED_M:
             break
-    return _result(rig, X, readings, y, S, encoder_sigma_m)
+    return _result(rig, X, readings, y, S, sigma_m)
 
 
 @dataclass(frozen=True)
@@ -124,12 +124,12 @@ def _predicted(rig: Rig, X: Array, offsets: Array) -> _Prediction:
 
 
 def _total(
-    rig: Rig, X: Array, offsets: Array, C: Array, by_offset: Array, sigma_m: float, covariance_rig: Array | None
+    rig: Rig, X: Array, offsets: Array, C: Array, by_offset: Array, sigma_m: Array, covariance_rig: Array | None
 ) -> Array:
     total = C.copy()
     each = np.arange(len(offsets))
     blocks = total.reshape(len(offsets), 2, len(offsets), 2)
-    blocks[each, :, each, :] += sigma_m**2 * by_offset[:, :, None] * by_offset[:, None, :]
+    blocks[each, :, each, :] += sigma_m[:, None, None] ** 2 * by_offset[:, :, None] * by_offset[:, None, :]
     if covariance_rig is not None:
         J = rig_derivatives(rig, X, offsets, by_offset)
         total += J @ covariance_rig @ J.T
@@ -162,7 +162,7 @@ def _start(rig: Rig, positions: FilmPositions, readings: Array) -> Array:
     return np.asarray(found.point_world_m + offset[0] * np.array(rig.stroke_axis_world))
 
 
-def _result(rig: Rig, X: Array, readings: Array, y: Array, S: tuple[Array, bool], sigma_m: float) -> FilmDepth:
+def _result(rig: Rig, X: Array, readings: Array, y: Array, S: tuple[Array, bool], sigma_m: Array) -> FilmDepth:
     at = _predicted(rig, X, readings)
     covariance = np.linalg.inv(at.by_point.T @ cho_solve(S, at.by_point))
     radial = X[:2] - rig.at(0.0).sphere_centre_m[:2]
@@ -198,13 +198,13 @@ def expected_sigma_m(
     point_world_m: Array,
     offsets_m: Array,
     positions: FilmPositions,
-    encoder_sigma_m: float,
+    encoder_sigma_m: float | Array,
     covariance_rig: Array | None = None,
 ) -> float:
     """Standard deviation of D that positions of these covariances allow: the bound of a film of such frames."""
     at = _predicted(rig, point_world_m, offsets_m)
-    C = positions.covariance_px2()
-    S = cho_factor(_total(rig, point_world_m, offsets_m, C, at.by_offset, encoder_sigma_m, covariance_rig))
+    C, sigma_m = positions.covariance_px2(), np.broadcast_to(encoder_sigma_m, positions.good.shape)
+    S = cho_factor(_total(rig, point_world_m, offsets_m, C, at.by_offset, sigma_m, covariance_rig))
     covariance = np.linalg.inv(at.by_point.T @ cho_solve(S, at.by_point))
     radial = point_world_m[:2] - rig.at(0.0).sphere_centre_m[:2]
     gradient = np.array([*(radial / np.hypot(*radial)), 0.0])

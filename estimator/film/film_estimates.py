@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from phibench.estimator.film.film_bundle import FilmDepth, expected_sigma_m, film_depth
-from phibench.estimator.film.film_frames import FilmFrames, Index
+from phibench.estimator.film.film_frames import FilmFrames, Index, room_weights
 from phibench.estimator.film.film_positions import FilmPositions, fit_positions, stepped_positions
-from phibench.estimator.film.laser_off_room import room_weights
 from phibench.estimator.film.recursive_filter import FilterState, first_state, updated
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.scenes.frames import Array, BoolArray

@@ -1,6 +1,6 @@
 """Positions of the spot in the frames of a film, with their noise, and with what frames share.
 
-What is left of a frame when the room is taken off (`laser_off_room`) is fitted around the spot: place and flux. A fit
+What is left of a frame when the room is taken off (`film_frames`) is fitted around the spot: place and flux. A fit
 errs by A (x - mu), with A = F^-1 d / V the influence of every pixel. Of frames k and l, whose spots share pixels p, the
 errors have these covariances, w the weights of frames with the laser off:
 
@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.film.film_frames import FilmFrames
-from phibench.estimator.film.laser_off_room import FARTHEST_PX, room_weights
+from phibench.estimator.film.film_frames import FARTHEST_PX, FilmFrames, room_weights
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.spots.fisher import fisher_matrix
 from phibench.estimator.spots.fit_raw import fit_law

@@ -13,9 +13,8 @@ from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.store.layers import SpotWindow
 from phibench.estimator.film.film_bundle import expected_sigma_m, film_depth
 from phibench.estimator.film.film_estimates import bundle_depth, seen_film
-from phibench.estimator.film.film_frames import FilmFrames
+from phibench.estimator.film.film_frames import FilmFrames, held_out_chi2
 from phibench.estimator.film.film_positions import FilmPositions, fit_positions, stepped_positions
-from phibench.estimator.film.laser_off_room import held_out_chi2
 from phibench.estimator.film.recursive_filter import FilterState, first_state, updated
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
 from phibench.estimator.spots.raw_pixels import PixelNoise, bayer_filters, raw_electrons
