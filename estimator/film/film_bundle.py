@@ -173,7 +173,7 @@ def _result(rig: Rig, X: Array, readings: Array, y: Array, S: tuple[Array, bool]
     # rows of J_p, one block of two per frame
     J = np.zeros((len(y), len(readings)))
     J.reshape(len(readings), 2, len(readings))[np.arange(len(readings)), :, np.arange(len(readings))] = at.by_offset
-    offsets = readings + sigma_m**2 * J.T @ whitened
+    offsets = readings + sigma_m**2 * (J.T @ whitened)
     gain = cho_solve(S, J)
     from_point = J.T @ cho_solve(S, at.by_point)
     variance = (
