@@ -129,6 +129,17 @@ def test_viewpoints_are_one_where_the_lens_is_in_the_focus() -> None:
     assert math.isnan(meridian(_rig("cone")).viewpoint_spread_m((45.0, 60.0), 4.0))
 
 
+def test_the_rim_of_a_hyperboloid_in_its_focus_shows_what_its_closed_form_says() -> None:
+    """Its ray leaves the rim as if from the inner focus: 3.92 degrees above the horizon. 4 px inside it is 3.27."""
+    rig = _rig("hyperboloid")
+    rays, profile = meridian(rig), rig.mirror.profile
+    focus_m = 0.22 * 0.25 / 2.25
+    rim_deg = 90.0 + math.degrees(math.atan2(profile.depth_m - focus_m, profile.rim_radius_m))
+    assert rim_deg == pytest.approx(93.9211, abs=1e-4)
+    assert rays.field_deg(0.0)[1] == pytest.approx(rim_deg, abs=5e-4)
+    assert rays.field_deg(4.0)[1] == pytest.approx(93.273, abs=2e-3)
+
+
 def test_rays_pass_their_viewpoints() -> None:
     rig = _rig("paraboloid")
     rays = meridian(rig)
