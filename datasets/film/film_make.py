@@ -50,7 +50,7 @@ from phibench.datasets.store.provenance import code_behind, code_sha256
 from phibench.render.film.film_truth import instant_truth
 from phibench.render.film.moving_rows import RowsImage, rows_image, spot_time_s
 from phibench.render.optics.room_tracer import room_geometry
-from phibench.render.optics.spot_layer import spot_layer
+from phibench.render.optics.spot_layer import SpotLayer, spot_layer
 from phibench.scenes.frames import as_vector
 from phibench.scenes.room import Room
 
@@ -196,11 +196,11 @@ def light_images(film: FilmPlan, room: Room, number: int) -> tuple[list[RowsImag
     images = frame_spots(alone, room, times)
     colour = film.scene.lights[number].colour
     if colour is not None:
-        images = [_coloured(one, colour) for one in images]
+        images = [coloured(one, colour) for one in images]
     return images, frame_truths(alone, room, times, images)
 
 
-def _coloured(image: RowsImage, colour: tuple[float, ...]) -> RowsImage:
+def coloured(image: RowsImage, colour: tuple[float, ...]) -> RowsImage:
     """Image whose planes are shares of the laser's red one."""
     share = np.array(colour)[:, None, None]
     stacks = (image.electrons_per_s, image.du_electrons_per_s_px, image.dv_electrons_per_s_px)
@@ -209,18 +209,18 @@ def _coloured(image: RowsImage, colour: tuple[float, ...]) -> RowsImage:
 
 def frame_spots(film: FilmPlan, room: Room, times_s: Sequence[float]) -> list[RowsImage]:
     """Spot in every frame; frames of one pose, in which nothing moves, share their image."""
-    scene, images = film.scene, []
-    held: tuple[tuple[float, ...], RowsImage] | None = None
+    scene = film.scene
+    images: list[RowsImage] = []
+    held: tuple[tuple[float, ...], SpotLayer] | None = None
     for frame, at in enumerate(times_s):
         state = _state(film, at)
         if held is not None and held[0] == state and not _moves(film, frame):
-            images.append(held[1])
+            images.append(images[-1])
             continue
-        view = scene.view_at(at)
-        layer = spot_layer(view, scene.spot_at(at), room_geometry(room, view))
-        image = rows_image(scene, frame, layer, at)
-        images.append(image)
-        held = (state, image)
+        if held is None or held[0] != state:
+            view = scene.view_at(at)
+            held = state, spot_layer(view, scene.spot_at(at), room_geometry(room, view))
+        images.append(rows_image(scene, frame, held[1], at))
     return images
 
 

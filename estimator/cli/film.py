@@ -156,6 +156,51 @@ def experiments(
 
 
 @film.command
+def track(
+    directory: Path,
+    *,
+    preset: str = "bayer-raw",
+    draw: int = 0,
+    camera_seed: Whole = 0,
+    phase: Literal["known", "unknown"] = "known",
+) -> int:
+    """Find the target of every film among all lights of the whole images, by its blink code.
+
+    Exit code 1 if a target was not found.
+
+    Parameters
+    ----------
+    directory
+        Folder of films with view = "full".
+    preset
+        Sensor preset of the frames.
+    draw
+        Draw of the noise.
+    camera_seed
+        Of the fixed pattern.
+    phase
+        "known" if the robot switches the laser itself; "unknown" takes longer.
+    """
+    from phibench.datasets.film.film_read import open_films
+    from phibench.estimator.film.film_estimates import found_rows, track_film
+
+    missed = 0
+    heads = ("lock s", "u px", "v px", "off px", "lost", "lights")
+    print(f"{'film':32s} {'target':12s} " + " ".join(f"{head:>8s}" for head in heads))
+    for one in open_films(directory):
+        for row in found_rows(one, track_film(one, preset, draw, camera_seed, phase == "known")):
+            missed += row.fault != ""
+            if row.fault:
+                print(f"{one.info.film:32s} {row.target:12s} {row.fault}")
+                continue
+            print(
+                f"{one.info.film:32s} {row.target:12s} {row.lock_s:8.2f} {row.uv_px[0]:8.2f} {row.uv_px[1]:8.2f} "
+                f"{row.error_px:8.2f} {row.losses:8d} {row.lights:8d}"
+            )
+    return 1 if missed else 0
+
+
+@film.command
 def frames(
     directory: Path,
     *,

@@ -16,11 +16,13 @@ Soup has more, data association above all, for nine more packages.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from phibench.estimator.film.film_positions import FilmPositions
 from phibench.estimator.geometry.reflection import reflect, reflect_jacobian
 from phibench.estimator.geometry.sphere_image import SphereImager
 from phibench.estimator.geometry.triangulate import depth_exact
@@ -62,6 +64,11 @@ class Direction:
 
 def direction_of(rig: Rig, u_px: float, v_px: float, sigma_px: float) -> Direction | None:
     """Direction that a pixel belongs to, by the nominal rig; None where no ray leaves the mirror."""
+    return direction_with(rig, u_px, v_px, sigma_px**2 * np.eye(2))
+
+
+def direction_with(rig: Rig, u_px: float, v_px: float, covariance_px2: Array) -> Direction | None:
+    """Same, with the covariance of the pixel, shape (2, 2)."""
     view, uv = rig.at(0.0), np.array([u_px, v_px])
     ray = reflect(view, uv)
     r, dr = ray.direction_world, reflect_jacobian(view, uv).direction_per_px
@@ -76,7 +83,7 @@ def direction_of(rig: Rig, u_px: float, v_px: float, sigma_px: float) -> Directi
         ]
     )
     J = J @ dr
-    return Direction(math.atan2(r[1], r[0]), float(r[2] / across), sigma_px**2 * J @ J.T)
+    return Direction(math.atan2(r[1], r[0]), float(r[2] / across), J @ covariance_px2 @ J.T)
 
 
 def wrapped(angle_rad: float) -> float:
@@ -297,6 +304,45 @@ def _direction_mean(values: Array, weights: Array) -> Array:
     first = values[0, 0]
     turned = np.array([wrapped(a - first) for a in values[:, 0]])
     return np.array([first + weights @ turned, weights @ values[:, 1]])
+
+
+def film_beliefs(
+    rig: Rig,
+    vehicle: Vehicle,
+    positions: FilmPositions,
+    times_s: Array,
+    strokes_m: Array,
+    distances_m: tuple[float, float] = PRIOR_DISTANCES_M,
+    acceleration_m2_per_s3: float = 0.0,
+    speed_m_per_s: float = 0.3,
+) -> Iterator[tuple[int, TargetBelief]]:
+    """Belief after each frame of a film of a robot that stands: its number, and the belief, which goes on changing.
+
+    Parameters
+    ----------
+    positions : FilmPositions
+        In N frames, those of `film.spot_tracks.fitted_positions`; frames without one are left out.
+    times_s, strokes_m : shape (N,)
+        Time at which the spot's row was exposed, and the encoder's reading then.
+    distances_m, acceleration_m2_per_s3, speed_m_per_s
+        As for `TargetBelief`.
+    """
+    belief, before = None, 0.0
+    shared = np.einsum("nini->ni", positions.pattern_px2)  # of the fixed pattern, as if new in every frame
+    for k in np.flatnonzero(positions.good):
+        noise = positions.noise_px2[k] + np.diag(shared[k])
+        seen = direction_with(rig, float(positions.uv_px[k, 0]), float(positions.uv_px[k, 1]), noise)
+        if seen is None:
+            continue
+        if belief is None:
+            belief = TargetBelief(
+                rig, vehicle, seen, float(strokes_m[k]), distances_m, acceleration_m2_per_s3, speed_m_per_s
+            )
+        else:
+            belief.predict(0.0, 0.0, float(times_s[k]) - before)
+            belief.update(seen, float(strokes_m[k]))
+        before = float(times_s[k])
+        yield int(k), belief
 
 
 # -- baseline ----------------------------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -180,6 +181,19 @@ class ColourPlanes:
         """(h, w)."""
         return self.values_e.shape[1], self.values_e.shape[2]
 
+    @cached_property
+    def green_at_red(self) -> Array:
+        """Green at the red sites, shape (h, w); kept, because every test of places asks for it."""
+        green = self.values_e[1]
+        if not self.mosaic:
+            return green
+        p = np.pad(green, 1, mode="reflect")
+        result = np.zeros_like(green)
+        here = (slice(None, None, 2), slice(None, None, 2))
+        around = p[:-2, 1:-1][here] + p[2:, 1:-1][here] + p[1:-1, :-2][here] + p[1:-1, 2:][here]
+        result[here] = np.float32(0.25) * around
+        return result
+
 
 def colour_planes(image: Image, card: SensorCard, box: Box) -> ColourPlanes:
     """Planes of the part `box` of an image; see `interface.Pair` for the outputs.
@@ -208,15 +222,7 @@ def blur_of(card: SensorCard, sigma_px: float) -> float:
 
 def green_at_red(on: ColourPlanes) -> Array:
     """Green at the red sites: of a mosaic the mean of the four neighbours, zero elsewhere."""
-    green = on.values_e[1]
-    if not on.mosaic:
-        return green
-    p = np.pad(green, 1, mode="reflect")
-    result = np.zeros_like(green)
-    here = (slice(None, None, 2), slice(None, None, 2))
-    around = p[:-2, 1:-1][here] + p[2:, 1:-1][here] + p[1:-1, :-2][here] + p[1:-1, 2:][here]
-    result[here] = np.float32(0.25) * around
-    return result
+    return on.green_at_red
 
 
 def variance_e2(mean_e: Array, card: SensorCard, alike: bool) -> Array:
