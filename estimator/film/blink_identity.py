@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.film.spot_tracks import FrameSearch, SpotTrack, SpotTracker
+from phibench.estimator.interface import Box
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.motion.film_times import BlinkCode, FilmTimes
 from phibench.scenes.rig import Rig
@@ -34,13 +35,13 @@ LOCK = math.log(2000.0)
 REGAIN = 3.0
 """The same of a light that comes back where the target is expected."""
 _WRONG = 0.02  # of frames
-_RELATIVE = 0.1  # of a spot's light, that changes from frame to frame: its place in the mosaic
+_RELATIVE = 0.1  # of a light, that changes from frame to frame: its place in the mosaic
 _LONGEST = 60  # frames that count
 _PHASES_PER_BIT = 4
 _LEAST_SPREAD = 0.3  # of the levels: without an on and an off frame nothing is known
 _STEADY = -1.0  # log odds of such a light
 _CHANGES = 4.0  # standard deviations of chi^2 of a light that is steady
-_FOLLOWS = 3.5  # standard deviations of A below which a light does not follow the code
+_FOLLOWS = 6.0  # least A over its standard deviation: noise at a million places does not reach it
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ def _of_phase(y: Array, sigma: Array, exposures: Exposures, bits: str) -> Eviden
     if np.ptp(x) < _LEAST_SPREAD:
         return Evidence()
     C, A, sigma_A = _fitted(y, sigma, x)
-    if A < _FOLLOWS * sigma_A:
+    if sigma_A * _FOLLOWS > A:
         return Evidence(_STEADY, A, sigma_A)
     flat = _WRONG / (A + 6.0 * float(np.median(sigma)))
     own = np.log(_likelihood(y, C, A, sigma, x[:, None], flat)).sum()
@@ -166,7 +167,7 @@ def _fitted(y: Array, sigma: Array, x: Array) -> tuple[float, float, float]:
     for _ in range(2):
         F = (X * weight) @ X.T
         C, A = np.linalg.solve(F, (X * weight) @ y)
-        spread = np.hypot(sigma, _RELATIVE * A * x)
+        spread = np.hypot(sigma, _RELATIVE * (abs(C) + A * x))
         rest = np.abs(y - C - A * x)
         weight = np.where(rest < 4.0 * spread, 1.0, (4.0 * spread / np.maximum(rest, 1e-12)) ** 2) / spread**2
     return float(C), float(A), float(math.sqrt(np.linalg.inv(F)[1, 1]))
@@ -174,7 +175,7 @@ def _fitted(y: Array, sigma: Array, x: Array) -> tuple[float, float, float]:
 
 def _likelihood(y: Array, C: float, A: float, sigma: Array, levels: Array, flat: float) -> Array:
     """Likelihood of N frames at levels (N, m)."""
-    spread = np.hypot(sigma[:, None], _RELATIVE * A * levels)
+    spread = np.hypot(sigma[:, None], _RELATIVE * (abs(C) + A * levels))
     normal = np.exp(-0.5 * ((y[:, None] - C - A * levels) / spread) ** 2) / (math.sqrt(2.0 * math.pi) * spread)
     return np.asarray(flat + (1.0 - _WRONG) * normal)
 
@@ -242,6 +243,8 @@ class TargetTracker:
         Targets to look for, each by a code of its own.
     patience_s : float
         Time after which a light that is not seen is given up.
+    box : Box, optional
+        Part of the image to search, as of `FrameSearch`.
 
     Raises
     ------
@@ -258,13 +261,21 @@ class TargetTracker:
     """
 
     def __init__(
-        self, rig: Rig, card: SensorCard, times: FilmTimes, codes: Sequence[TargetCode], patience_s: float = 1.0
+        self,
+        rig: Rig,
+        card: SensorCard,
+        times: FilmTimes,
+        codes: Sequence[TargetCode],
+        patience_s: float = 1.0,
+        box: Box | None = None,
     ) -> None:
         _check(times, codes)
         self.rig, self.times, self.card = rig, times, card
         self._states = {one.name: _Search(one, one.dark_frames(times.rate_hz)) for one in codes}
         tentative = max(state.dark_frames for state in self._states.values())
-        self.tracker = SpotTracker(FrameSearch(rig, card), max(round(patience_s * times.rate_hz), tentative), tentative)
+        self.tracker = SpotTracker(
+            FrameSearch(rig, card, box), max(round(patience_s * times.rate_hz), tentative), tentative
+        )
         self.holds: list[Hold] = []
 
     @property

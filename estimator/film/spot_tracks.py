@@ -29,6 +29,7 @@ from scipy.optimize import linear_sum_assignment
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.film.film_positions import FilmPositions, fit_positions
+from phibench.estimator.interface import Box
 from phibench.estimator.spots.candidates import candidates_at, peaks
 from phibench.estimator.spots.detect import lamp_halo, mirror_box, outline_mask
 from phibench.estimator.spots.image_planes import ColourPlanes, blur_of, colour_planes, variance_e2
@@ -77,10 +78,12 @@ class FrameSearch:
     rig : Rig
         Nominal: its mirror's outline and its blur.
     card : SensorCard
+    box : Box, optional
+        Part of the image to search, which begins at an even row and column; all that holds the mirror by default.
     """
 
-    def __init__(self, rig: Rig, card: SensorCard) -> None:
-        self.card, self.box = card, mirror_box(rig)
+    def __init__(self, rig: Rig, card: SensorCard, box: Box | None = None) -> None:
+        self.card, self.box = card, box or mirror_box(rig)
         self.sigma_px = blur_of(card, rig.camera.blur_sigma_px)
         self._outline = outline_mask(rig, self.box)
         self._origin = np.array([self.box.u0_px, self.box.v0_px], float)
@@ -102,26 +105,26 @@ class FrameSearch:
         places = peaks(planes, None, self.card, self.sigma_px, where, _LEAST_PEAK, _MOST_PEAKS).uv_px
         tests = candidates_at(planes, None, self.card, places, self.sigma_px)
         keep = np.flatnonzero(tests.z >= LEAST_Z)
-        uv = tests.uv_px[keep]
+        uv = self._refined(planes, None, tests.uv_px[keep])
         if before is not None and len(more := self._brighter(planes, before, where)):
+            more = self._refined(planes, before, more)
             apart = np.linalg.norm(more[:, None] - uv[None], axis=-1).min(axis=1, initial=np.inf) > _APART_PX
             uv = np.concatenate([uv, more[apart]])
-        uv, electrons, sigma = self._refined(planes, uv)
-        order = np.argsort(-electrons, kind="stable")
-        return FrameSpots(uv[order] + self._origin, electrons[order], sigma[order])
+        light = candidates_at(planes, None, self.card, uv, self.sigma_px)
+        order = np.argsort(-light.electrons, kind="stable")
+        return FrameSpots(uv[order] + self._origin, light.electrons[order], light.sigma_e[order])
 
-    def _refined(self, planes: ColourPlanes, uv_px: Array) -> tuple[Array, Array, Array]:
-        """Places at the vertex of a parabola along u and one along v through the gain A^2 / variance, and the light."""
+    def _refined(self, planes: ColourPlanes, off: ColourPlanes | None, uv_px: Array) -> Array:
+        """Places at the vertex of a parabola along u and one along v through the gain A^2 / variance."""
         around = (uv_px[:, None] + _CROSS).reshape(-1, 2)
-        tests = candidates_at(planes, None, self.card, around, self.sigma_px)
+        tests = candidates_at(planes, off, self.card, around, self.sigma_px)
         gain = ((np.maximum(tests.electrons, 0.0) / tests.sigma_e) ** 2).reshape(len(uv_px), len(_CROSS))
         shift = np.zeros((len(uv_px), 2))
         for axis, (low, high) in enumerate(((1, 2), (3, 4))):
             bend = gain[:, low] - 2.0 * gain[:, 0] + gain[:, high]
             slope = 0.5 * (gain[:, low] - gain[:, high])
             shift[:, axis] = np.where(bend < 0.0, np.clip(slope / np.minimum(bend, -1e-9), -1.0, 1.0), 0.0)
-        middle = slice(None, None, len(_CROSS))
-        return uv_px + 0.5 * shift, tests.electrons[middle], tests.sigma_e[middle]
+        return uv_px + 0.5 * shift
 
     def _brighter(self, planes: ColourPlanes, before: ColourPlanes, where: BoolArray) -> Array:
         """Places relative to the box, shape (n, 2), that are brighter than before."""

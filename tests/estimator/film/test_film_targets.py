@@ -22,7 +22,7 @@ from phibench.estimator.film.blink_identity import (
     track_targets,
 )
 from phibench.estimator.film.film_estimates import found_rows, track_film
-from phibench.estimator.film.spot_tracks import FrameSpots, SpotTrack, _assigned, _motion, fitted_positions
+from phibench.estimator.film.spot_tracks import FrameSpots, SpotTrack, _assigned, _motion
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.motion.film_times import BlinkCode, FilmTimes
 from phibench.scenes.random_streams import generator
@@ -123,10 +123,6 @@ def test_targets_are_found_among_lights_in_whole_frames(film_images: Path) -> No
         apart = np.linalg.norm(film.uv_px[:, hold.locked] - place, axis=1)
         assert int(np.argmin(apart)) == number
         assert apart[number] < 1.0
-        # a fit of raw pixels is good to 0.1 px where the room is even; these large pixels show steep edges
-        fitted = fitted_positions(hold.track, film.scene.rig, card)
-        off = fitted.uv_px - film.uv_px[number, hold.track.seen_frames]
-        assert np.median(np.abs(off[fitted.good])) < 0.3
 
 
 def test_a_target_that_is_hidden_is_lost_and_found_again(film_images: Path) -> None:
