@@ -1,4 +1,4 @@
-"""Depth of a film in three ways: joint bundle, bursts at both ends, recursive filter.
+"""Estimates from a film: depth by joint bundle, bursts at both ends or recursive filter, and its targets.
 
 Each takes what a robot has: raw frames with the laser on and off, their times, encoder readings, the rig that it knows,
 and how the carriage was told to go. The true scene is not asked.
@@ -6,10 +6,16 @@ and how the carriage was told to go. The true scene is not asked.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+import polars
 
+from phibench.datasets.film.film_read import Film
+from phibench.datasets.frames.sensor_card import card_of
+from phibench.datasets.recipe.film_tables import TARGET
+from phibench.estimator.film.blink_identity import TargetCode, TargetTracker, track_targets
 from phibench.estimator.film.film_bundle import FilmDepth, expected_sigma_m, film_depth
 from phibench.estimator.film.film_frames import FilmFrames, Index, room_weights
 from phibench.estimator.film.film_positions import FilmPositions, fit_positions, stepped_positions
@@ -17,6 +23,7 @@ from phibench.estimator.film.recursive_filter import FilterState, first_state, u
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import Beam
+from phibench.scenes.validation import SceneError
 
 _ROUNDS = 2  # of the frames' own fits: the second one knows distance and motion
 _STEPS, _SETTLED = 8, 0.02  # of the bundle, and standard deviations that it stops at
@@ -157,3 +164,73 @@ def _two_ends(frames: FilmFrames, numbers: Index) -> Index:
     """As many frames, half of them that of the lowest and half that of the highest offset: their index."""
     told = frames.carriage.position_m(frames.times.frame_s[numbers])
     return np.where(np.arange(len(numbers)) < len(numbers) // 2, np.argmin(told), np.argmax(told))
+
+
+# Targets.
+
+
+def track_film(
+    film: Film, preset: str = "bayer-raw", draw: int = 0, camera_seed: int = 0, phase_known: bool = True
+) -> TargetTracker:
+    """Tracker after all frames of a film of a data set; it looks for the target and for lights that are targets, too.
+
+    Raises
+    ------
+    SceneError
+        If the film holds windows only, or a code has no 0.
+    """
+    scene, info = film.plan.scene, film.info
+    if info.window_px is not None:
+        raise SceneError(
+            f"film {info.film} holds windows around the spot, and a target is looked for in whole images: make it with "
+            'view = "full" in [film]'
+        )
+    codes = [TargetCode(TARGET, scene.code, phase_known)]
+    codes += [TargetCode(one.name, one.code, phase_known) for one in scene.lights if one.is_target]
+    images = (film.frame(k, preset, draw, camera_seed).image for k in range(len(film)))
+    return track_targets(images, film.plan.nominal.rig, card_of(film.sensor(preset)), scene.times, codes)
+
+
+@dataclass(frozen=True)
+class FoundRow:
+    """Outcome for one target of a film.
+
+    Attributes
+    ----------
+    target, fault : str
+        Name, and the sentence that says why it was not found; empty where it was.
+    lock_s : float
+        Time from the film's first frame to the end of the frame of the lock.
+    uv_px : (u, v)
+        Place at the lock.
+    error_px : float
+        Distance from the true place.
+    losses, lights : int
+        Times that it was lost; lights that are followed at the end.
+    """
+
+    target: str
+    fault: str = ""
+    lock_s: float = math.nan
+    uv_px: tuple[float, float] = (math.nan, math.nan)
+    error_px: float = math.nan
+    losses: int = 0
+    lights: int = 0
+
+
+def found_rows(film: Film, tracker: TargetTracker) -> list[FoundRow]:
+    """Outcome of a film for each of its targets, against the truth."""
+    return [_found(film, tracker, name) for name in tracker.names]
+
+
+def _found(film: Film, tracker: TargetTracker, name: str) -> FoundRow:
+    try:
+        first = tracker.first_lock(name)
+    except SceneError as error:
+        return FoundRow(name, str(error))
+    table = film.table if name == TARGET else film.lights_table.filter(polars.col("light") == name)
+    truth = np.array([table["row_u_px"][first.locked], table["row_v_px"][first.locked]])
+    place = first.track.uv_px[first.locked - first.track.first]
+    losses = sum(hold.lost >= 0 for hold in tracker.holds if hold.target == name)
+    lock_s = (first.locked + 1) / tracker.times.rate_hz
+    return FoundRow(name, "", lock_s, place, float(np.linalg.norm(truth - place)), losses, tracker.lights)

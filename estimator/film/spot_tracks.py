@@ -28,11 +28,15 @@ from scipy.ndimage import correlate1d, maximum_filter
 from scipy.optimize import linear_sum_assignment
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.film.film_positions import FilmPositions, fit_positions
+from phibench.estimator.film.film_positions import FilmPositions
+from phibench.estimator.geometry.status import Status
 from phibench.estimator.interface import Box
 from phibench.estimator.spots.candidates import candidates_at, peaks
 from phibench.estimator.spots.detect import lamp_halo, mirror_box, outline_mask
+from phibench.estimator.spots.fit_raw import fit_law
+from phibench.estimator.spots.gaussian_spot import SpotModel
 from phibench.estimator.spots.image_planes import ColourPlanes, blur_of, colour_planes, variance_e2
+from phibench.estimator.spots.raw_pixels import GaussLaw, noise_of, raw_electrons, spot_regions
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import Beam
@@ -50,12 +54,12 @@ _LEAST_PEAK = 4.0
 _MOST_PEAKS = 600
 _GATE2 = 16.0  # chi squared of 2: 3e-4 of a track's own spots lie beyond
 _FARTHEST_PX = 4.0  # of a track's own spot from where it is expected, however long it was dark
-_PLACE_PX = 0.2  # of a detection: noise of a spot of 7 sigma, and minima of the mosaic
-_SPEED_PX = 0.15  # per frame, of a track at its first spot: a stroke of 0.25 m/s moves one 1.5 m away by 0.4
-_ACCELERATION_PX2 = 0.003  # density, per frame^3
+_PLACE_PX = 0.35  # of a detection: noise of a spot of 7 sigma, and minima of the mosaic
+_SPEED_PX = 0.1  # per frame, of a track at its first spot: most lights rest, and a stroke speeds up in time
+_ACCELERATION_PX2 = 0.001  # density, per frame^3: a stroke of 0.25 m/s at 1.5 m moves a spot by 0.4 px a frame
 _BACK = 4  # frames before the first spot that are measured: a code's longest dark run and one more
 _TENTATIVE = 2  # spots up to which a track may be noise
-WINDOW_PX = 11  # kept around every spot, for a fit of its place: wider ones may hold brighter things
+WINDOW_PX = 9  # kept around every spot, for a fit of its place: a level per filter describes the room there
 
 
 @dataclass(frozen=True)
@@ -344,7 +348,7 @@ def _assigned(tracks: Sequence[SpotTrack], expected: Array, spots: FrameSpots) -
 def fitted_positions(track: SpotTrack, rig: Rig, card: SensorCard, depth_m: float = 2.5) -> FilmPositions:
     """Positions in the frames in which a track's spot was detected, `track.seen_frames`, with their covariance.
 
-    Raw pixels only: those of other outputs have no fit for films.
+    The fixed pattern counts as new in every frame, and the room as a level per filter. Raw pixels only.
 
     Raises
     ------
@@ -354,4 +358,13 @@ def fitted_positions(track: SpotTrack, rig: Rig, card: SensorCard, depth_m: floa
     if card.output != "raw":
         raise SceneError(f"positions of '{card.output}' frames have no fit for films; take raw ones")
     blur = spot_blur(rig, np.array(track.place_px), depth_m, Beam())
-    return fit_positions(np.stack(track.windows), track.origins_px, card, rig, blur)
+    x = raw_electrons(np.stack(track.windows), card)
+    red, green, blue = rig.camera.detector.laser_filter_response
+    model = SpotModel((red, green, blue) if card.mosaic == "bayer" else None)
+    regions = spot_regions(x, track.origins_px, x < card.full_from_e)
+    fit = fit_law(regions, GaussLaw(noise_of(card, pattern_known=False)), blur, model)
+    good = (fit.status == Status.OK)[:, None]
+    # what the room's edges do to a spot shows in the misfit
+    covariance = fit.covariance_px2 * np.maximum(fit.chi2, 1.0)[:, None, None]
+    count = len(x)
+    return FilmPositions(np.where(good, fit.uv_px, np.nan), covariance, np.zeros((count, 2, count, 2)))

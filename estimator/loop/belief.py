@@ -328,7 +328,7 @@ def film_beliefs(
         As for `TargetBelief`.
     """
     belief, before = None, 0.0
-    shared = np.einsum("nini->ni", positions.pattern_px2)  # of the fixed pattern, as if new in every frame
+    shared = np.einsum("nini->ni", positions.shared_px2)  # of the fixed pattern, as if new in every frame
     for k in np.flatnonzero(positions.good):
         noise = positions.noise_px2[k] + np.diag(shared[k])
         seen = direction_with(rig, float(positions.uv_px[k, 0]), float(positions.uv_px[k, 1]), noise)
