@@ -1,17 +1,19 @@
-"""Holder of the mirror: what carries the ball above the camera, between two plates or on a post from above.
+"""Holder of the mirror: what carries it above the camera, between two plates or on a post from above.
 
 It has a file of its own because three sides need the same thing: the rig checks its sizes, rooms take its shapes, and
-recipes draw it. It belongs to the rig and moves with it. Its axis is the line from the lens centre to the ball's
-centre: the ball sits centred in its holder, and the two are misaligned together against camera and stroke axis. Along
-that axis z is 0 at the lens centre.
+recipes draw it. It belongs to the rig and moves with it. Its axis is the line from the lens centre to the sphere's
+centre, or to the vertex of a mirror of revolution: the mirror sits centred in its holder, and the two are misaligned
+together against camera and stroke axis. Along that axis z is 0 at the lens centre. A mirror of revolution may be tilted
+in its holder.
 
-* Rods: three upright rods on a circle around the ball, between a plate below the camera and one above the ball.
-* Post: a post from above ends at the ball's top. Nothing that is wholly behind a convex mirror is ever seen in it. The
-  post therefore hangs from an arm, and a column beside the ball carries that from the plate below the camera.
+* Rods: three upright rods on a circle around the mirror, between a plate below the camera and one above the mirror.
+* Post: a post from above ends at the top of a ball, or on the back of a mirror of revolution, in the plane of its rim.
+  Nothing that is wholly behind a convex mirror is ever seen in it. The post therefore hangs from an arm, and a column
+  beside the mirror carries that from the plate below the camera.
 
-**Nothing of it stands between lens and mirror.** Ball and lens lie in a cylinder around the axis with the ball's
-radius (`check`: the lens opening is narrower), and so does every line between their points, since a cylinder is convex.
-All parts beside the ball lie outside that cylinder. What hides a spot, it hides between mirror and wall.
+**Nothing of it stands between lens and mirror.** Mirror and lens lie in a cylinder around the axis, as wide as the
+mirror reaches (`check`: or as the lens opening), and so does every line between their points, since a cylinder is
+convex. All parts beside the mirror lie outside that cylinder. What hides a spot, it hides between mirror and wall.
 
 Rods are prisms of `SIDES` sides. Their corners lie r (pi / n) / sin(pi / n) from the axis, so that the mean width of
 the prism, seen from all sides, is that of the round rod (Cauchy: the perimeter over pi). Its outline then lies within
@@ -46,8 +48,25 @@ LARGEST_INDEX = 2.5  # of a tube: diamond has 2.42
 
 
 @dataclass(frozen=True)
+class Extent:
+    """Reach of a mirror from the point that the holder's axis leads to: a sphere's centre, or a vertex.
+
+    Attributes
+    ----------
+    wide_m, high_m : float
+        Farthest from the axis, and up along it.
+    back_m : float
+        Height at which a post ends.
+    """
+
+    wide_m: float
+    high_m: float
+    back_m: float
+
+
+@dataclass(frozen=True)
 class Holder:
-    """Kind and sizes of a holder; `check` holds them against a ball.
+    """Kind and sizes of a holder; `check` holds them against a mirror.
 
     Parameters
     ----------
@@ -59,7 +78,7 @@ class Holder:
     plate_m : float
         Radius of the plates.
     rise_m : float
-        From the ball's centre up to the upper plate, or to the top of the arm.
+        From the sphere's centre, or the vertex, up to the upper plate, or to the top of the arm.
     azimuth_rad : float
         Direction of the first rod, or of the column, from the camera's x axis against the clock seen from above.
     wall_m : float
@@ -95,39 +114,41 @@ class Holder:
 
     @property
     def top_m(self) -> float:
-        """Height of its highest part above the ball's centre, along its axis."""
+        """Height of its highest part above the sphere's centre or the vertex, along its axis."""
         return self.rise_m + (0.0 if self.kind == "post" else _PLATE_M)
 
-    def check(self, ball_m: float, lens_m: float) -> None:
-        """Raise `SceneError` if it does not fit a ball of radius `ball_m` and a lens opening of radius `lens_m`."""
+    def check(self, mirror: Extent, lens_m: float) -> None:
+        """Raise `SceneError` if it does not fit a mirror and a lens opening of radius `lens_m`."""
+        wide_m = mirror.wide_m
         if self.kind == "tube":
-            self._check_tube(ball_m, lens_m)
+            self._check_tube(mirror, lens_m)
             return
         thick = prism_radius_m(self.radius_m)
-        inside = max(ball_m, lens_m) + thick
+        inside = max(wide_m, lens_m) + thick
         upright = "rods" if self.kind == "rods" else "column"
         if self.circle_m <= inside:
             raise SceneError(
-                f"Holder.circle_m = {self.circle_m:g}: the {upright} would stand inside the ball, whose radius is "
-                f"{ball_m:g} m; give more than {inside:.4f}"
+                f"Holder.circle_m = {self.circle_m:g}: the {upright} would stand inside the mirror, which reaches "
+                f"{wide_m:g} m from the axis; give more than {inside:.4f}"
             )
         if self.circle_m + thick > self.plate_m:
             raise SceneError(
                 f"Holder.plate_m = {self.plate_m:g}: the {upright} would stand outside the plate; give at least "
                 f"{self.circle_m + thick:.4f}, or a smaller circle_m"
             )
-        if self.kind == "post" and thick >= ball_m:
+        if self.kind == "post" and thick >= wide_m:
             raise SceneError(
-                f"Holder.radius_m = {self.radius_m:g}: the post is thicker than the ball, whose radius is "
-                f"{ball_m:g} m; give less"
+                f"Holder.radius_m = {self.radius_m:g}: the post is thicker than the mirror, which reaches "
+                f"{wide_m:g} m from the axis; give less"
             )
-        self._check_rise(ball_m if self.kind == "rods" else ball_m + 2.0 * self.radius_m)
+        self._check_rise(mirror.high_m if self.kind == "rods" else mirror.high_m + 2.0 * self.radius_m)
 
-    def _check_tube(self, ball_m: float, lens_m: float) -> None:
-        if self.circle_m <= max(ball_m, lens_m):
+    def _check_tube(self, mirror: Extent, lens_m: float) -> None:
+        inside = max(mirror.wide_m, lens_m)
+        if self.circle_m <= inside:
             raise SceneError(
-                f"Holder.circle_m = {self.circle_m:g}: the tube would stand inside the ball, whose radius is "
-                f"{ball_m:g} m; give more than {max(ball_m, lens_m):.4f}"
+                f"Holder.circle_m = {self.circle_m:g}: the tube would stand inside the mirror, which reaches "
+                f"{mirror.wide_m:g} m from the axis; give more than {inside:.4f}"
             )
         outer = self.circle_m + self.wall_m
         if outer > self.plate_m * math.cos(math.pi / PLATE_SIDES):
@@ -136,27 +157,34 @@ class Holder:
                 f"Holder.plate_m = {self.plate_m:g}: the tube's wall would stand outside the plate; give at least "
                 f"{least:.4f}, or a smaller circle_m or wall_m"
             )
-        self._check_rise(ball_m)
+        self._check_rise(mirror.high_m)
 
     def _check_rise(self, low: float) -> None:
         if self.rise_m <= low:
             raise SceneError(
-                f"Holder.rise_m = {self.rise_m:g}: the holder's top would lie inside the ball; give more than {low:.4f}"
+                f"Holder.rise_m = {self.rise_m:g}: the holder's top would lie inside the mirror; give more than "
+                f"{low:.4f}"
             )
 
 
-def fitted(kind: HolderKind, ball_m: float, **given: float) -> Holder:
-    """Holder with the sizes that are given, and others that suit a ball of radius `ball_m`.
+def fitted(kind: HolderKind, wide_m: float, depth_m: float | None = None, **given: float) -> Holder:
+    """Holder with the sizes that are given, and others that suit a ball of radius `wide_m`, or a rim of this radius.
 
-    The gap between ball and rods, or tube, is a quarter of the ball's radius. The plates reach two radii of a rod
-    beyond them, and the upper plate is half the ball's radius above its top. A tube's wall does not follow the ball.
+    The gap between mirror and rods, or tube, is a quarter of the radius. The plates reach two radii of a rod beyond
+    them, and the upper plate is half the radius above the mirror's top. A tube's wall does not follow the mirror.
+
+    Parameters
+    ----------
+    kind, wide_m
+    depth_m : float or None
+        Of the rim over the vertex; None is a ball.
     """
-    sizes = {"radius_m": ball_m / 15.0, "wall_m": Holder.wall_m, **given}
+    sizes = {"radius_m": wide_m / 15.0, "wall_m": Holder.wall_m, **given}
     tube = kind == "tube"
-    sizes.setdefault("circle_m", 1.25 * ball_m + (0.0 if tube else sizes["radius_m"]))
+    sizes.setdefault("circle_m", 1.25 * wide_m + (0.0 if tube else sizes["radius_m"]))
     beyond = sizes["wall_m"] + 2.0 * sizes["radius_m"] if tube else 3.0 * sizes["radius_m"]
     sizes.setdefault("plate_m", sizes["circle_m"] + beyond)
-    sizes.setdefault("rise_m", 1.5 * ball_m)
+    sizes.setdefault("rise_m", 1.5 * wide_m if depth_m is None else depth_m + 0.5 * wide_m)
     return Holder(kind, **sizes)
 
 
@@ -172,16 +200,16 @@ def prism_radius_m(radius_m: float, sides: int = SIDES) -> float:
     return radius_m * half / math.sin(half)
 
 
-def holder_shapes(holder: Holder, T_world_camera: Pose, sphere_centre_m: Array, ball_m: float) -> tuple[Part, ...]:
+def holder_shapes(holder: Holder, T_world_camera: Pose, sphere_centre_m: Array, back_m: float) -> tuple[Part, ...]:
     """Shapes of a holder in the world, in the order of `Holder.part_names`.
 
     Parameters
     ----------
     T_world_camera : Pose
     sphere_centre_m : array, shape (3,)
-        In the world.
-    ball_m : float
-        Radius of the ball, which the post ends on.
+        Or the vertex, in the world.
+    back_m : float
+        Height above it at which the post ends.
     """
     axis = _Axis.of(T_world_camera, sphere_centre_m)
     foot, top = _ends_m(holder, axis)
@@ -203,7 +231,7 @@ def holder_shapes(holder: Holder, T_world_camera: Pose, sphere_centre_m: Array, 
         (holder.circle_m + width, width, width),
         _BLACK_METAL,
     )
-    post = axis.upright(0.0, 0.0, axis.length_m + ball_m, top - width, thick, SIDES)
+    post = axis.upright(0.0, 0.0, axis.length_m + back_m, top - width, thick, SIDES)
     return _named(holder, [*plates, column, arm, post])
 
 
@@ -225,7 +253,7 @@ def _named(holder: Holder, parts: Sequence[Part]) -> tuple[Part, ...]:
 
 @dataclass(frozen=True)
 class _Axis:
-    """The holder's frame: z from the lens centre to the ball's centre, x as near to the camera's as it can be."""
+    """The holder's frame: z from the lens centre to the sphere's or the vertex, x near to the camera's."""
 
     origin_m: Array
     rotation: Array

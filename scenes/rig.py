@@ -18,13 +18,14 @@ import numpy as np
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector, rotation_xyz
 from phibench.scenes.glass_tube import GlassTube
-from phibench.scenes.holder import Holder, holder_shapes, holder_tube
+from phibench.scenes.holder import Extent, Holder, holder_shapes, holder_tube
 from phibench.scenes.mirror import Form, SphereMirror, deviation, level
 from phibench.scenes.misalignment import Misalignment, Motion
 from phibench.scenes.revolved_mirror import RevolvedMirror, rim_points
 from phibench.scenes.shapes import Cuboid, Prism
 from phibench.scenes.validation import SceneError, finite, positive, unit_vector
 
+_AROUND = 360  # places of the rim
 _STEPS = 8  # Newton's method starts within the form's slopes, some 1e-3 rad
 _CLOSE_RAD = 1e-9  # the step after that would be its square
 
@@ -128,6 +129,7 @@ class Rig:
             self.mirror.band(nm)
         if isinstance(self.mirror, RevolvedMirror):
             self._check_revolved(self.mirror)
+            self._check_holder()
             return
         distance, radius = math.hypot(*self.T_camera_sphere.translation_m), self.mirror.bound_m
         if self.T_camera_sphere.translation_m[2] <= radius or distance <= radius:
@@ -135,11 +137,14 @@ class Rig:
                 f"Rig.T_camera_sphere: the sphere centre is {self.T_camera_sphere.translation_m[2]:.4f} m in front of "
                 f"the camera; it must be more than the mirror radius {radius:.4f} m"
             )
+        self._check_holder()
+
+    def _check_holder(self) -> None:
         if self.holder is not None:
-            self.holder.check(radius, self.camera.aperture_radius_m)
+            self.holder.check(self.extent, self.camera.aperture_radius_m)
 
     def _check_revolved(self, mirror: RevolvedMirror) -> None:
-        """Raise `SceneError` if the lens is inside the mirror or behind its rim, or if something else carries it."""
+        """Raise `SceneError` if the lens is inside the mirror or behind its rim."""
         lens = self.T_camera_sphere.inverse().t
         if self.T_camera_sphere.translation_m[2] <= 0.0 or mirror.profile.holds(lens + [0.0, 0.0, mirror.reach_m]):
             raise SceneError(
@@ -150,8 +155,6 @@ class Rig:
             raise SceneError("Rig.T_camera_sphere: the lens is behind the mirror's rim; turn the mirror towards it")
         if mirror.profile.shape == "cone":
             self._check_cone(mirror.profile.rim_radius_m)
-        if self.holder is not None:
-            raise SceneError(f"Rig.holder: a holder carries a sphere; a {mirror.profile.shape} needs none")
 
     def _check_cone(self, rim_radius_m: float) -> None:
         """Raise `SceneError` for a cone of which the image shows the tip alone.
@@ -187,6 +190,22 @@ class Rig:
     def sphere_in_camera_m(self) -> Array:
         """Sphere centre in the camera frame, shape (3,), metres."""
         return self.T_camera_sphere.t
+
+    @property
+    def extent(self) -> Extent:
+        """Reach of the mirror around the axis of a holder, the line from the lens to the sphere centre or the vertex.
+
+        Of a mirror of revolution, whose profile rises to the rim, the rim is what reaches farthest.
+        """
+        if isinstance(self.mirror, SphereMirror):
+            return Extent(self.mirror.bound_m, self.mirror.bound_m, self.mirror.radius_m)
+        profile, turn = self.mirror.profile, np.linspace(0.0, 2.0 * np.pi, _AROUND, endpoint=False)
+        flat = profile.rim_radius_m * np.stack([np.cos(turn), np.sin(turn)])
+        rim = np.concatenate([flat, np.full((1, _AROUND), profile.depth_m)])
+        axis = self.T_camera_sphere.R.T @ (self.sphere_in_camera_m / np.linalg.norm(self.sphere_in_camera_m))
+        along = axis @ rim
+        wide_m = float(np.linalg.norm(rim - axis[:, None] * along, axis=0).max())
+        return Extent(wide_m + self.mirror.reach_m, float(along.max()) + self.mirror.reach_m, profile.depth_m)
 
     @property
     def top_m(self) -> float:
@@ -319,7 +338,7 @@ class View:
         rig = self.rig
         if rig.holder is None:
             return ()
-        return holder_shapes(rig.holder, self.T_world_camera, self.sphere_centre_m, rig.sphere.radius_m)
+        return holder_shapes(rig.holder, self.T_world_camera, self.sphere_centre_m, rig.extent.back_m)
 
     @cached_property
     def tube(self) -> GlassTube | None:

@@ -26,7 +26,7 @@ from phibench.scenes.faces import face_table
 from phibench.scenes.frames import Array, Pose, Vector, as_matrix, as_vector, rotation_xyz
 from phibench.scenes.holder import LENGTHS, Holder, fitted
 from phibench.scenes.laser import LaserSpot
-from phibench.scenes.mirror import ReflectanceTable, SphereMirror
+from phibench.scenes.mirror import ReflectanceTable
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.revolved_mirror import Profile, RevolvedMirror, cone
 from phibench.scenes.rig import Rig
@@ -106,7 +106,7 @@ def _rig(table: RigTable) -> Rig:
     camera = _camera(base.camera, table)
     if table.z_c_m is not None or table.radius_m is not None:  # on the virtual image
         camera = _focused(camera, table, z_c_m - mirror.radius_m / 2.0)
-    holder = _holder(table.holder, mirror)
+    holder = _holder(table.holder, mirror.bound_m, None)
     return Rig(camera, mirror, T_world_camera, T_camera_sphere, _stroke_axis(table), holder=holder)
 
 
@@ -155,8 +155,6 @@ def _revolved_rig(table: RigTable, mirror: MirrorTable, base: Rig) -> Rig:
     """Rig with a mirror of revolution, its axis upright but for its tilt."""
     if table.radius_m is not None:
         raise SceneError(f"rig.radius_m = {table.radius_m:g}: is a sphere's; a {mirror.shape} has its own keys")
-    if table.holder.kind != "none":
-        raise SceneError(f"rig.holder.kind = {table.holder.kind}: carries a sphere; remove it for a {mirror.shape}")
     vertex_m = _VERTEX_M if table.z_c_m is None else table.z_c_m
     profile = build_profile(mirror, vertex_m)
     given = _given(table, _SURFACE)
@@ -166,7 +164,8 @@ def _revolved_rig(table: RigTable, mirror: MirrorTable, base: Rig) -> Rig:
     camera = _focused(_camera(base.camera, table), table, vertex_m + _image_depth_m(profile))
     stroke = _stroke_axis(table)
     revolved = RevolvedMirror(profile, **given, reflectance_table=_reflectance(table))
-    return Rig(camera, revolved, T_world_camera, T_camera_mirror, stroke)
+    holder = _holder(table.holder, profile.rim_radius_m, profile.depth_m)
+    return Rig(camera, revolved, T_world_camera, T_camera_mirror, stroke, holder=holder)
 
 
 def _image_depth_m(profile: Profile) -> float:
@@ -200,11 +199,12 @@ def _focused(camera: Camera, table: RigTable, distance_m: float) -> Camera:
     return camera if table.focus_distance_m is not None else replace(camera, focus_distance_m=distance_m)
 
 
-def _holder(table: HolderTable, mirror: SphereMirror) -> Holder | None:
+def _holder(table: HolderTable, wide_m: float, depth_m: float | None) -> Holder | None:
+    """Holder of a ball, or of a mirror of revolution with a rim so wide and so far over its vertex."""
     if table.kind == "none":
         return None
     given = {name: value for name in (*LENGTHS, "glass_index") if (value := getattr(table, name)) is not None}
-    return fitted(table.kind, mirror.bound_m, azimuth_rad=float(np.radians(table.azimuth_deg)), **given)
+    return fitted(table.kind, wide_m, depth_m, azimuth_rad=float(np.radians(table.azimuth_deg)), **given)
 
 
 def build_misalignment(table: MisalignmentTable) -> Misalignment:

@@ -129,11 +129,11 @@ def view_film(
 
 
 def _texel_sizes_m(surfaces: Surfaces, fixed: int, texel_m: float) -> Array:
-    """Texels of each patch: a third of the ball's radius where a holder is lit, whose light the ball changes."""
+    """Texels of each patch: a third of the mirror's width where a holder is lit, whose light the mirror changes."""
     sizes = np.full(len(surfaces.table.shape), texel_m)
     rig = surfaces.view.rig
     if rig.holder is not None:
-        sizes[fixed:] = min(texel_m, rig.sphere.radius_m / 3.0)
+        sizes[fixed:] = min(texel_m, rig.extent.wide_m / 3.0)
     return sizes
 
 

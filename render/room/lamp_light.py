@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from phibench.render.room.ball_light import meets_ball
 from phibench.render.room.camera_plugin import MM_PER_M
+from phibench.render.room.mirror_light import MirrorBody
 from phibench.render.room.subpixel_grid import points, shifts
 from phibench.render.room.surfaces import Surfaces, aligned
 from phibench.render.room.texel_points import Texels, chosen, transmitted
@@ -37,14 +37,14 @@ def direct_light(
     sun: Sun | None,
     rays: int,
     seed: int,
-    ball_mm: float = 0.0,
+    mirror: MirrorBody | None = None,
 ) -> tuple[Array, Array]:
     """Irradiance from lamps and sun, shape (texels, 3), twice: halves with `rays` rays a lamp each, where they differ.
 
-    L cos cos' / r^2 over the lamp's area, W/m^2. A mirror ball of the radius `ball_mm` stops it; 0 is none.
+    L cos cos' / r^2 over the lamp's area, W/m^2. The mirror stops it, where one is given.
     """
     halves = tuple(
-        np.zeros((len(texels), 3)) if sun is None else _sunlight(mi, surfaces, texels, sun, seed + half, ball_mm)
+        np.zeros((len(texels), 3)) if sun is None else _sunlight(mi, surfaces, texels, sun, seed + half, mirror)
         for half in (0, 1)
     )
     for number, lamp in enumerate(_lamps(surfaces)):
@@ -58,7 +58,7 @@ def direct_light(
         whole = whole_lamp(way[seen], texels.normals_world[seen], lamp)
         whole[above[seen] < reach[seen]] = np.nan
         key = seed + 100 * number
-        value, share = _lamp_rays(mi, surfaces, texels, seen, lamp, whole, min(FIRST_RAYS, rays), key, ball_mm)
+        value, share = _lamp_rays(mi, surfaces, texels, seen, lamp, whole, min(FIRST_RAYS, rays), key, mirror)
         partly = np.zeros(len(texels), dtype=bool)
         partly[seen] = (share > 0.0) & (share < 1.0)
         # a screen's picture needs all rays
@@ -66,7 +66,7 @@ def direct_light(
         for half, total in enumerate(halves):
             if again.any():
                 value[again], _ = _lamp_rays(
-                    mi, surfaces, texels, seen[again], lamp, whole[again], rays, key + 50 + half, ball_mm
+                    mi, surfaces, texels, seen[again], lamp, whole[again], rays, key + 50 + half, mirror
                 )
             total[seen] += value
     return halves[0], halves[1]
@@ -118,7 +118,7 @@ def _lamp_rays(
     whole: Array,
     rays: int,
     seed: int,
-    ball_mm: float,
+    mirror: MirrorBody | None,
 ) -> tuple[Array, Array]:
     """Irradiance of some texels by a lamp, shape (n, 3), and the part of the rays that reach it, shape (n,).
 
@@ -129,7 +129,6 @@ def _lamp_rays(
     lanes = mi.UInt32(aligned(some, np.uint32))
     point, normal, coat = chosen(mi, texels, lanes)
     numbers = [dr.opaque(mi.Float, float(value)) for value in lamp]
-    ball = dr.opaque(mi.Float, ball_mm) if ball_mm else None
     is_screen = bool(surfaces.table.is_radiance[int(lamp[13])])
     count, key, patch = (dr.opaque(mi.UInt32, value) for value in (rays, seed, int(lamp[13])))
     shift = shifts(mi, lanes, 2, key)
@@ -147,8 +146,8 @@ def _lamp_rays(
         ray = mi.Ray3f(point, way)
         ray.maxt = r - _LAMP_GAP_MM
         free = faces & ~surfaces.scene.ray_test(ray, coherent=True, active=faces)
-        if ball is not None:
-            free &= ~meets_ball(ball, point, way)[0]  # lamps are never nearer than the ball
+        if mirror is not None:
+            free &= ~mirror.meets(point, way)[0]  # lamps are never nearer than the mirror
         weight = dr.select(faces, cos_here * cos_lamp / r2, 0.0)
         arrives = mi.Float(1.0) if coat is None else transmitted(surfaces, coat, cos_here)
         part = dr.select(free, weight * arrives, 0.0)
@@ -167,7 +166,9 @@ def _lamp_rays(
     return value * scale[:, None], np.array(seen, dtype=float) / rays
 
 
-def _sunlight(mi: ModuleType, surfaces: Surfaces, texels: Texels, sun: Sun, seed: int, ball_mm: float) -> Array:
+def _sunlight(
+    mi: ModuleType, surfaces: Surfaces, texels: Texels, sun: Sun, seed: int, mirror: MirrorBody | None
+) -> Array:
     """Irradiance from the sun, shape (texels, 3): rays over its disc that leave by a window."""
     import drjit as dr
 
@@ -182,7 +183,6 @@ def _sunlight(mi: ModuleType, surfaces: Surfaces, texels: Texels, sun: Sun, seed
     axis = mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in direction))
     radius, key = dr.opaque(mi.Float, sun.radius_rad), dr.opaque(mi.UInt32, seed + 7)
     count, frame = dr.opaque(mi.UInt32, _SUN_RAYS), mi.Frame3f(axis)
-    ball = dr.opaque(mi.Float, ball_mm) if ball_mm else None
     shift = shifts(mi, lanes, 2, key)
     dr.eval(shift)
 
@@ -191,8 +191,8 @@ def _sunlight(mi: ModuleType, surfaces: Surfaces, texels: Texels, sun: Sun, seed
         way = dr.normalize(frame.to_world(mi.Vector3f(disc.x, disc.y, 1.0)))
         _, patch, valid = surfaces.hit(mi.Ray3f(point, way))
         out = valid & (dr.gather(mi.Float, window, patch, valid) > 0.0)
-        if ball is not None:
-            out &= ~meets_ball(ball, point, way)[0]
+        if mirror is not None:
+            out &= ~mirror.meets(point, way)[0]
         cos = dr.maximum(dr.dot(way, normal), 0.0)
         if coat is not None:
             cos *= transmitted(surfaces, coat, cos)

@@ -28,10 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from phibench.render.room.ball_light import ball_light
 from phibench.render.room.bounced_light import bounced_light, finer, gathered
-from phibench.render.room.camera_plugin import MM_PER_M
 from phibench.render.room.lamp_light import direct_light
+from phibench.render.room.mirror_light import mirror_body, mirror_light
 from phibench.render.room.surfaces import Surfaces
 from phibench.render.room.texel_grid import TexelGrid
 from phibench.render.room.texel_points import Texels, covered_texels, filled
@@ -144,7 +143,7 @@ def light_carriage(
 ) -> NDArray[np.float32]:
     """Irradiance of all texels of a view: the map for the `fixed` first patches, gathered now for the others.
 
-    With a holder, which stands close to it, the mirror ball takes and gives light as well (`ball_light`).
+    With a holder, which stands close to it, the mirror takes and gives light as well (`mirror_light`).
     """
     mi = activate()
     first = grid.texels_of(fixed)
@@ -153,13 +152,12 @@ def light_carriage(
     surfaces.set_light(grid, full)
     if first < grid.count:
         texels = Texels.of(mi, surfaces, grid, first)
-        rig = surfaces.view.rig
-        ball_mm = 0.0 if rig.holder is None else MM_PER_M * rig.sphere.radius_m
-        rays = _HOLDER_RAYS if ball_mm else _CARRIAGE_RAYS
-        direct = direct_light(mi, surfaces, texels, sun, settings.lamp_rays, _SEED, ball_mm)
+        body = mirror_body(mi, surfaces.view)
+        rays = _CARRIAGE_RAYS if body is None else _HOLDER_RAYS
+        direct = direct_light(mi, surfaces, texels, sun, settings.lamp_rays, _SEED, body)
         light = 0.5 * (direct[0] + direct[1]) + gathered(mi, surfaces, texels, rays, _SEED + 2)
-        if ball_mm:
-            light = np.maximum(light + ball_light(mi, surfaces, texels, rays, _SEED + 3), 0.0)
+        if body is not None:
+            light = np.maximum(light + mirror_light(mi, surfaces, texels, body, rays, _SEED + 3), 0.0)
         full[first:] = light
         surfaces.set_light(grid, full)
     return full

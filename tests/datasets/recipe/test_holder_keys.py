@@ -34,7 +34,7 @@ def test_every_size_of_a_holder_has_its_kinds() -> None:
         ({"wall_m": 0.003}, {"kind": {"choice": ["none", "post"]}}, "rig.holder.wall_m: has no effect on a holder"),
         ({}, {"circle_m": 0.09}, 'random.rig.holder.circle_m: has no effect on a holder of kind "none"'),
         ({"kind": "tube"}, {"kind": "rods", "glass_index": 1.5}, "random.rig.holder.glass_index: has no effect"),
-        ({"kind": "rods", "circle_m": 0.03}, {}, "rig.holder.circle_m: 0.03: the rods would stand inside the ball"),
+        ({"kind": "rods", "circle_m": 0.03}, {}, "rig.holder.circle_m: 0.03: the rods would stand inside the mirror"),
         ({"kind": "tube", "plate_m": 0.03}, {}, "rig.holder.plate_m: 0.03: the tube's wall would stand outside"),
         ({"kind": "glass", "wall_m": 0.003}, {}, "rig.holder.kind: 'glass' is not allowed; give one of 'none'"),
         ({}, {"kind": 3}, "random.rig.holder.kind: 3 is not allowed; give a name or { choice = [names] }: 'none'"),

@@ -84,7 +84,10 @@ def test_every_key_has_its_shapes() -> None:
         ({"mirror": {"shape": "cone", "rim_radius_m": 5e-4}}, "rig.mirror.rim_radius_m: 0.0005: the tip of the cone"),
         ({"mirror": {"shape": "paraboloid", "vertex_radius_m": -0.06}}, "rig.mirror.vertex_radius_m: -0.06 is not"),
         ({"radius_m": 0.05, "mirror": {"shape": "cone"}}, "rig.radius_m: 0.05: is a sphere's"),
-        ({"holder": {"kind": "rods"}, "mirror": {"shape": "cone"}}, "rig.holder.kind: rods: carries a sphere"),
+        (
+            {"holder": {"kind": "rods", "circle_m": 0.05}, "mirror": {"shape": "cone"}},
+            "rig.holder.circle_m: 0.05: the rods would stand inside the mirror",
+        ),
         ({"metal": "brass"}, "rig.metal: 'brass' is not allowed; give one of 'steel'"),
     ],
 )
