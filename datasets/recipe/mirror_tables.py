@@ -38,7 +38,8 @@ class HolderTable(OfHolder):
     )
     plate_m: HolderM | None = Field(default=None, description="radius of the plates; 2 radius_m beyond rods or tube")
     rise_m: HolderM | None = Field(
-        default=None, description="sphere centre to the upper plate, or to the arm's top; 1.5 R"
+        default=None,
+        description="sphere centre or vertex to the upper plate or arm's top; 1.5 R, or rim + 0.5 R",
     )
     azimuth_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = Field(
         default=30.0, description="of the first rod, or the column, from the camera's x axis"

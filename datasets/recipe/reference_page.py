@@ -143,7 +143,7 @@ distance from the axis.
 * A cone has `half_angle_deg` (45).
 * A polynomial has `vertex_radius_m` (0.06), `conic` (-1) and `even_terms`, which must be given.
 
-It has no holder. A cone has no form error; the others have those of `[misalignment]`.
+A cone has no form error; the others have those of `[misalignment]`.
 """,
     "[misalignment]": """What the true rig deviates by from `[rig]`, which then is the nominal one: what an estimator
 is given. Images and truth are those of the true rig. Signs, axes and figures: `docs/misalignment.md`.

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from helpers.revolved_rigs import PROFILES, revolved
 
 from phibench.datasets.store.documents import from_json, to_json
 from phibench.render.optics.certificate import certify
@@ -181,6 +182,76 @@ def test_a_rod_cuts_a_part_of_the_light_and_the_certificate_agrees(kind: str) ->
     assert parts[2] == 1.0
     dark = spot_layer(view, spot(5.2 * math.tan(math.pi / 6.0)), geometry)
     assert dark.total_electrons_per_s[0] == 0.0
+
+
+# -- mirrors of revolution -------------------------------------------------------------------------------------------
+
+
+def held(shape: str, kind: str, *, aligned: bool) -> Rig:
+    rig = revolved(shape, aligned=aligned)
+    return dataclasses.replace(rig, holder=fitted(kind, rig.mirror.profile.rim_radius_m, rig.mirror.profile.depth_m))
+
+
+@pytest.mark.parametrize("shape", PROFILES)
+@pytest.mark.parametrize("kind", [*KINDS, "tube"])
+def test_nothing_of_it_stands_between_lens_and_a_mirror_of_revolution(kind: str, shape: str) -> None:
+    """Segments from all over the lens to the mirror, with rods as near as they may be; and all of the mirror is seen.
+
+    The mirror keeps within what the rig says of its extent; the holder hides none of it.
+    """
+    rng, bare = np.random.default_rng(3), revolved(shape, aligned=False)
+    extent, profile = bare.extent, bare.mirror.profile
+    tight = extent.wide_m + (1e-6 if kind == "tube" else prism_radius_m(0.004) + 1e-6)
+    view = dataclasses.replace(bare, holder=Holder(kind, circle_m=tight, rise_m=extent.high_m + 0.009)).at(0.2)
+    # a tenth of them on the rim itself
+    r = profile.rim_radius_m * np.sqrt(np.minimum(1.1 * rng.random(20_000), 1.0))
+    turn = rng.uniform(0.0, 2.0 * np.pi, 20_000)
+    ends = np.stack([r * np.cos(turn), r * np.sin(turn), profile.sag(r * r).z_m], axis=1)
+    ends = view.T_world_sphere.points(ends)
+    own = own_frame(view, ends)
+    length = float(np.linalg.norm(view.sphere_centre_m - view.camera_centre_m))
+    assert np.hypot(own[:, 0], own[:, 1]).max() == pytest.approx(extent.wide_m, abs=1e-4)
+    assert own[:, 2].max() - length == pytest.approx(extent.high_m, abs=1e-4)
+    lens = view.T_world_camera.points(
+        view.rig.camera.aperture_radius_m * np.stack([np.cos(turn), np.sin(turn), 0.0 * turn], axis=1)
+    )
+    way = ends - lens
+    distance = np.linalg.norm(way, axis=1)
+    assert np.all(first_hit(view.holder_shapes, lens, way / distance[:, None]).distance_m > distance)
+
+
+@pytest.mark.parametrize(("shape", "kind"), [("hyperboloid", "rods"), ("ellipsoid", "post"), ("paraboloid", "tube")])
+def test_accuracy_spots_in_a_held_mirror_of_revolution(shape: str, kind: str) -> None:
+    """Spots around the rig: hidden where rays from the camera meet a part, else certified, the cut ones as well."""
+    view, room = held(shape, kind, aligned=False).at(0.3), lab()
+    geometry, names, causes = room_geometry(room, view), view.rig.holder.part_names, []
+    for turn in np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False):
+        c, s = math.cos(turn), math.sin(turn)
+        spot = LaserSpot((1.5 * c, 1.5 * s, 0.5), (-c, -s, 0.0), 0.006)
+        truth = spot_truth(view, spot, geometry)
+        rays = trace_pixels(view, np.array([[truth.u_px, truth.v_px]]))
+        met = first_hit(view.holder_shapes, rays.points_m, rays.directions).object_id[0]
+        causes.append(truth.cause)
+        if kind != "tube":  # which bends the ray
+            assert truth.cause == ("none" if met < 0 else f"occluded:{names[met]}")
+        if len(causes) % 8 == 1 and truth.visible:
+            assert certify(view, spot, geometry, truth, spot_layer(view, spot, geometry)).passed
+    hidden = {cause for cause in causes if cause != "none"}
+    assert (
+        hidden
+        == {
+            "rods": {f"occluded:holder_rod_{k}" for k in (1, 2, 3)},
+            "post": {"occluded:holder_column"},
+            "tube": set(),
+        }[kind]
+    )
+
+
+def test_a_post_ends_on_the_back_of_a_mirror_of_revolution() -> None:
+    view = held("hyperboloid", "post", aligned=True).at(0.0)
+    *_, post = view.holder_shapes
+    low = post.T_world_shape.t[2] - 0.5 * post.size_m[2]
+    assert low == pytest.approx(view.sphere_centre_m[2] + view.rig.mirror.profile.depth_m, abs=1e-12)
 
 
 # -- sizes -----------------------------------------------------------------------------------------------------------
