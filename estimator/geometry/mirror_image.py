@@ -92,19 +92,18 @@ def _start(view: View, X: Array) -> Array:
 
 def _beyond_rim(view: View) -> View:
     """View of a mirror that goes on behind its rim, which Newton's method may pass on its way."""
-    mirror = view.rig.mirror
-    if not isinstance(mirror, RevolvedMirror):
-        return view
-    return replace(view, rig=replace(view.rig, mirror=_wider(mirror)))
+    return replace(view, rig=_wider(view.rig)) if isinstance(view.rig.mirror, RevolvedMirror) else view
 
 
 @lru_cache(maxsize=64)
-def _wider(mirror: RevolvedMirror) -> RevolvedMirror:
-    profile = mirror.profile
+def _wider(rig: Rig) -> Rig:
+    assert isinstance(rig.mirror, RevolvedMirror)
+    profile = rig.mirror.profile
     for factor in _WIDER:
-        with suppress(SceneError):  # folds, or is no longer convex
-            return replace(mirror, profile=replace(profile, rim_radius_m=factor * profile.rim_radius_m))
-    return mirror
+        with suppress(SceneError):  # folds, is no longer convex, or meets its holder
+            wide = replace(profile, rim_radius_m=factor * profile.rim_radius_m)
+            return replace(rig, mirror=replace(rig.mirror, profile=wide))
+    return rig
 
 
 def _start_in_meridian(view: View, X: Array, profile: Profile) -> Array:

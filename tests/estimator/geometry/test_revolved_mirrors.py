@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from helpers.revolved_rigs import PROFILES, revolved
@@ -21,6 +23,7 @@ from phibench.render.optics.ray_tracer import trace_pixels
 from phibench.render.optics.reflection_point import mirror_points
 from phibench.scenes.catalog import default_rig
 from phibench.scenes.frames import Array, rotation_xyz
+from phibench.scenes.holder import fitted
 from phibench.scenes.misalignment import OF_REVOLVED, Misalignment
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.revolved_mirror import cone, sphere_cap
@@ -131,6 +134,24 @@ def test_accuracy_exact_depth_from_true_pixels(shape: str) -> None:
         assert found.depth_m == pytest.approx(D[apart], rel=1e-9)
     both = combine(rig, STROKE_M, pixels[0], C, pixels[1], C)
     assert both.depth_m == pytest.approx(D[apart], rel=1e-7)  # it ends where a step is small against its sigma
+
+
+@pytest.mark.parametrize("shape", PROFILES)
+def test_accuracy_exact_depth_through_a_glass_tube(shape: str) -> None:
+    """D to 1e-9 and images to 1e-9 px by the simulator's pixels, off axis: Snell's law there, closed forms here."""
+    rig = revolved(shape, aligned=False)
+    holder = fitted("tube", rig.mirror.profile.rim_radius_m, rig.mirror.profile.depth_m)
+    rig, rng = dataclasses.replace(rig, holder=holder), rng_of("tube", shape)
+    turn, D = rng.uniform(0.0, 2.0 * np.pi, 60), rng.uniform(1.0, 4.0, 60)
+    heights = rng.uniform(1.05, 1.2, 60) if shape == "cone" else rng.uniform(0.2, 0.5, 60)
+    points = np.stack([D * np.cos(turn), D * np.sin(turn), heights], axis=1)
+    down, up = (chief_pixels(rig.at(offset), points) for offset in (0.0, STROKE_M))
+    seen = np.isfinite(down).all(axis=1) & np.isfinite(up).all(axis=1)
+    assert seen.sum() >= 20
+    assert image_of(rig.at(0.0), points[seen]).uv_px == pytest.approx(down[seen], abs=1e-9)
+    found = depth_exact(rig, STROKE_M, down[seen], up[seen])
+    expected = np.hypot(*(points[seen] - rig.at(0.0).sphere_centre_m)[:, :2].T)
+    assert found.depth_m == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize(
