@@ -48,11 +48,13 @@ from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_file
 from phibench.datasets.store.files import WriteError, only_run, sha256, write_text
 from phibench.datasets.store.provenance import code_behind, code_sha256
 from phibench.render.film.film_truth import instant_truth
-from phibench.render.film.moving_rows import RowsImage, rows_image, spot_time_s
+from phibench.render.film.moving_rows import RowsImage, parted_image, rows_image, spot_time_s
 from phibench.render.optics.room_tracer import room_geometry
 from phibench.render.optics.spot_layer import SpotLayer, spot_layer
-from phibench.scenes.frames import as_vector
+from phibench.scenes.frames import Array, as_vector
 from phibench.scenes.room import Room
+
+_UNEVEN = 5e-3  # of the flux: what it changes from frame to frame beside its own course
 
 
 @dataclass(frozen=True)
@@ -208,20 +210,39 @@ def coloured(image: RowsImage, colour: tuple[float, ...]) -> RowsImage:
 
 
 def frame_spots(film: FilmPlan, room: Room, times_s: Sequence[float]) -> list[RowsImage]:
-    """Spot in every frame; frames of one pose, in which nothing moves, share their image."""
+    """Spot in every frame; frames of one pose, in which nothing moves, share their image.
+
+    Where a spot goes behind something, or comes out, its flux bends: such frames are put together from parts.
+    """
     scene = film.scene
     images: list[RowsImage] = []
+    flux: list[float] = []
     held: tuple[tuple[float, ...], SpotLayer] | None = None
     for frame, at in enumerate(times_s):
         state = _state(film, at)
         if held is not None and held[0] == state and not _moves(film, frame):
             images.append(images[-1])
+            flux.append(flux[-1])
             continue
         if held is None or held[0] != state:
             view = scene.view_at(at)
             held = state, spot_layer(view, scene.spot_at(at), room_geometry(room, view))
         images.append(rows_image(scene, frame, held[1], at))
+        flux.append(float(held[1].total_electrons_per_s.sum()))
+    for frame in _bends(np.array(flux)):
+        if _moves(film, frame):
+            images[frame] = parted_image(scene, room, frame)
     return images
+
+
+def _bends(flux: Array) -> list[int]:
+    """Frames beside which the flux of the spot does not change evenly."""
+    if len(flux) < 2:
+        return []
+    padded = np.pad(flux, 1, mode="reflect", reflect_type="odd")
+    bent = np.abs(np.diff(padded, n=2)) > _UNEVEN * flux.max(initial=0.0)
+    near = bent | np.append(bent[1:], False) | np.append(False, bent[:-1])
+    return [int(frame) for frame in np.flatnonzero(near)]
 
 
 def _state(film: FilmPlan, at: float) -> tuple[float, ...]:

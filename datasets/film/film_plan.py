@@ -31,7 +31,7 @@ from phibench.scenes.validation import SceneError
 
 TILE_PX = 32
 MARGIN_PX = 20  # a JPEG's unit and what demosaicing looks at, around a window
-KEY_PX = 1.2  # motion of the spot's image from key view to key view, before the proof is asked
+KEY_PX, DRIVE_KEY_PX = 1.2, 1.8  # motion of the spot's image from key view to key view, before the proof is asked
 _SAMPLES = 257
 _DISC_ALBEDO = 0.5  # of a light, where the laser's spot takes that of the surface
 
@@ -236,7 +236,8 @@ def _keys(scene: FilmScene, uv: Array) -> tuple[int, ...]:
             quiet = replace(scene, vibrations=(), path=SpotPath())
             track = chief_uv_px(quiet, np.linspace(part.start_s, end, _SAMPLES))
             way = float(np.linalg.norm(np.diff(track, axis=0), axis=1).sum())
-        counts.append(max(4, math.ceil(way / KEY_PX) + 1))
+        apart = KEY_PX if part.leg is None else DRIVE_KEY_PX  # of a turn, all of the window moves alike
+        counts.append(max(4, math.ceil(way / apart) + 1))
     return tuple(counts)
 
 

@@ -86,14 +86,22 @@ def _marks(image: Image.Image, film: Film, frame: FilmFrame, region: Region, zoo
 
 
 def _with_numbers(image: Image.Image, film: Film, frame: FilmFrame) -> Picture:
-    """Picture with two lines of numbers below."""
+    """Picture with lines of numbers below."""
     row = film.table.row(frame.frame, named=True)
-    lines = (
+    lines: tuple[str, ...] = (
         f"frame {frame.frame:3d}  t {row['time_s']:6.3f} s  carriage {1e3 * row['offset_m']:7.1f} mm  "
         f"{1e3 * row['offset_m_per_s']:6.1f} mm/s",
         f"spot ({row['row_u_px']:.2f}, {row['row_v_px']:.2f}) px  {row['row_u_px_per_s']:6.1f} "
         f"{row['row_v_px_per_s']:6.1f} px/s  D {row['depth_m']:.3f} m  laser {row['row_laser_level']:.2f}",
     )
+    if film.plan.scene.drive is not None:
+        x, y, z = row["rig_world_m"]
+        _, pitch, yaw = np.degrees(row["rig_angles_rad"])
+        speed, turning = np.linalg.norm(row["rig_m_per_s"]), np.degrees(row["rig_rad_per_s"][2])
+        lines += (
+            f"robot ({x:6.3f}, {y:6.3f}, {z:6.3f}) m  yaw {yaw:6.1f}  nose up {-pitch:5.1f} deg  "
+            f"{speed:5.3f} m/s  {turning:6.1f} deg/s",
+        )
     canvas = Image.new("RGB", (max(image.width, 480), image.height + _LINE_PX * len(lines)))
     canvas.paste(image, (0, 0))
     draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(11)

@@ -12,22 +12,26 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 
 from phibench.render.optics.reflection_point import mirror_points
-from phibench.render.optics.spot_layer import SpotLayer
+from phibench.render.optics.room_tracer import room_geometry
+from phibench.render.optics.spot_layer import SpotLayer, spot_layer
 from phibench.render.sensor.rolling_shutter import Spectrum, layer_spectra
 from phibench.render.sensor.settings import SensorError
 from phibench.scenes.frames import Array
 from phibench.scenes.motion.film_scene import FilmScene
+from phibench.scenes.room import Room
 
 _MAX_MOTION_PX = 200.0
 _STILL_PX = 1e-7
 _SETTLED_S = 1e-13
 _ROUNDS = 60
+_PARTS = 16  # of an exposure at an edge
 
 
 def chief_uv_px(scene: FilmScene, times_s: Array) -> Array:
@@ -77,6 +81,16 @@ class RowsImage:
     du_electrons_per_s_px: Array
     dv_electrons_per_s_px: Array
 
+    @property
+    def origin_px(self) -> tuple[int, int]:
+        """(u, v) of the window's first pixel."""
+        return self.u0_px, self.v0_px
+
+    @property
+    def stacks(self) -> Array:
+        """Mean and both derivatives, shape (3, 3, h, w)."""
+        return np.stack([self.electrons_per_s, self.du_electrons_per_s_px, self.dv_electrons_per_s_px])
+
 
 def rows_image(scene: FilmScene, frame: int, layer: SpotLayer, time_s: float) -> RowsImage:
     """Image of the spot in a frame.
@@ -110,6 +124,37 @@ def rows_image(scene: FilmScene, frame: int, layer: SpotLayer, time_s: float) ->
     shift = np.where(np.isfinite(uv[1:]), uv[1:] - uv[0], 0.0).reshape(*nodes.shape, 2)
     images = _shifted(layer, margin, shift, weights)
     return RowsImage(layer.u0_px - margin, layer.v0_px - margin, *images)
+
+
+def parted_image(scene: FilmScene, room: Room, frame: int) -> RowsImage:
+    """Image of the spot in a frame as the mean over parts of the exposure, each with the layer at its middle.
+
+    For a spot that goes behind something, or comes out: its flux and its shape change within an exposure.
+    """
+    exposure_s, images = scene.times.exposure_s / _PARTS, []
+    for part in range(_PARTS):
+        later_s = (part + 0.5 - 0.5 * _PARTS) * exposure_s
+        times = replace(scene.times, exposure_s=exposure_s, first_s=scene.times.first_s + later_s)
+        short = replace(scene, times=times)
+        at = spot_time_s(short, frame)
+        view = scene.view_at(at)
+        images.append(rows_image(short, frame, spot_layer(view, scene.spot_at(at), room_geometry(room, view)), at))
+    return _mean_image(images)
+
+
+def _mean_image(images: Sequence[RowsImage]) -> RowsImage:
+    """Mean of images that may have other windows; one without pixels is dark."""
+    lit = [one for one in images if one.electrons_per_s.size]
+    if not lit:
+        return images[0]
+    u0, v0 = min(one.u0_px for one in lit), min(one.v0_px for one in lit)
+    u1, v1 = (max(one.origin_px[k] + one.electrons_per_s.shape[2 - k] for one in lit) for k in (0, 1))
+    total = np.zeros((3, 3, v1 - v0, u1 - u0))
+    for one in lit:
+        height, width = one.electrons_per_s.shape[1:]
+        v, u = one.v0_px - v0, one.u0_px - u0
+        total[:, :, v : v + height, u : u + width] += one.stacks
+    return RowsImage(u0, v0, *(total / len(images)))
 
 
 def exposure_nodes(scene: FilmScene, middle_s: Array, count: int) -> tuple[Array, Array]:
