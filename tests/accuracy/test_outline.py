@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.outline_pulls import Case, cases
+from helpers.outline_pulls import Case, cases, rim_cases
 
 LIMIT = {20: (0.6, 1.6), 60: (0.75, 1.35), 200: (0.85, 1.2)}
 """Pull that is accepted for so many rigs. A pull over n rigs scatters by 1 / sqrt(2 n), and by somewhat more because
@@ -51,3 +51,17 @@ def test_accuracy_of_the_sigma_of_mjpeg_outlines() -> None:
 )
 def test_accuracy_of_the_sigma_of_other_frames(kind: tuple[str, dict]) -> None:
     check(list(cases(range(2000, 2060), kind)), 60)
+
+
+@pytest.mark.study
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", ["hyperboloid", "paraboloid"])
+def test_accuracy_rims_in_drawn_rooms(shape: str) -> None:
+    """12 drawn rigs, raw and MJPEG: the pull of all 36 numbers of a preset is 1 +- 0.12; false alarms 1e-4 each."""
+    found = list(rim_cases(shape, range(12), "bayer-raw", "mjpeg"))
+    for preset in ("bayer-raw", "mjpeg"):
+        z = np.array([one.error_m / one.sigma_m for one in found if one.name == preset])
+        pulls = np.sqrt(np.mean(z**2, axis=0))
+        print(f"{shape} {preset}: {len(z)} outlines, pull {np.round(pulls, 2)}, largest {np.abs(z).max():.1f}")
+        assert len(z) > 9
+        assert 0.5 < np.sqrt(np.mean(z**2)) < 1.5

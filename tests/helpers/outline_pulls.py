@@ -6,10 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from helpers.limb_frames import drawn_rig, drawn_room, drawn_tint, limb_light
+from helpers.limb_frames import drawn_revolved, drawn_rig, drawn_room, drawn_tint, limb_light
 
 from phibench.datasets.frames.sensor_card import sensor_card
+from phibench.estimator.outline.contour import place_of_rig
 from phibench.estimator.outline.limb_image import planes_of
+from phibench.estimator.outline.rim_outline import fit_rim
 from phibench.estimator.outline.sphere_outline import find_sphere_outline as find_outline
 from phibench.estimator.outline.sphere_outline import fit_outline
 from phibench.estimator.spots.image_planes import ImageError
@@ -32,6 +34,26 @@ class Case:
     rig: int
     error_m: np.ndarray
     sigma_m: np.ndarray
+
+
+def rim_cases(shape: str, rigs: range, *presets: str) -> Iterator[Case]:
+    """The same of a mirror of revolution: its vertex, from 0.02 mm and 0.3 mm beside it."""
+    for k in rigs:
+        rng = generator("test", "rim pulls", shape, k)
+        rig = drawn_revolved(rng, shape)
+        tint, level = drawn_tint(rng), rng.uniform(0.8e5, 2.5e5)
+        light = Light(limb_light(rig, rng, level, drawn_room(rng), tint))
+        off = rng.choice([-1.0, 1.0], 5) * [2e-5, 2e-5, 3e-4, 0.0, 0.0]
+        for preset in presets:
+            frame = Chain(sensor(preset), 0, rig.camera).frame(light, NoiseStream(("pulls", k)))
+            card = sensor_card(preset)
+            again = (frame, card) if preset == "mjpeg" else None
+            try:
+                found = fit_rim(planes_of(frame, card), rig, place_of_rig(rig) + off, again=again)
+            except ImageError as error:
+                print(f"{shape} {k} {preset}: {error}")
+                continue
+            yield Case(preset, k, found.sphere_in_camera_m - rig.sphere_in_camera_m, found.sigma_m)
 
 
 def cases(rigs: range, *kinds: tuple[str, dict]) -> Iterator[Case]:

@@ -1,6 +1,7 @@
 """Errors of outlines and of `align` over their stated sigmas, on frames of a data set in many rooms. Not a test file.
 
-`python tests/helpers/outlines_in_rooms.py FOLDER [PRESET ...]` prints them for a data set with a room for each sample.
+`python tests/helpers/outlines_in_rooms.py FOLDER [PRESET ...]` prints them for a data set with a room for each sample:
+one position of each sample, down and up in turn, or both with `--both`.
 The outline is asked with the true camera and radius, which its sigma takes as exact, and a mirror straight above the
 lens; `align` with the nominal rig, as a user has it.
 """
@@ -80,12 +81,13 @@ def outline_of(dataset: Dataset, sample: Sample, position: str, preset: str) -> 
     return RoomOutline(name, error, found.sigma_m, radius, aligned, "", found.arc, found.shift_rms_px)
 
 
-def outlines(folder: Path, presets: Sequence[str] = PRESETS) -> Iterator[RoomOutline]:
-    """All frames of a data set: one position of each sample, down and up in turn."""
+def outlines(folder: Path, presets: Sequence[str] = PRESETS, both: bool = False) -> Iterator[RoomOutline]:
+    """All frames of a data set: one position of each sample, down and up in turn, or both."""
     dataset = open_dataset(folder)
     for number, sample in enumerate(dataset):
-        for preset in presets:
-            yield outline_of(dataset, sample, POSITIONS[number % 2], preset)
+        for position in POSITIONS if both else (POSITIONS[number % 2],):
+            for preset in presets:
+                yield outline_of(dataset, sample, position, preset)
 
 
 def pull(z: np.ndarray) -> np.ndarray:
@@ -111,9 +113,9 @@ def report(found: Sequence[RoomOutline], preset: str) -> str:
 
 
 if __name__ == "__main__":
-    names = sys.argv[2:] or PRESETS
+    names = [name for name in sys.argv[2:] if name != "--both"] or PRESETS
     everything: list[RoomOutline] = []
-    for one in outlines(Path(sys.argv[1]), names):
+    for one in outlines(Path(sys.argv[1]), names, "--both" in sys.argv):
         text = one.fault or f"z {np.round(one.z, 2)} sigma {np.round(1e6 * one.sigma_m, 1)} um, align {one.align_z}"
         print(f"{one.name}: {text} arc {one.arc:.2f} shift {one.shift_rms_px:.3f} px", flush=True)
         everything.append(one)
