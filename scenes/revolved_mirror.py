@@ -48,11 +48,13 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from phibench.scenes.frames import Array
 from phibench.scenes.mirror import HARMONICS, Form, Level, MetalName, MetalSurface, ReflectanceTable, known_metal
 from phibench.scenes.validation import SceneError, finite, positive, within
 
+ComplexArray = NDArray[np.complexfloating]
 Shape = Literal["sphere", "ellipsoid", "paraboloid", "hyperboloid", "cone", "polynomial"]
 
 _LARGEST_M = 1.0
@@ -291,7 +293,7 @@ class FormedProfile:
         return self.form.bound_m * float(lengthening(self.ideal, np.array(self.rim_radius_m**2))[0])
 
     @cached_property
-    def _polynomials(self) -> tuple[Array, ...]:
+    def _polynomials(self) -> tuple[ComplexArray, ...]:
         return disc_polynomials(self.form)
 
     def heights(self, x: Array, y: Array) -> Heights:
@@ -309,32 +311,28 @@ class FormedProfile:
         )
 
     def deviation(self, x: Array, y: Array) -> Heights:
-        """h and its derivatives: c0 + a1 X + b1 Y + a2 C2 + b2 S2 + a3 C3 + b3 S3, polynomials of t = X^2 + Y^2.
+        """h and its derivatives: the real part of w0 + w1 p + w2 p^2 + w3 p^3, polynomials w in t = |p|^2.
 
-        X, Y are places in radii of the disc; C2 + i S2 and C3 + i S3 are the powers of X + i Y.
+        p = X + i Y is the place in radii of the disc. With the sum S as a function of p and t, the derivative by X is
+        S_p + 2 X S_t, and that by Y is i S_p + 2 Y S_t.
         """
-        c0, a1, b1, a2, b2, a3, b3 = self._polynomials
+        w0, w1, w2, (w3,) = self._polynomials
         X, Y = x / self.disc_m, y / self.disc_m
-        t = X * X + Y * Y
-        (c, c1, c2), (a, a_1, a_2), (b, b_1, b_2) = (_by_power(k, t) for k in (c0, a1, b1))
-        p, q = a2[0] + a2[1] * t, b2[0] + b2[1] * t
-        C2, S2 = X * X - Y * Y, 2.0 * X * Y
-        h = c + a * X + b * Y + p * C2 + q * S2 + a3[0] * (C2 * X - S2 * Y) + b3[0] * (C2 * Y + S2 * X)
-        by_t = c1 + a_1 * X + b_1 * Y + a2[1] * C2 + b2[1] * S2
-        by_tt = c2 + a_2 * X + b_2 * Y
-        # of what stands beside t, and of its slope by t
-        own_x = a + 2.0 * (p * X + q * Y) + 3.0 * (a3[0] * C2 + b3[0] * S2)
-        own_y = b + 2.0 * (q * X - p * Y) + 3.0 * (b3[0] * C2 - a3[0] * S2)
-        mix_x, mix_y = a_1 + 2.0 * (a2[1] * X + b2[1] * Y), b_1 + 2.0 * (b2[1] * X - a2[1] * Y)
-        bent, twisted = 2.0 * p + 6.0 * (a3[0] * X + b3[0] * Y), 2.0 * q + 6.0 * (b3[0] * X - a3[0] * Y)
-        k, k2 = 1.0 / self.disc_m, 1.0 / self.disc_m**2
+        p, t = X + 1j * Y, X * X + Y * Y
+        a, b = (w1[2] * t + w1[1]) * t + w1[0], w2[1] * t + w2[0]
+        b_t, wave = 2.0 * w1[2] * t + w1[1], w3 * p
+        S = ((w0[3] * t + w0[2]) * t + w0[1]) * t + w0[0] + p * (a + p * (b + wave))
+        S_p, S_pp = a + p * (2.0 * b + 3.0 * wave), 2.0 * b + 6.0 * wave
+        S_t = (3.0 * w0[3] * t + 2.0 * w0[2]) * t + w0[1] + p * (b_t + w2[1] * p)
+        S_tp, S_tt = b_t + 2.0 * w2[1] * p, (6.0 * w0[3] * t + 2.0 * w0[2] + 2.0 * w1[2] * p).real
+        k, k2, twice_t = 1.0 / self.disc_m, 1.0 / self.disc_m**2, 2.0 * S_t.real
         return Heights(
-            h,
-            k * (2.0 * X * by_t + own_x),
-            k * (2.0 * Y * by_t + own_y),
-            k2 * (2.0 * by_t + 4.0 * X * (X * by_tt + mix_x) + bent),
-            k2 * (4.0 * X * Y * by_tt + 2.0 * (Y * mix_x + X * mix_y) + twisted),
-            k2 * (2.0 * by_t + 4.0 * Y * (Y * by_tt + mix_y) - bent),
+            S.real,
+            k * (S_p.real + X * twice_t),
+            k * (Y * twice_t - S_p.imag),
+            k2 * (S_pp.real + twice_t + 4.0 * X * (S_tp.real + X * S_tt)),
+            k2 * (2.0 * (Y * S_tp.real - X * S_tp.imag) - S_pp.imag + 4.0 * X * Y * S_tt),
+            k2 * (twice_t - S_pp.real + 4.0 * Y * (Y * S_tt - S_tp.imag)),
         )
 
     def level(self, points_m: Array) -> Level:
@@ -368,22 +366,16 @@ def _raised(sag: Sag, x: Array, y: Array) -> Heights:
     return Heights(sag.z_m, steep * x, steep * y, steep + bend * x * x, bend * x * y, steep + bend * y * y)
 
 
-def disc_polynomials(form: Form) -> tuple[Array, ...]:
-    """Coefficients by powers of rho^2, of c0, a1, b1, a2, b2, a3, b3 in `FormedProfile`."""
+def disc_polynomials(form: Form) -> tuple[ComplexArray, ...]:
+    """Coefficients by powers of rho^2, metres, of w0 to w3 in `deviation`: those of cosines, less i those of sines."""
     f = {name[5:-2]: getattr(form, name) for name in HARMONICS}
-    c0 = f["20"] * np.array([1.0, -6.0, 6.0, 0.0]) + f["30"] * np.array([-1.0, 12.0, -30.0, 20.0])
-    coma, astigmatism = (
-        [f[f"2{m}{part}"] * np.array(low) + f[f"3{m}{part}"] * np.array(high) for part in "cs"]
-        for m, low, high in ((1, [-2.0, 3.0, 0.0], [3.0, -12.0, 10.0]), (2, [1.0, 0.0], [-3.0, 4.0]))
+    c = {f"{n}{m}": f[f"{n}{m}c"] - 1j * f[f"{n}{m}s"] for n, m in ("21", "22", "31", "32", "33")}
+    return (
+        f["20"] * np.array([1.0 + 0.0j, -6.0, 6.0, 0.0]) + f["30"] * np.array([-1.0, 12.0, -30.0, 20.0]),
+        c["21"] * np.array([-2.0, 3.0, 0.0]) + c["31"] * np.array([3.0, -12.0, 10.0]),
+        c["22"] * np.array([1.0, 0.0]) + c["32"] * np.array([-3.0, 4.0]),
+        c["33"] * np.ones(1),
     )
-    return (c0, *coma, *astigmatism, *(np.array([f[f"33{part}"]]) for part in "cs"))
-
-
-def _by_power(c: Array, t: Array) -> tuple[Array, Array, Array]:
-    """Polynomial of degree 2 or 3 and its first two derivatives."""
-    third = c[3] if len(c) == 4 else 0.0
-    value = c[0] + t * (c[1] + t * (c[2] + t * third))
-    return value, c[1] + t * (2.0 * c[2] + 3.0 * third * t), 2.0 * c[2] + 6.0 * third * t
 
 
 def lengthening(profile: Profile, s: Array, sag: Sag | None = None) -> tuple[Array, Array, Array]:

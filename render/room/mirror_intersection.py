@@ -169,7 +169,9 @@ class _DiscForm:
     """Form error of a mirror of revolution, millimetres; as in `FormedProfile.deviation`."""
 
     def __init__(self, number: Callable[[float], Any], surface: FormedProfile) -> None:
-        self._terms = [[number(MM_PER_M * c) for c in terms] for terms in disc_polynomials(surface.form)]
+        around, *waves = disc_polynomials(surface.form)
+        parts = [around.real, *(part for w in waves for part in (w.real, -w.imag))]
+        self._terms = [[number(MM_PER_M * c) for c in part] for part in parts]
         self._scale = number(1.0 / (MM_PER_M * surface.disc_m))
 
     def at(self, P: Any) -> tuple[Any, Any, Any]:
