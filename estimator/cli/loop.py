@@ -86,6 +86,41 @@ def run(
     return 1 if any(row.outcome == LOST for row in rows) else 0
 
 
+@loop.command
+def show(
+    policy: Literal["paper", "greedy", "drive-only"] = "paper",
+    *,
+    out: Path,
+    rooms: Path | None = None,
+    fidelity: Fidelity = "exact",
+    seed: str = "show",
+    episode: Whole = 0,
+) -> int:
+    """Write an episode as an MP4: what the camera sees, the room from above, and what the robot believes.
+
+    Parameters
+    ----------
+    policy
+        Of the robot.
+    out
+        MP4 to write.
+    rooms
+        Folder of `phibench loop bake`; without it the episode has a plain room, in which only spots are seen.
+    fidelity
+        With --rooms: windows around spots, or whole frames, which take 2 CPU-s each.
+    seed
+        Name of the stream that targets, lights and noise are drawn from.
+    episode
+        Number of the episode in that stream.
+    """
+    from phibench.datasets.store.files import require_writable
+    from phibench.estimator.studies.loop.drawings import show_episode
+
+    require_writable(out)
+    print(f"{out}: {show_episode(_setup(rooms, fidelity), out, policy, seed, episode)}")
+    return 0
+
+
 def _setup(rooms: Path | None, fidelity: Fidelity) -> Setup:
     from phibench.estimator.loop.arena import baked_arenas
     from phibench.estimator.loop.simulator import Setup

@@ -140,6 +140,7 @@ STUDIES = {
     "isotropy": "Error of D against azimuth, and what panoramas keep.",
     "stroke": "The stroke that measures a distance best.",
     "mirror": "Mirrors of other shapes beside each other, for the choice of one.",
+    "loop": "A robot that drives up to its target: time, strokes, success, and what spoils them.",
 }
 """Every study in one sentence; the names are those of `studies.run`."""
 

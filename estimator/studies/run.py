@@ -35,7 +35,7 @@ DOCUMENT = "study.json"
 _AGAIN = "run `phibench study` again"
 FINDINGS = "findings.md"
 DATA = "data"
-NAMES = ("noise", "misalignment", "baseline", "cause", "isotropy", "stroke", "mirror")
+NAMES = ("noise", "misalignment", "baseline", "cause", "isotropy", "stroke", "mirror", "loop")
 
 
 class DrawingEntry(Document):
