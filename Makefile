@@ -25,7 +25,7 @@ help:
 	@echo "make setup      make .venv with everything in it, and make sure of LLVM"
 	@echo "make dataset    render $(RECIPE) into $(OUT)"
 	@echo "make bench      $(SAMPLES) samples of bench-dev, all built-in methods on them, a report, in out/"
-	@echo "make studies    the seven studies, reduced, and a report on them, in out/studies"
+	@echo "make studies    the eight studies, reduced, and a report on them, in out/studies"
 	@echo "make studies-full  the same in full (hours), published to docs/studies"
 	@echo "make test       the tests, without the slow ones"
 	@echo "make test-slow  the slow tests"

@@ -135,4 +135,7 @@ def _print(rows: list[Episode]) -> None:
             f"{row.number:7d} {row.outcome:18s} {row.time_s:5.1f} {row.driven_m:5.2f} {row.strokes:7d} "
             f"{row.distance_m:6.3f} {row.stated_m:8.3f} {row.cause}"
         )
+    for row in rows:
+        if row.refused:
+            print(f"episode {row.number}: refused {row.refused}")
     print(f"reached: {sum(row.reached for row in rows)} of {len(rows)}")

@@ -1,4 +1,4 @@
-"""Commands `phibench paper` and `phibench study ...`: the tables of the paper, its experiments, and seven studies."""
+"""Commands `phibench paper` and `phibench study ...`: the tables of the paper, its experiments, and eight studies."""
 
 from __future__ import annotations
 

@@ -43,6 +43,8 @@ class Episode:
     pull : float
         Error of the inverse distance over its standard deviation, at the end; NaN without a belief.
     nees : float
+    refused : str
+        First command that was refused, in one sentence; empty where none was.
     """
 
     number: int
@@ -57,6 +59,7 @@ class Episode:
     locked_s: float
     pull: float
     nees: float
+    refused: str = ""
 
     @property
     def reached(self) -> bool:
@@ -66,7 +69,7 @@ class Episode:
 
 def run_episode(simulator: Simulator, policy: Policy, observation: Observation, number: int = 0) -> Episode:
     """Run one episode, which has begun, to its end; a policy that raises or answers nonsense loses it."""
-    stated, failure, was_seen = math.nan, "", False
+    stated, failure, refused, was_seen = math.nan, "", "", False
     while simulator.outcome == RUNNING:
         try:
             action = policy.act(observation)
@@ -76,6 +79,7 @@ def run_episode(simulator: Simulator, policy: Policy, observation: Observation, 
             failure = f"{named}in step {simulator.step}: {' '.join(str(error).split())[:200]}"
             break
         was_seen = was_seen or simulator.unseen_cause == ""
+        refused = refused or (simulator.refused and f"in step {simulator.step}: {simulator.refused}")
         stated = action.stated_m if action.stated_m > 0.0 else stated
     belief = getattr(policy, "belief", None)
     locked = getattr(policy, "locked_step", -1)
@@ -93,6 +97,7 @@ def run_episode(simulator: Simulator, policy: Policy, observation: Observation, 
         locked * simulator.setup.task.step_s if locked >= 0 else math.nan,
         pull,
         nees,
+        refused,
     )
 
 

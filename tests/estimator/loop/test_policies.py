@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import binomtest
 
 from phibench.estimator.loop.arena import generated_arena
-from phibench.estimator.loop.episodes import LOST, episode_frame, run_episode, run_episodes, run_foreign
+from phibench.estimator.loop.episodes import LOST, PolicyFile, episode_frame, run_episode, run_episodes, run_foreign
 from phibench.estimator.loop.policies import CODED, POLICIES, Identifier, Plan
 from phibench.estimator.loop.sensing import SEEN, Reading
 from phibench.estimator.loop.simulator import CODES, Action, Known, Observation, Setup, Simulator, Task
@@ -128,6 +128,32 @@ def test_a_policy_that_fails_loses_its_episode_in_one_sentence(policy, words: st
     assert run_episode(
         simulator, POLICIES["oracle"](simulator.setup.known, simulator), simulator.start("fails")
     ).reached
+
+
+class Strokes:
+    def act(self, observation: Observation) -> Action:
+        return Action(drive_m_per_s=0.1, stroke_m_per_s=0.1)
+
+
+def test_refused_commands_stay_with_the_episode() -> None:
+    simulator = Simulator(Setup(task=Task(longest_s=0.3)))
+    episode = run_episode(simulator, Strokes(), simulator.start("refused"))
+    assert episode.refused.startswith("in step 1: stroke_m_per_s = 0.1 while the tracks run")
+    assert run_episodes(Setup(), "oracle", 1, "refused")[0].refused == ""
+
+
+def test_policies_of_files_are_named_in_one_sentence(tmp_path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "class P:\n    act = staticmethod(lambda seen: None)\nmake = lambda known: P()\nthree = lambda known: 3\n"
+    )
+    assert PolicyFile.of(f"{file}:make")(Setup().known).act(None) is None
+    for text, words in ((f"{file}:three", "gave int"), (f"{file}:other", "no function other")):
+        with pytest.raises(SceneError, match=words):
+            PolicyFile.of(text)(Setup().known)
+    for text, words in ((f"{file}", "give FILE.py:NAME"), ("nowhere.py:make", "no file nowhere.py")):
+        with pytest.raises(SceneError, match=words):
+            PolicyFile.of(text)
 
 
 def test_a_target_that_is_never_seen_is_said() -> None:
