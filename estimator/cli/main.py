@@ -23,16 +23,14 @@ from cyclopts import App, CycloptsError
 
 from phibench.datasets.parallel import ONE_THREAD
 from phibench.estimator.cli.calibration import align, calibrate
-from phibench.estimator.cli.captures import import_, measure
+from phibench.estimator.cli.captures import import_, measure, sensor
 from phibench.estimator.cli.dataset import dataset, export
-from phibench.estimator.cli.film import film
-from phibench.estimator.cli.loop import loop
+from phibench.estimator.cli.film import film, loop
 from phibench.estimator.cli.methods import method
 from phibench.estimator.cli.options import DATA, INSTALLATION, METHODS, SENSOR, answer_to_old_spelling
 from phibench.estimator.cli.room import room
 from phibench.estimator.cli.score import bench, compare, report, score
 from phibench.estimator.cli.seal import seal
-from phibench.estimator.cli.sensor import sensor
 from phibench.estimator.cli.studies import paper, study
 
 app = App(

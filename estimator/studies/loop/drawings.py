@@ -75,7 +75,7 @@ def condition_drawing(found: Mapping[tuple[str, str], Numbers]) -> Drawing:
 
 @dataclass
 class Track:
-    """What happened so far in an episode, a number per step."""
+    """Course of an episode so far, a number per step."""
 
     time_s: list[float] = field(default_factory=list)
     place_m: list[tuple[float, float]] = field(default_factory=list)
