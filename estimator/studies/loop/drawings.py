@@ -118,7 +118,7 @@ def process_drawing(seed: int = 4) -> Drawing:
     setup = Setup(arenas=(plain_arena("figure", seed),))
     simulator, _, _, track = list(episode_steps(setup, "paper", "figure", seed))[-1]
     with canvas(10.0, 4.6) as figure:
-        left, right = figure.subfigures(1, 2, width_ratios=(1, 1.2))
+        left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1, 1.2)))
         top_view(left.subplots(), simulator, track)
         depth, stroke, laser = right.subplots(3, 1, sharex=True, height_ratios=(3, 1, 0.5))
         belief_axes(depth, track)
@@ -157,7 +157,8 @@ def top_view(ax: Axes, simulator: Simulator, track: Track) -> None:
     """Room, robot, way and target from above."""
     _boxes(ax, simulator.arena)
     target, vehicle = simulator.target.point_m, simulator.setup.vehicle
-    ax.add_patch(Circle(target[:2], simulator.setup.task.stand_off_m, fill=False, linestyle=":", edgecolor="black"))
+    x, y = map(float, target[:2])
+    ax.add_patch(Circle((x, y), simulator.setup.task.stand_off_m, fill=False, linestyle=":", edgecolor="black"))
     ax.plot(*np.array(track.place_m).T, color=_WAY, linewidth=1.5)
     pose = simulator.pose
     c, s = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
@@ -229,8 +230,8 @@ def picture(simulator: Simulator, policy: Any, observation: Observation, track: 
         fontsize=11, color="#117733" if simulator.outcome == REACHED else "black",
     )  # fmt: skip
     agg = FigureCanvasAgg(figure)
-    agg.draw()
-    return np.asarray(agg.buffer_rgba())[..., :3].copy()
+    agg.draw()  # type: ignore[no-untyped-call]
+    return np.asarray(agg.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
 
 
 def frame_axes(ax: Axes, simulator: Simulator, policy: Any, observation: Observation) -> None:

@@ -162,8 +162,14 @@ def summary(episodes: Sequence[Episode]) -> Summary:
     low, high = share.proportion_ci(method="wilson")
     pulls = np.array([one.pull for one in episodes if math.isfinite(one.pull)])
     errors = np.array([one.stated_m / one.distance_m - 1.0 for one in episodes if math.isfinite(one.stated_m)])
-    means = (interval([getattr(one, name) for one in reached]) for name in ("time_s", "driven_m", "strokes"))
-    return Summary((len(reached) / len(episodes), low, high), *means, interval(pulls, rms), interval(errors, rms))
+    return Summary(
+        (len(reached) / len(episodes), float(low), float(high)),
+        interval([one.time_s for one in reached]),
+        interval([one.driven_m for one in reached]),
+        interval([one.strokes for one in reached]),
+        interval(pulls, rms),
+        interval(errors, rms),
+    )
 
 
 def rms(values: Array, axis: int = -1) -> Array:
