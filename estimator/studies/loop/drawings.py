@@ -118,7 +118,8 @@ def process_drawing(seed: int = 4) -> Drawing:
     setup = Setup(arenas=(plain_arena("figure", seed),))
     simulator, _, _, track = list(episode_steps(setup, "paper", "figure", seed))[-1]
     with canvas(10.0, 4.6) as figure:
-        left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1, 1.2)))
+        parts: Any = figure.subfigures(1, 2, width_ratios=(1, 1.2))
+        left, right = parts
         top_view(left.subplots(), simulator, track)
         depth, stroke, laser = right.subplots(3, 1, sharex=True, height_ratios=(3, 1, 0.5))
         belief_axes(depth, track)
