@@ -277,6 +277,7 @@ class TargetTracker:
             FrameSearch(rig, card, box), max(round(patience_s * times.rate_hz), tentative), tentative
         )
         self.holds: list[Hold] = []
+        self._rested = 0  # frames since anything moved
 
     @property
     def frame(self) -> int:
@@ -298,22 +299,43 @@ class TargetTracker:
         hold = self._states[name].hold
         return None if hold is None else hold.track
 
-    def add(self, image: NDArray[Any]) -> None:
+    def add(self, image: NDArray[Any], moves: bool = False) -> None:
         """Take in the next frame.
+
+        Parameters
+        ----------
+        image : array
+            As the camera delivers it.
+        moves : bool
+            Carriage, robot or target may have moved since the frame before.
 
         Raises
         ------
         ValueError
             If the image does not fit the card's output.
         """
-        self.tracker.add(image)
+        self.tracker.add(image, moves)
+        self._rested = 0 if moves else self._rested + 1
         for state in self._states.values():
             self._restart(state)
             if state.hold is not None:
                 self._check_hold(state, state.hold)
         for state in self._states.values():
             if state.hold is None:
+                if not moves:
+                    self._follow(state)
                 self._try_lock(state)
+
+    def _follow(self, state: _Search) -> None:
+        """Look for a light that follows the code at one place, over the latest frames of a rig that rests."""
+        count, code = min(self._rested, self.tracker.kept), state.code
+        if not code.phase_known or count / (self.times.rate_hz * code.code.bit_s) * math.log(2.0) < LOCK:
+            return
+        box = self.tracker.search.box
+        rows = box.v0_px + np.arange(box.height_px, dtype=float)
+        frames = self.frame - count + 1 + np.arange(count, dtype=float)
+        times = self.times.row_s(frames[:, None], rows)
+        self.tracker.follow(code.code.mean_level(times, self.times.exposure_s))
 
     def _may_lock(self, state: _Search, track: SpotTrack) -> bool:
         """Quick look: frames enough for a lock, and light that changes by more than its noise."""

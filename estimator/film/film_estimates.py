@@ -15,7 +15,7 @@ import polars
 from phibench.datasets.film.film_read import Film
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.recipe.film_tables import TARGET
-from phibench.estimator.film.blink_identity import TargetCode, TargetTracker, track_targets
+from phibench.estimator.film.blink_identity import TargetCode, TargetTracker
 from phibench.estimator.film.film_bundle import FilmDepth, expected_sigma_m, film_depth
 from phibench.estimator.film.film_frames import FilmFrames, Index, room_weights
 from phibench.estimator.film.film_positions import FilmPositions, fit_positions, stepped_positions
@@ -28,6 +28,7 @@ from phibench.scenes.validation import SceneError
 _ROUNDS = 2  # of the frames' own fits: the second one knows distance and motion
 _STEPS, _SETTLED = 8, 0.02  # of the bundle, and standard deviations that it stops at
 _REST_M = 1e-9
+_MOVES_M = 1.5e-3  # of the encoder from frame to frame: five of its standard deviations
 
 
 @dataclass(frozen=True)
@@ -187,8 +188,13 @@ def track_film(
         )
     codes = [TargetCode(TARGET, scene.code, phase_known)]
     codes += [TargetCode(one.name, one.code, phase_known) for one in scene.lights if one.is_target]
-    images = (film.frame(k, preset, draw, camera_seed).image for k in range(len(film)))
-    return track_targets(images, film.plan.nominal.rig, card_of(film.sensor(preset)), scene.times, codes)
+    tracker = TargetTracker(film.plan.nominal.rig, card_of(film.sensor(preset)), scene.times, codes)
+    told = film.table["encoder_m"].to_numpy()
+    driven = np.abs(np.diff(scene.robot_state(scene.times.frame_s), axis=0, prepend=0.0)).max(axis=1)
+    for k in range(len(film)):
+        moves = k > 0 and (abs(told[k] - told[k - 1]) > _MOVES_M or driven[k] > 0.0)
+        tracker.add(film.frame(k, preset, draw, camera_seed).image, bool(moves))
+    return tracker
 
 
 @dataclass(frozen=True)

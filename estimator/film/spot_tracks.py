@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -45,19 +45,23 @@ from phibench.scenes.validation import SceneError
 
 LEAST_Z = 4.8  # of a spot: one false one in a frame of noise at most, see `spots.detect`
 _LEAST_CHANGE = 5.0  # of a light that becomes brighter
+_LEAST_FOLLOWING = 7.0  # of a light that follows a code over many frames: no noise of a million places does
 _LEAST_SITE, _MOST_SITES = 3.5, 25  # of a red site and its neighbours, before the test
 _APART_PX = 3.0  # of a changed light from a spot that is found anyway
 _CROSS = 0.5 * np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)], float)
 _SIDE_SHARE = 0.3  # of a spot's light in the next site, about
+_SAME_PX = 1.0  # of a track from a light that follows a code
 _OFFSETS = 0.5 * np.stack(np.meshgrid(np.arange(-2, 3), np.arange(-2, 3)), axis=-1).reshape(-1, 2)
 _LEAST_PEAK = 4.0
 _MOST_PEAKS = 600
 _GATE2 = 16.0  # chi squared of 2: 3e-4 of a track's own spots lie beyond
 _FARTHEST_PX = 4.0  # of a track's own spot from where it is expected, however long it was dark
 _PLACE_PX = 0.35  # of a detection: noise of a spot of 7 sigma, and minima of the mosaic
-_SPEED_PX = 0.1  # per frame, of a track at its first spot: most lights rest, and a stroke speeds up in time
-_ACCELERATION_PX2 = 0.001  # density, per frame^3: a stroke of 0.25 m/s at 1.5 m moves a spot by 0.4 px a frame
+_SPEED_PX, _MOVING_PX = 0.1, 1.0  # per frame, of a track at its first spot: at rest, and while something moves
+_AGILITY = 5e-4 * np.kron(np.eye(2), [[1.0 / 3.0, 0.5], [0.5, 1.0]])  # pixels and frames, at rest
+_MOVING = 100.0  # times that, while something moves: a stroke of 0.25 m/s speeds up by 0.2 px a frame in a frame
 _BACK = 4  # frames before the first spot that are measured: a code's longest dark run and one more
+_KEPT = 15  # frames over which a code may be followed
 _TENTATIVE = 2  # spots up to which a track may be noise
 WINDOW_PX = 9  # kept around every spot, for a fit of its place: a level per filter describes the room there
 
@@ -130,11 +134,43 @@ class FrameSearch:
             shift[:, axis] = np.where(bend < 0.0, np.clip(slope / np.minimum(bend, -1e-9), -1.0, 1.0), 0.0)
         return uv_px + 0.5 * shift
 
-    def _brighter(self, planes: ColourPlanes, before: ColourPlanes, where: BoolArray) -> Array:
-        """Places relative to the box, shape (n, 2), that are brighter than before."""
+    def following(self, frames: Sequence[ColourPlanes], levels: Array) -> Array:
+        """Places in the image, shape (n, 2), whose light follows a code over frames of a rig that rests.
+
+        The mean of the frames with the light on, less the mean of those with it off: nothing of the room is left.
+
+        Parameters
+        ----------
+        frames : sequence of N ColourPlanes
+        levels : shape (N, rows of the box)
+            Of the code, by the time of each row.
+        """
+        x = np.clip(levels, 0.0, 1.0)
+        lit, dark = x.sum(axis=0), (1.0 - x).sum(axis=0)
+        if min(lit.min(), dark.min()) < 1.0:
+            return np.zeros((0, 2))
+        reds = np.stack([one.values_e[0] for one in frames])
+        on, off = (
+            np.einsum("nr,nrc->rc", np.asarray(weights, np.float32), reds) for weights in (x / lit, (1.0 - x) / dark)
+        )
+        scale = math.sqrt(0.5 * float(np.median(((x / lit) ** 2 + ((1.0 - x) / dark) ** 2).sum(axis=0))))
+        first = frames[0]
+        mean_on, mean_off = (replace(first, values_e=np.stack([red, red, red])) for red in (on, off))
+        found = self._brighter(mean_on, mean_off, self._outline, scale, _LEAST_FOLLOWING)
+        return self._refined(mean_on, mean_off, found) + self._origin
+
+    def _brighter(
+        self,
+        planes: ColourPlanes,
+        before: ColourPlanes,
+        where: BoolArray,
+        scale: float = 1.0,
+        least: float = _LEAST_CHANGE,
+    ) -> Array:
+        """Places relative to the box, shape (n, 2), that are brighter than before; `scale` is that of the noise."""
         step = 2 if planes.mosaic else 1
         now, then = (one.values_e[0][::step, ::step] for one in (planes, before))
-        z = (now - then) / np.sqrt(2.0 * variance_e2(np.maximum(now, then), self.card, True))
+        z = (now - then) / scale / np.sqrt(2.0 * variance_e2(np.maximum(now, then), self.card, True))
         kernel = np.array([_SIDE_SHARE, 1.0, _SIDE_SHARE]) / math.sqrt(1.0 + 2.0 * _SIDE_SHARE**2)
         z = correlate1d(correlate1d(z, kernel, axis=0), kernel, axis=1) * where[::step, ::step]
         highest = np.flatnonzero((z >= _LEAST_SITE) & (z == maximum_filter(z, 3)))
@@ -144,9 +180,10 @@ class FrameSearch:
         sites = step * np.stack(np.unravel_index(highest, z.shape)[::-1], axis=-1).astype(float)
         around = (sites[:, None] + _OFFSETS).reshape(-1, 2)
         tests = candidates_at(planes, before, self.card, around, self.sigma_px)
-        significance = tests.z.reshape(len(sites), -1)
+        # without chi^2: the difference has no structure that a misfit would have to tell
+        significance = (tests.electrons / tests.sigma_e).reshape(len(sites), -1) / scale
         best = significance.argmax(axis=1)
-        return around.reshape(len(sites), -1, 2)[np.arange(len(sites)), best][significance.max(axis=1) >= _LEAST_CHANGE]
+        return around.reshape(len(sites), -1, 2)[np.arange(len(sites)), best][significance.max(axis=1) >= least]
 
     def light(self, planes: ColourPlanes, uv_px: Array) -> tuple[Array, Array]:
         """Amplitudes at places (n, 2) and their standard deviations, electrons; NaN outside of the mirror's image."""
@@ -255,10 +292,11 @@ class SpotTracker:
         self.live: list[SpotTrack] = []
         self.frame = -1
         self._count = 0
-        self._before: deque[ColourPlanes] = deque(maxlen=_BACK)
+        self._moved = False
+        self._before: deque[ColourPlanes] = deque(maxlen=_KEPT)
 
-    def add(self, image: NDArray[Any]) -> None:
-        """Take in the next frame.
+    def add(self, image: NDArray[Any], moves: bool = False) -> None:
+        """Take in the next frame; `moves` says that spots may have changed their speed since the frame before.
 
         Raises
         ------
@@ -268,10 +306,12 @@ class SpotTracker:
         self.frame += 1
         planes = self.search.planes(image)
         spots = self.search.spots(planes, self._before[-2] if len(self._before) > 1 else None)
+        changes = moves or self._moved
+        self._moved = moves
         for track in self.live:
-            track.motion.predict()
+            track.motion.predict(Q=_MOVING * _AGILITY if changes else _AGILITY)
         expected = np.array([_place(track) for track in self.live]).reshape(-1, 2)
-        taken = dict(zip(*_assigned(self.live, expected, spots), strict=True))
+        taken = _assigned(self.live, expected, spots)
         for k, spot in taken.items():
             self.live[k].motion.update(spots.uv_px[spot])
         # where the filter is after the update: all frames know the place better than one, which lies on half a pixel
@@ -287,16 +327,38 @@ class SpotTracker:
 
     def _begin(self, spots: FrameSpots, new: list[int], image: NDArray[Any]) -> None:
         """New tracks, their light in the frames before measured at the same places."""
-        before = [self.search.light(planes, spots.uv_px[new]) for planes in self._before] if new else []
+        past = list(self._before)[-_BACK:]
+        before = [self.search.light(planes, spots.uv_px[new]) for planes in past] if new else []
         for k, spot in enumerate(new):
             uv = spots.uv_px[spot]
-            track = SpotTrack(self._count, self.frame - len(before), _motion(uv))
+            track = SpotTrack(
+                self._count, self.frame - len(before), _motion(uv, _MOVING_PX if self._moved else _SPEED_PX)
+            )
             for electrons, sigma_e in before:
                 track.put(uv, float(electrons[k]), float(sigma_e[k]), False)
             track.put(uv, float(spots.electrons[spot]), float(spots.sigma_e[spot]), True)
             self._keep(track, image, uv)
             self.live.append(track)
             self._count += 1
+
+    def follow(self, levels: Array) -> None:
+        """Begin tracks where the light of the latest frames follows a code; `levels` as for `FrameSearch.following`."""
+        frames = list(self._before)[-len(levels) :]
+        for uv in self.search.following(frames, levels):
+            if any(np.linalg.norm(np.array(one.place_px) - uv) < _SAME_PX for one in self.live):
+                continue
+            track = SpotTrack(self._count, self.frame - len(frames) + 1, _motion(uv))
+            for planes in frames:
+                electrons, sigma_e = self.search.light(planes, uv)
+                track.put(uv, float(electrons[0]), float(sigma_e[0]), bool(electrons[0] > LEAST_Z * sigma_e[0]))
+            track.detected[-1] = True
+            self.live.append(track)
+            self._count += 1
+
+    @property
+    def kept(self) -> int:
+        """Frames over which a code may be followed now."""
+        return len(self._before)
 
     def _keep(self, track: SpotTrack, image: NDArray[Any], uv_px: Array) -> None:
         window, origin = self.search.window(image, uv_px)
@@ -309,7 +371,7 @@ class SpotTracker:
         return track.dark > (self.tentative if track.spots <= _TENTATIVE else self.patience)
 
 
-def _motion(uv_px: Array) -> Any:
+def _motion(uv_px: Array, speed_px: float = _SPEED_PX) -> Any:
     """Filter of constant velocity of `filterpy`: u, its velocity, v, its velocity; pixels and frames."""
     try:
         from filterpy.kalman import KalmanFilter
@@ -319,10 +381,8 @@ def _motion(uv_px: Array) -> Any:
     motion.F = np.kron(np.eye(2), [[1.0, 1.0], [0.0, 1.0]])
     motion.H = np.kron(np.eye(2), [[1.0, 0.0]])
     motion.x = np.array([[uv_px[0]], [0.0], [uv_px[1]], [0.0]])
-    motion.P = np.diag([_PLACE_PX**2, _SPEED_PX**2] * 2)
+    motion.P = np.diag([_PLACE_PX**2, speed_px**2] * 2)
     motion.R = _PLACE_PX**2 * np.eye(2)
-    one = _ACCELERATION_PX2 * np.array([[1.0 / 3.0, 0.5], [0.5, 1.0]])
-    motion.Q = np.kron(np.eye(2), one)
     return motion
 
 
@@ -330,10 +390,10 @@ def _place(track: SpotTrack) -> Array:
     return np.asarray(track.motion.x[[0, 2], 0])
 
 
-def _assigned(tracks: Sequence[SpotTrack], expected: Array, spots: FrameSpots) -> tuple[list[int], list[int]]:
-    """Tracks and spots that belong together, by global nearest neighbours within the gate."""
+def _assigned(tracks: Sequence[SpotTrack], expected: Array, spots: FrameSpots) -> dict[int, int]:
+    """Spots by the tracks that they belong to, by global nearest neighbours within the gate."""
     if not len(tracks) or not len(spots):
-        return [], []
+        return {}
     spread = np.array([track.motion.P[np.ix_([0, 2], [0, 2])] for track in tracks]) + _PLACE_PX**2 * np.eye(2)
     apart = spots.uv_px[None] - expected[:, None]
     distance2 = np.einsum("tsi,tij,tsj->ts", apart, np.linalg.inv(spread), apart)
@@ -342,7 +402,7 @@ def _assigned(tracks: Sequence[SpotTrack], expected: Array, spots: FrameSpots) -
     near: BoolArray = (distance2 < _GATE2) & (np.linalg.norm(apart, axis=-1) < _FARTHEST_PX)
     rows, columns = linear_sum_assignment(np.where(near, cost - cost.min() + 1.0, 1e6))
     good = near[rows, columns]
-    return rows[good].tolist(), columns[good].tolist()
+    return dict(zip(rows[good].tolist(), columns[good].tolist(), strict=True))
 
 
 def fitted_positions(track: SpotTrack, rig: Rig, card: SensorCard, depth_m: float = 2.5) -> FilmPositions:

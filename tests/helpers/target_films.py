@@ -43,9 +43,9 @@ from phibench.scenes.motion.film_times import BlinkCode, FilmTimes
 from phibench.scenes.random_streams import generator
 from phibench.scenes.room import Room
 
-CODES = ("111100010011010", "000111011001011", "000100011011111", "000100101110111")
-"""Codes of 15 bits that agree with each other, and with themselves at another time, in at most 11 bits."""
-CODE = CODES[0]
+CODE = "111100010011010"
+CODES = ((CODE, 0), (CODE, 5), ("000111011001011", 0), ("000111011001011", 7))
+"""Codes of up to four targets, with their delays in bits: any two agree in at most 9 of 15 bits."""
 RATE_HZ = 30.0
 APART_PX = 12.0  # of lights from the target: nearer ones share its pixels
 KINDS = ("lamp", "reflection", "red object", "other laser", "drifting")
@@ -169,7 +169,8 @@ def staged(
     for number, kind in enumerate(chosen):
         if kind == "target":
             spots.append(_target(scene, rendered, light, rng, spots))
-            own = BlinkCode(CODES[number + 1], bit, float(rng.uniform(0.0, len(CODE) * bit)))
+            bits, delay = CODES[number + 1]
+            own = BlinkCode(bits, bit, code.start_s + delay * bit)
             lights.append(FilmLight(f"target {number + 1}", spots[-1], code=own, is_target=True))
             continue
         spots.append(_visible_spot(scene, rendered, spots, rng))
@@ -245,7 +246,7 @@ def _other(kind: str, number: int, spot: LaserSpot, code: BlinkCode, bit: float,
     if kind == "other laser":
         bits = ("10", "1100101", CODE, "".join(map(str, rng.integers(0, 2, 15))))[int(rng.integers(4))]
         bits = bits if "1" in bits else "1" + bits[1:]
-        apart = float(rng.uniform(bit, 14.0 * bit))  # the target's own code comes at another time
+        apart = 10.0 * bit  # the target's own code comes at another time, which is no other target's
         return FilmLight(name, spot, code=BlinkCode(bits, bit, code.start_s + apart))
     if kind == "lamp":
         return FilmLight(name, spot, colour=(1.0, 1.1, 0.8))
