@@ -33,6 +33,7 @@ TILE_PX = 32
 MARGIN_PX = 20  # a JPEG's unit and what demosaicing looks at, around a window
 KEY_PX, DRIVE_KEY_PX = 1.2, 1.8  # motion of the spot's image from key view to key view, before the proof is asked
 _SAMPLES = 257
+_CEILING_M = 2.6
 _DISC_ALBEDO = 0.5  # of a light, where the laser's spot takes that of the surface
 
 
@@ -106,7 +107,7 @@ def _film(plan: Plan, table: FilmTable, pair: PairPlan) -> FilmPlan:
     region = Region.whole(size) if whole else _around(uv, table.window_px, size, pair.sample_id)
     encoder = Encoder(table.encoder_rms_m, table.encoder_step_m)
     window = None if whole else table.window_px
-    return FilmPlan(pair.sample_id, pair, scene, nominal, encoder, names, region, window, _keys(scene, uv))
+    return FilmPlan(pair.sample_id, pair, scene, nominal, encoder, names, region, window, _keys(scene, uv, whole))
 
 
 def film_scene(plan: Plan, table: FilmTable, pair: PairPlan) -> FilmScene:
@@ -221,8 +222,11 @@ def _around(uv: Array, side_px: int, size: tuple[int, int], film_id: str) -> Reg
     return box.grown(size, (TILE_PX, TILE_PX), (MARGIN_PX, MARGIN_PX))
 
 
-def _keys(scene: FilmScene, uv: Array) -> tuple[int, ...]:
-    """Number of key views of each part at which the image moves by about `KEY_PX` from one to the next."""
+def _keys(scene: FilmScene, uv: Array, whole: bool) -> tuple[int, ...]:
+    """Number of key views of each part at which the image moves by about `KEY_PX` from one to the next.
+
+    On a leg of the drive that is the image of the spot; in whole images, that of any place around the robot.
+    """
     parts = PoseParts.of(scene).parts
     counts = []
     for number, part in enumerate(parts):
@@ -233,12 +237,31 @@ def _keys(scene: FilmScene, uv: Array) -> tuple[int, ...]:
             way = float(np.linalg.norm(uv.max(axis=0) - uv.min(axis=0)))
         else:
             end = parts[number + 1].start_s if number + 1 < len(parts) else scene.times.duration_s
-            quiet = replace(scene, vibrations=(), path=SpotPath())
-            track = chief_uv_px(quiet, np.linspace(part.start_s, end, _SAMPLES))
-            way = float(np.linalg.norm(np.diff(track, axis=0), axis=1).sum())
+            times = np.linspace(part.start_s, max(end, part.start_s + 1e-3), _SAMPLES)
+            way = max(_way_px(one, times) for one in (_surroundings(scene) if whole else (_quiet(scene),)))
         apart = KEY_PX if part.leg is None else DRIVE_KEY_PX  # of a turn, all of the window moves alike
         counts.append(max(4, math.ceil(way / apart) + 1))
     return tuple(counts)
+
+
+def _quiet(scene: FilmScene) -> FilmScene:
+    return replace(scene, vibrations=(), path=SpotPath(), lights=())
+
+
+def _surroundings(scene: FilmScene) -> Iterator[FilmScene]:
+    """Films of places as far away as the spot, all around, at its height and near the ceiling."""
+    here, spot = scene.rig.T_world_camera.t, np.array(scene.spot.position_world_m)
+    distance = float(np.linalg.norm((spot - here)[:2]))
+    for turn in np.arange(0.0, 2.0 * np.pi, 0.25 * np.pi):
+        for height in (float(spot[2]), _CEILING_M):
+            place = np.array([here[0] + distance * np.cos(turn), here[1] + distance * np.sin(turn), height])
+            point = replace(scene.spot, position_world_m=as_vector(place), beam_direction_world=None)
+            yield replace(_quiet(scene), spot=point)
+
+
+def _way_px(scene: FilmScene, times_s: Array) -> float:
+    """Way of the spot's image, where there is one."""
+    return float(np.nansum(np.linalg.norm(np.diff(chief_uv_px(scene, times_s), axis=0), axis=1)))
 
 
 # -- what the robot runs into ----------------------------------------------------------------------------------------

@@ -121,7 +121,8 @@ def test_what_the_robot_carries_hides_the_spot_as_for_a_robot_that_stands() -> N
     assert causes == {"none", "occluded:holder_rod_1"}
 
 
-def test_a_spot_that_comes_out_from_behind_a_rod_is_the_mean_of_its_exposure() -> None:
+@pytest.mark.slow
+def test_accuracy_of_a_spot_that_comes_out_from_behind_a_rod() -> None:
     """Flux and shape change within the exposure: parts of it agree with stills, one layer does not."""
     frame = 6
     image = parted_image(RODS, EMPTY, frame)
