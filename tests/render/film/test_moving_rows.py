@@ -47,9 +47,11 @@ CASES = {
 }
 
 
-def brute_force(scene: FilmScene, frame: int, rows: Array, columns: Array, room: Room | None = None) -> Array:
-    """Mean over each row's exposure of stills rendered at 10 times of it."""
-    image, (nodes, weights) = np.zeros((3, len(rows), len(columns))), np.polynomial.legendre.leggauss(10)
+def brute_force(
+    scene: FilmScene, frame: int, rows: Array, columns: Array, room: Room | None = None, count: int = 10
+) -> Array:
+    """Mean over each row's exposure of stills rendered at `count` times of it."""
+    image, (nodes, weights) = np.zeros((3, len(rows), len(columns))), np.polynomial.legendre.leggauss(count)
     for number, row in enumerate(rows):
         middle = float(scene.times.row_s(frame, float(row)))
         for time, weight in zip(middle + 0.5 * scene.times.exposure_s * nodes, 0.5 * weights, strict=True):
@@ -128,13 +130,13 @@ def test_accuracy_of_a_spot_that_comes_out_from_behind_a_rod() -> None:
     image = parted_image(RODS, EMPTY, frame)
     row = image.v0_px + int(np.argmax(image.electrons_per_s[0].sum(axis=1)))
     columns = image.u0_px + np.arange(image.electrons_per_s.shape[2])
-    wanted = brute_force(RODS, frame, np.array([row]), columns, EMPTY)
+    wanted = brute_force(RODS, frame, np.array([row]), columns, EMPTY, 40)
     time = spot_time_s(RODS, 9)
     peak = spot_layer(RODS.view_at(time), RODS.spot_at(time), ()).electrons_per_s.max()
     error = np.abs(image.electrons_per_s[:, [row - image.v0_px]] - wanted).max() / peak
     print(f"behind a rod: moving rows against brute force, {error:.1e} of the peak")
-    # sixteen parts and ten nodes of a step that takes a fifth of the exposure: a percent
-    assert error < 1e-2
+    # required; with 10 stills in place of 40 it is brute force that errs, by 5e-4
+    assert error < 1e-3
     assert wanted.max() > 0.1 * peak
     time = spot_time_s(RODS, frame)
     view = RODS.view_at(time)
