@@ -166,11 +166,16 @@ def film_frames(
     Raises
     ------
     DatasetError
-        If fewer than two frames have the laser on, or none has it off.
+        If fewer than two frames have the laser on, or none has it off, or the robot drives.
     """
     numbers = np.arange(len(film)) if frames is None else np.asarray(frames, np.int64)
     on, off, blinks = lit_frames(film, numbers)
     region = film.info.region
+    if film.plan.scene.drive is not None:
+        raise DatasetError(
+            f"film {film.info.film}: the robot drives, and depth of a film takes it to stand; give a film without "
+            "[[film.drive]]"
+        )
     nominal, card = film.plan.nominal, card_of(film.sensor(preset, **changes))
     side = min(_SIDE_PX, film.info.window_px or _SIDE_PX)
     windows = np.array([(w.u0_px, w.v0_px, w.u1_px, w.v1_px) for w in (film.window(int(k), side) for k in on)])

@@ -20,6 +20,7 @@ from phibench.datasets.film.film_show import picture
 from phibench.datasets.film.film_store import verify
 from phibench.datasets.film.film_video import read_frames, write_frames, write_mp4, write_videos
 from phibench.datasets.recipe.load import parse_recipe
+from phibench.estimator.film.film_frames import film_frames
 from phibench.render.film.key_views import PoseParts
 from phibench.render.optics.spot_layer import spot_layer
 from phibench.render.optics.truth import spot_truth
@@ -247,6 +248,8 @@ def test_a_film_of_a_driving_robot_has_views_along_its_way(tmp_path: Path) -> No
     # the room turns in the image: the last frame's differs from the first one's, and is smooth in between
     first, middle, last = (film.room(k) for k in (0, len(film) // 2, len(film) - 1))
     assert np.abs(last - first).mean() > np.abs(middle - first).mean() > 0.0
+    with pytest.raises(DatasetError, match="takes it to stand"):
+        film_frames(film)
     still = spot_truth(film.plan.scene.view_at(end["time_s"]), film.plan.scene.spot_at(end["time_s"]), ())
     assert (end["u_px"], end["v_px"], end["phi_ray_rad"]) == (still.u_px, still.v_px, still.phi_ray_rad)
 
