@@ -15,6 +15,7 @@ from phibench.estimator.film.film_bundle import expected_sigma_m, film_depth
 from phibench.estimator.film.film_estimates import bundle_depth, seen_film
 from phibench.estimator.film.film_frames import FilmFrames, held_out_chi2
 from phibench.estimator.film.film_positions import FilmPositions, fit_positions, stepped_positions
+from phibench.estimator.film.processed_film import processed_positions
 from phibench.estimator.film.recursive_filter import FilterState, first_state, updated
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
 from phibench.estimator.spots.raw_pixels import PixelNoise, bayer_filters, raw_electrons
@@ -281,3 +282,28 @@ def still_spot(camera: Sensor, seed: int) -> tuple[FilmPositions, Array]:
     np.testing.assert_allclose(stepped.uv_px, fit.uv_px, atol=1e-2)
     np.testing.assert_allclose(stepped.noise_px2, fit.noise_px2, atol=0.1 * fit.noise_px2.max())
     return fit, layer.centroid_uv_px
+
+
+@pytest.mark.slow
+def test_single_mjpeg_frames_have_the_claimed_errors() -> None:
+    """Three frames in motion, squared pulls with 6 degrees within 1e-5; places 0.3 px beside them are noticed."""
+    camera = sensor(
+        "mjpeg", exposure_s=FILM.times.exposure_s, readout_s=FILM.times.readout_s, prnu=0.0, jpeg_quality=90
+    )
+    box, chain = lights()[1].grown((720, 1280), (16, 16), (32, 32)), Chain(camera, 0)
+    images = []
+    for k, light in enumerate(lights()[0]):
+        shown = replace(light, laser_level=0.3 if k % 2 == 0 else 0.0)
+        images.append(chain.frame(shown, NoiseStream(("mjpeg", k)), box))
+    x, origin = np.stack(images), np.array([box.u0_px, box.v0_px])
+    parts = NUMBERS[::2], NUMBERS[1::2], x[::2], x[1::2], origin, told()[1][::2]
+    frames = FilmFrames(SCENE.rig, card_of(camera), FILM.times, FILM.carriage, told()[0], ENCODER_M, *parts)
+    found, offsets = processed_positions(frames, POINT, np.array([4, 5, 6]))
+    assert found.good.all()
+    times = np.array([spot_time_s(FILM, 2 * k) for k in (4, 5, 6)])
+    np.testing.assert_allclose(offsets, FILM.offset_m(times), atol=1e-6)
+    errors = found.uv_px - chief_uv_px(FILM, times)
+    limit = stats.chi2.ppf(1 - 1e-5, 6)
+    for beside, within in ((0.0, True), (0.3, False)):
+        pulls = [e @ np.linalg.solve(C, e) for e, C in zip(errors + beside, found.noise_px2, strict=True)]
+        assert (np.sum(pulls) < limit) == within
