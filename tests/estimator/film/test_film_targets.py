@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.target_films import CODE, RenderedRoom, staged
+from conftest import ROOT
+from helpers.target_films import CODE, RenderedRoom, rendered_rooms, staged
+from scipy import stats
 
 from phibench.datasets.film.film_read import open_films
 from phibench.datasets.frames.sensor_card import card_of
@@ -152,3 +154,28 @@ def test_what_cannot_be_found_is_said_in_one_sentence(film_images: Path, film_wi
     assert "was never seen in 10 frames" in rows[0].fault
     with pytest.raises(SceneError, match='view = "full"'):
         track_film(next(iter(open_films(film_windows))))
+
+
+@pytest.mark.study
+def test_locks_within_half_a_second_in_rooms_that_nothing_was_tuned_on(tmp_path: Path) -> None:
+    """75 films of 15 whole frames in twelve rooms: four targets of 10 sigma a frame, five other lights each."""
+    rooms = rendered_rooms((ROOT / "tests" / "target_rooms.toml").read_text(encoding="utf-8"), [0.0], tmp_path)
+    card = card_of(sensor("bayer-raw", exposure_s=1 / 60, readout_s=0.03))
+    frames, right, wrong = [], 0, 0
+    for number in range(300, 375):
+        film = staged(rooms[number % len(rooms)], ("target-test", number, "10.0", 5), 10.0, 5, 15, targets=4)
+        codes = [film.scene.code, *(one.code for one in film.scene.lights if one.is_target)]
+        named = [TargetCode(str(n), code) for n, code in enumerate(codes)]
+        tracker = track_targets(film.frames(), film.scene.rig, card, film.scene.times, named)
+        firsts = {hold.target: hold for hold in reversed(tracker.holds)}
+        for name, hold in firsts.items():
+            place = np.array(hold.track.uv_px[hold.locked - hold.track.first])
+            apart = np.linalg.norm(film.uv_px[:, hold.locked] - place, axis=1)
+            is_right = int(np.argmin(apart)) == int(name) and apart[int(name)] < 3.0
+            right, wrong = right + is_right, wrong + (not is_right)
+            frames.append(hold.locked + 1)
+    count = 4 * 75
+    low, high = stats.binomtest(right, count).proportion_ci(method="exact")
+    print(f"\nright {right} of {count} [{low:.1%}, {high:.1%}], wrong {wrong}, median {np.median(frames) / 30.0:.2f} s")
+    assert wrong <= 1  # 0.5 % of 300
+    assert right >= 0.97 * count
