@@ -4,6 +4,7 @@ State, in the rig's frame made level: the azimuth a, the rise k = (z - z0) / D a
 the height of the sphere centre at the down position; then the slip and the skid factor of the tracks, and the velocity
 of a target that moves, divided by D (modified polar coordinates, V. J. Aidala and S. E. Hammel, IEEE Trans. Automatic
 Control 28, 283, 1983). The robot's own place is no part of it: what odometry does not know moves the target.
+Constant states for the principal deviations of a rig that is not known exactly come last (`rig_bias`).
 
 A spot's pixel counts as the direction (azimuth, rise) of the ray that leaves the mirror. From a mirror raised by h the
 target's rise is k - h q but for the mirror's radius: nearly linear in the state, so that a filter stays consistent
@@ -26,6 +27,7 @@ from phibench.estimator.film.film_positions import FilmPositions
 from phibench.estimator.geometry.reflection import reflect, reflect_jacobian
 from phibench.estimator.geometry.sphere_image import SphereImager
 from phibench.estimator.geometry.triangulate import depth_exact
+from phibench.estimator.loop.rig_bias import RigBias
 from phibench.estimator.loop.sensing import Reading
 from phibench.scenes.frames import Array
 from phibench.scenes.motion.vehicle import PlanarPose, Stance, Vehicle, arc_covariance, rig_placement
@@ -35,6 +37,7 @@ from phibench.scenes.validation import SceneError
 PRIOR_DISTANCES_M = (0.8, 6.0)
 """Distances between which a target is expected before anything is known: ends of q at about 1.5 deviations."""
 _LEAST_Q = 0.02  # sigma points at 50 m and beyond count as there
+_WIDE = 2.0  # of the shift that the rig's deviations may have: the direction before the first one
 _ALPHA, _BETA, _KAPPA = 0.6, 2.0, 0.0  # of Merwe's sigma points: 1.3 deviations away for 5 states
 PLACE = 3  # first entries of the state
 SLIP, SKID = 3, 4
@@ -108,6 +111,8 @@ class TargetBelief:
         Density of the target's acceleration per axis; 0 is a target at rest.
     speed_m_per_s : float
         Standard deviation of the target's first velocity per axis.
+    bias : RigBias or None
+        Of the rig's deviations; None is an exact rig.
 
     Raises
     ------
@@ -124,16 +129,20 @@ class TargetBelief:
         distances_m: tuple[float, float] = PRIOR_DISTANCES_M,
         acceleration_m2_per_s3: float = 0.0,
         speed_m_per_s: float = 0.3,
+        bias: RigBias | None = None,
     ) -> None:
         self.rig, self.vehicle = rig, vehicle
+        self._bias = RigBias(rig, None) if bias is None else bias
         self._imager = SphereImager(rig)
         self._z0 = float(rig.at(0.0).sphere_centre_m[2])
         self._axis = np.array(rig.stroke_axis_world)
         self._acceleration, self._moves = acceleration_m2_per_s3, acceleration_m2_per_s3 > 0.0
-        n = 8 if self._moves else 5
+        of_target = 8 if self._moves else 5
+        n = of_target + self._bias.count
+        self._deviations = slice(of_target, n)
         near, far = distances_m
         q, spread = 0.5 * (1.0 / near + 1.0 / far), (1.0 / near - 1.0 / far) / 3.0
-        self._filter = _unscented(n, self._residual)
+        self._filter = _unscented(n, of_target, self._residual)
         x, P = np.zeros(n), np.zeros((n, n))
         # the direction's rise is k - h q, but for the radius: k goes with q
         x[:5] = first.azimuth_rad, first.rise + stroke_m * q, q, vehicle.slip, vehicle.skid
@@ -145,12 +154,19 @@ class TargetBelief:
         if self._moves:
             P[VELOCITY, VELOCITY] = (speed_m_per_s * q) ** 2 * np.eye(3)
         self._filter.x, self._filter.P = x, P
+        if self._bias.count:
+            # a wide direction, and then the first one: their correlation with the deviations is not linear
+            P[self._deviations, self._deviations] = np.eye(self._bias.count)
+            B = _WIDE * self._bias.shifts(self.point_m(x), stroke_m)
+            P[:2, :2] += B @ B.T
+            self.predict(0.0, 0.0, 0.0)
+            self.update(first, stroke_m)
 
     # -- what is believed ------------------------------------------------------------------------------------------
 
     @property
     def mean(self) -> Array:
-        """State, shape (5,) or (8,)."""
+        """State, shape (5,) or (8,), and as many more as the rig has deviations."""
         return np.asarray(self._filter.x)
 
     @property
@@ -190,13 +206,13 @@ class TargetBelief:
 
     def expected(self, stroke_m: float, held: Stance | None = None) -> tuple[float, float]:
         """Azimuth and rise at which the mean is seen."""
-        azimuth, rise = self._seen(self.mean, stroke_m, held)
+        azimuth, rise = self._seen(self.mean[np.newaxis], stroke_m, held)[0]
         return float(azimuth), float(rise)
 
     def pixel(self, stroke_m: float, held: Stance | None = None) -> tuple[float, float] | None:
         """Pixel at which the mean is seen; None where the mirror does not show it."""
-        image = self._imager.image(*self._lowered(self.mean, stroke_m, held).tolist())
-        return None if image is None else (image.u_px, image.v_px)
+        place = self._bias.pixel(self._standing(self.mean, held), stroke_m, self.mean[self._deviations])
+        return None if math.isnan(place[0]) else place
 
     # -- what changes it -------------------------------------------------------------------------------------------
 
@@ -210,13 +226,14 @@ class TargetBelief:
 
     def update(self, seen: Direction, stroke_m: float, held: Stance | None = None) -> None:
         """Take in a direction, after `predict`; `held` is the robot's attitude, level by default."""
-        self._filter.update(seen.values, R=seen.covariance, hx=lambda x: self._seen(x, stroke_m, held))
+        expected = iter(self._seen(self._filter.sigmas_f, stroke_m, held))
+        self._filter.update(seen.values, R=seen.covariance, hx=lambda _: next(expected))
         self._filter.P = 0.5 * (self._filter.P + self._filter.P.T)
         self._filter.x[2] = max(self._filter.x[2], _LEAST_Q)
 
     def distance2(self, seen: Direction, stroke_m: float, held: Stance | None = None) -> float:
         """Squared Mahalanobis distance of a direction from what is expected: chi squared of 2 for the target's own."""
-        values = np.array([self._seen(x, stroke_m, held) for x in self._filter.sigmas_f])
+        values = self._seen(self._filter.sigmas_f, stroke_m, held)
         values[:, 0] = [wrapped(a - seen.azimuth_rad) for a in values[:, 0]]
         values[:, 1] -= seen.rise
         mean = self._filter.Wm @ values
@@ -230,20 +247,27 @@ class TargetBelief:
         D = 1.0 / max(float(x[2]), _LEAST_Q)
         return np.array([D * math.cos(x[0]), D * math.sin(x[0]), self._z0 + D * x[1]])
 
-    def _seen(self, x: Array, stroke_m: float, held: Stance | None) -> Array:
-        """Direction of a state's image; its own where the mirror does not show it."""
-        lowered = self._lowered(x, stroke_m, held)
+    def _seen(self, states: Array, stroke_m: float, held: Stance | None) -> Array:
+        """Directions of the images of N states, shape (N, 2); their own where the mirror does not show them."""
+        if not self._bias.count:
+            return np.array([self._seen_exactly(x, stroke_m, held) for x in states])
+        points = np.array([self._standing(x, held) for x in states])
+        return self._bias.directions(points, stroke_m, states[:, self._deviations])
+
+    def _seen_exactly(self, x: Array, stroke_m: float, held: Stance | None) -> Array:
+        """Direction of a state's image in the nominal rig."""
+        lowered = self._standing(x, held) - stroke_m * self._axis
         image = self._imager.image(*lowered.tolist())
         d = lowered - np.array([0.0, 0.0, self._z0]) if image is None else np.array(image.ray)
         return np.array([math.atan2(d[1], d[0]), d[2] / math.hypot(d[0], d[1])])
 
-    def _lowered(self, x: Array, stroke_m: float, held: Stance | None) -> Array:
-        """Place of a state in the rig's frame, lowered by the stroke."""
+    def _standing(self, x: Array, held: Stance | None) -> Array:
+        """Place of a state in the rig's frame of the robot as it stands."""
         point = self.point_m(x)
         if held is not None:
             R, t = rig_placement(self.vehicle, PlanarPose(), held)
             point = (point + np.array([self.vehicle.sensor_x_m, 0.0, 0.0]) - t) @ R
-        return np.asarray(point - stroke_m * self._axis)
+        return np.asarray(point)
 
     def _moved(self, x: Array, left_m: float, right_m: float, step_s: float, about_rad: float) -> Array:
         """State after a step."""
@@ -289,13 +313,14 @@ class TargetBelief:
         return np.asarray(difference)
 
 
-def _unscented(n: int, residual_z: Any) -> Any:
-    """Filter of `filterpy` with n states and directions as measurements."""
+def _unscented(n: int, of_target: int, residual_z: Any) -> Any:
+    """Filter of `filterpy` with n states, some of them the target's, and directions as measurements."""
     try:
         from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
     except ImportError as error:
         raise SceneError("beliefs need filterpy: pip install 'phibench[loop]'") from error
-    points = MerweScaledSigmaPoints(n, _ALPHA, _BETA, _KAPPA)
+    alpha = _ALPHA * math.sqrt(of_target / n)  # sigma points are no farther away for more states
+    points = MerweScaledSigmaPoints(n, alpha, _BETA, _KAPPA)
     return UnscentedKalmanFilter(n, 2, 1.0, None, None, points, residual_z=residual_z, z_mean_fn=_direction_mean)
 
 

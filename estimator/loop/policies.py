@@ -19,6 +19,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from phibench.estimator.loop.belief import Direction, TargetBelief, direction_of
+from phibench.estimator.loop.rig_bias import RigBias
 from phibench.estimator.loop.sensing import Reading
 from phibench.estimator.loop.simulator import CODES, Action, Known, Observation, Simulator
 from phibench.scenes.frames import Array
@@ -93,6 +94,7 @@ class SearchingPolicy(abc.ABC):
 
     def __init__(self, known: Known) -> None:
         self.known = known
+        self._bias = RigBias(known.rig, known.rig_covariance)
         self.belief: TargetBelief | None = None
         self.observation: Observation
         self.exposure = _EXPOSURES[0]
@@ -146,7 +148,8 @@ class SearchingPolicy(abc.ABC):
         first = direction_of(self.known.rig, spot.u_px, spot.v_px, spot.sigma_px)
         if first is None:
             return False
-        self.belief = TargetBelief(self.known.rig, self.known.vehicle, first, self.observation.stroke_m)
+        rig, vehicle, stroke_m = self.known.rig, self.known.vehicle, self.observation.stroke_m
+        self.belief = TargetBelief(rig, vehicle, first, stroke_m, bias=self._bias)
         self.locked_step, self._missed = self.observation.step, 0
         self.locks, self._seen_stroke_m = self.locks + 1, self.observation.stroke_m
         return True

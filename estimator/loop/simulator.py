@@ -150,11 +150,12 @@ class Task:
 
 @dataclass(frozen=True)
 class Known:
-    """Knowledge of a policy: nominal vehicle and rig, and the task."""
+    """Knowledge of a policy: nominal vehicle and rig, the task, and the covariance of the rig; None is an exact rig."""
 
     vehicle: Vehicle
     rig: Rig
     task: Task
+    rig_covariance: Array | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)
@@ -168,6 +169,9 @@ class Setup:
         The nominal one, which policies know.
     misalignment : Misalignment
         Deviations of the true rig from it, which they do not know.
+    rig_covariance : shape (p, p), or None
+        Of such deviations, in the order of `rig_parameters.PARAMETERS`, which they know; None tells them that the rig
+        is exact.
     preset : str
         Sensor whose bound is the noise, or whose pixels are drawn.
     task : Task
@@ -189,6 +193,7 @@ class Setup:
     task: Task = field(default_factory=Task)
     arenas: tuple[Arena, ...] = ()
     fidelity: Fidelity = "exact"
+    rig_covariance: Array | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         if self.fidelity not in FIDELITIES:
@@ -205,7 +210,7 @@ class Setup:
     @property
     def known(self) -> Known:
         """Knowledge that policies may have."""
-        return Known(self.vehicle, self.rig, self.task)
+        return Known(self.vehicle, self.rig, self.task, self.rig_covariance)
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,22 @@ from functools import lru_cache
 
 import numpy as np
 
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, RIG_PARAMETERS
+from phibench.estimator.geometry.sphere_image import SphereImager
 from phibench.estimator.loop.belief import Direction, TargetBelief, direction_of
+from phibench.estimator.loop.rig_bias import RigBias
 from phibench.estimator.loop.sensing import SEEN, Light, Reading, Sensing
 from phibench.scenes.motion.vehicle import PlanarPose, Stance, Vehicle, rig_placement, stance
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
 
 RIG, VEHICLE = Rig(), Vehicle()
+OF_SPHERE = RIG_PARAMETERS[1:12]  # a perfect sphere has neither axis nor rim; the carriage is exact
+
+
+def rig_covariance(size: float) -> np.ndarray:
+    """Covariance of a rig whose errors are `size` times those of one that was built by hand."""
+    return np.diag([(size * PRIOR_SIGMA[name]) ** 2 if name in OF_SPHERE else 0.0 for name in PARAMETERS])
 
 
 @lru_cache(maxsize=1)
@@ -68,11 +77,27 @@ class Approach:
         self.pose = self.pose.after(VEHICLE.arc(*true, self.slip, self.skid))
 
 
-def stroked(run: Approach, to_m: float, frames: int, moving: float = 0.0) -> TargetBelief:
+@dataclass
+class MisalignedApproach(Approach):
+    """Run of a rig that differs from the nominal one, with a noise of 0.05 px."""
+
+    rig: Rig = RIG
+
+    def read(self) -> Reading | None:
+        R, t = rig_placement(VEHICLE, self.pose, self.held)
+        lowered = (self.point - t) @ R - self.stroke_m * np.array(self.rig.stroke_axis_world)
+        image = SphereImager(self.rig).image(*lowered.tolist())
+        if image is None:
+            return None
+        du, dv = 0.05 * self.rng.standard_normal(2)
+        return Reading(image.u_px + du, image.v_px + dv, 0.05, 1e4, SEEN)
+
+
+def stroked(run: Approach, to_m: float, frames: int, moving: float = 0.0, bias: RigBias | None = None) -> TargetBelief:
     """Belief after a stroke with frames on its way."""
     first = run.look()
     assert first is not None
-    belief = TargetBelief(RIG, VEHICLE, first, 0.0, acceleration_m2_per_s3=moving)
+    belief = TargetBelief(RIG, VEHICLE, first, 0.0, acceleration_m2_per_s3=moving, bias=bias)
     for k in range(frames):
         run.stroke_m = to_m * (k + 1) / frames
         step(run, belief, 0.0, 0.0)

@@ -6,13 +6,26 @@ import math
 
 import numpy as np
 import pytest
-from helpers.target_approach import RIG, VEHICLE, Approach, step, stroked
+from helpers.target_approach import (
+    OF_SPHERE,
+    RIG,
+    VEHICLE,
+    Approach,
+    MisalignedApproach,
+    rig_covariance,
+    step,
+    stroked,
+)
 from scipy.stats import chi2
 
 from phibench.estimator.geometry.mirror_image import image_of
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.loop.belief import PairTracker, TargetBelief, direction_of
+from phibench.estimator.loop.rig_bias import RigBias
 from phibench.scenes.frames import Array
+from phibench.scenes.misalignment import Misalignment
+from phibench.scenes.validation import SceneError
 
 RUNS = 24
 FALSE_ALARM = 1e-3  # of each band; the streams are fixed, so that a pass stays one
@@ -116,6 +129,60 @@ def test_a_lifted_robot_sees_the_same_place() -> None:
     belief.predict(0.0, 0.0, 0.1)
     assert belief.distance2(seen, run.stroke_m, run.held) < chi2.ppf(1 - 1e-4, 2)
     assert belief.distance2(seen, run.stroke_m) > 1e3  # as if the robot were level
+
+
+# -- rigs that are not known exactly -----------------------------------------------------------------------------------
+
+SIZE = 0.25  # of a rig as built by hand
+
+
+def approached(number: int, bias: RigBias | None) -> list[float]:
+    """NEES after a stroke and after a drive, with a rig that is drawn by the number."""
+    run = MisalignedApproach(number)
+    drawn = np.random.default_rng(number).standard_normal(len(OF_SPHERE))
+    values = {name: SIZE * PRIOR_SIGMA[name] * float(z) for name, z in zip(OF_SPHERE, drawn, strict=True)}
+    run.rig = RIG.perturbed(Misalignment(**values))
+    belief = stroked(run, 0.42, 3, bias=bias)
+    found = [belief.nees(run.place())]
+    for k in range(6):
+        step(run, belief, *((0.06, 0.06) if k % 3 else (0.04, 0.07)))
+    return [*found, belief.nees(run.place())]
+
+
+def test_a_belief_that_knows_how_well_its_rig_is_known_is_consistent() -> None:
+    """NEES in the band of the runs; without the covariance the same rigs give hundreds of times as much."""
+    bias, n = RigBias(RIG, rig_covariance(SIZE)), 6
+    low, high = band(n)
+    told = np.mean([approached(number, bias) for number in range(n)], axis=0)
+    assert np.all((low < told) & (told < high)), told
+    untold = np.mean([approached(number, None) for number in range(n)], axis=0)
+    assert np.all(untold > 100.0 * high)
+
+
+def test_shifts_are_those_of_a_deviated_rig() -> None:
+    """Exact for each theta, the stroke's axis included; the wrong sign would be twice the shift off."""
+    bias = RigBias(RIG, rig_covariance(1.0))
+    theta = np.random.default_rng(2).standard_normal(bias.count)
+    values = bias.deviations @ theta
+    rig = RIG.perturbed(Misalignment(**{n: float(v) for n, v in zip(PARAMETERS, values, strict=True) if v}))
+    point, h = np.array([1.5, 0.4, 0.9]), 0.3
+    pixels = [image_of(one.at(h), point).uv_px for one in (RIG, rig)]
+    seen = [direction_of(RIG, float(u), float(v), 0.1) for u, v in pixels]
+    assert seen[0] is not None
+    assert seen[1] is not None
+    assert np.all(np.abs(seen[1].values - seen[0].values) > 1e-3)
+    found = bias.directions(np.array([point, point]), h, np.array([theta, 0.0 * theta]))
+    assert found == pytest.approx(np.array([seen[1].values, seen[0].values]), abs=1e-9)
+    # differences over one standard deviation: second order, a tenth of the shift
+    assert bias.shifts(point, h) @ theta == pytest.approx(found[0] - found[1], rel=0.3)
+
+
+def test_an_exact_rig_adds_no_states_and_a_wrong_covariance_is_refused() -> None:
+    assert RigBias(RIG, None).count == RigBias(RIG, np.zeros((len(PARAMETERS),) * 2)).count == 0
+    with pytest.raises(SceneError, match="of shape"):
+        RigBias(RIG, np.eye(3))
+    with pytest.raises(SceneError, match="no negative eigenvalue"):
+        RigBias(RIG, rig_covariance(1.0) @ (np.ones((len(PARAMETERS),) * 2) - 0.5 * np.eye(len(PARAMETERS))))
 
 
 # -- moving targets ----------------------------------------------------------------------------------------------------
