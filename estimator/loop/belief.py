@@ -4,7 +4,7 @@ State, in the rig's frame made level: the azimuth a, the rise k = (z - z0) / D a
 the height of the sphere centre at the down position; then the slip and the skid factor of the tracks, and the velocity
 of a target that moves, divided by D (modified polar coordinates, V. J. Aidala and S. E. Hammel, IEEE Trans. Automatic
 Control 28, 283, 1983). The robot's own place is no part of it: what odometry does not know moves the target.
-Constant states for the principal deviations of a rig that is not known exactly come last (`rig_bias`).
+Constant states for the principal deviations of a rig that is not known exactly come last (`RigBias`).
 
 A spot's pixel counts as the direction (azimuth, rise) of the ray that leaves the mirror. From a mirror raised by h the
 target's rise is k - h q but for the mirror's radius: nearly linear in the state, so that a filter stays consistent
@@ -25,9 +25,9 @@ import numpy as np
 
 from phibench.estimator.film.film_positions import FilmPositions
 from phibench.estimator.geometry.reflection import reflect, reflect_jacobian
+from phibench.estimator.geometry.rig_parameters import RigBias
 from phibench.estimator.geometry.sphere_image import SphereImager
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.estimator.loop.rig_bias import RigBias
 from phibench.estimator.loop.sensing import Reading
 from phibench.scenes.frames import Array
 from phibench.scenes.motion.vehicle import PlanarPose, Stance, Vehicle, arc_covariance, rig_placement

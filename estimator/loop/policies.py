@@ -18,8 +18,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from phibench.estimator.geometry.rig_parameters import RigBias
 from phibench.estimator.loop.belief import Direction, TargetBelief, direction_of
-from phibench.estimator.loop.rig_bias import RigBias
 from phibench.estimator.loop.sensing import Reading
 from phibench.estimator.loop.simulator import CODES, Action, Known, Observation, Simulator
 from phibench.scenes.frames import Array

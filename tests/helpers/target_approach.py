@@ -9,10 +9,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, RIG_PARAMETERS
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, RIG_PARAMETERS, RigBias
 from phibench.estimator.geometry.sphere_image import SphereImager
 from phibench.estimator.loop.belief import Direction, TargetBelief, direction_of
-from phibench.estimator.loop.rig_bias import RigBias
 from phibench.estimator.loop.sensing import SEEN, Light, Reading, Sensing
 from phibench.scenes.motion.vehicle import PlanarPose, Stance, Vehicle, rig_placement, stance
 from phibench.scenes.random_streams import generator

@@ -19,10 +19,9 @@ from helpers.target_approach import (
 from scipy.stats import chi2
 
 from phibench.estimator.geometry.mirror_image import image_of
-from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA
+from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, RigBias
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.loop.belief import PairTracker, TargetBelief, direction_of
-from phibench.estimator.loop.rig_bias import RigBias
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.validation import SceneError
