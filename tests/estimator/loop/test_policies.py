@@ -188,7 +188,7 @@ def test_rigs_whose_covariance_is_stated(capsys, size: float) -> None:
     A rig is shared by episodes, so that few pulls are independent: their rms below 2 is required, not 0.9 to 1.1.
     """
     rows = []
-    for number in range(12):
+    for number in range(20):
         setup = Setup(misalignment=misaligned(size, number % 4), rig_covariance=rig_covariance(size))
         rows += [replace(one, number=number) for one in run_episodes(setup, "paper", 1, STREAM, number)]
     found = summary(rows)
