@@ -335,7 +335,17 @@ class TargetTracker:
         rows = box.v0_px + np.arange(box.height_px, dtype=float)
         frames = self.frame - count + 1 + np.arange(count, dtype=float)
         times = self.times.row_s(frames[:, None], rows)
-        self.tracker.follow(code.code.mean_level(times, self.times.exposure_s))
+        earlier = self.tracker.follow(code.code.mean_level(times, self.times.exposure_s))
+        for track in self.tracker.live:
+            if track.number in earlier and track.number not in state.began:
+                self._choose_start(state, track, earlier[track.number])
+
+    def _choose_start(self, state: _Search, track: SpotTrack, before: int) -> None:
+        """Leave the frames out that a track has got, if they speak against the code: something may have hidden it."""
+        longer = self.evidence(state, track).log_odds
+        state.began[track.number] = before
+        if self.evidence(state, track).log_odds <= longer:
+            del state.began[track.number]
 
     def _may_lock(self, state: _Search, track: SpotTrack) -> bool:
         """Quick look: frames enough for a lock, and light that changes by more than its noise."""

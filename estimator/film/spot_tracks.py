@@ -249,8 +249,9 @@ class SpotTrack:
 
     @property
     def seen_frames(self) -> NDArray[np.int64]:
-        """Numbers of the frames in which the spot was detected."""
-        return self.frames[np.array(self.detected)]
+        """Numbers of the frames in which the spot was detected and its pixels kept: not those before `follow`."""
+        seen = self.frames[np.array(self.detected)]
+        return seen[len(seen) - len(self.windows) :]
 
     @property
     def dark(self) -> int:
@@ -273,6 +274,16 @@ class SpotTrack:
         self.electrons.append(electrons)
         self.sigma_e.append(sigma_e)
         self.detected.append(detected)
+
+    def measured_again(self, start: int, uv_px: Array, light: Array) -> None:
+        """Replace place and light of the frames from `start` to the latest; `light` has shape (2, frames)."""
+        place = (float(uv_px[0]), float(uv_px[1]))
+        if (more := self.first - start) > 0:
+            self.first = start
+            self.detected[:0] = [False] * more
+        kept = start - self.first
+        self.uv_px[kept:] = [place] * light.shape[1]
+        self.electrons[kept:], self.sigma_e[kept:] = light[0].tolist(), light[1].tolist()
 
 
 class SpotTracker:
@@ -341,19 +352,32 @@ class SpotTracker:
             self.live.append(track)
             self._count += 1
 
-    def follow(self, levels: Array) -> None:
-        """Begin tracks where the light of the latest frames follows a code; `levels` as for `FrameSearch.following`."""
-        frames = list(self._before)[-len(levels) :]
+    def follow(self, levels: Array) -> dict[int, int]:
+        """Tracks where the light of the latest frames follows a code; `levels` as for `FrameSearch.following`.
+
+        A track that is there already is measured again in these frames, at the place that all of them give: on an edge
+        of the room its own place may have wandered, and what it measured with it. Returned are the tracks that now
+        begin earlier, and the frames in which they began before.
+        """
+        frames, earlier = list(self._before)[-len(levels) :], {}
+        start = self.frame - len(frames) + 1
         for uv in self.search.following(frames, levels):
-            if any(np.linalg.norm(np.array(one.place_px) - uv) < _SAME_PX for one in self.live):
+            near = [one for one in self.live if np.linalg.norm(np.array(one.place_px) - uv) < _SAME_PX]
+            light = np.concatenate([self.search.light(planes, uv) for planes in frames], axis=1)
+            if near:
+                for track in near:
+                    if track.first > start:
+                        earlier[track.number] = track.first
+                    track.measured_again(start, uv, light)
+                    track.motion = _motion(uv)
                 continue
-            track = SpotTrack(self._count, self.frame - len(frames) + 1, _motion(uv))
-            for planes in frames:
-                electrons, sigma_e = self.search.light(planes, uv)
-                track.put(uv, float(electrons[0]), float(sigma_e[0]), bool(electrons[0] > LEAST_Z * sigma_e[0]))
+            track = SpotTrack(self._count, start, _motion(uv))
+            for electrons, sigma_e in light.T:
+                track.put(uv, float(electrons), float(sigma_e), bool(electrons > LEAST_Z * sigma_e))
             track.detected[-1] = True
             self.live.append(track)
             self._count += 1
+        return earlier
 
     @property
     def kept(self) -> int:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -340,25 +340,33 @@ def film_beliefs(
     distances_m: tuple[float, float] = PRIOR_DISTANCES_M,
     acceleration_m2_per_s3: float = 0.0,
     speed_m_per_s: float = 0.3,
+    encoder_sigma_m: float = 0.0,
 ) -> Iterator[tuple[int, TargetBelief]]:
     """Belief after each frame of a film of a robot that stands: its number, and the belief, which goes on changing.
 
     Parameters
     ----------
     positions : FilmPositions
-        In N frames, those of `film.spot_tracks.fitted_positions`; frames without one are left out.
+        In N frames, those of `film.film_estimates.seen_film`, which takes the room off by frames with the laser off,
+        or of `film.spot_tracks.fitted_positions`; frames without one are left out.
     times_s, strokes_m : shape (N,)
         Time at which the spot's row was exposed, and the encoder's reading then.
     distances_m, acceleration_m2_per_s3, speed_m_per_s
         As for `TargetBelief`.
+    encoder_sigma_m : float
+        Standard deviation of a reading: the rise is k - h q, and errs by as much as q times that.
     """
     belief, before = None, 0.0
-    shared = np.einsum("nini->ni", positions.shared_px2)  # of the fixed pattern, as if new in every frame
+    q = 0.5 * sum(1.0 / D for D in distances_m)
+    # what frames share, as if new in every frame: the sum over all frames is no less than it, by Gershgorin's theorem
+    shared = np.abs(positions.shared_px2[:, :, positions.good]).sum(axis=(2, 3))
     for k in np.flatnonzero(positions.good):
         noise = positions.noise_px2[k] + np.diag(shared[k])
         seen = direction_with(rig, float(positions.uv_px[k, 0]), float(positions.uv_px[k, 1]), noise)
         if seen is None:
             continue
+        q = q if belief is None else float(belief.mean[2])
+        seen = replace(seen, covariance=seen.covariance + np.diag([0.0, (q * encoder_sigma_m) ** 2]))
         if belief is None:
             belief = TargetBelief(
                 rig, vehicle, seen, float(strokes_m[k]), distances_m, acceleration_m2_per_s3, speed_m_per_s

@@ -32,6 +32,7 @@ from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError
 
 BIT_S = 1 / 30
+FILMS = range(400, 475)  # development looked at films below 375 of the same rooms
 TIMES = FilmTimes(15, 30.0, 1 / 60, 0.030, 720)
 
 
@@ -157,12 +158,18 @@ def test_what_cannot_be_found_is_said_in_one_sentence(film_images: Path, film_wi
 
 
 @pytest.mark.study
-def test_locks_within_half_a_second_in_rooms_that_nothing_was_tuned_on(tmp_path: Path) -> None:
-    """75 films of 15 whole frames in twelve rooms: four targets of 10 sigma a frame, five other lights each."""
-    rooms = rendered_rooms((ROOT / "tests" / "target_rooms.toml").read_text(encoding="utf-8"), [0.0], tmp_path)
+def test_locks_within_half_a_second_in_rooms_that_nothing_was_tuned_on(pytestconfig: pytest.Config) -> None:
+    """75 films of 15 whole frames in twelve rooms: four targets of 10 sigma a frame, five other lights each.
+
+    The rooms' light takes ten minutes and is kept; `--cache-clear` renders it anew.
+    """
+    assert pytestconfig.cache is not None
+    kept = pytestconfig.cache.mkdir("target-rooms")
+    rooms = rendered_rooms((ROOT / "tests" / "target_rooms.toml").read_text(encoding="utf-8"), [0.0], kept)
     card = card_of(sensor("bayer-raw", exposure_s=1 / 60, readout_s=0.03))
-    frames, right, wrong = [], 0, 0
-    for number in range(300, 375):
+    frames: list[int] = []
+    right = wrong = 0
+    for number in FILMS:
         film = staged(rooms[number % len(rooms)], ("target-test", number, "10.0", 5), 10.0, 5, 15, targets=4)
         codes = [film.scene.code, *(one.code for one in film.scene.lights if one.is_target)]
         named = [TargetCode(str(n), code) for n, code in enumerate(codes)]
@@ -174,8 +181,11 @@ def test_locks_within_half_a_second_in_rooms_that_nothing_was_tuned_on(tmp_path:
             is_right = int(np.argmin(apart)) == int(name) and apart[int(name)] < 3.0
             right, wrong = right + is_right, wrong + (not is_right)
             frames.append(hold.locked + 1)
-    count = 4 * 75
+        print(
+            number, {name: firsts[name].locked if name in firsts else None for name in "0123"}, right, wrong, flush=True
+        )
+    count = 4 * len(FILMS)
     low, high = stats.binomtest(right, count).proportion_ci(method="exact")
     print(f"\nright {right} of {count} [{low:.1%}, {high:.1%}], wrong {wrong}, median {np.median(frames) / 30.0:.2f} s")
     assert wrong <= 1  # 0.5 % of 300
-    assert right >= 0.97 * count
+    assert right >= 0.99 * count
