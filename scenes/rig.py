@@ -146,10 +146,16 @@ class Rig:
     def _check_revolved(self, mirror: RevolvedMirror) -> None:
         """Raise `SceneError` if the lens is inside the mirror or behind its rim."""
         lens = self.T_camera_sphere.inverse().t
-        if self.T_camera_sphere.translation_m[2] <= 0.0 or mirror.profile.holds(lens + [0.0, 0.0, mirror.reach_m]):
+        ahead_m = self.T_camera_sphere.translation_m[2]
+        if mirror.profile.holds(lens + [0.0, 0.0, mirror.reach_m]):
             raise SceneError(
-                f"Rig.T_camera_sphere: the lens is inside the mirror, whose vertex is at "
-                f"{self.T_camera_sphere.translation_m[2]:.4f} m in front of it; put the vertex farther away"
+                f"Rig.T_camera_sphere: the lens is inside the mirror, whose vertex is at {ahead_m:.4f} m in front of "
+                "it; put the vertex farther away"
+            )
+        if ahead_m <= 0.0:
+            raise SceneError(
+                f"Rig.T_camera_sphere: the mirror's vertex is at {ahead_m:.4f} m in front of the lens; it must be "
+                "above 0: put the vertex farther away"
             )
         if not lens[2] < mirror.profile.depth_m - mirror.reach_m:
             raise SceneError("Rig.T_camera_sphere: the lens is behind the mirror's rim; turn the mirror towards it")

@@ -31,8 +31,9 @@ from phibench.render.room.lamp_light import FIRST_RAYS
 from phibench.render.room.light_map import fixed_shapes, texel_count
 from phibench.render.room.texel_grid import TexelGrid
 from phibench.scenes.faces import face_table
+from phibench.scenes.frames import Array
 from phibench.scenes.revolved_mirror import RevolvedMirror
-from phibench.scenes.rig import POSITIONS
+from phibench.scenes.rig import POSITIONS, Rig
 from phibench.scenes.room import Room
 
 Light = Literal["baked", "cached", "none"]
@@ -374,10 +375,30 @@ def rim_lines(plan: Plan, pairs: Iterable[PairForecast]) -> list[str]:
     ]
     if not hidden:
         return []
+    one = next(pair for pair in plan.pairs if pair.sample_id == hidden[0])
+    if cause := _below_cone(plan.rigs[one.rig], np.array(plan.spots[one.spot].position_world_m)):
+        return [f"{NO_REFLECTION} and {EDGE} of {hidden[0]}: {cause}"]
     return [
         f"{NO_REFLECTION} and {EDGE} of {hidden[0]}: the mirror ends at its rim, before the place that would show the "
         "spot; put the spot nearer to the mirror's height or farther away, or make rim_radius_m of [rig.mirror] larger"
     ]
+
+
+def _below_cone(rig: Rig, point_world_m: Array) -> str:
+    """Sentence if a cone shows a point at no size: its side turns a ray along the axis by twice the half angle."""
+    if not isinstance(rig.mirror, RevolvedMirror) or rig.mirror.profile.shape != "cone":
+        return ""
+    half_angle = np.arctan(np.sqrt(-1.0 - rig.mirror.profile.conic))
+    least = np.degrees(np.pi - 2.0 * half_angle)
+    away = point_world_m - rig.at(0.0).sphere_centre_m
+    theta = np.degrees(np.arctan2(np.hypot(away[0], away[1]), -away[2]))
+    if theta >= least:
+        return ""
+    return (
+        f"a cone of {np.degrees(half_angle):.0f} degrees shows nothing less than {least:.0f} degrees from straight "
+        f"down, whatever its rim, and the spot is at {theta:.1f}; raise the spot, or make half_angle_deg of "
+        "[rig.mirror] larger"
+    )
 
 
 def _traced(plan: Plan, pairs: Iterable[PairPlan]) -> Iterator[PairForecast]:

@@ -19,6 +19,9 @@ inside.
 
 At the tip of a cone the path has a kink, where the search in the half-plane may end, and no second derivatives. What is
 lost there begins again, one Newton step from the tip along the side on which the path falls most (`_beside_tip`).
+
+That the place is the only one does not say that Newton's steps reach it. For points within millimetres of the mirror
+they may not; what is lost there begins again where a careful descent ends (`_descended`).
 """
 
 from __future__ import annotations
@@ -36,6 +39,8 @@ _EQUATOR = 0.999999
 _LONGEST = 0.3  # step, in rim radii
 _CLOSE = 1e-9  # of the rim's radius: the step after that would be its square
 _FOUND = 1e-6
+_BESIDE = 4.0  # rim radii from the vertex: points that are lost nearer than this are looked for by `_descended`
+_DESCENTS, _HALVINGS = 60, 40
 _MANY, _NEAR = 32, 0.05  # pairs, and their extent over their distance, that start together
 Surface = Profile | FormedProfile
 _START = 1e-6  # of the rim's radius: where the search in the half-plane ends; the one in two coordinates goes on
@@ -72,7 +77,46 @@ def revolved_points(points_m: Array, eyes_m: Array, surface: Surface) -> tuple[A
         if len(rest) and isinstance(surface, Profile) and surface.shape == "cone":  # a cone bears no form error
             ends = points_m[rest], eyes_m[rest]
             P[rest], N[rest], valid[rest] = _search(_beside_tip(*ends, surface), *ends, surface)
+        rest = np.flatnonzero(~valid & (np.linalg.norm(points_m, axis=1) < _BESIDE * surface.rim_radius_m))
+        if len(rest):
+            ends = points_m[rest], eyes_m[rest]
+            P[rest], N[rest], valid[rest] = _search(_descended(*ends, surface), *ends, surface)
     return P, N, valid
+
+
+def _descended(points_m: Array, eyes_m: Array, surface: Surface) -> Array:
+    """Places (x, y) near the least path, shape (N, 2), for points beside the mirror.
+
+    There the path bends within millimetres, and Newton's steps may leave its basin. Here a step is taken only if the
+    path becomes shorter, and goes down the slope where the path has no upward bend.
+    """
+    rim = surface.rim_radius_m
+    xy = _start(points_m, eyes_m, surface)
+    foot = points_m[:, :2] * np.minimum(1.0, rim / np.maximum(np.hypot(*points_m[:, :2].T), rim))[:, None]
+    xy = np.where(np.isfinite(xy), xy, foot)
+
+    def length(xy: Array) -> Array:
+        P = np.concatenate([xy, surface.heights(*xy.T).z_m[:, None]], axis=-1)
+        total = sum(np.linalg.norm(P - end, axis=-1) for end in (points_m, eyes_m))
+        return np.where(np.hypot(*xy.T) <= _BEYOND * rim, np.nan_to_num(total, nan=np.inf), np.inf)
+
+    now = length(xy)
+    for _ in range(_DESCENTS):
+        (g_x, g_y), (h_xx, h_xy, h_yy), _ = _path(xy, points_m, eyes_m, surface)
+        g = np.stack([g_x, g_y], axis=-1)
+        bends_up = (h_xx > 0.0) & (h_xx * h_yy > h_xy * h_xy)
+        down = -g * (_LONGEST * rim / np.maximum(np.linalg.norm(g, axis=-1), 1e-300))[:, None]
+        move = np.where(bends_up[:, None], _newton(xy, points_m, eyes_m, surface), down)
+        for _ in range(_HALVINGS):
+            new = length(xy + move)
+            if not (longer := new > now).any():
+                break
+            move = np.where(longer[:, None], 0.5 * move, move)
+        better = new < now
+        xy, now = np.where(better[:, None], xy + move, xy), np.where(better, new, now)
+        if not better.any():
+            break
+    return xy
 
 
 def _beside_tip(points_m: Array, eyes_m: Array, profile: Profile) -> Array:

@@ -323,6 +323,10 @@ def test_the_preview_says_what_to_do_about_a_spot_that_a_rim_hides(tmp_path: Pat
         )
         told = make.dry_run(recipe, tmp_path / "data")
         assert told.count("of seen-near-h0.500: the mirror ends at its rim") == lines
+    recipe.write_text(text.replace("hyperboloid", "cone"))
+    assert "a cone of 45 degrees shows nothing less than 90 degrees from straight down" in make.dry_run(
+        recipe, tmp_path / "data"
+    )
 
 
 @pytest.mark.usefixtures("inline")
