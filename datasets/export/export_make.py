@@ -220,7 +220,7 @@ def _check_folder(out: Path, dataset: Path) -> None:
     if where == dataset.resolve() or dataset.resolve() in where.parents:
         raise DatasetError(f"{out} lies inside the data set, whose files are signed: give a folder outside, `--out`")
     if out.is_dir() and not (out / INFO).is_file() and any(not path.name.startswith(".") for path in out.iterdir()):
-        raise DatasetError(f"{out} holds other files: give an empty folder, `--out`")
+        raise DatasetError(f"{out} holds other files: give an empty folder, `--out FOLDER`")
 
 
 def _claim(out: Path, dataset: Dataset, request: ExportRequest) -> None:
@@ -233,7 +233,8 @@ def _claim(out: Path, dataset: Dataset, request: ExportRequest) -> None:
     path = out / INFO
     if path.is_file():
         held = InputFile(path, "give another folder, `--out FOLDER`").json()
-        if other := [name for name in meant if held.get(name) != meant[name]]:
+        words = {"form": "--to"}
+        if other := [words.get(name, name) for name in meant if held.get(name) != meant[name]]:
             raise DatasetError(
                 f"{out} holds an export with another {', '.join(other)}: give another folder, `--out FOLDER`"
             )

@@ -257,7 +257,7 @@ def verdict(found: Alignment) -> str:
         else "mirror off centre: move it"
     )
     outline = found.outline
-    by_edge = "; by the edge in the picture alone: its light is not that of polished steel" if outline.by_edge else ""
+    by_edge = "; by the edge in the picture alone: the light beside it did not fit" if outline.by_edge else ""
     return (
         f"{mark} ({off:.1f} standard deviations); outline residual {outline.shift_rms_px:.2f} px rms over "
         f"{100.0 * outline.arc:.0f} % of it{by_edge}"

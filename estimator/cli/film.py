@@ -190,9 +190,13 @@ def track(
 
     missed = 0
     heads = ("lock s", "u px", "v px", "off px", "lost", "lights")
-    print(f"{'film':32s} {'target':12s} " + " ".join(f"{head:>8s}" for head in heads))
+    head = f"{'film':32s} {'target':12s} " + " ".join(f"{head:>8s}" for head in heads)
     for one in open_films(directory):
-        for row in found_rows(one, track_film(one, preset, draw, camera_seed, phase == "known")):
+        rows = found_rows(one, track_film(one, preset, draw, camera_seed, phase == "known"))
+        if head:
+            print(head)  # not before a film that can be searched
+        head = ""
+        for row in rows:
             missed += row.fault != ""
             if row.fault:
                 print(f"{one.info.film:32s} {row.target:12s} {row.fault}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import math
 import multiprocessing
 import runpy
@@ -174,6 +175,8 @@ class PolicyFile:
             )
         if not Path(path).is_file():
             raise SceneError(f"policy '{text}': there is no file {path}; give the path of a Python file")
+        if name not in (there := _names(Path(path))):
+            raise SceneError(f"policy '{text}': {Path(path).name} has no {name}; {nearest(name, sorted(there))}")
         return cls(Path(path).resolve(), name)
 
     def __call__(self, known: Known) -> Policy:
@@ -185,6 +188,30 @@ class PolicyFile:
         if not callable(getattr(policy, "act", None)):
             raise SceneError(f"{self.name} gave {type(policy).__name__}, which has no function act(observation)")
         return cast(Policy, policy)
+
+
+def _names(path: Path) -> set[str]:
+    """Names that a Python file defines or imports; it is read, not run.
+
+    Raises
+    ------
+    SceneError
+        If it is no Python.
+    """
+    try:
+        tree = ast.parse(path.read_bytes())
+    except (SyntaxError, ValueError) as error:
+        raise SceneError(f"{path} is no Python file: {error}") from error
+    found: set[str] = set()
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            found |= {alias.asname or alias.name for alias in node.names}
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            found |= {target.id for target in targets if isinstance(target, ast.Name)}
+    return found
 
 
 class PolicyProcess:

@@ -152,7 +152,7 @@ class FilmScene:
             raise SceneError("FilmScene.path: the spot of a beam stays where its beam ends; give a spot without beam")
         if self.code.duration_s > self.times.duration_s * (1.0 + 1e-9):
             raise SceneError(
-                f"FilmScene.code takes {self.code.duration_s:g} s and the film {self.times.duration_s:g} s: a film "
+                f"the code takes {self.code.duration_s:g} s and the film {self.times.duration_s:g} s: a film "
                 "must hold the whole code; give more frames or a shorter code"
             )
         for light in self.lights:

@@ -151,10 +151,15 @@ def test_policies_of_files_are_named_in_one_sentence(tmp_path) -> None:
         "class P:\n    act = staticmethod(lambda seen: None)\nmake = lambda known: P()\nthree = lambda known: 3\n"
     )
     assert PolicyFile.of(f"{file}:make")(Setup().known).act(None) is None
-    for text, words in ((f"{file}:three", "gave int"), (f"{file}:other", "no function other")):
-        with pytest.raises(SceneError, match=words):
-            PolicyFile.of(text)(Setup().known)
-    for text, words in ((f"{file}", "give FILE.py:NAME"), ("nowhere.py:make", "no file nowhere.py")):
+    with pytest.raises(SceneError, match="gave int"):
+        PolicyFile.of(f"{file}:three")(Setup().known)
+    (tmp_path / "broken.py").write_text("def make(known)\n")
+    for text, words in (
+        (f"{file}", "give FILE.py:NAME"),
+        ("nowhere.py:make", "no file nowhere.py"),
+        (f"{file}:mke", r"mine.py has no mke; did you mean 'make'\? known: P, make, three"),
+        (f"{tmp_path / 'broken.py'}:make", "is no Python file"),
+    ):
         with pytest.raises(SceneError, match=words):
             PolicyFile.of(text)
 
