@@ -60,7 +60,7 @@ class MirrorTable(Table):
         return {key: value for key, value in document.items() if not key.startswith("tilt_") or value}
 
     shape: Literal["ellipsoid", "paraboloid", "hyperboloid", "cone", "polynomial"] = Field(
-        description="surface; z_c_m leads to its vertex; for a sphere leave the table out"
+        description="surface at z_c_m; a sphere needs no table"
     )
     rim_radius_m: float = Field(default=0.060, gt=0.0, le=1.0, description="radius of the rim, where the mirror ends")
     vertex_radius_m: float | None = Field(
