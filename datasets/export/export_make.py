@@ -20,7 +20,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.export.containers import image_name, shard_name, write_shard
 from phibench.datasets.export.dataset_card import LICENSE_TEXT, card, croissant
 from phibench.datasets.export.pair_rows import INDEX, SPLITS, ExportRequest, drawn_pair, pair_key, pair_table, splits
-from phibench.datasets.exposures.draw import sample_key
+from phibench.datasets.exposures.draw import require_outside, sample_key
 from phibench.datasets.frames.request import whole_number
 from phibench.datasets.frames.source import FrameSource, has_place
 from phibench.datasets.input_files import InputFile
@@ -214,11 +214,7 @@ def _write_rows(out: Path, rows: Iterable[ShardRow]) -> None:
 
 
 def _check_folder(out: Path, dataset: Path) -> None:
-    where = out.resolve()
-    if out.exists() and not out.is_dir():
-        raise DatasetError(f"{out} is a file: give a folder, `--out`")
-    if where == dataset.resolve() or dataset.resolve() in where.parents:
-        raise DatasetError(f"{out} lies inside the data set, whose files are signed: give a folder outside, `--out`")
+    require_outside(out, dataset)
     if out.is_dir() and not (out / INFO).is_file() and any(not path.name.startswith(".") for path in out.iterdir()):
         raise DatasetError(f"{out} holds other files: give an empty folder, `--out FOLDER`")
 

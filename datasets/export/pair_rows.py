@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.frames.frame_files import suffix
+from phibench.datasets.frames.frame_files import png_bytes, suffix
 from phibench.datasets.frames.request import FrameRequest, whole_number
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset
@@ -112,8 +112,6 @@ def pair_key(sample_id: str, draw: int) -> str:
 
 def drawn_pair(source: FrameSource, row: ManifestRow, draw: int, request: ExportRequest) -> DrawnPair:
     """Draw one pair."""
-    from phibench.datasets.frames.frame_files import png_bytes
-
     images: dict[str, bytes] = {}
     added: dict[str, float | int | str] = {"draw": draw, "preset": request.frames.preset}
     for column, position, laser in request.images:

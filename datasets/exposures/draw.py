@@ -259,12 +259,23 @@ def _jobs(
     return jobs, notes
 
 
-def _check_folder(out: Path, dataset: Path) -> None:
+def require_outside(out: Path, dataset: Path) -> None:
+    """Refuse to write into a data set, or over a file.
+
+    Raises
+    ------
+    DatasetError
+        In one sentence.
+    """
     where = out.resolve()
     if out.exists() and not out.is_dir():
         raise DatasetError(f"{out} is a file: give a folder, `--out`")
     if where == dataset.resolve() or dataset.resolve() in where.parents:
         raise DatasetError(f"{out} lies inside the data set, whose files are signed: give a folder outside, `--out`")
+
+
+def _check_folder(out: Path, dataset: Path) -> None:
+    require_outside(out, dataset)
     if (out / schema.INFO).exists():
         raise DatasetError(f"{out} is a data set: give a folder of its own for the frames, `--out`")
 
