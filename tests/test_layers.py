@@ -247,7 +247,7 @@ def write(root: Path, path: str, source: str) -> None:
 
 
 def test_the_tree_has_few_large_rooms() -> None:
-    """At most 350 files, at most 16 in a folder, no file name twice (but for the fixed roles of a study).
+    """At most 375 files, at most 16 in a folder, no file name twice (but for the fixed roles of a study).
 
     There were 212 before rooms could be generated, measured and made of meshes, 243 before recipes had all three,
     255 before the mirror had a holder: what it is, and the light between the two, and 257 before that could be glass.
@@ -255,10 +255,11 @@ def test_the_tree_has_few_large_rooms() -> None:
     275 before sets of those could be imported, calibrated with and scored; 285 before mirrors were other than spheres;
     288 before a study compared them; 292 before anything moved: the carriage, films, vehicle and loop;
     335 before the robot drove in films, found its target among others, and was studied;
-    345 before pairs were exported for other tools and training.
+    345 before pairs were exported for other tools and training;
+    350 before the benchmark was released, fetched, learned from and shown on pages.
     """
     files = [file.relative_to(ROOT) for file in sources(ROOT)]
-    assert len(files) <= 350
+    assert len(files) <= 375
     folders = Counter(file.parent for file in files)
     assert {str(folder): n for folder, n in folders.items() if n > 16} == {}
     stems = Counter(file.stem for file in files if file.parts[1] not in ("studies", "cli"))
