@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.request import FrameRequest, in_one_sentence, whole_number
+from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.datasets.frames.source import FrameSource
 from phibench.datasets.read import Dataset, open_finished
 from phibench.datasets.store.layers import SpotWindow
@@ -135,12 +136,44 @@ class CropSettings:
         return -(-(self.side_px + 2 * _MARGIN_PX + PERIOD_PX) // PERIOD_PX) * PERIOD_PX
 
 
+@dataclass(frozen=True, eq=False)
+class Crop:
+    """One crop about a spot.
+
+    Attributes
+    ----------
+    image : array
+        As `Frame.image`.
+    image_off : array or None
+        The same with the laser off, from another exposure of the same camera.
+    uv_px : shape (2,)
+        True image of the spot's centre in the crop.
+    phase_px : shape (2,)
+        Column and row of the crop's first pixel on the sensor, modulo 16.
+    card : SensorCard
+        Numbers of the sensor, with the exposure that was chosen.
+    sample_id, position, preset : str
+    laser_level : float
+        Factor of the spot's light.
+    """
+
+    image: NDArray[Any]
+    image_off: NDArray[Any] | None
+    uv_px: Array
+    phase_px: NDArray[np.int64]
+    card: SensorCard
+    sample_id: str
+    position: str
+    preset: str
+    laser_level: float
+
+
 class SpotCrops:
     """Crops about the spots of data sets, at every phase of pixel, mosaic and JPEG unit.
 
     Item k is a dict: "image" as `Frame.image`; "uv_px", shape (2,), the true image of the spot's centre in the crop;
     "phase_px", shape (2,), column and row of the crop's first pixel on the sensor, modulo 16; "sample_id" and
-    "position" of the spot; "laser_level"; "preset".
+    "position" of the spot; "laser_level"; "preset"; "image_off" where asked for. `crop` gives the same as a `Crop`.
 
     The light of a spot and of what surrounds it is that of the data set. It is moved over the sensor as a whole, by
     whole pixels, and the spot by the fraction that is left. The room under the spot keeps its place to half a pixel.
@@ -154,6 +187,9 @@ class SpotCrops:
         Crops in an epoch.
     seed : int
     settings : CropSettings
+    samples : ids; all by default
+    laser_off : bool
+        Also the crop with the laser off.
 
     Raises
     ------
@@ -169,14 +205,16 @@ class SpotCrops:
         *,
         seed: int = 0,
         settings: CropSettings | None = None,
+        samples: Sequence[str] | None = None,
+        laser_off: bool = False,
     ) -> None:
-        self.settings, self.requests = settings or CropSettings(), tuple(requests)
+        self.settings, self.requests, self.laser_off = settings or CropSettings(), tuple(requests), laser_off
         self.length, self.seed, self.epoch = whole_number("length", length, 1), whole_number("seed", seed), 0
         if not self.requests:
             raise DatasetError("requests is empty: give at least one FrameRequest")
         if any(request.region is not None for request in self.requests):
             raise DatasetError("region: the crops have a side of their own, CropSettings.side_px")
-        self._sides = tuple(_sides([open_finished(folder) for folder in folders], self.settings))
+        self._sides = tuple(_sides([open_finished(folder) for folder in folders], self.settings, samples))
         if not self._sides:
             raise DatasetError("no spot is seen in these data sets: there is nothing to crop")
         self._sensors: dict[tuple[int, int], Chain] = {}
@@ -189,6 +227,13 @@ class SpotCrops:
         return self.length
 
     def __getitem__(self, index: int) -> Item:
+        crop = self.crop(index)
+        names = ("image", "uv_px", "phase_px", "sample_id", "position", "laser_level", "preset")
+        item: Item = {name: getattr(crop, name) for name in names}
+        return item if crop.image_off is None else {**item, "image_off": crop.image_off}
+
+    def crop(self, index: int) -> Crop:
+        """Crop of an index, with the numbers of its sensor."""
         k = _place(index, self.length)
         names = ("crops", self.seed, self.epoch, k)
         draw, s = generator(*names), self.settings
@@ -205,15 +250,9 @@ class SpotCrops:
         region = Region(*(int(x) for x in (*first, *(first + s.side_px))))
         with in_one_sentence():
             image = chain.frame(light, NoiseStream((*names, "noise")), region)
-        return {
-            "image": image,
-            "uv_px": place,
-            "phase_px": phase,
-            "sample_id": side.sample_id,
-            "position": side.position,
-            "laser_level": level,
-            "preset": request.preset,
-        }
+            off = chain.frame(light.laser_off(), NoiseStream((*names, "off")), region) if self.laser_off else None
+        card = card_of(chain.sensor)
+        return Crop(image, off, place, phase, card, side.sample_id, side.position, request.preset, level)
 
     def _chain(self, side: _Side, number: int) -> Chain:
         """Camera of a spot for a request; its exposure is that of the whole image."""
@@ -269,12 +308,14 @@ class _Side:
 _STEP_PX = 8
 
 
-def _sides(datasets: Sequence[Dataset], settings: CropSettings) -> list[_Side]:
-    """All spots that are seen, with light enough around them for every phase."""
+def _sides(datasets: Sequence[Dataset], settings: CropSettings, chosen: Sequence[str] | None) -> list[_Side]:
+    """Spots that are seen, of all samples or of the chosen ones, with light enough around them for every phase."""
     reach = settings.patch_px
     found = []
     for dataset in datasets:
         for sample in dataset.samples:
+            if chosen is not None and sample.row.sample_id not in chosen:
+                continue
             for position in POSITIONS:
                 truth = sample.truth_row(position)
                 if not truth.visible or truth.spot_file is None:

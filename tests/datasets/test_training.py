@@ -128,6 +128,28 @@ def test_items_depend_on_seed_epoch_and_index_alone(tiny_dataset: Path, kind: st
         first[len(first)]
 
 
+def test_crops_with_the_laser_off_are_the_same_crops_without_the_spot(tiny_dataset: Path) -> None:
+    """Expected electrons without noise: what is taken away is the spot, and the item is otherwise the same."""
+    sample = open_dataset(tiny_dataset).samples[0].row.sample_id
+    request, settings = FrameRequest.of("ideal", {}), CropSettings(side_px=24)
+    both = SpotCrops([tiny_dataset], [request], 8, settings=settings, samples=[sample], laser_off=True)
+    alone = SpotCrops([tiny_dataset], [request], 8, settings=settings, samples=[sample])
+    checked = 0
+    for k in range(8):
+        crop, item = both.crop(k), alone[k]
+        assert crop.sample_id == sample
+        assert crop.card.exposure_s > 0.0
+        assert crop.image_off is not None
+        assert np.array_equal(crop.image, item["image"])
+        assert np.array_equal(both[k]["image_off"], crop.image_off)
+        assert "image_off" not in item
+        added = crop.image - crop.image_off
+        assert added.min() > -1e-9 * crop.image.max()
+        v, u = np.unravel_index(np.argmax(added.sum(axis=0)), (24, 24))
+        checked += bool(np.hypot(u - crop.uv_px[0], v - crop.uv_px[1]) < 1.0)
+    assert checked == 8
+
+
 def test_pairs_are_the_data_sets_own_frames(tiny_dataset: Path) -> None:
     pairs = PairDataset(tiny_dataset, "mjpeg")
     pairs.set_epoch(2)
