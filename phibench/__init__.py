@@ -16,18 +16,38 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from phibench.datasets.read import open_dataset
+    from phibench.datasets.training import PairDataset
     from phibench.estimator.benchmark.score import score
+    from phibench.estimator.geometry.triangulate import depth_exact
     from phibench.estimator.interface import Answer, Pair, Spot
     from phibench.estimator.paper.sensitivity_table import make
+    from phibench.estimator.sandbox.easy_pairs import EasyPairs
+    from phibench.estimator.spots.simple_spots import find_spot
 
     __version__: str
 
-__all__ = ["Answer", "Pair", "Spot", "__version__", "make", "open_dataset", "score"]
+__all__ = [
+    "Answer",
+    "EasyPairs",
+    "Pair",
+    "PairDataset",
+    "Spot",
+    "__version__",
+    "depth_exact",
+    "find_spot",
+    "make",
+    "open_dataset",
+    "score",
+]
 
 _HOMES = {
     "Answer": "phibench.estimator.interface",
+    "EasyPairs": "phibench.estimator.sandbox.easy_pairs",
     "Pair": "phibench.estimator.interface",
+    "PairDataset": "phibench.datasets.training",
     "Spot": "phibench.estimator.interface",
+    "depth_exact": "phibench.estimator.geometry.triangulate",
+    "find_spot": "phibench.estimator.spots.simple_spots",
     "make": "phibench.estimator.paper.sensitivity_table",
     "open_dataset": "phibench.datasets.read",
     "score": "phibench.estimator.benchmark.score",
@@ -45,7 +65,7 @@ def __getattr__(name: str) -> Any:
     if name in _HOMES:
         value: Any = getattr(import_module(_HOMES[name]), name)
     elif name == "__version__":
-        value = _version()
+        value = import_module("phibench.datasets.version").own_version()
     else:
         raise AttributeError(f"module 'phibench' has no attribute '{name}'; it has {', '.join(__all__)}")
     globals()[name] = value
@@ -54,13 +74,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
-
-
-def _version() -> str:
-    """Version of the installed distribution; "0+unknown" where only the files are on the path."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("phibench")
-    except PackageNotFoundError:
-        return "0+unknown"

@@ -29,7 +29,7 @@ render/film
 render/setup
 render/room
 datasets/errors
-datasets/parallel datasets/progress datasets/input_files
+datasets/parallel datasets/progress datasets/input_files datasets/version
 datasets/rooms
 datasets/recipe
 datasets/plan

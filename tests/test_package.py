@@ -1,8 +1,11 @@
 """The public interface: what `import phibench` gives, at which price, and the old names of one version."""
 
+import ast
 import inspect
+import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +18,7 @@ from phibench.estimator import interface
 from phibench.estimator.sandbox.resolve import MethodError
 from phibench.estimator.sandbox.runner import asked_here
 
+ROOT = Path(__file__).resolve().parent.parent
 Python = Callable[..., subprocess.CompletedProcess[str]]
 METHOD = """
 import numpy as np
@@ -35,13 +39,27 @@ def test_the_public_names_are_there() -> None:
     assert {name: getattr(phibench, name) for name in ("Pair", "Answer", "Spot")} == {
         name: getattr(interface, name) for name in ("Pair", "Answer", "Spot")
     }
-    assert set(phibench.__all__) == {"Answer", "Pair", "Spot", "__version__", "make", "open_dataset", "score"}
+    assert len(set(phibench.__all__) - {"__version__"}) == 10
     assert set(phibench.__all__) <= set(dir(phibench))
-    assert callable(phibench.open_dataset)
-    assert phibench.__version__[0].isdigit()
+    assert all(callable(getattr(phibench, name)) for name in phibench.__all__ if name != "__version__")
     with pytest.raises(AttributeError, match="no attribute 'open'; it has Answer"):
         phibench.open  # noqa: B018
     assert list(inspect.signature(phibench.score).parameters)[:3] == ["dataset", "method", "preset"]
+
+
+def test_type_checkers_and_editors_see_the_same_names() -> None:
+    """The block that only they read imports every public name from the module that gives it at run time."""
+    tree = ast.parse(Path(phibench.__file__).read_text(encoding="utf-8"))
+    block = next(node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")
+    seen = {alias.name: node.module for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+    assert seen == phibench._HOMES
+    assert set(seen) | {"__version__"} == set(phibench.__all__)
+
+
+def test_the_page_names_every_public_name_and_no_other() -> None:
+    page = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)` \|", page, re.M)
+    assert sorted(rows) == sorted(phibench.__all__)
 
 
 def test_the_import_loads_nothing_else(python: Python) -> None:
@@ -50,6 +68,20 @@ def test_the_import_loads_nothing_else(python: Python) -> None:
     # The set is not empty because nothing could be in it.
     child = python("import sys, phibench; phibench.Pair; print('numpy' in sys.modules)")
     assert child.stdout.strip() == "True", child.stderr
+
+
+def test_no_public_name_loads_the_renderer(python: Python) -> None:
+    child = python("import sys\nfrom phibench import *\nprint({'mitsuba', 'drjit', 'torch'} & set(sys.modules), make)")
+    assert child.stdout.startswith("set() <function make"), child.stderr
+
+
+def test_the_version_is_that_of_the_checkout(python: Python) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert phibench.__version__ == project["version"]
+    said = python("from phibench.estimator.cli.main import main; main(['--version'])").stdout.strip()
+    assert re.fullmatch(rf"phibench {project['version']}( \(commit [0-9a-f]{{10}}(, changed since)?\))?", said)
+    assert ("commit" in said) == (ROOT / ".git").exists()
+    assert f"version: {project['version']}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
 
 
 def test_the_module_is_the_command_line(tmp_path: Path) -> None:

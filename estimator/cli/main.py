@@ -18,6 +18,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
+from typing import Literal
 
 from cyclopts import App, CycloptsError
 
@@ -33,8 +34,18 @@ from phibench.estimator.cli.score import bench, compare, report, score
 from phibench.estimator.cli.seal import seal
 from phibench.estimator.cli.studies import paper, study
 
+
+def _version_line() -> str:
+    """Version as `phibench --version` prints it; in a checkout with the commit and with what differs from it."""
+    from phibench.datasets.version import checkout_state, own_version
+
+    state = checkout_state()
+    return f"phibench {own_version()}" + (f" ({state})" if state else "")
+
+
 app = App(
     name="phibench",
+    version=_version_line,
     help="Render an omnidirectional camera-mirror sensor with exact depth, and score depth estimators against it.",
     suppress_keyboard_interrupt=False,
     result_action="return_value",
@@ -100,6 +111,21 @@ def limit(megabytes: float) -> int:
 
 def _maps(count: int) -> str:
     return f"{count} light map{'' if count == 1 else 's'}"
+
+
+@app.command(group=INSTALLATION)
+def completion(shell: Literal["bash", "zsh", "fish"]) -> int:
+    """Print a script that lets the Tab key complete commands and options.
+
+    For bash: phibench completion bash > ~/.local/share/bash-completion/completions/phibench
+
+    Parameters
+    ----------
+    shell
+        "bash", "zsh" or "fish".
+    """
+    print(app.generate_completion(shell=shell))
+    return 0
 
 
 @app.command(group=INSTALLATION)

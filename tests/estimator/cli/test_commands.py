@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import shutil
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -69,6 +71,39 @@ def test_help_fits_80_columns(command: str, capsys: pytest.CaptureFixture[str], 
     assert len(lines) > 2
     assert max(map(len, lines)) <= 80
     assert not any("…" in line for line in lines)  # nothing is cut off
+
+
+@pytest.mark.skipif(not shutil.which("bash"), reason="no bash here")
+def test_bash_completes_commands_and_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = {
+        "phibench m": "method measure",
+        "phibench dataset ma": "make",
+        "phibench dataset make --o": "--out",
+        "phibench export x --to web": "webdataset",
+        "phibench completion f": "fish",
+    }
+    assert cli.main(["completion", "bash"]) == 0
+    script = tmp_path / "phibench"
+    script.write_text(capsys.readouterr().out)
+    calls = "".join(
+        f'COMP_WORDS=({line}); COMP_CWORD={len(line.split()) - 1}; _phibench; echo "${{COMPREPLY[*]}}"\n'
+        for line in lines
+    )
+    bash = ["bash", "--noprofile", "--norc", "-c", f"source {script}\ncomplete -p phibench\n{calls}"]
+    child = subprocess.run(bash, capture_output=True, text=True, timeout=60, check=False)
+    assert child.stderr == ""
+    assert child.stdout.splitlines() == ["complete -F _phibench phibench", *lines.values()]
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_has_every_command(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    words = {word for name in leaves() for word in name.split()}
+    assert len(words) > 40
+    assert [word for word in words if not re.search(rf"\b{word}\b", script)] == []
+    if shutil.which(shell):
+        subprocess.run([shell, "-n"], input=script, capture_output=True, text=True, timeout=60, check=True)
 
 
 @pytest.mark.parametrize(("old", "new"), OLD_COMMANDS.items())
