@@ -9,6 +9,9 @@ SAMPLES ?= 12
 BENCH  ?= out/bench-dev
 STUDIES ?= out/studies
 STUDIES_ALL := noise misalignment baseline cause isotropy stroke mirror
+# Environment without Mitsuba, and what is tested in it.
+BASE := out/base-env
+BASE_TESTS := tests/scenes tests/estimator/geometry tests/estimator/sandbox tests/test_package.py
 # Which Python makes the environment: `make setup PYTHON=python3.13`. Without it the first that is new enough.
 PYTHON ?=
 # Tests start hundreds of processes. Where compiled modules may not be kept, each compiles the package anew, for a second.
@@ -19,7 +22,7 @@ PARALLEL ?= --numprocesses 2 --dist loadfile --no-loadscope-reorder
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help setup dataset bench studies studies-full lint clean
-.PHONY: docs test test-slow proof test-all attack mutants benchmark
+.PHONY: docs dist test test-base test-slow proof test-all attack mutants benchmark
 
 help:
 	@echo "make setup      make .venv with everything in it, and make sure of LLVM"
@@ -28,6 +31,7 @@ help:
 	@echo "make studies    the eight studies, reduced, and a report on them, in out/studies"
 	@echo "make studies-full  the same in full (hours), published to docs/studies"
 	@echo "make test       the tests, without the slow ones"
+	@echo "make test-base  the tests of scoring and geometry without Mitsuba, with any PYTHON=python3.13"
 	@echo "make test-slow  the slow tests"
 	@echo "make proof      the slow tests of accuracy, but those of many minutes"
 	@echo "make test-all   all tests"
@@ -35,6 +39,7 @@ help:
 	@echo "make mutants    proof that the tests see faults: one fault at a time, in copies of the checkout"
 	@echo "make benchmark  timings of what must be fast"
 	@echo "make docs       all pages and the reference as a site, in out/site; it works from disk"
+	@echo "make dist       source distribution and wheel, in dist/"
 	@echo "make lint       ruff and mypy"
 	@echo "make clean      remove caches and builds; .venv and out/ stay"
 
@@ -87,6 +92,13 @@ studies-full: $(READY)
 test: $(READY)
 	$(BIN)/python -m pytest $(PARALLEL)
 
+# Scoring, reading and geometry as they are installed without Mitsuba, for any Python: `make test-base PYTHON=python3.13`.
+# Tests that need a rendered data set are skipped there.
+test-base:
+	$(or $(PYTHON),python3) -m venv --clear $(BASE)
+	@$(BASE)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[test]'
+	$(BASE)/bin/python -m pytest $(BASE_TESTS)
+
 test-slow: $(READY)
 	$(BIN)/python -m pytest --slow --study -m "slow or study"
 
@@ -109,6 +121,11 @@ docs: $(READY)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict --site-dir out/site
 	@echo "out/site/index.html"
+
+# Source distribution, and the wheel built from it.
+dist: $(READY)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt build
+	$(BIN)/python -m build --outdir dist .
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -67,7 +67,8 @@ class SharedFolder:
         self._folder = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
     def made(self, name: str, make: Callable[[Path], object]) -> Path:
-        """Folder `name`, filled by `make`, which gets a path that is not there yet."""
+        """Folder `name`, filled by `make`, which gets a path that is not there yet; without Mitsuba a skip."""
+        pytest.importorskip("mitsuba", reason="nothing renders here: Mitsuba is not installed", exc_type=ImportError)
         out = self._folder / f"shared-{name}"
         with FileLock(out.with_suffix(".lock")):
             if not out.exists():
