@@ -40,7 +40,7 @@ datasets/exposures
 datasets/build
 datasets/make
 datasets/film datasets/export
-datasets/show datasets/verify datasets/merge_repair datasets/training
+datasets/show datasets/sample_page datasets/verify datasets/merge_repair datasets/training
 estimator/interface
 estimator/pair_set
 estimator/geometry

@@ -132,8 +132,8 @@ def verify(directory: Path) -> int:
 
 
 @dataset.command
-def show(directory: Path, *, out: Path | None = None) -> int:
-    """Print a table of a data set and write its contact sheet.
+def show(directory: Path, *, out: Path | None = None, sample: str | None = None, html: Path | None = None) -> int:
+    """Print a table of a data set and write its contact sheet; or write the interactive page of a sample.
 
     Parameters
     ----------
@@ -141,9 +141,24 @@ def show(directory: Path, *, out: Path | None = None) -> int:
         Folder of a data set.
     out
         PNG file for the contact sheet; by default contact_sheet.png in the folder.
+    sample
+        Sample of the page: its number, counted from 0, or its id; the first one by default.
+    html
+        HTML file for the page of a sample: frames, truth of every pixel, epipolar lines, room and rays in 3-D. Nothing
+        else is done then.
     """
+    from phibench.datasets.errors import DatasetError
     from phibench.datasets.show import show as show_dataset
 
+    if html is not None:
+        from phibench.datasets.read import open_finished
+        from phibench.datasets.sample_page import sample_of, write_sample_page
+
+        page = write_sample_page(sample_of(open_finished(directory), sample), html)
+        print(f"{page}: {page.stat().st_size / 1e6:.1f} MB; open it in a browser")
+        return 0
+    if sample is not None:
+        raise DatasetError("--sample is for the page of one sample: name its file too, for example --html sample.html")
     show_dataset(directory, out=out)
     return 0
 
