@@ -315,10 +315,20 @@ function camera() {
   const up = [-Math.sin(pitch) * Math.cos(yaw), -Math.sin(pitch) * Math.sin(yaw), Math.cos(pitch)];
   const eye = target.map((value, k) => value + distance * back[k]);
   const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-  return (point) => {
+  const look = (point) => {
     const d = [point[0] - eye[0], point[1] - eye[1], point[2] - eye[2]];
     return [dot(d, right), dot(d, up), -dot(d, back)];
   };
+  return { look, eye };
+}
+
+// Sides of the room's box, [axis, place, outwards], that hold a polygon as a whole: near walls and ceilings hide the rest.
+function markSides() {
+  const { low, high } = roomBox(), reach = 0.25;
+  const sides = [0, 1, 2].flatMap((axis) => [[axis, low[axis], -1], [axis, high[axis], 1]]);
+  for (const polygon of data.scene.polygons) {
+    polygon.sides = sides.filter(([axis, place]) => polygon.p.every((point) => Math.abs(point[axis] - place) < reach));
+  }
 }
 
 const NEAR = 0.02;
@@ -355,12 +365,13 @@ function facing(points) {
 }
 
 function drawRoom() {
-  const canvas = byId("room"), ctx = context(canvas), look = camera();
+  const canvas = byId("room"), ctx = context(canvas), { look, eye } = camera();
   const wide = canvas.clientWidth, high = canvas.clientHeight, focal = 0.95 * Math.min(wide, high * 1.5);
   const flat = (p) => [wide / 2 + focal * p[0] / p[2], high / 2 - focal * p[1] / p[2]];
   const chosen = state.chosen && state.chosen.object;
   const seen = [];
   data.scene.polygons.forEach((polygon, place) => {
+    if (polygon.sides.some(([axis, at, outwards]) => (eye[axis] - at) * outwards > 0)) return;
     const points = polygon.p.map(look), face = facing(points);
     if (face.towards <= 0 && !polygon.both) return;
     const distance = points.reduce((sum, p) => sum + Math.hypot(...p), 0) / points.length;
@@ -520,6 +531,7 @@ async function main() {
   writeTexts();
   followPictures();
   followRoom();
+  markSides();
   lookAtRoom();
   for (const name of ["laser", "marks", "lines", "layers"]) byId(name).addEventListener("change", drawAll);
   byId("whole").addEventListener("click", () => { state.zoom = "whole"; drawAll(); });
