@@ -13,7 +13,7 @@ from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Box, Pair, Spot
 from phibench.estimator.methods.likelihood_maps import SpotLikelihood, of_pixels, of_window
 from phibench.estimator.methods.locate import around as box_at
-from phibench.estimator.methods.locate import box_around, measured_twice, pair_blur, seen_depth_m
+from phibench.estimator.methods.locate import box_around, detected, measured_twice, once, pair_blur, seen_depth_m
 from phibench.estimator.processed.fit_chain import (
     code_data,
     first_fit,
@@ -26,7 +26,7 @@ from phibench.estimator.processed.fit_chain import (
     unrounded,
 )
 from phibench.estimator.processed.quasi_score import Window
-from phibench.estimator.spots.detect import Detection, detect
+from phibench.estimator.spots.detect import Detection
 from phibench.estimator.spots.fit_raw import SpotData, SpotFit
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel
 from phibench.estimator.spots.image_planes import PROCESSED
@@ -50,7 +50,11 @@ def chain_fit(pair: Pair) -> Answer:
     if pair.card.output not in PROCESSED:
         missing = Spot.missing(f"chain_fit needs srgb8, yuyv or mjpeg images, not {pair.card.output}")
         return Answer(missing, missing)
-    found = detect(pair)
+    return once(pair, "chain_fit", _fitted)
+
+
+def _fitted(pair: Pair) -> Answer:
+    found = detected(pair)
 
     def measure(depth_m: float | None) -> Answer:
         return Answer(

@@ -18,9 +18,10 @@ Integer (u, v) are pixel centres, u along the columns, v along the rows.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,7 +31,7 @@ from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.estimator.interface import Answer, Box, Image, Method, Pair, Spot
 from phibench.estimator.spots.camera_codes import rgb_codes
-from phibench.estimator.spots.detect import Detection, detect, outline_mask
+from phibench.estimator.spots.detect import Detection, PairDetection, detect, outline_mask
 from phibench.estimator.spots.gaussian_spot import SpotBlur
 from phibench.estimator.spots.image_planes import demosaiced, kind_of, linear_planes, redness
 from phibench.estimator.spots.simple_spots import SpotPositions
@@ -73,6 +74,84 @@ def laser_light(pair: Pair, position: str) -> Array:
     return redness(on) if off is None else np.asarray(on[0] - linear_planes(off, pair.card)[0])
 
 
+# -- work that methods share -----------------------------------------------------------------------------------------
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class _Made:
+    value: Any
+    seconds: float
+
+
+class SharedWork:
+    """Results for one pair that several built-in methods begin with: each is made once and kept.
+
+    Results are immutable, so that no method can change what another one gets.
+
+    Attributes
+    ----------
+    stages : dict of str to float
+        CPU-seconds of each result, without those of results that it began with.
+    reused_seconds : float
+        Wall clock that results took which were there already: what a method would have taken besides, alone.
+    """
+
+    def __init__(self) -> None:
+        self._made: dict[str, _Made] = {}
+        self.stages: dict[str, float] = {}
+        self.reused_seconds = 0.0
+
+    def once(self, stage: str, make: Callable[[], T]) -> T:
+        """Result of a stage, made now or kept; what raises is not kept."""
+        if stage in self._made:
+            self.reused_seconds += self._made[stage].seconds
+            kept: T = self._made[stage].value
+            return kept
+        start, cpu, reused, inner = time.perf_counter(), time.process_time(), self.reused_seconds, self.total
+        value = make()
+        self.stages[stage] = time.process_time() - cpu - (self.total - inner)
+        self._made[stage] = _Made(value, time.perf_counter() - start + self.reused_seconds - reused)
+        return value
+
+    @property
+    def total(self) -> float:
+        """CPU-seconds of all stages."""
+        return sum(self.stages.values())
+
+
+@dataclass(frozen=True)
+class SharedPair(Pair):
+    """A pair that built-in methods look at one after the other, with the work that they share.
+
+    `dataclasses.replace` gives one without results: they belong to these very images.
+    """
+
+    work: SharedWork = field(default_factory=SharedWork, init=False, repr=False, compare=False)
+
+    @classmethod
+    def of(cls, pair: Pair) -> SharedPair:
+        """The same pair, nothing done."""
+        return cls(**{one.name: getattr(pair, one.name) for one in fields(Pair)})
+
+
+def once(pair: Pair, stage: str, make: Callable[[Pair], T]) -> T:
+    """Result of a stage; kept where methods share the work on this pair."""
+    return pair.work.once(stage, lambda: make(pair)) if isinstance(pair, SharedPair) else make(pair)
+
+
+def detected(pair: Pair) -> PairDetection:
+    """Spots that `detect` sees.
+
+    Raises
+    ------
+    ValueError
+        If an image does not fit the card's output.
+    """
+    return once(pair, "detect", detect)
+
+
 # -- boxes -----------------------------------------------------------------------------------------------------------
 
 
@@ -84,7 +163,7 @@ def locate(pair: Pair) -> tuple[Box | None, Box | None]:
     ValueError
         If an image does not fit the card's output.
     """
-    found = detect(pair)
+    found = detected(pair)
     return box_around(found.down, pair.down) or pair.box_down, box_around(found.up, pair.up) or pair.box_up
 
 

@@ -31,7 +31,7 @@ from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Image, Matrix2, Pair, Spot
 from phibench.estimator.methods.chain_fit import chain_fit, spot_likelihood
 from phibench.estimator.methods.likelihood_maps import SpotLikelihood, likelihood_map, of_pixels
-from phibench.estimator.methods.locate import SearchRegion, each_spot_twice, pair_blur, seen_depth_m
+from phibench.estimator.methods.locate import SearchRegion, each_spot_twice, once, pair_blur, seen_depth_m
 from phibench.estimator.spots.fit_joint import JointFit, fit_joint
 from phibench.estimator.spots.fit_raw import SpotData, SpotFit, fit_law, spot_data
 from phibench.estimator.spots.gaussian_spot import SpotModel
@@ -133,9 +133,14 @@ _MOST_CHI2 = 24.0  # of one degree of freedom: 1e-6 by chance
 _each = each_spot_twice(raw_maximum_likelihood)
 
 
+def raw_likelihood(pair: Pair) -> Answer:
+    """Both spots by `raw_maximum_likelihood`, each by itself."""
+    return once(pair, "raw_maximum_likelihood", _each)
+
+
 def joint_fit(pair: Pair) -> Answer:
     """Positions and depth of a pair; the separate answers where one image has no spot or the two are not one point."""
-    return joint_of(pair, _each(pair) if pair.card.output == "raw" else chain_fit(pair))
+    return joint_of(pair, raw_likelihood(pair) if pair.card.output == "raw" else chain_fit(pair))
 
 
 def joint_of(pair: Pair, separate: Answer) -> Answer:

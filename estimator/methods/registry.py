@@ -10,8 +10,8 @@ from importlib.util import find_spec
 
 from phibench.estimator.interface import Answer, Method, Pair, Spot
 from phibench.estimator.methods.chain_fit import chain_fit
-from phibench.estimator.methods.locate import each_spot, each_spot_twice
-from phibench.estimator.methods.raw_likelihood import joint_fit, raw_maximum_likelihood
+from phibench.estimator.methods.locate import each_spot
+from phibench.estimator.methods.raw_likelihood import joint_fit, raw_likelihood
 from phibench.estimator.methods.simple import (
     at_the_red_peak,
     detected_spots,
@@ -122,7 +122,7 @@ _ALL = (
     ),
     BuiltIn(
         "raw_maximum_likelihood",
-        each_spot_twice(raw_maximum_likelihood),
+        raw_likelihood,
         "maximum likelihood on raw pixels with the sensor's noise; claims a covariance",
         "F. Huang et al., Nature Methods 10, 653 (2013)",
         accepts=RAW,

@@ -11,8 +11,8 @@ from collections.abc import Callable
 import numpy as np
 
 from phibench.estimator.interface import Answer, Pair, Spot
-from phibench.estimator.methods.locate import SearchRegion, red_peak, spot_of
-from phibench.estimator.spots.detect import Detection, detect
+from phibench.estimator.methods.locate import SearchRegion, detected, red_peak, spot_of
+from phibench.estimator.spots.detect import Detection
 from phibench.estimator.spots.image_planes import linear_planes, redness
 from phibench.estimator.spots.simple_spots import SIMPLE_METHODS, thresholded_centroid
 from phibench.scenes.frames import Array
@@ -120,7 +120,7 @@ def _spot_in_window(near: SearchRegion, u: float, v: float) -> Spot:
 
 def detected_spots(pair: Pair) -> Answer:
     """Position of the matched filter's peak, refined by a parabola, in both images."""
-    found = detect(pair)
+    found = detected(pair)
     return Answer(_detected_spot(found.down), _detected_spot(found.up))
 
 

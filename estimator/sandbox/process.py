@@ -39,6 +39,7 @@ from phibench.estimator.sandbox.transport import (
     Connection,
     MemoryFile,
     TransportError,
+    again,
     needed_bytes,
     pack,
 )
@@ -46,6 +47,7 @@ from phibench.estimator.sandbox.worker import lacks_memory
 from phibench.scenes.validation import printable_line
 
 _KEPT_BYTES = 65536
+_NO_PAIR: Pair | None = None
 _READS = 16  # of 64 kB at a time
 _LOOK_MS = 500  # between looks at whether anybody listens
 _LINES, _LINE_LENGTH = 20, 200  # of the output that an outcome keeps
@@ -178,7 +180,10 @@ def advised(message: str, isolation: Isolation) -> str:
 
 
 class MethodProcess:
-    """A method that is kept warm between pairs, and started anew after a failure.
+    """A method that is kept warm between pairs, and started anew after a failure; or several built-in ones.
+
+    Built-in methods may have one process together. They get a pair once and share what they begin with
+    (`locate.SharedWork`). A method of another's has its process alone: nothing that it does reaches others.
 
     Parameters
     ----------
@@ -186,15 +191,22 @@ class MethodProcess:
     limits : RunLimits
     hidden : sequence of Path
         Folders with the truth, which the method cannot read.
+    others : sequence of Reference
+        Further methods of the process, built-in like the first.
 
     Raises
     ------
     MethodError
-        If the method lies in one of them, or a path that is allowed does.
+        If the method lies in one of them, or a path that is allowed does; or if methods of others would share it.
     """
 
-    def __init__(self, reference: Reference, limits: RunLimits, hidden: Sequence[Path] = ()) -> None:
-        self._reference, self._limits = reference, limits
+    def __init__(
+        self, reference: Reference, limits: RunLimits, hidden: Sequence[Path] = (), others: Sequence[Reference] = ()
+    ) -> None:
+        self._reference, self._references, self._limits = reference, (reference, *others), limits
+        if others and any(one.kind != "built-in" for one in self._references):
+            raise MethodError("built-in methods alone share a process: ask methods of your own one by one")
+        self.stages: dict[str, float] = {}
         self._access, self._isolation = access_of(reference, limits, hidden), Isolation(reason="it did not start")
         self._lock, self._closed = threading.Lock(), False
         self._process: _Running | None = None
@@ -224,15 +236,15 @@ class MethodProcess:
                 raise MethodError(f"method '{self._reference.name}' was stopped")
             process = self._process = _Running(max(2 * size, LEAST_BYTES), self._access)
         try:
-            self._isolation = process.load(self._reference, self._limits)
+            self._isolation = process.load(self._references, self._limits)
         except BaseException:
             self.end()
             raise
 
-    def ask(self, pair: Pair) -> Outcome:
-        """Give the method one pair; never raises for what the method does."""
+    def ask(self, pair: Pair, method: int = 0) -> Outcome:
+        """Give a method one pair; never raises for what the method does."""
         try:
-            outcome = self._asked(pair)
+            outcome = self._asked(pair, method)
         except Exception as error:  # one pair must never end a run, whatever was not thought of
             text = f"{type(error).__name__}: {error}"
             outcome = Outcome(pair.number, None, math.nan, "crash", f"the method's process cannot be used: {text}")
@@ -241,7 +253,11 @@ class MethodProcess:
         message = printable_line(outcome.message, _MESSAGE_LENGTH)
         return replace(outcome, message=advised(message, self._isolation) if outcome.failure == "error" else message)
 
-    def _asked(self, pair: Pair) -> Outcome:
+    def ask_each(self, pair: Pair) -> tuple[Outcome, ...]:
+        """Give one pair to the methods, one after the other."""
+        return tuple(self.ask(pair, method) for method in range(len(self._references)))
+
+    def _asked(self, pair: Pair, method: int) -> Outcome:
         size = needed_bytes(pair)
         if self._process is not None and not self._process.is_ready(size):
             self.end()
@@ -253,7 +269,15 @@ class MethodProcess:
         if process is None:  # ended by `close` in between
             return Outcome(pair.number, None, math.nan, "crash", "the run was stopped")
         file = self._reference.place if self._reference.kind == "file" else ""
-        return process.ask(pair, self._limits, file)
+        outcome = process.ask(pair, self._limits, file, method)
+        if len(self._references) > 1:
+            self._add(process.stages, self._references[method].name)
+        return outcome
+
+    def _add(self, stages: dict[str, float], name: str) -> None:
+        for stage, seconds in stages.items():
+            stage = stage or name
+            self.stages[stage] = self.stages.get(stage, 0.0) + seconds
 
     def end(self) -> None:
         """Kill the process with all that it started; the next question starts another."""
@@ -285,6 +309,7 @@ class _Running:
             raise MethodError("methods run in processes of their own on Linux and macOS only")
         ours, theirs = socket.socketpair()
         self._connection, self._memory = Connection(ours), MemoryFile(size)
+        self._shares, self._held, self.stages = False, _NO_PAIR, dict[str, float]()
         self._owned = OwnedFolder("method")
         self._folder = str(self._owned.path)
         try:
@@ -317,10 +342,11 @@ class _Running:
         self._memory.close()
         self._owned.close()
 
-    def load(self, reference: Reference, limits: RunLimits) -> Isolation:
-        """Let the process import the method; its isolation, which it tells before any code of the method runs."""
-        nonce, end = secrets.token_hex(8), time.monotonic() + limits.start_seconds
-        order = {"nonce": nonce, "reference": asdict(reference), "memory_mb": limits.memory_mb}
+    def load(self, references: Sequence[Reference], limits: RunLimits) -> Isolation:
+        """Let the process import its methods; its isolation, which it tells before any code of a method runs."""
+        nonce, end, reference = secrets.token_hex(8), time.monotonic() + limits.start_seconds, references[0]
+        self._shares = len(references) > 1
+        order = {"nonce": nonce, "references": [asdict(one) for one in references], "memory_mb": limits.memory_mb}
         try:
             isolation = Isolation(**json.loads(self._connection.receive(limits.start_seconds)))
             self._connection.send(json.dumps(order).encode(), limits.start_seconds)
@@ -342,10 +368,11 @@ class _Running:
         """Tell that a pair of so many bytes can be asked, and that nothing is left of the one before."""
         return size <= self._memory.size and self._connection.is_silent()
 
-    def ask(self, pair: Pair, limits: RunLimits, file: str) -> Outcome:
-        """Answer or failure for one pair."""
-        nonce, before = secrets.token_hex(8), self._output.count()
-        message = pack(pair, self._memory, nonce)
+    def ask(self, pair: Pair, limits: RunLimits, file: str, method: int = 0) -> Outcome:
+        """Answer or failure of a method for one pair."""
+        nonce, before, self.stages = secrets.token_hex(8), self._output.count(), {}
+        message = again(nonce, method) if self._held is pair else pack(pair, self._memory, nonce, method)
+        self._held = pair if self._shares else _NO_PAIR
         start = time.monotonic()  # by this clock alone: the method's process could tell any time
         try:
             self._connection.send(message, limits.seconds)
@@ -356,7 +383,11 @@ class _Running:
             return Outcome(pair.number, None, math.nan, "timeout", late, output)
         except TransportError:
             return self._dead(pair, limits, file, before)
-        outcome = outcome_of(pair, reply, time.monotonic() - start)
+        seconds = time.monotonic() - start
+        if self._shares:  # built-in methods tell the truth; of others nothing but the answer counts
+            seconds += reply["reused_seconds"]
+            self.stages = {**reply["stages"], "": reply["own_seconds"]}
+        outcome = outcome_of(pair, reply, seconds)
         return replace(outcome, output=last_lines(self._output.text(since=before)))
 
     def kill(self) -> None:

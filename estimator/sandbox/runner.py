@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
+from typing import TypeVar
 
 from phibench.estimator.interface import Method, Outcome, Pair
 from phibench.estimator.pair_set import PairSet, truth_folders
@@ -22,11 +24,15 @@ from phibench.estimator.sandbox.process import MethodProcess, outcome_of
 from phibench.estimator.sandbox.resolve import MethodError, Reference, RunLimits, resolve
 from phibench.estimator.sandbox.worker import reply_of, require_method
 
+T = TypeVar("T")
+
 
 class Harness:
     """Methods in processes of their own, kept warm from pair to pair; a context manager.
 
-    Each pair is made once and shown to one method after the other; pairs are worked on side by side.
+    Each pair is made once and shown to one method after the other; pairs are worked on side by side. Several built-in
+    methods have one process together, in which they share the search for the spot; their answers are those that each
+    gives alone.
 
     Parameters
     ----------
@@ -34,7 +40,8 @@ class Harness:
         ``my_phi.py:extract``, a built-in name, or that of an installed package's method.
     limits : RunLimits, optional
     workers : int
-        Pairs that are worked on at a time. One method alone has as many processes, several have one each.
+        Pairs that are worked on at a time. One method alone, and the built-in ones together, have as many processes;
+        others have one each.
     hidden : sequence of Path
         Folders with the truth, which no method can read: `pair_set.truth_folders`.
 
@@ -55,15 +62,13 @@ class Harness:
             raise MethodError(f"workers = {workers}: must be 1 or more")
         self._references = [resolve(method) if isinstance(method, str) else method for method in methods]
         self._limits, self._workers, self._hidden = limits or RunLimits(), workers, hidden
+        self._places = _together(self._references)
+        self._draw_seconds = 0.0
         self._failed: list[dict[int, str]] = [{} for _ in self._references]
         self._turns: list[_Turns] = []
 
     def __enter__(self) -> Harness:
-        copies = self._workers if len(self._references) == 1 else 1
-        self._pools = [
-            _MethodPool([MethodProcess(reference, self._limits, self._hidden) for _ in range(copies)])
-            for reference in self._references
-        ]
+        self._pools = [self._pool([self._references[place] for place in places]) for places in self._places]
         # one more than processes, so that a pair is made while the others are looked at
         self._threads = ThreadPoolExecutor(self._workers + 1, thread_name_prefix="phibench-method")
         try:
@@ -73,6 +78,11 @@ class Harness:
             self.__exit__(None, None, None)
             raise
         return self
+
+    def _pool(self, references: Sequence[Reference]) -> _MethodPool:
+        copies = self._workers if len(self._places) == 1 or len(references) > 1 else 1
+        first, *others = references
+        return _MethodPool([MethodProcess(first, self._limits, self._hidden, others) for _ in range(copies)])
 
     def __exit__(self, kind: type[BaseException] | None, error: object, trace: TracebackType | None) -> None:
         for turns in self._turns:
@@ -85,7 +95,27 @@ class Harness:
     @property
     def isolations(self) -> list[str]:
         """Isolation of each method in a sentence; after entering."""
-        return [pool.isolation.sentence() for pool in self._pools]
+        told = self._in_order([[pool.isolation.sentence()] * len(at) for pool, at in self._pooled()])
+        return list(told)
+
+    @property
+    def stages(self) -> dict[str, float]:
+        """CPU-seconds so far: "draw" of all pairs, and of built-in methods that share a process their stages."""
+        parts = [stages for pool in self._pools for stages in pool.stages]
+        names = dict.fromkeys(name for part in parts for name in part)
+        return {"draw": self._draw_seconds, **{name: sum(part.get(name, 0.0) for part in parts) for name in names}}
+
+    def _pooled(self) -> Iterator[tuple[_MethodPool, Sequence[int]]]:
+        return zip(self._pools, self._places, strict=True)
+
+    def _in_order(self, parts: Sequence[Sequence[T]]) -> tuple[T, ...]:
+        """What belongs to each method, from what each process gives, in the methods' order."""
+        found = {
+            place: one
+            for at, part in zip(self._places, parts, strict=True)
+            for place, one in zip(at, part, strict=True)
+        }
+        return tuple(found[place] for place in range(len(found)))
 
     @property
     def failed_outputs(self) -> list[str]:
@@ -104,19 +134,27 @@ class Harness:
         def one(place: int, number: int) -> tuple[Outcome, ...]:
             try:
                 with making.turn(place):
+                    start = time.thread_time()
                     pair = pairs.pair(number)
+                    self._draw_seconds += time.thread_time() - start
             except BaseException:
                 for skipped in turns:  # or those that come after would wait for it
                     with skipped.turn(place):
                         pass
                 raise
-            done = tuple(pool.ask(pair, turn, place) for pool, turn in zip(self._pools, turns, strict=True))
+            done = self._in_order([pool.ask(pair, turn, place) for pool, turn in zip(self._pools, turns, strict=True)])
             for failed, outcome in zip(self._failed, done, strict=True):
                 if outcome.failure and outcome.output:
                     failed[number] = outcome.output
             return done
 
         return _in_order([self._threads.submit(one, *item) for item in enumerate(numbers)])
+
+
+def _together(references: Sequence[Reference]) -> list[list[int]]:
+    """Places of the methods that have a process together: the built-in ones; every other has its own."""
+    built_in = [place for place, one in enumerate(references) if one.kind == "built-in"]
+    return [[place] for place in range(len(references)) if place not in built_in] + [built_in] * bool(built_in)
 
 
 _WAKE_SECONDS = 0.2
@@ -162,7 +200,7 @@ class _Turns:
 
 
 class _MethodPool:
-    """Processes of one method, of which each looks at one pair at a time."""
+    """Processes of one method, or of some together, of which each looks at one pair at a time."""
 
     def __init__(self, processes: list[MethodProcess]) -> None:
         self._processes, self._free = processes, queue.SimpleQueue[MethodProcess]()
@@ -176,11 +214,15 @@ class _MethodPool:
     def isolation(self) -> Isolation:
         return self._processes[0].isolation
 
-    def ask(self, pair: Pair, turns: _Turns, place: int) -> Outcome:
+    @property
+    def stages(self) -> list[dict[str, float]]:
+        return [process.stages for process in self._processes]
+
+    def ask(self, pair: Pair, turns: _Turns, place: int) -> tuple[Outcome, ...]:
         with turns.turn(place):
             process = self._free.get()
         try:
-            return process.ask(pair)
+            return process.ask_each(pair)
         finally:
             self._free.put(process)
 

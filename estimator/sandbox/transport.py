@@ -222,12 +222,15 @@ class ReceivedPair:
         The parent's, read-only.
     nonce : str
         Of the question; the reply repeats it.
+    method : int
+        Which of the process's methods is asked.
     """
 
     pair: Pair
     data: bytes
     original: mmap.mmap
     nonce: str = ""
+    method: int = 0
 
     def unchanged(self) -> bool:
         """Compare the images with what the runner sent, byte for byte."""
@@ -241,7 +244,7 @@ def _arrays(pair: Pair) -> dict[str, Image]:
     return {**pair.images, **{_FRAMES_OF + name: stack for name, stack in (pair.frames or {}).items()}}
 
 
-def pack(pair: Pair, memory: MemoryFile, nonce: str = "") -> bytes:
+def pack(pair: Pair, memory: MemoryFile, nonce: str = "", method: int = 0) -> bytes:
     """Images into the memory file, all else into the message; nothing but the fields of `Pair` goes along."""
     plain = Pair(**{field.name: getattr(pair, field.name) for field in fields(Pair)})
     images = {name: np.ascontiguousarray(image) for name, image in _arrays(plain).items()}
@@ -249,12 +252,20 @@ def pack(pair: Pair, memory: MemoryFile, nonce: str = "") -> bytes:
     layout = [(name, image.dtype.str, image.shape) for name, image in images.items()]
     nothing: dict[str, Any] = dict.fromkeys((*_IMAGES, "frames"))
     rest = replace(plain, **nothing)
-    return pickle.dumps((rest, layout, memory.write(views), nonce), protocol=5)
+    return pickle.dumps((rest, layout, memory.write(views), nonce, method), protocol=5)
 
 
-def unpack(message: bytes, shared: SharedPages) -> ReceivedPair:
-    """Pair of a message, with images that cannot be written to."""
-    rest, layout, starts, nonce = pickle.loads(message)
+def again(nonce: str, method: int) -> bytes:
+    """Message that asks another method of the same process for the pair that it got last."""
+    return pickle.dumps((nonce, method), protocol=5)
+
+
+def unpack(message: bytes, shared: SharedPages, held: ReceivedPair | None = None) -> ReceivedPair:
+    """Pair of a message, with images that cannot be written to; of `again` the one that is held."""
+    parts = pickle.loads(message)
+    if held is not None and len(parts) == 2:
+        return replace(held, nonce=parts[0], method=parts[1])
+    rest, layout, starts, nonce, method = parts
     original = shared.first(starts[-1])
     data = original[: starts[-1]]
     images = {
@@ -263,4 +274,4 @@ def unpack(message: bytes, shared: SharedPages) -> ReceivedPair:
     }
     frames = {name.removeprefix(_FRAMES_OF): images.pop(name) for name in tuple(images) if name.startswith(_FRAMES_OF)}
     pair = replace(rest, **images, frames=MappingProxyType(frames) if frames else None)
-    return ReceivedPair(pair, data, original, nonce)
+    return ReceivedPair(pair, data, original, nonce, method)

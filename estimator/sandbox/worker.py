@@ -25,15 +25,19 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from phibench.estimator.interface import Answer, Method
 from phibench.estimator.sandbox.answers import answer_text, to_bytes
 from phibench.estimator.sandbox.resolve import MethodError, Reference, RunLimits
 from phibench.estimator.sandbox.transport import Connection, ReceivedPair, SharedPages, TransportError, unpack
 from phibench.scenes.validation import close_names
+
+if TYPE_CHECKING:
+    from phibench.estimator.methods.locate import SharedWork
 
 _STATM = Path("/proc/self/statm")
 
@@ -195,24 +199,35 @@ def main(line: int, reader: int, isolation: dict[str, Any]) -> None:
     faulthandler.enable(all_threads=False)
     faulthandler.register(signal.SIGUSR1, all_threads=False)
     order = json.loads(connection.receive())
-    nonce, reference = order["nonce"], Reference.of(order["reference"])
+    nonce, references = order["nonce"], [Reference.of(one) for one in order["references"]]
     try:
-        method = load(reference)
+        methods = [load(reference) for reference in references]
     except MethodError as error:
         connection.send(to_bytes({"nonce": nonce, "fault": str(error)[:_LONGEST_MESSAGE]}))
         return
-    file = reference.place if reference.kind == "file" else ""
+    file = references[0].place if references[0].kind == "file" else ""
     limits = RunLimits(memory_mb=order["memory_mb"])
     limit_bytes = size_bytes() + int(1e6 * limits.memory_mb)
     connection.send(to_bytes({"nonce": nonce, "fault": ""}))
+    held = None
     with suppress(TransportError):
         while True:
-            _answer(connection, pages, lambda received: _reply(method, received, limits, limit_bytes, file))
+            received = unpack(connection.receive(), pages, held)
+            if len(methods) > 1:  # one method's pair is not kept: it would count against its limit
+                held = received = _shared(received)
+            _answer(connection, received, lambda one: _reply(methods[one.method], one, limits, limit_bytes, file))
 
 
-def _answer(connection: Connection, pages: SharedPages, reply: Callable[[ReceivedPair], dict[str, Any]]) -> None:
+def _shared(received: ReceivedPair) -> ReceivedPair:
+    """The pair with the work that built-in methods share."""
+    from phibench.estimator.methods.locate import SharedPair
+
+    pair = received.pair
+    return received if isinstance(pair, SharedPair) else replace(received, pair=SharedPair.of(pair))
+
+
+def _answer(connection: Connection, received: ReceivedPair, reply: Callable[[ReceivedPair], dict[str, Any]]) -> None:
     """Answer one pair, in the process that was asked alone."""
-    received = unpack(connection.receive(), pages)
     asked = {"number": received.pair.number, "nonce": received.nonce}
     process = os.getpid()
     answer = to_bytes({**reply(received), **asked})
@@ -226,13 +241,22 @@ def _reply(method: Method, received: ReceivedPair, limits: RunLimits, limit_byte
         with limited(limit_bytes):
             return method(received.pair)
 
-    reply = reply_of(ask, file, BaseException, limits)
+    work = getattr(received.pair, "work", None)
+    reply = reply_of(ask, file, BaseException, limits) if work is None else _reply_with_stages(ask, work, limits)
     for stream in (sys.stdout, sys.stderr):  # what belongs to this pair must be in the pipe before the reply
         with suppress(Exception):
             stream.flush()
     if not received.unchanged():
         return {**reply, "failure": "mutated", "message": "the method wrote into the pair's images: work on a copy"}
     return reply
+
+
+def _reply_with_stages(ask: Callable[[], Answer], work: SharedWork, limits: RunLimits) -> dict[str, Any]:
+    """Reply of a built-in method, with CPU-seconds by stage and the wall clock of the results that it found there."""
+    work.stages, work.reused_seconds, start = {}, 0.0, time.process_time()
+    reply = reply_of(ask, "", BaseException, limits)
+    own = time.process_time() - start - work.total
+    return {**reply, "stages": work.stages, "own_seconds": own, "reused_seconds": work.reused_seconds}
 
 
 def reply_of(
