@@ -37,8 +37,8 @@ _SIDE = np.arange(-_WIDE_PX, _WIDE_PX + 1e-9, _WIDE_STEP_PX)
 _PLACE = 2  # unknowns u, v, the first ones
 _LEAST_FLUX = 1e-3  # of the fit's flux, below which a hypothesis has no spot
 
-Scores = Callable[[Array], tuple[Array, Array, Array]]
-"""From hypotheses, shape (m, k): misfit (m,), score (m, k) and Fisher matrix (m, k, k)."""
+Scores = Callable[[Array, int], tuple[Array, Array, Array]]
+"""From hypotheses, shape (m, k): misfit (m,), and score and Fisher matrix of the unknowns from a first one on."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ def of_window(window: Window, start: Array, corner_px: Array) -> SpotLikelihood 
     limited_square = float(np.minimum(misfit**2, _OUTLIER**2).sum())
     excess = max(limited_square / max(len(noise.sigma) - len(start), 1), 1.0)
 
-    def scores(theta: Array) -> tuple[Array, Array, Array]:
-        r, J = residuals(theta)
+    def scores(theta: Array, first: int) -> tuple[Array, Array, Array]:
+        r, J = residuals(theta, first)
         return np.einsum("ml,ml->m", r, r), np.einsum("mkl,ml->mk", J, r), J @ np.swapaxes(J, 1, 2)
 
     return SpotLikelihood(scores, theta, corner_px, excess) if np.isfinite(excess) else None
@@ -90,11 +90,11 @@ def of_pixels(data: SpotData, uv_px: Array) -> SpotLikelihood:
     """Likelihood of one region's pixels or codes about a place (u, v) in the image, where a fit has put the spot."""
     corner = np.asarray(data.regions.origin_px[0], float)
 
-    def scores(theta: Array) -> tuple[Array, Array, Array]:
+    def scores(theta: Array, first: int) -> tuple[Array, Array, Array]:
         many = data.rows(np.zeros(len(theta), np.int64))
         mean, derivatives = many.pixels.at(theta)
         used, x = many.regions.used, many.regions.x_e
-        flat = derivatives.reshape(*theta.shape, -1)
+        flat = derivatives.reshape(*theta.shape, -1)[:, first:]
         weight = (used * many.law.information(mean)).reshape(len(theta), 1, -1)
         score = (flat @ (used * many.law.score(x, mean)).reshape(len(theta), -1, 1))[..., 0]
         misfit = np.sum(used * many.law.misfit(x, mean), axis=(1, 2))
@@ -105,7 +105,7 @@ def of_pixels(data: SpotData, uv_px: Array) -> SpotLikelihood:
     above = used * (above - np.einsum("c,chw->hw", levels, data.pixels.levels[0])) * data.pixels.response[0]
     start = np.array([*(uv_px - corner), max(float(above.sum()), 100.0), *levels])
     for _ in range(_STEPS):
-        _, score, fisher = scores(start[None])
+        _, score, fisher = scores(start[None], 0)
         start = limited(start[None], scoring_step(fisher, score))[0]
     return SpotLikelihood(scores, start, corner, 1.0)
 
@@ -116,7 +116,7 @@ def _median(values: Array) -> float:
 
 def likelihood_map(one: SpotLikelihood) -> LikelihoodMap | None:
     """Map of all places near the fit whose misfit is within the range of the least; None if the fit has no place."""
-    misfit, _, fisher = (part[0] for part in one.scores(one.theta[None]))
+    misfit, _, fisher = (part[0] for part in one.scores(one.theta[None], 0))
     C = covariance_bound(fisher) * one.excess
     if not np.isfinite(C).all():
         return None
@@ -185,9 +185,9 @@ def _part_profiled(one: SpotLikelihood, theta: Array, evaluations: int) -> tuple
     theta[:, _PLACE] = np.maximum(theta[:, _PLACE], least)
     misfit = gain = np.zeros(len(theta))
     for _ in range(evaluations):
-        misfit, score, F = one.scores(theta)
-        step = scoring_step(F[:, rest, rest], score[:, rest])
-        gain = np.sum(step * score[:, rest], axis=1)
+        misfit, score, F = one.scores(theta, _PLACE)
+        step = scoring_step(F, score)
+        gain = np.sum(step * score, axis=1)
         theta[:, rest] += step
         theta[:, _PLACE] = np.maximum(theta[:, _PLACE], least)
     return (misfit - np.maximum(gain, 0.0)) / one.excess, theta

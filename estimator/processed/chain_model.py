@@ -42,6 +42,7 @@ from phibench.scenes.frames import Array
 
 _UNITS = 2  # a window of JPEG holds 2 x 2 units: the spot is at least half a unit from its sides
 _SIDE_PX = 12  # of other windows: the spot is at least 5 px from its sides, and 18 px would tell 0.1 % more
+_MOST_BLOCKS = 32
 _ROUNDING = 1.0 / 12.0  # variance of rounding to whole codes: uniform over one code
 UNIT_MATRIX = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -71,6 +72,8 @@ class ChainModel:
         Changes of Y' by denoising that spares edges, q of them; None where denoising is linear, and q is 0.
     transform : shape (3 p + q, n)
         From codes, and changes of Y', to outputs.
+    block : shape (n,), int
+        Outputs that depend on the same codes have the same number, such as those of one block of JPEG.
     step : shape (n,)
         Of the quantiser.
     shift : shape (n,)
@@ -90,6 +93,7 @@ class ChainModel:
     tables: MeanCodes | None
     sparing: EdgeSparing | None
     transform: Array
+    block: NDArray[np.int64]
     step: Array
     shift: Array
     rounding: Array
@@ -147,8 +151,15 @@ def chain_model(card: SensorCard, noise: PixelNoise) -> ChainModel:
         T = np.vstack([T, card.denoise_luma * (output.transform @ same).toarray().T])
     tables = mean_codes(card, noise, whole) if card.colour_matrix == UNIT_MATRIX else None
     kinds = _kinds(filters)
-    parts = (np.ascontiguousarray(T), output.step, output.shift, output.rounding)
+    parts = (np.ascontiguousarray(T), _blocks(T), output.step, output.shift, output.rounding)
     return ChainModel(card, noise, (h, w), margin, filters, linear, linear.power(2), kinds, tables, sparing, *parts)
+
+
+def _blocks(transform: Array) -> NDArray[np.int64]:
+    """Number of each output's block, shape (n,); one for all where there are many, whose products are not worth it."""
+    first: dict[bytes, int] = {}
+    block = np.array([first.setdefault(row.tobytes(), len(first)) for row in transform.T != 0.0], np.int64)
+    return block if len(first) <= _MOST_BLOCKS else np.zeros_like(block)
 
 
 def window_px(card: SensorCard) -> tuple[int, int]:
@@ -186,9 +197,9 @@ def _codes(model: ChainModel, mean_e: Array) -> Codes:
         excess = np.maximum(n.variance - (n.by_mean * sigma) ** 2, 0.0)
         return Codes(255.0 * n.mean, 255.0 * n.by_mean, 255.0 * n.by_mean, 255.0**2 * excess)
     gain = np.repeat(full_scale_e(model.card) / np.asarray(model.card.white_balance), linear.shape[-1] // 3)
-    at, table = linear * gain, model.tables.at
-    by_mean, regression = (table(name, at, model.kinds) * gain for name in ("by_mean", "regression"))
-    return Codes(table("mean", at, model.kinds), by_mean, regression, table("excess", at, model.kinds))
+    names = ("mean", "by_mean", "regression", "excess")
+    mean, by_mean, regression, excess = model.tables.values(names, linear * gain, model.kinds)
+    return Codes(mean, by_mean * gain, regression * gain, excess)
 
 
 def raw_variance_e2(model: ChainModel, mean_e: Array) -> Array:

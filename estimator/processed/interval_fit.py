@@ -115,13 +115,14 @@ class IntervalPosterior:
     sites: Sites
     settled: bool
 
-    def likelihood(self) -> Callable[[Array], tuple[Array, Array]]:
+    def likelihood(self) -> Callable[[Array, int], tuple[Array, Array]]:
         """Likelihood of other hypotheses, with the Gaussians in place of the intervals.
 
         Returns
         -------
         callable
-            From hypotheses, shape (m, k), to whitened residuals, shape (m, l), and derivatives, shape (m, k, l).
+            From hypotheses, shape (m, k), and the first unknown to derive by, to whitened residuals, shape (m, l), and
+            derivatives, shape (m, k - first, l).
         """
         inputs, used = (
             self.window.inputs(self.theta),
@@ -135,8 +136,8 @@ class IntervalPosterior:
         )
         L = np.linalg.cholesky(F.T @ F + np.diag(inputs.own[index] + 1.0 / precision))
 
-        def residuals(theta: Array) -> tuple[Array, Array]:
-            mean, slopes = self.window.means(theta, rows)
+        def residuals(theta: Array, first: int) -> tuple[Array, Array]:
+            mean, slopes = self.window.means(theta, rows, first)
             m, k, count = slopes.shape
             both = np.concatenate([(middle - mean)[:, None], slopes], axis=1).reshape(-1, count)
             white = solve_triangular(L, both.T, lower=True, check_finite=False).T.reshape(m, k + 1, count)

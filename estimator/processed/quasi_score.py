@@ -14,6 +14,7 @@ Where steps exceed the noise the equation has several roots; `interval_fit` is f
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +51,7 @@ class Rows:
 
     index: NDArray[np.int64]
     transform: Array
+    block: NDArray[np.int64]
     step: Array
     shift: Array
     rounding: Array
@@ -57,12 +59,33 @@ class Rows:
     @classmethod
     def all(cls, model: ChainModel) -> Rows:
         """All coefficients of a model."""
-        names = ("transform", "step", "shift", "rounding")
+        names = ("transform", "block", "step", "shift", "rounding")
         return cls(np.arange(len(model.step)), *(getattr(model, name) for name in names))
 
     def part(self, index: NDArray[np.int64]) -> Rows:
         """Take some of them."""
         return Rows(*(np.take(getattr(self, f.name), index, axis=-1) for f in fields(self)))
+
+    @cached_property
+    def _parts(self) -> list[tuple[NDArray[np.int64], NDArray[np.int64], Array]]:
+        """Codes and outputs of each block, and the part of the transform between them, which holds its non-zeros."""
+        parts = []
+        for number in np.unique(self.block):
+            columns = np.flatnonzero(self.block == number)
+            rows = np.flatnonzero((self.transform[:, columns[:1]] if self._many else self.transform).any(axis=1))
+            parts.append((rows, columns, np.ascontiguousarray(self.transform[np.ix_(rows, columns)])))
+        return parts
+
+    @property
+    def _many(self) -> bool:
+        return bool(len(self.block) and self.block.max() > 0)
+
+    def of_codes(self, values: Array) -> Array:
+        """Outputs, shape (..., l), of codes, shape (..., 3 p + q): `values @ transform`, block by block."""
+        result = np.empty((*values.shape[:-1], len(self.block)))
+        for rows, columns, matrix in self._parts:
+            result[..., columns] = values[..., rows] @ matrix
+        return result
 
 
 @dataclass(frozen=True)
@@ -205,11 +228,15 @@ class Window:
             C = C / self.frames + (1.0 - 1.0 / self.frames) * alike
         return Noise(rows, sigma, np.asarray(np.linalg.cholesky(C), float))
 
-    def means(self, theta: Array, rows: Rows) -> tuple[Array, Array]:
-        """Means before the quantiser, shape (m, l), and derivatives, shape (m, k, l), of hypotheses (m, k)."""
+    def means(self, theta: Array, rows: Rows, first: int = 0) -> tuple[Array, Array]:
+        """Means before the quantiser, shape (m, l), and derivatives, shape (m, k - first, l), of hypotheses (m, k).
+
+        Derivatives are those by the unknowns from `first` on.
+        """
         raw, derivatives = self._raw(theta)
         at, offset = codes(self.model, raw.mean_e), np.broadcast_to(self.offset, len(self.model.step))[rows.index]
-        return at.mean @ rows.transform + rows.shift + offset, code_slopes(self.model, at, derivatives) @ rows.transform
+        slopes = code_slopes(self.model, at, derivatives[:, first:])
+        return rows.of_codes(at.mean) + rows.shift + offset, rows.of_codes(slopes)
 
     def inputs(self, theta: Array) -> Inputs:
         """Outputs before the quantiser for one hypothesis, shape (k,)."""
@@ -236,10 +263,10 @@ class Window:
         _, derivatives = self.pixels.at(theta[None])
         return np.asarray((self.prnu * theta[2] * derivatives[0, 2].ravel()) ** 2)
 
-    def residual(self, noise: Noise, theta: Array) -> tuple[Array, Array]:
-        """Whitened residuals, shape (m, l), and derivatives of the mean, shape (m, k, l), of hypotheses (m, k)."""
+    def residual(self, noise: Noise, theta: Array, first: int = 0) -> tuple[Array, Array]:
+        """Whitened residuals, shape (m, l), and derivatives of the mean, shape (m, k - first, l), as `means`."""
         rows = noise.rows
-        mean, slopes = self.means(theta, rows)
+        mean, slopes = self.means(theta, rows, first)
         output = quantised(mean, noise.sigma, rows.step)
         slopes *= output.slope[:, None, :]
         m, k, count = slopes.shape

@@ -20,6 +20,7 @@ A code is a pixel's 8-bit value. All is in closed form or from exact sums.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -249,13 +250,23 @@ class MeanCodes:
         which : shape (p,), int
             Row of the table, 3 x colour + place in `COUNTS`.
         """
-        table = getattr(self, name).reshape(9, -1)
+        (value,) = self.values((name,), mean_e, which)
+        return value
+
+    def values(self, names: Sequence[str], mean_e: Array, which: NDArray[np.int64]) -> tuple[Array, ...]:
+        """Values of several tables at the same means, as `at`."""
+        size = self.mean.shape[-1]
         root = np.sqrt(np.maximum(mean_e, 0.0)) / self.step
-        node = np.minimum(root.astype(np.int64), table.shape[1] - 2)
-        share = np.minimum(root - node, 1.0)
-        first = table[which, node]
-        value = first + share * (table[which, node + 1] - first)
-        return value + np.minimum(mean_e, 0.0) * self.by_mean.reshape(9, -1)[which, 0] if name == "mean" else value
+        node = np.minimum(root.astype(np.int64), size - 2)
+        share, place = np.minimum(root - node, 1.0), which * size + node
+
+        def one(name: str) -> Array:
+            table = getattr(self, name).reshape(-1)
+            first = table[place]
+            value = first + share * (table[place + 1] - first)
+            return value + np.minimum(mean_e, 0.0) * self.by_mean.reshape(9, -1)[which, 0] if name == "mean" else value
+
+        return tuple(one(name) for name in names)
 
 
 @lru_cache(maxsize=8)

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -137,3 +138,16 @@ def test_rig_and_room_survive_json() -> None:
     assert from_json(Room, json.loads(json.dumps(to_json(room)))) == room
     with pytest.raises(DatasetError, match="camera"):
         from_json(Rig, {**to_json(rig), "camera": {"fx_px": -1.0}})
+
+
+@dataclass(frozen=True)
+class _Named:
+    stream: tuple[str | int, ...]
+
+
+def test_names_of_streams_may_hold_any_seed() -> None:
+    """A secret seed is drawn from all of 63 bits; 1e12 is the largest of other numbers."""
+    named = _Named(("bench-test", 2**62 + 1, "room", 3))
+    assert from_json(_Named, json.loads(json.dumps(to_json(named)))) == named
+    with pytest.raises(DatasetError, match=r"stream\.1 is 18446744073709551616: not allowed"):
+        from_json(_Named, {"stream": ["bench-test", 2**64]})
