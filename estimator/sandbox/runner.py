@@ -109,7 +109,7 @@ class Harness:
         return zip(self._pools, self._places, strict=True)
 
     def _in_order(self, parts: Sequence[Sequence[T]]) -> tuple[T, ...]:
-        """What belongs to each method, from what each process gives, in the methods' order."""
+        """Values of each method in the methods' order, from those of each process."""
         found = {
             place: one
             for at, part in zip(self._places, parts, strict=True)
