@@ -4,7 +4,7 @@ State, in the rig's frame made level: the azimuth a, the rise k = (z - z0) / D a
 the height of the sphere centre at the down position; then the slip and the skid factor of the tracks, and the velocity
 of a target that moves, divided by D (modified polar coordinates, V. J. Aidala and S. E. Hammel, IEEE Trans. Automatic
 Control 28, 283, 1983). The robot's own place is no part of it: what odometry does not know moves the target.
-Constant states for the principal deviations of a rig that is not known exactly come last (`RigBias`).
+The rig is exact here; one that is known to a covariance has a `smoothing.SmoothedBelief`.
 
 A spot's pixel counts as the direction (azimuth, rise) of the ray that leaves the mirror. From a mirror raised by h the
 target's rise is k - h q but for the mirror's radius: nearly linear in the state, so that a filter stays consistent
@@ -16,19 +16,16 @@ Soup has more, data association above all, for nine more packages.
 
 from __future__ import annotations
 
+import abc
+import copy
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
-from phibench.estimator.film.film_positions import FilmPositions
-from phibench.estimator.geometry.reflection import reflect, reflect_jacobian
-from phibench.estimator.geometry.rig_parameters import RigBias
 from phibench.estimator.geometry.sphere_image import SphereImager
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.estimator.loop.sensing import Reading
+from phibench.estimator.loop.sensing import Direction, Reading, wrapped
 from phibench.scenes.frames import Array
 from phibench.scenes.motion.vehicle import PlanarPose, Stance, Vehicle, arc_covariance, rig_placement
 from phibench.scenes.rig import Rig
@@ -36,143 +33,63 @@ from phibench.scenes.validation import SceneError
 
 PRIOR_DISTANCES_M = (0.8, 6.0)
 """Distances between which a target is expected before anything is known: ends of q at about 1.5 deviations."""
-_LEAST_Q = 0.02  # sigma points at 50 m and beyond count as there
-_WIDE = 2.0  # of the shift that the rig's deviations may have: the direction before the first one
-_ALPHA, _BETA, _KAPPA = 0.6, 2.0, 0.0  # of Merwe's sigma points: 1.3 deviations away for 5 states
+LEAST_Q = 0.02  # states at 50 m and beyond count as there
 PLACE = 3  # first entries of the state
 SLIP, SKID = 3, 4
 VELOCITY = slice(5, 8)
+_ALPHA, _BETA, _KAPPA = 0.6, 2.0, 0.0  # of Merwe's sigma points: 1.3 deviations away for 5 states
 
 
-@dataclass(frozen=True)
-class Direction:
-    """Direction of the ray that leaves the mirror, in the rig's frame.
-
-    Parameters
-    ----------
-    azimuth_rad, rise : float
-        Rise is the tangent of the elevation, up counts.
-    covariance : shape (2, 2)
-    """
-
-    azimuth_rad: float
-    rise: float
-    covariance: Array
-
-    @property
-    def values(self) -> Array:
-        """Both numbers, shape (2,)."""
-        return np.array([self.azimuth_rad, self.rise])
-
-
-def direction_of(rig: Rig, u_px: float, v_px: float, sigma_px: float) -> Direction | None:
-    """Direction that a pixel belongs to, by the nominal rig; None where no ray leaves the mirror."""
-    return direction_with(rig, u_px, v_px, sigma_px**2 * np.eye(2))
-
-
-def direction_with(rig: Rig, u_px: float, v_px: float, covariance_px2: Array) -> Direction | None:
-    """Same, with the covariance of the pixel, shape (2, 2)."""
-    view, uv = rig.at(0.0), np.array([u_px, v_px])
-    ray = reflect(view, uv)
-    r, dr = ray.direction_world, reflect_jacobian(view, uv).direction_per_px
-    if not np.isfinite(dr).all():
-        return None
-    across2 = r[0] ** 2 + r[1] ** 2
-    across = math.sqrt(across2)
-    J = np.array(
-        [
-            [-r[1] / across2, r[0] / across2, 0.0],
-            [-r[2] * r[0] / across**3, -r[2] * r[1] / across**3, 1.0 / across],
-        ]
-    )
-    J = J @ dr
-    return Direction(math.atan2(r[1], r[0]), float(r[2] / across), J @ covariance_px2 @ J.T)
-
-
-def wrapped(angle_rad: float) -> float:
-    """Angle between -pi and pi."""
-    return math.remainder(angle_rad, 2.0 * math.pi)
-
-
-class TargetBelief:
-    """Belief over one target.
+class Belief(abc.ABC):
+    """Belief over one target: mean and covariance of its state, and how a robot's moves change that.
 
     Parameters
     ----------
     rig : Rig
         The nominal one.
     vehicle : Vehicle
-    first : Direction
-        Of the target, seen with the mirror raised by `stroke_m` and the robot level.
-    stroke_m : float
-    distances_m : 2 floats
-        Range that is expected.
     acceleration_m2_per_s3 : float
         Density of the target's acceleration per axis; 0 is a target at rest.
-    speed_m_per_s : float
-        Standard deviation of the target's first velocity per axis.
-    bias : RigBias or None
-        Of the rig's deviations; None is an exact rig.
-
-    Raises
-    ------
-    SceneError
-        If `filterpy` is not installed.
     """
 
-    def __init__(
-        self,
-        rig: Rig,
-        vehicle: Vehicle,
-        first: Direction,
-        stroke_m: float,
-        distances_m: tuple[float, float] = PRIOR_DISTANCES_M,
-        acceleration_m2_per_s3: float = 0.0,
-        speed_m_per_s: float = 0.3,
-        bias: RigBias | None = None,
-    ) -> None:
+    def __init__(self, rig: Rig, vehicle: Vehicle, acceleration_m2_per_s3: float) -> None:
         self.rig, self.vehicle = rig, vehicle
-        self._bias = RigBias(rig, None) if bias is None else bias
-        self._imager = SphereImager(rig)
         self._z0 = float(rig.at(0.0).sphere_centre_m[2])
-        self._axis = np.array(rig.stroke_axis_world)
         self._acceleration, self._moves = acceleration_m2_per_s3, acceleration_m2_per_s3 > 0.0
-        of_target = 8 if self._moves else 5
-        n = of_target + self._bias.count
-        self._deviations = slice(of_target, n)
-        near, far = distances_m
-        q, spread = 0.5 * (1.0 / near + 1.0 / far), (1.0 / near - 1.0 / far) / 3.0
-        self._filter = _unscented(n, of_target, self._residual)
-        x, P = np.zeros(n), np.zeros((n, n))
-        # the direction's rise is k - h q, but for the radius: k goes with q
-        x[:5] = first.azimuth_rad, first.rise + stroke_m * q, q, vehicle.slip, vehicle.skid
-        P[:2, :2] = first.covariance
-        to_q = np.array([0.0, stroke_m, 1.0])
-        P[:3, :3] += spread**2 * np.outer(to_q, to_q)
-        P[1, 1] += (2.0 * rig.sphere.radius_m * spread) ** 2  # what the radius does to the first rise
-        P[SLIP, SLIP], P[SKID, SKID] = vehicle.slip_sigma**2 + 1e-12, vehicle.skid_sigma**2 + 1e-12
-        if self._moves:
-            P[VELOCITY, VELOCITY] = (speed_m_per_s * q) ** 2 * np.eye(3)
-        self._filter.x, self._filter.P = x, P
-        if self._bias.count:
-            # a wide direction, and then the first one: their correlation with the deviations is not linear
-            P[self._deviations, self._deviations] = np.eye(self._bias.count)
-            B = _WIDE * self._bias.shifts(self.point_m(x), stroke_m)
-            P[:2, :2] += B @ B.T
-            self.predict(0.0, 0.0, 0.0)
-            self.update(first, stroke_m)
-
-    # -- what is believed ------------------------------------------------------------------------------------------
 
     @property
+    @abc.abstractmethod
     def mean(self) -> Array:
         """State, shape (5,) or (8,), and as many more as the rig has deviations."""
-        return np.asarray(self._filter.x)
 
     @property
+    @abc.abstractmethod
     def covariance(self) -> Array:
         """Of the state."""
-        return np.asarray(self._filter.P)
+
+    @abc.abstractmethod
+    def pixel(self, stroke_m: float, held: Stance | None = None) -> tuple[float, float] | None:
+        """Pixel at which the mean is seen; None where the mirror does not show it."""
+
+    @abc.abstractmethod
+    def predict(self, left_m: float, right_m: float, step_s: float) -> None:
+        """Take in a step of the tracks, as their encoders count it, and the time that it took."""
+
+    @abc.abstractmethod
+    def update(self, seen: Direction, stroke_m: float, held: Stance | None = None) -> None:
+        """Take in a direction, after `predict`; `held` is the robot's attitude, level by default."""
+
+    @abc.abstractmethod
+    def imagine(self, stroke_m: float, covariance: Array) -> None:
+        """Take in a direction where it is expected, with a covariance, shape (2, 2): what a frame would be worth."""
+
+    @abc.abstractmethod
+    def copied(self) -> Self:
+        """Copy that changes on its own."""
+
+    @abc.abstractmethod
+    def distance2(self, seen: Direction, stroke_m: float, held: Stance | None = None) -> float:
+        """Squared Mahalanobis distance of a direction from what is expected: chi squared of 2 for the target's own."""
 
     @property
     def distance_m(self) -> float:
@@ -204,76 +121,28 @@ class TargetBelief:
         error[0] = wrapped(error[0])
         return float(error @ np.linalg.solve(self.covariance[:PLACE, :PLACE], error))
 
-    def expected(self, stroke_m: float, held: Stance | None = None) -> tuple[float, float]:
-        """Azimuth and rise at which the mean is seen."""
-        azimuth, rise = self._seen(self.mean[np.newaxis], stroke_m, held)[0]
-        return float(azimuth), float(rise)
-
-    def pixel(self, stroke_m: float, held: Stance | None = None) -> tuple[float, float] | None:
-        """Pixel at which the mean is seen; None where the mirror does not show it."""
-        place = self._bias.pixel(self._standing(self.mean, held), stroke_m, self.mean[self._deviations])
-        return None if math.isnan(place[0]) else place
-
-    # -- what changes it -------------------------------------------------------------------------------------------
-
-    def predict(self, left_m: float, right_m: float, step_s: float) -> None:
-        """Take in a step of the tracks, as their encoders count it, and the time that it took."""
-        mean = self.mean
-        Q = self._process_noise(mean, left_m, right_m, step_s)
-        self._filter.Q = Q + 1e-16 * np.eye(len(mean))
-        self._filter.predict(fx=lambda x, _: self._moved(x, left_m, right_m, step_s, float(mean[0])))
-        self._filter.P = 0.5 * (self._filter.P + self._filter.P.T)
-
-    def update(self, seen: Direction, stroke_m: float, held: Stance | None = None) -> None:
-        """Take in a direction, after `predict`; `held` is the robot's attitude, level by default."""
-        expected = iter(self._seen(self._filter.sigmas_f, stroke_m, held))
-        self._filter.update(seen.values, R=seen.covariance, hx=lambda _: next(expected))
-        self._filter.P = 0.5 * (self._filter.P + self._filter.P.T)
-        self._filter.x[2] = max(self._filter.x[2], _LEAST_Q)
-
-    def distance2(self, seen: Direction, stroke_m: float, held: Stance | None = None) -> float:
-        """Squared Mahalanobis distance of a direction from what is expected: chi squared of 2 for the target's own."""
-        values = self._seen(self._filter.sigmas_f, stroke_m, held)
-        values[:, 0] = [wrapped(a - seen.azimuth_rad) for a in values[:, 0]]
-        values[:, 1] -= seen.rise
-        mean = self._filter.Wm @ values
-        S = (values - mean).T @ np.diag(self._filter.Wc) @ (values - mean) + seen.covariance
-        return float(mean @ np.linalg.solve(S, mean))
-
-    # -- model -----------------------------------------------------------------------------------------------------
-
     def point_m(self, x: Array) -> Array:
         """Place of a state in the rig's frame made level, shape (3,)."""
-        D = 1.0 / max(float(x[2]), _LEAST_Q)
+        D = 1.0 / max(float(x[2]), LEAST_Q)
         return np.array([D * math.cos(x[0]), D * math.sin(x[0]), self._z0 + D * x[1]])
-
-    def _seen(self, states: Array, stroke_m: float, held: Stance | None) -> Array:
-        """Directions of the images of N states, shape (N, 2); their own where the mirror does not show them."""
-        if not self._bias.count:
-            return np.array([self._seen_exactly(x, stroke_m, held) for x in states])
-        points = np.array([self._standing(x, held) for x in states])
-        return self._bias.directions(points, stroke_m, states[:, self._deviations])
-
-    def _seen_exactly(self, x: Array, stroke_m: float, held: Stance | None) -> Array:
-        """Direction of a state's image in the nominal rig."""
-        lowered = self._standing(x, held) - stroke_m * self._axis
-        image = self._imager.image(*lowered.tolist())
-        d = lowered - np.array([0.0, 0.0, self._z0]) if image is None else np.array(image.ray)
-        return np.array([math.atan2(d[1], d[0]), d[2] / math.hypot(d[0], d[1])])
 
     def _standing(self, x: Array, held: Stance | None) -> Array:
         """Place of a state in the rig's frame of the robot as it stands."""
-        point = self.point_m(x)
-        if held is not None:
-            R, t = rig_placement(self.vehicle, PlanarPose(), held)
-            point = (point + np.array([self.vehicle.sensor_x_m, 0.0, 0.0]) - t) @ R
-        return np.asarray(point)
+        R, t = self._tilt(held)
+        return np.asarray((self.point_m(x) - t) @ R)
+
+    def _tilt(self, held: Stance | None) -> tuple[Array, Array]:
+        """Rotation and origin of the rig's frame as the robot stands, in that frame made level."""
+        if held is None:
+            return np.eye(3), np.zeros(3)
+        R, t = rig_placement(self.vehicle, PlanarPose(), held)
+        return R, t - np.array([self.vehicle.sensor_x_m, 0.0, 0.0])
 
     def _moved(self, x: Array, left_m: float, right_m: float, step_s: float, about_rad: float) -> Array:
         """State after a step."""
         after, point = x.copy(), self.point_m(x)
         if self._moves:
-            point = point + step_s * x[VELOCITY] / max(float(x[2]), _LEAST_Q)
+            point = point + step_s * x[VELOCITY] / max(float(x[2]), LEAST_Q)
         arc = self.vehicle.arc(left_m, right_m, float(x[SLIP]), float(x[SKID]))
         (cx, cy), c, s = arc.chord_m, math.cos(arc.turn_rad), math.sin(arc.turn_rad)
         dx, dy = point[0] + self.vehicle.sensor_x_m - cx, point[1] - cy
@@ -282,14 +151,14 @@ class TargetBelief:
         expected = about_rad - arc.turn_rad
         after[:3] = expected + wrapped(math.atan2(Y, X) - expected), (point[2] - self._z0) / D, 1.0 / D
         if self._moves:
-            vx, vy, vz = x[VELOCITY] / (D * max(float(x[2]), _LEAST_Q))
+            vx, vy, vz = x[VELOCITY] / (D * max(float(x[2]), LEAST_Q))
             after[VELOCITY] = c * vx + s * vy, c * vy - s * vx, vz
         return after
 
     def _process_noise(self, x: Array, left_m: float, right_m: float, step_s: float) -> Array:
         """Covariance that a step adds: random parts of the tracks' ways, and the target's acceleration."""
         n = len(x)
-        Q, D, k = np.zeros((n, n)), 1.0 / max(float(x[2]), _LEAST_Q), float(x[1])
+        Q, D, k = np.zeros((n, n)), 1.0 / max(float(x[2]), LEAST_Q), float(x[1])
         c, s = math.cos(x[0]), math.sin(x[0])
         # d(azimuth, rise, q) by the place
         J = np.array([[-s / D, c / D, 0.0], [-k * c / D, -k * s / D, 1.0 / D], [-c / D**2, -s / D**2, 0.0]])
@@ -306,6 +175,133 @@ class TargetBelief:
             Q[VELOCITY, VELOCITY] = a * t / D**2 * np.eye(3)
         return Q
 
+
+class TargetBelief(Belief):
+    """Belief over one target of a rig that is known exactly.
+
+    Parameters
+    ----------
+    rig : Rig
+        The nominal one.
+    vehicle : Vehicle
+    first : Direction
+        Of the target, seen with the mirror raised by `stroke_m` and the robot level.
+    stroke_m : float
+    distances_m : 2 floats
+        Range that is expected.
+    acceleration_m2_per_s3 : float
+        Density of the target's acceleration per axis; 0 is a target at rest.
+    speed_m_per_s : float
+        Standard deviation of the target's first velocity per axis.
+
+    Raises
+    ------
+    SceneError
+        If `filterpy` is not installed.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        vehicle: Vehicle,
+        first: Direction,
+        stroke_m: float,
+        distances_m: tuple[float, float] = PRIOR_DISTANCES_M,
+        acceleration_m2_per_s3: float = 0.0,
+        speed_m_per_s: float = 0.3,
+    ) -> None:
+        super().__init__(rig, vehicle, acceleration_m2_per_s3)
+        self._imager = SphereImager(rig)
+        self._axis = np.array(rig.stroke_axis_world)
+        n = 8 if self._moves else 5
+        near, far = distances_m
+        q, spread = 0.5 * (1.0 / near + 1.0 / far), (1.0 / near - 1.0 / far) / 3.0
+        self._filter = _unscented(n, self._residual)
+        x, P = np.zeros(n), np.zeros((n, n))
+        # the direction's rise is k - h q, but for the radius: k goes with q
+        x[:5] = first.azimuth_rad, first.rise + stroke_m * q, q, vehicle.slip, vehicle.skid
+        P[:2, :2] = first.covariance
+        to_q = np.array([0.0, stroke_m, 1.0])
+        P[:3, :3] += spread**2 * np.outer(to_q, to_q)
+        P[1, 1] += (2.0 * rig.sphere.radius_m * spread) ** 2  # what the radius does to the first rise
+        P[SLIP, SLIP], P[SKID, SKID] = vehicle.slip_sigma**2 + 1e-12, vehicle.skid_sigma**2 + 1e-12
+        if self._moves:
+            P[VELOCITY, VELOCITY] = (speed_m_per_s * q) ** 2 * np.eye(3)
+        self._filter.x, self._filter.P = x, P
+
+    # -- what is believed ------------------------------------------------------------------------------------------
+
+    @property
+    def mean(self) -> Array:
+        """State, shape (5,) or (8,)."""
+        return np.asarray(self._filter.x)
+
+    @property
+    def covariance(self) -> Array:
+        """Of the state."""
+        return np.asarray(self._filter.P)
+
+    def expected(self, stroke_m: float, held: Stance | None = None) -> tuple[float, float]:
+        """Azimuth and rise at which the mean is seen."""
+        azimuth, rise = self._seen(self.mean[np.newaxis], stroke_m, held)[0]
+        return float(azimuth), float(rise)
+
+    def pixel(self, stroke_m: float, held: Stance | None = None) -> tuple[float, float] | None:
+        """Pixel at which the mean is seen; None where the mirror does not show it."""
+        image = self._imager.image(*self._lowered(self.mean, stroke_m, held).tolist())
+        return None if image is None else (image.u_px, image.v_px)
+
+    # -- what changes it -------------------------------------------------------------------------------------------
+
+    def predict(self, left_m: float, right_m: float, step_s: float) -> None:
+        """Take in a step of the tracks, as their encoders count it, and the time that it took."""
+        mean = self.mean
+        Q = self._process_noise(mean, left_m, right_m, step_s)
+        self._filter.Q = Q + 1e-16 * np.eye(len(mean))
+        self._filter.predict(fx=lambda x, _: self._moved(x, left_m, right_m, step_s, float(mean[0])))
+        self._filter.P = 0.5 * (self._filter.P + self._filter.P.T)
+
+    def update(self, seen: Direction, stroke_m: float, held: Stance | None = None) -> None:
+        """Take in a direction, after `predict`; `held` is the robot's attitude, level by default."""
+        expected = iter(self._seen(self._filter.sigmas_f, stroke_m, held))
+        self._filter.update(seen.values, R=seen.covariance, hx=lambda _: next(expected))
+        self._filter.P = 0.5 * (self._filter.P + self._filter.P.T)
+        self._filter.x[2] = max(self._filter.x[2], LEAST_Q)
+
+    def distance2(self, seen: Direction, stroke_m: float, held: Stance | None = None) -> float:
+        """Squared Mahalanobis distance of a direction from what is expected: chi squared of 2 for the target's own."""
+        values = self._seen(self._filter.sigmas_f, stroke_m, held)
+        values[:, 0] = [wrapped(a - seen.azimuth_rad) for a in values[:, 0]]
+        values[:, 1] -= seen.rise
+        mean = self._filter.Wm @ values
+        S = (values - mean).T @ np.diag(self._filter.Wc) @ (values - mean) + seen.covariance
+        return float(mean @ np.linalg.solve(S, mean))
+
+    def imagine(self, stroke_m: float, covariance: Array) -> None:
+        """Take in a direction where it is expected."""
+        nowhere = np.full(2, np.nan)
+        self.update(Direction(*self.expected(stroke_m), covariance, nowhere, np.diag(nowhere)), stroke_m)
+
+    def copied(self) -> Self:
+        """Copy that changes on its own."""
+        return copy.deepcopy(self)
+
+    # -- model -----------------------------------------------------------------------------------------------------
+
+    def _seen(self, states: Array, stroke_m: float, held: Stance | None) -> Array:
+        """Directions of the images of N states, shape (N, 2); their own where the mirror does not show them."""
+        return np.array([self._seen_exactly(x, stroke_m, held) for x in states])
+
+    def _seen_exactly(self, x: Array, stroke_m: float, held: Stance | None) -> Array:
+        lowered = self._lowered(x, stroke_m, held)
+        image = self._imager.image(*lowered.tolist())
+        d = lowered - np.array([0.0, 0.0, self._z0]) if image is None else np.array(image.ray)
+        return np.array([math.atan2(d[1], d[0]), d[2] / math.hypot(d[0], d[1])])
+
+    def _lowered(self, x: Array, stroke_m: float, held: Stance | None) -> Array:
+        """Place of a state in the rig's frame of the robot as it stands, less the stroke."""
+        return np.asarray(self._standing(x, held) - stroke_m * self._axis)
+
     @staticmethod
     def _residual(a: Array, b: Array) -> Array:
         difference = np.subtract(a, b)
@@ -313,14 +309,13 @@ class TargetBelief:
         return np.asarray(difference)
 
 
-def _unscented(n: int, of_target: int, residual_z: Any) -> Any:
-    """Filter of `filterpy` with n states, some of them the target's, and directions as measurements."""
+def _unscented(n: int, residual_z: Any) -> Any:
+    """Filter of `filterpy` with n states, and directions as measurements."""
     try:
         from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
     except ImportError as error:
         raise SceneError("beliefs need filterpy: pip install 'phibench[loop]'") from error
-    alpha = _ALPHA * math.sqrt(of_target / n)  # sigma points are no farther away for more states
-    points = MerweScaledSigmaPoints(n, alpha, _BETA, _KAPPA)
+    points = MerweScaledSigmaPoints(n, _ALPHA, _BETA, _KAPPA)
     return UnscentedKalmanFilter(n, 2, 1.0, None, None, points, residual_z=residual_z, z_mean_fn=_direction_mean)
 
 
@@ -329,53 +324,6 @@ def _direction_mean(values: Array, weights: Array) -> Array:
     first = values[0, 0]
     turned = np.array([wrapped(a - first) for a in values[:, 0]])
     return np.array([first + weights @ turned, weights @ values[:, 1]])
-
-
-def film_beliefs(
-    rig: Rig,
-    vehicle: Vehicle,
-    positions: FilmPositions,
-    times_s: Array,
-    strokes_m: Array,
-    distances_m: tuple[float, float] = PRIOR_DISTANCES_M,
-    acceleration_m2_per_s3: float = 0.0,
-    speed_m_per_s: float = 0.3,
-    encoder_sigma_m: float = 0.0,
-) -> Iterator[tuple[int, TargetBelief]]:
-    """Belief after each frame of a film of a robot that stands: its number, and the belief, which goes on changing.
-
-    Parameters
-    ----------
-    positions : FilmPositions
-        In N frames, those of `film.film_estimates.seen_film`, which takes the room off by frames with the laser off,
-        or of `film.spot_tracks.fitted_positions`; frames without one are left out.
-    times_s, strokes_m : shape (N,)
-        Time at which the spot's row was exposed, and the encoder's reading then.
-    distances_m, acceleration_m2_per_s3, speed_m_per_s
-        As for `TargetBelief`.
-    encoder_sigma_m : float
-        Standard deviation of a reading: the rise is k - h q, and errs by as much as q times that.
-    """
-    belief, before = None, 0.0
-    q = 0.5 * sum(1.0 / D for D in distances_m)
-    # what frames share, as if new in every frame: the sum over all frames is no less than it, by Gershgorin's theorem
-    shared = np.abs(positions.shared_px2[:, :, positions.good]).sum(axis=(2, 3))
-    for k in np.flatnonzero(positions.good):
-        noise = positions.noise_px2[k] + np.diag(shared[k])
-        seen = direction_with(rig, float(positions.uv_px[k, 0]), float(positions.uv_px[k, 1]), noise)
-        if seen is None:
-            continue
-        q = q if belief is None else float(belief.mean[2])
-        seen = replace(seen, covariance=seen.covariance + np.diag([0.0, (q * encoder_sigma_m) ** 2]))
-        if belief is None:
-            belief = TargetBelief(
-                rig, vehicle, seen, float(strokes_m[k]), distances_m, acceleration_m2_per_s3, speed_m_per_s
-            )
-        else:
-            belief.predict(0.0, 0.0, float(times_s[k]) - before)
-            belief.update(seen, float(strokes_m[k]))
-        before = float(times_s[k])
-        yield int(k), belief
 
 
 # -- baseline ----------------------------------------------------------------------------------------------------------

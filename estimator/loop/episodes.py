@@ -14,7 +14,7 @@ from typing import Any, cast
 
 import polars as pl
 
-from phibench.estimator.loop.belief import TargetBelief
+from phibench.estimator.loop.belief import Belief
 from phibench.estimator.loop.policies import POLICIES, Policy
 from phibench.estimator.loop.simulator import REACHED, RUNNING, Action, Known, Observation, Setup, Simulator
 from phibench.scenes.random_streams import Name
@@ -102,9 +102,9 @@ def run_episode(simulator: Simulator, policy: Policy, observation: Observation, 
     )
 
 
-def _judged(simulator: Simulator, belief: TargetBelief | None) -> tuple[float, float, float]:
+def _judged(simulator: Simulator, belief: Belief | None) -> tuple[float, float, float]:
     """Pull, NEES and standard deviation of D of a belief at the end."""
-    if not isinstance(belief, TargetBelief):
+    if not isinstance(belief, Belief):
         return math.nan, math.nan, math.nan
     error = belief.mean[2] - 1.0 / simulator.distance_m
     pull = float(error / math.sqrt(belief.covariance[2, 2]))

@@ -9,7 +9,6 @@ it takes the plan that is quickest among those whose expected standard deviation
 from __future__ import annotations
 
 import abc
-import copy
 import itertools
 import math
 from collections.abc import Callable, Iterator
@@ -19,9 +18,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from phibench.estimator.geometry.rig_parameters import RigBias
-from phibench.estimator.loop.belief import Direction, TargetBelief, direction_of
-from phibench.estimator.loop.sensing import Reading
+from phibench.estimator.loop.belief import Belief
+from phibench.estimator.loop.sensing import Direction, Reading, direction_of
 from phibench.estimator.loop.simulator import CODES, Action, Known, Observation, Simulator
+from phibench.estimator.loop.smoothing import belief_of
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 
@@ -95,7 +95,7 @@ class SearchingPolicy(abc.ABC):
     def __init__(self, known: Known) -> None:
         self.known = known
         self._bias = RigBias(known.rig, known.rig_covariance)
-        self.belief: TargetBelief | None = None
+        self.belief: Belief | None = None
         self.observation: Observation
         self.exposure = _EXPOSURES[0]
         self.locked_step = -1
@@ -149,12 +149,12 @@ class SearchingPolicy(abc.ABC):
         if first is None:
             return False
         rig, vehicle, stroke_m = self.known.rig, self.known.vehicle, self.observation.stroke_m
-        self.belief = TargetBelief(rig, vehicle, first, stroke_m, bias=self._bias)
+        self.belief = belief_of(rig, vehicle, first, stroke_m, self._bias)
         self.locked_step, self._missed = self.observation.step, 0
         self.locks, self._seen_stroke_m = self.locks + 1, self.observation.stroke_m
         return True
 
-    def _track(self, belief: TargetBelief, seen: Observation) -> None:
+    def _track(self, belief: Belief, seen: Observation) -> None:
         """Take the step in, and the spot that lies nearest to what is expected; a hidden target is reckoned on."""
         belief.predict(seen.left_m, seen.right_m, self.known.task.step_s)
         held = seen.attitude(self.known.vehicle)
@@ -176,7 +176,7 @@ class SearchingPolicy(abc.ABC):
     # -- moves -----------------------------------------------------------------------------------------------------
 
     @property
-    def target(self) -> TargetBelief:
+    def target(self) -> Belief:
         """Belief over the target that is locked."""
         assert self.belief is not None
         return self.belief
@@ -292,7 +292,7 @@ class GreedyInformation(SearchingPolicy):
 
     def expected(self, plan: Plan) -> Plan:
         """The plan with its expected time and standard deviation: the belief's own filter, fed with its own mean."""
-        belief, task = copy.deepcopy(self.target), self.known.task
+        belief, task = self.target.copied(), self.known.task
         noise = self._frame_noise()
         here = self.observation.stroke_m
         here = self._imagine_stroke(belief, here, plan.before_m, noise)
@@ -304,19 +304,19 @@ class GreedyInformation(SearchingPolicy):
             frames = max(abs(way) / fastest / task.step_s / steps, 1.0)
             for _ in range(steps):
                 belief.predict(each, each, task.step_s)
-                _imagined(belief, here, noise / frames)
+                belief.imagine(here, noise / frames)
         self._imagine_stroke(belief, here, plan.after_m, noise)
         time_s = (plan.before_m + plan.after_m) / _STROKE_SPEED + abs(way) / fastest
         return Plan(plan.before_m, plan.after_m, time_s, belief.distance_sigma_m)
 
-    def _imagine_stroke(self, belief: TargetBelief, from_m: float, way_m: float, noise: Array) -> float:
+    def _imagine_stroke(self, belief: Belief, from_m: float, way_m: float, noise: Array) -> float:
         if way_m == 0.0:
             return from_m
         to_m = from_m + way_m if from_m + way_m <= self.known.task.stroke_m else from_m - way_m
         frames = max(way_m / _STROKE_SPEED / self.known.task.step_s / 3.0, 1.0)
         for share in (1 / 3, 2 / 3, 1.0):
             belief.predict(0.0, 0.0, 0.0)
-            _imagined(belief, from_m + share * (to_m - from_m), noise / frames)
+            belief.imagine(from_m + share * (to_m - from_m), noise / frames)
         return to_m
 
     def _frame_noise(self) -> Array:
@@ -326,12 +326,6 @@ class GreedyInformation(SearchingPolicy):
             if seen is not None and self.target.distance2(seen, self.observation.stroke_m) < _GATE:
                 return seen.covariance
         return 1e-6 * np.eye(2)
-
-
-def _imagined(belief: TargetBelief, stroke_m: float, covariance: Array) -> None:
-    """Update with the direction that is expected."""
-    azimuth, rise = belief.expected(stroke_m)
-    belief.update(Direction(azimuth, rise, covariance), stroke_m)
 
 
 class RandomPolicy:

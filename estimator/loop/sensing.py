@@ -18,6 +18,7 @@ import numpy as np
 
 from phibench.datasets.film.moving_camera import BakedRoom
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
+from phibench.estimator.geometry.reflection import reflect, reflect_jacobian
 from phibench.estimator.geometry.sphere_image import SphereImage, SphereImager
 from phibench.estimator.limits.best_stroke import spot_bound
 from phibench.estimator.loop.arena import Arena, Boxes, boxes_of
@@ -246,3 +247,61 @@ class Sensing:
             stands |= arena.sight.block(mirror @ R.T + origin, own @ R.T + origin)
         each = iter(stands.tolist())
         return [one is not None and next(each) for one in seen]
+
+
+# -- directions of pixels --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Direction:
+    """Direction of the ray that leaves the mirror, in the rig's frame.
+
+    Parameters
+    ----------
+    azimuth_rad, rise : float
+        Rise is the tangent of the elevation, up counts.
+    covariance : shape (2, 2)
+    uv_px, covariance_px2 : shapes (2,), (2, 2)
+        Of the pixel.
+    """
+
+    azimuth_rad: float
+    rise: float
+    covariance: Array
+    uv_px: Array
+    covariance_px2: Array
+
+    @property
+    def values(self) -> Array:
+        """Both numbers, shape (2,)."""
+        return np.array([self.azimuth_rad, self.rise])
+
+
+def direction_of(rig: Rig, u_px: float, v_px: float, sigma_px: float) -> Direction | None:
+    """Direction that a pixel belongs to, by the nominal rig; None where no ray leaves the mirror."""
+    return direction_with(rig, u_px, v_px, sigma_px**2 * np.eye(2))
+
+
+def direction_with(rig: Rig, u_px: float, v_px: float, covariance_px2: Array) -> Direction | None:
+    """Same, with the covariance of the pixel, shape (2, 2)."""
+    view, uv = rig.at(0.0), np.array([u_px, v_px])
+    ray = reflect(view, uv)
+    r, dr = ray.direction_world, reflect_jacobian(view, uv).direction_per_px
+    if not np.isfinite(dr).all():
+        return None
+    across2 = r[0] ** 2 + r[1] ** 2
+    across = math.sqrt(across2)
+    J = np.array(
+        [
+            [-r[1] / across2, r[0] / across2, 0.0],
+            [-r[2] * r[0] / across**3, -r[2] * r[1] / across**3, 1.0 / across],
+        ]
+    )
+    J = J @ dr
+    covariance = J @ covariance_px2 @ J.T
+    return Direction(math.atan2(r[1], r[0]), float(r[2] / across), covariance, uv, covariance_px2)
+
+
+def wrapped(angle_rad: float) -> float:
+    """Angle between -pi and pi."""
+    return math.remainder(angle_rad, 2.0 * math.pi)

@@ -11,8 +11,9 @@ import numpy as np
 
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, RIG_PARAMETERS, RigBias
 from phibench.estimator.geometry.sphere_image import SphereImager
-from phibench.estimator.loop.belief import Direction, TargetBelief, direction_of
-from phibench.estimator.loop.sensing import SEEN, Light, Reading, Sensing
+from phibench.estimator.loop.belief import Belief
+from phibench.estimator.loop.sensing import SEEN, Direction, Light, Reading, Sensing, direction_of
+from phibench.estimator.loop.smoothing import belief_of
 from phibench.scenes.motion.vehicle import PlanarPose, Stance, Vehicle, rig_placement, stance
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
@@ -92,20 +93,18 @@ class MisalignedApproach(Approach):
         return Reading(image.u_px + du, image.v_px + dv, 0.05, 1e4, SEEN)
 
 
-def stroked(run: Approach, to_m: float, frames: int, moving: float = 0.0, bias: RigBias | None = None) -> TargetBelief:
+def stroked(run: Approach, to_m: float, frames: int, moving: float = 0.0, bias: RigBias | None = None) -> Belief:
     """Belief after a stroke with frames on its way."""
     first = run.look()
     assert first is not None
-    belief = TargetBelief(RIG, VEHICLE, first, 0.0, acceleration_m2_per_s3=moving, bias=bias)
+    belief = belief_of(RIG, VEHICLE, first, 0.0, bias or RigBias(RIG, None), acceleration_m2_per_s3=moving)
     for k in range(frames):
         run.stroke_m = to_m * (k + 1) / frames
         step(run, belief, 0.0, 0.0)
     return belief
 
 
-def step(
-    run: Approach, belief: TargetBelief, left: float, right: float, seen: Callable[[], bool] = lambda: True
-) -> None:
+def step(run: Approach, belief: Belief, left: float, right: float, seen: Callable[[], bool] = lambda: True) -> None:
     belief.predict(left, right, 0.1)
     if left or right:
         run.drive(left, right)

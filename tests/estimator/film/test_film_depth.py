@@ -19,8 +19,9 @@ from phibench.estimator.film.processed_film import processed_positions
 from phibench.estimator.film.recursive_filter import FilterState, first_state, updated
 from phibench.estimator.film.spot_tracks import FrameSearch, SpotTrack, fitted_positions
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
-from phibench.estimator.loop.belief import PairTracker, film_beliefs
+from phibench.estimator.loop.belief import PairTracker
 from phibench.estimator.loop.sensing import Reading
+from phibench.estimator.loop.smoothing import film_beliefs
 from phibench.estimator.spots.raw_pixels import PixelNoise, bayer_filters, raw_electrons
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.render.film.moving_rows import chief_uv_px, rows_image, spot_time_s

@@ -21,7 +21,8 @@ from scipy.stats import chi2
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, RigBias
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.estimator.loop.belief import PairTracker, TargetBelief, direction_of
+from phibench.estimator.loop.belief import Belief, PairTracker, TargetBelief
+from phibench.estimator.loop.sensing import direction_of
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import Misalignment
 from phibench.scenes.validation import SceneError
@@ -71,7 +72,7 @@ def runs() -> list[tuple[float, float, float, float]]:
     return rows
 
 
-def pull(belief: TargetBelief, place: Array) -> float:
+def pull(belief: Belief, place: Array) -> float:
     return float((belief.mean[2] - 1 / math.hypot(place[0], place[1])) / math.sqrt(belief.covariance[2, 2]))
 
 

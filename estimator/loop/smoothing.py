@@ -1,0 +1,479 @@
+"""Belief over a target of a rig that is not known exactly: the most probable course of all frames, by Gauss-Newton.
+
+A filter that takes frame after frame commits itself to the straight line on which it took each: directions in a rig as
+built by hand bend by a tenth of their shift, many times the noise, and all frames share that bend. `SmoothedBelief`
+keeps the frames and solves for target and rig anew with each, every ray being that of the rig as it is then believed.
+
+Unknowns are the state of `Belief`: target, slip and skid, velocity, and theta of `RigBias`. With p_i the target's place
+in the robot at frame i, by the arcs of the tracks back from now, and o_i, d_i the ray of its pixel in the deviated rig,
+
+    r_i = (azimuth, rise)(p_i - h_i e - o_i) - (azimuth, rise)(d_i)
+
+should be 0. Its covariance has the pixel's noise in each frame, and what frames share. Random parts w_j of the steps
+since a frame move its p_i, so that cov(r_i, r_k) has F_i (sum over j > max(i, k) of D_j Q_j D_j^T) F_k^T, F_i = dr_i /
+dp_i and D_j = dp / dw_j. A target whose velocity walks with the density a adds F_i F_k^T a s^2 (3 t - s) / 6, s <= t
+being the two frames' lags before now (integrated Wiener process).
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Self
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from phibench.estimator.film.film_positions import FilmPositions
+from phibench.estimator.geometry.reflection import reflect
+from phibench.estimator.geometry.rig_parameters import RigBias, changed, stroke_of
+from phibench.estimator.loop.belief import LEAST_Q, PRIOR_DISTANCES_M, SKID, SLIP, VELOCITY, Belief, TargetBelief
+from phibench.estimator.loop.sensing import Direction, direction_with, wrapped
+from phibench.scenes.frames import Array
+from phibench.scenes.motion.vehicle import Stance, Vehicle, arc_covariance
+from phibench.scenes.rig import Rig, View
+from phibench.scenes.validation import SceneError
+
+_STEP = 0.1  # of a standard deviation: differences by theta err by 1 % of the slope
+_STALE = 0.2  # of one: slopes by theta are taken anew beyond
+_ROUNDS, _HALVINGS, _AT_REST = 6, 8, 0.1  # of standard deviations
+_PIXEL_STEP_PX = 1e-3
+_MOST_FRAMES = 160  # kept: older ones are thinned, which loses what they say and adds nothing
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """N frames in order: pixels and their covariances, nominal strokes, attitudes, and steps and time before them."""
+
+    uv_px: Array
+    covariance_px2: Array
+    stroke_m: Array
+    turned: Array
+    origin_m: Array
+    steps: Array
+    time_s: Array
+
+    def joined(self, other: _Frames) -> _Frames:
+        """Both, this one's first."""
+        return _Frames(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in self.__dataclass_fields__))
+
+    def thinned(self) -> _Frames:
+        """Every other frame of the older half, and all of the newer."""
+        n = len(self.time_s)
+        keep = np.concatenate([np.arange(0, n // 2, 2), np.arange(n // 2, n)])
+        return _Frames(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
+
+
+class _DeviatedView(NamedTuple):
+    """A rig with a deviation, mirror down; its stroke axis, and the values it deviates by."""
+
+    view: View
+    axis: Array
+    values: Array
+
+    def rays(self, uv_px: Array, stroke_m: Array) -> tuple[Array, Array, Array]:
+        """Origins and directions of rays, shapes (..., N, 3), and how far the mirror was raised, shape (N, 3)."""
+        found = reflect(self.view, uv_px)
+        raised = stroke_of(stroke_m, self.values)[:, None] * self.axis
+        return found.origin_world_m, found.direction_world, raised
+
+
+@dataclass(frozen=True)
+class _Course:
+    """Places of the robot after each step, frame of the first: shapes (S + 1,), (S + 1, 2)."""
+
+    heading_rad: Array
+    place_m: Array
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Residuals, shape (r,), their slopes by the state (r, n) and covariance (r, r), and F of the frames (N, 2, 3)."""
+
+    r: Array
+    J: Array
+    C: Array
+    F: Array
+
+
+class SmoothedBelief(Belief):
+    """Belief over one target of a rig that is known to a covariance.
+
+    Parameters
+    ----------
+    rig, vehicle, first, stroke_m, distances_m, acceleration_m2_per_s3, speed_m_per_s
+        As for `belief.TargetBelief`.
+    bias : RigBias
+        Of the rig's deviations.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        vehicle: Vehicle,
+        first: Direction,
+        stroke_m: float,
+        bias: RigBias,
+        distances_m: tuple[float, float] = PRIOR_DISTANCES_M,
+        acceleration_m2_per_s3: float = 0.0,
+        speed_m_per_s: float = 0.3,
+    ) -> None:
+        super().__init__(rig, vehicle, acceleration_m2_per_s3)
+        self._bias, of_target = bias, 8 if self._moves else 5
+        n = of_target + bias.count
+        self._deviations = slice(of_target, n)
+        near, far = distances_m
+        self._first_q, self._q_sigma = 0.5 * (1.0 / near + 1.0 / far), (1.0 / near - 1.0 / far) / 3.0
+        self._speed, self._time_s = speed_m_per_s, 0.0
+        self._tracks_m, self._track_noise = np.zeros((0, 2)), np.zeros((0, 2, 2))
+        x, q = np.zeros(n), self._first_q
+        x[:5] = first.azimuth_rad, first.rise + stroke_m * q, q, vehicle.slip, vehicle.skid
+        self._prior, self._precision = x.copy(), np.zeros(n)
+        self._precision[[SLIP, SKID]] = 1.0 / (np.array([vehicle.slip_sigma, vehicle.skid_sigma]) ** 2 + 1e-12)
+        self._precision[self._deviations] = 1.0
+        self._P = np.zeros((n, n))
+        self._x, self._middle = x, x[self._deviations]
+        self._views = self._around()
+        self._frames = self._frame(first, stroke_m, None)
+        self._solve()
+
+    @property
+    def mean(self) -> Array:
+        """State."""
+        return self._x
+
+    @property
+    def covariance(self) -> Array:
+        """Of the state, by the slopes at the mean."""
+        return self._P
+
+    def pixel(self, stroke_m: float, held: Stance | None = None) -> tuple[float, float] | None:
+        """Pixel at which the mean is seen; None where the mirror does not show it."""
+        place = self._bias.pixel(self._standing(self._x, held), stroke_m, self._x[self._deviations])
+        return None if math.isnan(place[0]) else place
+
+    def predict(self, left_m: float, right_m: float, step_s: float) -> None:
+        """Take in a step of the tracks, and the time that it took."""
+        x, about = self._x, float(self._x[0])
+        F = np.eye(len(x))
+        for k in range(8 if self._moves else 5):
+            e = np.zeros(len(x))
+            e[k] = 1e-6
+            ends = (self._moved(x + s * e, left_m, right_m, step_s, about) for s in (1.0, -1.0))
+            F[:, k] = np.subtract(*ends) / 2e-6
+        Q = self._process_noise(x, left_m, right_m, step_s)
+        self._x, self._P = self._moved(x, left_m, right_m, step_s, about), F @ self._P @ F.T + Q
+        self._time_s += step_s
+        if left_m or right_m:
+            self._tracks_m = np.concatenate([self._tracks_m, [[left_m, right_m]]])
+            noise = arc_covariance(self.vehicle, left_m, right_m)
+            self._track_noise = np.concatenate([self._track_noise, noise[None]])
+
+    def update(self, seen: Direction, stroke_m: float, held: Stance | None = None) -> None:
+        """Take in a direction, after `predict`."""
+        self._frames = self._frames.joined(self._frame(seen, stroke_m, held))
+        if len(self._frames.time_s) > _MOST_FRAMES:
+            self._frames = self._frames.thinned()
+        self._solve()
+
+    def imagine(self, stroke_m: float, covariance: Array) -> None:
+        """Take in a direction where it is expected."""
+        place = self.pixel(stroke_m)
+        if place is None:
+            return
+        nothing = Direction(0.0, 0.0, covariance, np.array(place), np.zeros((2, 2)))
+        rows = self._rows(self._x, self._frame(nothing, stroke_m, None))
+        K = self._P @ rows.J.T @ np.linalg.inv(rows.J @ self._P @ rows.J.T + covariance)
+        self._P = self._P - K @ rows.J @ self._P
+        self._P = 0.5 * (self._P + self._P.T)
+
+    def copied(self) -> Self:
+        """Copy that changes on its own: no array is changed in place."""
+        return copy.copy(self)
+
+    def distance2(self, seen: Direction, stroke_m: float, held: Stance | None = None) -> float:
+        """Squared Mahalanobis distance of a direction from what is expected, to first order."""
+        rows = self._rows(self._x, self._frame(seen, stroke_m, held))
+        return float(rows.r @ np.linalg.solve(rows.J @ self._P @ rows.J.T + rows.C, rows.r))
+
+    # -- solution --------------------------------------------------------------------------------------------------
+
+    def _solve(self) -> None:
+        """Most probable state by Gauss-Newton, and the covariance by its slopes (Laplace's approximation)."""
+        for _ in range(_ROUNDS):
+            if np.max(np.abs(self._x[self._deviations] - self._middle)) > _STALE:
+                self._middle = self._x[self._deviations].copy()
+                self._views = self._around()
+            rows = self._with_priors(self._x, self._rows(self._x, self._frames))
+            factor = np.asarray(np.linalg.cholesky(rows.C), float)
+            r, J = (solve_triangular(factor, part, lower=True) for part in (rows.r, rows.J))
+            hessian = J.T @ J + np.diag(self._precision)
+            step = -np.linalg.solve(hessian, J.T @ r + self._precision * (self._x - self._prior))
+            P = np.linalg.inv(hessian)
+            self._P = 0.5 * (P + P.T)
+            size = float(np.max(np.abs(step) / np.sqrt(np.diag(P))))
+            if not self._stepped(step, factor, r) or size < _AT_REST:
+                break
+        self._x = np.concatenate([[wrapped(float(self._x[0]))], self._x[1:]])
+
+    def _stepped(self, step: Array, factor: Array, r: Array) -> bool:
+        """Take a step, or the part of it that makes chi squared smaller with the covariance as it is."""
+        before = self._chi2(r, self._x)
+        for k in range(_HALVINGS):
+            x = self._x + 0.5**k * step
+            try:
+                residuals = self._first_rows(x, self._residuals(x, self._frames).reshape(-1))
+            except SceneError:  # a rig that cannot exist
+                continue
+            if np.isfinite(residuals).all() and x[2] > LEAST_Q:
+                after = self._chi2(solve_triangular(factor, residuals, lower=True), x)
+                if after <= before + 1e-6:
+                    self._x = x
+                    return True
+        return False
+
+    def _chi2(self, whitened: Array, x: Array) -> float:
+        return float(whitened @ whitened + self._precision @ (x - self._prior) ** 2)
+
+    def _first_rows(self, x: Array, r: Array) -> Array:
+        """Residuals of frames, and those of what was believed at the first frame: q, and the velocity."""
+        return np.concatenate([r, self._first(x)])
+
+    def _first(self, x: Array) -> Array:
+        p, V = self._places(x, self._frames)
+        return np.concatenate([[1.0 / math.hypot(*p[0, :2]) - self._first_q], V if self._moves else []])
+
+    def _with_priors(self, x: Array, rows: _Rows) -> _Rows:
+        """Rows, and those of what was believed at the first frame."""
+        n, more = len(rows.r), 4 if self._moves else 1
+        J, C = np.zeros((n + more, len(x))), np.zeros((n + more, n + more))
+        J[:n], C[:n, :n] = rows.J, rows.C
+        J[n:, : self._deviations.start] = self._slopes(x, self._first)
+        C[n, n] = self._q_sigma**2
+        if self._moves:
+            lag, a = self._time_s - self._frames.time_s, self._acceleration
+            C[n + 1 :, n + 1 :] = (self._speed**2 + a * lag[0]) * np.eye(3)
+            C[:n, n + 1 :] = (-0.5 * a * lag[:, None, None] ** 2 * rows.F).reshape(n, 3)
+            C[n + 1 :, :n] = C[:n, n + 1 :].T
+        return _Rows(self._first_rows(x, rows.r), J, C, rows.F)
+
+    def _slopes(self, x: Array, function: Callable[[Array], Array]) -> Array:
+        """Derivatives of a function by the target's part of the state, shape (..., 5 or 8)."""
+        columns = []
+        for k in range(self._deviations.start):
+            e = np.zeros(len(x))
+            e[k] = 1e-6
+            columns.append((function(x + e) - function(x - e)) / 2e-6)
+        return np.stack(columns, axis=-1)
+
+    # -- model -----------------------------------------------------------------------------------------------------
+
+    def _frame(self, seen: Direction, stroke_m: float, held: Stance | None) -> _Frames:
+        """One frame, now."""
+        R, t = self._tilt(held)
+        return _Frames(
+            seen.uv_px[None],
+            seen.covariance_px2[None],
+            np.array([stroke_m]),
+            R[None],
+            t[None],
+            np.array([len(self._tracks_m)]),
+            np.array([self._time_s]),
+        )
+
+    def _around(self) -> list[_DeviatedView]:
+        """Rig of the middle deviation, and those a step away from it along each of its numbers."""
+        return [self._rig(self._middle + _STEP * e) for e in np.eye(len(self._middle) + 1, len(self._middle), k=-1)]
+
+    def _rig(self, theta: Array) -> _DeviatedView:
+        values = self._bias.deviations @ theta
+        rig = changed(self.rig, values)
+        return _DeviatedView(rig.at(0.0), np.array(rig.stroke_axis_world), values)
+
+    def _residuals(self, x: Array, frames: _Frames) -> Array:
+        """Azimuths and rises of the target by those of its pixels, shape (N, 2)."""
+        rays = self._rig(x[self._deviations]).rays(frames.uv_px, frames.stroke_m)
+        return _residual(self._places(x, frames)[0], *rays)
+
+    def _rows(self, x: Array, frames: _Frames) -> _Rows:
+        """Residuals of frames, their slopes and covariance."""
+        n, m = len(frames.time_s), self._deviations.start
+        # a row of pixels as they are, and two a step aside
+        uv = frames.uv_px + _PIXEL_STEP_PX * np.eye(3, 2, k=-1)[:, None]
+        origin, direction, raised = self._rig(x[self._deviations]).rays(uv, frames.stroke_m)
+        here = origin[0], direction[0], raised
+        p = self._places(x, frames)[0]
+        r = _residual(p, *here)
+        J = np.zeros((2 * n, len(x)))
+        J[:, :m] = self._slopes(x, lambda y: _residual(self._places(y, frames)[0], *here)).reshape(2 * n, m)
+        base, *moved = (_residual(p, *view.rays(frames.uv_px, frames.stroke_m)) for view in self._views)
+        for k, one in enumerate(moved):
+            # a pixel at the mirror's rim may be none in the next rig: it then says nothing of this deviation
+            J[:, m + k] = np.nan_to_num(_turned(one - base)).reshape(-1) / _STEP
+        aside = [_turned(_residual(p, origin[k], direction[k], raised) - r) for k in (1, 2)]
+        per_px = np.stack(aside, axis=-1) / _PIXEL_STEP_PX
+        noise = per_px @ frames.covariance_px2 @ np.swapaxes(per_px, 1, 2)
+        C, F = self._covariance(x, frames, _direction_slopes(p - origin[0] - raised), noise)
+        return _Rows(r.reshape(-1), J, C, F)
+
+    def _places(self, y: Array, frames: _Frames) -> tuple[Array, Array]:
+        """Places of the target in the rig's frame as the robot stood at each frame, shape (N, 3), and its velocity."""
+        course = self._course(y)
+        ahead = np.array([self.vehicle.sensor_x_m, 0.0, 0.0])
+        P = _yaw(course.heading_rad[-1]) @ (self.point_m(y) + ahead)
+        P[:2] += course.place_m[-1]
+        velocity = np.zeros(3)
+        points = np.tile(P, (len(frames.time_s), 1))
+        if self._moves:
+            velocity = _yaw(course.heading_rad[-1]) @ y[VELOCITY] / max(float(y[2]), LEAST_Q)
+            points = points - (self._time_s - frames.time_s)[:, None] * velocity
+        points[:, :2] -= course.place_m[frames.steps]
+        level = np.einsum("nji,nj->ni", _yaw(course.heading_rad[frames.steps]), points) - ahead
+        return np.einsum("nji,nj->ni", frames.turned, level - frames.origin_m), velocity
+
+    def _course(self, y: Array) -> _Course:
+        """Places after each step, by the state's slip and skid."""
+        left, right = self._tracks_m.T
+        kept, lever = 1.0 - y[SLIP], y[SKID] * self.vehicle.gauge_m
+        length, turn = 0.5 * kept * (left + right), kept * (right - left) / lever
+        heading = np.concatenate([[0.0], np.cumsum(turn)])
+        chord, along = length * np.sinc(0.5 * turn / np.pi), heading[:-1] + 0.5 * turn
+        steps = chord[:, None] * np.stack([np.cos(along), np.sin(along)], axis=-1)
+        return _Course(heading, np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]))
+
+    def _covariance(self, x: Array, frames: _Frames, E: Array, noise: Array) -> tuple[Array, Array]:
+        """Covariance of residuals, shape (2 N, 2 N): pixels in each frame, steps and motion between frames; and F."""
+        n, course = len(frames.time_s), self._course(x)
+        C = np.zeros((n, 2, n, 2))
+        C[np.arange(n), :, np.arange(n), :] = noise
+        yaw = _yaw(course.heading_rad[frames.steps])
+        F = E @ np.swapaxes(frames.turned, 1, 2) @ np.swapaxes(yaw, 1, 2)
+        flat = F.reshape(2 * n, 3)
+        if len(self._tracks_m):
+            S = self._shared_place(x, course)[frames.steps]
+            later = ((F @ S).reshape(2 * n, 3) @ flat.T).reshape(n, 2, n, 2)
+            # the later of two frames decides, and frames are in order
+            C += np.where(np.tri(n, dtype=bool)[:, None, :, None], later, later.transpose(2, 3, 0, 1))
+        if self._moves:
+            lag = self._time_s - frames.time_s
+            short, long = np.minimum.outer(lag, lag), np.maximum.outer(lag, lag)
+            K = self._acceleration * short**2 * (3.0 * long - short) / 6.0
+            C += K[:, None, :, None] * (flat @ flat.T).reshape(n, 2, n, 2)
+        return C.reshape(2 * n, 2 * n), F
+
+    def _shared_place(self, x: Array, course: _Course) -> Array:
+        """Covariance of the target's place, frame of the first, by the steps after each, shape (S + 1, 3, 3)."""
+        ahead = np.array([self.vehicle.sensor_x_m, 0.0, 0.0])
+        P = course.place_m[-1] + (_yaw(course.heading_rad[-1]) @ (self.point_m(x) + ahead))[:2]
+        dx, dy = (P - course.place_m[:-1]).T
+        c, s = np.cos(course.heading_rad[:-1]), np.sin(course.heading_rad[:-1])
+        zero = np.zeros_like(c)
+        D = np.stack([np.stack(row, axis=-1) for row in ((c, -dy), (s, dx), (zero, zero))], axis=-2)
+        each = D @ self._track_noise @ np.swapaxes(D, 1, 2)
+        return np.concatenate([np.cumsum(each[::-1], axis=0)[::-1], np.zeros((1, 3, 3))])
+
+
+def _yaw(heading_rad: Array) -> Array:
+    """Rotations about the vertical, shape (..., 3, 3)."""
+    R = np.zeros((*np.shape(heading_rad), 3, 3))
+    R[..., 0, 0] = R[..., 1, 1] = np.cos(heading_rad)
+    R[..., 1, 0] = np.sin(heading_rad)
+    R[..., 0, 1], R[..., 2, 2] = -R[..., 1, 0], 1.0
+    return R
+
+
+def _residual(p: Array, origin: Array, direction: Array, raised: Array) -> Array:
+    """Azimuth and rise of points by those of rays, shape (N, 2)."""
+    return _turned(_angles(p - origin - raised) - _angles(direction))
+
+
+def _angles(d: Array) -> Array:
+    return np.stack([np.arctan2(d[:, 1], d[:, 0]), d[:, 2] / np.hypot(d[:, 0], d[:, 1])], axis=-1)
+
+
+def _turned(difference: Array) -> Array:
+    """Differences with their azimuth between -pi and pi."""
+    azimuth = np.arctan2(np.sin(difference[:, 0]), np.cos(difference[:, 0]))
+    return np.stack([azimuth, difference[:, 1]], axis=-1)
+
+
+def _direction_slopes(d: Array) -> Array:
+    """Derivatives of azimuth and rise by the vector, shape (N, 2, 3)."""
+    x, y, z = d.T
+    across2 = x**2 + y**2
+    across = np.sqrt(across2)
+    zero = np.zeros_like(x)
+    rows = (-y / across2, x / across2, zero), (-z * x / across**3, -z * y / across**3, 1.0 / across)
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+# -- choice -----------------------------------------------------------------------------------------------------------
+
+
+def belief_of(
+    rig: Rig,
+    vehicle: Vehicle,
+    first: Direction,
+    stroke_m: float,
+    bias: RigBias,
+    distances_m: tuple[float, float] = PRIOR_DISTANCES_M,
+    acceleration_m2_per_s3: float = 0.0,
+    speed_m_per_s: float = 0.3,
+) -> Belief:
+    """Belief for what is known of a rig: smoothed where it has deviations, filtered where it is exact."""
+    target = distances_m, acceleration_m2_per_s3, speed_m_per_s
+    if bias.count:
+        return SmoothedBelief(rig, vehicle, first, stroke_m, bias, *target)
+    return TargetBelief(rig, vehicle, first, stroke_m, *target)
+
+
+def film_beliefs(
+    rig: Rig,
+    vehicle: Vehicle,
+    positions: FilmPositions,
+    times_s: Array,
+    strokes_m: Array,
+    distances_m: tuple[float, float] = PRIOR_DISTANCES_M,
+    acceleration_m2_per_s3: float = 0.0,
+    speed_m_per_s: float = 0.3,
+    encoder_sigma_m: float = 0.0,
+    rig_covariance: Array | None = None,
+) -> Iterator[tuple[int, Belief]]:
+    """Belief after each frame of a film of a robot that stands: its number, and the belief, which goes on changing.
+
+    Parameters
+    ----------
+    positions : FilmPositions
+        In N frames, those of `film.film_estimates.seen_film`, which takes the room off by frames with the laser off,
+        or of `film.spot_tracks.fitted_positions`; frames without one are left out.
+    times_s, strokes_m : shape (N,)
+        Time at which the spot's row was exposed, and the encoder's reading then.
+    distances_m, acceleration_m2_per_s3, speed_m_per_s
+        As for `TargetBelief`.
+    encoder_sigma_m : float
+        Standard deviation of a reading: the rise is k - h q, and errs by as much as q times that.
+    rig_covariance : shape (p, p), or None
+        Of the true rig's deviations from `rig`, that of a calibration (`Calibration.covariance`); None is an exact rig.
+    """
+    belief: Belief | None = None
+    before, bias = 0.0, RigBias(rig, rig_covariance)
+    q = 0.5 * sum(1.0 / D for D in distances_m)
+    # what frames share, as if new in every frame: the sum over all frames is no less than it, by Gershgorin's theorem
+    shared = np.abs(positions.shared_px2[:, :, positions.good]).sum(axis=(2, 3))
+    for k in np.flatnonzero(positions.good):
+        noise = positions.noise_px2[k] + np.diag(shared[k])
+        seen = direction_with(rig, float(positions.uv_px[k, 0]), float(positions.uv_px[k, 1]), noise)
+        if seen is None:
+            continue
+        q = q if belief is None else float(belief.mean[2])
+        seen = replace(seen, covariance=seen.covariance + np.diag([0.0, (q * encoder_sigma_m) ** 2]))
+        if belief is None:
+            target = distances_m, acceleration_m2_per_s3, speed_m_per_s
+            belief = belief_of(rig, vehicle, seen, float(strokes_m[k]), bias, *target)
+        else:
+            belief.predict(0.0, 0.0, float(times_s[k]) - before)
+            belief.update(seen, float(strokes_m[k]))
+        before = float(times_s[k])
+        yield int(k), belief
