@@ -363,7 +363,8 @@ def run_and_score(
     cards = [MethodCard.of(name, **method.document()) for name, method in zip(references, found, strict=True)]
     if not cards:
         return []
-    with Harness(found, limits, workers, truth_folders(pairs)) as harness, Steps(console, title, len(pairs)) as steps:
+    # the steps first: they tell of time that goes by while methods start
+    with Steps(console, title, len(pairs)) as steps, Harness(found, limits, workers, truth_folders(pairs)) as harness:
         scored = score_methods(cards, pairs, harness.outcomes, None, seed, limits.document(), steps.reach)
     told = zip(scored, harness.failed_outputs, harness.isolations, strict=True)
     return [replace(isolated(one, isolation), output=output) for one, output, isolation in told]

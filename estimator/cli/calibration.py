@@ -151,6 +151,7 @@ def align(
         As in `phibench calibrate`.
     """
     from phibench.datasets.errors import DatasetError
+    from phibench.datasets.progress import Steps, progress_console
     from phibench.estimator.calibration.align import (
         Numbers,
         alignment,
@@ -178,12 +179,16 @@ def align(
     else:
         require_camera_size(known, (pixels.shape[1], pixels.shape[0]), str(image))
     if known is None:
-        circle = circle_of(pixels, card)
+        with Steps(progress_console(), "circle", 1) as steps:
+            circle = circle_of(pixels, card)
+            steps.advance()
         print(circle_in_words(circle))
         print(f"{write_circle_picture(out, pixels, card, circle)}: outline; look at it")
         return 0
     doubts = math.radians(tilt_sigma_deg), principal_point_sigma_px, outline_sigma_factor
-    found = alignment(pixels, known, card, *doubts, math.radians(mirror_tilt_sigma_deg))
+    with Steps(progress_console(), "outline", 1) as steps:
+        found = alignment(pixels, known, card, *doubts, math.radians(mirror_tilt_sigma_deg))
+        steps.advance()
     print(verdict(found))
     print(f"{write_alignment_picture(out, pixels, known, found)}: outline, and the move drawn 20 times as long")
     print(in_words(found))

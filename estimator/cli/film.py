@@ -280,6 +280,8 @@ def run(
     episodes: Whole = 10,
     rooms: Path | None = None,
     fidelity: Fidelity = "exact",
+    calibration: Path | None = None,
+    as_built: float | None = None,
     seed: str = "run",
     seconds: float = 5.0,
     out: Path | None = None,
@@ -296,6 +298,10 @@ def run(
         Folder of `phibench loop bake`; without it each episode has a plain room of its own.
     fidelity
         Spots by the exact measurement model, or read in pixels: windows around spots, or whole frames.
+    calibration
+        File of `phibench calibrate`: the robot knows this rig to its covariance, from which each episode's is drawn.
+    as_built
+        The same with a rig as built by hand: its errors are so many times those of `RigParameter.prior_sigma`.
     seed
         Name of the stream that targets, lights and noise are drawn from.
     seconds
@@ -303,16 +309,23 @@ def run(
     out
         Parquet file for the rows.
     """
+    from phibench.datasets.progress import Steps, progress_console
     from phibench.datasets.store.files import require_writable
-    from phibench.estimator.loop.episodes import LOST, PolicyFile, episode_frame, run_episodes, run_foreign
+    from phibench.estimator.loop.episodes import LOST, PolicyFile, episode_frame, episodes_of, run_foreign
 
     if out is not None:
         require_writable(out)
-    setup = _setup(rooms, fidelity)
+    setup = _setup(rooms, fidelity, calibration, as_built)
+    known = setup.rig_covariance is not None
     if ".py" in policy:
-        rows = list(run_foreign(setup, PolicyFile.of(policy), episodes, seed, limit_s=seconds))
+        running = run_foreign(setup, PolicyFile.of(policy), episodes, seed, limit_s=seconds, own_rigs=known)
     else:
-        rows = run_episodes(setup, policy, episodes, seed)
+        running = episodes_of(setup, policy, episodes, seed, own_rigs=known)
+    rows = []
+    with Steps(progress_console(), "episodes", episodes) as steps:
+        for row in running:
+            rows.append(row)
+            steps.advance()
     _print(rows)
     if out is not None:
         episode_frame(rows).write_parquet(out)
@@ -327,6 +340,8 @@ def show_loop(
     out: Path,
     rooms: Path | None = None,
     fidelity: Fidelity = "exact",
+    calibration: Path | None = None,
+    as_built: float | None = None,
     seed: str = "show",
     episode: Whole = 0,
 ) -> int:
@@ -342,24 +357,55 @@ def show_loop(
         Folder of `phibench loop bake`; without it the episode has a plain room, in which only spots are seen.
     fidelity
         With --rooms: windows around spots, or whole frames, which take 2 CPU-s each.
+    calibration
+        File of `phibench calibrate`: the robot knows this rig to its covariance, from which each episode's is drawn.
+    as_built
+        The same with a rig as built by hand: its errors are so many times those of `RigParameter.prior_sigma`.
     seed
         Name of the stream that targets, lights and noise are drawn from.
     episode
         Number of the episode in that stream.
     """
     from phibench.datasets.store.files import require_writable
+    from phibench.estimator.loop.episodes import with_own_rig
     from phibench.estimator.studies.loop.drawings import show_episode
 
     require_writable(out)
-    print(f"{out}: {show_episode(_setup(rooms, fidelity), out, policy, seed, episode)}")
+    setup = with_own_rig(_setup(rooms, fidelity, calibration, as_built), seed, episode)
+    print(f"{out}: {show_episode(setup, out, policy, seed, episode)}")
     return 0
 
 
-def _setup(rooms: Path | None, fidelity: Fidelity) -> Setup:
+def _setup(rooms: Path | None, fidelity: Fidelity, calibration: Path | None, as_built: float | None) -> Setup:
+    """Setup with what is known of the rig.
+
+    Raises
+    ------
+    DatasetError
+        If a calibration is given together with `as_built`, or cannot be read.
+    SceneError
+        If `as_built` is not between 0 and 2.
+    """
+    import numpy as np
+
+    from phibench.datasets.errors import DatasetError
+    from phibench.estimator.calibration.file import read_calibration
+    from phibench.estimator.geometry.rig_parameters import prior_sigmas
     from phibench.estimator.loop.arena import baked_arenas
     from phibench.estimator.loop.simulator import Setup
+    from phibench.scenes.rig import Rig
+    from phibench.scenes.validation import within
 
-    return Setup(arenas=() if rooms is None else baked_arenas(rooms), fidelity=fidelity)
+    nominal, covariance = Rig(), None
+    if calibration is not None:
+        if as_built is not None:
+            raise DatasetError("--calibration and --as-built: both say how well the rig is known; give one of them")
+        read = read_calibration(calibration)
+        nominal, covariance = read.rig, read.covariance
+    elif as_built is not None:
+        covariance = within("loop", "as_built", as_built, 0.0, 2.0) ** 2 * np.diag(prior_sigmas() ** 2)
+    arenas = () if rooms is None else baked_arenas(rooms)
+    return Setup(rig=nominal, arenas=arenas, fidelity=fidelity, rig_covariance=covariance)
 
 
 def _print(rows: list[Episode]) -> None:

@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.geometry.reflection import reflect
 from phibench.estimator.geometry.sphere_image import SphereImage, SphereImager
 from phibench.estimator.geometry.triangulate import depth_exact
 from phibench.scenes.frames import Array, BoolArray
@@ -95,6 +94,32 @@ def changed(rig: Rig, values: Array) -> Rig:
     # all at once: `Misalignment` defines the order in which they act
     given = zip(PARAMETERS, np.asarray(values, float).tolist(), strict=True)
     return rig.perturbed(Misalignment(**{name: value for name, value in given if name not in STROKE_PARAMETERS}))
+
+
+def drawn_deviation(covariance: Array, rng: np.random.Generator) -> Misalignment:
+    """Deviation of a true rig from the nominal one, drawn from a covariance, shape (p, p).
+
+    Raises
+    ------
+    SceneError
+        If the covariance is no such matrix, or a value is beyond its limit.
+    """
+    values, vectors = _scaled_eigen(covariance)
+    drawn = vectors @ (np.sqrt(values) * rng.standard_normal(len(values)))
+    return Misalignment(**{name: float(value) for name, value in zip(PARAMETERS, drawn, strict=True) if value})
+
+
+def _scaled_eigen(covariance: Array) -> tuple[Array, Array]:
+    """Eigenvalues of the correlations, shape (p,), none below 0, and their vectors times the standard deviations."""
+    P, n = np.asarray(covariance, float), len(PARAMETERS)
+    if P.shape != (n, n) or not np.isfinite(P).all():
+        raise SceneError(f"rig covariance: must be finite and of shape ({n}, {n}), one row for each of PARAMETERS")
+    sigma = np.sqrt(np.maximum(np.diag(P), 0.0))
+    scale = np.where(sigma == 0.0, 1.0, sigma)
+    values, vectors = np.linalg.eigh(P / np.outer(scale, scale))
+    if values[0] < -1e-9:
+        raise SceneError("rig covariance: must have no negative eigenvalue; give the covariance of a calibration")
+    return np.maximum(values, 0.0), sigma[:, None] * vectors
 
 
 def stroke_of(stroke_m: Array, values: Array) -> Array:
@@ -209,8 +234,6 @@ class RigBias:
 
     def __init__(self, rig: Rig, covariance: Array | None) -> None:
         self._rig, self._axis = rig, np.array(rig.stroke_axis_world)
-        self._view = rig.at(0.0)
-        self._centre = self._view.sphere_centre_m
         self._rigs: dict[bytes, _Deviated] = {}
         self.deviations = np.zeros((len(PARAMETERS), 0)) if covariance is None else self._principal(covariance)
         """Columns L, shape (p, m): deviations of one standard deviation."""
@@ -219,22 +242,6 @@ class RigBias:
     def count(self) -> int:
         """Number of states m."""
         return self.deviations.shape[1]
-
-    def shifts(self, point_m: Array, stroke_m: float) -> Array:
-        """Shifts of azimuth and rise by one standard deviation of each state, shape (2, m): half of differences.
-
-        Parameters
-        ----------
-        point_m : shape (3,)
-            In the rig's frame of the robot as it stands, the carriage being down.
-        stroke_m : float
-        """
-        m = self.count
-        thetas = np.concatenate([np.eye(m), -np.eye(m)])
-        seen = self.directions(np.tile(point_m, (2 * m, 1)), stroke_m, thetas)
-        difference = seen[:m] - seen[m:]
-        difference[:, 0] = np.arctan2(np.sin(difference[:, 0]), np.cos(difference[:, 0]))
-        return np.asarray(0.5 * difference.T)
 
     def pixel(self, point_m: Array, stroke_m: float, theta: Array) -> tuple[float, float]:
         """Pixel of a point in the rig with the deviations L theta; NaN where the mirror does not show it."""
@@ -245,37 +252,19 @@ class RigBias:
         image = rig.image(point_m, stroke_m)
         return (math.nan, math.nan) if image is None else (image.u_px, image.v_px)
 
-    def directions(self, points_m: Array, stroke_m: float, thetas: Array) -> Array:
-        """Directions that the nominal rig gives to the pixels of points in deviated rigs, shape (N, 2).
-
-        Parameters
-        ----------
-        points_m, thetas : shapes (N, 3), (N, m)
-            A point's own direction counts where its mirror does not show it.
-        """
-        uv = np.array([self.pixel(p, stroke_m, t) for p, t in zip(points_m, thetas, strict=True)])
-        d = reflect(self._view, uv).direction_world
-        own = points_m - stroke_m * self._axis - self._centre
-        d = np.where(np.isfinite(d).all(axis=1, keepdims=True), d, own)
-        return np.stack([np.arctan2(d[:, 1], d[:, 0]), d[:, 2] / np.hypot(d[:, 0], d[:, 1])], axis=1)
-
     def _deviated(self, values: Array) -> _Deviated:
         rig = changed(self._rig, values)
         return _Deviated(SphereImager(rig), np.array(rig.stroke_axis_world), values)
 
     def _principal(self, covariance: Array) -> Array:
         """Deviations of one standard deviation along the directions that move pixels most, shape (p, m)."""
-        P, n = np.asarray(covariance, float), len(PARAMETERS)
-        if P.shape != (n, n) or not np.isfinite(P).all():
-            raise SceneError(f"rig covariance: must be finite and of shape ({n}, {n}), one row for each of PARAMETERS")
-        P = np.where(np.outer(moves_rays(self._rig), moves_rays(self._rig)), P, 0.0)
-        sigma = np.sqrt(np.maximum(np.diag(P), 0.0))
+        moving, n = moves_rays(self._rig), len(PARAMETERS)
+        P = np.asarray(covariance, float)
+        if P.shape == (n, n):
+            P = np.where(np.outer(moving, moving), P, 0.0)
+        values, vectors = _scaled_eigen(P)
+        sigma, factor = np.sqrt(np.maximum(np.diag(P), 0.0)), vectors * np.sqrt(values)
         held = sigma == 0.0
-        scale = np.where(held, 1.0, sigma)
-        values, vectors = np.linalg.eigh(P / np.outer(scale, scale))
-        if values[0] < -1e-9:
-            raise SceneError("rig covariance: must have no negative eigenvalue; give the covariance of a calibration")
-        factor = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
         slopes = np.zeros((2 * len(_points()), n))
         for k in np.flatnonzero(~held):
             step = np.where(np.arange(n) == k, sigma, 0.0)

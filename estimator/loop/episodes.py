@@ -7,17 +7,18 @@ import math
 import multiprocessing
 import runpy
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, cast
 
 import polars as pl
 
+from phibench.estimator.geometry.rig_parameters import drawn_deviation
 from phibench.estimator.loop.belief import Belief
 from phibench.estimator.loop.policies import POLICIES, Policy
 from phibench.estimator.loop.simulator import REACHED, RUNNING, Action, Known, Observation, Setup, Simulator
-from phibench.scenes.random_streams import Name
+from phibench.scenes.random_streams import Name, generator
 from phibench.scenes.validation import SceneError, nearest
 
 LOST = "policy failed"
@@ -122,7 +123,21 @@ def _cause(simulator: Simulator, stated_m: float, was_seen: bool) -> str:
 
 
 def run_episodes(setup: Setup, policy: str, count: int, *stream: Name) -> list[Episode]:
-    """Episodes of a built-in policy, in this process.
+    """Episodes of a built-in policy, in this process; parameters as for `episodes_of`."""
+    return list(episodes_of(setup, policy, count, *stream))
+
+
+def episodes_of(setup: Setup, policy: str, count: int, *stream: Name, own_rigs: bool = False) -> Iterator[Episode]:
+    """Episodes of a built-in policy, in this process, one after the other.
+
+    Parameters
+    ----------
+    setup : Setup
+    policy : str
+    count : int
+    *stream : names
+    own_rigs : bool
+        Every episode has a true rig of its own, drawn from the covariance of the setup.
 
     Raises
     ------
@@ -131,11 +146,28 @@ def run_episodes(setup: Setup, policy: str, count: int, *stream: Name) -> list[E
     """
     if policy not in POLICIES:
         raise SceneError(f"policy '{policy}': {nearest(policy, POLICIES)}")
-    simulator, rows = Simulator(setup), []
+    return (
+        run_episode(simulator, POLICIES[policy](setup.known, simulator), observation, number)
+        for number, simulator, observation in _started(setup, count, stream, own_rigs)
+    )
+
+
+def with_own_rig(setup: Setup, *stream: Name) -> Setup:
+    """Setup whose true rig is drawn from its covariance; as it is without one."""
+    if setup.rig_covariance is None:
+        return setup
+    return replace(setup, misalignment=drawn_deviation(setup.rig_covariance, generator(*stream, "rig")))
+
+
+def _started(
+    setup: Setup, count: int, stream: Sequence[Name], own_rigs: bool
+) -> Iterator[tuple[int, Simulator, Observation]]:
+    """Number, simulator and first observation of each episode."""
+    simulator = Simulator(setup)
     for number in range(count):
-        observation = simulator.start(*stream, number)
-        rows.append(run_episode(simulator, POLICIES[policy](setup.known, simulator), observation, number))
-    return rows
+        if own_rigs:
+            simulator = Simulator(with_own_rig(setup, *stream, number))
+        yield number, simulator, simulator.start(*stream, number)
 
 
 def episode_frame(episodes: Sequence[Episode]) -> pl.DataFrame:
@@ -285,12 +317,16 @@ def _serve(end: Connection, factory: Callable[[Known], Policy], known: Known) ->
 
 
 def run_foreign(
-    setup: Setup, factory: Callable[[Known], Policy], count: int, *stream: Name, limit_s: float = 5.0
+    setup: Setup,
+    factory: Callable[[Known], Policy],
+    count: int,
+    *stream: Name,
+    limit_s: float = 5.0,
+    own_rigs: bool = False,
 ) -> Iterator[Episode]:
     """Episodes of a policy of others: a process for each, so that what it does to one episode stays there."""
-    simulator = Simulator(setup)
-    for number in range(count):
-        observation, policy = simulator.start(*stream, number), _Started(factory, setup.known, limit_s)
+    for number, simulator, observation in _started(setup, count, stream, own_rigs):
+        policy = _Started(factory, setup.known, limit_s)
         try:
             yield run_episode(simulator, policy, observation, number)
         finally:

@@ -19,7 +19,7 @@ import numpy as np
 
 from phibench.estimator.geometry.rig_parameters import RigBias
 from phibench.estimator.loop.belief import Belief
-from phibench.estimator.loop.sensing import Direction, Reading, direction_of
+from phibench.estimator.loop.sensing import Direction, Reading, direction_read
 from phibench.estimator.loop.simulator import CODES, Action, Known, Observation, Simulator
 from phibench.estimator.loop.smoothing import belief_of
 from phibench.scenes.frames import Array
@@ -145,7 +145,7 @@ class SearchingPolicy(abc.ABC):
                     return
 
     def _lock(self, spot: Reading) -> bool:
-        first = direction_of(self.known.rig, spot.u_px, spot.v_px, spot.sigma_px)
+        first = direction_read(self.known.rig, spot)
         if first is None:
             return False
         rig, vehicle, stroke_m = self.known.rig, self.known.vehicle, self.observation.stroke_m
@@ -163,7 +163,7 @@ class SearchingPolicy(abc.ABC):
         for spot in seen.spots:
             if place is not None and math.hypot(spot.u_px - place[0], spot.v_px - place[1]) > _NEAR_PX:
                 continue
-            direction = direction_of(self.known.rig, spot.u_px, spot.v_px, spot.sigma_px)
+            direction = direction_read(self.known.rig, spot)
             if direction is not None:
                 far = belief.distance2(direction, seen.stroke_m, held)
                 if far < _GATE and (best is None or far < best[0]):
@@ -322,7 +322,7 @@ class GreedyInformation(SearchingPolicy):
     def _frame_noise(self) -> Array:
         """Covariance of a direction in one frame, that of the latest spot near the target; shape (2, 2)."""
         for spot in self.observation.spots:
-            seen = direction_of(self.known.rig, spot.u_px, spot.v_px, spot.sigma_px)
+            seen = direction_read(self.known.rig, spot)
             if seen is not None and self.target.distance2(seen, self.observation.stroke_m) < _GATE:
                 return seen.covariance
         return 1e-6 * np.eye(2)

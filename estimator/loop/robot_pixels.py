@@ -42,6 +42,7 @@ _OFFSET_PX = 6  # of a window's middle from the spot, at most
 _FIT_REACH_PX = 6
 _MOST_FITTED = 64  # places of a whole frame
 _LEAST_Z = {"windows": 5.0, "frames": RAW.alone}  # a window has 4000 places: 1e-3 false spots
+_PATTERN_PX = 0.006  # of a spot's place by the sensor's fixed pattern, measured: docs/measurements/loop.md
 _APART_PX, _MOST_SPOTS = 4.0, 24
 
 
@@ -207,12 +208,14 @@ class SpotReader:
         sigma_px, ratio, mixed = (np.array([getattr(b, n) for b in blurs]) for n in ("sigma_px", "ratio", "mixed_px2"))
         blur = SpotBlur(sigma_px, ratio, mixed)
         fit = fit_raw(raw_electrons(regions, card), origin, noise_of(card), blur, saturation_e=card.saturation_e)
-        sigma = np.sqrt(0.5 * np.trace(fit.covariance_px2, axis1=1, axis2=2) * np.maximum(fit.chi2, 1.0))
+        bound = np.sqrt(0.5 * np.trace(fit.covariance_px2, axis1=1, axis2=2))
+        sigma = bound * np.sqrt(np.maximum(fit.chi2, 1.0))
         # a spot of n standard deviations has its place to a blur over n, to twice that between red pixels; what fits
         # badly counts for less
         good = (fit.status == Status.OK) & (sigma <= 2.0 * self._sigma_px / self._least_z)
-        rows = np.column_stack([fit.uv_px, sigma, fit.flux_e])[good]
-        return [Reading(u, v, s, e, SEEN) for u, v, s, e in rows.tolist()]
+        texture = bound * np.sqrt(np.maximum(fit.chi2 - 1.0, 0.0))
+        rows = np.column_stack([fit.uv_px, sigma, fit.flux_e, texture])[good]
+        return [Reading(u, v, s, e, SEEN, _PATTERN_PX, t) for u, v, s, e, t in rows.tolist()]
 
 
 def _inside_outline(rig: Rig) -> BoolArray:

@@ -65,6 +65,9 @@ class Reading(NamedTuple):
         Measured place with its standard deviation, and electrons of the spot; 0 where it is not seen.
     cause : str
         Cause that it is not seen; `SEEN` where it is.
+    pattern_px, texture_px : float
+        Standard deviations of what frames share, of pixels only: the camera's fixed pattern, for frames whose spot lies
+        on the same pixels, and what lies on the wall around the spot, for frames from about the same place.
     """
 
     u_px: float
@@ -72,6 +75,8 @@ class Reading(NamedTuple):
     sigma_px: float
     electrons: float
     cause: str
+    pattern_px: float = 0.0
+    texture_px: float = 0.0
 
 
 class _Seen(NamedTuple):
@@ -263,6 +268,8 @@ class Direction:
     covariance : shape (2, 2)
     uv_px, covariance_px2 : shapes (2,), (2, 2)
         Of the pixel.
+    shared_px : 2 floats
+        `pattern_px` and `texture_px` of its reading, which are not part of the covariances.
     """
 
     azimuth_rad: float
@@ -270,6 +277,7 @@ class Direction:
     covariance: Array
     uv_px: Array
     covariance_px2: Array
+    shared_px: tuple[float, float] = (0.0, 0.0)
 
     @property
     def values(self) -> Array:
@@ -280,6 +288,12 @@ class Direction:
 def direction_of(rig: Rig, u_px: float, v_px: float, sigma_px: float) -> Direction | None:
     """Direction that a pixel belongs to, by the nominal rig; None where no ray leaves the mirror."""
     return direction_with(rig, u_px, v_px, sigma_px**2 * np.eye(2))
+
+
+def direction_read(rig: Rig, reading: Reading) -> Direction | None:
+    """Direction of a reading, with what its error shares with that of other frames."""
+    found = direction_of(rig, reading.u_px, reading.v_px, reading.sigma_px)
+    return None if found is None else replace(found, shared_px=(reading.pattern_px, reading.texture_px))
 
 
 def direction_with(rig: Rig, u_px: float, v_px: float, covariance_px2: Array) -> Direction | None:
@@ -305,3 +319,24 @@ def direction_with(rig: Rig, u_px: float, v_px: float, covariance_px2: Array) ->
 def wrapped(angle_rad: float) -> float:
     """Angle between -pi and pi."""
     return math.remainder(angle_rad, 2.0 * math.pi)
+
+
+def angles(d: Array) -> Array:
+    """Azimuth and rise of vectors, shape (N, 3), shape (N, 2)."""
+    return np.stack([np.arctan2(d[:, 1], d[:, 0]), d[:, 2] / np.hypot(d[:, 0], d[:, 1])], axis=-1)
+
+
+def turned(difference: Array) -> Array:
+    """Differences with their azimuth between -pi and pi."""
+    azimuth = np.arctan2(np.sin(difference[:, 0]), np.cos(difference[:, 0]))
+    return np.stack([azimuth, difference[:, 1]], axis=-1)
+
+
+def angle_slopes(d: Array) -> Array:
+    """Derivatives of azimuth and rise by the vector, shape (N, 2, 3)."""
+    x, y, z = d.T
+    across2 = x**2 + y**2
+    across = np.sqrt(across2)
+    zero = np.zeros_like(x)
+    rows = (-y / across2, x / across2, zero), (-z * x / across**3, -z * y / across**3, 1.0 / across)
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

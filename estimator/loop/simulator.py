@@ -300,6 +300,12 @@ class Simulator:
         return math.hypot(x, y)
 
     @property
+    def raised_m(self) -> float:
+        """True place of the carriage, where `stroke_m` is what its encoder reads (`rig_parameters.stroke_of`)."""
+        own = self.setup.misalignment
+        return (1.0 + own.stroke_relative) * self.stroke_m + own.stroke_offset_m
+
+    @property
     def time_s(self) -> float:
         """Time since the episode began."""
         return self.step * self.setup.task.step_s
@@ -393,7 +399,7 @@ class Simulator:
         lights = [Light(*self.target, self.setup.task.power), *on] if lit else on
         windows: tuple[Window, ...] = ()
         if self._camera is None:
-            read = self._sensing.read(lights, self.placement, self.stroke_m, action.exposure, self.arena, self._rng)
+            read = self._sensing.read(lights, self.placement, self.raised_m, action.exposure, self.arena, self._rng)
             self.unseen_cause = read[0].cause if lit else DARK
             spots = tuple(sorted(reading for reading in read if reading.cause == SEEN))
         else:
@@ -407,10 +413,10 @@ class Simulator:
         """Pixels, and the spots that are read in them."""
         room = self.arena.baked
         assert room is not None
-        places = self._sensing.unhidden(lights, self.placement, self.stroke_m, self.arena)
+        places = self._sensing.unhidden(lights, self.placement, self.raised_m, self.arena)
         shown = [(light, *at) for light, at in zip(lights, places, strict=True) if not isinstance(at, str)]
         stream = (*self.stream, "frame", self.step)
-        windows = camera.take(room, shown, self.placement, self.stroke_m, exposure, self._rng, *stream)
+        windows = camera.take(room, shown, self.placement, self.raised_m, exposure, self._rng, *stream)
         spots = () if self._reader is None else self._reader.read(windows, exposure)
         self.unseen_cause = _cause_of(places[0], spots, self._reader is not None) if lit else DARK
         return windows, spots

@@ -30,7 +30,7 @@ from phibench.estimator.film.film_positions import FilmPositions
 from phibench.estimator.geometry.reflection import reflect
 from phibench.estimator.geometry.rig_parameters import RigBias, changed, stroke_of
 from phibench.estimator.loop.belief import LEAST_Q, PRIOR_DISTANCES_M, SKID, SLIP, VELOCITY, Belief, TargetBelief
-from phibench.estimator.loop.sensing import Direction, direction_with, wrapped
+from phibench.estimator.loop.sensing import Direction, angle_slopes, angles, direction_with, turned, wrapped
 from phibench.scenes.frames import Array
 from phibench.scenes.motion.vehicle import Stance, Vehicle, arc_covariance
 from phibench.scenes.rig import Rig, View
@@ -40,12 +40,16 @@ _STEP = 0.1  # of a standard deviation: differences by theta err by 1 % of the s
 _STALE = 0.2  # of one: slopes by theta are taken anew beyond
 _ROUNDS, _HALVINGS, _AT_REST = 6, 8, 0.1  # of standard deviations
 _PIXEL_STEP_PX = 1e-3
+_PATTERN_REACH_PX, _TEXTURE_REACH_M = 1.0, 0.5
 _MOST_FRAMES = 160  # kept: older ones are thinned, which loses what they say and adds nothing
 
 
 @dataclass(frozen=True)
 class _Frames:
-    """N frames in order: pixels and their covariances, nominal strokes, attitudes, and steps and time before them."""
+    """N frames in order: pixels and their covariances, nominal strokes, attitudes, and steps and time before them.
+
+    `rays` has origin, direction and rise of the mirror by the middle rig and those beside it, shape (N, m + 1, 3, 3).
+    """
 
     uv_px: Array
     covariance_px2: Array
@@ -54,6 +58,8 @@ class _Frames:
     origin_m: Array
     steps: Array
     time_s: Array
+    rays: Array
+    shared_px: Array
 
     def joined(self, other: _Frames) -> _Frames:
         """Both, this one's first."""
@@ -134,6 +140,7 @@ class SmoothedBelief(Belief):
         self._precision[[SLIP, SKID]] = 1.0 / (np.array([vehicle.slip_sigma, vehicle.skid_sigma]) ** 2 + 1e-12)
         self._precision[self._deviations] = 1.0
         self._P = np.zeros((n, n))
+        self._latest: tuple[Direction, _Frames] | None = None
         self._x, self._middle = x, x[self._deviations]
         self._views = self._around()
         self._frames = self._frame(first, stroke_m, None)
@@ -203,9 +210,11 @@ class SmoothedBelief(Belief):
     def _solve(self) -> None:
         """Most probable state by Gauss-Newton, and the covariance by its slopes (Laplace's approximation)."""
         for _ in range(_ROUNDS):
-            if np.max(np.abs(self._x[self._deviations] - self._middle)) > _STALE:
+            if np.any(np.abs(self._x[self._deviations] - self._middle) > _STALE):
                 self._middle = self._x[self._deviations].copy()
-                self._views = self._around()
+                self._views, self._latest = self._around(), None
+                rays = self._view_rays(self._frames.uv_px, self._frames.stroke_m)
+                self._frames = replace(self._frames, rays=rays)
             rows = self._with_priors(self._x, self._rows(self._x, self._frames))
             factor = np.asarray(np.linalg.cholesky(rows.C), float)
             r, J = (solve_triangular(factor, part, lower=True) for part in (rows.r, rows.J))
@@ -271,9 +280,11 @@ class SmoothedBelief(Belief):
     # -- model -----------------------------------------------------------------------------------------------------
 
     def _frame(self, seen: Direction, stroke_m: float, held: Stance | None) -> _Frames:
-        """One frame, now."""
+        """One frame, now; that of the latest direction again, as `update` follows `distance2`."""
+        if self._latest is not None and self._latest[0] is seen:
+            return self._latest[1]
         R, t = self._tilt(held)
-        return _Frames(
+        one = _Frames(
             seen.uv_px[None],
             seen.covariance_px2[None],
             np.array([stroke_m]),
@@ -281,7 +292,16 @@ class SmoothedBelief(Belief):
             t[None],
             np.array([len(self._tracks_m)]),
             np.array([self._time_s]),
+            self._view_rays(seen.uv_px[None], np.array([stroke_m])),
+            np.array([seen.shared_px]),
         )
+        self._latest = seen, one
+        return one
+
+    def _view_rays(self, uv_px: Array, stroke_m: Array) -> Array:
+        """Rays of pixels by the middle rig and those beside it, shape (N, m + 1, 3, 3)."""
+        rays = [np.stack(view.rays(uv_px, stroke_m), axis=1) for view in self._views]
+        return np.stack(rays, axis=1)
 
     def _around(self) -> list[_DeviatedView]:
         """Rig of the middle deviation, and those a step away from it along each of its numbers."""
@@ -308,14 +328,16 @@ class SmoothedBelief(Belief):
         r = _residual(p, *here)
         J = np.zeros((2 * n, len(x)))
         J[:, :m] = self._slopes(x, lambda y: _residual(self._places(y, frames)[0], *here)).reshape(2 * n, m)
-        base, *moved = (_residual(p, *view.rays(frames.uv_px, frames.stroke_m)) for view in self._views)
+        base, *moved = (_residual(p, *np.moveaxis(one, 1, 0)) for one in np.moveaxis(frames.rays, 1, 0))
         for k, one in enumerate(moved):
             # a pixel at the mirror's rim may be none in the next rig: it then says nothing of this deviation
-            J[:, m + k] = np.nan_to_num(_turned(one - base)).reshape(-1) / _STEP
-        aside = [_turned(_residual(p, origin[k], direction[k], raised) - r) for k in (1, 2)]
+            J[:, m + k] = np.nan_to_num(turned(one - base)).reshape(-1) / _STEP
+        aside = [turned(_residual(p, origin[k], direction[k], raised) - r) for k in (1, 2)]
         per_px = np.stack(aside, axis=-1) / _PIXEL_STEP_PX
         noise = per_px @ frames.covariance_px2 @ np.swapaxes(per_px, 1, 2)
-        C, F = self._covariance(x, frames, _direction_slopes(p - origin[0] - raised), noise)
+        C, F = self._covariance(x, frames, angle_slopes(p - origin[0] - raised), noise)
+        flat = per_px.reshape(2 * n, 2)
+        C += np.kron(self._shared(frames), np.ones((2, 2))) * (flat @ flat.T)
         return _Rows(r.reshape(-1), J, C, F)
 
     def _places(self, y: Array, frames: _Frames) -> tuple[Array, Array]:
@@ -342,6 +364,19 @@ class SmoothedBelief(Belief):
         chord, along = length * np.sinc(0.5 * turn / np.pi), heading[:-1] + 0.5 * turn
         steps = chord[:, None] * np.stack([np.cos(along), np.sin(along)], axis=-1)
         return _Course(heading, np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]))
+
+    def _shared(self, frames: _Frames) -> Array:
+        """Covariance of pixels that frames share, each coordinate, shape (N, N): fixed pattern, and the wall's texture.
+
+        The pattern is that of the pixels under the spot. The texture stays where it is around the spot while only the
+        carriage moves; a drive shows it from elsewhere.
+        """
+        pattern, texture = frames.shared_px.T
+        uv, way = frames.uv_px, np.concatenate([[0.0], np.cumsum(np.abs(self._tracks_m).mean(axis=1))])[frames.steps]
+        apart = np.hypot(*np.moveaxis(uv[:, None] - uv, -1, 0))
+        driven = np.abs(np.subtract.outer(way, way))
+        result = np.outer(pattern, pattern) * np.exp(-apart / _PATTERN_REACH_PX)
+        return result + np.outer(texture, texture) * np.exp(-driven / _TEXTURE_REACH_M)
 
     def _covariance(self, x: Array, frames: _Frames, E: Array, noise: Array) -> tuple[Array, Array]:
         """Covariance of residuals, shape (2 N, 2 N): pixels in each frame, steps and motion between frames; and F."""
@@ -386,27 +421,7 @@ def _yaw(heading_rad: Array) -> Array:
 
 def _residual(p: Array, origin: Array, direction: Array, raised: Array) -> Array:
     """Azimuth and rise of points by those of rays, shape (N, 2)."""
-    return _turned(_angles(p - origin - raised) - _angles(direction))
-
-
-def _angles(d: Array) -> Array:
-    return np.stack([np.arctan2(d[:, 1], d[:, 0]), d[:, 2] / np.hypot(d[:, 0], d[:, 1])], axis=-1)
-
-
-def _turned(difference: Array) -> Array:
-    """Differences with their azimuth between -pi and pi."""
-    azimuth = np.arctan2(np.sin(difference[:, 0]), np.cos(difference[:, 0]))
-    return np.stack([azimuth, difference[:, 1]], axis=-1)
-
-
-def _direction_slopes(d: Array) -> Array:
-    """Derivatives of azimuth and rise by the vector, shape (N, 2, 3)."""
-    x, y, z = d.T
-    across2 = x**2 + y**2
-    across = np.sqrt(across2)
-    zero = np.zeros_like(x)
-    rows = (-y / across2, x / across2, zero), (-z * x / across**3, -z * y / across**3, 1.0 / across)
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return turned(angles(p - origin - raised) - angles(direction))
 
 
 # -- choice -----------------------------------------------------------------------------------------------------------
@@ -422,9 +437,9 @@ def belief_of(
     acceleration_m2_per_s3: float = 0.0,
     speed_m_per_s: float = 0.3,
 ) -> Belief:
-    """Belief for what is known of a rig: smoothed where it has deviations, filtered where it is exact."""
+    """Belief for what is known: smoothed where the rig has deviations or frames share errors, filtered elsewhere."""
     target = distances_m, acceleration_m2_per_s3, speed_m_per_s
-    if bias.count:
+    if bias.count or any(first.shared_px):
         return SmoothedBelief(rig, vehicle, first, stroke_m, bias, *target)
     return TargetBelief(rig, vehicle, first, stroke_m, *target)
 
