@@ -20,7 +20,7 @@ from phibench.estimator.loop.sensing import DARK, EXPOSURES_S, FAINT, SEEN, Ligh
 from phibench.estimator.spots.spot_prediction import Laser
 from phibench.scenes.frames import Array
 from phibench.scenes.misalignment import Misalignment
-from phibench.scenes.motion.vehicle import PlanarPose, Stance, Vehicle, rig_placement, stance
+from phibench.scenes.motion.vehicle import Obstacle, PlanarPose, Stance, Vehicle, rig_placement, stance
 from phibench.scenes.random_streams import Name, generator
 from phibench.scenes.rig import Rig
 from phibench.scenes.validation import SceneError, within
@@ -119,6 +119,9 @@ class Task:
         Largest speeds.
     lights : int
         Other lights in the room, at most 5.
+    obstacle_m, obstacle_run_m : float
+        Height of a block across the way, half of it, and length of its ramps; a height of 0 is a level floor, a run of
+        0 a step. The robot may start on the ramp.
     power : float
         Of the laser, relative to `laser`.
     """
@@ -134,6 +137,8 @@ class Task:
     turn_rad_per_s: float = 0.8
     lights: int = 3
     power: float = 1.0
+    obstacle_m: float = 0.0
+    obstacle_run_m: float = 0.4
     laser: Laser = field(default_factory=Laser)
 
     def __post_init__(self) -> None:
@@ -141,6 +146,8 @@ class Task:
         within("Task", "stand_off_m", self.stand_off_m, 0.7, self.distances_m[0])
         within("Task", "step_s", self.step_s, 0.01, 1.0)
         within("Task", "power", self.power, 1e-3, 5.0)
+        within("Task", "obstacle_m", self.obstacle_m, 0.0, 0.3)
+        within("Task", "obstacle_run_m", self.obstacle_run_m, 0.0, 5.0)
 
     @property
     def steps(self) -> int:
@@ -258,6 +265,7 @@ class Simulator:
         ]
         self.slip = float(np.clip(setup.vehicle.slip + setup.vehicle.slip_sigma * rng.standard_normal(), -0.2, 0.5))
         self.skid = max(setup.vehicle.skid + setup.vehicle.skid_sigma * float(rng.standard_normal()), 0.5)
+        self.obstacles = self._obstacles()
         heading = float(rng.uniform(-math.pi, math.pi))
         ahead = setup.vehicle.sensor_x_m  # the stroke axis starts at the room's origin
         self.pose = PlanarPose(-ahead * math.cos(heading), -ahead * math.sin(heading), heading)
@@ -281,12 +289,27 @@ class Simulator:
             "allow other distances, or give other rooms"
         )
 
+    def _obstacles(self) -> tuple[Obstacle, ...]:
+        """Block across the straight way to the stand-off distance, half of it; none on a level floor."""
+        task, (x, y) = self.setup.task, self.target.point_m[:2].tolist()
+        if task.obstacle_m == 0.0:
+            return ()
+        half = 0.5 * (1.0 - task.stand_off_m / math.hypot(x, y))
+        block = Obstacle(half * x, half * y, 0.3, 2.0, task.obstacle_m, task.obstacle_run_m, math.atan2(y, x))
+        block.lift_m(0.0, 0.0, self.setup.vehicle.roller_m)  # a step that is too high is said at once
+        return (block,)
+
     # -- truth -----------------------------------------------------------------------------------------------------
 
     @property
     def placement(self) -> tuple[Array, Array]:
         """Rotation and origin of the rig's frame in the world."""
-        return rig_placement(self.setup.vehicle, self.pose, stance(self.setup.vehicle, self.pose, self.flipper_rad))
+        return rig_placement(self.setup.vehicle, self.pose, self.stance)
+
+    @property
+    def stance(self) -> Stance:
+        """Attitude by flippers and ground."""
+        return stance(self.setup.vehicle, self.pose, self.flipper_rad, self.obstacles)
 
     def target_in_rig_m(self) -> Array:
         """True place of the target in the rig's frame of the level robot, shape (3,)."""
@@ -404,7 +427,8 @@ class Simulator:
             spots = tuple(sorted(reading for reading in read if reading.cause == SEEN))
         else:
             windows, spots = self._look(self._camera, lights, action.exposure, lit)
-        held = self.flipper_rad, 0.0, 0.0, self.stroke_m
+        ground = self.stance
+        held = self.flipper_rad, ground.pitch_rad, ground.roll_rad, self.stroke_m
         return Observation(self.step, left_m, right_m, *held, lit, spots, windows)
 
     def _look(

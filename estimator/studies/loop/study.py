@@ -98,6 +98,11 @@ def conditions(settings: LoopSettings) -> Iterator[Condition]:
     for size in settings.misalignments:
         rigs = tuple(Setup(misalignment=misaligned(size, k)) for k in range(settings.rigs))
         yield Condition("misalignment", f"{size:g} of as built", rigs, n)
+    for size in settings.misalignments:
+        told = replace(base, rig_covariance=covariance(size))
+        rigs = tuple(replace(told, misalignment=misaligned(size, k)) for k in range(settings.rigs))
+        for policy in ("paper", "greedy") if size == max(settings.misalignments) else ("paper",):
+            yield Condition("covariance told", f"{size:g} of as built, {policy}", rigs, n, policy)
     for sigma in settings.slip_sigmas:
         yield Condition("slip from run to run", f"{sigma:g}", (_with_vehicle(slip_sigma=sigma),), n)
     for noise in settings.track_noises:
@@ -138,6 +143,12 @@ def misaligned(size: float, number: int) -> Misalignment:
     rng = generator(STREAM, "rig", number)
     sigmas = {name: sigma for name, sigma in PRIOR_SIGMA.items() if name not in (*STROKE_PARAMETERS, *_NO_EFFECT)}
     return Misalignment(**{name: size * sigma * float(rng.standard_normal()) for name, sigma in sigmas.items()})
+
+
+def covariance(size: float) -> Array:
+    """Covariance of such deviations, shape (p, p), in the order of `rig_parameters.PARAMETERS`."""
+    exact = (*STROKE_PARAMETERS, *_NO_EFFECT)
+    return np.diag([0.0 if name in exact else (size * sigma) ** 2 for name, sigma in PRIOR_SIGMA.items()])
 
 
 # -- statistics ------------------------------------------------------------------------------------------------------

@@ -12,12 +12,22 @@ import pytest
 from helpers.target_approach import rig_covariance
 from scipy.stats import binomtest
 
+from phibench.estimator.cli import main as cli
 from phibench.estimator.loop.arena import generated_arena
-from phibench.estimator.loop.episodes import LOST, PolicyFile, episode_frame, run_episode, run_episodes, run_foreign
+from phibench.estimator.loop.episodes import (
+    LOST,
+    PolicyFile,
+    episode_frame,
+    run_episode,
+    run_episodes,
+    run_foreign,
+    with_own_rig,
+)
 from phibench.estimator.loop.policies import CODED, POLICIES, Identifier, Plan
 from phibench.estimator.loop.sensing import SEEN, Reading
 from phibench.estimator.loop.simulator import CODES, Action, Known, Observation, Setup, Simulator, Task
-from phibench.estimator.studies.loop.study import STREAM, misaligned, summary
+from phibench.estimator.studies.loop.study import misaligned, summary
+from phibench.scenes.motion.vehicle import PlanarPose
 from phibench.scenes.validation import SceneError
 
 
@@ -188,18 +198,50 @@ def test_a_process_of_its_own_ends_policies_that_hang() -> None:
 @pytest.mark.study
 @pytest.mark.parametrize("size", [0.25, 1.0])
 def test_rigs_whose_covariance_is_stated(capsys, size: float) -> None:
-    """Episodes and rigs of the study `loop`, whose policies take the rig for exact and reach 0 of 20, pulls 47 and 87.
+    """Every episode with a rig of its own; without the covariance none is reached, with pulls of 47 and 87.
 
-    A rig is shared by episodes, so that few pulls are independent: their rms below 2 is required, not 0.9 to 1.1.
+    The rms pull of 30 consistent beliefs is 1 +- 0.13: three of these are allowed.
     """
     rows = []
-    for number in range(20):
-        setup = Setup(misalignment=misaligned(size, number % 4), rig_covariance=rig_covariance(size))
-        rows += [replace(one, number=number) for one in run_episodes(setup, "paper", 1, STREAM, number)]
+    for number in range(100, 130):
+        setup = Setup(misalignment=misaligned(size, 1000 + number), rig_covariance=rig_covariance(size))
+        rows += [replace(one, number=number) for one in run_episodes(setup, "paper", 1, "loop rigs test", number)]
     found = summary(rows)
     with capsys.disabled():
         print(f"{size:g} of as built: reached {found.reached}, pull {found.pull}, error of D {found.error}")
-    assert found.pull[0] < 2.0
+    assert found.reached[0] >= 0.9
+    assert 0.6 < found.pull[0] < 1.4
+
+
+def test_the_command_line_draws_rigs_from_what_is_known_of_them(tmp_path, capsys) -> None:
+    one, other = (with_own_rig(Setup(rig_covariance=rig_covariance(1.0)), "x", n).misalignment for n in (0, 1))
+    assert one != other
+    assert with_own_rig(Setup(), "x", 0) == Setup()
+    assert cli.main(["loop", "run", "oracle", "--episodes", "1", "--as-built", "0.5"]) == 0
+    assert "reached: 1 of 1" in capsys.readouterr().out
+    both = ["--as-built", "1", "--calibration", str(tmp_path / "none.json")]
+    for options, words in ((["--as-built", "3"], "as_built"), (both, "give one of them"), (both[2:], "none.json")):
+        assert cli.main(["loop", "run", "oracle", *options]) == 2
+        said = capsys.readouterr().err
+        assert words in said
+        assert said.count("\n") == 1
+
+
+def test_obstacles_pitch_the_robot_and_too_high_steps_are_refused() -> None:
+    """Ramps of 0.4 m for 0.05 m: both rollers on one ramp pitch by atan(0.05 / 0.4)."""
+    simulator = Simulator(Setup(task=Task(obstacle_m=0.05, lights=0)))
+    simulator.start("ramp", 1)
+    (block,) = simulator.obstacles
+    seen = []
+    for along in np.linspace(0.0, 1.0, 41):
+        simulator.pose = PlanarPose(along * 2.0 * block.x_m, along * 2.0 * block.y_m, block.yaw_rad)
+        seen.append(simulator.act(Action()))
+    pitches = np.array([one.pitch_rad for one in seen])
+    assert 0.04 < pitches.max() <= math.atan(0.05 / 0.4) + 1e-9
+    assert pitches.min() < -0.04
+    assert max(abs(one.roll_rad) for one in seen) < 1e-12
+    with pytest.raises(SceneError, match="climbs no higher step"):
+        Simulator(Setup(task=Task(obstacle_m=0.2, obstacle_run_m=0.0))).start("ramp", 1)
 
 
 @pytest.mark.study
