@@ -48,6 +48,7 @@ estimator/spots
 estimator/processed
 estimator/sensor_fit
 estimator/outline
+estimator/learned
 estimator/film estimator/limits estimator/methods
 estimator/loop
 estimator/draw_pairs

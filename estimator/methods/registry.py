@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 
 from phibench.estimator.interface import Answer, Method, Pair, Spot
+from phibench.estimator.learned.network_input import ACCEPTED
 from phibench.estimator.methods.chain_fit import chain_fit
 from phibench.estimator.methods.locate import each_spot
 from phibench.estimator.methods.raw_likelihood import joint_fit, raw_likelihood
@@ -16,6 +17,7 @@ from phibench.estimator.methods.simple import (
     at_the_red_peak,
     detected_spots,
     in_the_box,
+    learned_crop,
     off_difference,
     photutils_centroid_2dg,
     red_centroid,
@@ -146,6 +148,14 @@ _ALL = (
         detected_spots,
         "peak of a matched filter over the whole mirror, boxes or not, refined by parabolas",
         "estimator/spots/detect.py",
+    ),
+    BuiltIn(
+        "learned_crop",
+        learned_crop(),
+        "small network on the 32 x 32 pixels about the spot that `detect` sees; claims a covariance",
+        "docs/learned.md",
+        accepts=ACCEPTED,
+        package="onnxruntime",
     ),
     BuiltIn(
         "photutils_centroid_2dg",

@@ -139,10 +139,12 @@ def test_every_built_in_method_has_its_row() -> None:
 @pytest.mark.parametrize("name", [name for name, method in KNOWN.items() if method.package])
 def test_accuracy_of_the_optional_methods(name: str) -> None:
     pytest.importorskip(KNOWN[name].package)
-    error = errors(KNOWN[name], "mono-raw", COUNT)
-    print(f"mono-raw, {name}: median {np.median(np.linalg.norm(error, axis=1)):.3f} px")
+    preset = "mono-raw" if "mono-raw" in KNOWN[name].accepts else "bayer-raw"
+    error = errors(KNOWN[name], preset, COUNT)
+    print(f"{preset}, {name}: median {np.median(np.linalg.norm(error, axis=1)):.3f} px")
     assert len(error) == 2 * COUNT
-    assert np.median(np.linalg.norm(error, axis=1)) < 0.1
+    # of a network about 1.5 times what it has; its crops are those of a mosaic
+    assert np.median(np.linalg.norm(error, axis=1)) < {"learned_crop": 0.3}.get(name, 0.1)
 
 
 # -- refusals ---------------------------------------------------------------------------------------------------------

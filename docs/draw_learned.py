@@ -1,0 +1,178 @@
+"""Networks of crops compared on rooms they have not seen: train preset by test preset, outside the range, room leak.
+
+    .venv/bin/python docs/draw_learned.py measure DEV TEST NETWORKS out/learned.json
+    .venv/bin/python docs/draw_learned.py draw out/learned.json docs/learned.png
+
+NETWORKS is a folder: seed0.onnx to seed2.onnx, trained on all presets, and bayer-raw.onnx, srgb8.onnx, mjpeg.onnx,
+each trained on that preset alone.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from phibench.datasets.frames.request import FrameRequest
+from phibench.datasets.read import open_finished
+from phibench.datasets.training import CropSettings, SpotCrops
+from phibench.estimator.learned.network_input import SIDE_PX, crop_input
+from phibench.estimator.learned.networks import CROP, Network, covariances
+from phibench.estimator.learned.training import CROP_SETTINGS, Answers, TrainingSettings, crops_of, rooms_of
+from phibench.scenes.frames import Array
+from phibench.scenes.random_streams import generator
+
+PRESETS = ("bayer-raw", "srgb8", "mjpeg")
+SEEDS = ("seed0", "seed1", "seed2")
+COUNT, LEAK_COUNT, RESAMPLES = 800, 1600, 2000
+SETTINGS = replace(CROP_SETTINGS, laser_levels=(0.25, 1.0))  # those of the recipe
+SIZES: dict[str, dict[str, Any]] = {  # numbers of bench-test
+    "bayer-raw": {"read_noise_e": 5.0},
+    "srgb8": {"read_noise_e": 5.0},
+    "mjpeg 50": {"jpeg_quality": 50, "read_noise_e": 5.0},
+    "mjpeg 65": {"jpeg_quality": 65, "read_noise_e": 5.0},
+    "mjpeg 80": {"jpeg_quality": 80, "read_noise_e": 5.0},
+}
+
+
+@dataclass(frozen=True)
+class Crops:
+    """Inputs of n crops with their true places, samples, and the blur of their cameras."""
+
+    planes: Array
+    scalars: Array
+    uv_px: Array
+    samples: Array
+    blur_px: Array
+
+    def answers(self, file: Path) -> Answers:
+        """Answers of a network for all of them."""
+        found = Network(file, CROP)
+        uv, factor = found.run(planes=self.planes, scalars=self.scalars)
+        scale = float(found.metadata["covariance_scale"])
+        return Answers(uv.astype(float) - self.uv_px, covariances(factor.astype(float), scale))
+
+
+def made(crops: SpotCrops, folder: Path) -> Crops:
+    """Inputs of an epoch's crops, all with the laser-off image."""
+    dataset, columns = open_finished(folder), []
+    blur = {sample.row.sample_id: sample.rig.camera.blur_sigma_px for sample in dataset}
+    for k in range(len(crops)):
+        crop = crops.crop(k)
+        u0, v0 = crop.phase_px % 2
+        part = (slice(v0, v0 + SIDE_PX), slice(u0, u0 + SIDE_PX))
+        assert crop.image_off is not None, "asked for"
+        one = crop_input(crop.image[part], crop.image_off[part], crop.card)
+        columns.append((one.planes, one.scalars, crop.uv_px - [u0, v0], crop.sample_id, blur[crop.sample_id]))
+    return Crops(*(np.array(column) for column in zip(*columns, strict=True)))
+
+
+def interval(values: Callable[[Array], float], samples: Array, name: str) -> list[float]:
+    """Value of all crops, and its 95 % interval by drawing samples, which are rooms, again."""
+    draw, rooms = generator("learned intervals", name), sorted(set(samples))
+    members = [np.flatnonzero(samples == room) for room in rooms]
+    drawn = [
+        values(np.concatenate([members[k] for k in draw.integers(len(rooms), size=len(rooms))]))
+        for _ in range(RESAMPLES)
+    ]
+    low, high = np.nanquantile(drawn, [0.025, 0.975])
+    return [values(np.arange(len(samples))), float(low), float(high)]
+
+
+def rms(errors_px: Array) -> float:
+    """Root of the mean squared distance."""
+    return float(np.sqrt((errors_px**2).sum(axis=1).mean())) if len(errors_px) else float("nan")
+
+
+def table_of(crops: Crops, files: dict[str, Path], name: str, chosen: Array) -> dict[str, Any]:
+    """Rms, median and pull of networks on the chosen crops."""
+    rows = np.flatnonzero(chosen)
+    found: dict[str, Any] = {"crops": len(rows), "rooms": len(set(crops.samples[rows]))}
+    if not len(rows):
+        return found
+    for network, file in files.items():
+        answers = crops.answers(file)
+        error, pull, samples = answers.error_px[rows], answers.squared_pull[rows], crops.samples[rows]
+        distance = np.linalg.norm(error, axis=1)
+        found[network] = {
+            "rms_px": interval(lambda k, e=error: rms(e[k]), samples, name),
+            "median_px": interval(lambda k, d=distance: float(np.median(d[k])), samples, name),
+            "pull": interval(lambda k, p=pull: float(np.sqrt(p[k].mean())), samples, name),
+        }
+    return found
+
+
+def measure(dev: Path, test: Path, networks: Path, out: Path) -> None:
+    """Write all numbers as JSON."""
+    files = {file.stem: file for file in sorted(networks.glob("*.onnx"))}
+    tables: dict[str, Any] = {}
+    for size, numbers in SIZES.items():
+        request = FrameRequest(size.split()[0], "auto", overrides=numbers)
+        crops = made(_crops(test, request), test)
+        lead = crops.answers(files[SEEDS[0]])
+        full = crops.planes[:, 3, 10:22, 10:22].any(axis=(1, 2))
+        wide = crops.blur_px > 1.0
+        for part, chosen in (
+            ("", lead.sure),
+            (", blur to 1.0 px", lead.sure & ~wide),
+            (", blur above 1.0 px", lead.sure & wide),
+            (", full pixels", lead.sure & full),
+        ):
+            tables[size + part] = table_of(crops, files, size + part, chosen)
+            print(size + part, {k: v["rms_px"] if isinstance(v, dict) else v for k, v in tables[size + part].items()})
+    tables["leak"] = leak(dev, {name: files[name] for name in SEEDS if name in files})
+    out.write_text(json.dumps(tables, indent=1))
+
+
+def _crops(folder: Path, request: FrameRequest, settings: CropSettings = SETTINGS) -> SpotCrops:
+    return SpotCrops([folder], [request], COUNT, seed=77, settings=settings, laser_off=True)
+
+
+def leak(dev: Path, files: dict[str, Path]) -> dict[str, Any]:
+    """Ratio of rms errors in rooms held out and trained in, of the same crops by different networks."""
+    seeds = {name: int(name.removeprefix("seed")) for name in files}
+    held = {name: set(rooms_of(dev, seed)[1]) for name, seed in seeds.items()}
+    every = sorted(set().union(*held.values()))
+    crops = made(crops_of(dev, TrainingSettings(), every, LEAK_COUNT, 78), dev)
+    answers = {name: crops.answers(file) for name, file in files.items()}
+    sure = np.all([one.sure for one in answers.values()], axis=0)
+    squared = {name: (one.error_px**2).sum(axis=1) for name, one in answers.items()}
+    outside, inside = np.full(len(crops.samples), np.nan), np.full(len(crops.samples), np.nan)
+    for k, sample in enumerate(crops.samples):
+        outside[k] = np.mean([squared[name][k] for name in files if sample in held[name]])
+        inside[k] = np.mean([squared[name][k] for name in files if sample not in held[name]])
+    kept = np.flatnonzero(sure & np.isfinite(outside) & np.isfinite(inside))
+    o, i = outside[kept], inside[kept]
+    ratio = interval(lambda k: float(np.sqrt(o[k].mean() / i[k].mean())), crops.samples[kept], "leak")
+    return {"crops": len(kept), "rooms": len(set(crops.samples[kept])), "unseen_over_seen": ratio}
+
+
+def draw(source: Path, out: Path) -> None:
+    """Rms error by test preset: networks of one preset and of all."""
+    tables = json.loads(source.read_text())
+    figure, axes = plt.subplots(figsize=(7.0, 3.2), layout="constrained")
+    names = [*(name for name in PRESETS if name in tables["bayer-raw"]), SEEDS[0]]
+    for shift, name in enumerate(names):
+        found = np.array([tables[size][name]["rms_px"] for size in SIZES])
+        x = np.arange(len(SIZES)) + 0.12 * (shift - (len(names) - 1) / 2.0)
+        label = "trained on all presets" if name == SEEDS[0] else f"trained on {name}"
+        bars = np.abs(found[:, 1:].T - found[:, 0])
+        axes.errorbar(x, found[:, 0], bars, fmt="o", markersize=4, capsize=2, label=label)
+    axes.set_xticks(np.arange(len(SIZES)), [f"{size}" for size in SIZES])
+    axes.set(yscale="log", ylabel="rms distance, px", xlabel="crops of bench-test")
+    axes.grid(axis="y", which="both", alpha=0.3)
+    axes.legend(fontsize=8)
+    figure.savefig(out, dpi=110)
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "measure":
+        measure(*map(Path, sys.argv[2:6]))
+    else:
+        draw(*map(Path, sys.argv[2:4]))

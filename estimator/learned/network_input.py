@@ -1,0 +1,128 @@
+"""Input of the networks: images of every processing brought to one form, electrons behind R, G and B.
+
+Crops have 32 x 32 pixels and begin at an even column and row, so that red pixels of the mosaic come first. Raw pixels
+are interpolated bilinearly, which loses nothing; 8-bit codes go back through tone curve, colour matrix and white
+balance. What is left of the difference on - off is then free of exposure, gain and the brightness of the room.
+
+Noise is measured in the border of the crop itself. No input says which processing it was: a network sees it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.datasets.frames.sensor_card import SensorCard
+from phibench.estimator.interface import Box, Image
+from phibench.estimator.spots.image_planes import colour_planes, demosaiced, variance_e2
+from phibench.estimator.spots.raw_pixels import raw_electrons
+from phibench.scenes.frames import Array, BoolArray
+
+SIDE_PX = 32
+PLANES = 4  # R, G, B of the difference, and full pixels
+SCALARS = 5  # see `crop_input`
+ACCEPTED = ("bayer-raw", "srgb8", "mjpeg")
+
+_MIDDLE = slice(10, 22)  # of a crop: rows and columns in which the spot's centre may lie
+_BORDER_PX = 6  # of which background and noise are taken
+_SIGMA_OF_MAD = 1.4826
+_LEAST_SIGMA = 0.1  # of the card's: rounding and JPEG may leave a border without any noise
+_CUT = 3.0  # of relative values: beyond it there is another light
+
+
+@dataclass(frozen=True)
+class CropInput:
+    """Input for one crop.
+
+    Attributes
+    ----------
+    planes : shape (4, 32, 32), float32
+        Difference behind R, G, B over the spot's amplitude; 1 where a pixel is full.
+    scalars : shape (5,), float32
+    """
+
+    planes: NDArray[np.float32]
+    scalars: NDArray[np.float32]
+
+
+def crop_origin(uv_px: tuple[float, float]) -> tuple[int, int]:
+    """First column and row of the crop about a position: even, with the position within a pixel of its middle."""
+    u0, v0 = (2 * round((x - (SIDE_PX - 1) / 2.0) / 2.0) for x in uv_px)
+    return int(u0), int(v0)
+
+
+def cut(image: Image, origin_px: tuple[int, int], side_px: int = SIDE_PX) -> Image:
+    """Part of an image, shape (H, W, ...), that may reach over its border.
+
+    Beyond the border stands what is mirrored about the border pixel, which keeps the mosaic's colours in order.
+    """
+    height, width = image.shape[:2]
+    rows, columns = (
+        _mirrored(first + np.arange(side_px), n) for first, n in zip(origin_px[::-1], (height, width), strict=True)
+    )
+    return np.asarray(image[rows[:, None], columns[None, :]])
+
+
+def _mirrored(index: NDArray[Any], size: int) -> NDArray[Any]:
+    inside = np.abs(index)
+    return np.clip(np.where(inside >= size, 2 * (size - 1) - inside, inside), 0, size - 1)
+
+
+def filter_planes(image: Image, card: SensorCard) -> tuple[Array, BoolArray]:
+    """Electrons behind R, G, B, shape (3, h, w), and full pixels, shape (h, w), of a part that begins with red."""
+    if card.output == "raw":
+        signal = raw_electrons(image, card)
+        return demosaiced(signal), np.asarray(signal >= card.saturation_e)
+    height, width = image.shape[:2]
+    found = colour_planes(image, card, Box(0, 0, width, height))
+    return np.asarray(found.values_e, float), np.asarray(found.full.any(axis=0))
+
+
+def crop_input(on: Image, off: Image | None, card: SensorCard) -> CropInput:
+    """Input for a crop of 32 x 32 pixels.
+
+    Parameters
+    ----------
+    on, off : shape (32, 32, ...)
+        Pixels with the laser on, and off where there are such; without them the border's median is the background.
+    card : SensorCard
+
+    Returns
+    -------
+    CropInput
+        Scalars: ln of amplitude over the card's noise; ln of measured over the card's noise; amplitude over the
+        saturation; the room's level over the saturation; whether there are pixels with the laser off.
+    """
+    planes, full = filter_planes(on, card)
+    border = np.ones(full.shape, bool)
+    border[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX] = False
+    room = np.median(planes[:, border], axis=1)[:, None, None]
+    if off is None:
+        difference = planes - room
+    else:
+        dark, dark_full = filter_planes(off, card)
+        difference, full = planes - dark, full | dark_full
+    difference = difference - np.median(difference[:, border], axis=1)[:, None, None]
+    level = float(room[0, 0, 0])
+    sigma = float(np.sqrt(variance_e2(np.array(level), card, alike=off is not None) * (1.0 if off is None else 2.0)))
+    measured = _SIGMA_OF_MAD * float(np.median(np.abs(difference[0, border])))
+    amplitude = max(float(_smoothed(difference[0])[_MIDDLE, _MIDDLE].max()), 0.5 * sigma)
+    relative = np.clip(difference / amplitude, -_CUT, _CUT)
+    scalars = (
+        np.log(amplitude / sigma),
+        np.log(measured / sigma + _LEAST_SIGMA),
+        amplitude / card.saturation_e,
+        level / card.saturation_e,
+        float(off is not None),
+    )
+    return CropInput(np.concatenate([relative, full[None]]).astype(np.float32), np.array(scalars, np.float32))
+
+
+def _smoothed(plane: Array) -> Array:
+    """Mean over (1 2 1) / 4 along both axes, shape (h, w): a peak that noise and mosaic move less."""
+    p = np.pad(plane, 1, mode="edge")
+    rows = 0.25 * (p[:-2] + 2.0 * p[1:-1] + p[2:])
+    return np.asarray(0.25 * (rows[:, :-2] + 2.0 * rows[:, 1:-1] + rows[:, 2:]))

@@ -1,0 +1,320 @@
+"""Networks in ONNX files: their layers, writing and reading them, and running them by onnxruntime.
+
+One thread: the same bytes every time.
+
+A file ends with the SHA-256 of all that is before it. It is an entry of the model's metadata, so that other programs
+read the file as they read any ONNX model. `learned.training` makes the weights.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import MIB, InputFile
+from phibench.datasets.store.files import write_bytes
+from phibench.estimator.interface import Pair, Spot
+from phibench.estimator.learned.network_input import (
+    PLANES,
+    SCALARS,
+    SIDE_PX,
+    CropInput,
+    crop_input,
+    crop_origin,
+    cut,
+)
+from phibench.scenes.frames import Array
+
+VERSION = "1"
+"""Version of what a network gets and answers; a change of either raises it."""
+CROP = "learned_crop"
+INSTALL = "pip install 'phibench[learned]'"
+INSTALL_TRAINING = (
+    "pip install 'phibench[learned-training]' --extra-index-url https://download.pytorch.org/whl/cpu (PyTorch for the "
+    "CPU)"
+)
+
+Weights = dict[str, NDArray[Any]]
+"""Arrays by name, "<layer>.w" and "<layer>.b"."""
+
+_REMEDY = "install phibench anew, or train it: docs/learned.md"
+_MOST_BYTES = MIB
+_HASH = b"r\x4a\x0a\x06sha256\x12\x40"  # field 14 of a model, 74 bytes: the key, and a value of 64
+_TAIL = len(_HASH) + 64
+
+
+class NetworkError(DatasetError):
+    """A network that cannot be used; one sentence."""
+
+
+SHIPPED = {CROP: "79311c243108acd7ccaaa4f2f559edc60ee3d2f4fbaf360eb48fca596db4e6ea"}
+"""SHA-256 that the files of this release state; part of the code, so that a method's hash changes with its weights."""
+
+
+def shipped(name: str) -> Network:
+    """Network that comes with phibench.
+
+    Raises
+    ------
+    NetworkError
+        As of `Network`, or if the file belongs to another release.
+    """
+    path = Path(__file__).with_name(f"{name}.onnx")
+    found = network(path, name)
+    if found.sha256 != SHIPPED[name]:
+        raise NetworkError(f"{path} belongs to another release of phibench; {_REMEDY}")
+    return found
+
+
+def sealed(model: bytes) -> bytes:
+    """Model with the SHA-256 of its bytes at its end."""
+    return model + _HASH + hashlib.sha256(model).hexdigest().encode()
+
+
+@dataclass(frozen=True)
+class Position:
+    """Answer of the network for crops.
+
+    Attributes
+    ----------
+    uv_px : shape (2,)
+        Spot in the crop.
+    covariance_px2 : shape (2, 2)
+    """
+
+    uv_px: Array
+    covariance_px2: Array
+
+
+class Network:
+    """Network of a file.
+
+    Parameters
+    ----------
+    path : Path
+    name : str, such as `CROP`
+
+    Raises
+    ------
+    NetworkError
+        If onnxruntime is missing, or the file is damaged, of another version or no such network.
+    """
+
+    def __init__(self, path: Path, name: str) -> None:
+        file = InputFile(path, _REMEDY, NetworkError, _MOST_BYTES)
+        model = file.read()
+        if model[-_TAIL:-64] != _HASH:
+            raise file.fault("does not end as a network of phibench does")
+        if model[-64:] != hashlib.sha256(model[:-_TAIL]).hexdigest().encode():
+            raise file.fault("is damaged: its bytes do not have the SHA-256 that it states")
+        self.sha256 = model[-64:].decode()
+        self._session = _session(model, file)
+        self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
+        if self.metadata.get("name") != name:
+            raise file.fault(f"holds '{self.metadata.get('name')}', not '{name}'")
+        if self.metadata.get("version") != VERSION:
+            raise file.fault(f"is of version {self.metadata.get('version')}, this phibench needs version {VERSION}")
+
+    def run(self, **inputs: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+        """Outputs for inputs with a leading axis of items."""
+        return list(self._session.run(None, inputs))
+
+    def position(self, crop: CropInput) -> Position:
+        """Position of the spot in a crop, with its covariance."""
+        uv, factor = self.run(planes=crop.planes[None], scalars=crop.scalars[None])
+        scale = float(self.metadata["covariance_scale"])
+        return Position(np.asarray(uv[0], float), covariances(np.asarray(factor, float), scale)[0])
+
+
+def covariances(factors: Array, scale: float) -> Array:
+    """Covariances, shape (n, 2, 2), px^2, of what the network answers.
+
+    Parameters
+    ----------
+    factors : shape (n, 3)
+        ln a, b, ln c of the precision's Cholesky factor ((a, 0), (b, c)).
+    scale : float
+        Factor of the covariance, from crops of rooms that were not trained in.
+    """
+    lower = np.zeros((len(factors), 2, 2))
+    lower[:, 0, 0], lower[:, 1, 0], lower[:, 1, 1] = np.exp(factors[:, 0]), factors[:, 1], np.exp(factors[:, 2])
+    inverse = np.linalg.inv(lower)
+    return np.asarray(scale * np.swapaxes(inverse, 1, 2) @ inverse)
+
+
+@lru_cache(maxsize=8)
+def network(path: Path, name: str) -> Network:
+    """Network of a file, read once."""
+    return Network(path, name)
+
+
+def _session(model: bytes, file: InputFile) -> Any:
+    # from version 1.32 on it names the machine and reports its use, unless this is set before the import
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise NetworkError(f"learned methods need onnxruntime: {INSTALL}") from error
+    onnxruntime.set_default_logger_severity(4)
+    onnxruntime.disable_telemetry_events()
+    options = onnxruntime.SessionOptions()
+    # several threads would add up in another order
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    try:
+        return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # its own kinds, some without a common base
+        raise file.fault("is no network that onnxruntime can run") from error
+
+
+# -- layers ----------------------------------------------------------------------------------------------------------
+
+CONVOLUTIONS = (("c1", PLANES, 12, 1), ("c2", 12, 24, 2), ("c3", 24, 32, 1), ("c4", 32, 32, 1))
+"""Of the network of crops: name, planes in, planes out, step; 3 x 3 pixels each, cut at 0."""
+DENSE = (("d1", 2 * 32 + SCALARS, 48), ("d2", 48, 5))
+"""Of what is pooled, and their widths."""
+CORRECTION_PX = 0.1
+"""Of the place, per unit of the last layer."""
+CELLS = SIDE_PX // 2
+
+
+def cell_places() -> NDArray[np.float32]:
+    """Places (u, v) of the middles of all cells, shape (1, 2, cells): of the pixel that the stride begins at."""
+    v, u = np.mgrid[:CELLS, :CELLS] * 2.0
+    return np.stack([u.ravel(), v.ravel()])[None].astype(np.float32)
+
+
+# -- writing ----------------------------------------------------------------------------------------------------------
+
+_OPSET, _IR = 17, 8  # of 2022: what every onnxruntime of these years reads
+
+
+def write_network(
+    path: Path, name: str, weights: Weights, metadata: Mapping[str, Any], graph_of: Callable[[Any], Graph] | None = None
+) -> Path:
+    """Write the file of a network, and read it back.
+
+    Parameters
+    ----------
+    path : Path
+    name : str, such as `CROP`
+    weights : Weights
+    metadata : entries besides name and version, such as "covariance_scale" of `CROP`
+    graph_of : function
+        From onnx.helper to the graph; that of `CROP` by default.
+
+    Raises
+    ------
+    NetworkError
+        If onnx is missing.
+    """
+    try:
+        import onnx
+        import onnx.checker
+        import onnx.helper
+        import onnx.numpy_helper
+    except ImportError as error:
+        raise NetworkError(f"writing networks needs onnx: {INSTALL_TRAINING}") from error
+    graph = (graph_of or _crop_graph)(onnx.helper)
+    tensors = [onnx.numpy_helper.from_array(value, key) for key, value in (weights | graph.constants).items()]
+    float_of = onnx.TensorProto.FLOAT
+    ends = [
+        [onnx.helper.make_tensor_value_info(key, float_of, shape) for key, shape in side.items()]
+        for side in (graph.inputs, graph.outputs)
+    ]
+    made = onnx.helper.make_graph(graph.nodes, name, *ends, initializer=tensors)
+    opset = [onnx.helper.make_operatorsetid("", _OPSET)]
+    model = onnx.helper.make_model(made, opset_imports=opset, ir_version=_IR, producer_name="phibench")
+    entries = {"name": name, "version": VERSION, **{key: str(value) for key, value in metadata.items()}}
+    onnx.helper.set_model_props(model, entries)
+    onnx.checker.check_model(model)
+    write_bytes(path, sealed(model.SerializeToString(deterministic=True)))
+    Network(path, name)
+    return path
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Nodes of a network, constants besides its weights, and shapes of its inputs and outputs."""
+
+    nodes: list[Any]
+    constants: Weights
+    inputs: dict[str, list[str | int]]
+    outputs: dict[str, list[str | int]]
+
+
+def _crop_graph(helper: Any) -> Graph:
+    """`crop_forward` in ONNX's operators."""
+    node, nodes, x = helper.make_node, [], "planes"
+    for name, _, _, stride in CONVOLUTIONS:
+        nodes += convolution(helper, x, name, stride)
+        x = f"{name}.y"
+    nodes += [
+        node("Conv", [x, "cells.w", "cells.b"], ["cells"], kernel_shape=[1, 1]),
+        node("Reshape", ["cells", "three"], ["flat"]),
+        node("Split", ["flat", "parts"], ["logit", "offset"], axis=1),
+        node("Softmax", ["logit"], ["weight"], axis=2),
+        node("Add", ["offset", "places"], ["placed"]),
+        node("Mul", ["weight", "placed"], ["weighted"]),
+        node("ReduceSum", ["weighted", "last"], ["middle"], keepdims=0),
+        node("Reshape", [x, "many"], ["features"]),
+        node("Mul", ["weight", "features"], ["attended"]),
+        node("ReduceSum", ["attended", "last"], ["at_spot"], keepdims=0),
+        node("ReduceMean", ["features"], ["everywhere"], axes=[2], keepdims=0),
+        node("Concat", ["at_spot", "everywhere", "scalars"], ["pooled"], axis=1),
+        node("Gemm", ["pooled", "d1.w", "d1.b"], ["h"]),
+        node("Relu", ["h"], ["h.y"]),
+        node("Gemm", ["h.y", "d2.w", "d2.b"], ["y"]),
+        node("Split", ["y", "ends"], ["moved", "factor"], axis=1),
+        node("Mul", ["moved", "share"], ["correction"]),
+        node("Add", ["middle", "correction"], ["uv_px"]),
+    ]
+    whole = {"three": [0, 3, -1], "many": [0, 32, -1], "parts": [1, 2], "last": [2], "ends": [2, 3]}
+    constants: Weights = {key: np.array(value, np.int64) for key, value in whole.items()}
+    constants |= {"places": cell_places(), "share": np.array(CORRECTION_PX, np.float32)}
+    inputs: dict[str, list[str | int]] = {"planes": ["n", PLANES, SIDE_PX, SIDE_PX], "scalars": ["n", SCALARS]}
+    return Graph(nodes, constants, inputs, {"uv_px": ["n", 2], "factor": ["n", 3]})
+
+
+def convolution(helper: Any, x: str, name: str, stride: int = 1) -> list[Any]:
+    """Nodes of a layer of 3 x 3 that is cut at 0; its result is "<name>.y"."""
+    numbers = {"kernel_shape": [3, 3], "pads": [1] * 4, "strides": [stride] * 2}
+    return [
+        helper.make_node("Conv", [x, f"{name}.w", f"{name}.b"], [f"{name}.x"], **numbers),
+        helper.make_node("Relu", [f"{name}.x"], [f"{name}.y"]),
+    ]
+
+
+# -- spots of a pair -------------------------------------------------------------------------------------------------
+
+_LOOKS = 3  # a crop about the place that the last one gave; the second is nearly always the same
+_REACH_PX = 9.0  # of the crop's middle: farther away nothing was trained
+
+
+def refined(found: Network, pair: Pair, position: str, uv_px: tuple[float, float]) -> Spot:
+    """Position and covariance by a network, from the crop about a place (u, v)."""
+    image, dark = pair.images[position], pair.images.get(f"{position}_off")
+    origin = crop_origin(uv_px)
+    for _ in range(_LOOKS):
+        made = crop_input(cut(image, origin), None if dark is None else cut(dark, origin), pair.card)
+        answer = found.position(made)
+        if not np.abs(answer.uv_px - (SIDE_PX - 1) / 2.0).max() < _REACH_PX:
+            return Spot.missing("no spot near the place")
+        u, v = (float(x) for x in answer.uv_px + origin)
+        if (again := crop_origin((u, v))) == origin:
+            break
+        origin = again
+    height, width = image.shape[:2]
+    if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
+        return Spot.missing("spot cut")
+    (a, b), (_, c) = answer.covariance_px2.tolist()
+    return Spot((u, v), ((a, b), (b, c)))

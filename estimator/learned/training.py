@@ -1,0 +1,390 @@
+"""Training of `learned_crop` by PyTorch, from crops of a data set.
+
+    python -m phibench.estimator.learned.training out/bench-dev --out learned_crop.onnx --seed 0
+
+Needs `pip install 'phibench[learned-training]'`; the CPU wheel is enough. Every random number comes from a named
+stream: first weights, crops, their order and flips, and which rooms are held out. One thread: the same file each time.
+
+Loss: -ln of a Gaussian, q / 2 - ln a - ln c with q = |L^T e|^2, L = ((a, 0), (b, c)) the Cholesky
+factor of the precision and e the error (D. A. Nix, A. S. Weigend, "Estimating the mean and variance of the target
+probability distribution", ICNN 1994). Place: sum of w (cell + offset), w a softmax over cells of 2 x 2 pixels, so that
+a shift of the image by a cell of the mosaic shifts the answer by as much.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.request import FrameRequest
+from phibench.datasets.read import open_finished
+from phibench.datasets.training import Crop, CropSettings, SpotCrops
+from phibench.estimator.learned.network_input import (
+    SIDE_PX,
+    crop_input,
+)
+from phibench.estimator.learned.networks import (
+    CONVOLUTIONS,
+    CORRECTION_PX,
+    CROP,
+    DENSE,
+    INSTALL_TRAINING,
+    NetworkError,
+    Weights,
+    cell_places,
+    covariances,
+    write_network,
+)
+from phibench.scenes.frames import Array
+from phibench.scenes.random_streams import generator
+
+HELD_OUT = 6  # rooms
+REQUESTS: Mapping[str, Sequence[Mapping[str, Any]]] = {
+    "bayer-raw": [{"read_noise_e": 3.0}, {"read_noise_e": 6.0}],
+    "srgb8": [{"read_noise_e": 3.0}, {"read_noise_e": 6.0}],
+    # half of all crops: the hardest, and the most numbers to learn
+    "mjpeg": [
+        {"jpeg_quality": 60, "read_noise_e": 3.0},
+        {"jpeg_quality": 75},
+        {"jpeg_quality": 85, "read_noise_e": 6.0},
+        {"jpeg_quality": 95},
+    ],
+}
+Parameters = dict[str, Any]  # torch.Tensor by name
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """Choices of a training run.
+
+    Parameters
+    ----------
+    seed : int
+        Of all streams. Seed k holds out the k-th six of the rooms, in one drawn order.
+    presets : tuple of keys of `REQUESTS`
+    epochs : int
+        Each has crops of its own.
+    crops : int
+        New crops of an epoch.
+    passes : int
+        Times that an epoch's crops are used, each time flipped anew.
+    batch : int
+    rate : float
+        Largest step of Adam.
+    without_off : float
+        Part of the crops without a laser-off image.
+    checked : int
+        Crops of held-out rooms that give the covariance's scale.
+    """
+
+    seed: int = 0
+    presets: tuple[str, ...] = tuple(REQUESTS)
+    epochs: int = 3
+    crops: int = 6_000
+    passes: int = 4
+    batch: int = 32
+    rate: float = 2e-3
+    without_off: float = 0.15
+    checked: int = 1500
+
+    @property
+    def requests(self) -> tuple[FrameRequest, ...]:
+        """Requests of the crops, each drawn as often."""
+        return tuple(
+            FrameRequest(preset, "auto", overrides=dict(numbers))
+            for preset in self.presets
+            for numbers in REQUESTS[preset]
+        )
+
+
+CROP_SETTINGS = CropSettings(side_px=SIDE_PX + 2, spread_px=2.5, laser_levels=(0.15, 2.0))
+
+
+def rooms_of(folder: Path, seed: int) -> tuple[list[str], list[str]]:
+    """Samples that are trained on, and those of the rooms that seed `seed` holds out."""
+    rows = open_finished(folder).rows
+    rooms = sorted({row.room for row in rows})
+    if len(rooms) <= HELD_OUT:
+        raise DatasetError(f"{folder}: has {len(rooms)} rooms; training holds {HELD_OUT} out and needs more than that")
+    order = [rooms[k] for k in generator("learned", "rooms").permutation(len(rooms))]
+    first = seed * HELD_OUT % (len(rooms) - HELD_OUT + 1)
+    held = set(order[first : first + HELD_OUT])
+    parts: tuple[list[str], list[str]] = ([], [])
+    for row in rows:
+        parts[row.room in held].append(row.sample_id)
+    return parts
+
+
+def crops_of(
+    folder: Path, settings: TrainingSettings, samples: Sequence[str], length: int, seed: int, **numbers: Any
+) -> SpotCrops:
+    """Crops with and without the laser, of some samples; `numbers` change `CROP_SETTINGS`."""
+    chosen = replace(CROP_SETTINGS, **numbers)
+    return SpotCrops([folder], settings.requests, length, seed=seed, settings=chosen, samples=samples, laser_off=True)
+
+
+# -- items -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Items:
+    """Inputs and places of n crops of 33 x 33 pixels, red at their four corners.
+
+    Attributes
+    ----------
+    planes : shape (n, 4, 33, 33)
+    scalars : shape (n, 5)
+    uv_px : shape (n, 2)
+    turned : shape (n,), bool
+        Whether rows may become columns: not of JPEG with chroma of half the width.
+    """
+
+    planes: NDArray[np.float32]
+    scalars: NDArray[np.float32]
+    uv_px: NDArray[np.float32]
+    turned: NDArray[np.bool_]
+
+    def flipped(self, rows: NDArray[Any], draw: np.random.Generator) -> tuple[Array, Array, Array]:
+        """Planes (n, 4, 32, 32), scalars and places of some items, each mirrored and turned by chance."""
+        planes, uv = self.planes[rows].copy(), self.uv_px[rows].copy()
+        left, top, turn = draw.random((3, len(rows))) < 0.5
+        turn &= self.turned[rows]
+        planes[left], uv[left, 0] = planes[left][..., ::-1], SIDE_PX - uv[left, 0]
+        planes[top], uv[top, 1] = planes[top][..., ::-1, :], SIDE_PX - uv[top, 1]
+        planes[turn], uv[turn] = np.swapaxes(planes[turn], 2, 3), uv[turn][:, ::-1]
+        return np.ascontiguousarray(planes[..., :SIDE_PX, :SIDE_PX]), self.scalars[rows], uv
+
+
+def items_of(crops: SpotCrops, settings: TrainingSettings, side_px: int = SIDE_PX + 1) -> Items:
+    """Inputs of all crops of an epoch; some of them without laser-off image."""
+    draw = generator("learned", "without off", crops.seed, crops.epoch)
+    blind = draw.random(len(crops)) < settings.without_off
+    found = [_item(crops.crop(k), bool(blind[k]), side_px) for k in range(len(crops))]
+    planes, scalars, uv, turned = (np.array(column) for column in zip(*found, strict=True))
+    return Items(planes, scalars, uv.astype(np.float32), turned)
+
+
+def _item(crop: Crop, blind: bool, side_px: int) -> tuple[NDArray[Any], NDArray[Any], Array, bool]:
+    u0, v0 = crop.phase_px % 2
+    part = (slice(v0, v0 + side_px), slice(u0, u0 + side_px))
+    off = None if blind or crop.image_off is None else crop.image_off[part]
+    made = crop_input(crop.image[part], off, crop.card)
+    return made.planes, made.scalars, crop.uv_px - [u0, v0], crop.card.output != "mjpeg"
+
+
+# -- the network of crops --------------------------------------------------------------------------------------------
+
+_FIRST_LN = math.log(1.0 / 0.3)  # of the precision's factor: 0.3 px
+
+
+def first_crop_weights(seed: int) -> Weights:
+    """Weights before training (He's law), by name: "<layer>.w" and "<layer>.b"."""
+    draw = generator("learned", "crop weights", seed)
+    found: Weights = {}
+    for name, of, to, _ in CONVOLUTIONS:
+        found |= first_layer(draw, name, (to, of, 3, 3))
+    found |= first_layer(draw, "cells", (3, 32, 1, 1), 0.3)
+    for name, of, to in DENSE:
+        found |= first_layer(draw, name, (of, to), 0.1 if name == "d2" else 1.0, axis=0)
+    found["d2.b"][[2, 4]] = _FIRST_LN
+    return found
+
+
+def first_layer(
+    draw: np.random.Generator, name: str, shape: tuple[int, ...], gain: float = 1.0, axis: int | None = None
+) -> Weights:
+    """Weights of one layer before training, by He's law, and zeros; `axis` is that of the inputs of a matrix."""
+    inputs = math.prod(shape[1:]) if axis is None else shape[axis]
+    outputs = shape[0] if axis is None else shape[1 - axis]
+    weights = gain * math.sqrt(2.0 / inputs) * draw.standard_normal(shape)
+    return {f"{name}.w": weights.astype(np.float32), f"{name}.b": np.zeros(outputs, np.float32)}
+
+
+def crop_forward(torch: Any, p: Parameters, planes: Any, scalars: Any) -> tuple[Any, Any]:
+    """Places (n, 2) and factors (n, 3) of crops, as `networks.covariances` takes them."""
+    f, x = torch.nn.functional, planes
+    for name, _, _, stride in CONVOLUTIONS:
+        x = f.relu(f.conv2d(x, p[f"{name}.w"], p[f"{name}.b"], stride=stride, padding=1))
+    cells = f.conv2d(x, p["cells.w"], p["cells.b"]).flatten(2)
+    weight = torch.softmax(cells[:, :1], dim=2)
+    uv = (weight * (cells[:, 1:] + torch.from_numpy(cell_places()))).sum(2)
+    x = x.flatten(2)
+    pooled = torch.cat([(weight * x).sum(2), x.mean(2), scalars], dim=1)
+    y = f.relu(pooled @ p["d1.w"] + p["d1.b"]) @ p["d2.w"] + p["d2.b"]
+    return uv + CORRECTION_PX * y[:, :2], y[:, 2:]
+
+
+def gaussian_loss(torch: Any, uv: Any, factor: Any, true: Any) -> Any:
+    """Negative log likelihood of places, without its constant; shape (n,)."""
+    e, (a, b, c) = uv - true, factor.unbind(1)
+    along, across = torch.exp(a) * e[:, 0] + b * e[:, 1], torch.exp(c) * e[:, 1]
+    return 0.5 * (along**2 + across**2) - a - c
+
+
+def train_crop(folder: Path, settings: TrainingSettings, samples: Sequence[str] | None = None) -> Weights:
+    """Weights after training on some samples; by default on all but the held-out rooms."""
+    torch = torch_on_one_thread()
+    chosen = rooms_of(folder, settings.seed)[0] if samples is None else samples
+    crops = crops_of(folder, settings, chosen, settings.crops, settings.seed)
+    p = {name: torch.tensor(value, requires_grad=True) for name, value in first_crop_weights(settings.seed).items()}
+    steps = Steps(torch, p, settings.rate, settings.epochs * settings.passes * (settings.crops // settings.batch))
+    for epoch in range(settings.epochs):
+        crops.set_epoch(epoch)
+        items, total = items_of(crops, settings), []
+        for planes, scalars, uv in _batches(items, settings, epoch):
+            given, numbers, true = map(torch.from_numpy, (planes, scalars, np.ascontiguousarray(uv)))
+            total.append(steps.step(_crop_loss(torch, p, given, numbers, true, epoch)))
+        _say(f"epoch {epoch}: loss {np.mean(total[-len(total) // settings.passes :]):.3f}")
+    return {name: value.detach().numpy().copy() for name, value in p.items()}
+
+
+def _crop_loss(torch: Any, p: Parameters, planes: Any, scalars: Any, true: Any, epoch: int) -> Any:
+    uv, factor = crop_forward(torch, p, planes, scalars)
+    # a likelihood first widens what it does not know yet: the distance itself leads in the first epoch
+    lead = 10.0 * torch.nn.functional.smooth_l1_loss(uv, true, beta=0.1) if epoch == 0 else 0.0
+    return gaussian_loss(torch, uv, factor, true).mean() + lead
+
+
+def _batches(items: Items, settings: TrainingSettings, epoch: int) -> Iterator[tuple[Array, Array, Array]]:
+    draw = generator("learned", "batches", settings.seed, epoch)
+    for _ in range(settings.passes):
+        order = draw.permutation(len(items.planes))
+        for first in range(0, len(order) - settings.batch + 1, settings.batch):
+            yield items.flipped(order[first : first + settings.batch], draw)
+
+
+class Steps:
+    """Adam with a rate that rises over 5 % of the steps and falls as a cosine; gradients are cut at a norm of 5."""
+
+    def __init__(self, torch: Any, p: Parameters, rate: float, steps: int) -> None:
+        self._torch, self._p, self._rate, self._steps, self._done = torch, list(p.values()), rate, max(steps, 1), 0
+        self._adam = torch.optim.Adam(self._p, lr=rate)
+
+    def step(self, loss: Any) -> float:
+        """Take one step down."""
+        share = self._done / self._steps
+        self._adam.param_groups[0]["lr"] = self._rate * min(share / 0.05 + 1e-3, 0.5 + 0.5 * math.cos(math.pi * share))
+        self._adam.zero_grad()
+        loss.backward()
+        self._torch.nn.utils.clip_grad_norm_(self._p, 5.0)
+        self._adam.step()
+        self._done += 1
+        return float(loss.detach())
+
+
+# -- the covariance's scale ------------------------------------------------------------------------------------------
+
+_SURE_PX = 1.0  # claimed deviation of crops that count: detection finds no spot that is fainter
+_TAIL = 25.0  # of a squared pull: a scale for most spots, not for the worst
+
+
+@dataclass(frozen=True)
+class Answers:
+    """Answers of a network for n crops: errors (n, 2), covariances (n, 2, 2)."""
+
+    error_px: Array
+    covariance_px2: Array
+
+    @property
+    def squared_pull(self) -> Array:
+        """e^T C^-1 e / 2, shape (n,): mean 1."""
+        return np.asarray(
+            np.einsum("ni,nij,nj->n", self.error_px, np.linalg.inv(self.covariance_px2), self.error_px) / 2
+        )
+
+    @property
+    def sure(self) -> NDArray[np.bool_]:
+        """Claimed deviation below a pixel, shape (n,)."""
+        return np.asarray(np.trace(self.covariance_px2, axis1=1, axis2=2) < 2.0 * _SURE_PX**2)
+
+
+def answers_of(weights: Weights, items: Items, scale: float = 1.0) -> Answers:
+    """Answers for items, as they are."""
+    torch = torch_on_one_thread()
+    p = {name: torch.from_numpy(value) for name, value in weights.items()}
+    with torch.no_grad():
+        parts = [
+            crop_forward(torch, p, *map(torch.from_numpy, (planes, items.scalars[k : k + 256])))
+            for k in range(0, len(items.planes), 256)
+            for planes in [np.ascontiguousarray(items.planes[k : k + 256, :, :SIDE_PX, :SIDE_PX])]
+        ]
+    uv, factor = (np.concatenate([part[k].numpy() for part in parts]).astype(float) for k in (0, 1))
+    return Answers(uv - items.uv_px, covariances(factor, scale))
+
+
+def scale_of(answers: Answers) -> float:
+    """Scale of the covariance with which squared pulls, cut at 25, have the mean 1."""
+    pulls = answers.squared_pull[answers.sure]
+    scale = float(pulls.mean()) if pulls.size else 1.0
+    for _ in range(20):
+        scale = float(np.minimum(pulls / scale, _TAIL).mean()) * scale if pulls.size else 1.0
+    return scale
+
+
+# -- from the command line -------------------------------------------------------------------------------------------
+
+
+def train(folder: Path, out: Path, settings: TrainingSettings) -> Path:
+    """Train `learned_crop` and write its file."""
+    began = time.process_time()
+    weights = train_crop(folder, settings)
+    held = rooms_of(folder, settings.seed)[1]
+    items = items_of(crops_of(folder, settings, held, settings.checked, settings.seed + 1_000_000), settings)
+    scale = scale_of(answers_of(weights, items))
+    found = answers_of(weights, items, scale)
+    minutes = (time.process_time() - began) / 60.0
+    _say(f"held-out rooms: rms pull {np.sqrt(found.squared_pull[found.sure].mean()):.2f}, scale {scale:.2f}")
+    _say(f"rms error {np.sqrt((found.error_px[found.sure] ** 2).mean()):.4f} px, {minutes:.1f} CPU-min")
+    entries = {"covariance_scale": scale, "settings": json.dumps(asdict(settings), sort_keys=True)}
+    return write_network(out, CROP, weights, entries)
+
+
+def torch_on_one_thread() -> Any:
+    """PyTorch, on one thread: several would add up in another order."""
+    try:
+        import torch
+    except ImportError as error:
+        raise NetworkError(f"training needs PyTorch: {INSTALL_TRAINING}") from error
+    torch.set_num_threads(1)
+    torch.use_deterministic_algorithms(True)
+    return torch
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Train a network from the command line."""
+    parser = argparse.ArgumentParser(
+        "python -m phibench.estimator.learned.training", description=__doc__.split("\n")[0]
+    )
+    parser.add_argument("folder", type=Path, help="finished data set")
+    parser.add_argument("--out", type=Path, required=True, help="file to write, .onnx")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--preset", action="append", choices=list(REQUESTS), help="may be given again; all by default")
+    parser.add_argument("--epochs", type=int, default=TrainingSettings.epochs)
+    parser.add_argument("--crops", type=int, default=TrainingSettings.crops, help="new ones in each epoch")
+    given = parser.parse_args(arguments)
+    settings = TrainingSettings(given.seed, tuple(given.preset or REQUESTS), given.epochs, given.crops)
+    try:
+        print(train(given.folder, given.out, settings))
+    except DatasetError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
