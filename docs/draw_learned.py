@@ -22,9 +22,9 @@ import numpy as np
 from phibench.datasets.frames.request import FrameRequest
 from phibench.datasets.read import open_finished
 from phibench.datasets.training import CropSettings, SpotCrops
+from phibench.estimator.learned.crop_training import CROP_SETTINGS, Answers, TrainingSettings, crops_of, rooms_of
 from phibench.estimator.learned.network_input import SIDE_PX, crop_input
 from phibench.estimator.learned.networks import CROP, Network, covariances
-from phibench.estimator.learned.training import CROP_SETTINGS, Answers, TrainingSettings, crops_of, rooms_of
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 

@@ -3,7 +3,7 @@
 One thread: the same bytes every time.
 
 A file ends with the SHA-256 of all that is before it. It is an entry of the model's metadata, so that other programs
-read the file as they read any ONNX model. `learned.training` makes the weights.
+read the file as they read any ONNX model. `learned.crop_training` makes the weights.
 """
 
 from __future__ import annotations

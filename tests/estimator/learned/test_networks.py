@@ -11,10 +11,10 @@ import pytest
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import sensor_card
-from phibench.estimator.learned import networks, training
+from phibench.estimator.learned import crop_training, networks
+from phibench.estimator.learned.crop_training import Answers, TrainingSettings, scale_of
 from phibench.estimator.learned.network_input import SCALARS, SIDE_PX, crop_input, crop_origin, cut, filter_planes
 from phibench.estimator.learned.networks import CROP, Network, NetworkError, covariances, sealed, shipped
-from phibench.estimator.learned.training import Answers, TrainingSettings, scale_of
 from phibench.estimator.methods.registry import METHODS
 from phibench.estimator.sandbox.easy_pairs import EasyPairs
 from phibench.scenes.random_streams import generator
@@ -162,7 +162,7 @@ def test_without_onnxruntime_and_pytorch_it_says_what_to_install(monkeypatch: An
     with pytest.raises(NetworkError, match=r"onnxruntime: pip install 'phibench\[learned\]'$"):
         Network(FOLDER / f"{CROP}.onnx", CROP)
     with pytest.raises(NetworkError, match=r"training needs PyTorch: pip install 'phibench\[learned-training\]'"):
-        training.torch_on_one_thread()
+        crop_training.torch_on_one_thread()
     absent = replace(METHODS[CROP] if RUNTIME else next(iter(METHODS.values())), package="no_such_package_here")
     assert absent(EasyPairs("bayer-raw").pair(0)).down.status == "install no_such_package_here"
 
@@ -173,7 +173,7 @@ def test_without_onnxruntime_and_pytorch_it_says_what_to_install(monkeypatch: An
 def test_training_refuses_data_sets_that_will_not_do(tmp_path: Path, tiny_dataset: Path, capsys: Any) -> None:
     out = tmp_path / "out.onnx"
     for folder, text in ((tmp_path, str(tmp_path)), (tiny_dataset, "training holds 6 out and needs more than that")):
-        assert training.main([str(folder), "--out", str(out)]) == 2
+        assert crop_training.main([str(folder), "--out", str(out)]) == 2
         said = capsys.readouterr().err
         assert said.startswith("error: ")
         assert text in said
@@ -184,14 +184,14 @@ def test_training_refuses_data_sets_that_will_not_do(tmp_path: Path, tiny_datase
 @needs_torch
 def test_training_gives_the_same_weights_and_the_file_their_answers(tiny_dataset: Path, tmp_path: Path) -> None:
     from phibench.datasets.read import open_dataset
+    from phibench.estimator.learned.crop_training import answers_of, crops_of, items_of, train_crop
     from phibench.estimator.learned.networks import write_network
-    from phibench.estimator.learned.training import answers_of, crops_of, items_of, train_crop
 
     settings = TrainingSettings(presets=("srgb8",), epochs=2, crops=64, passes=1)
     samples = [row.sample_id for row in open_dataset(tiny_dataset).rows if row.sample_id.startswith("seen")]
     first, second = (train_crop(tiny_dataset, settings, samples) for _ in range(2))
     assert all(np.array_equal(first[name], second[name]) for name in first)
-    assert any(not np.array_equal(value, training.first_crop_weights(0)[name]) for name, value in first.items())
+    assert any(not np.array_equal(value, crop_training.first_crop_weights(0)[name]) for name, value in first.items())
     items = items_of(crops_of(tiny_dataset, settings, samples, 8, 5), settings, SIDE_PX)
     found = Network(write_network(tmp_path / "n.onnx", CROP, first, {"covariance_scale": 1.0}), CROP)
     uv, factor = found.run(planes=items.planes, scalars=items.scalars)
