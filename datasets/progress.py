@@ -1,4 +1,7 @@
-"""Progress for people: a bar with the time left on a terminal, a line every 30 s elsewhere."""
+"""Progress for people: a bar with the time left on a terminal, a line every 30 s elsewhere.
+
+`Steps` counts; `StillRunning` speaks where nothing counts.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,7 @@ from rich.table import Column
 
 LINE_EVERY_S = 30.0
 _BAR_EVERY_S = 1.0
+_TELLER = "phibench progress"  # name of the threads of `Steps`, by which `StillRunning` knows that one tells
 _BAR_COLUMNS = 16
 
 
@@ -53,7 +57,7 @@ class Steps:
         self._done, self._started, self._share = 0, time.monotonic(), 0.0
         self._bar = _bar(console) if console.is_terminal else None
         self._end = threading.Event()
-        self._teller = threading.Thread(target=self._keep_telling, daemon=True)
+        self._teller = threading.Thread(target=self._keep_telling, name=_TELLER, daemon=True)
 
     def __enter__(self) -> Steps:
         if self._bar is not None:
@@ -109,6 +113,46 @@ class Steps:
         if self._forecast_s is not None:
             return self._forecast_s()
         return (time.monotonic() - self._started) / self._done * (self._total - self._done)
+
+
+class StillRunning:
+    """Line every 30 s that something still runs, as a context manager: for what cannot count its steps.
+
+    It is silent while `Steps` tells how far they are.
+
+    Parameters
+    ----------
+    console : Console
+    title : str
+        What runs.
+    every_s : float
+        Seconds of silence before a line.
+    """
+
+    def __init__(self, console: Console, title: str, every_s: float = LINE_EVERY_S) -> None:
+        self._console, self._title, self._every_s = console, title, every_s
+        self._started = time.monotonic()
+        self._end = threading.Event()
+        self._teller = threading.Thread(target=self._keep_telling, daemon=True)
+
+    def __enter__(self) -> StillRunning:
+        self._teller.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: object, trace: TracebackType | None) -> None:
+        self._end.set()
+        self._teller.join()
+
+    def _keep_telling(self) -> None:
+        heard = self._started
+        while not self._end.wait(self._every_s / 30.0):
+            now = time.monotonic()
+            if any(thread.name == _TELLER for thread in threading.enumerate()):
+                heard = now
+            elif now - heard >= self._every_s:
+                heard = now
+                text = f"{self._title}: running for {now - self._started:.0f} s"
+                self._console.print(text, highlight=False, soft_wrap=True)
 
 
 class _ShareColumn(ProgressColumn):

@@ -15,7 +15,8 @@ import sys
 import threading
 import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from itertools import takewhile
 from pathlib import Path
 from types import FrameType
 from typing import Literal
@@ -150,7 +151,7 @@ def main(tokens: Sequence[str] | None = None) -> int:
         os.environ.setdefault(name, value)
     try:
         _refuse_strange(sys.argv[1:] if tokens is None else tokens)
-        with _orderly_stop():
+        with _orderly_stop(), _told(sys.argv[1:] if tokens is None else tokens):
             return int(app(tokens, exit_on_error=False) or 0)
     except CycloptsError:
         return 2  # cyclopts has said what is wrong
@@ -195,6 +196,14 @@ def _orderly_stop() -> Iterator[None]:
 def _stop(number: int, frame: FrameType | None) -> None:
     signal.signal(number, signal.SIG_DFL)
     raise _Stopped(signal.Signals(number))
+
+
+def _told(tokens: Sequence[str]) -> AbstractContextManager[object]:
+    """Line every 30 s while a command runs that says nothing itself; it is named by its words before the options."""
+    from phibench.datasets.progress import StillRunning, progress_console
+
+    words = list(takewhile(lambda word: not word.startswith("-"), tokens))
+    return StillRunning(progress_console(), f"phibench {' '.join(words[:2])}".rstrip())
 
 
 TRACEBACK = "PHIBENCH_TRACEBACK"

@@ -58,7 +58,7 @@ def check(
     from phibench.datasets.progress import Steps, progress_console
     from phibench.estimator.sandbox.check import PAIRS, check_method
 
-    with Steps(progress_console(), "easy pairs", PAIRS) as steps:
+    with Steps(progress_console(), "easy pairs", PAIRS, announce=True) as steps:
         done = check_method(reference, preset, limits.of_run, told=steps.reach)
     for number, text in done.printed if show_output else ():
         print(f"printed for pair {number}:\n{indent(text, '    ')}")

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import functools
+import io
 import json
 import math
+import re
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from phibench.datasets.errors import DatasetError, RecipeError
+from phibench.datasets.progress import Steps, StillRunning
 from phibench.datasets.verify import Report
 from phibench.estimator.cli import main as cli
 from phibench.estimator.paper.paper_tables import Score
@@ -191,3 +199,48 @@ def test_make_passes_shard_and_scheduler_on(monkeypatch, tmp_path):
     assert cli.main(tokens) == 0
     assert kept == []  # a shard's are made when it is merged
     assert calls == [(("smoke", tmp_path, 3, None, "s", "2/5", None, None, False, None), {})]  # console ... replace
+
+
+def lines_of(written: io.StringIO) -> list[str]:
+    return written.getvalue().splitlines()
+
+
+def wait_for(done: Callable[[], bool]) -> None:
+    """Wait until something holds, for at most 10 s."""
+    end = time.monotonic() + 10.0
+    while not done() and time.monotonic() < end:
+        time.sleep(0.02)
+    assert done()
+
+
+def test_a_command_that_counts_nothing_says_that_it_runs():
+    with StillRunning(Console(file=(written := io.StringIO())), "phibench study cause", every_s=0.1):
+        wait_for(lambda: len(lines_of(written)) >= 2)
+    assert [
+        line for line in lines_of(written) if not re.fullmatch(r"phibench study cause: running for \d+ s", line)
+    ] == []
+    with StillRunning(Console(file=(written := io.StringIO())), "phibench method list"):  # a quick one says nothing
+        time.sleep(0.2)
+    assert lines_of(written) == []
+
+
+def test_a_command_that_counts_is_not_spoken_over():
+    console = Console(file=(written := io.StringIO()))
+    with ExitStack() as steps:
+        steps.enter_context(Steps(console, "pairs", 1))
+        with StillRunning(console, "phibench bench", every_s=0.1):
+            time.sleep(0.4)
+            assert lines_of(written) == []
+            steps.close()
+            wait_for(lambda: "phibench bench: running for" in written.getvalue())
+
+
+def test_every_command_is_told_of(monkeypatch, capsys):
+    """A slow command is named by its first two words, on the standard error."""
+    quick = functools.partialmethod(StillRunning.__init__, every_s=0.1)
+    monkeypatch.setattr(StillRunning, "__init__", quick)
+    monkeypatch.setattr("phibench.datasets.verify.verify", lambda folder: time.sleep(0.5) or Report((), 0, 0))
+    assert cli.main(["dataset", "verify", "x"]) == 0
+    out, err = capsys.readouterr()
+    assert err.startswith("phibench dataset verify: running for 0 s\n")
+    assert out == "x: 0 files, 0 samples, 0 faults\n"
