@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -217,6 +218,7 @@ def test_rays_from_values_against_newtons_method() -> None:
     assert checked > 20000
 
 
+@pytest.mark.skipif(find_spec("mitsuba") is None, reason="needs Mitsuba")
 def test_rays_inside_a_kernel_against_those_in_float64() -> None:
     """The ambient layer's rays start 200 to 300 mm off, in float64: some ulp of 6e-14 mm, over cos i >= 0.05."""
     from phibench.render.room.mirror_intersection import meet_form
