@@ -234,7 +234,8 @@ def _places(plan: Plan) -> list[str]:
     """Relative names of all files of a plan, those included that need not be there."""
     samples = [pair.sample_id for pair in plan.pairs]
     return [
-        *(schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.RIGS, schema.ROOMS, *schema.NOT_DATA),
+        *(schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.RIGS, schema.ROOMS),
+        *(schema.CROISSANT, *schema.NOT_DATA),
         *(schema.light_map_file(room) for room in plan.rooms),
         *(schema.room_file(name) for name in plan.files.digests),
         *(schema.view_file(pose.pose_id, kind) for pose in plan.poses for kind in ("ambient", "truth", "preview")),

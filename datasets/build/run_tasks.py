@@ -32,7 +32,8 @@ from phibench.datasets.rooms.room_files import RoomFiles, checked_data
 from phibench.datasets.rooms.room_sources import ONLY_ROOM
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import checksums_text
-from phibench.datasets.store.documents import manifest_documents, parse_info, read_info, rigs_text
+from phibench.datasets.store.croissant import dataset_croissant
+from phibench.datasets.store.documents import manifest_documents, parse_info, read_info, rigs_text, to_table
 from phibench.datasets.store.files import only_run, remove_temporary, sha256, write_bytes
 from phibench.datasets.store.leftovers import TEMPORARY_PREFIX
 from phibench.datasets.store.schema import ManifestRow, RoomInfo
@@ -285,6 +286,9 @@ def assemble(plan: Plan, head: FolderHead, entries: Mapping[str, Entry]) -> dict
     }
     hashes = {name: digest for entry in entries.values() for name, digest in entry.files.items()}
     hashes |= {name: hashlib.sha256(data).hexdigest() for name, data in small.items()}
+    types = {name: str(dtype) for name, dtype in to_table(rows).schema.items()}
+    small[schema.CROISSANT] = dataset_croissant(parse_info(head.info), types, hashes).encode()
+    hashes[schema.CROISSANT] = hashlib.sha256(small[schema.CROISSANT]).hexdigest()
     hashes |= {schema.room_file(name): digest for name, digest in plan.files.digests.items()}
     return {**small, schema.CHECKSUMS: checksums_text(hashes).encode()}
 

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.export.containers import image_name, shard_name, write_shard
-from phibench.datasets.export.dataset_card import LICENSE_TEXT, card, croissant
+from phibench.datasets.export.dataset_card import card, croissant
 from phibench.datasets.export.pair_rows import INDEX, SPLITS, ExportRequest, drawn_pair, pair_key, pair_table, splits
 from phibench.datasets.exposures.draw import require_outside, sample_key
 from phibench.datasets.frames.request import whole_number
@@ -29,6 +29,7 @@ from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import Dataset, open_dataset, open_finished
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import checksums_text, differing_files, read_checksums
+from phibench.datasets.store.croissant import LICENSE_TEXT
 from phibench.datasets.store.documents import parquet_bytes
 from phibench.datasets.store.files import (
     WriteError,
@@ -46,7 +47,6 @@ from phibench.scenes.rig import POSITIONS
 
 INFO = "export.json"
 SHARDS = "export.jsonl"
-CROISSANT = "croissant.json"
 _COPIED = (schema.RIGS, schema.ROOMS, schema.RECIPE)
 _AGAIN = "run the same `phibench export` again"
 
@@ -251,9 +251,9 @@ def _finish(
         write_bytes(out / name, (dataset.folder / name).read_bytes())
     write_text(out / "LICENSE", LICENSE_TEXT)
     hashes = {name: digest for shard in shards for name, digest in rows[shard.name].files.items()}
-    write_text(out / CROISSANT, croissant(dataset, request, table, out, hashes))
+    write_text(out / schema.CROISSANT, croissant(dataset, request, table, out, hashes))
     write_text(out / "README.md", card(dataset, request, table))
-    for name in (INFO, INDEX, CROISSANT, "README.md", "LICENSE", *_COPIED):
+    for name in (INFO, INDEX, schema.CROISSANT, "README.md", "LICENSE", *_COPIED):
         hashes[name] = sha256(out / name)
     write_text(out / schema.CHECKSUMS, checksums_text(hashes))
 

@@ -12,9 +12,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+import polars
 from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
@@ -45,8 +47,10 @@ from phibench.datasets.parallel import parallel_map
 from phibench.datasets.plan.plan import Plan
 from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.recipe.load import find_recipe, parse_recipe, recipe_files, recipe_text
+from phibench.datasets.store.croissant import films_croissant
 from phibench.datasets.store.files import WriteError, only_run, sha256, write_text
 from phibench.datasets.store.provenance import code_behind, code_sha256
+from phibench.datasets.store.schema import CROISSANT
 from phibench.render.film.film_truth import instant_truth
 from phibench.render.film.moving_rows import RowsImage, parted_image, rows_image, spot_time_s
 from phibench.render.optics.room_tracer import room_geometry
@@ -118,6 +122,11 @@ def _make(plan: Plan, films: Sequence[FilmPlan], text: str, out: Path, workers: 
         schema_version=SCHEMA_VERSION, name=dataset.name, seed=dataset.seed, code_sha256=code_sha256(), films=names
     )
     write_document(out / INFO, info)
+    hashes = {name: sha256(out / name) for name in (INFO, RECIPE)}
+    types = polars.read_parquet_schema(FilmFolder.of(out, names[0]).path / "film.parquet")
+    kinds = {column: str(dtype) for column, dtype in types.items()}
+    text = films_croissant(dataset.name, version("phibench"), len(names), kinds, hashes)
+    write_text(out / CROISSANT, text)
     write_checksums(out, names)
     made = tuple(film.film_id for film in todo)
     return Made(out, made, tuple(name for name in names if name not in made))

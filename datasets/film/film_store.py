@@ -2,6 +2,7 @@
 
 film.json                  the data set: recipe, code, what each film holds and its proof; written last
 recipe.toml
+croissant.json
 films/<film>/film.parquet  truth, a row per frame
 films/<film>/spots.npz     the spot in each frame, electrons per second over the exposure
 films/<film>/lights.parquet  truth of other lights, a row per light and frame; light00.npz, ... their images
@@ -30,7 +31,7 @@ from phibench.datasets.input_files import InputFile, first_fault
 from phibench.datasets.store.checksums import checksums_text
 from phibench.datasets.store.files import sha256, write_bytes, write_text
 from phibench.datasets.store.layers import read_exr, write_exr
-from phibench.datasets.store.schema import Document, described
+from phibench.datasets.store.schema import CROISSANT, Document, described
 from phibench.render.film.film_truth import RATES, InstantTruth
 from phibench.render.film.moving_rows import RowsImage
 from phibench.render.sensor.light import Region
@@ -310,7 +311,7 @@ def finite_or_none(value: float) -> float | None:
 
 def data_files(out: Path, films: Sequence[str]) -> list[str]:
     """Names of all files of a data set of films, relative to its folder, sorted."""
-    names = [INFO, RECIPE]
+    names = [INFO, RECIPE, *([CROISSANT] if (out / CROISSANT).exists() else [])]  # films of version 0.2 have none
     for film in films:
         folder = FilmFolder.of(out, film)
         names += [f"films/{film}/{name}" for name in (*folder.info().sha256, "done.json")]

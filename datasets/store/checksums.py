@@ -26,7 +26,7 @@ from phibench.datasets.store.stored_rooms import read_rooms
 from phibench.scenes.rig import POSITIONS
 
 _FILES = {
-    *(schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.RIGS, schema.ROOMS),
+    *(schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.RIGS, schema.ROOMS, schema.CROISSANT),
     *schema.NOT_DATA,
 }
 
@@ -41,6 +41,8 @@ def data_files(folder: Path) -> list[str]:
     """
     rows = read_manifest(folder)
     names = {schema.INFO, schema.MANIFEST, schema.TABLE, schema.RECIPE, schema.RIGS}
+    if (folder / schema.CROISSANT).exists():  # data sets of version 0.2 and before have none
+        names.add(schema.CROISSANT)
     info = read_info(folder)
     if info.room is None:
         names.add(schema.ROOMS)

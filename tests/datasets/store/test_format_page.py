@@ -90,7 +90,7 @@ def test_files() -> None:
         schema.RUN,
         schema.CONTACT_SHEET,
     }
-    single |= {schema.LOG, schema.JOURNAL, schema.RIGS, schema.SENSITIVITIES}
+    single |= {schema.LOG, schema.JOURNAL, schema.RIGS, schema.SENSITIVITIES, schema.CROISSANT}
     rooms = {
         schema.ROOMS,
         schema.room_file("FILE"),
