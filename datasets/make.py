@@ -14,7 +14,15 @@ from pathlib import Path
 from rich.console import Console
 
 from phibench.datasets.build.finished_work import OR_REPLACE, LostWorkError, kept_samples, lost_work
-from phibench.datasets.build.forecast import PairForecast, forecast, pair_forecasts, pair_table, rim_lines, slowdown
+from phibench.datasets.build.forecast import (
+    Forecast,
+    PairForecast,
+    forecast,
+    pair_forecasts,
+    pair_table,
+    rim_lines,
+    slowdown,
+)
 from phibench.datasets.build.journal import FolderHead, Journal
 from phibench.datasets.build.room_export import (
     damaged_exports,
@@ -154,6 +162,19 @@ def dry_run(
     told += [f"will be refused: {name}: {reason}" for name, reason in plan.refused.items()]
     told += export_lines(unexported(plan.recipe, plan.files))
     return "\n".join([*pair_table(pairs), seen, *told, f"{cost}, {len(tasks)} tasks in all; nothing was rendered"])
+
+
+def cost(recipe: str | Path, out: str | Path, samples: int | None = None) -> Forecast:
+    """Cost of a whole data set, whatever of it there is; nothing is rendered or written.
+
+    Raises
+    ------
+    DatasetError
+        If the recipe will not do.
+    """
+    out = Path(out)
+    plan, _, _ = _planned(recipe, out, None, samples, None, True, None, lambda _, files: held(files, out))
+    return forecast(plan, plan_tasks(plan, {}).values())
 
 
 def _hidden(pairs: Iterable[PairForecast]) -> list[str]:

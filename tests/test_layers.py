@@ -41,6 +41,7 @@ datasets/build
 datasets/make
 datasets/film datasets/export
 datasets/show datasets/sample_page datasets/verify datasets/merge_repair datasets/training
+datasets/release
 estimator/interface
 estimator/pair_set
 estimator/geometry

@@ -81,6 +81,11 @@ class Forecast:
     seconds: dict[str, float]
     light: Light = "baked"
 
+    @property
+    def cpu_s(self) -> float:
+        """Seconds of all tasks on one core of the machine of the constants."""
+        return sum(count * self.seconds[kind] for kind, count in self.counts.items())
+
     def text(self, workers: int, slowdown: float) -> str:
         """One sentence for the terminal."""
         pace = Pace(self.seconds, slowdown)

@@ -198,7 +198,8 @@ def films_croissant(name: str, version: str, films: int, types: Mapping[str, str
     """JSON-LD text of a data set of films; `types` are the columns of each `film.parquet`."""
     about = (
         "Films of a laser spot in a mirror, seen by a rolling-shutter camera that moves: the spot in every frame, "
-        f"views of the room, and the exact truth of every frame: {counted((films, 'film'))}. phibench draws frames from them."
+        f"views of the room, and the exact truth of every frame: {counted((films, 'film'))}. "
+        "phibench draws frames from them."
     )
     small = [file_object(name, media, hashes[name]) for name, media in _SMALL.items() if name in hashes]
     sets = [

@@ -288,6 +288,84 @@ def export(
     return 0
 
 
+def release(
+    *,
+    out: Path,
+    work: Path,
+    secret_seed: Path,
+    part: Annotated[tuple[str, ...], Parameter(negative="")] = (),
+    samples: Whole | None = None,
+    use: Annotated[tuple[Path, ...], Parameter(negative="")] = (),
+    workers: Whole | None = None,
+    dry_run: bool = False,
+) -> int:
+    """Make the frozen benchmark as archives to be published, with a list of their hashes.
+
+    What is finished already is kept, so that a run that ended early goes on.
+
+    Parameters
+    ----------
+    out
+        Folder to publish: archives, MANIFEST.json, SHA256SUMS, card, licence and Croissant.
+    work
+        Folder of the data sets, not to be published: it holds the truth of the sealed part.
+    secret_seed
+        File with the seed of the sealed part, outside --out; one is drawn if there is no such file.
+    part
+        "dev", "test", "paper", "mirrors", "films" or "drives". May be given several times; all by default.
+    samples
+        Samples of each part that draws its samples, instead of the recipe's number.
+    use
+        Folder of a finished data set of a part, to be packed in place of a rendered one. May be given several times.
+    workers
+        Number of processes; one for each core by default.
+    dry_run
+        Say how many samples, bytes and CPU-hours each part takes; render nothing.
+    """
+    from phibench.datasets.release import release_make
+    from phibench.datasets.release.benchmark import chosen_parts
+    from phibench.estimator.sealed.sealed_set import seal
+
+    request = release_make.ReleaseRequest(chosen_parts(part), out, work, secret_seed, samples, use, workers=workers)
+    if dry_run:
+        for line in release_make.dry_run(request):
+            print(line)
+        return 0
+    done = release_make.release(request, seal)
+    for name, held in sorted(done.manifest.parts.items()):
+        print(f"{name}: {held.samples} samples, {len(held.archives)} archives, {held.download / 1e6:.1f} MB")
+    print(f"{out}: {done.made} archives written, {done.kept} kept; SHA-256 of MANIFEST.json: {done.digest}")
+    return 0
+
+
+def fetch(
+    name: str,
+    *,
+    out: Path,
+    from_: Annotated[str | None, Parameter(name="--from")] = None,
+    manifest_sha256: str | None = None,
+) -> int:
+    """Fetch a released data set and check every file; what was fetched before a break is kept.
+
+    Parameters
+    ----------
+    name
+        "phibench-v3-dev", or its last word.
+    out
+        Folder that the data set will be. It has this name only when all of it is there.
+    from_
+        Folder of a release, or its address with http:// or https://; by default that in PHIBENCH_SOURCE.
+    manifest_sha256
+        SHA-256 that the release's MANIFEST.json must have.
+    """
+    from phibench.datasets.release.fetch import fetch as fetch_set
+
+    done = fetch_set(name, out, from_, manifest_sha256=manifest_sha256)
+    what = f"{done.fetched} of {done.archives} archives fetched" if done.fetched else "it is there already"
+    print(f"{done.folder}: {done.title}, {what}; every file has its SHA-256")
+    return 0
+
+
 @dataset.command
 def panorama(
     directory: Path,

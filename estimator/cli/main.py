@@ -26,7 +26,7 @@ from cyclopts import App, CycloptsError
 from phibench.datasets.parallel import ONE_THREAD
 from phibench.estimator.cli.calibration import align, calibrate
 from phibench.estimator.cli.captures import import_, measure, sensor
-from phibench.estimator.cli.dataset import dataset, export
+from phibench.estimator.cli.dataset import dataset, export, fetch, release
 from phibench.estimator.cli.film import film, loop
 from phibench.estimator.cli.methods import method
 from phibench.estimator.cli.options import DATA, INSTALLATION, METHODS, SENSOR, answer_to_old_spelling
@@ -54,6 +54,8 @@ app = App(
 for _group in (dataset, film, room, method, seal, sensor, loop, study):
     app.command(_group)
 app.command(export, group=DATA)
+app.command(release, group=DATA)
+app.command(fetch, group=DATA)
 app.command(score, group=METHODS)
 app.command(bench, group=METHODS)
 app.command(compare, group=METHODS)

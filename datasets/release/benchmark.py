@@ -1,0 +1,185 @@
+"""Frozen benchmark: its version, the parts that are released, and the documents of a release.
+
+The recipes of a version never change. `SHA256` over the values of each, comments aside, is written down here, and a
+recipe with another one is refused. docs/release.md has the rules and the changelog of the versions.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.input_files import SETTINGS_BYTES, FileName, InputFile, Name
+from phibench.datasets.recipe.load import recipe_text
+from phibench.datasets.store.schema import Document
+from phibench.scenes.validation import nearest
+
+VERSION = "3.0"
+"""Version of the benchmark. The first number counts sets of recipes, the second one additions that change no sample."""
+MANIFEST = "MANIFEST.json"
+FORMAT = "phibench release 1"
+Kind = Literal["pairs", "sealed", "films"]
+Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+
+
+@dataclass(frozen=True)
+class Part:
+    """One data set of a release.
+
+    Parameters
+    ----------
+    name : str
+        Last word of its archives' name.
+    recipe : str or Path
+        Name of a shipped recipe, or a file.
+    kind : "pairs", "sealed" or "films"
+    sha256 : str
+        Hash of the recipe's values (`content_sha256`).
+    """
+
+    name: str
+    recipe: str | Path
+    kind: Kind
+    sha256: str
+
+    @property
+    def title(self) -> str:
+        """Name of the released data set."""
+        return f"phibench-v{VERSION.split('.')[0]}-{self.name}"
+
+    def text(self) -> str:
+        """Text of the recipe.
+
+        Raises
+        ------
+        DatasetError
+            If its values are not the frozen ones.
+        """
+        text = recipe_text(self.recipe)
+        if content_sha256(text) != self.sha256:
+            what = f"recipe {self.recipe} is not the frozen one of version {VERSION} of the benchmark"
+            raise DatasetError(f"{what}: a number in it was changed; put it back, or make a data set of another name")
+        return text
+
+
+PARTS = (
+    Part("dev", "bench-dev", "pairs", "c7d7e7de3551cd4d0e55fbac91ca9936a6debe57958051dc6046242d4a1c4fa0"),
+    Part("test", "bench-test", "sealed", "46144d56bc9db2639ef887f4cd169a6b808ad06e67ad0c5a54cd6404de1f3540"),
+    Part("paper", "paper", "pairs", "025ece80c9cfc9cce31e558089867a760568627e53154381c59bf926be27563d"),
+    Part("mirrors", "bench-mirrors", "pairs", "2b63e735f53c26545511c37c369ee0525a2e1423719e6e663c3d0f27f52b6b9e"),
+    Part("films", "bench-films", "films", "d7e243e791f85a1e0c0e761c5f1ca5377cc839d1a7e1221b5d0a87424c91b9c9"),
+    Part("drives", "bench-drives", "films", "825473dc49345b0f331de47ab49b735d453fcdfafa669aa45dbbb39c4a3926f3"),
+)
+
+
+def chosen_parts(names: tuple[str, ...]) -> tuple[Part, ...]:
+    """Parts by their last words or whole titles; all where none is named.
+
+    Raises
+    ------
+    DatasetError
+        For a name that is none.
+    """
+    if not names:
+        return PARTS
+    known = {word: part for part in PARTS for word in (part.name, part.title)}
+    for name in names:
+        if name not in known:
+            raise DatasetError(f"there is no part '{name}' of the benchmark; {nearest(name, [p.name for p in PARTS])}")
+    return tuple(part for part in PARTS if part in [known[name] for name in names])
+
+
+def content_sha256(text: str) -> str:
+    """SHA-256 of a recipe's values as canonical JSON: comments, spaces and order do not count."""
+    return _sha256(tomllib.loads(text))
+
+
+def same_but_drawn(text: str, other: str) -> bool:
+    """True if two recipes differ in the seed and in the number of samples at most."""
+    return _sha256(_without_numbers(tomllib.loads(text))) == _sha256(_without_numbers(tomllib.loads(other)))
+
+
+def drawn_numbers(text: str) -> tuple[int, int | None]:
+    """Seed of a recipe, and its number of samples; None if it draws none."""
+    raw = tomllib.loads(text)
+    return raw.get("dataset", {}).get("seed", 0), raw.get("random", {}).get("samples")
+
+
+def _sha256(values: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def _without_numbers(values: dict[str, Any]) -> dict[str, Any]:
+    left_out = {"dataset": "seed", "random": "samples"}
+    plain = {name: table for name, table in values.items() if name not in left_out}
+    tables = {name: values[name] for name in left_out if name in values}
+    return plain | {name: {k: v for k, v in table.items() if k != left_out[name]} for name, table in tables.items()}
+
+
+# Documents of a release.
+
+
+class Archive(Document):
+    """One archive: a tar file with a share of a data set's files."""
+
+    name: FileName
+    size: Annotated[int, Field(ge=0)]
+    sha256: Digest
+
+
+class ReleasedPart(Document):
+    """One data set in `MANIFEST.json`.
+
+    `size` and `files` are those of the unpacked data set. `sums_sha256` is the hash of its `SHA256SUMS`, and with it
+    that of every file.
+    """
+
+    kind: Kind
+    recipe_sha256: Digest
+    samples: Annotated[int, Field(ge=0)]
+    files: Annotated[int, Field(ge=1)]
+    size: Annotated[int, Field(ge=1)]
+    sums_sha256: Digest
+    archives: Annotated[tuple[Archive, ...], Field(strict=False, min_length=1)]
+
+    @property
+    def download(self) -> int:
+        """Bytes of all archives."""
+        return sum(archive.size for archive in self.archives)
+
+
+class Manifest(Document):
+    """`MANIFEST.json` of a release: what it holds, by title. It has no time, no place and no seed."""
+
+    format: Name
+    benchmark: Name
+    phibench: Name
+    parts: dict[Name, ReleasedPart]
+
+    def text(self) -> str:
+        """Text of the file, parts sorted."""
+        document = self.model_dump(mode="json")
+        document["parts"] = {name: document["parts"][name] for name in sorted(document["parts"])}
+        return json.dumps(document, indent=1, allow_nan=False) + "\n"
+
+
+def read_manifest_file(path: Path, remedy: str) -> Manifest:
+    """Read `MANIFEST.json`.
+
+    Raises
+    ------
+    DatasetError
+        If it is missing, damaged, or of another format.
+    """
+    file = InputFile(path, remedy, limit_bytes=SETTINGS_BYTES)
+    raw = file.json()
+    if raw.get("format") != FORMAT:
+        raise file.fault(f"is no list of a release of this phibench: its format is not '{FORMAT}'")
+    return file.validated(Manifest, raw)

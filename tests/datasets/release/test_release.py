@@ -1,0 +1,464 @@
+"""Frozen recipes, releases made of them, and fetching from a folder and from a server on the loopback device."""
+
+import hashlib
+import io
+import json
+import os
+import re
+import shutil
+import stat
+import tarfile
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from phibench.datasets.errors import DatasetError
+from phibench.datasets.film.film_store import verify as film_faults
+from phibench.datasets.recipe.load import recipe_text
+from phibench.datasets.release import fetch as fetching
+from phibench.datasets.release.benchmark import PARTS, VERSION, Part, content_sha256
+from phibench.datasets.release.fetch import Fetched, fetch, unpack
+from phibench.datasets.release.release_make import Released, ReleaseRequest, dry_run, release
+from phibench.datasets.store.checksums import damaged, differing_files, read_checksums
+from phibench.estimator.cli.main import main
+from phibench.estimator.sealed.sealed_set import read_seal, seal
+
+ROOT = Path(__file__).parents[3]
+SECRET = 2**62 + 12345
+
+
+def part_of(name: str, recipe: str, kind: Any) -> Part:
+    path = ROOT / "tests" / recipe
+    return Part(name, path, kind, content_sha256(path.read_text(encoding="utf-8")))
+
+
+SMALL, FILMS = part_of("small", "smallest.toml", "pairs"), part_of("films", "films.toml", "films")
+
+
+@dataclass(frozen=True)
+class Made:
+    """A release of three parts, and the sealed data set behind one of them."""
+
+    request: ReleaseRequest
+    released: Released
+
+    @property
+    def out(self) -> Path:
+        return self.request.out
+
+
+def ask(folder: Path, parts: list[Part], **options: Any) -> ReleaseRequest:
+    return ReleaseRequest(
+        parts, folder / "public", folder / "work", folder / "seed", workers=1, archive_bytes=100_000, **options
+    )
+
+
+@pytest.fixture(scope="module")
+def made(smallest_dataset: Path, film_windows: Path, tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """Data sets that are there are used; the sealed one is rendered with a secret seed."""
+    from helpers.inline_workers import InlineWorkerPool
+
+    folder = tmp_path_factory.mktemp("release")
+    recipe = folder / "hidden.toml"
+    recipe.write_text(SMALL.text() + '\n[frames]\npresets = ["mjpeg"]\n', encoding="utf-8")
+    sealed = Part("hidden", recipe, "sealed", content_sha256(recipe.read_text(encoding="utf-8")))
+    request = ask(folder, [SMALL, sealed, FILMS], use=[smallest_dataset, film_windows])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("phibench.datasets.make.WorkerPool", InlineWorkerPool)
+        return Made(request, release(request, seal))
+
+
+def snapshot(folder: Path) -> dict[str, str]:
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+# The frozen recipes.
+
+
+def test_frozen_recipes_are_unchanged() -> None:
+    """The hashes stand in the code; a change of a number in a recipe needs a new version, a comment does not."""
+    assert [part.name for part in PARTS] == ["dev", "test", "paper", "mirrors", "films", "drives"]
+    for part in PARTS:
+        assert content_sha256(part.text()) == part.sha256
+        assert part.title == f"phibench-v3-{part.name}"
+
+
+def test_comments_do_not_count_and_numbers_do(tmp_path: Path) -> None:
+    text = recipe_text("bench-dev")
+    changed = tmp_path / "bench-dev.toml"
+    changed.write_text("# another comment\n" + text.replace("  # 4 sigma", ""))
+    part = Part("dev", changed, "pairs", PARTS[0].sha256)
+    assert part.text()
+    assert text.count("[0.25, 1.0]") == 1
+    changed.write_text(text.replace("[0.25, 1.0]", "[0.25, 1.001]"))
+    with pytest.raises(DatasetError, match=r"not the frozen one of version 3\.0"):
+        part.text()
+
+
+def test_the_page_has_the_versions_and_the_parts() -> None:
+    page = (ROOT / "docs" / "release.md").read_text(encoding="utf-8")
+    versions = re.findall(r"^\| (\d+\.\d+) \|", page.split("## Versions")[1], flags=re.MULTILINE)
+    assert versions[0] == VERSION
+    assert sorted(versions, reverse=True) == versions
+    for part in PARTS:
+        assert f"| `{part.title}` | `{part.recipe}`" in page
+
+
+def test_citation_names_this_version() -> None:
+    import tomllib
+
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert (cited["cff-version"], cited["version"], cited["license"]) == ("1.2.0", project["version"], "MIT")
+    assert {"message", "title", "authors", "type"} <= set(cited)
+    data = next(one for one in cited["references"] if one["type"] == "data")
+    assert (data["version"], data["license"]) == (VERSION, "CC-BY-4.0")
+
+
+# Releases.
+
+
+def test_archives_hold_the_data_sets_and_no_secret(made: Made, smallest_dataset: Path, film_windows: Path) -> None:
+    parts = made.released.manifest.parts
+    assert {name: part.kind for name, part in parts.items()} == {
+        "phibench-v3-small": "pairs",
+        "phibench-v3-hidden": "sealed",
+        "phibench-v3-films": "films",
+    }
+    assert len(parts["phibench-v3-small"].archives) > 3
+    assert differing_files(made.out, read_checksums(made.out)) == []
+    for title, source in (("phibench-v3-small", smallest_dataset), ("phibench-v3-films", film_windows)):
+        found = {}
+        for archive in parts[title].archives:
+            with tarfile.open(made.out / archive.name) as tar:
+                for entry in tar:
+                    assert (entry.uid, entry.gid, entry.uname, entry.mtime) == (0, 0, "", 315532800)
+                    found[entry.name.removeprefix(f"{title}/")] = tar.extractfile(entry).read()  # type: ignore[union-attr]
+        assert len(found) == parts[title].files
+        assert found == {name: (source / name).read_bytes() for name in found}
+        assert set(read_checksums(source)) < set(found)
+    secret = made.request.secret_seed.read_text().strip()
+    assert stat.S_IMODE(made.request.secret_seed.stat().st_mode) == 0o600
+    assert int(secret) > 2**62
+    truth = list((made.request.work / "phibench-v3-hidden").glob("seal_*.truth.json"))
+    assert len(truth) == 1
+    for path in made.out.iterdir():
+        assert secret.encode() not in path.read_bytes()
+        assert b"truth.json" not in path.read_bytes()
+
+
+def test_the_same_again_keeps_all_and_elsewhere_has_the_same_bytes(made: Made, tmp_path: Path) -> None:
+    again = release(made.request, seal)
+    assert (again.made, again.kept) == (0, made.released.made)
+    before = snapshot(made.out)
+    shutil.copytree(made.request.work, tmp_path / "work")
+    for path in (tmp_path / "work").rglob("*"):
+        os.utime(path, (1e9, 1e9))
+    (tmp_path / "work" / "archives.jsonl").unlink()
+    shutil.copy2(made.request.secret_seed, tmp_path / "seed")
+    other = release(ask(tmp_path, list(made.request.parts), use=made.request.use), seal)
+    assert other.made == made.released.made
+    assert snapshot(other.out) == before
+
+
+def test_a_run_that_was_killed_goes_on(made: Made, tmp_path: Path, smallest_dataset: Path) -> None:
+    """Killed after some archives: one has a flipped bit, one is half there under a temporary name, one is missing."""
+    request = ask(tmp_path, [SMALL], use=[smallest_dataset])
+    first = release(request, seal)
+    before = snapshot(first.out)
+    names = sorted(path.name for path in first.out.glob("*.tar"))
+    flip(first.out / names[0])
+    (first.out / names[1]).unlink()
+    (first.out / ".phibench-tmp-half0000.tar").write_bytes(b"half")
+    (first.out / "SHA256SUMS").unlink()
+    second = release(request, seal)
+    assert (second.made, second.kept) == (2, len(names) - 2)
+    assert snapshot(second.out) == before
+
+
+def flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(bytes(data))
+
+
+def test_a_damaged_data_set_is_not_released(smallest_dataset: Path, tmp_path: Path) -> None:
+    shutil.copytree(smallest_dataset, tmp_path / "set")
+    flip(next((tmp_path / "set" / "spots").glob("*.exr")))
+    with pytest.raises(DatasetError, match=r"spots/.* is damaged.*phibench dataset repair"):
+        release(ask(tmp_path, [SMALL], use=[tmp_path / "set"]), seal)
+    assert not (tmp_path / "public" / "SHA256SUMS").exists()
+
+
+def test_a_dry_run_says_sizes_and_writes_nothing(made: Made, tmp_path: Path) -> None:
+    request = ask(tmp_path, list(made.request.parts), use=made.request.use)
+    lines = list(dry_run(request))
+    assert [line.split(":")[0] for line in lines] == ["phibench-v3-small", "phibench-v3-hidden", "phibench-v3-films"]
+    assert all(re.search(r"\d+ MB", line) for line in lines)
+    assert "CPU-hours" in lines[1]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_folders_and_seeds_that_will_not_do(made: Made, tmp_path: Path, smallest_dataset: Path) -> None:
+    def told(**changes: Any) -> str:
+        values = {"out": tmp_path / "public", "work": tmp_path / "work", "secret_seed": tmp_path / "seed", **changes}
+        request = ReleaseRequest(changes.pop("parts", [SMALL]), **{k: v for k, v in values.items() if k != "parts"})
+        with pytest.raises(DatasetError) as caught:
+            release(request, seal)
+        return str(caught.value)
+
+    assert "part them" in told(work=tmp_path / "public" / "work")
+    assert "to be published" in told(secret_seed=tmp_path / "public" / "seed")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine.txt").write_text("mine")
+    assert "holds other files" in told(out=tmp_path / "full")
+    assert (tmp_path / "full" / "mine.txt").read_text() == "mine"
+    assert "no data set of a recipe" in told(use=[tmp_path / "full"])
+    sealed = Part("hidden", SMALL.recipe, "sealed", SMALL.sha256)  # the data set has the public seed
+    for number, mode, expected in (
+        (SECRET, 0o600, "seed is not the one"),
+        (SECRET, 0o644, "chmod 600"),
+        (7, 0o600, "2^56"),
+    ):
+        (tmp_path / "seed").write_text(f"{number}\n")
+        (tmp_path / "seed").chmod(mode)
+        assert expected in told(parts=[sealed], use=[smallest_dataset])
+    other = tmp_path / "other"
+    shutil.copytree(made.out, other)
+    manifest = json.loads((other / "MANIFEST.json").read_text())
+    (other / "MANIFEST.json").write_text(json.dumps(manifest | {"benchmark": "2.0"}))
+    assert "version 2.0 of the benchmark" in told(out=other)
+
+
+def test_command_line_speaks_in_sentences(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--out", str(tmp_path / "a"), "--work", str(tmp_path / "b"), "--secret-seed", str(tmp_path / "c")]
+    assert main(["release", "--part", "tset", *options]) == 2
+    assert "there is no part 'tset'" in capsys.readouterr().err
+    assert main(["release", "--part", "films", "--dry-run", *options]) == 0
+    assert "phibench-v3-films: 6 films" in capsys.readouterr().out
+    assert main(["fetch", "dev", "--out", str(tmp_path / "d")]) == 2
+    assert fetching.SOURCE in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+# Fetching.
+
+
+def test_fetched_from_a_folder(made: Made, tmp_path: Path, smallest_dataset: Path) -> None:
+    done = fetch("small", tmp_path / "set", str(made.out))
+    assert done.fetched == done.archives > 3
+    assert [path.name for path in tmp_path.iterdir()] == ["set"]
+    found = snapshot(tmp_path / "set")
+    assert found == {name: digest for name, digest in snapshot(smallest_dataset).items() if name in found}
+    assert damaged(tmp_path / "set") == []
+    assert fetch("phibench-v3-small", tmp_path / "set", str(made.out)).fetched == 0
+    fetch("films", tmp_path / "films", str(made.out))
+    assert film_faults(tmp_path / "films") == []
+    fetch("hidden", tmp_path / "hidden", str(made.out))
+    assert read_seal(tmp_path / "hidden").pairs == 2
+
+
+def test_the_place_is_a_setting(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(fetching.SOURCE, str(made.out))
+    assert fetch("films", tmp_path / "set", manifest_sha256=made.released.digest).fetched > 0
+
+
+@dataclass
+class Server:
+    """Server of a folder that breaks off: of each name in `broken`, that many answers end half-way."""
+
+    folder: Path
+    broken: dict[str, int] = field(default_factory=dict)
+    asked: Counter[str] = field(default_factory=Counter)
+    address: str = ""
+
+
+@contextmanager
+def served(server: Server) -> Iterator[Server]:
+    class Handler(SimpleHTTPRequestHandler):
+        def do_GET(self) -> None:
+            name = self.path.lstrip("/")
+            server.asked[name] += 1
+            if server.broken.get(name, 0) <= 0:
+                super().do_GET()
+                return
+            server.broken[name] -= 1
+            data = (server.folder / name).read_bytes()
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(data)))
+            self.end_headers()
+            self.wfile.write(data[: len(data) // 2])
+            self.close_connection = True
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(server.folder))) as http:
+        thread = threading.Thread(target=http.serve_forever, kwargs={"poll_interval": 0.02})
+        thread.start()
+        server.address = f"http://127.0.0.1:{http.server_address[1]}/"
+        try:
+            yield server
+        finally:
+            http.shutdown()
+            thread.join()
+
+
+def test_a_download_that_breaks_off_loses_nothing_and_goes_on(made: Made, tmp_path: Path) -> None:
+    archives = [archive.name for archive in made.released.manifest.parts["phibench-v3-small"].archives]
+    with served(Server(made.out, {archives[2]: 1})) as server:
+        with pytest.raises(DatasetError, match=rf"{archives[2]} from .* broke off: .*run the same command again"):
+            fetch("small", tmp_path / "set", server.address, tries=1)
+        assert not (tmp_path / "set").exists()
+        done = fetch("small", tmp_path / "set", server.address, tries=1)
+        assert done.fetched == len(archives) - 2
+        assert server.asked[archives[0]] == server.asked[archives[1]] == 1
+        assert server.asked[archives[2]] == 2
+    assert damaged(tmp_path / "set") == []
+    assert [path.name for path in tmp_path.iterdir()] == ["set"]
+
+
+def test_a_file_is_asked_for_again_before_the_fetch_ends(made: Made, tmp_path: Path) -> None:
+    name = made.released.manifest.parts["phibench-v3-films"].archives[0].name
+    with served(Server(made.out, {name: 1, "MANIFEST.json": 1})) as server:
+        assert fetch("films", tmp_path / "set", server.address, tries=2).fetched > 0
+        assert (server.asked[name], server.asked["MANIFEST.json"]) == (2, 2)
+
+
+def test_flipped_bits_and_strange_sources_are_refused(made: Made, tmp_path: Path) -> None:
+    def told(source: Path | str, name: str = "small", out: str = "set", **options: Any) -> str:
+        with pytest.raises(DatasetError) as caught:
+            fetch(name, tmp_path / out, str(source), tries=1, **options)
+        assert out != "set" or not (tmp_path / "set").exists()
+        return str(caught.value)
+
+    copy = tmp_path / "copy"
+    shutil.copytree(made.out, copy)
+    victim = made.released.manifest.parts["phibench-v3-small"].archives[1].name
+    flip(copy / victim)
+    assert f"{victim} from {copy} is damaged" in told(copy)
+    with served(Server(copy)) as server:
+        assert "is damaged" in told(server.address)
+        shutil.copy2(made.out / victim, copy / victim)
+        assert fetch("small", tmp_path / "later", server.address, tries=1).fetched > 0
+        (copy / victim).unlink()
+        assert "does not give" in told(server.address)
+    assert "does not hold 'dev'" in told(copy, "dev")
+    assert "no data set 'smal' there; did you mean 'small'?" in told(copy, "smal")
+    assert "has not the SHA-256" in told(copy, manifest_sha256="0" * 64)
+    assert "no MANIFEST.json" in told(tmp_path / "later")
+    assert "no such folder" in told(tmp_path / "nowhere")
+    (copy / "MANIFEST.json").write_text("{}")
+    assert "its format is not" in told(copy)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine.txt").write_text("mine")
+    assert "is not phibench-v3-small" in told(made.out, out="full")
+    assert (tmp_path / "full" / "mine.txt").read_text() == "mine"
+    (tmp_path / "new.part").mkdir()
+    (tmp_path / "new.part" / "mine.txt").write_text("mine")
+    assert "holds other files" in told(made.out, out="new")
+    assert (tmp_path / "new.part" / "mine.txt").read_text() == "mine"
+    # set.part holds what was fetched of another release
+    (tmp_path / "set.part" / "fetch.json").write_text('{"title": "phibench-v3-small", "sums_sha256": "0"}')
+    assert "another data set or version" in told(made.out)
+
+
+def test_what_is_changed_before_it_has_its_name_is_fetched_again(made: Made, tmp_path: Path) -> None:
+    """A bit flips in the growing set between two runs."""
+    archives = made.released.manifest.parts["phibench-v3-small"].archives
+    with served(Server(made.out, {archives[-1].name: 1})) as server:
+        with pytest.raises(DatasetError, match="broke off"):
+            fetch("small", tmp_path / "set", server.address, tries=1)
+        flip(next((tmp_path / "set.part" / "set").rglob("*.exr")))
+        with pytest.raises(DatasetError, match=r"is damaged: .*run the same command again"):
+            fetch("small", tmp_path / "set", server.address, tries=1)
+        assert not (tmp_path / "set").exists()
+        assert fetch("small", tmp_path / "set", server.address, tries=1) == Fetched(
+            tmp_path / "set", "phibench-v3-small", len(archives), len(archives)
+        )
+
+
+def entry(
+    name: str, data: bytes = b"x", kind: bytes = tarfile.REGTYPE, target: str = ""
+) -> tuple[tarfile.TarInfo, bytes]:
+    info = tarfile.TarInfo(name)
+    info.type, info.linkname, info.size = kind, target, len(data) if kind == tarfile.REGTYPE else 0
+    return info, data
+
+
+@pytest.mark.parametrize(
+    "strange",
+    [
+        entry("title/../outside"),
+        entry("/title/absolute"),
+        entry("title/a/../../outside"),
+        entry("other/file"),
+        entry("title/.hidden"),
+        entry("title/link", kind=tarfile.SYMTYPE, target="/etc"),
+        entry("title/hard", kind=tarfile.LNKTYPE, target="title/good"),
+        entry("title/fifo", kind=tarfile.FIFOTYPE),
+        entry("title/folder", kind=tarfile.DIRTYPE),
+        entry("title/good"),
+        entry("title/large", b"x" * 200),
+    ],
+    ids=lambda one: one[0].name.replace("/", "_"),
+)
+def test_archives_of_others_write_nothing_elsewhere(tmp_path: Path, strange: tuple[tarfile.TarInfo, bytes]) -> None:
+    archive, folder = tmp_path / "a.tar", tmp_path / "inside"
+    folder.mkdir()
+    with tarfile.open(archive, "w") as tar:
+        for info, data in (entry("title/good", b"good"), strange):
+            tar.addfile(info, io.BytesIO(data))
+    with pytest.raises(DatasetError, match="nothing of it is used"):
+        unpack(archive, folder, "title", 100)
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["a.tar", "good", "inside"]
+    assert (folder / "good").read_bytes() == b"good"
+
+
+# Croissant beside data sets.
+
+
+def test_croissant_of_a_data_set_is_valid_and_gives_the_rows(smallest_dataset: Path) -> None:
+    import mlcroissant
+    import polars
+
+    found = mlcroissant.Dataset(jsonld=str(smallest_dataset / "croissant.json"))  # raises what is not valid
+    records, table = list(found.records("pairs")), polars.read_parquet(smallest_dataset / "manifest.parquet")
+    assert [record["pairs/depth_m"] for record in records] == table["depth_m"].to_list()
+    document = json.loads((smallest_dataset / "croissant.json").read_text())
+    assert {one["name"] for one in document["recordSet"][0]["field"]} == set(table.columns)
+    assert sum(name.startswith("rai:") for name in document) >= 10
+    assert "http://mlcommons.org/croissant/1.1" in document["conformsTo"]
+
+
+def test_croissant_of_films_and_of_a_release_is_valid(film_windows: Path, made: Made) -> None:
+    import mlcroissant
+
+    films = mlcroissant.Dataset(jsonld=str(film_windows / "croissant.json"))
+    assert [record["frames/frame"] for record in films.records("frames")] == list(range(10))
+    whole = mlcroissant.Dataset(jsonld=str(made.out / "croissant.json"))
+    assert whole.metadata.version == f"{VERSION}.0"
+    assert len(json.loads((made.out / "croissant.json").read_text())["distribution"]) == made.released.made + 1
+
+
+def test_data_sets_without_one_are_no_faults_and_a_lost_one_is(smallest_dataset: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    shutil.copytree(smallest_dataset, folder)
+    (folder / "croissant.json").unlink()
+    assert damaged(folder) == ["croissant.json is missing"]
+    sums = folder / "SHA256SUMS"  # as version 0.2 wrote it
+    sums.write_text("".join(x for x in sums.read_text().splitlines(True) if "croissant" not in x))
+    assert damaged(folder) == []
