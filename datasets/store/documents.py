@@ -104,6 +104,7 @@ def from_json(kind: type[T], document: Any) -> T:
 _LATER = {"form", "form_radius_m", "coat", "window", "sun", "holder", "metal", "reflectance_table", *OF_TUBES}
 """Fields that older versions do not have, whose default is what these versions meant: `mirror.form` in version 4."""
 _LARGEST = 1e12
+_LARGEST_WHOLE = 2**63 - 1  # seeds and names of random streams
 
 
 def _difference(given: Any, whole: Any, place: str = "its root") -> str:
@@ -132,6 +133,8 @@ def _is_seed(given: Any) -> bool:
 
 def _same_kind(given: Any, whole: Any) -> bool:
     """True for two numbers of any sensible size, and for two other values of one type."""
+    if type(given) is int and type(whole) is int:
+        return abs(given) <= _LARGEST_WHOLE
     numbers = [isinstance(value, int | float) and not isinstance(value, bool) for value in (given, whole)]
     return abs(given) <= _LARGEST if all(numbers) else type(given) is type(whole)
 

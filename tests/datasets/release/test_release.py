@@ -23,7 +23,8 @@ import yaml
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.film.film_store import verify as film_faults
-from phibench.datasets.recipe.load import recipe_text
+from phibench.datasets.plan.plan import make_plan
+from phibench.datasets.recipe.load import parse_recipe, recipe_text, with_numbers
 from phibench.datasets.release import fetch as fetching
 from phibench.datasets.release.benchmark import PARTS, VERSION, Part, content_sha256
 from phibench.datasets.release.fetch import Fetched, fetch, unpack
@@ -96,6 +97,19 @@ def test_frozen_recipes_are_unchanged() -> None:
         assert part.title == f"phibench-v3-{part.name}"
 
 
+def test_frozen_samples_are_unchanged() -> None:
+    """What the code draws from the frozen recipe of the open set; 1e-6 m is more than libraries of sines differ by."""
+    plan = make_plan(parse_recipe(with_numbers(recipe_text("bench-dev"), "bench-dev", 4, None)))
+    expected = {
+        0: (0.550114925, (-4.965248958, 0.283741908, 0.109299339)),
+        3: (1.170399890, (-0.266339945, -1.718236028, 3.819721291)),
+    }
+    for number, (stroke_m, spot_m) in expected.items():
+        pair = plan.pairs[number]
+        assert pair.stroke_m == pytest.approx(stroke_m, abs=1e-6)
+        assert plan.spots[pair.spot].position_world_m == pytest.approx(spot_m, abs=1e-6)
+
+
 def test_comments_do_not_count_and_numbers_do(tmp_path: Path) -> None:
     text = recipe_text("bench-dev")
     changed = tmp_path / "bench-dev.toml"
@@ -160,6 +174,7 @@ def test_archives_hold_the_data_sets_and_no_secret(made: Made, smallest_dataset:
         assert b"truth.json" not in path.read_bytes()
 
 
+@pytest.mark.usefixtures("inline")
 def test_the_same_again_keeps_all_and_elsewhere_has_the_same_bytes(made: Made, tmp_path: Path) -> None:
     again = release(made.request, seal)
     assert (again.made, again.kept) == (0, made.released.made)

@@ -15,11 +15,13 @@ from helpers.processes import SMALLEST, quiet
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import make_from_plan
 from phibench.datasets.plan.plan import POSITIONS, Plan, make_plan, pose_of
+from phibench.datasets.plan.room_draws import draw_rooms
 from phibench.datasets.read import open_dataset, open_finished
 from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.rooms.room_sources import NamedRoom, room_of
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import data_files, read_checksums, write_checksums
+from phibench.datasets.store.documents import from_json, to_json
 from phibench.datasets.verify import verify
 
 IDS = ("lit-0", "dark-1")
@@ -188,3 +190,17 @@ def test_another_source_than_the_recipes_is_found(one: Path) -> None:
     sign(one)
     faults = verify(one, truth_layers=False, console=quiet()).faults
     assert "rooms.jsonl: room is not the room that the recipe gives" in faults
+
+
+@pytest.mark.parametrize(("number", "is_read"), [(2**62 + 12345, True), (2**63 - 1, True), (2**63, False)])
+def test_rooms_of_secret_seeds_are_read(number: int, is_read: bool) -> None:
+    """A seed of 62 bits stands in the name of a generated room's streams; it was refused, and such sets with it."""
+    recipe = load_recipe("bench-test")
+    source = next(iter(draw_rooms(recipe).values()))
+    document = to_json(source)
+    document["stream"] = [document["stream"][0], number, *document["stream"][2:]]
+    if is_read:
+        assert from_json(type(source), document).stream[1] == number
+    else:
+        with pytest.raises(DatasetError, match="not allowed"):
+            from_json(type(source), document)
