@@ -35,6 +35,7 @@ _NEAR_PX = 60.0  # spots farther from what is expected are not asked: a target's
 _LOST_STEPS = 15
 _HIDDEN_STEPS = 2
 _STROKE_SPEED = 0.2  # m/s: a frame every 2 cm
+_LEVEL_RAD, _LEVEL_M = 1e-3, 0.01
 _ALIGNED_RAD = 0.03
 _SEARCH_RAD_PER_S, _SEARCH_STEPS = 0.8, 15
 _EXPOSURES = (4, 5, 3, 2)  # in the order in which they are tried
@@ -100,7 +101,7 @@ class SearchingPolicy(abc.ABC):
         self.exposure = _EXPOSURES[0]
         self.locked_step = -1
         self.locks = 0
-        self._missed, self._seen_stroke_m = 0, 0.0
+        self._missed, self._seen_stroke_m, self._lift_m = 0, 0.0, 0.0
         self._run = self._process()
 
     def act(self, observation: Observation) -> Action:
@@ -157,6 +158,8 @@ class SearchingPolicy(abc.ABC):
     def _track(self, belief: Belief, seen: Observation) -> None:
         """Take the step in, and the spot that lies nearest to what is expected; a hidden target is reckoned on."""
         belief.predict(seen.left_m, seen.right_m, self.known.task.step_s)
+        if self._climbs(seen):
+            return
         held = seen.attitude(self.known.vehicle)
         best: tuple[float, Direction] | None = None
         place = belief.pixel(seen.stroke_m, held)
@@ -172,6 +175,19 @@ class SearchingPolicy(abc.ABC):
         if best is not None:
             self._seen_stroke_m = seen.stroke_m
             belief.update(best[1], seen.stroke_m, held)
+
+    def _climbs(self, seen: Observation) -> bool:
+        """True on an obstacle: how high the robot stands there is known to a centimetre, which is 50 times the noise.
+
+        Pitch and way give the height roughly, so that a level robot on top of something does not pass for one on the
+        floor.
+        """
+        way_m = 0.5 * (seen.left_m + seen.right_m) * (1.0 - self.known.vehicle.slip)
+        self._lift_m += way_m * math.tan(seen.pitch_rad)
+        leans = max(abs(seen.pitch_rad), abs(seen.roll_rad)) > _LEVEL_RAD
+        if not leans and abs(self._lift_m) < _LEVEL_M:
+            self._lift_m = 0.0
+        return leans or self._lift_m != 0.0
 
     # -- moves -----------------------------------------------------------------------------------------------------
 

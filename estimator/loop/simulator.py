@@ -121,7 +121,7 @@ class Task:
         Other lights in the room, at most 5.
     obstacle_m, obstacle_run_m : float
         Height of a block across the way, half of it, and length of its ramps; a height of 0 is a level floor, a run of
-        0 a step. The robot may start on the ramp.
+        0 a step. Robots whose target is near start on it: 3 m suffice for the default.
     power : float
         Of the laser, relative to `laser`.
     """
