@@ -8,7 +8,7 @@ OUT    ?= out/paper
 SAMPLES ?= 12
 BENCH  ?= out/bench-dev
 STUDIES ?= out/studies
-STUDIES_ALL := noise misalignment baseline cause isotropy stroke mirror
+STUDIES_ALL := noise misalignment baseline cause isotropy stroke mirror loop
 # Environment without Mitsuba, and what is tested in it.
 BASE := out/base-env
 BASE_TESTS := tests/scenes tests/estimator/geometry tests/estimator/sandbox tests/test_package.py

@@ -240,6 +240,8 @@ def test_obstacles_pitch_the_robot_and_too_high_steps_are_refused() -> None:
     assert 0.04 < pitches.max() <= math.atan(0.05 / 0.4) + 1e-9
     assert pitches.min() < -0.04
     assert max(abs(one.roll_rad) for one in seen) < 1e-12
+    ramp = Setup(task=Task(obstacle_m=0.05, distances_m=(3.0, 4.5)))
+    assert [one.reached for one in run_episodes(ramp, "paper", 1, "ramp")] == [True]
     with pytest.raises(SceneError, match="climbs no higher step"):
         Simulator(Setup(task=Task(obstacle_m=0.2, obstacle_run_m=0.0))).start("ramp", 1)
 
