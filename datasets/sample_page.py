@@ -2,7 +2,7 @@
 
 One HTML file with one script of its own. It opens from disk and fetches nothing. Truth planes travel as 16-bit numbers
 with a stated step, the same number of pixels as the image: what the page shows at a pixel is the truth plane's value
-there, rounded to that step. The script is `sample_page.js`, the frame around it `sample_page.html`.
+there, rounded to that step. `sample_page.js` draws images, `sample_room.js` the room; `sample_page.html` frames them.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ STEPS = {
     "azimuth_rad": 1e-4,
 }
 """Step of each truth plane in the page. Lengths take twice, four times, ... of it in rooms that need more than 65 m."""
+_PARTS = ("sample_page.html", "sample_room.js", "sample_page.js")
 _MOST = 65_534  # largest code; 16 bits
 _GRID_PX = 16  # between the reflection points that the 3-D view interpolates
 _LINE_POINTS = 400
@@ -89,8 +90,8 @@ def sample_page(sample: Sample) -> str:
     here = Path(__file__)
     # "<" would end the script where a name holds "</script>"
     data = json.dumps(page_data(sample), allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-    page = here.with_suffix(".html").read_text(encoding="utf-8")
-    return page.replace("@DATA@", data).replace("@SCRIPT@", here.with_suffix(".js").read_text(encoding="utf-8"))
+    page, *scripts = (here.with_name(name).read_text(encoding="utf-8") for name in _PARTS)
+    return page.replace("@DATA@", data).replace("@SCRIPT@", "\n".join(scripts))
 
 
 def page_data(sample: Sample) -> dict[str, Any]:

@@ -1,17 +1,21 @@
 """Hooks of the site: pages that lie elsewhere in the tree, sources that pages link to, and the reference.
 
 A link of a page is relative to the page's place in the repository. Here every file gets a place in the site, and links
-are turned towards it.
+are turned towards it. Formulas become MathML, which browsers draw by themselves. Tutorials are executed, and their
+outputs stand in their pages.
 """
 
 from __future__ import annotations
 
+import html
+import logging
 import posixpath
 import re
 import shutil
 from pathlib import Path
 from typing import Any
 
+from latex2mathml.converter import convert
 from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 
@@ -59,6 +63,9 @@ REFERENCE = {
         "phibench.estimator.loop.simulator",
     ),
 }
+_LOG = logging.getLogger("mkdocs.hooks.phibench")
+_FORMULA = re.compile(r'<(span|div) class="arithmatex">(.*?)</\1>', re.S)
+_FUNCTION = re.compile(r"(<m[io]>(?:sin|cos|tan|arccos|arcsin)</m[io]>)")
 _LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
 _LANGUAGE = {".py": "python", ".toml": "toml", ".csv": "text", ".cff": "yaml", ".txt": "text", "": "text"}
 
@@ -90,7 +97,8 @@ def on_files(files: Files, config: Any) -> Files:
             linked |= _sources(file.content_string, f"docs/{file.src_uri}")
     for source in sorted(linked):
         text = (ROOT / source).read_text(encoding="utf-8")
-        fence = f"# {source}\n\n````{_LANGUAGE.get(Path(source).suffix, 'text')}\n{text}\n````\n"
+        language = _LANGUAGE.get(Path(source).suffix, "text")
+        fence = f"---\nsearch: {{exclude: true}}\n---\n\n# {source}\n\n````{language}\n{text}\n````\n"
         files.append(File.generated(config, _source_place(source), content=fence))
     for title, modules in REFERENCE.items():
         body = "\n".join(f"::: {module}\n" for module in modules)
@@ -112,6 +120,23 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
         return f"{link[1]}{there}{link[3] or ''}{link[4]}"
 
     return _LINK.sub(turned, markdown)
+
+
+def on_page_content(content: str, page: Any, config: Any, files: Files) -> str:
+    """Turn LaTeX, marked by the extension `arithmatex`, into MathML."""
+
+    def formula(found: re.Match[str]) -> str:
+        is_block = found[1] == "div"
+        latex = html.unescape(found[2]).strip()[2:-2]
+        latex, _, number = latex.partition(r"\tag{")
+        drawn = convert(latex.strip(), display="block" if is_block else "inline")
+        drawn = _FUNCTION.sub(r'<mspace width="0.17em"/>\1', drawn)
+        if "\\" in drawn:  # a command that the converter does not know stays as it was written
+            _LOG.warning("%s: formula is not understood: %s", page.file.src_uri, latex)
+        label = f'<span class="number">({number.rstrip().rstrip("}")})</span>' if number else ""
+        return f'<div class="formula">{drawn}{label}</div>' if is_block else drawn
+
+    return _FORMULA.sub(formula, content)
 
 
 def _place(target: str) -> str:
