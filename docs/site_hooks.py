@@ -7,19 +7,28 @@ outputs stand in their pages.
 
 from __future__ import annotations
 
+import hashlib
 import html
 import logging
 import posixpath
 import re
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
+import nbformat
 from latex2mathml.converter import convert
 from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
+from nbconvert import MarkdownExporter
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "docs"))
+from run_notebook import executed  # noqa: E402
+
+FOLDERS = ("scenes", "render", "datasets", "estimator")
+TUTORIALS = ("own_method", "own_rig", "real_frames")
 PAGES = {
     "README.md": "index.md",
     "CHANGELOG.md": "CHANGELOG.md",
@@ -75,7 +84,7 @@ def on_config(config: Any) -> Any:
     """Lay out the package as the reference's reader wants it: with `__init__.py` in every folder."""
     package = ROOT / "out" / "site-sources" / "phibench"
     shutil.rmtree(package.parent, ignore_errors=True)
-    for folder in ("scenes", "render", "datasets", "estimator"):
+    for folder in FOLDERS:
         for file in (ROOT / folder).rglob("*.py"):
             there = package / file.relative_to(ROOT)
             there.parent.mkdir(parents=True, exist_ok=True)
@@ -86,8 +95,11 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add pages of other folders, sources that pages name, and the reference."""
+    """Add tutorials, pages of other folders, sources that pages name, and the reference."""
     linked = set()
+    for name in TUTORIALS:
+        for place, content in _tutorial(name).items():
+            files.append(File.generated(config, place, content=content))
     for source, place in PAGES.items():
         text = (ROOT / source).read_text(encoding="utf-8")
         files.append(File.generated(config, place, content=text))
@@ -105,6 +117,24 @@ def on_files(files: Files, config: Any) -> Files:
         place = f"reference/{title.lower().replace(', ', '-').replace(' ', '-')}.md"
         files.append(File.generated(config, place, content=f"# {title}\n\n{body}"))
     return files
+
+
+def _tutorial(name: str) -> dict[str, str | bytes]:
+    """Page and pictures of a tutorial, by their places in the site. It is executed once for each state of the code."""
+    source = ROOT / "docs" / "tutorials" / f"{name}.py"
+    code = [source, *(file for folder in FOLDERS for file in sorted((ROOT / folder).rglob("*.py")))]
+    state = hashlib.sha256(b"".join(file.read_bytes() for file in code)).hexdigest()[:16]
+    kept = ROOT / "out" / "site-tutorials" / f"{name}-{state}.ipynb"
+    if not kept.exists():
+        shutil.rmtree(kept.parent / name, ignore_errors=True)
+        for old in kept.parent.glob(f"{name}-*.ipynb"):
+            old.unlink()
+        nbformat.write(executed(source, kept.parent / name), kept)
+    naming = {"unique_key": name, "output_files_dir": f"{name}_files"}
+    page, resources = MarkdownExporter().from_notebook_node(nbformat.read(kept, as_version=4), resources=naming)
+    page += f"\nThis page is a notebook: `docs/tutorials/{name}.py` opens in Jupyter with jupytext.\n"
+    pictures = {f"tutorials/{file}": data for file, data in resources["outputs"].items()}
+    return {f"tutorials/{name}.md": page, **pictures}
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
@@ -143,6 +173,8 @@ def _place(target: str) -> str:
     """Place in the site of a file of the repository."""
     if target in PAGES:
         return PAGES[target]
+    if target.startswith("docs/tutorials/"):
+        return f"tutorials/{Path(target).stem}.md"
     if target.startswith("docs/") and Path(target).suffix not in (".py", ".json"):
         return target.removeprefix("docs/")
     return _source_place(target)

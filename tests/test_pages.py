@@ -16,7 +16,7 @@ from phibench.scenes.catalog import default_rig
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted(
     page.relative_to(ROOT).as_posix()
-    for pattern in ("*.md", "docs/**/*.md", "datasets/*.md")
+    for pattern in ("*.md", "docs/**/*.md", "docs/tutorials/*.py", "datasets/*.md")
     for page in ROOT.glob(pattern)
 )
 # History is written once and describes commands and files of its time.
@@ -42,7 +42,18 @@ ABBREVIATION = re.compile(
 
 
 def read(page: str) -> str:
-    return (ROOT / page).read_text(encoding="utf-8")
+    text = (ROOT / page).read_text(encoding="utf-8")
+    return notebook(text) if page.startswith("docs/tutorials/") else text
+
+
+def notebook(text: str) -> str:
+    """Markdown of a Python file with cells: code in fences, commands of the shell without their comment signs."""
+    parts = []
+    for cell in text.split("\n# %%")[1:]:
+        kind, _, body = cell.partition("\n")
+        plain = re.sub(r"^# ?", "", body, flags=re.M) if kind.strip() else body
+        parts.append(plain if "[markdown]" in kind else f"```\n{plain.strip()}\n```\n")
+    return "\n".join(parts)
 
 
 def in_table(line: str) -> bool:
@@ -273,4 +284,7 @@ def test_the_checks_see_faults():
     assert is_command("dataset", "make")
     assert not is_command("dataset", "bake")
     assert not is_command("paint", None)
+    assert notebook('---\n# %% [markdown]\n# A [b](c).\n\n# %% language="bash"\n# phibench no\n\n# %%\nx = 1') == (
+        "A [b](c).\n\n```\nphibench no\n```\n\n```\nx = 1\n```\n"
+    )
     assert slug("What `make dataset` writes") == "what-make-dataset-writes"

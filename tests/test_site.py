@@ -1,0 +1,99 @@
+"""The site: its navigation leads to pages that exist, its formulas are understood, and it works from disk."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parent.parent
+CHROMIUM = next((name for name in ("chromium", "chromium-browser", "google-chrome") if shutil.which(name)), "")
+ELSEWHERE = {
+    "index.md": "README.md",
+    "datasets/RECIPE.md": "datasets/RECIPE.md",
+    "datasets/FORMAT.md": "datasets/FORMAT.md",
+}
+FORMULA = re.compile(r"\$\$(.+?)\$\$|\$([^$\n]+?)\$", re.S)
+CODE = re.compile(r"```.*?```|`[^`]*`", re.S)
+
+
+class Loader(yaml.SafeLoader):
+    """YAML of mkdocs, whose tags name Python objects."""
+
+
+Loader.add_multi_constructor("tag:yaml.org,2002:python/", lambda loader, suffix, node: None)
+
+
+def navigation(part: Any) -> Iterator[str]:
+    """Every page of the navigation."""
+    if isinstance(part, str):
+        yield part
+    for entry in part.values() if isinstance(part, dict) else part if isinstance(part, list) else ():
+        yield from navigation(entry)
+
+
+def test_every_page_of_the_navigation_exists_and_every_page_is_reached() -> None:
+    config = yaml.load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"), Loader)
+    places = list(navigation(config["nav"]))
+    assert len(places) == len(set(places)) > 30
+    for place in places:
+        source = ROOT / ELSEWHERE.get(place, f"docs/{place}")
+        notebook = source.with_suffix(".py") if place.startswith("tutorials/") else source
+        assert place.startswith("reference/") or notebook.is_file(), place
+    linked = "".join(page.read_text(encoding="utf-8") for page in [*ROOT.glob("docs/*.md"), ROOT / "README.md"])
+    for page in (ROOT / "docs").glob("*.md"):
+        assert page.name in places or f"{page.name})" in linked or f"{page.name}#" in linked, page
+
+
+def test_every_formula_of_the_pages_is_understood() -> None:
+    convert = pytest.importorskip("latex2mathml.converter").convert
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "datasets").glob("*.md")]
+    formulas = [(page, a or b) for page in pages for a, b in FORMULA.findall(CODE.sub("", page.read_text("utf-8")))]
+    assert len(formulas) > 40
+    for page, latex in formulas:
+        # a command that the converter does not know stays in its output with its backslash
+        assert "\\" not in convert(re.sub(r"\\tag\{\d+\}", "", latex).strip()), (page, latex)
+    assert "\\" in convert(r"\unknowable x")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("material")
+    out = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(out)]
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return out
+
+
+@pytest.mark.study
+def test_the_site_loads_nothing_from_the_network(site: Path) -> None:
+    pages = list(site.rglob("*.html"))
+    assert len(pages) > 60
+    loads = re.compile(r"""<(?:script|link|img|iframe)\b[^>]*?\b(?:src|href)=["']?https?://[^>]*>""")
+    # a link to the page's own address is no load
+    found = {tag for page in pages for tag in loads.findall(page.read_text("utf-8")) if 'rel="canonical"' not in tag}
+    assert not found
+    formulas = (site / "limits.html").read_text("utf-8")
+    assert formulas.count("<math") > 8
+    assert "arithmatex" not in formulas
+
+
+@pytest.mark.study
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")
+def test_the_search_works_from_disk(site: Path, tmp_path: Path) -> None:
+    command = [CHROMIUM, "--headless=new", "--no-sandbox", "--virtual-time-budget=20000", "--enable-logging=stderr"]
+    command += [f"--user-data-dir={tmp_path}", "--dump-dom", f"{(site / 'index.html').as_uri()}?q=Alhazen"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert "CONSOLE" not in done.stderr
+    assert re.search(r"[1-9]\d* matching document", done.stdout)
+    assert "model.html" in done.stdout
