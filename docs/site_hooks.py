@@ -132,8 +132,12 @@ def _tutorial(name: str) -> dict[str, str | bytes]:
         nbformat.write(executed(source, kept.parent / name), kept)
     naming = {"unique_key": name, "output_files_dir": f"{name}_files"}
     page, resources = MarkdownExporter().from_notebook_node(nbformat.read(kept, as_version=4), resources=naming)
-    page += f"\nThis page is a notebook: `docs/tutorials/{name}.py` opens in Jupyter with jupytext.\n"
     pictures = {f"tutorials/{file}": data for file, data in resources["outputs"].items()}
+    sample = kept.parent / name / "sample.html"
+    if sample.is_file():
+        pictures[f"tutorials/{name}_files/sample.html"] = sample.read_bytes()
+        page += f"\nThe sample's page as it comes out: [sample.html]({name}_files/sample.html).\n"
+    page += f"\nThis page is a notebook: `docs/tutorials/{name}.py` opens in Jupyter with jupytext.\n"
     return {f"tutorials/{name}.md": page, **pictures}
 
 
