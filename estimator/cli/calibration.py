@@ -151,7 +151,6 @@ def align(
         As in `phibench calibrate`.
     """
     from phibench.datasets.errors import DatasetError
-    from phibench.datasets.progress import Steps, progress_console
     from phibench.estimator.calibration.align import (
         Numbers,
         alignment,
@@ -179,16 +178,12 @@ def align(
     else:
         require_camera_size(known, (pixels.shape[1], pixels.shape[0]), str(image))
     if known is None:
-        with Steps(progress_console(), "circle", 1) as steps:
-            circle = circle_of(pixels, card)
-            steps.advance()
+        circle = circle_of(pixels, card)
         print(circle_in_words(circle))
         print(f"{write_circle_picture(out, pixels, card, circle)}: outline; look at it")
         return 0
     doubts = math.radians(tilt_sigma_deg), principal_point_sigma_px, outline_sigma_factor
-    with Steps(progress_console(), "outline", 1) as steps:
-        found = alignment(pixels, known, card, *doubts, math.radians(mirror_tilt_sigma_deg))
-        steps.advance()
+    found = alignment(pixels, known, card, *doubts, math.radians(mirror_tilt_sigma_deg))
     print(verdict(found))
     print(f"{write_alignment_picture(out, pixels, known, found)}: outline, and the move drawn 20 times as long")
     print(in_words(found))
