@@ -301,7 +301,7 @@ function writeTexts() {
   byId("steps").textContent = planes.map(([name, plane]) => `${name} ${plane.step.toPrecision(2)}`).join(", ");
 }
 
-// "#hover=down,640,359" puts the pointer there, "&zoom=spot" enlarges, "&look=mirror" turns the room.
+// "#hover=down,640,359" puts the pointer there, also between centres, "&zoom=spot" enlarges, "&look=mirror" turns the room.
 function followAddress() {
   const wanted = new URLSearchParams(location.hash.slice(1));
   if (wanted.get("zoom") === "spot") state.zoom = "spot";
@@ -316,6 +316,9 @@ function followAddress() {
   const frame = frameOf(view), [x, y] = toCanvas(frame, Number(u), Number(v));
   const at = { clientX: frame.left + x, clientY: frame.top + y, bubbles: true };
   view.canvas.dispatchEvent(new PointerEvent("pointermove", at));
+  const ratio = view.canvas.width / view.canvas.clientWidth, place = [x, y].map((value) => Math.floor(value * ratio));
+  const drawn = view.canvas.getContext("2d").getImageData(...place, 1, 1).data; // what lies under the pointer
+  byId("readout").dataset.drawn = [...drawn].slice(0, 3).join(",");
 }
 
 async function main() {

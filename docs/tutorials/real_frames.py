@@ -111,6 +111,7 @@ print("\n".join(lines))
 #
 # The outline of the ball in one picture says it. The place of the ball and the tilt of the camera look alike there. The
 # standard deviation counts what is not known of the camera.
+# Of the 2.3 mm below, 1 mm is the ball, and 1.3 mm is 5 mrad of tilt over 0.26 m.
 
 # %%
 on, off = lines[2].split(",")[1], lines[2].split(",")[3]

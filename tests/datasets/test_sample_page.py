@@ -178,3 +178,25 @@ def test_a_pointer_over_a_pixel_shows_its_truth_accuracy(
             assert abs(value - truth[name][v, u]) <= 0.5 * ROUNDING * step, name
             shown += 1
     assert shown >= 2 * len(STEPS)
+
+
+@NEEDS_BROWSER
+@pytest.mark.slow
+@pytest.mark.parametrize("position", POSITIONS)
+@pytest.mark.parametrize("beside", [-0.3, 0.3])
+def test_pixels_are_drawn_around_their_centres_accuracy(
+    sample: Sample, tmp_path: Path, position: str, beside: float
+) -> None:
+    """0.3 px beside the centre of the brightest pixel still lies on it; a picture half a pixel off shows another."""
+    page = write_sample_page(sample, tmp_path / "page.html")
+    frame = sample.camera_frames("mjpeg").by_name[position].image.astype(int)
+    spot = sample.truth_row(position)
+    u, v = round(spot.u_px), round(spot.v_px)
+    around = [frame[v + j, u + i] for i, j in ((-1, -1), (1, 1))]
+    assert min(np.abs(frame[v, u] - other).max() for other in around) > 12
+    address = f"hover={position},{u + beside},{v + beside}&zoom=spot&marks=0&lines=0"
+    readout, console = browsed(page, address, tmp_path)
+    assert console == ""
+    assert (readout["u"], readout["v"]) == (str(u), str(v))
+    # two JPEG decoders differ by a few codes
+    assert np.abs(np.array(readout["drawn"].split(","), int) - frame[v, u]).max() <= 6
