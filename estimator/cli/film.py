@@ -170,7 +170,8 @@ def track(
 ) -> int:
     """Find the target of every film among all lights of the whole images, by its blink code.
 
-    Exit code 1 if a target was not found.
+    D and its standard deviation are those of a target that rests before a robot that stands and moves its carriage;
+    nan where its frames do not give them. Exit code 1 if a target was not found.
 
     Parameters
     ----------
@@ -189,7 +190,7 @@ def track(
     from phibench.estimator.film.film_estimates import found_rows, track_film
 
     missed = 0
-    heads = ("lock s", "u px", "v px", "off px", "lost", "lights")
+    heads = ("lock s", "u px", "v px", "off px", "lost", "lights", "D m", "+- m")
     head = f"{'film':32s} {'target':12s} " + " ".join(f"{head:>8s}" for head in heads)
     for one in open_films(directory):
         rows = found_rows(one, track_film(one, preset, draw, camera_seed, phase == "known"))
@@ -203,7 +204,7 @@ def track(
                 continue
             print(
                 f"{one.info.film:32s} {row.target:12s} {row.lock_s:8.2f} {row.uv_px[0]:8.2f} {row.uv_px[1]:8.2f} "
-                f"{row.error_px:8.2f} {row.losses:8d} {row.lights:8d}"
+                f"{row.error_px:8.2f} {row.losses:8d} {row.lights:8d} {row.depth_m:8.3f} {row.sigma_m:8.3f}"
             )
     return 1 if missed else 0
 

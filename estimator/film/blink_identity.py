@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -93,11 +93,14 @@ class Evidence:
         Log likelihood ratio against a light that blinks by chance, less ln(phases).
     electrons, sigma_e : float
         Amplitude A of what follows the code, and its standard deviation.
+    phase : int
+        Number of the phase that fits best.
     """
 
     log_odds: float = 0.0
     electrons: float = 0.0
     sigma_e: float = math.inf
+    phase: int = 0
 
 
 @dataclass(frozen=True)
@@ -141,11 +144,11 @@ def evidence(electrons: Array, sigma_e: Array, exposures: Sequence[Exposures], b
     bits : str
     """
     best = Evidence(-math.inf)
-    for one in exposures:
+    for phase, one in enumerate(exposures):
         found = _of_phase(electrons, sigma_e, one, bits)
         if found.log_odds > best.log_odds:
-            best = found
-    return Evidence(best.log_odds - math.log(len(exposures)), best.electrons, best.sigma_e)
+            best = replace(found, phase=phase)
+    return replace(best, log_odds=best.log_odds - math.log(len(exposures)))
 
 
 def _of_phase(y: Array, sigma: Array, exposures: Exposures, bits: str) -> Evidence:
@@ -397,7 +400,7 @@ class TargetTracker:
             (one, track)
             for track in self.tracker.live
             if id(track) not in taken
-            and (track is state.past or self._may_lock(state, track))
+            and (track.dark <= state.dark_frames if track is state.past else self._may_lock(state, track))
             and (one := self.evidence(state, track)).log_odds > 0.0
         ]
         sure = [pair for pair in found if pair[0].log_odds >= (REGAIN if pair[1] is state.past else LOCK)]
@@ -408,6 +411,38 @@ class TargetTracker:
             return
         state.hold = Hold(state.code.name, track, self.frame, log_odds=best.log_odds)
         self.holds.append(state.hold)
+
+    def seen_places(self, name: str) -> tuple[NDArray[np.int64], Array]:
+        """Frames in which a target was detected while it was known, or shortly before its lock, and places (n, 2).
+
+        Raises
+        ------
+        SceneError
+            If the target was never seen.
+        """
+        self.first_lock(name)
+        places: dict[int, tuple[float, float]] = {}
+        for hold in (one for one in self.holds if one.target == name):
+            track, first = hold.track, hold.locked - math.floor(LOCK / math.log(2.0))
+            last = hold.lost if hold.lost >= 0 else track.last
+            for number, uv, seen in zip(track.frames.tolist(), track.uv_px, track.detected, strict=True):
+                if first <= number <= last and (seen or number == hold.locked):
+                    places[number] = uv
+        frames = sorted(places)
+        return np.array(frames), np.array([places[k] for k in frames])
+
+    def levels(self, name: str, frames: NDArray[np.int64], rows: Array) -> Array:
+        """Part of the exposure of a row, in each frame, during which a target's code is on: shape (n,).
+
+        Where the phase of the code is not known, a quarter bit before and after counts as well.
+        """
+        code, margin_s, start_s = self._states[name].code, 0.0, self._states[name].code.code.start_s
+        if not code.phase_known:
+            track = next(hold.track for hold in reversed(self.holds) if hold.target == name)
+            start_s = float(code.starts_s[self.evidence(self._states[name], track).phase])
+            margin_s = 2.0 * code.code.bit_s / _PHASES_PER_BIT
+        middle = self.times.row_s(frames.astype(float), rows)
+        return replace(code.code, start_s=start_s).mean_level(middle, self.times.exposure_s + margin_s)
 
     def first_lock(self, name: str) -> Hold:
         """First lock on a target.

@@ -12,22 +12,29 @@ from dataclasses import dataclass
 import numpy as np
 import polars
 
+from phibench.datasets.errors import DatasetError
 from phibench.datasets.film.film_read import Film
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.recipe.film_tables import TARGET
 from phibench.estimator.film.blink_identity import TargetCode, TargetTracker
 from phibench.estimator.film.film_bundle import FilmDepth, expected_sigma_m, film_depth
-from phibench.estimator.film.film_frames import FilmFrames, Index, room_weights
+from phibench.estimator.film.film_frames import LIT, FilmFrames, Index, room_weights
 from phibench.estimator.film.film_positions import FilmPositions, fit_positions, stepped_positions
 from phibench.estimator.film.recursive_filter import FilterState, first_state, updated
+from phibench.estimator.spots.raw_pixels import raw_electrons
 from phibench.estimator.spots.spot_prediction import spot_blur
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import Beam
+from phibench.scenes.motion.carriage import Carriage
 from phibench.scenes.validation import SceneError
 
 _ROUNDS = 2  # of the frames' own fits: the second one knows distance and motion
 _STEPS, _SETTLED = 8, 0.02  # of the bundle, and standard deviations that it stops at
 _REST_M = 1e-9
+_AROUND_PX = 24  # of a tracked spot
+_TRACKED_WITHIN_PX = 3  # of the place that a track says
+_ONE_PLACE_M = 3e-3  # of the carriage: an image moves by less than half a pixel
+_MOST_CHI2 = 2.0  # per degree of freedom: 20 frames of a target at rest exceed it with a chance of 2e-4
 _MOVES_M = 1.5e-3  # of the encoder from frame to frame: five of its standard deviations
 
 
@@ -198,6 +205,98 @@ def track_film(
 
 
 @dataclass(frozen=True)
+class TrackedPositions:
+    """Positions of a tracked target that rests, the room taken off by the frames in which its code is off.
+
+    Attributes
+    ----------
+    positions : FilmPositions
+        In N frames with its code on.
+    times_s, offsets_m : shape (N,)
+        Of the spot's row, and the encoder then: the arguments of `loop.belief.film_beliefs`.
+    depth : FilmDepth
+        From all of them.
+    """
+
+    positions: FilmPositions
+    times_s: Array
+    offsets_m: Array
+    depth: FilmDepth
+
+
+def tracked_positions(
+    tracker: TargetTracker, name: str, carriage: Carriage, encoder_m: Array, encoder_sigma_m: float
+) -> TrackedPositions:
+    """Positions of a target that a tracker has found, while the robot stands and moves its carriage.
+
+    Parameters
+    ----------
+    tracker : TargetTracker
+        After the film's frames.
+    name : str
+        Of the target.
+    carriage : Carriage
+        As it was told to go.
+    encoder_m : shape (frames,)
+        Readings at the frames' times.
+    encoder_sigma_m : float
+
+    Raises
+    ------
+    SceneError
+        If the target was never seen, or the pixels are not raw.
+    DatasetError
+        If its code is on in fewer than two frames or off in none, or the positions give no depth.
+    """
+    frames = tracked_frames(tracker, name, carriage, encoder_m, encoder_sigma_m)
+    found = bundle_depth(seen_film(frames))
+    positions, offsets = joint_positions(frames, found.point_world_m)
+    rows = predicted_px(frames, found.point_world_m)[0][: len(frames.on), 1]
+    return TrackedPositions(positions, frames.times.row_s(frames.on.astype(float), rows), offsets, found)
+
+
+def tracked_frames(
+    tracker: TargetTracker, name: str, carriage: Carriage, encoder_m: Array, encoder_sigma_m: float
+) -> FilmFrames:
+    """Frames of a target that a tracker has found, with its code on and off: arguments as of `tracked_positions`."""
+    if tracker.card.output != "raw":
+        raise SceneError(f"positions of '{tracker.card.output}' frames have no fit for films; take raw ones")
+    used, places = _places(tracker, name, np.asarray(encoder_m, float))
+    level = tracker.levels(name, used, places[:, 1])
+    lit, dark = np.flatnonzero(level > LIT), np.flatnonzero(level < 1.0 - LIT)
+    if len(lit) < 2 or not len(dark):
+        raise DatasetError(
+            f"target '{name}': its code is on in {len(lit)} frames since it was seen, and off in {len(dark)}; two on "
+            "and one off are the least: take more frames, or a code whose bits are longer than an exposure"
+        )
+    box = tracker.tracker.search.box
+    origin, limit = np.array([box.u0_px, box.v0_px]), np.array([box.width_px, box.height_px])
+    middle = np.rint(places).astype(np.int64) - origin
+    # pairs of rows and columns: the mosaic begins with a whole cell
+    low = np.clip((middle.min(axis=0) - _AROUND_PX) // 2 * 2, 0, limit)
+    high = np.clip(middle.max(axis=0) + _AROUND_PX, 0, limit)
+    x = raw_electrons(tracker.tracker.pixels(used)[:, low[1] : high[1], low[0] : high[0]], tracker.card)
+    parts = (used[lit], used[dark], x[lit], x[dark], low + origin, places[lit])
+    told = tracker.rig, tracker.card, tracker.times, carriage, encoder_m, encoder_sigma_m
+    return FilmFrames(*told, *parts, reach_px=_TRACKED_WITHIN_PX)
+
+
+def _places(tracker: TargetTracker, name: str, encoder_m: Array) -> tuple[Index, Array]:
+    """Frames that are kept, from the first in which a target was seen, and its places there, shape (n, 2).
+
+    The place of a target that rests depends on the carriage alone: where it was not seen it is interpolated in that.
+    """
+    seen, uv = tracker.seen_places(name)
+    frames = np.arange(max(int(seen[0]), tracker.tracker.oldest), tracker.frame + 1)
+    _, same = np.unique(np.round(encoder_m[seen] / _ONE_PLACE_M), return_inverse=True)
+    count = np.bincount(same)
+    at, u, v = (np.bincount(same, values) / count for values in (encoder_m[seen], uv[:, 0], uv[:, 1]))
+    reached = (encoder_m[frames] > at[0] - _ONE_PLACE_M) & (encoder_m[frames] < at[-1] + _ONE_PLACE_M)
+    frames = frames[reached]
+    return frames, np.stack([np.interp(encoder_m[frames], at, values) for values in (u, v)], axis=1)
+
+
+@dataclass(frozen=True)
 class FoundRow:
     """Outcome for one target of a film.
 
@@ -213,6 +312,8 @@ class FoundRow:
         Distance from the true place.
     losses, lights : int
         Times that it was lost; lights that are followed at the end.
+    depth_m, sigma_m : float
+        D, as of a target that rests before a robot that stands; NaN where the frames do not give it.
     """
 
     target: str
@@ -222,6 +323,8 @@ class FoundRow:
     error_px: float = math.nan
     losses: int = 0
     lights: int = 0
+    depth_m: float = math.nan
+    sigma_m: float = math.nan
 
 
 def found_rows(film: Film, tracker: TargetTracker) -> list[FoundRow]:
@@ -239,4 +342,18 @@ def _found(film: Film, tracker: TargetTracker, name: str) -> FoundRow:
     place = first.track.uv_px[first.locked - first.track.first]
     losses = sum(hold.lost >= 0 for hold in tracker.holds if hold.target == name)
     lock_s = (first.locked + 1) / tracker.times.rate_hz
-    return FoundRow(name, "", lock_s, place, float(np.linalg.norm(truth - place)), losses, tracker.lights)
+    off_px = float(np.linalg.norm(truth - place))
+    return FoundRow(name, "", lock_s, place, off_px, losses, tracker.lights, *_depth(film, tracker, name))
+
+
+def _depth(film: Film, tracker: TargetTracker, name: str) -> tuple[float, float]:
+    """D and its standard deviation; NaN where the robot drives, or what was seen is not one place."""
+    if film.plan.scene.drive is not None:
+        return math.nan, math.nan
+    encoder_m, nominal = film.table["encoder_m"].to_numpy(), film.plan.nominal
+    try:
+        depth = tracked_positions(tracker, name, nominal.carriage, encoder_m, film.plan.encoder.sigma_m).depth
+    except (DatasetError, SceneError):
+        return math.nan, math.nan
+    agrees = depth.chi2 < _MOST_CHI2 * (2 * depth.frames - 3)
+    return (depth.depth_m, depth.sigma_m) if agrees else (math.nan, math.nan)

@@ -41,7 +41,7 @@ from phibench.scenes.rig import Rig
 
 _NODES = 4  # of an exposure: exact to the seventh power of a motion of 2 px over a blur of 0.7 px
 _SIDE_PX, _UNIT_PX, _MARGIN_PX = 48, 16, 32  # of what is kept around all spots
-_LIT = 0.99  # of an exposure: a frame with less, and more than none, is no frame of either kind
+LIT = 0.99  # of an exposure: a frame with less, and more than none, is no frame of either kind
 LENGTH_PX = 1.5  # l: edges of the room, blurred by 0.9 px, are interpolated to a tenth of their noise
 STRUCTURE = 300.0  # S^2 over the noise of a pixel: edges of 800 e behind 50 e
 FARTHEST_PX = 2.0 * LENGTH_PX  # from a frame with the laser off: beyond it the room is not known
@@ -71,9 +71,10 @@ class FilmFrames:
     origin_px : array, shape (2,)
         Image pixel (u, v) of the first one.
     near_px : array, shape (N, 2)
-        Places within 12 px of the spots.
+        Places within `reach_px` of the spots.
     stroke_scale : float
         Of a calibrated stroke, over the nominal one.
+    reach_px : int
     """
 
     rig: Rig
@@ -89,6 +90,7 @@ class FilmFrames:
     origin_px: Index
     near_px: Array
     stroke_scale: float = 1.0
+    reach_px: int = 12
 
     def some(self, on: Index, off: Index) -> FilmFrames:
         """Some of the frames, by their index among those with the laser on, and off; twice is allowed."""
@@ -220,7 +222,7 @@ def lit_frames(film: Film, numbers: Index) -> tuple[Index, Index, bool]:
     if blinks:
         rows = film.table["row_v_px"].to_numpy()[numbers]
         level = code.mean_level(times.row_s(numbers.astype(float), rows), times.exposure_s)
-        on, off = numbers[level > _LIT], numbers[level == 0.0]
+        on, off = numbers[level > LIT], numbers[level == 0.0]
     else:
         on, off = numbers[::2], numbers[1::2]
     if len(on) < 2 or not len(off):

@@ -32,7 +32,6 @@ from phibench.estimator.spots.raw_pixels import GaussLaw, PatternNoise, SpotRegi
 from phibench.scenes.frames import Array, BoolArray
 
 SIDE_PX = 11  # a spot of 0.9 px that moves by 2 px, and its tails
-_SEARCH_PX = 12  # around the place where a spot is looked for
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ class _Windows:
 
 
 def fit_positions(frames: FilmFrames, blur: SpotBlur, weights: Array) -> FilmPositions:
-    """Fit each frame by itself, where the light that blinks is brightest within 12 px of `frames.near_px`.
+    """Fit each frame by itself, where the light that blinks is brightest within reach of `frames.near_px`.
 
     Parameters
     ----------
@@ -94,7 +93,7 @@ def fit_positions(frames: FilmFrames, blur: SpotBlur, weights: Array) -> FilmPos
         Of the frames with the laser off, for the room.
     """
     left = frames.on_e - np.tensordot(weights, frames.off_e, 1)
-    windows = _windows(frames, _brightest(left, frames.near_px - frames.origin_px) + frames.origin_px, weights)
+    windows = _windows(frames, _brightest(left, frames) + frames.origin_px, weights)
     model = _model(frames, windows)
     fit = fit_law(windows.regions, windows.law, blur, model)
     good = fit.status == Status.OK
@@ -161,13 +160,13 @@ def _windows(frames: FilmFrames, middle_px: NDArray[np.int64], weights: Array) -
     return _Windows(regions, GaussLaw(noise, extra, 1, pattern.prnu), seen, weights, pattern.prnu)
 
 
-def _brightest(left_e: Array, near_px: Array) -> NDArray[np.int64]:
+def _brightest(left_e: Array, frames: FilmFrames) -> NDArray[np.int64]:
     """Place (u, v) of the brightest 3 x 3 pixels near a place in each image; a mosaic shows a spot in one of four."""
-    count, h, w = left_e.shape
+    near_px, (count, h, w) = frames.near_px - frames.origin_px, left_e.shape
     padded = np.pad(left_e, ((0, 0), (1, 1), (1, 1)), mode="edge")
     total = np.asarray(sum(padded[:, a : a + h, b : b + w] for a in range(3) for b in range(3)))
     v, u = np.arange(h)[None, :, None], np.arange(w)[None, None, :]
-    far = np.maximum(np.abs(u - near_px[:, 0, None, None]), np.abs(v - near_px[:, 1, None, None])) > _SEARCH_PX
+    far = np.maximum(np.abs(u - near_px[:, 0, None, None]), np.abs(v - near_px[:, 1, None, None])) > frames.reach_px
     best = np.where(far, -np.inf, total).reshape(count, -1).argmax(axis=1)
     return np.stack(np.unravel_index(best, (h, w))[::-1], axis=1)
 

@@ -62,6 +62,7 @@ _AGILITY = 5e-4 * np.kron(np.eye(2), [[1.0 / 3.0, 0.5], [0.5, 1.0]])  # pixels a
 _MOVING = 100.0  # times that, while something moves: a stroke of 0.25 m/s speeds up by 0.2 px a frame in a frame
 _BACK = 4  # frames before the first spot that are measured: a code's longest dark run and one more
 _KEPT = 15  # frames over which a code may be followed
+_REMEMBERED = 90  # frames whose pixels are kept, for positions of a target once it is known: 1 MB each
 _TENTATIVE = 2  # spots up to which a track may be noise
 WINDOW_PX = 9  # kept around every spot, for a fit of its place: a level per filter describes the room there
 
@@ -88,12 +89,17 @@ class FrameSearch:
     card : SensorCard
     box : Box, optional
         Part of the image to search, which begins at an even row and column; all that holds the mirror by default.
+
+    Attributes
+    ----------
+    inside : shape (h, w), bool
+        Pixels of the box that show the mirror.
     """
 
     def __init__(self, rig: Rig, card: SensorCard, box: Box | None = None) -> None:
         self.card, self.box = card, box or mirror_box(rig)
         self.sigma_px = blur_of(card, rig.camera.blur_sigma_px)
-        self._outline = outline_mask(rig, self.box)
+        self.inside = outline_mask(rig, self.box)
         self._origin = np.array([self.box.u0_px, self.box.v0_px], float)
 
     def planes(self, image: NDArray[Any]) -> ColourPlanes:
@@ -106,10 +112,14 @@ class FrameSearch:
         """
         return colour_planes(image, self.card, self.box)
 
+    def part(self, image: NDArray[Any]) -> NDArray[Any]:
+        """Box of an image."""
+        return image[self.box.slices]
+
     def spots(self, planes: ColourPlanes, before: ColourPlanes | None = None) -> FrameSpots:
         """Spots of a frame, the brightest first; `before` is an earlier frame, from which lights may be brighter."""
         # full pixels alone count as lamps: what is merely bright is steady, and the code tells it from the target
-        where = self._outline & ~lamp_halo(planes, self._outline, self.card, True)
+        where = self.inside & ~lamp_halo(planes, self.inside, self.card, True)
         places = peaks(planes, None, self.card, self.sigma_px, where, _LEAST_PEAK, _MOST_PEAKS).uv_px
         tests = candidates_at(planes, None, self.card, places, self.sigma_px)
         keep = np.flatnonzero(tests.z >= LEAST_Z)
@@ -156,7 +166,7 @@ class FrameSearch:
         scale = math.sqrt(0.5 * float(np.median(((x / lit) ** 2 + ((1.0 - x) / dark) ** 2).sum(axis=0))))
         first = frames[0]
         mean_on, mean_off = (replace(first, values_e=np.stack([red, red, red])) for red in (on, off))
-        found = self._brighter(mean_on, mean_off, self._outline, scale, _LEAST_FOLLOWING)
+        found = self._brighter(mean_on, mean_off, self.inside, scale, _LEAST_FOLLOWING)
         return self._refined(mean_on, mean_off, found) + self._origin
 
     def _brighter(
@@ -188,9 +198,9 @@ class FrameSearch:
     def light(self, planes: ColourPlanes, uv_px: Array) -> tuple[Array, Array]:
         """Amplitudes at places (n, 2) and their standard deviations, electrons; NaN outside of the mirror's image."""
         at = np.asarray(uv_px, float).reshape(-1, 2) - self._origin
-        inside = ((at >= 0.0) & (at <= np.array(self._outline.shape[::-1]) - 1.0)).all(axis=1)
+        inside = ((at >= 0.0) & (at <= np.array(self.inside.shape[::-1]) - 1.0)).all(axis=1)
         row, column = np.rint(np.where(inside[:, None], at, 0.0)).astype(int).T[::-1]
-        inside &= self._outline[row, column]
+        inside &= self.inside[row, column]
         result = np.full((2, len(at)), np.nan)
         if inside.any():
             tests = candidates_at(planes, None, self.card, at[inside], self.sigma_px)
@@ -305,6 +315,7 @@ class SpotTracker:
         self._count = 0
         self._moved = False
         self._before: deque[ColourPlanes] = deque(maxlen=_KEPT)
+        self._pixels: deque[NDArray[Any]] = deque(maxlen=_REMEMBERED)
 
     def add(self, image: NDArray[Any], moves: bool = False) -> None:
         """Take in the next frame; `moves` says that spots may have changed their speed since the frame before.
@@ -317,6 +328,7 @@ class SpotTracker:
         self.frame += 1
         planes = self.search.planes(image)
         spots = self.search.spots(planes, self._before[-2] if len(self._before) > 1 else None)
+        self._pixels.append(self.search.part(image).copy())
         changes = moves or self._moved
         self._moved = moves
         for track in self.live:
@@ -383,6 +395,20 @@ class SpotTracker:
     def kept(self) -> int:
         """Frames over which a code may be followed now."""
         return len(self._before)
+
+    @property
+    def planes(self) -> ColourPlanes:
+        """Planes of the latest frame."""
+        return self._before[-1]
+
+    @property
+    def oldest(self) -> int:
+        """Number of the earliest frame whose pixels are kept."""
+        return self.frame - len(self._pixels) + 1
+
+    def pixels(self, frames: NDArray[np.int64]) -> NDArray[Any]:
+        """Pixels of the box in frames from `oldest` on, shape (n, h, w, ...)."""
+        return np.stack([self._pixels[int(k) - self.oldest] for k in frames])
 
     def _keep(self, track: SpotTrack, image: NDArray[Any], uv_px: Array) -> None:
         window, origin = self.search.window(image, uv_px)

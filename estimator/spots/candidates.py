@@ -246,6 +246,15 @@ def candidates_at(
     return Candidates(uv_px, z, red.amplitude, np.sqrt(red.variance) * noise.spread, red.chi2, colour)
 
 
+def plane_amplitudes(on: ColourPlanes, card: SensorCard, uv_px: Array, sigma_px: float) -> tuple[Array, Array]:
+    """Amplitudes in every plane, each by itself, and their variances, electrons: shape (c, n) each."""
+    reach = _PATCH_REACH_PX[on.mosaic]
+    corner = np.rint(uv_px).astype(int) - reach
+    template = _template(uv_px - corner, sigma_px, reach)
+    fits = [_fitted(on, None, card, c, corner, template, guided=False) for c in range(len(on.values_e))]
+    return np.stack([f.amplitude for f in fits]), np.stack([f.variance * np.maximum(f.chi2, 1.0) for f in fits])
+
+
 def candidate_noise(
     on: ColourPlanes,
     off: ColourPlanes | None,

@@ -8,9 +8,11 @@ itself from one frame in which it is on.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -21,9 +23,12 @@ from phibench.datasets.film.film_make import coloured, frame_spots
 from phibench.datasets.film.film_plan import FilmPlan, film_plans
 from phibench.datasets.film.film_read import film_light
 from phibench.datasets.film.film_room import renderer
+from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.plan.plan import Plan
 from phibench.datasets.recipe.load import parse_recipe
 from phibench.datasets.recipe.spot_placement import by_ray
+from phibench.estimator.film.blink_identity import TargetCode, TargetTracker
+from phibench.estimator.film.simple_targets import ColourIdentity, NearestBlob, red_blobs
 from phibench.estimator.spots.detect import mirror_box, outline_mask
 from phibench.render.film.key_views import PoseParts, blended
 from phibench.render.film.moving_rows import RowsImage, chief_uv_px, spot_time_s
@@ -49,6 +54,8 @@ CODES = ((CODE, 0), (CODE, 5), ("000111011001011", 0), ("000111011001011", 7))
 RATE_HZ = 30.0
 APART_PX = 12.0  # of lights from the target: nearer ones share its pixels
 KINDS = ("lamp", "reflection", "red object", "other laser", "drifting")
+Hidden = Mapping[int, range]
+"""Frames in which lights are hidden, by their numbers: 0 is the first target."""
 _TRIES = 200
 _READ_E2 = 4.0**2
 
@@ -68,11 +75,11 @@ class RenderedRoom:
         return self.recipe.room(self.plan.pair.room)
 
 
-def rendered_rooms(text: str, keys_m: Sequence[float], kept: Path) -> list[RenderedRoom]:
-    """Rooms of a recipe, rendered into a folder, or read from there."""
+def rendered_rooms(text: str, keys_m: Sequence[float], kept: Path, most: int | None = None) -> list[RenderedRoom]:
+    """Rooms of a recipe, at most so many, rendered into a folder, or read from there."""
     recipe, films = film_plans(parse_recipe(text))
     rooms = []
-    for film in films:
+    for film in films[:most]:
         path = kept / f"{film.film_id}.npy"
         if not path.exists():
             render = renderer(recipe, film, recipe.room(film.pair.room))
@@ -111,12 +118,18 @@ class StagedFilm:
     names: tuple[Any, ...]
     preset: str = "bayer-raw"
 
-    def light(self, frame: int, hidden: bool = False) -> Light:
-        """Light of a frame; `hidden` leaves the target out, as an opaque thing in front of it does."""
-        spot = self.images[0][frame]
-        if hidden:
-            spot = RowsImage(0, 0, *np.zeros((3, 3, 0, 0)))
-        return film_light(self.scene, self.room(frame), spot, [one[frame] for one in self.images[1:]])
+    @property
+    def codes(self) -> list[BlinkCode]:
+        """Codes of the targets, which come first among the lights."""
+        return [self.scene.code, *(one.code for one in self.scene.lights if one.is_target)]
+
+    def light(self, frame: int, hidden: Hidden = MappingProxyType({})) -> Light:
+        """Light of a frame; what is hidden is left out, as by an opaque thing in front of it."""
+        nothing = RowsImage(0, 0, *np.zeros((3, 3, 0, 0)))
+        own = [
+            nothing if frame in hidden.get(number, ()) else images[frame] for number, images in enumerate(self.images)
+        ]
+        return film_light(self.scene, self.room(frame), own[0], own[1:])
 
     def room(self, frame: int) -> NDArray[np.float32]:
         """Room in a frame, shape (3, H, W), electrons per second; without a stroke it is the same in all."""
@@ -126,14 +139,14 @@ class StagedFilm:
         rows = np.arange(views.shape[2]).astype(float)
         return blended(views, PoseParts.of(self.scene).row_weights([keys], frame, rows))
 
-    def frames(self, hidden: range = range(0)) -> Iterator[NDArray[Any]]:
-        """Camera frames, black outside of the mirror's box."""
+    def frames(self, hidden: Hidden = MappingProxyType({})) -> Iterator[NDArray[Any]]:
+        """Camera frames, black outside of the mirror's box; lights are hidden in some frames, by their number."""
         times = self.scene.times
         chosen = sensor(self.preset, exposure_s=times.exposure_s, readout_s=times.readout_s)
         chain = Chain(chosen, 0, self.scene.rig.camera)
         for k in range(times.frames):
             stream = NoiseStream((*self.names, "frame", k))
-            part = chain.frame(self.light(k, k in hidden), stream, self.region)
+            part = chain.frame(self.light(k, hidden), stream, self.region)
             image = np.zeros((*self.rendered.views.shape[2:], *part.shape[2:]), part.dtype)
             image[self.region.slices()] = part
             yield image
@@ -300,3 +313,138 @@ def _factor(scene: FilmScene, spot: LaserSpot, room: Array, sigma: float) -> flo
         return float(np.sum((f * s) ** 2 / (f * s + b + _READ_E2))) - sigma**2
 
     return float(np.exp(brentq(excess, -25.0, 10.0)))
+
+
+# -- outcome -----------------------------------------------------------------------------------------------------------
+
+ON_IT_PX = 3.0  # of a place from the target
+_OTHERS_PX = 6.0  # around other targets: simple ways are not shown what lies there
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Outcome of one way to find a target, in one film.
+
+    Attributes
+    ----------
+    way : str
+        "code", "colour", "blob", or "told blob", which is told the true place in the first frame.
+    sigma, lights : float and int
+        Of the film.
+    film, target : int
+    first : int
+        Frame at which it first says where the target is; -1 for never.
+    right : bool
+        At that frame; of simple ways after half a second, because they change their minds.
+    asked : int
+        1 where it is on the target after half a second, 0 where it says nothing, -1 where it is on something else.
+    last : int
+        The same in the last frame.
+    losses : int
+    again : int
+        Frame of the first lock after a loss; -1 where there is none.
+    """
+
+    way: str
+    sigma: float
+    lights: int
+    film: int
+    target: int
+    first: int
+    right: bool
+    asked: int
+    last: int
+    losses: int = 0
+    again: int = -1
+
+
+def followed(
+    film: StagedFilm, cell: tuple[float, int, int], asked: int = 14, hidden: Hidden = MappingProxyType({})
+) -> list[Outcome]:
+    """Outcomes of all ways in a film; `cell` is its sigma, its number of lights, and its own number.
+
+    A film without hidden targets ends where all of them are locked, but not before the frame `asked`. Simple ways look
+    for each target by itself, and are not shown the others, which nothing would tell from it.
+    """
+    rig, card = film.scene.rig, card_of(sensor(film.preset, exposure_s=1 / 60, readout_s=0.03))
+    codes = [TargetCode(str(n), code) for n, code in enumerate(film.codes)]
+    tracker = TargetTracker(rig, card, film.scene.times, codes)
+    search, count = tracker.tracker.search, len(codes)
+    colour = ColourIdentity(search, rig.camera.detector.laser_filter_response)
+    blobs, told = [NearestBlob() for _ in codes], [NearestBlob(film.uv_px[n, 0]) for n in range(count)]
+    places: list[list[tuple[Array | None, ...]]] = []
+    for k, image in enumerate(film.frames(hidden)):
+        tracker.add(image)
+        colour.add(tracker.tracker.planes, tracker.tracker.live)
+        found = red_blobs(tracker.tracker.planes, search)
+        now: list[tuple[Array | None, ...]] = []
+        for n in range(count):
+            others = np.delete(film.uv_px[:count, k], n, axis=0)
+            for one in (blobs[n], told[n]):
+                one.add(found[_apart(found, others)])
+            live = [one for one in tracker.tracker.live if _apart(np.array([one.place_px]), others)[0]]
+            best = colour.target(live)
+            now.append((blobs[n].place_px, told[n].place_px, None if best is None else np.array(best.place_px)))
+        places.append(now)
+        if not hidden and k >= asked and all(tracker.held(one.name) is not None for one in codes):
+            break
+    outcomes = [_of_code(film, tracker, n, asked, cell) for n in range(count)]
+    for number, way in enumerate(("blob", "told blob", "colour")):
+        for n in range(count):
+            own = [now[n][number] for now in places]
+            said = [_on(film, n, k, place) for k, place in enumerate(own)]
+            first = next((k for k, value in enumerate(said) if value), -1)
+            outcomes.append(Outcome(way, *cell, n, first, said[asked] == 1, said[asked], said[-1]))
+    return outcomes
+
+
+def _apart(uv_px: Array, others_px: Array) -> NDArray[np.bool_]:
+    distance = np.linalg.norm(uv_px[:, None] - others_px[None], axis=-1)
+    return np.asarray(distance.min(axis=1, initial=np.inf) > _OTHERS_PX)
+
+
+def _on(film: StagedFilm, target: int, frame: int, place: Array | None) -> int:
+    """1 for a place on the target, -1 for one on something else, 0 for none."""
+    if place is None:
+        return 0
+    return 1 if float(np.linalg.norm(film.uv_px[target, frame] - place)) < ON_IT_PX else -1
+
+
+def _of_code(film: StagedFilm, tracker: TargetTracker, n: int, asked: int, cell: tuple[float, int, int]) -> Outcome:
+    holds = [hold for hold in tracker.holds if hold.target == str(n)]
+
+    def at(frame: int) -> int:
+        for hold in holds:
+            if hold.locked <= frame and (hold.lost < 0 or frame < hold.lost):
+                return _on(film, n, frame, np.array(hold.track.uv_px[frame - hold.track.first]))
+        return 0
+
+    first = holds[0].locked if holds else -1
+    again = holds[1].locked if len(holds) > 1 else -1
+    losses = sum(hold.lost >= 0 for hold in holds)
+    right = bool(holds) and all(at(hold.locked) == 1 for hold in holds)
+    return Outcome("code", *cell, n, first, right, at(asked), at(tracker.frame), losses, again)
+
+
+def swept(
+    rooms: Sequence[RenderedRoom],
+    stream: str,
+    cell: tuple[float, int],
+    films: Sequence[int],
+    kept: Path,
+    frames: int = 24,
+    hidden: Hidden = MappingProxyType({}),
+) -> list[Outcome]:
+    """Outcomes of films of one signal and number of other lights; those in the file `kept` are not made again."""
+    rows = [Outcome(**json.loads(line)) for line in kept.read_text().splitlines()] if kept.exists() else []
+    for number in films:
+        key = (*cell, number)
+        if any((one.sigma, one.lights, one.film) == key for one in rows):
+            continue
+        names = (stream, number, f"{cell[0]:g}", cell[1])
+        film = staged(rooms[number % len(rooms)], names, cell[0], cell[1], frames, targets=4)
+        new = followed(film, key, hidden=hidden)
+        rows += new
+        with kept.open("a") as file:
+            file.writelines(json.dumps(asdict(one)) + "\n" for one in new)
+    return [one for one in rows if (one.sigma, one.lights) == cell and one.film in films]
