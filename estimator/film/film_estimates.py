@@ -32,7 +32,9 @@ _ROUNDS = 2  # of the frames' own fits: the second one knows distance and motion
 _STEPS, _SETTLED = 8, 0.02  # of the bundle, and standard deviations that it stops at
 _REST_M = 1e-9
 _AROUND_PX = 24  # of a tracked spot
-_TRACKED_WITHIN_PX = 3  # of the place that a track says
+_BEYOND_CHANCE = 20.0  # chi squared of 2: one fit in 2e4
+_LEFT_OUT = 0.5  # of the frames with the code on, at most
+_TRACKED_WITHIN_PX = 2  # of the place that a track says
 _ONE_PLACE_M = 3e-3  # of the carriage: an image moves by less than half a pixel
 _MOST_CHI2 = 2.0  # per degree of freedom: 20 frames of a target at rest exceed it with a chance of 2e-4
 _MOVES_M = 1.5e-3  # of the encoder from frame to frame: five of its standard deviations
@@ -246,10 +248,15 @@ def tracked_positions(
     SceneError
         If the target was never seen, or the pixels are not raw.
     DatasetError
-        If its code is on in fewer than two frames or off in none, or the positions give no depth.
+        If its code is on in fewer than two frames or off in none, or the positions give no depth, or do not agree.
     """
-    frames = tracked_frames(tracker, name, carriage, encoder_m, encoder_sigma_m)
+    frames = agreeing(tracked_frames(tracker, name, carriage, encoder_m, encoder_sigma_m))
     found = bundle_depth(seen_film(frames))
+    if not found.chi2 < _MOST_CHI2 * (2 * found.frames - 3):
+        raise DatasetError(
+            f"target '{name}': {found.frames} positions do not agree with one place at rest, chi^2 {found.chi2:.0f} "
+            f"with {2 * found.frames - 3} degrees of freedom; it moves, or another light is beside it"
+        )
     positions, offsets = joint_positions(frames, found.point_world_m)
     rows = predicted_px(frames, found.point_world_m)[0][: len(frames.on), 1]
     return TrackedPositions(positions, frames.times.row_s(frames.on.astype(float), rows), offsets, found)
@@ -279,6 +286,27 @@ def tracked_frames(
     parts = (used[lit], used[dark], x[lit], x[dark], low + origin, places[lit])
     told = tracker.rig, tracker.card, tracker.times, carriage, encoder_m, encoder_sigma_m
     return FilmFrames(*told, *parts, reach_px=_TRACKED_WITHIN_PX)
+
+
+def agreeing(frames: FilmFrames) -> FilmFrames:
+    """Frames whose fits, each by itself, agree with one place: the worst is left out while it is beyond chance.
+
+    On edges of the room, or behind something, a fit in one frame may find anything.
+    """
+    seen = seen_film(frames)
+    kept, at_most = np.flatnonzero(seen.positions.good), _LEFT_OUT * len(frames.on)
+    while len(frames.on) - len(kept) <= at_most:
+        found = film_depth(frames.rig, seen.positions.some(kept), seen.offsets_m[kept], frames.encoder_sigma_m)
+        apart = seen.positions.uv_px[kept] - frames.image_px(found.point_world_m, seen.offsets_m[kept])
+        own = seen.positions.noise_px2[kept] + seen.positions.shared_px2[kept, :, kept]
+        distance2 = np.einsum("ni,nij,nj->n", apart, np.linalg.inv(own), apart)
+        if distance2.max() < _BEYOND_CHANCE:
+            return frames.some(kept, np.arange(len(frames.off)))
+        kept = np.delete(kept, int(np.argmax(distance2)))
+    raise DatasetError(
+        f"positions in {len(frames.on) - len(kept)} of {len(frames.on)} frames do not agree with those in the others: "
+        "the target moves, or is hidden, or another light is beside it"
+    )
 
 
 def _places(tracker: TargetTracker, name: str, encoder_m: Array) -> tuple[Index, Array]:
@@ -355,5 +383,4 @@ def _depth(film: Film, tracker: TargetTracker, name: str) -> tuple[float, float]
         depth = tracked_positions(tracker, name, nominal.carriage, encoder_m, film.plan.encoder.sigma_m).depth
     except (DatasetError, SceneError):
         return math.nan, math.nan
-    agrees = depth.chi2 < _MOST_CHI2 * (2 * depth.frames - 3)
-    return (depth.depth_m, depth.sigma_m) if agrees else (math.nan, math.nan)
+    return depth.depth_m, depth.sigma_m

@@ -96,7 +96,9 @@ def fit_positions(frames: FilmFrames, blur: SpotBlur, weights: Array) -> FilmPos
     windows = _windows(frames, _brightest(left, frames) + frames.origin_px, weights)
     model = _model(frames, windows)
     fit = fit_law(windows.regions, windows.law, blur, model)
-    good = fit.status == Status.OK
+    # a fit that wanders off has found something else
+    astray = np.abs(fit.uv_px - frames.near_px).max(axis=1) > frames.reach_px + 1.0
+    good = (fit.status == Status.OK) & ~astray
     pixels = SpotPixels.of(windows.regions.filters, blur, model)
     theta = np.column_stack([fit.uv_px - windows.regions.origin_px, fit.flux_e])
     uv = np.where(good[:, None], fit.uv_px, np.nan)
