@@ -282,9 +282,9 @@ def test_locks_within_half_a_second_in_rooms_that_nothing_was_tuned_on(pytestcon
 
 NEW_STROKE_M = 0.1
 CELLS = [(sigma, lights) for lights in (5, 10, 0) for sigma in (10.0, 6.0, 15.0)]
-FEW, MANY = range(3), range(15)  # films of a cell, and of the cell that the requirement is about
+FEW, MANY = range(2), range(15)  # films of a cell, and of the cell that the requirement is about
 HIDDEN = {0: range(18, 27), 1: range(18, 27), 2: range(18, 48), 3: range(18, 48)}  # 0.3 s and 1 s
-HIDDEN_FRAMES, HIDDEN_FILMS = 66, range(100, 103)
+HIDDEN_FRAMES, HIDDEN_FILMS = 66, range(100, 102)
 WAYS = ("code", "colour", "told blob", "blob")
 
 
@@ -340,7 +340,7 @@ def test_targets_in_new_rooms_by_signal_and_clutter(pytestconfig: pytest.Config)
 
 @pytest.mark.study
 def test_targets_in_new_rooms_are_found_again_after_they_were_hidden(pytestconfig: pytest.Config) -> None:
-    """Three films with six targets hidden for 0.3 s and six for 1 s: lost, found again, and when."""
+    """Two films with four targets hidden for 0.3 s and four for 1 s: lost, found again, and when."""
     rooms, kept = new_rooms(pytestconfig)
     path = kept / "hidden.jsonl"
     rows = swept(at_rest(rooms), "target-hidden", (10.0, 5), HIDDEN_FILMS, path, HIDDEN_FRAMES, HIDDEN)
@@ -358,14 +358,15 @@ def test_targets_in_new_rooms_are_found_again_after_they_were_hidden(pytestconfi
 
 @pytest.mark.study
 def test_beliefs_of_tracks_in_new_rooms_are_consistent(pytestconfig: pytest.Config) -> None:
-    """Five films of four targets of 10 sigma and a stroke of 0.1 m: mean NEES within its 95 % band.
+    """Six films of four targets of 10 sigma and a stroke of 0.1 m: mean NEES within its 95 % band.
 
     In the fourth room a track of an earlier film had shown that fits may go astray.
     """
     rooms, _ = new_rooms(pytestconfig)
     stroke, values = Carriage((0.0, NEW_STROKE_M), (0.4, 0.4), 0.2, 2.0), []
-    for number in (0, 1, 2, 4, 5):
-        film, tracker, encoder = stroke_film(rooms[number], "tracks-again", number, 10.0, ("lamp",), stroke, 40)
+    for number in (0, 1, 2, 4, 5, 6):
+        room = rooms[number % len(rooms)]
+        film, tracker, encoder = stroke_film(room, "tracks-again", number, 10.0, ("lamp",), stroke, 40)
         for n in range(4):
             try:
                 values.append(nees_of(film, tracker, n, encoder))
@@ -405,12 +406,12 @@ def moving_target(room: RenderedRoom, number: int) -> tuple[float, bool]:
 
 @pytest.mark.study
 def test_speed_of_the_image_up_to_which_a_target_is_locked(pytestconfig: pytest.Config) -> None:
-    """Thirty targets of 15 sigma that walk: the share that is locked falls with the speed of the image."""
+    """Twenty-four targets of 15 sigma that walk: the share that is locked falls with the speed of the image."""
     rooms, _ = new_rooms(pytestconfig)
-    rows = np.array([moving_target(at_rest(rooms)[n % len(rooms)], n) for n in range(30)])
+    rows = np.array([moving_target(at_rest(rooms)[n % len(rooms)], n) for n in range(24)])
     for low, high in itertools.pairwise((0.0, 0.5, 1.0, 2.0, 4.0, 100.0)):
         here = rows[(rows[:, 0] >= low) & (rows[:, 0] < high)]
         print(f"{low:g} to {high:g} px a frame: locked {share(int(here[:, 1].sum()), max(len(here), 1))}")
     slow, fast = rows[rows[:, 0] < 0.5, 1], rows[rows[:, 0] >= 4.0, 1]
-    assert len(slow) >= 5
+    assert len(slow) >= 3
     assert slow.mean() > fast.mean()
