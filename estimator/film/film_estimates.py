@@ -215,7 +215,7 @@ class TrackedPositions:
     positions : FilmPositions
         In N frames with its code on.
     times_s, offsets_m : shape (N,)
-        Of the spot's row, and the encoder then: the arguments of `loop.belief.film_beliefs`.
+        Of the spot's row, and the encoder then: the arguments of `loop.smoothing.film_beliefs`.
     depth : FilmDepth
         From all of them.
     """

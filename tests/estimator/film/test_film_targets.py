@@ -32,7 +32,7 @@ from phibench.estimator.film.film_estimates import found_rows, track_film, track
 from phibench.estimator.film.simple_targets import ColourIdentity, NearestBlob
 from phibench.estimator.film.spot_tracks import FrameSearch, FrameSpots, SpotTrack, _assigned, _motion
 from phibench.estimator.interface import Box
-from phibench.estimator.loop.belief import film_beliefs
+from phibench.estimator.loop.smoothing import film_beliefs
 from phibench.render.sensor.light import Region
 from phibench.render.sensor.settings import sensor
 from phibench.scenes.frames import Array
