@@ -9,6 +9,7 @@ import io
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -18,14 +19,21 @@ from pydantic import AfterValidator, Field, model_validator
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import InputFile, Name
 from phibench.datasets.store.files import sha256, write_bytes, write_text
+from phibench.datasets.store.provenance import code_behind, provenance
 from phibench.datasets.store.schema import Document
+from phibench.estimator.benchmark.answer_errors import Rules
+from phibench.estimator.benchmark.causes import count, count_failures
 from phibench.estimator.benchmark.intervals import Estimate
-from phibench.estimator.benchmark.metrics import Measured
+from phibench.estimator.benchmark.metrics import METRICS, Measured
+from phibench.estimator.benchmark.pair_bounds import excesses
 from phibench.estimator.benchmark.records import COLUMN_TYPES
+from phibench.estimator.benchmark.strata import Stratum, count_pairs, measured, strata
 from phibench.scenes.validation import printable_line
 
 KIND: Literal["phibench score"] = "phibench score"
 VERSION = 3
+SCORER = "phibench.estimator.benchmark.score"
+"""Module whose code, with all that it imports, is behind a score."""
 
 
 class Value(Document):
@@ -200,6 +208,62 @@ class ScoreDocument(Document):
             pairs=self.pairs,
             metrics=self.metrics,
         )
+
+
+def document_of(
+    method: MethodCard,
+    pair_set: Mapping[str, Any],
+    table: pl.DataFrame,
+    rules: Rules,
+    seed: int,
+    limits: Mapping[str, Any],
+    missed: float,
+) -> ScoreDocument:
+    """Score of complete records, without its worst images, whose pictures the records do not hold."""
+    whole, *others = strata(table)
+    return ScoreDocument(
+        kind=KIND,
+        version=VERSION,
+        method=method,
+        pair_set=dict(pair_set),
+        pairs=table["number"].n_unique(),
+        images=len(table),
+        samples=table["sample_id"].n_unique(),
+        seed=seed,
+        rules={name: float(value) for name, value in asdict(rules).items()},
+        limits=dict(limits),
+        provenance=dict(provenance()),
+        code_sha256=code_behind(SCORER),
+        missed_relative=missed,
+        flags=[Flag(**{**asdict(one), "ratio": finite(one.ratio)}) for one in excesses(whole.images)],
+        metrics={name: _metric(name, value) for name, value in measured(whole, rules, "score", seed).items()},
+        strata=[_stratum(stratum, rules, seed) for stratum in others],
+        causes=count(table),
+        failures=count_failures(table),
+        worst=[],
+        records="",
+        records_sha256="",
+    )
+
+
+def _metric(name: str, value: Measured) -> Metric:
+    metric = METRICS[name]
+    return Metric.of(value, unit=metric.unit, better=metric.better, text=metric.text)
+
+
+def _stratum(stratum: Stratum, rules: Rules, seed: int) -> StratumScore:
+    # the same stream for every method: on the same pairs they are resampled alike, so that their intervals compare
+    values = measured(stratum, rules, "score", seed)
+    return StratumScore(
+        by=stratum.by,
+        label=stratum.label,
+        low=finite(stratum.low),
+        high=finite(stratum.high),
+        mean=finite(stratum.mean),
+        images=len(stratum.images),
+        pairs=count_pairs(stratum),
+        metrics={name: Value.of(value) for name, value in values.items()},
+    )
 
 
 def finite(value: float | None) -> float | None:

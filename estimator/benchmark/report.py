@@ -77,6 +77,29 @@ class Section:
     captions: tuple[str, ...] = ()
 
 
+def time_section(times: Mapping[str, Mapping[str, float]]) -> Section:
+    """Section on where the time of a run went.
+
+    Parameters
+    ----------
+    times : preset to stage to CPU-seconds a pair
+    """
+    stages = list(dict.fromkeys(stage for part in times.values() for stage in part))
+    heads = ("stage", *(f"{preset} / ms" for preset in times))
+    rows = [(stage, *(_milliseconds(part.get(stage)) for part in times.values())) for stage in stages]
+    total = ("all", *(_milliseconds(sum(part.values())) for part in times.values()))
+    words = (
+        "CPU time of one pair, the mean over all pairs of a preset. Frames are drawn once for all methods; built-in "
+        "methods share the search for the spot, and joint_fit begins with the fits of each image.",
+        "Methods of others are not in this table: their time is in the ranking.",
+    )
+    return Section("Where the time went", words, (), ((heads, *rows, total),), ("Stages",))
+
+
+def _milliseconds(seconds: float | None) -> str:
+    return "" if seconds is None else f"{1e3 * seconds:.1f}"
+
+
 @dataclass(frozen=True)
 class Ranking:
     """Scores that were taken on the same pairs, the best first, with all that is shown of them.
@@ -159,7 +182,10 @@ def write_report(files: Sequence[Path], out: Path, sections: Sequence[Section] =
 
 
 def report_html(
-    scores: Sequence[tuple[ScoreDocument, pl.DataFrame]], sections: Sequence[Section] = (), by: str = "phi"
+    scores: Sequence[tuple[ScoreDocument, pl.DataFrame]],
+    sections: Sequence[Section] = (),
+    by: str = "phi",
+    title: str = "phibench report",
 ) -> str:
     """The page as text; the same scores give the same text."""
     environment = Environment(
@@ -176,7 +202,7 @@ def report_html(
     )
     environment.filters["json"] = lambda value: json.dumps(value, indent=1)
     rankings = [_ranking(number, group, by) for number, group in enumerate(_groups(scores), 1)]
-    return environment.get_template(_TEMPLATE).render(rankings=rankings, sections=sections)
+    return environment.get_template(_TEMPLATE).render(rankings=rankings, sections=sections, title=title)
 
 
 def _groups(scores: Sequence[tuple[ScoreDocument, pl.DataFrame]]) -> list[list[tuple[ScoreDocument, pl.DataFrame]]]:

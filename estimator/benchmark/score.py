@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 import webbrowser
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,28 +24,18 @@ from phibench.datasets.frames.sensor_file import read_sensor_file
 from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import Dataset, open_finished
 from phibench.datasets.store.files import require_writable
-from phibench.datasets.store.provenance import code_behind, provenance
 from phibench.estimator.benchmark.answer_errors import Rules
-from phibench.estimator.benchmark.causes import count, count_failures, with_causes
+from phibench.estimator.benchmark.causes import with_causes
 from phibench.estimator.benchmark.dataset_pairs import TASK_VERSION, CalibratedPairs, dataset_pairs, of_calibration
 from phibench.estimator.benchmark.document import (
-    KIND,
-    VERSION,
-    Flag,
     MethodCard,
-    Metric,
     ScoreDocument,
-    StratumScore,
-    Value,
     Worst,
-    finite,
+    document_of,
     write_score,
 )
-from phibench.estimator.benchmark.metrics import METRICS, Measured
-from phibench.estimator.benchmark.pair_bounds import excesses
 from phibench.estimator.benchmark.records import in_order, missed_relative, record_table, with_missed
-from phibench.estimator.benchmark.report import write_report
-from phibench.estimator.benchmark.strata import Stratum, count_pairs, measured, strata
+from phibench.estimator.benchmark.report import time_section, write_report
 from phibench.estimator.benchmark.worst_images import worst, worst_of
 from phibench.estimator.calibration.file import read_calibration
 from phibench.estimator.captures.imported_set import ImportedSet, imported_pairs, is_imported, open_imported
@@ -86,6 +78,7 @@ def score_methods(
     seed: int = 0,
     limits: Mapping[str, Any] | None = None,
     told: Callable[[int], None] = lambda done: None,
+    stages: dict[str, float] | None = None,
 ) -> list[Scored]:
     """Run methods on all pairs of a set and score them; each pair is simulated once for all of them.
 
@@ -100,6 +93,8 @@ def score_methods(
     limits : the harness's, for the record
     told : callable
         Given the number of pairs that are done, now and then.
+    stages : dict, optional
+        Gets the CPU-seconds of "bounds" and of "statistics", causes and worst images included.
 
     Raises
     ------
@@ -112,12 +107,25 @@ def score_methods(
         numbers = range(start, min(start + AT_ONCE, len(pairs)))
         held = CachedPairs(pairs)
         answers = list(ask(held, numbers))
+        with _timed("bounds", stages):
+            for number in numbers:
+                held.truth(number)
         for part, outcomes in zip(parts, zip(*answers, strict=True), strict=True):
-            part.append(examine(held, outcomes, rules))
+            with _timed("statistics", stages):
+                part.append(examine(held, outcomes, rules))
         told(numbers.stop)
-    return [
-        _scored(method, pairs, part, rules, seed, limits or {}) for method, part in zip(methods, parts, strict=True)
-    ]
+    with _timed("statistics", stages):
+        return [
+            _scored(method, pairs, part, rules, seed, limits or {}) for method, part in zip(methods, parts, strict=True)
+        ]
+
+
+@contextmanager
+def _timed(stage: str, stages: dict[str, float] | None) -> Iterator[None]:
+    start = time.thread_time()
+    yield
+    if stages is not None:
+        stages[stage] = stages.get(stage, 0.0) + time.thread_time() - start
 
 
 def score_outcomes(
@@ -157,51 +165,9 @@ def _scored(
     table = pl.concat([part.records for part in parts])
     missed = missed_relative(table, rules)
     table = with_missed(table, missed)
-    whole, *others = strata(table)
-    document = ScoreDocument(
-        kind=KIND,
-        version=VERSION,
-        method=method,
-        pair_set=pairs.document(),
-        pairs=table["number"].n_unique(),
-        images=len(table),
-        samples=table["sample_id"].n_unique(),
-        seed=seed,
-        rules={name: float(value) for name, value in asdict(rules).items()},
-        limits=dict(limits),
-        provenance=dict(provenance()),
-        code_sha256=code_behind(__name__),
-        missed_relative=missed,
-        flags=[Flag(**{**asdict(one), "ratio": finite(one.ratio)}) for one in excesses(whole.images)],
-        metrics={name: _metric(name, value) for name, value in measured(whole, rules, "score", seed).items()},
-        strata=[_stratum(stratum, rules, seed) for stratum in others],
-        causes=count(table),
-        failures=count_failures(table),
-        worst=worst_of(table, [entry for part in parts for entry in part.worst]),
-        records="",
-        records_sha256="",
-    )
-    return Scored(document, table)
-
-
-def _metric(name: str, value: Measured) -> Metric:
-    metric = METRICS[name]
-    return Metric.of(value, unit=metric.unit, better=metric.better, text=metric.text)
-
-
-def _stratum(stratum: Stratum, rules: Rules, seed: int) -> StratumScore:
-    # the same stream for every method: on the same pairs they are resampled alike, so that their intervals compare
-    values = measured(stratum, rules, "score", seed)
-    return StratumScore(
-        by=stratum.by,
-        label=stratum.label,
-        low=finite(stratum.low),
-        high=finite(stratum.high),
-        mean=finite(stratum.mean),
-        images=len(stratum.images),
-        pairs=count_pairs(stratum),
-        metrics={name: Value.of(value) for name, value in values.items()},
-    )
+    document = document_of(method, pairs.document(), table, rules, seed, limits, missed)
+    entries = [entry for part in parts for entry in part.worst]
+    return Scored(document.model_copy(update={"worst": worst_of(table, entries)}), table)
 
 
 def score(
@@ -327,20 +293,22 @@ def bench(
     if out.resolve() == dataset.folder.resolve() or dataset.folder.resolve() in out.resolve().parents:
         raise DatasetError(f"{out} lies inside the data set, whose files are signed; give a folder outside, --out")
     require_writable(out / REPORT)
-    scores, notes = [], []
+    scores, notes, times = [], [], dict[str, dict[str, float]]()
     for preset in _presets(dataset):
         taken = wanted_pairs(dataset, preset, pairs=pairs, calibration=calibration)
         refusals = {name: refusal(METHODS[name], taken) for name in chosen}
         notes += [f"{name} is left out on {preset}: {why}" for name, why in refusals.items() if why]
         names = [name for name, why in refusals.items() if not why]
-        done = run_and_score(names, taken, workers, console, preset, limits=limits)
+        stages: dict[str, float] = {}
+        done = run_and_score(names, taken, workers, console, preset, limits=limits, stages=stages)
+        times[preset] = {stage: seconds / len(taken) for stage, seconds in stages.items()}
         for name, scored in zip(names, done, strict=True):
             path = out / f"{preset}-{name}.json"
             write_score(path, scored.document, scored.records)
             scores.append(path)
     if not scores:
         raise DatasetError(f"none of {', '.join(chosen)} takes a preset of {folder}: give another --method")
-    return Benched(write_report(scores, out / REPORT), tuple(scores), tuple(notes))
+    return Benched(write_report(scores, out / REPORT, [time_section(times)]), tuple(scores), tuple(notes))
 
 
 def run_and_score(
@@ -351,8 +319,11 @@ def run_and_score(
     title: str,
     seed: int = 0,
     limits: RunLimits | None = None,
+    stages: dict[str, float] | None = None,
 ) -> list[Scored]:
-    """Score methods on the same pairs, each in a process of its own; parameters as for `bench`.
+    """Score methods on the same pairs, built-in ones in one process, others in their own; parameters as for `bench`.
+
+    `stages` gets the CPU-seconds by stage: of all pairs together.
 
     Raises
     ------
@@ -365,7 +336,9 @@ def run_and_score(
         return []
     # the steps first: they tell of time that goes by while methods start
     with Steps(console, title, len(pairs)) as steps, Harness(found, limits, workers, truth_folders(pairs)) as harness:
-        scored = score_methods(cards, pairs, harness.outcomes, None, seed, limits.document(), steps.reach)
+        scored = score_methods(cards, pairs, harness.outcomes, None, seed, limits.document(), steps.reach, stages)
+    if stages is not None:
+        stages.update(harness.stages)
     told = zip(scored, harness.failed_outputs, harness.isolations, strict=True)
     return [replace(isolated(one, isolation), output=output) for one, output, isolation in told]
 

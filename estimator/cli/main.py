@@ -31,8 +31,8 @@ from phibench.estimator.cli.film import film, loop
 from phibench.estimator.cli.methods import method
 from phibench.estimator.cli.options import DATA, INSTALLATION, METHODS, SENSOR, answer_to_old_spelling
 from phibench.estimator.cli.room import room
-from phibench.estimator.cli.score import bench, compare, report, score
-from phibench.estimator.cli.seal import seal
+from phibench.estimator.cli.score import bench, compare, report, results, score
+from phibench.estimator.cli.seal import seal, submission
 from phibench.estimator.cli.studies import paper, study
 
 
@@ -51,7 +51,7 @@ app = App(
     suppress_keyboard_interrupt=False,
     result_action="return_value",
 )
-for _group in (dataset, film, room, method, seal, sensor, loop, study):
+for _group in (dataset, film, room, method, seal, submission, sensor, loop, study):
     app.command(_group)
 app.command(export, group=DATA)
 app.command(release, group=DATA)
@@ -60,6 +60,7 @@ app.command(score, group=METHODS)
 app.command(bench, group=METHODS)
 app.command(compare, group=METHODS)
 app.command(report, group=METHODS)
+app.command(results, group=METHODS)
 app.command(calibrate, group=SENSOR)
 app.command(align, group=SENSOR)
 app.command(measure, group=SENSOR)

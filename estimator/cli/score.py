@@ -185,6 +185,50 @@ def report(
     return 0
 
 
+def results(
+    *files: Path,
+    out: Path | None = None,
+    html: Path | None = None,
+    against: str = "chain_fit",
+    rank: Rank = "phi",
+    bootstrap_seed: Whole = 0,
+    json: Annotated[bool, Parameter(negative="", help="Everything as one JSON document on the standard output.")] = (
+        False
+    ),
+) -> int:
+    """Write the page of results: every method on every preset, differences, strata, causes, from score files.
+
+    Without --out, --html or --json the page goes to the standard output.
+
+    Parameters
+    ----------
+    files
+        JSON files that `score --out` or `bench` wrote, with their Parquet files beside them.
+    out
+        Page in Markdown to write.
+    html
+        Page in HTML to write: one file, without network and scripts.
+    against
+        Method that the others are compared with, sample by sample; the best one where it has no score.
+    rank
+        Error that methods are ranked by, missed spots and false detections counted: phi, or depth for D.
+    bootstrap_seed
+        Seed of the bootstrap that makes the intervals of differences.
+    """
+    from json import dumps
+
+    from phibench.estimator.benchmark.results_page import read_parts, results_document, results_page, write_results
+
+    parts = read_parts(files, against, rank, _seed(bootstrap_seed))
+    for path in write_results(parts, out, html, rank):
+        print(f"written: {path}", file=sys.stderr)
+    if json:
+        print(dumps(results_document(parts), allow_nan=False))
+    elif out is None and html is None:
+        sys.stdout.write(results_page(parts, rank))
+    return 0
+
+
 def _files(out: Path | None, cards: Sequence[MethodCard]) -> list[Path | None]:
     """One file per method: `out` itself for one, with the method's name added for several."""
     from phibench.datasets.errors import DatasetError

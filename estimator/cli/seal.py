@@ -1,11 +1,12 @@
-"""Commands `phibench seal ...`: publish frames without their truth, answer them, and open the seal."""
+"""Commands `phibench seal ...` and `submission ...`: frames without their truth, answers to them, and their checks."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Annotated
 
-from cyclopts import App
+from cyclopts import App, Parameter
 
 from phibench.estimator.cli.options import LIMITS, METHODS, Limits, Whole
 
@@ -112,4 +113,57 @@ def open_(public: Path, *, truth: Path, submission: Path, out: Path | None = Non
     print_scores([scored if out is None else saved(scored, out)], "terminal", "phi", wide=False)
     if out is not None:
         print(f"written: {out}")
+    return 0
+
+
+submission = App(
+    name="submission",
+    group=METHODS,
+    help="Check a score that is to be added to the results.",
+)
+
+
+@submission.command
+def check(
+    file: Path,
+    *,
+    data: Path | None = None,
+    release: Path | None = None,
+    json: Annotated[bool, Parameter(negative="", help="The outcome as one JSON document.")] = False,
+) -> int:
+    """Check a score file of an open set: a sentence for each fault. The exit code is 1 if there is one.
+
+    Form, version, hashes, pairs, impossible values, errors and statistics; with --data truth and bounds as well.
+
+    Parameters
+    ----------
+    file
+        JSON file that `phibench score --out` wrote, with its Parquet file beside it.
+    data
+        Folder of the data set that was scored: truth and bounds are computed again.
+    release
+        MANIFEST.json of a release: the data set must be one of it.
+    """
+    from phibench.estimator.sealed.score_check import check_score
+
+    checked = check_score(file, data, release)
+    if json:
+        sys.stdout.write(checked.text())
+        return int(bool(checked.faults))
+    for fault in checked.faults:
+        print(fault)
+    for left in checked.unchecked:
+        print(f"not checked: {left}", file=sys.stderr)
+    count = len(checked.faults)
+    words = "no fault found" if not count else f"{count} fault{'s' * (count > 1)}"
+    print(f"{file}: {checked.method} on {checked.pairs} pairs, {words}")
+    return int(bool(count))
+
+
+@submission.command
+def schema() -> int:
+    """Print the JSON schema of a score file."""
+    from phibench.estimator.sealed.score_check import schema_text
+
+    sys.stdout.write(schema_text())
     return 0
