@@ -35,9 +35,10 @@ from phibench.estimator.benchmark.score_tables import (
 )
 
 AGAINST = "chain_fit"
-_BOARD = ("rank_phi_rad", "rank_depth", "detection_rate", "false_rate", "median_px", "rms_px", "rms_depth_relative")
-_PRECISION = ("efficiency_px", "efficiency_pair_px", "pull_deviation", "coverage_depth", "seconds")
-_DIFFERENCES = ("rank_phi_rad", "rank_depth", "detection_rate", "false_rate", "median_px", "rms_px")
+_BOARD = ("rank_phi_rad", "rank_depth", "detection_rate", "false_rate")
+_ERRORS = ("median_px", "rms_px", "median_depth_relative", "rms_depth_relative")
+_CLAIMS = ("efficiency_px", "efficiency_pair_px", "pull_deviation", "coverage_depth")
+_DIFFERENCES = ("rank_phi_rad", "rank_depth", "detection_rate", "median_px", "rms_px")
 _STRATA = ("spot", "signal", "depth", "stroke", "hint", "quality")
 _SHOWN = 4
 """Methods whose strata are shown: the best ones, and the one that the others are compared with."""
@@ -48,12 +49,12 @@ _HEADS = {
     "false_rate": "false",
     "median_px": "median",
     "rms_px": "rms",
+    "median_depth_relative": "median D",
     "rms_depth_relative": "rms D",
     "efficiency_px": "efficiency",
     "efficiency_pair_px": "efficiency, pair",
     "pull_deviation": "pull",
     "coverage_depth": "coverage of D",
-    "seconds": "time",
 }
 
 
@@ -128,11 +129,15 @@ def _part(group: Sequence[tuple[ScoreDocument, pl.DataFrame]], against: str, by:
 
 
 def grids(part: Part) -> list[Grid]:
-    """Tables of a part: ranking, precision, differences, strata, causes."""
+    """Tables of a part: ranking, errors, claims, differences, strata, causes."""
     causes = cause_table(part.scores)
     if len(part.scores) == 1:
         causes = Grid(causes.title, causes.heads[:-1], tuple(row[:-1] for row in causes.rows), causes.columns[:-1])
-    made = [_board(part, "Ranking", _BOARD), _board(part, "Precision", _PRECISION)]
+    made = [
+        _board(part, "Ranking", _BOARD),
+        _board(part, "Errors of found spots and depths", _ERRORS),
+        _board(part, "Efficiency and claims", _CLAIMS),
+    ]
     return [*made, *([_differences(part)] if part.differences else []), _strata(part), causes]
 
 
@@ -184,14 +189,14 @@ def _strata(part: Part) -> Grid:
             cells = (_in_stratum(one, stratum) for one in shown)
             rows.append((stratum.by, stratum.label, str(stratum.images), *cells))
     heads = ("by", "stratum", "images", *(one.method.name for one in shown))
-    return Grid("Found / %, median error / px", heads, tuple(rows), "llr" + "r" * len(shown))
+    return Grid("Found / %; median error / px", heads, tuple(rows), "llr" + "r" * len(shown))
 
 
 def _in_stratum(one: ScoreDocument, wanted: StratumScore) -> str:
     for stratum in one.strata:
         if (stratum.by, stratum.label) == (wanted.by, wanted.label):
-            there = [name for name in ("detection_rate", "median_px") if name in stratum.metrics]
-            return ", ".join(_cut(" ".join(shown_parts(name, stratum.metrics[name]))) for name in there)
+            found, _ = shown_parts("detection_rate", stratum.metrics["detection_rate"])
+            return f"{found}; {_cut(' '.join(shown_parts('median_px', stratum.metrics['median_px'])))}"
     return ""
 
 
@@ -203,14 +208,15 @@ _INTRODUCTION = """# Results
 [Scoring](scoring.md) defines every number; [how to add a result](submission.md) is a page of its own.
 """
 _LEGEND = """Values have 95 % intervals over samples in brackets. A star: too few samples for an interval.
-A blank: the metric is not that method's. The first table is ordered by the rank of {quantity}.
+A blank: the metric is not that method's. A dash: nothing to compute it from.
 
 | table | what it shows |
 |---|---|
-| Ranking | rms errors with missed spots and false detections counted; then found, false, errors of found spots |
-| Precision | rms at the bound over rms, deviation of pulls (1 is right), coverage of D (95 is right), time of a pair |
-| Method minus | paired differences on the same samples; two stars: shown by the test, Holm over 16 metrics |
-| Found, median | strata of the best methods and of the one that is compared with |
+| Ranking | rms errors with missed spots and false detections counted, the best rank of {quantity} first; found, false |
+| Errors of found spots and depths | each method over what it has found itself: who finds less has easier spots |
+| Efficiency and claims | rms at the bound over rms; deviation of pulls, 1 is right; coverage of D, 95 is right |
+| Method minus | paired differences on the same samples; two stars: shown by an exact test, Holm over 16 metrics |
+| Found; median error | strata, of the best methods and of the one that is compared with |
 | Images without a right position | counts by kind, and their most frequent causes |
 """
 
