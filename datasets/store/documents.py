@@ -118,17 +118,11 @@ def _difference(given: Any, whole: Any, place: str = "its root") -> str:
     elif isinstance(whole, list) and isinstance(given, list | tuple) and len(whole) == len(given):
         inner = ((str(number), *pair) for number, pair in enumerate(zip(given, whole, strict=True)))
     else:
-        same = _same_kind(given, whole) or (place.startswith("stream.") and _is_seed(given))
-        return "" if same else f"{place} is {printable_line(repr(given), 60)}: not allowed"
+        return "" if _same_kind(given, whole) else f"{place} is {printable_line(repr(given), 60)}: not allowed"
     faults = (
         _difference(value, known, key if place == "its root" else f"{place}.{key}") for key, value, known in inner
     )
     return next(filter(None, faults), "")
-
-
-def _is_seed(given: Any) -> bool:
-    """True for a data set's seed, which may be any whole number below 2^64; it is part of the names of streams."""
-    return isinstance(given, int) and not isinstance(given, bool) and 0 <= given < 2**64
 
 
 def _same_kind(given: Any, whole: Any) -> bool:
