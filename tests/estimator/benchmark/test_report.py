@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 import re
+import shutil
 from html.parser import HTMLParser
 
 import numpy as np
@@ -15,10 +17,12 @@ from PIL import Image
 from phibench.datasets.errors import DatasetError
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.causes import CAUSES
-from phibench.estimator.benchmark.document import Flag, MethodCard
+from phibench.estimator.benchmark.document import Flag, MethodCard, write_score
 from phibench.estimator.benchmark.figures import Picture, cause_bars, plain_number, pull_histogram
-from phibench.estimator.benchmark.report import Section, report_html, verdict, write_report
+from phibench.estimator.benchmark.report import Section, report_html, time_section, verdict, write_report
+from phibench.estimator.benchmark.results_page import read_parts
 from phibench.estimator.benchmark.score import score_outcomes
+from phibench.estimator.cli import main as cli
 
 RULES = Rules(resamples=199)
 
@@ -264,3 +268,48 @@ def test_sections_follow(crowded):
 def test_a_report_of_nothing_is_refused(tmp_path):
     with pytest.raises(DatasetError, match="a report of nothing"):
         write_report([], tmp_path / "page.html")
+
+
+@pytest.fixture(scope="module")
+def score_files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("results")
+    for name, oracle in (("half", shifted(0.5)), ("tenth", shifted(0.1)), ("mixed", mixed)):
+        write_score(folder / f"{name}.json", *scored(name, oracle))
+    return sorted(folder.glob("*.json"))
+
+
+def test_results_are_one_page_in_each_form(score_files, tmp_path, capsys):
+    words = ["results", *map(str, score_files), "--against", "half"]
+    page, html = tmp_path / "results.md", tmp_path / "results.html"
+    assert cli.main([*words, "--out", str(page), "--html", str(html), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)  # the document and nothing else
+    (part,) = document["parts"]
+    assert (part["against"], list(part["differences"])) == ("half", ["tenth", "mixed"])
+    found = part["differences"]["tenth"]["rms_px"]
+    assert found["difference"] == pytest.approx(-0.4, abs=1e-9)
+    text = page.read_text()
+    assert "| tenth | " in text.partition("**Method minus half**")[2]
+    assert max(len(line) for line in text.split("\n") if line.startswith("|")) <= 160
+    assert max(len(line) for line in text.split("\n") if not line.startswith("|")) <= 120
+    read = Page(html.read_text())
+    assert len(read.of("table")) == 7  # sources, and six of the part
+    assert all(box["tabindex"] == "0" for box in read.of("div") if box.get("class") == "wide")
+    again = tmp_path / "again.md"
+    assert cli.main([*words, "--out", str(again)]) == 0
+    assert again.read_bytes() == page.read_bytes()
+
+
+def test_results_of_nothing_or_of_one_method_twice_are_refused(score_files, tmp_path):
+    copy = tmp_path / score_files[0].name
+    for suffix in (".json", ".parquet"):
+        shutil.copy(score_files[0].with_suffix(suffix), tmp_path)
+    with pytest.raises(DatasetError, match="another score of the same pairs"):
+        read_parts([score_files[0], copy])
+    with pytest.raises(DatasetError, match="results of nothing"):
+        read_parts([])
+
+
+def test_the_report_says_where_the_time_went():
+    times = {"mjpeg": {"draw": 0.5, "detect": 0.25}, "bayer-raw": {"draw": 0.4}}
+    (table,) = time_section(times).tables
+    assert table[1:] == (("draw", "500.0", "400.0"), ("detect", "250.0", ""), ("all", "750.0", "400.0"))

@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import textwrap
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from helpers.processes import quiet
+from helpers.sandbox_pairs import HEADER, method_file
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.read import open_finished
+from phibench.estimator.benchmark.dataset_pairs import dataset_pairs
 from phibench.estimator.benchmark.document import read_score
 from phibench.estimator.benchmark.score import bench, score
+from phibench.estimator.methods import locate
+from phibench.estimator.methods.locate import SharedPair
+from phibench.estimator.methods.registry import METHODS
+from phibench.estimator.sandbox.process import MethodProcess
+from phibench.estimator.sandbox.resolve import MethodError, RunLimits, resolve
+from phibench.estimator.sandbox.runner import Harness
+from phibench.estimator.spots.detect import detect
 
 
 def test_the_benchmark_runs_what_accepts_each_preset(bench_dataset: Path, tmp_path: Path) -> None:
@@ -41,3 +53,67 @@ def test_a_benchmark_that_cannot_be_is_refused(
     folder = bench_dataset / "out" if out == "inside" else tmp_path / out
     with pytest.raises(DatasetError, match=words):
         bench(bench_dataset, folder, names, console=quiet())
+
+
+@pytest.mark.parametrize("preset", ["bayer-raw", "mjpeg"])
+def test_shared_work_is_done_once_and_changes_no_answer(
+    bench_dataset: Path, preset: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair = dataset_pairs(open_finished(bench_dataset), preset).pair(0)
+    asked = [method for method in METHODS.values() if not method.refusal(pair)]
+    alone = [repr(method(pair)) for method in asked]  # repr of a float tells every bit
+    searches: list[int] = []
+    monkeypatch.setattr(locate, "detect", lambda one: searches.append(one.number) or detect(one))
+    for order in (1, -1):
+        shared = SharedPair.of(pair)
+        assert [repr(method(shared)) for method in asked[::order]] == alone[::order]
+        assert len(shared.work.stages) == 2  # the search, and the fits of each image that joint_fit begins with
+    assert len(asked) >= 9
+    assert searches == [0, 0]
+    # another pair has nothing of this one's work
+    assert replace(shared, stroke_m=0.1).work.stages == {}
+
+
+def test_a_method_of_others_neither_profits_from_shared_work_nor_changes_it(
+    bench_dataset: Path, tmp_path: Path
+) -> None:
+    body = """
+    from phibench.estimator.methods import locate
+    from phibench.estimator.spots import detect
+    locate.detect = detect.detect = lambda pair: 1 / 0
+    return Answer(Spot((float(hasattr(pair, "work")), float(os.getpid()))), Spot.missing(type(pair).__name__))
+    """
+    foreign = method_file(tmp_path, textwrap.dedent(body), header=f"import os\n{HEADER}")
+    pairs = dataset_pairs(open_finished(bench_dataset), "bayer-raw")
+    names = ["red_centroid", foreign, "detect", "off_difference"]
+    with Harness(names) as harness:
+        done = list(harness.outcomes(pairs, range(2)))
+        assert len(harness.isolations) == len(names)
+        assert {"draw", "detect", "red_centroid", "off_difference"} <= set(harness.stages)
+        assert harness.stages["off_difference"] < harness.stages["detect"]  # it found the search done
+    for number, outcomes in enumerate(done):
+        pair = pairs.pair(number)
+        right = {name: repr(METHODS[name](pair)) for name in names if name in METHODS}
+        assert {name: repr(one.answer) for name, one in zip(names, outcomes, strict=True) if name in right} == right
+        answer = outcomes[1].answer
+        assert answer is not None
+        assert (answer.down.uv_px or (1.0,))[0] == 0.0
+        assert answer.up.status == "Pair"
+        # a method's time is what it takes alone, the search included
+        assert outcomes[3].seconds > 0.5 * outcomes[0].seconds
+    with pytest.raises(MethodError, match="built-in methods alone share a process"):
+        MethodProcess(resolve("detect"), RunLimits(), others=[resolve(foreign)])
+
+
+def test_a_shared_process_that_ends_is_started_anew(bench_dataset: Path) -> None:
+    pair = dataset_pairs(open_finished(bench_dataset), "bayer-raw").pair(0)
+    process = MethodProcess(resolve("red_centroid"), RunLimits(), others=[resolve("detect")])
+    try:
+        first = process.ask(pair, 0)
+        process.end()
+        second = process.ask(pair, 1)
+    finally:
+        process.close()
+    assert (repr(first.answer), repr(second.answer)) == tuple(
+        repr(METHODS[n](pair)) for n in ("red_centroid", "detect")
+    )
