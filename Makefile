@@ -38,7 +38,7 @@ help:
 	@echo "make attack     hostile methods, files and moments: nothing is lost, and nobody is fooled (docs/trust.md)"
 	@echo "make mutants    proof that the tests see faults: one fault at a time, in copies of the checkout"
 	@echo "make benchmark  timings of what must be fast"
-	@echo "make docs       all pages and the reference as a site, in out/site; it works from disk"
+	@echo "make docs       all pages and the reference as a site, in out/site; runs the tutorials; it works from disk"
 	@echo "make dist       source distribution and wheel, in dist/"
 	@echo "make lint       ruff and mypy"
 	@echo "make clean      remove caches and builds; .venv and out/ stay"
