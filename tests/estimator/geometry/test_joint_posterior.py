@@ -88,10 +88,10 @@ def test_map_of_a_quadratic_misfit_is_its_profile(sigma_px: float) -> None:
     F[:, :2] *= scale
     best = np.array([7.0, 8.0, 9000.0, 3.0, 4.0])
 
-    def scores(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def scores(theta: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         off = theta - best
-        repeated = np.repeat(F[None], len(theta), axis=0)
-        return 5.0 + np.einsum("mi,ij,mj->m", off, F, off), -off @ F, repeated
+        repeated = np.repeat(F[None, first:, first:], len(theta), axis=0)
+        return 5.0 + np.einsum("mi,ij,mj->m", off, F, off), (-off @ F)[:, first:], repeated
 
     found = likelihood_map(SpotLikelihood(scores, best, np.array([100.0, 200.0]), 1.0))
     assert found is not None
