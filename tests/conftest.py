@@ -118,15 +118,19 @@ def misaligned_dataset(shared: SharedFolder, tmp_path_factory: pytest.TempPathFa
     return rendered(shared, "misaligned", folder / "recipe.toml")
 
 
-def filmed(shared: SharedFolder, name: str, old: str = "", new: str = "") -> Path:
-    """Films of `tests/films.toml` with a change, made once for all test processes. Read only."""
+def filmed(shared: SharedFolder, name: str, changes: dict[str, str], alone: bool = False) -> Path:
+    """Films of `tests/films.toml` with changes, made once for all test processes. Read only.
+
+    `alone`: without vibration and other lights.
+    """
     from phibench.datasets.film.film_make import make_films
 
     def make(out: Path) -> None:
-        recipe = out.with_suffix(".toml")
-        recipe.write_text(
-            (ROOT / "tests" / "films.toml").read_text(encoding="utf-8").replace(old, new), encoding="utf-8"
-        )
+        recipe, text = out.with_suffix(".toml"), (ROOT / "tests" / "films.toml").read_text(encoding="utf-8")
+        for old, new in changes.items():
+            assert old in text
+            text = text.replace(old, new)
+        recipe.write_text(text.split("[[film.vibration]]")[0] if alone else text, encoding="utf-8")
         make_films(recipe, out, 1)
 
     return shared.made(name, make)
@@ -135,23 +139,31 @@ def filmed(shared: SharedFolder, name: str, old: str = "", new: str = "") -> Pat
 @pytest.fixture(scope="session")
 def film_windows(shared: SharedFolder) -> Path:
     """Films of windows around the spot. Read only."""
-    return filmed(shared, "films-windows")
+    return filmed(shared, "films-windows", {})
 
 
 _MOVES = "window_px = 24\nspeed_m_per_s = 1.0\nacceleration_m_per_s2 = 4.0\n"
+_RESTS = f"{_MOVES}pauses_s = [0.6, 0.6]\n"
 _BLINKING = f'frames = 10\n{_MOVES}pauses_s = [0.2, 0.1]\ncode = "110"\nbit_s = 0.2\n'
 
 
 @pytest.fixture(scope="session")
 def film_with_rests(shared: SharedFolder) -> Path:
     """Film with a laser that is on all the time, and with rests of some frames."""
-    return filmed(shared, "films-rests", _BLINKING, f"{_MOVES}pauses_s = [0.6, 0.6]\n")
+    return filmed(shared, "films-rests", {_BLINKING: _RESTS})
+
+
+@pytest.fixture(scope="session")
+def film_processed(shared: SharedFolder) -> Path:
+    """The same for processed frames: whole units of a JPEG, a spot below the full well, and nothing else that moves."""
+    changes = {_BLINKING: _RESTS, "height_px = 90": "height_px = 96", "power_w = 64e-3": "power_w = 40e-3"}
+    return filmed(shared, "films-processed", changes, alone=True)
 
 
 @pytest.fixture(scope="session")
 def film_images(shared: SharedFolder) -> Path:
     """The same as whole images. Read only."""
-    return filmed(shared, "films-images", "window_px = 24", 'view = "full"')
+    return filmed(shared, "films-images", {"window_px = 24": 'view = "full"'})
 
 
 @pytest.fixture(scope="session")

@@ -133,25 +133,31 @@ def experiments(
     jpeg_quality
         Of mjpeg.
     stroke
-        Fit all frames of the stroke as well; raw pixels only.
+        Fit the whole stroke as well.
     out
         Parquet file for the rows.
     """
     from phibench.datasets.film.film_read import open_films
     from phibench.datasets.read import open_finished
     from phibench.datasets.store.files import require_writable
-    from phibench.estimator.paper.film_experiments import FilmProcedure, run_film_experiments, summary
+    from phibench.estimator.paper.film_experiments import FilmProcedure, closure_interval, run_film_experiments, summary
 
     if out is not None:
         require_writable(out)
     numbers = {"jpeg_quality": jpeg_quality} if preset == "mjpeg" else None
     procedure = FilmProcedure(preset, on, off, cameras, stroke, numbers)
     rows = run_film_experiments(open_films(directory), open_finished(calibration), procedure)
-    print(f"{'way':8s} {'films':>5s} {'rms':>8s} {'predicted':>9s} {'pull':>6s} {'within 95 %':>11s} {'gain':>6s}")
+    print(
+        f"{'way':8s} {'films':>5s} {'rms':>8s} {'predicted':>9s} {'pixels':>8s} {'ratio':>6s} {'95 % if right':>14s} "
+        f"{'pull':>6s} {'within 95 %':>11s} {'gain':>6s}"
+    )
     for row in summary(rows).iter_rows(named=True):
+        low, high = closure_interval(rows.filter(rows["way"] == row["way"]))
+        interval = f"{low:.2f} to {high:.2f}"
         print(
-            f"{row['way']:8s} {row['films']:5d} {row['rms']:8.3%} {row['predicted']:9.3%} {row['pull']:6.2f} "
-            f"{row['within_95']:11.1%} {row['gain']:6.2f}"
+            f"{row['way']:8s} {row['films']:5d} {row['rms']:8.3%} {row['predicted']:9.3%} {row['pixels']:8.3%} "
+            f"{row['rms'] / row['predicted']:6.2f} {interval:>14s} "
+            f"{row['pull']:6.2f} {row['within_95']:11.1%} {row['gain']:6.2f}"
         )
     if out is not None:
         rows.write_parquet(out)

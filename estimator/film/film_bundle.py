@@ -47,6 +47,9 @@ class FilmDepth:
         Sum of squares of the positions, with 2 N - 3 degrees of freedom.
     frames : int
         N.
+    by_rig_m : array, shape (p,)
+        Derivatives of D by `rig_parameters.PARAMETERS`, with which errors of one rig are common to several depths; 0
+        for an exact rig.
     """
 
     point_world_m: Array
@@ -57,6 +60,7 @@ class FilmDepth:
     offset_sigma_m: Array
     chi2: float
     frames: int
+    by_rig_m: Array
 
 
 def film_depth(
@@ -105,7 +109,7 @@ def film_depth(
         X = X + step * min(1.0, 0.5 * far / max(float(np.linalg.norm(step)), 1e-12))
         if float(np.linalg.norm(step)) < _SETTLED_M:
             break
-    return _result(rig, X, readings, y, S, sigma_m)
+    return _result(rig, X, readings, y, S, sigma_m, covariance_rig is not None)
 
 
 @dataclass(frozen=True)
@@ -162,12 +166,18 @@ def _start(rig: Rig, positions: FilmPositions, readings: Array) -> Array:
     return np.asarray(found.point_world_m + offset[0] * np.array(rig.stroke_axis_world))
 
 
-def _result(rig: Rig, X: Array, readings: Array, y: Array, S: tuple[Array, bool], sigma_m: Array) -> FilmDepth:
+def _result(
+    rig: Rig, X: Array, readings: Array, y: Array, S: tuple[Array, bool], sigma_m: Array, calibrated: bool
+) -> FilmDepth:
     at = _predicted(rig, X, readings)
     covariance = np.linalg.inv(at.by_point.T @ cho_solve(S, at.by_point))
     radial = X[:2] - rig.at(0.0).sphere_centre_m[:2]
     D = float(np.hypot(*radial))
     gradient = np.array([*(radial / D), 0.0])
+    by_rig_m = np.zeros(len(PARAMETERS))
+    if calibrated:  # a rig that moves the images as u moves the fitted point as -u
+        weights = cho_solve(S, at.by_point @ (covariance @ gradient))
+        by_rig_m = -weights @ rig_derivatives(rig, X, readings, at.by_offset)
     residual = y - at.uv
     whitened = cho_solve(S, residual)
     # rows of J_p, one block of two per frame
@@ -190,6 +200,7 @@ def _result(rig: Rig, X: Array, readings: Array, y: Array, S: tuple[Array, bool]
         np.sqrt(np.maximum(variance, 0.0)),
         float(residual @ whitened),
         len(readings),
+        by_rig_m,
     )
 
 

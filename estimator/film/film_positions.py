@@ -70,6 +70,15 @@ class FilmPositions:
         return total.reshape(2 * count, 2 * count)
 
 
+def joined(first: FilmPositions, second: FilmPositions) -> FilmPositions:
+    """Positions of both, which share nothing."""
+    a, b = len(first.uv_px), len(second.uv_px)
+    shared = np.zeros((a + b, 2, a + b, 2))
+    shared[:a, :, :a], shared[a:, :, a:] = first.shared_px2, second.shared_px2
+    uv, noise = np.concatenate([first.uv_px, second.uv_px]), np.concatenate([first.noise_px2, second.noise_px2])
+    return FilmPositions(uv, noise, shared)
+
+
 @dataclass(frozen=True)
 class _Windows:
     """Squares of N frames, room taken off, with the law of their pixels and the weights (N, M) of the room."""

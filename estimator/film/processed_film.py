@@ -5,6 +5,9 @@ weights of `film_frames.room_weights`, and smoothed as `background_of` does it f
 predict the spot, the interval fit of a JPEG's coefficients (`processed.interval_fit`) or the quasi-score of other
 outputs gives the place. Motion blur is part of the spot's model. Frames at rest are better fitted as a burst.
 
+The interval fit starts from a prior of 2 px about the prediction. Many frames would each count it, so it is taken out:
+the place is one scoring step of the likelihood alone (`IntervalPosterior.likelihood`) from the posterior's mean.
+
 What frames share by the same frames with the laser off, and by the pattern of the spot's own light, is left out: the
 rounding of a single JPEG is several times as large.
 """
@@ -17,9 +20,9 @@ from numpy.typing import NDArray
 from phibench.estimator.film.film_frames import FARTHEST_PX, FilmFrames, Index, room_weights
 from phibench.estimator.film.film_positions import FilmPositions
 from phibench.estimator.processed.fit_chain import spot_window, undone, unrounded
-from phibench.estimator.processed.interval_fit import fit_intervals
-from phibench.estimator.processed.quasi_score import fit_window
-from phibench.estimator.spots.fisher import covariance_bound
+from phibench.estimator.processed.interval_fit import interval_posterior
+from phibench.estimator.processed.quasi_score import Window, fit_window
+from phibench.estimator.spots.fisher import covariance_bound, scoring_step
 from phibench.estimator.spots.fit_raw import LEAST_SNR
 from phibench.estimator.spots.gaussian_spot import SpotModel
 from phibench.estimator.spots.jpeg_coefficients import mcu_px
@@ -56,13 +59,28 @@ def processed_positions(frames: FilmFrames, point_world_m: Array, which: Index) 
         window, start, origin = spot_window(
             image, corner[None], places[k], frames.card, blur.rows(np.array([k])), SpotModel((r, g, b)), room, size
         )
-        found = fit_intervals(window, start) if window.of_intervals else fit_window(window, start[None])
-        covariance = covariance_bound(found.fisher, keep=3)
-        if found.converged and found.theta[2] > LEAST_SNR * np.sqrt(covariance[2, 2]):
-            uv[row] = found.theta[:2] + origin
-            noise[row] = covariance[:2, :2] * max(1.0, found.chi2)
+        theta, fisher = _of_intervals(window, start) if window.of_intervals else _of_score(window, start)
+        covariance = covariance_bound(fisher, keep=3)
+        if theta[2] > LEAST_SNR * np.sqrt(covariance[2, 2]):
+            uv[row] = theta[:2] + origin
+            noise[row] = covariance[:2, :2]
     nothing = np.zeros((len(which), 2, len(which), 2))
     return FilmPositions(uv, noise, nothing), offsets[which]
+
+
+def _of_intervals(window: Window, start: Array) -> tuple[Array, Array]:
+    """Unknowns and Fisher matrix by the likelihood alone; NaN where the posterior is none."""
+    found = interval_posterior(window, start)
+    if found is None or not found.settled:
+        return np.full(len(start), np.nan), np.eye(len(start))
+    (r,), (J,) = found.likelihood()(found.theta[None])
+    fisher = J @ J.T
+    return found.theta + scoring_step(fisher[None], (J @ r)[None])[0], fisher
+
+
+def _of_score(window: Window, start: Array) -> tuple[Array, Array]:
+    found = fit_window(window, start[None])
+    return (found.theta if found.converged else np.full(len(start), np.nan)), found.fisher
 
 
 def _units(frames: FilmFrames, uv_px: Array) -> tuple[NDArray[np.int64], tuple[slice, slice]]:

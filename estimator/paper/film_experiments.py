@@ -5,7 +5,11 @@ Every film then gives D in two ways, each for several cameras, whose fixed patte
 
 1. burst: frames at rest at both ends, every other one with the laser off, by the method that is closest to the bound
    (`method_for`), as for stills of so many frames;
-2. stroke (raw pixels): all frames of the film, by the joint bundle (`film_bundle`).
+2. stroke: all frames of the film, by the joint bundle (`film_bundle`). Of processed images these are both bursts, and
+   the frames on the way one by one (`processed_film`).
+
+Errors of one rig's calibration are common to all its rows. `closure_interval` draws errors that are as the budget says,
+that part common, and so tells how far rms over predicted may lie from 1.
 
 A film holds the room around its spot alone. Its images are cut-outs, seen by a camera whose principal point is moved by
 as much: mosaic and JPEG blocks keep their phase, because regions begin at whole tiles.
@@ -27,22 +31,27 @@ from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.read import Dataset
 from phibench.estimator.calibration.bundle import Bundle
 from phibench.estimator.calibration.spots import method_for
-from phibench.estimator.film.film_bundle import FilmDepth
+from phibench.estimator.film.film_bundle import FilmDepth, film_depth
 from phibench.estimator.film.film_estimates import EqualLight, bundle_depth, equal_light, seen_film
 from phibench.estimator.film.film_frames import film_frames, lit_frames
-from phibench.estimator.geometry.least_squares_depth import depth_general
+from phibench.estimator.film.film_positions import FilmPositions, joined
+from phibench.estimator.film.processed_film import processed_positions
 from phibench.estimator.interface import Image, Pair
 from phibench.estimator.paper.experiment_tables import Procedure, calibrate_rig
+from phibench.scenes.frames import Array
 from phibench.scenes.laser import Beam
+from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import Rig
 
 COLUMNS = (
     *("film", "experiment", "rig", "camera", "way", "depth_m", "error_m", "sigma_m", "frames"),
-    *("film_pixels_m", "two_ends_pixels_m"),
+    *("film_pixels_m", "two_ends_pixels_m", "calibration_m"),
 )
-"""The last two: standard deviations of D from pixels and encoder alone, of the film and of as many frames in two bursts
-at the ends of its stroke; NaN for bursts."""
+"""The last three: standard deviations of D from pixels and encoder alone, of these frames and, for a raw film, of as
+many frames in two bursts at the ends of its stroke; errors of D by one standard deviation of each independent part of
+the calibration, a list."""
 WITHIN = 1.959963984540054
+_DRAWS = 4000  # of `closure_interval`: its ends are good to 1 %
 
 
 @dataclass(frozen=True)
@@ -57,7 +66,7 @@ class FilmProcedure:
     cameras : int
         Cameras with a fixed pattern of their own, 0 to `cameras` - 1, each with a draw of the noise.
     stroke : bool
-        Whether the whole stroke is fitted, too; raw pixels only.
+        Whether the whole stroke is fitted, too.
     sensor : dict
         Numbers of the preset, such as ``jpeg_quality``.
     """
@@ -99,51 +108,99 @@ def run_film_experiments(
 _TYPES: dict[str, Any] = {
     **dict.fromkeys(("film", "experiment", "rig", "way"), pl.String),
     **dict.fromkeys(("camera", "frames"), pl.Int64),
+    "calibration_m": pl.List(pl.Float64),
 }
 
 
 def _rows(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> list[dict[str, Any]]:
-    nan = float("nan")
-    found = [("burst", *burst(film, bundle, procedure, camera), nan, nan)]
+    seen, nan = bursts(film, bundle, procedure, camera), float("nan")
+    found: list[tuple[str, FilmDepth | None, int, float]] = [("burst", seen.depth, seen.frames, nan)]
     if procedure.stroke and procedure.preset == "bayer-raw":
         at, light = whole_stroke(film, bundle, procedure, camera)
-        found.append(("stroke", at.depth_m, at.sigma_m, len(film), light.film_m, light.two_ends_m))
-    pair, depth_m = film.plan.pair, float(film.table["depth_m"][0])
-    return [
-        {
-            "film": film.info.film,
-            "experiment": pair.experiment,
-            "rig": pair.rig,
-            "camera": camera,
-            "way": way,
-            "depth_m": depth_m,
-            "error_m": estimate - depth_m,
-            "sigma_m": sigma,
-            "frames": frames,
-            "film_pixels_m": film_pixels_m,
-            "two_ends_pixels_m": two_ends_pixels_m,
-        }
-        for way, estimate, sigma, frames, film_pixels_m, two_ends_pixels_m in found
-    ]
+        found.append(("stroke", at, len(film), light.two_ends_m))
+    elif procedure.stroke:
+        whole = processed_stroke(film, bundle, procedure, camera, seen)
+        frames = seen.frames if whole is None else seen.frames + whole.frames - 2
+        found.append(("stroke", whole, frames, nan))
+    pair, depth_m, parts = film.plan.pair, float(film.table["depth_m"][0]), _independent(bundle.covariance)
+    rows = []
+    for way, one, frames, two_ends_m in found:
+        estimate, sigma = (nan, nan) if one is None else (one.depth_m, one.sigma_m)
+        calibration = np.full(len(parts), nan) if one is None else one.by_rig_m @ parts
+        rows.append(
+            {
+                "film": film.info.film,
+                "experiment": pair.experiment,
+                "rig": pair.rig,
+                "camera": camera,
+                "way": way,
+                "depth_m": depth_m,
+                "error_m": estimate - depth_m,
+                "sigma_m": sigma,
+                "frames": frames,
+                "film_pixels_m": float(np.sqrt(max(sigma**2 - calibration @ calibration, 0.0))) if one else nan,
+                "two_ends_pixels_m": two_ends_m,
+                "calibration_m": calibration.tolist(),
+            }
+        )
+    return rows
+
+
+def _independent(covariance: Array) -> Array:
+    """Matrix L of a covariance L L^T, shape (p, p), which may be singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 # Bursts.
 
 
-def burst(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> tuple[float, float, int]:
-    """D and its standard deviation from frames at rest at both ends, metres, and their number; NaN without answer."""
+@dataclass(frozen=True)
+class Bursts:
+    """Two bursts at rest.
+
+    Attributes
+    ----------
+    depth : FilmDepth or None
+        None where a spot was not found, or the rays do not meet.
+    positions : FilmPositions
+        Of both ends in the whole image; NaN where there is none.
+    offsets_m : array, shape (2,)
+    frames : int
+    """
+
+    depth: FilmDepth | None
+    positions: FilmPositions
+    offsets_m: Array
+    frames: int
+
+
+def bursts(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> Bursts:
+    """Positions and depth from frames at rest at both ends.
+
+    Raises
+    ------
+    DatasetError
+        If the film rests for fewer frames than two on and one off.
+    """
     pair = burst_pair(film, bundle, procedure, camera)
     frames = sum(pair.count(name) for name in ("down", "down_off", "up", "up_off"))
+    uv, C = np.full((2, 2), np.nan), np.full((2, 2, 2), np.nan)
     answer = method_for(pair.card)(pair)
-    spots = (answer.down, answer.up)
-    if any(one.uv_px is None or one.covariance_px2 is None for one in spots):
-        return float("nan"), float("nan"), frames
-    (uv1, uv2), (C1, C2) = (
-        [np.array(one.uv_px, float) for one in spots],
-        [np.array(one.covariance_px2, float) for one in spots],
-    )
-    at = depth_general(pair.rig, pair.stroke_m, uv1, uv2, C1, C2, bundle.covariance)
-    return float(at.depth_m), float(at.sigma_m), frames
+    for k, one in enumerate((answer.down, answer.up)):
+        if one.uv_px is not None and one.covariance_px2 is not None:
+            uv[k], C[k] = np.array(one.uv_px) + (film.info.u0_px, film.info.v0_px), one.covariance_px2
+    positions, offsets = FilmPositions(uv, C, np.zeros((2, 2, 2, 2))), np.array([0.0, pair.stroke_m])
+    return Bursts(_depth(bundle, positions, offsets, np.zeros(2)), positions, offsets, frames)
+
+
+def _depth(bundle: Bundle, positions: FilmPositions, offsets_m: Array, sigma_m: Array) -> FilmDepth | None:
+    if not positions.good[:2].all():
+        return None
+    try:
+        return film_depth(bundle.rig, positions, offsets_m, sigma_m, bundle.covariance)
+    except DatasetError:  # rays that do not meet are no answer
+        return None
 
 
 def burst_pair(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> Pair:
@@ -217,6 +274,23 @@ def whole_stroke(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: i
     return found, equal_light(seen, found.point_world_m)
 
 
+def processed_stroke(
+    film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int, ends: Bursts
+) -> FilmDepth | None:
+    """Depth from two bursts of processed frames and from single ones on the way; None where the bursts give none."""
+    if ends.depth is None:
+        return None
+    scale = ends.offsets_m[1] / film.plan.pair.nominal_stroke_m
+    sensor = procedure.sensor or {}
+    frames = film_frames(film, camera, camera, procedure.preset, rig=bundle.rig, stroke_scale=scale, **sensor)
+    resting = np.isin(frames.on, np.concatenate(resting_frames(film)))
+    moving = np.flatnonzero(~resting)
+    way, offsets = processed_positions(frames, ends.depth.point_world_m, moving)
+    # bursts stand where the carriage was told to, and readings on the way have the encoder's noise
+    sigma_m = np.concatenate([np.zeros(2), np.full(len(moving), frames.encoder_sigma_m)])
+    return _depth(bundle, joined(ends.positions, way), np.concatenate([ends.offsets_m, offsets]), sigma_m)
+
+
 # What came out.
 
 
@@ -230,6 +304,26 @@ def summary(rows: pl.DataFrame) -> pl.DataFrame:
         (claim**2).mean().sqrt().alias("predicted"),
         (pl.col("error_m").abs() <= WITHIN * pl.col("sigma_m")).mean().alias("within_95"),
         ((pl.col("error_m") / pl.col("sigma_m")) ** 2).mean().sqrt().alias("pull"),
+        ((pl.col("film_pixels_m") / pl.col("depth_m")) ** 2).mean().sqrt().alias("pixels"),
         # median over films: one of a short stroke has as much say as one of a long one
         ((pl.col("two_ends_pixels_m") / pl.col("film_pixels_m")) ** 2).median().alias("gain"),
     )
+
+
+def closure_interval(rows: pl.DataFrame) -> tuple[float, float]:
+    """95 % interval of rms over predicted, of relative errors of D, if the budget of these rows is right.
+
+    Errors from pixels and encoder are independent, those of a rig's calibration are common to its rows.
+    """
+    good = rows.filter(pl.col("error_m").is_finite() & pl.col("sigma_m").is_finite())
+    D, sigma = good["depth_m"].to_numpy(), good["sigma_m"].to_numpy()
+    common = np.array(good["calibration_m"].to_list()).reshape(len(D), -1)
+    own = np.sqrt(np.maximum(sigma**2 - np.sum(common**2, axis=1), 0.0)) / D
+    rng = generator("film experiments", "closure")
+    errors = own * rng.standard_normal((_DRAWS, len(D)))
+    for rig in good["rig"].unique(maintain_order=True):
+        mine = (good["rig"] == rig).to_numpy()
+        errors[:, mine] += rng.standard_normal((_DRAWS, common.shape[1])) @ (common[mine] / D[mine, None]).T
+    ratio = np.sqrt(np.mean(errors**2, axis=1) / np.mean((sigma / D) ** 2))
+    low, high = np.quantile(ratio, [0.025, 0.975])
+    return float(low), float(high)

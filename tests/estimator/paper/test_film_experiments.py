@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from scipy import stats
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.film.film_read import Film, open_films
@@ -16,9 +17,11 @@ from phibench.estimator.geometry.rig_parameters import PARAMETERS
 from phibench.estimator.paper.film_experiments import (
     COLUMNS,
     FilmProcedure,
-    burst,
     burst_pair,
+    bursts,
+    closure_interval,
     cut_rig,
+    processed_stroke,
     resting_frames,
     run_film_experiments,
     summary,
@@ -58,11 +61,44 @@ def test_frames_are_lit_by_the_code_or_by_turns(film_windows: Path, film_with_re
 
 def test_a_burst_of_a_cut_out_gives_the_depth(film_with_rests: Path) -> None:
     film, bundle = film_and_bundle(film_with_rests)
-    depth_m, sigma_m, frames = burst(film, bundle, FEW, 0)
-    assert frames == 8
+    found = bursts(film, bundle, FEW, 0)
+    assert found.frames == 8
+    at = found.depth
+    assert at is not None
     # a normal error beyond 5 sigma: 6e-7
-    assert abs(depth_m - film.table["depth_m"][0]) < 5.0 * sigma_m
-    assert sigma_m < 0.1 * depth_m
+    assert abs(at.depth_m - film.table["depth_m"][0]) < 5.0 * at.sigma_m
+    assert at.sigma_m < 0.1 * at.depth_m
+
+
+@pytest.mark.slow
+def test_processed_frames_on_the_way_add_to_the_bursts(film_processed: Path) -> None:
+    """Three cameras: squared pulls of D, and misfits, below their limits of 1e-5; sigma falls, D moves with the rig."""
+    film, bundle = film_and_bundle(film_processed)
+    wide = replace(bundle, covariance=1e-6 * np.diag([float(name == "stroke_relative") for name in PARAMETERS]))
+    mjpeg, depth_m = FilmProcedure("mjpeg", on=2, off=2, sensor={"jpeg_quality": 85}), film.table["depth_m"][0]
+    pulls, misfits, degrees = [], 0.0, 0
+    for camera in range(3):
+        ends = bursts(film, bundle, mjpeg, camera)
+        whole = processed_stroke(film, bundle, mjpeg, camera, ends)
+        assert whole is not None
+        assert ends.depth is not None
+        assert whole.frames > 3
+        assert whole.sigma_m < 0.9 * ends.depth.sigma_m
+        pulls.append((whole.depth_m - depth_m) / whole.sigma_m)
+        misfits, degrees = misfits + whole.chi2, degrees + 2 * whole.frames - 3
+    assert np.sum(np.square(pulls)) < stats.chi2.ppf(1 - 1e-5, 3)
+    assert misfits < stats.chi2.ppf(1 - 1e-5, degrees)
+    # a stroke that is longer by a thousandth makes D larger by as much
+    found = processed_stroke(film, wide, mjpeg, 0, bursts(film, wide, mjpeg, 0))
+    assert found is not None
+    assert found.by_rig_m[-1] == pytest.approx(depth_m, rel=0.1)
+    assert found.sigma_m**2 == pytest.approx(whole_sigma_m(film, bundle, mjpeg) ** 2 + (1e-3 * depth_m) ** 2, rel=0.05)
+
+
+def whole_sigma_m(film: Film, bundle: Bundle, procedure: FilmProcedure) -> float:
+    found = processed_stroke(film, bundle, procedure, 0, bursts(film, bundle, procedure, 0))
+    assert found is not None
+    return found.sigma_m
 
 
 def test_the_whole_stroke_gives_the_depth(film_with_rests: Path) -> None:
@@ -101,7 +137,7 @@ def test_what_does_not_go_together_is_one_sentence(film_windows: Path, tiny_data
 def test_summary_of_rows() -> None:
     rows = pl.DataFrame(
         [
-            ("f", "e", "r", k, "burst", 2.0, error, 0.02, 4, 0.01, 0.02)
+            ("f", "e", "r", k, "burst", 2.0, error, 0.02, 4, 0.01, 0.02, [0.0])
             for k, error in enumerate((0.02, -0.02, 0.06, float("nan")))
         ],
         schema=list(COLUMNS),
@@ -113,3 +149,16 @@ def test_summary_of_rows() -> None:
     assert row["predicted"] == pytest.approx(0.01)
     assert row["within_95"] == pytest.approx(2 / 3)
     assert row["gain"] == pytest.approx(4.0)
+
+
+@pytest.mark.parametrize(("common", "degrees"), [(0.0, 20), (0.02, 1)])
+def test_the_interval_of_a_right_budget_knows_what_rows_share(common: float, degrees: int) -> None:
+    """Ends of the root of chi-square over its degrees: 20 of independent rows, 1 of rows with one common error."""
+    rows = pl.DataFrame(
+        [("f", "e", "r", k, "burst", 2.0, 0.0, 0.02, 4, 0.01, 0.02, [common, 0.0]) for k in range(20)],
+        schema=list(COLUMNS),
+        orient="row",
+    )
+    # 4000 draws: a quantile of 2.5 % is good to 2.5e-3 in probability; tails of one degree are flat below
+    expected = np.sqrt(stats.chi2.ppf([0.025, 0.975], degrees) / degrees)
+    np.testing.assert_allclose(closure_interval(rows), expected, rtol=0.06, atol=0.02)
