@@ -138,6 +138,7 @@ def experiments(
         Parquet file for the rows.
     """
     from phibench.datasets.film.film_read import open_films
+    from phibench.datasets.progress import Steps, progress_console
     from phibench.datasets.read import open_finished
     from phibench.datasets.store.files import require_writable
     from phibench.estimator.paper.film_experiments import FilmProcedure, closure_interval, run_film_experiments, summary
@@ -146,7 +147,9 @@ def experiments(
         require_writable(out)
     numbers = {"jpeg_quality": jpeg_quality} if preset == "mjpeg" else None
     procedure = FilmProcedure(preset, on, off, cameras, stroke, numbers)
-    rows = run_film_experiments(open_films(directory), open_finished(calibration), procedure)
+    films = open_films(directory)
+    with Steps(progress_console(), "films", len(films)) as steps:
+        rows = run_film_experiments(films, open_finished(calibration), procedure, told=steps.advance)
     print(
         f"{'way':8s} {'films':>5s} {'rms':>8s} {'predicted':>9s} {'pixels':>8s} {'ratio':>6s} {'95 % if right':>14s} "
         f"{'pull':>6s} {'within 95 %':>11s} {'gain':>6s}"

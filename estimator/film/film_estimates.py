@@ -72,7 +72,7 @@ def seen_film(frames: FilmFrames) -> SeenFilm:
     count, middle = len(frames.on), frames.near_px.mean(axis=0)
     blur, places = spot_blur(frames.rig, middle, None, Beam()), None
     for number in range(_ROUNDS):
-        weights = _in_time(frames) if places is None else room_weights(places[:count], places[count:])
+        weights = in_time(frames) if places is None else room_weights(places[:count], places[count:])
         positions = fit_positions(frames, blur, weights)
         rows = np.where(positions.good, positions.uv_px[:, 1], middle[1])
         offsets = frames.offsets_m(frames.on, rows)
@@ -83,7 +83,7 @@ def seen_film(frames: FilmFrames) -> SeenFilm:
     return SeenFilm(frames, positions, offsets, found)
 
 
-def _in_time(frames: FilmFrames) -> Array:
+def in_time(frames: FilmFrames) -> Array:
     """Weights of the room by straight lines in time between frames with the laser off, shape (N, M)."""
     each = np.eye(len(frames.off))
     return np.stack([np.interp(frames.on, frames.off, row) for row in each], axis=1)

@@ -126,15 +126,21 @@ class FilmFrames:
     def blur(self, point_world_m: Array, uv_px: Array) -> SpotBlur:
         """Blur of the N spots at (u, v), drawn out by the motion during the exposure."""
         D = float(np.hypot(*(point_world_m[:2] - self.rig.at(0.0).sphere_centre_m[:2])))
-        each = [spot_blur(self.rig, uv, D, Beam()) for uv in uv_px]
-        sigma, ratio, mixed = np.array([(b.sigma_px, b.ratio, b.mixed_px2) for b in each], float).T
-        still = SpotBlur(sigma, ratio, mixed)
-        nodes, weights = leggauss(_NODES)
         middle = self.times.row_s(self.on.astype(float), uv_px[:, 1])[:, None]
-        when = np.hstack([middle, middle + 0.5 * self.times.exposure_s * nodes])
+        when = np.hstack([middle, middle + 0.5 * self.times.exposure_s * leggauss(_NODES)[0]])
         places = self.image_px(point_world_m, self.stroke_scale * self.carriage.position_m(when))
-        apart = places[:, 1:] - places[:, :1]
-        return replace(still, parts=SpotParts(apart, np.broadcast_to(0.5 * weights, apart.shape[:2]), still))
+        return self._drawn_out(np.full(len(uv_px), D), uv_px, places[:, 1:] - places[:, :1])
+
+    def moving_blur(self, depth_m: Array, uv_px: Array, px_per_s: Array) -> SpotBlur:
+        """Blur of the N spots at distances (N,), which move evenly during the exposure, shape (N, 2)."""
+        apart = 0.5 * self.times.exposure_s * leggauss(_NODES)[0][:, None] * px_per_s[:, None]
+        return self._drawn_out(depth_m, uv_px, apart)
+
+    def _drawn_out(self, depth_m: Array, uv_px: Array, apart_px: Array) -> SpotBlur:
+        each = [spot_blur(self.rig, uv, float(D), Beam()) for uv, D in zip(uv_px, depth_m, strict=True)]
+        sigma, ratio, mixed = np.array([(b.sigma_px, b.ratio, b.mixed_px2) for b in each], float).T
+        still, weights = SpotBlur(sigma, ratio, mixed), 0.5 * leggauss(_NODES)[1]
+        return replace(still, parts=SpotParts(apart_px, np.broadcast_to(weights, apart_px.shape[:2]), still))
 
 
 def film_frames(
@@ -147,6 +153,7 @@ def film_frames(
     frames: Array | None = None,
     rig: Rig | None = None,
     stroke_scale: float = 1.0,
+    driving: bool = False,
     **changes: Any,
 ) -> FilmFrames:
     """Draw frames with the laser on and off.
@@ -162,6 +169,8 @@ def film_frames(
         Calibrated; the nominal one by default.
     stroke_scale : float
         Of the calibrated stroke.
+    driving : bool
+        The robot may drive, as `driving_depth` has it; places and blur by the carriage alone are then none.
     **changes
         Numbers of the preset.
 
@@ -173,10 +182,10 @@ def film_frames(
     numbers = np.arange(len(film)) if frames is None else np.asarray(frames, np.int64)
     on, off, blinks = lit_frames(film, numbers)
     region = film.info.region
-    if film.plan.scene.drive is not None:
+    if film.plan.scene.drive is not None and not driving:
         raise DatasetError(
-            f"film {film.info.film}: the robot drives, and depth of a film takes it to stand; give a film without "
-            "[[film.drive]]"
+            f"film {film.info.film}: the robot drives, and this estimator takes it to stand; give a film without "
+            "[[film.drive]], or use driving_film_depth"
         )
     nominal, card = film.plan.nominal, card_of(film.sensor(preset, **changes))
     side = min(_SIDE_PX, film.info.window_px or _SIDE_PX)

@@ -17,7 +17,7 @@ as much: mosaic and JPEG blocks keep their phase, because regions begin at whole
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -80,9 +80,13 @@ class FilmProcedure:
 
 
 def run_film_experiments(
-    films: Films, calibration: Dataset, procedure: FilmProcedure, names: Sequence[str] | None = None
+    films: Films,
+    calibration: Dataset,
+    procedure: FilmProcedure,
+    names: Sequence[str] | None = None,
+    told: Callable[[], None] = lambda: None,
 ) -> pl.DataFrame:
-    """Errors of D of every film, camera and way: one row each, `COLUMNS`.
+    """Errors of D of every film, camera and way: one row each, `COLUMNS`; `told` is called after every film.
 
     Raises
     ------
@@ -102,6 +106,7 @@ def run_film_experiments(
             known[rig] = calibrate_rig(calibration, rig, Procedure(procedure.preset))
         for camera in range(procedure.cameras):
             rows += _rows(film, known[rig], procedure, camera)
+        told()
     return pl.DataFrame(rows, schema={name: _TYPES.get(name, pl.Float64) for name in COLUMNS})
 
 
@@ -138,7 +143,7 @@ def _rows(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> 
                 "error_m": estimate - depth_m,
                 "sigma_m": sigma,
                 "frames": frames,
-                "film_pixels_m": float(np.sqrt(max(sigma**2 - calibration @ calibration, 0.0))) if one else nan,
+                "film_pixels_m": float(np.sqrt(max(sigma**2 - float(calibration @ calibration), 0.0))) if one else nan,
                 "two_ends_pixels_m": two_ends_m,
                 "calibration_m": calibration.tolist(),
             }
@@ -164,13 +169,16 @@ class Bursts:
     depth : FilmDepth or None
         None where a spot was not found, or the rays do not meet.
     positions : FilmPositions
-        Of both ends in the whole image; NaN where there is none.
+        Of both ends in the whole image, fitted; NaN where there is none.
+    seen_px : array, shape (2, 2)
+        The same; of a spot that was seen and gave no fit, where it was seen.
     offsets_m : array, shape (2,)
     frames : int
     """
 
     depth: FilmDepth | None
     positions: FilmPositions
+    seen_px: Array
     offsets_m: Array
     frames: int
 
@@ -185,18 +193,20 @@ def bursts(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) ->
     """
     pair = burst_pair(film, bundle, procedure, camera)
     frames = sum(pair.count(name) for name in ("down", "down_off", "up", "up_off"))
-    uv, C = np.full((2, 2), np.nan), np.full((2, 2, 2), np.nan)
+    uv, C, corner = np.full((2, 2), np.nan), np.full((2, 2, 2), np.nan), (film.info.u0_px, film.info.v0_px)
     answer = method_for(pair.card)(pair)
     for k, one in enumerate((answer.down, answer.up)):
-        if one.uv_px is not None and one.covariance_px2 is not None:
-            uv[k], C[k] = np.array(one.uv_px) + (film.info.u0_px, film.info.v0_px), one.covariance_px2
-    positions, offsets = FilmPositions(uv, C, np.zeros((2, 2, 2, 2))), np.array([0.0, pair.stroke_m])
-    return Bursts(_depth(bundle, positions, offsets, np.zeros(2)), positions, offsets, frames)
+        if one.uv_px is not None:
+            uv[k] = np.array(one.uv_px) + corner
+        if one.covariance_px2 is not None:
+            C[k] = one.covariance_px2
+    fitted = np.where(np.isfinite(C).all(axis=2), uv, np.nan)
+    positions, offsets = FilmPositions(fitted, C, np.zeros((2, 2, 2, 2))), np.array([0.0, pair.stroke_m])
+    depth = _depth(bundle, positions, offsets, np.zeros(2)) if positions.good.all() else None
+    return Bursts(depth, positions, uv, offsets, frames)
 
 
 def _depth(bundle: Bundle, positions: FilmPositions, offsets_m: Array, sigma_m: Array) -> FilmDepth | None:
-    if not positions.good[:2].all():
-        return None
     try:
         return film_depth(bundle.rig, positions, offsets_m, sigma_m, bundle.covariance)
     except DatasetError:  # rays that do not meet are no answer
@@ -277,15 +287,20 @@ def whole_stroke(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: i
 def processed_stroke(
     film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int, ends: Bursts
 ) -> FilmDepth | None:
-    """Depth from two bursts of processed frames and from single ones on the way; None where the bursts give none."""
-    if ends.depth is None:
+    """Depth from two bursts of processed frames and from single ones on the way; None where a spot was not seen.
+
+    Frames of a burst that gives no fit are taken one by one, too.
+    """
+    rough = FilmPositions(ends.seen_px, np.tile(np.eye(2), (2, 1, 1)), np.zeros((2, 2, 2, 2)))
+    start = _depth(bundle, rough, ends.offsets_m, np.zeros(2)) if rough.good.all() else None
+    if start is None:
         return None
     scale = ends.offsets_m[1] / film.plan.pair.nominal_stroke_m
     sensor = procedure.sensor or {}
     frames = film_frames(film, camera, camera, procedure.preset, rig=bundle.rig, stroke_scale=scale, **sensor)
-    resting = np.isin(frames.on, np.concatenate(resting_frames(film)))
-    moving = np.flatnonzero(~resting)
-    way, offsets = processed_positions(frames, ends.depth.point_world_m, moving)
+    fitted = [at for at, good in zip(resting_frames(film), ends.positions.good, strict=True) if good]
+    moving = np.flatnonzero(~np.isin(frames.on, np.concatenate([*fitted, []])))
+    way, offsets = processed_positions(frames, start.point_world_m, moving)
     # bursts stand where the carriage was told to, and readings on the way have the encoder's noise
     sigma_m = np.concatenate([np.zeros(2), np.full(len(moving), frames.encoder_sigma_m)])
     return _depth(bundle, joined(ends.positions, way), np.concatenate([ends.offsets_m, offsets]), sigma_m)
