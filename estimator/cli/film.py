@@ -152,14 +152,14 @@ def experiments(
         rows = run_film_experiments(films, open_finished(calibration), procedure, told=steps.advance)
     print(
         f"{'way':8s} {'films':>5s} {'rms':>8s} {'predicted':>9s} {'pixels':>8s} {'ratio':>6s} {'95 % if right':>14s} "
-        f"{'pull':>6s} {'within 95 %':>11s} {'gain':>6s}"
+        f"{'one lower end':>14s} {'pull':>6s} {'within 95 %':>11s} {'gain':>6s}"
     )
     for row in summary(rows).iter_rows(named=True):
-        low, high = closure_interval(rows.filter(rows["way"] == row["way"]))
-        interval = f"{low:.2f} to {high:.2f}"
+        mine = rows.filter(rows["way"] == row["way"])
+        apart, together = ("{:.2f} to {:.2f}".format(*closure_interval(mine, common)) for common in (False, True))
         print(
             f"{row['way']:8s} {row['films']:5d} {row['rms']:8.3%} {row['predicted']:9.3%} {row['pixels']:8.3%} "
-            f"{row['rms'] / row['predicted']:6.2f} {interval:>14s} "
+            f"{row['rms'] / row['predicted']:6.2f} {apart:>14s} {together:>14s} "
             f"{row['pull']:6.2f} {row['within_95']:11.1%} {row['gain']:6.2f}"
         )
     if out is not None:

@@ -269,11 +269,11 @@ class _Problem:
         r, J = self.residuals(x)
         frames = np.arange(len(self.way.tracks_m))
         uv, _, poses, by_unknown = self.model(x, frames)
-        covariance = np.linalg.inv(J.T @ J)
+        covariance = np.asarray(np.linalg.inv(J.T @ J), float)
         centre = np.array(self.rig.at(0.0).sphere_centre_m)
         R, t = placement(self.way.vehicle, self._states(poses, frames))
         apart = x[_POINT] - (R @ centre + t)
-        D = np.asarray(np.hypot(apart[:, 0], apart[:, 1]), float)
+        D = np.hypot(apart[:, 0], apart[:, 1])
         g = apart[:, :2] / D[:, None]
         arm = R @ centre + t - np.column_stack([poses[:, :2], np.zeros(len(poses))])
         slopes = -g[:, :1] * by_unknown[:, 0] - g[:, 1:] * by_unknown[:, 1]

@@ -325,10 +325,12 @@ def summary(rows: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def closure_interval(rows: pl.DataFrame) -> tuple[float, float]:
+def closure_interval(rows: pl.DataFrame, common_end: bool = False) -> tuple[float, float]:
     """95 % interval of rms over predicted, of relative errors of D, if the budget of these rows is right.
 
-    Errors from pixels and encoder are independent, those of a rig's calibration are common to its rows.
+    Errors of a rig's calibration are common to its rows. Those from pixels and encoder are independent; or, with
+    `common_end`, half of their variance, that of the lower end, is common to all films of one target and camera, as
+    far as it comes from the pattern or from what rounding hides of a room. The truth lies between.
     """
     good = rows.filter(pl.col("error_m").is_finite() & pl.col("sigma_m").is_finite())
     D, sigma = good["depth_m"].to_numpy(), good["sigma_m"].to_numpy()
@@ -336,6 +338,9 @@ def closure_interval(rows: pl.DataFrame) -> tuple[float, float]:
     own = np.sqrt(np.maximum(sigma**2 - np.sum(common**2, axis=1), 0.0)) / D
     rng = generator("film experiments", "closure")
     errors = own * rng.standard_normal((_DRAWS, len(D)))
+    if common_end:
+        target = good.select(pl.struct("rig", "experiment", "depth_m", "camera").rank("dense"))[:, 0].to_numpy() - 1
+        errors = (errors + own * rng.standard_normal((_DRAWS, target.max() + 1))[:, target]) * np.sqrt(0.5)
     for rig in good["rig"].unique(maintain_order=True):
         mine = (good["rig"] == rig).to_numpy()
         errors[:, mine] += rng.standard_normal((_DRAWS, common.shape[1])) @ (common[mine] / D[mine, None]).T

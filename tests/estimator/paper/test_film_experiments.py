@@ -162,3 +162,8 @@ def test_the_interval_of_a_right_budget_knows_what_rows_share(common: float, deg
     # 4000 draws: a quantile of 2.5 % is good to 2.5e-3 in probability; tails of one degree are flat below
     expected = np.sqrt(stats.chi2.ppf([0.025, 0.975], degrees) / degrees)
     np.testing.assert_allclose(closure_interval(rows), expected, rtol=0.06, atol=0.02)
+    # 20 cameras: their lower ends have nothing in common; of one camera half of the variance is a single number
+    np.testing.assert_allclose(closure_interval(rows, True), expected, rtol=0.06, atol=0.02)
+    low, high = closure_interval(rows.with_columns(camera=pl.lit(0)), True)
+    assert high > 1.5 if common == 0.0 else high > 2.0
+    assert low < expected[0] + 0.05
