@@ -50,6 +50,9 @@ class FilmDepth:
     by_rig_m : array, shape (p,)
         Derivatives of D by `rig_parameters.PARAMETERS`, with which errors of one rig are common to several depths; 0
         for an exact rig.
+    places_px : array, shape (all frames, 2)
+        Fitted places y - C S^-1 (y - u(X)): the point's image, moved by what rig and carriage deviate by. NaN where
+        there is no position.
     """
 
     point_world_m: Array
@@ -61,6 +64,7 @@ class FilmDepth:
     chi2: float
     frames: int
     by_rig_m: Array
+    places_px: Array
 
 
 def film_depth(
@@ -109,7 +113,9 @@ def film_depth(
         X = X + step * min(1.0, 0.5 * far / max(float(np.linalg.norm(step)), 1e-12))
         if float(np.linalg.norm(step)) < _SETTLED_M:
             break
-    return _result(rig, X, readings, y, S, sigma_m, covariance_rig is not None)
+    places = np.full(positions.uv_px.shape, np.nan)
+    places[keep] = (y - C @ cho_solve(S, y - _predicted(rig, X, readings).uv)).reshape(-1, 2)
+    return _result(rig, X, readings, y, S, sigma_m, covariance_rig is not None, places)
 
 
 @dataclass(frozen=True)
@@ -167,7 +173,14 @@ def _start(rig: Rig, positions: FilmPositions, readings: Array) -> Array:
 
 
 def _result(
-    rig: Rig, X: Array, readings: Array, y: Array, S: tuple[Array, bool], sigma_m: Array, calibrated: bool
+    rig: Rig,
+    X: Array,
+    readings: Array,
+    y: Array,
+    S: tuple[Array, bool],
+    sigma_m: Array,
+    calibrated: bool,
+    places_px: Array,
 ) -> FilmDepth:
     at = _predicted(rig, X, readings)
     covariance = np.linalg.inv(at.by_point.T @ cho_solve(S, at.by_point))
@@ -201,6 +214,7 @@ def _result(
         float(residual @ whitened),
         len(readings),
         by_rig_m,
+        places_px,
     )
 
 

@@ -97,19 +97,22 @@ def predicted_px(frames: FilmFrames, point_world_m: Array) -> tuple[Array, Array
 
 def bundle_depth(seen: SeenFilm, covariance_rig: Array | None = None) -> FilmDepth:
     """Joint bundle over all frames: Gauss-Newton steps of the likelihood of all pixels, from the frames' own fits."""
-    frames, found = seen.frames, seen.depth
+    frames, found, places = seen.frames, seen.depth, None
     for _ in range(_STEPS):
-        positions, offsets = joint_positions(frames, found.point_world_m)
+        positions, offsets = joint_positions(frames, found.point_world_m, places)
         before, found = found, film_depth(frames.rig, positions, offsets, frames.encoder_sigma_m, covariance_rig)
         if abs(found.depth_m - before.depth_m) < _SETTLED * found.sigma_m:
             break
+        places = found.places_px
     return found
 
 
-def joint_positions(frames: FilmFrames, point_world_m: Array) -> tuple[FilmPositions, Array]:
-    """Positions one step from where a point predicts them, and offsets, shape (N,)."""
+def joint_positions(
+    frames: FilmFrames, point_world_m: Array, from_px: Array | None = None
+) -> tuple[FilmPositions, Array]:
+    """Positions one step from where a point predicts them, or from `from_px` (N, 2), and offsets, shape (N,)."""
     uv, offsets = predicted_px(frames, point_world_m)
-    return stepped_positions(frames, frames.blur(point_world_m, uv[: len(frames.on)]), uv), offsets
+    return stepped_positions(frames, frames.blur(point_world_m, uv[: len(frames.on)]), uv, from_px), offsets
 
 
 def burst_depth(seen: SeenFilm, covariance_rig: Array | None = None) -> FilmDepth:

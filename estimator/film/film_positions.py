@@ -114,16 +114,21 @@ def fit_positions(frames: FilmFrames, blur: SpotBlur, weights: Array) -> FilmPos
     return _covariances(uv, np.where(good[:, None], theta, 1.0), pixels, windows)
 
 
-def stepped_positions(frames: FilmFrames, blur: SpotBlur, at_px: Array) -> FilmPositions:
+def stepped_positions(frames: FilmFrames, blur: SpotBlur, at_px: Array, from_px: Array | None = None) -> FilmPositions:
     """Positions after one scoring step from predicted ones, flux fitted there; frames without light have none.
 
     Parameters
     ----------
     at_px : array, shape (N + M, 2)
         Predicted positions in the frames with the laser on, then in those with it off. Others as for `fit_positions`.
+    from_px : array, shape (N, 2), optional
+        Places to step from, where they are finite: a rig that is not exact predicts none that are near enough.
     """
     count = len(frames.on)
     here, weights = at_px[:count], room_weights(at_px[:count], at_px[count:])
+    # farther from all frames with the laser off the room is not known
+    known = np.linalg.norm(here[:, None] - at_px[count:], axis=2).min(axis=1) < FARTHEST_PX
+    here = here if from_px is None else np.where(np.isfinite(from_px), from_px, here)
     windows = _windows(frames, np.rint(here).astype(np.int64), weights)
     pixels = SpotPixels.of(windows.regions.filters, blur, _model(frames, windows))
     x, used = windows.regions.x_e, windows.regions.used
@@ -132,8 +137,6 @@ def stepped_positions(frames: FilmFrames, blur: SpotBlur, at_px: Array) -> FilmP
     weight = used * windows.law.information(mean)
     score = np.einsum("nkhw,nhw->nk", derivatives, weight * (x - mean))
     step = np.einsum("nkl,nl->nk", np.linalg.pinv(fisher_matrix(derivatives, weight), hermitian=True), score)
-    # farther from all frames with the laser off the room is not known
-    known = np.linalg.norm(here[:, None] - at_px[count:], axis=2).min(axis=1) < FARTHEST_PX
     good = np.isfinite(step).all(axis=1) & (theta[:, 2] > 0.0) & known
     uv = np.where(good[:, None], here + step[:, :2], np.nan)
     return _covariances(uv, theta, pixels, windows)

@@ -73,7 +73,7 @@ def _of_intervals(window: Window, start: Array) -> tuple[Array, Array]:
     found = interval_posterior(window, start)
     if found is None or not found.settled:
         return np.full(len(start), np.nan), np.eye(len(start))
-    (r,), (J,) = found.likelihood()(found.theta[None])
+    (r,), (J,) = found.likelihood()(found.theta[None], 0)
     fisher = J @ J.T
     return found.theta + scoring_step(fisher[None], (J @ r)[None])[0], fisher
 

@@ -119,19 +119,21 @@ _TYPES: dict[str, Any] = {
 
 def _rows(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> list[dict[str, Any]]:
     seen, nan = bursts(film, bundle, procedure, camera), float("nan")
-    found: list[tuple[str, FilmDepth | None, int, float]] = [("burst", seen.depth, seen.frames, nan)]
+    found: list[tuple[str, FilmDepth | None, int, EqualLight | None]] = [("burst", seen.depth, seen.frames, None)]
     if procedure.stroke and procedure.preset == "bayer-raw":
         at, light = whole_stroke(film, bundle, procedure, camera)
-        found.append(("stroke", at, len(film), light.two_ends_m))
+        found.append(("stroke", at, len(film), light))
     elif procedure.stroke:
         whole = processed_stroke(film, bundle, procedure, camera, seen)
         frames = seen.frames if whole is None else seen.frames + whole.frames - 2
-        found.append(("stroke", whole, frames, nan))
+        found.append(("stroke", whole, frames, None))
     pair, depth_m, parts = film.plan.pair, float(film.table["depth_m"][0]), _independent(bundle.covariance)
     rows = []
-    for way, one, frames, two_ends_m in found:
+    for way, one, frames, at_light in found:
         estimate, sigma = (nan, nan) if one is None else (one.depth_m, one.sigma_m)
+        two_ends_m = at_light.two_ends_m if at_light else nan
         calibration = np.full(len(parts), nan) if one is None else one.by_rig_m @ parts
+        pixels_m = np.sqrt(max(sigma**2 - float(calibration @ calibration), 0.0)) if one else nan
         rows.append(
             {
                 "film": film.info.film,
@@ -143,7 +145,7 @@ def _rows(film: Film, bundle: Bundle, procedure: FilmProcedure, camera: int) -> 
                 "error_m": estimate - depth_m,
                 "sigma_m": sigma,
                 "frames": frames,
-                "film_pixels_m": float(np.sqrt(max(sigma**2 - float(calibration @ calibration), 0.0))) if one else nan,
+                "film_pixels_m": at_light.film_m if at_light else float(pixels_m),
                 "two_ends_pixels_m": two_ends_m,
                 "calibration_m": calibration.tolist(),
             }

@@ -19,6 +19,7 @@ from phibench.estimator.film.film_positions import FilmPositions, fit_positions,
 from phibench.estimator.film.processed_film import processed_positions
 from phibench.estimator.film.recursive_filter import FilterState, first_state, updated
 from phibench.estimator.film.spot_tracks import FrameSearch, SpotTrack, fitted_positions
+from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
 from phibench.estimator.loop.belief import PairTracker
 from phibench.estimator.loop.sensing import Reading
@@ -125,6 +126,25 @@ def test_filter_follows_the_bundle_and_is_consistent() -> None:
     assert low < np.mean(squares) < high
     # linearised in another order: a part of sigma
     assert np.abs(differences).max() < 0.3
+
+
+def test_fitted_places_follow_a_rig_that_is_off() -> None:
+    """A principal point that is 3 px off: the point's own image is not at the places, the fitted places are."""
+    offsets, uv = exact()
+    covariance = np.zeros((len(PARAMETERS),) * 2)
+    for name, sigma in (("cx_px", 5.0), ("cy_px", 5.0), ("tilt_x_rad", 5e-3)):
+        covariance[PARAMETERS.index(name), PARAMETERS.index(name)] = sigma**2
+    camera = replace(SCENE.rig.camera, cx_px=SCENE.rig.camera.cx_px + 3.0, cy_px=SCENE.rig.camera.cy_px - 2.0)
+    noise, shared = drawn(0)[0].noise_px2, drawn(0)[0].shared_px2
+    missing = np.where(np.arange(FRAMES)[:, None] == 4, np.nan, uv)
+    off = replace(SCENE.rig, camera=camera)
+    found = film_depth(off, FilmPositions(missing, noise, shared), offsets, ENCODER_M, covariance)
+    image = image_of(off.at(0.0), found.point_world_m - offsets[:, None] * np.array(off.stroke_axis_world)).uv_px
+    assert np.isnan(found.places_px[4]).all()
+    seen = np.arange(FRAMES) != 4
+    # what the rig's deviations do not explain stays below the noise of one frame
+    assert np.abs(found.places_px - uv)[seen].max() < 0.2 * NOISE_PX
+    assert np.abs(image - uv)[seen].max() > 2.0 * NOISE_PX
 
 
 def test_a_rig_that_is_not_known_widens_the_claim() -> None:
