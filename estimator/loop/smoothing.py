@@ -140,7 +140,7 @@ class SmoothedBelief(Belief):
         self._precision[[SLIP, SKID]] = 1.0 / (np.array([vehicle.slip_sigma, vehicle.skid_sigma]) ** 2 + 1e-12)
         self._precision[self._deviations] = 1.0
         self._P = np.zeros((n, n))
-        self._latest: tuple[Direction, _Frames] | None = None
+        self._latest: tuple[tuple[Direction, float, Stance | None, float, int], _Frames] | None = None
         self._x, self._middle = x, x[self._deviations]
         self._views = self._around()
         self._frames = self._frame(first, stroke_m, None)
@@ -179,8 +179,11 @@ class SmoothedBelief(Belief):
             self._track_noise = np.concatenate([self._track_noise, noise[None]])
 
     def update(self, seen: Direction, stroke_m: float, held: Stance | None = None) -> None:
-        """Take in a direction, after `predict`."""
-        self._frames = self._frames.joined(self._frame(seen, stroke_m, held))
+        """Take in a direction, after `predict`; one that the rig as believed cannot see says nothing."""
+        one = self._frame(seen, stroke_m, held)
+        if not np.isfinite(self._residuals(self._x, one)).all():
+            return
+        self._frames = self._frames.joined(one)
         if len(self._frames.time_s) > _MOST_FRAMES:
             self._frames = self._frames.thinned()
         self._solve()
@@ -281,7 +284,8 @@ class SmoothedBelief(Belief):
 
     def _frame(self, seen: Direction, stroke_m: float, held: Stance | None) -> _Frames:
         """One frame, now; that of the latest direction again, as `update` follows `distance2`."""
-        if self._latest is not None and self._latest[0] is seen:
+        when = seen, stroke_m, held, self._time_s, len(self._tracks_m)
+        if self._latest is not None and self._latest[0][0] is seen and self._latest[0][1:] == when[1:]:
             return self._latest[1]
         R, t = self._tilt(held)
         one = _Frames(
@@ -295,7 +299,7 @@ class SmoothedBelief(Belief):
             self._view_rays(seen.uv_px[None], np.array([stroke_m])),
             np.array([seen.shared_px]),
         )
-        self._latest = seen, one
+        self._latest = when, one
         return one
 
     def _view_rays(self, uv_px: Array, stroke_m: Array) -> Array:
