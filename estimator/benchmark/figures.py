@@ -133,7 +133,7 @@ def error_maps(tables: Tables) -> dict[str, Picture]:
             found = len(table.filter(pl.col("visible") & pl.col("detected")))
             maps[name] = _png(
                 figure,
-                f"Map of the image for {name}: {found} found spots as discs, larger and darker for larger errors; "
+                f"Map of the image for {name}: {found} found spots as discs, larger for larger errors; "
                 "images without a right position as crosses.",
             )
     return maps

@@ -107,7 +107,11 @@ def merge(*shards: Path, out: Path) -> int:
 
 
 @dataset.command
-def verify(directory: Path) -> int:
+def verify(
+    directory: Path,
+    *,
+    json: Annotated[bool, Parameter(negative="", help="The outcome as one JSON document.")] = False,
+) -> int:
     """Check every file, hash, row and certificate of a data set; exit code 1 if there is a fault.
 
     Parameters
@@ -115,14 +119,20 @@ def verify(directory: Path) -> int:
     directory
         Folder of a data set, or of an export.
     """
+    from json import dumps
+
     from phibench.datasets.export.export_make import INFO, verify_export
     from phibench.datasets.verify import verify as verify_dataset
 
     if (directory / INFO).is_file():
         faults = verify_export(directory)
-        print("\n".join([*faults, f"{directory}: {len(faults)} faults"]))
+        whole = {"faults": list(faults), "valid": not faults}
+        print(dumps(whole) if json else "\n".join([*faults, f"{directory}: {len(faults)} faults"]))
         return 1 if faults else 0
     report = verify_dataset(directory)
+    if json:
+        print(dumps({**vars(report), "valid": report.ok}))
+        return 0 if report.ok else 1
     for fault in report.faults:
         print(fault)
     for note in report.notes:

@@ -244,3 +244,14 @@ def test_every_command_is_told_of(monkeypatch, capsys):
     out, err = capsys.readouterr()
     assert err.startswith("phibench dataset verify: running for 0 s\n")
     assert out == "x: 0 files, 0 samples, 0 faults\n"
+
+
+def test_verify_prints_one_document_and_nothing_else(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for faults, code in (((), 0), (("views/x is missing",), 1)):
+        report = Report(faults, files=7, samples=2, notes=("odd",))
+        monkeypatch.setattr("phibench.datasets.verify.verify", lambda folder, report=report: report)
+        assert cli.main(["dataset", "verify", "x", "--json"]) == code
+        document = json.loads(capsys.readouterr().out)
+        assert document == {"faults": list(faults), "files": 7, "samples": 2, "notes": ["odd"], "valid": code == 0}
