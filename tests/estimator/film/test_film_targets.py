@@ -1,7 +1,6 @@
 """Targets among other lights: evidence of blink codes against other mathematics, tracks, locks in films of frames."""
 
 import itertools
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 from conftest import ROOT
 from helpers.target_films import CODE, Outcome, RenderedRoom, StagedFilm, rendered_rooms, staged, swept
+from matplotlib.figure import Figure
 from scipy import stats
 
 from phibench.datasets.errors import DatasetError
@@ -322,6 +322,29 @@ def counted(rows: Sequence[Outcome]) -> list[dict[str, Any]]:
     return cells
 
 
+def drawn(cells: Sequence[dict[str, Any]], path: Path) -> None:
+    """Draw the share of targets found within half a second against other lights, with exact intervals of 95 %."""
+    names = ("blink code", "colour of the laser", "nearest red blob, told its place", "nearest red blob")
+    colours = ("#0072b2", "#009e73", "#cc79a7", "#d55e00")
+    figure = Figure(figsize=(9, 3.4), layout="constrained", dpi=110)
+    axes = figure.subplots(1, 3, sharey=True)
+    for ax, sigma in zip(axes, (6.0, 10.0, 15.0), strict=True):
+        for n, (way, name, colour) in enumerate(zip(WAYS, names, colours, strict=True)):
+            mine = sorted((c for c in cells if (c["sigma"], c["way"]) == (sigma, way)), key=lambda c: c["lights"])
+            y = np.array([c["found"] / c["of"] for c in mine])
+            ends = np.array([stats.binomtest(c["found"], c["of"]).proportion_ci(method="exact") for c in mine])
+            x = np.array([c["lights"] for c in mine]) + 0.5 * (n - 1.5)
+            look = {"color": colour, "marker": "o", "markersize": 4, "capsize": 2, "linewidth": 1.0}
+            ax.errorbar(x, 100 * y, 100 * np.abs(ends.T - y), label=name, **look)
+        ax.set_title(f"{sigma:g} sigma per frame", fontsize=10)
+        ax.set_xticks([0, 5, 10])
+        ax.set_xlim(-1.5, 11.5)
+        ax.set_xlabel("other lights")
+    axes[0].set_ylabel("found within 0.5 s, %")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    figure.savefig(path)
+
+
 @pytest.mark.study
 def test_targets_in_new_rooms_by_signal_and_clutter(pytestconfig: pytest.Config) -> None:
     """Nine cells of signal and other lights; what follows the code against simple ways, on the same frames."""
@@ -335,7 +358,7 @@ def test_targets_in_new_rooms_by_signal_and_clutter(pytestconfig: pytest.Config)
         if cell[0] >= 10.0:
             others = max(sum(one.asked == 1 for one in rows if one.way == way) for way in ("colour", "blob"))
             assert sum(one.asked == 1 for one in code) >= others
-    (kept / "target.json").write_text(json.dumps(cells, indent=1))  # docs/target.json
+    drawn(cells, kept / "target.png")  # docs/target.png
 
 
 @pytest.mark.study
