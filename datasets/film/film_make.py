@@ -122,10 +122,9 @@ def _make(plan: Plan, films: Sequence[FilmPlan], text: str, out: Path, workers: 
         schema_version=SCHEMA_VERSION, name=dataset.name, seed=dataset.seed, code_sha256=code_sha256(), films=names
     )
     write_document(out / INFO, info)
-    hashes = {name: sha256(out / name) for name in (INFO, RECIPE)}
     types = polars.read_parquet_schema(FilmFolder.of(out, names[0]).path / "film.parquet")
     kinds = {column: str(dtype) for column, dtype in types.items()}
-    text = films_croissant(dataset.name, version("phibench"), len(names), kinds, hashes)
+    text = films_croissant(dataset.name, version("phibench"), len(names), kinds)
     write_text(out / CROISSANT, text)
     write_checksums(out, names)
     made = tuple(film.film_id for film in todo)

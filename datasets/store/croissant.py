@@ -161,9 +161,6 @@ _SMALL = {
     schema.MANIFEST: JSON_LINES,
     schema.RIGS: JSON_LINES,
     schema.ROOMS: JSON_LINES,
-    schema.RECIPE: TOML,
-    schema.INFO: "application/json",
-    "film.json": "application/json",
 }
 
 
@@ -183,6 +180,7 @@ def dataset_croissant(info: DatasetInfo, types: Mapping[str, str], hashes: Mappi
         "phibench draws frames of any exposure and noise from them."
     )
     sets = [
+        *_settings(schema.INFO),
         file_set("ambient", EXR, "views/*/ambient.exr"),
         file_set("truth", EXR, "views/*/truth.exr"),
         file_set("spots", EXR, "spots/*.exr"),
@@ -194,15 +192,20 @@ def dataset_croissant(info: DatasetInfo, types: Mapping[str, str], hashes: Mappi
     return croissant_text(info.name, about, made_by(info), [*small, *sets], [records])
 
 
-def films_croissant(name: str, version: str, films: int, types: Mapping[str, str], hashes: Mapping[str, str]) -> str:
+def _settings(info: str) -> list[dict[str, Any]]:
+    """Description and recipe, without hashes: `[frames]` may be changed, and this file stays as it is."""
+    return [file_set("description", "application/json", info), file_set("recipe", TOML, schema.RECIPE)]
+
+
+def films_croissant(name: str, version: str, films: int, types: Mapping[str, str]) -> str:
     """JSON-LD text of a data set of films; `types` are the columns of each `film.parquet`."""
     about = (
         "Films of a laser spot in a mirror, seen by a rolling-shutter camera that moves: the spot in every frame, "
         f"views of the room, and the exact truth of every frame: {counted((films, 'film'))}. "
         "phibench draws frames from them."
     )
-    small = [file_object(name, media, hashes[name]) for name, media in _SMALL.items() if name in hashes]
     sets = [
+        *_settings("film.json"),
         file_set("frames_truth", PARQUET, "films/*/film.parquet"),
         file_set("views", EXR, "films/*/views/*.exr"),
         file_set("spots", "application/x-npz", "films/*/spots.npz"),
@@ -210,4 +213,4 @@ def films_croissant(name: str, version: str, films: int, types: Mapping[str, str
     rows = "One row for each frame of each film: instants of the frame, and of the row that shows the spot."
     texts = {column: column.replace("_", " ") for column in types}
     records = record_set("frames", rows, types, texts, {"fileSet": {"@id": "frames_truth"}})
-    return croissant_text(name, about, version, [*small, *sets], [records])
+    return croissant_text(name, about, version, sets, [records])

@@ -55,6 +55,7 @@ def test_everything_is_there(smallest_dataset: Path) -> None:
         schema.RECIPE,
         schema.RIGS,
         schema.ROOMS,
+        schema.CROISSANT,
         schema.light_map_file("room"),
     }
     listed = set(read_checksums(smallest_dataset))

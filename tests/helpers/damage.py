@@ -57,7 +57,7 @@ def unseen_flips(folder: Path, count: int) -> dict[str, list[int]]:
     names = {*read_checksums(folder), schema.CHECKSUMS, schema.JOURNAL, schema.SENSITIVITIES}
     # of views, spots and previews one of each: they are read alike
     kinds = {name.split("/")[-1] if name.startswith("views") else name.split("/")[0]: name for name in sorted(names)}
-    assert len(kinds) == 15
+    assert len(kinds) == 16
     for name in kinds.values():
         for bit in map(int, random.integers(0, 8 * (folder / name).stat().st_size, count)):
             flip_bit(folder / name, bit)
