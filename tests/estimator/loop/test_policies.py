@@ -189,7 +189,7 @@ def test_unknown_policies_are_refused() -> None:
 def test_a_process_of_its_own_ends_policies_that_hang() -> None:
     short = Setup(task=Task(longest_s=0.5))
     (stood,) = run_foreign(short, stands, 1, "foreign")
-    assert stood.outcome == "time is over"
+    assert stood.outcome == "time is over", stood.cause
     hung = list(run_foreign(short, hangs, 2, "foreign", limit_s=0.5))
     assert [episode.outcome for episode in hung] == [LOST, LOST]
     assert "did not answer within 0.5 s" in hung[0].cause
