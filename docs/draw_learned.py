@@ -2,6 +2,10 @@
 
     .venv/bin/python docs/draw_learned.py measure DEV TEST NETWORKS out/learned.json
     .venv/bin/python docs/draw_learned.py draw out/learned.json docs/learned.png
+    .venv/bin/python docs/draw_learned.py pairs TEST SCORES NETWORKS
+
+SCORES is a folder with scores of `detect` and of others on TEST, such as mjpeg-detect.parquet, by `phibench score`.
+`pairs` asks the networks at the places that `detect` answered; bounds and other methods' errors are the scores'.
 
 NETWORKS is a folder of ONNX files: released.onnx, and others to compare with it, such as other seeds and networks of
 one preset. Crops count of which the first claims a deviation below a pixel.
@@ -18,17 +22,23 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+import polars as pl
 
+from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, pair_draws
 from phibench.datasets.frames.request import FrameRequest
+from phibench.datasets.frames.sensor_card import card_of
+from phibench.datasets.frames.source import frame_stream
 from phibench.datasets.read import open_finished
 from phibench.datasets.training import CropSettings, SpotCrops
 from phibench.estimator.learned.crop_training import CROP_SETTINGS, Answers, TrainingSettings, crops_of, rooms_of
-from phibench.estimator.learned.network_input import SIDE_PX, crop_input
+from phibench.estimator.learned.network_input import SIDE_PX, crop_input, crop_origin, cut
 from phibench.estimator.learned.networks import CROP, Network, covariances
+from phibench.render.sensor.light import Region
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 
 LEAD = "released"
+_LABELS = {LEAD: "released: 18 000 crops, 3 epochs", "short0": "3000 crops, 1 epoch"}
 COUNT, LEAK_COUNT, RESAMPLES = 500, 1200, 2000
 SETTINGS = replace(CROP_SETTINGS, laser_levels=(0.25, 1.0))  # those of the recipe
 SIZES: dict[str, dict[str, Any]] = {  # numbers of bench-test
@@ -175,6 +185,78 @@ def ratio(squared: Array, unseen: Array, samples: Array) -> list[float]:
     return [float(values[0]), *(float(x) for x in np.quantile(values[1:], [0.025, 0.975]))]
 
 
+OTHERS = {"bayer-raw": "raw_maximum_likelihood", "srgb8": "chain_fit", "mjpeg": "chain_fit"}
+_PART_PX = 64  # of a frame that is simulated about a place
+
+
+def pairs(test: Path, scores: Path, networks: Path) -> None:
+    """Print rms, median, efficiency and pull of networks on detected spots, and of another method on the same ones."""
+    found = {file.stem: Network(file, CROP) for file in sorted(networks.glob("*.onnx"))}
+    for preset, other in OTHERS.items():
+        keys = ["number", "image"]
+        records = pl.read_parquet(scores / f"{preset}-detect.parquet").filter(
+            "detected", (pl.col("bound_px2") < 1.0).fill_null(False)
+        )
+        theirs = pl.read_parquet(scores / f"{preset}-{other}.parquet").filter("detected")
+        both = records.join(theirs.select(*keys, "du_px", "dv_px", "pull_u", "pull_v"), on=keys, suffix="_other")
+        rows = both.sort("sample_id").to_dicts()
+        answers = _asked(test, preset, rows, found)
+        samples, bound = np.array([row["sample_id"] for row in rows]), np.array([row["bound_px2"] for row in rows])
+        error = np.array([[row["du_px_other"], row["dv_px_other"]] for row in rows], float)
+        pull = np.array([[row["pull_u_other"], row["pull_v_other"]] for row in rows], float)
+        _print(preset, other, error, (pull**2).mean(axis=1), bound, samples)
+        for name, one in answers.items():
+            _print(preset, name, one.error_px, one.squared_pull, bound, samples)
+
+
+def _print(preset: str, name: str, error: Array, squared: Array, bound: Array, samples: Array) -> None:
+    square = (error**2).sum(axis=1)
+    values: dict[str, Callable[[Array], float]] = {
+        "rms": lambda k: float(np.sqrt(square[k].mean())),
+        "median": lambda k: float(np.median(np.sqrt(square[k]))),
+        "efficiency": lambda k: float(np.sqrt(bound[k].mean() / square[k].mean())),
+        "pull": lambda k: float(np.sqrt(squared[k].mean())),
+    }
+    shown = {key: [round(x, 3) for x in interval(value, samples, preset + key)] for key, value in values.items()}
+    print(preset, name, len(samples), shown)
+
+
+def _asked(test: Path, preset: str, rows: list[dict[str, Any]], networks: dict[str, Network]) -> dict[str, Answers]:
+    """Answers of networks for the spots of records."""
+    dataset, kept, every = open_finished(test), None, {name: ([], []) for name in networks}
+    draws = pair_draws(dataset, preset)
+    for row in rows:
+        if kept is None or kept.row.sample_id != row["sample_id"]:
+            kept = CachedSample(dataset[row["sample_id"]])
+        on, off, card, first = _part(kept, draws[row["number"]], row["image"], (row["u_px"], row["v_px"]))
+        for name, network in networks.items():
+            place = np.array([row["u_px"], row["v_px"]]) - first
+            for _ in range(2):  # once more about the answer
+                origin = crop_origin((float(place[0]), float(place[1])))
+                answer = network.position(crop_input(cut(on, origin), cut(off, origin), card))
+                place = answer.uv_px + origin
+            every[name][0].append(place + first - [row["u_true_px"], row["v_true_px"]])
+            every[name][1].append(answer.covariance_px2)
+    return {name: Answers(np.array(error), np.array(covariance)) for name, (error, covariance) in every.items()}
+
+
+def _part(sample: CachedSample, pair_draw: PairDraw, position: str, uv_px: tuple[float, float]) -> tuple[Any, ...]:
+    """Pixels about a place with the laser on and off, the sensor's card, and their first column and row."""
+    source = sample.source(pair_draw)
+    side = source.sides[position]
+    height, width = side.light.size
+    u0, v0 = (
+        int(min(max(2 * round(x / 2) - _PART_PX // 2, 0), size - _PART_PX))
+        for x, size in zip(uv_px, (width, height), strict=True)
+    )
+    region = Region(u0, v0, u0 + _PART_PX, v0 + _PART_PX)
+    images = [
+        side.chain.frame(light, frame_stream(*source.names, position, laser, pair_draw.noise_draw), region)
+        for light, laser in ((side.light, True), (side.light.laser_off(), False))
+    ]
+    return (*images, card_of(side.chain.sensor), np.array([u0, v0]))
+
+
 def draw(source: Path, out: Path) -> None:
     """Median and rms error by test preset, one colour for each network."""
     tables = json.loads(source.read_text())
@@ -186,7 +268,7 @@ def draw(source: Path, out: Path) -> None:
             found = np.array([tables[size][name][key] for size in SIZES])
             x = np.arange(len(SIZES)) + 0.12 * (shift - (len(names) - 1) / 2.0)
             bars = np.abs(found[:, 1:].T - found[:, 0])
-            axes.errorbar(x, found[:, 0], bars, fmt="o", markersize=4, capsize=2, label=name)
+            axes.errorbar(x, found[:, 0], bars, fmt="o", markersize=4, capsize=2, label=_LABELS.get(name, name))
         axes.set_xticks(np.arange(len(SIZES)), [size.replace(" ", "\n") for size in SIZES])
         axes.set(yscale="log", title=f"{title} distance, px")
         axes.grid(axis="y", which="both", alpha=0.3)
@@ -197,5 +279,7 @@ def draw(source: Path, out: Path) -> None:
 if __name__ == "__main__":
     if sys.argv[1] == "measure":
         measure(*map(Path, sys.argv[2:6]))
+    elif sys.argv[1] == "pairs":
+        pairs(*map(Path, sys.argv[2:5]))
     else:
         draw(*map(Path, sys.argv[2:4]))
