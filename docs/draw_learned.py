@@ -215,7 +215,7 @@ def _print(preset: str, name: str, error: Array, squared: Array, bound: Array, s
         "rms": lambda k: float(np.sqrt(square[k].mean())),
         "median": lambda k: float(np.median(np.sqrt(square[k]))),
         "efficiency": lambda k: float(np.sqrt(bound[k].mean() / square[k].mean())),
-        "pull": lambda k: float(np.sqrt(squared[k].mean())),
+        "pull": lambda k: float(np.sqrt(np.nanmean(squared[k]))),
     }
     shown = {key: [round(x, 3) for x in interval(value, samples, preset + key)] for key, value in values.items()}
     print(preset, name, len(samples), shown)
