@@ -38,10 +38,7 @@ VERSION = "1"
 """Version of what a network gets and answers; a change of either raises it."""
 CROP = "learned_crop"
 INSTALL = "pip install 'phibench[learned]'"
-INSTALL_TRAINING = (
-    "pip install 'phibench[learned-training]' --extra-index-url https://download.pytorch.org/whl/cpu (PyTorch for the "
-    "CPU)"
-)
+INSTALL_TRAINING = "pip install 'phibench[learned-training]' (the CPU's wheel of PyTorch is enough: docs/learned.md)"
 
 Weights = dict[str, NDArray[Any]]
 """Arrays by name, "<layer>.w" and "<layer>.b"."""

@@ -284,7 +284,7 @@ NEW_STROKE_M = 0.1
 CELLS = [(sigma, lights) for lights in (5, 10, 0) for sigma in (10.0, 6.0, 15.0)]
 FEW, MANY = range(2), range(15)  # films of a cell, and of the cell that the requirement is about
 HIDDEN = {0: range(18, 27), 1: range(18, 27), 2: range(18, 48), 3: range(18, 48)}  # 0.3 s and 1 s
-HIDDEN_FRAMES, HIDDEN_FILMS = 66, range(100, 102)
+HIDDEN_FRAMES, HIDDEN_FILMS = 90, range(100, 102)
 WAYS = ("code", "colour", "told blob", "blob")
 
 
