@@ -5,8 +5,10 @@ weights of `film_frames.room_weights`, and smoothed as `background_of` does it f
 predict the spot, the interval fit of a JPEG's coefficients (`processed.interval_fit`) or the quasi-score of other
 outputs gives the place. Motion blur is part of the spot's model. Frames at rest are better fitted as a burst.
 
-The interval fit starts from a prior of 2 px about the prediction. Many frames would each count it, so it is taken out:
-the place is one scoring step of the likelihood alone (`IntervalPosterior.likelihood`) from the posterior's mean.
+The likelihood of one faint JPEG has several summits: a fit of its own may settle a pixel away and claim a seventh of
+one. The interval fit therefore keeps to the prediction, by a narrow prior. Many frames would each count that, so it is
+taken out: the place is one scoring step of the likelihood alone (`IntervalPosterior.likelihood`) from the posterior's
+mean. Near the truth the score has mean zero and the Fisher matrix as its covariance, however the likelihood is shaped.
 
 What frames share by the same frames with the laser off, and by the pattern of the spot's own light, is left out: the
 rounding of a single JPEG is several times as large.
@@ -31,6 +33,7 @@ from phibench.scenes.frames import Array
 
 _AROUND_PX = 12  # of the spot, and whole units of the JPEG beyond
 _LEAST_WEIGHT = 1e-3  # of a frame with the laser off
+_PREDICTED_PX = 0.1  # between two bursts a place is known to some hundredths
 
 
 def processed_positions(frames: FilmFrames, point_world_m: Array, which: Index) -> tuple[FilmPositions, Array]:
@@ -41,7 +44,7 @@ def processed_positions(frames: FilmFrames, point_world_m: Array, which: Index) 
     frames : FilmFrames
         Of processed images.
     point_world_m : array, shape (3,)
-        From which the places are predicted, to a pixel.
+        From which the places are predicted, to a tenth of a pixel.
     which : array of int, shape (n,)
     """
     count = len(frames.on)
@@ -70,7 +73,7 @@ def processed_positions(frames: FilmFrames, point_world_m: Array, which: Index) 
 
 def _of_intervals(window: Window, start: Array) -> tuple[Array, Array]:
     """Unknowns and Fisher matrix by the likelihood alone; NaN where the posterior is none."""
-    found = interval_posterior(window, start)
+    found = interval_posterior(window, start, _PREDICTED_PX)
     if found is None or not found.settled:
         return np.full(len(start), np.nan), np.eye(len(start))
     (r,), (J,) = found.likelihood()(found.theta[None], 0)

@@ -302,7 +302,7 @@ def processed_stroke(
     frames = film_frames(film, camera, camera, procedure.preset, rig=bundle.rig, stroke_scale=scale, **sensor)
     fitted = [at for at, good in zip(resting_frames(film), ends.positions.good, strict=True) if good]
     moving = np.flatnonzero(~np.isin(frames.on, np.concatenate([*fitted, []])))
-    way, offsets = processed_positions(frames, start.point_world_m, moving)
+    way, offsets = processed_positions(frames, (ends.depth or start).point_world_m, moving)
     # bursts stand where the carriage was told to, and readings on the way have the encoder's noise
     sigma_m = np.concatenate([np.zeros(2), np.full(len(moving), frames.encoder_sigma_m)])
     return _depth(bundle, joined(ends.positions, way), np.concatenate([ends.offsets_m, offsets]), sigma_m)

@@ -165,9 +165,12 @@ def fit_intervals(window: Window, start: Array) -> WindowFit:
     return WindowFit(found.theta, np.asarray(np.linalg.inv(found.covariance), float), chi2, found.settled)
 
 
-def interval_posterior(window: Window, start: Array) -> IntervalPosterior | None:
-    """Posterior of a window, parameters as `fit_intervals`; None where the arithmetic fails."""
-    prior, step = np.diag(_prior_sigma(start, window) ** 2), window.model.step
+def interval_posterior(window: Window, start: Array, prior_px: float = _PRIOR_PX) -> IntervalPosterior | None:
+    """Posterior of a window, parameters as `fit_intervals`; None where the arithmetic fails.
+
+    The place of the start is known to `prior_px`, one standard deviation of each of its coordinates.
+    """
+    prior, step = np.diag(_prior_sigma(start, window, prior_px) ** 2), window.model.step
     steps = Steps.of(window.each, step)
     theta, covariance = fit_window(window, start[None], _START_STEPS).theta, _CLOSER**2 * prior
     sites, last, settled = Sites(*np.zeros((2, len(step)))), np.zeros(len(start)), False
@@ -198,10 +201,10 @@ def _nothing(theta: Array) -> WindowFit:
     return WindowFit(theta, np.zeros((len(theta),) * 2), np.nan, False)
 
 
-def _prior_sigma(start: Array, window: Window) -> Array:
+def _prior_sigma(start: Array, window: Window, prior_px: float) -> Array:
     level = _PRIOR_LEVEL_E + np.abs(start[3:6])
     width = [_PRIOR_WIDTH * start[6]] if window.pixels.free_width else []
-    return np.array([_PRIOR_PX, _PRIOR_PX, _PRIOR_LEVEL_E + abs(start[2]), *level, *width])
+    return np.array([prior_px, prior_px, _PRIOR_LEVEL_E + abs(start[2]), *level, *width])
 
 
 def _near(inputs: Inputs, covariance: Array, steps: Steps) -> NDArray[np.int64]:

@@ -170,6 +170,7 @@ def test_without_onnxruntime_and_pytorch_it_says_what_to_install(monkeypatch: An
 # -- training --------------------------------------------------------------------------------------------------------
 
 
+@needs_torch
 def test_training_refuses_data_sets_that_will_not_do(tmp_path: Path, tiny_dataset: Path, capsys: Any) -> None:
     out = tmp_path / "out.onnx"
     for folder, text in ((tmp_path, str(tmp_path)), (tiny_dataset, "training holds 6 out and needs more than that")):

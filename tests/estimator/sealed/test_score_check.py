@@ -67,13 +67,10 @@ def _at_once(document: ScoreDocument) -> dict[str, Any]:
         "isolation": "not isolated: no Landlock",
         "method": document.method.model_copy(update={"sha256": None}),
         "samples": 500,
-        "failures": {**document.failures, "crash": 2},
-        **_with_metric(document),
     }
 
 
 SENTENCES = (
-    "metrics.rms_px.value is 0.1, and the records give 0.3",
     "the score is not of an open set",
     "task_version is 4, this program scores task",
     "pairs is 3 and pair_set.pairs 500",
@@ -92,6 +89,16 @@ def test_each_fault_of_the_document_is_told(honest: Path, tmp_path: Path) -> Non
     faults = check_score(path).faults
     assert [sentence for sentence in SENTENCES if not any(sentence in fault for fault in faults)] == []
     assert len(faults) == len(SENTENCES)
+
+
+def test_statistics_are_those_of_the_records(honest: Path, tmp_path: Path) -> None:
+    document = read_score(honest)
+    path, changed = tmp_path / "mine.json", {"failures": {**document.failures, "crash": 2}, **_with_metric(document)}
+    write_score(path, document.model_copy(update=changed), read_records(honest, document))
+    faults = check_score(path).faults
+    assert len(faults) == 2
+    assert "metrics.rms_px.value is 0.1, and the records give 0.3" in faults[0]
+    assert faults[1].startswith("failures")
 
 
 def _first(table: pl.DataFrame, **values: Any) -> pl.DataFrame:
