@@ -19,6 +19,7 @@ from __future__ import annotations
 import abc
 import copy
 import math
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -29,15 +30,66 @@ from phibench.estimator.loop.sensing import Direction, Reading, wrapped
 from phibench.scenes.frames import Array
 from phibench.scenes.motion.vehicle import PlanarPose, Stance, Vehicle, arc_covariance, rig_placement
 from phibench.scenes.rig import Rig
-from phibench.scenes.validation import SceneError
+from phibench.scenes.validation import SceneError, finite, positive
 
-PRIOR_DISTANCES_M = (0.8, 6.0)
-"""Distances between which a target is expected before anything is known: ends of q at about 1.5 deviations."""
 LEAST_Q = 0.02  # states at 50 m and beyond count as there
 PLACE = 3  # first entries of the state
 SLIP, SKID = 3, 4
 VELOCITY = slice(5, 8)
 _ALPHA, _BETA, _KAPPA = 0.6, 2.0, 0.0  # of Merwe's sigma points: 1.3 deviations away for 5 states
+
+
+@dataclass(frozen=True)
+class TargetPrior:
+    """Target as it is expected before its first frame.
+
+    Attributes
+    ----------
+    distances_m : 2 floats
+        Range of D: its ends are those of q at about 1.5 standard deviations.
+    acceleration_m2_per_s3 : float
+        Density of the target's acceleration per axis; 0 is a target at rest.
+    speed_m_per_s : float
+        Standard deviation of the first velocity per axis, of a target that moves.
+
+    Raises
+    ------
+    SceneError
+        If a number is beyond its range.
+    """
+
+    distances_m: tuple[float, float] = (0.8, 6.0)
+    acceleration_m2_per_s3: float = 0.0
+    speed_m_per_s: float = 0.3
+
+    def __post_init__(self) -> None:
+        near, far = (positive("prior", "distances_m", D) for D in self.distances_m)
+        if near >= far:
+            raise SceneError(f"prior.distances_m = {self.distances_m}: the first must be below the second")
+        if finite("prior", "acceleration_m2_per_s3", self.acceleration_m2_per_s3) < 0.0:
+            raise SceneError(f"prior.acceleration_m2_per_s3 = {self.acceleration_m2_per_s3}: must be 0 or above")
+        positive("prior", "speed_m_per_s", self.speed_m_per_s)
+
+    @property
+    def moves(self) -> bool:
+        """True for a target that may move."""
+        return self.acceleration_m2_per_s3 > 0.0
+
+    @property
+    def q(self) -> float:
+        """Mean of 1 / D."""
+        near, far = self.distances_m
+        return 0.5 * (1.0 / near + 1.0 / far)
+
+    @property
+    def q_sigma(self) -> float:
+        """Standard deviation of 1 / D."""
+        near, far = self.distances_m
+        return (1.0 / near - 1.0 / far) / 3.0
+
+
+ANY_TARGET = TargetPrior()
+"""Target at rest in a room."""
 
 
 class Belief(abc.ABC):
@@ -48,14 +100,12 @@ class Belief(abc.ABC):
     rig : Rig
         The nominal one.
     vehicle : Vehicle
-    acceleration_m2_per_s3 : float
-        Density of the target's acceleration per axis; 0 is a target at rest.
+    prior : TargetPrior
     """
 
-    def __init__(self, rig: Rig, vehicle: Vehicle, acceleration_m2_per_s3: float) -> None:
-        self.rig, self.vehicle = rig, vehicle
+    def __init__(self, rig: Rig, vehicle: Vehicle, prior: TargetPrior) -> None:
+        self.rig, self.vehicle, self.prior = rig, vehicle, prior
         self._z0 = float(rig.at(0.0).sphere_centre_m[2])
-        self._acceleration, self._moves = acceleration_m2_per_s3, acceleration_m2_per_s3 > 0.0
 
     @property
     @abc.abstractmethod
@@ -141,7 +191,7 @@ class Belief(abc.ABC):
     def _moved(self, x: Array, left_m: float, right_m: float, step_s: float, about_rad: float) -> Array:
         """State after a step."""
         after, point = x.copy(), self.point_m(x)
-        if self._moves:
+        if self.prior.moves:
             point = point + step_s * x[VELOCITY] / max(float(x[2]), LEAST_Q)
         arc = self.vehicle.arc(left_m, right_m, float(x[SLIP]), float(x[SKID]))
         (cx, cy), c, s = arc.chord_m, math.cos(arc.turn_rad), math.sin(arc.turn_rad)
@@ -150,7 +200,7 @@ class Belief(abc.ABC):
         D = math.hypot(X, Y)
         expected = about_rad - arc.turn_rad
         after[:3] = expected + wrapped(math.atan2(Y, X) - expected), (point[2] - self._z0) / D, 1.0 / D
-        if self._moves:
+        if self.prior.moves:
             vx, vy, vz = x[VELOCITY] / (D * max(float(x[2]), LEAST_Q))
             after[VELOCITY] = c * vx + s * vy, c * vy - s * vx, vz
         return after
@@ -167,8 +217,8 @@ class Belief(abc.ABC):
             # a way ahead moves the target back; a turn moves it about the base
             G = np.array([[-1.0, D * s], [0.0, -(D * c + self.vehicle.sensor_x_m)], [0.0, 0.0]])
             Q[:3, :3] = J @ G @ C @ G.T @ J.T
-        if self._moves:
-            a, t = self._acceleration, step_s
+        if self.prior.moves:
+            a, t = self.prior.acceleration_m2_per_s3, step_s
             Q[:3, :3] += a * t**3 / 3.0 * J @ J.T
             Q[:3, VELOCITY] = a * t**2 / 2.0 * J / D
             Q[VELOCITY, :3] = Q[:3, VELOCITY].T
@@ -187,12 +237,7 @@ class TargetBelief(Belief):
     first : Direction
         Of the target, seen with the mirror raised by `stroke_m` and the robot level.
     stroke_m : float
-    distances_m : 2 floats
-        Range that is expected.
-    acceleration_m2_per_s3 : float
-        Density of the target's acceleration per axis; 0 is a target at rest.
-    speed_m_per_s : float
-        Standard deviation of the target's first velocity per axis.
+    prior : TargetPrior
 
     Raises
     ------
@@ -206,16 +251,12 @@ class TargetBelief(Belief):
         vehicle: Vehicle,
         first: Direction,
         stroke_m: float,
-        distances_m: tuple[float, float] = PRIOR_DISTANCES_M,
-        acceleration_m2_per_s3: float = 0.0,
-        speed_m_per_s: float = 0.3,
+        prior: TargetPrior = ANY_TARGET,
     ) -> None:
-        super().__init__(rig, vehicle, acceleration_m2_per_s3)
+        super().__init__(rig, vehicle, prior)
         self._imager = SphereImager(rig)
         self._axis = np.array(rig.stroke_axis_world)
-        n = 8 if self._moves else 5
-        near, far = distances_m
-        q, spread = 0.5 * (1.0 / near + 1.0 / far), (1.0 / near - 1.0 / far) / 3.0
+        n, q, spread = 8 if prior.moves else 5, prior.q, prior.q_sigma
         self._filter = _unscented(n, self._residual)
         x, P = np.zeros(n), np.zeros((n, n))
         # the direction's rise is k - h q, but for the radius: k goes with q
@@ -225,8 +266,8 @@ class TargetBelief(Belief):
         P[:3, :3] += spread**2 * np.outer(to_q, to_q)
         P[1, 1] += (2.0 * rig.sphere.radius_m * spread) ** 2  # what the radius does to the first rise
         P[SLIP, SLIP], P[SKID, SKID] = vehicle.slip_sigma**2 + 1e-12, vehicle.skid_sigma**2 + 1e-12
-        if self._moves:
-            P[VELOCITY, VELOCITY] = (speed_m_per_s * q) ** 2 * np.eye(3)
+        if prior.moves:
+            P[VELOCITY, VELOCITY] = (prior.speed_m_per_s * q) ** 2 * np.eye(3)
         self._filter.x, self._filter.P = x, P
 
     # -- what is believed ------------------------------------------------------------------------------------------

@@ -9,10 +9,7 @@ in the robot at frame i, by the arcs of the tracks back from now, and o_i, d_i t
 
     r_i = (azimuth, rise)(p_i - h_i e - o_i) - (azimuth, rise)(d_i)
 
-should be 0. Its covariance has the pixel's noise in each frame, and what frames share. Random parts w_j of the steps
-since a frame move its p_i, so that cov(r_i, r_k) has F_i (sum over j > max(i, k) of D_j Q_j D_j^T) F_k^T, F_i = dr_i /
-dp_i and D_j = dp / dw_j. A target whose velocity walks with the density a adds F_i F_k^T a s^2 (3 t - s) / 6, s <= t
-being the two frames' lags before now (integrated Wiener process).
+should be 0. Its covariance has the pixel's noise in each frame, and what frames share (`kept_frames`).
 """
 
 from __future__ import annotations
@@ -29,10 +26,11 @@ from scipy.linalg import solve_triangular
 from phibench.estimator.film.film_positions import FilmPositions
 from phibench.estimator.geometry.reflection import reflect
 from phibench.estimator.geometry.rig_parameters import RigBias, changed, stroke_of
-from phibench.estimator.loop.belief import LEAST_Q, PRIOR_DISTANCES_M, SKID, SLIP, VELOCITY, Belief, TargetBelief
+from phibench.estimator.loop.belief import ANY_TARGET, LEAST_Q, SKID, SLIP, VELOCITY, Belief, TargetBelief, TargetPrior
+from phibench.estimator.loop.kept_frames import Course, Frames, Way, shared_by_motion, shared_px2
 from phibench.estimator.loop.sensing import Direction, angle_slopes, angles, direction_with, turned, wrapped
 from phibench.scenes.frames import Array
-from phibench.scenes.motion.vehicle import Stance, Vehicle, arc_covariance
+from phibench.scenes.motion.vehicle import Stance, Vehicle
 from phibench.scenes.rig import Rig, View
 from phibench.scenes.validation import SceneError
 
@@ -40,36 +38,7 @@ _STEP = 0.1  # of a standard deviation: differences by theta err by 1 % of the s
 _STALE = 0.2  # of one: slopes by theta are taken anew beyond
 _ROUNDS, _HALVINGS, _AT_REST = 6, 8, 0.1  # of standard deviations
 _PIXEL_STEP_PX = 1e-3
-_PATTERN_REACH_PX, _TEXTURE_REACH_M = 1.0, 0.5
 _MOST_FRAMES = 160  # kept: older ones are thinned, which loses what they say and adds nothing
-
-
-@dataclass(frozen=True)
-class _Frames:
-    """N frames in order: pixels and their covariances, nominal strokes, attitudes, and steps and time before them.
-
-    `rays` has origin, direction and rise of the mirror by the middle rig and those beside it, shape (N, m + 1, 3, 3).
-    """
-
-    uv_px: Array
-    covariance_px2: Array
-    stroke_m: Array
-    turned: Array
-    origin_m: Array
-    steps: Array
-    time_s: Array
-    rays: Array
-    shared_px: Array
-
-    def joined(self, other: _Frames) -> _Frames:
-        """Both, this one's first."""
-        return _Frames(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in self.__dataclass_fields__))
-
-    def thinned(self) -> _Frames:
-        """Every other frame of the older half, and all of the newer."""
-        n = len(self.time_s)
-        keep = np.concatenate([np.arange(0, n // 2, 2), np.arange(n // 2, n)])
-        return _Frames(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
 
 
 class _DeviatedView(NamedTuple):
@@ -87,14 +56,6 @@ class _DeviatedView(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Course:
-    """Places of the robot after each step, frame of the first: shapes (S + 1,), (S + 1, 2)."""
-
-    heading_rad: Array
-    place_m: Array
-
-
-@dataclass(frozen=True)
 class _Rows:
     """Residuals, shape (r,), their slopes by the state (r, n) and covariance (r, r), and F of the frames (N, 2, 3)."""
 
@@ -109,7 +70,7 @@ class SmoothedBelief(Belief):
 
     Parameters
     ----------
-    rig, vehicle, first, stroke_m, distances_m, acceleration_m2_per_s3, speed_m_per_s
+    rig, vehicle, first, stroke_m, prior
         As for `belief.TargetBelief`.
     bias : RigBias
         Of the rig's deviations.
@@ -122,25 +83,20 @@ class SmoothedBelief(Belief):
         first: Direction,
         stroke_m: float,
         bias: RigBias,
-        distances_m: tuple[float, float] = PRIOR_DISTANCES_M,
-        acceleration_m2_per_s3: float = 0.0,
-        speed_m_per_s: float = 0.3,
+        prior: TargetPrior = ANY_TARGET,
     ) -> None:
-        super().__init__(rig, vehicle, acceleration_m2_per_s3)
-        self._bias, of_target = bias, 8 if self._moves else 5
+        super().__init__(rig, vehicle, prior)
+        self._bias, of_target = bias, 8 if prior.moves else 5
         n = of_target + bias.count
         self._deviations = slice(of_target, n)
-        near, far = distances_m
-        self._first_q, self._q_sigma = 0.5 * (1.0 / near + 1.0 / far), (1.0 / near - 1.0 / far) / 3.0
-        self._speed, self._time_s = speed_m_per_s, 0.0
-        self._tracks_m, self._track_noise = np.zeros((0, 2)), np.zeros((0, 2, 2))
-        x, q = np.zeros(n), self._first_q
+        self._way = Way(vehicle)
+        x, q = np.zeros(n), prior.q
         x[:5] = first.azimuth_rad, first.rise + stroke_m * q, q, vehicle.slip, vehicle.skid
         self._prior, self._precision = x.copy(), np.zeros(n)
         self._precision[[SLIP, SKID]] = 1.0 / (np.array([vehicle.slip_sigma, vehicle.skid_sigma]) ** 2 + 1e-12)
         self._precision[self._deviations] = 1.0
         self._P = np.zeros((n, n))
-        self._latest: tuple[tuple[Direction, float, Stance | None, float, int], _Frames] | None = None
+        self._latest: tuple[tuple[Direction, float, Stance | None, float, int], Frames] | None = None
         self._x, self._middle = x, x[self._deviations]
         self._views = self._around()
         self._frames = self._frame(first, stroke_m, None)
@@ -165,18 +121,14 @@ class SmoothedBelief(Belief):
         """Take in a step of the tracks, and the time that it took."""
         x, about = self._x, float(self._x[0])
         F = np.eye(len(x))
-        for k in range(8 if self._moves else 5):
+        for k in range(self._deviations.start):
             e = np.zeros(len(x))
             e[k] = 1e-6
             ends = (self._moved(x + s * e, left_m, right_m, step_s, about) for s in (1.0, -1.0))
             F[:, k] = np.subtract(*ends) / 2e-6
         Q = self._process_noise(x, left_m, right_m, step_s)
         self._x, self._P = self._moved(x, left_m, right_m, step_s, about), F @ self._P @ F.T + Q
-        self._time_s += step_s
-        if left_m or right_m:
-            self._tracks_m = np.concatenate([self._tracks_m, [[left_m, right_m]]])
-            noise = arc_covariance(self.vehicle, left_m, right_m)
-            self._track_noise = np.concatenate([self._track_noise, noise[None]])
+        self._way = self._way.after(left_m, right_m, step_s)
 
     def update(self, seen: Direction, stroke_m: float, held: Stance | None = None) -> None:
         """Take in a direction, after `predict`; one that the rig as believed cannot see says nothing."""
@@ -255,18 +207,18 @@ class SmoothedBelief(Belief):
 
     def _first(self, x: Array) -> Array:
         p, V = self._places(x, self._frames)
-        return np.concatenate([[1.0 / math.hypot(*p[0, :2]) - self._first_q], V if self._moves else []])
+        return np.concatenate([[1.0 / math.hypot(*p[0, :2]) - self.prior.q], V if self.prior.moves else []])
 
     def _with_priors(self, x: Array, rows: _Rows) -> _Rows:
         """Rows, and those of what was believed at the first frame."""
-        n, more = len(rows.r), 4 if self._moves else 1
+        n, more = len(rows.r), 4 if self.prior.moves else 1
         J, C = np.zeros((n + more, len(x))), np.zeros((n + more, n + more))
         J[:n], C[:n, :n] = rows.J, rows.C
         J[n:, : self._deviations.start] = self._slopes(x, self._first)
-        C[n, n] = self._q_sigma**2
-        if self._moves:
-            lag, a = self._time_s - self._frames.time_s, self._acceleration
-            C[n + 1 :, n + 1 :] = (self._speed**2 + a * lag[0]) * np.eye(3)
+        C[n, n] = self.prior.q_sigma**2
+        if self.prior.moves:
+            lag, a = self._way.time_s - self._frames.time_s, self.prior.acceleration_m2_per_s3
+            C[n + 1 :, n + 1 :] = (self.prior.speed_m_per_s**2 + a * lag[0]) * np.eye(3)
             C[:n, n + 1 :] = (-0.5 * a * lag[:, None, None] ** 2 * rows.F).reshape(n, 3)
             C[n + 1 :, :n] = C[:n, n + 1 :].T
         return _Rows(self._first_rows(x, rows.r), J, C, rows.F)
@@ -282,20 +234,20 @@ class SmoothedBelief(Belief):
 
     # -- model -----------------------------------------------------------------------------------------------------
 
-    def _frame(self, seen: Direction, stroke_m: float, held: Stance | None) -> _Frames:
+    def _frame(self, seen: Direction, stroke_m: float, held: Stance | None) -> Frames:
         """One frame, now; that of the latest direction again, as `update` follows `distance2`."""
-        when = seen, stroke_m, held, self._time_s, len(self._tracks_m)
+        when = seen, stroke_m, held, self._way.time_s, self._way.steps
         if self._latest is not None and self._latest[0][0] is seen and self._latest[0][1:] == when[1:]:
             return self._latest[1]
         R, t = self._tilt(held)
-        one = _Frames(
+        one = Frames(
             seen.uv_px[None],
             seen.covariance_px2[None],
             np.array([stroke_m]),
             R[None],
             t[None],
-            np.array([len(self._tracks_m)]),
-            np.array([self._time_s]),
+            np.array([self._way.steps]),
+            np.array([self._way.time_s]),
             self._view_rays(seen.uv_px[None], np.array([stroke_m])),
             np.array([seen.shared_px]),
         )
@@ -316,12 +268,12 @@ class SmoothedBelief(Belief):
         rig = changed(self.rig, values)
         return _DeviatedView(rig.at(0.0), np.array(rig.stroke_axis_world), values)
 
-    def _residuals(self, x: Array, frames: _Frames) -> Array:
+    def _residuals(self, x: Array, frames: Frames) -> Array:
         """Azimuths and rises of the target by those of its pixels, shape (N, 2)."""
         rays = self._rig(x[self._deviations]).rays(frames.uv_px, frames.stroke_m)
         return _residual(self._places(x, frames)[0], *rays)
 
-    def _rows(self, x: Array, frames: _Frames) -> _Rows:
+    def _rows(self, x: Array, frames: Frames) -> _Rows:
         """Residuals of frames, their slopes and covariance."""
         n, m = len(frames.time_s), self._deviations.start
         # a row of pixels as they are, and two a step aside
@@ -341,86 +293,32 @@ class SmoothedBelief(Belief):
         noise = per_px @ frames.covariance_px2 @ np.swapaxes(per_px, 1, 2)
         C, F = self._covariance(x, frames, angle_slopes(p - origin[0] - raised), noise)
         flat = per_px.reshape(2 * n, 2)
-        C += np.kron(self._shared(frames), np.ones((2, 2))) * (flat @ flat.T)
+        driven_m = self._way.driven_m[frames.steps]
+        C += np.kron(shared_px2(frames, driven_m), np.ones((2, 2))) * (flat @ flat.T)
         return _Rows(r.reshape(-1), J, C, F)
 
-    def _places(self, y: Array, frames: _Frames) -> tuple[Array, Array]:
+    def _course(self, y: Array) -> Course:
+        """Course of the robot by the state's slip and skid."""
+        return self._way.course(y[SLIP], y[SKID])
+
+    def _places(self, y: Array, frames: Frames) -> tuple[Array, Array]:
         """Places of the target in the rig's frame as the robot stood at each frame, shape (N, 3), and its velocity."""
-        course = self._course(y)
-        ahead = np.array([self.vehicle.sensor_x_m, 0.0, 0.0])
-        P = _yaw(course.heading_rad[-1]) @ (self.point_m(y) + ahead)
-        P[:2] += course.place_m[-1]
-        velocity = np.zeros(3)
-        points = np.tile(P, (len(frames.time_s), 1))
-        if self._moves:
-            velocity = _yaw(course.heading_rad[-1]) @ y[VELOCITY] / max(float(y[2]), LEAST_Q)
-            points = points - (self._time_s - frames.time_s)[:, None] * velocity
-        points[:, :2] -= course.place_m[frames.steps]
-        level = np.einsum("nji,nj->ni", _yaw(course.heading_rad[frames.steps]), points) - ahead
-        return np.einsum("nji,nj->ni", frames.turned, level - frames.origin_m), velocity
+        course, velocity = self._course(y), np.zeros(3)
+        if self.prior.moves:
+            velocity = course.last_yaw @ y[VELOCITY] / max(float(y[2]), LEAST_Q)
+        return course.seen_from(frames, course.fixed(self.point_m(y)), velocity, self._way.time_s), velocity
 
-    def _course(self, y: Array) -> _Course:
-        """Places after each step, by the state's slip and skid."""
-        left, right = self._tracks_m.T
-        kept, lever = 1.0 - y[SLIP], y[SKID] * self.vehicle.gauge_m
-        length, turn = 0.5 * kept * (left + right), kept * (right - left) / lever
-        heading = np.concatenate([[0.0], np.cumsum(turn)])
-        chord, along = length * np.sinc(0.5 * turn / np.pi), heading[:-1] + 0.5 * turn
-        steps = chord[:, None] * np.stack([np.cos(along), np.sin(along)], axis=-1)
-        return _Course(heading, np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]))
-
-    def _shared(self, frames: _Frames) -> Array:
-        """Covariance of pixels that frames share, each coordinate, shape (N, N): fixed pattern, and the wall's texture.
-
-        The pattern is that of the pixels under the spot. The texture stays where it is around the spot while only the
-        carriage moves; a drive shows it from elsewhere.
-        """
-        pattern, texture = frames.shared_px.T
-        uv, way = frames.uv_px, np.concatenate([[0.0], np.cumsum(np.abs(self._tracks_m).mean(axis=1))])[frames.steps]
-        apart = np.hypot(*np.moveaxis(uv[:, None] - uv, -1, 0))
-        driven = np.abs(np.subtract.outer(way, way))
-        result = np.outer(pattern, pattern) * np.exp(-apart / _PATTERN_REACH_PX)
-        return result + np.outer(texture, texture) * np.exp(-driven / _TEXTURE_REACH_M)
-
-    def _covariance(self, x: Array, frames: _Frames, E: Array, noise: Array) -> tuple[Array, Array]:
+    def _covariance(self, x: Array, frames: Frames, E: Array, noise: Array) -> tuple[Array, Array]:
         """Covariance of residuals, shape (2 N, 2 N): pixels in each frame, steps and motion between frames; and F."""
         n, course = len(frames.time_s), self._course(x)
         C = np.zeros((n, 2, n, 2))
         C[np.arange(n), :, np.arange(n), :] = noise
-        yaw = _yaw(course.heading_rad[frames.steps])
-        F = E @ np.swapaxes(frames.turned, 1, 2) @ np.swapaxes(yaw, 1, 2)
-        flat = F.reshape(2 * n, 3)
-        if len(self._tracks_m):
-            S = self._shared_place(x, course)[frames.steps]
-            later = ((F @ S).reshape(2 * n, 3) @ flat.T).reshape(n, 2, n, 2)
-            # the later of two frames decides, and frames are in order
-            C += np.where(np.tri(n, dtype=bool)[:, None, :, None], later, later.transpose(2, 3, 0, 1))
-        if self._moves:
-            lag = self._time_s - frames.time_s
-            short, long = np.minimum.outer(lag, lag), np.maximum.outer(lag, lag)
-            K = self._acceleration * short**2 * (3.0 * long - short) / 6.0
-            C += K[:, None, :, None] * (flat @ flat.T).reshape(n, 2, n, 2)
+        F = course.slopes(frames, E)
+        if self._way.steps:
+            C += self._way.shared_by_steps(course, course.fixed(self.point_m(x)), frames, F)
+        if self.prior.moves:
+            C += shared_by_motion(self.prior.acceleration_m2_per_s3, self._way.time_s - frames.time_s, F)
         return C.reshape(2 * n, 2 * n), F
-
-    def _shared_place(self, x: Array, course: _Course) -> Array:
-        """Covariance of the target's place, frame of the first, by the steps after each, shape (S + 1, 3, 3)."""
-        ahead = np.array([self.vehicle.sensor_x_m, 0.0, 0.0])
-        P = course.place_m[-1] + (_yaw(course.heading_rad[-1]) @ (self.point_m(x) + ahead))[:2]
-        dx, dy = (P - course.place_m[:-1]).T
-        c, s = np.cos(course.heading_rad[:-1]), np.sin(course.heading_rad[:-1])
-        zero = np.zeros_like(c)
-        D = np.stack([np.stack(row, axis=-1) for row in ((c, -dy), (s, dx), (zero, zero))], axis=-2)
-        each = D @ self._track_noise @ np.swapaxes(D, 1, 2)
-        return np.concatenate([np.cumsum(each[::-1], axis=0)[::-1], np.zeros((1, 3, 3))])
-
-
-def _yaw(heading_rad: Array) -> Array:
-    """Rotations about the vertical, shape (..., 3, 3)."""
-    R = np.zeros((*np.shape(heading_rad), 3, 3))
-    R[..., 0, 0] = R[..., 1, 1] = np.cos(heading_rad)
-    R[..., 1, 0] = np.sin(heading_rad)
-    R[..., 0, 1], R[..., 2, 2] = -R[..., 1, 0], 1.0
-    return R
 
 
 def _residual(p: Array, origin: Array, direction: Array, raised: Array) -> Array:
@@ -437,15 +335,12 @@ def belief_of(
     first: Direction,
     stroke_m: float,
     bias: RigBias,
-    distances_m: tuple[float, float] = PRIOR_DISTANCES_M,
-    acceleration_m2_per_s3: float = 0.0,
-    speed_m_per_s: float = 0.3,
+    prior: TargetPrior = ANY_TARGET,
 ) -> Belief:
     """Belief for what is known: smoothed where the rig has deviations or frames share errors, filtered elsewhere."""
-    target = distances_m, acceleration_m2_per_s3, speed_m_per_s
     if bias.count or any(first.shared_px):
-        return SmoothedBelief(rig, vehicle, first, stroke_m, bias, *target)
-    return TargetBelief(rig, vehicle, first, stroke_m, *target)
+        return SmoothedBelief(rig, vehicle, first, stroke_m, bias, prior)
+    return TargetBelief(rig, vehicle, first, stroke_m, prior)
 
 
 def film_beliefs(
@@ -454,9 +349,7 @@ def film_beliefs(
     positions: FilmPositions,
     times_s: Array,
     strokes_m: Array,
-    distances_m: tuple[float, float] = PRIOR_DISTANCES_M,
-    acceleration_m2_per_s3: float = 0.0,
-    speed_m_per_s: float = 0.3,
+    prior: TargetPrior = ANY_TARGET,
     encoder_sigma_m: float = 0.0,
     rig_covariance: Array | None = None,
 ) -> Iterator[tuple[int, Belief]]:
@@ -469,8 +362,7 @@ def film_beliefs(
         or of `film.spot_tracks.fitted_positions`; frames without one are left out.
     times_s, strokes_m : shape (N,)
         Time at which the spot's row was exposed, and the encoder's reading then.
-    distances_m, acceleration_m2_per_s3, speed_m_per_s
-        As for `TargetBelief`.
+    prior : TargetPrior
     encoder_sigma_m : float
         Standard deviation of a reading: the rise is k - h q, and errs by as much as q times that.
     rig_covariance : shape (p, p), or None
@@ -478,7 +370,6 @@ def film_beliefs(
     """
     belief: Belief | None = None
     before, bias = 0.0, RigBias(rig, rig_covariance)
-    q = 0.5 * sum(1.0 / D for D in distances_m)
     # what frames share, as if new in every frame: the sum over all frames is no less than it, by Gershgorin's theorem
     shared = np.abs(positions.shared_px2[:, :, positions.good]).sum(axis=(2, 3))
     for k in np.flatnonzero(positions.good):
@@ -486,11 +377,10 @@ def film_beliefs(
         seen = direction_with(rig, float(positions.uv_px[k, 0]), float(positions.uv_px[k, 1]), noise)
         if seen is None:
             continue
-        q = q if belief is None else float(belief.mean[2])
+        q = prior.q if belief is None else float(belief.mean[2])
         seen = replace(seen, covariance=seen.covariance + np.diag([0.0, (q * encoder_sigma_m) ** 2]))
         if belief is None:
-            target = distances_m, acceleration_m2_per_s3, speed_m_per_s
-            belief = belief_of(rig, vehicle, seen, float(strokes_m[k]), bias, *target)
+            belief = belief_of(rig, vehicle, seen, float(strokes_m[k]), bias, prior)
         else:
             belief.predict(0.0, 0.0, float(times_s[k]) - before)
             belief.update(seen, float(strokes_m[k]))

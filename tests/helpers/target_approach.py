@@ -11,7 +11,7 @@ import numpy as np
 
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, RIG_PARAMETERS, RigBias
 from phibench.estimator.geometry.sphere_image import SphereImager
-from phibench.estimator.loop.belief import Belief
+from phibench.estimator.loop.belief import Belief, TargetPrior
 from phibench.estimator.loop.sensing import SEEN, Direction, Light, Reading, Sensing, direction_of
 from phibench.estimator.loop.smoothing import belief_of
 from phibench.scenes.motion.vehicle import PlanarPose, Stance, Vehicle, rig_placement, stance
@@ -97,7 +97,7 @@ def stroked(run: Approach, to_m: float, frames: int, moving: float = 0.0, bias: 
     """Belief after a stroke with frames on its way."""
     first = run.look()
     assert first is not None
-    belief = belief_of(RIG, VEHICLE, first, 0.0, bias or RigBias(RIG, None), acceleration_m2_per_s3=moving)
+    belief = belief_of(RIG, VEHICLE, first, 0.0, bias or RigBias(RIG, None), TargetPrior(acceleration_m2_per_s3=moving))
     for k in range(frames):
         run.stroke_m = to_m * (k + 1) / frames
         step(run, belief, 0.0, 0.0)

@@ -24,7 +24,7 @@ from phibench.estimator.film.film_positions import FilmPositions
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, PRIOR_SIGMA, RigBias, drawn_deviation
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.estimator.loop.belief import Belief, PairTracker, TargetBelief
+from phibench.estimator.loop.belief import Belief, PairTracker, TargetBelief, TargetPrior
 from phibench.estimator.loop.sensing import direction_of, direction_read
 from phibench.estimator.loop.smoothing import SmoothedBelief, belief_of, film_beliefs
 from phibench.scenes.frames import Array
@@ -225,7 +225,7 @@ def test_frames_at_once_say_what_explicit_steps_say(moving: float) -> None:
     first = direction_of(RIG, read.u_px, read.v_px, 0.05)
     assert first is not None
     frames = [(first.uv_px, 0.0, (0.0, 0.0))]
-    belief = belief_of(RIG, VEHICLE, first, 0.0, bias, acceleration_m2_per_s3=moving)
+    belief = belief_of(RIG, VEHICLE, first, 0.0, bias, TargetPrior(acceleration_m2_per_s3=moving))
     for k in range(9):
         tracks = (0.0, 0.0) if k < 4 else (0.06, 0.08)
         run.stroke_m = 0.1 * min(k + 1, 4)
@@ -333,6 +333,20 @@ def test_an_exact_rig_adds_no_states_and_a_wrong_covariance_is_refused() -> None
         RigBias(RIG, rig_covariance(1.0) @ (np.ones((len(PARAMETERS),) * 2) - 0.5 * np.eye(len(PARAMETERS))))
 
 
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [
+        ({"distances_m": (3.0, 2.0)}, "the first must be below the second"),
+        ({"distances_m": (0.0, 2.0)}, "distances_m = 0.0: must be above 0"),
+        ({"acceleration_m2_per_s3": -0.1}, "must be 0 or above"),
+        ({"speed_m_per_s": math.nan}, "must be a finite number"),
+    ],
+)
+def test_targets_that_cannot_be_expected_are_refused(numbers, words: str) -> None:
+    with pytest.raises(SceneError, match=words):
+        TargetPrior(**numbers)
+
+
 # -- moving targets ----------------------------------------------------------------------------------------------------
 
 MOVING = 0.01  # m2/s3: the speed changes by 0.1 m/s in a second
@@ -349,7 +363,7 @@ def moved(number: int, seconds: float = 6.0) -> tuple[float, float, float, float
     )
     first = run.look()
     assert first is not None
-    belief, pairs = TargetBelief(RIG, VEHICLE, first, 0.0, acceleration_m2_per_s3=MOVING), PairTracker(RIG)
+    belief, pairs = TargetBelief(RIG, VEHICLE, first, 0.0, TargetPrior(acceleration_m2_per_s3=MOVING)), PairTracker(RIG)
     for k in range(round(10 * seconds)):
         kick, rest = math.sqrt(MOVING * 0.1) * run.rng.standard_normal((2, 3))
         # the integral of a velocity that walks randomly: half of its step, and a part of its own
