@@ -38,7 +38,14 @@ from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 
 LEAD = "released"
-_LABELS = {LEAD: "released: 18 000 crops, 3 epochs", "short0": "3000 crops, 1 epoch"}
+_LABELS = {
+    LEAD: "all presets, seed 0: released",
+    "seed1": "all presets, seed 1",
+    "seed2": "all presets, seed 2",
+    "bayer-raw": "bayer-raw alone",
+    "srgb8": "srgb8 alone",
+    "mjpeg": "mjpeg alone",
+}
 COUNT, LEAK_COUNT, RESAMPLES = 500, 1200, 2000
 SETTINGS = replace(CROP_SETTINGS, laser_levels=(0.25, 1.0))  # those of the recipe
 SIZES: dict[str, dict[str, Any]] = {  # numbers of bench-test
@@ -47,6 +54,11 @@ SIZES: dict[str, dict[str, Any]] = {  # numbers of bench-test
     "mjpeg 50": {"jpeg_quality": 50, "read_noise_e": 5.0},
     "mjpeg 65": {"jpeg_quality": 65, "read_noise_e": 5.0},
     "mjpeg 80": {"jpeg_quality": 80, "read_noise_e": 5.0},
+}
+OUTSIDE = {  # what was trained: factors of 0.15 to 2, up to 2.5 px from the middle
+    "brighter, 2 to 8 times": replace(SETTINGS, laser_levels=(2.0, 8.0)),
+    "fainter, 0.05 to 0.15 times": replace(SETTINGS, laser_levels=(0.05, 0.15)),
+    "up to 6 px from the middle": replace(SETTINGS, spread_px=6.0),
 }
 
 
@@ -135,7 +147,15 @@ def measure(dev: Path, test: Path, networks: Path, out: Path) -> None:
         ):
             tables[size + part] = table_of(crops, files, size + part, chosen)
             print(size + part, {k: v["rms_px"] if isinstance(v, dict) else v for k, v in tables[size + part].items()})
+    for size in ("bayer-raw", "srgb8", "mjpeg 80"):
+        request = FrameRequest(size.split()[0], "auto", overrides=SIZES[size])
+        for part, settings in OUTSIDE.items():
+            crops = made(_crops(test, request, settings), test)
+            name = f"{size}, {part}"
+            tables[name] = table_of(crops, {LEAD: files[LEAD]}, name, crops.answers(files[LEAD]).sure)
+            print(name, tables[name])
     tables["leak"] = leak(dev, files)
+    print("leak", tables["leak"])
     out.write_text(json.dumps(tables, indent=1))
 
 
@@ -146,29 +166,31 @@ def _crops(folder: Path, request: FrameRequest, settings: CropSettings = SETTING
 def leak(dev: Path, files: dict[str, Path]) -> dict[str, Any]:
     """Rms pull in rooms that were held out over that in rooms trained in, by network; and of all networks together.
 
-    Together, the same crops are answered by networks that were trained in their room and by others: the ratio of their
-    rms errors has no part of the rooms.
+    Networks count that have the settings of the released one; seeds, and so rooms, differ. Together, the same crops are
+    answered by networks that were trained in their room and by others: the ratio of rms errors has no part of rooms.
     """
     numbers = {name: json.loads(Network(file, CROP).metadata["settings"]) for name, file in files.items()}
+    numbers = {name: one for name, one in numbers.items() if {**one, "seed": 0} == {**numbers[LEAD], "seed": 0}}
     every = [row.sample_id for row in open_finished(dev).rows]
     held = {name: set(rooms_of(dev, one["seed"])[1]) for name, one in numbers.items()}
     crops = made(crops_of(dev, TrainingSettings(), every, LEAK_COUNT, 78), dev)
-    answers = {name: crops.answers(file) for name, file in files.items()}
+    answers = {name: crops.answers(files[name]) for name in numbers}
     found: dict[str, Any] = {}
     for name, one in answers.items():
         unseen = np.isin(crops.samples, sorted(held[name]))
         found[name] = ratio(one.squared_pull[one.sure], unseen[one.sure], crops.samples[one.sure])
-    short = [name for name in files if name != LEAD]
-    sure = np.all([answers[name].sure for name in short], axis=0) if short else np.zeros(len(crops.samples), bool)
+    sure = np.all([one.sure for one in answers.values()], axis=0)
     outside, inside = np.full(len(sure), np.nan), np.full(len(sure), np.nan)
     for k, sample in enumerate(crops.samples):
         for part, chosen in ((outside, True), (inside, False)):
-            some = [(answers[n].error_px[k] ** 2).sum() for n in short if (sample in held[n]) == chosen]
+            some = [(answers[n].error_px[k] ** 2).sum() for n in numbers if (sample in held[n]) == chosen]
             part[k] = np.mean(some) if some else np.nan
     kept = np.flatnonzero(sure & np.isfinite(outside) & np.isfinite(inside))
     if len(kept):
         o, i = outside[kept], inside[kept]
-        found["together"] = interval(lambda k: float(np.sqrt(o[k].mean() / i[k].mean())), crops.samples[kept], "leak")
+        samples = crops.samples[kept]
+        found["together"] = interval(lambda k: float(np.sqrt(o[k].mean() / i[k].mean())), samples, "leak")
+        found["crops, rooms"] = [len(kept), len(set(samples))]
     return found
 
 
@@ -204,18 +226,22 @@ def pairs(test: Path, scores: Path, networks: Path) -> None:
         samples, bound = np.array([row["sample_id"] for row in rows]), np.array([row["bound_px2"] for row in rows])
         error = np.array([[row["du_px_other"], row["dv_px_other"]] for row in rows], float)
         pull = np.array([[row["pull_u_other"], row["pull_v_other"]] for row in rows], float)
-        _print(preset, other, error, (pull**2).mean(axis=1), bound, samples)
+        others = (error**2).sum(axis=1)
+        _print(preset, other, others, others, (pull**2).mean(axis=1), bound, samples)
         for name, one in answers.items():
-            _print(preset, name, one.error_px, one.squared_pull, bound, samples)
+            _print(preset, name, (one.error_px**2).sum(axis=1), others, one.squared_pull, bound, samples)
 
 
-def _print(preset: str, name: str, error: Array, squared: Array, bound: Array, samples: Array) -> None:
-    square = (error**2).sum(axis=1)
+def _print(preset: str, name: str, square: Array, others: Array, squared: Array, bound: Array, samples: Array) -> None:
     values: dict[str, Callable[[Array], float]] = {
         "rms": lambda k: float(np.sqrt(square[k].mean())),
         "median": lambda k: float(np.median(np.sqrt(square[k]))),
         "efficiency": lambda k: float(np.sqrt(bound[k].mean() / square[k].mean())),
         "pull": lambda k: float(np.sqrt(np.nanmean(squared[k]))),
+        "rms over the other's": lambda k: float(np.sqrt(square[k].mean() / others[k].mean())),
+        "90 % quantile over the other's": lambda k: float(
+            np.sqrt(np.quantile(square[k], 0.9) / np.quantile(others[k], 0.9))
+        ),
     }
     shown = {key: [round(x, 3) for x in interval(value, samples, preset + key)] for key, value in values.items()}
     print(preset, name, len(samples), shown)

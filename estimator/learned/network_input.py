@@ -5,6 +5,8 @@ are interpolated bilinearly, which loses nothing; 8-bit codes go back through to
 balance. What is left of the difference on - off is then free of exposure, gain and the brightness of the room.
 
 Noise is measured in the border of the crop itself. No input says which processing it was: a network sees it.
+
+A whole frame is brought to cells of 2 x 2 pixels: the difference on - off behind R and G in standard deviations.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from phibench.scenes.frames import Array, BoolArray
 SIDE_PX = 32
 PLANES = 4  # R, G, B of the difference, and full pixels
 SCALARS = 5  # see `crop_input`
+FRAME_PLANES = 3  # significance behind R and G, and full pixels
 ACCEPTED = ("bayer-raw", "srgb8", "mjpeg")
 
 _MIDDLE = slice(10, 22)  # of a crop: rows and columns in which the spot's centre may lie
@@ -31,6 +34,8 @@ _BORDER_PX = 6  # of which background and noise are taken
 _SIGMA_OF_MAD = 1.4826
 _LEAST_SIGMA = 0.1  # of the card's: rounding and JPEG may leave a border without any noise
 _CUT = 3.0  # of relative values: beyond it there is another light
+_COMPRESSED = 3.0  # significances beyond it count by their logarithm
+_NOISE_STEP = 4  # every fourth cell in both directions is enough for a median
 
 
 @dataclass(frozen=True)
@@ -126,3 +131,42 @@ def _smoothed(plane: Array) -> Array:
     p = np.pad(plane, 1, mode="edge")
     rows = 0.25 * (p[:-2] + 2.0 * p[1:-1] + p[2:])
     return np.asarray(0.25 * (rows[:, :-2] + 2.0 * rows[:, 1:-1] + rows[:, 2:]))
+
+
+# -- whole frames ----------------------------------------------------------------------------------------------------
+
+
+def frame_input(on: Image, off: Image, card: SensorCard) -> tuple[NDArray[np.float32], Array]:
+    """Input for a frame at half its resolution, and the red light of its cells.
+
+    Parameters
+    ----------
+    on, off : shape (H, W, ...), H and W even
+        Frame or a part of it that begins at an even row and column.
+    card : SensorCard
+
+    Returns
+    -------
+    planes : shape (3, H / 2, W / 2), float32
+        Means of on - off behind R and G over cells of 2 x 2 pixels, in standard deviations z of the noise, compressed
+        as asinh(z / 3); share of full pixels.
+    red_e : shape (H / 2, W / 2)
+        Electrons of the difference behind R, mean of a cell.
+    """
+    (lit, full), (dark, dark_full) = filter_planes(on, card), filter_planes(off, card)
+    cells = [_cells(lit[k] - dark[k]) for k in (0, 1)]
+    planes = []
+    for k, cell in enumerate(cells):
+        z = cell / np.sqrt(2.0 * variance_e2(_cells(dark[k]), card, alike=True))
+        # the card knows no interpolation, denoising or JPEG: the scale is measured
+        scatter = _SIGMA_OF_MAD * float(np.median(np.abs(z[::_NOISE_STEP, ::_NOISE_STEP])))
+        planes.append(np.arcsinh(z / max(scatter, _LEAST_SIGMA) / _COMPRESSED))
+    planes.append(_cells(full | dark_full))
+    return np.stack(planes).astype(np.float32), cells[0]
+
+
+def _cells(plane: NDArray[Any]) -> Array:
+    """Means of cells of 2 x 2 pixels, shape (H / 2, W / 2)."""
+    p = np.asarray(plane, float)
+    rows = p[::2] + p[1::2]
+    return np.asarray(0.25 * (rows[:, ::2] + rows[:, 1::2]))

@@ -3,7 +3,7 @@
 One thread: the same bytes every time.
 
 A file ends with the SHA-256 of all that is before it. It is an entry of the model's metadata, so that other programs
-read the file as they read any ONNX model. `learned.crop_training` makes the weights.
+read the file as they read any ONNX model. `learned.crop_training` and `learned.frame_training` make the weights.
 """
 
 from __future__ import annotations
@@ -18,12 +18,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, uniform_filter
 
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.datasets.input_files import MIB, InputFile
 from phibench.datasets.store.files import write_bytes
-from phibench.estimator.interface import Pair, Spot
+from phibench.estimator.interface import Image, Spot
 from phibench.estimator.learned.network_input import (
+    FRAME_PLANES,
     PLANES,
     SCALARS,
     SIDE_PX,
@@ -32,11 +35,11 @@ from phibench.estimator.learned.network_input import (
     crop_origin,
     cut,
 )
-from phibench.scenes.frames import Array
+from phibench.scenes.frames import Array, BoolArray
 
 VERSION = "1"
 """Version of what a network gets and answers; a change of either raises it."""
-CROP = "learned_crop"
+CROP, DETECT = "learned_crop", "learned_detect"
 INSTALL = "pip install 'phibench[learned]'"
 INSTALL_TRAINING = "pip install 'phibench[learned-training]' (the CPU's wheel of PyTorch is enough: docs/learned.md)"
 
@@ -53,7 +56,10 @@ class NetworkError(DatasetError):
     """A network that cannot be used; one sentence."""
 
 
-SHIPPED = {CROP: "c4aa88dae1ff24d866a5287c31af3a213a9731eea1a87cd92f73d112c187e652"}
+SHIPPED = {
+    CROP: "c4aa88dae1ff24d866a5287c31af3a213a9731eea1a87cd92f73d112c187e652",
+    DETECT: "98a94db274d407ee1a51efb3ab6209a0da18f038dbc2889d1a4aba3d76c2846f",
+}
 """SHA-256 that the files of this release state; part of the code, so that a method's hash changes with its weights."""
 
 
@@ -98,7 +104,7 @@ class Network:
     Parameters
     ----------
     path : Path
-    name : str, such as `CROP`
+    name : `CROP` or `DETECT`
 
     Raises
     ------
@@ -125,10 +131,14 @@ class Network:
         """Outputs for inputs with a leading axis of items."""
         return list(self._session.run(None, inputs))
 
-    def position(self, crop: CropInput) -> Position:
-        """Position of the spot in a crop, with its covariance."""
+    def number(self, key: str) -> float:
+        """Number of the metadata."""
+        return float(self.metadata[key])
+
+    def position(self, crop: CropInput, scale: float | None = None) -> Position:
+        """Position of the spot in a crop, with its covariance; by default with the network's own scale."""
         uv, factor = self.run(planes=crop.planes[None], scalars=crop.scalars[None])
-        scale = float(self.metadata["covariance_scale"])
+        scale = self.number("covariance_scale") if scale is None else scale
         return Position(np.asarray(uv[0], float), covariances(np.asarray(factor, float), scale)[0])
 
 
@@ -182,6 +192,8 @@ DENSE = (("d1", 2 * 32 + SCALARS, 48), ("d2", 48, 5))
 CORRECTION_PX = 0.1
 """Of the place, per unit of the last layer."""
 CELLS = SIDE_PX // 2
+DETECTOR = (("e1", FRAME_PLANES, 12), ("e2", 12, 16), ("e3", 16, 16), ("e4", 16, 16))
+"""Of the network of frames: name, planes in, planes out; 3 x 3 cells each, cut at 0; then one plane of 1 x 1."""
 
 
 def cell_places() -> NDArray[np.float32]:
@@ -195,19 +207,15 @@ def cell_places() -> NDArray[np.float32]:
 _OPSET, _IR = 17, 8  # of 2022: what every onnxruntime of these years reads
 
 
-def write_network(
-    path: Path, name: str, weights: Weights, metadata: Mapping[str, Any], graph_of: Callable[[Any], Graph] | None = None
-) -> Path:
+def write_network(path: Path, name: str, weights: Weights, metadata: Mapping[str, Any]) -> Path:
     """Write the file of a network, and read it back.
 
     Parameters
     ----------
     path : Path
-    name : str, such as `CROP`
+    name : `CROP` or `DETECT`
     weights : Weights
-    metadata : entries besides name and version, such as "covariance_scale" of `CROP`
-    graph_of : function
-        From onnx.helper to the graph; that of `CROP` by default.
+    metadata : entries besides name and version, such as "covariance_scale"
 
     Raises
     ------
@@ -221,7 +229,7 @@ def write_network(
         import onnx.numpy_helper
     except ImportError as error:
         raise NetworkError(f"writing networks needs onnx: {INSTALL_TRAINING}") from error
-    graph = (graph_of or _crop_graph)(onnx.helper)
+    graph = _GRAPHS[name](onnx.helper)
     tensors = [onnx.numpy_helper.from_array(value, key) for key, value in (weights | graph.constants).items()]
     float_of = onnx.TensorProto.FLOAT
     ends = [
@@ -282,6 +290,16 @@ def _crop_graph(helper: Any) -> Graph:
     return Graph(nodes, constants, inputs, {"uv_px": ["n", 2], "factor": ["n", 3]})
 
 
+def _detect_graph(helper: Any) -> Graph:
+    """`detector_forward` in ONNX's operators."""
+    nodes, x = [], "planes"
+    for name, _, _ in DETECTOR:
+        nodes += convolution(helper, x, name)
+        x = f"{name}.y"
+    nodes.append(helper.make_node("Conv", [x, "heat.w", "heat.b"], ["heat"], kernel_shape=[1, 1]))
+    return Graph(nodes, {}, {"planes": ["n", FRAME_PLANES, "h", "w"]}, {"heat": ["n", 1, "h", "w"]})
+
+
 def convolution(helper: Any, x: str, name: str, stride: int = 1) -> list[Any]:
     """Nodes of a layer of 3 x 3 that is cut at 0; its result is "<name>.y"."""
     numbers = {"kernel_shape": [3, 3], "pads": [1] * 4, "strides": [stride] * 2}
@@ -291,19 +309,39 @@ def convolution(helper: Any, x: str, name: str, stride: int = 1) -> list[Any]:
     ]
 
 
+_GRAPHS: Mapping[str, Callable[[Any], Graph]] = {CROP: _crop_graph, DETECT: _detect_graph}
+
+
 # -- spots of a pair -------------------------------------------------------------------------------------------------
 
 _LOOKS = 3  # a crop about the place that the last one gave; the second is nearly always the same
 _REACH_PX = 9.0  # of the crop's middle: farther away nothing was trained
 
 
-def refined(found: Network, pair: Pair, position: str, uv_px: tuple[float, float]) -> Spot:
-    """Position and covariance by a network, from the crop about a place (u, v)."""
-    image, dark = pair.images[position], pair.images.get(f"{position}_off")
+def refined(
+    found: Network,
+    image: Image,
+    dark: Image | None,
+    card: SensorCard,
+    uv_px: tuple[float, float],
+    scale: float | None = None,
+) -> Spot:
+    """Position and covariance by the network of crops, from the crop about a place (u, v).
+
+    Parameters
+    ----------
+    found : Network, of `CROP`
+    image, dark : shape (H, W, ...)
+        With the laser on, and off where there is such a frame.
+    card : SensorCard
+    uv_px : (u, v)
+    scale : float, optional
+        Factor of the covariance instead of the network's.
+    """
     origin = crop_origin(uv_px)
     for _ in range(_LOOKS):
-        made = crop_input(cut(image, origin), None if dark is None else cut(dark, origin), pair.card)
-        answer = found.position(made)
+        made = crop_input(cut(image, origin), None if dark is None else cut(dark, origin), card)
+        answer = found.position(made, scale)
         if not np.abs(answer.uv_px - (SIDE_PX - 1) / 2.0).max() < _REACH_PX:
             return Spot.missing("no spot near the place")
         u, v = (float(x) for x in answer.uv_px + origin)
@@ -315,3 +353,31 @@ def refined(found: Network, pair: Pair, position: str, uv_px: tuple[float, float
         return Spot.missing("spot cut")
     (a, b), (_, c) = answer.covariance_px2.tolist()
     return Spot((u, v), ((a, b), (b, c)))
+
+
+@dataclass(frozen=True)
+class HeatPeaks:
+    """Peaks of a map of heat.
+
+    Attributes
+    ----------
+    cells : shape (n, 2)
+        Places (u, v), cells of 2 x 2 pixels.
+    heat : shape (n,)
+    red_e : shape (n,)
+        Red light about them, mean electrons of 5 x 5 cells.
+    """
+
+    cells: Array
+    heat: Array
+    red_e: Array
+
+
+_NEAR = 5  # cells along a side: one spot
+
+
+def heat_peaks(heat: Array, red_e: Array, inside: BoolArray, least: float) -> HeatPeaks:
+    """Peaks above a level in the part that is asked for; heat, light and part have the shape (h, w)."""
+    heat = np.where(inside, heat, -np.inf)
+    v, u = np.nonzero((heat >= least) & (heat == maximum_filter(heat, _NEAR)))
+    return HeatPeaks(np.stack([u, v], axis=1).astype(float), heat[v, u], uniform_filter(red_e, _NEAR)[v, u])

@@ -11,13 +11,13 @@ from importlib.util import find_spec
 from phibench.estimator.interface import Answer, Method, Pair, Spot
 from phibench.estimator.learned.network_input import ACCEPTED
 from phibench.estimator.methods.chain_fit import chain_fit
+from phibench.estimator.methods.learned_spots import learned_crop, learned_detect
 from phibench.estimator.methods.locate import each_spot
 from phibench.estimator.methods.raw_likelihood import joint_fit, raw_likelihood
 from phibench.estimator.methods.simple import (
     at_the_red_peak,
     detected_spots,
     in_the_box,
-    learned_crop,
     off_difference,
     photutils_centroid_2dg,
     red_centroid,
@@ -155,6 +155,15 @@ _ALL = (
         "small network on the 32 x 32 pixels about the spot that `detect` sees; claims a covariance",
         "docs/learned.md",
         accepts=ACCEPTED,
+        package="onnxruntime",
+    ),
+    BuiltIn(
+        "learned_detect",
+        learned_detect(),
+        "small network that finds the spot in the whole mirror, then that of `learned_crop`; claims a covariance",
+        "docs/learned.md",
+        accepts=ACCEPTED,
+        needs_off=True,
         package="onnxruntime",
     ),
     BuiltIn(

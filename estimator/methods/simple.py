@@ -1,4 +1,4 @@
-"""Built-in methods without a noise model: simple extractors, centroids, other packages, networks, `detect`.
+"""Built-in methods without a noise model: simple extractors, centroids, other packages, `detect`.
 
 The extractors of `simple_spots` work on the picture as a viewer shows it. Extractors of other packages are rows to
 compare with; each package is imported when its method runs.
@@ -7,13 +7,11 @@ compare with; each package is imported when its method runs.
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
-from phibench.estimator.interface import Answer, Method, Pair, Spot
-from phibench.estimator.learned.networks import CROP, network, refined, shipped
-from phibench.estimator.methods.locate import SearchRegion, detected, each_spot, red_peak, spot_of
+from phibench.estimator.interface import Answer, Pair, Spot
+from phibench.estimator.methods.locate import SearchRegion, detected, red_peak, spot_of
 from phibench.estimator.spots.detect import Detection
 from phibench.estimator.spots.image_planes import linear_planes, redness
 from phibench.estimator.spots.simple_spots import SIMPLE_METHODS, thresholded_centroid
@@ -118,27 +116,6 @@ def _spot_in_window(near: SearchRegion, u: float, v: float) -> Spot:
     if not (0.0 <= u <= near.box.width_px - 1.0 and 0.0 <= v <= near.box.height_px - 1.0):
         return Spot.missing("spot cut")
     return Spot((u + near.box.u0_px, v + near.box.v0_px))
-
-
-def learned_crop(file: Path | None = None) -> Method:
-    """Network of a file on the 32 x 32 pixels about the red peak; by default the network that phibench ships.
-
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> from phibench.estimator.methods.simple import learned_crop
-    >>> extract = learned_crop(Path("my_crop.onnx"))  # in my_phi.py: phibench score ... --method my_phi.py:extract
-    """
-
-    def find(region: SearchRegion) -> Spot:
-        peak = red_peak(region.red)
-        if peak is None:
-            return Spot.missing("no spot")
-        u0, v0 = region.origin_px
-        found = shipped(CROP) if file is None else network(file, CROP)
-        return refined(found, region.pair, region.position, (peak[0] + u0, peak[1] + v0))
-
-    return each_spot(find)
 
 
 def detected_spots(pair: Pair) -> Answer:

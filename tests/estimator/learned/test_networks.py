@@ -11,16 +11,34 @@ import pytest
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import sensor_card
-from phibench.estimator.learned import crop_training, networks
+from phibench.estimator.learned import crop_training, frame_training, networks
 from phibench.estimator.learned.crop_training import Answers, TrainingSettings, scale_of
-from phibench.estimator.learned.network_input import SCALARS, SIDE_PX, crop_input, crop_origin, cut, filter_planes
-from phibench.estimator.learned.networks import CROP, Network, NetworkError, covariances, sealed, shipped
+from phibench.estimator.learned.frame_training import FrameSettings
+from phibench.estimator.learned.network_input import (
+    SCALARS,
+    SIDE_PX,
+    crop_input,
+    crop_origin,
+    cut,
+    filter_planes,
+    frame_input,
+)
+from phibench.estimator.learned.networks import (
+    CROP,
+    DETECT,
+    Network,
+    NetworkError,
+    covariances,
+    heat_peaks,
+    sealed,
+    shipped,
+)
 from phibench.estimator.methods.registry import METHODS
 from phibench.estimator.sandbox.easy_pairs import EasyPairs
 from phibench.scenes.random_streams import generator
 
 FOLDER = Path(networks.__file__).parent
-NAMES = [CROP]
+NAMES = [CROP, DETECT]
 RUNTIME = importlib.util.find_spec("onnxruntime") is not None
 needs_runtime = pytest.mark.skipif(not RUNTIME, reason="onnxruntime is not installed: pip install 'phibench[learned]'")
 needs_torch = pytest.mark.skipif(
@@ -107,6 +125,38 @@ def test_the_scale_makes_pulls_unit_and_is_not_moved_by_a_few() -> None:
     assert 4.0 * (1.0 - 5 * 0.016) < scale_of(answers) < 4.0 * (1.14 + 5 * 0.016)
 
 
+def test_significances_of_a_frame_know_neither_gain_nor_room() -> None:
+    """The same electrons at two gains, steps of 0.01 and 0.005 electrons at a noise of 15: less than a thousandth."""
+    draw, made = generator("frame input"), []
+    v, u = np.indices((64, 80))
+    spot = 400.0 * np.exp(-0.5 * ((u - 37.0) ** 2 + (v - 22.0) ** 2) / 1.5**2)
+    noise = draw.normal(0.0, 15.0, (2, 64, 80))
+    for gain, room_e in ((100.0, 200.0), (200.0, 220.0)):
+        card = replace(sensor_card("bayer-raw"), dn_per_e=gain, full_well_e=1e5, top_dn=2**31)
+        on, off = (card.black_level_dn + np.rint(gain * (room_e + x)) for x in (spot + noise[0], noise[1]))
+        made.append(frame_input(on, off, card))
+    (first, red), (second, _) = made
+    assert first.shape == (3, 32, 40)
+    assert np.unravel_index(int(np.argmax(first[0])), red.shape) == (11, 18)
+    # a cell's variance is the mean of the card's; the room's 10 % of it cancels with the measured scatter
+    assert np.abs(first - second).max() < 0.02
+    assert not first[2].any()
+
+
+def test_peaks_of_heat_are_the_largest_of_five_cells_inside_the_part() -> None:
+    heat = np.full((30, 40), -9.0)
+    for (v, u), value in {(10, 10): 3.0, (10, 12): 4.0, (20, 30): 2.0, (25, 5): 9.0, (5, 35): -1.0}.items():
+        heat[v, u] = value
+    inside = np.ones(heat.shape, bool)
+    inside[24:] = False
+    red = np.zeros(heat.shape)
+    red[20, 30] = 25.0
+    found = heat_peaks(heat, red, inside, 0.0)
+    assert found.cells.tolist() == [[12.0, 10.0], [30.0, 20.0]]
+    assert found.heat.tolist() == [4.0, 2.0]
+    np.testing.assert_allclose(found.red_e, [0.0, 1.0], atol=1e-12)
+
+
 # -- files -----------------------------------------------------------------------------------------------------------
 
 
@@ -125,8 +175,9 @@ def test_shipped_networks_are_small_and_give_the_same_bytes(name: str) -> None:
 
 
 @needs_runtime
-def test_files_that_will_not_do_are_refused_in_one_sentence(tmp_path: Path, monkeypatch: Any) -> None:
-    model = (FOLDER / f"{CROP}.onnx").read_bytes()
+@pytest.mark.parametrize("name", NAMES)
+def test_files_that_will_not_do_are_refused_in_one_sentence(name: str, tmp_path: Path, monkeypatch: Any) -> None:
+    model = (FOLDER / f"{name}.onnx").read_bytes()
     bare = model[:-76]  # without the entry of its hash
     assert sealed(bare) == model
     other = bare.replace(b"version\x12\x011", b"version\x12\x012")
@@ -136,7 +187,7 @@ def test_files_that_will_not_do_are_refused_in_one_sentence(tmp_path: Path, monk
         (b"", "does not end as"),
         (model[:-1], "does not end as"),
         (sealed(b"no network"), "is no network that onnxruntime can run"),
-        (sealed(bare.replace(b"name\x12\x0clearned_crop", b"name\x12\x0clearned_crow")), "not 'learned_crop'"),
+        (sealed(_renamed(bare, name)), f"not '{name}'"),
     ]
     for place in generator("flipped bits").integers(0, len(model), 20):
         flipped = bytearray(model)
@@ -146,14 +197,21 @@ def test_files_that_will_not_do_are_refused_in_one_sentence(tmp_path: Path, monk
         path = tmp_path / f"{number}.onnx"
         path.write_bytes(data)
         with pytest.raises(NetworkError, match=text) as caught:
-            Network(path, CROP)
+            Network(path, name)
         assert "\n" not in str(caught.value)
         assert "install phibench anew" in str(caught.value)
     with pytest.raises(DatasetError, match="install phibench anew"):
-        Network(tmp_path / "nothing.onnx", CROP)
-    monkeypatch.setattr(networks, "SHIPPED", {CROP: "0" * 64})
+        Network(tmp_path / "nothing.onnx", name)
+    monkeypatch.setattr(networks, "SHIPPED", {CROP: "0" * 64, DETECT: "0" * 64})
     with pytest.raises(NetworkError, match="belongs to another release"):
-        shipped(CROP)
+        shipped(name)
+
+
+def _renamed(model: bytes, name: str) -> bytes:
+    """Model whose name has another last letter."""
+    entry = b"name\x12" + bytes([len(name)]) + name.encode()
+    assert entry in model
+    return model.replace(entry, entry[:-1] + b"x")
 
 
 def test_without_onnxruntime_and_pytorch_it_says_what_to_install(monkeypatch: Any, tmp_path: Path) -> None:
@@ -167,18 +225,53 @@ def test_without_onnxruntime_and_pytorch_it_says_what_to_install(monkeypatch: An
     assert absent(EasyPairs("bayer-raw").pair(0)).down.status == "install no_such_package_here"
 
 
+# -- detection in whole frames ---------------------------------------------------------------------------------------
+
+
+@needs_runtime
+@pytest.mark.parametrize("preset", ["bayer-raw", "srgb8", "mjpeg"])
+def test_a_bright_spot_is_found_in_the_whole_mirror_and_an_absent_one_is_not(preset: str) -> None:
+    pairs = EasyPairs(preset, hinted=False)
+    pair, truth = pairs.pair(0), pairs.truth(0)
+    answer = METHODS[DETECT](pair)
+    for spot, true in ((answer.down, truth.down), (answer.up, truth.up)):
+        assert spot.uv_px is not None
+        assert spot.covariance_px2 is not None
+        # of 25 000 electrons: its claims are below 0.2 px, five of them are a pixel
+        assert np.hypot(*np.subtract(spot.uv_px, true.uv_px)) < 1.0
+    dark = pairs.pair(1)  # the same camera and room, other noise
+    without = METHODS[DETECT](replace(pair, down=dark.down_off, up=dark.up_off))
+    assert (without.down.uv_px, without.up.uv_px) == (None, None)
+    assert without.down.status == "no spot found"
+    half = METHODS[DETECT](replace(pair, up=dark.up_off))
+    assert (half.down.uv_px is None, half.up.uv_px is None) == (False, True)
+    assert METHODS[DETECT](replace(pair, down_off=None)).down.status == "needs laser-off frames"
+
+
+@needs_runtime
+def test_boxes_restrict_the_search() -> None:
+    pairs = EasyPairs("srgb8")
+    pair = pairs.pair(2)
+    assert pair.box_down is not None
+    there = METHODS[DETECT](pair).down.uv_px
+    assert there is not None
+    elsewhere = replace(pair.box_down, u0_px=pair.box_down.u0_px + pair.box_down.width_px)
+    assert METHODS[DETECT](replace(pair, box_down=elsewhere)).down.uv_px is None
+
+
 # -- training --------------------------------------------------------------------------------------------------------
 
 
 @needs_torch
 def test_training_refuses_data_sets_that_will_not_do(tmp_path: Path, tiny_dataset: Path, capsys: Any) -> None:
     out = tmp_path / "out.onnx"
-    for folder, text in ((tmp_path, str(tmp_path)), (tiny_dataset, "training holds 6 out and needs more than that")):
-        assert crop_training.main([str(folder), "--out", str(out)]) == 2
-        said = capsys.readouterr().err
-        assert said.startswith("error: ")
-        assert text in said
-        assert said.count("\n") == 1
+    for main in (crop_training.main, frame_training.main):
+        for folder, text in ((tmp_path, str(tmp_path)), (tiny_dataset, "training holds 6 out and needs more")):
+            assert main([str(folder), "--out", str(out)]) == 2
+            said = capsys.readouterr().err
+            assert said.startswith("error: ")
+            assert text in said
+            assert said.count("\n") == 1
     assert not out.exists()
 
 
@@ -199,3 +292,30 @@ def test_training_gives_the_same_weights_and_the_file_their_answers(tiny_dataset
     answers = answers_of(first, items)
     np.testing.assert_allclose(uv - items.uv_px, answers.error_px, rtol=0, atol=1e-4)  # float32, sums of 1000 terms
     np.testing.assert_allclose(covariances(factor.astype(float), 1.0), answers.covariance_px2, rtol=1e-3)
+
+
+@needs_torch
+def test_training_of_frames_gives_the_same_weights_and_learns(tiny_dataset: Path, tmp_path: Path) -> None:
+    """Tiles alone: the heat of a spot's cells rises above that of all others."""
+    import torch
+
+    from phibench.datasets.read import open_dataset
+    from phibench.estimator.learned.networks import write_network
+
+    settings = FrameSettings(rounds=1, passes=8, batch=8)
+    samples = [row.sample_id for row in open_dataset(tiny_dataset).rows if row.sample_id.startswith("seen")]
+    tiles = frame_training.spot_tiles(frame_training.spot_crops(tiny_dataset, samples, 32, 5))
+    assert set(np.unique(tiles.heat)) == {0.0, 1.0}
+    maps = [
+        frame_training.FrameMap("srgb8", planes.astype(np.float16), planes[0].astype(float), heat, counted)
+        for planes, heat, counted in zip(tiles.planes[:3], tiles.heat, tiles.counted, strict=False)
+    ]
+    first, second = (frame_training.train_detector(tiles, maps, settings) for _ in range(2))
+    assert all(np.array_equal(first[name], second[name]) for name in first)
+    found = Network(write_network(tmp_path / "n.onnx", DETECT, first, {"covariance_scale": 1.0}), DETECT)
+    heat = found.run(planes=tiles.planes)[0][:, 0]
+    weights = {name: torch.from_numpy(value) for name, value in first.items()}
+    forward = frame_training.detector_forward(torch, weights, torch.from_numpy(tiles.planes))
+    np.testing.assert_allclose(heat, forward.numpy(), rtol=0, atol=1e-4)  # float32, sums of 150 terms
+    hot, cold = tiles.heat > 0.0, (tiles.heat == 0.0) & (tiles.counted > 0.0)
+    assert np.median(heat[hot]) > np.quantile(heat[cold], 0.99)
