@@ -282,9 +282,9 @@ def test_locks_within_half_a_second_in_rooms_that_nothing_was_tuned_on(pytestcon
 
 NEW_STROKE_M = 0.1
 CELLS = [(sigma, lights) for lights in (5, 10, 0) for sigma in (10.0, 6.0, 15.0)]
-FEW, MANY = range(2), range(15)  # films of a cell, and of the cell that the requirement is about
+FEW, MANY = range(5), range(75)  # films of a cell, and of the cell that the requirement is about
 HIDDEN = {0: range(18, 27), 1: range(18, 27), 2: range(18, 48), 3: range(18, 48)}  # 0.3 s and 1 s
-HIDDEN_FRAMES, HIDDEN_FILMS = 90, range(100, 102)
+HIDDEN_FRAMES, HIDDEN_FILMS = 90, range(100, 106)
 WAYS = ("code", "colour", "told blob", "blob")
 
 
@@ -363,7 +363,7 @@ def test_targets_in_new_rooms_by_signal_and_clutter(pytestconfig: pytest.Config)
 
 @pytest.mark.study
 def test_targets_in_new_rooms_are_found_again_after_they_were_hidden(pytestconfig: pytest.Config) -> None:
-    """Two films with four targets hidden for 0.3 s and four for 1 s: lost, found again, and when."""
+    """Six films, each with two targets hidden for 0.3 s and two for 1 s: lost, found again, and when."""
     rooms, kept = new_rooms(pytestconfig)
     path = kept / "hidden.jsonl"
     rows = swept(at_rest(rooms), "target-hidden", (10.0, 5), HIDDEN_FILMS, path, HIDDEN_FRAMES, HIDDEN)
