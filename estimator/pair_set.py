@@ -5,6 +5,7 @@ A truth is never shown to a method. Positions are pixels (u, v), integers at pix
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -149,16 +150,35 @@ def truth_folders(pairs: object) -> tuple[Path, ...]:
 class CachedPairs:
     """Pairs and truths of another set, each asked for once and kept; make a new one for the next part of a set.
 
+    A pair's truth is asked for with it: both begin with the layers of the same sample, of which a set keeps the last.
+
     Parameters
     ----------
     pairs : PairSet
+
+    Attributes
+    ----------
+    truth_seconds : float
+        CPU-seconds of the truths so far.
     """
 
     def __init__(self, pairs: PairSet) -> None:
         self._pairs = pairs
         self.folders = truth_folders(pairs)
-        self.pair = cache(pairs.pair)
-        self.truth = cache(pairs.truth)
+        self.truth_seconds = 0.0
+        self.pair = cache(self._pair)
+        self.truth = cache(self._truth)
+
+    def _pair(self, number: int) -> Pair:
+        pair = self._pairs.pair(number)
+        self.truth(number)
+        return pair
+
+    def _truth(self, number: int) -> PairTruth:
+        start = time.thread_time()
+        truth = self._pairs.truth(number)
+        self.truth_seconds += time.thread_time() - start
+        return truth
 
     def __len__(self) -> int:
         return len(self._pairs)

@@ -28,6 +28,7 @@ from phibench.scenes.frames import Vector
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.random_streams import Name, generator
 from phibench.scenes.rig import POSITIONS
+from phibench.scenes.room import Room
 
 MIN_APART_PX = 12.0
 """Nearer than this a distractor would lie in the spot's window, and the spot's own place would be in doubt."""
@@ -73,22 +74,40 @@ def present(names: Names, tables: tuple[DistractorTable, ...]) -> tuple[int, ...
 
 
 def distractors(sample: Sample) -> tuple[Distractor, ...]:
-    """Distractors of a sample, in the order of the recipe; those that find no place are left out."""
+    """Distractors of a sample, in the order of the recipe; those that find no place are left out.
+
+    They stay with the sample, which is frozen: all presets and draws have the same, and their room takes long to build.
+    """
+    kept = vars(sample)
+    if _KEPT not in kept:
+        kept[_KEPT] = _found(sample)
+    found: tuple[Distractor, ...] = kept[_KEPT]
+    return found
+
+
+_KEPT = "_distractors"
+
+
+def _found(sample: Sample) -> tuple[Distractor, ...]:
     tables = sample.dataset.recipe.distractors
     if not any(sample.truth_row(position).visible for position in POSITIONS):
         return ()
-    placed = (_placed(sample, i, tables[i]) for i in present(sample.stream_names, tables))
+    numbers = present(sample.stream_names, tables)
+    if not numbers:
+        return ()
+    room = sample.dataset.rooms.surfaces(sample.row.room)
+    placed = (_placed(sample, room, i, tables[i]) for i in numbers)
     return tuple(one for one in placed if one is not None)
 
 
-def _placed(sample: Sample, number: int, table: DistractorTable) -> Distractor | None:
+def _placed(sample: Sample, room: Room, number: int, table: DistractorTable) -> Distractor | None:
     """First of `TRIES` places that the down image shows, apart from the spot in both images."""
+    views = {position: sample.view(position) for position in POSITIONS}
+    rooms = {position: room_geometry(room, view) for position, view in views.items()}
     for attempt in range(TRIES):
-        spot = _drawn_spot(sample, number, table, attempt)
+        spot = _drawn_spot(sample, room, number, table, attempt)
         if spot is None:
             continue
-        views = {position: sample.view(position) for position in POSITIONS}
-        rooms = {position: room_geometry(sample.room, view) for position, view in views.items()}
         truths = {position: spot_truth(view, spot, rooms[position]) for position, view in views.items()}
         if not truths["down"].visible or any(_too_near(sample, position, truths[position]) for position in POSITIONS):
             continue
@@ -123,10 +142,10 @@ def _scaled(layer: SpotLayer, factor: float) -> SpotLayer:
     )
 
 
-def _drawn_spot(sample: Sample, number: int, table: DistractorTable, attempt: int) -> LaserSpot | None:
+def _drawn_spot(sample: Sample, room: Room, number: int, table: DistractorTable, attempt: int) -> LaserSpot | None:
     """Disc at one drawn place; None where there can be none."""
     place = _ray_place if table.azimuth_deg is not None else _board_place
-    found = place(sample, number, table, attempt)
+    found = place(sample, room, number, table, attempt)
     if found is None:
         return None
     recipe = sample.dataset.recipe
@@ -140,9 +159,11 @@ def _drawn_spot(sample: Sample, number: int, table: DistractorTable, attempt: in
     )
 
 
-def _ray_place(sample: Sample, number: int, table: DistractorTable, attempt: int) -> tuple[Vector, Vector] | None:
+def _ray_place(
+    sample: Sample, room: Room, number: int, table: DistractorTable, attempt: int
+) -> tuple[Vector, Vector] | None:
     """Position and normal on a horizontal ray from the axis: free in the room, or where it ends."""
-    names, room = sample.stream_names, sample.room
+    names = sample.stream_names
     azimuth_deg, height_m, distance_m = (
         0.0 if given is None else _value(names, number, key, given, attempt)
         for key, given in (
@@ -159,7 +180,9 @@ def _ray_place(sample: Sample, number: int, table: DistractorTable, attempt: int
     return None if room.solid_around(position) is not None else (position, (-x, -y, 0.0))
 
 
-def _board_place(sample: Sample, number: int, table: DistractorTable, attempt: int) -> tuple[Vector, Vector] | None:
+def _board_place(
+    sample: Sample, _room: Room, number: int, table: DistractorTable, attempt: int
+) -> tuple[Vector, Vector] | None:
     """Position and normal anywhere on a board that is not the sample's own."""
     recipe, names = sample.dataset.recipe, sample.stream_names
     allowed = None if table.target is None else set(table.target.choice)

@@ -267,6 +267,8 @@ def meets_box(corners_m: Array, low_m: Array, high_m: Array) -> NDArray[np.bool_
     J. Graphics Tools 6, 29, 2001).
     """
     near = np.all((corners_m.min(axis=1) < high_m) & (corners_m.max(axis=1) > low_m), axis=1)
+    if not near.any():
+        return near
     p, half = corners_m[near] - 0.5 * (low_m + high_m), 0.5 * (high_m - low_m)
     edges = np.roll(p, -1, axis=1) - p
     axes = [np.cross(edges[:, i], np.eye(3)[k]) for i in range(3) for k in range(3)]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.rooms.room_sources import ONLY_ROOM, SOURCES, NamedRoom, RoomSource, room_of
+from phibench.datasets.rooms.room_sources import ONLY_ROOM, SOURCES, NamedRoom, PanoramaRoom, RoomSource, room_of
 from phibench.datasets.store import schema
 from phibench.datasets.store.documents import from_json
 from phibench.datasets.store.files import read_rows
@@ -39,14 +39,28 @@ class Rooms:
         """
         info = self.info(name)
         try:
-            kind: type[RoomSource] = SOURCES.get(str(info.source.get("kind")), NamedRoom)
-            room = room_of(from_json(kind, info.source), self.folder)
+            room = room_of(_source(info), self.folder)
         except (DatasetError, SceneError) as error:
             raise DatasetError(f"{schema.ROOMS}: {name} cannot be built: {error}") from error
         if room.digest != info.digest:
             text = f"{schema.ROOMS}: {name} is another room here than where the data set was made"
             raise DatasetError(f"{text}; install the version that made it, and give it the same files")
         return room
+
+    def surfaces(self, name: str) -> Room:
+        """Room as rays meet it; a panorama's on a box is the box alone, whose picture is not read.
+
+        Raises
+        ------
+        DatasetError
+            As for the room itself.
+        """
+        from phibench.datasets.rooms.panorama_room import blank_room
+
+        source = self.info(name).source
+        if source.get("kind") != "panorama" or source["settings"].get("mesh") is not None:
+            return self[name]
+        return blank_room(from_json(PanoramaRoom, source).settings)
 
     def info(self, name: str) -> RoomInfo:
         """Line of a room."""
@@ -64,6 +78,15 @@ class OldRooms(Rooms):
     def __getitem__(self, name: str) -> Room:
         self.info(name)
         return self.room
+
+    def surfaces(self, name: str) -> Room:
+        """Return the same: it is there already."""
+        return self[name]
+
+
+def _source(info: RoomInfo) -> RoomSource:
+    kind: type[RoomSource] = SOURCES.get(str(info.source.get("kind")), NamedRoom)
+    return from_json(kind, info.source)
 
 
 def read_rooms(folder: Path, info: DatasetInfo) -> Rooms:

@@ -41,7 +41,7 @@ _MOST_CHI2 = 30.0  # beyond it the light around the spot is not what the model s
 
 
 def chain_fit(pair: Pair) -> Answer:
-    """Fit both spots where `detect` sees them, or in their boxes.
+    """Fit both spots where `detect` sees them.
 
     The blur is what the rig predicts (`spot_blur`), with the beam's size once the distance is known. The room behind
     comes from the laser-off frames where they are there, otherwise from what surrounds the spot. A misfit above 1 per
@@ -58,8 +58,8 @@ def _fitted(pair: Pair) -> Answer:
 
     def measure(depth_m: float | None) -> Answer:
         return Answer(
-            _spot_or_place(pair, "down", found.down, pair.box_down, depth_m),
-            _spot_or_place(pair, "up", found.up, pair.box_up, depth_m),
+            _spot_or_place(pair, "down", found.down, depth_m),
+            _spot_or_place(pair, "up", found.up, depth_m),
         )
 
     depth_m = None
@@ -68,9 +68,9 @@ def _fitted(pair: Pair) -> Answer:
     return measured_twice(measure, pair) if depth_m is None else measure(depth_m)
 
 
-def _spot_or_place(pair: Pair, position: str, found: Detection | None, hint: Box | None, depth_m: float | None) -> Spot:
+def _spot_or_place(pair: Pair, position: str, found: Detection | None, depth_m: float | None) -> Spot:
     """Fit; or, of a spot that was seen but gives no fit, the place of the matched filter, without covariance."""
-    spot = _spot(pair, position, box_around(found, pair.images[position]) or hint, depth_m)
+    spot = _spot(pair, position, box_around(found, pair.images[position]), depth_m)
     return Spot(found.uv_px) if spot.uv_px is None and found is not None else spot
 
 

@@ -155,8 +155,10 @@ def detected(pair: Pair) -> PairDetection:
 # -- boxes -----------------------------------------------------------------------------------------------------------
 
 
-def locate(pair: Pair) -> tuple[Box | None, Box | None]:
-    """Boxes around the spots that `detect` sees; where it sees none, the pair's own hint, or None.
+def locate(pair: Pair, hints: bool = False) -> tuple[Box | None, Box | None]:
+    """Boxes around the spots that `detect` sees; where it sees none, None, or the pair's own hint if `hints`.
+
+    In hints in which `detect` sees no spot, fits gave 56 answers on a benchmark, none of them near the spot.
 
     Raises
     ------
@@ -164,7 +166,8 @@ def locate(pair: Pair) -> tuple[Box | None, Box | None]:
         If an image does not fit the card's output.
     """
     found = detected(pair)
-    return box_around(found.down, pair.down) or pair.box_down, box_around(found.up, pair.up) or pair.box_up
+    own = (pair.box_down, pair.box_up) if hints else (None, None)
+    return box_around(found.down, pair.down) or own[0], box_around(found.up, pair.up) or own[1]
 
 
 def box_around(found: Detection | None, image: Image) -> Box | None:
@@ -312,9 +315,9 @@ class SearchRegion:
 # -- methods on search regions ---------------------------------------------------------------------------------------
 
 
-def each_spot(find: Callable[[SearchRegion], Spot]) -> Method:
-    """Method that looks at each image by itself, where `locate` sees a spot."""
-    return lambda pair: _both(find, pair, locate(pair), None)
+def each_spot(find: Callable[[SearchRegion], Spot], hints: bool = False) -> Method:
+    """Method that looks at each image by itself, where `locate` sees a spot, or else at its hint if `hints`."""
+    return lambda pair: _both(find, pair, locate(pair, hints), None)
 
 
 def each_spot_twice(find: Callable[[SearchRegion], Spot]) -> Method:

@@ -87,25 +87,25 @@ class BuiltIn:
 _ALL = (
     BuiltIn(
         "brightest_pixel",
-        each_spot(in_the_box("brightest_pixel")),
+        each_spot(in_the_box("brightest_pixel"), hints=True),
         "pixel of the largest luma in the box",
         "the plainest there is",
     ),
     BuiltIn(
         "red_centroid",
-        each_spot(red_centroid),
+        each_spot(red_centroid, hints=True),
         "centroid of R - max(G, B) in linear light above 30 % of its peak",
         "what most laser-spot detectors do",
     ),
     BuiltIn(
         "laplacian_blob",
-        each_spot(in_the_box("laplacian_blob")),
+        each_spot(in_the_box("laplacian_blob"), hints=True),
         "largest negative Laplacian of Gaussian of the luma in the box, refined by parabolas",
         "T. Lindeberg, Int. J. Comput. Vis. 30, 79 (1998), at one scale",
     ),
     BuiltIn(
         "windowed_centroid",
-        each_spot(at_the_red_peak("windowed_centroid")),
+        each_spot(at_the_red_peak("windowed_centroid"), hints=True),
         "centroid of the luma under a Gaussian window that follows it",
         "E. Bertin, S. Arnouts, A&AS 117, 393 (1996)",
     ),
@@ -117,7 +117,7 @@ _ALL = (
     ),
     BuiltIn(
         "off_difference",
-        each_spot(off_difference),
+        each_spot(off_difference, hints=True),
         "centroid of the red light that the laser adds: on minus off in linear light",
         "background subtraction, as in most laser triangulation",
         needs_off=True,
@@ -175,7 +175,7 @@ _ALL = (
     ),
     BuiltIn(
         "trackpy_refine",
-        each_spot(trackpy_refine),
+        each_spot(trackpy_refine, hints=True),
         "centre of mass of the redness, moved until it is central, by trackpy",
         "J. C. Crocker, D. G. Grier, J. Colloid Interface Sci. 179, 298 (1996); trackpy.refine_com",
         package="trackpy",

@@ -275,6 +275,7 @@ def _kinds(filters: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.concatenate([row.ravel() for row in rows])
 
 
+@lru_cache(maxsize=16)
 def _interpolation(h: int, w: int, margin: int, colour: int) -> sparse.csr_array:
     """One plane, shape (h w, (h + 2)(w + 2))."""
     filters = bayer_filters(np.array([[margin % 2, margin % 2]]), (h + 2, w + 2))[0]

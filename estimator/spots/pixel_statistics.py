@@ -277,14 +277,34 @@ def mean_codes(card: SensorCard, noise: PixelNoise, rounded: bool = True) -> Mea
     Codes are rounded to whole ones unless the camera goes on with finer ones.
     """
     root, step = np.linspace(0.0, np.sqrt(1.3 * card.saturation_e), _MEAN_NODES, retstep=True)
-    sums = np.array([_moments(mu, card, noise, rounded) for mu in root**2])  # (m, colour, count, 4)
+    curve = _codes_of_dn(replace(card, **_BESIDE_CURVE), rounded)
+    sums = np.array([_moments(mu, card, noise, curve) for mu in root**2])  # (m, colour, count, 4)
     mean, regression, excess = np.ascontiguousarray(sums.transpose(3, 1, 2, 0))
     by_mean = np.gradient(mean, root**2, axis=-1)
     return MeanCodes(float(step), mean, by_mean, regression, excess)
 
 
-def _moments(mu: float, card: SensorCard, noise: PixelNoise, rounded: bool) -> Array:
-    """Mean code, regression and excess, shape (3 colours, 3 counts, 3)."""
+_FINEST = COUNTS[-1]  # means of so many pixels lie on a lattice of DN on which all the others lie, too
+_BESIDE_CURVE: dict[str, Any] = {
+    **{"name": "", "exposure_s": 0.0, "full_well_e": 0.0, "read_noise_e": 0.0, "prnu": 0.0, "dsnu_e": 0.0},
+    **{"dn_per_e": 1.0, "jpeg_quality": 0},
+}
+"""Numbers in which cameras of one make differ, and which the codes of a DN do not depend on."""
+
+
+@lru_cache(maxsize=8)
+def _codes_of_dn(card: SensorCard, rounded: bool) -> Array:
+    """Codes of R, G, B at every DN and the quarters between, shape (3, m), read only; kept for cameras of one make."""
+    x = np.arange(_FINEST * card.top_dn + 1) / _FINEST - card.black_level_dn  # DN above black
+    linear = x / (card.top_dn - card.black_level_dn)
+    y = np.stack([255.0 * tone_of(gain * linear, card) for gain in card.white_balance])
+    y = np.rint(y) if rounded else y
+    y.flags.writeable = False
+    return y
+
+
+def _moments(mu: float, card: SensorCard, noise: PixelNoise, curve: Array) -> Array:
+    """Mean code, regression and excess, shape (3 colours, 3 counts, 3); `curve` as of `_codes_of_dn`."""
     first, chance = _law(mu, card, noise)
     result = np.empty((3, len(COUNTS), 3))
     for i, count in enumerate(COUNTS):
@@ -292,9 +312,8 @@ def _moments(mu: float, card: SensorCard, noise: PixelNoise, rounded: bool) -> A
             chance = np.convolve(chance, chance) if len(chance) < _SHORT else _by_fourier(chance)
         x = first + np.arange(len(chance)) / count - card.black_level_dn  # DN above black
         p = chance / chance.sum()
-        linear = x / (card.top_dn - card.black_level_dn)
-        y = np.stack([255.0 * tone_of(gain * linear, card) for gain in card.white_balance])
-        y = np.rint(y) if rounded else y
+        step, start = _FINEST // count, _FINEST * int(first)
+        y = np.ascontiguousarray(curve[:, start : start + step * len(x) : step])
         mean = y @ p
         dx = x - x @ p
         variance = dx**2 @ p

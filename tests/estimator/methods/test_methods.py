@@ -14,8 +14,9 @@ import pytest
 
 from phibench.datasets.frames.sensor_card import SensorCard, sensor_card
 from phibench.estimator.interface import Answer, Box, Pair, Spot
-from phibench.estimator.methods.locate import around, clipped, laser_light, locate, mirror_mask, red_peak
+from phibench.estimator.methods.locate import around, clipped, each_spot, laser_light, locate, mirror_mask, red_peak
 from phibench.estimator.methods.registry import KNOWN, METHODS, BuiltIn
+from phibench.estimator.methods.simple import at_the_red_peak
 from phibench.estimator.sandbox.easy_pairs import EasyPairs
 from phibench.estimator.spots.camera_codes import linear_to_srgb, srgb_to_linear
 from phibench.estimator.spots.image_planes import (
@@ -226,6 +227,39 @@ def test_locate_looks_inside_the_mirror_only_and_may_find_nothing() -> None:
     assert box is not None
     assert abs(box.u0_px + box.width_px // 2 - (640 + truth.down.uv_px[0] - u)) < 2.0
     assert abs(box.v0_px + box.height_px // 2 - (300 + truth.down.uv_px[1] - v)) < 2.0
+
+
+@pytest.mark.parametrize("preset", ["bayer-raw", "srgb8"])
+def test_fits_are_silent_where_the_search_is_and_plain_methods_look_at_the_hint(preset: str) -> None:
+    """Hints on nothing but noise: a fit's answer there would be a false detection with a claimed covariance."""
+    pair, box = easy(preset, 0), Box(600, 300, 48, 48)
+    noise = generator("hidden", preset).integers(-3, 4, (2, *pair.down.shape))
+    down, up = (
+        np.clip(off.astype(int) + n, 0, 1023 if off.dtype == np.uint16 else 255).astype(off.dtype)
+        for off, n in zip(dark_frames(pair), noise, strict=True)
+    )
+    hidden = replace(pair, down=down, up=up, box_down=box, box_up=box)
+    answers = {name: method(hidden) for name, method in METHODS.items() if not method.refusal(hidden)}
+    for name in (
+        "gaussian_least_squares",
+        "joint_fit",
+        "raw_maximum_likelihood",
+        "chain_fit",
+        "learned_crop",
+        "detect",
+    ):
+        answer = answers.get(name, Answer(Spot.missing(""), Spot.missing("")))
+        assert (answer.down.uv_px, answer.up.uv_px) == (None, None), name
+    for name in ("brightest_pixel", "red_centroid", "laplacian_blob", "off_difference"):
+        assert answers[name].down.uv_px is not None, name
+    plain = each_spot(at_the_red_peak("gaussian_least_squares"), hints=True)(hidden)  # it would have answered
+    assert plain.down.uv_px is not None or plain.up.uv_px is not None
+
+
+def dark_frames(pair: Pair) -> tuple[np.ndarray, np.ndarray]:
+    assert pair.down_off is not None
+    assert pair.up_off is not None
+    return pair.down_off, pair.up_off
 
 
 def test_methods_without_a_hint_give_what_they_give_with_one() -> None:

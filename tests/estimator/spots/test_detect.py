@@ -312,7 +312,8 @@ def test_hints_are_kept_and_restrict_the_search() -> None:
     pair = scene.pair()
     wrong = Box(100, 60, 16, 16)
     hinted = replace(pair, box_down=wrong, box_up=wrong)
-    assert locate(hinted) == (wrong, wrong)
+    assert locate(hinted, hints=True) == (wrong, wrong)
+    assert locate(hinted) == (None, None)
     assert min(misses(detect(hinted), scene)) == np.inf
     assert max(misses(detect(pair), scene)) < 1.0
 
