@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -63,6 +64,30 @@ def show(folder: str | Path, console: Console | None = None, out: str | Path | N
         raise DatasetError(f"the contact sheet was not written: {fault}, for example `--out sheet.png`") from fault
     console.print(f"contact sheet: {path}", highlight=False, soft_wrap=True)
     return path
+
+
+def summary(folder: str | Path) -> dict[str, Any]:
+    """Data set as one JSON document: what it is, and the manifest's rows as in `manifest.jsonl`.
+
+    Raises
+    ------
+    DatasetError
+        If the data set is damaged or unfinished.
+    """
+    dataset = open_finished(folder)
+    info = dataset.info
+    return {
+        "name": info.name,
+        "folder": str(dataset.folder),
+        "schema_version": info.schema_version,
+        "recipe_sha256": info.recipe_sha256,
+        "samples": len(dataset),
+        "poses": len(info.poses),
+        "rigs": len(dataset.rigs),
+        "rooms": len(dataset.rooms),
+        "presets": list(dataset.recipe.frames.presets) if dataset.recipe.frames else [],
+        "rows": [row.model_dump(mode="json") for row in dataset.rows],
+    }
 
 
 class _PatientConsole(Console):

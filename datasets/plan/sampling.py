@@ -24,6 +24,7 @@ import numpy as np
 
 from phibench.datasets.errors import RecipeError
 from phibench.datasets.recipe.build import (
+    MIRROR_SHAPES,
     build_misalignment,
     build_rig,
     build_target,
@@ -32,7 +33,7 @@ from phibench.datasets.recipe.build import (
     true_stroke_m,
 )
 from phibench.datasets.recipe.distributions import DistributionTable, pick, quantile
-from phibench.datasets.recipe.mirror_tables import HolderTable
+from phibench.datasets.recipe.mirror_tables import DRAWN_OF_MIRROR, HolderTable, MirrorTable
 from phibench.datasets.recipe.spot_placement import Boards, Placed, place, visibility_fault
 from phibench.datasets.recipe.tables import (
     DRAWABLE,
@@ -67,6 +68,7 @@ PARAMETERS = (
     "spot.hidden",
     *(f"rig.holder.{key}" for key in HolderTable.model_fields),
     *(f"misalignment.{key}" for key in OF_REVOLVED),
+    *(f"rig.mirror.{key}" for key in DRAWN_OF_MIRROR),
 )
 """Everything that can be drawn; the place in this list is the dimension in Sobol's sequence, whose first ones are the
 best: 16 of them correlate by at most 0.25 at 100 samples, where independent ones reach 0.38 (12 seeds each)."""
@@ -113,7 +115,7 @@ HIDDEN, SHOWN = "in one image", "in none"
 _PILOT = 8  # samples
 _NANOMETRE = 9  # decimals of a stroke: a pose's name then says its offset exactly
 
-_PREFIX, _HOLDER = "misalignment.", "holder."
+_PREFIX, _HOLDER, _MIRROR = "misalignment.", "holder.", "mirror."
 
 Value = float | str
 
@@ -208,7 +210,17 @@ def rig_table(table: RigTable, values: Mapping[str, Value]) -> RigTable:
     of_holder = {key.removeprefix(_HOLDER): drawn.pop(key) for key in [*drawn] if key.startswith(_HOLDER)}
     if of_holder:
         drawn["holder"] = table.holder.model_copy(update=of_holder)  # type: ignore[assignment]
+    of_mirror = {key.removeprefix(_MIRROR): drawn.pop(key) for key in [*drawn] if key.startswith(_MIRROR)}
+    if of_mirror and table.mirror is not None:
+        drawn["mirror"] = _drawn_mirror(table.mirror, of_mirror)  # type: ignore[assignment]
     return table.model_copy(update=drawn)
+
+
+def _drawn_mirror(table: MirrorTable, drawn: Mapping[str, Value]) -> MirrorTable:
+    """`[rig.mirror]` with drawn values, without what the drawn shape does not have."""
+    shape = str(drawn.get("shape", table.shape))
+    idle = dict.fromkeys((key for key, shapes in MIRROR_SHAPES.items() if shape not in shapes), None)
+    return table.model_copy(update={**drawn, **idle})
 
 
 def drawn_misalignment(table: MisalignmentTable, values: Mapping[str, Value]) -> Misalignment:
@@ -343,15 +355,21 @@ def draw_values(table: RandomTable, targets: list[str], points: Mapping[str, Arr
     return {name: values[name] for name in points}
 
 
+_NAMES = ("rig.holder.kind", "rig.mirror.shape")  # drawn from a choice of names
+
+
 def _sample_distributions(table: RandomTable) -> Iterator[tuple[str, Any]]:
     """Parameter and distribution of every number, and of every name but the board's, that is drawn."""
     yield "stroke_m", table.stroke_m
     rig, holder = table.rig, table.rig.holder  # type: ignore[attr-defined]
-    groups = (("rig", rig), ("spot", table.spot), ("misalignment", table.misalignment), ("rig.holder", holder))
+    groups = (
+        *(("rig", rig), ("spot", table.spot), ("misalignment", table.misalignment), ("rig.holder", holder)),
+        ("rig.mirror", table.rig.mirror),  # type: ignore[attr-defined]
+    )
     for prefix, group in groups:
-        for key in type(group).model_fields:
+        for key in () if group is None else type(group).model_fields:
             value, name = getattr(group, key), f"{prefix}.{key}"
-            if isinstance(value, DistributionTable) or (value is not None and name == "rig.holder.kind"):
+            if isinstance(value, DistributionTable) or (value is not None and name in _NAMES):
                 yield name, value
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -120,19 +120,42 @@ MIRROR_SHAPES: Mapping[str, tuple[str, ...]] = {
 
 _VERTEX_M = 0.220  # from the lens: rims of 60 mm fit the image
 _VERTEX_RADIUS_M = 0.060
+CONIC_RANGES = {"ellipsoid": (-1.0, np.inf), "hyperboloid": (-np.inf, -1.0)}
+"""Open ranges of the conic constants of shapes that do not take every one."""
 _CONICS = {"ellipsoid": -0.5, "paraboloid": -1.0, "hyperboloid": -1.5625, "polynomial": -1.0}
 
 
-def idle_mirror_keys(path: str, table: MirrorTable) -> list[Fault]:
-    """Faults of keys of `[rig.mirror]` that do not belong to its shape, and of one that a shape needs."""
-    faults = []
-    for key, shapes in MIRROR_SHAPES.items():
-        if getattr(table, key) is not None and table.shape not in shapes:
-            quoted = " or ".join(f'"{shape}"' for shape in shapes)
-            text = f'has no effect on shape = "{table.shape}"; remove it, or give shape = {quoted}'
-            faults.append(Fault(f"{path}.{key}", text))
-    if table.shape == "polynomial" and not table.even_terms:
+def idle_mirror_keys(path: str, table: MirrorTable, shapes: Sequence[str] = ()) -> list[Fault]:
+    """Faults of keys of `[rig.mirror]` that belong to none of its possible shapes, and of one that a shape needs."""
+    shapes = shapes or (table.shape,)
+    given = [key for key in MIRROR_SHAPES if getattr(table, key) is not None]
+    faults = _idle_of_shapes(path, given, shapes)
+    if "polynomial" in shapes and not table.even_terms:
         faults.append(Fault(f"{path}.even_terms", 'is missing: shape = "polynomial" needs at least one number'))
+    return faults
+
+
+def drawn_mirror_faults(path: str, drawn: Mapping[str, Any], shapes: Sequence[str]) -> list[Fault]:
+    """Faults of drawn keys of a mirror that none of its shapes has, or of whose values a shape refuses some."""
+    given = [key for key, one in drawn.items() if one is not None]
+    faults = _idle_of_shapes(path, given, shapes)
+    for shape in shapes if "conic" in given else ():
+        (least, most), (low, high) = drawn["conic"].support, CONIC_RANGES.get(shape, (-np.inf, np.inf))
+        if shape in MIRROR_SHAPES["conic"] and not low < least <= most < high:
+            side = "below" if shape == "hyperboloid" else "above"
+            text = f'reaches from {least:g} to {most:g}; a conic of shape = "{shape}" is {side} -1'
+            faults.append(Fault(f"{path}.conic", f"{text}, give such a range or leave that shape out"))
+    return faults
+
+
+def _idle_of_shapes(path: str, given: Iterable[str], shapes: Sequence[str]) -> list[Fault]:
+    faults = []
+    for key in given:
+        takers = MIRROR_SHAPES.get(key, shapes)
+        if not set(takers) & set(shapes):
+            quoted, is_now = (" or ".join(f'"{shape}"' for shape in names) for names in (takers, shapes))
+            text = f"has no effect on shape = {is_now}; remove it, or give shape = {quoted}"
+            faults.append(Fault(f"{path}.{key}", text))
     return faults
 
 
@@ -141,7 +164,7 @@ def build_profile(table: MirrorTable, vertex_m: float) -> Profile:
     if table.shape == "cone":
         return cone(float(np.radians(table.half_angle_deg or 45.0)), table.rim_radius_m)
     conic = _CONICS[table.shape] if table.conic is None else table.conic
-    low, high = {"ellipsoid": (-1.0, np.inf), "hyperboloid": (-np.inf, -1.0)}.get(table.shape, (-np.inf, np.inf))
+    low, high = CONIC_RANGES.get(table.shape, (-np.inf, np.inf))
     if not low < conic < high:
         side = "below" if table.shape == "hyperboloid" else "above"
         raise SceneError(f'Profile.conic = {conic:g}: {side} -1 for shape = "{table.shape}"')

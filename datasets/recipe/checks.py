@@ -19,6 +19,7 @@ from phibench.datasets.recipe.build import (
     build_true_rig,
     by_keys,
     ceiling_m,
+    drawn_mirror_faults,
     idle_holder_keys,
     idle_mirror_keys,
     rig_fault_of,
@@ -47,6 +48,7 @@ from phibench.datasets.recipe.tables import (
     LaserTable,
     MisalignmentTable,
     RandomHolderTable,
+    RandomMirrorTable,
     Recipe,
     RigTable,
     TargetTable,
@@ -191,7 +193,7 @@ def _repeats(raw: Raw) -> Iterator[Fault]:
 
 def _draws(draft: _Draft) -> Iterator[Fault]:
     for key in table_of(draft.raw, "random", "rig"):
-        if key in RigTable.model_fields and key not in (*DRAWABLE, "holder"):
+        if key in RigTable.model_fields and key not in (*DRAWABLE, "holder", "mirror"):
             why = (
                 "is not a number" if key in ("preset", "laser_filter_response") else "must be the same for all samples"
             )
@@ -323,11 +325,16 @@ def _holder(raw: Raw) -> Iterator[Fault]:
 
 
 def _mirror(raw: Raw) -> Iterator[Fault]:
-    """Keys of a mirror of revolution that its shape does not have."""
-    if table := table_of(raw, "rig", "mirror"):
-        sound = sound_of(table, MirrorTable)
-        if sound is not None and table.keys() <= sound.model_fields_set:
-            yield from idle_mirror_keys("rig.mirror", sound)
+    """Keys of a mirror of revolution that none of its shapes has."""
+    table, drawn = table_of(raw, "rig", "mirror"), table_of(raw, "random", "rig", "mirror")
+    sound, chosen = sound_of(table, MirrorTable), sound_of(drawn, RandomMirrorTable)
+    if drawn and not table:
+        yield Fault("rig.mirror", "missing; [random.rig.mirror] draws keys of it, give at least its shape")
+    if not table or sound is None or not table.keys() <= sound.model_fields_set:
+        return  # told by the tables
+    shapes = getattr(getattr(chosen, "shape", None), "choice", (sound.shape,))
+    yield from idle_mirror_keys("rig.mirror", sound, shapes)
+    yield from drawn_mirror_faults("random.rig.mirror", {} if chosen is None else dict(chosen), shapes)
 
 
 def _rig(draft: _Draft) -> Iterator[Fault]:

@@ -75,6 +75,10 @@ class MirrorTable(Table):
     tilt_y_rad: Tilt = Field(default=0.0, description="mirror turned about world y through its vertex")
 
 
+DRAWN_OF_MIRROR = tuple(key for key in MirrorTable.model_fields if key != "even_terms")
+"""Keys of `[rig.mirror]` that may be drawn: the shape and all single numbers."""
+
+
 class ReflectionTable(Table):
     """`[rig.reflectance]`: measured reflectance of the mirror instead of its metal's."""
 

@@ -34,6 +34,7 @@ from phibench.datasets.recipe.tables import (
     LaserTable,
     MisalignmentTable,
     RandomHolderTable,
+    RandomMirrorTable,
     RandomMisalignmentTable,
     RandomRigTable,
     RandomSpotTable,
@@ -69,6 +70,7 @@ TABLES: dict[str, type[BaseModel]] = {
     "[random]": RandomTable,
     "[random.rig]": RandomRigTable,
     "[random.rig.holder]": RandomHolderTable,
+    "[random.rig.mirror]": RandomMirrorTable,
     "[random.misalignment]": RandomMisalignmentTable,
     "[random.spot]": RandomSpotTable,
     "[frames]": FramesTable,
@@ -232,6 +234,11 @@ not drawn is as in `[rig]`, which must be a possible rig itself. A drawn `fx_px`
 """,
     "[random.rig.holder]": """Any key of `[rig.holder]`, and `kind` from a choice of names, such as
 `kind = { choice = ["none", "rods", "tube"] }`. A sample whose sizes do not go together is drawn again.
+""",
+    "[random.rig.mirror]": """Any key of `[rig.mirror]` but `even_terms`, and `shape` from a choice of names, such as
+`shape = { choice = ["ellipsoid", "paraboloid", "cone"] }`. `[rig.mirror]` must be given, with what is not drawn.
+A sample takes those keys of both tables that its shape has. A drawn `conic` must suit every drawn shape that has
+one. An ellipsoid of `conic = 0` is a spherical cap.
 """,
     "[random.misalignment]": """Any key of `[misalignment]`, within its range, in place of the value there. The rig
 that `[random.rig]` gives is the nominal one.

@@ -29,7 +29,15 @@ from phibench.datasets.recipe.distributions import (
     values_of,
 )
 from phibench.datasets.recipe.film_tables import FilmTable
-from phibench.datasets.recipe.mirror_tables import HolderTable, MirrorTable, OfHolder, ReflectionTable, Tilt, Unit
+from phibench.datasets.recipe.mirror_tables import (
+    DRAWN_OF_MIRROR,
+    HolderTable,
+    MirrorTable,
+    OfHolder,
+    ReflectionTable,
+    Tilt,
+    Unit,
+)
 from phibench.datasets.recipe.room_tables import RoomsTable, RoomTable
 from phibench.scenes.catalog import BOARD_SIZE_M
 from phibench.scenes.mirror import MetalName
@@ -278,11 +286,41 @@ else:
     )
 
 if TYPE_CHECKING:
+    RandomMirrorTable = Table
+else:
+    RandomMirrorTable = create_model(
+        "RandomMirrorTable",
+        __base__=Table,
+        __doc__="`[random.rig.mirror]`: distributions of keys of `[rig.mirror]`.",
+        **{
+            key: (
+                names_of(field.annotation)
+                if key == "shape"
+                else Annotated[Distribution, values_of(Annotated[field.annotation, Field(), *field.metadata])] | None,
+                Field(default=None, description=field.description),
+            )
+            for key, field in MirrorTable.model_fields.items()
+            if key in DRAWN_OF_MIRROR
+        },
+    )
+
+
+class _OfRandomRig(Table):
+    """Table with distributions of keys of a rig."""
+
+    @model_serializer(mode="wrap")
+    def _without_what_is_not_given(self, serialised: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Recipes that draw no mirror's shape keep the hash that they had before there was a table for it."""
+        document: dict[str, Any] = serialised(self)
+        return {key: value for key, value in document.items() if key != "mirror" or value is not None}
+
+
+if TYPE_CHECKING:
     RandomRigTable = Table
 else:
     RandomRigTable = create_model(
         "RandomRigTable",
-        __base__=Table,
+        __base__=_OfRandomRig,
         __doc__="`[random.rig]`: distributions of keys of `[rig]`.",
         **{
             key: (
@@ -295,6 +333,10 @@ else:
         holder=(
             RandomHolderTable,
             Field(default=RandomHolderTable(), description="distributions of keys of [rig.holder]"),
+        ),
+        mirror=(
+            RandomMirrorTable | None,
+            Field(default=None, description="distributions of keys of [rig.mirror], which must be given too"),
         ),
     )
 

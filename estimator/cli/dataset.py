@@ -142,7 +142,14 @@ def verify(
 
 
 @dataset.command
-def show(directory: Path, *, out: Path | None = None, sample: str | None = None, html: Path | None = None) -> int:
+def show(
+    directory: Path,
+    *,
+    out: Path | None = None,
+    sample: str | None = None,
+    html: Path | None = None,
+    json: Annotated[bool, Parameter(negative="", help="Numbers and rows as one JSON document; no sheet.")] = False,
+) -> int:
     """Print a table of a data set and write its contact sheet; or write the interactive page of a sample.
 
     Parameters
@@ -157,9 +164,17 @@ def show(directory: Path, *, out: Path | None = None, sample: str | None = None,
         HTML file for the page of a sample: frames, truth of every pixel, epipolar lines, room and rays in 3-D. Nothing
         else is done then.
     """
+    from json import dumps
+
     from phibench.datasets.errors import DatasetError
     from phibench.datasets.show import show as show_dataset
+    from phibench.datasets.show import summary
 
+    if json:
+        if html is not None or sample is not None or out is not None:
+            raise DatasetError("--json prints the data set and writes no file: leave --out, --sample and --html out")
+        print(dumps(summary(directory), allow_nan=False))
+        return 0
     if html is not None:
         from phibench.datasets.read import open_finished
         from phibench.datasets.sample_page import sample_of, write_sample_page

@@ -107,6 +107,24 @@ def test_the_page_is_one_file_that_fetches_nothing(sample: Sample, tmp_path: Pat
     assert len(page) < 4e6
 
 
+def test_an_untouched_page_says_what_to_do(sample: Sample) -> None:
+    box = re.search(r'<div id="readout"[^>]*>(.*?)</div>', sample_page(sample), flags=re.S)
+    assert box is not None
+    assert "Move over a frame" in box[1]
+
+
+def test_a_dataset_is_shown_as_one_document(tiny_dataset: Path, capsys: pytest.CaptureFixture) -> None:
+    before = sorted(tiny_dataset.rglob("*"))
+    assert main(["dataset", "show", str(tiny_dataset), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    lines = (tiny_dataset / "manifest.jsonl").read_text().splitlines()
+    assert document["rows"] == [json.loads(line) for line in lines]
+    assert document["samples"] == len(lines) == 2
+    assert sorted(tiny_dataset.rglob("*")) == before
+    assert main(["dataset", "show", str(tiny_dataset), "--json", "--sample", "0"]) == 2
+    assert "writes no file" in capsys.readouterr().err
+
+
 def test_samples_are_taken_by_number_or_name(tiny_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     dataset = open_dataset(tiny_dataset)
     assert sample_of(dataset, None) == sample_of(dataset, "0") == dataset[0]

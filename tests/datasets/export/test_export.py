@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -191,6 +192,24 @@ def test_bad_requests_end_in_a_sentence(
     said = capsys.readouterr().err
     assert text in said
     assert "Traceback" not in said
+
+
+@pytest.mark.parametrize("command", ["export", "score"])
+def test_a_dataset_without_frames_ends_in_a_sentence(
+    command: str, tiny_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The layers are gone of which frames are made: one sentence, and what was there is left alone."""
+    shutil.copytree(tiny_dataset, tmp_path / "bare", ignore=shutil.ignore_patterns("*.exr"))
+    before = snapshot(tmp_path / "bare")
+    out = tmp_path / "out"
+    words = ["export", "--to", "frames"] if command == "export" else ["score", "--method", "detect"]
+    options = ["--preset", "srgb8", "--workers", "1", "--out", str(out if command == "export" else out / "score.json")]
+    assert main([words[0], str(tmp_path / "bare"), *words[1:], *options]) == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert re.search(r"\.exr is missing", said[-1])
+    assert "Traceback" not in "".join(said)
+    assert snapshot(tmp_path / "bare") == before
+    assert not (out / "SHA256SUMS").exists()
 
 
 def test_foreign_folders_and_other_exports_are_left_alone(

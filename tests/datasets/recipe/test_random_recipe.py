@@ -1,5 +1,6 @@
 """Faults of `[random]`: every one in one go, with path, value, range and advice."""
 
+import hashlib
 import json
 import math
 from typing import Any
@@ -8,9 +9,17 @@ import pytest
 from helpers.drawn_values import RAY, drawing
 from helpers.recipes import changed, complaints
 
-from phibench.datasets.plan.sampling import MISALIGNMENT, PARAMETERS
-from phibench.datasets.recipe.load import check_recipe
-from phibench.datasets.recipe.mirror_tables import HolderTable
+from phibench.datasets.plan.sampling import (
+    MISALIGNMENT,
+    PARAMETERS,
+    draw_values,
+    drawn_parameters,
+    first_points,
+    rig_table,
+)
+from phibench.datasets.recipe.build import build_rig
+from phibench.datasets.recipe.load import check_recipe, load_recipe
+from phibench.datasets.recipe.mirror_tables import DRAWN_OF_MIRROR, HolderTable
 from phibench.datasets.recipe.tables import DRAWABLE, RandomRigTable, Recipe
 
 UNIFORM = {"uniform": [0.1, 1.4]}
@@ -106,8 +115,91 @@ def test_nonsense_is_reported_and_never_raises_anything_else(nonsense: Any) -> N
 
 
 def test_every_drawable_key_is_a_key_of_the_rig_and_has_a_parameter() -> None:
-    assert tuple(RandomRigTable.model_fields) == (*DRAWABLE, "holder")
+    assert tuple(RandomRigTable.model_fields) == (*DRAWABLE, "holder", "mirror")
     others = 8 + len(MISALIGNMENT) + len(HolderTable.model_fields)
     assert len(PARAMETERS) == len(set(PARAMETERS)) == len(DRAWABLE) + others
     recipe = check_recipe(drawing(rig={"z_c_m": 0.3}))
     assert Recipe.model_validate(json.loads(json.dumps(recipe.model_dump(mode="json")))) == recipe
+
+
+# -- shapes of mirrors -------------------------------------------------------------------------------------------------
+
+
+def mirrors(drawn: dict[str, Any], **given: Any) -> dict[str, Any]:
+    """Recipe that draws keys of a mirror of revolution."""
+    raw = drawing(rig={"mirror": drawn})
+    table = {"mirror": {"shape": "paraboloid", **given}} if given.get("shape") != "none" else {}
+    return {**raw, "rig": {**{k: v for k, v in raw.get("rig", {}).items() if k not in ("radius_m", "z_c_m")}, **table}}
+
+
+@pytest.mark.parametrize(
+    ("drawn", "given", "path", "words"),
+    [
+        ({"shape": "cone"}, {"shape": "none"}, "rig.mirror", ("missing", "[random.rig.mirror]")),
+        ({"shape": "sphere"}, {}, "random.rig.mirror.shape.choice[0]", ("'sphere'", "'ellipsoid'")),
+        ({"shape": {"choice": []}}, {}, "random.rig.mirror.shape.choice", ("at least 1",)),
+        ({"half_angle_deg": 40.0}, {}, "random.rig.mirror.half_angle_deg", ("no effect", 'shape = "cone"')),
+        ({"shape": "cone", "conic": -0.5}, {}, "random.rig.mirror.conic", ("no effect on", '"cone"')),
+        ({"vertex_radius_m": -1.0}, {}, "random.rig.mirror.vertex_radius_m", ("reaches -1", "above 0")),
+        ({"even_terms": 3.0}, {}, "random.rig.mirror.even_terms", ("unknown",)),
+        ({"shape": "polynomial"}, {}, "rig.mirror.even_terms", ("is missing",)),
+        (
+            {"shape": {"choice": ["ellipsoid", "hyperboloid"]}, "conic": {"uniform": [-0.8, -0.2]}},
+            {},
+            "random.rig.mirror.conic",
+            ("from -0.8 to -0.2", '"hyperboloid" is below -1'),
+        ),
+    ],
+)
+def test_each_fault_of_a_drawn_mirror_is_one_line(
+    drawn: dict[str, Any], given: dict[str, Any], path: str, words: tuple[str, ...]
+) -> None:
+    [line] = complaints(mirrors(drawn, **given))
+    assert line.startswith(f"{path}: ")
+    assert [word for word in words if word not in line] == []
+
+
+def test_drawn_mirrors_have_what_their_shape_has() -> None:
+    shapes = ["ellipsoid", "paraboloid", "cone", "polynomial"]
+    drawn = {
+        "shape": {"choice": shapes},
+        "conic": {"uniform": [-0.8, -0.2]},
+        "half_angle_deg": {"uniform": [40.0, 50.0]},
+        "rim_radius_m": {"uniform": [0.055, 0.060]},
+    }
+    recipe = check_recipe(mirrors(drawn, even_terms=[3.0]))
+    assert recipe.random is not None
+    points = first_points("sobol", "name", 1, 64, drawn_parameters(recipe.random))
+    values = draw_values(recipe.random, [target.name for target in recipe.targets], points)
+    found = dict.fromkeys(shapes, 0)
+    for k in range(64):
+        own = {key: column[k] for key, column in values.items() if key.startswith("rig.")}
+        mirror = rig_table(recipe.rig, own).mirror
+        assert mirror is not None
+        assert 0.055 <= mirror.rim_radius_m <= 0.060
+        assert (mirror.conic is None) == (mirror.shape in ("paraboloid", "cone"))
+        assert (mirror.half_angle_deg is None) == (mirror.shape != "cone")
+        assert (mirror.even_terms is None) == (mirror.shape != "polynomial")
+        profile = build_rig(rig_table(recipe.rig, own)).mirror.profile  # type: ignore[union-attr]
+        assert profile.rim_radius_m == mirror.rim_radius_m
+        assert mirror.conic is None or profile.conic == mirror.conic
+        found[mirror.shape] += 1
+    assert min(found.values()) == max(found.values()) == 16  # Sobol's points deal four shapes evenly
+
+
+def test_the_frozen_recipes_draw_what_they_drew() -> None:
+    """Hashes of recipe and numbers from before shapes could be drawn: later keys have later dimensions."""
+    kept = {"bench-dev": ("8ad2fe87e3f560ef", DEV), "bench-test": ("20f2bc324d45b16b", TEST)}
+    for name, (of_recipe, of_points) in kept.items():
+        recipe = load_recipe(name)
+        assert recipe.random is not None
+        document = json.dumps(recipe.model_dump(mode="json"), sort_keys=True)
+        assert hashlib.sha256(document.encode()).hexdigest()[:16] == of_recipe
+        points = first_points(recipe.random.sequence, name, recipe.dataset.seed, 64, drawn_parameters(recipe.random))
+        text = "".join(f"{key}{[float(x).hex() for x in column]}" for key, column in points.items())
+        assert hashlib.sha256(text.encode()).hexdigest()[:16] == of_points
+    assert PARAMETERS[-7:] == tuple(f"rig.mirror.{key}" for key in DRAWN_OF_MIRROR)
+    assert hashlib.sha256(repr(PARAMETERS[:-7]).encode()).hexdigest()[:16] == ORDER  # places are Sobol's dimensions
+
+
+DEV, TEST, ORDER = "bf20b945d932884a", "b8267fd806dda2f7", "1d9f874c8ac06f6a"

@@ -299,6 +299,18 @@ def test_results_are_one_page_in_each_form(score_files, tmp_path, capsys):
     assert again.read_bytes() == page.read_bytes()
 
 
+@pytest.mark.parametrize("command", ["report", "results", "compare"])
+def test_a_score_of_another_version_ends_in_a_sentence(command, score_files, tmp_path, capsys):
+    old = tmp_path / "old.json"
+    old.write_text(json.dumps({**json.loads(score_files[0].read_text()), "version": 1}))
+    out = [] if command == "compare" else ["--out", str(tmp_path / "page.html")]
+    assert cli.main([command, str(score_files[1]), str(old), *out]) == 2
+    said = capsys.readouterr().err
+    assert "old.json has version 1, this program reads" in said
+    assert "Traceback" not in said
+    assert not (tmp_path / "page.html").exists()
+
+
 def test_results_of_nothing_or_of_one_method_twice_are_refused(score_files, tmp_path):
     copy = tmp_path / score_files[0].name
     for suffix in (".json", ".parquet"):
