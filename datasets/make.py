@@ -51,7 +51,7 @@ from phibench.datasets.build.tasks import Task
 from phibench.datasets.build.workers import Environment, NoRendererError, WorkerPool, versions
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import InputFile
-from phibench.datasets.plan.plan import Plan, make_plan, shard_plan
+from phibench.datasets.plan.plan import Plan, make_plan
 from phibench.datasets.plan.room_draws import unexported
 from phibench.datasets.progress import progress_console
 from phibench.datasets.recipe.checks import warnings
@@ -222,7 +222,7 @@ def _planned(
     parsed = parse_recipe(text, source, files)
     if parsed.rooms is not None and parsed.rooms.exported:
         files = exported(parsed, files)
-    return shard_plan(make_plan(parsed, files), shard), text, note
+    return make_plan(parsed, files, shard), text, note
 
 
 @dataclass

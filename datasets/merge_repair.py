@@ -30,7 +30,7 @@ from phibench.datasets.build.run_tasks import (
 from phibench.datasets.build.task_list import task_names
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import make_from_plan
-from phibench.datasets.plan.plan import Plan, make_plan, parse_shard, shard_plan
+from phibench.datasets.plan.plan import Plan, make_plan, parse_shard
 from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.recipe.load import parse_recipe, recipe_text
 from phibench.datasets.recipe.tables import Recipe
@@ -195,7 +195,7 @@ def _held_plan(folder: Path) -> tuple[Plan, str]:
         raise DatasetError(f"{folder} is not a data set: there is nothing to repair")
     info = parse_info(head.info)
     _refuse_other_code(folder, info.provenance)
-    return shard_plan(make_plan(_recipe(folder, head, info), held_room_files(folder)), info.shard), head.recipe
+    return make_plan(_recipe(folder, head, info), held_room_files(folder), info.shard), head.recipe
 
 
 def _lost_head(folder: Path) -> FolderHead | None:

@@ -23,7 +23,7 @@ from phibench.datasets.build.sample_task import noise_row, spot_noise
 from phibench.datasets.build.spot_task import SpotAnswer, answer_spot
 from phibench.datasets.build.task_list import sample_task_name
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.plan.plan import PairPlan, Plan, make_plan, shard_plan
+from phibench.datasets.plan.plan import PairPlan, Plan, make_plan
 from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.recipe.load import parse_recipe
@@ -130,7 +130,7 @@ def _missing_samples(folder: Path) -> str:
         if journal.head is None:
             return ""
         info = parse_info(journal.head.info)
-        plan = shard_plan(make_plan(parse_recipe(journal.head.recipe), held_room_files(folder)), info.shard)
+        plan = make_plan(parse_recipe(journal.head.recipe), held_room_files(folder), info.shard)
     except ValueError:  # damaged, or of another version
         return ""
     names = [pair.sample_id for pair in plan.pairs if sample_task_name(pair) not in journal.entries]
@@ -354,7 +354,7 @@ def _guarded(faults: Iterator[str]) -> Iterator[str]:
 def plan_faults(dataset: Dataset) -> Iterator[str]:
     """Faults of manifest, rigs and poses against the plan of the recipe."""
     try:
-        plan = shard_plan(make_plan(dataset.recipe, held_room_files(dataset.folder)), dataset.info.shard)
+        plan = make_plan(dataset.recipe, held_room_files(dataset.folder), dataset.info.shard)
     except DatasetError as error:
         yield f"{schema.INFO}: its recipe cannot be followed: {error}"
         return

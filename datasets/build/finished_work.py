@@ -20,7 +20,7 @@ from phibench.datasets.build.run_tasks import held_head, is_intact
 from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.build.workers import versions
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.plan.plan import make_plan, shard_plan
+from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import parse_recipe
 from phibench.datasets.recipe.tables import Recipe
 from phibench.datasets.store import schema
@@ -90,7 +90,7 @@ def _held_keys(out: Path, journal: Journal, wanted: DatasetInfo) -> dict[str, st
     if head is None or info is None or info.provenance.get("code_sha256") != code_sha256():
         return unlike
     try:
-        plan = shard_plan(make_plan(parse_recipe(head.recipe), held_room_files(out)), info.shard)
+        plan = make_plan(parse_recipe(head.recipe), held_room_files(out), info.shard)
         # a description that `repair` has recovered does not know the renderer
         environment = versions({**wanted.provenance, **info.provenance})
         return {name: task.key for name, task in plan_tasks(plan, environment).items()}

@@ -12,8 +12,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 from phibench.datasets.errors import DatasetError, RecipeError
+from phibench.datasets.plan.rig_draws import draw_rigs
 from phibench.datasets.plan.room_draws import draw_rooms, room_files
-from phibench.datasets.plan.sampling import RandomSample, draw_rigs, draw_samples
+from phibench.datasets.plan.sampling import RandomSample, draw_samples, have_own_rigs
 from phibench.datasets.recipe.build import build_misalignment, build_rig, build_spot, true_stroke_m
 from phibench.datasets.recipe.tables import DrawnRigsTable, RandomTable, Recipe
 from phibench.datasets.rooms.room_errors import RoomError
@@ -142,11 +143,15 @@ class Plan:
         return self.rigs[pair.rig].at(Stroke(pair.stroke_m).offset_m(position))
 
 
-def make_plan(recipe: Recipe, files: RoomFiles | None = None) -> Plan:
-    """Plan of a recipe; `files` are those of its rooms, where it has panoramas or meshes.
+def make_plan(recipe: Recipe, files: RoomFiles | None = None, shard: str | None = None) -> Plan:
+    """Plan of a recipe or of a shard of it; `files` are those of its rooms, where it has panoramas or meshes.
+
+    A shard of `[random]` whose samples have rigs of their own draws no sample and builds no room of another shard.
 
     Raises
     ------
+    DatasetError
+        If that is no shard, or has no sample.
     RecipeError
         If two strokes differ by less than a nanometre, so that their poses would share a name, or if all of the first
         samples of `[random]` stay impossible, or if a room cannot be built.
@@ -158,7 +163,19 @@ def make_plan(recipe: Recipe, files: RoomFiles | None = None) -> Plan:
     except RoomError as error:
         raise RecipeError(f"rooms: {error}") from error
     if recipe.random is not None:
-        return replace(_random_plan(recipe, recipe.random, rig, rooms, files), files=files)
+        own = _own_numbers(recipe, recipe.random, shard)
+        plan = replace(_random_plan(recipe, recipe.random, rig, rooms, files, own), files=files)
+        return shard_plan(plan, shard) if own is None else replace(plan, shard="{}/{}".format(*parse_shard(shard)))
+    return shard_plan(_whole_plan(recipe, rig, rooms), shard)
+
+
+def _own_numbers(recipe: Recipe, table: RandomTable, shard: str | None) -> range | None:
+    """Numbers of a shard's samples; None where all samples have to be drawn."""
+    return None if shard is None or not have_own_rigs(recipe, table) else _part_of(shard, table.samples)
+
+
+def _whole_plan(recipe: Recipe, rig: Rig, rooms: dict[str, RoomSource]) -> Plan:
+    """Plan of a recipe with `[[experiments]]`."""
     room = rooms[ONLY_ROOM]
     if recipe.rigs is not None:
         return _rigs_plan(recipe, recipe.rigs, rig, room)
@@ -219,9 +236,16 @@ def pose_of(rig: str, offset_m: float, room: str = ONLY_ROOM) -> str:
     return "-".join(parts)
 
 
-def _random_plan(recipe: Recipe, table: RandomTable, rig: Rig, rooms: dict[str, RoomSource], files: RoomFiles) -> Plan:
+def _random_plan(
+    recipe: Recipe,
+    table: RandomTable,
+    rig: Rig,
+    rooms: dict[str, RoomSource],
+    files: RoomFiles,
+    wanted: range | None,
+) -> Plan:
     """Equal rigs share an id, and so their views; the first sample that has one names it, so that more change none."""
-    samples, refused = draw_samples(recipe, table, rooms, files.folder)
+    samples, refused = draw_samples(recipe, table, rooms, files.folder, wanted)
     ids = {rig: RECIPE_RIG}
     for sample in samples:
         ids.setdefault(sample.rig, f"r{sample.number:06d}")
@@ -230,7 +254,8 @@ def _random_plan(recipe: Recipe, table: RandomTable, rig: Rig, rooms: dict[str, 
     used = {name for pair in pairs for name in (pair.rig, pair.nominal_rig)}
     rigs = {name: one for one, name in ids.items() if name in used}
     spots = {pair.spot: sample.spot for pair, sample in zip(pairs, samples, strict=True)}
-    used_rooms = {name: rooms[name] for name in dict.fromkeys(pair.room for pair in pairs)}
+    seen = {pair.room for pair in pairs}
+    used_rooms = {name: source for name, source in rooms.items() if name in seen}
     poses = _poses(recipe, dict.fromkeys(_places(pairs)))
     reasons = {_random_name(number): reason for number, reason in refused.items()}
     return Plan(recipe, rig, rigs, used_rooms, spots, poses, pairs, refused=reasons)
@@ -281,14 +306,11 @@ def shard_plan(plan: Plan, shard: str | None) -> Plan:
     """
     if shard is None:
         return plan
-    i, n = parse_shard(shard)
     # shards in a row, without a gap; their sizes differ by one sample at most
     names = [pair.sample_id for pair in plan.pairs]
     names = sorted([*names, *plan.refused]) if plan.refused else names  # drawn samples: their numbers give the order
-    first, end = (k * len(names) // n for k in (i - 1, i))
-    if first == end:
-        raise DatasetError(f"shard {shard} is empty: there are {len(names)} samples; use at most as many shards")
-    owned = set(names[first:end])
+    part = _part_of(shard, len(names))
+    owned = set(names[part.start : part.stop])
     pairs = tuple(pair for pair in plan.pairs if pair.sample_id in owned)
     poses, spots = {pair.pose_id(p) for pair in pairs for p in POSITIONS}, {pair.spot for pair in pairs}
     rigs = {name for pair in pairs for name in (pair.rig, pair.nominal_rig)}
@@ -299,9 +321,18 @@ def shard_plan(plan: Plan, shard: str | None) -> Plan:
         spots={name: spot for name, spot in plan.spots.items() if name in spots},
         poses=tuple(pose for pose in plan.poses if pose.pose_id in poses),
         pairs=pairs,
-        shard=f"{i}/{n}",
+        shard="{}/{}".format(*parse_shard(shard)),
         refused={name: reason for name, reason in plan.refused.items() if name in owned},
     )
+
+
+def _part_of(shard: str, count: int) -> range:
+    """Places of a shard's samples among so many."""
+    i, n = parse_shard(shard)
+    first, end = (k * count // n for k in (i - 1, i))
+    if first == end:
+        raise DatasetError(f"shard {shard} is empty: there are {count} samples; use at most as many shards")
+    return range(first, end)
 
 
 def parse_shard(shard: str) -> tuple[int, int]:

@@ -1,16 +1,15 @@
 """Random rigs, spots and strokes of a recipe, drawn again where the geometry is impossible.
 
-They come from `[random]`; the misalignments of `[rigs]` are drawn here, too.
+They come from `[random]`; `rig_draws` draws the misalignments of `[rigs]` likewise.
 
 The number of sample i for parameter p, in [0, 1), is a function of (data set, seed, sequence, p, i) and of nothing
 else. It depends neither on how many samples there are nor on which other parameters are drawn. The distributions turn
 it into a value (`distributions.quantile`).
 
 A sample may be impossible: rig, spot and stroke do not go together, or not with the room. It is then drawn again, with
-numbers of streams of its own (`further_points`), so that no other sample moves. The same holds for a rig of `[rigs]`
-that cannot exist or cannot make one of the strokes. A sample that stays impossible is refused alone, if others are
-possible. Whether a sample's spot is to be hidden in one image is dealt once
-and stays, however often the sample is drawn: the share of hidden ones is that of the recipe.
+numbers of streams of its own (`further_points`), so that no other sample moves. A sample that stays impossible is
+refused alone, if others are possible. Whether a sample's spot is to be hidden in one image is dealt once and stays,
+however often the sample is drawn: the share of hidden ones is that of the recipe.
 """
 
 from __future__ import annotations
@@ -37,7 +36,6 @@ from phibench.datasets.recipe.mirror_tables import DRAWN_OF_MIRROR, HolderTable,
 from phibench.datasets.recipe.spot_placement import Boards, Placed, place, visibility_fault
 from phibench.datasets.recipe.tables import (
     DRAWABLE,
-    DrawnRigsTable,
     MisalignmentTable,
     RandomTable,
     Recipe,
@@ -115,7 +113,7 @@ HIDDEN, SHOWN = "in one image", "in none"
 _PILOT = 8  # samples
 _NANOMETRE = 9  # decimals of a stroke: a pose's name then says its offset exactly
 
-_PREFIX, _HOLDER, _MIRROR = "misalignment.", "holder.", "mirror."
+PREFIX, _HOLDER, _MIRROR = "misalignment.", "holder.", "mirror."
 
 Value = float | str
 
@@ -155,9 +153,15 @@ class RandomSample:
 
 
 def draw_samples(
-    recipe: Recipe, table: RandomTable, rooms: Mapping[str, RoomSource], folder: Path | None = None
+    recipe: Recipe,
+    table: RandomTable,
+    rooms: Mapping[str, RoomSource],
+    folder: Path | None = None,
+    wanted: range | None = None,
 ) -> tuple[tuple[RandomSample, ...], dict[int, str]]:
-    """All samples of a recipe with `[random]`, dealt to its rooms in turn; `folder` has the files of the rooms.
+    """Samples of a recipe with `[random]`, dealt to its rooms in turn; `folder` has the files of the rooms.
+
+    Of the `wanted` numbers, in a row, or all; rooms without such a sample are not built.
 
     Returns
     -------
@@ -173,8 +177,9 @@ def draw_samples(
     """
     dataset, found, refused = recipe.dataset, dict[int, RandomSample](), dict[int, str]()
     first = first_points(table.sequence, dataset.name, dataset.seed, table.samples, drawn_parameters(table))
+    wanted = range(table.samples) if wanted is None else wanted
     for k, room_id in enumerate(rooms):  # a room is built once, and let go before the next
-        numbers = range(k, table.samples, len(rooms))
+        numbers = range(wanted.start + (k - wanted.start) % len(rooms), wanted.stop, len(rooms))
         if numbers:
             stated = isinstance(rooms[room_id], PanoramaRoom | MeshRoom) and not is_exported(rooms[room_id])
             try:
@@ -193,7 +198,8 @@ def draw_samples(
                 refused |= lost
                 _require_some(refused, found, table.samples)
                 if stated:  # it is the recipe that names it
-                    _require_some(lost, [number for number in numbers if number in found], len(numbers))
+                    of_room = len(range(k, table.samples, len(rooms)))
+                    _require_some(lost, [number for number in numbers if number in found], of_room)
     return tuple(found[number] for number in sorted(found)), dict(sorted(refused.items()))
 
 
@@ -202,6 +208,26 @@ def _require_some(refused: Mapping[int, str], found: Collection[int], count: int
     if refused and not found and len(refused) >= min(_PILOT, count):
         number = min(refused)
         raise RecipeError(f"random: sample {number} {refused[number]}")
+
+
+_OF_STROKE = ("stroke_relative", "stroke_offset_m")
+
+
+def have_own_rigs(recipe: Recipe, table: RandomTable) -> bool:
+    """Tell whether what a sample's rigs are called depends on no other sample.
+
+    Equal rigs are called after the first sample that has them. No two are equal where a number that every rig has is
+    drawn from an interval; and the recipe's own rig has a name of its own.
+    """
+    drawn = dict(_sample_distributions(table))
+    spread = {name for name, one in drawn.items() if isinstance(one, DistributionTable) and one.choice is None}
+    if spread & {f"rig.{key}" for key in DRAWABLE}:
+        return True
+    if any(name.startswith("rig.") for name in drawn):
+        return False
+    if not any(name.startswith(PREFIX) for name in drawn):
+        return build_misalignment(recipe.misalignment) == Misalignment()
+    return bool(spread & {PREFIX + key for key in MISALIGNMENT if key not in (*OF_REVOLVED, *_OF_STROKE)})
 
 
 def rig_table(table: RigTable, values: Mapping[str, Value]) -> RigTable:
@@ -225,7 +251,7 @@ def _drawn_mirror(table: MirrorTable, drawn: Mapping[str, Value]) -> MirrorTable
 
 def drawn_misalignment(table: MisalignmentTable, values: Mapping[str, Value]) -> Misalignment:
     """Misalignment with drawn numbers, by parameter, in place of those of `[misalignment]`."""
-    drawn = {key.removeprefix(_PREFIX): value for key, value in values.items() if key.startswith(_PREFIX)}
+    drawn = {key.removeprefix(PREFIX): value for key, value in values.items() if key.startswith(PREFIX)}
     return build_misalignment(table.model_copy(update=drawn))
 
 
@@ -385,89 +411,3 @@ def _values(chosen: Any, points: Array) -> Any:
 
 def _plain(value: Any) -> Value:
     return value if isinstance(value, str) else float(value)
-
-
-# Rigs of `[rigs]`.
-
-
-@dataclass(frozen=True)
-class DrawnRig:
-    """A drawn rig.
-
-    Attributes
-    ----------
-    rig_id : str
-        Such as ``r000002``, the third one.
-    tries : int
-        Number of the first draw that was possible.
-    drawn : tuple of (parameter, value)
-        Parameters as in `PARAMETERS`.
-    misalignment : Misalignment
-    rig : Rig, the true one
-    """
-
-    rig_id: str
-    tries: int
-    drawn: tuple[tuple[str, Value], ...]
-    misalignment: Misalignment
-    rig: Rig
-
-
-def draw_rigs(recipe: Recipe, table: DrawnRigsTable, nominal: Rig, room: Room) -> tuple[DrawnRig, ...]:
-    """All rigs of a recipe with `[rigs]`.
-
-    Raises
-    ------
-    RecipeError
-        If a rig stays impossible after `TRIES` draws, with the reason of the last one.
-    """
-    chosen = _rig_distributions(table)
-    first = first_points("independent", recipe.dataset.name, recipe.dataset.seed, table.count, chosen)
-    values = {name: quantile(chosen[name], u) for name, u in first.items()}
-    top_m, boards = ceiling_m(room), Boards([build_target(target) for target in recipe.targets])
-    return tuple(_possible(recipe, chosen, _row(values, k), k, nominal, top_m, boards) for k in range(table.count))
-
-
-def _possible(
-    recipe: Recipe,
-    chosen: Mapping[str, DistributionTable],
-    drawn: dict[str, Value],
-    number: int,
-    nominal: Rig,
-    top_m: float,
-    boards: Boards,
-) -> DrawnRig:
-    for attempt in range(TRIES):
-        if attempt:
-            points = further_points(recipe.dataset.name, recipe.dataset.seed, chosen, [number], attempt)
-            drawn = _row({name: quantile(chosen[name], u) for name, u in points.items()}, 0)
-        made = _made(recipe, drawn, number, attempt + 1, nominal, top_m, boards)
-        if isinstance(made, DrawnRig):
-            return made
-    text = f"rig {number} stays impossible in {TRIES} draws; the last: {made}"
-    raise RecipeError(f"rigs: {text}; narrow the distributions, move the boards or shorten the strokes")
-
-
-def _made(
-    recipe: Recipe, drawn: dict[str, Value], number: int, tries: int, nominal: Rig, top_m: float, boards: Boards
-) -> DrawnRig | str:
-    """The rig, or why it is impossible."""
-    try:
-        misalignment = drawn_misalignment(recipe.misalignment, drawn)
-        rig = nominal.perturbed(misalignment)
-        strokes_m = {true_stroke_m(misalignment, h) for one in recipe.experiments for h in one.strokes_m}
-    except SceneError as error:
-        return by_keys(str(error))
-    faults = (rig_fault(rig, stroke_m, top_m, boards) for stroke_m in sorted(strokes_m))
-    why = next((fault for fault in faults if fault), None)
-    return why or DrawnRig(f"r{number:06d}", tries, tuple(drawn.items()), misalignment, rig)
-
-
-def _rig_distributions(table: DrawnRigsTable) -> dict[str, DistributionTable]:
-    """Distribution by parameter, in the order of `[misalignment]`."""
-    given = ((key, getattr(table.misalignment, key)) for key in type(table.misalignment).model_fields)
-    return {_PREFIX + key: one for key, one in given if isinstance(one, DistributionTable)}
-
-
-def _row(values: Mapping[str, Array], k: int) -> dict[str, Value]:
-    return {name: float(np.asarray(column)[k]) for name, column in values.items()}

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.drawn_values import drawing
 from helpers.folders import contents
 from helpers.inline_workers import InlineWorkerPool
 from helpers.processes import SMALLEST, quiet
@@ -16,12 +17,17 @@ from phibench.datasets.build.journal import Journal
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.make import make
 from phibench.datasets.merge_repair import merge
+from phibench.datasets.plan import sampling
 from phibench.datasets.plan.plan import make_plan, shard_plan
 from phibench.datasets.read import open_dataset
-from phibench.datasets.recipe.load import load_recipe
+from phibench.datasets.recipe.load import check_recipe, load_recipe
+from phibench.datasets.rooms.room_sources import RoomSource, room_of
 from phibench.datasets.store import schema
 from phibench.datasets.verify import verify
 from phibench.scenes.rig import POSITIONS
+from phibench.scenes.room import Room
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -182,3 +188,56 @@ def test_what_does_not_fit_is_refused(shards: list[Path], tmp_path: Path) -> Non
     assert "is missing; run `phibench dataset repair`" in refusal(out, shards)
     (second / schema.CHECKSUMS).unlink()
     assert "is not a finished shard" in refusal(out, shards)
+
+
+UNIFORM = {"uniform": [1420.0, 1440.0]}
+RECIPES = {
+    "rigs of their own": {"rig": {"fx_px": UNIFORM, "holder": {"kind": {"choice": ["none", "rods"]}}}},
+    "misaligned": {"misalignment": {"tilt_x_rad": {"uniform": [-0.01, 0.01]}, "k1": 0.001}},
+    "one rig": {},
+    "two focal lengths": {"rig": {"fx_px": {"choice": [1420.0, 1440.0]}}},
+    "strokes alone": {"misalignment": {"stroke_relative": {"uniform": [-0.01, 0.01]}}},
+}
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_shard_plans_its_own_samples_as_the_whole_does(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every number and name, those of rigs included; where samples may share a rig, all of them are drawn."""
+    recipe, drawn, draw = check_recipe(drawing(samples=11, **RECIPES[name])), list[int](), sampling._Makers._sample
+
+    def counted(makers: Any, number: int, *others: Any) -> Any:
+        drawn.append(number)
+        return draw(makers, number, *others)
+
+    monkeypatch.setattr(sampling._Makers, "_sample", counted)
+    whole = make_plan(recipe)
+    assert set(drawn) == set(range(11))
+    for i in range(1, 5):
+        drawn.clear()
+        part = make_plan(recipe, shard=f"{i}/4")
+        assert part == shard_plan(whole, f"{i}/4")
+        assert list(part.rigs) == list(shard_plan(whole, f"{i}/4").rigs)
+        own = set(range(11 * (i - 1) // 4, 11 * i // 4))
+        assert set(drawn) == (set(range(11)) if name in ("two focal lengths", "strokes alone") else own)
+    with pytest.raises(DatasetError, match="shard 1/12 is empty: there are 11 samples"):
+        make_plan(recipe, shard="1/12")
+
+
+def test_a_shard_builds_no_room_of_another_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sample i stands in room i modulo 3; rooms keep the order in which they are drawn."""
+    recipe, built = load_recipe(ROOT / "tiny_worlds.toml"), list[str]()
+
+    def counted(source: RoomSource, folder: Path | None = None) -> Room:
+        built.append(str(source))
+        return room_of(source, folder)
+
+    monkeypatch.setattr(sampling, "room_of", counted)
+    whole = make_plan(recipe)
+    count, samples = len(built), len(whole.pairs)
+    assert count > 1
+    for i in range(1, samples + 1):
+        built.clear()
+        part = make_plan(recipe, shard=f"{i}/{samples}")
+        assert part == shard_plan(whole, f"{i}/{samples}")
+        assert list(part.rooms) == list(shard_plan(whole, f"{i}/{samples}").rooms)
+        assert len(built) == 1
