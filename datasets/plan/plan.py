@@ -165,7 +165,7 @@ def make_plan(recipe: Recipe, files: RoomFiles | None = None, shard: str | None 
     if recipe.random is not None:
         own = _own_numbers(recipe, recipe.random, shard)
         plan = replace(_random_plan(recipe, recipe.random, rig, rooms, files, own), files=files)
-        return shard_plan(plan, shard) if own is None else replace(plan, shard="{}/{}".format(*parse_shard(shard)))
+        return shard_plan(plan, shard) if shard is None or own is None else replace(plan, shard=_written(shard))
     return shard_plan(_whole_plan(recipe, rig, rooms), shard)
 
 
@@ -321,9 +321,13 @@ def shard_plan(plan: Plan, shard: str | None) -> Plan:
         spots={name: spot for name, spot in plan.spots.items() if name in spots},
         poses=tuple(pose for pose in plan.poses if pose.pose_id in poses),
         pairs=pairs,
-        shard="{}/{}".format(*parse_shard(shard)),
+        shard=_written(shard),
         refused={name: reason for name, reason in plan.refused.items() if name in owned},
     )
+
+
+def _written(shard: str) -> str:
+    return "{}/{}".format(*parse_shard(shard))
 
 
 def _part_of(shard: str, count: int) -> range:
