@@ -3,9 +3,11 @@
     .venv/bin/python docs/draw_learned.py measure DEV TEST NETWORKS out/learned.json
     .venv/bin/python docs/draw_learned.py draw out/learned.json docs/learned.png
     .venv/bin/python docs/draw_learned.py pairs TEST SCORES NETWORKS
+    .venv/bin/python docs/draw_learned.py found SCORES
 
 SCORES is a folder with scores of `detect` and of others on TEST, such as mjpeg-detect.parquet, by `phibench score`.
 `pairs` asks the networks at the places that `detect` answered; bounds and other methods' errors are the scores'.
+`found` compares scores of `learned_detect` with those of `detect` and of the fits.
 
 NETWORKS is a folder of ONNX files: released.onnx, and others to compare with it, such as other seeds and networks of
 one preset. Crops count of which the first claims a deviation below a pixel.
@@ -30,6 +32,7 @@ from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.frames.source import frame_stream
 from phibench.datasets.read import open_finished
 from phibench.datasets.training import CropSettings, SpotCrops
+from phibench.estimator.benchmark.intervals import clopper_pearson
 from phibench.estimator.learned.crop_training import CROP_SETTINGS, Answers, TrainingSettings, crops_of, rooms_of
 from phibench.estimator.learned.network_input import SIDE_PX, crop_input, crop_origin, cut
 from phibench.estimator.learned.networks import CROP, Network, covariances
@@ -46,7 +49,7 @@ _LABELS = {
     "srgb8": "srgb8 alone",
     "mjpeg": "mjpeg alone",
 }
-COUNT, LEAK_COUNT, RESAMPLES = 500, 1200, 2000
+COUNT, OUTSIDE_COUNT, LEAK_COUNT, RESAMPLES = 500, 250, 1200, 2000
 SETTINGS = replace(CROP_SETTINGS, laser_levels=(0.25, 1.0))  # those of the recipe
 SIZES: dict[str, dict[str, Any]] = {  # numbers of bench-test
     "bayer-raw": {"read_noise_e": 5.0},
@@ -147,10 +150,10 @@ def measure(dev: Path, test: Path, networks: Path, out: Path) -> None:
         ):
             tables[size + part] = table_of(crops, files, size + part, chosen)
             print(size + part, {k: v["rms_px"] if isinstance(v, dict) else v for k, v in tables[size + part].items()})
-    for size in ("bayer-raw", "srgb8", "mjpeg 80"):
+    for size in ("bayer-raw", "mjpeg 80"):
         request = FrameRequest(size.split()[0], "auto", overrides=SIZES[size])
         for part, settings in OUTSIDE.items():
-            crops = made(_crops(test, request, settings), test)
+            crops = made(_crops(test, request, settings, OUTSIDE_COUNT), test)
             name = f"{size}, {part}"
             tables[name] = table_of(crops, {LEAD: files[LEAD]}, name, crops.answers(files[LEAD]).sure)
             print(name, tables[name])
@@ -159,8 +162,8 @@ def measure(dev: Path, test: Path, networks: Path, out: Path) -> None:
     out.write_text(json.dumps(tables, indent=1))
 
 
-def _crops(folder: Path, request: FrameRequest, settings: CropSettings = SETTINGS) -> SpotCrops:
-    return SpotCrops([folder], [request], COUNT, seed=77, settings=settings, laser_off=True)
+def _crops(folder: Path, request: FrameRequest, settings: CropSettings = SETTINGS, count: int = COUNT) -> SpotCrops:
+    return SpotCrops([folder], [request], count, seed=77, settings=settings, laser_off=True)
 
 
 def leak(dev: Path, files: dict[str, Path]) -> dict[str, Any]:
@@ -213,7 +216,7 @@ _PART_PX = 64  # of a frame that is simulated about a place
 
 def pairs(test: Path, scores: Path, networks: Path) -> None:
     """Print rms, median, efficiency and pull of networks on detected spots, and of another method on the same ones."""
-    found = {file.stem: Network(file, CROP) for file in sorted(networks.glob("*.onnx"))}
+    read = {file.stem: Network(file, CROP) for file in sorted(networks.glob("*.onnx"))}
     for preset, other in OTHERS.items():
         keys = ["number", "image"]
         records = pl.read_parquet(scores / f"{preset}-detect.parquet").filter(
@@ -222,7 +225,7 @@ def pairs(test: Path, scores: Path, networks: Path) -> None:
         theirs = pl.read_parquet(scores / f"{preset}-{other}.parquet").filter("detected")
         both = records.join(theirs.select(*keys, "du_px", "dv_px", "pull_u", "pull_v"), on=keys, suffix="_other")
         rows = both.sort("sample_id").to_dicts()
-        answers = _asked(test, preset, rows, found)
+        answers = _asked(test, preset, rows, read)
         samples, bound = np.array([row["sample_id"] for row in rows]), np.array([row["bound_px2"] for row in rows])
         error = np.array([[row["du_px_other"], row["dv_px_other"]] for row in rows], float)
         pull = np.array([[row["pull_u_other"], row["pull_v_other"]] for row in rows], float)
@@ -283,6 +286,34 @@ def _part(sample: CachedSample, pair_draw: PairDraw, position: str, uv_px: tuple
     return (*images, card_of(side.chain.sensor), np.array([u0, v0]))
 
 
+def found(scores: Path) -> None:
+    """Print hidden and visible spots that `detect` and `learned_detect` answer, and errors of the ones both find."""
+    keys = ["number", "image"]
+    for preset, other in OTHERS.items():
+        tables = {m: pl.read_parquet(scores / f"{preset}-{m}.parquet") for m in ("detect", "learned_detect", other)}
+        for name, table in tables.items():
+            hidden = table.filter(~pl.col("visible"))
+            answered = hidden["u_px"].is_not_null().sum()
+            low, high = clopper_pearson(answered, len(hidden), 0.95)
+            samples = table["sample_id"].to_numpy()
+            parts = {}
+            for part, of in (("detected", "visible"), ("false_detection", None)):
+                base = np.ones(len(table)) if of is None else table[of].to_numpy().astype(float)
+                hits = table[part].to_numpy().astype(float) * (base if of else 1.0)
+                parts[part] = interval(lambda k, h=hits, b=base: float(h[k].sum() / b[k].sum()), samples, preset + part)
+            shown = {key: [round(x, 3) for x in value] for key, value in parts.items()}
+            print(preset, name, f"hidden {answered} of {len(hidden)} [{low:.3f}, {high:.3f}]", shown)
+        mine = tables["learned_detect"].filter("detected", (pl.col("bound_px2") < 1.0).fill_null(False))
+        columns = ("du_px", "dv_px", "pull_u", "pull_v")
+        both = mine.join(tables[other].filter("detected").select(*keys, *columns), on=keys, suffix="_other")
+        rows = both.sort("sample_id")
+        samples, bound = rows["sample_id"].to_numpy(), rows["bound_px2"].to_numpy()
+        square, others = ((rows[f"du_px{e}"] ** 2 + rows[f"dv_px{e}"] ** 2).to_numpy() for e in ("", "_other"))
+        pulls = [(rows[f"pull_u{e}"] ** 2 + rows[f"pull_v{e}"] ** 2).to_numpy() / 2.0 for e in ("", "_other")]
+        _print(preset, "learned_detect", square, others, pulls[0], bound, samples)
+        _print(preset, other, others, others, pulls[1], bound, samples)
+
+
 def draw(source: Path, out: Path) -> None:
     """Median and rms error by test preset, one colour for each network."""
     tables = json.loads(source.read_text())
@@ -307,5 +338,7 @@ if __name__ == "__main__":
         measure(*map(Path, sys.argv[2:6]))
     elif sys.argv[1] == "pairs":
         pairs(*map(Path, sys.argv[2:5]))
+    elif sys.argv[1] == "found":
+        found(Path(sys.argv[2]))
     else:
         draw(*map(Path, sys.argv[2:4]))
