@@ -303,6 +303,7 @@ def found(scores: Path) -> None:
                 parts[part] = interval(lambda k, h=hits, b=base: float(h[k].sum() / b[k].sum()), samples, preset + part)
             shown = {key: [round(x, 3) for x in value] for key, value in parts.items()}
             print(preset, name, f"hidden {answered} of {len(hidden)} [{low:.3f}, {high:.3f}]", shown)
+        _print_minus(preset, tables["learned_detect"].sort(keys), tables["detect"].sort(keys))
         mine = tables["learned_detect"].filter("detected", (pl.col("bound_px2") < 1.0).fill_null(False))
         columns = ("du_px", "dv_px", "pull_u", "pull_v")
         both = mine.join(tables[other].filter("detected").select(*keys, *columns), on=keys, suffix="_other")
@@ -312,6 +313,17 @@ def found(scores: Path) -> None:
         pulls = [(rows[f"pull_u{e}"] ** 2 + rows[f"pull_v{e}"] ** 2).to_numpy() / 2.0 for e in ("", "_other")]
         _print(preset, "learned_detect", square, others, pulls[0], bound, samples)
         _print(preset, other, others, others, pulls[1], bound, samples)
+
+
+def _print_minus(preset: str, one: pl.DataFrame, two: pl.DataFrame) -> None:
+    """Print what one method finds and answers falsely more often than another one on the same images."""
+    seen, samples = one["visible"].to_numpy(), one["sample_id"].to_numpy()
+    more, false = (one[c].to_numpy().astype(float) - two[c].to_numpy() for c in ("detected", "false_detection"))
+    shown = [
+        interval(lambda k: float(more[k].sum() / seen[k].sum()), samples, preset + "found"),
+        interval(lambda k: float(false[k].mean()), samples, preset + "false"),
+    ]
+    print(preset, "learned_detect minus detect: found, false", [[round(x, 3) for x in one] for one in shown])
 
 
 def draw(source: Path, out: Path) -> None:
