@@ -1,8 +1,8 @@
 """Frames that a smoothed belief keeps, the robot's way between them, and the errors that frames share.
 
 Places are those in the robot's frame at the first frame. p_i is the target's place by the robot at frame i, and
-F_i = dr_i / dp_i the slope of the residuals r_i of `smoothing`. Random parts w_j of the steps since a frame move its
-p_i, so that cov(r_i, r_k) has
+F_i = de_i / dp_i the slope of the residuals e_i of `smoothing`. Random parts w_j of the steps since a frame move its
+p_i, so that cov(e_i, e_k) has
 
     F_i (sum over j > max(i, k) of D_j Q_j D_j^T) F_k^T,        D_j = dp / dw_j.
 
@@ -35,8 +35,8 @@ class Frames:
         Attitude: rotation and origin of the rig's frame in that frame made level.
     steps, time_s : shape (N,)
         Steps of the tracks and time before the frame.
-    rays : shape (N, m + 1, 3, 3)
-        Origin, direction and rise of the mirror by the middle rig and those beside it.
+    rays : shape (N, m + 1, 3, 3, 3)
+        Origin, direction and rise of the mirror, by the middle rig and those beside it, of the pixel and two beside it.
     shared_px : shape (N, 2)
         Standard deviations of what frames share: fixed pattern, texture.
     """

@@ -9,7 +9,9 @@ in the robot at frame i, by the arcs of the tracks back from now, and o_i, d_i t
 
     r_i = (azimuth, rise)(p_i - h_i e - o_i) - (azimuth, rise)(d_i)
 
-should be 0. Its covariance has the pixel's noise in each frame, and what frames share (`kept_frames`).
+should be 0. Residuals are e_i = J_i^-1 r_i in pixels, J_i = dr_i / d(pixel). In angles, whose scale J_i depends on the
+rig, a fit would prefer rigs that make the same noise a smaller angle: by half a standard deviation in 40 frames.
+The covariance of e_i has the pixel's noise in each frame, and what frames share (`kept_frames`).
 """
 
 from __future__ import annotations
@@ -54,15 +56,24 @@ class _DeviatedView(NamedTuple):
         raised = stroke_of(stroke_m, self.values)[:, None] * self.axis
         return found.origin_world_m, found.direction_world, raised
 
+    def rays_beside(self, uv_px: Array, stroke_m: Array) -> Array:
+        """Origin, direction and rise for each pixel as it is and a step aside in u and v, shape (3, 3, N, 3)."""
+        origin, direction, raised = self.rays(uv_px + _PIXEL_STEP_PX * np.eye(3, 2, k=-1)[:, None], stroke_m)
+        return np.stack([origin, direction, np.broadcast_to(raised, origin.shape)])
+
 
 @dataclass(frozen=True)
 class _Rows:
-    """Residuals, shape (r,), their slopes by the state (r, n) and covariance (r, r), and F of the frames (N, 2, 3)."""
+    """Residuals, shape (r,), their slopes by the state (r, n) and covariance (r, r).
+
+    `F` has their slopes by the target's place, shape (N, 2, 3), `per_px` those of the angles by the pixel, (N, 2, 2).
+    """
 
     r: Array
     J: Array
     C: Array
     F: Array
+    per_px: Array
 
 
 class SmoothedBelief(Belief):
@@ -147,8 +158,9 @@ class SmoothedBelief(Belief):
             return
         nothing = Direction(0.0, 0.0, covariance, np.array(place), np.zeros((2, 2)))
         rows = self._rows(self._x, self._frame(nothing, stroke_m, None))
-        K = self._P @ rows.J.T @ np.linalg.inv(rows.J @ self._P @ rows.J.T + covariance)
-        self._P = self._P - K @ rows.J @ self._P
+        J = rows.per_px[0] @ rows.J
+        K = self._P @ J.T @ np.linalg.inv(J @ self._P @ J.T + covariance)
+        self._P = self._P - K @ J @ self._P
         self._P = 0.5 * (self._P + self._P.T)
 
     def copied(self) -> Self:
@@ -221,7 +233,7 @@ class SmoothedBelief(Belief):
             C[n + 1 :, n + 1 :] = (self.prior.speed_m_per_s**2 + a * lag[0]) * np.eye(3)
             C[:n, n + 1 :] = (-0.5 * a * lag[:, None, None] ** 2 * rows.F).reshape(n, 3)
             C[n + 1 :, :n] = C[:n, n + 1 :].T
-        return _Rows(self._first_rows(x, rows.r), J, C, rows.F)
+        return _Rows(self._first_rows(x, rows.r), J, C, rows.F, rows.per_px)
 
     def _slopes(self, x: Array, function: Callable[[Array], Array]) -> Array:
         """Derivatives of a function by the target's part of the state, shape (..., 5 or 8)."""
@@ -255,9 +267,8 @@ class SmoothedBelief(Belief):
         return one
 
     def _view_rays(self, uv_px: Array, stroke_m: Array) -> Array:
-        """Rays of pixels by the middle rig and those beside it, shape (N, m + 1, 3, 3)."""
-        rays = [np.stack(view.rays(uv_px, stroke_m), axis=1) for view in self._views]
-        return np.stack(rays, axis=1)
+        """Rays of pixels by the middle rig and those beside it, shape (N, m + 1, 3, 3, 3)."""
+        return np.stack([np.moveaxis(view.rays_beside(uv_px, stroke_m), 2, 0) for view in self._views], axis=1)
 
     def _around(self) -> list[_DeviatedView]:
         """Rig of the middle deviation, and those a step away from it along each of its numbers."""
@@ -269,33 +280,28 @@ class SmoothedBelief(Belief):
         return _DeviatedView(rig.at(0.0), np.array(rig.stroke_axis_world), values)
 
     def _residuals(self, x: Array, frames: Frames) -> Array:
-        """Azimuths and rises of the target by those of its pixels, shape (N, 2)."""
-        rays = self._rig(x[self._deviations]).rays(frames.uv_px, frames.stroke_m)
-        return _residual(self._places(x, frames)[0], *rays)
+        """Pixels by those of the target, shape (N, 2)."""
+        rays = self._rig(x[self._deviations]).rays_beside(frames.uv_px, frames.stroke_m)
+        return _pixel_residual(self._places(x, frames)[0], rays)[0]
 
     def _rows(self, x: Array, frames: Frames) -> _Rows:
         """Residuals of frames, their slopes and covariance."""
         n, m = len(frames.time_s), self._deviations.start
-        # a row of pixels as they are, and two a step aside
-        uv = frames.uv_px + _PIXEL_STEP_PX * np.eye(3, 2, k=-1)[:, None]
-        origin, direction, raised = self._rig(x[self._deviations]).rays(uv, frames.stroke_m)
-        here = origin[0], direction[0], raised
+        rays = self._rig(x[self._deviations]).rays_beside(frames.uv_px, frames.stroke_m)
         p = self._places(x, frames)[0]
-        r = _residual(p, *here)
+        e, per_px = _pixel_residual(p, rays)
+        to_px = np.linalg.inv(per_px)
+        origin, direction, raised = rays[:, 0]
+        slopes = self._slopes(x, lambda y: _residual(self._places(y, frames)[0], origin, direction, raised))
         J = np.zeros((2 * n, len(x)))
-        J[:, :m] = self._slopes(x, lambda y: _residual(self._places(y, frames)[0], *here)).reshape(2 * n, m)
-        base, *moved = (_residual(p, *np.moveaxis(one, 1, 0)) for one in np.moveaxis(frames.rays, 1, 0))
+        J[:, :m] = (to_px @ slopes).reshape(2 * n, m)
+        base, *moved = (_pixel_residual(p, np.moveaxis(one, 0, 2))[0] for one in np.moveaxis(frames.rays, 1, 0))
         for k, one in enumerate(moved):
             # a pixel at the mirror's rim may be none in the next rig: it then says nothing of this deviation
-            J[:, m + k] = np.nan_to_num(turned(one - base)).reshape(-1) / _STEP
-        aside = [turned(_residual(p, origin[k], direction[k], raised) - r) for k in (1, 2)]
-        per_px = np.stack(aside, axis=-1) / _PIXEL_STEP_PX
-        noise = per_px @ frames.covariance_px2 @ np.swapaxes(per_px, 1, 2)
-        C, F = self._covariance(x, frames, angle_slopes(p - origin[0] - raised), noise)
-        flat = per_px.reshape(2 * n, 2)
-        driven_m = self._way.driven_m[frames.steps]
-        C += np.kron(shared_px2(frames, driven_m), np.ones((2, 2))) * (flat @ flat.T)
-        return _Rows(r.reshape(-1), J, C, F)
+            J[:, m + k] = np.nan_to_num(one - base).reshape(-1) / _STEP
+        C, F = self._covariance(x, frames, to_px @ angle_slopes(p - origin - raised))
+        C += np.kron(shared_px2(frames, self._way.driven_m[frames.steps]), np.eye(2))
+        return _Rows(e.reshape(-1), J, C, F, per_px)
 
     def _course(self, y: Array) -> Course:
         """Course of the robot by the state's slip and skid."""
@@ -308,11 +314,11 @@ class SmoothedBelief(Belief):
             velocity = course.last_yaw @ y[VELOCITY] / max(float(y[2]), LEAST_Q)
         return course.seen_from(frames, course.fixed(self.point_m(y)), velocity, self._way.time_s), velocity
 
-    def _covariance(self, x: Array, frames: Frames, E: Array, noise: Array) -> tuple[Array, Array]:
+    def _covariance(self, x: Array, frames: Frames, E: Array) -> tuple[Array, Array]:
         """Covariance of residuals, shape (2 N, 2 N): pixels in each frame, steps and motion between frames; and F."""
         n, course = len(frames.time_s), self._course(x)
         C = np.zeros((n, 2, n, 2))
-        C[np.arange(n), :, np.arange(n), :] = noise
+        C[np.arange(n), :, np.arange(n), :] = frames.covariance_px2
         F = course.slopes(frames, E)
         if self._way.steps:
             C += self._way.shared_by_steps(course, course.fixed(self.point_m(x)), frames, F)
@@ -324,6 +330,13 @@ class SmoothedBelief(Belief):
 def _residual(p: Array, origin: Array, direction: Array, raised: Array) -> Array:
     """Azimuth and rise of points by those of rays, shape (N, 2)."""
     return turned(angles(p - origin - raised) - angles(direction))
+
+
+def _pixel_residual(p: Array, rays: Array) -> tuple[Array, Array]:
+    """Residuals of pixels, shape (N, 2), and slopes of the angles by the pixel, (N, 2, 2), for `rays_beside`."""
+    r, *aside = (_residual(p, *rays[:, k]) for k in range(3))
+    per_px = np.stack([turned(one - r) for one in aside], axis=-1) / _PIXEL_STEP_PX
+    return np.asarray(np.linalg.solve(per_px, r[..., None])[..., 0], float), per_px
 
 
 # -- choice -----------------------------------------------------------------------------------------------------------
