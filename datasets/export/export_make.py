@@ -232,7 +232,7 @@ def _claim(out: Path, dataset: Dataset, request: ExportRequest) -> None:
         words = {"form": "--to"}
         if other := [words.get(name, name) for name in meant if held.get(name) != meant[name]]:
             raise DatasetError(
-                f"{out} holds an export with another {', '.join(other)}: give another folder, `--out FOLDER`"
+                f"{out} holds an export that differs in {', '.join(other)}: give another folder, `--out FOLDER`"
             )
         return
     write_text(path, json.dumps(meant, indent=1, allow_nan=False) + "\n")

@@ -81,7 +81,7 @@ def fetch(
     if out.exists() or out.is_symlink():
         if _is_the_set(out, part):
             return Fetched(out, title, 0, len(part.archives))
-        raise DatasetError(f"{out} is there already and is not {title}; give another folder, `--out FOLDER`")
+        raise DatasetError(_what_it_is(out, title, part))
     stage = out.with_name(f"{out.name}.part")
     try:
         _claim(stage, title, part)
@@ -103,7 +103,7 @@ def _listed(name: str, place: _Source, out: Path, manifest_sha256: str | None) -
         path = place.get(MANIFEST, folder, None)
         if manifest_sha256 is not None and sha256(path) != manifest_sha256.lower():
             raise DatasetError(
-                f"{MANIFEST} of {place.name} has not the SHA-256 {manifest_sha256}: it is another release"
+                f"{MANIFEST} of {place.name} has another SHA-256 than {manifest_sha256}: it is another release"
             )
         manifest = read_manifest_file(path, f"{place.name} may be no release; ask who gave it")
     titles = {word: title for title in manifest.parts for word in (title, _last(title))}
@@ -122,6 +122,15 @@ def _last(title: str) -> str:
 def _is_the_set(out: Path, part: ReleasedPart) -> bool:
     sums = out / schema.CHECKSUMS
     return sums.is_file() and sha256(sums) == part.sums_sha256 and not differing_files(out, read_checksums(out))
+
+
+def _what_it_is(out: Path, title: str, part: ReleasedPart) -> str:
+    """Sentence on a folder that is not the data set, or not any more."""
+    sums = out / schema.CHECKSUMS
+    if sums.is_file() and sha256(sums) == part.sums_sha256:
+        file = differing_files(out, read_checksums(out))[0]
+        return f"{out} is {title}, and damaged or changed: {file}; move the folder away, and fetch it again"
+    return f"{out} holds something else than {title}; give another folder, `--out FOLDER`"
 
 
 # The folder in which a data set grows.

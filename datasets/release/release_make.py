@@ -87,7 +87,7 @@ class ReleaseRequest:
     ----------
     parts : parts to make; others that the folder holds stay
     out, work : public folder, and folder of the data sets; neither inside the other
-    secret_seed : file with the seed of sealed parts; made if it is not there
+    secret_seed : file with the seed of sealed parts, made if it is not there; None where none is made
     samples : samples of each part that draws its samples, instead of the recipe's number
     use : folders of finished data sets, each taken for the part that it fits
     archive_bytes : an archive holds files up to this size, or one larger file
@@ -96,7 +96,7 @@ class ReleaseRequest:
     parts: Sequence[Part]
     out: Path
     work: Path
-    secret_seed: Path
+    secret_seed: Path | None
     samples: int | None = None
     use: Sequence[Path] = ()
     archive_bytes: int = ARCHIVE_BYTES
@@ -173,7 +173,7 @@ def dry_run(request: ReleaseRequest) -> Iterator[str]:
             size = forecast.size if part.kind == "pairs" else (samples or 1) * _IMAGES * _IMAGE_BYTES
             hours = 0.0 if part.title in used else forecast.cpu_s / 3600.0
             rendered = f", rendered layers {megabytes(forecast.size)}" if part.kind == "sealed" else ""
-            yield f"{part.title}: {count}about {megabytes(size)}, {hours:.1f} CPU-hours{rendered}"
+            yield f"{part.title}: {count}about {megabytes(size)}, {hours:.2g} CPU-hours{rendered}"
 
 
 def _film_cost(part: Part) -> str:
@@ -187,12 +187,15 @@ def _film_cost(part: Part) -> str:
 
 
 def _check_folders(request: ReleaseRequest) -> None:
-    out, work, seed = (path.resolve() for path in (request.out, request.work, request.secret_seed))
+    out, work = request.out.resolve(), request.work.resolve()
     if out.is_relative_to(work) or work.is_relative_to(out):
         raise DatasetError(
             f"--out {out} and --work {work}: one lies in the other; {out} is to be published, so part them"
         )
-    if seed.is_relative_to(out):
+    sealed = [part.name for part in request.parts if part.kind == "sealed"]
+    if request.secret_seed is None and sealed:
+        raise DatasetError(f"part {sealed[0]} is sealed: give --secret-seed FILE; a seed is drawn if there is no such file")
+    if request.secret_seed is not None and (seed := request.secret_seed.resolve()).is_relative_to(out):
         raise DatasetError(f"--secret-seed {seed} lies in {out}, which is to be published; give a file elsewhere")
     if out.is_dir() and not (out / MANIFEST).is_file() and any(not path.name.startswith(".") for path in out.iterdir()):
         raise DatasetError(f"{out} holds other files: give an empty folder, `--out FOLDER`")
@@ -219,6 +222,7 @@ def _seed(request: ReleaseRequest, part: Part, make_it: bool = True) -> int | No
     if part.kind != "sealed":
         return drawn_numbers(part.text())[0]
     path = request.secret_seed
+    assert path is not None  # `_check_folders`
     if not path.exists():
         if not make_it:
             return None

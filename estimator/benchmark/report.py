@@ -259,7 +259,7 @@ def verdict(scores: Mapping[str, ScoreDocument], by: str) -> str:
     missing = {name: kind["missed"] + kind["false"] for name, kind in first.causes.items()}
     cause = max(missing, key=lambda name: missing[name])
     placed = first.metrics["rms_counted_px"].value is not None  # of real pairs no cause can be told
-    why = f", the others are mostly {cause}" if missing[cause] and placed else ""
+    why = f", most of the others are missed for the cause '{cause}'" if missing[cause] and placed else ""
     alone = "is best by" if len(scores) > 1 else "has, by the rank of"
     parts = [f"{best}: {flag.text}." for flag in first.flags]
     parts += [

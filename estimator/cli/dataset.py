@@ -317,7 +317,7 @@ def release(
     *,
     out: Path,
     work: Path,
-    secret_seed: Path,
+    secret_seed: Path | None = None,
     part: Annotated[tuple[str, ...], Parameter(negative="")] = (),
     samples: Whole | None = None,
     use: Annotated[tuple[Path, ...], Parameter(negative="")] = (),
@@ -335,7 +335,8 @@ def release(
     work
         Folder of the data sets, not to be published: it holds the truth of the sealed part.
     secret_seed
-        File with the seed of the sealed part, outside --out; one is drawn if there is no such file.
+        File with the seed of the sealed part, outside --out; one is drawn if there is no such file. Other parts need
+        none.
     part
         "dev", "test", "paper", "mirrors", "films" or "drives". May be given several times; all by default.
     samples
@@ -386,7 +387,7 @@ def fetch(
     from phibench.datasets.release.fetch import fetch as fetch_set
 
     done = fetch_set(name, out, from_, manifest_sha256=manifest_sha256)
-    what = f"{done.fetched} of {done.archives} archives fetched" if done.fetched else "it is there already"
+    what = f"{done.fetched} of {done.archives} archives fetched" if done.fetched else "there already"
     print(f"{done.folder}: {done.title}, {what}; every file has its SHA-256")
     return 0
 

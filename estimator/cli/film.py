@@ -43,7 +43,7 @@ def make(recipe: str, *, out: Path, workers: Whole | None = None, dry_run: bool 
     from phibench.datasets.film.film_make import make_films
 
     made = make_films(recipe, out, workers)
-    print(f"{out}: {len(made.made)} films made, {len(made.kept)} kept")
+    print(f"{out}: films made: {len(made.made)}, kept: {len(made.kept)}")
     return 0
 
 
@@ -61,7 +61,7 @@ def verify(directory: Path) -> int:
     faults = verify_films(directory)
     for fault in faults:
         print(fault)
-    print(f"{directory}: {len(faults)} faults")
+    print(f"{directory}: faults: {len(faults)}")
     return 1 if faults else 0
 
 

@@ -222,7 +222,7 @@ def test_foreign_folders_and_other_exports_are_left_alone(
     with pytest.raises(DatasetError, match="inside the data set"):
         exported(tiny_dataset, tiny_dataset / "export", "frames")
     before = snapshot(done)
-    with pytest.raises(DatasetError, match=r"another export|another dataset, dataset_sha256"):
+    with pytest.raises(DatasetError, match=r"another export|differs in dataset, dataset_sha256"):
         exported(smallest_dataset, done, json.loads((done / "export.json").read_text())["form"])
     assert snapshot(done) == before
     (tmp_path / "unfinished").mkdir()

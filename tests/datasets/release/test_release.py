@@ -237,6 +237,8 @@ def test_folders_and_seeds_that_will_not_do(made: Made, tmp_path: Path, smallest
 
     assert "part them" in told(work=tmp_path / "public" / "work")
     assert "to be published" in told(secret_seed=tmp_path / "public" / "seed")
+    sealed = Part("sealed", SMALL.recipe, "sealed", SMALL.sha256)
+    assert "is sealed: give --secret-seed" in told(secret_seed=None, parts=[sealed])
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
     assert "holds other files" in told(out=tmp_path / "full")
@@ -373,14 +375,18 @@ def test_flipped_bits_and_strange_sources_are_refused(made: Made, tmp_path: Path
         assert "does not give" in told(server.address)
     assert "does not hold 'dev'" in told(copy, "dev")
     assert "no data set 'smal' there; did you mean 'small'?" in told(copy, "smal")
-    assert "has not the SHA-256" in told(copy, manifest_sha256="0" * 64)
+    assert "has another SHA-256 than" in told(copy, manifest_sha256="0" * 64)
     assert "no MANIFEST.json" in told(tmp_path / "later")
     assert "no such folder" in told(tmp_path / "nowhere")
     (copy / "MANIFEST.json").write_text("{}")
     assert "its format is not" in told(copy)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
-    assert "is not phibench-v3-small" in told(made.out, out="full")
+    assert "holds something else than phibench-v3-small" in told(made.out, out="full")
+    later = fetch("small", tmp_path / "whole", str(made.out)).folder
+    with next(later.rglob("*.exr")).open("ab") as file:
+        file.write(b"0")
+    assert "damaged or changed" in told(made.out, out="whole")
     assert (tmp_path / "full" / "mine.txt").read_text() == "mine"
     (tmp_path / "new.part").mkdir()
     (tmp_path / "new.part" / "mine.txt").write_text("mine")
