@@ -194,7 +194,7 @@ def _check_folders(request: ReleaseRequest) -> None:
         )
     sealed = [part.name for part in request.parts if part.kind == "sealed"]
     if request.secret_seed is None and sealed:
-        raise DatasetError(f"part {sealed[0]} is sealed: give --secret-seed FILE; a seed is drawn if there is no such file")
+        raise DatasetError(f"part {sealed[0]} is sealed: give --secret-seed FILE, which is made if it is not there")
     if request.secret_seed is not None and (seed := request.secret_seed.resolve()).is_relative_to(out):
         raise DatasetError(f"--secret-seed {seed} lies in {out}, which is to be published; give a file elsewhere")
     if out.is_dir() and not (out / MANIFEST).is_file() and any(not path.name.startswith(".") for path in out.iterdir()):
