@@ -42,12 +42,12 @@ from phibench.scenes.random_streams import generator
 
 LEAD = "released"
 _LABELS = {
-    LEAD: "all presets, seed 0: released",
-    "seed1": "all presets, seed 1",
-    "seed2": "all presets, seed 2",
-    "bayer-raw": "bayer-raw alone",
-    "srgb8": "srgb8 alone",
-    "mjpeg": "mjpeg alone",
+    LEAD: "released: 18 000 crops, 3 epochs",
+    "seed1": "the same, seed 1",
+    "short0": "3000 crops, 1 epoch",
+    "bayer-raw": "the same of bayer-raw alone",
+    "srgb8": "the same of srgb8 alone",
+    "mjpeg": "the same of mjpeg alone",
 }
 COUNT, OUTSIDE_COUNT, LEAK_COUNT, RESAMPLES = 500, 250, 1200, 2000
 SETTINGS = replace(CROP_SETTINGS, laser_levels=(0.25, 1.0))  # those of the recipe
@@ -329,16 +329,17 @@ def _print_minus(preset: str, one: pl.DataFrame, two: pl.DataFrame) -> None:
 def draw(source: Path, out: Path) -> None:
     """Median and rms error by test preset, one colour for each network."""
     tables = json.loads(source.read_text())
+    sizes = [size for size in SIZES if size in tables]
     figure, panels = plt.subplots(1, 2, figsize=(8.0, 3.2), layout="constrained", sharey=True)
     names = [name for name, one in tables["bayer-raw"].items() if isinstance(one, dict)]
     names.sort(key=lambda name: name != LEAD)
     for axes, key, title in zip(panels, ("median_px", "rms_px"), ("median", "rms"), strict=True):
         for shift, name in enumerate(names):
-            found = np.array([tables[size][name][key] for size in SIZES])
-            x = np.arange(len(SIZES)) + 0.12 * (shift - (len(names) - 1) / 2.0)
+            found = np.array([tables[size][name][key] for size in sizes])
+            x = np.arange(len(sizes)) + 0.12 * (shift - (len(names) - 1) / 2.0)
             bars = np.abs(found[:, 1:].T - found[:, 0])
             axes.errorbar(x, found[:, 0], bars, fmt="o", markersize=4, capsize=2, label=_LABELS.get(name, name))
-        axes.set_xticks(np.arange(len(SIZES)), [size.replace(" ", "\n") for size in SIZES])
+        axes.set_xticks(np.arange(len(sizes)), [size.replace(" ", "\n") for size in sizes])
         axes.set(yscale="log", title=f"{title} distance, px")
         axes.grid(axis="y", which="both", alpha=0.3)
     panels[0].legend(fontsize=8)
