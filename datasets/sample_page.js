@@ -135,7 +135,7 @@ function haloed(ctx, text, x, y, fill) {
   ctx.fillText(text, x, y);
 }
 
-function drawLine(ctx, frame, line, wide) {
+function drawLine(ctx, frame, line, wide, mark) {
   ctx.strokeStyle = "#0009";
   ctx.lineWidth = 3.5;
   polyline(ctx, frame, line.points);
@@ -143,7 +143,7 @@ function drawLine(ctx, frame, line, wide) {
   ctx.lineWidth = 1.7;
   polyline(ctx, frame, line.points);
   ctx.font = "11px system-ui, sans-serif";
-  const taken = [];
+  const taken = mark && state.zoom !== "spot" ? [toCanvas(frame, ...mark)] : []; // no number on the cross
   for (const [depth, u, v] of line.marks) {
     const [x, y] = toCanvas(frame, u, v);
     ctx.beginPath();
@@ -203,7 +203,7 @@ function drawView(position) {
     ctx.lineWidth = 1;
     polyline(ctx, frame, [...view.outline, view.outline[0]]);
   }
-  if (byId("lines").checked && view.line) drawLine(ctx, frame, view.line, frame.wide);
+  if (byId("lines").checked && view.line) drawLine(ctx, frame, view.line, frame.wide, view.mark);
   if (byId("marks").checked && view.mark) drawMark(ctx, frame, view.mark);
   if (state.chosen && state.chosen.position === position) {
     const [cx, cy] = toCanvas(frame, state.chosen.u - 0.5, state.chosen.v - 0.5);

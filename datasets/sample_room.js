@@ -16,8 +16,21 @@ function roomBox() {
 function lookAtRoom() {
   const { low, high } = roomBox();
   orbit.target = low.map((value, k) => (value + high[k]) / 2);
-  orbit.distance = 1.2 * Math.hypot(...low.map((value, k) => high[k] - value));
+  orbit.distance = 0.5 * Math.hypot(...low.map((value, k) => high[k] - value));
   Object.assign(orbit, { yaw: 0.9, pitch: 0.85 });
+  const corners = [0, 1, 2, 3, 4, 5, 6, 7].map((n) => [0, 1, 2].map((k) => ((n >> k) & 1 ? high : low)[k]));
+  for (let step = 0; step < 60 && !allSeen(corners); step++) orbit.distance *= 1.05;
+}
+
+function allSeen(points) {
+  const { wide, high, focal } = screen(byId("room")), { look } = camera();
+  return points.map(look).every(([x, y, z]) =>
+    z > NEAR && focal * Math.abs(x) < 0.48 * wide * z && focal * Math.abs(y) < 0.48 * high * z);
+}
+
+function screen(canvas) {
+  const wide = canvas.clientWidth, high = canvas.clientHeight;
+  return { wide, high, focal: 0.95 * Math.min(wide, high * 1.5) };
 }
 
 function lookAtMirror() {
@@ -88,7 +101,7 @@ function facing(points) {
 
 function drawRoom() {
   const canvas = byId("room"), ctx = context(canvas), { look, eye } = camera();
-  const wide = canvas.clientWidth, high = canvas.clientHeight, focal = 0.95 * Math.min(wide, high * 1.5);
+  const { wide, high, focal } = screen(canvas);
   const flat = (p) => [wide / 2 + focal * p[0] / p[2], high / 2 - focal * p[1] / p[2]];
   const chosen = state.chosen && state.chosen.object;
   const seen = [];
@@ -155,7 +168,10 @@ function drawRigs(ctx, look, flat, focal) {
   dot(spot, 4.5, colour("--ray"));
   const label = look([(axis[0] + spot[0]) / 2, (axis[1] + spot[1]) / 2, spot[2]]);
   ctx.font = "13px system-ui, sans-serif";
-  if (label[2] > NEAR) haloed(ctx, `D = ${data.depth_m.toFixed(3)} m`, ...flat(label), "#fff");
+  if (label[2] > NEAR) {
+    const [x, y] = flat(label); // below the rays, which come from above
+    haloed(ctx, `D = ${data.depth_m.toFixed(3)} m`, x - 20, y + 24, "#fff");
+  }
 }
 
 // Reflection point between the four of the grid around a pixel; the nearest where the mirror ends.
