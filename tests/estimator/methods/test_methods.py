@@ -246,6 +246,7 @@ def test_fits_are_silent_where_the_search_is_and_plain_methods_look_at_the_hint(
         "raw_maximum_likelihood",
         "chain_fit",
         "learned_crop",
+        "learned_detect",
         "detect",
     ):
         answer = answers.get(name, Answer(Spot.missing(""), Spot.missing("")))
