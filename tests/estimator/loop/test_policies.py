@@ -196,21 +196,23 @@ def test_a_process_of_its_own_ends_policies_that_hang() -> None:
 
 
 @pytest.mark.study
-@pytest.mark.parametrize("size", [0.25, 1.0])
-def test_rigs_whose_covariance_is_stated(capsys, size: float) -> None:
-    """Every episode with a rig of its own; without the covariance none is reached, with pulls of 47 and 87.
+@pytest.mark.parametrize("policy", ["paper", "greedy"])
+def test_rigs_whose_covariance_is_stated(capsys, policy: str) -> None:
+    """200 episodes in 20 rooms, each with a rig of its own as built by hand; without the covariance none is reached.
 
-    The rms pull of 30 consistent beliefs is 1 +- 0.13: three of these are allowed.
+    The rms pull of 200 consistent beliefs is 1 +- 0.05: two of these are allowed. Rooms, rigs and episodes are none of
+    those ("loop test 3") on which the belief was mended.
     """
-    rows = []
-    for number in range(100, 130):
-        setup = Setup(misalignment=misaligned(size, 1000 + number), rig_covariance=rig_covariance(size))
-        rows += [replace(one, number=number) for one in run_episodes(setup, "paper", 1, "loop rigs test", number)]
+    rooms = tuple(generated_arena("loop test 4", k) for k in range(20))
+    setup, rows = Setup(arenas=rooms, rig_covariance=rig_covariance(1.0)), []
+    for number in range(200):
+        own = replace(setup, misalignment=misaligned(1.0, 6000 + number))
+        rows += [replace(one, number=number) for one in run_episodes(own, policy, 1, "told rooms 2", number)]
     found = summary(rows)
     with capsys.disabled():
-        print(f"{size:g} of as built: reached {found.reached}, pull {found.pull}, error of D {found.error}")
-    assert found.reached[0] >= 0.9
-    assert 0.6 < found.pull[0] < 1.4
+        print(f"{policy}: reached {found.reached}, pull {found.pull}, error of D {found.error}, time {found.time_s}")
+    assert found.reached[0] >= 0.95
+    assert 0.9 < found.pull[0] < 1.1
 
 
 def test_the_command_line_draws_rigs_from_what_is_known_of_them(tmp_path, capsys) -> None:
