@@ -55,11 +55,12 @@ def chain_fit(pair: Pair) -> Answer:
 
 def _fitted(pair: Pair) -> Answer:
     found = detected(pair)
+    hints = {"down": pair.box_down, "up": pair.box_up} if found.apart else {"down": None, "up": None}
 
     def measure(depth_m: float | None) -> Answer:
         return Answer(
-            _spot_or_place(pair, "down", found.down, depth_m),
-            _spot_or_place(pair, "up", found.up, depth_m),
+            _spot_or_place(pair, "down", found.down, hints["down"], depth_m),
+            _spot_or_place(pair, "up", found.up, hints["up"], depth_m),
         )
 
     depth_m = None
@@ -68,9 +69,9 @@ def _fitted(pair: Pair) -> Answer:
     return measured_twice(measure, pair) if depth_m is None else measure(depth_m)
 
 
-def _spot_or_place(pair: Pair, position: str, found: Detection | None, depth_m: float | None) -> Spot:
+def _spot_or_place(pair: Pair, position: str, found: Detection | None, hint: Box | None, depth_m: float | None) -> Spot:
     """Fit; or, of a spot that was seen but gives no fit, the place of the matched filter, without covariance."""
-    spot = _spot(pair, position, box_around(found, pair.images[position]), depth_m)
+    spot = _spot(pair, position, box_around(found, pair.images[position]) or hint, depth_m)
     return Spot(found.uv_px) if spot.uv_px is None and found is not None else spot
 
 

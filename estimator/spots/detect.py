@@ -84,6 +84,7 @@ class Choice:
 
     down: int | None = None
     up: int | None = None
+    apart: bool = False
 
 
 def choose(rig: Rig, stroke_m: float, down: Candidates, up: Candidates, least: Thresholds, sure: bool) -> Choice:
@@ -159,7 +160,8 @@ def _single(down: Candidates, up: Candidates, rows: tuple[int | None, int | None
     """One candidate, the more significant of two: both could not be one point."""
     if rows[0] is None or rows[1] is None:
         return Choice(rows[0], rows[1])
-    return Choice(rows[0]) if down.z[rows[0]] >= up.z[rows[1]] else Choice(None, rows[1])
+    one = down.z[rows[0]] >= up.z[rows[1]]
+    return Choice(rows[0] if one else None, None if one else rows[1], apart=True)
 
 
 # -- detection -------------------------------------------------------------------------------------------------------
@@ -198,10 +200,15 @@ class Detection:
 
 @dataclass(frozen=True)
 class PairDetection:
-    """Both images of a pair; None where there is no spot."""
+    """Both images of a pair; None where there is no spot.
+
+    `apart` tells that each image has one that is sure by itself, but not both of one point: other lights, or a rig that
+    differs from the nominal one. The more significant one is taken.
+    """
 
     down: Detection | None
     up: Detection | None
+    apart: bool = False
 
 
 @dataclass(frozen=True)
@@ -333,7 +340,7 @@ def _moved(tests: Candidates, box: Box) -> Candidates:
 
 
 def _refined(choice: Choice, down: _Searched, up: _Searched, card: SensorCard) -> PairDetection:
-    return PairDetection(_detection(choice.down, down, card), _detection(choice.up, up, card))
+    return PairDetection(_detection(choice.down, down, card), _detection(choice.up, up, card), choice.apart)
 
 
 def _detection(index: int | None, searched: _Searched, card: SensorCard) -> Detection | None:
