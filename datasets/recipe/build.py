@@ -139,12 +139,26 @@ def drawn_mirror_faults(path: str, drawn: Mapping[str, Any], shapes: Sequence[st
     """Faults of drawn keys of a mirror that none of its shapes has, or of whose values a shape refuses some."""
     given = [key for key, one in drawn.items() if one is not None]
     faults = _idle_of_shapes(path, given, shapes)
-    for shape in shapes if "conic" in given else ():
-        (least, most), (low, high) = drawn["conic"].support, CONIC_RANGES.get(shape, (-np.inf, np.inf))
+    if "conic" in given:
+        least, most = drawn["conic"].support
+        faults += _conic_faults(f"{path}.conic", least, most, shapes)
+    return faults
+
+
+def fixed_conic_faults(path: str, table: MirrorTable, shapes: Sequence[str]) -> list[Fault]:
+    """Faults of a conic that is not drawn, where shapes are and one of them refuses it."""
+    return [] if table.conic is None else _conic_faults(f"{path}.conic", table.conic, table.conic, shapes)
+
+
+def _conic_faults(key: str, least: float, most: float, shapes: Sequence[str]) -> list[Fault]:
+    faults = []
+    for shape in shapes:
+        low, high = CONIC_RANGES.get(shape, (-np.inf, np.inf))
         if shape in MIRROR_SHAPES["conic"] and not low < least <= most < high:
             side = "below" if shape == "hyperboloid" else "above"
-            text = f'reaches from {least:g} to {most:g}; a conic of shape = "{shape}" is {side} -1'
-            faults.append(Fault(f"{path}.conic", f"{text}, give such a range or leave that shape out"))
+            reach = f"is {least:g}" if least == most else f"reaches from {least:g} to {most:g}"
+            text = f'{reach}; a conic of shape = "{shape}" is {side} -1'
+            faults.append(Fault(key, f"{text}, give such a one or leave that shape out"))
     return faults
 
 

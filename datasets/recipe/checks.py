@@ -20,6 +20,7 @@ from phibench.datasets.recipe.build import (
     by_keys,
     ceiling_m,
     drawn_mirror_faults,
+    fixed_conic_faults,
     idle_holder_keys,
     idle_mirror_keys,
     rig_fault_of,
@@ -335,6 +336,8 @@ def _mirror(raw: Raw) -> Iterator[Fault]:
     shapes = getattr(getattr(chosen, "shape", None), "choice", (sound.shape,))
     yield from idle_mirror_keys("rig.mirror", sound, shapes)
     yield from drawn_mirror_faults("random.rig.mirror", {} if chosen is None else dict(chosen), shapes)
+    if {"shape", "conic"} & drawn.keys() == {"shape"}:
+        yield from fixed_conic_faults("rig.mirror", sound, shapes)
 
 
 def _rig(draft: _Draft) -> Iterator[Fault]:

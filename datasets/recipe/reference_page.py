@@ -237,8 +237,8 @@ not drawn is as in `[rig]`, which must be a possible rig itself. A drawn `fx_px`
 """,
     "[random.rig.mirror]": """Any key of `[rig.mirror]` but `even_terms`, and `shape` from a choice of names, such as
 `shape = { choice = ["ellipsoid", "paraboloid", "cone"] }`. `[rig.mirror]` must be given, with what is not drawn.
-A sample takes those keys of both tables that its shape has. A drawn `conic` must suit every drawn shape that has
-one. An ellipsoid of `conic = 0` is a spherical cap.
+A sample takes those keys of both tables that its shape has. A `conic`, drawn or not, must suit every drawn shape
+that has one. An ellipsoid of `conic = 0` is a spherical cap.
 """,
     "[random.misalignment]": """Any key of `[misalignment]`, within its range, in place of the value there. The rig
 that `[random.rig]` gives is the nominal one.

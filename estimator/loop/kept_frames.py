@@ -39,6 +39,8 @@ class Frames:
         Origin, direction and rise of the mirror, by the middle rig and those beside it, of the pixel and two beside it.
     shared_px : shape (N, 2)
         Standard deviations of what frames share: fixed pattern, texture.
+    stroke_sigma_m : shape (N,)
+        Of the readings of the stroke.
     """
 
     uv_px: Array
@@ -50,6 +52,7 @@ class Frames:
     time_s: Array
     rays: Array
     shared_px: Array
+    stroke_sigma_m: Array
 
     def joined(self, other: Frames) -> Frames:
         """Both, this one's first."""

@@ -270,6 +270,8 @@ class Direction:
         Of the pixel.
     shared_px : 2 floats
         `pattern_px` and `texture_px` of its reading, which are not part of the covariances.
+    stroke_sigma_m : float
+        Standard deviation of the stroke's reading, which is part of `covariance` but not of that of the pixel.
     """
 
     azimuth_rad: float
@@ -278,6 +280,7 @@ class Direction:
     uv_px: Array
     covariance_px2: Array
     shared_px: tuple[float, float] = (0.0, 0.0)
+    stroke_sigma_m: float = 0.0
 
     @property
     def values(self) -> Array:

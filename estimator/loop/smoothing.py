@@ -262,6 +262,7 @@ class SmoothedBelief(Belief):
             np.array([self._way.time_s]),
             self._view_rays(seen.uv_px[None], np.array([stroke_m])),
             np.array([seen.shared_px]),
+            np.array([seen.stroke_sigma_m]),
         )
         self._latest = when, one
         return one
@@ -315,10 +316,12 @@ class SmoothedBelief(Belief):
         return course.seen_from(frames, course.fixed(self.point_m(y)), velocity, self._way.time_s), velocity
 
     def _covariance(self, x: Array, frames: Frames, E: Array) -> tuple[Array, Array]:
-        """Covariance of residuals, shape (2 N, 2 N): pixels in each frame, steps and motion between frames; and F."""
+        """Covariance of residuals, shape (2 N, 2 N): pixels, readings of the stroke, steps and motion; and F."""
         n, course = len(frames.time_s), self._course(x)
         C = np.zeros((n, 2, n, 2))
-        C[np.arange(n), :, np.arange(n), :] = frames.covariance_px2
+        by_reading = E @ np.array(self.rig.stroke_axis_world) * frames.stroke_sigma_m[:, None]  # px
+        own = frames.covariance_px2 + by_reading[:, :, None] * by_reading[:, None, :]
+        C[np.arange(n), :, np.arange(n), :] = own
         F = course.slopes(frames, E)
         if self._way.steps:
             C += self._way.shared_by_steps(course, course.fixed(self.point_m(x)), frames, F)
@@ -391,7 +394,8 @@ def film_beliefs(
         if seen is None:
             continue
         q = prior.q if belief is None else float(belief.mean[2])
-        seen = replace(seen, covariance=seen.covariance + np.diag([0.0, (q * encoder_sigma_m) ** 2]))
+        noisy = seen.covariance + np.diag([0.0, (q * encoder_sigma_m) ** 2])
+        seen = replace(seen, covariance=noisy, stroke_sigma_m=encoder_sigma_m)
         if belief is None:
             belief = belief_of(rig, vehicle, seen, float(strokes_m[k]), bias, prior)
         else:

@@ -13,7 +13,15 @@ from phibench.estimator.geometry.status import Status, describe
 from phibench.estimator.interface import Answer, Box, Pair, Spot
 from phibench.estimator.methods.likelihood_maps import SpotLikelihood, of_pixels, of_window
 from phibench.estimator.methods.locate import around as box_at
-from phibench.estimator.methods.locate import box_around, detected, measured_twice, once, pair_blur, seen_depth_m
+from phibench.estimator.methods.locate import (
+    box_around,
+    detected,
+    measured_twice,
+    once,
+    pair_blur,
+    seen_depth_m,
+    trusted_hints,
+)
 from phibench.estimator.processed.fit_chain import (
     code_data,
     first_fit,
@@ -55,12 +63,12 @@ def chain_fit(pair: Pair) -> Answer:
 
 def _fitted(pair: Pair) -> Answer:
     found = detected(pair)
-    hints = {"down": pair.box_down, "up": pair.box_up} if found.apart else {"down": None, "up": None}
+    hint_down, hint_up = trusted_hints(pair, found)
 
     def measure(depth_m: float | None) -> Answer:
         return Answer(
-            _spot_or_place(pair, "down", found.down, hints["down"], depth_m),
-            _spot_or_place(pair, "up", found.up, hints["up"], depth_m),
+            _spot_or_place(pair, "down", found.down, hint_down, depth_m),
+            _spot_or_place(pair, "up", found.up, hint_up, depth_m),
         )
 
     depth_m = None

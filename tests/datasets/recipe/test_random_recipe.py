@@ -116,7 +116,7 @@ def test_nonsense_is_reported_and_never_raises_anything_else(nonsense: Any) -> N
 
 def test_every_drawable_key_is_a_key_of_the_rig_and_has_a_parameter() -> None:
     assert tuple(RandomRigTable.model_fields) == (*DRAWABLE, "holder", "mirror")
-    others = 8 + len(MISALIGNMENT) + len(HolderTable.model_fields)
+    others = 8 + len(MISALIGNMENT) + len(HolderTable.model_fields) + len(DRAWN_OF_MIRROR)
     assert len(PARAMETERS) == len(set(PARAMETERS)) == len(DRAWABLE) + others
     recipe = check_recipe(drawing(rig={"z_c_m": 0.3}))
     assert Recipe.model_validate(json.loads(json.dumps(recipe.model_dump(mode="json")))) == recipe
@@ -143,6 +143,12 @@ def mirrors(drawn: dict[str, Any], **given: Any) -> dict[str, Any]:
         ({"vertex_radius_m": -1.0}, {}, "random.rig.mirror.vertex_radius_m", ("reaches -1", "above 0")),
         ({"even_terms": 3.0}, {}, "random.rig.mirror.even_terms", ("unknown",)),
         ({"shape": "polynomial"}, {}, "rig.mirror.even_terms", ("is missing",)),
+        (
+            {"shape": {"choice": ["ellipsoid", "hyperboloid"]}},
+            {"conic": -0.5},
+            "rig.mirror.conic",
+            ("is -0.5", "below -1", "leave that shape out"),
+        ),
         (
             {"shape": {"choice": ["ellipsoid", "hyperboloid"]}, "conic": {"uniform": [-0.8, -0.2]}},
             {},
