@@ -308,18 +308,23 @@ def test_drawn_deviations_have_the_covariance() -> None:
     assert {one.stroke_relative for one in drawn} == {0.0}
 
 
-def test_films_of_a_rig_that_is_not_known_exactly() -> None:
-    """A carriage that rises by 0.4 m: NEES within what 1e-4 of consistent beliefs exceed; untold, 30 times that."""
-    run, strokes = MisalignedApproach(6), np.linspace(0.0, 0.4, 8)
-    run.rig = RIG.perturbed(drawn_deviation(rig_covariance(0.5), np.random.default_rng(5)))
+def positions_of(run: MisalignedApproach, strokes_m: Array) -> tuple[FilmPositions, Array]:
+    """Read pixels of a carriage that rises, and their times."""
     rows = []
-    for run.stroke_m in strokes.tolist():
+    for run.stroke_m in strokes_m.tolist():
         read = run.read()
         assert read is not None
         rows.append((read.u_px, read.v_px))
     n = len(rows)
-    positions = FilmPositions(np.array(rows), np.tile(0.05**2 * np.eye(2), (n, 1, 1)), np.zeros((n, 2, n, 2)))
-    film = positions, 0.03 * np.arange(n), strokes
+    noise = np.tile(0.05**2 * np.eye(2), (n, 1, 1))
+    return FilmPositions(np.array(rows), noise, np.zeros((n, 2, n, 2))), 0.03 * np.arange(n)
+
+
+def test_films_of_a_rig_that_is_not_known_exactly() -> None:
+    """A carriage that rises by 0.4 m: NEES within what 1e-4 of consistent beliefs exceed; untold, 30 times that."""
+    run, strokes = MisalignedApproach(6), np.linspace(0.0, 0.4, 8)
+    run.rig = RIG.perturbed(drawn_deviation(rig_covariance(0.5), np.random.default_rng(5)))
+    film = *positions_of(run, strokes), strokes
     told, untold = (
         list(film_beliefs(RIG, VEHICLE, *film, rig_covariance=covariance))[-1][1]
         for covariance in (rig_covariance(0.5), None)
@@ -335,14 +340,7 @@ def test_films_of_such_a_rig_with_an_inexact_encoder() -> None:
     for k in range(12):
         run, rng = MisalignedApproach(100 + k), np.random.default_rng(1000 + k)
         run.rig = RIG.perturbed(drawn_deviation(rig_covariance(1e-3), rng))
-        rows = []
-        for run.stroke_m in strokes.tolist():
-            read = run.read()
-            assert read is not None
-            rows.append((read.u_px, read.v_px))
-        n = len(rows)
-        positions = FilmPositions(np.array(rows), np.tile(0.05**2 * np.eye(2), (n, 1, 1)), np.zeros((n, 2, n, 2)))
-        film = RIG, VEHICLE, positions, 0.03 * np.arange(n), strokes + 5e-3 * rng.standard_normal(n)
+        film = RIG, VEHICLE, *positions_of(run, strokes), strokes + 5e-3 * rng.standard_normal(len(strokes))
         beliefs = (
             list(film_beliefs(*film, encoder_sigma_m=sigma, rig_covariance=rig_covariance(1e-3)))[-1][1]
             for sigma in (5e-3, 0.0)
