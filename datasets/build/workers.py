@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import json
 import logging
+import re
 import signal
 import subprocess
 import sys
@@ -36,10 +37,12 @@ CONNECT_S = 10.0  # a scheduler that is up answers at once: a longer wait would 
 WORKERS_S = 60.0
 # The queue of a cluster may replace a lost worker only after minutes. Finished work is on disk either way.
 LOST_S = 300.0
+DEATH_S = 10.0  # a nanny says at once how its worker died, on a busy machine a little later
 _POLL_S = 0.005
 _CENSUS_S = 2.0  # counting the workers is a call to the scheduler: not before every task
 # dask lets glibc return memory at once; a view's arrays of 45 MB would then fault every page anew, 1 s a view
 _MEMORY = {"MALLOC_TRIM_THRESHOLD_": 2**31, "MALLOC_MMAP_THRESHOLD_": 2**30, "MALLOC_TOP_PAD_": 2**26}
+_DEATH = re.compile(r"Worker process (\d+) ((?:was killed by|exited with) .*)")
 _STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _MISSING = "dask.distributed is not installed: run `pip install 'phibench[cluster]'`"
 
@@ -102,7 +105,8 @@ class DaskExecutor:
             outcome: Done | Failed = future.result()
             return outcome
         if isinstance(error, KilledWorker):
-            return Failed(self._deaths.last if self._deaths else "see the worker's log", lethal=True)
+            cause = self._deaths.cause(error.last_worker.pid) if self._deaths else "see the worker's log"
+            return Failed(cause, lethal=True)
         return Failed(f"{type(error).__name__}: {error}")
 
 
@@ -212,16 +216,22 @@ def _libraries() -> tuple[Any, Any]:
 
 
 class _Deaths(logging.Handler):
-    """Log handler that keeps how a worker died, as its nanny says."""
+    """Log handler that keeps how each worker died, as its nanny says."""
 
     def __init__(self) -> None:
         super().__init__(logging.INFO)
-        self.last = "no cause known"
+        self._causes = dict[int, str]()
 
     def emit(self, record: logging.LogRecord) -> None:
-        text = record.getMessage()
-        if " was killed by " in text or " exited with " in text:
-            self.last = text.split(" ", 3)[-1]
+        if found := _DEATH.match(record.getMessage()):
+            self._causes[int(found[1])] = found[2]
+
+    def cause(self, pid: int) -> str:
+        """Return how a process died; the scheduler may know of its end before its nanny has said how."""
+        until = time.monotonic() + DEATH_S
+        while pid not in self._causes and time.monotonic() < until:
+            time.sleep(_POLL_S)
+        return self._causes.get(pid, "no cause known")
 
     @contextlib.contextmanager
     def listening(self) -> Iterator[None]:

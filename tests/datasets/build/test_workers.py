@@ -2,12 +2,14 @@
 
 import contextlib
 import json
+import logging
 import os
 import re
 import shlex
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -87,6 +89,21 @@ def test_a_worker_that_starts_while_dask_looks_is_kept(tmp_path: Path, monkeypat
         outcome = pool.next()[1]
     assert isinstance(outcome, Done)
     assert outcome.result == 9
+
+
+def test_a_death_has_the_cause_of_its_own_process_also_when_that_is_said_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The scheduler may see a connection end before the nanny has looked at its worker."""
+    monkeypatch.setattr(workers, "DEATH_S", 5.0)
+    deaths, nanny = workers._Deaths(), logging.getLogger("distributed.nanny")
+    with deaths.listening():
+        nanny.info("Worker process 11 was killed by signal 9")
+        late = threading.Timer(0.2, nanny.info, ("Worker process 12 exited with status 3",))
+        late.start()
+        assert deaths.cause(12) == "exited with status 3"
+        assert deaths.cause(11) == "was killed by signal 9"
+        late.join()
+        monkeypatch.setattr(workers, "DEATH_S", 0.01)
+        assert deaths.cause(13) == "no cause known"
 
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs /proc")
