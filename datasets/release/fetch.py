@@ -2,7 +2,8 @@
 
 `pooch` downloads each archive and checks its SHA-256, which `MANIFEST.json` holds. Archives are unpacked beside the
 final folder, in OUT.part. When all files have the hashes of the data set's own list, the folder gets its name.
-Whatever ends a fetch before that leaves OUT.part alone, and the next one goes on with the archives that are missing.
+Whatever ends a fetch before that leaves OUT.part alone. The next one goes on where it ended: within an archive, too, if
+the server gives ranges of bytes (RFC 9110, section 14).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from rich.console import Console
@@ -33,12 +34,16 @@ from phibench.datasets.store.files import WriteError, only_run, sha256, write_te
 from phibench.datasets.store.leftovers import OwnedFolder, remove_tree
 from phibench.scenes.validation import nearest, printable_line
 
+if TYPE_CHECKING:
+    import requests
+
 SOURCE = "PHIBENCH_SOURCE"
 """Environment variable: the default place of releases, a folder or an HTTP address."""
 _STATE, _SET, _ARCHIVES = "fetch.json", "set", "archives"
 _TIMEOUT_S = 60.0
 _TRIES = 3
 _CHUNK = 1 << 20
+_NETWORK_CHUNK = 1 << 14  # what is lost at most where a connection breaks off
 
 
 @dataclass(frozen=True)
@@ -152,7 +157,8 @@ def _claim(stage: Path, title: str, part: ReleasedPart) -> None:
     if not (stage / _STATE).is_file():
         _write_state(stage, meant | {"unpacked": []})
     free = shutil.disk_usage(stage).free
-    left = part.size + max(archive.size for archive in part.archives) - _size(stage / _SET)
+    begun = sum(_Partial(stage / _ARCHIVES, archive).size for archive in part.archives)
+    left = part.size + max(archive.size for archive in part.archives) - _size(stage / _SET) - begun
     if free < left:
         raise DatasetError(f"{title} needs {megabytes(left)} more in {stage.parent}, and {megabytes(free)} are free")
 
@@ -171,15 +177,32 @@ def _archives(place: _Source, stage: Path, title: str, part: ReleasedPart, conso
     done = [text for text in state.get("unpacked", []) if isinstance(text, str)]
     todo = [archive for archive in part.archives if archive.sha256 not in done]
     (stage / _SET).mkdir(exist_ok=True)
-    with Steps(console, title, len(todo)) as steps:
-        for archive in todo:
-            path = place.get(archive.name, stage / _ARCHIVES, archive)
+    _remove_strays(stage / _ARCHIVES, todo)
+
+    current: Archive | None = None
+
+    def running() -> str:
+        begun = 0 if current is None else _Partial(stage / _ARCHIVES, current).size
+        return f"{current.name}, {megabytes(begun)} of {megabytes(current.size)}" if current and begun else ""
+
+    with Steps(console, title, len(todo), running=running) as steps:
+        for current in todo:
+            path = place.get(current.name, stage / _ARCHIVES, current)
             unpack(path, stage / _SET, title, part.size)
-            done.append(archive.sha256)
+            done.append(current.sha256)
             _write_state(stage, state | {"unpacked": done})
             path.unlink()  # a disk need not hold all archives beside the set
             steps.advance()
     return len(todo)
+
+
+def _remove_strays(folder: Path, archives: list[Archive]) -> None:
+    """Remove what a killed fetch left of `pooch`'s own temporary files; the run holds the folder alone."""
+    parts = [_Partial(folder, archive) for archive in archives]
+    kept = {folder / archive.name for archive in archives}
+    kept |= {path for part in parts for path in (part.path, part.validator)}
+    for path in set(folder.glob("*")) - kept:
+        path.unlink()
 
 
 def unpack(archive: Path, folder: Path, title: str, most: int) -> None:
@@ -276,6 +299,8 @@ class _Source:
             retry_if_failed=0 if self.is_folder else self.tries - 1,
         )
         download = _copy if self.is_folder else pooch.HTTPDownloader(timeout=_TIMEOUT_S)
+        if archive is not None and not self.is_folder:
+            download = _Partial(folder, archive).download
         again = "run the same command again; archives that are there are kept"
         try:
             with _quiet(pooch.get_logger()):
@@ -291,6 +316,97 @@ class _Source:
             raise DatasetError(f"{told}; {again}, and if it stays so, ask who gave the release") from error
         except FileNotFoundError as error:
             raise DatasetError(f"{self.name} has no {name}; it may be no release, or an unfinished one") from error
+
+
+class _Partial:
+    """First bytes of an archive, kept under a name made of its SHA-256 until the archive is whole.
+
+    Parameters
+    ----------
+    folder : Path
+    archive : Archive
+        Name, size in bytes and SHA-256, as the manifest has them.
+
+    Attributes
+    ----------
+    path, validator : Path
+        The bytes, and the server's entity tag or time of change for them (empty if it names neither). Without the
+        second file the first is of no use: a server had packed the bytes for the way, and ranges count packed ones.
+    """
+
+    def __init__(self, folder: Path, archive: Archive) -> None:
+        self._archive = archive
+        self.path, self.validator = folder / f"{archive.sha256}.part", folder / f"{archive.sha256}.validator"
+
+    @property
+    def size(self) -> int:
+        """Bytes that are there."""
+        return self.path.stat().st_size if self.path.is_file() else 0
+
+    def download(self, url: str, target: str, _pooch: Any) -> None:
+        """Put the whole archive into the file `target`, from the bytes that are there and the rest of the server's.
+
+        Bytes that were put together from two answers are taken with the right SHA-256 only; else all are asked for.
+
+        Raises
+        ------
+        requests.RequestException
+            If the connection breaks off, or the server refuses; what came stays.
+        ValueError
+            If the server sends more than the archive has.
+        """
+        if not (self.size and self.validator.is_file() and self._completed(url)):
+            with _answer(url, {}) as answer:
+                answer.raise_for_status()
+                self._take_whole(answer)
+        self.path.replace(target)
+        self.validator.unlink(missing_ok=True)
+
+    def _completed(self, url: str) -> bool:
+        """Ask for the bytes that are missing; False if the server does not give them, or if they do not fit."""
+        begun = self.size
+        if begun < self._archive.size:
+            asked = {"Range": f"bytes={begun}-", "If-Range": self.validator.read_text("ascii", "ignore")}
+            with _answer(url, {key: value for key, value in asked.items() if value}) as answer:
+                if answer.status_code == 200:  # no ranges here, or another file by now
+                    self._take_whole(answer)
+                    return True
+                if answer.status_code not in (206, 412, 416):  # 503, say: what is there may still do
+                    answer.raise_for_status()
+                if not answer.headers.get("Content-Range", "").startswith(f"bytes {begun}-"):
+                    return False
+                self._take(answer, "ab")
+        return sha256(self.path) == self._archive.sha256
+
+    def _take_whole(self, answer: requests.Response) -> None:
+        self.validator.unlink(missing_ok=True)
+        self.path.unlink(missing_ok=True)
+        if answer.headers.get("Content-Encoding", "identity") == "identity":
+            tag, changed = answer.headers.get("ETag", ""), answer.headers.get("Last-Modified", "")
+            strong = tag if tag.startswith('"') else changed  # a weak tag will not do
+            self.validator.write_text(strong, "ascii", "ignore")
+        self._take(answer, "wb")
+
+    def _take(self, answer: requests.Response, mode: str) -> None:
+        import requests
+
+        with self.path.open(mode) as file:
+            for chunk in answer.iter_content(_NETWORK_CHUNK):
+                file.write(chunk)
+                if file.tell() > self._archive.size:
+                    self.validator.unlink(missing_ok=True)
+                    raise ValueError(f"{self._archive.name} has more bytes than {MANIFEST} says")
+        # a range may be shorter than what was asked for, and without a length nobody else notices the end
+        ended_early = answer.status_code == 206 or "Content-Length" not in answer.headers
+        if ended_early and self.size < self._archive.size:
+            raise requests.ConnectionError(f"{self._archive.name} ended early")
+
+
+def _answer(url: str, headers: dict[str, str]) -> requests.Response:
+    """Server's answer, its body not yet read, and not to be packed for the way."""
+    import requests
+
+    return requests.get(url, headers={"Accept-Encoding": "identity", **headers}, stream=True, timeout=_TIMEOUT_S)
 
 
 def _copy(url: str, target: str, _pooch: Any) -> None:

@@ -1,89 +1,30 @@
-"""Frozen recipes, releases made of them, and fetching from a folder and from a server on the loopback device."""
+"""Frozen recipes, and releases made of them."""
 
-import hashlib
-import io
 import json
 import os
 import re
 import shutil
 import stat
 import tarfile
-import threading
-from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from helpers.small_release import SMALL, Made, ask, flip, snapshot
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.film.film_store import verify as film_faults
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.recipe.load import parse_recipe, recipe_text, with_numbers
 from phibench.datasets.release import fetch as fetching
 from phibench.datasets.release.benchmark import PARTS, VERSION, Part, content_sha256
-from phibench.datasets.release.fetch import Fetched, fetch, unpack
-from phibench.datasets.release.release_make import Released, ReleaseRequest, dry_run, release
+from phibench.datasets.release.release_make import ReleaseRequest, dry_run, release
 from phibench.datasets.store.checksums import damaged, differing_files, read_checksums
 from phibench.estimator.cli.main import main
-from phibench.estimator.sealed.sealed_set import read_seal, seal
+from phibench.estimator.sealed.sealed_set import seal
 
 ROOT = Path(__file__).parents[3]
 SECRET = 2**62 + 12345
-
-
-def part_of(name: str, recipe: str, kind: Any) -> Part:
-    path = ROOT / "tests" / recipe
-    return Part(name, path, kind, content_sha256(path.read_text(encoding="utf-8")))
-
-
-SMALL, FILMS = part_of("small", "smallest.toml", "pairs"), part_of("films", "films.toml", "films")
-
-
-@dataclass(frozen=True)
-class Made:
-    """A release of three parts, and the sealed data set behind one of them."""
-
-    request: ReleaseRequest
-    released: Released
-
-    @property
-    def out(self) -> Path:
-        return self.request.out
-
-
-def ask(folder: Path, parts: list[Part], **options: Any) -> ReleaseRequest:
-    return ReleaseRequest(
-        parts, folder / "public", folder / "work", folder / "seed", workers=1, archive_bytes=100_000, **options
-    )
-
-
-@pytest.fixture(scope="module")
-def made(smallest_dataset: Path, film_windows: Path, tmp_path_factory: pytest.TempPathFactory) -> Made:
-    """Data sets that are there are used; the sealed one is rendered with a secret seed."""
-    from helpers.inline_workers import InlineWorkerPool
-
-    folder = tmp_path_factory.mktemp("release")
-    recipe = folder / "hidden.toml"
-    recipe.write_text(SMALL.text() + '\n[frames]\npresets = ["mjpeg"]\n', encoding="utf-8")
-    sealed = Part("hidden", recipe, "sealed", content_sha256(recipe.read_text(encoding="utf-8")))
-    request = ask(folder, [SMALL, sealed, FILMS], use=[smallest_dataset, film_windows])
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("phibench.datasets.make.WorkerPool", InlineWorkerPool)
-        return Made(request, release(request, seal))
-
-
-def snapshot(folder: Path) -> dict[str, str]:
-    return {
-        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
 
 
 # The frozen recipes.
@@ -204,12 +145,6 @@ def test_a_run_that_was_killed_goes_on(made: Made, tmp_path: Path, smallest_data
     assert snapshot(second.out) == before
 
 
-def flip(path: Path) -> None:
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
-    path.write_bytes(bytes(data))
-
-
 def test_a_damaged_data_set_is_not_released(smallest_dataset: Path, tmp_path: Path) -> None:
     shutil.copytree(smallest_dataset, tmp_path / "set")
     flip(next((tmp_path / "set" / "spots").glob("*.exr")))
@@ -269,184 +204,6 @@ def test_command_line_speaks_in_sentences(tmp_path: Path, capsys: pytest.Capture
     assert main(["fetch", "dev", "--out", str(tmp_path / "d")]) == 2
     assert fetching.SOURCE in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
-
-
-# Fetching.
-
-
-def test_fetched_from_a_folder(made: Made, tmp_path: Path, smallest_dataset: Path) -> None:
-    done = fetch("small", tmp_path / "set", str(made.out))
-    assert done.fetched == done.archives > 3
-    assert [path.name for path in tmp_path.iterdir()] == ["set"]
-    found = snapshot(tmp_path / "set")
-    assert found == {name: digest for name, digest in snapshot(smallest_dataset).items() if name in found}
-    assert damaged(tmp_path / "set") == []
-    assert fetch("phibench-v3-small", tmp_path / "set", str(made.out)).fetched == 0
-    fetch("films", tmp_path / "films", str(made.out))
-    assert film_faults(tmp_path / "films") == []
-    fetch("hidden", tmp_path / "hidden", str(made.out))
-    assert read_seal(tmp_path / "hidden").pairs == 2
-
-
-def test_the_place_is_a_setting(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(fetching.SOURCE, str(made.out))
-    assert fetch("films", tmp_path / "set", manifest_sha256=made.released.digest).fetched > 0
-
-
-@dataclass
-class Server:
-    """Server of a folder that breaks off: of each name in `broken`, that many answers end half-way."""
-
-    folder: Path
-    broken: dict[str, int] = field(default_factory=dict)
-    asked: Counter[str] = field(default_factory=Counter)
-    address: str = ""
-
-
-@contextmanager
-def served(server: Server) -> Iterator[Server]:
-    class Handler(SimpleHTTPRequestHandler):
-        def do_GET(self) -> None:
-            name = self.path.lstrip("/")
-            server.asked[name] += 1
-            if server.broken.get(name, 0) <= 0:
-                super().do_GET()
-                return
-            server.broken[name] -= 1
-            data = (server.folder / name).read_bytes()
-            self.send_response(200)
-            self.send_header("Content-Length", str(len(data)))
-            self.end_headers()
-            self.wfile.write(data[: len(data) // 2])
-            self.close_connection = True
-
-        def log_message(self, *_: object) -> None:
-            pass
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(server.folder))) as http:
-        thread = threading.Thread(target=http.serve_forever, kwargs={"poll_interval": 0.02})
-        thread.start()
-        server.address = f"http://127.0.0.1:{http.server_address[1]}/"
-        try:
-            yield server
-        finally:
-            http.shutdown()
-            thread.join()
-
-
-def test_a_download_that_breaks_off_loses_nothing_and_goes_on(made: Made, tmp_path: Path) -> None:
-    archives = [archive.name for archive in made.released.manifest.parts["phibench-v3-small"].archives]
-    with served(Server(made.out, {archives[2]: 1})) as server:
-        with pytest.raises(DatasetError, match=rf"{archives[2]} from .* broke off: .*run the same command again"):
-            fetch("small", tmp_path / "set", server.address, tries=1)
-        assert not (tmp_path / "set").exists()
-        done = fetch("small", tmp_path / "set", server.address, tries=1)
-        assert done.fetched == len(archives) - 2
-        assert server.asked[archives[0]] == server.asked[archives[1]] == 1
-        assert server.asked[archives[2]] == 2
-    assert damaged(tmp_path / "set") == []
-    assert [path.name for path in tmp_path.iterdir()] == ["set"]
-
-
-def test_a_file_is_asked_for_again_before_the_fetch_ends(made: Made, tmp_path: Path) -> None:
-    name = made.released.manifest.parts["phibench-v3-films"].archives[0].name
-    with served(Server(made.out, {name: 1, "MANIFEST.json": 1})) as server:
-        assert fetch("films", tmp_path / "set", server.address, tries=2).fetched > 0
-        assert (server.asked[name], server.asked["MANIFEST.json"]) == (2, 2)
-
-
-def test_flipped_bits_and_strange_sources_are_refused(made: Made, tmp_path: Path) -> None:
-    def told(source: Path | str, name: str = "small", out: str = "set", **options: Any) -> str:
-        with pytest.raises(DatasetError) as caught:
-            fetch(name, tmp_path / out, str(source), tries=1, **options)
-        assert out != "set" or not (tmp_path / "set").exists()
-        return str(caught.value)
-
-    copy = tmp_path / "copy"
-    shutil.copytree(made.out, copy)
-    victim = made.released.manifest.parts["phibench-v3-small"].archives[1].name
-    flip(copy / victim)
-    assert f"{victim} from {copy} is damaged" in told(copy)
-    with served(Server(copy)) as server:
-        assert "is damaged" in told(server.address)
-        shutil.copy2(made.out / victim, copy / victim)
-        assert fetch("small", tmp_path / "later", server.address, tries=1).fetched > 0
-        (copy / victim).unlink()
-        assert "does not give" in told(server.address)
-    assert "does not hold 'dev'" in told(copy, "dev")
-    assert "no data set 'smal' there; did you mean 'small'?" in told(copy, "smal")
-    assert "has another SHA-256 than" in told(copy, manifest_sha256="0" * 64)
-    assert "no MANIFEST.json" in told(tmp_path / "later")
-    assert "no such folder" in told(tmp_path / "nowhere")
-    (copy / "MANIFEST.json").write_text("{}")
-    assert "its format is not" in told(copy)
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "mine.txt").write_text("mine")
-    assert "holds something else than phibench-v3-small" in told(made.out, out="full")
-    later = fetch("small", tmp_path / "whole", str(made.out)).folder
-    with next(later.rglob("*.exr")).open("ab") as file:
-        file.write(b"0")
-    assert "damaged or changed" in told(made.out, out="whole")
-    assert (tmp_path / "full" / "mine.txt").read_text() == "mine"
-    (tmp_path / "new.part").mkdir()
-    (tmp_path / "new.part" / "mine.txt").write_text("mine")
-    assert "holds other files" in told(made.out, out="new")
-    assert (tmp_path / "new.part" / "mine.txt").read_text() == "mine"
-    # set.part holds what was fetched of another release
-    (tmp_path / "set.part" / "fetch.json").write_text('{"title": "phibench-v3-small", "sums_sha256": "0"}')
-    assert "another data set or version" in told(made.out)
-
-
-def test_what_is_changed_before_it_has_its_name_is_fetched_again(made: Made, tmp_path: Path) -> None:
-    """A bit flips in the growing set between two runs."""
-    archives = made.released.manifest.parts["phibench-v3-small"].archives
-    with served(Server(made.out, {archives[-1].name: 1})) as server:
-        with pytest.raises(DatasetError, match="broke off"):
-            fetch("small", tmp_path / "set", server.address, tries=1)
-        flip(next((tmp_path / "set.part" / "set").rglob("*.exr")))
-        with pytest.raises(DatasetError, match=r"is damaged: .*run the same command again"):
-            fetch("small", tmp_path / "set", server.address, tries=1)
-        assert not (tmp_path / "set").exists()
-        assert fetch("small", tmp_path / "set", server.address, tries=1) == Fetched(
-            tmp_path / "set", "phibench-v3-small", len(archives), len(archives)
-        )
-
-
-def entry(
-    name: str, data: bytes = b"x", kind: bytes = tarfile.REGTYPE, target: str = ""
-) -> tuple[tarfile.TarInfo, bytes]:
-    info = tarfile.TarInfo(name)
-    info.type, info.linkname, info.size = kind, target, len(data) if kind == tarfile.REGTYPE else 0
-    return info, data
-
-
-@pytest.mark.parametrize(
-    "strange",
-    [
-        entry("title/../outside"),
-        entry("/title/absolute"),
-        entry("title/a/../../outside"),
-        entry("other/file"),
-        entry("title/.hidden"),
-        entry("title/link", kind=tarfile.SYMTYPE, target="/etc"),
-        entry("title/hard", kind=tarfile.LNKTYPE, target="title/good"),
-        entry("title/fifo", kind=tarfile.FIFOTYPE),
-        entry("title/folder", kind=tarfile.DIRTYPE),
-        entry("title/good"),
-        entry("title/large", b"x" * 200),
-    ],
-    ids=lambda one: one[0].name.replace("/", "_"),
-)
-def test_archives_of_others_write_nothing_elsewhere(tmp_path: Path, strange: tuple[tarfile.TarInfo, bytes]) -> None:
-    archive, folder = tmp_path / "a.tar", tmp_path / "inside"
-    folder.mkdir()
-    with tarfile.open(archive, "w") as tar:
-        for info, data in (entry("title/good", b"good"), strange):
-            tar.addfile(info, io.BytesIO(data))
-    with pytest.raises(DatasetError, match="nothing of it is used"):
-        unpack(archive, folder, "title", 100)
-    assert sorted(path.name for path in tmp_path.rglob("*")) == ["a.tar", "good", "inside"]
-    assert (folder / "good").read_bytes() == b"good"
 
 
 # Croissant beside data sets.
