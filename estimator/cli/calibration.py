@@ -8,7 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from phibench.estimator.cli.options import DEFAULT_PRESET
+from phibench.estimator.cli.options import DEFAULT_PRESET, Preset
 
 _LAB = (
     "sigma of the outline: checked in the room `lab`; in a room with more lamps or edges widen it with "
@@ -21,7 +21,7 @@ def calibrate(
     *,
     out: Path,
     sample: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
-    preset: str = DEFAULT_PRESET,
+    preset: Preset = DEFAULT_PRESET,
     spots: bool = False,
     vertical: Annotated[bool, Parameter(negative="")] = False,
     distance_sigma_m: float = 1e-3,

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import App, Parameter
 
-from phibench.estimator.cli.options import DATA, DEFAULT_PRESET, Whole
+from phibench.estimator.cli.completions import parts, pictures, recipes, released
+from phibench.estimator.cli.options import DATA, DEFAULT_PRESET, OwnOrPreset, Preset, Whole
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -20,7 +21,7 @@ dataset = App(name="dataset", group=DATA, help="Make, check and show data sets; 
 
 @dataset.command
 def make(
-    recipe: str,
+    recipe: Annotated[str, Parameter(completer=recipes(films=False))],
     *,
     out: Path,
     workers: Whole | None = None,
@@ -192,7 +193,7 @@ def show(
 def frames(
     directory: Path,
     *,
-    preset: str | None = None,
+    preset: OwnOrPreset = None,
     sensor: Path | None = None,
     draws: Whole = 1,
     out: Path | None = None,
@@ -253,7 +254,7 @@ def export(
     *,
     to: Literal["parquet", "webdataset", "frames"],
     out: Path,
-    preset: str = DEFAULT_PRESET,
+    preset: Preset = DEFAULT_PRESET,
     draws: Whole = 1,
     laser_off: bool = False,
     exposure: str | None = None,
@@ -318,7 +319,7 @@ def release(
     out: Path,
     work: Path,
     secret_seed: Path | None = None,
-    part: Annotated[tuple[str, ...], Parameter(negative="")] = (),
+    part: Annotated[tuple[str, ...], Parameter(negative="", completer=parts)] = (),
     samples: Whole | None = None,
     use: Annotated[tuple[Path, ...], Parameter(negative="")] = (),
     workers: Whole | None = None,
@@ -365,7 +366,7 @@ def release(
 
 
 def fetch(
-    name: str,
+    name: Annotated[str, Parameter(completer=released)],
     *,
     out: Path,
     from_: Annotated[str | None, Parameter(name="--from")] = None,
@@ -402,7 +403,7 @@ def panorama(
     by: Literal["model", "truth"] = "model",
     width: Whole = 1440,
     elevation_deg: tuple[float, float] = (-60.0, 30.0),
-    preset: str = DEFAULT_PRESET,
+    preset: Annotated[str, Parameter(completer=pictures)] = DEFAULT_PRESET,
     image: Path | None = None,
     distance_m: float | None = None,
 ) -> int:

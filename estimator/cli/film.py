@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from cyclopts import App
+from cyclopts import App, Parameter
 
-from phibench.estimator.cli.options import DATA, SENSOR, Whole
+from phibench.estimator.cli.completions import policies, recipes
+from phibench.estimator.cli.options import DATA, SENSOR, Preset, Whole
 
 if TYPE_CHECKING:
     from phibench.estimator.loop.episodes import Episode
@@ -17,7 +18,13 @@ film = App(name="film", group=DATA, help="Make, check and show films of the stro
 
 
 @film.command
-def make(recipe: str, *, out: Path, workers: Whole | None = None, dry_run: bool = False) -> int:
+def make(
+    recipe: Annotated[str, Parameter(completer=recipes(films=True))],
+    *,
+    out: Path,
+    workers: Whole | None = None,
+    dry_run: bool = False,
+) -> int:
     """Make the films of a recipe with [film]; what is finished already is kept.
 
     Parameters
@@ -67,7 +74,7 @@ def verify(directory: Path) -> int:
 
 @film.command
 def show(
-    directory: Path, *, name: str | None = None, preset: str = "mjpeg", draw: int = 0, out: Path | None = None
+    directory: Path, *, name: str | None = None, preset: Preset = "mjpeg", draw: int = 0, out: Path | None = None
 ) -> int:
     """Print a table of films and write one of them as an MP4 with overlays.
 
@@ -172,7 +179,7 @@ def experiments(
 def track(
     directory: Path,
     *,
-    preset: str = "bayer-raw",
+    preset: Preset = "bayer-raw",
     draw: int = 0,
     camera_seed: Whole = 0,
     phase: Literal["known", "unknown"] = "known",
@@ -285,7 +292,7 @@ def bake(*, out: Path, rooms: Whole = 5, seed: str = "rooms", workers: Whole | N
 
 @loop.command
 def run(
-    policy: str = "paper",
+    policy: Annotated[str, Parameter(completer=policies)] = "paper",
     *,
     episodes: Whole = 10,
     rooms: Path | None = None,

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from phibench.estimator.cli.options import DEFAULT_PRESET, LIMITS, METHODS, Limits, wide_console
+from phibench.estimator.cli.completions import methods
+from phibench.estimator.cli.options import DEFAULT_PRESET, LIMITS, METHODS, Limits, Preset, wide_console
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -38,9 +39,9 @@ def list_() -> int:
 
 @method.command
 def check(
-    reference: Annotated[str, Parameter(name="--method")],
+    reference: Annotated[str, Parameter(name="--method", completer=methods)],
     *,
-    preset: str = DEFAULT_PRESET,
+    preset: Preset = DEFAULT_PRESET,
     limits: Limits = LIMITS,
     show_output: Annotated[bool, Parameter(negative="")] = False,
 ) -> int:

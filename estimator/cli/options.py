@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Group, Parameter, Token
 
+from phibench.estimator.cli.completions import built_in_methods, methods, presets
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -45,11 +47,14 @@ def number(_kind: object, tokens: Sequence[Token]) -> float:
 
 
 Whole = Annotated[int, Parameter(converter=_whole)]
+Preset = Annotated[str, Parameter(completer=presets)]
+OwnOrPreset = Annotated[str | None, Parameter(completer=presets)]
 Methods = Annotated[
     list[str] | None,
     Parameter(
         name="--method",
         negative="",
+        completer=methods,
         help="A method: a name that `phibench method list` shows, or FILE.py:FUNCTION. May be given several times.",
     ),
 ]
@@ -58,6 +63,7 @@ BuiltIn = Annotated[
     Parameter(
         name="--method",
         negative="",
+        completer=built_in_methods,
         help="A built-in method, as `phibench method list` shows. May be given several times; all by default.",
     ),
 ]

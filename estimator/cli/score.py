@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from phibench.estimator.cli.options import LIMITS, BuiltIn, Limits, Methods, Whole
+from phibench.estimator.cli.options import LIMITS, BuiltIn, Limits, Methods, OwnOrPreset, Whole
 
 if TYPE_CHECKING:
     from phibench.estimator.benchmark.document import MethodCard, ScoreDocument
@@ -57,7 +57,7 @@ def score(
     directory: Path,
     *,
     method: Methods = None,
-    preset: str | None = None,
+    preset: OwnOrPreset = None,
     draws: Whole | None = None,
     pairs: Whole | None = None,
     hints: bool = True,

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from cyclopts import App, Parameter
 
-from phibench.estimator.cli.options import LIMITS, METHODS, Limits, Whole
+from phibench.estimator.cli.options import LIMITS, METHODS, Limits, OwnOrPreset, Whole
 
 seal = App(
     name="seal",
@@ -18,7 +18,7 @@ seal = App(
 
 
 @seal.command
-def make(directory: Path, *, out: Path, preset: str | None = None) -> int:
+def make(directory: Path, *, out: Path, preset: OwnOrPreset = None) -> int:
     """Write one pair of each sample without the truth, and a seal that says by hash which truth it was.
 
     Presets are dealt out over the samples. The truth goes into the data set's folder, as `seal_ID.truth.json`: keep

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from phibench.estimator.cli.options import DEFAULT_PRESET, SENSOR, Whole
+from phibench.estimator.cli.options import DEFAULT_PRESET, SENSOR, OwnOrPreset, Whole
 
 if TYPE_CHECKING:
     from phibench.estimator.paper.experiment_tables import Procedure
@@ -21,7 +21,7 @@ def paper(
     *,
     misaligned: Annotated[bool, Parameter(negative="")] = False,
     calibration: Path | None = None,
-    preset: str | None = None,
+    preset: OwnOrPreset = None,
     draws: Whole | None = None,
     laser_off: bool | None = None,
     frames: Annotated[tuple[Whole, Whole] | None, Parameter(negative="")] = None,
