@@ -19,6 +19,12 @@ unexport PYTHONDONTWRITEBYTECODE
 # Test files are shared between two processes; `make test PARALLEL=` runs them one after the other.
 PARALLEL ?= --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
+# All extras but those of networks and of the site.
+EVERYTHING := --editable '.[render,cluster,study,film,export,test,check]'
+# `$(call install,FOLDER OF PYTHON,WHAT)`: pip says nothing, but for everything that it had to say where it fails.
+install = $(1)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt $(2) \
+    > $(1)/../pip.log 2>&1 || { cat $(1)/../pip.log >&2; exit 1; }
+
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help setup dataset bench studies studies-full lint clean
@@ -61,7 +67,7 @@ $(READY): pyproject.toml constraints.txt
 	    echo "Making $(VENV) with $$python"; \
 	    "$$python" -m venv --clear $(VENV) )
 	@echo "Installing phibench and what it needs (some minutes the first time)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[render,cluster,study,film,export,test,check]'
+	@$(call install,$(BIN),$(EVERYTHING))
 	@$(BIN)/python -m phibench.render.setup.llvm
 	@touch $@
 
@@ -96,7 +102,7 @@ test: $(READY)
 # Tests that need a rendered data set are skipped there.
 test-base:
 	$(or $(PYTHON),python3) -m venv --clear $(BASE)
-	@$(BASE)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[test]'
+	@$(call install,$(BASE)/bin,--editable '.[test]')
 	$(BASE)/bin/python -m pytest $(BASE_TESTS)
 
 test-slow: $(READY)
@@ -118,13 +124,15 @@ benchmark: $(READY)
 	$(BIN)/python -m pytest --benchmark-enable --benchmark-only
 
 docs: $(READY)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[docs]'
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict --site-dir out/site
+	@echo "Installing what the site needs"
+	@$(call install,$(BIN),--editable '.[docs]')
+	@echo "Building the site: half a minute, and some minutes more where the tutorials are to be run"
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict --site-dir out/site
 	@echo "out/site/index.html"
 
 # Source distribution, and the wheel built from it.
 dist: $(READY)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt build
+	@$(call install,$(BIN),build)
 	$(BIN)/python -m build --outdir dist .
 
 lint: $(READY)

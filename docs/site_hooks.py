@@ -14,6 +14,7 @@ import posixpath
 import re
 import shutil
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -119,6 +120,11 @@ def on_files(files: Files, config: Any) -> Files:
     return files
 
 
+def _tell(line: str) -> None:
+    """Line on the standard error: mkdocs keeps quiet for some minutes."""
+    print(line, file=sys.stderr, flush=True)
+
+
 def _tutorial(name: str) -> dict[str, str | bytes]:
     """Page and pictures of a tutorial, by their places in the site. It is executed once for each state of the code."""
     source = ROOT / "docs" / "tutorials" / f"{name}.py"
@@ -129,7 +135,10 @@ def _tutorial(name: str) -> dict[str, str | bytes]:
         shutil.rmtree(kept.parent / name, ignore_errors=True)
         for old in kept.parent.glob(f"{name}-*.ipynb"):
             old.unlink()
+        _tell(f"tutorial {name}: is run, rendering included (its outputs are kept until code or tutorial changes)")
+        began = time.monotonic()
         nbformat.write(executed(source, kept.parent / name), kept)
+        _tell(f"tutorial {name}: done after {time.monotonic() - began:.0f} s")
     naming = {"unique_key": name, "output_files_dir": f"{name}_files"}
     page, resources = MarkdownExporter().from_notebook_node(nbformat.read(kept, as_version=4), resources=naming)
     pictures = {f"tutorials/{file}": data for file, data in resources["outputs"].items()}
@@ -137,7 +146,8 @@ def _tutorial(name: str) -> dict[str, str | bytes]:
     if sample.is_file():
         pictures[f"tutorials/{name}_files/sample.html"] = sample.read_bytes()
         page += f"\nThe sample's page as it comes out: [sample.html]({name}_files/sample.html).\n"
-    page += f"\nThis page is a notebook: `docs/tutorials/{name}.py` opens in Jupyter with jupytext.\n"
+    page += f"\nThis page is the file `docs/tutorials/{name}.py`. To run it, with its outputs in a folder of yours:\n"
+    page += f"\n    python docs/run_notebook.py docs/tutorials/{name}.py out/{name}\n"
     return {f"tutorials/{name}.md": page, **pictures}
 
 

@@ -97,3 +97,26 @@ def test_the_search_works_from_disk(site: Path, tmp_path: Path) -> None:
     assert "CONSOLE" not in done.stderr
     assert re.search(r"[1-9]\d* matching document", done.stdout)
     assert "model.html" in done.stdout
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_make_docs_tells_what_it_does_and_shows_pip_where_it_fails(tmp_path: Path, fails: bool) -> None:
+    """The environment's Python is a script that warns as pip does, and fails or not."""
+    (tmp_path / "bin").mkdir()
+    for name, text in {"python": f"echo WARNING: a location; exit {int(fails)}", "mkdocs": "exit 0"}.items():
+        (tmp_path / "bin" / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / "bin" / name).chmod(0o755)
+    (tmp_path / ".phibench-ready").touch()
+    child = subprocess.run(
+        ["make", "--no-print-directory", "docs", f"VENV={tmp_path}"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (child.returncode == 0) == (not fails)
+    assert ("WARNING: a location" in child.stderr) == fails
+    lines = child.stdout.splitlines()
+    assert lines[0] == "Installing what the site needs"
+    assert (lines[-1] == "out/site/index.html" and "tutorials are to be run" in lines[1]) == (not fails)

@@ -16,7 +16,14 @@
 # * its score with a confidence interval, beside a simple method and a careful one;
 # * the reason why it is not better, and a page to look at a sample.
 #
-# You need `make setup`, and a terminal in which `phibench` is a command: `. .venv/bin/activate`.
+# You need `make setup`, and a terminal in which `phibench` is a command: `. .venv/bin/activate`. Then
+#
+# ```
+# python docs/run_notebook.py docs/tutorials/own_method.py out/own_method
+# ```
+#
+# runs all of it in that folder, and writes a notebook with its outputs there. You can also open the file in Jupyter with
+# jupytext, or type cell by cell.
 
 # %%
 import os

@@ -15,7 +15,14 @@
 # * its pictures and the exact distance of everything that they show;
 # * the best accuracy of D that such a rig can have, and what a millimetre of error in the stroke costs.
 #
-# You need `make setup`, and a terminal in which `phibench` is a command: `. .venv/bin/activate`.
+# You need `make setup`, and a terminal in which `phibench` is a command: `. .venv/bin/activate`. Then
+#
+# ```
+# python docs/run_notebook.py docs/tutorials/own_rig.py out/own_rig
+# ```
+#
+# runs all of it in that folder, and writes a notebook with its outputs there. You can also open the file in Jupyter with
+# jupytext, or type cell by cell.
 
 # %%
 import os

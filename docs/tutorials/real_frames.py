@@ -18,7 +18,14 @@
 # You need pictures of a rig: a camera that looks up at a mirror ball, at two heights, with the laser on and off. If you
 # have none yet, the first step makes some. They are simulated, with a rig that is not built as drawn.
 #
-# You need `make setup`, and a terminal in which `phibench` is a command: `. .venv/bin/activate`.
+# You need `make setup`, and a terminal in which `phibench` is a command: `. .venv/bin/activate`. Then
+#
+# ```
+# python docs/run_notebook.py docs/tutorials/real_frames.py out/real_frames
+# ```
+#
+# runs all of it in that folder, and writes a notebook with its outputs there. You can also open the file in Jupyter with
+# jupytext, or type cell by cell.
 
 # %%
 import os
