@@ -21,8 +21,8 @@
 # python docs/run_notebook.py docs/tutorials/own_rig.py out/own_rig
 # ```
 #
-# runs all of it in that folder, and writes a notebook with its outputs there. You can also open the file in Jupyter with
-# jupytext, or type cell by cell.
+# runs all of it in that folder, and writes a notebook with its outputs there. You can also open the file in Jupyter
+# (with jupytext), or type cell by cell.
 
 # %%
 import os
