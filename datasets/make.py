@@ -13,7 +13,13 @@ from pathlib import Path
 
 from rich.console import Console
 
-from phibench.datasets.build.finished_work import OR_REPLACE, LostWorkError, kept_samples, lost_work
+from phibench.datasets.build.finished_work import (
+    OR_REPLACE,
+    LostWorkError,
+    finished_without,
+    kept_samples,
+    lost_work,
+)
 from phibench.datasets.build.forecast import (
     Forecast,
     PairForecast,
@@ -24,6 +30,15 @@ from phibench.datasets.build.forecast import (
     slowdown,
 )
 from phibench.datasets.build.journal import FolderHead, Journal
+from phibench.datasets.build.refusals import (
+    forget_others,
+    incomplete_text,
+    left_out_line,
+    left_out_text,
+    possible,
+    refused_samples,
+    settled_samples,
+)
 from phibench.datasets.build.room_export import (
     damaged_exports,
     export_lines,
@@ -49,7 +64,7 @@ from phibench.datasets.build.run_tasks import (
 from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.build.tasks import Task
 from phibench.datasets.build.workers import Environment, NoRendererError, WorkerPool, versions
-from phibench.datasets.errors import DatasetError
+from phibench.datasets.errors import DatasetError, IncompleteError
 from phibench.datasets.input_files import InputFile
 from phibench.datasets.plan.plan import Plan, make_plan
 from phibench.datasets.plan.room_draws import unexported
@@ -76,6 +91,7 @@ def make(
     seed: int | None = None,
     replace: bool = False,
     room_files: str | Path | None = None,
+    leave_out_refused: bool = False,
 ) -> Path:
     """Render the data set of a recipe into a folder; what is finished there is kept, whatever ended the last run.
 
@@ -93,6 +109,7 @@ def make(
     samples, seed : numbers instead of the recipe's `[random].samples` and `[dataset].seed`
     replace : whether finished work that does not fit may be deleted or made again; what fits is kept
     room_files : folder of the files that the recipe names for rooms; by default the recipe's own
+    leave_out_refused : whether the data set is finished without the samples that are refused, if others are not
 
     Returns
     -------
@@ -106,7 +123,8 @@ def make(
         If recipe, folder or disk will not do, or a task fails (the others are finished first). Nothing is then
         half-written under a final name, and `SHA256SUMS` is missing.
     IncompleteError
-        If nothing but samples by themselves cannot be made; the others are finished first, and `SHA256SUMS` is missing.
+        If nothing but samples by themselves cannot be made; the others are finished first, and `SHA256SUMS` is
+        missing. With `leave_out_refused`, if not one sample can be made.
     """
     console, out, exports = console or progress_console(), Path(out), Exports()
 
@@ -117,7 +135,7 @@ def make(
     for warning in [*warnings(plan.recipe), *_hidden(pair_forecasts(plan))]:
         console.print(f"warning: {warning}", highlight=False, soft_wrap=True)
     try:
-        make_from_plan(plan, text, out, workers, console, scheduler, replace)
+        make_from_plan(plan, text, out, workers, console, scheduler, replace, leave_out_refused)
     except LostWorkError:
         remove_files(out, exports.made)  # the folder is as it was
         raise
@@ -136,6 +154,7 @@ def dry_run(
     seed: int | None = None,
     replace: bool = False,
     room_files: str | Path | None = None,
+    leave_out_refused: bool = False,
 ) -> str:
     """Say what `make` would do, and render and write nothing: what will be seen, how many tasks, bytes, seconds.
 
@@ -152,14 +171,21 @@ def dry_run(
     if journal.entries:
         environment, _ = _environment(WorkerPool(out, count), journal)
         tasks = plan_tasks(plan, versions(environment))
+        forget_others(journal, tasks)
+        info = dataset_info(plan, environment)
+        lost = None if replace else _lost(out, _keys(tasks), journal, info, leave_out_refused)
+        told += [f"will be refused: {lost}"] if lost else []
+        if leave_out_refused:
+            plan = plan.without(settled_samples(plan, tasks, journal))
+            tasks, pairs = plan_tasks(plan, versions(environment)), list(pair_forecasts(plan))
         todo = unfinished(tasks, journal, out)
-        lost = None if replace else lost_work(out, _keys(tasks), journal, dataset_info(plan, environment))
-        told += [f"will be refused: {lost}; {OR_REPLACE}"] if lost else []
+        todo = possible(todo, tasks, journal) if leave_out_refused else todo
     chosen = [tasks[name] for name in (todo if journal.entries else tasks)]
     cost = forecast(plan, chosen).text(count, slowdown(count)) if chosen else "to make: nothing"
     seen = f"{sum(pair.visible for pair in pairs)} of {len(pairs)} pairs will be visible in both images"
     told += rim_lines(plan, pairs) + [f"warning: {warning}" for warning in warnings(plan.recipe)]
-    told += [f"will be refused: {name}: {reason}" for name, reason in plan.refused.items()]
+    verb = "left out" if leave_out_refused else "refused"
+    told += [f"will be {verb}: {name}: {reason}" for name, reason in {**plan.left_out, **plan.refused}.items()]
     told += export_lines(unexported(plan.recipe, plan.files))
     return "\n".join([*pair_table(pairs), seen, *told, f"{cost}, {len(tasks)} tasks in all; nothing was rendered"])
 
@@ -271,8 +297,12 @@ def make_from_plan(
     console: Console,
     scheduler: str | None = None,
     replace: bool = False,
+    leave_out: bool = False,
 ) -> list[str]:
-    """Make what is unfinished or damaged of a plan; return the names of the tasks done and documents written."""
+    """Make what is unfinished or damaged of a plan; return the names of the tasks done and documents written.
+
+    With `leave_out` the data set is finished without the samples that are refused.
+    """
     count = _count(workers)
     try:
         with (
@@ -280,37 +310,55 @@ def make_from_plan(
             WorkerPool(out, count, scheduler) as pool,
             Journal(out) as journal,
         ):
-            return _make(plan, recipe, out, pool, journal, console, replace)
+            return _make(plan, recipe, out, pool, journal, console, replace, leave_out)
     except OSError as error:
         text = str(error) if isinstance(error, WriteError) else f"could not write to {out}: {error}"
         raise DatasetError(f"{text}; then run the same command again") from error
 
 
 def _make(
-    plan: Plan, recipe: str, out: Path, pool: WorkerPool, journal: Journal, console: Console, replace: bool
+    whole: Plan,
+    recipe: str,
+    out: Path,
+    pool: WorkerPool,
+    journal: Journal,
+    console: Console,
+    replace: bool,
+    leave_out: bool,
 ) -> list[str]:
     started, began = time.monotonic(), datetime.now(UTC)
     environment, no_renderer = _environment(pool, journal)
-    info, tasks = dataset_info(plan, environment), plan_tasks(plan, versions(environment))
-    if not replace and (lost := lost_work(out, _keys(tasks), journal, info)):
-        raise LostWorkError(f"{lost}; {OR_REPLACE}")
-    head = FolderHead(_info_text(info, journal, out), recipe)
+    every = plan_tasks(whole, versions(environment))
+    forget_others(journal, every)
+    if not replace and (lost := _lost(out, _keys(every), journal, dataset_info(whole, environment), leave_out)):
+        raise LostWorkError(lost)
+    settled = settled_samples(whole, every, journal) if leave_out else {}
+    plan, tasks, head = _part(whole, settled, every, environment, recipe, journal, out)
     todo = unfinished(tasks, journal, out)
+    todo = possible(todo, tasks, journal) if leave_out else todo
     if todo and no_renderer is not None:
         what = f"{len(todo)} of {len(tasks)} tasks are to be done, such as '{todo[0]}'"
         raise DatasetError(f"{what}, and {no_renderer}") from no_renderer
     copies = missing_room_files(plan.files, out)
-    if not todo and not plan.refused and not (faults := _loose_ends(plan, head, journal, tasks, out)) and not copies:
-        if journal.is_written(head, tasks):
-            console.print(f"{out} is complete, nothing to do", highlight=False)
-            return []
-        journal.begin(head, tasks)
-        console.print(f"{out} is complete, its journal is written anew", highlight=False)
-        return [schema.JOURNAL]
-    if todo or plan.refused:
+    if todo or (plan.refused and not leave_out):
         (out / schema.CHECKSUMS).unlink(missing_ok=True)
         run_tasks(plan, tasks, todo, journal, head, out, pool, console)
-        faults = _loose_ends(plan, head, journal, tasks, out)
+    refused = settled | refused_samples(plan, tasks, journal)
+    if refused and not (leave_out and len(refused) < len(whole.sample_ids)):
+        (out / schema.CHECKSUMS).unlink(missing_ok=True)
+        raise IncompleteError(incomplete_text(whole, refused))
+    if refused != settled:
+        plan, tasks, head = _part(whole, refused, every, environment, recipe, journal, out)
+    journal.keep_refusals(every)
+    faults = _loose_ends(plan, head, journal, tasks, out)
+    if not todo and not faults and not copies:
+        said = f"; {left_out_line(plan.left_out, len(plan.pairs))}" if plan.left_out else ""
+        if journal.is_written(head, tasks):
+            console.print(f"{out} is complete, nothing to do{said}", highlight=False, soft_wrap=True)
+            return []
+        journal.begin(head, tasks)
+        console.print(f"{out} is complete, its journal is written anew{said}", highlight=False, soft_wrap=True)
+        return [schema.JOURNAL]
     journal.begin(head, tasks)
     copy_room_files(plan.files, out)
     wanted = assemble(plan, head, journal.entries)
@@ -318,7 +366,32 @@ def _make(
     write_documents(out, wanted, [name for name in faults if name in wanted])
     _write_run(out, pool.width, began, time.monotonic() - started)
     console.print(f"{out}: {visibility_line(read_manifest(out))}", highlight=False, soft_wrap=True)
-    return [*todo, *(schema.room_file(name) for name in copies), *faults]
+    if plan.left_out:
+        text = left_out_text(plan.left_out, len(plan.pairs))
+        console.print(f"{out}: {text}", highlight=False, soft_wrap=True, markup=False)
+    return [*(name for name in todo if name in tasks), *(schema.room_file(name) for name in copies), *faults]
+
+
+def _lost(out: Path, keys: Mapping[str, str], journal: Journal, info: DatasetInfo, leave_out: bool) -> str | None:
+    """Sentence on what a run would lose: finished work, or the end of a data set that leaves samples out."""
+    if lost := lost_work(out, keys, journal, info):
+        return f"{lost}; {OR_REPLACE}"
+    return None if leave_out else finished_without(out, journal)
+
+
+def _part(
+    whole: Plan,
+    left_out: Mapping[str, str],
+    every: dict[str, Task],
+    environment: Environment,
+    recipe: str,
+    journal: Journal,
+    out: Path,
+) -> tuple[Plan, dict[str, Task], FolderHead]:
+    """Plan without some samples, its tasks, and the head of its folder."""
+    plan = whole.without(left_out)
+    tasks = plan_tasks(plan, versions(environment)) if left_out else every
+    return plan, tasks, FolderHead(_info_text(dataset_info(plan, environment), journal, out), recipe)
 
 
 def _environment(pool: WorkerPool, journal: Journal) -> tuple[Environment, NoRendererError | None]:

@@ -16,7 +16,7 @@ from typing import Any
 from rich.console import Console
 
 from phibench.datasets.build.finished_work import lost_work
-from phibench.datasets.build.journal import Entry, FolderHead, Journal
+from phibench.datasets.build.journal import Entry, FolderHead, Journal, Refusal
 from phibench.datasets.build.run_tasks import (
     assemble,
     claimed,
@@ -65,8 +65,8 @@ def merge(out: str | Path, shards: Sequence[str | Path], console: Console | None
         [Path(shard) for shard in shards],
         console or progress_console(),
     )
-    head, info, entries = _collect(folders)
-    plan = make_plan(parse_recipe(head.recipe), held_room_files(folders[0]))
+    head, whole, info, entries, refusals = _collect(folders)
+    plan = whole.without(info.causes)
     names = task_names(plan)
     if missing := [name for name in names if name not in entries]:
         raise DatasetError(f"the shards lack {len(missing)} tasks, such as {missing[0]}; finish or add their shards")
@@ -77,7 +77,8 @@ def merge(out: str | Path, shards: Sequence[str | Path], console: Console | None
         journal.begin(head, [])  # says what the folder is, should this be interrupted
         copy_room_files(plan.files, out)
         _copy(out, [entries[name] for name in names], console)
-        journal.entries = {name: entries[name][0] for name in names}
+        journal.entries, journal.refusals = {name: entries[name][0] for name in names}, refusals
+        journal.keep_refusals(task_names(whole))
         journal.begin(head, names)
         wanted = assemble(plan, head, journal.entries)
         remove_files(out, stale_files(out, [file for entry in journal.entries.values() for file in entry.files]))
@@ -85,23 +86,43 @@ def merge(out: str | Path, shards: Sequence[str | Path], console: Console | None
     return out
 
 
-def _collect(folders: list[Path]) -> tuple[FolderHead, DatasetInfo, dict[str, tuple[Entry, Path]]]:
-    """Head and info of the whole, and every task's entry with the folder that has its files."""
+_Entries = dict[str, tuple[Entry, Path]]
+
+
+def _collect(folders: list[Path]) -> tuple[FolderHead, Plan, DatasetInfo, _Entries, dict[str, Refusal]]:
+    """Head, plan and info of the whole, every task's entry with the folder that has its files, and the refusals.
+
+    The plan has all samples; the info leaves out those that any shard does.
+    """
     if not folders:
         raise DatasetError("give the folders of the shards")
     heads = [_finished(folder) for folder in folders]
     infos = [parse_info(head.info) for head in heads]
-    whole = [_whole(*one) for one in zip(folders, infos, heads, strict=True)]
+    plans: dict[str, Plan] = {}
+    for folder, info, head in zip(folders, infos, heads, strict=True):
+        if head.recipe not in plans:  # one for all shards that belong together
+            plans[head.recipe] = make_plan(parse_recipe(head.recipe), held_room_files(folder))
+        if recipe_sha256(plans[head.recipe].recipe) != info.recipe_sha256:
+            raise DatasetError(f"the recipe of shard {info.shard} is not the one it was made from")
+    causes = {name: cause for info in infos for name, cause in info.causes.items()}
+    whole = [
+        dataset_info(plans[head.recipe].without(causes), info.provenance)
+        for info, head in zip(infos, heads, strict=True)
+    ]
     for folder, info in zip(folders, whole, strict=True):
         if not same_content(info, whole[0]):
             raise DatasetError(f"{folder} and {folders[0]} are of different recipes, code or environments")
     _all_there(folders, infos)
-    entries: dict[str, tuple[Entry, Path]] = {}
+    entries: _Entries = {}
+    refusals: dict[str, Refusal] = {}
     for folder in folders:
-        for name, entry in Journal(folder).entries.items():
+        journal = Journal(folder)
+        refusals |= journal.refusals
+        for name, entry in journal.entries.items():
             if entries.setdefault(name, (entry, folder))[0].files != entry.files:
                 raise DatasetError(f"{name} has other bytes in {folder} than in {entries[name][1]}; repair one of them")
-    return FolderHead(info_text(whole[0]), heads[0].recipe), whole[0], entries
+    plan = plans[heads[0].recipe]
+    return FolderHead(info_text(whole[0]), heads[0].recipe), plan, whole[0], entries, refusals
 
 
 def _finished(folder: Path) -> FolderHead:
@@ -109,14 +130,6 @@ def _finished(folder: Path) -> FolderHead:
     if head is None or not (folder / CHECKSUMS).is_file():
         raise DatasetError(f"{folder} is not a finished shard; run its `phibench dataset make` again")
     return head
-
-
-def _whole(folder: Path, info: DatasetInfo, head: FolderHead) -> DatasetInfo:
-    """Description of the data set that a shard is a part of."""
-    plan = make_plan(parse_recipe(head.recipe), held_room_files(folder))
-    if recipe_sha256(plan.recipe) != info.recipe_sha256:
-        raise DatasetError(f"the recipe of shard {info.shard} is not the one it was made from")
-    return dataset_info(plan, info.provenance)
 
 
 def _all_there(folders: list[Path], infos: list[DatasetInfo]) -> None:
@@ -174,15 +187,15 @@ def repair(
         hold, or if this code or these packages are not those that made it: the parts would not fit together.
     """
     folder, console = Path(folder), console or progress_console()
-    plan, recipe = _held_plan(folder)
+    plan, recipe, leave_out = _held_plan(folder)
     _clear(folder, [schema.LOCK], console)  # without it nobody can hold the folder
     with only_run(folder):
         _clear(folder, _places(plan), console)
-    return make_from_plan(plan, recipe, folder, workers, console, scheduler)
+    return make_from_plan(plan, recipe, folder, workers, console, scheduler, leave_out=leave_out)
 
 
-def _held_plan(folder: Path) -> tuple[Plan, str]:
-    """Plan of what a folder should hold, and the text of its recipe."""
+def _held_plan(folder: Path) -> tuple[Plan, str, bool]:
+    """Plan of what a folder should hold, the text of its recipe, and whether it leaves out refused samples."""
     try:
         head = held_head(folder) if folder.is_dir() else None
     except DatasetError as error:
@@ -190,12 +203,13 @@ def _held_plan(folder: Path) -> tuple[Plan, str]:
             raise error from None
         with only_run(folder), Journal(folder) as journal:
             journal.begin(head, list(journal.entries))
-        return make_plan(parse_recipe(head.recipe), held_room_files(folder)), head.recipe
+        return make_plan(parse_recipe(head.recipe), held_room_files(folder)), head.recipe, False
     if head is None:
         raise DatasetError(f"{folder} is not a data set: there is nothing to repair")
     info = parse_info(head.info)
     _refuse_other_code(folder, info.provenance)
-    return make_plan(_recipe(folder, head, info), held_room_files(folder), info.shard), head.recipe
+    plan = make_plan(_recipe(folder, head, info), held_room_files(folder), info.shard)
+    return plan, head.recipe, bool(info.left_out)
 
 
 def _lost_head(folder: Path) -> FolderHead | None:
@@ -217,8 +231,8 @@ def _lost_head(folder: Path) -> FolderHead | None:
     if not held or not held.items() <= expected.items():
         raise DatasetError(f"{path} is not the recipe of the layers in {folder}; put the right one back")
     if (folder / schema.MANIFEST).is_file() and len(read_manifest(folder)) != len(plan.pairs):
-        text = f"{folder} holds a shard, and which one is lost with {schema.INFO}"
-        raise DatasetError(f"{text}; put {schema.INFO} back, or render the shard into a new folder")
+        text = f"{folder} holds a shard, or leaves samples out, and which is lost with {schema.INFO}"
+        raise DatasetError(f"{text}; put {schema.INFO} back, or render it into a new folder")
     return FolderHead(info_text(dataset_info(plan, {})), text)
 
 

@@ -168,7 +168,9 @@ class Dataset:
     def __repr__(self) -> str:
         spots = [row.position(position) for row in self.rows for position in POSITIONS]
         poses, rigs = len({spot.pose for spot in spots}), len({row.rig for row in self.rows})
-        counts = _count(len(self), "stroke pair"), _count(poses, "mirror pose"), _count(rigs, "rig")
+        counts = [_count(len(self), "stroke pair"), _count(poses, "mirror pose"), _count(rigs, "rig")]
+        if self.info.left_out:
+            counts.append(f"{len(self.info.left_out)} refused and left out")
         lines = {
             "samples": ", ".join(counts),
             "ids": _ends([row.sample_id for row in self.rows]),

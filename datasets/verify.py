@@ -20,10 +20,11 @@ from rich.console import Console
 from phibench.datasets.build.bake_task import read_light_map
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.build.sample_task import noise_row, spot_noise
-from phibench.datasets.build.spot_task import SpotAnswer, answer_spot
+from phibench.datasets.build.spot_task import OUT_OF_TOLERANCE, SpotAnswer, answer_spot, certificate_fault
 from phibench.datasets.build.task_list import sample_task_name
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.plan.plan import PairPlan, Plan, make_plan
+from phibench.datasets.plan.sampling import UNDRAWN
 from phibench.datasets.progress import Steps, progress_console
 from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.recipe.load import parse_recipe
@@ -130,7 +131,7 @@ def _missing_samples(folder: Path) -> str:
         if journal.head is None:
             return ""
         info = parse_info(journal.head.info)
-        plan = make_plan(parse_recipe(journal.head.recipe), held_room_files(folder), info.shard)
+        plan = make_plan(parse_recipe(journal.head.recipe), held_room_files(folder), info.shard).without(info.causes)
     except ValueError:  # damaged, or of another version
         return ""
     names = [pair.sample_id for pair in plan.pairs if sample_task_name(pair) not in journal.entries]
@@ -354,12 +355,14 @@ def _guarded(faults: Iterator[str]) -> Iterator[str]:
 def plan_faults(dataset: Dataset) -> Iterator[str]:
     """Faults of manifest, rigs and poses against the plan of the recipe."""
     try:
-        plan = make_plan(dataset.recipe, held_room_files(dataset.folder), dataset.info.shard)
+        whole = make_plan(dataset.recipe, held_room_files(dataset.folder), dataset.info.shard)
     except DatasetError as error:
         yield f"{schema.INFO}: its recipe cannot be followed: {error}"
         return
+    yield from _left_out_faults(whole, dataset)
+    plan = whole.without(dataset.info.causes)
     rows, pairs = {row.sample_id: row for row in dataset.rows}, {pair.sample_id: pair for pair in plan.pairs}
-    for name in sorted(set(pairs) - set(rows)):
+    for name in sorted({*pairs, *plan.refused} - set(rows)):
         yield f"{schema.MANIFEST}: sample {name} of the recipe is missing"
     for name in sorted(set(rows) - set(pairs)):
         yield f"{schema.MANIFEST}: sample {name} is not in the recipe"
@@ -372,6 +375,26 @@ def plan_faults(dataset: Dataset) -> Iterator[str]:
     held = [(pose.pose, pose.rig, pose.room) for pose in dataset.info.poses]
     if held != [(pose.pose_id, pose.rig, pose.room) for pose in plan.poses]:
         yield f"{schema.INFO}: the poses are not those of the recipe"
+
+
+def _left_out_faults(whole: Plan, dataset: Dataset) -> Iterator[str]:
+    """Faults of the list of samples that were left out: each must be of the recipe, and still be refused.
+
+    One that was refused for its noise, or whose room cannot be built, is not rendered again here.
+    """
+    causes, pairs = dataset.info.causes, {pair.sample_id: pair for pair in whole.pairs}
+    if len(causes) != len(dataset.info.left_out):
+        yield f"{schema.INFO}: left_out lists a sample twice"
+    for name, cause in causes.items():
+        if name not in pairs and name not in whole.refused:
+            yield f"{schema.INFO}: left_out lists {name}, which is not in the recipe"
+        elif name in pairs and cause.startswith(UNDRAWN):
+            yield f"{schema.INFO}: left_out lists {name}, which can be drawn"
+        elif name in pairs and cause.startswith(OUT_OF_TOLERANCE):
+            pair = pairs[name]
+            spot, room = whole.spots[pair.spot], whole.room(pair.room)
+            if not certificate_fault({p: answer_spot(whole.view(pair, p), spot, room) for p in POSITIONS}):
+                yield f"{schema.INFO}: left_out lists {name}, whose certificates pass when they are computed again"
 
 
 def _row_faults(plan: Plan, pair: PairPlan, row: ManifestRow) -> Iterator[str]:

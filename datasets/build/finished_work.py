@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from phibench.datasets.build.journal import Entry, FolderHead, Journal
+from phibench.datasets.build.refusals import OPTION, left_out_line
 from phibench.datasets.build.run_tasks import held_head, is_intact
 from phibench.datasets.build.task_list import plan_tasks
 from phibench.datasets.build.workers import versions
@@ -62,6 +63,15 @@ def lost_work(out: Path, keys: Mapping[str, str], journal: Journal, wanted: Data
     return f"{out} holds {what} that this run would delete or make again, they were made with {causes}"
 
 
+def finished_without(out: Path, journal: Journal) -> str | None:
+    """Sentence on a finished data set that leaves samples out, which a run that needs them all would undo."""
+    info = _held_info(out, journal)
+    if info is None or not info.left_out or not (out / schema.CHECKSUMS).is_file():
+        return None
+    keep = f"add `{OPTION}` to keep it so, or `--replace` to try them again"
+    return f"{out} is finished, and {left_out_line(info.causes, info.samples)}; {keep}"
+
+
 def _lost_tasks(out: Path, keys: Mapping[str, str], journal: Journal) -> list[str]:
     """Tasks whose files are good, and which the run does not have or makes from other values."""
     other = [name for name, entry in journal.entries.items() if entry.files and keys.get(name) != entry.key]
@@ -90,7 +100,7 @@ def _held_keys(out: Path, journal: Journal, wanted: DatasetInfo) -> dict[str, st
     if head is None or info is None or info.provenance.get("code_sha256") != code_sha256():
         return unlike
     try:
-        plan = make_plan(parse_recipe(head.recipe), held_room_files(out), info.shard)
+        plan = make_plan(parse_recipe(head.recipe), held_room_files(out), info.shard).without(info.causes)
         # a description that `repair` has recovered does not know the renderer
         environment = versions({**wanted.provenance, **info.provenance})
         return {name: task.key for name, task in plan_tasks(plan, environment).items()}

@@ -3,9 +3,9 @@
 It alone decides what is finished; names and times of files do not.
 
 Each line is one entry: a CRC-32 and a JSON object. The first is the folder's head, with the texts of `dataset.json` and
-`recipe.toml`, so that these can be repaired. One entry per finished task follows; the last one of a name counts. A line
-that was half-written or damaged fails its CRC and is ignored: its task is done again. So is one whose files are not
-those of its task: nobody follows a name that leads elsewhere.
+`recipe.toml`, so that these can be repaired. One entry per finished task follows, and one per task that was refused;
+the last one of a name counts. A line that was half-written or damaged fails its CRC and is ignored: its task is done
+again. So is one whose files are not those of its task: nobody follows a name that leads elsewhere.
 """
 
 from __future__ import annotations
@@ -36,6 +36,15 @@ class Entry:
 
 
 @dataclass(frozen=True)
+class Refusal:
+    """A task that was tried and cannot be done: its key, and the cause that it gave."""
+
+    task: str
+    key: str
+    refused: str
+
+
+@dataclass(frozen=True)
 class FolderHead:
     """Description of the folder: the text of `dataset.json`, and of the recipe."""
 
@@ -50,6 +59,7 @@ class Journal:
     ----------
     head : FolderHead or None
     entries : dict of Entry by task
+    refusals : dict of Refusal by task
     damaged : list of int
         Numbers of the lines that are ignored, from 1.
     """
@@ -60,14 +70,15 @@ class Journal:
         self._size = 0
         self.head: FolderHead | None = None
         self.entries: dict[str, Entry] = {}
+        self.refusals: dict[str, Refusal] = {}
         self.damaged: list[int] = []
         for number, document in enumerate(_documents(self._path), 1):
             if document is None:
                 self.damaged.append(number)
             elif isinstance(document, FolderHead):
                 self.head = document
-            elif set(document.files) <= schema.task_files(document.task):
-                self.entries[document.task] = document
+            elif _is_of_its_task(document):
+                self._note(document)
             else:
                 self.damaged.append(number)
 
@@ -79,8 +90,21 @@ class Journal:
             self._file.close()
             self._file = None
 
+    def _note(self, document: Entry | Refusal) -> None:
+        """Keep an entry or a refusal in memory; of both, the last one of a task counts."""
+        if isinstance(document, Entry):
+            self.entries[document.task] = document
+            self.refusals.pop(document.task, None)
+        else:
+            self.refusals[document.task] = document
+            self.entries.pop(document.task, None)
+
+    def keep_refusals(self, tasks: Iterable[str]) -> None:
+        """Forget the refusals of all tasks but these; the next `begin` writes them in this order."""
+        self.refusals = {name: self.refusals[name] for name in tasks if name in self.refusals}
+
     def begin(self, head: FolderHead, tasks: Iterable[str]) -> None:
-        """Write the journal anew, atomically: this head, and the entries of these tasks in this order."""
+        """Write the journal anew, atomically: this head, the entries of these tasks in this order, the refusals."""
         self.__exit__()
         self.head = head
         self.entries = {name: self.entries[name] for name in tasks if name in self.entries}
@@ -111,16 +135,23 @@ class Journal:
 
     def _bytes(self, head: FolderHead, tasks: Iterable[str]) -> bytes:
         entries = (self.entries[name] for name in tasks if name in self.entries)
-        return b"".join([_line(asdict(head)), *(_line(asdict(entry)) for entry in entries)])
+        lines = [_line(asdict(head)), *(_line(asdict(entry)) for entry in entries)]
+        return b"".join([*lines, *(_line(asdict(refusal)) for refusal in self.refusals.values())])
 
-    def add(self, entry: Entry) -> None:
-        """Append one entry. The operating system has it before this returns, so that kill -9 cannot take it."""
+    def add(self, entry: Entry | Refusal) -> None:
+        """Append one entry or refusal. The operating system has it before this returns: kill -9 cannot take it."""
         if self._file is None:
             self._file = self._path.open("ab", buffering=0)
         line = _line(asdict(entry))
         self._file.write(line)
         self._size += len(line)
-        self.entries[entry.task] = entry
+        self._note(entry)
+
+
+def _is_of_its_task(document: Entry | Refusal) -> bool:
+    """Tell whether a line names a task, and no files but those that the task may write."""
+    files = schema.task_files(document.task)
+    return set(document.files) <= files if isinstance(document, Entry) else bool(files)
 
 
 def _line(document: dict[str, Any]) -> bytes:
@@ -128,8 +159,8 @@ def _line(document: dict[str, Any]) -> bytes:
     return b"%08x %b\n" % (zlib.crc32(text), text)
 
 
-def _documents(path: Path) -> Iterator[FolderHead | Entry | None]:
-    """Head and entries of a journal, line by line; None for a line that is damaged or of another form."""
+def _documents(path: Path) -> Iterator[FolderHead | Entry | Refusal | None]:
+    """Head, entries and refusals of a journal, line by line; None for a line that is damaged or of another form."""
     if not path.is_file():
         return
     data = InputFile(path, "remove it, and run `phibench dataset make` again").read()
@@ -141,4 +172,4 @@ def _documents(path: Path) -> Iterator[FolderHead | Entry | None]:
             yield None
 
 
-_LINES: TypeAdapter[FolderHead | Entry] = TypeAdapter(FolderHead | Entry)
+_LINES: TypeAdapter[FolderHead | Entry | Refusal] = TypeAdapter(FolderHead | Entry | Refusal)

@@ -19,12 +19,13 @@ from pathlib import Path
 from rich.console import Console
 
 from phibench.datasets.build.forecast import Pace, TaskProgress, forecast, megabytes, slowdown
-from phibench.datasets.build.journal import Entry, FolderHead, Journal
+from phibench.datasets.build.journal import Entry, FolderHead, Journal, Refusal
+from phibench.datasets.build.refusals import listed
 from phibench.datasets.build.scheduler import schedule
 from phibench.datasets.build.task_list import bake_task_name, sample_task_name, spot_task_name
 from phibench.datasets.build.tasks import Done, Failed, Task, log_entry
 from phibench.datasets.build.workers import WorkerPool
-from phibench.datasets.errors import DatasetError, IncompleteError
+from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import InputFile
 from phibench.datasets.plan.plan import PairPlan, Plan
 from phibench.datasets.progress import Steps
@@ -155,9 +156,6 @@ def held_head(out: Path) -> FolderHead | None:
     return FolderHead(info.text(), recipe.text() if recipe.path.is_file() else "")
 
 
-_TOLD = 20  # failures that are told in full
-
-
 def unfinished(tasks: Mapping[str, Task], journal: Journal, out: Path) -> list[str]:
     """Names of the tasks whose entry is missing, of another key, or belies the files."""
     known = [name for name, task in tasks.items() if (e := journal.entries.get(name)) is not None and e.key == task.key]
@@ -186,9 +184,8 @@ def run_tasks(
     Raises
     ------
     DatasetError
-        If the disk has no room, or, when all others are done, with the tasks that failed and why.
-    IncompleteError
-        If samples were refused and nothing else has failed, when all others are done.
+        If the disk has no room, or, when all others are done, with the tasks that failed and why. The journal has
+        those that were refused; if nothing else has failed they are no error here.
     """
     chosen = [tasks[name] for name in todo]
     cost, before = forecast(plan, chosen), {name: journal.entries[name] for name in todo if name in journal.entries}
@@ -206,8 +203,6 @@ def run_tasks(
             console.print(f"warning: {name} came out with other bytes than the first time", highlight=False)
     if any(not failed.refused for failed in failures.values()):
         raise DatasetError(_report(failures, len(todo)))
-    if refused := {**plan.refused, **_refused(plan, tasks, failures)}:
-        raise IncompleteError(_refusals(plan, refused))
 
 
 def _run(
@@ -222,6 +217,8 @@ def _run(
             if isinstance(outcome, Done):
                 journal.add(Entry(task.name, task.key, outcome.files, outcome.result))
             else:
+                if outcome.refused and not any(need in failures for need in task.needs):
+                    journal.add(Refusal(task.name, task.key, outcome.cause))
                 failures[task.name] = outcome
             log.write(json.dumps({"time": datetime.now(UTC).isoformat(), **log_entry(task, outcome)}) + "\n")
             log.flush()
@@ -235,40 +232,7 @@ def _report(failures: dict[str, Failed], count: int) -> str:
     first = (
         f"{len(failures)} of {count} tasks failed; what is finished is kept, run the same command again for the rest:"
     )
-    return _listed(first, lines)
-
-
-def _listed(first: str, lines: Sequence[str]) -> str:
-    more = [f"  and {len(lines) - _TOLD} more, see {schema.LOG}"] if len(lines) > _TOLD else []
-    return "\n".join([first, *(f"  {line}" for line in lines[:_TOLD]), *more])
-
-
-def _refused(plan: Plan, tasks: Mapping[str, Task], failures: Mapping[str, Failed]) -> dict[str, str]:
-    """Cause by sample, for those whose last task is not done: that of the first task of theirs that failed."""
-    named = {pair.sample_id: sample_task_name(pair) for pair in plan.pairs}
-    return {
-        sample_id: failures[_culprit(name, tasks, failures)].cause
-        for sample_id, name in named.items()
-        if name in failures
-    }
-
-
-def _culprit(name: str, tasks: Mapping[str, Task], failures: Mapping[str, Failed]) -> str:
-    need = next((need for need in tasks[name].needs if need in failures), None)
-    return name if need is None else _culprit(need, tasks, failures)
-
-
-def _refusals(plan: Plan, refused: Mapping[str, str]) -> str:
-    """One sentence for each refused sample: which, why, and what to do."""
-    order, count = sorted(refused) if plan.recipe.random else list(refused), len(plan.pairs) + len(plan.refused)
-    remedy = "change its target, its stroke or its rig"
-    if plan.recipe.random is not None:
-        number = int(order[0].rsplit("-", 1)[1])  # the samples of a shard are numbered as in the whole
-        fewer = f", or `--samples {number}` for those before {order[0]} alone" if number and plan.shard is None else ""
-        remedy = f"give another seed{fewer}"
-    lines = [f"{name} is refused: {refused[name]}; {remedy}" for name in order]
-    first = f"{len(refused)} of {count} samples are refused, all others are kept; the data set is not finished:"
-    return _listed(first, lines)
+    return listed(first, lines)
 
 
 # The small files, when all tasks are done.

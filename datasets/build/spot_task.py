@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -59,14 +59,23 @@ def make_spot(out: Path, dataset: str, rig: Rig, source: RoomSource, spot: Laser
     views = {position: rig.at(Stroke(pair.stroke_m).offset_m(position)) for position in POSITIONS}
     room = room_of(source, out / schema.ROOM_FILES)
     answers = {position: answer_spot(view, spot, room) for position, view in views.items()}
-    if refused := [text for position in POSITIONS for text in _complaints(position, answers[position])]:
-        raise RefusedSampleError(f"a certificate is out of tolerance ({'; '.join(refused)})")
+    if fault := certificate_fault(answers):
+        raise RefusedSampleError(fault)
     rows = {}
     for position, answer in answers.items():
         file = _write_layer(out, dataset, pair, position, answer)
         rows[position] = _spot_row(pair.pose_id(position), views[position], answer, file)
     row = manifest_row(rig, spot, pair, rows["down"], rows["up"])
     return Made(tuple(r.spot_file for r in rows.values() if r.spot_file is not None), row.model_dump(mode="json"))
+
+
+OUT_OF_TOLERANCE = "a certificate is out of tolerance"
+
+
+def certificate_fault(answers: Mapping[str, SpotAnswer]) -> str:
+    """Cause for which a sample is refused by the certificates of both positions; empty if it is not."""
+    told = [text for position in POSITIONS for text in _complaints(position, answers[position])]
+    return f"{OUT_OF_TOLERANCE} ({'; '.join(told)})" if told else ""
 
 
 def _write_layer(out: Path, dataset: str, pair: PairPlan, position: str, answer: SpotAnswer) -> str | None:

@@ -8,7 +8,7 @@ complete and readable.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from phibench.datasets.errors import DatasetError, RecipeError
@@ -121,6 +121,8 @@ class Plan:
         Of all rooms of the recipe, with the SHA-256 that they must have.
     refused : dict
         Samples that are not among `pairs`, because they cannot be drawn: the reason by id.
+    left_out : dict
+        Samples that are not among `pairs`, because a data set is finished without them: the cause by id (`without`).
     """
 
     recipe: Recipe
@@ -133,6 +135,29 @@ class Plan:
     shard: str | None = None
     files: RoomFiles = RoomFiles()
     refused: dict[str, str] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def sample_ids(self) -> list[str]:
+        """Ids of all samples, of those too that cannot be drawn, in the order of the recipe."""
+        names = [pair.sample_id for pair in self.pairs]
+        return sorted([*names, *self.refused]) if self.refused else names  # drawn samples: their numbers give the order
+
+    def without(self, causes: Mapping[str, str]) -> Plan:
+        """Plan without some samples, and without the rigs, rooms, spots and poses that they alone have.
+
+        Parameters
+        ----------
+        causes : cause by id of a sample; ids of no sample are ignored
+        """
+        if not causes:
+            return self
+        part = _of_pairs(self, tuple(pair for pair in self.pairs if pair.sample_id not in causes))
+        return replace(
+            part,
+            refused={name: reason for name, reason in self.refused.items() if name not in causes},
+            left_out=self.left_out | {name: causes[name] for name in self.sample_ids if name in causes},
+        )
 
     def room(self, name: str) -> Room:
         """Room of an id, built from the files in their folder."""
@@ -307,11 +332,18 @@ def shard_plan(plan: Plan, shard: str | None) -> Plan:
     if shard is None:
         return plan
     # shards in a row, without a gap; their sizes differ by one sample at most
-    names = [pair.sample_id for pair in plan.pairs]
-    names = sorted([*names, *plan.refused]) if plan.refused else names  # drawn samples: their numbers give the order
+    names = plan.sample_ids
     part = _part_of(shard, len(names))
     owned = set(names[part.start : part.stop])
-    pairs = tuple(pair for pair in plan.pairs if pair.sample_id in owned)
+    return replace(
+        _of_pairs(plan, tuple(pair for pair in plan.pairs if pair.sample_id in owned)),
+        shard=_written(shard),
+        refused={name: reason for name, reason in plan.refused.items() if name in owned},
+    )
+
+
+def _of_pairs(plan: Plan, pairs: tuple[PairPlan, ...]) -> Plan:
+    """Plan of some of the pairs, with what they need alone."""
     poses, spots = {pair.pose_id(p) for pair in pairs for p in POSITIONS}, {pair.spot for pair in pairs}
     rigs = {name for pair in pairs for name in (pair.rig, pair.nominal_rig)}
     return replace(
@@ -321,8 +353,6 @@ def shard_plan(plan: Plan, shard: str | None) -> Plan:
         spots={name: spot for name, spot in plan.spots.items() if name in spots},
         poses=tuple(pose for pose in plan.poses if pose.pose_id in poses),
         pairs=pairs,
-        shard=_written(shard),
-        refused={name: reason for name, reason in plan.refused.items() if name in owned},
     )
 
 

@@ -108,6 +108,7 @@ def further_points(
 TRIES = 100
 HIDDEN_TRIES = 1000
 """Of samples whose spot one image is to hide: in the worst rooms one draw in some 50 does."""
+UNDRAWN = "has no possible rig, spot and stroke"
 HIDDEN, SHOWN = "in one image", "in none"
 """Values of "spot.hidden"."""
 _PILOT = 8  # samples
@@ -288,7 +289,7 @@ class _Makers:
         spreads = [name for name, one in _sample_distributions(self._table) if len(set(_support(one))) > 1]
         drawn = f"narrow the distributions ({', '.join(spreads[:4])}{', ...' * (len(spreads) > 4)})" if spreads else ""
         advice = " or ".join(filter(None, ("change the numbers that are fixed", drawn)))
-        why = f"has no possible rig, spot and stroke{where} in {tries} draws; the last: {last}"
+        why = f"{UNDRAWN}{where} in {tries} draws; the last: {last}"
         return f"{why}; {advice}{boards}"
 
     def _tries(self, number: int) -> int:

@@ -48,6 +48,7 @@ from phibench.datasets.release.benchmark import (
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import checksums_text, read_checksums
 from phibench.datasets.store.croissant import LICENSE_TEXT, LICENSE_URL, croissant_text, file_object
+from phibench.datasets.store.documents import read_info
 from phibench.datasets.store.files import (
     WriteError,
     only_run,
@@ -268,6 +269,9 @@ def _misfit(request: ReleaseRequest, part: Part, folder: Path) -> str:
         return _OTHER
     if not (folder / schema.CHECKSUMS).is_file():
         return "it was not finished; run its `phibench dataset make` again"
+    if part.kind != "films" and (left_out := read_info(folder).left_out):
+        refused = f"{len(left_out)} of its samples are refused and left out, such as {left_out[0].sample_id}"
+        return f"{refused}, and a release has all samples of its recipe"
     seed, samples = drawn_numbers(text)
     wanted = request.samples_of(part)
     if samples != wanted:

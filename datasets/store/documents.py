@@ -35,6 +35,7 @@ from phibench.datasets.store.schema import (
     SCHEMA_VERSION,
     DatasetInfo,
     Document,
+    LeftOutInfo,
     ManifestRow,
     PoseInfo,
     RigInfo,
@@ -171,14 +172,16 @@ def dataset_info(plan: Plan, environment: dict[str, Any]) -> DatasetInfo:
         poses=tuple(_pose_info(pose) for pose in plan.poses),
         samples=len(plan.pairs),
         shard=plan.shard,
+        left_out=tuple(LeftOutInfo(sample_id=name, cause=cause) for name, cause in plan.left_out.items()),
         conventions=CONVENTIONS,
         provenance={**provenance(), **environment},
     )
 
 
 def info_text(info: DatasetInfo) -> str:
-    """Text of `dataset.json`."""
-    return json.dumps(info.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
+    """Text of `dataset.json`; a data set of which nothing was left out has no such key, as before there was one."""
+    document = info.model_dump(mode="json", exclude=None if info.left_out else {"left_out"})
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
 
 def same_content(a: DatasetInfo, b: DatasetInfo) -> bool:

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, field_validator, model_validator
 
-from phibench.datasets.input_files import FileName, Name, NoFileName
+from phibench.datasets.input_files import FileName, Name, NoFileName, Text
 from phibench.datasets.rooms.room_sources import ONLY_ROOM
 
 SCHEMA_VERSION = 6
@@ -172,6 +172,13 @@ class PoseInfo(Document):
         return files
 
 
+class LeftOutInfo(Document):
+    """One sample that was refused and left out, in `dataset.json`."""
+
+    sample_id: Name = described("-", "id that the sample has in the recipe")
+    cause: Text = described("-", "why it cannot be made: no possible draw, its certificate, or the noise of its views")
+
+
 class RigInfo(Document):
     """One rig: one line of `rigs.jsonl`."""
 
@@ -207,8 +214,16 @@ class DatasetInfo(Document):
     poses: Annotated[tuple[PoseInfo, ...], Field(strict=False)] = described("-", "all mirror poses")
     samples: int = described("-", "number of rows of the manifest")
     shard: str | None = described("-", "which part of the recipe this is, such as 1/4; null for all of it")
+    left_out: Annotated[tuple[LeftOutInfo, ...], Field(strict=False)] = described(
+        "-", "samples of the recipe that were refused and left out; the key is missing where there are none", default=()
+    )
     conventions: dict[str, str] = described("-", "frames, pixels, phi, units in one sentence each")
     provenance: dict[str, Any] = described("-", "versions, commit, code hash, variant, LLVM, threads")
+
+    @property
+    def causes(self) -> dict[str, str]:
+        """Cause by id of the samples that were left out."""
+        return {one.sample_id: one.cause for one in self.left_out}
 
 
 # Lines and columns.

@@ -31,6 +31,7 @@ def make(
     seed: Whole | None = None,
     replace: Annotated[bool, Parameter(negative="")] = False,
     room_files: Path | None = None,
+    leave_out_refused: Annotated[bool, Parameter(negative="")] = False,
     dry_run: bool = False,
 ) -> int:
     """Render a data set; what is finished already is kept. Sensitivities of D come last, sensitivities.parquet.
@@ -55,10 +56,13 @@ def make(
         Delete or make again finished work that does not fit, of another seed or recipe; what fits is kept.
     room_files
         Folder of the panoramas and meshes that the recipe names; the recipe's own by default.
+    leave_out_refused
+        Finish the data set without the samples that are refused; dataset.json lists them with their causes.
     dry_run
         Say what will be seen, where and why not, how many tasks, bytes and seconds it takes; render nothing.
     """
     given: Any = {"shard": shard, "samples": samples, "seed": seed, "replace": replace, "room_files": room_files}
+    given["leave_out_refused"] = leave_out_refused
     if dry_run:
         from phibench.datasets.make import dry_run as dry_run_text
 

@@ -110,12 +110,14 @@ def make(
     seed: int | None = None,
     replace: bool = False,
     room_files: str | Path | None = None,
+    leave_out_refused: bool = False,
 ) -> Path:
     """Make the data set of a recipe; parameters and errors are those of `phibench.datasets.make.make`.
 
     A shard has no table of sensitivities: `merge` writes that of the whole.
     """
-    folder = rendering.make(recipe, out, workers, console, scheduler, shard, samples, seed, replace, room_files)
+    numbers = (shard, samples, seed, replace, room_files, leave_out_refused)
+    folder = rendering.make(recipe, out, workers, console, scheduler, *numbers)
     if shard is None:
         keep_sensitivities(folder)
     return folder

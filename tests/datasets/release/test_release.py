@@ -179,6 +179,13 @@ def test_folders_and_seeds_that_will_not_do(made: Made, tmp_path: Path, smallest
     assert "holds other files" in told(out=tmp_path / "full")
     assert (tmp_path / "full" / "mine.txt").read_text() == "mine"
     assert "no data set of a recipe" in told(use=[tmp_path / "full"])
+    lacking = tmp_path / "lacking"
+    shutil.copytree(smallest_dataset, lacking)
+    left_out = [{"sample_id": "seen-near-h0.500", "cause": "a certificate"}]
+    info = json.loads((lacking / "dataset.json").read_text()) | {"left_out": left_out}
+    (lacking / "dataset.json").write_text(json.dumps(info))
+    refused = "1 of its samples are refused and left out, such as seen-near-h0.500, and a release has all samples"
+    assert refused in told(use=[lacking])
     sealed = Part("hidden", SMALL.recipe, "sealed", SMALL.sha256)  # the data set has the public seed
     for number, mode, expected in (
         (SECRET, 0o600, "seed is not the one"),

@@ -23,6 +23,7 @@ MODELS = (
     schema.NoiseRow,
     schema.DatasetInfo,
     schema.PoseInfo,
+    schema.LeftOutInfo,
     schema.RigInfo,
     schema.RoomInfo,
     FrameRow,
