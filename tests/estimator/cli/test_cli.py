@@ -200,7 +200,7 @@ def test_make_passes_shard_and_scheduler_on(monkeypatch, tmp_path):
     assert kept == []  # a shard's are made when it is merged
     assert calls == [
         (("smoke", tmp_path, 3, None, "s", "2/5", None, None, False, None, False), {})
-    ]  # console ... replace
+    ]
 
 
 def lines_of(written: io.StringIO) -> list[str]:
