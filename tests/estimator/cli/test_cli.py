@@ -198,9 +198,7 @@ def test_make_passes_shard_and_scheduler_on(monkeypatch, tmp_path):
     kept = sensitivities_kept(monkeypatch)
     assert cli.main(tokens) == 0
     assert kept == []  # a shard's are made when it is merged
-    assert calls == [
-        (("smoke", tmp_path, 3, None, "s", "2/5", None, None, False, None, False), {})
-    ]
+    assert calls == [(("smoke", tmp_path, 3, None, "s", "2/5", None, None, False, None, False), {})]
 
 
 def lines_of(written: io.StringIO) -> list[str]:
