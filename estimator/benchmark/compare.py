@@ -10,6 +10,7 @@ two methods of the same law, any metric at all is called different in at most 1 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -56,6 +57,8 @@ _KEY = ("number", "image")
 _TRUTH = ("sample_id", "draw", "depth_m", "u_true_px", "v_true_px", "visible")
 # of a pair set: how much of it was taken, with which versions
 _MAY_DIFFER = ("pairs", "samples", "hinted", "provenance")
+
+_TOLD = 3  # methods that a note names
 
 _NOTHING = Estimate(np.nan, np.nan, np.nan, "no record counts for both")
 
@@ -138,6 +141,33 @@ def note_on_code(first: ScoreDocument, second: ScoreDocument) -> str:
     return (
         f"the two runs differ in {' and '.join(changed)}: the frames may not be the same; score both again to be sure"
     )
+
+
+def note_on_pairs(first: ScoreDocument, second: ScoreDocument, first_name: str, second_name: str) -> str:
+    """A warning if two scores count different numbers of the same set's pairs; empty if not."""
+    if first.pairs == second.pairs:
+        return ""
+    return (
+        f"{first_name} counts {first.pairs} pairs and {second_name} {second.pairs}: the differences are over the pairs "
+        "that both have"
+    )
+
+
+def note_on_others(mine: Sequence[ScoreDocument], every: Sequence[ScoreDocument]) -> str:
+    """A warning for scores that stand together if others of the same set count another number of pairs.
+
+    Parameters
+    ----------
+    mine : scores of the same pairs
+    every : these and all others
+    """
+    first = mine[0]
+    apart = [one for one in every if same_pairs(one) == same_pairs(first) and one.pairs != first.pairs]
+    if not apart:
+        return ""
+    told = ", ".join(f"{one.method.name} ({one.pairs})" for one in apart[:_TOLD])
+    more = f" and {len(apart) - _TOLD} more" if len(apart) > _TOLD else ""
+    return f"{first.pairs} pairs are counted here, other numbers elsewhere: {told}{more}; such scores do not compare"
 
 
 def same_pairs(document: ScoreDocument) -> dict[str, Any]:

@@ -217,6 +217,15 @@ def _curves(axes: Axes, scores: Named, by: str, metric: str, factor: float) -> N
             continue
         x, y = [x for x, _ in shown], [factor * (value.value or math.nan) for _, value in shown]
         axes.errorbar(x, y, yerr=_bars([value for _, value in shown], factor), label=name, capsize=3, **line_style(i))
+        lone = [number for number, (_, value) in enumerate(shown) if value.low is None]
+        colour, mark = line_style(i)["color"], line_style(i)["marker"]
+        axes.plot([x[n] for n in lone], [y[n] for n in lone], mark, color=colour, markerfacecolor="white", zorder=3)
+
+
+def has_open_marks(score: ScoreDocument) -> bool:
+    """True if a point of the curves of a score has no interval: too few samples."""
+    every = (_points(score, by, metric) for metric, _, _ in _ROWS for by, _ in _COLUMNS)
+    return any(value.low is None for points in every for _, value in points)
 
 
 def _points(score: ScoreDocument, by: str, metric: str) -> list[tuple[float, Value]]:

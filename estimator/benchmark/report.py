@@ -18,13 +18,14 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.store.files import write_text
 from phibench.estimator.benchmark.causes import CAUSES, KINDS
-from phibench.estimator.benchmark.compare import same_pairs
+from phibench.estimator.benchmark.compare import note_on_others, same_pairs
 from phibench.estimator.benchmark.document import EncodedPicture, ScoreDocument, read_records, read_score
 from phibench.estimator.benchmark.figures import (
     Picture,
     cause_bars,
     error_maps,
     error_panels,
+    has_open_marks,
     keys,
     pull_histogram,
     radius_panels,
@@ -115,6 +116,8 @@ class Ranking:
         (method, place among its worst) to the key of its frame.
     false_lines : dict of str to str
         What the false detections of a method are, where it has many.
+    apart : str
+        Sentence on scores that count another number of pairs; empty where there are none.
     """
 
     title: str
@@ -130,11 +133,17 @@ class Ranking:
     frames: Mapping[str, EncodedPicture]
     frame_of: Mapping[tuple[str, int], str]
     false_lines: Mapping[str, str]
+    apart: str
 
     @property
     def placed(self) -> bool:
         """True where the places of the spots are known; of real pairs nobody has measured them."""
         return any(score.metrics["rms_counted_px"].value is not None for score in self.scores.values())
+
+    @property
+    def has_open_marks(self) -> bool:
+        """True where a curve has a point without an interval."""
+        return any(has_open_marks(score) for score in self.scores.values())
 
     @property
     def board(self) -> list[str]:
@@ -201,7 +210,8 @@ def report_html(
         kinds=KINDS,
     )
     environment.filters["json"] = lambda value: json.dumps(value, indent=1)
-    rankings = [_ranking(number, group, by) for number, group in enumerate(_groups(scores), 1)]
+    every = [document for document, _ in scores]
+    rankings = [_ranking(number, group, every, by) for number, group in enumerate(_groups(scores), 1)]
     return environment.get_template(_TEMPLATE).render(rankings=rankings, sections=sections, title=title)
 
 
@@ -214,14 +224,18 @@ def _groups(scores: Sequence[tuple[ScoreDocument, pl.DataFrame]]) -> list[list[t
     return list(groups.values())
 
 
-def _ranking(number: int, group: list[tuple[ScoreDocument, pl.DataFrame]], by: str) -> Ranking:
+def _ranking(
+    number: int, group: list[tuple[ScoreDocument, pl.DataFrame]], every: Sequence[ScoreDocument], by: str
+) -> Ranking:
     order = sorted(group, key=lambda item: rank_key(item[0], by))
     names = _distinct([document.method.name for document, _ in order])
     scores = {name: document for name, (document, _) in zip(names, order, strict=True)}
     tables = {name: table for name, (_, table) in zip(names, order, strict=True)}
     pair_set = order[0][0].pair_set
     presets: Any = pair_set.get("presets", ())
-    title = ", ".join([str(pair_set.get("name", "unnamed")), *presets])
+    apart = note_on_others([document for document, _ in order], every)
+    counted = (f"{order[0][0].pairs} pairs",) if apart else ()
+    title = ", ".join([str(pair_set.get("name", "unnamed")), *presets, *counted])
     frames, frame_of = _frames(number, scores)
     return Ranking(
         title=title,
@@ -237,6 +251,7 @@ def _ranking(number: int, group: list[tuple[ScoreDocument, pl.DataFrame]], by: s
         frames=frames,
         frame_of=frame_of,
         false_lines={name: line for name, table in tables.items() if (line := false_line(table))},
+        apart=apart,
     )
 
 

@@ -8,6 +8,7 @@ causes. Differences and their verdicts are those of `compare`.
 from __future__ import annotations
 
 import json
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,13 @@ import polars as pl
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.store.files import write_text
 from phibench.estimator.benchmark.answer_errors import Rules
-from phibench.estimator.benchmark.compare import Difference, compare_records, note_on_code, same_pairs
+from phibench.estimator.benchmark.compare import (
+    Difference,
+    compare_records,
+    note_on_code,
+    note_on_others,
+    same_pairs,
+)
 from phibench.estimator.benchmark.document import ScoreDocument, StratumScore, read_records, read_score
 from phibench.estimator.benchmark.metrics import METRICS, applies
 from phibench.estimator.benchmark.report import Section, report_html
@@ -105,10 +112,17 @@ def read_parts(files: Sequence[Path], against: str = AGAINST, by: str = "phi", s
         if any(other.method.name == document.method.name for other, _ in group):
             raise DatasetError(f"{path}: {document.method.name} has another score of the same pairs; give one of them")
         group.append((document, read_records(path, document)))
-    return [_part(group, against, by, seed) for group in groups.values()]
+    every = [document for group in groups.values() for document, _ in group]
+    return [_part(group, every, against, by, seed) for group in groups.values()]
 
 
-def _part(group: Sequence[tuple[ScoreDocument, pl.DataFrame]], against: str, by: str, seed: int) -> Part:
+def _part(
+    group: Sequence[tuple[ScoreDocument, pl.DataFrame]],
+    every: Sequence[ScoreDocument],
+    against: str,
+    by: str,
+    seed: int,
+) -> Part:
     tables = {document.method.name: table for document, table in group}
     order = ranked([document for document, _ in group], by)
     base = next((one for one in order if one.method.name == against), order[0])
@@ -121,8 +135,10 @@ def _part(group: Sequence[tuple[ScoreDocument, pl.DataFrame]], against: str, by:
     }
     notes = [f"{one.method.name}: {flag.text}" for one in order for flag in one.flags]
     notes += [f"{one.method.name}: {text}" for one in order if (text := note_on_code(base, one))]
-    presets = ", ".join(base.pair_set.get("presets", ()))
-    return Part(presets or "pairs", tuple(order), name, differences, tuple(notes))
+    title = ", ".join(base.pair_set.get("presets", ())) or "pairs"
+    if apart := note_on_others(order, every):
+        notes, title = [apart, *notes], f"{title}, {base.pairs} pairs"
+    return Part(title, tuple(order), name, differences, tuple(notes))
 
 
 # -- tables ------------------------------------------------------------------------------------------------------------
@@ -228,7 +244,7 @@ def results_page(parts: Sequence[Part], by: str = "phi") -> str:
     for part in parts:
         text.append(f"## {part.title}\n")
         text += [_titled(grid) for grid in grids(part)]
-        text += ["".join(f"* {_sentence(note)}\n" for note in part.notes)] * bool(part.notes)
+        text += ["".join(f"{_item(note)}\n" for note in part.notes)] * bool(part.notes)
     return "\n".join(text)
 
 
@@ -238,8 +254,10 @@ def _titled(grid: Grid) -> str:
     return f"**{grid.title}**\n\n{rest}"
 
 
-def _sentence(note: str) -> str:
-    return note if note.endswith(".") else f"{note}."
+def _item(note: str) -> str:
+    """Item of a list, a sentence in lines of at most 120 characters."""
+    text = note if note.endswith(".") else f"{note}."
+    return textwrap.fill(f"* {text}", 120, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 
 
 def _sources(parts: Sequence[Part]) -> Iterator[str]:

@@ -142,7 +142,7 @@ def compare(first: Path, second: Path, *, bootstrap_seed: Whole = 0, output: Out
         Seed of the bootstrap that makes the intervals.
     """
     from phibench.estimator.benchmark.compare import compare as compare_scores
-    from phibench.estimator.benchmark.compare import note_on_code
+    from phibench.estimator.benchmark.compare import note_on_code, note_on_pairs
     from phibench.estimator.benchmark.document import read_score
     from phibench.estimator.benchmark.score_tables import print_comparison
 
@@ -150,7 +150,7 @@ def compare(first: Path, second: Path, *, bootstrap_seed: Whole = 0, output: Out
     a, b = read_score(first), read_score(second)
     print_comparison(differences, _distinct(first, a), _distinct(second, b), form, output.wide)
     lines = sys.stdout if form == "terminal" else sys.stderr
-    if note := note_on_code(a, b):
+    for note in filter(None, (note_on_pairs(a, b, str(first), str(second)), note_on_code(a, b))):
         print(f"note: {note}", file=lines)
     if all(item.better == "too few samples" for item in differences):
         print(f"Too few samples for a verdict: {a.rules['least_compared']:g} are the least.", file=lines)

@@ -18,7 +18,14 @@ from phibench.datasets.errors import DatasetError
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.causes import CAUSES
 from phibench.estimator.benchmark.document import Flag, MethodCard, write_score
-from phibench.estimator.benchmark.figures import Picture, cause_bars, plain_number, pull_histogram
+from phibench.estimator.benchmark.figures import (
+    Picture,
+    cause_bars,
+    error_panels,
+    has_open_marks,
+    plain_number,
+    pull_histogram,
+)
 from phibench.estimator.benchmark.report import Section, report_html, time_section, verdict, write_report
 from phibench.estimator.benchmark.results_page import read_parts
 from phibench.estimator.benchmark.score import score_outcomes
@@ -297,6 +304,40 @@ def test_results_are_one_page_in_each_form(score_files, tmp_path, capsys):
     again = tmp_path / "again.md"
     assert cli.main([*words, "--out", str(again)]) == 0
     assert again.read_bytes() == page.read_bytes()
+
+
+def test_scores_of_fewer_pairs_are_told_of(score_files, tmp_path, capsys):
+    """One method was scored on 25 of the 40 pairs."""
+    few = tmp_path / "few.json"
+    write_score(few, *scored("few", shifted(0.3), cases(25)))
+    files = [str(score_files[0]), str(few)]
+    assert cli.main(["results", *files, "--out", str(tmp_path / "results.md")]) == 0
+    text = (tmp_path / "results.md").read_text()
+    assert "25 pairs are counted here, other numbers elsewhere: half (40); such scores do not compare." in text
+    assert "40 pairs are counted here, other numbers elsewhere: few (25); such scores do not compare." in text
+    assert len(re.findall(r"^## .*, (?:25|40) pairs$", text, re.M)) == 2
+    assert cli.main(["report", *files, "--out", str(tmp_path / "page.html")]) == 0
+    page = (tmp_path / "page.html").read_text()
+    assert page.count("pairs are counted here, other numbers elsewhere") == 2
+    capsys.readouterr()
+    assert cli.main(["compare", *files]) == 0
+    said = capsys.readouterr().out
+    assert f"{files[0]} counts 40 pairs and {few} 25: the differences are over the pairs that both have" in said
+    assert cli.main(["compare", *map(str, score_files[:2])]) == 0
+    assert "counts" not in capsys.readouterr().out
+
+
+def test_points_without_an_interval_are_open_and_explained(html):
+    """Each stratum of three pairs has fewer than five samples; with forty, those of distance have more."""
+    few = scored("ideal", sampler(), cases(3))
+    assert "Open marks: too few samples for an interval." in report_html([few])
+    assert has_open_marks(few[0])
+    many = scored("ideal", sampler(), cases(200))
+    assert not has_open_marks(many[0])
+    assert "Open marks" not in report_html([many])
+    for document, is_open in ((few[0], True), (many[0], False)):
+        drawn = base64.b64decode(error_panels({"ideal": document})[0].source.split(",")[1]).decode()
+        assert ("fill: #ffffff; stroke: #0072b2" in drawn) == is_open
 
 
 @pytest.mark.parametrize("command", ["report", "results", "compare"])
