@@ -167,10 +167,12 @@ class Summary:
 
 
 def summary(episodes: Sequence[Episode]) -> Summary:
-    """Summary of episodes: all of those that were reached but for the share and the pull."""
+    """Summary of episodes: all of those that were reached but for the share and the pull.
+
+    The share has the exact interval of Clopper and Pearson, as every rate of this package.
+    """
     reached = [one for one in episodes if one.reached]
-    share = binomtest(len(reached), len(episodes))
-    low, high = share.proportion_ci(method="wilson")
+    low, high = binomtest(len(reached), len(episodes)).proportion_ci(method="exact")
     pulls = np.array([one.pull for one in episodes if math.isfinite(one.pull)])
     errors = np.array([one.stated_m / one.distance_m - 1.0 for one in episodes if math.isfinite(one.stated_m)])
     return Summary(

@@ -56,6 +56,11 @@ def test_differences_are_taken_episode_by_episode() -> None:
     found = summary(later)
     assert found.reached[0] == pytest.approx(5 / 6)
     assert found.reached[1] < 5 / 6 < found.reached[2] < 1.0
+    # by hand: 5 or more of 6 have a chance of 2.5 % at `low`, 5 or fewer at `high`
+    low, high = found.reached[1:]
+    assert 6 * low**5 * (1.0 - low) + low**6 == pytest.approx(0.025, rel=1e-9)
+    assert 1.0 - high**6 == pytest.approx(0.025, rel=1e-9)
+    assert summary(later[:5]).reached[1:] == pytest.approx((0.025**0.2, 1.0))  # all of 5
     assert found.time_s[0] == 14.0
     assert math.isnan(interval([1.0, 2.0])[1])
 
