@@ -31,7 +31,7 @@ from phibench.render.sensor.electrons import (
     stop_factor,
 )
 from phibench.render.sensor.light import Light, Region
-from phibench.render.sensor.noise_tiles import NoiseStream, whole_tiles
+from phibench.render.sensor.noise_tiles import TILE_PX, NoiseStream, whole_tiles
 from phibench.render.sensor.processing import (
     LUMA,
     MCU_PX,
@@ -50,6 +50,8 @@ from phibench.render.sensor.processing import (
 from phibench.render.sensor.settings import Sensor, SensorError
 from phibench.scenes.camera import Camera
 from phibench.scenes.frames import Array
+
+_BAND_PX = 64  # rows that are processed at a time: what a core's cache holds
 
 
 @dataclass(frozen=True)
@@ -109,22 +111,29 @@ class Chain:
 
     def raw(self, light: Light, stream: NoiseStream, region: Region) -> NDArray[np.uint16]:
         """Return the converter's DN, shape (h, w)."""
-        tiles = whole_tiles(region, light.size)
-        photo = self.photo_electrons(light, tiles, speckle_gain(self.sensor, stream))
-        pattern = self.pattern(tiles)
-        charge = collected(mean_charge(photo, self.sensor, pattern), self.sensor, stream, tiles)
-        return digitised(read_out(charge, self.sensor, pattern, stream, tiles), self.sensor)[region.slices(tiles)]
+        s, tiles = self.sensor, whole_tiles(region, light.size)
+        photo = self.photo_electrons(light, tiles, speckle_gain(s, stream))
+        pattern, dn = self.pattern(tiles), np.empty(tiles.shape, np.uint16)
+        for band in tiles.bands(TILE_PX):
+            rows, _ = band.slices(tiles)
+            part = pattern.rows(rows)
+            charge = collected(mean_charge(photo[rows], s, part), s, stream, band)
+            dn[rows] = digitised(read_out(charge, s, part, stream, band), s)
+        return dn[region.slices(tiles)]
 
     def developed(self, light: Light, stream: NoiseStream, region: Region) -> NDArray[np.uint8]:
         """Return the processed image before JPEG, shape (h, w, 3), or (h, w, 2) of "yuyv"."""
-        box = self.raw_region(region, light.size)
-        signal = linear_signal(self.raw(light, stream, box), self.sensor, np.float32)
-        planes = rendered(linear_rgb(signal, self.sensor), self.sensor)
-        if self.sensor.output != "yuyv":
-            return eight_bit(planes)[region.slices(box)]
-        if light.size[1] % 2:
-            raise SensorError(f"image of {light.size[1]} columns: YUYV holds pairs of them, give an even number")
-        return yuyv(planes, self.sensor)[region.slices(box)]
+        yuv, size = self.sensor.output == "yuyv", light.size
+        if yuv and size[1] % 2:
+            raise SensorError(f"image of {size[1]} columns: YUYV holds pairs of them, give an even number")
+        box = self.raw_region(region, size)
+        raw, image = self.raw(light, stream, box), np.empty((*region.shape, 2 if yuv else 3), np.uint8)
+        for band in region.bands(_BAND_PX):
+            around = self.raw_region(band, size)
+            signal = linear_signal(raw[around.slices(box)], self.sensor, np.float32)
+            planes = rendered(linear_rgb(signal, self.sensor), self.sensor)
+            image[band.slices(region)] = (yuyv(planes, self.sensor) if yuv else eight_bit(planes))[band.slices(around)]
+        return image
 
     def shrunk_frame(self, light: Light, stream: NoiseStream, factor: int) -> NDArray[np.uint8]:
         """Whole frame of a camera that shrinks its image, shape (h, w, 3) or (h, w, 2) of "yuyv".

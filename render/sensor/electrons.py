@@ -123,6 +123,13 @@ class FixedPattern:
     responsivity: Array | float
     offset_e: Array | float
 
+    def rows(self, part: slice) -> FixedPattern:
+        """Pattern of some rows."""
+        each = (
+            values[part] if isinstance(values, np.ndarray) else values for values in (self.responsivity, self.offset_e)
+        )
+        return FixedPattern(*each)
+
 
 def fixed_pattern(sensor: Sensor, camera_seed: int, region: Region) -> FixedPattern:
     """Fixed pattern of one camera on a region of whole tiles; read only, and kept for the next frame."""

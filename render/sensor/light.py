@@ -6,6 +6,7 @@ Layers have the shape (3, H, W), planes R, G, B; a region is a rectangle of whol
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -167,6 +168,11 @@ class Region:
         """Rows and columns of this region in an image, or in an array that holds the region `origin`."""
         u0, v0 = (origin.u0_px, origin.v0_px) if origin else (0, 0)
         return slice(self.v0_px - v0, self.v1_px - v0), slice(self.u0_px - u0, self.u1_px - u0)
+
+    def bands(self, rows: int) -> Iterator[Region]:
+        """Parts of so many rows, from above; the last one may have less."""
+        for v in range(self.v0_px, self.v1_px, rows):
+            yield Region(self.u0_px, v, self.u1_px, min(v + rows, self.v1_px))
 
     def grown(self, size: tuple[int, int], step: tuple[int, int] = (1, 1), margin: tuple[int, int] = (0, 0)) -> Region:
         """Smallest region on a grid of `step` pixels (down, across) that holds this one and `margin` pixels around.

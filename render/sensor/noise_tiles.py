@@ -78,12 +78,15 @@ def _by_tiles(stream: NoiseStream, region: Region, draw: Draw) -> Array:
     """Put together what `draw` gives for each tile of `region`."""
     bits = np.random.Philox(key=philox_key(*stream.names))
     generator, state = np.random.Generator(bits), bits.state
+    # plain integers: numpy reads them three times as fast as its own arrays' elements
+    state["state"] = {name: words.tolist() for name, words in state["state"].items()}
+    state["buffer"] = state["buffer"].tolist()
     result = np.empty(region.shape)
     height, width = region.shape
     for v in range(0, height, TILE_PX):
         for u in range(0, width, TILE_PX):
             # word 0 counts the tile's own draws
-            state["state"]["counter"][:] = (0, (region.v0_px + v) // TILE_PX, (region.u0_px + u) // TILE_PX, 0)
+            state["state"]["counter"] = (0, (region.v0_px + v) // TILE_PX, (region.u0_px + u) // TILE_PX, 0)
             bits.state = state
             part = slice(v, v + TILE_PX), slice(u, u + TILE_PX)
             result[part] = draw(generator, part)
