@@ -271,6 +271,6 @@ class CachedSample:
         """Request with the exposure and gain that auto exposure chooses for the down image, for all images."""
         if request.exposure != "auto":
             return request
-        sensor = FrameSource.from_request(self, request).sides["down"].chain.sensor
+        sensor = FrameSource.exposed(self, request)
         overrides = {**request.overrides, "analogue_gain": sensor.analogue_gain}
         return replace(request, exposure=sensor.exposure_s, overrides=overrides)

@@ -194,6 +194,12 @@ class FrameSource:
             sides = {position: _side(sample, position, request, others.get(position, ())) for position in POSITIONS}
         return cls(request, sample.stream_names, sides)
 
+    @staticmethod
+    def exposed(sample: SampleLayers, request: FrameRequest) -> Sensor:
+        """Sensor with the exposure and the gain of the down image, without other lights; errors as of `of`."""
+        with in_one_sentence():
+            return _side(sample, "down", request, ()).chain.sensor
+
     def frames(self, draw: int = 0, *, laser_off: bool = False) -> Frames:
         """Both positions with the laser on, and, if asked for, both with the laser off."""
         return Frames.of(

@@ -16,7 +16,7 @@ The outputs are what is then quantised: codes in steps of 1, or coefficients in 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -36,7 +36,7 @@ from phibench.estimator.spots.jpeg_coefficients import (
     steps,
     transform,
 )
-from phibench.estimator.spots.pixel_statistics import COUNTS, MeanCodes, mean_codes
+from phibench.estimator.spots.pixel_statistics import BESIDE_CURVE, COUNTS, MeanCodes, mean_codes
 from phibench.estimator.spots.raw_pixels import PixelNoise, bayer_filters
 from phibench.scenes.frames import Array
 
@@ -134,6 +134,36 @@ def chain_model(card: SensorCard, noise: PixelNoise) -> ChainModel:
     noise : PixelNoise
         Without the converter's rounding.
     """
+    way = _way(replace(card, **{**BESIDE_CURVE, "jpeg_qtables": None}))
+    linear = _linear(card, way.outer, way.margin)
+    tables = mean_codes(card, noise, way.whole) if card.colour_matrix == UNIT_MATRIX else None
+    fixed = way.kinds, tables, way.sparing, way.transform, way.block, _steps(way.shape, card), way.shift, way.rounding
+    return ChainModel(card, noise, way.shape, way.margin, way.filters, linear, linear.power(2), *fixed)
+
+
+@dataclass(frozen=True)
+class _Way:
+    """What models of cameras of one make share; `outer` is the shape of the codes that count, the rest `ChainModel`'s.
+
+    `whole` says that codes of R, G, B are rounded before JPEG.
+    """
+
+    shape: tuple[int, int]
+    outer: tuple[int, int]
+    margin: int
+    whole: bool
+    filters: NDArray[np.int64]
+    kinds: NDArray[np.int64]
+    sparing: EdgeSparing | None
+    transform: Array
+    block: NDArray[np.int64]
+    shift: Array
+    rounding: Array
+
+
+@lru_cache(maxsize=4)
+def _way(card: SensorCard) -> _Way:
+    """Way of a camera's make; arrays are read only. Nothing here depends on the numbers in `BESIDE_CURVE`."""
     h, w = window_px(card)
     mixed = (card.sharpen_amount > 0.0) + denoise_margin_px(card)
     # R, G, B are whole codes before JPEG; those that sharpening or denoising mix are rounded after it
@@ -142,17 +172,17 @@ def chain_model(card: SensorCard, noise: PixelNoise) -> ChainModel:
     grown = output.margin + mixed
     margin, outer = grown + 1, (h + 2 * grown, w + 2 * grown)
     filters = bayer_filters(np.array([[margin % 2, margin % 2]]), (outer[0] + 2, outer[1] + 2))[0]
-    linear = _linear(card, outer, margin)
     sharp, smooth = neighbours(outer, card)
     T = ((smooth @ sharp).T @ output.transform.T).toarray()
     sparing = edge_sparing(sharp, outer, card)
     if sparing is not None:  # R, G and B change by what Y' does
         same = sparse.kron(np.ones((3, 1)), sparse.eye_array(len(sparing.centre)))
         T = np.vstack([T, card.denoise_luma * (output.transform @ same).toarray().T])
-    tables = mean_codes(card, noise, whole) if card.colour_matrix == UNIT_MATRIX else None
-    kinds = _kinds(filters)
-    parts = (np.ascontiguousarray(T), _blocks(T), output.step, output.shift, output.rounding)
-    return ChainModel(card, noise, (h, w), margin, filters, linear, linear.power(2), kinds, tables, sparing, *parts)
+    T = np.ascontiguousarray(T)
+    arrays = filters, _kinds(filters), T, _blocks(T), output.shift, output.rounding
+    for array in arrays:
+        array.flags.writeable = False
+    return _Way((h, w), outer, margin, whole, *arrays[:2], sparing, *arrays[2:])
 
 
 def _blocks(transform: Array) -> NDArray[np.int64]:
@@ -300,7 +330,6 @@ class _Output:
 
     transform: sparse.csr_array
     margin: int
-    step: Array
     shift: Array
     rounding: Array
 
@@ -310,14 +339,19 @@ def _output(shape: tuple[int, int], card: SensorCard, whole: bool) -> _Output:
     if card.output == "mjpeg":
         parts = shape, card.jpeg_subsampling
         rounding = _rounding(*parts, 0.0 if whole else _ROUNDING)
-        return _Output(
-            sparse.csr_array(transform(*parts)), 0, steps(*parts, qtables_of(card)), _shift(*parts), rounding
-        )
+        return _Output(sparse.csr_array(transform(*parts)), 0, _shift(*parts), rounding)
     count = shape[0] * shape[1]
     if card.output == "yuyv":
         matrix, shift = ycbcr_transform(shape, card)
-        return _Output(matrix, 1, np.ones(2 * count), shift, np.zeros(2 * count))
-    return _Output(sparse.csr_array(sparse.eye_array(3 * count)), 0, np.ones(3 * count), *np.zeros((2, 3 * count)))
+        return _Output(matrix, 1, shift, np.zeros(2 * count))
+    return _Output(sparse.csr_array(sparse.eye_array(3 * count)), 0, *np.zeros((2, 3 * count)))
+
+
+def _steps(shape: tuple[int, int], card: SensorCard) -> Array:
+    """Quantiser's steps, shape (n,)."""
+    if card.output == "mjpeg":
+        return steps(shape, card.jpeg_subsampling, qtables_of(card))
+    return np.ones((2 if card.output == "yuyv" else 3) * shape[0] * shape[1])
 
 
 def _shift(shape: tuple[int, int], subsampling: str) -> Array:

@@ -39,6 +39,7 @@ from phibench.scenes.frames import Array
 _LAW_NODES = 1024  # of the table of information, even in sign(mu) sqrt(|mu|)
 _BELOW = 8.0  # square root of the electrons below 0 that a fit may try
 _FAR = 6.0  # standard deviations beyond which an interval's score is that of its nearer end
+_NO_CHANCE = 12.0  # standard deviations; Q(12) = 2e-33 is below the least chance that counts
 _WELL_SIGMAS = 4.0  # of read noise: what is this near to saturation only says "at least"
 _ROOT_2PI = np.sqrt(2.0 * np.pi)
 
@@ -180,8 +181,12 @@ def _information(low: Array, high: Array, mean: Array, noise: PixelNoise) -> Arr
     """Information on the nodes `mean`, shape (m, 1), about codes with the ends `low`, `high`, shape (256,)."""
     s, by_mean = _deviation(noise, mean)
     _, once = np.unique(low, return_index=True)  # codes that do not occur repeat others
-    chance, change = _interval((low[once] - mean) / s, (high[once] - mean) / s, s, by_mean)
-    return np.sum(np.where(chance > 1e-30, change**2 / np.maximum(chance, 1e-30), 0.0), axis=1)
+    a, b = (low[once] - mean) / s, (high[once] - mean) / s
+    near, told = (a < _NO_CHANCE) & (b > -_NO_CHANCE), np.zeros(a.shape)
+    by_node = (np.broadcast_to(x, a.shape)[near] for x in (s, by_mean))
+    chance, change = _interval(a[near], b[near], *by_node)
+    told[near] = np.where(chance > 1e-30, change**2 / np.maximum(chance, 1e-30), 0.0)
+    return np.sum(told, axis=1)
 
 
 def _deviation(noise: PixelNoise, mean: Array) -> tuple[Array, Array]:
@@ -214,31 +219,54 @@ def _finite(x: Array) -> Array:
 COUNTS = (1, 2, 4)
 """Pixels in a mean."""
 
+_TABLES = ("mean", "by_mean", "regression", "excess")
 _MEAN_NODES = 400  # even in sqrt(mu)
+_AT_ONCE = 4  # nodes that are worked out together
 _POISSON_UP_TO_E = 300.0  # from there a Gaussian: skewness 0.06
 _SIGMAS = 8.0
 _SHORT = 1000  # values of a law up to which a sum of products is quicker than Fourier's way
 
 
-@dataclass(frozen=True)
 class MeanCodes:
     """Tables on nodes even in sqrt(mean), shape (3, 3, m): colour, one of `COUNTS`, node.
 
-    Attributes
+    * mean : codes
+    * by_mean : codes per electron of the pixels' mean
+    * regression : codes per electron: covariance of code and mean of the pixels, over the variance of the latter
+    * excess : variance of the code that the regression leaves, codes squared
+
+    A node is worked out when a mean beside it is first asked for: those of one window lie on a part of the nodes.
+
+    Parameters
     ----------
-    step : float
-        Distance of the nodes, square roots of electrons.
-    mean : codes
-    by_mean : codes per electron of the pixels' mean
-    regression : codes per electron: covariance of code and mean of the pixels, over the variance of the latter
-    excess : variance of the code that the regression leaves, codes squared
+    card : SensorCard
+    noise : PixelNoise
+    curve : shape (3, d), codes at every DN and the quarters between
     """
 
-    step: float
-    mean: Array
-    by_mean: Array
-    regression: Array
-    excess: Array
+    def __init__(self, card: SensorCard, noise: PixelNoise, curve: Array) -> None:
+        root, step = np.linspace(0.0, np.sqrt(1.3 * card.saturation_e), _MEAN_NODES, retstep=True)
+        self._of, self._step, self._mean_e = (card, noise, curve), float(step), root**2
+        self._known = range(0)
+        self._tables = {name: np.zeros((3, len(COUNTS), _MEAN_NODES)) for name in _TABLES}
+
+    def _fill(self, first: int, last: int) -> None:
+        """Work out the nodes from `first` to `last`, and one beside on each side for the derivative."""
+        begin, end = max(first - 1, 0), min(last + 2, _MEAN_NODES)
+        known = self._known or range(begin, begin)
+        if begin >= known.start and end <= known.stop:
+            return
+        begin = min(begin // _AT_ONCE * _AT_ONCE, known.start)
+        end = max(min(-(-end // _AT_ONCE) * _AT_ONCE, _MEAN_NODES), known.stop)
+        tables = self._tables
+        for node in (*range(begin, known.start), *range(known.stop, end)):
+            moments = _moments(float(self._mean_e[node]), *self._of)
+            for name, values in zip(("mean", "regression", "excess"), moments, strict=True):
+                tables[name][..., node] = values
+        nodes = slice(begin, end)
+        # at the ends of what is known the difference is one-sided, but of the outermost nodes these are not asked for
+        tables["by_mean"][..., nodes] = np.gradient(tables["mean"][..., nodes], self._mean_e[nodes], axis=-1)
+        self._known = range(begin, end)
 
     def at(self, name: str, mean_e: Array, which: NDArray[np.int64]) -> Array:
         """Values of one table, linear between nodes.
@@ -256,16 +284,18 @@ class MeanCodes:
 
     def values(self, names: Sequence[str], mean_e: Array, which: NDArray[np.int64]) -> tuple[Array, ...]:
         """Values of several tables at the same means, as `at`."""
-        size = self.mean.shape[-1]
-        root = np.sqrt(np.maximum(mean_e, 0.0)) / self.step
-        node = np.minimum(root.astype(np.int64), size - 2)
-        share, place = np.minimum(root - node, 1.0), which * size + node
+        root = np.sqrt(np.maximum(mean_e, 0.0)) / self._step
+        node = np.minimum(root.astype(np.int64), _MEAN_NODES - 2)
+        if node.size:
+            self._fill(int(node.min()), int(node.max()) + 1)
+        share, place = np.minimum(root - node, 1.0), which * _MEAN_NODES + node
 
         def one(name: str) -> Array:
-            table = getattr(self, name).reshape(-1)
+            table = self._tables[name].reshape(-1)
             first = table[place]
             value = first + share * (table[place + 1] - first)
-            return value + np.minimum(mean_e, 0.0) * self.by_mean.reshape(9, -1)[which, 0] if name == "mean" else value
+            below = self._tables["by_mean"].reshape(9, -1)[which, 0]
+            return value + np.minimum(mean_e, 0.0) * below if name == "mean" else value
 
         return tuple(one(name) for name in names)
 
@@ -276,16 +306,11 @@ def mean_codes(card: SensorCard, noise: PixelNoise, rounded: bool = True) -> Mea
 
     Codes are rounded to whole ones unless the camera goes on with finer ones.
     """
-    root, step = np.linspace(0.0, np.sqrt(1.3 * card.saturation_e), _MEAN_NODES, retstep=True)
-    curve = _codes_of_dn(replace(card, **_BESIDE_CURVE), rounded)
-    sums = np.array([_moments(mu, card, noise, curve) for mu in root**2])  # (m, colour, count, 4)
-    mean, regression, excess = np.ascontiguousarray(sums.transpose(3, 1, 2, 0))
-    by_mean = np.gradient(mean, root**2, axis=-1)
-    return MeanCodes(float(step), mean, by_mean, regression, excess)
+    return MeanCodes(card, noise, _codes_of_dn(replace(card, **BESIDE_CURVE), rounded))
 
 
 _FINEST = COUNTS[-1]  # means of so many pixels lie on a lattice of DN on which all the others lie, too
-_BESIDE_CURVE: dict[str, Any] = {
+BESIDE_CURVE: dict[str, Any] = {
     **{"name": "", "exposure_s": 0.0, "full_well_e": 0.0, "read_noise_e": 0.0, "prnu": 0.0, "dsnu_e": 0.0},
     **{"dn_per_e": 1.0, "jpeg_quality": 0},
 }
@@ -304,9 +329,9 @@ def _codes_of_dn(card: SensorCard, rounded: bool) -> Array:
 
 
 def _moments(mu: float, card: SensorCard, noise: PixelNoise, curve: Array) -> Array:
-    """Mean code, regression and excess, shape (3 colours, 3 counts, 3); `curve` as of `_codes_of_dn`."""
+    """Mean code, regression and excess, shape (3, 3 colours, 3 counts); `curve` as of `_codes_of_dn`."""
     first, chance = _law(mu, card, noise)
-    result = np.empty((3, len(COUNTS), 3))
+    result = np.empty((3, 3, len(COUNTS)))
     for i, count in enumerate(COUNTS):
         if count > 1:
             chance = np.convolve(chance, chance) if len(chance) < _SHORT else _by_fourier(chance)
@@ -315,12 +340,12 @@ def _moments(mu: float, card: SensorCard, noise: PixelNoise, curve: Array) -> Ar
         step, start = _FINEST // count, _FINEST * int(first)
         y = np.ascontiguousarray(curve[:, start : start + step * len(x) : step])
         mean = y @ p
-        dx = x - x @ p
+        dx, dy = x - x @ p, y - mean[:, None]
         variance = dx**2 @ p
-        covariance = (y - mean[:, None]) * dx @ p
+        covariance = dy * dx @ p
         slope = covariance / variance if variance > 0.0 else np.zeros(3)  # 0: full pixels have one DN only
-        left = (y - mean[:, None]) ** 2 @ p - slope * covariance
-        result[:, i] = np.stack([mean, slope * card.dn_per_e, np.maximum(left, 0.0)], axis=-1)
+        left = dy**2 @ p - slope * covariance
+        result[0, :, i], result[1, :, i], result[2, :, i] = mean, slope * card.dn_per_e, np.maximum(left, 0.0)
     return result
 
 
@@ -330,12 +355,13 @@ def _by_fourier(chance: Array) -> Array:
 
 def _law(mu: float, card: SensorCard, noise: PixelNoise) -> tuple[float, Array]:
     """First DN and the chances of the DN from there on, of one pixel."""
-    spread = _SIGMAS * np.sqrt(noise.variance_e2(np.array(mu)) + 1.0 / card.dn_per_e**2)
+    variance_e2 = noise.variance_e2(np.array(mu))
+    spread = _SIGMAS * np.sqrt(variance_e2 + 1.0 / card.dn_per_e**2)
     ends = np.rint(card.black_level_dn + card.dn_per_e * np.array([mu - spread, mu + spread]))
     low, high = np.clip(ends, [0.0, 1.0], [card.top_dn - 1.0, card.top_dn])
     edges = (np.arange(low, high) + 0.5 - card.black_level_dn) / card.dn_per_e
     if mu > _POISSON_UP_TO_E:
-        below = ndtr((edges - mu) / np.sqrt(noise.variance_e2(np.array(mu))))
+        below = ndtr((edges - mu) / np.sqrt(variance_e2))
     else:
         n = np.arange(0.0, mu + 8.0 * np.sqrt(mu) + 12.0)
         r = max(float(np.sqrt(noise.gaussian_e2 + (noise.prnu * mu) ** 2)), 1e-6)
