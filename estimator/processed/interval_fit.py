@@ -69,24 +69,25 @@ class _Belief:
         outputs[np.diag_indices_from(outputs)] += inputs.own[index]
         return cls(prior, covariance, inputs.mean[index] + (prior - theta) @ slopes, cross, outputs)
 
-    def factor(self, sites: Sites) -> tuple[Array, Array]:
-        """Square roots of the sites' precisions, and the Cholesky factor of 1 + root outputs root."""
+    def factor(self, sites: Sites) -> tuple[Array, Array, Array]:
+        """Square roots of the sites' precisions, root outputs, and the Cholesky factor of 1 + root outputs root."""
         root = np.sqrt(sites.precision)
-        B = root[:, None] * self.outputs * root
+        R = root[:, None] * self.outputs
+        B = R * root
         B[np.diag_indices_from(B)] += 1.0
-        return root, np.asarray(np.linalg.cholesky(B))
+        return root, R, np.asarray(np.linalg.cholesky(B))
 
     def updated(self, sites: Sites) -> tuple[Array, Array]:
         """Mean and variance of the outputs with the sites, shape (n,) each."""
-        root, L = self.factor(sites)
-        A = solve_triangular(L, root[:, None] * self.outputs, lower=True, check_finite=False)
+        _, R, L = self.factor(sites)
+        A = solve_triangular(L, np.asfortranarray(R), lower=True, overwrite_b=True, check_finite=False)
         push = sites.shift - sites.precision * self.mean
         mean = self.mean + self.outputs @ push - A.T @ (A @ push)
         return mean, np.diagonal(self.outputs) - np.einsum("ij,ij->j", A, A)
 
     def posterior(self, sites: Sites) -> tuple[Array, Array]:
         """Mean, shape (k,), and covariance, shape (k, k), of theta with the sites."""
-        root, L = self.factor(sites)
+        root, _, L = self.factor(sites)
         push = sites.shift - sites.precision * self.mean
         both = np.column_stack([root[:, None] * self.cross.T, root * (self.outputs @ push)])
         G = solve_triangular(L, both, lower=True, check_finite=False)

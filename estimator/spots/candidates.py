@@ -130,7 +130,8 @@ def _highest_phase(
             norm = np.sqrt(np.outer(_squares(down, on, 0), _squares(across, on, 1)))
             z = _correlated(rows, across, 1) / (scale * norm.astype(np.float32))
             higher = z > best
-            best[higher], which[higher] = z[higher], 2 * i + j
+            np.copyto(best, z, where=higher)
+            np.copyto(which, np.int8(2 * i + j), where=higher)
     return best, which
 
 
