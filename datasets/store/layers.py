@@ -83,7 +83,7 @@ def write_exr(
     """
     arrays = {name: _float32(name, plane) for name, plane in planes.items()}
     _check_shapes(arrays)
-    sums = {name: zlib.crc32(array) for name, array in arrays.items()}
+    sums = {name: zlib.crc32(array.data) for name, array in arrays.items()}
     text = json.dumps({"header": dict(header), "crc32": sums}, allow_nan=False)
 
     def write(temporary: Path) -> None:
@@ -169,7 +169,7 @@ def _content(path: Path, header: dict[str, Any], planes: dict[str, Plane]) -> Ex
     document = InputFile(path, "render it again").json(header[ATTRIBUTE].encode())
     if not isinstance(document.get("header"), dict):
         raise DatasetError(f"{path} is damaged: its attribute '{ATTRIBUTE}' has no header")
-    if {name: zlib.crc32(np.ascontiguousarray(plane)) for name, plane in planes.items()} != document.get("crc32"):
+    if {name: zlib.crc32(np.ascontiguousarray(plane).data) for name, plane in planes.items()} != document.get("crc32"):
         raise DatasetError(f"{path} is damaged: its pixels do not have the checksums of its header")
     u0, v0 = (int(x) for x in header["dataWindow"][0])
     return Exr(planes, document["header"], (u0, v0))

@@ -22,8 +22,10 @@ are pixel centres. Phi does not depend on the carriage: rigs are taken at the do
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +36,8 @@ from phibench.scenes.frames import Array
 from phibench.scenes.rig import Rig
 
 Flags = NDArray[np.bool_]
+P = ParamSpec("P")
+T = TypeVar("T")
 
 MATCH_PX = 3.0
 """A spot at 5 sigma, the faintest that counts as there, is placed to 0.3 to 0.5 px (blur 0.7 px; mono to Bayer), so
@@ -163,6 +167,42 @@ def pixel_errors(true_rig: Rig, true_px: Array, answer_px: Array) -> PixelErrors
     return PixelErrors(error[:, 0], error[:, 1], radial, tangential)
 
 
+_KEPT = 256  # results: of a part of a set with a rig each, until the next method
+
+
+@dataclass(frozen=True)
+class _ByValue:
+    key: Hashable
+    value: Any = field(compare=False)
+
+    @classmethod
+    def of(cls, value: Any) -> _ByValue:
+        return cls((value.shape, value.dtype.str, value.tobytes()) if isinstance(value, np.ndarray) else value, value)
+
+
+def kept(function: Callable[P, T]) -> Callable[P, T]:
+    """The function with its last results kept: what follows from a truth alone is the same for all methods.
+
+    Arguments go by position, arrays are compared by their bytes. Arrays in the results are read only.
+    """
+
+    @lru_cache(_KEPT)
+    def of_values(*arguments: _ByValue) -> Any:
+        result = function(*(one.value for one in arguments))  # type: ignore[call-arg]
+        for array in (result, *getattr(result, "__dict__", {}).values()):
+            if isinstance(array, np.ndarray):
+                array.flags.writeable = False
+        return result
+
+    def once(*arguments: P.args, **named: P.kwargs) -> T:
+        assert not named
+        found: T = of_values(*map(_ByValue.of, arguments))
+        return found
+
+    return once
+
+
+@kept
 def from_centre_px(rig: Rig, uv_px: Array) -> Array:
     """Distance from the image of the sphere centre, shape (n,)."""
     return np.asarray(np.linalg.norm(uv_px - outline_circle(rig)[0], axis=-1))
@@ -173,6 +213,7 @@ def phi_of(convention: str, rig: Rig, uv_px: Array) -> Array:
     return CONVENTIONS[convention](rig.at(0.0), uv_px)
 
 
+@kept
 def phi_variance(rig: Rig, uv_px: Array, covariance_px2: Array, convention: str = "ray") -> Array:
     """Variance of phi, shape (n,), rad^2: g C g^T; NaN for covariances, shape (n, 2, 2), that are NaN."""
     return estimate_phi(convention, rig.at(0.0), uv_px, covariance_px2).variance_rad2

@@ -20,6 +20,7 @@ from phibench.estimator.benchmark.answer_errors import (
     best_constant,
     from_centre_px,
     in_ray_units,
+    kept,
     phi_of,
     phi_variance,
     pixel_errors,
@@ -176,11 +177,13 @@ def record_table(truths: Sequence[PairTruth], outcomes: Sequence[Outcome], rules
     for i, truth in enumerate(truths):
         # a calibration goes with its rig; its array is one object for all pairs, or rows that are equal stay apart
         index.setdefault((truth.nominal_rig, truth.true_rig, id(truth.calibration_covariance)), []).append(i)
-    frames = [
-        _of_rigs(nominal, true, [truths[i] for i in rows], [outcomes[i] for i in rows], rules)
+    parts = [
+        part
         for (nominal, true, _), rows in index.items()
+        for part in _of_rigs(nominal, true, [truths[i] for i in rows], [outcomes[i] for i in rows], rules)
     ]
-    table = pl.concat(frames).sort("number", pl.col("image") == "up")
+    columns = {name: _joined([part[name] for part in parts]) for name in parts[0]}
+    table = pl.DataFrame(columns, schema_overrides=_TYPES).sort("number", pl.col("image") == "up")
     return table.with_columns(pl.col(pl.Float64).fill_nan(None)).select(*COLUMNS)
 
 
@@ -202,12 +205,19 @@ def in_order(outcomes: Iterable[Outcome], count: int) -> list[Outcome]:
     return ordered
 
 
-def _of_rigs(nominal: Rig, true: Rig, truths: list[PairTruth], outcomes: list[Outcome], rules: Rules) -> pl.DataFrame:
-    """Records of pairs that share their rigs, image by image, then the pairs' own columns."""
+def _joined(parts: list[Any]) -> Any:
+    """Parts of a column, all arrays or all lists, one after the other."""
+    return np.concatenate(parts) if isinstance(parts[0], np.ndarray) else [value for part in parts for value in part]
+
+
+def _of_rigs(
+    nominal: Rig, true: Rig, truths: list[PairTruth], outcomes: list[Outcome], rules: Rules
+) -> list[dict[str, Any]]:
+    """Columns of pairs that share their rigs, of each image: its own, then the pairs'."""
     images = {p: _image_columns(p, nominal, true, truths, outcomes, rules) for p in POSITIONS}
     pair = _pair_columns(nominal, truths, outcomes, images)
     pair |= _joint_columns(nominal, truths, images, pair)
-    return pl.concat([pl.DataFrame({**images[p], **pair}, schema_overrides=_TYPES) for p in POSITIONS])
+    return [{**images[p], **pair} for p in POSITIONS]
 
 
 def _image_columns(
@@ -282,7 +292,7 @@ def _phi_columns(
         a.phi_convention if a is not None and np.isfinite(x) else "ray" for a, x in zip(answers, own, strict=True)
     ]
     phi = np.where(np.isfinite(own), own, phi_of("ray", nominal, uv))
-    outline = phi_of("outline", true, xy)
+    outline = _true_phi("outline", true, xy)
     truth = np.array([s.phi_rad.get(c, o) for s, c, o in zip(spots, convention, outline, strict=True)])
     return {
         "phi_convention": [c if np.isfinite(x) else None for c, x in zip(convention, phi, strict=True)],
@@ -373,11 +383,14 @@ def _pair_columns(
         "depth_sigma_m": sigma,
         "depth_pull": pull,
         "depth_within": within,
-        "bound_depth_m2": depth_exact(nominal, nominal_h, *truth, *bounds).sigma_m ** 2,
+        "bound_depth_m2": _bound_depth(nominal, nominal_h, *truth, *bounds).sigma_m ** 2,
         "seconds": [float(o.seconds) for o in outcomes],
         "failure": [o.failure for o in outcomes],
         "message": [o.message for o in outcomes],
     }
+
+
+_true_phi, _bound_depth = kept(phi_of), kept(depth_exact)
 
 
 def _spot(outcome: Outcome, position: str) -> Spot | None:

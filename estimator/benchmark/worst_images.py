@@ -66,13 +66,11 @@ def crop(image: NDArray[Any], uv_px: Array, side_px: int = CROP_PX) -> tuple[NDA
 def half_size(image: NDArray[Any], card: SensorCard) -> NDArray[np.uint8]:
     """Frame at half its size, 8 bits, shape (h, w) of a sensor without filters, else (h, w, 3)."""
     height, width = (size // 2 * 2 for size in image.shape[:2])
-    whole = np.asarray(image[:height, :width], float)
-    cells = [whole[v::2, u::2] for v in (0, 1) for u in (0, 1)]
-    if card.output != "raw":
-        return np.asarray(np.round(np.mean(cells, axis=0)), np.uint8)
-    if card.mosaic == "mono":
-        return _brightened(np.mean(cells, axis=0))
-    red, green, other, blue = cells
+    whole = image[:height, :width]
+    red, green, other, blue = (np.asarray(whole[v::2, u::2], float) for v in (0, 1) for u in (0, 1))
+    if card.output != "raw" or card.mosaic == "mono":
+        mean = (red + green + other + blue) / 4.0
+        return _brightened(mean) if card.output == "raw" else np.asarray(np.round(mean), np.uint8)
     return _brightened(np.stack([red, 0.5 * (green + other), blue], axis=-1))
 
 

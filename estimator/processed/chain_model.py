@@ -179,10 +179,12 @@ def _way(card: SensorCard) -> _Way:
         same = sparse.kron(np.ones((3, 1)), sparse.eye_array(len(sparing.centre)))
         T = np.vstack([T, card.denoise_luma * (output.transform @ same).toarray().T])
     T = np.ascontiguousarray(T)
-    arrays = filters, _kinds(filters), T, _blocks(T), output.shift, output.rounding
-    for array in arrays:
+    way = _Way(
+        (h, w), outer, margin, whole, filters, _kinds(filters), sparing, T, _blocks(T), output.shift, output.rounding
+    )
+    for array in (way.filters, way.kinds, way.transform, way.block, way.shift, way.rounding):
         array.flags.writeable = False
-    return _Way((h, w), outer, margin, whole, *arrays[:2], sparing, *arrays[2:])
+    return way
 
 
 def _blocks(transform: Array) -> NDArray[np.int64]:

@@ -77,7 +77,8 @@ def row_normal(stream: NoiseStream, region: Region) -> Array:
 def _by_tiles(stream: NoiseStream, region: Region, draw: Draw) -> Array:
     """Put together what `draw` gives for each tile of `region`."""
     bits = np.random.Philox(key=philox_key(*stream.names))
-    generator, state = np.random.Generator(bits), bits.state
+    generator = np.random.Generator(bits)
+    state: dict[str, Any] = dict(bits.state)
     # plain integers: numpy reads them three times as fast as its own arrays' elements
     state["state"] = {name: words.tolist() for name, words in state["state"].items()}
     state["buffer"] = state["buffer"].tolist()
