@@ -92,7 +92,7 @@ def score_methods(
         Of the bootstrap; 0 or above.
     limits : the harness's, for the record
     told : callable
-        Given the number of pairs that are done, now and then.
+        Given the number of pairs that are answered, after each.
     stages : dict, optional
         Gets the CPU-seconds of "bounds" and of "statistics", causes and worst images included.
 
@@ -105,14 +105,15 @@ def score_methods(
     parts: list[list[Examined]] = [[] for _ in methods]
     for start in range(0, len(pairs), AT_ONCE):
         numbers = range(start, min(start + AT_ONCE, len(pairs)))
-        held = CachedPairs(pairs)
-        answers = list(ask(held, numbers))
+        held, answers = CachedPairs(pairs), []
+        for done, outcomes in enumerate(ask(held, numbers), start=start + 1):
+            answers.append(outcomes)
+            told(done)
         if stages is not None:
             stages["bounds"] = stages.get("bounds", 0.0) + held.truth_seconds
         for part, outcomes in zip(parts, zip(*answers, strict=True), strict=True):
             with _timed("statistics", stages):
                 part.append(examine(held, outcomes, rules))
-        told(numbers.stop)
     with _timed("statistics", stages):
         return [
             _scored(method, pairs, part, rules, seed, limits or {}) for method, part in zip(methods, parts, strict=True)

@@ -365,6 +365,24 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
+def one_or_more(text: str) -> int:
+    """Whole number from 1 up, of a command line.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        If it is none.
+    """
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r}: must be a whole number from 1 up")
+    return int(text)
+
+
+def add_passes(parser: argparse.ArgumentParser, default: int, text: str) -> None:
+    """Add the option --passes."""
+    parser.add_argument("--passes", type=one_or_more, default=default, help=f"{text}; {default} by default")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Train a network from the command line."""
     parser = argparse.ArgumentParser(
@@ -374,10 +392,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="file to write, .onnx")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--preset", action="append", choices=list(REQUESTS), help="may be given again; all by default")
-    parser.add_argument("--epochs", type=int, default=TrainingSettings.epochs)
-    parser.add_argument("--crops", type=int, default=TrainingSettings.crops, help="new ones in each epoch")
+    parser.add_argument("--epochs", type=one_or_more, default=TrainingSettings.epochs)
+    parser.add_argument("--crops", type=one_or_more, default=TrainingSettings.crops, help="new ones in each epoch")
+    add_passes(parser, TrainingSettings.passes, "times that an epoch's crops are used")
     given = parser.parse_args(arguments)
-    settings = TrainingSettings(given.seed, tuple(given.preset or REQUESTS), given.epochs, given.crops)
+    settings = TrainingSettings(given.seed, tuple(given.preset or REQUESTS), given.epochs, given.crops, given.passes)
     try:
         print(train(given.folder, given.out, settings))
     except DatasetError as error:

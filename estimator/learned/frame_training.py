@@ -36,6 +36,7 @@ from phibench.estimator.learned.crop_training import (
     Parameters,
     Steps,
     TrainingSettings,
+    add_passes,
     first_layer,
     rooms_of,
     scale_of,
@@ -357,9 +358,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="file to write, .onnx")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--spots", type=int, default=FrameSettings.spots, help="tiles with a spot")
+    add_passes(parser, FrameSettings.passes, "times that a round's tiles are used")
     given = parser.parse_args(arguments)
     try:
-        print(train(given.folder, given.out, FrameSettings(given.seed, given.spots)))
+        print(train(given.folder, given.out, FrameSettings(given.seed, given.spots, passes=given.passes)))
     except DatasetError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -78,7 +78,7 @@ def _by_tiles(stream: NoiseStream, region: Region, draw: Draw) -> Array:
     """Put together what `draw` gives for each tile of `region`."""
     bits = np.random.Philox(key=philox_key(*stream.names))
     generator = np.random.Generator(bits)
-    state: dict[str, Any] = dict(bits.state)
+    state: Any = bits.state
     # plain integers: numpy reads them three times as fast as its own arrays' elements
     state["state"] = {name: words.tolist() for name, words in state["state"].items()}
     state["buffer"] = state["buffer"].tolist()

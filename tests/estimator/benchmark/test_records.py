@@ -12,7 +12,7 @@ from helpers.oracles import random_rig, true_pixel
 from scipy.linalg import cholesky, solve_triangular
 
 from phibench.datasets.errors import DatasetError
-from phibench.estimator.benchmark.answer_errors import MATCH_PX, Rules, phi_of
+from phibench.estimator.benchmark.answer_errors import MATCH_PX, Rules, kept, phi_of
 from phibench.estimator.benchmark.records import COLUMNS, COUNTED, record_table, records, with_missed
 from phibench.estimator.geometry.phi import CONVENTIONS, outline_circle
 from phibench.estimator.geometry.triangulate import depth_exact
@@ -309,3 +309,36 @@ def test_outcomes_that_belong_to_no_pair_are_refused(numbers, words):
 def test_rules_without_sense_are_refused(changes):
     with pytest.raises(DatasetError, match=next(iter(changes))):
         Rules(**changes)
+
+
+def test_kept_results_are_those_of_equal_arguments_and_cannot_be_changed():
+    calls = []
+
+    @kept
+    def total(name, values):
+        calls.append(name)
+        return values.sum(axis=0) + len(name)
+
+    values = np.arange(6.0).reshape(2, 3)
+    first = total("a", values)
+    assert first is total("a", values.copy())
+    assert first.tolist() == [4.0, 6.0, 8.0]
+    assert total("bb", values).tolist() == [5.0, 7.0, 9.0]
+    assert total("a", values.reshape(3, 2)).tolist() == [7.0, 10.0]
+    values[0, 0] = 1.0
+    assert total("a", values).tolist() == [5.0, 6.0, 8.0]
+    assert calls == ["a", "bb", "a", "a"]
+    with pytest.raises(ValueError, match="read-only"):
+        first[0] = 0.0
+
+
+def test_records_are_the_same_after_another_method():
+    """Rigs and truths of a pair each, as drawn ones have: what is kept from one method is the next one's, too."""
+    pairs = cases(6)
+    few = [Cases((one,)) for one in pairs.truths]
+    tables = []
+    for make in (sampler(claim=1.7), shifted(0.3), sampler(claim=1.7)):
+        answers = outcomes(pairs, make)
+        tables.append([record_table(part.truths, [answers[k]], RULES) for k, part in enumerate(few)])
+    assert all(a.equals(b) for a, b in zip(tables[0], tables[2], strict=True))
+    assert not any(a.equals(b) for a, b in zip(tables[0], tables[1], strict=True))

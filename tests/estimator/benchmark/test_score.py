@@ -240,7 +240,7 @@ def test_several_methods_are_scored_as_each_alone():
 
     told = []
     both = score_methods([MethodCard.of("a"), MethodCard.of("b")], pairs, ask, RULES, told=told.append)
-    assert told == [16, 32, 40]
+    assert told == list(range(1, 41))
     for one, oracle, name in zip(both, oracles, "ab", strict=True):
         alone = score_outcomes(MethodCard.of(name), pairs, outcomes(pairs, oracle), RULES)
         assert one.records.equals(alone.records)

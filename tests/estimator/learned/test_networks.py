@@ -262,6 +262,20 @@ def test_boxes_restrict_the_search() -> None:
 # -- training --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("module", [crop_training, frame_training])
+def test_training_takes_the_number_of_passes(module: Any, tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(module, "train", lambda folder, out, settings: asked.append(settings.passes))
+    call = [str(tmp_path), "--out", str(tmp_path / "out.onnx")]
+    assert module.main([*call, "--passes", "6"]) == 0
+    assert module.main(call) == 0
+    assert asked == [6, {crop_training: 4, frame_training: 2}[module]]
+    for wrong in ("0", "-1", "two"):
+        with pytest.raises(SystemExit):
+            module.main([*call, f"--passes={wrong}"])
+        assert "from 1 up" in capsys.readouterr().err
+
+
 @needs_torch
 def test_training_refuses_data_sets_that_will_not_do(tmp_path: Path, tiny_dataset: Path, capsys: Any) -> None:
     out = tmp_path / "out.onnx"

@@ -7,8 +7,17 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
+from phibench.datasets.frames.sensor_card import sensor_card
 from phibench.estimator.spots.jpeg_coefficients import room_variance, steps
-from phibench.estimator.spots.pixel_statistics import cut_pixels
+from phibench.estimator.spots.pixel_statistics import (
+    COUNTS,
+    _information_table,
+    _interval,
+    code_table,
+    cut_pixels,
+    mean_codes,
+)
+from phibench.estimator.spots.raw_pixels import PixelNoise
 
 
 @pytest.mark.parametrize("mean", [8e3, 11_600.0, 11_950.0, 12_000.0, 12_300.0, 40e3])
@@ -72,3 +81,42 @@ def test_a_flat_room_is_known_but_for_its_level() -> None:
     variance = room_variance(flat, step)
     assert variance[0] == pytest.approx(step[0] ** 2 / 12.0)
     assert (variance[1:] == 0.0).all()
+
+
+NAMES = ("mean", "by_mean", "regression", "excess")
+
+
+@pytest.mark.parametrize("asked", [(5000.0, 60.0, 900.0), (0.0, 15_600.0), (-30.0, 2000.0), (300.0, 310.0, 290.0)])
+def test_tables_of_codes_do_not_depend_on_what_was_asked_for_before(asked: tuple[float, ...]) -> None:
+    """Bit by bit those of tables that are worked out as a whole, from below 0 to above the last node."""
+    card, noise = sensor_card("mjpeg"), PixelNoise(20.0, 0.01)
+    whole, parts = (mean_codes.__wrapped__(card, noise) for _ in range(2))
+    rows = np.repeat(np.arange(3 * len(COUNTS)), 2)
+    whole.values(NAMES, np.tile([0.0, 1e6], 3 * len(COUNTS)), rows)
+    for mean in asked:
+        means = mean + np.linspace(-5.0, 5.0, len(rows))
+        for name, expected, found in zip(
+            NAMES, whole.values(NAMES, means, rows), parts.values(NAMES, means, rows), strict=True
+        ):
+            assert expected.tobytes() == found.tobytes(), name
+
+
+def test_information_leaves_out_codes_without_a_chance_and_nothing_else() -> None:
+    card, noise = sensor_card("srgb8"), PixelNoise(20.0, 0.01)
+    step, information = _information_table.__wrapped__(card, noise)
+    table, checked = code_table(card), 0
+    root = -8.0 + step * np.arange(information.shape[1])
+    for node in range(0, information.shape[1], 100):
+        mean = np.sign(root[node]) * root[node] ** 2
+        smooth = 0.5 * (mean + np.sqrt(mean * mean + 1.0))
+        s = np.sqrt(noise.variance_e2(np.array(smooth)))
+        by_mean = 0.5 * (1.0 + mean / np.sqrt(mean * mean + 1.0)) * (1.0 + 2.0 * noise.prnu**2 * smooth) / (2.0 * s)
+        for colour in range(3):
+            low, once = np.unique(table.low_e[colour], return_index=True)
+            ends = (low - mean) / s, (table.high_e[colour][once] - mean) / s
+            chance, change = _interval(*ends, s, by_mean)
+            expected = np.sum(np.where(chance > 1e-30, change**2 / np.maximum(chance, 1e-30), 0.0))
+            # the nodes of this test and of the table differ by rounding: 1e-13 of sqrt(mean)
+            assert information[colour, node] == pytest.approx(expected, rel=1e-9)
+            checked += 1
+    assert checked == 33
