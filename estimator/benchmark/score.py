@@ -36,7 +36,7 @@ from phibench.estimator.benchmark.document import (
 )
 from phibench.estimator.benchmark.records import in_order, missed_relative, record_table, with_missed
 from phibench.estimator.benchmark.report import time_section, write_report
-from phibench.estimator.benchmark.worst_images import worst, worst_of
+from phibench.estimator.benchmark.worst_images import worst, worst_of, worst_records
 from phibench.estimator.calibration.file import read_calibration
 from phibench.estimator.captures.imported_set import ImportedSet, imported_pairs, is_imported, open_imported
 from phibench.estimator.captures.spot_shape import with_shape
@@ -64,10 +64,14 @@ class Scored:
 
 @dataclass(frozen=True)
 class Examined:
-    """Some pairs of one method: records with causes, and its worst images among them."""
+    """Some pairs of one method: records with causes, and its worst images among them.
+
+    `leading` are the records of the worst images of these and all pairs before.
+    """
 
     records: pl.DataFrame
     worst: list[Worst]
+    leading: pl.DataFrame
 
 
 def score_methods(
@@ -113,7 +117,7 @@ def score_methods(
             stages["bounds"] = stages.get("bounds", 0.0) + held.truth_seconds
         for part, outcomes in zip(parts, zip(*answers, strict=True), strict=True):
             with _timed("statistics", stages):
-                part.append(examine(held, outcomes, rules))
+                part.append(examine(held, outcomes, rules, part[-1].leading if part else None))
     with _timed("statistics", stages):
         return [
             _scored(method, pairs, part, rules, seed, limits or {}) for method, part in zip(methods, parts, strict=True)
@@ -138,18 +142,19 @@ def score_outcomes(
 ) -> Scored:
     """Score what a method has answered on all pairs; parameters as for `score_methods`."""
     ordered = in_order(outcomes, len(pairs))
-    parts = [
-        examine(CachedPairs(pairs), ordered[i : i + AT_ONCE], rules) for i in range(0, max(len(ordered), 1), AT_ONCE)
-    ]
+    parts: list[Examined] = []
+    for i in range(0, max(len(ordered), 1), AT_ONCE):
+        leading = parts[-1].leading if parts else None
+        parts.append(examine(CachedPairs(pairs), ordered[i : i + AT_ONCE], rules, leading))
     return _scored(method, pairs, parts, rules, seed, limits or {})
 
 
-def examine(pairs: PairSet, outcomes: Sequence[Outcome], rules: Rules) -> Examined:
-    """Join outcomes with truth and images."""
+def examine(pairs: PairSet, outcomes: Sequence[Outcome], rules: Rules, before: pl.DataFrame | None = None) -> Examined:
+    """Join outcomes with truth and images; `before` is `Examined.leading` of the pairs before."""
     truths = [pairs.truth(outcome.number) for outcome in outcomes]
     table = record_table(truths, outcomes, rules)
     table = with_causes(table, pairs, rules)
-    return Examined(table, worst(table, pairs))
+    return Examined(table, worst(table, pairs, before=before), worst_records(table, before=before))
 
 
 def _scored(

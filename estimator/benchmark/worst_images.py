@@ -31,13 +31,20 @@ _GAMMA = 1.0 / 2.2  # raw pixels are linear in the light
 _JPEG_QUALITY = 70
 
 
-def worst(records: pl.DataFrame, pairs: Pairs, count: int = COUNT) -> list[Worst]:
+def worst(records: pl.DataFrame, pairs: Pairs, count: int = COUNT, before: pl.DataFrame | None = None) -> list[Worst]:
     """Worst images first: wrong positions by distance, then no position, then detected spots by distance.
 
-    Only visible spots, and one image of a sample: ten draws of one spot would show one thing ten times.
+    Only visible spots, and one image of a sample: ten draws of one spot would show one thing ten times. `before` are
+    `worst_records` of the parts before: what is not among the worst together with them will not be in the end.
     """
-    rows = _ranked(records).head(count).iter_rows(named=True)
-    return [_entry(row, pairs, place < FRAMES) for place, row in enumerate(rows)]
+    own = set(records["number"])
+    rows = worst_records(records, count, before).iter_rows(named=True)
+    return [_entry(row, pairs, place < FRAMES) for place, row in enumerate(rows) if row["number"] in own]
+
+
+def worst_records(records: pl.DataFrame, count: int = COUNT, before: pl.DataFrame | None = None) -> pl.DataFrame:
+    """Records of the worst images, and of those before."""
+    return _ranked(records if before is None else pl.concat([before.select(records.columns), records])).head(count)
 
 
 def worst_of(records: pl.DataFrame, entries: Sequence[Worst], count: int = COUNT) -> list[Worst]:

@@ -22,7 +22,7 @@ from phibench.estimator.benchmark.metrics import METRICS
 from phibench.estimator.benchmark.score import score_methods, score_outcomes
 from phibench.estimator.benchmark.score_tables import leaderboard, number, ranked
 from phibench.estimator.benchmark.strata import STRATA
-from phibench.estimator.benchmark.worst_images import crop
+from phibench.estimator.benchmark.worst_images import crop, worst
 from phibench.estimator.cli import main as cli
 from phibench.estimator.interface import Outcome
 
@@ -130,6 +130,15 @@ def test_ranks_go_by_phi_with_missed_spots_and_by_depth_where_asked():
     assert [row[0] for row in leaderboard([easy, every]).rows] == ["every !", "easy !"]
     assert "ranked by phi" in leaderboard([easy, every]).title
     assert "ranked by D" in leaderboard([easy, every], "depth").title
+
+
+def test_worst_images_of_parts_are_those_of_all_at_once():
+    """Pictures are made of what is among the worst so far: the end is the same in whatever order errors come."""
+    pairs = cases(70)  # five parts
+    for make in (sampler(seed=3), shifted(0.2)):
+        found = score_outcomes(MethodCard.of("m"), pairs, outcomes(pairs, make), RULES)
+        assert found.document.worst == worst(found.records, pairs)
+        assert len(found.document.worst) == 10
 
 
 def test_worst_images_first_one_of_a_sample():
