@@ -143,7 +143,7 @@ def chain_model(card: SensorCard, noise: PixelNoise) -> ChainModel:
 
 @dataclass(frozen=True)
 class _Way:
-    """What models of cameras of one make share; `outer` is the shape of the codes that count, the rest `ChainModel`'s.
+    """Part that models of cameras of one make share; `outer` is the shape of the codes that count, else `ChainModel`'s.
 
     `whole` says that codes of R, G, B are rounded before JPEG.
     """
