@@ -22,7 +22,6 @@ from phibench.datasets.build.finished_work import (
 )
 from phibench.datasets.build.forecast import (
     Forecast,
-    PairForecast,
     forecast,
     pair_forecasts,
     pair_table,
@@ -30,6 +29,7 @@ from phibench.datasets.build.forecast import (
     slowdown,
 )
 from phibench.datasets.build.journal import FolderHead, Journal
+from phibench.datasets.build.kept_draws import draws_bytes, read_draws, seen_causes, write_draws
 from phibench.datasets.build.refusals import (
     forget_others,
     incomplete_text,
@@ -66,6 +66,7 @@ from phibench.datasets.build.tasks import Task
 from phibench.datasets.build.workers import Environment, NoRendererError, WorkerPool, versions
 from phibench.datasets.errors import DatasetError, IncompleteError
 from phibench.datasets.input_files import InputFile
+from phibench.datasets.plan.kept_samples import Causes
 from phibench.datasets.plan.plan import Plan, make_plan
 from phibench.datasets.plan.room_draws import unexported
 from phibench.datasets.progress import progress_console
@@ -78,6 +79,8 @@ from phibench.datasets.store.documents import dataset_info, info_text, parse_inf
 from phibench.datasets.store.files import WriteError, write_text
 from phibench.datasets.store.provenance import code_sha256, provenance
 from phibench.datasets.store.schema import DatasetInfo
+from phibench.render.optics.truth import VISIBLE
+from phibench.scenes.rig import POSITIONS
 
 
 def make(
@@ -132,10 +135,12 @@ def make(
         return _export(asked, files, out, workers, console, scheduler, replace, exports)
 
     plan, text, note = _planned(recipe, out, shard, samples, seed, replace, room_files, export)
-    for warning in [*warnings(plan.recipe), *_hidden(pair_forecasts(plan))]:
+    causes = seen_causes(plan)
+    for warning in [*warnings(plan.recipe), *_hidden(causes)]:
         console.print(f"warning: {warning}", highlight=False, soft_wrap=True)
+    draws = draws_bytes(plan, causes) if plan.recipe.random is not None else b""
     try:
-        make_from_plan(plan, text, out, workers, console, scheduler, replace, leave_out_refused)
+        make_from_plan(plan, text, out, workers, console, scheduler, replace, leave_out_refused, draws)
     except LostWorkError:
         remove_files(out, exports.made)  # the folder is as it was
         raise
@@ -203,16 +208,15 @@ def cost(recipe: str | Path, out: str | Path, samples: int | None = None) -> For
     return forecast(plan, plan_tasks(plan, {}).values())
 
 
-def _hidden(pairs: Iterable[PairForecast]) -> list[str]:
+def _hidden(causes: Mapping[str, Causes]) -> list[str]:
     """Warn of pairs that will not be visible in both images."""
-    listed = list(pairs)
-    hidden = [pair for pair in listed if not pair.visible]
+    hidden = [name for name, both in causes.items() if both != (VISIBLE, VISIBLE)]
     if not hidden:
         return []
-    first = hidden[0]
-    causes = " and ".join(f"{n} {t.cause}" for n, t in (("down", first.down), ("up", first.up)) if not t.visible)
-    text = f"{len(hidden)} of {len(listed)} pairs will not be visible in both images, such as {first.pair.sample_id}"
-    return [f"{text} ({causes}); --dry-run lists them all"]
+    told = zip(POSITIONS, causes[hidden[0]], strict=True)
+    why = " and ".join(f"{position} {cause}" for position, cause in told if cause != VISIBLE)
+    text = f"{len(hidden)} of {len(causes)} pairs will not be visible in both images, such as {hidden[0]}"
+    return [f"{text} ({why}); --dry-run lists them all"]
 
 
 def _count(workers: int | None) -> int:
@@ -248,7 +252,7 @@ def _planned(
     parsed = parse_recipe(text, source, files)
     if parsed.rooms is not None and parsed.rooms.exported:
         files = exported(parsed, files)
-    return make_plan(parsed, files, shard), text, note
+    return make_plan(parsed, files, shard, read_draws(out, parsed, files)), text, note
 
 
 @dataclass
@@ -298,10 +302,11 @@ def make_from_plan(
     scheduler: str | None = None,
     replace: bool = False,
     leave_out: bool = False,
+    draws: bytes = b"",
 ) -> list[str]:
     """Make what is unfinished or damaged of a plan; return the names of the tasks done and documents written.
 
-    With `leave_out` the data set is finished without the samples that are refused.
+    With `leave_out` the data set is finished without the samples that are refused. `draws` are kept for the next start.
     """
     count = _count(workers)
     try:
@@ -310,6 +315,8 @@ def make_from_plan(
             WorkerPool(out, count, scheduler) as pool,
             Journal(out) as journal,
         ):
+            if draws:
+                write_draws(out, draws)
             return _make(plan, recipe, out, pool, journal, console, replace, leave_out)
     except OSError as error:
         text = str(error) if isinstance(error, WriteError) else f"could not write to {out}: {error}"

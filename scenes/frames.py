@@ -74,7 +74,10 @@ class Pose:
     def inverse(self) -> Pose:
         """Return ``T_source_target``."""
         R = self.R
-        return Pose(self.source, self.target, as_vector(-R.T @ self.t), as_matrix(R.T))
+        turned = object.__new__(Pose)  # without its checks: the inverse of a rotation is one
+        values = {"target": self.source, "source": self.target}
+        vars(turned).update(values, translation_m=as_vector(-R.T @ self.t), rotation=as_matrix(R.T))
+        return turned
 
     def __matmul__(self, other: Pose) -> Pose:
         """Compose ``T_a_b @ T_b_c = T_a_c``; raise `SceneError` if the inner frames differ."""
@@ -106,7 +109,7 @@ def _dot(a: Vector, b: Vector) -> float:
 
 def as_vector(values: Array) -> Vector:
     """Return a float tuple of a 1-D array."""
-    return tuple(float(x) for x in values)
+    return tuple(map(float, values))
 
 
 def as_matrix(values: Array) -> Matrix:

@@ -17,7 +17,7 @@ import numpy as np
 
 from phibench.scenes.frames import Pose, Vector, as_matrix, as_vector, rotation_xyz
 from phibench.scenes.rig import RobotPose, View
-from phibench.scenes.shapes import Cuboid, Mesh, Rectangle, Shape, cuboid, shines
+from phibench.scenes.shapes import Cuboid, Mesh, Prism, Rectangle, Shape, cuboid, shines
 from phibench.scenes.textures import Uniform
 from phibench.scenes.validation import SceneError, finite_vector, unit_vector, within
 
@@ -49,6 +49,13 @@ def chassis(robot: RobotPose | None = None) -> tuple[Cuboid, ...]:
     turn = np.array(rotation_xyz(y_rad=FLIPPER_RAD - robot.flipper_rad))
     about = Pose("rig", "rig", as_vector(_AXLE_M - turn @ _AXLE_M), as_matrix(turn))
     return tuple(_placed(part, robot.T_world_rig, about if "flipper" in part.name else None) for part in parts)
+
+
+def _may_contain(solid: Cuboid | Prism, point_world_m: tuple[float, ...]) -> bool:
+    """Tell whether a point lies in the sphere around a solid, which takes a hundredth of the time of `contains`."""
+    reach = solid.size_m if isinstance(solid, Cuboid) else (2.0 * solid.radius_m, solid.height_m)
+    # a micrometre more, far above the rounding of both
+    return math.dist(point_world_m, solid.T_world_shape.translation_m) <= 0.5 * math.hypot(*reach) + 1e-6
 
 
 def _placed(part: Cuboid, T_world_rig: Pose, moved: Pose | None = None) -> Cuboid:
@@ -168,4 +175,5 @@ class Room:
         """Name of the solid (furniture, robot) that a world point lies inside, or None."""
         solids = (*self.furniture, *(chassis() if self.robot else ()))
         named = (solid for solid in solids if not isinstance(solid, Rectangle | Mesh))
-        return next((solid.name for solid in named if solid.contains(point_world_m)), None)
+        near = (solid for solid in named if _may_contain(solid, point_world_m))
+        return next((solid.name for solid in near if solid.contains(point_world_m)), None)

@@ -45,11 +45,12 @@ def positive(owner: str, name: str, value: float) -> float:
 
 def finite_vector(owner: str, name: str, value: Sequence[float], length: int) -> tuple[float, ...]:
     """Return `value` as a tuple of `length` finite floats, else raise `SceneError`."""
-    vector = tuple(float(x) for x in value)
+    vector = tuple(map(float, value))
     if len(vector) != length:
         raise SceneError(f"{owner}.{name} has {len(vector)} numbers: {length} are needed")
-    for x in vector:
-        finite(owner, name, x)
+    if not all(map(math.isfinite, vector)):
+        for x in vector:
+            finite(owner, name, x)
     return vector
 
 

@@ -13,7 +13,7 @@ import statistics
 import threading
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -363,11 +363,11 @@ class PairForecast:
         return self.down.visible and self.up.visible
 
 
-def pair_forecasts(plan: Plan) -> Iterator[PairForecast]:
-    """Trace the chief rays of all pairs of a plan, room by room; nothing is rendered."""
-    rooms = {name: number for number, name in enumerate(plan.rooms)}
-    found = {one.pair.sample_id: one for one in _traced(plan, sorted(plan.pairs, key=lambda pair: rooms[pair.room]))}
-    return (found[pair.sample_id] for pair in plan.pairs)
+def pair_forecasts(plan: Plan, pairs: Sequence[PairPlan] | None = None) -> Iterator[PairForecast]:
+    """Trace the chief rays of all pairs of a plan, or of some, room by room; nothing is rendered."""
+    rooms, pairs = {name: number for number, name in enumerate(plan.rooms)}, plan.pairs if pairs is None else pairs
+    found = {one.pair.sample_id: one for one in _traced(plan, sorted(pairs, key=lambda pair: rooms[pair.room]))}
+    return (found[pair.sample_id] for pair in pairs)
 
 
 def rim_lines(plan: Plan, pairs: Iterable[PairForecast]) -> list[str]:

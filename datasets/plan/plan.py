@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from phibench.datasets.errors import DatasetError, RecipeError
+from phibench.datasets.plan.kept_samples import Kept, rebuilt
 from phibench.datasets.plan.rig_draws import draw_rigs
 from phibench.datasets.plan.room_draws import draw_rooms, room_files
 from phibench.datasets.plan.sampling import RandomSample, draw_samples, have_own_rigs
@@ -123,6 +124,8 @@ class Plan:
         Samples that are not among `pairs`, because they cannot be drawn: the reason by id.
     left_out : dict
         Samples that are not among `pairs`, because a data set is finished without them: the cause by id (`without`).
+    seen : dict
+        Causes of both views, down and up, by id of those drawn samples that were traced; it is no part of the plan.
     """
 
     recipe: Recipe
@@ -136,6 +139,7 @@ class Plan:
     files: RoomFiles = RoomFiles()
     refused: dict[str, str] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
+    seen: dict[str, tuple[str, str]] = field(default_factory=dict, compare=False)
 
     @property
     def sample_ids(self) -> list[str]:
@@ -168,8 +172,12 @@ class Plan:
         return self.rigs[pair.rig].at(Stroke(pair.stroke_m).offset_m(position))
 
 
-def make_plan(recipe: Recipe, files: RoomFiles | None = None, shard: str | None = None) -> Plan:
+def make_plan(
+    recipe: Recipe, files: RoomFiles | None = None, shard: str | None = None, kept: Kept | None = None
+) -> Plan:
     """Plan of a recipe or of a shard of it; `files` are those of its rooms, where it has panoramas or meshes.
+
+    Samples of `[random]` that are `kept` are not drawn; the plan is the same.
 
     A shard of `[random]` whose samples have rigs of their own draws no sample and builds no room of another shard.
 
@@ -189,7 +197,7 @@ def make_plan(recipe: Recipe, files: RoomFiles | None = None, shard: str | None 
         raise RecipeError(f"rooms: {error}") from error
     if recipe.random is not None:
         own = _own_numbers(recipe, recipe.random, shard)
-        plan = replace(_random_plan(recipe, recipe.random, rig, rooms, files, own), files=files)
+        plan = replace(_random_plan(recipe, recipe.random, rig, rooms, files, own, kept or {}), files=files)
         return shard_plan(plan, shard) if shard is None or own is None else replace(plan, shard=_written(shard))
     return shard_plan(_whole_plan(recipe, rig, rooms), shard)
 
@@ -268,9 +276,13 @@ def _random_plan(
     rooms: dict[str, RoomSource],
     files: RoomFiles,
     wanted: range | None,
+    kept: Kept,
 ) -> Plan:
     """Equal rigs share an id, and so their views; the first sample that has one names it, so that more change none."""
-    samples, refused = draw_samples(recipe, table, rooms, files.folder, wanted)
+    held: dict[int, RandomSample | str] = {number: one for number, one in kept.items() if isinstance(one, str)}
+    if kept:
+        held |= rebuilt(recipe, table, list(rooms), kept, range(table.samples) if wanted is None else wanted)
+    samples, refused = draw_samples(recipe, table, rooms, files.folder, wanted, held)
     ids = {rig: RECIPE_RIG}
     for sample in samples:
         ids.setdefault(sample.rig, f"r{sample.number:06d}")
@@ -283,7 +295,8 @@ def _random_plan(
     used_rooms = {name: source for name, source in rooms.items() if name in seen}
     poses = _poses(recipe, dict.fromkeys(_places(pairs)))
     reasons = {_random_name(number): reason for number, reason in refused.items()}
-    return Plan(recipe, rig, rigs, used_rooms, spots, poses, pairs, refused=reasons)
+    traced = {_random_name(one.number): (one.causes[0], one.causes[1]) for one in samples if one.causes}
+    return Plan(recipe, rig, rigs, used_rooms, spots, poses, pairs, refused=reasons, seen=traced)
 
 
 def _random_name(number: int) -> str:

@@ -15,6 +15,7 @@ however often the sample is drawn: the share of hidden ones is that of the recip
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Sequence as Sequence_
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -33,7 +34,7 @@ from phibench.datasets.recipe.build import (
 )
 from phibench.datasets.recipe.distributions import DistributionTable, pick, quantile
 from phibench.datasets.recipe.mirror_tables import DRAWN_OF_MIRROR, HolderTable, MirrorTable
-from phibench.datasets.recipe.spot_placement import Boards, Placed, place, visibility_fault
+from phibench.datasets.recipe.spot_placement import Boards, Placed, place, shown_as
 from phibench.datasets.recipe.tables import (
     DRAWABLE,
     MisalignmentTable,
@@ -139,6 +140,8 @@ class RandomSample:
         The true ones.
     nominal_rig, nominal_stroke_m
         Those that an estimator is given.
+    causes : tuple of str
+        Of both views, down and up; empty where nobody has asked yet.
     """
 
     number: int
@@ -151,6 +154,7 @@ class RandomSample:
     stroke_m: float
     nominal_rig: Rig
     nominal_stroke_m: float
+    causes: tuple[str, ...] = ()
 
 
 def draw_samples(
@@ -159,10 +163,12 @@ def draw_samples(
     rooms: Mapping[str, RoomSource],
     folder: Path | None = None,
     wanted: range | None = None,
+    held: Mapping[int, RandomSample | str] | None = None,
 ) -> tuple[tuple[RandomSample, ...], dict[int, str]]:
     """Samples of a recipe with `[random]`, dealt to its rooms in turn; `folder` has the files of the rooms.
 
-    Of the `wanted` numbers, in a row, or all; rooms without such a sample are not built.
+    Of the `wanted` numbers, in a row, or all; those of `held` are taken from there, the reason of a refused one too.
+    Rooms without such a sample, or with held ones alone, are not built.
 
     Returns
     -------
@@ -176,12 +182,14 @@ def draw_samples(
     RecipeError
         If a panorama or mesh cannot be used, or if none of the first samples is possible, of all or of one of these.
     """
-    dataset, found, refused = recipe.dataset, dict[int, RandomSample](), dict[int, str]()
+    dataset, held = recipe.dataset, held or {}
     first = first_points(table.sequence, dataset.name, dataset.seed, table.samples, drawn_parameters(table))
     wanted = range(table.samples) if wanted is None else wanted
+    found = {number: one for number in wanted if isinstance(one := held.get(number), RandomSample)}
+    refused = {number: one for number in wanted if isinstance(one := held.get(number), str)}
     for k, room_id in enumerate(rooms):  # a room is built once, and let go before the next
-        numbers = range(wanted.start + (k - wanted.start) % len(rooms), wanted.stop, len(rooms))
-        if numbers:
+        every = range(wanted.start + (k - wanted.start) % len(rooms), wanted.stop, len(rooms))
+        if numbers := [number for number in every if number not in held]:
             stated = isinstance(rooms[room_id], PanoramaRoom | MeshRoom) and not is_exported(rooms[room_id])
             try:
                 room = room_of(rooms[room_id], folder)
@@ -200,7 +208,7 @@ def draw_samples(
                 _require_some(refused, found, table.samples)
                 if stated:  # it is the recipe that names it
                     of_room = len(range(k, table.samples, len(rooms)))
-                    _require_some(lost, [number for number in numbers if number in found], of_room)
+                    _require_some(lost, [number for number in every if number in found], of_room)
     return tuple(found[number] for number in sorted(found)), dict(sorted(refused.items()))
 
 
@@ -267,7 +275,7 @@ class _Makers:
         self._boards = Boards([build_target(target) for target in recipe.targets])
         self._ceiling_m = ceiling_m(room)
 
-    def draw(self, numbers: range) -> tuple[list[RandomSample], dict[int, str]]:
+    def draw(self, numbers: Sequence_[int]) -> tuple[list[RandomSample], dict[int, str]]:
         """Draw some samples, those that are impossible again until they are not; the reason where they stay so."""
         found: dict[int, RandomSample] = {}
         refused: dict[int, str] = {}
@@ -298,21 +306,14 @@ class _Makers:
 
     def _once(self, numbers: list[int], attempt: int) -> dict[int, RandomSample | str]:
         """Draw some samples once; the reason instead of a sample that is impossible."""
-        values = draw_values(self._table, list(self._targets), self._points(numbers, attempt))
+        points = points_of(self._recipe, self._table, self._first, numbers, attempt)
+        values = draw_values(self._table, list(self._targets), points)
         spots = place(self._recipe.laser, self._room, self._targets, values)
-        rows = [tuple((name, _plain(column[k])) for name, column in values.items()) for k in range(len(numbers))]
+        rows = rows_of(values, len(numbers))
         return {
             number: self._sample(number, attempt + 1, drawn, spot)
             for number, drawn, spot in zip(numbers, rows, spots, strict=True)
         }
-
-    def _points(self, numbers: list[int], attempt: int) -> dict[str, Array]:
-        drawn = drawn_parameters(self._table)
-        if attempt == 0:
-            return {name: self._first[name][numbers] for name in drawn}
-        dataset, dealt = self._recipe.dataset, [name for name in drawn if name == "spot.hidden"]
-        points = further_points(dataset.name, dataset.seed, [n for n in drawn if n not in dealt], numbers, attempt)
-        return points | {name: self._first[name][numbers] for name in dealt}
 
     def _sample(
         self, number: int, tries: int, drawn: tuple[tuple[str, Value], ...], placed: Placed
@@ -322,21 +323,57 @@ class _Makers:
         if (solid := self._room.solid_around(placed[1].position_world_m)) is not None:
             return f"the spot lies inside {solid}"
         values = dict(drawn)
-        nominal_stroke_m = float(values["stroke_m"])
         try:
-            nominal_rig = build_rig(rig_table(self._recipe.rig, values))
-            misalignment = drawn_misalignment(self._recipe.misalignment, values)
-            rig, stroke_m = nominal_rig.perturbed(misalignment), true_stroke_m(misalignment, nominal_stroke_m)
+            rigs = drawn_rigs(self._recipe, values)
         except SceneError as error:
             return by_keys(str(error))
-        if fault := rig_fault(rig, stroke_m, self._ceiling_m, self._boards):
+        if fault := rig_fault(rigs.rig, rigs.stroke_m, self._ceiling_m, self._boards):
             return fault
-        if "spot.hidden" in values and (
-            fault := visibility_fault(values["spot.hidden"] == HIDDEN, rig, stroke_m, placed[1], self._room)
-        ):
-            return fault
-        place = (self._room_id, rig, *placed)
-        return RandomSample(number, tries, drawn, *place, stroke_m, nominal_rig, nominal_stroke_m)
+        causes: tuple[str, ...] | str = ()
+        if "spot.hidden" in values:
+            causes = shown_as(values["spot.hidden"] == HIDDEN, rigs.rig, rigs.stroke_m, placed[1], self._room)
+        if isinstance(causes, str):
+            return causes
+        place = (self._room_id, rigs.rig, *placed)
+        return RandomSample(
+            number, tries, drawn, *place, rigs.stroke_m, rigs.nominal_rig, rigs.nominal_stroke_m, causes
+        )
+
+
+@dataclass(frozen=True)
+class DrawnRigs:
+    """Rigs and strokes of a draw: the true ones, and those that an estimator is given."""
+
+    rig: Rig
+    stroke_m: float
+    nominal_rig: Rig
+    nominal_stroke_m: float
+
+
+def drawn_rigs(recipe: Recipe, values: Mapping[str, Value]) -> DrawnRigs:
+    """Rigs and strokes of drawn values, by parameter; `SceneError` where there can be no such rig."""
+    nominal_stroke_m = float(values["stroke_m"])
+    nominal_rig = build_rig(rig_table(recipe.rig, values))
+    misalignment = drawn_misalignment(recipe.misalignment, values)
+    rig, stroke_m = nominal_rig.perturbed(misalignment), true_stroke_m(misalignment, nominal_stroke_m)
+    return DrawnRigs(rig, stroke_m, nominal_rig, nominal_stroke_m)
+
+
+def points_of(
+    recipe: Recipe, table: RandomTable, first: Mapping[str, Array], numbers: list[int], attempt: int
+) -> dict[str, Array]:
+    """Numbers of a try, 0 and up, of some samples, by parameter; `first` are those of try 0 of all samples."""
+    drawn = drawn_parameters(table)
+    if attempt == 0:
+        return {name: first[name][numbers] for name in drawn}
+    dataset, dealt = recipe.dataset, [name for name in drawn if name == "spot.hidden"]
+    points = further_points(dataset.name, dataset.seed, [n for n in drawn if n not in dealt], numbers, attempt)
+    return points | {name: first[name][numbers] for name in dealt}
+
+
+def rows_of(values: Mapping[str, Any], count: int) -> list[tuple[tuple[str, Value], ...]]:
+    """Drawn values of each of so many samples, from columns."""
+    return [tuple((name, _plain(column[k])) for name, column in values.items()) for k in range(count)]
 
 
 def rig_fault(rig: Rig, stroke_m: float, ceiling_m: float, boards: Boards) -> str | None:

@@ -228,8 +228,8 @@ def place(laser: LaserTable, room: Room, targets: Mapping[str, TargetTable], val
 _DARK = 0.01  # of the spot's light in the image that shows it: what a hidden spot may still send into the other one
 
 
-def visibility_fault(hidden: bool, rig: Rig, stroke_m: float, spot: LaserSpot, room: Room) -> str | None:
-    """Say why a spot is not shown as it should be: by exactly one image if `hidden`, else by both; None if it is.
+def shown_as(hidden: bool, rig: Rig, stroke_m: float, spot: LaserSpot, room: Room) -> tuple[str, ...] | str:
+    """Causes of both views, or why a spot is not shown as it should be: by exactly one image if `hidden`, else by both.
 
     The hidden image must hold no light of the spot either. Where a chief ray just fails, half of the spot may be seen:
     whoever finds that is not wrong.
@@ -239,9 +239,12 @@ def visibility_fault(hidden: bool, rig: Rig, stroke_m: float, spot: LaserSpot, r
     causes = [spot_truth(view, spot, geometry).cause for view, geometry in zip(views, rooms, strict=True)]
     seen = [cause == VISIBLE for cause in causes]
     if not hidden:
-        return None if all(seen) else f"the spot is not visible ({next(c for c in causes if c != VISIBLE)})"
+        return tuple(causes) if all(seen) else f"the spot is not visible ({next(c for c in causes if c != VISIBLE)})"
     if all(seen) or not any(seen):
         return "the spot is not hidden in exactly one image"
-    light = [float(spot_layer(*of).total_electrons_per_s.sum()) for of in zip(views, (spot, spot), rooms, strict=True)]
     shown = seen.index(True)
-    return None if light[1 - shown] <= _DARK * light[shown] else "the image that hides the spot shows a part of it"
+    hidden_e = float(spot_layer(views[1 - shown], spot, rooms[1 - shown]).total_electrons_per_s.sum())
+    if hidden_e == 0.0:  # whatever the other one shows
+        return tuple(causes)
+    shown_e = float(spot_layer(views[shown], spot, rooms[shown]).total_electrons_per_s.sum())
+    return tuple(causes) if hidden_e <= _DARK * shown_e else "the image that hides the spot shows a part of it"

@@ -292,9 +292,10 @@ LOG = "log.jsonl"
 JOURNAL = "journal.txt"
 LOCK = ".phibench-lock"
 WORKING = ".phibench-working"
+DRAWS = ".phibench-draws"
 CONTACT_SHEET = "contact_sheet.png"
 SENSITIVITIES = "sensitivities.parquet"
-NOT_DATA = (CHECKSUMS, RUN, LOG, JOURNAL, LOCK, WORKING, CONTACT_SHEET, SENSITIVITIES)
+NOT_DATA = (CHECKSUMS, RUN, LOG, JOURNAL, LOCK, WORKING, DRAWS, CONTACT_SHEET, SENSITIVITIES)
 """Files that SHA256SUMS does not list: itself, the diaries of the run, locks, and what is computed from it all."""
 
 _TASK = re.compile(rf"(bake|view|spot|sample) ({_ID})")
