@@ -152,10 +152,15 @@ def _bake_s(plan: Plan) -> float:
 
 
 def _room_s(plan: Plan, room: Room) -> float:
-    """Seconds of the light map of a room: rays are texels times rays per texel."""
-    ambient = plan.recipe.ambient
-    if not room.lit or is_cached(plan.rig.at(0.0), room, bake_settings(ambient)):
+    """Seconds of the light map of a room, baked or taken from the cache."""
+    if not room.lit or is_cached(plan.rig.at(0.0), room, bake_settings(plan.recipe.ambient)):
         return CACHED_BAKE_S
+    return light_map_s(plan, room)
+
+
+def light_map_s(plan: Plan, room: Room) -> float:
+    """Seconds of baking the light map of a room: rays are texels times rays per texel."""
+    ambient = plan.recipe.ambient
     table = face_table(fixed_shapes(room))
     doubled = math.log2(max(len(table.patch), 64))
     fine, indirect, coarse = (

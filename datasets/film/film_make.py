@@ -93,6 +93,26 @@ def make_films(recipe: str | Path, out: str | Path, workers: int | None = None, 
         raise DatasetError(f"{told}; then run the same command again") from error
 
 
+def unfinished(plan: Plan, films: Sequence[FilmPlan], out: Path) -> list[FilmPlan]:
+    """Films that `make_films` would make in a folder; nothing is written.
+
+    Raises
+    ------
+    DatasetError
+        If the folder holds something else.
+    """
+    _refuse_other(out, plan.recipe.dataset.name)
+    if not out.is_dir():
+        return list(films)
+    keys = _keys(plan, films)
+    return [film for film in films if not _is_done(out, film, keys[film.film_id])]
+
+
+def _keys(plan: Plan, films: Sequence[FilmPlan]) -> dict[str, str]:
+    code = code_behind("phibench.datasets.film.film_make")
+    return {film.film_id: film_key(plan, film, code) for film in films}
+
+
 def _refuse_other(out: Path, name: str) -> None:
     """Raise `DatasetError` for a folder of something else."""
     if out.is_file():
@@ -106,8 +126,7 @@ def _refuse_other(out: Path, name: str) -> None:
 
 
 def _make(plan: Plan, films: Sequence[FilmPlan], text: str, out: Path, workers: int | None, console: Console) -> Made:
-    code = code_behind("phibench.datasets.film.film_make")
-    keys = {film.film_id: film_key(plan, film, code) for film in films}
+    keys = _keys(plan, films)
     todo = [film for film in films if not _is_done(out, film, keys[film.film_id])]
     if todo:
         (out / CHECKSUMS).unlink(missing_ok=True)

@@ -327,14 +327,3 @@ def _robot_lines(scene: FilmScene, up_m: float) -> tuple[Array, Array]:
 
 def _grid(low: float, high: float) -> Array:
     return np.linspace(low, high, math.ceil((high - low) / _GRID_M) + 1)
-
-
-def listed(plans: tuple[FilmPlan, ...]) -> Iterator[str]:
-    """Lines that say what will be made."""
-    for plan in plans:
-        times = plan.scene.times
-        height, width = plan.region.shape
-        yield (
-            f"{plan.film_id}: {times.frames} frames, {times.duration_s:.2f} s, {width} x {height} px, "
-            f"{sum(plan.keys)} key views or more"
-        )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -77,7 +77,12 @@ def _light_maps(rig: Rig, film: FilmPlan, room: Room, settings: BakeSettings) ->
     """
     from phibench.datasets.build.light_map_cache import light_map
 
-    parts, result = PoseParts.of(film.scene), []
+    return [(places, [light_map(view, room, settings) for view in views]) for places, views in light_views(rig, film)]
+
+
+def light_views(rig: Rig, film: FilmPlan) -> Iterator[tuple[Array, list[View]]]:
+    """Places of each part at which a light map is baked, and the views there."""
+    parts = PoseParts.of(film.scene)
     for number, part in enumerate(parts.parts):
         count, drive = 1, film.scene.drive
         if part.leg is not None and drive is not None:
@@ -86,9 +91,7 @@ def _light_maps(rig: Rig, film: FilmPlan, room: Room, settings: BakeSettings) ->
             count = 1 + math.ceil(way / drive.profiles[part.leg].end_m / _BAKE_M) if leg.drives else 2
         places = np.linspace(part.low, part.high, count)
         # of the view, a light map takes the robot's place and the origin of coordinates: films of a set share that
-        views = (replace(parts.view(number, float(at)), rig=rig, offset_m=0.0, motion=None) for at in places)
-        result.append((places, [light_map(view, room, settings) for view in views]))
-    return result
+        yield places, [replace(parts.view(number, float(at)), rig=rig, offset_m=0.0, motion=None) for at in places]
 
 
 def key_views(

@@ -25,6 +25,7 @@ from rich.console import Console
 
 from phibench.datasets.build.forecast import megabytes
 from phibench.datasets.errors import DatasetError
+from phibench.datasets.film.film_forecast import films_forecast
 from phibench.datasets.film.film_make import make_films
 from phibench.datasets.film.film_plan import film_plans
 from phibench.datasets.film.film_store import INFO as FILM_INFO
@@ -68,7 +69,6 @@ _TIME_S = 315532800  # 1980-01-01, as all files of a sealed set have
 _LEAST_SEED, _SEED_BITS = 2**56, 62
 _SEAL = "seal.json"
 _IMAGE_BYTES, _IMAGES = 730_000, 4  # of a sealed pair at 1280 x 720; the mean of 40 pairs in three presets
-_VIEW_BYTES_PX = 25.0  # of a film's key view
 
 
 class ArchiveRow(Document):
@@ -179,9 +179,9 @@ def dry_run(request: ReleaseRequest) -> Iterator[str]:
 
 def _film_cost(part: Part) -> str:
     plan, films = film_plans(parse_recipe(part.text()), recipe_files(part.recipe))
-    views = sum(sum(film.keys) for film in films)
-    size = sum(sum(film.keys) * _VIEW_BYTES_PX * film.region.shape[0] * film.region.shape[1] for film in films)
-    return f"{len(plan.pairs)} films, about {megabytes(int(size))} or more, {views} rendered views or more"
+    forecast = films_forecast(plan, films)
+    hours = (forecast.cpu_s + sum(forecast.bakes)) / 3600.0
+    return f"{len(films)} films, about {megabytes(forecast.size)} or more, {hours:.2g} CPU-hours"
 
 
 # Folders, seed, and data sets that are there.

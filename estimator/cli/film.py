@@ -36,15 +36,12 @@ def make(
     workers
         Number of processes; one for each core by default.
     dry_run
-        Say what will be made; render nothing.
+        Say what will be made, how many bytes and how long it takes; render nothing.
     """
     if dry_run:
-        from phibench.datasets.film.film_plan import check_drives, film_plans, listed
-        from phibench.datasets.recipe.load import load_recipe, recipe_files
+        from phibench.datasets.film.film_forecast import dry_run as lines
 
-        plan, films = film_plans(load_recipe(recipe), recipe_files(recipe))
-        check_drives(plan, films)
-        for line in listed(films):
+        for line in lines(recipe, out, workers):
             print(line)
         return 0
     from phibench.datasets.film.film_make import make_films

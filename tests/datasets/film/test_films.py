@@ -13,6 +13,7 @@ from conftest import ROOT
 
 from phibench.datasets.errors import DatasetError, RecipeError
 from phibench.datasets.film import film_make, film_room
+from phibench.datasets.film.film_forecast import dry_run, films_forecast
 from phibench.datasets.film.film_make import make_films
 from phibench.datasets.film.film_plan import check_drives, film_plans
 from phibench.datasets.film.film_read import Film, open_films
@@ -117,6 +118,21 @@ def test_other_lights_have_their_own_code_colour_and_path(film_images: Path) -> 
     stream = NoiseStream(("light", k))
     more = chain.frame(both, stream) - chain.frame(replace(both, others=both.others[1:]), stream)
     assert more[0].sum() == pytest.approx(film.sensor("ideal").exposure_s * light[k], rel=1e-4)
+
+
+def test_a_dry_run_tells_bytes_and_time_and_leaves_out_what_is_made(film_images: Path, tmp_path: Path) -> None:
+    recipe, out = film_images / "recipe.toml", tmp_path / "new"
+    *lines, last = dry_run(recipe, out, workers=1)
+    assert [line.split(":")[0] for line in lines] == [FILM]
+    assert "to make: 1 film of 10 frames with" in last
+    assert " MB, " in last
+    assert not out.exists()
+    assert list(dry_run(recipe, film_images)) == ["to make: nothing; 1 kept; nothing was rendered"]
+    plan, films = film_plans(parse_recipe(recipe.read_text(encoding="utf-8")))
+    folder = film_of(film_images)
+    size = sum(path.stat().st_size for path in folder.folder.path.rglob("*") if path.is_file())
+    # spots of so small an image take less than those of the constants
+    assert 0.5 < films_forecast(plan, films).size / size < 3.0
 
 
 def test_a_killed_run_goes_on_and_gives_the_same_bytes(film_windows: Path, tmp_path: Path, monkeypatch: Any) -> None:
