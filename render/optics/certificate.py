@@ -71,6 +71,11 @@ class Certificate:
     flux_tolerance: float
     passed: bool
 
+    @property
+    def chief_rays_agree(self) -> bool:
+        """False where the places differ, which no number of rays mends."""
+        return self.chief_difference_px <= self.chief_tolerance_px
+
 
 def certify(view: View, spot: LaserSpot, room: GeometryLike, truth: SpotTruth, layer: SpotLayer) -> Certificate:
     """Check one visible spot. Raises nothing: look at `passed`.

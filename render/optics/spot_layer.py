@@ -61,9 +61,17 @@ class SpotLayer:
     total_electrons_per_s: Array
 
 
-def spot_layer(view: View, spot: LaserSpot, room: GeometryLike) -> SpotLayer:
-    """Render the spot by specular connection (ideal mirror) or microfacet sampling (rough mirror)."""
-    cloud = (rough_cloud if view.rig.mirror.roughness_alpha > 0.0 else specular_cloud)(view, spot, as_geometry(room))
+def spot_layer(view: View, spot: LaserSpot, room: GeometryLike, log2_pairs: int | None = None) -> SpotLayer:
+    """Render the spot by specular connection (ideal mirror) or microfacet sampling (rough mirror).
+
+    `log2_pairs` takes so many quasi-random pairs of an ideal mirror, whatever the spot seems to need (a rough mirror
+    has its own number).
+    """
+    geometry = as_geometry(room)
+    if view.rig.mirror.roughness_alpha > 0.0:
+        cloud = rough_cloud(view, spot, geometry)
+    else:
+        cloud = specular_cloud(view, spot, geometry, log2_pairs)
     gain = np.array(view.rig.camera.detector.laser_electrons_per_joule(spot.wavelength_nm))
     return splat(cloud, view.rig.camera.blur_sigma_px, gain)
 

@@ -156,13 +156,15 @@ class FilmCloud:
             return self.watts @ self.uv_px / self.watts.sum()
 
 
-def specular_cloud(view: View, spot: LaserSpot, room: GeometryLike) -> FilmCloud:
+def specular_cloud(view: View, spot: LaserSpot, room: GeometryLike, log2_pairs: int | None = None) -> FilmCloud:
     """Quadrature over spot and aperture; occluded pairs keep their place with power 0.
 
     Where an edge cuts the light, or faces and textures change below it, nodes would sample a step: quasi-random pairs
-    take over.
+    take over. `log2_pairs` takes that many of them in any case.
     """
     geometry = as_geometry(room)
+    if log2_pairs is not None:
+        return _dense_cloud(view, spot, geometry, log2_pairs)
     probes = deposit(spot, geometry, _probes(spot))
     if _is_cut(view, spot, geometry, probes):
         return _dense_cloud(view, spot, geometry, _LOG2_DENSE)

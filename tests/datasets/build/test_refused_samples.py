@@ -12,7 +12,7 @@ from helpers.inline_workers import make_inline
 from helpers.processes import SMALLEST, quiet
 from helpers.refusing_workers import REFUSED
 
-from phibench.datasets.build import tasks, workers
+from phibench.datasets.build import spot_task, tasks, workers
 from phibench.datasets.build.journal import Journal
 from phibench.datasets.errors import DatasetError, IncompleteError, RecipeError
 from phibench.datasets.make import dry_run, make
@@ -22,6 +22,11 @@ from phibench.datasets.recipe.load import load_recipe
 from phibench.datasets.store import schema
 from phibench.datasets.verify import verify
 from phibench.estimator.cli.main import main
+from phibench.render.optics import certificate, spot_samples
+from phibench.scenes.catalog import default_rig
+from phibench.scenes.laser import LaserSpot
+from phibench.scenes.room import Room
+from phibench.scenes.shapes import cuboid
 
 DRAWN = """
 [random]
@@ -165,3 +170,24 @@ def test_a_bug_beside_a_refused_sample_is_no_refusal(
         make(recipe, tmp_path / "out", workers=1, console=quiet())
     assert not isinstance(caught.value, IncompleteError)
     assert "spot random-000002" in Journal(tmp_path / "out").entries
+
+
+def test_a_layer_of_too_few_pairs_is_made_again_before_its_sample_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An edge cuts the light. 2^6 pairs are wrong by some percent of the flux, of which 0.3 % are allowed."""
+    view, spot = default_rig().at(0.4), LaserSpot((2.0, 0.0, 0.5), (-1, 0, 0), 5e-3)
+    room = Room("cut", (), (cuboid("screen", (1.9, -0.501, 0.5), (0.01, 1.0, 1.0), (0.5, 0.5, 0.5)),))
+    enough = spot_task.answer_spot(view, spot, room).layer.total_electrons_per_s[0]
+    monkeypatch.setattr(spot_samples, "_LOG2_DENSE", 6)
+    monkeypatch.setattr(spot_task, "_LOG2_MORE_PAIRS", (17,))
+    monkeypatch.setattr(certificate, "_LOG2_RAYS", (15,))
+    with monkeypatch.context() as never_again:
+        never_again.setattr(spot_task, "_LOG2_MORE_PAIRS", ())
+        few = spot_task.answer_spot(view, spot, room)
+    more = spot_task.answer_spot(view, spot, room)
+    assert few.certificate is not None
+    assert more.certificate is not None
+    assert not few.certificate.passed
+    assert more.certificate.passed
+    # 2^17 Sobol' pairs: to about 1e-3 of the flux; the same pairs give the same layer
+    assert more.layer.total_electrons_per_s[0] == pytest.approx(enough, rel=1e-12)
+    assert few.layer.total_electrons_per_s[0] != pytest.approx(enough, rel=3e-3)
