@@ -23,7 +23,6 @@ from phibench.scenes.laser import LaserSpot
 from phibench.scenes.rig import POSITIONS, Rig, Stroke, View
 from phibench.scenes.room import Room
 
-
 _LOG2_MORE_PAIRS = (19, 21)  # four and sixteen times those of a spot that an edge cuts
 
 

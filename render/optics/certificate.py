@@ -348,6 +348,9 @@ _APART = 4.0  # standard deviations from the image's middle: 3e-4 of a Gaussian
 _MOST_APART = 8  # faces
 _APART_WIDTH = 2.0  # a few pilots tell the extent badly
 _WIDTHS = (1.3, 3.0)  # of the two Gaussians, relative to the image: bounded weights, and tails where it is no Gaussian
+_MANY = 16  # pilots that tell a face's part of the image
+_SCATTERED = 0.15  # area of the parts over that of a Gaussian about all of them, below which each is drawn by itself
+_STRAY = 0.2  # share of the rays that are drawn about all of them even so
 
 
 def _trace_beam(
@@ -395,8 +398,9 @@ def _image_parts(view: View, spot: LaserSpot, room: RoomGeometry, chief_px: Arra
     """Gaussians that cover the spot's image, pixels from the chief ray's.
 
     Two cover the whole. A tail of the beam that passes an edge lands further on, and its image apart from the rest:
-    each face with such a part gets a Gaussian of its own. Only how densely film positions are drawn follows from all
-    this, which is why the world-side solution may be used.
+    each face with such a part gets a Gaussian of its own. Where an edge splits the beam, the image is parts with little
+    between them, and each is covered by itself. Only how densely film positions are drawn follows from all this, which
+    is why the world-side solution may be used.
     """
     places = ndtri(np.clip(sobol(2, _PILOTS), 1e-4, 1.0 - 1e-4))
     light = deposit(spot, room, places if spot.profile == "gaussian" else 0.5 * places)
@@ -407,6 +411,8 @@ def _image_parts(view: View, spot: LaserSpot, room: RoomGeometry, chief_px: Arra
     uv, patch = np.concatenate([uv[found], np.zeros((1, 2))]), np.append(light.patch[found], -1)
     mean, covariance = _moments_of(uv)
     root = np.asarray(np.linalg.cholesky(covariance), float)
+    if split := _split_parts(uv, patch, covariance):
+        return [*split, _Part(_STRAY, mean, _WIDTHS[1] * root)]
     away = np.linalg.norm(np.linalg.solve(root, (uv - mean).T), axis=0) > _APART
     faces, counts = np.unique(patch[away], return_counts=True)
     apart = faces[np.argsort(-counts, kind="stable")][:_MOST_APART]
@@ -417,6 +423,24 @@ def _image_parts(view: View, spot: LaserSpot, room: RoomGeometry, chief_px: Arra
         own_root = _APART_WIDTH * np.asarray(np.linalg.cholesky(own + 0.01 * covariance), float)
         parts.append(_Part((1.0 - whole) / len(apart), own_mean, own_root))
     return parts
+
+
+def _split_parts(uv: Array, patch: IntArray, covariance: Array) -> list[_Part]:
+    """Gaussians of the faces that share an image with little between its parts; none for any other image."""
+    faces, counts = np.unique(patch[patch >= 0], return_counts=True)
+    most = np.argsort(-counts, kind="stable")[:_MOST_APART]
+    most = most[counts[most] >= _MANY]
+    if len(most) < 2:
+        return []
+    moments = [_moments_of(uv[patch == face]) for face in faces[most]]
+    if sum(math.sqrt(np.linalg.det(own)) for _, own in moments) > _SCATTERED * math.sqrt(np.linalg.det(covariance)):
+        return []
+    shares = (1.0 - _STRAY) * counts[most] / counts[most].sum()
+    return [
+        _Part(0.5 * float(share), mean, width * np.asarray(np.linalg.cholesky(own), float))
+        for share, (mean, own) in zip(shares, moments, strict=True)
+        for width in _WIDTHS
+    ]
 
 
 def _moments_of(uv: Array) -> tuple[Array, Array]:

@@ -234,6 +234,26 @@ def test_certificate_of_a_beam_whose_tail_passes_an_edge() -> None:
     assert _differences(VIEW, spot, RoomGeometry(shapes), truth, alone, 15)[1] > 3.0 * FLUX_TOLERANCE
 
 
+def test_certificate_of_a_beam_that_an_edge_splits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A part of the beam passes the edge of a board and lands 0.15 m behind it: two images, 7 px apart.
+
+    2^15 rays about each are enough. About both together, as an image of one piece is covered, they are not.
+    """
+    board = rectangle("board", (0.6, 0.1, 0.7), (-1.0, 0.0, 0.0), (0.2, 0.4))
+    behind = rectangle("behind", (0.75, 0.0, 0.7), (-0.9, -0.4, 0.0), (2.0, 2.0))
+    shapes = (board, behind)
+    spot = beam_onto(shapes, (0.6, 1e-3, 0.72))
+    truth, layer = spot_truth(VIEW, spot, shapes), spot_layer(VIEW, spot, shapes)
+    certificate = certify(VIEW, spot, shapes, truth, layer)
+    assert certificate.passed, certificate
+    centroid_px, flux = _differences(VIEW, spot, RoomGeometry(shapes), truth, layer, 15)
+    assert centroid_px < CENTROID_TOLERANCE_PX
+    assert flux < FLUX_TOLERANCE
+    monkeypatch.setattr("phibench.render.optics.certificate._SCATTERED", 0.0)
+    together_px, _ = _differences(VIEW, spot, RoomGeometry(shapes), truth, layer, 15)
+    assert together_px > CENTROID_TOLERANCE_PX, (centroid_px, flux, together_px)
+
+
 def test_coats_keep_energy() -> None:
     """A white ground returns all that enters; f(1.5) = 0.596 (Egan and Hilgeman 1979), T(1.5) = 0.96 head on."""
     assert inside_reflectance(1.5) == pytest.approx(0.596, abs=1e-3)
