@@ -51,6 +51,8 @@ _NO_PAIR: Pair | None = None
 _READS = 16  # of 64 kB at a time
 _LOOK_MS = 500  # between looks at whether anybody listens
 _LINES, _LINE_LENGTH = 20, 200  # of the output that an outcome keeps
+# Python 3.14 prints a stack of C functions after that of Python
+_STACK = re.compile(r"(?<!C stack trace )\(most recent call first\)")
 _FRAME = re.compile(r'^  File "(.+)", line (\d+) in (.+)$')
 
 
@@ -133,7 +135,8 @@ def stack_place(text: str, file: str = "") -> str:
 
 def _last_stack(text: str) -> Iterator[tuple[str, str, str]]:
     """Frames (file, line, function), the innermost first."""
-    for line in text[text.rfind("(most recent call first)") :].splitlines():
+    starts = [match.start() for match in _STACK.finditer(text)] or [0]
+    for line in text[starts[-1] :].splitlines():
         if match := _FRAME.match(line):
             yield match[1], match[2], match[3]
 

@@ -21,7 +21,7 @@ from helpers.sandbox_pairs import GOOD, HEADER, SHAPE, SmallPairs, method_file
 
 from phibench.estimator.interface import FAILURES, Outcome, Pair
 from phibench.estimator.pair_set import PairTruth, SpotTruth
-from phibench.estimator.sandbox.process import MethodProcess, environment
+from phibench.estimator.sandbox.process import MethodProcess, environment, stack_place
 from phibench.estimator.sandbox.resolve import MethodError, RunLimits, resolve
 from phibench.estimator.sandbox.runner import Harness, outcomes, run_method
 from phibench.estimator.sandbox.transport import (
@@ -98,6 +98,16 @@ def test_the_message_says_what_happened_and_where(survived: list[Outcome], numbe
     assert "\n" not in survived[number].message
     assert "Traceback" not in survived[number].message
     assert survived[number].answer is None
+
+
+def test_a_stack_of_c_functions_hides_no_line_of_the_method() -> None:
+    """Python 3.14 prints it after the stack of Python; older ones print none."""
+    python = "Fatal Python error: Segmentation fault\n\nCurrent thread 0x1 [python] (most recent call first):\n"
+    frames = '  File "/lib/ctypes/__init__.py", line 624 in string_at\n  File "/x/my_phi.py", line 16 in extract\n'
+    compiled = '\nCurrent thread\'s C stack trace (most recent call first):\n  Binary file "python", at f+0x4a [0x49]\n'
+    for text in (python + frames, python + frames + compiled):
+        assert stack_place(text, "/x/my_phi.py") == "my_phi.py, line 16, in extract"
+    assert stack_place(compiled) == ""
 
 
 def test_an_outcome_keeps_the_last_lines_that_the_method_printed(survived: list[Outcome]) -> None:
