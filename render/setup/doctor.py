@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Literal
 
 from phibench.render.setup.llvm import find_llvm
-from phibench.render.setup.llvm_library import LlvmError, fault_of, prove
+from phibench.render.setup.llvm_library import GET_LIBRARY, MISSING_LIBRARY, LlvmError, fault_of, prove
 from phibench.render.setup.variant import ENVIRONMENT, default_variant
 
 State = Literal["ok", "optional", "warning", "fault"]
@@ -133,9 +133,13 @@ def llvm_finding(*, is_needed: bool) -> Finding:
             "LLVM",
             text,
             state,
-            f"LLVM {llvm.label} fails the proof, {fault}: run `python -m phibench.render.setup.llvm`.",
+            f"LLVM {llvm.label} fails the proof, {fault}: {_remedy(fault)}.",
         )
     return Finding("LLVM", text)
+
+
+def _remedy(fault: str) -> str:
+    return GET_LIBRARY if MISSING_LIBRARY in fault else "run `python -m phibench.render.setup.llvm`"
 
 
 def is_installed(name: str) -> bool:

@@ -63,15 +63,23 @@ def fault_of(module: str, *arguments: str, timeout_s: float, environment: Mappin
 
 
 def _complaint(stderr: str) -> str:
-    """Return the line that matters: LLVM prints its fatal error before a stack, Python prints its own last."""
+    """Return the line that matters: LLVM prints its fatal error before a stack, Python prints its own last.
+
+    A library of the system that Dr.Jit misses is named by an error in the middle.
+    """
     lines = [line.strip() for line in stderr.splitlines() if line.strip()]
-    fatal = [line for line in lines if line.startswith("LLVM ERROR")]
+    fatal = [line for line in lines if line.startswith("LLVM ERROR") or MISSING_LIBRARY in line]
     return (fatal or lines[-1:] or ["no message"])[0]
 
 
 def _ending(returncode: int) -> str:
     return f"killed by signal {-returncode}" if returncode < 0 else f"exit status {returncode}"
 
+
+MISSING_LIBRARY = "cannot open shared object file"
+"""What the loader of Linux says of a library that is not there."""
+GET_LIBRARY = "install the library that it misses (Debian, Ubuntu: `apt-get install libatomic1`)"
+"""What to do then: Dr.Jit needs libatomic, which comes with a compiler and with little else."""
 
 Version = tuple[int, int, int]
 

@@ -14,6 +14,7 @@ from types import ModuleType
 
 from phibench.render.setup.llvm import ENVIRONMENT as LLVM_ENVIRONMENT
 from phibench.render.setup.llvm import use_llvm
+from phibench.render.setup.llvm_library import GET_LIBRARY, MISSING_LIBRARY
 
 _DRIVER = {"linux": "libcuda.so.1", "win32": "nvcuda.dll"}
 _OPTIX = {"linux": "libnvoptix.so.1", "win32": "nvoptix.dll"}
@@ -114,6 +115,11 @@ def _import_mitsuba(*, needs_llvm: bool) -> ModuleType:
         import mitsuba
     except ModuleNotFoundError as error:
         raise VariantError("Mitsuba is not installed: run `pip install 'phibench[render,cluster]'`.") from error
+    except (ImportError, NameError) as error:  # drjit goes on after an ImportError, and stumbles over a name
+        cause = error.__context__ or error
+        raise VariantError(
+            f"Mitsuba cannot be loaded ({cause}){f': {GET_LIBRARY}' if MISSING_LIBRARY in str(cause) else ''}."
+        ) from error
     return mitsuba
 
 

@@ -91,6 +91,7 @@ def test_a_child_that_aborts_hangs_or_fails_is_one_line(tmp_path: Path, monkeypa
         "aborts": "import os, sys\nprint('LLVM ERROR: x', file=sys.stderr)\nprint('0x1', file=sys.stderr)\nos.abort()",
         "hangs": "import time\ntime.sleep(60)",
         "fails": "raise ValueError('so it is')",
+        "misses": "try:\n    raise ImportError('libx.so: cannot open' + ' shared object file')\nfinally:\n    nothing",
         "quits": "import sys\nsys.exit(3)",
         "works": "import os, sys\nsys.exit(os.environ['GIVEN'] + sys.argv[1] != 'ab')",
     }
@@ -99,6 +100,8 @@ def test_a_child_that_aborts_hangs_or_fails_is_one_line(tmp_path: Path, monkeypa
     assert fault_of("child_aborts", timeout_s=30) == "LLVM ERROR: x (killed by signal 6)"
     assert fault_of("child_hangs", timeout_s=0.5) == "not done after 0.5 s"
     assert fault_of("child_fails", timeout_s=30) == "ValueError: so it is (exit status 1)"
+    missing = "ImportError: libx.so: cannot open shared object file (exit status 1)"
+    assert fault_of("child_misses", timeout_s=30) == missing
     assert fault_of("child_quits", timeout_s=30) == "no message (exit status 3)"
     assert fault_of("child_works", "b", timeout_s=30, environment={"GIVEN": "a"}) == ""
 

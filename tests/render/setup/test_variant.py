@@ -11,6 +11,14 @@ from phibench.render.setup.variant import CUDA, LLVM
 
 Python = Callable[..., subprocess.CompletedProcess[str]]
 ACTIVATE = "from phibench.render.setup.variant import LLVM, activate; mi = activate(LLVM)\n"
+WITHOUT_LIBATOMIC = """
+import sys
+class Loader:
+    def find_spec(self, name, path=None, target=None):
+        if name == "drjit._drjit_ext":
+            raise ImportError("libatomic.so.1: cannot open shared object file: No such file or directory")
+sys.meta_path.insert(0, Loader())
+"""
 CHECKSUMS = """
 import sys, drjit as dr
 from drjit.llvm import Float, PCG32
@@ -89,6 +97,8 @@ def test_the_environment_forces_llvm_where_there_is_a_gpu(python: Python) -> Non
         (ACTIVATE, {"PHIBENCH_VARIANT": "llvm_nonsense"}, "Mitsuba has no variant llvm_nonsense: choose one of "),
         (ACTIVATE, {"DRJIT_LIBLLVM_PATH": "/nowhere"}, "DRJIT_LIBLLVM_PATH names /nowhere, which is not a file"),
         ("import drjit\n" + ACTIVATE, {"DRJIT_LIBLLVM_PATH": ""}, "Dr.Jit was imported before its LLVM was chosen"),
+        (WITHOUT_LIBATOMIC + ACTIVATE, {}, "Mitsuba cannot be loaded (libatomic.so.1: cannot open shared object file"),
+        (WITHOUT_LIBATOMIC + ACTIVATE, {}, "apt-get install libatomic1"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line(
