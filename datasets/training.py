@@ -28,6 +28,7 @@ from phibench.datasets.store.layers import SpotWindow
 from phibench.render.sensor.camera_chain import Chain, auto_exposed
 from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.noise_tiles import NoiseStream
+from phibench.render.sensor.rolling_shutter import layer_spectra
 from phibench.scenes.frames import Array
 from phibench.scenes.random_streams import generator
 from phibench.scenes.rig import POSITIONS
@@ -339,31 +340,22 @@ def _sides(datasets: Sequence[Dataset], settings: CropSettings, chosen: Sequence
     return found
 
 
+_PAD_PX = 2
+
+
 def shifted_spot(window: SpotWindow, du_px: float, dv_px: float) -> Array:
     """Planes of a spot whose image is moved by a fraction of a pixel, shape of the window's own.
 
     Samples and derivatives at whole pixels together determine a function whose spectrum ends below one cycle per pixel
     (D. L. Jagerman and L. J. Fogel, "Some general aspects of the sampling theorem", 1956). Samples alone would fold
-    what lies beyond half a cycle: 6 % of a spot with a blur of 0.7 px.
-
-    With F the spectrum, f from -1/2 to 1/2 and g = f - sign(f), samples have S = F(f) + F(g) along each axis.
-    Derivatives by a shift, which are minus those by the place, have -2 pi i (f F(f) + g F(g)). So F(g) is known in u
-    and in v. What is folded in both at once, 0.06^2 of the spot, is taken as if the spectrum were a product.
+    what lies beyond half a cycle: 6 % of a spot with a blur of 0.7 px. `layer_spectra` says how well it does.
     """
-    shape = window.electrons_per_s.shape[1:]
-    pad = [(0, 0), (2, 2), (2, 2)]
-    layers = window.electrons_per_s, window.du_electrons_per_s_px, window.dv_electrons_per_s_px
-    whole, by_u, by_v = (np.fft.fft2(np.pad(planes, pad)) for planes in layers)
-    f_v, f_u = (np.fft.fftfreq(n + 4).reshape(place) for n, place in zip(shape, ((-1, 1), (1, -1)), strict=True))
-    sign_v, sign_u = (np.where(f < 0.0, -1.0, 1.0) for f in (f_v, f_u))
-    folded_u = (f_u * whole - by_u / (-2j * np.pi)) * sign_u
-    folded_v = (f_v * whole - by_v / (-2j * np.pi)) * sign_v
-    turn = np.exp(-2j * np.pi * (f_u * du_px + f_v * dv_px))
-    back_u, back_v = np.exp(2j * np.pi * sign_u * du_px), np.exp(2j * np.pi * sign_v * dv_px)
-    both = folded_u * folded_v * whole.conj() / (np.abs(whole) ** 2 + (1e-6 * np.abs(whole).max()) ** 2)
-    back_u, back_v = back_u - 1.0, back_v - 1.0
-    moved = turn * (whole + folded_u * back_u + folded_v * back_v + both * back_u * back_v)
-    return np.maximum(np.fft.ifft2(moved).real[:, 2 : shape[0] + 2, 2 : shape[1] + 2], 0.0)
+    moved = [
+        spectrum * np.exp(-2j * np.pi * (ku * du_px + kv[:, None] * dv_px))
+        for spectrum, kv, ku in layer_spectra(window, _PAD_PX)
+    ]
+    inner = slice(_PAD_PX, -_PAD_PX)
+    return np.maximum(np.fft.ifft2(np.sum(moved, axis=0)).real[:, inner, inner], 0.0)
 
 
 class _Hashed:

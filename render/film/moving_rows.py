@@ -160,7 +160,7 @@ def _mean_image(images: Sequence[RowsImage]) -> RowsImage:
 def exposure_nodes(scene: FilmScene, middle_s: Array, count: int) -> tuple[Array, Array]:
     """Nodes within the exposures about `middle_s`, shape (N,), and their weights with the laser's level, (N, M).
 
-    Gauss-Legendre on every piece of an exposure during which the laser stays on.
+    Gauss-Legendre on every piece of an exposure, between changes of the laser and waypoints of the spot.
     """
     exposure, code = scene.times.exposure_s, scene.code
     if exposure == 0.0:
@@ -170,11 +170,14 @@ def exposure_nodes(scene: FilmScene, middle_s: Array, count: int) -> tuple[Array
     if code.duration_s > 0.0:
         first = np.ceil((low - code.start_s) / code.bit_s)
         for number in range(math.ceil(exposure / code.bit_s) + 1):
-            edges.insert(-1, np.minimum(np.maximum(code.start_s + (first + number) * code.bit_s, low), high))
+            edges.append(np.clip(code.start_s + (first + number) * code.bit_s, low, high))
+    turns_s = [one.time_s for one in scene.path.waypoints if low.min() < one.time_s < high.max()]
+    edges += [np.clip(time_s, low, high) for time_s in turns_s]
+    ordered = np.sort(edges, axis=0)
     x, weight = leggauss(count)
     pieces = [
         (0.5 * (a + b)[:, None] + 0.5 * (b - a)[:, None] * x, (0.5 * (b - a) * code.level(0.5 * (a + b)))[:, None])
-        for a, b in itertools.pairwise(edges)
+        for a, b in itertools.pairwise(ordered)
     ]
     return np.hstack([node for node, _ in pieces]), np.hstack([part * weight for _, part in pieces]) / exposure
 
