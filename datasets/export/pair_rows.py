@@ -28,6 +28,7 @@ Form = Literal["parquet", "webdataset", "frames"]
 SplitBy = Literal["both", "rig", "room"]
 INDEX = "pairs.parquet"
 SPLITS = ("train", "validation", "test")
+_DOTLESS = str.maketrans("._", "_=")
 POSITION_FIELDS = ("exposure_s", "analogue_gain", "u0_px", "v0_px", "width_px", "height_px")
 """What a draw adds to `down.` and `up.` of the manifest's columns; FORMAT.md's rows of frames describe them."""
 
@@ -106,8 +107,11 @@ class DrawnPair:
 
 
 def pair_key(sample_id: str, draw: int) -> str:
-    """Name of a pair in one draw. It has no dot, for a name in a WebDataset ends at its first one."""
-    return f"{sample_id.replace('.', '_')}-{draw:04d}"
+    """Name of a pair in one draw, no other's. It has no dot, for a name in a WebDataset ends at its first one.
+
+    A dot becomes "_", and "_" becomes "=", which no sample's name has.
+    """
+    return f"{sample_id.translate(_DOTLESS)}-{draw:04d}"
 
 
 def drawn_pair(source: FrameSource, row: ManifestRow, draw: int, request: ExportRequest) -> DrawnPair:

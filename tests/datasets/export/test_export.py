@@ -18,7 +18,7 @@ from PIL import Image
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.export.export_make import Exported, export, verify_export
-from phibench.datasets.export.pair_rows import ExportRequest, Form, splits
+from phibench.datasets.export.pair_rows import ExportRequest, Form, pair_key, splits
 from phibench.datasets.frames.request import FrameRequest
 from phibench.datasets.read import open_dataset
 from phibench.estimator.cli.main import main
@@ -136,6 +136,15 @@ def test_jpegs_are_the_cameras_own(tiny_dataset: Path, tmp_path: Path) -> None:
         source = dataset[row["sample_id"]].frame_source("mjpeg")
         assert row["image_up"]["bytes"] == source.frame("up", 0).jpeg
         assert Image.open(io.BytesIO(row["image_up"]["bytes"])).format == "JPEG"
+
+
+@given(st.lists(st.text("ab._-", min_size=1, max_size=4), min_size=2, max_size=2, unique=True))
+def test_keys_of_other_samples_differ_and_have_no_dot(names: list[str]) -> None:
+    """Samples of targets "d1.5" and "d1_5" had one key, and so one file for the images of both."""
+    assert pair_key("e-d1.5-h0.400", 0) != pair_key("e-d1_5-h0.400", 0)
+    keys = [pair_key(name, 0) for name in names]
+    assert keys[0] != keys[1]
+    assert not any("." in key for key in keys)
 
 
 @dataclass(frozen=True)
