@@ -39,6 +39,8 @@ _MEDIA = {
     "frames": ("image/png", "**/*.png"),
 }
 
+_PIXELS = "Pixels are (column, row), integers at pixel centres."
+
 
 def croissant(dataset: Dataset, request: ExportRequest, table: DataFrame, out: Path, hashes: Mapping[str, str]) -> str:
     """JSON-LD text of an export whose index `table` lies in `out`."""
@@ -47,7 +49,7 @@ def croissant(dataset: Dataset, request: ExportRequest, table: DataFrame, out: P
     about = "One row for each pair of images and draw of the noise, with the exact truth."
     types = {column: str(dtype) for column, dtype in table.schema.items()}
     pairs = record_set("pairs", about, types, column_texts(request), {"fileObject": {"@id": INDEX}}, key="key")
-    text = _description(dataset, request, table)
+    text = f"{_description(dataset, request, table)} {_PIXELS}"
     return croissant_text(name, text, version("phibench"), distribution, [pairs, *_images(request)])
 
 
@@ -105,10 +107,7 @@ def card(dataset: Dataset, request: ExportRequest, table: DataFrame) -> str:
     lines += ["", "## Columns", "", f"Images: {values}.", "", "| column | meaning |", "|---|---|"]
     texts = column_texts(request)
     lines += [f"| `{name}` | {texts.get(name, 'drawn by the recipe')} |" for name in table.columns]
-    lines += [
-        "",
-        "Pixels are (column, row), integers at pixel centres. `rigs.jsonl` has the numbers of every rig by the",
-    ]
+    lines += ["", f"{_PIXELS} `rigs.jsonl` has the numbers of every rig by the"]
     lines += ["ids in `rig` and `nominal_rig`, `rooms.jsonl` those of every room, `recipe.toml` the recipe.", ""]
     return "\n".join([*lines, "## Licence", "", f"[CC BY 4.0]({LICENSE_URL}).", ""])
 

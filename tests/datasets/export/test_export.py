@@ -87,6 +87,7 @@ def test_croissant_is_valid_and_gives_the_rows(done: Path) -> None:
     document = json.loads((done / "croissant.json").read_text())
     assert "http://mlcommons.org/croissant/1.1" in document["conformsTo"]
     assert sum(name.startswith("rai:") for name in document) >= 10
+    assert "integers at pixel centres" in document["description"]  # half a pixel would be a wrong product
     rows = list(read_index(done))
     assert [record["pairs/key"].decode() for record in records] == [row["key"] for row in rows]
     assert [record["pairs/down.u_px"] for record in records] == [row["down.u_px"] for row in rows]
