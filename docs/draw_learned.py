@@ -1,6 +1,7 @@
 """Networks of crops on rooms that they have not seen: by preset, outside the range of training, and a room leak test.
 
     .venv/bin/python docs/draw_learned.py measure DEV TEST NETWORKS out/learned.json
+    .venv/bin/python docs/draw_learned.py seeds SCORES
     .venv/bin/python docs/draw_learned.py draw out/learned.json docs/learned.png
     .venv/bin/python docs/draw_learned.py pairs TEST SCORES NETWORKS
     .venv/bin/python docs/draw_learned.py found SCORES
@@ -11,6 +12,8 @@ SCORES is a folder with scores of `detect` and of others on TEST, such as mjpeg-
 
 NETWORKS is a folder of ONNX files: released.onnx, and others to compare with it, such as other seeds and networks of
 one preset. Crops count of which the first claims a deviation below a pixel.
+
+`seeds` compares scores of detectors of other seeds with those of `learned_detect`: mjpeg-detect_seed1.parquet.
 """
 
 from __future__ import annotations
@@ -292,18 +295,8 @@ def found(scores: Path) -> None:
     for preset, other in OTHERS.items():
         tables = {m: pl.read_parquet(scores / f"{preset}-{m}.parquet") for m in ("detect", "learned_detect", other)}
         for name, table in tables.items():
-            hidden = table.filter(~pl.col("visible"))
-            answered = hidden["u_px"].is_not_null().sum()
-            low, high = clopper_pearson(answered, len(hidden), 0.95)
-            samples = table["sample_id"].to_numpy()
-            parts = {}
-            for part, of in (("detected", "visible"), ("false_detection", None)):
-                base = np.ones(len(table)) if of is None else table[of].to_numpy().astype(float)
-                hits = table[part].to_numpy().astype(float) * (base if of else 1.0)
-                parts[part] = interval(lambda k, h=hits, b=base: float(h[k].sum() / b[k].sum()), samples, preset + part)
-            shown = {key: [round(x, 3) for x in value] for key, value in parts.items()}
-            print(preset, name, f"hidden {answered} of {len(hidden)} [{low:.3f}, {high:.3f}]", shown)
-        _print_minus(preset, tables["learned_detect"].sort(keys), tables["detect"].sort(keys))
+            _print_rates(preset, name, table)
+        _print_minus(preset, "learned_detect minus detect", tables["learned_detect"], tables["detect"])
         mine = tables["learned_detect"].filter("detected", (pl.col("bound_px2") < 1.0).fill_null(False))
         columns = ("du_px", "dv_px", "pull_u", "pull_v")
         both = mine.join(tables[other].filter("detected").select(*keys, *columns), on=keys, suffix="_other")
@@ -315,15 +308,43 @@ def found(scores: Path) -> None:
         _print(preset, other, others, others, pulls[1], bound, samples)
 
 
-def _print_minus(preset: str, one: pl.DataFrame, two: pl.DataFrame) -> None:
+def seeds(scores: Path) -> None:
+    """Print what detectors of other seeds find and answer falsely, and the difference to the released one."""
+    for preset in OTHERS:
+        released = pl.read_parquet(scores / f"{preset}-learned_detect.parquet")
+        _print_rates(preset, "learned_detect", released)
+        for file in sorted(scores.glob(f"{preset}-detect_seed*.parquet")):
+            name, table = file.stem.removeprefix(f"{preset}-"), pl.read_parquet(file)
+            _print_rates(preset, name, table)
+            _print_minus(preset, f"{name} minus learned_detect", table, released)
+
+
+def _print_rates(preset: str, name: str, table: pl.DataFrame) -> None:
+    """Print hidden spots answered, and the rates of visible ones found and of images with a false answer."""
+    hidden = table.filter(~pl.col("visible"))
+    answered = hidden["u_px"].is_not_null().sum()
+    low, high = clopper_pearson(answered, len(hidden), 0.95)
+    samples = table["sample_id"].to_numpy()
+    parts = {}
+    for part, of in (("detected", "visible"), ("false_detection", None)):
+        base = np.ones(len(table)) if of is None else table[of].to_numpy().astype(float)
+        hits = table[part].to_numpy().astype(float) * (base if of else 1.0)
+        parts[part] = interval(lambda k, h=hits, b=base: float(h[k].sum() / b[k].sum()), samples, preset + part)
+    shown = {key: [round(x, 3) for x in value] for key, value in parts.items()}
+    print(preset, name, f"hidden {answered} of {len(hidden)} [{low:.3f}, {high:.3f}]", shown)
+
+
+def _print_minus(preset: str, name: str, first: pl.DataFrame, second: pl.DataFrame) -> None:
     """Print what one method finds and answers falsely more often than another one on the same images."""
+    keys = ["number", "image"]
+    one, two = first.sort(keys), second.sort(keys)
     seen, samples = one["visible"].to_numpy(), one["sample_id"].to_numpy()
     more, false = (one[c].to_numpy().astype(float) - two[c].to_numpy() for c in ("detected", "false_detection"))
     shown = [
         interval(lambda k: float(more[k].sum() / seen[k].sum()), samples, preset + "found"),
         interval(lambda k: float(false[k].mean()), samples, preset + "false"),
     ]
-    print(preset, "learned_detect minus detect: found, false", [[round(x, 3) for x in one] for one in shown])
+    print(preset, f"{name}: found, false", [[round(x, 3) for x in part] for part in shown])
 
 
 def draw(source: Path, out: Path) -> None:
@@ -349,6 +370,8 @@ def draw(source: Path, out: Path) -> None:
 if __name__ == "__main__":
     if sys.argv[1] == "measure":
         measure(*map(Path, sys.argv[2:6]))
+    elif sys.argv[1] == "seeds":
+        seeds(Path(sys.argv[2]))
     elif sys.argv[1] == "pairs":
         pairs(*map(Path, sys.argv[2:5]))
     elif sys.argv[1] == "found":
