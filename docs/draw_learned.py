@@ -5,10 +5,12 @@
     .venv/bin/python docs/draw_learned.py draw out/learned.json docs/learned.png
     .venv/bin/python docs/draw_learned.py pairs TEST SCORES NETWORKS
     .venv/bin/python docs/draw_learned.py found SCORES
+    .venv/bin/python docs/draw_learned.py held DEV NETWORKS
 
 SCORES is a folder with scores of `detect` and of others on TEST, such as mjpeg-detect.parquet, by `phibench score`.
 `pairs` asks the networks at the places that `detect` answered; bounds and other methods' errors are the scores'.
 `found` compares scores of `learned_detect` with those of `detect` and of the fits.
+`held` is what a training is chosen by: crops of rooms of DEV that seed 0 does not train in, from faint to bright ones.
 
 NETWORKS is a folder of ONNX files: released.onnx, and others to compare with it, such as other seeds and networks of
 one preset. Crops count of which the first claims a deviation below a pixel.
@@ -163,6 +165,27 @@ def measure(dev: Path, test: Path, networks: Path, out: Path) -> None:
     tables["leak"] = leak(dev, files)
     print("leak", tables["leak"])
     out.write_text(json.dumps(tables, indent=1))
+
+
+def held(dev: Path, networks: Path) -> None:
+    """Print rms, median and pull of networks in the rooms that seed 0 holds out, and rms by the light of the spot."""
+    files = {file.stem: file for file in sorted(networks.glob("*.onnx"))}
+    samples = rooms_of(dev, 0)[1]
+    for size, numbers in {**SIZES, "mjpeg 95": {"jpeg_quality": 95}}.items():
+        request = FrameRequest(size.split()[0], "auto", overrides=numbers)
+        crops = made(
+            SpotCrops([dev], [request], COUNT, seed=79, settings=SETTINGS, samples=samples, laser_off=True), dev
+        )
+        lead = crops.answers(files[LEAD])
+        light = crops.scalars[:, 0]
+        edges = np.quantile(light[lead.sure], [1 / 3, 2 / 3])
+        for name, one in table_of(crops, files, size, lead.sure).items():
+            if not isinstance(one, dict):
+                continue
+            error, third = crops.answers(files[name]).error_px, np.searchsorted(edges, light)
+            thirds = [rms(error[lead.sure & (third == k)]) for k in range(3)]
+            shown = {key: [round(x, 3) for x in value] for key, value in one.items()}
+            print(size, name, shown, "thirds, faint ones first:", [round(x, 3) for x in thirds], flush=True)
 
 
 def _crops(folder: Path, request: FrameRequest, settings: CropSettings = SETTINGS, count: int = COUNT) -> SpotCrops:
@@ -376,5 +399,7 @@ if __name__ == "__main__":
         pairs(*map(Path, sys.argv[2:5]))
     elif sys.argv[1] == "found":
         found(Path(sys.argv[2]))
+    elif sys.argv[1] == "held":
+        held(*map(Path, sys.argv[2:4]))
     else:
         draw(*map(Path, sys.argv[2:4]))
