@@ -32,6 +32,9 @@ def shard_name(form: Form, split: str, number: int, count: int) -> str:
     return f"{FOLDER[form]}/{split}-{number:05d}-of-{count:05d}.{end}"
 
 
+NEEDS_PYARROW = "Parquet files with images need pyarrow: pip install 'phibench[export]'"
+
+
 def write_shard(
     out: Path, name: str, request: ExportRequest, pairs: Sequence[DrawnPair], table: DataFrame
 ) -> list[str]:
@@ -83,8 +86,7 @@ def _parquet(request: ExportRequest, pairs: Sequence[DrawnPair], table: DataFram
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError as error:
-        text = "Parquet files with images need pyarrow: pip install 'phibench[export]'"
-        raise DatasetError(text) from error
+        raise DatasetError(NEEDS_PYARROW) from error
     arrow = pa.table({name: _arrow_column(pa, table, name) for name in table.columns})
     kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
     for column, _, _ in request.images:

@@ -17,7 +17,7 @@ from typing import Any
 from rich.console import Console
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.export.containers import image_name, shard_name, write_shard
+from phibench.datasets.export.containers import NEEDS_PYARROW, image_name, shard_name, write_shard
 from phibench.datasets.export.dataset_card import card, croissant
 from phibench.datasets.export.pair_rows import INDEX, SPLITS, ExportRequest, drawn_pair, pair_key, pair_table, splits
 from phibench.datasets.exposures.draw import require_outside, sample_key
@@ -102,6 +102,7 @@ def export(
     dataset, console, out = open_finished(folder), console or progress_console(), Path(out)
     count = whole_number("workers", os.cpu_count() or 1 if workers is None else workers, 1)
     _check_folder(out, Path(folder))
+    _versions(request)  # a missing package is said before anything is written
     try:
         out.mkdir(parents=True, exist_ok=True)
         with only_run(out):
@@ -199,9 +200,21 @@ def _key(dataset: Dataset, shard: Shard) -> str:
 
 
 def _versions(request: ExportRequest) -> list[str]:
-    from importlib.metadata import version
+    """Packages that the bytes depend on.
 
-    return [f"pyarrow {version('pyarrow')}"] if request.form == "parquet" else []
+    Raises
+    ------
+    DatasetError
+        If Parquet files are wanted and pyarrow is not installed.
+    """
+    from importlib.metadata import PackageNotFoundError, version
+
+    if request.form != "parquet":
+        return []
+    try:
+        return [f"pyarrow {version('pyarrow')}"]
+    except PackageNotFoundError as error:
+        raise DatasetError(NEEDS_PYARROW) from error
 
 
 def _one(known: Mapping[str, ShardRow], name: str) -> Mapping[str, ShardRow]:

@@ -307,6 +307,12 @@ class _Source:
                 return Path(files.fetch(name, downloader=download))
         except requests.HTTPError as error:
             raise DatasetError(f"{self.name} does not give {name}: {printable_line(str(error), 200)}") from error
+        except requests.ConnectionError as error:
+            if archive is None:
+                raise DatasetError(
+                    f"{self.name} does not answer: check the address, and that its server runs"
+                ) from error
+            raise DatasetError(f"{name} from {self.name} broke off: {_reason(error)}; {again}") from error
         except requests.RequestException as error:
             raise DatasetError(f"{name} from {self.name} broke off: {_reason(error)}; {again}") from error
         except ValueError as error:  # pooch's word for another hash

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -423,11 +424,12 @@ def _setup(rooms: Path | None, fidelity: Fidelity, calibration: Path | None, as_
 
 
 def _print(rows: list[Episode]) -> None:
-    print(f"{'episode':>7s} {'outcome':18s} {'s':>5s} {'m':>5s} {'strokes':>7s} {'D m':>6s} {'stated m':>8s} cause")
+    print(f"{'episode':>7s} {'outcome':18s} {'s':>5s} {'m':>5s} {'strokes':>7s} {'D m':>6s} {'stated m':>8s}  cause")
     for row in rows:
+        stated = f"{row.stated_m:.3f}" if math.isfinite(row.stated_m) else "-"
         print(
             f"{row.number:7d} {row.outcome:18s} {row.time_s:5.1f} {row.driven_m:5.2f} {row.strokes:7d} "
-            f"{row.distance_m:6.3f} {row.stated_m:8.3f} {row.cause}"
+            f"{row.distance_m:6.3f} {stated:>8s}  {row.cause}".rstrip()
         )
     for row in rows:
         if row.refused:

@@ -350,12 +350,25 @@ class TargetBelief(Belief):
         return np.asarray(difference)
 
 
-def _unscented(n: int, residual_z: Any) -> Any:
-    """Filter of `filterpy` with n states, and directions as measurements."""
+def require_filter() -> None:
+    """Make sure of the package that beliefs need.
+
+    Raises
+    ------
+    SceneError
+        If `filterpy` is not installed.
+    """
     try:
-        from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+        import filterpy.kalman  # noqa: F401
     except ImportError as error:
         raise SceneError("beliefs need filterpy: pip install 'phibench[loop]'") from error
+
+
+def _unscented(n: int, residual_z: Any) -> Any:
+    """Filter of `filterpy` with n states, and directions as measurements."""
+    require_filter()
+    from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+
     points = MerweScaledSigmaPoints(n, _ALPHA, _BETA, _KAPPA)
     return UnscentedKalmanFilter(n, 2, 1.0, None, None, points, residual_z=residual_z, z_mean_fn=_direction_mean)
 

@@ -15,8 +15,8 @@ from typing import Any, cast
 import polars as pl
 
 from phibench.estimator.geometry.rig_parameters import drawn_deviation
-from phibench.estimator.loop.belief import Belief
-from phibench.estimator.loop.policies import POLICIES, Policy
+from phibench.estimator.loop.belief import Belief, require_filter
+from phibench.estimator.loop.policies import BELIEVING, POLICIES, Policy
 from phibench.estimator.loop.simulator import REACHED, RUNNING, Action, Known, Observation, Setup, Simulator
 from phibench.scenes.random_streams import Name, generator
 from phibench.scenes.validation import SceneError, nearest
@@ -142,10 +142,12 @@ def episodes_of(setup: Setup, policy: str, count: int, *stream: Name, own_rigs: 
     Raises
     ------
     SceneError
-        If there is no such policy.
+        If there is no such policy, or it needs a package that is not installed.
     """
     if policy not in POLICIES:
         raise SceneError(f"policy '{policy}': {nearest(policy, POLICIES)}")
+    if policy in BELIEVING:
+        require_filter()  # else each episode would count as one that the policy has lost
     return (
         run_episode(simulator, POLICIES[policy](setup.known, simulator), observation, number)
         for number, simulator, observation in _started(setup, count, stream, own_rigs)

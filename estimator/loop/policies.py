@@ -398,3 +398,5 @@ POLICIES: dict[str, Callable[[Known, Simulator], Policy]] = {
     "oracle": Oracle,
 }
 """Policies by name; only the oracle uses the simulator's truth."""
+BELIEVING = ("paper", "greedy", "drive-only")
+"""Policies that keep a belief, for which they need `filterpy`."""

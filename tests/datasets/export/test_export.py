@@ -1,5 +1,6 @@
 """Exports against the data set that they come from, through the libraries of others."""
 
+import importlib.metadata
 import io
 import json
 import re
@@ -202,6 +203,19 @@ def test_bad_requests_end_in_a_sentence(
     said = capsys.readouterr().err
     assert text in said
     assert "Traceback" not in said
+
+
+def test_parquet_without_its_package_is_refused_before_anything_is_written(
+    tiny_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing(name: str) -> str:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", missing)
+    request = ExportRequest("parquet", FrameRequest("srgb8"))
+    with pytest.raises(DatasetError, match=r"need pyarrow: pip install 'phibench\[export\]'"):
+        export(tiny_dataset, request, tmp_path / "out", workers=1)
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("command", ["export", "score"])

@@ -264,6 +264,7 @@ def test_flipped_bits_and_strange_sources_are_refused(made: Made, tmp_path: Path
         assert fetch("small", tmp_path / "later", server.address, tries=1).fetched > 0
         (copy / victim).unlink()
         assert "does not give" in told(server.address)
+    assert "does not answer: check the address" in told("http://127.0.0.1:9/x")
     assert "does not hold 'dev'" in told(copy, "dev")
     assert "no data set 'smal' there; did you mean 'small'?" in told(copy, "smal")
     assert "has another SHA-256 than" in told(copy, manifest_sha256="0" * 64)

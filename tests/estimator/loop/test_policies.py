@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 import time
 from dataclasses import replace
 
@@ -12,6 +13,7 @@ import pytest
 from helpers.target_approach import rig_covariance
 from scipy.stats import binomtest
 
+from phibench.estimator.cli import film
 from phibench.estimator.cli import main as cli
 from phibench.estimator.loop.arena import generated_arena
 from phibench.estimator.loop.episodes import (
@@ -183,6 +185,23 @@ def test_a_target_that_is_never_seen_is_said() -> None:
 def test_unknown_policies_are_refused() -> None:
     with pytest.raises(SceneError, match="papr"):
         run_episodes(Setup(), "papr", 1, "x")
+
+
+def test_a_policy_without_its_package_is_no_policy_that_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No episode counts as lost; policies without a belief run."""
+    monkeypatch.setitem(sys.modules, "filterpy.kalman", None)
+    for policy in sorted(set(POLICIES) - {"random", "oracle"}):
+        with pytest.raises(SceneError, match=r"need filterpy: pip install 'phibench\[loop\]'"):
+            run_episodes(Setup(), policy, 1, "x")
+    assert len(run_episodes(Setup(), "random", 1, "x")) == 1
+
+
+def test_a_table_of_episodes_has_a_dash_where_nothing_was_stated(capsys: pytest.CaptureFixture[str]) -> None:
+    [episode] = run_episodes(Setup(), "random", 1, "x")
+    film._print([replace(episode, stated_m=math.nan, cause="ran into something")])
+    row = capsys.readouterr().out.splitlines()[1]
+    assert "nan" not in row
+    assert row.endswith(" -  ran into something")
 
 
 @pytest.mark.slow
