@@ -411,8 +411,9 @@ def _image_parts(view: View, spot: LaserSpot, room: RoomGeometry, chief_px: Arra
     uv, patch = np.concatenate([uv[found], np.zeros((1, 2))]), np.append(light.patch[found], -1)
     mean, covariance = _moments_of(uv)
     root = np.asarray(np.linalg.cholesky(covariance), float)
-    if split := _split_parts(uv, patch, covariance):
-        return [*split, _Part(_STRAY, mean, _WIDTHS[1] * root)]
+    if shared := _split_faces(uv, patch, covariance):
+        offset = _offsets(view, spot, light.points_m[found])
+        return [*_split_parts(offset, patch[:-1], shared), _Part(_STRAY, mean, _WIDTHS[1] * root)]
     away = np.linalg.norm(np.linalg.solve(root, (uv - mean).T), axis=0) > _APART
     faces, counts = np.unique(patch[away], return_counts=True)
     apart = faces[np.argsort(-counts, kind="stable")][:_MOST_APART]
@@ -425,17 +426,42 @@ def _image_parts(view: View, spot: LaserSpot, room: RoomGeometry, chief_px: Arra
     return parts
 
 
-def _split_parts(uv: Array, patch: IntArray, covariance: Array) -> list[_Part]:
-    """Gaussians of the faces that share an image with little between its parts; none for any other image."""
+def _split_faces(uv: Array, patch: IntArray, covariance: Array) -> list[int]:
+    """Faces that share an image with little between its parts; none for any other image."""
     faces, counts = np.unique(patch[patch >= 0], return_counts=True)
     most = np.argsort(-counts, kind="stable")[:_MOST_APART]
     most = most[counts[most] >= _MANY]
     if len(most) < 2:
         return []
-    moments = [_moments_of(uv[patch == face]) for face in faces[most]]
-    if sum(math.sqrt(np.linalg.det(own)) for _, own in moments) > _SCATTERED * math.sqrt(np.linalg.det(covariance)):
-        return []
-    shares = (1.0 - _STRAY) * counts[most] / counts[most].sum()
+    areas = [math.sqrt(np.linalg.det(_moments_of(uv[patch == face])[1])) for face in faces[most]]
+    return [] if sum(areas) > _SCATTERED * math.sqrt(np.linalg.det(covariance)) else faces[most].tolist()
+
+
+def _offsets(view: View, spot: LaserSpot, points_m: Array) -> Array:
+    """Film positions (N, 2) of points through all of the aperture, from those of the spot's centre through the same.
+
+    Points behind the spot are out of its focus: their image moves with the ray's place in the aperture.
+    """
+    lens = view.rig.camera.aperture_radius_m * _disc(sobol(2, len(points_m)))
+    eyes = view.T_world_camera.points(np.concatenate([lens, np.zeros((len(lens), 1))], axis=-1))
+    centre = np.broadcast_to(spot.position_world_m, points_m.shape)
+    pose, focus = view.T_world_camera.inverse(), view.rig.camera.focus_distance_m
+    places = []
+    for ends in (points_m, centre):
+        mirror = pose.points(mirror_points(view, ends, eyes).points_m)
+        at_focus = lens + (mirror[:, :2] - lens) * (focus / mirror[:, 2:])
+        places.append(view.rig.camera.to_pixel(at_focus / focus))
+    return np.asarray(places[0] - places[1])
+
+
+def _split_parts(offset: Array, patch: IntArray, faces: list[int]) -> list[_Part]:
+    """Gaussians of the faces that share an image."""
+    whole = np.isfinite(offset).all(axis=1)
+    chosen = [offset[whole & (patch == face)] for face in faces]
+    counts = np.array([len(part) for part in chosen])
+    # half by the beam's parts, half to each alike: a small part may scatter much light to the mirror
+    shares = (1.0 - _STRAY) * 0.5 * (counts / counts.sum() + 1.0 / len(counts))
+    moments = [_moments_of(part) for part in chosen]
     return [
         _Part(0.5 * float(share), mean, width * np.asarray(np.linalg.cholesky(own), float))
         for share, (mean, own) in zip(shares, moments, strict=True)
