@@ -129,7 +129,18 @@ def completion(shell: Literal["bash", "zsh", "fish"]) -> int:
         "bash", "zsh" or "fish".
     """
     print(app.generate_completion(shell=shell))
+    if shell == "zsh":
+        print(_ZSH_CALL)
     return 0
+
+
+# zsh runs a file of its fpath as the function itself; cyclopts defines another one and does not call it.
+_ZSH_CALL = """
+if [[ "${funcstack[1]}" == _phibench ]]; then
+  _cyclopts_phibench "$@"
+else
+  compdef _cyclopts_phibench phibench
+fi"""
 
 
 @app.command(group=INSTALLATION)

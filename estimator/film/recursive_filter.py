@@ -6,8 +6,9 @@ r the first frame's ray and t_1, t_2 across it: in q the image is nearly linear 
 Davison, J. M. M. Montiel, "Inverse depth parametrization for monocular SLAM", IEEE Trans. Robotics 24, 932, 2008).
 
 The pattern's error stays while the spot rests, and is forgotten as it moves on: e_k = s e_(k-1) + w, with
-s = exp(-d^2 / 2 l^2) for a move of d px, and the variance of w that keeps the variance of e. Encoder noise counts as
-noise of the position. The same measurements as in `film_bundle`, one by one: the filter can be asked at any time.
+s = exp(-d^2 / 2 l^2) for a move of d px, and the variance of w that keeps the variance of e. The move is that of the
+predicted position: measured ones differ by noise while the spot rests. Encoder noise counts as noise of the position.
+The same measurements as in `film_bundle`, one by one: the filter can be asked at any time.
 """
 
 from __future__ import annotations
@@ -40,6 +41,8 @@ class FilterState:
         P, and r, t_1, t_2 as rows, world.
     uv_px : array, shape (2,)
         Last position.
+    offset_m : float
+        Last reading of the carriage.
     frames : int
     chi2 : float
         Sum of squared innovations, two degrees of freedom a frame from the second on.
@@ -50,6 +53,7 @@ class FilterState:
     start_m: Array = field(repr=False)
     axes: Array = field(repr=False)
     uv_px: Array
+    offset_m: float
     frames: int = 1
     chi2: float = 0.0
 
@@ -91,7 +95,9 @@ def first_state(rig: Rig, uv_px: Array, noise_px2: Array, pattern_px2: Array, of
     across = np.cross(r, helper) / np.linalg.norm(np.cross(r, helper))
     axes = np.stack([r, across, np.cross(r, across)])
     start = ray.origin_world_m + offset_m * np.array(rig.stroke_axis_world)
-    state = FilterState(np.array([0.0, 0.0, _PRIOR_Q, 0.0, 0.0]), np.eye(5), start, axes, np.asarray(uv_px, float))
+    state = FilterState(
+        np.array([0.0, 0.0, _PRIOR_Q, 0.0, 0.0]), np.eye(5), start, axes, np.asarray(uv_px, float), offset_m
+    )
     J = _image(rig, state, offset_m)[1]
     sight = np.linalg.inv(J[:, :2])
     covariance = np.zeros((5, 5))
@@ -101,21 +107,21 @@ def first_state(rig: Rig, uv_px: Array, noise_px2: Array, pattern_px2: Array, of
     covariance[:2, :2] = sight @ (noise_px2 + pattern_px2) @ sight.T
     covariance[:2, 3:] = -sight @ pattern_px2
     covariance[3:, :2] = covariance[:2, 3:].T
-    return FilterState(state.mean, covariance, start, axes, state.uv_px)
+    return FilterState(state.mean, covariance, start, axes, state.uv_px, offset_m)
 
 
 def updated(
     rig: Rig, state: FilterState, uv_px: Array, noise_px2: Array, pattern_px2: Array, offset_m: float, sigma_m: float
 ) -> FilterState:
     """Belief after one more frame; arguments as for `first_state`, and the encoder's standard deviation."""
-    moved = float(np.linalg.norm(uv_px - state.uv_px))
+    moved = float(np.linalg.norm(_image(rig, state, offset_m)[0] - _image(rig, state, state.offset_m)[0]))
     s = np.exp(-0.5 * (moved / PATTERN_PX) ** 2)
     F = np.diag([1.0, 1.0, 1.0, s, s])
     mean, P = F @ state.mean, F @ state.covariance @ F.T
     P[3:, 3:] += (1.0 - s * s) * pattern_px2
     x = mean
     for _ in range(_ROUNDS):
-        at = FilterState(x, P, state.start_m, state.axes, state.uv_px)
+        at = FilterState(x, P, state.start_m, state.axes, state.uv_px, offset_m)
         predicted, J, by_offset = _image(rig, at, offset_m)
         H = np.hstack([J, np.eye(2)])
         S = H @ P @ H.T + noise_px2 + sigma_m**2 * np.outer(by_offset, by_offset)
@@ -129,7 +135,8 @@ def updated(
     R = noise_px2 + sigma_m**2 * np.outer(by_offset, by_offset)
     covariance = left @ P @ left.T + K @ R @ K.T
     chi2 = state.chi2 + float(innovation @ np.linalg.solve(S, innovation))
-    return FilterState(x, covariance, state.start_m, state.axes, np.asarray(uv_px, float), state.frames + 1, chi2)
+    seen = np.asarray(uv_px, float)
+    return FilterState(x, covariance, state.start_m, state.axes, seen, offset_m, state.frames + 1, chi2)
 
 
 def _image(rig: Rig, state: FilterState, offset_m: float) -> tuple[Array, Array, Array]:

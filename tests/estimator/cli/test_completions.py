@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -99,3 +100,21 @@ def test_completion_imports_nothing_slow(python: Python) -> None:
     )
     assert "chain_fit" in child.stdout
     assert child.stdout.splitlines()[-1] == "[]"
+
+
+def test_the_script_of_zsh_calls_what_it_defines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As a file of `fpath` it is the function `_phibench` itself; sourced, it names its function to `compdef`."""
+    assert cli.main(["completion", "zsh"]) == 0
+    script = tmp_path / "_phibench"
+    script.write_text(capsys.readouterr().out)
+    if (zsh := shutil.which("zsh")) is None:
+        assert script.read_text().rstrip().endswith("fi")
+        assert '_cyclopts_phibench "$@"' in script.read_text()
+        return
+    start = f"fpath=({tmp_path} $fpath); autoload -Uz _phibench; _arguments() {{ print called; }}; "
+    for code, said in (
+        (f"{start}words=(phibench ''); CURRENT=2; _phibench; exit 0", "called"),
+        (f"compdef() {{ print $*; }}; source {script}; exit 0", "_cyclopts_phibench phibench"),
+    ):
+        child = subprocess.run([zsh, "-f", "-c", code], capture_output=True, text=True, check=False)
+        assert said in child.stdout, child.stderr
