@@ -102,21 +102,50 @@ def test_bundle_errors_are_within_their_covariance(understated: bool) -> None:
     assert (found.offset_sigma_m < ENCODER_M).all()
 
 
+def last_state(positions: FilmPositions, readings: Array, pattern_px2: Array) -> FilterState:
+    """Belief of the filter after all frames."""
+    uv, noise = positions.uv_px, positions.noise_px2
+    state = first_state(SCENE.rig, uv[0], noise[0], pattern_px2, readings[0])
+    for k in range(1, FRAMES):
+        state = updated(SCENE.rig, state, uv[k], noise[k], pattern_px2, readings[k], ENCODER_M)
+    return state
+
+
+def test_filter_leaves_a_fit_astray_out() -> None:
+    """A frame late in the stroke whose fit settled 30 deviations away leaves the belief as without it."""
+    positions, readings = drawn(0)
+    nothing = 1e-12 * np.eye(2)
+    astray = positions.uv_px.copy()
+    astray[-2] += 30.0 * np.sqrt(np.diag(positions.noise_px2[-2]))
+    right = last_state(positions, readings, nothing)
+    left_out = last_state(replace(positions, uv_px=astray), readings, nothing)
+    assert left_out.frames == right.frames - 1
+    (depth, sigma), (other, _) = (state.depth(SCENE.rig) for state in (right, left_out))
+    assert abs(depth - other) < 0.5 * sigma
+
+
+def test_filter_keeps_the_patterns_error_at_rest() -> None:
+    """Frames of one place average their noise, not the pattern's error, however far noise moves their fits."""
+    pattern = 0.05**2 * np.eye(2)
+    noise = 0.2**2 * np.eye(2)
+    uv = exact()[1][0] + np.random.default_rng(5).normal(0.0, 0.2, (400, 2))
+    state = first_state(SCENE.rig, uv[0], noise, pattern, 0.0)
+    per_px2 = state.covariance[:2, :2] / (0.2**2 + 0.05**2)
+    for place in uv[1:]:
+        state = updated(SCENE.rig, state, place, noise, pattern, 0.0, 0.0)
+    variance_px2 = 0.5 * np.trace(np.linalg.solve(per_px2, state.covariance[:2, :2]))
+    # 400 frames leave the pattern's variance and a 400th of the noise's; the map of a and b is that of the first frame,
+    # whose place is off by 0.2 px: to some percent
+    assert variance_px2 == pytest.approx(0.05**2 + 0.2**2 / 400, rel=0.1)
+
+
 def test_filter_follows_the_bundle_and_is_consistent() -> None:
     """Normalised squared errors of D of 20 filters: chi-square with 20 degrees, band of 1e-5; the same information."""
     squares, differences = [], []
     nothing = 1e-12 * np.eye(2)
     for number in range(FILTERS):
         positions, readings = drawn(number)
-        state: FilterState | None = None
-        for k in range(FRAMES):
-            uv, noise = positions.uv_px[k], positions.noise_px2[k]
-            if state is None:
-                state = first_state(SCENE.rig, uv, noise, nothing, readings[k])
-            else:
-                state = updated(SCENE.rig, state, uv, noise, nothing, readings[k], ENCODER_M)
-        assert state is not None
-        depth, sigma = state.depth(SCENE.rig)
+        depth, sigma = last_state(positions, readings, nothing).depth(SCENE.rig)
         squares.append(((depth - DEPTH_M) / sigma) ** 2)
         if number < 6:
             joint = film_depth(SCENE.rig, positions, readings, ENCODER_M)
