@@ -101,6 +101,10 @@ class Film:
     def __len__(self) -> int:
         return self.info.frames
 
+    def __repr__(self) -> str:
+        height, width = self.plan.region.shape
+        return f"<film {self.plan.film_id}: {len(self)} frames of {width} x {height} px>"
+
     @cached_property
     def table(self) -> polars.DataFrame:
         """Truth, a row per frame: the columns of FORMAT.md."""

@@ -17,7 +17,7 @@ that all frames together predict: repeated with the bundle, these are Gauss-Newt
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,8 +49,8 @@ class FilmPositions:
     """
 
     uv_px: Array
-    noise_px2: Array
-    shared_px2: Array
+    noise_px2: Array = field(repr=False)
+    shared_px2: Array = field(repr=False)
 
     @property
     def good(self) -> BoolArray:
