@@ -92,7 +92,9 @@ def test_a_full_disk_while_an_exr_is_written(tmp_path: Path) -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
 def test_control_c_in_a_real_process(tmp_path: Path) -> None:
     code = (
-        "import sys, time\nfrom pathlib import Path\nfrom phibench.datasets.store.files import write_atomic\n"
+        # children of a shell's background job ignore SIGINT
+        "import signal, sys, time\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from pathlib import Path\nfrom phibench.datasets.store.files import write_atomic\n"
         "def write(path):\n    path.write_bytes(b'half')\n    print('writing', flush=True)\n    time.sleep(60)\n"
         "write_atomic(Path(sys.argv[1]), write)"
     )
