@@ -25,11 +25,11 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import ndtri
 
-from phibench.render.optics.beam_deposit import BEAM_REACH_M, deposit
+from phibench.render.optics.beam_deposit import BEAM_REACH_M
 from phibench.render.optics.ray_tracer import MirrorRays, lens_rays, reflect, through_glass
-from phibench.render.optics.reflection_point import mirror_points
 from phibench.render.optics.room_tracer import GeometryLike, RoomGeometry, as_geometry, blocked_by
 from phibench.render.optics.spot_layer import SpotLayer
+from phibench.render.optics.spot_samples import image_parts
 from phibench.render.optics.truth import SpotTruth
 from phibench.scenes.faces import FaceTable, IntArray
 from phibench.scenes.frames import Array, BoolArray
@@ -343,16 +343,6 @@ def _through_lens(view: View, spot: LaserSpot, uv: Array, rays: _Reflected, radi
 # Spots of a beam.
 
 
-_PILOTS = 4096
-_APART = 4.0  # standard deviations from the image's middle: 3e-4 of a Gaussian
-_MOST_APART = 8  # faces
-_APART_WIDTH = 2.0  # a few pilots tell the extent badly
-_WIDTHS = (1.3, 3.0)  # of the two Gaussians, relative to the image: bounded weights, and tails where it is no Gaussian
-_MANY = 16  # pilots that tell a face's part of the image
-_SCATTERED = 0.15  # area of the parts over that of a Gaussian about all of them, below which each is drawn by itself
-_STRAY = 0.2  # share of the rays that are drawn about all of them even so
-
-
 def _trace_beam(
     view: View, spot: LaserSpot, room: RoomGeometry, truth: SpotTruth, log2_rays: int
 ) -> tuple[Array, float]:
@@ -360,7 +350,7 @@ def _trace_beam(
     x = np.clip(sobol(7, 2**log2_rays), 1e-12, 1.0 - 1e-12)
     bundle = _Bundle(view.rig.camera.aperture_radius_m * _disc(x[:, :2]), _facets(view, x[:, 4:6]))
     centres = aim(view, spot, bundle, np.zeros((len(x), 2)), _through_chief_point(view, truth, bundle.lens_m))
-    parts = _image_parts(view, spot, room, np.array([truth.u_px, truth.v_px]))
+    parts = image_parts(view, spot, room, np.array([truth.u_px, truth.v_px]))
     chosen = np.searchsorted(np.cumsum([part.share for part in parts])[:-1], x[:, 6], side="right")
     z = ndtri(x[:, 2:4])
     offset = np.empty_like(z)
@@ -378,100 +368,6 @@ def _trace_beam(
     watts = np.zeros(len(uv))
     watts[seen] = _through_lens(view, spot, uv, rays, radiance)[seen]
     return _moments(view, uv, watts / density / len(x))
-
-
-@dataclass(frozen=True)
-class _Part:
-    """Gaussian by which film positions are drawn: share of the rays, mean (2,) and root (2, 2) of the covariance."""
-
-    share: float
-    mean: Array
-    root: Array
-
-    def density(self, offset: Array) -> Array:
-        """Rays per square pixel at offsets (N, 2), as a part of all rays."""
-        r2 = (np.linalg.solve(self.root, (offset - self.mean).T) ** 2).sum(axis=0)
-        return np.asarray(self.share * np.exp(-0.5 * r2) / (2.0 * math.pi * abs(np.linalg.det(self.root))))
-
-
-def _image_parts(view: View, spot: LaserSpot, room: RoomGeometry, chief_px: Array) -> list[_Part]:
-    """Gaussians that cover the spot's image, pixels from the chief ray's.
-
-    Two cover the whole. A tail of the beam that passes an edge lands further on, and its image apart from the rest:
-    each face with such a part gets a Gaussian of its own. Where an edge splits the beam, the image is parts with little
-    between them, and each is covered by itself. Only how densely film positions are drawn follows from all this, which
-    is why the world-side solution may be used.
-    """
-    places = ndtri(np.clip(sobol(2, _PILOTS), 1e-4, 1.0 - 1e-4))
-    light = deposit(spot, room, places if spot.profile == "gaussian" else 0.5 * places)
-    light = light[light.lit]
-    mirror = mirror_points(view, light.points_m, np.broadcast_to(view.camera_centre_m, light.points_m.shape)).points_m
-    uv = view.rig.camera.project(view.T_world_camera.inverse().points(mirror)) - chief_px
-    found = np.isfinite(uv).all(axis=1)
-    uv, patch = np.concatenate([uv[found], np.zeros((1, 2))]), np.append(light.patch[found], -1)
-    mean, covariance = _moments_of(uv)
-    root = np.asarray(np.linalg.cholesky(covariance), float)
-    if shared := _split_faces(uv, patch, covariance):
-        offset = _offsets(view, spot, light.points_m[found])
-        return [*_split_parts(offset, patch[:-1], shared), _Part(_STRAY, mean, _WIDTHS[1] * root)]
-    away = np.linalg.norm(np.linalg.solve(root, (uv - mean).T), axis=0) > _APART
-    faces, counts = np.unique(patch[away], return_counts=True)
-    apart = faces[np.argsort(-counts, kind="stable")][:_MOST_APART]
-    whole = 1.0 if len(apart) == 0 else 0.75
-    parts = [_Part(0.5 * whole, mean, width * root) for width in _WIDTHS]
-    for face in apart:
-        own_mean, own = _moments_of(uv[away & (patch == face)])
-        own_root = _APART_WIDTH * np.asarray(np.linalg.cholesky(own + 0.01 * covariance), float)
-        parts.append(_Part((1.0 - whole) / len(apart), own_mean, own_root))
-    return parts
-
-
-def _split_faces(uv: Array, patch: IntArray, covariance: Array) -> list[int]:
-    """Faces that share an image with little between its parts; none for any other image."""
-    faces, counts = np.unique(patch[patch >= 0], return_counts=True)
-    most = np.argsort(-counts, kind="stable")[:_MOST_APART]
-    most = most[counts[most] >= _MANY]
-    if len(most) < 2:
-        return []
-    areas = [math.sqrt(np.linalg.det(_moments_of(uv[patch == face])[1])) for face in faces[most]]
-    return [] if sum(areas) > _SCATTERED * math.sqrt(np.linalg.det(covariance)) else faces[most].tolist()
-
-
-def _offsets(view: View, spot: LaserSpot, points_m: Array) -> Array:
-    """Film positions (N, 2) of points through all of the aperture, from those of the spot's centre through the same.
-
-    Points behind the spot are out of its focus: their image moves with the ray's place in the aperture.
-    """
-    lens = view.rig.camera.aperture_radius_m * _disc(sobol(2, len(points_m)))
-    eyes = view.T_world_camera.points(np.concatenate([lens, np.zeros((len(lens), 1))], axis=-1))
-    centre = np.broadcast_to(spot.position_world_m, points_m.shape)
-    pose, focus = view.T_world_camera.inverse(), view.rig.camera.focus_distance_m
-    places = []
-    for ends in (points_m, centre):
-        mirror = pose.points(mirror_points(view, ends, eyes).points_m)
-        at_focus = lens + (mirror[:, :2] - lens) * (focus / mirror[:, 2:])
-        places.append(view.rig.camera.to_pixel(at_focus / focus))
-    return np.asarray(places[0] - places[1])
-
-
-def _split_parts(offset: Array, patch: IntArray, faces: list[int]) -> list[_Part]:
-    """Gaussians of the faces that share an image."""
-    whole = np.isfinite(offset).all(axis=1)
-    chosen = [offset[whole & (patch == face)] for face in faces]
-    counts = np.array([len(part) for part in chosen])
-    # half by the beam's parts, half to each alike: a small part may scatter much light to the mirror
-    shares = (1.0 - _STRAY) * 0.5 * (counts / counts.sum() + 1.0 / len(counts))
-    moments = [_moments_of(part) for part in chosen]
-    return [
-        _Part(0.5 * float(share), mean, width * np.asarray(np.linalg.cholesky(own), float))
-        for share, (mean, own) in zip(shares, moments, strict=True)
-        for width in _WIDTHS
-    ]
-
-
-def _moments_of(uv: Array) -> tuple[Array, Array]:
-    """Mean and covariance; a spot of a point has an extent, too."""
-    return uv.mean(axis=0), np.atleast_2d(np.cov(uv.T, bias=True)) + 1e-6 * np.eye(2)
 
 
 def _beam_radiance(spot: LaserSpot, room: RoomGeometry, origins: Array, directions: Array) -> Array:

@@ -12,6 +12,8 @@ Coddington's equations for a convex sphere give the distances of the virtual ima
 and dPhi = L rho(i) cos(theta_spot) cos(theta_lens) / (s^2 (1 + l/s_t) (1 + l/s_s)) dA_spot dA_lens.
 With a form error the two factors become a determinant, that of the reflected bundle's curvature (`reflection_point`). A
 glass tube around the mirror moves the point that the mirror sees, and takes a part of the light.
+
+`image_parts` says where the image lies, for a certificate to draw its film positions there.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ from scipy.special import ndtri
 from phibench.render.optics.beam_deposit import Deposit, deposit, footprint, is_plain
 from phibench.render.optics.reflection_point import bundle_spread, mirror_points, onward
 from phibench.render.optics.room_tracer import GeometryLike, RoomGeometry, as_geometry, blocked_by
+from phibench.scenes.faces import IntArray
 from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.random_streams import sobol
@@ -310,3 +313,103 @@ def _unobstructed(room: RoomGeometry, legs: tuple[tuple[Array, Array], ...], lit
 
 def _unit(vectors: Array) -> Array:
     return vectors / np.linalg.norm(vectors, axis=-1)[:, None]
+
+
+# Where the image lies: a certificate draws its film positions there.
+
+
+_PILOTS = 4096
+_APART = 4.0  # standard deviations from the image's middle: 3e-4 of a Gaussian
+_MOST_APART = 8  # faces
+_APART_WIDTH = 2.0  # a few pilots tell the extent badly
+_WIDTHS = (1.3, 3.0)  # of the two Gaussians, relative to the image: bounded weights, and tails where it is no Gaussian
+_MANY = 16  # pilots that tell a face's part of the image
+_SCATTERED = 0.15  # area of the parts over that of a Gaussian about all of them, below which each is drawn by itself
+_STRAY = 0.2  # share of the rays that are drawn about all of them even so
+
+
+@dataclass(frozen=True)
+class ImagePart:
+    """Gaussian by which film positions are drawn: share of the rays, mean (2,) and root (2, 2) of the covariance."""
+
+    share: float
+    mean: Array
+    root: Array
+
+    def density(self, offset: Array) -> Array:
+        """Rays per square pixel at offsets (N, 2), as a part of all rays."""
+        r2 = (np.linalg.solve(self.root, (offset - self.mean).T) ** 2).sum(axis=0)
+        return np.asarray(self.share * np.exp(-0.5 * r2) / (2.0 * math.pi * abs(np.linalg.det(self.root))))
+
+
+def image_parts(view: View, spot: LaserSpot, room: RoomGeometry, chief_px: Array) -> list[ImagePart]:
+    """Gaussians that cover the spot's image, pixels from the chief ray's.
+
+    Two cover the whole. A tail of the beam that passes an edge lands further on, and its image apart from the rest:
+    each face with such a part gets a Gaussian of its own. Where an edge splits the beam, the image is parts with little
+    between them, and each is covered by itself. Only how densely film positions are drawn follows from all this, which
+    is why the world-side solution may be used.
+    """
+    places = ndtri(np.clip(sobol(2, _PILOTS), 1e-4, 1.0 - 1e-4))
+    light = deposit(spot, room, places if spot.profile == "gaussian" else 0.5 * places)
+    light = light[light.lit]
+    mirror = mirror_points(view, light.points_m, np.broadcast_to(view.camera_centre_m, light.points_m.shape)).points_m
+    uv = view.rig.camera.project(view.T_world_camera.inverse().points(mirror)) - chief_px
+    found = np.isfinite(uv).all(axis=1)
+    uv, patch = np.concatenate([uv[found], np.zeros((1, 2))]), np.append(light.patch[found], -1)
+    mean, covariance = _moments_of(uv)
+    root = np.asarray(np.linalg.cholesky(covariance), float)
+    if shared := _split_faces(uv, patch, covariance):
+        offset = _offsets(view, spot, light.points_m[found])
+        return [*_split_parts(offset, patch[:-1], shared), ImagePart(_STRAY, mean, _WIDTHS[1] * root)]
+    away = np.linalg.norm(np.linalg.solve(root, (uv - mean).T), axis=0) > _APART
+    faces, counts = np.unique(patch[away], return_counts=True)
+    apart = faces[np.argsort(-counts, kind="stable")][:_MOST_APART]
+    whole = 1.0 if len(apart) == 0 else 0.75
+    parts = [ImagePart(0.5 * whole, mean, width * root) for width in _WIDTHS]
+    for face in apart:
+        own_mean, own = _moments_of(uv[away & (patch == face)])
+        own_root = _APART_WIDTH * np.asarray(np.linalg.cholesky(own + 0.01 * covariance), float)
+        parts.append(ImagePart((1.0 - whole) / len(apart), own_mean, own_root))
+    return parts
+
+
+def _split_faces(uv: Array, patch: IntArray, covariance: Array) -> list[int]:
+    """Faces that share an image with little between its parts; none for any other image."""
+    faces, counts = np.unique(patch[patch >= 0], return_counts=True)
+    most = np.argsort(-counts, kind="stable")[:_MOST_APART]
+    most = most[counts[most] >= _MANY]
+    if len(most) < 2:
+        return []
+    areas = [math.sqrt(np.linalg.det(_moments_of(uv[patch == face])[1])) for face in faces[most]]
+    return [] if sum(areas) > _SCATTERED * math.sqrt(np.linalg.det(covariance)) else faces[most].tolist()
+
+
+def _offsets(view: View, spot: LaserSpot, points_m: Array) -> Array:
+    """Film positions (N, 2) of points through all of the aperture, from those of the spot's centre through the same.
+
+    Points behind the spot are out of its focus: their image moves with the ray's place in the aperture.
+    """
+    eyes = _lens_points(view, disc_points("uniform", sobol(2, len(points_m))))
+    centre = np.broadcast_to(spot.position_world_m, points_m.shape)
+    return _film(view, points_m, eyes) - _film(view, centre, eyes)
+
+
+def _split_parts(offset: Array, patch: IntArray, faces: list[int]) -> list[ImagePart]:
+    """Gaussians of the faces that share an image."""
+    whole = np.isfinite(offset).all(axis=1)
+    chosen = [offset[whole & (patch == face)] for face in faces]
+    counts = np.array([len(part) for part in chosen])
+    # half by the beam's parts, half to each alike: a small part may scatter much light to the mirror
+    shares = (1.0 - _STRAY) * 0.5 * (counts / counts.sum() + 1.0 / len(counts))
+    moments = [_moments_of(part) for part in chosen]
+    return [
+        ImagePart(0.5 * float(share), mean, width * np.asarray(np.linalg.cholesky(own), float))
+        for share, (mean, own) in zip(shares, moments, strict=True)
+        for width in _WIDTHS
+    ]
+
+
+def _moments_of(uv: Array) -> tuple[Array, Array]:
+    """Mean and covariance; a spot of a point has an extent, too."""
+    return uv.mean(axis=0), np.atleast_2d(np.cov(uv.T, bias=True)) + 1e-6 * np.eye(2)

@@ -249,7 +249,7 @@ def test_certificate_of_a_beam_that_an_edge_splits(monkeypatch: pytest.MonkeyPat
     centroid_px, flux = _differences(VIEW, spot, RoomGeometry(shapes), truth, layer, 15)
     assert centroid_px < CENTROID_TOLERANCE_PX
     assert flux < FLUX_TOLERANCE
-    monkeypatch.setattr("phibench.render.optics.certificate._SCATTERED", 0.0)
+    monkeypatch.setattr("phibench.render.optics.spot_samples._SCATTERED", 0.0)
     together_px, _ = _differences(VIEW, spot, RoomGeometry(shapes), truth, layer, 15)
     assert together_px > CENTROID_TOLERANCE_PX, (centroid_px, flux, together_px)
 
