@@ -23,8 +23,7 @@ from scipy.linalg import solve_triangular
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.film.film_read import Film
-from phibench.estimator.film.film_estimates import in_time
-from phibench.estimator.film.film_frames import LENGTH_PX, Index, film_frames
+from phibench.estimator.film.film_frames import LENGTH_PX, FilmFrames, Index, RoomWeights, film_frames
 from phibench.estimator.film.film_positions import FilmPositions, fit_positions, stepped_positions
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.reflection import room_rays
@@ -324,7 +323,7 @@ def driving_film_depth(
     numbers, read = np.sort(np.concatenate([frames.on, frames.off])), np.array(film.table["tracks_m"].to_list())
     on, off = (np.searchsorted(numbers, some) for some in (frames.on, frames.off))
     middle = frames.near_px.mean(axis=0)
-    positions = fit_positions(frames, spot_blur(frames.rig, middle, None, Beam()), in_time(frames))
+    positions = fit_positions(frames, spot_blur(frames.rig, middle, None, Beam()), _in_time(frames))
     places, before_m = np.broadcast_to(middle, (len(numbers), 2)), np.inf
     for _ in range(_ROUNDS):
         times = frames.times.row_s(numbers.astype(float), places[:, 1])
@@ -342,6 +341,13 @@ def driving_film_depth(
         nearest = np.linalg.norm(places[on][:, None] - places[off], axis=2).min(axis=1)
         positions.uv_px[nearest > LENGTH_PX] = np.nan
     return found
+
+
+def _in_time(frames: FilmFrames) -> RoomWeights:
+    """Straight lines in time between frames with the laser off."""
+    each = np.eye(len(frames.off))
+    weights = np.stack([np.interp(frames.on, frames.off, row) for row in each], axis=1)
+    return RoomWeights(weights, np.zeros(len(weights)))
 
 
 def _spread(positions: FilmPositions, on: Index, count: int) -> FilmPositions:

@@ -22,13 +22,15 @@ from phibench.estimator.film.film_positions import FilmPositions
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS, STROKE_PARAMETERS
 from phibench.estimator.geometry.triangulate import depth_exact
-from phibench.scenes.frames import Array
+from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.misalignment import PARAMETERS as MISALIGNMENT
 from phibench.scenes.rig import Rig
 
 _STEPS = 30
 _SETTLED_M = 1e-9
 _LEAST_STROKE_M = 1e-3
+_PROPOSE = 8  # frames at each end: half of them may be astray, and one pair in four is right
+_AGREE_PX = 3.0  # a faint spot behind a mosaic settles up to a pixel of its filter away
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,56 @@ def film_depth(
     places = np.full(positions.uv_px.shape, np.nan)
     places[keep] = (y - C @ cho_solve(S, y - _predicted(rig, X, readings).uv)).reshape(-1, 2)
     return _result(rig, X, readings, y, S, sigma_m, covariance_rig is not None, places)
+
+
+def most_agree(rig: Rig, positions: FilmPositions, encoder_m: Array) -> BoolArray:
+    """Frames whose positions agree with the point that most of them agree with, shape (N,).
+
+    A fit of one frame may settle anywhere within reach. Each of some frames low on the stroke gives a point with each
+    of some frames high on it; the point with the least mean distance, cut at a few pixels, counts.
+    """
+    good = np.flatnonzero(positions.good)
+    if not len(good):
+        return positions.good
+    uv, readings = positions.uv_px[good], np.asarray(encoder_m, float)[good]
+    order, third = np.argsort(readings), max(1, len(good) // 3)
+    low, high = (some[np.linspace(0, third - 1, _PROPOSE).astype(int)] for some in (order[:third], order[-third:]))
+    pairs = np.array([(i, j) for i in low for j in high if readings[j] - readings[i] > _LEAST_STROKE_M], np.int64)
+    if not len(pairs):
+        return positions.good
+    i, j = pairs.T
+    axis = np.array(rig.stroke_axis_world)
+    X = depth_exact(rig, readings[j] - readings[i], uv[i], uv[j]).point_world_m + readings[i, None] * axis
+    at = image_of(rig.at(0.0), X[:, None] - readings[None, :, None] * axis).uv_px
+    apart = np.nan_to_num(np.linalg.norm(at - uv, axis=2), nan=np.inf)
+    best = apart[np.argmin(np.minimum(apart, _AGREE_PX).mean(axis=1))]
+    result = np.zeros(len(positions.uv_px), bool)
+    result[good[best < _AGREE_PX]] = True
+    return result if result.any() else positions.good
+
+
+def deviations2(
+    rig: Rig,
+    point_world_m: Array,
+    positions: FilmPositions,
+    encoder_m: Array,
+    encoder_sigma_m: float | Array,
+    covariance_rig: Array | None = None,
+) -> Array:
+    """Squared deviation of each position from a point's image, in units of its own covariance, shape (N,).
+
+    2 degrees of freedom each; NaN where there is no position. Arguments as of `film_depth`.
+    """
+    keep = np.flatnonzero(positions.good)
+    few, readings = positions.some(keep), np.asarray(encoder_m, float)[keep]
+    sigma_m = np.broadcast_to(encoder_sigma_m, positions.good.shape)[keep]
+    at = _predicted(rig, point_world_m, readings)
+    S = _total(rig, point_world_m, readings, few.covariance_px2(), at.by_offset, sigma_m, covariance_rig)
+    each, apart = np.arange(len(keep)), few.uv_px - at.uv.reshape(-1, 2)
+    own = S.reshape(len(keep), 2, len(keep), 2)[each, :, each, :]
+    result = np.full(len(positions.uv_px), np.nan)
+    result[keep] = np.einsum("ni,nij,nj->n", apart, np.linalg.inv(own), apart)
+    return result
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from phibench.datasets.film.film_read import Film
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.recipe.film_tables import TARGET
 from phibench.estimator.film.blink_identity import TargetCode, TargetTracker
-from phibench.estimator.film.film_bundle import FilmDepth, expected_sigma_m, film_depth
-from phibench.estimator.film.film_frames import LIT, FilmFrames, Index, room_weights
+from phibench.estimator.film.film_bundle import FilmDepth, deviations2, expected_sigma_m, film_depth, most_agree
+from phibench.estimator.film.film_frames import LIT, FilmFrames, Index, room_known, room_weights
 from phibench.estimator.film.film_positions import FilmPositions, fit_positions, stepped_positions
 from phibench.estimator.film.recursive_filter import FilterState, first_state, updated
 from phibench.estimator.spots.raw_pixels import raw_electrons
@@ -37,6 +37,8 @@ _LEFT_OUT = 0.5  # of the frames with the code on, at most
 _TRACKED_WITHIN_PX = 2  # of the place that a track says
 _ONE_PLACE_M = 3e-3  # of the carriage: an image moves by less than half a pixel
 _MOST_CHI2 = 2.0  # per degree of freedom: 20 frames of a target at rest exceed it with a chance of 2e-4
+_NO_ONE_PLACE_CHI2 = 4.0  # per degree of freedom: vibrations that nobody told of give 2
+_CAUSES = "the target moves, or is hidden, or another light is beside it, or the rig is not the one that was told"
 _MOVES_M = 1.5e-3  # of the encoder from frame to frame: five of its standard deviations
 
 
@@ -62,20 +64,21 @@ class SeenFilm:
 
 
 def seen_film(frames: FilmFrames) -> SeenFilm:
-    """Fit the spot in each frame by itself.
+    """Fit the spot in each frame by itself; fits that settled elsewhere, or before an unknown room, are none.
 
     Raises
     ------
     DatasetError
         If the positions give no depth.
     """
-    count, middle = len(frames.on), frames.near_px.mean(axis=0)
-    blur, places = spot_blur(frames.rig, middle, None, Beam()), None
+    count, places = len(frames.on), _near_px(frames)
+    blur = spot_blur(frames.rig, places[:count].mean(axis=0), None, Beam())
     for number in range(_ROUNDS):
-        weights = in_time(frames) if places is None else room_weights(places[:count], places[count:])
-        positions = fit_positions(frames, blur, weights)
-        rows = np.where(positions.good, positions.uv_px[:, 1], middle[1])
-        offsets = frames.offsets_m(frames.on, rows)
+        here, off = places[:count], places[count:]
+        positions = fit_positions(frames, blur, room_weights(here, off))
+        positions.uv_px[~room_known(here, off)] = np.nan
+        offsets = frames.offsets_m(frames.on, np.where(positions.good, positions.uv_px[:, 1], here[:, 1]))
+        positions.uv_px[~most_agree(frames.rig, positions, offsets)] = np.nan
         found = film_depth(frames.rig, positions, offsets, frames.encoder_sigma_m)
         if number + 1 < _ROUNDS:
             places = predicted_px(frames, found.point_world_m)[0]
@@ -83,10 +86,11 @@ def seen_film(frames: FilmFrames) -> SeenFilm:
     return SeenFilm(frames, positions, offsets, found)
 
 
-def in_time(frames: FilmFrames) -> Array:
-    """Weights of the room by straight lines in time between frames with the laser off, shape (N, M)."""
-    each = np.eye(len(frames.off))
-    return np.stack([np.interp(frames.on, frames.off, row) for row in each], axis=1)
+def _near_px(frames: FilmFrames) -> Array:
+    """Rough places in all frames, laser on first, shape (N + M, 2): those of a point at rest follow the carriage."""
+    order = np.argsort(frames.encoder_m[frames.on])
+    at = frames.encoder_m[frames.on][order], frames.encoder_m[frames.off]
+    return np.vstack([frames.near_px, np.stack([np.interp(at[1], at[0], x) for x in frames.near_px[order].T], axis=1)])
 
 
 def predicted_px(frames: FilmFrames, point_world_m: Array) -> tuple[Array, Array]:
@@ -96,15 +100,37 @@ def predicted_px(frames: FilmFrames, point_world_m: Array) -> tuple[Array, Array
 
 
 def bundle_depth(seen: SeenFilm, covariance_rig: Array | None = None) -> FilmDepth:
-    """Joint bundle over all frames: Gauss-Newton steps of the likelihood of all pixels, from the frames' own fits."""
+    """Joint bundle over all frames: Gauss-Newton steps of the likelihood of all pixels, from the frames' own fits.
+
+    Frames that disagree with the others beyond chance are left out: the room behind their spot was not known.
+
+    Raises
+    ------
+    DatasetError
+        If more than half of the frames disagree, or what is left is no one place at rest.
+    """
     frames, found, places = seen.frames, seen.depth, None
+    told = frames.encoder_sigma_m, covariance_rig
     for _ in range(_STEPS):
         positions, offsets = joint_positions(frames, found.point_world_m, places)
-        before, found = found, film_depth(frames.rig, positions, offsets, frames.encoder_sigma_m, covariance_rig)
+        known, apart2 = positions.good, deviations2(frames.rig, found.point_world_m, positions, offsets, *told)
+        positions.uv_px[apart2 > _BEYOND_CHANCE] = np.nan
+        if positions.good.sum() < (1.0 - _LEFT_OUT) * known.sum():
+            raise _disagreement(int((known & ~positions.good).sum()), int(known.sum()))
+        before, found = found, film_depth(frames.rig, positions, offsets, *told)
         if abs(found.depth_m - before.depth_m) < _SETTLED * found.sigma_m:
             break
         places = found.places_px
+    if not found.chi2 < _NO_ONE_PLACE_CHI2 * (2 * found.frames - 3):
+        raise DatasetError(
+            f"{found.frames} positions do not agree with one place at rest, chi^2 {found.chi2:.0f} with "
+            f"{2 * found.frames - 3} degrees of freedom: {_CAUSES}"
+        )
     return found
+
+
+def _disagreement(count: int, of: int) -> DatasetError:
+    return DatasetError(f"positions in {count} of {of} frames do not agree with those in the others: {_CAUSES}")
 
 
 def joint_positions(
@@ -138,11 +164,8 @@ def filtered(seen: SeenFilm) -> list[FilterState]:
     rig, sigma = seen.frames.rig, seen.frames.encoder_sigma_m
     for k in np.flatnonzero(seen.positions.good):
         uv, noise = seen.positions.uv_px[k], seen.positions.noise_px2[k]
-        shared, offset = seen.positions.shared_px2[k, :, k], float(seen.offsets_m[k])
-        if not states:
-            states.append(first_state(rig, uv, noise, shared, offset))
-            continue
-        states.append(updated(rig, states[-1], uv, noise, shared, offset, sigma))
+        new = uv, noise, seen.positions.shared_px2[k, :, k], float(seen.offsets_m[k]), sigma
+        states.append(updated(rig, states[-1], *new) if states else first_state(rig, *new))
     return states
 
 
@@ -300,16 +323,12 @@ def agreeing(frames: FilmFrames) -> FilmFrames:
     kept, at_most = np.flatnonzero(seen.positions.good), _LEFT_OUT * len(frames.on)
     while len(frames.on) - len(kept) <= at_most:
         found = film_depth(frames.rig, seen.positions.some(kept), seen.offsets_m[kept], frames.encoder_sigma_m)
-        apart = seen.positions.uv_px[kept] - frames.image_px(found.point_world_m, seen.offsets_m[kept])
-        own = seen.positions.noise_px2[kept] + seen.positions.shared_px2[kept, :, kept]
-        distance2 = np.einsum("ni,nij,nj->n", apart, np.linalg.inv(own), apart)
+        told = seen.offsets_m[kept], frames.encoder_sigma_m
+        distance2 = deviations2(frames.rig, found.point_world_m, seen.positions.some(kept), *told)
         if distance2.max() < _BEYOND_CHANCE:
             return frames.some(kept, np.arange(len(frames.off)))
         kept = np.delete(kept, int(np.argmax(distance2)))
-    raise DatasetError(
-        f"positions in {len(frames.on) - len(kept)} of {len(frames.on)} frames do not agree with those in the others: "
-        "the target moves, or is hidden, or another light is beside it"
-    )
+    raise _disagreement(len(frames.on) - len(kept), len(frames.on))
 
 
 def _places(tracker: TargetTracker, name: str, encoder_m: Array) -> tuple[Index, Array]:

@@ -33,7 +33,7 @@ from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotParts
 from phibench.estimator.spots.raw_pixels import PixelNoise, raw_electrons
 from phibench.estimator.spots.spot_prediction import spot_blur
-from phibench.scenes.frames import Array
+from phibench.scenes.frames import Array, BoolArray
 from phibench.scenes.laser import Beam
 from phibench.scenes.motion.carriage import Carriage
 from phibench.scenes.motion.film_times import FilmTimes
@@ -44,7 +44,7 @@ _SIDE_PX, _UNIT_PX, _MARGIN_PX = 48, 16, 32  # of what is kept around all spots
 LIT = 0.99  # of an exposure: a frame with less, and more than none, is no frame of either kind
 LENGTH_PX = 1.5  # l: edges of the room, blurred by 0.9 px, are interpolated to a tenth of their noise
 STRUCTURE = 300.0  # S^2 over the noise of a pixel: edges of 800 e behind 50 e
-FARTHEST_PX = 2.0 * LENGTH_PX  # from a frame with the laser off: beyond it the room is not known
+_FARTHEST_PX = 2.0 * LENGTH_PX  # from a frame with the laser off: beyond it the room is not known
 _ANY_LEVEL = 1e6
 Index = NDArray[np.int64]
 
@@ -245,22 +245,47 @@ def lit_frames(film: Film, numbers: Index) -> tuple[Index, Index, bool]:
 # Room behind the spot.
 
 
-def room_weights(places_px: Array, off_px: Array) -> Array:
-    """Weights of M frames with the laser off, shape (N, M), for the room in N frames; each row has the sum 1.
+@dataclass(frozen=True)
+class RoomWeights:
+    """Interpolation of the room between M frames with the laser off, for N frames.
+
+    Attributes
+    ----------
+    weights : array, shape (N, M)
+        Each row has the sum 1.
+    moved_px : array, shape (N,)
+        Standard deviation of what the room's image has moved by beyond the interpolation.
+    """
+
+    weights: Array
+    moved_px: Array
+
+
+def room_weights(places_px: Array, off_px: Array) -> RoomWeights:
+    """Kriging of the room.
 
     Parameters
     ----------
     places_px, off_px : arrays, shape (N, 2) and (M, 2)
         Of the spot's image in each frame, seen or not.
     """
-    K = _covariance(off_px, off_px) + np.eye(len(off_px))
-    weights = np.linalg.solve(K, _covariance(off_px, places_px)).T
-    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+    between, to = _correlation(off_px, off_px), _correlation(places_px, off_px)
+    K = _ANY_LEVEL + STRUCTURE * between + np.eye(len(off_px))
+    weights = np.linalg.solve(K, (_ANY_LEVEL + STRUCTURE * to).T).T
+    weights = weights / weights.sum(axis=1, keepdims=True)
+    unknown = 1.0 - 2.0 * np.sum(weights * to, axis=1) + np.sum((weights @ between) * weights, axis=1)
+    return RoomWeights(weights, LENGTH_PX * np.sqrt(np.maximum(unknown, 0.0)))
 
 
-def _covariance(a: Array, b: Array) -> Array:
+def room_known(places_px: Array, off_px: Array) -> BoolArray:
+    """Frames with the laser off in nearly the same pose, shape (N,): arguments as of `room_weights`."""
+    apart = np.linalg.norm(places_px[:, None] - off_px, axis=2)
+    return np.asarray(apart.min(axis=1) < _FARTHEST_PX)
+
+
+def _correlation(a: Array, b: Array) -> Array:
     apart2 = np.sum((a[:, None] - b[None]) ** 2, axis=-1)
-    return np.asarray(_ANY_LEVEL + STRUCTURE * np.exp(-0.5 * apart2 / LENGTH_PX**2))
+    return np.asarray(np.exp(-0.5 * apart2 / LENGTH_PX**2))
 
 
 def held_out_chi2(off_e: Array, off_px: Array, noise: PixelNoise) -> Array:
@@ -279,7 +304,7 @@ def held_out_chi2(off_e: Array, off_px: Array, noise: PixelNoise) -> Array:
     result = []
     for k in range(len(off_e)):
         others = np.delete(np.arange(len(off_e)), k)
-        (weights,) = room_weights(off_px[k : k + 1], off_px[others])
+        (weights,) = room_weights(off_px[k : k + 1], off_px[others]).weights
         room = np.tensordot(weights, off_e[others], 1)
         variance = noise.variance_e2(room) * (1.0 + weights @ weights)
         result.append(float(np.mean((off_e[k] - room) ** 2 / variance)))

@@ -6,6 +6,8 @@ errors have these covariances, w the weights of frames with the laser off:
 
     noise     new in every frame: A_kp^2 V_kp
     room      sum_p A_kp A_lp V_p (sum_j w_kj w_lj): the same frames with the laser off were taken off both
+    motion    (sum_p A_kp g_p)^2 m_k^2, new in every frame: g the slope of the room's image, m_k how far it may have moved
+              beyond what is interpolated; coherent over the pixels of an edge
     pattern   sum_p A_kp A_lp prnu^2 s_kp s_lp, s the spot's light alone
 
 DSNU and the pattern of the room's light are taken off with the room. A spot that rests gains nothing against the rest
@@ -23,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.frames.sensor_card import SensorCard
-from phibench.estimator.film.film_frames import FARTHEST_PX, FilmFrames, room_weights
+from phibench.estimator.film.film_frames import FilmFrames, RoomWeights, room_known, room_weights
 from phibench.estimator.geometry.status import Status
 from phibench.estimator.spots.fisher import fisher_matrix
 from phibench.estimator.spots.fit_raw import fit_law
@@ -81,16 +83,21 @@ def joined(first: FilmPositions, second: FilmPositions) -> FilmPositions:
 
 @dataclass(frozen=True)
 class _Windows:
-    """Squares of N frames, room taken off, with the law of their pixels and the weights (N, M) of the room."""
+    """Squares of N frames, room taken off, with the law of their pixels.
+
+    weights (N, M) are those of the room; moved_e (N, 2, h, w) is the room's change as its image moves along u and v by
+    the standard deviation of what the interpolation misses.
+    """
 
     regions: SpotRegions
     law: GaussLaw
     room_e: Array
+    moved_e: Array
     weights: Array
     prnu: float
 
 
-def fit_positions(frames: FilmFrames, blur: SpotBlur, weights: Array) -> FilmPositions:
+def fit_positions(frames: FilmFrames, blur: SpotBlur, room: RoomWeights) -> FilmPositions:
     """Fit each frame by itself, where the light that blinks is brightest within reach of `frames.near_px`.
 
     Parameters
@@ -98,11 +105,10 @@ def fit_positions(frames: FilmFrames, blur: SpotBlur, weights: Array) -> FilmPos
     frames : FilmFrames
     blur : SpotBlur
         Of one spot, or of each.
-    weights : array, shape (N, M)
-        Of the frames with the laser off, for the room.
+    room : RoomWeights
     """
-    left = frames.on_e - np.tensordot(weights, frames.off_e, 1)
-    windows = _windows(frames, _brightest(left, frames) + frames.origin_px, weights)
+    left = frames.on_e - np.tensordot(room.weights, frames.off_e, 1)
+    windows = _windows(frames, _brightest(left, frames) + frames.origin_px, room)
     model = _model(frames, windows)
     fit = fit_law(windows.regions, windows.law, blur, model)
     # a fit that wanders off has found something else
@@ -125,11 +131,10 @@ def stepped_positions(frames: FilmFrames, blur: SpotBlur, at_px: Array, from_px:
         Places to step from, where they are finite: a rig that is not exact predicts none that are near enough.
     """
     count = len(frames.on)
-    here, weights = at_px[:count], room_weights(at_px[:count], at_px[count:])
-    # farther from all frames with the laser off the room is not known
-    known = np.linalg.norm(here[:, None] - at_px[count:], axis=2).min(axis=1) < FARTHEST_PX
+    here, room = at_px[:count], room_weights(at_px[:count], at_px[count:])
+    known = room_known(here, at_px[count:])
     here = here if from_px is None else np.where(np.isfinite(from_px), from_px, here)
-    windows = _windows(frames, np.rint(here).astype(np.int64), weights)
+    windows = _windows(frames, np.rint(here).astype(np.int64), room)
     pixels = SpotPixels.of(windows.regions.filters, blur, _model(frames, windows))
     x, used = windows.regions.x_e, windows.regions.used
     theta = np.column_stack([here - windows.regions.origin_px, _fluxes(pixels, windows, here)])
@@ -159,19 +164,33 @@ def _model(frames: FilmFrames, windows: _Windows) -> SpotModel:
     return SpotModel((red, green, blue) if frames.card.mosaic == "bayer" else None, nothing)
 
 
-def _windows(frames: FilmFrames, middle_px: NDArray[np.int64], weights: Array) -> _Windows:
+def _windows(frames: FilmFrames, middle_px: NDArray[np.int64], interpolation: RoomWeights) -> _Windows:
     """Squares around these pixels, moved inside the region."""
     card: SensorCard = frames.card
     limit = np.array(frames.on_e.shape[:0:-1]) - SIDE_PX
     corners = np.clip(middle_px - frames.origin_px - SIDE_PX // 2, 0, limit)
-    squares = [(slice(v, v + SIDE_PX), slice(u, u + SIDE_PX)) for u, v in corners]
-    on = np.stack([one[square] for one, square in zip(frames.on_e, squares, strict=True)])
-    room = np.stack([np.tensordot(w, frames.off_e[:, *at], 1) for w, at in zip(weights, squares, strict=True)])
+    on, room, moved = [], [], []
+    for image, w, px, (u, v) in zip(frames.on_e, interpolation.weights, interpolation.moved_px, corners, strict=True):
+        on.append(image[v : v + SIDE_PX, u : u + SIDE_PX])
+        around = np.tensordot(w, frames.off_e[:, max(v - 2, 0) : v + SIDE_PX + 2, max(u - 2, 0) : u + SIDE_PX + 2], 1)
+        inner = slice(min(v, 2), min(v, 2) + SIDE_PX), slice(min(u, 2), min(u, 2) + SIDE_PX)
+        room.append(around[inner])
+        moved.append(px * np.stack([_slope(around, axis)[inner] for axis in (1, 0)]))
     noise, pattern = noise_of(card, pattern_known=True), PatternNoise.of(card)
-    seen = np.maximum(room, 0.0)
-    extra = seen + noise.variance_e2(seen) * np.sum(weights**2, axis=1)[:, None, None]
-    regions = spot_regions(on - room, corners + frames.origin_px, on < card.full_from_e)
-    return _Windows(regions, GaussLaw(noise, extra, 1, pattern.prnu), seen, weights, pattern.prnu)
+    seen, moved_e = np.maximum(room, 0.0), np.stack(moved)
+    interpolated = np.sum(interpolation.weights**2, axis=1)[:, None, None]
+    extra = seen + noise.variance_e2(seen) * interpolated + np.sum(moved_e**2, axis=1)
+    regions = spot_regions(np.stack(on) - np.stack(room), corners + frames.origin_px, np.stack(on) < card.full_from_e)
+    law = GaussLaw(noise, extra, 1, pattern.prnu)
+    return _Windows(regions, law, seen, moved_e, interpolation.weights, pattern.prnu)
+
+
+def _slope(image: Array, axis: int) -> Array:
+    """Change per pixel, between the pixels of one filter on both sides; beyond the edge the image stays as it is."""
+    padded = np.pad(image, [(2, 2) if k == axis else (0, 0) for k in (0, 1)], mode="edge")
+    count = image.shape[axis]
+    high, low = (padded.take(np.arange(count) + start, axis=axis) for start in (4, 0))
+    return np.asarray(0.25 * (high - low))
 
 
 def _brightest(left_e: Array, frames: FilmFrames) -> NDArray[np.int64]:
@@ -193,6 +212,8 @@ def _covariances(uv_px: Array, theta: Array, pixels: SpotPixels, windows: _Windo
     influence = np.einsum("nik,nkhw->nihw", inverse, derivatives * weight[:, None])
     room = np.sqrt(law.noise.variance_e2(windows.room_e))[:, None]
     new = np.einsum("nihw,nhw,njhw->nij", influence, law.noise.variance_e2(mean) + windows.room_e, influence)
+    by_motion = np.einsum("nihw,njhw->nij", influence, windows.moved_e)
+    new += by_motion @ by_motion.transpose(0, 2, 1)
     common = _common(influence * room, origins) * (windows.weights @ windows.weights.T)[:, None, :, None]
     return FilmPositions(uv_px, new, common + windows.prnu**2 * _common(influence * mean[:, None], origins))
 

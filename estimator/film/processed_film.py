@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from phibench.estimator.film.film_frames import FARTHEST_PX, FilmFrames, Index, room_weights
+from phibench.estimator.film.film_frames import FilmFrames, Index, room_known, room_weights
 from phibench.estimator.film.film_positions import FilmPositions
 from phibench.estimator.processed.fit_chain import spot_window, undone, unrounded
 from phibench.estimator.processed.interval_fit import interval_posterior
@@ -49,12 +49,13 @@ def processed_positions(frames: FilmFrames, point_world_m: Array, which: Index) 
     """
     count = len(frames.on)
     places, offsets = frames.positions_px(point_world_m, np.concatenate([frames.on, frames.off]))
-    weights, blur = room_weights(places[:count], places[count:]), frames.blur(point_world_m, places[:count])
+    weights, known = room_weights(places[:count], places[count:]).weights, room_known(places[:count], places[count:])
+    blur = frames.blur(point_world_m, places[:count])
     r, g, b = frames.rig.camera.detector.laser_filter_response
     size = frames.rig.camera.width_px, frames.rig.camera.height_px
     uv, noise = np.full((len(which), 2), np.nan), np.tile(np.eye(2), (len(which), 1, 1))
     for row, k in enumerate(which):
-        if np.linalg.norm(places[count:] - places[k], axis=1).min() > FARTHEST_PX:
+        if not known[k]:
             continue
         corner, part = _units(frames, places[k])
         room = _room(frames, weights[k], corner, part)

@@ -8,12 +8,13 @@ Davison, J. M. M. Montiel, "Inverse depth parametrization for monocular SLAM", I
 The pattern's error stays while the spot rests, and is forgotten as it moves on: e_k = s e_(k-1) + w, with
 s = exp(-d^2 / 2 l^2) for a move of d px, and the variance of w that keeps the variance of e. The move is that of the
 predicted position: measured ones differ by noise while the spot rests. Encoder noise counts as noise of the position.
+While the carriage rests, its readings differ by noise, and the image does not follow them: q is then left as it is.
 The same measurements as in `film_bundle`, one by one: the filter can be asked at any time.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -27,7 +28,8 @@ PATTERN_PX = 1.0  # l: a move by which half of the pixels that locate a spot are
 # may settle half a pixel away, and claims as little as a right one.
 GATE = 16.0
 _PRIOR_Q, _PRIOR_SIGMA_Q = 0.5, 0.4  # 1/m: from 0.6 m to beyond all rooms within two deviations
-_ROUNDS = 4
+_RESTS = 5.0  # encoder's standard deviations from the first frame: what moves by less tells nothing of q
+_ROUNDS = 8
 _SETTLED = 1e-2  # standard deviations: far below what the linear map of a frame errs by
 
 
@@ -46,6 +48,8 @@ class FilterState:
         Last position.
     offset_m : float
         Last reading of the carriage.
+    first_offset_m : float
+        First reading.
     frames : int
     chi2 : float
         Sum of squared innovations, two degrees of freedom a frame from the second on.
@@ -57,6 +61,7 @@ class FilterState:
     axes: Array = field(repr=False)
     uv_px: Array
     offset_m: float
+    first_offset_m: float
     frames: int = 1
     chi2: float = 0.0
 
@@ -80,7 +85,9 @@ class FilterState:
         return D, float(np.sqrt(gradient @ self.covariance[:3, :3] @ gradient))
 
 
-def first_state(rig: Rig, uv_px: Array, noise_px2: Array, pattern_px2: Array, offset_m: float) -> FilterState:
+def first_state(
+    rig: Rig, uv_px: Array, noise_px2: Array, pattern_px2: Array, offset_m: float, sigma_m: float
+) -> FilterState:
     """Belief after the first frame: the line of sight, and next to nothing about the distance.
 
     Parameters
@@ -89,8 +96,8 @@ def first_state(rig: Rig, uv_px: Array, noise_px2: Array, pattern_px2: Array, of
     uv_px : array, shape (2,)
     noise_px2, pattern_px2 : arrays, shape (2, 2)
         Covariance of what is new in every frame, and of what the pattern does.
-    offset_m : float
-        Reading of the carriage.
+    offset_m, sigma_m : float
+        Reading of the carriage, and its standard deviation.
     """
     ray = room_rays(rig.at(0.0), uv_px)
     r = ray.direction_world
@@ -99,35 +106,39 @@ def first_state(rig: Rig, uv_px: Array, noise_px2: Array, pattern_px2: Array, of
     axes = np.stack([r, across, np.cross(r, across)])
     start = ray.origin_world_m + offset_m * np.array(rig.stroke_axis_world)
     state = FilterState(
-        np.array([0.0, 0.0, _PRIOR_Q, 0.0, 0.0]), np.eye(5), start, axes, np.asarray(uv_px, float), offset_m
+        np.array([0.0, 0.0, _PRIOR_Q, 0.0, 0.0]), np.eye(5), start, axes, np.asarray(uv_px, float), offset_m, offset_m
     )
-    J = _image(rig, state, offset_m)[1]
+    _, J, by_offset = _image(rig, state, offset_m)
     sight = np.linalg.inv(J[:, :2])
     covariance = np.zeros((5, 5))
     covariance[2, 2] = _PRIOR_SIGMA_Q**2
     covariance[3:, 3:] = pattern_px2
-    # a and b are what they are because the position errs by noise and pattern
-    covariance[:2, :2] = sight @ (noise_px2 + pattern_px2) @ sight.T
+    # a and b are what they are because the position errs by noise, reading and pattern
+    new_px2 = noise_px2 + _by_encoder(covariance, _PRIOR_Q, by_offset, sigma_m)
+    covariance[:2, :2] = sight @ (new_px2 + pattern_px2) @ sight.T
     covariance[:2, 3:] = -sight @ pattern_px2
     covariance[3:, :2] = covariance[:2, 3:].T
-    return FilterState(state.mean, covariance, start, axes, state.uv_px, offset_m)
+    return replace(state, covariance=covariance)
 
 
 def updated(
     rig: Rig, state: FilterState, uv_px: Array, noise_px2: Array, pattern_px2: Array, offset_m: float, sigma_m: float
 ) -> FilterState:
-    """Belief after one more frame; arguments as for `first_state`, and the encoder's standard deviation."""
+    """Belief after one more frame; arguments as for `first_state`."""
     moved = float(np.linalg.norm(_image(rig, state, offset_m)[0] - _image(rig, state, state.offset_m)[0]))
     s = np.exp(-0.5 * (moved / PATTERN_PX) ** 2)
     F = np.diag([1.0, 1.0, 1.0, s, s])
     mean, P = F @ state.mean, F @ state.covariance @ F.T
     P[3:, 3:] += (1.0 - s * s) * pattern_px2
     x = mean
+    rests = abs(offset_m - state.first_offset_m) < _RESTS * sigma_m
     for _ in range(_ROUNDS):
-        at = FilterState(x, P, state.start_m, state.axes, state.uv_px, offset_m)
-        predicted, J, by_offset = _image(rig, at, offset_m)
+        predicted, J, by_offset = _image(rig, replace(state, mean=x), offset_m)
         H = np.hstack([J, np.eye(2)])
-        S = H @ P @ H.T + noise_px2 + sigma_m**2 * np.outer(by_offset, by_offset)
+        if rests:
+            H[:, 2] = 0.0
+        R = noise_px2 + _by_encoder(P, x[2], by_offset, sigma_m)
+        S = H @ P @ H.T + R
         K = P @ H.T @ np.linalg.inv(S)
         innovation = uv_px - predicted - x[3:] - H @ (mean - x)
         before, x = x, mean + K @ innovation
@@ -138,10 +149,17 @@ def updated(
     if squared > GATE:
         return state
     left = np.eye(5) - K @ H
-    R = noise_px2 + sigma_m**2 * np.outer(by_offset, by_offset)
     covariance = left @ P @ left.T + K @ R @ K.T
-    seen = np.asarray(uv_px, float)
-    return FilterState(x, covariance, state.start_m, state.axes, seen, offset_m, state.frames + 1, state.chi2 + squared)
+    told = {"uv_px": np.asarray(uv_px, float), "offset_m": offset_m, "frames": state.frames + 1}
+    return replace(state, mean=x, covariance=covariance, chi2=state.chi2 + squared, **told)
+
+
+def _by_encoder(covariance: Array, q: float, by_offset: Array, sigma_m: float) -> Array:
+    """Covariance of a position by the reading of the carriage, pixels^2.
+
+    The image moves with the carriage in proportion to q: as long as that is unknown, by a deviation more.
+    """
+    return (sigma_m * (1.0 + np.sqrt(covariance[2, 2]) / q)) ** 2 * np.outer(by_offset, by_offset)
 
 
 def _image(rig: Rig, state: FilterState, offset_m: float) -> tuple[Array, Array, Array]:

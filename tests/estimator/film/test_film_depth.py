@@ -12,9 +12,9 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.store.layers import SpotWindow
 from phibench.estimator.film.driving_depth import Way, driving_depth
-from phibench.estimator.film.film_bundle import expected_sigma_m, film_depth
+from phibench.estimator.film.film_bundle import expected_sigma_m, film_depth, most_agree
 from phibench.estimator.film.film_estimates import bundle_depth, joint_positions, seen_film
-from phibench.estimator.film.film_frames import FilmFrames, held_out_chi2
+from phibench.estimator.film.film_frames import FilmFrames, RoomWeights, held_out_chi2
 from phibench.estimator.film.film_positions import FilmPositions, fit_positions, stepped_positions
 from phibench.estimator.film.processed_film import processed_positions
 from phibench.estimator.film.recursive_filter import FilterState, first_state, updated
@@ -105,10 +105,25 @@ def test_bundle_errors_are_within_their_covariance(understated: bool) -> None:
 def last_state(positions: FilmPositions, readings: Array, pattern_px2: Array) -> FilterState:
     """Belief of the filter after all frames."""
     uv, noise = positions.uv_px, positions.noise_px2
-    state = first_state(SCENE.rig, uv[0], noise[0], pattern_px2, readings[0])
+    state = first_state(SCENE.rig, uv[0], noise[0], pattern_px2, readings[0], ENCODER_M)
     for k in range(1, FRAMES):
         state = updated(SCENE.rig, state, uv[k], noise[k], pattern_px2, readings[k], ENCODER_M)
     return state
+
+
+def test_frames_that_most_agree_with_are_found() -> None:
+    """Ten of 24 fits astray by up to 12 px, at both ends of the stroke too; without any, all frames agree."""
+    positions, readings = drawn(0)
+    assert most_agree(SCENE.rig, positions, readings).all()
+    astray = generator("film depth", "astray").permutation(FRAMES)[:10]
+    positions.uv_px[astray] += (
+        generator("film depth", "by").choice([-1.0, 1.0], (10, 2)) * np.linspace(4, 12, 10)[:, None]
+    )
+    agree = most_agree(SCENE.rig, positions, readings)
+    assert not agree[astray].any()
+    assert agree.sum() == FRAMES - 10
+    nobody = replace(positions, uv_px=np.full_like(positions.uv_px, np.nan))
+    assert not most_agree(SCENE.rig, nobody, readings).any()
 
 
 def test_filter_leaves_a_fit_astray_out() -> None:
@@ -129,7 +144,7 @@ def test_filter_keeps_the_patterns_error_at_rest() -> None:
     pattern = 0.05**2 * np.eye(2)
     noise = 0.2**2 * np.eye(2)
     uv = exact()[1][0] + np.random.default_rng(5).normal(0.0, 0.2, (400, 2))
-    state = first_state(SCENE.rig, uv[0], noise, pattern, 0.0)
+    state = first_state(SCENE.rig, uv[0], noise, pattern, 0.0, 0.0)
     per_px2 = state.covariance[:2, :2] / (0.2**2 + 0.05**2)
     for place in uv[1:]:
         state = updated(SCENE.rig, state, place, noise, pattern, 0.0, 0.0)
@@ -137,6 +152,20 @@ def test_filter_keeps_the_patterns_error_at_rest() -> None:
     # 400 frames leave the pattern's variance and a 400th of the noise's; the map of a and b is that of the first frame,
     # whose place is off by 0.2 px: to some percent
     assert variance_px2 == pytest.approx(0.05**2 + 0.2**2 / 400, rel=0.1)
+
+
+def test_readings_at_rest_tell_the_filter_nothing_of_the_distance() -> None:
+    """Sharp positions at rest, readings that differ by their noise: the image follows none, as that of a far point."""
+    rng, nothing = generator("film depth", "rest"), 1e-12 * np.eye(2)
+    sharp = 0.005**2 * np.eye(2)
+    readings = ENCODER_M * rng.standard_normal(200)
+    uv = exact()[1][0] + 0.005 * rng.standard_normal((200, 2))
+    state = first_state(SCENE.rig, uv[0], sharp, nothing, readings[0], ENCODER_M)
+    before = state.mean[2], state.covariance[2, 2]
+    for place, reading in zip(uv[1:], readings[1:], strict=True):
+        state = updated(SCENE.rig, state, place, sharp, nothing, reading, ENCODER_M)
+    assert (state.mean[2], state.covariance[2, 2]) == pytest.approx(before, rel=1e-9)
+    assert state.frames > 190
 
 
 def test_filter_follows_the_bundle_and_is_consistent() -> None:
@@ -248,12 +277,12 @@ def frames_of(images: list[Array], encoder_m: Array, times: FilmTimes = FILM.tim
     return FilmFrames(SCENE.rig, card_of(STRONG), times, FILM.carriage, encoder_m, ENCODER_M, *parts)
 
 
-def mean_electrons(k: int) -> Array:
+def mean_electrons(k: int, laser: bool) -> Array:
     """Expected electrons of a frame behind an RGGB mosaic."""
     light, box = lights()[0][k], lights()[1]
     planes, one = light.ambient_electrons_per_s[:, *box.slices()].astype(float), light.spot
     assert one is not None
-    if k % 2 == 0:
+    if laser:
         u, v = one.u0_px - box.u0_px, one.v0_px - box.v0_px
         h, w = one.electrons_per_s.shape[1:]
         planes[:, v : v + h, u : u + w] += one.electrons_per_s
@@ -263,7 +292,7 @@ def mean_electrons(k: int) -> Array:
 
 def test_expected_frames_give_the_exact_point() -> None:
     """Model against the simulator's moving rows: 0.1 of a frame's noise, 0.3 of D's; still spots are noticed."""
-    images = [mean_electrons(k) for k in range(FRAMES)]
+    images = [mean_electrons(k, k % 2 == 0) for k in range(FRAMES)]
     seen = seen_film(frames_of(images, told()[0]))
     found = bundle_depth(seen)
     assert found.chi2 / found.frames < 2 * 0.1**2
@@ -273,11 +302,31 @@ def test_expected_frames_give_the_exact_point() -> None:
 
 
 def test_room_of_expected_frames_is_that_between_them() -> None:
-    images = np.stack([mean_electrons(k) for k in NUMBERS[1::2]])
+    images = np.stack([mean_electrons(k, False) for k in NUMBERS[1::2]])
     # means without noise leave what interpolation errs by: a fifth of the noise at twice the spacing, squared
     places = told()[1][1::2]
     assert held_out_chi2(images, places, PixelNoise(9.0))[1:-1].max() < 0.2**2
     assert held_out_chi2(images, np.zeros_like(places), PixelNoise(9.0))[1:-1].max() > 1.0
+
+
+def test_room_seen_at_both_ends_alone_is_believed_as_far_as_it_is_known() -> None:
+    """Half-way the room is 2.8 px from any that was seen. Expected frames, an edge of 1000 e 3 px beside the spot."""
+    off = np.isin(NUMBERS, (2, 21))
+    images = np.stack([mean_electrons(k, not off[k]) for k in NUMBERS])
+    few = {"on": NUMBERS[~off], "off": NUMBERS[off], "on_e": images[~off], "off_e": images[off]}
+    frames = replace(frames_of(list(images), told()[0]), **few, near_px=np.rint(told()[1][~off]))
+    found = bundle_depth(seen_film(frames))
+    # a room that is believed wherever it is interpolated gives 1.4 and 0.8
+    assert found.chi2 < 0.3 * (2 * found.frames - 3)
+    assert abs(found.depth_m - DEPTH_M) < 0.3 * found.sigma_m
+
+
+def test_frames_of_no_one_place_are_a_sentence() -> None:
+    """A carriage that swings by 2 cm unseen: 0.5 px or more in every frame, ten of its standard deviations."""
+    images = [mean_electrons(k, k % 2 == 0) for k in NUMBERS]
+    swings = generator("film depth", "swings").choice([-0.02, 0.02], FRAMES)
+    with pytest.raises(DatasetError, match="do not agree"):
+        bundle_depth(seen_film(frames_of(images, told()[0] + swings)))
 
 
 def test_drawn_films_have_the_claimed_errors() -> None:
@@ -330,7 +379,7 @@ def still_spot(camera: Sensor, seed: int) -> tuple[FilmPositions, Array]:
     args = (SCENE.rig, card, FILM.times, FILM.carriage, np.zeros(12), ENCODER_M, 2 * each, 2 * each + 1, on, off)
     frames = FilmFrames(*args, origin, near)
     blur = spot_blur(SCENE.rig, near[0], DEPTH_M, Beam())
-    fit = fit_positions(frames, blur, np.full((6, 6), 1.0 / 6.0))
+    fit = fit_positions(frames, blur, RoomWeights(np.full((6, 6), 1.0 / 6.0), np.zeros(6)))
     assert fit.good.all()
     at = fit.uv_px + 0.05
     stepped = stepped_positions(frames, blur.each(6), np.vstack([at, at]))
