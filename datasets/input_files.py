@@ -89,7 +89,8 @@ def first_fault(error: ValidationError) -> str:
     """Place and message of the first fault that pydantic found."""
     first = error.errors(include_url=False, include_context=False, include_input=False)[0]
     where = ".".join(map(str, first["loc"]))
-    return printable_line(f"{where}: {first['msg']}" if where else first["msg"], 300)
+    text = "there is no such field" if first["type"] == "extra_forbidden" else first["msg"]
+    return printable_line(f"{where}: {text}" if where else text, 300)
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,7 @@ def closeup(ax: Axes) -> None:
     arc(ax, mirror, 0.20, e, n, "", "#2a8050", 0.2)
     ax.plot(*centre, ".k")
     ax.text(centre[0], centre[1] + 0.04, "sphere centre", ha="center", va="bottom", fontsize=9)
-    low, high = mirror - [0.62, 0.90], mirror + [0.86, 0.62]
+    low, high = mirror - [0.62, 0.90], mirror + [0.86, 0.92]
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), title="angles at the reflection point")
 
 

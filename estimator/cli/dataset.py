@@ -132,7 +132,7 @@ def verify(
     if (directory / INFO).is_file():
         faults = verify_export(directory)
         whole = {"faults": list(faults), "valid": not faults}
-        print(dumps(whole) if json else "\n".join([*faults, f"{directory}: {len(faults)} faults"]))
+        print(dumps(whole) if json else "\n".join([*faults, f"{directory}: {_counted(len(faults))}"]))
         return 1 if faults else 0
     report = verify_dataset(directory)
     if json:
@@ -142,8 +142,12 @@ def verify(
         print(fault)
     for note in report.notes:
         print(f"note: {note}")
-    print(f"{directory}: {report.files} files, {report.samples} samples, {len(report.faults)} faults")
+    print(f"{directory}: {report.files} files, {report.samples} samples, {_counted(len(report.faults))}")
     return 0 if report.ok else 1
+
+
+def _counted(faults: int) -> str:
+    return "1 fault" if faults == 1 else f"{faults} faults"
 
 
 @dataset.command
@@ -296,8 +300,10 @@ def export(
         Names the camera whose fixed pattern the frames share.
     split_by
         What no two splits share: "both" rig and room, or one of them.
-    validation, test
-        Shares of the pairs, at most; the rest is for training. A set of one rig or room is all for training.
+    validation
+        Share of the pairs, at most; a set of one rig or room is all for training.
+    test
+        Share of the pairs, at most; the rest is for training.
     pairs_per_shard
         Pairs in one file of Parquet or tar, or in one folder of image files.
     workers

@@ -6,8 +6,8 @@ errors have these covariances, w the weights of frames with the laser off:
 
     noise     new in every frame: A_kp^2 V_kp
     room      sum_p A_kp A_lp V_p (sum_j w_kj w_lj): the same frames with the laser off were taken off both
-    motion    (sum_p A_kp g_p)^2 m_k^2, new in every frame: g the slope of the room's image, m_k how far it may have moved
-              beyond what is interpolated; coherent over the pixels of an edge
+    motion    (sum_p A_kp g_p)^2 m_k^2, new in every frame: g the slope of the room, and m_k how far its image may have
+              moved beyond what is interpolated; the pixels of an edge err together
     pattern   sum_p A_kp A_lp prnu^2 s_kp s_lp, s the spot's light alone
 
 DSNU and the pattern of the room's light are taken off with the room. A spot that rests gains nothing against the rest

@@ -43,6 +43,9 @@ class VehicleParameter:
     meaning: str
 
 
+_ROUNDING_RAD = 1e-9  # of sums of steps
+
+
 def _number(default: float, unit: str, low: float, high: float, meaning: str, source: str = "ours") -> Any:
     """Field of one parameter: all of its `VehicleParameter` but the name."""
     entry = {"unit": unit, "low": low, "high": high, "source": source, "meaning": meaning}
@@ -85,19 +88,20 @@ class Vehicle:
             object.__setattr__(self, entry.name, float(number))
 
     def check_flipper(self, flipper_rad: float) -> float:
-        """Return the angle.
+        """Return the angle; steps that add up to an end of the range, to their rounding, are at that end.
 
         Raises
         ------
         SceneError
             If it is beyond the flippers' range.
         """
-        if not self.flipper_low_rad <= flipper_rad <= self.flipper_high_rad:
+        inside = min(max(flipper_rad, self.flipper_low_rad), self.flipper_high_rad)
+        if not abs(flipper_rad - inside) < _ROUNDING_RAD:
             raise SceneError(
                 f"flipper_rad = {flipper_rad:g}: the flippers turn from {self.flipper_low_rad:g} to "
                 f"{self.flipper_high_rad:g} rad; ask for an angle in between"
             )
-        return float(flipper_rad)
+        return float(inside)
 
     def arc(self, left_m: float, right_m: float, slip: float | None = None, skid: float | None = None) -> Arc:
         """Arc of the base when the tracks run these distances at constant speeds; nominal slip and skid by default."""
