@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import correlate1d
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.film.film_frames import FilmFrames, RoomWeights, room_known, room_weights
@@ -30,7 +31,14 @@ from phibench.estimator.geometry.status import Status
 from phibench.estimator.spots.fisher import fisher_matrix
 from phibench.estimator.spots.fit_raw import fit_law
 from phibench.estimator.spots.gaussian_spot import SpotBlur, SpotModel, SpotPixels
-from phibench.estimator.spots.raw_pixels import GaussLaw, PatternNoise, SpotRegions, noise_of, spot_regions
+from phibench.estimator.spots.raw_pixels import (
+    GaussLaw,
+    PatternNoise,
+    SpotRegions,
+    bayer_filters,
+    noise_of,
+    spot_regions,
+)
 from phibench.scenes.frames import Array, BoolArray
 
 SIDE_PX = 11  # a spot of 0.9 px that moves by 2 px, and its tails
@@ -98,7 +106,7 @@ class _Windows:
 
 
 def fit_positions(frames: FilmFrames, blur: SpotBlur, room: RoomWeights) -> FilmPositions:
-    """Fit each frame by itself, where the light that blinks is brightest within reach of `frames.near_px`.
+    """Fit each frame by itself, where the light that blinks stands out most within reach of `frames.near_px`.
 
     Parameters
     ----------
@@ -107,8 +115,7 @@ def fit_positions(frames: FilmFrames, blur: SpotBlur, room: RoomWeights) -> Film
         Of one spot, or of each.
     room : RoomWeights
     """
-    left = frames.on_e - np.tensordot(room.weights, frames.off_e, 1)
-    windows = _windows(frames, _brightest(left, frames) + frames.origin_px, room)
+    windows = _windows(frames, _most_outstanding(frames, room) + frames.origin_px, room)
     model = _model(frames, windows)
     fit = fit_law(windows.regions, windows.law, blur, model)
     # a fit that wanders off has found something else
@@ -193,15 +200,37 @@ def _slope(image: Array, axis: int) -> Array:
     return np.asarray(0.25 * (high - low))
 
 
-def _brightest(left_e: Array, frames: FilmFrames) -> NDArray[np.int64]:
-    """Place (u, v) of the brightest 3 x 3 pixels near a place in each image; a mosaic shows a spot in one of four."""
-    near_px, (count, h, w) = frames.near_px - frames.origin_px, left_e.shape
-    padded = np.pad(left_e, ((0, 0), (1, 1), (1, 1)), mode="edge")
-    total = np.asarray(sum(padded[:, a : a + h, b : b + w] for a in range(3) for b in range(3)))
-    v, u = np.arange(h)[None, :, None], np.arange(w)[None, None, :]
-    far = np.maximum(np.abs(u - near_px[:, 0, None, None]), np.abs(v - near_px[:, 1, None, None])) > frames.reach_px
-    best = np.where(far, -np.inf, total).reshape(count, -1).argmax(axis=1)
-    return np.stack(np.unravel_index(best, (h, w))[::-1], axis=1)
+def _most_outstanding(frames: FilmFrames, interpolation: RoomWeights) -> NDArray[np.int64]:
+    """Place (u, v) near a given one in each image, shape (N, 2), where light of the laser's colour is surest.
+
+    Score of a spot of 1 pixel rms: sum k r x / V over the root of sum (k r)^2 / V, with its shape k, the answer r of
+    each filter, and the variance V of what is left when the room is taken off.
+    """
+    near_px, (count, h, w) = frames.near_px - frames.origin_px, frames.on_e.shape
+    answer = np.ones((h, w))
+    if frames.card.mosaic == "bayer":
+        filters = bayer_filters([frames.origin_px], (h, w))[0]
+        answer = np.array(frames.rig.camera.detector.laser_filter_response)[filters]
+    noise, best = noise_of(frames.card, pattern_known=True), np.zeros((count, 2), np.int64)
+    v, u = np.mgrid[:h, :w]
+    for k, (image, weights, px) in enumerate(
+        zip(frames.on_e, interpolation.weights, interpolation.moved_px, strict=True)
+    ):
+        room = np.tensordot(weights, frames.off_e, 1)
+        seen, moved = np.maximum(room, 0.0), [px * _slope(room, axis) for axis in (0, 1)]
+        variance = noise.variance_e2(seen) * (1.0 + weights @ weights) + moved[0] ** 2 + moved[1] ** 2
+        clear = image < frames.card.full_from_e
+        above = _smoothed(clear * answer * (image - room) / variance, 1)
+        score = above / np.sqrt(_smoothed(clear * answer**2 / variance, 2) + 1e-12)
+        far = np.maximum(np.abs(u - near_px[k, 0]), np.abs(v - near_px[k, 1])) > frames.reach_px
+        best[k] = np.unravel_index(np.argmax(np.where(far, -np.inf, score)), (h, w))[::-1]
+    return best
+
+
+def _smoothed(image: Array, power: int) -> Array:
+    """Sums of neighbours, weighted by a spot of 1 pixel rms to a power."""
+    kernel = np.exp(-0.5 * np.arange(-2, 3) ** 2) ** power
+    return np.asarray(correlate1d(correlate1d(image, kernel, 0, mode="constant"), kernel, 1, mode="constant"))
 
 
 def _covariances(uv_px: Array, theta: Array, pixels: SpotPixels, windows: _Windows) -> FilmPositions:

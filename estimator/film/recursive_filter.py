@@ -150,8 +150,8 @@ def updated(
         return state
     left = np.eye(5) - K @ H
     covariance = left @ P @ left.T + K @ R @ K.T
-    told = {"uv_px": np.asarray(uv_px, float), "offset_m": offset_m, "frames": state.frames + 1}
-    return replace(state, mean=x, covariance=covariance, chi2=state.chi2 + squared, **told)
+    belief = replace(state, mean=x, covariance=covariance, chi2=state.chi2 + squared, frames=state.frames + 1)
+    return replace(belief, uv_px=np.asarray(uv_px, float), offset_m=offset_m)
 
 
 def _by_encoder(covariance: Array, q: float, by_offset: Array, sigma_m: float) -> Array:
