@@ -131,8 +131,8 @@ def verify(
 
     if (directory / INFO).is_file():
         faults = verify_export(directory)
-        whole = {"faults": list(faults), "valid": not faults}
-        print(dumps(whole) if json else "\n".join([*faults, f"{directory}: {_counted(len(faults))}"]))
+        closing = f"{directory}: {len(faults)} fault{'s' * (len(faults) != 1)}"
+        print(dumps({"faults": list(faults), "valid": not faults}) if json else "\n".join([*faults, closing]))
         return 1 if faults else 0
     report = verify_dataset(directory)
     if json:
@@ -142,12 +142,9 @@ def verify(
         print(fault)
     for note in report.notes:
         print(f"note: {note}")
-    print(f"{directory}: {report.files} files, {report.samples} samples, {_counted(len(report.faults))}")
+    count = len(report.faults)
+    print(f"{directory}: {report.files} files, {report.samples} samples, {count} fault{'s' * (count != 1)}")
     return 0 if report.ok else 1
-
-
-def _counted(faults: int) -> str:
-    return "1 fault" if faults == 1 else f"{faults} faults"
 
 
 @dataset.command

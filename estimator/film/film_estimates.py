@@ -33,6 +33,8 @@ _STEPS, _SETTLED = 8, 0.02  # of the bundle, and standard deviations that it sto
 _REST_M = 1e-9
 _AROUND_PX = 24  # of a tracked spot
 _BEYOND_CHANCE = 20.0  # chi squared of 2: one fit in 2e4
+_LEAST_SNR = 10.0  # of all frames: noise within reach, searched for the place that all agree on, has 6
+_AMONG_WORST = 0.5  # of the largest squared deviation: what is farther is left out with it
 _LEFT_OUT = 0.5  # of the frames with the code on, at most
 _TRACKED_WITHIN_PX = 2  # of the place that a track says
 _ONE_PLACE_M = 3e-3  # of the carriage: an image moves by less than half a pixel
@@ -107,30 +109,56 @@ def bundle_depth(seen: SeenFilm, covariance_rig: Array | None = None) -> FilmDep
     Raises
     ------
     DatasetError
-        If more than half of the frames disagree, or what is left is no one place at rest.
+        If the spot is too faint, more than half of the frames disagree, or what is left is no one place at rest.
     """
     frames, found, places = seen.frames, seen.depth, None
-    told = frames.encoder_sigma_m, covariance_rig
     for _ in range(_STEPS):
         positions, offsets = joint_positions(frames, found.point_world_m, places)
-        known, apart2 = positions.good, deviations2(frames.rig, found.point_world_m, positions, offsets, *told)
-        positions.uv_px[apart2 > _BEYOND_CHANCE] = np.nan
-        if positions.good.sum() < (1.0 - _LEFT_OUT) * known.sum():
-            raise _disagreement(int((known & ~positions.good).sum()), int(known.sum()))
-        before, found = found, film_depth(frames.rig, positions, offsets, *told)
+        before, found = found, _agreed(frames, positions, offsets, covariance_rig)
         if abs(found.depth_m - before.depth_m) < _SETTLED * found.sigma_m:
             break
         places = found.places_px
-    if not found.chi2 < _NO_ONE_PLACE_CHI2 * (2 * found.frames - 3):
-        raise DatasetError(
-            f"{found.frames} positions do not agree with one place at rest, chi^2 {found.chi2:.0f} with "
-            f"{2 * found.frames - 3} degrees of freedom: {_CAUSES}"
-        )
-    return found
+    _check_light(positions)
+    return _of_one_place(found, _NO_ONE_PLACE_CHI2)
+
+
+def _agreed(
+    frames: FilmFrames, positions: FilmPositions, offsets_m: Array, covariance_rig: Array | None = None
+) -> FilmDepth:
+    """Depth of the frames that agree: the worst are left out and the others fitted again while any is beyond chance."""
+    known, told = positions.good, (frames.encoder_sigma_m, covariance_rig)
+    while positions.good.sum() >= (1.0 - _LEFT_OUT) * known.sum():
+        found = film_depth(frames.rig, positions, offsets_m, *told)
+        apart2 = np.nan_to_num(deviations2(frames.rig, found.point_world_m, positions, offsets_m, *told))
+        if apart2.max() < _BEYOND_CHANCE:
+            return found
+        positions.uv_px[apart2 >= max(_BEYOND_CHANCE, _AMONG_WORST * apart2.max())] = np.nan
+    raise _disagreement(int((known & ~positions.good).sum()), int(known.sum()))
 
 
 def _disagreement(count: int, of: int) -> DatasetError:
     return DatasetError(f"positions in {count} of {of} frames do not agree with those in the others: {_CAUSES}")
+
+
+def _check_light(positions: FilmPositions) -> None:
+    # frames in which the flux came out below 0 have no position, and count
+    snr = np.broadcast_to(positions.snr, len(positions.uv_px))
+    snr = snr[positions.good | (snr <= 0.0)]
+    if not (together := float(snr.sum() / np.sqrt(len(snr)))) > _LEAST_SNR:
+        raise DatasetError(
+            f"the spot is too faint: its light is {together:.1f} standard deviations in {len(snr)} frames together, "
+            f"and {_LEAST_SNR:g} are the least; expose longer, take more frames, or a darker place"
+        )
+
+
+def _of_one_place(found: FilmDepth, most_chi2: float) -> FilmDepth:
+    degrees = 2 * found.frames - 3
+    if not found.chi2 < most_chi2 * degrees:
+        raise DatasetError(
+            f"{found.frames} positions do not agree with one place at rest, chi^2 {found.chi2:.0f} with {degrees} "
+            f"degrees of freedom: {_CAUSES}"
+        )
+    return found
 
 
 def joint_positions(
@@ -277,13 +305,9 @@ def tracked_positions(
         If its code is on in fewer than two frames or off in none, or the positions give no depth, or do not agree.
     """
     frames = agreeing(tracked_frames(tracker, name, carriage, encoder_m, encoder_sigma_m))
-    found = bundle_depth(seen_film(frames))
-    if not found.chi2 < _MOST_CHI2 * (2 * found.frames - 3):
-        raise DatasetError(
-            f"target '{name}': {found.frames} positions do not agree with one place at rest, chi^2 {found.chi2:.0f} "
-            f"with {2 * found.frames - 3} degrees of freedom; it moves, or another light is beside it"
-        )
+    found = _of_one_place(bundle_depth(seen_film(frames)), _MOST_CHI2)
     positions, offsets = joint_positions(frames, found.point_world_m)
+    positions.uv_px[np.isnan(found.places_px)] = np.nan  # frames that the bundle left out
     rows = predicted_px(frames, found.point_world_m)[0][: len(frames.on), 1]
     return TrackedPositions(positions, frames.times.row_s(frames.on.astype(float), rows), offsets, found)
 
@@ -320,15 +344,10 @@ def agreeing(frames: FilmFrames) -> FilmFrames:
     On edges of the room, or behind something, a fit in one frame may find anything.
     """
     seen = seen_film(frames)
-    kept, at_most = np.flatnonzero(seen.positions.good), _LEFT_OUT * len(frames.on)
-    while len(frames.on) - len(kept) <= at_most:
-        found = film_depth(frames.rig, seen.positions.some(kept), seen.offsets_m[kept], frames.encoder_sigma_m)
-        told = seen.offsets_m[kept], frames.encoder_sigma_m
-        distance2 = deviations2(frames.rig, found.point_world_m, seen.positions.some(kept), *told)
-        if distance2.max() < _BEYOND_CHANCE:
-            return frames.some(kept, np.arange(len(frames.off)))
-        kept = np.delete(kept, int(np.argmax(distance2)))
-    raise _disagreement(len(frames.on) - len(kept), len(frames.on))
+    found = _agreed(frames, seen.positions, seen.offsets_m)
+    if found.frames < (1.0 - _LEFT_OUT) * len(frames.on):
+        raise _disagreement(len(frames.on) - found.frames, len(frames.on))
+    return frames.some(np.flatnonzero(seen.positions.good), np.arange(len(frames.off)))
 
 
 def _places(tracker: TargetTracker, name: str, encoder_m: Array) -> tuple[Index, Array]:

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import correlate1d
+from scipy.ndimage import gaussian_filter
 
 from phibench.datasets.frames.sensor_card import SensorCard
 from phibench.estimator.film.film_frames import FilmFrames, RoomWeights, room_known, room_weights
@@ -56,11 +56,14 @@ class FilmPositions:
         Covariance of what is new in every frame.
     shared_px2 : array, shape (N, 2, N, 2)
         Covariance of what frames share: pattern, and room.
+    snr : array, shape (N,)
+        Flux over its standard deviation; infinite where nothing was measured in pixels.
     """
 
     uv_px: Array
     noise_px2: Array = field(repr=False)
     shared_px2: Array = field(repr=False)
+    snr: Array = field(default_factory=lambda: np.array(np.inf), repr=False)
 
     @property
     def good(self) -> BoolArray:
@@ -69,7 +72,8 @@ class FilmPositions:
 
     def some(self, index: NDArray[np.int64]) -> FilmPositions:
         """Positions of some frames."""
-        return FilmPositions(self.uv_px[index], self.noise_px2[index], self.shared_px2[index][:, :, index])
+        shared, snr = self.shared_px2[index][:, :, index], np.broadcast_to(self.snr, len(self.uv_px))
+        return FilmPositions(self.uv_px[index], self.noise_px2[index], shared, snr[index])
 
     def covariance_px2(self) -> Array:
         """Covariance of all positions, shape (2 N, 2 N), frame by frame (u, v)."""
@@ -220,31 +224,27 @@ def _most_outstanding(frames: FilmFrames, interpolation: RoomWeights) -> NDArray
         seen, moved = np.maximum(room, 0.0), [px * _slope(room, axis) for axis in (0, 1)]
         variance = noise.variance_e2(seen) * (1.0 + weights @ weights) + moved[0] ** 2 + moved[1] ** 2
         clear = image < frames.card.full_from_e
-        above = _smoothed(clear * answer * (image - room) / variance, 1)
-        score = above / np.sqrt(_smoothed(clear * answer**2 / variance, 2) + 1e-12)
+        above = gaussian_filter(clear * answer * (image - room) / variance, 1.0)
+        # the square of a Gaussian is one of half the variance
+        score = above / np.sqrt(gaussian_filter(clear * answer**2 / variance, np.sqrt(0.5)) + 1e-12)
         far = np.maximum(np.abs(u - near_px[k, 0]), np.abs(v - near_px[k, 1])) > frames.reach_px
         best[k] = np.unravel_index(np.argmax(np.where(far, -np.inf, score)), (h, w))[::-1]
     return best
-
-
-def _smoothed(image: Array, power: int) -> Array:
-    """Sums of neighbours, weighted by a spot of 1 pixel rms to a power."""
-    kernel = np.exp(-0.5 * np.arange(-2, 3) ** 2) ** power
-    return np.asarray(correlate1d(correlate1d(image, kernel, 0, mode="constant"), kernel, 1, mode="constant"))
 
 
 def _covariances(uv_px: Array, theta: Array, pixels: SpotPixels, windows: _Windows) -> FilmPositions:
     mean, derivatives = pixels.at(theta)
     law, origins = windows.law, windows.regions.origin_px
     weight = windows.regions.used * law.information(mean)
-    inverse = np.linalg.pinv(fisher_matrix(derivatives, weight), hermitian=True)[:, :2]
-    influence = np.einsum("nik,nkhw->nihw", inverse, derivatives * weight[:, None])
+    inverse = np.linalg.pinv(fisher_matrix(derivatives, weight), hermitian=True)
+    influence = np.einsum("nik,nkhw->nihw", inverse[:, :2], derivatives * weight[:, None])
     room = np.sqrt(law.noise.variance_e2(windows.room_e))[:, None]
     new = np.einsum("nihw,nhw,njhw->nij", influence, law.noise.variance_e2(mean) + windows.room_e, influence)
     by_motion = np.einsum("nihw,njhw->nij", influence, windows.moved_e)
     new += by_motion @ by_motion.transpose(0, 2, 1)
     common = _common(influence * room, origins) * (windows.weights @ windows.weights.T)[:, None, :, None]
-    return FilmPositions(uv_px, new, common + windows.prnu**2 * _common(influence * mean[:, None], origins))
+    shared = common + windows.prnu**2 * _common(influence * mean[:, None], origins)
+    return FilmPositions(uv_px, new, shared, theta[:, 2] / np.sqrt(np.maximum(inverse[:, 2, 2], 1e-12)))
 
 
 def _common(values: Array, origins: NDArray[np.int64]) -> Array:

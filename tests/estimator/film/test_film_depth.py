@@ -5,19 +5,18 @@ from functools import cache
 
 import numpy as np
 import pytest
+from helpers.stroke_film import DEPTH_M, ENCODER_M, FRAMES, NOISE_PX, POINT, SCENE, SPOT, drawn, exact
 from scipy import stats
 from scipy.special import ndtr
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.frames.sensor_card import card_of
 from phibench.datasets.store.layers import SpotWindow
-from phibench.estimator.film.driving_depth import Way, driving_depth
 from phibench.estimator.film.film_bundle import expected_sigma_m, film_depth, most_agree
 from phibench.estimator.film.film_estimates import bundle_depth, joint_positions, seen_film
-from phibench.estimator.film.film_frames import FilmFrames, RoomWeights, held_out_chi2
+from phibench.estimator.film.film_frames import FilmFrames, RoomWeights, held_out_chi2, room_weights
 from phibench.estimator.film.film_positions import FilmPositions, fit_positions, stepped_positions
 from phibench.estimator.film.processed_film import processed_positions
-from phibench.estimator.film.recursive_filter import FilterState, first_state, updated
 from phibench.estimator.film.spot_tracks import FrameSearch, SpotTrack, fitted_positions
 from phibench.estimator.geometry.mirror_image import image_of
 from phibench.estimator.geometry.rig_parameters import PARAMETERS
@@ -33,38 +32,13 @@ from phibench.render.sensor.light import Light, Region
 from phibench.render.sensor.noise_tiles import NoiseStream
 from phibench.render.sensor.settings import Sensor, sensor
 from phibench.scenes.frames import Array
-from phibench.scenes.laser import Beam, LaserSpot
+from phibench.scenes.laser import Beam
 from phibench.scenes.motion.carriage import Carriage
-from phibench.scenes.motion.drive import Drive, DriveLeg, placement
-from phibench.scenes.motion.film_scene import FilmScene
 from phibench.scenes.motion.film_times import FilmTimes
 from phibench.scenes.motion.vehicle import Vehicle
 from phibench.scenes.random_streams import generator
-from phibench.scenes.rig import Rig
 
-FRAMES, FILMS, FILTERS = 24, 60, 20
-NOISE_PX, ENCODER_M = 0.05, 3e-4
-SPOT = LaserSpot((2.0, 1.0, 0.5), (-0.894427191, -0.447213595, 0.0), 5e-3)
-SCENE = FilmScene(Rig(), SPOT, FilmTimes(FRAMES, 20.0, 1 / 60, 0.03, 720), Carriage((0.0, 0.5), (0.1, 0.1), 0.6, 4.0))
-DEPTH_M = float(np.hypot(2.0, 1.0))
-POINT = np.array(SPOT.position_world_m)
-
-
-@cache
-def exact() -> tuple[Array, Array]:
-    """Offsets and exact positions by the simulator: its own solver of the reflection."""
-    times = SCENE.times.frame_s
-    return SCENE.offset_m(times), chief_uv_px(SCENE, times)
-
-
-def drawn(number: int, noise_px: float = NOISE_PX, encoder_m: float = ENCODER_M) -> tuple[FilmPositions, Array]:
-    offsets, uv = exact()
-    rng = generator("film depth", number)
-    each = np.broadcast_to(NOISE_PX**2 * np.eye(2), (FRAMES, 2, 2))
-    noisy = uv + noise_px * rng.standard_normal(uv.shape)
-    return FilmPositions(noisy, each, np.zeros((FRAMES, 2, FRAMES, 2))), offsets + encoder_m * rng.standard_normal(
-        FRAMES
-    )
+FILMS = 60
 
 
 def test_exact_positions_give_the_exact_point() -> None:
@@ -102,15 +76,6 @@ def test_bundle_errors_are_within_their_covariance(understated: bool) -> None:
     assert (found.offset_sigma_m < ENCODER_M).all()
 
 
-def last_state(positions: FilmPositions, readings: Array, pattern_px2: Array) -> FilterState:
-    """Belief of the filter after all frames."""
-    uv, noise = positions.uv_px, positions.noise_px2
-    state = first_state(SCENE.rig, uv[0], noise[0], pattern_px2, readings[0], ENCODER_M)
-    for k in range(1, FRAMES):
-        state = updated(SCENE.rig, state, uv[k], noise[k], pattern_px2, readings[k], ENCODER_M)
-    return state
-
-
 def test_frames_that_most_agree_with_are_found() -> None:
     """Ten of 24 fits astray by up to 12 px, at both ends of the stroke too; without any, all frames agree."""
     positions, readings = drawn(0)
@@ -124,66 +89,6 @@ def test_frames_that_most_agree_with_are_found() -> None:
     assert agree.sum() == FRAMES - 10
     nobody = replace(positions, uv_px=np.full_like(positions.uv_px, np.nan))
     assert not most_agree(SCENE.rig, nobody, readings).any()
-
-
-def test_filter_leaves_a_fit_astray_out() -> None:
-    """A frame late in the stroke whose fit settled 30 deviations away leaves the belief as without it."""
-    positions, readings = drawn(0)
-    nothing = 1e-12 * np.eye(2)
-    astray = positions.uv_px.copy()
-    astray[-2] += 30.0 * np.sqrt(np.diag(positions.noise_px2[-2]))
-    right = last_state(positions, readings, nothing)
-    left_out = last_state(replace(positions, uv_px=astray), readings, nothing)
-    assert left_out.frames == right.frames - 1
-    (depth, sigma), (other, _) = (state.depth(SCENE.rig) for state in (right, left_out))
-    assert abs(depth - other) < 0.5 * sigma
-
-
-def test_filter_keeps_the_patterns_error_at_rest() -> None:
-    """Frames of one place average their noise, not the pattern's error, however far noise moves their fits."""
-    pattern = 0.05**2 * np.eye(2)
-    noise = 0.2**2 * np.eye(2)
-    uv = exact()[1][0] + np.random.default_rng(5).normal(0.0, 0.2, (400, 2))
-    state = first_state(SCENE.rig, uv[0], noise, pattern, 0.0, 0.0)
-    per_px2 = state.covariance[:2, :2] / (0.2**2 + 0.05**2)
-    for place in uv[1:]:
-        state = updated(SCENE.rig, state, place, noise, pattern, 0.0, 0.0)
-    variance_px2 = 0.5 * np.trace(np.linalg.solve(per_px2, state.covariance[:2, :2]))
-    # 400 frames leave the pattern's variance and a 400th of the noise's; the map of a and b is that of the first frame,
-    # whose place is off by 0.2 px: to some percent
-    assert variance_px2 == pytest.approx(0.05**2 + 0.2**2 / 400, rel=0.1)
-
-
-def test_readings_at_rest_tell_the_filter_nothing_of_the_distance() -> None:
-    """Sharp positions at rest, readings that differ by their noise: the image follows none, as that of a far point."""
-    rng, nothing = generator("film depth", "rest"), 1e-12 * np.eye(2)
-    sharp = 0.005**2 * np.eye(2)
-    readings = ENCODER_M * rng.standard_normal(200)
-    uv = exact()[1][0] + 0.005 * rng.standard_normal((200, 2))
-    state = first_state(SCENE.rig, uv[0], sharp, nothing, readings[0], ENCODER_M)
-    before = state.mean[2], state.covariance[2, 2]
-    for place, reading in zip(uv[1:], readings[1:], strict=True):
-        state = updated(SCENE.rig, state, place, sharp, nothing, reading, ENCODER_M)
-    assert (state.mean[2], state.covariance[2, 2]) == pytest.approx(before, rel=1e-9)
-    assert state.frames > 190
-
-
-def test_filter_follows_the_bundle_and_is_consistent() -> None:
-    """Normalised squared errors of D of 20 filters: chi-square with 20 degrees, band of 1e-5; the same information."""
-    squares, differences = [], []
-    nothing = 1e-12 * np.eye(2)
-    for number in range(FILTERS):
-        positions, readings = drawn(number)
-        depth, sigma = last_state(positions, readings, nothing).depth(SCENE.rig)
-        squares.append(((depth - DEPTH_M) / sigma) ** 2)
-        if number < 6:
-            joint = film_depth(SCENE.rig, positions, readings, ENCODER_M)
-            differences.append((depth - joint.depth_m) / joint.sigma_m)
-            assert sigma == pytest.approx(joint.sigma_m, rel=0.1)
-    low, high = stats.chi2.ppf([5e-6, 1 - 5e-6], FILTERS) / FILTERS
-    assert low < np.mean(squares) < high
-    # linearised in another order: a part of sigma
-    assert np.abs(differences).max() < 0.3
 
 
 def test_fitted_places_follow_a_rig_that_is_off() -> None:
@@ -329,6 +234,48 @@ def test_frames_of_no_one_place_are_a_sentence() -> None:
         bundle_depth(seen_film(frames_of(images, told()[0] + swings)))
 
 
+@pytest.mark.parametrize("by_px", [(1, 1), (2, 0), (0, 2)])
+def test_a_frame_that_shows_the_spot_elsewhere_is_left_out(by_px: tuple[int, int]) -> None:
+    """One frame of twelve, its image moved: no position in it, and D as without it."""
+    images = [mean_electrons(k, k % 2 == 0) for k in NUMBERS]
+    right = bundle_depth(seen_film(frames_of(images, told()[0])))
+    images[10] = np.roll(images[10], by_px, axis=(0, 1))
+    found = bundle_depth(seen_film(frames_of(images, told()[0])))
+    assert np.flatnonzero(np.isnan(found.places_px[:, 0])).tolist() == [5]
+    assert abs(found.depth_m - right.depth_m) < 0.2 * right.sigma_m
+
+
+def test_light_that_is_lost_in_the_noise_is_a_sentence() -> None:
+    """A hundredth of the light, at the place that bright frames give."""
+    rng = generator("film depth", "lost")
+    bright = [mean_electrons(k, k % 2 == 0) for k in NUMBERS]
+    dark = [mean_electrons(k, False) for k in NUMBERS]
+    images = [rng.poisson(b + 0.01 * (a - b)).astype(float) for a, b in zip(bright, dark, strict=True)]
+    seen = replace(seen_film(frames_of(bright, told()[0])), frames=frames_of(images, told()[0]))
+    with pytest.raises(DatasetError, match="too faint"):
+        bundle_depth(seen)
+
+
+def test_a_faint_spot_is_found_beside_a_bright_part_of_the_room() -> None:
+    """Peak of 70 e, 50 e of room at the spot and 5000 e six pixels aside: noise there is as high as the spot.
+
+    In 20 frames, 90 % or more are found; the brightest pixels would be on the bright side in most.
+    """
+    truth, rng = np.array([20.0, 20.0]), generator("film depth", "faint")
+    v, u = np.mgrid[:41, :41].astype(float)
+    red = np.array(SCENE.rig.camera.detector.laser_filter_response)[bayer_filters([[700, 300]], (41, 41))[0]]
+    room = np.where(u > 26.0, 5000.0, 50.0)
+    spot = 70.0 * red * np.exp(-0.5 * ((u - truth[0]) ** 2 + (v - truth[1]) ** 2) / 0.9**2)
+    on, off = (rng.poisson(one, (20, 41, 41)) + rng.normal(0.0, 4.0, (20, 41, 41)) for one in (room + spot, room))
+    near = np.tile(np.array([700.0, 300.0]) + truth, (20, 1))
+    told_m = np.zeros(40)
+    parts = np.arange(0, 40, 2), np.arange(1, 40, 2), on, off, np.array([700, 300]), near
+    frames = FilmFrames(SCENE.rig, card_of(STRONG), FILM.times, FILM.carriage, told_m, ENCODER_M, *parts)
+    fit = fit_positions(frames, spot_blur(SCENE.rig, near[0], DEPTH_M, Beam()), room_weights(near, near))
+    found = np.abs(fit.uv_px - near).max(axis=1) < 1.0
+    assert found.sum() >= 18
+
+
 def test_drawn_films_have_the_claimed_errors() -> None:
     """Six cameras with 2 % PRNU: chi2 and squared pulls of the point, each within its band of 1e-5."""
     box, chi2, pulls, dof = lights()[1], 0.0, 0.0, 0
@@ -412,66 +359,6 @@ def test_single_mjpeg_frames_have_the_claimed_errors() -> None:
     for beside, within in ((0.0, True), (0.3, False)):
         pulls = [e @ np.linalg.solve(C, e) for e, C in zip(errors + beside, found.noise_px2, strict=True)]
         assert (np.sum(pulls) < limit) == within
-
-
-# A robot that drives.
-
-DRIVES, AT_S = 8, np.arange(24) * 0.12
-NOMINAL = Vehicle()
-
-
-def driven(number: int) -> tuple[Drive, Array, Array]:
-    """Drive with drawn slip and skid, exact places by the simulator, and D from where the robot stands."""
-    drive = Drive.drawn(NOMINAL, (DriveLeg(0.1, 0.4, 0.35),), "driven", number)
-    scene = replace(SCENE, carriage=Carriage((0.0,), (0.1,)), drive=drive)
-    turns, origins = placement(NOMINAL, drive.state(AT_S))
-    apart = POINT - (turns @ np.array(SCENE.rig.at(0.0).sphere_centre_m) + origins)
-    return drive, chief_uv_px(scene, AT_S), np.hypot(apart[:, 0], apart[:, 1])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("understated", [False, True])
-def test_motion_stereo_is_consistent(understated: bool) -> None:
-    """8 drives: squared pulls of X, of D at the end, and chi2 in bands of 1e-5; slip and skid taken as exact fail."""
-    vehicle = replace(NOMINAL, slip_sigma=1e-4, skid_sigma=1e-4, track_noise=1e-4) if understated else NOMINAL
-    each, count = NOISE_PX**2 * np.eye(2), len(AT_S)
-    pulls, ends, misfits, covariance = [], [], [], np.zeros((len(PARAMETERS),) * 2)
-    for number in range(DRIVES):
-        drive, uv, depth_m = driven(number)
-        noisy = uv + NOISE_PX * generator("drives", number).standard_normal(uv.shape)
-        noisy[5] = np.nan
-        positions = FilmPositions(noisy, np.broadcast_to(each, (count, 2, 2)), np.zeros((count, 2, count, 2)))
-        way = Way(vehicle, drive.readings_m(AT_S, "drives", number), drive.state(AT_S)[:, 3])
-        found = driving_depth(SCENE.rig, way, positions)
-        error = found.point_world_m - POINT
-        pulls.append(error @ np.linalg.solve(found.covariance_m2, error))
-        ends.append(((found.depth_m[-1] - depth_m[-1]) / found.sigma_m[-1]) ** 2)
-        misfits.append(found.chi2)
-    high, end, most = (stats.chi2.ppf(1 - 1e-5, k * DRIVES) for k in (3, 1, 2 * (count - 1) - 3))
-    assert (np.sum(pulls) < high) == (not understated)
-    assert (np.sum(misfits) < most) == (not understated)
-    if understated:
-        return
-    assert np.sum(ends) < end
-    assert np.sum(ends) > stats.chi2.ppf(1e-5, DRIVES)
-    # a focal length that is 1 % unknown widens the claim, and moves no place of a fit without error
-    covariance[PARAMETERS.index("focal_relative")][PARAMETERS.index("focal_relative")] = 0.01**2
-    wide = driving_depth(SCENE.rig, way, positions, covariance)
-    assert (wide.sigma_m > found.sigma_m).all()
-
-
-def test_motion_stereo_from_exact_readings_is_exact() -> None:
-    drive, uv, depth_m = driven(3)
-    exact_one = replace(NOMINAL, slip=drive.slip, skid=drive.skid, slip_sigma=1e-6, skid_sigma=1e-6, track_noise=1e-6)
-    each = np.broadcast_to(NOISE_PX**2 * np.eye(2), (len(AT_S), 2, 2))
-    positions = FilmPositions(uv, each, np.zeros((len(AT_S), 2, len(AT_S), 2)))
-    found = driving_depth(SCENE.rig, Way(exact_one, drive.tracks_m(AT_S)[0], drive.state(AT_S)[:, 3]), positions)
-    # an arc is reckoned exactly, and priors of 1e-6 hold the rest
-    np.testing.assert_allclose(found.point_world_m, POINT, atol=1e-6)
-    np.testing.assert_allclose(found.depth_m, depth_m, atol=1e-6)
-    still = replace(positions, uv_px=uv[:1].repeat(len(AT_S), 0))
-    with pytest.raises(DatasetError, match="drive farther, or make a stroke"):
-        driving_depth(SCENE.rig, Way(NOMINAL, np.zeros((len(AT_S), 2)), drive.state(AT_S)[:, 3]), still)
 
 
 # Belief over the place of the target, from the same frames.

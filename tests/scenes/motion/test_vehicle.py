@@ -177,6 +177,13 @@ def test_the_vehicle_is_as_long_and_as_wide_as_the_robot_that_is_rendered() -> N
     assert left.T_world_shape.t[0] == pytest.approx(-ESCALADE.sensor_x_m)  # the world of rooms is the rig's
 
 
+def test_steps_that_add_up_to_the_end_of_the_flippers_range_are_at_that_end() -> None:
+    assert sum([0.1] * 16) > ESCALADE.flipper_high_rad
+    assert ESCALADE.check_flipper(sum([0.1] * 16)) == ESCALADE.flipper_high_rad
+    with pytest.raises(SceneError, match="flipper_rad"):
+        ESCALADE.check_flipper(ESCALADE.flipper_high_rad + 1e-6)
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
