@@ -23,8 +23,7 @@ from phibench.datasets.plan.plan import Plan
 from phibench.datasets.plan.room_draws import room_files
 from phibench.datasets.plan.sampling import HIDDEN_TRIES
 from phibench.datasets.recipe.tables import Recipe
-from phibench.datasets.rooms.room_errors import RoomError
-from phibench.datasets.rooms.room_files import RoomFiles
+from phibench.datasets.rooms.room_files import RoomError, RoomFiles
 from phibench.datasets.store import schema
 from phibench.datasets.store.files import write_bytes
 from phibench.datasets.store.provenance import PACKAGES, code_behind, provenance

@@ -28,8 +28,7 @@ from phibench.datasets.progress import Steps
 from phibench.datasets.recipe.tables import AmbientTable, Recipe
 from phibench.datasets.rooms.gltf_export import glb_of
 from phibench.datasets.rooms.panorama_settings import PanoramaSettings
-from phibench.datasets.rooms.room_errors import RoomError
-from phibench.datasets.rooms.room_files import RoomFiles
+from phibench.datasets.rooms.room_files import RoomError, RoomFiles
 from phibench.datasets.rooms.room_sources import EXPORTED, NamedRoom, UnexportedRoom
 from phibench.datasets.store import schema
 from phibench.datasets.store.checksums import held_room_files

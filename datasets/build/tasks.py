@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from phibench.datasets.errors import DatasetError
-from phibench.datasets.rooms.room_errors import RoomError
+from phibench.datasets.rooms.room_files import RoomError
 from phibench.datasets.store.files import sha256, working
 from phibench.datasets.store.provenance import code_sha256
 from phibench.scenes.validation import SceneError

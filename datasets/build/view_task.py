@@ -12,7 +12,7 @@ from phibench.datasets.build.bake_task import bake_settings, read_light_map
 from phibench.datasets.build.tasks import Made
 from phibench.datasets.plan.plan import PosePlan
 from phibench.datasets.recipe.tables import AmbientTable
-from phibench.datasets.rooms.room_errors import RoomError
+from phibench.datasets.rooms.room_files import RoomError
 from phibench.datasets.rooms.room_sources import RoomSource, room_of
 from phibench.datasets.store import schema
 from phibench.datasets.store.layers import write_ambient, write_truth

@@ -18,8 +18,7 @@ from phibench.datasets.plan.room_draws import draw_rooms, room_files
 from phibench.datasets.plan.sampling import RandomSample, draw_samples, have_own_rigs
 from phibench.datasets.recipe.build import build_misalignment, build_rig, build_spot, true_stroke_m
 from phibench.datasets.recipe.tables import DrawnRigsTable, RandomTable, Recipe
-from phibench.datasets.rooms.room_errors import RoomError
-from phibench.datasets.rooms.room_files import RoomFiles
+from phibench.datasets.rooms.room_files import RoomError, RoomFiles
 from phibench.datasets.rooms.room_sources import ONLY_ROOM, RoomSource, room_of
 from phibench.scenes.laser import LaserSpot
 from phibench.scenes.misalignment import Misalignment

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import PICTURE_PIXELS, InputFile
-from phibench.datasets.rooms.room_errors import RoomError
+from phibench.datasets.rooms.room_files import RoomError
 from phibench.render.sensor.srgb import srgb_decoded
 from phibench.scenes.frames import Array, Vector, as_vector
 from phibench.scenes.validation import printable_line

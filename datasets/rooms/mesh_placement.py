@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phibench.datasets.rooms.mesh_files import MeshPart, read_mesh
-from phibench.datasets.rooms.room_errors import RoomError
+from phibench.datasets.rooms.room_files import RoomError
 from phibench.scenes.frames import Array, Vector
 from phibench.scenes.room import chassis
 from phibench.scenes.validation import finite_vector, positive, unit_vector, within

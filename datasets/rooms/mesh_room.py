@@ -28,7 +28,7 @@ from phibench.datasets.rooms.mesh_placement import (
     heights_on_vertical,
     placed_parts,
 )
-from phibench.datasets.rooms.room_errors import RoomError
+from phibench.datasets.rooms.room_files import RoomError
 from phibench.render.sensor.srgb import srgb_decoded
 from phibench.scenes.frames import Array, Pose, as_matrix, as_vector
 from phibench.scenes.room import Room

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import ImageOps
 
 from phibench.datasets.input_files import PICTURE_PIXELS, InputFile, quiet_terminal
-from phibench.datasets.rooms.room_errors import RoomError
+from phibench.datasets.rooms.room_files import RoomError
 from phibench.render.sensor.srgb import srgb_decoded
 from phibench.scenes.validation import printable_line
 

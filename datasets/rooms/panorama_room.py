@@ -27,7 +27,7 @@ from phibench.datasets.rooms.mesh_placement import EXTENT_M, corners_of, placed_
 from phibench.datasets.rooms.mesh_room import MOST_VALUES, mesh_shape
 from phibench.datasets.rooms.panorama_files import Light, read_panorama
 from phibench.datasets.rooms.panorama_settings import CLEAR_M, PanoramaSettings
-from phibench.datasets.rooms.room_errors import RoomError
+from phibench.datasets.rooms.room_files import RoomError
 from phibench.scenes.frames import Array, Vector
 from phibench.scenes.room import Room
 from phibench.scenes.shapes import Rectangle, rectangle

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from phibench.datasets.rooms.mesh_placement import EXTENT_M, MIRROR_TOP_M, MeshSettings, robot_box
-from phibench.datasets.rooms.room_errors import RoomError
+from phibench.datasets.rooms.room_files import RoomError
 from phibench.scenes.frames import Vector
 from phibench.scenes.validation import finite_vector, within
 

@@ -10,11 +10,16 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from phibench.datasets.errors import DatasetError
 from phibench.datasets.input_files import MIB, InputFile
-from phibench.datasets.rooms.room_errors import RoomError
+from phibench.scenes.validation import SceneError
 
 LARGEST_BYTES = 64 * MIB
 _REMEDY = "put a file of at most 64 MiB there, or give the name of another one"
+
+
+class RoomError(DatasetError, SceneError):
+    """A mesh, a panorama or settings of which no room can be made."""
 
 
 @dataclass(frozen=True)

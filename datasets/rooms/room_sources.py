@@ -17,8 +17,7 @@ from typing import Literal, cast
 from phibench.datasets.input_files import FILE_NAME
 from phibench.datasets.rooms.mesh_placement import MeshSettings
 from phibench.datasets.rooms.panorama_settings import PanoramaSettings
-from phibench.datasets.rooms.room_errors import RoomError
-from phibench.datasets.rooms.room_files import checked_file
+from phibench.datasets.rooms.room_files import RoomError, checked_file
 from phibench.scenes.catalog import ROOMS, Target
 from phibench.scenes.room import Room
 from phibench.scenes.validation import SceneError, nearest, printable_line

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from phibench.datasets.exposures.pair_draws import CachedSample, PairDraw, pair_
 from phibench.datasets.frames.sensor_card import SensorCard, card_of
 from phibench.datasets.frames.sensor_file import SensorFile
 from phibench.datasets.frames.source import FrameSource, Side
-from phibench.datasets.read import Dataset, Sample
+from phibench.datasets.read import Dataset, Sample, open_dataset
 from phibench.datasets.store import schema
 from phibench.datasets.store.files import sha256
 from phibench.datasets.store.provenance import provenance
@@ -82,6 +83,10 @@ class DatasetPairs(DrawnPairs):
         super().__init__(dataset, pair_draws)
         self._boxes_px, self._sensor, self._count_frames = boxes_px, sensor, count_frames
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle without rows and layers: another process opens the data set itself."""
+        return _reopened, (self.dataset.folder, self.pair_draws, self._boxes_px, self._sensor, self._count_frames)
+
     def truth(self, number: int) -> PairTruth:
         """The exact answer, with the bounds of the image and of the raw pixels behind it."""
         pair_draw, sample, source = self.drawn_from(number)
@@ -135,6 +140,10 @@ class DatasetPairs(DrawnPairs):
             text = json.dumps([self._sensor.preset, dict(self._sensor.numbers)], sort_keys=True)
             found["sensor_sha256"] = hashlib.sha256(text.encode()).hexdigest()
         return found
+
+
+def _reopened(folder: Path, *others: Any) -> DatasetPairs:
+    return DatasetPairs(open_dataset(folder), *others)
 
 
 def dataset_pairs(
@@ -357,42 +366,42 @@ class CalibratedPairs:
     """
 
     def __init__(self, pairs: PairSet, calibration: Calibration) -> None:
-        self._pairs, self._calibration = pairs, calibration
+        self.pairs, self.calibration = pairs, calibration
         self.folders = truth_folders(pairs)
         self._covariance = np.array(calibration.covariance)
         self._covariance.flags.writeable = False
 
     def __len__(self) -> int:
-        return len(self._pairs)
+        return len(self.pairs)
 
     def pair(self, number: int) -> Pair:
         """Images of a pair, with the calibrated rig and its covariance."""
-        seen = self._pairs.pair(number)
+        seen = self.pairs.pair(number)
         return replace(
             seen,
-            rig=self._calibration.rig,
+            rig=self.calibration.rig,
             stroke_m=self._stroke_m(seen.stroke_m),
             calibration_covariance=self._covariance,
         )
 
     def truth(self, number: int) -> PairTruth:
         """The exact answer."""
-        truth = self._pairs.truth(number)
+        truth = self.pairs.truth(number)
         nominal_m = truth.stroke_m if truth.nominal_stroke_m is None else truth.nominal_stroke_m
         return replace(
             truth,
-            nominal_rig=self._calibration.rig,
+            nominal_rig=self.calibration.rig,
             nominal_stroke_m=self._stroke_m(nominal_m),
             calibration_covariance=self._covariance,
         )
 
     def document(self) -> dict[str, Any]:
         """Provenance of the set, with the calibration's hash."""
-        made_from = self._calibration.made_from
-        return {**self._pairs.document(), "calibration": self._calibration.sha256, "calibrated_from": made_from}
+        made_from = self.calibration.made_from
+        return {**self.pairs.document(), "calibration": self.calibration.sha256, "calibrated_from": made_from}
 
     def _stroke_m(self, nominal_m: float) -> float:
-        return float(stroke_of(np.array(nominal_m), self._calibration.values))
+        return float(stroke_of(np.array(nominal_m), self.calibration.values))
 
 
 def of_calibration(dataset: Dataset, calibration: Calibration) -> Dataset:

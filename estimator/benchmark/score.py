@@ -26,7 +26,13 @@ from phibench.datasets.read import Dataset, open_finished
 from phibench.datasets.store.files import require_writable
 from phibench.estimator.benchmark.answer_errors import Rules
 from phibench.estimator.benchmark.causes import with_causes
-from phibench.estimator.benchmark.dataset_pairs import TASK_VERSION, CalibratedPairs, dataset_pairs, of_calibration
+from phibench.estimator.benchmark.dataset_pairs import (
+    TASK_VERSION,
+    CalibratedPairs,
+    DatasetPairs,
+    dataset_pairs,
+    of_calibration,
+)
 from phibench.estimator.benchmark.document import (
     MethodCard,
     ScoreDocument,
@@ -44,13 +50,14 @@ from phibench.estimator.interface import Box, Method, Outcome
 from phibench.estimator.limits.off_frame_bound import FrameCounts
 from phibench.estimator.methods.registry import METHODS, BuiltIn
 from phibench.estimator.pair_set import CachedPairs, PairSet, truth_folders
+from phibench.estimator.sandbox.pairs_ahead import PairsAhead
 from phibench.estimator.sandbox.resolve import MethodError, RunLimits, resolve
 from phibench.estimator.sandbox.runner import Harness, asked_here, function_name
 
 Ask = Callable[[PairSet, Sequence[int]], Iterable[tuple[Outcome, ...]]]
 """Pairs and numbers to the outcomes of every method: `sandbox.runner.Harness.outcomes`."""
 AT_ONCE = 16
-"""Pairs in memory at a time; one of MJPEG frames with the laser on and off takes 11 MB."""
+"""Pairs that are examined together; twice as many are in memory. One of MJPEG frames, on and off, takes 11 MB."""
 
 
 @dataclass(frozen=True)
@@ -107,12 +114,16 @@ def score_methods(
     """
     rules = rules or Rules()
     parts: list[list[Examined]] = [[] for _ in methods]
-    for start in range(0, len(pairs), AT_ONCE):
-        numbers = range(start, min(start + AT_ONCE, len(pairs)))
-        held, answers = CachedPairs(pairs), []
-        for done, outcomes in enumerate(ask(held, numbers), start=start + 1):
+    batches, answered = _asked(pairs, ask), 0
+    following = next(batches, None)
+    while following is not None:
+        # the next pairs are asked for first: methods work on them while these are examined
+        (held, asked), following = following, next(batches, None)
+        answers = []
+        for outcomes in asked:
             answers.append(outcomes)
-            told(done)
+            told(answered + len(answers))
+        answered += len(answers)
         if stages is not None:
             stages["bounds"] = stages.get("bounds", 0.0) + held.truth_seconds
         for part, outcomes in zip(parts, zip(*answers, strict=True), strict=True):
@@ -122,6 +133,13 @@ def score_methods(
         return [
             _scored(method, pairs, part, rules, seed, limits or {}) for method, part in zip(methods, parts, strict=True)
         ]
+
+
+def _asked(pairs: PairSet, ask: Ask) -> Iterator[tuple[CachedPairs, Iterable[tuple[Outcome, ...]]]]:
+    """Some pairs of a set and their outcomes to come, then the next ones."""
+    for start in range(0, len(pairs), AT_ONCE):
+        held = CachedPairs(pairs)
+        yield held, ask(held, range(start, min(start + AT_ONCE, len(pairs))))
 
 
 @contextmanager
@@ -340,13 +358,35 @@ def run_and_score(
     if not cards:
         return []
     # the steps first: they tell of time that goes by while methods start
-    with Steps(console, title, len(pairs)) as steps, Harness(found, limits, workers, truth_folders(pairs)) as harness:
-        scored = score_methods(cards, pairs, harness.outcomes, None, seed, limits.document(), steps.reach, stages)
+    with (
+        Steps(console, title, len(pairs)) as steps,
+        _ahead(pairs, workers) as (made, making),
+        Harness(found, limits, workers, truth_folders(pairs)) as harness,
+    ):
+        scored = score_methods(cards, made, harness.outcomes, None, seed, limits.document(), steps.reach, stages)
     if stages is not None:
         stages.update(harness.stages)
         stages["draw"] -= stages["bounds"]  # made in the same turn: `CachedPairs`
+        stages |= {stage: stages[stage] + seconds for stage, seconds in making.items()}
     told = zip(scored, harness.failed_outputs, harness.isolations, strict=True)
     return [replace(isolated(one, isolation), output=output) for one, output, isolation in told]
+
+
+_WORTH_A_PROCESS = 40  # pairs; a process that makes them starts in 2 s
+
+
+@contextmanager
+def _ahead(pairs: PairSet, workers: int) -> Iterator[tuple[PairSet, dict[str, float]]]:
+    """Pairs of a data set made by as many processes as work on them, and their CPU-seconds by stage.
+
+    Few pairs, and those of other sets, are made here.
+    """
+    drawn = pairs.pairs if isinstance(pairs, CalibratedPairs) else pairs
+    if workers == 1 or len(pairs) < _WORTH_A_PROCESS or not isinstance(drawn, DatasetPairs):
+        yield pairs, {}
+        return
+    with PairsAhead(drawn, workers) as made:
+        yield CalibratedPairs(made, pairs.calibration) if isinstance(pairs, CalibratedPairs) else made, made.seconds
 
 
 def isolated(scored: Scored, isolation: str) -> Scored:

@@ -93,7 +93,7 @@ def score(
     bootstrap_seed
         Seed of the bootstrap that makes the intervals.
     workers
-        Pairs that are worked on at a time.
+        Pairs that are worked on at a time. From 2 on, as many further processes draw them, where they are 40 or more.
     calibration
         File of `phibench calibrate`: its rig's samples, with the calibrated rig, stroke and covariance.
     sensor
@@ -279,7 +279,7 @@ def bench(
     pairs
         Only the first so many of each preset.
     workers
-        Pairs that are worked on at a time.
+        Pairs that are worked on at a time. From 2 on, as many further processes draw them, where they are 40 or more.
     calibration
         File of `phibench calibrate`: only its rig's pairs, with the calibrated rig and stroke.
     """

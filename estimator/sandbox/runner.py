@@ -65,10 +65,11 @@ class Harness:
         self._places = _together(self._references)
         self._draw_seconds = 0.0
         self._failed: list[dict[int, str]] = [{} for _ in self._references]
-        self._turns: list[_Turns] = []
+        self._asked = 0
 
     def __enter__(self) -> Harness:
         self._pools = [self._pool([self._references[place] for place in places]) for places in self._places]
+        self._making, self._turns = _Turns(), [_Turns() for _ in self._pools]
         # one more than processes, so that a pair is made while the others are looked at
         self._threads = ThreadPoolExecutor(self._workers + 1, thread_name_prefix="phibench-method")
         try:
@@ -85,7 +86,7 @@ class Harness:
         return _MethodPool([MethodProcess(first, self._limits, self._hidden, others) for _ in range(copies)])
 
     def __exit__(self, kind: type[BaseException] | None, error: object, trace: TracebackType | None) -> None:
-        for turns in self._turns:
+        for turns in (self._making, *self._turns):
             turns.stop()
         for pool in self._pools:
             pool.close()
@@ -126,29 +127,30 @@ class Harness:
         """Outcomes of every method for some pairs, in the order of `numbers`.
 
         Pairs are made one at a time and given out in this order, whatever the number of workers: a set need not be
-        safe for threads, and one process alone sees the same pairs in the same order in every run.
+        safe for threads, and one process alone sees the same pairs in the same order in every run. Pairs of the next
+        call, asked for before these are answered, come after them.
         """
-        making, turns = _Turns(), [_Turns() for _ in self._pools]
-        self._turns += [making, *turns]
+        first, self._asked = self._asked, self._asked + len(numbers)
 
         def one(place: int, number: int) -> tuple[Outcome, ...]:
             try:
-                with making.turn(place):
+                with self._making.turn(place):
                     start = time.thread_time()
                     pair = pairs.pair(number)
                     self._draw_seconds += time.thread_time() - start
             except BaseException:
-                for skipped in turns:  # or those that come after would wait for it
+                for skipped in self._turns:  # or those that come after would wait for it
                     with skipped.turn(place):
                         pass
                 raise
-            done = self._in_order([pool.ask(pair, turn, place) for pool, turn in zip(self._pools, turns, strict=True)])
+            asked = zip(self._pools, self._turns, strict=True)
+            done = self._in_order([pool.ask(pair, turns, place) for pool, turns in asked])
             for failed, outcome in zip(self._failed, done, strict=True):
                 if outcome.failure and outcome.output:
                     failed[number] = outcome.output
             return done
 
-        return _in_order([self._threads.submit(one, *item) for item in enumerate(numbers)])
+        return _in_order([self._threads.submit(one, *item) for item in enumerate(numbers, first)])
 
 
 def _together(references: Sequence[Reference]) -> list[list[int]]:

@@ -140,10 +140,10 @@ def _correlated(plane: Array, kernel: Array, axis: int) -> Array:
 
 
 def _squares(kernel: Array, on: ColourPlanes, axis: int) -> Array:
-    """Sum of k^2 over the red sites around each row (axis 0) or column, shape (h,) or (w,)."""
+    """Sum of k^2 over the red sites around each row (axis 0) or column, shape (h,) or (w,); (1,) if all are alike."""
     site = (np.arange(on.shape[axis]) % 2 == 0) if on.mosaic else np.ones(on.shape[axis], bool)
     # the border counts as if the sites went on: a spot cut by the image's edge is then only underrated
-    return np.asarray(correlate1d(site.astype(float), kernel**2, mode="wrap"))
+    return np.asarray(correlate1d(site.astype(float), kernel**2, mode="wrap"))[: None if on.mosaic else 1]
 
 
 def _map_spread(z: NDArray[Any], inside: BoolArray) -> float:

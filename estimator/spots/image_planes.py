@@ -255,9 +255,9 @@ def _raw(part: Image, card: SensorCard, box: Box) -> ColourPlanes:
 def _developed(part: Image, card: SensorCard, box: Box) -> ColourPlanes:
     planes = [np.ascontiguousarray(part[..., c]) for c in range(3 if card.mosaic == "bayer" else 1)]
     curve = (light_of(np.arange(256) / 255.0, card) * full_scale_e(card)).astype(np.float32)
-    linear = np.stack([curve[plane] for plane in planes])
-    if card.mosaic == "bayer":
-        linear = np.einsum("ij,jhw->ihw", _to_sensor(card).astype(np.float32), linear, optimize=True)
+    linear = np.stack([curve.take(plane) for plane in planes])
+    if card.mosaic == "bayer":  # as a product of matrices: einsum leaves the planes interleaved, for slow filters
+        linear = (_to_sensor(card).astype(np.float32) @ linear.reshape(3, -1)).reshape(linear.shape)
     full = np.stack([plane >= _TOP_CODE for plane in planes])
     return ColourPlanes(linear, np.ones(linear.shape, bool), full, box)
 

@@ -22,7 +22,7 @@ from phibench.datasets.merge_repair import merge, repair
 from phibench.datasets.plan.plan import make_plan
 from phibench.datasets.read import open_finished
 from phibench.datasets.recipe.load import load_recipe, recipe_files
-from phibench.datasets.rooms.room_errors import RoomError
+from phibench.datasets.rooms.room_files import RoomError
 from phibench.datasets.show import table
 from phibench.datasets.store.checksums import data_files, read_checksums
 from phibench.datasets.verify import verify

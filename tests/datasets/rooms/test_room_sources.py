@@ -10,8 +10,7 @@ from phibench.datasets.errors import DatasetError
 from phibench.datasets.rooms.mesh_files import read_mesh
 from phibench.datasets.rooms.mesh_placement import MeshLamp, MeshSettings
 from phibench.datasets.rooms.panorama_settings import PanoramaSettings
-from phibench.datasets.rooms.room_errors import RoomError
-from phibench.datasets.rooms.room_files import RoomFiles
+from phibench.datasets.rooms.room_files import RoomError, RoomFiles
 from phibench.datasets.rooms.room_sources import SOURCES, MeshRoom, PanoramaRoom, room_of
 from phibench.datasets.store.documents import from_json, to_json
 

@@ -240,16 +240,22 @@ def test_small_numbers_do_not_read_as_zero():
 
 
 def test_several_methods_are_scored_as_each_alone():
-    """Pairs are drawn once for all and in parts of 16; what a method gets does not depend on that."""
+    """Pairs are drawn once for all and in parts of 16; what a method gets does not depend on that.
+
+    Each part is asked for before the one before is answered, so that methods work while answers are examined.
+    """
     pairs, oracles = cases(40), [sampler(), shifted(0.5)]
+    answered_before = []
 
     def ask(held, numbers):
+        answered_before.append(len(told))
         answers = [{o.number: o for o in outcomes(pairs, oracle)} for oracle in oracles]
         return [tuple(answer[number] for answer in answers) for number in numbers]
 
     told = []
     both = score_methods([MethodCard.of("a"), MethodCard.of("b")], pairs, ask, RULES, told=told.append)
     assert told == list(range(1, 41))
+    assert answered_before == [0, 0, 16]
     for one, oracle, name in zip(both, oracles, "ab", strict=True):
         alone = score_outcomes(MethodCard.of(name), pairs, outcomes(pairs, oracle), RULES)
         assert one.records.equals(alone.records)

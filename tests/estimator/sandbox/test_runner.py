@@ -169,6 +169,26 @@ def test_several_workers_give_the_same_in_the_same_order(tmp_path: Path) -> None
     assert [o.failure for o in one] == ["", "", "error", "", "", ""]
 
 
+def test_pairs_asked_for_ahead_are_made_one_at_a_time_and_in_order(tmp_path: Path) -> None:
+    """A set need not be safe for threads: those of the next call wait for the last ones of this call."""
+    made: list[int] = []
+    inside: list[int] = []
+
+    class Watched(SmallPairs):
+        def pair(self, number: int) -> Pair:
+            inside.append(len(made))
+            time.sleep(0.02)
+            made.append(number)
+            return super().pair(number)
+
+    with Harness([method_file(tmp_path, f"return {GOOD}")], LIMITS, workers=3) as harness:
+        first, then = (harness.outcomes(Watched(), part) for part in ([3, 1, 4, 0], [2, 5]))
+        answers = [outcome.answer for part in (first, then) for (outcome,) in part]
+    assert made == [3, 1, 4, 0, 2, 5]
+    assert inside == list(range(6))  # nobody begins before the one before has ended
+    assert [answer.down.uv_px[0] for answer in answers if answer and answer.down.uv_px] == [100.0 + n for n in made]
+
+
 def test_a_process_stays_warm_until_it_fails(tmp_path: Path) -> None:
     body = "import os\nif pair.number == 2: 1 / 0\nreturn Answer(Spot((float(os.getpid()), 0.0)), Spot.missing('x'))"
     done = run_method(method_file(tmp_path, body), SmallPairs(5), LIMITS)
