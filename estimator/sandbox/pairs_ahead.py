@@ -56,7 +56,14 @@ class PairsAhead:
         self._truths: dict[int, PairTruth] = {}
         self.seconds = {"draw": 0.0, "bounds": 0.0}
         told = pickle.dumps(pairs)
-        self._makers = [_Maker() for _ in range(min(processes, len(pairs)))]
+        self._makers: list[_Maker] = []
+        try:
+            for _ in range(min(processes, len(pairs))):
+                self._makers.append(_Maker())
+        except OSError as error:
+            self._end()
+            what = f"no process that draws pairs can be started: {error.strerror or error}; take --workers 1"
+            raise DatasetError(what) from error
         for first, maker in enumerate(self._makers):  # all import what they need by now, side by side
             maker.begin(told, first)
 
@@ -64,6 +71,9 @@ class PairsAhead:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: object, trace: TracebackType | None) -> None:
+        self._end()
+
+    def _end(self) -> None:
         for maker in self._makers:
             maker.end()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -9,6 +10,7 @@ import sys
 import time
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -121,6 +123,22 @@ def test_a_process_that_dies_is_a_sentence() -> None:
         os.kill(made._makers[0]._process.pid, signal.SIGKILL)
         with pytest.raises(DatasetError, match="died; most often memory has run out: take fewer --workers"):
             made.pair(1), made.pair(2)
+
+
+def test_a_process_that_cannot_be_started_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[subprocess.Popen[bytes]] = []
+    start = subprocess.Popen
+
+    def popen(*given: Any, **named: Any) -> subprocess.Popen[bytes]:
+        if started:
+            raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+        started.append(start(*given, **named))
+        return started[0]
+
+    monkeypatch.setattr(subprocess, "Popen", popen)
+    with pytest.raises(DatasetError, match="can be started: Resource temporarily unavailable; take --workers 1"):
+        PairsAhead(EasyPairs(count=4), 2)
+    assert started[0].poll() is not None  # the first one was ended
 
 
 def is_alive(pid: int) -> bool:
