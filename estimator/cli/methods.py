@@ -58,7 +58,9 @@ def check(
     """
     from phibench.datasets.progress import Steps, progress_console
     from phibench.estimator.sandbox.check import PAIRS, check_method
+    from phibench.estimator.sandbox.resolve import resolve
 
+    resolve(reference)  # one that is not there is told before anything begins
     with Steps(progress_console(), "easy pairs", PAIRS, announce=True) as steps:
         done = check_method(reference, preset, limits.of_run, told=steps.reach)
     for number, text in done.printed if show_output else ():
