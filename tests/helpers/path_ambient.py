@@ -53,12 +53,19 @@ def path_trace(
 
 
 def path_runs(
-    view: View, room: Room, samples_per_pixel: int, max_depth: int, runs: int, crop: tuple[int, int, int, int]
+    view: View,
+    room: Room,
+    samples_per_pixel: int,
+    max_depth: int,
+    runs: int,
+    crop: tuple[int, int, int, int],
+    first_seed: int = 0,
 ) -> NDArray[np.float32]:
     """Independent runs over a small window, one pass each, shape (runs, 3, height, width); else as `path_trace`."""
     mi = activate()
     scene = load_scene(mi, scene_dict(mi, view, room, crop))
     integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 1000})
     # the multijitter sampler lays out the samples of a pass anew for each seed
-    images = [np.array(mi.render(scene, integrator=integrator, spp=samples_per_pixel, seed=k)) for k in range(runs)]
+    seeds = range(first_seed, first_seed + runs)
+    images = [np.array(mi.render(scene, integrator=integrator, spp=samples_per_pixel, seed=k)) for k in seeds]
     return np.stack(images).transpose(0, 3, 1, 2)

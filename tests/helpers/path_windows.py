@@ -71,7 +71,7 @@ def drawn_window(room: Room, stream: int, samples: int) -> tuple[Crop, str]:
     Nothing of ours is looked at.
     """
     best = (np.inf, ((0, 0, 0, 0), ""))
-    for window in islice(_windows(room, np.random.default_rng(stream)), _CANDIDATES):
+    for window in islice(windows_of(room, np.random.default_rng(stream)), _CANDIDATES):
         a, b = path_runs(VIEW, room, _PILOT, DEPTH, 2, window[0]).astype(float)
         noise = np.sqrt(np.sum((a - b) ** 2, axis=(1, 2))) / np.sum(a + b, axis=(1, 2))
         error = float(noise.max()) * np.sqrt(2.0 * _PILOT / (RUNS * samples))
@@ -81,7 +81,8 @@ def drawn_window(room: Room, stream: int, samples: int) -> tuple[Crop, str]:
     return best[1]
 
 
-def _windows(room: Room, rng: np.random.Generator) -> Iterator[tuple[Crop, str]]:
+def windows_of(room: Room, rng: np.random.Generator) -> Iterator[tuple[Crop, str]]:
+    """Random windows in the mirror that show nothing but the room, no nearer than `NEAREST_M`, and what they show."""
     geometry = room_geometry(room, VIEW)
     planes = truth_layer(VIEW, geometry, view_surfaces(VIEW, room).first_patch)
     ids, depth_m = planes["object_id"], planes["depth_m"]
