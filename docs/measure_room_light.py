@@ -3,7 +3,8 @@
 Run from the repository root. Every lit room of the recipe is baked once, as `dataset make` bakes it: with the settings
 of its `[ambient]`. Windows of 16 x 16 pixels are drawn in the mirror, and nothing of ours is looked at to choose them.
 A window may not show the robot, or what is nearer than 0.5 m: there the ball's own shadow counts, which light maps
-leave out. Rooms of panoramas have no light map, the sun is left out of all. Path tracing is Mitsuba's, 30 bounces. Its
+leave out. Rooms of panoramas have no light map, the sun is left out of all. Rooms in which a mesh shines are left out,
+because Mitsuba cannot trace them. Path tracing is Mitsuba's, 30 bounces. Its
 runs are kept in `out/room_light/`, by the digest of the room: other settings are measured against the same runs.
 
 Prints a line for every window, then rms and largest difference, with the tracer's own error, and the time of baking.
@@ -15,6 +16,7 @@ import argparse
 import sys
 import time
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +32,7 @@ from phibench.datasets.rooms.panorama_settings import PanoramaSettings
 from phibench.render.room.ambient import render_ambient
 from phibench.render.room.light_map import BakeSettings, bake
 from phibench.scenes.room import Room
+from phibench.scenes.shapes import Rectangle
 
 KEPT = Path("out/room_light")
 _SAMPLES, _RUNS, _MOST_RUNS = 128, 4, 12
@@ -55,6 +58,12 @@ def traced(room: Room, key: str, windows: int) -> dict[str, np.ndarray]:
         np.savez(path, crops=crops, means=means, errors=errors, shown=shown)
     with np.load(path) as kept:
         return dict(kept)
+
+
+def traceable(room: Room) -> bool:
+    """Whether Mitsuba can trace a room: of what shines by a picture, only rectangles."""
+    shapes = (*room.surfaces, *room.furniture)
+    return all(isinstance(one, Rectangle) or not getattr(one.texture, "is_radiance", False) for one in shapes)
 
 
 def compared(room: Room, settings: BakeSettings, kept: dict[str, np.ndarray]) -> tuple[np.ndarray, float]:
@@ -87,10 +96,11 @@ def main() -> None:
     settings = replace(settings, **changed)
     print(settings)
     sources = draw_rooms(recipe).items()
-    lit = [(key, one) for key, one in sources if not isinstance(getattr(one, "settings", None), PanoramaSettings)]
+    baked = [(key, one) for key, one in sources if not isinstance(getattr(one, "settings", None), PanoramaSettings)]
+    built = ((key, replace(one.build(), sun=None)) for key, one in baked)
+    rooms = islice(((key, room) for key, room in built if traceable(room)), given.first, given.first + given.rooms)
     differences, errors, seconds = [], [], []
-    for key, source in lit[given.first : given.first + given.rooms]:
-        room = replace(source.build(), sun=None)
+    for key, room in rooms:
         kept = traced(room, f"{recipe.dataset.name}-{key}", given.windows)
         difference, spent = compared(room, settings, kept)
         error = kept["errors"] / kept["means"]

@@ -18,10 +18,11 @@ negative anywhere inside the rim. Of a quadric it is R^2 / w^3, and nothing need
 behind it, z >= sag, is then a convex body, so that of two points outside it at most one point of the mirror reflects
 light from one to the other (`render.optics.revolved_reflection`).
 
-**Form error.** h(x, y), in metres along the normal towards the camera, makes the surface z = sag - h N, N = sqrt(1 +
-4 s sag'^2) being 1 over the cosine of the slope: what is moved along the axis by h N is moved along the normal by h, to
-first order in the form's slope. h is a sum of peak times Zernike polynomial on the disc of the rim, whose largest
-magnitude is 1. With rho the radius over the rim's, and phi the angle from x to y:
+**Form error.** h(x, y), in metres, positive towards the camera, makes the surface z = sag - h N, N = sqrt(1 + 4 s
+sag'^2) being 1 over the cosine of the slope. This is the definition: h N lies along the axis, at the same x and y. To
+first order in h that is h along the normal; at 0.2 mm the two surfaces differ by up to 12 um. h is a sum of peak times
+Zernike polynomial on the disc of the rim, whose largest magnitude is 1. With rho the radius over the rim's, and phi the
+angle from x to y:
 
     20   6 rho^4 - 6 rho^2 + 1                     spherical aberration
     21   (3 rho^3 - 2 rho) cos, sin phi            coma

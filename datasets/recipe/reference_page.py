@@ -204,10 +204,11 @@ further targets. Each has a place, a power, a colour, a code and a path. A light
 reflection. Their images and their truth are stored with the film's.
 """,
     "[[film.drive]]": """The robot drives from leg to leg, each from rest to rest, on a level floor. A leg is an arc:
-`length_m` alone is straight, `turn_deg` alone turns about the middle of the tracks. A leg with `flipper_deg` turns the
-flippers instead, which start at 25 deg; down, they lift the robot's front. Slip and skid factor are drawn from the
-seed; the path is the true one whatever they are. The robot makes a stroke only while it stands. A film without a stroke
-has `stops = [0.0]` and one of `pauses_s`.
+`length_m` alone is straight, `turn_deg` alone turns about the middle of the tracks, 60 mm behind the stroke axis.
+`length_m` is the way of that middle, not of the mirror. A leg with `flipper_deg` turns the flippers instead, which
+start at 25 deg; down, they lift the robot's front. Slip and skid factor are drawn from the seed; the path is the true
+one whatever they are. The robot makes a stroke only while it stands. A film without a stroke has `stops = [0.0]` and
+one of `pauses_s`.
 """,
     "[random]": """Instead of `[[experiments]]`: `samples` stroke pairs, each with a rig, a spot and a stroke that are
 drawn. Sample i depends on the rest of the recipe and on i, not on `samples`. Make the same
